@@ -1,0 +1,25 @@
+from ._brownian import (
+    TruncatedBrownianPath as TruncatedBrownianPath,
+    WeakBrownianPath as WeakBrownianPath,
+    WeakIncrement as WeakIncrement,
+)
+from ._conditions import (
+    strong_order_residuals as strong_order_residuals,
+    symplectic_residuals as symplectic_residuals,
+    weak_order_residuals as weak_order_residuals,
+)
+from ._hamiltonian import hamiltonian_terms as hamiltonian_terms
+from ._root_finder import SmallLU as SmallLU, PicardNewton as PicardNewton
+from ._solver import (
+    AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
+    Midpoint as Midpoint,
+    SRKs1 as SRKs1,
+    SRKw1 as SRKw1,
+    SRKw2 as SRKw2,
+)
+from ._tableau import AbstractTableau as AbstractTableau, GeneralTableau as GeneralTableau
+from ._verify import (
+    step_expectation as step_expectation,
+    symplecticity_defect as symplecticity_defect,
+    weak_order_defect as weak_order_defect,
+)

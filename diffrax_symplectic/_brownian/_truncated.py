@@ -1,0 +1,113 @@
+import dataclasses
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree
+
+from .._custom_types import RealScalarLike
+from ._fixed_steps import require_fixed_steps
+
+
+class TruncatedBrownianPath(diffrax.AbstractBrownianPath):
+    r"""Bounds the increments of a Brownian path, for implicit strong methods.
+
+    Over a step of size $h < 1$ an increment $\sqrt h\,\xi$ becomes
+    $\sqrt h\,\max(-A_h, \min(\xi, A_h))$ with $A_h = \sqrt{2 k |\ln h|}$. A Gaussian
+    increment is unbounded, so that at any step size an implicit stage has, with positive
+    probability, no solution; a truncated one is bounded by $\sqrt{2 k h |\ln h|}$. The
+    price is a mean-square error $\mathbb E[(\xi - \xi_h)^2] \leq h^k$: take $k$ at least
+    twice the strong order of the method.
+
+    Lévy areas of the wrapped path are kept as they are. Step sizes have to be fixed.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{milstein2002numerical,
+            author = {Milstein, G. N. and Repin, Yu. M. and Tretyakov, M. V.},
+            title = {Numerical Methods for Stochastic Systems Preserving Symplectic
+                     Structure},
+            journal = {SIAM Journal on Numerical Analysis},
+            volume = {40},
+            number = {4},
+            pages = {1583--1604},
+            year = {2002},
+            doi = {10.1137/S0036142901395588},
+        }
+        ```
+    """
+
+    path: diffrax.AbstractBrownianPath
+    k: int = eqx.field(static=True)
+
+    def __init__(self, path: diffrax.AbstractBrownianPath, *, k: int = 2):
+        """**Arguments:**
+
+        - `path`: any Brownian path of Diffrax.
+        - `k`: the integer $k \\geq 1$ above.
+
+        **Raises:** a `ValueError` if `k` is not a positive integer, or `path` is not a
+        Brownian path. An error when run if a step is not shorter than one unit of time,
+        where $A_h$ has no meaning.
+        """
+        if not isinstance(path, diffrax.AbstractBrownianPath):
+            raise ValueError(
+                "`TruncatedBrownianPath` wraps a Brownian path, for example "
+                f"`diffrax.VirtualBrownianTree(...)`; got {type(path).__name__}."
+            )
+        if isinstance(k, bool) or not isinstance(k, int) or k < 1:
+            raise ValueError(
+                "`k` must be an integer, 1 or larger (2 suits methods of strong order "
+                f"1); got {k!r}."
+            )
+        self.path = path
+        self.k = k
+
+    @property
+    def t0(self):
+        return self.path.t0
+
+    @property
+    def t1(self):
+        return self.path.t1
+
+    @property
+    def levy_area(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.path.levy_area
+
+    def evaluate(
+        self,
+        t0: RealScalarLike,
+        t1: RealScalarLike | None = None,
+        left: bool = True,
+        use_levy: bool = False,
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
+
+        **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
+        size controller or `diffrax.HalfSolver`; an error when run for a step of one unit
+        of time or longer.
+        """
+        require_fixed_steps(type(self).__name__)
+        h = jnp.abs(jnp.asarray(t0) if t1 is None else jnp.asarray(t1) - t0)
+        h = eqx.error_if(
+            h,
+            h >= 1,
+            "`TruncatedBrownianPath` needs steps shorter than one unit of time, since "
+            "the bound is a multiple of sqrt(|ln h|). Pass a smaller `dt0`, or measure "
+            "time in larger units.",
+        )
+        # An empty step has an increment of zero: h |ln h| -> 0.
+        log_h = jnp.log(jnp.where(h > 0, h, 1))
+        bound = jnp.sqrt(2 * self.k * h * jnp.abs(log_h))
+
+        def clip(w):
+            return jnp.clip(w, -bound.astype(w.dtype), bound.astype(w.dtype))
+
+        increment = self.path.evaluate(t0, t1, left, use_levy)
+        if use_levy:
+            assert isinstance(increment, diffrax.AbstractBrownianIncrement)
+            return dataclasses.replace(increment, W=jtu.tree_map(clip, increment.W))
+        return jtu.tree_map(clip, increment)

@@ -1,0 +1,240 @@
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import lineax.internal as lxi
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from .._custom_types import BM, RealScalarLike
+from ._fixed_steps import require_fixed_steps
+
+
+class WeakIncrement(diffrax.AbstractBrownianIncrement):
+    r"""The random variables of one step of a weak method, for a step of size $h$.
+
+    They have the moments of Gaussian increments that a weak method needs, and are
+    bounded, so that implicit stages stay solvable and moments stay finite.
+
+    - `dt`: the step size $h$.
+    - `W`: the three-point variables $\hat I_k$, $\pm\sqrt{3h}$ with probability $1/6$
+        each and $0$ with probability $2/3$. Moments 1 to 5 are those of
+        $\mathcal N(0, h)$.
+    - `second`: further, independent three-point variables $\hat I_{k+m}$, or `None`.
+    - `two_point`: the variables $\tilde I_k = \pm\sqrt h$ with probability $1/2$ each,
+        independent of the others, or `None`.
+
+    `W`, `second` and `two_point` have the structure and shapes of the path.
+
+    ??? cite "Reference"
+
+        Equations (2.3)-(2.5) and (3.3) of
+
+        ```bibtex
+        @article{wang2017construction,
+            author = {Wang, Peng and Hong, Jialin and Xu, Dongsheng},
+            title = {Construction of Symplectic Runge-Kutta Methods for Stochastic
+                     Hamiltonian Systems},
+            journal = {Communications in Computational Physics},
+            volume = {21},
+            number = {1},
+            pages = {237--270},
+            year = {2017},
+            doi = {10.4208/cicp.261014.230616a},
+        }
+        ```
+    """
+
+    dt: PyTree[Float[Array, ""], "BM"]
+    W: BM
+    second: BM | None = None
+    two_point: BM | None = None
+
+    def _flat(self) -> tuple[Float[Array, " m"], Float[Array, " m"], Array]:
+        if self.two_point is None:
+            raise ValueError(
+                "The mixed integrals need the two-point variables. Construct the path "
+                "as `WeakBrownianPath(..., two_point=True)`."
+            )
+        ihat, _ = jfu.ravel_pytree(self.W)
+        itilde, _ = jfu.ravel_pytree(self.two_point)
+        return ihat, itilde, jnp.sqrt(jnp.abs(jtu.tree_leaves(self.dt)[0]))
+
+    def mixed_stratonovich(self) -> Float[Array, "m m"]:
+        r"""The variables $\hat I_{(k,l)}$ of the Stratonovich methods, as a matrix with
+        the `m` noises in the order of the leaves of `W`: $\hat I_k \tilde I_l$ for
+        $l < k$, $-\hat I_l \tilde I_k$ for $k < l$. The diagonal, which the methods do
+        not use, is zero.
+
+        **Raises:** a `ValueError` if the two-point variables were not asked for.
+        """
+        ihat, itilde, _ = self._flat()
+        lower = jnp.tril(jnp.outer(ihat, itilde), -1)
+        return lower - lower.T
+
+    def mixed_ito(self) -> Float[Array, "m m"]:
+        r"""The variables $\hat I_{(k,l)}$ of the Itô methods, which stand for the
+        iterated integrals $\int \int \mathrm{d}w_k \mathrm{d}w_l$, as a matrix with the
+        `m` noises in the order of the leaves of `W`:
+        $(\hat I_k \hat I_l - \sqrt h \tilde I_k) / 2$ for $k < l$,
+        $(\hat I_k \hat I_l + \sqrt h \tilde I_l) / 2$ for $l < k$, and
+        $(\hat I_k^2 - h) / 2$ for $k = l$.
+
+        **Raises:** a `ValueError` if the two-point variables were not asked for.
+        """
+        ihat, itilde, sqrt_h = self._flat()
+        upper = jnp.triu(jnp.broadcast_to(itilde[:, None], (ihat.size,) * 2), 1)
+        skew = sqrt_h * (upper.T - upper)
+        return (jnp.outer(ihat, ihat) + skew - sqrt_h**2 * jnp.eye(ihat.size)) / 2
+
+
+class WeakBrownianPath(diffrax.AbstractBrownianPath):
+    r"""Discrete random variables in place of Brownian increments, for weak methods.
+
+    Over each step this gives a [`diffrax_symplectic.WeakIncrement`][]. Steps are
+    independent. Use it where expectations are wanted and not paths: there is no
+    Brownian motion that these are the increments of, so that step sizes have to be
+    fixed (`diffrax.ConstantStepSize` or `diffrax.StepTo`).
+
+    The increments are a function of `key` and of where the step lies. "Where" is
+    rounded to a fraction of the step size, so that the rounding errors of the time do
+    not matter: a step that is computed again (by the backward pass of
+    `diffrax.RecursiveCheckpointAdjoint`, say) sees the same increments.
+
+    Probabilities are exact up to $2^{-32}$, odd moments exactly zero.
+    """
+
+    shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
+    key: PRNGKeyArray
+    second: bool = eqx.field(static=True)
+    two_point: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        shape: tuple[int, ...] | PyTree[jax.ShapeDtypeStruct],
+        key: PRNGKeyArray,
+        *,
+        second: bool = False,
+        two_point: bool = False,
+    ):
+        r"""**Arguments:**
+
+        - `shape`: a PyTree of `jax.ShapeDtypeStruct`s, the shape, dtype and structure of
+            an increment; or a tuple of integers for one array of the default
+            floating-point dtype. For `m` noises, `(m,)`.
+        - `key`: a JAX random key, as from `jax.random.key(seed)`.
+        - `second`: whether to draw a second, independent set of three-point variables.
+        - `two_point`: whether to draw the two-point variables.
+
+        `second` and `two_point` do not change what `W` is for the same `key`.
+
+        **Raises:** a `ValueError` if a dtype is not real floating-point.
+        """
+        if isinstance(shape, tuple) and all(isinstance(n, int) for n in shape):
+            shape = jax.ShapeDtypeStruct(shape, lxi.default_floating_dtype())
+        for leaf in jtu.tree_leaves(shape):
+            if not isinstance(leaf, jax.ShapeDtypeStruct):
+                raise ValueError(
+                    "`shape` must be a tuple of integers or a PyTree of "
+                    f"`jax.ShapeDtypeStruct`s; got {shape}."
+                )
+            if not jnp.issubdtype(leaf.dtype, jnp.floating):
+                raise ValueError(
+                    "The dtypes of a `WeakBrownianPath` must be real floating-point; "
+                    f"got {leaf.dtype}."
+                )
+        self.shape = shape
+        self.key = key
+        self.second = second
+        self.two_point = two_point
+
+    @property
+    def t0(self):
+        return -jnp.inf
+
+    @property
+    def t1(self):
+        return jnp.inf
+
+    @property
+    def levy_area(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return WeakIncrement
+
+    def evaluate(
+        self,
+        t0: RealScalarLike,
+        t1: RealScalarLike | None = None,
+        left: bool = True,
+        use_levy: bool = False,
+    ) -> PyTree[Array] | WeakIncrement:
+        """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
+
+        Returns the three-point variables of the step from `t0` to `t1`, or with
+        `use_levy=True` a [`diffrax_symplectic.WeakIncrement`][]. Without `t1` the step
+        is the one from `0` to `t0`.
+
+        **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
+        size controller or `diffrax.HalfSolver`.
+        """
+        del left
+        require_fixed_steps(type(self).__name__)
+        if t1 is None:
+            t0, t1 = jnp.zeros_like(t0), t0
+        t0 = eqxi.nondifferentiable(jnp.asarray(t0), name="t0")
+        t1 = eqxi.nondifferentiable(jnp.asarray(t1), name="t1")
+        h = t1 - t0
+        key = _step_key(self.key, t0, t1)
+        W = self._draw(key, h, _three_point)
+        if not use_levy:
+            return W
+        dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), self.shape)
+        second = two_point = None
+        if self.second:
+            second = self._draw(jr.fold_in(key, 1), h, _three_point)
+        if self.two_point:
+            two_point = self._draw(jr.fold_in(key, 2), h, _two_point)
+        return WeakIncrement(dt=dt, W=W, second=second, two_point=two_point)
+
+    def _draw(self, key, h, law) -> PyTree[Array]:
+        leaves, treedef = jtu.tree_flatten(self.shape)
+        sizes = [int(np.prod(leaf.shape)) for leaf in leaves]
+        bits = jr.bits(key, (sum(sizes),), jnp.uint32)
+        pieces = jnp.split(bits, np.cumsum(sizes)[:-1])
+        out = [
+            law(piece.reshape(leaf.shape), jnp.sqrt(jnp.abs(h)).astype(leaf.dtype))
+            for piece, leaf in zip(pieces, leaves)
+        ]
+        return jtu.tree_unflatten(treedef, out)
+
+
+def _three_point(bits, sqrt_h):
+    sixth = np.uint32(2**32 // 6)
+    size = np.sqrt(3.0).astype(sqrt_h.dtype) * sqrt_h
+    up = bits >= np.uint32(2**32 - 2**32 // 6)
+    return jnp.where(bits < sixth, -size, jnp.where(up, size, jnp.zeros_like(size)))
+
+
+def _two_point(bits, sqrt_h):
+    return jnp.where(bits < np.uint32(2**31), -sqrt_h, sqrt_h)
+
+
+def _step_key(key, t0, t1):
+    """A key for the step from `t0` to `t1`, the same for times that differ by rounding.
+
+    The middle of the step is counted in units of a power of two that lies between a
+    quarter and a half of the step, so that no two steps of one size share a count. The
+    two odd constants keep round numbers away from where the roundings change.
+    """
+    h = jnp.abs(t1 - t0)
+    _, exponent = jnp.frexp(h * 1.37)
+    exponent = exponent.astype(jnp.int32) - 2
+    count = jnp.floor(jnp.ldexp(t0 + (t1 - t0) / 2, -exponent) + 0.29)
+    # Wraps around after 2^31 counts, where neighbours are still distinct.
+    count = jnp.remainder(count, 2.0**31).astype(jnp.uint32)
+    return jr.fold_in(jr.fold_in(key, count), exponent.astype(jnp.uint32))

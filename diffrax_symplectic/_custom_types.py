@@ -1,0 +1,18 @@
+from typing import Any, TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, PyTree, Real, Shaped
+
+
+if TYPE_CHECKING:
+    BoolScalarLike: TypeAlias = bool | Array | np.ndarray
+    RealScalarLike: TypeAlias = int | float | Array | np.ndarray
+else:
+    BoolScalarLike = Bool[ArrayLike, ""]
+    RealScalarLike = Real[ArrayLike, ""]
+
+Args: TypeAlias = PyTree[Any]
+Y: TypeAlias = PyTree[Shaped[ArrayLike, "?*y"], "Y"]
+VF: TypeAlias = PyTree[Shaped[ArrayLike, "?*vf"], "VF"]
+BM: TypeAlias = PyTree[Shaped[ArrayLike, "?*bm"], "BM"]
+DenseInfo: TypeAlias = dict[str, PyTree[Array]]

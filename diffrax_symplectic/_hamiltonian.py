@@ -1,0 +1,207 @@
+from collections.abc import Callable
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from equinox.internal import ω
+from jaxtyping import Array, PyTree, Shaped
+
+from ._custom_types import Args, BM, RealScalarLike
+
+
+_P = PyTree[Shaped[Array, "?*p"], "P"]
+_State = tuple[_P, _P]
+_Hamiltonian = Callable[[RealScalarLike, _P, _P, Args], PyTree[Array]]
+
+
+def hamiltonian_terms(
+    H0: _Hamiltonian, noise: _Hamiltonian, path: diffrax.AbstractBrownianPath
+) -> diffrax.MultiTerm:
+    r"""The terms of a stochastic Hamiltonian system, from its Hamiltonians.
+
+    For the state $y = (p, q)$, in the sense of Stratonovich,
+
+    $$\mathrm{d}p = -\frac{\partial H_0}{\partial q}\,\mathrm{d}t
+        - \sum_{k=1}^m \frac{\partial H_k}{\partial q} \circ \mathrm{d}w_k, \qquad
+      \mathrm{d}q = \frac{\partial H_0}{\partial p}\,\mathrm{d}t
+        + \sum_{k=1}^m \frac{\partial H_k}{\partial p} \circ \mathrm{d}w_k.$$
+
+    The result goes to `diffrax.diffeqsolve`, with the solvers of this package or with
+    any Stratonovich solver of Diffrax. All derivatives are taken by JAX. The noise of a
+    step is the gradient of one scalar, $\sum_k I_k H_k$, so that it costs one reverse
+    pass whatever the number of noises.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+        import jax.random as jr
+
+        def H0(t, p, q, args):
+            return (p**2 + q**2) / 2
+
+        def noise(t, p, q, args):
+            return jnp.stack([args * q, args * p * q])
+
+        path = ds.WeakBrownianPath(shape=(2,), key=jr.key(0))
+        terms = ds.hamiltonian_terms(H0, noise, path)
+        y0 = (jnp.array(0.0), jnp.array(1.0))
+        sol = diffrax.diffeqsolve(
+            terms, ds.Midpoint(), t0=0, t1=1, dt0=0.01, y0=y0, args=0.1
+        )
+        ```
+
+    **Arguments:**
+
+    - `H0`: `H0(t, p, q, args)`, a scalar. A function, or a Module with parameters;
+        differentiable with respect to these and to `args`.
+    - `noise`: `noise(t, p, q, args)`, the noise Hamiltonians $H_1, \ldots, H_m$ as an
+        array of shape `(m,)`, or whatever structure and shapes `path` has. A scalar will
+        do if `m = 1`.
+    - `path`: the Brownian path, of shape `(m,)`: a
+        [`diffrax_symplectic.WeakBrownianPath`][], a
+        [`diffrax_symplectic.TruncatedBrownianPath`][], or any of Diffrax's.
+
+    `p` and `q` are PyTrees of arrays of the same structure and shapes.
+
+    **Returns:** `MultiTerm(drift, diffusion)`.
+
+    **Raises:** a `ValueError` if `path` is not a Brownian path; and, while the solve is
+    traced, if the state is not a pair `(p, q)` of the same structure and shapes, if `H0`
+    does not return a scalar, or if `noise` does not match the path.
+    """
+    if not isinstance(path, diffrax.AbstractBrownianPath):
+        raise ValueError(
+            "`path` must be a Brownian path, for example `diffrax_symplectic."
+            f"WeakBrownianPath(shape=(m,), key=key)`; got {type(path).__name__}."
+        )
+    for name, fn in (("H0", H0), ("noise", noise)):
+        if not callable(fn):
+            raise ValueError(
+                f"`{name}` must be a function `{name}(t, p, q, args)`; got {fn!r}."
+            )
+    return diffrax.MultiTerm(diffrax.ODETerm(_Drift(H0)), _Noise(noise, path))
+
+
+class _Drift(eqx.Module):
+    """The vector field `(-dH0/dq, dH0/dp)`."""
+
+    H0: _Hamiltonian
+
+    def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
+        check_pair(y)
+
+        def scalar(p, q):
+            out = self.H0(t, p, q, args)
+            if not jtu.all_leaves([out]) or jnp.shape(out) != ():
+                raise ValueError(
+                    "`H0(t, p, q, args)` must return a scalar; got "
+                    f"{eqx.tree_pformat(out)}. Sum over the degrees of freedom."
+                )
+            return jnp.asarray(out, jnp.result_type(out, float))
+
+        return _symplectic_gradient(scalar, y)
+
+
+class _Noise(diffrax.AbstractTerm):
+    """The noise part: control `I`, product the symplectic gradient of `I . H`."""
+
+    noise: _Hamiltonian
+    path: diffrax.AbstractBrownianPath
+
+    def contr(self, t0: RealScalarLike, t1: RealScalarLike, **kwargs) -> BM:
+        return self.path.evaluate(t0, t1, **kwargs)
+
+    def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
+        # The structure of the state, with the structure of the noises at each leaf, and
+        # arrays of shape `(*state, *noise)` in that.
+        check_pair(y)
+        struct = jax.eval_shape(lambda: self.path.evaluate(0.0, 1.0))
+        jac = jax.jacrev(lambda y: self._hamiltonians(t, *y, args, struct))(y)
+        noise_def, state_def = jtu.tree_structure(struct), jtu.tree_structure(y)
+
+        def noise_last(entry):
+            move = lambda x, s: jnp.moveaxis(x, range(s.ndim), range(-s.ndim, 0))
+            return jtu.tree_map(move, jtu.tree_unflatten(noise_def, entry), struct)
+
+        rows = [state_def.flatten_up_to(row) for row in noise_def.flatten_up_to(jac)]
+        entries = [noise_last(entry) for entry in zip(*rows)]
+        dp, dq = jtu.tree_unflatten(state_def, entries)
+        return (-(dq**ω)).ω, dp
+
+    def prod(self, vf: PyTree[Array], control: BM) -> _State:
+        structure = jtu.tree_structure(control)
+
+        def contract(entry):
+            terms = jtu.tree_map(
+                lambda v, c: jnp.tensordot(v, c.astype(v.dtype), axes=c.ndim),
+                entry,
+                control,
+            )
+            return sum(jtu.tree_leaves(terms))
+
+        is_entry = lambda x: jtu.tree_structure(x) == structure
+        dp, dq = vf
+        return (
+            jtu.tree_map(contract, dp, is_leaf=is_entry),
+            jtu.tree_map(contract, dq, is_leaf=is_entry),
+        )
+
+    def vf_prod(self, t: RealScalarLike, y: _State, args: Args, control: BM) -> _State:
+        check_pair(y)
+
+        def scalar(p, q):
+            H = self._hamiltonians(t, p, q, args, control)
+            dots = jtu.tree_map(lambda h, c: jnp.sum(h * c.astype(h.dtype)), H, control)
+            return sum(jtu.tree_leaves(dots))
+
+        return _symplectic_gradient(scalar, y)
+
+    def is_vf_expensive(self, t0, t1, y, args) -> bool:
+        # `vf` takes one reverse pass for each noise, `vf_prod` takes one in all.
+        struct = jax.eval_shape(lambda: self.path.evaluate(0.0, 1.0))
+        return sum(s.size for s in jtu.tree_leaves(struct)) > 2
+
+    def _hamiltonians(self, t, p, q, args, struct) -> PyTree[Array]:
+        """The noise Hamiltonians, in the structure and shapes of the path."""
+        H = self.noise(t, p, q, args)
+        matches = jtu.tree_structure(H) == jtu.tree_structure(struct)
+        if matches:
+            for h, s in zip(jtu.tree_leaves(H), jtu.tree_leaves(struct)):
+                # One noise may come as a scalar.
+                matches = matches and (jnp.shape(h) == s.shape or jnp.size(h) == s.size == 1)
+        if not matches:
+            raise ValueError(
+                "`noise(t, p, q, args)` must return one Hamiltonian for each noise of "
+                f"the path, which has shape {eqx.tree_pformat(struct)}; got "
+                f"{eqx.tree_pformat(jax.eval_shape(lambda: H))}. Return an array of "
+                "shape `(m,)` and construct the path with `shape=(m,)`."
+            )
+        return jtu.tree_map(lambda h, s: jnp.reshape(h, s.shape), H, struct)
+
+
+def _symplectic_gradient(scalar: Callable, y: _State) -> _State:
+    p, q = y
+    dp, dq = jax.grad(scalar, argnums=(0, 1))(p, q)
+    return (-(dq**ω)).ω, dp
+
+
+def check_pair(y: PyTree) -> None:
+    """Raises a `ValueError` unless `y` is a pair of the same structure and shapes."""
+    advice = (
+        "The state of a Hamiltonian system is a pair `(p, q)` of arrays (or PyTrees) of "
+        "the same structure and shapes: pass `y0=(p0, q0)`. "
+    )
+    if not isinstance(y, tuple) or len(y) != 2:
+        raise ValueError(f"{advice}Got {eqx.tree_pformat(y)}.")
+    p, q = y
+    if jtu.tree_structure(p) != jtu.tree_structure(q) or [
+        jnp.shape(x) for x in jtu.tree_leaves(p)
+    ] != [jnp.shape(x) for x in jtu.tree_leaves(q)]:
+        raise ValueError(
+            f"{advice}Got p = {eqx.tree_pformat(p)} and q = {eqx.tree_pformat(q)}."
+        )

@@ -1,0 +1,145 @@
+"""From a tableau to the work of one step, decided before anything is traced."""
+
+import dataclasses
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from ._tableau import FlatTableau
+
+
+# Coefficients are exact up to a few roundings of order-one numbers.
+_TOLERANCE = 1e-14
+
+
+class Block(NamedTuple):
+    """Stages that depend on each other, directly or in a circle.
+
+    - `unknown`: the stages whose values are solved for; empty if the block is explicit.
+    - `explicit`: the other stages, in an order in which each can be evaluated once the
+        unknown ones and the earlier ones are known.
+    """
+
+    unknown: tuple[int, ...]
+    explicit: tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Plan:
+    """The live, distinct stages of a tableau, in blocks to be solved one after another."""
+
+    tableau: FlatTableau
+    blocks: tuple[Block, ...]
+
+    @property
+    def num_unknown(self) -> int:
+        """Stage vectors that are solved for in one step."""
+        return sum(len(block.unknown) for block in self.blocks)
+
+
+def make_plan(tableau: FlatTableau) -> Plan:
+    """Drops what feeds nothing, evaluates what is equal once, and orders the rest."""
+    previous = None
+    tableau = _mask(tableau)
+    while previous is None or len(tableau.stages) < len(previous.stages):
+        previous = tableau
+        tableau = _merge(tableau, same_channels=True)
+        tableau = _live(tableau)
+        tableau = _merge(tableau, same_channels=False)
+    return Plan(tableau, _blocks(tableau.matrix))
+
+
+def _mask(tableau: FlatTableau) -> FlatTableau:
+    """Zeroes the coefficients of values a stage does not read."""
+    reads = np.array(
+        [[b.writes in a.reads for b in tableau.stages] for a in tableau.stages]
+    )
+    matrix = np.where(reads, tableau.matrix, 0.0)
+    return dataclasses.replace(tableau, matrix=_snap(matrix))
+
+
+def _snap(x: np.ndarray) -> np.ndarray:
+    return np.where(np.abs(x) < _TOLERANCE, 0.0, x)
+
+
+def _live(tableau: FlatTableau) -> FlatTableau:
+    """Keeps the stages that reach the end of the step."""
+    live = tableau.weights != 0
+    for _ in tableau.stages:
+        live = live | (live @ (tableau.matrix != 0))
+    return tableau.take(list(np.flatnonzero(live)))
+
+
+def _merge(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
+    """Merges pairs of stages that are evaluated at the same point.
+
+    With the same channels they have the same value: their coefficients add up. With
+    different channels they can still be one stage if they always enter together.
+    """
+    stages, matrix, weights = tableau.stages, tableau.matrix, tableau.weights
+    for i, j in itertools.combinations(range(len(stages)), 2):
+        a, b = stages[i], stages[j]
+        same_point = (
+            (a.reads, a.writes) == (b.reads, b.writes)
+            and np.isclose(a.c, b.c, rtol=0, atol=_TOLERANCE)
+            and np.allclose(matrix[i], matrix[j], rtol=0, atol=_TOLERANCE)
+        )
+        if not same_point or (a.channels == b.channels) != same_channels:
+            continue
+        if same_channels:
+            matrix, weights = matrix.copy(), weights.copy()
+            matrix[:, i] = _snap(matrix[:, i] + matrix[:, j])
+            weights[i] = _snap(weights[i] + weights[j])
+            merged = a
+        else:
+            same_use = np.allclose(
+                np.append(matrix[:, i], weights[i]),
+                np.append(matrix[:, j], weights[j]),
+                rtol=0,
+                atol=_TOLERANCE,
+            )
+            if not same_use:
+                continue
+            merged = a._replace(channels=a.channels + b.channels)
+        stages = stages[:i] + (merged,) + stages[i + 1 :]
+        keep = [k for k in range(len(stages)) if k != j]
+        # One pair at a time: the merged stage may now equal another.
+        return _merge(FlatTableau(stages, matrix, weights).take(keep), same_channels)
+    return tableau
+
+
+def _blocks(matrix: np.ndarray) -> tuple[Block, ...]:
+    """Strongly connected components of the dependencies, dependencies first."""
+    n = len(matrix)
+    reach = matrix != 0
+    for k in range(n):
+        reach = reach | (reach[:, k, None] & reach[k])
+    closed = reach | np.eye(n, dtype=bool)
+    components = {tuple(np.flatnonzero(closed[i] & closed[:, i])) for i in range(n)}
+    # A stage reaches everything that what it depends on reaches, and itself besides.
+    ordered = sorted(components, key=lambda block: (closed[block[0]].sum(), block))
+    return tuple(_cut(block, matrix != 0) for block in ordered)
+
+
+def _cut(block: tuple[int, ...], depends: np.ndarray) -> Block:
+    """The fewest stages that, once known, leave no circle among the others."""
+    for size in range(len(block) + 1):
+        for unknown in itertools.combinations(block, size):
+            explicit = _evaluation_order([i for i in block if i not in unknown], depends)
+            if explicit is not None:
+                return Block(tuple(map(int, unknown)), tuple(map(int, explicit)))
+    raise AssertionError
+
+
+def _evaluation_order(stages: list[int], depends: np.ndarray) -> list[int] | None:
+    order = []
+    rest = list(stages)
+    while rest:
+        ready = [i for i in rest if not depends[i, rest].any()]
+        if not ready:
+            return None
+        order += ready
+        rest = [i for i in rest if i not in ready]
+    return order
+

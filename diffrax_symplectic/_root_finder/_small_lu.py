@@ -1,0 +1,75 @@
+from typing import Any, TypeAlias
+
+import jax.numpy as jnp
+import lineax as lx
+import lineax.internal as lxi
+from jaxtyping import Array, PyTree
+
+
+# Up to this size elimination is written out; its length grows with the cube.
+_MAX_UNROLLED = 4
+
+_State: TypeAlias = tuple[Array, lxi.PackedStructures]
+
+
+class SmallLU(lx.AbstractLinearSolver[_State]):
+    """Gaussian elimination with partial pivoting, written out for small systems.
+
+    A batched call to LAPACK costs far more than the arithmetic of a 2 x 2 system and
+    cannot be fused with what surrounds it. Here a system of up to four unknowns is a
+    handful of elementwise operations. Larger ones go to `jax.numpy.linalg.solve`.
+
+    This solver can only handle square nonsingular operators.
+    """
+
+    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
+        del options
+        if operator.in_size() != operator.out_size():
+            raise ValueError(
+                "`SmallLU` may only be used for linear solves with square matrices."
+            )
+        return operator.as_matrix(), lxi.pack_structures(operator)
+
+    def compute(
+        self, state: _State, vector: PyTree[Array], options: dict[str, Any]
+    ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
+        del options
+        matrix, structures = state
+        rhs = lxi.ravel_vector(vector, structures)
+        if len(matrix) <= _MAX_UNROLLED:
+            solution = _solve_unrolled(matrix, rhs)
+        else:
+            solution = jnp.linalg.solve(matrix, rhs)
+        return lxi.unravel_solution(solution, structures), lx.RESULTS.successful, {}
+
+    def transpose(self, state: _State, options: dict[str, Any]):
+        matrix, structures = state
+        return (matrix.T, lxi.transpose_packed_structures(structures)), options
+
+    def conj(self, state: _State, options: dict[str, Any]):
+        matrix, structures = state
+        return (matrix.conj(), structures), options
+
+    def assume_full_rank(self) -> bool:
+        return True
+
+
+def _solve_unrolled(matrix: Array, rhs: Array) -> Array:
+    n = len(rhs)
+    # Rows as lists of scalars: XLA sees straight-line arithmetic and fuses all of it.
+    rows = [[matrix[i, j] for j in range(n)] + [rhs[i]] for i in range(n)]
+    for k in range(n):
+        for i in range(k + 1, n):
+            # Bring the largest pivot up by comparing neighbours, column by column.
+            swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
+            upper = [jnp.where(swap, b, a) for a, b in zip(rows[k], rows[i])]
+            lower = [jnp.where(swap, a, b) for a, b in zip(rows[k], rows[i])]
+            rows[k], rows[i] = upper, lower
+        for i in range(k + 1, n):
+            factor = rows[i][k] / rows[k][k]
+            rows[i] = [b - factor * a for a, b in zip(rows[k], rows[i])]
+    solution = [rhs[0]] * n
+    for i in reversed(range(n)):
+        known = sum((rows[i][j] * solution[j] for j in range(i + 1, n)), 0.0)
+        solution[i] = (rows[i][n] - known) / rows[i][i]
+    return jnp.stack(solution)

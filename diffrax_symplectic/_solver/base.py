@@ -1,0 +1,266 @@
+"""One step of any family: the plan of its tableau, carried out on Diffrax terms."""
+
+import functools as ft
+from collections.abc import Callable
+from typing import ClassVar, TypeAlias
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from equinox.internal import ω
+from jaxtyping import Array, Bool, PyTree
+
+from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
+from .._plan import make_plan
+from .._tableau import AbstractTableau, FlatTableau, Stage
+
+
+_SolverState: TypeAlias = None
+# The value of one stage: the change of the part of the state that it writes.
+_Value: TypeAlias = PyTree[Array]
+
+
+class AbstractSymplecticRungeKutta(
+    diffrax.AbstractImplicitSolver[_SolverState],
+    diffrax.AbstractStratonovichSolver[_SolverState],
+):
+    r"""A Runge--Kutta method with its own coefficients for drift and noise.
+
+    Subclasses give a `tableau`, the fields `root_finder` and `root_find_max_steps`, and
+    their orders. Everything else is decided by the tableau: stages that feed nothing
+    are dropped, equal ones evaluated once, explicit ones evaluated directly, and the
+    implicit rest is solved in as many small systems, one after another, as the
+    coefficients allow. The unknowns are the stage values $k_i$, not the stages, so that
+    the end of the step is their weighted sum and needs no further evaluation.
+
+    **Terms.** `MultiTerm(drift, noise)` as from
+    [`diffrax_symplectic.hamiltonian_terms`][] or of Diffrax's own `ODETerm` and
+    `ControlTerm`; any number of noise terms; or the drift alone.
+
+    **State.** Any PyTree of real floating-point arrays.
+
+    **Failures.** If a stage equation is not solved, or the step does not end at finite
+    numbers, `diffeqsolve` stops there and says so: as an error, or with `throw=False`
+    through `sol.result`. In a batch the other paths go on.
+    """
+
+    tableau: eqx.AbstractVar[AbstractTableau]
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = (
+        diffrax.LocalLinearInterpolation
+    )
+
+    @property
+    def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
+        """The least that the increments of the path have to hold."""
+        return diffrax.AbstractBrownianIncrement
+
+    def init(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+    ) -> _SolverState:
+        del terms, t0, t1, args
+        _check_state(y0, type(self).__name__)
+        return None
+
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: _SolverState,
+        made_jump: BoolScalarLike,
+    ) -> tuple[Y, None, DenseInfo, _SolverState, diffrax.RESULTS]:
+        del solver_state, made_jump
+        evaluate = _Evaluate(terms, t0, t1, args)
+        plan = make_plan(evaluate.drop_absent(self.tableau.flatten()))
+        stages, matrix = plan.tableau.stages, plan.tableau.matrix
+        values: dict[int, _Value] = {}
+        result = diffrax.RESULTS.successful
+
+        def value_of(i: int, values: dict[int, _Value]) -> _Value:
+            position = _weighted_sum(y0, stages, matrix[i], values)
+            return evaluate(stages[i], position)
+
+        for block in plan.blocks:
+            if len(block.unknown) > 0:
+                unknown, block_result = self._solve(block, value_of, values, stages, y0)
+                values |= unknown
+                result = diffrax.RESULTS.where(
+                    result == diffrax.RESULTS.successful, block_result, result
+                )
+            for i in block.explicit:
+                values[i] = value_of(i, values)
+
+        y1 = _weighted_sum(y0, stages, plan.tableau.weights, values)
+        result = diffrax.RESULTS.where(
+            (result != diffrax.RESULTS.successful) | _all_finite(y1),
+            result,
+            diffrax.RESULTS.nonfinite,
+        )
+        return y1, None, dict(y0=y0, y1=y1), None, result
+
+    def _solve(
+        self, block, value_of, known, stages, y0
+    ) -> tuple[dict[int, _Value], diffrax.RESULTS]:
+        def residual(unknown: dict[int, _Value], _) -> dict[int, _Value]:
+            values = known | unknown
+            for i in block.explicit:
+                values[i] = value_of(i, values)
+            return {i: (k**ω - value_of(i, values) ** ω).ω for i, k in unknown.items()}
+
+        # A stage where it would be if this block did not move at all.
+        guess = {i: value_of(i, known) for i in block.unknown}
+        written = {i: _part(y0, stages[i].writes) for i in block.unknown}
+        linear_solver = getattr(self.root_finder, "linear_solver", lx.AutoLinearSolver(None))
+        sol = optx.root_find(
+            residual,
+            self.root_finder,
+            guess,
+            options=dict(scale=jtu.Partial(_scale, written)),
+            max_steps=self.root_find_max_steps,
+            adjoint=optx.ImplicitAdjoint(linear_solver=linear_solver),
+            throw=False,
+        )
+        return sol.value, diffrax.RESULTS.promote(sol.result)
+
+    def func(
+        self, terms: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
+    ) -> VF:
+        return terms.vf(t0, y0, args)
+
+
+def _scale(written: dict[int, _Value], unknown: dict[int, _Value]) -> dict:
+    """How large the state is that the unknown stage values change."""
+    return jtu.tree_map(lambda x, k: jnp.abs(x) + jnp.abs(k), written, unknown)
+
+
+class _Evaluate:
+    """The value of a stage at a point: vector fields times controls, over one step."""
+
+    def __init__(self, terms, t0, t1, args):
+        self.t0, self.h = t0, t1 - t0
+        drift, noise = _split(terms)
+        self.driven = {}
+        if len(drift) > 0:
+            self.driven["h"] = (drift, [x.contr(t0, t1) for x in drift], args)
+        if len(noise) > 0:
+            self.driven["W"] = (noise, [x.contr(t0, t1) for x in noise], args)
+
+    def drop_absent(self, tableau: FlatTableau) -> FlatTableau:
+        """Leaves out the stages that no term drives (an ODE has no noise)."""
+        stages = enumerate(tableau.stages)
+        return tableau.take([i for i, s in stages if s.channels[0] in self.driven])
+
+    def __call__(self, stage: Stage, y: Y) -> _Value:
+        t = self.t0 + stage.c * self.h
+        values = [_apply(*self.driven[c], t, y) for c in stage.channels]
+        return _part(_sum(values), stage.writes)
+
+
+# Called at several stages, this is traced and lowered once.
+@eqx.filter_jit
+def _apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> Y:
+    """The sum over terms of vector field times control."""
+    values = [x.vf_prod(t, y, args, c) for x, c in zip(terms, controls)]
+    total = _sum(values)
+    _check_value(total, y)
+    return total
+
+
+def _sum(values: list[Y]) -> Y:
+    return ft.reduce(lambda a, b: (a**ω + b**ω).ω, values)
+
+
+def _split(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
+    """Drift terms and noise terms."""
+    if isinstance(terms, diffrax.MultiTerm):
+        return terms.terms[:1], terms.terms[1:]
+    is_path = lambda x: isinstance(x, diffrax.AbstractBrownianPath)
+    if any(map(is_path, jtu.tree_leaves(terms, is_leaf=is_path))):
+        return (), (terms,)
+    return (terms,), ()
+
+
+def _part(y: Y, part: str) -> PyTree[Array]:
+    return y if part == "y" else y["pq".index(part)]
+
+
+def _weighted_sum(
+    y0: Y, stages: tuple[Stage, ...], weights: np.ndarray, values: dict[int, _Value]
+) -> Y:
+    """`y0 + sum_i weights[i] values[i]`, over the values there are."""
+
+    def add(part: str) -> PyTree[Array]:
+        total = None
+        for i, value in values.items():
+            if weights[i] != 0 and stages[i].writes == part:
+                weight = float(weights[i])
+                scaled = value if weight == 1 else (weight * value**ω).ω
+                total = scaled if total is None else (total**ω + scaled**ω).ω
+        base = _part(y0, part)
+        # The small terms first: fewer roundings of the size of the state.
+        return base if total is None else (base**ω + total**ω).ω
+
+    return add("y") if stages[0].writes == "y" else (add("p"), add("q"))
+
+
+def _all_finite(y: Y) -> Bool[Array, ""]:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(y)]))
+
+
+def _check_state(y0: Y, solver: str) -> None:
+    leaves = jtu.tree_leaves(y0)
+    if len(leaves) == 0:
+        raise ValueError(f"`{solver}` needs a state with at least one array in it.")
+    for leaf in leaves:
+        dtype = jnp.result_type(leaf)
+        if not jnp.issubdtype(dtype, jnp.floating):
+            raise ValueError(
+                f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
+                f"array of dtype {dtype}. Convert it with `.astype(float)`; split a "
+                "complex one into real and imaginary parts."
+            )
+    if len({jnp.result_type(leaf) for leaf in leaves}) > 1:
+        raise ValueError(
+            f"`{solver}` needs all arrays of `y0` in one dtype; got "
+            f"{sorted({str(jnp.result_type(leaf)) for leaf in leaves})}."
+        )
+
+
+def _check_value(value: _Value, y: PyTree[Array]) -> None:
+    def check(v, x):
+        if jnp.result_type(v) != jnp.result_type(x) or jnp.shape(v) != jnp.shape(x):
+            raise ValueError(
+                "The terms change an array of dtype and shape "
+                f"{jnp.result_type(x)}{jnp.shape(x)} by one of {jnp.result_type(v)}"
+                f"{jnp.shape(v)}. Give the state, the vector fields and the path (as "
+                "`shape=jax.ShapeDtypeStruct(shape, dtype)`) the same dtype, and time "
+                "no wider one."
+            )
+
+    jtu.tree_map(check, value, y)
+
+
+def number_of_noises(terms: diffrax.AbstractTerm) -> int:
+    """How many scalar random variables drive the noise terms."""
+    _, noise = _split(terms)
+    struct = eqx.filter_eval_shape(lambda: [term.contr(0.0, 1.0) for term in noise])
+    return sum(int(np.prod(s.shape)) for s in jtu.tree_leaves(struct))
+
+
+def strong_order_if_commutative(terms: diffrax.AbstractTerm) -> float:
+    """One noise commutes with itself; whether several do cannot be seen from here."""
+    return 1.0 if number_of_noises(terms) <= 1 else 0.5

@@ -1,0 +1,66 @@
+from typing import ClassVar
+
+import numpy as np
+import optimistix as optx
+
+from .._root_finder import PicardNewton
+from .._tableau import GeneralTableau
+from .base import AbstractSymplecticRungeKutta, strong_order_if_commutative
+
+
+_half = np.array([[0.5]])
+_tab = GeneralTableau.strong(A=_half, B=_half, alpha=np.ones(1), beta=np.ones(1))
+
+
+class Midpoint(AbstractSymplecticRungeKutta):
+    r"""The implicit midpoint rule for Stratonovich systems.
+
+    $$G = y_n + \tfrac12 h\,a(G) + \tfrac12 \sum_k b_k(G) I_k, \qquad
+      y_{n+1} = y_n + h\,a(G) + \sum_k b_k(G) I_k$$
+
+    Symplectic for any Hamiltonians, and conserves every quadratic invariant. One stage
+    vector is solved for, whatever the number of noises.
+
+    Strong order 1/2, and 1 if there is one noise or the noises commute. Weak order 1.
+    Order 2 without noise.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{milstein2002numerical,
+            author = {Milstein, G. N. and Repin, Yu. M. and Tretyakov, M. V.},
+            title = {Numerical Methods for Stochastic Systems Preserving Symplectic
+                     Structure},
+            journal = {SIAM Journal on Numerical Analysis},
+            volume = {40},
+            number = {4},
+            pages = {1583--1604},
+            year = {2002},
+            doi = {10.1137/S0036142901395588},
+        }
+        ```
+    """
+
+    root_finder: optx.AbstractRootFinder = PicardNewton()
+    root_find_max_steps: int = 20
+
+    tableau: ClassVar[GeneralTableau] = _tab
+
+    def order(self, terms):
+        del terms
+        return 2
+
+    def strong_order(self, terms):
+        return strong_order_if_commutative(terms)
+
+    def weak_order(self, terms):
+        """Order of convergence of expectations."""
+        del terms
+        return 1
+
+
+Midpoint.__init__.__doc__ = """**Arguments:**
+
+- `root_finder`: any Optimistix root finder for the stage equations.
+- `root_find_max_steps`: the most iterations it may take in one step.
+"""

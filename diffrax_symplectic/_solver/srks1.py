@@ -1,0 +1,81 @@
+import equinox as eqx
+import numpy as np
+import optimistix as optx
+
+from .._root_finder import PicardNewton
+from .._tableau import GeneralTableau, real_parameter
+from .base import AbstractSymplecticRungeKutta, strong_order_if_commutative
+
+
+def _srks1(a: float) -> GeneralTableau:
+    A = np.array([[a, 0.0], [2 * a, 0.5 - a]])
+    alpha = np.array([2 * a, 1 - 2 * a])
+    return GeneralTableau.strong(A=A, B=A, alpha=alpha, beta=alpha)
+
+
+class SRKs1(AbstractSymplecticRungeKutta):
+    r"""The two-stage symplectic methods SRKs1 of Wang, Hong and Xu.
+
+    $$A = B = \begin{pmatrix} a & 0 \\ 2a & \tfrac12 - a \end{pmatrix}, \qquad
+      \alpha = \beta = (2a,\; 1 - 2a)$$
+
+    Two steps of the midpoint rule in a row, over the fractions $2a$ and $1 - 2a$ of the
+    step and of its increment. The parameter matters: $a = 0$ and $a = 1/2$ are the
+    midpoint rule itself, with one stage vector to solve for; any other value has two, one
+    after the other, and $a = 1/4$ (two half steps) the smallest errors of them.
+
+    Symplectic for any Hamiltonians, and conserves every quadratic invariant. Strong
+    order 1/2, and 1 if there is one noise or the noises commute. Weak order 1. Order 2
+    without noise.
+
+    ??? cite "Reference"
+
+        Section 2.2 of
+
+        ```bibtex
+        @article{wang2017construction,
+            author = {Wang, Peng and Hong, Jialin and Xu, Dongsheng},
+            title = {Construction of Symplectic Runge-Kutta Methods for Stochastic
+                     Hamiltonian Systems},
+            journal = {Communications in Computational Physics},
+            volume = {21},
+            number = {1},
+            pages = {237--270},
+            year = {2017},
+            doi = {10.4208/cicp.261014.230616a},
+        }
+        ```
+    """
+
+    a: float = eqx.field(default=0.25, static=True)
+    root_finder: optx.AbstractRootFinder = PicardNewton()
+    root_find_max_steps: int = 20
+
+    def __check_init__(self):
+        real_parameter("a", self.a)
+
+    @property
+    def tableau(self) -> GeneralTableau:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return _srks1(self.a)
+
+    def order(self, terms):
+        del terms
+        return 2
+
+    def strong_order(self, terms):
+        return strong_order_if_commutative(terms)
+
+    def weak_order(self, terms):
+        """Order of convergence of expectations."""
+        del terms
+        return 1
+
+
+SRKs1.__init__.__doc__ = """**Arguments:**
+
+- `a`: the free parameter, a Python float.
+- `root_finder`: any Optimistix root finder for the stage equations.
+- `root_find_max_steps`: the most iterations it may take in one step.
+
+**Raises:** a `ValueError` if `a` is not a finite real number.
+"""

@@ -1,0 +1,82 @@
+import equinox as eqx
+import numpy as np
+import optimistix as optx
+
+from .._root_finder import PicardNewton
+from .._tableau import GeneralTableau, real_parameter
+from .base import AbstractSymplecticRungeKutta
+
+
+def _srkw1(b: float) -> GeneralTableau:
+    one, half = np.ones(1), np.array([[0.5]])
+    return GeneralTableau(
+        alpha=one, beta=one, A0=half, B0=[[b]], A1=[[1 - b]], B1=half
+    )
+
+
+class SRKw1(AbstractSymplecticRungeKutta):
+    r"""The one-stage symplectic methods SRKw1 of Wang, Hong and Xu, of weak order 1.
+
+    $$G^0 = y_n + \tfrac12 h\,a(G^0) + b \sum_k b_k(G^1) \hat I_k, \qquad
+      G^1 = y_n + (1 - b) h\,a(G^0) + \tfrac12 \sum_k b_k(G^1) \hat I_k$$
+
+    $$y_{n+1} = y_n + h\,a(G^0) + \sum_k b_k(G^1) \hat I_k$$
+
+    The parameter matters. At $b = 1/2$, the default, $G^0 = G^1$ and this is the
+    midpoint rule, with one stage vector to solve for. At $b = 0$ and $b = 1$ it is a
+    midpoint step of the drift followed by one of the noise, or the other way round: two
+    small systems one after the other. Any other value couples the two.
+
+    Symplectic for any Hamiltonians, and conserves every quadratic invariant. Weak order
+    1 for any number of noises. Order 2 without noise.
+
+    Use with [`diffrax_symplectic.WeakBrownianPath`][].
+
+    ??? cite "Reference"
+
+        Section 2.1 of
+
+        ```bibtex
+        @article{wang2017construction,
+            author = {Wang, Peng and Hong, Jialin and Xu, Dongsheng},
+            title = {Construction of Symplectic Runge-Kutta Methods for Stochastic
+                     Hamiltonian Systems},
+            journal = {Communications in Computational Physics},
+            volume = {21},
+            number = {1},
+            pages = {237--270},
+            year = {2017},
+            doi = {10.4208/cicp.261014.230616a},
+        }
+        ```
+    """
+
+    b: float = eqx.field(default=0.5, static=True)
+    root_finder: optx.AbstractRootFinder = PicardNewton()
+    root_find_max_steps: int = 20
+
+    def __check_init__(self):
+        real_parameter("b", self.b)
+
+    @property
+    def tableau(self) -> GeneralTableau:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return _srkw1(self.b)
+
+    def order(self, terms):
+        del terms
+        return 2
+
+    def weak_order(self, terms):
+        """Order of convergence of expectations."""
+        del terms
+        return 1
+
+
+SRKw1.__init__.__doc__ = """**Arguments:**
+
+- `b`: the free parameter, a Python float.
+- `root_finder`: any Optimistix root finder for the stage equations.
+- `root_find_max_steps`: the most iterations it may take in one step.
+
+**Raises:** a `ValueError` if `b` is not a finite real number.
+"""

@@ -1,0 +1,167 @@
+"""Coefficients as data.
+
+A tableau states a family's coefficients in the letters of the paper. Every tableau also
+*flattens*: each evaluation of one vector field becomes one `Stage`, and the tableau
+becomes one square matrix between stages and one vector of weights, whatever the family.
+Symplecticity, liveness, the merging of equal stages and the order in which the implicit
+systems are solved are then questions about that one matrix, answered once.
+"""
+
+import abc
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Stage(NamedTuple):
+    """One evaluation, `y -> sum over channels of (vector field times control)`.
+
+    - `channels`: the controls that drive it: `"h"` is the drift, driven by time; any
+        other name is the noise, driven by the random variable of that name.
+    - `c`: where in the step it is evaluated, as a fraction of the step.
+    - `reads`: the part of the state it depends on, `"y"` (all), `"p"`, `"q"` or `""`.
+    - `writes`: the part of the state it changes, `"y"`, `"p"` or `"q"`.
+    """
+
+    channels: tuple[str, ...]
+    c: float
+    reads: str
+    writes: str
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FlatTableau:
+    """Stage `i` is evaluated at `y0 + sum_j matrix[i, j] k_j` and has the value `k_i`;
+    the step ends at `y0 + sum_i weights[i] k_i`."""
+
+    stages: tuple[Stage, ...]
+    matrix: Float[np.ndarray, "s s"]
+    weights: Float[np.ndarray, " s"]
+
+    def take(self, keep: list[int]) -> "FlatTableau":
+        """The tableau with only the stages `keep`."""
+        return FlatTableau(
+            stages=tuple(self.stages[i] for i in keep),
+            matrix=self.matrix[np.ix_(keep, keep)],
+            weights=self.weights[keep],
+        )
+
+
+class AbstractTableau(abc.ABC):
+    """What every tableau offers."""
+
+    @abc.abstractmethod
+    def flatten(self) -> FlatTableau:
+        """All stages of the tableau, dead ones included, as one matrix."""
+
+
+def _coefficients(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.asarray(value)
+    if array.dtype.kind not in "iuf":
+        raise ValueError(
+            f"Coefficients `{name}` must be real numbers; got dtype {array.dtype}."
+        )
+    array = array.astype(np.float64)
+    if array.shape != shape:
+        raise ValueError(
+            f"Coefficients `{name}` must have shape {shape}; got shape {array.shape}."
+        )
+    if not np.isfinite(array).all():
+        raise ValueError(f"Coefficients `{name}` must be finite; got {array}.")
+    array.setflags(write=False)
+    return array
+
+
+def real_parameter(name: str, value) -> float:
+    """A solver's free parameter as a Python float. Parameters decide which stages are
+    live, so they have to be known while tracing.
+
+    Raises a `ValueError` unless `value` is a finite real number.
+    """
+    try:
+        ok = not isinstance(value, complex) and np.isfinite(float(value))
+    except Exception:
+        ok = False
+    if not ok:
+        raise ValueError(
+            f"`{name}` must be a finite real number, known before tracing (a Python "
+            f"float, not a traced array); got {value!r}."
+        )
+    return float(value)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class GeneralTableau(AbstractTableau):
+    r"""Coefficients for a Stratonovich system without further structure, with `s` drift
+    and `r` noise stages.
+
+    In the form of Rößler (2007), equations (2.6)-(2.7) of Wang, Hong and Xu (2017),
+
+    $$G^0_i = y_n + h \sum_j A^0_{ij} a(t_n + c^0_j h, G^0_j)
+      + \sum_l \sum_j B^0_{ij} b_l(t_n + c^1_j h, G^l_j) I_l$$
+
+    $$G^k_i = y_n + h \sum_j A^1_{ij} a(t_n + c^0_j h, G^0_j)
+      + \sum_j B^1_{ij} b_k(t_n + c^1_j h, G^k_j) I_k
+      + \sum_{l \neq k} \sum_j B^3_{ij} b_l(t_n + c^1_j h, G^l_j) I_l$$
+
+    $$y_{n+1} = y_n + h \sum_i \alpha_i a(t_n + c^0_i h, G^0_i)
+      + \sum_k \sum_i \beta_i b_k(t_n + c^1_i h, G^k_i) I_k$$
+
+    with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$. Here $B^3 = B^1$: with that choice
+    the stages $G^k_i$ are the same vector for every $k$, a step costs the same whatever
+    the number of noises, and the condition on $B^3$ follows from the one on $B^1$.
+
+    **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
+    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`, `B1` of shape `(r, r)`.
+
+    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
+    real numbers.
+    """
+
+    alpha: Float[np.ndarray, " s"]
+    beta: Float[np.ndarray, " r"]
+    A0: Float[np.ndarray, "s s"]
+    B0: Float[np.ndarray, "s r"]
+    A1: Float[np.ndarray, "r s"]
+    B1: Float[np.ndarray, "r r"]
+
+    def __post_init__(self):
+        s, r = np.size(self.alpha), np.size(self.beta)
+        shapes = dict(
+            alpha=(s,), beta=(r,), A0=(s, s), B0=(s, r), A1=(r, s), B1=(r, r)
+        )
+        for name, shape in shapes.items():
+            array = _coefficients(name, getattr(self, name), shape)
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def strong(cls, A, B, alpha, beta) -> "GeneralTableau":
+        r"""The form of Burrage and Burrage (2000), equations (2.14)-(2.15) of Wang,
+        Hong and Xu (2017), in which drift and noise are evaluated at the same points:
+
+        $$G_i = y_n + h \sum_j A_{ij} a(G_j) + \sum_k \sum_j B_{ij} b_k(G_j) I_k$$
+
+        **Arguments:** `A` and `B` of shape `(s, s)`, `alpha` and `beta` of shape `(s,)`.
+        """
+        return cls(alpha=alpha, beta=beta, A0=A, B0=B, A1=A, B1=B)
+
+    @property
+    def c0(self) -> Float[np.ndarray, " s"]:
+        """Times of the drift stages, as fractions of the step."""
+        return self.A0.sum(axis=1)
+
+    @property
+    def c1(self) -> Float[np.ndarray, " r"]:
+        """Times of the noise stages, as fractions of the step."""
+        return self.A1.sum(axis=1)
+
+    def flatten(self) -> FlatTableau:
+        stages = [Stage(("h",), float(c), "y", "y") for c in self.c0]
+        stages += [Stage(("W",), float(c), "y", "y") for c in self.c1]
+        return FlatTableau(
+            stages=tuple(stages),
+            matrix=np.block([[self.A0, self.B0], [self.A1, self.B1]]),
+            weights=np.concatenate([self.alpha, self.beta]),
+        )

@@ -1,0 +1,114 @@
+"""Problems that several tests share."""
+
+import diffrax
+import diffrax_symplectic as ds
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import PyTree
+
+
+GENERAL = {
+    "Midpoint": ds.Midpoint(),
+    "SRKs1": ds.SRKs1(),
+    "SRKw1": ds.SRKw1(),
+    "SRKw1-0.2": ds.SRKw1(b=0.2),
+    "SRKw2": ds.SRKw2(),
+}
+
+
+class TrigonometricSum:
+    """`H(p, q) = sum_j a_j cos(u_j . p + v_j . q + phi_j)`: smooth, bounded, and with no
+    structure. The coefficients are `args[name]`, with a leading axis for the noises."""
+
+    def __init__(self, name: str):
+        self.name = name
+
+    def __call__(self, t, p, q, args):
+        a, u, v, phi = args[self.name]
+        phase = jnp.einsum("...jd,d->...j", u, p) + jnp.einsum("...jd,d->...j", v, q)
+        return jnp.sum(a * jnp.cos(phase + phi + t), axis=-1)
+
+
+def _coefficients(key, noises, d: int, size: float, dtype):
+    ka, ku, kv, kp = jr.split(key, 4)
+    shape = noises + (4,)
+    return (
+        size * jr.normal(ka, shape, dtype),
+        jr.normal(ku, shape + (d,), dtype),
+        jr.normal(kv, shape + (d,), dtype),
+        jr.uniform(kp, shape, dtype, 0, 2 * np.pi),
+    )
+
+
+H0 = TrigonometricSum("drift")
+noise = TrigonometricSum("noise")
+
+
+def random_problem(key, d: int, m: int, dtype=jnp.float64) -> tuple[PyTree, PyTree]:
+    """A random state and random `args` for `H0` and `noise`."""
+    kd, kn, ky = jr.split(key, 3)
+    args = {
+        "drift": _coefficients(kd, (), d, 0.5, dtype),
+        "noise": _coefficients(kn, (m,), d, 0.2, dtype),
+    }
+    p, q = jr.normal(ky, (2, d), dtype)
+    return (p, q), args
+
+
+def random_problem_of_any_size(key, dtype) -> tuple[PyTree, PyTree]:
+    """As `random_problem` for random `d` and `m` from 1 to 3, in arrays of size 3: the
+    Hamiltonians do not depend on the other coordinates, the other noises vanish."""
+    k_problem, k_d, k_m = jr.split(key, 3)
+    y0, args = random_problem(k_problem, 3, 3, dtype)
+    used_d = jnp.arange(3) < jr.randint(k_d, (), 1, 4)
+    used_m = jnp.arange(3) < jr.randint(k_m, (), 1, 4)
+
+    def restrict(coefficients, noises):
+        a, u, v, phi = coefficients
+        return (jnp.where(noises, a, 0), u * used_d, v * used_d, phi)
+
+    return y0, {
+        "drift": restrict(args["drift"], True),
+        "noise": restrict(args["noise"], used_m[:, None]),
+    }
+
+
+def weak_path(m: int, key=None, dtype=jnp.float64, **kwargs):
+    key = jr.key(0) if key is None else key
+    return ds.WeakBrownianPath(jax.ShapeDtypeStruct((m,), dtype), key, **kwargs)
+
+
+def kubo_terms(path, s=1.0):
+    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    noise = lambda t, p, q, args: s * (p**2 + q**2) / 2
+    return ds.hamiltonian_terms(H0, noise, path)
+
+
+def rigid_body_terms(path, mu=0.1, inertia=(0.8, 0.6, 0.2)):
+    """The rigid body with one noise, as plain Diffrax terms in three variables."""
+    I1, I2, I3 = inertia
+
+    def drift(t, X, args):
+        X1, X2, X3 = X
+        return jnp.stack(
+            [
+                (1 / I3 - 1 / I2) * X3 * X2,
+                (1 / I1 - 1 / I3) * X3 * X1,
+                (1 / I2 - 1 / I1) * X2 * X1,
+            ]
+        )
+
+    def diffusion(t, X, args):
+        _, X2, X3 = X
+        return mu * jnp.stack([jnp.zeros_like(X2), X3, -X2])
+
+    return diffrax.MultiTerm(
+        diffrax.ODETerm(drift), diffrax.ControlTerm(diffusion, path)
+    )
+
+
+def slope(hs, errors):
+    """The order that errors at several step sizes show, by least squares."""
+    return np.polyfit(np.log(hs), np.log(np.abs(errors)), 1)[0]

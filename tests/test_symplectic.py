@@ -1,0 +1,102 @@
+"""Every step is symplectic to rounding error, whatever the Hamiltonians."""
+
+import dataclasses
+
+import diffrax
+import diffrax_symplectic as ds
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import pytest
+
+from .problems import (
+    GENERAL,
+    H0,
+    noise,
+    random_problem,
+    random_problem_of_any_size,
+)
+
+
+class _Given(diffrax.AbstractBrownianPath):
+    """An increment drawn beforehand, so that one compilation serves both paths."""
+
+    W: jax.Array
+    t0 = 0
+    t1 = 1
+    levy_area = diffrax.BrownianIncrement
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        return self.W
+
+
+def _increments(key, h, dtype):
+    """Three noises, as the weak and as the truncated path draw them."""
+    shape = jax.ShapeDtypeStruct((3,), dtype)
+    gaussian = diffrax.UnsafeBrownianPath(shape, key)
+    paths = ds.WeakBrownianPath(shape, key), ds.TruncatedBrownianPath(gaussian, k=2)
+    return jnp.stack([path.evaluate(jnp.zeros_like(h), h) for path in paths])
+
+
+@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-6)])
+@pytest.mark.parametrize("solver", GENERAL.values(), ids=GENERAL.keys())
+def test_step_is_symplectic_for_a_thousand_random_systems(solver, dtype, bound):
+    def problem(key):
+        k_problem, k_path, k_h = jr.split(key, 3)
+        y0, args = random_problem_of_any_size(k_problem, dtype)
+        # Uniform in the logarithm over [1e-3, 0.2].
+        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
+        return y0, args, h, _increments(k_path, h, dtype)
+
+    def defect(y0, args, h, W):
+        terms = ds.hamiltonian_terms(H0, noise, _Given(W))
+        return ds.symplecticity_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
+
+    y0, args, h, W = jax.vmap(problem)(jr.split(jr.key(0), 1000))
+    defect = eqx.filter_jit(jax.vmap(defect))
+    for path in range(2):
+        defects = defect(y0, args, h, W[:, path])
+        assert defects.dtype == dtype
+        assert jnp.max(defects) <= bound
+
+
+def _weak(m, key, dtype=jnp.float64):
+    return ds.WeakBrownianPath(jax.ShapeDtypeStruct((m,), dtype), key)
+
+
+@pytest.mark.parametrize("solver", [diffrax.Heun(), diffrax.StratonovichMilstein()])
+def test_defect_sees_a_method_that_is_not_symplectic(solver):
+    y0, args = random_problem(jr.key(0), 1, 1)
+    terms = ds.hamiltonian_terms(H0, noise, _weak(1, jr.key(1)))
+    assert ds.symplecticity_defect(terms, solver, 0.0, 0.1, y0, args) > 1e-6
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize("solver", GENERAL.values(), ids=GENERAL.keys())
+def test_stage_equations_are_solved_to_rounding_error(solver, dtype):
+    # The Jacobian above is implicit, and would be symplectic at any approximate
+    # solution. So the end of the step is compared to a solve that never stops early.
+    stubborn = ds.PicardNewton(rtol=0.0, direct=10_000, unrolled=8)
+    exact = dataclasses.replace(solver, root_finder=stubborn, root_find_max_steps=1)
+
+    def ends(key):
+        y0, args = random_problem(key, 2, 2, dtype)
+        terms = ds.hamiltonian_terms(H0, noise, _weak(2, key, dtype))
+        step = lambda s: s.step(
+            terms, dtype(0.0), dtype(0.1), y0, args, None, False
+        )
+        y1, *_, result = step(solver)
+        return y1, step(exact)[0], result == diffrax.RESULTS.successful
+
+    y1, y1_exact, success = eqx.filter_jit(jax.vmap(ends))(jr.split(jr.key(1), 300))
+    assert jnp.all(success)
+    for a, b in zip(y1, y1_exact):
+        error = jnp.abs(a - b) / (1 + jnp.abs(b))
+        assert jnp.max(error) <= 8 * jnp.finfo(dtype).eps
+
+
+def test_defect_needs_a_pair():
+    terms = diffrax.ODETerm(lambda t, y, args: -y)
+    with pytest.raises(ValueError, match=r"pair `\(p, q\)`"):
+        ds.symplecticity_defect(terms, ds.Midpoint(), 0.0, 0.1, jnp.ones(3))

@@ -1,0 +1,119 @@
+"""Coefficients satisfy their conditions, and only live, distinct stages are solved."""
+
+import dataclasses
+
+import diffrax_symplectic as ds
+import numpy as np
+import pytest
+from diffrax_symplectic._plan import Block, make_plan
+
+
+TABLEAUS = {
+    "Midpoint": ds.Midpoint().tableau,
+    "SRKw2": ds.SRKw2().tableau,
+    **{f"SRKs1({a})": ds.SRKs1(a=a).tableau for a in (-0.3, 0.0, 0.25, 0.4, 0.5)},
+    **{f"SRKw1({b})": ds.SRKw1(b=b).tableau for b in (-0.3, 0.0, 0.5, 0.7, 1.0)},
+}
+all_tableaus = pytest.mark.parametrize("tableau", TABLEAUS.values(), ids=TABLEAUS.keys())
+
+
+@all_tableaus
+def test_tableau_is_symplectic(tableau):
+    assert np.max(np.abs(ds.symplectic_residuals(tableau))) <= 1e-15
+
+
+@all_tableaus
+def test_tableau_has_weak_order_one(tableau):
+    residuals = ds.weak_order_residuals(tableau, 1)
+    assert max(map(abs, residuals.values())) <= 1e-15
+
+
+def test_srkw2_satisfies_all_17_conditions_for_weak_order_two():
+    residuals = ds.weak_order_residuals(ds.SRKw2().tableau, 2)
+    assert len(residuals) == 17
+    assert max(map(abs, residuals.values())) <= 1e-15
+
+
+@pytest.mark.parametrize("name", [n for n in TABLEAUS if n != "SRKw2"])
+def test_other_tableaus_do_not_have_weak_order_two(name):
+    residuals = ds.weak_order_residuals(TABLEAUS[name], 2)
+    assert max(map(abs, residuals.values())) > 1e-2
+
+
+@pytest.mark.parametrize("a", [0.0, 0.25, 0.5])
+def test_strong_tableaus_have_strong_order(a):
+    for tableau in (ds.Midpoint().tableau, ds.SRKs1(a=a).tableau):
+        residuals = ds.strong_order_residuals(tableau)
+        assert max(map(abs, residuals.values())) <= 1e-15
+
+
+@all_tableaus
+@pytest.mark.parametrize("field", ["alpha", "beta", "A0", "B0", "A1", "B1"])
+def test_every_perturbed_live_coefficient_is_caught(tableau, field):
+    coefficients = getattr(tableau, field)
+    for index in np.ndindex(coefficients.shape):
+        wrong = coefficients.copy()
+        wrong[index] += 1e-6
+        perturbed = dataclasses.replace(tableau, **{field: wrong})
+        residuals = [*ds.weak_order_residuals(perturbed, 1).values()]
+        residuals.append(np.max(np.abs(ds.symplectic_residuals(perturbed))))
+        # The coefficients of a stage of weight 0 that nothing reads are free.
+        weights = dict(A0="alpha", B0="alpha", A1="beta", B1="beta")
+        dead = field in weights and getattr(tableau, weights[field])[index[0]] == 0
+        caught = np.max(np.abs(residuals)) > 1e-8
+        assert caught or dead
+
+
+@pytest.mark.parametrize(
+    "solver, blocks",
+    [
+        (ds.Midpoint(), [1]),
+        (ds.SRKs1(a=0.0), [1]),
+        (ds.SRKs1(a=0.5), [1]),
+        (ds.SRKs1(a=0.25), [1, 1]),
+        (ds.SRKw1(b=0.5), [1]),
+        (ds.SRKw1(b=0.0), [1, 1]),
+        (ds.SRKw1(b=1.0), [1, 1]),
+        (ds.SRKw1(b=0.2), [2]),
+        (ds.SRKw2(), [6]),
+    ],
+)
+def test_only_live_distinct_stages_are_solved(solver, blocks):
+    plan = make_plan(solver.tableau.flatten())
+    assert [len(block.unknown) for block in plan.blocks] == blocks
+    assert all(block.explicit == () for block in plan.blocks)
+
+
+def test_explicit_stages_never_reach_the_root_finder():
+    # An explicit trapezoidal rule is not symplectic, but must be recognised.
+    A = [[0.0, 0.0], [1.0, 0.0]]
+    heun = ds.GeneralTableau.strong(A=A, B=A, alpha=[0.5, 0.5], beta=[0.5, 0.5])
+    plan = make_plan(heun.flatten())
+    assert plan.blocks == (Block((), (0,)), Block((), (1,)))
+    assert np.max(np.abs(ds.symplectic_residuals(heun))) > 0.1
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(A0=np.ones((2, 2))), r"`A0` must have shape \(1, 1\)"),
+        (dict(beta=[np.nan]), "`beta` must be finite"),
+        (dict(alpha=[1j]), "`alpha` must be real"),
+    ],
+)
+def test_malformed_tableaus_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(ds.Midpoint().tableau, **change)
+
+
+@pytest.mark.parametrize("value", [1j, np.nan, np.inf, "a", None])
+def test_malformed_parameters_are_refused(value):
+    with pytest.raises(ValueError, match="`a` must be a finite real number"):
+        ds.SRKs1(a=value)
+    with pytest.raises(ValueError, match="`b` must be a finite real number"):
+        ds.SRKw1(b=value)
+
+
+def test_weak_order_residuals_know_orders_one_and_two():
+    with pytest.raises(ValueError, match="`order` must be 1 or 2"):
+        ds.weak_order_residuals(ds.Midpoint().tableau, 3)

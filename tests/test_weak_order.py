@@ -1,0 +1,169 @@
+"""Weak orders and exact moments, from the finitely many outcomes of one step."""
+
+import diffrax
+import diffrax_symplectic as ds
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from .problems import GENERAL, H0, kubo_terms, noise, random_problem, slope, weak_path
+
+
+STEPS = np.array([0.02, 0.01, 0.005, 0.0025])
+
+
+def _test_functions(y):
+    p, q = y[0][0], y[1][0]
+    return jnp.stack([p, q**2, p * q, jnp.sin(p + q), jnp.exp(p / 2)])
+
+
+def _slopes(solver, m, order):
+    """Orders of the local defect, for four random systems and five test functions."""
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(m))
+    keys = jr.split(jr.key(0), 24)[2:6]
+    y0, args = jax.vmap(lambda key: random_problem(key, 1, m))(keys)
+
+    def defect(h, y0, args):
+        return ds.weak_order_defect(
+            terms, solver, 0.1, 0.1 + h, y0, args, fn=_test_functions, order=order
+        )
+
+    over_steps = jax.vmap(defect, in_axes=(0, None, None))
+    defects = jax.jit(jax.vmap(over_steps, in_axes=(None, 0, 0)))(STEPS, y0, args)
+    return [slope(STEPS, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(STEPS))]
+
+
+@pytest.mark.parametrize("m", [1, 2])
+@pytest.mark.parametrize("solver", GENERAL.values(), ids=GENERAL.keys())
+def test_local_weak_defect_has_the_order_of_the_solver(solver, m):
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(m))
+    order = solver.weak_order(terms)
+    assert order == (2 if isinstance(solver, ds.SRKw2) and m == 1 else 1)
+    slopes = _slopes(solver, m, order)
+    assert len(slopes) == 20
+    np.testing.assert_allclose(slopes, order + 1, atol=0.1)
+
+
+def test_defect_sees_a_method_of_lower_order():
+    slopes = _slopes(ds.Midpoint(), 1, order=2)
+    assert np.max(slopes) < 2.5
+
+
+def test_defect_knows_ito_from_stratonovich():
+    # dy = y dw: Euler's E[y^2] = (1 + h) y^2 is Itô's to first order.
+    path = weak_path(1)
+    drift = diffrax.ODETerm(lambda t, y, args: jnp.zeros_like(y))
+    diffusion = diffrax.ControlTerm(lambda t, y, args: y[:, None], path)
+    terms = diffrax.MultiTerm(drift, diffusion)
+    kwargs = dict(fn=lambda y: y[0] ** 2, order=1)
+    y0 = jnp.array([1.0])
+    defect = ds.weak_order_defect(terms, diffrax.Euler(), 0.0, 0.1, y0, **kwargs)
+    np.testing.assert_allclose(defect, 0, atol=1e-15)
+    defect = ds.weak_order_defect(terms, diffrax.Heun(), 0.0, 0.1, y0, **kwargs)
+    # Heun: y1 = (1 + I + I^2 / 2) y, so E[y1^2] = 1 + 2 h + 3 h^2 / 4.
+    np.testing.assert_allclose(defect, 0.75 * 0.1**2, atol=1e-15)
+
+
+def test_expectation_enumerates_second_and_two_point_variables():
+    class Read(diffrax.AbstractPath):
+        """Shows the extra variables to the vector field as if they were increments."""
+
+        path: ds.WeakBrownianPath
+        t0 = 0
+        t1 = 1
+
+        def evaluate(self, t0, t1=None, left=True):
+            inc = self.path.evaluate(t0, t1, use_levy=True)
+            return jnp.concatenate([inc.W, inc.second, inc.two_point])
+
+    path = weak_path(1, second=True, two_point=True)
+    identity = lambda t, y, args: jnp.eye(3)
+    terms = diffrax.MultiTerm(
+        diffrax.ODETerm(lambda t, y, args: jnp.zeros_like(y)),
+        diffrax.ControlTerm(identity, Read(path)),
+    )
+    h = 0.3
+    powers = lambda y: jnp.stack([jnp.outer(y, y), jnp.outer(y**2, y**2)])
+    second, fourth = ds.step_expectation(
+        terms, diffrax.Euler(), 0.0, h, jnp.zeros(3), fn=powers
+    )
+    np.testing.assert_allclose(second, h * np.eye(3), atol=1e-15)
+    expected = h**2 * np.array([[3, 1, 1], [1, 3, 1], [1, 1, 1]])
+    np.testing.assert_allclose(fourth, expected, atol=1e-15)
+
+
+# Per-step excess of E(x^2 + y^2) over s^2 h, on the linear oscillator with additive
+# noise: h = 0.2, s = 1.
+@pytest.mark.parametrize(
+    "solver, excess",
+    [
+        (ds.Midpoint(), -0.00198020),
+        (ds.SRKw1(b=0.5), -0.00198020),
+        (ds.SRKs1(a=0.25), -0.00099626),
+        (ds.SRKw1(b=0.0), 0.0),
+        (ds.SRKw1(b=1.0), 0.0),
+    ],
+    ids=repr,
+)
+def test_excess_per_step_on_the_linear_oscillator(solver, excess):
+    # Position q, momentum p: dq = p dt, dp = -q dt + s dw.
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: (p**2 + q**2) / 2,
+        lambda t, p, q, args: -q,
+        ds.WeakBrownianPath((), jr.key(0)),
+    )
+    h = 0.2
+    for y0 in ((0.0, 1.0), (0.7, -0.4)):
+        p0, q0 = map(jnp.asarray, y0)
+        squared = ds.step_expectation(
+            terms, solver, 0.0, h, (p0, q0), fn=lambda y: y[0] ** 2 + y[1] ** 2
+        )
+        measured = squared - (p0**2 + q0**2) - h
+        assert abs(measured - excess) <= (1e-12 if excess == 0 else 5e-9)
+        assert abs(measured - _exact_excess(solver, h)) <= 1e-12
+
+
+def _exact_excess(solver, h):
+    """A midpoint step over t turns by an angle and adds a vector of squared length
+    1 / (1 + t^2 / 4) times the variance."""
+    gain = lambda t: 1 / (1 + (t / 2) ** 2)
+    if isinstance(solver, ds.SRKs1):
+        # Two half steps, each with half of the same increment.
+        step = lambda t: np.linalg.solve(
+            np.array([[1, t / 2], [-t / 2, 1]]),
+            np.array([[1, -t / 2], [t / 2, 1]]),
+        )
+        kick = np.linalg.solve(np.array([[1, h / 4], [-h / 4, 1]]), np.array([1.0, 0]))
+        total = (step(h / 2) @ kick + kick) / 2
+        return h * (total @ total - 1)
+    if isinstance(solver, ds.SRKw1) and solver.b != 0.5:
+        return 0.0
+    return h * (gain(h) - 1)
+
+
+def test_kubo_moments_match_the_matrix_recursion():
+    # A midpoint step of the Kubo oscillator turns the plane by 2 atan((h + s I) / 2).
+    h, s = 0.1, 0.7
+    terms = kubo_terms(ds.WeakBrownianPath((), jr.key(0)), s)
+    got = ds.step_expectation(
+        terms,
+        ds.Midpoint(),
+        0.0,
+        h,
+        (jnp.array(0.0), jnp.array(1.0)),
+        fn=lambda y: jnp.stack([*y]),
+    )
+    increments = np.sqrt(3 * h) * np.array([-1, 0, 1])
+    angles = 2 * np.arctan((h + s * increments) / 2)
+    weights = np.array([1, 4, 1]) / 6
+    expected = [-weights @ np.sin(angles), weights @ np.cos(angles)]
+    np.testing.assert_allclose(got, expected, atol=1e-15)
+
+
+def test_expectation_needs_a_weak_path():
+    terms = kubo_terms(diffrax.UnsafeBrownianPath((), jr.key(0)))
+    y0 = (jnp.array(0.0), jnp.array(1.0))
+    with pytest.raises(ValueError, match="exactly one Brownian path"):
+        ds.step_expectation(terms, ds.Midpoint(), 0.0, 0.1, y0, fn=lambda y: y[0])
