@@ -235,6 +235,6 @@ def _step_key(key, t0, t1):
     _, exponent = jnp.frexp(h * 1.37)
     exponent = exponent.astype(jnp.int32) - 2
     count = jnp.floor(jnp.ldexp(t0 + (t1 - t0) / 2, -exponent) + 0.29)
-    # Wraps around after 2^31 counts, where neighbours are still distinct.
-    count = jnp.remainder(count, 2.0**31).astype(jnp.uint32)
-    return jr.fold_in(jr.fold_in(key, count), exponent.astype(jnp.uint32))
+    # Starts again after 2^31 counts. (`fmod` is exact, also for negative times.)
+    count = jnp.fmod(count, 2.0**31).astype(jnp.int32)
+    return jr.fold_in(jr.fold_in(key, count), exponent)

@@ -1,0 +1,241 @@
+"""The laws of the increments, and that they are the same whenever a step is computed."""
+
+import diffrax
+import diffrax_symplectic as ds
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+from diffrax_symplectic._brownian._weak import _three_point, _two_point
+
+from .problems import kubo_terms, weak_path
+
+
+def test_three_point_law_is_exact_in_the_bits():
+    # The law of a uniform 32-bit word: the two thresholds, and symmetry.
+    sixth = 2**32 // 6
+    edges = jnp.array([0, sixth - 1, sixth, 2**31, 2**32 - sixth - 1, 2**32 - sixth])
+    values = _three_point(edges.astype(jnp.uint32), jnp.array(1.0))
+    np.testing.assert_array_equal(np.sign(values), [-1, -1, 0, 0, 0, 1])
+    assert abs(sixth / 2**32 - 1 / 6) < 2**-32
+    np.testing.assert_allclose(values[-1], np.sqrt(3), rtol=1e-15)
+    edges = jnp.array([0, 2**31 - 1, 2**31, 2**32 - 1], jnp.uint32)
+    np.testing.assert_array_equal(_two_point(edges, jnp.array(1.0)), [-1, -1, 1, 1])
+
+
+def test_sampled_moments_are_within_four_standard_errors():
+    n, h = 200_000, 0.3
+    path = weak_path(2, second=True, two_point=True)
+    t = h * jnp.arange(n)
+    inc = jax.vmap(lambda t: path.evaluate(t, t + h, use_levy=True))(t)
+    x = np.concatenate([inc.W, inc.second, inc.two_point], axis=1) / np.sqrt(h)
+    three = lambda k: 0 if k % 2 else 3 ** (k / 2) / 3
+    two = lambda k: 0 if k % 2 else 1
+    laws = [three] * 4 + [two] * 2
+
+    def check(sample, mean, second):
+        error = np.sqrt(max(second - mean**2, 0) / n)
+        assert abs(sample.mean() - mean) <= 4 * error + 1e-10
+
+    for i, law in enumerate(laws):
+        for k in (1, 2, 3, 4):
+            check(x[:, i] ** k, law(k), law(2 * k))
+        # Independent of the other variables and of the next step.
+        for j in range(i):
+            check(x[:, i] * x[:, j], 0, 1)
+        shifted = x[1:, i] * x[:-1, i]
+        assert abs(shifted.mean()) <= 4 / np.sqrt(n)
+
+
+def test_mixed_integrals_are_the_formulas():
+    path = weak_path(3, two_point=True)
+    inc = path.evaluate(0.0, 0.2, use_levy=True)
+    for key in range(20):  # until all kinds of values have been seen
+        path = weak_path(3, jr.key(key), two_point=True)
+        inc = path.evaluate(0.0, 0.2, use_levy=True)
+        hat, tilde, sqrt_h = inc.W, inc.two_point, np.sqrt(0.2)
+        stratonovich, ito = inc.mixed_stratonovich(), inc.mixed_ito()
+        for k in range(3):
+            for l in range(3):
+                if l < k:
+                    s = hat[k] * tilde[l]
+                    i = (hat[k] * hat[l] + sqrt_h * tilde[l]) / 2
+                elif k < l:
+                    s = -hat[l] * tilde[k]
+                    i = (hat[k] * hat[l] - sqrt_h * tilde[k]) / 2
+                else:
+                    s, i = 0, (hat[k] ** 2 - 0.2) / 2
+                np.testing.assert_allclose(stratonovich[k, l], s, atol=1e-15)
+                np.testing.assert_allclose(ito[k, l], i, atol=1e-15)
+
+
+def test_mixed_integrals_need_two_point_variables():
+    inc = weak_path(2).evaluate(0.0, 0.1, use_levy=True)
+    assert inc.second is None and inc.two_point is None
+    with pytest.raises(ValueError, match="two_point=True"):
+        inc.mixed_ito()
+    with pytest.raises(ValueError, match="two_point=True"):
+        inc.mixed_stratonovich()
+
+
+def test_asking_for_more_does_not_change_the_increment():
+    more = weak_path(2, second=True, two_point=True)
+    for t in (0.0, 0.7):
+        np.testing.assert_array_equal(
+            weak_path(2).evaluate(t, t + 0.1), more.evaluate(t, t + 0.1)
+        )
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("h", [0.01, 2**-6, 0.1, 1 / 3])
+@pytest.mark.parametrize("start", [0.0, 0.5, -2.0, 0.005])
+def test_increments_do_not_depend_on_the_rounding_of_time(h, start, dtype):
+    path = weak_path(20)
+    # The sizes follow the step; which of the three values it is, is what is random.
+    evaluate = jax.jit(jax.vmap(lambda t0, t1: jnp.sign(path.evaluate(t0, t1))))
+    n = 400
+    ts = (start + h * np.arange(n + 1)).astype(dtype)
+    W = evaluate(ts[:-1], ts[1:])
+    nudged = [np.nextafter(ts, end, dtype=dtype) for end in (np.inf, -np.inf)]
+    same = [evaluate(a[:-1], b[1:]) == W for a in nudged for b in nudged]
+    # In single precision, one step in many thousands may sit at the edge of a count.
+    assert np.mean(np.all(same, axis=(0, 2))) >= (1 if dtype == jnp.float64 else 0.99)
+    # Two steps share 20 increments with probability 2^-20, roughly, if independent.
+    assert len(np.unique(np.asarray(W), axis=0)) == n
+
+
+def test_steps_of_a_long_solve_all_differ():
+    path = weak_path(40)
+    ts = np.linspace(0, 1e4, 10**6 + 1)
+    picks = np.concatenate([np.arange(500), 10**6 - 500 + np.arange(500)])
+    W = jax.vmap(path.evaluate)(ts[picks], ts[picks + 1])
+    assert len(np.unique(np.asarray(W), axis=0)) == 1000
+
+
+def test_path_takes_any_pytree_under_jit_and_vmap():
+    shape = {
+        "a": jax.ShapeDtypeStruct((2, 3), jnp.float32),
+        "b": (jax.ShapeDtypeStruct((), jnp.float64),),
+    }
+
+    @jax.jit
+    @jax.vmap
+    def evaluate(key):
+        path = ds.WeakBrownianPath(shape, key, second=True, two_point=True)
+        return path.evaluate(0.0, 0.1, use_levy=True)
+
+    inc = evaluate(jr.split(jr.key(0), 5))
+    for part in (inc.W, inc.second, inc.two_point):
+        assert part["a"].shape == (5, 2, 3) and part["a"].dtype == jnp.float32
+        assert part["b"][0].shape == (5,) and part["b"][0].dtype == jnp.float64
+    assert inc.mixed_ito is not None
+    # An increment from 0 can be had by its end alone, as from Diffrax's paths.
+    path = ds.WeakBrownianPath(shape, jr.key(0))
+    assert jax.tree.all(
+        jax.tree.map(lambda a, b: jnp.all(a == b), path.evaluate(0.1), path.evaluate(0.0, 0.1))
+    )
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_increments_have_the_dtype_of_the_path(dtype):
+    inc = weak_path(2, dtype=dtype).evaluate(
+        dtype(0.0), dtype(0.1), use_levy=True
+    )
+    assert inc.W.dtype == inc.dt.dtype == dtype
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+@pytest.mark.parametrize("h", [0.2, 0.01, 1e-4])
+def test_truncation_error_is_below_its_bound(k, h):
+    # E[(xi - clip xi)^2] by quadrature over the tail.
+    bound = np.sqrt(2 * k * abs(np.log(h)))
+    x = np.linspace(bound, bound + 20, 200_001)
+    density = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
+    assert 2 * np.trapezoid((x - bound) ** 2 * density, x) <= h**k
+
+
+def test_truncated_path_clips_and_keeps_the_levy_area():
+    h = 0.5
+    plain = diffrax.VirtualBrownianTree(
+        0.0, 1000.0, h / 2, (3,), jr.key(0), levy_area=diffrax.SpaceTimeLevyArea
+    )
+    path = ds.TruncatedBrownianPath(plain, k=1)
+    bound = np.sqrt(h) * np.sqrt(2 * abs(np.log(h)))
+    t = h * jnp.arange(1000)
+    get = lambda p: jax.vmap(lambda t: p.evaluate(t, t + h, use_levy=True))(t)
+    raw, cut = get(plain), get(path)
+    assert isinstance(cut, diffrax.SpaceTimeLevyArea)
+    np.testing.assert_array_equal(raw.H, cut.H)
+    np.testing.assert_allclose(cut.W, np.clip(raw.W, -bound, bound), rtol=1e-12)
+    assert np.any(raw.W != cut.W)
+    np.testing.assert_allclose(
+        jax.vmap(lambda t: path.evaluate(t, t + h))(t), cut.W, rtol=1e-12
+    )
+    assert path.levy_area is diffrax.SpaceTimeLevyArea
+    np.testing.assert_array_equal(path.evaluate(0.3, 0.3), np.zeros(3))
+
+
+@pytest.mark.parametrize("k", [0, -1, 1.5, True, None])
+def test_truncation_needs_a_positive_integer(k):
+    with pytest.raises(ValueError, match="`k` must be an integer"):
+        ds.TruncatedBrownianPath(diffrax.UnsafeBrownianPath((), jr.key(0)), k=k)
+
+
+def test_truncation_needs_a_path():
+    with pytest.raises(ValueError, match="wraps a Brownian path"):
+        ds.TruncatedBrownianPath(lambda t0, t1: 0.0)  # pyright: ignore
+
+
+def test_truncation_needs_steps_shorter_than_one():
+    path = ds.TruncatedBrownianPath(diffrax.UnsafeBrownianPath((), jr.key(0)))
+    with pytest.raises(Exception, match="shorter than one unit of time"):
+        jax.block_until_ready(jax.jit(lambda t: path.evaluate(0.0, t))(1.0))
+
+
+@pytest.mark.parametrize(
+    "shape, message",
+    [
+        (jax.ShapeDtypeStruct((2,), jnp.int32), "real floating-point"),
+        (jax.ShapeDtypeStruct((2,), jnp.complex64), "real floating-point"),
+        (3, "tuple of integers"),
+        ([2], "tuple of integers"),
+    ],
+)
+def test_malformed_shapes_are_refused(shape, message):
+    with pytest.raises(ValueError, match=message):
+        ds.WeakBrownianPath(shape, jr.key(0))
+
+
+def _paths():
+    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jr.key(0))
+    return [ds.WeakBrownianPath((), jr.key(0)), ds.TruncatedBrownianPath(tree)]
+
+
+@pytest.mark.parametrize("path", _paths(), ids=["weak", "truncated"])
+@pytest.mark.parametrize("solver", [ds.Midpoint(), diffrax.Heun()], ids=repr)
+def test_fixed_increments_refuse_adaptive_steps(path, solver):
+    terms, y0 = kubo_terms(path), (jnp.array(0.0), jnp.array(1.0))
+    solve = lambda solver, **kwargs: diffrax.diffeqsolve(
+        terms, solver, 0.0, 0.5, 0.1, y0, **kwargs
+    )
+    pid = diffrax.PIDController(rtol=1e-3, atol=1e-3, error_order=1.0)
+    with pytest.raises(ValueError, match="adaptive step size controller"):
+        solve(solver, stepsize_controller=pid)
+    with pytest.raises(ValueError, match="adaptive step size controller"):
+        solve(solver, stepsize_controller=diffrax.ClipStepSizeController(pid))
+    half = diffrax.HalfSolver(solver)
+    if isinstance(half, diffrax.AbstractImplicitSolver):
+        # Diffrax refuses `HalfSolver` around any implicit solver, before it gets here.
+        with pytest.raises(AttributeError, match="root_finder"):
+            solve(half)
+    else:
+        with pytest.raises(ValueError, match="`diffrax.HalfSolver`"):
+            solve(half)
+        with pytest.raises(ValueError, match="adaptive step size controller"):
+            solve(half, stepsize_controller=pid)
+    # Prescribed steps are fixed steps.
+    ts = jnp.array([0.0, 0.1, 0.3, 0.5])
+    diffrax.diffeqsolve(
+        terms, solver, 0.0, 0.5, None, y0, stepsize_controller=diffrax.StepTo(ts)
+    )

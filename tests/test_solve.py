@@ -1,0 +1,375 @@
+"""Whole solves: strong order, invariants, gradients, failures, bad input."""
+
+import subprocess
+import sys
+
+import diffrax
+import diffrax_symplectic as ds
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import lineax as lx
+import numpy as np
+import optimistix as optx
+import pytest
+
+from .problems import (
+    GENERAL,
+    H0,
+    kubo_terms,
+    noise,
+    random_problem,
+    rigid_body_terms,
+    slope,
+    weak_path,
+)
+
+
+all_solvers = pytest.mark.parametrize("solver", GENERAL.values(), ids=GENERAL.keys())
+
+
+class _FineSample(diffrax.AbstractBrownianPath):
+    """One Brownian path by its values on a fine grid over [0, 1]."""
+
+    w: jax.Array
+    t0 = 0
+    t1 = 1
+    levy_area = diffrax.BrownianIncrement
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        at = lambda t: self.w[jnp.round(t * (len(self.w) - 1)).astype(int)]
+        return at(t1) - at(t0)
+
+
+def _strong_slope(solver, m, steps, reference, samples=200):
+    y0, args = random_problem(jr.key(11), 1, m)
+    fine = 2**reference
+
+    @jax.jit
+    @jax.vmap
+    def ends(key):
+        dw = jr.normal(key, (fine, m)) / np.sqrt(fine)
+        w = jnp.concatenate([jnp.zeros((1, m)), jnp.cumsum(dw, axis=0)])
+        # Stronger noise than elsewhere, for its errors to lead.
+        strong = args | {"noise": (3 * args["noise"][0], *args["noise"][1:])}
+        terms = ds.hamiltonian_terms(H0, noise, _FineSample(w))
+        solve = lambda h: jnp.concatenate(
+            diffrax.diffeqsolve(terms, solver, 0.0, 1.0, h, y0, strong).ys, axis=1
+        )[0]
+        return jnp.stack([solve(h) for h in (*steps, 1 / fine)])
+
+    ys = ends(jr.split(jr.key(0), samples))
+    squared = jnp.sum((ys[:, :-1] - ys[:, -1:]) ** 2, axis=-1)
+    return slope(np.array(steps), np.sqrt(jnp.mean(squared, axis=0)))
+
+
+@pytest.mark.parametrize("solver", [ds.Midpoint(), ds.SRKs1()], ids=repr)
+def test_strong_order_one_for_one_noise(solver):
+    steps = [2.0**-k for k in (4, 5, 6, 7)]
+    assert abs(_strong_slope(solver, 1, steps, reference=11) - 1) <= 0.1
+
+
+@pytest.mark.parametrize("solver", [ds.Midpoint(), ds.SRKs1()], ids=repr)
+def test_strong_order_half_for_two_noises_that_do_not_commute(solver):
+    steps = [2.0**-k for k in (4, 5, 6, 7)]
+    # Clearly below 1 too: otherwise the noises of this test would commute.
+    assert 0.45 <= _strong_slope(solver, 2, steps, reference=11) <= 0.85
+
+
+def _drift_of_invariant(terms, solver, y0, invariant, h, steps):
+    sol = diffrax.diffeqsolve(
+        terms,
+        solver,
+        0.0,
+        h * steps,
+        h,
+        y0,
+        max_steps=None,
+        saveat=diffrax.SaveAt(ts=jnp.linspace(0, h * steps, 101)),
+    )
+    values = jax.vmap(invariant)(sol.ys)
+    return jnp.max(jnp.abs(values / invariant(y0) - 1))
+
+
+@all_solvers
+def test_kubo_energy_is_conserved_over_1e5_steps(solver):
+    y0 = (jnp.array(0.0), jnp.array(1.0))
+    terms = kubo_terms(ds.WeakBrownianPath((), jr.key(0)))
+    energy = lambda y: y[0] ** 2 + y[1] ** 2
+    assert _drift_of_invariant(terms, solver, y0, energy, 0.01, 10**5) <= 1e-11
+
+
+@all_solvers
+def test_rigid_body_stays_on_the_sphere_over_1e5_steps(solver):
+    y0 = jnp.array([np.cos(1.1), 0.0, np.sin(1.1)])
+    terms = rigid_body_terms(ds.WeakBrownianPath((), jr.key(0)))
+    squared = lambda y: jnp.sum(y**2)
+    assert _drift_of_invariant(terms, solver, y0, squared, 0.02, 10**5) <= 1e-11
+
+
+def _truncated_tree():
+    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 0.01, (2,), jr.key(3))
+    return ds.TruncatedBrownianPath(tree, k=1)
+
+
+@pytest.mark.parametrize("path", [weak_path(2), _truncated_tree()], ids=["weak", "cut"])
+@all_solvers
+def test_gradients_equal_central_differences(solver, path):
+    y0, args = random_problem(jr.key(0), 1, 2)
+    terms = ds.hamiltonian_terms(H0, noise, path)
+
+    @jax.jit
+    def loss(y0, args):
+        ys = diffrax.diffeqsolve(
+            terms,
+            solver,
+            0.0,
+            1.0,
+            0.1,
+            y0,
+            args,
+            saveat=diffrax.SaveAt(ts=[0.5, 1.0]),
+            adjoint=diffrax.RecursiveCheckpointAdjoint(checkpoints=2),
+        ).ys
+        return jnp.sum(ys[0] ** 2) + jnp.sum(jnp.sin(ys[1]))
+
+    flat, unravel = jax.flatten_util.ravel_pytree((y0, args))
+    f = lambda x: loss(*unravel(x))
+    gradient = jax.jit(jax.grad(f))(flat)
+    eps = 1e-5
+    shifts = jnp.eye(flat.size) * eps
+    differences = jax.vmap(lambda s: (f(flat + s) - f(flat - s)) / (2 * eps))(shifts)
+    assert jnp.max(jnp.abs(gradient)) > 1e-2
+    np.testing.assert_allclose(gradient, differences, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "adjoint",
+    [diffrax.DirectAdjoint(), diffrax.RecursiveCheckpointAdjoint()],
+    ids=["direct", "checkpoint"],
+)
+def test_adjoints_agree(adjoint):
+    y0, args = random_problem(jr.key(0), 1, 2)
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(2))
+    solve = lambda y0, adjoint: jnp.sum(
+        diffrax.diffeqsolve(
+            terms, ds.Midpoint(), 0.0, 0.5, 0.1, y0, args, adjoint=adjoint, max_steps=8
+        ).ys[0]
+    )
+    tangent = jax.tree.map(jnp.ones_like, y0)
+    forward = lambda y0: solve(y0, diffrax.ForwardMode())
+    _, expected = jax.jvp(forward, (y0,), (tangent,))
+    gradient = jax.grad(lambda y0: solve(y0, adjoint))(y0)
+    np.testing.assert_allclose(jnp.sum(jnp.stack(gradient)), expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "root_finder",
+    [
+        optx.Newton(rtol=1e-12, atol=1e-14),
+        optx.Chord(rtol=1e-12, atol=1e-14),
+        optx.Dogleg(rtol=1e-12, atol=1e-14),
+        optx.LevenbergMarquardt(rtol=1e-12, atol=1e-14),
+        diffrax.VeryChord(rtol=1e-12, atol=1e-14),
+        ds.PicardNewton(linear_solver=lx.QR()),
+        ds.PicardNewton(direct=0),
+        ds.PicardNewton(direct=100),
+        ds.PicardNewton(unrolled=0),
+    ],
+    ids=lambda r: type(r).__name__,
+)
+@pytest.mark.parametrize("name", ["Midpoint", "SRKw1-0.2"])
+def test_any_root_finder_gives_the_same_solution(name, root_finder):
+    import dataclasses
+
+    y0, args = random_problem(jr.key(0), 2, 2)
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(2))
+    solve = lambda s: diffrax.diffeqsolve(terms, s, 0.0, 0.3, 0.1, y0, args).ys
+    solver = GENERAL[name]
+    other = dataclasses.replace(solver, root_finder=root_finder, root_find_max_steps=50)
+    for a, b in zip(solve(other), solve(solver)):
+        np.testing.assert_allclose(a, b, atol=1e-10)
+
+
+# A noise for which a step can be too large: q' = q^2 has no midpoint step once the
+# increment exceeds 1 / (2 q).
+def _explosive(path):
+    return ds.hamiltonian_terms(
+        lambda t, p, q, args: 0.0, lambda t, p, q, args: p * q**2, path
+    )
+
+
+def test_unsolvable_stages_are_reported():
+    path = ds.WeakBrownianPath((), jr.key(0))
+    y0 = (jnp.array(0.1), jnp.array(10.0))
+    solve = lambda **kwargs: diffrax.diffeqsolve(
+        _explosive(path), ds.Midpoint(), 0.0, 1.0, 0.1, y0, **kwargs
+    )
+    with pytest.raises(Exception, match="nonlinear solver"):
+        jax.block_until_ready(solve())
+    assert solve(throw=False).result != diffrax.RESULTS.successful
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_failed_paths_do_not_spoil_their_neighbours(dtype):
+    def solve(q, key):
+        path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((), dtype), key)
+        y0 = (dtype(0.1), q)
+        return diffrax.diffeqsolve(
+            _explosive(path), ds.Midpoint(), dtype(0), dtype(1), dtype(0.1), y0, throw=False
+        )
+
+    q = jnp.array([0.1, 50.0, 0.2, jnp.nan], dtype)
+    keys = jr.split(jr.key(0), 4)
+    batch = jax.vmap(solve)(q, keys)
+    success = batch.result == diffrax.RESULTS.successful
+    np.testing.assert_array_equal(success, [True, False, True, False])
+    for i in (0, 2):
+        alone = solve(q[i], keys[i])
+        for a, b in zip(batch.ys, alone.ys):
+            np.testing.assert_allclose(a[i], b, rtol=4 * jnp.finfo(dtype).eps)
+    # Nothing that is not a number goes unannounced.
+    finite = jnp.isfinite(batch.ys[0][:, 0]) & jnp.isfinite(batch.ys[1][:, 0])
+    assert jnp.all(finite | ~success)
+
+
+@all_solvers
+def test_non_finite_hamiltonians_are_reported(solver):
+    H = lambda t, p, q, args: jnp.log(q) + p**2
+    y0 = (jnp.array(0.1), jnp.array(-1.0))
+    good = lambda t, p, q, args: q
+    path = ds.WeakBrownianPath((), jr.key(0))
+    for terms in (
+        ds.hamiltonian_terms(lambda *a: H(*a) * jnp.nan, good, path),
+        ds.hamiltonian_terms(good, lambda *a: jnp.sqrt(H(*a)), path),
+    ):
+        sol = diffrax.diffeqsolve(terms, solver, 0.0, 0.3, 0.1, y0, throw=False)
+        assert sol.result != diffrax.RESULTS.successful
+        with pytest.raises(Exception, match=r"(?i)non-?finite|nonlinear solver"):
+            jax.block_until_ready(
+                diffrax.diffeqsolve(terms, solver, 0.0, 0.3, 0.1, y0)
+            )
+
+
+def _solve(terms, y0, solver=None):
+    solver = ds.Midpoint() if solver is None else solver
+    return diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0)
+
+
+@pytest.mark.parametrize(
+    "y0",
+    [
+        jnp.ones(2),
+        [jnp.ones(2), jnp.ones(2)],
+        (jnp.ones(2),) * 3,
+        (jnp.ones(2), jnp.ones(3)),
+        (jnp.ones(2), {"q": jnp.ones(2)}),
+        {"p": jnp.ones(2), "q": jnp.ones(2)},
+    ],
+)
+def test_state_that_is_not_a_pair_is_refused(y0):
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: jnp.sum(p), lambda t, p, q, args: q[:1], weak_path(1)
+    )
+    for solver in (ds.Midpoint(), diffrax.Heun()):
+        with pytest.raises(ValueError, match=r"pass `y0=\(p0, q0\)`"):
+            _solve(terms, y0, solver)
+
+
+@pytest.mark.parametrize(
+    "H",
+    [
+        lambda t, p, q, args: q,
+        lambda t, p, q, args: jnp.outer(q, q),
+        lambda t, p, q, args: jnp.sum(q),
+        lambda t, p, q, args: (jnp.sum(q),) * 2,
+    ],
+    ids=["longer", "matrix", "scalar", "tuple"],
+)
+def test_noise_that_does_not_match_the_path_is_refused(H):
+    terms = ds.hamiltonian_terms(lambda t, p, q, args: jnp.sum(p), H, weak_path(2))
+    with pytest.raises(ValueError, match="one Hamiltonian for each noise of the path"):
+        _solve(terms, (jnp.ones(3), jnp.ones(3)))
+
+
+def test_drift_hamiltonian_that_is_not_a_scalar_is_refused():
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: p, lambda t, p, q, args: q[:1], weak_path(1)
+    )
+    with pytest.raises(ValueError, match="must return a scalar"):
+        _solve(terms, (jnp.ones(2), jnp.ones(2)))
+
+
+def test_malformed_terms_are_refused():
+    H = lambda t, p, q, args: jnp.sum(p)
+    with pytest.raises(ValueError, match="`path` must be a Brownian path"):
+        ds.hamiltonian_terms(H, H, lambda t0, t1: 0.0)  # pyright: ignore
+    with pytest.raises(ValueError, match="`H0` must be a function"):
+        ds.hamiltonian_terms(1.0, H, weak_path(1))  # pyright: ignore
+    with pytest.raises(ValueError, match="`noise` must be a function"):
+        ds.hamiltonian_terms(H, None, weak_path(1))  # pyright: ignore
+
+
+@pytest.mark.filterwarnings("ignore:Complex")
+def test_states_that_are_not_real_floats_are_refused():
+    terms = diffrax.ODETerm(lambda t, y, args: y)
+    with pytest.raises(ValueError, match="real floating-point arrays; got.*complex"):
+        _solve(terms, jnp.ones(2, complex))
+    with pytest.raises(ValueError, match="real floating-point arrays; got.*int"):
+        ds.Midpoint().init(terms, 0.0, 0.1, jnp.ones(2, int), None)
+    with pytest.raises(ValueError, match="at least one array"):
+        _solve(terms, ())
+    # Diffrax itself turns an integer state into a floating-point one.
+    assert jnp.issubdtype(_solve(terms, jnp.ones(2, int)).ys.dtype, jnp.floating)
+
+
+def test_mixed_dtypes_are_refused():
+    field = lambda t, y, args: jnp.ones((2, 1))
+    terms = diffrax.MultiTerm(
+        diffrax.ODETerm(lambda t, y, args: y), diffrax.ControlTerm(field, weak_path(1))
+    )
+    f = jnp.float32
+    y0 = jnp.ones(2, f)
+    with pytest.raises(ValueError, match="the same dtype"):
+        diffrax.diffeqsolve(terms, ds.Midpoint(), f(0), f(0.2), f(0.1), y0)
+
+
+def test_missing_levy_area_is_refused_by_diffrax_solvers():
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
+    y0, args = random_problem(jr.key(0), 1, 1)
+    with pytest.raises(ValueError, match="not compatible"):
+        diffrax.diffeqsolve(terms, diffrax.SPaRK(), 0.0, 0.2, 0.1, y0, args)
+
+
+def test_everything_works_in_single_precision_mode():
+    # In a process of its own: the tests run with 64-bit floats enabled.
+    program = """
+import diffrax, diffrax_symplectic as ds, jax, jax.numpy as jnp, jax.random as jr
+H = lambda t, p, q, args: (p**2 + q**2) / 2
+y0 = (jnp.array(0.0), jnp.array(1.0))
+tree = diffrax.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jr.key(0))
+for path in (ds.WeakBrownianPath((), jr.key(0)), ds.TruncatedBrownianPath(tree)):
+    terms = ds.hamiltonian_terms(H, H, path)
+    for solver in (ds.Midpoint(), ds.SRKs1(), ds.SRKw1(b=0.2), ds.SRKw2()):
+        solve = lambda y0: diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.01, y0).ys
+        p, q = jax.jit(solve)(y0)
+        assert p.dtype == jnp.float32
+        assert abs(p**2 + q**2 - 1) < 1e-5, (solver, p, q)
+        jax.grad(lambda y0: jnp.sum(solve(y0)[0]))(y0)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_results_under_jit_and_vmap_are_those_without():
+    y0, args = random_problem(jr.key(0), 2, 2)
+
+    def solve(key):
+        terms = ds.hamiltonian_terms(H0, noise, weak_path(2, key))
+        return diffrax.diffeqsolve(terms, ds.SRKw2(), 0.0, 0.5, 0.1, y0, args).ys
+
+    keys = jr.split(jr.key(0), 5)
+    batch = eqx.filter_jit(jax.vmap(solve))(keys)
+    for i, key in enumerate(keys):
+        for a, b in zip(batch, solve(key)):
+            np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-13)

@@ -1,0 +1,214 @@
+"""Terms from Hamiltonians: values, structures, derivatives, and use with Diffrax."""
+
+import diffrax
+import diffrax_symplectic as ds
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from .problems import GENERAL, H0, noise, random_problem, weak_path
+
+
+def test_terms_are_the_symplectic_gradients():
+    H0 = lambda t, p, q, args: jnp.sum(p**2) * args + jnp.cos(t) * jnp.sum(p * q**2)
+    noise = lambda t, p, q, args: jnp.stack([jnp.sum(q**3), args * jnp.sum(p * q)])
+    drift, diffusion = ds.hamiltonian_terms(H0, noise, weak_path(2)).terms
+    p, q = jnp.array([0.3, -0.5]), jnp.array([0.2, 0.9])
+    t, args = 0.4, 1.7
+    f, g = drift.vf(t, (p, q), args)
+    np.testing.assert_allclose(f, -np.cos(t) * 2 * p * q, rtol=1e-14)
+    np.testing.assert_allclose(g, 2 * args * p + np.cos(t) * q**2, rtol=1e-14)
+    sigma, gamma = diffusion.vf(t, (p, q), args)
+    np.testing.assert_allclose(sigma, np.stack([-3 * q**2, -args * p], 1), rtol=1e-14)
+    np.testing.assert_allclose(gamma, np.stack([0 * q, args * q], 1), rtol=1e-14)
+    control = jnp.array([0.7, -1.1])
+    for got in (
+        diffusion.vf_prod(t, (p, q), args, control),
+        diffusion.prod((sigma, gamma), control),
+    ):
+        np.testing.assert_allclose(got[0], sigma @ control, rtol=1e-14)
+        np.testing.assert_allclose(got[1], gamma @ control, rtol=1e-14)
+
+
+def test_state_and_noise_may_be_any_pytrees():
+    shape = {
+        "bath": jax.ShapeDtypeStruct((2,), jnp.float64),
+        "drive": jax.ShapeDtypeStruct((), jnp.float64),
+    }
+    path = ds.WeakBrownianPath(shape, jr.key(0))
+
+    def noise(t, p, q, args):
+        x, (z,) = q["x"], q["rest"]
+        return {"bath": jnp.stack([jnp.sum(x), p["rest"][0] * z]), "drive": z**2}
+
+    def H0(t, p, q, args):
+        squares = jax.tree.map(lambda a, b: jnp.sum(a**2 + b**4), p, q)
+        return sum(jax.tree.leaves(squares))
+
+    p = {"x": jnp.array([[0.1, 0.2]]), "rest": (jnp.array(0.3),)}
+    q = {"x": jnp.array([[0.5, 0.4]]), "rest": (jnp.array(-0.6),)}
+    terms = ds.hamiltonian_terms(H0, noise, path)
+    _, diffusion = terms.terms
+    control = {"bath": jnp.array([0.3, -0.2]), "drive": jnp.array(0.8)}
+    vf = diffusion.vf(0.0, (p, q), None)
+    assert vf[0]["x"]["bath"].shape == (1, 2, 2)
+    assert vf[0]["x"]["drive"].shape == (1, 2)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-15),
+        diffusion.prod(vf, control),
+        diffusion.vf_prod(0.0, (p, q), None, control),
+    )
+    for solver in (*GENERAL.values(), diffrax.Heun()):
+        sol = diffrax.diffeqsolve(terms, solver, 0.0, 0.1, 0.05, (p, q))
+        assert jax.tree.structure(sol.ys) == jax.tree.structure((p, q))
+    assert ds.symplecticity_defect(terms, ds.Midpoint(), 0.0, 0.1, (p, q)) < 1e-14
+
+
+@pytest.mark.parametrize("shape", [(), (1,)])
+def test_one_noise_may_be_a_scalar(shape):
+    path = ds.WeakBrownianPath(shape, jr.key(0))
+    H = lambda t, p, q, args: (p**2 + q**2) / 2
+    terms = ds.hamiltonian_terms(H, H, path)
+    y0 = (jnp.array(0.0), jnp.array(1.0))
+    solve = lambda solver: diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0).ys
+    np.testing.assert_allclose(sum(x**2 for x in solve(ds.Midpoint())), 1, rtol=1e-14)
+    solve(diffrax.StratonovichMilstein())
+
+
+@pytest.mark.parametrize("m", [1, 3])
+@pytest.mark.parametrize(
+    "solver", [diffrax.Heun(), diffrax.StratonovichMilstein(), diffrax.SlowRK()]
+)
+def test_terms_work_with_diffrax_solvers(solver, m):
+    y0, args = random_problem(jr.key(0), 2, m)
+    path = diffrax.VirtualBrownianTree(
+        0.0, 1.0, 1e-3, (m,), jr.key(1), levy_area=diffrax.SpaceTimeTimeLevyArea
+    )
+    terms = ds.hamiltonian_terms(H0, noise, path)
+    h = 2.0**-9
+    solve = lambda solver: diffrax.diffeqsolve(
+        terms, solver, 0.0, 0.25, h, y0, args
+    ).ys
+    for a, b in zip(solve(solver), solve(ds.Midpoint())):
+        np.testing.assert_allclose(a, b, atol=0.02)
+
+
+@pytest.mark.parametrize("solver", GENERAL.values(), ids=GENERAL.keys())
+def test_plain_diffrax_terms_give_the_same_solution(solver):
+    y0, args = random_problem(jr.key(0), 2, 2)
+    path = weak_path(2)
+    terms = ds.hamiltonian_terms(H0, noise, path)
+    drift, diffusion = terms.terms
+
+    # The same vector fields on one array for the whole state.
+    def on_array(vf):
+        return lambda t, y, args: jnp.concatenate(vf(t, (y[:2], y[2:]), args))
+
+    plain = diffrax.MultiTerm(
+        diffrax.ODETerm(on_array(drift.vf)),
+        diffrax.ControlTerm(on_array(diffusion.vf), path),
+    )
+
+    class OneNoise(diffrax.AbstractPath):
+        k: int
+        t0 = 0
+        t1 = 1
+
+        def evaluate(self, t0, t1=None, left=True):
+            return path.evaluate(t0, t1)[self.k]
+
+    one = lambda k: lambda t, y, args: on_array(diffusion.vf)(t, y, args)[:, k]
+    separate = diffrax.MultiTerm(
+        diffrax.ODETerm(on_array(drift.vf)),
+        *[diffrax.ControlTerm(one(k), OneNoise(k)) for k in range(2)],
+    )
+    solve = lambda terms, y0: diffrax.diffeqsolve(
+        terms, solver, 0.0, 0.5, 0.1, y0, args
+    ).ys
+    expected = jnp.concatenate(solve(terms, y0), axis=1)
+    for other in (plain, separate):
+        got = solve(other, jnp.concatenate(y0))
+        np.testing.assert_allclose(got, expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("solver", GENERAL.values(), ids=GENERAL.keys())
+def test_without_noise_the_solvers_have_order_two(solver):
+    drift = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0]) - t]))
+    assert solver.order(drift) == 2
+    y0 = jnp.array([1.0, 0.0])
+    solve = lambda s, h: diffrax.diffeqsolve(drift, s, 0.0, 1.0, h, y0).ys[0]
+    exact = solve(diffrax.Dopri8(), 1e-3)
+    coarse, fine = (np.abs(solve(solver, h) - exact).max() for h in (0.1, 0.05))
+    np.testing.assert_allclose(np.log2(coarse / fine), 2, atol=0.1)
+
+
+def test_noise_alone_can_be_solved():
+    path = weak_path(1)
+    term = diffrax.ControlTerm(lambda t, y, args: y[:, None], path)
+    y = diffrax.diffeqsolve(term, ds.Midpoint(), 0.0, 0.3, 0.1, jnp.ones(1)).ys[0]
+    increments = jnp.stack([path.evaluate(i * 0.1, (i + 1) * 0.1)[0] for i in range(3)])
+    expected = jnp.prod((1 + increments / 2) / (1 - increments / 2))
+    np.testing.assert_allclose(y[0], expected, rtol=1e-13)
+
+
+def test_backwards_in_time():
+    y0, args = random_problem(jr.key(0), 1, 1)
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
+    there = diffrax.diffeqsolve(terms, ds.Midpoint(), 0.0, 1.0, 0.1, y0, args).ys
+    end = jax.tree.map(lambda x: x[0], there)
+    back = diffrax.diffeqsolve(terms, ds.Midpoint(), 1.0, 0.0, -0.1, end, args).ys
+    # The midpoint rule is its own inverse, and both ways see the same increments.
+    for a, b in zip(back, y0):
+        np.testing.assert_allclose(a[0], b, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "solver, m, weak, strong",
+    [
+        (ds.Midpoint(), 1, 1, 1.0),
+        (ds.Midpoint(), 2, 1, 0.5),
+        (ds.SRKs1(), 1, 1, 1.0),
+        (ds.SRKs1(), 3, 1, 0.5),
+        (ds.SRKw1(), 2, 1, None),
+        (ds.SRKw2(), 1, 2, None),
+        (ds.SRKw2(), 2, 1, None),
+    ],
+)
+def test_solvers_know_their_orders_and_kinds(solver, m, weak, strong):
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(m))
+    assert solver.order(terms) == 2
+    assert solver.weak_order(terms) == weak
+    assert solver.strong_order(terms) == strong
+    assert solver.minimal_levy_area is diffrax.AbstractBrownianIncrement
+    assert isinstance(solver, diffrax.AbstractImplicitSolver)
+    assert isinstance(solver, diffrax.AbstractStratonovichSolver)
+
+
+class _Network(eqx.Module):
+    mlp: eqx.nn.MLP
+
+    def __call__(self, t, p, q, args):
+        return self.mlp(jnp.concatenate([p, q]))
+
+
+def test_hamiltonians_may_be_networks():
+    make = lambda key, out: _Network(
+        eqx.nn.MLP(4, out, 8, 1, activation=jnp.tanh, key=key, dtype=jnp.float64)
+    )
+    terms = ds.hamiltonian_terms(
+        make(jr.key(0), "scalar"), make(jr.key(1), 2), weak_path(2)
+    )
+    y0 = (jnp.array([0.1, 0.2]), jnp.array([0.3, 0.4]))
+    for solver in (ds.Midpoint(), ds.SRKw2()):
+        assert ds.symplecticity_defect(terms, solver, 0.0, 0.1, y0) < 1e-13
+
+    @eqx.filter_grad
+    def gradient(terms):
+        ys = diffrax.diffeqsolve(terms, ds.Midpoint(), 0.0, 0.3, 0.1, y0).ys
+        return jnp.sum(ys[0] ** 2)
+
+    leaves = jax.tree.leaves(eqx.filter(gradient(terms), eqx.is_inexact_array))
+    assert len(leaves) > 0 and all(jnp.any(x != 0) for x in leaves[:2])
