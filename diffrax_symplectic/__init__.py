@@ -17,7 +17,10 @@ from ._solver import (
     SRKw1 as SRKw1,
     SRKw2 as SRKw2,
 )
-from ._tableau import AbstractTableau as AbstractTableau, GeneralTableau as GeneralTableau
+from ._tableau import (
+    AbstractTableau as AbstractTableau,
+    GeneralTableau as GeneralTableau,
+)
 from ._verify import (
     step_expectation as step_expectation,
     symplecticity_defect as symplecticity_defect,

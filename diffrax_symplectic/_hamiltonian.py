@@ -173,7 +173,9 @@ class _Noise(diffrax.AbstractTerm):
         if matches:
             for h, s in zip(jtu.tree_leaves(H), jtu.tree_leaves(struct)):
                 # One noise may come as a scalar.
-                matches = matches and (jnp.shape(h) == s.shape or jnp.size(h) == s.size == 1)
+                matches = matches and (
+                    jnp.shape(h) == s.shape or jnp.size(h) == s.size == 1
+                )
         if not matches:
             raise ValueError(
                 "`noise(t, p, q, args)` must return one Hamiltonian for each noise of "

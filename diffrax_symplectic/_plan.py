@@ -126,7 +126,9 @@ def _cut(block: tuple[int, ...], depends: np.ndarray) -> Block:
     """The fewest stages that, once known, leave no circle among the others."""
     for size in range(len(block) + 1):
         for unknown in itertools.combinations(block, size):
-            explicit = _evaluation_order([i for i in block if i not in unknown], depends)
+            explicit = _evaluation_order(
+                [i for i in block if i not in unknown], depends
+            )
             if explicit is not None:
                 return Block(tuple(map(int, unknown)), tuple(map(int, explicit)))
     raise AssertionError
@@ -142,4 +144,3 @@ def _evaluation_order(stages: list[int], depends: np.ndarray) -> list[int] | Non
         order += ready
         rest = [i for i in rest if i not in ready]
     return order
-

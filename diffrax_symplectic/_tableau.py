@@ -129,9 +129,7 @@ class GeneralTableau(AbstractTableau):
 
     def __post_init__(self):
         s, r = np.size(self.alpha), np.size(self.beta)
-        shapes = dict(
-            alpha=(s,), beta=(r,), A0=(s, s), B0=(s, r), A1=(r, s), B1=(r, r)
-        )
+        shapes = dict(alpha=(s,), beta=(r,), A0=(s, s), B0=(s, r), A1=(r, s), B1=(r, r))
         for name, shape in shapes.items():
             array = _coefficients(name, getattr(self, name), shape)
             object.__setattr__(self, name, array)

@@ -1,12 +1,13 @@
 """Problems that several tests share."""
 
 import diffrax
-import diffrax_symplectic as ds
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 from jaxtyping import PyTree
+
+import diffrax_symplectic as ds
 
 
 GENERAL = {

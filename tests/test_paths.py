@@ -1,12 +1,13 @@
 """The laws of the increments, and that they are the same whenever a step is computed."""
 
 import diffrax
-import diffrax_symplectic as ds
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+
+import diffrax_symplectic as ds
 from diffrax_symplectic._brownian._weak import _three_point, _two_point
 
 from .problems import kubo_terms, weak_path
@@ -91,7 +92,7 @@ def test_asking_for_more_does_not_change_the_increment():
 @pytest.mark.parametrize("h", [0.01, 2**-6, 0.1, 1 / 3])
 @pytest.mark.parametrize("start", [0.0, 0.5, -2.0, 0.005])
 def test_increments_do_not_depend_on_the_rounding_of_time(h, start, dtype):
-    path = weak_path(20)
+    path = weak_path(40)
     # The sizes follow the step; which of the three values it is, is what is random.
     evaluate = jax.jit(jax.vmap(lambda t0, t1: jnp.sign(path.evaluate(t0, t1))))
     n = 400
@@ -101,7 +102,7 @@ def test_increments_do_not_depend_on_the_rounding_of_time(h, start, dtype):
     same = [evaluate(a[:-1], b[1:]) == W for a in nudged for b in nudged]
     # In single precision, one step in many thousands may sit at the edge of a count.
     assert np.mean(np.all(same, axis=(0, 2))) >= (1 if dtype == jnp.float64 else 0.99)
-    # Two steps share 20 increments with probability 2^-20, roughly, if independent.
+    # Two steps share 40 increments with probability 2^-40, if independent.
     assert len(np.unique(np.asarray(W), axis=0)) == n
 
 
@@ -133,15 +134,15 @@ def test_path_takes_any_pytree_under_jit_and_vmap():
     # An increment from 0 can be had by its end alone, as from Diffrax's paths.
     path = ds.WeakBrownianPath(shape, jr.key(0))
     assert jax.tree.all(
-        jax.tree.map(lambda a, b: jnp.all(a == b), path.evaluate(0.1), path.evaluate(0.0, 0.1))
+        jax.tree.map(
+            lambda a, b: jnp.all(a == b), path.evaluate(0.1), path.evaluate(0.0, 0.1)
+        )
     )
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_increments_have_the_dtype_of_the_path(dtype):
-    inc = weak_path(2, dtype=dtype).evaluate(
-        dtype(0.0), dtype(0.1), use_levy=True
-    )
+    inc = weak_path(2, dtype=dtype).evaluate(dtype(0.0), dtype(0.1), use_levy=True)
     assert inc.W.dtype == inc.dt.dtype == dtype
 
 

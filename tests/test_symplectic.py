@@ -3,12 +3,13 @@
 import dataclasses
 
 import diffrax
-import diffrax_symplectic as ds
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import pytest
+
+import diffrax_symplectic as ds
 
 from .problems import (
     GENERAL,
@@ -83,9 +84,7 @@ def test_stage_equations_are_solved_to_rounding_error(solver, dtype):
     def ends(key):
         y0, args = random_problem(key, 2, 2, dtype)
         terms = ds.hamiltonian_terms(H0, noise, _weak(2, key, dtype))
-        step = lambda s: s.step(
-            terms, dtype(0.0), dtype(0.1), y0, args, None, False
-        )
+        step = lambda s: s.step(terms, dtype(0.0), dtype(0.1), y0, args, None, False)
         y1, *_, result = step(solver)
         return y1, step(exact)[0], result == diffrax.RESULTS.successful
 

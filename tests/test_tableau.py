@@ -2,9 +2,10 @@
 
 import dataclasses
 
-import diffrax_symplectic as ds
 import numpy as np
 import pytest
+
+import diffrax_symplectic as ds
 from diffrax_symplectic._plan import Block, make_plan
 
 
@@ -14,7 +15,9 @@ TABLEAUS = {
     **{f"SRKs1({a})": ds.SRKs1(a=a).tableau for a in (-0.3, 0.0, 0.25, 0.4, 0.5)},
     **{f"SRKw1({b})": ds.SRKw1(b=b).tableau for b in (-0.3, 0.0, 0.5, 0.7, 1.0)},
 }
-all_tableaus = pytest.mark.parametrize("tableau", TABLEAUS.values(), ids=TABLEAUS.keys())
+all_tableaus = pytest.mark.parametrize(
+    "tableau", TABLEAUS.values(), ids=TABLEAUS.keys()
+)
 
 
 @all_tableaus

@@ -1,13 +1,14 @@
 """Terms from Hamiltonians: values, structures, derivatives, and use with Diffrax."""
 
 import diffrax
-import diffrax_symplectic as ds
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+
+import diffrax_symplectic as ds
 
 from .problems import GENERAL, H0, noise, random_problem, weak_path
 
@@ -89,9 +90,7 @@ def test_terms_work_with_diffrax_solvers(solver, m):
     )
     terms = ds.hamiltonian_terms(H0, noise, path)
     h = 2.0**-9
-    solve = lambda solver: diffrax.diffeqsolve(
-        terms, solver, 0.0, 0.25, h, y0, args
-    ).ys
+    solve = lambda solver: diffrax.diffeqsolve(terms, solver, 0.0, 0.25, h, y0, args).ys
     for a, b in zip(solve(solver), solve(ds.Midpoint())):
         np.testing.assert_allclose(a, b, atol=0.02)
 
@@ -125,9 +124,9 @@ def test_plain_diffrax_terms_give_the_same_solution(solver):
         diffrax.ODETerm(on_array(drift.vf)),
         *[diffrax.ControlTerm(one(k), OneNoise(k)) for k in range(2)],
     )
-    solve = lambda terms, y0: diffrax.diffeqsolve(
-        terms, solver, 0.0, 0.5, 0.1, y0, args
-    ).ys
+    solve = lambda terms, y0: (
+        diffrax.diffeqsolve(terms, solver, 0.0, 0.5, 0.1, y0, args).ys
+    )
     expected = jnp.concatenate(solve(terms, y0), axis=1)
     for other in (plain, separate):
         got = solve(other, jnp.concatenate(y0))

@@ -1,12 +1,13 @@
 """Weak orders and exact moments, from the finitely many outcomes of one step."""
 
 import diffrax
-import diffrax_symplectic as ds
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+
+import diffrax_symplectic as ds
 
 from .problems import GENERAL, H0, kubo_terms, noise, random_problem, slope, weak_path
 

@@ -126,13 +126,16 @@ class PicardNewton(optx.AbstractRootFinder):
         size_of = lambda y: optx.two_norm(fn(y, args)[0])
         before = size_of(state.y)
         # Rounding errors alone may make a residual larger, by a little.
-        best, best_size = full.y, jnp.where(
-            full.overall <= 1e-3, -jnp.inf, size_of(full.y)
+        best, best_size = (
+            full.y,
+            jnp.where(full.overall <= 1e-3, -jnp.inf, size_of(full.y)),
         )
         for factor in (0.5, 0.25, 0.125, 0.0625):
             shorter = (state.y**ω + factor * (full.y**ω - state.y**ω)).ω
             size = size_of(shorter)
-            better = ~(best_size < before) & (~(size >= best_size) | jnp.isnan(best_size))
+            better = ~(best_size < before) & (
+                ~(size >= best_size) | jnp.isnan(best_size)
+            )
             best = jtu.tree_map(lambda a, b: jnp.where(better, a, b), shorter, best)
             best_size = jnp.where(better, size, best_size)
         new_state = eqx.tree_at(lambda s: s.y, full, best)
@@ -173,9 +176,7 @@ class PicardNewton(optx.AbstractRootFinder):
 # One function that is traced and lowered once, and called several times.
 @eqx.filter_jit
 def _newton(self: PicardNewton, fn, args, options, state: _State, tags) -> _State:
-    residual, jacobian, _ = jax.linearize(
-        lambda y: fn(y, args), state.y, has_aux=True
-    )
+    residual, jacobian, _ = jax.linearize(lambda y: fn(y, args), state.y, has_aux=True)
     operator = lx.FunctionLinearOperator(
         jacobian, jax.eval_shape(lambda: state.y), tags=tags
     )

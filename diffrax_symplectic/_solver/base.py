@@ -6,7 +6,6 @@ from typing import ClassVar, TypeAlias
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
@@ -124,7 +123,9 @@ class AbstractSymplecticRungeKutta(
         # A stage where it would be if this block did not move at all.
         guess = {i: value_of(i, known) for i in block.unknown}
         written = {i: _part(y0, stages[i].writes) for i in block.unknown}
-        linear_solver = getattr(self.root_finder, "linear_solver", lx.AutoLinearSolver(None))
+        linear_solver = getattr(
+            self.root_finder, "linear_solver", lx.AutoLinearSolver(None)
+        )
         sol = optx.root_find(
             residual,
             self.root_finder,

@@ -9,9 +9,7 @@ from .base import AbstractSymplecticRungeKutta
 
 def _srkw1(b: float) -> GeneralTableau:
     one, half = np.ones(1), np.array([[0.5]])
-    return GeneralTableau(
-        alpha=one, beta=one, A0=half, B0=[[b]], A1=[[1 - b]], B1=half
-    )
+    return GeneralTableau(alpha=one, beta=one, A0=half, B0=[[b]], A1=[[1 - b]], B1=half)
 
 
 class SRKw1(AbstractSymplecticRungeKutta):
