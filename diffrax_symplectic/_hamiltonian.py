@@ -121,7 +121,7 @@ class _Noise(diffrax.AbstractTerm):
         # arrays of shape `(*state, *noise)` in that.
         check_pair(y)
         struct = jax.eval_shape(lambda: self.path.evaluate(0.0, 1.0))
-        jac = jax.jacrev(lambda y: self._hamiltonians(t, *y, args, struct))(y)
+        jac = jax.jacrev(lambda y: self._hamiltonians(t, y[0], y[1], args, struct))(y)
         noise_def, state_def = jtu.tree_structure(struct), jtu.tree_structure(y)
 
         def noise_last(entry):

@@ -68,7 +68,7 @@ def _live(tableau: FlatTableau) -> FlatTableau:
     live = tableau.weights != 0
     for _ in tableau.stages:
         live = live | (live @ (tableau.matrix != 0))
-    return tableau.take(list(np.flatnonzero(live)))
+    return tableau.take(np.flatnonzero(live).tolist())
 
 
 def _merge(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
@@ -116,7 +116,8 @@ def _blocks(matrix: np.ndarray) -> tuple[Block, ...]:
     for k in range(n):
         reach = reach | (reach[:, k, None] & reach[k])
     closed = reach | np.eye(n, dtype=bool)
-    components = {tuple(np.flatnonzero(closed[i] & closed[:, i])) for i in range(n)}
+    mutual = closed & closed.T
+    components = {tuple(np.flatnonzero(row).tolist()) for row in mutual}
     # A stage reaches everything that what it depends on reaches, and itself besides.
     ordered = sorted(components, key=lambda block: (closed[block[0]].sum(), block))
     return tuple(_cut(block, matrix != 0) for block in ordered)
@@ -130,7 +131,7 @@ def _cut(block: tuple[int, ...], depends: np.ndarray) -> Block:
                 [i for i in block if i not in unknown], depends
             )
             if explicit is not None:
-                return Block(tuple(map(int, unknown)), tuple(map(int, explicit)))
+                return Block(unknown, tuple(explicit))
     raise AssertionError
 
 

@@ -9,10 +9,14 @@ systems are solved are then questions about that one matrix, answered once.
 
 import abc
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
+
+
+# Anything that NumPy makes an array of; a read-only array of float64 once checked.
+Coefficients: TypeAlias = Any
 
 
 class Stage(NamedTuple):
@@ -74,22 +78,23 @@ def _coefficients(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def real_parameter(name: str, value) -> float:
+def real_parameter(name: str, value: Any) -> float:
     """A solver's free parameter as a Python float. Parameters decide which stages are
     live, so they have to be known while tracing.
 
     Raises a `ValueError` unless `value` is a finite real number.
     """
     try:
-        ok = not isinstance(value, complex) and np.isfinite(float(value))
+        real = not isinstance(value, complex)
+        number = float(value)  # pyright: ignore[reportArgumentType]
     except Exception:
-        ok = False
-    if not ok:
+        real, number = False, np.nan
+    if not real or not np.isfinite(number):
         raise ValueError(
             f"`{name}` must be a finite real number, known before tracing (a Python "
             f"float, not a traced array); got {value!r}."
         )
-    return float(value)
+    return number
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -120,12 +125,12 @@ class GeneralTableau(AbstractTableau):
     real numbers.
     """
 
-    alpha: Float[np.ndarray, " s"]
-    beta: Float[np.ndarray, " r"]
-    A0: Float[np.ndarray, "s s"]
-    B0: Float[np.ndarray, "s r"]
-    A1: Float[np.ndarray, "r s"]
-    B1: Float[np.ndarray, "r r"]
+    alpha: Coefficients
+    beta: Coefficients
+    A0: Coefficients
+    B0: Coefficients
+    A1: Coefficients
+    B1: Coefficients
 
     def __post_init__(self):
         s, r = np.size(self.alpha), np.size(self.beta)

@@ -109,9 +109,10 @@ def step_expectation(
     increments, weights = _outcomes(path, t1 - t0)
 
     def outcome(increment):
+        given = _FixedIncrement(increment)  # pyright: ignore[reportCallIssue]
         is_path = lambda x: isinstance(x, WeakBrownianPath)
         fixed = jtu.tree_map(
-            lambda x: _FixedIncrement(increment) if is_path(x) else x,
+            lambda x: given if is_path(x) else x,
             terms,
             is_leaf=is_path,
         )
@@ -225,7 +226,7 @@ class _FixedIncrement(diffrax.AbstractBrownianPath):
         return jnp.inf
 
     @property
-    def levy_area(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+    def levy_area(self):
         return WeakIncrement
 
     def evaluate(self, t0, t1=None, left=True, use_levy=False):

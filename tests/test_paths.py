@@ -58,17 +58,17 @@ def test_mixed_integrals_are_the_formulas():
         hat, tilde, sqrt_h = inc.W, inc.two_point, np.sqrt(0.2)
         stratonovich, ito = inc.mixed_stratonovich(), inc.mixed_ito()
         for k in range(3):
-            for l in range(3):
-                if l < k:
-                    s = hat[k] * tilde[l]
-                    i = (hat[k] * hat[l] + sqrt_h * tilde[l]) / 2
-                elif k < l:
-                    s = -hat[l] * tilde[k]
-                    i = (hat[k] * hat[l] - sqrt_h * tilde[k]) / 2
+            for j in range(3):
+                if j < k:
+                    s = hat[k] * tilde[j]
+                    i = (hat[k] * hat[j] + sqrt_h * tilde[j]) / 2
+                elif k < j:
+                    s = -hat[j] * tilde[k]
+                    i = (hat[k] * hat[j] - sqrt_h * tilde[k]) / 2
                 else:
                     s, i = 0, (hat[k] ** 2 - 0.2) / 2
-                np.testing.assert_allclose(stratonovich[k, l], s, atol=1e-15)
-                np.testing.assert_allclose(ito[k, l], i, atol=1e-15)
+                np.testing.assert_allclose(stratonovich[k, j], s, atol=1e-15)
+                np.testing.assert_allclose(ito[k, j], i, atol=1e-15)
 
 
 def test_mixed_integrals_need_two_point_variables():

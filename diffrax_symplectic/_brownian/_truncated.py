@@ -74,7 +74,7 @@ class TruncatedBrownianPath(diffrax.AbstractBrownianPath):
         return self.path.t1
 
     @property
-    def levy_area(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+    def levy_area(self):
         return self.path.levy_area
 
     def evaluate(

@@ -1,4 +1,4 @@
-from typing import Any
+from typing import Any, cast
 
 import diffrax
 import equinox as eqx
@@ -186,8 +186,8 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
         require_fixed_steps(type(self).__name__)
         if t1 is None:
             t0, t1 = jnp.zeros_like(t0), t0
-        t0 = eqxi.nondifferentiable(jnp.asarray(t0), name="t0")
-        t1 = eqxi.nondifferentiable(jnp.asarray(t1), name="t1")
+        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
+        t0, t1 = cast(tuple[Array, Array], eqxi.nondifferentiable((t0, t1), name="t"))
         h = t1 - t0
         key = _step_key(self.key, t0, t1)
         W = self._draw(key, h, _three_point)

@@ -2,7 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, TYPE_CHECKING, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -18,6 +18,11 @@ from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF,
 from .._plan import make_plan
 from .._tableau import AbstractTableau, FlatTableau, Stage
 
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 _SolverState: TypeAlias = None
 # The value of one stage: the change of the part of the state that it writes.
@@ -48,7 +53,7 @@ class AbstractSymplecticRungeKutta(
     through `sol.result`. In a batch the other paths go on.
     """
 
-    tableau: eqx.AbstractVar[AbstractTableau]
+    tableau: AbstractVar[AbstractTableau]
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = (
@@ -107,7 +112,7 @@ class AbstractSymplecticRungeKutta(
         result = diffrax.RESULTS.where(
             (result != diffrax.RESULTS.successful) | _all_finite(y1),
             result,
-            diffrax.RESULTS.nonfinite,
+            diffrax.RESULTS.nonfinite,  # pyright: ignore[reportArgumentType]
         )
         return y1, None, dict(y0=y0, y1=y1), None, result
 
@@ -167,14 +172,15 @@ class _Evaluate:
 
     def __call__(self, stage: Stage, y: Y) -> _Value:
         t = self.t0 + stage.c * self.h
-        values = [_apply(*self.driven[c], t, y) for c in stage.channels]
+        values = [_apply(self.driven[c], t, y) for c in stage.channels]
         return _part(_sum(values), stage.writes)
 
 
 # Called at several stages, this is traced and lowered once.
 @eqx.filter_jit
-def _apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> Y:
+def _apply(driven: tuple[tuple, list, Args], t: RealScalarLike, y: Y) -> Y:
     """The sum over terms of vector field times control."""
+    terms, controls, args = driven
     values = [x.vf_prod(t, y, args, c) for x, c in zip(terms, controls)]
     total = _sum(values)
     _check_value(total, y)

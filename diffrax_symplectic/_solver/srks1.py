@@ -1,3 +1,5 @@
+import functools as ft
+
 import equinox as eqx
 import numpy as np
 import optimistix as optx
@@ -47,15 +49,14 @@ class SRKs1(AbstractSymplecticRungeKutta):
         ```
     """
 
-    a: float = eqx.field(default=0.25, static=True)
+    a: float = eqx.field(
+        default=0.25, static=True, converter=ft.partial(real_parameter, "a")
+    )
     root_finder: optx.AbstractRootFinder = PicardNewton()
     root_find_max_steps: int = 20
 
-    def __check_init__(self):
-        real_parameter("a", self.a)
-
     @property
-    def tableau(self) -> GeneralTableau:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def tableau(self) -> GeneralTableau:
         return _srks1(self.a)
 
     def order(self, terms):

@@ -1,3 +1,5 @@
+import functools as ft
+
 import equinox as eqx
 import numpy as np
 import optimistix as optx
@@ -49,15 +51,14 @@ class SRKw1(AbstractSymplecticRungeKutta):
         ```
     """
 
-    b: float = eqx.field(default=0.5, static=True)
+    b: float = eqx.field(
+        default=0.5, static=True, converter=ft.partial(real_parameter, "b")
+    )
     root_finder: optx.AbstractRootFinder = PicardNewton()
     root_find_max_steps: int = 20
 
-    def __check_init__(self):
-        real_parameter("b", self.b)
-
     @property
-    def tableau(self) -> GeneralTableau:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def tableau(self) -> GeneralTableau:
         return _srkw1(self.b)
 
     def order(self, terms):
