@@ -1,2 +1,3 @@
+from ._fixed_steps import refuse_half_solver as refuse_half_solver
 from ._truncated import TruncatedBrownianPath as TruncatedBrownianPath
 from ._weak import WeakBrownianPath as WeakBrownianPath, WeakIncrement as WeakIncrement

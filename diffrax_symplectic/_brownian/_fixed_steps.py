@@ -36,3 +36,23 @@ def require_fixed_steps(path_name: str) -> None:
                 )
             return
         frame = frame.f_back
+
+
+def refuse_half_solver(solver_name: str) -> None:
+    """Raises a `ValueError` if asked by a `diffrax.HalfSolver` around this solver.
+
+    Diffrax takes `HalfSolver(solver)` for an implicit solver if `solver` is one, and
+    then fails with an `AttributeError`, since it has no `root_finder`.
+    """
+    # Called by a property of the solver, which is read by the same property of its
+    # wrapper; Equinox looks attributes up in frames of its own.
+    frame, callers = sys._getframe(1), []
+    while frame is not None and len(callers) < 4:
+        callers.append(frame.f_locals.get("self"))
+        frame = frame.f_back
+    if any(isinstance(caller, diffrax.HalfSolver) for caller in callers):
+        raise ValueError(
+            f"`diffrax.HalfSolver` cannot wrap the implicit solver `{solver_name}`. "
+            f"Pass `{solver_name}()` itself, with a fixed step size: symplectic steps "
+            "lose what they are for if their size follows the state."
+        )

@@ -125,22 +125,22 @@ class PicardNewton(optx.AbstractRootFinder):
         full = _newton(self, fn, args, options, state, tags)
         size_of = lambda y: optx.two_norm(fn(y, args)[0])
         before = size_of(state.y)
-        # Rounding errors alone may make a residual larger, by a little.
-        best, best_size = (
-            full.y,
-            jnp.where(full.overall <= 1e-3, -jnp.inf, size_of(full.y)),
-        )
-        for factor in (0.5, 0.25, 0.125, 0.0625):
-            shorter = (state.y**ω + factor * (full.y**ω - state.y**ω)).ω
-            size = size_of(shorter)
-            better = ~(best_size < before) & (
-                ~(size >= best_size) | jnp.isnan(best_size)
-            )
-            best = jtu.tree_map(lambda a, b: jnp.where(better, a, b), shorter, best)
-            best_size = jnp.where(better, size, best_size)
-        new_state = eqx.tree_at(lambda s: s.y, full, best)
+
+        def shorten(carry):
+            _, factor = carry
+            factor = factor / 2
+            return (state.y**ω + factor * (full.y**ω - state.y**ω)).ω, factor
+
+        def too_long(carry):
+            y, factor = carry
+            # Rounding errors alone may make a residual larger, by a little.
+            matters = full.overall > 1e-3
+            return matters & ~(size_of(y) < before) & (factor > 1e-3)
+
+        one = jnp.ones_like(full.size)
+        best, _ = lax.while_loop(too_long, shorten, (full.y, one))
         _, aux = fn(best, args)
-        return best, new_state, aux
+        return best, eqx.tree_at(lambda s: s.y, full, best), aux
 
     def terminate(
         self,

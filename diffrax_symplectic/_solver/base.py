@@ -14,6 +14,7 @@ import optimistix as optx
 from equinox.internal import ω
 from jaxtyping import Array, Bool, PyTree
 
+from .._brownian import refuse_half_solver
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
 from .._tableau import AbstractTableau, FlatTableau, Stage
@@ -59,6 +60,12 @@ class AbstractSymplecticRungeKutta(
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = (
         diffrax.LocalLinearInterpolation
     )
+
+    @property
+    def term_compatible_contr_kwargs(self) -> dict:  # pyright: ignore
+        # Asked for first of all in a solve, and passed on by `HalfSolver`.
+        refuse_half_solver(type(self).__name__)
+        return {}
 
     @property
     def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
