@@ -14,8 +14,12 @@ from ._solver import (
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
     Midpoint as Midpoint,
     SRKs1 as SRKs1,
+    SRKs2 as SRKs2,
+    SRKs3 as SRKs3,
     SRKw1 as SRKw1,
     SRKw2 as SRKw2,
+    SRKw3 as SRKw3,
+    SRKw4 as SRKw4,
 )
 from ._tableau import (
     AbstractTableau as AbstractTableau,

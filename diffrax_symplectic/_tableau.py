@@ -78,6 +78,12 @@ def _coefficients(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
+def _check_all(tableau, **shapes: tuple[int, ...]) -> None:
+    for name, shape in shapes.items():
+        array = _coefficients(name, getattr(tableau, name), shape)
+        object.__setattr__(tableau, name, array)
+
+
 def real_parameter(name: str, value: Any) -> float:
     """A solver's free parameter as a Python float. Parameters decide which stages are
     live, so they have to be known while tracing.
@@ -134,10 +140,9 @@ class GeneralTableau(AbstractTableau):
 
     def __post_init__(self):
         s, r = np.size(self.alpha), np.size(self.beta)
-        shapes = dict(alpha=(s,), beta=(r,), A0=(s, s), B0=(s, r), A1=(r, s), B1=(r, r))
-        for name, shape in shapes.items():
-            array = _coefficients(name, getattr(self, name), shape)
-            object.__setattr__(self, name, array)
+        _check_all(
+            self, alpha=(s,), beta=(r,), A0=(s, s), B0=(s, r), A1=(r, s), B1=(r, r)
+        )
 
     @classmethod
     def strong(cls, A, B, alpha, beta) -> "GeneralTableau":
@@ -167,4 +172,73 @@ class GeneralTableau(AbstractTableau):
             stages=tuple(stages),
             matrix=np.block([[self.A0, self.B0], [self.A1, self.B1]]),
             weights=np.concatenate([self.alpha, self.beta]),
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SeparableTableau(AbstractTableau):
+    r"""Coefficients for $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$, with `s` drift
+    and `r` noise stages.
+
+    With $f = -\partial U_0 / \partial q$, $g = \partial V / \partial p$ and
+    $\sigma_k = -\partial U_k / \partial q$, equations (3.4)-(3.5) and (3.13)-(3.14) of
+    Wang, Hong and Xu (2017) are
+
+    $$p_i = P + h \sum_j A^0_{ij} f(t_n + c^0_j h, q_j)
+      + \sum_k \sum_j B^0_{ij} \sigma_k(t_n + c^1_j h, \bar q_j) I_k$$
+
+    $$q_i = Q + h \sum_j A^0_{ij} g(p_j), \qquad
+      \bar q_i = Q + h \sum_j A^1_{ij} g(p_j)$$
+
+    $$P_1 = P + h \sum_i \alpha_i f(t_n + c^0_i h, q_i)
+      + \sum_k \sum_i \beta_i \sigma_k(t_n + c^1_i h, \bar q_i) I_k, \qquad
+      Q_1 = Q + h \sum_i \alpha_i g(p_i)$$
+
+    with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$. (The paper's further weights
+    against other random variables cancel in all of its methods.)
+
+    **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
+    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`.
+
+    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
+    real numbers.
+    """
+
+    alpha: Coefficients
+    beta: Coefficients
+    A0: Coefficients
+    B0: Coefficients
+    A1: Coefficients
+
+    def __post_init__(self):
+        s, r = np.size(self.alpha), np.size(self.beta)
+        _check_all(self, alpha=(s,), beta=(r,), A0=(s, s), B0=(s, r), A1=(r, s))
+
+    @property
+    def c0(self) -> Float[np.ndarray, " s"]:
+        """Times of the drift stages, as fractions of the step."""
+        return self.A0.sum(axis=1)
+
+    @property
+    def c1(self) -> Float[np.ndarray, " r"]:
+        """Times of the noise stages, as fractions of the step."""
+        return self.A1.sum(axis=1)
+
+    def flatten(self) -> FlatTableau:
+        s, r = len(self.alpha), len(self.beta)
+        # The velocity g does not depend on time, so that its stages may share theirs.
+        stages = [Stage(("h",), 0.0, "p", "q") for _ in range(s)]
+        stages += [Stage(("h",), float(c), "q", "p") for c in self.c0]
+        stages += [Stage(("W",), float(c), "q", "p") for c in self.c1]
+        zeros = np.zeros
+        return FlatTableau(
+            stages=tuple(stages),
+            matrix=np.block(
+                [
+                    [zeros((s, s)), self.A0, self.B0],
+                    [self.A0, zeros((s, s)), zeros((s, r))],
+                    [self.A1, zeros((r, s)), zeros((r, r))],
+                ]
+            ),
+            weights=np.concatenate([self.alpha, self.alpha, self.beta]),
         )

@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool, PyTree
 from .._brownian import refuse_half_solver
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
-from .._tableau import AbstractTableau, FlatTableau, Stage
+from .._structure import check_separable
+from .._tableau import AbstractTableau, FlatTableau, SeparableTableau, Stage
 
 
 if TYPE_CHECKING:
@@ -80,8 +81,11 @@ class AbstractSymplecticRungeKutta(
         y0: Y,
         args: Args,
     ) -> _SolverState:
-        del terms, t0, t1, args
+        del t1
         _check_state(y0, type(self).__name__)
+        if isinstance(self.tableau, SeparableTableau):
+            drift, noise = _split(terms)
+            check_separable(drift, noise, t0, y0, args, type(self).__name__)
         return None
 
     def step(

@@ -1,0 +1,69 @@
+from typing import ClassVar
+
+import numpy as np
+import optimistix as optx
+
+from .._root_finder import PicardNewton
+from .._tableau import SeparableTableau
+from .base import AbstractSymplecticRungeKutta
+
+
+_half = np.array([[0.5]])
+_tab = SeparableTableau(alpha=[1], beta=[1], A0=_half, B0=_half, A1=_half)
+
+
+class SRKs2(AbstractSymplecticRungeKutta):
+    r"""The symplectic method SRKs2 of Wang, Hong and Xu, of strong order 1, for
+    $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
+
+    Two of the paper's three noise stages read the same point and enter with opposite
+    weights. What remains is the midpoint rule on the separable system: in the form of
+    [`diffrax_symplectic.SeparableTableau`][], $\alpha = \beta = 1$ and
+    $A^0 = B^0 = A^1 = \frac12$.
+
+    Strong order 1 and weak order 1. Order 2 without noise. A Hamiltonian without the
+    structure is refused while tracing.
+
+    ??? cite "Reference"
+
+        Section 3.2 of
+
+        ```bibtex
+        @article{wang2017construction,
+            author = {Wang, Peng and Hong, Jialin and Xu, Dongsheng},
+            title = {Construction of Symplectic Runge-Kutta Methods for Stochastic
+                     Hamiltonian Systems},
+            journal = {Communications in Computational Physics},
+            volume = {21},
+            number = {1},
+            pages = {237--270},
+            year = {2017},
+            doi = {10.4208/cicp.261014.230616a},
+        }
+        ```
+    """
+
+    root_finder: optx.AbstractRootFinder = PicardNewton()
+    root_find_max_steps: int = 20
+
+    tableau: ClassVar[SeparableTableau] = _tab
+
+    def order(self, terms):
+        del terms
+        return 2
+
+    def strong_order(self, terms):
+        del terms
+        return 1.0
+
+    def weak_order(self, terms):
+        """Order of convergence of expectations."""
+        del terms
+        return 1
+
+
+SRKs2.__init__.__doc__ = """**Arguments:**
+
+- `root_finder`: any Optimistix root finder for the stage equations.
+- `root_find_max_steps`: the most iterations it may take in one step.
+"""

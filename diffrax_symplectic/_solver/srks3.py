@@ -1,0 +1,91 @@
+import functools as ft
+
+import equinox as eqx
+import numpy as np
+import optimistix as optx
+
+from .._root_finder import PicardNewton
+from .._tableau import real_parameter, SeparableTableau
+from .base import AbstractSymplecticRungeKutta
+
+
+def _srks3(a: float) -> SeparableTableau:
+    alpha = np.array([2 * a, 1 - 2 * a])
+    return SeparableTableau(
+        alpha=alpha,
+        beta=[1 / 2, 1 / 2],
+        A0=[[a, 0], [2 * a, 1 / 2 - a]],
+        B0=np.zeros((2, 2)),
+        A1=[alpha, alpha],
+    )
+
+
+class SRKs3(AbstractSymplecticRungeKutta):
+    r"""The symplectic methods SRKs3 of Wang, Hong and Xu, of strong order 1 for any
+    number of noises, for $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
+
+    In the form of [`diffrax_symplectic.SeparableTableau`][], $B^0 = 0$ and
+
+    $$A^0 = \begin{pmatrix} a & 0 \\ 2a & \frac12 - a \end{pmatrix}, \quad
+      \alpha = (2a,\; 1 - 2a), \quad
+      A^1 = \begin{pmatrix} 2a & 1 - 2a \\ 2a & 1 - 2a \end{pmatrix}, \quad
+      \beta = (\tfrac12, \tfrac12).$$
+
+    Two midpoint steps of the drift over the fractions $2a$ and $1 - 2a$ of the step, then
+    the kick $\sum_k \sigma_k(t_{n+1}, Q_1) I_k$. The paper's second noise weight, and
+    with it its other parameters, cancels, since both noise stages read $Q_1$.
+
+    Strong order 1 and weak order 1. Order 2 without noise. A Hamiltonian without the
+    structure is refused while tracing.
+
+    ??? cite "Reference"
+
+        Section 3.2 of
+
+        ```bibtex
+        @article{wang2017construction,
+            author = {Wang, Peng and Hong, Jialin and Xu, Dongsheng},
+            title = {Construction of Symplectic Runge-Kutta Methods for Stochastic
+                     Hamiltonian Systems},
+            journal = {Communications in Computational Physics},
+            volume = {21},
+            number = {1},
+            pages = {237--270},
+            year = {2017},
+            doi = {10.4208/cicp.261014.230616a},
+        }
+        ```
+    """
+
+    a: float = eqx.field(
+        default=0.25, static=True, converter=ft.partial(real_parameter, "a")
+    )
+    root_finder: optx.AbstractRootFinder = PicardNewton()
+    root_find_max_steps: int = 20
+
+    @property
+    def tableau(self) -> SeparableTableau:
+        return _srks3(self.a)
+
+    def order(self, terms):
+        del terms
+        return 2
+
+    def strong_order(self, terms):
+        del terms
+        return 1.0
+
+    def weak_order(self, terms):
+        """Order of convergence of expectations."""
+        del terms
+        return 1
+
+
+SRKs3.__init__.__doc__ = """**Arguments:**
+
+- `a`: the free parameter, a Python float.
+- `root_finder`: any Optimistix root finder for the stage equations.
+- `root_find_max_steps`: the most iterations it may take in one step.
+
+**Raises:** a `ValueError` if `a` is not a finite real number.
+"""
