@@ -75,7 +75,7 @@ def test_kicks_are_explicit_and_only_half_of_the_state_is_solved(solver, blocks)
 
 
 @pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-6)])
-@pytest.mark.parametrize("name", ["SRKw3a", "SRKw3b", "SRKw3c", "SRKw4", "SRKs3"])
+@pytest.mark.parametrize("name", ["SRKw3a", "SRKw3c", "SRKw4", "SRKs3"])
 def test_step_is_symplectic_for_a_thousand_random_systems(name, dtype, bound):
     def defect(key):
         k_problem, k_sizes, k_path, k_h = jr.split(key, 4)
