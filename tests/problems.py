@@ -76,6 +76,18 @@ def random_problem_of_any_size(key, dtype) -> tuple[PyTree, PyTree]:
     }
 
 
+class Given(diffrax.AbstractBrownianPath):
+    """An increment drawn beforehand, the same over every step."""
+
+    W: jax.Array
+    t0 = 0
+    t1 = 1
+    levy_area = diffrax.BrownianIncrement
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        return self.W
+
+
 def weak_path(m: int, key=None, dtype=jnp.float64, **kwargs):
     key = jr.key(0) if key is None else key
     return ds.WeakBrownianPath(jax.ShapeDtypeStruct((m,), dtype), key, **kwargs)

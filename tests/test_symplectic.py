@@ -13,23 +13,12 @@ import diffrax_symplectic as ds
 
 from .problems import (
     GENERAL,
+    Given,
     H0,
     noise,
     random_problem,
     random_problem_of_any_size,
 )
-
-
-class _Given(diffrax.AbstractBrownianPath):
-    """An increment drawn beforehand, so that one compilation serves both paths."""
-
-    W: jax.Array
-    t0 = 0
-    t1 = 1
-    levy_area = diffrax.BrownianIncrement
-
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
-        return self.W
 
 
 def _increments(key, h, dtype):
@@ -51,7 +40,7 @@ def test_step_is_symplectic_for_a_thousand_random_systems(solver, dtype, bound):
         return y0, args, h, _increments(k_path, h, dtype)
 
     def defect(y0, args, h, W):
-        terms = ds.hamiltonian_terms(H0, noise, _Given(W))
+        terms = ds.hamiltonian_terms(H0, noise, Given(W))
         return ds.symplecticity_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
 
     y0, args, h, W = jax.vmap(problem)(jr.split(jr.key(0), 1000))
