@@ -16,16 +16,21 @@ from ._solver import (
     SRKs1 as SRKs1,
     SRKs2 as SRKs2,
     SRKs3 as SRKs3,
+    SRKs4 as SRKs4,
     SRKw1 as SRKw1,
     SRKw2 as SRKw2,
     SRKw3 as SRKw3,
     SRKw4 as SRKw4,
+    SRKw5 as SRKw5,
 )
 from ._tableau import (
     AbstractTableau as AbstractTableau,
+    AdditiveTableau as AdditiveTableau,
     GeneralTableau as GeneralTableau,
+    SeparableTableau as SeparableTableau,
 )
 from ._verify import (
+    second_moment_map as second_moment_map,
     step_expectation as step_expectation,
     symplecticity_defect as symplecticity_defect,
     weak_order_defect as weak_order_defect,

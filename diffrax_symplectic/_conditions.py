@@ -3,7 +3,12 @@
 import numpy as np
 from jaxtyping import Float
 
-from ._tableau import AbstractTableau, GeneralTableau
+from ._tableau import (
+    AbstractTableau,
+    AdditiveTableau,
+    GeneralTableau,
+    SeparableTableau,
+)
 
 
 def symplectic_residuals(tableau: AbstractTableau) -> Float[np.ndarray, "s s"]:
@@ -36,13 +41,20 @@ def symplectic_residuals(tableau: AbstractTableau) -> Float[np.ndarray, "s s"]:
     return np.where(reads & reads.T, residuals, 0.0)
 
 
-def weak_order_residuals(tableau: GeneralTableau, order: int) -> dict[str, float]:
-    r"""Residuals of the conditions for weak order 1 or 2 of a Stratonovich method with
-    three-point increments: weak order 1 for any number of noises, weak order 2 for one.
+def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, float]:
+    r"""Residuals of the conditions for weak order 1 or 2.
+
+    - For a [`diffrax_symplectic.GeneralTableau`][] with three-point increments: weak
+        order 1 for any number of noises, weak order 2 for one.
+    - For a [`diffrax_symplectic.SeparableTableau`][] with three-point increments, what
+        remains of the conditions for Itô equations if the noise does not read what it
+        changes: again order 2 is for one noise.
+    - For a [`diffrax_symplectic.AdditiveTableau`][]: any number of noises, with
+        constant $b_k$ if the tableau is `constant`.
 
     **Arguments:**
 
-    - `tableau`: a [`diffrax_symplectic.GeneralTableau`][].
+    - `tableau`: any tableau of this package.
     - `order`: 1 or 2.
 
     **Returns:** the residual of each condition, by its formula. The conditions for order
@@ -64,7 +76,105 @@ def weak_order_residuals(tableau: GeneralTableau, order: int) -> dict[str, float
             doi = {10.1007/s10543-007-0130-3},
         }
         ```
+
+        ```bibtex
+        @article{rossler2009second,
+            author = {R\"{o}\ss{}ler, Andreas},
+            title = {Second Order Runge--Kutta Methods for It\^{o} Stochastic
+                     Differential Equations},
+            journal = {SIAM Journal on Numerical Analysis},
+            volume = {47},
+            number = {3},
+            pages = {1713--1738},
+            year = {2009},
+            doi = {10.1137/060673308},
+        }
+        ```
     """
+    if order not in (1, 2):
+        raise ValueError(f"`order` must be 1 or 2; got {order!r}.")
+    if isinstance(tableau, GeneralTableau):
+        first, second = _weak_general(tableau)
+    elif isinstance(tableau, SeparableTableau):
+        first, second = _weak_separable(tableau)
+    else:
+        assert isinstance(tableau, AdditiveTableau)
+        first, second = _weak_additive(tableau)
+    conditions = first if order == 1 else first | second
+    return {name: float(value) for name, value in conditions.items()}
+
+
+def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
+    r"""Residuals of the conditions for the strong order that tableaus of one kind can
+    have, with Gaussian increments:
+
+    - 1/2 for a [`diffrax_symplectic.GeneralTableau`][], and 1 if the noises commute,
+        since every noise has the same coefficients;
+    - 1 for a [`diffrax_symplectic.SeparableTableau`][];
+    - 3/2 for an [`diffrax_symplectic.AdditiveTableau`][], in the variables $I_k = W_k$
+        and $I_{k0} / h = W_k / 2 + H_k$.
+
+    **Arguments:**
+
+    - `tableau`: any tableau of this package.
+
+    **Returns:** the residual of each condition, by its formula.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{burrage2000order,
+            author = {Burrage, K. and Burrage, P. M.},
+            title = {Order Conditions of Stochastic Runge--Kutta Methods by B-Series},
+            journal = {SIAM Journal on Numerical Analysis},
+            volume = {38},
+            number = {5},
+            pages = {1626--1646},
+            year = {2000},
+            doi = {10.1137/S0036142999363206},
+        }
+        ```
+
+        ```bibtex
+        @article{rossler2010runge,
+            author = {R\"{o}\ss{}ler, Andreas},
+            title = {Runge--Kutta Methods for the Strong Approximation of Solutions of
+                     Stochastic Differential Equations},
+            journal = {SIAM Journal on Numerical Analysis},
+            volume = {48},
+            number = {3},
+            pages = {922--952},
+            year = {2010},
+            doi = {10.1137/09076636X},
+        }
+        ```
+    """
+    if isinstance(tableau, GeneralTableau):
+        conditions = {
+            "alpha.e - 1": tableau.alpha.sum() - 1,
+            "beta.e - 1": tableau.beta.sum() - 1,
+            "beta.B1e - 1/2": tableau.beta @ tableau.B1.sum(axis=1) - 1 / 2,
+        }
+    elif isinstance(tableau, SeparableTableau):
+        conditions = {
+            "alpha.e - 1": tableau.alpha.sum() - 1,
+            "beta.e - 1": tableau.beta["W"].sum() - 1,
+            **_others_vanish(tableau, e=np.ones(len(tableau.c1)), A1e=tableau.c1),
+        }
+    else:
+        assert isinstance(tableau, AdditiveTableau)
+        first, second = _weak_additive(tableau)
+        beta, B, c1 = tableau.beta, tableau.B, tableau.c1
+        time_area = {
+            "alpha.B[H]e - 1": tableau.alpha @ B["H"].sum(axis=1) - 1,
+            "beta[W].c1 - 1/2": beta["W"] @ c1 - 1 / 2,
+            "beta[H].c1 + 1": beta["H"] @ c1 + 1,
+        }
+        conditions = first | second | time_area
+    return {name: float(value) for name, value in conditions.items()}
+
+
+def _weak_general(tableau: GeneralTableau) -> tuple[dict, dict]:
     al, be = tableau.alpha, tableau.beta
     A0, A1, B0, B1 = tableau.A0, tableau.A1, tableau.B0, tableau.B1
     A0e, A1e, B0e, B1e = (x.sum(axis=1) for x in (A0, A1, B0, B1))
@@ -89,41 +199,57 @@ def weak_order_residuals(tableau: GeneralTableau, order: int) -> dict[str, float
         "beta.((A1e)(B1e)) - 1/4": be @ (A1e * B1e) - 1 / 4,
         "beta.B1(A1e) - 1/4": be @ B1 @ A1e - 1 / 4,
     }
-    if order not in (1, 2):
-        raise ValueError(f"`order` must be 1 or 2; got {order!r}.")
-    conditions = first if order == 1 else first | second
-    return {name: float(value) for name, value in conditions.items()}
+    return first, second
 
 
-def strong_order_residuals(tableau: GeneralTableau) -> dict[str, float]:
-    r"""Residuals of the conditions for strong order 1/2 of a Stratonovich method with
-    Gaussian increments. They also give strong order 1 for noises that commute, since
-    every noise has the same coefficients.
-
-    **Arguments:**
-
-    - `tableau`: a [`diffrax_symplectic.GeneralTableau`][].
-
-    **Returns:** the residual of each condition, by its formula.
-
-    ??? cite "Reference"
-
-        ```bibtex
-        @article{burrage2000order,
-            author = {Burrage, K. and Burrage, P. M.},
-            title = {Order Conditions of Stochastic Runge--Kutta Methods by B-Series},
-            journal = {SIAM Journal on Numerical Analysis},
-            volume = {38},
-            number = {5},
-            pages = {1626--1646},
-            year = {2000},
-            doi = {10.1137/S0036142999363206},
-        }
-        ```
-    """
-    conditions = {
-        "alpha.e - 1": tableau.alpha.sum() - 1,
-        "beta.e - 1": tableau.beta.sum() - 1,
-        "beta.B1e - 1/2": tableau.beta @ tableau.B1.sum(axis=1) - 1 / 2,
+def _weak_separable(tableau: SeparableTableau) -> tuple[dict, dict]:
+    al, be = tableau.alpha, tableau.beta["W"]
+    A0e, A1, A1e = tableau.c0, tableau.A1, tableau.c1
+    B0e = tableau.B0["W"].sum(axis=1)
+    e = np.ones(len(A1))
+    first = {
+        "alpha.e - 1": al.sum() - 1,
+        "(beta.e)^2 - 1": be.sum() ** 2 - 1,
+        **_others_vanish(tableau, e=e),
     }
-    return {name: float(value) for name, value in conditions.items()}
+    second = {
+        "alpha.A0e - 1/2": al @ A0e - 1 / 2,
+        "(beta.e)(alpha.B0e) - 1/2": be.sum() * (al @ B0e) - 1 / 2,
+        "alpha.(B0e)^2 - 1/2": al @ B0e**2 - 1 / 2,
+        "(beta.e)(beta.A1e) - 1/2": be.sum() * (be @ A1e) - 1 / 2,
+        "beta.A1(B0e)": be @ A1 @ B0e,
+        "beta.A1((B0e)^2)": be @ A1 @ B0e**2,
+        **_others_vanish(tableau, A1e=A1e, **{"A1(B0e)": A1 @ B0e}),
+    }
+    return first, second
+
+
+def _others_vanish(tableau: SeparableTableau, **moments: np.ndarray) -> dict:
+    """Weights of random variables other than `W` that must not show."""
+    return {
+        f"beta[{name}].{label}": weights @ moment
+        for name, weights in tableau.beta.items()
+        if name != "W"
+        for label, moment in moments.items()
+    }
+
+
+# Variances of the random variables of a step, in units of its size.
+_VARIANCE = {"W": 1, "second": 1, "H": 1 / 12}
+
+
+def _weak_additive(tableau: AdditiveTableau) -> tuple[dict, dict]:
+    al, B = tableau.alpha, {k: v.sum(axis=1) for k, v in tableau.B.items()}
+    first = {"alpha.e - 1": al.sum() - 1}
+    for name, weights in tableau.beta.items():
+        exact = 1 if name == "W" else 0
+        first[f"beta[{name}].e - {exact}"] = weights.sum() - exact
+    squares = sum(_VARIANCE[name] * (al @ Be**2) for name, Be in B.items())
+    second = {
+        "alpha.Ae - 1/2": al @ tableau.c0 - 1 / 2,
+        "alpha.B[W]e - 1/2": al @ B["W"] - 1 / 2,
+        "sum over variables: variance alpha.(Be)^2 - 1/2": squares - 1 / 2,
+    }
+    if not tableau.constant:
+        second["beta[W].c1 - 1/2"] = tableau.beta["W"] @ tableau.c1 - 1 / 2
+    return first, second

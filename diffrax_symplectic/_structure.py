@@ -52,6 +52,28 @@ def check_separable(
         )
 
 
+def check_additive(
+    noise: tuple, t0: RealScalarLike, y0: Y, args: Args, solver: str, constant: bool
+) -> None:
+    """Raises a `ValueError`, while tracing, unless the noise does not depend on the state
+    nor, if it has to be `constant`, on time."""
+    needs = "needs additive noise, H_k = -sigma_k(t).q + gamma_k(t).p"
+    for term in noise:
+        _refuse_unless(
+            _independent(_noise_matrix, "y", term, t0, y0, args),
+            f"`{solver}` {needs}, but db_k/dy, the derivative of the noise b_k = "
+            "(-dH_k/dq, dH_k/dp) by the state, does not vanish. Use a solver for the "
+            "general structure, for example `Midpoint` or `SRKw1`.",
+        )
+        if constant:
+            _refuse_unless(
+                _independent(_noise_matrix, "t", term, t0, y0, args),
+                f"`{solver}` needs additive noise that is constant in time, but "
+                "db_k/dt does not vanish. Use `SRKs4`, or a solver for the general "
+                "structure, for example `Midpoint` or `SRKw1`.",
+            )
+
+
 def _refuse_unless(condition: bool, message: str) -> None:
     if not condition:
         raise ValueError(message)
@@ -67,7 +89,8 @@ def _noise_matrix(term: diffrax.AbstractTerm, t, y, args) -> Y:
 
 
 def _independent(fn: Callable, of: str, term, t0, y0, args) -> bool:
-    """Whether `fn(term, t, (p, q), args)` does not depend on `t`, `p` or `q`.
+    """Whether `fn(term, t, y, args)` does not depend on `t`, on `y`, or for `y = (p, q)`
+    on `p` or `q`.
 
     First by the program: most are written so that the other variable does not enter.
     If it enters, it may still cancel: then the derivative is computed at random points.
@@ -75,11 +98,15 @@ def _independent(fn: Callable, of: str, term, t0, y0, args) -> bool:
     t0 = jnp.asarray(t0, jnp.result_type(float))
 
     def split(x, term, t, y, args):
-        p, q = y
-        replaced = dict(t=(x, y), p=(t, (x, q)), q=(t, (p, x)))[of]
-        return fn(term, *replaced, args)
+        if of == "t":
+            t = x
+        elif of == "y":
+            y = x
+        else:
+            y = (x, y[1]) if of == "p" else (y[0], x)
+        return fn(term, t, y, args)
 
-    x0 = dict(t=t0, p=y0[0], q=y0[1])[of]
+    x0 = t0 if of == "t" else y0 if of == "y" else y0["pq".index(of)]
     inputs = (x0, term, t0, y0, args)
     if not _reads_first(split, inputs):
         return True

@@ -9,21 +9,28 @@ systems are solved are then questions about that one matrix, answered once.
 
 import abc
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
+from ._custom_types import Args, RealScalarLike, Y
+from ._structure import check_additive, check_separable
+
 
 # Anything that NumPy makes an array of; a read-only array of float64 once checked.
 Coefficients: TypeAlias = Any
+# The same for each random variable of a step, by its name. Without a name it is "W".
+CoefficientsByVariable: TypeAlias = Any
 
 
 class Stage(NamedTuple):
     """One evaluation, `y -> sum over channels of (vector field times control)`.
 
     - `channels`: the controls that drive it: `"h"` is the drift, driven by time; any
-        other name is the noise, driven by the random variable of that name.
+        other name is the noise, driven by the random variable of that name among the
+        attributes of the Brownian increment.
     - `c`: where in the step it is evaluated, as a fraction of the step.
     - `reads`: the part of the state it depends on, `"y"` (all), `"p"`, `"q"` or `""`.
     - `writes`: the part of the state it changes, `"y"`, `"p"` or `"q"`.
@@ -60,6 +67,19 @@ class AbstractTableau(abc.ABC):
     def flatten(self) -> FlatTableau:
         """All stages of the tableau, dead ones included, as one matrix."""
 
+    @abc.abstractmethod
+    def check_structure(
+        self,
+        drift: tuple,
+        noise: tuple,
+        t0: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver: str,
+    ) -> None:
+        """Raises a `ValueError`, while tracing, unless the terms have the structure that
+        the coefficients are for."""
+
 
 def _coefficients(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
     array = np.asarray(value)
@@ -82,6 +102,30 @@ def _check_all(tableau, **shapes: tuple[int, ...]) -> None:
     for name, shape in shapes.items():
         array = _coefficients(name, getattr(tableau, name), shape)
         object.__setattr__(tableau, name, array)
+
+
+def _check_by_variable(tableau, **shapes: tuple[int, ...]) -> None:
+    """Brings coefficients into the form of a dictionary over the random variables."""
+    for name, shape in shapes.items():
+        value = getattr(tableau, name)
+        named = value if isinstance(value, Mapping) else {"W": value}
+        checked = {
+            k: _coefficients(f"{name}[{k!r}]", v, shape) for k, v in named.items()
+        }
+        object.__setattr__(tableau, name, checked)
+
+
+def _columns(
+    coefficients: Mapping[str, np.ndarray], variables: list[str], shape: tuple[int, ...]
+) -> np.ndarray:
+    """Those for all of `variables`, side by side; zero where there are none."""
+    zeros = np.zeros(shape)
+    return np.concatenate([coefficients.get(v, zeros) for v in variables], axis=-1)
+
+
+def _variables(*coefficients: Mapping[str, np.ndarray]) -> list[str]:
+    """All random variables, in the order of their first appearance."""
+    return list(dict.fromkeys(name for c in coefficients for name in c))
 
 
 def real_parameter(name: str, value: Any) -> float:
@@ -174,6 +218,9 @@ class GeneralTableau(AbstractTableau):
             weights=np.concatenate([self.alpha, self.beta]),
         )
 
+    def check_structure(self, drift, noise, t0, y0, args, solver) -> None:
+        """Any structure will do."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SeparableTableau(AbstractTableau):
@@ -194,25 +241,27 @@ class SeparableTableau(AbstractTableau):
       + \sum_k \sum_i \beta_i \sigma_k(t_n + c^1_i h, \bar q_i) I_k, \qquad
       Q_1 = Q + h \sum_i \alpha_i g(p_i)$$
 
-    with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$. (The paper's further weights
-    against other random variables cancel in all of its methods.)
+    with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$.
 
     **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
-    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`.
+    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`. `beta` and `B0` may also be
+    dictionaries from the names of several random variables, of which `"W"` is $I_k$, to
+    such arrays: then the equations hold with a sum over these.
 
     **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
     real numbers.
     """
 
     alpha: Coefficients
-    beta: Coefficients
+    beta: CoefficientsByVariable
     A0: Coefficients
-    B0: Coefficients
+    B0: CoefficientsByVariable
     A1: Coefficients
 
     def __post_init__(self):
-        s, r = np.size(self.alpha), np.size(self.beta)
-        _check_all(self, alpha=(s,), beta=(r,), A0=(s, s), B0=(s, r), A1=(r, s))
+        s, r = np.size(self.alpha), len(self.A1)
+        _check_all(self, alpha=(s,), A0=(s, s), A1=(r, s))
+        _check_by_variable(self, beta=(r,), B0=(s, r))
 
     @property
     def c0(self) -> Float[np.ndarray, " s"]:
@@ -225,20 +274,90 @@ class SeparableTableau(AbstractTableau):
         return self.A1.sum(axis=1)
 
     def flatten(self) -> FlatTableau:
-        s, r = len(self.alpha), len(self.beta)
+        s, r = len(self.alpha), len(self.c1)
+        variables = _variables(self.B0, self.beta)
+        B0 = _columns(self.B0, variables, (s, r))
+        A1 = np.concatenate([self.A1] * len(variables))
         # The velocity g does not depend on time, so that its stages may share theirs.
         stages = [Stage(("h",), 0.0, "p", "q") for _ in range(s)]
         stages += [Stage(("h",), float(c), "q", "p") for c in self.c0]
-        stages += [Stage(("W",), float(c), "q", "p") for c in self.c1]
+        stages += [Stage((v,), float(c), "q", "p") for v in variables for c in self.c1]
         zeros = np.zeros
+        n = len(A1)
         return FlatTableau(
             stages=tuple(stages),
             matrix=np.block(
                 [
-                    [zeros((s, s)), self.A0, self.B0],
-                    [self.A0, zeros((s, s)), zeros((s, r))],
-                    [self.A1, zeros((r, s)), zeros((r, r))],
+                    [zeros((s, s)), self.A0, B0],
+                    [self.A0, zeros((s, s)), zeros((s, n))],
+                    [A1, zeros((n, s)), zeros((n, n))],
                 ]
             ),
-            weights=np.concatenate([self.alpha, self.alpha, self.beta]),
+            weights=np.concatenate(
+                [self.alpha, self.alpha, _columns(self.beta, variables, (r,))]
+            ),
         )
+
+    def check_structure(self, drift, noise, t0, y0, args, solver) -> None:
+        check_separable(drift, noise, t0, y0, args, solver)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class AdditiveTableau(AbstractTableau):
+    r"""Coefficients for noise that does not depend on the state, $b_k(t)$, with `s` drift
+    stages and `r` times at which the noise is read.
+
+    With several random variables $\xi^\nu_k$ in a step, equations (4.4)-(4.5) and
+    (4.8)-(4.9) of Wang, Hong and Xu (2017) are
+
+    $$G_i = y_n + h \sum_j A_{ij} a(t_n + c^0_j h, G_j)
+      + \sum_\nu \sum_k \sum_j B^\nu_{ij} b_k(t_n + c^1_j h)\, \xi^\nu_k$$
+
+    $$y_{n+1} = y_n + h \sum_i \alpha_i a(t_n + c^0_i h, G_i)
+      + \sum_\nu \sum_k \sum_j \beta^\nu_j b_k(t_n + c^1_j h)\, \xi^\nu_k$$
+
+    with stage times $c^0 = A e$. Symplecticity asks nothing of $B$ and $\beta$.
+
+    **Arguments:** `alpha` of shape `(s,)`, `A` of shape `(s, s)`, `c1` of shape `(r,)`;
+    `beta` and `B`, dictionaries from the names of random variables (attributes of the
+    Brownian increment, of which `"W"` is $I_k$) to arrays of shape `(r,)` and `(s, r)`, or
+    just such an array for `"W"`; `constant`, whether the noise must not depend on time
+    either.
+
+    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
+    real numbers.
+    """
+
+    alpha: Coefficients
+    beta: CoefficientsByVariable
+    A: Coefficients
+    B: CoefficientsByVariable
+    c1: Coefficients
+    constant: bool = False
+
+    def __post_init__(self):
+        s, r = np.size(self.alpha), np.size(self.c1)
+        _check_all(self, alpha=(s,), A=(s, s), c1=(r,))
+        _check_by_variable(self, beta=(r,), B=(s, r))
+
+    @property
+    def c0(self) -> Float[np.ndarray, " s"]:
+        """Times of the drift stages, as fractions of the step."""
+        return self.A.sum(axis=1)
+
+    def flatten(self) -> FlatTableau:
+        s, r = len(self.alpha), len(self.c1)
+        variables = _variables(self.B, self.beta)
+        B = _columns(self.B, variables, (s, r))
+        stages = [Stage(("h",), float(c), "y", "y") for c in self.c0]
+        stages += [Stage((v,), float(c), "", "y") for v in variables for c in self.c1]
+        n = len(variables) * r
+        return FlatTableau(
+            stages=tuple(stages),
+            matrix=np.block([[self.A, B], [np.zeros((n, s + n))]]),
+            weights=np.concatenate([self.alpha, _columns(self.beta, variables, (r,))]),
+        )
+
+    def check_structure(self, drift, noise, t0, y0, args, solver) -> None:
+        del drift
+        check_additive(noise, t0, y0, args, solver, self.constant)

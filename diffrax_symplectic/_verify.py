@@ -1,6 +1,5 @@
 """Tests of a solver by one step, without Monte Carlo error."""
 
-import itertools
 from collections.abc import Callable
 from typing import cast
 
@@ -14,9 +13,9 @@ import numpy as np
 from equinox.internal import ω
 from jaxtyping import Array, Float, PyTree
 
-from ._brownian import WeakBrownianPath, WeakIncrement
 from ._custom_types import Args, RealScalarLike, Y
 from ._hamiltonian import check_pair
+from ._outcomes import outcomes
 
 
 def _one_step(terms, solver, t0, t1, y0, args) -> tuple[Y, diffrax.RESULTS]:
@@ -85,41 +84,87 @@ def step_expectation(
     args: Args = None,
     *,
     fn: Callable[[Y], PyTree[Array]],
+    nodes: int = 8,
 ) -> PyTree[Array]:
-    r"""The exact expectation $\mathbb E[\phi(y_1)]$ after one step from `y0`.
+    r"""The expectation $\mathbb E[\phi(y_1)]$ after one step from `y0`, without sampling.
 
     The random variables of a [`diffrax_symplectic.WeakBrownianPath`][] take finitely
     many values, so that the expectation is a finite sum: $3^m$ outcomes for $m$ noises,
     $9^m$ with the second set of three-point variables, and $2^m$ times as many with the
-    two-point ones.
+    two-point ones. For Gaussian increments (and space-time Lévy areas) of a path of
+    Diffrax it is computed by Gauss--Hermite quadrature, exact if $\phi(y_1)$ is a
+    polynomial in these of degree less than twice `nodes`.
 
     **Arguments:**
 
     - `terms`, `solver`, `y0`, `args`: as for `diffrax.diffeqsolve`; `terms` with one
-        `WeakBrownianPath`.
+        Brownian path.
     - `t0`, `t1`: start and end of the step.
     - `fn`: the function $\phi$ of the state, to arrays.
+    - `nodes`: points of the quadrature in each Gaussian variable.
 
     **Returns:** what `fn` returns, averaged.
 
-    **Raises:** a `ValueError` if `terms` does not hold exactly one `WeakBrownianPath`; an
+    **Raises:** a `ValueError` if `terms` does not hold exactly one path of a known law; an
     error when run if the solver reports that a step failed.
     """
-    path = _weak_path(terms)
-    increments, weights = _outcomes(path, t1 - t0)
 
-    def outcome(increment):
-        given = _FixedIncrement(increment)  # pyright: ignore[reportCallIssue]
-        is_path = lambda x: isinstance(x, WeakBrownianPath)
-        fixed = jtu.tree_map(
-            lambda x: given if is_path(x) else x,
-            terms,
-            is_leaf=is_path,
-        )
-        y1, result = _one_step(fixed, solver, t0, t1, y0, args)
+    def outcome(terms):
+        y1, result = _one_step(terms, solver, t0, t1, y0, args)
         return fn(y1), result
 
-    values, result = jax.vmap(outcome)(increments)
+    return _average(outcome, terms, t1 - t0, nodes)
+
+
+def second_moment_map(
+    terms: PyTree[diffrax.AbstractTerm],
+    solver: diffrax.AbstractSolver,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    y0: Y,
+    args: Args = None,
+    *,
+    nodes: int = 8,
+) -> Float[Array, "N N"]:
+    r"""The linear map by which one step moves first and second moments, for a linear
+    system (with additive or multiplicative noise).
+
+    There a step is $z_1 = Z z_0$ with a random matrix $Z$, for $z = (1, y)$ and $y$ the
+    state as one vector of length $n$. So $\mathrm{vec}\, \mathbb E[z_1 z_1^\top] = K\,
+    \mathrm{vec}\, \mathbb E[z_0 z_0^\top]$ with $K = \mathbb E[Z \otimes Z]$, and $N$
+    steps are $K^N$: moments over a whole solve, without sampling. The spectral radius of
+    $K$ is the growth of the mean square per step. Random variables are treated as in
+    [`diffrax_symplectic.step_expectation`][].
+
+    **Arguments:** as for [`diffrax_symplectic.step_expectation`][]; of `y0` only the
+    structure, shapes and dtype matter. The system has to be linear and autonomous, which
+    is not checked.
+
+    **Returns:** the matrix $K$, of shape `((n + 1)**2, (n + 1)**2)`.
+
+    **Raises:** as [`diffrax_symplectic.step_expectation`][].
+    """
+    flat, unravel = jfu.ravel_pytree(y0)
+
+    def outcome(terms):
+        def step(y):
+            y1, result = _one_step(terms, solver, t0, t1, unravel(y), args)
+            return jfu.ravel_pytree(y1)[0], result
+
+        zero = jnp.zeros_like(flat)
+        offset, result = step(zero)
+        matrix, _ = jax.jacrev(step, has_aux=True)(zero)
+        first = jnp.zeros_like(flat, shape=(1, flat.size + 1)).at[0, 0].set(1)
+        Z = jnp.concatenate([first, jnp.concatenate([offset[:, None], matrix], axis=1)])
+        return jnp.kron(Z, Z), result
+
+    return _average(outcome, terms, t1 - t0, nodes)
+
+
+def _average(outcome: Callable, terms, h, nodes: int) -> PyTree[Array]:
+    """The expectation of `outcome(terms) -> (value, result)`."""
+    increments, weights, put = outcomes(terms, h, nodes)
+    values, result = jax.vmap(lambda increment: outcome(put(increment)))(increments)
     failed = jnp.any(result != diffrax.RESULTS.successful)
     values = eqx.error_if(
         values, failed, "A step failed: its stage equations could not be solved."
@@ -139,6 +184,7 @@ def weak_order_defect(
     *,
     fn: Callable[[Y], PyTree[Array]],
     order: int,
+    nodes: int = 8,
 ) -> PyTree[Array]:
     r"""The exact local weak error of one step,
 
@@ -160,7 +206,7 @@ def weak_order_defect(
 
     **Raises:** as [`diffrax_symplectic.step_expectation`][].
     """
-    expected = step_expectation(terms, solver, t0, t1, y0, args, fn=fn)
+    expected = step_expectation(terms, solver, t0, t1, y0, args, fn=fn, nodes=nodes)
     L = _generator(terms, args, ito=isinstance(solver, diffrax.AbstractItoSolver))
     phi = lambda t, y: fn(y)
     h, factor = t1 - t0, 1.0
@@ -210,60 +256,3 @@ def _generator(terms, args, ito: bool) -> Callable:
         return L_phi
 
     return L
-
-
-class _FixedIncrement(diffrax.AbstractBrownianPath):
-    """The same, given increment over every step."""
-
-    increment: WeakIncrement
-
-    @property
-    def t0(self):
-        return -jnp.inf
-
-    @property
-    def t1(self):
-        return jnp.inf
-
-    @property
-    def levy_area(self):
-        return WeakIncrement
-
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
-        del t0, t1, left
-        return self.increment if use_levy else self.increment.W
-
-
-def _weak_path(terms) -> WeakBrownianPath:
-    is_path = lambda x: isinstance(x, diffrax.AbstractBrownianPath)
-    paths = [x for x in jtu.tree_leaves(terms, is_leaf=is_path) if is_path(x)]
-    if len(paths) != 1 or not isinstance(paths[0], WeakBrownianPath):
-        raise ValueError(
-            "`terms` must hold exactly one Brownian path, a `WeakBrownianPath`, whose "
-            f"outcomes can be enumerated; got {[type(p).__name__ for p in paths]}."
-        )
-    return paths[0]
-
-
-def _outcomes(path: WeakBrownianPath, h) -> tuple[WeakIncrement, np.ndarray]:
-    """Every value of the increments of one step, stacked, and its probability."""
-    three = ((-np.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (np.sqrt(3.0), 1 / 6))
-    two = ((-1.0, 1 / 2), (1.0, 1 / 2))
-    struct = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), path.shape)
-    flat, unravel = jfu.ravel_pytree(struct)
-    m = flat.size
-    laws = [three] * m + [three] * (m * path.second) + [two] * (m * path.two_point)
-    table = list(itertools.product(*laws))
-    values = np.array([[v for v, _ in row] for row in table])
-    weights = np.array([np.prod([w for _, w in row]) for row in table])
-    scaled = jnp.sqrt(jnp.abs(h)) * values
-
-    def pick(columns) -> PyTree[Array]:
-        return jax.vmap(unravel)(columns.astype(flat.dtype))
-
-    blocks = [pick(scaled[:, i : i + m]) for i in range(0, len(laws), m)]
-    blocks += [None] * (3 - len(blocks))
-    if path.two_point and not path.second:
-        blocks = [blocks[0], None, blocks[1]]
-    dt = jtu.tree_map(lambda s: jnp.full(len(table), h, s.dtype), path.shape)
-    return WeakIncrement(dt, *blocks), weights

@@ -76,16 +76,54 @@ def random_problem_of_any_size(key, dtype) -> tuple[PyTree, PyTree]:
     }
 
 
+class _AnyIncrement(diffrax.AbstractSpaceTimeLevyArea, ds.WeakIncrement):
+    """An increment with everything that a solver may ask for."""
+
+    H: PyTree = None
+
+
 class Given(diffrax.AbstractBrownianPath):
     """An increment drawn beforehand, the same over every step."""
 
     W: jax.Array
+    H: jax.Array | None = None
+    second: jax.Array | None = None
     t0 = 0
     t1 = 1
-    levy_area = diffrax.BrownianIncrement
+    levy_area = _AnyIncrement
 
     def evaluate(self, t0, t1=None, left=True, use_levy=False):
-        return self.W
+        if not use_levy:
+            return self.W
+        return _AnyIncrement(t1 - t0, self.W, self.second, None, self.H)
+
+
+class FineSample(diffrax.AbstractBrownianPath):
+    """One Brownian path over [0, 1] by the values of `w` and of its integral over time on
+    a fine grid, jointly Gaussian: coarse increments and areas are sums of fine ones."""
+
+    w: jax.Array
+    integral: jax.Array
+    t0 = 0
+    t1 = 1
+    levy_area = diffrax.SpaceTimeLevyArea
+
+    @staticmethod
+    def draw(key, steps: int, m: int, dtype=jnp.float64) -> "FineSample":
+        dw, H = jr.normal(key, (2, steps, m), dtype) / np.sqrt(steps)
+        H = H / np.sqrt(12)
+        from_zero = lambda x: jnp.concatenate([jnp.zeros_like(x[:1]), jnp.cumsum(x, 0)])
+        w = from_zero(dw)
+        return FineSample(w, from_zero((w[:-1] + dw / 2 + H) / steps))
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        i, j = (jnp.round(t * (len(self.w) - 1)).astype(int) for t in (t0, t1))
+        W = self.w[j] - self.w[i]
+        if not use_levy:
+            return W
+        h = t1 - t0
+        mean = (self.integral[j] - self.integral[i]) / h - self.w[i]
+        return diffrax.SpaceTimeLevyArea(dt=h, W=W, H=mean - W / 2)
 
 
 def weak_path(m: int, key=None, dtype=jnp.float64, **kwargs):

@@ -17,6 +17,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from .problems import (
+    FineSample,
     GENERAL,
     H0,
     kubo_terms,
@@ -31,19 +32,6 @@ from .problems import (
 all_solvers = pytest.mark.parametrize("solver", GENERAL.values(), ids=GENERAL.keys())
 
 
-class _FineSample(diffrax.AbstractBrownianPath):
-    """One Brownian path by its values on a fine grid over [0, 1]."""
-
-    w: jax.Array
-    t0 = 0
-    t1 = 1
-    levy_area = diffrax.BrownianIncrement
-
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
-        at = lambda t: self.w[jnp.round(t * (len(self.w) - 1)).astype(int)]
-        return at(t1) - at(t0)
-
-
 def _strong_slope(solver, m, steps, reference, samples=200):
     y0, args = random_problem(jr.key(11), 1, m)
     fine = 2**reference
@@ -51,11 +39,9 @@ def _strong_slope(solver, m, steps, reference, samples=200):
     @jax.jit
     @jax.vmap
     def ends(key):
-        dw = jr.normal(key, (fine, m)) / np.sqrt(fine)
-        w = jnp.concatenate([jnp.zeros((1, m)), jnp.cumsum(dw, axis=0)])
         # Stronger noise than elsewhere, for its errors to lead.
         strong = args | {"noise": (1.5 * args["noise"][0], *args["noise"][1:])}
-        terms = ds.hamiltonian_terms(H0, noise, _FineSample(w))
+        terms = ds.hamiltonian_terms(H0, noise, FineSample.draw(key, fine, m))
         solve = lambda h: jnp.concatenate(
             diffrax.diffeqsolve(terms, solver, 0.0, 1.0, h, y0, strong).ys, axis=1
         )[0]

@@ -2,7 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable
-from typing import ClassVar, TYPE_CHECKING, TypeAlias
+from typing import ClassVar, NamedTuple, TYPE_CHECKING, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -14,11 +14,10 @@ import optimistix as optx
 from equinox.internal import ω
 from jaxtyping import Array, Bool, PyTree
 
-from .._brownian import refuse_half_solver
+from .._brownian import refuse_half_solver, WeakIncrement
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
-from .._structure import check_separable
-from .._tableau import AbstractTableau, FlatTableau, SeparableTableau, Stage
+from .._tableau import AbstractTableau, FlatTableau, Stage
 
 
 if TYPE_CHECKING:
@@ -71,6 +70,9 @@ class AbstractSymplecticRungeKutta(
     @property
     def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
         """The least that the increments of the path have to hold."""
+        for name in _variables(make_plan(self.tableau.flatten()).tableau):
+            if name in _PROVIDED_BY:
+                return _PROVIDED_BY[name].increment
         return diffrax.AbstractBrownianIncrement
 
     def init(
@@ -83,9 +85,8 @@ class AbstractSymplecticRungeKutta(
     ) -> _SolverState:
         del t1
         _check_state(y0, type(self).__name__)
-        if isinstance(self.tableau, SeparableTableau):
-            drift, noise = _split(terms)
-            check_separable(drift, noise, t0, y0, args, type(self).__name__)
+        drift, noise = _split(terms)
+        self.tableau.check_structure(drift, noise, t0, y0, args, type(self).__name__)
         return None
 
     def step(
@@ -99,8 +100,10 @@ class AbstractSymplecticRungeKutta(
         made_jump: BoolScalarLike,
     ) -> tuple[Y, None, DenseInfo, _SolverState, diffrax.RESULTS]:
         del solver_state, made_jump
-        evaluate = _Evaluate(terms, t0, t1, args)
-        plan = make_plan(evaluate.drop_absent(self.tableau.flatten()))
+        drift, noise = _split(terms)
+        plan = make_plan(_drop_absent(self.tableau.flatten(), drift, noise))
+        variables = _variables(plan.tableau)
+        evaluate = _Evaluate(drift, noise, variables, t0, t1, args, type(self).__name__)
         stages, matrix = plan.tableau.stages, plan.tableau.matrix
         values: dict[int, _Value] = {}
         result = diffrax.RESULTS.successful
@@ -164,22 +167,66 @@ def _scale(written: dict[int, _Value], unknown: dict[int, _Value]) -> dict:
     return jtu.tree_map(lambda x, k: jnp.abs(x) + jnp.abs(k), written, unknown)
 
 
+def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTableau:
+    """Leaves out the stages that no term drives (an ODE has no noise)."""
+    keep = [
+        i
+        for i, stage in enumerate(tableau.stages)
+        if len(drift if stage.channels == ("h",) else noise) > 0
+    ]
+    return tableau.take(keep)
+
+
+class _Provider(NamedTuple):
+    increment: type[diffrax.AbstractBrownianIncrement]
+    advice: str
+
+
+# Random variables beyond `W`: which increments hold them, and how to ask for these.
+_PROVIDED_BY = {
+    "H": _Provider(
+        diffrax.AbstractSpaceTimeLevyArea,
+        "space-time Lévy area. Pass a path that has it, for example `diffrax."
+        "VirtualBrownianTree(..., levy_area=diffrax.SpaceTimeLevyArea)`",
+    ),
+    "second": _Provider(
+        WeakIncrement,
+        "a second set of three-point variables. Construct the path as "
+        "`WeakBrownianPath(..., second=True)`",
+    ),
+}
+
+
+def _variables(tableau: FlatTableau) -> list[str]:
+    """The random variables that drive the stages."""
+    channels = [c for stage in tableau.stages for c in stage.channels]
+    return [c for c in dict.fromkeys(channels) if c != "h"]
+
+
+def _controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, list]:
+    """The random variables of the step from `t0` to `t1`, for each noise term."""
+    if names == ["W"]:
+        return {"W": [term.contr(t0, t1) for term in noise]}
+    increments = [term.contr(t0, t1, use_levy=True) for term in noise]
+    for name in names:
+        if any(getattr(increment, name, None) is None for increment in increments):
+            provider = _PROVIDED_BY.get(name)
+            advice = f"increments with the attribute `{name}`"
+            raise ValueError(
+                f"`{solver}` needs {provider.advice if provider else advice}."
+            )
+    return {name: [getattr(i, name) for i in increments] for name in names}
+
+
 class _Evaluate:
     """The value of a stage at a point: vector fields times controls, over one step."""
 
-    def __init__(self, terms, t0, t1, args):
+    def __init__(self, drift, noise, variables, t0, t1, args, solver):
         self.t0, self.h = t0, t1 - t0
-        drift, noise = _split(terms)
-        self.driven = {}
-        if len(drift) > 0:
-            self.driven["h"] = (drift, [x.contr(t0, t1) for x in drift], args)
-        if len(noise) > 0:
-            self.driven["W"] = (noise, [x.contr(t0, t1) for x in noise], args)
-
-    def drop_absent(self, tableau: FlatTableau) -> FlatTableau:
-        """Leaves out the stages that no term drives (an ODE has no noise)."""
-        stages = enumerate(tableau.stages)
-        return tableau.take([i for i, s in stages if s.channels[0] in self.driven])
+        self.driven: dict[str, tuple[tuple, list, Args]] = {}
+        self.driven["h"] = (drift, [x.contr(t0, t1) for x in drift], args)
+        for name, controls in _controls(noise, variables, t0, t1, solver).items():
+            self.driven[name] = (noise, controls, args)
 
     def __call__(self, stage: Stage, y: Y) -> _Value:
         t = self.t0 + stage.c * self.h

@@ -8,8 +8,17 @@ from .._tableau import SeparableTableau
 from .base import AbstractSymplecticRungeKutta
 
 
-_half = np.array([[0.5]])
-_tab = SeparableTableau(alpha=[1], beta=[1], A0=_half, B0=_half, A1=_half)
+def _srks2(d1: float = 0.5) -> SeparableTableau:
+    """The paper's tableau, where its other parameters have no weight. The first two noise
+    stages read the same point, so that `d1` cancels."""
+    A = np.array([[0, 0, 0], [0, 0, 0], [0, 0, 1 / 2]])
+    return SeparableTableau(
+        alpha=[0, 0, 1],
+        beta={"W": [0, 0, 1], "sqrt h": [d1, -d1, 0]},
+        A0=A,
+        B0={"W": A, "sqrt h": [[0, 0, 0], [0, 0, 0], [d1, -d1, 0]]},
+        A1=A,
+    )
 
 
 class SRKs2(AbstractSymplecticRungeKutta):
@@ -46,7 +55,7 @@ class SRKs2(AbstractSymplecticRungeKutta):
     root_finder: optx.AbstractRootFinder = PicardNewton()
     root_find_max_steps: int = 20
 
-    tableau: ClassVar[SeparableTableau] = _tab
+    tableau: ClassVar[SeparableTableau] = _srks2()
 
     def order(self, terms):
         del terms

@@ -9,11 +9,16 @@ from .._tableau import real_parameter, SeparableTableau
 from .base import AbstractSymplecticRungeKutta
 
 
-def _srks3(a: float) -> SeparableTableau:
+def _srks3(a: float, b1_plus_b2: float = 1.0) -> SeparableTableau:
+    """The paper's tableau. Both noise stages read the same point, so that the weights
+    against the second variable, and with them `b1` and `b2`, cancel."""
     alpha = np.array([2 * a, 1 - 2 * a])
     return SeparableTableau(
         alpha=alpha,
-        beta=[1 / 2, 1 / 2],
+        beta={
+            "W": [1 / 2, 1 / 2],
+            "I_kk / sqrt h": np.array([1, -1]) / (2 * b1_plus_b2),
+        },
         A0=[[a, 0], [2 * a, 1 / 2 - a]],
         B0=np.zeros((2, 2)),
         A1=[alpha, alpha],

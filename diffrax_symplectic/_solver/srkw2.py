@@ -9,35 +9,39 @@ from .base import AbstractSymplecticRungeKutta, number_of_noises
 
 
 _r = np.sqrt(3.0)
-# b1 = b2 = b3 = 0: with the third and fourth noise stage they feed nothing.
-_tab = GeneralTableau(
-    alpha=[1 / 4, 1 / 4, 1 / 4, 1 / 4],
-    beta=[1 / 2, 1 / 2, 0, 0],
-    A0=[
-        [1 / 8, 0, 0, 0],
-        [1 / 4, 1 / 8, 0, 0],
-        [1 / 4, 1 / 4, 1 / 8, 0],
-        [1 / 4, 1 / 4, 1 / 4, 1 / 8],
-    ],
-    B0=[
-        [5 / 6 - _r / 3, -1 / 2, 0, 0],
-        [-1 / 6 + _r / 3, 1 / 2, 0, 0],
-        [1 / 2, 1 / 2, 0, 0],
-        [-1 / 6, 1 / 2, 0, 0],
-    ],
-    A1=[
-        [-1 / 6 + _r / 6, 1 / 3 - _r / 6, 0, 1 / 3],
-        [1 / 2, 0, 0, 0],
-        [0, 0, 0, 0],
-        [0, 0, 0, 0],
-    ],
-    B1=[
-        [1 / 4, 1 / 4 - _r / 6, 0, 0],
-        [1 / 4 + _r / 6, 1 / 4, 0, 0],
-        [0, 0, 0, 0],
-        [0, -1 / 2, 0, 0],
-    ],
-)
+
+
+def _srkw2(b1: float = 0.0, b2: float = 0.0, b3: float = 0.0) -> GeneralTableau:
+    """The paper's tableau. The third and fourth noise stage, and so `b1`, `b2` and `b3`,
+    feed nothing."""
+    return GeneralTableau(
+        alpha=[1 / 4, 1 / 4, 1 / 4, 1 / 4],
+        beta=[1 / 2, 1 / 2, 0, 0],
+        A0=[
+            [1 / 8, 0, 0, 0],
+            [1 / 4, 1 / 8, 0, 0],
+            [1 / 4, 1 / 4, 1 / 8, 0],
+            [1 / 4, 1 / 4, 1 / 4, 1 / 8],
+        ],
+        B0=[
+            [5 / 6 - _r / 3, -1 / 2, 0, 0],
+            [-1 / 6 + _r / 3, 1 / 2, 0, 0],
+            [1 / 2, 1 / 2, 0, 0],
+            [-1 / 6, 1 / 2, 0, 0],
+        ],
+        A1=[
+            [-1 / 6 + _r / 6, 1 / 3 - _r / 6, 0, 1 / 3],
+            [1 / 2, 0, 0, 0],
+            [0, 0, 0, 0],
+            [0, 0, 0, 0],
+        ],
+        B1=[
+            [1 / 4, 1 / 4 - _r / 6, 0, 0],
+            [1 / 4 + _r / 6, 1 / 4, 0, 0],
+            [b1, b2, 0, b3],
+            [0, -1 / 2, 0, 0],
+        ],
+    )
 
 
 class SRKw2(AbstractSymplecticRungeKutta):
@@ -91,7 +95,7 @@ class SRKw2(AbstractSymplecticRungeKutta):
     root_finder: optx.AbstractRootFinder = PicardNewton()
     root_find_max_steps: int = 20
 
-    tableau: ClassVar[GeneralTableau] = _tab
+    tableau: ClassVar[GeneralTableau] = _srkw2()
 
     def order(self, terms):
         del terms

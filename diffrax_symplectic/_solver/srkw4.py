@@ -9,13 +9,20 @@ from .._tableau import real_parameter, SeparableTableau
 from .base import AbstractSymplecticRungeKutta
 
 
-def _srkw4(a21: float) -> SeparableTableau:
+def _srkw4(
+    a21: float, a31: float = 0.0, a32: float = 0.0, b33: float = 0.0, b: float = 0.0
+) -> SeparableTableau:
+    """The paper's tableau. Only `a21` is live: the third drift stage feeds nothing, and the
+    second and third noise stage read the same point, so that `b` cancels."""
     return SeparableTableau(
-        alpha=[1 / 2, 1 / 2],
-        beta=[1 / 2, 1 / 2],
-        A0=[[1 / 4, 1 / 2 - a21], [a21, 1 / 4]],
-        B0=[[1, 0], [0, 0]],
-        A1=[[-1 / 2, 1 / 2], [1 / 2, 1 / 2]],
+        alpha=[1 / 2, 1 / 2, 0],
+        beta={
+            "W": [1 / 2, 1 / 4 - b, 1 / 4 + b],
+            "I_11 / sqrt h": [0, 1 / 2, -1 / 2],
+        },
+        A0=[[1 / 4, 1 / 2 - a21, 0], [a21, 1 / 4, 0], [a31, a32, 0]],
+        B0={"W": [[1, 0, 0], [0, 0, 0], [1, 1, b33]]},
+        A1=[[-1 / 2, 1 / 2, 0], [1 / 2, 1 / 2, 0], [1 / 2, 1 / 2, 0]],
     )
 
 

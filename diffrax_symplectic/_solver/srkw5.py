@@ -1,0 +1,78 @@
+from typing import ClassVar
+
+import optimistix as optx
+
+from .._root_finder import PicardNewton
+from .._tableau import AdditiveTableau
+from .base import AbstractSymplecticRungeKutta
+
+
+_tab = AdditiveTableau(
+    alpha=[1],
+    beta={"W": [1]},
+    A=[[1 / 2]],
+    B={"W": [[1 / 2]], "second": [[1 / 2]]},
+    c1=[0],
+    constant=True,
+)
+
+
+class SRKw5(AbstractSymplecticRungeKutta):
+    r"""The symplectic method SRKw5 of Wang, Hong and Xu, of weak order 2 for any number of
+    noises that depend neither on the state nor on time.
+
+    For any $H_0$ and $H_k = -\sigma_k \cdot q + \gamma_k \cdot p$, or any
+    $\mathrm{d}y = a(t, y)\,\mathrm{d}t + \sum_k b_k\,\mathrm{d}w_k$ with constant $b_k$,
+
+    $$G = y_n + \frac h2 a(t_n + \tfrac h2, G)
+      + \sum_k b_k \frac{\hat I_k + \hat I_{k+m}}{2}, \qquad
+      y_{n+1} = y_n + h\, a(t_n + \tfrac h2, G) + \sum_k b_k \hat I_k.$$
+
+    One stage vector, as for the midpoint rule; the second, independent variable
+    $\hat I_{k+m}$ is what brings the second order. No free parameters.
+
+    Order 2 without noise. Noise without the structure is refused while tracing.
+
+    !!! warning
+
+        The path has to be `WeakBrownianPath(..., second=True)`.
+
+    ??? cite "Reference"
+
+        Section 4.2 of
+
+        ```bibtex
+        @article{wang2017construction,
+            author = {Wang, Peng and Hong, Jialin and Xu, Dongsheng},
+            title = {Construction of Symplectic Runge-Kutta Methods for Stochastic
+                     Hamiltonian Systems},
+            journal = {Communications in Computational Physics},
+            volume = {21},
+            number = {1},
+            pages = {237--270},
+            year = {2017},
+            doi = {10.4208/cicp.261014.230616a},
+        }
+        ```
+    """
+
+    root_finder: optx.AbstractRootFinder = PicardNewton()
+    root_find_max_steps: int = 20
+
+    tableau: ClassVar[AdditiveTableau] = _tab
+
+    def order(self, terms):
+        del terms
+        return 2
+
+    def weak_order(self, terms):
+        """Order of convergence of expectations."""
+        del terms
+        return 2
+
+
+SRKw5.__init__.__doc__ = """**Arguments:**
+
+- `root_finder`: any Optimistix root finder for the stage equations.
+- `root_find_max_steps`: the most iterations it may take in one step.
+"""

@@ -1,0 +1,277 @@
+"""Families for noise that does not depend on the state, and their strong order 3/2."""
+
+import dataclasses
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._plan import Block, make_plan
+
+from .problems import FineSample, Given, H0, random_problem, slope, weak_path
+
+
+ADDITIVE = {
+    "SRKw5": ds.SRKw5(),
+    "SRKs4": ds.SRKs4(),
+    "SRKs4-paper": ds.SRKs4(sign=1),
+    "SRKs4-split": ds.SRKs4(beta1=0.3, beta2=-0.7, b=0.4),
+}
+all_solvers = pytest.mark.parametrize("solver", ADDITIVE.values(), ids=ADDITIVE.keys())
+
+
+def noise(t, p, q, args):
+    sigma, gamma = args["sigma"], args["gamma"]
+    return -sigma @ q + gamma @ p
+
+
+def moving_noise(t, p, q, args):
+    sigma, gamma = args["sigma"], args["gamma"]
+    return -jnp.cos(2 * t) * (sigma @ q) + jnp.exp(-t) * (gamma @ p)
+
+
+def _problem(key, d, m, dtype=jnp.float64):
+    k_drift, k_sigma, k_gamma = jr.split(key, 3)
+    y0, args = random_problem(k_drift, d, m, dtype)
+    sigma = 0.5 * jr.normal(k_sigma, (m, d), dtype)
+    gamma = 0.5 * jr.normal(k_gamma, (m, d), dtype)
+    return y0, {"drift": args["drift"], "sigma": sigma, "gamma": gamma}
+
+
+def test_stages_are_solved_one_after_the_other():
+    blocks = make_plan(ds.SRKs4().tableau.flatten()).blocks
+    assert [b.unknown for b in blocks if b.unknown] == [(0,), (1,)]
+    assert make_plan(ds.SRKw5().tableau.flatten()).num_unknown == 1
+    assert Block((), (5,)) in blocks
+
+
+@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-6)])
+@pytest.mark.parametrize("name", ["SRKw5", "SRKs4"])
+def test_step_is_symplectic_for_a_thousand_random_systems(name, dtype, bound):
+    def defect(key):
+        k_problem, k_m, k_W, k_more, k_h = jr.split(key, 5)
+        y0, args = _problem(k_problem, 3, 3, dtype)
+        used = (jnp.arange(3) < jr.randint(k_m, (), 1, 4))[:, None]
+        args |= {"sigma": args["sigma"] * used, "gamma": args["gamma"] * used}
+        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
+        W, more = (jnp.sqrt(h) * jr.normal(k, (3,), dtype) for k in (k_W, k_more))
+        terms = ds.hamiltonian_terms(H0, noise, Given(W, H=more, second=more))
+        solver = ADDITIVE[name]
+        return ds.symplecticity_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
+
+    defects = jax.jit(jax.vmap(defect))(jr.split(jr.key(0), 1000))
+    assert defects.dtype == dtype
+    assert jnp.max(defects) <= bound
+
+
+def _functions(y):
+    p, q = y[0][0], y[1][0]
+    return jnp.stack([p, q**2, p * q, jnp.sin(p + q), jnp.exp(p / 2)])
+
+
+def _weak_slopes(solver, m, path, noise):
+    y0, args = jax.vmap(lambda key: _problem(key, 1, m))(jr.split(jr.key(0), 3))
+    terms = ds.hamiltonian_terms(H0, noise, path)
+    hs = np.array([0.02, 0.01, 0.005, 0.0025])
+
+    def defect(h, y0, args):
+        kwargs = dict(fn=_functions, order=2, nodes=4)
+        return ds.weak_order_defect(terms, solver, 0.1, 0.1 + h, y0, args, **kwargs)
+
+    over_steps = jax.vmap(defect, in_axes=(0, None, None))
+    defects = jax.jit(jax.vmap(over_steps, in_axes=(None, 0, 0)))(hs, y0, args)
+    return [slope(hs, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(hs))]
+
+
+@pytest.mark.parametrize("m", [1, 2])
+def test_srkw5_is_weak_order_two(m):
+    assert ds.SRKw5().weak_order(None) == 2
+    slopes = _weak_slopes(ds.SRKw5(), m, weak_path(m, second=True), noise)
+    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
+
+
+@pytest.mark.parametrize("name", ["SRKs4", "SRKs4-split"])
+def test_srks4_is_weak_order_two_too(name):
+    # Over its Gaussian variables, by quadrature.
+    gaussian = diffrax.UnsafeBrownianPath(
+        (1,), jr.key(0), levy_area=diffrax.SpaceTimeLevyArea
+    )
+    assert ds.SRKs4().weak_order(None) == 2
+    slopes = _weak_slopes(ADDITIVE[name], 1, gaussian, moving_noise)
+    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
+
+
+@pytest.mark.parametrize("noise", [noise, moving_noise], ids=["constant", "moving"])
+@pytest.mark.parametrize("name", ["SRKs4", "SRKs4-paper", "SRKs4-split"])
+def test_srks4_is_strong_order_three_halves(name, noise):
+    y0, args = _problem(jr.key(7), 1, 2)
+    terms = lambda path: ds.hamiltonian_terms(H0, noise, path)
+    errors = _strong_errors(terms, ADDITIVE[name], y0, args)
+    assert ADDITIVE[name].strong_order(None) == 1.5
+    assert slope(STEPS, errors) >= 1.45
+
+
+STEPS = np.array([2.0**-k for k in (3, 4, 5, 6)])
+
+
+def _strong_errors(terms, solver, y0, args, fine=2**10):
+    def ends(key):
+        sample = FineSample.draw(key, fine, 2)
+        solve = lambda h: jnp.concatenate(
+            diffrax.diffeqsolve(terms(sample), solver, 0.0, 1.0, h, y0, args).ys
+        )
+        return jax.lax.map(solve, jnp.array([*STEPS, 1 / fine]))
+
+    ys = jax.jit(jax.vmap(ends))(jr.split(jr.key(0), 200))
+    return np.sqrt(np.mean(np.sum((ys[:, :-1] - ys[:, -1:]) ** 2, axis=(2, 3)), axis=0))
+
+
+def test_the_default_sign_has_the_smaller_strong_error():
+    # Over 200 common paths; on other systems the two come closer to each other.
+    y0, args = _problem(jr.key(8), 1, 2)
+    terms = lambda path: ds.hamiltonian_terms(H0, noise, path)
+    ours, paper = (_strong_errors(terms, ds.SRKs4(sign=s), y0, args) for s in (-1, 1))
+    assert np.all(ours < paper)
+
+
+@all_solvers
+def test_conditions_hold_and_see_every_live_coefficient(solver):
+    residuals = ds.strong_order_residuals if "s4" in repr(solver) else _weak_two
+    clean = residuals(solver.tableau)
+    assert max(map(abs, clean.values())) <= 1e-15
+    assert np.max(np.abs(ds.symplectic_residuals(solver.tableau))) <= 1e-15
+    for name in ("alpha", "A", "c1", "beta", "B"):
+        value = getattr(solver.tableau, name)
+        for path, array in jax.tree_util.tree_leaves_with_path(value):
+            for index in np.argwhere(array != 0):
+                moved = array.copy()
+                moved[tuple(index)] += 1e-6
+                changed = moved if path == () else value | {path[0].key: moved}
+                tableau = dataclasses.replace(solver.tableau, **{name: changed})
+                worst = max(
+                    np.max(np.abs(list(residuals(tableau).values()))),
+                    np.max(np.abs(ds.symplectic_residuals(tableau))),
+                )
+                assert worst >= 1e-9, (name, index)
+
+
+def _weak_two(tableau):
+    return ds.weak_order_residuals(tableau, 2)
+
+
+def _solve(noise, solver, path=None, d=2, **kwargs):
+    levy_area = diffrax.SpaceTimeLevyArea
+    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 0.01, (), jr.key(0), levy_area)
+    weak = ds.WeakBrownianPath((), jr.key(0), second=True)
+    if path is None:
+        path = weak if isinstance(solver, ds.SRKw5) else tree
+    H0 = lambda t, p, q, args: jnp.sum(jnp.cosh(p) + p * q)
+    terms = ds.hamiltonian_terms(H0, noise, path)
+    y0 = (0.3 * jnp.ones(d), 0.5 * jnp.ones(d))
+    return diffrax.diffeqsolve(
+        terms, solver, 0.0, 0.2, 0.1, y0, jnp.array(0.7), **kwargs
+    )
+
+
+@all_solvers
+@pytest.mark.parametrize(
+    "noise",
+    [
+        lambda t, p, q, args: jnp.sum(q**2),
+        lambda t, p, q, args: jnp.sum(p * q),
+        lambda t, p, q, args: jnp.sum(jnp.sin(p)) + args * jnp.sum(q),
+    ],
+)
+def test_noise_that_depends_on_the_state_is_refused(solver, noise):
+    with pytest.raises(ValueError, match="db_k/dy.* does not vanish"):
+        _solve(noise, solver)
+
+
+def test_noise_that_depends_on_time_is_for_srks4():
+    noise = lambda t, p, q, args: jnp.cos(t) * jnp.sum(q)
+    with pytest.raises(ValueError, match="db_k/dt does not vanish. Use `SRKs4`"):
+        _solve(noise, ds.SRKw5())
+    _solve(noise, ds.SRKs4())
+
+
+@all_solvers
+@pytest.mark.parametrize(
+    "noise",
+    [
+        lambda t, p, q, args: args * (jnp.sum(p) - jnp.sum(q)),
+        lambda t, p, q, args: jnp.sum((p + q) ** 2 - p**2 - q**2 - 2 * p * q + p),
+        lambda t, p, q, args: jnp.sum(jnp.log(jnp.exp(q) * jnp.exp(p))),
+    ],
+)
+def test_structure_is_never_refused_for_the_way_it_is_written(solver, noise):
+    assert all(jnp.all(jnp.isfinite(x)) for x in _solve(noise, solver).ys)
+
+
+@all_solvers
+def test_plain_terms_and_any_state_will_do(solver):
+    second = isinstance(solver, ds.SRKw5)
+    levy = diffrax.SpaceTimeLevyArea
+    shape = {"a": jax.ShapeDtypeStruct((2,), jnp.float64)}
+    path = ds.WeakBrownianPath(shape, jr.key(0), second=True)
+    if not second:
+        path = diffrax.VirtualBrownianTree(0.0, 1.0, 0.01, shape, jr.key(0), levy)
+    terms = diffrax.MultiTerm(
+        diffrax.ODETerm(lambda t, y, args: {"a": -y["a"]}),
+        diffrax.ControlTerm(lambda t, y, args: {"a": jnp.ones((3, 2))}, path),
+    )
+    y0 = {"a": jnp.ones(3)}
+    sol = diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0)
+    assert sol.ys["a"].shape == (1, 3)
+    ode = diffrax.ODETerm(lambda t, y, args: {"a": -y["a"]})
+    sol = diffrax.diffeqsolve(ode, solver, 0.0, 1.0, 0.01, y0)
+    np.testing.assert_allclose(sol.ys["a"], np.exp(-1), rtol=1e-4)
+
+
+def test_truncated_paths_keep_their_space_time_area():
+    noise = lambda t, p, q, args: jnp.sum(q)
+    levy = diffrax.SpaceTimeLevyArea
+    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 0.01, (), jr.key(0), levy)
+    cut = _solve(noise, ds.SRKs4(), ds.TruncatedBrownianPath(tree, k=4))
+    for a, b in zip(cut.ys, _solve(noise, ds.SRKs4(), tree).ys):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    "solver, path, advice",
+    [
+        (ds.SRKw5(), ds.WeakBrownianPath((), jr.key(0)), "second=True"),
+        (ds.SRKw5(), diffrax.UnsafeBrownianPath((), jr.key(0)), "second=True"),
+        (ds.SRKs4(), diffrax.UnsafeBrownianPath((), jr.key(0)), "SpaceTimeLevyArea"),
+        (ds.SRKs4(), ds.WeakBrownianPath((), jr.key(0)), "SpaceTimeLevyArea"),
+    ],
+    ids=["one set", "gaussian", "no area", "weak"],
+)
+def test_missing_random_variables_are_refused_with_advice(solver, path, advice):
+    with pytest.raises(ValueError, match=advice):
+        noise = lambda t, p, q, args: jnp.sum(q)
+        _solve(noise, solver, path, adjoint=diffrax.ForwardMode())
+
+
+def test_levy_areas_are_declared():
+    assert ds.SRKs4().minimal_levy_area is diffrax.AbstractSpaceTimeLevyArea
+    assert ds.SRKw5().minimal_levy_area is ds.WeakIncrement
+    assert ds.Midpoint().minimal_levy_area is diffrax.AbstractBrownianIncrement
+
+
+@pytest.mark.parametrize("value", [1j, np.nan, np.inf, "x"])
+@pytest.mark.parametrize("name", ["beta1", "beta2", "b"])
+def test_malformed_parameters_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"`{name}` must be a finite real number"):
+        ds.SRKs4(**{name: value})
+
+
+def test_beta2_of_zero_and_unknown_signs_are_refused():
+    with pytest.raises(ValueError, match="`beta2` must not be 0"):
+        ds.SRKs4(beta2=0)
+    for sign in (0, 2, True, 0.5, "-"):
+        with pytest.raises(ValueError, match="`sign` must be 1 or -1"):
+            ds.SRKs4(sign=sign)

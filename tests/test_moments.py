@@ -1,0 +1,176 @@
+"""Second moments on linear models, exactly: one step, and whole solves."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from .problems import kubo_terms
+
+
+# The excess of E(x^2 + y^2) over s^2 h that one step adds for h = 0.2 and s = 1, as far as
+# it is known in the literature or in closed form.
+EXCESS = [
+    (ds.Midpoint(), -0.00198020),
+    (ds.SRKs1(a=0.25), -0.00099626),
+    (ds.SRKs1(a=0.4), None),
+    (ds.SRKs2(), -0.00198020),
+    (ds.SRKs3(), 0.0),
+    (ds.SRKs4(), None),
+    (ds.SRKs4(sign=1), None),
+    (ds.SRKw1(b=0.5), -0.00198020),
+    (ds.SRKw1(b=0.0), 0.0),
+    (ds.SRKw1(b=0.2), None),
+    (ds.SRKw1(b=1.0), 0.0),
+    (ds.SRKw2(), None),
+    (ds.SRKw3("a"), -0.00198020),
+    *[(ds.SRKw3(v), 0.0) for v in "bcef"],
+    (ds.SRKw4(a21=0.0), 0.0),
+    (ds.SRKw5(), 0.0),
+]
+all_solvers = pytest.mark.parametrize("solver, excess", EXCESS, ids=repr)
+Y0 = (jnp.array(0.7), jnp.array(-0.4))
+
+
+def _path(solver):
+    if isinstance(solver, ds.SRKs4):
+        levy_area = diffrax.SpaceTimeLevyArea
+        return diffrax.UnsafeBrownianPath((), jr.key(0), levy_area)
+    if type(solver).__module__.startswith("diffrax."):
+        return diffrax.UnsafeBrownianPath((), jr.key(0))
+    return ds.WeakBrownianPath((), jr.key(0), second=isinstance(solver, ds.SRKw5))
+
+
+def _oscillator(solver):
+    energy = lambda t, p, q, args: (p**2 + q**2) / 2
+    return ds.hamiltonian_terms(energy, lambda t, p, q, args: -q, _path(solver))
+
+
+def _linear_step(tableau, h):
+    """The step `y1 = R y + sum_v r_v xi_v` on the linear oscillator dp = -q dt + dw,
+    dq = p dt, by one dense linear solve with the tableau's full matrix."""
+    flat = tableau.flatten()
+    s = len(flat.stages)
+    parts = {"y": (1, 1), "p": (1, 0), "q": (0, 1), "": (0, 0)}
+    reads, writes = (
+        [np.diag(parts[getattr(x, name)]) for x in flat.stages]
+        for name in ("reads", "writes")
+    )
+    field = np.array([[0.0, -1.0], [1.0, 0.0]])
+    drift = [
+        h * w @ field @ r if x.channels == ("h",) else np.zeros((2, 2))
+        for x, r, w in zip(flat.stages, reads, writes)
+    ]
+    # k_i = drift_i (y + sum_j M_ij k_j) + noise_i
+    rows = [[drift[i] * flat.matrix[i, j] for j in range(s)] for i in range(s)]
+    system = np.eye(2 * s) - np.block(rows)
+    end = np.kron(flat.weights, np.eye(2))
+    R = np.eye(2) + end @ np.linalg.solve(system, np.concatenate(drift))
+    r = {}
+    for name in {x.channels[0] for x in flat.stages} - {"h"}:
+        kicks = [(x.channels[0] == name) * np.array([1.0, 0.0]) for x in flat.stages]
+        r[name] = end @ np.linalg.solve(system, np.concatenate(kicks))
+    return R, r
+
+
+@all_solvers
+def test_excess_per_step_on_the_linear_oscillator(solver, excess):
+    h = 0.2
+    R, r = _linear_step(solver.tableau, h)
+    np.testing.assert_allclose(R.T @ R, np.eye(2), atol=1e-14)
+    variance = {"W": 1, "second": 1, "H": 1 / 12}
+    # Other variables of the paper's tableaus cancel.
+    total = sum(x @ x * variance.get(name, np.inf) for name, x in r.items() if any(x))
+    exact = h * (total - 1)
+    squared = ds.step_expectation(
+        _oscillator(solver), solver, 0.0, h, Y0, fn=lambda y: y[0] ** 2 + y[1] ** 2
+    )
+    assert abs(squared - (Y0[0] ** 2 + Y0[1] ** 2) - h - exact) <= 1e-12
+    if excess is not None:
+        assert abs(exact - excess) <= (1e-12 if excess == 0 else 5e-9)
+
+
+def _after(solver, h, steps):
+    """E(x^2 + y^2) after so many steps from (x, y) = (0, 1), by the exact recursion."""
+    y0 = (jnp.array(1.0), jnp.array(0.0))
+    K = ds.second_moment_map(_oscillator(solver), solver, 0.0, h, y0)
+    z0 = np.array([1.0, 1.0, 0.0])
+    moments = np.linalg.matrix_power(K, steps) @ np.kron(z0, z0)
+    return moments[4] + moments[8]
+
+
+@all_solvers
+def test_linear_growth_over_25_000_steps(solver, excess):
+    h, steps = 0.2, 25_000
+    error = _after(solver, h, steps) / (1 + h * steps) - 1
+    if solver == ds.SRKs4(sign=1):
+        # The paper's choice of sign is the one that misses.
+        assert abs(error + 0.0136) < 1e-4
+    else:
+        assert abs(error) < 0.01
+
+
+@pytest.mark.parametrize(
+    "solver, determinant",
+    [(diffrax.Euler(), lambda h: 1 + h**2), (diffrax.Heun(), lambda h: 1 + h**4 / 4)],
+    ids=["Euler", "Heun"],
+)
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_explicit_methods_explode(solver, determinant):
+    h = 0.2
+    K = ds.second_moment_map(_oscillator(solver), solver, 0.0, h, Y0)
+    growth = np.max(np.abs(np.linalg.eigvals(K)))
+    # The mean square of a rotation with this determinant.
+    np.testing.assert_allclose(growth, determinant(h), rtol=1e-12)
+    # Over 25,000 steps.
+    assert growth**25_000 > 2e4
+
+
+def test_moments_of_a_multiplicative_noise_agree_with_the_closed_form():
+    # A midpoint step of the Kubo oscillator turns the plane by 2 atan((h + s I) / 2).
+    h, s = 0.1, 0.7
+    terms = kubo_terms(ds.WeakBrownianPath((), jr.key(0)), s)
+    K = ds.second_moment_map(terms, ds.Midpoint(), 0.0, h, Y0)
+    increments = np.sqrt(3 * h) * np.array([-1, 0, 1])
+    twice = 4 * np.arctan((h + s * increments) / 2)
+    z0 = np.array([1.0, *Y0])
+    moments = np.linalg.matrix_power(K, 50) @ np.kron(z0, z0)
+    factor = np.sum(np.exp(1j * twice) * np.array([1, 4, 1]) / 6) ** 50
+    # p + iq turns, |p + iq|^2 stays.
+    square = factor * complex(*Y0) ** 2
+    np.testing.assert_allclose(moments[4] - moments[8], square.real, atol=1e-14)
+    np.testing.assert_allclose(2 * moments[5], square.imag, atol=1e-14)
+    np.testing.assert_allclose(moments[4] + moments[8], abs(complex(*Y0)) ** 2)
+
+
+def test_quadrature_over_gaussian_increments_is_exact_for_polynomials():
+    # Heun on the Kubo oscillator is a polynomial in the increment, of degree 2.
+    h = 0.1
+    terms = kubo_terms(diffrax.UnsafeBrownianPath((), jr.key(0)))
+    squared = lambda nodes: ds.step_expectation(
+        terms,
+        diffrax.Heun(),
+        0.0,
+        h,
+        Y0,
+        fn=lambda y: y[0] ** 2 + y[1] ** 2,
+        nodes=nodes,
+    )
+    # |1 + i x - x^2 / 2|^2 = 1 + x^4 / 4 with x = h + I.
+    fourth = h**4 + 6 * h**2 * h + 3 * h**2
+    exact = (Y0[0] ** 2 + Y0[1] ** 2) * (1 + fourth / 4)
+    np.testing.assert_allclose(squared(3), exact, rtol=1e-14)
+    np.testing.assert_allclose(squared(8), exact, rtol=1e-14)
+    assert abs(squared(2) - exact) > 1e-4
+
+
+def test_moments_work_under_jit_and_vmap():
+    path = ds.WeakBrownianPath((), jr.key(0))
+    maps = lambda h: ds.second_moment_map(kubo_terms(path), ds.SRKw2(), 0.0, h, Y0)
+    hs = jnp.array([0.1, 0.2])
+    together = jax.jit(jax.vmap(maps))(hs)
+    np.testing.assert_allclose(together[1], maps(hs[1]), atol=1e-13)
