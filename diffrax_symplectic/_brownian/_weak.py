@@ -4,13 +4,14 @@ import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
+import jax.extend.random as jer
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import lineax.internal as lxi
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Integer, PRNGKeyArray, PyTree
 
 from .._custom_types import BM, RealScalarLike
 from ._fixed_steps import require_fixed_steps
@@ -189,26 +190,26 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
         t0, t1 = cast(tuple[Array, Array], eqxi.nondifferentiable((t0, t1), name="t"))
         h = t1 - t0
-        key = _step_key(self.key, t0, t1)
-        W = self._draw(key, h, _three_point)
+        sets = 1 + (self.second + self.two_point if use_levy else 0)
+        leaves = jtu.tree_leaves(self.shape)
+        bits = _bits(self.key, t0, t1, sets, sum(int(np.prod(s.shape)) for s in leaves))
+        W = self._draw(bits[0], h, _three_point)
         if not use_levy:
             return W
         dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), self.shape)
         second = two_point = None
         if self.second:
-            second = self._draw(jr.fold_in(key, 1), h, _three_point)
+            second = self._draw(bits[1], h, _three_point)
         if self.two_point:
-            two_point = self._draw(jr.fold_in(key, 2), h, _two_point)
+            two_point = self._draw(bits[-1], h, _two_point)
         return WeakIncrement(dt=dt, W=W, second=second, two_point=two_point)
 
-    def _draw(self, key, h, law) -> PyTree[Array]:
+    def _draw(self, bits, h, law) -> PyTree[Array]:
         leaves, treedef = jtu.tree_flatten(self.shape)
-        sizes = [int(np.prod(leaf.shape)) for leaf in leaves]
-        bits = jr.bits(key, (sum(sizes),), jnp.uint32)
-        pieces = jnp.split(bits, np.cumsum(sizes)[:-1])
+        ends = np.cumsum([int(np.prod(leaf.shape)) for leaf in leaves])
         out = [
             law(piece.reshape(leaf.shape), jnp.sqrt(jnp.abs(h)).astype(leaf.dtype))
-            for piece, leaf in zip(pieces, leaves)
+            for piece, leaf in zip(jnp.split(bits, ends[:-1]), leaves)
         ]
         return jtu.tree_unflatten(treedef, out)
 
@@ -224,8 +225,33 @@ def _two_point(bits, sqrt_h):
     return jnp.where(bits < np.uint32(2**31), -sqrt_h, sqrt_h)
 
 
-def _step_key(key, t0, t1):
-    """A key for the step from `t0` to `t1`, the same for times that differ by rounding.
+def _bits(key, t0, t1, sets: int, n: int) -> Integer[Array, "sets n"]:
+    """Random words for the step from `t0` to `t1`, the same for times that differ by
+    rounding. The first of the sets are the same whatever their number is."""
+    if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        key = jr.wrap_key_data(key)
+    count, exponent = _place(t0, t1)
+    blocks = (sets * n + 1) // 2
+    if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks < 2**20:
+        # The place is the counter of the generator, so that one hash gives two words.
+        # (Keys folded and split would take three hashes for the first.)
+        numbers = np.arange(blocks, dtype=np.uint32)
+        counters = jnp.concatenate(
+            [
+                jnp.broadcast_to(count.astype(jnp.uint32), (blocks,)),
+                (exponent.astype(jnp.uint32) << 20) + numbers,
+            ]
+        )
+        words = jer.threefry_2x32(jr.key_data(key), counters)
+        return words.reshape(2, blocks).T.reshape(-1)[: sets * n].reshape(sets, n)
+    place = jr.fold_in(jr.fold_in(key, count), exponent)
+    return jnp.stack(
+        [jr.bits(jr.fold_in(place, i), (n,), jnp.uint32) for i in range(sets)]
+    )
+
+
+def _place(t0, t1) -> tuple[Integer[Array, ""], Integer[Array, ""]]:
+    """Where a step lies, in integers.
 
     The middle of the step is counted in units of a power of two that lies between a
     quarter and a half of the step, so that no two steps of one size share a count. The
@@ -236,5 +262,4 @@ def _step_key(key, t0, t1):
     exponent = exponent.astype(jnp.int32) - 2
     count = jnp.floor(jnp.ldexp(t0 + (t1 - t0) / 2, -exponent) + 0.29)
     # Starts again after 2^31 counts. (`fmod` is exact, also for negative times.)
-    count = jnp.fmod(count, 2.0**31).astype(jnp.int32)
-    return jr.fold_in(jr.fold_in(key, count), exponent)
+    return jnp.fmod(count, 2.0**31).astype(jnp.int32), exponent

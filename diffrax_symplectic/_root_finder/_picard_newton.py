@@ -1,3 +1,4 @@
+import functools as ft
 from collections.abc import Callable
 from typing import Any
 
@@ -16,17 +17,25 @@ from ._small_lu import SmallLU
 
 class _State(eqx.Module):
     y: PyTree[Array]
-    # The last two corrections in units of the tolerance (1 is converged), and the last
-    # one relative to the whole iterate.
+    # The last correction in units of the tolerance (1 is converged), how much smaller it
+    # was than those before (1 as long as that is unknown), and its size relative to the
+    # whole iterate.
     size: Scalar
-    size_prev: Scalar
+    shrink: Scalar
     overall: Scalar
 
     @property
-    def shrink(self) -> Scalar:
-        """By how much the last correction was smaller; 1 as long as that is unknown."""
-        known = jnp.isfinite(self.size_prev)
-        return jnp.where(known, _ratio(self.size, self.size_prev), 1.0)
+    def converged(self) -> Bool[Array, ""]:
+        """Whether the next correction would be below the tolerance."""
+        # Rounding errors can keep the corrections to a leaf that is small next to the
+        # others above `rtol` for ever: then they no longer shrink.
+        eps = jnp.finfo(self.size.dtype).eps
+        stagnated = (self.shrink > 0.5) & (self.overall <= 100 * eps)
+        return (self.size * jnp.minimum(self.shrink, 1) <= 1) | stagnated
+
+    @property
+    def contracting(self) -> Bool[Array, ""]:
+        return self.shrink < 0.5
 
 
 class PicardNewton(optx.AbstractRootFinder):
@@ -34,19 +43,23 @@ class PicardNewton(optx.AbstractRootFinder):
     rounding error, cheaply when the step is small and robustly when it is not.
 
     A step is as symplectic as its stage equations are solved. So the default tolerance
-    is a few units in the last place of whatever dtype the state has, and the
-    quadratic convergence of Newton's method is used to tell when the *next* correction
-    would be below it: after $\delta_{k-1}$ and $\delta_k$ it is about
-    $\delta_k (\delta_k / \delta_{k-1})^2$.
+    is a few units in the last place of whatever dtype the state has. Iteration ends when
+    the *next* correction would be below it: after $\delta_{n-1}$ and $\delta_n$ that is
+    about $\delta_n\, (\delta_n / \delta_{n-1})$ for a method of linear convergence.
 
-    Systems of up to `direct` unknowns are solved by Newton's method, the first few
-    iterations of which are written out ahead of Optimistix' loop. The loop then normally
-    has nothing left to do; over a batch of paths, iterating for as long as any of them
-    needs costs more than one iteration too many. Larger systems are first tried by
-    fixed-point (Picard) iteration, which needs no Jacobian and converges fast for steps
-    that resolve the dynamics. It is given up for Newton's method if it converges
-    slowly. Corrections of Newton's method that would make the
-    residual larger are shortened.
+    What a step normally needs is written out, ahead of Optimistix' loop: over a batch of
+    paths a loop costs more than the arithmetic, since XLA fuses none of what is in it
+    with what is around it, and since it goes on for as long as any of the paths needs.
+
+    - Up to `direct` unknowns: `warmup` fixed-point (Picard) iterations, one of Newton's
+        method, and `chords` with the same Jacobian.
+    - Above: fixed-point iterations, which need no Jacobian and converge fast for steps
+        that resolve the dynamics. If the equations are a short program on small arrays
+        `sweeps` of them are written out; a loop goes on for as long as corrections shrink.
+
+    The loop that then normally has nothing left to do is Newton's method, from where the
+    above got to if that was converging, and otherwise from the start. Corrections
+    that would make the residual larger are shortened.
 
     **Arguments:**
 
@@ -56,7 +69,7 @@ class PicardNewton(optx.AbstractRootFinder):
     - `norm`: norm within a leaf.
     - `linear_solver`: solves for the corrections of Newton's method; see Lineax.
     - `direct`: the most unknowns for which Newton's method is used from the start.
-    - `unrolled`: the number of its iterations that are written out.
+    - `warmup`, `chords`, `sweeps`: see above.
     - `picard_steps`: the most fixed-point iterations.
     """
 
@@ -65,8 +78,10 @@ class PicardNewton(optx.AbstractRootFinder):
     norm: Callable[[PyTree], Scalar] = optx.max_norm
     linear_solver: lx.AbstractLinearSolver = SmallLU()
     direct: int = eqx.field(default=4, static=True)
-    unrolled: int = eqx.field(default=3, static=True)
-    picard_steps: int = eqx.field(default=30, static=True)
+    warmup: int = eqx.field(default=2, static=True)
+    chords: int = eqx.field(default=1, static=True)
+    sweeps: int = eqx.field(default=10, static=True)
+    picard_steps: int = eqx.field(default=40, static=True)
 
     def init(
         self,
@@ -79,38 +94,45 @@ class PicardNewton(optx.AbstractRootFinder):
         tags: frozenset[object],
     ) -> _State:
         del f_struct, aux_struct
-        dtype = jnp.result_type(*jtu.tree_leaves(y))
-        inf = jnp.array(jnp.inf, jnp.finfo(dtype).dtype)
-        state = _State(y=y, size=inf, size_prev=inf, overall=inf)
-        if sum(x.size for x in jtu.tree_leaves(y)) > self.direct:
-            return self._picard(fn, args, options, state)
-        for _ in range(self.unrolled):
-            state = _newton(self, fn, args, options, state, tags)
+        dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).dtype
+        inf, one = jnp.array(jnp.inf, dtype), jnp.array(1, dtype)
+        start = _State(y=y, size=inf, shrink=one, overall=inf)
+        if sum(x.size for x in jtu.tree_leaves(y)) <= self.direct:
+            state = self._write_out_newton(fn, args, options, start, tags)
+        else:
+            state = self._picard(fn, args, options, start)
+        keep = state.converged | state.contracting
+        return jtu.tree_map(lambda a, b: jnp.where(keep, a, b), state, start)
+
+    def _write_out_newton(self, fn, args, options, state: _State, tags) -> _State:
+        for _ in range(self.warmup):
+            y = (state.y**ω - fn(state.y, args)[0] ** ω).ω
+            state = eqx.tree_at(lambda s: s.y, state, y)
+        residual, solve = _linearized(self, fn, args, state.y, tags)
+        state = _correct(self, options, state, solve(residual))
+        for _ in range(self.chords):
+            state = _correct(self, options, state, solve(fn(state.y, args)[0]))
         return state
 
-    def _picard(self, fn, args, options, init: _State) -> _State:
-        # Two iterations at a time: positions and momenta move each other, so that single
-        # corrections shrink in turns.
+    def _picard(self, fn, args, options, state: _State) -> _State:
         def advance(carry):
-            state, step = carry
-            first, _ = fn(state.y, args)
-            state = eqx.tree_at(lambda s: s.y, state, (state.y**ω - first**ω).ω)
-            second, _ = fn(state.y, args)
-            return _correct(self, options, state, second), step + 2
+            state, previous, step = carry
+            new = _correct(self, options, state, fn(state.y, args)[0])
+            # Positions and momenta move each other, so that corrections may shrink in
+            # turns: what counts is the slower turn.
+            shrink = jnp.maximum(new.shrink, previous)
+            return eqx.tree_at(lambda s: s.shrink, new, shrink), new.shrink, step + 1
 
         def proceed(carry):
-            state, step = carry
-            contracting = (step <= 2) | (state.shrink < 0.5)
-            return ~_picard_done(state) & contracting & (step < self.picard_steps)
+            state, _, step = carry
+            contracting = (step <= 2) | state.contracting
+            return ~state.converged & contracting & (step < self.picard_steps)
 
-        state, _ = lax.while_loop(proceed, advance, advance((init, 0)))
-        done = _picard_done(state)
-        # Newton's method starts afresh: iterates that did not converge may be anywhere.
-        return jtu.tree_map(
-            lambda a, b: jnp.where(done, a, b),
-            eqx.tree_at(lambda s: s.size, state, jnp.zeros_like(state.size)),
-            init,
-        )
+        carry = state, state.shrink, jnp.array(0)
+        if _is_short(fn, state.y, args):
+            for _ in range(min(self.sweeps, self.picard_steps)):
+                carry = advance(carry)
+        return lax.while_loop(proceed, advance, carry)[0]
 
     def step(
         self,
@@ -152,11 +174,10 @@ class PicardNewton(optx.AbstractRootFinder):
         tags: frozenset[object],
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         del fn, y, args, options, tags
-        quadratic = state.size * state.shrink**2 <= 1
         result = optx.RESULTS.where(
             jnp.isnan(state.size), optx.RESULTS.nonfinite, optx.RESULTS.successful
         )
-        return (state.size <= 1) | quadratic | _stagnated(state), result
+        return state.converged, result
 
     def postprocess(
         self,
@@ -173,16 +194,19 @@ class PicardNewton(optx.AbstractRootFinder):
         return state.y, aux, {}
 
 
-# One function that is traced and lowered once, and called several times.
-@eqx.filter_jit
-def _newton(self: PicardNewton, fn, args, options, state: _State, tags) -> _State:
-    residual, jacobian, _ = jax.linearize(lambda y: fn(y, args), state.y, has_aux=True)
-    operator = lx.FunctionLinearOperator(
-        jacobian, jax.eval_shape(lambda: state.y), tags=tags
-    )
+def _linearized(
+    self: PicardNewton, fn, args, y: PyTree[Array], tags
+) -> tuple[PyTree[Array], Callable]:
+    """The residual at `y`, and what solves the linearized equations there."""
+    residual, jacobian, _ = jax.linearize(lambda y: fn(y, args), y, has_aux=True)
+    operator = lx.FunctionLinearOperator(jacobian, jax.eval_shape(lambda: y), tags=tags)
     linear_state = self.linear_solver.init(operator, {})
-    diff, _, _ = self.linear_solver.compute(linear_state, residual, {})
-    return _correct(self, options, state, diff)
+    return residual, lambda x: self.linear_solver.compute(linear_state, x, {})[0]
+
+
+def _newton(self: PicardNewton, fn, args, options, state: _State, tags) -> _State:
+    residual, solve = _linearized(self, fn, args, state.y, tags)
+    return _correct(self, options, state, solve(residual))
 
 
 def _correct(self: PicardNewton, options, state: _State, diff) -> _State:
@@ -191,28 +215,33 @@ def _correct(self: PicardNewton, options, state: _State, diff) -> _State:
     # What the unknown is added to: increments are only needed to the accuracy of the
     # state that they change.
     scale_of = options.get("scale", lambda y: y)
-    sizes = jnp.stack([self.norm(d) for d in jtu.tree_leaves(diff)])
-    scales = jnp.stack([self.norm(s) for s in jtu.tree_leaves(scale_of(y))])
-    rtol = 2 * jnp.finfo(sizes.dtype).eps if self.rtol is None else self.rtol
-    return _State(
-        y=y,
-        size=jnp.max(_ratio(sizes, rtol * scales + self.atol)),
-        size_prev=state.size,
-        overall=_ratio(jnp.max(sizes), jnp.max(scales)),
-    )
-
-
-def _picard_done(state: _State) -> Bool[Array, ""]:
-    return (state.size <= 1) | _stagnated(state)
-
-
-def _stagnated(state: _State) -> Bool[Array, ""]:
-    """Rounding errors can keep the corrections to a leaf that is small next to the others
-    above `rtol` for ever. They are recognised by no longer shrinking."""
-    eps = jnp.finfo(state.size.dtype).eps
-    return (state.shrink > 0.5) & (state.overall <= 100 * eps)
+    sizes = [self.norm(d) for d in jtu.tree_leaves(diff)]
+    scales = [self.norm(s) for s in jtu.tree_leaves(scale_of(y))]
+    rtol = 2 * jnp.finfo(sizes[0].dtype).eps if self.rtol is None else self.rtol
+    largest = ft.partial(ft.reduce, jnp.maximum)
+    size = largest([_ratio(a, rtol * b + self.atol) for a, b in zip(sizes, scales)])
+    shrink = jnp.where(jnp.isfinite(state.size), _ratio(size, state.size), 1)
+    return _State(y, size, shrink, _ratio(largest(sizes), largest(scales)))
 
 
 def _ratio(a: Array, b: Array) -> Array:
     """`a / b`, with `0 / 0 = 0`: no correction at all is no error at all."""
     return jnp.where(a == 0, 0, a / b)
+
+
+def _is_short(fn, y, args) -> bool:
+    """Whether writing `fn` out ten times costs little: all arrays are small, and the
+    operations few."""
+    closed = jax.make_jaxpr(lambda y: fn(y, args))(y)
+    return sum(x.size for x in jtu.tree_leaves(y)) <= 32 and _length(closed) <= 500
+
+
+def _length(closed) -> int:
+    """The operations of a program, those of its subprograms included."""
+    inner = [
+        sub
+        for eqn in closed.eqns
+        for sub in jtu.tree_leaves(eqn.params, is_leaf=lambda x: hasattr(x, "eqns"))
+        if hasattr(sub, "eqns")
+    ]
+    return len(closed.eqns) + sum(map(_length, inner))

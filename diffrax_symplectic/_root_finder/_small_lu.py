@@ -1,8 +1,10 @@
 from typing import Any, TypeAlias
 
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import lineax as lx
 import lineax.internal as lxi
+import numpy as np
 from jaxtyping import Array, PyTree
 
 
@@ -28,7 +30,7 @@ class SmallLU(lx.AbstractLinearSolver[_State]):
             raise ValueError(
                 "`SmallLU` may only be used for linear solves with square matrices."
             )
-        return operator.as_matrix(), lxi.pack_structures(operator)
+        return _matrix(operator), lxi.pack_structures(operator)
 
     def compute(
         self, state: _State, vector: PyTree[Array], options: dict[str, Any]
@@ -54,8 +56,32 @@ class SmallLU(lx.AbstractLinearSolver[_State]):
         return True
 
 
+def _matrix(operator: lx.AbstractLinearOperator) -> Array:
+    n = operator.in_size()
+    if n > _MAX_UNROLLED:
+        return operator.as_matrix()
+    structure = operator.in_structure()
+    zeros = jtu.tree_map(lambda s: np.zeros(s.shape, s.dtype), structure)
+    leaves, treedef = jtu.tree_flatten(zeros)
+    columns = []
+    for i, leaf in enumerate(leaves):
+        for index in np.ndindex(leaf.shape):
+            unit = leaf.copy()
+            unit[index] = 1
+            y = operator.mv(treedef.unflatten(leaves[:i] + [unit] + leaves[i + 1 :]))
+            columns.append(jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(y)]))
+    return jnp.stack(columns, axis=1)
+
+
 def _solve_unrolled(matrix: Array, rhs: Array) -> Array:
     n = len(rhs)
+    if n == 1:
+        return rhs / matrix[0]
+    if n == 2:
+        (a, b), (c, d) = matrix
+        x, y = rhs
+        det = a * d - b * c
+        return jnp.stack([(d * x - b * y) / det, (a * y - c * x) / det])
     # Rows as lists of scalars: XLA sees straight-line arithmetic and fuses all of it.
     rows = [[matrix[i, j] for j in range(n)] + [rhs[i]] for i in range(n)]
     for k in range(n):
