@@ -2,7 +2,8 @@
 
 import dataclasses
 import itertools
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -11,6 +12,12 @@ from ._tableau import FlatTableau
 
 # Coefficients are exact up to a few roundings of order-one numbers.
 _TOLERANCE = 1e-14
+# From how many stages of one kind on it pays to evaluate them as one array.
+_WORTH_STACKING = 2
+
+
+# Stages of one kind that do not wait for each other.
+Group: TypeAlias = tuple[int, ...]
 
 
 class Block(NamedTuple):
@@ -19,10 +26,12 @@ class Block(NamedTuple):
     - `unknown`: the stages whose values are solved for; empty if the block is explicit.
     - `explicit`: the other stages, in an order in which each can be evaluated once the
         unknown ones and the earlier ones are known.
+
+    Both in groups of stages that can be evaluated together.
     """
 
-    unknown: tuple[int, ...]
-    explicit: tuple[int, ...]
+    unknown: tuple[Group, ...]
+    explicit: tuple[Group, ...]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,7 +44,7 @@ class Plan:
     @property
     def num_unknown(self) -> int:
         """Stage vectors that are solved for in one step."""
-        return sum(len(block.unknown) for block in self.blocks)
+        return sum(len(group) for block in self.blocks for group in block.unknown)
 
 
 def make_plan(tableau: FlatTableau) -> Plan:
@@ -47,7 +56,7 @@ def make_plan(tableau: FlatTableau) -> Plan:
         tableau = _merge(tableau, same_channels=True)
         tableau = _live(tableau)
         tableau = _merge(tableau, same_channels=False)
-    return Plan(tableau, _blocks(tableau.matrix))
+    return Plan(tableau, _blocks(tableau))
 
 
 def _mask(tableau: FlatTableau) -> FlatTableau:
@@ -109,10 +118,11 @@ def _merge(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
     return tableau
 
 
-def _blocks(matrix: np.ndarray) -> tuple[Block, ...]:
+def _blocks(tableau: FlatTableau) -> tuple[Block, ...]:
     """Strongly connected components of the dependencies, dependencies first."""
-    n = len(matrix)
-    reach = matrix != 0
+    n = len(tableau.stages)
+    depends = tableau.matrix != 0
+    reach = depends
     for k in range(n):
         reach = reach | (reach[:, k, None] & reach[k])
     closed = reach | np.eye(n, dtype=bool)
@@ -120,28 +130,48 @@ def _blocks(matrix: np.ndarray) -> tuple[Block, ...]:
     components = {tuple(np.flatnonzero(row).tolist()) for row in mutual}
     # A stage reaches everything that what it depends on reaches, and itself besides.
     ordered = sorted(components, key=lambda block: (closed[block[0]].sum(), block))
-    return tuple(_cut(block, matrix != 0) for block in ordered)
+    blocks = []
+    for component in ordered:
+        unknown, rounds = _cut(component, depends)
+        explicit = [group for ready in rounds for group in _groups(ready, tableau)]
+        blocks.append(Block(_groups(unknown, tableau), tuple(explicit)))
+    return tuple(blocks)
 
 
-def _cut(block: tuple[int, ...], depends: np.ndarray) -> Block:
-    """The fewest stages that, once known, leave no circle among the others."""
+def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
+    """Stages by what they evaluate."""
+    groups: dict[tuple, list[int]] = {}
+    for i in stages:
+        stage = tableau.stages[i]
+        kind = (stage.channels, stage.reads, stage.writes)
+        groups.setdefault(kind, []).append(i)
+    return tuple(
+        piece
+        for group in groups.values()
+        for piece in ([tuple(group)] if len(group) >= _WORTH_STACKING else zip(group))
+    )
+
+
+def _cut(
+    block: tuple[int, ...], depends: np.ndarray
+) -> tuple[tuple[int, ...], list[list[int]]]:
+    """The fewest stages that, once known, leave no circle among the others, and the rounds
+    in which these can be evaluated."""
     for size in range(len(block) + 1):
         for unknown in itertools.combinations(block, size):
-            explicit = _evaluation_order(
-                [i for i in block if i not in unknown], depends
-            )
-            if explicit is not None:
-                return Block(unknown, tuple(explicit))
+            rounds = _rounds([i for i in block if i not in unknown], depends)
+            if rounds is not None:
+                return unknown, rounds
     raise AssertionError
 
 
-def _evaluation_order(stages: list[int], depends: np.ndarray) -> list[int] | None:
-    order = []
+def _rounds(stages: list[int], depends: np.ndarray) -> list[list[int]] | None:
+    rounds = []
     rest = list(stages)
     while rest:
         ready = [i for i in rest if not depends[i, rest].any()]
         if not ready:
             return None
-        order += ready
+        rounds.append(ready)
         rest = [i for i in rest if i not in ready]
-    return order
+    return rounds

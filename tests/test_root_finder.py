@@ -61,7 +61,7 @@ def test_overshooting_corrections_are_shortened(start):
     # Newton's method alone diverges on arctan from beyond 1.39.
     sol = optx.root_find(
         lambda x, _: jnp.arctan(x),
-        ds.PicardNewton(unrolled=0, atol=1e-12),
+        ds.PicardNewton(atol=1e-12),
         jnp.array(start),
         max_steps=50,
         throw=False,

@@ -163,7 +163,7 @@ def test_adjoints_agree(adjoint):
         ds.PicardNewton(linear_solver=lx.QR()),
         ds.PicardNewton(direct=0),
         ds.PicardNewton(direct=100),
-        ds.PicardNewton(unrolled=0),
+        ds.PicardNewton(warmup=0, chords=0),
     ],
     ids=lambda r: type(r).__name__,
 )

@@ -66,8 +66,8 @@ def test_defect_sees_a_method_that_is_not_symplectic(solver):
 @pytest.mark.parametrize("solver", GENERAL.values(), ids=GENERAL.keys())
 def test_stage_equations_are_solved_to_rounding_error(solver, dtype):
     # The Jacobian above is implicit, and would be symplectic at any approximate
-    # solution. So the end of the step is compared to a solve that never stops early.
-    stubborn = ds.PicardNewton(rtol=0.0, direct=10_000, unrolled=8)
+    # solution. So the end of the step is compared to a solve that goes on and on.
+    stubborn = ds.PicardNewton(rtol=0.0, direct=10_000, chords=30)
     exact = dataclasses.replace(solver, root_finder=stubborn, root_find_max_steps=1)
 
     def ends(key):

@@ -15,6 +15,10 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from ._small_lu import SmallLU
 
 
+# Up to this many unknowns a few iterations too many cost less than to look after each.
+_SMALL = 32
+
+
 class _State(eqx.Module):
     y: PyTree[Array]
     # The last correction in units of the tolerance (1 is converged), how much smaller it
@@ -32,10 +36,6 @@ class _State(eqx.Module):
         eps = jnp.finfo(self.size.dtype).eps
         stagnated = (self.shrink > 0.5) & (self.overall <= 100 * eps)
         return (self.size * jnp.minimum(self.shrink, 1) <= 1) | stagnated
-
-    @property
-    def contracting(self) -> Bool[Array, ""]:
-        return self.shrink < 0.5
 
 
 class PicardNewton(optx.AbstractRootFinder):
@@ -98,13 +98,10 @@ class PicardNewton(optx.AbstractRootFinder):
         inf, one = jnp.array(jnp.inf, dtype), jnp.array(1, dtype)
         start = _State(y=y, size=inf, shrink=one, overall=inf)
         if sum(x.size for x in jtu.tree_leaves(y)) <= self.direct:
-            state = self._write_out_newton(fn, args, options, start, tags)
-        else:
-            state = self._picard(fn, args, options, start)
-        keep = state.converged | state.contracting
-        return jtu.tree_map(lambda a, b: jnp.where(keep, a, b), state, start)
+            return self._write_out_newton(fn, args, options, start, tags)
+        return self._picard(fn, args, options, start)
 
-    def _write_out_newton(self, fn, args, options, state: _State, tags) -> _State:
+    def _write_out_newton(self, fn, args, options, state: _State, tags):
         for _ in range(self.warmup):
             y = (state.y**ω - fn(state.y, args)[0] ** ω).ω
             state = eqx.tree_at(lambda s: s.y, state, y)
@@ -114,25 +111,39 @@ class PicardNewton(optx.AbstractRootFinder):
             state = _correct(self, options, state, solve(fn(state.y, args)[0]))
         return state
 
-    def _picard(self, fn, args, options, state: _State) -> _State:
+    def _picard(
+        self, fn, args, options, start: _State
+    ) -> tuple[_State, Bool[Array, ""]]:
+        # In pairs: positions and momenta move each other, so that corrections may shrink
+        # in turns.
+        def twice(y):
+            for _ in range(2):
+                y = (y**ω - fn(y, args)[0] ** ω).ω
+            return y
+
         def advance(carry):
-            state, previous, step = carry
-            new = _correct(self, options, state, fn(state.y, args)[0])
-            # Positions and momenta move each other, so that corrections may shrink in
-            # turns: what counts is the slower turn.
-            shrink = jnp.maximum(new.shrink, previous)
-            return eqx.tree_at(lambda s: s.shrink, new, shrink), new.shrink, step + 1
+            state, step = carry
+            diff = (state.y**ω - twice(state.y) ** ω).ω
+            return _correct(self, options, state, diff), step + 2
 
         def proceed(carry):
-            state, _, step = carry
-            contracting = (step <= 2) | state.contracting
+            state, step = carry
+            contracting = (step <= 2) | (state.shrink < 0.25)
             return ~state.converged & contracting & (step < self.picard_steps)
 
-        carry = state, state.shrink, jnp.array(0)
-        if _is_short(fn, state.y, args):
-            for _ in range(min(self.sweeps, self.picard_steps)):
-                carry = advance(carry)
-        return lax.while_loop(proceed, advance, carry)[0]
+        state, step = start, jnp.array(0)
+        if sum(x.size for x in jtu.tree_leaves(start.y)) <= _SMALL:
+            # No need to look before the last of these.
+            pairs = self.sweeps // 2
+            shift = lambda _, ys: (*ys[1:], twice(ys[-1]))
+            ys = lax.fori_loop(0, pairs, shift, (start.y,) * 3)
+            size_prev, _ = _sizes(self, options, ys[2], (ys[1] ** ω - ys[0] ** ω).ω)
+            size, overall = _sizes(self, options, ys[2], (ys[2] ** ω - ys[1] ** ω).ω)
+            state = _State(ys[2], size, _ratio(size, size_prev), overall)
+            step = jnp.array(2 * pairs)
+        state, _ = lax.while_loop(proceed, advance, (state, step))
+        keep = state.converged | (state.shrink < 0.25)
+        return jtu.tree_map(lambda a, b: jnp.where(keep, a, b), state, start)
 
     def step(
         self,
@@ -143,7 +154,12 @@ class PicardNewton(optx.AbstractRootFinder):
         state: _State,
         tags: frozenset[object],
     ) -> tuple[PyTree[Array], _State, Any]:
-        del y
+        # Before the first step `y` is the first guess. What was written out may have led
+        # anywhere if it was not converging.
+        keep = state.shrink < 0.5
+        fresh = eqx.tree_at(lambda s: s.size, state, jnp.full_like(state.size, jnp.inf))
+        fresh = eqx.tree_at(lambda s: s.y, fresh, y)
+        state = jtu.tree_map(lambda a, b: jnp.where(keep, a, b), state, fresh)
         full = _newton(self, fn, args, options, state, tags)
         size_of = lambda y: optx.two_norm(fn(y, args)[0])
         before = size_of(state.y)
@@ -212,6 +228,13 @@ def _newton(self: PicardNewton, fn, args, options, state: _State, tags) -> _Stat
 def _correct(self: PicardNewton, options, state: _State, diff) -> _State:
     """Subtracts the correction and measures it."""
     y = (state.y**ω - diff**ω).ω
+    size, overall = _sizes(self, options, y, diff)
+    shrink = jnp.where(jnp.isfinite(state.size), _ratio(size, state.size), 1)
+    return _State(y, size, shrink, overall)
+
+
+def _sizes(self: PicardNewton, options, y, diff) -> tuple[Scalar, Scalar]:
+    """A correction in units of the tolerance, and relative to the whole iterate."""
     # What the unknown is added to: increments are only needed to the accuracy of the
     # state that they change.
     scale_of = options.get("scale", lambda y: y)
@@ -220,28 +243,9 @@ def _correct(self: PicardNewton, options, state: _State, diff) -> _State:
     rtol = 2 * jnp.finfo(sizes[0].dtype).eps if self.rtol is None else self.rtol
     largest = ft.partial(ft.reduce, jnp.maximum)
     size = largest([_ratio(a, rtol * b + self.atol) for a, b in zip(sizes, scales)])
-    shrink = jnp.where(jnp.isfinite(state.size), _ratio(size, state.size), 1)
-    return _State(y, size, shrink, _ratio(largest(sizes), largest(scales)))
+    return size, _ratio(largest(sizes), largest(scales))
 
 
 def _ratio(a: Array, b: Array) -> Array:
     """`a / b`, with `0 / 0 = 0`: no correction at all is no error at all."""
     return jnp.where(a == 0, 0, a / b)
-
-
-def _is_short(fn, y, args) -> bool:
-    """Whether writing `fn` out ten times costs little: all arrays are small, and the
-    operations few."""
-    closed = jax.make_jaxpr(lambda y: fn(y, args))(y)
-    return sum(x.size for x in jtu.tree_leaves(y)) <= 32 and _length(closed) <= 500
-
-
-def _length(closed) -> int:
-    """The operations of a program, those of its subprograms included."""
-    inner = [
-        sub
-        for eqn in closed.eqns
-        for sub in jtu.tree_leaves(eqn.params, is_leaf=lambda x: hasattr(x, "eqns"))
-        if hasattr(sub, "eqns")
-    ]
-    return len(closed.eqns) + sum(map(_length, inner))

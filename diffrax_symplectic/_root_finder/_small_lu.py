@@ -1,5 +1,9 @@
+from collections.abc import Iterator
 from typing import Any, TypeAlias
 
+import jax
+import jax.flatten_util as jfu
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
@@ -15,7 +19,7 @@ _State: TypeAlias = tuple[Array, lxi.PackedStructures]
 
 
 class SmallLU(lx.AbstractLinearSolver[_State]):
-    """Gaussian elimination with partial pivoting, written out for small systems.
+    """Direct elimination (with partial pivoting), written out for small systems.
 
     A batched call to LAPACK costs far more than the arithmetic of a 2 x 2 system and
     cannot be fused with what surrounds it. Here a system of up to four unknowns is a
@@ -57,27 +61,33 @@ class SmallLU(lx.AbstractLinearSolver[_State]):
 
 
 def _matrix(operator: lx.AbstractLinearOperator) -> Array:
-    n = operator.in_size()
-    if n > _MAX_UNROLLED:
-        return operator.as_matrix()
+    """The matrix of an operator, column by column."""
     structure = operator.in_structure()
-    zeros = jtu.tree_map(lambda s: np.zeros(s.shape, s.dtype), structure)
-    leaves, treedef = jtu.tree_flatten(zeros)
-    columns = []
+    column = lambda unit: jfu.ravel_pytree(operator.mv(unit))[0]
+    if operator.in_size() <= _MAX_UNROLLED:
+        return jnp.stack([column(unit) for unit in _units(structure)], axis=1)
+    # In turns, and not by `vmap`: in an inner loop of a solve XLA finds that the products
+    # of the identity matrix with what is constant there can be had once for the whole
+    # loop, and then computes them in every step, also if the loop runs zero times.
+    zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), structure)
+    flat, unravel = jfu.ravel_pytree(zeros)
+    return lax.map(lambda x: column(unravel(x)), jnp.eye(flat.size, dtype=flat.dtype)).T
+
+
+def _units(structure: PyTree[jax.ShapeDtypeStruct]) -> Iterator[PyTree[np.ndarray]]:
+    """Unit vectors as constants of the program, which XLA can simplify."""
+    leaves, treedef = jtu.tree_flatten(structure)
     for i, leaf in enumerate(leaves):
         for index in np.ndindex(leaf.shape):
-            unit = leaf.copy()
-            unit[index] = 1
-            y = operator.mv(treedef.unflatten(leaves[:i] + [unit] + leaves[i + 1 :]))
-            columns.append(jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(y)]))
-    return jnp.stack(columns, axis=1)
+            unit = [np.zeros(s.shape, s.dtype) for s in leaves]
+            unit[i][index] = 1
+            yield treedef.unflatten(unit)
 
 
 def _solve_unrolled(matrix: Array, rhs: Array) -> Array:
     n = len(rhs)
-    if n == 1:
-        return rhs / matrix[0]
     if n == 2:
+        # Cramer's rule: no worse here than elimination, and no comparisons.
         (a, b), (c, d) = matrix
         x, y = rhs
         det = a * d - b * c

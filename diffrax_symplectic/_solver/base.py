@@ -6,6 +6,7 @@ from typing import ClassVar, NamedTuple, TYPE_CHECKING, TypeAlias
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
@@ -108,21 +109,24 @@ class AbstractSymplecticRungeKutta(
         values: dict[int, _Value] = {}
         result = diffrax.RESULTS.successful
 
-        def value_of(i: int, values: dict[int, _Value]) -> _Value:
-            position = _weighted_sum(y0, stages, matrix[i], values)
-            return evaluate(stages[i], position)
+        def values_of(group: tuple[int, ...], values: dict[int, _Value]) -> _Value:
+            """The values of stages of one kind; stacked, unless it is only one."""
+            position = _position(y0, stages, matrix[list(group)], values)
+            return evaluate([stages[i] for i in group], position)
 
         for block in plan.blocks:
             if len(block.unknown) > 0:
-                unknown, block_result = self._solve(block, value_of, values, stages, y0)
+                unknown, block_result = self._solve(
+                    block, values_of, values, stages, y0
+                )
                 values |= unknown
                 result = diffrax.RESULTS.where(
                     result == diffrax.RESULTS.successful, block_result, result
                 )
-            for i in block.explicit:
-                values[i] = value_of(i, values)
+            for group in block.explicit:
+                values |= _unstack(group, values_of(group, values))
 
-        y1 = _weighted_sum(y0, stages, plan.tableau.weights, values)
+        y1 = _position(y0, stages, plan.tableau.weights[None], values)
         result = diffrax.RESULTS.where(
             (result != diffrax.RESULTS.successful) | _all_finite(y1),
             result,
@@ -131,17 +135,26 @@ class AbstractSymplecticRungeKutta(
         return y1, None, dict(y0=y0, y1=y1), None, result
 
     def _solve(
-        self, block, value_of, known, stages, y0
+        self, block, values_of, known, stages, y0
     ) -> tuple[dict[int, _Value], diffrax.RESULTS]:
-        def residual(unknown: dict[int, _Value], _) -> dict[int, _Value]:
-            values = known | unknown
-            for i in block.explicit:
-                values[i] = value_of(i, values)
-            return {i: (k**ω - value_of(i, values) ** ω).ω for i, k in unknown.items()}
+        groups = block.unknown
+
+        def complete(unknown: list[_Value]) -> dict[int, _Value]:
+            values = dict(known)
+            for group, value in zip(groups, unknown):
+                values |= _unstack(group, value)
+            return values
+
+        def residual(unknown: list[_Value], _) -> list[_Value]:
+            values = complete(unknown)
+            for group in block.explicit:
+                values |= _unstack(group, values_of(group, values))
+            image = [values_of(group, values) for group in groups]
+            return (unknown**ω - image**ω).ω
 
         # A stage where it would be if this block did not move at all.
-        guess = {i: value_of(i, known) for i in block.unknown}
-        written = {i: _part(y0, stages[i].writes) for i in block.unknown}
+        guess = [values_of(group, known) for group in groups]
+        written = [_part(y0, stages[group[0]].writes) for group in groups]
         linear_solver = getattr(
             self.root_finder, "linear_solver", lx.AutoLinearSolver(None)
         )
@@ -154,7 +167,8 @@ class AbstractSymplecticRungeKutta(
             adjoint=optx.ImplicitAdjoint(linear_solver=linear_solver),
             throw=False,
         )
-        return sol.value, diffrax.RESULTS.promote(sol.result)
+        solved = {i: v for i, v in complete(sol.value).items() if i not in known}
+        return solved, diffrax.RESULTS.promote(sol.result)
 
     def func(
         self, terms: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
@@ -162,9 +176,15 @@ class AbstractSymplecticRungeKutta(
         return terms.vf(t0, y0, args)
 
 
-def _scale(written: dict[int, _Value], unknown: dict[int, _Value]) -> dict:
+def _scale(written: list[_Value], unknown: list[_Value]) -> list:
     """How large the state is that the unknown stage values change."""
     return jtu.tree_map(lambda x, k: jnp.abs(x) + jnp.abs(k), written, unknown)
+
+
+def _unstack(group: tuple[int, ...], value: _Value) -> dict[int, _Value]:
+    if len(group) == 1:
+        return {group[0]: value}
+    return {i: jtu.tree_map(lambda v: v[j], value) for j, i in enumerate(group)}
 
 
 def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTableau:
@@ -228,10 +248,23 @@ class _Evaluate:
         for name, controls in _controls(noise, variables, t0, t1, solver).items():
             self.driven[name] = (noise, controls, args)
 
-    def __call__(self, stage: Stage, y: Y) -> _Value:
-        t = self.t0 + stage.c * self.h
-        values = [_apply(self.driven[c], t, y) for c in stage.channels]
-        return _part(_sum(values), stage.writes)
+    def __call__(self, stages: list[Stage], y: Y) -> _Value:
+        first = stages[0]
+
+        def value(c, y):
+            t = self.t0 + c * self.h
+            return _part(
+                _sum([_apply(self.driven[name], t, y) for name in first.channels]),
+                first.writes,
+            )
+
+        if len(stages) == 1:
+            return value(first.c, y)
+        # Under `vmap`, for code and arrays of the size of one evaluation, not of many.
+        c = [stage.c for stage in stages]
+        if len(set(c)) == 1:
+            return jax.vmap(value, in_axes=(None, 0))(c[0], y)
+        return jax.vmap(value)(jnp.asarray(c, jnp.result_type(self.h)), y)
 
 
 # Called at several stages, this is traced and lowered once.
@@ -263,21 +296,32 @@ def _part(y: Y, part: str) -> PyTree[Array]:
     return y if part == "y" else y["pq".index(part)]
 
 
-def _weighted_sum(
-    y0: Y, stages: tuple[Stage, ...], weights: np.ndarray, values: dict[int, _Value]
+def _position(
+    y0: Y, stages: tuple[Stage, ...], rows: np.ndarray, values: dict[int, _Value]
 ) -> Y:
-    """`y0 + sum_i weights[i] values[i]`, over the values there are."""
+    """`y0 + sum_i rows[:, i] values[i]`, over the values there are. Stacked, unless it is
+    only one row."""
+
+    def scaled(i: int) -> PyTree[Array]:
+        column = rows[:, i]
+        if len(column) == 1:
+            weight = float(column[0])
+            return values[i] if weight == 1 else (weight * values[i] ** ω).ω
+        return jtu.tree_map(
+            lambda v: column.astype(v.dtype).reshape(-1, *[1] * v.ndim) * v, values[i]
+        )
 
     def add(part: str) -> PyTree[Array]:
-        total = None
-        for i, value in values.items():
-            if weights[i] != 0 and stages[i].writes == part:
-                weight = float(weights[i])
-                scaled = value if weight == 1 else (weight * value**ω).ω
-                total = scaled if total is None else (total**ω + scaled**ω).ω
         base = _part(y0, part)
+        total = None
+        for i in values:
+            if rows[:, i].any() and stages[i].writes == part:
+                total = scaled(i) if total is None else (total**ω + scaled(i) ** ω).ω
+        if total is None:
+            stack = lambda x: jnp.broadcast_to(x, (len(rows), *jnp.shape(x)))
+            return base if len(rows) == 1 else jtu.tree_map(stack, base)
         # The small terms first: fewer roundings of the size of the state.
-        return base if total is None else (base**ω + total**ω).ω
+        return (base**ω + total**ω).ω
 
     return add("y") if stages[0].writes == "y" else (add("p"), add("q"))
 
