@@ -44,9 +44,9 @@ def _problem(key, d, m, dtype=jnp.float64):
 
 def test_stages_are_solved_one_after_the_other():
     blocks = make_plan(ds.SRKs4().tableau.flatten()).blocks
-    assert [b.unknown for b in blocks if b.unknown] == [(0,), (1,)]
+    assert [b.unknown for b in blocks if b.unknown] == [((0,),), ((1,),)]
     assert make_plan(ds.SRKw5().tableau.flatten()).num_unknown == 1
-    assert Block((), (5,)) in blocks
+    assert Block((), ((5,),)) in blocks
 
 
 @pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-6)])

@@ -119,11 +119,20 @@ def test_other_parameters_of_the_paper_are_dead(make):
     "solver, blocks",
     [
         # Stages: velocities, then forces, then noise.
-        (ds.SRKw3("a"), [Block((0,), (1,))]),  # the noise is read with the force
-        (ds.SRKw3("b"), [Block((0,), (1,)), Block((), (2,))]),  # drift, then kick
-        (ds.SRKw3("c"), [Block((), (2,)), Block((0,), (1,))]),  # kick, then drift
-        (ds.SRKs2(), [Block((0,), (1,))]),
-        (ds.SRKs3(), [Block((0,), (2,)), Block((1,), (3,)), Block((), (4,))]),
+        (ds.SRKw3("a"), [Block(((0,),), ((1,),))]),  # the noise is read with the force
+        (
+            ds.SRKw3("b"),
+            [Block(((0,),), ((1,),)), Block((), ((2,),))],
+        ),  # drift, then kick
+        (
+            ds.SRKw3("c"),
+            [Block((), ((2,),)), Block(((0,),), ((1,),))],
+        ),  # kick, then drift
+        (ds.SRKs2(), [Block(((0,),), ((1,),))]),
+        (
+            ds.SRKs3(),
+            [Block(((0,),), ((2,),)), Block(((1,),), ((3,),)), Block((), ((4,),))],
+        ),
     ],
     ids=repr,
 )

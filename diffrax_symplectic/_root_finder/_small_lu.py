@@ -74,14 +74,14 @@ def _matrix(operator: lx.AbstractLinearOperator) -> Array:
     return lax.map(lambda x: column(unravel(x)), jnp.eye(flat.size, dtype=flat.dtype)).T
 
 
-def _units(structure: PyTree[jax.ShapeDtypeStruct]) -> Iterator[PyTree[np.ndarray]]:
+def _units(structure: PyTree[jax.ShapeDtypeStruct]) -> Iterator[PyTree[Array]]:
     """Unit vectors as constants of the program, which XLA can simplify."""
     leaves, treedef = jtu.tree_flatten(structure)
     for i, leaf in enumerate(leaves):
         for index in np.ndindex(leaf.shape):
             unit = [np.zeros(s.shape, s.dtype) for s in leaves]
             unit[i][index] = 1
-            yield treedef.unflatten(unit)
+            yield treedef.unflatten(map(jnp.asarray, unit))
 
 
 def _solve_unrolled(matrix: Array, rhs: Array) -> Array:

@@ -1,0 +1,281 @@
+"""Expectations over very many paths, a batch at a time."""
+
+import collections
+import functools as ft
+import os
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+
+_Sample: TypeAlias = Callable[[PRNGKeyArray], Any]
+_Host = PyTree[np.ndarray]
+
+
+class Expectation(eqx.Module):
+    r"""An estimate of $\mathbb E[\phi]$, as [`diffrax_symplectic.expectation`][] returns.
+
+    - `mean`: the mean over the paths that succeeded, in the structure of $\phi$, in
+        float64.
+    - `sum_of_squares`: the sum of the squared deviations from `mean`.
+    - `num_paths`: how many paths succeeded.
+    - `num_failed`: how many paths failed. They have no part in the rest.
+    - `key_data`: the random key that the paths came from.
+    """
+
+    mean: _Host
+    sum_of_squares: _Host
+    num_paths: int
+    num_failed: int
+    key_data: np.ndarray
+
+    @property
+    def variance(self) -> PyTree[Float[np.ndarray, "..."]]:
+        r"""The variance of $\phi$ over the paths."""
+        n = self.num_paths - 1
+        share = lambda m2: m2 / n if n > 0 else np.full_like(m2, np.nan)
+        return jtu.tree_map(share, self.sum_of_squares)
+
+    @property
+    def std_error(self) -> PyTree[Float[np.ndarray, "..."]]:
+        """The standard error of `mean`."""
+        n = max(self.num_paths, 1)
+        return jtu.tree_map(lambda v: np.sqrt(v / n), self.variance)
+
+
+class ExpectationInterrupted(KeyboardInterrupt):
+    """Raised by [`diffrax_symplectic.expectation`][] in place of a `KeyboardInterrupt`.
+    Its attribute `estimate` holds what was done until then, to go on from with
+    `start=`."""
+
+    def __init__(self, estimate: Expectation):
+        super().__init__(
+            f"Interrupted after {estimate.num_paths + estimate.num_failed} paths. Catch "
+            "`ExpectationInterrupted` and pass its `estimate` as `start` to go on."
+        )
+        self.estimate = estimate
+
+
+def expectation(
+    fn: _Sample,
+    key: PRNGKeyArray,
+    num_paths: int,
+    *,
+    batch_size: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+    start: Expectation | None = None,
+    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
+) -> Expectation:
+    r"""Estimates $\mathbb E[\phi]$ and its standard error over any number of paths.
+
+    The paths are taken in batches that fit a processor's cache, so that memory does not
+    grow with their number. Path number $i$ gets the key
+    `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, whatever the batch size and the
+    devices are. Means and deviations are accumulated by the pairwise formula of Chan,
+    Golub and LeVeque, between batches in float64.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+        import jax.random as jr
+
+        H = lambda t, p, q, args: (p**2 + q**2) / 2
+        y0 = (jnp.array(0.0), jnp.array(1.0))
+
+        def phi(key):
+            terms = ds.hamiltonian_terms(H, H, ds.WeakBrownianPath((), key))
+            sol = diffrax.diffeqsolve(
+                terms, ds.SRKw1(), t0=0, t1=1, dt0=0.1, y0=y0, throw=False
+            )
+            p, q = sol.ys
+            return q[-1] ** 2, sol.result
+
+        estimate = ds.expectation(phi, jr.key(0), 10_000)
+        print(estimate.mean, estimate.std_error, estimate.num_failed)
+        ```
+
+    **Arguments:**
+
+    - `fn`: takes a random key to $\phi$, a PyTree of real arrays, or to a pair of that
+        and a `diffrax.RESULTS`: as above, with `throw=False`. A path fails if its result
+        is not successful or anything in its $\phi$ is not finite.
+    - `key`: a JAX random key.
+    - `num_paths`: how many paths there shall be in all, those of `start` included.
+    - `batch_size`: how many paths each device takes at once. By default 1,024 on CPUs and
+        65,536 elsewhere.
+    - `devices`: the devices that share each batch, by default all of `jax.devices()`:
+        under `jax.distributed` those of every process, each of which has to make the same
+        call and gets the same result.
+    - `start`: an earlier estimate with the same `fn` and `key`, to be continued.
+    - `progress_meter`: one of Diffrax's.
+
+    **Returns:** an [`diffrax_symplectic.Expectation`][].
+
+    **Raises:** a `ValueError` for sizes that are not positive integers, if `start` came
+    from another key or has more paths, or if $\phi$ is not real;
+    [`diffrax_symplectic.ExpectationInterrupted`][], with the estimate so far, on an
+    interrupt from the keyboard.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{chan1983algorithms,
+            author = {Chan, Tony F. and Golub, Gene H. and LeVeque, Randall J.},
+            title = {Algorithms for Computing the Sample Variance: Analysis and
+                     Recommendations},
+            journal = {The American Statistician},
+            volume = {37},
+            number = {3},
+            pages = {242--247},
+            year = {1983},
+            doi = {10.1080/00031305.1983.10483115},
+        }
+        ```
+    """
+    devices = tuple(jax.devices() if devices is None else devices)
+    on_cpu = devices[0].platform == "cpu"
+    if batch_size is None:
+        batch_size = 1024 if on_cpu else 65536
+    for name, value in (("num_paths", num_paths), ("batch_size", batch_size)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
+    if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        key = jr.wrap_key_data(key)
+    key_data, impl = np.asarray(jr.key_data(key)), jr.key_impl(key)
+    estimate = _start(fn, key, key_data, start, num_paths)
+
+    mesh = Mesh(np.array(devices), ("paths",))
+    step = batch_size * len(devices)
+    # One batch runs on one core, more or less: as many at once as there are cores.
+    local = sum(d.process_index == jax.process_index() for d in devices)
+    at_once = max(2, (os.cpu_count() or 1) // max(local, 1)) if on_cpu else 2
+    begins = range(estimate.num_paths + estimate.num_failed, num_paths, step)
+    running = collections.deque()
+    meter = progress_meter.init()
+    try:
+        for begin in begins:
+            lo_hi = np.array([begin & 0xFFFFFFFF, begin >> 32], np.uint32)
+            size = np.array(min(step, num_paths - begin), np.int32)
+            running.append(_batch(fn, key_data, lo_hi, size, impl, mesh, batch_size))
+            if len(running) == at_once:
+                estimate = _merge(estimate, running.popleft())
+                done = estimate.num_paths + estimate.num_failed
+                meter = progress_meter.step(meter, np.asarray(done / num_paths))
+        while running:
+            estimate = _merge(estimate, running.popleft())
+    except KeyboardInterrupt:
+        raise ExpectationInterrupted(estimate) from None
+    finally:
+        progress_meter.close(meter)
+    return estimate
+
+
+def _start(fn, key, key_data, start: Expectation | None, num_paths: int) -> Expectation:
+    """The estimate without any path, or the one to go on from."""
+    phi, _ = eqx.filter_eval_shape(_evaluate, fn, key)
+    for leaf in jtu.tree_leaves(phi):
+        if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
+            raise ValueError(
+                "`fn` must return real arrays; got one of dtype "
+                f"{leaf.dtype}. Return real and imaginary parts."
+            )
+    zeros = jtu.tree_map(lambda s: np.zeros(s.shape), phi)
+    if start is None:
+        return Expectation(zeros, zeros, 0, 0, key_data)
+    if not np.array_equal(start.key_data, key_data):
+        raise ValueError(
+            "`start` is an estimate with another `key`. Pass the one that it came from, "
+            "so that no path is taken twice."
+        )
+    if jtu.tree_structure(start.mean) != jtu.tree_structure(zeros):
+        raise ValueError("`start` is an estimate of something of another structure.")
+    if start.num_paths + start.num_failed > num_paths:
+        raise ValueError(
+            "`num_paths` counts all paths, those of `start` included, of which there are "
+            f"{start.num_paths + start.num_failed} already; got {num_paths}."
+        )
+    return start
+
+
+def _evaluate(fn: _Sample, key) -> tuple[PyTree[Array], Array]:
+    """What `fn` returns, and whether the path succeeded."""
+    out = fn(key)
+    success = jnp.array(True)
+    if isinstance(out, tuple) and len(out) == 2 and _is_result(out[1]):
+        out, result = out
+        success = result == diffrax.RESULTS.successful
+    out = jtu.tree_map(jnp.asarray, out)
+    for leaf in jtu.tree_leaves(out):
+        success = success & jnp.all(jnp.isfinite(leaf))
+    return out, success
+
+
+def _is_result(x) -> bool:
+    return isinstance(x, type(diffrax.RESULTS.successful))
+
+
+@eqx.filter_jit
+def _batch(fn, key_data, lo_hi, size, impl, mesh: Mesh, n: int):
+    """Number, mean and sum of squared deviations of the successful paths, and the number
+    of the others, over one batch on all devices."""
+
+    def local(lo_hi, size):
+        index = jax.lax.axis_index("paths") * n + jnp.arange(n)
+        lo = lo_hi[0] + index.astype(jnp.uint32)
+        hi = lo_hi[1] + (lo < lo_hi[0]).astype(jnp.uint32)
+        key = jr.wrap_key_data(jnp.asarray(key_data), impl=impl)
+        fold = lambda hi, lo: jr.fold_in(jr.fold_in(key, hi), lo)
+        phi, success = jax.vmap(lambda k: _evaluate(fn, k))(jax.vmap(fold)(hi, lo))
+        good = success & (index < size)
+        total = ft.partial(jax.lax.psum, axis_name="paths")
+        count = total(jnp.sum(good))
+        failed = total(jnp.sum(~success & (index < size)))
+
+        def moments(x):
+            x = x.astype(jnp.result_type(x, float))
+            keep = good.reshape(-1, *[1] * (x.ndim - 1))
+            add = lambda x: total(jnp.sum(jnp.where(keep, x, 0), axis=0))
+            mean = add(x) / jnp.maximum(count, 1)
+            # In two passes: no difference of large numbers.
+            return mean, add((x - mean) ** 2)
+
+        leaves, treedef = jtu.tree_flatten(phi)
+        means, squares = zip(*map(moments, leaves))
+        return count, failed, treedef.unflatten(means), treedef.unflatten(squares)
+
+    specs = PartitionSpec(), PartitionSpec()
+    return jax.shard_map(
+        local, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False
+    )(lo_hi, size)
+
+
+def _merge(estimate: Expectation, batch) -> Expectation:
+    """The estimate from the paths of both."""
+    count, failed, mean, squares = jax.device_get(batch)
+    a, b = estimate.num_paths, int(count)
+    n = max(a + b, 1)
+    delta = jtu.tree_map(lambda x, y: y.astype(float) - x, estimate.mean, mean)
+    return Expectation(
+        mean=jtu.tree_map(lambda x, d: x + d * (b / n), estimate.mean, delta),
+        sum_of_squares=jtu.tree_map(
+            lambda x, y, d: x + y.astype(float) + d**2 * (a * b / n),
+            estimate.sum_of_squares,
+            squares,
+            delta,
+        ),
+        num_paths=a + b,
+        num_failed=estimate.num_failed + int(failed),
+        key_data=estimate.key_data,
+    )
