@@ -8,6 +8,11 @@ from ._conditions import (
     symplectic_residuals as symplectic_residuals,
     weak_order_residuals as weak_order_residuals,
 )
+from ._expectation import (
+    Expectation as Expectation,
+    expectation as expectation,
+    ExpectationInterrupted as ExpectationInterrupted,
+)
 from ._hamiltonian import hamiltonian_terms as hamiltonian_terms
 from ._root_finder import SmallLU as SmallLU, PicardNewton as PicardNewton
 from ._solver import (

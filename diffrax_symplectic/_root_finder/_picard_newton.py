@@ -101,7 +101,7 @@ class PicardNewton(optx.AbstractRootFinder):
             return self._write_out_newton(fn, args, options, start, tags)
         return self._picard(fn, args, options, start)
 
-    def _write_out_newton(self, fn, args, options, state: _State, tags):
+    def _write_out_newton(self, fn, args, options, state: _State, tags) -> _State:
         for _ in range(self.warmup):
             y = (state.y**ω - fn(state.y, args)[0] ** ω).ω
             state = eqx.tree_at(lambda s: s.y, state, y)
@@ -111,9 +111,7 @@ class PicardNewton(optx.AbstractRootFinder):
             state = _correct(self, options, state, solve(fn(state.y, args)[0]))
         return state
 
-    def _picard(
-        self, fn, args, options, start: _State
-    ) -> tuple[_State, Bool[Array, ""]]:
+    def _picard(self, fn, args, options, start: _State) -> _State:
         # In pairs: positions and momenta move each other, so that corrections may shrink
         # in turns.
         def twice(y):

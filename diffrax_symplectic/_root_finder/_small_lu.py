@@ -79,9 +79,12 @@ def _units(structure: PyTree[jax.ShapeDtypeStruct]) -> Iterator[PyTree[Array]]:
     leaves, treedef = jtu.tree_flatten(structure)
     for i, leaf in enumerate(leaves):
         for index in np.ndindex(leaf.shape):
-            unit = [np.zeros(s.shape, s.dtype) for s in leaves]
-            unit[i][index] = 1
-            yield treedef.unflatten(map(jnp.asarray, unit))
+            unit = [jnp.zeros(s.shape, s.dtype) for s in leaves]
+            one = np.zeros(leaf.shape, leaf.dtype)
+            one[index] = 1
+            # Made by operations, to have the type of what is traced (under `shard_map`).
+            unit[i] = unit[i] + one
+            yield treedef.unflatten(unit)
 
 
 def _solve_unrolled(matrix: Array, rhs: Array) -> Array:

@@ -1,0 +1,203 @@
+"""Expectations over many paths: the same paths however they are run, none lost, none
+counted that failed."""
+
+import os
+import socket
+import subprocess
+import sys
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from .problems import kubo_terms
+
+
+def _normal(key):
+    return {"x": 1e6 + jr.normal(key, (2,))}
+
+
+def _by_hand(fn, key, n):
+    index = jnp.arange(n, dtype=jnp.uint32)
+    return jax.vmap(lambda i: fn(jr.fold_in(jr.fold_in(key, 0), i)))(index)
+
+
+@pytest.mark.parametrize("batch_size", [7, 64, 1000, 4096])
+def test_mean_and_standard_error_are_those_of_all_paths(batch_size):
+    key = jr.key(1)
+    got = ds.expectation(_normal, key, 1000, batch_size=batch_size)
+    x = np.asarray(_by_hand(_normal, key, 1000)["x"])
+    np.testing.assert_allclose(got.mean["x"], x.mean(axis=0), rtol=1e-14)
+    # Small deviations about a large mean: a difference of squares would lose these.
+    np.testing.assert_allclose(got.variance["x"], x.var(axis=0, ddof=1), rtol=1e-9)
+    error = x.std(axis=0, ddof=1) / np.sqrt(1000)
+    np.testing.assert_allclose(got.std_error["x"], error, rtol=1e-9)
+    assert (got.num_paths, got.num_failed) == (1000, 0)
+
+
+def test_single_precision_is_accumulated_in_double():
+    ones = lambda key: jnp.float32(1) + 1e-3 * jr.normal(key, (), jnp.float32)
+    got = ds.expectation(ones, jr.key(0), 100_000, batch_size=1000)
+    x = np.asarray(_by_hand(ones, jr.key(0), 100_000), float)
+    np.testing.assert_allclose(got.mean, x.mean(), rtol=1e-8)
+    np.testing.assert_allclose(got.variance, x.var(ddof=1), rtol=1e-4)
+
+
+def test_an_estimate_can_be_continued():
+    key = jr.key(2)
+    first = ds.expectation(_normal, key, 300, batch_size=128)
+    rest = ds.expectation(_normal, key, 1000, batch_size=200, start=first)
+    whole = ds.expectation(_normal, key, 1000)
+    assert rest.num_paths == 1000
+    np.testing.assert_allclose(rest.mean["x"], whole.mean["x"], rtol=1e-14)
+    np.testing.assert_allclose(rest.variance["x"], whole.variance["x"], rtol=1e-9)
+    with pytest.raises(ValueError, match="another `key`"):
+        ds.expectation(_normal, jr.key(3), 1000, start=first)
+    with pytest.raises(ValueError, match="of which there are 1000 already"):
+        ds.expectation(_normal, key, 300, start=rest)
+    with pytest.raises(ValueError, match="another structure"):
+        ds.expectation(lambda k: jr.normal(k), key, 2000, start=rest)
+
+
+def test_failed_paths_are_counted_and_left_out():
+    def phi(key):
+        x = jr.uniform(key)
+        ok = diffrax.RESULTS.successful
+        bad = diffrax.RESULTS.max_steps_reached
+        value = jnp.where(x > 0.9, jnp.nan, x)
+        return value, diffrax.RESULTS.where(x < 0.2, bad, ok)
+
+    got = ds.expectation(phi, jr.key(0), 5000, batch_size=999)
+    x = np.asarray(_by_hand(jr.uniform, jr.key(0), 5000))
+    good = x[(x >= 0.2) & (x <= 0.9)]
+    assert got.num_paths == len(good) and got.num_failed == 5000 - len(good)
+    np.testing.assert_allclose(got.mean, good.mean(), rtol=1e-13)
+    nothing = ds.expectation(lambda key: jnp.nan, jr.key(0), 10)
+    assert (nothing.num_paths, nothing.num_failed) == (0, 10)
+    assert np.isnan(nothing.std_error)
+
+
+def _square(solver, steps=10):
+    def phi(key):
+        terms = kubo_terms(ds.WeakBrownianPath((), key))
+        y0 = (jnp.array(0.0), jnp.array(1.0))
+        sol = diffrax.diffeqsolve(
+            terms, solver, 0.0, 1.0, 1 / steps, y0, max_steps=steps, throw=False
+        )
+        return sol.ys[1][-1] ** 2, sol.result
+
+    return phi
+
+
+def test_the_estimate_of_a_solve_is_its_exact_expectation():
+    # Midpoint turns by 2 atan((h + I) / 2): the moments of the method in closed form.
+    n, h = 10, 0.1
+    got = ds.expectation(_square(ds.Midpoint(), n), jr.key(0), 20_000)
+    increments = np.sqrt(3 * h) * np.array([-1, 0, 1])
+    twice = 4 * np.arctan((h + increments) / 2)
+    exact = (1 + (np.exp(1j * twice) @ np.array([1, 4, 1]) / 6) ** n).real / 2
+    assert got.num_failed == 0
+    assert abs(got.mean - exact) <= 4 * got.std_error
+    assert 0 < got.std_error < 0.01
+
+
+def test_an_interrupt_loses_only_what_is_running():
+    class Interrupting(diffrax.AbstractProgressMeter):
+        def init(self):
+            return 0
+
+        def step(self, state, progress):
+            if state == 2:
+                raise KeyboardInterrupt
+            return state + 1
+
+        def close(self, state):
+            pass
+
+    with pytest.raises(ds.ExpectationInterrupted) as info:
+        ds.expectation(
+            _normal, jr.key(0), 1000, batch_size=100, progress_meter=Interrupting()
+        )
+    estimate = info.value.estimate
+    assert estimate.num_paths == 300
+    rest = ds.expectation(_normal, jr.key(0), 1000, start=estimate)
+    whole = ds.expectation(_normal, jr.key(0), 1000)
+    np.testing.assert_allclose(rest.mean["x"], whole.mean["x"], rtol=1e-14)
+
+
+def test_progress_is_shown(capfd):
+    meter = diffrax.TextProgressMeter()
+    ds.expectation(_normal, jr.key(0), 1000, batch_size=100, progress_meter=meter)
+    jax.effects_barrier()
+    assert "%" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("value", [0, -1, 1.5, "3", True])
+@pytest.mark.parametrize("name", ["num_paths", "batch_size"])
+def test_sizes_that_are_not_positive_integers_are_refused(name, value):
+    kwargs = {"num_paths": 10, "batch_size": 10, name: value}
+    with pytest.raises(ValueError, match=f"`{name}` must be a positive integer"):
+        ds.expectation(_normal, jr.key(0), **kwargs)
+
+
+def test_complex_values_are_refused():
+    with pytest.raises(ValueError, match="must return real arrays"):
+        ds.expectation(lambda key: jr.normal(key) * 1j, jr.key(0), 10)
+
+
+def test_old_style_keys_will_do():
+    a = ds.expectation(_normal, jr.PRNGKey(1), 100)
+    np.testing.assert_array_equal(
+        a.mean["x"], ds.expectation(_normal, jr.key(1), 100).mean["x"]
+    )
+
+
+PROGRAM = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
+if len(sys.argv) > 2:
+    address, rank = sys.argv[2:]
+    jax.distributed.initialize(address, num_processes=2, process_id=int(rank))
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+import jax.random as jr
+import diffrax_symplectic as ds
+from tests.test_expectation import _square
+assert len(jax.devices()) == int(sys.argv[1]) * (2 if len(sys.argv) > 2 else 1)
+e = ds.expectation(_square(ds.Midpoint()), jr.key(0), 3001, batch_size=100)
+print(repr(float(e.mean)), repr(float(e.std_error)), e.num_paths)
+"""
+
+
+def _start(*args) -> subprocess.Popen:
+    root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    command = [sys.executable, "-c", PROGRAM, *map(str, args)]
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=environment, cwd=root
+    )
+
+
+def _read(process: subprocess.Popen) -> list[float]:
+    out, _ = process.communicate(timeout=300)
+    assert process.returncode == 0
+    return [float(x) for x in out.splitlines()[-1].split()]
+
+
+def test_the_paths_are_the_same_on_any_devices_and_hosts():
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{s.getsockname()[1]}"
+    here = ds.expectation(_square(ds.Midpoint()), jr.key(0), 3001)
+    expected = [here.mean, here.std_error, here.num_paths]
+    # Three devices of one process; then two processes with two devices each.
+    np.testing.assert_allclose(_read(_start(3)), expected, rtol=1e-12)
+    processes = [_start(2, address, rank) for rank in (0, 1)]
+    for process in processes:
+        np.testing.assert_allclose(_read(process), expected, rtol=1e-12)
