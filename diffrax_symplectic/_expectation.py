@@ -159,9 +159,12 @@ def expectation(
     key_data, impl = np.asarray(jr.key_data(key)), jr.key_impl(key)
     estimate = _start(fn, key, key_data, start, num_paths)
 
+    first = estimate.num_paths + estimate.num_failed
+    # No more lanes than paths.
+    batch_size = min(batch_size, max(1, -(-(num_paths - first) // len(devices))))
     mesh = Mesh(np.array(devices), ("paths",))
     step = batch_size * len(devices)
-    begins = range(estimate.num_paths + estimate.num_failed, num_paths, step)
+    begins = range(first, num_paths, step)
     running = collections.deque()
     meter = progress_meter.init()
     try:

@@ -35,7 +35,8 @@ class _State(eqx.Module):
         # others above `rtol` for ever: then they no longer shrink.
         eps = jnp.finfo(self.size.dtype).eps
         stagnated = (self.shrink > 0.5) & (self.overall <= 100 * eps)
-        return (self.size * jnp.minimum(self.shrink, 1) <= 1) | stagnated
+        # A fraction of the tolerance: what remains has the same sign in every step.
+        return (self.size * jnp.minimum(self.shrink, 1) <= 1 / 8) | stagnated
 
 
 class PicardNewton(optx.AbstractRootFinder):
