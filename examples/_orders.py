@@ -178,8 +178,8 @@ def report(title: str, results: dict[str, Errors]) -> None:
 def plot_orders(axes, title: str, results: dict[str, Errors], slopes=(1, 2)) -> None:
     """Errors with three standard errors, and reference slopes."""
     for i, (name, e) in enumerate(results.items()):
-        dashed = "-" if name.startswith(("SRK", "Mid")) else "--"
-        label = f"{name} ({e.slope:.2f})"
+        dashed = "--" if name in dir(diffrax) else "-"
+        label = name if np.isnan(e.slope) else f"{name} ({e.slope:.2f})"
         axes.errorbar(
             e.hs, np.maximum(e.errors, 1e-17), 3 * e.std_errors, label=label,
             color=f"C{i}", ls=dashed, marker="o", ms=3, lw=1, capsize=2,
@@ -190,5 +190,7 @@ def plot_orders(axes, title: str, results: dict[str, Errors], slopes=(1, 2)) -> 
         axes.loglog(first.hs, line, "k:", lw=0.8)
         axes.annotate(f"{slope:g}", (first.hs[-1], line[-1]), fontsize=7)
     axes.set(xscale="log", yscale="log", xlabel="step size h", title=title)
+    axes.set_xticks(first.hs, [f"$2^{{{np.log2(h):.0f}}}$" for h in first.hs])
+    axes.minorticks_off()
     axes.legend(fontsize=7)
     axes.grid(alpha=0.3)

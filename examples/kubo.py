@@ -47,6 +47,7 @@ def weak_orders(axes) -> None:
     solvers = {
         "SRKw1": (ds.SRKw1(), weak),
         "SRKw2": (ds.SRKw2(), weak),
+        "StrangGauss": (ds.StrangGauss(), weak),
         "SlowRK": (diffrax.SlowRK(), area),
         "Heun": (diffrax.Heun(), gaussian),
         "StratonovichMilstein": (diffrax.StratonovichMilstein(), gaussian),

@@ -16,6 +16,7 @@ GENERAL = {
     "SRKw1": ds.SRKw1(),
     "SRKw1-0.2": ds.SRKw1(b=0.2),
     "SRKw2": ds.SRKw2(),
+    "StrangGauss": ds.StrangGauss(),
 }
 
 

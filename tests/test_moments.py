@@ -27,6 +27,7 @@ EXCESS = [
     (ds.SRKw1(b=0.2), None),
     (ds.SRKw1(b=1.0), 0.0),
     (ds.SRKw2(), None),
+    (ds.StrangGauss(), None),
     (ds.SRKw3("a"), -0.00198020),
     *[(ds.SRKw3(v), 0.0) for v in "bcef"],
     (ds.SRKw4(a21=0.0), 0.0),

@@ -12,6 +12,7 @@ from diffrax_symplectic._plan import Block, make_plan
 TABLEAUS = {
     "Midpoint": ds.Midpoint().tableau,
     "SRKw2": ds.SRKw2().tableau,
+    "StrangGauss": ds.StrangGauss().tableau,
     **{f"SRKs1({a})": ds.SRKs1(a=a).tableau for a in (-0.3, 0.0, 0.25, 0.4, 0.5)},
     **{f"SRKw1({b})": ds.SRKw1(b=b).tableau for b in (-0.3, 0.0, 0.5, 0.7, 1.0)},
 }
@@ -31,13 +32,16 @@ def test_tableau_has_weak_order_one(tableau):
     assert max(map(abs, residuals.values())) <= 1e-15
 
 
-def test_srkw2_satisfies_all_17_conditions_for_weak_order_two():
-    residuals = ds.weak_order_residuals(ds.SRKw2().tableau, 2)
+@pytest.mark.parametrize("name", ["SRKw2", "StrangGauss"])
+def test_all_17_conditions_for_weak_order_two_are_satisfied(name):
+    residuals = ds.weak_order_residuals(TABLEAUS[name], 2)
     assert len(residuals) == 17
     assert max(map(abs, residuals.values())) <= 1e-15
 
 
-@pytest.mark.parametrize("name", [n for n in TABLEAUS if n != "SRKw2"])
+@pytest.mark.parametrize(
+    "name", [n for n in TABLEAUS if n not in ("SRKw2", "StrangGauss")]
+)
 def test_other_tableaus_do_not_have_weak_order_two(name):
     residuals = ds.weak_order_residuals(TABLEAUS[name], 2)
     assert max(map(abs, residuals.values())) > 1e-2
@@ -79,6 +83,7 @@ def test_every_perturbed_live_coefficient_is_caught(tableau, field):
         (ds.SRKw1(b=1.0), [1, 1]),
         (ds.SRKw1(b=0.2), [2]),
         (ds.SRKw2(), [6]),
+        (ds.StrangGauss(), [1, 2, 1]),
     ],
 )
 def test_only_live_distinct_stages_are_solved(solver, blocks):

@@ -9,3 +9,4 @@ from .srkw2 import SRKw2 as SRKw2
 from .srkw3 import SRKw3 as SRKw3
 from .srkw4 import SRKw4 as SRKw4
 from .srkw5 import SRKw5 as SRKw5
+from .strang_gauss import StrangGauss as StrangGauss
