@@ -1,4 +1,6 @@
 from ._brownian import (
+    PlateauBrownianPath as PlateauBrownianPath,
+    PlateauIncrement as PlateauIncrement,
     TruncatedBrownianPath as TruncatedBrownianPath,
     WeakBrownianPath as WeakBrownianPath,
     WeakIncrement as WeakIncrement,
@@ -17,6 +19,8 @@ from ._hamiltonian import hamiltonian_terms as hamiltonian_terms
 from ._root_finder import SmallLU as SmallLU, PicardNewton as PicardNewton
 from ._solver import (
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
+    AdditiveGauss as AdditiveGauss,
+    PlateauVerlet as PlateauVerlet,
     Midpoint as Midpoint,
     SRKs1 as SRKs1,
     SRKs2 as SRKs2,
@@ -33,6 +37,7 @@ from ._tableau import (
     AbstractTableau as AbstractTableau,
     AdditiveTableau as AdditiveTableau,
     GeneralTableau as GeneralTableau,
+    PartitionedTableau as PartitionedTableau,
     SeparableTableau as SeparableTableau,
 )
 from ._verify import (

@@ -235,7 +235,7 @@ def _others_vanish(tableau: SeparableTableau, **moments: np.ndarray) -> dict:
 
 
 # Variances of the random variables of a step, in units of its size.
-_VARIANCE = {"W": 1, "second": 1, "H": 1 / 12}
+_VARIANCE = {"W": 1, "second": 1, "third": 1, "H": 1 / 12}
 
 
 def _weak_additive(tableau: AdditiveTableau) -> tuple[dict, dict]:

@@ -26,6 +26,11 @@ class Outcomes(NamedTuple):
 
 _Law = list[tuple[float, float]]
 _THREE_POINT: _Law = [(-np.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (np.sqrt(3.0), 1 / 6)]
+_FOUR_POINT: _Law = [
+    (sign * np.sqrt(3 + s * np.sqrt(6)), (3 - s * np.sqrt(6)) / 12)
+    for sign in (-1, 1)
+    for s in (-1, 1)
+]
 _TWO_POINT: _Law = [(-1.0, 1 / 2), (1.0, 1 / 2)]
 
 
@@ -41,9 +46,11 @@ def outcomes(terms: PyTree[diffrax.AbstractTerm], h, nodes: int) -> Outcomes:
     path = _the_path(terms)
     laws: dict[str, _Law]
     if isinstance(path, WeakBrownianPath):
-        laws = {"W": _THREE_POINT}
+        laws = {"W": _THREE_POINT if path.order == 2 else _FOUR_POINT}
         if path.second:
             laws["second"] = _THREE_POINT
+        if path.order == 3:
+            laws["third"] = _THREE_POINT
         if path.two_point:
             laws["two_point"] = _TWO_POINT
         increment_cls = WeakIncrement

@@ -274,27 +274,76 @@ class SeparableTableau(AbstractTableau):
         return self.A1.sum(axis=1)
 
     def flatten(self) -> FlatTableau:
-        s, r = len(self.alpha), len(self.c1)
-        variables = _variables(self.B0, self.beta)
-        B0 = _columns(self.B0, variables, (s, r))
-        A1 = np.concatenate([self.A1] * len(variables))
+        return PartitionedTableau(
+            alpha=self.alpha,
+            alpha_hat=self.alpha,
+            beta=self.beta,
+            A=self.A0,
+            A_hat=self.A0,
+            B0=self.B0,
+            A1=self.A1,
+        ).flatten()
+
+    def check_structure(self, drift, noise, t0, y0, args, solver) -> None:
+        check_separable(drift, noise, t0, y0, args, solver)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PartitionedTableau(AbstractTableau):
+    r"""As [`diffrax_symplectic.SeparableTableau`][], with coefficients $A$ and $\alpha$ for
+    the forces $f$ and others, $\hat A$ and $\hat \alpha$, for the velocities $g$: what
+    explicit symplectic methods need.
+
+    $$p_i = P + h \sum_j A_{ij} f(t_n + \hat c_j h, q_j)
+      + \sum_k \sum_j B^0_{ij} \sigma_k(t_n + c^1_j h, \bar q_j) I_k, \qquad
+      q_i = Q + h \sum_j \hat A_{ij} g(p_j)$$
+
+    with stage times $\hat c = \hat A e$ and $c^1 = A^1 e$; the rest is as there.
+
+    **Arguments:** for `s` forces, `v` velocities and `r` noise stages: `alpha` of shape
+    `(s,)`, `alpha_hat` of shape `(v,)`, `beta` of shape `(r,)`, `A` of shape `(v, s)`,
+    `A_hat` of shape `(s, v)`, `B0` of shape `(v, r)`, `A1` of shape `(r, v)`; `beta` and
+    `B0` possibly by random variable.
+
+    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
+    real numbers.
+    """
+
+    alpha: Coefficients
+    alpha_hat: Coefficients
+    beta: CoefficientsByVariable
+    A: Coefficients
+    A_hat: Coefficients
+    B0: CoefficientsByVariable
+    A1: Coefficients
+
+    def __post_init__(self):
+        s, v, r = np.size(self.alpha), np.size(self.alpha_hat), len(self.A1)
+        _check_all(self, alpha=(s,), alpha_hat=(v,), A=(v, s), A_hat=(s, v), A1=(r, v))
+        _check_by_variable(self, beta=(r,), B0=(v, r))
+
+    def flatten(self) -> FlatTableau:
+        s, v, r = len(self.alpha), len(self.alpha_hat), len(self.A1)
+        names = _variables(self.B0, self.beta)
+        B0 = _columns(self.B0, names, (v, r))
+        A1 = np.concatenate([self.A1] * len(names))
         # The velocity g does not depend on time, so that its stages may share theirs.
-        stages = [Stage(("h",), 0.0, "p", "q") for _ in range(s)]
-        stages += [Stage(("h",), float(c), "q", "p") for c in self.c0]
-        stages += [Stage((v,), float(c), "q", "p") for v in variables for c in self.c1]
-        zeros = np.zeros
-        n = len(A1)
+        stages = [Stage(("h",), 0.0, "p", "q") for _ in range(v)]
+        stages += [Stage(("h",), float(c), "q", "p") for c in self.A_hat.sum(axis=1)]
+        c1 = self.A1.sum(axis=1)
+        stages += [Stage((name,), float(c), "q", "p") for name in names for c in c1]
+        zeros, n = np.zeros, len(A1)
         return FlatTableau(
             stages=tuple(stages),
             matrix=np.block(
                 [
-                    [zeros((s, s)), self.A0, B0],
-                    [self.A0, zeros((s, s)), zeros((s, n))],
+                    [zeros((v, v)), self.A, B0],
+                    [self.A_hat, zeros((s, s)), zeros((s, n))],
                     [A1, zeros((n, s)), zeros((n, n))],
                 ]
             ),
             weights=np.concatenate(
-                [self.alpha, self.alpha, _columns(self.beta, variables, (r,))]
+                [self.alpha_hat, self.alpha, _columns(self.beta, names, (r,))]
             ),
         )
 

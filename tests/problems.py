@@ -81,6 +81,7 @@ class _AnyIncrement(diffrax.AbstractSpaceTimeLevyArea, ds.WeakIncrement):
     """An increment with everything that a solver may ask for."""
 
     H: PyTree = None
+    C: PyTree = None
 
 
 class Given(diffrax.AbstractBrownianPath):
@@ -89,6 +90,8 @@ class Given(diffrax.AbstractBrownianPath):
     W: jax.Array
     H: jax.Array | None = None
     second: jax.Array | None = None
+    third: jax.Array | None = None
+    C: jax.Array | None = None
     t0 = 0
     t1 = 1
     levy_area = _AnyIncrement
@@ -96,7 +99,9 @@ class Given(diffrax.AbstractBrownianPath):
     def evaluate(self, t0, t1=None, left=True, use_levy=False):
         if not use_levy:
             return self.W
-        return _AnyIncrement(t1 - t0, self.W, self.second, None, self.H)
+        return _AnyIncrement(
+            t1 - t0, self.W, self.second, None, self.third, self.H, self.C
+        )
 
 
 class FineSample(diffrax.AbstractBrownianPath):

@@ -1,3 +1,7 @@
 from ._fixed_steps import refuse_half_solver as refuse_half_solver
+from ._plateau import (
+    PlateauBrownianPath as PlateauBrownianPath,
+    PlateauIncrement as PlateauIncrement,
+)
 from ._truncated import TruncatedBrownianPath as TruncatedBrownianPath
 from ._weak import WeakBrownianPath as WeakBrownianPath, WeakIncrement as WeakIncrement

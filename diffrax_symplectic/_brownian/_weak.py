@@ -25,9 +25,12 @@ class WeakIncrement(diffrax.AbstractBrownianIncrement):
 
     - `dt`: the step size $h$.
     - `W`: the three-point variables $\hat I_k$, $\pm\sqrt{3h}$ with probability $1/6$
-        each and $0$ with probability $2/3$. Moments 1 to 5 are those of
-        $\mathcal N(0, h)$.
-    - `second`: further, independent three-point variables $\hat I_{k+m}$, or `None`.
+        each and $0$ with probability $2/3$, with moments 1 to 5 those of
+        $\mathcal N(0, h)$. For methods of order 3 the four-point variables, $\pm\sqrt{h
+        (3 + \sqrt 6)}$ with probability $(3 - \sqrt 6) / 12$ each and $\pm\sqrt{h (3 -
+        \sqrt 6)}$ with probability $(3 + \sqrt 6) / 12$ each: moments 1 to 7.
+    - `second`, `third`: further, independent three-point variables $\hat I_{k+m}$ and
+        $\hat I_{k+2m}$, or `None`.
     - `two_point`: the variables $\tilde I_k = \pm\sqrt h$ with probability $1/2$ each,
         independent of the others, or `None`.
 
@@ -56,6 +59,7 @@ class WeakIncrement(diffrax.AbstractBrownianIncrement):
     W: BM
     second: BM | None = None
     two_point: BM | None = None
+    third: BM | None = None
 
     def _flat(self) -> tuple[Float[Array, " m"], Float[Array, " m"], Array]:
         if self.two_point is None:
@@ -115,6 +119,7 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
     key: PRNGKeyArray
     second: bool = eqx.field(static=True)
     two_point: bool = eqx.field(static=True)
+    order: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -123,6 +128,7 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
         *,
         second: bool = False,
         two_point: bool = False,
+        order: int = 2,
     ):
         r"""**Arguments:**
 
@@ -132,11 +138,16 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
         - `key`: a JAX random key, as from `jax.random.key(seed)`.
         - `second`: whether to draw a second, independent set of three-point variables.
         - `two_point`: whether to draw the two-point variables.
+        - `order`: 2 for the three-point variables, which serve methods of weak order 1
+            and 2; 3 for the four-point ones, with `second` and `third`.
 
         `second` and `two_point` do not change what `W` is for the same `key`.
 
-        **Raises:** a `ValueError` if a dtype is not real floating-point.
+        **Raises:** a `ValueError` if a dtype is not real floating-point, or if `order` is
+        neither 2 nor 3.
         """
+        if order not in (2, 3):
+            raise ValueError(f"`order` must be 2 or 3; got {order!r}.")
         if isinstance(shape, tuple) and all(isinstance(n, int) for n in shape):
             shape = jax.ShapeDtypeStruct(shape, lxi.default_floating_dtype())
         for leaf in jtu.tree_leaves(shape):
@@ -152,8 +163,9 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
                 )
         self.shape = shape
         self.key = key
-        self.second = second
+        self.second = second or order == 3
         self.two_point = two_point
+        self.order = order
 
     @property
     def t0(self):
@@ -190,19 +202,24 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
         t0, t1 = cast(tuple[Array, Array], eqxi.nondifferentiable((t0, t1), name="t"))
         h = t1 - t0
-        sets = 1 + (self.second + self.two_point if use_levy else 0)
+        more = self.second + self.two_point + (self.order == 3)
+        sets = 1 + (more if use_levy else 0)
         leaves = jtu.tree_leaves(self.shape)
-        bits = _bits(self.key, t0, t1, sets, sum(int(np.prod(s.shape)) for s in leaves))
-        W = self._draw(bits[0], h, _three_point)
+        bits = random_words(
+            self.key, t0, t1, sets, sum(int(np.prod(s.shape)) for s in leaves)
+        )
+        W = self._draw(bits[0], h, _three_point if self.order == 2 else _four_point)
         if not use_levy:
             return W
         dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), self.shape)
-        second = two_point = None
+        second = two_point = third = None
         if self.second:
             second = self._draw(bits[1], h, _three_point)
+        if self.order == 3:
+            third = self._draw(bits[2], h, _three_point)
         if self.two_point:
-            two_point = self._draw(bits[-1], h, _two_point)
-        return WeakIncrement(dt=dt, W=W, second=second, two_point=two_point)
+            two_point = self._draw(bits[-1], h, fair_sign)
+        return WeakIncrement(dt, W, second, two_point, third)
 
     def _draw(self, bits, h, law) -> PyTree[Array]:
         leaves, treedef = jtu.tree_flatten(self.shape)
@@ -221,11 +238,20 @@ def _three_point(bits, sqrt_h):
     return jnp.where(bits < sixth, -size, jnp.where(up, size, jnp.zeros_like(size)))
 
 
-def _two_point(bits, sqrt_h):
+def _four_point(bits, sqrt_h):
+    # Half of the words are negative; of each half the rare ones are large.
+    rare = np.uint32(round(2**32 * (3 - np.sqrt(6)) / 12))
+    large, small = (np.sqrt(3 + s * np.sqrt(6)).astype(sqrt_h.dtype) for s in (1, -1))
+    half = np.uint32(2**31)
+    size = jnp.where(bits % half < rare, large, small) * sqrt_h
+    return jnp.where(bits < half, -size, size)
+
+
+def fair_sign(bits, sqrt_h):
     return jnp.where(bits < np.uint32(2**31), -sqrt_h, sqrt_h)
 
 
-def _bits(key, t0, t1, sets: int, n: int) -> Integer[Array, "sets n"]:
+def random_words(key, t0, t1, sets: int, n: int) -> Integer[Array, "sets n"]:
     """Random words for the step from `t0` to `t1`, the same for times that differ by
     rounding. The first of the sets are the same whatever their number is."""
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):

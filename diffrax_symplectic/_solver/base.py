@@ -15,7 +15,7 @@ import optimistix as optx
 from equinox.internal import ω
 from jaxtyping import Array, Bool, PyTree
 
-from .._brownian import refuse_half_solver, WeakIncrement
+from .._brownian import PlateauIncrement, refuse_half_solver, WeakIncrement
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
 from .._tableau import AbstractTableau, FlatTableau, Stage
@@ -31,16 +31,14 @@ _SolverState: TypeAlias = None
 _Value: TypeAlias = PyTree[Array]
 
 
-class AbstractSymplecticRungeKutta(
-    diffrax.AbstractImplicitSolver[_SolverState],
-    diffrax.AbstractStratonovichSolver[_SolverState],
-):
+class AbstractSymplecticRungeKutta(diffrax.AbstractStratonovichSolver[_SolverState]):
     r"""A Runge--Kutta method with its own coefficients for drift and noise.
 
-    Subclasses give a `tableau`, the fields `root_finder` and `root_find_max_steps`, and
-    their orders. Everything else is decided by the tableau: stages that feed nothing
-    are dropped, equal ones evaluated once, explicit ones evaluated directly, and the
-    implicit rest is solved in as many small systems, one after another, as the
+    Subclasses give a `tableau` and their orders, and if stages are implicit also subclass
+    `diffrax.AbstractImplicitSolver`, with its fields `root_finder` and
+    `root_find_max_steps`. Everything else is decided by the tableau: stages that feed
+    nothing are dropped, equal ones evaluated once, explicit ones evaluated directly, and
+    the implicit rest is solved in as many small systems, one after another, as the
     coefficients allow. The unknowns are the stage values $k_i$, not the stages, so that
     the end of the step is their weighted sum and needs no further evaluation.
 
@@ -71,9 +69,10 @@ class AbstractSymplecticRungeKutta(
     @property
     def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
         """The least that the increments of the path have to hold."""
-        for name in _variables(make_plan(self.tableau.flatten()).tableau):
-            if name in _PROVIDED_BY:
-                return _PROVIDED_BY[name].increment
+        variables = _variables(make_plan(self.tableau.flatten()).tableau)
+        for name, provider in _PROVIDED_BY.items():
+            if name in variables:
+                return provider.increment
         return diffrax.AbstractBrownianIncrement
 
     def init(
@@ -155,6 +154,7 @@ class AbstractSymplecticRungeKutta(
         # A stage where it would be if this block did not move at all.
         guess = [values_of(group, known) for group in groups]
         written = [_part(y0, stages[group[0]].writes) for group in groups]
+        assert isinstance(self, diffrax.AbstractImplicitSolver)
         linear_solver = getattr(
             self.root_finder, "linear_solver", lx.AutoLinearSolver(None)
         )
@@ -202,12 +202,23 @@ class _Provider(NamedTuple):
     advice: str
 
 
-# Random variables beyond `W`: which increments hold them, and how to ask for these.
+# Random variables beyond `W`: which increments hold them, and how to ask for these. Those
+# that hold more come first.
 _PROVIDED_BY = {
+    "C": _Provider(
+        PlateauIncrement,
+        "plateaus. Wrap a path with space-time Lévy area as `PlateauBrownianPath(path, "
+        "key)`",
+    ),
     "H": _Provider(
         diffrax.AbstractSpaceTimeLevyArea,
         "space-time Lévy area. Pass a path that has it, for example `diffrax."
         "VirtualBrownianTree(..., levy_area=diffrax.SpaceTimeLevyArea)`",
+    ),
+    "third": _Provider(
+        WeakIncrement,
+        "four-point variables and two more sets. Construct the path as "
+        "`WeakBrownianPath(..., order=3)`",
     ),
     "second": _Provider(
         WeakIncrement,
@@ -228,13 +239,12 @@ def _controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, 
     if names == ["W"]:
         return {"W": [term.contr(t0, t1) for term in noise]}
     increments = [term.contr(t0, t1, use_levy=True) for term in noise]
-    for name in names:
+    # The most telling advice first.
+    for name in sorted(names, key=lambda x: [*_PROVIDED_BY, x].index(x)):
         if any(getattr(increment, name, None) is None for increment in increments):
             provider = _PROVIDED_BY.get(name)
             advice = f"increments with the attribute `{name}`"
-            raise ValueError(
-                f"`{solver}` needs {provider.advice if provider else advice}."
-            )
+            raise ValueError(f"`{solver}` needs {provider.advice if provider else advice}.")
     return {name: [getattr(i, name) for i in increments] for name in names}
 
 

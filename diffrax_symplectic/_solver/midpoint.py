@@ -2,6 +2,7 @@ from typing import ClassVar
 
 import numpy as np
 import optimistix as optx
+from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau
@@ -12,7 +13,7 @@ _half = np.array([[0.5]])
 _tab = GeneralTableau.strong(A=_half, B=_half, alpha=np.ones(1), beta=np.ones(1))
 
 
-class Midpoint(AbstractSymplecticRungeKutta):
+class Midpoint(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     r"""The implicit midpoint rule for Stratonovich systems.
 
     $$G = y_n + \tfrac12 h\,a(G) + \tfrac12 \sum_k b_k(G) I_k, \qquad

@@ -3,6 +3,7 @@ import functools as ft
 import equinox as eqx
 import numpy as np
 import optimistix as optx
+from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau, real_parameter
@@ -15,7 +16,7 @@ def _srks1(a: float) -> GeneralTableau:
     return GeneralTableau.strong(A=A, B=A, alpha=alpha, beta=alpha)
 
 
-class SRKs1(AbstractSymplecticRungeKutta):
+class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     r"""The two-stage symplectic methods SRKs1 of Wang, Hong and Xu.
 
     $$A = B = \begin{pmatrix} a & 0 \\ 2a & \tfrac12 - a \end{pmatrix}, \qquad

@@ -2,6 +2,7 @@ from typing import ClassVar
 
 import numpy as np
 import optimistix as optx
+from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import SeparableTableau
@@ -21,7 +22,7 @@ def _srks2(d1: float = 0.5) -> SeparableTableau:
     )
 
 
-class SRKs2(AbstractSymplecticRungeKutta):
+class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     r"""The symplectic method SRKs2 of Wang, Hong and Xu, of strong order 1, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
 

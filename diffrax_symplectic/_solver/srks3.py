@@ -3,6 +3,7 @@ import functools as ft
 import equinox as eqx
 import numpy as np
 import optimistix as optx
+from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import real_parameter, SeparableTableau
@@ -25,7 +26,7 @@ def _srks3(a: float, b1_plus_b2: float = 1.0) -> SeparableTableau:
     )
 
 
-class SRKs3(AbstractSymplecticRungeKutta):
+class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     r"""The symplectic methods SRKs3 of Wang, Hong and Xu, of strong order 1 for any
     number of noises, for $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
 

@@ -4,6 +4,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 import optimistix as optx
+from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import AdditiveTableau, real_parameter
@@ -40,7 +41,7 @@ def _sign(value: Any) -> int:
     return int(value)
 
 
-class SRKs4(AbstractSymplecticRungeKutta):
+class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     r"""The symplectic methods SRKs4 of Wang, Hong and Xu, of strong order 3/2 for any
     number of noises that do not depend on the state.
 

@@ -3,6 +3,7 @@ import functools as ft
 import equinox as eqx
 import numpy as np
 import optimistix as optx
+from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau, real_parameter
@@ -14,7 +15,7 @@ def _srkw1(b: float) -> GeneralTableau:
     return GeneralTableau(alpha=one, beta=one, A0=half, B0=[[b]], A1=[[1 - b]], B1=half)
 
 
-class SRKw1(AbstractSymplecticRungeKutta):
+class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     r"""The one-stage symplectic methods SRKw1 of Wang, Hong and Xu, of weak order 1.
 
     $$G^0 = y_n + \tfrac12 h\,a(G^0) + b \sum_k b_k(G^1) \hat I_k, \qquad

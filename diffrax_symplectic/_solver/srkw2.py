@@ -2,6 +2,7 @@ from typing import ClassVar
 
 import numpy as np
 import optimistix as optx
+from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau
@@ -44,7 +45,7 @@ def _srkw2(b1: float = 0.0, b2: float = 0.0, b3: float = 0.0) -> GeneralTableau:
     )
 
 
-class SRKw2(AbstractSymplecticRungeKutta):
+class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     r"""The symplectic method SRKw2 of Wang, Hong and Xu, of weak order 2 for one noise.
 
     Four drift and two noise stages in the form of

@@ -3,6 +3,7 @@ from typing import get_args, Literal, TypeAlias
 import equinox as eqx
 import numpy as np
 import optimistix as optx
+from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import SeparableTableau
@@ -28,7 +29,7 @@ def _srkw3(variant: Variant) -> SeparableTableau:
     return SeparableTableau(alpha=[1], beta=[beta], A0=half, B0=[[B0]], A1=[[A1]])
 
 
-class SRKw3(AbstractSymplecticRungeKutta):
+class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     r"""The one-stage symplectic methods SRKw3a to SRKw3f of Wang, Hong and Xu, of weak
     order 1, for $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
 

@@ -3,6 +3,7 @@ import functools as ft
 import equinox as eqx
 import numpy as np
 import optimistix as optx
+from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import real_parameter, SeparableTableau
@@ -26,7 +27,7 @@ def _srkw4(
     )
 
 
-class SRKw4(AbstractSymplecticRungeKutta):
+class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     r"""The symplectic methods SRKw4 of Wang, Hong and Xu, of weak order 2, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
 

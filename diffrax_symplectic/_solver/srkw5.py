@@ -1,6 +1,7 @@
 from typing import ClassVar
 
 import optimistix as optx
+from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import AdditiveTableau
@@ -17,7 +18,7 @@ _tab = AdditiveTableau(
 )
 
 
-class SRKw5(AbstractSymplecticRungeKutta):
+class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     r"""The symplectic method SRKw5 of Wang, Hong and Xu, of weak order 2 for any number of
     noises that depend neither on the state nor on time.
 

@@ -2,6 +2,7 @@ from typing import ClassVar
 
 import numpy as np
 import optimistix as optx
+from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau
@@ -19,7 +20,7 @@ _tab = GeneralTableau(
 )
 
 
-class StrangGauss(AbstractSymplecticRungeKutta):
+class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     r"""A symplectic method of weak order 2 for one noise: the drift over half of the step
     by the midpoint rule, the noise by the Gauss method of order 4, and the drift over the
     other half.

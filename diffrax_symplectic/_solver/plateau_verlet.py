@@ -1,0 +1,70 @@
+from typing import ClassVar
+
+from .._tableau import PartitionedTableau
+from .base import AbstractSymplecticRungeKutta
+
+
+_kicks = {"W": [1 / 2, 0, 1 / 2], "H": [1, 0, -1], "C": [-1, 2, -1]}
+_tab = PartitionedTableau(
+    alpha=[1 / 2, 1 / 2],
+    alpha_hat=[1 / 4, 1 / 4, 1 / 4, 1 / 4],
+    beta=_kicks,
+    # The momenta after the first kick, the first force, the second kick, the second force.
+    A=[[0, 0], [1 / 2, 0], [1 / 2, 0], [1 / 2, 1 / 2]],
+    A_hat=[[1 / 4, 0, 0, 0], [1 / 4, 1 / 4, 1 / 4, 0]],
+    B0={
+        name: [[a, 0, 0], [a, 0, 0], [a, b, 0], [a, b, 0]]
+        for name, (a, b, _) in _kicks.items()
+    },
+    A1=[[0, 0, 0, 0], [1 / 4, 1 / 4, 0, 0], [1 / 4, 1 / 4, 1 / 4, 1 / 4]],
+)
+
+
+class PlateauVerlet(AbstractSymplecticRungeKutta):
+    r"""An explicit symplectic method of strong order 3/2 for any number of noises, for
+    $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
+
+    With $M_k = \frac1h \int (w_k(s) - w_k(t_n))\,\mathrm{d}s = W_k / 2 + H_k$ and
+    $C_k = \pm\sqrt{h / 6}$ with fair, independent signs: kick by
+    $\sum_k \sigma_k (M_k - C_k)$; one Störmer--Verlet step of $H_0$ over $h / 2$; kick by
+    $\sum_k 2 \sigma_k C_k$; Störmer--Verlet over $h / 2$; kick by
+    $\sum_k \sigma_k (W_k - M_k - C_k)$, each time at the $q$ that was reached. In short,
+    the noise is replaced by two plateaus, $M \mp C$, that have its mean over the step and,
+    in expectation, its mean square: the first brings order 3/2 where the noise is constant
+    along the step, the second where it is not.
+
+    No equation to solve. Order 2 without noise. No free parameters. A Hamiltonian without
+    the structure is refused while tracing. As explicit methods are, it is limited to steps
+    that resolve the fastest frequency $\omega$ of $H_0$: $\omega h < 4$.
+
+    !!! warning
+
+        The path has to be [`diffrax_symplectic.PlateauBrownianPath`][] around one with
+        space-time Lévy area.
+
+    ??? cite "Reference"
+
+        The method is new here. It extends the schemes for additive noise and for second
+        order systems of chapters 4 and 5 of
+
+        ```bibtex
+        @book{milstein2021stochastic,
+            author = {Milstein, Grigori N. and Tretyakov, Michael V.},
+            title = {Stochastic Numerics for Mathematical Physics},
+            edition = {2},
+            publisher = {Springer},
+            year = {2021},
+            doi = {10.1007/978-3-030-82040-4},
+        }
+        ```
+    """
+
+    tableau: ClassVar[PartitionedTableau] = _tab
+
+    def order(self, terms):
+        del terms
+        return 2
+
+    def strong_order(self, terms):
+        del terms
+        return 1.5

@@ -1,0 +1,81 @@
+"""How long solves take."""
+
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.random as jr
+
+
+jax.config.update("jax_enable_x64", True)
+
+DOCS = Path(__file__).parents[2] / "docs" / "benchmarks"
+
+
+class Timing(NamedTuple):
+    trace: float
+    compile: float
+    # Of the best of several runs.
+    seconds: float
+
+
+def measure(fn: Callable, *args, repeats: int = 5) -> Timing:
+    """Of `fn(*args)` under `jit`."""
+    # A function of its own: nothing is taken from an earlier trace.
+    jitted = jax.jit(lambda *args: fn(*args))
+    start = time.perf_counter()
+    lowered = jitted.lower(*args)
+    traced = time.perf_counter()
+    compiled = lowered.compile()
+    done = time.perf_counter()
+    jax.block_until_ready(compiled(*args))
+    best = float("inf")
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        jax.block_until_ready(compiled(*args))
+        best = min(best, time.perf_counter() - begin)
+    return Timing(traced - start, done - traced, best)
+
+
+def ensemble(make_terms, make_path, solver, y0, h: float, steps: int) -> Callable:
+    """Takes keys to the ends of paths; one path without a batch if there is one key."""
+
+    def one(key):
+        return diffrax.diffeqsolve(
+            make_terms(make_path(key)),
+            solver,
+            0.0,
+            h * steps,
+            h,
+            y0,
+            max_steps=None,
+            # Unlike the default adjoint this one takes any path.
+            adjoint=diffrax.ForwardMode(),
+        ).ys
+
+    return lambda keys: one(keys[0]) if len(keys) == 1 else jax.vmap(one)(keys)
+
+
+def keys(n: int):
+    return jr.split(jr.key(0), n)
+
+
+def machine() -> str:
+    name = platform.processor() or platform.machine()
+    try:
+        with open("/proc/cpuinfo") as file:
+            lines = [x for x in file if x.startswith("model name")]
+        name = lines[0].split(":")[1].strip()
+    except (OSError, IndexError):
+        pass
+    devices = ", ".join(sorted({d.device_kind for d in jax.devices()}))
+    return (
+        f"{name}, {os.cpu_count()} cores; device: {devices}; Python "
+        f"{platform.python_version()}, JAX {jax.__version__}, Diffrax "
+        f"{diffrax.__version__}"
+    )

@@ -1,0 +1,169 @@
+"""Nanoseconds per path and step, and seconds to compile, of every solver:
+
+    python -m examples.benchmarks.speed
+
+In one run, so that ratios mean something on a noisy machine. Writes
+`docs/benchmarks/speed.md`.
+"""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+
+import diffrax_symplectic as ds
+
+from ._timing import DOCS, ensemble, keys, machine, measure
+
+
+H, STEPS = 0.01, 200
+SIZES = (1, 1_000, 50_000)
+Y0 = (jnp.array(0.0), jnp.array(1.0))
+
+
+def weak(key, shape=(), **kwargs):
+    return ds.WeakBrownianPath(shape, key, **kwargs)
+
+
+def gaussian(key, shape=()):
+    return diffrax.UnsafeBrownianPath(shape, key)
+
+
+def with_area(key):
+    return diffrax.UnsafeBrownianPath((), key, levy_area=diffrax.SpaceTimeLevyArea)
+
+
+def truncated(key):
+    return ds.TruncatedBrownianPath(gaussian(key))
+
+
+def quartic(t, p, q, args):
+    return (p**2 + q**2) / 2 + (p**4 + q**4) / 10
+
+
+def kubo(path):
+    return ds.hamiltonian_terms(quartic, lambda *args: 0.3 * quartic(*args), path)
+
+
+def synchrotron(path):
+    return ds.hamiltonian_terms(
+        lambda t, p, q, args: p**2 / 2 - 4 * jnp.cos(q),
+        lambda t, p, q, args: jnp.stack([0.2 * jnp.sin(q), -0.1 * jnp.cos(q)]),
+        path,
+    )
+
+
+def additive(path):
+    return ds.hamiltonian_terms(quartic, lambda t, p, q, args: -0.3 * q, path)
+
+
+def by_hand(keys):
+    """The midpoint rule on `kubo` in a bare `lax.scan`: three-point numbers drawn inside
+    the loop, three Newton iterations, no check of anything."""
+    gradient = jax.grad(lambda p, q: quartic(0, p, q, None), argnums=(0, 1))
+    size = jnp.sqrt(3 * H)
+
+    def one(key):
+        def step(y, i):
+            p, q = y
+            bits = jr.bits(jr.fold_in(key, i), (), jnp.uint32)
+            up = jnp.where(bits >= jnp.uint32(2**32 - 2**32 // 6), size, 0.0)
+            x = H + 0.3 * jnp.where(bits < jnp.uint32(2**32 // 6), -size, up)
+
+            def residual(kp, kq):
+                dp, dq = gradient(p + kp / 2, q + kq / 2)
+                return kp + x * dq, kq - x * dp
+
+            dp, dq = gradient(p, q)
+            kp, kq = -x * dq, x * dp
+            for _ in range(3):
+                (rp, rq), jacobian = jax.linearize(residual, kp, kq)
+                (a, c), (b, d) = jacobian(1.0, 0.0), jacobian(0.0, 1.0)
+                det = a * d - b * c
+                kp, kq = kp - (d * rp - b * rq) / det, kq - (a * rq - c * rp) / det
+            return (p + kp, q + kq), None
+
+        return jax.lax.scan(step, Y0, jnp.arange(STEPS))[0]
+
+    return one(keys[0]) if len(keys) == 1 else jax.vmap(one)(keys)
+
+
+two = lambda path: lambda key: path(key, (2,))
+second = lambda key: weak(key, second=True)
+MODELS = {
+    "Quartic Kubo oscillator, one multiplicative noise": (
+        kubo,
+        [
+            ("Diffrax Heun", diffrax.Heun(), gaussian),
+            ("Diffrax StratonovichMilstein", diffrax.StratonovichMilstein(), gaussian),
+            ("Diffrax SlowRK", diffrax.SlowRK(), with_area),
+            ("midpoint rule by hand, `lax.scan`", None, None),
+            ("Midpoint, weak increments", ds.Midpoint(), weak),
+            ("Midpoint, truncated increments", ds.Midpoint(), truncated),
+            ("SRKs1", ds.SRKs1(), weak),
+            ("SRKw1", ds.SRKw1(), weak),
+            ("SRKw1(b=0)", ds.SRKw1(b=0.0), weak),
+            ("SRKw2", ds.SRKw2(), weak),
+            ("StrangGauss", ds.StrangGauss(), weak),
+        ],
+    ),
+    "Synchrotron oscillations, two noises in the potential": (
+        synchrotron,
+        [
+            ("Diffrax Heun", diffrax.Heun(), two(gaussian)),
+            ("Midpoint", ds.Midpoint(), two(weak)),
+            ("SRKs2", ds.SRKs2(), two(weak)),
+            ("SRKs3", ds.SRKs3(), two(weak)),
+            ('SRKw3("a")', ds.SRKw3("a"), two(weak)),
+            ('SRKw3("c")', ds.SRKw3("c"), two(weak)),
+            ("SRKw4", ds.SRKw4(), two(weak)),
+        ],
+    ),
+    "Quartic oscillator, additive noise": (
+        additive,
+        [
+            ("Diffrax Heun", diffrax.Heun(), gaussian),
+            ("Diffrax ShARK", diffrax.ShARK(), with_area),
+            ("SRKw5", ds.SRKw5(), second),
+            ("SRKs4", ds.SRKs4(), with_area),
+        ],
+    ),
+}
+
+
+def main() -> None:
+    lines = [
+        "# Speed",
+        "",
+        f"{machine()}. float64, h = {H}, {STEPS} steps, best of 5 runs, one process. "
+        "Compilation is tracing and XLA's work together, for 1,000 paths. Made by "
+        "`python -m examples.benchmarks.speed`.",
+    ]
+    for title, (make_terms, solvers) in MODELS.items():
+        heads = ["1 path", *(f"{n:,} paths" for n in SIZES[1:])]
+        lines += ["", f"## {title}", ""]
+        lines.append("| solver | " + " | ".join(f"ns, {x}" for x in heads) + " | x Heun "
+                     "at 1,000 | at 50,000 | compile, s |")  # fmt: skip
+        lines.append("|---" * 7 + "|")
+        heun = None
+        for name, solver, make_path in solvers:
+            cells, compile_time = [], 0.0
+            for n in SIZES:
+                fn = by_hand
+                if solver is not None:
+                    fn = ensemble(make_terms, make_path, solver, Y0, H, STEPS)
+                timing = measure(fn, keys(n))
+                cells.append(timing.seconds / n / STEPS * 1e9)
+                if n == SIZES[1]:
+                    compile_time = timing.trace + timing.compile
+            heun = heun or cells
+            ratios = [f"{cells[i] / heun[i]:.2f}" for i in (1, 2)]
+            row = [name, *(f"{x:,.1f}" for x in cells), *ratios, f"{compile_time:.2f}"]
+            lines.append("| " + " | ".join(row) + " |")
+            print(lines[-1], flush=True)
+    DOCS.mkdir(parents=True, exist_ok=True)
+    (DOCS / "speed.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,211 @@
+"""Methods past the paper: weak order 3 for additive noise, explicit strong order 3/2."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._plan import make_plan
+
+from .problems import FineSample, Given, random_problem, slope, weak_path
+from .test_additive import H0 as any_H0, noise as additive_noise
+from .test_separable import _problem as separable_problem, H0, noise
+
+
+def _additive_problem(key, d, m, dtype=jnp.float64):
+    k_drift, k_sigma, k_gamma = jr.split(key, 3)
+    y0, args = random_problem(k_drift, d, m, dtype)
+    sigma, gamma = (0.5 * jr.normal(k, (m, d), dtype) for k in (k_sigma, k_gamma))
+    return y0, {"drift": args["drift"], "sigma": sigma, "gamma": gamma}
+
+
+@pytest.mark.parametrize("solver", [ds.AdditiveGauss(), ds.PlateauVerlet()], ids=repr)
+def test_tableau_is_symplectic(solver):
+    assert np.max(np.abs(ds.symplectic_residuals(solver.tableau))) <= 1e-15
+
+
+def test_additive_gauss_satisfies_the_conditions_for_weak_order_two():
+    residuals = ds.weak_order_residuals(ds.AdditiveGauss().tableau, 2)
+    assert max(map(abs, residuals.values())) <= 1e-15
+
+
+@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-6)])
+@pytest.mark.parametrize("solver", [ds.AdditiveGauss(), ds.PlateauVerlet()], ids=repr)
+def test_step_is_symplectic_for_a_thousand_random_systems(solver, dtype, bound):
+    additive = isinstance(solver, ds.AdditiveGauss)
+
+    def defect(key):
+        k_problem, k_m, k_h, *ks = jr.split(key, 6)
+        problem = _additive_problem if additive else separable_problem
+        y0, args = problem(k_problem, 3, 3, dtype)
+        used = jnp.arange(3) < jr.randint(k_m, (), 1, 4)
+        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
+        W, a, b = (jnp.sqrt(h) * used * jr.normal(k, (3,), dtype) for k in ks)
+        path = Given(W, H=a, second=a, third=b, C=b)
+        hamiltonians = (any_H0, additive_noise) if additive else (H0, noise)
+        terms = ds.hamiltonian_terms(*hamiltonians, path)
+        return ds.symplecticity_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
+
+    defects = jax.jit(jax.vmap(defect))(jr.split(jr.key(0), 1000))
+    assert defects.dtype == dtype
+    assert jnp.max(defects) <= bound
+
+
+def _functions(y):
+    p, q = y[0][0], y[1][0]
+    return jnp.stack([p, q**2, p * q, jnp.sin(p + q), jnp.exp(p / 2)])
+
+
+@pytest.mark.parametrize("m", [1, 2])
+def test_additive_gauss_is_weak_order_three(m):
+    solver = ds.AdditiveGauss()
+    y0, args = jax.vmap(lambda key: _additive_problem(key, 1, m))(
+        jr.split(jr.key(0), 2)
+    )
+    terms = ds.hamiltonian_terms(any_H0, additive_noise, weak_path(m, order=3))
+    hs = np.array([0.04, 0.02, 0.01, 0.005])
+
+    def defect(h, y0, args):
+        kwargs = dict(fn=_functions, order=3)
+        return ds.weak_order_defect(terms, solver, 0.1, 0.1 + h, y0, args, **kwargs)
+
+    over_steps = jax.vmap(defect, in_axes=(0, None, None))
+    defects = jax.jit(jax.vmap(over_steps, in_axes=(None, 0, 0)))(hs, y0, args)
+    slopes = [slope(hs, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(hs))]
+    assert solver.weak_order(None) == 3
+    np.testing.assert_allclose(slopes, 4.0, atol=0.15)
+
+
+def test_four_point_variables_have_seven_moments():
+    h = 0.3
+    path = weak_path(200_000, jr.key(1), order=3)
+    increment = path.evaluate(0.0, h, use_levy=True)
+    values = np.unique(np.asarray(increment.W) / np.sqrt(h))
+    expected = np.sqrt(3 + np.array([1, -1]) * np.sqrt(6))
+    np.testing.assert_allclose(values, [*-expected, *expected[::-1]], rtol=1e-12)
+    # Exactly, with the weights; and the frequencies within 4 standard errors.
+    weights = (3 - np.array([1, -1]) * np.sqrt(6)) / 12
+    for n, exact in ((2, 1), (4, 3), (6, 15)):
+        np.testing.assert_allclose(2 * weights @ expected**n, exact, rtol=1e-14)
+    frequency = np.mean(np.abs(increment.W) > 2 * np.sqrt(h))
+    p = 2 * weights[0]
+    assert abs(frequency - p) <= 4 * np.sqrt(p * (1 - p) / 200_000)
+    for a, b in ((increment.W, increment.second), (increment.second, increment.third)):
+        assert abs(np.mean(a * b)) <= 4 * h / np.sqrt(200_000)
+    with pytest.raises(ValueError, match="`order` must be 2 or 3"):
+        weak_path(1, order=4)
+
+
+class _Plateaus(diffrax.AbstractBrownianPath):
+    """A fine sample with signs drawn beforehand for every step of the finest grid."""
+
+    sample: FineSample
+    key: jax.Array
+    t0 = 0
+    t1 = 1
+    levy_area = ds.PlateauIncrement
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        if not use_levy:
+            return self.sample.evaluate(t0, t1)
+        path = ds.PlateauBrownianPath(self.sample, self.key)
+        return path.evaluate(t0, t1, use_levy=True)
+
+
+def _strong_errors(solver, strength, m=2, fine=2**11, samples=200):
+    y0, args = separable_problem(jr.key(3), 1, m)
+    a, v, phi = args["noise"]
+    args["noise"] = strength * a, v, phi
+    steps = np.array([2.0**-k for k in (3, 4, 5, 6)])
+
+    def ends(key):
+        k_sample, k_sign = jr.split(key)
+        path = _Plateaus(FineSample.draw(k_sample, fine, m), k_sign)
+        terms = ds.hamiltonian_terms(H0, noise, path)
+        solve = lambda h, s: jnp.concatenate(
+            diffrax.diffeqsolve(terms, s, 0.0, 1.0, h, y0, args).ys, axis=1
+        )[0]
+        exact = solve(1 / fine, ds.PlateauVerlet())
+        return jax.lax.map(lambda h: solve(h, solver) - exact, jnp.asarray(steps))
+
+    errors = jax.jit(jax.vmap(ends))(jr.split(jr.key(0), samples))
+    return steps, np.sqrt(np.mean(np.sum(errors**2, axis=-1), axis=0))
+
+
+def test_plateau_verlet_is_strong_order_three_halves():
+    steps, errors = _strong_errors(ds.PlateauVerlet(), 6.0)
+    assert ds.PlateauVerlet().strong_order(None) == 1.5
+    assert slope(steps, errors) >= 1.45
+
+
+class _OnePlateau(ds.AbstractSymplecticRungeKutta):
+    """The same without the signs: kick M, one Verlet step, kick W - M."""
+
+    tableau = ds.PartitionedTableau(
+        alpha=[1],
+        alpha_hat=[1 / 2, 1 / 2],
+        beta={"W": [1 / 2, 1 / 2], "H": [1, -1]},
+        A=[[0], [1]],
+        A_hat=[[1 / 2, 0]],
+        B0={"W": [[1 / 2, 0]] * 2, "H": [[1, 0]] * 2},
+        A1=[[0, 0], [1 / 2, 1 / 2]],
+    )
+
+    def order(self, terms):
+        return 2
+
+
+def test_one_plateau_is_only_order_one_there():
+    steps, errors = _strong_errors(_OnePlateau(), 6.0)
+    assert slope(steps, errors) <= 1.25
+
+
+def _plateau_path(m=2):
+    levy = diffrax.SpaceTimeLevyArea
+    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 0.01, (m,), jr.key(0), levy)
+    return ds.PlateauBrownianPath(tree, jr.key(1))
+
+
+def test_plateau_verlet_has_no_equation_to_solve():
+    assert make_plan(ds.PlateauVerlet().tableau.flatten()).num_unknown == 0
+    assert not isinstance(ds.PlateauVerlet(), diffrax.AbstractImplicitSolver)
+    y0, args = separable_problem(jr.key(0), 2, 2)
+    terms = ds.hamiltonian_terms(H0, noise, _plateau_path())
+    step = lambda y0: ds.PlateauVerlet().step(terms, 0.0, 0.1, y0, args, None, False)[0]
+    text = str(jax.make_jaxpr(step)(y0))
+    assert "root_find" not in text and "triangular_solve" not in text
+    sol = diffrax.diffeqsolve(terms, ds.PlateauVerlet(), 0.0, 0.5, 0.1, y0, args)
+    assert all(jnp.all(jnp.isfinite(x)) for x in sol.ys)
+
+
+def test_plateaus_are_fair_and_independent_of_the_path():
+    h = 0.25
+    tree = diffrax.UnsafeBrownianPath((100_000,), jr.key(0), diffrax.SpaceTimeLevyArea)
+    path = ds.PlateauBrownianPath(tree, jr.key(1))
+    first = path.evaluate(0.0, h, use_levy=True)
+    again = path.evaluate(1e-12, h, use_levy=True)
+    np.testing.assert_array_equal(np.sign(first.C), np.sign(again.C))
+    np.testing.assert_allclose(np.abs(first.C), np.sqrt(h / 6), rtol=1e-15)
+    bound = 4 * np.sqrt(h / 6) / np.sqrt(100_000)
+    assert abs(np.mean(first.C)) <= bound
+    later = path.evaluate(h, 2 * h, use_levy=True)
+    for other in (first.W, first.H, later.C):
+        assert abs(np.mean(first.C * other)) <= bound * np.std(other)
+
+
+def test_missing_variables_are_refused_with_advice():
+    y0, args = separable_problem(jr.key(0), 2, 2)
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(2))
+    with pytest.raises(ValueError, match=r"PlateauBrownianPath\(path, key\)"):
+        diffrax.diffeqsolve(terms, ds.PlateauVerlet(), 0.0, 0.2, 0.1, y0, args)
+    with pytest.raises(ValueError, match="needs a path with space-time"):
+        ds.PlateauBrownianPath(weak_path(2), jr.key(0))
+    y0, args = _additive_problem(jr.key(0), 2, 2)
+    terms = ds.hamiltonian_terms(any_H0, additive_noise, weak_path(2, second=True))
+    with pytest.raises(ValueError, match=r"WeakBrownianPath\(..., order=3\)"):
+        diffrax.diffeqsolve(terms, ds.AdditiveGauss(), 0.0, 0.2, 0.1, y0, args)
+    assert ds.PlateauVerlet().minimal_levy_area is ds.PlateauIncrement
+    assert ds.AdditiveGauss().minimal_levy_area is ds.WeakIncrement
