@@ -244,7 +244,9 @@ def _controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, 
         if any(getattr(increment, name, None) is None for increment in increments):
             provider = _PROVIDED_BY.get(name)
             advice = f"increments with the attribute `{name}`"
-            raise ValueError(f"`{solver}` needs {provider.advice if provider else advice}.")
+            raise ValueError(
+                f"`{solver}` needs {provider.advice if provider else advice}."
+            )
     return {name: [getattr(i, name) for i in increments] for name in names}
 
 
