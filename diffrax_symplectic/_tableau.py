@@ -327,9 +327,10 @@ class PartitionedTableau(AbstractTableau):
         names = _variables(self.B0, self.beta)
         B0 = _columns(self.B0, names, (v, r))
         A1 = np.concatenate([self.A1] * len(names))
+        # Forces first: where either can be the unknown, let it be the one that costs more.
+        stages = [Stage(("h",), float(c), "q", "p") for c in self.A_hat.sum(axis=1)]
         # The velocity g does not depend on time, so that its stages may share theirs.
-        stages = [Stage(("h",), 0.0, "p", "q") for _ in range(v)]
-        stages += [Stage(("h",), float(c), "q", "p") for c in self.A_hat.sum(axis=1)]
+        stages += [Stage(("h",), 0.0, "p", "q") for _ in range(v)]
         c1 = self.A1.sum(axis=1)
         stages += [Stage((name,), float(c), "q", "p") for name in names for c in c1]
         zeros, n = np.zeros, len(A1)
@@ -337,13 +338,13 @@ class PartitionedTableau(AbstractTableau):
             stages=tuple(stages),
             matrix=np.block(
                 [
-                    [zeros((v, v)), self.A, B0],
-                    [self.A_hat, zeros((s, s)), zeros((s, n))],
-                    [A1, zeros((n, s)), zeros((n, n))],
+                    [zeros((s, s)), self.A_hat, zeros((s, n))],
+                    [self.A, zeros((v, v)), B0],
+                    [zeros((n, s)), A1, zeros((n, n))],
                 ]
             ),
             weights=np.concatenate(
-                [self.alpha_hat, self.alpha, _columns(self.beta, names, (r,))]
+                [self.alpha, self.alpha_hat, _columns(self.beta, names, (r,))]
             ),
         )
 
