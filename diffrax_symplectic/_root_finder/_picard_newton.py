@@ -34,7 +34,7 @@ class _State(eqx.Module):
         # Rounding errors can keep the corrections to a leaf that is small next to the
         # others above `rtol` for ever: then they no longer shrink.
         eps = jnp.finfo(self.size.dtype).eps
-        stagnated = (self.shrink > 0.5) & (self.overall <= 100 * eps)
+        stagnated = ~(self.shrink < 0.25) & (self.overall <= 100 * eps)
         # A fraction of the tolerance: what remains has the same sign in every step.
         return (self.size * jnp.minimum(self.shrink, 1) <= 1 / 8) | stagnated
 
@@ -214,9 +214,18 @@ def _linearized(
 ) -> tuple[PyTree[Array], Callable]:
     """The residual at `y`, and what solves the linearized equations there."""
     residual, jacobian, _ = jax.linearize(lambda y: fn(y, args), y, has_aux=True)
+    if sum(x.size for x in jtu.tree_leaves(y)) > self.direct:
+        # The Jacobian of a linear system does not depend on `y`. XLA would move it, and
+        # its factorization, out of the loop and compute them in every step, also if the
+        # loop runs zero times. `0 * y` is not simplified: `y` might not be finite.
+        jacobian = ft.partial(_apply_tied, jacobian, y)
     operator = lx.FunctionLinearOperator(jacobian, jax.eval_shape(lambda: y), tags=tags)
     linear_state = self.linear_solver.init(operator, {})
     return residual, lambda x: self.linear_solver.compute(linear_state, x, {})[0]
+
+
+def _apply_tied(linear: Callable, y: PyTree[Array], x: PyTree[Array]) -> PyTree[Array]:
+    return linear((x**ω + 0 * y**ω).ω)
 
 
 def _newton(self: PicardNewton, fn, args, options, state: _State, tags) -> _State:

@@ -3,7 +3,6 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.flatten_util as jfu
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
@@ -66,12 +65,7 @@ def _matrix(operator: lx.AbstractLinearOperator) -> Array:
     column = lambda unit: jfu.ravel_pytree(operator.mv(unit))[0]
     if operator.in_size() <= _MAX_UNROLLED:
         return jnp.stack([column(unit) for unit in _units(structure)], axis=1)
-    # In turns, and not by `vmap`: in an inner loop of a solve XLA finds that the products
-    # of the identity matrix with what is constant there can be had once for the whole
-    # loop, and then computes them in every step, also if the loop runs zero times.
-    zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), structure)
-    flat, unravel = jfu.ravel_pytree(zeros)
-    return lax.map(lambda x: column(unravel(x)), jnp.eye(flat.size, dtype=flat.dtype)).T
+    return operator.as_matrix()
 
 
 def _units(structure: PyTree[jax.ShapeDtypeStruct]) -> Iterator[PyTree[Array]]:

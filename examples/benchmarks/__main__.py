@@ -1,10 +1,11 @@
 """All benchmarks: `python -m examples.benchmarks`."""
 
-from . import growth, speed, work_precision
+from . import ensemble, growth, speed, work_precision
 
 
 def main() -> None:
     speed.main()
+    ensemble.main()
     growth.main()
     work_precision.main()
 

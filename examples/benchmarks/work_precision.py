@@ -183,7 +183,7 @@ class _Scalar(diffrax.AbstractBrownianPath):
 def draw(axes, title: str, results: dict[str, tuple[np.ndarray, Errors]]) -> list[str]:
     lines = []
     for i, (name, (seconds, e)) in enumerate(results.items()):
-        style = "--" if name in dir(diffrax) else "-"
+        style = "--" if name in dir(diffrax) and name != "Midpoint" else "-"
         axes.errorbar(
             seconds, np.maximum(e.errors, 1e-16), 3 * e.std_errors, label=name,
             color=f"C{i}", ls=style, marker="o", ms=3, lw=1, capsize=2,
