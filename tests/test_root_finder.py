@@ -89,3 +89,17 @@ def test_leaves_that_vanish_do_not_keep_it_from_finishing():
         sol = optx.root_find(residual, finder, start, max_steps=20, throw=False)
         assert sol.result == optx.RESULTS.successful
         np.testing.assert_allclose(sol.value, (1, 0), atol=1e-13)
+
+
+@pytest.mark.parametrize("direct", [0, 4], ids=["picard", "newton"])
+def test_leaving_the_domain_on_the_way_is_no_failure(direct):
+    # From 3 the first fixed-point iteration leads to where the logarithm has no value.
+    sol = optx.root_find(
+        lambda x, _: 10 * jnp.log(x),
+        ds.PicardNewton(direct=direct, atol=1e-13),
+        jnp.array(3.0),
+        max_steps=50,
+        throw=False,
+    )
+    assert sol.result == optx.RESULTS.successful
+    np.testing.assert_allclose(sol.value, 1, atol=1e-13)

@@ -55,8 +55,8 @@ class PicardNewton(optx.AbstractRootFinder):
     - Up to `direct` unknowns: `warmup` fixed-point (Picard) iterations, one of Newton's
         method, and `chords` with the same Jacobian.
     - Above: fixed-point iterations, which need no Jacobian and converge fast for steps
-        that resolve the dynamics. If the equations are a short program on small arrays
-        `sweeps` of them are written out; a loop goes on for as long as corrections shrink.
+        that resolve the dynamics. Up to 32 unknowns, `sweeps` of them follow each other
+        without a look at the error; a loop goes on for as long as corrections shrink.
 
     The loop that then normally has nothing left to do is Newton's method, from where the
     above got to if that was converging, and otherwise from the start. Corrections
@@ -110,7 +110,9 @@ class PicardNewton(optx.AbstractRootFinder):
         state = _correct(self, options, state, solve(residual))
         for _ in range(self.chords):
             state = _correct(self, options, state, solve(fn(state.y, args)[0]))
-        return state
+        # If this led out of where `fn` has values, the loop starts afresh.
+        size = jnp.where(jnp.isnan(state.size), jnp.inf, state.size)
+        return eqx.tree_at(lambda s: s.size, state, size)
 
     def _picard(self, fn, args, options, start: _State) -> _State:
         # In pairs: positions and momenta move each other, so that corrections may shrink
