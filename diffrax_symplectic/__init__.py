@@ -1,4 +1,6 @@
 from ._brownian import (
+    LevyAreaBrownianPath as LevyAreaBrownianPath,
+    LevyAreaIncrement as LevyAreaIncrement,
     PlateauBrownianPath as PlateauBrownianPath,
     PlateauIncrement as PlateauIncrement,
     TruncatedBrownianPath as TruncatedBrownianPath,
@@ -20,8 +22,10 @@ from ._root_finder import SmallLU as SmallLU, PicardNewton as PicardNewton
 from ._solver import (
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
     AdditiveGauss as AdditiveGauss,
-    PlateauVerlet as PlateauVerlet,
+    LevyAreaMidpoint as LevyAreaMidpoint,
     Midpoint as Midpoint,
+    NinomiyaVictoir as NinomiyaVictoir,
+    PlateauVerlet as PlateauVerlet,
     SRKs1 as SRKs1,
     SRKs2 as SRKs2,
     SRKs3 as SRKs3,

@@ -169,7 +169,11 @@ class GeneralTableau(AbstractTableau):
     the number of noises, and the condition on $B^3$ follows from the one on $B^1$.
 
     **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
-    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`, `B1` of shape `(r, r)`.
+    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`, `B1` of shape `(r, r)`;
+    `noise`, the random variables that drive the noise stages: `("W",)`, of which `"W"` is
+    $I_k$, or `("W", "A")` for $\sum_k b_k I_k + \sum_{k<l} [b_k, b_l] A_{kl}$, with the
+    Lie brackets $[b_k, b_l] = b_l' b_k - b_k' b_l$ and the Lévy areas $A_{kl}$ of a
+    [`diffrax_symplectic.LevyAreaIncrement`][].
 
     **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
     real numbers.
@@ -181,6 +185,7 @@ class GeneralTableau(AbstractTableau):
     B0: Coefficients
     A1: Coefficients
     B1: Coefficients
+    noise: tuple[str, ...] = ("W",)
 
     def __post_init__(self):
         s, r = np.size(self.alpha), np.size(self.beta)
@@ -211,7 +216,7 @@ class GeneralTableau(AbstractTableau):
 
     def flatten(self) -> FlatTableau:
         stages = [Stage(("h",), float(c), "y", "y") for c in self.c0]
-        stages += [Stage(("W",), float(c), "y", "y") for c in self.c1]
+        stages += [Stage(self.noise, float(c), "y", "y") for c in self.c1]
         return FlatTableau(
             stages=tuple(stages),
             matrix=np.block([[self.A0, self.B0], [self.A1, self.B1]]),

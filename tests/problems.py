@@ -82,6 +82,7 @@ class _AnyIncrement(diffrax.AbstractSpaceTimeLevyArea, ds.WeakIncrement):
 
     H: PyTree = None
     C: PyTree = None
+    A: PyTree = None
 
 
 class Given(diffrax.AbstractBrownianPath):
@@ -92,6 +93,8 @@ class Given(diffrax.AbstractBrownianPath):
     second: jax.Array | None = None
     third: jax.Array | None = None
     C: jax.Array | None = None
+    A: jax.Array | None = None
+    two_point: jax.Array | None = None
     t0 = 0
     t1 = 1
     levy_area = _AnyIncrement
@@ -100,7 +103,14 @@ class Given(diffrax.AbstractBrownianPath):
         if not use_levy:
             return self.W
         return _AnyIncrement(
-            t1 - t0, self.W, self.second, None, self.third, self.H, self.C
+            dt=t1 - t0,
+            W=self.W,
+            second=self.second,
+            two_point=self.two_point,
+            third=self.third,
+            H=self.H,
+            C=self.C,
+            A=self.A,
         )
 
 

@@ -254,8 +254,7 @@ def fair_sign(bits, sqrt_h):
 def random_words(key, t0, t1, sets: int, n: int) -> Integer[Array, "sets n"]:
     """Random words for the step from `t0` to `t1`, the same for times that differ by
     rounding. The first of the sets are the same whatever their number is."""
-    if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
-        key = jr.wrap_key_data(key)
+    key = _typed(key)
     count, exponent = _place(t0, t1)
     blocks = (sets * n + 1) // 2
     if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks < 2**20:
@@ -270,10 +269,21 @@ def random_words(key, t0, t1, sets: int, n: int) -> Integer[Array, "sets n"]:
         )
         words = jer.threefry_2x32(jr.key_data(key), counters)
         return words.reshape(2, blocks).T.reshape(-1)[: sets * n].reshape(sets, n)
-    place = jr.fold_in(jr.fold_in(key, count), exponent)
+    place = place_key(key, t0, t1)
     return jnp.stack(
         [jr.bits(jr.fold_in(place, i), (n,), jnp.uint32) for i in range(sets)]
     )
+
+
+def place_key(key, t0, t1) -> PRNGKeyArray:
+    """A key for the step from `t0` to `t1`, the same for times that differ by rounding."""
+    count, exponent = _place(t0, t1)
+    return jr.fold_in(jr.fold_in(_typed(key), count), exponent)
+
+
+def _typed(key) -> PRNGKeyArray:
+    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    return key if typed else jr.wrap_key_data(key)
 
 
 def _place(t0, t1) -> tuple[Integer[Array, ""], Integer[Array, ""]]:

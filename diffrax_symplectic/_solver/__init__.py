@@ -9,6 +9,8 @@ from .srkw2 import SRKw2 as SRKw2
 from .srkw3 import SRKw3 as SRKw3
 from .srkw4 import SRKw4 as SRKw4
 from .srkw5 import SRKw5 as SRKw5
+from .levy_area_midpoint import LevyAreaMidpoint as LevyAreaMidpoint
+from .ninomiya_victoir import NinomiyaVictoir as NinomiyaVictoir
 from .strang_gauss import StrangGauss as StrangGauss
 from .additive_gauss import AdditiveGauss as AdditiveGauss
 from .plateau_verlet import PlateauVerlet as PlateauVerlet

@@ -6,7 +6,8 @@ from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau
-from .base import AbstractSymplecticRungeKutta, strong_order_if_commutative
+from ._terms import strong_order_if_commutative
+from .base import AbstractSymplecticRungeKutta
 
 
 _half = np.array([[0.5]])

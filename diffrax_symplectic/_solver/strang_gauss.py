@@ -6,7 +6,8 @@ from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau
-from .base import AbstractSymplecticRungeKutta, number_of_noises
+from ._terms import number_of_noises
+from .base import AbstractSymplecticRungeKutta
 
 
 _r = np.sqrt(3.0)

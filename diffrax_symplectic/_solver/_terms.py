@@ -1,0 +1,192 @@
+"""What a step needs of Diffrax terms: their parts, their random variables, and that they
+fit the state."""
+
+import functools as ft
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from equinox.internal import ω
+from jaxtyping import Array, Float, PyTree
+
+from .._brownian import LevyAreaIncrement, PlateauIncrement, WeakIncrement
+from .._custom_types import Args, RealScalarLike, Y
+
+
+def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
+    """Drift terms and noise terms."""
+    if isinstance(terms, diffrax.MultiTerm):
+        return terms.terms[:1], terms.terms[1:]
+    is_path = lambda x: isinstance(x, diffrax.AbstractBrownianPath)
+    if any(map(is_path, jtu.tree_leaves(terms, is_leaf=is_path))):
+        return (), (terms,)
+    return (terms,), ()
+
+
+# Called at several stages, this is traced and lowered once.
+@eqx.filter_jit
+def apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> Y:
+    """The sum over terms of vector field times control."""
+    total = tree_sum([x.vf_prod(t, y, args, c) for x, c in zip(terms, controls)])
+    _check_value(total, y)
+    return total
+
+
+@eqx.filter_jit
+def apply_brackets(
+    term: diffrax.AbstractTerm,
+    A: Float[Array, "m m"],
+    args: Args,
+    t: RealScalarLike,
+    y: Y,
+) -> Y:
+    """`sum_{k<l} A_kl [b_k, b_l]`, with the Lie brackets `Db_l b_k - Db_k b_l` of the
+    vector fields of one term.
+
+    For antisymmetric `A` that is `sum_l Db_l (sum_k A_kl b_k)`: `m` derivatives.
+    """
+    struct = eqx.filter_eval_shape(term.contr, 0.0, 1.0)
+    _, unravel = jfu.ravel_pytree(
+        jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
+    )
+    along = lambda y, x: term.vf_prod(t, y, args, unravel(x))
+
+    def summand(column, unit):
+        return jax.jvp(lambda y: along(y, unit), (y,), (along(y, column),))[1]
+
+    summands = jax.vmap(summand)(A.T, jnp.eye(len(A), dtype=A.dtype))
+    return jtu.tree_map(lambda x: jnp.sum(x, axis=0), summands)
+
+
+def tree_sum(values: list[Y]) -> Y:
+    return ft.reduce(lambda a, b: (a**ω + b**ω).ω, values)
+
+
+class _Provider(NamedTuple):
+    increment: type[diffrax.AbstractBrownianIncrement]
+    advice: str
+
+
+# Random variables beyond `W`: which increments hold them, and how to ask for these. Those
+# that hold more come first.
+PROVIDED_BY = {
+    "A": _Provider(
+        LevyAreaIncrement,
+        "Lévy areas. Wrap a path with space-time Lévy area as `LevyAreaBrownianPath(path, "
+        "key)`",
+    ),
+    "C": _Provider(
+        PlateauIncrement,
+        "plateaus. Wrap a path with space-time Lévy area as `PlateauBrownianPath(path, "
+        "key)`",
+    ),
+    "H": _Provider(
+        diffrax.AbstractSpaceTimeLevyArea,
+        "space-time Lévy area. Pass a path that has it, for example `diffrax."
+        "VirtualBrownianTree(..., levy_area=diffrax.SpaceTimeLevyArea)`",
+    ),
+    "third": _Provider(
+        WeakIncrement,
+        "four-point variables and two more sets. Construct the path as "
+        "`WeakBrownianPath(..., order=3)`",
+    ),
+    "second": _Provider(
+        WeakIncrement,
+        "a second set of three-point variables. Construct the path as "
+        "`WeakBrownianPath(..., second=True)`",
+    ),
+    "two_point": _Provider(
+        WeakIncrement,
+        "two-point variables. Construct the path as `WeakBrownianPath(..., "
+        "two_point=True)`",
+    ),
+}
+
+
+def controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, list]:
+    """The random variables of the step from `t0` to `t1`, for each noise term."""
+    if names == ["W"]:
+        return {"W": [term.contr(t0, t1) for term in noise]}
+    increments = [term.contr(t0, t1, use_levy=True) for term in noise]
+    # The most telling advice first.
+    for name in sorted(names, key=lambda x: [*PROVIDED_BY, x].index(x)):
+        if any(getattr(increment, name, None) is None for increment in increments):
+            provider = PROVIDED_BY.get(name)
+            advice = f"increments with the attribute `{name}`"
+            raise ValueError(
+                f"`{solver}` needs {provider.advice if provider else advice}."
+            )
+    return {name: [getattr(i, name) for i in increments] for name in names}
+
+
+def noise_driven(
+    noise: tuple, names: list[str], t0, t1, args: Args, solver: str
+) -> dict[str, jtu.Partial]:
+    """What drives noise stages over the step, for each random variable."""
+    driven = {}
+    for name, values in controls(noise, names, t0, t1, solver).items():
+        if name != "A":
+            driven[name] = jtu.Partial(apply, noise, values, args)
+        elif len(noise) == 1:
+            driven[name] = jtu.Partial(apply_brackets, noise[0], values[0], args)
+        else:
+            raise ValueError(
+                f"`{solver}` needs all noises in one term, whose path samples the Lévy "
+                f"areas between them; got {len(noise)} noise terms."
+            )
+    return driven
+
+
+def drift_driven(drift: tuple, t0, t1, args: Args) -> jtu.Partial:
+    """What drives drift stages over the step."""
+    return jtu.Partial(apply, drift, [x.contr(t0, t1) for x in drift], args)
+
+
+def check_state(y0: Y, solver: str) -> None:
+    leaves = jtu.tree_leaves(y0)
+    if len(leaves) == 0:
+        raise ValueError(f"`{solver}` needs a state with at least one array in it.")
+    for leaf in leaves:
+        dtype = jnp.result_type(leaf)
+        if not jnp.issubdtype(dtype, jnp.floating):
+            raise ValueError(
+                f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
+                f"array of dtype {dtype}. Convert it with `.astype(float)`; split a "
+                "complex one into real and imaginary parts."
+            )
+    if len({jnp.result_type(leaf) for leaf in leaves}) > 1:
+        raise ValueError(
+            f"`{solver}` needs all arrays of `y0` in one dtype; got "
+            f"{sorted({str(jnp.result_type(leaf)) for leaf in leaves})}."
+        )
+
+
+def _check_value(value: PyTree[Array], y: PyTree[Array]) -> None:
+    def check(v, x):
+        if jnp.result_type(v) != jnp.result_type(x) or jnp.shape(v) != jnp.shape(x):
+            raise ValueError(
+                "The terms change an array of dtype and shape "
+                f"{jnp.result_type(x)}{jnp.shape(x)} by one of {jnp.result_type(v)}"
+                f"{jnp.shape(v)}. Give the state, the vector fields and the path (as "
+                "`shape=jax.ShapeDtypeStruct(shape, dtype)`) the same dtype, and time "
+                "no wider one."
+            )
+
+    jtu.tree_map(check, value, y)
+
+
+def number_of_noises(terms: diffrax.AbstractTerm) -> int:
+    """How many scalar random variables drive the noise terms."""
+    _, noise = split_terms(terms)
+    struct = eqx.filter_eval_shape(lambda: [term.contr(0.0, 1.0) for term in noise])
+    return sum(int(np.prod(s.shape)) for s in jtu.tree_leaves(struct))
+
+
+def strong_order_if_commutative(terms: diffrax.AbstractTerm) -> float:
+    """One noise commutes with itself; whether several do cannot be seen from here."""
+    return 1.0 if number_of_noises(terms) <= 1 else 0.5

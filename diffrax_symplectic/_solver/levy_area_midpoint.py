@@ -1,0 +1,85 @@
+import dataclasses
+from typing import ClassVar
+
+import optimistix as optx
+from diffrax import AbstractImplicitSolver
+
+from .._root_finder import PicardNewton
+from .._tableau import GeneralTableau
+from .base import AbstractSymplecticRungeKutta
+from .midpoint import Midpoint
+
+
+class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+    r"""The implicit midpoint rule with Lévy areas, of strong order 1 for any number of
+    noises, whether they commute or not.
+
+    $$G = \tfrac12 (y_n + y_{n+1}), \qquad y_{n+1} = y_n + h\,a(G) + \sum_k b_k(G) I_k
+      + \sum_{k<l} [b_k, b_l](G)\, A_{kl}$$
+
+    with the Lie brackets $[b_k, b_l] = b_l' b_k - b_k' b_l$ and the Lévy areas
+    $A_{kl} = \frac12 \int (w_k \,\mathrm{d}w_l - w_l \,\mathrm{d}w_k)$ of the step. This is
+    one midpoint step, over unit time, of the Hamiltonian
+
+    $$h H_0 + \sum_k I_k H_k + \sum_{k<l} A_{kl} \{H_k, H_l\}, \qquad
+      \{F, G\} = \frac{\partial F}{\partial p} \cdot \frac{\partial G}{\partial q}
+      - \frac{\partial F}{\partial q} \cdot \frac{\partial G}{\partial p},$$
+
+    since the Lie bracket of two Hamiltonian vector fields is the field of their Poisson
+    bracket: so it is symplectic for any Hamiltonians, and conserves every quadratic
+    invariant of the system. JAX takes the derivatives; terms that do not come from
+    Hamiltonians will do, but all noises have to be in one term.
+
+    The areas bring the order: without them the midpoint rule has strong order 1/2. For `m`
+    noises they cost `m` directional derivatives of the noise in each evaluation. With one
+    noise, or noises that commute, it is [`diffrax_symplectic.Midpoint`][] at a higher
+    price. Weak order 1. Order 2 without noise. No free parameters.
+
+    !!! warning
+
+        The path has to be a [`diffrax_symplectic.LevyAreaBrownianPath`][] around one with
+        space-time Lévy area.
+
+    ??? cite "Reference"
+
+        That Lévy areas and Lie brackets bring order 1 is due to Milstein; the combination
+        with the midpoint rule, which keeps it symplectic, is new here.
+
+        ```bibtex
+        @book{milstein2021stochastic,
+            author = {Milstein, Grigori N. and Tretyakov, Michael V.},
+            title = {Stochastic Numerics for Mathematical Physics},
+            edition = {2},
+            publisher = {Springer},
+            year = {2021},
+            doi = {10.1007/978-3-030-82040-4},
+        }
+        ```
+    """
+
+    root_finder: optx.AbstractRootFinder = PicardNewton()
+    root_find_max_steps: int = 20
+
+    tableau: ClassVar[GeneralTableau] = dataclasses.replace(
+        Midpoint.tableau, noise=("W", "A")
+    )
+
+    def order(self, terms):
+        del terms
+        return 2
+
+    def strong_order(self, terms):
+        del terms
+        return 1.0
+
+    def weak_order(self, terms):
+        """Order of convergence of expectations."""
+        del terms
+        return 1
+
+
+LevyAreaMidpoint.__init__.__doc__ = """**Arguments:**
+
+- `root_finder`: any Optimistix root finder for the stage equations.
+- `root_find_max_steps`: the most iterations it may take in one step.
+"""

@@ -1,0 +1,159 @@
+import diffrax
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import optimistix as optx
+
+from .._brownian import WeakIncrement
+from .._plan import make_plan
+from .._root_finder import PicardNewton
+from .._tableau import FlatTableau, Stage
+from ._stages import first_failure, Step, take_step
+from ._terms import apply, check_state, controls, drift_driven, split_terms
+from .base import AbstractSymplecticSolver
+
+
+_r = np.sqrt(3.0)
+# The flow of one vector field: two stages of the Gauss method, of order 4.
+_gauss = make_plan(
+    FlatTableau(
+        stages=tuple(Stage(("h",), 1 / 2 + s * _r / 6, "y", "y") for s in (-1, 1)),
+        matrix=np.array([[1 / 4, 1 / 4 - _r / 6], [1 / 4 + _r / 6, 1 / 4]]),
+        weights=np.array([1 / 2, 1 / 2]),
+    )
+)
+# Up to so many noises their flows are written out one after another, without a loop.
+_WRITTEN_OUT = 2
+
+
+class NinomiyaVictoir(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
+    r"""A symplectic method of weak order 2 for any Hamiltonians and any number of noises,
+    whether they commute or not: splitting in random order.
+
+    With $F_0(t)$ for the flow of the drift over time $t$, $F_k(x)$ for that of the noise
+    $b_k$ over "time" $x$, and the three-point variables $\hat I_k$, by one fair coin
+
+    $$y_{n+1} = F_0(\tfrac h2)\, F_m(\hat I_m) \cdots F_1(\hat I_1)\, F_0(\tfrac h2)\, y_n
+      \quad \text{or} \quad
+      F_0(\tfrac h2)\, F_1(\hat I_1) \cdots F_m(\hat I_m)\, F_0(\tfrac h2)\, y_n.$$
+
+    Each flow is one step of the Gauss method with two stages, of order 4. (By the midpoint
+    rule the method would fall back to weak order 1.) So a step solves $m + 2$ systems of
+    two stage vectors, one after another; each evaluates all noises of the terms.
+
+    Symplectic path by path for any Hamiltonians, and any Stratonovich system will do:
+    quadratic invariants that drift and noises share are conserved. Weak order 2. Order 2
+    without noise. No free parameters. For one noise, [`diffrax_symplectic.StrangGauss`][]
+    has the same order and is cheaper.
+
+    !!! warning
+
+        For two noises and more the path has to be a
+        [`diffrax_symplectic.WeakBrownianPath`][] with `two_point=True`: the coin is the
+        sign of the first two-point variable.
+
+    ??? cite "Reference"
+
+        The splitting; that the flows can be replaced by Runge--Kutta methods of high
+        order; and the Gauss method:
+
+        ```bibtex
+        @article{ninomiya2008weak,
+            author = {Ninomiya, Syoiti and Victoir, Nicolas},
+            title = {Weak Approximation of Stochastic Differential Equations and
+                     Application to Derivative Pricing},
+            journal = {Applied Mathematical Finance},
+            volume = {15},
+            number = {2},
+            pages = {107--121},
+            year = {2008},
+            doi = {10.1080/13504860701413958},
+        }
+
+        @article{ninomiya2009new,
+            author = {Ninomiya, Mariko and Ninomiya, Syoiti},
+            title = {A New Higher-Order Weak Approximation Scheme for Stochastic
+                     Differential Equations and the {R}unge--{K}utta Method},
+            journal = {Finance and Stochastics},
+            volume = {13},
+            pages = {415--443},
+            year = {2009},
+            doi = {10.1007/s00780-009-0101-4},
+        }
+        ```
+    """
+
+    root_finder: optx.AbstractRootFinder = PicardNewton()
+    root_find_max_steps: int = 20
+
+    @property
+    def minimal_levy_area(self):
+        """The least that the increments of the path have to hold."""
+        return WeakIncrement
+
+    def init(self, terms, t0, t1, y0, args):
+        del t0, t1
+        check_state(y0, type(self).__name__)
+        return None
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        del solver_state, made_jump
+        drift, noise = split_terms(terms)
+        middle = t0 + (t1 - t0) / 2
+
+        def along_drift(t0, t1, y):
+            if len(drift) == 0:
+                return y, diffrax.RESULTS.successful
+            step = Step(t0, t1 - t0, {"h": drift_driven(drift, t0, t1, args)})
+            return take_step(_gauss, step, y, self)
+
+        y, first = along_drift(t0, middle, y0)
+        y, second = self._along_noise(noise, t0, t1, middle, y, args)
+        y1, third = along_drift(middle, t1, y)
+        result = first_failure(first_failure(first, second), third)
+        return y1, None, dict(y0=y0, y1=y1), None, result
+
+    def _along_noise(self, noise, t0, t1, time, y0, args):
+        """The flows of all noises, the time standing still at `time`."""
+        if len(noise) == 0:
+            return y0, diffrax.RESULTS.successful
+        drawn = controls(noise, ["W"], t0, t1, type(self).__name__)
+        increments, unravel = jfu.ravel_pytree(drawn["W"])
+        m = increments.size
+        numbers = jnp.arange(m)
+        if m > 1:
+            names = ["W", "two_point"]
+            drawn = controls(noise, names, t0, t1, type(self).__name__)
+            increments, _ = jfu.ravel_pytree(drawn["W"])
+            coin = jtu.tree_leaves(drawn["two_point"])[0].reshape(-1)[0] > 0
+            numbers = jnp.where(coin, numbers, numbers[::-1])
+
+        def flow(carry, number):
+            y, result = carry
+            one = unravel(jnp.where(jnp.arange(m) == number, increments, 0))
+            step = Step(time, 0.0, {"h": jtu.Partial(apply, noise, one, args)})
+            y, flowed = take_step(_gauss, step, y, self)
+            return (y, first_failure(result, flowed)), None
+
+        carry = (y0, diffrax.RESULTS.successful)
+        unroll = m if m <= _WRITTEN_OUT else 1
+        (y1, result), _ = jax.lax.scan(flow, carry, numbers, unroll=unroll)
+        return y1, result
+
+    def order(self, terms):
+        del terms
+        return 2
+
+    def weak_order(self, terms):
+        """Order of convergence of expectations."""
+        del terms
+        return 2
+
+
+NinomiyaVictoir.__init__.__doc__ = """**Arguments:**
+
+- `root_finder`: any Optimistix root finder for the stage equations.
+- `root_find_max_steps`: the most iterations it may take in one system of a step.
+"""

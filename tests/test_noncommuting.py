@@ -1,0 +1,311 @@
+"""Methods for several noises that do not commute: weak order 2, strong order 1."""
+
+import diffrax
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from .problems import FineSample, Given, H0, noise, random_problem, slope, weak_path
+
+
+SOLVERS = [ds.NinomiyaVictoir(), ds.LevyAreaMidpoint()]
+
+
+@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-6)])
+@pytest.mark.parametrize("solver", SOLVERS, ids=repr)
+def test_step_is_symplectic_for_a_thousand_random_systems(solver, dtype, bound):
+    def defect(key):
+        k_problem, k_m, k_h, k_W, k_A, k_coin = jr.split(key, 6)
+        y0, args = random_problem(k_problem, 2, 3, dtype)
+        used = jnp.arange(3) < jr.randint(k_m, (), 1, 4)
+        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
+        W = jnp.sqrt(h) * used * jr.normal(k_W, (3,), dtype)
+        A = h / 2 * used[:, None] * used * jr.normal(k_A, (3, 3), dtype)
+        coin = jr.rademacher(k_coin, (3,), dtype)
+        terms = ds.hamiltonian_terms(H0, noise, Given(W, A=A - A.T, two_point=coin))
+        return ds.symplecticity_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
+
+    defects = jax.jit(jax.vmap(defect))(jr.split(jr.key(0), 1000))
+    assert defects.dtype == dtype
+    assert jnp.max(defects) <= bound
+
+
+def _functions(y):
+    p, q = y[0][0], y[1][0]
+    return jnp.stack([p, q**2, p * q, jnp.sin(p + q), jnp.exp(p / 2)])
+
+
+@pytest.mark.parametrize("m", [2, 3])
+def test_ninomiya_victoir_is_weak_order_two(m):
+    solver = ds.NinomiyaVictoir()
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(m, two_point=True))
+    # Two systems in which no test function's leading error happens to be small.
+    y0, args = jax.vmap(lambda key: random_problem(key, 1, m))(
+        jr.split(jr.key(1), 24)[jnp.array([4, 6])]
+    )
+    hs = np.array([0.02, 0.01, 0.005, 0.0025])
+
+    def defect(h, y0, args):
+        kwargs = dict(fn=_functions, order=2)
+        return ds.weak_order_defect(terms, solver, 0.1, 0.1 + h, y0, args, **kwargs)
+
+    over_steps = jax.vmap(defect, in_axes=(0, None, None))
+    defects = jax.jit(jax.vmap(over_steps, in_axes=(None, 0, 0)))(hs, y0, args)
+    slopes = [slope(hs, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(hs))]
+    assert solver.weak_order(terms) == 2
+    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
+
+
+def test_flows_follow_each_other_in_the_order_of_the_coin():
+    # Without drift and for one coin, two separate solves with one noise each.
+    y0, args = random_problem(jr.key(0), 2, 2)
+    W = jnp.array([0.3, -0.2])
+    zero = lambda t, p, q, args: 0.0 * jnp.sum(p)
+    solver = ds.NinomiyaVictoir()
+
+    def end(W, coin, y0):
+        path = Given(W, two_point=coin * jnp.ones(2))
+        terms = ds.hamiltonian_terms(zero, lambda *x: noise(0.05, *x[1:]), path)
+        return solver.step(terms, 0.0, 0.1, y0, args, None, False)[0]
+
+    end = jax.jit(end)
+    first, then = W * jnp.array([1, 0]), W * jnp.array([0, 1])
+    for coin, (a, b) in {1.0: (first, then), -1.0: (then, first)}.items():
+        expected = end(b, 1.0, end(a, 1.0, y0))
+        got = end(W, coin, y0)
+        np.testing.assert_allclose(got[0], expected[0], atol=1e-14)
+        np.testing.assert_allclose(got[1], expected[1], atol=1e-14)
+    assert abs(end(W, 1.0, y0)[0] - end(W, -1.0, y0)[0]).max() > 1e-4
+
+
+def test_levy_area_midpoint_is_one_step_of_the_hamiltonian_with_brackets():
+    y0, args = random_problem(jr.key(0), 2, 3)
+    W = jnp.array([0.3, -0.2, 0.1])
+    A = jnp.array([[0, 0.04, -0.05], [-0.04, 0, 0.02], [0.05, -0.02, 0]])
+    t0, h = 0.4, 0.2
+
+    def total(t, p, q, args):
+        values = noise(t0 + h / 2, p, q, args)
+        dp = jax.jacobian(noise, 1)(t0 + h / 2, p, q, args)
+        dq = jax.jacobian(noise, 2)(t0 + h / 2, p, q, args)
+        brackets = dp @ dq.T - dq @ dp.T
+        deterministic = h * H0(t0 + h / 2, p, q, args)
+        return deterministic + W @ values + jnp.sum(jnp.triu(A) * brackets)
+
+    terms = ds.hamiltonian_terms(H0, noise, Given(W, A=A))
+    got = ds.LevyAreaMidpoint().step(terms, t0, t0 + h, y0, args, None, False)[0]
+    unit = ds.hamiltonian_terms(total, noise, Given(jnp.zeros(3)))
+    expected = ds.Midpoint().step(unit, 0.0, 1.0, y0, args, None, False)[0]
+    without = ds.Midpoint().step(terms, t0, t0 + h, y0, args, None, False)[0]
+    np.testing.assert_allclose(got, expected, atol=1e-14)
+    assert np.abs(np.subtract(without, expected)).max() > 1e-4
+
+
+def test_levy_area_midpoint_is_strong_order_one_where_the_midpoint_rule_is_not():
+    fine, m = 2**11, 2
+    y0, args = random_problem(jr.key(6), 1, m)
+    a, u, v, phi = args["noise"]
+    args["noise"] = 1.5 * a, u, v, phi
+    steps = np.array([2.0**-k for k in (4, 5, 6, 7)])
+
+    def errors(key):
+        k_sample, k_area = jr.split(key)
+        sample = FineSample.draw(k_sample, fine, m)
+        path = ds.LevyAreaBrownianPath(sample, k_area, terms=0, cell=1 / fine)
+        terms = ds.hamiltonian_terms(H0, noise, path)
+        solve = lambda h, solver: jnp.concatenate(
+            diffrax.diffeqsolve(terms, solver, 0.0, 1.0, h, y0, args).ys, axis=1
+        )[0]
+        exact = solve(1 / fine, ds.LevyAreaMidpoint())
+        return [
+            jax.lax.map(lambda h: solve(h, solver) - exact, jnp.asarray(steps))
+            for solver in (ds.LevyAreaMidpoint(), ds.Midpoint())
+        ]
+
+    with_areas, without = [
+        np.sqrt(np.mean(np.sum(e**2, axis=-1), axis=0))
+        for e in jax.jit(jax.vmap(errors))(jr.split(jr.key(0), 200))
+    ]
+    assert ds.LevyAreaMidpoint().strong_order(None) == 1.0
+    assert abs(slope(steps, with_areas) - 1.0) <= 0.1
+    assert slope(steps, without) <= 0.7
+    assert with_areas[-1] < without[-1] / 2
+
+
+def _areas(n, m=3, terms=8, h=1.0, cell=None):
+    """`n` samples of `W`, `H` and `A` over a step."""
+
+    def draw(key):
+        k_path, k_area = jr.split(key)
+        path = diffrax.UnsafeBrownianPath((m,), k_path, diffrax.SpaceTimeLevyArea)
+        path = ds.LevyAreaBrownianPath(path, k_area, terms=terms, cell=cell)
+        increment = path.evaluate(0.0, h, use_levy=True)
+        return increment.W, increment.H, increment.A
+
+    return jax.jit(jax.vmap(draw))(jr.split(jr.key(1), n))
+
+
+@pytest.mark.parametrize("terms, cell", [(0, None), (8, None), (0, 0.25)])
+def test_areas_have_the_covariances_and_kurtosis_of_the_law(terms, cell):
+    n, h = 200_000, 0.5
+    W, H, A = _areas(n, terms=terms, h=h, cell=cell)
+    np.testing.assert_allclose(A, -np.swapaxes(A, 1, 2), atol=1e-14)
+    scale = np.sqrt(h)
+    W, H, a, b = W / scale, H / scale, A[:, 0, 1] / h, A[:, 0, 2] / h
+    bridge = H[:, 0] * W[:, 1] - H[:, 1] * W[:, 0]
+    # Lévy's area has the characteristic function 1 / cosh(u / 2): E A^4 = 5 / 16. Given W,
+    # E(A_01^2) = 1 / 12 + (W_0^2 + W_1^2) / 12 and E(A_01 A_02) = W_1 W_2 / 12.
+    for sample, exact in (
+        (a, 0),
+        (a**2, 1 / 4),
+        (a * b, 0),
+        (a**4, 5 / 16),
+        (a**2 * W[:, 0] ** 2, 1 / 12 + (3 + 1) / 12),
+        (a * b * W[:, 1] * W[:, 2], 1 / 12),
+        (a * W[:, 0] * W[:, 1], 0),
+        (a * bridge, 2 / 12),
+        (H[:, 0] ** 2, 1 / 12),
+        (H[:, 0] * W[:, 0], 0),
+    ):
+        assert abs(np.mean(sample) - exact) <= 4 * np.std(sample) / np.sqrt(n)
+
+
+@pytest.mark.parametrize("terms", [0, 3])
+def test_bridge_areas_have_their_moments_given_the_integral(terms):
+    # Given W and H the area A_01 has the mean H_0 W_1 - H_1 W_0 and the variance
+    # 1 / 20 + (H_0^2 + H_1^2) / 5, and Cov(A_01, A_02) = H_1 H_2 / 5 (Davie; Foster).
+    n = 100_000
+    W, H = jnp.array([0.7, -1.0, 0.4]), jnp.array([0.3, -0.5, 0.2])
+
+    def draw(key):
+        path = ds.LevyAreaBrownianPath(Given(W, H), key, terms=terms)
+        return path.evaluate(0.0, 1.0, use_levy=True).A
+
+    A = jax.jit(jax.vmap(draw))(jr.split(jr.key(0), n))
+    mean = np.outer(H, W) - np.outer(W, H)
+    a, b = (A[:, 0, k] - mean[0, k] for k in (1, 2))
+    for sample, exact in (
+        (a, 0),
+        (a**2, 1 / 20 + (H[0] ** 2 + H[1] ** 2) / 5),
+        (a * b, H[1] * H[2] / 5),
+    ):
+        assert abs(np.mean(sample) - exact) <= 4 * np.std(sample) / np.sqrt(n)
+
+
+def test_kurtosis_without_terms_is_short_of_the_law_and_terms_mend_it():
+    # Exact: the bridge's area given H is Gaussian without terms. Its fourth moment
+    # falls short of the law's by the kurtosis of a sum of products of Gaussians.
+    draw = lambda terms: _areas(400_000, m=2, terms=terms)
+    short, mended = (
+        np.mean((A[:, 0, 1] - H[:, 0] * W[:, 1] + H[:, 1] * W[:, 0]) ** 4)
+        for W, H, A in (draw(0), draw(8))
+    )
+    # The bridge's own area has cumulants sum_r 2 E(r-th term): variance 1 / 12 and fourth
+    # moment 3 / 144 + 12 sum_r (1 / (2 pi r))^4 = 3 / 144 + 1 / 120.
+    assert abs(mended - (3 / 144 + 1 / 120)) <= 0.02 * mended
+    assert short < mended
+
+
+def test_areas_over_cells_follow_chens_rule():
+    tree = diffrax.VirtualBrownianTree(
+        0.0, 1.0, 2**-6, (3,), jr.key(0), diffrax.SpaceTimeLevyArea
+    )
+    path = ds.LevyAreaBrownianPath(tree, jr.key(1), terms=2, cell=1 / 16)
+    evaluate = jax.jit(lambda a, b: path.evaluate(a, b, use_levy=True))
+    whole = evaluate(0.25, 0.75)
+    left, right = evaluate(0.25, 0.5), evaluate(0.5, 0.75 + 1e-12)
+    outer = np.outer(left.W, right.W)
+    expected = left.A + right.A + (outer - outer.T) / 2
+    np.testing.assert_allclose(whole.A, expected, atol=1e-14)
+    np.testing.assert_allclose(whole.W, left.W + right.W, atol=1e-14)
+    # The tree's own increments, up to its tolerance.
+    direct = tree.evaluate(0.25, 0.75, use_levy=True)
+    np.testing.assert_allclose(whole.W, direct.W, atol=1e-12)
+    np.testing.assert_allclose(whole.H, direct.H, atol=1e-12)
+    np.testing.assert_array_equal(path.evaluate(0.25, 0.75), whole.W)
+    # Areas are at least those of the polygon through the cells, up to cell areas.
+    with pytest.raises(Exception, match="multiples of `cell`"):
+        evaluate(0.25, 0.7)
+
+
+def test_gradients_pass_through_a_whole_solve():
+    y0, args = random_problem(jr.key(0), 1, 2)
+    tree = diffrax.VirtualBrownianTree(
+        0.0, 1.0, 2**-6, (2,), jr.key(0), diffrax.SpaceTimeLevyArea
+    )
+    paths = weak_path(2, two_point=True), ds.LevyAreaBrownianPath(tree, jr.key(1))
+
+    def ends(x, size):
+        a, u, v, phi = args["noise"]
+        scaled = {**args, "noise": (size * a, u, v, phi)}
+        solve = lambda solver, path: (
+            diffrax.diffeqsolve(
+                ds.hamiltonian_terms(H0, noise, path), solver, 0.0, 0.5, 0.1, x, scaled
+            ).ys
+        )
+        return sum(jnp.sum(jfu.ravel_pytree(solve(*z))[0]) for z in zip(SOLVERS, paths))
+
+    flat, unravel = jfu.ravel_pytree((y0, 1.0))
+    value_and_grad = jax.jit(jax.value_and_grad(lambda x: ends(*unravel(x))))
+    _, gradient = value_and_grad(flat)
+    for i, unit in enumerate(1e-5 * np.eye(flat.size)):
+        change = value_and_grad(flat + unit)[0] - value_and_grad(flat - unit)[0]
+        np.testing.assert_allclose(gradient[i], change / 2e-5, atol=1e-7)
+
+
+def test_parts_of_a_system_may_be_missing_and_noises_in_several_terms():
+    y0, args = random_problem(jr.key(0), 1, 2)
+    solver = ds.NinomiyaVictoir()
+    full = ds.hamiltonian_terms(H0, noise, weak_path(2, two_point=True))
+    drift, diffusion = full.terms
+    end = lambda terms: np.array(
+        diffrax.diffeqsolve(terms, solver, 0.0, 0.4, 0.1, y0, args).ys
+    )
+    only_drift, only_noise = end(drift), end(diffusion)
+    # A circle needs no noise: the drift alone is solved to order 4 in h / 2.
+    exact = diffrax.diffeqsolve(drift, diffrax.Dopri8(), 0.0, 0.4, 0.001, y0, args).ys
+    np.testing.assert_allclose(only_drift, np.array(exact), atol=1e-6)
+    assert np.abs(only_noise - np.array(y0)).max() > 1e-2
+    halves = [
+        ds.hamiltonian_terms(H0, lambda *x, i=i: noise(*x)[i : i + 1], path).terms[1]
+        for i, path in enumerate(
+            Given(jnp.array([w]), two_point=jnp.ones(1)) for w in (0.1, -0.2)
+        )
+    ]
+    together = ds.hamiltonian_terms(
+        H0, noise, Given(jnp.array([0.1, -0.2]), two_point=jnp.ones(2))
+    )
+    split = end(diffrax.MultiTerm(drift, *halves))
+    np.testing.assert_allclose(split, end(together), atol=1e-14)
+
+
+def test_missing_variables_are_refused_with_advice():
+    y0, args = random_problem(jr.key(0), 1, 2)
+    solve = lambda solver, path: diffrax.diffeqsolve(
+        ds.hamiltonian_terms(H0, noise, path), solver, 0.0, 0.2, 0.1, y0, args
+    )
+    with pytest.raises(ValueError, match=r"WeakBrownianPath\(..., two_point=True\)"):
+        solve(ds.NinomiyaVictoir(), weak_path(2))
+    with pytest.raises(ValueError, match=r"LevyAreaBrownianPath\(path, key\)"):
+        solve(ds.LevyAreaMidpoint(), weak_path(2))
+    with pytest.raises(ValueError, match="needs a path with space-time"):
+        ds.LevyAreaBrownianPath(weak_path(2), jr.key(0))
+    levy = diffrax.SpaceTimeLevyArea
+    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 0.1, (1,), jr.key(0), levy)
+    with pytest.raises(ValueError, match="`terms` must be"):
+        ds.LevyAreaBrownianPath(tree, jr.key(0), terms=-1)
+    with pytest.raises(ValueError, match="`cell` must be"):
+        ds.LevyAreaBrownianPath(tree, jr.key(0), cell=0.0)
+    path = ds.LevyAreaBrownianPath(tree, jr.key(0))
+    one = ds.hamiltonian_terms(H0, lambda *x: noise(*x)[:1], path)
+    drift, diffusion = one.terms
+    several = diffrax.MultiTerm(drift, diffusion, diffusion)
+    with pytest.raises(ValueError, match="all noises in one term"):
+        diffrax.diffeqsolve(several, ds.LevyAreaMidpoint(), 0.0, 0.2, 0.1, y0, args)
+    assert ds.LevyAreaMidpoint().minimal_levy_area is ds.LevyAreaIncrement
+    assert ds.NinomiyaVictoir().minimal_levy_area is ds.WeakIncrement
