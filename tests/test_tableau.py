@@ -1,6 +1,7 @@
 """Coefficients satisfy their conditions, and only live, distinct stages are solved."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -71,6 +72,18 @@ def test_every_perturbed_live_coefficient_is_caught(tableau, field):
         assert caught or dead
 
 
+def test_every_member_of_srkw2_satisfies_all_conditions():
+    for rows in itertools.permutations((1, 2, 3, 4)):
+        for conjugate in (False, True):
+            tableau = ds.SRKw2(rows=rows, conjugate=conjugate).tableau
+            residuals = [*ds.weak_order_residuals(tableau, 2).values()]
+            residuals.append(np.max(np.abs(ds.symplectic_residuals(tableau))))
+            assert np.max(np.abs(residuals)) <= 1e-15
+    for wrong in ((1, 2, 3), (0, 1, 2, 3), (1, 1, 2, 3), None):
+        with pytest.raises(ValueError, match="`rows` must be the numbers 1 to 4"):
+            ds.SRKw2(rows=wrong)
+
+
 @pytest.mark.parametrize(
     "solver, blocks",
     [
@@ -82,7 +95,8 @@ def test_every_perturbed_live_coefficient_is_caught(tableau, field):
         (ds.SRKw1(b=0.0), [1, 1]),
         (ds.SRKw1(b=1.0), [1, 1]),
         (ds.SRKw1(b=0.2), [2]),
-        (ds.SRKw2(), [6]),
+        (ds.SRKw2(), [5, 1]),
+        (ds.SRKw2(rows=(1, 2, 3, 4)), [6]),
         (ds.StrangGauss(), [1, 2, 1]),
     ],
 )
