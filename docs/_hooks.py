@@ -3,9 +3,10 @@
 import functools as ft
 import html
 import importlib.metadata
-import pathlib
+import io
 import re
 
+from fontTools.ttLib import TTFont
 from math_core import LatexToMathML
 from mkdocs.structure.files import File
 
@@ -25,12 +26,34 @@ _mathml = LatexToMathML(annotation=True)
 
 
 def on_files(files, config):
-    # The copy of STIX Two Math that ziamath brings along, for systems without a font that
-    # has the sizes of brackets, roots and sums.
-    font = "fonts/STIXTwoMath-Regular.ttf"
-    path = importlib.metadata.distribution("ziamath").locate_file(f"ziamath/{font}")
-    files.append(File.generated(config, font, content=pathlib.Path(path).read_bytes()))
+    files.append(File.generated(config, "fonts/formulas.woff", content=_font()))
     return files
+
+
+def _font() -> bytes:
+    """STIX Two Math, for readers whose system has no font with brackets, roots and sums of
+    all sizes: the copy that ziamath brings along, with one change.
+
+    Browsers reserve for every root sign the width of the largest there is, which leaves a
+    gap behind the small ones. So the larger ones are made as narrow as the smallest.
+    """
+    ttf = "ziamath/fonts/STIXTwoMath-Regular.ttf"
+    path = importlib.metadata.distribution("ziamath").locate_file(ttf)
+    font = TTFont(str(path))
+    glyphs, metrics = font["glyf"], font["hmtx"]
+    root = font.getBestCmap()[ord("√")]
+    width, _ = metrics[root]
+    for name in font.getGlyphOrder():
+        if name.startswith(f"{root}.") and metrics[name][0] > width:
+            glyph = glyphs[name]
+            glyph.coordinates.scale((width / metrics[name][0], 1))
+            glyph.coordinates.toInt()
+            glyph.recalcBounds(glyphs)
+            metrics[name] = (width, glyph.xMin)
+    font.flavor = "woff"
+    out = io.BytesIO()
+    font.save(out)
+    return out.getvalue()
 
 
 def on_env(env, config, files):
