@@ -41,7 +41,7 @@ def _font() -> bytes:
     path = importlib.metadata.distribution("ziamath").locate_file(ttf)
     font = TTFont(str(path))
     glyphs, metrics = font["glyf"], font["hmtx"]
-    root = font.getBestCmap()[ord("√")]
+    root = (font.getBestCmap() or {})[ord("√")]
     width, _ = metrics[root]
     for name in font.getGlyphOrder():
         if name.startswith(f"{root}.") and metrics[name][0] > width:
