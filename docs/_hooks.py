@@ -22,7 +22,7 @@ _FORMULA = re.compile(
     re.DOTALL,
 )
 # Raises an error for what it does not know, which ends the build.
-_mathml = LatexToMathML(annotation=True)
+_mathml = LatexToMathML()
 
 
 def on_files(files, config):

@@ -88,10 +88,10 @@ def browser(tmp_path_factory):
     driver.quit()
 
 
-# Text outside of code, of formulas' own TeX and of bibliography entries.
+# Text outside of code (bibliography entries are code).
 _TEXT = """
 const main = document.querySelector('article').cloneNode(true);
-main.querySelectorAll('code, pre, annotation').forEach(x => x.remove());
+main.querySelectorAll('code, pre').forEach(x => x.remove());
 return main.textContent;
 """
 _READY = """
