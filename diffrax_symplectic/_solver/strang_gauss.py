@@ -30,8 +30,9 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
 
     $$A^0 = \begin{pmatrix} \frac14 & 0 \\ \frac12 & \frac14 \end{pmatrix}, \quad
       B^0 = \begin{pmatrix} 0 & 0 \\ \frac12 & \frac12 \end{pmatrix}, \quad
-      A^1 = \begin{pmatrix} \frac12 & 0 \\ \frac12 & 0 \end{pmatrix}, \quad
-      B^1 = \begin{pmatrix} \frac14 & \frac14 - \frac r6 \\
+      A^1 = \begin{pmatrix} \frac12 & 0 \\ \frac12 & 0 \end{pmatrix},$$
+
+    $$B^1 = \begin{pmatrix} \frac14 & \frac14 - \frac r6 \\
         \frac14 + \frac r6 & \frac14 \end{pmatrix}, \quad
       \alpha = \beta = (\tfrac12, \tfrac12).$$
 
