@@ -29,8 +29,8 @@ def gaussian(key, shape=()):
     return diffrax.UnsafeBrownianPath(shape, key)
 
 
-def with_area(key):
-    return diffrax.UnsafeBrownianPath((), key, levy_area=diffrax.SpaceTimeLevyArea)
+def with_area(key, shape=()):
+    return diffrax.UnsafeBrownianPath(shape, key, levy_area=diffrax.SpaceTimeLevyArea)
 
 
 def truncated(key):
@@ -49,6 +49,14 @@ def synchrotron(path):
     return ds.hamiltonian_terms(
         lambda t, p, q, args: p**2 / 2 - 4 * jnp.cos(q),
         lambda t, p, q, args: jnp.stack([0.2 * jnp.sin(q), -0.1 * jnp.cos(q)]),
+        path,
+    )
+
+
+def two_noises(path):
+    return ds.hamiltonian_terms(
+        quartic,
+        lambda t, p, q, args: 0.2 * jnp.stack([quartic(t, p, q, args), p * q]),
         path,
     )
 
@@ -88,8 +96,15 @@ def by_hand(keys):
     return one(keys[0]) if len(keys) == 1 else jax.vmap(one)(keys)
 
 
+def plateaus(key):
+    return ds.PlateauBrownianPath(with_area(key, (2,)), key)
+
+
+def levy_areas(key):
+    return ds.LevyAreaBrownianPath(with_area(key, (2,)), key)
+
+
 two = lambda path: lambda key: path(key, (2,))
-second = lambda key: weak(key, second=True)
 MODELS = {
     "Quartic Kubo oscillator, one multiplicative noise": (
         kubo,
@@ -117,6 +132,20 @@ MODELS = {
             ('SRKw3("a")', ds.SRKw3("a"), two(weak)),
             ('SRKw3("c")', ds.SRKw3("c"), two(weak)),
             ("SRKw4", ds.SRKw4(), two(weak)),
+            ("PlateauVerlet", ds.PlateauVerlet(), plateaus),
+        ],
+    ),
+    "Quartic oscillator, two noises that do not commute": (
+        two_noises,
+        [
+            ("Diffrax Heun", diffrax.Heun(), two(gaussian)),
+            ("Midpoint", ds.Midpoint(), two(weak)),
+            (
+                "NinomiyaVictoir",
+                ds.NinomiyaVictoir(),
+                lambda key: weak(key, (2,), two_point=True),
+            ),
+            ("LevyAreaMidpoint", ds.LevyAreaMidpoint(), levy_areas),
         ],
     ),
     "Quartic oscillator, additive noise": (
@@ -124,7 +153,8 @@ MODELS = {
         [
             ("Diffrax Heun", diffrax.Heun(), gaussian),
             ("Diffrax ShARK", diffrax.ShARK(), with_area),
-            ("SRKw5", ds.SRKw5(), second),
+            ("SRKw5", ds.SRKw5(), lambda key: weak(key, second=True)),
+            ("AdditiveGauss", ds.AdditiveGauss(), lambda key: weak(key, order=3)),
             ("SRKs4", ds.SRKs4(), with_area),
         ],
     ),
