@@ -26,7 +26,7 @@ SEPARABLE = {
     "SRKw4": ds.SRKw4(),
     "SRKw4-Gauss": ds.SRKw4(a21=_gauss),
     "SRKs2": ds.SRKs2(),
-    "SRKs3": ds.SRKs3(),
+    "SRKs3": ds.SRKs3(a=0.25),
 }
 all_solvers = pytest.mark.parametrize(
     "solver", SEPARABLE.values(), ids=SEPARABLE.keys()
@@ -130,7 +130,7 @@ def test_other_parameters_of_the_paper_are_dead(make):
         ),  # kick, then drift
         (ds.SRKs2(), [Block(((0,),), ((1,),))]),
         (
-            ds.SRKs3(),
+            ds.SRKs3(a=0.25),
             [Block(((0,),), ((2,),)), Block(((1,),), ((3,),)), Block((), ((4,),))],
         ),
     ],
