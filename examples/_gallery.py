@@ -40,8 +40,9 @@ def truncated(key) -> ds.TruncatedBrownianPath:
 
 
 def solve(terms, solver, y0, t1, h, **kwargs) -> diffrax.Solution:
-    settings = dict(max_steps=None, adjoint=diffrax.ForwardMode(), throw=False)
-    return diffrax.diffeqsolve(terms, solver, 0.0, t1, h, y0, **(settings | kwargs))
+    settings: dict[str, Any] = dict(max_steps=None, adjoint=diffrax.ForwardMode())
+    settings |= kwargs
+    return diffrax.diffeqsolve(terms, solver, 0.0, t1, h, y0, throw=False, **settings)
 
 
 def trajectory(make_terms, make_path, solver, y0, h, steps: int, every: int, seed=0):
@@ -50,6 +51,7 @@ def trajectory(make_terms, make_path, solver, y0, h, steps: int, every: int, see
     saveat = diffrax.SaveAt(t0=True, steps=every)
     terms = make_terms(make_path(jr.key(seed)))
     sol = solve(terms, solver, y0, h * steps, h, saveat=saveat, max_steps=steps)
+    assert sol.ts is not None and sol.ys is not None
     return sol.ts, sol.ys, sol.result == diffrax.RESULTS.successful
 
 

@@ -107,7 +107,8 @@ def transfer_weak_errors(
             make_terms, path, solver, y0, phi, hs, widths, degree
         )
 
-    coarse, fine = expectations(*reference, [hs[-1], hs[-1] / 2])
+    solver, path = reference
+    coarse, fine = expectations(solver, path, [hs[-1], hs[-1] / 2])
     exact = fine + (fine - coarse) / 3
     errors = {}
     for name, (solver, path) in solvers.items():
