@@ -1,18 +1,13 @@
-"""All examples: `python -m examples`."""
-
-import time
+"""All figures of the paper: `python -m examples`, or some: `python -m examples 2a 2c`."""
 
 from . import kubo, linear_oscillator, rigid_body, synchrotron
-
-
-def main() -> None:
-    start = time.perf_counter()
-    linear_oscillator.main()
-    kubo.main()
-    synchrotron.main()
-    rigid_body.main()
-    print(f"\nAll done in {time.perf_counter() - start:.0f} seconds.")
+from ._gallery import run
 
 
 if __name__ == "__main__":
-    main()
+    run(
+        linear_oscillator.FIGURES
+        | kubo.FIGURES
+        | synchrotron.FIGURES
+        | rigid_body.FIGURES
+    )

@@ -1,4 +1,4 @@
-"""Errors against the step size: exact where the model is linear, sampled otherwise."""
+"""Errors against the step size, exact and sampled, and the orders they show."""
 
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
@@ -12,23 +12,40 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
+from ._gallery import claim, solve
+
 
 class Errors(NamedTuple):
     hs: np.ndarray
-    errors: np.ndarray
+    # With their signs, where they have one.
+    signed: np.ndarray
     # Standard errors; zero where the error is exact.
     std_errors: np.ndarray
 
     @property
-    def slope(self) -> float:
-        """The order that the errors show, by least squares over the steps whose error is
-        clear of its own uncertainty and of rounding."""
+    def errors(self) -> np.ndarray:
+        return np.abs(self.signed)
+
+    def _fit(self) -> tuple[float, float]:
         clear = (self.errors > 4 * self.std_errors) & (self.errors > 1e-13)
-        if clear.sum() < 2:
-            return np.nan
-        return float(
-            np.polyfit(np.log(self.hs[clear]), np.log(self.errors[clear]), 1)[0]
-        )
+        last = np.flatnonzero(clear)[-5:]
+        if len(last) < 2:
+            return np.nan, np.nan
+        x = np.log(self.hs[last])
+        weights = (x - x.mean()) / np.sum((x - x.mean()) ** 2)
+        relative = self.std_errors[last] / self.errors[last]
+        slope = weights @ np.log(self.errors[last])
+        return float(slope), float(np.linalg.norm(weights * relative))
+
+    @property
+    def slope(self) -> float:
+        """The order that the errors show, by least squares over the five smallest steps
+        whose error is clear of its own uncertainty and of rounding."""
+        return self._fit()[0]
+
+    @property
+    def slope_std_error(self) -> float:
+        return self._fit()[1]
 
 
 def exact_moment_map(
@@ -40,6 +57,14 @@ def exact_moment_map(
     return lambda h: np.asarray(step(h))
 
 
+def second_moments(moment_map: Callable, y0, h: float, steps: int) -> np.ndarray:
+    """E[y y^T] after so many steps."""
+    z0 = np.array([1.0, *(float(x) for x in jax.tree.leaves(y0))])
+    with np.errstate(all="ignore"):
+        K = np.linalg.matrix_power(moment_map(h), steps)
+        return (K @ np.kron(z0, z0)).reshape(len(z0), len(z0))[1:, 1:]
+
+
 def exact_weak_error(
     moment_map: Callable,
     y0,
@@ -48,15 +73,11 @@ def exact_weak_error(
     hs: Iterable[float],
     t1: float = 1.0,
 ) -> Errors:
-    """|E[phi(y_N)] - exact| for a linear model and phi(y) a quadratic form, given as
+    """E[phi(y_N)] - exact for a linear model and phi(y) a quadratic form, given as
     `quadratic(E[y y^T])`, by the recursion of second moments: no sampling."""
-    z0 = np.array([1.0, *(float(x) for x in jax.tree.leaves(y0))])
-    errors = []
-    for h in hs:
-        K = np.linalg.matrix_power(moment_map(h), round(t1 / h))
-        moments = (K @ np.kron(z0, z0)).reshape(len(z0), len(z0))
-        errors.append(abs(quadratic(moments[1:, 1:]) - exact))
-    return Errors(np.array([*hs]), np.array(errors), np.zeros(len(errors)))
+    moments = [second_moments(moment_map, y0, h, round(t1 / h)) for h in hs]
+    signed = np.array([quadratic(m) - exact for m in moments])
+    return Errors(np.array([*hs]), signed, np.zeros_like(signed))
 
 
 def sampled_weak_error(
@@ -73,28 +94,18 @@ def sampled_weak_error(
     """The same, by Monte Carlo, with its standard error."""
 
     def sample(h, key):
-        sol = diffrax.diffeqsolve(
-            make_terms(make_path(key)),
-            solver,
-            0.0,
-            t1,
-            h,
-            y0,
-            max_steps=None,
-            adjoint=diffrax.ForwardMode(),
-            throw=False,
-        )
+        sol = solve(make_terms(make_path(key)), solver, y0, t1, h)
         return phi(jax.tree.map(lambda y: y[-1], sol.ys)), sol.result
 
-    means, errors = [], []
+    signed, std_errors = [], []
     for h in hs:
         # The step size as an array: compiled once for all of them.
         at_h = eqx.Partial(sample, jnp.asarray(h))
         estimate = ds.expectation(at_h, jr.key(round(t1 / h)), paths)
         assert estimate.num_failed == 0
-        means.append(abs(float(estimate.mean) - exact))
-        errors.append(float(estimate.std_error))
-    return Errors(np.array([*hs]), np.array(means), np.array(errors))
+        signed.append(float(estimate.mean) - exact)
+        std_errors.append(float(estimate.std_error))
+    return Errors(np.array([*hs]), np.array(signed), np.array(std_errors))
 
 
 class _FinePath(diffrax.AbstractBrownianPath):
@@ -145,52 +156,121 @@ def strong_errors(
     steps on the same Brownian paths."""
 
     def end(path, solver, h):
-        sol = diffrax.diffeqsolve(
-            make_terms(path), solver, 0.0, t1, h, y0, max_steps=None
-        )
-        return component(jax.tree.map(lambda y: y[-1], sol.ys))
+        sol = solve(make_terms(path), solver, y0, t1, h)
+        return component(jax.tree.map(lambda y: y[-1], sol.ys)), sol.result
 
     steps = jnp.array([*hs])
 
-    @jax.jit
-    def one(key):
+    def squares(key):
         path = _FinePath.draw(key, fine, m, t1)
-        exact = end(path, reference, t1 / fine)
-        run = lambda solver: jax.lax.map(lambda h: end(path, solver, h), steps)
-        return {name: (run(s) - exact) ** 2 for name, s in solvers.items()}
+        exact, _ = end(path, reference, t1 / fine)
 
-    squares = jax.vmap(one)(jr.split(jr.key(0), paths))
+        def run(solver):
+            x, result = jax.lax.map(lambda h: end(path, solver, h), steps)
+            failed = result != diffrax.RESULTS.successful
+            return jnp.where(failed, jnp.nan, (x - exact) ** 2)
+
+        return {name: run(s) for name, s in solvers.items()}
+
+    # In small batches: every path is kept in all its fine steps.
+    estimate = ds.expectation(squares, jr.key(0), paths, batch_size=250)
+    assert estimate.num_failed == 0
     out = {}
-    for name, x in squares.items():
-        rms = np.sqrt(np.mean(x, axis=0))
-        spread = np.std(x, axis=0) / np.sqrt(paths) / (2 * rms)
-        out[name] = Errors(np.asarray(steps), rms, spread)
+    for name, mean in estimate.mean.items():
+        rms = np.sqrt(mean)
+        out[name] = Errors(np.asarray(steps), rms, estimate.std_error[name] / (2 * rms))
     return out
 
 
+class GivenStep(diffrax.AbstractBrownianPath):
+    """The same increment, and if there is one area, over every step."""
+
+    W: jax.Array
+    H: jax.Array
+    t0 = 0.0
+    t1 = np.inf
+    levy_area = diffrax.SpaceTimeLevyArea
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        assert t1 is not None
+        area = diffrax.SpaceTimeLevyArea(dt=jnp.asarray(t1 - t0), W=self.W, H=self.H)
+        return area if use_levy else self.W
+
+
+def one_step(make_terms: Callable, solver, y0, h, W, H=0.0):
+    """The state after one step from `y0` with increment `W` and space-time area `H`."""
+    terms = make_terms(GivenStep(jnp.asarray(W), jnp.asarray(H)))  # pyright: ignore
+    state = solver.init(terms, 0.0, h, y0, None)
+    y1, *_ = solver.step(terms, 0.0, h, y0, None, state, made_jump=False)
+    return y1
+
+
 def report(title: str, results: dict[str, Errors]) -> None:
-    print(f"\n{title}")
+    print(f"  {title}")
     for name, e in results.items():
         listed = " ".join(f"{x:8.1e}" for x in e.errors)
-        print(f"{name:22} slope {e.slope:5.2f}   errors {listed}", flush=True)
+        print(f"    {name:22} slope {e.slope:5.2f}   errors {listed}", flush=True)
 
 
-def plot_orders(axes, title: str, results: dict[str, Errors], slopes=(1, 2)) -> None:
-    """Errors with three standard errors, and reference slopes."""
+def claim_slopes(results: dict[str, Errors], expected: dict[str, float]) -> None:
+    for name, order in expected.items():
+        e = results[name]
+        claim(f"slope of {name}", e.slope, order - 0.15, order + 0.15)
+        if np.any(e.std_errors):
+            claim(f"its standard error, {name}", e.slope_std_error, high=0.05)
+
+
+def claim_small_first_order(name: str, e: Errors) -> None:
+    """That a method of order 1 has an error c1 h + c2 h^2 in which the first term is so
+    small, for little noise, that one sees order 2 down to the smallest steps."""
+    h = e.hs[-1]
+    twice, once = e.signed[-2:]
+    c2 = (twice - 2 * once) / (2 * h**2)
+    c1 = once / h - c2 * h
+    print(f"  error of {name}: {c1:.2g} h + {c2:.2g} h^2")
+    claim(f"h at which both are equal, {name}", abs(c1 / c2), 2.0**-12, 2.0**-5)
+    slope = np.log2(e.errors[2] / e.errors[4]) / 2
+    claim(f"slope of {name} from 2^-3 to 2^-5", slope, 1.85, 2.5)
+
+
+def claim_samples(exact: dict[str, Errors], sampled: dict[str, Errors]) -> None:
+    """That what was sampled is what is exact."""
+    for name, e in sampled.items():
+        at = np.searchsorted(-exact[name].hs, -e.hs)
+        off = np.abs(e.signed - exact[name].signed[at]) / e.std_errors
+        claim(f"sampled errors of {name}, in standard errors", off.max(), high=4)
+
+
+def plot_orders(
+    axes,
+    title: str,
+    results: dict[str, Errors],
+    sampled: dict[str, Errors] | None = None,
+    slopes=(1, 2),
+) -> None:
+    """Errors with their slopes, what was sampled of them with three standard errors, and
+    reference slopes."""
     for i, (name, e) in enumerate(results.items()):
-        dashed = "--" if name in dir(diffrax) and name != "Midpoint" else "-"
+        style = dict(color=f"C{i}", ms=3, lw=1, capsize=2)
         label = name if np.isnan(e.slope) else f"{name} ({e.slope:.2f})"
-        axes.errorbar(
-            e.hs, np.maximum(e.errors, 1e-17), 3 * e.std_errors, label=label,
-            color=f"C{i}", ls=dashed, marker="o", ms=3, lw=1, capsize=2,
-        )  # fmt: skip
-    first = next(iter(results.values()))
+        bars = 3 * e.std_errors if np.any(e.std_errors) else None
+        axes.errorbar(e.hs, e.errors, bars, label=label, fmt="o-", **style)
+        if sampled is not None and name in sampled:
+            e = sampled[name]
+            label = "sampled, 3 standard errors" if i == 0 else None
+            style = dict(color=f"C{i}", mfc="none", ms=6, lw=0.8, capsize=3)
+            axes.errorbar(
+                e.hs, e.errors, 3 * e.std_errors, label=label, fmt="s", **style
+            )
+    all_errors = np.concatenate([e.errors for e in results.values()])
+    hs = next(iter(results.values())).hs
     for slope in slopes:
-        line = first.errors[0] * (first.hs / first.hs[0]) ** slope
-        axes.loglog(first.hs, line, "k:", lw=0.8)
-        axes.annotate(f"{slope:g}", (first.hs[-1], line[-1]), fontsize=7)
+        line = 2 * all_errors.max() * (hs / hs.max()) ** slope
+        axes.loglog(hs, line, "k:", lw=0.8)
+        axes.annotate(f"slope {slope:g}", (hs[-1], line[-1]), fontsize=7)
     axes.set(xscale="log", yscale="log", xlabel="step size h", title=title)
-    axes.set_xticks(first.hs, [f"$2^{{{np.log2(h):.0f}}}$" for h in first.hs])
+    axes.set_ylim(all_errors[all_errors > 0].min() / 4, 4 * all_errors.max())
+    axes.set_xticks(hs, [f"$2^{{{np.log2(h):.0f}}}$" for h in hs])
     axes.minorticks_off()
     axes.legend(fontsize=7)
     axes.grid(alpha=0.3)

@@ -1,26 +1,29 @@
 """The Kubo oscillator: an oscillator whose frequency is noisy.
 
-H0 = (p^2 + q^2) / 2 and H1 = s H0, so that every path stays on its circle.
-Wang, Hong and Xu (2017), example 2: figures 3 and 2(c).
+dq = p dt + s p o dw, dp = -q dt - s q o dw: H0 = (p^2 + q^2) / 2 and H1 = s H0, so that
+every path stays on its circle. Wang, Hong and Xu (2017), example 2: figures 2(c) and 3.
 """
 
 import diffrax
+import jax
 import jax.numpy as jnp
-import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
 
 import diffrax_symplectic as ds
 
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-
-from ._compare import COLOURS, compare, plot_drift, save  # noqa: E402
-from ._orders import (  # noqa: E402
+from ._gallery import claim, gaussian, run, save, trajectory, truncated, weak
+from ._orders import (
+    claim_samples,
+    claim_slopes,
+    Errors,
     exact_moment_map,
     exact_weak_error,
+    one_step,
     plot_orders,
     report,
+    sampled_weak_error,
+    second_moments,
 )
 
 
@@ -34,51 +37,136 @@ def make_terms(path, s: float = 1.0):
     return ds.hamiltonian_terms(energy, noise, path)
 
 
-def weak_orders(axes) -> None:
-    """Figure 2(c): the error of E(q^2) at t = 1 from (p, q) = (0, 1), exactly."""
-    y0 = (jnp.array(0.0), jnp.array(1.0))
-    # q + ip turns by 1 + w(1): E(q^2) = (1 + E cos(2 + 2 w)) / 2.
-    exact = (1 + np.cos(2) * np.exp(-2)) / 2
-    weak = lambda key: ds.WeakBrownianPath((), key)
-    gaussian = lambda key: diffrax.UnsafeBrownianPath((), key)
-    area = lambda key: diffrax.UnsafeBrownianPath(
-        (), key, levy_area=diffrax.SpaceTimeLevyArea
+def make_ito_terms(path):
+    """The same system in the Itô sense, for Euler's method: with the drift -y / 2 of the
+    noise added."""
+    drift = lambda t, y, args: jnp.stack([-y[1], y[0]]) - y / 2
+    noise = lambda t, y, args: jnp.stack([-y[1], y[0]])
+    return diffrax.MultiTerm(diffrax.ODETerm(drift), diffrax.ControlTerm(noise, path))
+
+
+# (p, q)
+Y0 = (jnp.array(0.0), jnp.array(1.0))
+
+
+def figure_2c(full: bool) -> None:
+    """Weak error of E(q^2) at t = 1."""
+    paths = 30_000_000 if full else 40_000
+    print(
+        f"\nFig. 2(c): weak error of E(q^2) at t = 1, h = 2^-1 .. 2^-8; {paths:,} paths"
     )
+    # q + ip turns by 1 + w(1): E(q^2) = (1 + E cos(2 + 2 w)) / 2.
+    value = (1 + np.cos(2) * np.exp(-2)) / 2
+    hs = [2.0**-k for k in range(1, 9)]
     solvers = {
-        "SRKw1": (ds.SRKw1(), weak),
-        "SRKw2": (ds.SRKw2(), weak),
-        "StrangGauss": (ds.StrangGauss(), weak),
-        "SlowRK": (diffrax.SlowRK(), area),
-        "Heun": (diffrax.Heun(), gaussian),
-        "StratonovichMilstein": (diffrax.StratonovichMilstein(), gaussian),
+        "SRKw1(b=0)": (ds.SRKw1(b=0.0), weak()),
+        "SRKw2": (ds.SRKw2(), weak()),
+        "Milstein": (diffrax.StratonovichMilstein(), gaussian()),
     }
-    results = {}
+    exact, sampled = {}, {}
     for name, (solver, path) in solvers.items():
-        moment_map = exact_moment_map(make_terms, path, solver, y0)
-        hs = [2.0**-k for k in range(2, 9)]
-        results[name] = exact_weak_error(moment_map, y0, lambda m: m[1, 1], exact, hs)
-    report("Weak error of E(q^2) at t = 1, exact; h = 2^-2 .. 2^-8", results)
-    plot_orders(axes, "weak error of E(q^2), exact", results)
+        moment_map = exact_moment_map(make_terms, path, solver, Y0)
+        exact[name] = exact_weak_error(moment_map, Y0, lambda m: m[1, 1], value, hs)
+        sampled[name] = sampled_weak_error(
+            make_terms, path, solver, Y0, lambda y: y[1] ** 2, value, hs, paths
+        )
+    report("exact", exact)
+    report("sampled", sampled)
+    figure, axes = plt.subplots(figsize=(6, 4.5))
+    plot_orders(axes, "2(c): weak error of E(q^2)", exact, sampled)
+    save(figure, "fig2c.png")
+    claim_slopes(exact, {"SRKw1(b=0)": 1, "SRKw2": 2, "Milstein": 1})
+    claim_samples(exact, sampled)
 
 
-def main(steps: int = 100_000) -> None:
-    y0 = (jnp.array(0.0), jnp.array(1.0))
-    radius = lambda y: y[0] ** 2 + y[1] ** 2
-    runs = compare("Kubo oscillator", make_terms, radius, y0, h=0.01, steps=steps)
-
-    figure, (left, right, orders) = plt.subplots(1, 3, figsize=(15, 4.5))
-    for name in ("Heun", "StratonovichMilstein", "SRKw1"):
-        p, q = runs[name].ys.T
-        keep = np.isfinite(p) & (p**2 + q**2 < 25)
-        left.plot(q[keep], p[keep], ".", ms=2, color=COLOURS[name], label=name)
+def figure_3(full: bool) -> None:
+    """One path, and the circle that it should stay on."""
+    h, steps = 0.01, 10_000
+    print(f"\nFig. 3: one path to t = {h * steps:g}, h = {h}; the largest |radius - 1|")
+    solvers = {
+        "Milstein": (diffrax.StratonovichMilstein(), gaussian()),
+        "Heun": (diffrax.Heun(), gaussian()),
+        "SRKs1": (ds.SRKs1(), truncated),
+        "SRKw1(b=0)": (ds.SRKw1(b=0.0), weak()),
+        "SRKw2": (ds.SRKw2(), weak()),
+    }
+    figure, axes = plt.subplots(1, 5, figsize=(15, 3.6))
     angle = np.linspace(0, 2 * np.pi, 200)
-    left.plot(np.cos(angle), np.sin(angle), "k-", lw=0.8, label="exact circle")
-    left.set(xlabel="q", ylabel="p", aspect="equal", title="Kubo oscillator, one path")
-    left.legend(fontsize=7, loc="upper right")
-    plot_drift(right, runs)
-    weak_orders(orders)
-    save(figure, "kubo.png")
+    drifts = {}
+    for ax, (name, (solver, path)) in zip(axes, solvers.items()):
+        solution = jax.jit(
+            lambda: trajectory(make_terms, path, solver, Y0, h, steps, every=2)
+        )
+        _, (p, q), success = solution()
+        drift = np.max(np.abs(np.hypot(p, q) - 1))
+        drifts[name] = float(drift) if success else np.inf
+        title = f"{name}: {drifts[name]:.1e}"
+        if name in ("Milstein", "Heun"):
+            moment_map = exact_moment_map(make_terms, path, solver, Y0)
+            mean = np.trace(second_moments(moment_map, Y0, h, steps))
+            title += f"\nexact E(p^2 + q^2) at the end: {mean:.4g}"
+        print(f"    {title}".replace("\n", "; "), flush=True)
+        ax.plot(q, p, ".", ms=1, color="C1" if name in ("Milstein", "Heun") else "C0")
+        ax.plot(np.cos(angle), np.sin(angle), "k-", lw=0.8)
+        ax.set(xlabel="q", ylabel="p", aspect="equal")
+        ax.set_title(title, fontsize=8)
+    save(figure, "fig3.png")
+    for name, drift in drifts.items():
+        ours = isinstance(solvers[name][0], ds.AbstractSymplecticRungeKutta)
+        bounds = dict(high=1e-11) if ours else dict(low=1e-2)
+        claim(f"largest |radius - 1| of {name}", drift, **bounds)
+
+
+def exact_strong_error(make_terms, solver, y0, hs, t1: float = 1.0) -> Errors:
+    """The root-mean-square error of (p, q) at `t1`. A step turns and stretches q + ip by
+    a factor that depends on the increment alone, and so does the exact solution."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(40)
+    weights = weights / np.sqrt(2 * np.pi)
+
+    @jax.jit
+    def ratios(h):
+        """The factor of the method by that of the solution, for each increment."""
+
+        def ratio(W):
+            p, q = one_step(make_terms, solver, y0, h, W)
+            return (q + 1j * p) * jnp.exp(1j * (h + W))
+
+        return jax.vmap(ratio)(jnp.sqrt(h) * nodes)
+
+    errors = []
+    for h in hs:
+        r, steps = np.asarray(ratios(h)), round(t1 / h)
+        square, mean = weights @ np.abs(r) ** 2, weights @ r
+        errors.append(np.sqrt(square**steps - 2 * (mean**steps).real + 1))
+    return Errors(np.array([*hs]), np.array(errors), np.zeros(len(errors)))
+
+
+def figure_strong(full: bool) -> None:
+    """Strong orders 1/2 and 1. Not in the paper, which shows no strong order 1/2."""
+    print("\nStrong error of (p, q) at t = 1 (not in the paper), h = 2^-2 .. 2^-8")
+    hs = [2.0**-k for k in range(2, 9)]
+    solvers = {
+        "SRKs1": ds.SRKs1(),
+        "Midpoint": ds.Midpoint(),
+        "Milstein": diffrax.StratonovichMilstein(),
+    }
+    exact = {
+        name: exact_strong_error(make_terms, solver, Y0, hs)
+        for name, solver in solvers.items()
+    }
+    exact["Euler (Itô)"] = exact_strong_error(
+        make_ito_terms, diffrax.Euler(), jnp.stack(Y0), hs
+    )
+    report("exact", exact)
+    figure, axes = plt.subplots(figsize=(6, 4.5))
+    plot_orders(axes, "strong error of (p, q)", exact, slopes=(0.5, 1))
+    save(figure, "kubo_strong.png")
+    orders = {"SRKs1": 1, "Midpoint": 1, "Milstein": 1, "Euler (Itô)": 0.5}
+    claim_slopes(exact, orders)
+
+
+FIGURES = {"2c": figure_2c, "3": figure_3, "kubo-strong": figure_strong}
 
 
 if __name__ == "__main__":
-    main()
+    run(FIGURES)

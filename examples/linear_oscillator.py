@@ -2,27 +2,32 @@
 
 dx = y dt, dy = -x dt + s dw: H0 = (x^2 + y^2) / 2 and H1 = -s x, with the position x and
 the momentum y. E(x^2 + y^2) grows by s^2 in each unit of time, exactly. Wang, Hong and Xu
-(2017), example 1: figures 1, 2(a), 2(b) and table 1. Everything but the strong errors is
-exact here, by the recursion of second moments.
+(2017), example 1: figures 1, 2(a), 2(b) and table 1.
 """
 
+from typing import NamedTuple
+
 import diffrax
+import jax
 import jax.numpy as jnp
-import matplotlib
+import jax.random as jr
+import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrax_symplectic as ds
 
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-
-from ._compare import save  # noqa: E402
-from ._orders import (  # noqa: E402
+from ._gallery import claim, gaussian, run, save, solve, weak
+from ._orders import (
+    claim_samples,
+    claim_slopes,
+    Errors,
     exact_moment_map,
     exact_weak_error,
+    one_step,
     plot_orders,
     report,
+    sampled_weak_error,
+    second_moments,
     strong_errors,
 )
 
@@ -35,91 +40,238 @@ def make_terms(path, s: float = 1.0):
     )
 
 
-def weak(key, shape=()):
-    return ds.WeakBrownianPath(shape, key, second=True)
-
-
-def gaussian(key, shape=()):
-    return diffrax.UnsafeBrownianPath(shape, key, levy_area=diffrax.SpaceTimeLevyArea)
-
-
-SOLVERS = {
-    "Midpoint": (ds.Midpoint(), weak),
-    "SRKs1": (ds.SRKs1(), weak),
-    "SRKs2": (ds.SRKs2(), weak),
-    "SRKs3": (ds.SRKs3(), weak),
-    "SRKs4": (ds.SRKs4(), gaussian),
-    "SRKw1(b=0)": (ds.SRKw1(b=0.0), weak),
-    "SRKw2": (ds.SRKw2(), weak),
-    "SRKw3c": (ds.SRKw3("c"), weak),
-    "SRKw4(a21=0)": (ds.SRKw4(a21=0.0), weak),
-    "SRKw5": (ds.SRKw5(), weak),
-    "Heun": (diffrax.Heun(), gaussian),
-    "Euler": (diffrax.Euler(), gaussian),
-}
 # (momentum, position)
 Y0 = (jnp.array(1.0), jnp.array(0.0))
+PAPER_SRKs4 = ds.SRKs4(sign=1)
+# The rows of table 1, with the paper's figures after 5,000, 10,000 and 25,000 steps.
+# Gaussian increments serve the strong methods as well as truncated ones here: the stage
+# equations are linear, and have a solution whatever the increment is.
+TABLE_1 = {
+    "Euler": (diffrax.Euler(), gaussian(), (7.34e82, 5.40e167, np.inf)),
+    "Heun": (diffrax.Heun(), gaussian(), (0.44426, 2.50545, 443.928)),
+    "SRKw1(b=0)": (ds.SRKw1(b=0.0), weak(), (0.002512, 0.001959, 0.002089)),
+    "SRKw2": (ds.SRKw2(), weak(), (0.004205, 0.004159, 0.004082)),
+    "SRKw3a": (ds.SRKw3("a"), weak(), (0.002140, 0.001983, 0.002059)),
+    "SRKw3b": (ds.SRKw3("b"), weak(), (0.000061, 0.000254, 0.000040)),
+    "SRKw3c": (ds.SRKw3("c"), weak(), (0.000160, 0.000134, 0.000285)),
+    "SRKw3d": (ds.SRKw3("d"), weak(), (0.002079, 0.001873, 0.001957)),
+    "SRKw3e": (ds.SRKw3("e"), weak(), (0.000298, 0.000048, 0.000217)),
+    "SRKw3f": (ds.SRKw3("f"), weak(), (0.000021, 0.000197, 0.000446)),
+    "SRKw4(a21=0)": (ds.SRKw4(a21=0.0), weak(), (0.000145, 0.000162, 0.000216)),
+    "SRKw5": (ds.SRKw5(), weak(second=True), (0.000336, 0.000022, 0.000051)),
+    "SRKs1": (ds.SRKs1(), gaussian(), (0.000890, 0.001168, 0.001151)),
+    "SRKs2": (ds.SRKs2(), gaussian(), (0.002091, 0.002016, 0.001959)),
+    "SRKs3": (ds.SRKs3(), gaussian(), (0.002626, 0.002448, 0.002180)),
+    "SRKs4(sign=1)": (PAPER_SRKs4, gaussian(area=True), (0.002417, 0.002449, 0.002314)),
+}
+H = 0.2
+COUNTS = (5_000, 10_000, 25_000)
 
 
-def growth(moment_map, h: float, counts: list[int]) -> np.ndarray:
-    """E(x^2 + y^2) after so many steps."""
-    z0 = np.array([1.0, *map(float, Y0)])
-    out = []
-    for n in counts:
-        with np.errstate(all="ignore"):
-            m = np.linalg.matrix_power(moment_map(h), n) @ np.kron(z0, z0)
-        value = m[4] + m[8]
-        out.append(value if np.isfinite(value) else np.inf)
-    return np.array(out)
+class Growth(NamedTuple):
+    """x^2 + y^2 after every thousand steps, by one method."""
+
+    exact: np.ndarray
+    # NaN where it was not sampled.
+    sampled: np.ndarray
+    std_errors: np.ndarray
 
 
-def main() -> None:
-    h, counts = 0.2, [5_000, 10_000, 25_000]
-    print(f"\nLinear oscillator: |E(x^2 + y^2) - exact| / N after N steps of h = {h}")
-    exact = np.array([1 + h * n for n in counts])
-    maps = {
-        name: exact_moment_map(make_terms, path, solver, Y0)
-        for name, (solver, path) in SOLVERS.items()
-    }
-    for name, moment_map in maps.items():
-        errors = abs(growth(moment_map, h, counts) - exact) / counts
-        print(f"{name:22}" + "".join(f"{x:14.3e}" for x in errors), flush=True)
+def growth(name: str, steps: int, paths: int) -> Growth:
+    solver, path, _ = TABLE_1[name]
+    moment_map = exact_moment_map(make_terms, path, solver, Y0)
+    counts = 1000 * np.arange(1, COUNTS[-1] // 1000 + 1)
+    moments = [np.trace(second_moments(moment_map, Y0, H, int(n))) for n in counts]
+    exact = np.nan_to_num(np.array(moments), nan=np.inf)
+    sampled, std_errors = np.full((2, len(counts)), np.nan)
+    if name != "Euler":  # whose numbers overflow
 
-    figure, axes = plt.subplots(1, 3, figsize=(15, 4.5))
-    counts = [*range(0, 5001, 250)]
-    ts = np.array(counts) * h
-    for i, (name, moment_map) in enumerate(maps.items()):
-        style = dict(ls="--" if name in ("Heun", "Euler") else "-", lw=1, color=f"C{i}")
-        axes[0].plot(ts, growth(moment_map, h, counts), label=name, **style)
-    axes[0].plot(ts, 1 + ts, "k:", label="exact")
-    axes[0].set(ylim=(0, 2500), xlabel="time", ylabel="E(x^2 + y^2)", title="h = 0.2")
-    axes[0].legend(fontsize=7)
+        def phi(key):
+            saveat = diffrax.SaveAt(steps=1000)
+            terms = make_terms(path(key))
+            sol = solve(terms, solver, Y0, H * steps, H, saveat=saveat, max_steps=steps)
+            assert sol.ys is not None
+            return sol.ys[0] ** 2 + sol.ys[1] ** 2, sol.result
 
+        estimate = ds.expectation(phi, jr.key(0), paths)
+        assert estimate.num_failed == 0
+        sampled[: steps // 1000] = estimate.mean
+        std_errors[: steps // 1000] = estimate.std_error
+    return Growth(exact, sampled, std_errors)
+
+
+def figure_1(full: bool) -> None:
+    """Figure 1 and table 1: growth of the second moment."""
+    steps, paths = (25_000, 1_000_000) if full else (5_000, 4_000)
+    print(
+        "\nTable 1: |E(x^2 + y^2) - exact| / N after N = 5,000, 10,000, 25,000 steps of"
+    )
+    print(f"  h = {H}; exact | over {paths:,} paths (of {steps:,} steps) | the paper's")
+    columns = np.array(COUNTS) // 1000 - 1
+    # x^2 + y^2 comes to be exponentially distributed: its deviation is its mean.
+    paper_bar = H / np.sqrt(1e6)
+    results, off = {}, {}
+    for name, (_, _, paper) in TABLE_1.items():
+        results[name] = g = growth(name, steps, paths)
+        true = 1 + H * np.array(COUNTS)
+        bias, sampled = (
+            np.abs(x[columns] - true) / COUNTS for x in (g.exact, g.sampled)
+        )
+        bars = g.std_errors[columns] / COUNTS
+        with np.errstate(invalid="ignore"):
+            off[name] = np.abs(g.sampled - g.exact)[columns] / g.std_errors[columns]
+        row = ["".join(f"{x:10.3g}" for x in bias)]
+        row += [" ".join(f"{x:.4f} ± {b:.4f}" for x, b in zip(sampled, bars) if b > 0)]
+        row += ["".join(f"{x:10.3g}" for x in paper)]
+        symplectic = bias.max() < 0.1
+        if symplectic and np.any(np.abs(paper - bias) > 4 * paper_bar):
+            row += ["differs"]
+        print(f"  {name:14}" + " | ".join(row), flush=True)
+    plot_growth(results)
+    for name in [*TABLE_1][1:]:
+        claim(f"table 1, {name}, in standard errors", np.nanmax(off[name]), high=4)
+    for name in ("Euler", "Heun"):
+        claim(f"growth of {name}", results[name].exact[-1], low=1000 * H * COUNTS[-1])
+
+
+def plot_growth(results: dict[str, Growth]) -> None:
+    figure, axes = plt.subplots(1, 2, figsize=(13, 5))
+    counts = 1000 * np.arange(1, COUNTS[-1] // 1000 + 1)
+    for i, (name, g) in enumerate(results.items()):
+        style = dict(color=f"C{i}", ls="--" if i < 2 else "-", lw=1)
+        axes[0].plot(H * counts, g.exact, label=name, **style)
+        axes[0].errorbar(
+            H * counts,
+            g.sampled,
+            3 * g.std_errors,
+            fmt=".",
+            color=f"C{i}",
+            ms=3,
+            lw=0.8,
+        )
+        if i >= 2:
+            last = np.flatnonzero(np.isfinite(g.sampled))[-1]
+            biases = np.abs(np.array(g[:2]) - 1 - H * counts)[:, last] / counts[last]
+            axes[1].plot(biases[0], i, "kD", ms=5)
+            bar = 3 * g.std_errors[last] / counts[last]
+            axes[1].errorbar(biases[1], i, xerr=bar, fmt="C0s", ms=3)
+            axes[1].plot(TABLE_1[name][2], [i] * 3, "rx", ms=5)
+    axes[0].plot(H * counts, 1 + H * counts, "k:", label="exact solution")
+    axes[0].set(ylim=(0, 3 * H * COUNTS[-1]), xlabel="time", ylabel="E(x^2 + y^2)")
+    axes[0].set_title("figure 1: exact (lines), sampled (dots), h = 0.2")
+    axes[0].legend(fontsize=6, ncols=2)
+    axes[1].set_yticks(range(2, len(TABLE_1)), [*TABLE_1][2:], fontsize=7)
+    axes[1].set(xlabel="|E(x^2 + y^2) - exact| / N", title="table 1")
+    axes[1].plot([], [], "kD", ms=5, label="exact")
+    axes[1].plot([], [], "C0s", ms=3, label="sampled, 3 standard errors")
+    axes[1].plot([], [], "rx", label="paper, three values of N")
+    axes[1].legend(fontsize=7)
+    axes[1].grid(alpha=0.3)
+    save(figure, "fig1.png")
+
+
+def figure_2a(full: bool) -> None:
+    """Weak error of E(x^2) at t = 1."""
+    paths = 30_000_000 if full else 40_000
+    print(
+        f"\nFig. 2(a): weak error of E(x^2) at t = 1, h = 2^-1 .. 2^-8; {paths:,} paths"
+    )
     hs = [2.0**-k for k in range(1, 9)]
     # x(1) from (x, y) = (0, 1): sin 1 + int sin(1 - u) dw.
-    second_moment = np.sin(1) ** 2 + 1 / 2 - np.sin(2) / 4
-    results = {
-        name: exact_weak_error(moment_map, Y0, lambda m: m[1, 1], second_moment, hs)
-        for name, moment_map in maps.items()
+    value = np.sin(1) ** 2 + 1 / 2 - np.sin(2) / 4
+    solvers = {
+        "SRKw5": (ds.SRKw5(), weak(second=True)),
+        "Euler": (diffrax.Euler(), gaussian()),
     }
-    report("Weak error of E(x^2) at t = 1, exact; h = 2^-1 .. 2^-8", results)
-    plot_orders(axes[1], "weak error of E(x^2), exact", results)
+    exact, sampled = {}, {}
+    for name, (solver, path) in solvers.items():
+        moment_map = exact_moment_map(make_terms, path, solver, Y0)
+        exact[name] = exact_weak_error(moment_map, Y0, lambda m: m[1, 1], value, hs)
+        sampled[name] = sampled_weak_error(
+            make_terms, path, solver, Y0, lambda y: y[1] ** 2, value, hs, paths
+        )
+    report("exact", exact)
+    report("sampled", sampled)
+    figure, axes = plt.subplots(figsize=(6, 4.5))
+    plot_orders(axes, "2(a): weak error of E(x^2)", exact, sampled)
+    save(figure, "fig2a.png")
+    claim_slopes(exact, {"SRKw5": 2, "Euler": 1})
+    claim_samples(exact, sampled)
 
-    results = strong_errors(
-        make_terms,
-        {name: SOLVERS[name][0] for name in ("Midpoint", "SRKs4", "Heun", "Euler")},
-        ds.SRKs4(),
-        (jnp.ones(1), jnp.zeros(1)),
-        [2.0**-k for k in range(2, 8)],
-        m=1,
-        paths=1000,
-        fine=2**11,
-        component=lambda y: y[1][0],
+
+def exact_strong_error(solver, hs, t1: float = 1.0) -> Errors:
+    r"""The root-mean-square error of x at `t1`: the numerical solution is linear in the
+    increments and space-time areas, so that its error is a Wiener integral, and Itô's
+    isometry gives its variance."""
+
+    @jax.jit
+    def linear_step(h):
+        def step(p, q, W, H):
+            return jnp.stack(one_step(make_terms, solver, (p, q), h, W, H))
+
+        zero = jnp.array(0.0)
+        return jnp.stack(jax.jacrev(step, argnums=(0, 1, 2, 3))(*[zero] * 4), axis=1)
+
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    errors = []
+    for h in hs:
+        steps = round(t1 / h)
+        R, noise = np.split(np.asarray(linear_step(h)), 2, axis=1)
+        propagators = [np.linalg.matrix_power(R, steps - 1 - n) for n in range(steps)]
+        W, area = np.stack([(P @ noise)[1] for P in propagators])[..., None].swapaxes(
+            0, 1
+        )
+        # H is the integral of (1 - u) - 1/2 dw over the step, u from 0 to 1.
+        u = (1 + nodes) / 2
+        left = h * np.arange(steps)[:, None]
+        kernel = W + area * (1 / 2 - u) - np.sin(t1 - left - h * u)
+        bias = (np.linalg.matrix_power(R, steps) @ np.array(Y0))[1] - np.sin(t1)
+        errors.append(np.sqrt(bias**2 + np.sum(kernel**2 * weights) * h / 2))
+    return Errors(np.array([*hs]), np.array(errors), np.zeros(len(errors)))
+
+
+def nonlinear_terms(path):
+    """A pendulum with noise in both its variables, for which strong order 3/2 shows."""
+    H0 = lambda t, p, q, args: jnp.sum(p**2 / 2 - jnp.cos(2 * q))
+    return ds.hamiltonian_terms(H0, lambda t, p, q, args: p - q, path)
+
+
+def figure_2b(full: bool) -> None:
+    """Strong error of x at t = 1, with 20 batches of 250 paths as in the paper."""
+    print("\nFig. 2(b): strong error of x at t = 1, h = 2^-1 .. 2^-8; 5,000 paths")
+    hs = [2.0**-k for k in range(1, 9)]
+    solvers = {
+        "SRKs4": ds.SRKs4(),
+        "SRKs4(sign=1)": PAPER_SRKs4,
+        "Euler": diffrax.Euler(),
+    }
+    exact = {name: exact_strong_error(solver, hs) for name, solver in solvers.items()}
+    del solvers["SRKs4"]
+    y0, component = (jnp.ones(1), jnp.zeros(1)), lambda y: y[1][0]
+    sampled = strong_errors(
+        make_terms, solvers, ds.SRKs4(), y0, hs, 1, 5_000, 2**11, component
     )
-    report("Strong error of x at t = 1, 1,000 paths; h = 2^-2 .. 2^-7", results)
-    plot_orders(axes[2], "strong error of x", results, slopes=(1, 1.5))
-    save(figure, "linear_oscillator.png")
+    report("exact", exact)
+    report("sampled", sampled)
+    paths, fine = (5_000, 2**14) if full else (1_000, 2**11)
+    solvers = {"SRKs4": ds.SRKs4(), "Euler": diffrax.Euler()}
+    nonlinear = strong_errors(
+        nonlinear_terms, solvers, ds.SRKs4(), y0, hs, 1, paths, fine, component
+    )
+    report(f"pendulum (not in the paper), {paths:,} paths", nonlinear)
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.5))
+    slopes = 1, 1.5, 2
+    plot_orders(axes[0], "2(b): strong error of x", exact, sampled, slopes)
+    plot_orders(axes[1], "strong error, pendulum", nonlinear, slopes=slopes)
+    save(figure, "fig2b.png")
+    # The terms that keep SRKs4 at order 3/2 vanish where the drift is linear.
+    claim_slopes(exact, {"SRKs4": 2, "SRKs4(sign=1)": 2, "Euler": 1})
+    claim_samples(exact, sampled)
+    claim_slopes(nonlinear, {"SRKs4": 1.5, "Euler": 1})
+
+
+FIGURES = {"1": figure_1, "2a": figure_2a, "2b": figure_2b}
 
 
 if __name__ == "__main__":
-    main()
+    run(FIGURES)

@@ -6,21 +6,27 @@ Wang, Hong and Xu (2017), example 4: figures 5 and 6(b).
 """
 
 import diffrax
+import jax
 import jax.numpy as jnp
-import matplotlib
+import jax.random as jr
+import matplotlib.pyplot as plt
+import numpy as np
 
 import diffrax_symplectic as ds
 
+from ._gallery import claim, gaussian, run, save, trajectory, truncated, weak
+from ._orders import (
+    claim_samples,
+    claim_slopes,
+    claim_small_first_order,
+    plot_orders,
+    report,
+    sampled_weak_error,
+)
+from ._transfer import enumerated_expectation, transfer_weak_errors
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
 
-from ._compare import COLOURS, compare, plot_drift, save  # noqa: E402
-from ._orders import plot_orders, report, sampled_weak_error  # noqa: E402
-
-
-def make_terms(path, mu: float = 0.1, inertia=(0.8, 0.6, 0.2)):
+def make_terms(path, mu=0.1, inertia=(0.8, 0.6, 0.2)):
     I1, I2, I3 = inertia
 
     def drift(t, X, args):
@@ -42,50 +48,97 @@ def make_terms(path, mu: float = 0.1, inertia=(0.8, 0.6, 0.2)):
     )
 
 
-def weak_orders(axes, X0, mu: float = 0.5, paths: int = 100_000) -> None:
-    """Figure 6(b): the error of E(X1^2) at t = 1, against a fine solve. (With a stronger
-    noise than above, so that its errors show.)"""
-    terms = lambda path: make_terms(path, mu)
-    weak = lambda key: ds.WeakBrownianPath((), key)
-    gaussian = lambda key: diffrax.UnsafeBrownianPath((), key)
-    solvers = {
-        "SRKw1": (ds.SRKw1(), weak),
-        "SRKw2": (ds.SRKw2(), weak),
-        "StratonovichMilstein": (diffrax.StratonovichMilstein(), gaussian),
-    }
-    phi = lambda X: X[0] ** 2
-    fine = sampled_weak_error(
-        terms, weak, ds.SRKw2(), X0, phi, 0.0, [2.0**-5], 4 * paths
+X0 = jnp.array([np.cos(1.1), 0.0, np.sin(1.1)])
+SOLVERS = {
+    "Milstein": (diffrax.StratonovichMilstein(), gaussian()),
+    "Heun": (diffrax.Heun(), gaussian()),
+    "SRKs1": (ds.SRKs1(), truncated),
+    "SRKw1(b=0)": (ds.SRKw1(b=0.0), weak()),
+    "SRKw2": (ds.SRKw2(), weak()),
+}
+
+
+def figure_5(full: bool) -> None:
+    """One path on the sphere, with the paper's noise and a stronger one."""
+    h, steps = 0.02, 2_000
+    print(f"\nFig. 5: one path to t = {h * steps:g}, h = {h}; the largest ||X| - 1|")
+    mus = (0.1, 0.2, 1.0)
+    figure, axes = plt.subplots(
+        2, 5, figsize=(14, 6), subplot_kw={"projection": "3d"}, layout="constrained"
     )
-    hs = [2.0**-k for k in range(1, 5)]
-    results = {}
-    for name, (solver, path) in solvers.items():
-        exact = float(fine.errors[0])
-        e = sampled_weak_error(terms, path, solver, X0, phi, exact, hs, paths)
-        both = np.hypot(e.std_errors, fine.std_errors[0])
-        results[name] = e._replace(std_errors=both)
-    report(f"Weak error of E(X1^2) at t = 1, mu = {mu}, {paths:,} paths", results)
-    plot_orders(axes, "weak error of E(X1^2)", results)
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 25), np.linspace(0, np.pi, 13))
+    sphere = np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)
+    drifts = {}
+    for i, (name, (solver, path)) in enumerate(SOLVERS.items()):
+
+        @jax.jit
+        def solve_all(mus, solver=solver, path=path):
+            def one(mu):
+                terms = lambda path: make_terms(path, mu)
+                return trajectory(terms, path, solver, X0, h, steps, every=1)
+
+            return jax.vmap(one)(mus)
+
+        _, X, success = solve_all(jnp.array(mus))
+        with np.errstate(all="ignore"):
+            length = np.linalg.norm(X, axis=-1)
+        # Numbers that overflow are infinite.
+        drifts[name] = np.nan_to_num(np.max(np.abs(length - 1), axis=1), nan=np.inf)
+        assert i < 2 or np.all(success)
+        listed = ", ".join(f"{d:.1e} (mu = {mu})" for d, mu in zip(drifts[name], mus))
+        print(f"    {name:12} {listed}", flush=True)
+        for ax, j in zip(axes[:, i], (0, 2)):
+            ax.plot_wireframe(*sphere, color="0.85", lw=0.4)
+            colour = "C1" if i < 2 else "C0"
+            shown = np.asarray(X[j])[length[j] < 2]
+            ax.plot(*shown.T, ".", ms=1, color=colour)
+            ax.set_title(f"{name}, mu = {mus[j]}:\n{drifts[name][j]:.1e}", fontsize=8)
+            ax.set_aspect("equal")
+            ax.tick_params(labelsize=6)
+    save(figure, "fig5.png")
+    for name, drift in drifts.items():
+        ours = isinstance(SOLVERS[name][0], ds.AbstractSymplecticRungeKutta)
+        bounds = dict(high=1e-11) if ours else dict(low=1e-5)
+        worst = drift.max() if ours else drift.min()
+        claim(f"largest ||X| - 1| of {name}", worst, **bounds)
 
 
-def main(steps: int = 100_000) -> None:
-    X0 = jnp.array([np.cos(1.1), 0.0, np.sin(1.1)])
-    squared = lambda X: jnp.sum(X**2)
-    runs = compare("Rigid body", make_terms, squared, X0, h=0.02, steps=steps)
+def figure_6b(full: bool) -> None:
+    """Weak error of E(X1^2) at t = 1."""
+    paths = 20_000_000 if full else 50_000
+    print(
+        f"\nFig. 6(b): weak error of E(X1^2) at t = 1, h = 2^-1 .. 2^-8; {paths:,} paths"
+    )
+    hs = [2.0**-k for k in range(1, 9)]
+    solvers = {name: SOLVERS[name] for name in ("SRKw1(b=0)", "SRKw2", "Milstein")}
+    phi = lambda X: X[0] ** 2
+    # Three standard deviations of the largest of them.
+    exact, value = transfer_weak_errors(
+        make_terms, solvers, solvers["SRKw2"], X0, phi, hs, (0.3,) * 3, degree=8
+    )
+    sampled = {
+        name: sampled_weak_error(make_terms, path, solver, X0, phi, value, hs, paths)
+        for name, (solver, path) in solvers.items()
+    }
+    print(f"  E(X1^2) = {value:.9f}")
+    report("exact", exact)
+    report("sampled", sampled)
+    figure, axes = plt.subplots(figsize=(6, 4.5))
+    plot_orders(axes, "6(b): weak error of E(X1^2)", exact, sampled)
+    save(figure, "fig6b.png")
+    claim_slopes(exact, {"SRKw2": 2, "Milstein": 1})
+    claim_small_first_order("SRKw1(b=0)", exact["SRKw1(b=0)"])
+    claim_samples(exact, sampled)
+    terms = make_terms(weak()(jr.key(0)))
+    all_paths = jax.jit(
+        lambda: enumerated_expectation(terms, ds.SRKw1(b=0.0), X0, phi, 0.25, 4)
+    )
+    difference = float(all_paths()) - value - exact["SRKw1(b=0)"].signed[1]
+    claim("transfer against all paths of four steps", abs(difference), high=1e-8)
 
-    figure = plt.figure(figsize=(15, 4.5))
-    left = figure.add_subplot(1, 3, 1, projection="3d")
-    for name in ("StratonovichMilstein", "SRKw1"):
-        X = runs[name].ys
-        keep = np.all(np.isfinite(X), axis=1) & (np.sum(X**2, axis=1) < 25)
-        left.plot(*X[keep].T, ".", ms=2, color=COLOURS[name], label=name)
-    left.set(xlabel="X1", ylabel="X2", zlabel="X3", title="Rigid body, one path")
-    left.set_aspect("equal")
-    left.legend(fontsize=7)
-    plot_drift(figure.add_subplot(1, 3, 2), runs)
-    weak_orders(figure.add_subplot(1, 3, 3), X0)
-    save(figure, "rigid_body.png")
+
+FIGURES = {"5": figure_5, "6b": figure_6b}
 
 
 if __name__ == "__main__":
-    main()
+    run(FIGURES)

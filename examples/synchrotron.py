@@ -1,146 +1,189 @@
 """Synchrotron oscillations of particles in a storage ring, with two noises.
 
 dP = -w^2 sin Q dt - s1 cos Q dw1 - s2 sin Q dw2, dQ = P dt: separable, with noise in the
-potential. Wang, Hong and Xu (2017), example 3: figures 4, 2(d) and 6(a).
+potential. Wang, Hong and Xu (2017), example 3: figures 2(d), 4 and 6(a).
 """
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import jax.random as jr
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrax_symplectic as ds
 
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-
-from ._compare import save  # noqa: E402
-from ._orders import (  # noqa: E402
+from ._gallery import claim, gaussian, run, save, trajectory, weak
+from ._orders import (
+    claim_samples,
+    claim_slopes,
+    claim_small_first_order,
     plot_orders,
     report,
     sampled_weak_error,
     strong_errors,
 )
+from ._transfer import enumerated_expectation, transfer_weak_errors
 
 
-OMEGA = 2.0
+OMEGA, S1, S2 = 2.0, 0.2, 0.1
 
 
 def H0(t, p, q, args):
     return p**2 / 2 - OMEGA**2 * jnp.cos(q)
 
 
-def make_terms(path, s1: float = 0.2, s2: float = 0.1):
+def make_terms(path, s1: float = S1, s2: float = S2):
     noise = lambda t, p, q, args: jnp.stack([s1 * jnp.sin(q), -s2 * jnp.cos(q)])
     return ds.hamiltonian_terms(H0, noise, path)
 
 
-def weak(key):
-    return ds.WeakBrownianPath((2,), key)
+def make_terms_one_noise(path):
+    return ds.hamiltonian_terms(H0, lambda t, p, q, args: S1 * jnp.sin(q), path)
 
 
-def gaussian(key):
-    return diffrax.UnsafeBrownianPath((2,), key)
-
-
-LONG_RUN = {
-    "SRKw3a": (ds.SRKw3("a"), weak),
-    "SRKw3b": (ds.SRKw3("b"), weak),
-    "SRKw3c": (ds.SRKw3("c"), weak),
-    "SRKw3d": (ds.SRKw3("d"), weak),
-    "SRKw3e": (ds.SRKw3("e"), weak),
-    "SRKw3f": (ds.SRKw3("f"), weak),
-    "SRKw4": (ds.SRKw4(), weak),
-    "SRKs3": (ds.SRKs3(), weak),
-    "Euler": (diffrax.Euler(), gaussian),
-}
+# (P, Q); the paper does not give its own.
 Y0 = (jnp.array(1.0), jnp.array(0.0))
 
 
-def mean_energy(solver, path, h: float, steps: int, paths: int) -> np.ndarray:
-    """The mean of H0 over all paths, at 51 times."""
-
-    def phi(key):
-        sol = diffrax.diffeqsolve(
-            make_terms(path(key)),
-            solver,
-            0.0,
-            h * steps,
-            h,
-            Y0,
-            saveat=diffrax.SaveAt(ts=jnp.linspace(0, h * steps, 51)),
-            max_steps=steps,
-            adjoint=diffrax.ForwardMode(),
-            throw=False,
-        )
-        assert sol.ys is not None
-        p, q = sol.ys
-        return H0(None, p, q, None), sol.result
-
-    return ds.expectation(phi, jr.key(0), paths).mean
-
-
-def long_run(axes, h: float = 0.02, steps: int = 5_000, paths: int = 64) -> None:
-    print(f"\nSynchrotron: mean H0 at t = {h * steps:g}, {paths} paths, h = {h}")
-    for i, (name, (solver, path)) in enumerate(LONG_RUN.items()):
-        energy = mean_energy(solver, path, h, steps, paths)
-        print(f"{name:22}{energy[-1]:10.3f}", flush=True)
-        style = dict(color=f"C{i}", ls="--" if name == "Euler" else "-", lw=1)
-        axes.plot(np.linspace(0, h * steps, 51), energy, label=name, **style)
-    axes.set(
-        xlabel="time", title=f"mean of H0 over {paths} paths, h = {h}", ylim=(-4, 60)
+def figure_2d(full: bool) -> None:
+    """Strong error of P at t = 1, with 20 batches of 250 paths as in the paper."""
+    paths, fine = (5_000, 2**14) if full else (2_000, 2**11)
+    print(
+        f"\nFig. 2(d): strong error of P at t = 1, h = 2^-1 .. 2^-8; {paths:,} paths,"
     )
-    axes.legend(fontsize=7)
-
-
-def weak_orders(axes, paths: int = 100_000) -> None:
-    """Figure 6(a): the error of E(P^2) at t = 1 with one noise, against a fine solve."""
-    one_noise = lambda path: ds.hamiltonian_terms(
-        H0, lambda t, p, q, args: 0.2 * jnp.sin(q), path
-    )
-    weak = lambda key: ds.WeakBrownianPath((), key)
-    gaussian = lambda key: diffrax.UnsafeBrownianPath((), key)
-    solvers = {
-        "SRKw3a": (ds.SRKw3("a"), weak),
-        "SRKw3c": (ds.SRKw3("c"), weak),
-        "SRKw4": (ds.SRKw4(), weak),
-        "Euler": (diffrax.Euler(), gaussian),
-    }
-    phi = lambda y: y[0] ** 2
-    args = (phi, 0.0, [2.0**-6], 4 * paths)
-    fine = sampled_weak_error(one_noise, weak, ds.SRKw4(), Y0, *args)
-    exact = float(fine.errors[0])
-    hs = [2.0**-k for k in range(1, 6)]
-    results = {}
-    for name, (solver, path) in solvers.items():
-        e = sampled_weak_error(one_noise, path, solver, Y0, phi, exact, hs, paths)
-        both = np.hypot(e.std_errors, fine.std_errors[0])
-        results[name] = e._replace(std_errors=both)
-    report(f"Weak error of E(P^2) at t = 1, {paths:,} paths; h = 2^-1 .. 2^-5", results)
-    plot_orders(axes, "weak error of E(P^2)", results)
-
-
-def main(paths: int = 100_000) -> None:
-    figure, axes = plt.subplots(1, 3, figsize=(15, 4.5))
-    long_run(axes[0])
-    weak_orders(axes[1], paths)
-    results = strong_errors(
+    print(f"  against the same paths in {fine:,} steps")
+    sampled = strong_errors(
         make_terms,
-        {"SRKs3": ds.SRKs3(), "Midpoint": ds.Midpoint(), "Euler": diffrax.Euler()},
-        ds.SRKs3(),
+        {"SRKs3": ds.SRKs3(), "Euler": diffrax.Euler()},
+        # Its own error is far smaller than those that are measured.
+        ds.Midpoint(),
         Y0,
-        [2.0**-k for k in range(2, 8)],
+        [2.0**-k for k in range(1, 9)],
         m=2,
-        paths=1000,
-        fine=2**11,
+        paths=paths,
+        fine=fine,
         component=lambda y: y[0],
     )
-    report("Strong error of P at t = 1, 1,000 paths; h = 2^-2 .. 2^-7", results)
-    plot_orders(axes[2], "strong error of P", results, slopes=(1,))
-    save(figure, "synchrotron.png")
+    report("sampled", sampled)
+    figure, axes = plt.subplots(figsize=(6, 4.5))
+    plot_orders(axes, "2(d): strong error of P", sampled, slopes=(0.5, 1))
+    save(figure, "fig2d.png")
+    claim_slopes(sampled, {"SRKs3": 1, "Euler": 1})
+
+
+LONG_RUN = {
+    "SRKw3a": (ds.SRKw3("a"), weak(2)),
+    "SRKw3b": (ds.SRKw3("b"), weak(2)),
+    "SRKw3c": (ds.SRKw3("c"), weak(2)),
+    "SRKw3d": (ds.SRKw3("d"), weak(2)),
+    "SRKw3e": (ds.SRKw3("e"), weak(2)),
+    "SRKw3f": (ds.SRKw3("f"), weak(2)),
+    "SRKs3": (ds.SRKs3(), gaussian(2)),
+    "Euler": (diffrax.Euler(), gaussian(2)),
+}
+
+
+def long_run(solver, path, h: float, steps: int, paths: int):
+    """P of one path, and the mean of H0 over many with its standard error."""
+
+    @jax.jit
+    def solve_all(seeds):
+        one = lambda seed: trajectory(make_terms, path, solver, Y0, h, steps, 10, seed)
+        _, (p, q), success = jax.vmap(one)(seeds)
+        energy = H0(0.0, p, q, None)
+        bar = jnp.std(energy, axis=0) / np.sqrt(paths)
+        return p[0], jnp.mean(energy, axis=0), bar, jnp.all(success)
+
+    p, mean, bar, success = map(np.asarray, solve_all(jnp.arange(paths)))
+    assert success
+    return p, mean, bar
+
+
+def figure_4(full: bool) -> None:
+    """One path of each method, and the mean energy of many."""
+    h, steps = 0.02, 10_000
+    paths = 4096 if full else 128
+    print(
+        f"\nFig. 4: paths to t = {h * steps:g}, h = {h}; the mean of H0 over {paths:,}"
+    )
+    figure, panels = plt.subplots(3, 4, figsize=(15, 9))
+    for unused in panels[2]:
+        unused.remove()
+    energies = figure.add_subplot(3, 1, 3)
+    ts = np.linspace(0, h * steps, steps // 10 + 1)
+    # d E(H0) / dt = E(s1^2 cos^2 Q + s2^2 sin^2 Q) / 2.
+    start = H0(0.0, 1.0, 0.0, None)
+    low, high = (np.asarray(start + s**2 / 2 * ts) for s in (S2, S1))
+    means = {}
+    for ax, (name, (solver, path)) in zip(panels.ravel(), LONG_RUN.items()):
+        p, mean, bar = long_run(solver, path, h, steps, paths)
+        means[name] = mean[-1], bar[-1]
+        print(f"    {name:8} {mean[-1]:8.3f} +- {bar[-1]:.3f}", flush=True)
+        ax.plot(ts, p, color="C1" if name == "Euler" else "C0", lw=0.3)
+        ax.set(title=f"{name}: P of one path", ylim=(-12, 12))
+        energies.errorbar(ts, mean, 3 * bar, label=name, errorevery=100, lw=0.8)
+    energies.fill_between(ts, low, high, color="0.8", label="bounds of the exact mean")
+    energies.set(xlabel="time", ylim=(-5, 30))
+    energies.set_title(f"mean of H0 over {paths:,} paths, 3 standard errors")
+    energies.legend(fontsize=7, ncols=3)
+    save(figure, "fig4.png")
+    for name, (mean, bar) in means.items():
+        if name == "Euler":
+            claim("mean H0 of Euler", mean, low=high[-1] + 4 * bar)
+        else:
+            claim(f"mean H0 of {name}", mean, low[-1] - 4 * bar, high[-1] + 4 * bar)
+
+
+def figure_6a(full: bool) -> None:
+    """Weak error of E(P^2) at t = 1 with one noise."""
+    paths = 20_000_000 if full else 50_000
+    print(
+        f"\nFig. 6(a): weak error of E(P^2) at t = 1, h = 2^-1 .. 2^-8; {paths:,} paths"
+    )
+    hs = [2.0**-k for k in range(1, 9)]
+    solvers = {
+        "SRKw3a": (ds.SRKw3("a"), weak()),
+        "SRKw4(a21=0)": (ds.SRKw4(a21=0.0), weak()),
+        "Euler": (diffrax.Euler(), gaussian()),
+    }
+    phi = lambda y: y[0] ** 2
+    # Five standard deviations of P, and of Q.
+    exact, value = transfer_weak_errors(
+        make_terms_one_noise,
+        solvers,
+        solvers["SRKw4(a21=0)"],
+        Y0,
+        phi,
+        hs,
+        widths=(1.0, 0.5),
+        degree=14,
+    )
+    sampled = {
+        name: sampled_weak_error(
+            make_terms_one_noise, path, solver, Y0, phi, value, hs, paths
+        )
+        for name, (solver, path) in solvers.items()
+    }
+    print(f"  E(P^2) = {value:.9f}")
+    report("exact", exact)
+    report("sampled", sampled)
+    figure, axes = plt.subplots(figsize=(6, 4.5))
+    plot_orders(axes, "6(a): weak error of E(P^2)", exact, sampled)
+    save(figure, "fig6a.png")
+    claim_slopes(exact, {"SRKw4(a21=0)": 2, "Euler": 1})
+    claim_small_first_order("SRKw3a", exact["SRKw3a"])
+    claim_samples(exact, sampled)
+    terms = make_terms_one_noise(weak()(jr.key(0)))
+    all_paths = jax.jit(
+        lambda: enumerated_expectation(terms, ds.SRKw3("a"), Y0, phi, 0.25, 4)
+    )
+    difference = float(all_paths()) - value - exact["SRKw3a"].signed[1]
+    claim("transfer against all paths of four steps", abs(difference), high=1e-10)
+
+
+FIGURES = {"2d": figure_2d, "4": figure_4, "6a": figure_6a}
 
 
 if __name__ == "__main__":
-    main()
+    run(FIGURES)

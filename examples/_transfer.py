@@ -1,0 +1,125 @@
+"""Expectations after many steps without sampling, for nonlinear models of two or three
+variables and little noise."""
+
+from collections.abc import Callable, Iterable
+
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+
+import diffrax_symplectic as ds
+
+from ._orders import Errors
+
+
+def transfer_expectations(
+    make_terms: Callable,
+    make_path: Callable,
+    solver,
+    y0,
+    phi: Callable,
+    hs: Iterable[float],
+    widths: tuple[float, ...],
+    degree: int,
+    t1: float = 1.0,
+) -> np.ndarray:
+    r"""$\mathbb E[\phi(y_N)]$ for each step size $h = t_1 / N$.
+
+    Backwards in time, $u_N = \phi$ and $u_n(y) = \mathbb E[u_{n+1}(y_1(y))]$, a sum over
+    the outcomes of one step. Each $u_n$ is a polynomial of `degree` in each variable, by
+    its values at Chebyshev points of a box. The boxes follow the path of the means and
+    have the half widths `widths * sqrt(t + h)`: take several standard deviations of what
+    the noise adds in a unit of time.
+    """
+    terms = make_terms(make_path(jr.key(0)))
+    flat, unravel = jfu.ravel_pytree(y0)
+    ravel = lambda y: jfu.ravel_pytree(y)[0]
+    n = flat.size
+    points = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+    to_coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(points, degree))
+    grid = np.stack(np.meshgrid(*[points] * n, indexing="ij"), axis=-1).reshape(-1, n)
+
+    def fit(values):
+        u = values.reshape((degree + 1,) * n)
+        for axis in range(n):
+            u = jnp.moveaxis(jnp.tensordot(to_coefficients, u, (1, axis)), 0, axis)
+        return u
+
+    def evaluate(u, x):
+        T = [jnp.ones_like(x), x]
+        for _ in range(degree - 1):
+            T.append(2 * x * T[-1] - T[-2])
+        for axis in range(n):
+            u = jnp.tensordot(jnp.stack(T)[:, axis], u, 1)
+        return u
+
+    @jax.jit
+    def back(u, h, box0, box1):
+        """The polynomial on `box0` of that on `box1`, and the mean from the centre."""
+
+        def fn(y):
+            return evaluate(u, (ravel(y) - box1[0]) / box1[1]), ravel(y)
+
+        def expected(x):
+            y = unravel(box0[0] + box0[1] * x)
+            return ds.step_expectation(terms, solver, 0.0, h, y, fn=fn)
+
+        values, means = jax.vmap(expected)(np.concatenate([grid, np.zeros((1, n))]))
+        return fit(values[:-1]), means[-1]
+
+    out = []
+    for h in hs:
+        steps = round(t1 / h)
+        width = lambda i: np.asarray(widths) * np.sqrt((i + 1) * h)
+        u = jnp.zeros((degree + 1,) * n)
+        centres = [flat]
+        for i in range(steps):
+            box = centres[-1], width(i)
+            centres.append(back(u, h, box, box)[1])
+        box = centres[-1], width(steps)
+        u = fit(jax.vmap(lambda x: phi(unravel(box[0] + box[1] * x)))(grid))
+        for i in reversed(range(steps)):
+            before = centres[i], width(i)
+            u, _ = back(u, h, before, box)
+            box = before
+        out.append(float(evaluate(u, jnp.zeros(n))))
+    return np.array(out)
+
+
+def transfer_weak_errors(
+    make_terms: Callable,
+    solvers: dict,
+    reference: tuple,
+    y0,
+    phi: Callable,
+    hs: Iterable[float],
+    widths: tuple[float, ...],
+    degree: int,
+) -> tuple[dict[str, Errors], float]:
+    """The errors of all `solvers`, each a pair of a solver and a path, and the exact
+    expectation: Richardson's extrapolation of `reference`, which is of weak order 2."""
+    hs = np.array([*hs])
+
+    def expectations(solver, path, hs):
+        return transfer_expectations(
+            make_terms, path, solver, y0, phi, hs, widths, degree
+        )
+
+    solver, path = reference
+    coarse, fine = expectations(solver, path, [hs[-1], hs[-1] / 2])
+    exact = fine + (fine - coarse) / 3
+    errors = {}
+    for name, (solver, path) in solvers.items():
+        signed = expectations(solver, path, hs) - exact
+        errors[name] = Errors(hs, signed, np.zeros_like(hs))
+    return errors, exact
+
+
+def enumerated_expectation(terms, solver, y0, phi: Callable, h, steps: int):
+    r"""The same by all paths there are: $3^N$ for one noise and $N$ steps."""
+    if steps == 0:
+        return phi(y0)
+    then = lambda y: enumerated_expectation(terms, solver, y, phi, h, steps - 1)
+    return ds.step_expectation(terms, solver, 0.0, h, y0, fn=then)
