@@ -151,9 +151,10 @@ def strong_errors(
     fine: int,
     component: Callable,
     t1: float = 1.0,
+    wrap: Callable = lambda path, key, cell: path,
 ) -> dict[str, Errors]:
     """Root-mean-square errors of `component(y)` at `t1` against `reference` with `fine`
-    steps on the same Brownian paths."""
+    steps on the same Brownian paths, to which `wrap` may add random variables."""
 
     def end(path, solver, h):
         sol = solve(make_terms(path), solver, y0, t1, h)
@@ -162,7 +163,8 @@ def strong_errors(
     steps = jnp.array([*hs])
 
     def squares(key):
-        path = _FinePath.draw(key, fine, m, t1)
+        key, key_wrap = jr.split(key)
+        path = wrap(_FinePath.draw(key, fine, m, t1), key_wrap, t1 / fine)
         exact, _ = end(path, reference, t1 / fine)
 
         def run(solver):

@@ -1,17 +1,18 @@
-"""Speed against accuracy on all four models:
+"""Speed against accuracy on the four models, and one with two noises:
 
     python -m examples.benchmarks.work_precision
 
-Weak errors are exact on the linear models (linear and Kubo oscillator) and sampled on the
-others, with error bars of three standard errors. Strong errors are root mean squares over
-one set of Brownian paths. Costs are CPU seconds per path, in batches of 10,000. Writes
-`docs/benchmarks/work_precision.md` and its picture.
+Weak errors are exact on the linear models (linear and Kubo oscillator, two noises) and
+sampled on the others, with error bars of three standard errors. Strong errors are root
+mean squares over one set of Brownian paths. Costs are CPU seconds per path, in batches of
+10,000. Writes `docs/benchmarks/work_precision.md` and its picture.
 """
 
 import diffrax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
+from jax.scipy.linalg import expm
 
 import diffrax_symplectic as ds
 
@@ -51,6 +52,25 @@ def cost(make_terms, make_path, solver, y0, hs) -> np.ndarray:
     return timing.seconds / BATCH / steps / np.asarray(hs)
 
 
+def two_noises(path):
+    """A linear oscillator with two noises that do not commute."""
+    return ds.hamiltonian_terms(
+        lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2,
+        lambda t, p, q, args: jnp.stack([jnp.sum(p**2 - q**2) / 2, jnp.sum(p * q)]) / 2,
+        path,
+    )
+
+
+def _two_noises_moment() -> float:
+    """E(q^2) at t = 1 from (p, q) = (0, 1), by the linear equation of second moments."""
+    A = np.array([[0, -1], [1, 0]])
+    Bs = np.array([[0, 1], [1, 0]]) / 2, np.array([[-1, 0], [0, 1]]) / 2
+    ito = A + sum(B @ B for B in Bs) / 2
+    one = np.eye(2)
+    generator = np.kron(ito, one) + np.kron(one, ito) + sum(np.kron(B, B) for B in Bs)
+    return float((expm(generator) @ np.array([0, 0, 0, 1.0]))[3])
+
+
 def weak(model: str):
     """(solver, path) by name, and the function from these to `Errors`."""
     scalar = {
@@ -66,6 +86,7 @@ def weak(model: str):
         exact = np.sin(1) ** 2 + 1 / 2 - np.sin(2) / 4
         additive = {
             "SRKw5": (ds.SRKw5(), Weak((), second=True)),
+            "AdditiveGauss": (ds.AdditiveGauss(), Weak((), order=3)),
             "SRKw4": (ds.SRKw4(), Weak(())),
             "SRKs4": (ds.SRKs4(), Area(())),
             "ShARK": (diffrax.ShARK(), Area(())),
@@ -88,6 +109,15 @@ def weak(model: str):
         phi = lambda y: y[0] ** 2
         reference = ds.SRKw4(), Weak((2,))
         return make_terms, y0, separable, _sampled(make_terms, y0, phi, *reference)
+    if model == "two noises":
+        several = {
+            "SRKw1": (ds.SRKw1(), Weak((2,))),
+            "StrangGauss": (ds.StrangGauss(), Weak((2,))),
+            "NinomiyaVictoir": (ds.NinomiyaVictoir(), Weak((2,), two_point=True)),
+            "Heun": (diffrax.Heun(), Gaussian((2,))),
+        }
+        y0 = (jnp.array(0.0), jnp.array(1.0))
+        return two_noises, y0, several, _exact(two_noises, y0, _two_noises_moment())
     make_terms = lambda path: rigid_body.make_terms(path, 0.5)
     y0 = jnp.array([np.cos(1.1), 0.0, np.sin(1.1)])
     phi = lambda X: X[0] ** 2
@@ -148,9 +178,10 @@ STRONG = {
         synchrotron.Y0,
         2,
         lambda y: y[0],
-        {"SRKs3": ds.SRKs3(), "Midpoint": ds.Midpoint(), "Heun": diffrax.Heun(),
+        {"PlateauVerlet": ds.PlateauVerlet(), "SRKs3": ds.SRKs3(),
+         "Midpoint": ds.Midpoint(), "Heun": diffrax.Heun(),
          "SlowRK": diffrax.SlowRK()},
-        ds.Midpoint(),
+        ds.PlateauVerlet(),
     ),
     "rigid body": (
         lambda path: rigid_body.make_terms(_scalar(path), 0.5),
@@ -162,7 +193,28 @@ STRONG = {
          "SlowRK": diffrax.SlowRK()},
         ds.Midpoint(),
     ),
+    "two noises": (
+        two_noises,
+        (jnp.zeros(1), jnp.ones(1)),
+        2,
+        lambda y: y[1][0],
+        {"LevyAreaMidpoint": ds.LevyAreaMidpoint(), "Midpoint": ds.Midpoint(),
+         "SRKs1": ds.SRKs1(), "Heun": diffrax.Heun()},
+        ds.LevyAreaMidpoint(),
+    ),
 }  # fmt: skip
+
+
+def _plateaus(path, key, cell):
+    return ds.PlateauBrownianPath(path, key)
+
+
+def _levy_areas(path, key, cell):
+    return ds.LevyAreaBrownianPath(path, key, terms=0 if cell else 8, cell=cell)
+
+
+# What solvers ask of a path beyond space-time area.
+WRAP = {"synchrotron": _plateaus, "two noises": _levy_areas}
 
 
 class _Scalar(diffrax.AbstractBrownianPath):
@@ -209,8 +261,8 @@ def main() -> None:
         "| error, model | solver | h | error | microseconds per path |",
         "|---" * 5 + "|",
     ]
-    figure, axes = plt.subplots(2, 4, figsize=(20, 9))
-    models = "linear oscillator", "Kubo oscillator", "synchrotron", "rigid body"
+    figure, axes = plt.subplots(2, 5, figsize=(25, 9))
+    models = [*STRONG]
     for ax, model in zip(axes[0], models):
         make_terms, y0, solvers, error_of = weak(model)
         results = {
@@ -222,10 +274,20 @@ def main() -> None:
     for ax, model in zip(axes[1], models):
         make_terms, y0, m, component, solvers, reference = STRONG[model]
         hs = [2.0**-k for k in range(2, 8)]
+        wrap = WRAP.get(model, lambda path, key, cell: path)
         errors = strong_errors(
-            make_terms, solvers, reference, y0, hs, m, 500, 2**12, component
+            make_terms,
+            solvers,
+            reference,
+            y0,
+            hs,
+            m,
+            500,
+            2**12,
+            component,
+            wrap=wrap,
         )
-        path = Area((m,))
+        path = lambda key, wrap=wrap, m=m: wrap(Area((m,))(key), key, None)
         results = {
             name: (cost(make_terms, path, solvers[name], y0, hs), e)
             for name, e in errors.items()
