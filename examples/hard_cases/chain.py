@@ -132,8 +132,8 @@ SOLVERS = {
 
 
 def section(page: Page) -> str:
-    t1, paths = (2.0, 16) if page.quick else (20.0, 512)
-    hs = [0.1] if page.quick else [0.8, 0.4, 0.2, 0.1, 0.05]
+    t1, paths = (2.0, 16) if page.quick else (20.0, 256)
+    hs = [0.1] if page.quick else [0.8, 0.4, 0.2, 0.1]
     names = ["Midpoint", "Heun"] if page.quick else SOLVERS
     args = Args(beta=1.0, s=0.2)
     print("\nHarmonic chain, 64 unknowns: one step, exactly; s = 1")

@@ -91,8 +91,8 @@ SOLVERS = {
 
 
 def section(page: Page) -> str:
-    s, count, paths = (0.01, 5, 32) if page.quick else (0.01, 100, 256)
-    sizes = [400, 25] if page.quick else [400, 100, 50, 25, 12]
+    s, count, paths = (0.01, 5, 32) if page.quick else (0.01, 100, 64)
+    sizes = [400, 25] if page.quick else [400, 100, 50, 25]
     names = ["Midpoint", "Heun"] if page.quick else SOLVERS
     print(f"\nTwo-body problem, {count} orbits, s = {s}, {paths} paths")
     rows = []
@@ -101,7 +101,7 @@ def section(page: Page) -> str:
         solver, make_path = SOLVERS[name]
         for per_orbit in sizes:
             # Every step is saved.
-            few = max(paths * sizes[-1] // per_orbit, 32)
+            few = max(paths * sizes[-1] // per_orbit, 16)
             r = orbits(solver, make_path, per_orbit, count, s, few)
             lost = f"{100 * r.failed_share:.0f}%"
             if r.failed_share == 1:

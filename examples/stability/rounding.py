@@ -119,33 +119,22 @@ class Run(NamedTuple):
     dtype: type
 
 
-_RANDOM, _BOUNDED = "rounding, at random", "bounded"
 RUNS = [
-    *[
-        Run(f"Kubo, {type(s).__name__}", KUBO, s, dtype)
-        for dtype in (np.float64, np.float32)
-        for s in (
-            ds.Midpoint(),
-            ds.SRKs1(),
-            ds.SRKw1(b=0.0),
-            ds.SRKw2(),
-            ds.StrangGauss(),
-        )
-    ],
-    *[
-        Run(f"rigid body, {type(s).__name__}", RIGID_BODY, s, dtype)
-        for dtype in (np.float64, np.float32)
-        for s in (ds.Midpoint(), ds.SRKw2())
-    ],
-    Run("pendulum, no noise, Midpoint", PENDULUM, ds.Midpoint(), np.float64),
+    Run("Kubo, Midpoint", KUBO, ds.Midpoint(), np.float64),
+    Run("Kubo, Midpoint", KUBO, ds.Midpoint(), np.float32),
+    Run("Kubo, SRKs1", KUBO, ds.SRKs1(), np.float64),
+    Run("Kubo, SRKw2", KUBO, ds.SRKw2(), np.float64),
+    Run("Kubo, SRKw2", KUBO, ds.SRKw2(), np.float32),
+    Run("rigid body, Midpoint", RIGID_BODY, ds.Midpoint(), np.float64),
+    Run("rigid body, Midpoint", RIGID_BODY, ds.Midpoint(), np.float32),
+    Run("pendulum without noise, Midpoint", PENDULUM, ds.Midpoint(), np.float64),
     Run("pendulum, Midpoint", NOISY_PENDULUM, ds.Midpoint(), np.float64),
-    Run("pendulum, StrangGauss", NOISY_PENDULUM, ds.StrangGauss(), np.float64),
 ]
-_QUICK = [RUNS[0], RUNS[5], RUNS[-2]]
+_QUICK = RUNS[:2]
 
 
 def section(page: Page) -> str:
-    steps, paths = (10_000, 32) if page.quick else (1_000_000, 64)
+    steps, paths = (10_000, 32) if page.quick else (1_000_000, 32)
     print(f"\nErrors of invariants over {steps:,} steps of h = 2^-6, {paths} paths")
     runs = _QUICK if page.quick else RUNS
     rows = []
@@ -153,6 +142,7 @@ def section(page: Page) -> str:
     panels = {KUBO: 0, RIGID_BODY: 1, PENDULUM: 2, NOISY_PENDULUM: 2}
     for run in runs:
         g = growth(run.system, run.solver, steps, paths, run.dtype)
+        print(f"  {run.label}, {run.dtype.__name__}: {g.rms[-1]:.1e}", flush=True)
         exponent, error = g.exponent()
         bias, bias_error = g.bias
         eps = float(np.finfo(run.dtype).eps)
@@ -173,7 +163,8 @@ def section(page: Page) -> str:
         for power in (0.5, 1):
             ax.loglog(n, 1e-16 * n**power, "k:", lw=0.8)
         ax.set(xlabel="steps", title=title)
-        ax.legend(fontsize=7)
+        if ax.lines[:-2]:
+            ax.legend(fontsize=7)
     axes[0].set_ylabel("rms of the relative error of the invariant")
     picture = page.picture(figure, "rounding", "Growth of rounding errors")
     plt.close(figure)
