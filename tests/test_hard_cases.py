@@ -28,6 +28,30 @@ def test_two_bodies_by_an_explicit_method_lose_their_angular_momentum():
     assert r.balance(two_body.PERIOD / 100, 0.01).sigmas > 10
 
 
+def test_two_body_steps_fail_exactly_where_they_have_no_solution():
+    def step(key):
+        k_p, k_q, k_h = jr.split(key, 3)
+        p, q = jr.normal(k_p, (2,)), jr.normal(k_q, (2,))
+        h = jnp.exp(jr.uniform(k_h, (), minval=jnp.log(0.02), maxval=jnp.log(0.5)))
+        # Without noise: the path is not used.
+        drift = two_body.make_terms(diffrax.UnsafeBrownianPath((), key)).terms[0]
+        *_, result = ds.Midpoint().step(drift, 0.0, h, (p, q), 0.0, None, False)
+        solved = result == diffrax.RESULTS.successful
+        return solved, two_body.midpoint_solvable(p, q, h)
+
+    solved, solvable = map(np.asarray, jax.vmap(step)(jr.split(jr.key(0), 4096)))
+    assert not np.any(solved & ~solvable)
+    assert np.mean(~solvable) > 0.01
+    # Next to the fold some that exist are given up.
+    assert np.mean(solvable & ~solved) <= 0.01
+    # The first step at 25 and at 50 to an orbit.
+    h = two_body.PERIOD / np.array([25, 50])
+    start = two_body.start()
+    np.testing.assert_array_equal(
+        jax.vmap(lambda h: two_body.midpoint_solvable(*start, h))(h), [False, True]
+    )
+
+
 def test_two_bodies_with_too_large_steps_fail_loudly():
     # At 12 steps for an orbit the pericentre is not resolved. A step either is reported or
     # keeps the angular momentum.

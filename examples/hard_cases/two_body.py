@@ -40,6 +40,13 @@ def start():
     return jnp.array([0.0, speed]), jnp.array([1 - ECCENTRICITY, 0.0])
 
 
+def midpoint_solvable(p, q, h, x=0.0):
+    """Whether a midpoint step of size h with x = s I has a solution: for the length r of the
+    midpoint, r + h (h + x) / (4 r^2) = |q + h p / 2|, and the left side has a minimum."""
+    c = jnp.sqrt(jnp.sum((q + h * p / 2) ** 2))
+    return c >= 1.5 * jnp.cbrt(jnp.maximum(h * (h + x), 0) / 2)
+
+
 class Orbits(NamedTuple):
     """Of the paths that did not fail, in each row one; saved after each step."""
 

@@ -152,7 +152,8 @@ def section(page: Page) -> str:
              f"{bias / eps:+.1e} ± {bias_error / eps:.1e}"),
         )  # fmt: skip
         style = dict(lw=1, ls="--" if run.dtype is np.float32 else "-")
-        label = f"{run.label.split(', ', 1)[1]}, {name}"
+        quiet = " without noise" if run.system == PENDULUM else ""
+        label = f"{run.label.split(', ', 1)[1]}{quiet}, {name}"
         axes[panels[run.system]].loglog(g.steps, g.rms, label=label, **style)
     shown = table(
         ("system, solver", "precision", "rms at the end", "exponent",
