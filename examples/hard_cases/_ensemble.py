@@ -28,6 +28,8 @@ class Mean(NamedTuple):
         return self.value / self.std_error
 
     def __str__(self) -> str:
+        if not np.isfinite(self.value):
+            return "overflow"
         return f"{self.value:+.4f} ± {self.std_error:.4f}"
 
 

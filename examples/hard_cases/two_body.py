@@ -41,8 +41,8 @@ def start():
 
 
 def midpoint_solvable(p, q, h, x=0.0):
-    """Whether a midpoint step of size h with x = s I has a solution: for the length r of the
-    midpoint, r + h (h + x) / (4 r^2) = |q + h p / 2|, and the left side has a minimum."""
+    """Whether a midpoint step of size h with x = s I has a solution: for the length r of a
+    midpoint, r + h (h + x) / (4 r^2) = |q + h p / 2|, where the left has a minimum."""
     c = jnp.sqrt(jnp.sum((q + h * p / 2) ** 2))
     return c >= 1.5 * jnp.cbrt(jnp.maximum(h * (h + x), 0) / 2)
 
