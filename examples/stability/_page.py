@@ -4,12 +4,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import matplotlib
 
 
 matplotlib.use("Agg")
-jax.config.update("jax_enable_x64", True)
 
 ROOT = Path(__file__).parents[2]
 

@@ -56,7 +56,7 @@ CASES = {
     "Heun": Case(diffrax.Heun(), gaussian),
     "EulerHeun": Case(diffrax.EulerHeun(), gaussian),
 }
-QUICK = ("Midpoint", "Verlet", "Heun")
+QUICK = ("Midpoint", "Verlet")
 
 
 class Args(NamedTuple):
