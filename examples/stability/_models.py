@@ -1,0 +1,132 @@
+"""Linear models and the solvers that take them."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+
+import diffrax_symplectic as ds
+
+
+def weak(key, shape=(), **kwargs):
+    return ds.WeakBrownianPath(shape, key, **kwargs)
+
+
+def second(key, shape=()):
+    return weak(key, shape, second=True)
+
+
+def third(key, shape=()):
+    return weak(key, shape, order=3)
+
+
+def gaussian(key, shape=()):
+    return diffrax.UnsafeBrownianPath(shape, key)
+
+
+def areas(key, shape=()):
+    return diffrax.UnsafeBrownianPath(shape, key, levy_area=diffrax.SpaceTimeLevyArea)
+
+
+class Case(NamedTuple):
+    """A solver with the random variables that it is meant for."""
+
+    solver: diffrax.AbstractSolver
+    path: Callable
+    # The models it takes.
+    models: tuple[str, ...] = ("linear", "kubo", "spring")
+
+
+_SEPARABLE, _ADDITIVE = ("linear", "spring"), ("linear",)
+GENERAL = {
+    "Midpoint": Case(ds.Midpoint(), weak),
+    "SRKs1": Case(ds.SRKs1(), weak),
+    "SRKw1(b=0)": Case(ds.SRKw1(b=0.0), weak),
+    "SRKw2": Case(ds.SRKw2(), weak),
+    "StrangGauss": Case(ds.StrangGauss(), weak),
+}
+SEPARABLE = {
+    "SRKs2": Case(ds.SRKs2(), weak, _SEPARABLE),
+    "SRKs3": Case(ds.SRKs3(), weak, _SEPARABLE),
+    "SRKw3a": Case(ds.SRKw3("a"), weak, _SEPARABLE),
+    "SRKw3b": Case(ds.SRKw3("b"), weak, _SEPARABLE),
+    "SRKw3c": Case(ds.SRKw3("c"), weak, _SEPARABLE),
+    "SRKw4": Case(ds.SRKw4(), weak, _SEPARABLE),
+}
+ADDITIVE = {
+    "SRKs4": Case(ds.SRKs4(), areas, _ADDITIVE),
+    "SRKw5": Case(ds.SRKw5(), second, _ADDITIVE),
+    "AdditiveGauss": Case(ds.AdditiveGauss(), third, _ADDITIVE),
+}
+DIFFRAX = {
+    "Heun": Case(diffrax.Heun(), gaussian),
+    "EulerHeun": Case(diffrax.EulerHeun(), gaussian),
+    "StratonovichMilstein": Case(diffrax.StratonovichMilstein(), gaussian),
+    "SlowRK": Case(diffrax.SlowRK(), areas),
+}
+# For an Ito equation: where the noise is not additive it gets the corrected drift.
+EULER = Case(diffrax.Euler(), gaussian)
+EXPLICIT = {**DIFFRAX, "Euler": EULER}
+
+# Noise Hamiltonians of an oscillator with H0 = (p^2 + q^2) / 2, before the factor s.
+NOISE = {
+    # dp = -q dt + s dw, dq = p dt
+    "linear": lambda p, q: -q,
+    # dp = -q dt - s q o dw, dq = p dt + s p o dw: every path stays on its circle.
+    "kubo": lambda p, q: (p**2 + q**2) / 2,
+    # dp = -q dt - s q dw, dq = p dt: a noisy spring, which pumps energy in.
+    "spring": lambda p, q: q**2 / 2,
+}
+Y0 = (jnp.zeros(()), jnp.zeros(()))
+
+
+def _terms(case: Case):
+    """`args` are the strengths of the models' noises."""
+    energy = lambda t, p, q, args: (p**2 + q**2) / 2
+
+    def noise(t, p, q, args):
+        parts = zip(case.models, args)
+        return jnp.asarray(sum(s * NOISE[name](p, q) for name, s in parts))
+
+    terms = ds.hamiltonian_terms(energy, noise, case.path(jr.key(0)))
+    if not isinstance(case.solver, diffrax.Euler):
+        return terms
+    drift, diffusion = terms.terms
+
+    def corrected(t, y, args):
+        # The equivalent Ito equation: -s^2 y / 2 for the rotation by Kubo's noise, and
+        # nothing for the others, one of them at a time.
+        s = args[case.models.index("kubo")]
+        return jax.tree.map(lambda f, x: f - s**2 * x / 2, drift.vf(t, y, args), y)
+
+    return diffrax.MultiTerm(diffrax.ODETerm(corrected), diffusion)
+
+
+def moment_maps(case: Case, hs, strengths) -> dict[str, np.ndarray]:
+    """For each model the maps of (E p^2, E pq, E qp, E q^2) by one step, with what additive
+    noise adds left out: `maps[i, j]` for `hs[i]` and `strengths[j]`."""
+    terms = _terms(case)
+    one = lambda h, args: ds.second_moment_map(terms, case.solver, 0.0, h, Y0, args)
+    # One program for all models.
+    units = jnp.asarray(strengths)[:, None] * jnp.eye(len(case.models))[:, None]
+    over_args = jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(None, 0))
+    K = jax.jit(jax.vmap(over_args, in_axes=(0, None)))(jnp.asarray(hs), units)
+    quadratic = [4, 5, 7, 8]
+    K = np.asarray(K)[..., quadratic, :][..., quadratic]
+    return {name: K[:, i] for i, name in enumerate(case.models)}
+
+
+def growth_factors(maps: np.ndarray) -> np.ndarray:
+    """The factor by which mean squares grow in each step, in the long run."""
+    return np.max(np.abs(np.linalg.eigvals(maps)), axis=-1)
+
+
+def spring_growth_rate(strengths) -> np.ndarray:
+    """The exact rate at which second moments of the noisy spring grow: the positive root
+    of x^3 + 4 x = 2 s^2, from d/dt (E q^2, E pq, E p^2)."""
+    roots = [np.roots([1, 0, 4, -2 * s**2]) for s in np.atleast_1d(strengths)]
+    return np.array([np.max(r.real[np.abs(r.imag) < 1e-9]) for r in roots])

@@ -1,0 +1,53 @@
+"""Where tables, pictures and pages go."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+
+
+matplotlib.use("Agg")
+
+ROOT = Path(__file__).parents[2]
+
+
+class Page(NamedTuple):
+    """`docs/<name>.md` and the pictures in `docs/<name>/`. A quick run writes them to
+    `examples/output`, so that what is published always comes from a full one."""
+
+    name: str
+    quick: bool
+
+    @property
+    def folder(self) -> Path:
+        return ROOT / ("examples/output" if self.quick else "docs")
+
+    def picture(self, figure, name: str, caption: str) -> str:
+        """Saves it; returns the Markdown that shows it."""
+        path = self.folder / self.name / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=110, bbox_inches="tight")
+        print(f"picture: {path.relative_to(ROOT)}", flush=True)
+        return f"![{caption}]({self.name}/{name}.png)"
+
+    def write(self, sections: Iterable[str]) -> None:
+        path = self.folder / f"{self.name}.md"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n\n".join(s.strip() for s in sections) + "\n")
+        print(f"page: {path.relative_to(ROOT)}", flush=True)
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table, printed too."""
+    rows = [[str(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(header, *rows)]
+    for row in ([*header], *rows):
+        print("  ".join(x.ljust(w) for x, w in zip(row, widths)), flush=True)
+    lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def fill(module: str, **values) -> str:
+    """The text next to a module, with what was measured put in the braces."""
+    return Path(module).with_suffix(".md").read_text().format(**values)

@@ -1,0 +1,128 @@
+"""Growth of mean squares in one step of the linear models, exactly."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import LogNorm
+
+from ._models import (
+    ADDITIVE,
+    Case,
+    EXPLICIT,
+    GENERAL,
+    growth_factors,
+    moment_maps,
+    SEPARABLE,
+    spring_growth_rate,
+)
+from ._page import fill, Page, table
+
+
+ALL = {**GENERAL, **SEPARABLE, **ADDITIVE, **EXPLICIT}
+QUICK = ("Midpoint", "SRKs3", "Heun", "Euler")
+# Below this a growth factor is 1 but for rounding.
+ROUNDING = 1e-12
+
+
+def _linear(page: Page, hs, factors: dict[str, np.ndarray]) -> tuple[str, str]:
+    figure, axes = plt.subplots(figsize=(6, 4))
+    rows = []
+    for name, factor in factors.items():
+        x = factor - 1
+        grows = hs[x > ROUNDING]
+        onset = (
+            "no" if len(grows) == 0 else "at every h" if x.min() > ROUNDING else "yes"
+        )
+        rows.append((name, f"{np.max(np.abs(x[hs <= 1])):.1e}", f"{x[-1]:.1e}", onset))
+        rate = np.maximum(np.abs(x) / hs, 1e-17)
+        if len(grows):
+            axes.loglog(hs, rate, label=name, ls="--")
+        else:
+            axes.loglog(hs, rate, "k-", lw=0.4)
+    axes.plot([], [], "k-", lw=0.4, label="the symplectic ones")
+    axes.set(xlabel="h", ylabel="growth per unit time", ylim=(1e-17, 1e3))
+    axes.legend(fontsize=7)
+    axes.set_title("linear oscillator, additive noise")
+    shown = page.picture(figure, "linear", "Growth on the linear oscillator")
+    plt.close(figure)
+    header = ("solver", "largest excess over 1, h <= 1", "at h = 4", "grows")
+    return table(header, rows), shown
+
+
+def _map(page: Page, name: str, title: str, hs, strengths, values: dict) -> str:
+    """One picture over h and s for each solver."""
+    rows = -(-len(values) // 5)
+    figure, axes = plt.subplots(
+        rows, 5, figsize=(15, 3 * rows), squeeze=False, sharex=True, sharey=True,
+        layout="constrained",
+    )  # fmt: skip
+    norm, image = LogNorm(1e-16, 1e2), None
+    for ax, (label, value) in zip(axes.flat, values.items()):
+        shown = np.clip(np.abs(value), 1e-16, 1e2)
+        image = ax.pcolormesh(strengths, hs, shown, norm=norm, cmap="magma")
+        ax.set(xscale="log", yscale="log", title=label)
+    for ax in axes[-1]:
+        ax.set_xlabel("s")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("h")
+    for ax in axes.flat[len(values) :]:
+        ax.set_visible(False)
+    assert image is not None
+    figure.colorbar(image, ax=axes, label=title)
+    markdown = page.picture(figure, name, title)
+    plt.close(figure)
+    return markdown
+
+
+def _near(grid, *values) -> list[int]:
+    return [int(np.argmin(np.abs(np.log(grid / x)))) for x in values]
+
+
+def section(page: Page) -> str:
+    points = 12 if page.quick else 48
+    hs, strengths = np.geomspace(0.01, 4, points), np.geomspace(0.05, 2, points)
+    cases: dict[str, Case] = {n: ALL[n] for n in (QUICK if page.quick else ALL)}
+    factors = {"linear": {}, "kubo": {}, "spring": {}}
+    for name, case in cases.items():
+        for model, maps in moment_maps(case, hs, strengths).items():
+            factors[model][name] = growth_factors(maps)
+
+    print("\nLinear oscillator: growth of the mean square per step")
+    one_strength = {name: f[:, 0] for name, f in factors["linear"].items()}
+    linear_table, linear_picture = _linear(page, hs, one_strength)
+
+    rates = {n: np.log(f) / hs[:, None] for n, f in factors["kubo"].items()}
+    title = "growth of E(p^2 + q^2) per unit time"
+    kubo_picture = _map(page, "kubo", title, hs, strengths, rates)
+    some, (one,) = _near(hs, 0.01, 0.1, 1.0), _near(strengths, 1.0)
+    print(f"\nKubo oscillator: growth per unit time at s = {strengths[one]:.2g}")
+    kubo_table = table(
+        ("solver", *[f"h = {hs[i]:.2g}" for i in some], "largest of the map"),
+        [
+            (n, *[f"{r[i, one]:.1e}" for i in some], f"{np.max(np.abs(r)):.1e}")
+            for n, r in rates.items()
+        ],
+    )
+
+    exact = spring_growth_rate(strengths)
+    errors = {
+        n: np.log(f) / hs[:, None] / exact - 1 for n, f in factors["spring"].items()
+    }
+    title = "relative error of the growth rate"
+    spring_picture = _map(page, "spring", title, hs, strengths, errors)
+    some, (i,) = _near(strengths, 0.05, 0.3, 2.0), _near(hs, 0.1)
+    print(f"\nNoisy spring: relative error of the growth rate at h = {hs[i]:.2g}")
+    spring_table = table(
+        ("solver", *[f"s = {strengths[j]:.2g}" for j in some]),
+        [(n, *[f"{e[i, j]:+.1e}" for j in some]) for n, e in errors.items()],
+    )
+    return fill(
+        __file__,
+        linear_table=linear_table,
+        linear_picture=linear_picture,
+        kubo_table=kubo_table,
+        kubo_picture=kubo_picture,
+        spring_table=spring_table,
+        spring_picture=spring_picture,
+        h=f"{hs[i]:.2g}",
+        s=f"{strengths[one]:.2g}",
+    )

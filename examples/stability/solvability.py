@@ -1,0 +1,250 @@
+"""How often the stage equation of a step is not solved, and whether it could have been."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import LogNorm
+
+import diffrax_symplectic as ds
+
+from ._page import fill, Page, table
+
+
+class Given(diffrax.AbstractBrownianPath):
+    """The same increment over every step."""
+
+    W: jax.Array
+    t0 = -jnp.inf
+    t1 = jnp.inf
+    levy_area = diffrax.BrownianIncrement
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        del t0, t1, left, use_levy
+        return self.W
+
+
+class Law(NamedTuple):
+    label: str
+    path: Callable
+    # The largest increment over a step of size h.
+    bound: Callable
+
+
+def _truncated(k: int) -> Law:
+    path = lambda g: ds.TruncatedBrownianPath(g, k=k)
+    return Law(f"truncated, k = {k}", path, lambda h: np.sqrt(2 * k * h * -np.log(h)))
+
+
+LAWS = [
+    Law("Gaussian", lambda g: g, lambda h: np.full_like(h, np.inf)),
+    *map(_truncated, (4, 2, 1)),
+    Law(
+        "three-point",
+        lambda g: ds.WeakBrownianPath((), g.key),
+        lambda h: np.sqrt(3 * h),
+    ),
+]
+
+
+class Model(NamedTuple):
+    """`dy = J grad H0 dt + s J grad H1 o dw`, and whether the midpoint rule has a real
+    solution for a step of size h from (p, q) with x = s I."""
+
+    H0: Callable
+    H1: Callable
+    solvable: Callable
+
+
+_oscillator = lambda p, q: (p**2 + q**2) / 2
+MODELS = {
+    # q' = q^2 by the noise alone: m = q + x m^2 / 2 for the midpoint m.
+    "escape": Model(
+        lambda p, q: 0 * p, lambda p, q: p * q**2, lambda h, x, p, q: x * q <= 1 / 2
+    ),
+    # Once p is eliminated, h x m^2 / 4 + (1 + h^2 / 4) m = q + h p / 2.
+    "cubic": Model(
+        _oscillator,
+        lambda p, q: q**3 / 3,
+        lambda h, x, p, q: (1 + h**2 / 4) ** 2 + h * x * (q + h * p / 2) >= 0,
+    ),
+    # r (1 + (h + x r)^2 / 4) = p^2 + q^2 for r = |m|^2, from 0 to infinity on the left.
+    "rotation": Model(
+        _oscillator,
+        lambda p, q: (p**2 + q**2) ** 2 / 4,
+        lambda h, x, p, q: np.full_like(x, True, dtype=bool),
+    ),
+}
+
+
+class Shares(NamedTuple):
+    """Of steps, each with its standard error: by law, step size and strength."""
+
+    failed: np.ndarray
+    # For which there is no solution; and that failed although there is one.
+    unsolvable: np.ndarray
+    given_up: np.ndarray
+    # Solved although there is no solution: none, or something is very wrong.
+    impossible: np.ndarray
+    steps: int
+
+    def std_error(self, share):
+        return np.sqrt(np.maximum(share * (1 - share), 0) / self.steps)
+
+
+def draw(hs, steps: int, seed: int = 0) -> np.ndarray:
+    """Increments over the first step of `steps` paths, by law and step size: the truncated
+    ones of the same Gaussian paths."""
+    keys = jr.split(jr.key(seed), steps)
+
+    def one(h, key):
+        gaussian = diffrax.UnsafeBrownianPath((), key)
+        paths = [law.path(gaussian) for law in LAWS]
+        return jnp.stack([path.evaluate(jnp.zeros(()), h) for path in paths])
+
+    over_keys = jax.vmap(one, in_axes=(None, 0), out_axes=1)
+    W = jax.jit(jax.vmap(over_keys, in_axes=(0, None), out_axes=1))(
+        jnp.asarray(hs), keys
+    )
+    return np.asarray(W)
+
+
+def shares(model: Model, solver, hs, strengths, steps: int, seed: int = 0) -> Shares:
+    """Of one step from points spread evenly over the unit circle."""
+    W = draw(hs, steps, seed)
+    angle = 2 * np.pi * (np.arange(steps) + 0.5) / steps
+    p, q = np.sin(angle), np.cos(angle)
+
+    def one(h, s, w, p, q):
+        H0 = lambda t, p, q, s: model.H0(p, q)
+        noise = lambda t, p, q, s: s * model.H1(p, q)
+        path = Given(w)  # pyright: ignore[reportCallIssue]
+        terms = ds.hamiltonian_terms(H0, noise, path)
+        *_, result = solver.step(terms, 0.0, h, (p, q), s, None, False)
+        return result == diffrax.RESULTS.successful
+
+    over = jax.vmap(one, in_axes=(None, None, 0, 0, 0))
+    over = jax.vmap(over, in_axes=(None, 0, None, None, None))
+    over = jax.jit(jax.vmap(over, in_axes=(0, None, 0, None, None)))
+    # Law after law: those that fail keep the others of their batch waiting.
+    solved = np.stack([np.asarray(over(hs, strengths, w, p, q)) for w in W])
+    x = strengths[:, None] * W[:, :, None]
+    solvable = model.solvable(hs[:, None, None], x, p, q)
+    mean = lambda y: np.mean(y, axis=-1)
+    return Shares(
+        mean(~solved), mean(~solvable), mean(~solved & solvable),
+        mean(solved & ~solvable), steps,
+    )  # fmt: skip
+
+
+def lost_paths(hs, s: float, paths: int, t1: float = 10.0) -> dict[str, np.ndarray]:
+    """The share of whole solves of "rotation" that fail, by step size."""
+    model = MODELS["rotation"]
+    tree = lambda key: diffrax.VirtualBrownianTree(0.0, t1, 1e-3, (), key)
+    makers = {
+        "Gaussian (`VirtualBrownianTree`)": tree,
+        "truncated, k = 2": lambda key: ds.TruncatedBrownianPath(tree(key), k=2),
+        "three-point": lambda key: ds.WeakBrownianPath((), key),
+    }
+    keys = jr.split(jr.key(1), paths)
+    y0 = (jnp.array(0.0), jnp.array(1.0))
+    out = {}
+    for name, make in makers.items():
+
+        def solve(h, key):
+            terms = ds.hamiltonian_terms(
+                lambda t, p, q, args: model.H0(p, q),
+                lambda t, p, q, args: s * model.H1(p, q),
+                make(key),
+            )
+            sol = diffrax.diffeqsolve(
+                terms, ds.Midpoint(), 0.0, t1, h, y0, max_steps=None,
+                adjoint=diffrax.ForwardMode(), throw=False,
+            )  # fmt: skip
+            return sol.result != diffrax.RESULTS.successful
+
+        failed = jax.jit(jax.vmap(solve, in_axes=(None, 0)))
+        out[name] = np.array([np.mean(failed(h, keys)) for h in hs])
+    return out
+
+
+def _picture(page: Page, hs, strengths, results: dict[str, Shares]) -> str:
+    figure, axes = plt.subplots(
+        len(results), len(LAWS), figsize=(15, 3 * len(results)), sharex=True,
+        sharey=True, layout="constrained", squeeze=False,
+    )  # fmt: skip
+    image = None
+    for row, (name, r) in zip(axes, results.items()):
+        row[0].set_ylabel(f"{name}\nh")
+        for ax, failed, none in zip(row, r.failed, r.unsolvable):
+            image = ax.pcolormesh(
+                strengths, hs, np.ma.masked_equal(failed, 0),
+                norm=LogNorm(1e-4, 1), cmap="viridis",
+            )  # fmt: skip
+            if none.any():
+                ax.contour(strengths, hs, none, [1 / r.steps / 2], colors="r")
+            ax.set(xscale="log", yscale="log")
+    for ax, law in zip(axes[0], LAWS):
+        ax.set_title(law.label)
+    for ax in axes[-1]:
+        ax.set_xlabel("s")
+    assert image is not None
+    figure.colorbar(image, ax=axes, label="share of steps that fail (white: none)")
+    markdown = page.picture(figure, "solvability", "Shares of steps that fail")
+    plt.close(figure)
+    return markdown
+
+
+def section(page: Page) -> str:
+    points, steps, paths = (6, 1024, 100) if page.quick else (16, 16_384, 2_000)
+    hs, strengths = np.geomspace(0.01, 0.9, points), np.geomspace(0.1, 4, points)
+    cases: dict[str, tuple[Model, diffrax.AbstractSolver]]
+    cases = {f"Midpoint, {n}": (m, ds.Midpoint()) for n, m in MODELS.items()}
+    # Its one equation is the midpoint step of an oscillator, after the kick.
+    kick = MODELS["cubic"]._replace(solvable=MODELS["rotation"].solvable)
+    cases["SRKw3c, cubic"] = (kick, ds.SRKw3("c"))
+    print(f"\nSteps that fail, in percent of {steps:,}, with standard errors")
+    results = {
+        name: shares(model, solver, hs, strengths, steps)
+        for name, (model, solver) in cases.items()
+    }
+    assert not any(r.impossible.any() for r in results.values())
+    rows = []
+    i, j = points - 2, points - 3
+    for name, r in results.items():
+        for law, f, u, g in zip(LAWS, r.failed, r.unsolvable, r.given_up):
+            percent = lambda y: f"{100 * y:.2f} ± {100 * r.std_error(y):.2f}"
+            cells = [percent(y[i, j]) for y in (f, u, g)]
+            rows.append((name, law.label, *cells, f"{100 * np.max(f):.1f}"))
+    header = (
+        "step",
+        "increments",
+        "fail",
+        "no solution",
+        "given up",
+        "worst of the map",
+    )
+    shown = table(header, rows)
+    kept = {n: r for n, r in results.items() if n.startswith("Midpoint")}
+    picture = _picture(page, hs, strengths, kept)
+
+    print("\nPaths of `rotation` lost until t = 10, s = 2, in percent")
+    lost_hs = [0.4, 0.2, 0.1, 0.05, 0.025]
+    lost = lost_paths(lost_hs, 2.0, paths)
+    error = lambda y: np.sqrt(y * (1 - y) / paths)
+    lost_table = table(
+        ("increments", *[f"h = {h:g}" for h in lost_hs]),
+        [
+            (name, *[f"{100 * y:.2f} ± {100 * error(y):.2f}" for y in share])
+            for name, share in lost.items()
+        ],
+    )
+    return fill(__file__, 
+        table=shown, picture=picture, lost=lost_table, steps=f"{steps:,}",
+        h=f"{hs[i]:.2g}", s=f"{strengths[j]:.2g}", paths=f"{paths:,}",
+    )  # fmt: skip

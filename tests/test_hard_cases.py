@@ -1,0 +1,127 @@
+"""Systems that people bring, by what is known of them exactly: `docs/hard_cases.md`."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+
+import diffrax_symplectic as ds
+from examples.hard_cases import chain, double_well, henon_heiles, two_body
+
+from .problems import FineSample, slope
+
+
+def test_two_bodies_keep_their_angular_momentum_and_gain_energy_as_they_should():
+    s, per_orbit = 0.03, 400
+    r = two_body.orbits(*two_body.SOLVERS["Midpoint"], per_orbit, 4, s, 64)
+    assert r.failed_share == 0
+    assert r.momentum_error <= 5e-14
+    balance = r.balance(two_body.PERIOD / per_orbit, s)
+    assert abs(balance.sigmas) <= 4
+
+
+def test_two_bodies_by_an_explicit_method_lose_their_angular_momentum():
+    r = two_body.orbits(*two_body.SOLVERS["Heun"], 100, 4, 0.01, 16)
+    assert r.momentum_error > 1e-3
+    # And gain energy that nobody gave them.
+    assert r.balance(two_body.PERIOD / 100, 0.01).sigmas > 10
+
+
+def test_two_body_steps_fail_exactly_where_they_have_no_solution():
+    def step(key):
+        k_p, k_q, k_h = jr.split(key, 3)
+        p, q = jr.normal(k_p, (2,)), jr.normal(k_q, (2,))
+        h = jnp.exp(jr.uniform(k_h, (), minval=jnp.log(0.02), maxval=jnp.log(0.5)))
+        # Without noise: the path is not used.
+        drift = two_body.make_terms(diffrax.UnsafeBrownianPath((), key)).terms[0]
+        *_, result = ds.Midpoint().step(drift, 0.0, h, (p, q), 0.0, None, False)
+        solved = result == diffrax.RESULTS.successful
+        return solved, two_body.midpoint_solvable(p, q, h)
+
+    solved, solvable = map(np.asarray, jax.vmap(step)(jr.split(jr.key(0), 4096)))
+    assert not np.any(solved & ~solvable)
+    assert np.mean(~solvable) > 0.01
+    # Next to the fold some that exist are given up.
+    assert np.mean(solvable & ~solved) <= 0.01
+    # The first step at 25 and at 50 to an orbit.
+    h = two_body.PERIOD / np.array([25, 50])
+    start = two_body.start()
+    np.testing.assert_array_equal(
+        jax.vmap(lambda h: two_body.midpoint_solvable(*start, h))(h), [False, True]
+    )
+
+
+def test_two_bodies_with_too_large_steps_fail_loudly():
+    # At 12 steps for an orbit the pericentre is not resolved. A step either is reported or
+    # keeps the angular momentum.
+    r = two_body.orbits(*two_body.SOLVERS["Midpoint"], 12, 5, 0.01, 32)
+    assert r.failed_share > 0
+    if r.failed_share < 1:
+        assert r.momentum_error <= 1e-12
+
+
+def test_escape_from_a_double_well_costs_the_energy_that_noise_brings():
+    e = double_well.escape(*double_well.SOLVERS["Midpoint"], 0.2, 0.1, 10.0, 10_000)
+    assert e.failed == 0
+    assert 0.2 < e.escaped.value < 0.8
+    assert abs(e.balance.sigmas) <= 4
+    # It could be seen if it were not so.
+    assert e.balance.std_error <= 0.02 * -double_well.BOTTOM
+
+
+def test_double_well_with_friction_has_the_moments_of_gibbs():
+    r = double_well.thermal(*double_well.SOLVERS["Midpoint"], 0.1, 15.0, 10_000)
+    # h^2 / 8 is what the midpoint rule's own stationary density may be off by.
+    for mean in (r.p2, r.q2, r.q):
+        assert abs(mean.value) <= 4 * mean.std_error + 0.1**2 / 8
+        assert mean.std_error <= 0.02
+
+
+def test_harmonic_chain_in_64_unknowns_is_heated_as_in_closed_form():
+    hs = (0.1, 1.0)
+    r = chain.heating(ds.Midpoint(), hs)
+    assert np.max(r.energy_defect) <= 1e-13
+    np.testing.assert_allclose(
+        r.rate, list(map(chain.midpoint_heating, hs)), rtol=1e-12
+    )
+
+
+def test_nonlinear_chain_of_32_has_the_exact_mean_energy_and_symplectic_steps():
+    args = chain.Args(beta=1.0, s=0.2)
+    r = chain.nonlinear(*chain.SOLVERS["Midpoint"], 0.05, 2.0, 64, args)
+    assert r.failed == 0
+    assert abs(r.excess.sigmas) <= 4
+    assert np.max(chain.symplecticity(ds.Midpoint(), (0.1, 0.4), args)) <= 1e-13
+
+
+def test_henon_heiles_orbits_leave_for_the_energy_of_the_noise_only():
+    ours = henon_heiles.stay(
+        *henon_heiles.SOLVERS["Midpoint"], 0.003, 0.2, 100.0, paths=512
+    )
+    heun = henon_heiles.stay(
+        *henon_heiles.SOLVERS["Heun"], 0.003, 0.2, 100.0, paths=512
+    )
+    assert ours.failed == heun.failed == 0
+    assert abs(ours.balance.sigmas) <= 4
+    assert heun.balance.sigmas > 20
+    assert heun.left.value > ours.left.value + 0.2
+
+
+def test_henon_heiles_converges_to_itself():
+    steps, fine = [2.0**-k for k in (3, 4, 5)], 2**9
+
+    def ends(key):
+        terms = henon_heiles.make_terms(FineSample.draw(key, fine, 2))
+        solve = lambda h: jnp.concatenate(
+            diffrax.diffeqsolve(
+                terms, ds.Midpoint(), 0.0, 1.0, h, henon_heiles.start(), 0.3
+            ).ys,
+            axis=1,
+        )[0]
+        return jax.lax.map(solve, jnp.array([*steps, 1 / fine]))
+
+    ys = jax.jit(jax.vmap(ends))(jr.split(jr.key(0), 50))
+    squared = jnp.sum((ys[:, :-1] - ys[:, -1:]) ** 2, axis=-1)
+    measured = slope(np.array(steps), np.sqrt(jnp.mean(squared, axis=0)))
+    assert abs(measured - 1) <= 0.15
