@@ -91,7 +91,7 @@ def orbits(
 
 SOLVERS = {
     "Midpoint": (ds.Midpoint(), truncated()),
-    "SRKs3": (ds.SRKs3(), truncated()),
+    "SRKs3(a=1/4)": (ds.SRKs3(a=0.25), truncated()),
     "PlateauVerlet": (ds.PlateauVerlet(), plateaus()),
     "Heun": (diffrax.Heun(), gaussian()),
 }
