@@ -21,6 +21,10 @@ import diffrax_symplectic as ds
 _output = Path(__file__).parent / "output"
 _failed: list[str] = []
 
+# The paper's members of these families; the defaults are others.
+PAPER_SRKW2 = ds.SRKw2(rows=(1, 2, 3, 4))
+PAPER_SRKS3 = ds.SRKs3(a=0.25)
+
 
 def weak(m: int | None = None, **kwargs) -> Callable[[Any], ds.WeakBrownianPath]:
     """Paths of `m` noises (one, without an axis, if `None`) from keys."""

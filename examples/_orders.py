@@ -53,7 +53,10 @@ def exact_moment_map(
 ) -> Callable[[float], np.ndarray]:
     """What moves second moments by one step of size h, for a linear model."""
     terms = make_terms(make_path(jr.key(0)))
-    step = jax.jit(lambda h: ds.second_moment_map(terms, solver, 0.0, h, y0))
+    # Run a few times only: not worth optimising.
+    options = {"xla_backend_optimization_level": 0}
+    moment_map = lambda h: ds.second_moment_map(terms, solver, 0.0, h, y0)
+    step = jax.jit(moment_map, compiler_options=options)
     return lambda h: np.asarray(step(h))
 
 

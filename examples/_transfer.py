@@ -91,7 +91,7 @@ def transfer_expectations(
 def transfer_weak_errors(
     make_terms: Callable,
     solvers: dict,
-    reference: tuple,
+    reference: str,
     y0,
     phi: Callable,
     hs: Iterable[float],
@@ -99,22 +99,19 @@ def transfer_weak_errors(
     degree: int,
 ) -> tuple[dict[str, Errors], float]:
     """The errors of all `solvers`, each a pair of a solver and a path, and the exact
-    expectation: Richardson's extrapolation of `reference`, which is of weak order 2."""
+    expectation: Richardson's extrapolation of `reference`, one of them, which is of weak
+    order 2."""
     hs = np.array([*hs])
-
-    def expectations(solver, path, hs):
-        return transfer_expectations(
-            make_terms, path, solver, y0, phi, hs, widths, degree
-        )
-
-    solver, path = reference
-    coarse, fine = expectations(solver, path, [hs[-1], hs[-1] / 2])
-    exact = fine + (fine - coarse) / 3
-    errors = {}
+    expectations = {}
     for name, (solver, path) in solvers.items():
-        signed = expectations(solver, path, hs) - exact
-        errors[name] = Errors(hs, signed, np.zeros_like(hs))
-    return errors, exact
+        steps = [*hs, hs[-1] / 2] if name == reference else hs
+        expectations[name] = transfer_expectations(
+            make_terms, path, solver, y0, phi, steps, widths, degree
+        )
+    coarse, fine = expectations[reference][-2:]
+    exact = fine + (fine - coarse) / 3
+    signed = {name: values[: len(hs)] - exact for name, values in expectations.items()}
+    return {name: Errors(hs, s, np.zeros_like(hs)) for name, s in signed.items()}, exact
 
 
 def enumerated_expectation(terms, solver, y0, phi: Callable, h, steps: int):

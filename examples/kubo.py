@@ -12,7 +12,16 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
-from ._gallery import claim, gaussian, run, save, trajectory, truncated, weak
+from ._gallery import (
+    claim,
+    gaussian,
+    PAPER_SRKW2,
+    run,
+    save,
+    trajectory,
+    truncated,
+    weak,
+)
 from ._orders import (
     claim_samples,
     claim_slopes,
@@ -60,7 +69,7 @@ def figure_2c(full: bool) -> None:
     hs = [2.0**-k for k in range(1, 9)]
     solvers = {
         "SRKw1(b=0)": (ds.SRKw1(b=0.0), weak()),
-        "SRKw2": (ds.SRKw2(), weak()),
+        "SRKw2": (PAPER_SRKW2, weak()),
         "Milstein": (diffrax.StratonovichMilstein(), gaussian()),
     }
     exact, sampled = {}, {}
@@ -88,7 +97,7 @@ def figure_3(full: bool) -> None:
         "Heun": (diffrax.Heun(), gaussian()),
         "SRKs1": (ds.SRKs1(), truncated),
         "SRKw1(b=0)": (ds.SRKw1(b=0.0), weak()),
-        "SRKw2": (ds.SRKw2(), weak()),
+        "SRKw2": (PAPER_SRKW2, weak()),
     }
     figure, axes = plt.subplots(1, 5, figsize=(15, 3.6))
     angle = np.linspace(0, 2 * np.pi, 200)
