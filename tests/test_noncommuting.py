@@ -212,10 +212,8 @@ def test_kurtosis_without_terms_is_short_of_the_law_and_terms_mend_it():
 
 
 def test_areas_over_cells_follow_chens_rule():
-    tree = diffrax.VirtualBrownianTree(
-        0.0, 1.0, 2**-6, (3,), jr.key(0), diffrax.SpaceTimeLevyArea
-    )
-    path = ds.LevyAreaBrownianPath(tree, jr.key(1), terms=2, cell=1 / 16)
+    sample = FineSample.draw(jr.key(0), 32, 3)
+    path = ds.LevyAreaBrownianPath(sample, jr.key(1), terms=2, cell=1 / 16)
     evaluate = jax.jit(lambda a, b: path.evaluate(a, b, use_levy=True))
     whole = evaluate(0.25, 0.75)
     left, right = evaluate(0.25, 0.5), evaluate(0.5, 0.75 + 1e-12)
@@ -223,29 +221,27 @@ def test_areas_over_cells_follow_chens_rule():
     expected = left.A + right.A + (outer - outer.T) / 2
     np.testing.assert_allclose(whole.A, expected, atol=1e-14)
     np.testing.assert_allclose(whole.W, left.W + right.W, atol=1e-14)
-    # The tree's own increments, up to its tolerance.
-    direct = tree.evaluate(0.25, 0.75, use_levy=True)
-    np.testing.assert_allclose(whole.W, direct.W, atol=1e-12)
-    np.testing.assert_allclose(whole.H, direct.H, atol=1e-12)
-    np.testing.assert_array_equal(path.evaluate(0.25, 0.75), whole.W)
-    # Areas are at least those of the polygon through the cells, up to cell areas.
+    # Increments and space-time areas are those of the path inside.
+    direct = sample.evaluate(0.25, 0.75, use_levy=True)
+    np.testing.assert_allclose(whole.W, direct.W, atol=1e-14)
+    np.testing.assert_allclose(whole.H, direct.H, atol=1e-14)
+    np.testing.assert_allclose(jax.jit(path.evaluate)(0.25, 0.75), whole.W, atol=1e-14)
     with pytest.raises(Exception, match="multiples of `cell`"):
         evaluate(0.25, 0.7)
 
 
 def test_gradients_pass_through_a_whole_solve():
     y0, args = random_problem(jr.key(0), 1, 2)
-    tree = diffrax.VirtualBrownianTree(
-        0.0, 1.0, 2**-6, (2,), jr.key(0), diffrax.SpaceTimeLevyArea
-    )
-    paths = weak_path(2, two_point=True), ds.LevyAreaBrownianPath(tree, jr.key(1))
+    sample = FineSample.draw(jr.key(0), 10, 2)
+    areas = ds.LevyAreaBrownianPath(sample, jr.key(1), terms=1)
+    paths = weak_path(2, two_point=True), areas
 
     def ends(x, size):
         a, u, v, phi = args["noise"]
         scaled = {**args, "noise": (size * a, u, v, phi)}
         solve = lambda solver, path: (
             diffrax.diffeqsolve(
-                ds.hamiltonian_terms(H0, noise, path), solver, 0.0, 0.5, 0.1, x, scaled
+                ds.hamiltonian_terms(H0, noise, path), solver, 0.0, 0.2, 0.1, x, scaled
             ).ys
         )
         return sum(jnp.sum(jfu.ravel_pytree(solve(*z))[0]) for z in zip(SOLVERS, paths))
@@ -258,30 +254,29 @@ def test_gradients_pass_through_a_whole_solve():
         np.testing.assert_allclose(gradient[i], change / 2e-5, atol=1e-7)
 
 
-def test_parts_of_a_system_may_be_missing_and_noises_in_several_terms():
-    y0, args = random_problem(jr.key(0), 1, 2)
-    solver = ds.NinomiyaVictoir()
-    full = ds.hamiltonian_terms(H0, noise, weak_path(2, two_point=True))
-    drift, diffusion = full.terms
-    end = lambda terms: np.array(
-        diffrax.diffeqsolve(terms, solver, 0.0, 0.4, 0.1, y0, args).ys
-    )
-    only_drift, only_noise = end(drift), end(diffusion)
-    # A circle needs no noise: the drift alone is solved to order 4 in h / 2.
-    exact = diffrax.diffeqsolve(drift, diffrax.Dopri8(), 0.0, 0.4, 0.001, y0, args).ys
-    np.testing.assert_allclose(only_drift, np.array(exact), atol=1e-6)
-    assert np.abs(only_noise - np.array(y0)).max() > 1e-2
-    halves = [
-        ds.hamiltonian_terms(H0, lambda *x, i=i: noise(*x)[i : i + 1], path).terms[1]
-        for i, path in enumerate(
-            Given(jnp.array([w]), two_point=jnp.ones(1)) for w in (0.1, -0.2)
+def test_flows_of_an_oscillator_are_those_of_the_gauss_method():
+    # Of q + ip each flow over the "time" x makes R(-ix) (q + ip). Drift or noise may be
+    # missing, and noises may come in several terms.
+    h, x, y = 0.3, 0.4, -0.2
+    R = lambda z: (1 + z / 2 + z**2 / 12) / (1 - z / 2 + z**2 / 12)
+    energy = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2
+    given = lambda w: Given(jnp.array([w]), two_point=jnp.ones(1))
+    drift, first = ds.hamiltonian_terms(energy, energy, given(x)).terms
+    second = ds.hamiltonian_terms(energy, energy, given(y)).terms[1]
+    half = R(-0.5j * h)
+    for terms, factor in (
+        (drift, half**2),
+        (first, R(-1j * x)),
+        (diffrax.MultiTerm(drift, first), half**2 * R(-1j * x)),
+        (diffrax.MultiTerm(drift, first, second), half**2 * R(-1j * x) * R(-1j * y)),
+    ):
+        step = jax.jit(
+            lambda terms=terms: ds.NinomiyaVictoir().step(
+                terms, 0.0, h, (jnp.zeros(1), jnp.ones(1)), None, None, False
+            )[0]
         )
-    ]
-    together = ds.hamiltonian_terms(
-        H0, noise, Given(jnp.array([0.1, -0.2]), two_point=jnp.ones(2))
-    )
-    split = end(diffrax.MultiTerm(drift, *halves))
-    np.testing.assert_allclose(split, end(together), atol=1e-14)
+        p, q = step()
+        np.testing.assert_allclose(q + 1j * p, [factor], atol=1e-15)
 
 
 def test_missing_variables_are_refused_with_advice():
