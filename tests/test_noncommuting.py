@@ -211,7 +211,7 @@ def test_kurtosis_without_terms_is_short_of_the_law_and_terms_mend_it():
     assert short < mended
 
 
-def test_areas_over_cells_follow_chens_rule():
+def test_areas_over_cells_follow_chens_rule(optimized):
     tree = diffrax.VirtualBrownianTree(
         0.0, 1.0, 2**-6, (3,), jr.key(0), diffrax.SpaceTimeLevyArea
     )
