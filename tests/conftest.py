@@ -1,8 +1,40 @@
-import jax
-import pytest
+"""Settings of the suite. Nearly all of its time goes into tracing and compiling programs
+that run for milliseconds, so they are compiled with little optimization. What a claim
+is about optimized programs, or runs for long, has the fixture `optimized`; the examples
+and benchmarks always run optimized."""
 
+import gc
+import os
+
+
+# Inherited by the processes that some tests start, too.
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+
+import jax  # noqa: E402
+import jaxlib  # noqa: E402
+import pytest  # noqa: E402
+
+
+# The older code generator compiles in a third of the time. XLA aborts for flags that it
+# does not know, and they come and go with its versions.
+if jaxlib.__version__.startswith("0.10."):
+    flags = os.environ.get("XLA_FLAGS", ""), "--xla_cpu_use_fusion_emitters=false"
+    os.environ["XLA_FLAGS"] = " ".join(flags)
 
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_disable_most_optimizations", True)
+
+# Tracing makes millions of objects that live on: to look through them every few hundred
+# takes a third of its time.
+gc.set_threshold(100_000, 50, 100)
+
+
+@pytest.fixture
+def optimized():
+    """Programs compiled within the test are optimized as a user's are."""
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -10,3 +42,4 @@ def free_compiled_programs():
     """Thousands of programs in one process exhaust its memory mappings, and XLA crashes."""
     yield
     jax.clear_caches()
+    gc.collect()
