@@ -31,10 +31,12 @@ gc.set_threshold(100_000, 50, 100)
 
 @pytest.fixture
 def optimized():
-    """Programs compiled within the test are optimized as a user's are."""
+    """Programs run in the test are optimized: those compiled before are not reused."""
+    jax.clear_caches()
     jax.config.update("jax_disable_most_optimizations", False)
     yield
     jax.config.update("jax_disable_most_optimizations", True)
+    jax.clear_caches()
 
 
 @pytest.fixture(autouse=True, scope="module")

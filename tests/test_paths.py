@@ -153,7 +153,7 @@ def test_truncation_error_is_below_its_bound(k, h):
     assert 2 * np.trapezoid((x - bound) ** 2 * density, x) <= h**k
 
 
-def test_truncated_path_clips_and_keeps_the_levy_area():
+def test_truncated_path_clips_and_keeps_the_levy_area(optimized):
     h = 0.5
     plain = diffrax.VirtualBrownianTree(
         0.0, 1000.0, h / 2, (3,), jr.key(0), levy_area=diffrax.SpaceTimeLevyArea
