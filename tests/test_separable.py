@@ -159,9 +159,13 @@ def test_step_is_symplectic_for_a_thousand_random_systems(name, dtype, bound):
     assert jnp.max(defects) <= bound
 
 
+# Variants d, e and f have the defects of a, b and c: the same steps at the negated
+# increments (a test below), which are as likely.
 @pytest.mark.parametrize("m", [1, 2])
-@all_solvers
-def test_local_weak_defect_has_the_order_of_the_solver(solver, m):
+@pytest.mark.parametrize("name", [n for n in SEPARABLE if n[-1] not in "def"])
+def test_local_weak_defect_has_the_order_of_the_solver(name, m):
+    solver = SEPARABLE[name]
+
     def H0(t, p, q, args):
         return jnp.sum(jnp.cosh(p) + jnp.cos(p) + jnp.cos(q + t) + 0.1 * q**4)
 
@@ -187,7 +191,8 @@ def test_local_weak_defect_has_the_order_of_the_solver(solver, m):
 def _step(solver, W, h=0.1):
     y0, args = _problem(jr.key(0), 2, 2)
     terms = ds.hamiltonian_terms(H0, noise, Given(W))
-    y1, *_, result = solver.step(terms, 0.0, h, y0, args, None, False)
+    step = lambda y0: solver.step(terms, 0.0, h, y0, args, None, False)
+    y1, *_, result = eqx.filter_jit(step)(y0)
     assert result == diffrax.RESULTS.successful
     return y1
 
@@ -229,7 +234,7 @@ _good_H0 = lambda t, p, q, args: jnp.sum(p**2 + q**4)
 _good_noise = lambda t, p, q, args: jnp.sum(jnp.sin(q))
 
 
-@all_solvers
+@pytest.mark.parametrize("solver", [ds.SRKw3("c"), ds.SRKw4(), ds.SRKs2(), ds.SRKs3()])
 @pytest.mark.parametrize(
     "H0, noise, derivative",
     [

@@ -63,9 +63,13 @@ def test_defect_sees_a_method_that_is_not_symplectic(solver):
     assert ds.symplecticity_defect(terms, solver, 0.0, 0.1, y0, args) > 1e-6
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-@pytest.mark.parametrize("solver", GENERAL.values(), ids=GENERAL.keys())
-def test_stage_equations_are_solved_to_rounding_error(solver, dtype):
+@pytest.mark.parametrize(
+    "name, dtype",
+    [(name, jnp.float64) for name in GENERAL]
+    + [(name, jnp.float32) for name in ("Midpoint", "SRKw2")],
+)
+def test_stage_equations_are_solved_to_rounding_error(name, dtype):
+    solver = GENERAL[name]
     # The Jacobian above is implicit, and would be symplectic at any approximate
     # solution. So the end of the step is compared to a solve that goes on and on.
     stubborn = optx.Newton(rtol=0.0, atol=0.0, linear_solver=ds.SmallLU())

@@ -101,7 +101,7 @@ def plateaus(key):
 
 
 def levy_areas(key):
-    return ds.LevyAreaBrownianPath(with_area(key, (2,)), key)
+    return ds.LevyAreaBrownianPath(with_area(key, (2,)), key, terms=8)
 
 
 two = lambda path: lambda key: path(key, (2,))
@@ -145,7 +145,7 @@ MODELS = {
                 ds.NinomiyaVictoir(),
                 lambda key: weak(key, (2,), two_point=True),
             ),
-            ("LevyAreaMidpoint", ds.LevyAreaMidpoint(), levy_areas),
+            ("LevyAreaMidpoint, 8 Fourier terms", ds.LevyAreaMidpoint(), levy_areas),
         ],
     ),
     "Quartic oscillator, additive noise": (
