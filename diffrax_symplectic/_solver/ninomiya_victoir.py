@@ -11,7 +11,14 @@ from .._plan import make_plan
 from .._root_finder import PicardNewton
 from .._tableau import FlatTableau, Stage
 from ._stages import first_failure, Step, take_step
-from ._terms import apply, check_state, controls, drift_driven, split_terms
+from ._terms import (
+    apply,
+    check_state,
+    controls,
+    drift_driven,
+    number_of_noises,
+    split_terms,
+)
 from .base import AbstractSymplecticSolver
 
 
@@ -100,7 +107,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del solver_state, made_jump
-        drift, noise = split_terms(terms)
+        drift, _ = split_terms(terms)
         middle = t0 + (t1 - t0) / 2
 
         def along_drift(t0, t1, y):
@@ -110,23 +117,23 @@ class NinomiyaVictoir(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
             return take_step(_gauss, step, y, self)
 
         y, first = along_drift(t0, middle, y0)
-        y, second = self._along_noise(noise, t0, t1, middle, y, args)
+        y, second = self._along_noise(terms, t0, t1, middle, y, args)
         y1, third = along_drift(middle, t1, y)
         result = first_failure(first_failure(first, second), third)
         return y1, None, dict(y0=y0, y1=y1), None, result
 
-    def _along_noise(self, noise, t0, t1, time, y0, args):
+    def _along_noise(self, terms, t0, t1, time, y0, args):
         """The flows of all noises, the time standing still at `time`."""
+        _, noise = split_terms(terms)
         if len(noise) == 0:
             return y0, diffrax.RESULTS.successful
-        drawn = controls(noise, ["W"], t0, t1, type(self).__name__)
+        m = number_of_noises(terms)
+        # One noise has no order.
+        names = ["W", "two_point"] if m > 1 else ["W"]
+        drawn = controls(noise, names, t0, t1, type(self).__name__)
         increments, unravel = jfu.ravel_pytree(drawn["W"])
-        m = increments.size
         numbers = jnp.arange(m)
         if m > 1:
-            names = ["W", "two_point"]
-            drawn = controls(noise, names, t0, t1, type(self).__name__)
-            increments, _ = jfu.ravel_pytree(drawn["W"])
             coin = jtu.tree_leaves(drawn["two_point"])[0].reshape(-1)[0] > 0
             numbers = jnp.where(coin, numbers, numbers[::-1])
 

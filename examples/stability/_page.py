@@ -1,7 +1,10 @@
 """Where tables, pictures and pages go."""
 
+import argparse
+import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple
 
 import matplotlib
@@ -51,3 +54,23 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def fill(module: str, **values) -> str:
     """The text next to a module, with what was measured put in the braces."""
     return Path(module).with_suffix(".md").read_text().format(**values)
+
+
+def run(name: str, description: str | None, modules: Sequence[ModuleType]) -> None:
+    """The command that makes a page: the text of `page.md` next to the modules, and a
+    section of each."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="small sizes; writes to examples/output and leaves docs alone",
+    )
+    page = Page(name, parser.parse_args().quick)
+    start = time.perf_counter()
+    sections = [(ROOT / "examples" / name / "page.md").read_text()]
+    for module in modules:
+        begin = time.perf_counter()
+        sections.append(module.section(page))
+        print(f"({time.perf_counter() - begin:.0f} seconds)", flush=True)
+    page.write(sections)
+    print(f"\nAll done in {time.perf_counter() - start:.0f} seconds.")
