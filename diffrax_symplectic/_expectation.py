@@ -157,22 +157,26 @@ def expectation(
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jr.wrap_key_data(key)
     key_data, impl = np.asarray(jr.key_data(key)), jr.key_impl(key)
-    estimate = _start(fn, key, key_data, start, num_paths)
-
-    first = estimate.num_paths + estimate.num_failed
+    first = 0 if start is None else start.num_paths + start.num_failed
     # No more lanes than paths.
     batch_size = min(batch_size, max(1, -(-(num_paths - first) // len(devices))))
     mesh = Mesh(np.array(devices), ("paths",))
     step = batch_size * len(devices)
-    begins = range(first, num_paths, step)
+
+    def batch(begin: int):
+        lo_hi = np.array([begin & 0xFFFFFFFF, begin >> 32], np.uint32)
+        size = np.array(min(step, num_paths - begin), np.int32)
+        return _batch(fn, key_data, lo_hi, size, impl, mesh, batch_size)
+
+    # JAX keeps what it traced here for the first batch.
+    shapes = eqx.filter_eval_shape(batch, min(first, num_paths - 1))
+    estimate = _start(shapes[2], key_data, start, num_paths)
     running = collections.deque()
     meter = progress_meter.init()
     try:
-        for begin in begins:
-            lo_hi = np.array([begin & 0xFFFFFFFF, begin >> 32], np.uint32)
-            size = np.array(min(step, num_paths - begin), np.int32)
+        for begin in range(first, num_paths, step):
             # One computes while the one before is added up.
-            running.append(_batch(fn, key_data, lo_hi, size, impl, mesh, batch_size))
+            running.append(batch(begin))
             if len(running) == 2:
                 estimate = _merge(estimate, running.popleft())
                 done = estimate.num_paths + estimate.num_failed
@@ -186,16 +190,20 @@ def expectation(
     return estimate
 
 
-def _start(fn, key, key_data, start: Expectation | None, num_paths: int) -> Expectation:
+def _start(
+    mean: PyTree[jax.ShapeDtypeStruct],
+    key_data: np.ndarray,
+    start: Expectation | None,
+    num_paths: int,
+) -> Expectation:
     """The estimate without any path, or the one to go on from."""
-    phi, _ = eqx.filter_eval_shape(_evaluate, fn, key)
-    for leaf in jtu.tree_leaves(phi):
+    for leaf in jtu.tree_leaves(mean):
         if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
             raise ValueError(
                 "`fn` must return real arrays; got one of dtype "
                 f"{leaf.dtype}. Return real and imaginary parts."
             )
-    zeros = jtu.tree_map(lambda s: np.zeros(s.shape), phi)
+    zeros = jtu.tree_map(lambda s: np.zeros(s.shape), mean)
     if start is None:
         return Expectation(zeros, zeros, 0, 0, key_data)
     if not np.array_equal(start.key_data, key_data):

@@ -4,10 +4,12 @@ from . import kubo, linear_oscillator, rigid_body, synchrotron
 from ._gallery import run
 
 
+FIGURES = (
+    linear_oscillator.FIGURES | kubo.FIGURES | synchrotron.FIGURES | rigid_body.FIGURES
+)
+# These take longest, and start first so that both processes end at about the same time.
+LONGEST = {name: FIGURES[name] for name in ("1", "2c", "6a", "6b")}
+
+
 if __name__ == "__main__":
-    run(
-        linear_oscillator.FIGURES
-        | kubo.FIGURES
-        | synchrotron.FIGURES
-        | rigid_body.FIGURES
-    )
+    run(LONGEST | FIGURES)

@@ -40,6 +40,17 @@ def test_mean_and_standard_error_are_those_of_all_paths(batch_size):
     assert (got.num_paths, got.num_failed) == (1000, 0)
 
 
+def test_what_is_sampled_is_traced_once():
+    calls = []
+
+    def fn(key):
+        calls.append(key)
+        return jr.normal(key)
+
+    ds.expectation(fn, jr.key(0), 1000, batch_size=100)
+    assert len(calls) == 1
+
+
 def test_single_precision_is_accumulated_in_double():
     ones = lambda key: jnp.float32(1) + 1e-3 * jr.normal(key, (), jnp.float32)
     got = ds.expectation(ones, jr.key(0), 100_000, batch_size=1000)

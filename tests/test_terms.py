@@ -144,6 +144,44 @@ def test_without_noise_the_solvers_have_order_two(solver):
     np.testing.assert_allclose(np.log2(coarse / fine), 2, atol=0.1)
 
 
+_GAUSSIAN = diffrax.UnsafeBrownianPath(
+    (1,), jr.key(0), levy_area=diffrax.SpaceTimeLevyArea
+)
+
+
+@pytest.mark.parametrize(
+    "solver, path",
+    [
+        (ds.SRKs2(), _GAUSSIAN),
+        (ds.SRKs3(), _GAUSSIAN),
+        (ds.SRKs4(), _GAUSSIAN),
+        (ds.SRKw3("a"), weak_path(1)),
+        (ds.SRKw4(), weak_path(1)),
+        (ds.SRKw5(), weak_path(1, second=True)),
+        (ds.AdditiveGauss(), weak_path(1, order=3)),
+        (ds.StrangGauss(), weak_path(1)),
+        (ds.NinomiyaVictoir(), weak_path(1, two_point=True)),
+        (ds.PlateauVerlet(), ds.PlateauBrownianPath(_GAUSSIAN, jr.key(1))),
+        (ds.LevyAreaMidpoint(), ds.LevyAreaBrownianPath(_GAUSSIAN, jr.key(1))),
+    ],
+    ids=lambda x: type(x).__name__,
+)
+def test_with_noise_of_size_zero_the_solvers_have_the_order_they_state(solver, path):
+    energy = lambda t, p, q, args: jnp.sum(p**2 / 2 - jnp.cos(q))
+    nothing = lambda t, p, q, args: 0.0 * q
+    terms = ds.hamiltonian_terms(energy, nothing, path)
+    y0 = (jnp.array([0.5]), jnp.array([1.0]))
+
+    def end(terms, solver, h):
+        adjoint = diffrax.ForwardMode()
+        sol = diffrax.diffeqsolve(terms, solver, 0.0, 1.0, h, y0, adjoint=adjoint)
+        return jnp.concatenate(sol.ys, axis=None)
+
+    exact = end(terms.terms[0], diffrax.Dopri8(), 1e-2)
+    coarse, fine = (jnp.linalg.norm(end(terms, solver, h) - exact) for h in (0.2, 0.1))
+    np.testing.assert_allclose(jnp.log2(coarse / fine), solver.order(terms), atol=0.15)
+
+
 def test_noise_alone_can_be_solved():
     path = weak_path(1)
     term = diffrax.ControlTerm(lambda t, y, args: y[:, None], path)

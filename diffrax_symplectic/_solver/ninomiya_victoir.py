@@ -51,7 +51,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
     two stage vectors, one after another; each evaluates all noises of the terms.
 
     Symplectic path by path for any Hamiltonians, and any Stratonovich system will do:
-    quadratic invariants that drift and noises share are conserved. Weak order 2. Order 2
+    quadratic invariants that drift and noises share are conserved. Weak order 2. Order 4
     without noise. No free parameters. For one noise, [`diffrax_symplectic.StrangGauss`][]
     has the same order and is cheaper.
 
@@ -151,7 +151,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
 
     def order(self, terms):
         del terms
-        return 2
+        return 4
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
