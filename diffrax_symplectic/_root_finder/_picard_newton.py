@@ -140,12 +140,10 @@ class PicardNewton(optx.AbstractRootFinder):
             ys = lax.fori_loop(0, pairs, shift, (start.y,) * 3)
             # In the loops below this norm costs more: XLA computes what it is fused with
             # anew for each entry.
-            short = self.norm is optx.max_norm
-            measure = (
-                eqx.tree_at(lambda s: s.norm, self, _folded_norm) if short else self
-            )
-            size_prev, _ = _sizes(measure, options, ys[2], (ys[1] ** ω - ys[0] ** ω).ω)
-            size, overall = _sizes(measure, options, ys[2], (ys[2] ** ω - ys[1] ** ω).ω)
+            norm = _folded_norm if self.norm is optx.max_norm else self.norm
+            last, prev = ((ys[i] ** ω - ys[i - 1] ** ω).ω for i in (2, 1))
+            size_prev, _ = _sizes(self, norm, options, ys[2], prev)
+            size, overall = _sizes(self, norm, options, ys[2], last)
             state = _State(ys[2], size, _ratio(size, size_prev), overall)
             step = jnp.array(2 * pairs)
         state, _ = lax.while_loop(proceed, advance, (state, step))
@@ -244,18 +242,18 @@ def _newton(self: PicardNewton, fn, args, options, state: _State, tags) -> _Stat
 def _correct(self: PicardNewton, options, state: _State, diff) -> _State:
     """Subtracts the correction and measures it."""
     y = (state.y**ω - diff**ω).ω
-    size, overall = _sizes(self, options, y, diff)
+    size, overall = _sizes(self, self.norm, options, y, diff)
     shrink = jnp.where(jnp.isfinite(state.size), _ratio(size, state.size), 1)
     return _State(y, size, shrink, overall)
 
 
-def _sizes(self: PicardNewton, options, y, diff) -> tuple[Scalar, Scalar]:
+def _sizes(self: PicardNewton, norm, options, y, diff) -> tuple[Scalar, Scalar]:
     """A correction in units of the tolerance, and relative to the whole iterate."""
     # What the unknown is added to: increments are only needed to the accuracy of the
     # state that they change.
     scale_of = options.get("scale", lambda y: y)
-    sizes = [self.norm(d) for d in jtu.tree_leaves(diff)]
-    scales = [self.norm(s) for s in jtu.tree_leaves(scale_of(y))]
+    sizes = [norm(d) for d in jtu.tree_leaves(diff)]
+    scales = [norm(s) for s in jtu.tree_leaves(scale_of(y))]
     rtol = 2 * jnp.finfo(sizes[0].dtype).eps if self.rtol is None else self.rtol
     largest = ft.partial(ft.reduce, jnp.maximum)
     size = largest([_ratio(a, rtol * b + self.atol) for a, b in zip(sizes, scales)])
