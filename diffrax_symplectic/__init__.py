@@ -35,6 +35,7 @@ from ._solver import (
     SRKw3 as SRKw3,
     SRKw4 as SRKw4,
     SRKw5 as SRKw5,
+    StormerVerlet as StormerVerlet,
     StrangGauss as StrangGauss,
 )
 from ._tableau import (

@@ -1,5 +1,8 @@
 """What a tableau promises, as residuals that vanish when it keeps the promise."""
 
+import dataclasses
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
 
@@ -7,6 +10,7 @@ from ._tableau import (
     AbstractTableau,
     AdditiveTableau,
     GeneralTableau,
+    PartitionedTableau,
     SeparableTableau,
 )
 
@@ -46,21 +50,23 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
 
     - For a [`diffrax_symplectic.GeneralTableau`][] with three-point increments: weak
         order 1 for any number of noises, weak order 2 for one.
-    - For a [`diffrax_symplectic.SeparableTableau`][] with three-point increments, what
-        remains of the conditions for Itô equations if the noise does not read what it
-        changes: again order 2 is for one noise.
+    - For a [`diffrax_symplectic.PartitionedTableau`][] or
+        [`diffrax_symplectic.SeparableTableau`][] (where $\hat\alpha = \alpha$ and
+        $A = \hat A = A^0$): what remains of the conditions for Itô equations if the noise
+        does not read what it changes.
     - For a [`diffrax_symplectic.AdditiveTableau`][]: any number of noises, with
         constant $b_k$ if the tableau is `constant`.
 
     **Arguments:**
 
-    - `tableau`: any tableau of this package.
+    - `tableau`: any tableau of these.
     - `order`: 1 or 2.
 
     **Returns:** the residual of each condition, by its formula. The conditions for order
     2 contain those for order 1.
 
-    **Raises:** a `ValueError` for any other order.
+    **Raises:** a `ValueError` for any other order, for other tableaus, or for random
+    variables of unknown variance.
 
     ??? cite "Reference"
 
@@ -97,9 +103,12 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
         first, second = _weak_general(tableau)
     elif isinstance(tableau, SeparableTableau):
         first, second = _weak_separable(tableau)
-    else:
-        assert isinstance(tableau, AdditiveTableau)
+    elif isinstance(tableau, PartitionedTableau):
+        first, second = _weak_partitioned(tableau)
+    elif isinstance(tableau, AdditiveTableau):
         first, second = _weak_additive(tableau)
+    else:
+        raise _unknown(tableau)
     conditions = first if order == 1 else first | second
     return {name: float(value) for name, value in conditions.items()}
 
@@ -110,7 +119,9 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
 
     - 1/2 for a [`diffrax_symplectic.GeneralTableau`][], and 1 if the noises commute,
         since every noise has the same coefficients;
-    - 1 for a [`diffrax_symplectic.SeparableTableau`][];
+    - 1 for a [`diffrax_symplectic.SeparableTableau`][] or
+        [`diffrax_symplectic.PartitionedTableau`][] (with more variables than $I_k$ these
+        may have 3/2, which is not tested here);
     - 3/2 for an [`diffrax_symplectic.AdditiveTableau`][], in the variables $I_k = W_k$
         and $I_{k0} / h = W_k / 2 + H_k$.
 
@@ -119,6 +130,8 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
     - `tableau`: any tableau of this package.
 
     **Returns:** the residual of each condition, by its formula.
+
+    **Raises:** a `ValueError` for other tableaus, or random variables of unknown variance.
 
     ??? cite "Reference"
 
@@ -156,22 +169,34 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
             "beta.B1e - 1/2": tableau.beta @ tableau.B1.sum(axis=1) - 1 / 2,
         }
     elif isinstance(tableau, SeparableTableau):
-        conditions = {
-            "alpha.e - 1": tableau.alpha.sum() - 1,
-            "beta.e - 1": tableau.beta["W"].sum() - 1,
-            **_others_vanish(tableau, e=np.ones(len(tableau.c1)), A1e=tableau.c1),
+        conditions = _strong_partitioned(tableau.partitioned())
+        # Of the paper's further variables, which are not independent of `W`.
+        conditions |= _others_vanish(tableau.beta, A1e=tableau.c1)
+    elif isinstance(tableau, PartitionedTableau):
+        conditions = _strong_partitioned(tableau)
+    elif isinstance(tableau, AdditiveTableau):
+        first, second = _weak_additive(tableau)
+        al, c1 = tableau.alpha, tableau.c1
+        B_H = tableau.B.get("H", np.zeros((len(al), len(c1))))
+        beta_H = tableau.beta.get("H", np.zeros(len(c1)))
+        conditions = first | second
+        conditions |= {
+            "alpha.B[H]e - 1": al @ B_H.sum(axis=1) - 1,
+            "beta[W].c1 - 1/2": tableau.beta["W"] @ c1 - 1 / 2,
+            "beta[H].c1 + 1": beta_H @ c1 + 1,
         }
     else:
-        assert isinstance(tableau, AdditiveTableau)
-        first, second = _weak_additive(tableau)
-        beta, B, c1 = tableau.beta, tableau.B, tableau.c1
-        time_area = {
-            "alpha.B[H]e - 1": tableau.alpha @ B["H"].sum(axis=1) - 1,
-            "beta[W].c1 - 1/2": beta["W"] @ c1 - 1 / 2,
-            "beta[H].c1 + 1": beta["H"] @ c1 + 1,
-        }
-        conditions = first | second | time_area
+        raise _unknown(tableau)
     return {name: float(value) for name, value in conditions.items()}
+
+
+def _strong_partitioned(tableau: PartitionedTableau) -> dict:
+    return {
+        "alpha.e - 1": tableau.alpha.sum() - 1,
+        "alpha_hat.e - 1": tableau.alpha_hat.sum() - 1,
+        "beta.e - 1": tableau.beta["W"].sum() - 1,
+        **_others_vanish(tableau.beta, e=np.ones(len(tableau.A1))),
+    }
 
 
 def _weak_general(tableau: GeneralTableau) -> tuple[dict, dict]:
@@ -202,40 +227,72 @@ def _weak_general(tableau: GeneralTableau) -> tuple[dict, dict]:
     return first, second
 
 
-def _weak_separable(tableau: SeparableTableau) -> tuple[dict, dict]:
-    al, be = tableau.alpha, tableau.beta["W"]
-    A0e, A1, A1e = tableau.c0, tableau.A1, tableau.c1
-    B0e = tableau.B0["W"].sum(axis=1)
-    e = np.ones(len(A1))
+def _weak_partitioned(tableau: PartitionedTableau) -> tuple[dict, dict]:
+    be, A1 = tableau.beta["W"], tableau.A1
+    B0e = {name: B0.sum(axis=1) for name, B0 in tableau.B0.items()}
     first = {
-        "alpha.e - 1": al.sum() - 1,
+        "alpha.e - 1": tableau.alpha.sum() - 1,
+        "alpha_hat.e - 1": tableau.alpha_hat.sum() - 1,
         "(beta.e)^2 - 1": be.sum() ** 2 - 1,
-        **_others_vanish(tableau, e=e),
+        **_others_vanish(tableau.beta, e=np.ones(len(A1))),
     }
+    squares = sum(_variance(v) * (tableau.alpha_hat @ x**2) for v, x in B0e.items())
+    products = sum(
+        _variance(v) * (tableau.beta[v] @ A1 @ x)
+        for v, x in B0e.items()
+        if v in tableau.beta
+    )
     second = {
-        "alpha.A0e - 1/2": al @ A0e - 1 / 2,
-        "(beta.e)(alpha.B0e) - 1/2": be.sum() * (al @ B0e) - 1 / 2,
-        "alpha.(B0e)^2 - 1/2": al @ B0e**2 - 1 / 2,
-        "(beta.e)(beta.A1e) - 1/2": be.sum() * (be @ A1e) - 1 / 2,
-        "beta.A1(B0e)": be @ A1 @ B0e,
-        "beta.A1((B0e)^2)": be @ A1 @ B0e**2,
-        **_others_vanish(tableau, A1e=A1e, **{"A1(B0e)": A1 @ B0e}),
+        "alpha.A_hat e - 1/2": tableau.alpha @ tableau.c_hat - 1 / 2,
+        "alpha_hat.Ae - 1/2": tableau.alpha_hat @ tableau.A.sum(axis=1) - 1 / 2,
+        "(beta.e)(alpha_hat.B0e) - 1/2": be.sum() * (tableau.alpha_hat @ B0e["W"])
+        - 1 / 2,
+        "sum over variables: variance alpha_hat.(B0e)^2 - 1/2": squares - 1 / 2,
+        "(beta.e)(beta.A1e) - 1/2": be.sum() * (be @ tableau.c1) - 1 / 2,
+        "sum over variables: variance beta.A1(B0e)": products,
     }
     return first, second
 
 
-def _others_vanish(tableau: SeparableTableau, **moments: np.ndarray) -> dict:
+def _weak_separable(tableau: SeparableTableau) -> tuple[dict, dict]:
+    """With the paper's conditions on further variables, which are not independent of `W`:
+    those in `B0` must not be live."""
+    B0 = {"W": tableau.B0["W"]}
+    partitioned = dataclasses.replace(tableau.partitioned(), B0=B0)
+    first, second = _weak_partitioned(partitioned)
+    B0e = tableau.B0["W"].sum(axis=1)
+    return first, second | {
+        "beta.A1((B0e)^2)": tableau.beta["W"] @ tableau.A1 @ B0e**2,
+        **_others_vanish(tableau.beta, A1e=tableau.c1, **{"A1(B0e)": tableau.A1 @ B0e}),
+    }
+
+
+def _others_vanish(beta: Mapping[str, np.ndarray], **moments: np.ndarray) -> dict:
     """Weights of random variables other than `W` that must not show."""
     return {
         f"beta[{name}].{label}": weights @ moment
-        for name, weights in tableau.beta.items()
+        for name, weights in beta.items()
         if name != "W"
         for label, moment in moments.items()
     }
 
 
-# Variances of the random variables of a step, in units of its size.
-_VARIANCE = {"W": 1, "second": 1, "third": 1, "H": 1 / 12}
+def _variance(name: str) -> float:
+    """The variance of a random variable of a step, in units of the step's size."""
+    known = {"W": 1, "second": 1, "third": 1, "two_point": 1, "H": 1 / 12, "C": 1 / 6}
+    if name not in known:
+        raise ValueError(
+            f"The conditions are known for the random variables {', '.join(known)}; got a "
+            f"tableau with `{name}`. `weak_order_defect` measures the order of any solver."
+        )
+    return known[name]
+
+
+def _unknown(tableau) -> ValueError:
+    return ValueError(
+        "The conditions are known for `GeneralTableau`, `SeparableTableau`, "
+        f"`PartitionedTableau` and `AdditiveTableau`; got `{type(tableau).__name__}`."
+    )
 
 
 def _weak_additive(tableau: AdditiveTableau) -> tuple[dict, dict]:
@@ -244,7 +301,7 @@ def _weak_additive(tableau: AdditiveTableau) -> tuple[dict, dict]:
     for name, weights in tableau.beta.items():
         exact = 1 if name == "W" else 0
         first[f"beta[{name}].e - {exact}"] = weights.sum() - exact
-    squares = sum(_VARIANCE[name] * (al @ Be**2) for name, Be in B.items())
+    squares = sum(_variance(name) * (al @ Be**2) for name, Be in B.items())
     second = {
         "alpha.Ae - 1/2": al @ tableau.c0 - 1 / 2,
         "alpha.B[W]e - 1/2": al @ B["W"] - 1 / 2,

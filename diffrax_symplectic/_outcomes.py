@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import diffrax
 import jax
@@ -12,7 +12,12 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from ._brownian import WeakBrownianPath, WeakIncrement
+from ._brownian import (
+    PlateauBrownianPath,
+    PlateauIncrement,
+    WeakBrownianPath,
+    WeakIncrement,
+)
 
 
 class Outcomes(NamedTuple):
@@ -24,7 +29,7 @@ class Outcomes(NamedTuple):
     put: Callable[[diffrax.AbstractBrownianIncrement], PyTree[diffrax.AbstractTerm]]
 
 
-_Law = list[tuple[float, float]]
+_Law: TypeAlias = list[tuple[float, float]]
 _THREE_POINT: _Law = [(-np.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (np.sqrt(3.0), 1 / 6)]
 _FOUR_POINT: _Law = [
     (sign * np.sqrt(3 + s * np.sqrt(6)), (3 - s * np.sqrt(6)) / 12)
@@ -43,7 +48,7 @@ def _gaussian(variance: float, nodes: int) -> _Law:
 
 def outcomes(terms: PyTree[diffrax.AbstractTerm], h, nodes: int) -> Outcomes:
     """All outcomes of a step of size `h`, for `terms` with one Brownian path."""
-    path = _the_path(terms)
+    path, plateaus = _the_path(terms)
     laws: dict[str, _Law]
     if isinstance(path, WeakBrownianPath):
         laws = {"W": _THREE_POINT if path.order == 2 else _FOUR_POINT}
@@ -59,6 +64,9 @@ def outcomes(terms: PyTree[diffrax.AbstractTerm], h, nodes: int) -> Outcomes:
         increment_cls = path.levy_area
         if issubclass(increment_cls, diffrax.SpaceTimeLevyArea):
             laws["H"] = _gaussian(1 / 12, nodes)
+    if plateaus:
+        laws["C"] = [(x / np.sqrt(6), weight) for x, weight in _TWO_POINT]
+        increment_cls = PlateauIncrement
 
     zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), path.shape)
     flat, unravel = jfu.ravel_pytree(zeros)
@@ -109,27 +117,30 @@ def _is_path(x) -> bool:
     return isinstance(x, diffrax.AbstractBrownianPath)
 
 
-def _the_path(
-    terms,
-) -> WeakBrownianPath | diffrax.UnsafeBrownianPath | diffrax.VirtualBrownianTree:
+_Known: TypeAlias = (
+    WeakBrownianPath | diffrax.UnsafeBrownianPath | diffrax.VirtualBrownianTree
+)
+
+
+def _the_path(terms) -> tuple[_Known, bool]:
+    """The path, without the plateaus that may be around it, and whether they are."""
     leaves = jtu.tree_leaves(terms, is_leaf=_is_path)
     paths = [x for x in leaves if _is_path(x)]
-    known = (
-        WeakBrownianPath,
-        diffrax.UnsafeBrownianPath,
-        diffrax.VirtualBrownianTree,
-    )
-    if len(paths) != 1 or not isinstance(paths[0], known):
+    path = paths[0] if len(paths) == 1 else None
+    plateaus = isinstance(path, PlateauBrownianPath)
+    if plateaus:
+        path = path.path
+    if not isinstance(path, _Known):
         raise ValueError(
             "`terms` must hold exactly one Brownian path, a `WeakBrownianPath`, whose "
             "outcomes can be enumerated, or one of Diffrax's, whose Gaussian increments "
-            f"are integrated over; got {[type(p).__name__ for p in paths]}."
+            "are integrated over, also within a `PlateauBrownianPath`; got "
+            f"{[type(p).__name__ for p in paths]}."
         )
-    path = paths[0]
     gaussian = diffrax.BrownianIncrement, diffrax.SpaceTimeLevyArea
     if not isinstance(path, WeakBrownianPath) and path.levy_area not in gaussian:
         raise ValueError(
             "Expectations over Gaussian increments are for paths with `levy_area="
             f"BrownianIncrement` or `SpaceTimeLevyArea`; got {path.levy_area.__name__}."
         )
-    return path
+    return path, plateaus

@@ -278,7 +278,8 @@ class SeparableTableau(AbstractTableau):
         """Times of the noise stages, as fractions of the step."""
         return self.A1.sum(axis=1)
 
-    def flatten(self) -> FlatTableau:
+    def partitioned(self) -> "PartitionedTableau":
+        """The same method with its coefficients for velocities written out."""
         return PartitionedTableau(
             alpha=self.alpha,
             alpha_hat=self.alpha,
@@ -287,10 +288,13 @@ class SeparableTableau(AbstractTableau):
             A_hat=self.A0,
             B0=self.B0,
             A1=self.A1,
-        ).flatten()
+        )
+
+    def flatten(self) -> FlatTableau:
+        return self.partitioned().flatten()
 
     def check_structure(self, drift, noise, t0, y0, args, solver) -> None:
-        check_separable(drift, noise, t0, y0, args, solver)
+        self.partitioned().check_structure(drift, noise, t0, y0, args, solver)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -327,17 +331,28 @@ class PartitionedTableau(AbstractTableau):
         _check_all(self, alpha=(s,), alpha_hat=(v,), A=(v, s), A_hat=(s, v), A1=(r, v))
         _check_by_variable(self, beta=(r,), B0=(v, r))
 
+    @property
+    def c_hat(self) -> Float[np.ndarray, " s"]:
+        """Times of the forces, as fractions of the step."""
+        return self.A_hat.sum(axis=1)
+
+    @property
+    def c1(self) -> Float[np.ndarray, " r"]:
+        """Times of the noise stages, as fractions of the step."""
+        return self.A1.sum(axis=1)
+
     def flatten(self) -> FlatTableau:
         s, v, r = len(self.alpha), len(self.alpha_hat), len(self.A1)
         names = _variables(self.B0, self.beta)
         B0 = _columns(self.B0, names, (v, r))
         A1 = np.concatenate([self.A1] * len(names))
         # Forces first: where either can be the unknown, let it be the one that costs more.
-        stages = [Stage(("h",), float(c), "q", "p") for c in self.A_hat.sum(axis=1)]
+        stages = [Stage(("h",), float(c), "q", "p") for c in self.c_hat]
         # The velocity g does not depend on time, so that its stages may share theirs.
         stages += [Stage(("h",), 0.0, "p", "q") for _ in range(v)]
-        c1 = self.A1.sum(axis=1)
-        stages += [Stage((name,), float(c), "q", "p") for name in names for c in c1]
+        stages += [
+            Stage((name,), float(c), "q", "p") for name in names for c in self.c1
+        ]
         zeros, n = np.zeros, len(A1)
         return FlatTableau(
             stages=tuple(stages),

@@ -234,7 +234,9 @@ _good_H0 = lambda t, p, q, args: jnp.sum(p**2 + q**4)
 _good_noise = lambda t, p, q, args: jnp.sum(jnp.sin(q))
 
 
-@pytest.mark.parametrize("solver", [ds.SRKw3("c"), ds.SRKw4(), ds.SRKs2(), ds.SRKs3()])
+@pytest.mark.parametrize(
+    "solver", [ds.SRKw3("c"), ds.SRKw4(), ds.SRKs2(), ds.SRKs3(), ds.StormerVerlet()]
+)
 @pytest.mark.parametrize(
     "H0, noise, derivative",
     [
@@ -309,7 +311,9 @@ def test_unused_halves_of_gradients_are_not_computed():
 
 
 @pytest.mark.parametrize(
-    "solver, m", [(ds.SRKs2(), 1), (ds.SRKs2(), 2), (ds.SRKs3(), 1), (ds.SRKs3(), 2)]
+    "solver, m",
+    [(s, m) for s in (ds.SRKs2(), ds.SRKs3(), ds.StormerVerlet()) for m in (1, 2)],
+    ids=repr,
 )
 def test_strong_order_one(solver, m):
     y0, args = _problem(jr.key(3), 1, m)

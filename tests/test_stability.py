@@ -170,7 +170,7 @@ def test_a_singular_linear_step_is_reported():
 
 @pytest.mark.parametrize(
     "name, limit",
-    [("Verlet", 2), ("PlateauVerlet", 4), ("Midpoint", None)],
+    [("StormerVerlet", 2), ("PlateauVerlet", 4), ("Midpoint", None)],
 )
 def test_stiff_limits(name, limit):
     # h times the fastest frequency.
@@ -191,7 +191,7 @@ def test_explicit_methods_that_are_not_symplectic_have_no_stable_step():
 def test_stiff_nonlinear_energies():
     hs = np.array([0.5, 1.8, 2.2]) / stiff.fastest()
     midpoint = stiff.energies(stiff.CASES["Midpoint"], hs, 2.0, 256)
-    verlet = stiff.energies(stiff.CASES["Verlet"], hs, 2.0, 256)
+    verlet = stiff.energies(stiff.CASES["StormerVerlet"], hs, 2.0, 256)
     for e in (*midpoint, verlet[0]):
         assert e.failed == 0
         assert abs(e.excess) <= 4 * e.excess_error

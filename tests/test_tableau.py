@@ -139,3 +139,25 @@ def test_malformed_parameters_are_refused(value):
 def test_weak_order_residuals_know_orders_one_and_two():
     with pytest.raises(ValueError, match="`order` must be 1 or 2"):
         ds.weak_order_residuals(ds.Midpoint().tableau, 3)
+
+
+def test_conditions_are_known_for_known_tableaus_and_variables():
+    class Other(ds.AbstractTableau):
+        def flatten(self):
+            return ds.Midpoint().tableau.flatten()
+
+        def check_structure(self, drift, noise, t0, y0, args, solver):
+            pass
+
+    for residuals in (
+        ds.strong_order_residuals,
+        lambda x: ds.weak_order_residuals(x, 1),
+    ):
+        with pytest.raises(ValueError, match="got `Other`"):
+            residuals(Other())
+    own = ds.AdditiveTableau([1], {"W": [1]}, [[0.5]], {"W": [[1]], "mine": [[1]]}, [0])
+    with pytest.raises(ValueError, match="got a tableau with `mine`"):
+        ds.weak_order_residuals(own, 2)
+    # Without space-time area there is no strong order 3/2.
+    strong = ds.strong_order_residuals(ds.SRKw5().tableau)
+    assert abs(strong["beta[H].c1 + 1"]) == 1

@@ -162,6 +162,7 @@ _GAUSSIAN = diffrax.UnsafeBrownianPath(
         (ds.StrangGauss(), weak_path(1)),
         (ds.NinomiyaVictoir(), weak_path(1, two_point=True)),
         (ds.PlateauVerlet(), ds.PlateauBrownianPath(_GAUSSIAN, jr.key(1))),
+        (ds.StormerVerlet(), weak_path(1)),
         (ds.LevyAreaMidpoint(), ds.LevyAreaBrownianPath(_GAUSSIAN, jr.key(1))),
     ],
     ids=lambda x: type(x).__name__,

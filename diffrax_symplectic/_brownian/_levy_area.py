@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from .._custom_types import BM, RealScalarLike
 from ._fixed_steps import require_fixed_steps
 from ._weak import place_key
+from ._wrapper import AbstractWrappedPath, require_space_time_area
 
 
 class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
@@ -48,7 +49,7 @@ class _Piece(eqx.Module):
         )
 
 
-class LevyAreaBrownianPath(diffrax.AbstractBrownianPath):
+class LevyAreaBrownianPath(AbstractWrappedPath):
     r"""Adds the Lévy areas of a [`diffrax_symplectic.LevyAreaIncrement`][] to the
     increments of a Brownian path with space-time Lévy area. Step sizes have to be fixed.
 
@@ -134,13 +135,7 @@ class LevyAreaBrownianPath(diffrax.AbstractBrownianPath):
         negative or `cell` is not positive; an error when run if a step does not consist of
         cells.
         """
-        area = getattr(path, "levy_area", type(None))
-        if not issubclass(area, diffrax.AbstractSpaceTimeLevyArea):
-            raise ValueError(
-                "`LevyAreaBrownianPath` needs a path with space-time Lévy area, for "
-                "example `diffrax.VirtualBrownianTree(..., levy_area=diffrax."
-                f"SpaceTimeLevyArea)`; got {type(path).__name__} with {area.__name__}."
-            )
+        require_space_time_area(path, type(self).__name__)
         if not isinstance(terms, int) or terms < 0:
             raise ValueError(f"`terms` must be an integer from 0 on; got {terms!r}.")
         if cell is not None and not cell > 0:
@@ -149,14 +144,6 @@ class LevyAreaBrownianPath(diffrax.AbstractBrownianPath):
         self.key = key
         self.terms = terms
         self.cell = cell
-
-    @property
-    def t0(self):
-        return self.path.t0
-
-    @property
-    def t1(self):
-        return self.path.t1
 
     @property
     def levy_area(self):

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from .._custom_types import BM, RealScalarLike
 from ._fixed_steps import require_fixed_steps
 from ._weak import fair_sign, random_words
+from ._wrapper import AbstractWrappedPath, require_space_time_area
 
 
 class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
@@ -26,7 +27,7 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
     C: BM
 
 
-class PlateauBrownianPath(diffrax.AbstractBrownianPath):
+class PlateauBrownianPath(AbstractWrappedPath):
     """Adds the plateaus of a [`diffrax_symplectic.PlateauIncrement`][] to the increments of
     a Brownian path with space-time Lévy area. Step sizes have to be fixed."""
 
@@ -42,23 +43,9 @@ class PlateauBrownianPath(diffrax.AbstractBrownianPath):
 
         **Raises:** a `ValueError` if `path` has no space-time Lévy area.
         """
-        area = getattr(path, "levy_area", type(None))
-        if not issubclass(area, diffrax.AbstractSpaceTimeLevyArea):
-            raise ValueError(
-                "`PlateauBrownianPath` needs a path with space-time Lévy area, for example "
-                "`diffrax.VirtualBrownianTree(..., levy_area=diffrax.SpaceTimeLevyArea)`; "
-                f"got {type(path).__name__} with {area.__name__}."
-            )
+        require_space_time_area(path, type(self).__name__)
         self.path = path
         self.key = key
-
-    @property
-    def t0(self):
-        return self.path.t0
-
-    @property
-    def t1(self):
-        return self.path.t1
 
     @property
     def levy_area(self):

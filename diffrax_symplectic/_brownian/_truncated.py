@@ -8,9 +8,10 @@ from jaxtyping import Array, PyTree
 
 from .._custom_types import RealScalarLike
 from ._fixed_steps import require_fixed_steps
+from ._wrapper import AbstractWrappedPath
 
 
-class TruncatedBrownianPath(diffrax.AbstractBrownianPath):
+class TruncatedBrownianPath(AbstractWrappedPath):
     r"""Bounds the increments of a Brownian path, for implicit strong methods.
 
     Over a step of size $h < 1$ an increment $\sqrt h\,\xi$ becomes
@@ -64,14 +65,6 @@ class TruncatedBrownianPath(diffrax.AbstractBrownianPath):
             )
         self.path = path
         self.k = k
-
-    @property
-    def t0(self):
-        return self.path.t0
-
-    @property
-    def t1(self):
-        return self.path.t1
 
     @property
     def levy_area(self):

@@ -14,3 +14,4 @@ from .ninomiya_victoir import NinomiyaVictoir as NinomiyaVictoir
 from .strang_gauss import StrangGauss as StrangGauss
 from .additive_gauss import AdditiveGauss as AdditiveGauss
 from .plateau_verlet import PlateauVerlet as PlateauVerlet
+from .stormer_verlet import StormerVerlet as StormerVerlet

@@ -33,9 +33,10 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
     in expectation, its mean square: the first brings order 3/2 where the noise is constant
     along the step, the second where it is not.
 
-    No equation to solve. Order 2 without noise. No free parameters. A Hamiltonian without
-    the structure is refused while tracing. As explicit methods are, it is limited to steps
-    that resolve the fastest frequency $\omega$ of $H_0$: $\omega h < 4$.
+    No equation to solve. Weak order 2, and order 2 without noise. No free parameters. A
+    Hamiltonian without the structure is refused while tracing. As explicit methods are, it
+    is limited to steps that resolve the fastest frequency $\omega$ of $H_0$:
+    $\omega h < 4$.
 
     !!! warning
 
@@ -68,3 +69,8 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
     def strong_order(self, terms):
         del terms
         return 1.5
+
+    def weak_order(self, terms):
+        """Order of convergence of expectations."""
+        del terms
+        return 2

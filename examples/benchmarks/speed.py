@@ -101,7 +101,7 @@ def plateaus(key):
 
 
 def levy_areas(key):
-    return ds.LevyAreaBrownianPath(with_area(key, (2,)), key, terms=8)
+    return ds.LevyAreaBrownianPath(with_area(key, (2,)), key)
 
 
 two = lambda path: lambda key: path(key, (2,))
@@ -132,6 +132,7 @@ MODELS = {
             ('SRKw3("a")', ds.SRKw3("a"), two(weak)),
             ('SRKw3("c")', ds.SRKw3("c"), two(weak)),
             ("SRKw4", ds.SRKw4(), two(weak)),
+            ("StormerVerlet", ds.StormerVerlet(), two(weak)),
             ("PlateauVerlet", ds.PlateauVerlet(), plateaus),
         ],
     ),
@@ -145,7 +146,7 @@ MODELS = {
                 ds.NinomiyaVictoir(),
                 lambda key: weak(key, (2,), two_point=True),
             ),
-            ("LevyAreaMidpoint, 8 Fourier terms", ds.LevyAreaMidpoint(), levy_areas),
+            ("LevyAreaMidpoint", ds.LevyAreaMidpoint(), levy_areas),
         ],
     ),
     "Quartic oscillator, additive noise": (

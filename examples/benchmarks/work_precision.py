@@ -88,6 +88,7 @@ def weak(model: str):
             "SRKw5": (ds.SRKw5(), Weak((), second=True)),
             "AdditiveGauss": (ds.AdditiveGauss(), Weak((), order=3)),
             "SRKw4": (ds.SRKw4(), Weak(())),
+            "StormerVerlet": (ds.StormerVerlet(), Weak(())),
             "SRKs4": (ds.SRKs4(), Area(())),
             "ShARK": (diffrax.ShARK(), Area(())),
             "Heun": (diffrax.Heun(), Gaussian(())),
@@ -103,6 +104,7 @@ def weak(model: str):
             "SRKw3a": (ds.SRKw3("a"), Weak((2,))),
             "SRKw3c": (ds.SRKw3("c"), Weak((2,))),
             "SRKw4": (ds.SRKw4(), Weak((2,))),
+            "StormerVerlet": (ds.StormerVerlet(), Weak((2,))),
             "Heun": (diffrax.Heun(), Gaussian((2,))),
             "SlowRK": (diffrax.SlowRK(), Area((2,))),
         }
@@ -178,7 +180,8 @@ STRONG = {
         synchrotron.Y0,
         2,
         lambda y: y[0],
-        {"PlateauVerlet": ds.PlateauVerlet(), "SRKs3": ds.SRKs3(),
+        {"PlateauVerlet": ds.PlateauVerlet(),
+         "StormerVerlet": ds.StormerVerlet(), "SRKs3": ds.SRKs3(),
          "Midpoint": ds.Midpoint(), "Heun": diffrax.Heun(),
          "SlowRK": diffrax.SlowRK()},
         ds.PlateauVerlet(),
@@ -210,7 +213,7 @@ def _plateaus(path, key, cell):
 
 
 def _levy_areas(path, key, cell):
-    return ds.LevyAreaBrownianPath(path, key, terms=0 if cell else 8, cell=cell)
+    return ds.LevyAreaBrownianPath(path, key, terms=0 if cell else 2, cell=cell)
 
 
 # What solvers ask of a path beyond space-time area.

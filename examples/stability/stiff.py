@@ -19,24 +19,6 @@ OMEGA = 50.0
 SIGMA = 0.5
 
 
-class Verlet(ds.AbstractSymplecticRungeKutta):
-    """Half of the kick, one Stormer-Verlet step, half of the kick: a solver that a user
-    might write."""
-
-    tableau = ds.PartitionedTableau(
-        alpha=[1],
-        alpha_hat=[1 / 2, 1 / 2],
-        beta={"W": [1 / 2, 1 / 2]},
-        A=[[0], [1]],
-        A_hat=[[1 / 2, 0]],
-        B0={"W": [[1 / 2, 0]] * 2},
-        A1=[[0, 0], [1 / 2, 1 / 2]],
-    )
-
-    def order(self, terms):
-        return 2
-
-
 def plateaus(key, shape=()):
     k_path, k_signs = jr.split(key)
     return ds.PlateauBrownianPath(areas(k_path, shape), k_signs)
@@ -52,11 +34,11 @@ CASES = {
     "SRKw4": Case(ds.SRKw4(), weak),
     "SRKs4": Case(ds.SRKs4(), areas),
     "PlateauVerlet": Case(ds.PlateauVerlet(), plateaus),
-    "Verlet": Case(Verlet(), weak),
+    "StormerVerlet": Case(ds.StormerVerlet(), weak),
     "Heun": Case(diffrax.Heun(), gaussian),
     "EulerHeun": Case(diffrax.EulerHeun(), gaussian),
 }
-QUICK = ("Midpoint", "Verlet")
+QUICK = ("Midpoint", "StormerVerlet")
 
 
 class Args(NamedTuple):

@@ -1,0 +1,83 @@
+from typing import ClassVar
+
+from .._tableau import PartitionedTableau
+from .base import AbstractSymplecticRungeKutta
+
+
+_tab = PartitionedTableau(
+    alpha=[1],
+    alpha_hat=[1 / 2, 1 / 2],
+    beta=[1],
+    # The momenta before and after the kick.
+    A=[[0], [1]],
+    A_hat=[[1 / 2, 0]],
+    B0=[[0], [1]],
+    A1=[[1 / 2, 0]],
+)
+
+
+class StormerVerlet(AbstractSymplecticRungeKutta):
+    r"""The Störmer--Verlet method with the noise in its kick: explicit, symplectic, of weak
+    order 2 and strong order 1 for any number of noises, for $H_0 = V(p) + U_0(t, q)$ and
+    $H_k = U_k(t, q)$.
+
+    $$\bar q = Q + \tfrac h2 g(P), \qquad
+      P_1 = P + h f(t_n + \tfrac h2, \bar q)
+        + \sum_k \sigma_k(t_n + \tfrac h2, \bar q) I_k, \qquad
+      Q_1 = \bar q + \tfrac h2 g(P_1)$$
+
+    in the letters of [`diffrax_symplectic.SeparableTableau`][]. Force and noise read the
+    same $q$, so that the kick is the exact flow of both together; a symmetric splitting of
+    the generator has weak order 2. One evaluation of the forces, and no equation to solve.
+
+    Order 2 without noise. No free parameters. A Hamiltonian without the structure is
+    refused while tracing. As explicit methods are, it is limited to steps that resolve the
+    fastest frequency $\omega$ of $H_0$: $\omega h < 2$.
+
+    Any Brownian path will do: a [`diffrax_symplectic.WeakBrownianPath`][] for expectations,
+    one of Diffrax's for paths.
+
+    ??? cite "Reference"
+
+        The splitting is that of Strang (1968). That symmetric splittings have weak order 2:
+
+        ```bibtex
+        @article{strang1968construction,
+            author = {Strang, Gilbert},
+            title = {On the Construction and Comparison of Difference Schemes},
+            journal = {SIAM Journal on Numerical Analysis},
+            volume = {5},
+            number = {3},
+            pages = {506--517},
+            year = {1968},
+            doi = {10.1137/0705041},
+        }
+
+        @article{ninomiya2008weak,
+            author = {Ninomiya, Syoiti and Victoir, Nicolas},
+            title = {Weak Approximation of Stochastic Differential Equations and
+                     Application to Derivative Pricing},
+            journal = {Applied Mathematical Finance},
+            volume = {15},
+            number = {2},
+            pages = {107--121},
+            year = {2008},
+            doi = {10.1080/13504860701413958},
+        }
+        ```
+    """
+
+    tableau: ClassVar[PartitionedTableau] = _tab
+
+    def order(self, terms):
+        del terms
+        return 2
+
+    def strong_order(self, terms):
+        del terms
+        return 1.0
+
+    def weak_order(self, terms):
+        """Order of convergence of expectations."""
+        del terms
+        return 2
