@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM, RealScalarLike
+from .._once import once
 from ._fixed_steps import require_fixed_steps
 from ._weak import place_key
 from ._wrapper import AbstractWrappedPath, require_space_time_area
@@ -27,6 +28,10 @@ class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
     W: BM
     H: BM
     A: Float[Array, "m m"]
+
+
+# Up to so many Fourier terms matrix products are written out.
+_WRITTEN_OUT = 4
 
 
 class _Piece(eqx.Module):
@@ -60,7 +65,8 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     So for any `terms` the mean and all covariances of $W$, $H$ and $A$ are exact; the law
     of $A$ is approached as `terms` grows, with an error (after Mrongowius and Rößler) in
     mean square of $\mathcal O(h / \text{terms})$. Without terms it is the approximation of
-    Davie. A step draws $2 m\, (\text{terms} + 1) + m^2$ normal numbers for $m$ noises.
+    Davie. A step draws $2 m\, (\text{terms} + 1) + \frac12 m (m - 1)$ normal numbers for
+    $m$ noises.
 
     With `cell`, the path is refined consistently: it is sampled over cells of that size,
     and what it returns over a longer stretch is put together from these by Chen's rule, so
@@ -197,7 +203,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         )
 
     def _sample(self, t0, t1) -> _Piece:
-        increment = self.path.evaluate(t0, t1, use_levy=True)
+        increment = once(lambda: self.path.evaluate(t0, t1, use_levy=True))
         assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
         W, _ = jfu.ravel_pytree(increment.W)
         H, _ = jfu.ravel_pytree(increment.H)
@@ -222,15 +228,38 @@ def _bridge_area(
     s = 1 / (2 * np.pi**2 * r**2)
     rest, rest_squared = 1 / 12 - np.sum(s), max(1 / 360 - np.sum(s**2), 0)
     cast = lambda x: jnp.asarray(x, H.dtype)
-    k_a, k_b, k_rest, k_mean, k_area = jr.split(key, 5)
-    a = cast(np.sqrt(s)) * jr.normal(k_a, (m, terms), H.dtype)
-    b = cast(np.sqrt(s)) * jr.normal(k_b, (m, terms), H.dtype)
-    total = jnp.sum(a, axis=1) + np.sqrt(rest) * jr.normal(k_rest, (m,), H.dtype)
+    # In one draw: each further one costs a hash of its own.
+    sizes = m * terms, m * terms, m, m, m * (m - 1) // 2
+    normals = jr.normal(key, (sum(sizes),), H.dtype)
+    a, b, from_rest, by_mean, by_area = jnp.split(normals, np.cumsum(sizes)[:-1])
+    a, b = (cast(np.sqrt(s)) * x.reshape(m, terms) for x in (a, b))
+    total = jnp.sum(a, axis=1) + np.sqrt(rest) * from_rest
     # Given that all cosine coefficients, the rest included, sum up to -H.
     a = a - cast(12 * s) * (total + H)[:, None]
-    series = jnp.matmul(a * cast(np.pi * r), b.T, precision=jax.lax.Precision.HIGHEST)
+    series = _weighted_product(a, b, np.pi * r)
     # The rest: those coefficients have the mean -12 s_r H and the variance s_r - 12 s_r^2.
-    mean = jnp.outer(H, np.sqrt(72 * rest_squared) * jr.normal(k_mean, (m,), H.dtype))
+    mean = jnp.outer(H, np.sqrt(72 * rest_squared) * by_mean)
     size = np.sqrt(rest - 12 * rest_squared)
-    area = series - mean + size * jnp.triu(jr.normal(k_area, (m, m), H.dtype), 1)
+    area = series - mean + size * _strictly_upper(by_area, m)
     return area - area.T
+
+
+def _weighted_product(
+    a: Float[Array, "m terms"], b: Float[Array, "m terms"], weights: np.ndarray
+) -> Float[Array, "m m"]:
+    """`a diag(weights) b^T`."""
+    if len(weights) > _WRITTEN_OUT:
+        a = a * jnp.asarray(weights, a.dtype)
+        return jnp.matmul(a, b.T, precision=jax.lax.Precision.HIGHEST)
+    # A product of small matrices for each path of a batch costs more than its arithmetic.
+    outer = [float(w) * jnp.outer(a[:, i], b[:, i]) for i, w in enumerate(weights)]
+    return sum(outer, jnp.zeros((len(a), len(a)), a.dtype))
+
+
+def _strictly_upper(x: Float[Array, " n"], m: int) -> Float[Array, "m m"]:
+    """The matrix with the entries `x` above its diagonal."""
+    place = np.zeros((m, m), int)
+    place[np.triu_indices(m, 1)] = np.arange(x.size)
+    # By gathering: scattering is slow.
+    padded = jnp.append(x, 0) if x.size == 0 else x
+    return jnp.triu(padded[place], 1)

@@ -1,5 +1,6 @@
 """The stage equations of one step, carried out by the plan of a tableau."""
 
+import functools as ft
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
@@ -14,8 +15,9 @@ from equinox.internal import ω
 from jaxtyping import Array, Bool, PyTree
 
 from .._custom_types import RealScalarLike, Y
+from .._once import once
 from .._plan import Block, Plan
-from .._tableau import Stage
+from .._tableau import FlatTableau, Stage
 from ._terms import tree_sum
 
 
@@ -53,12 +55,20 @@ def take_step(
             values |= unknown
             result = first_failure(result, solved)
         for group in block.explicit:
-            values |= _unstack(group, values_of(group, values))
+            evaluate = ft.partial(values_of, group, values)
+            shared = _uses(plan.tableau, group) > 1
+            values |= _unstack(group, once(evaluate) if shared else evaluate())
 
     y1 = _position(y0, stages, plan.tableau.weights[None], values)
     nonfinite: diffrax.RESULTS = diffrax.RESULTS.nonfinite  # pyright: ignore
     finite = diffrax.RESULTS.where(_all_finite(y1), result, nonfinite)
     return y1, first_failure(result, finite)
+
+
+def _uses(tableau: FlatTableau, group: tuple[int, ...]) -> int:
+    """How many positions the values of `group` enter, the end of the step included."""
+    columns = np.vstack([tableau.matrix, tableau.weights])[:, list(group)]
+    return int(np.count_nonzero(columns.any(axis=1)))
 
 
 def first_failure(first: diffrax.RESULTS, then: diffrax.RESULTS) -> diffrax.RESULTS:

@@ -14,8 +14,14 @@ import numpy as np
 from equinox.internal import ω
 from jaxtyping import Array, Float, PyTree
 
-from .._brownian import LevyAreaIncrement, PlateauIncrement, WeakIncrement
+from .._brownian import (
+    LevyAreaIncrement,
+    PlateauIncrement,
+    WeakBrownianPath,
+    WeakIncrement,
+)
 from .._custom_types import Args, RealScalarLike, Y
+from .._once import once
 
 
 def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
@@ -110,9 +116,10 @@ PROVIDED_BY = {
 
 def controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, list]:
     """The random variables of the step from `t0` to `t1`, for each noise term."""
+    draw = _drawn if _is_weak(noise) else lambda *args: once(ft.partial(_drawn, *args))
     if names == ["W"]:
-        return {"W": [term.contr(t0, t1) for term in noise]}
-    increments = [term.contr(t0, t1, use_levy=True) for term in noise]
+        return {"W": draw(noise, t0, t1, False)}
+    increments = draw(noise, t0, t1, True)
     # The most telling advice first.
     for name in sorted(names, key=lambda x: [*PROVIDED_BY, x].index(x)):
         if any(getattr(increment, name, None) is None for increment in increments):
@@ -122,6 +129,19 @@ def controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, l
                 f"`{solver}` needs {provider.advice if provider else advice}."
             )
     return {name: [getattr(i, name) for i in increments] for name in names}
+
+
+def _drawn(noise: tuple, t0, t1, use_levy: bool) -> list:
+    if use_levy:
+        return [term.contr(t0, t1, use_levy=True) for term in noise]
+    return [term.contr(t0, t1) for term in noise]
+
+
+def _is_weak(noise: tuple) -> bool:
+    """Whether all random variables are discrete, and so cheap to compute again."""
+    is_path = lambda x: isinstance(x, diffrax.AbstractBrownianPath)
+    paths = filter(is_path, jtu.tree_leaves(noise, is_leaf=is_path))
+    return all(isinstance(path, WeakBrownianPath) for path in paths)
 
 
 def noise_driven(
