@@ -1,6 +1,7 @@
 """Expectations over very many paths, a batch at a time."""
 
 import collections
+import dataclasses
 import functools as ft
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
@@ -15,6 +16,8 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from ._brownian import check_key
+
 
 _Sample: TypeAlias = Callable[[PRNGKeyArray], Any]
 _Host = PyTree[np.ndarray]
@@ -27,7 +30,7 @@ class Expectation(eqx.Module):
     r"""An estimate of $\mathbb E[\phi]$, as [`diffrax_symplectic.expectation`][] returns.
 
     - `mean`: the mean over the paths that succeeded, in the structure of $\phi$, in
-        float64.
+        float64; NaN if none did.
     - `sum_of_squares`: the sum of the squared deviations from `mean`.
     - `num_paths`: how many paths succeeded.
     - `num_failed`: how many paths failed. They have no part in the rest.
@@ -108,11 +111,19 @@ def expectation(
         print(estimate.mean, estimate.std_error, estimate.num_failed)
         ```
 
+    `fn` is compiled anew for each new function. For many values of a parameter pass one
+    function and the parameter as an array, `jax.tree_util.Partial(fn, parameter)`.
+    Gradients are taken within: the mean of `jax.grad` of a path is the gradient of the
+    expectation (on one device: `devices=jax.devices()[:1]`). This function itself is no
+    part of a JAX program: it cannot be differentiated, `jit`ted or `vmap`ped.
+
     **Arguments:**
 
     - `fn`: takes a random key to $\phi$, a PyTree of real arrays, or to a pair of that
         and a `diffrax.RESULTS`: as above, with `throw=False`. A path fails if its result
-        is not successful or anything in its $\phi$ is not finite.
+        is neither successful nor an event, or anything in its $\phi$ is not finite.
+        (Without `sol.result` a path that failed counts as a success: Diffrax returns where
+        it stopped.)
     - `key`: a JAX random key.
     - `num_paths`: how many paths there shall be in all, those of `start` included.
     - `batch_size`: how many paths each device takes at once. By default 32,768 on CPUs
@@ -121,13 +132,15 @@ def expectation(
     - `devices`: the devices that share each batch, by default all of `jax.devices()`:
         under `jax.distributed` those of every process, each of which has to make the same
         call and gets the same result.
-    - `start`: an earlier estimate with the same `fn` and `key`, to be continued.
+    - `start`: an earlier estimate with the same `fn` (which is not checked) and `key`, to
+        be continued.
     - `progress_meter`: one of Diffrax's.
 
     **Returns:** an [`diffrax_symplectic.Expectation`][].
 
-    **Raises:** a `ValueError` for sizes that are not positive integers, if `start` came
-    from another key or has more paths, or if $\phi$ is not real;
+    **Raises:** a `ValueError` for sizes that are not positive integers, if `key` is not a
+    random key, if `start` came from another key, has other shapes or more paths, or if
+    $\phi$ is not real or holds a `diffrax.RESULTS`;
     [`diffrax_symplectic.ExpectationInterrupted`][], with the estimate so far, on an
     interrupt from the keyboard.
 
@@ -151,9 +164,9 @@ def expectation(
     on_cpu = devices[0].platform == "cpu"
     if batch_size is None:
         batch_size = 32768 if on_cpu else 262144
-    for name, value in (("num_paths", num_paths), ("batch_size", batch_size)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
+    num_paths = _positive("num_paths", num_paths)
+    batch_size = _positive("batch_size", batch_size)
+    check_key(key, "expectation")
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jr.wrap_key_data(key)
     key_data, impl = np.asarray(jr.key_data(key)), jr.key_impl(key)
@@ -166,6 +179,8 @@ def expectation(
     def batch(begin: int):
         lo_hi = np.array([begin & 0xFFFFFFFF, begin >> 32], np.uint32)
         size = np.array(min(step, num_paths - begin), np.int32)
+        if len(devices) == 1:
+            lo_hi, size = jax.device_put((lo_hi, size), devices[0])
         return _batch(fn, key_data, lo_hi, size, impl, mesh, batch_size)
 
     # JAX keeps what it traced here for the first batch.
@@ -184,10 +199,25 @@ def expectation(
         while running:
             estimate = _merge(estimate, running.popleft())
     except KeyboardInterrupt:
-        raise ExpectationInterrupted(estimate) from None
+        raise ExpectationInterrupted(_finished(estimate)) from None
     finally:
         progress_meter.close(meter)
-    return estimate
+    return _finished(estimate)
+
+
+def _positive(name: str, value) -> int:
+    integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not integer or value < 1:
+        raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
+    return int(value)
+
+
+def _finished(estimate: Expectation) -> Expectation:
+    """Without any path there is no mean."""
+    if estimate.num_paths > 0:
+        return estimate
+    nothing = jtu.tree_map(lambda x: np.full_like(x, np.nan), estimate.mean)
+    return dataclasses.replace(estimate, mean=nothing)
 
 
 def _start(
@@ -211,14 +241,20 @@ def _start(
             "`start` is an estimate with another `key`. Pass the one that it came from, "
             "so that no path is taken twice."
         )
-    if jtu.tree_structure(start.mean) != jtu.tree_structure(zeros):
-        raise ValueError("`start` is an estimate of something of another structure.")
+    if jtu.tree_structure(start.mean) != jtu.tree_structure(zeros) or any(
+        np.shape(a) != b.shape
+        for a, b in zip(jtu.tree_leaves(start.mean), jtu.tree_leaves(zeros))
+    ):
+        raise ValueError(
+            "`start` is an estimate of something of another structure or other shapes. "
+            "Pass one that came from the same `fn`."
+        )
     if start.num_paths + start.num_failed > num_paths:
         raise ValueError(
             "`num_paths` counts all paths, those of `start` included, of which there are "
             f"{start.num_paths + start.num_failed} already; got {num_paths}."
         )
-    return start
+    return start if start.num_paths > 0 else dataclasses.replace(start, mean=zeros)
 
 
 def _evaluate(fn: _Sample, key) -> tuple[PyTree[Array], Array]:
@@ -227,7 +263,12 @@ def _evaluate(fn: _Sample, key) -> tuple[PyTree[Array], Array]:
     success = jnp.array(True)
     if isinstance(out, tuple) and len(out) == 2 and _is_result(out[1]):
         out, result = out
-        success = result == diffrax.RESULTS.successful
+        success = diffrax.is_okay(result)
+    if any(map(_is_result, jtu.tree_leaves(out, is_leaf=_is_result))):
+        raise ValueError(
+            "`fn` returns a `diffrax.RESULTS` within phi, where it would be averaged. "
+            "Return a pair `(phi, sol.result)`, so that paths that failed are left out."
+        )
     out = jtu.tree_map(jnp.asarray, out)
     for leaf in jtu.tree_leaves(out):
         success = success & jnp.all(jnp.isfinite(leaf))
@@ -243,15 +284,14 @@ def _batch(fn, key_data, lo_hi, size, impl, mesh: Mesh, n: int):
     """Number, mean and sum of squared deviations of the successful paths, and the number
     of the others, over one batch on all devices."""
 
-    def local(lo_hi, size):
-        index = jax.lax.axis_index("paths") * n + jnp.arange(n)
+    def local(lo_hi, size, device: Any = 0, total=lambda x: x):
+        index = device * n + jnp.arange(n)
         lo = lo_hi[0] + index.astype(jnp.uint32)
         hi = lo_hi[1] + (lo < lo_hi[0]).astype(jnp.uint32)
         key = jr.wrap_key_data(jnp.asarray(key_data), impl=impl)
         fold = lambda hi, lo: jr.fold_in(jr.fold_in(key, hi), lo)
         phi, success = jax.vmap(lambda k: _evaluate(fn, k))(jax.vmap(fold)(hi, lo))
         good = success & (index < size)
-        total = ft.partial(jax.lax.psum, axis_name="paths")
         count = total(jnp.sum(good))
         failed = total(jnp.sum(~success & (index < size)))
 
@@ -267,9 +307,16 @@ def _batch(fn, key_data, lo_hi, size, impl, mesh: Mesh, n: int):
         means, squares = zip(*map(moments, leaves))
         return count, failed, treedef.unflatten(means), treedef.unflatten(squares)
 
+    def shard(lo_hi, size):
+        total = ft.partial(jax.lax.psum, axis_name="paths")
+        return local(lo_hi, size, jax.lax.axis_index("paths"), total)
+
+    if mesh.size == 1:
+        # Diffrax's and Optimistix' reverse mode does not work under `shard_map`.
+        return local(lo_hi, size)
     specs = PartitionSpec(), PartitionSpec()
     return jax.shard_map(
-        local, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False
+        shard, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False
     )(lo_hi, size)
 
 

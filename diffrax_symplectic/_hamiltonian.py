@@ -198,7 +198,7 @@ def check_pair(y: PyTree) -> None:
         "The state of a Hamiltonian system is a pair `(p, q)` of arrays (or PyTrees) of "
         "the same structure and shapes: pass `y0=(p0, q0)`. "
     )
-    if not isinstance(y, tuple) or len(y) != 2:
+    if type(y) is not tuple or len(y) != 2:
         raise ValueError(f"{advice}Got {eqx.tree_pformat(y)}.")
     p, q = y
     if jtu.tree_structure(p) != jtu.tree_structure(q) or [

@@ -1,7 +1,6 @@
 """Tests of a solver by one step, without Monte Carlo error."""
 
 from collections.abc import Callable
-from typing import cast
 
 import diffrax
 import equinox as eqx
@@ -16,6 +15,7 @@ from jaxtyping import Array, Float, PyTree
 from ._custom_types import Args, RealScalarLike, Y
 from ._hamiltonian import check_pair
 from ._outcomes import outcomes
+from ._solver import split_terms, tree_sum
 
 
 def _one_step(terms, solver, t0, t1, y0, args) -> tuple[Y, diffrax.RESULTS]:
@@ -219,8 +219,7 @@ def weak_order_defect(
 
 
 def _generator(terms, args, ito: bool) -> Callable:
-    multi = cast(diffrax.MultiTerm, terms)
-    drift, *noise = multi.terms
+    drift, noise = split_terms(terms)
 
     def noise_fields(t):
         """Each `b_k`, as the response to a unit control."""
@@ -240,7 +239,9 @@ def _generator(terms, args, ito: bool) -> Callable:
 
     def L(phi):
         def L_phi(t, y):
-            along_drift = (jnp.ones_like(t), drift.vf(t, y, args))
+            still = jtu.tree_map(jnp.zeros_like, y)
+            velocity = tree_sum([still, *(term.vf(t, y, args) for term in drift)])
+            along_drift = (jnp.ones_like(t), velocity)
             _, total = jax.jvp(phi, (t, y), along_drift)
             for field in noise_fields(t):
 

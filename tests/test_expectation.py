@@ -212,3 +212,52 @@ def test_the_paths_are_the_same_on_any_devices_and_hosts():
     processes = [_start(2, address, rank) for rank in (0, 1)]
     for process in processes:
         np.testing.assert_allclose(_read(process), expected, rtol=1e-12)
+
+
+def test_results_within_phi_are_refused():
+    def fn(key):
+        terms = kubo_terms(ds.WeakBrownianPath((), key))
+        y0 = (jnp.array(0.0), jnp.array(1.0))
+        sol = diffrax.diffeqsolve(terms, ds.Midpoint(), 0.0, 0.2, 0.1, y0, throw=False)
+        return sol.ys[0][-1], sol.ys[1][-1], sol.result
+
+    with pytest.raises(ValueError, match=r"Return a pair `\(phi, sol.result\)`"):
+        ds.expectation(fn, jr.key(0), 10)
+
+
+def test_without_any_success_there_is_no_mean_and_it_can_go_on():
+    nothing = ds.expectation(lambda key: jnp.nan * jr.normal(key), jr.key(0), 10)
+    assert np.isnan(nothing.mean) and nothing.num_failed == 10
+    more = ds.expectation(jr.normal, jr.key(0), np.int64(20), start=nothing)
+    assert np.isfinite(more.mean) and (more.num_paths, more.num_failed) == (10, 10)
+    with pytest.raises(ValueError, match="other shapes"):
+        ds.expectation(lambda k: jr.normal(k, (2,)), jr.key(0), 30, start=more)
+    with pytest.raises(ValueError, match="needs a random key"):
+        ds.expectation(jr.normal, 0, 10)
+
+
+def test_paths_that_an_event_ends_are_no_failures():
+    def fn(key):
+        terms = kubo_terms(ds.WeakBrownianPath((), key))
+        y0 = (jnp.array(0.0), jnp.array(1.0))
+        event = diffrax.Event(lambda t, y, args, **kwargs: y[1] < 0)
+        sol = diffrax.diffeqsolve(
+            terms, ds.Midpoint(), 0.0, 2.0, 0.1, y0, event=event, throw=False
+        )
+        return sol.ts[-1], sol.result
+
+    got = ds.expectation(fn, jr.key(0), 200)
+    assert got.num_failed == 0 and 0.1 < got.mean < 2
+
+
+def test_gradients_are_taken_within():
+    def observable(strength, key):
+        terms = kubo_terms(ds.WeakBrownianPath((), key), strength)
+        y0 = (jnp.array(0.0), jnp.array(1.0))
+        return diffrax.diffeqsolve(terms, ds.SRKw1(), 0.0, 0.5, 0.1, y0).ys[1][-1]
+
+    gradient = jax.tree_util.Partial(jax.grad(observable), jnp.array(0.5))
+    one = jax.devices()[:1]
+    got = ds.expectation(gradient, jr.key(0), 100, devices=one)
+    expected = np.mean(_by_hand(gradient, jr.key(0), 100))
+    np.testing.assert_allclose(got.mean, expected, rtol=1e-12)

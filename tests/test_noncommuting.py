@@ -305,3 +305,25 @@ def test_missing_variables_are_refused_with_advice():
         diffrax.diffeqsolve(several, ds.LevyAreaMidpoint(), 0.0, 0.2, 0.1, y0, args)
     assert ds.LevyAreaMidpoint().minimal_levy_area is ds.LevyAreaIncrement
     assert ds.NinomiyaVictoir().minimal_levy_area is ds.WeakIncrement
+
+
+@pytest.mark.parametrize("cell", [None, 0.05])
+def test_paths_of_a_batch_may_end_at_different_times(cell):
+    # Those that have ended go on with empty steps.
+    y0, args = random_problem(jr.key(0), 1, 2)
+    tree = diffrax.VirtualBrownianTree(
+        0.0, 0.7, 0.01, (2,), jr.key(1), diffrax.SpaceTimeLevyArea
+    )
+    path = ds.LevyAreaBrownianPath(tree, jr.key(2), cell=cell)
+    terms = ds.hamiltonian_terms(H0, noise, path)
+
+    def end(scale, t1):
+        y = jax.tree.map(lambda x: scale * x, y0)
+        solver = ds.LevyAreaMidpoint()
+        return diffrax.diffeqsolve(terms, solver, 0.0, t1, 0.05, y, args).ys[1][-1, 0]
+
+    gradient = jax.value_and_grad(end)
+    t1 = jnp.array([0.25, 0.7])
+    together = jax.vmap(gradient, (None, 0))(1.0, t1)
+    alone = [gradient(1.0, t) for t in t1]
+    np.testing.assert_allclose(jnp.stack(together, 1), jnp.array(alone), rtol=1e-12)

@@ -232,3 +232,16 @@ def test_fixed_increments_refuse_adaptive_steps(path, solver):
     diffrax.diffeqsolve(
         terms, solver, 0.0, 0.5, None, y0, stepsize_controller=diffrax.StepTo(ts)
     )
+
+
+def test_what_is_no_key_is_refused():
+    tree = diffrax.UnsafeBrownianPath((2,), jr.key(0), diffrax.SpaceTimeLevyArea)
+    for make in (
+        lambda key: ds.WeakBrownianPath((2,), key),
+        lambda key: ds.PlateauBrownianPath(tree, key),
+        lambda key: ds.LevyAreaBrownianPath(tree, key),
+    ):
+        with pytest.raises(ValueError, match="needs a random key"):
+            make(0)
+    with pytest.raises(ValueError, match=r"array of keys of shape \(5,\)"):
+        ds.WeakBrownianPath((2,), jr.split(jr.key(0), 5)).evaluate(0.0, 0.1)

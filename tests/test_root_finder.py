@@ -103,3 +103,9 @@ def test_leaving_the_domain_on_the_way_is_no_failure(direct):
     )
     assert sol.result == optx.RESULTS.successful
     np.testing.assert_allclose(sol.value, 1, atol=1e-13)
+
+
+def test_numbers_of_iterations_that_mean_nothing_are_refused():
+    for change in (dict(sweeps=1), dict(warmup=-1), dict(picard_steps=-1)):
+        with pytest.raises(ValueError, match="must be at least"):
+            ds.PicardNewton(**change)

@@ -333,3 +333,37 @@ def test_strong_order_one(solver, m):
     measured = slope(np.array(steps), np.sqrt(jnp.mean(squared, axis=0)))
     assert solver.strong_order(None) == 1.0
     assert abs(measured - 1) <= 0.1
+
+
+_oscillator = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize(
+    "H0, noise",
+    [
+        (_oscillator, lambda t, p, q, args: 1e-4 * jnp.sum(p)),
+        (_oscillator, lambda t, p, q, args: 1e-20 * jnp.sum(p * q)),
+        (lambda t, p, q, args: jnp.sum((p - 1e-3 * q) ** 2 + q**2), _good_noise),
+        # Defined for positive numbers only: the more, the fewer random draws are.
+        (_oscillator, lambda t, p, q, args: jnp.sum(jnp.sqrt(args) * p[0] * q[0])),
+        (lambda t, p, q, args: jnp.sum(p[0] ** 2 * q[0] * jnp.sqrt(args)), _good_noise),
+    ],
+    ids=["small", "tiny", "tilted", "domain of noise", "domain of drift"],
+)
+def test_small_couplings_and_narrow_domains_do_not_get_past_the_check(H0, noise, dtype):
+    if "args" not in H0.__code__.co_names and dtype == jnp.float32:
+        H0, noise = (lambda *x, f=f: f(*x).astype(jnp.float32) for f in (H0, noise))
+    path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((), dtype), jr.key(0))
+    terms = ds.hamiltonian_terms(H0, noise, path)
+    y0 = (jnp.array([0.3, 0.1], dtype), jnp.array([0.5, -0.2], dtype))
+    args = jnp.full(12, 0.1, dtype)
+    t0, t1, h = jnp.array([0.0, 0.2, 0.1], dtype)
+    with pytest.raises(ValueError, match="does not vanish"):
+        diffrax.diffeqsolve(terms, ds.SRKw3(), t0, t1, h, y0, args)
+
+
+def test_structure_that_cannot_be_tested_is_refused():
+    nowhere = lambda t, p, q, args: jnp.sum(p**2 + jnp.sqrt(-1 - (p * q) ** 2))
+    with pytest.raises(ValueError, match="could not be tested"):
+        _solve(nowhere, _good_noise)

@@ -1,5 +1,7 @@
 """Terms from Hamiltonians: values, structures, derivatives, and use with Diffrax."""
 
+from typing import NamedTuple
+
 import diffrax
 import equinox as eqx
 import jax
@@ -250,3 +252,95 @@ def test_hamiltonians_may_be_networks():
 
     leaves = jax.tree.leaves(eqx.filter(gradient(terms), eqx.is_inexact_array))
     assert len(leaves) > 0 and all(jnp.any(x != 0) for x in leaves[:2])
+
+
+def test_terms_may_come_in_any_order_and_drift_in_pieces():
+    y0, args = random_problem(jr.key(0), 1, 1)
+    drift, diffusion = ds.hamiltonian_terms(H0, noise, weak_path(1)).terms
+    friction = diffrax.ODETerm(lambda t, y, args: (-0.1 * y[0], jnp.zeros_like(y[1])))
+    together = diffrax.MultiTerm(diffrax.MultiTerm(drift, friction), diffusion)
+    solver = ds.StrangGauss()
+    solve = lambda *terms: (
+        diffrax.diffeqsolve(
+            diffrax.MultiTerm(*terms), solver, 0.0, 0.3, 0.1, y0, args
+        ).ys
+    )
+    expected = solve(*together.terms)
+    for terms in ((drift, diffusion, friction), (diffusion, friction, drift)):
+        for a, b in zip(solve(*terms), expected):
+            np.testing.assert_allclose(a, b, rtol=1e-13)
+        assert solver.weak_order(diffrax.MultiTerm(*terms)) == 2
+
+
+@pytest.mark.parametrize("solver", [ds.SRKs4(), ds.PlateauVerlet()], ids=repr)
+def test_order_three_halves_holds_backwards_in_time(solver):
+    energy = lambda t, p, q, args: jnp.sum(p**2 / 2 + q**4 / 4)
+    kick = lambda t, p, q, args: -q
+    y0 = (jnp.array([0.2]), jnp.array([1.0]))
+
+    def errors(key):
+        area = diffrax.SpaceTimeLevyArea
+        tree = diffrax.VirtualBrownianTree(0.0, 1.0, 2.0**-13, (1,), key, area)
+        plateaus = ds.PlateauBrownianPath(tree, jr.key(0))
+        path = plateaus if isinstance(solver, ds.PlateauVerlet) else tree
+        end = lambda s, h, path: diffrax.diffeqsolve(
+            ds.hamiltonian_terms(energy, kick, path), s, 1.0, 0.0, -h, y0
+        ).ys[1][-1, 0]
+        exact = end(ds.SRKs4(), 2.0**-9, tree)
+        return [end(solver, h, path) - exact for h in (1 / 8, 1 / 32)]
+
+    # At order 1 it is a factor of 4, and an error ten times as large.
+    coarse, fine = jax.jit(jax.vmap(errors))(jr.split(jr.key(1), 50))
+    assert jnp.sqrt(jnp.mean(coarse**2)) < 5e-3
+    assert jnp.sqrt(jnp.mean(fine**2)) < jnp.sqrt(jnp.mean(coarse**2)) / 6
+
+
+def test_integer_times_are_times():
+    moving = lambda t, p, q, args: jnp.sum(p**2 / 2 + jnp.cos(3 * t) * q)
+    terms = ds.hamiltonian_terms(
+        moving, lambda t, p, q, args: -q, weak_path(1, order=3)
+    )
+    y0 = (jnp.array([0.2]), jnp.array([1.0]))
+    value = lambda t0, t1: ds.step_expectation(
+        terms, ds.AdditiveGauss(), t0, t1, y0, fn=lambda y: y[1][0]
+    )
+    np.testing.assert_allclose(value(0, 1), value(0.0, 1.0), rtol=1e-14)
+
+
+def test_time_dependent_noise_in_single_precision():
+    y0, args = random_problem(jr.key(0), 1, 2, jnp.float32)
+    path = weak_path(2, jr.key(0), jnp.float32, two_point=True)
+    terms = ds.hamiltonian_terms(H0, noise, path)
+    t0, t1, h = jnp.array([0.0, 0.2, 0.1], jnp.float32)
+    for solver in (ds.NinomiyaVictoir(), ds.StrangGauss()):
+        ys = diffrax.diffeqsolve(terms, solver, t0, t1, h, y0, args).ys
+        assert ys[0].dtype == jnp.float32 and jnp.all(jnp.isfinite(ys[0]))
+
+
+def test_named_pairs_and_half_precision_are_refused():
+    class Pair(NamedTuple):
+        p: jax.Array
+        q: jax.Array
+
+    y0, args = random_problem(jr.key(0), 1, 1)
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
+    with pytest.raises(ValueError, match=r"is a pair `\(p, q\)`"):
+        diffrax.diffeqsolve(terms, ds.Midpoint(), 0.0, 0.2, 0.1, Pair(*y0), args)
+    half = jax.tree.map(lambda x: x.astype(jnp.float16), y0)
+    with pytest.raises(ValueError, match="float32 or float64"):
+        ds.Midpoint().init(terms, 0.0, 0.1, half, args)
+
+
+def test_implicit_tableaus_need_an_implicit_solver():
+    class Mine(ds.AbstractSymplecticRungeKutta):
+        tableau = ds.Midpoint().tableau
+
+        def order(self, terms):
+            return 2
+
+    y0, args = random_problem(jr.key(0), 1, 1)
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
+    with pytest.raises(
+        ValueError, match="also subclass `diffrax.AbstractImplicitSolver`"
+    ):
+        diffrax.diffeqsolve(terms, Mine(), 0.0, 0.2, 0.1, y0, args)

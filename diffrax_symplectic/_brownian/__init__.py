@@ -8,4 +8,8 @@ from ._plateau import (
     PlateauIncrement as PlateauIncrement,
 )
 from ._truncated import TruncatedBrownianPath as TruncatedBrownianPath
-from ._weak import WeakBrownianPath as WeakBrownianPath, WeakIncrement as WeakIncrement
+from ._weak import (
+    check_key as check_key,
+    WeakBrownianPath as WeakBrownianPath,
+    WeakIncrement as WeakIncrement,
+)

@@ -5,13 +5,15 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
+import jax.tree_util as jtu
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM, RealScalarLike
 from .._once import once
 from ._fixed_steps import require_fixed_steps
-from ._weak import place_key
+from ._weak import check_key, place_key
 from ._wrapper import AbstractWrappedPath, require_space_time_area
 
 
@@ -142,6 +144,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         cells.
         """
         require_space_time_area(path, type(self).__name__)
+        check_key(key, type(self).__name__)
         if not isinstance(terms, int) or terms < 0:
             raise ValueError(f"`terms` must be an integer from 0 on; got {terms!r}.")
         if cell is not None and not cell > 0:
@@ -184,7 +187,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         )
         if not use_levy:
             return unravel(piece.W)
-        H = piece.integral / piece.h - piece.W / 2
+        H = piece.integral / _or_one(piece.h) - piece.W / 2
         dt = jax.tree.map(lambda s: jnp.asarray(end - start, s.dtype), struct)
         return LevyAreaIncrement(dt, unravel(piece.W), unravel(H), piece.A)
 
@@ -193,14 +196,18 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         off = jnp.maximum(jnp.abs(first * cell - t0), jnp.abs(last * cell - t1))
         last = eqx.error_if(
             last,
-            (off > 1e-3 * cell) | (last <= first),
+            (off > 1e-3 * cell) | (last < first),
             "Steps of a `LevyAreaBrownianPath` with `cell` must begin and end at "
-            "multiples of `cell`.",
+            "multiples of `cell`. If they should, their times may have been rounded too "
+            "much: enable 64 bits, or step with `diffrax.StepTo`.",
         )
-        sample = lambda i: self._sample(i * cell, (i + 1) * cell)
-        return jax.lax.fori_loop(
-            first + 1, last, lambda i, piece: piece.then(sample(i)), sample(first)
+        # Rounding must not lead out of the path.
+        at = lambda i: jnp.clip(i * cell, self.path.t0, self.path.t1)
+        sample = lambda i: self._sample(at(i), at(i + 1))
+        empty = jtu.tree_map(
+            lambda s: lax.full_like(s, 0), jax.eval_shape(sample, first)
         )
+        return lax.fori_loop(first, last, lambda i, piece: piece.then(sample(i)), empty)
 
     def _sample(self, t0, t1) -> _Piece:
         increment = once(lambda: self.path.evaluate(t0, t1, use_levy=True))
@@ -209,9 +216,14 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         H, _ = jfu.ravel_pytree(increment.H)
         h = jnp.abs(t1 - t0).astype(W.dtype)
         key = place_key(self.key, jnp.asarray(t0), jnp.asarray(t1))
-        bridge = h * _bridge_area(H / jnp.sqrt(h), key, self.terms)
+        bridge = h * _bridge_area(H / jnp.sqrt(_or_one(h)), key, self.terms)
         outer = jnp.outer(H, W)
         return _Piece(h, W, h * (W / 2 + H), outer - outer.T + bridge)
+
+
+def _or_one(h: Float[Array, ""]) -> Float[Array, ""]:
+    """In a batch, paths that have ended go on with empty steps."""
+    return jnp.where(h > 0, h, 1)
 
 
 def _bridge_area(

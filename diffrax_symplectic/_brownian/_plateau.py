@@ -5,7 +5,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM, RealScalarLike
 from ._fixed_steps import require_fixed_steps
-from ._weak import fair_sign, random_words
+from ._weak import check_key, fair_sign, random_words
 from ._wrapper import AbstractWrappedPath, require_space_time_area
 
 
@@ -44,6 +44,7 @@ class PlateauBrownianPath(AbstractWrappedPath):
         **Raises:** a `ValueError` if `path` has no space-time Lévy area.
         """
         require_space_time_area(path, type(self).__name__)
+        check_key(key, type(self).__name__)
         self.path = path
         self.key = key
 

@@ -21,6 +21,10 @@ class TruncatedBrownianPath(AbstractWrappedPath):
     price is a mean-square error $\mathbb E[(\xi - \xi_h)^2] \leq h^k$: take $k$ at least
     twice the strong order of the method.
 
+    Steps have to be well below one unit of time, where the bound becomes 0: for `k=2` an
+    increment keeps 97% of its variance at $h = 1/4$, 84% at $h = 1/2$ and 28% at
+    $h = 0.9$.
+
     Lévy areas of the wrapped path are kept as they are. Step sizes have to be fixed.
 
     ??? cite "Reference"

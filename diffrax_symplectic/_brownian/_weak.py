@@ -34,7 +34,7 @@ class WeakIncrement(diffrax.AbstractBrownianIncrement):
     - `two_point`: the variables $\tilde I_k = \pm\sqrt h$ with probability $1/2$ each,
         independent of the others, or `None`.
 
-    `W`, `second` and `two_point` have the structure and shapes of the path.
+    `W`, `second`, `third` and `two_point` have the structure and shapes of the path.
 
     ??? cite "Reference"
 
@@ -143,7 +143,8 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
 
         `second` and `two_point` do not change what `W` is for the same `key`.
 
-        **Raises:** a `ValueError` if a dtype is not real floating-point, or if `order` is
+        **Raises:** a `ValueError` if `key` is not a random key, if a dtype is not real
+        floating-point, or if `order` is
         neither 2 nor 3.
         """
         if order not in (2, 3):
@@ -161,6 +162,7 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
                     "The dtypes of a `WeakBrownianPath` must be real floating-point; "
                     f"got {leaf.dtype}."
                 )
+        check_key(key, type(self).__name__)
         self.shape = shape
         self.key = key
         self.second = second or order == 3
@@ -275,6 +277,18 @@ def random_words(key, t0, t1, sets: int, n: int) -> Integer[Array, "sets n"]:
     )
 
 
+def check_key(key, user: str) -> None:
+    """Raises a `ValueError` unless `key` is a random key, of the new style or the old, or
+    an array of such, to be `vmap`ped over."""
+    dtype = getattr(key, "dtype", None)
+    if dtype is None or not (
+        jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32
+    ):
+        raise ValueError(
+            f"`{user}` needs a random key, as from `jax.random.key(0)`; got {key!r}."
+        )
+
+
 def place_key(key, t0, t1) -> PRNGKeyArray:
     """A key for the step from `t0` to `t1`, the same for times that differ by rounding."""
     count, exponent = _place(t0, t1)
@@ -283,14 +297,20 @@ def place_key(key, t0, t1) -> PRNGKeyArray:
 
 def _typed(key) -> PRNGKeyArray:
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-    return key if typed else jr.wrap_key_data(key)
+    key = key if typed else jr.wrap_key_data(key)
+    if key.ndim > 0:
+        raise ValueError(
+            "A Brownian path needs one random key; got an array of keys of shape "
+            f"{key.shape}. Use `jax.vmap` over it."
+        )
+    return key
 
 
 def _place(t0, t1) -> tuple[Integer[Array, ""], Integer[Array, ""]]:
     """Where a step lies, in integers.
 
-    The middle of the step is counted in units of a power of two that lies between a
-    quarter and a half of the step, so that no two steps of one size share a count. The
+    The middle of the step is counted in units of a power of two that lies between a third
+    and 0.7 of the step, so that no two steps of one size share a count. The
     two odd constants keep round numbers away from where the roundings change.
     """
     h = jnp.abs(t1 - t0)

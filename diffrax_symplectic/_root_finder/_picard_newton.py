@@ -58,9 +58,13 @@ class PicardNewton(optx.AbstractRootFinder):
         that resolve the dynamics. Up to 32 unknowns, `sweeps` of them follow each other
         without a look at the error; a loop goes on for as long as corrections shrink.
 
-    The loop that then normally has nothing left to do is Newton's method, from where the
-    above got to if that was converging, and otherwise from the start. Corrections
-    that would make the residual larger are shortened.
+    The loop that then normally has nothing left to do is Newton's method. It goes on from
+    where these iterations ended if they converged, and otherwise begins at the first
+    guess. Corrections that would make the residual larger are shortened.
+
+    The iterate is kept in the state, ahead of the one that Optimistix holds: a root finder
+    that wraps another and looks at its iterates, such as `optimistix.BestSoFarRootFinder`,
+    cannot wrap this one.
 
     **Arguments:**
 
@@ -72,6 +76,8 @@ class PicardNewton(optx.AbstractRootFinder):
     - `direct`: the most unknowns for which Newton's method is used from the start.
     - `warmup`, `chords`, `sweeps`: see above.
     - `picard_steps`: the most fixed-point iterations.
+
+    **Raises:** a `ValueError` for negative numbers, or fewer than 2 `sweeps`.
     """
 
     rtol: float | None = None
@@ -83,6 +89,15 @@ class PicardNewton(optx.AbstractRootFinder):
     chords: int = eqx.field(default=1, static=True)
     sweeps: int = eqx.field(default=10, static=True)
     picard_steps: int = eqx.field(default=40, static=True)
+
+    def __check_init__(self):
+        least = dict(direct=0, warmup=0, chords=0, sweeps=2, picard_steps=0)
+        for name, n in least.items():
+            if getattr(self, name) < n:
+                raise ValueError(
+                    f"`{name}` of `PicardNewton` must be at least {n}; got "
+                    f"{getattr(self, name)}."
+                )
 
     def init(
         self,

@@ -96,7 +96,12 @@ def _solve(
     # A stage where it would be if this block did not move at all.
     guess = [values_of(group, known) for group in groups]
     written = [_part(y0, stages[group[0]].writes) for group in groups]
-    assert isinstance(solver, diffrax.AbstractImplicitSolver)
+    if not isinstance(solver, diffrax.AbstractImplicitSolver):
+        raise ValueError(
+            f"The tableau of `{type(solver).__name__}` has implicit stages. Let the class "
+            "also subclass `diffrax.AbstractImplicitSolver`, with its fields `root_finder` "
+            "and `root_find_max_steps`."
+        )
     finder = solver.root_finder
     linear_solver = getattr(finder, "linear_solver", lx.AutoLinearSolver(None))
     sol = optx.root_find(
@@ -138,7 +143,7 @@ def _evaluate(step: Step, stages: list[Stage], y: Y) -> _Value:
     c = [stage.c for stage in stages]
     if len(set(c)) == 1:
         return jax.vmap(value, in_axes=(None, 0))(c[0], y)
-    return jax.vmap(value)(jnp.asarray(c, jnp.result_type(step.h)), y)
+    return jax.vmap(value)(jnp.asarray(c, jnp.result_type(step.h, float)), y)
 
 
 def _part(y: Y, part: str) -> PyTree[Array]:

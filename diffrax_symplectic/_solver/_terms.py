@@ -25,13 +25,25 @@ from .._once import once
 
 
 def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
-    """Drift terms and noise terms."""
-    if isinstance(terms, diffrax.MultiTerm):
-        return terms.terms[:1], terms.terms[1:]
+    """Drift terms and noise terms, in any order: noise has a Brownian path, or is a later
+    term that time does not drive."""
+    parts = terms.terms if isinstance(terms, diffrax.MultiTerm) else (terms,)
+    is_noise = [
+        len(brownian_paths(term)) > 0 or (i > 0 and not _is_ode(term))
+        for i, term in enumerate(parts)
+    ]
+    drift = tuple(term for term, noise in zip(parts, is_noise) if not noise)
+    return drift, tuple(term for term, noise in zip(parts, is_noise) if noise)
+
+
+def brownian_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
     is_path = lambda x: isinstance(x, diffrax.AbstractBrownianPath)
-    if any(map(is_path, jtu.tree_leaves(terms, is_leaf=is_path))):
-        return (), (terms,)
-    return (terms,), ()
+    return [x for x in jtu.tree_leaves(terms, is_leaf=is_path) if is_path(x)]
+
+
+def _is_ode(term: diffrax.AbstractTerm) -> bool:
+    # In a solve Diffrax has wrapped each term, to be able to go backward in time.
+    return isinstance(getattr(term, "term", term), diffrax.ODETerm)
 
 
 # Called at several stages, this is traced and lowered once.
@@ -128,7 +140,16 @@ def controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, l
             raise ValueError(
                 f"`{solver}` needs {provider.advice if provider else advice}."
             )
-    return {name: [getattr(i, name) for i in increments] for name in names}
+    drawn = {name: [getattr(i, name) for i in increments] for name in names}
+    if "H" in names:
+        drawn["H"] = [_area_in_time(term, x) for term, x in zip(noise, drawn["H"])]
+    return drawn
+
+
+def _area_in_time(term: diffrax.AbstractTerm, H: PyTree[Array]) -> PyTree[Array]:
+    """Backward in time increments change their sign, and all of Diffrax's variables do;
+    but the bridge, seen from its other end, has the same integral."""
+    return (getattr(term, "direction", 1) * H**ω).ω
 
 
 def _drawn(noise: tuple, t0, t1, use_levy: bool) -> list:
@@ -139,9 +160,7 @@ def _drawn(noise: tuple, t0, t1, use_levy: bool) -> list:
 
 def _is_weak(noise: tuple) -> bool:
     """Whether all random variables are discrete, and so cheap to compute again."""
-    is_path = lambda x: isinstance(x, diffrax.AbstractBrownianPath)
-    paths = filter(is_path, jtu.tree_leaves(noise, is_leaf=is_path))
-    return all(isinstance(path, WeakBrownianPath) for path in paths)
+    return all(isinstance(path, WeakBrownianPath) for path in brownian_paths(noise))
 
 
 def noise_driven(
@@ -173,9 +192,9 @@ def check_state(y0: Y, solver: str) -> None:
         raise ValueError(f"`{solver}` needs a state with at least one array in it.")
     for leaf in leaves:
         dtype = jnp.result_type(leaf)
-        if not jnp.issubdtype(dtype, jnp.floating):
+        if not jnp.issubdtype(dtype, jnp.floating) or jnp.finfo(dtype).bits < 32:
             raise ValueError(
-                f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
+                f"`{solver}` needs a state `y0` of float32 or float64 arrays; got an "
                 f"array of dtype {dtype}. Convert it with `.astype(float)`; split a "
                 "complex one into real and imaginary parts."
             )

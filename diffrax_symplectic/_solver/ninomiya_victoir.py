@@ -140,7 +140,9 @@ class NinomiyaVictoir(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
         def flow(carry, number):
             y, result = carry
             one = unravel(jnp.where(jnp.arange(m) == number, increments, 0))
-            step = Step(time, 0.0, {"h": jtu.Partial(apply, noise, one, args)})
+            step = Step(
+                time, 0 * (t1 - t0), {"h": jtu.Partial(apply, noise, one, args)}
+            )
             y, flowed = take_step(_gauss, step, y, self)
             return (y, first_failure(result, flowed)), None
 

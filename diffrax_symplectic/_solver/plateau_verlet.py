@@ -24,8 +24,9 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
     r"""An explicit symplectic method of strong order 3/2 for any number of noises, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
 
-    With $M_k = \frac1h \int (w_k(s) - w_k(t_n))\,\mathrm{d}s = W_k / 2 + H_k$ and
-    $C_k = \pm\sqrt{h / 6}$ with fair, independent signs: kick by
+    With $M_k = \frac1h \int (w_k(s) - w_k(t_n))\,\mathrm{d}s$ (half of the increment $W_k$,
+    and the space-time Lévy area) and $C_k = \pm\sqrt{h / 6}$ with fair, independent signs:
+    kick by
     $\sum_k \sigma_k (M_k - C_k)$; one Störmer--Verlet step of $H_0$ over $h / 2$; kick by
     $\sum_k 2 \sigma_k C_k$; Störmer--Verlet over $h / 2$; kick by
     $\sum_k \sigma_k (W_k - M_k - C_k)$, each time at the $q$ that was reached. In short,

@@ -43,7 +43,7 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     to these. $a_{21}$ matters: 0 and 1/2 make $A^0$ triangular, and
     $\frac14 \pm \frac{\sqrt 3}{6}$ the Gauss method, of order 4 without noise.
 
-    Weak order 2 for one noise (and measured, past the paper, for two). A Hamiltonian
+    Weak order 2: in the paper for one noise, and measured for two and three. A Hamiltonian
     without the structure is refused while tracing.
 
     ??? cite "Reference"
