@@ -194,9 +194,9 @@ def check_state(y0: Y, solver: str) -> None:
         dtype = jnp.result_type(leaf)
         if not jnp.issubdtype(dtype, jnp.floating) or jnp.finfo(dtype).bits < 32:
             raise ValueError(
-                f"`{solver}` needs a state `y0` of float32 or float64 arrays; got an "
-                f"array of dtype {dtype}. Convert it with `.astype(float)`; split a "
-                "complex one into real and imaginary parts."
+                f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
+                f"array of dtype {dtype}. Convert it with `.astype(float)`, to float32 or "
+                "float64; split a complex one into real and imaginary parts."
             )
     if len({jnp.result_type(leaf) for leaf in leaves}) > 1:
         raise ValueError(
