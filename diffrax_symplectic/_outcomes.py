@@ -18,6 +18,7 @@ from ._brownian import (
     WeakBrownianPath,
     WeakIncrement,
 )
+from ._solver import brownian_paths
 
 
 class Outcomes(NamedTuple):
@@ -124,8 +125,7 @@ _Known: TypeAlias = (
 
 def _the_path(terms) -> tuple[_Known, bool]:
     """The path, without the plateaus that may be around it, and whether they are."""
-    leaves = jtu.tree_leaves(terms, is_leaf=_is_path)
-    paths = [x for x in leaves if _is_path(x)]
+    paths = brownian_paths(terms)
     path = paths[0] if len(paths) == 1 else None
     plateaus = isinstance(path, PlateauBrownianPath)
     if plateaus:
