@@ -179,3 +179,22 @@ def rigid_body_terms(path, mu=0.1, inertia=(0.8, 0.6, 0.2)):
 def slope(hs, errors):
     """The order that errors at several step sizes show, by least squares."""
     return np.polyfit(np.log(hs), np.log(np.abs(errors)), 1)[0]
+
+
+def values_of_a_step(y):
+    """Test functions of one degree of freedom."""
+    p, q = y[0][0], y[1][0]
+    return jnp.stack([p, q**2, p * q, jnp.sin(p + q), jnp.exp(p / 2)])
+
+
+def local_weak_orders(terms, solver, y0, args, hs, order: int, **kwargs) -> list[float]:
+    """Slopes of the local weak defect over the steps `hs`, for a batch of systems and
+    each of the functions above."""
+
+    def defect(h, y0, args):
+        kw = dict(fn=values_of_a_step, order=order, **kwargs)
+        return ds.weak_order_defect(terms, solver, 0.1, 0.1 + h, y0, args, **kw)
+
+    over_steps = jax.vmap(defect, in_axes=(0, None, None))
+    defects = jax.jit(jax.vmap(over_steps, in_axes=(None, 0, 0)))(hs, y0, args)
+    return [slope(hs, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(hs))]

@@ -12,7 +12,14 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._plan import make_plan
 
-from .problems import FineSample, Given, random_problem, slope, weak_path
+from .problems import (
+    FineSample,
+    Given,
+    local_weak_orders,
+    random_problem,
+    slope,
+    weak_path,
+)
 from .test_additive import H0 as any_H0, noise as additive_noise
 from .test_separable import _problem as separable_problem, H0, noise
 
@@ -80,11 +87,6 @@ def test_step_is_symplectic_for_a_thousand_random_systems(solver, dtype, bound):
     assert jnp.max(defects) <= bound
 
 
-def _functions(y):
-    p, q = y[0][0], y[1][0]
-    return jnp.stack([p, q**2, p * q, jnp.sin(p + q), jnp.exp(p / 2)])
-
-
 @pytest.mark.parametrize("m", [1, 2])
 def test_additive_gauss_is_weak_order_three(m):
     solver = ds.AdditiveGauss()
@@ -93,14 +95,7 @@ def test_additive_gauss_is_weak_order_three(m):
     )
     terms = ds.hamiltonian_terms(any_H0, additive_noise, weak_path(m, order=3))
     hs = np.array([0.04, 0.02, 0.01, 0.005])
-
-    def defect(h, y0, args):
-        kwargs = dict(fn=_functions, order=3)
-        return ds.weak_order_defect(terms, solver, 0.1, 0.1 + h, y0, args, **kwargs)
-
-    over_steps = jax.vmap(defect, in_axes=(0, None, None))
-    defects = jax.jit(jax.vmap(over_steps, in_axes=(None, 0, 0)))(hs, y0, args)
-    slopes = [slope(hs, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(hs))]
+    slopes = local_weak_orders(terms, solver, y0, args, hs, order=3)
     assert solver.weak_order(None) == 3
     np.testing.assert_allclose(slopes, 4.0, atol=0.15)
 
@@ -178,14 +173,7 @@ def test_explicit_methods_are_weak_order_two(solver, m):
         jr.split(jr.key(0), 24)[jnp.array([0, 2, 7, 9])]
     )
     hs = np.array([0.02, 0.01, 0.005])
-
-    def defect(h, y0, args):
-        kwargs = dict(fn=_functions, order=2, nodes=5)
-        return ds.weak_order_defect(terms, solver, 0.1, 0.1 + h, y0, args, **kwargs)
-
-    over_steps = jax.vmap(defect, in_axes=(0, None, None))
-    defects = jax.jit(jax.vmap(over_steps, in_axes=(None, 0, 0)))(hs, y0, args)
-    slopes = [slope(hs, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(hs))]
+    slopes = local_weak_orders(terms, solver, y0, args, hs, order=2, nodes=5)
     assert solver.weak_order(None) == 2
     np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 

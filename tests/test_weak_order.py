@@ -9,15 +9,18 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from .problems import GENERAL, H0, kubo_terms, noise, random_problem, slope, weak_path
+from .problems import (
+    GENERAL,
+    H0,
+    kubo_terms,
+    local_weak_orders,
+    noise,
+    random_problem,
+    weak_path,
+)
 
 
 STEPS = np.array([0.02, 0.01, 0.005, 0.0025])
-
-
-def _test_functions(y):
-    p, q = y[0][0], y[1][0]
-    return jnp.stack([p, q**2, p * q, jnp.sin(p + q), jnp.exp(p / 2)])
 
 
 def _slopes(solver, m, order):
@@ -28,15 +31,7 @@ def _slopes(solver, m, order):
         jnp.array([2, 3, 5, 6] if order == 2 else [2, 3, 4, 5])
     ]
     y0, args = jax.vmap(lambda key: random_problem(key, 1, m))(keys)
-
-    def defect(h, y0, args):
-        return ds.weak_order_defect(
-            terms, solver, 0.1, 0.1 + h, y0, args, fn=_test_functions, order=order
-        )
-
-    over_steps = jax.vmap(defect, in_axes=(0, None, None))
-    defects = jax.jit(jax.vmap(over_steps, in_axes=(None, 0, 0)))(STEPS, y0, args)
-    return [slope(STEPS, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(STEPS))]
+    return local_weak_orders(terms, solver, y0, args, STEPS, order)
 
 
 @pytest.mark.parametrize("m", [1, 2])
