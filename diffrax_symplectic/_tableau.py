@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ._custom_types import Args, RealScalarLike, Y
-from ._structure import check_additive, check_separable
+from ._structure_checks import check_additive, check_separable
 
 
 # Anything that NumPy makes an array of; a read-only array of float64 once checked.

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, PyTree
 
 from ._custom_types import Args, RealScalarLike, Y
 from ._hamiltonian import check_pair
-from ._outcomes import outcomes
-from ._solver import split_terms, tree_sum
+from ._quadrature import outcomes
+from ._terms import split_terms, tree_sum
 
 
 def _one_step(terms, solver, t0, t1, y0, args) -> tuple[Y, diffrax.RESULTS]:

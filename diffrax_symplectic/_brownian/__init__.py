@@ -7,9 +7,9 @@ from ._plateau import (
     PlateauBrownianPath as PlateauBrownianPath,
     PlateauIncrement as PlateauIncrement,
 )
+from ._random_words import check_key as check_key
 from ._truncated import TruncatedBrownianPath as TruncatedBrownianPath
 from ._weak import (
-    check_key as check_key,
     WeakBrownianPath as WeakBrownianPath,
     WeakIncrement as WeakIncrement,
 )

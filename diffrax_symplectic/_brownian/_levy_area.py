@@ -11,9 +11,9 @@ from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM, RealScalarLike
-from .._once import once
+from .._materialize import materialize
 from ._fixed_steps import require_fixed_steps
-from ._weak import check_key, place_key
+from ._random_words import check_key, place_key
 from ._wrapper import AbstractWrappedPath, require_space_time_area
 
 
@@ -210,7 +210,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         return lax.fori_loop(first, last, lambda i, piece: piece.then(sample(i)), empty)
 
     def _sample(self, t0, t1) -> _Piece:
-        increment = once(lambda: self.path.evaluate(t0, t1, use_levy=True))
+        increment = materialize(lambda: self.path.evaluate(t0, t1, use_levy=True))
         assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
         W, _ = jfu.ravel_pytree(increment.W)
         H, _ = jfu.ravel_pytree(increment.H)

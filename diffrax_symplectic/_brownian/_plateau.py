@@ -5,7 +5,8 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM, RealScalarLike
 from ._fixed_steps import require_fixed_steps
-from ._weak import check_key, fair_sign, random_words
+from ._random_words import check_key, random_words
+from ._weak import fair_sign
 from ._wrapper import AbstractWrappedPath, require_space_time_area
 
 

@@ -1,8 +1,3 @@
-from ._terms import (
-    brownian_paths as brownian_paths,
-    split_terms as split_terms,
-    tree_sum as tree_sum,
-)
 from .base import AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta
 from .midpoint import Midpoint as Midpoint
 from .srks1 import SRKs1 as SRKs1

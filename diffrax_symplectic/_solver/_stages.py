@@ -15,10 +15,10 @@ from equinox.internal import ω
 from jaxtyping import Array, Bool, PyTree
 
 from .._custom_types import RealScalarLike, Y
-from .._once import once
+from .._materialize import materialize
 from .._plan import Block, Plan
 from .._tableau import FlatTableau, Stage
-from ._terms import tree_sum
+from .._terms import tree_sum
 
 
 # The value of one stage: the change of the part of the state that it writes.
@@ -57,7 +57,7 @@ def take_step(
         for group in block.explicit:
             evaluate = ft.partial(values_of, group, values)
             shared = _uses(plan.tableau, group) > 1
-            values |= _unstack(group, once(evaluate) if shared else evaluate())
+            values |= _unstack(group, materialize(evaluate) if shared else evaluate())
 
     y1 = _position(y0, stages, plan.tableau.weights[None], values)
     nonfinite: diffrax.RESULTS = diffrax.RESULTS.nonfinite  # pyright: ignore

@@ -9,14 +9,14 @@ from .._brownian import refuse_half_solver
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
 from .._tableau import AbstractTableau, FlatTableau
-from ._stages import Step, take_step
-from ._terms import (
+from .._terms import (
     check_state,
     drift_driven,
     noise_driven,
     PROVIDED_BY,
     split_terms,
 )
+from ._stages import Step, take_step
 
 
 if TYPE_CHECKING:

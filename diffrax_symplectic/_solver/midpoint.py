@@ -6,7 +6,7 @@ from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau
-from ._terms import strong_order_if_commutative
+from .._terms import strong_order_if_commutative
 from .base import AbstractSymplecticRungeKutta
 
 

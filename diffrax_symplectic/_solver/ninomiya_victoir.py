@@ -10,8 +10,7 @@ from .._brownian import WeakIncrement
 from .._plan import make_plan
 from .._root_finder import PicardNewton
 from .._tableau import FlatTableau, Stage
-from ._stages import first_failure, Step, take_step
-from ._terms import (
+from .._terms import (
     apply,
     check_state,
     controls,
@@ -19,6 +18,7 @@ from ._terms import (
     number_of_noises,
     split_terms,
 )
+from ._stages import first_failure, Step, take_step
 from .base import AbstractSymplecticSolver
 
 

@@ -7,7 +7,7 @@ from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau, real_parameter
-from ._terms import strong_order_if_commutative
+from .._terms import strong_order_if_commutative
 from .base import AbstractSymplecticRungeKutta
 
 

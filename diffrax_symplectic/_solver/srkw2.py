@@ -7,7 +7,7 @@ from diffrax import AbstractImplicitSolver
 
 from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau
-from ._terms import number_of_noises
+from .._terms import number_of_noises
 from .base import AbstractSymplecticRungeKutta
 
 

@@ -9,7 +9,7 @@ from jax import lax
 _T = TypeVar("_T")
 
 
-def once(fn: Callable[[], _T]) -> _T:
+def materialize(fn: Callable[[], _T]) -> _T:
     """`fn()`, as something that is computed once and kept.
 
     On CPUs XLA computes whatever several of its kernels need anew in each of them, be it a

@@ -14,14 +14,14 @@ import numpy as np
 from equinox.internal import ω
 from jaxtyping import Array, Float, PyTree
 
-from .._brownian import (
+from ._brownian import (
     LevyAreaIncrement,
     PlateauIncrement,
     WeakBrownianPath,
     WeakIncrement,
 )
-from .._custom_types import Args, RealScalarLike, Y
-from .._once import once
+from ._custom_types import Args, RealScalarLike, Y
+from ._materialize import materialize
 
 
 def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
@@ -128,7 +128,11 @@ PROVIDED_BY = {
 
 def controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, list]:
     """The random variables of the step from `t0` to `t1`, for each noise term."""
-    draw = _drawn if _is_weak(noise) else lambda *args: once(ft.partial(_drawn, *args))
+    draw = (
+        _drawn
+        if _is_weak(noise)
+        else lambda *args: materialize(ft.partial(_drawn, *args))
+    )
     if names == ["W"]:
         return {"W": draw(noise, t0, t1, False)}
     increments = draw(noise, t0, t1, True)

@@ -18,7 +18,7 @@ from ._brownian import (
     WeakBrownianPath,
     WeakIncrement,
 )
-from ._solver import brownian_paths
+from ._terms import brownian_paths
 
 
 class Outcomes(NamedTuple):

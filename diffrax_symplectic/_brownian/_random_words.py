@@ -1,0 +1,76 @@
+"""Random words for a step, as a function of a key and of where the step lies."""
+
+import jax
+import jax.extend.random as jer
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array, Integer, PRNGKeyArray
+
+
+def random_words(key, t0, t1, sets: int, n: int) -> Integer[Array, "sets n"]:
+    """Random words for the step from `t0` to `t1`, the same for times that differ by
+    rounding. The first of the sets are the same whatever their number is."""
+    key = _typed(key)
+    count, exponent = _place(t0, t1)
+    blocks = (sets * n + 1) // 2
+    if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks < 2**20:
+        # The place is the counter of the generator, so that one hash gives two words.
+        # (Keys folded and split would take three hashes for the first.)
+        numbers = np.arange(blocks, dtype=np.uint32)
+        counters = jnp.concatenate(
+            [
+                jnp.broadcast_to(count.astype(jnp.uint32), (blocks,)),
+                (exponent.astype(jnp.uint32) << 20) + numbers,
+            ]
+        )
+        words = jer.threefry_2x32(jr.key_data(key), counters)
+        return words.reshape(2, blocks).T.reshape(-1)[: sets * n].reshape(sets, n)
+    place = place_key(key, t0, t1)
+    return jnp.stack(
+        [jr.bits(jr.fold_in(place, i), (n,), jnp.uint32) for i in range(sets)]
+    )
+
+
+def check_key(key, user: str) -> None:
+    """Raises a `ValueError` unless `key` is a random key, of the new style or the old, or
+    an array of such, to be `vmap`ped over."""
+    dtype = getattr(key, "dtype", None)
+    if dtype is None or not (
+        jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32
+    ):
+        raise ValueError(
+            f"`{user}` needs a random key, as from `jax.random.key(0)`; got {key!r}."
+        )
+
+
+def place_key(key, t0, t1) -> PRNGKeyArray:
+    """A key for the step from `t0` to `t1`, the same for times that differ by rounding."""
+    count, exponent = _place(t0, t1)
+    return jr.fold_in(jr.fold_in(_typed(key), count), exponent)
+
+
+def _typed(key) -> PRNGKeyArray:
+    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    key = key if typed else jr.wrap_key_data(key)
+    if key.ndim > 0:
+        raise ValueError(
+            "A Brownian path needs one random key; got an array of keys of shape "
+            f"{key.shape}. Use `jax.vmap` over it."
+        )
+    return key
+
+
+def _place(t0, t1) -> tuple[Integer[Array, ""], Integer[Array, ""]]:
+    """Where a step lies, in integers.
+
+    The middle of the step is counted in units of a power of two that lies between a third
+    and 0.7 of the step, so that no two steps of one size share a count. The
+    two odd constants keep round numbers away from where the roundings change.
+    """
+    h = jnp.abs(t1 - t0)
+    _, exponent = jnp.frexp(h * 1.37)
+    exponent = exponent.astype(jnp.int32) - 2
+    count = jnp.floor(jnp.ldexp(t0 + (t1 - t0) / 2, -exponent) + 0.29)
+    # Starts again after 2^31 counts. (`fmod` is exact, also for negative times.)
+    return jnp.fmod(count, 2.0**31).astype(jnp.int32), exponent
