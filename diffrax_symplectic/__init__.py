@@ -20,6 +20,7 @@ from ._expectation import (
 from ._hamiltonian import hamiltonian_terms as hamiltonian_terms
 from ._root_finder import SmallLU as SmallLU, PicardNewton as PicardNewton
 from ._solver import (
+    AbstractImplicitStages as AbstractImplicitStages,
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
     AdditiveGauss as AdditiveGauss,
     LevyAreaMidpoint as LevyAreaMidpoint,

@@ -1,3 +1,4 @@
+from ._implicit import AbstractImplicitStages as AbstractImplicitStages
 from .base import AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta
 from .midpoint import Midpoint as Midpoint
 from .srks1 import SRKs1 as SRKs1

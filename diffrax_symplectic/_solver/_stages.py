@@ -99,8 +99,7 @@ def _solve(
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         raise ValueError(
             f"The tableau of `{type(solver).__name__}` has implicit stages. Let the class "
-            "also subclass `diffrax.AbstractImplicitSolver`, with its fields `root_finder` "
-            "and `root_find_max_steps`."
+            "also subclass `diffrax_symplectic.AbstractImplicitStages`."
         )
     finder = solver.root_finder
     linear_solver = getattr(finder, "linear_solver", lx.AutoLinearSolver(None))

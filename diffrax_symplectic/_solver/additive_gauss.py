@@ -1,11 +1,9 @@
 from typing import ClassVar
 
 import numpy as np
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
 
-from .._root_finder import PicardNewton
 from .._tableau import AdditiveTableau
+from ._implicit import AbstractImplicitStages, ARGUMENTS
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -25,7 +23,7 @@ _tab = AdditiveTableau(
 )
 
 
-class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""A symplectic method of weak order 3 for any number of noises that depend neither on
     the state nor on time: the Gauss method of two stages, with three random variables for
     each noise.
@@ -70,9 +68,6 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         ```
     """
 
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
-
     tableau: ClassVar[AdditiveTableau] = _tab
 
     def order(self, terms):
@@ -85,8 +80,4 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 3
 
 
-AdditiveGauss.__init__.__doc__ = """**Arguments:**
-
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one step.
-"""
+AdditiveGauss.__init__.__doc__ = ARGUMENTS

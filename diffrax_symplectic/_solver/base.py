@@ -50,13 +50,13 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
 class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
     r"""A Runge--Kutta method with its own coefficients for drift and noise.
 
-    Subclasses give a `tableau` and their orders, and if stages are implicit also subclass
-    `diffrax.AbstractImplicitSolver`, with its fields `root_finder` and
-    `root_find_max_steps`. Everything else is decided by the tableau: stages that feed
-    nothing are dropped, equal ones evaluated once, explicit ones evaluated directly, and
-    the implicit rest is solved in as many small systems, one after another, as the
-    coefficients allow. The unknowns are the stage values $k_i$, not the stages, so that
-    the end of the step is their weighted sum and needs no further evaluation.
+    Subclasses give a `tableau` and their orders. If stages are implicit, they also subclass
+    [`diffrax_symplectic.AbstractImplicitStages`][]. Everything else is decided by the
+    tableau: unused stages are dropped, equal ones are evaluated once, explicit ones are
+    evaluated directly, and the implicit rest is solved in as many small systems, one after
+    another, as the coefficients allow. The unknowns are the stage values $k_i$, not the
+    stages, so that the end of the step is their weighted sum and needs no further
+    evaluation.
 
     **Terms.** `MultiTerm(drift, noise)` as from
     [`diffrax_symplectic.hamiltonian_terms`][] or of Diffrax's own `ODETerm` and

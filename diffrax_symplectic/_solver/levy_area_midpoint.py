@@ -1,16 +1,13 @@
 import dataclasses
 from typing import ClassVar
 
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
-
-from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau
+from ._implicit import AbstractImplicitStages, ARGUMENTS
 from .base import AbstractSymplecticRungeKutta
 from .midpoint import Midpoint
 
 
-class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The implicit midpoint rule with Lévy areas, of strong order 1 for any number of
     noises, whether they commute or not.
 
@@ -57,9 +54,6 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         ```
     """
 
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
-
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
         Midpoint.tableau, noise=("W", "A")
     )
@@ -78,8 +72,4 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 1
 
 
-LevyAreaMidpoint.__init__.__doc__ = """**Arguments:**
-
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one step.
-"""
+LevyAreaMidpoint.__init__.__doc__ = ARGUMENTS

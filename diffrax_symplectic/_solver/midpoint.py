@@ -1,12 +1,10 @@
 from typing import ClassVar
 
 import numpy as np
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
 
-from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau
 from .._terms import strong_order_if_commutative
+from ._implicit import AbstractImplicitStages, ARGUMENTS
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -14,7 +12,7 @@ _half = np.array([[0.5]])
 _tab = GeneralTableau.strong(A=_half, B=_half, alpha=np.ones(1), beta=np.ones(1))
 
 
-class Midpoint(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class Midpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The implicit midpoint rule for Stratonovich systems.
 
     $$G = y_n + \tfrac12 h\,a(G) + \tfrac12 \sum_k b_k(G) I_k, \qquad
@@ -43,9 +41,6 @@ class Midpoint(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         ```
     """
 
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
-
     tableau: ClassVar[GeneralTableau] = _tab
 
     def order(self, terms):
@@ -61,8 +56,4 @@ class Midpoint(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 1
 
 
-Midpoint.__init__.__doc__ = """**Arguments:**
-
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one step.
-"""
+Midpoint.__init__.__doc__ = ARGUMENTS

@@ -4,11 +4,9 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-import optimistix as optx
 
 from .._brownian import WeakIncrement
 from .._plan import make_plan
-from .._root_finder import PicardNewton
 from .._tableau import FlatTableau, Stage
 from .._terms import (
     apply,
@@ -18,6 +16,7 @@ from .._terms import (
     number_of_noises,
     split_terms,
 )
+from ._implicit import AbstractImplicitStages, ARGUMENTS
 from ._stages import first_failure, Step, take_step
 from .base import AbstractSymplecticSolver
 
@@ -35,7 +34,7 @@ _gauss = make_plan(
 _WRITTEN_OUT = 2
 
 
-class NinomiyaVictoir(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
+class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     r"""A symplectic method of weak order 2 for any Hamiltonians and any number of noises,
     whether they commute or not: splitting in random order.
 
@@ -91,9 +90,6 @@ class NinomiyaVictoir(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
         }
         ```
     """
-
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
 
     @property
     def minimal_levy_area(self):
@@ -161,8 +157,4 @@ class NinomiyaVictoir(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
         return 2
 
 
-NinomiyaVictoir.__init__.__doc__ = """**Arguments:**
-
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one system of a step.
-"""
+NinomiyaVictoir.__init__.__doc__ = ARGUMENTS

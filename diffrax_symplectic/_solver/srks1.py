@@ -2,12 +2,10 @@ import functools as ft
 
 import equinox as eqx
 import numpy as np
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
 
-from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau, real_parameter
 from .._terms import strong_order_if_commutative
+from ._implicit import AbstractImplicitStages, ROOT_FINDER
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -17,7 +15,7 @@ def _srks1(a: float) -> GeneralTableau:
     return GeneralTableau.strong(A=A, B=A, alpha=alpha, beta=alpha)
 
 
-class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The two-stage symplectic methods SRKs1 of Wang, Hong and Xu.
 
     $$A = B = \begin{pmatrix} a & 0 \\ 2a & \tfrac12 - a \end{pmatrix}, \qquad
@@ -56,8 +54,6 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     a: float = eqx.field(
         default=0.25, static=True, converter=ft.partial(real_parameter, "a")
     )
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
 
     @property
     def tableau(self) -> GeneralTableau:
@@ -76,11 +72,9 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 1
 
 
-SRKs1.__init__.__doc__ = """**Arguments:**
+SRKs1.__init__.__doc__ = f"""**Arguments:**
 
 - `a`: the free parameter, a Python float.
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one step.
-
+{ROOT_FINDER}
 **Raises:** a `ValueError` if `a` is not a finite real number.
 """

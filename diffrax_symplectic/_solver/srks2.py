@@ -1,11 +1,9 @@
 from typing import ClassVar
 
 import numpy as np
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
 
-from .._root_finder import PicardNewton
 from .._tableau import SeparableTableau
+from ._implicit import AbstractImplicitStages, ARGUMENTS
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -22,7 +20,7 @@ def _srks2(d1: float = 0.5) -> SeparableTableau:
     )
 
 
-class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKs2 of Wang, Hong and Xu, of strong order 1, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
 
@@ -53,9 +51,6 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         ```
     """
 
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
-
     tableau: ClassVar[SeparableTableau] = _srks2()
 
     def order(self, terms):
@@ -72,8 +67,4 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 1
 
 
-SRKs2.__init__.__doc__ = """**Arguments:**
-
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one step.
-"""
+SRKs2.__init__.__doc__ = ARGUMENTS

@@ -2,11 +2,9 @@ import functools as ft
 
 import equinox as eqx
 import numpy as np
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
 
-from .._root_finder import PicardNewton
 from .._tableau import real_parameter, SeparableTableau
+from ._implicit import AbstractImplicitStages, ROOT_FINDER
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -26,7 +24,7 @@ def _srks3(a: float, b1_plus_b2: float = 1.0) -> SeparableTableau:
     )
 
 
-class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic methods SRKs3 of Wang, Hong and Xu, of strong order 1 for any
     number of noises, for $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
 
@@ -68,8 +66,6 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     a: float = eqx.field(
         default=0.0, static=True, converter=ft.partial(real_parameter, "a")
     )
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
 
     @property
     def tableau(self) -> SeparableTableau:
@@ -89,11 +85,9 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 1
 
 
-SRKs3.__init__.__doc__ = """**Arguments:**
+SRKs3.__init__.__doc__ = f"""**Arguments:**
 
 - `a`: the free parameter, a Python float.
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one step.
-
+{ROOT_FINDER}
 **Raises:** a `ValueError` if `a` is not a finite real number.
 """

@@ -3,11 +3,9 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
 
-from .._root_finder import PicardNewton
 from .._tableau import AdditiveTableau, real_parameter
+from ._implicit import AbstractImplicitStages, ROOT_FINDER
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -41,7 +39,7 @@ def _sign(value: Any) -> int:
     return int(value)
 
 
-class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic methods SRKs4 of Wang, Hong and Xu, of strong order 3/2 for any
     number of noises that do not depend on the state.
 
@@ -103,8 +101,6 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         default=0.0, static=True, converter=ft.partial(real_parameter, "b")
     )
     sign: int = eqx.field(default=-1, static=True, converter=_sign)
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
 
     @property
     def tableau(self) -> AdditiveTableau:
@@ -124,13 +120,11 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 2
 
 
-SRKs4.__init__.__doc__ = """**Arguments:**
+SRKs4.__init__.__doc__ = f"""**Arguments:**
 
 - `beta1`, `beta2`, `b`: the free parameters, Python floats; `beta2` not 0.
 - `sign`: the sign $s$, 1 or -1.
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one step.
-
+{ROOT_FINDER}
 **Raises:** a `ValueError` if a parameter is not a finite real number, if `beta2` is 0, or
 if `sign` is not 1 or -1. While tracing, if the path has no space-time Lévy area.
 """

@@ -2,11 +2,9 @@ import functools as ft
 
 import equinox as eqx
 import numpy as np
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
 
-from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau, real_parameter
+from ._implicit import AbstractImplicitStages, ROOT_FINDER
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -15,7 +13,7 @@ def _srkw1(b: float) -> GeneralTableau:
     return GeneralTableau(alpha=one, beta=one, A0=half, B0=[[b]], A1=[[1 - b]], B1=half)
 
 
-class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The one-stage symplectic methods SRKw1 of Wang, Hong and Xu, of weak order 1.
 
     $$G^0 = y_n + \tfrac12 h\,a(G^0) + b \sum_k b_k(G^1) \hat I_k, \qquad
@@ -55,8 +53,6 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     b: float = eqx.field(
         default=0.5, static=True, converter=ft.partial(real_parameter, "b")
     )
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
 
     @property
     def tableau(self) -> GeneralTableau:
@@ -72,11 +68,9 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 1
 
 
-SRKw1.__init__.__doc__ = """**Arguments:**
+SRKw1.__init__.__doc__ = f"""**Arguments:**
 
 - `b`: the free parameter, a Python float.
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one step.
-
+{ROOT_FINDER}
 **Raises:** a `ValueError` if `b` is not a finite real number.
 """

@@ -2,12 +2,10 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
 
-from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau
 from .._terms import number_of_noises
+from ._implicit import AbstractImplicitStages, ROOT_FINDER
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -70,7 +68,7 @@ def _rows(value: Any) -> tuple[int, ...]:
     return tuple(int(i) for i in value)
 
 
-class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKw2 of Wang, Hong and Xu, of weak order 2 for one noise.
 
     Four drift and two noise stages in the form of
@@ -128,8 +126,6 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         default=(1, 4, 2, 3), static=True, converter=_rows
     )
     conjugate: bool = eqx.field(default=False, static=True, converter=bool)
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
 
     @property
     def tableau(self) -> GeneralTableau:
@@ -144,13 +140,11 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 2 if number_of_noises(terms) <= 1 else 1
 
 
-SRKw2.__init__.__doc__ = """**Arguments:**
+SRKw2.__init__.__doc__ = f"""**Arguments:**
 
 - `rows`: the order of the drift stages, a permutation of `(1, 2, 3, 4)`, which is the
     paper's.
 - `conjugate`: whether to take the other sign of the square root of 3.
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one step.
-
+{ROOT_FINDER}
 **Raises:** a `ValueError` if `rows` is not a permutation.
 """

@@ -2,11 +2,9 @@ from typing import get_args, Literal, TypeAlias
 
 import equinox as eqx
 import numpy as np
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
 
-from .._root_finder import PicardNewton
 from .._tableau import SeparableTableau
+from ._implicit import AbstractImplicitStages, ROOT_FINDER
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -29,7 +27,7 @@ def _srkw3(variant: Variant) -> SeparableTableau:
     return SeparableTableau(alpha=[1], beta=[beta], A0=half, B0=[[B0]], A1=[[A1]])
 
 
-class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The one-stage symplectic methods SRKw3a to SRKw3f of Wang, Hong and Xu, of weak
     order 1, for $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
 
@@ -69,8 +67,6 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     """
 
     variant: Variant = eqx.field(default="c", static=True)
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
 
     def __check_init__(self):
         if self.variant not in get_args(Variant):
@@ -92,11 +88,9 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 1
 
 
-SRKw3.__init__.__doc__ = """**Arguments:**
+SRKw3.__init__.__doc__ = f"""**Arguments:**
 
 - `variant`: one of `"a"` to `"f"`.
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one step.
-
+{ROOT_FINDER}
 **Raises:** a `ValueError` if `variant` is not one of these letters.
 """

@@ -2,11 +2,9 @@ import functools as ft
 
 import equinox as eqx
 import numpy as np
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
 
-from .._root_finder import PicardNewton
 from .._tableau import real_parameter, SeparableTableau
+from ._implicit import AbstractImplicitStages, ROOT_FINDER
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -27,7 +25,7 @@ def _srkw4(
     )
 
 
-class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic methods SRKw4 of Wang, Hong and Xu, of weak order 2, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
 
@@ -68,8 +66,6 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
     a21: float = eqx.field(
         default=0.5, static=True, converter=ft.partial(real_parameter, "a21")
     )
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
 
     @property
     def tableau(self) -> SeparableTableau:
@@ -86,11 +82,9 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 2
 
 
-SRKw4.__init__.__doc__ = """**Arguments:**
+SRKw4.__init__.__doc__ = f"""**Arguments:**
 
 - `a21`: the free parameter, a Python float.
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one step.
-
+{ROOT_FINDER}
 **Raises:** a `ValueError` if `a21` is not a finite real number.
 """

@@ -1,10 +1,7 @@
 from typing import ClassVar
 
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
-
-from .._root_finder import PicardNewton
 from .._tableau import AdditiveTableau
+from ._implicit import AbstractImplicitStages, ARGUMENTS
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -18,7 +15,7 @@ _tab = AdditiveTableau(
 )
 
 
-class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKw5 of Wang, Hong and Xu, of weak order 2 for any number of
     noises that depend neither on the state nor on time.
 
@@ -57,9 +54,6 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         ```
     """
 
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
-
     tableau: ClassVar[AdditiveTableau] = _tab
 
     def order(self, terms):
@@ -72,8 +66,4 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 2
 
 
-SRKw5.__init__.__doc__ = """**Arguments:**
-
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one step.
-"""
+SRKw5.__init__.__doc__ = ARGUMENTS

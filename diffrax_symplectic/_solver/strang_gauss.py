@@ -1,12 +1,10 @@
 from typing import ClassVar
 
 import numpy as np
-import optimistix as optx
-from diffrax import AbstractImplicitSolver
 
-from .._root_finder import PicardNewton
 from .._tableau import GeneralTableau
 from .._terms import number_of_noises
+from ._implicit import AbstractImplicitStages, ARGUMENTS
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -21,7 +19,7 @@ _tab = GeneralTableau(
 )
 
 
-class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
+class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""A symplectic method of weak order 2 for one noise: the drift over half of the step
     by the midpoint rule, the noise by the Gauss method of order 4, and the drift over the
     other half.
@@ -62,9 +60,6 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         ```
     """
 
-    root_finder: optx.AbstractRootFinder = PicardNewton()
-    root_find_max_steps: int = 20
-
     tableau: ClassVar[GeneralTableau] = _tab
 
     def order(self, terms):
@@ -76,8 +71,4 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitSolver):
         return 2 if number_of_noises(terms) <= 1 else 1
 
 
-StrangGauss.__init__.__doc__ = """**Arguments:**
-
-- `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in one system of a step.
-"""
+StrangGauss.__init__.__doc__ = ARGUMENTS
