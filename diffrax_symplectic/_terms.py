@@ -25,15 +25,22 @@ from ._materialize import materialize
 
 
 def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
-    """Drift terms and noise terms, in any order: noise has a Brownian path, or is a later
-    term that time does not drive."""
-    parts = terms.terms if isinstance(terms, diffrax.MultiTerm) else (terms,)
+    """Drift terms and noise terms, in any order and however nested. A term is noise if it
+    has a Brownian path, or if it is not the first one and time does not drive it."""
+    parts = _flatten(terms)
     is_noise = [
         len(brownian_paths(term)) > 0 or (i > 0 and not _is_ode(term))
         for i, term in enumerate(parts)
     ]
     drift = tuple(term for term, noise in zip(parts, is_noise) if not noise)
     return drift, tuple(term for term, noise in zip(parts, is_noise) if noise)
+
+
+def _flatten(terms: diffrax.AbstractTerm) -> tuple:
+    """The terms of a `MultiTerm`, and of every `MultiTerm` among these."""
+    if isinstance(terms, diffrax.MultiTerm):
+        return tuple(part for term in terms.terms for part in _flatten(term))
+    return (terms,)
 
 
 def brownian_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
