@@ -23,6 +23,7 @@ from ._solver import (
     AbstractImplicitStages as AbstractImplicitStages,
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
     AdditiveGauss as AdditiveGauss,
+    check_structure as check_structure,
     LevyAreaMidpoint as LevyAreaMidpoint,
     Midpoint as Midpoint,
     NinomiyaVictoir as NinomiyaVictoir,

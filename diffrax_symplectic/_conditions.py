@@ -1,6 +1,7 @@
 """What a tableau promises, as residuals that vanish when it keeps the promise."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Mapping
 
 import numpy as np
@@ -99,16 +100,7 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     """
     if order not in (1, 2):
         raise ValueError(f"`order` must be 1 or 2; got {order!r}.")
-    if isinstance(tableau, GeneralTableau):
-        first, second = _weak_general(tableau)
-    elif isinstance(tableau, SeparableTableau):
-        first, second = _weak_separable(tableau)
-    elif isinstance(tableau, PartitionedTableau):
-        first, second = _weak_partitioned(tableau)
-    elif isinstance(tableau, AdditiveTableau):
-        first, second = _weak_additive(tableau)
-    else:
-        raise _unknown(tableau)
+    first, second = _weak(tableau)
     conditions = first if order == 1 else first | second
     return {name: float(value) for name, value in conditions.items()}
 
@@ -162,35 +154,33 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
         }
         ```
     """
-    if isinstance(tableau, GeneralTableau):
-        conditions = {
-            "alpha.e - 1": tableau.alpha.sum() - 1,
-            "beta.e - 1": tableau.beta.sum() - 1,
-            "beta.B1e - 1/2": tableau.beta @ tableau.B1.sum(axis=1) - 1 / 2,
-        }
-    elif isinstance(tableau, SeparableTableau):
-        conditions = _strong_partitioned(tableau.partitioned())
-        # Of the paper's further variables, which are not independent of `W`.
-        conditions |= _others_vanish(tableau.beta, A1e=tableau.c1)
-    elif isinstance(tableau, PartitionedTableau):
-        conditions = _strong_partitioned(tableau)
-    elif isinstance(tableau, AdditiveTableau):
-        first, second = _weak_additive(tableau)
-        al, c1 = tableau.alpha, tableau.c1
-        B_H = tableau.B.get("H", np.zeros((len(al), len(c1))))
-        beta_H = tableau.beta.get("H", np.zeros(len(c1)))
-        conditions = first | second
-        conditions |= {
-            "alpha.B[H]e - 1": al @ B_H.sum(axis=1) - 1,
-            "beta[W].c1 - 1/2": tableau.beta["W"] @ c1 - 1 / 2,
-            "beta[H].c1 + 1": beta_H @ c1 + 1,
-        }
-    else:
-        raise _unknown(tableau)
-    return {name: float(value) for name, value in conditions.items()}
+    return {name: float(value) for name, value in _strong(tableau).items()}
 
 
-def _strong_partitioned(tableau: PartitionedTableau) -> dict:
+@ft.singledispatch
+def _strong(tableau: AbstractTableau) -> dict:
+    """The conditions for the strong order of the tableau's family."""
+    raise _unknown(tableau)
+
+
+@_strong.register
+def _(tableau: GeneralTableau) -> dict:
+    return {
+        "alpha.e - 1": tableau.alpha.sum() - 1,
+        "beta.e - 1": tableau.beta.sum() - 1,
+        "beta.B1e - 1/2": tableau.beta @ tableau.B1.sum(axis=1) - 1 / 2,
+    }
+
+
+@_strong.register
+def _(tableau: SeparableTableau) -> dict:
+    # Of the paper's further variables, which are not independent of `W`.
+    others = _others_vanish(tableau.beta, A1e=tableau.c1)
+    return _strong(tableau.partitioned()) | others
+
+
+@_strong.register
+def _(tableau: PartitionedTableau) -> dict:
     return {
         "alpha.e - 1": tableau.alpha.sum() - 1,
         "alpha_hat.e - 1": tableau.alpha_hat.sum() - 1,
@@ -199,7 +189,29 @@ def _strong_partitioned(tableau: PartitionedTableau) -> dict:
     }
 
 
-def _weak_general(tableau: GeneralTableau) -> tuple[dict, dict]:
+@_strong.register
+def _(tableau: AdditiveTableau) -> dict:
+    first, second = _weak(tableau)
+    al, c1 = tableau.alpha, tableau.c1
+    B_H = tableau.B.get("H", np.zeros((len(al), len(c1))))
+    beta_H = tableau.beta.get("H", np.zeros(len(c1)))
+    return {
+        **first,
+        **second,
+        "alpha.B[H]e - 1": al @ B_H.sum(axis=1) - 1,
+        "beta[W].c1 - 1/2": tableau.beta["W"] @ c1 - 1 / 2,
+        "beta[H].c1 + 1": beta_H @ c1 + 1,
+    }
+
+
+@ft.singledispatch
+def _weak(tableau: AbstractTableau) -> tuple[dict, dict]:
+    """The conditions for weak order 1, and those that order 2 adds."""
+    raise _unknown(tableau)
+
+
+@_weak.register
+def _(tableau: GeneralTableau) -> tuple[dict, dict]:
     al, be = tableau.alpha, tableau.beta
     A0, A1, B0, B1 = tableau.A0, tableau.A1, tableau.B0, tableau.B1
     A0e, A1e, B0e, B1e = (x.sum(axis=1) for x in (A0, A1, B0, B1))
@@ -227,7 +239,8 @@ def _weak_general(tableau: GeneralTableau) -> tuple[dict, dict]:
     return first, second
 
 
-def _weak_partitioned(tableau: PartitionedTableau) -> tuple[dict, dict]:
+@_weak.register
+def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
     be, A1 = tableau.beta["W"], tableau.A1
     B0e = {name: B0.sum(axis=1) for name, B0 in tableau.B0.items()}
     first = {
@@ -254,17 +267,36 @@ def _weak_partitioned(tableau: PartitionedTableau) -> tuple[dict, dict]:
     return first, second
 
 
-def _weak_separable(tableau: SeparableTableau) -> tuple[dict, dict]:
+@_weak.register
+def _(tableau: SeparableTableau) -> tuple[dict, dict]:
     """With the paper's conditions on further variables, which are not independent of `W`:
     those in `B0` must not be live."""
     B0 = {"W": tableau.B0["W"]}
     partitioned = dataclasses.replace(tableau.partitioned(), B0=B0)
-    first, second = _weak_partitioned(partitioned)
+    first, second = _weak(partitioned)
     B0e = tableau.B0["W"].sum(axis=1)
     return first, second | {
         "beta.A1((B0e)^2)": tableau.beta["W"] @ tableau.A1 @ B0e**2,
         **_others_vanish(tableau.beta, A1e=tableau.c1, **{"A1(B0e)": tableau.A1 @ B0e}),
     }
+
+
+@_weak.register
+def _(tableau: AdditiveTableau) -> tuple[dict, dict]:
+    al, B = tableau.alpha, {k: v.sum(axis=1) for k, v in tableau.B.items()}
+    first = {"alpha.e - 1": al.sum() - 1}
+    for name, weights in tableau.beta.items():
+        exact = 1 if name == "W" else 0
+        first[f"beta[{name}].e - {exact}"] = weights.sum() - exact
+    squares = sum(_variance(name) * (al @ Be**2) for name, Be in B.items())
+    second = {
+        "alpha.Ae - 1/2": al @ tableau.c0 - 1 / 2,
+        "alpha.B[W]e - 1/2": al @ B["W"] - 1 / 2,
+        "sum over variables: variance alpha.(Be)^2 - 1/2": squares - 1 / 2,
+    }
+    if not tableau.constant:
+        second["beta[W].c1 - 1/2"] = tableau.beta["W"] @ tableau.c1 - 1 / 2
+    return first, second
 
 
 def _others_vanish(beta: Mapping[str, np.ndarray], **moments: np.ndarray) -> dict:
@@ -293,20 +325,3 @@ def _unknown(tableau) -> ValueError:
         "The conditions are known for `GeneralTableau`, `SeparableTableau`, "
         f"`PartitionedTableau` and `AdditiveTableau`; got `{type(tableau).__name__}`."
     )
-
-
-def _weak_additive(tableau: AdditiveTableau) -> tuple[dict, dict]:
-    al, B = tableau.alpha, {k: v.sum(axis=1) for k, v in tableau.B.items()}
-    first = {"alpha.e - 1": al.sum() - 1}
-    for name, weights in tableau.beta.items():
-        exact = 1 if name == "W" else 0
-        first[f"beta[{name}].e - {exact}"] = weights.sum() - exact
-    squares = sum(_variance(name) * (al @ Be**2) for name, Be in B.items())
-    second = {
-        "alpha.Ae - 1/2": al @ tableau.c0 - 1 / 2,
-        "alpha.B[W]e - 1/2": al @ B["W"] - 1 / 2,
-        "sum over variables: variance alpha.(Be)^2 - 1/2": squares - 1 / 2,
-    }
-    if not tableau.constant:
-        second["beta[W].c1 - 1/2"] = tableau.beta["W"] @ tableau.c1 - 1 / 2
-    return first, second

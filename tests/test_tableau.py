@@ -1,7 +1,10 @@
 """Coefficients satisfy their conditions, and only live, distinct stages are solved."""
 
+import ast
 import dataclasses
 import itertools
+import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -146,18 +149,39 @@ def test_conditions_are_known_for_known_tableaus_and_variables():
         def flatten(self):
             return ds.Midpoint().tableau.flatten()
 
-        def check_structure(self, drift, noise, t0, y0, args, solver):
-            pass
-
     for residuals in (
         ds.strong_order_residuals,
         lambda x: ds.weak_order_residuals(x, 1),
     ):
         with pytest.raises(ValueError, match="got `Other`"):
             residuals(Other())
+    with pytest.raises(ValueError, match="no check of the structure is registered"):
+        ds.check_structure(Other(), (), (), 0.0, None, None, "Mine")
     own = ds.AdditiveTableau([1], {"W": [1]}, [[0.5]], {"W": [[1]], "mine": [[1]]}, [0])
     with pytest.raises(ValueError, match="got a tableau with `mine`"):
         ds.weak_order_residuals(own, 2)
     # Without space-time area there is no strong order 3/2.
     strong = ds.strong_order_residuals(ds.SRKw5().tableau)
     assert abs(strong["beta[H].c1 + 1"]) == 1
+
+
+def test_tableaus_know_nothing_of_jax():
+    root = pathlib.Path(ds.__file__).parent / "_tableau"
+    imported = set()
+    for node in itertools.chain(
+        *(ast.walk(ast.parse(f.read_text())) for f in root.glob("*.py"))
+    ):
+        if isinstance(node, ast.Import):
+            imported |= {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom):
+            imported.add("." * node.level + (node.module or ""))
+    outside = {name for name in imported if not re.match(r"\.[^.]", name)}
+    assert {"dataclasses", "numpy"} <= outside
+    assert outside <= {
+        "abc",
+        "collections.abc",
+        "dataclasses",
+        "jaxtyping",
+        "numpy",
+        "typing",
+    }

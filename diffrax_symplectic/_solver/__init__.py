@@ -1,3 +1,4 @@
+from ._structure import check_structure as check_structure
 from ._implicit import AbstractImplicitStages as AbstractImplicitStages
 from .base import AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta
 from .midpoint import Midpoint as Midpoint

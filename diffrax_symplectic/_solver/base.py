@@ -17,6 +17,7 @@ from .._terms import (
     split_terms,
 )
 from ._stages import Step, take_step
+from ._structure import check_structure
 
 
 if TYPE_CHECKING:
@@ -91,7 +92,8 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         del t1
         check_state(y0, type(self).__name__)
         drift, noise = split_terms(terms)
-        self.tableau.check_structure(drift, noise, t0, y0, args, type(self).__name__)
+        name = type(self).__name__
+        check_structure(self.tableau, drift, noise, t0, y0, args, name)
         return None
 
     def step(

@@ -1,0 +1,51 @@
+"""What every tableau becomes: stages, one matrix between them, one vector of weights."""
+
+import abc
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Stage(NamedTuple):
+    """One evaluation, `y -> sum over channels of (vector field times control)`.
+
+    - `channels`: the controls that drive it: `"h"` is the drift, driven by time; any
+        other name is the noise, driven by the random variable of that name among the
+        attributes of the Brownian increment.
+    - `c`: where in the step it is evaluated, as a fraction of the step.
+    - `reads`: the part of the state it depends on, `"y"` (all), `"p"`, `"q"` or `""`.
+    - `writes`: the part of the state it changes, `"y"`, `"p"` or `"q"`.
+    """
+
+    channels: tuple[str, ...]
+    c: float
+    reads: str
+    writes: str
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FlatTableau:
+    """Stage `i` is evaluated at `y0 + sum_j matrix[i, j] k_j` and has the value `k_i`;
+    the step ends at `y0 + sum_i weights[i] k_i`."""
+
+    stages: tuple[Stage, ...]
+    matrix: Float[np.ndarray, "s s"]
+    weights: Float[np.ndarray, " s"]
+
+    def take(self, keep: list[int]) -> "FlatTableau":
+        """The tableau with only the stages `keep`."""
+        return FlatTableau(
+            stages=tuple(self.stages[i] for i in keep),
+            matrix=self.matrix[np.ix_(keep, keep)],
+            weights=self.weights[keep],
+        )
+
+
+class AbstractTableau(abc.ABC):
+    """What every tableau offers."""
+
+    @abc.abstractmethod
+    def flatten(self) -> FlatTableau:
+        """All stages of the tableau, dead ones included, as one matrix."""

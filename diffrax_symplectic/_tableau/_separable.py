@@ -1,0 +1,155 @@
+"""Tableaus for separable systems."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from ._coefficients import (
+    check_all,
+    check_by_variable,
+    Coefficients,
+    CoefficientsByVariable,
+    columns,
+    variables_of,
+)
+from ._flat import AbstractTableau, FlatTableau, Stage
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SeparableTableau(AbstractTableau):
+    r"""Coefficients for $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$, with `s` drift
+    and `r` noise stages.
+
+    With $f = -\partial U_0 / \partial q$, $g = \partial V / \partial p$ and
+    $\sigma_k = -\partial U_k / \partial q$, equations (3.4)-(3.5) and (3.13)-(3.14) of
+    Wang, Hong and Xu (2017) are
+
+    $$p_i = P + h \sum_j A^0_{ij} f(t_n + c^0_j h, q_j)
+      + \sum_k \sum_j B^0_{ij} \sigma_k(t_n + c^1_j h, \bar q_j) I_k$$
+
+    $$q_i = Q + h \sum_j A^0_{ij} g(p_j), \qquad
+      \bar q_i = Q + h \sum_j A^1_{ij} g(p_j)$$
+
+    $$P_1 = P + h \sum_i \alpha_i f(t_n + c^0_i h, q_i)
+      + \sum_k \sum_i \beta_i \sigma_k(t_n + c^1_i h, \bar q_i) I_k, \qquad
+      Q_1 = Q + h \sum_i \alpha_i g(p_i)$$
+
+    with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$.
+
+    **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
+    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`. `beta` and `B0` may also be
+    dictionaries from the names of several random variables, of which `"W"` is $I_k$, to
+    such arrays: then the equations hold with a sum over these.
+
+    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
+    real numbers.
+    """
+
+    alpha: Coefficients
+    beta: CoefficientsByVariable
+    A0: Coefficients
+    B0: CoefficientsByVariable
+    A1: Coefficients
+
+    def __post_init__(self):
+        s, r = np.size(self.alpha), len(self.A1)
+        check_all(self, alpha=(s,), A0=(s, s), A1=(r, s))
+        check_by_variable(self, beta=(r,), B0=(s, r))
+
+    @property
+    def c0(self) -> Float[np.ndarray, " s"]:
+        """Times of the drift stages, as fractions of the step."""
+        return self.A0.sum(axis=1)
+
+    @property
+    def c1(self) -> Float[np.ndarray, " r"]:
+        """Times of the noise stages, as fractions of the step."""
+        return self.A1.sum(axis=1)
+
+    def partitioned(self) -> "PartitionedTableau":
+        """The same method with its coefficients for velocities written out."""
+        return PartitionedTableau(
+            alpha=self.alpha,
+            alpha_hat=self.alpha,
+            beta=self.beta,
+            A=self.A0,
+            A_hat=self.A0,
+            B0=self.B0,
+            A1=self.A1,
+        )
+
+    def flatten(self) -> FlatTableau:
+        return self.partitioned().flatten()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PartitionedTableau(AbstractTableau):
+    r"""As [`diffrax_symplectic.SeparableTableau`][], with coefficients $A$ and $\alpha$ for
+    the forces $f$ and others, $\hat A$ and $\hat \alpha$, for the velocities $g$: what
+    explicit symplectic methods need.
+
+    $$p_i = P + h \sum_j A_{ij} f(t_n + \hat c_j h, q_j)
+      + \sum_k \sum_j B^0_{ij} \sigma_k(t_n + c^1_j h, \bar q_j) I_k, \qquad
+      q_i = Q + h \sum_j \hat A_{ij} g(p_j)$$
+
+    with stage times $\hat c = \hat A e$ and $c^1 = A^1 e$; the rest is as there.
+
+    **Arguments:** for `s` forces, `v` velocities and `r` noise stages: `alpha` of shape
+    `(s,)`, `alpha_hat` of shape `(v,)`, `beta` of shape `(r,)`, `A` of shape `(v, s)`,
+    `A_hat` of shape `(s, v)`, `B0` of shape `(v, r)`, `A1` of shape `(r, v)`; `beta` and
+    `B0` possibly by random variable.
+
+    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
+    real numbers.
+    """
+
+    alpha: Coefficients
+    alpha_hat: Coefficients
+    beta: CoefficientsByVariable
+    A: Coefficients
+    A_hat: Coefficients
+    B0: CoefficientsByVariable
+    A1: Coefficients
+
+    def __post_init__(self):
+        s, v, r = np.size(self.alpha), np.size(self.alpha_hat), len(self.A1)
+        check_all(self, alpha=(s,), alpha_hat=(v,), A=(v, s), A_hat=(s, v), A1=(r, v))
+        check_by_variable(self, beta=(r,), B0=(v, r))
+
+    @property
+    def c_hat(self) -> Float[np.ndarray, " s"]:
+        """Times of the forces, as fractions of the step."""
+        return self.A_hat.sum(axis=1)
+
+    @property
+    def c1(self) -> Float[np.ndarray, " r"]:
+        """Times of the noise stages, as fractions of the step."""
+        return self.A1.sum(axis=1)
+
+    def flatten(self) -> FlatTableau:
+        s, v, r = len(self.alpha), len(self.alpha_hat), len(self.A1)
+        names = variables_of(self.B0, self.beta)
+        B0 = columns(self.B0, names, (v, r))
+        A1 = np.concatenate([self.A1] * len(names))
+        # Forces first: where either can be the unknown, let it be the one that costs more.
+        stages = [Stage(("h",), float(c), "q", "p") for c in self.c_hat]
+        # The velocity g does not depend on time, so that its stages may share theirs.
+        stages += [Stage(("h",), 0.0, "p", "q") for _ in range(v)]
+        stages += [
+            Stage((name,), float(c), "q", "p") for name in names for c in self.c1
+        ]
+        zeros, n = np.zeros, len(A1)
+        return FlatTableau(
+            stages=tuple(stages),
+            matrix=np.block(
+                [
+                    [zeros((s, s)), self.A_hat, zeros((s, n))],
+                    [self.A, zeros((v, v)), B0],
+                    [zeros((n, s)), A1, zeros((n, n))],
+                ]
+            ),
+            weights=np.concatenate(
+                [self.alpha, self.alpha_hat, columns(self.beta, names, (r,))]
+            ),
+        )
