@@ -7,6 +7,7 @@ from ._brownian import (
     WeakBrownianPath as WeakBrownianPath,
     WeakIncrement as WeakIncrement,
 )
+from ._citation import citation as citation
 from ._conditions import (
     strong_order_residuals as strong_order_residuals,
     symplectic_residuals as symplectic_residuals,

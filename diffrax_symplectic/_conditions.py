@@ -34,10 +34,8 @@ def symplectic_residuals(tableau: AbstractTableau) -> Float[np.ndarray, "s s"]:
     **Returns:** a matrix over all pairs of stages, in the order of
     `tableau.flatten().stages`; zero where there is no condition.
 
-    ??? cite "Reference"
-
-        Theorems 2.1, 2.2, 3.1 and 4.1 of Wang, Hong and Xu (2017), Commun. Comput.
-        Phys. 21, 237-270.
+    **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
+    theorems 2.1, 2.2, 3.1 and 4.1.
     """
     flat = tableau.flatten()
     reads = np.array([[b.writes in a.reads for b in flat.stages] for a in flat.stages])
@@ -69,34 +67,8 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     **Raises:** a `ValueError` for any other order, for other tableaus, or for random
     variables of unknown variance.
 
-    ??? cite "Reference"
-
-        ```bibtex
-        @article{rossler2007second,
-            author = {Andreas R\"{o}\ss{}ler},
-            title = {Second Order Runge--Kutta Methods for Stratonovich Stochastic
-                     Differential Equations},
-            journal = {BIT Numerical Mathematics},
-            volume = {47},
-            pages = {657--680},
-            year = {2007},
-            doi = {10.1007/s10543-007-0130-3},
-        }
-        ```
-
-        ```bibtex
-        @article{rossler2009second,
-            author = {R\"{o}\ss{}ler, Andreas},
-            title = {Second Order Runge--Kutta Methods for It\^{o} Stochastic
-                     Differential Equations},
-            journal = {SIAM Journal on Numerical Analysis},
-            volume = {47},
-            number = {3},
-            pages = {1713--1738},
-            year = {2009},
-            doi = {10.1137/060673308},
-        }
-        ```
+    **Source:** [Rößler (2007)](https://doi.org/10.1007/s10543-007-0130-3) for Stratonovich
+    equations, [Rößler (2009)](https://doi.org/10.1137/060673308) for Itô equations.
     """
     if order not in (1, 2):
         raise ValueError(f"`order` must be 1 or 2; got {order!r}.")
@@ -125,34 +97,8 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
 
     **Raises:** a `ValueError` for other tableaus, or random variables of unknown variance.
 
-    ??? cite "Reference"
-
-        ```bibtex
-        @article{burrage2000order,
-            author = {Burrage, K. and Burrage, P. M.},
-            title = {Order Conditions of Stochastic Runge--Kutta Methods by B-Series},
-            journal = {SIAM Journal on Numerical Analysis},
-            volume = {38},
-            number = {5},
-            pages = {1626--1646},
-            year = {2000},
-            doi = {10.1137/S0036142999363206},
-        }
-        ```
-
-        ```bibtex
-        @article{rossler2010runge,
-            author = {R\"{o}\ss{}ler, Andreas},
-            title = {Runge--Kutta Methods for the Strong Approximation of Solutions of
-                     Stochastic Differential Equations},
-            journal = {SIAM Journal on Numerical Analysis},
-            volume = {48},
-            number = {3},
-            pages = {922--952},
-            year = {2010},
-            doi = {10.1137/09076636X},
-        }
-        ```
+    **Source:** [Burrage and Burrage (2000)](https://doi.org/10.1137/S0036142999363206) for
+    general tableaus; [Rößler (2010)](https://doi.org/10.1137/09076636X) for the others.
     """
     return {name: float(value) for name, value in _strong(tableau).items()}
 

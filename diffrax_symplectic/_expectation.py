@@ -144,21 +144,9 @@ def expectation(
     [`diffrax_symplectic.ExpectationInterrupted`][], with the estimate so far, on an
     interrupt from the keyboard.
 
-    ??? cite "Reference"
-
-        ```bibtex
-        @article{chan1983algorithms,
-            author = {Chan, Tony F. and Golub, Gene H. and LeVeque, Randall J.},
-            title = {Algorithms for Computing the Sample Variance: Analysis and
-                     Recommendations},
-            journal = {The American Statistician},
-            volume = {37},
-            number = {3},
-            pages = {242--247},
-            year = {1983},
-            doi = {10.1080/00031305.1983.10483115},
-        }
-        ```
+    **Source:** [Chan, Golub and LeVeque
+    (1983)](https://doi.org/10.1080/00031305.1983.10483115) for the formula by which means
+    and variances of batches are combined.
     """
     devices = tuple(jax.devices() if devices is None else devices)
     on_cpu = devices[0].platform == "cpu"

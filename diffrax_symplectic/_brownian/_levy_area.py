@@ -75,46 +75,11 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     that solutions with different step sizes, multiples of `cell`, follow the same path. An
     evaluation then costs as many samples as there are cells in the step.
 
-    ??? cite "Reference"
-
-        The Fourier series, the Gaussian remainder, and the moments given $W$ and $H$:
-
-        ```bibtex
-        @article{kloeden1992approximation,
-            author = {Kloeden, P. E. and Platen, E. and Wright, I. W.},
-            title = {The Approximation of Multiple Stochastic Integrals},
-            journal = {Stochastic Analysis and Applications},
-            volume = {10},
-            number = {4},
-            pages = {431--441},
-            year = {1992},
-            doi = {10.1080/07362999208809281},
-        }
-
-        @article{mrongowius2022approximation,
-            author = {Mrongowius, Jan and R\"{o}\ss{}ler, Andreas},
-            title = {On the Approximation and Simulation of Iterated Stochastic Integrals
-                     and the Corresponding L\'{e}vy Areas in Terms of a Multidimensional
-                     {B}rownian Motion},
-            journal = {Stochastic Analysis and Applications},
-            volume = {40},
-            number = {3},
-            pages = {397--425},
-            year = {2022},
-            doi = {10.1080/07362994.2021.1922291},
-        }
-
-        @article{davie2014kmt,
-            author = {Davie, Alexander},
-            title = {{KMT} Theory Applied to Approximations of {SDE}},
-            journal = {Stochastic Analysis and Applications 2014},
-            series = {Springer Proceedings in Mathematics \& Statistics},
-            volume = {100},
-            pages = {185--201},
-            year = {2014},
-            doi = {10.1007/978-3-319-11292-3_7},
-        }
-        ```
+    **Source:** [Kloeden, Platen and Wright
+    (1992)](https://doi.org/10.1080/07362999208809281) for the Fourier series; [Mrongowius
+    and Rößler (2022)](https://doi.org/10.1080/07362994.2021.1922291) for the Gaussian
+    remainder; [Davie (2014)](https://doi.org/10.1007/978-3-319-11292-3_7) for the moments
+    given $W$ and $H$.
     """
 
     path: diffrax.AbstractBrownianPath

@@ -27,21 +27,8 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
     Lévy areas of the wrapped path are kept as they are. Step sizes have to be fixed.
 
-    ??? cite "Reference"
-
-        ```bibtex
-        @article{milstein2002numerical,
-            author = {Milstein, G. N. and Repin, Yu. M. and Tretyakov, M. V.},
-            title = {Numerical Methods for Stochastic Systems Preserving Symplectic
-                     Structure},
-            journal = {SIAM Journal on Numerical Analysis},
-            volume = {40},
-            number = {4},
-            pages = {1583--1604},
-            year = {2002},
-            doi = {10.1137/S0036142901395588},
-        }
-        ```
+    **Source:** [Milstein, Repin and Tretyakov
+    (2002)](https://doi.org/10.1137/S0036142901395588).
     """
 
     path: diffrax.AbstractBrownianPath

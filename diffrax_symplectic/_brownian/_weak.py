@@ -35,23 +35,8 @@ class WeakIncrement(diffrax.AbstractBrownianIncrement):
 
     `W`, `second`, `third` and `two_point` have the structure and shapes of the path.
 
-    ??? cite "Reference"
-
-        Equations (2.3)-(2.5) and (3.3) of
-
-        ```bibtex
-        @article{wang2017construction,
-            author = {Wang, Peng and Hong, Jialin and Xu, Dongsheng},
-            title = {Construction of Symplectic Runge-Kutta Methods for Stochastic
-                     Hamiltonian Systems},
-            journal = {Communications in Computational Physics},
-            volume = {21},
-            number = {1},
-            pages = {237--270},
-            year = {2017},
-            doi = {10.4208/cicp.261014.230616a},
-        }
-        ```
+    **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
+    equations (2.3)-(2.5) and (3.3).
     """
 
     dt: PyTree[Float[Array, ""], "BM"]

@@ -50,22 +50,8 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
         The path has to be `WeakBrownianPath(..., order=3)`.
 
-    ??? cite "Reference"
-
-        The conditions are those of
-
-        ```bibtex
-        @article{debrabant2010runge,
-            author = {Debrabant, Kristian},
-            title = {Runge--Kutta Methods for Third Order Weak Approximation of SDEs with
-                     Multidimensional Additive Noise},
-            journal = {BIT Numerical Mathematics},
-            volume = {50},
-            pages = {541--558},
-            year = {2010},
-            doi = {10.1007/s10543-010-0276-2},
-        }
-        ```
+    **Source:** [Debrabant (2010)](https://doi.org/10.1007/s10543-010-0276-2) for the
+    conditions.
     """
 
     tableau: ClassVar[AdditiveTableau] = _tab

@@ -37,21 +37,9 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         The path has to be a [`diffrax_symplectic.LevyAreaBrownianPath`][] around one with
         space-time Lévy area.
 
-    ??? cite "Reference"
-
-        That Lévy areas and Lie brackets bring order 1 is due to Milstein; the combination
-        with the midpoint rule, which keeps it symplectic, is new here.
-
-        ```bibtex
-        @book{milstein2021stochastic,
-            author = {Milstein, Grigori N. and Tretyakov, Michael V.},
-            title = {Stochastic Numerics for Mathematical Physics},
-            edition = {2},
-            publisher = {Springer},
-            year = {2021},
-            doi = {10.1007/978-3-030-82040-4},
-        }
-        ```
+    **Source:** [Milstein and Tretyakov (2021)](https://doi.org/10.1007/978-3-030-82040-4)
+    for the order that Lévy areas and Lie brackets bring, which is due to Milstein. The
+    combination with the midpoint rule, which keeps it symplectic, is new here.
     """
 
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(

@@ -24,21 +24,8 @@ class Midpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     Strong order 1/2, and 1 if there is one noise or the noises commute. Weak order 1.
     Order 2 without noise.
 
-    ??? cite "Reference"
-
-        ```bibtex
-        @article{milstein2002numerical,
-            author = {Milstein, G. N. and Repin, Yu. M. and Tretyakov, M. V.},
-            title = {Numerical Methods for Stochastic Systems Preserving Symplectic
-                     Structure},
-            journal = {SIAM Journal on Numerical Analysis},
-            volume = {40},
-            number = {4},
-            pages = {1583--1604},
-            year = {2002},
-            doi = {10.1137/S0036142901395588},
-        }
-        ```
+    **Source:** [Milstein, Repin and Tretyakov
+    (2002)](https://doi.org/10.1137/S0036142901395588).
     """
 
     tableau: ClassVar[GeneralTableau] = _tab

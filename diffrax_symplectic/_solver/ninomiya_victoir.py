@@ -60,35 +60,10 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         [`diffrax_symplectic.WeakBrownianPath`][] with `two_point=True`: the coin is the
         sign of the first two-point variable.
 
-    ??? cite "Reference"
-
-        The splitting; that the flows can be replaced by Runge--Kutta methods of high
-        order; and the Gauss method:
-
-        ```bibtex
-        @article{ninomiya2008weak,
-            author = {Ninomiya, Syoiti and Victoir, Nicolas},
-            title = {Weak Approximation of Stochastic Differential Equations and
-                     Application to Derivative Pricing},
-            journal = {Applied Mathematical Finance},
-            volume = {15},
-            number = {2},
-            pages = {107--121},
-            year = {2008},
-            doi = {10.1080/13504860701413958},
-        }
-
-        @article{ninomiya2009new,
-            author = {Ninomiya, Mariko and Ninomiya, Syoiti},
-            title = {A New Higher-Order Weak Approximation Scheme for Stochastic
-                     Differential Equations and the {R}unge--{K}utta Method},
-            journal = {Finance and Stochastics},
-            volume = {13},
-            pages = {415--443},
-            year = {2009},
-            doi = {10.1007/s00780-009-0101-4},
-        }
-        ```
+    **Source:** [Ninomiya and Victoir (2008)](https://doi.org/10.1080/13504860701413958) for
+    the splitting; [Ninomiya and Ninomiya (2009)](https://doi.org/10.1007/s00780-009-0101-4)
+    for Runge--Kutta methods of high order, the Gauss method among them, in place of the
+    flows.
     """
 
     @property

@@ -44,21 +44,9 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
         The path has to be [`diffrax_symplectic.PlateauBrownianPath`][] around one with
         space-time Lévy area.
 
-    ??? cite "Reference"
-
-        The method is new here. It extends the schemes for additive noise and for second
-        order systems of chapters 4 and 5 of
-
-        ```bibtex
-        @book{milstein2021stochastic,
-            author = {Milstein, Grigori N. and Tretyakov, Michael V.},
-            title = {Stochastic Numerics for Mathematical Physics},
-            edition = {2},
-            publisher = {Springer},
-            year = {2021},
-            doi = {10.1007/978-3-030-82040-4},
-        }
-        ```
+    **Source:** the method is new here. It extends the schemes for additive noise and for
+    second order systems of [Milstein and Tretyakov
+    (2021)](https://doi.org/10.1007/978-3-030-82040-4), chapters 4 and 5.
     """
 
     tableau: ClassVar[PartitionedTableau] = _tab

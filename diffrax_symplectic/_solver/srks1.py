@@ -32,23 +32,8 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     order 1/2, and 1 if there is one noise or the noises commute. Weak order 1. Order 2
     without noise.
 
-    ??? cite "Reference"
-
-        Section 2.2 of
-
-        ```bibtex
-        @article{wang2017construction,
-            author = {Wang, Peng and Hong, Jialin and Xu, Dongsheng},
-            title = {Construction of Symplectic Runge-Kutta Methods for Stochastic
-                     Hamiltonian Systems},
-            journal = {Communications in Computational Physics},
-            volume = {21},
-            number = {1},
-            pages = {237--270},
-            year = {2017},
-            doi = {10.4208/cicp.261014.230616a},
-        }
-        ```
+    **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
+    section 2.2.
     """
 
     a: float = eqx.field(

@@ -74,23 +74,8 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         The path has to provide space-time Lévy area, from which $I_{k0}$ follows: for
         example `diffrax.VirtualBrownianTree(..., levy_area=diffrax.SpaceTimeLevyArea)`.
 
-    ??? cite "Reference"
-
-        Section 4.1 of
-
-        ```bibtex
-        @article{wang2017construction,
-            author = {Wang, Peng and Hong, Jialin and Xu, Dongsheng},
-            title = {Construction of Symplectic Runge-Kutta Methods for Stochastic
-                     Hamiltonian Systems},
-            journal = {Communications in Computational Physics},
-            volume = {21},
-            number = {1},
-            pages = {237--270},
-            year = {2017},
-            doi = {10.4208/cicp.261014.230616a},
-        }
-        ```
+    **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
+    section 4.1.
     """
 
     beta1: float = eqx.field(

@@ -47,23 +47,8 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     Weak order 1 for any number of noises. Order 2 without noise. A Hamiltonian without
     the structure is refused while tracing.
 
-    ??? cite "Reference"
-
-        Section 3.1 of
-
-        ```bibtex
-        @article{wang2017construction,
-            author = {Wang, Peng and Hong, Jialin and Xu, Dongsheng},
-            title = {Construction of Symplectic Runge-Kutta Methods for Stochastic
-                     Hamiltonian Systems},
-            journal = {Communications in Computational Physics},
-            volume = {21},
-            number = {1},
-            pages = {237--270},
-            year = {2017},
-            doi = {10.4208/cicp.261014.230616a},
-        }
-        ```
+    **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
+    section 3.1.
     """
 
     variant: Variant = eqx.field(default="c", static=True)

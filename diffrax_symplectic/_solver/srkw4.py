@@ -44,23 +44,8 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     Weak order 2: in the paper for one noise, and measured for two and three. A Hamiltonian
     without the structure is refused while tracing.
 
-    ??? cite "Reference"
-
-        Section 3.1 of
-
-        ```bibtex
-        @article{wang2017construction,
-            author = {Wang, Peng and Hong, Jialin and Xu, Dongsheng},
-            title = {Construction of Symplectic Runge-Kutta Methods for Stochastic
-                     Hamiltonian Systems},
-            journal = {Communications in Computational Physics},
-            volume = {21},
-            number = {1},
-            pages = {237--270},
-            year = {2017},
-            doi = {10.4208/cicp.261014.230616a},
-        }
-        ```
+    **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
+    section 3.1.
     """
 
     a21: float = eqx.field(

@@ -35,23 +35,8 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
         The path has to be `WeakBrownianPath(..., second=True)`.
 
-    ??? cite "Reference"
-
-        Section 4.2 of
-
-        ```bibtex
-        @article{wang2017construction,
-            author = {Wang, Peng and Hong, Jialin and Xu, Dongsheng},
-            title = {Construction of Symplectic Runge-Kutta Methods for Stochastic
-                     Hamiltonian Systems},
-            journal = {Communications in Computational Physics},
-            volume = {21},
-            number = {1},
-            pages = {237--270},
-            year = {2017},
-            doi = {10.4208/cicp.261014.230616a},
-        }
-        ```
+    **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
+    section 4.2.
     """
 
     tableau: ClassVar[AdditiveTableau] = _tab

@@ -37,34 +37,9 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     Any Brownian path will do: a [`diffrax_symplectic.WeakBrownianPath`][] for expectations,
     one of Diffrax's for paths.
 
-    ??? cite "Reference"
-
-        The splitting is that of Strang (1968). That symmetric splittings have weak order 2:
-
-        ```bibtex
-        @article{strang1968construction,
-            author = {Strang, Gilbert},
-            title = {On the Construction and Comparison of Difference Schemes},
-            journal = {SIAM Journal on Numerical Analysis},
-            volume = {5},
-            number = {3},
-            pages = {506--517},
-            year = {1968},
-            doi = {10.1137/0705041},
-        }
-
-        @article{ninomiya2008weak,
-            author = {Ninomiya, Syoiti and Victoir, Nicolas},
-            title = {Weak Approximation of Stochastic Differential Equations and
-                     Application to Derivative Pricing},
-            journal = {Applied Mathematical Finance},
-            volume = {15},
-            number = {2},
-            pages = {107--121},
-            year = {2008},
-            doi = {10.1080/13504860701413958},
-        }
-        ```
+    **Source:** [Strang (1968)](https://doi.org/10.1137/0705041) for the splitting;
+    [Ninomiya and Victoir (2008)](https://doi.org/10.1080/13504860701413958) for the weak
+    order of symmetric splittings.
     """
 
     tableau: ClassVar[PartitionedTableau] = _tab

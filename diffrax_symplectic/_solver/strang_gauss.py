@@ -42,22 +42,7 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     noise share are conserved. Weak order 2 for one noise and weak order 1 for several.
     Order 2 without noise. No free parameters.
 
-    ??? cite "Reference"
-
-        The splitting is that of
-
-        ```bibtex
-        @article{strang1968construction,
-            author = {Strang, Gilbert},
-            title = {On the Construction and Comparison of Difference Schemes},
-            journal = {SIAM Journal on Numerical Analysis},
-            volume = {5},
-            number = {3},
-            pages = {506--517},
-            year = {1968},
-            doi = {10.1137/0705041},
-        }
-        ```
+    **Source:** [Strang (1968)](https://doi.org/10.1137/0705041) for the splitting.
     """
 
     tableau: ClassVar[GeneralTableau] = _tab

@@ -1,0 +1,62 @@
+"""BibTeX for what a solve uses."""
+
+import importlib.resources
+import inspect
+import re
+from typing import Any
+
+import diffrax
+import jax.tree_util as jtu
+
+
+_DOI = re.compile(r"https://doi\.org/([^\s)]+)")
+
+
+def citation(*args: Any, **kwargs: Any) -> None:
+    """Prints BibTeX for the numerical methods of a solve: what `diffrax.citation` prints,
+    and then the sources of the solver and the Brownian path, if they are of this package.
+
+    ```python
+    ds.citation(terms, ds.SRKw2(), t0=0, t1=1, dt0=0.01, y0=y0)
+    ```
+
+    Diffrax offers other packages no way to add to its list, so this is a function of its
+    own.
+
+    **Arguments:** any of those of `diffrax.diffeqsolve`.
+    """
+    diffrax.citation(*args, **kwargs)
+    bound = inspect.signature(diffrax.diffeqsolve).bind_partial(*args, **kwargs)
+    entries = _entries()
+    for cls in _classes(bound.arguments):
+        dois = list(dict.fromkeys(_DOI.findall(cls.__doc__ or "")))
+        if len(dois) > 0:
+            print(
+                f"\n% `diffrax_symplectic.{cls.__name__}` is from, or builds on, doi:"
+            )
+            print(*(f"% - {doi}" for doi in dois), sep="\n")
+        for doi in dois:
+            # What two classes share is printed once: BibTeX refuses a key that repeats.
+            if doi in entries:
+                print(entries.pop(doi))
+
+
+def _classes(tree: Any) -> list[type]:
+    """The classes of this package that occur in `tree`, in order."""
+    found = {}
+
+    def note(node: Any) -> bool:
+        if type(node).__module__.split(".")[0] == "diffrax_symplectic":
+            found[type(node)] = None
+        return False
+
+    jtu.tree_leaves(tree, is_leaf=note)
+    return list(found)
+
+
+def _entries() -> dict[str, str]:
+    """The entries of `references.bib`, by DOI."""
+    bib = importlib.resources.files("diffrax_symplectic").joinpath("references.bib")
+    entries = bib.read_text(encoding="utf-8").strip().split("\n\n")
+    doi = re.compile(r"doi = \{(.*?)\}")
+    return {match[1]: e for e in entries if (match := doi.search(e))}
