@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from typing import get_args, Literal
 
 import diffrax
 import equinox as eqx
@@ -14,10 +15,15 @@ from ._custom_types import Args, BM, RealScalarLike
 _P = PyTree[Shaped[Array, "?*p"], "P"]
 _State = tuple[_P, _P]
 _Hamiltonian = Callable[[RealScalarLike, _P, _P, Args], PyTree[Array]]
+_Structure = Literal["separable", "additive"]
 
 
 def hamiltonian_terms(
-    H0: _Hamiltonian, noise: _Hamiltonian, path: diffrax.AbstractBrownianPath
+    H0: _Hamiltonian,
+    noise: _Hamiltonian,
+    path: diffrax.AbstractBrownianPath,
+    *,
+    structure: _Structure | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of a stochastic Hamiltonian system, from its Hamiltonians.
 
@@ -65,14 +71,21 @@ def hamiltonian_terms(
     - `path`: the Brownian path, of shape `(m,)`: a
         [`diffrax_symplectic.WeakBrownianPath`][], a
         [`diffrax_symplectic.TruncatedBrownianPath`][], or any of Diffrax's.
+    - `structure`: what you know of the Hamiltonians: `"separable"`, that $H_0 = V(p) +
+        U(t, q)$ and $H_k = U_k(t, q)$; or `"additive"`, that the gradients of the $H_k$ do
+        not depend on the state. Solvers that need this structure then rely on it. By
+        default they find out while tracing: from the program if it tells, else by
+        evaluating derivatives at random points (where no check of yours can raise and
+        nothing is printed). Arrays in `args` are then drawn at random, too.
 
     `p` and `q` are PyTrees of arrays of the same structure and shapes.
 
     **Returns:** `MultiTerm(drift, diffusion)`.
 
-    **Raises:** a `ValueError` if `path` is not a Brownian path; and, while the solve is
-    traced, if the state is not a pair `(p, q)` of the same structure and shapes, if `H0`
-    does not return a scalar, or if `noise` does not match the path.
+    **Raises:** a `ValueError` if `path` is not a Brownian path or `structure` is unknown;
+    and, while the solve is traced, if the state is not a pair `(p, q)` of the same
+    structure and shapes, if `H0` does not return a scalar, or if `noise` does not match
+    the path.
     """
     if not isinstance(path, diffrax.AbstractBrownianPath):
         raise ValueError(
@@ -84,13 +97,20 @@ def hamiltonian_terms(
             raise ValueError(
                 f"`{name}` must be a function `{name}(t, p, q, args)`; got {fn!r}."
             )
-    return diffrax.MultiTerm(diffrax.ODETerm(_Drift(H0)), _Noise(noise, path))
+    if structure not in (None, *get_args(_Structure)):
+        raise ValueError(
+            f"`structure` must be one of {get_args(_Structure)}, or `None` to have it "
+            f"found out; got {structure!r}."
+        )
+    drift = diffrax.ODETerm(_Drift(H0, structure))
+    return diffrax.MultiTerm(drift, _Noise(noise, path, structure))
 
 
 class _Drift(eqx.Module):
     """The vector field `(-dH0/dq, dH0/dp)`."""
 
     H0: _Hamiltonian
+    structure: _Structure | None = eqx.field(static=True, default=None)
 
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
         check_pair(y)
@@ -112,6 +132,7 @@ class _Noise(diffrax.AbstractTerm):
 
     noise: _Hamiltonian
     path: diffrax.AbstractBrownianPath
+    structure: _Structure | None = eqx.field(static=True, default=None)
 
     def contr(self, t0: RealScalarLike, t1: RealScalarLike, **kwargs) -> BM:
         return self.path.evaluate(t0, t1, **kwargs)
@@ -190,6 +211,22 @@ def _symplectic_gradient(scalar: Callable, y: _State) -> _State:
     p, q = y
     dp, dq = jax.grad(scalar, argnums=(0, 1))(p, q)
     return (-(dq**ω)).ω, dp
+
+
+def is_hamiltonian(term: diffrax.AbstractTerm) -> bool:
+    """Whether a term came from Hamiltonians."""
+    return len(_parts(term)) > 0
+
+
+def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
+    """What the user said of the Hamiltonians that a term came from."""
+    asserted = {part.structure for part in _parts(term)}
+    return asserted.pop() if len(asserted) == 1 else None
+
+
+def _parts(term: diffrax.AbstractTerm) -> list[_Drift | _Noise]:
+    ours = lambda x: isinstance(x, _Drift | _Noise)
+    return [x for x in jtu.tree_leaves(term, is_leaf=ours) if ours(x)]
 
 
 def check_pair(y: PyTree) -> None:

@@ -1,6 +1,8 @@
 """Whether a system has the structure that a family of methods relies on."""
 
+import functools as ft
 from collections.abc import Callable
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -10,10 +12,12 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PyTree
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from ._custom_types import Args, RealScalarLike, Y
-from ._hamiltonian import check_pair
+from ._effect_free import evaluate_without_effects
+from ._hamiltonian import asserted_structure, check_pair, is_hamiltonian
 
 
 def check_separable(
@@ -22,33 +26,28 @@ def check_separable(
     """Raises a `ValueError`, while tracing, unless `H0 = V(p) + U(t, q)` and the noise
     Hamiltonians are functions of `t` and `q` alone."""
     check_pair(y0)
-
-    def velocity(part):
-        return lambda term, t, y, args, _: term.vf(t, y, args)[part]
-
-    def noise_value(part):
-        return lambda *inputs: _noise_at(*inputs)[part]
-
     needs = "needs H0 = V(p) + U(t, q) and noise Hamiltonians H_k = U_k(t, q)"
-    for term in drift:
-        for part, wrong, name in ((0, "p", "d(dH0/dq)/dp"), (1, "q", "d(dH0/dp)/dq")):
-            _refuse_unless(
-                _independent(velocity(part), wrong, term, t0, y0, args),
-                f"`{solver}` {needs}, but {name} does not vanish. Use a solver for the "
-                "general structure, for example `Midpoint` or `SRKw1`.",
-            )
-        _refuse_unless(
-            _independent(velocity(1), "t", term, t0, y0, args),
-            f"`{solver}` {needs}, but d(dH0/dp)/dt does not vanish. Use a solver for "
-            "the general structure, for example `Midpoint` or `SRKw1`.",
-        )
-    for term in noise:
-        _refuse_unless(
-            _vanishes(noise_value(1), noise_value(0), term, t0, y0, args)
-            and _independent(noise_value(0), "p", term, t0, y0, args),
-            f"`{solver}` {needs}, but dH_k/dp does not vanish. Use a solver for the "
-            "general structure, for example `Midpoint` or `SRKw1`.",
-        )
+
+    def require(part: int, of: str, term, derivative: str, advice: str) -> None:
+        if not _independent(part, of, term, t0, y0, args):
+            raise ValueError(f"`{solver}` {needs}, but {derivative}. {advice}")
+
+    for term in _not_asserted(drift, "separable"):
+        from_H0 = is_hamiltonian(term) or len(drift) == 1
+        for part, of, derivative, dependence in (
+            (0, "p", "d(dH0/dq)/dp", "dp/dt depend on p"),
+            (1, "q", "d(dH0/dp)/dq", "dq/dt depend on q"),
+            (1, "t", "d(dH0/dp)/dt", "dq/dt depend on t"),
+        ):
+            if from_H0:
+                require(part, of, term, f"{derivative} does not vanish", _ADVICE)
+            else:
+                beside = f"a drift term beside that of H0 makes {dependence}"
+                require(part, of, term, beside, f"{_FRICTION} {_ADVICE}")
+    for term in _not_asserted(noise, "separable"):
+        # What is linear in the increment and does not depend on it is zero.
+        for part, of in ((1, "control"), (0, "p")):
+            require(part, of, term, "dH_k/dp does not vanish", _ADVICE)
 
 
 def check_additive(
@@ -58,140 +57,142 @@ def check_additive(
     nor, if it has to be `constant`, on time."""
     needs = "needs additive noise, H_k = -sigma_k(t).q + gamma_k(t).p"
     for term in noise:
-        _refuse_unless(
-            _independent(_noise_at, "y", term, t0, y0, args),
-            f"`{solver}` {needs}, but db_k/dy, the derivative of the noise b_k = "
-            "(-dH_k/dq, dH_k/dp) by the state, does not vanish. Use a solver for the "
-            "general structure, for example `Midpoint` or `SRKw1`.",
-        )
-        if constant:
-            _refuse_unless(
-                _independent(_noise_at, "t", term, t0, y0, args),
-                f"`{solver}` needs additive noise that is constant in time, but "
-                "db_k/dt does not vanish. Use `SRKs4`, or a solver for the general "
-                "structure, for example `Midpoint` or `SRKw1`.",
+        asserted = len(_not_asserted((term,), "additive")) == 0
+        if not asserted and not _independent(None, "y", term, t0, y0, args):
+            raise ValueError(
+                f"`{solver}` {needs}, but db_k/dy, the derivative of the noise b_k = "
+                f"(-dH_k/dq, dH_k/dp) by the state, does not vanish. {_ADVICE}"
+            )
+        if constant and not _independent(None, "t", term, t0, y0, args):
+            raise ValueError(
+                f"`{solver}` needs additive noise that is constant in time, but db_k/dt "
+                f"does not vanish. Use `SRKs4`, or else another one. {_ADVICE}"
             )
 
 
-def _refuse_unless(condition: bool, message: str) -> None:
-    if not condition:
-        raise ValueError(message)
+_ADVICE = (
+    "Use a solver for the general structure, for example `Midpoint` or `SRKw1`. (An array "
+    "in `args` stands for any value. If the derivative vanishes for yours, pass "
+    "`structure=` to `hamiltonian_terms`.)"
+)
+_FRICTION = "Friction -gamma p is what `Damped(solver, gamma)` is for."
 
 
-def _noise_at(term: diffrax.AbstractTerm, t, y, args, control) -> Y:
-    return term.vf_prod(t, y, args, control)
+def _not_asserted(terms: tuple, structure: str) -> list:
+    return [term for term in terms if asserted_structure(term) != structure]
 
 
-def _any_control(term: diffrax.AbstractTerm, t) -> PyTree:
-    struct = eqx.filter_eval_shape(term.contr, t, t)
-    return jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
+def _independent(
+    part: int | None, of: str, term: diffrax.AbstractTerm, t0, y0: Y, args: Args
+) -> bool:
+    """Whether the change of the state by `term` does not depend on `t`, `y`, `p`, `q`, or
+    `control`, whichever `of` names. With `part` only its first or second half counts.
 
-
-def _independent(fn: Callable, of: str, term, t0, y0, args) -> bool:
-    """Whether `fn(term, t, y, args, control)` does not depend on `t`, on `y`, or for
-    `y = (p, q)` on `p` or `q`.
-
-    First by the program: most are written so that the other variable does not enter.
-    If it enters, it may still cancel: then the derivative is computed at random points.
+    The flow of data through the program decides if it can: JAX then finds that the
+    derivative is zero by rules alone. If the variable enters it may still cancel, which
+    is decided by the derivative at random points.
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
+    struct = eqx.filter_eval_shape(term.contr, t0, t0)
+    control = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
+    place = {"t": 0, "y": 1, "p": 1, "q": 1, "control": 3}[of]
 
-    def split(x, term, t, y, args, control):
-        if of == "t":
-            t = x
-        elif of == "y":
-            y = x
-        else:
-            y = (x, y[1]) if of == "p" else (y[0], x)
-        return fn(term, t, y, args, control)
+    def change(x, *inputs):
+        values = list(inputs[1:])
+        if of == "p":
+            x = (x, values[place][1])
+        elif of == "q":
+            x = (values[place][0], x)
+        values[place] = x
+        t, y, args, control = values
+        return inputs[0].vf_prod(t, y, args, control)
 
-    x0 = t0 if of == "t" else y0 if of == "y" else y0["pq".index(of)]
-    inputs = (x0, term, t0, y0, args, _any_control(term, t0))
-    if not _reads_first(split, inputs):
+    inputs = (term, t0, y0, args, control)
+    x: Any = inputs[1 + place]
+    x = x["pq".index(of)] if of in ("p", "q") else x
+    select = lambda out: out if part is None else out[part]
+    if _flows_nowhere(lambda x: select(change(x, *inputs)), x):
         return True
 
-    def derivative(x, *rest):
-        leaves, treedef = jtu.tree_flatten(x)
-        keys = jr.split(jr.key(0), len(leaves))
-        tangent = treedef.unflatten(
-            [jr.normal(k, v.shape, v.dtype) for k, v in zip(keys, leaves)]
-        )
-        return jax.jvp(lambda x: split(x, *rest), (x,), (tangent,))
+    def derivative(x, tangent, *inputs):
+        value, rate = jax.jvp(lambda x: change(x, *inputs), (x,), (tangent,))
+        if of == "control":
+            # Half of the noise is compared to all of it.
+            return value, tuple(r if i == part else 0 * r for i, r in enumerate(rate))
+        return select(value), select(rate)
 
-    return _small_at_random_points(derivative, inputs)
-
-
-def _vanishes(fn: Callable, reference: Callable, term, t0, y0, args) -> bool:
-    """Whether `fn(term, t, y, args, control)` is zero everywhere, but for the rounding
-    errors that go with numbers of the size of `reference`."""
-    t0 = jnp.asarray(t0, jnp.result_type(float))
-    both = lambda *inputs: (reference(*inputs), fn(*inputs))
-    inputs = (term, t0, y0, args, _any_control(term, t0))
-    return _small_at_random_points(both, inputs)
+    return _small_at_random_points(derivative, (x, x, *inputs))
 
 
-def _closed(fn: Callable, inputs: PyTree):
-    """The program of `fn`, with all arrays that enter it as inputs."""
+def _flows_nowhere(fn: Callable, x: PyTree) -> bool:
+    """Whether the derivative of `fn` is zero by the rules of differentiation alone."""
+    zero = []
+
+    @jax.custom_jvp
+    def observe(*leaves):
+        return leaves
+
+    def rule(primals, tangents):
+        zero.append(all(isinstance(t, SymbolicZero) for t in tangents))
+        return primals, tuple(jnp.zeros(p.shape, p.dtype) for p in primals)
+
+    observe.defjvp(rule, symbolic_zeros=True)
+    observed = lambda x: observe(*map(jnp.asarray, jtu.tree_leaves(fn(x))))
+    jax.eval_shape(lambda x: jax.jvp(observed, (x,), (x,)), x)
+    return all(zero)
+
+
+def _small_at_random_points(fn: Callable, inputs: PyTree) -> bool:
+    """Whether, of `fn(*inputs) -> (reference, value)`, the value is rounding error next
+    to the reference, with every floating-point array that enters drawn at random."""
     dynamic, static = eqx.partition(inputs, eqx.is_array)
     flat, treedef = jtu.tree_flatten(dynamic)
 
     def flat_fn(*flat):
         return fn(*eqx.combine(jtu.tree_unflatten(treedef, flat), static))
 
-    return jax.make_jaxpr(flat_fn)(*flat), flat
+    closed = jax.make_jaxpr(flat_fn)(*flat)
+    # Arrays that the user's functions hold are what they are, but for traced ones.
+    is_traced = [isinstance(c, jax.core.Tracer) for c in closed.consts]
 
+    @ft.partial(jax.jit, static_argnums=1)
+    def sizes(key, positive: bool):
+        # Drawn within the program: what the program does not read is never drawn.
+        keys = iter(jr.split(key, len(closed.consts) + len(flat)))
+        draw = lambda x: _draw(x, next(keys), positive)
+        consts = [draw(c) if new else c for c, new in zip(closed.consts, is_traced)]
+        out = evaluate_without_effects(closed.jaxpr, consts, [draw(x) for x in flat])
+        half = len(out) // 2
+        reference, value = (
+            jnp.concatenate([jnp.ravel(x) for x in part])
+            for part in (out[:half], out[half:])
+        )
+        finite = jnp.isfinite(reference) & jnp.isfinite(value)
+        largest = lambda x: jnp.max(jnp.abs(x), initial=0, where=finite)
+        return largest(reference), largest(value), jnp.any(finite)
 
-def _reads_first(fn: Callable, inputs: PyTree) -> bool:
-    """Whether the first input enters the program that computes `fn`."""
-    from jax.interpreters import partial_eval as pe
-
-    closed, _ = _closed(fn, inputs)
-    n = len(jtu.tree_leaves(eqx.filter(inputs[0], eqx.is_array)))
-    _, used = pe.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
-    return any(used[:n])
-
-
-def _small_at_random_points(fn: Callable, inputs: PyTree) -> bool:
-    """Whether, of `fn(*inputs) -> (reference, value)`, the value is rounding error next
-    to the reference, with every traced or given floating-point input drawn at random."""
-    closed, flat = _closed(fn, inputs)
-    half = len(closed.jaxpr.outvars) // 2
-    rng = np.random.default_rng(0)
-    normal = lambda x: rng.normal(size=jnp.shape(x))
-    # Between 0 and 1 most functions are defined that are not defined everywhere.
-    positive = lambda x: rng.uniform(size=jnp.shape(x))
     tested = False
     with jax.ensure_compile_time_eval():
-        for draw in [normal, positive] * 4:
-            consts = [_concrete(c, draw, redraw=False) for c in closed.consts]
-            drawn = [_concrete(x, draw, redraw=True) for x in flat]
-            out = jax.core.eval_jaxpr(closed.jaxpr, consts, *drawn)
-            flat_out = [
-                np.concatenate([np.ravel(x) for x in part])
-                for part in (out[:half], out[half:])
-            ]
-            finite = np.isfinite(flat_out[0]) & np.isfinite(flat_out[1])
-            size, error = (np.max(np.abs(x[finite]), initial=0) for x in flat_out)
-            tested = tested or bool(finite.any())
+        # Between 0 and 1 most functions are defined that are not defined everywhere.
+        for i in range(8):
+            size, error, finite = sizes(jr.key(i), i % 2 == 1)
+            tested = tested or bool(finite)
             if error > 1e3 * float(np.finfo(size.dtype).eps) * size:
                 return False
     if not tested:
         raise ValueError(
             "The structure of the Hamiltonians could not be tested, because their "
-            "derivatives were not finite at any of the points tried. Write them so that "
-            "variables that cancel do not enter at all, or use a solver for the general "
-            "structure, for example `Midpoint` or `SRKw1`."
+            "derivatives were not finite at any of the points tried. Pass `structure=` to "
+            "`hamiltonian_terms`, write the Hamiltonians so that variables that cancel do "
+            "not enter at all, or use a solver for the general structure, for example "
+            "`Midpoint` or `SRKw1`."
         )
     return True
 
 
-def _concrete(x, draw: Callable, redraw: bool):
-    dtype = jnp.result_type(x)
-    traced = isinstance(x, jax.core.Tracer)
-    if jnp.issubdtype(dtype, jnp.floating) and (traced or redraw):
-        return jnp.asarray(draw(x), dtype)
-    if not traced:
-        return x
-    if jnp.issubdtype(dtype, jax.dtypes.prng_key):
-        return jnp.broadcast_to(jr.key(0), jnp.shape(x))
-    return jnp.ones(jnp.shape(x), dtype)
+def _draw(x: Array, key: PRNGKeyArray, positive: bool) -> Array:
+    if jnp.issubdtype(x.dtype, jnp.floating):
+        return (jr.uniform if positive else jr.normal)(key, x.shape, x.dtype)
+    if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+        return jnp.broadcast_to(jr.key(0, impl=jr.key_impl(x)), x.shape)
+    return jnp.ones(x.shape, x.dtype)

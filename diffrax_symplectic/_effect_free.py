@@ -1,0 +1,114 @@
+"""Programs without their effects: to evaluate a user's function at points that are none
+of the user's, without printing, raising, or calling back into Python."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax.extend.core as jex
+import jax.numpy as jnp
+from jax import lax
+
+
+_CALLBACKS = ("pure_callback", "io_callback")
+# Primitives that stand for the program that they hold.
+_CALLS = (
+    "jit",
+    "pjit",
+    "closed_call",
+    "core_call",
+    "checkpoint",
+    "custom_jvp_call",
+    "custom_vjp_call",
+    "custom_vjp_call_jaxpr",
+)
+
+
+def evaluate_without_effects(jaxpr: jex.Jaxpr, consts, args) -> list:
+    """What `jaxpr` computes from `args`.
+
+    Prints are left out. The results of callbacks are NaN. Since `equinox.error_if` raises
+    by a callback, what goes through a check that fails is NaN as well.
+    """
+    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *args)))
+    read = lambda x: x.val if isinstance(x, jex.Literal) else values[x]
+    for eqn in jaxpr.eqns:
+        results = _apply(eqn, [read(x) for x in eqn.invars])
+        values.update(zip(eqn.outvars, results))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def _apply(eqn: jex.JaxprEqn, inputs: list) -> list:
+    name, params = eqn.primitive.name, eqn.params
+    if name in _CALLBACKS:
+        return [_nan(x.aval) for x in eqn.outvars]
+    if name in _CALLS:
+        (inner,) = _programs(params)
+        return _run(inner, *inputs)
+    if _has_effects(eqn):
+        if name == "cond":
+            branches = [lambda *x, b=b: _run(b, *x) for b in params["branches"]]
+            return lax.switch(inputs[0], branches, *inputs[1:])
+        if name == "scan":
+            return _scan(params, inputs)
+        if name == "while":
+            return _while(params, inputs)
+    if len(eqn.outvars) == 0:
+        # Only its effects can matter: a print.
+        return []
+    out = eqn.primitive.bind(*inputs, **params)
+    return out if eqn.primitive.multiple_results else [out]
+
+
+def _scan(params: dict, inputs: list) -> list:
+    consts, carry, xs = _split(inputs, params["num_consts"], params["num_carry"])
+
+    def body(carry, x):
+        out = _run(params["jaxpr"], *consts, *carry, *x)
+        return out[: len(carry)], out[len(carry) :]
+
+    carry, ys = lax.scan(body, carry, xs, params["length"], params["reverse"])
+    return [*carry, *ys]
+
+
+def _while(params: dict, inputs: list) -> list:
+    of_cond, of_body, carry = _split(
+        inputs, params["cond_nconsts"], params["body_nconsts"]
+    )
+    proceed = lambda carry: _run(params["cond_jaxpr"], *of_cond, *carry)[0]
+    body = lambda carry: _run(params["body_jaxpr"], *of_body, *carry)
+    return lax.while_loop(proceed, body, carry)
+
+
+def _split(inputs: list, first: int, second: int) -> tuple[list, list, list]:
+    return inputs[:first], inputs[first : first + second], inputs[first + second :]
+
+
+def _run(program, *args) -> list:
+    if isinstance(program, jex.ClosedJaxpr):
+        return evaluate_without_effects(program.jaxpr, program.consts, args)
+    return evaluate_without_effects(program, (), args)
+
+
+def _nan(aval) -> Any:
+    inexact = jnp.issubdtype(aval.dtype, jnp.inexact)
+    return jnp.full(aval.shape, jnp.nan if inexact else 0, aval.dtype)
+
+
+def _has_effects(eqn: jex.JaxprEqn) -> bool:
+    return (
+        eqn.primitive.name in _CALLBACKS
+        or len(eqn.outvars) == 0
+        or any(
+            _has_effects(inner)
+            for program in _programs(eqn.params)
+            for inner in getattr(program, "jaxpr", program).eqns
+        )
+    )
+
+
+def _programs(params: dict) -> Iterator[Any]:
+    """The programs among the parameters of a primitive."""
+    for value in params.values():
+        for item in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(item, jex.Jaxpr | jex.ClosedJaxpr):
+                yield item
