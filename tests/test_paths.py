@@ -234,6 +234,39 @@ def test_fixed_increments_refuse_adaptive_steps(path, solver):
     )
 
 
+def test_half_steps_work_where_the_path_can_be_refined():
+    tree = diffrax.VirtualBrownianTree(0.0, 0.5, 1e-3, (), jr.key(0))
+    H0 = lambda t, p, q, args: p**2 / 2 + q**4 / 4
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: jnp.sin(q), tree)
+    pid = diffrax.PIDController(rtol=1e-3, atol=1e-3, dtmin=1e-2, error_order=1.0)
+    sol = diffrax.diffeqsolve(
+        terms,
+        diffrax.HalfSolver(ds.StormerVerlet()),
+        0.0,
+        0.5,
+        0.1,
+        (jnp.array(0.0), jnp.array(1.0)),
+        stepsize_controller=pid,
+    )
+    assert sol.stats["num_steps"] > 0
+
+
+def test_another_solve_may_change_its_steps():
+    # An adaptive solve that evaluates the path, but is not driven by it.
+    path = ds.WeakBrownianPath((), jr.key(0))
+    field = lambda t, y, args: y * path.evaluate(0.0, 0.1)
+    pid = diffrax.PIDController(rtol=1e-3, atol=1e-3)
+    diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        diffrax.Heun(),
+        0.0,
+        0.5,
+        0.1,
+        jnp.array(1.0),
+        stepsize_controller=pid,
+    )
+
+
 def test_what_is_no_key_is_refused():
     tree = diffrax.UnsafeBrownianPath((2,), jr.key(0), diffrax.SpaceTimeLevyArea)
     for make in (

@@ -1,4 +1,3 @@
-from ._fixed_steps import refuse_half_solver as refuse_half_solver
 from ._levy_area import (
     LevyAreaBrownianPath as LevyAreaBrownianPath,
     LevyAreaIncrement as LevyAreaIncrement,

@@ -135,7 +135,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
         size controller or `diffrax.HalfSolver`.
         """
-        require_fixed_steps(type(self).__name__)
+        require_fixed_steps(self)
         if not use_levy and self.cell is None:
             return self.path.evaluate(t0, t1, left)
         start, end = (jnp.zeros_like(t0), t0) if t1 is None else (t0, t1)

@@ -65,7 +65,7 @@ class PlateauBrownianPath(AbstractWrappedPath):
         **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
         size controller or `diffrax.HalfSolver`.
         """
-        require_fixed_steps(type(self).__name__)
+        require_fixed_steps(self)
         increment = self.path.evaluate(t0, t1, left, use_levy)
         if not use_levy:
             return increment

@@ -74,7 +74,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         size controller or `diffrax.HalfSolver`; an error when run for a step of one unit
         of time or longer.
         """
-        require_fixed_steps(type(self).__name__)
+        require_fixed_steps(self)
         h = jnp.abs(jnp.asarray(t0) if t1 is None else jnp.asarray(t1) - t0)
         h = eqx.error_if(
             h,

@@ -182,7 +182,7 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
         size controller or `diffrax.HalfSolver`.
         """
         del left
-        require_fixed_steps(type(self).__name__)
+        require_fixed_steps(self)
         if t1 is None:
             t0, t1 = jnp.zeros_like(t0), t0
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)

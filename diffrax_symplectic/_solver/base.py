@@ -5,7 +5,6 @@ from typing import ClassVar, TYPE_CHECKING, TypeAlias
 
 import diffrax
 
-from .._brownian import refuse_half_solver
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
 from .._tableau import AbstractTableau, FlatTableau
@@ -35,12 +34,6 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = (
         diffrax.LocalLinearInterpolation
     )
-
-    @property
-    def term_compatible_contr_kwargs(self) -> dict:  # pyright: ignore
-        # Asked for first of all in a solve, and passed on by `HalfSolver`.
-        refuse_half_solver(type(self).__name__)
-        return {}
 
     def func(
         self, terms: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
