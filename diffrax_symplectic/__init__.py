@@ -19,6 +19,7 @@ from ._expectation import (
     ExpectationInterrupted as ExpectationInterrupted,
 )
 from ._hamiltonian import hamiltonian_terms as hamiltonian_terms
+from ._indexed_noise import IndexedNoise as IndexedNoise
 from ._root_finder import SmallLU as SmallLU, PicardNewton as PicardNewton
 from ._solver import (
     AbstractImplicitStages as AbstractImplicitStages,

@@ -4,12 +4,14 @@ from typing import get_args, Literal
 import diffrax
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from equinox.internal import ω
 from jaxtyping import Array, PyTree, Shaped
 
 from ._custom_types import Args, BM, RealScalarLike
+from ._indexed_noise import IndexedNoise, OneNoise
 
 
 _P = PyTree[Shaped[Array, "?*p"], "P"]
@@ -37,7 +39,9 @@ def hamiltonian_terms(
     The result goes to `diffrax.diffeqsolve`, with the solvers of this package or with
     any Stratonovich solver of Diffrax. All derivatives are taken by JAX. The noise of a
     step is the gradient of one scalar, $\sum_k I_k H_k$, so that it costs one reverse
-    pass whatever the number of noises.
+    pass whatever the number of noises. ([`diffrax_symplectic.NinomiyaVictoir`][] needs
+    the noises one at a time. If there are many, give them to it as a
+    [`diffrax_symplectic.IndexedNoise`][].)
 
     !!! example
 
@@ -67,7 +71,7 @@ def hamiltonian_terms(
         differentiable with respect to these and to `args`.
     - `noise`: `noise(t, p, q, args)`, the noise Hamiltonians $H_1, \ldots, H_m$ as an
         array of shape `(m,)`, or whatever structure and shapes `path` has. A scalar will
-        do if `m = 1`.
+        do if `m = 1`. Or an [`diffrax_symplectic.IndexedNoise`][].
     - `path`: the Brownian path, of shape `(m,)`: a
         [`diffrax_symplectic.WeakBrownianPath`][], a
         [`diffrax_symplectic.TruncatedBrownianPath`][], or any of Diffrax's.
@@ -103,7 +107,7 @@ def hamiltonian_terms(
             f"found out; got {structure!r}."
         )
     drift = diffrax.ODETerm(_Drift(H0, structure))
-    return diffrax.MultiTerm(drift, _Noise(noise, path, structure))
+    return diffrax.MultiTerm(drift, HamiltonianNoise(noise, path, structure))
 
 
 class _Drift(eqx.Module):
@@ -127,7 +131,7 @@ class _Drift(eqx.Module):
         return _symplectic_gradient(scalar, y)
 
 
-class _Noise(diffrax.AbstractTerm):
+class HamiltonianNoise(diffrax.AbstractTerm):
     """The noise part: control `I`, product the symplectic gradient of `I . H`."""
 
     noise: _Hamiltonian
@@ -172,10 +176,15 @@ class _Noise(diffrax.AbstractTerm):
             jtu.tree_map(contract, dq, is_leaf=is_entry),
         )
 
-    def vf_prod(self, t: RealScalarLike, y: _State, args: Args, control: BM) -> _State:
+    def vf_prod(
+        self, t: RealScalarLike, y: _State, args: Args, control: BM | OneNoise
+    ) -> _State:
         check_pair(y)
 
         def scalar(p, q):
+            if isinstance(control, OneNoise):
+                H = self._one_hamiltonian(t, p, q, args, control.number)
+                return H * jnp.asarray(control.increment, H.dtype)
             H = self._hamiltonians(t, p, q, args, control)
             dots = jtu.tree_map(lambda h, c: jnp.sum(h * c.astype(h.dtype)), H, control)
             return sum(jtu.tree_leaves(dots))
@@ -186,6 +195,14 @@ class _Noise(diffrax.AbstractTerm):
         # `vf` takes one reverse pass for each noise, `vf_prod` takes one in all.
         struct = jax.eval_shape(lambda: self.path.evaluate(0.0, 1.0))
         return sum(s.size for s in jtu.tree_leaves(struct)) > 2
+
+    def _one_hamiltonian(self, t, p, q, args, number) -> Array:
+        struct = jax.eval_shape(lambda: self.path.evaluate(0.0, 1.0))
+        every = lambda: self._hamiltonians(t, p, q, args, struct)
+        if isinstance(self.noise, IndexedNoise):
+            jax.eval_shape(every)  # for its error
+            return self.noise.one(number, t, p, q, args)
+        return jfu.ravel_pytree(every())[0][number]
 
     def _hamiltonians(self, t, p, q, args, struct) -> PyTree[Array]:
         """The noise Hamiltonians, in the structure and shapes of the path."""
@@ -224,8 +241,8 @@ def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
     return asserted.pop() if len(asserted) == 1 else None
 
 
-def _parts(term: diffrax.AbstractTerm) -> list[_Drift | _Noise]:
-    ours = lambda x: isinstance(x, _Drift | _Noise)
+def _parts(term: diffrax.AbstractTerm) -> list[_Drift | HamiltonianNoise]:
+    ours = lambda x: isinstance(x, _Drift | HamiltonianNoise)
     return [x for x in jtu.tree_leaves(term, is_leaf=ours) if ours(x)]
 
 

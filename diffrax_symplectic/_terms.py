@@ -20,7 +20,9 @@ from ._brownian import (
     WeakBrownianPath,
     WeakIncrement,
 )
-from ._custom_types import Args, RealScalarLike, Y
+from ._custom_types import Args, IntScalarLike, RealScalarLike, Y
+from ._hamiltonian import HamiltonianNoise
+from ._indexed_noise import OneNoise
 from ._materialize import materialize
 
 
@@ -49,8 +51,12 @@ def brownian_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
 
 
 def _is_ode(term: diffrax.AbstractTerm) -> bool:
+    return isinstance(_unwrapped(term), diffrax.ODETerm)
+
+
+def _unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
     # In a solve Diffrax has wrapped each term, to be able to go backward in time.
-    return isinstance(getattr(term, "term", term), diffrax.ODETerm)
+    return getattr(term, "term", term)
 
 
 # Called at several stages, this is traced and lowered once.
@@ -60,6 +66,48 @@ def apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> 
     total = tree_sum([x.vf_prod(t, y, args, c) for x, c in zip(terms, controls)])
     _check_value(total, y)
     return total
+
+
+@eqx.filter_jit
+def apply_one(
+    terms: tuple,
+    number: IntScalarLike,
+    increment: Float[Array, ""],
+    args: Args,
+    t: RealScalarLike,
+    y: Y,
+) -> Y:
+    """The vector field of one noise times its increment. `number` counts the noises of
+    all terms, in the order of their flattened controls."""
+    parts, before = [], 0
+    for term in terms:
+        struct = eqx.filter_eval_shape(term.contr, 0.0, 1.0)
+        m = sum(s.size for s in jtu.tree_leaves(struct))
+        # The noise may belong to another term: then this one adds zero.
+        here = (before <= number) & (number < before + m)
+        local = jnp.clip(number - before, 0, m - 1)
+        only = jnp.where(here, increment, 0)
+        parts.append(_along_one(term, struct, local, only, args, t, y))
+        before += m
+    total = tree_sum(parts)
+    _check_value(total, y)
+    return total
+
+
+def _along_one(term, struct, number, increment, args: Args, t, y: Y) -> Y:
+    if isinstance(_unwrapped(term), HamiltonianNoise):
+        return term.vf_prod(t, y, args, OneNoise(number, increment))
+    if isinstance(_unwrapped(term), diffrax.ControlTerm):
+        matrix = term.vf(t, y, args)
+        # One array of noises, not a Lineax operator and no other PyTree.
+        one_array = eqx.is_array(matrix) and isinstance(struct, jax.ShapeDtypeStruct)
+        if one_array and struct.ndim == 1:
+            return matrix[..., number] * increment.astype(matrix.dtype)
+    flat, unravel = jfu.ravel_pytree(
+        jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
+    )
+    only = flat.at[number].set(increment.astype(flat.dtype))
+    return term.vf_prod(t, y, args, unravel(only))
 
 
 @eqx.filter_jit

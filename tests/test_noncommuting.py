@@ -1,14 +1,18 @@
 """Methods for several noises that do not commute: weak order 2, strong order 1."""
 
+import re
+
 import diffrax
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
+import lineax as lx
 import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._terms import apply, apply_one
 
 from .problems import (
     FineSample,
@@ -78,6 +82,100 @@ def test_flows_follow_each_other_in_the_order_of_the_coin():
         np.testing.assert_allclose(got[0], expected[0], atol=1e-14)
         np.testing.assert_allclose(got[1], expected[1], atol=1e-14)
     assert abs(end(W, 1.0, y0)[0] - end(W, -1.0, y0)[0]).max() > 1e-4
+
+
+def test_one_noise_alone_is_that_noise_of_all():
+    # For every way to give noises: one function of all, one of the index, several terms, a
+    # matrix of noises, a Lineax operator.
+    m, (p, q) = 3, random_problem(jr.key(0), 2, 3)[0]
+    args = random_problem(jr.key(0), 2, m)[1]
+    W = jr.normal(jr.key(1), (m,))
+    restrict = lambda args, i: {"noise": jax.tree.map(lambda x: x[i], args["noise"])}
+    indexed = ds.IndexedNoise(
+        lambda k, t, p, q, args: noise(t, p, q, restrict(args, k)), m
+    )
+    first = lambda t, p, q, args: noise(t, p, q, restrict(args, slice(0, 1)))
+    rest = lambda t, p, q, args: noise(t, p, q, restrict(args, slice(1, None)))
+    term = lambda fn, W: ds.hamiltonian_terms(H0, fn, Given(W)).terms[1]
+    matrix = lambda t, y, args: jnp.outer(jnp.sin(y + t), jnp.arange(1.0, m + 1))
+    diagonal = lambda t, y, args: lx.DiagonalLinearOperator(jnp.sin(y + t))
+    y = jnp.concatenate([p, q])[:m]
+
+    def deviations(t):
+        both = (p, q)
+        forms = {
+            "function": ((term(noise, W),), both),
+            "index": ((term(indexed, W),), both),
+            "terms": ((term(first, W[:1]), term(rest, W[1:])), both),
+            "matrix": ((diffrax.ControlTerm(matrix, Given(W)),), y),
+            "operator": ((diffrax.ControlTerm(diagonal, Given(W)),), y),
+        }
+
+        def deviation(terms, y):
+            controls = [term.contr(0.0, 1.0) for term in terms]
+            flat, unravel = jfu.ravel_pytree(controls)
+
+            def one(k):
+                alone = unravel(jnp.where(jnp.arange(m) == k, flat, 0))
+                expected = apply(terms, alone, args, t, y)
+                got = apply_one(terms, k, flat[k], args, t, y)
+                return jfu.ravel_pytree(got)[0], jfu.ravel_pytree(expected)[0]
+
+            return jax.vmap(one)(jnp.arange(m))
+
+        return {name: deviation(*form) for name, form in forms.items()}
+
+    for got, expected in jax.jit(deviations)(0.3).values():
+        np.testing.assert_allclose(got, expected, atol=1e-15)
+        # No two noises are alike.
+        assert np.min(np.abs(np.diff(expected, axis=0)).max(axis=1)) > 1e-3
+
+
+def test_noises_given_by_their_index_are_not_all_evaluated_in_each_flow():
+    m, d = 1000, 2
+    u = jr.normal(jr.key(0), (m, d))
+    one = lambda k, t, p, q, u: jnp.cos(u[k] @ q) * jnp.sin(u[k] @ p)
+    every = lambda t, p, q, u: jnp.cos(u @ q) * jnp.sin(u @ p)
+
+    def step(noise):
+        def end(u, y0):
+            path = weak_path(m, two_point=True)
+            terms = ds.hamiltonian_terms(H0, noise, path)
+            # The noise alone.
+            solver, terms = ds.NinomiyaVictoir(), terms.terms[1]
+            return solver.step(terms, 0.0, 0.1, y0, u, None, False)[0]
+
+        return jax.jit(end), (u, (jnp.ones(d), jnp.ones(d)))
+
+    def takes_cosines_of_all(noise):
+        end, inputs = step(noise)
+        return re.search(rf"{m}[^\]]*\] = cos", str(jax.make_jaxpr(end)(*inputs)))
+
+    assert not takes_cosines_of_all(ds.IndexedNoise(one, m))
+    assert takes_cosines_of_all(every)
+    end, inputs = step(ds.IndexedNoise(one, m))
+    compiled = end.lower(*inputs).compile()
+    # The increments, the order and the random numbers: some numbers for each noise.
+    assert compiled.memory_analysis().temp_size_in_bytes <= 100 * m
+    assert np.all(np.isfinite(compiled(*inputs)))
+
+
+def test_noises_by_their_index_are_checked():
+    with pytest.raises(ValueError, match="`m`, the number of noises"):
+        ds.IndexedNoise(lambda k, t, p, q, args: q[k], 0)
+    with pytest.raises(ValueError, match="`H` must be a function"):
+        ds.IndexedNoise(3.0, 2)  # pyright: ignore[reportArgumentType]
+    y0 = jnp.ones(2), jnp.ones(2)
+
+    def step(H, m):
+        path = weak_path(2, two_point=True)
+        terms = ds.hamiltonian_terms(H0, ds.IndexedNoise(H, m), path).terms[1]
+        return ds.NinomiyaVictoir().step(terms, 0.0, 0.1, y0, None, None, False)
+
+    with pytest.raises(ValueError, match="must return one Hamiltonian for each noise"):
+        step(lambda k, t, p, q, args: q[k], 3)
+    with pytest.raises(ValueError, match="must return a scalar, the Hamiltonian of"):
+        step(lambda k, t, p, q, args: q, 2)
 
 
 def test_levy_area_midpoint_is_one_step_of_the_hamiltonian_with_brackets():
