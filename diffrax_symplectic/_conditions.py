@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
+from ._brownian import VARIABLES
 from ._tableau import (
     AbstractTableau,
     AdditiveTableau,
@@ -257,13 +258,14 @@ def _others_vanish(beta: Mapping[str, np.ndarray], **moments: np.ndarray) -> dic
 
 def _variance(name: str) -> float:
     """The variance of a random variable of a step, in units of the step's size."""
-    known = {"W": 1, "second": 1, "third": 1, "two_point": 1, "H": 1 / 12, "C": 1 / 6}
-    if name not in known:
+    variable = VARIABLES.get(name)
+    if variable is None or variable.variance is None:
+        known = [name for name, x in VARIABLES.items() if x.variance is not None]
         raise ValueError(
             f"The conditions are known for the random variables {', '.join(known)}; got a "
             f"tableau with `{name}`. `weak_order_defect` measures the order of any solver."
         )
-    return known[name]
+    return variable.variance
 
 
 def _unknown(tableau) -> ValueError:

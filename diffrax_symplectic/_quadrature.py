@@ -1,8 +1,8 @@
 """What the random variables of one step may be, each with its probability."""
 
 import itertools
-from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from collections.abc import Callable, Mapping
+from typing import Any, cast, NamedTuple
 
 import diffrax
 import jax
@@ -12,12 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from ._brownian import (
-    PlateauBrownianPath,
-    PlateauIncrement,
-    WeakBrownianPath,
-    WeakIncrement,
-)
+from ._brownian import AbstractLaw, increment_struct, laws_of
 from ._terms import brownian_paths
 
 
@@ -30,58 +25,21 @@ class Outcomes(NamedTuple):
     put: Callable[[diffrax.AbstractBrownianIncrement], PyTree[diffrax.AbstractTerm]]
 
 
-_Law: TypeAlias = list[tuple[float, float]]
-_THREE_POINT: _Law = [(-np.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (np.sqrt(3.0), 1 / 6)]
-_FOUR_POINT: _Law = [
-    (sign * np.sqrt(3 + s * np.sqrt(6)), (3 - s * np.sqrt(6)) / 12)
-    for sign in (-1, 1)
-    for s in (-1, 1)
-]
-_TWO_POINT: _Law = [(-1.0, 1 / 2), (1.0, 1 / 2)]
-
-
-def _gaussian(variance: float, nodes: int) -> _Law:
-    """Gauss--Hermite quadrature: exact for polynomials of degree `2 nodes - 1`."""
-    points, weights = np.polynomial.hermite_e.hermegauss(nodes)
-    scaled = np.sqrt(variance) * points, weights / np.sqrt(2 * np.pi)
-    return [(float(x), float(w)) for x, w in zip(*scaled)]
-
-
 def outcomes(terms: PyTree[diffrax.AbstractTerm], h, nodes: int) -> Outcomes:
     """All outcomes of a step of size `h`, for `terms` with one Brownian path."""
-    path, plateaus = _the_path(terms)
-    laws: dict[str, _Law]
-    if isinstance(path, WeakBrownianPath):
-        laws = {"W": _THREE_POINT if path.order == 2 else _FOUR_POINT}
-        if path.second:
-            laws["second"] = _THREE_POINT
-        if path.order == 3:
-            laws["third"] = _THREE_POINT
-        if path.two_point:
-            laws["two_point"] = _TWO_POINT
-        increment_cls = WeakIncrement
-    else:
-        laws = {"W": _gaussian(1.0, nodes)}
-        increment_cls = path.levy_area
-        if issubclass(increment_cls, diffrax.SpaceTimeLevyArea):
-            laws["H"] = _gaussian(1 / 12, nodes)
-    if plateaus:
-        laws["C"] = [(x / np.sqrt(6), weight) for x, weight in _TWO_POINT]
-        increment_cls = PlateauIncrement
-
-    zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), path.shape)
+    path, laws = _the_path(terms)
+    shape = increment_struct(path)
+    zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), shape)
     flat, unravel = jfu.ravel_pytree(zeros)
-    table = list(
-        itertools.product(*[v for v in laws.values() for _ in range(flat.size)])
-    )
-    values = np.array([[value for value, _ in row] for row in table])
-    weights = np.array([np.prod([weight for _, weight in row]) for row in table])
+    scalars = [law.outcomes(nodes) for law in laws.values() for _ in range(flat.size)]
+    values = np.array([*itertools.product(*[values for values, _ in scalars])])
+    weights = np.array([*itertools.product(*[weights for _, weights in scalars])])
     scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(flat.dtype)
     columns = {
         name: jax.vmap(unravel)(scaled[:, i * flat.size : (i + 1) * flat.size])
         for i, name in enumerate(laws)
     }
-    dt = jtu.tree_map(lambda s: jnp.full(len(table), h, s.dtype), path.shape)
+    dt = jtu.tree_map(lambda s: jnp.full(len(values), h, s.dtype), shape)
 
     def put(increment):
         given = _FixedIncrement(increment)  # pyright: ignore[reportCallIssue]
@@ -89,7 +47,8 @@ def outcomes(terms: PyTree[diffrax.AbstractTerm], h, nodes: int) -> Outcomes:
             lambda x: given if _is_path(x) else x, terms, is_leaf=_is_path
         )
 
-    return Outcomes(increment_cls(dt=dt, **columns), weights, put)
+    increments = cast(Any, path.levy_area)(dt=dt, **columns)
+    return Outcomes(increments, np.prod(weights, axis=1), put)
 
 
 class _FixedIncrement(diffrax.AbstractBrownianPath):
@@ -118,29 +77,19 @@ def _is_path(x) -> bool:
     return isinstance(x, diffrax.AbstractBrownianPath)
 
 
-_Known: TypeAlias = (
-    WeakBrownianPath | diffrax.UnsafeBrownianPath | diffrax.VirtualBrownianTree
-)
-
-
-def _the_path(terms) -> tuple[_Known, bool]:
-    """The path, without the plateaus that may be around it, and whether they are."""
+def _the_path(terms) -> tuple[diffrax.AbstractBrownianPath, Mapping[str, AbstractLaw]]:
     paths = brownian_paths(terms)
-    path = paths[0] if len(paths) == 1 else None
-    plateaus = isinstance(path, PlateauBrownianPath)
-    if plateaus:
-        path = path.path
-    if not isinstance(path, _Known):
+    laws = laws_of(paths[0]) if len(paths) == 1 else None
+    if laws is None:
         raise ValueError(
             "`terms` must hold exactly one Brownian path, a `WeakBrownianPath`, whose "
-            "outcomes can be enumerated, or one of Diffrax's, whose Gaussian increments "
-            "are integrated over, also within a `PlateauBrownianPath`; got "
-            f"{[type(p).__name__ for p in paths]}."
+            "outcomes can be enumerated, or a Gaussian one, whose increments are "
+            "integrated over, with `levy_area=BrownianIncrement` or `SpaceTimeLevyArea`, "
+            "also within a `PlateauBrownianPath`; got "
+            f"{[_named(path) for path in paths]}."
         )
-    gaussian = diffrax.BrownianIncrement, diffrax.SpaceTimeLevyArea
-    if not isinstance(path, WeakBrownianPath) and path.levy_area not in gaussian:
-        raise ValueError(
-            "Expectations over Gaussian increments are for paths with `levy_area="
-            f"BrownianIncrement` or `SpaceTimeLevyArea`; got {path.levy_area.__name__}."
-        )
-    return path, plateaus
+    return paths[0], laws
+
+
+def _named(path: diffrax.AbstractBrownianPath) -> str:
+    return f"{type(path).__name__} with {getattr(path.levy_area, '__name__', '?')}"

@@ -2,7 +2,6 @@
 fit the state."""
 
 import functools as ft
-from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -11,15 +10,11 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from diffrax._term import WrapTerm
 from equinox.internal import ω
 from jaxtyping import Array, Float, PyTree
 
-from ._brownian import (
-    LevyAreaIncrement,
-    PlateauIncrement,
-    WeakBrownianPath,
-    WeakIncrement,
-)
+from ._brownian import Discrete, laws_of, VARIABLES
 from ._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from ._hamiltonian import HamiltonianNoise
 from ._indexed_noise import OneNoise
@@ -56,7 +51,7 @@ def _is_ode(term: diffrax.AbstractTerm) -> bool:
 
 def _unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
     # In a solve Diffrax has wrapped each term, to be able to go backward in time.
-    return getattr(term, "term", term)
+    return term.term if isinstance(term, WrapTerm) else term
 
 
 # Called at several stages, this is traced and lowered once.
@@ -140,75 +135,37 @@ def tree_sum(values: list[Y]) -> Y:
     return ft.reduce(lambda a, b: (a**ω + b**ω).ω, values)
 
 
-class _Provider(NamedTuple):
-    increment: type[diffrax.AbstractBrownianIncrement]
-    advice: str
-
-
-# Random variables beyond `W`: which increments hold them, and how to ask for these. Those
-# that hold more come first.
-PROVIDED_BY = {
-    "A": _Provider(
-        LevyAreaIncrement,
-        "Lévy areas. Wrap a path with space-time Lévy area as `LevyAreaBrownianPath(path, "
-        "key)`",
-    ),
-    "C": _Provider(
-        PlateauIncrement,
-        "plateaus. Wrap a path with space-time Lévy area as `PlateauBrownianPath(path, "
-        "key)`",
-    ),
-    "H": _Provider(
-        diffrax.AbstractSpaceTimeLevyArea,
-        "space-time Lévy area. Pass a path that has it, for example `diffrax."
-        "VirtualBrownianTree(..., levy_area=diffrax.SpaceTimeLevyArea)`",
-    ),
-    "third": _Provider(
-        WeakIncrement,
-        "four-point variables and two more sets. Construct the path as "
-        "`WeakBrownianPath(..., order=3)`",
-    ),
-    "second": _Provider(
-        WeakIncrement,
-        "a second set of three-point variables. Construct the path as "
-        "`WeakBrownianPath(..., second=True)`",
-    ),
-    "two_point": _Provider(
-        WeakIncrement,
-        "two-point variables. Construct the path as `WeakBrownianPath(..., "
-        "two_point=True)`",
-    ),
-}
-
-
 def controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, list]:
     """The random variables of the step from `t0` to `t1`, for each noise term."""
     draw = (
         _drawn
-        if _is_weak(noise)
+        if _are_discrete(noise)
         else lambda *args: materialize(ft.partial(_drawn, *args))
     )
     if names == ["W"]:
         return {"W": draw(noise, t0, t1, False)}
     increments = draw(noise, t0, t1, True)
     # The most telling advice first.
-    for name in sorted(names, key=lambda x: [*PROVIDED_BY, x].index(x)):
+    for name in sorted(names, key=lambda x: [*VARIABLES, x].index(x)):
         if any(getattr(increment, name, None) is None for increment in increments):
-            provider = PROVIDED_BY.get(name)
+            variable = VARIABLES.get(name)
             advice = f"increments with the attribute `{name}`"
             raise ValueError(
-                f"`{solver}` needs {provider.advice if provider else advice}."
+                f"`{solver}` needs {variable.advice if variable else advice}."
             )
-    drawn = {name: [getattr(i, name) for i in increments] for name in names}
-    if "H" in names:
-        drawn["H"] = [_area_in_time(term, x) for term, x in zip(noise, drawn["H"])]
-    return drawn
+    return {
+        name: [
+            _in_time(term, name, getattr(i, name)) for term, i in zip(noise, increments)
+        ]
+        for name in names
+    }
 
 
-def _area_in_time(term: diffrax.AbstractTerm, H: PyTree[Array]) -> PyTree[Array]:
-    """Backward in time increments change their sign, and all of Diffrax's variables do;
-    but the bridge, seen from its other end, has the same integral."""
-    return (getattr(term, "direction", 1) * H**ω).ω
+def _in_time(term: diffrax.AbstractTerm, name: str, x: PyTree[Array]) -> PyTree[Array]:
+    """Backward in time Diffrax changes the sign of all random variables. Those that stay
+    the same get it back."""
+    even = name in VARIABLES and VARIABLES[name].even
+    return (term.direction * x**ω).ω if even and isinstance(term, WrapTerm) else x
 
 
 def _drawn(noise: tuple, t0, t1, use_levy: bool) -> list:
@@ -217,9 +174,13 @@ def _drawn(noise: tuple, t0, t1, use_levy: bool) -> list:
     return [term.contr(t0, t1) for term in noise]
 
 
-def _is_weak(noise: tuple) -> bool:
+def _are_discrete(noise: tuple) -> bool:
     """Whether all random variables are discrete, and so cheap to compute again."""
-    return all(isinstance(path, WeakBrownianPath) for path in brownian_paths(noise))
+    return all(
+        isinstance(law, Discrete)
+        for path in brownian_paths(noise)
+        for law in (laws_of(path) or {"unknown": None}).values()
+    )
 
 
 def noise_driven(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._brownian._weak import _three_point, fair_sign
+from diffrax_symplectic._brownian._laws import THREE_POINT, two_point
 
 from .problems import kubo_terms, weak_path
 
@@ -17,12 +17,12 @@ def test_three_point_law_is_exact_in_the_bits():
     # The law of a uniform 32-bit word: the two thresholds, and symmetry.
     sixth = 2**32 // 6
     edges = jnp.array([0, sixth - 1, sixth, 2**31, 2**32 - sixth - 1, 2**32 - sixth])
-    values = _three_point(edges.astype(jnp.uint32), jnp.array(1.0))
+    values = THREE_POINT.from_words(edges.astype(jnp.uint32), float)
     np.testing.assert_array_equal(np.sign(values), [-1, -1, 0, 0, 0, 1])
     assert abs(sixth / 2**32 - 1 / 6) < 2**-32
     np.testing.assert_allclose(values[-1], np.sqrt(3), rtol=1e-15)
     edges = jnp.array([0, 2**31 - 1, 2**31, 2**32 - 1], jnp.uint32)
-    np.testing.assert_array_equal(fair_sign(edges, jnp.array(1.0)), [-1, -1, 1, 1])
+    np.testing.assert_array_equal(two_point().from_words(edges, float), [-1, -1, 1, 1])
 
 
 def test_sampled_moments_are_within_four_standard_errors():

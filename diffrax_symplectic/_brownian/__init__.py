@@ -1,3 +1,4 @@
+from ._laws import AbstractLaw as AbstractLaw, Discrete as Discrete
 from ._levy_area import (
     LevyAreaBrownianPath as LevyAreaBrownianPath,
     LevyAreaIncrement as LevyAreaIncrement,
@@ -7,8 +8,15 @@ from ._plateau import (
     PlateauIncrement as PlateauIncrement,
 )
 from ._random_words import check_key as check_key
+from ._stepwise import (
+    AbstractStepwisePath as AbstractStepwisePath,
+    laws_of as laws_of,
+    stepwise as stepwise,
+)
 from ._truncated import TruncatedBrownianPath as TruncatedBrownianPath
+from ._variables import VARIABLES as VARIABLES
 from ._weak import (
     WeakBrownianPath as WeakBrownianPath,
     WeakIncrement as WeakIncrement,
 )
+from ._wrapper import increment_struct as increment_struct

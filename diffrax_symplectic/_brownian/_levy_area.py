@@ -1,20 +1,24 @@
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 
 from .._custom_types import BM, RealScalarLike
 from .._materialize import materialize
 from ._fixed_steps import require_fixed_steps
-from ._random_words import check_key, place_key
-from ._wrapper import AbstractWrappedPath, require_space_time_area
+from ._laws import normal_from_words
+from ._random_words import AREA_WORDS, check_key, random_words
+from ._stepwise import num_noises, step_ends, stepwise
+from ._wrapper import (
+    AbstractWrappedPath,
+    increment_struct,
+    require_space_time_area,
+)
 
 
 class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
@@ -129,7 +133,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         t1: RealScalarLike | None = None,
         left: bool = True,
         use_levy: bool = False,
-    ) -> PyTree[Array] | LevyAreaIncrement:
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
         """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
 
         **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
@@ -138,23 +142,50 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         require_fixed_steps(self)
         if not use_levy and self.cell is None:
             return self.path.evaluate(t0, t1, left)
-        start, end = (jnp.zeros_like(t0), t0) if t1 is None else (t0, t1)
-        start, end = eqxi.nondifferentiable(
-            (jnp.asarray(start), jnp.asarray(end)), name="t"
-        )
+        t0, t1 = step_ends(t0, t1)
         if self.cell is None:
-            piece = self._sample(start, end)
+            piece = self._sample(t0, t1)
         else:
-            piece = self._compose(start, end, self.cell)
-        struct = jax.eval_shape(lambda: self.path.evaluate(0.0, 1.0))
-        _, unravel = jfu.ravel_pytree(
-            jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
-        )
+            piece = self._compose(t0, t1, self.cell)
+        return self._increment(piece, t1 - t0, use_levy)
+
+    @property
+    def laws(self) -> None:
+        return None
+
+    def num_words(self, use_levy: bool = False) -> int:
+        words = stepwise(self.path).num_words(use_levy)
+        return words + (self._num_normals() if use_levy else 0)
+
+    def increment(
+        self,
+        words: UInt32[Array, " num_words"],
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        use_levy: bool = False,
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        """Samples the step by itself, whatever `cell` is."""
+        path = stepwise(self.path)
+        increment = path.increment(words, t0, t1, use_levy)
+        if not use_levy:
+            return increment
+        piece = self._piece(increment, words[path.num_words(True) :], t1 - t0)
+        return self._increment(piece, t1 - t0, use_levy)
+
+    def _increment(
+        self, piece: _Piece, h: RealScalarLike, use_levy: bool
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        struct = increment_struct(self.path)
+        zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
+        _, unravel = jfu.ravel_pytree(zeros)
         if not use_levy:
             return unravel(piece.W)
         H = piece.integral / _or_one(piece.h) - piece.W / 2
-        dt = jax.tree.map(lambda s: jnp.asarray(end - start, s.dtype), struct)
+        dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), struct)
         return LevyAreaIncrement(dt, unravel(piece.W), unravel(H), piece.A)
+
+    def _num_normals(self) -> int:
+        return sum(_sizes(num_noises(increment_struct(self.path)), self.terms))
 
     def _compose(self, t0, t1, cell: float) -> _Piece:
         first, last = (jnp.round(t / cell).astype(int) for t in (t0, t1))
@@ -176,12 +207,17 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
 
     def _sample(self, t0, t1) -> _Piece:
         increment = materialize(lambda: self.path.evaluate(t0, t1, use_levy=True))
+        n = self._num_normals()
+        words = random_words(self.key, t0, t1, 1, n, AREA_WORDS)
+        return self._piece(increment, words[0], t1 - t0)
+
+    def _piece(self, increment, words: UInt32[Array, " normals"], h) -> _Piece:
         assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
         W, _ = jfu.ravel_pytree(increment.W)
         H, _ = jfu.ravel_pytree(increment.H)
-        h = jnp.abs(t1 - t0).astype(W.dtype)
-        key = place_key(self.key, jnp.asarray(t0), jnp.asarray(t1))
-        bridge = h * _bridge_area(H / jnp.sqrt(_or_one(h)), key, self.terms)
+        h = jnp.abs(h).astype(W.dtype)
+        normals = normal_from_words(words, W.dtype)
+        bridge = h * _bridge_area(H / jnp.sqrt(_or_one(h)), normals, self.terms)
         outer = jnp.outer(H, W)
         return _Piece(h, W, h * (W / 2 + H), outer - outer.T + bridge)
 
@@ -191,10 +227,16 @@ def _or_one(h: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(h > 0, h, 1)
 
 
+def _sizes(m: int, terms: int) -> tuple[int, ...]:
+    """How many normal numbers each part of the area needs."""
+    return m * terms, m * terms, m, m, m * (m - 1) // 2
+
+
 def _bridge_area(
-    H: Float[Array, " m"], key: PRNGKeyArray, terms: int
+    H: Float[Array, " m"], normals: Float[Array, " normals"], terms: int
 ) -> Float[Array, "m m"]:
-    r"""The Lévy areas of a Brownian bridge over unit time, given the integral `H` of it.
+    r"""The Lévy areas of a Brownian bridge over unit time, given the integral `H` of it,
+    from independent standard normal numbers.
 
     The bridge is $\sum_r a_r (\cos 2 \pi r t - 1) + b_r \sin 2 \pi r t$ with independent
     coefficients of variance $s_r = 1 / (2 \pi^2 r^2)$, its integral $-\sum_r a_r$ and its
@@ -205,10 +247,8 @@ def _bridge_area(
     s = 1 / (2 * np.pi**2 * r**2)
     rest, rest_squared = 1 / 12 - np.sum(s), max(1 / 360 - np.sum(s**2), 0)
     cast = lambda x: jnp.asarray(x, H.dtype)
-    # In one draw: each further one costs a hash of its own.
-    sizes = m * terms, m * terms, m, m, m * (m - 1) // 2
-    normals = jr.normal(key, (sum(sizes),), H.dtype)
-    a, b, from_rest, by_mean, by_area = jnp.split(normals, np.cumsum(sizes)[:-1])
+    ends = np.cumsum(_sizes(m, terms))
+    a, b, from_rest, by_mean, by_area = jnp.split(normals, ends[:-1])
     a, b = (cast(np.sqrt(s)) * x.reshape(m, terms) for x in (a, b))
     total = jnp.sum(a, axis=1) + np.sqrt(rest) * from_rest
     # Given that all cosine coefficients, the rest included, sum up to -H.

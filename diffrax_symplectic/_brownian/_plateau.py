@@ -1,13 +1,16 @@
 import diffrax
-import jax.flatten_util as jfu
-import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 
 from .._custom_types import BM, RealScalarLike
 from ._fixed_steps import require_fixed_steps
-from ._random_words import check_key, random_words
-from ._weak import fair_sign
-from ._wrapper import AbstractWrappedPath, require_space_time_area
+from ._laws import AbstractLaw, two_point
+from ._random_words import check_key, PLATEAU_WORDS, random_words
+from ._stepwise import draw_set, laws_of, num_noises, step_ends, stepwise
+from ._wrapper import (
+    AbstractWrappedPath,
+    increment_struct,
+    require_space_time_area,
+)
 
 
 class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
@@ -26,6 +29,9 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
     W: BM
     H: BM
     C: BM
+
+
+_PLATEAU = two_point(variance=1 / 6)
 
 
 class PlateauBrownianPath(AbstractWrappedPath):
@@ -53,13 +59,35 @@ class PlateauBrownianPath(AbstractWrappedPath):
     def levy_area(self):
         return PlateauIncrement
 
+    @property
+    def laws(self) -> dict[str, AbstractLaw] | None:
+        laws = laws_of(self.path)
+        return None if laws is None else {**laws, "C": _PLATEAU}
+
+    def num_words(self, use_levy: bool = False) -> int:
+        words = stepwise(self.path).num_words(use_levy)
+        return words + (num_noises(increment_struct(self.path)) if use_levy else 0)
+
+    def increment(
+        self,
+        words: UInt32[Array, " num_words"],
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        use_levy: bool = False,
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        path = stepwise(self.path)
+        increment = path.increment(words, t0, t1, use_levy)
+        if not use_levy:
+            return increment
+        return _with_plateaus(increment, words[path.num_words(True) :], t1 - t0)
+
     def evaluate(
         self,
         t0: RealScalarLike,
         t1: RealScalarLike | None = None,
         left: bool = True,
         use_levy: bool = False,
-    ) -> PyTree[Array] | PlateauIncrement:
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
         """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
 
         **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
@@ -69,12 +97,13 @@ class PlateauBrownianPath(AbstractWrappedPath):
         increment = self.path.evaluate(t0, t1, left, use_levy)
         if not use_levy:
             return increment
-        assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
-        start, end = (jnp.zeros_like(t0), t0) if t1 is None else (t0, t1)
-        flat, unravel = jfu.ravel_pytree(increment.W)
-        words = random_words(
-            self.key, jnp.asarray(start), jnp.asarray(end), 1, flat.size
-        )
-        size = jnp.sqrt(jnp.abs(jnp.asarray(end) - start) / 6).astype(flat.dtype)
-        C = unravel(fair_sign(words[0], size))
-        return PlateauIncrement(dt=increment.dt, W=increment.W, H=increment.H, C=C)
+        start, end = step_ends(t0, t1)
+        n = num_noises(increment_struct(self.path))
+        words = random_words(self.key, start, end, 1, n, PLATEAU_WORDS)
+        return _with_plateaus(increment, words[0], end - start)
+
+
+def _with_plateaus(increment, words, h) -> PlateauIncrement:
+    assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
+    C = draw_set(_PLATEAU, words, h, increment.W)
+    return PlateauIncrement(dt=increment.dt, W=increment.W, H=increment.H, C=C)

@@ -5,19 +5,26 @@ import jax.extend.random as jer
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Array, Integer, PRNGKeyArray
+from jaxtyping import Array, Integer, PRNGKeyArray, UInt32
 
 
-def random_words(key, t0, t1, sets: int, n: int) -> Integer[Array, "sets n"]:
+# Where the words of wrappers begin, in the numbers of a step.
+PLATEAU_WORDS, AREA_WORDS = 2**18, 2**19
+
+
+def random_words(
+    key, t0, t1, sets: int, n: int, begin: int = 0
+) -> UInt32[Array, "sets n"]:
     """Random words for the step from `t0` to `t1`, the same for times that differ by
-    rounding. The first of the sets are the same whatever their number is."""
+    rounding. The first of the sets are the same whatever their number is. Words from
+    another `begin` are independent, so that a path and a wrapper may have the same key."""
     key = _typed(key)
     count, exponent = _place(t0, t1)
     blocks = (sets * n + 1) // 2
-    if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks < 2**20:
+    if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks < 2**20 - begin:
         # The place is the counter of the generator, so that one hash gives two words.
         # (Keys folded and split would take three hashes for the first.)
-        numbers = np.arange(blocks, dtype=np.uint32)
+        numbers = np.arange(begin, begin + blocks, dtype=np.uint32)
         counters = jnp.concatenate(
             [
                 jnp.broadcast_to(count.astype(jnp.uint32), (blocks,)),
@@ -28,7 +35,7 @@ def random_words(key, t0, t1, sets: int, n: int) -> Integer[Array, "sets n"]:
         return words.reshape(2, blocks).T.reshape(-1)[: sets * n].reshape(sets, n)
     place = place_key(key, t0, t1)
     return jnp.stack(
-        [jr.bits(jr.fold_in(place, i), (n,), jnp.uint32) for i in range(sets)]
+        [jr.bits(jr.fold_in(place, begin + i), (n,), jnp.uint32) for i in range(sets)]
     )
 
 

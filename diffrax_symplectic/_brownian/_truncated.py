@@ -4,10 +4,11 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, PyTree, UInt32
 
 from .._custom_types import RealScalarLike
 from ._fixed_steps import require_fixed_steps
+from ._stepwise import stepwise
 from ._wrapper import AbstractWrappedPath
 
 
@@ -75,7 +76,28 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         of time or longer.
         """
         require_fixed_steps(self)
-        h = jnp.abs(jnp.asarray(t0) if t1 is None else jnp.asarray(t1) - t0)
+        start, end = (0, t0) if t1 is None else (t0, t1)
+        return self._clip(self.path.evaluate(t0, t1, left, use_levy), end - start)
+
+    @property
+    def laws(self) -> None:
+        return None
+
+    def num_words(self, use_levy: bool = False) -> int:
+        return stepwise(self.path).num_words(use_levy)
+
+    def increment(
+        self,
+        words: UInt32[Array, " num_words"],
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        use_levy: bool = False,
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        increment = stepwise(self.path).increment(words, t0, t1, use_levy)
+        return self._clip(increment, t1 - t0)
+
+    def _clip(self, increment, h) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        h = jnp.abs(h)
         h = eqx.error_if(
             h,
             h >= 1,
@@ -90,8 +112,6 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         def clip(w):
             return jnp.clip(w, -bound.astype(w.dtype), bound.astype(w.dtype))
 
-        increment = self.path.evaluate(t0, t1, left, use_levy)
-        if use_levy:
-            assert isinstance(increment, diffrax.AbstractBrownianIncrement)
+        if isinstance(increment, diffrax.AbstractBrownianIncrement):
             return dataclasses.replace(increment, W=jtu.tree_map(clip, increment.W))
         return jtu.tree_map(clip, increment)

@@ -1,19 +1,24 @@
-from typing import Any, cast
+from typing import Any
 
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import lineax.internal as lxi
-import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 
 from .._custom_types import BM, RealScalarLike
 from ._fixed_steps import require_fixed_steps
+from ._laws import AbstractLaw, FOUR_POINT, THREE_POINT, two_point
 from ._random_words import check_key, random_words
+from ._stepwise import (
+    AbstractStepwisePath,
+    checked_shape,
+    increment_from_words,
+    num_noises,
+    step_ends,
+)
 
 
 class WeakIncrement(diffrax.AbstractBrownianIncrement):
@@ -83,7 +88,7 @@ class WeakIncrement(diffrax.AbstractBrownianIncrement):
         return (jnp.outer(ihat, ihat) + skew - sqrt_h**2 * jnp.eye(ihat.size)) / 2
 
 
-class WeakBrownianPath(diffrax.AbstractBrownianPath):
+class WeakBrownianPath(AbstractStepwisePath):
     r"""Discrete random variables in place of Brownian increments, for weak methods.
 
     Over each step this gives a [`diffrax_symplectic.WeakIncrement`][]. Steps are
@@ -133,21 +138,8 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
         """
         if order not in (2, 3):
             raise ValueError(f"`order` must be 2 or 3; got {order!r}.")
-        if isinstance(shape, tuple) and all(isinstance(n, int) for n in shape):
-            shape = jax.ShapeDtypeStruct(shape, lxi.default_floating_dtype())
-        for leaf in jtu.tree_leaves(shape):
-            if not isinstance(leaf, jax.ShapeDtypeStruct):
-                raise ValueError(
-                    "`shape` must be a tuple of integers or a PyTree of "
-                    f"`jax.ShapeDtypeStruct`s; got {shape}."
-                )
-            if not jnp.issubdtype(leaf.dtype, jnp.floating):
-                raise ValueError(
-                    "The dtypes of a `WeakBrownianPath` must be real floating-point; "
-                    f"got {leaf.dtype}."
-                )
         check_key(key, type(self).__name__)
-        self.shape = shape
+        self.shape = checked_shape(shape, type(self).__name__)
         self.key = key
         self.second = second or order == 3
         self.two_point = two_point
@@ -171,7 +163,7 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
         t1: RealScalarLike | None = None,
         left: bool = True,
         use_levy: bool = False,
-    ) -> PyTree[Array] | WeakIncrement:
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
         """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
 
         Returns the three-point variables of the step from `t0` to `t1`, or with
@@ -183,55 +175,31 @@ class WeakBrownianPath(diffrax.AbstractBrownianPath):
         """
         del left
         require_fixed_steps(self)
-        if t1 is None:
-            t0, t1 = jnp.zeros_like(t0), t0
-        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
-        t0, t1 = cast(tuple[Array, Array], eqxi.nondifferentiable((t0, t1), name="t"))
-        h = t1 - t0
-        more = self.second + self.two_point + (self.order == 3)
-        sets = 1 + (more if use_levy else 0)
-        leaves = jtu.tree_leaves(self.shape)
-        bits = random_words(
-            self.key, t0, t1, sets, sum(int(np.prod(s.shape)) for s in leaves)
-        )
-        W = self._draw(bits[0], h, _three_point if self.order == 2 else _four_point)
-        if not use_levy:
-            return W
-        dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), self.shape)
-        second = two_point = third = None
+        t0, t1 = step_ends(t0, t1)
+        sets = len(self.laws) if use_levy else 1
+        words = random_words(self.key, t0, t1, sets, num_noises(self.shape))
+        return self.increment(words.reshape(-1), t0, t1, use_levy)
+
+    @property
+    def laws(self) -> dict[str, AbstractLaw]:
+        laws: dict[str, AbstractLaw]
+        laws = {"W": THREE_POINT if self.order == 2 else FOUR_POINT}
         if self.second:
-            second = self._draw(bits[1], h, _three_point)
+            laws["second"] = THREE_POINT
         if self.order == 3:
-            third = self._draw(bits[2], h, _three_point)
+            laws["third"] = THREE_POINT
         if self.two_point:
-            two_point = self._draw(bits[-1], h, fair_sign)
-        return WeakIncrement(dt, W, second, two_point, third)
+            laws["two_point"] = two_point()
+        return laws
 
-    def _draw(self, bits, h, law) -> PyTree[Array]:
-        leaves, treedef = jtu.tree_flatten(self.shape)
-        ends = np.cumsum([int(np.prod(leaf.shape)) for leaf in leaves])
-        out = [
-            law(piece.reshape(leaf.shape), jnp.sqrt(jnp.abs(h)).astype(leaf.dtype))
-            for piece, leaf in zip(jnp.split(bits, ends[:-1]), leaves)
-        ]
-        return jtu.tree_unflatten(treedef, out)
+    def num_words(self, use_levy: bool = False) -> int:
+        return (len(self.laws) if use_levy else 1) * num_noises(self.shape)
 
-
-def _three_point(bits, sqrt_h):
-    sixth = np.uint32(2**32 // 6)
-    size = np.sqrt(3.0).astype(sqrt_h.dtype) * sqrt_h
-    up = bits >= np.uint32(2**32 - 2**32 // 6)
-    return jnp.where(bits < sixth, -size, jnp.where(up, size, jnp.zeros_like(size)))
-
-
-def _four_point(bits, sqrt_h):
-    # Half of the words are negative; of each half the rare ones are large.
-    rare = np.uint32(round(2**32 * (3 - np.sqrt(6)) / 12))
-    large, small = (np.sqrt(3 + s * np.sqrt(6)).astype(sqrt_h.dtype) for s in (1, -1))
-    half = np.uint32(2**31)
-    size = jnp.where(bits % half < rare, large, small) * sqrt_h
-    return jnp.where(bits < half, -size, size)
-
-
-def fair_sign(bits, sqrt_h):
-    return jnp.where(bits < np.uint32(2**31), -sqrt_h, sqrt_h)
+    def increment(
+        self,
+        words: UInt32[Array, " num_words"],
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        use_levy: bool = False,
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        return increment_from_words(self, self.shape, words, t1 - t0, use_levy)

@@ -1,6 +1,10 @@
 from typing import TYPE_CHECKING
 
 import diffrax
+import jax
+from jaxtyping import PyTree
+
+from ._stepwise import AbstractStepwisePath
 
 
 if TYPE_CHECKING:
@@ -9,7 +13,7 @@ else:
     from equinox import AbstractVar
 
 
-class AbstractWrappedPath(diffrax.AbstractBrownianPath):
+class AbstractWrappedPath(AbstractStepwisePath):
     """A Brownian path that changes the increments of another, or adds to them."""
 
     path: AbstractVar[diffrax.AbstractBrownianPath]
@@ -21,6 +25,13 @@ class AbstractWrappedPath(diffrax.AbstractBrownianPath):
     @property
     def t1(self):
         return self.path.t1
+
+
+def increment_struct(
+    path: diffrax.AbstractBrownianPath,
+) -> PyTree[jax.ShapeDtypeStruct]:
+    """Shapes, dtypes and structure of an increment."""
+    return jax.eval_shape(lambda: path.evaluate(0.0, 1.0))
 
 
 def require_space_time_area(path: diffrax.AbstractBrownianPath, wrapper: str) -> None:

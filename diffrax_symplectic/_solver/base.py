@@ -5,6 +5,7 @@ from typing import ClassVar, TYPE_CHECKING, TypeAlias
 
 import diffrax
 
+from .._brownian import VARIABLES
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
 from .._tableau import AbstractTableau, FlatTableau
@@ -12,7 +13,6 @@ from .._terms import (
     check_state,
     drift_driven,
     noise_driven,
-    PROVIDED_BY,
     split_terms,
 )
 from ._stages import Step, take_step
@@ -69,9 +69,9 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
     def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
         """The least that the increments of the path have to hold."""
         variables = _variables(make_plan(self.tableau.flatten()).tableau)
-        for name, provider in PROVIDED_BY.items():
+        for name, variable in VARIABLES.items():
             if name in variables:
-                return provider.increment
+                return variable.increment
         return diffrax.AbstractBrownianIncrement
 
     def init(

@@ -1,0 +1,74 @@
+"""What there is to know of each random variable of a step, in one place."""
+
+from typing import NamedTuple
+
+import diffrax
+
+from ._levy_area import LevyAreaIncrement
+from ._plateau import PlateauIncrement
+from ._weak import WeakIncrement
+
+
+class RandomVariable(NamedTuple):
+    """One random variable of a step for each noise (or for each pair of noises).
+
+    - `increment`: the increments that hold it.
+    - `advice`: what it is called, and how to ask for increments that hold it.
+    - `variance`: in units of the step size, whichever law of the path it has; `None` if
+        it has no law of its own.
+    - `even`: whether it stays the same when time runs backward. Diffrax changes the sign
+        of all.
+    """
+
+    increment: type[diffrax.AbstractBrownianIncrement]
+    advice: str
+    variance: float | None
+    even: bool = False
+
+
+# By the name on the increment. Those whose increments hold more come first.
+VARIABLES = {
+    "A": RandomVariable(
+        LevyAreaIncrement,
+        "Lévy areas. Wrap a path with space-time Lévy area as `LevyAreaBrownianPath(path, "
+        "key)`",
+        variance=None,
+    ),
+    "C": RandomVariable(
+        PlateauIncrement,
+        "plateaus. Wrap a path with space-time Lévy area as `PlateauBrownianPath(path, "
+        "key)`",
+        variance=1 / 6,
+    ),
+    "H": RandomVariable(
+        diffrax.AbstractSpaceTimeLevyArea,
+        "space-time Lévy area. Pass a path that has it, for example `diffrax."
+        "VirtualBrownianTree(..., levy_area=diffrax.SpaceTimeLevyArea)`",
+        variance=1 / 12,
+        # The bridge, seen from its other end, has the same integral.
+        even=True,
+    ),
+    "third": RandomVariable(
+        WeakIncrement,
+        "four-point variables and two more sets. Construct the path as "
+        "`WeakBrownianPath(..., order=3)`",
+        variance=1,
+    ),
+    "second": RandomVariable(
+        WeakIncrement,
+        "a second set of three-point variables. Construct the path as "
+        "`WeakBrownianPath(..., second=True)`",
+        variance=1,
+    ),
+    "two_point": RandomVariable(
+        WeakIncrement,
+        "two-point variables. Construct the path as `WeakBrownianPath(..., "
+        "two_point=True)`",
+        variance=1,
+    ),
+    "W": RandomVariable(
+        diffrax.AbstractBrownianIncrement,
+        "the increment of a Brownian path. Pass `WeakBrownianPath(shape, key)`",
+        variance=1,
+    ),
+}
