@@ -51,7 +51,7 @@ def test_increments_can_be_made_from_words_given_in_place_of_the_random_ones():
     words = jnp.array([0, 2**31, 2**32 - 1, 5], jnp.uint32)
     h = 0.25
     inc = path.increment(words, 1.0, 1.0 + h, use_levy=True)
-    assert isinstance(inc, ds.WeakIncrement)
+    assert isinstance(inc, ds.WeakIncrement) and inc.two_point is not None
     bound = np.sqrt(2 * h * abs(np.log(h)))
     assert np.sqrt(3 * h) > bound
     np.testing.assert_allclose(inc.W, [-bound, 0], rtol=1e-14)
