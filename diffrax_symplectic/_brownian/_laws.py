@@ -46,7 +46,7 @@ class Discrete(AbstractLaw):
 
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
         values = [np.asarray(value, dtype) for value in self.values]
-        sample = jnp.full_like(words, values[-1], dtype)
+        sample = jnp.full(words.shape, values[-1])
         for cut, value in reversed([*zip(self.cuts, values)]):
             sample = jnp.where(words < np.uint32(cut), value, sample)
         return sample
