@@ -67,7 +67,7 @@ class Gaussian(AbstractLaw):
         sample = normal_from_words(words, dtype)
         if self.variance == 1:
             return sample
-        return np.asarray(np.sqrt(self.variance), dtype) * sample
+        return sample * np.asarray(np.sqrt(self.variance), dtype)
 
 
 def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
