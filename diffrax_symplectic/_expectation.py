@@ -14,13 +14,14 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from ._brownian import check_key
 
 
 _Sample: TypeAlias = Callable[[PRNGKeyArray], Any]
-_Host = PyTree[np.ndarray]
+# Scalars of NumPy are no arrays.
+_Host = PyTree[np.ndarray | np.floating]
 
 
 _no_meter = diffrax.NoProgressMeter()
@@ -44,14 +45,14 @@ class Expectation(eqx.Module):
     key_data: np.ndarray
 
     @property
-    def variance(self) -> PyTree[Float[np.ndarray, "..."]]:
+    def variance(self) -> _Host:
         r"""The variance of $\phi$ over the paths."""
         n = self.num_paths - 1
         share = lambda m2: m2 / n if n > 0 else np.full_like(m2, np.nan)
         return jtu.tree_map(share, self.sum_of_squares)
 
     @property
-    def std_error(self) -> PyTree[Float[np.ndarray, "..."]]:
+    def std_error(self) -> _Host:
         """The standard error of `mean`."""
         n = max(self.num_paths, 1)
         return jtu.tree_map(lambda v: np.sqrt(v / n), self.variance)

@@ -68,7 +68,7 @@ def _mask(tableau: FlatTableau) -> FlatTableau:
     return dataclasses.replace(tableau, matrix=_snap(matrix))
 
 
-def _snap(x: np.ndarray) -> np.ndarray:
+def _snap(x: np.ndarray | np.floating) -> np.ndarray:
     return np.where(np.abs(x) < _TOLERANCE, 0.0, x)
 
 

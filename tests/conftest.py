@@ -1,14 +1,17 @@
 """Settings of the suite. Nearly all of its time goes into tracing and compiling programs
-that run for milliseconds, so they are compiled with little optimization. What a claim
-is about optimized programs, or runs for long, has the fixture `optimized`; the examples
-and benchmarks always run optimized."""
+that run for milliseconds, so they are compiled with little optimization. A test whose claim
+is about optimized programs, or whose programs run for long, has the fixture `optimized`;
+the examples and benchmarks always run optimized.
+
+What users run is optimized. So the tests with the mark `core` are run once more with
+`JAX_DISABLE_MOST_OPTIMIZATIONS=0`, which every test then follows."""
 
 import gc
 import os
 
 
 # Inherited by the processes that some tests start, too.
-os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+OPTIMIZED = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1") == "0"
 
 import jax  # noqa: E402
 import jaxlib  # noqa: E402
@@ -17,12 +20,12 @@ import pytest  # noqa: E402
 
 # The older code generator compiles in a third of the time. XLA aborts for flags that it
 # does not know, and they come and go with its versions.
-if jaxlib.__version__.startswith("0.10."):
+if jaxlib.__version__.startswith("0.10.") and not OPTIMIZED:
     flags = os.environ.get("XLA_FLAGS", ""), "--xla_cpu_use_fusion_emitters=false"
     os.environ["XLA_FLAGS"] = " ".join(flags)
 
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_disable_most_optimizations", True)
+jax.config.update("jax_disable_most_optimizations", not OPTIMIZED)
 
 # Tracing makes millions of objects that live on: to look through them every few hundred
 # takes a third of its time.
@@ -35,7 +38,7 @@ def optimized():
     jax.clear_caches()
     jax.config.update("jax_disable_most_optimizations", False)
     yield
-    jax.config.update("jax_disable_most_optimizations", True)
+    jax.config.update("jax_disable_most_optimizations", not OPTIMIZED)
     jax.clear_caches()
 
 

@@ -13,6 +13,7 @@ from diffrax_symplectic._brownian._laws import THREE_POINT, two_point
 from .problems import kubo_terms, weak_path
 
 
+@pytest.mark.core
 def test_three_point_law_is_exact_in_the_bits():
     # The law of a uniform 32-bit word: the two thresholds, and symmetry.
     sixth = 2**32 // 6
@@ -25,6 +26,7 @@ def test_three_point_law_is_exact_in_the_bits():
     np.testing.assert_array_equal(two_point().from_words(edges, float), [-1, -1, 1, 1])
 
 
+@pytest.mark.core
 def test_sampled_moments_are_within_four_standard_errors():
     n, h = 200_000, 0.3
     path = weak_path(2, second=True, two_point=True)
@@ -89,6 +91,7 @@ def test_asking_for_more_does_not_change_the_increment():
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("h", [0.01, 2**-6, 0.1, 1 / 3])
 @pytest.mark.parametrize("start", [0.0, 0.5, -2.0, 0.005])
+@pytest.mark.core
 def test_increments_do_not_depend_on_the_rounding_of_time(h, start, dtype):
     path = weak_path(40)
     # The sizes follow the step; which of the three values it is, is what is random.
@@ -104,6 +107,7 @@ def test_increments_do_not_depend_on_the_rounding_of_time(h, start, dtype):
     assert len(np.unique(np.asarray(W), axis=0)) == n
 
 
+@pytest.mark.core
 def test_steps_of_a_long_solve_all_differ():
     path = weak_path(40)
     ts = np.linspace(0, 1e4, 10**6 + 1)

@@ -44,6 +44,7 @@ def test_small_lu_needs_a_square_matrix():
 
 @pytest.mark.parametrize("direct", [0, 4], ids=["picard", "newton"])
 @pytest.mark.parametrize("frequency", [0.1, 1.0, 10.0, 1000.0])
+@pytest.mark.core
 def test_stiff_steps_are_solved_where_fixed_points_diverge(frequency, direct):
     # A midpoint step of a rotation: the fixed-point map has slope `frequency / 2`.
     turn = frequency * jnp.array([[0.0, 1.0], [-1.0, 0.0]])
@@ -57,6 +58,7 @@ def test_stiff_steps_are_solved_where_fixed_points_diverge(frequency, direct):
 
 
 @pytest.mark.parametrize("start", [1.0, 3.0, 30.0])
+@pytest.mark.core
 def test_overshooting_corrections_are_shortened(start):
     # Newton's method alone diverges on arctan from beyond 1.39.
     sol = optx.root_find(
@@ -70,6 +72,7 @@ def test_overshooting_corrections_are_shortened(start):
     assert abs(sol.value) <= 1e-12
 
 
+@pytest.mark.core
 def test_equations_without_a_solution_are_reported():
     for finder in (ds.PicardNewton(), ds.PicardNewton(direct=0)):
         sol = optx.root_find(
@@ -78,6 +81,7 @@ def test_equations_without_a_solution_are_reported():
         assert sol.result != optx.RESULTS.successful
 
 
+@pytest.mark.core
 def test_leaves_that_vanish_do_not_keep_it_from_finishing():
     # One leaf has its root at exactly 0, where no relative tolerance can be met.
     def residual(x, _):
@@ -92,6 +96,7 @@ def test_leaves_that_vanish_do_not_keep_it_from_finishing():
 
 
 @pytest.mark.parametrize("direct", [0, 4], ids=["picard", "newton"])
+@pytest.mark.core
 def test_leaving_the_domain_on_the_way_is_no_failure(direct):
     # From 3 the first fixed-point iteration leads to where the logarithm has no value.
     sol = optx.root_find(

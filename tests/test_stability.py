@@ -203,8 +203,8 @@ def test_stiff_nonlinear_energies():
 @pytest.mark.parametrize(
     "system, dtype",
     [
-        (rounding.KUBO, np.float64),
-        (rounding.KUBO, np.float32),
+        pytest.param(rounding.KUBO, np.float64, marks=pytest.mark.core),
+        pytest.param(rounding.KUBO, np.float32, marks=pytest.mark.core),
         (rounding.RIGID_BODY, np.float64),
     ],
     ids=["Kubo, float64", "Kubo, float32", "rigid body, float64"],

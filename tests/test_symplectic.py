@@ -31,7 +31,13 @@ def _increments(key, h, dtype):
 
 
 @pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-6)])
-@pytest.mark.parametrize("solver", GENERAL.values(), ids=GENERAL.keys())
+@pytest.mark.parametrize(
+    "solver",
+    [
+        pytest.param(s, id=name, marks=[pytest.mark.core] * (name == "Midpoint"))
+        for name, s in GENERAL.items()
+    ],
+)
 def test_step_is_symplectic_for_a_thousand_random_systems(solver, dtype, bound):
     def problem(key):
         k_problem, k_path, k_h = jr.split(key, 3)

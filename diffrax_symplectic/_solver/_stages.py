@@ -151,7 +151,7 @@ def _part(y: Y, part: str) -> PyTree[Array]:
 
 def _position(
     y0: Y, stages: tuple[Stage, ...], rows: np.ndarray, values: dict[int, _Value]
-) -> Y:
+) -> PyTree[Array]:
     """`y0 + sum_i rows[:, i] values[i]`, over the values there are. Stacked, unless it is
     only one row."""
 
