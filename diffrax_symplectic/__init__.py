@@ -42,6 +42,11 @@ from ._solver import (
     StormerVerlet as StormerVerlet,
     StrangGauss as StrangGauss,
 )
+from ._spins import (
+    from_spinors as from_spinors,
+    spin_terms as spin_terms,
+    to_spinors as to_spinors,
+)
 from ._tableau import (
     AbstractTableau as AbstractTableau,
     AdditiveTableau as AdditiveTableau,
@@ -50,6 +55,7 @@ from ._tableau import (
     SeparableTableau as SeparableTableau,
 )
 from ._verify import (
+    poisson_defect as poisson_defect,
     second_moment_map as second_moment_map,
     step_expectation as step_expectation,
     symplecticity_defect as symplecticity_defect,

@@ -96,11 +96,7 @@ def hamiltonian_terms(
             "`path` must be a Brownian path, for example `diffrax_symplectic."
             f"WeakBrownianPath(shape=(m,), key=key)`; got {type(path).__name__}."
         )
-    for name, fn in (("H0", H0), ("noise", noise)):
-        if not callable(fn):
-            raise ValueError(
-                f"`{name}` must be a function `{name}(t, p, q, args)`; got {fn!r}."
-            )
+    check_functions("t, p, q, args", H0=H0, noise=noise)
     if structure not in (None, *get_args(_Structure)):
         raise ValueError(
             f"`structure` must be one of {get_args(_Structure)}, or `None` to have it "
@@ -123,7 +119,7 @@ class _Drift(eqx.Module):
             out = self.H0(t, p, q, args)
             if not jtu.all_leaves([out]) or jnp.shape(out) != ():
                 raise ValueError(
-                    "`H0(t, p, q, args)` must return a scalar; got "
+                    "`H0` must return a scalar; got "
                     f"{eqx.tree_pformat(out)}. Sum over the degrees of freedom."
                 )
             return jnp.asarray(out, jnp.result_type(out, float))
@@ -216,7 +212,7 @@ class HamiltonianNoise(diffrax.AbstractTerm):
                 )
         if not matches:
             raise ValueError(
-                "`noise(t, p, q, args)` must return one Hamiltonian for each noise of "
+                "`noise` must return one Hamiltonian for each noise of "
                 f"the path, which has shape {eqx.tree_pformat(struct)}; got "
                 f"{eqx.tree_pformat(jax.eval_shape(lambda: H))}. Return an array of "
                 "shape `(m,)` and construct the path with `shape=(m,)`."
@@ -246,11 +242,21 @@ def _parts(term: diffrax.AbstractTerm) -> list[_Drift | HamiltonianNoise]:
     return [x for x in jtu.tree_leaves(term, is_leaf=ours) if ours(x)]
 
 
+def check_functions(arguments: str, **functions: Callable) -> None:
+    """Raises a `ValueError` unless the Hamiltonians of these names can be called."""
+    for name, fn in functions.items():
+        if not callable(fn):
+            raise ValueError(
+                f"`{name}` must be a function `{name}({arguments})`; got {fn!r}."
+            )
+
+
 def check_pair(y: PyTree) -> None:
     """Raises a `ValueError` unless `y` is a pair of the same structure and shapes."""
     advice = (
         "The state of a Hamiltonian system is a pair `(p, q)` of arrays (or PyTrees) of "
-        "the same structure and shapes: pass `y0=(p0, q0)`. "
+        "the same structure and shapes: pass `y0=(p0, q0)`, or for spins "
+        "`y0=to_spinors(s0)`. "
     )
     if type(y) is not tuple or len(y) != 2:
         raise ValueError(f"{advice}Got {eqx.tree_pformat(y)}.")

@@ -1,5 +1,6 @@
 """Tests of a solver by one step, without Monte Carlo error."""
 
+import functools as ft
 from collections.abc import Callable
 
 import diffrax
@@ -15,6 +16,7 @@ from jaxtyping import Array, Float, PyTree
 from ._custom_types import Args, RealScalarLike, Y
 from ._hamiltonian import check_pair
 from ._quadrature import outcomes
+from ._spins import as_spins, from_spinors, to_spinors
 from ._terms import split_terms, tree_sum
 
 
@@ -71,8 +73,60 @@ def symplecticity_defect(
     d = flat.size // 2
     zero, one = np.zeros((d, d)), np.eye(d)
     omega = jnp.asarray(np.block([[zero, one], [-one, zero]]), flat.dtype)
-    dot = lambda a, b: jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
-    return jnp.max(jnp.abs(dot(jacobian.T, dot(omega, jacobian)) - omega))
+    return jnp.max(jnp.abs(_dot(jacobian.T, _dot(omega, jacobian)) - omega))
+
+
+_dot = ft.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+
+
+def poisson_defect(
+    terms: PyTree[diffrax.AbstractTerm],
+    solver: diffrax.AbstractSolver,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    y0: Y,
+    args: Args = None,
+) -> Float[Array, ""]:
+    r"""How far one step of spins is from a Poisson map: the largest entry of
+    $|J\, P(s_0)\, J^\top - P(s_1)|$, where $J = \partial s_1 / \partial s_0$ is the
+    Jacobian of the step at fixed random variables and $P(s)\, v = s \times v$ for each
+    spin. In other words: of $\{s_i \circ S, s_j \circ S\} - \{s_i, s_j\} \circ S$ for
+    the step $S$ and all pairs of components.
+
+    Exact up to rounding, as [`diffrax_symplectic.symplecticity_defect`][]. Works under
+    `jit` and `vmap`, and with any solver and terms of Diffrax.
+
+    **Arguments:**
+
+    - `terms`, `solver`, `args`: as for `diffrax.diffeqsolve`.
+    - `t0`, `t1`: start and end of the step. The increments are those that the path in
+        `terms` has over it.
+    - `y0`: the state, `to_spinors(s0)` for the terms of
+        [`diffrax_symplectic.spin_terms`][]. For terms in the spins themselves, their
+        array `s0` of shape `(..., 3)`.
+
+    **Returns:** a scalar.
+
+    **Raises:** a `ValueError` if `y0` is neither; an error when run if a spin of the pair
+    `y0` has length zero, or if the solver reports that the step failed.
+    """
+    lifted = isinstance(y0, tuple)
+    s0 = from_spinors(y0) if lifted else as_spins(y0)
+
+    def step(s):
+        y0 = to_spinors(s) if lifted else s
+        y1, result = _one_step(terms, solver, t0, t1, y0, args)
+        s1 = from_spinors(y1) if lifted else y1
+        return s1, (s1, result)
+
+    jacobian, (s1, result) = jax.jacrev(step, has_aux=True)(s0)
+    jacobian = result.error_if(jacobian, result != diffrax.RESULTS.successful)
+    # Row i of the first holds ds1_i / ds0, of the second the gradient of s_i itself.
+    rows = lambda x: x.reshape(s0.size, *s0.shape)
+    flat = lambda x: x.reshape(s0.size, s0.size)
+    gradients, units = rows(jacobian), rows(jnp.eye(s0.size, dtype=s0.dtype))
+    before = _dot(flat(gradients), flat(jnp.cross(s0, gradients)).T)
+    return jnp.max(jnp.abs(before - flat(jnp.cross(s1, units)).T))
 
 
 def step_expectation(

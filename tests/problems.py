@@ -189,10 +189,10 @@ def values_of_a_step(y):
 
 def local_weak_orders(terms, solver, y0, args, hs, order: int, **kwargs) -> list[float]:
     """Slopes of the local weak defect over the steps `hs`, for a batch of systems and
-    each of the functions above."""
+    each of the functions above, or of those of `fn`."""
 
     def defect(h, y0, args):
-        kw = dict(fn=values_of_a_step, order=order, **kwargs)
+        kw = dict(fn=values_of_a_step, order=order) | kwargs
         return ds.weak_order_defect(terms, solver, 0.1, 0.1 + h, y0, args, **kw)
 
     over_steps = jax.vmap(defect, in_axes=(0, None, None))

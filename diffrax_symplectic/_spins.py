@@ -1,0 +1,208 @@
+"""Spins and rigid bodies: canonical pairs `(p, q)` in place of vectors `s` of R^3."""
+
+from collections.abc import Callable
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from ._custom_types import Args, RealScalarLike
+from ._hamiltonian import check_functions, check_pair, hamiltonian_terms
+from ._indexed_noise import IndexedNoise
+
+
+_Spins = Float[Array, "*spins 3"]
+_Spinors = tuple[Float[Array, "*spins 2"], Float[Array, "*spins 2"]]
+_SpinHamiltonian = Callable[[RealScalarLike, _Spins, Args], PyTree[Array]]
+
+
+def spin_terms(
+    H0: _SpinHamiltonian, noise: _SpinHamiltonian, path: diffrax.AbstractBrownianPath
+) -> diffrax.MultiTerm:
+    r"""The terms of spins, or of a rigid body, from their Hamiltonians.
+
+    For vectors $s$ of $\mathbb R^3$, one or many, in the sense of Stratonovich,
+
+    $$\mathrm{d}s = s \times \nabla H_0\,\mathrm{d}t
+        + \sum_{k=1}^m s \times \nabla H_k \circ \mathrm{d}w_k.$$
+
+    That is the angular momentum of a rigid body, the stochastic Landau--Lifshitz
+    equation of magnetic moments, or the motion of point vortices on a sphere. The length
+    of each $s$ is constant, and the flow is a Poisson map: $\{F \circ S, G \circ S\} =
+    \{F, G\} \circ S$ for the bracket $\{F, G\} = s \cdot (\nabla G \times \nabla F)$. A
+    symplectic method for $s$ itself need not be: the midpoint rule keeps the length but
+    not the bracket.
+
+    So the state of these terms is not $s$ but a pair $(p, q)$ of arrays of shape
+    `(..., 2)`, from which [`diffrax_symplectic.from_spinors`][] makes $s$. They are
+    [`diffrax_symplectic.hamiltonian_terms`][] of the Hamiltonians $H_k(s(p, q))$, whose
+    solutions $(p, q)$ give solutions $s(p, q)$ of the equation above. The length of a
+    spin is a quadratic invariant of them. A symplectic Runge--Kutta method with the same
+    coefficients for $p$ and $q$ keeps it, and is a Poisson map of $s$.
+
+    All solvers for general systems are such methods: `Midpoint`, `SRKs1`, `SRKw1`,
+    `SRKw2`, `StrangGauss`, `NinomiyaVictoir` and `LevyAreaMidpoint`. Their orders are
+    those for canonical systems. The others refuse these terms.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+        import jax.random as jr
+
+        inertia = jnp.array([0.8, 0.6, 0.2])
+
+        def H0(t, s, args):  # a free rigid body
+            return jnp.sum(s**2 / inertia) / 2
+
+        def noise(t, s, args):  # turned at random about each of its axes
+            return args * s
+
+        path = ds.WeakBrownianPath(shape=(3,), key=jr.key(0), two_point=True)
+        sol = diffrax.diffeqsolve(
+            ds.spin_terms(H0, noise, path),
+            ds.NinomiyaVictoir(),
+            t0=0,
+            t1=1,
+            dt0=0.1,
+            y0=ds.to_spinors(jnp.array([0.6, 0.0, 0.8])),
+            args=0.3,
+        )
+        s = ds.from_spinors(sol.ys)
+        ```
+
+    **Arguments:**
+
+    - `H0`: `H0(t, s, args)`, a scalar, for `s` of shape `(..., 3)`: the sum over all
+        spins. A function, or a Module with parameters; differentiable with respect to
+        these and to `args`.
+    - `noise`: `noise(t, s, args)`, the noise Hamiltonians $H_1, \ldots, H_m$ as an
+        array of shape `(m,)`, or whatever structure and shapes `path` has. A field along
+        each axis of each spin is `noise = lambda t, s, args: args * s` with a path of
+        the shape of `s`; its cost is one reverse pass. Or an
+        [`diffrax_symplectic.IndexedNoise`][] of `H(k, t, s, args)`.
+    - `path`: the Brownian path, as for [`diffrax_symplectic.hamiltonian_terms`][].
+
+    **Returns:** `MultiTerm(drift, diffusion)`, for the state `to_spinors(s0)`.
+
+    **Raises:** as [`diffrax_symplectic.hamiltonian_terms`][]; and a `ValueError` while
+    the solve is traced if the arrays of the state do not have the shape `(..., 2)`.
+
+    **Source:** [McLachlan, Modin and Verdier
+    (2014)](https://doi.org/10.1088/0951-7715/27/6/1525), for systems without noise.
+    """
+    check_functions("t, s, args", H0=H0, noise=noise)
+    if isinstance(noise, IndexedNoise):
+        lifted = IndexedNoise(SpinHamiltonian(noise.H), noise.m)
+    else:
+        lifted = SpinHamiltonian(noise)
+    return hamiltonian_terms(SpinHamiltonian(H0), lifted, path)
+
+
+class SpinHamiltonian(eqx.Module):
+    """`H(t, s(p, q), args)`, by the Hopf map as in McLachlan, Modin and Verdier,
+    https://doi.org/10.1088/0951-7715/27/6/1525
+    """
+
+    H: Callable
+
+    def __call__(self, *inputs) -> PyTree[Array]:
+        # The Hamiltonian of an `IndexedNoise` has the index of the noise before the time.
+        *before, p, q, args = inputs
+        return self.H(*before, from_spinors((p, q)), args)
+
+
+def from_spinors(y: _Spinors) -> _Spins:
+    r"""The vectors $s$ of the state $(p, q)$ of [`diffrax_symplectic.spin_terms`][],
+
+    $$s = \tfrac14 \left(2 \operatorname{Re} a b^*,\; 2 \operatorname{Im} a b^*,\;
+        |a|^2 - |b|^2\right), \qquad
+        a = q_1 + \mathrm i p_1, \quad b = q_2 + \mathrm i p_2.$$
+
+    This is the Hopf map. The factor $1/4$ makes the canonical brackets of its components
+    those of spins, $\{s_1, s_2\} = -s_3$ and cyclic. So canonical equations for
+    $H(s(p, q))$ push forward to $\mathrm{d}s = s \times \nabla H\,\mathrm{d}t$. The
+    length is $|s| = (|p|^2 + |q|^2) / 4$.
+
+    **Arguments:**
+
+    - `y`: the pair $(p, q)$ of arrays of shape `(..., 2)`, for example `sol.ys`.
+
+    **Returns:** an array of shape `(..., 3)`.
+
+    **Raises:** a `ValueError` if `y` is anything else.
+    """
+    check_pair(y)
+    p, q = y
+    if not eqx.is_array_like(p) or jnp.shape(p)[-1:] != (2,):
+        raise ValueError(
+            "The state of spins is a pair `(p, q)` of arrays of shape `(..., 2)`: pass "
+            f"`y0=to_spinors(s0)`. Got {eqx.tree_pformat(y)}."
+        )
+    (p1, p2), (q1, q2) = jnp.moveaxis(jnp.asarray(p), -1, 0), jnp.moveaxis(q, -1, 0)
+    s1 = (q1 * q2 + p1 * p2) / 2
+    s2 = (p1 * q2 - q1 * p2) / 2
+    s3 = (q1**2 + p1**2 - q2**2 - p2**2) / 4
+    return jnp.stack([s1, s2, s3], axis=-1)
+
+
+def to_spinors(s: _Spins) -> _Spinors:
+    r"""A state $(p, q)$ for the vectors $s$, to begin a solve of
+    [`diffrax_symplectic.spin_terms`][] with: `from_spinors(to_spinors(s))` is $s$.
+
+    There is a circle of such states for each $s$, all $(\mathrm e^{\mathrm i \phi} a,
+    \mathrm e^{\mathrm i \phi} b)$. The phase $\phi$ is a gauge: neither the equations nor
+    the solvers for general systems see it, and $s$ does not depend on it at any time. No
+    choice of it is continuous on the whole sphere. Here $a > 0$ where $s_3 \ge 0$ and
+    $b > 0$ where $s_3 < 0$. So $(p, q)$ jumps where $s$ crosses the equator, and depends
+    smoothly on $s$ on both sides, poles included. Derivatives of what is made of $s$ are
+    right everywhere.
+
+    **Arguments:**
+
+    - `s`: an array of shape `(..., 3)`, of any lengths but zero.
+
+    **Returns:** the pair `(p, q)` of arrays of shape `(..., 2)`.
+
+    **Raises:** a `ValueError` if `s` has another shape; an error when run if a spin has
+    length zero. Such a spin has no direction and never moves; and $(p, q)$, which grows
+    like $|s|^{1/2}$, has no derivative there.
+    """
+    s = as_spins(s)
+    # Squares of very short and of very long vectors leave the range of the numbers. The
+    # state grows like the square root of the scale, which thus needs no derivative.
+    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(s), axis=-1, keepdims=True))
+    scale = eqx.error_if(
+        scale,
+        scale == 0,
+        "`to_spinors(s)` needs spins whose length is not zero. A spin of length zero "
+        "never moves: leave it out.",
+    )
+    x, y, z = jnp.moveaxis(s / scale, -1, 0)
+    north = z >= 0
+    length = jnp.sqrt(x**2 + y**2 + z**2)
+    # The larger of |a| and |b|, which is real, and the other one.
+    real = jnp.sqrt(2 * (length + jnp.where(north, z, -z)))
+    other_q, other_p = 2 * x / real, 2 * y / real
+    p1, p2 = jnp.where(north, 0, other_p), jnp.where(north, -other_p, 0)
+    q1, q2 = jnp.where(north, real, other_q), jnp.where(north, other_q, real)
+    root = jnp.sqrt(scale)
+    return root * jnp.stack([p1, p2], axis=-1), root * jnp.stack([q1, q2], axis=-1)
+
+
+def as_spins(s: PyTree) -> _Spins:
+    """`s` as an array of floating-point numbers; a `ValueError` if it holds no spins."""
+    if (
+        not eqx.is_array_like(s)
+        or jnp.shape(s)[-1:] != (3,)
+        or jnp.issubdtype(jnp.result_type(s), jnp.complexfloating)
+    ):
+        raise ValueError(
+            "Spins are a real array `s` of shape `(..., 3)`, the three components last; "
+            f"got {eqx.tree_pformat(s)}."
+        )
+    return jnp.asarray(s, jnp.result_type(s, float))
