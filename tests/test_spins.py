@@ -162,19 +162,31 @@ def test_ninomiya_victoir_is_weak_order_two_for_three_noises_that_do_not_commute
     np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 
 
-def _end(y0, args, m=3):
+def test_noises_of_spins_may_be_indexed():
+    s0, args = _problem(jr.key(0), 2, 3)
+    y0 = ds.to_spinors(s0)
+    path = weak_path(3, two_point=True)
+    indexed = ds.IndexedNoise(lambda k, t, s, args: noise(t, s, args)[k], 3)
+    ends = [
+        ds.NinomiyaVictoir().step(
+            ds.spin_terms(H0, fields, path), 0.0, 0.1, y0, args, None, False
+        )[0]
+        for fields in (noise, indexed)
+    ]
+    np.testing.assert_allclose(*map(ds.from_spinors, ends), atol=1e-15)
+
+
+def _end(y0, args):
     """Of a chain of spins with a field along each axis of each spin."""
 
     def H0(t, s, args):
         return -jnp.sum(s[1:] * s[:-1])
 
-    path = weak_path(3)
-    path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((4, 3), y0[0].dtype), jr.key(0))
+    dtype = y0[0].dtype
+    path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((4, 3), dtype), jr.key(0))
     terms = ds.spin_terms(H0, lambda t, s, args: args * s, path)
-    sol = diffrax.diffeqsolve(
-        terms, ds.Midpoint(), 0.0, 1.0, 0.125, y0, args, throw=False,
-        adjoint=diffrax.DirectAdjoint(), max_steps=8,
-    )  # fmt: skip
+    times = jnp.array([0, 1, 0.125], dtype)
+    sol = diffrax.diffeqsolve(terms, ds.Midpoint(), *times, y0, args, throw=False)
     return ds.from_spinors(sol.ys)[0], sol.result == diffrax.RESULTS.successful
 
 
@@ -183,6 +195,7 @@ def test_a_batch_of_chains_keeps_lengths_and_does_not_see_the_phase(dtype):
     eps = jnp.finfo(dtype).eps
     s0 = jax.vmap(lambda key: _problem(key, 4, 1, dtype)[0])(jr.split(jr.key(0), 3))
     p, q = ds.to_spinors(s0)
+    # Another phase for each spin.
     phase = jr.uniform(jr.key(1), (3, 4, 1), dtype, 0, 2 * np.pi)
     c, s = jnp.cos(phase), jnp.sin(phase)
     turned = c * p + s * q, c * q - s * p
