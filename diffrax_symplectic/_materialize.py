@@ -10,16 +10,17 @@ _T = TypeVar("_T")
 
 
 def materialize(fn: Callable[[], _T]) -> _T:
-    """`fn()`, as something that is computed once and kept.
+    """`fn()`, computed once and kept in memory.
 
-    On CPUs XLA computes whatever several of its kernels need anew in each of them, be it a
-    Gaussian number or a sine. It fuses nothing across the border of a conditional: here of
-    one whose condition it cannot see through until it has fused.
+    On CPUs, XLA fuses a cheap-looking computation into every kernel that reads its result,
+    and so repeats it there. For Gaussian numbers and transcendental functions that costs
+    more than it saves. XLA fuses nothing across the border of a conditional, so `fn` is put
+    behind one. The barrier hides that its condition is always true.
     """
 
-    def behind_a_border() -> _T:
+    def in_a_conditional() -> _T:
         shapes = jax.eval_shape(fn)
         zeros = lambda: jtu.tree_map(lambda s: lax.full_like(s, 0), shapes)
         return lax.cond(lax.optimization_barrier(True), fn, zeros)
 
-    return lax.platform_dependent(cpu=behind_a_border, default=fn)
+    return lax.platform_dependent(cpu=in_a_conditional, default=fn)
