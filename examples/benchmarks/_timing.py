@@ -42,7 +42,9 @@ def measure(fn: Callable, *args, repeats: int = 5) -> Timing:
     return Timing(traced - start, done - traced, best)
 
 
-def ensemble(make_terms, make_path, solver, y0, h: float, steps: int) -> Callable:
+def ensemble(
+    make_terms, make_path, solver, y0, h: float | jax.Array, steps: int
+) -> Callable:
     """Takes keys to the ends of paths; one path without a batch if there is one key."""
 
     def one(key):

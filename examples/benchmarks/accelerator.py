@@ -7,6 +7,7 @@ Writes `docs/benchmarks/accelerator.md`. Runs on CPUs, too, where `--quick` is a
 
 import sys
 import time
+from typing import Any
 
 import diffrax
 import jax
@@ -33,7 +34,7 @@ def weak(shape=(), **kwargs):
     )
 
 
-def gaussian(shape=(), area=diffrax.BrownianIncrement):
+def gaussian(shape=(), area: Any = diffrax.BrownianIncrement):
     return lambda dtype: (
         lambda key: diffrax.UnsafeBrownianPath(struct(shape, dtype), key, area)
     )
