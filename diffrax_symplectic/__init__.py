@@ -20,6 +20,10 @@ from ._expectation import (
 )
 from ._hamiltonian import hamiltonian_terms as hamiltonian_terms
 from ._indexed_noise import IndexedNoise as IndexedNoise
+from ._quasi import (
+    quasi_expectation as quasi_expectation,
+    QuasiExpectation as QuasiExpectation,
+)
 from ._root_finder import SmallLU as SmallLU, PicardNewton as PicardNewton
 from ._solver import (
     AbstractImplicitStages as AbstractImplicitStages,

@@ -1,0 +1,87 @@
+"""A randomized low-discrepancy set of points, as random words of 32 bits."""
+
+import functools as ft
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, UInt32
+from scipy.stats import qmc
+
+
+# So many coordinates of Sobol' points have direction numbers.
+MAX_DIMENSION: int = qmc.Sobol.MAXDIM
+
+
+@ft.lru_cache(maxsize=8)
+def sobol_points(num_points: int, dimension: int) -> np.ndarray:
+    r"""The first points of the Sobol' sequence, as words of 32 bits, for a power of two of
+    points.
+
+    With the number of a point before its coordinates they are a digital net: of every
+    $2^k$ consecutive points from a multiple of $2^k$ on, each coordinate has one in each
+    interval of length $2^{-k}$.
+
+    The direction numbers are those of
+    [Joe and Kuo (2008)](https://doi.org/10.1137/070709359), as SciPy has them.
+    """
+    sequence = qmc.Sobol(dimension, scramble=False, bits=32)
+    points = sequence.random_base2(num_points.bit_length() - 1)
+    return (points * 2.0**32).astype(np.uint32)
+
+
+def nested_scramble(x: UInt32[Array, "..."], seed: UInt32[Array, "..."]):
+    """Owen's nested uniform scrambling of words of 32 bits, by a hash: each bit is flipped
+    or not at random, as a function of the bits above it. A bijection for each seed, that
+    keeps what is in one interval of length `2^-k` together for all `k`.
+
+    Section 4 of [Laine and Karras (2011)](https://doi.org/10.1111/j.1467-8659.2011.01980.x)
+    and [Burley (2020)](https://jcgt.org/published/0009/04/01/), with the constants of
+    Vegdahl (2021).
+    """
+    # In the other order of bits a flip has to depend on lower bits only, as the carries of
+    # sums and products do.
+    x = _reverse_bits(x)
+    x = x ^ (x * np.uint32(0x3D20ADEA))
+    x = x + seed
+    x = x * ((seed >> np.uint32(16)) | np.uint32(1))
+    x = x ^ (x * np.uint32(0x05526C56))
+    x = x ^ (x * np.uint32(0x53A22864))
+    return _reverse_bits(x)
+
+
+def _reverse_bits(x: UInt32[Array, "..."]) -> UInt32[Array, "..."]:
+    for shift, mask in (
+        (1, 0x55555555),
+        (2, 0x33333333),
+        (4, 0x0F0F0F0F),
+        (8, 0x00FF00FF),
+    ):
+        s, m = np.uint32(shift), np.uint32(mask)
+        x = ((x >> s) & m) | ((x & m) << s)
+    return (x >> np.uint32(16)) | (x << np.uint32(16))
+
+
+def num_seeds(dimension: int) -> int:
+    """How many random words `randomized` needs."""
+    return 1 + 2 * dimension
+
+
+def randomized(
+    points: UInt32[Array, "n d"], seeds: UInt32[Array, " s"]
+) -> UInt32[Array, "n d"]:
+    """The points of `sobol_points`, scrambled. Each word has the uniform distribution
+    exactly, whatever its place.
+
+    The numbers of the points are scrambled like their coordinates. Otherwise neighbours
+    would have complementary coordinates in the same order everywhere, and whatever
+    alternates along the paths as they are sorted would add up.
+    """
+    n, d = points.shape
+    bits = np.uint32(32 - (n.bit_length() - 1))
+    # (A shift by all 32 bits is undefined.)
+    number = jnp.arange(n, dtype=jnp.uint32) << min(bits, np.uint32(31))
+    number = nested_scramble(number, seeds[0]) >> min(bits, np.uint32(31))
+    number = number if n > 1 else jnp.zeros_like(number)
+    words = nested_scramble(points[number.astype(jnp.int32)], seeds[1 : 1 + d])
+    # The hash of one seed is no uniform permutation; a digital shift makes up for it.
+    return words ^ seeds[1 + d : 1 + 2 * d]

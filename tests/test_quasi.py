@@ -1,0 +1,291 @@
+"""Expectations by quasi-Monte Carlo: the points are balanced, the order is a permutation
+along a curve without jumps, each path has its law, and what is estimated is exact up to
+the spread that is reported."""
+
+import os
+import subprocess
+import sys
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._quasi._estimate import estimate, extrapolation_weights
+from diffrax_symplectic._quasi._given_words import layout
+from diffrax_symplectic._quasi._point_set import (
+    nested_scramble,
+    num_seeds,
+    randomized,
+    sobol_points,
+)
+from diffrax_symplectic._quasi._quasi_expectation import _check_functions
+from diffrax_symplectic._quasi._sorting import _curve, hilbert_order
+
+from .problems import kubo_terms
+
+
+Y0 = (jnp.array(0.0), jnp.array(1.0))
+SQUARE = lambda t, y, args: y[1] ** 2
+
+
+def _midpoint_moment(n: int, h: float) -> float:
+    """E(q^2) after n steps of the midpoint rule on the Kubo oscillator, in closed form: it
+    turns by 2 atan((h + I) / 2)."""
+    twice = 4 * np.arctan((h + np.sqrt(3 * h) * np.array([-1, 0, 1])) / 2)
+    return (1 + (np.exp(1j * twice) @ np.array([1, 4, 1]) / 6) ** n).real / 2
+
+
+MIDPOINT = ds.Midpoint()
+
+
+def _estimate(solver=MIDPOINT, terms=None, phi=SQUARE, **kwargs):
+    terms = kubo_terms(ds.WeakBrownianPath((), jr.key(0))) if terms is None else terms
+    kwargs = dict(t1=1.0, key=jr.key(7), num_paths=256, replicates=4) | kwargs
+    t1 = kwargs.pop("t1")
+    dt0 = kwargs.pop("dt0", 0.1)
+    y0 = kwargs.pop("y0", Y0)
+    return ds.quasi_expectation(phi, terms, solver, 0.0, t1, dt0, y0, **kwargs)
+
+
+def test_points_are_a_digital_net_after_scrambling():
+    n, d = 256, 2
+    seeds = jr.bits(jr.key(0), (50, num_seeds(d)), jnp.uint32)
+    points = jnp.asarray(sobol_points(n, d))
+    words = np.asarray(jax.jit(jax.vmap(lambda s: randomized(points, s)))(seeds))
+    for k in range(1, 9):
+        # 2^k consecutive points, and 2^k intervals for each coordinate.
+        cells = (words >> np.uint32(32 - k)).reshape(50, -1, 2**k, d)
+        cells = np.sort(cells, axis=2)
+        assert np.all(cells == np.arange(2**k)[:, None])
+    # The two coordinates together are one, too: 16 boxes by 16.
+    boxes = (words[..., 0] >> np.uint32(28)) * 16 + (words[..., 1] >> np.uint32(28))
+    assert np.all(np.sort(boxes, axis=1) == np.arange(n))
+    assert len(np.unique(words[:, 0, 0])) == 50
+
+
+def test_scrambling_is_a_bijection_that_respects_intervals():
+    x = np.arange(2**16, dtype=np.uint32) << np.uint32(16)
+    y = np.asarray(nested_scramble(jnp.asarray(x), jnp.uint32(123456789)))
+    for k in (1, 2, 5, 16):
+        shift = np.uint32(32 - k)
+        # Of each interval one image, and of different intervals different ones.
+        pairs = np.unique(np.stack([x >> shift, y >> shift]), axis=1)
+        assert pairs.shape[1] == 2**k
+        assert len(np.unique(pairs[1])) == 2**k
+
+
+@pytest.mark.parametrize("d, bits", [(2, 4), (3, 3), (5, 2)])
+def test_the_curve_meets_each_cell_once_and_goes_on_to_its_neighbour(
+    d, bits, monkeypatch
+):
+    monkeypatch.setattr("diffrax_symplectic._quasi._sorting._COORDINATE_BITS", bits)
+    axes = np.meshgrid(*[np.arange(2**bits)] * d, indexing="ij")
+    cells = np.stack(axes, -1).reshape(-1, d).astype(np.uint32)
+    place = np.asarray(_curve([*jnp.asarray(cells).T], 48, jnp.uint64))
+    np.testing.assert_array_equal(np.sort(place), np.arange(len(cells)))
+    moves = np.diff(cells[np.argsort(place)].astype(int), axis=0)
+    assert np.all(np.abs(moves).sum(axis=1) == 1)
+
+
+@pytest.mark.parametrize("x64", [True, False])
+def test_sorting_is_a_permutation_by_place_with_the_failed_ones_last(x64):
+    with jax.enable_x64(x64):
+        z = jr.normal(jr.key(0), (1000, 1), float)
+        # Neither what is far away nor what is no number disturbs the others.
+        z = z.at[3].set(1e30).at[5].set(jnp.nan)
+        last = jnp.zeros(1000, bool).at[jnp.array([3, 5, 77])].set(True)
+        order = np.asarray(jax.jit(hilbert_order)(z, last))
+    np.testing.assert_array_equal(np.sort(order), np.arange(1000))
+    assert set(order[-3:]) == {3, 5, 77}
+    good = np.clip(np.asarray(z)[order[:-3], 0], -2, 2)
+    assert np.all(np.diff(good) > -1e-3)
+
+
+def test_the_estimate_is_exact_up_to_the_spread_that_it_reports():
+    got = _estimate(replicates=16, num_paths=2048)
+    exact = _midpoint_moment(10, 0.1)
+    # Student's distribution with 15 degrees of freedom is beyond 4.9 once in 5,000.
+    assert abs(got.mean - exact) <= 4.9 * got.std_error
+    # Of as many independent paths the standard error would be 1.9e-3.
+    assert 0 < got.std_error < 6e-4
+    assert (got.num_replicates, got.num_failed) == (16, 0)
+    assert got.bias is None and got.tol_reached is None
+    np.testing.assert_allclose(np.mean(got.replicates), got.mean, rtol=1e-14)
+    low, high = got.interval(0.95)
+    np.testing.assert_allclose(high - low, 2 * 2.13145 * got.std_error, rtol=1e-5)
+
+
+def test_of_one_step_the_law_is_balanced_to_the_last_path():
+    # Of 256 paths a sixth is 42.67: each replicate has 42 or 43 of either sign.
+    signs = lambda t, y, args: jnp.stack([y < -1e-3, y > 1e-3, jnp.abs(y) < 1e-3])
+    path = ds.WeakBrownianPath((), jr.key(0))
+    terms = diffrax.ControlTerm(lambda t, y, args: jnp.ones(()), path)
+    got = _estimate(
+        diffrax.Euler(), terms, signs, y0=jnp.zeros(()), t1=0.1, replicates=64
+    )
+    counts = 256 * got.replicates
+    assert np.all(np.abs(counts[:, :2] - 256 / 6) <= 1)
+    np.testing.assert_allclose(counts.sum(axis=1), 256)
+    assert np.all(np.abs(got.mean - [1 / 6, 1 / 6, 2 / 3]) <= 5 * got.std_error)
+
+
+def test_two_levels_extrapolate_by_the_weak_order_and_tell_the_bias():
+    got = _estimate(levels=2, replicates=4, num_paths=128)
+    one, other = _midpoint_moment(10, 0.1), _midpoint_moment(20, 0.05)
+    assert abs(got.mean - (2 * other - one)) <= 10 * got.std_error
+    assert abs(got.bias - abs(other - one)) <= 20 * got.std_error
+
+
+def test_weights_of_levels_cancel_powers_of_the_step_size():
+    for order, levels in ((1, 1), (1, 2), (2, 2), (2, 3), (3, 4)):
+        weights = extrapolation_weights(order, levels)
+        h = 0.5 ** np.arange(levels)
+        np.testing.assert_allclose(weights.sum(), 1)
+        for power in range(order, order + levels - 1):
+            assert abs(weights @ h**power) < 1e-13
+    values = [[np.array(2.0), np.array(1.0)], [np.array(4.0), np.array(3.0)]]
+    got = estimate(values, 0, 1, tol=None)
+    np.testing.assert_allclose([got.mean, got.bias, got.std_error], [1.0, 1.0, 1.0])
+
+
+def test_times_of_averaging_and_failed_paths():
+    def drift(t, y, args):
+        # What is kicked upwards in the first step is lost soon after.
+        return jnp.where(y > 0.1, jnp.where(t > 0.15, jnp.nan, 0.0), 0.0)
+
+    path = ds.WeakBrownianPath((), jr.key(0))
+    kick = diffrax.ControlTerm(lambda t, y, args: jnp.where(t < 0.05, 1.0, 0.0), path)
+    terms = diffrax.MultiTerm(diffrax.ODETerm(drift), kick)
+    got = _estimate(
+        diffrax.Euler(), terms, lambda t, y, args: {"t": t, "y": y}, y0=jnp.zeros(()),
+        ts=[0.4, 0.0, 0.1], t1=0.4, num_paths=64,
+    )  # fmt: skip
+    np.testing.assert_allclose(got.mean["t"], [0.4, 0.0, 0.1], atol=1e-15)
+    np.testing.assert_allclose(got.mean["y"][1], 0.0)
+    # 10 or 11 of 64 go up, as many go down, and the ones that stay are left.
+    assert 4 * 10 <= got.num_failed <= 4 * 11
+    down = -np.sqrt(0.3) * np.array([10 / 54, 11 / 53])
+    assert down[1] - 1e-12 <= got.mean["y"][0] <= down[0] + 1e-12
+
+
+def test_it_stops_at_the_tolerance_with_the_replicates_of_the_whole():
+    whole = _estimate(replicates=12)
+    got = _estimate(replicates=12, tol=1.0)
+    assert got.tol_reached and got.num_replicates == 8
+    np.testing.assert_array_equal(got.replicates, whole.replicates[:8])
+    never = _estimate(replicates=3, tol=1e-12)
+    assert never.tol_reached is False and never.num_replicates == 3
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_solvers_of_diffrax_in_both_precisions(dtype):
+    path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((1,), dtype), jr.key(0))
+    drift = diffrax.ODETerm(lambda t, y, args: -y)
+    noise = diffrax.ControlTerm(lambda t, y, args: jnp.full((1, 1), 0.5, dtype), path)
+    terms = diffrax.MultiTerm(drift, noise)
+    square = lambda t, y, args: y[0] ** 2
+    y0 = jnp.zeros(1, dtype)
+    got = _estimate(diffrax.Heun(), terms, square, y0=y0, num_paths=512)
+    # An Ornstein-Uhlenbeck process, up to the error of the steps.
+    assert abs(got.mean - 0.125 * (1 - np.exp(-2))) <= 1e-3
+    assert got.std_error < 5e-4
+    assert got.replicates.dtype == np.float64
+
+
+PROGRAM = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
+from tests.test_quasi import _estimate
+print([float(x).hex() for x in _estimate(replicates=5, tol=1e-12).replicates])
+"""
+
+
+def test_one_device_or_eight_the_same_numbers():
+    root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}
+    out = subprocess.run(
+        [sys.executable, "-c", PROGRAM, "8"],
+        env=environment, cwd=root, stdout=subprocess.PIPE, text=True, check=True,
+    )  # fmt: skip
+    here = [float(x).hex() for x in _estimate(replicates=5, tol=1e-12).replicates]
+    assert out.stdout.splitlines()[-1] == str(here)
+
+
+def test_equal_paths_are_one_brownian_motion():
+    path = ds.WeakBrownianPath((2,), jr.key(0), two_point=True)
+    other = ds.WeakBrownianPath((2,), jr.key(1), two_point=True)
+    term = lambda path: diffrax.ControlTerm(lambda t, y, args: y, path)
+    terms = diffrax.MultiTerm(term(path), term(other), term(path))
+    assert layout(terms) == (((0, 4), (4, 8), (0, 4)), 8)
+
+
+@pytest.mark.parametrize(
+    "message, kwargs",
+    [
+        ("`num_paths` must be a power of two", dict(num_paths=1000)),
+        ("`num_paths` must be an integer", dict(num_paths=1)),
+        ("`replicates` must be an integer, 2 or larger", dict(replicates=1)),
+        ("`levels` must be an integer", dict(levels=0)),
+        ("`tol` must be positive", dict(tol=0.0)),
+        ("whole number of steps", dict(ts=[0.25])),
+        ("whole number of steps", dict(t1=0.95)),
+        ("must lie between", dict(ts=[1.1])),
+        ("must be positive, and `t1` after", dict(t1=-1.0)),
+        ("`phi` must return real arrays", dict(phi=lambda t, y, a: 1j * y[0])),
+        ("`sort_by` must return real arrays", dict(sort_by=lambda y: None)),
+        ("needs a random key", dict(key=3)),
+    ],
+)
+def test_bad_input_is_told_what_to_pass(message, kwargs):
+    with pytest.raises(ValueError, match=message):
+        _estimate(**kwargs)
+
+
+def test_paths_whose_words_cannot_be_chosen_are_refused():
+    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jr.key(0))
+    for path in (tree, diffrax.UnsafeBrownianPath((), jr.key(0))):
+        with pytest.raises(ValueError, match="FixedStepBrownianPath"):
+            _estimate(terms=kubo_terms(path))
+    with pytest.raises(ValueError, match="0 random variables in each step"):
+        _estimate(terms=diffrax.ODETerm(lambda t, y, args: y))
+    many = diffrax.ControlTerm(
+        lambda t, y, args: y, ds.WeakBrownianPath((30_000,), jr.key(0))
+    )
+    with pytest.raises(ValueError, match="30,000 random variables in each step"):
+        _estimate(terms=many)
+
+
+def test_too_many_coordinates_to_sort_by_are_warned_of():
+    check = lambda d: _check_functions(
+        SQUARE, lambda y: jnp.ones(d), 0.0, Y0, None, num_paths=256
+    )
+    check(5)
+    with pytest.warns(
+        UserWarning, match="by 8 coordinates.* 2.0 along each.* 5 at most"
+    ):
+        check(8)
+
+
+def test_progress_is_shown(capfd):
+    _estimate(progress_meter=diffrax.TextProgressMeter())
+    assert "100" in capfd.readouterr().out
+
+
+def test_solvers_with_a_state_of_their_own_go_along_with_their_paths():
+    # The state of this solver is another copy of the path, that has to stay with it.
+    drift = diffrax.ODETerm(lambda t, y, args: -y)
+    path = ds.WeakBrownianPath((), jr.key(0))
+    noise = diffrax.ControlTerm(lambda t, y, args: jnp.asarray(0.5), path)
+    terms = diffrax.MultiTerm(drift, noise)
+    square = lambda t, y, args: y**2
+    solver = diffrax.ReversibleHeun()
+    got = _estimate(solver, terms, square, y0=jnp.asarray(0.0), dt0=0.05)
+    # Of as many independent paths the standard error would be 4.8e-3.
+    assert abs(got.mean - 0.125 * (1 - np.exp(-2))) <= 4e-3
+    assert got.std_error < 1.2e-3 and got.num_failed == 0
