@@ -34,7 +34,7 @@ def nested_scramble(x: UInt32[Array, "..."], seed: UInt32[Array, "..."]):
     or not at random, as a function of the bits above it. A bijection for each seed, that
     keeps what is in one interval of length `2^-k` together for all `k`.
 
-    Section 4 of [Laine and Karras (2011)](https://doi.org/10.1111/j.1467-8659.2011.01980.x)
+    Section 4 of [Laine and Karras (2011)](https://doi.org/10.1111/j.1467-8659.2011.01978.x)
     and [Burley (2020)](https://jcgt.org/published/0009/04/01/), with the constants of
     Vegdahl (2021).
     """

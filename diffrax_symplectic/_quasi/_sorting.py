@@ -21,7 +21,7 @@ def hilbert_order(
     with those of which `last` is true at the end."""
     n, d = z.shape
     index_bits = max(1, (n - 1).bit_length())
-    if jax.config.jax_enable_x64 and index_bits <= 32:
+    if jax.dtypes.canonicalize_dtype(np.uint64) == np.uint64 and index_bits <= 32:
         # XLA sorts one operand of unsigned integers ten times as fast as anything else on
         # CPUs, so that the number of a row lies in the bits below its place on the curve.
         key = _curve(_on_grid(z, 63 - index_bits), 63 - index_bits, jnp.uint64)
