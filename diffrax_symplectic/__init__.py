@@ -1,4 +1,5 @@
 from ._brownian import (
+    FixedStepBrownianPath as FixedStepBrownianPath,
     LevyAreaBrownianPath as LevyAreaBrownianPath,
     LevyAreaIncrement as LevyAreaIncrement,
     PlateauBrownianPath as PlateauBrownianPath,

@@ -14,7 +14,13 @@ from diffrax._term import WrapTerm
 from equinox.internal import ω
 from jaxtyping import Array, Float, PyTree
 
-from ._brownian import Discrete, laws_of, VARIABLES
+from ._brownian import (
+    FixedStepBrownianPath,
+    PlateauBrownianPath,
+    TruncatedBrownianPath,
+    VARIABLES,
+    WeakBrownianPath,
+)
 from ._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from ._hamiltonian import HamiltonianNoise
 from ._indexed_noise import OneNoise
@@ -139,7 +145,7 @@ def controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, l
     """The random variables of the step from `t0` to `t1`, for each noise term."""
     draw = (
         _drawn
-        if _are_discrete(noise)
+        if _are_cheap(noise)
         else lambda *args: materialize(ft.partial(_drawn, *args))
     )
     if names == ["W"]:
@@ -174,13 +180,15 @@ def _drawn(noise: tuple, t0, t1, use_levy: bool) -> list:
     return [term.contr(t0, t1) for term in noise]
 
 
-def _are_discrete(noise: tuple) -> bool:
-    """Whether all random variables are discrete, and so cheap to compute again."""
-    return all(
-        isinstance(law, Discrete)
-        for path in brownian_paths(noise)
-        for law in (laws_of(path) or {"unknown": None}).values()
-    )
+def _are_cheap(noise: tuple) -> bool:
+    """Whether all random variables cost less to compute again than to keep."""
+    return all(map(_is_cheap, brownian_paths(noise)))
+
+
+def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
+    while isinstance(path, TruncatedBrownianPath | PlateauBrownianPath):
+        path = path.path
+    return isinstance(path, WeakBrownianPath | FixedStepBrownianPath)
 
 
 def noise_driven(

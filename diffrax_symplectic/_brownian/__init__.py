@@ -1,3 +1,4 @@
+from ._gaussian import FixedStepBrownianPath as FixedStepBrownianPath
 from ._laws import AbstractLaw as AbstractLaw, Discrete as Discrete
 from ._levy_area import (
     LevyAreaBrownianPath as LevyAreaBrownianPath,

@@ -3,6 +3,7 @@ quadrature over them needs, and samples of them from random words."""
 
 import abc
 import dataclasses
+import functools as ft
 
 import jax.numpy as jnp
 import numpy as np
@@ -70,14 +71,44 @@ class Gaussian(AbstractLaw):
         return sample * np.asarray(np.sqrt(self.variance), dtype)
 
 
+# With p the distance of a probability from the nearer of 0 and 1, and q = 1/2 - p, the
+# normal quantile is q F(-log(4 p (1 - p))), where F is smooth, growing, and so well
+# approximated by one ratio of polynomials that no branch is needed. These (lowest degree
+# first) are the best of degrees 6 and 5 for p from 2^-33 on, found by weighted least
+# squares: the largest relative error is 9.7e-9. All are positive, so that nothing cancels.
+_NUMERATOR = (
+    2.506628250602876,
+    0.894851053435387,
+    0.18198359950254517,
+    0.025040486604300607,
+    0.002275143781368971,
+    0.00011854314661164789,
+    3.8177635593160345e-07,
+)
+_DENOMINATOR = (
+    1.0,
+    0.09519425299621843,
+    0.034648399059640025,
+    0.0023108827187771457,
+    0.00024829960535979235,
+    3.7341501976265963e-06,
+)
+
+
 def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
-    """The inverse of the normal distribution function at the middle of the interval of
+    """The inverse of the normal distribution function, at the middle of the interval of
     length `2^-32` that each word stands for."""
-    # A word and its complement have samples of opposite sign.
-    distance = jnp.where(words < np.uint32(2**31), ~words, words) - np.uint32(2**31)
-    x = (distance.astype(dtype) + np.asarray(0.5, dtype)) * np.asarray(2.0**-31, dtype)
-    x = np.asarray(np.sqrt(2), dtype) * lax.erf_inv(x)
-    return jnp.where(words < np.uint32(2**31), -x, x)
+    constant = lambda x: np.asarray(x, dtype)
+    half, unit = constant(0.5), constant(2.0**-31)
+    # Signed integers, which processors convert to numbers faster.
+    signed = lax.bitcast_convert_type(words ^ np.uint32(2**31), np.int32)
+    # 2 q with its sign, and 2 p: one of them is precise where the other is not.
+    two_q = (signed.astype(dtype) + half) * unit
+    tail = lax.bitcast_convert_type(jnp.minimum(words, ~words), np.int32)
+    two_p = (tail.astype(dtype) + half) * unit
+    w = -jnp.log(two_p * (2 - two_p))
+    polynomial = lambda c: ft.reduce(lambda s, a: s * w + constant(a), reversed(c))
+    return two_q * half * polynomial(_NUMERATOR) / polynomial(_DENOMINATOR)
 
 
 # Up to 2^-32 the probability 1/6, and the values +-sqrt(3) equally likely.

@@ -5,14 +5,14 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 
 from .._custom_types import BM, RealScalarLike
 from .._materialize import materialize
+from ._cells import check_cell, compose, or_one, Piece
 from ._fixed_steps import require_fixed_steps
 from ._laws import normal_from_words
-from ._random_words import AREA_WORDS, check_key, random_words
+from ._random_words import AREA_WORDS, check_key, place_of, random_words
 from ._stepwise import num_noises, step_ends, stepwise
 from ._wrapper import (
     AbstractWrappedPath,
@@ -38,26 +38,6 @@ class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
 
 # Up to so many Fourier terms matrix products are written out.
 _WRITTEN_OUT = 4
-
-
-class _Piece(eqx.Module):
-    """A stretch of a Brownian path in flat form: its length, increment, Lévy areas, and
-    the integral of the path over it, counted from its start."""
-
-    h: Float[Array, ""]
-    W: Float[Array, " m"]
-    integral: Float[Array, " m"]
-    A: Float[Array, "m m"]
-
-    def then(self, other: "_Piece") -> "_Piece":
-        """The two stretches one after the other, by Chen's rule."""
-        outer = jnp.outer(self.W, other.W)
-        return _Piece(
-            h=self.h + other.h,
-            W=self.W + other.W,
-            integral=self.integral + other.integral + self.W * other.h,
-            A=self.A + other.A + (outer - outer.T) / 2,
-        )
 
 
 class LevyAreaBrownianPath(AbstractWrappedPath):
@@ -101,9 +81,9 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     ):
         """**Arguments:**
 
-        - `path`: a Brownian path, for example `diffrax.VirtualBrownianTree(...,
-            levy_area=diffrax.SpaceTimeLevyArea)`.
-        - `key`: a JAX random key for the areas, independent of the path's.
+        - `path`: a Brownian path with space-time Lévy area, for example
+            `FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`.
+        - `key`: a JAX random key for the areas, which may be that of the path.
         - `terms`: Fourier terms over each step, or each cell.
         - `cell`: the finest stretch that is sampled, of which every step is a multiple;
             or `None` to sample each step by itself.
@@ -116,8 +96,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         check_key(key, type(self).__name__)
         if not isinstance(terms, int) or terms < 0:
             raise ValueError(f"`terms` must be an integer from 0 on; got {terms!r}.")
-        if cell is not None and not cell > 0:
-            raise ValueError(f"`cell` must be positive, or `None`; got {cell!r}.")
+        check_cell(cell)
         self.path = path
         self.key = key
         self.terms = terms
@@ -146,7 +125,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         if self.cell is None:
             piece = self._sample(t0, t1)
         else:
-            piece = self._compose(t0, t1, self.cell)
+            piece = self._composed(t0, t1, self.cell)
         return self._increment(piece, t1 - t0, use_levy)
 
     @property
@@ -173,58 +152,41 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         return self._increment(piece, t1 - t0, use_levy)
 
     def _increment(
-        self, piece: _Piece, h: RealScalarLike, use_levy: bool
+        self, piece: Piece, h: RealScalarLike, use_levy: bool
     ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
         struct = increment_struct(self.path)
         zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
         _, unravel = jfu.ravel_pytree(zeros)
         if not use_levy:
             return unravel(piece.W)
-        H = piece.integral / _or_one(piece.h) - piece.W / 2
         dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), struct)
-        return LevyAreaIncrement(dt, unravel(piece.W), unravel(H), piece.A)
+        assert piece.A is not None
+        return LevyAreaIncrement(dt, unravel(piece.W), unravel(piece.H), piece.A)
 
     def _num_normals(self) -> int:
         return sum(_sizes(num_noises(increment_struct(self.path)), self.terms))
 
-    def _compose(self, t0, t1, cell: float) -> _Piece:
-        first, last = (jnp.round(t / cell).astype(int) for t in (t0, t1))
-        off = jnp.maximum(jnp.abs(first * cell - t0), jnp.abs(last * cell - t1))
-        last = eqx.error_if(
-            last,
-            (off > 1e-3 * cell) | (last < first),
-            "Steps of a `LevyAreaBrownianPath` with `cell` must begin and end at "
-            "multiples of `cell`. If they should, their times may have been rounded too "
-            "much: enable 64 bits, or step with `diffrax.StepTo`.",
-        )
+    def _composed(self, t0, t1, cell: float) -> Piece:
         # Rounding must not lead out of the path.
         at = lambda i: jnp.clip(i * cell, self.path.t0, self.path.t1)
         sample = lambda i: self._sample(at(i), at(i + 1))
-        empty = jtu.tree_map(
-            lambda s: lax.full_like(s, 0), jax.eval_shape(sample, first)
-        )
-        return lax.fori_loop(first, last, lambda i, piece: piece.then(sample(i)), empty)
+        return compose(t0, t1, cell, sample, type(self).__name__)
 
-    def _sample(self, t0, t1) -> _Piece:
+    def _sample(self, t0, t1) -> Piece:
         increment = materialize(lambda: self.path.evaluate(t0, t1, use_levy=True))
         n = self._num_normals()
-        words = random_words(self.key, t0, t1, 1, n, AREA_WORDS)
+        words = random_words(self.key, place_of(t0, t1), 1, n, AREA_WORDS)
         return self._piece(increment, words[0], t1 - t0)
 
-    def _piece(self, increment, words: UInt32[Array, " normals"], h) -> _Piece:
+    def _piece(self, increment, words: UInt32[Array, " normals"], h) -> Piece:
         assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
         W, _ = jfu.ravel_pytree(increment.W)
         H, _ = jfu.ravel_pytree(increment.H)
         h = jnp.abs(h).astype(W.dtype)
         normals = normal_from_words(words, W.dtype)
-        bridge = h * _bridge_area(H / jnp.sqrt(_or_one(h)), normals, self.terms)
+        bridge = h * _bridge_area(H / jnp.sqrt(or_one(h)), normals, self.terms)
         outer = jnp.outer(H, W)
-        return _Piece(h, W, h * (W / 2 + H), outer - outer.T + bridge)
-
-
-def _or_one(h: Float[Array, ""]) -> Float[Array, ""]:
-    """In a batch, paths that have ended go on with empty steps."""
-    return jnp.where(h > 0, h, 1)
+        return Piece(h, W, h * (W / 2 + H), outer - outer.T + bridge)
 
 
 def _sizes(m: int, terms: int) -> tuple[int, ...]:

@@ -4,7 +4,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 from .._custom_types import BM, RealScalarLike
 from ._fixed_steps import require_fixed_steps
 from ._laws import AbstractLaw, two_point
-from ._random_words import check_key, PLATEAU_WORDS, random_words
+from ._random_words import check_key, place_of, PLATEAU_WORDS, random_words
 from ._stepwise import draw_set, laws_of, num_noises, step_ends, stepwise
 from ._wrapper import (
     AbstractWrappedPath,
@@ -44,9 +44,9 @@ class PlateauBrownianPath(AbstractWrappedPath):
     def __init__(self, path: diffrax.AbstractBrownianPath, key: PRNGKeyArray):
         """**Arguments:**
 
-        - `path`: a Brownian path, for example `diffrax.VirtualBrownianTree(...,
-            levy_area=diffrax.SpaceTimeLevyArea)`.
-        - `key`: a JAX random key for the signs, independent of the path's.
+        - `path`: a Brownian path with space-time Lévy area, for example
+            `FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`.
+        - `key`: a JAX random key for the signs, which may be that of the path.
 
         **Raises:** a `ValueError` if `path` has no space-time Lévy area.
         """
@@ -99,7 +99,7 @@ class PlateauBrownianPath(AbstractWrappedPath):
             return increment
         start, end = step_ends(t0, t1)
         n = num_noises(increment_struct(self.path))
-        words = random_words(self.key, start, end, 1, n, PLATEAU_WORDS)
+        words = random_words(self.key, place_of(start, end), 1, n, PLATEAU_WORDS)
         return _with_plateaus(increment, words[0], end - start)
 
 

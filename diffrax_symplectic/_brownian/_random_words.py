@@ -1,5 +1,7 @@
 """Random words for a step, as a function of a key and of where the step lies."""
 
+from typing import TypeAlias
+
 import jax
 import jax.extend.random as jer
 import jax.numpy as jnp
@@ -8,18 +10,21 @@ import numpy as np
 from jaxtyping import Array, Integer, PRNGKeyArray, UInt32
 
 
+# A number that counts places, and one that says what is counted.
+Place: TypeAlias = tuple[Integer[Array, ""], Integer[Array, ""]]
+
 # Where the words of wrappers begin, in the numbers of a step.
 PLATEAU_WORDS, AREA_WORDS = 2**18, 2**19
 
 
 def random_words(
-    key, t0, t1, sets: int, n: int, begin: int = 0
+    key, place: Place, sets: int, n: int, begin: int = 0
 ) -> UInt32[Array, "sets n"]:
-    """Random words for the step from `t0` to `t1`, the same for times that differ by
-    rounding. The first of the sets are the same whatever their number is. Words from
-    another `begin` are independent, so that a path and a wrapper may have the same key."""
+    """Random words for a place on the axis of time. The first of the sets are the same
+    whatever their number is. Words from another `begin` are independent, so that a path
+    and a wrapper may have the same key."""
     key = _typed(key)
-    count, exponent = _place(t0, t1)
+    count, exponent = place
     blocks = (sets * n + 1) // 2
     if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks < 2**20 - begin:
         # The place is the counter of the generator, so that one hash gives two words.
@@ -33,9 +38,9 @@ def random_words(
         )
         words = jer.threefry_2x32(jr.key_data(key), counters)
         return words.reshape(2, blocks).T.reshape(-1)[: sets * n].reshape(sets, n)
-    place = place_key(key, t0, t1)
+    at = jr.fold_in(jr.fold_in(key, count), exponent)
     return jnp.stack(
-        [jr.bits(jr.fold_in(place, begin + i), (n,), jnp.uint32) for i in range(sets)]
+        [jr.bits(jr.fold_in(at, begin + i), (n,), jnp.uint32) for i in range(sets)]
     )
 
 
@@ -51,12 +56,6 @@ def check_key(key, user: str) -> None:
         )
 
 
-def place_key(key, t0, t1) -> PRNGKeyArray:
-    """A key for the step from `t0` to `t1`, the same for times that differ by rounding."""
-    count, exponent = _place(t0, t1)
-    return jr.fold_in(jr.fold_in(_typed(key), count), exponent)
-
-
 def _typed(key) -> PRNGKeyArray:
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     key = key if typed else jr.wrap_key_data(key)
@@ -68,8 +67,8 @@ def _typed(key) -> PRNGKeyArray:
     return key
 
 
-def _place(t0, t1) -> tuple[Integer[Array, ""], Integer[Array, ""]]:
-    """Where a step lies, in integers.
+def place_of(t0, t1) -> Place:
+    """Where a step lies, in integers, the same for times that differ by rounding.
 
     The middle of the step is counted in units of a power of two that lies between a third
     and 0.7 of the step, so that no two steps of one size share a count. The

@@ -48,7 +48,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         if not isinstance(path, diffrax.AbstractBrownianPath):
             raise ValueError(
                 "`TruncatedBrownianPath` wraps a Brownian path, for example "
-                f"`diffrax.VirtualBrownianTree(...)`; got {type(path).__name__}."
+                f"`FixedStepBrownianPath(shape, key)`; got {type(path).__name__}."
             )
         if isinstance(k, bool) or not isinstance(k, int) or k < 1:
             raise ValueError(

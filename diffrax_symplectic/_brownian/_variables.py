@@ -42,8 +42,8 @@ VARIABLES = {
     ),
     "H": RandomVariable(
         diffrax.AbstractSpaceTimeLevyArea,
-        "space-time Lévy area. Pass a path that has it, for example `diffrax."
-        "VirtualBrownianTree(..., levy_area=diffrax.SpaceTimeLevyArea)`",
+        "space-time Lévy area. Pass a path that has it, for example "
+        "`FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`",
         variance=1 / 12,
         # The bridge, seen from its other end, has the same integral.
         even=True,
@@ -68,7 +68,8 @@ VARIABLES = {
     ),
     "W": RandomVariable(
         diffrax.AbstractBrownianIncrement,
-        "the increment of a Brownian path. Pass `WeakBrownianPath(shape, key)`",
+        "the increment of a Brownian path. Pass `WeakBrownianPath(shape, key)` or "
+        "`FixedStepBrownianPath(shape, key)`",
         variance=1,
     ),
 }

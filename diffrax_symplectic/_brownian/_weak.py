@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 from .._custom_types import BM, RealScalarLike
 from ._fixed_steps import require_fixed_steps
 from ._laws import AbstractLaw, FOUR_POINT, THREE_POINT, two_point
-from ._random_words import check_key, random_words
+from ._random_words import check_key, place_of, random_words
 from ._stepwise import (
     AbstractStepwisePath,
     checked_shape,
@@ -177,7 +177,7 @@ class WeakBrownianPath(AbstractStepwisePath):
         require_fixed_steps(self)
         t0, t1 = step_ends(t0, t1)
         sets = len(self.laws) if use_levy else 1
-        words = random_words(self.key, t0, t1, sets, num_noises(self.shape))
+        words = random_words(self.key, place_of(t0, t1), sets, num_noises(self.shape))
         return self.increment(words.reshape(-1), t0, t1, use_levy)
 
     @property

@@ -40,6 +40,6 @@ def require_space_time_area(path: diffrax.AbstractBrownianPath, wrapper: str) ->
     if not issubclass(area, diffrax.AbstractSpaceTimeLevyArea):
         raise ValueError(
             f"`{wrapper}` needs a path with space-time Lévy area, for example "
-            "`diffrax.VirtualBrownianTree(..., levy_area=diffrax.SpaceTimeLevyArea)`; got "
+            "`FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`; got "
             f"{type(path).__name__} with {area.__name__}."
         )

@@ -72,7 +72,7 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     !!! warning
 
         The path has to provide space-time Lévy area, from which $I_{k0}$ follows: for
-        example `diffrax.VirtualBrownianTree(..., levy_area=diffrax.SpaceTimeLevyArea)`.
+        example `FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 4.1.

@@ -1,0 +1,71 @@
+"""Steps put together from cells, so that steps of different sizes see one path."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from .._custom_types import RealScalarLike
+
+
+class Piece(eqx.Module):
+    """A stretch of a Brownian path in flat form: its length, its increment, and if they are
+    asked for the integral of the path over it, counted from its start, and the Lévy
+    areas."""
+
+    h: Float[Array, ""]
+    W: Float[Array, " m"]
+    integral: Float[Array, " m"] | None = None
+    A: Float[Array, "m m"] | None = None
+
+    @property
+    def H(self) -> Float[Array, " m"]:
+        """The space-time Lévy area. That of an empty stretch is zero."""
+        assert self.integral is not None
+        return self.integral / or_one(self.h) - self.W / 2
+
+    def then(self, other: "Piece") -> "Piece":
+        """The two stretches one after the other, by Chen's rule."""
+        integral = A = None
+        if self.integral is not None and other.integral is not None:
+            integral = self.integral + other.integral + self.W * other.h
+        if self.A is not None and other.A is not None:
+            outer = jnp.outer(self.W, other.W)
+            A = self.A + other.A + (outer - outer.T) / 2
+        return Piece(self.h + other.h, self.W + other.W, integral, A)
+
+
+def or_one(h: Float[Array, ""]) -> Float[Array, ""]:
+    """In a batch, paths that have ended go on with empty steps."""
+    return jnp.where(h > 0, h, 1)
+
+
+def check_cell(cell: float | None) -> None:
+    if cell is not None and not cell > 0:
+        raise ValueError(f"`cell` must be positive, or `None`; got {cell!r}.")
+
+
+def compose(
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    cell: float,
+    sample: Callable[[Int[Array, ""]], Piece],
+    path_name: str,
+) -> Piece:
+    """The stretch from `t0` to `t1`, where `sample(i)` is the one from `i * cell` to
+    `(i + 1) * cell`. An error when run if it does not consist of cells."""
+    first, last = (jnp.round(t / cell).astype(int) for t in (t0, t1))
+    off = jnp.maximum(jnp.abs(first * cell - t0), jnp.abs(last * cell - t1))
+    last = eqx.error_if(
+        last,
+        (off > 1e-3 * cell) | (last < first),
+        f"Steps of a `{path_name}` with `cell` must begin and end at multiples of `cell`. "
+        "If they should, their times may have been rounded too much: enable 64 bits, or "
+        "step with `diffrax.StepTo`.",
+    )
+    empty = jtu.tree_map(lambda s: lax.full_like(s, 0), jax.eval_shape(sample, first))
+    return lax.fori_loop(first, last, lambda i, piece: piece.then(sample(i)), empty)

@@ -1,0 +1,173 @@
+from collections.abc import Mapping
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PRNGKeyArray, PyTree, UInt32
+
+from .._custom_types import RealScalarLike
+from ._cells import check_cell, compose, Piece
+from ._fixed_steps import require_fixed_steps
+from ._laws import AbstractLaw
+from ._random_words import check_key, place_of, random_words
+from ._stepwise import (
+    AbstractStepwisePath,
+    checked_shape,
+    gaussian_laws,
+    increment_from_words,
+    num_noises,
+    step_ends,
+)
+
+
+class FixedStepBrownianPath(AbstractStepwisePath):
+    r"""Gaussian increments of a Brownian motion, for fixed steps.
+
+    Over a step of size $h$ the increment is $W \sim \mathcal N(0, h)$, and with space-time
+    Lévy area there is an independent $H \sim \mathcal N(0, h / 12)$. They are a function
+    of `key` and of where the step lies, as those of
+    [`diffrax_symplectic.WeakBrownianPath`][]: a step that is computed again sees the same
+    increments, in reverse mode, too, which `diffrax.UnsafeBrownianPath` does not allow;
+    and a step costs what its random numbers cost, where a `diffrax.VirtualBrownianTree`
+    descends to its leaves.
+
+    Without `cell`, steps of another size are another Brownian motion. With `cell`, the
+    motion is sampled over cells of that size, and what is returned over a step is put
+    together from these, so that solutions with different steps, multiples of `cell`,
+    follow one path: strong errors against a fine solution, or the difference of the
+    results of two step sizes. A step then costs as much as the cells in it.
+
+    Each number is made from one random word of 32 bits, by the inverse of the normal
+    distribution function, with a relative error below $10^{-8}$ in float64 and rounding
+    error in float32. So there are $2^{32}$ different values, up to 6.3 standard
+    deviations. Odd moments vanish up to rounding, and even moments to the eighth are those
+    of the normal distribution up to a relative error of $10^{-5}$, the variance up to
+    $10^{-7}$.
+    """
+
+    shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
+    key: PRNGKeyArray
+    levy_area: type[diffrax.BrownianIncrement | diffrax.SpaceTimeLevyArea] = eqx.field(
+        static=True
+    )
+    cell: float | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        shape: tuple[int, ...] | PyTree[jax.ShapeDtypeStruct],
+        key: PRNGKeyArray,
+        levy_area: type[
+            diffrax.BrownianIncrement | diffrax.SpaceTimeLevyArea
+        ] = diffrax.BrownianIncrement,
+        *,
+        cell: float | None = None,
+    ):
+        """**Arguments:**
+
+        - `shape`: a PyTree of `jax.ShapeDtypeStruct`s, the shape, dtype and structure of
+            an increment; or a tuple of integers for one array of the default
+            floating-point dtype. For `m` noises, `(m,)`.
+        - `key`: a JAX random key, as from `jax.random.key(seed)`.
+        - `levy_area`: `diffrax.BrownianIncrement` or `diffrax.SpaceTimeLevyArea`.
+        - `cell`: the finest stretch that is sampled, of which every step is a multiple;
+            or `None` to sample each step by itself.
+
+        **Raises:** a `ValueError` if `key` is not a random key, if a dtype is not real
+        floating-point, for another `levy_area`, or if `cell` is not positive; an error
+        when run if a step does not consist of cells.
+        """
+        if gaussian_laws(levy_area) is None:
+            raise ValueError(
+                "`levy_area` must be `diffrax.BrownianIncrement` or "
+                f"`diffrax.SpaceTimeLevyArea`; got {levy_area!r}."
+            )
+        check_key(key, type(self).__name__)
+        check_cell(cell)
+        self.shape = checked_shape(shape, type(self).__name__)
+        self.key = key
+        self.levy_area = levy_area
+        self.cell = cell
+
+    @property
+    def t0(self):
+        return -jnp.inf
+
+    @property
+    def t1(self):
+        return jnp.inf
+
+    @property
+    def laws(self) -> Mapping[str, AbstractLaw]:
+        laws = gaussian_laws(self.levy_area)
+        assert laws is not None
+        return laws
+
+    def num_words(self, use_levy: bool = False) -> int:
+        return (len(self.laws) if use_levy else 1) * num_noises(self.shape)
+
+    def increment(
+        self,
+        words: UInt32[Array, " num_words"],
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        use_levy: bool = False,
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        """Samples the step by itself, whatever `cell` is."""
+        return increment_from_words(self, self.shape, words, t1 - t0, use_levy)
+
+    def evaluate(
+        self,
+        t0: RealScalarLike,
+        t1: RealScalarLike | None = None,
+        left: bool = True,
+        use_levy: bool = False,
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
+
+        Returns the increment over the step from `t0` to `t1`, or with `use_levy=True` an
+        object of type `levy_area`. Without `t1` the step is the one from `0` to `t0`.
+
+        **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
+        size controller or `diffrax.HalfSolver`.
+        """
+        del left
+        require_fixed_steps(self)
+        t0, t1 = step_ends(t0, t1)
+        if self.cell is not None:
+            return self._composed(t0, t1, self.cell, use_levy)
+        words = self._words(place_of(t0, t1), use_levy)
+        return self.increment(words, t0, t1, use_levy)
+
+    def _words(self, place, use_levy: bool) -> UInt32[Array, " num_words"]:
+        sets = len(self.laws) if use_levy else 1
+        return random_words(self.key, place, sets, num_noises(self.shape)).reshape(-1)
+
+    def _composed(
+        self, t0: Array, t1: Array, cell: float, use_levy: bool
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        # The motion of a path is the same whether or not its areas are asked for.
+        with_area = self.levy_area is diffrax.SpaceTimeLevyArea
+        h = jnp.asarray(cell, t0.dtype)
+
+        def sample(i) -> Piece:
+            words = self._words((i.astype(jnp.int32), jnp.array(0)), with_area)
+            increment = self.increment(words, 0 * h, h, with_area)
+            if not with_area:
+                return Piece(h, jfu.ravel_pytree(increment)[0])
+            assert isinstance(increment, diffrax.SpaceTimeLevyArea)
+            W, H = (jfu.ravel_pytree(x)[0] for x in (increment.W, increment.H))
+            length = h.astype(W.dtype)
+            return Piece(length, W, length * (W / 2 + H))
+
+        piece = compose(t0, t1, cell, sample, type(self).__name__)
+        zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), self.shape)
+        _, unravel = jfu.ravel_pytree(zeros)
+        if not use_levy:
+            return unravel(piece.W)
+        dt = jtu.tree_map(lambda s: jnp.asarray(t1 - t0, s.dtype), self.shape)
+        if not with_area:
+            return diffrax.BrownianIncrement(dt, unravel(piece.W))
+        return diffrax.SpaceTimeLevyArea(dt, unravel(piece.W), unravel(piece.H))
