@@ -253,17 +253,23 @@ def check_functions(arguments: str, **functions: Callable) -> None:
 
 def check_pair(y: PyTree) -> None:
     """Raises a `ValueError` unless `y` is a pair of the same structure and shapes."""
+    if fault := pair_fault(y):
+        raise ValueError(fault)
+
+
+def pair_fault(y: PyTree) -> str | None:
+    """What to pass instead of `y`; `None` if it is a pair of the same structure and
+    shapes."""
     advice = (
         "The state of a Hamiltonian system is a pair `(p, q)` of arrays (or PyTrees) of "
         "the same structure and shapes: pass `y0=(p0, q0)`, or for spins "
         "`y0=to_spinors(s0)`. "
     )
     if type(y) is not tuple or len(y) != 2:
-        raise ValueError(f"{advice}Got {eqx.tree_pformat(y)}.")
+        return f"{advice}Got {eqx.tree_pformat(y)}."
     p, q = y
     if jtu.tree_structure(p) != jtu.tree_structure(q) or [
         jnp.shape(x) for x in jtu.tree_leaves(p)
     ] != [jnp.shape(x) for x in jtu.tree_leaves(q)]:
-        raise ValueError(
-            f"{advice}Got p = {eqx.tree_pformat(p)} and q = {eqx.tree_pformat(q)}."
-        )
+        return f"{advice}Got p = {eqx.tree_pformat(p)} and q = {eqx.tree_pformat(q)}."
+    return None

@@ -2,7 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -12,12 +12,21 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
+from equinox.internal import ω
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from ._custom_types import Args, RealScalarLike, Y
 from ._effect_free import evaluate_without_effects
-from ._hamiltonian import asserted_structure, check_pair, is_hamiltonian
+from ._hamiltonian import asserted_structure, check_pair, is_hamiltonian, pair_fault
+from ._terms import apply
+
+
+class Fault(NamedTuple):
+    """Why a system does not have a structure, and what may be done about it."""
+
+    reason: str
+    advice: str
 
 
 def check_separable(
@@ -27,27 +36,7 @@ def check_separable(
     Hamiltonians are functions of `t` and `q` alone."""
     check_pair(y0)
     needs = "needs H0 = V(p) + U(t, q) and noise Hamiltonians H_k = U_k(t, q)"
-
-    def require(part: int, of: str, term, derivative: str, advice: str) -> None:
-        if not _independent(part, of, term, t0, y0, args):
-            raise ValueError(f"`{solver}` {needs}, but {derivative}. {advice}")
-
-    for term in _not_asserted(drift, "separable"):
-        from_H0 = is_hamiltonian(term) or len(drift) == 1
-        for part, of, derivative, dependence in (
-            (0, "p", "d(dH0/dq)/dp", "dp/dt depend on p"),
-            (1, "q", "d(dH0/dp)/dq", "dq/dt depend on q"),
-            (1, "t", "d(dH0/dp)/dt", "dq/dt depend on t"),
-        ):
-            if from_H0:
-                require(part, of, term, f"{derivative} does not vanish", _ADVICE)
-            else:
-                beside = f"a drift term beside that of H0 makes {dependence}"
-                require(part, of, term, beside, f"{_FRICTION} {_ADVICE}")
-    for term in _not_asserted(noise, "separable"):
-        # What is linear in the increment and does not depend on it is zero.
-        for part, of in ((1, "control"), (0, "p")):
-            require(part, of, term, "dH_k/dp does not vanish", _ADVICE)
+    _refuse(solver, needs, separable_fault(drift, noise, t0, y0, args))
 
 
 def check_additive(
@@ -56,24 +45,106 @@ def check_additive(
     """Raises a `ValueError`, while tracing, unless the noise does not depend on the state
     nor, if it has to be `constant`, on time."""
     needs = "needs additive noise, H_k = -sigma_k(t).q + gamma_k(t).p"
+    _refuse(solver, needs, additive_fault(noise, t0, y0, args))
+    if constant:
+        needs = "needs additive noise that is constant in time"
+        _refuse(solver, needs, constant_fault(noise, t0, y0, args))
+
+
+def _refuse(solver: str, needs: str, fault: Fault | None) -> None:
+    if fault is not None:
+        raise ValueError(f"`{solver}` {needs}, but {fault.reason}. {fault.advice}")
+
+
+def separable_fault(
+    drift: tuple, noise: tuple, t0: RealScalarLike, y0: Y, args: Args
+) -> Fault | None:
+    """Why the system is not of the form `H0 = V(p) + U(t, q)`, `H_k = U_k(t, q)`; `None`
+    if it is."""
+    if fault := pair_fault(y0):
+        return Fault("the state is not a pair (p, q)", fault)
+    for term in _not_asserted(drift, "separable"):
+        from_H0 = is_hamiltonian(term) or len(drift) == 1
+        for part, of, derivative, dependence in (
+            (0, "p", "d(dH0/dq)/dp", "dp/dt depend on p"),
+            (1, "q", "d(dH0/dp)/dq", "dq/dt depend on q"),
+            (1, "t", "d(dH0/dp)/dt", "dq/dt depend on t"),
+        ):
+            independent = _independent(part, of, term, t0, y0, args)
+            if fault := _fault(independent, derivative):
+                if from_H0 or independent is None:
+                    return fault
+                beside = f"a drift term beside that of H0 makes {dependence}"
+                return Fault(beside, f"{_FRICTION} {_ADVICE}")
+    for term in _not_asserted(noise, "separable"):
+        # What is linear in the increment and does not depend on it is zero.
+        for part, of in ((1, "control"), (0, "p")):
+            independent = _independent(part, of, term, t0, y0, args)
+            if fault := _fault(independent, "dH_k/dp"):
+                return fault
+    return None
+
+
+def additive_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
+    """Why the noise is not additive; `None` if it does not depend on the state."""
+    derivative = (
+        "db_k/dy, the derivative of the noise b_k = (-dH_k/dq, dH_k/dp) by the state,"
+    )
+    for term in _not_asserted(noise, "additive"):
+        if fault := _fault(_independent(None, "y", term, t0, y0, args), derivative):
+            return fault
+    return None
+
+
+def constant_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
+    """Why additive noise is not constant; `None` if it does not depend on time."""
     for term in noise:
-        asserted = len(_not_asserted((term,), "additive")) == 0
-        if not asserted and not _independent(None, "y", term, t0, y0, args):
-            raise ValueError(
-                f"`{solver}` {needs}, but db_k/dy, the derivative of the noise b_k = "
-                f"(-dH_k/dq, dH_k/dp) by the state, does not vanish. {_ADVICE}"
-            )
-        if constant and not _independent(None, "t", term, t0, y0, args):
-            raise ValueError(
-                f"`{solver}` needs additive noise that is constant in time, but db_k/dt "
-                f"does not vanish. Use `SRKs4`, or else another one. {_ADVICE}"
-            )
+        fault = _fault(_independent(None, "t", term, t0, y0, args), "db_k/dt")
+        if fault is not None:
+            return Fault(fault.reason, f"Use `SRKs4`, or else another one. {_ADVICE}")
+    return None
+
+
+def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
+    """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish, for these `t0` and
+    `args`, at random states; no if it cannot be tested.
+
+    The bracket is bilinear, so that those of two random sums of the noises tell.
+    """
+    t0 = jnp.asarray(t0, jnp.result_type(float))
+    struct = eqx.filter_eval_shape(lambda: [term.contr(t0, t0) for term in noise])
+    control = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
+
+    def brackets(y, x, z):
+        along = lambda control: lambda y: apply(noise, control, args, t0, y)
+        first = jax.jvp(along(z), (y,), (along(x)(y),))[1]
+        second = jax.jvp(along(x), (y,), (along(z)(y),))[1]
+        return first, (first**ω - second**ω).ω
+
+    return _small_at_random_points(brackets, (y0, control, control)) is True
+
+
+def _fault(independent: bool | None, derivative: str) -> Fault | None:
+    if independent:
+        return None
+    if independent is None:
+        reason = (
+            f"whether {derivative} vanishes could not be tested, because the derivatives "
+            "of the Hamiltonians were not finite at any of the points tried"
+        )
+        return Fault(reason, _UNTESTED)
+    return Fault(f"{derivative} does not vanish", _ADVICE)
 
 
 _ADVICE = (
     "Use a solver for the general structure, for example `Midpoint` or `SRKw1`. (An array "
     "in `args` stands for any value. If the derivative vanishes for yours, pass "
     "`structure=` to `hamiltonian_terms`.)"
+)
+_UNTESTED = (
+    "Pass `structure=` to `hamiltonian_terms`, write the Hamiltonians so that variables "
+    "that cancel do not enter at all, or use a solver for the general structure, for "
+    "example `Midpoint` or `SRKw1`."
 )
 _FRICTION = "Friction -gamma p is what `Damped(solver, gamma)` is for."
 
@@ -84,13 +155,13 @@ def _not_asserted(terms: tuple, structure: str) -> list:
 
 def _independent(
     part: int | None, of: str, term: diffrax.AbstractTerm, t0, y0: Y, args: Args
-) -> bool:
+) -> bool | None:
     """Whether the change of the state by `term` does not depend on `t`, `y`, `p`, `q`, or
     `control`, whichever `of` names. With `part` only its first or second half counts.
 
     The flow of data through the program decides if it can: JAX then finds that the
     derivative is zero by rules alone. If the variable enters it may still cancel, which
-    is decided by the derivative at random points.
+    is decided by the derivative at random points; `None` if it is finite at none.
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
     struct = eqx.filter_eval_shape(term.contr, t0, t0)
@@ -142,9 +213,10 @@ def _flows_nowhere(fn: Callable, x: PyTree) -> bool:
     return all(zero)
 
 
-def _small_at_random_points(fn: Callable, inputs: PyTree) -> bool:
+def _small_at_random_points(fn: Callable, inputs: PyTree) -> bool | None:
     """Whether, of `fn(*inputs) -> (reference, value)`, the value is rounding error next
-    to the reference, with every floating-point array that enters drawn at random."""
+    to the reference, with every floating-point array that enters drawn at random; `None`
+    if they were finite at no point."""
     dynamic, static = eqx.partition(inputs, eqx.is_array)
     flat, treedef = jtu.tree_flatten(dynamic)
 
@@ -179,15 +251,7 @@ def _small_at_random_points(fn: Callable, inputs: PyTree) -> bool:
             tested = tested or bool(finite)
             if error > 1e3 * float(np.finfo(size.dtype).eps) * size:
                 return False
-    if not tested:
-        raise ValueError(
-            "The structure of the Hamiltonians could not be tested, because their "
-            "derivatives were not finite at any of the points tried. Pass `structure=` to "
-            "`hamiltonian_terms`, write the Hamiltonians so that variables that cancel do "
-            "not enter at all, or use a solver for the general structure, for example "
-            "`Midpoint` or `SRKw1`."
-        )
-    return True
+    return True if tested else None
 
 
 def _draw(x: Array, key: PRNGKeyArray, positive: bool) -> Array:

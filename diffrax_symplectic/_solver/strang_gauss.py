@@ -20,9 +20,9 @@ _tab = GeneralTableau(
 
 
 class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
-    r"""A symplectic method of weak order 2 for one noise: the drift over half of the step
-    by the midpoint rule, the noise by the Gauss method of order 4, and the drift over the
-    other half.
+    r"""A symplectic method of weak order 2 for one noise or noises that commute: the drift
+    over half of the step by the midpoint rule, the noise by the Gauss method of order 4, and
+    the drift over the other half.
 
     In the form of [`diffrax_symplectic.GeneralTableau`][], with $r = \sqrt 3$,
 
@@ -39,7 +39,8 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     cheaper of the two, and the more accurate in our tests.
 
     Any Hamiltonians, and any Stratonovich system: quadratic invariants that drift and
-    noise share are conserved. Weak order 2 for one noise and weak order 1 for several.
+    noise share are conserved. Weak order 2 for one noise and for noises that commute, weak
+    order 1 for others.
     Order 2 without noise. No free parameters.
 
     **Source:** [Strang (1968)](https://doi.org/10.1137/0705041) for the splitting.

@@ -1,0 +1,224 @@
+"""Suggested solvers fit the system, and the docs give the same rules."""
+
+from pathlib import Path
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._suggestion_rules import PATHS, RULES
+
+from .problems import H0, local_weak_orders, random_problem, weak_path
+
+
+# Pieces of Hamiltonians, by what they allow the whole to be.
+KINETIC = [
+    lambda t, p, q: jnp.sum(p**2) / 2,
+    lambda t, p, q: jnp.sum(jnp.cosh(p)),
+    lambda t, p, q: jnp.sqrt(1 + jnp.sum(p**2)),
+]
+POTENTIAL = [
+    lambda t, p, q: -jnp.sum(jnp.cos(q)),
+    lambda t, p, q: jnp.sum(q**4) / 4 + jnp.sin(t) * jnp.sum(q),
+    lambda t, p, q: jnp.sum((1 + q**2) ** 1.5),
+]
+MIXED = [
+    lambda t, p, q: jnp.sum(p * q) ** 2 / 3,
+    lambda t, p, q: jnp.sum(p**2) * (1 + t),
+    lambda t, p, q: jnp.sum(jnp.sin(p + q)),
+]
+NOISES = {
+    "constant": [
+        lambda t, p, q: jnp.sum(q),
+        lambda t, p, q: p.reshape(-1)[0] - 2 * jnp.sum(q),
+    ],
+    "additive": [lambda t, p, q: jnp.exp(-t) * jnp.sum(p), lambda t, p, q: t * p.sum()],
+    "separable": [lambda t, p, q: jnp.sum(jnp.sin(q)), lambda t, p, q: jnp.sum(q**2)],
+    "commuting": [
+        lambda t, p, q: jnp.sum(p * q),
+        lambda t, p, q: jnp.cos(t) * jnp.sin(jnp.sum(p * q)),
+    ],
+    "any": [lambda t, p, q: jnp.sum(p * q), lambda t, p, q: jnp.sum(p + q**2) ** 2],
+}
+
+
+def random_system(seed: int):
+    """Hamiltonians from random pieces, their terms and state, and what they are."""
+    rng = np.random.default_rng(seed)
+    pick = lambda pieces: pieces[rng.integers(len(pieces))]
+    parts = [pick(KINETIC), pick(POTENTIAL)]
+    mixed = rng.random() < 0.5
+    if mixed:
+        parts.append(pick(MIXED))
+    kind = list(NOISES)[rng.integers(len(NOISES))]
+    m = int(rng.integers(1, 3))
+    noises = NOISES[kind] if m == 2 else [pick(NOISES[kind])]
+    scales = rng.uniform(0.1, 1.0, (5,))
+    dtype = jnp.float64 if rng.random() < 0.5 else jnp.float32
+
+    def energy(t, p, q, args):
+        return sum(float(s) * part(t, p, q) for s, part in zip(scales, parts))
+
+    def noise(t, p, q, args):
+        # A random factor, which may be an array that stands for any value.
+        return jnp.stack([args * f(t, p, q) for f in noises])
+
+    shape = () if rng.random() < 0.3 else (int(rng.integers(1, 4)),)
+    path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((m,), dtype), jr.key(seed))
+    y0 = tuple(jnp.asarray(rng.normal(size=shape), dtype) for _ in range(2))
+    args = jnp.asarray(0.3, dtype) if rng.random() < 0.5 else 0.3
+    t0 = jnp.asarray(0.1, dtype)
+    known = {
+        "separable": not mixed and _depends_on_q_alone(noises),
+        "additive": kind in ("constant", "additive"),
+        "constant": kind == "constant",
+        "commuting": m == 1 or kind != "any",
+    }
+    return ds.hamiltonian_terms(energy, noise, path), y0, args, t0, known
+
+
+def _depends_on_q_alone(noises) -> bool:
+    q = jnp.array([0.3, 0.7])
+    return all(bool(jnp.all(jax.grad(f, 1)(0.4, q, q) == 0)) for f in noises)
+
+
+def check_systems(seeds) -> None:
+    """No suggestion is refused, and each system is what it is by construction."""
+    for seed in seeds:
+        terms, y0, args, t0, known = random_system(seed)
+        for want in ("expectations", "paths"):
+            # The structure is the same for all arrays: no program is worth compiling.
+            with jax.disable_jit():
+                found = ds.suggest_solver(terms, y0, args, want=want, t0=t0)
+            for name in ("separable", "additive", "constant"):
+                assert known[name] == (name in found.system), (seed, found)
+            assert known["commuting"] == ("do not commute" not in found.system)
+            orders = {"expectations": "weak_order", "paths": "strong_order"}
+            assert getattr(found[0], orders[want]) >= 1
+            for s in found:
+                with jax.disable_jit():
+                    state = s.solver.init(s.terms(jr.key(1)), t0, t0 + 0.01, y0, args)
+                step = lambda key: s.solver.step(
+                    s.terms(key), t0, t0 + 0.01, y0, args, state, False
+                )[0]
+                y1 = jax.eval_shape(step, jr.key(1))
+                assert jax.tree.map(jnp.shape, y1) == jax.tree.map(jnp.shape, y0)
+
+
+def test_no_suggestion_is_refused():
+    check_systems(range(24))
+
+
+CASES = {
+    "separable": (
+        POTENTIAL[0],
+        NOISES["separable"][:1],
+        "StormerVerlet",
+        "PlateauVerlet",
+    ),
+    "additive": (MIXED[0], NOISES["constant"], "AdditiveGauss", "SRKs4"),
+    "commuting": (MIXED[0], NOISES["commuting"], "StrangGauss", "Midpoint"),
+    "not commuting": (MIXED[0], NOISES["any"], "NinomiyaVictoir", "LevyAreaMidpoint"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_first_suggestion_solves_as_it_stands(case):
+    mixed, noises, *expected = CASES[case]
+    H0 = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2 + mixed(t, p, q)
+    noise = lambda t, p, q, args: 0.1 * jnp.stack([f(t, p, q) for f in noises])
+    path = ds.WeakBrownianPath((len(noises),), jr.key(0))
+    terms, y0 = ds.hamiltonian_terms(H0, noise, path), (jnp.ones(1), jnp.ones(1))
+    for want, name in zip(("expectations", "paths"), expected):
+        with jax.disable_jit():
+            best = ds.suggest_solver(terms, y0, want=want)[0]
+        assert type(best.solver).__name__ == name
+        sol = diffrax.diffeqsolve(
+            best.terms(jr.key(1)), best.solver, 0, 0.2, 0.1, y0, max_steps=2
+        )
+        assert jnp.all(jnp.isfinite(sol.ys[0]))
+
+
+def test_code_of_a_path_makes_the_path():
+    H0 = lambda t, p, q, args: p**2 / 2
+    path = ds.WeakBrownianPath((2,), jr.key(0))
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: jnp.stack([q, p]), path)
+    names = dict(ds=ds, diffrax=diffrax, jr=jr, key=jr.key(3))
+    for want in ("expectations", "paths"):
+        for s in ds.suggest_solver(terms, (jnp.ones(()), jnp.ones(())), want=want):
+            made = s.terms(jr.key(3)).terms[1].path
+            assert jax.tree.all(jax.tree.map(_same, eval(s.path, names), made))
+    for kind in PATHS.values():
+        made = kind.make((2,), jr.key(3))
+        written = eval(kind.code.format(shape="(2,)"), names)
+        assert jax.tree.structure(made) == jax.tree.structure(written)
+
+
+def _same(a, b) -> bool:
+    return bool(jnp.all(a == b))
+
+
+def test_terms_that_share_a_path_share_the_new_one():
+    path = ds.WeakBrownianPath((), jr.key(0))
+    other = ds.WeakBrownianPath((), jr.key(7))
+    noise = [diffrax.ControlTerm(lambda t, y, args: y, x) for x in (path, path, other)]
+    terms = diffrax.MultiTerm(diffrax.ODETerm(lambda t, y, args: -y), *noise)
+    best = ds.suggest_solver(terms, jnp.ones(2))[0]
+    a, b, c = (term.control for term in best.terms(jr.key(1)).terms[1:])
+    assert _same(a.key, b.key) and not _same(a.key, c.key)
+
+
+def test_strang_gauss_is_weak_order_two_for_noises_that_commute():
+    G = lambda p, q: jnp.sum(p * q + q**2 / 2)
+    noise = lambda t, p, q, args: jnp.stack([0.5 * G(p, q), jnp.sin(G(p, q))])
+    solver = ds.StrangGauss()
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(2))
+    y0, args = jax.vmap(lambda key: random_problem(key, 1, 2))(jr.split(jr.key(1), 2))
+    hs = np.array([0.02, 0.01, 0.005, 0.0025])
+    slopes = local_weak_orders(terms, solver, y0, args, hs, order=2)
+    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
+
+
+def test_docs_give_the_rules_of_the_package():
+    page = (Path(__file__).parent.parent / "docs/choosing.md").read_text()
+    for want in ("expectations", "paths"):
+        rows = [
+            f"| {_system(rule)} | `{rule.solver.__name__}` | {rule.reason} | "
+            f"`{PATHS[rule.path].code.format(shape='shape')}` |\n"
+            for rule in RULES
+            if rule.want == want
+        ]
+        # In one piece: no row is missing, none is left over.
+        assert f"|---|---|---|---|\n{''.join(rows)}\n" in page, "".join(rows)
+
+
+def _system(rule) -> str:
+    structure = "" if rule.structure == "constant" else rule.structure
+    structure = "additive, constant" if rule.structure == "constant" else structure
+    if rule.noises == "any":
+        return structure
+    return {
+        "commuting": "any, one noise or commuting ones",
+        "not commuting": "any, noises that do not commute",
+    }[rule.noises]
+
+
+def test_bad_input_gets_a_clear_error():
+    H0 = lambda t, p, q, args: p**2 / 2
+    noise = lambda t, p, q, args: q
+    terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+    y0 = (jnp.ones(()), jnp.ones(()))
+    with pytest.raises(ValueError, match="`want` must be one of"):
+        ds.suggest_solver(terms, y0, want="moments")
+    with pytest.raises(ValueError, match="with a Brownian path; got function"):
+        ds.suggest_solver(noise, y0)
+    with pytest.raises(ValueError, match="have a part without one"):
+        ds.suggest_solver(diffrax.ODETerm(lambda t, y, args: y), y0)
+    with pytest.raises(ValueError, match="is a pair"):
+        ds.suggest_solver(terms, jnp.ones(2))
+    with pytest.raises(ValueError, match="real floating-point"):
+        ds.suggest_solver(terms, (1j * jnp.ones(()), jnp.ones(())))
