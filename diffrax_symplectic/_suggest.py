@@ -138,7 +138,7 @@ def suggest_solver(
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
     drift, noise = _parts(terms)
     check_state(y0, "suggest_solver")
-    t0 = jnp.asarray(t0, jnp.result_type(float))
+    t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
     # Raises an error if the terms do not fit the state.
     controls = eqx.filter_eval_shape(
         lambda: [x.contr(t0, t0) for x in (*drift, *noise)]

@@ -21,8 +21,8 @@ _tab = GeneralTableau(
 
 class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""A symplectic method of weak order 2 for one noise or noises that commute: the drift
-    over half of the step by the midpoint rule, the noise by the Gauss method of order 4, and
-    the drift over the other half.
+    over half of the step by the midpoint rule, the noise by the Gauss method of order 4,
+    and the drift over the other half.
 
     In the form of [`diffrax_symplectic.GeneralTableau`][], with $r = \sqrt 3$,
 
