@@ -51,6 +51,7 @@ from ._spins import (
     from_spinors as from_spinors,
     spin_terms as spin_terms,
     to_spinors as to_spinors,
+)
 from ._suggest import (
     suggest_solver as suggest_solver,
     Suggestion as Suggestion,
