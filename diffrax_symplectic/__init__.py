@@ -1,3 +1,4 @@
+from ._adjoint import ReversingAdjoint as ReversingAdjoint
 from ._brownian import (
     FixedStepBrownianPath as FixedStepBrownianPath,
     LevyAreaBrownianPath as LevyAreaBrownianPath,

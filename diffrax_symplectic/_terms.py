@@ -27,10 +27,24 @@ from ._indexed_noise import OneNoise
 from ._materialize import materialize
 
 
+_BACKSOLVE = (
+    "`diffrax.BacksolveAdjoint` cannot be used with the solvers of `diffrax_symplectic`: "
+    "its gradients are not those of the solution. It takes steps of its own backward in "
+    "time, over which a weak path has other increments, and a state that is no pair "
+    "`(p, q)`. Pass `adjoint=diffrax_symplectic.ReversingAdjoint()`, whose memory does not "
+    "grow with the steps either, or `adjoint=diffrax.RecursiveCheckpointAdjoint()`."
+)
+
+
 def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     """Drift terms and noise terms, in any order and however nested. A term is noise if it
-    has a Brownian path, or if it is not the first one and time does not drive it."""
+    has a Brownian path, or if it is not the first one and time does not drive it.
+
+    Raises a `ValueError` for the terms of `diffrax.BacksolveAdjoint`."""
     parts = _flatten(terms)
+    # A class that Diffrax does not export.
+    if any(type(_unwrapped(term)).__name__ == "AdjointTerm" for term in parts):
+        raise ValueError(_BACKSOLVE)
     is_noise = [
         len(brownian_paths(term)) > 0 or (i > 0 and not _is_ode(term))
         for i, term in enumerate(parts)

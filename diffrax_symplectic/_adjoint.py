@@ -1,0 +1,396 @@
+"""Gradients by walking back along the solution, for solvers that undo their own steps."""
+
+import functools as ft
+import itertools as it
+from typing import Any, cast, NamedTuple
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from equinox.internal import ω
+from jax import lax
+from jaxtyping import Array, Bool, PyTree
+
+from ._custom_types import IntScalarLike, RealScalarLike, Y
+from ._plan import make_plan
+from ._solver import AbstractSymplecticRungeKutta, NinomiyaVictoir
+from ._tableau import FlatTableau
+
+
+# Random variables that change their sign if a step is taken back.
+_NEGATED = {"h", "W", "second", "two_point", "third", "A"}
+
+
+class ReversingAdjoint(diffrax.AbstractAdjoint):
+    r"""Reverse-mode gradients in memory that does not grow with the number of steps, for
+    `diffrax.diffeqsolve(..., adjoint=...)`.
+
+    Some solvers undo their own steps: the step from $t_{n+1}$ to $t_n$ with the same
+    increments, negated, leads from $y_{n+1}$ to $y_n$. So the states need not be stored.
+    The backward pass walks along the solution, from its end to its beginning, and
+    multiplies with the transposed Jacobian of one step after another. In exact arithmetic
+    these are the gradients of `diffrax.RecursiveCheckpointAdjoint`.
+
+    Rounding errors grow on the way. Therefore the solution is saved at `checkpoints`
+    states, evenly spread over the steps, and the walk begins anew at each of them. Where
+    it arrives at one, it is compared with what was saved. If they differ by more than
+    $\varepsilon^{2/3}$ of the largest number in the state, where $\varepsilon$ is the
+    machine epsilon (4e-11 in float64), the gradient is not returned: an error is raised,
+    or with `throw=False` the gradient is NaN.
+
+    **Solvers:** those that are their own inverse, which is read off their coefficients:
+    [`diffrax_symplectic.Midpoint`][], [`diffrax_symplectic.StormerVerlet`][],
+    [`diffrax_symplectic.StrangGauss`][], [`diffrax_symplectic.LevyAreaMidpoint`][],
+    [`diffrax_symplectic.NinomiyaVictoir`][] and tableaus of your own.
+
+    **Steps:** `diffrax.ConstantStepSize` or `diffrax.StepTo`. **Saving:** `SaveAt(t1=True)`
+    or `SaveAt(ts=...)`. No events, no forward mode; no derivatives with respect to times.
+
+    **Raises:** a `ValueError`, while tracing, for anything else.
+    """
+
+    checkpoints: int = 64
+
+    def __check_init__(self):
+        if not isinstance(self.checkpoints, int) or self.checkpoints < 1:
+            raise ValueError(
+                f"`checkpoints` must be a positive integer; got {self.checkpoints!r}."
+            )
+
+    def loop(
+        self,
+        *,
+        args,
+        terms,
+        solver,
+        stepsize_controller,
+        event,
+        saveat,
+        init_state,
+        passed_solver_state,
+        passed_controller_state,
+        **kwargs,
+    ) -> Any:
+        if passed_solver_state or passed_controller_state:
+            raise ValueError(
+                "`ReversingAdjoint` takes no `solver_state` and no `controller_state`."
+            )
+        _check_supported(solver, stepsize_controller, event, saveat)
+        y = init_state.y
+        init_state = eqx.tree_at(lambda s: s.y, init_state, object())
+        final_state, aux_stats = _solve(
+            (y, args, terms),
+            adjoint=self,
+            solver=solver,
+            stepsize_controller=stepsize_controller,
+            saveat=saveat,
+            init_state=init_state,
+            **kwargs,
+        )
+        ys = final_state.save_state.ys
+        final_state = eqxi.nondifferentiable_backward(final_state, symbolic=False)
+        return eqx.tree_at(lambda s: s.save_state.ys, final_state, ys), aux_stats
+
+
+ReversingAdjoint.__init__.__doc__ = """**Arguments:**
+
+- `checkpoints`: how many states of the solution are saved. More of them cost memory, and
+    save no time; they are for systems in which rounding errors grow fast.
+
+**Raises:** a `ValueError` if `checkpoints` is not a positive integer.
+"""
+
+
+def _check_supported(solver, controller, event, saveat) -> None:
+    name = type(solver).__name__
+    advice = "Pass `adjoint=diffrax.RecursiveCheckpointAdjoint()`."
+    if not _undoes_its_steps(solver):
+        raise ValueError(
+            f"`ReversingAdjoint` needs a solver that undoes its own steps, and `{name}` "
+            f"does not. Use `Midpoint`, `StormerVerlet` or `StrangGauss`. Or: {advice}"
+        )
+    if not isinstance(controller, diffrax.ConstantStepSize | diffrax.StepTo):
+        raise ValueError(
+            "`ReversingAdjoint` needs steps that are known beforehand: `stepsize_"
+            "controller=diffrax.ConstantStepSize()` or `diffrax.StepTo(ts)`; got "
+            f"`{type(controller).__name__}`. Or: {advice}"
+        )
+    if event is not None:
+        raise ValueError(f"`ReversingAdjoint` knows no events. {advice}")
+    sub = saveat.subs
+    one = isinstance(sub, diffrax.SubSaveAt) and not saveat.dense
+    if not one or sub.steps or sub.t0 or (sub.t1 and sub.ts is not None):
+        raise ValueError(
+            "`ReversingAdjoint` can do `SaveAt(t1=True)` and `SaveAt(ts=...)`. For all "
+            f"else: {advice[0].lower()}{advice[1:]}"
+        )
+    if sub.fn is not diffrax.SubSaveAt(t1=True).fn:
+        raise ValueError(
+            "`ReversingAdjoint` cannot do `SaveAt(fn=...)`. Save the state, and apply the "
+            f"function to `sol.ys`. Or: {advice}"
+        )
+
+
+def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:
+    # Its coin changes sides with the sign of the increments, and so the order of flows.
+    if isinstance(solver, NinomiyaVictoir):
+        return True
+    if not isinstance(solver, AbstractSymplecticRungeKutta):
+        return False
+    return is_own_inverse(make_plan(solver.tableau.flatten()).tableau)
+
+
+def is_own_inverse(tableau: FlatTableau) -> bool:
+    r"""Whether the step with all controls negated undoes the step: whether the stages can
+    be paired, $i \leftrightarrow \sigma(i)$, such that
+
+    $$a_{ij} + a_{\sigma(i)\sigma(j)} = b_j, \qquad b_{\sigma(j)} = b_j, \qquad
+      c_i + c_{\sigma(i)} = 1.$$
+    """
+    stages, b = tableau.stages, tableau.weights
+    if not {c for stage in stages for c in stage.channels} <= _NEGATED:
+        return False
+
+    def partners(i: int) -> list[int]:
+        this = stages[i]
+        return [
+            j
+            for j, that in enumerate(stages)
+            if (that.channels, that.reads, that.writes)
+            == (this.channels, this.reads, this.writes)
+            # What a separable system makes of p alone does not depend on time.
+            and (this.reads == "p" or np.isclose(that.c, 1 - this.c))
+            and np.isclose(b[i], b[j])
+        ]
+
+    for sigma in it.product(*map(partners, range(len(stages)))):
+        paired = all(sigma[j] == i for i, j in enumerate(sigma))
+        both = tableau.matrix + tableau.matrix[np.ix_(sigma, sigma)]
+        if paired and np.allclose(_read(both - b, stages), 0, atol=1e-12):
+            return True
+    return False
+
+
+def _read(matrix: np.ndarray, stages: tuple) -> np.ndarray:
+    """Without the entries that do not matter: stages that write what a stage does not
+    read."""
+    matters = [
+        [i.reads == "y" or j.writes in ("y", i.reads) for j in stages] for i in stages
+    ]
+    return np.where(matters, matrix, 0)
+
+
+@eqx.filter_custom_vjp
+def _solve(y__args__terms, *, adjoint, throw, **kwargs):
+    del throw
+    return _run(
+        adjoint, y__args__terms, ft.partial(eqxi.while_loop, kind="lax"), kwargs
+    )
+
+
+def _run(adjoint, y__args__terms, outer_while_loop, kwargs):
+    y, args, terms = y__args__terms
+    init_state = eqx.tree_at(lambda s: s.y, kwargs["init_state"], y)
+    return adjoint._loop(
+        **kwargs | {"init_state": init_state},
+        args=args,
+        terms=terms,
+        event=None,
+        inner_while_loop=ft.partial(eqxi.while_loop, kind="lax"),
+        outer_while_loop=outer_while_loop,
+    )
+
+
+@_solve.def_fwd
+def _solve_fwd(perturbed, y__args__terms, *, adjoint, throw, **kwargs):
+    del perturbed, throw
+    every = _Steps.of(kwargs).spread(adjoint.checkpoints)
+    recorded = []
+
+    def recording_while_loop(cond_fun, body_fun, init_val, *, buffers, **options):
+        rows = jtu.tree_map(
+            lambda x: jnp.zeros((adjoint.checkpoints, *jnp.shape(x)), x.dtype),
+            init_val.y,
+        )
+
+        def body(carry):
+            state, rows = carry
+            row, rest = jnp.divmod(state.num_steps, every)
+            here = cast(bool, rest == 0)
+            save = lambda x, rows: eqxi.buffer_at_set(rows, row, x, pred=here)
+            return body_fun(state), jtu.tree_map(save, state.y, rows)
+
+        final, rows = eqxi.while_loop(
+            lambda carry: cond_fun(carry[0]),
+            body,
+            (init_val, rows),
+            buffers=lambda carry: (buffers(carry[0]), jtu.tree_leaves(carry[1])),
+            kind="lax",
+            **options,
+        )
+        recorded.append(rows)
+        return final
+
+    out = _run(adjoint, y__args__terms, recording_while_loop, kwargs)
+    final_state, _ = out
+    index = final_state.save_state.saveat_ts_index
+    return out, (recorded[0], final_state.y, final_state.num_steps, index)
+
+
+class _Steps(NamedTuple):
+    """The steps of a solve, by the arithmetic of its controller."""
+
+    controller: diffrax.AbstractStepSizeController
+    init_state: Any
+
+    @staticmethod
+    def of(kwargs: dict) -> "_Steps":
+        return _Steps(kwargs["stepsize_controller"], kwargs["init_state"])
+
+    def spread(self, checkpoints: int) -> IntScalarLike:
+        """After how many steps each a state is saved."""
+        if isinstance(self.controller, diffrax.StepTo):
+            number = len(self.controller.ts) - 1
+        else:
+            _, number, *_ = self.init_state.controller_state
+        return jnp.maximum(1, -(-jnp.asarray(number) // checkpoints))
+
+    def time(self, i: IntScalarLike) -> RealScalarLike:
+        """The time after `i` steps."""
+        if isinstance(self.controller, diffrax.StepTo):
+            return self.controller.ts[i]
+        _, *fixed = self.init_state.controller_state
+        first, second = self.init_state.tprev, self.init_state.tnext
+        # The controller computes times from their number, and reads nothing else.
+        _, _, later, *_ = self.controller.adapt_step_size(
+            first, second, None, None, None, None, 1, (i - 1, *fixed)
+        )
+        return jnp.where(i == 0, first, jnp.where(i == 1, second, later))
+
+
+class _Walk(NamedTuple):
+    """Where the backward pass stands."""
+
+    # The number of steps between here and the start, and the state here.
+    i: Array
+    y: Y
+    # The derivatives of the loss: with respect to this state and to the parameters so far.
+    a_y: Y
+    a_parameters: PyTree[Array]
+    # How many of the saved times lie before here.
+    saved: Array
+    arrived: Bool[Array, ""]
+
+
+@_solve.def_bwd
+def _solve_bwd(
+    residuals, grad_out, perturbed, y__args__terms, *, adjoint, throw, **kwargs
+):
+    rows, y1, num_steps, saved = residuals
+    solver, sub = kwargs["solver"], kwargs["saveat"].subs
+    init_state, steps = kwargs["init_state"], _Steps.of(kwargs)
+    every = steps.spread(adjoint.checkpoints)
+    _, *parameters = y__args__terms
+    _, *is_perturbed = perturbed
+    diff, nondiff = eqx.partition(parameters, is_perturbed)
+    g = jtu.tree_map(
+        lambda x, g: (
+            jnp.zeros(jnp.shape(x)[:0] + (1, *jnp.shape(x)), x.dtype)
+            if g is None
+            else g
+        ),
+        y1,
+        grad_out[0].save_state.ys,
+        is_leaf=lambda x: x is None,
+    )
+
+    def step(y, diff, i, back: bool):
+        args, terms = eqx.combine(diff, nondiff)
+        t0, t1 = steps.time(i), steps.time(i + 1)
+        if back:
+            t0, t1, terms = -t1, -t0, _reversed(terms)
+        return solver.step(terms, t0, t1, y, args, init_state.solver_state, False)[0]
+
+    def body(walk: _Walk) -> _Walk:
+        i = walk.i - 1
+        y, arrived = _begin_anew(
+            step(walk.y, diff, i, True), rows, i, every, walk.arrived
+        )
+        a_y, a_y0, saved = walk.a_y, (0 * walk.a_y**ω).ω, walk.saved
+        if sub.ts is not None:
+            t0, t1 = steps.time(i), steps.time(i + 1)
+            a_y, a_y0, saved = _saved_between(t0, t1, sub.ts, g, a_y, a_y0, saved)
+        _, vjp = jax.vjp(lambda y, diff: step(y, diff, i, False), y, diff)
+        through, a_parameters = vjp(a_y)
+        total = (walk.a_parameters**ω + a_parameters**ω).ω
+        return _Walk(i, y, (a_y0**ω + through**ω).ω, total, saved, arrived)
+
+    start = jtu.tree_map(lambda g: g[-1] if sub.ts is None else 0 * g[0], g)
+    zeros = jtu.tree_map(jnp.zeros_like, diff)
+    saved = jnp.asarray(saved)
+    walk = _Walk(jnp.asarray(num_steps), y1, start, zeros, saved, jnp.array(True))
+    walk = lax.while_loop(lambda walk: walk.i > 0, body, walk)
+    a_y = walk.a_y
+    if sub.ts is not None:
+        # What was saved at the start itself.
+        before = jnp.arange(len(sub.ts)) < walk.saved
+        a_y = jtu.tree_map(lambda a, g: a + jnp.tensordot(before, g, 1), a_y, g)
+    return _unless(walk.arrived, throw, (a_y, *walk.a_parameters))
+
+
+def _reversed(terms: PyTree) -> PyTree:
+    """The terms with time running the other way. In a solve Diffrax has wrapped each term
+    to that end."""
+    is_leaf = lambda x: isinstance(x, diffrax.AbstractTerm) and hasattr(x, "direction")
+    turn = lambda x: eqx.tree_at(lambda x: x.direction, x, replace_fn=lambda d: -d)
+    return jtu.tree_map(turn, terms, is_leaf=is_leaf)
+
+
+def _begin_anew(y: Y, rows: Y, i, every, arrived) -> tuple[Y, Bool[Array, ""]]:
+    """The saved state in place of the one walked to, if there is one after `i` steps; and
+    whether they agree."""
+    row, rest = jnp.divmod(i, every)
+    exact = jtu.tree_map(lambda rows: rows[row], rows)
+    largest = lambda tree: jnp.max(
+        jnp.stack([jnp.max(jnp.abs(x)) for x in jtu.tree_leaves(tree)])
+    )
+    dtype = jnp.result_type(*jtu.tree_leaves(y))
+    error = largest((y**ω - exact**ω).ω)
+    close = error <= float(jnp.finfo(dtype).eps) ** (2 / 3) * largest(exact)
+    here = rest == 0
+    y = jtu.tree_map(lambda walked, saved: jnp.where(here, saved, walked), y, exact)
+    return y, arrived & (close | ~here)
+
+
+def _saved_between(t0, t1, ts, g, a_y, a_y0, saved):
+    """Adds the derivatives with respect to what was saved in the step from `t0` to `t1`,
+    which Diffrax interpolates linearly."""
+
+    def add(carry):
+        a_y, a_y0, saved = carry
+        share = (ts[saved - 1] - t0) / (t1 - t0)
+        of = lambda x, share: jtu.tree_map(
+            lambda x, g: x + share.astype(x.dtype) * g[saved - 1], x, g
+        )
+        return of(a_y, share), of(a_y0, 1 - share), saved - 1
+
+    # Index -1 is read, but not used.
+    more = lambda carry: (carry[2] > 0) & (ts[carry[2] - 1] > t0)
+    return lax.while_loop(more, add, (a_y, a_y0, saved))
+
+
+def _unless(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyTree:
+    if throw:
+        return eqx.error_if(
+            gradients,
+            ~arrived,
+            "`ReversingAdjoint` did not find its way back: rounding errors grew between "
+            "two saved states. Raise `checkpoints`, or pass `adjoint=diffrax."
+            "RecursiveCheckpointAdjoint()`.",
+        )
+    nan = lambda x: jnp.where(arrived, x, cast(Array, jnp.nan))
+    return jtu.tree_map(nan, gradients)

@@ -1,0 +1,225 @@
+"""Gradients by walking back along the solution, and adjoints that are refused."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+from diffrax._term import WrapTerm
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._adjoint import _undoes_its_steps
+
+from .problems import Given, H0, noise, random_problem, weak_path
+
+
+def separable_H0(t, p, q, args):
+    return jnp.sum(p**2) / 2 + jnp.sum(jnp.cos(q + t))
+
+
+def separable_noise(t, p, q, args):
+    return jnp.stack([jnp.sum(jnp.sin(q)), jnp.sum(jnp.cos(2 * q) * (1 + t))])
+
+
+UNDO = {
+    "general": [ds.Midpoint(), ds.StrangGauss()],
+    "several": [ds.LevyAreaMidpoint(), ds.NinomiyaVictoir()],
+    "separable": [ds.StormerVerlet(), ds.SRKs2()],
+}
+
+
+@pytest.mark.parametrize("kind", UNDO)
+def test_solvers_taken_for_their_own_inverse_undo_their_steps(kind):
+    m = 1 if kind == "general" else 2
+    y0, args = random_problem(jr.key(0), 2, m)
+    W, A = jnp.array([0.3, -0.2])[:m], jnp.array([[0, 0.05], [-0.05, 0]])[:m, :m]
+    given = Given(W, second=W[::-1], two_point=0.1 * jnp.sign(W), A=A)
+    functions = (H0, noise) if kind != "separable" else (separable_H0, separable_noise)
+    terms = ds.hamiltonian_terms(*functions, given).terms
+    for solver in UNDO[kind]:
+        assert _undoes_its_steps(solver)
+
+        @jax.jit
+        def step(t0, t1, direction, y, solver=solver):
+            wrapped = diffrax.MultiTerm(*[WrapTerm(x, direction) for x in terms])
+            return solver.step(wrapped, t0, t1, y, args, None, False)[0]
+
+        there = step(0.4, 0.5, 1, y0)
+        back = step(-0.5, -0.4, -1, there)
+        assert np.abs(np.subtract(there, y0)).max() > 1e-2
+        np.testing.assert_allclose(back, y0, atol=1e-14)
+
+
+def test_solvers_that_do_not_undo_their_steps_are_refused():
+    refused = (
+        *[ds.SRKw2(), ds.SRKs3(), ds.SRKs4(), ds.SRKw3(), ds.SRKw4(), ds.SRKw5()],
+        *[ds.PlateauVerlet(), ds.AdditiveGauss(), diffrax.Heun()],
+    )
+    assert not any(map(_undoes_its_steps, refused))
+
+
+class Spring(eqx.Module):
+    stiffness: jax.Array
+
+    def __call__(self, t, p, q, args):
+        return jnp.sum(p**2) / 2 + jnp.sum(self.stiffness * (1 - jnp.cos(q - t)))
+
+
+def kicks(t, p, q, args):
+    return args * jnp.sum(jnp.sin(q))
+
+
+def phase(t, p, q, args):
+    return args * jnp.sum(p * jnp.sin(q))
+
+
+SAVED = jnp.array([0.0, 0.07, 0.2, 0.21, 0.22, 0.9, 1.03])
+TO = jnp.array([0.0, 0.1, 0.4, 0.5, 0.9, 1.0, 1.03])
+
+
+def gradients(solver, noise, saveat, dtype=jnp.float64, **options):
+    """With respect to a Module of the terms, `args` and the initial state: ours and those
+    of checkpointing. The steps are not all of one length."""
+    y0 = jnp.array([0.3, -0.2], dtype), jnp.array([0.1, 0.7], dtype)
+    stiffness, args = jnp.array([1.0, 1.5], dtype), jnp.array(0.4, dtype)
+    path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((), dtype), jr.key(0))
+    times = dict(t0=0.0, t1=1.03, dt0=0.1) | options
+    cast = lambda x: jnp.asarray(x, dtype) if isinstance(x, float) else x
+    times = {name: cast(x) for name, x in times.items()}
+
+    def loss(x, adjoint):
+        stiffness, args, y0 = x
+        terms = ds.hamiltonian_terms(Spring(stiffness), noise, path)
+        ys = diffrax.diffeqsolve(
+            terms, solver, **times, y0=y0, args=args, adjoint=adjoint, saveat=saveat
+        ).ys  # pyright: ignore[reportArgumentType]
+        return sum(jnp.sum(jnp.arange(1.0, x.size + 1) * x.ravel() ** 2) for x in ys)
+
+    adjoints = ds.ReversingAdjoint(checkpoints=3), diffrax.RecursiveCheckpointAdjoint()
+    both = lambda x: [jax.grad(loss)(x, adjoint) for adjoint in adjoints]
+    return [jax.tree.leaves(g) for g in jax.jit(both)((stiffness, args, y0))]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        (ds.Midpoint(), phase, diffrax.SaveAt(ts=SAVED), {}),
+        (
+            *(ds.StormerVerlet(), kicks, diffrax.SaveAt(ts=SAVED[::-1])),
+            dict(t0=1.03, t1=0.0, dt0=-0.1),
+        ),
+        (
+            *(ds.StormerVerlet(), kicks, diffrax.SaveAt(t1=True)),
+            dict(dt0=None, stepsize_controller=diffrax.StepTo(TO)),
+        ),
+    ],
+    ids=["times", "backward", "StepTo"],
+)
+def test_gradients_are_those_of_checkpointing(case):
+    solver, noise, saveat, options = case
+    got, expected = gradients(solver, noise, saveat, **options)
+    assert min(np.abs(x).min() for x in expected) > 1e-3
+    for a, b in zip(got, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_gradients_in_single_precision():
+    saveat = diffrax.SaveAt(t1=True)
+    for a, b in zip(*gradients(ds.StormerVerlet(), kicks, saveat, jnp.float32)):
+        assert a.dtype == jnp.float32
+        np.testing.assert_allclose(a, b, rtol=1e-5)
+
+
+def test_memory_does_not_grow_with_steps():
+    # One program for any number of steps, of which no bound has to be known.
+    def end(args, y0, t1):
+        path = ds.WeakBrownianPath((), jr.key(0))
+        terms = ds.hamiltonian_terms(separable_H0, lambda t, p, q, a: a * q[0], path)
+        adjoint = ds.ReversingAdjoint(checkpoints=8)
+        sol = diffrax.diffeqsolve(
+            terms, ds.StormerVerlet(), 0.0, t1, 0.01, y0, args, adjoint=adjoint,
+            max_steps=None,
+        )  # fmt: skip
+        return jnp.sum(sol.ys[1] ** 2)
+
+    d = 100
+    args, y0 = jnp.array(0.1), (jnp.zeros(d), jnp.linspace(2.0, 4.0, d))
+    compiled = jax.jit(jax.grad(end)).lower(args, y0, 1.0).compile()
+    state = 2 * d * 8
+    assert compiled.memory_analysis().temp_size_in_bytes <= (8 + 16) * state
+    # 10,000 steps of it are no more than rounding off from a difference quotient.
+    e, t1 = 1e-6, 100.0
+    value = jax.jit(lambda args: end(args, y0, t1))
+    change = (value(args + e) - value(args - e)) / (2 * e)
+    np.testing.assert_allclose(compiled(args, y0, t1), change, rtol=1e-5)
+
+
+def test_a_way_back_that_is_lost_is_reported_for_that_path_alone():
+    # Away from an unstable equilibrium, rounding errors grow by exp(2 t rate) on the walk.
+    def end(q0, rate, checkpoints, throw):
+        hill = lambda t, p, q, args: p**2 / 2 - (args * q) ** 2 / 2
+        path = ds.WeakBrownianPath((), jr.key(0))
+        terms = ds.hamiltonian_terms(hill, lambda t, p, q, args: 0.1 * q, path)
+        adjoint = ds.ReversingAdjoint(checkpoints=checkpoints)
+        return diffrax.diffeqsolve(
+            terms, ds.StormerVerlet(), 0.0, 10.0, 0.05, (0.0 * q0, q0), rate,
+            adjoint=adjoint, throw=throw,
+        ).ys[1][-1]  # fmt: skip
+
+    gradient = lambda checkpoints, throw: jax.jit(
+        jax.vmap(jax.grad(end), in_axes=(None, 0, None, None)),
+        static_argnums=(2, 3),
+    )(jnp.array(1.0), jnp.array([0.1, 3.0]), checkpoints, throw)
+    lost = gradient(1, False)
+    found = gradient(20, True)
+    assert np.isnan(lost[1]) and np.all(np.isfinite(found))
+    np.testing.assert_allclose(lost[0], found[0], rtol=1e-12)
+    with pytest.raises(Exception, match="did not find its way back"):
+        jax.block_until_ready(gradient(1, True))
+
+
+def test_what_reversing_cannot_do_is_refused_with_advice():
+    y0, args = random_problem(jr.key(0), 1, 1)
+
+    def solve(solver=None, path=None, functions=(H0, noise), **options):
+        terms = ds.hamiltonian_terms(*functions, path or weak_path(1))
+        return diffrax.diffeqsolve(
+            terms, solver or ds.Midpoint(), 0.0, 1.0, 0.1, y0, args, **options,
+            adjoint=ds.ReversingAdjoint(),
+        )  # fmt: skip
+
+    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 0.01, (1,), jr.key(0))
+    pid = diffrax.PIDController(rtol=1e-3, atol=1e-3)
+    kick = separable_H0, lambda t, p, q, args: q
+    adaptive = dict(solver=ds.StormerVerlet(), path=tree, functions=kick)
+    outside = diffrax.Event(lambda t, y, args, **kwargs: y[0][0] > 9)
+    for message, options in (
+        ("`SRKw2` does not", dict(solver=ds.SRKw2(), path=weak_path(1, second=True))),
+        ("steps that are known beforehand", dict(**adaptive, stepsize_controller=pid)),
+        ("knows no events", dict(event=outside)),
+        (r"SaveAt\(ts=...\)", dict(saveat=diffrax.SaveAt(steps=True))),
+        (r"SaveAt\(ts=...\)", dict(saveat=diffrax.SaveAt(t0=True, t1=True))),
+        (r"SaveAt\(ts=...\)", dict(saveat=diffrax.SaveAt(t1=True, dense=True))),
+        (r"SaveAt\(fn", dict(saveat=diffrax.SaveAt(t1=True, fn=lambda t, y, a: y[0]))),
+    ):
+        with pytest.raises(ValueError, match=message):
+            solve(**options)
+    with pytest.raises(ValueError, match="`checkpoints` must be"):
+        ds.ReversingAdjoint(checkpoints=0)
+
+
+@pytest.mark.parametrize("solver", [ds.Midpoint(), ds.StormerVerlet()], ids=repr)
+def test_backsolve_is_refused_with_advice(solver):
+    # It takes steps of its own, which have other increments of a weak path, and its state
+    # is no pair (p, q).
+    path = weak_path(1)
+    terms = ds.hamiltonian_terms(separable_H0, lambda t, p, q, args: q, path)
+    y0 = jnp.ones(1), jnp.ones(1)
+    adjoint = diffrax.BacksolveAdjoint()
+    end = lambda y0: jnp.sum(
+        diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.3, y0, adjoint=adjoint).ys[1]
+    )
+    with pytest.raises(ValueError, match="BacksolveAdjoint.*ReversingAdjoint"):
+        jax.grad(end)(y0)
