@@ -7,7 +7,7 @@ import jax.random as jr
 import numpy as np
 
 import diffrax_symplectic as ds
-from examples.hard_cases import chain, double_well, henon_heiles, two_body
+from examples.hard_cases import chain, double_well, henon_heiles, spins, two_body
 
 from .problems import FineSample, slope
 
@@ -125,3 +125,25 @@ def test_henon_heiles_converges_to_itself():
     squared = jnp.sum((ys[:, :-1] - ys[:, -1:]) ** 2, axis=-1)
     measured = slope(np.array(steps), np.sqrt(jnp.mean(squared, axis=0)))
     assert abs(measured - 1) <= 0.15
+
+
+def test_ring_of_spins_keeps_its_total_spin_and_gains_no_energy_without_noise():
+    lift, _, heun = spins.METHODS.values()
+    ours = spins.course(lift, 0.0, 0.2, 100, 1, spins=32)
+    assert ours.length_error.max() <= 1e-13
+    assert ours.total_error <= 1e-12
+    # A hundredth of what it is.
+    assert ours.energy_error <= 0.01 * abs(ours.energy[0, 0])
+    theirs = spins.course(heun, 0.0, 0.2, 100, 1, spins=32)
+    assert theirs.length_error.max() <= 1e-15
+    assert theirs.total_error > 1 and theirs.energy_error > 1
+
+
+def test_ring_of_spins_with_noise_decays_as_in_closed_form():
+    sigma = 0.5
+    c = spins.course(next(iter(spins.METHODS.values())), sigma, 0.1, 20, 512, spins=8)
+    for mean in (c.excess(sigma), c.total_excess(sigma)):
+        assert abs(mean.sigmas) <= 4
+        assert mean.std_error <= 0.2
+    # Both would be seen if they stayed what they were.
+    assert abs(c.energy[0, 0]) * (1 - np.exp(-2 * sigma**2 * 2)) > 1
