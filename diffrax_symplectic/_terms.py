@@ -78,9 +78,26 @@ def _unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
 @eqx.filter_jit
 def apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> Y:
     """The sum over terms of vector field times control."""
-    total = tree_sum([x.vf_prod(t, y, args, c) for x, c in zip(terms, controls)])
+    total = tree_sum([_change(x, t, y, args, c) for x, c in zip(terms, controls)])
     _check_value(total, y)
     return total
+
+
+def _change(term: diffrax.AbstractTerm, t, y: Y, args: Args, control: PyTree) -> Y:
+    try:
+        return term.vf_prod(t, y, args, control)
+    except ValueError as error:
+        control_term = isinstance(_unwrapped(term), diffrax.ControlTerm)
+        if not control_term or jtu.tree_structure(y) == jtu.tree_structure(control):
+            raise
+        # Diffrax multiplies leaf by leaf, and JAX then speaks of trees.
+        raise ValueError(
+            "A `ControlTerm` multiplies arrays only if state and noise have the same "
+            f"structure; got the state {eqx.tree_pformat(y)} and the noise "
+            f"{eqx.tree_pformat(control)}. Return the matrix of noises as a Lineax "
+            "operator (`lineax.PyTreeLinearOperator`), make the state one array, or "
+            "construct the terms with `hamiltonian_terms`."
+        ) from error
 
 
 @eqx.filter_jit

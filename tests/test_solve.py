@@ -321,6 +321,21 @@ def test_malformed_terms_are_refused():
 
 
 @pytest.mark.filterwarnings("ignore:Complex")
+def test_a_matrix_of_noises_for_a_state_of_several_arrays_is_refused_with_advice():
+    field = lambda t, y, args: {"a": jnp.ones((3, 2))}
+    terms = diffrax.ControlTerm(field, weak_path(2))
+    drift = diffrax.ODETerm(lambda t, y, args: y)
+    with pytest.raises(ValueError, match="as a Lineax operator"):
+        diffrax.diffeqsolve(
+            diffrax.MultiTerm(drift, terms),
+            ds.Midpoint(),
+            0.0,
+            0.1,
+            0.1,
+            {"a": jnp.ones(3)},
+        )
+
+
 def test_states_that_are_not_real_floats_are_refused():
     terms = diffrax.ODETerm(lambda t, y, args: y)
     with pytest.raises(ValueError, match="real floating-point arrays; got.*complex"):
