@@ -15,11 +15,11 @@ from ._conditions import (
     symplectic_residuals as symplectic_residuals,
     weak_order_residuals as weak_order_residuals,
 )
-from ._expectation import (
+from ._estimate import (
     Expectation as Expectation,
-    expectation as expectation,
     ExpectationInterrupted as ExpectationInterrupted,
 )
+from ._expectation import expectation as expectation
 from ._hamiltonian import hamiltonian_terms as hamiltonian_terms
 from ._indexed_noise import IndexedNoise as IndexedNoise
 from ._quasi import (

@@ -17,58 +17,22 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from ._brownian import check_key
+from ._estimate import (
+    Expectation,
+    ExpectationInterrupted,
+    finished,
+    initial,
+    merge,
+    reached,
+)
 
 
-_Sample: TypeAlias = Callable[[PRNGKeyArray], Any]
+_Sample: TypeAlias = Callable[..., Any]
 # Scalars of NumPy are no arrays.
 _Host = PyTree[np.ndarray | np.floating]
 
 
 _no_meter = diffrax.NoProgressMeter()
-
-
-class Expectation(eqx.Module):
-    r"""An estimate of $\mathbb E[\phi]$, as [`diffrax_symplectic.expectation`][] returns.
-
-    - `mean`: the mean over the paths that succeeded, in the structure of $\phi$, in
-        float64; NaN if none did.
-    - `sum_of_squares`: the sum of the squared deviations from `mean`.
-    - `num_paths`: how many paths succeeded.
-    - `num_failed`: how many paths failed. They have no part in the rest.
-    - `key_data`: the random key that the paths came from.
-    """
-
-    mean: _Host
-    sum_of_squares: _Host
-    num_paths: int
-    num_failed: int
-    key_data: np.ndarray
-
-    @property
-    def variance(self) -> _Host:
-        r"""The variance of $\phi$ over the paths."""
-        n = self.num_paths - 1
-        share = lambda m2: m2 / n if n > 0 else np.full_like(m2, np.nan)
-        return jtu.tree_map(share, self.sum_of_squares)
-
-    @property
-    def std_error(self) -> _Host:
-        """The standard error of `mean`."""
-        n = max(self.num_paths, 1)
-        return jtu.tree_map(lambda v: np.sqrt(v / n), self.variance)
-
-
-class ExpectationInterrupted(KeyboardInterrupt):
-    """Raised by [`diffrax_symplectic.expectation`][] in place of a `KeyboardInterrupt`.
-    Its attribute `estimate` holds what was done until then, to go on from with
-    `start=`."""
-
-    def __init__(self, estimate: Expectation):
-        super().__init__(
-            f"Interrupted after {estimate.num_paths + estimate.num_failed} paths. Catch "
-            "`ExpectationInterrupted` and pass its `estimate` as `start` to go on."
-        )
-        self.estimate = estimate
 
 
 def expectation(
@@ -79,6 +43,10 @@ def expectation(
     batch_size: int | None = None,
     devices: Sequence[Any] | None = None,
     start: Expectation | None = None,
+    tol: float | None = None,
+    levels: int = 1,
+    order: int | None = None,
+    num_coupled: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter = _no_meter,
 ) -> Expectation:
     r"""Estimates $\mathbb E[\phi]$ and its standard error over any number of paths.
@@ -118,6 +86,29 @@ def expectation(
     expectation (on one device: `devices=jax.devices()[:1]`). This function itself is no
     part of a JAX program: it cannot be differentiated, `jit`ted or `vmap`ped.
 
+    **Two levels.** With `levels=2` and `order=p` the function is `fn(key, level)`, which
+    solves with the step $h$ on level 0 and with $h/2$ on level 1. `mean` is that of level
+    0. The difference of the levels is estimated from paths that are solved on both, with
+    the same key. Let them follow one Brownian motion, with `cell=` of
+    [`diffrax_symplectic.FixedStepBrownianPath`][]: then it varies little, and few paths are
+    enough. From it come `bias`, the part of the error of discretization that is of order
+    $h^p$, and `bias_std_error`.
+
+    !!! example
+
+        ```python
+        def phi(key, level):
+            path = ds.FixedStepBrownianPath((), key, cell=0.05)
+            terms = ds.hamiltonian_terms(H, H, ds.TruncatedBrownianPath(path))
+            sol = diffrax.diffeqsolve(
+                terms, ds.Midpoint(), t0=0, t1=1, dt0=0.1 / 2**level, y0=y0, throw=False
+            )
+            return sol.ys[1][-1] ** 2, sol.result
+
+        estimate = ds.expectation(phi, jr.key(0), 10_000, levels=2, order=1)
+        print(estimate.mean - estimate.bias, estimate.bias_std_error)
+        ```
+
     **Arguments:**
 
     - `fn`: takes a random key to $\phi$, a PyTree of real arrays, or to a pair of that
@@ -135,12 +126,20 @@ def expectation(
         call and gets the same result.
     - `start`: an earlier estimate with the same `fn` (which is not checked) and `key`, to
         be continued.
-    - `progress_meter`: one of Diffrax's.
+    - `tol`: if given, no further batch begins once the standard error of every entry of
+        $\phi$ is at most `tol`. `num_paths` is then the most that are taken.
+    - `levels`: 2 to estimate the error of discretization, too.
+    - `order`: with two levels, the weak order $p$ of the solver for the terms, as
+        `solver.weak_order(terms)` says.
+    - `num_coupled`: with two levels, how many further paths are solved on both; by default
+        a sixteenth of `num_paths`.
+    - `progress_meter`: one of Diffrax's, for the paths of the first level.
 
     **Returns:** an [`diffrax_symplectic.Expectation`][].
 
     **Raises:** a `ValueError` for sizes that are not positive integers, if `key` is not a
-    random key, if `start` came from another key, has other shapes or more paths, or if
+    random key, if `start` came from another key, has other shapes or more paths, if `tol`
+    is not positive, for `levels` other than 1 or 2, or 2 without `order`, or if
     $\phi$ is not real or holds a `diffrax.RESULTS`;
     [`diffrax_symplectic.ExpectationInterrupted`][], with the estimate so far, on an
     interrupt from the keyboard.
@@ -158,6 +157,72 @@ def expectation(
     check_key(key, "expectation")
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jr.wrap_key_data(key)
+    if tol is not None and not 0 < tol < np.inf:
+        raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")
+    run = ft.partial(_run, batch_size=batch_size, devices=devices)
+    if levels == 1:
+        return run(fn, key, num_paths, start, tol, progress_meter)
+    if levels != 2 or order is None:
+        raise ValueError(
+            "`levels` must be 1, or 2 with `order=`, the weak order of the solver; got "
+            f"levels={levels!r} and order={order!r}."
+        )
+    order = _positive("order", order)
+    if num_coupled is not None:
+        num_coupled = _positive("num_coupled", num_coupled)
+    estimate = run(_Level(fn, 0), key, num_paths, start, tol, progress_meter)
+    estimate = dataclasses.replace(estimate, order=order)
+    before = estimate.difference
+    if num_coupled is None:
+        made = 0 if before is None else before.num_paths + before.num_failed
+        num_coupled = max(num_paths // 16, 2, made)
+    # Keys that belong to no path.
+    key = jr.fold_in(key, 0xFFFFFFFF)
+    try:
+        difference = run(_Difference(fn), key, num_coupled, before, None, _no_meter)
+    except ExpectationInterrupted as interrupt:
+        estimate = dataclasses.replace(estimate, difference=interrupt.estimate)
+        raise ExpectationInterrupted(estimate) from None
+    return dataclasses.replace(estimate, difference=difference)
+
+
+class _Level(eqx.Module):
+    """A path on one level. Of the same `fn` it is the same function to JAX."""
+
+    fn: _Sample
+    level: int = eqx.field(static=True)
+
+    def __call__(self, key):
+        return self.fn(key, self.level)
+
+
+class _Difference(eqx.Module):
+    """The finer level minus the coarser one, from the same key."""
+
+    fn: _Sample
+
+    def __call__(self, key):
+        coarse, a = _evaluate(_Level(self.fn, 0), key)
+        fine, b = _evaluate(_Level(self.fn, 1), key)
+        wide = lambda x: x.astype(jnp.result_type(x, float))
+        difference = jtu.tree_map(lambda x, y: wide(x) - wide(y), fine, coarse)
+        nonfinite: diffrax.RESULTS = diffrax.RESULTS.nonfinite  # pyright: ignore
+        good = diffrax.RESULTS.successful
+        return difference, diffrax.RESULTS.where(a & b, good, nonfinite)
+
+
+def _run(
+    fn: _Sample,
+    key: PRNGKeyArray,
+    num_paths: int,
+    start: Expectation | None,
+    tol: float | None,
+    progress_meter: diffrax.AbstractProgressMeter,
+    *,
+    batch_size: int,
+    devices: tuple,
+) -> Expectation:
+    """The estimate of one level, a batch at a time."""
     key_data, impl = np.asarray(jr.key_data(key)), jr.key_impl(key)
     first = 0 if start is None else start.num_paths + start.num_failed
     # No more lanes than paths.
@@ -174,24 +239,27 @@ def expectation(
 
     # JAX keeps what it traced here for the first batch.
     shapes = eqx.filter_eval_shape(batch, min(first, num_paths - 1))
-    estimate = _start(shapes[2], key_data, start, num_paths)
+    estimate = initial(shapes[2], key_data, start, num_paths)
     running = collections.deque()
     meter = progress_meter.init()
     try:
-        for begin in range(first, num_paths, step):
+        while True:
+            more = first < num_paths and not reached(estimate, tol)
+            if more:
+                running.append(batch(first))
+                first += step
             # One computes while the one before is added up.
-            running.append(batch(begin))
-            if len(running) == 2:
-                estimate = _merge(estimate, running.popleft())
+            if len(running) > more:
+                estimate = merge(estimate, running.popleft())
                 done = estimate.num_paths + estimate.num_failed
                 meter = progress_meter.step(meter, np.asarray(done / num_paths))
-        while running:
-            estimate = _merge(estimate, running.popleft())
+            elif not more:
+                break
     except KeyboardInterrupt:
-        raise ExpectationInterrupted(_finished(estimate)) from None
+        raise ExpectationInterrupted(finished(estimate, tol)) from None
     finally:
         progress_meter.close(meter)
-    return _finished(estimate)
+    return finished(estimate, tol)
 
 
 def _positive(name: str, value) -> int:
@@ -199,51 +267,6 @@ def _positive(name: str, value) -> int:
     if not integer or value < 1:
         raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
     return int(value)
-
-
-def _finished(estimate: Expectation) -> Expectation:
-    """Without any path there is no mean."""
-    if estimate.num_paths > 0:
-        return estimate
-    nothing = jtu.tree_map(lambda x: np.full_like(x, np.nan), estimate.mean)
-    return dataclasses.replace(estimate, mean=nothing)
-
-
-def _start(
-    mean: PyTree[jax.ShapeDtypeStruct],
-    key_data: np.ndarray,
-    start: Expectation | None,
-    num_paths: int,
-) -> Expectation:
-    """The estimate without any path, or the one to go on from."""
-    for leaf in jtu.tree_leaves(mean):
-        if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
-            raise ValueError(
-                "`fn` must return real arrays; got one of dtype "
-                f"{leaf.dtype}. Return real and imaginary parts."
-            )
-    zeros = jtu.tree_map(lambda s: np.zeros(s.shape), mean)
-    if start is None:
-        return Expectation(zeros, zeros, 0, 0, key_data)
-    if not np.array_equal(start.key_data, key_data):
-        raise ValueError(
-            "`start` is an estimate with another `key`. Pass the one that it came from, "
-            "so that no path is taken twice."
-        )
-    if jtu.tree_structure(start.mean) != jtu.tree_structure(zeros) or any(
-        np.shape(a) != b.shape
-        for a, b in zip(jtu.tree_leaves(start.mean), jtu.tree_leaves(zeros))
-    ):
-        raise ValueError(
-            "`start` is an estimate of something of another structure or other shapes. "
-            "Pass one that came from the same `fn`."
-        )
-    if start.num_paths + start.num_failed > num_paths:
-        raise ValueError(
-            "`num_paths` counts all paths, those of `start` included, of which there are "
-            f"{start.num_paths + start.num_failed} already; got {num_paths}."
-        )
-    return start if start.num_paths > 0 else dataclasses.replace(start, mean=zeros)
 
 
 def _evaluate(fn: _Sample, key) -> tuple[PyTree[Array], Array]:
@@ -307,23 +330,3 @@ def _batch(fn, key_data, lo_hi, size, impl, mesh: Mesh, n: int):
     return jax.shard_map(
         shard, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False
     )(lo_hi, size)
-
-
-def _merge(estimate: Expectation, batch) -> Expectation:
-    """The estimate from the paths of both."""
-    count, failed, mean, squares = jax.device_get(batch)
-    a, b = estimate.num_paths, int(count)
-    n = max(a + b, 1)
-    delta = jtu.tree_map(lambda x, y: y.astype(float) - x, estimate.mean, mean)
-    return Expectation(
-        mean=jtu.tree_map(lambda x, d: x + d * (b / n), estimate.mean, delta),
-        sum_of_squares=jtu.tree_map(
-            lambda x, y, d: x + y.astype(float) + d**2 * (a * b / n),
-            estimate.sum_of_squares,
-            squares,
-            delta,
-        ),
-        num_paths=a + b,
-        num_failed=estimate.num_failed + int(failed),
-        key_data=estimate.key_data,
-    )
