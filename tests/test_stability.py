@@ -204,7 +204,7 @@ def test_stiff_nonlinear_energies():
     "system, dtype",
     [
         pytest.param(rounding.KUBO, np.float64, marks=pytest.mark.core),
-        pytest.param(rounding.KUBO, np.float32, marks=pytest.mark.core),
+        (rounding.KUBO, np.float32),
         (rounding.RIGID_BODY, np.float64),
     ],
     ids=["Kubo, float64", "Kubo, float32", "rigid body, float64"],
