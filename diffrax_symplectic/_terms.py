@@ -15,6 +15,7 @@ from equinox.internal import ω
 from jaxtyping import Array, Float, PyTree
 
 from ._brownian import (
+    AbstractWrappedPath,
     FixedStepBrownianPath,
     PlateauBrownianPath,
     TruncatedBrownianPath,
@@ -174,6 +175,7 @@ def tree_sum(values: list[Y]) -> Y:
 
 def controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, list]:
     """The random variables of the step from `t0` to `t1`, for each noise term."""
+    t1 = _within_resolution(noise, t0, t1)
     draw = (
         _drawn
         if _are_cheap(noise)
@@ -209,6 +211,31 @@ def _drawn(noise: tuple, t0, t1, use_levy: bool) -> list:
     if use_levy:
         return [term.contr(t0, t1, use_levy=True) for term in noise]
     return [term.contr(t0, t1) for term in noise]
+
+
+def _within_resolution(noise: tuple, t0, t1) -> RealScalarLike:
+    """`t1`, with an error when run if a tree does not resolve the step."""
+    h = jnp.abs(t1 - t0)
+    for path in map(_innermost, brownian_paths(noise)):
+        if isinstance(path, diffrax.VirtualBrownianTree):
+            # The tree keeps its tolerance in units of its length.
+            tol = path.tol * (path.t1 - path.t0)
+            # What rounding leaves at the end of a solve is no step.
+            coarse = (h < 0.999 * tol) & (h > 1e-6 * tol)
+            t1 = eqx.error_if(
+                t1,
+                coarse,
+                "A step is shorter than `tol` of the `VirtualBrownianTree`, which only "
+                "interpolates there, so that the noise would be too small. Pass a smaller "
+                "`tol`, or for fixed steps `FixedStepBrownianPath(shape, key)`.",
+            )
+    return t1
+
+
+def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
+    while isinstance(path, AbstractWrappedPath):
+        path = path.path
+    return path
 
 
 def _are_cheap(noise: tuple) -> bool:

@@ -20,4 +20,7 @@ from ._weak import (
     WeakBrownianPath as WeakBrownianPath,
     WeakIncrement as WeakIncrement,
 )
-from ._wrapper import increment_struct as increment_struct
+from ._wrapper import (
+    AbstractWrappedPath as AbstractWrappedPath,
+    increment_struct as increment_struct,
+)
