@@ -35,6 +35,7 @@ from ._solver import (
     LevyAreaMidpoint as LevyAreaMidpoint,
     Midpoint as Midpoint,
     NinomiyaVictoir as NinomiyaVictoir,
+    PlateauGauss as PlateauGauss,
     PlateauVerlet as PlateauVerlet,
     SRKs1 as SRKs1,
     SRKs2 as SRKs2,

@@ -49,7 +49,8 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     r"""Residuals of the conditions for weak order 1 or 2.
 
     - For a [`diffrax_symplectic.GeneralTableau`][] with three-point increments: weak
-        order 1 for any number of noises, weak order 2 for one.
+        order 1 for any number of noises, weak order 2 for one. With the variable `"L"`,
+        what its brackets add is counted in.
     - For a [`diffrax_symplectic.PartitionedTableau`][] or
         [`diffrax_symplectic.SeparableTableau`][] (where $\hat\alpha = \alpha$ and
         $A = \hat A = A^0$): what remains of the conditions for Itô equations if the noise
@@ -162,6 +163,9 @@ def _(tableau: GeneralTableau) -> tuple[dict, dict]:
     al, be = tableau.alpha, tableau.beta
     A0, A1, B0, B1 = tableau.A0, tableau.A1, tableau.B0, tableau.B1
     A0e, A1e, B0e, B1e = (x.sum(axis=1) for x in (A0, A1, B0, B1))
+    # The expectation of the double brackets, E L_kl = h^2 delta_kl / 12 in front of
+    # [b, [b, a]] = a''bb + a'b'b - b''ba - 2 b'a'b + b'b'a.
+    L = be.sum() / 12 if "L" in tableau.noise else 0.0
     first = {
         "alpha.e - 1": al.sum() - 1,
         "(beta.e)^2 - 1": be.sum() ** 2 - 1,
@@ -171,17 +175,17 @@ def _(tableau: GeneralTableau) -> tuple[dict, dict]:
         "alpha.A0e - 1/2": al @ A0e - 1 / 2,
         "beta.A1e - 1/2": be @ A1e - 1 / 2,
         "(beta.e)(alpha.B0e) - 1/2": be.sum() * (al @ B0e) - 1 / 2,
-        "alpha.(B0e)^2 - 1/2": al @ B0e**2 - 1 / 2,
-        "alpha.B0(B1e) - 1/4": al @ B0 @ B1e - 1 / 4,
-        "beta.A1(B0e)": be @ A1 @ B0e,
+        "alpha.(B0e)^2 - 1/2": al @ B0e**2 - 1 / 2 + 2 * L,
+        "alpha.B0(B1e) - 1/4": al @ B0 @ B1e - 1 / 4 + L,
+        "beta.A1(B0e)": be @ A1 @ B0e - 2 * L,
         "beta.(B1e)^2 - 1/3": be @ B1e**2 - 1 / 3,
         "beta.B1(B1e) - 1/6": be @ B1 @ B1e - 1 / 6,
         "beta.(B1e)^3 - 1/4": be @ B1e**3 - 1 / 4,
         "beta.((B1e)(B1(B1e))) - 1/8": be @ (B1e * (B1 @ B1e)) - 1 / 8,
         "beta.B1((B1e)^2) - 1/12": be @ B1 @ B1e**2 - 1 / 12,
         "beta.B1(B1(B1e)) - 1/24": be @ B1 @ B1 @ B1e - 1 / 24,
-        "beta.((A1e)(B1e)) - 1/4": be @ (A1e * B1e) - 1 / 4,
-        "beta.B1(A1e) - 1/4": be @ B1 @ A1e - 1 / 4,
+        "beta.((A1e)(B1e)) - 1/4": be @ (A1e * B1e) - 1 / 4 - L,
+        "beta.B1(A1e) - 1/4": be @ B1 @ A1e - 1 / 4 + L,
     }
     return first, second
 

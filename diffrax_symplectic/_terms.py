@@ -14,6 +14,7 @@ from diffrax._term import WrapTerm
 from equinox.internal import ω
 from jaxtyping import Array, Float, PyTree
 
+from ._bridge import apply_bridge, bridge
 from ._brownian import (
     AbstractWrappedPath,
     FixedStepBrownianPath,
@@ -173,8 +174,11 @@ def tree_sum(values: list[Y]) -> Y:
     return ft.reduce(lambda a, b: (a**ω + b**ω).ω, values)
 
 
-def controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, list]:
-    """The random variables of the step from `t0` to `t1`, for each noise term."""
+def controls(
+    noise: tuple, names: list[str], t0, t1, solver: str, optional: tuple[str, ...] = ()
+) -> dict[str, list]:
+    """The random variables of the step from `t0` to `t1`, for each noise term; those of
+    `optional` if all increments hold them."""
     t1 = _within_resolution(noise, t0, t1)
     draw = (
         _drawn
@@ -185,8 +189,9 @@ def controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, l
         return {"W": draw(noise, t0, t1, False)}
     increments = draw(noise, t0, t1, True)
     # The most telling advice first.
+    held = lambda name: all(getattr(i, name, None) is not None for i in increments)
     for name in sorted(names, key=lambda x: [*VARIABLES, x].index(x)):
-        if any(getattr(increment, name, None) is None for increment in increments):
+        if not held(name):
             variable = VARIABLES.get(name)
             advice = f"increments with the attribute `{name}`"
             raise ValueError(
@@ -196,7 +201,7 @@ def controls(noise: tuple, names: list[str], t0, t1, solver: str) -> dict[str, l
         name: [
             _in_time(term, name, getattr(i, name)) for term, i in zip(noise, increments)
         ]
-        for name in names
+        for name in [*names, *filter(held, optional)]
     }
 
 
@@ -250,15 +255,28 @@ def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
 
 
 def noise_driven(
-    noise: tuple, names: list[str], t0, t1, args: Args, solver: str
+    drift: tuple, noise: tuple, names: list[str], t0, t1, args: Args, solver: str
 ) -> dict[str, jtu.Partial]:
     """What drives noise stages over the step, for each random variable."""
+    draw = lambda names, *optional: controls(noise, names, t0, t1, solver, optional)
+    if "L" not in names:
+        drawn = draw(names)
+    else:
+        # It is computed from others.
+        own = [name for name in names if name != "L"]
+        drawn = draw([*dict.fromkeys(["W", "H", *own])], "K")
     driven = {}
-    for name, values in controls(noise, names, t0, t1, solver).items():
-        if name != "A":
-            driven[name] = jtu.Partial(apply, noise, values, args)
+    for name in names:
+        if name == "L":
+            along = drift_driven(drift, t0, t1, args)
+            bridges = bridge(t1 - t0, drawn["W"], drawn["H"], drawn.get("K"))
+            driven[name] = jtu.Partial(
+                apply_bridge, along, noise, bridges, t1 - t0, args
+            )
+        elif name != "A":
+            driven[name] = jtu.Partial(apply, noise, drawn[name], args)
         elif len(noise) == 1:
-            driven[name] = jtu.Partial(apply_brackets, noise[0], values[0], args)
+            driven[name] = jtu.Partial(apply_brackets, noise[0], drawn[name][0], args)
         else:
             raise ValueError(
                 f"`{solver}` needs all noises in one term, whose path samples the Lévy "

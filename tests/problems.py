@@ -81,6 +81,7 @@ class _AnyIncrement(diffrax.AbstractSpaceTimeLevyArea, ds.WeakIncrement):
     """An increment with everything that a solver may ask for."""
 
     H: PyTree = None
+    K: PyTree = None
     C: PyTree = None
     A: PyTree = None
 
@@ -95,6 +96,7 @@ class Given(diffrax.AbstractBrownianPath):
     C: jax.Array | None = None
     A: jax.Array | None = None
     two_point: jax.Array | None = None
+    K: jax.Array | None = None
     t0 = 0
     t1 = 1
     levy_area = _AnyIncrement
@@ -109,6 +111,7 @@ class Given(diffrax.AbstractBrownianPath):
             two_point=self.two_point,
             third=self.third,
             H=self.H,
+            K=self.K,
             C=self.C,
             A=self.A,
         )

@@ -26,6 +26,10 @@ class RandomVariable(NamedTuple):
     even: bool = False
 
 
+_SPACE_TIME_AREA = (
+    "space-time Lévy area. Pass a path that has it, for example "
+    "`FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`"
+)
 # By the name on the increment. Those whose increments hold more come first.
 VARIABLES = {
     "A": RandomVariable(
@@ -40,10 +44,13 @@ VARIABLES = {
         "key)`",
         variance=1 / 6,
     ),
+    # On no increment: it is computed from `W`, `H` and, where there is one, `K`.
+    "L": RandomVariable(
+        diffrax.AbstractSpaceTimeLevyArea, _SPACE_TIME_AREA, variance=None
+    ),
     "H": RandomVariable(
         diffrax.AbstractSpaceTimeLevyArea,
-        "space-time Lévy area. Pass a path that has it, for example "
-        "`FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`",
+        _SPACE_TIME_AREA,
         variance=1 / 12,
         # The bridge, seen from its other end, has the same integral.
         even=True,

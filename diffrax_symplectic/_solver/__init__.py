@@ -15,5 +15,6 @@ from .levy_area_midpoint import LevyAreaMidpoint as LevyAreaMidpoint
 from .ninomiya_victoir import NinomiyaVictoir as NinomiyaVictoir
 from .strang_gauss import StrangGauss as StrangGauss
 from .additive_gauss import AdditiveGauss as AdditiveGauss
+from .plateau_gauss import PlateauGauss as PlateauGauss
 from .plateau_verlet import PlateauVerlet as PlateauVerlet
 from .stormer_verlet import StormerVerlet as StormerVerlet

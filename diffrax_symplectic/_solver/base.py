@@ -1,5 +1,6 @@
 """The solvers' common base, and the step of any tableau."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import ClassVar, TYPE_CHECKING, TypeAlias
 
@@ -104,19 +105,26 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         plan = make_plan(_drop_absent(self.tableau.flatten(), drift, noise))
         variables = _variables(plan.tableau)
         driven = {"h": drift_driven(drift, t0, t1, args)}
-        driven |= noise_driven(noise, variables, t0, t1, args, type(self).__name__)
+        name = type(self).__name__
+        driven |= noise_driven(drift, noise, variables, t0, t1, args, name)
         y1, result = take_step(plan, Step(t0, t1 - t0, driven), y0, self)
         return y1, None, dict(y0=y0, y1=y1), None, result
 
 
 def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTableau:
-    """Leaves out the stages that no term drives (an ODE has no noise)."""
+    """Leaves out the stages that no term drives (an ODE has no noise), and the brackets of
+    drift and noise unless there are both."""
     keep = [
         i
         for i, stage in enumerate(tableau.stages)
         if len(drift if stage.channels == ("h",) else noise) > 0
     ]
-    return tableau.take(keep)
+    tableau = tableau.take(keep)
+    if len(drift) > 0:
+        return tableau
+    without = lambda stage: tuple(c for c in stage.channels if c != "L")
+    stages = tuple(stage._replace(channels=without(stage)) for stage in tableau.stages)
+    return dataclasses.replace(tableau, stages=stages)
 
 
 def _variables(tableau: FlatTableau) -> list[str]:

@@ -44,9 +44,12 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
         The path has to be [`diffrax_symplectic.PlateauBrownianPath`][] around one with
         space-time Lévy area.
 
-    **Source:** the method is new here. It extends the schemes for additive noise and for
-    second order systems of [Milstein and Tretyakov
-    (2021)](https://doi.org/10.1007/978-3-030-82040-4), chapters 4 and 5.
+    **Source:** the path is that of [Foster, dos Reis and Strange
+    (2024)](https://doi.org/10.1137/23M155147X), whose $C_k$ depend on $W_k$, $H_k$ and the
+    sign of a third integral of the path; in our tests those had half the error. The signs
+    here are independent of the path. For additive noise and second order systems see
+    [Milstein and Tretyakov (2021)](https://doi.org/10.1007/978-3-030-82040-4), chapters 4
+    and 5.
     """
 
     tableau: ClassVar[PartitionedTableau] = _tab

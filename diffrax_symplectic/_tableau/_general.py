@@ -35,7 +35,9 @@ class GeneralTableau(AbstractTableau):
     `noise`, the random variables that drive the noise stages: `("W",)`, of which `"W"` is
     $I_k$, or `("W", "A")` for $\sum_k b_k I_k + \sum_{k<l} [b_k, b_l] A_{kl}$, with the
     Lie brackets $[b_k, b_l] = b_l' b_k - b_k' b_l$ and the Lévy areas $A_{kl}$ of a
-    [`diffrax_symplectic.LevyAreaIncrement`][].
+    [`diffrax_symplectic.LevyAreaIncrement`][], or `("W", "L")` for
+    $\sum_k b_k I_k + h \sum_k [b_k, a] H_k + \sum_{k, l} [b_k, [b_l, a]] L_{kl}$ with the
+    variables of [`diffrax_symplectic.PlateauGauss`][].
 
     **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
     real numbers.

@@ -1,0 +1,223 @@
+"""Strong order 3/2 for any Hamiltonians, by brackets of noise and drift."""
+
+import dataclasses
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from .problems import (
+    FineSample,
+    Given,
+    H0,
+    local_weak_orders,
+    noise,
+    random_problem,
+    rigid_body_terms,
+    slope,
+    weak_path,
+)
+
+
+solver = ds.PlateauGauss()
+
+
+def test_tableau_is_symplectic_and_of_weak_order_two_by_its_brackets():
+    tableau = solver.tableau
+    assert np.max(np.abs(ds.symplectic_residuals(tableau))) <= 1e-15
+    assert max(map(abs, ds.weak_order_residuals(tableau, 2).values())) <= 1e-15
+    assert max(map(abs, ds.strong_order_residuals(tableau).values())) <= 1e-15
+    without = ds.weak_order_residuals(dataclasses.replace(tableau, noise=("W",)), 2)
+    assert sum(abs(r) > 0.05 for r in without.values()) == 5
+
+
+@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-6)])
+def test_step_is_symplectic_for_a_thousand_random_systems(dtype, bound):
+    def defect(key):
+        k_problem, k_m, k_h, *ks = jr.split(key, 6)
+        y0, args = random_problem(k_problem, 2, 2, dtype)
+        # One noise or two.
+        size, *phases = args["noise"]
+        used = jnp.arange(2) < jr.randint(k_m, (), 1, 3)
+        args["noise"] = (jnp.where(used[:, None], size, 0), *phases)
+        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
+        draw = lambda key, v: jnp.sqrt(v * h) * jr.normal(key, (2,), dtype)
+        W, H, K = (draw(k, v) for k, v in zip(ks, (1, 1 / 12, 1 / 720)))
+        terms = ds.hamiltonian_terms(H0, noise, Given(W, H=H, K=K))
+        return ds.symplecticity_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
+
+    defects = jax.jit(jax.vmap(defect))(jr.split(jr.key(0), 1000))
+    assert defects.dtype == dtype
+    assert jnp.max(defects) <= bound
+
+
+def _linear_terms(path, *matrices):
+    A, Bs = matrices[0], jnp.stack(matrices[1:])
+    diffusion = lambda t, y, args: jnp.einsum("kij,j->ik", Bs, y)
+    return diffrax.MultiTerm(
+        diffrax.ODETerm(lambda t, y, args: A @ y), diffrax.ControlTerm(diffusion, path)
+    )
+
+
+@pytest.mark.parametrize("with_K", [False, True])
+def test_step_is_the_gauss_method_on_the_field_of_the_docstring(with_K):
+    rng = np.random.default_rng(0)
+    A, B, C = rng.normal(size=(3, 3, 3))
+    W, H, K = 0.3 * rng.normal(size=(3, 2))
+    h = 0.3
+    bracket = lambda B, A: A @ B - B @ A
+    L = 3 / 5 * h * np.outer(H, H)
+    if with_K:
+        L += 60 / 7 * h * np.outer(K, K) - h * (np.outer(W, K) + np.outer(K, W)) / 2
+        L += 3 / 140 * h**2 * np.eye(2)
+    else:
+        L += h**2 / 30 * np.eye(2)
+    omega = h * A
+    for k, X in enumerate((B, C)):
+        omega += W[k] * X + h * H[k] * bracket(X, A)
+        for j, Y in enumerate((B, C)):
+            omega += L[k, j] * bracket(X, bracket(Y, A))
+    # The stability function of the Gauss method with two stages.
+    even, odd = np.eye(3) + omega @ omega / 12, omega / 2
+    y0 = rng.normal(size=3)
+    expected = np.linalg.solve(even - odd, (even + odd) @ y0)
+
+    path = Given(*map(jnp.asarray, (W, H)), K=jnp.asarray(K) if with_K else None)
+    stubborn = dataclasses.replace(solver, root_find_max_steps=100)
+    step = lambda terms: eqx.filter_jit(
+        lambda y: stubborn.step(terms, 0.0, h, y, None, None, False)[0]
+    )(jnp.asarray(y0))
+    actual = step(_linear_terms(path, A, B, C))
+    np.testing.assert_allclose(actual, expected, rtol=1e-12)
+
+    # Each noise in a term of its own.
+    def one(k):
+        K_k = path.K[k : k + 1] if path.K is not None else None
+        return Given(path.W[k : k + 1], H=path.H[k : k + 1], K=K_k)
+
+    drift, first = _linear_terms(one(0), A, B).terms
+    second = _linear_terms(one(1), A, C).terms[1]
+    apart = step(diffrax.MultiTerm(drift, first, second))
+    np.testing.assert_allclose(apart, expected, rtol=1e-12)
+
+
+def _drift(t, p, q, args):
+    return p**2 / 4 + q**4 / 8 + 0.15 * (1 + jnp.sin(3 * t)) * p * q**2
+
+
+def _one(t, p, q, args):
+    return jnp.stack([jnp.sin(q + 3 * t) / 2 + 0.4 * p * q + jnp.cos(p) / 5])
+
+
+def _two_that_commute(t, p, q, args):
+    """Two functions of one function."""
+    f = p**2 / 2 + jnp.cos(q) + p * q / 2
+    return jnp.stack([0.4 * jnp.sin(f), 0.3 * f])
+
+
+_STEPS = np.array([2.0**-k for k in (3, 4, 5, 6)])
+
+
+@pytest.mark.parametrize("noise, m", [(_one, 1), (_two_that_commute, 2)])
+def test_strong_order_three_halves(noise, m):
+    """Neither is separable, and the drift depends on time, the noise in the first, too."""
+    y0, fine, samples = (jnp.array(0.3), jnp.array(0.8)), 2**9, 200
+
+    @jax.jit
+    @jax.vmap
+    def ends(key):
+        terms = ds.hamiltonian_terms(_drift, noise, FineSample.draw(key, fine, m))
+        solve = lambda h: jnp.stack(
+            diffrax.diffeqsolve(
+                terms, solver, 0.0, 1.0, h, y0, adjoint=diffrax.ForwardMode()
+            ).ys
+        )[:, -1]
+        return jax.lax.map(solve, jnp.array([*_STEPS, 1 / fine]))
+
+    ys = ends(jr.split(jr.key(0), samples))
+    squared = jnp.sum((ys[:, :-1] - ys[:, -1:]) ** 2, axis=-1)
+    measured = slope(_STEPS, np.sqrt(jnp.mean(squared, axis=0)))
+    assert abs(measured - 1.5) <= 0.1, measured
+
+
+def test_weak_order_two():
+    levy = diffrax.SpaceTimeLevyArea
+    path = diffrax.UnsafeBrownianPath((1,), jr.key(0), levy)
+    # In this one no leading error of a test function happens to be small.
+    y0, args = jax.vmap(lambda key: random_problem(key, 1, 1))(
+        jr.split(jr.key(0), 2)[:1]
+    )
+    terms = ds.hamiltonian_terms(H0, noise, path)
+    hs = np.array([0.02, 0.01, 0.005])
+    slopes = local_weak_orders(terms, solver, y0, args, hs, order=2, nodes=5)
+    assert solver.weak_order(terms) == 2
+    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
+
+
+def test_backward_in_time_it_undoes_its_steps():
+    """The Gauss method is its own inverse, and the field of the path run backward is the
+    negative of that forward."""
+    terms = ds.hamiltonian_terms(_drift, _one, FineSample.draw(jr.key(0), 8, 1))
+    y0 = jnp.array(0.3), jnp.array(0.8)
+    there = diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.125, y0)
+    y1 = jax.tree.map(lambda y: y[-1], there.ys)
+    back = diffrax.diffeqsolve(terms, solver, 1.0, 0.0, -0.125, y1)
+    for a, b in zip(back.ys, y0):
+        np.testing.assert_allclose(a[-1], b, atol=1e-12)
+    assert abs(y1[0] - y0[0]) > 0.1
+
+
+def test_a_shared_quadratic_invariant_is_conserved():
+    levy = diffrax.SpaceTimeLevyArea
+    path = diffrax.UnsafeBrownianPath((), jr.key(0), levy)
+    X0 = jnp.array([np.cos(1.1), 0.0, np.sin(1.1)])
+    terms = rigid_body_terms(path, mu=0.5)
+    kwargs = dict(adjoint=diffrax.ForwardMode())
+    sol = diffrax.diffeqsolve(terms, solver, 0.0, 10.0, 0.1, X0, **kwargs)
+    assert abs(jnp.linalg.norm(sol.ys[-1]) - 1) <= 1e-14
+
+
+def test_gradients_failures_and_single_precision():
+    H0 = lambda t, p, q, args: args * p**2 / 2 + q**4 / 4
+
+    def end(args, key):
+        W, H = jnp.array([[0.3], [0.1]], args.dtype) * jr.normal(key, (), args.dtype)
+        terms = ds.hamiltonian_terms(H0, _one, Given(W, H=H))
+        y0 = jnp.asarray(0.3, args.dtype), jnp.asarray(0.8, args.dtype)
+        t0, t1, h = jnp.array([0.0, 0.5, 0.125], args.dtype)
+        sol = diffrax.diffeqsolve(terms, solver, t0, t1, h, y0, args, throw=False)
+        return sol.ys[1][-1], sol.result == diffrax.RESULTS.successful
+
+    keys = jr.split(jr.key(0), 4)
+    args = jnp.array([1.0, 1.5, jnp.inf, 2.0])
+    q, success = jax.jit(jax.vmap(end))(args, keys)
+    np.testing.assert_array_equal(success, [True, True, False, True])
+    low, success = jax.jit(jax.vmap(end))(args.astype(jnp.float32), keys)
+    assert low.dtype == jnp.float32
+    np.testing.assert_array_equal(success, [True, True, False, True])
+    value = jax.jit(lambda x: end(x, keys[0])[0])
+    gradient = jax.jit(jax.grad(value))(args[0])
+    difference = (value(args[0] + 1e-5) - value(args[0] - 1e-5)) / 2e-5
+    np.testing.assert_allclose(gradient, difference, rtol=1e-7)
+
+
+def test_drift_alone_noise_alone_and_paths_without_area():
+    y0 = jnp.array(0.3), jnp.array(0.8)
+    levy = diffrax.SpaceTimeLevyArea
+    path = diffrax.UnsafeBrownianPath((1,), jr.key(0), levy)
+    for term in ds.hamiltonian_terms(_drift, _one, path).terms:
+        terms = diffrax.MultiTerm(term) if term.is_vf_expensive else term
+        step = solver.step(terms, 0.0, 0.1, y0, None, None, False)
+        assert all(jnp.isfinite(y) for y in step[0])
+    assert solver.minimal_levy_area is diffrax.AbstractSpaceTimeLevyArea
+    terms = ds.hamiltonian_terms(_drift, _one, weak_path(1))
+    with pytest.raises(ValueError, match="`PlateauGauss` needs space-time Lévy area"):
+        diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0)
+    two = ds.hamiltonian_terms(_drift, _two_that_commute, weak_path(2))
+    assert solver.strong_order(two) == 0.5 and solver.weak_order(two) == 1
