@@ -13,6 +13,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import PRNGKeyArray, PyTree
 
+from ._brownian import WeakBrownianPath
 from ._custom_types import Args, RealScalarLike, Y
 from ._structure_checks import (
     additive_fault,
@@ -200,7 +201,7 @@ def _suggestion(rule: Rule, terms: diffrax.AbstractTerm, commute: bool) -> Sugge
     # The orders of noises that commute are those of one noise.
     counted = terms
     if commute:
-        path = diffrax.UnsafeBrownianPath((), jr.key(0))
+        path = WeakBrownianPath((), jr.key(0))
         counted = diffrax.ControlTerm(lambda t, y, args: y, path)
     kind = PATHS[rule.path]
     return Suggestion(

@@ -9,6 +9,7 @@ import jax.random as jr
 from jaxtyping import PRNGKeyArray
 
 from ._brownian import (
+    FixedStepBrownianPath,
     LevyAreaBrownianPath,
     PlateauBrownianPath,
     TruncatedBrownianPath,
@@ -42,15 +43,15 @@ class PathKind(NamedTuple):
 
 
 def _gaussian(shape, key) -> _Path:
-    return diffrax.UnsafeBrownianPath(shape, key)
+    return FixedStepBrownianPath(shape, key)
 
 
 def _with_area(shape, key) -> _Path:
-    return diffrax.UnsafeBrownianPath(shape, key, levy_area=diffrax.SpaceTimeLevyArea)
+    return FixedStepBrownianPath(shape, key, levy_area=diffrax.SpaceTimeLevyArea)
 
 
-_GAUSSIAN = "diffrax.UnsafeBrownianPath({shape}, key)"
-_AREA = "diffrax.UnsafeBrownianPath({shape}, key, levy_area=diffrax.SpaceTimeLevyArea)"
+_GAUSSIAN = "ds.FixedStepBrownianPath({shape}, key)"
+_AREA = "ds.FixedStepBrownianPath({shape}, key, levy_area=diffrax.SpaceTimeLevyArea)"
 _weak = lambda **kwargs: lambda shape, key: WeakBrownianPath(shape, key, **kwargs)
 _around_area = lambda wrapper: (
     lambda shape, key: wrapper(_with_area(shape, key), jr.fold_in(key, 1))

@@ -143,14 +143,7 @@ def test_first_suggestion_solves_as_it_stands(case):
             best = ds.suggest_solver(terms, y0, want=want)[0]
         assert type(best.solver).__name__ == name
         sol = diffrax.diffeqsolve(
-            best.terms(jr.key(1)),
-            best.solver,
-            0,
-            0.2,
-            0.1,
-            y0,
-            max_steps=2,
-            adjoint=diffrax.ForwardMode(),
+            best.terms(jr.key(1)), best.solver, 0, 0.2, 0.1, y0, max_steps=2
         )
         assert jnp.all(jnp.isfinite(sol.ys[0]))
 

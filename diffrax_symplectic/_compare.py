@@ -1,0 +1,310 @@
+"""Speed against accuracy of solvers on one system."""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PRNGKeyArray
+
+from ._brownian import (
+    FixedStepBrownianPath,
+    LevyAreaBrownianPath,
+    LevyAreaIncrement,
+    PlateauBrownianPath,
+    PlateauIncrement,
+    WeakBrownianPath,
+)
+from ._custom_types import Args, Y
+from ._expectation import expectation
+from ._suggest import suggest_solver
+from ._suggestion_rules import PATHS, RULES
+
+
+# How many steps of the reference there are in the smallest step that is compared.
+_FINER = 8
+
+
+class ComparedStep(NamedTuple):
+    """One solver at one step size.
+
+    - `solver`: the name of the solver.
+    - `dt`: the step size.
+    - `error`, `std_error`: the error, and its standard error.
+    - `seconds`: the measured time of a path.
+    - `num_failed`: how many paths failed; they have no part in the error.
+    """
+
+    solver: str
+    dt: float
+    error: float
+    std_error: float
+    seconds: float
+    num_failed: int
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Comparison:
+    """What [`diffrax_symplectic.compare_solvers`][] returns. To print it gives a table.
+
+    - `kind`: `"strong"` or `"weak"`.
+    - `steps`: one [`diffrax_symplectic.ComparedStep`][] for each solver and step size.
+    - `refused`: the solvers that do not fit the terms, each with the reason.
+    """
+
+    kind: str
+    steps: tuple[ComparedStep, ...]
+    refused: dict[str, str]
+
+    def __str__(self) -> str:
+        title = f"{self.kind} error"
+        lines = [f"{'solver':20} {'dt':>9} {title:>22} {'seconds per path':>17}"]
+        for s in self.steps:
+            failed = f"  {s.num_failed} failed" if s.num_failed else ""
+            error = f"{s.error:.1e} +- {s.std_error:.0e}"
+            row = f"{s.solver:20} {s.dt:9.3g} {error:>22} {s.seconds:17.1e}"
+            lines.append(row + failed)
+        lines += [f"{name}: {why}" for name, why in self.refused.items()]
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draws errors against times, with three standard errors, and returns the axes.
+
+        **Arguments:**
+
+        - `axes`: Matplotlib's axes; by default new ones.
+
+        **Raises:** an `ImportError` without Matplotlib.
+        """
+        try:
+            import matplotlib.pyplot as plt
+        except ImportError as error:
+            raise ImportError(
+                "To plot needs Matplotlib: `pip install 'diffrax_symplectic[examples]'`, "
+                "or `pip install matplotlib`."
+            ) from error
+        if axes is None:
+            _, axes = plt.subplots(layout="constrained")
+        for name in dict.fromkeys(s.solver for s in self.steps):
+            own = [s for s in self.steps if s.solver == name]
+            axes.errorbar(
+                [s.seconds for s in own],
+                [s.error for s in own],
+                [3 * s.std_error for s in own],
+                label=name,
+                marker="o",
+                capsize=2,
+            )
+        axes.set(
+            xscale="log",
+            yscale="log",
+            xlabel="seconds per path",
+            ylabel=f"{self.kind} error",
+        )
+        axes.legend()
+        return axes
+
+
+def compare_solvers(
+    make_terms: Callable[[Any], diffrax.AbstractTerm],
+    y0: Y,
+    t0: float,
+    t1: float,
+    *,
+    dts: Sequence[float],
+    key: PRNGKeyArray,
+    shape: Any = (),
+    solvers: Sequence[diffrax.AbstractSolver] | None = None,
+    phi: Callable[[Y], Array] | None = None,
+    args: Args = None,
+    num_paths: int = 1000,
+) -> Comparison:
+    r"""Measures speed against accuracy on a system of your own.
+
+    Without `phi` errors are strong: root mean squares of $|y - y^*|$ at `t1`, with $y^*$
+    a solution along the same Brownian path in steps an eighth of the smallest of `dts`.
+    With `phi` they are weak: $|\mathbb E \phi(y) - \mathbb E \phi(y^*)|$ at `t1`, by
+    independent paths; their standard errors fall as one over the root of `num_paths`. The
+    solver of $y^*$ is the first that [`diffrax_symplectic.suggest_solver`][] names.
+
+    Times are those of a batch of paths on this machine, divided by their number, without
+    compiling.
+
+    !!! example
+
+        ```python
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+        import jax.random as jr
+
+        H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
+        noise = lambda t, p, q, args: 0.1 * jnp.sin(q)
+        make_terms = lambda path: ds.hamiltonian_terms(H0, noise, path)
+        y0 = (jnp.array(0.0), jnp.array(1.0))
+        print(
+            ds.compare_solvers(
+                make_terms,
+                y0,
+                0.0,
+                1.0,
+                dts=[0.25, 0.125],
+                solvers=[ds.StormerVerlet(), ds.Midpoint()],
+                key=jr.key(0),
+            )
+        )
+        ```
+
+    **Arguments:**
+
+    - `make_terms`: takes a Brownian path to the terms.
+    - `y0`, `t0`, `t1`, `args`: as for `diffrax.diffeqsolve`, with numbers for the times.
+    - `dts`: the step sizes; each divides the interval, and is a multiple of the smallest.
+    - `key`: a JAX random key.
+    - `shape`: the shape of the Brownian paths, as `(m,)` for `m` noises.
+    - `solvers`: by default those that `suggest_solver` names.
+    - `phi`: takes a state to a number.
+    - `num_paths`: how many paths.
+
+    **Returns:** a [`diffrax_symplectic.Comparison`][]. A solver that does not fit the terms
+    is named there with the reason, and the others are compared.
+
+    **Raises:** a `ValueError` if a step size does not divide the interval or is no multiple
+    of the smallest.
+    """
+    dts = _checked_steps(t0, t1, dts)
+    want = "paths" if phi is None else "expectations"
+    terms = make_terms(WeakBrownianPath(shape, key))
+    suggestions = suggest_solver(terms, y0, args, want=want, t0=t0)
+    reference = suggestions[0].solver
+    if solvers is None:
+        solvers = [s.solver for s in suggestions]
+    cell = min(dts) / _FINER
+
+    def end(solver, path, dt):
+        sol = diffrax.diffeqsolve(
+            make_terms(path),
+            solver,
+            t0,
+            t1,
+            dt,
+            y0,
+            args,
+            max_steps=None,
+            adjoint=diffrax.ForwardMode(),
+            throw=False,
+        )
+        return jtu.tree_map(lambda y: y[-1], sol.ys), sol.result
+
+    def sample(solver, dt, key):
+        y1, result = end(solver, _path(solver, shape, key, want), dt)
+        return (y1 if phi is None else phi(y1)), result
+
+    named, refused = {}, {}
+    for solver in solvers:
+        try:
+            eqx.filter_eval_shape(sample, solver, dts[0], key)
+            named[repr(solver)] = solver
+        except ValueError as error:
+            refused[repr(solver)] = str(error).splitlines()[0]
+
+    if phi is None:
+        errors = _strong_errors(end, named, reference, shape, dts, cell, key, num_paths)
+    fine = None
+    steps = []
+    for name, solver in named.items():
+        at = lambda dt, f=eqx.Partial(sample, solver): eqx.Partial(f, jnp.asarray(dt))
+        # Compiles the program, in which the step size is an array.
+        expectation(at(dts[0]), key, num_paths)
+        for i, dt in enumerate(dts):
+            start = time.perf_counter()
+            estimate = expectation(at(dt), jr.fold_in(key, i), num_paths)
+            seconds = (time.perf_counter() - start) / num_paths
+            if phi is None:
+                error, bar, failed = errors[name][i]
+            else:
+                if fine is None:
+                    of = eqx.Partial(sample, reference, jnp.asarray(cell))
+                    fine = expectation(of, jr.fold_in(key, len(dts)), num_paths)
+                error = abs(float(estimate.mean - fine.mean))
+                bar = float(np.hypot(estimate.std_error, fine.std_error))
+                failed = estimate.num_failed
+            steps.append(ComparedStep(name, dt, error, bar, seconds, failed))
+    return Comparison("strong" if phi is None else "weak", tuple(steps), refused)
+
+
+def _checked_steps(t0, t1, dts: Sequence[float]) -> list[float]:
+    whole = lambda x: math.isfinite(x) and x > 0.5 and abs(x - round(x)) < 1e-6
+    for dt in dts:
+        if not dt or not whole((t1 - t0) / dt) or not whole(dt / min(dts)):
+            raise ValueError(
+                f"Every step in `dts` must divide the interval from {t0} to {t1} and be a "
+                f"multiple of the smallest; got {dt}. Take for example "
+                "`[(t1 - t0) / 2**k for k in range(3, 8)]`."
+            )
+    if len(dts) == 0:
+        raise ValueError("`dts` must hold at least one step size.")
+    return [float(dt) for dt in dts]
+
+
+def _path(solver, shape, key, want: str) -> diffrax.AbstractBrownianPath:
+    """A path for `solver`, which samples each step by itself."""
+    for rule in RULES:
+        if type(solver) is rule.solver and rule.want == want:
+            return PATHS[rule.path].make(shape, key)
+    return _common_path(solver, shape, key, None)
+
+
+def _common_path(solver, shape, key, cell) -> diffrax.AbstractBrownianPath:
+    """The same Brownian motion for all solvers."""
+    area = diffrax.SpaceTimeLevyArea
+    path = FixedStepBrownianPath(shape, key, levy_area=area, cell=cell)
+    needs = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
+    if needs is PlateauIncrement:
+        return PlateauBrownianPath(path, jr.fold_in(key, 1))
+    if needs is LevyAreaIncrement:
+        terms = 0 if cell else 2
+        return LevyAreaBrownianPath(path, jr.fold_in(key, 1), terms=terms, cell=cell)
+    return path
+
+
+def _strong_errors(end, named, reference, shape, dts, cell, key, num_paths) -> dict:
+    """Error, standard error and failed paths for each solver and step size."""
+    steps = jnp.asarray(dts)
+
+    def squares(key):
+        exact, solved = end(reference, _common_path(reference, shape, key, cell), cell)
+
+        def at(solver, dt):
+            y1, result = end(solver, _common_path(solver, shape, key, cell), dt)
+            squared = jtu.tree_map(lambda a, b: jnp.sum((a - b) ** 2), y1, exact)
+            okay = diffrax.is_okay(result) & diffrax.is_okay(solved)
+            total = jnp.where(okay, sum(jtu.tree_leaves(squared)), 0.0)
+            return total, total**2, okay.astype(total.dtype)
+
+        one = lambda s: jax.lax.map(lambda dt: at(s, dt), steps)
+        return {name: one(solver) for name, solver in named.items()}
+
+    if not named:
+        return {}
+    estimate = expectation(squares, key, num_paths)
+    out = {}
+    for name, (square, fourth, okay) in estimate.mean.items():
+        with np.errstate(all="ignore"):
+            count = okay * estimate.num_paths
+            mean = square / okay
+            deviation = np.sqrt(np.maximum(fourth / okay - mean**2, 0) / count)
+            rms = np.sqrt(mean)
+            bars = deviation / (2 * rms)
+        failed = np.round(num_paths - count).astype(int)
+        out[name] = list(zip(rms.tolist(), bars.tolist(), failed.tolist()))
+    return out

@@ -1,0 +1,70 @@
+"""Comparisons of solvers: their errors are what they are, and their solvers are named."""
+
+import sys
+
+import diffrax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+
+Y0 = (jnp.array(0.0), jnp.array(1.0))
+
+
+def _make_terms(path):
+    """The linear oscillator: additive and separable, with E(q^2) known at t = 1."""
+    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    return ds.hamiltonian_terms(H0, lambda t, p, q, args: -q, path)
+
+
+def test_strong_errors_are_of_the_orders_of_the_solvers():
+    solvers = [ds.SRKs4(), ds.StormerVerlet(), ds.SRKw5(), diffrax.Euler()]
+    result = ds.compare_solvers(
+        _make_terms, Y0, 0.0, 1.0, dts=[0.25, 0.125], solvers=solvers, key=jr.key(0),
+        num_paths=400,
+    )  # fmt: skip
+    order = {}
+    for name in {s.solver for s in result.steps}:
+        coarse, fine = [s.error for s in result.steps if s.solver == name]
+        order[name] = np.log2(coarse / fine)
+    names = [repr(solver) for solver in solvers]
+    # On a linear system SRKs4 has order 2. Five standard errors of the ratio are 0.25.
+    assert order[names[0]] == pytest.approx(2, abs=0.25)
+    assert order[names[1]] == pytest.approx(1, abs=0.25)
+    # One that needs weak random variables is named; the others were compared.
+    assert list(result.refused) == [names[2]]
+    assert names[3] in order
+    assert names[0] in str(result) and "second" in str(result)
+    assert all(s.seconds > 0 and s.num_failed == 0 for s in result.steps)
+    pytest.importorskip("matplotlib").use("Agg")
+    assert len(result.plot().get_legend().get_texts()) == 3
+
+
+def test_weak_error_is_within_its_bars(monkeypatch):
+    result = ds.compare_solvers(
+        _make_terms, Y0, 0.0, 1.0, dts=[0.5], solvers=[ds.SRKw1()], key=jr.key(1),
+        phi=lambda y: y[1] ** 2, num_paths=4000,
+    )  # fmt: skip
+    (step,) = result.steps
+    # The exact error of the midpoint rule at h = 1/2, by its matrix.
+    h = 0.5
+    K = np.array([[1, h / 2], [-h / 2, 1]])
+    step_map = np.linalg.solve(K, K.T)
+    forced = np.linalg.solve(K, np.array([1.0, 0.0]))
+    second = np.diag([0.0, 1.0])
+    for _ in range(2):
+        second = step_map @ second @ step_map.T + h * np.outer(forced, forced)
+    exact = abs(second[1, 1] - (np.cos(1) ** 2 + 1 / 2 - np.sin(2) / 4))
+    assert abs(step.error - exact) < 5 * step.std_error
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    with pytest.raises(ImportError, match=r"diffrax_symplectic\[examples\]"):
+        result.plot()
+
+
+@pytest.mark.parametrize("dts", [[0.3], [0.5, 1 / 3], [], [0.0], [-0.5]])
+def test_steps_that_do_not_divide_the_interval_are_refused(dts):
+    with pytest.raises(ValueError, match="`dts`"):
+        ds.compare_solvers(_make_terms, Y0, 0.0, 1.0, dts=dts, key=jr.key(0))
