@@ -217,24 +217,27 @@ def compare_solvers(
         except ValueError as error:
             refused[repr(solver)] = str(error).splitlines()[0]
 
+    def measure(solver, dt, number: int):
+        """The estimate by the paths of a number, and the seconds for each."""
+        fn = eqx.Partial(sample, solver, jnp.asarray(dt))
+        start = time.perf_counter()
+        estimate = expectation(fn, jr.fold_in(key, number), num_paths)
+        return estimate, (time.perf_counter() - start) / num_paths
+
+    strong, fine = {}, None
     if phi is None:
-        errors = _strong_errors(end, named, reference, shape, dts, cell, key, num_paths)
-    fine = None
+        strong = _strong_errors(end, named, reference, shape, dts, cell, key, num_paths)
+    else:
+        fine, _ = measure(reference, cell, 0)
     steps = []
     for name, solver in named.items():
-        at = lambda dt, f=eqx.Partial(sample, solver): eqx.Partial(f, jnp.asarray(dt))
         # Compiles the program, in which the step size is an array.
-        expectation(at(dts[0]), key, num_paths)
+        measure(solver, dts[0], 1)
         for i, dt in enumerate(dts):
-            start = time.perf_counter()
-            estimate = expectation(at(dt), jr.fold_in(key, i), num_paths)
-            seconds = (time.perf_counter() - start) / num_paths
-            if phi is None:
-                error, bar, failed = errors[name][i]
+            estimate, seconds = measure(solver, dt, 1 + i)
+            if fine is None:
+                error, bar, failed = strong[name][i]
             else:
-                if fine is None:
-                    of = eqx.Partial(sample, reference, jnp.asarray(cell))
-                    fine = expectation(of, jr.fold_in(key, len(dts)), num_paths)
                 error = abs(float(estimate.mean - fine.mean))
                 bar = float(np.hypot(estimate.std_error, fine.std_error))
                 failed = estimate.num_failed

@@ -79,21 +79,35 @@ def save(figure, name: str) -> None:
     print(f"  picture: {_output / name}", flush=True)
 
 
-def _make(figure: Callable[[bool], None], full: bool, output: Path) -> list[str]:
-    """Makes one figure; the claims that failed."""
+def _make(
+    name: str, figure: Callable[[bool], None], full: bool, output: Path
+) -> list[str]:
+    """Makes one figure; the claims that failed, with its name."""
     global _output
     _output = output
     _failed.clear()
     begin = time.perf_counter()
     figure(full)
     print(f"  {time.perf_counter() - begin:.1f} seconds", flush=True)
-    return list(_failed)
+    return [f"figure {name}: {what}" for what in _failed]
 
 
 def _make_quietly(*args) -> tuple[str, list[str]]:
     with contextlib.redirect_stdout(io.StringIO()) as text:
         failed = _make(*args)
     return text.getvalue(), failed
+
+
+def _progress(names: list[str], done: set[str], jobs: int, start: float) -> None:
+    """Says what runs, and how long the rest will take at the pace so far."""
+    rest = [name for name in names if name not in done]
+    bar = "#" * len(done) + "." * len(rest)
+    passed = time.perf_counter() - start
+    left = f", about {passed / len(done) * len(rest):.0f} s to go" if done else ""
+    running = f"; running: {', '.join(rest[:jobs])}" if rest else ""
+    print(
+        f"[{bar}] {len(done)}/{len(names)} in {passed:.0f} s{left}{running}", flush=True
+    )
 
 
 def _hasten() -> None:
@@ -122,9 +136,13 @@ def run(figures: dict[str, Callable[[bool], None]]) -> None:
     start = time.perf_counter()
     args = options.full, options.output.resolve()
     failed = []
+    done: set[str] = set()
+    _progress(names, done, jobs, start)
     if jobs == 1:
         for name in names:
-            failed += _make(figures[name], *args)
+            failed += _make(name, figures[name], *args)
+            done.add(name)
+            _progress(names, done, jobs, start)
     else:
         if not options.full and version("jaxlib").startswith("0.10."):
             # The older code generator compiles faster. XLA aborts for flags that it does
@@ -136,13 +154,16 @@ def run(figures: dict[str, Callable[[bool], None]]) -> None:
             os.environ["XLA_FLAGS"] = " ".join(flags)
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(jobs, mp_context=context, initializer=_hasten) as pool:
-            running = [
-                pool.submit(_make_quietly, figures[name], *args) for name in names
-            ]
-            for done in as_completed(running):
-                text, some = done.result()
+            running = {
+                pool.submit(_make_quietly, name, figures[name], *args): name
+                for name in names
+            }
+            for future in as_completed(running):
+                text, some = future.result()
                 print(text, end="", flush=True)
                 failed += some
+                done.add(running[future])
+                _progress(names, done, jobs, start)
     print(f"\nAll done in {time.perf_counter() - start:.0f} seconds.")
     if failed:
-        sys.exit("Claims that fail: " + "; ".join(failed))
+        sys.exit("Claims that fail:\n  " + "\n  ".join(failed))

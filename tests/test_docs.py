@@ -20,7 +20,10 @@ PAGES = {
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_code_of_a_page_runs_from_top_to_bottom(page):
+def test_code_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
+    # Pictures are drawn into files, outside the checkout.
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    monkeypatch.chdir(tmp_path)
     namespace = {}
     for number, code in enumerate(PAGES[page], start=1):
         exec(compile(code, f"{page}, block {number}", "exec"), namespace)
@@ -33,14 +36,32 @@ def test_every_page_is_looked_through():
     assert {"README.md", "docs/index.md", "docs/own_tableau.md"} <= PAGES.keys()
 
 
-def test_readme_and_docs_list_every_solver():
-    readme = (ROOT / "README.md").read_text()
+def test_docs_list_every_solver():
+    table = (ROOT / "docs/solvers/index.md").read_text()
     pages = "".join(p.read_text() for p in (ROOT / "docs/solvers").glob("*.md"))
     for name, value in vars(ds).items():
         if isinstance(value, type) and issubclass(value, diffrax.AbstractSolver):
             abstract = name.startswith("Abstract")
-            assert abstract or f"| `{name}(" in readme
+            assert abstract or f"| `{name}(" in table
             assert abstract or f"::: diffrax_symplectic.{name}\n" in pages
+
+
+def test_figures_of_readme_are_those_of_the_benchmarks():
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    page = (ROOT / "docs/benchmarks/work_precision.md").read_text()
+    claims = [
+        ("linear oscillator", "AdditiveGauss", "an error of {} in {}"),
+        ("linear oscillator", "ShARK", "one of {} in {}"),
+        ("two noises", "NinomiyaVictoir", "has {} in {}"),
+        ("two noises", "Heun", "{} in {}"),
+    ]
+    for model, solver, claim in claims:
+        row = rf"\| weak, {model} \| {solver} \| 0.0625 \| (\S+) \| (\S+) \|"
+        (measured,) = re.findall(row, page)
+        pattern = f"`{solver}`[^;]*?" + re.escape(claim.format(*measured))
+        assert re.search(pattern, readme), (solver, measured)
+    for link in re.findall(r"\]\((docs/.*?)\)", readme):
+        assert (ROOT / link).exists(), link
 
 
 def test_docs_describe_every_public_name():
