@@ -2,7 +2,6 @@
 
 import sys
 
-import diffrax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -21,7 +20,7 @@ def _make_terms(path):
 
 
 def test_strong_errors_are_of_the_orders_of_the_solvers():
-    solvers = [ds.SRKs4(), ds.StormerVerlet(), ds.SRKw5(), diffrax.Euler()]
+    solvers = [ds.SRKs4(), ds.StormerVerlet(), ds.SRKw5()]
     result = ds.compare_solvers(
         _make_terms, Y0, 0.0, 1.0, dts=[0.25, 0.125], solvers=solvers, key=jr.key(0),
         num_paths=400,
@@ -36,11 +35,11 @@ def test_strong_errors_are_of_the_orders_of_the_solvers():
     assert order[names[1]] == pytest.approx(1, abs=0.25)
     # One that needs weak random variables is named; the others were compared.
     assert list(result.refused) == [names[2]]
-    assert names[3] in order
+    assert set(order) == set(names[:2])
     assert names[0] in str(result) and "second" in str(result)
     assert all(s.seconds > 0 and s.num_failed == 0 for s in result.steps)
     pytest.importorskip("matplotlib").use("Agg")
-    assert len(result.plot().get_legend().get_texts()) == 3
+    assert len(result.plot().get_legend().get_texts()) == 2
 
 
 def test_weak_error_is_within_its_bars(monkeypatch):

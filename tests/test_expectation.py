@@ -166,7 +166,7 @@ def test_progress_is_shown_to_the_end():
         H0, lambda t, p, q, args: q, ds.WeakBrownianPath((), jr.key(0))
     )
     ds.quasi_expectation(
-        lambda y: y[1], terms, ds.StormerVerlet(), 0.0, 1.0, 0.5,
+        lambda t, y, args: y[1], terms, ds.StormerVerlet(), 0.0, 1.0, 0.5,
         (jnp.array(0.0), jnp.array(1.0)), key=jr.key(0), num_paths=16, replicates=4,
         devices=jax.devices()[:1], progress_meter=quasi,
     )  # fmt: skip
