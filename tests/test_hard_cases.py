@@ -1,13 +1,22 @@
 """Systems that people bring, by what is known of them exactly: `docs/hard_cases.md`."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
 import diffrax_symplectic as ds
-from examples.hard_cases import chain, double_well, henon_heiles, spins, two_body
+from examples.hard_cases import (
+    chain,
+    double_well,
+    henon_heiles,
+    learning,
+    nls,
+    spins,
+    two_body,
+)
 
 from .problems import FineSample, slope
 
@@ -147,3 +156,67 @@ def test_ring_of_spins_with_noise_decays_as_in_closed_form():
         assert mean.std_error <= 0.2
     # Both would be seen if they stayed what they were.
     assert abs(c.energy[0, 0]) * (1 - np.exp(-2 * sigma**2 * 2)) > 1
+
+
+def test_schroedinger_lattice_keeps_its_norm_and_gains_the_energy_of_the_noise():
+    ours, heun = (
+        nls.lattice(nls.SOLVERS[name], 0.02, 1.0, 8, 0.1, n=128)
+        for name in ("Midpoint", "Heun")
+    )
+    assert ours.failed == heun.failed == 0
+    assert ours.norm_error <= 1e-13
+    assert abs(ours.balance.sigmas) <= 4
+    # Heun multiplies the highest modes, of frequency 32, in each step.
+    assert heun.norm_error > 1e-3
+
+
+class Known(eqx.Module):
+    log_s: jax.Array
+
+    def __call__(self, q):
+        return q**2 / 2
+
+
+def test_likelihood_of_an_oscillator_is_that_of_its_gaussian_transitions():
+    # Of dp = -q dt + s dw, dq = p dt over the spacing T, in closed form.
+    T, s, y, then = learning.SPACING, 0.3, np.array([0.2, -0.5]), np.array([0.7, -0.3])
+    got = learning.negative_log_likelihood(
+        Known(jnp.log(s)), ds.StormerVerlet(), 64, jnp.asarray(y), jnp.asarray(then)
+    )
+    cos, sin = np.cos(T), np.sin(T)
+    away = then - np.array([[cos, -sin], [sin, cos]]) @ y
+    pq = np.sin(T) ** 2 / 2
+    covariance = s**2 * np.array(
+        [[T / 2 + np.sin(2 * T) / 4, pq], [pq, T / 2 - np.sin(2 * T) / 4]]
+    )
+    fit = away @ np.linalg.solve(covariance, away)
+    expected = (fit + np.linalg.slogdet(covariance)[1]) / 2
+    np.testing.assert_allclose(got, expected, rtol=1e-3)
+
+
+def test_noise_strength_is_found_if_steps_are_small_and_heun_is_farther_from_it():
+    observed = learning.observe(jr.key(2), 64, 9)
+    now, then = (
+        jnp.moveaxis(x, 1, 0).reshape(2, -1) for x in (observed[:-1], observed[1:])
+    )
+
+    class True_(Known):
+        def __call__(self, q):
+            return learning.true_potential(q)
+
+    def found(name, steps):
+        def loss(log_s):
+            each = lambda now, then: learning.negative_log_likelihood(
+                True_(log_s), learning.SOLVERS[name], steps, now, then
+            )
+            return jnp.mean(jax.vmap(each, (1, 1))(now, then))
+
+        # The loss is fit exp(-2 log s) / 2 + 2 log s, up to a constant.
+        fit = 2 - jax.jit(jax.grad(loss))(0.0)
+        return float(jnp.sqrt(fit / 2))
+
+    std_error = learning.S / np.sqrt(4 * now.shape[1])
+    assert abs(found("StormerVerlet", 4) - learning.S) <= 4 * std_error
+    # Two steps are not enough for either of them.
+    ours, heun = (found(name, 2) - learning.S for name in ("StormerVerlet", "Heun"))
+    assert heun > 1.5 * ours

@@ -1,0 +1,133 @@
+"""A stochastic nonlinear Schroedinger lattice: 1,024 sites, a noise on each.
+
+i d psi_j = -(psi_(j+1) - 2 psi_j + psi_(j-1)) / (2 dx^2) dt - |psi_j|^2 psi_j dt
+            + s psi_j o dw_j, on a ring; psi = q + i p. The norm sum |psi_j|^2 is a
+quadratic invariant of drift and noises. With C = sum_j Re(psi_(j+1) conj(psi_j)),
+E H0 grows by (s^2 / (2 dx^2)) E C in each unit of time.
+"""
+
+from typing import NamedTuple
+
+import diffrax
+import jax.numpy as jnp
+import lineax as lx
+import matplotlib.pyplot as plt
+import numpy as np
+
+import diffrax_symplectic as ds
+
+from ..stability._page import fill, Page, table
+from ._ensemble import ensemble, Mean, weak
+
+
+N = 1024
+DX = 0.25
+
+
+def energy(p, q):
+    bonds = sum(jnp.sum((jnp.roll(x, -1) - x) ** 2) for x in (p, q)) / (4 * DX**2)
+    return bonds - jnp.sum((p**2 + q**2) ** 2) / 4
+
+
+def make_terms(path):
+    return ds.hamiltonian_terms(
+        lambda t, p, q, s: energy(p, q),
+        lambda t, p, q, s: s * (p**2 + q**2) / 2,
+        path,
+    )
+
+
+def start(n: int = N):
+    """A soliton of height 1 in the middle that moves to the right."""
+    x = DX * (np.arange(n) - n / 2)
+    psi = np.exp(0.5j * x) / np.cosh(x)
+    return jnp.asarray(psi.imag), jnp.asarray(psi.real)
+
+
+def _observe(t, y, s):
+    p, q = y
+    coherence = jnp.sum(p * jnp.roll(p, -1) + q * jnp.roll(q, -1))
+    return jnp.sum(p**2 + q**2), energy(p, q), coherence
+
+
+class Lattice(NamedTuple):
+    # The largest relative error of the norm in any path that did not fail.
+    norm_error: float
+    # H0(t1) - H0(0) less what the noise brings on average.
+    balance: Mean
+    # |psi|^2 of the first path at t1.
+    density: np.ndarray
+    failed: float
+
+
+def lattice(solver, h: float, t1: float, paths: int, s: float, n: int = N) -> Lattice:
+    y0, steps = start(n), round(t1 / h)
+    saveat = diffrax.SaveAt(
+        subs=[
+            diffrax.SubSaveAt(t1=True),
+            diffrax.SubSaveAt(t0=True, steps=True, fn=_observe),
+        ]
+    )
+    _, ((p, q), (norms, energies, coherence)), failed = ensemble(
+        make_terms, weak((n,)), solver, y0, h, steps, paths, args=s, saveat=saveat
+    )
+    good = ~failed
+    # Rows that were not needed are infinite.
+    cut = lambda x: np.asarray(x)[good, : steps + 1]
+    norms, energies, coherence = cut(norms), cut(energies), cut(coherence)
+    if not good.any():
+        nan = np.nan
+        return Lattice(nan, Mean(nan, nan), np.full(n, nan), 1.0)
+    middle = (coherence[:, 1:] + coherence[:, :-1]) / 2
+    brought = s**2 / (2 * DX**2) * h * np.sum(middle, axis=1)
+    balance = Mean.of(energies[:, -1] - energies[:, 0] - brought)
+    error = float(np.max(np.abs(norms / norms[:, :1] - 1)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        density = np.asarray(p[good][0, -1] ** 2 + q[good][0, -1] ** 2)
+    return Lattice(error, balance, density, float(np.mean(failed)))
+
+
+# No dense matrix of 2,048 unknowns, should fixed points not contract.
+_MATRIX_FREE = ds.PicardNewton(linear_solver=lx.GMRES(rtol=1e-9, atol=1e-9))
+SOLVERS = {
+    "Midpoint": ds.Midpoint(root_finder=_MATRIX_FREE),
+    "Heun": diffrax.Heun(),
+    "EulerHeun": diffrax.EulerHeun(),
+}
+
+
+def section(page: Page) -> str:
+    t1, paths = (0.5, 2) if page.quick else (5.0, 16)
+    hs = [0.01] if page.quick else [0.04, 0.02, 0.01]
+    names = ["Midpoint", "Heun"] if page.quick else SOLVERS
+    s = 0.1
+    print(f"\nSchroedinger lattice, {N:,} sites, until t = {t1:g}, {paths} paths")
+    rows = []
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4))
+    x = DX * (np.arange(N) - N / 2)
+    for name in names:
+        errors = []
+        for h in hs:
+            r = lattice(SOLVERS[name], h, t1, paths, s)
+            shown = abs(r.balance.value) < 1e3
+            error = f"{r.norm_error:.1e}" if np.isfinite(r.norm_error) else "overflow"
+            rows.append((name, h, f"{100 * r.failed:.0f}%", error,
+                         str(r.balance) if shown else "overflow"))  # fmt: skip
+            errors.append(r.norm_error)
+            if h == 0.01 and r.failed < 1:
+                axes[0].plot(x, r.density, lw=0.8, label=name)
+        axes[1].plot(hs, errors, marker="o", ms=3, lw=1, label=name)
+    axes[0].plot(x, np.sum(np.square(start()), axis=0), "k:", lw=0.8, label="start")
+    axes[0].set(xlim=(-20, 20), ylim=(0, 1.6), xlabel="x", title="one path, h = 0.01")
+    axes[1].set(
+        xscale="log", yscale="log", xlabel="h", title="relative error of the norm"
+    )
+    for ax in axes:
+        ax.legend(fontsize=7)
+    picture = page.picture(figure, "nls", "Stochastic nonlinear Schroedinger lattice")
+    plt.close(figure)
+    header = ("solver", "h", "failed", "norm error", "energy balance")
+    return fill(
+        __file__, table=table(header, rows), picture=picture, t1=f"{t1:g}", paths=paths,
+        s=s, n=f"{N:,}", frequency=f"{2 / DX**2:g}",
+    )  # fmt: skip
