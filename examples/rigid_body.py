@@ -146,7 +146,48 @@ def figure_6b(full: bool) -> None:
     claim("transfer against all paths of two steps", abs(difference), high=1e-8)
 
 
-FIGURES = {"5": figure_5, "6b": figure_6b}
+def spinor_terms(path, mu=0.1, inertia=(0.8, 0.6, 0.2)):
+    """The same body with a noise about each of its axes, for `ds.to_spinors(X0)`."""
+    H0 = lambda t, X, args: jnp.sum(X**2 / jnp.array(inertia)) / 2
+    return ds.spin_terms(H0, lambda t, X, args: mu * X, path)
+
+
+def figure_poisson(full: bool) -> None:
+    """Past the paper: three noises, by `spin_terms`."""
+    hs = 2.0 ** -np.arange(2, 8)
+    steps = 20_000 if full else 2_000
+    print(f"\nThree noises, one about each axis: Poisson defect; {steps:,} steps")
+    y0, path = ds.to_spinors(X0), gaussian(3)(jr.key(0))
+    pairs = spinor_terms(path), y0
+    # The midpoint rule for X itself, with the one noise of the paper.
+    itself = make_terms(gaussian()(jr.key(0))), X0
+
+    def defects(terms, y0):
+        defect = lambda h: ds.poisson_defect(terms, ds.Midpoint(), 0.0, h, y0)
+        return np.asarray(jax.jit(jax.vmap(defect))(hs))
+
+    of_pairs, of_X = defects(*pairs), defects(*itself)
+    ts, y, success = jax.jit(
+        lambda: trajectory(
+            spinor_terms, gaussian(3), ds.Midpoint(), y0, 0.1, steps, every=1
+        )
+    )()
+    assert success
+    length = np.abs(np.linalg.norm(ds.from_spinors(y), axis=-1) - 1)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.5))
+    axes[0].loglog(hs, of_X, "o-C1", label="Midpoint of X")
+    axes[0].loglog(hs, of_pairs, "o-C0", label="Midpoint, spin_terms")
+    axes[0].set(xlabel="h", title="Poisson defect of one step")
+    axes[0].legend(fontsize=8)
+    axes[1].semilogy(ts, length + 1e-17, "C0", lw=0.5)
+    axes[1].set(xlabel="t", title="||X| - 1|, Midpoint, spin_terms, h = 0.1")
+    save(figure, "poisson.png")
+    claim("Poisson defect by spin_terms", of_pairs.max(), high=1e-13)
+    claim("Poisson defect of the midpoint rule for X, h = 1/4", of_X[0], low=1e-4)
+    claim("largest ||X| - 1| by spin_terms", np.nanmax(length), high=1e-11)
+
+
+FIGURES = {"5": figure_5, "6b": figure_6b, "poisson": figure_poisson}
 
 
 if __name__ == "__main__":
