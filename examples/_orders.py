@@ -265,20 +265,23 @@ def plot_orders(
         axes.errorbar(e.hs, e.errors, bars, label=label, fmt="o-", **style)
         if sampled is not None and name in sampled:
             e = sampled[name]
-            label = "sampled, 3 standard errors" if i == 0 else None
+            # A point that is not clear of its own bar says nothing.
+            clear = e.errors > 3 * e.std_errors
             style = dict(color=f"C{i}", mfc="none", ms=6, lw=0.8, capsize=3)
-            axes.errorbar(
-                e.hs, e.errors, 3 * e.std_errors, label=label, fmt="s", **style
-            )
+            bars = 3 * e.std_errors[clear]
+            axes.errorbar(e.hs[clear], e.errors[clear], bars, fmt="s", **style)
+    if sampled is not None:
+        label = "sampled, 3 standard errors,\nwhere that is less than the error"
+        axes.plot([], [], "ks", mfc="none", ms=6, label=label)
     all_errors = np.concatenate([e.errors for e in results.values()])
     hs = next(iter(results.values())).hs
     for slope in slopes:
         line = 2 * all_errors.max() * (hs / hs.max()) ** slope
         axes.loglog(hs, line, "k:", lw=0.8)
-        axes.annotate(f"slope {slope:g}", (hs[-1], line[-1]), fontsize=7)
+        axes.annotate(f"slope {slope:g}", (hs[-1], line[-1]), fontsize=8)
     axes.set(xscale="log", yscale="log", xlabel="step size h", title=title)
     axes.set_ylim(all_errors[all_errors > 0].min() / 4, 4 * all_errors.max())
     axes.set_xticks(hs, [f"$2^{{{np.log2(h):.0f}}}$" for h in hs])
     axes.minorticks_off()
-    axes.legend(fontsize=7)
+    axes.legend(fontsize=8)
     axes.grid(alpha=0.3)
