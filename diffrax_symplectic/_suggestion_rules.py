@@ -20,6 +20,7 @@ from ._solver import (
     LevyAreaMidpoint,
     Midpoint,
     NinomiyaVictoir,
+    PlateauGauss,
     PlateauVerlet,
     SRKs2,
     SRKs4,
@@ -180,6 +181,15 @@ RULES = (
         SRKs4,
         "space-time area",
         "Two stage vectors, one after the other.",
+    ),
+    Rule(
+        "paths",
+        "any",
+        "commuting",
+        PlateauGauss,
+        "space-time area",
+        "Two stage vectors, and brackets of the vector fields: accurate paths for one "
+        "noise or commuting ones.",
     ),
     Rule(
         "paths",

@@ -126,7 +126,7 @@ CASES = {
         "PlateauVerlet",
     ),
     "additive": (MIXED[0], NOISES["constant"], "AdditiveGauss", "SRKs4"),
-    "commuting": (MIXED[0], NOISES["commuting"], "StrangGauss", "Midpoint"),
+    "commuting": (MIXED[0], NOISES["commuting"], "StrangGauss", "PlateauGauss"),
     "not commuting": (MIXED[0], NOISES["any"], "NinomiyaVictoir", "LevyAreaMidpoint"),
 }
 
