@@ -37,6 +37,7 @@ from ._solver import (
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
     AdditiveGauss as AdditiveGauss,
     check_structure as check_structure,
+    Damped as Damped,
     LevyAreaMidpoint as LevyAreaMidpoint,
     Midpoint as Midpoint,
     NinomiyaVictoir as NinomiyaVictoir,

@@ -18,3 +18,4 @@ from .additive_gauss import AdditiveGauss as AdditiveGauss
 from .plateau_gauss import PlateauGauss as PlateauGauss
 from .plateau_verlet import PlateauVerlet as PlateauVerlet
 from .stormer_verlet import StormerVerlet as StormerVerlet
+from .damped import Damped as Damped

@@ -1,0 +1,106 @@
+"""Friction around a solver."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from .problems import Given, slope, values_of_a_step, weak_path
+
+
+_oscillator = lambda t, p, q, args: jnp.sum(p**2 / 2 + jnp.cos(q + t))
+_force = lambda t, p, q, args: jnp.stack([jnp.sum(jnp.sin(q))])
+
+
+@pytest.mark.parametrize("inner", [ds.StormerVerlet(), ds.Midpoint()], ids=repr)
+def test_step_is_conformally_symplectic(inner):
+    gamma, h = 0.7, 0.2
+    terms = ds.hamiltonian_terms(_oscillator, _force, Given(jnp.array([0.3])))
+    solver = ds.Damped(inner, gamma)
+
+    def step(x):
+        state = solver.init(terms, 0.1, 0.1 + h, (x[:2], x[2:]), None)
+        y1, *_ = solver.step(terms, 0.1, 0.1 + h, (x[:2], x[2:]), None, state, False)
+        return jnp.concatenate(y1)
+
+    J = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
+    x = jr.normal(jr.key(0), (20, 4))
+    S = jax.jit(jax.vmap(jax.jacrev(step)))(x)
+    defect = jnp.einsum("nji,jk,nkl->nil", S, J, S) - np.exp(-gamma * h) * J
+    assert jnp.max(jnp.abs(defect)) <= 1e-13
+
+
+def test_local_weak_defect_is_of_order_three_with_stormer_verlet():
+    gamma = 0.7
+    terms = ds.hamiltonian_terms(_oscillator, _force, weak_path(1))
+    friction = diffrax.ODETerm(lambda t, y, args: (-gamma * y[0], jnp.zeros_like(y[1])))
+    y0 = jnp.array([0.3]), jnp.array([0.5])
+    solver = ds.Damped(ds.StormerVerlet(), gamma)
+
+    def defect(h, terms, solver):
+        kwargs = dict(fn=values_of_a_step, order=2)
+        return ds.weak_order_defect(terms, solver, 0.1, 0.1 + h, y0, **kwargs)
+
+    # The generator of the equation with friction: of one solver's defect less what it
+    # and the damped solver expect after the step.
+    both = diffrax.MultiTerm(*terms.terms, friction)
+
+    def damped(h):
+        at = dict(fn=values_of_a_step)
+        expected = ds.step_expectation(terms, solver, 0.1, 0.1 + h, y0, **at)
+        other = ds.step_expectation(both, ds.Midpoint(), 0.1, 0.1 + h, y0, **at)
+        return defect(h, both, ds.Midpoint()) + expected - other
+
+    hs = np.array([0.02, 0.01, 0.005])
+    defects = jax.jit(jax.vmap(damped))(hs)
+    slopes = [slope(hs, d) for d in defects.T]
+    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
+
+
+def test_momentum_alone_decays_exactly_forward_and_backward():
+    free = lambda t, p, q, args: 0 * jnp.sum(p * q)
+    term = ds.hamiltonian_terms(free, _force, Given(jnp.zeros(1))).terms[0]
+    y0 = jnp.array([1.0, 2.0]), jnp.zeros(2)
+    solver = ds.Damped(ds.Midpoint(), jnp.array([0.5, 0.0]))
+    for end in (1.0, -1.0):
+        sol = diffrax.diffeqsolve(term, solver, 0.0, end, end / 4, y0)
+        expected = y0[0] * np.exp(-np.array([0.5, 0.0]) * end)
+        np.testing.assert_allclose(sol.ys[0][-1], expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("gamma", [-1.0, np.nan, np.inf, 1j, "much"])
+def test_friction_must_be_finite_and_not_negative(gamma):
+    with pytest.raises(ValueError, match="`gamma` must be"):
+        ds.Damped(ds.Midpoint(), gamma)
+
+
+def test_misfits_are_refused_with_advice():
+    terms = ds.hamiltonian_terms(_oscillator, _force, Given(jnp.array([0.3])))
+    y0 = jnp.ones(2), jnp.ones(2)
+    for gamma, match in ((jnp.ones(3), "shape of its momenta"), ([1.0], "structure")):
+        with pytest.raises(ValueError, match=match):
+            ds.Damped(ds.Midpoint(), gamma).init(terms, 0.0, 0.1, y0, None)
+    with pytest.raises(ValueError, match="wraps a solver of this package"):
+        ds.Damped(diffrax.Heun(), 1.0)
+    assert isinstance(ds.Damped(ds.Midpoint(), 1.0), diffrax.AbstractImplicitSolver)
+    explicit = ds.Damped(ds.StormerVerlet(), 1.0)
+    assert not isinstance(explicit, diffrax.AbstractImplicitSolver)
+
+
+def test_a_traced_friction_that_is_negative_fails_its_path_alone():
+    terms = ds.hamiltonian_terms(_oscillator, _force, Given(jnp.array([0.3])))
+    y0 = jnp.ones(2), jnp.ones(2)
+
+    @eqx.filter_jit
+    @jax.vmap
+    def run(gamma):
+        solver = ds.Damped(ds.StormerVerlet(), gamma)
+        sol = diffrax.diffeqsolve(terms, solver, 0.0, 0.5, 0.1, y0, throw=False)
+        return sol.result == diffrax.RESULTS.successful
+
+    np.testing.assert_array_equal(run(jnp.array([0.5, -0.5])), [True, False])
