@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 
-_Host = PyTree[np.ndarray]
+# Scalars of NumPy are no arrays.
+_Host = PyTree[np.ndarray | np.floating]
 
 
 class Expectation(eqx.Module):
@@ -51,7 +52,7 @@ class Expectation(eqx.Module):
         return jtu.tree_map(lambda v: np.sqrt(v / n), self.variance)
 
     @property
-    def bias(self) -> PyTree[np.ndarray] | None:
+    def bias(self) -> _Host | None:
         r"""With two levels, the error of discretization $\mathbb E[\phi_h] - \mathbb
         E[\phi]$ of `mean`, as far as it is of the order $h^p$: $2^p / (2^p - 1)$ times the
         difference of the levels. `mean - bias` is the extrapolated estimate."""
@@ -60,7 +61,7 @@ class Expectation(eqx.Module):
         return jtu.tree_map(lambda d: -self._factor * d, self.difference.mean)
 
     @property
-    def bias_std_error(self) -> PyTree[np.ndarray] | None:
+    def bias_std_error(self) -> _Host | None:
         """The standard error of `bias`, which is independent of that of `mean`."""
         if self.difference is None:
             return None

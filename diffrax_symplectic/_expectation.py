@@ -28,8 +28,6 @@ from ._estimate import (
 
 
 _Sample: TypeAlias = Callable[..., Any]
-# Scalars of NumPy are no arrays.
-_Host = PyTree[np.ndarray | np.floating]
 
 
 _no_meter = diffrax.NoProgressMeter()

@@ -99,10 +99,11 @@ def draw_set(
     law: AbstractLaw,
     words: UInt32[Array, " n"],
     h: RealScalarLike,
-    shape: PyTree[jax.ShapeDtypeStruct],
+    like: PyTree[jax.ShapeDtypeStruct | Array],
 ) -> PyTree[Array]:
-    """A random variable for each noise, over a step of size `h`."""
-    leaves, treedef = jtu.tree_flatten(shape)
+    """A random variable for each noise, over a step of size `h`, in the structure, shapes
+    and dtypes of `like`."""
+    leaves, treedef = jtu.tree_flatten(like)
     ends = np.cumsum([int(np.prod(leaf.shape)) for leaf in leaves])
     root = jnp.sqrt(jnp.abs(h))
     out = [
