@@ -1,19 +1,24 @@
 """From a tableau to the work of one step, decided before anything is traced."""
 
 import dataclasses
+import functools as ft
 import itertools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from ._tableau import FlatTableau
+from ._tableau import FlatTableau, Stage
 
 
 # Coefficients are exact up to a few roundings of order-one numbers.
 _TOLERANCE = 1e-14
 # From how many stages of one kind on it pays to evaluate them as one array.
 _WORTH_STACKING = 2
+# The fewest unknown stages of a block are searched for among at most so many choices of
+# one size; their number grows exponentially with the stages.
+_MOST_CHOICES = 1000
 
 
 # Stages of one kind that do not wait for each other.
@@ -48,7 +53,19 @@ class Plan:
 
 
 def make_plan(tableau: FlatTableau) -> Plan:
-    """Drops what feeds nothing, evaluates what is equal once, and orders the rest."""
+    """Drops unused stages, evaluates equal ones once, and orders the rest. Plans of equal
+    tableaus are one object, found again in every trace."""
+    as_bytes = lambda x: np.asarray(x, np.float64).tobytes()
+    return _make_plan(
+        tableau.stages, as_bytes(tableau.matrix), as_bytes(tableau.weights)
+    )
+
+
+@ft.lru_cache(maxsize=1024)
+def _make_plan(stages: tuple[Stage, ...], matrix: bytes, weights: bytes) -> Plan:
+    read = lambda data: np.frombuffer(data, np.float64)
+    s = len(stages)
+    tableau = FlatTableau(stages, read(matrix).reshape(s, s), read(weights))
     previous = None
     tableau = _mask(tableau)
     while previous is None or len(tableau.stages) < len(previous.stages):
@@ -155,14 +172,25 @@ def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
 def _cut(
     block: tuple[int, ...], depends: np.ndarray
 ) -> tuple[tuple[int, ...], list[list[int]]]:
-    """The fewest stages that, once known, leave no circle among the others, and the rounds
-    in which these can be evaluated."""
+    """Few stages that, once known, leave no cycle among the others, and the rounds in which
+    these can be evaluated: the fewest, unless that takes too long to find out."""
     for size in range(len(block) + 1):
+        if math.comb(len(block), size) > _MOST_CHOICES:
+            break
         for unknown in itertools.combinations(block, size):
             rounds = _rounds([i for i in block if i not in unknown], depends)
             if rounds is not None:
                 return unknown, rounds
-    raise AssertionError
+    # One after the other is made explicit where it closes no cycle. The stages with the
+    # fewest neighbours come first.
+    links = depends | depends.T
+    explicit = []
+    for i in sorted(block, key=lambda i: links[i, list(block)].sum()):
+        if _rounds([*explicit, i], depends) is not None:
+            explicit.append(i)
+    rounds = _rounds(sorted(explicit), depends)
+    assert rounds is not None
+    return tuple(i for i in block if i not in explicit), rounds
 
 
 def _rounds(stages: list[int], depends: np.ndarray) -> list[list[int]] | None:

@@ -1,2 +1,5 @@
+from ._continuation import finish as finish
+from ._implicit import differentiate as differentiate
 from ._picard_newton import PicardNewton as PicardNewton
 from ._small_lu import SmallLU as SmallLU
+from ._start import start as start

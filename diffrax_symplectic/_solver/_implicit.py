@@ -16,7 +16,7 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
     root_finder: optx.AbstractRootFinder = eqx.field(
         default=PicardNewton(), kw_only=True
     )
-    root_find_max_steps: int = eqx.field(default=20, kw_only=True)
+    root_find_max_steps: int = eqx.field(default=100, kw_only=True)
 
 
 # The lines about these fields in the documentation of every such solver's `__init__`.

@@ -1,18 +1,16 @@
-"""The stage equations of one step, carried out by the plan of a tableau."""
+"""The stages of one step, carried out by the plan of a tableau."""
 
 import functools as ft
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
-import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import lineax as lx
 import numpy as np
-import optimistix as optx
 from equinox.internal import ω
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, PyTree
 
 from .._custom_types import RealScalarLike, Y
 from .._materialize import materialize
@@ -23,6 +21,10 @@ from .._terms import tree_sum
 
 # The value of one stage: the change of the part of the state that it writes.
 _Value: TypeAlias = PyTree[Array]
+# The values of the stages known so far, by their numbers.
+Values: TypeAlias = dict[int, _Value]
+# The values of the unknown stages: for each block, for each of its groups.
+Unknown: TypeAlias = list[list[_Value]]
 # What drives stages of one channel: from time and state to vector field times control.
 Driven: TypeAlias = Callable[[RealScalarLike, Y], Y]
 
@@ -35,90 +37,98 @@ class Step(NamedTuple):
     driven: dict[str, Driven]
 
 
-def take_step(
-    plan: Plan, step: Step, y0: Y, solver: diffrax.AbstractSolver
-) -> tuple[Y, diffrax.RESULTS]:
-    """The end of the step, and whether it was reached. Implicit stages are solved by the
-    root finder of `solver`."""
-    stages, matrix = plan.tableau.stages, plan.tableau.matrix
-    values: dict[int, _Value] = {}
-    result = diffrax.RESULTS.successful
+class Stages(eqx.Module):
+    """The stages of one step, in the blocks of its plan. Values of stages that are not
+    known count as zero."""
 
-    def values_of(group: tuple[int, ...], values: dict[int, _Value]) -> _Value:
-        """The values of stages of one kind; stacked, unless it is only one."""
-        position = _position(y0, stages, matrix[list(group)], values)
-        return _evaluate(step, [stages[i] for i in group], position)
+    plan: Plan = eqx.field(static=True)
+    step: Step
+    y0: Y
 
-    for block in plan.blocks:
-        if len(block.unknown) > 0:
-            unknown, solved = _solve(block, values_of, values, stages, y0, solver)
-            values |= unknown
-            result = first_failure(result, solved)
+    def unknown_of(self, block: Block, values: Values) -> list[_Value]:
+        """The unknown stages of a block, evaluated once all others are known."""
+        return [self._evaluate_group(group, values) for group in block.unknown]
+
+    def zero_of(self, block: Block) -> list[_Value]:
+        """Zero for each unknown stage of a block."""
+        stages = self.plan.tableau.stages
+
+        def zero(group: tuple[int, ...], x: Array) -> Array:
+            shape = jnp.shape(x) if len(group) == 1 else (len(group), *jnp.shape(x))
+            return jnp.zeros(shape, jnp.result_type(x))
+
+        return [
+            jtu.tree_map(ft.partial(zero, group), _part(self.y0, stages[group[0]].writes))
+            for group in block.unknown
+        ]
+
+    def given(self, block: Block, values: Values, unknown: list[_Value]) -> Values:
+        """`values` with those of the unknown stages of a block."""
+        for group, value in zip(block.unknown, unknown):
+            values = values | _unstack(group, value)
+        return values
+
+    def explicit_of(self, block: Block, values: Values, keep: bool = False) -> Values:
+        """`values` with those of the explicit stages of a block. If `keep`, what enters
+        several positions is computed only once."""
         for group in block.explicit:
-            evaluate = ft.partial(values_of, group, values)
-            shared = _uses(plan.tableau, group) > 1
-            values |= _unstack(group, materialize(evaluate) if shared else evaluate())
+            evaluate = ft.partial(self._evaluate_group, group, values)
+            shared = keep and _uses(self.plan.tableau, group) > 1
+            new = materialize(evaluate) if shared else evaluate()
+            values = values | _unstack(group, new)
+        return values
 
-    y1 = _position(y0, stages, plan.tableau.weights[None], values)
-    nonfinite: diffrax.RESULTS = diffrax.RESULTS.nonfinite  # pyright: ignore
-    finite = diffrax.RESULTS.where(_all_finite(y1), result, nonfinite)
-    return y1, first_failure(result, finite)
+    def image(self, unknown: Unknown) -> Unknown:
+        r"""$\Phi$ of the stage equations $k = \Phi(k)$ of the whole step."""
+        values, image = {}, []
+        for block, k in zip(self.plan.blocks, unknown):
+            values = self.explicit_of(block, self.given(block, values, k))
+            image.append(self.unknown_of(block, values))
+        return image
+
+    def end(self, unknown: Unknown, keep: bool = False) -> Y:
+        """The end of the step."""
+        values = {}
+        for block, k in zip(self.plan.blocks, unknown):
+            values = self.explicit_of(block, self.given(block, values, k), keep)
+        return self.end_of(values)
+
+    def end_of(self, values: Values) -> Y:
+        """The end of the step, once all stages are known."""
+        tableau = self.plan.tableau
+        return _position(self.y0, tableau.stages, tableau.weights[None], values)
+
+    def scale(self, unknown: Unknown) -> Unknown:
+        """How large the state is that the unknown values change: they are only needed to
+        its accuracy."""
+        pairs = zip(self.plan.blocks, unknown)
+        return [self.scale_of(block, k) for block, k in pairs]
+
+    def scale_of(self, block: Block, unknown: list[_Value]) -> list[_Value]:
+        stages = self.plan.tableau.stages
+        written = [_part(self.y0, stages[group[0]].writes) for group in block.unknown]
+        return jtu.tree_map(lambda x, k: jnp.abs(x) + jnp.abs(k), written, unknown)
+
+    def _evaluate_group(self, group: tuple[int, ...], values: Values) -> _Value:
+        """The values of stages of one kind; stacked, unless it is only one."""
+        stages, matrix = self.plan.tableau.stages, self.plan.tableau.matrix
+        position = _position(self.y0, stages, matrix[list(group)], values)
+        return _evaluate(self.step, [stages[i] for i in group], position)
+
+
+def closed(step: Step, y0: Y) -> Step:
+    """The same step, with all arrays that its functions capture as parts of it. Each
+    function is traced once, here."""
+    dtype = jnp.result_type(step.t0, step.h, float)
+    t0, h = jnp.asarray(step.t0, dtype), jnp.asarray(step.h, dtype)
+    close = lambda fn: eqx.filter_closure_convert(fn, t0, y0)
+    return Step(t0, h, {name: close(fn) for name, fn in step.driven.items()})
 
 
 def _uses(tableau: FlatTableau, group: tuple[int, ...]) -> int:
     """How many positions the values of `group` enter, the end of the step included."""
     columns = np.vstack([tableau.matrix, tableau.weights])[:, list(group)]
     return int(np.count_nonzero(columns.any(axis=1)))
-
-
-def first_failure(first: diffrax.RESULTS, then: diffrax.RESULTS) -> diffrax.RESULTS:
-    return diffrax.RESULTS.where(first == diffrax.RESULTS.successful, then, first)
-
-
-def _solve(
-    block: Block, values_of, known, stages, y0, solver
-) -> tuple[dict[int, _Value], diffrax.RESULTS]:
-    groups = block.unknown
-
-    def complete(unknown: list[_Value]) -> dict[int, _Value]:
-        values = dict(known)
-        for group, value in zip(groups, unknown):
-            values |= _unstack(group, value)
-        return values
-
-    def residual(unknown: list[_Value], _) -> list[_Value]:
-        values = complete(unknown)
-        for group in block.explicit:
-            values |= _unstack(group, values_of(group, values))
-        image = [values_of(group, values) for group in groups]
-        return (unknown**ω - image**ω).ω
-
-    # A stage where it would be if this block did not move at all.
-    guess = [values_of(group, known) for group in groups]
-    written = [_part(y0, stages[group[0]].writes) for group in groups]
-    if not isinstance(solver, diffrax.AbstractImplicitSolver):
-        raise ValueError(
-            f"The tableau of `{type(solver).__name__}` has implicit stages. Let the class "
-            "also subclass `diffrax_symplectic.AbstractImplicitStages`."
-        )
-    finder = solver.root_finder
-    linear_solver = getattr(finder, "linear_solver", lx.AutoLinearSolver(None))
-    sol = optx.root_find(
-        residual,
-        finder,
-        guess,
-        options=dict(scale=jtu.Partial(_scale, written)),
-        max_steps=solver.root_find_max_steps,
-        adjoint=optx.ImplicitAdjoint(linear_solver=linear_solver),
-        throw=False,
-    )
-    solved = {i: v for i, v in complete(sol.value).items() if i not in known}
-    return solved, diffrax.RESULTS.promote(sol.result)
-
-
-def _scale(written: list[_Value], unknown: list[_Value]) -> list:
-    """How large the state is that the unknown stage values change."""
-    return jtu.tree_map(lambda x, k: jnp.abs(x) + jnp.abs(k), written, unknown)
 
 
 def _unstack(group: tuple[int, ...], value: _Value) -> dict[int, _Value]:
@@ -177,7 +187,3 @@ def _position(
         return (base**ω + total**ω).ω
 
     return add("y") if stages[0].writes == "y" else (add("p"), add("q"))
-
-
-def _all_finite(y: Y) -> Bool[Array, ""]:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(y)]))

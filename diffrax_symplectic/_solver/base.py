@@ -16,7 +16,8 @@ from .._terms import (
     noise_driven,
     split_terms,
 )
-from ._stages import Step, take_step
+from ._implicit_step import take_step
+from ._stages import Step
 from ._structure import check_structure
 
 

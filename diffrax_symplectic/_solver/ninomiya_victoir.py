@@ -17,7 +17,8 @@ from .._terms import (
     split_terms,
 )
 from ._implicit import AbstractImplicitStages, ARGUMENTS
-from ._stages import first_failure, Step, take_step
+from ._implicit_step import first_failure, take_step
+from ._stages import Step
 from .base import AbstractSymplecticSolver
 
 

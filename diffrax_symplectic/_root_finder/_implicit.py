@@ -1,0 +1,78 @@
+"""The derivative of what stage equations define."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import lineax as lx
+import optimistix as optx
+from equinox.internal import ω
+from jax import lax
+from jaxtyping import Array, PyTree
+
+from . import _linear
+from ._tolerance import ratio
+
+
+_Linear = Callable[[PyTree[Array]], PyTree[Array]]
+
+# The most terms of the series, and the size of a term at which it is given up. Before they
+# shrink terms may well grow, since positions and momenta differ in scale.
+_MOST_TERMS, _DIVERGED = 60, 1e3
+# The most cycles of GMRES.
+_MOST_CYCLES = 40
+# Rounding errors may keep terms above the tolerance by this factor.
+_ENOUGH = 50
+
+
+def differentiate(finder: Any, linear: _Linear, rhs: PyTree[Array]) -> PyTree[Array]:
+    r"""The tangent $x = L x + b$ of the solution of $k = \Phi(k)$, for the derivatives $L$
+    of $\Phi$ along $k$ and $b$ along everything else; and by transposition its adjoint.
+
+    Up to four unknowns by elimination, by a `linear_solver` of `finder` if it has one, and
+    otherwise by the iteration $x \leftarrow L x + b$. It converges where the one for the
+    solution did, and where it does not, GMRES solves the system.
+    """
+    linear_solver = getattr(finder, "linear_solver", None)
+    small = sum(x.size for x in jtu.tree_leaves(rhs)) <= 4
+
+    def solve(operator: _Linear, b: PyTree[Array]) -> PyTree[Array]:
+        if small or linear_solver is not None:
+            return _linear.solve(operator, b, linear_solver)
+        return _by_series(operator, b)
+
+    operator = lambda x: (x**ω - linear(x) ** ω).ω
+    return lax.custom_linear_solve(operator, rhs, solve, solve)
+
+
+def _by_series(operator: _Linear, b: PyTree[Array]) -> PyTree[Array]:
+    eps = jnp.finfo(jnp.result_type(*jtu.tree_leaves(b))).eps
+    # A derivative is as accurate as the solution: two units in the last place.
+    tolerance = 2 * eps
+
+    def improve(correct: _Linear):
+        def body(carry):
+            x, size, step = carry
+            residual = (b**ω - operator(x) ** ω).ω
+            x = (x**ω + correct(residual) ** ω).ω
+            return x, ratio(optx.max_norm(residual), optx.max_norm(x)), step + 1
+
+        return body
+
+    def proceed(most: int):
+        def proceed(carry):
+            _, size, step = carry
+            return (size > tolerance) & (size < _DIVERGED) & (step < most)
+
+        return proceed
+
+    start = b, jnp.ones_like(tolerance, eps.dtype), 0
+    x, size, _ = lax.while_loop(proceed(_MOST_TERMS), improve(lambda r: r), start)
+    # Where that ended without success, by GMRES from nothing, improved a few times.
+    solved = size <= _ENOUGH * tolerance
+    x = jtu.tree_map(lambda x: jnp.where(solved, x, 0), x)
+    size = jnp.where(solved, 0, 1).astype(eps.dtype)
+    by_krylov = improve(lambda r: _linear.solve(operator, r, None))
+    x, *_ = lax.while_loop(proceed(_MOST_CYCLES), by_krylov, (x, size, 0))
+    return x

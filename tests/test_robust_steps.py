@@ -1,0 +1,155 @@
+"""Steps that fixed-point iteration does not solve, of few and of many unknowns, and what
+their failures leave alone."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._plan import make_plan
+from diffrax_symplectic._solver._lanes import where_pending
+
+from .problems import Given
+
+
+def _one_step(solver, term, h, y0):
+    y1, *_, result = solver.step(term, 0.0, h, y0, None, None, False)
+    return y1, result == diffrax.RESULTS.successful
+
+
+def test_steps_of_stiff_networks_are_solved():
+    # Newton's method alone fails for 26 of these, shortened corrections stall in more.
+    def residual(key):
+        a, b, c = jr.split(key, 3)
+        W1, W2 = jr.normal(a, (4, 2)), 4 * jr.normal(b, (2, 4)) / 2
+        y0 = jr.normal(c, (2,))
+        term = diffrax.ODETerm(lambda t, y, args: W2 @ jnp.tanh(W1 @ y))
+        y1, success = _one_step(ds.Midpoint(), term, 1.0, y0)
+        return success, y1 - y0 - W2 @ jnp.tanh(W1 @ (y0 + y1) / 2)
+
+    success, error = jax.jit(jax.vmap(residual))(jr.split(jr.key(0), 400))
+    assert jnp.sum(~success) <= 1
+    assert jnp.max(jnp.abs(error[success])) <= 1e-14
+
+
+def test_many_unknowns_are_solved_without_a_matrix():
+    # A Schroedinger lattice: frequencies up to n^2, of which h resolves few.
+    n, h = 100, 2e-3
+    pad = lambda u: jnp.pad(u, 1)
+    laplacian = lambda u: (2 * u - pad(u)[2:] - pad(u)[:-2]) * n**2 / 10
+    term = diffrax.ODETerm(lambda t, y, args: (-laplacian(y[1]), laplacian(y[0])))
+    x = jnp.arange(1, n + 1) / (n + 1) * jnp.pi
+    y0 = jnp.sin(x), jnp.sin(2 * x) + 0.1 * jnp.sin(50 * x)
+    step = jax.jit(lambda y0: _one_step(ds.Midpoint(), term, h, y0)).lower(y0).compile()
+    # Sixty vectors of all unknowns; one dense matrix has 200.
+    assert step.memory_analysis().temp_size_in_bytes <= 60 * 2 * n * 8
+    y1, success = step(y0)
+    assert success
+    norm = lambda y: jnp.sum(y[0] ** 2 + y[1] ** 2)
+    assert abs(norm(y1) / norm(y0) - 1) <= 1e-13
+    dense = ds.Midpoint(root_finder=ds.PicardNewton(linear_solver=ds.SmallLU()))
+    exact, success = jax.jit(lambda y0: _one_step(dense, term, h, y0))(y0)
+    assert success
+    np.testing.assert_allclose(y1, exact, atol=1e-13)
+
+
+def _end(strength, q0, key):
+    path = ds.WeakBrownianPath((), key)
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: args * p**2 / 2, lambda t, p, q, args: p * q**2, path
+    )
+    y0 = (jnp.array(0.1), q0)
+    sol = diffrax.diffeqsolve(
+        terms, ds.Midpoint(), 0.0, 1.0, 0.1, y0, strength, throw=False
+    )
+    success = sol.result == diffrax.RESULTS.successful
+    return jnp.where(success, sol.ys[1][-1], 0.0), success
+
+
+def test_gradients_survive_a_path_that_fails():
+    # The second path has a step without a solution.
+    q0, keys = jnp.array([0.1, 50.0, 0.2]), jr.split(jr.key(0), 4)[:3]
+    ends = lambda strength: jax.vmap(_end, in_axes=(None, 0, 0))(strength, q0, keys)
+
+    def loss(strength):
+        values, success = ends(strength)
+        return jnp.sum(values), success
+
+    strength = jnp.array(0.5)
+    gradient, success = jax.jit(jax.grad(loss, has_aux=True))(strength)
+    np.testing.assert_array_equal(success, [True, False, True])
+    h = 1e-5
+    slope = (loss(strength + h)[0] - loss(strength - h)[0]) / (2 * h)
+    np.testing.assert_allclose(gradient, slope, rtol=1e-7)
+    # Forward mode, path by path.
+    forward = jax.jit(lambda x: jax.jvp(lambda s: ends(s)[0], (x,), (jnp.ones(()),))[1])
+    each = forward(strength)
+    assert each[1] == 0
+    np.testing.assert_allclose(jnp.sum(each), gradient, rtol=1e-10)
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_failure_anywhere_in_a_step_is_reported(first):
+    # Two systems one after another; what the other one's success says must not count.
+    stuck = lambda t, p, q, args: p * q**2
+    easy = lambda t, p, q, args: 0.01 * p * q
+    H0, H1 = (stuck, easy) if first else (easy, stuck)
+    terms = ds.hamiltonian_terms(H0, H1, Given(jnp.array(1.0)))
+    y0 = (jnp.array(0.1), jnp.array(10.0))
+    for solver in (ds.StrangGauss(), ds.SRKs1(), ds.NinomiyaVictoir()):
+        assert not _one_step(solver, terms, 1.0, y0)[1]
+
+
+def test_increments_are_solved_to_the_accuracy_of_the_state():
+    # Rounding errors of a state of 1e8 make the force uncertain by 1e-5 of its size. Zero
+    # iterations of Newton's method: the cheap iterations have to find that out.
+    term = diffrax.ODETerm(lambda t, y, args: jnp.sin(1e3 * y))
+    y0 = 1e8 + jnp.arange(6.0)
+    for solver in (
+        ds.Midpoint(root_find_max_steps=0),
+        ds.Midpoint(root_finder=ds.PicardNewton(direct=6), root_find_max_steps=0),
+    ):
+        y1, success = jax.jit(lambda y0: _one_step(solver, term, 1e-4, y0))(y0)
+        assert success
+
+
+def test_only_pending_paths_of_a_batch_are_served():
+    double = lambda weight, x: weight * x
+    serve = lambda pending, w, x: where_pending(double, pending, w, x)
+    pending = jr.bernoulli(jr.key(0), 0.3, (3, 35))
+    x = jnp.arange(105.0).reshape(3, 35)
+    expected = jnp.where(pending, 2 * x, x)
+    nested = jax.jit(jax.vmap(jax.vmap(serve, (0, None, 0)), (0, None, 0)))
+    np.testing.assert_array_equal(nested(pending, jnp.array(2.0), x), expected)
+    flat = jax.jit(jax.vmap(serve, (0, None, 0)))
+    np.testing.assert_array_equal(
+        flat(pending.ravel(), jnp.array(2.0), x.ravel()), expected.ravel()
+    )
+
+
+@pytest.mark.parametrize("solver", [ds.Midpoint(), ds.StrangGauss()], ids=type)
+@pytest.mark.parametrize("d", [4, 32])
+def test_steps_of_many_unknowns_are_symplectic(solver, d):
+    def potential(t, p, q, args):
+        stretch = jnp.diff(q, prepend=0.0, append=0.0)
+        return jnp.sum(jnp.sqrt(1 + p**2)) + jnp.sum(stretch**2 / 2 + stretch**4 / 4)
+
+    kicks = lambda t, p, q, args: 0.2 * jnp.sum(p * q) + jnp.sum(jnp.cos(q + p))
+
+    def defect(key, h):
+        p, q = jr.normal(key, (2, d))
+        terms = ds.hamiltonian_terms(potential, kicks, Given(jnp.sqrt(h)))
+        return ds.symplecticity_defect(terms, solver, jnp.zeros(()), h, (p, q))
+
+    h = jnp.geomspace(1e-3, 0.2, 8)
+    defects = eqx.filter_jit(jax.vmap(defect))(jr.split(jr.key(d), 8), h)
+    assert jnp.max(defects) <= 1e-13
+
+
+def test_plans_are_made_once_and_soon():
+    tableau = ds.SRKw2().tableau.flatten()
+    assert make_plan(tableau) is make_plan(ds.SRKw2().tableau.flatten())
