@@ -1,6 +1,8 @@
 """Steps that fixed-point iteration does not solve, of few and of many unknowns, and what
 their failures leave alone."""
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
@@ -46,7 +48,8 @@ def test_many_unknowns_are_solved_without_a_matrix():
     y0 = jnp.sin(x), jnp.sin(2 * x) + 0.1 * jnp.sin(50 * x)
     step = jax.jit(lambda y0: _one_step(ds.Midpoint(), term, h, y0)).lower(y0).compile()
     # Sixty vectors of all unknowns; one dense matrix has 200.
-    assert step.memory_analysis().temp_size_in_bytes <= 60 * 2 * n * 8
+    memory: Any = step.memory_analysis()
+    assert memory.temp_size_in_bytes <= 60 * 2 * n * 8
     y1, success = step(y0)
     assert success
     norm = lambda y: jnp.sum(y[0] ** 2 + y[1] ** 2)
@@ -57,23 +60,28 @@ def test_many_unknowns_are_solved_without_a_matrix():
     np.testing.assert_allclose(y1, exact, atol=1e-13)
 
 
-def _end(strength, q0, key):
-    path = ds.WeakBrownianPath((), key)
+REVERSE = diffrax.RecursiveCheckpointAdjoint()
+
+
+def _end(strength, q0, adjoint=REVERSE):
+    # Steps from q > 1 / (2 I) have no solution.
     terms = ds.hamiltonian_terms(
-        lambda t, p, q, args: args * p**2 / 2, lambda t, p, q, args: p * q**2, path
+        lambda t, p, q, args: args * p**2 / 2,
+        lambda t, p, q, args: p * q**2,
+        Given(W=jnp.array(0.3)),
     )
     y0 = (jnp.array(0.1), q0)
     sol = diffrax.diffeqsolve(
-        terms, ds.Midpoint(), 0.0, 1.0, 0.1, y0, strength, throw=False
+        terms, ds.Midpoint(), 0, 1, 0.1, y0, strength, adjoint=adjoint, throw=False
     )
+    ys: Any = sol.ys
     success = sol.result == diffrax.RESULTS.successful
-    return jnp.where(success, sol.ys[1][-1], 0.0), success
+    return jnp.where(success, ys[1][-1], 0.0), success
 
 
 def test_gradients_survive_a_path_that_fails():
-    # The second path has a step without a solution.
-    q0, keys = jnp.array([0.1, 50.0, 0.2]), jr.split(jr.key(0), 4)[:3]
-    ends = lambda strength: jax.vmap(_end, in_axes=(None, 0, 0))(strength, q0, keys)
+    q0 = jnp.array([0.1, 50.0, 0.2])
+    ends = lambda s, **kwargs: jax.vmap(lambda q: _end(s, q, **kwargs))(q0)
 
     def loss(strength):
         values, success = ends(strength)
@@ -86,8 +94,8 @@ def test_gradients_survive_a_path_that_fails():
     slope = (loss(strength + h)[0] - loss(strength - h)[0]) / (2 * h)
     np.testing.assert_allclose(gradient, slope, rtol=1e-7)
     # Forward mode, path by path.
-    forward = jax.jit(lambda x: jax.jvp(lambda s: ends(s)[0], (x,), (jnp.ones(()),))[1])
-    each = forward(strength)
+    values = lambda s: ends(s, adjoint=diffrax.ForwardMode())[0]
+    each = jax.jit(jax.jacfwd(values))(strength)
     assert each[1] == 0
     np.testing.assert_allclose(jnp.sum(each), gradient, rtol=1e-10)
 
@@ -98,7 +106,7 @@ def test_a_failure_anywhere_in_a_step_is_reported(first):
     stuck = lambda t, p, q, args: p * q**2
     easy = lambda t, p, q, args: 0.01 * p * q
     H0, H1 = (stuck, easy) if first else (easy, stuck)
-    terms = ds.hamiltonian_terms(H0, H1, Given(jnp.array(1.0)))
+    terms = ds.hamiltonian_terms(H0, H1, Given(W=jnp.array(1.0)))
     y0 = (jnp.array(0.1), jnp.array(10.0))
     for solver in (ds.StrangGauss(), ds.SRKs1(), ds.NinomiyaVictoir()):
         assert not _one_step(solver, terms, 1.0, y0)[1]
@@ -142,7 +150,7 @@ def test_steps_of_many_unknowns_are_symplectic(solver, d):
 
     def defect(key, h):
         p, q = jr.normal(key, (2, d))
-        terms = ds.hamiltonian_terms(potential, kicks, Given(jnp.sqrt(h)))
+        terms = ds.hamiltonian_terms(potential, kicks, Given(W=jnp.sqrt(h)))
         return ds.symplecticity_defect(terms, solver, jnp.zeros(()), h, (p, q))
 
     h = jnp.geomspace(1e-3, 0.2, 8)

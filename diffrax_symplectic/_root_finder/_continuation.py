@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import optimistix as optx
 from equinox.internal import ω
 from jaxtyping import Array, Bool, Int, PyTree, Scalar
 
@@ -97,7 +96,7 @@ def advance(finder: "PicardNewton", residual: Callable, scale, state: State) -> 
     size = finder.tolerance.measure(diff, scale(y))
     shrink = jnp.where(state.tries > 0, ratio(size, state.size), 1)
     whole = s == 1
-    solved = whole & converged(finder, diff, scale(y), size, shrink)
+    solved = whole & converged(finder, diff, scale(y), size, shrink, shrink >= 0.25)
 
     at_once = whole & (state.reached == 0)
     patience = jnp.where(at_once, _PATIENCE, 2)

@@ -5,7 +5,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import lineax as lx
 import optimistix as optx
 from equinox.internal import ω
 from jax import lax

@@ -1,6 +1,7 @@
 """Linear systems with the Jacobian of the stage equations."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +9,9 @@ import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
 from equinox.internal import ω
-from jax import lax
 from jaxtyping import Array, PyTree
 
 from ._small_lu import SmallLU
-from ._tolerance import ratio
 
 
 # Up to so many unknowns a dense matrix takes less memory than the vectors of GMRES.
@@ -22,7 +21,9 @@ _Linear = Callable[[PyTree[Array]], PyTree[Array]]
 
 
 def solve(
-    apply: _Linear, rhs: PyTree[Array], linear_solver: lx.AbstractLinearSolver | None
+    apply: _Linear,
+    rhs: PyTree[Array],
+    linear_solver: lx.AbstractLinearSolver[Any] | None,
 ) -> PyTree[Array]:
     """The `x` with `apply(x) = rhs`, or something that is not finite, or inexact, if there
     is none: nothing is raised. By `linear_solver`, or if that is `None` by elimination for
@@ -34,7 +35,7 @@ def solve(
     size = optx.max_norm(rhs)
     size = jnp.where(size > 0, size, 1)
     operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: rhs))
-    state = linear_solver.init(operator, {})
+    state: Any = linear_solver.init(operator, {})
     x, *_ = linear_solver.compute(state, (rhs**ω / size).ω, {})
     return (x**ω * size).ω
 

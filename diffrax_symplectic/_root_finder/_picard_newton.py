@@ -20,35 +20,32 @@ class PicardNewton(optx.AbstractRootFinder):
     rounding error, cheaply when the step is small and robustly when it is not.
 
     A step is as symplectic as its stage equations are solved. So the default tolerance
-    is a few units in the last place of whatever dtype the state has. Iteration ends when
+    is two units in the last place of whatever dtype the state has. Iteration ends when
     the *next* correction would be below it: after $\delta_{n-1}$ and $\delta_n$ that is
     about $\delta_n\, (\delta_n / \delta_{n-1})$ for a method of linear convergence.
 
-    What a step normally needs is written out, ahead of Optimistix' loop: over a batch of
-    paths a loop costs more than the arithmetic, since XLA fuses none of what is in it
-    with what is around it, and since it goes on for as long as any of the paths needs.
+    First come iterations without a safety net, for each system of a step on its own:
 
     - Up to `direct` unknowns: `warmup` fixed-point (Picard) iterations, one of Newton's
         method, and `chords` with the same Jacobian.
-    - Above: fixed-point iterations, which need no Jacobian and converge fast for steps
-        that resolve the dynamics. Up to 32 unknowns, `sweeps` of them follow each other
-        without a look at the error; a loop goes on for as long as corrections shrink.
+    - Above: `sweeps` fixed-point iterations without a look at the error, and more, up to
+        `picard_steps`, for as long as corrections shrink. They need no Jacobian.
 
-    The loop that then normally has nothing left to do is Newton's method. It goes on from
-    where these iterations ended if they converged, and otherwise begins at the first
-    guess. Corrections that would make the residual larger are shortened.
-
-    The iterate is kept in the state, ahead of the one that Optimistix holds: a root finder
-    that wraps another and looks at its iterates, such as `optimistix.BestSoFarRootFinder`,
-    cannot wrap this one.
+    Where these do not converge, Newton's method solves all stages of the step as one
+    system. It tries the whole step first. If its corrections do not shrink, it solves for a
+    part of the step, with increments reduced alike, and goes on from there part by part
+    (continuation). If the branch of solutions that begins at the start of the step ends
+    before the whole step, Newton's method looks for any other solution. Its linear systems
+    are solved densely up to 16 unknowns, and above by GMRES, which needs no matrix.
 
     **Arguments:**
 
     - `rtol`: bound on the next correction, relative to the largest entry of each leaf of
-        the iterate. `None` stands for two units in the last place.
+        the state that it changes. `None` stands for two units in the last place.
     - `atol`: absolute bound on the next correction.
     - `norm`: norm within a leaf.
-    - `linear_solver`: solves for the corrections of Newton's method; see Lineax.
+    - `linear_solver`: a Lineax solver for all linear systems, those of derivatives
+        included. `None` is elimination for few unknowns, and otherwise no matrix.
     - `direct`: the most unknowns for which Newton's method is used from the start.
     - `warmup`, `chords`, `sweeps`: see above.
     - `picard_steps`: the most fixed-point iterations.

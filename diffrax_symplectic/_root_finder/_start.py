@@ -47,14 +47,19 @@ def start(finder: "PicardNewton", phi: _Map, y: PyTree[Array], scale: _Map) -> S
 
 
 def converged(
-    finder: "PicardNewton", diff: PyTree, scale: PyTree, size: Scalar, shrink: Scalar
+    finder: "PicardNewton",
+    diff: PyTree,
+    scale: PyTree,
+    size: Scalar,
+    shrink: Scalar,
+    stalled: Bool[Array, ""],
 ) -> Bool[Array, ""]:
     """Whether the correction that would follow `diff` is below the tolerance, when `diff`
-    was `shrink` times as large as the one before."""
+    was `shrink` times as large as the one before, or corrections have `stalled`."""
     # Rounding errors can keep the corrections to a leaf that is small next to the others
     # above `rtol` for ever. Then they no longer shrink, and all of them are tiny.
     eps = jnp.finfo(size.dtype).eps
-    stagnated = (shrink >= 0.25) & (finder.tolerance.relative(diff, scale) <= 100 * eps)
+    stagnated = stalled & (finder.tolerance.relative(diff, scale) <= 100 * eps)
     # A fraction of the tolerance: what remains has the same sign in every step, so that
     # over many steps it adds up to a drift where rounding errors would cancel.
     following = size * jnp.where(shrink < 1, shrink, 1)
@@ -70,15 +75,14 @@ def _newton(finder: "PicardNewton", phi: _Map, y: PyTree[Array], scale: _Map) ->
     )
     solver = finder.linear_solver or SmallLU()
     factors = solver.init(operator, {})
-    diff, shrink = y, None
-    size = jnp.array(jnp.inf)
+    diff, size, shrink = y, jnp.array(jnp.inf), jnp.array(jnp.inf)
     for i in range(finder.chords + 1):
         residual = (y**ω - (value if i == 0 else phi(y)) ** ω).ω
         diff, *_ = solver.compute(factors, residual, {})
         y = (y**ω - diff**ω).ω
         before, size = size, finder.tolerance.measure(diff, scale(y))
         shrink = jnp.ones_like(size) if i == 0 else ratio(size, before)
-    done = converged(finder, diff, scale(y), size, shrink)
+    done = converged(finder, diff, scale(y), size, shrink, shrink >= 0.25)
     return Start(y, done, shrink < 0.5)
 
 
@@ -86,29 +90,30 @@ def _picard(finder: "PicardNewton", phi: _Map, y: PyTree[Array], scale: _Map) ->
     # A look at the error costs several times what an iteration does: XLA fuses no norm
     # with what its result goes into, and a loop that any path of a batch may leave early
     # selects between old and new iterate for each.
-    shift = lambda _, ys: (ys[1], ys[2], phi(ys[2]))
-    ys = lax.fori_loop(0, finder.sweeps, shift, (y, y, y))
-    measure = lambda a, b: finder.tolerance.measure((b**ω - a**ω).ω, scale(ys[2]))
-    last, size = measure(ys[0], ys[1]), measure(ys[1], ys[2])
-    diff = (ys[2] ** ω - ys[1] ** ω).ω
-    shrink = ratio(size, last)
-    done = converged(finder, diff, scale(ys[2]), size, shrink)
+    shift = lambda _, ys: (*ys[1:], phi(ys[-1]))
+    ys = lax.fori_loop(0, finder.sweeps, shift, (y,) * 4)
+    diffs = [(b**ω - a**ω).ω for a, b in zip(ys, ys[1:])]
+    before, last, size = [finder.tolerance.measure(d, scale(ys[-1])) for d in diffs]
+    # Positions and momenta move each other, so that corrections may shrink in turns: of
+    # the last two ratios the larger one is believed.
+    shrink = jnp.maximum(ratio(size, last), ratio(last, before))
+    stalled = size >= 0.25 * before
+    done = converged(finder, diffs[-1], scale(ys[-1]), size, shrink, stalled)
 
     def advance(carry):
         y, _, _, before, last, step = carry
         image = phi(y)
         diff = (y**ω - image**ω).ω
         size = finder.tolerance.measure(diff, scale(image))
-        # Positions and momenta move each other, so that corrections may shrink in turns.
-        # Of the last two ratios the larger one is believed.
         shrink = jnp.maximum(ratio(size, last), ratio(last, before))
-        done = converged(finder, diff, scale(image), size, shrink)
+        stalled = size >= 0.25 * before
+        done = converged(finder, diff, scale(image), size, shrink, stalled)
         return image, done, size < 0.25 * before, last, size, step + 1
 
     def proceed(carry):
         _, done, contracting, _, _, step = carry
         return ~done & contracting & (step < finder.picard_steps)
 
-    carry = (ys[2], done, shrink < 1, last, size, finder.sweeps)
+    carry = (ys[-1], done, shrink < 1, last, size, finder.sweeps)
     y, done, contracting, *_ = lax.while_loop(proceed, advance, carry)
     return Start(y, done, contracting)

@@ -22,7 +22,7 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
 # The lines about these fields in the documentation of every such solver's `__init__`.
 ROOT_FINDER = """\
 - `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in each system of a step.
+- `root_find_max_steps`: the most iterations it may take in each step.
 """
 ARGUMENTS = f"""**Arguments:**
 

@@ -89,9 +89,7 @@ def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
     t_unknown = differentiate(finder, linear, rhs)
     end = lambda x, k: eqx.combine(x, still).end(k)
     _, t_y1 = jax.jvp(end, (moving, root), (t_stages, t_unknown))
-    t_y1, t_unknown = jtu.tree_map(
-        lambda t: jnp.where(failed, 0, t), (t_y1, t_unknown)
-    )
+    t_y1, t_unknown = jtu.tree_map(lambda t: jnp.where(failed, 0, t), (t_y1, t_unknown))
     return (y1, unknown, unsolved), (t_y1, t_unknown, None)
 
 
@@ -108,7 +106,9 @@ def _by_blocks(stages: Stages, finder: PicardNewton):
                 )
 
             guess = stages.zero_of(block)
-            found = start(finder, image, guess, lambda k, b=block: stages.scale_of(b, k))
+            found = start(
+                finder, image, guess, lambda k, b=block: stages.scale_of(b, k)
+            )
             keep = found.converged | found.contracting
             k = jtu.tree_map(lambda a, b: jnp.where(keep, a, b), found.y, guess)
             unsolved = unsolved | ~found.converged

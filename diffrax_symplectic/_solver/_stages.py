@@ -58,7 +58,9 @@ class Stages(eqx.Module):
             return jnp.zeros(shape, jnp.result_type(x))
 
         return [
-            jtu.tree_map(ft.partial(zero, group), _part(self.y0, stages[group[0]].writes))
+            jtu.tree_map(
+                ft.partial(zero, group), _part(self.y0, stages[group[0]].writes)
+            )
             for group in block.unknown
         ]
 
