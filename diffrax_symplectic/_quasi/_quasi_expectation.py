@@ -164,7 +164,6 @@ def quasi_expectation(
         return _replicates(problem, key, numbers, np.uint32(k), h, *steps, mesh)
 
     values, num_failed = [], 0
-    result = None
     meter = progress_meter.init()
     try:
         for begin in range(0, replicates, mesh.size):
@@ -175,17 +174,15 @@ def quasi_expectation(
                     one = [jtu.tree_map(lambda x: x[0], means) for means in one]
                 values.append(one)
                 num_failed += sum(int(failed[i]) for _, failed in done)
-                if len(values) < min(_BEFORE_STOPPING, replicates):
-                    continue
                 # The same replicates decide, however many are made at once.
-                result = estimate(values, num_failed, order, tol)
-                if result.tol_reached:
-                    return result
+                if tol is not None and len(values) >= _BEFORE_STOPPING:
+                    result = estimate(values, num_failed, order, tol)
+                    if result.tol_reached:
+                        return result
             meter = progress_meter.step(meter, np.asarray(len(values) / replicates))
     finally:
         progress_meter.close(meter)
-    assert result is not None
-    return result
+    return estimate(values, num_failed, order, tol)
 
 
 @eqx.filter_jit
