@@ -121,9 +121,10 @@ def quasi_expectation(
 
     **Raises:** a `ValueError` for a number of paths that is no power of two, fewer than two
     replicates, times between steps, a $\phi$ that is not real, a path whose random
-    variables cannot be chosen (Diffrax's own; use a `FixedStepBrownianPath`), or more in
-    a step than there are coordinates of Sobol' points (21,201). Warns if there are so many
-    coordinates to sort by that sorting does not bring neighbours together.
+    variables cannot be chosen (Diffrax's own; use a
+    [`diffrax_symplectic.FixedStepBrownianPath`][]), or more in a step than there are
+    coordinates of Sobol' points (21,201). Warns if there are so many coordinates to sort by
+    that sorting does not bring neighbours together.
     """
     num_paths = _whole("num_paths", num_paths, 2)
     if num_paths & (num_paths - 1):
