@@ -10,7 +10,7 @@ Measures the models named (all without names), keeps what it measured of each in
 import argparse
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,7 +50,7 @@ class Model(NamedTuple):
     noises: tuple[int, ...]
     solver: diffrax.AbstractSolver
     # What Diffrax has, and whether it needs space-time area.
-    others: dict[str, tuple[diffrax.AbstractSolver, bool]]
+    others: Mapping[str, tuple[diffrax.AbstractSolver, bool]]
     sort_by: Callable | None = None
     exact: float | None = None
 
@@ -105,39 +105,32 @@ MODELS = {
 }  # fmt: skip
 
 
-def _quasi(model: Model, solver, steps: int, paths: int, area=False, **kwargs):
-    """An estimate of phi and of its square."""
+def _quasi(model: Model, solver, area=False) -> Callable[..., ds.QuasiExpectation]:
+    """Estimates phi and its square. Of one solver: the program is compiled once for each
+    number of paths."""
     levy_area = diffrax.SpaceTimeLevyArea if area else diffrax.BrownianIncrement
     path = ds.FixedStepBrownianPath(model.noises, jr.key(0), levy_area=levy_area)
+    terms = model.make_terms(path)
 
     def phi(t, y, args):
         value = model.phi(y)
         return jnp.stack([value, value**2])
 
-    kwargs = dict(replicates=REPLICATES, sort_by=model.sort_by) | kwargs
-    return ds.quasi_expectation(
-        phi, model.make_terms(path), solver, 0.0, model.t1, model.t1 / steps, model.y0,
-        key=jr.key(steps), num_paths=paths, **kwargs,
-    )  # fmt: skip
+    def run(steps: int, paths: int, replicates: int, levels: int = 1):
+        return ds.quasi_expectation(
+            phi, terms, solver, 0.0, model.t1, model.t1 / steps, model.y0,
+            key=jr.key(steps), num_paths=paths, replicates=replicates, levels=levels,
+            sort_by=model.sort_by,
+        )  # fmt: skip
 
-
-def _timed(model: Model, steps: int, paths: int, levels: int):
-    """An estimate, and the seconds that it takes when compiled."""
-    run = lambda n: _quasi(
-        model, model.solver, steps, paths, levels=levels, replicates=n
-    )
-    run(2)
-    begin = time.perf_counter()
-    estimate = run(REPLICATES)
-    return estimate, time.perf_counter() - begin
+    return run
 
 
 def study(model: Model, quick: bool = False) -> dict[str, Any]:
     """Of each pipeline, seconds and the errors that they buy."""
     sizes = [2**6, 2**8] if quick else [2**8, 2**10, 2**12]
-    finest = _quasi(
-        model, model.solver, 2 * model.steps, sizes[-1], levels=2, replicates=4
-    )
+    run = _quasi(model, model.solver)
+    finest = run(2 * model.steps, 4 * sizes[-1], 4, levels=2)
     exact = float(finest.mean[0]) if model.exact is None else model.exact
     variance = float(finest.mean[1] - finest.mean[0] ** 2)
     out: dict[str, Any] = {"exact": exact, "variance": variance, "pipelines": {}}
@@ -147,7 +140,10 @@ def study(model: Model, quick: bool = False) -> dict[str, Any]:
     ):
         rows = []
         for paths in sizes:
-            estimate, seconds = _timed(model, steps, paths, levels)
+            run(steps, paths, 2, levels)
+            begin = time.perf_counter()
+            estimate = run(steps, paths, REPLICATES, levels)
+            seconds = time.perf_counter() - begin
             spread = float(np.var(estimate.replicates[:, 0], ddof=1))
             error = np.hypot(
                 float(estimate.mean[0]) - exact, np.sqrt(spread / REPLICATES)
@@ -173,9 +169,9 @@ def study(model: Model, quick: bool = False) -> dict[str, Any]:
         )
         batch = 100 if quick else BATCH
         cost = measure(fn, keys(batch), repeats=1 if quick else 3).seconds
-        biases = []
+        biases, other = [], _quasi(model, solver, area)
         for steps in (model.steps, 2 * model.steps):
-            e = _quasi(model, solver, steps, sizes[-1], area, replicates=4)
+            e = other(steps, sizes[-1], REPLICATES)
             biases.append((steps, float(e.mean[0]) - exact, float(e.std_error[0])))
         out["pipelines"][name] = {"cost": cost / batch / model.steps, "biases": biases}
     return out
