@@ -151,7 +151,7 @@ def study(model: Model, quick: bool = False) -> dict[str, Any]:
             rows.append((seconds, float(error), variance / paths / spread, paths))
         out["pipelines"][name] = {"rows": rows}
     ours = lambda key: ds.FixedStepBrownianPath(model.noises, key)
-    plain = {type(model.solver).__name__: (model.solver, False, ours)}
+    plain: dict[str, Any] = {type(model.solver).__name__: (model.solver, False, ours)}
     for name, (solver, area) in model.others.items():
         levy_area = diffrax.SpaceTimeLevyArea if area else diffrax.BrownianIncrement
         path = lambda key, levy_area=levy_area: diffrax.UnsafeBrownianPath(
