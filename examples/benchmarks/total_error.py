@@ -182,7 +182,8 @@ def curve(pipeline: dict, variance: float) -> tuple[np.ndarray, np.ndarray]:
     falls by the power of the step that it shows, and its square and the variance over the
     number of paths are the square of the error."""
     (n1, b1, s1), (n2, b2, s2) = pipeline["biases"]
-    b1, b2 = max(abs(b1), s1), max(abs(b2), s2)
+    # What is not clear of its own uncertainty counts for nothing: in favour of plain paths.
+    b1, b2 = (max(abs(b) - 2 * s, 1e-9) for b, s in ((b1, s1), (b2, s2)))
     order = np.clip(np.log2(b1 / b2), 1.0, 2.0)
     errors = np.logspace(-6, -2, 41)
     steps = n2 * 2.0 ** np.arange(-6, 24)[:, None]
