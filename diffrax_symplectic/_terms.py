@@ -228,7 +228,7 @@ def _within_resolution(noise: tuple, t0, t1) -> RealScalarLike:
             # What rounding leaves at the end of a solve is no step.
             coarse = (h < 0.999 * tol) & (h > 1e-6 * tol)
             t1 = eqx.error_if(
-                t1,
+                jnp.asarray(t1),
                 coarse,
                 "A step is shorter than `tol` of the `VirtualBrownianTree`, which only "
                 "interpolates there, so that the noise would be too small. Pass a smaller "
