@@ -15,6 +15,14 @@ from .problems import Given, slope, values_of_a_step, weak_path
 
 _oscillator = lambda t, p, q, args: jnp.sum(p**2 / 2 + jnp.cos(q + t))
 _force = lambda t, p, q, args: jnp.stack([jnp.sum(jnp.sin(q))])
+# Neither separable nor commuting.
+_noises = lambda t, p, q, args: jnp.stack([jnp.sin(q + t), 0.4 * p * q + jnp.cos(p)])[
+    :, 0
+]
+_CASES = {
+    "StormerVerlet": (ds.StormerVerlet(), _force, weak_path(1)),
+    "NinomiyaVictoir": (ds.NinomiyaVictoir(), _noises, weak_path(2, two_point=True)),
+}
 
 
 @pytest.mark.parametrize("inner", [ds.StormerVerlet(), ds.Midpoint()], ids=repr)
@@ -35,26 +43,26 @@ def test_step_is_conformally_symplectic(inner):
     assert jnp.max(jnp.abs(defect)) <= 1e-13
 
 
-def test_local_weak_defect_is_of_order_three_with_stormer_verlet():
+@pytest.mark.parametrize("case", _CASES)
+def test_local_weak_defect_is_of_order_three(case):
+    inner, noise, path = _CASES[case]
     gamma = 0.7
-    terms = ds.hamiltonian_terms(_oscillator, _force, weak_path(1))
+    terms = ds.hamiltonian_terms(_oscillator, noise, path)
     friction = diffrax.ODETerm(lambda t, y, args: (-gamma * y[0], jnp.zeros_like(y[1])))
-    y0 = jnp.array([0.3]), jnp.array([0.5])
-    solver = ds.Damped(ds.StormerVerlet(), gamma)
-
-    def defect(h, terms, solver):
-        kwargs = dict(fn=values_of_a_step, order=2)
-        return ds.weak_order_defect(terms, solver, 0.1, 0.1 + h, y0, **kwargs)
-
-    # The generator of the equation with friction: of one solver's defect less what it
-    # and the damped solver expect after the step.
     both = diffrax.MultiTerm(*terms.terms, friction)
+    y0 = jnp.array([0.3]), jnp.array([0.5])
+    fn = dict(fn=values_of_a_step)
 
+    # The generator of the equation with friction comes with the defect of a solver that
+    # takes friction as a term. What that solver expects after the step is then exchanged
+    # for what the damped solver expects.
     def damped(h):
-        at = dict(fn=values_of_a_step)
-        expected = ds.step_expectation(terms, solver, 0.1, 0.1 + h, y0, **at)
-        other = ds.step_expectation(both, ds.Midpoint(), 0.1, 0.1 + h, y0, **at)
-        return defect(h, both, ds.Midpoint()) + expected - other
+        step = (0.1, 0.1 + h, y0)
+        other = both, diffrax.Heun(), *step
+        solver = ds.Damped(inner, gamma)
+        expected = ds.step_expectation(terms, solver, *step, **fn)
+        exchange = expected - ds.step_expectation(*other, **fn)
+        return ds.weak_order_defect(*other, **fn, order=2) + exchange
 
     hs = np.array([0.02, 0.01, 0.005])
     defects = jax.jit(jax.vmap(damped))(hs)
