@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
@@ -41,8 +42,11 @@ def differentiate(finder: Any, linear: _Linear, rhs: PyTree[Array]) -> PyTree[Ar
             return _linear.solve(operator, b, linear_solver)
         return _by_series(operator, b)
 
-    operator = lambda x: (x**ω - linear(x) ** ω).ω
-    return lax.custom_linear_solve(operator, rhs, solve, solve)
+    # As one vector: JAX cannot transpose a solve in whose right-hand side some arrays
+    # depend on what is differentiated and others do not.
+    flat, unravel = jfu.ravel_pytree(rhs)
+    operator = lambda x: x - jfu.ravel_pytree(linear(unravel(x)))[0]
+    return unravel(lax.custom_linear_solve(operator, flat, solve, solve))
 
 
 def _by_series(operator: _Linear, b: PyTree[Array]) -> PyTree[Array]:
