@@ -105,7 +105,7 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         drift, noise = split_terms(terms)
         plan = make_plan(_drop_absent(self.tableau.flatten(), drift, noise))
         variables = _variables(plan.tableau)
-        driven = {"h": drift_driven(drift, t0, t1, args)}
+        driven = {"h": drift_driven(drift, t0, t1, args)} if drift else {}
         name = type(self).__name__
         driven |= noise_driven(drift, noise, variables, t0, t1, args, name)
         y1, result = take_step(plan, Step(t0, t1 - t0, driven), y0, self)
