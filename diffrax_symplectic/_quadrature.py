@@ -84,8 +84,8 @@ def _the_path(terms) -> tuple[diffrax.AbstractBrownianPath, Mapping[str, Abstrac
         raise ValueError(
             "`terms` must hold exactly one Brownian path, a `WeakBrownianPath`, whose "
             "outcomes can be enumerated, or a Gaussian one, whose increments are "
-            "integrated over, with `levy_area=BrownianIncrement` or `SpaceTimeLevyArea`, "
-            "also within a `PlateauBrownianPath`; got "
+            "integrated over, with `levy_area=BrownianIncrement`, `SpaceTimeLevyArea` or "
+            "`SpaceTimeTimeLevyArea`, also within a `PlateauBrownianPath`; got "
             f"{[_named(path) for path in paths]}."
         )
     return paths[0], laws

@@ -145,9 +145,10 @@ def step_expectation(
     The random variables of a [`diffrax_symplectic.WeakBrownianPath`][] take finitely
     many values, so that the expectation is a finite sum: $3^m$ outcomes for $m$ noises,
     $9^m$ with the second set of three-point variables, and $2^m$ times as many with the
-    two-point ones. For Gaussian increments (and space-time Lévy areas, and plateaus) of a
-    path of Diffrax it is computed by Gauss--Hermite quadrature, exact if $\phi(y_1)$ is a
-    polynomial in these of degree less than twice `nodes`.
+    two-point ones. For Gaussian increments of a path of Diffrax (and their
+    space-time and space-time-time Lévy areas, and plateaus) it is computed by
+    Gauss--Hermite quadrature, exact if $\phi(y_1)$ is a polynomial in these of degree less
+    than twice `nodes`.
 
     **Arguments:**
 

@@ -1,5 +1,7 @@
 """Systems that people bring, by what is known of them exactly: `docs/hard_cases.md`."""
 
+import functools
+
 import diffrax
 import equinox as eqx
 import jax
@@ -17,6 +19,7 @@ from examples.hard_cases import (
     spins,
     two_body,
 )
+from examples.hard_cases._stationary import stationary_bias, Step
 
 from .problems import FineSample, slope
 
@@ -79,12 +82,37 @@ def test_escape_from_a_double_well_costs_the_energy_that_noise_brings():
     assert e.balance.std_error <= 0.02 * -double_well.BOTTOM
 
 
-def test_double_well_with_friction_has_the_moments_of_gibbs():
-    r = double_well.thermal(*double_well.SOLVERS["Midpoint"], 0.1, 15.0, 10_000)
-    # h^2 / 8 is what the midpoint rule's own stationary density may be off by.
-    for mean in (r.p2, r.q2, r.q):
-        assert abs(mean.value) <= 4 * mean.std_error + 0.1**2 / 8
-        assert mean.std_error <= 0.02
+def test_stationary_law_of_an_oscillator_is_that_of_its_matrices():
+    gamma, T, h = 0.7, 0.5, 0.3
+    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    noise = lambda t, p, q, args: -np.sqrt(2 * gamma * T) * q
+    step = Step(
+        lambda path: ds.hamiltonian_terms(H0, noise, path),
+        lambda key: diffrax.UnsafeBrownianPath((), key),
+        ds.Damped(ds.StormerVerlet(), gamma),
+    )
+    [bias] = stationary_bias(step, lambda q: q**2 / 2, T, [h], degrees=(2, 2))
+    # For (q, p): friction, half a drift, kick, half a drift, friction.
+    friction = np.diag([1, np.exp(-gamma * h / 2)])
+    drift, kick = np.array([[1, h / 2], [0, 1]]), np.array([[1, 0], [-h, 1]])
+    after = friction @ drift
+    A, b = after @ kick @ drift @ friction, after @ [0, np.sqrt(2 * gamma * T * h)]
+    moments = np.linalg.solve(np.eye(4) - np.kron(A, A), np.kron(b, b))
+    np.testing.assert_allclose(bias, moments[[0, 3]] - T, atol=1e-13)
+
+
+def test_double_well_with_friction_has_nearly_the_moments_of_gibbs():
+    h, V = 0.1, lambda q: double_well.energy(0.0, q)
+    bound = {"Damped(PlateauVerlet)": 1e-4, "QUICSORT": 1e-4}
+    for name, most in bound.items():
+        step, _ = double_well.LANGEVIN[name]
+        [[q2, _]] = stationary_bias(step, V, double_well.T, [h])
+        assert abs(q2) <= most
+    # One evaluation for each step is enough where the well is cold.
+    cold = functools.partial(double_well.langevin_terms, T=0.1)
+    step = double_well.LANGEVIN["Damped(StormerVerlet)"][0]._replace(make_terms=cold)
+    [[q2, _]] = stationary_bias(step, V, 0.1, [h])
+    assert abs(q2) <= 1e-3
 
 
 def test_harmonic_chain_in_64_unknowns_is_heated_as_in_closed_form():

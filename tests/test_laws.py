@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._brownian import Discrete, VARIABLES
+from diffrax_symplectic._brownian import Discrete, laws_of, VARIABLES
 from diffrax_symplectic._terms import controls
 
 from .problems import weak_path
 
 
 def test_laws_have_the_variance_on_record_and_outcomes_of_their_words():
+    areas = diffrax.UnsafeBrownianPath((1,), jr.key(0), diffrax.SpaceTimeTimeLevyArea)
     paths = [
+        areas,
         weak_path(1, second=True, two_point=True),
         weak_path(1, order=3),
         ds.PlateauBrownianPath(
@@ -23,9 +25,11 @@ def test_laws_have_the_variance_on_record_and_outcomes_of_their_words():
         ),
     ]
     for path in paths:
-        assert path.laws is not None
-        for name, law in path.laws.items():
-            on_record = VARIABLES[name].variance
+        laws = laws_of(path)
+        assert laws is not None
+        for name, law in laws.items():
+            # K is Diffrax's: no solver here needs it.
+            on_record = 1 / 720 if name == "K" else VARIABLES[name].variance
             assert on_record is not None
             values, weights = law.outcomes(5)
             np.testing.assert_allclose(weights.sum(), 1, rtol=1e-14)
@@ -42,6 +46,10 @@ def test_laws_have_the_variance_on_record_and_outcomes_of_their_words():
                 np.testing.assert_allclose(
                     np.diff(edges.astype(float)) / 2**32, weights, atol=2**-32
                 )
+    names = lambda path: set(laws_of(path) or ())
+    assert names(areas) == {"W", "H", "K"}
+    # The increments with plateaus hold space-time areas alone.
+    assert names(ds.PlateauBrownianPath(areas, jr.key(1))) == {"W", "H", "C"}
 
 
 def test_increments_can_be_made_from_words_given_in_place_of_the_random_ones():

@@ -79,7 +79,7 @@ class FixedStepBrownianPath(AbstractStepwisePath):
         floating-point, for another `levy_area`, or if `cell` is not positive; an error
         when run if a step does not consist of cells.
         """
-        if gaussian_laws(levy_area) is None:
+        if levy_area not in (diffrax.BrownianIncrement, diffrax.SpaceTimeLevyArea):
             raise ValueError(
                 "`levy_area` must be `diffrax.BrownianIncrement` or "
                 f"`diffrax.SpaceTimeLevyArea`; got {levy_area!r}."

@@ -62,7 +62,10 @@ class PlateauBrownianPath(AbstractWrappedPath):
     @property
     def laws(self) -> dict[str, AbstractLaw] | None:
         laws = laws_of(self.path)
-        return None if laws is None else {**laws, "C": _PLATEAU}
+        if laws is None:
+            return None
+        # The increments here hold no space-time-time areas.
+        return {"W": laws["W"], "H": laws["H"], "C": _PLATEAU}
 
     def num_words(self, use_levy: bool = False) -> int:
         words = stepwise(self.path).num_words(use_levy)

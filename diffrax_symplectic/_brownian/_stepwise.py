@@ -69,6 +69,8 @@ def gaussian_laws(levy_area: type) -> Mapping[str, AbstractLaw] | None:
         return {"W": Gaussian()}
     if levy_area is diffrax.SpaceTimeLevyArea:
         return {"W": Gaussian(), "H": Gaussian(1 / 12)}
+    if levy_area is diffrax.SpaceTimeTimeLevyArea:
+        return {"W": Gaussian(), "H": Gaussian(1 / 12), "K": Gaussian(1 / 720)}
     return None
 
 

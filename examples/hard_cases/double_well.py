@@ -6,11 +6,14 @@ import diffrax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 import diffrax_symplectic as ds
 
+from ..benchmarks._timing import ensemble as many, keys, machine, measure
 from ..stability._page import fill, Page, table
-from ._ensemble import ensemble, gaussian, Mean, truncated
+from ._ensemble import ensemble, gaussian, Mean, plateaus, truncated
+from ._stationary import stationary_bias, Step
 
 
 def energy(p, q):
@@ -52,47 +55,65 @@ def escape(solver, make_path, s: float, h: float, t1: float, paths: int) -> Esca
     )  # fmt: skip
 
 
-def make_thermal_terms(path):
-    """With friction, `args = (gamma, T)`: no Hamiltonian system, but plain Diffrax terms
-    for the array [p, q], which the general solvers take. The Gibbs density exp(-H0 / T) is
-    stationary."""
+# With friction, and noise that balances it: the density exp(-H0 / T) is stationary.
+GAMMA, T = 1.0, 0.5
 
-    def drift(t, y, args):
-        p, q = y
-        return jnp.stack([q - q**3 - args[0] * p, p])
 
-    def diffusion(t, y, args):
-        return jnp.stack([jnp.sqrt(2 * args[0] * args[1]), 0.0])
-
-    return diffrax.MultiTerm(
-        diffrax.ODETerm(drift), diffrax.ControlTerm(diffusion, path)
+def langevin_terms(path, gamma=GAMMA, T=T):
+    """Those of a solver that is `Damped`."""
+    return ds.hamiltonian_terms(
+        lambda t, p, q, args: energy(p, q),
+        lambda t, p, q, args: -np.sqrt(2 * gamma * T) * q,
+        path,
     )
 
 
-def gibbs_moments(T: float) -> tuple[float, float]:
-    """E p^2 and E q^2, by quadrature."""
-    q = np.linspace(-6, 6, 20001)
-    density = np.exp(-energy(0.0, q) / T)
-    return T, float(np.sum(q**2 * density) / np.sum(density))
+def terms_with_friction(path):
+    friction = diffrax.ODETerm(lambda t, y, args: (-GAMMA * y[0], jnp.zeros_like(y[1])))
+    return diffrax.MultiTerm(*langevin_terms(path).terms, friction)
 
 
-class Thermal(NamedTuple):
-    """What is too much in E p^2 and E q^2; and the mean of q."""
+def diffrax_terms(path):
+    """Diffrax's own, of which its solvers for Langevin dynamics make use. Their
+    temperature is `u`."""
+    force = lambda q, args: (q**3 - q) / T
+    return diffrax.MultiTerm(
+        diffrax.UnderdampedLangevinDriftTerm(GAMMA, T, force),
+        diffrax.UnderdampedLangevinDiffusionTerm(GAMMA, T, path),
+    )
 
-    p2: Mean
-    q2: Mean
-    q: Mean
+
+def with_areas(levy_area):
+    return lambda key: diffrax.UnsafeBrownianPath((), key, levy_area)
 
 
-def thermal(solver, make_path, h, t1, paths, gamma=1.0, T=0.5) -> Thermal:
-    _, ys, failed = ensemble(
-        make_thermal_terms, make_path, solver, jnp.stack(Y0), h, round(t1 / h), paths,
-        args=(gamma, T),
-    )  # fmt: skip
-    assert not failed.any()
-    p, q = ys[:, -1].T
-    p2, q2 = gibbs_moments(T)
-    return Thermal(Mean.of(p**2 - p2), Mean.of(q**2 - q2), Mean.of(q))
+def damped(solver, make_path) -> Step:
+    return Step(langevin_terms, make_path, ds.Damped(solver, GAMMA))
+
+
+# Each with its evaluations of the force in a step.
+LANGEVIN = {
+    "Damped(StormerVerlet)": (damped(ds.StormerVerlet(), gaussian()), 1),
+    "Damped(PlateauVerlet)": (damped(ds.PlateauVerlet(), plateaus()), 2),
+    "Damped(Midpoint)": (damped(ds.Midpoint(), gaussian()), None),
+    "ALIGN": (
+        Step(
+            diffrax_terms, with_areas(diffrax.SpaceTimeLevyArea), diffrax.ALIGN(), True
+        ),
+        1,
+    ),
+    "QUICSORT": (
+        Step(
+            diffrax_terms,
+            with_areas(diffrax.SpaceTimeTimeLevyArea),
+            diffrax.QUICSORT(),
+            True,
+            nodes=5,
+        ),
+        2,
+    ),
+    "Heun": (Step(terms_with_friction, gaussian(), diffrax.Heun()), 2),
+}
 
 
 SOLVERS = {
@@ -102,41 +123,73 @@ SOLVERS = {
 }
 
 
-def section(page: Page) -> str:
+def escapes(page: Page) -> dict[str, str]:
     paths = 1_000 if page.quick else 20_000
     hs = [0.1] if page.quick else [0.4, 0.2, 0.1]
     names = ["Midpoint", "Heun"] if page.quick else SOLVERS
-    s, t1, thermal_t1 = 0.2, 20.0, 20.0
+    s, t1 = 0.2, 20.0
     print(f"\nDouble well: escape until t = {t1:g}, s = {s}, {paths:,} paths")
-    rows, thermal_rows = [], []
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4))
+    rows = []
+    figure, ax = plt.subplots(figsize=(5.5, 4))
     for name in names:
         solver, make_path = SOLVERS[name]
-        balances, squares = [], []
-        for h in hs:
-            e = escape(solver, make_path, s, h, t1, paths)
+        es = [escape(solver, make_path, s, h, t1, paths) for h in hs]
+        for h, e in zip(hs, es):
             rows.append((name, h, str(e.balance), str(e.escaped), str(e.time)))
-            balances.append(e.balance)
-            th = thermal(solver, make_path, h, thermal_t1, paths)
-            thermal_rows.append((name, h, str(th.p2), str(th.q2), str(th.q)))
-            squares.append(th.q2)
-        for ax, means in zip(axes, (balances, squares)):
-            y, error = np.array(means).T
-            ax.errorbar(hs, y, 3 * error, marker="o", ms=3, lw=1, capsize=2, label=name)
-    header = ("solver", "h", "balance", "escaped", "mean of min(time, t)")
-    shown = table(header, rows)
-    print(f"\nDouble well with friction: moments at t = {thermal_t1:g} less Gibbs")
-    thermal_table = table(("solver", "h", "E p^2", "E q^2", "E q"), thermal_rows)
-    for ax, title in zip(
-        axes, ("escape: energy balance", "friction: E q^2 less Gibbs")
-    ):
-        ax.set(xlabel="h", title=title, xscale="log")
-        ax.set_yscale("symlog", linthresh=1e-2)
-        ax.axhline(0, color="k", lw=0.5)
-        ax.legend(fontsize=7)
+        y, error = np.array([e.balance for e in es]).T
+        ax.errorbar(hs, y, 3 * error, marker="o", ms=3, lw=1, capsize=2, label=name)
+    shown = table(("solver", "h", "balance", "escaped", "mean of min(time, t)"), rows)
+    ax.set(xlabel="h", title="escape: energy balance", xscale="log")
+    ax.set_yscale("symlog", linthresh=1e-2)
+    ax.axhline(0, color="k", lw=0.5)
+    ax.legend(fontsize=7)
     picture = page.picture(figure, "double_well", "Double well")
     plt.close(figure)
-    return fill(__file__, 
-        table=shown, thermal=thermal_table, picture=picture, s=s, t1=f"{t1:g}",
-        paths=f"{paths:,}", t2=f"{thermal_t1:g}",
-    )  # fmt: skip
+    return dict(
+        table=shown, picture=picture, s=str(s), t1=f"{t1:g}", paths=f"{paths:,}"
+    )
+
+
+def seconds_per_step(step: Step, repeats: int) -> float:
+    """Of one path, of many at once."""
+    paths, steps = 1_000, 100
+    y0 = Y0[::-1] if step.q_first else Y0
+    solve = many(step.make_terms, step.make_path, step.solver, y0, 0.1, steps)
+    timing = measure(solve, keys(paths), repeats=repeats)
+    return timing.seconds / (paths * steps)
+
+
+def temperatures(page: Page) -> dict[str, str]:
+    names = ["Damped(StormerVerlet)", "ALIGN"] if page.quick else LANGEVIN
+    hs = np.array([0.2, 0.1] if page.quick else [0.4, 0.2, 0.1, 0.05])
+    print(f"\nDouble well with friction: stationary moments less Gibbs, T = {T:g}")
+    rows = []
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4), sharey=True)
+    for i, name in enumerate(names):
+        step, evaluations = LANGEVIN[name]
+        bias = stationary_bias(step, lambda q: energy(0.0, q), T, hs)
+        seconds = seconds_per_step(step, 5 if page.quick else 100)
+        costs = evaluations, 1e6 * seconds
+        cells = "implicit" if evaluations is None else evaluations, f"{costs[1]:.2f}"
+        for h, (q2, p2) in zip(hs, bias):
+            rows.append((name, h, f"{q2:+.1e}", f"{p2:+.1e}", *cells))
+        for ax, cost in zip(axes, costs):
+            if cost is not None:
+                y = np.abs(bias[:, 0])
+                ax.loglog(cost / hs, y, f"C{i}o-", ms=3, lw=1, label=name)
+    header = "solver", "h", "E q^2", "E p^2", "forces a step", "microseconds a step"
+    shown = table(header, rows)
+    units = "evaluations of the force", "microseconds"
+    for ax, unit in zip(axes, units):
+        ax.set(xlabel=f"{unit} per unit of time", title="bias of E q^2")
+        ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        ax.xaxis.set_minor_formatter(NullFormatter())
+        ax.legend(fontsize=7)
+    picture = page.picture(figure, "langevin", "Bias against cost")
+    plt.close(figure)
+    return dict(thermal=shown, chart=picture, machine=machine())
+
+
+def section(page: Page) -> str:
+    return fill(__file__, **escapes(page), **temperatures(page))
