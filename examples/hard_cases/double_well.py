@@ -160,7 +160,7 @@ def seconds_per_step(step: Step, repeats: int) -> float:
 
 
 def temperatures(page: Page) -> dict[str, str]:
-    names = ["Damped(StormerVerlet)", "ALIGN"] if page.quick else LANGEVIN
+    names = ["ALIGN"] if page.quick else LANGEVIN
     hs = np.array([0.2, 0.1] if page.quick else [0.4, 0.2, 0.1, 0.05])
     print(f"\nDouble well with friction: stationary moments less Gibbs, T = {T:g}")
     rows = []
