@@ -233,19 +233,28 @@ def test_explicit_methods_have_no_equation_to_solve(solver):
     assert all(jnp.all(jnp.isfinite(x)) for x in sol.ys)
 
 
-def test_plateaus_are_fair_and_independent_of_the_path():
+def test_plateaus_are_fair_and_have_the_mean_square_of_the_path():
     h = 0.25
     tree = diffrax.UnsafeBrownianPath((100_000,), jr.key(0), diffrax.SpaceTimeLevyArea)
     path = ds.PlateauBrownianPath(tree, jr.key(1))
     first = path.evaluate(0.0, h, use_levy=True)
     again = path.evaluate(1e-12, h, use_levy=True)
     np.testing.assert_array_equal(np.sign(first.C), np.sign(again.C))
-    np.testing.assert_allclose(np.abs(first.C), np.sqrt(h / 6), rtol=1e-15)
+    # The parabola through what is known of the path, and the mean square of the rest,
+    # h / 2 - h (1 / 3 + 1 / 10).
+    points, weights = np.polynomial.legendre.leggauss(3)
+    u = (1 + points[:, None]) / 2
+    parabola = first.W * u + 6 * first.H * u * (1 - u)
+    mean, square = (weights / 2 @ x for x in (parabola, parabola**2))
+    np.testing.assert_allclose(mean**2 + first.C**2, square + h / 15, rtol=1e-12)
+    assert abs(np.mean(first.C**2) - h / 6) <= 4 * np.std(first.C**2) / np.sqrt(100_000)
     bound = 4 * np.sqrt(h / 6) / np.sqrt(100_000)
     assert abs(np.mean(first.C)) <= bound
     later = path.evaluate(h, 2 * h, use_levy=True)
     for other in (first.W, first.H, later.C):
         assert abs(np.mean(first.C * other)) <= bound * np.std(other)
+    back = jax.tree.map(lambda x: -x, first)
+    np.testing.assert_array_equal(back.C, -first.C)
 
 
 def test_missing_variables_are_refused_with_advice():

@@ -49,7 +49,7 @@ def test_laws_have_the_variance_on_record_and_outcomes_of_their_words():
     names = lambda path: set(laws_of(path) or ())
     assert names(areas) == {"W", "H", "K"}
     # The increments with plateaus hold space-time areas alone.
-    assert names(ds.PlateauBrownianPath(areas, jr.key(1))) == {"W", "H", "C"}
+    assert names(ds.PlateauBrownianPath(areas, jr.key(1))) == {"W", "H", "sign"}
 
 
 def test_increments_can_be_made_from_words_given_in_place_of_the_random_ones():

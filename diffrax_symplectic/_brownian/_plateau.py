@@ -1,4 +1,6 @@
 import diffrax
+import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 
 from .._custom_types import BM, RealScalarLike
@@ -17,21 +19,37 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
     r"""Increment, space-time Lévy area and plateaus over a step of size $h$.
 
     The path over the step stands for two plateaus, of height $M - C$ over its first half
-    and $M + C$ over its second, with $M = W / 2 + H$ its mean and $C = \pm\sqrt{h / 6}$
-    with a fair sign: they have the mean of the Brownian path over the step and, in
-    expectation, its mean square.
+    and $M + C$ over its second. $M = W / 2 + H$ is the mean of the Brownian path over the
+    step, and
+
+    $$C = \pm\sqrt{\tfrac{1}{15} h + \tfrac{1}{12} W^2 + \tfrac15 H^2}$$
+
+    with a fair sign: $M^2 + C^2$ is the mean square of the Brownian path over the step, in
+    expectation given $W$ and $H$. In the mean, $C^2$ is $h / 6$.
 
     - `dt`, `W`, `H`: as for Diffrax.
+    - `sign`: the signs, times $\sqrt h$.
     - `C`: the variables $C_k$.
     """
 
     dt: PyTree[Float[Array, ""], "BM"]
     W: BM
     H: BM
-    C: BM
+    sign: BM
+
+    @property
+    def C(self) -> BM:
+        return jtu.tree_map(_offset, self.dt, self.W, self.H, self.sign)
 
 
-_PLATEAU = two_point(variance=1 / 6)
+def _offset(h, W, H, sign):
+    # Backward in time Diffrax changes the sign of all, the step size included.
+    h = jnp.abs(h).astype(W.dtype)
+    size = jnp.sqrt(h / 15 + W**2 / 12 + H**2 / 5)
+    return jnp.copysign(size, sign)
+
+
+_SIGN = two_point()
 
 
 class PlateauBrownianPath(AbstractWrappedPath):
@@ -65,7 +83,7 @@ class PlateauBrownianPath(AbstractWrappedPath):
         if laws is None:
             return None
         # The increments here hold no space-time-time areas.
-        return {"W": laws["W"], "H": laws["H"], "C": _PLATEAU}
+        return {"W": laws["W"], "H": laws["H"], "sign": _SIGN}
 
     def num_words(self, use_levy: bool = False) -> int:
         words = stepwise(self.path).num_words(use_levy)
@@ -108,5 +126,5 @@ class PlateauBrownianPath(AbstractWrappedPath):
 
 def _with_plateaus(increment, words, h) -> PlateauIncrement:
     assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
-    C = draw_set(_PLATEAU, words, h, increment.W)
-    return PlateauIncrement(dt=increment.dt, W=increment.W, H=increment.H, C=C)
+    sign = draw_set(_SIGN, words, h, increment.W)
+    return PlateauIncrement(increment.dt, increment.W, increment.H, sign)

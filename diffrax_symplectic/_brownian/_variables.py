@@ -30,6 +30,10 @@ _SPACE_TIME_AREA = (
     "space-time Lévy area. Pass a path that has it, for example "
     "`FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`"
 )
+_PLATEAUS = (
+    "plateaus. Wrap a path with space-time Lévy area as `PlateauBrownianPath(path, "
+    "key)`"
+)
 # By the name on the increment. Those whose increments hold more come first.
 VARIABLES = {
     "A": RandomVariable(
@@ -38,12 +42,9 @@ VARIABLES = {
         "key)`",
         variance=None,
     ),
-    "C": RandomVariable(
-        PlateauIncrement,
-        "plateaus. Wrap a path with space-time Lévy area as `PlateauBrownianPath(path, "
-        "key)`",
-        variance=1 / 6,
-    ),
+    "C": RandomVariable(PlateauIncrement, _PLATEAUS, variance=1 / 6),
+    # Of `C`, whose size is a function of `W` and `H`.
+    "sign": RandomVariable(PlateauIncrement, _PLATEAUS, variance=1),
     # On no increment: it is computed from `W`, `H` and, where there is one, `K`.
     "L": RandomVariable(
         diffrax.AbstractSpaceTimeLevyArea, _SPACE_TIME_AREA, variance=None
