@@ -29,9 +29,9 @@ def solve(d: int, rtol: float | None):
 
     def change(key):
         terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), key))
-        p, q = diffrax.diffeqsolve(
-            terms, solver, 0.0, H * STEPS, H, y0, max_steps=None
-        ).ys
+        sol = diffrax.diffeqsolve(terms, solver, 0.0, H * STEPS, H, y0, max_steps=None)
+        assert sol.ys is not None
+        p, q = sol.ys
         return square(p[-1], q[-1]) / square(*y0) - 1
 
     return jax.vmap(change)
