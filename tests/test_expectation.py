@@ -175,8 +175,6 @@ def test_progress_is_shown_to_the_end():
 
 @pytest.mark.parametrize("meter", ["TqdmProgressMeter", "TextProgressMeter"])
 def test_meters_of_diffrax_take_expectations(meter, capfd):
-    if meter == "TqdmProgressMeter":
-        pytest.importorskip("tqdm")
     meter = getattr(diffrax, meter)()
     ds.expectation(_normal, jr.key(0), 100, progress_meter=meter)
     jax.effects_barrier()
