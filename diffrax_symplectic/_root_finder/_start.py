@@ -91,7 +91,10 @@ def _picard(finder: "PicardNewton", phi: _Map, y: PyTree[Array], scale: _Map) ->
     # with what its result goes into, and a loop that any path of a batch may leave early
     # selects between old and new iterate for each.
     shift = lambda _, ys: (*ys[1:], phi(ys[-1]))
-    ys = lax.fori_loop(0, finder.sweeps, shift, (y,) * 4)
+    # Only of the last three iterations the iterates are kept: to move them costs time.
+    kept = min(finder.sweeps, 3)
+    y = lax.fori_loop(0, finder.sweeps - kept, lambda _, y: phi(y), y)
+    ys = lax.fori_loop(0, kept, shift, (y,) * 4)
     diffs = [(b**ω - a**ω).ω for a, b in zip(ys, ys[1:])]
     before, last, size = [finder.tolerance.measure(d, scale(ys[-1])) for d in diffs]
     # Positions and momenta move each other, so that corrections may shrink in turns: of
