@@ -38,8 +38,8 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         space-time Lévy area.
 
     **Source:** [Milstein and Tretyakov (2021)](https://doi.org/10.1007/978-3-030-82040-4)
-    for the order that Lévy areas and Lie brackets bring, which is due to Milstein. The
-    combination with the midpoint rule, which keeps it symplectic, is new here.
+    for the order that Lévy areas and Lie brackets bring, which is due to Milstein. We
+    know of no source for the combination with the midpoint rule, which keeps it symplectic.
     """
 
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
