@@ -201,3 +201,23 @@ def local_weak_orders(terms, solver, y0, args, hs, order: int, **kwargs) -> list
     over_steps = jax.vmap(defect, in_axes=(0, None, None))
     defects = jax.jit(jax.vmap(over_steps, in_axes=(None, 0, 0)))(hs, y0, args)
     return [slope(hs, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(hs))]
+
+
+class RecordingMeter(diffrax.AbstractProgressMeter):
+    """Writes down what is asked of it."""
+
+    calls: list
+    fails_at: int | None = None
+
+    def init(self):
+        self.calls.append("init")
+        return 0
+
+    def step(self, state, progress):
+        self.calls.append(float(progress))
+        if state == self.fails_at:
+            raise RuntimeError("stop here")
+        return state + 1
+
+    def close(self, state):
+        self.calls.append(("closed after", state))

@@ -148,31 +148,6 @@ def test_progress_is_shown(capfd):
     assert "%" in capfd.readouterr().out
 
 
-class _Recording(diffrax.NoProgressMeter):
-    shown: list
-
-    def step(self, state, progress):
-        self.shown.append(float(progress))
-        return state
-
-
-def test_progress_is_shown_to_the_end():
-    meter = _Recording([])
-    ds.expectation(_normal, jr.key(0), 250, batch_size=100, progress_meter=meter)
-    assert meter.shown == [0.4, 0.8, 1.0]
-    quasi = _Recording([])
-    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
-    terms = ds.hamiltonian_terms(
-        H0, lambda t, p, q, args: q, ds.WeakBrownianPath((), jr.key(0))
-    )
-    ds.quasi_expectation(
-        lambda t, y, args: y[1], terms, ds.StormerVerlet(), 0.0, 1.0, 0.5,
-        (jnp.array(0.0), jnp.array(1.0)), key=jr.key(0), num_paths=16, replicates=4,
-        devices=jax.devices()[:1], progress_meter=quasi,
-    )  # fmt: skip
-    assert quasi.shown == [0.25, 0.5, 0.75, 1.0]
-
-
 @pytest.mark.parametrize("meter", ["TqdmProgressMeter", "TextProgressMeter"])
 def test_meters_of_diffrax_take_expectations(meter, capfd):
     meter = getattr(diffrax, meter)()

@@ -11,7 +11,7 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from .problems import kubo_terms
+from .problems import kubo_terms, RecordingMeter
 
 
 def _number(key):
@@ -33,36 +33,16 @@ def test_keys_of_paths_beyond_32_bits_carry_into_the_second_word():
     np.testing.assert_allclose(got.variance, x.var(ddof=1), rtol=1e-12)
 
 
-class Recording(diffrax.AbstractProgressMeter):
-    """Writes down what is asked of it."""
-
-    calls: list
-    fails_at: int | None = None
-
-    def init(self):
-        self.calls.append("init")
-        return 0
-
-    def step(self, state, progress):
-        self.calls.append(float(progress))
-        if state == self.fails_at:
-            raise RuntimeError("stop here")
-        return state + 1
-
-    def close(self, state):
-        self.calls.append(("closed after", state))
-
-
 def test_progress_is_shown_after_each_batch_and_closed_in_any_case():
     calls = []
     run = lambda meter: ds.expectation(
         jr.normal, jr.key(0), 10, batch_size=4, progress_meter=meter
     )
-    run(Recording(calls))
+    run(RecordingMeter(calls))
     assert calls == ["init", 0.4, 0.8, 1.0, ("closed after", 3)]
     calls.clear()
     with pytest.raises(RuntimeError, match="stop here"):
-        run(Recording(calls, fails_at=1))
+        run(RecordingMeter(calls, fails_at=1))
     assert calls == ["init", 0.4, 0.8, ("closed after", 1)]
 
 

@@ -25,7 +25,7 @@ from diffrax_symplectic._quasi._point_set import (
 from diffrax_symplectic._quasi._quasi_expectation import _check_functions
 from diffrax_symplectic._quasi._sorting import _curve, hilbert_order
 
-from .problems import kubo_terms
+from .problems import kubo_terms, RecordingMeter
 
 
 Y0 = (jnp.array(0.0), jnp.array(1.0))
@@ -274,8 +274,23 @@ def test_too_many_coordinates_to_sort_by_are_warned_of():
         check(8)
 
 
-def test_progress_is_shown(capfd):
-    _estimate(progress_meter=diffrax.TextProgressMeter())
+def test_progress_is_shown_after_each_replicate_and_closed_in_any_case(capfd):
+    # One device: several would make several replicates at once.
+    run = lambda meter, **kwargs: _estimate(
+        progress_meter=meter, devices=jax.devices()[:1], num_paths=16, **kwargs
+    )
+    calls = []
+    run(RecordingMeter(calls))
+    assert calls == ["init", 0.25, 0.5, 0.75, 1.0, ("closed after", 4)]
+    calls.clear()
+    with pytest.raises(RuntimeError, match="stop here"):
+        run(RecordingMeter(calls, fails_at=1))
+    assert calls == ["init", 0.25, 0.5, ("closed after", 1)]
+    calls.clear()
+    # A tolerance that is reached ends it before the last replicate.
+    assert run(RecordingMeter(calls), tol=1.0, replicates=64).tol_reached
+    assert calls[-1][0] == "closed after" and 1.0 not in calls
+    run(diffrax.TextProgressMeter())
     assert "100" in capfd.readouterr().out
 
 

@@ -110,6 +110,34 @@ def test_leaving_the_domain_on_the_way_is_no_failure(direct):
     np.testing.assert_allclose(sol.value, 1, atol=1e-13)
 
 
+# Where the cheap iterations of either kind have to do it alone, and where they diverge.
+@pytest.mark.parametrize(
+    "direct, slope, most", [(0, 0.1, 0), (6, 0.1, 0), (0, 30.0, 20)]
+)
+def test_corrections_are_measured_by_the_scale_that_is_passed(direct, slope, most):
+    # Errors of 1e-6 in each evaluation, as if from a state of size 1e10 to which the unknowns
+    # are added. No tolerance relative to the unknowns themselves can be met.
+    noise = lambda k: jax.lax.stop_gradient(1e-6 * jnp.sin(1e12 * k))
+
+    def solved(**options):
+        sol = optx.root_find(
+            lambda k, _: (1 + slope) * k + noise(k) - jnp.arange(1.0, 7.0),
+            ds.PicardNewton(direct=direct),
+            jnp.zeros(6),
+            options=options,
+            max_steps=most,
+            throw=False,
+        )
+        exact = np.arange(1, 7) / (1 + slope)
+        return sol.result == optx.RESULTS.successful, jnp.max(
+            jnp.abs(sol.value - exact)
+        )
+
+    success, error = solved(scale=lambda k: 1e10 + jnp.abs(k))
+    assert success and error <= 1e-5
+    assert not solved()[0]
+
+
 def test_numbers_of_iterations_that_mean_nothing_are_refused():
     for change in (dict(sweeps=1), dict(warmup=-1), dict(picard_steps=-1)):
         with pytest.raises(ValueError, match="must be at least"):
