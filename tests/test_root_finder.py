@@ -115,8 +115,8 @@ def test_leaving_the_domain_on_the_way_is_no_failure(direct):
     "direct, slope, most", [(0, 0.1, 0), (6, 0.1, 0), (0, 30.0, 20)]
 )
 def test_corrections_are_measured_by_the_scale_that_is_passed(direct, slope, most):
-    # Errors of 1e-6 in each evaluation, as if from a state of size 1e10 to which the unknowns
-    # are added. No tolerance relative to the unknowns themselves can be met.
+    # Errors of 1e-6 in each evaluation, as if from a state of size 1e10 to which the
+    # unknowns are added. No tolerance relative to the unknowns themselves can be met.
     noise = lambda k: jax.lax.stop_gradient(1e-6 * jnp.sin(1e12 * k))
 
     def solved(**options):
