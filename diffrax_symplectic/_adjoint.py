@@ -5,14 +5,13 @@ from typing import Any, cast, NamedTuple
 
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from equinox.internal import ω
 from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
+from ._compat import nondifferentiable_backward, reversed_in_time, while_loop, ω
 from ._custom_types import IntScalarLike, RealScalarLike, Y
 from ._own_inverse import is_own_inverse
 from ._plan import make_plan
@@ -86,7 +85,7 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
             **kwargs,
         )
         ys = final_state.save_state.ys
-        final_state = eqxi.nondifferentiable_backward(final_state, symbolic=False)
+        final_state = nondifferentiable_backward(final_state, symbolic=False)
         return eqx.tree_at(lambda s: s.save_state.ys, final_state, ys), aux_stats
 
 
@@ -141,9 +140,7 @@ def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:
 @eqx.filter_custom_vjp
 def _solve(y__args__terms, *, adjoint, throw, **kwargs):
     del throw
-    return _run(
-        adjoint, y__args__terms, ft.partial(eqxi.while_loop, kind="lax"), kwargs
-    )
+    return _run(adjoint, y__args__terms, ft.partial(while_loop, kind="lax"), kwargs)
 
 
 def _run(adjoint, y__args__terms, outer_while_loop, kwargs):
@@ -154,7 +151,7 @@ def _run(adjoint, y__args__terms, outer_while_loop, kwargs):
         args=args,
         terms=terms,
         event=None,
-        inner_while_loop=ft.partial(eqxi.while_loop, kind="lax"),
+        inner_while_loop=ft.partial(while_loop, kind="lax"),
         outer_while_loop=outer_while_loop,
     )
 
@@ -174,15 +171,16 @@ def _solve_fwd(perturbed, y__args__terms, *, adjoint, throw, **kwargs):
         def body(carry):
             state, rows = carry
             row, rest = jnp.divmod(state.num_steps, every)
-            here = cast(bool, rest == 0)
-            save = lambda x, rows: eqxi.buffer_at_set(rows, row, x, pred=here)
+            # Beyond the last row nothing is written.
+            row = jnp.where(rest == 0, row, adjoint.checkpoints)
+            save = lambda x, rows: rows.at[row].set(x, mode="drop")
             return body_fun(state), jtu.tree_map(save, state.y, rows)
 
-        final, rows = eqxi.while_loop(
+        final, rows = while_loop(
             lambda carry: cond_fun(carry[0]),
             body,
             (init_val, rows),
-            buffers=lambda carry: (buffers(carry[0]), jtu.tree_leaves(carry[1])),
+            buffers=lambda carry: buffers(carry[0]),
             kind="lax",
             **options,
         )
@@ -266,7 +264,7 @@ def _solve_bwd(
         args, terms = eqx.combine(diff, nondiff)
         t0, t1 = steps.time(i), steps.time(i + 1)
         if back:
-            t0, t1, terms = -t1, -t0, _reversed(terms)
+            t0, t1, terms = -t1, -t0, reversed_in_time(terms)
         return solver.step(terms, t0, t1, y, args, init_state.solver_state, False)[0]
 
     def body(walk: _Walk) -> _Walk:
@@ -294,14 +292,6 @@ def _solve_bwd(
         before = jnp.arange(len(sub.ts)) < walk.saved
         a_y = jtu.tree_map(lambda a, g: a + jnp.tensordot(before, g, 1), a_y, g)
     return _unless(walk.arrived, throw, (a_y, *walk.a_parameters))
-
-
-def _reversed(terms: PyTree) -> PyTree:
-    """The terms with time running the other way. In a solve Diffrax has wrapped each term
-    to that end."""
-    is_leaf = lambda x: isinstance(x, diffrax.AbstractTerm) and hasattr(x, "direction")
-    turn = lambda x: eqx.tree_at(lambda x: x.direction, x, replace_fn=lambda d: -d)
-    return jtu.tree_map(turn, terms, is_leaf=is_leaf)
 
 
 def _begin_anew(y: Y, rows: Y, i, every, arrived) -> tuple[Y, Bool[Array, ""]]:

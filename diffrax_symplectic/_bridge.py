@@ -9,9 +9,9 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from equinox.internal import ω
 from jaxtyping import Array, Float, PyTree
 
+from ._compat import ω
 from ._custom_types import Args, RealScalarLike, Y
 
 

@@ -4,44 +4,34 @@ of the user's, without printing, raising, or calling back into Python."""
 from collections.abc import Iterator
 from typing import Any
 
-import jax.extend.core as jex
 import jax.numpy as jnp
 from jax import lax
 
+from ._compat import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+
 
 _CALLBACKS = ("pure_callback", "io_callback")
-# Primitives that stand for the program that they hold.
-_CALLS = (
-    "jit",
-    "pjit",
-    "closed_call",
-    "core_call",
-    "checkpoint",
-    "custom_jvp_call",
-    "custom_vjp_call",
-    "custom_vjp_call_jaxpr",
-)
 
 
-def evaluate_without_effects(jaxpr: jex.Jaxpr, consts, args) -> list:
+def evaluate_without_effects(jaxpr: Jaxpr, consts, args) -> list:
     """What `jaxpr` computes from `args`.
 
     Prints are left out. The results of callbacks are NaN. Since `equinox.error_if` raises
     by a callback, what goes through a check that fails is NaN as well.
     """
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *args)))
-    read = lambda x: x.val if isinstance(x, jex.Literal) else values[x]
+    read = lambda x: x.val if isinstance(x, Literal) else values[x]
     for eqn in jaxpr.eqns:
         results = _apply(eqn, [read(x) for x in eqn.invars])
         values.update(zip(eqn.outvars, results))
     return [read(x) for x in jaxpr.outvars]
 
 
-def _apply(eqn: jex.JaxprEqn, inputs: list) -> list:
+def _apply(eqn: JaxprEqn, inputs: list) -> list:
     name, params = eqn.primitive.name, eqn.params
     if name in _CALLBACKS:
         return [_nan(x.aval) for x in eqn.outvars]
-    if name in _CALLS:
+    if _is_call(eqn):
         (inner,) = _programs(params)
         return _run(inner, *inputs)
     if _has_effects(eqn):
@@ -84,7 +74,7 @@ def _split(inputs: list, first: int, second: int) -> tuple[list, list, list]:
 
 
 def _run(program, *args) -> list:
-    if isinstance(program, jex.ClosedJaxpr):
+    if isinstance(program, ClosedJaxpr):
         return evaluate_without_effects(program.jaxpr, program.consts, args)
     return evaluate_without_effects(program, (), args)
 
@@ -94,7 +84,20 @@ def _nan(aval) -> Any:
     return jnp.full(aval.shape, jnp.nan if inexact else 0, aval.dtype)
 
 
-def _has_effects(eqn: jex.JaxprEqn) -> bool:
+def _is_call(eqn: JaxprEqn) -> bool:
+    """Whether a primitive stands for the one program that it holds, as those of `jax.jit`,
+    `jax.checkpoint` and `jax.custom_jvp` do: inputs and outputs are then those of the
+    program."""
+    programs = list(_programs(eqn.params))
+    if len(programs) != 1 or eqn.primitive.name in ("cond", "scan", "while"):
+        return False
+    program = getattr(programs[0], "jaxpr", programs[0])
+    kinds = lambda variables: [(x.aval.shape, x.aval.dtype) for x in variables]
+    same_inputs = kinds(program.invars) == kinds(eqn.invars)
+    return same_inputs and kinds(program.outvars) == kinds(eqn.outvars)
+
+
+def _has_effects(eqn: JaxprEqn) -> bool:
     return (
         eqn.primitive.name in _CALLBACKS
         or len(eqn.outvars) == 0
@@ -110,5 +113,5 @@ def _programs(params: dict) -> Iterator[Any]:
     """The programs among the parameters of a primitive."""
     for value in params.values():
         for item in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(item, jex.Jaxpr | jex.ClosedJaxpr):
+            if isinstance(item, Jaxpr | ClosedJaxpr):
                 yield item

@@ -7,9 +7,9 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from equinox.internal import ω
 from jaxtyping import Array, PyTree, Shaped
 
+from ._compat import ω
 from ._custom_types import Args, BM, RealScalarLike
 from ._indexed_noise import IndexedNoise, OneNoise
 

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from equinox.internal import ω
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
+from ._compat import ω
 from ._custom_types import Args, RealScalarLike, Y
 from ._effect_free import evaluate_without_effects
 from ._hamiltonian import asserted_structure, check_pair, is_hamiltonian, pair_fault

@@ -10,8 +10,6 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from diffrax._term import WrapTerm
-from equinox.internal import ω
 from jaxtyping import Array, Float, PyTree
 
 from ._bridge import apply_bridge, bridge
@@ -23,6 +21,7 @@ from ._brownian import (
     VARIABLES,
     WeakBrownianPath,
 )
+from ._compat import direction, is_adjoint_term, unwrapped, ω
 from ._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from ._hamiltonian import HamiltonianNoise
 from ._indexed_noise import OneNoise
@@ -44,8 +43,7 @@ def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
 
     Raises a `ValueError` for the terms of `diffrax.BacksolveAdjoint`."""
     parts = _flatten(terms)
-    # A class that Diffrax does not export.
-    if any(type(_unwrapped(term)).__name__ == "AdjointTerm" for term in parts):
+    if any(map(is_adjoint_term, parts)):
         raise ValueError(_BACKSOLVE)
     is_noise = [
         len(brownian_paths(term)) > 0 or (i > 0 and not _is_ode(term))
@@ -68,12 +66,7 @@ def brownian_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
 
 
 def _is_ode(term: diffrax.AbstractTerm) -> bool:
-    return isinstance(_unwrapped(term), diffrax.ODETerm)
-
-
-def _unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
-    # In a solve Diffrax has wrapped each term, to be able to go backward in time.
-    return term.term if isinstance(term, WrapTerm) else term
+    return isinstance(unwrapped(term), diffrax.ODETerm)
 
 
 # Called at several stages, this is traced and lowered once.
@@ -89,7 +82,7 @@ def _change(term: diffrax.AbstractTerm, t, y: Y, args: Args, control: PyTree) ->
     try:
         return term.vf_prod(t, y, args, control)
     except ValueError as error:
-        control_term = isinstance(_unwrapped(term), diffrax.ControlTerm)
+        control_term = isinstance(unwrapped(term), diffrax.ControlTerm)
         if not control_term or jtu.tree_structure(y) == jtu.tree_structure(control):
             raise
         # Diffrax multiplies leaf by leaf, and JAX then speaks of trees.
@@ -129,9 +122,9 @@ def apply_one(
 
 
 def _along_one(term, struct, number, increment, args: Args, t, y: Y) -> Y:
-    if isinstance(_unwrapped(term), HamiltonianNoise):
+    if isinstance(unwrapped(term), HamiltonianNoise):
         return term.vf_prod(t, y, args, OneNoise(number, increment))
-    if isinstance(_unwrapped(term), diffrax.ControlTerm):
+    if isinstance(unwrapped(term), diffrax.ControlTerm):
         matrix = term.vf(t, y, args)
         # One array of noises, not a Lineax operator and no other PyTree.
         one_array = eqx.is_array(matrix) and isinstance(struct, jax.ShapeDtypeStruct)
@@ -209,7 +202,7 @@ def _in_time(term: diffrax.AbstractTerm, name: str, x: PyTree[Array]) -> PyTree[
     """Backward in time Diffrax changes the sign of all random variables. Those that stay
     the same get it back."""
     even = name in VARIABLES and VARIABLES[name].even
-    return (term.direction * x**ω).ω if even and isinstance(term, WrapTerm) else x
+    return (direction(term) * x**ω).ω if even else x
 
 
 def _drawn(noise: tuple, t0, t1, use_levy: bool) -> list:

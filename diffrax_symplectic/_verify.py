@@ -10,9 +10,9 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from equinox.internal import ω
 from jaxtyping import Array, Float, PyTree
 
+from ._compat import ω
 from ._custom_types import Args, RealScalarLike, Y
 from ._hamiltonian import check_pair
 from ._quadrature import outcomes

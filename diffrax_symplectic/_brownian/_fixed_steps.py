@@ -1,7 +1,7 @@
-import sys
-
 import diffrax
 import jax.tree_util as jtu
+
+from .._compat import innermost_solve
 
 
 def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
@@ -18,12 +18,10 @@ def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
     by a `jax.jit` of the user's around `evaluate`.
     """
     name = type(path).__name__
-    frame = sys._getframe(1)
-    while frame is not None and not _is_solve(frame):
-        frame = frame.f_back
-    if frame is None or not _holds(frame.f_locals.get("terms"), type(path)):
+    solve = innermost_solve()
+    if solve is None or not _holds(solve.get("terms"), type(path)):
         return
-    controller = frame.f_locals.get("stepsize_controller")
+    controller = solve.get("stepsize_controller")
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         raise ValueError(
             f"`{name}` cannot be used with the adaptive step size controller "
@@ -31,17 +29,12 @@ def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
             "cannot be refined. Pass `stepsize_controller=diffrax.ConstantStepSize()` (or "
             "`diffrax.StepTo`), or use `diffrax.VirtualBrownianTree` as path."
         )
-    if isinstance(frame.f_locals.get("solver"), diffrax.HalfSolver):
+    if isinstance(solve.get("solver"), diffrax.HalfSolver):
         raise ValueError(
             f"`{name}` cannot be used with `diffrax.HalfSolver`: the increments of the "
             "two half steps do not add up to the one of the whole step. Pass the wrapped "
             "solver itself, or use `diffrax.VirtualBrownianTree` as path."
         )
-
-
-def _is_solve(frame) -> bool:
-    in_diffrax = frame.f_globals.get("__name__") == "diffrax._integrate"
-    return in_diffrax and frame.f_code.co_name in ("loop", "diffeqsolve")
 
 
 def _holds(terms, kind: type) -> bool:

@@ -6,24 +6,15 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
-from .._custom_types import RealScalarLike
 from ._cells import check_cell, compose, Piece
-from ._fixed_steps import require_fixed_steps
 from ._laws import AbstractLaw
-from ._random_words import check_key, place_of, random_words
-from ._stepwise import (
-    AbstractStepwisePath,
-    checked_shape,
-    gaussian_laws,
-    increment_from_words,
-    num_noises,
-    step_ends,
-)
+from ._random_words import check_key, place_of
+from ._stepwise import AbstractPathWithLaws, checked_shape, gaussian_laws
 
 
-class FixedStepBrownianPath(AbstractStepwisePath):
+class FixedStepBrownianPath(AbstractPathWithLaws):
     r"""Gaussian increments of a Brownian motion, for fixed steps.
 
     Over a step of size $h$ the increment is $W \sim \mathcal N(0, h)$, and with space-time
@@ -92,58 +83,18 @@ class FixedStepBrownianPath(AbstractStepwisePath):
         self.cell = cell
 
     @property
-    def t0(self):
-        return -jnp.inf
-
-    @property
-    def t1(self):
-        return jnp.inf
-
-    @property
     def laws(self) -> Mapping[str, AbstractLaw]:
         laws = gaussian_laws(self.levy_area)
         assert laws is not None
         return laws
 
-    def num_words(self, use_levy: bool = False) -> int:
-        return (len(self.laws) if use_levy else 1) * num_noises(self.shape)
-
-    def increment(
-        self,
-        words: UInt32[Array, " num_words"],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        use_levy: bool = False,
+    def draw(
+        self, t0: Array, t1: Array, use_levy: bool
     ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        """Samples the step by itself, whatever `cell` is."""
-        return increment_from_words(self, self.shape, words, t1 - t0, use_levy)
-
-    def evaluate(
-        self,
-        t0: RealScalarLike,
-        t1: RealScalarLike | None = None,
-        left: bool = True,
-        use_levy: bool = False,
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
-
-        Returns the increment over the step from `t0` to `t1`, or with `use_levy=True` an
-        object of type `levy_area`. Without `t1` the step is the one from `0` to `t0`.
-
-        **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
-        size controller or `diffrax.HalfSolver`.
-        """
-        del left
-        require_fixed_steps(self)
-        t0, t1 = step_ends(t0, t1)
         if self.cell is not None:
             return self._composed(t0, t1, self.cell, use_levy)
-        words = self._words(place_of(t0, t1), use_levy)
+        words = self.words(place_of(t0, t1), use_levy)
         return self.increment(words, t0, t1, use_levy)
-
-    def _words(self, place, use_levy: bool) -> UInt32[Array, " num_words"]:
-        sets = len(self.laws) if use_levy else 1
-        return random_words(self.key, place, sets, num_noises(self.shape)).reshape(-1)
 
     def _composed(
         self, t0: Array, t1: Array, cell: float, use_levy: bool
@@ -153,7 +104,7 @@ class FixedStepBrownianPath(AbstractStepwisePath):
         h = jnp.asarray(cell, t0.dtype)
 
         def sample(i) -> Piece:
-            words = self._words((i.astype(jnp.int32), jnp.array(0)), with_area)
+            words = self.words((i.astype(jnp.int32), jnp.array(0)), with_area)
             increment = self.increment(words, 0 * h, h, with_area)
             if not with_area:
                 return Piece(h, jfu.ravel_pytree(increment)[0])

@@ -10,10 +10,9 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 from .._custom_types import BM, RealScalarLike
 from .._materialize import materialize
 from ._cells import check_cell, compose, or_one, Piece
-from ._fixed_steps import require_fixed_steps
 from ._laws import normal_from_words
 from ._random_words import AREA_WORDS, check_key, place_of, random_words
-from ._stepwise import num_noises, step_ends, stepwise
+from ._stepwise import num_noises, stepwise
 from ._wrapper import (
     AbstractWrappedPath,
     increment_struct,
@@ -106,27 +105,14 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     def levy_area(self):
         return LevyAreaIncrement
 
-    def evaluate(
-        self,
-        t0: RealScalarLike,
-        t1: RealScalarLike | None = None,
-        left: bool = True,
-        use_levy: bool = False,
+    def draw(
+        self, t0: Array, t1: Array, use_levy: bool
     ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
-
-        **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
-        size controller or `diffrax.HalfSolver`.
-        """
-        require_fixed_steps(self)
-        if not use_levy and self.cell is None:
-            return self.path.evaluate(t0, t1, left)
-        t0, t1 = step_ends(t0, t1)
-        if self.cell is None:
-            piece = self._sample(t0, t1)
-        else:
-            piece = self._composed(t0, t1, self.cell)
-        return self._increment(piece, t1 - t0, use_levy)
+        if self.cell is not None:
+            return self._increment(self._composed(t0, t1, self.cell), t1 - t0, use_levy)
+        if not use_levy:
+            return self.path.evaluate(t0, t1)
+        return self._increment(self._sample(t0, t1), t1 - t0, use_levy)
 
     @property
     def laws(self) -> None:

@@ -4,10 +4,9 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 
 from .._custom_types import BM, RealScalarLike
-from ._fixed_steps import require_fixed_steps
 from ._laws import AbstractLaw, two_point
 from ._random_words import check_key, place_of, PLATEAU_WORDS, random_words
-from ._stepwise import draw_set, laws_of, num_noises, step_ends, stepwise
+from ._stepwise import draw_set, laws_of, num_noises, stepwise
 from ._wrapper import (
     AbstractWrappedPath,
     increment_struct,
@@ -102,26 +101,15 @@ class PlateauBrownianPath(AbstractWrappedPath):
             return increment
         return _with_plateaus(increment, words[path.num_words(True) :], t1 - t0)
 
-    def evaluate(
-        self,
-        t0: RealScalarLike,
-        t1: RealScalarLike | None = None,
-        left: bool = True,
-        use_levy: bool = False,
+    def draw(
+        self, t0: Array, t1: Array, use_levy: bool
     ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
-
-        **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
-        size controller or `diffrax.HalfSolver`.
-        """
-        require_fixed_steps(self)
-        increment = self.path.evaluate(t0, t1, left, use_levy)
+        increment = self.path.evaluate(t0, t1, use_levy=use_levy)
         if not use_levy:
             return increment
-        start, end = step_ends(t0, t1)
         n = num_noises(increment_struct(self.path))
-        words = random_words(self.key, place_of(start, end), 1, n, PLATEAU_WORDS)
-        return _with_plateaus(increment, words[0], end - start)
+        words = random_words(self.key, place_of(t0, t1), 1, n, PLATEAU_WORDS)
+        return _with_plateaus(increment, words[0], t1 - t0)
 
 
 def _with_plateaus(increment, words, h) -> PlateauIncrement:

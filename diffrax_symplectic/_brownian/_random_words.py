@@ -3,11 +3,12 @@
 from typing import TypeAlias
 
 import jax
-import jax.extend.random as jer
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Integer, PRNGKeyArray, UInt32
+
+from .._compat import threefry_2x32
 
 
 # A number that counts places, and one that says what is counted.
@@ -36,7 +37,7 @@ def random_words(
                 (exponent.astype(jnp.uint32) << 20) + numbers,
             ]
         )
-        words = jer.threefry_2x32(jr.key_data(key), counters)
+        words = threefry_2x32(jr.key_data(key), counters)
         return words.reshape(2, blocks).T.reshape(-1)[: sets * n].reshape(sets, n)
     at = jr.fold_in(jr.fold_in(key, count), exponent)
     return jnp.stack(

@@ -2,25 +2,60 @@
 
 import abc
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any, cast, TYPE_CHECKING
 
 import diffrax
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import lineax.internal as lxi
 import numpy as np
-from jaxtyping import Array, PyTree, UInt32
+from jaxtyping import Array, PRNGKeyArray, PyTree, UInt32
 
+from .._compat import nondifferentiable
 from .._custom_types import RealScalarLike
+from ._fixed_steps import require_fixed_steps
 from ._laws import AbstractLaw, Gaussian
+from ._random_words import Place, random_words
+
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 class AbstractStepwisePath(diffrax.AbstractBrownianPath):
     """A path whose increment over a step is a function of random words of 32 bits, one for
-    each scalar random variable. `evaluate` takes them from a generator; whoever has others
-    to put in their place, such as a low-discrepancy set of points, calls `increment`."""
+    each scalar random variable. `evaluate` takes them from a generator. To put others in
+    their place, such as those of a low-discrepancy set of points, call `increment`."""
+
+    def evaluate(
+        self,
+        t0: RealScalarLike,
+        t1: RealScalarLike | None = None,
+        left: bool = True,
+        use_levy: bool = False,
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
+
+        Returns the increment over the step from `t0` to `t1`, or with `use_levy=True` an
+        object of type `levy_area`. Without `t1` the step is the one from `0` to `t0`.
+
+        **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
+        size controller or `diffrax.HalfSolver`.
+        """
+        del left
+        require_fixed_steps(self)
+        start, end = (jnp.zeros_like(t0), t0) if t1 is None else (t0, t1)
+        ends = jnp.asarray(start), jnp.asarray(end)
+        start, end = cast(tuple[Array, Array], nondifferentiable(ends, name="t"))
+        return self.draw(start, end, use_levy)
+
+    @abc.abstractmethod
+    def draw(
+        self, t0: Array, t1: Array, use_levy: bool
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        """What `evaluate` returns for the step from `t0` to `t1`."""
 
     @property
     @abc.abstractmethod
@@ -42,6 +77,54 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         use_levy: bool = False,
     ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
         """What `evaluate` returns for the step from `t0` to `t1`, from given words."""
+
+
+class AbstractPathWithLaws(AbstractStepwisePath):
+    """A path whose steps are made of independent random variables with its `laws`, one
+    from each law for each noise."""
+
+    shape: AbstractVar[PyTree[jax.ShapeDtypeStruct]]
+    key: AbstractVar[PRNGKeyArray]
+
+    @property
+    def t0(self):
+        return -jnp.inf
+
+    @property
+    def t1(self):
+        return jnp.inf
+
+    @property
+    @abc.abstractmethod
+    def laws(self) -> Mapping[str, AbstractLaw]:
+        """The law of the increment, `"W"`, comes first."""
+
+    def _num_sets(self, use_levy: bool) -> int:
+        return len(self.laws) if use_levy else 1
+
+    def num_words(self, use_levy: bool = False) -> int:
+        return self._num_sets(use_levy) * num_noises(self.shape)
+
+    def words(self, place: Place, use_levy: bool) -> UInt32[Array, " num_words"]:
+        """The path's own random words for a place on the axis of time."""
+        sets, n = self._num_sets(use_levy), num_noises(self.shape)
+        return random_words(self.key, place, sets, n).reshape(-1)
+
+    def increment(
+        self,
+        words: UInt32[Array, " num_words"],
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        use_levy: bool = False,
+    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+        n = num_noises(self.shape)
+        sets = [words[i * n : (i + 1) * n] for i in range(len(self.laws))]
+        draw = lambda law, words: draw_set(law, words, t1 - t0, self.shape)
+        if not use_levy:
+            return draw(self.laws["W"], sets[0])
+        dt = jtu.tree_map(lambda s: jnp.asarray(t1 - t0, s.dtype), self.shape)
+        drawn = {k: draw(law, x) for (k, law), x in zip(self.laws.items(), sets)}
+        return cast(Any, self.levy_area)(dt=dt, **drawn)
 
 
 def stepwise(path: diffrax.AbstractBrownianPath) -> AbstractStepwisePath:
@@ -78,25 +161,6 @@ def num_noises(shape: PyTree[jax.ShapeDtypeStruct]) -> int:
     return sum(int(np.prod(leaf.shape)) for leaf in jtu.tree_leaves(shape))
 
 
-def increment_from_words(
-    path: AbstractStepwisePath,
-    shape: PyTree[jax.ShapeDtypeStruct],
-    words: UInt32[Array, " num_words"],
-    h: RealScalarLike,
-    use_levy: bool,
-) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-    """The increment over a step of size `h` of a path that consists of its laws."""
-    assert path.laws is not None
-    n = num_noises(shape)
-    sets = [words[i * n : (i + 1) * n] for i in range(len(path.laws))]
-    draw = lambda law, words: draw_set(law, words, h, shape)
-    if not use_levy:
-        return draw(path.laws["W"], sets[0])
-    dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), shape)
-    drawn = {k: draw(law, x) for (k, law), x in zip(path.laws.items(), sets)}
-    return cast(Any, path.levy_area)(dt=dt, **drawn)
-
-
 def draw_set(
     law: AbstractLaw,
     words: UInt32[Array, " n"],
@@ -115,20 +179,13 @@ def draw_set(
     return jtu.tree_unflatten(treedef, out)
 
 
-def step_ends(t0: RealScalarLike, t1: RealScalarLike | None) -> tuple[Array, Array]:
-    """Start and end of a step: without `t1` the step from `0` to `t0`."""
-    start, end = (jnp.zeros_like(t0), t0) if t1 is None else (t0, t1)
-    ends = jnp.asarray(start), jnp.asarray(end)
-    return cast(tuple[Array, Array], eqxi.nondifferentiable(ends, name="t"))
-
-
 def checked_shape(
     shape: tuple[int, ...] | PyTree[jax.ShapeDtypeStruct], path_name: str
 ) -> PyTree[jax.ShapeDtypeStruct]:
     """The shape of the increments of a path, of which a tuple of integers is short for
     one array. Raises a `ValueError` for what is no shape, or not of real numbers."""
     if isinstance(shape, tuple) and all(isinstance(n, int) for n in shape):
-        shape = jax.ShapeDtypeStruct(shape, lxi.default_floating_dtype())
+        shape = jax.ShapeDtypeStruct(shape, jnp.result_type(float))
     for leaf in jtu.tree_leaves(shape):
         if not isinstance(leaf, jax.ShapeDtypeStruct):
             raise ValueError(

@@ -7,7 +7,6 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, UInt32
 
 from .._custom_types import RealScalarLike
-from ._fixed_steps import require_fixed_steps
 from ._stepwise import stepwise
 from ._wrapper import AbstractWrappedPath
 
@@ -62,22 +61,11 @@ class TruncatedBrownianPath(AbstractWrappedPath):
     def levy_area(self):
         return self.path.levy_area
 
-    def evaluate(
-        self,
-        t0: RealScalarLike,
-        t1: RealScalarLike | None = None,
-        left: bool = True,
-        use_levy: bool = False,
+    def draw(
+        self, t0: Array, t1: Array, use_levy: bool
     ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
-
-        **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
-        size controller or `diffrax.HalfSolver`; an error when run for a step of one unit
-        of time or longer.
-        """
-        require_fixed_steps(self)
-        start, end = (0, t0) if t1 is None else (t0, t1)
-        return self._clip(self.path.evaluate(t0, t1, left, use_levy), end - start)
+        increment = self.path.evaluate(t0, t1, use_levy=use_levy)
+        return self._clip(increment, t1 - t0)
 
     @property
     def laws(self) -> None:

@@ -6,19 +6,12 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from .._custom_types import BM, RealScalarLike
-from ._fixed_steps import require_fixed_steps
+from .._custom_types import BM
 from ._laws import AbstractLaw, FOUR_POINT, THREE_POINT, two_point
-from ._random_words import check_key, place_of, random_words
-from ._stepwise import (
-    AbstractStepwisePath,
-    checked_shape,
-    increment_from_words,
-    num_noises,
-    step_ends,
-)
+from ._random_words import check_key, place_of
+from ._stepwise import AbstractPathWithLaws, checked_shape
 
 
 class WeakIncrement(diffrax.AbstractBrownianIncrement):
@@ -88,7 +81,7 @@ class WeakIncrement(diffrax.AbstractBrownianIncrement):
         return (jnp.outer(ihat, ihat) + skew - sqrt_h**2 * jnp.eye(ihat.size)) / 2
 
 
-class WeakBrownianPath(AbstractStepwisePath):
+class WeakBrownianPath(AbstractPathWithLaws):
     r"""Discrete random variables in place of Brownian increments, for weak methods.
 
     Over each step this gives a [`diffrax_symplectic.WeakIncrement`][]. Steps are
@@ -146,39 +139,14 @@ class WeakBrownianPath(AbstractStepwisePath):
         self.order = order
 
     @property
-    def t0(self):
-        return -jnp.inf
-
-    @property
-    def t1(self):
-        return jnp.inf
-
-    @property
     def levy_area(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return WeakIncrement
 
-    def evaluate(
-        self,
-        t0: RealScalarLike,
-        t1: RealScalarLike | None = None,
-        left: bool = True,
-        use_levy: bool = False,
+    def draw(
+        self, t0: Array, t1: Array, use_levy: bool
     ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
-
-        Returns the three-point variables of the step from `t0` to `t1`, or with
-        `use_levy=True` a [`diffrax_symplectic.WeakIncrement`][]. Without `t1` the step
-        is the one from `0` to `t0`.
-
-        **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
-        size controller or `diffrax.HalfSolver`.
-        """
-        del left
-        require_fixed_steps(self)
-        t0, t1 = step_ends(t0, t1)
-        sets = len(self.laws) if use_levy else 1
-        words = random_words(self.key, place_of(t0, t1), sets, num_noises(self.shape))
-        return self.increment(words.reshape(-1), t0, t1, use_levy)
+        words = self.words(place_of(t0, t1), use_levy)
+        return self.increment(words, t0, t1, use_levy)
 
     @property
     def laws(self) -> dict[str, AbstractLaw]:
@@ -191,15 +159,3 @@ class WeakBrownianPath(AbstractStepwisePath):
         if self.two_point:
             laws["two_point"] = two_point()
         return laws
-
-    def num_words(self, use_levy: bool = False) -> int:
-        return (len(self.laws) if use_levy else 1) * num_noises(self.shape)
-
-    def increment(
-        self,
-        words: UInt32[Array, " num_words"],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        use_levy: bool = False,
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        return increment_from_words(self, self.shape, words, t1 - t0, use_levy)

@@ -39,11 +39,9 @@ class _GivenWords(AbstractStepwisePath):
     def increment(self, words, t0, t1, use_levy=False):
         return self.path.increment(words, t0, t1, use_levy)
 
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
-        del left
-        start, end = (0.0, t0) if t1 is None else (t0, t1)
+    def draw(self, t0, t1, use_levy):
         words = self.words[: self.num_words(use_levy)]
-        return self.increment(words, start, end, use_levy)
+        return self.increment(words, t0, t1, use_levy)
 
 
 class Layout(NamedTuple):

@@ -6,9 +6,9 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from diffrax._term import WrapTerm
 from jaxtyping import Array, PyTree
 
+from .._compat import direction
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._hamiltonian import check_pair
 from .base import AbstractSymplecticSolver
@@ -127,11 +127,8 @@ class Damped(
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y | None, DenseInfo, Any, diffrax.RESULTS]:
         # Backward in time momentum grows, and in a solve time runs forward even then.
-        is_wrapped = lambda x: isinstance(x, WrapTerm)
-        leaves = jtu.tree_leaves(terms, is_leaf=is_wrapped)
-        wrapped = [x for x in leaves if isinstance(x, WrapTerm)]
-        direction = wrapped[0].direction if wrapped else 1
-        factors = _factors(self.gamma, direction * (t1 - t0) / 2, y0[0])
+        time = direction(terms) * (t1 - t0) / 2
+        factors = _factors(self.gamma, time, y0[0])
         damp = lambda y: (jtu.tree_map(jnp.multiply, factors, y[0]), y[1])
         y1, error, _, solver_state, result = self.solver.step(
             terms, t0, t1, damp(y0), args, solver_state, made_jump

@@ -1,0 +1,75 @@
+"""What the package uses of other packages that these do not promise to keep.
+
+Nothing of the kind is used anywhere else. `tests/test_private_parts.py` tests each of these
+by itself.
+"""
+
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import diffrax
+import jax.tree_util as jtu
+from diffrax._term import AdjointTerm, WrapTerm
+from equinox.internal import (
+    nondifferentiable as nondifferentiable,
+    nondifferentiable_backward as nondifferentiable_backward,
+    while_loop as while_loop,
+    ω as ω,
+)
+from jax.extend.core import (
+    ClosedJaxpr as ClosedJaxpr,
+    Jaxpr as Jaxpr,
+    JaxprEqn as JaxprEqn,
+    Literal as Literal,
+)
+from jax.extend.random import threefry_2x32 as threefry_2x32
+from jaxtyping import PyTree
+from lineax.internal import (
+    pack_structures as pack_structures,
+    PackedStructures as PackedStructures,
+    ravel_vector as ravel_vector,
+    transpose_packed_structures as transpose_packed_structures,
+    unravel_solution as unravel_solution,
+)
+
+
+def unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
+    """The term that the user passed. In a solve Diffrax has wrapped it, to be able to go
+    backward in time."""
+    return term.term if isinstance(term, WrapTerm) else term
+
+
+def direction(terms: PyTree[diffrax.AbstractTerm]) -> Any:
+    """The sign of the direction of time in the solve that the terms come from. Terms that
+    are in no solve run forward."""
+    leaves = jtu.tree_leaves(terms, is_leaf=_is_wrapped)
+    return next((x.direction for x in leaves if _is_wrapped(x)), 1)
+
+
+def reversed_in_time(terms: PyTree[diffrax.AbstractTerm]) -> PyTree:
+    """The terms of a solve, with time running the other way."""
+    turn = lambda x: WrapTerm(x.term, -x.direction) if _is_wrapped(x) else x
+    return jtu.tree_map(turn, terms, is_leaf=_is_wrapped)
+
+
+def _is_wrapped(x: Any) -> bool:
+    return isinstance(x, WrapTerm)
+
+
+def is_adjoint_term(term: diffrax.AbstractTerm) -> bool:
+    """Whether the term is one of those that `diffrax.BacksolveAdjoint` solves."""
+    return isinstance(unwrapped(term), AdjointTerm)
+
+
+def innermost_solve() -> Mapping[str, Any] | None:
+    """The local variables, `terms`, `solver` and `stepsize_controller` among them, of the
+    innermost `diffrax.diffeqsolve` that is being traced; `None` if there is none on the
+    Python stack."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        in_diffrax = frame.f_globals.get("__name__") == "diffrax._integrate"
+        if in_diffrax and frame.f_code.co_name in ("loop", "diffeqsolve"):
+            return frame.f_locals
+        frame = frame.f_back
+    return None
