@@ -4,6 +4,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import lineax as lx
 import numpy as np
 import pytest
 
@@ -114,6 +115,42 @@ def test_steps_of_a_long_solve_all_differ():
     picks = np.concatenate([np.arange(500), 10**6 - 500 + np.arange(500)])
     W = jax.vmap(path.evaluate)(ts[picks], ts[picks + 1])
     assert len(np.unique(np.asarray(W), axis=0)) == 1000
+
+
+@pytest.mark.parametrize("start, h", [(1e5, 0.01), (-1e5, 0.005), (2e4, 0.001)])
+@pytest.mark.core
+def test_steps_differ_even_where_single_precision_hardly_resolves_them(start, h):
+    # The sizes of these steps are one or two units in the last place of their times.
+    ts = np.unique((start + h * np.arange(500)).astype(np.float32))
+    assert np.max(np.diff(ts)) <= 2 * np.spacing(np.float32(abs(start)))
+    path = weak_path(40, dtype=jnp.float32)
+    W = np.sign(jax.jit(jax.vmap(path.evaluate))(ts[:-1], ts[1:]))
+    assert len(np.unique(W, axis=0)) == len(ts) - 1
+
+
+def test_last_steps_merged_by_diffrax_in_single_precision_have_their_variance():
+    # Diffrax makes one step of all that end within 1.2e-5 t1 of t1.
+    t1, h = 20_000.0, 0.05
+    path = weak_path(200, dtype=jnp.float32)
+    terms = diffrax.ControlTerm(
+        lambda t, y, args: lx.DiagonalLinearOperator(jnp.ones_like(y)), path
+    )
+    sol = diffrax.diffeqsolve(
+        terms,
+        diffrax.Heun(),
+        *(jnp.float32(t) for t in (t1 - 1, t1, h)),
+        jnp.zeros(200, jnp.float32),
+        saveat=diffrax.SaveAt(t0=True, steps=True),
+        max_steps=30,
+    )
+    assert sol.ts is not None
+    steps = np.diff(sol.ts[jnp.isfinite(sol.ts)])
+    assert np.sum(steps) == 1 and np.max(steps) == steps[-1] > 3 * h
+    # Each increment is 0 or of the size that belongs to its step.
+    rows = np.diff(np.asarray(sol.ys)[: len(steps) + 1], axis=0)
+    scaled = np.abs(rows) / np.sqrt(3 * steps[:, None])
+    np.testing.assert_allclose(scaled, np.round(scaled), atol=1e-4)
+    assert np.all(np.max(scaled, axis=1) > 0.99)
 
 
 def test_path_takes_any_pytree_under_jit_and_vmap():

@@ -71,13 +71,19 @@ def _typed(key) -> PRNGKeyArray:
 def place_of(t0, t1) -> Place:
     """Where a step lies, in integers, the same for times that differ by rounding.
 
-    The middle of the step is counted in units of a power of two that lies between a third
-    and 0.7 of the step, so that no two steps of one size share a count. The
-    two odd constants keep round numbers away from where the roundings change.
+    The middle of the step is counted in units of a power of two, which is the second
+    integer and lies between a third and 0.7 of the step. All steps with the same unit are
+    longer than it, so that two steps have the same integers only if they overlap. The two
+    odd constants keep round numbers away from where the roundings change.
     """
     h = jnp.abs(t1 - t0)
     _, exponent = jnp.frexp(h * 1.37)
     exponent = exponent.astype(jnp.int32) - 2
-    count = jnp.floor(jnp.ldexp(t0 + (t1 - t0) / 2, -exponent) + 0.29)
+    # The middle itself would be rounded to the resolution of time. Late in a long solve
+    # in float32 that is not far below the step, and two steps may have one middle. So the
+    # integer part of the start, which is exact, is split off before half a step is added.
+    start, half = (jnp.ldexp(x, -exponent) for x in (t0, (t1 - t0) / 2))
+    whole = jnp.floor(start)
+    rest = jnp.floor(start - whole + half + 0.29)
     # Starts again after 2^31 counts. (`fmod` is exact, also for negative times.)
-    return jnp.fmod(count, 2.0**31).astype(jnp.int32), exponent
+    return jnp.fmod(whole, 2.0**31).astype(jnp.int32) + rest.astype(jnp.int32), exponent
