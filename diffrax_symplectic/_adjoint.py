@@ -129,7 +129,7 @@ def _check_supported(solver, controller, event, saveat) -> None:
 
 
 def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:
-    # Its coin changes sides with the sign of the increments, and so the order of flows.
+    # Its coin is the sign of an increment. So the step back has the reverse order of flows.
     if isinstance(solver, NinomiyaVictoir):
         return True
     if not isinstance(solver, AbstractSymplecticRungeKutta):
@@ -194,7 +194,7 @@ def _solve_fwd(perturbed, y__args__terms, *, adjoint, throw, **kwargs):
 
 
 class _Steps(NamedTuple):
-    """The steps of a solve, by the arithmetic of its controller."""
+    """The times of the steps of a solve, computed as its controller computes them."""
 
     controller: diffrax.AbstractStepSizeController
     init_state: Any
@@ -204,7 +204,7 @@ class _Steps(NamedTuple):
         return _Steps(kwargs["stepsize_controller"], kwargs["init_state"])
 
     def spread(self, checkpoints: int) -> IntScalarLike:
-        """After how many steps each a state is saved."""
+        """The number of steps between two saved states."""
         if isinstance(self.controller, diffrax.StepTo):
             number = len(self.controller.ts) - 1
         else:

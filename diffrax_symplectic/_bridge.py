@@ -1,5 +1,5 @@
-"""What a Brownian path does between the ends of a step, as a vector field: the Lie brackets
-of noise and drift in the logarithm of the solution."""
+"""The Lie brackets of noise and drift in the logarithm of the solution over one step. Their
+coefficients depend on the Brownian path between the ends of the step."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,8 @@ from ._custom_types import Args, RealScalarLike, Y
 
 
 class Bridge(NamedTuple):
-    r"""The bridges of a step of size $h$: the paths of the `m` noises less their chords.
+    r"""Integrals over a step of size $h$ of the Brownian bridges of `m` noises: their paths
+    less the straight lines between the ends.
 
     - `first`: the means of the bridges over the step, $H_k$.
     - `second`: $\frac{1}{2h} \int (\text{bridge}_k + W_k (\frac sh - \frac12))
@@ -29,8 +30,8 @@ class Bridge(NamedTuple):
 
 
 def bridge(h: RealScalarLike, W: PyTree, H: PyTree, K: PyTree | None) -> Bridge:
-    r"""The bridges by what is known of them: space-time areas, and if there are any also
-    space-time-time areas.
+    r"""The expectations of these integrals given the space-time areas, and given the
+    space-time-time areas as well unless `K` is `None`.
 
     A bridge is $6 u (1 - u) H + 120 u (1 - u) (\frac12 - u) K$ with $u = s / h$, and an
     independent rest whose square has the mean $h / 15$ without the second summand, and
@@ -74,7 +75,8 @@ def apply_bridge(
         return total
 
     def bracket(x, field, t, y, speed):
-        """Of the noise along `x` and `field`, which moves time by `speed`; and `field`."""
+        """The bracket of the noise along `x` with `field`, which moves time by `speed`; and
+        the value of `field`."""
         b = along_noise(t, y, x)
         value, change = jax.jvp(lambda y: field(t, y), (y,), (b,))
         along = lambda t, y: along_noise(t, y, x)

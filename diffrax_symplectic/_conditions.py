@@ -1,4 +1,4 @@
-"""What a tableau promises, as residuals that vanish when it keeps the promise."""
+"""Conditions on the coefficients of a tableau: for being symplectic, and for its orders."""
 
 import dataclasses
 import functools as ft
@@ -49,12 +49,12 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     r"""Residuals of the conditions for weak order 1 or 2.
 
     - For a [`diffrax_symplectic.GeneralTableau`][] with three-point increments: weak
-        order 1 for any number of noises, weak order 2 for one. With the variable `"L"`,
-        what its brackets add is counted in.
+        order 1 for any number of noises, weak order 2 for one. If the tableau has the
+        variable `"L"`, the conditions contain what its brackets contribute.
     - For a [`diffrax_symplectic.PartitionedTableau`][] or
         [`diffrax_symplectic.SeparableTableau`][] (where $\hat\alpha = \alpha$ and
-        $A = \hat A = A^0$): what remains of the conditions for Itô equations if the noise
-        does not read what it changes.
+        $A = \hat A = A^0$): those of the conditions for Itô equations that matter where the
+        noise changes $p$ alone and does not depend on it.
     - For a [`diffrax_symplectic.AdditiveTableau`][]: any number of noises, with
         constant $b_k$ if the tableau is `constant`.
 
@@ -122,7 +122,7 @@ def _(tableau: GeneralTableau) -> dict:
 
 @_strong.register
 def _(tableau: SeparableTableau) -> dict:
-    # Of the paper's further variables, which are not independent of `W`.
+    # For the paper's further variables, which are not independent of `W`.
     others = _others_vanish(tableau.beta, A1e=tableau.c1)
     return _strong(tableau.partitioned()) | others
 
@@ -221,7 +221,7 @@ def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
 @_weak.register
 def _(tableau: SeparableTableau) -> tuple[dict, dict]:
     """With the paper's conditions on further variables, which are not independent of `W`:
-    those in `B0` must not be live."""
+    the end of the step must not depend on those in `B0`."""
     B0 = {"W": tableau.B0["W"]}
     partitioned = dataclasses.replace(tableau.partitioned(), B0=B0)
     first, second = _weak(partitioned)
@@ -251,7 +251,7 @@ def _(tableau: AdditiveTableau) -> tuple[dict, dict]:
 
 
 def _others_vanish(beta: Mapping[str, np.ndarray], **moments: np.ndarray) -> dict:
-    """Weights of random variables other than `W` that must not show."""
+    """The conditions that the moments of random variables other than `W` vanish."""
     return {
         f"beta[{name}].{label}": weights @ moment
         for name, weights in beta.items()

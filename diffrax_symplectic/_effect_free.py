@@ -1,5 +1,5 @@
-"""Programs without their effects: to evaluate a user's function at points that are none
-of the user's, without printing, raising, or calling back into Python."""
+"""Runs programs without their effects. A user's function can so be evaluated at points that
+the user never chose, without printing, raising errors, or calling back into Python."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -43,7 +43,7 @@ def _apply(eqn: JaxprEqn, inputs: list) -> list:
         if name == "while":
             return _while(params, inputs)
     if len(eqn.outvars) == 0:
-        # Only its effects can matter: a print.
+        # It can only be there for its effects, such as printing.
         return []
     out = eqn.primitive.bind(*inputs, **params)
     return out if eqn.primitive.multiple_results else [out]

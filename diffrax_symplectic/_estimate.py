@@ -1,4 +1,4 @@
-"""What is known of an expectation after so many paths."""
+"""Estimates of expectations, and how they are combined."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 
-# Scalars of NumPy are no arrays.
+# NumPy returns scalars, which are not arrays, from operations on arrays without axes.
 _Host = PyTree[np.ndarray | np.floating]
 
 
@@ -26,7 +26,7 @@ class Expectation(eqx.Module):
     - `tol_reached`: whether all standard errors are at most `tol`; `None` without `tol`.
     - `difference`: with two levels, the estimate of $\mathbb E[\phi_{h/2} - \phi_h]$ from
         coupled paths.
-    - `order`: with two levels, the weak order that was said.
+    - `order`: with two levels, the weak order of the solver that was passed.
     """
 
     mean: _Host
@@ -88,14 +88,14 @@ class ExpectationInterrupted(KeyboardInterrupt):
 
 
 def reached(estimate: Expectation, tol: float | None) -> bool:
-    """Whether all standard errors are at most `tol`. That of a single path is unknown."""
+    """Whether all standard errors are at most `tol`. Of a single path there is none."""
     if tol is None or estimate.num_paths < 2:
         return False
     return all(np.all(x <= tol) for x in jtu.tree_leaves(estimate.std_error))
 
 
 def finished(estimate: Expectation, tol: float | None) -> Expectation:
-    """Says whether `tol` was reached. Without any path there is no mean."""
+    """The estimate with `tol_reached`, and with NaN for the mean if no path succeeded."""
     said = None if tol is None else reached(estimate, tol)
     estimate = dataclasses.replace(estimate, tol_reached=said)
     if estimate.num_paths > 0:
@@ -142,7 +142,7 @@ def initial(
 
 
 def merge(estimate: Expectation, batch) -> Expectation:
-    """The estimate from the paths of both."""
+    """The estimate from its own paths and those of the batch."""
     count, failed, mean, squares = jax.device_get(batch)
     a, b = estimate.num_paths, int(count)
     n = max(a + b, 1)

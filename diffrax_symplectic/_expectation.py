@@ -1,4 +1,4 @@
-"""Expectations over very many paths, a batch at a time."""
+"""Expectations over very many paths, one batch after another."""
 
 import collections
 import dataclasses
@@ -115,15 +115,15 @@ def expectation(
         (Without `sol.result` a path that failed counts as a success: Diffrax returns where
         it stopped.)
     - `key`: a JAX random key.
-    - `num_paths`: how many paths there shall be in all, those of `start` included.
+    - `num_paths`: the number of all paths, those of `start` included.
     - `batch_size`: how many paths each device takes at once. By default 32,768 on CPUs
         (for a state of a few numbers, enough for all cores and little for their caches)
         and 262,144 elsewhere. Take less for large states.
     - `devices`: the devices that share each batch, by default all of `jax.devices()`:
         under `jax.distributed` those of every process, each of which has to make the same
         call and gets the same result.
-    - `start`: an earlier estimate with the same `fn` (which is not checked) and `key`, to
-        be continued.
+    - `start`: an earlier estimate to continue. It has to come from the same `key` and the
+        same `fn`; that of `fn` is not checked.
     - `tol`: if given, no further batch begins once the standard error of every entry of
         $\phi$ is at most `tol`. `num_paths` is then the most that are taken.
     - `levels`: 2 to estimate the error of discretization, too.
@@ -174,7 +174,7 @@ def expectation(
     if num_coupled is None:
         made = 0 if before is None else before.num_paths + before.num_failed
         num_coupled = max(num_paths // 16, 2, made)
-    # Keys that belong to no path.
+    # The keys made from this one belong to no path of the first level.
     key = jr.fold_in(key, 0xFFFFFFFF)
     try:
         difference = run(_Difference(fn), key, num_coupled, before, None, _no_meter)
@@ -185,7 +185,8 @@ def expectation(
 
 
 class _Level(eqx.Module):
-    """A path on one level. Of the same `fn` it is the same function to JAX."""
+    """A path on one level. For the same `fn` two of these are equal, so that JAX compiles
+    them once."""
 
     fn: _Sample
     level: int = eqx.field(static=True)
@@ -223,7 +224,7 @@ def _run(
     """The estimate of one level, a batch at a time."""
     key_data, impl = np.asarray(jr.key_data(key)), jr.key_impl(key)
     first = 0 if start is None else start.num_paths + start.num_failed
-    # No more lanes than paths.
+    # A batch need not be larger than the number of paths.
     batch_size = min(batch_size, max(1, -(-(num_paths - first) // len(devices))))
     mesh = Mesh(np.array(devices), ("paths",))
     step = batch_size * len(devices)
@@ -235,7 +236,7 @@ def _run(
             lo_hi, size = jax.device_put((lo_hi, size), devices[0])
         return _batch(fn, key_data, lo_hi, size, impl, mesh, batch_size)
 
-    # JAX keeps what it traced here for the first batch.
+    # JAX caches this trace and uses it for the first batch.
     shapes = eqx.filter_eval_shape(batch, min(first, num_paths - 1))
     estimate = initial(shapes[2], key_data, start, num_paths)
     running = collections.deque()
@@ -246,7 +247,7 @@ def _run(
             if more:
                 running.append(batch(first))
                 first += step
-            # One computes while the one before is added up.
+            # One batch is computed while the one before it is added up.
             if len(running) > more:
                 estimate = merge(estimate, running.popleft())
                 done = estimate.num_paths + estimate.num_failed
@@ -310,7 +311,7 @@ def _batch(fn, key_data, lo_hi, size, impl, mesh: Mesh, n: int):
             keep = good.reshape(-1, *[1] * (x.ndim - 1))
             add = lambda x: total(jnp.sum(jnp.where(keep, x, 0), axis=0))
             mean = add(x) / jnp.maximum(count, 1)
-            # In two passes: no difference of large numbers.
+            # In two passes, so that no two large numbers are subtracted.
             return mean, add((x - mean) ** 2)
 
         leaves, treedef = jtu.tree_flatten(phi)

@@ -15,9 +15,9 @@ class IndexedNoise(eqx.Module):
 
     $H_1, \ldots, H_m$ are given by one function of the index. Called as
     `noise(t, p, q, args)` it returns all of them, by `jax.vmap` over the index, so that
-    it goes wherever a function goes. [`diffrax_symplectic.NinomiyaVictoir`][] follows
-    the flow of one noise after another, and evaluates only that one. A function that
-    returns all `m` is evaluated whole for each of the `m` flows.
+    it can be used in place of a function. [`diffrax_symplectic.NinomiyaVictoir`][] follows
+    the flow of one noise after another, and evaluates only the noise of that flow. With a
+    function that returns all `m` it has to evaluate all of them for each of the `m` flows.
 
     !!! example
 

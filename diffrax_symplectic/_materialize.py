@@ -12,10 +12,11 @@ _T = TypeVar("_T")
 def materialize(fn: Callable[[], _T]) -> _T:
     """`fn()`, computed once and kept in memory.
 
-    On CPUs, XLA fuses a cheap-looking computation into every kernel that reads its result,
-    and so repeats it there. For Gaussian numbers and transcendental functions that costs
-    more than it saves. XLA fuses nothing across the border of a conditional, so `fn` is put
-    behind one. The barrier hides that its condition is always true.
+    On CPUs, XLA may fuse a computation into every kernel that reads its result, and so
+    repeat it in each. For Gaussian numbers and transcendental functions this costs more
+    than it saves. XLA fuses nothing across the border of a conditional. So `fn` is called
+    in one branch of a conditional, and the barrier hides from XLA that the condition is
+    always true.
     """
 
     def in_a_conditional() -> _T:

@@ -7,7 +7,7 @@ import numpy as np
 from ._tableau import FlatTableau
 
 
-# Random variables that change their sign if a step is taken back.
+# The step size and the random variables that change their sign if a step is undone.
 _NEGATED = {"h", "W", "second", "two_point", "third", "A"}
 
 
@@ -29,7 +29,7 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
             for j, that in enumerate(stages)
             if (that.channels, that.reads, that.writes)
             == (this.channels, this.reads, this.writes)
-            # What a separable system makes of p alone does not depend on time.
+            # In a separable system what depends on p does not depend on time.
             and (this.reads == "p" or np.isclose(that.c, 1 - this.c))
             and np.isclose(b[i], b[j])
         ]
@@ -43,8 +43,8 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
 
 
 def _read(matrix: np.ndarray, stages: tuple) -> np.ndarray:
-    """Without the entries that do not matter: stages that write what a stage does not
-    read."""
+    """The matrix with zeros for entries that do not matter: those of stages that write what
+    the other stage does not read."""
     matters = [
         [i.reads == "y" or j.writes in ("y", i.reads) for j in stages] for i in stages
     ]

@@ -14,19 +14,21 @@ from ._tableau import FlatTableau, Stage
 
 # Coefficients are exact up to a few roundings of order-one numbers.
 _TOLERANCE = 1e-14
-# From how many stages of one kind on it pays to evaluate them as one array.
+# At least this many stages of one kind are evaluated together, as one array.
 _WORTH_STACKING = 2
-# The fewest unknown stages of a block are searched for among at most so many choices of
-# one size; their number grows exponentially with the stages.
+# The smallest set of unknown stages of a block is found by trying all sets of one size
+# after another. Their number grows exponentially with the stages. So the search ends at a
+# size with more sets than this.
 _MOST_CHOICES = 1000
 
 
-# Stages of one kind that do not wait for each other.
+# Stages of one kind that can be evaluated together.
 Group: TypeAlias = tuple[int, ...]
 
 
 class Block(NamedTuple):
-    """Stages that depend on each other, directly or in a circle.
+    """Stages that depend on each other: a strongly connected component of the graph of
+    dependencies.
 
     - `unknown`: the stages whose values are solved for; empty if the block is explicit.
     - `explicit`: the other stages, in an order in which each can be evaluated once the
@@ -41,7 +43,8 @@ class Block(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Plan:
-    """The live, distinct stages of a tableau, in blocks to be solved one after another."""
+    """The stages of a tableau that are used, without repetitions, in blocks that are solved
+    one after another."""
 
     tableau: FlatTableau
     blocks: tuple[Block, ...]
@@ -90,7 +93,7 @@ def _snap(x: np.ndarray | np.floating) -> np.ndarray:
 
 
 def _live(tableau: FlatTableau) -> FlatTableau:
-    """Keeps the stages that reach the end of the step."""
+    """Keeps the stages that the end of the step depends on."""
     live = tableau.weights != 0
     for _ in tableau.stages:
         live = live | (live @ (tableau.matrix != 0))
@@ -145,7 +148,7 @@ def _blocks(tableau: FlatTableau) -> tuple[Block, ...]:
     closed = reach | np.eye(n, dtype=bool)
     mutual = closed & closed.T
     components = {tuple(np.flatnonzero(row).tolist()) for row in mutual}
-    # A stage reaches everything that what it depends on reaches, and itself besides.
+    # A block depends on fewer stages than any block that depends on it.
     ordered = sorted(components, key=lambda block: (closed[block[0]].sum(), block))
     blocks = []
     for component in ordered:
@@ -156,7 +159,7 @@ def _blocks(tableau: FlatTableau) -> tuple[Block, ...]:
 
 
 def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
-    """Stages by what they evaluate."""
+    """Groups the stages that evaluate the same vector field."""
     groups: dict[tuple, list[int]] = {}
     for i in stages:
         stage = tableau.stages[i]
@@ -172,8 +175,9 @@ def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
 def _cut(
     block: tuple[int, ...], depends: np.ndarray
 ) -> tuple[tuple[int, ...], list[list[int]]]:
-    """Few stages that, once known, leave no cycle among the others, and the rounds in which
-    these can be evaluated: the fewest, unless that takes too long to find out."""
+    """Stages such that the others depend on each other in no cycle once these are known,
+    and the rounds in which the others can be evaluated. As few as possible, unless finding
+    the smallest set would take too long."""
     for size in range(len(block) + 1):
         if math.comb(len(block), size) > _MOST_CHOICES:
             break
@@ -181,8 +185,8 @@ def _cut(
             rounds = _rounds([i for i in block if i not in unknown], depends)
             if rounds is not None:
                 return unknown, rounds
-    # One after the other is made explicit where it closes no cycle. The stages with the
-    # fewest neighbours come first.
+    # Then stage after stage is made explicit unless that closes a cycle, beginning with the
+    # stages that have the fewest neighbours in the graph.
     links = depends | depends.T
     explicit = []
     for i in sorted(block, key=lambda i: links[i, list(block)].sum()):

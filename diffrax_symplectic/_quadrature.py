@@ -1,4 +1,4 @@
-"""What the random variables of one step may be, each with its probability."""
+"""Quadrature over the random variables of one step: their values and probabilities."""
 
 import itertools
 from collections.abc import Callable, Mapping
@@ -17,8 +17,12 @@ from ._terms import brownian_paths
 
 
 class Outcomes(NamedTuple):
-    """Increments, stacked along leading axes, the probability of each, and what puts one
-    in the place of the path."""
+    """The outcomes of a step.
+
+    - `increments`: the increments, stacked along leading axes.
+    - `weights`: their probabilities, or the weights of a quadrature.
+    - `put`: makes terms with a given increment in place of the path.
+    """
 
     increments: diffrax.AbstractBrownianIncrement
     weights: np.ndarray
@@ -52,7 +56,7 @@ def outcomes(terms: PyTree[diffrax.AbstractTerm], h, nodes: int) -> Outcomes:
 
 
 class _FixedIncrement(diffrax.AbstractBrownianPath):
-    """The same, given increment over every step."""
+    """A path that has a given increment over every step."""
 
     increment: diffrax.AbstractBrownianIncrement
 

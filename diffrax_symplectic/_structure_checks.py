@@ -60,7 +60,7 @@ def separable_fault(
     drift: tuple, noise: tuple, t0: RealScalarLike, y0: Y, args: Args
 ) -> Fault | None:
     """Why the system is not of the form `H0 = V(p) + U(t, q)`, `H_k = U_k(t, q)`; `None`
-    if it is."""
+    if it is of this form."""
     if fault := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", fault)
     for term in _not_asserted(drift, "separable"):
@@ -77,7 +77,8 @@ def separable_fault(
                 beside = f"a drift term beside that of H0 makes {dependence}"
                 return Fault(beside, f"{_FRICTION} {_ADVICE}")
     for term in _not_asserted(noise, "separable"):
-        # What is linear in the increment and does not depend on it is zero.
+        # The change of q is linear in the increment: if it does not depend on the
+        # increment, it is zero.
         for part, of in ((1, "control"), (0, "p")):
             independent = _independent(part, of, term, t0, y0, args)
             if fault := _fault(independent, "dH_k/dp"):
@@ -106,10 +107,11 @@ def constant_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault
 
 
 def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
-    """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish, for these `t0` and
-    `args`, at random states; no if it cannot be tested.
+    """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish at random states, for
+    these `t0` and `args`. False if this cannot be tested.
 
-    The bracket is bilinear, so that those of two random sums of the noises tell.
+    The bracket is bilinear. So it is enough to test the bracket of two random linear
+    combinations of the noises.
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
     struct = eqx.filter_eval_shape(lambda: [term.contr(t0, t0) for term in noise])
@@ -159,9 +161,10 @@ def _independent(
     """Whether the change of the state by `term` does not depend on `t`, `y`, `p`, `q`, or
     `control`, whichever `of` names. With `part` only its first or second half counts.
 
-    The flow of data through the program decides if it can: JAX then finds that the
-    derivative is zero by rules alone. If the variable enters it may still cancel, which
-    is decided by the derivative at random points; `None` if it is finite at none.
+    First JAX traces the derivative. If the variable does not enter the result at all, JAX
+    finds that the derivative is zero from the rules of differentiation alone. If it does
+    enter, it may still cancel. Then the derivative is evaluated at random points; the
+    result is `None` if it is finite at none of them.
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
     struct = eqx.filter_eval_shape(term.contr, t0, t0)
@@ -224,12 +227,13 @@ def _small_at_random_points(fn: Callable, inputs: PyTree) -> bool | None:
         return fn(*eqx.combine(jtu.tree_unflatten(treedef, flat), static))
 
     closed = jax.make_jaxpr(flat_fn)(*flat)
-    # Arrays that the user's functions hold are what they are, but for traced ones.
+    # Arrays that the user's functions capture keep their values, unless they are traced.
     is_traced = [isinstance(c, jax.core.Tracer) for c in closed.consts]
 
     @ft.partial(jax.jit, static_argnums=1)
     def sizes(key, positive: bool):
-        # Drawn within the program: what the program does not read is never drawn.
+        # Inputs are drawn within the program, so that those that it does not read are
+        # never made.
         keys = iter(jr.split(key, len(closed.consts) + len(flat)))
         draw = lambda x: _draw(x, next(keys), positive)
         consts = [draw(c) if new else c for c, new in zip(closed.consts, is_traced)]
@@ -245,7 +249,8 @@ def _small_at_random_points(fn: Callable, inputs: PyTree) -> bool | None:
 
     tested = False
     with jax.ensure_compile_time_eval():
-        # Between 0 and 1 most functions are defined that are not defined everywhere.
+        # Every other time the points lie between 0 and 1, where most functions are defined
+        # even if they are not defined everywhere.
         for i in range(8):
             size, error, finite = sizes(jr.key(i), i % 2 == 1)
             tested = tested or bool(finite)

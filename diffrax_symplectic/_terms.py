@@ -1,5 +1,5 @@
-"""What a step needs of Diffrax terms: their parts, their random variables, and that they
-fit the state."""
+"""Diffrax terms as a step uses them: drift and noise apart, the random variables of the
+step, and checks that terms and state fit each other."""
 
 import functools as ft
 
@@ -181,7 +181,8 @@ def controls(
     if names == ["W"]:
         return {"W": draw(noise, t0, t1, False)}
     increments = draw(noise, t0, t1, True)
-    # The most telling advice first.
+    # The variables of which the increments hold most are looked for first: the advice for
+    # these is right for the others, too.
     held = lambda name: all(getattr(i, name, None) is not None for i in increments)
     for name in sorted(names, key=lambda x: [*VARIABLES, x].index(x)):
         if not held(name):
@@ -218,7 +219,7 @@ def _within_resolution(noise: tuple, t0, t1) -> RealScalarLike:
         if isinstance(path, diffrax.VirtualBrownianTree):
             # The tree keeps its tolerance in units of its length.
             tol = path.tol * (path.t1 - path.t0)
-            # What rounding leaves at the end of a solve is no step.
+            # A difference of two times that is a rounding error is not a step.
             coarse = (h < 0.999 * tol) & (h > 1e-6 * tol)
             t1 = eqx.error_if(
                 jnp.asarray(t1),
@@ -324,5 +325,6 @@ def number_of_noises(terms: diffrax.AbstractTerm) -> int:
 
 
 def strong_order_if_commutative(terms: diffrax.AbstractTerm) -> float:
-    """One noise commutes with itself; whether several do cannot be seen from here."""
+    """1 for one noise, which commutes with itself, and 1/2 for several, of which it is not
+    known whether they commute."""
     return 1.0 if number_of_noises(terms) <= 1 else 0.5

@@ -1,4 +1,4 @@
-"""Tests of a solver by one step, without Monte Carlo error."""
+"""Measures of one step of a solver that are exact, without Monte Carlo errors."""
 
 import functools as ft
 from collections.abc import Callable
@@ -41,11 +41,11 @@ def symplecticity_defect(
     of the step at fixed random variables and
     $\Omega = \begin{pmatrix} 0 & I \\ -I & 0 \end{pmatrix}$.
 
-    Exact up to rounding: a symplectic method with solved stage equations gives a small
-    multiple of the machine epsilon, whatever the Hamiltonians, the step and the
-    increment. Any other method gives the size of its violation. (The solvers here
-    differentiate their stage equations implicitly, so that this is a statement on the
-    method and not on the tolerance of its root finder.)
+    Exact up to rounding: for a symplectic method whose stage equations are solved this is a
+    small multiple of the machine epsilon, whatever the Hamiltonians, the step and the
+    increment. For any other method it is not small. (The solvers of this package
+    differentiate their stage equations implicitly. So the defect is that of the method, and
+    does not depend on the tolerance of its root finder.)
 
     Works under `jit` and `vmap`, and with any solver and terms of Diffrax.
 

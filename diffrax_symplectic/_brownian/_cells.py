@@ -13,9 +13,14 @@ from .._custom_types import RealScalarLike
 
 
 class Piece(eqx.Module):
-    """A stretch of a Brownian path in flat form: its length, its increment, and if they are
-    asked for the integral of the path over it, counted from its start, and the Lévy
-    areas."""
+    """A stretch of a Brownian path of `m` noises.
+
+    - `h`: its length.
+    - `W`: the increment over it.
+    - `integral`: the integral over the stretch of the path less its value at the start, or
+        `None`.
+    - `A`: the Lévy areas, or `None`.
+    """
 
     h: Float[Array, ""]
     W: Float[Array, " m"]
@@ -40,7 +45,8 @@ class Piece(eqx.Module):
 
 
 def or_one(h: Float[Array, ""]) -> Float[Array, ""]:
-    """In a batch, paths that have ended go on with empty steps."""
+    """`h`, but 1 for an empty stretch, so that one can divide by it. In a batch, the paths
+    that have reached their end take empty steps until all have."""
     return jnp.where(h > 0, h, 1)
 
 

@@ -8,14 +8,15 @@ def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
     """Raises a `ValueError` if the solve being traced may change its step size, as far as
     that can be known.
 
-    Increments whose law depends on the step (weak, truncated) are not the increments of
-    one path: they cannot be refined, and to accept or reject a step by looking at them
-    biases their law. Diffrax refuses `UnsafeBrownianPath` for this reason, by name, and
-    tells a path nothing about the step size controller. With the solvers of this package
-    nothing can go wrong, since they give no error estimate, without which Diffrax refuses
-    adaptive steps. For other solvers this looks for the innermost solve on the Python
-    stack. That is best effort: it does not find a solve if increments were traced before,
-    by a `jax.jit` of the user's around `evaluate`.
+    Weak and truncated increments, whose law depends on the size of the step, are not the
+    increments of one path. They cannot be refined. To accept or reject a step depending on
+    them would change their law. Diffrax refuses its own `UnsafeBrownianPath` for this
+    reason, by name, and tells a path nothing about the step size controller.
+
+    The solvers of this package give no error estimate, and without one Diffrax refuses
+    adaptive steps. For other solvers this function looks for the innermost solve on the
+    Python stack. It does not find a solve if the increments were traced before, by a
+    `jax.jit` of the user's around `evaluate`.
     """
     name = type(path).__name__
     solve = innermost_solve()
@@ -38,7 +39,7 @@ def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
 
 
 def _holds(terms, kind: type) -> bool:
-    """Whether a path of this kind drives the terms: other solves are none of its business,
-    even if it is evaluated within."""
+    """Whether a path of this kind drives the terms. A path may also be evaluated within a
+    solve that it does not drive, whose steps it does not restrict."""
     is_path = lambda x: isinstance(x, kind)
     return any(map(is_path, jtu.tree_leaves(terms, is_leaf=is_path)))

@@ -20,16 +20,17 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
     Over a step of size $h$ the increment is $W \sim \mathcal N(0, h)$, and with space-time
     Lévy area there is an independent $H \sim \mathcal N(0, h / 12)$. They are a function
     of `key` and of where the step lies, as those of
-    [`diffrax_symplectic.WeakBrownianPath`][]: a step that is computed again sees the same
-    increments, in reverse mode, too, which `diffrax.UnsafeBrownianPath` does not allow;
-    and a step costs what its random numbers cost, where a `diffrax.VirtualBrownianTree`
-    descends to its leaves.
+    [`diffrax_symplectic.WeakBrownianPath`][]. A step that is computed again gets the same
+    increments. So reverse-mode gradients work, which `diffrax.UnsafeBrownianPath` does not
+    allow. A step costs as much as its random numbers, whereas a
+    `diffrax.VirtualBrownianTree` descends to its leaves for each of them.
 
-    Without `cell`, steps of another size are another Brownian motion. With `cell`, the
-    motion is sampled over cells of that size, and what is returned over a step is put
-    together from these, so that solutions with different steps, multiples of `cell`,
-    follow one path: strong errors against a fine solution, or the difference of the
-    results of two step sizes. A step then costs as much as the cells in it.
+    Without `cell`, steps of another size belong to another Brownian motion. With `cell`,
+    one Brownian motion is sampled over cells of that size, and the increment over a step
+    is put together from those of its cells. So solutions with different steps, all
+    multiples of `cell`, follow one path. That is needed for strong errors against a fine
+    solution, and for the difference of the results of two step sizes. A step then costs as
+    much as all cells in it.
 
     Each number is made from one random word of 32 bits, by the inverse of the normal
     distribution function, with a relative error below $10^{-8}$ in float64 and rounding
@@ -99,7 +100,7 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
     def _composed(
         self, t0: Array, t1: Array, cell: float, use_levy: bool
     ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        # The motion of a path is the same whether or not its areas are asked for.
+        # The increments are the same whether or not the areas are asked for.
         with_area = self.levy_area is diffrax.SpaceTimeLevyArea
         h = jnp.asarray(cell, t0.dtype)
 

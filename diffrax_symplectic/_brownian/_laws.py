@@ -12,12 +12,12 @@ from jaxtyping import Array, Float, UInt32
 
 
 class AbstractLaw(abc.ABC):
-    """The law of a scalar random variable. Laws are constants, compared by value."""
+    """The law of a scalar random variable with mean zero. Laws are compared by value."""
 
     @property
     @abc.abstractmethod
     def variance(self) -> float:
-        """The mean is zero for each law here."""
+        """The variance, which is the second moment since the mean is zero."""
 
     @abc.abstractmethod
     def outcomes(self, nodes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -113,7 +113,8 @@ def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]
 
 # Up to 2^-32 the probability 1/6, and the values +-sqrt(3) equally likely.
 _SIXTH = 2**32 // 6
-# Half of the words are negative; of each half the rare ones have the large size.
+# Words below 2^31 stand for negative values. The lowest of each half stand for the large
+# values, which are rare.
 _RARE = round(2**32 * (3 - np.sqrt(6)) / 12)
 _SMALL, _LARGE = (float(np.sqrt(3 + s * np.sqrt(6))) for s in (-1, 1))
 _LESS, _MORE = (float((3 + s * np.sqrt(6)) / 12) for s in (-1, 1))

@@ -23,7 +23,7 @@ from ._wrapper import (
 class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
     r"""Increment, space-time Lévy area and Lévy areas over a step of size $h$.
 
-    - `dt`, `W`, `H`: as for Diffrax.
+    - `dt`, `W`, `H`: as in Diffrax.
     - `A`: the Lévy areas $A_{kl} = \frac12 \int (w_k \,\mathrm{d}w_l - w_l \,\mathrm{d}
         w_k)$ with $w$ counted from the start of the step, as an antisymmetric matrix of
         shape `(m, m)`, with the `m` noises in the order of the leaves of `W`.
@@ -35,7 +35,7 @@ class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
     A: Float[Array, "m m"]
 
 
-# Up to so many Fourier terms matrix products are written out.
+# Matrix products over at most this many Fourier terms are written out as sums.
 _WRITTEN_OUT = 4
 
 
@@ -43,15 +43,15 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     r"""Adds the Lévy areas of a [`diffrax_symplectic.LevyAreaIncrement`][] to the
     increments of a Brownian path with space-time Lévy area. Step sizes have to be fixed.
 
-    The law of the areas over a stretch is simulated given $W$ and $H$, over which the
-    Brownian path is $\frac t h W$ and a bridge. The bridge's first `terms` Fourier terms
-    are drawn (given $H$, which is minus the sum of the cosine coefficients); the rest is
-    replaced by Gaussian variables with the mean and the covariances that it has given $H$.
-    So for any `terms` the mean and all covariances of $W$, $H$ and $A$ are exact; the law
-    of $A$ is approached as `terms` grows, with an error (after Mrongowius and Rößler) in
-    mean square of $\mathcal O(h / \text{terms})$. Without terms it is the approximation of
-    Davie. A step draws $2 m\, (\text{terms} + 1) + \frac12 m (m - 1)$ normal numbers for
-    $m$ noises.
+    Over a stretch of time the Brownian path is the line $\frac t h W$ plus a bridge. The
+    first `terms` Fourier terms of the bridge are drawn at random, such that the bridge has
+    the given integral $H$, which is minus the sum of all cosine coefficients. The terms
+    that are left out are replaced by Gaussian variables, with the mean and the covariances
+    that those terms have given $H$. So for any number of terms the mean and all
+    covariances of $W$, $H$ and $A$ are exact. The law of $A$ itself is approximated, with
+    an error in mean square of $\mathcal O(h / \text{terms})$ (Mrongowius and Rößler).
+    With `terms=0` this is the approximation of Davie. A step draws
+    $2 m\, (\text{terms} + 1) + \frac12 m (m - 1)$ normal numbers for $m$ noises.
 
     With `cell`, the path is refined consistently: it is sampled over cells of that size,
     and what it returns over a longer stretch is put together from these by Chen's rule, so
@@ -153,7 +153,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         return sum(_sizes(num_noises(increment_struct(self.path)), self.terms))
 
     def _composed(self, t0, t1, cell: float) -> Piece:
-        # Rounding must not lead out of the path.
+        # A cell may end a rounding error beyond the end of the path.
         at = lambda i: jnp.clip(i * cell, self.path.t0, self.path.t1)
         sample = lambda i: self._sample(at(i), at(i + 1))
         return compose(t0, t1, cell, sample, type(self).__name__)
@@ -199,10 +199,11 @@ def _bridge_area(
     a, b, from_rest, by_mean, by_area = jnp.split(normals, ends[:-1])
     a, b = (cast(np.sqrt(s)) * x.reshape(m, terms) for x in (a, b))
     total = jnp.sum(a, axis=1) + np.sqrt(rest) * from_rest
-    # Given that all cosine coefficients, the rest included, sum up to -H.
+    # Conditioned on the sum of all cosine coefficients, the rest included, which is -H.
     a = a - cast(12 * s) * (total + H)[:, None]
     series = _weighted_product(a, b, np.pi * r)
-    # The rest: those coefficients have the mean -12 s_r H and the variance s_r - 12 s_r^2.
+    # The area of the rest. Its cosine coefficients have the mean -12 s_r H, which gives
+    # the first part, and the variance s_r - 12 s_r^2, which gives the second.
     mean = jnp.outer(H, np.sqrt(72 * rest_squared) * by_mean)
     size = np.sqrt(rest - 12 * rest_squared)
     area = series - mean + size * _strictly_upper(by_area, m)

@@ -24,10 +24,10 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
     $$C = \pm\sqrt{\tfrac{1}{15} h + \tfrac{1}{12} W^2 + \tfrac15 H^2}$$
 
     with a fair sign: $M^2 + C^2$ is the mean square of the Brownian path over the step, in
-    expectation given $W$ and $H$. In the mean, $C^2$ is $h / 6$.
+    expectation given $W$ and $H$. The mean of $C^2$ is $h / 6$.
 
-    - `dt`, `W`, `H`: as for Diffrax.
-    - `sign`: the signs, times $\sqrt h$.
+    - `dt`, `W`, `H`: as in Diffrax.
+    - `sign`: the signs of $C$, times $\sqrt h$.
     - `C`: the variables $C_k$.
     """
 
@@ -42,7 +42,7 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
 
 
 def _offset(h, W, H, sign):
-    # Backward in time Diffrax changes the sign of all, the step size included.
+    # In a solve backward in time Diffrax changes all signs, that of the step size included.
     h = jnp.abs(h).astype(W.dtype)
     size = jnp.sqrt(h / 15 + W**2 / 12 + H**2 / 5)
     return jnp.copysign(size, sign)

@@ -14,22 +14,22 @@ from .._compat import threefry_2x32
 # A number that counts places, and one that says what is counted.
 Place: TypeAlias = tuple[Integer[Array, ""], Integer[Array, ""]]
 
-# Where the words of wrappers begin, in the numbers of a step.
+# The words of one step are numbered. Those of wrappers begin at these numbers.
 PLATEAU_WORDS, AREA_WORDS = 2**18, 2**19
 
 
 def random_words(
     key, place: Place, sets: int, n: int, begin: int = 0
 ) -> UInt32[Array, "sets n"]:
-    """Random words for a place on the axis of time. The first of the sets are the same
-    whatever their number is. Words from another `begin` are independent, so that a path
-    and a wrapper may have the same key."""
+    """Random words for a step at `place`: `sets` sets of `n` words each. To ask for more
+    sets does not change the first ones. Words for different values of `begin` are
+    independent, so that a path and a wrapper around it may have the same key."""
     key = _typed(key)
     count, exponent = place
     blocks = (sets * n + 1) // 2
     if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks < 2**20 - begin:
-        # The place is the counter of the generator, so that one hash gives two words.
-        # (Keys folded and split would take three hashes for the first.)
+        # The place is used as the counter of the generator: one hash then makes two words.
+        # With folded and split keys the first word alone would take three hashes.
         numbers = np.arange(begin, begin + blocks, dtype=np.uint32)
         counters = jnp.concatenate(
             [
@@ -46,8 +46,8 @@ def random_words(
 
 
 def check_key(key, user: str) -> None:
-    """Raises a `ValueError` unless `key` is a random key, of the new style or the old, or
-    an array of such, to be `vmap`ped over."""
+    """Raises a `ValueError` unless `key` is a random key (as from `jax.random.key` or
+    `jax.random.PRNGKey`) or an array of keys, which is meant for `jax.vmap`."""
     dtype = getattr(key, "dtype", None)
     if dtype is None or not (
         jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32

@@ -93,7 +93,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
             "the bound is a multiple of sqrt(|ln h|). Pass a smaller `dt0`, or measure "
             "time in larger units.",
         )
-        # An empty step has an increment of zero: h |ln h| -> 0.
+        # The bound of an empty step is zero, as h |ln h| tends to 0 with h.
         log_h = jnp.log(jnp.where(h > 0, h, 1))
         bound = jnp.sqrt(2 * self.k * h * jnp.abs(log_h))
 

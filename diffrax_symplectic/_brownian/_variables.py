@@ -1,4 +1,4 @@
-"""What there is to know of each random variable of a step, in one place."""
+"""The random variables of a step: one record for each says all that others need to know."""
 
 from typing import NamedTuple
 
@@ -34,7 +34,8 @@ _PLATEAUS = (
     "plateaus. Wrap a path with space-time Lévy area as `PlateauBrownianPath(path, "
     "key)`"
 )
-# By the name on the increment. Those whose increments hold more come first.
+# By the attribute of the increment that holds the variable. A variable comes before another
+# one if its increments hold more: that is the order in which missing ones are named.
 VARIABLES = {
     "A": RandomVariable(
         LevyAreaIncrement,
@@ -43,9 +44,10 @@ VARIABLES = {
         variance=None,
     ),
     "C": RandomVariable(PlateauIncrement, _PLATEAUS, variance=1 / 6),
-    # Of `C`, whose size is a function of `W` and `H`.
+    # The sign of `C`, which alone is drawn: its size is a function of `W` and `H`.
     "sign": RandomVariable(PlateauIncrement, _PLATEAUS, variance=1),
-    # On no increment: it is computed from `W`, `H` and, where there is one, `K`.
+    # No increment has this attribute. It is computed from `W`, `H` and, if there is one,
+    # from `K`.
     "L": RandomVariable(
         diffrax.AbstractSpaceTimeLevyArea, _SPACE_TIME_AREA, variance=None
     ),
@@ -53,7 +55,7 @@ VARIABLES = {
         diffrax.AbstractSpaceTimeLevyArea,
         _SPACE_TIME_AREA,
         variance=1 / 12,
-        # The bridge, seen from its other end, has the same integral.
+        # The bridge from the end of the step to its start has the same integral.
         even=True,
     ),
     "third": RandomVariable(

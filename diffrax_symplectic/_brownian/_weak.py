@@ -17,8 +17,8 @@ from ._stepwise import AbstractPathWithLaws, checked_shape
 class WeakIncrement(diffrax.AbstractBrownianIncrement):
     r"""The random variables of one step of a weak method, for a step of size $h$.
 
-    They have the moments of Gaussian increments that a weak method needs, and are
-    bounded, so that implicit stages stay solvable and moments stay finite.
+    Their low moments, which are all that a weak method needs, are those of Gaussian
+    increments. They are bounded, so that implicit stages stay solvable and moments finite.
 
     - `dt`: the step size $h$.
     - `W`: the three-point variables $\hat I_k$, $\pm\sqrt{3h}$ with probability $1/6$
@@ -85,14 +85,14 @@ class WeakBrownianPath(AbstractPathWithLaws):
     r"""Discrete random variables in place of Brownian increments, for weak methods.
 
     Over each step this gives a [`diffrax_symplectic.WeakIncrement`][]. Steps are
-    independent. Use it where expectations are wanted and not paths: there is no
-    Brownian motion that these are the increments of, so that step sizes have to be
-    fixed (`diffrax.ConstantStepSize` or `diffrax.StepTo`).
+    independent. Use it for expectations, and not for single paths: these are not the
+    increments of a Brownian motion, so that a step cannot be divided into shorter ones.
+    Step sizes have to be fixed (`diffrax.ConstantStepSize` or `diffrax.StepTo`).
 
-    The increments are a function of `key` and of where the step lies. "Where" is
-    rounded to a fraction of the step size, so that the rounding errors of the time do
-    not matter: a step that is computed again (by the backward pass of
-    `diffrax.RecursiveCheckpointAdjoint`, say) sees the same increments.
+    The increments are a function of `key` and of where the step lies, up to a fraction of
+    its size, so that rounding errors of the time do not matter. A step that is computed
+    again (for example by the backward pass of `diffrax.RecursiveCheckpointAdjoint`) gets
+    the same increments.
 
     Probabilities are exact up to $2^{-32}$, odd moments exactly zero.
     """

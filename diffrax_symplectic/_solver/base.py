@@ -30,7 +30,7 @@ SolverState: TypeAlias = None
 
 
 class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
-    """What all solvers of this package have in common."""
+    """The base of all solvers of this package."""
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = (
@@ -48,10 +48,10 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
 
     Subclasses give a `tableau` and their orders. If stages are implicit, they also subclass
     [`diffrax_symplectic.AbstractImplicitStages`][]. Everything else is decided by the
-    tableau: unused stages are dropped, equal ones are evaluated once, explicit ones are
-    evaluated directly, and the implicit rest is solved in as many small systems, one after
-    another, as the coefficients allow. The unknowns are the stage values $k_i$, not the
-    stages, so that the end of the step is their weighted sum and needs no further
+    tableau: unused stages are dropped, equal ones are evaluated once, and explicit ones are
+    evaluated directly. The implicit ones are solved for in small systems, one after
+    another, as far as the coefficients allow. The unknowns are the stage values $k_i$, not
+    the stages, so that the end of the step is their weighted sum and needs no further
     evaluation.
 
     **Terms.** `MultiTerm(drift, noise)` as from

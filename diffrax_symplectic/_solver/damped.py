@@ -15,7 +15,7 @@ from .base import AbstractSymplecticSolver
 
 
 def _checked(gamma: PyTree) -> PyTree:
-    """Friction coefficients whose values are known are checked at once."""
+    """`gamma`, after a check of those of its values that are not traced."""
     for leaf in jtu.tree_leaves(gamma):
         if not eqx.is_array_like(leaf) or np.iscomplexobj(leaf):
             raise ValueError(
@@ -126,7 +126,7 @@ class Damped(
         solver_state: Any,
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y | None, DenseInfo, Any, diffrax.RESULTS]:
-        # Backward in time momentum grows, and in a solve time runs forward even then.
+        # In a solve backward in time the momentum grows. Diffrax makes `t1 - t0` positive.
         time = direction(terms) * (t1 - t0) / 2
         factors = _factors(self.gamma, time, y0[0])
         damp = lambda y: (jtu.tree_map(jnp.multiply, factors, y[0]), y[1])
@@ -165,7 +165,7 @@ def _factors(gamma: PyTree[Array], time: RealScalarLike, p: PyTree[Array]) -> Py
             )
         g = jnp.asarray(g, jnp.result_type(x))
         bad = ~jnp.all(jnp.isfinite(g) & (g >= 0))
-        # Of values that are traced: a failure of its own path.
+        # Values that are traced cannot raise an error here. They make their path fail.
         return jnp.where(bad, jnp.nan, jnp.exp(-g * jnp.asarray(time, g.dtype)))
 
     return jtu.tree_map(factor, gamma, p)

@@ -23,9 +23,9 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       - \frac{\partial F}{\partial q} \cdot \frac{\partial G}{\partial p},$$
 
     since the Lie bracket of two Hamiltonian vector fields is the field of their Poisson
-    bracket: so it is symplectic for any Hamiltonians, and conserves every quadratic
-    invariant of the system. JAX takes the derivatives; terms that do not come from
-    Hamiltonians will do, but all noises have to be in one term.
+    bracket. So it is symplectic for any Hamiltonians, and conserves every quadratic
+    invariant of the system. JAX takes the derivatives. The terms need not come from
+    Hamiltonians, but all noises have to be in one term.
 
     The areas bring the order: without them the midpoint rule has strong order 1/2. For `m`
     noises they cost `m` directional derivatives of the noise in each evaluation. With one

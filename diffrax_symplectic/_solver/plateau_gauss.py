@@ -32,9 +32,9 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     $$L_{kl} = \tfrac35 h H_k H_l + \tfrac{60}{7} h K_k K_l
       - \tfrac12 h (W_k K_l + K_k W_l) + \tfrac{3}{140} h^2 \delta_{kl}.$$
 
-    Both are expectations of the integrals that the logarithm of the solution contains, by
-    what is known of the path. The second is nearer to them: with it the errors of small
-    steps were less than half as large.
+    Both are conditional expectations of the integrals that the logarithm of the solution
+    contains, given these variables of the path. The second one is closer to the integrals:
+    with it the errors of small steps were less than half as large.
 
     The brackets of Hamiltonian vector fields are fields of Hamiltonians, their Poisson
     brackets. So a step is symplectic for any Hamiltonians, and conserves every quadratic

@@ -30,12 +30,13 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
     independent signs: kick by
     $\sum_k \sigma_k (M_k - C_k)$; one Störmer--Verlet step of $H_0$ over $h / 2$; kick by
     $\sum_k 2 \sigma_k C_k$; Störmer--Verlet over $h / 2$; kick by
-    $\sum_k \sigma_k (W_k - M_k - C_k)$, each time at the $q$ that was reached. In short,
-    the noise is replaced by two plateaus, $M \mp C$, that have its mean over the step and,
-    in expectation given $W$ and $H$, its mean square: the first brings order 3/2 where the
-    noise is constant along the step, the second where it is not.
+    $\sum_k \sigma_k (W_k - M_k - C_k)$, each time at the $q$ that was reached. In other
+    words, the Brownian path over the step is replaced by two plateaus, $M \mp C$. They have
+    the mean of the path, which brings order 3/2 where the noise is constant along the step.
+    In expectation given $W$ and $H$ they have its mean square, which brings that order
+    where the noise is not constant.
 
-    No equation to solve. Weak order 2, and order 2 without noise. No free parameters. A
+    No equation is solved. Weak order 2, and order 2 without noise. No free parameters. A
     Hamiltonian without the structure is refused while tracing. As explicit methods are, it
     is limited to steps that resolve the fastest frequency $\omega$ of $H_0$:
     $\omega h < 4$.

@@ -21,12 +21,12 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     $$A = B = \begin{pmatrix} a & 0 \\ 2a & \tfrac12 - a \end{pmatrix}, \qquad
       \alpha = \beta = (2a,\; 1 - 2a)$$
 
-    Two steps of the midpoint rule in a row, over the fractions $2a$ and $1 - 2a$ of the
-    step and of its increment. The parameter matters: $a = 0$ and $a = 1/2$ are the
-    midpoint rule itself, with one stage vector to solve for; any other value has two, one
-    after the other. The default $a = 1/4$ makes two half steps and has the smallest strong
-    errors: where they are those of the drift, a quarter of the midpoint rule's; where they
-    are those of the noise there is nothing to gain.
+    These are two steps of the midpoint rule, over the fractions $2a$ and $1 - 2a$ of the
+    step and of its increment. For $a = 0$ and $a = 1/2$ this is the midpoint rule itself,
+    with one stage vector to solve for. For any other value there are two, solved one after
+    the other. The default $a = 1/4$ makes two half steps and has the smallest strong
+    errors. Where the error of the drift dominates, it is a quarter of the midpoint rule's.
+    Where that of the noise dominates, nothing is gained.
 
     Symplectic for any Hamiltonians, and conserves every quadratic invariant. Strong
     order 1/2, and 1 if there is one noise or the noises commute. Weak order 1. Order 2

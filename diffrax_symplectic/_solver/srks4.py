@@ -59,13 +59,12 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       \tfrac{I_{k0}}{h}\big) b_k(c^1_1) + \big((1 - \beta_1) I_k - \beta_2
       \tfrac{I_{k0}}{h}\big) b_k(c^1_2) \Big).$$
 
-    Two stage vectors, solved one after the other. If the noise is constant, only the
-    sign $s$ matters. The paper has $s = +1$. The default here is $s = -1$: over six
-    problems with two noises its strong error at $h = 1/16$ was half the paper's, and 0.7 of
-    it with weak noise. The
-    conditions leave $\beta_1$, $\beta_2 \neq 0$ and $b$ free, which place the noise in
-    time: with the defaults $\beta_1 = b = 0$, $\beta_2 = 1$ it is read at both ends of
-    the step.
+    Two stage vectors are solved for, one after the other. If the noise is constant, only
+    the sign $s$ matters. The paper has $s = +1$. The default here is $s = -1$: over six
+    problems with two noises its strong error at $h = 1/16$ was half as large as for
+    $s = +1$, and 0.7 times as large with weak noise. The conditions leave $\beta_1$,
+    $\beta_2 \neq 0$ and $b$ free. They decide at which times the noise is evaluated: with
+    the defaults $\beta_1 = b = 0$, $\beta_2 = 1$, at both ends of the step.
 
     Order 2 without noise. Noise without the structure is refused while tracing.
 

@@ -19,8 +19,8 @@ def _srkw2(
     b2: float = 0.0,
     b3: float = 0.0,
 ) -> GeneralTableau:
-    """The paper's tableau, its drift stages in another order if asked for. The third and
-    fourth noise stage, and so `b1`, `b2` and `b3`, feed nothing."""
+    """The paper's tableau, with its drift stages in any order. The third and fourth noise
+    stage are unused: no result depends on them, nor on `b1`, `b2` and `b3`."""
     r = -_r if conjugate else _r
     B0 = np.array(
         [
@@ -88,14 +88,14 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         \frac14 + \frac r6 & \frac14 \end{pmatrix}, \quad
       \beta = \begin{pmatrix} \frac12 \\ \frac12 \end{pmatrix}$$
 
-    The paper's third and fourth noise stage, and with them its free parameters, feed
-    nothing. All conditions hold for any order of the rows of $B^0$ (and the columns of
-    $A^1$), and for $-\sqrt 3$ in place of $\sqrt 3$. The paper has the rows as here. The
-    default `rows=(1, 4, 2, 3)` solves for five stage vectors together and then for one,
-    where the paper's order solves for six, and was the most accurate of the 48 members:
-    over six problems its local weak error was 4% below the paper's with strong noise, 1%
-    with weak noise, and on the Kubo oscillator with $s = 1$ the bias of $\mathbb E[x^2]$ at
-    $t = 1$ is about half.
+    The paper's third and fourth noise stage are unused, and so are its free parameters. All
+    conditions hold for any order of the rows of $B^0$ (and the columns of $A^1$), and for
+    $-\sqrt 3$ in place of $\sqrt 3$. The order above is the paper's, for which six stage
+    vectors are solved for together. For the default, `rows=(1, 4, 2, 3)`, five are solved
+    for together, and then one. It was the most accurate of the 48 members: over six
+    problems its local weak error was 4% below that of the paper's order with strong noise,
+    and 1% with weak noise. On the Kubo oscillator with $s = 1$ the bias of
+    $\mathbb E[x^2]$ at $t = 1$ is about half as large.
 
     Symplectic for any Hamiltonians, and conserves every quadratic invariant. Weak order
     2 for one noise; weak order 1 for several, for which $B^3 = B^1$ keeps it symplectic.

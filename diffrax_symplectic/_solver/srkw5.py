@@ -26,8 +26,8 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       + \sum_k b_k \frac{\hat I_k + \hat I_{k+m}}{2}, \qquad
       y_{n+1} = y_n + h\, a(t_n + \tfrac h2, G) + \sum_k b_k \hat I_k.$$
 
-    One stage vector, as for the midpoint rule; the second, independent variable
-    $\hat I_{k+m}$ is what brings the second order. No free parameters.
+    One stage vector is solved for, as in the midpoint rule. The second order comes from the
+    second, independent variable $\hat I_{k+m}$. No free parameters.
 
     Order 2 without noise. Noise without the structure is refused while tracing.
 

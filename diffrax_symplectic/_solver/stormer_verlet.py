@@ -26,9 +26,10 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
         + \sum_k \sigma_k(t_n + \tfrac h2, \bar q) I_k, \qquad
       Q_1 = \bar q + \tfrac h2 g(P_1)$$
 
-    in the letters of [`diffrax_symplectic.SeparableTableau`][]. Force and noise read the
-    same $q$, so that the kick is the exact flow of both together; a symmetric splitting of
-    the generator has weak order 2. One evaluation of the forces, and no equation to solve.
+    in the notation of [`diffrax_symplectic.SeparableTableau`][]. Force and noise are
+    evaluated at the same $q$, so that the kick is the exact flow of both together. A
+    symmetric splitting of the generator has weak order 2. A step takes one evaluation of
+    the forces, and no equation is solved.
 
     Order 2 without noise. No free parameters. A Hamiltonian without the structure is
     refused while tracing. As explicit methods are, it is limited to steps that resolve the

@@ -1,10 +1,11 @@
 """Coefficients as data.
 
-A tableau states a family's coefficients in the letters of the paper. Every tableau also
-*flattens*: each evaluation of one vector field becomes one `Stage`, and the tableau
-becomes one square matrix between stages and one vector of weights, whatever the family.
-Symplecticity, liveness, the merging of equal stages and the order in which the implicit
-systems are solved are then questions about that one matrix, answered once.
+A tableau holds the coefficients of a family of methods in the notation of the paper. Every
+tableau also *flattens*: each evaluation of one vector field becomes one `Stage`, and the
+tableau becomes one square matrix between stages and one vector of weights, whatever the
+family. Whether a method is symplectic, which stages are used, which are equal, and in which
+order the implicit ones are solved for can then be read off that one matrix, by code that is
+the same for all families.
 """
 
 from ._additive import AdditiveTableau as AdditiveTableau

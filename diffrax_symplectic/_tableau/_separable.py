@@ -93,7 +93,8 @@ class PartitionedTableau(AbstractTableau):
       + \sum_k \sum_j B^0_{ij} \sigma_k(t_n + c^1_j h, \bar q_j) I_k, \qquad
       q_i = Q + h \sum_j \hat A_{ij} g(p_j)$$
 
-    with stage times $\hat c = \hat A e$ and $c^1 = A^1 e$; the rest is as there.
+    with stage times $\hat c = \hat A e$ and $c^1 = A^1 e$. The other equations are those
+    of `SeparableTableau`.
 
     **Arguments:** for `s` forces, `v` velocities and `r` noise stages: `alpha` of shape
     `(s,)`, `alpha_hat` of shape `(v,)`, `beta` of shape `(r,)`, `A` of shape `(v, s)`,
@@ -132,9 +133,10 @@ class PartitionedTableau(AbstractTableau):
         names = variables_of(self.B0, self.beta)
         B0 = columns(self.B0, names, (v, r))
         A1 = np.concatenate([self.A1] * len(names))
-        # Forces first: where either can be the unknown, let it be the one that costs more.
+        # Forces come first. Where either forces or velocities may be solved for, this makes
+        # the forces the unknowns: they cost more to evaluate.
         stages = [Stage(("h",), float(c), "q", "p") for c in self.c_hat]
-        # The velocity g does not depend on time, so that its stages may share theirs.
+        # Velocities do not depend on time, so that all of their stages may have the time 0.
         stages += [Stage(("h",), 0.0, "p", "q") for _ in range(v)]
         stages += [
             Stage((name,), float(c), "q", "p") for name in names for c in self.c1
