@@ -1,5 +1,9 @@
 from ._gaussian import FixedStepBrownianPath as FixedStepBrownianPath
-from ._laws import AbstractLaw as AbstractLaw, Discrete as Discrete
+from ._laws import (
+    AbstractLaw as AbstractLaw,
+    Discrete as Discrete,
+    THREE_POINT as THREE_POINT,
+)
 from ._levy_area import (
     LevyAreaBrownianPath as LevyAreaBrownianPath,
     LevyAreaIncrement as LevyAreaIncrement,

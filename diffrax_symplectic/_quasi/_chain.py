@@ -62,7 +62,7 @@ def replicate(
 
     def words(step):
         seeds = jr.bits(jr.fold_in(key, step), (num_seeds(dimension),), jnp.uint32)
-        return randomized(p.points, seeds)
+        return randomized(p.points, seeds, p.layout.sixths)
 
     def start(words):
         terms = p.terms_with(words)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, UInt32
 
-from .._brownian import AbstractStepwisePath, stepwise
+from .._brownian import AbstractStepwisePath, stepwise, THREE_POINT
 from .._terms import brownian_paths
 
 
@@ -45,10 +45,12 @@ class _GivenWords(AbstractStepwisePath):
 
 
 class Layout(NamedTuple):
-    """Which of the words of a step each path in `terms` takes, and how many there are."""
+    """Which of the words of a step each path in `terms` takes, how many there are, and
+    whether there is but one three-point variable."""
 
     slices: tuple[tuple[int, int], ...]
     num_words: int
+    sixths: bool
 
 
 def layout(terms: PyTree[diffrax.AbstractTerm]) -> Layout:
@@ -61,7 +63,8 @@ def layout(terms: PyTree[diffrax.AbstractTerm]) -> Layout:
         start = slices[same[0]][0] if same else end
         slices.append((start, start + path.num_words(use_levy=True)))
         end = max(end, slices[-1][1])
-    return Layout(tuple(slices), end)
+    sixths = end == 1 and paths[0].laws == {"W": THREE_POINT}
+    return Layout(tuple(slices), end, sixths)
 
 
 def with_words(

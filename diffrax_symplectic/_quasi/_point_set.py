@@ -4,6 +4,7 @@ import functools as ft
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, UInt32
 from scipy.stats import qmc
 
@@ -63,11 +64,11 @@ def _reverse_bits(x: UInt32[Array, "..."]) -> UInt32[Array, "..."]:
 
 def num_seeds(dimension: int) -> int:
     """How many random words `randomized` needs."""
-    return 1 + 2 * dimension
+    return 3 + 2 * dimension
 
 
 def randomized(
-    points: UInt32[Array, "n d"], seeds: UInt32[Array, " s"]
+    points: UInt32[Array, "n d"], seeds: UInt32[Array, " s"], sixths: bool = False
 ) -> UInt32[Array, "n d"]:
     """The points of `sobol_points`, scrambled. Each word has the uniform distribution
     exactly, whatever its place.
@@ -75,11 +76,39 @@ def randomized(
     The numbers of the points are scrambled like their coordinates. Otherwise neighbours
     would have complementary coordinates in the same order everywhere, and whatever
     alternates along the paths as they are sorted would add up.
+
+    With `sixths` all that matters of the only coordinate is whether it lies in the first
+    sixth of its range, in the last, or between. A power of two of points cannot be divided
+    so. Then of six consecutive points the smallest gets the first word of the range, the
+    largest the last, and the others the middle.
     """
+    n, d = points.shape
+    if not sixths or n < _BLOCK:
+        return _scrambled(points, jnp.arange(n, dtype=jnp.uint32), seeds)
+    # The blocks of six begin anywhere, and so do the points: the law is the same at each
+    # place, and one in six is the smallest of its block.
+    start, offset = seeds[-2], seeds[-1] % np.uint32(_BLOCK)
+    blocks = n // _BLOCK + 2
+    number = jnp.arange(_BLOCK * blocks, dtype=jnp.uint32) + start
+    words = _scrambled(points, number & np.uint32(n - 1), seeds)
+    words = words.reshape(blocks, _BLOCK)
+    smallest = words == jnp.min(words, axis=1, keepdims=True)
+    largest = words == jnp.max(words, axis=1, keepdims=True)
+    words = jnp.where(largest, np.uint32(2**32 - 1), np.uint32(2**31))
+    words = jnp.where(smallest, np.uint32(0), words).reshape(-1, d)
+    return lax.dynamic_slice_in_dim(words, offset.astype(jnp.int32), n)
+
+
+_BLOCK = 6
+
+
+def _scrambled(
+    points: UInt32[Array, "n d"], number: UInt32[Array, " m"], seeds
+) -> UInt32[Array, "m d"]:
     n, d = points.shape
     bits = np.uint32(32 - (n.bit_length() - 1))
     # (A shift by all 32 bits is undefined.)
-    number = jnp.arange(n, dtype=jnp.uint32) << min(bits, np.uint32(31))
+    number = number << min(bits, np.uint32(31))
     number = nested_scramble(number, seeds[0]) >> min(bits, np.uint32(31))
     number = number if n > 1 else jnp.zeros_like(number)
     words = nested_scramble(points[number.astype(jnp.int32)], seeds[1 : 1 + d])
