@@ -36,9 +36,9 @@ _no_meter = diffrax.NoProgressMeter()
 def expectation(
     fn: _Sample,
     key: PRNGKeyArray,
-    num_paths: int,
+    num_paths: int | np.integer,
     *,
-    batch_size: int | None = None,
+    batch_size: int | np.integer | None = None,
     devices: Sequence[Any] | None = None,
     start: Expectation | None = None,
     tol: float | None = None,

@@ -39,11 +39,11 @@ def outcomes(terms: PyTree[diffrax.AbstractTerm], h, nodes: int) -> Outcomes:
     values = np.array([*itertools.product(*[values for values, _ in scalars])])
     weights = np.array([*itertools.product(*[weights for _, weights in scalars])])
     scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(flat.dtype)
-    columns = {
-        name: jax.vmap(unravel)(scaled[:, i * flat.size : (i + 1) * flat.size])
-        for i, name in enumerate(laws)
-    }
-    dt = jtu.tree_map(lambda s: jnp.full(len(values), h, s.dtype), shape)
+    dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), shape)
+
+    def increment(scaled):
+        sets = map(unravel, scaled.reshape(-1, flat.size))
+        return cast(Any, path.levy_area)(dt=dt, **dict(zip(laws, sets)))
 
     def put(increment):
         given = _FixedIncrement(increment)  # pyright: ignore[reportCallIssue]
@@ -51,8 +51,7 @@ def outcomes(terms: PyTree[diffrax.AbstractTerm], h, nodes: int) -> Outcomes:
             lambda x: given if _is_path(x) else x, terms, is_leaf=_is_path
         )
 
-    increments = cast(Any, path.levy_area)(dt=dt, **columns)
-    return Outcomes(increments, np.prod(weights, axis=1), put)
+    return Outcomes(jax.vmap(increment)(scaled), np.prod(weights, axis=1), put)
 
 
 class _FixedIncrement(diffrax.AbstractBrownianPath):

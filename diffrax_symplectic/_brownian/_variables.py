@@ -45,7 +45,7 @@ VARIABLES = {
     ),
     "C": RandomVariable(PlateauIncrement, _PLATEAUS, variance=1 / 6),
     # The sign of `C`, which alone is drawn: its size is a function of `W` and `H`.
-    "sign": RandomVariable(PlateauIncrement, _PLATEAUS, variance=1),
+    "sign": RandomVariable(PlateauIncrement, _PLATEAUS, variance=1.0),
     # No increment has this attribute. It is computed from `W`, `H` and, if there is one,
     # from `K`.
     "L": RandomVariable(
@@ -62,24 +62,24 @@ VARIABLES = {
         WeakIncrement,
         "four-point variables and two more sets. Construct the path as "
         "`WeakBrownianPath(..., order=3)`",
-        variance=1,
+        variance=1.0,
     ),
     "second": RandomVariable(
         WeakIncrement,
         "a second set of three-point variables. Construct the path as "
         "`WeakBrownianPath(..., second=True)`",
-        variance=1,
+        variance=1.0,
     ),
     "two_point": RandomVariable(
         WeakIncrement,
         "two-point variables. Construct the path as `WeakBrownianPath(..., "
         "two_point=True)`",
-        variance=1,
+        variance=1.0,
     ),
     "W": RandomVariable(
         diffrax.AbstractBrownianIncrement,
         "the increment of a Brownian path. Pass `WeakBrownianPath(shape, key)` or "
         "`FixedStepBrownianPath(shape, key)`",
-        variance=1,
+        variance=1.0,
     ),
 }

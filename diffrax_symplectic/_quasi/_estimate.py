@@ -9,7 +9,7 @@ from jaxtyping import Float, PyTree
 from scipy.stats import t as student
 
 
-_Host = PyTree[np.ndarray]
+_Host = PyTree[np.ndarray | np.floating]
 
 
 class QuasiExpectation(eqx.Module):

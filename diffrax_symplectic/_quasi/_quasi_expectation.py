@@ -224,7 +224,7 @@ def _whole(name: str, value, least: int) -> int:
     return int(value)
 
 
-def _steps(t0, t1, dt0, ts) -> tuple[np.ndarray, np.ndarray]:
+def _steps(t0, t1, dt0, ts) -> tuple[np.integer, np.ndarray]:
     """How many steps there are, and after how many of them to average."""
     t0, t1, dt0 = float(t0), float(t1), float(dt0)
     if not (dt0 > 0 and t1 > t0):
