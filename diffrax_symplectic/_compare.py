@@ -128,14 +128,14 @@ def compare_solvers(
     phi: Callable[[Y], Array] | None = None,
     args: Args = None,
     num_paths: int = 1000,
+    reference: diffrax.AbstractSolver | None = None,
 ) -> Comparison:
     r"""Measures speed against accuracy on a system of your own.
 
     Without `phi` errors are strong: root mean squares of $|y - y^*|$ at `t1`, with $y^*$
     a solution along the same Brownian path in steps an eighth of the smallest of `dts`.
     With `phi` they are weak: $|\mathbb E \phi(y) - \mathbb E \phi(y^*)|$ at `t1`, by
-    independent paths; their standard errors fall as one over the root of `num_paths`. The
-    solver of $y^*$ is the first that [`diffrax_symplectic.suggest_solver`][] names.
+    independent paths; their standard errors fall as one over the root of `num_paths`.
 
     Times are those of a batch of paths on this machine, divided by their number, without
     compiling.
@@ -174,6 +174,7 @@ def compare_solvers(
     - `solvers`: by default those that `suggest_solver` names.
     - `phi`: takes a state to a number.
     - `num_paths`: how many paths.
+    - `reference`: the solver of $y^*$; by default the first that `suggest_solver` names.
 
     **Returns:** a [`diffrax_symplectic.Comparison`][]. A solver that does not fit the terms
     is named there with the reason, and the others are compared.
@@ -185,7 +186,7 @@ def compare_solvers(
     want = "paths" if phi is None else "expectations"
     terms = make_terms(WeakBrownianPath(shape, key))
     suggestions = suggest_solver(terms, y0, args, want=want, t0=t0)
-    reference = suggestions[0].solver
+    reference = suggestions[0].solver if reference is None else reference
     if solvers is None:
         solvers = [s.solver for s in suggestions]
     cell = min(dts) / _FINER
@@ -209,13 +210,7 @@ def compare_solvers(
         y1, result = end(solver, _path(solver, shape, key, want), dt)
         return (y1 if phi is None else phi(y1)), result
 
-    named, refused = {}, {}
-    for solver in solvers:
-        try:
-            eqx.filter_eval_shape(sample, solver, dts[0], key)
-            named[repr(solver)] = solver
-        except ValueError as error:
-            refused[repr(solver)] = str(error).splitlines()[0]
+    named, refused = _those_that_fit(solvers, lambda s: sample(s, dts[0], key))
 
     def measure(solver, dt, number: int):
         """The estimate by the paths of a number, and the seconds for each."""
@@ -243,6 +238,18 @@ def compare_solvers(
                 failed = estimate.num_failed
             steps.append(ComparedStep(name, dt, error, bar, seconds, failed))
     return Comparison("strong" if phi is None else "weak", tuple(steps), refused)
+
+
+def _those_that_fit(solvers, solve: Callable) -> tuple[dict, dict[str, str]]:
+    """Solvers by their names, and why those left out do not fit."""
+    named, refused = {}, {}
+    for solver in solvers:
+        try:
+            eqx.filter_eval_shape(solve, solver)
+            named[repr(solver)] = solver
+        except ValueError as error:
+            refused[repr(solver)] = str(error).splitlines()[0]
+    return named, refused
 
 
 def _checked_steps(t0, t1, dts: Sequence[float]) -> list[float]:

@@ -75,7 +75,7 @@ def separable_fault(
                 if from_H0 or independent is None:
                     return fault
                 beside = f"a drift term beside that of H0 makes {dependence}"
-                return Fault(beside, f"{_FRICTION} {_ADVICE}")
+                return Fault(beside, f"{FRICTION} {_ADVICE}")
     for term in _not_asserted(noise, "separable"):
         # The change of q is linear in the increment: if it does not depend on the
         # increment, it is zero.
@@ -148,7 +148,7 @@ _UNTESTED = (
     "that cancel do not enter at all, or use a solver for the general structure, for "
     "example `Midpoint` or `SRKw1`."
 )
-_FRICTION = "Friction -gamma p is what `Damped(solver, gamma)` is for."
+FRICTION = "Friction -gamma p is what `Damped(solver, gamma)` is for."
 
 
 def _not_asserted(terms: tuple, structure: str) -> list:

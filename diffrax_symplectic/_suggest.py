@@ -19,6 +19,7 @@ from ._structure_checks import (
     additive_fault,
     commuting,
     constant_fault,
+    FRICTION,
     separable_fault,
 )
 from ._suggestion_rules import PATHS, Rule, RULES, Want
@@ -177,6 +178,8 @@ def suggest_solver(
     if m > 1:
         noises = f"{m} noises that {'commute' if commute else 'do not commute'}"
     system = f"For {want}. The system is {kind}, with {noises}."
+    if not_separable is not None and not_separable.advice.startswith(FRICTION):
+        system += f" {FRICTION} Ask for a solver for the terms without friction."
     return Suggestions(system, tuple(found))
 
 

@@ -204,11 +204,11 @@ def second_moment_map(
     def outcome(terms):
         def step(y):
             y1, result = _one_step(terms, solver, t0, t1, unravel(y), args)
-            return jfu.ravel_pytree(y1)[0], result
+            y1 = jfu.ravel_pytree(y1)[0]
+            return y1, (y1, result)
 
         zero = jnp.zeros_like(flat)
-        offset, result = step(zero)
-        matrix, _ = jax.jacrev(step, has_aux=True)(zero)
+        matrix, (offset, result) = jax.jacrev(step, has_aux=True)(zero)
         first = jnp.zeros_like(flat, shape=(1, flat.size + 1)).at[0, 0].set(1)
         Z = jnp.concatenate([first, jnp.concatenate([offset[:, None], matrix], axis=1)])
         return jnp.kron(Z, Z), result

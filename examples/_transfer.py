@@ -11,6 +11,7 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
+from ._gallery import briefly
 from ._orders import Errors
 
 
@@ -35,8 +36,9 @@ def transfer_expectations(
     """
     terms = make_terms(make_path(jr.key(0)))
     flat, unravel = jfu.ravel_pytree(y0)
-    ravel = lambda y: jfu.ravel_pytree(y)[0]
-    n = flat.size
+    # Of a type that does not depend on what it came from: else `back` is compiled anew.
+    ravel = lambda y: jfu.ravel_pytree(y)[0].astype(flat.dtype)
+    flat, n = ravel(y0), flat.size
     points = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
     to_coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(points, degree))
     grid = np.stack(np.meshgrid(*[points] * n, indexing="ij"), axis=-1).reshape(-1, n)
@@ -45,7 +47,7 @@ def transfer_expectations(
         u = values.reshape((degree + 1,) * n)
         for axis in range(n):
             u = jnp.moveaxis(jnp.tensordot(to_coefficients, u, (1, axis)), 0, axis)
-        return u
+        return u.astype(flat.dtype)
 
     def evaluate(u, x):
         T = [jnp.ones_like(x), x]
@@ -55,7 +57,7 @@ def transfer_expectations(
             u = jnp.tensordot(jnp.stack(T)[:, axis], u, 1)
         return u
 
-    @jax.jit
+    @briefly
     def back(u, h, box0, box1):
         """The polynomial on `box0` of that on `box1`, and the mean from the centre."""
 
@@ -69,6 +71,11 @@ def transfer_expectations(
         values, means = jax.vmap(expected)(np.concatenate([grid, np.zeros((1, n))]))
         return fit(values[:-1]), means[-1]
 
+    @briefly
+    def at_end(box):
+        return fit(jax.vmap(lambda x: phi(unravel(box[0] + box[1] * x)))(grid))
+
+    at_start = briefly(lambda u: evaluate(u, jnp.zeros(n)))
     out = []
     for h in hs:
         steps = round(t1 / h)
@@ -79,12 +86,12 @@ def transfer_expectations(
             box = centres[-1], width(i)
             centres.append(back(u, h, box, box)[1])
         box = centres[-1], width(steps)
-        u = fit(jax.vmap(lambda x: phi(unravel(box[0] + box[1] * x)))(grid))
+        u = at_end(box)
         for i in reversed(range(steps)):
             before = centres[i], width(i)
             u, _ = back(u, h, before, box)
             box = before
-        out.append(float(evaluate(u, jnp.zeros(n))))
+        out.append(float(at_start(u)))
     return np.array(out)
 
 

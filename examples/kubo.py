@@ -12,11 +12,12 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
+from ._command import run
 from ._gallery import (
+    briefly,
     claim,
     gaussian,
     PAPER_SRKW2,
-    run,
     save,
     trajectory,
     truncated,
@@ -31,6 +32,7 @@ from ._orders import (
     one_step,
     plot_orders,
     report,
+    resolved,
     sampled_weak_error,
     second_moments,
 )
@@ -60,7 +62,7 @@ Y0 = (jnp.array(0.0), jnp.array(1.0))
 
 def figure_2c(full: bool) -> None:
     """Weak error of E(q^2) at t = 1."""
-    paths = 30_000_000 if full else 40_000
+    paths = 30_000_000 if full else 100_000
     print(
         f"\nFig. 2(c): weak error of E(q^2) at t = 1, h = 2^-1 .. 2^-8; {paths:,} paths"
     )
@@ -77,7 +79,14 @@ def figure_2c(full: bool) -> None:
         moment_map = exact_moment_map(make_terms, path, solver, Y0)
         exact[name] = exact_weak_error(moment_map, Y0, lambda m: m[1, 1], value, hs)
         sampled[name] = sampled_weak_error(
-            make_terms, path, solver, Y0, lambda y: y[1] ** 2, value, hs, paths
+            make_terms,
+            path,
+            solver,
+            Y0,
+            lambda y: y[1] ** 2,
+            value,
+            resolved(hs, full),
+            paths,
         )
     report("exact", exact)
     report("sampled", sampled)
@@ -103,7 +112,7 @@ def figure_3(full: bool) -> None:
     angle = np.linspace(0, 2 * np.pi, 200)
     drifts = {}
     for ax, (name, (solver, path)) in zip(axes, solvers.items()):
-        solution = jax.jit(
+        solution = briefly(
             lambda: trajectory(make_terms, path, solver, Y0, h, steps, every=2)
         )
         _, (p, q), success = solution()
@@ -132,7 +141,7 @@ def exact_strong_error(make_terms, solver, y0, hs, t1: float = 1.0) -> Errors:
     nodes, weights = np.polynomial.hermite_e.hermegauss(40)
     weights = weights / np.sqrt(2 * np.pi)
 
-    @jax.jit
+    @briefly
     def ratios(h):
         """The factor of the method by that of the solution, for each increment."""
 
@@ -178,4 +187,4 @@ FIGURES = {"2c": figure_2c, "3": figure_3, "kubo-strong": figure_strong}
 
 
 if __name__ == "__main__":
-    run(FIGURES)
+    run(dict.fromkeys(FIGURES, "kubo"))

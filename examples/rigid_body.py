@@ -14,11 +14,12 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
+from ._command import run
 from ._gallery import (
+    briefly,
     claim,
     gaussian,
     PAPER_SRKW2,
-    run,
     save,
     trajectory,
     truncated,
@@ -30,6 +31,7 @@ from ._orders import (
     claim_small_first_order,
     plot_orders,
     report,
+    resolved,
     sampled_weak_error,
 )
 from ._transfer import enumerated_expectation, transfer_weak_errors
@@ -80,7 +82,7 @@ def figure_5(full: bool) -> None:
     drifts = {}
     for i, (name, (solver, path)) in enumerate(SOLVERS.items()):
 
-        @jax.jit
+        @briefly
         def solve_all(mus, solver=solver, path=path):
             def one(mu):
                 terms = lambda path: make_terms(path, mu)
@@ -101,7 +103,9 @@ def figure_5(full: bool) -> None:
             colour = "C1" if i < 2 else "C0"
             shown = np.asarray(X[j])[length[j] < 2]
             ax.plot(*shown.T, ".", ms=1, color=colour)
-            ax.set_title(f"{name}, mu = {mus[j]}:\n{drifts[name][j]:.1e}", fontsize=8)
+            ax.set_title(
+                f"{name}, mu = {mus[j]}:\n{drifts[name][j]:.1e}", fontsize=8, y=0.9
+            )
             ax.set_aspect("equal")
             ax.set_axis_off()
     save(figure, "fig5.png")
@@ -114,7 +118,7 @@ def figure_5(full: bool) -> None:
 
 def figure_6b(full: bool) -> None:
     """Weak error of E(X1^2) at t = 1."""
-    paths = 20_000_000 if full else 50_000
+    paths = 20_000_000 if full else 100_000
     print(
         f"\nFig. 6(b): weak error of E(X1^2) at t = 1, h = 2^-1 .. 2^-8; {paths:,} paths"
     )
@@ -126,7 +130,9 @@ def figure_6b(full: bool) -> None:
         make_terms, solvers, "SRKw2", X0, phi, hs, (0.3,) * 3, degree=8
     )
     sampled = {
-        name: sampled_weak_error(make_terms, path, solver, X0, phi, value, hs, paths)
+        name: sampled_weak_error(
+            make_terms, path, solver, X0, phi, value, resolved(hs, full), paths
+        )
         for name, (solver, path) in solvers.items()
     }
     print(f"  E(X1^2) = {value:.9f}")
@@ -139,7 +145,7 @@ def figure_6b(full: bool) -> None:
     claim_small_first_order("SRKw1(b=0)", exact["SRKw1(b=0)"])
     claim_samples(exact, sampled)
     terms = make_terms(weak()(jr.key(0)))
-    all_paths = jax.jit(
+    all_paths = briefly(
         lambda: enumerated_expectation(terms, ds.SRKw1(b=0.0), X0, phi, 0.5, 2)
     )
     difference = float(all_paths()) - value - exact["SRKw1(b=0)"].signed[0]
@@ -162,7 +168,7 @@ def local_weak_errors(hs):
         y0 = ds.to_spinors(X0)
         return ds.weak_order_defect(terms, solver, 0.0, h, y0, fn=square, order=2)
 
-    return np.asarray(jax.jit(jax.vmap(defect))(hs))
+    return np.asarray(briefly(jax.vmap(defect))(hs))
 
 
 def figure_poisson(full: bool) -> None:
@@ -170,23 +176,23 @@ def figure_poisson(full: bool) -> None:
     hs = 2.0 ** -np.arange(2, 8)
     steps = 20_000 if full else 2_000
     print(f"\nThree noises, one about each axis: Poisson defect; {steps:,} steps")
-    y0, path = ds.to_spinors(X0), gaussian(3)(jr.key(0))
+    y0, path = briefly(ds.to_spinors)(X0), gaussian(3)(jr.key(0))
     pairs = spinor_terms(path), y0
     # The midpoint rule for X itself, with the one noise of the paper.
     itself = make_terms(gaussian()(jr.key(0))), X0
 
     def defects(terms, y0):
         defect = lambda h: ds.poisson_defect(terms, ds.Midpoint(), 0.0, h, y0)
-        return np.asarray(jax.jit(jax.vmap(defect))(hs))
+        return np.asarray(briefly(jax.vmap(defect))(hs))
 
     of_pairs, of_X = defects(*pairs), defects(*itself)
-    ts, y, success = jax.jit(
+    ts, y, success = briefly(
         lambda: trajectory(
             spinor_terms, gaussian(3), ds.Midpoint(), y0, 0.1, steps, every=1
         )
     )()
     assert success
-    length = np.abs(np.linalg.norm(ds.from_spinors(y), axis=-1) - 1)
+    length = np.abs(np.linalg.norm(briefly(ds.from_spinors)(y), axis=-1) - 1)
     local_hs = 2.0 ** -np.arange(2, 7)
     local = np.abs(local_weak_errors(local_hs))
     slope = np.polyfit(np.log(local_hs), np.log(local), 1)[0]
@@ -201,6 +207,8 @@ def figure_poisson(full: bool) -> None:
     axes[2].loglog(
         local_hs, local[0] * (local_hs / local_hs[0]) ** 3, "k:", label="h^3"
     )
+    axes[2].set_xticks(local_hs[::2], [f"1/{1 / h:.0f}" for h in local_hs[::2]])
+    axes[2].minorticks_off()
     axes[2].set(xlabel="h", title="local weak error of E(X1^2), three noises")
     axes[2].legend(fontsize=8)
     save(figure, "poisson.png")
@@ -214,4 +222,4 @@ FIGURES = {"5": figure_5, "6b": figure_6b, "poisson": figure_poisson}
 
 
 if __name__ == "__main__":
-    run(FIGURES)
+    run(dict.fromkeys(FIGURES, "rigid_body"))

@@ -13,13 +13,15 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
-from ._gallery import claim, gaussian, PAPER_SRKS3, run, save, trajectory, weak
+from ._command import run
+from ._gallery import briefly, claim, gaussian, PAPER_SRKS3, save, trajectory, weak
 from ._orders import (
     claim_samples,
     claim_slopes,
     claim_small_first_order,
     plot_orders,
     report,
+    resolved,
     sampled_weak_error,
     strong_errors,
 )
@@ -53,7 +55,7 @@ def figure_2d(full: bool) -> None:
         f"\nFig. 2(d): strong error of P at t = 1, h = 2^-1 .. 2^-8; {paths:,} paths,"
     )
     print(f"  against the same paths in {fine:,} steps")
-    sampled = strong_errors(
+    study = strong_errors(
         make_terms,
         {"SRKs3": PAPER_SRKS3, "Euler": diffrax.Euler()},
         # Its own error is far smaller than those that are measured.
@@ -61,10 +63,10 @@ def figure_2d(full: bool) -> None:
         Y0,
         [2.0**-k for k in range(1, 9)],
         m=2,
-        paths=paths,
         fine=fine,
         component=lambda y: y[0],
     )
+    sampled = study(paths)
     report("sampled", sampled)
     figure, axes = plt.subplots(figsize=(6, 4.5))
     plot_orders(axes, "2(d): strong error of P", sampled, slopes=(0.5, 1))
@@ -87,7 +89,7 @@ LONG_RUN = {
 def long_run(solver, path, h: float, steps: int, paths: int):
     """P of one path, and the mean of H0 over many with its standard error."""
 
-    @jax.jit
+    @briefly
     def solve_all(seeds):
         one = lambda seed: trajectory(make_terms, path, solver, Y0, h, steps, 10, seed)
         _, (p, q), success = jax.vmap(one)(seeds)
@@ -137,7 +139,7 @@ def figure_4(full: bool) -> None:
 
 def figure_6a(full: bool) -> None:
     """Weak error of E(P^2) at t = 1 with one noise."""
-    paths = 20_000_000 if full else 50_000
+    paths = 20_000_000 if full else 100_000
     print(
         f"\nFig. 6(a): weak error of E(P^2) at t = 1, h = 2^-1 .. 2^-8; {paths:,} paths"
     )
@@ -161,7 +163,14 @@ def figure_6a(full: bool) -> None:
     )
     sampled = {
         name: sampled_weak_error(
-            make_terms_one_noise, path, solver, Y0, phi, value, hs, paths
+            make_terms_one_noise,
+            path,
+            solver,
+            Y0,
+            phi,
+            value,
+            resolved(hs, full),
+            paths,
         )
         for name, (solver, path) in solvers.items()
     }
@@ -175,7 +184,7 @@ def figure_6a(full: bool) -> None:
     claim_small_first_order("SRKw3a", exact["SRKw3a"])
     claim_samples(exact, sampled)
     terms = make_terms_one_noise(weak()(jr.key(0)))
-    all_paths = jax.jit(
+    all_paths = briefly(
         lambda: enumerated_expectation(terms, ds.SRKw3("a"), Y0, phi, 0.5, 2)
     )
     difference = float(all_paths()) - value - exact["SRKw3a"].signed[0]
@@ -186,4 +195,4 @@ FIGURES = {"2d": figure_2d, "4": figure_4, "6a": figure_6a}
 
 
 if __name__ == "__main__":
-    run(FIGURES)
+    run(dict.fromkeys(FIGURES, "synchrotron"))

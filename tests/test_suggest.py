@@ -148,6 +148,22 @@ def test_first_suggestion_solves_as_it_stands(case):
         assert jnp.all(jnp.isfinite(sol.ys[0]))
 
 
+def test_friction_as_a_term_gets_a_solver_and_is_told_of_damped():
+    mixed, noises, *_ = CASES["separable"]
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + mixed(t, p, q)
+    noise = lambda t, p, q, args: noises[0](t, p, q)
+    terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+    friction = lambda t, y, args: (-0.1 * y[0], jnp.zeros_like(y[1]))
+    damped = diffrax.MultiTerm(*terms.terms, diffrax.ODETerm(friction))
+    y0 = (jnp.ones(1), jnp.ones(1))
+    with jax.disable_jit():
+        found = ds.suggest_solver(damped, y0)
+        without = ds.suggest_solver(terms, y0)
+    assert type(found[0].solver).__name__ == "StrangGauss"
+    assert "Damped(solver, gamma)" in str(found)
+    assert "Damped" not in str(without)
+
+
 def test_code_of_a_path_makes_the_path():
     H0 = lambda t, p, q, args: p**2 / 2
     path = ds.WeakBrownianPath((2,), jr.key(0))

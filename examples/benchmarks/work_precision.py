@@ -281,17 +281,8 @@ def main() -> None:
         hs = [2.0**-k for k in range(2, 8)]
         wrap = WRAP.get(model, lambda path, key, cell: path)
         errors = strong_errors(
-            make_terms,
-            solvers,
-            reference,
-            y0,
-            hs,
-            m,
-            500,
-            2**12,
-            component,
-            wrap=wrap,
-        )
+            make_terms, solvers, reference, y0, hs, m, 2**12, component, wrap=wrap
+        )(500)
         path = lambda key, wrap=wrap, m=m: wrap(Area((m,))(key), key, None)
         results = {
             name: (cost(make_terms, path, solvers[name], y0, hs), e)

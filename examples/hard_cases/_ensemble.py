@@ -34,14 +34,12 @@ class Mean(NamedTuple):
 
 
 def gaussian(shape=()) -> Callable:
-    return lambda key: diffrax.UnsafeBrownianPath(shape, key)
+    return lambda key: ds.FixedStepBrownianPath(shape, key)
 
 
 def truncated(shape=()) -> Callable:
     """Bounded, so that implicit steps stay solvable."""
-    return lambda key: ds.TruncatedBrownianPath(
-        diffrax.UnsafeBrownianPath(shape, key), k=2
-    )
+    return lambda key: ds.TruncatedBrownianPath(gaussian(shape)(key), k=2)
 
 
 def weak(shape=()) -> Callable:
@@ -52,7 +50,7 @@ def plateaus(shape=()) -> Callable:
     def make(key):
         k_path, k_signs = jr.split(key)
         levy_area = diffrax.SpaceTimeLevyArea
-        path = diffrax.UnsafeBrownianPath(shape, k_path, levy_area)
+        path = ds.FixedStepBrownianPath(shape, k_path, levy_area)
         return ds.PlateauBrownianPath(path, k_signs)
 
     return make

@@ -84,7 +84,7 @@ def diffrax_terms(path):
 
 
 def with_areas(levy_area):
-    return lambda key: diffrax.UnsafeBrownianPath((), key, levy_area)
+    return lambda key: ds.FixedStepBrownianPath((), key, levy_area)
 
 
 def damped(solver, make_path) -> Step:

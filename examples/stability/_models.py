@@ -25,11 +25,11 @@ def third(key, shape=()):
 
 
 def gaussian(key, shape=()):
-    return diffrax.UnsafeBrownianPath(shape, key)
+    return ds.FixedStepBrownianPath(shape, key)
 
 
 def areas(key, shape=()):
-    return diffrax.UnsafeBrownianPath(shape, key, levy_area=diffrax.SpaceTimeLevyArea)
+    return ds.FixedStepBrownianPath(shape, key, levy_area=diffrax.SpaceTimeLevyArea)
 
 
 class Case(NamedTuple):

@@ -91,9 +91,7 @@ def growth(
 
     def solve(key):
         struct = jax.ShapeDtypeStruct((), dtype)
-        path = (ds.WeakBrownianPath if ours else diffrax.UnsafeBrownianPath)(
-            struct, key
-        )
+        path = (ds.WeakBrownianPath if ours else ds.FixedStepBrownianPath)(struct, key)
         sol = diffrax.diffeqsolve(
             system.make_terms(path), solver, dtype(0), dtype(H * steps), dtype(H), y0,
             saveat=diffrax.SaveAt(steps=max(steps // 1000, 1)), max_steps=steps,

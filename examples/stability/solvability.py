@@ -103,7 +103,7 @@ def draw(hs, steps: int, seed: int = 0) -> np.ndarray:
     keys = jr.split(jr.key(seed), steps)
 
     def one(h, key):
-        gaussian = diffrax.UnsafeBrownianPath((), key)
+        gaussian = ds.FixedStepBrownianPath((), key)
         paths = [law.path(gaussian) for law in LAWS]
         return jnp.stack([path.evaluate(jnp.zeros(()), h) for path in paths])
 
@@ -145,10 +145,10 @@ def shares(model: Model, solver, hs, strengths, steps: int, seed: int = 0) -> Sh
 def lost_paths(hs, s: float, paths: int, t1: float = 10.0) -> dict[str, np.ndarray]:
     """The share of whole solves of "rotation" that fail, by step size."""
     model = MODELS["rotation"]
-    tree = lambda key: diffrax.VirtualBrownianTree(0.0, t1, 1e-3, (), key)
+    gaussian = lambda key: ds.FixedStepBrownianPath((), key)
     makers = {
-        "Gaussian (`VirtualBrownianTree`)": tree,
-        "truncated, k = 2": lambda key: ds.TruncatedBrownianPath(tree(key), k=2),
+        "Gaussian": gaussian,
+        "truncated, k = 2": lambda key: ds.TruncatedBrownianPath(gaussian(key), k=2),
         "three-point": lambda key: ds.WeakBrownianPath((), key),
     }
     keys = jr.split(jr.key(1), paths)
