@@ -187,11 +187,10 @@ def strong_errors(
     fine: int,
     component: Callable,
     t1: float = 1.0,
-    wrap: Callable = lambda path, key, cell: path,
 ) -> Callable[..., dict[str, Errors]]:
     """What takes a number of paths, and `args` of the terms, to the root-mean-square errors
     of `component(y)` at `t1`, against `reference` with `fine` steps on the same Brownian
-    paths, to which `wrap` may add random variables. All calls share one program."""
+    paths. All calls share one program."""
     cell = t1 / fine
     steps = jnp.array([*hs])
 
@@ -200,8 +199,7 @@ def strong_errors(
         return component(jax.tree.map(lambda y: y[-1], sol.ys)), sol.result
 
     def squares(args, key):
-        key, key_wrap = jr.split(key)
-        path = wrap(_FinePath.draw(key, fine, m, t1), key_wrap, cell)
+        path = _FinePath.draw(key, fine, m, t1)
         exact, _ = end(path, reference, cell, args)
 
         def run(solver):

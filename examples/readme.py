@@ -3,10 +3,10 @@
     python -m examples.readme
 
 A noisy oscillator in phase space by a symplectic and an explicit method, and errors
-against costs as `docs/benchmarks/work_precision.md` has them.
+against costs as `docs/benchmarks/work_precision.json` has them.
 """
 
-import re
+import json
 from pathlib import Path
 
 import diffrax
@@ -56,12 +56,14 @@ def portrait(solver) -> np.ndarray:
 
 
 def benchmark(kind: str, model: str, solver: str) -> np.ndarray:
-    """Microseconds per path and errors of one solver, two step sizes, from the page."""
-    page = (DOCS / "benchmarks/work_precision.md").read_text()
-    row = re.compile(
-        rf"^\| {kind}, {model} \| {solver} \| \S+ \| (\S+).*? \| (\S+) \|$", re.M
-    )
-    return np.array([[float(time), float(error)] for error, time in row.findall(page)])
+    """Microseconds per path and errors of one solver, at all its step sizes."""
+    rows = json.loads((DOCS / "benchmarks/work_precision.json").read_text())
+    (row,) = [
+        row
+        for row in rows
+        if row["title"] == f"{kind}, {model}" and row["solver"] == solver
+    ]
+    return np.array([row["microseconds"], row["error"]])
 
 
 def main() -> None:
@@ -79,7 +81,7 @@ def main() -> None:
     left.set(xlim=(-2.3, 2.3), ylim=(-2.3, 2.9), aspect="equal")
     left.legend(loc="upper center", ncols=2, markerscale=4, frameon=False)
     for i, (solver, model) in enumerate(SHOWN.items()):
-        time, error = benchmark("weak", model, solver).T
+        time, error = benchmark("weak", model, solver)
         style = "-" if hasattr(ds, solver) else "--"
         label = f"{solver}, {model}"
         right.plot(time, error, style, marker="o", label=label, color=f"C{i // 2}")

@@ -3,13 +3,18 @@
     python -m examples.benchmarks.work_precision
 
 Weak errors are exact on the linear models (linear and Kubo oscillator, two noises) and
-sampled on the others, with error bars of three standard errors. Strong errors are root
-mean squares over one set of Brownian paths. Costs are CPU seconds per path, in batches of
-10,000. Writes `docs/benchmarks/work_precision.md` and its picture.
+estimated by quasi-Monte Carlo on the others, with error bars of three standard errors.
+Strong errors are root mean squares over one set of Brownian paths, by `compare_solvers`.
+Costs are CPU seconds per path, in batches of 10,000. Writes
+`docs/benchmarks/work_precision.md`, its picture, and all its numbers as JSON.
 """
+
+import json
+import time
 
 import diffrax
 import jax.numpy as jnp
+import jax.random as jr
 import matplotlib
 import numpy as np
 from jax.scipy.linalg import expm
@@ -21,8 +26,6 @@ from .._orders import (
     Errors,
     exact_moment_map,
     exact_weak_error,
-    sampled_weak_error,
-    strong_errors,
 )
 from ._timing import DOCS, ensemble, keys, machine, measure
 
@@ -35,9 +38,9 @@ BATCH = 10_000
 HS = [2.0**-k for k in range(1, 8)]
 
 Weak = lambda shape, **kwargs: lambda key: ds.WeakBrownianPath(shape, key, **kwargs)
-Gaussian = lambda shape: lambda key: diffrax.UnsafeBrownianPath(shape, key)
+Gaussian = lambda shape: lambda key: ds.FixedStepBrownianPath(shape, key)
 Area = lambda shape: (
-    lambda key: diffrax.UnsafeBrownianPath(
+    lambda key: ds.FixedStepBrownianPath(
         shape, key, levy_area=diffrax.SpaceTimeLevyArea
     )
 )
@@ -47,7 +50,7 @@ def cost(make_terms, make_path, solver, y0, hs) -> np.ndarray:
     """Seconds per path over one unit of time."""
     steps = 64
     fn = ensemble(make_terms, make_path, solver, y0, 1 / steps, steps)
-    timing = measure(fn, keys(BATCH), repeats=3)
+    timing = measure(fn, keys(BATCH), repeats=3, clock=time.process_time)
     # Cost per step hardly depends on the step.
     return timing.seconds / BATCH / steps / np.asarray(hs)
 
@@ -124,7 +127,10 @@ def weak(model: str):
     y0 = jnp.array([np.cos(1.1), 0.0, np.sin(1.1)])
     phi = lambda X: X[0] ** 2
     reference = ds.StrangGauss(), Weak(())
-    return make_terms, y0, scalar, _sampled(make_terms, y0, phi, *reference)
+    # A point of a sphere, by its height along the axis of the noise and the angle about it.
+    on_sphere = lambda X: (X[0], jnp.arctan2(X[1], X[2]))
+    errors = _sampled(make_terms, y0, phi, *reference, sort_by=on_sphere)
+    return make_terms, y0, scalar, errors
 
 
 def _exact(make_terms, y0, exact):
@@ -135,106 +141,84 @@ def _exact(make_terms, y0, exact):
     return errors
 
 
-def _sampled(make_terms, y0, phi, solver, path, paths: int = 200_000):
-    args = make_terms, path, solver, y0, phi, 0.0, [2.0**-7], 4 * paths
-    fine = sampled_weak_error(*args)
+def _sampled(make_terms, y0, phi, solver, path, sort_by=None):
+    """By quasi-Monte Carlo."""
+    estimate = lambda solver, path, h, **kwargs: ds.quasi_expectation(
+        lambda t, y, args: phi(y), make_terms(path(jr.key(0))), solver, 0.0, 1.0, h, y0,
+        key=jr.key(round(1 / h)), sort_by=sort_by, **kwargs,
+    )  # fmt: skip
+    fine = estimate(solver, path, HS[-1] / 2, num_paths=2**14, levels=2)
 
     def errors(solver, path, hs):
-        args = make_terms, path, solver, y0, phi, float(fine.errors[0]), hs, paths
-        e = sampled_weak_error(*args)
-        return e._replace(std_errors=np.hypot(e.std_errors, fine.std_errors[0]))
+        own = [estimate(solver, path, h, num_paths=2**12) for h in hs]
+        signed = np.array([float(e.mean - fine.mean) for e in own])
+        bars = np.hypot([float(e.std_error) for e in own], float(fine.std_error))
+        return Errors(np.array(hs), signed, bars)
 
     return errors
 
 
-def _scalar(path):
-    return _Scalar(path)  # pyright: ignore[reportCallIssue]
-
-
+_EXPLICIT = diffrax.Heun(), diffrax.StratonovichMilstein(), diffrax.SlowRK()
+_GENERAL = (ds.PlateauGauss(), ds.Midpoint(), ds.SRKs1(), *_EXPLICIT)
+# Terms, start, shape of the path, the solver of the reference, and all solvers.
 STRONG = {
     "linear oscillator": (
-        linear_oscillator.make_terms,
-        (jnp.ones(1), jnp.zeros(1)),
-        1,
-        lambda y: y[1][0],
-        {"SRKs4": ds.SRKs4(), "Midpoint": ds.Midpoint(), "SRKs3": ds.SRKs3(),
-         "Heun": diffrax.Heun(), "ShARK": diffrax.ShARK()},
-        ds.SRKs4(),
+        linear_oscillator.make_terms, linear_oscillator.Y0, (), ds.SRKs4(),
+        (ds.SRKs4(), ds.Midpoint(), ds.SRKs3(), diffrax.Heun(), diffrax.ShARK()),
     ),
-    "Kubo oscillator": (
-        lambda path: ds.hamiltonian_terms(
-            lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2,
-            lambda t, p, q, args: (p**2 + q**2) / 2,
-            path,
-        ),
-        (jnp.zeros(1), jnp.ones(1)),
-        1,
-        lambda y: y[1][0],
-        {"PlateauGauss": ds.PlateauGauss(),
-         "Midpoint": ds.Midpoint(), "SRKs1": ds.SRKs1(), "Heun": diffrax.Heun(),
-         "StratonovichMilstein": diffrax.StratonovichMilstein(),
-         "SlowRK": diffrax.SlowRK()},
-        ds.PlateauGauss(),
-    ),
+    "Kubo oscillator": (kubo.make_terms, kubo.Y0, (), ds.PlateauGauss(), _GENERAL),
     "synchrotron": (
-        synchrotron.make_terms,
-        synchrotron.Y0,
-        2,
-        lambda y: y[0],
-        {"PlateauVerlet": ds.PlateauVerlet(),
-         "StormerVerlet": ds.StormerVerlet(), "SRKs3": ds.SRKs3(),
-         "Midpoint": ds.Midpoint(), "Heun": diffrax.Heun(),
-         "SlowRK": diffrax.SlowRK()},
-        ds.PlateauVerlet(),
+        synchrotron.make_terms, synchrotron.Y0, (2,), ds.PlateauVerlet(),
+        (ds.PlateauVerlet(), ds.StormerVerlet(), ds.SRKs3(), ds.Midpoint(),
+         diffrax.Heun(), diffrax.SlowRK()),
     ),
     "rigid body": (
-        lambda path: rigid_body.make_terms(_scalar(path), 0.5),
-        jnp.array([np.cos(1.1), 0.0, np.sin(1.1)]),
-        1,
-        lambda X: X[0],
-        {"PlateauGauss": ds.PlateauGauss(),
-         "Midpoint": ds.Midpoint(), "SRKs1": ds.SRKs1(), "Heun": diffrax.Heun(),
-         "StratonovichMilstein": diffrax.StratonovichMilstein(),
-         "SlowRK": diffrax.SlowRK()},
-        ds.PlateauGauss(),
+        lambda path: rigid_body.make_terms(path, 0.5), rigid_body.X0, (),
+        ds.PlateauGauss(), _GENERAL,
     ),
     "two noises": (
-        two_noises,
-        (jnp.zeros(1), jnp.ones(1)),
-        2,
-        lambda y: y[1][0],
-        {"LevyAreaMidpoint": ds.LevyAreaMidpoint(), "Midpoint": ds.Midpoint(),
-         "SRKs1": ds.SRKs1(), "Heun": diffrax.Heun()},
-        ds.LevyAreaMidpoint(),
+        two_noises, kubo.Y0, (2,), ds.LevyAreaMidpoint(),
+        (ds.LevyAreaMidpoint(), ds.Midpoint(), ds.SRKs1(), diffrax.Heun()),
     ),
 }  # fmt: skip
 
 
-def _plateaus(path, key, cell):
-    return ds.PlateauBrownianPath(path, key)
-
-
-def _levy_areas(path, key, cell):
-    return ds.LevyAreaBrownianPath(path, key, terms=0 if cell else 2, cell=cell)
+def strong(model: str, hs: list[float]) -> dict[str, tuple[np.ndarray, Errors]]:
+    """Times and root-mean-square errors of the state at t = 1."""
+    make_terms, y0, shape, reference, solvers = STRONG[model]
+    compared = ds.compare_solvers(
+        make_terms, y0, 0.0, 1.0, dts=hs, shape=shape, solvers=solvers,
+        reference=reference, key=jr.key(0), num_paths=500,
+    )  # fmt: skip
+    assert not compared.refused
+    results = {}
+    for solver in solvers:
+        own = [s for s in compared.steps if s.solver == repr(solver)]
+        errors = Errors(
+            np.array(hs),
+            np.array([s.error for s in own]),
+            np.array([s.std_error for s in own]),
+        )
+        wrap = WRAP.get(type(solver), lambda path, key: path)
+        path = lambda key, wrap=wrap: wrap(Area(shape)(key), key)
+        seconds = cost(make_terms, path, solver, y0, hs)
+        results[type(solver).__name__] = seconds, errors
+    return results
 
 
 # What solvers ask of a path beyond space-time area.
-WRAP = {"synchrotron": _plateaus, "two noises": _levy_areas}
+WRAP = {
+    ds.PlateauVerlet: ds.PlateauBrownianPath,
+    ds.LevyAreaMidpoint: lambda path, key: ds.LevyAreaBrownianPath(path, key, terms=2),
+}
 
 
-class _Scalar(diffrax.AbstractBrownianPath):
-    """A path of shape (1,) as one of shape ()."""
-
-    path: diffrax.AbstractBrownianPath
-    t0 = 0.0
-    t1 = np.inf
-    levy_area = diffrax.SpaceTimeLevyArea
-
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
-        out = self.path.evaluate(t0, t1, left, use_levy)
-        if not use_levy:
-            return out[0]  # pyright: ignore
-        return diffrax.SpaceTimeLevyArea(dt=out.dt, W=out.W[0], H=out.H[0])  # pyright: ignore
+def as_json(title: str, results: dict[str, tuple[np.ndarray, Errors]]) -> list[dict]:
+    return [
+        dict(title=title, solver=name, h=[*e.hs], error=[*e.errors],
+             std_error=[*e.std_errors], microseconds=[*(1e6 * seconds)])
+        for name, (seconds, e) in results.items()
+    ]  # fmt: skip
 
 
 def draw(axes, title: str, results: dict[str, tuple[np.ndarray, Errors]]) -> list[str]:
@@ -266,33 +250,25 @@ def main() -> None:
         "| error, model | solver | h | error | microseconds per path |",
         "|---" * 5 + "|",
     ]
-    figure, axes = plt.subplots(2, 5, figsize=(25, 9))
-    models = [*STRONG]
-    for ax, model in zip(axes[0], models):
+    numbers: list[dict] = []
+    figure, axes = plt.subplots(5, 2, figsize=(11, 22), layout="constrained")
+    for ax, model in zip(axes[:, 0], STRONG):
         make_terms, y0, solvers, error_of = weak(model)
         results = {
             name: (cost(make_terms, path, solver, y0, HS), error_of(solver, path, HS))
             for name, (solver, path) in solvers.items()
         }
         lines += draw(ax, f"weak, {model}", results)
+        numbers += as_json(f"weak, {model}", results)
         print(f"weak, {model}: done", flush=True)
-    for ax, model in zip(axes[1], models):
-        make_terms, y0, m, component, solvers, reference = STRONG[model]
-        hs = [2.0**-k for k in range(2, 8)]
-        wrap = WRAP.get(model, lambda path, key, cell: path)
-        errors = strong_errors(
-            make_terms, solvers, reference, y0, hs, m, 2**12, component, wrap=wrap
-        )(500)
-        path = lambda key, wrap=wrap, m=m: wrap(Area((m,))(key), key, None)
-        results = {
-            name: (cost(make_terms, path, solvers[name], y0, hs), e)
-            for name, e in errors.items()
-        }
+    for ax, model in zip(axes[:, 1], STRONG):
+        results = strong(model, HS[1:])
         lines += draw(ax, f"strong, {model}", results)
+        numbers += as_json(f"strong, {model}", results)
         print(f"strong, {model}: done", flush=True)
-    figure.tight_layout()
     DOCS.mkdir(parents=True, exist_ok=True)
     figure.savefig(DOCS / "work_precision.png", dpi=90)
+    (DOCS / "work_precision.json").write_text(json.dumps(numbers) + "\n")
     (DOCS / "work_precision.md").write_text("\n".join(lines) + "\n")
 
 

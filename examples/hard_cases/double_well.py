@@ -84,7 +84,8 @@ def diffrax_terms(path):
 
 
 def with_areas(levy_area):
-    return lambda key: ds.FixedStepBrownianPath((), key, levy_area)
+    # That of Diffrax, since only it has space-time-time areas.
+    return lambda key: diffrax.UnsafeBrownianPath((), key, levy_area)
 
 
 def damped(solver, make_path) -> Step:
