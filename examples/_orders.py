@@ -86,6 +86,11 @@ def resolved(hs: list[float], full: bool) -> list[float]:
     return hs if full else hs[1:4]
 
 
+def resolved_solvers(solvers: dict, full: bool) -> dict:
+    """The solvers that are sampled: only the paper's many paths resolve those of SRKw2."""
+    return {name: s for name, s in solvers.items() if full or name != "SRKw2"}
+
+
 def sampled_weak_error(
     make_terms: Callable,
     make_path: Callable,

@@ -33,6 +33,7 @@ from ._orders import (
     plot_orders,
     report,
     resolved,
+    resolved_solvers,
     sampled_weak_error,
     second_moments,
 )
@@ -78,6 +79,7 @@ def figure_2c(full: bool) -> None:
     for name, (solver, path) in solvers.items():
         moment_map = exact_moment_map(make_terms, path, solver, Y0)
         exact[name] = exact_weak_error(moment_map, Y0, lambda m: m[1, 1], value, hs)
+    for name, (solver, path) in resolved_solvers(solvers, full).items():
         sampled[name] = sampled_weak_error(
             make_terms,
             path,

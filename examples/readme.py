@@ -2,11 +2,11 @@
 
     python -m examples.readme
 
-A noisy oscillator in phase space by a symplectic and an explicit method, and errors
-against costs as `docs/benchmarks/work_precision.json` has them.
+A noisy oscillator in phase space by a symplectic and an explicit method, and exact errors
+against costs as `docs/benchmarks/work_precision.md` has them.
 """
 
-import json
+import re
 from pathlib import Path
 
 import diffrax
@@ -17,6 +17,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrax_symplectic as ds
+
+from .benchmarks import work_precision
 
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -55,15 +57,20 @@ def portrait(solver) -> np.ndarray:
     return points[:, np.all(np.abs(points) < 1e3, axis=0)]
 
 
-def benchmark(kind: str, model: str, solver: str) -> np.ndarray:
-    """Microseconds per path and errors of one solver, at all its step sizes."""
-    rows = json.loads((DOCS / "benchmarks/work_precision.json").read_text())
-    (row,) = [
-        row
-        for row in rows
-        if row["title"] == f"{kind}, {model}" and row["solver"] == solver
-    ]
-    return np.array([row["microseconds"], row["error"]])
+def cost(model: str, solver: str) -> float:
+    """Microseconds per path and step of size 1, from the page of the benchmark. The cost of
+    a step does not depend on its size."""
+    page = (DOCS / "benchmarks/work_precision.md").read_text()
+    row = rf"^\| weak, {model} \| {solver} \| 0.0625 \| .* \| (\S+) \|$"
+    (microseconds,) = re.findall(row, page, re.M)
+    return 0.0625 * float(microseconds)
+
+
+def error(model: str, solver: str) -> np.ndarray:
+    """Exact, for all step sizes of the benchmark."""
+    _, _, solvers, errors = work_precision.weak(model)
+    method, path = solvers[solver]
+    return errors(method, path, work_precision.HS).errors
 
 
 def main() -> None:
@@ -81,10 +88,17 @@ def main() -> None:
     left.set(xlim=(-2.3, 2.3), ylim=(-2.3, 2.9), aspect="equal")
     left.legend(loc="upper center", ncols=2, markerscale=4, frameon=False)
     for i, (solver, model) in enumerate(SHOWN.items()):
-        time, error = benchmark("weak", model, solver)
+        time = cost(model, solver) / np.array(work_precision.HS)
         style = "-" if hasattr(ds, solver) else "--"
         label = f"{solver}, {model}"
-        right.plot(time, error, style, marker="o", label=label, color=f"C{i // 2}")
+        right.plot(
+            time,
+            error(model, solver),
+            style,
+            marker="o",
+            label=label,
+            color=f"C{i // 2}",
+        )
     right.set(xscale="log", yscale="log", title="error of an expectation")
     right.set(xlabel="microseconds per path", ylabel="error")
     right.set_ylim(top=100)

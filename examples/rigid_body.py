@@ -32,6 +32,7 @@ from ._orders import (
     plot_orders,
     report,
     resolved,
+    resolved_solvers,
     sampled_weak_error,
 )
 from ._transfer import enumerated_expectation, transfer_weak_errors
@@ -133,7 +134,7 @@ def figure_6b(full: bool) -> None:
         name: sampled_weak_error(
             make_terms, path, solver, X0, phi, value, resolved(hs, full), paths
         )
-        for name, (solver, path) in solvers.items()
+        for name, (solver, path) in resolved_solvers(solvers, full).items()
     }
     print(f"  E(X1^2) = {value:.9f}")
     report("exact", exact)

@@ -6,10 +6,9 @@ Weak errors are exact on the linear models (linear and Kubo oscillator, two nois
 estimated by quasi-Monte Carlo on the others, with error bars of three standard errors.
 Strong errors are root mean squares over one set of Brownian paths, by `compare_solvers`.
 Costs are CPU seconds per path, in batches of 10,000. Writes
-`docs/benchmarks/work_precision.md`, its picture, and all its numbers as JSON.
+`docs/benchmarks/work_precision.md` and its picture.
 """
 
-import json
 import time
 
 import diffrax
@@ -213,14 +212,6 @@ WRAP = {
 }
 
 
-def as_json(title: str, results: dict[str, tuple[np.ndarray, Errors]]) -> list[dict]:
-    return [
-        dict(title=title, solver=name, h=[*e.hs], error=[*e.errors],
-             std_error=[*e.std_errors], microseconds=[*(1e6 * seconds)])
-        for name, (seconds, e) in results.items()
-    ]  # fmt: skip
-
-
 def draw(axes, title: str, results: dict[str, tuple[np.ndarray, Errors]]) -> list[str]:
     lines = []
     for i, (name, (seconds, e)) in enumerate(results.items()):
@@ -250,7 +241,6 @@ def main() -> None:
         "| error, model | solver | h | error | microseconds per path |",
         "|---" * 5 + "|",
     ]
-    numbers: list[dict] = []
     figure, axes = plt.subplots(5, 2, figsize=(11, 22), layout="constrained")
     for ax, model in zip(axes[:, 0], STRONG):
         make_terms, y0, solvers, error_of = weak(model)
@@ -259,16 +249,13 @@ def main() -> None:
             for name, (solver, path) in solvers.items()
         }
         lines += draw(ax, f"weak, {model}", results)
-        numbers += as_json(f"weak, {model}", results)
         print(f"weak, {model}: done", flush=True)
     for ax, model in zip(axes[:, 1], STRONG):
         results = strong(model, HS[1:])
         lines += draw(ax, f"strong, {model}", results)
-        numbers += as_json(f"strong, {model}", results)
         print(f"strong, {model}: done", flush=True)
     DOCS.mkdir(parents=True, exist_ok=True)
     figure.savefig(DOCS / "work_precision.png", dpi=90)
-    (DOCS / "work_precision.json").write_text(json.dumps(numbers) + "\n")
     (DOCS / "work_precision.md").write_text("\n".join(lines) + "\n")
 
 
