@@ -61,8 +61,8 @@ def quasi_expectation(
     The error falls faster than one over the root of the number of paths, in few dimensions
     much faster: for up to four numbers in the state (or in `sort_by`) and $\phi$ smooth,
     one replicate is worth hundreds to thousands of times as many independent paths. For
-    large systems, or in chaos after long times, it is worth no less than as many
-    independent paths, and what is spent on sorting is lost: take
+    large systems that the noise moves far it is worth tens of times as many, in chaos
+    after long times no less than as many, and what is spent on sorting is lost: take
     [`diffrax_symplectic.expectation`][].
 
     !!! example

@@ -1,6 +1,6 @@
 """All benchmarks: `python -m examples.benchmarks`."""
 
-from . import ensemble, growth, members, speed, tolerance, work_precision
+from . import ensemble, growth, members, speed, tolerance, total_error, work_precision
 
 
 def main() -> None:
@@ -10,6 +10,7 @@ def main() -> None:
     tolerance.main()
     members.main()
     work_precision.main()
+    total_error.main()
 
 
 if __name__ == "__main__":

@@ -1,31 +1,33 @@
 """Total error against seconds, from nothing to answer, compilation aside:
 
-    python -m examples.benchmarks.total_error [--quick] [MODEL ...]
+    python -m examples.benchmarks.total_error errors [MODEL ...]
+    python -m examples.benchmarks.total_error seconds [MODEL ...]
+    python -m examples.benchmarks.total_error [--quick]
 
-Measures the models named (all without names), keeps what it measured of each in
-`examples/output`, and writes `docs/benchmarks/total_error.md` and its picture. With
-`--quick` it measures at small sizes and writes nothing.
+The first measures errors, of the models named or of all, on however busy a machine. The
+second measures how long the estimates take, and wants a quiet one. Both keep what they
+measure in `examples/output`. The last writes `docs/benchmarks/total_error.md` and its
+picture from that, and measures what is missing; with `--quick` it goes through all of this
+at small sizes for one model and writes nothing.
 """
 
 import argparse
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import diffrax
 import jax
-import jax.numpy as jnp
-import jax.random as jr
 import matplotlib
 import numpy as np
 
-import diffrax_symplectic as ds
+from diffrax_symplectic._quasi._estimate import extrapolation_weights
 
-from .. import kubo, linear_oscillator, rigid_body, synchrotron
-from ..hard_cases import chain, henon_heiles
-from ._timing import DOCS, ensemble, keys, machine, measure
+from .._orders import exact_moment_map, exact_weak_error
+from ._ensembles import Model, MODELS, other, plain, quasi
+from ._limits import limits, LONG
+from ._timing import DOCS, keys, machine, measure
 
 
 matplotlib.use("Agg")
@@ -33,232 +35,285 @@ import matplotlib.pyplot as plt  # noqa: E402
 
 
 KEPT = Path(__file__).parents[1] / "output" / "total_error"
-REPLICATES = 16
+# An estimate is of so many replicates.
+REPLICATES = 4
+REPETITIONS = 20
 BATCH = 10_000
+LEVELS = {"quasi, one level": 1, "quasi, two levels": 2}
+TARGET = 1e-5
 
 
-class Model(NamedTuple):
-    """A problem, its solvers, and the steps that are taken."""
-
-    make_terms: Callable
-    y0: Any
-    phi: Callable[[Any], Any]
-    t1: float
-    # Of the quasi-Monte Carlo runs: with one level, and of the coarser of two.
-    steps: int
-    coarse: int
-    noises: tuple[int, ...]
-    solver: diffrax.AbstractSolver
-    # What Diffrax has, and whether it needs space-time area.
-    others: Mapping[str, tuple[diffrax.AbstractSolver, bool]]
-    sort_by: Callable | None = None
-    exact: float | None = None
+def sizes(model: Model, levels: int, quick: bool) -> list[int]:
+    """How many paths a replicate has. With one level the bias is what is left of more."""
+    if quick:
+        return [2**6]
+    largest = model.paths if levels > 1 else min(model.paths, 2**14)
+    return [n for n in (2**8, 2**10, 2**12, 2**14, 2**16) if n <= largest]
 
 
-_heun = {"Heun": (diffrax.Heun(), False)}
-_slow = _heun | {"SlowRK": (diffrax.SlowRK(), True)}
-_hh_start = (jnp.array([0.4, 0.1]), jnp.array([0.0, -0.15]))
+def plain_sizes(quick: bool) -> list[int]:
+    return [2**8] if quick else [2**10, 2**13, 2**16]
 
 
-def _chain_terms(path):
-    terms = lambda f: lambda t, p, q, args: f(p, q)
-    return ds.hamiltonian_terms(
-        terms(lambda p, q: chain.energy(p, q, 0.5)), terms(lambda p, q: -0.1 * q), path
-    )
+def steps_of(model: Model, levels: int) -> int:
+    return model.steps if levels == 1 else model.coarse
 
 
-def _henon_heiles_terms(path):
-    return ds.hamiltonian_terms(
-        lambda t, p, q, args: henon_heiles.energy(p, q),
-        lambda t, p, q, args: -0.03 * q,
-        path,
-    )
-
-
-MODELS = {
-    "linear oscillator": Model(
-        linear_oscillator.make_terms, linear_oscillator.Y0, lambda y: y[1] ** 2, 1.0,
-        64, 16, (), ds.StormerVerlet(), _heun | {"ShARK": (diffrax.ShARK(), True)},
-        exact=float(np.sin(1) ** 2 + 1 / 2 - np.sin(2) / 4),
-    ),
-    "Kubo oscillator": Model(
-        kubo.make_terms, kubo.Y0, lambda y: y[1] ** 2, 1.0, 32, 16, (),
-        ds.StrangGauss(), _slow, exact=float((1 + np.cos(2) * np.exp(-2)) / 2),
-    ),
-    "synchrotron": Model(
-        synchrotron.make_terms, synchrotron.Y0, lambda y: y[0] ** 2, 2.0, 128, 32, (2,),
-        ds.StormerVerlet(), _slow,
-    ),
-    "rigid body": Model(
-        lambda path: rigid_body.make_terms(path, 0.5), rigid_body.X0,
-        lambda X: X[0] ** 2, 4.0, 64, 32, (), ds.StrangGauss(), _slow,
-        sort_by=lambda X: (X[0], jnp.arctan2(X[1], X[2])),
-    ),
-    "Henon-Heiles": Model(
-        _henon_heiles_terms, _hh_start, lambda y: y[1][0] ** 2, 5.0, 100, 50, (2,),
-        ds.StormerVerlet(), _slow,
-    ),
-    "chain of 32": Model(
-        _chain_terms, chain.start(1.0), lambda y: jnp.mean(y[0] ** 2), 2.0, 32, 16,
-        (chain.N,), ds.StormerVerlet(), _heun,
-    ),
-}  # fmt: skip
-
-
-def _quasi(model: Model, solver, area=False) -> Callable[..., ds.QuasiExpectation]:
-    """Estimates phi and its square. Of one solver: the program is compiled once for each
-    number of paths."""
-    levy_area = diffrax.SpaceTimeLevyArea if area else diffrax.BrownianIncrement
-    path = ds.FixedStepBrownianPath(model.noises, jr.key(0), levy_area=levy_area)
-    terms = model.make_terms(path)
-
-    def phi(t, y, args):
-        value = model.phi(y)
-        return jnp.stack([value, value**2])
-
-    def run(steps: int, paths: int, replicates: int, levels: int = 1):
-        return ds.quasi_expectation(
-            phi, terms, solver, 0.0, model.t1, model.t1 / steps, model.y0,
-            key=jr.key(steps), num_paths=paths, replicates=replicates, levels=levels,
-            sort_by=model.sort_by,
-        )  # fmt: skip
-
-    return run
-
-
-def study(model: Model, quick: bool = False) -> dict[str, Any]:
-    """Of each pipeline, seconds and the errors that they buy."""
-    sizes = [2**6, 2**8] if quick else [2**8, 2**10, 2**12]
-    run = _quasi(model, model.solver)
-    finest = run(2 * model.steps, 4 * sizes[-1], 4, levels=2)
-    exact = float(finest.mean[0]) if model.exact is None else model.exact
-    variance = float(finest.mean[1] - finest.mean[0] ** 2)
-    out: dict[str, Any] = {"exact": exact, "variance": variance, "pipelines": {}}
-    for name, steps, levels in (
-        ("quasi, one level", model.steps, 1),
-        ("quasi, two levels", model.coarse, 2),
-    ):
-        rows = []
-        for paths in sizes:
-            run(steps, paths, 2, levels)
-            begin = time.perf_counter()
-            estimate = run(steps, paths, REPLICATES, levels)
-            seconds = time.perf_counter() - begin
-            spread = float(np.var(estimate.replicates[:, 0], ddof=1))
-            error = np.hypot(
-                float(estimate.mean[0]) - exact, np.sqrt(spread / REPLICATES)
-            )
-            rows.append((seconds, float(error), variance / paths / spread, paths))
-        out["pipelines"][name] = {"rows": rows}
-    ours = lambda key: ds.FixedStepBrownianPath(model.noises, key)
-    plain: dict[str, Any] = {type(model.solver).__name__: (model.solver, False, ours)}
-    for name, (solver, area) in model.others.items():
-        levy_area = diffrax.SpaceTimeLevyArea if area else diffrax.BrownianIncrement
-        path = lambda key, levy_area=levy_area: diffrax.UnsafeBrownianPath(
-            model.noises, key, levy_area=levy_area
-        )
-        plain[name] = solver, area, path
-    for name, (solver, area, path) in plain.items():
-        fn = ensemble(
-            model.make_terms,
-            path,
-            solver,
-            model.y0,
-            model.t1 / model.steps,
-            model.steps,
-        )
-        batch = 100 if quick else BATCH
-        cost = measure(fn, keys(batch), repeats=1 if quick else 3).seconds
-        biases, other = [], _quasi(model, solver, area)
-        for steps in (model.steps, 2 * model.steps):
-            e = other(steps, sizes[-1], REPLICATES)
-            biases.append((steps, float(e.mean[0]) - exact, float(e.std_error[0])))
-        out["pipelines"][name] = {"cost": cost / batch / model.steps, "biases": biases}
+def errors(model: Model, quick: bool = False) -> dict[str, Any]:
+    """Of each estimate the root mean square error, its systematic part, and what the
+    variance of a replicate is below that of as many independent paths."""
+    repetitions = 2 if quick else REPETITIONS
+    run, largest = quasi(model), sizes(model, 2, quick)[-1]
+    if quick or model.exact is None:
+        finest = run(2 * model.steps, largest, 4 * repetitions, levels=2, seed=1)
+        exact, exact_error = float(finest.mean[0]), float(finest.std_error[0])
+    else:
+        exact, exact_error = model.exact(), 0.0
+    variance = 0.0
+    out: dict[str, Any] = {"exact": exact, "exact error": exact_error}
+    for name, levels in LEVELS.items():
+        out[name] = []
+        for paths in sizes(model, levels, quick):
+            count = repetitions * REPLICATES
+            estimate = run(steps_of(model, levels), paths, count, levels)
+            assert estimate.num_failed == 0
+            variance = float(estimate.mean[1] - estimate.mean[0] ** 2)
+            each = estimate.replicates[:, 0]
+            gain = variance / paths / np.var(each, ddof=1)
+            means = np.mean(each.reshape(repetitions, REPLICATES), axis=1)
+            row = _row(paths, means, exact) | {"gain": float(gain)}
+            if model.linear:
+                row["systematic"] = abs(own_bias(model, levels, exact))
+            out[name].append(row)
+    out["variance"] = variance
+    estimate = plain(model)
+    out["expectation"] = [
+        _row(n, [float(estimate(n, s).mean) for s in range(repetitions)], exact)
+        for n in plain_sizes(quick)
+    ]
+    out["others"] = {x: bias(model, x, exact, quick) for x in model.others}
     return out
 
 
-def curve(pipeline: dict, variance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Seconds of plain Monte Carlo for each error, with the best step for each: the bias
-    falls by the power of the step that it shows, and its square and the variance over the
-    number of paths are the square of the error."""
-    (n1, b1, s1), (n2, b2, s2) = pipeline["biases"]
-    # What is not clear of its own uncertainty counts for nothing: in favour of plain paths.
-    b1, b2 = (max(abs(b) - 2 * s, 1e-9) for b, s in ((b1, s1), (b2, s2)))
-    order = np.clip(np.log2(b1 / b2), 1.0, 2.0)
-    errors = np.logspace(-6, -2, 41)
-    steps = n2 * 2.0 ** np.arange(-6, 24)[:, None]
-    bias = b2 * (n2 / steps) ** order
-    left = np.where(errors > bias, errors**2 - bias**2, np.nan)
-    seconds = pipeline["cost"] * steps * variance / left
-    return np.nanmin(seconds, axis=0), errors
+def _row(paths: int, estimates, exact: float) -> dict[str, float]:
+    """The square of the systematic part is unbiased, or zero where it would be less."""
+    off = np.asarray(estimates) - exact
+    rms, own = np.sqrt(np.mean(off**2)), np.var(off, ddof=1) / len(off)
+    systematic = np.sqrt(max(0.0, np.mean(off) ** 2 - own))
+    return {"paths": paths, "error": float(rms), "systematic": float(systematic)}
+
+
+def own_bias(model: Model, levels: int, exact: float) -> float:
+    """Of the solver here for a linear model, by its second moments: no sampling."""
+    path = lambda key: model.quasi_path()
+    moments = exact_moment_map(model.make_terms, path, model.solver, model.y0)
+    hs = [model.t1 / (steps_of(model, levels) * 2**k) for k in range(levels)]
+    e = exact_weak_error(moments, model.y0, lambda m: m[1, 1], exact, hs).signed
+    order = model.solver.weak_order(model.make_terms(path(None)))
+    return float(extrapolation_weights(order, levels) @ e)
+
+
+def bias(model: Model, name: str, exact: float, quick: bool) -> list[list[float]]:
+    """(steps, bias, its standard error) of one of Diffrax's solvers: exact for linear
+    models, otherwise by `quasi_expectation` with that solver."""
+    solver, area = model.others[name]
+    if model.linear:
+        steps = [2**k for k in range(3, 5 if quick else 12)]
+        hs = [model.t1 / n for n in steps]
+        path = lambda key: model.gaussian_path(key, area)
+        moments = exact_moment_map(model.make_terms, path, solver, model.y0)
+        e = exact_weak_error(moments, model.y0, lambda m: m[1, 1], exact, hs)
+        return [[n, b, 0.0] for n, b in zip(steps, e.signed.tolist())]
+    run, out = quasi(model, solver, area), []
+    for steps in (model.coarse, 2 * model.coarse):
+        e = run(steps, min(2**14, sizes(model, 2, quick)[-1]), 16)
+        out.append([steps, float(e.mean[0]) - exact, float(e.std_error[0])])
+    return out
+
+
+def seconds(model: Model, quick: bool = False) -> dict[str, Any]:
+    """Of each estimate, and of a path and step of Diffrax's solvers."""
+    batch = 100 if quick else BATCH
+    out: dict[str, Any] = {"others": {}}
+    for name in model.others:
+        timing = measure(other(model, name), keys(batch), repeats=3)
+        out["others"][name] = timing.seconds / batch / model.steps
+    estimate = plain(model)
+    out["expectation"] = [
+        _seconds(lambda n=n: estimate(n, 0)) for n in plain_sizes(quick)
+    ]
+    run = quasi(model)
+    for name, levels in LEVELS.items():
+        out[name] = [
+            _seconds(lambda n=n: run(steps_of(model, levels), n, REPLICATES, levels))
+            for n in sizes(model, levels, quick)
+        ]
+    return out
+
+
+def _seconds(fn: Callable) -> float:
+    """The first call compiles. Of short ones the best of several."""
+    fn()
+    times = []
+    while sum(times) < 0.5:
+        begin = time.perf_counter()
+        fn()
+        times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def extrapolated(
+    biases: list[list[float]], variance: float, cost: float, error: np.ndarray
+) -> np.ndarray:
+    """Seconds of independent paths for each total error, with the best step for each: the
+    square of the error is that of the bias plus the variance over the number of paths.
+
+    Past the finest step measured the bias falls by the power of the step that the last two
+    show. What is not clear of its own uncertainty counts in favour of the solver."""
+    n, b, s = np.array(biases).T
+    b = np.maximum(np.abs(b) - 2 * s, 1e-12)
+    order = np.clip(np.log2(b[-2] / b[-1]), 1.0, 2.0)
+    finer = 2.0 ** np.arange(1, 24)
+    steps = np.concatenate([n, n[-1] * finer])[:, None]
+    left = np.concatenate([b, b[-1] / finer**order])[:, None]
+    left = np.where(error > left, error**2 - left**2, np.nan)
+    return np.nanmin(cost * steps * variance / left, axis=0)
+
+
+def to_target(rows: list[dict], times: list[float], target: float = TARGET) -> float:
+    """Seconds to the target, with as many replicates as it takes."""
+    best = np.inf
+    for row, s in zip(rows, times):
+        random = row["error"] ** 2 - row["systematic"] ** 2
+        left = target**2 - row["systematic"] ** 2
+        if left > 0:
+            best = min(best, s * max(1.0, random / left))
+    return best
 
 
 def draw(results: dict[str, dict]) -> None:
-    figure, axes = plt.subplots(2, 3, figsize=(15, 9))
+    figure, axes = plt.subplots(4, 2, figsize=(9.5, 14))
+    colors = {"expectation": "C2", "Heun": "C3", "SlowRK": "C1", "ShARK": "C4"}
+    colors |= {"quasi, one level": "C9", "quasi, two levels": "C0"}
+    lines = {}
     for ax, (title, result) in zip(axes.flat, results.items()):
-        for i, (name, pipeline) in enumerate(result["pipelines"].items()):
-            if "rows" in pipeline:
-                seconds, errors, *_ = np.array(pipeline["rows"]).T
-                ax.plot(seconds, errors, "o-", color=f"C{i}", label=name)
-            else:
-                seconds, errors = curve(pipeline, result["variance"])
-                style = "--" if name in dir(diffrax) else "-"
-                ax.plot(seconds, errors, style, color=f"C{i}", label=name)
-        ax.set(xscale="log", yscale="log", title=title, ylim=(1e-6, 1e-2))
-        ax.set(xlabel="seconds", ylabel="total error", xlim=(1e-2, 1e8))
-        ax.legend(fontsize=7)
+        e, s = result["errors"], result["seconds"]
+        for name in (*LEVELS, "expectation"):
+            y = [row["error"] for row in e[name]]
+            lines[name] = ax.plot(s[name], y, "o-", ms=4, color=colors[name])[0]
+        error = np.logspace(-5.5, -1, 46)
+        for name, b in e["others"].items():
+            x = extrapolated(b, e["variance"], s["others"][name], error)
+            lines[name] = ax.plot(x, error, "--", color=colors[name])[0]
+        ax.axhline(TARGET, color="k", lw=0.5, ls=":")
+        ax.set(xscale="log", yscale="log", title=title)
+        ax.set(ylim=(1e-6, 3e-2), xlim=(1e-3, 1e9))
+        ax.set(xlabel="seconds", ylabel="total error")
         ax.grid(alpha=0.3)
-    for ax in axes.flat[len(results) :]:
-        ax.axis("off")
+    ax = axes.flat[-1]
+    ax.axis("off")
+    own = lambda name: (
+        name if "quasi" not in name else name.replace("quasi", "quasi_expectation")
+    )
+    labels = [
+        own(x) if x in (*LEVELS, "expectation") else f"diffrax.{x}" for x in lines
+    ]
+    ax.legend(lines.values(), labels, loc="center", fontsize=12)
     figure.tight_layout()
     DOCS.mkdir(parents=True, exist_ok=True)
-    figure.savefig(DOCS / "total_error.png", dpi=90)
+    figure.savefig(DOCS / "total_error.png", dpi=80)
     plt.close(figure)
 
 
-PAGE = (Path(__file__).with_suffix(".md")).read_text()
-
-
-def page(results: dict[str, dict]) -> str:
-    rows = []
+def table(results: dict[str, dict]) -> str:
+    lines = []
     for title, result in results.items():
-        seconds, error, gain, paths = result["pipelines"]["quasi, two levels"]["rows"][
-            -1
-        ]
-        curves = [
-            curve(p, result["variance"])
-            for name, p in result["pipelines"].items()
-            if name in dir(diffrax)
-        ]
-        best = min(float(np.interp(error, e, s)) for s, e in curves)
+        e, s = result["errors"], result["seconds"]
+        ours = {x: to_target(e[x], s[x]) for x in LEVELS}
+        name = min(ours, key=lambda x: ours[x])
+        theirs = {
+            x: float(
+                extrapolated(b, e["variance"], s["others"][x], np.array([TARGET]))[0]
+            )
+            for x, b in e["others"].items()
+        }
+        other = min(theirs, key=lambda x: theirs[x])
+        last = e["quasi, two levels"][-1]
         cells = (
-            title, f"{error:.1e}", f"{seconds:.2g}", f"{3 * REPLICATES * int(paths):,}",
-            f"{gain:,.0f}", f"{best:,.2g}", f"{best / seconds:,.2g}",
+            title, f"{last['paths']:,}", f"{last['error']:.1e}",
+            f"{s['quasi, two levels'][-1]:.2g}", f"{last['gain']:,.0f}",
+            f"{ours[name]:.2g}", f"{theirs[other]:,.0f} ({other})",
+            f"{theirs[other] / ours[name]:,.0f}",
         )  # fmt: skip
-        rows.append("| " + " | ".join(cells) + " |")
-    return PAGE.format(machine=machine(), rows="\n".join(rows))
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
-def main(names: list[str] | None = None) -> None:
-    KEPT.mkdir(parents=True, exist_ok=True)
-    for name in names or MODELS:
-        result = study(MODELS[name])
-        (KEPT / f"{name}.json").write_text(json.dumps(result))
-        print(name, json.dumps(result, indent=1), flush=True)
+def limit_tables(measured: dict) -> dict[str, str]:
+    row = lambda cells: "| " + " | ".join(cells) + " |"
+    shown = lambda x: f"{x:,.0f}" if x >= 10 else f"{x:.2f}"
+    out = {
+        key: "\n".join(
+            row((f"{t:g}", shown(x))) for t, x in zip(LONG[key], measured[key])
+        )
+        for key in LONG
+    }
+    lines = [row((str(n), *map(shown, x))) for n, *x in measured["dimensions"]]
+    return out | {"dimensions": "\n".join(lines)}
+
+
+def kept(kind: str, name: str, fn: Callable, again: bool) -> dict:
+    """What was measured, or is measured now."""
+    path = KEPT / kind / f"{name}.json"
+    if again or not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        begin = time.process_time()
+        path.write_text(json.dumps(fn()))
+        used = time.process_time() - begin
+        print(f"{kind}, {name}: {used:.0f} s of processor time", flush=True)
         jax.clear_caches()
-    kept = {name: KEPT / f"{name}.json" for name in MODELS}
-    results = {k: json.loads(p.read_text()) for k, p in kept.items() if p.exists()}
+    return json.loads(path.read_text())
+
+
+def main(kind: str | None = None, names: list[str] | None = None) -> None:
+    kinds = {"errors": errors, "seconds": seconds}
+    results = {
+        name: {
+            k: kept(k, name, lambda fn=fn, n=name: fn(MODELS[n]), again=kind == k)
+            for k, fn in kinds.items()
+            if kind in (None, k)
+        }
+        for name in names or MODELS
+    }
+    if kind is None:
+        write(results, kept("limits", "limits", limits, again=False))
+
+
+def write(results: dict[str, dict], measured: dict) -> None:
     draw(results)
-    (DOCS / "total_error.md").write_text(page(results))
+    page = Path(__file__).with_suffix(".md").read_text()
+    text = page.format(
+        machine=machine(), rows=table(results), replicates=REPLICATES,
+        chain_error=f"{results['chain of 32']['errors']['exact error']:.0e}",
+        **limit_tables(measured),
+    )  # fmt: skip
+    (DOCS / "total_error.md").write_text(text)
+
+
+def quick() -> None:
+    model = "linear oscillator"
+    args = MODELS[model], True
+    print(table({model: {"errors": errors(*args), "seconds": seconds(*args)}}))
+    print("\n".join(limit_tables(limits(quick=True)).values()))
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("kind", nargs="?", choices=("errors", "seconds"))
     parser.add_argument("models", nargs="*", help="of " + ", ".join(MODELS))
     arguments = parser.parse_args()
     if arguments.quick:
-        for name in arguments.models or MODELS:
-            print(name, study(MODELS[name], quick=True))
+        quick()
     else:
-        main(arguments.models)
+        main(arguments.kind, arguments.models)

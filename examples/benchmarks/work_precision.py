@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import jax.random as jr
 import matplotlib
 import numpy as np
-from jax.scipy.linalg import expm
 
 import diffrax_symplectic as ds
 
@@ -26,6 +25,7 @@ from .._orders import (
     exact_moment_map,
     exact_weak_error,
 )
+from ._exact import two_noises_square
 from ._timing import DOCS, ensemble, keys, machine, measure
 
 
@@ -61,16 +61,6 @@ def two_noises(path):
         lambda t, p, q, args: jnp.stack([jnp.sum(p**2 - q**2) / 2, jnp.sum(p * q)]) / 2,
         path,
     )
-
-
-def _two_noises_moment() -> float:
-    """E(q^2) at t = 1 from (p, q) = (0, 1), by the linear equation of second moments."""
-    A = np.array([[0, -1], [1, 0]])
-    Bs = np.array([[0, 1], [1, 0]]) / 2, np.array([[-1, 0], [0, 1]]) / 2
-    ito = A + sum(B @ B for B in Bs) / 2
-    one = np.eye(2)
-    generator = np.kron(ito, one) + np.kron(one, ito) + sum(np.kron(B, B) for B in Bs)
-    return float((expm(generator) @ np.array([0, 0, 0, 1.0]))[3])
 
 
 def weak(model: str):
@@ -121,7 +111,7 @@ def weak(model: str):
             "Heun": (diffrax.Heun(), Gaussian((2,))),
         }
         y0 = (jnp.array(0.0), jnp.array(1.0))
-        return two_noises, y0, several, _exact(two_noises, y0, _two_noises_moment())
+        return two_noises, y0, several, _exact(two_noises, y0, two_noises_square())
     make_terms = lambda path: rigid_body.make_terms(path, 0.5)
     y0 = jnp.array([np.cos(1.1), 0.0, np.sin(1.1)])
     phi = lambda X: X[0] ** 2
