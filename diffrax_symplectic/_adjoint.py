@@ -294,7 +294,9 @@ def _solve_bwd(
     return _unless(walk.arrived, throw, (a_y, *walk.a_parameters))
 
 
-def _begin_anew(y: Y, rows: Y, i, every, arrived) -> tuple[Y, Bool[Array, ""]]:
+def _begin_anew(
+    y: Y, rows: PyTree[Array], i, every, arrived
+) -> tuple[Y, Bool[Array, ""]]:
     """The saved state in place of the one walked to, if there is one after `i` steps; and
     whether they agree."""
     row, rest = jnp.divmod(i, every)

@@ -6,7 +6,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ._custom_types import Args, RealScalarLike
 from ._hamiltonian import check_functions, check_pair, hamiltonian_terms
@@ -15,7 +15,7 @@ from ._indexed_noise import IndexedNoise
 
 _Spins = Float[Array, "*spins 3"]
 _Spinors = tuple[Float[Array, "*spins 2"], Float[Array, "*spins 2"]]
-_SpinHamiltonian = Callable[[RealScalarLike, _Spins, Args], PyTree[Array]]
+_SpinHamiltonian = Callable[[RealScalarLike, _Spins, Args], PyTree[ArrayLike]]
 
 
 def spin_terms(
@@ -110,7 +110,7 @@ class SpinHamiltonian(eqx.Module):
 
     H: Callable
 
-    def __call__(self, *inputs) -> PyTree[Array]:
+    def __call__(self, *inputs) -> PyTree[ArrayLike]:
         # The Hamiltonian of an `IndexedNoise` has the index of the noise before the time.
         *before, p, q, args = inputs
         return self.H(*before, from_spinors((p, q)), args)

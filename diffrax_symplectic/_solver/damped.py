@@ -6,7 +6,7 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from .._compat import direction
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
@@ -56,7 +56,7 @@ class Damped(
     """
 
     solver: diffrax.AbstractSolver
-    gamma: PyTree[Array] = eqx.field(converter=_checked)
+    gamma: PyTree[ArrayLike] = eqx.field(converter=_checked)
 
     def __check_init__(self):
         if not isinstance(self.solver, AbstractSymplecticSolver):
@@ -146,7 +146,9 @@ class Damped(
         return self.solver.func(terms, t0, y0, args)
 
 
-def _factors(gamma: PyTree[Array], time: RealScalarLike, p: PyTree[Array]) -> PyTree:
+def _factors(
+    gamma: PyTree[ArrayLike], time: RealScalarLike, p: PyTree[Array]
+) -> PyTree:
     """`exp(-gamma time)`, for each array of `p`."""
     if jtu.treedef_is_leaf(jtu.tree_structure(gamma)):
         gamma = jtu.tree_map(lambda _: gamma, p)
