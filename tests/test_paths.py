@@ -10,6 +10,12 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian._laws import THREE_POINT, two_point
+from diffrax_symplectic._brownian._random_words import (
+    AREA_WORDS,
+    place_of,
+    PLATEAU_WORDS,
+    random_words,
+)
 
 from .problems import kubo_terms, weak_path
 
@@ -306,6 +312,37 @@ def test_another_solve_may_change_its_steps():
         jnp.array(1.0),
         stepsize_controller=pid,
     )
+
+
+def test_the_same_key_gives_the_same_path_in_every_version():
+    # By hand: 1.37 h lies in [2^(e + 1), 2^(e + 2)), and the middle of the step is counted
+    # in units of 2^e, shifted by 0.29.
+    for step, place in (
+        ((0.0, 0.25), (1, -3)),
+        ((7.5, 7.75), (61, -3)),
+        ((-3.0, -2.9), (-47, -4)),
+        ((100.0, 101.0), (201, -1)),
+        # Counts begin again after 2^31.
+        ((2.0**31 + 7.5, 2.0**31 + 7.75), (61, -3)),
+    ):
+        assert tuple(map(int, place_of(*map(jnp.array, step)))) == place
+    # The generator is that of Random123. What is recorded is how its counters are used.
+    place = jnp.array(5, jnp.int32), jnp.array(-3, jnp.int32)
+    first, second = [3384798094, 3537045821], [1887961620, 1291108390]
+    key = jr.key(7, impl="threefry2x32")
+    np.testing.assert_array_equal(random_words(key, place, 2, 2), [first, second])
+    np.testing.assert_array_equal(
+        random_words(key, place, 1, 2, AREA_WORDS), [[2750506793, 1201171554]]
+    )
+
+
+@pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])
+def test_more_sets_of_words_leave_the_first_ones_and_wrappers_have_their_own(impl):
+    key, place = jr.key(3, impl=impl), place_of(jnp.array(0.5), jnp.array(0.75))
+    words = random_words(key, place, 3, 4)
+    np.testing.assert_array_equal(random_words(key, place, 1, 4), words[:1])
+    others = random_words(key, place, 3, 4, PLATEAU_WORDS)
+    assert len(np.unique(np.concatenate([words, others]))) == 24
 
 
 def test_what_is_no_key_is_refused():
