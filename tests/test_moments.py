@@ -170,7 +170,7 @@ def test_quadrature_over_gaussian_increments_is_exact_for_polynomials():
 
 def test_moments_work_under_jit_and_vmap():
     path = ds.WeakBrownianPath((), jr.key(0))
-    maps = lambda h: ds.second_moment_map(kubo_terms(path), ds.SRKw2(), 0.0, h, Y0)
+    maps = lambda h: ds.second_moment_map(kubo_terms(path), ds.Midpoint(), 0.0, h, Y0)
     hs = jnp.array([0.1, 0.2])
     together = jax.jit(jax.vmap(maps))(hs)
     np.testing.assert_allclose(together[1], maps(hs[1]), atol=1e-13)

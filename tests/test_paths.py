@@ -343,6 +343,10 @@ def test_more_sets_of_words_leave_the_first_ones_and_wrappers_have_their_own(imp
     np.testing.assert_array_equal(random_words(key, place, 1, 4), words[:1])
     others = random_words(key, place, 3, 4, PLATEAU_WORDS)
     assert len(np.unique(np.concatenate([words, others]))) == 24
+    # A million words, too, stay clear of those of the place that is counted next.
+    many = random_words(key, place, 1, 2**20 + 2, AREA_WORDS)
+    after = random_words(key, (place[0], place[1] + 1), 1, 2)
+    assert not np.isin(after, many).all()
 
 
 def test_what_is_no_key_is_refused():

@@ -1,6 +1,7 @@
 """Every step is symplectic to rounding error, whatever the Hamiltonians."""
 
 import dataclasses
+import functools
 
 import diffrax
 import equinox as eqx
@@ -39,6 +40,22 @@ def _increments(key, h, dtype):
     ],
 )
 def test_step_is_symplectic_for_a_thousand_random_systems(solver, dtype, bound):
+    def defect(y0, args, h, W):
+        terms = ds.hamiltonian_terms(H0, noise, Given(W))
+        return ds.symplecticity_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
+
+    y0, args, h, W = _systems(dtype)
+    defect = eqx.filter_jit(jax.vmap(defect))
+    for path in range(2):
+        defects = defect(y0, args, h, W[:, path])
+        assert defects.dtype == dtype
+        assert jnp.max(defects) <= bound
+
+
+@functools.cache
+def _systems(dtype):
+    """The systems and their increments, made once for all solvers."""
+
     def problem(key):
         k_problem, k_path, k_h = jr.split(key, 3)
         y0, args = random_problem_of_any_size(k_problem, dtype)
@@ -46,16 +63,7 @@ def test_step_is_symplectic_for_a_thousand_random_systems(solver, dtype, bound):
         h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
         return y0, args, h, _increments(k_path, h, dtype)
 
-    def defect(y0, args, h, W):
-        terms = ds.hamiltonian_terms(H0, noise, Given(W))
-        return ds.symplecticity_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
-
-    y0, args, h, W = jax.vmap(problem)(jr.split(jr.key(0), 1000))
-    defect = eqx.filter_jit(jax.vmap(defect))
-    for path in range(2):
-        defects = defect(y0, args, h, W[:, path])
-        assert defects.dtype == dtype
-        assert jnp.max(defects) <= bound
+    return jax.jit(jax.vmap(problem))(jr.split(jr.key(0), 1000))
 
 
 def _weak(m, key, dtype=jnp.float64):
