@@ -43,7 +43,7 @@ class Suggestion:
     """
 
     solver: diffrax.AbstractSolver
-    weak_order: float
+    weak_order: int
     strong_order: float | None
     path: str
     reason: str

@@ -221,6 +221,16 @@ def test_truncated_path_clips_and_keeps_the_levy_area(optimized):
     np.testing.assert_array_equal(path.evaluate(0.3, 0.3), np.zeros(3))
 
 
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_truncation_bound_is_that_of_the_docstring(k):
+    path = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((3,), jr.key(0)), k=k)
+    # The words of the smallest, of nearly the middle, and of the largest increment.
+    words, h = jnp.array([0, 2**31, 2**32 - 1], jnp.uint32), 0.5
+    bound = np.sqrt(2 * k * h * np.log(2))
+    W = path.increment(words, 1.0, 1.0 + h)
+    np.testing.assert_allclose(W, [-bound, 0, bound], rtol=1e-14, atol=1e-9)
+
+
 @pytest.mark.parametrize("k", [0, -1, 1.5, True, None])
 def test_truncation_needs_a_positive_integer(k):
     with pytest.raises(ValueError, match="`k` must be an integer"):

@@ -13,7 +13,8 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
     each system of a step. Both are given by keyword, after the parameters of the method.
     """
 
-    root_finder: optx.AbstractRootFinder = eqx.field(
+    # `optimistix.root_find` takes either kind of solver.
+    root_finder: optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver = eqx.field(
         default=PicardNewton(), kw_only=True
     )
     root_find_max_steps: int = eqx.field(default=100, kw_only=True)
