@@ -48,6 +48,7 @@ def test_laws_have_the_variance_on_record_and_outcomes_of_their_words():
                 )
     names = lambda path: set(laws_of(path) or ())
     assert names(areas) == {"W", "H", "K"}
+    assert names(weak_path(1, order=3)) == {"W", "second", "third"}
     # The increments with plateaus hold space-time areas alone.
     assert names(ds.PlateauBrownianPath(areas, jr.key(1))) == {"W", "H", "sign"}
 

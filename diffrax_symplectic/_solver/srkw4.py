@@ -11,8 +11,9 @@ from .base import AbstractSymplecticRungeKutta
 def _srkw4(
     a21: float, a31: float = 0.0, a32: float = 0.0, b33: float = 0.0, b: float = 0.0
 ) -> SeparableTableau:
-    """The paper's tableau. Only `a21` is live: the third drift stage feeds nothing, and the
-    second and third noise stage read the same point, so that `b` cancels."""
+    """The paper's tableau. A step depends on none of its parameters but `a21`: the third
+    drift stage is unused, and the second and third noise stage are at the same point, so
+    that `b` cancels."""
     return SeparableTableau(
         alpha=[1 / 2, 1 / 2, 0],
         beta={
@@ -36,10 +37,11 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       \end{pmatrix}, \quad B^0 = \begin{pmatrix} 1 & 0 \\ 0 & 0 \end{pmatrix}, \quad
       A^1 = \begin{pmatrix} -\frac12 & \frac12 \\ \frac12 & \frac12 \end{pmatrix}.$$
 
-    This is the live part. The paper's third drift stage has weight 0, and its two
-    halves of the second noise weight read the same point; its other parameters belong
-    to these. $a_{21}$ matters: 0 and 1/2 make $A^0$ triangular, and
-    $\frac14 \pm \frac{\sqrt 3}{6}$ the Gauss method, of order 4 without noise.
+    These are the coefficients that a step depends on. The paper's third drift stage has
+    weight 0, its second and third noise stages are at the same point, and its other
+    parameters belong to these. For $a_{21} = 0$ and $1/2$ the matrix $A^0$ is triangular;
+    $\frac14 \pm \frac{\sqrt 3}{6}$ make it that of the Gauss method, of order 4 without
+    noise.
 
     Weak order 2: in the paper for one noise, and measured for two and three. A Hamiltonian
     without the structure is refused while tracing.

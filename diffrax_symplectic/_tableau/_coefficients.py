@@ -61,7 +61,7 @@ def variables_of(*coefficients: Mapping[str, np.ndarray]) -> list[str]:
 
 def real_parameter(name: str, value: Any) -> float:
     """A solver's free parameter as a Python float. Parameters decide which stages are
-    live, so they have to be known while tracing.
+    used, so they have to be known while tracing.
 
     Raises a `ValueError` unless `value` is a finite real number.
     """
