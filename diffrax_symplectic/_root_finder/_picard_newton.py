@@ -28,15 +28,16 @@ class PicardNewton(optx.AbstractRootFinder):
 
     - Up to `direct` unknowns: `warmup` fixed-point (Picard) iterations, one of Newton's
         method, and `chords` with the same Jacobian.
-    - Above: `sweeps` fixed-point iterations without a look at the error, and more, up to
-        `picard_steps`, for as long as corrections shrink. They need no Jacobian.
+    - Above: `sweeps` fixed-point iterations, which need no Jacobian, without a look at the
+        error; and as many again, up to `picard_steps`, for as long as corrections shrink.
 
     Where these do not converge, Newton's method solves all stages of the step as one
     system. It tries the whole step first. If its corrections do not shrink, it solves for a
     part of the step, with increments reduced alike, and goes on from there part by part
     (continuation). If the branch of solutions that begins at the start of the step ends
     before the whole step, Newton's method looks for any other solution. Its linear systems
-    are solved densely up to 16 unknowns, and above by GMRES, which needs no matrix.
+    are solved by elimination up to four unknowns, and above by GMRES, which needs no
+    matrix.
 
     **Arguments:**
 
@@ -48,7 +49,7 @@ class PicardNewton(optx.AbstractRootFinder):
         included. `None` is elimination for few unknowns, and otherwise no matrix.
     - `direct`: the most unknowns for which Newton's method is used from the start.
     - `warmup`, `chords`, `sweeps`: see above.
-    - `picard_steps`: the most fixed-point iterations.
+    - `picard_steps`: the most fixed-point iterations, in whole rounds of `sweeps`.
 
     **Raises:** a `ValueError` for negative numbers, or fewer than 2 `sweeps`.
     """
@@ -60,7 +61,7 @@ class PicardNewton(optx.AbstractRootFinder):
     direct: int = eqx.field(default=4, static=True)
     warmup: int = eqx.field(default=3, static=True)
     chords: int = eqx.field(default=1, static=True)
-    sweeps: int = eqx.field(default=9, static=True)
+    sweeps: int = eqx.field(default=10, static=True)
     picard_steps: int = eqx.field(default=40, static=True)
 
     def __check_init__(self):
@@ -89,7 +90,7 @@ class PicardNewton(optx.AbstractRootFinder):
         del f_struct, aux_struct, tags
         phi = lambda y: (y**ω - fn(y, args)[0] ** ω).ω
         first = start(self, phi, y, _scale(options))
-        keep = first.converged | first.contracting
+        keep = first.converged | first.near
         near = jtu.tree_map(lambda a, b: jnp.where(keep, a, b), first.y, y)
         return _continuation.begin(y, near, first.converged)
 

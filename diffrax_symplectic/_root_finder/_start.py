@@ -11,12 +11,16 @@ from equinox.internal import ω
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
+from .._custom_types import IntScalarLike
 from ._small_lu import SmallLU
 from ._tolerance import ratio
 
 
 if TYPE_CHECKING:
     from ._picard_newton import PicardNewton
+
+# A correction below this fraction of the state shows that iteration came near.
+_NEAR = 0.1
 
 _Map = Callable[[PyTree[Array]], PyTree[Array]]
 
@@ -26,13 +30,12 @@ class Start(NamedTuple):
 
     - `y`: the last iterate.
     - `converged`: whether the next correction would be below the tolerance.
-    - `contracting`: whether the corrections became smaller, at least by half each time, so
-        that `y` is a better first guess than the one that these iterations began with.
+    - `near`: whether `y` is a better first guess than the one that they began with.
     """
 
     y: PyTree[Array]
     converged: Bool[Array, ""]
-    contracting: Bool[Array, ""]
+    near: Bool[Array, ""]
 
 
 def size_of(y: PyTree) -> int:
@@ -58,17 +61,20 @@ def converged(
     was `shrink` times as large as the one before, or corrections have `stalled`."""
     # Rounding errors can keep the corrections to a leaf that is small next to the others
     # above `rtol` for ever. Then they no longer shrink, and all of them are tiny.
-    eps = jnp.finfo(size.dtype).eps
-    stagnated = stalled & (finder.tolerance.relative(diff, scale) <= 100 * eps)
+    stagnated = stalled & rounded(finder.tolerance.relative(diff, scale))
     # A fraction of the tolerance: what remains has the same sign in every step, so that
     # over many steps it adds up to a drift where rounding errors would cancel.
     following = size * jnp.where(shrink < 1, shrink, 1)
     return (following <= 1 / 8) | stagnated
 
 
+def rounded(relative: Scalar) -> Bool[Array, ""]:
+    """Whether a correction, relative to the iterate, can be due to rounding errors."""
+    return relative <= 100 * jnp.finfo(relative.dtype).eps
+
+
 def _newton(finder: "PicardNewton", phi: _Map, y: PyTree[Array], scale: _Map) -> Start:
-    for _ in range(finder.warmup):
-        y = phi(y)
+    y = lax.fori_loop(0, finder.warmup, lambda _, y: phi(y), y)
     value, jacobian = jax.linearize(phi, y)
     operator = lx.FunctionLinearOperator(
         lambda x: (x**ω - jacobian(x) ** ω).ω, jax.eval_shape(lambda: y)
@@ -87,36 +93,40 @@ def _newton(finder: "PicardNewton", phi: _Map, y: PyTree[Array], scale: _Map) ->
 
 
 def _picard(finder: "PicardNewton", phi: _Map, y: PyTree[Array], scale: _Map) -> Start:
-    # A look at the error costs several times what an iteration does: XLA fuses no norm
-    # with what its result goes into, and a loop that any path of a batch may leave early
-    # selects between old and new iterate for each.
-    shift = lambda _, ys: (*ys[1:], phi(ys[-1]))
-    # Only of the last three iterations the iterates are kept: to move them costs time.
-    kept = min(finder.sweeps, 3)
-    y = lax.fori_loop(0, finder.sweeps - kept, lambda _, y: phi(y), y)
-    ys = lax.fori_loop(0, kept, shift, (y,) * 4)
-    diffs = [(b**ω - a**ω).ω for a, b in zip(ys, ys[1:])]
-    before, last, size = [finder.tolerance.measure(d, scale(ys[-1])) for d in diffs]
-    # Positions and momenta move each other, so that corrections may shrink in turns: of
-    # the last two ratios the larger one is believed.
-    shrink = jnp.maximum(ratio(size, last), ratio(last, before))
-    stalled = size >= 0.25 * before
-    done = converged(finder, diffs[-1], scale(ys[-1]), size, shrink, stalled)
+    # A look at the error costs as much as an iteration does, and a loop that any path of a
+    # batch may leave selects between its old and its new iterate. So both come only after
+    # several iterations, which are a loop of their own: XLA makes faster code of it than of
+    # iterations written out.
+    advance = lambda _, ys: (ys[1], phi(ys[1]))
 
-    def advance(carry):
-        y, _, _, before, last, step = carry
-        image = phi(y)
-        diff = (y**ω - image**ω).ω
-        size = finder.tolerance.measure(diff, scale(image))
-        shrink = jnp.maximum(ratio(size, last), ratio(last, before))
-        stalled = size >= 0.25 * before
-        done = converged(finder, diff, scale(image), size, shrink, stalled)
-        return image, done, size < 0.25 * before, last, size, step + 1
+    def some(carry: _Rounds) -> _Rounds:
+        before, y = lax.fori_loop(0, finder.sweeps, advance, (carry.y, carry.y))
+        diff = (y**ω - before**ω).ω
+        size = finder.tolerance.measure(diff, scale(y))
+        relative = finder.tolerance.relative(diff, scale(y))
+        # If so many iterations brought the corrections down to the tolerance, each made
+        # them smaller by a large factor: the next one is far below it.
+        stalled = size >= 0.5 * carry.size
+        done = (size <= 1) | (stalled & rounded(relative))
+        near = (relative <= _NEAR) & ~stalled
+        return _Rounds(y, size, done, near, carry.step + finder.sweeps)
 
-    def proceed(carry):
-        _, done, contracting, _, _, step = carry
-        return ~done & contracting & (step < finder.picard_steps)
+    def proceed(carry: _Rounds):
+        return ~carry.done & carry.near & (carry.step < finder.picard_steps)
 
-    carry = (ys[-1], done, shrink < 1, last, size, finder.sweeps)
-    y, done, contracting, *_ = lax.while_loop(proceed, advance, carry)
-    return Start(y, done, contracting)
+    dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).dtype
+    no, yes = jnp.array(False), jnp.array(True)
+    first = _Rounds(y, jnp.array(jnp.inf, dtype), no, yes, 0)
+    last = lax.while_loop(proceed, some, first)
+    return Start(last.y, last.done, last.near)
+
+
+class _Rounds(NamedTuple):
+    """The iterate, the size of its last correction, whether that was small enough, whether
+    iteration comes nearer, and how many iterations there were."""
+
+    y: PyTree[Array]
+    size: Scalar
+    done: Bool[Array, ""]
+    near: Bool[Array, ""]
+    step: IntScalarLike

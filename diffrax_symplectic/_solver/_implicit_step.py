@@ -109,7 +109,7 @@ def _by_blocks(stages: Stages, finder: PicardNewton):
             found = start(
                 finder, image, guess, lambda k, b=block: stages.scale_of(b, k)
             )
-            keep = found.converged | found.contracting
+            keep = found.converged | found.near
             k = jtu.tree_map(lambda a, b: jnp.where(keep, a, b), found.y, guess)
             unsolved = unsolved | ~found.converged
         values = stages.given(block, values, k)
