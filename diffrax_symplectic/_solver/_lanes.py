@@ -1,5 +1,6 @@
 """What only a few paths of a batch need."""
 
+import functools as ft
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -28,6 +29,8 @@ def where_pending(
     those with a path in them for which `pending` holds. This has no derivative.
     """
     dynamic, static = eqx.partition(args, eqx.is_array)
+    treedef = jtu.tree_structure(dynamic)
+    small = max(x.size for x in jtu.tree_leaves(value))
     # Batched more than once, but traced only here.
     call = jax.jit(lambda dynamic, value: fn(eqx.combine(dynamic, static), value))
 
@@ -36,35 +39,49 @@ def where_pending(
         body = lambda carry: (jnp.array(False), call(dynamic, carry[1]))
         return lax.while_loop(lambda carry: carry[0], body, (pending, value))[1]
 
+    # JAX batches a loop again and again until it knows what varies from path to path. This,
+    # the long part of the program, is the same each time.
+    @ft.partial(jax.jit, static_argnums=0)
+    def serve_part(axes, pending, leaves, value):
+        def one(pending, leaves, value):
+            new = call(treedef.unflatten(leaves), value)
+            return jtu.tree_map(lambda a, b: jnp.where(pending, a, b), new, value)
+
+        return jax.vmap(one, in_axes=(0, list(axes), 0))(pending, leaves, value)
+
     @serve.def_vmap
     def serve_batch(size, in_batched, pending, dynamic, value):
         spread = lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape))
         pending, value = jtu.tree_map(
             spread, (pending, value), (in_batched[0], in_batched[2])
         )
-        dynamic_batched = in_batched[1]
         part = -(-size // _PARTS)
-        axes = jtu.tree_map(lambda b: 0 if b else None, dynamic_batched)
+        batched = jtu.tree_leaves(in_batched[1])
 
-        def one(pending, dynamic, value):
-            new = call(dynamic, value)
-            return jtu.tree_map(lambda a, b: jnp.where(pending, a, b), new, value)
+        def cut(x, b, first):
+            if b:
+                return lax.dynamic_slice_in_dim(x, first, part)
+            # What is shared and no larger than the state is repeated, so that it makes no
+            # difference that it is shared.
+            return jnp.broadcast_to(x, (part, *x.shape)) if x.size <= small else x
 
         def body(carry):
             pending, value = carry
             first = jnp.minimum(jnp.argmax(pending), size - part)
-            cut = lambda x: lax.dynamic_slice_in_dim(x, first, part)
-            paste = lambda x, new: lax.dynamic_update_slice_in_dim(x, new, first, 0)
-            some = jtu.tree_map(
-                lambda x, b: cut(x) if b else x, dynamic, dynamic_batched
-            )
-            new = jax.vmap(one, in_axes=(0, axes, 0))(
-                cut(pending), some, jtu.tree_map(cut, value)
-            )
-            done = jnp.zeros(part, bool)
-            return paste(pending, done), jtu.tree_map(paste, value, new)
+            old = jtu.tree_map(lambda x: cut(x, True, first), (pending, value))
+            leaves = [cut(x, b, first) for x, b in zip(all_leaves, batched)]
+            new = serve_part(axes, old[0], leaves, old[1])
+            paste = lambda x, y: lax.dynamic_update_slice_in_dim(x, y, first, 0)
+            pending = paste(pending, jnp.zeros(part, bool))
+            return pending, jtu.tree_map(paste, value, new)
 
-        _, value = lax.while_loop(lambda c: jnp.any(c[0]), body, (pending, value))
+        all_leaves = jtu.tree_leaves(dynamic)
+        axes = tuple(
+            0 if b or x.size <= small else None for x, b in zip(all_leaves, batched)
+        )
+        value = lax.while_loop(lambda carry: jnp.any(carry[0]), body, (pending, value))[
+            1
+        ]
         return value, jtu.tree_map(lambda _: True, value)
 
     return serve(pending, dynamic, value)
