@@ -1,14 +1,14 @@
 """Newton's method that does not give up: the safety net behind the cheap iterations."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.tree_util as jtu
-from equinox.internal import ω
-from jaxtyping import Array, Bool, Int, PyTree, Scalar
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
 from . import _linear
 from ._start import converged
@@ -36,6 +36,25 @@ _LONGER, _SHORTER = 2.0, 0.25
 _SHORTEST = 1e-3
 
 
+class Equations(NamedTuple):
+    """The equations `residual(y) = 0` for all unknowns as one vector, which makes a shorter
+    program than a tree of arrays. `restore` makes the tree again, and `scale` says how
+    large the state is that is changed."""
+
+    residual: Callable[[Float[Array, " n"]], Float[Array, " n"]]
+    restore: Callable[[Float[Array, " n"]], PyTree[Array]]
+    scale: Callable[[PyTree[Array]], PyTree[Array]]
+
+
+def as_vector(
+    residual: Callable, scale: Callable, y: PyTree[Array]
+) -> tuple[Equations, Float[Array, " n"]]:
+    """The equations for a vector in place of a tree, and the vector of `y`."""
+    flat, restore = jfu.ravel_pytree(y)
+    as_flat = lambda y: jfu.ravel_pytree(residual(restore(y)))[0]
+    return Equations(as_flat, restore, scale), flat
+
+
 class State(eqx.Module):
     r"""Where the continuation stands. With the residual $r$ and the origin $k_0$ the
     equations solved for $s \in [0, 1]$ are $(1 - s)(k - k_0) + s\, r(k) = 0$. For $k_0 = 0$
@@ -51,9 +70,9 @@ class State(eqx.Module):
     - `solved`: whether `y` solves the equations of the whole step.
     """
 
-    origin: PyTree[Array]
-    y: PyTree[Array]
-    anchor: PyTree[Array]
+    origin: Float[Array, " n"]
+    y: Float[Array, " n"]
+    anchor: Float[Array, " n"]
     reached: Scalar
     target: Scalar
     tries: Int[Array, ""]
@@ -67,41 +86,43 @@ class State(eqx.Module):
         return self.lost & ~jnp.isfinite(self.size)
 
 
-def begin(origin: PyTree[Array], y: PyTree[Array], solved: Bool[Array, ""]) -> State:
+def begin(
+    origin: Float[Array, " n"], y: Float[Array, " n"], solved: Bool[Array, ""]
+) -> State:
     """First all of the step at once, from the guess `y`."""
-    dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).dtype
     return State(
         origin=origin,
         y=y,
         anchor=origin,
-        reached=jnp.zeros((), dtype),
-        target=jnp.ones((), dtype),
+        reached=jnp.zeros((), y.dtype),
+        target=jnp.ones((), y.dtype),
         tries=jnp.array(0),
-        size=jnp.array(jnp.inf, dtype),
+        size=jnp.array(jnp.inf, y.dtype),
         lost=jnp.array(False),
         solved=solved,
     )
 
 
-def advance(finder: "PicardNewton", residual: Callable, scale, state: State) -> State:
+def advance(finder: "PicardNewton", equations: Equations, state: State) -> State:
     """One iteration of Newton's method, and what follows from its correction."""
     s = state.target
-    value, jacobian = jax.linearize(residual, state.y)
-    part = lambda y, r: ((1 - s) * y**ω + s * r**ω).ω
-    moved = (state.y**ω - state.origin**ω).ω
+    value, jacobian = jax.linearize(equations.residual, state.y)
+    part = lambda y, r: (1 - s) * y + s * r
+    moved = state.y - state.origin
     diff = _linear.solve(
         lambda x: part(x, jacobian(x)), part(moved, value), finder.linear_solver
     )
-    y = (state.y**ω - diff**ω).ω
-    size = finder.tolerance.measure(diff, scale(y))
+    y = state.y - diff
+    tree, scale = equations.restore(diff), equations.scale(equations.restore(y))
+    size = finder.tolerance.measure(tree, scale)
     shrink = jnp.where(state.tries > 0, ratio(size, state.size), 1)
     whole = s == 1
-    solved = whole & converged(finder, diff, scale(y), size, shrink, shrink >= 0.25)
+    solved = whole & converged(finder, tree, scale, size, shrink, shrink >= 0.25)
 
     at_once = whole & (state.reached == 0)
     patience = jnp.where(at_once, _PATIENCE, 2)
     stalled = (state.tries + 1 >= patience) & ~(shrink < _SHRINK)
-    near = finder.tolerance.relative(diff, moved) < _LOOSE
+    near = optx.max_norm(diff) < _LOOSE * optx.max_norm(moved)
     arrived = near & ~whole
     slow = ~whole & (state.tries + 1 >= _PATIENCE_IN_PART)
     back = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~state.lost & ~solved
@@ -110,16 +131,13 @@ def advance(finder: "PicardNewton", residual: Callable, scale, state: State) -> 
     reached = jnp.where(arrived, s, state.reached)
     stride = stride * jnp.where(arrived, _LONGER, jnp.where(back, _SHORTER, 1))
     lost = state.lost | (stride < _SHORTEST)
-    target = jnp.where(lost, 1, jnp.minimum(reached + stride, 1))
-    choose = lambda a, b: jnp.where(back, a, b)
-    fresh = arrived | back
     return State(
         origin=state.origin,
-        y=jtu.tree_map(choose, state.anchor, y),
-        anchor=jtu.tree_map(lambda a, b: jnp.where(arrived, a, b), y, state.anchor),
+        y=jnp.where(back, state.anchor, y),
+        anchor=jnp.where(arrived, y, state.anchor),
         reached=reached,
-        target=target,
-        tries=jnp.where(fresh, 0, state.tries + 1),
+        target=jnp.where(lost, 1, jnp.minimum(reached + stride, 1)),
+        tries=jnp.where(arrived | back, 0, state.tries + 1),
         size=size,
         lost=lost,
         solved=solved,
@@ -131,15 +149,16 @@ def finish(
 ) -> tuple[PyTree[Array], Bool[Array, ""]]:
     """Goes on from `y` until the equations are solved, or `max_steps` iterations spent. The
     solution for no step at all is zero."""
+    equations, flat = as_vector(residual, scale, y)
 
     def body(carry):
         state, step = carry
-        return advance(finder, residual, scale, state), step + 1
+        return advance(finder, equations, state), step + 1
 
     def proceed(carry):
         state, step = carry
         return ~state.solved & ~state.hopeless & (step < max_steps)
 
-    zero = jtu.tree_map(jnp.zeros_like, y)
-    state, _ = jax.lax.while_loop(proceed, body, (begin(zero, y, solved), 0))
-    return state.y, state.solved
+    first = begin(jnp.zeros_like(flat), flat, solved)
+    state, _ = jax.lax.while_loop(proceed, body, (first, 0))
+    return equations.restore(state.y), state.solved

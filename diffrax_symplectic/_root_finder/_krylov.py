@@ -5,7 +5,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int, Scalar
+from jaxtyping import Array, Float, Scalar
+
+from .._custom_types import IntScalarLike
 
 
 # The most directions that are kept; with fewer unknowns, as many as there are.
@@ -19,16 +21,16 @@ _LEAST_REDUCTION = 0.9
 
 
 class _State(NamedTuple):
-    """An iterate `x` and its residual `r`; directions and their images, which are
-    orthonormal; the next direction; how many products there were, and the size of the
-    residual when the directions were last forgotten."""
+    """An iterate `x`, its residual `r` and the size of that; the basis, whose rows are the
+    image of a direction and the direction; the next direction; how many products there
+    were, and the size of the residual when the basis was last forgotten."""
 
     x: Float[Array, " n"]
     r: Float[Array, " n"]
-    directions: Float[Array, "m n"]
-    images: Float[Array, "m n"]
+    size: Scalar
+    basis: Float[Array, "m 2*n"]
     following: Float[Array, " n"]
-    step: Int[Array, ""]
+    step: IntScalarLike
     before: Scalar
 
 
@@ -46,36 +48,34 @@ def gmres(
     n = rhs.size
     m = min(n, _DIRECTIONS)
     norm = lambda x: jnp.sqrt(jnp.sum(x**2))
-    size = norm(rhs)
+    target = _REDUCTION * norm(rhs)
 
     def advance(state: _State) -> _State:
-        x, r, directions, images, p, step, before = state
-        q = apply(p)
-        # Twice, since one pass leaves what rounding errors put there.
-        for _ in range(2):
-            along = images @ q
-            p, q = p - along @ directions, q - along @ images
-        length = norm(q)
-        unit = jnp.where(length > 0, 1 / length, 0)
-        p, q = p * unit, q * unit
-        size_before, along = norm(r), jnp.sum(q * r)
+        x, r, _, basis, p, step, before = state
+        # What rounding errors leave of the other images only makes the method slower:
+        # `x` and `r` belong together whatever the directions are.
+        new = jnp.concatenate([apply(p), p])
+        new = new - (basis[:, :n] @ new[:n]) @ basis
+        length = norm(new[:n])
+        new = new * jnp.where(length > 0, 1 / length, 0)
+        q, p = new[:n], new[n:]
+        along = jnp.sum(q * r)
         x, r = x + along * p, r - along * q
-        j = step % m
-        directions, images = directions.at[j].set(p), images.at[j].set(q)
         size = norm(r)
-        full = j == m - 1
-        forget = lambda stack: jnp.where(full, 0, stack)
-        better = full | (size <= _LEAST_REDUCTION * size_before)
-        p = jnp.where(better, r / size, q)
+        full = step % m == m - 1
+        basis = jnp.where(full, 0, basis.at[step % m].set(new))
+        shrunk = size <= _LEAST_REDUCTION * state.size
+        p = jnp.where(full | shrunk, r / size, q)
         # A cycle that gained nothing ends it.
         stuck = full & ~(size <= _LEAST_REDUCTION * before)
         step = jnp.where(stuck, _MOST_PRODUCTS, step + 1)
         before = jnp.where(full, size, before)
-        return _State(x, r, forget(directions), forget(images), p, step, before)
+        return _State(x, r, size, basis, p, step, before)
 
     def proceed(state: _State):
-        return (norm(state.r) > _REDUCTION * size) & (state.step < _MOST_PRODUCTS)
+        return (state.size > target) & (state.step < _MOST_PRODUCTS)
 
-    none = jnp.zeros((m, n), rhs.dtype)
-    state = _State(jnp.zeros_like(rhs), rhs, none, none, rhs / size, jnp.array(0), size)
+    size = norm(rhs)
+    none = jnp.zeros((m, 2 * n), rhs.dtype)
+    state = _State(jnp.zeros_like(rhs), rhs, size, none, rhs / size, 0, size)
     return lax.while_loop(proceed, advance, state).x

@@ -3,8 +3,8 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
 from equinox.internal import ω
@@ -91,8 +91,9 @@ class PicardNewton(optx.AbstractRootFinder):
         phi = lambda y: (y**ω - fn(y, args)[0] ** ω).ω
         first = start(self, phi, y, _scale(options))
         keep = first.converged | first.near
-        near = jtu.tree_map(lambda a, b: jnp.where(keep, a, b), first.y, y)
-        return _continuation.begin(y, near, first.converged)
+        origin, near = (jfu.ravel_pytree(y)[0] for y in (y, first.y))
+        near = jnp.where(keep, near, origin)
+        return _continuation.begin(origin, near, first.converged)
 
     def step(
         self,
@@ -103,10 +104,12 @@ class PicardNewton(optx.AbstractRootFinder):
         state: _continuation.State,
         tags: frozenset[object],
     ) -> tuple[PyTree[Array], _continuation.State, Any]:
-        del y, tags
+        del tags
         residual = lambda y: fn(y, args)[0]
-        state = _continuation.advance(self, residual, _scale(options), state)
-        return state.y, state, fn(state.y, args)[1]
+        equations, _ = _continuation.as_vector(residual, _scale(options), y)
+        state = _continuation.advance(self, equations, state)
+        y = equations.restore(state.y)
+        return y, state, fn(y, args)[1]
 
     def terminate(
         self,
@@ -134,8 +137,8 @@ class PicardNewton(optx.AbstractRootFinder):
         tags: frozenset[object],
         result: optx.RESULTS,
     ) -> tuple[PyTree[Array], Any, dict[str, Any]]:
-        del fn, y, args, options, tags, result
-        return state.y, aux, {}
+        del fn, args, options, tags, result
+        return jfu.ravel_pytree(y)[1](state.y), aux, {}
 
 
 def _scale(options: dict[str, Any]) -> Callable[[PyTree[Array]], PyTree[Array]]:

@@ -66,7 +66,12 @@ def _implicit_step(
         return stages.end(unknown), unknown, unsolved
     y1, unknown, unsolved = _by_blocks(stages, finder)
     rescue = lambda stages, value: _as_one_system(stages, value, finder, max_steps)
-    return where_pending(rescue, unsolved, stages, (y1, unknown, unsolved))
+    if any(block.explicit for block in stages.plan.blocks):
+        # The end of the step takes further evaluations, only for the paths concerned.
+        return where_pending(rescue, unsolved, stages, (y1, unknown, unsolved))
+    alone = lambda stages, value: rescue(stages, (None, *value))[1:]
+    unknown, unsolved = where_pending(alone, unsolved, stages, (unknown, unsolved))
+    return stages.end(unknown), unknown, unsolved
 
 
 @_implicit_step.def_jvp
