@@ -16,8 +16,8 @@ _DIRECTIONS = 10
 # accuracy than the next one makes up for.
 _REDUCTION = 1e-3
 # The most products, and how much a cycle of all directions has to reduce the residual by.
-_MOST_PRODUCTS = 400
-_LEAST_REDUCTION = 0.9
+_MOST_PRODUCTS = 2000
+_LEAST_REDUCTION = 0.99
 
 
 class _State(NamedTuple):
