@@ -29,9 +29,6 @@ def test_private_parts_of_others_are_used_in_one_module_only():
                 found |= {alias.name for alias in node.names}
             if isinstance(node, ast.ImportFrom) and node.level == 0:
                 found |= {f"{node.module}.{alias.name}" for alias in node.names}
-        # Not yet moved there.
-        if file.parent.name in ("_root_finder", "_solver"):
-            found -= {"equinox.internal.ω", "lineax.internal"}
         if file != root / "_compat.py":
             assert not {name for name in found if private.search(name)}, file
 

@@ -7,9 +7,9 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
-from equinox.internal import ω
 from jaxtyping import Array, Bool, PyTree, Scalar
 
+from .._compat import ω
 from . import _continuation
 from ._start import start
 from ._tolerance import Tolerance

@@ -6,15 +6,22 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
-import lineax.internal as lxi
 import numpy as np
 from jaxtyping import Array, PyTree
+
+from .._compat import (
+    pack_structures,
+    PackedStructures,
+    ravel_vector,
+    transpose_packed_structures,
+    unravel_solution,
+)
 
 
 # Up to this size elimination is written out; its length grows with the cube.
 _MAX_UNROLLED = 4
 
-_State: TypeAlias = tuple[Array, lxi.PackedStructures]
+_State: TypeAlias = tuple[Array, PackedStructures]
 
 
 class SmallLU(lx.AbstractLinearSolver[_State]):
@@ -33,23 +40,23 @@ class SmallLU(lx.AbstractLinearSolver[_State]):
             raise ValueError(
                 "`SmallLU` may only be used for linear solves with square matrices."
             )
-        return _matrix(operator), lxi.pack_structures(operator)
+        return _matrix(operator), pack_structures(operator)
 
     def compute(
         self, state: _State, vector: PyTree[Array], options: dict[str, Any]
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
         del options
         matrix, structures = state
-        rhs = lxi.ravel_vector(vector, structures)
+        rhs = ravel_vector(vector, structures)
         if len(matrix) <= _MAX_UNROLLED:
             solution = _solve_unrolled(matrix, rhs)
         else:
             solution = jnp.linalg.solve(matrix, rhs)
-        return lxi.unravel_solution(solution, structures), lx.RESULTS.successful, {}
+        return unravel_solution(solution, structures), lx.RESULTS.successful, {}
 
     def transpose(self, state: _State, options: dict[str, Any]):
         matrix, structures = state
-        return (matrix.T, lxi.transpose_packed_structures(structures)), options
+        return (matrix.T, transpose_packed_structures(structures)), options
 
     def conj(self, state: _State, options: dict[str, Any]):
         matrix, structures = state

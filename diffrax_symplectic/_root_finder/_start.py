@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
-from equinox.internal import ω
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
+from .._compat import ω
 from .._custom_types import IntScalarLike
 from ._small_lu import SmallLU
 from ._tolerance import ratio

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
-from equinox.internal import ω
 from jaxtyping import Array, Bool
 
+from .._compat import ω
 from .._custom_types import BoolScalarLike, Y
 from .._plan import Plan
 from .._root_finder import differentiate, finish, PicardNewton, start

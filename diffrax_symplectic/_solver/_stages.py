@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from equinox.internal import ω
 from jaxtyping import Array, PyTree
 
+from .._compat import ω
 from .._custom_types import RealScalarLike, Y
 from .._materialize import materialize
 from .._plan import Block, Plan
