@@ -81,8 +81,9 @@ def expectation(
     `fn` is compiled anew for each new function. For many values of a parameter pass one
     function and the parameter as an array, `jax.tree_util.Partial(fn, parameter)`.
     Gradients are taken within: the mean of `jax.grad` of a path is the gradient of the
-    expectation (on one device: `devices=jax.devices()[:1]`). This function itself is no
-    part of a JAX program: it cannot be differentiated, `jit`ted or `vmap`ped.
+    expectation. On several devices the solve needs the adjoint `diffrax.DirectAdjoint()` or
+    `diffrax_symplectic.ReversingAdjoint()`. This function itself is no part of a JAX
+    program: it cannot be differentiated, `jit`ted or `vmap`ped.
 
     **Two levels.** With `levels=2` and `order=p` the function is `fn(key, level)`, which
     solves with the step $h$ on level 0 and with $h/2$ on level 1. `mean` is that of level
@@ -323,9 +324,21 @@ def _batch(fn, key_data, lo_hi, size, impl, mesh: Mesh, n: int):
         return local(lo_hi, size, jax.lax.axis_index("paths"), total)
 
     if mesh.size == 1:
-        # Diffrax's and Optimistix' reverse mode does not work under `shard_map`.
         return local(lo_hi, size)
     specs = PartitionSpec(), PartitionSpec()
-    return jax.shard_map(
+    sharded = jax.shard_map(
         shard, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False
-    )(lo_hi, size)
+    )
+    try:
+        return sharded(lo_hi, size)
+    except ValueError as error:
+        # The loop of Diffrax's default adjoint takes arrays that vary from device to
+        # device for others than those it was made for.
+        if "Closure-converted function" not in str(error):
+            raise
+        raise ValueError(
+            "Reverse mode through `diffrax.RecursiveCheckpointAdjoint`, the default of "
+            "`diffeqsolve`, does not work on several devices. Pass `adjoint="
+            "diffrax_symplectic.ReversingAdjoint()` or `adjoint=diffrax.DirectAdjoint()` "
+            "to `diffeqsolve`, or `devices=jax.devices()[:1]` to `expectation`."
+        ) from error

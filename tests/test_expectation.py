@@ -194,9 +194,9 @@ print(repr(float(e.mean)), repr(float(e.std_error)), e.num_paths)
 """
 
 
-def _start(*args) -> subprocess.Popen:
+def _start(program: str, *args) -> subprocess.Popen:
     root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-    command = [sys.executable, "-c", PROGRAM, *map(str, args)]
+    command = [sys.executable, "-c", program, *map(str, args)]
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env=environment, cwd=root
@@ -216,8 +216,8 @@ def test_the_paths_are_the_same_on_any_devices_and_hosts():
     here = ds.expectation(_square(ds.Midpoint()), jr.key(0), 3001)
     expected = [here.mean, here.std_error, here.num_paths]
     # Three devices of one process; then two processes with two devices each.
-    np.testing.assert_allclose(_read(_start(3)), expected, rtol=1e-12)
-    processes = [_start(2, address, rank) for rank in (0, 1)]
+    np.testing.assert_allclose(_read(_start(PROGRAM, 3)), expected, rtol=1e-12)
+    processes = [_start(PROGRAM, 2, address, rank) for rank in (0, 1)]
     for process in processes:
         np.testing.assert_allclose(_read(process), expected, rtol=1e-12)
 
@@ -258,14 +258,41 @@ def test_paths_that_an_event_ends_are_no_failures():
     assert got.num_failed == 0 and 0.1 < got.mean < 2
 
 
-def test_gradients_are_taken_within():
+def _gradient(adjoint=None):
+    if adjoint is None:
+        adjoint = diffrax.RecursiveCheckpointAdjoint()
+
     def observable(strength, key):
         terms = kubo_terms(ds.WeakBrownianPath((), key), strength)
         y0 = (jnp.array(0.0), jnp.array(1.0))
-        return diffrax.diffeqsolve(terms, ds.SRKw1(), 0.0, 0.5, 0.1, y0).ys[1][-1]
+        sol = diffrax.diffeqsolve(terms, ds.SRKw1(), 0.0, 0.5, 0.1, y0, adjoint=adjoint)
+        return sol.ys[1][-1]
 
-    gradient = jax.tree_util.Partial(jax.grad(observable), jnp.array(0.5))
+    return jax.tree_util.Partial(jax.grad(observable), jnp.array(0.5))
+
+
+GRADIENTS = """
+import jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", 2)
+import jax.random as jr
+import diffrax_symplectic as ds
+from tests.test_expectation import _gradient
+try:
+    ds.expectation(_gradient(), jr.key(0), 100)
+except ValueError as error:
+    assert "does not work on several devices" in str(error), error
+else:
+    assert False
+print(repr(float(ds.expectation(_gradient(ds.ReversingAdjoint()), jr.key(0), 100).mean)))
+"""
+
+
+def test_gradients_are_taken_within():
+    elsewhere = _start(GRADIENTS)
     one = jax.devices()[:1]
-    got = ds.expectation(gradient, jr.key(0), 100, devices=one)
-    expected = np.mean(_by_hand(gradient, jr.key(0), 100))
+    got = ds.expectation(_gradient(), jr.key(0), 100, devices=one)
+    expected = np.mean(_by_hand(_gradient(), jr.key(0), 100))
     np.testing.assert_allclose(got.mean, expected, rtol=1e-12)
+    # On two devices, by an adjoint that works there; the default one is refused.
+    np.testing.assert_allclose(_read(elsewhere), [expected], rtol=1e-12)
