@@ -275,6 +275,7 @@ GRADIENTS = """
 import jax
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
+import diffrax
 import jax.random as jr
 import diffrax_symplectic as ds
 from tests.test_expectation import _gradient
@@ -284,7 +285,8 @@ except ValueError as error:
     assert "does not work on several devices" in str(error), error
 else:
     assert False
-print(repr(float(ds.expectation(_gradient(ds.ReversingAdjoint()), jr.key(0), 100).mean)))
+got = ds.expectation(_gradient(diffrax.DirectAdjoint()), jr.key(0), 100)
+print(repr(float(got.mean)))
 """
 
 
