@@ -43,8 +43,8 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     **Steps:** `diffrax.ConstantStepSize` or `diffrax.StepTo`. **Saving:** `SaveAt(t1=True)`
     or `SaveAt(ts=...)`. No events, no forward mode; no derivatives with respect to times.
 
-    **Parameters:** what gradients are taken of is part of `args`, of the initial state or of
-    the terms. JAX refuses values that a Hamiltonian captures as a closure.
+    **Parameters:** what gradients are taken of is part of `args`, of the initial state or
+    of the terms. JAX refuses values that a Hamiltonian captures as a closure.
 
     **Raises:** a `ValueError`, while tracing, for anything else.
     """
