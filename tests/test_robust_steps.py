@@ -13,6 +13,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._plan import make_plan
+from diffrax_symplectic._root_finder._linear import solve as solve_linear
 from diffrax_symplectic._solver._lanes import where_pending
 
 from .problems import Given
@@ -161,3 +162,11 @@ def test_steps_of_many_unknowns_are_symplectic(solver, d):
 def test_plans_are_made_once_and_soon():
     tableau = ds.SRKw2().tableau.flatten()
     assert make_plan(tableau) is make_plan(ds.SRKw2().tableau.flatten())
+
+
+@pytest.mark.parametrize("n", [2, 12])
+def test_a_linear_system_without_numbers_has_no_solution(n):
+    # If it were zero, a step without finite numbers would pass for solved.
+    for bad in (jnp.nan, jnp.inf):
+        rhs = jnp.ones(n).at[0].set(bad)
+        assert not jnp.all(jnp.isfinite(solve_linear(lambda x: 2 * x, rhs, None)))

@@ -1,6 +1,7 @@
 """Whole solves: strong order, invariants, gradients, failures, bad input."""
 
 import dataclasses
+import os
 import subprocess
 import sys
 
@@ -384,7 +385,9 @@ for solver, path in ((ds.Midpoint(), cut), (ds.SRKw2(), weak)):
     assert abs(p**2 + q**2 - 1) < 1e-5, (solver, p, q)
     assert all(jnp.isfinite(g) for g in grad)
 """
-    subprocess.run([sys.executable, "-c", program], check=True)
+    # The examples, which other tests import, ask for double precision.
+    single = os.environ | {"JAX_ENABLE_X64": "0"}
+    subprocess.run([sys.executable, "-c", program], check=True, env=single)
 
 
 def test_results_under_jit_and_vmap_are_those_without():

@@ -37,7 +37,8 @@ class _State(NamedTuple):
 def gmres(
     apply: Callable[[Array], Array], rhs: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """An `x` with `apply(x)` near `rhs`, or one that is no nearer than this can reach.
+    """An `x` with `apply(x)` near `rhs`, or one that is no nearer than this can reach. It
+    is NaN if `rhs` is not finite.
 
     Restarted GMRES as "adaptive simpler GMRES" by Jiranek and Rozloznik (Numerical
     Algorithms 53, 2010, 93-112): images of directions are kept orthonormal, so that the
@@ -78,4 +79,6 @@ def gmres(
     size = norm(rhs)
     none = jnp.zeros((m, 2 * n), rhs.dtype)
     state = _State(jnp.zeros_like(rhs), rhs, size, none, rhs / size, 0, size)
-    return lax.while_loop(proceed, advance, state).x
+    x = lax.while_loop(proceed, advance, state).x
+    # Nothing was solved where there is no number to begin with.
+    return jnp.where(jnp.isfinite(size), x, jnp.nan)
