@@ -79,9 +79,8 @@ def where_pending(
         axes = tuple(
             0 if b or x.size <= small else None for x, b in zip(all_leaves, batched)
         )
-        value = lax.while_loop(lambda carry: jnp.any(carry[0]), body, (pending, value))[
-            1
-        ]
+        some_pending = lambda carry: jnp.any(carry[0])
+        _, value = lax.while_loop(some_pending, body, (pending, value))
         return value, jtu.tree_map(lambda _: True, value)
 
     return serve(pending, dynamic, value)
