@@ -116,7 +116,7 @@ def row(system: Callable, d: int) -> list[str]:
         return lambda keys, q0: jax.value_and_grad(mean(keys))(q0)
 
     # Compilation of one program differs by a tenth from run to run.
-    repeats = 3 if d in (1, 16) else 1
+    repeats = 2 if d in (1, 16) else 1
     solvers = {"Heun": HEUN, "Midpoint": ds.Midpoint()}
     if d in (1, 16, 64):
         solvers |= {"StrangGauss": ds.StrangGauss(), "SRKw2": ds.SRKw2()}
