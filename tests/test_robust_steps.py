@@ -170,3 +170,12 @@ def test_a_linear_system_without_numbers_has_no_solution(n):
     for bad in (jnp.nan, jnp.inf):
         rhs = jnp.ones(n).at[0].set(bad)
         assert not jnp.all(jnp.isfinite(solve_linear(lambda x: 2 * x, rhs, None)))
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
+@pytest.mark.parametrize("n", [2, 12])
+def test_units_make_no_difference_to_linear_systems(n, scale):
+    # Squares of these numbers are zero, or infinite, in single precision.
+    rhs = scale * jnp.arange(1, n + 1, dtype=jnp.float32)
+    got = solve_linear(lambda x: 2 * x, rhs, None)
+    np.testing.assert_allclose(got, rhs / 2, rtol=1e-2)

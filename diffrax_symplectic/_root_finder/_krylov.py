@@ -49,7 +49,7 @@ def gmres(
     n = rhs.size
     m = min(n, _DIRECTIONS)
     norm = lambda x: jnp.sqrt(jnp.sum(x**2))
-    target = _REDUCTION * norm(rhs)
+    start = norm(rhs)
 
     def advance(state: _State) -> _State:
         x, r, _, basis, p, step, before = state
@@ -74,11 +74,10 @@ def gmres(
         return _State(x, r, size, basis, p, step, before)
 
     def proceed(state: _State):
-        return (state.size > target) & (state.step < _MOST_PRODUCTS)
+        return (state.size > _REDUCTION * start) & (state.step < _MOST_PRODUCTS)
 
-    size = norm(rhs)
     none = jnp.zeros((m, 2 * n), rhs.dtype)
-    state = _State(jnp.zeros_like(rhs), rhs, size, none, rhs / size, 0, size)
+    state = _State(jnp.zeros_like(rhs), rhs, start, none, rhs / start, 0, start)
     x = lax.while_loop(proceed, advance, state).x
     # Nothing was solved where there is no number to begin with.
-    return jnp.where(jnp.isfinite(size), x, jnp.nan)
+    return jnp.where(jnp.isfinite(start), x, jnp.nan)

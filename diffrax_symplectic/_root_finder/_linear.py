@@ -25,12 +25,13 @@ def solve(
     """The `x` with `apply(x) = rhs`, or something that is not finite, or inexact, if there
     is none: nothing is raised. By `linear_solver`, or if that is `None` by elimination for
     a few unknowns and by GMRES, which needs no matrix, for more."""
-    if linear_solver is None and rhs.size > MAX_DENSE:
-        return _krylov.gmres(apply, rhs)
-    linear_solver = SmallLU() if linear_solver is None else linear_solver
-    # An absolute tolerance refers to a right-hand side of size one.
+    # An absolute tolerance refers to a right-hand side of size one, and squares of very
+    # small or large numbers are zero or infinite.
     size = optx.max_norm(rhs)
     size = jnp.where(size > 0, size, 1)
+    if linear_solver is None and rhs.size > MAX_DENSE:
+        return _krylov.gmres(apply, rhs / size) * size
+    linear_solver = SmallLU() if linear_solver is None else linear_solver
     operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: rhs))
     state: Any = linear_solver.init(operator, {})
     x, *_ = linear_solver.compute(state, rhs / size, {})

@@ -104,9 +104,10 @@ def _picard(finder: "PicardNewton", phi: _Map, y: PyTree[Array], scale: _Map) ->
         diff = (y**ω - before**ω).ω
         size = finder.tolerance.measure(diff, scale(y))
         relative = finder.tolerance.relative(diff, scale(y))
-        # If so many iterations brought the corrections down to the tolerance, each made
-        # them smaller by a large factor: the next one is far below it.
         stalled = size >= 0.5 * carry.size
+        # If so many iterations brought the corrections down to the tolerance, each made
+        # them smaller by a large factor: the next one is far below it. What rounding errors
+        # make of a small leaf does not become smaller.
         done = (size <= 1) | (stalled & rounded(relative))
         near = (relative <= _NEAR) & ~stalled
         return _Rounds(y, size, done, near, carry.step + finder.sweeps)
