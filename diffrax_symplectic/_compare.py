@@ -192,19 +192,7 @@ def compare_solvers(
     cell = min(dts) / _FINER
 
     def end(solver, path, dt):
-        sol = diffrax.diffeqsolve(
-            make_terms(path),
-            solver,
-            t0,
-            t1,
-            dt,
-            y0,
-            args,
-            max_steps=None,
-            adjoint=diffrax.ForwardMode(),
-            throw=False,
-        )
-        return jtu.tree_map(lambda y: y[-1], sol.ys), sol.result
+        return _end(make_terms(path), solver, t0, t1, dt, y0, args)
 
     def sample(solver, dt, key):
         y1, result = end(solver, _path(solver, shape, key, want), dt)
@@ -238,6 +226,22 @@ def compare_solvers(
                 failed = estimate.num_failed
             steps.append(ComparedStep(name, dt, error, bar, seconds, failed))
     return Comparison("strong" if phi is None else "weak", tuple(steps), refused)
+
+
+def _end(terms, solver, t0, t1, dt, y0, args) -> tuple[Y, diffrax.RESULTS]:
+    sol = diffrax.diffeqsolve(
+        terms,
+        solver,
+        t0,
+        t1,
+        dt,
+        y0,
+        args,
+        max_steps=None,
+        adjoint=diffrax.ForwardMode(),
+        throw=False,
+    )
+    return jtu.tree_map(lambda y: y[-1], sol.ys), sol.result
 
 
 def _those_that_fit(solvers, solve: Callable) -> tuple[dict, dict[str, str]]:

@@ -49,20 +49,12 @@ def transfer_expectations(
             u = jnp.moveaxis(jnp.tensordot(to_coefficients, u, (1, axis)), 0, axis)
         return u.astype(flat.dtype)
 
-    def evaluate(u, x):
-        T = [jnp.ones_like(x), x]
-        for _ in range(degree - 1):
-            T.append(2 * x * T[-1] - T[-2])
-        for axis in range(n):
-            u = jnp.tensordot(jnp.stack(T)[:, axis], u, 1)
-        return u
-
     @briefly
     def back(u, h, box0, box1):
         """The polynomial on `box0` of that on `box1`, and the mean from the centre."""
 
         def fn(y):
-            return evaluate(u, (ravel(y) - box1[0]) / box1[1]), ravel(y)
+            return _chebyshev_series(u, (ravel(y) - box1[0]) / box1[1]), ravel(y)
 
         def expected(x):
             y = unravel(box0[0] + box0[1] * x)
@@ -75,24 +67,32 @@ def transfer_expectations(
     def at_end(box):
         return fit(jax.vmap(lambda x: phi(unravel(box[0] + box[1] * x)))(grid))
 
-    at_start = briefly(lambda u: evaluate(u, jnp.zeros(n)))
+    at_start = briefly(lambda u: _chebyshev_series(u, jnp.zeros(n)))
     out = []
     for h in hs:
         steps = round(t1 / h)
         width = lambda i: np.asarray(widths) * np.sqrt((i + 1) * h)
         u = jnp.zeros((degree + 1,) * n)
-        centres = [flat]
+        boxes = [(flat, width(0))]
         for i in range(steps):
-            box = centres[-1], width(i)
-            centres.append(back(u, h, box, box)[1])
-        box = centres[-1], width(steps)
-        u = at_end(box)
+            _, centre = back(u, h, boxes[i], boxes[i])
+            boxes.append((centre, width(i + 1)))
+        u = at_end(boxes[-1])
         for i in reversed(range(steps)):
-            before = centres[i], width(i)
-            u, _ = back(u, h, before, box)
-            box = before
+            u, _ = back(u, h, boxes[i], boxes[i + 1])
         out.append(float(at_start(u)))
     return np.array(out)
+
+
+def _chebyshev_series(coefficients, x):
+    """The polynomial with a coefficient for each product of Chebyshev polynomials, one
+    in each variable, at the point `x`."""
+    T = [jnp.ones_like(x), x]
+    for _ in range(len(coefficients) - 2):
+        T.append(2 * x * T[-1] - T[-2])
+    for axis in range(len(x)):
+        coefficients = jnp.tensordot(jnp.stack(T)[:, axis], coefficients, 1)
+    return coefficients
 
 
 def transfer_weak_errors(

@@ -126,34 +126,15 @@ def quasi_expectation(
     coordinates of Sobol' points (21,201). Warns if there are so many coordinates to sort by
     that sorting does not bring neighbours together.
     """
-    num_paths = _whole("num_paths", num_paths, 2)
-    if num_paths & (num_paths - 1):
-        raise ValueError(
-            "`num_paths` must be a power of two, of which Sobol' points are balanced; got "
-            f"{num_paths}. Pass {2 ** (num_paths.bit_length() - 1)} or "
-            f"{2 ** num_paths.bit_length()}."
-        )
+    num_paths = _power_of_two("num_paths", num_paths)
     replicates = _whole("replicates", replicates, 2)
     levels = _whole("levels", levels, 1)
     check_key(key, "quasi_expectation")
     if tol is not None and not tol > 0:
         raise ValueError(f"`tol` must be positive, or `None`; got {tol!r}.")
     num_steps, saved_steps = _steps(t0, t1, dt0, ts)
-    y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
-    dtype = jnp.result_type(*jtu.tree_leaves(y0))
-    words = layout(terms)
-    if not 0 < words.num_words <= MAX_DIMENSION:
-        raise ValueError(
-            f"`terms` need {words.num_words:,} random variables in each step. There have "
-            f"to be some, and at most {MAX_DIMENSION:,}, as Sobol' points have. "
-            "Use `expectation`."
-        )
-    sort_by = _state if sort_by is None else sort_by
-    _check_functions(phi, sort_by, t0, y0, args, num_paths)
-    points = jnp.asarray(sobol_points(num_paths, words.num_words))
-    problem = Problem(
-        phi, sort_by, terms, solver, jnp.asarray(t0, dtype), y0, args, points, words
-    )
+    problem = _problem(phi, sort_by, terms, solver, t0, y0, args, num_paths)
+    dtype = problem.t0.dtype
     order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
     devices = tuple(jax.local_devices() if devices is None else devices)
     mesh = Mesh(np.array(devices), ("replicates",))
@@ -184,6 +165,23 @@ def quasi_expectation(
     finally:
         progress_meter.close(meter)
     return estimate(values, num_failed, order, tol)
+
+
+def _problem(phi, sort_by, terms, solver, t0, y0, args, num_paths: int) -> Problem:
+    """What all replicates share. Raises for what they cannot do."""
+    y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+    t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
+    words = layout(terms)
+    if not 0 < words.num_words <= MAX_DIMENSION:
+        raise ValueError(
+            f"`terms` need {words.num_words:,} random variables in each step. There have "
+            f"to be some, and at most {MAX_DIMENSION:,}, as Sobol' points have. "
+            "Use `expectation`."
+        )
+    sort_by = _state if sort_by is None else sort_by
+    _check_functions(phi, sort_by, t0, y0, args, num_paths)
+    points = jnp.asarray(sobol_points(num_paths, words.num_words))
+    return Problem(phi, sort_by, terms, solver, t0, y0, args, points, words)
 
 
 @eqx.filter_jit
@@ -224,6 +222,16 @@ def _whole(name: str, value, least: int) -> int:
     return int(value)
 
 
+def _power_of_two(name: str, value) -> int:
+    whole = _whole(name, value, 2)
+    if whole & (whole - 1):
+        raise ValueError(
+            f"`{name}` must be a power of two, of which Sobol' points are balanced; got "
+            f"{whole}. Pass {2 ** (whole.bit_length() - 1)} or {2 ** whole.bit_length()}."
+        )
+    return whole
+
+
 def _steps(t0, t1, dt0, ts) -> tuple[np.integer, np.ndarray]:
     """How many steps there are, and after how many of them to average."""
     t0, t1, dt0 = float(t0), float(t1), float(dt0)
@@ -250,8 +258,7 @@ def _steps(t0, t1, dt0, ts) -> tuple[np.integer, np.ndarray]:
 
 
 def _check_functions(phi, sort_by, t0, y0, args, num_paths: int) -> None:
-    time = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
-    out = jtu.tree_leaves(eqx.filter_eval_shape(phi, time, y0, args))
+    out = jtu.tree_leaves(eqx.filter_eval_shape(phi, t0, y0, args))
     batch = jtu.tree_map(lambda x: x[None], y0)
     by = eqx.filter_eval_shape(lambda y: jtu.tree_leaves(jax.vmap(sort_by)(y)), batch)
     for name, leaves in (("phi", out), ("sort_by", by)):
@@ -271,5 +278,5 @@ def _check_functions(phi, sort_by, t0, y0, args, num_paths: int) -> None:
             f"{along:.1f} along each of them: neighbours are far apart, and "
             "`quasi_expectation` gains little over `expectation`. Pass `sort_by` with the "
             f"few coordinates that matter most, {int(math.log(num_paths, 3))} at most.",
-            stacklevel=3,
+            stacklevel=4,
         )
