@@ -160,7 +160,8 @@ def suggest_solver(
     commute = (
         m == 1 or has["separable"] or has["additive"] or commuting(noise, t0, y0, args)
     )
-    one_array = len(noise) == 1 and jtu.all_leaves([_shape(brownian_paths(noise)[0])])
+    shape = _shape(brownian_paths(noise)[0])
+    one_array = len(noise) == 1 and jtu.all_leaves([shape])
     found = []
     for rule in RULES:
         fits = rule.want == want and has[rule.structure]
@@ -169,7 +170,7 @@ def suggest_solver(
         if rule.path == "Lévy areas":
             fits = fits and one_array
         if fits and rule.solver not in [type(s.solver) for s in found]:
-            found.append(_suggestion(rule, terms, commute))
+            found.append(_suggestion(rule, terms, shape, commute))
     structure = [name for name in has if has[name] and name != "any"]
     kind = (
         " and ".join(structure) or f"general ({getattr(not_separable, 'reason', '')})"
@@ -199,7 +200,7 @@ def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     return drift, noise
 
 
-def _suggestion(rule: Rule, terms: diffrax.AbstractTerm, commute: bool) -> Suggestion:
+def _suggestion(rule: Rule, terms: diffrax.AbstractTerm, shape, commute) -> Suggestion:
     solver: Any = rule.solver()
     # The orders of noises that commute are those of one noise.
     counted = terms
@@ -211,7 +212,7 @@ def _suggestion(rule: Rule, terms: diffrax.AbstractTerm, commute: bool) -> Sugge
         solver=solver,
         weak_order=solver.weak_order(counted),
         strong_order=solver.strong_order(counted),
-        path=kind.code.format(shape=_shape_code(brownian_paths(terms)[0])),
+        path=kind.code.format(shape=_shape_code(shape)),
         reason=rule.reason,
         terms=jtu.Partial(_with_paths, kind.make, terms),
     )
@@ -238,8 +239,7 @@ def _shape(path: _Path) -> PyTree[jax.ShapeDtypeStruct]:
     return eqx.filter_eval_shape(path.evaluate, 0.0, 1.0)
 
 
-def _shape_code(path: _Path) -> str:
-    shape = _shape(path)
+def _shape_code(shape: PyTree[jax.ShapeDtypeStruct]) -> str:
     if not isinstance(shape, jax.ShapeDtypeStruct):
         return "shape"
     if shape.dtype == jnp.result_type(float):
