@@ -1,7 +1,5 @@
 """Terms from Hamiltonians: values, structures, derivatives, and use with Diffrax."""
 
-from typing import NamedTuple
-
 import diffrax
 import equinox as eqx
 import jax
@@ -343,32 +341,3 @@ def test_time_dependent_noise_in_single_precision():
     t0, t1, h = jnp.array([0.0, 0.2, 0.1], jnp.float32)
     ys = diffrax.diffeqsolve(terms, ds.NinomiyaVictoir(), t0, t1, h, y0, args).ys
     assert ys[0].dtype == jnp.float32 and jnp.all(jnp.isfinite(ys[0]))
-
-
-def test_named_pairs_and_half_precision_are_refused():
-    class Pair(NamedTuple):
-        p: jax.Array
-        q: jax.Array
-
-    y0, args = random_problem(jr.key(0), 1, 1)
-    terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
-    with pytest.raises(ValueError, match=r"is a pair `\(p, q\)`"):
-        diffrax.diffeqsolve(terms, ds.Midpoint(), 0.0, 0.2, 0.1, Pair(*y0), args)
-    half = jax.tree.map(lambda x: x.astype(jnp.float16), y0)
-    with pytest.raises(ValueError, match="float32 or float64"):
-        ds.Midpoint().init(terms, 0.0, 0.1, half, args)
-
-
-def test_implicit_tableaus_need_an_implicit_solver():
-    class Mine(ds.AbstractSymplecticRungeKutta):
-        tableau = ds.Midpoint().tableau
-
-        def order(self, terms):
-            return 2
-
-    y0, args = random_problem(jr.key(0), 1, 1)
-    terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
-    with pytest.raises(
-        ValueError, match="also subclass `diffrax_symplectic.AbstractImplicitStages`"
-    ):
-        diffrax.diffeqsolve(terms, Mine(), 0.0, 0.2, 0.1, y0, args)

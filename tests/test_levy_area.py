@@ -1,0 +1,106 @@
+"""The law of Lévy areas, exact moments first, and areas over cells."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from .problems import FineSample, Given
+
+
+def _areas(n, m=3, terms=8, h=1.0, cell=None):
+    """`n` samples of `W`, `H` and `A` over a step."""
+
+    def draw(key):
+        k_path, k_area = jr.split(key)
+        path = diffrax.UnsafeBrownianPath((m,), k_path, diffrax.SpaceTimeLevyArea)
+        path = ds.LevyAreaBrownianPath(path, k_area, terms=terms, cell=cell)
+        increment = path.evaluate(0.0, h, use_levy=True)
+        return increment.W, increment.H, increment.A
+
+    return jax.jit(jax.vmap(draw))(jr.split(jr.key(1), n))
+
+
+@pytest.mark.parametrize("terms, cell", [(0, None), (8, None), (0, 0.25)])
+def test_areas_have_the_covariances_and_kurtosis_of_the_law(terms, cell):
+    n, h = 200_000, 0.5
+    W, H, A = _areas(n, terms=terms, h=h, cell=cell)
+    np.testing.assert_allclose(A, -np.swapaxes(A, 1, 2), atol=1e-14)
+    scale = np.sqrt(h)
+    W, H, a, b = W / scale, H / scale, A[:, 0, 1] / h, A[:, 0, 2] / h
+    bridge = H[:, 0] * W[:, 1] - H[:, 1] * W[:, 0]
+    # Lévy's area has the characteristic function 1 / cosh(u / 2): E A^4 = 5 / 16. Given W,
+    # E(A_01^2) = 1 / 12 + (W_0^2 + W_1^2) / 12 and E(A_01 A_02) = W_1 W_2 / 12.
+    for sample, exact in (
+        (a, 0),
+        (a**2, 1 / 4),
+        (a * b, 0),
+        (a**4, 5 / 16),
+        (a**2 * W[:, 0] ** 2, 1 / 12 + (3 + 1) / 12),
+        (a * b * W[:, 1] * W[:, 2], 1 / 12),
+        (a * W[:, 0] * W[:, 1], 0),
+        (a * bridge, 2 / 12),
+        (H[:, 0] ** 2, 1 / 12),
+        (H[:, 0] * W[:, 0], 0),
+    ):
+        assert abs(np.mean(sample) - exact) <= 4 * np.std(sample) / np.sqrt(n)
+
+
+@pytest.mark.parametrize("terms", [0, 3])
+def test_bridge_areas_have_their_moments_given_the_integral(terms):
+    # Given W and H the area A_01 has the mean H_0 W_1 - H_1 W_0 and the variance
+    # 1 / 20 + (H_0^2 + H_1^2) / 5, and Cov(A_01, A_02) = H_1 H_2 / 5 (Davie; Foster).
+    n = 100_000
+    W, H = jnp.array([0.7, -1.0, 0.4]), jnp.array([0.3, -0.5, 0.2])
+
+    def draw(key):
+        path = ds.LevyAreaBrownianPath(Given(W, H), key, terms=terms)
+        return path.evaluate(0.0, 1.0, use_levy=True).A
+
+    A = jax.jit(jax.vmap(draw))(jr.split(jr.key(0), n))
+    mean = np.outer(H, W) - np.outer(W, H)
+    a, b = (A[:, 0, k] - mean[0, k] for k in (1, 2))
+    for sample, exact in (
+        (a, 0),
+        (a**2, 1 / 20 + (H[0] ** 2 + H[1] ** 2) / 5),
+        (a * b, H[1] * H[2] / 5),
+    ):
+        assert abs(np.mean(sample) - exact) <= 4 * np.std(sample) / np.sqrt(n)
+
+
+def test_kurtosis_without_terms_is_short_of_the_law_and_terms_mend_it():
+    # Exact: the bridge's area given H is Gaussian without terms. Its fourth moment
+    # falls short of the law's by the kurtosis of a sum of products of Gaussians.
+    draw = lambda terms: _areas(400_000, m=2, terms=terms)
+    short, mended = (
+        np.mean((A[:, 0, 1] - H[:, 0] * W[:, 1] + H[:, 1] * W[:, 0]) ** 4)
+        for W, H, A in (draw(0), draw(8))
+    )
+    # The bridge's own area has cumulants sum_r 2 E(r-th term): variance 1 / 12 and fourth
+    # moment 3 / 144 + 12 sum_r (1 / (2 pi r))^4 = 3 / 144 + 1 / 120.
+    assert abs(mended - (3 / 144 + 1 / 120)) <= 0.02 * mended
+    assert short < mended
+
+
+def test_areas_over_cells_follow_chens_rule():
+    sample = FineSample.draw(jr.key(0), 32, 3)
+    path = ds.LevyAreaBrownianPath(sample, jr.key(1), terms=2, cell=1 / 16)
+    evaluate = jax.jit(lambda a, b: path.evaluate(a, b, use_levy=True))
+    whole = evaluate(0.25, 0.75)
+    left, right = evaluate(0.25, 0.5), evaluate(0.5, 0.75 + 1e-12)
+    outer = np.outer(left.W, right.W)
+    expected = left.A + right.A + (outer - outer.T) / 2
+    np.testing.assert_allclose(whole.A, expected, atol=1e-14)
+    np.testing.assert_allclose(whole.W, left.W + right.W, atol=1e-14)
+    # Increments and space-time areas are those of the path inside.
+    direct = sample.evaluate(0.25, 0.75, use_levy=True)
+    np.testing.assert_allclose(whole.W, direct.W, atol=1e-14)
+    np.testing.assert_allclose(whole.H, direct.H, atol=1e-14)
+    only_W = jax.jit(lambda a, b: path.evaluate(a, b))(0.25, 0.75)
+    np.testing.assert_allclose(only_W, whole.W, atol=1e-14)
+    with pytest.raises(Exception, match="multiples of `cell`"):
+        evaluate(0.25, 0.7)
