@@ -261,7 +261,7 @@ def test_missing_random_variables_are_refused_with_advice(solver, path, advice):
         _solve(noise, solver, path, adjoint=diffrax.ForwardMode())
 
 
-def test_levy_areas_are_declared():
+def test_solvers_declare_the_levy_area_that_they_need():
     assert ds.SRKs4().minimal_levy_area is diffrax.AbstractSpaceTimeLevyArea
     assert ds.SRKw5().minimal_levy_area is ds.WeakIncrement
     assert ds.Midpoint().minimal_levy_area is diffrax.AbstractBrownianIncrement

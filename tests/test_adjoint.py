@@ -125,7 +125,7 @@ def test_gradients_are_those_of_checkpointing(case):
         np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
-def test_gradients_in_single_precision():
+def test_gradients_in_single_precision_are_those_of_checkpointing():
     saveat = diffrax.SaveAt(t1=True)
     for a, b in zip(*gradients(ds.StormerVerlet(), kicks, saveat, jnp.float32)):
         assert a.dtype == jnp.float32

@@ -178,7 +178,7 @@ def test_explicit_methods_are_weak_order_two(solver, m):
     np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 
 
-def test_stormer_verlet_is_what_it_says():
+def test_stormer_verlet_drifts_half_a_step_kicks_and_drifts_again():
     y0, args = separable_problem(jr.key(0), 2, 2)
     t0, h, W = 0.3, 0.1, jnp.array([0.4, -0.3])
     terms = ds.hamiltonian_terms(H0, noise, Given(W))

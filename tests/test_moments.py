@@ -94,7 +94,7 @@ def _after(solver, h, steps, y0=(1.0, 0.0)):
 
 
 @all_solvers
-def test_excess_per_step_and_growth_over_25_000_steps(solver, excess):
+def test_moments_grow_by_the_exact_excess_of_each_of_25_000_steps(solver, excess):
     h = 0.2
     R, r = _linear_step(solver.tableau, h)
     np.testing.assert_allclose(R.T @ R, np.eye(2), atol=1e-14)

@@ -58,7 +58,7 @@ def test_sampled_moments_are_within_four_standard_errors():
         assert abs(shifted.mean()) <= 4 / np.sqrt(n)
 
 
-def test_mixed_integrals_are_the_formulas():
+def test_mixed_integrals_are_those_of_the_formulas():
     for key in range(20):  # until all kinds of values have been seen
         path = weak_path(3, jr.key(key), two_point=True)
         inc = path.evaluate(0.0, 0.2, use_levy=True)

@@ -125,7 +125,7 @@ _STEPS = np.array([2.0**-k for k in (3, 4, 5, 6)])
 
 
 @pytest.mark.parametrize("noise, m", [(_one, 1), (_two_that_commute, 2)])
-def test_strong_order_three_halves(noise, m):
+def test_strong_order_is_three_halves(noise, m):
     """Neither is separable, and the drift depends on time, the noise in the first, too."""
     y0, fine, samples = (jnp.array(0.3), jnp.array(0.8)), 2**9, 200
 
@@ -146,7 +146,7 @@ def test_strong_order_three_halves(noise, m):
     assert abs(measured - 1.5) <= 0.1, measured
 
 
-def test_weak_order_two():
+def test_weak_order_is_two():
     levy = diffrax.SpaceTimeLevyArea
     path = diffrax.UnsafeBrownianPath((1,), jr.key(0), levy)
     # In this one no leading error of a test function happens to be small.
@@ -188,7 +188,7 @@ def test_a_shared_quadratic_invariant_is_conserved():
     assert abs(jnp.linalg.norm(sol.ys[-1]) - 1) <= 1e-14
 
 
-def test_gradients_and_failures_in_a_batch():
+def test_a_failed_path_of_a_batch_leaves_values_and_gradients_of_the_others():
     H0 = lambda t, p, q, args: args * p**2 / 2 + q**4 / 4
     given = Given(jnp.array([0.3]), H=jnp.array([0.1]))
     terms = ds.hamiltonian_terms(H0, _one, given)
@@ -205,7 +205,7 @@ def test_gradients_and_failures_in_a_batch():
     np.testing.assert_allclose(gradient, (q[1] - q[3]) / 2e-5, rtol=1e-7)
 
 
-def test_drift_alone_noise_alone_and_paths_without_area():
+def test_drift_or_noise_alone_will_do_but_not_a_path_without_area():
     y0 = jnp.array(0.3), jnp.array(0.8)
     levy = diffrax.SpaceTimeLevyArea
     path = diffrax.UnsafeBrownianPath((1,), jr.key(0), levy)

@@ -171,7 +171,7 @@ def test_weights_of_levels_cancel_powers_of_the_step_size():
     np.testing.assert_allclose([got.mean, got.bias, got.std_error], [1.0, 1.0, 1.0])
 
 
-def test_times_of_averaging_and_failed_paths():
+def test_means_are_taken_at_the_times_given_over_paths_that_have_not_failed():
     def drift(t, y, args):
         # All go up by one in the first step. What is also kicked downwards fails later.
         lost = (t > 0.15) & (y < 0.9)
@@ -202,7 +202,7 @@ def test_it_stops_at_the_tolerance_with_the_replicates_of_the_whole():
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_solvers_of_diffrax_in_both_precisions(dtype):
+def test_solvers_of_diffrax_work_in_both_precisions(dtype):
     shape, area = jax.ShapeDtypeStruct((1,), dtype), diffrax.SpaceTimeLevyArea
     path = ds.FixedStepBrownianPath(shape, jr.key(0), levy_area=area)
     drift = diffrax.ODETerm(lambda t, y, args: -y)
@@ -227,7 +227,7 @@ print([float(x).hex() for x in _estimate(replicates=5, tol=1e-12).replicates])
 """
 
 
-def test_one_device_or_eight_the_same_numbers():
+def test_one_device_and_eight_give_the_same_numbers():
     root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}
     out = subprocess.run(

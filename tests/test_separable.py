@@ -211,7 +211,7 @@ def test_srks2_is_the_midpoint_rule():
         np.testing.assert_allclose(a, b, atol=1e-15)
 
 
-def test_kick_then_drift_is_what_it_says():
+def test_srkw3_c_is_a_kick_and_a_midpoint_step():
     W = jnp.array([0.4, -0.3])
     y0, args = _problem(jr.key(0), 2, 2)
     terms = ds.hamiltonian_terms(H0, noise, Given(W))
@@ -264,7 +264,7 @@ def test_unused_halves_of_gradients_are_not_computed():
     [(s, m) for s in (ds.SRKs2(), ds.SRKs3(), ds.StormerVerlet()) for m in (1, 2)],
     ids=repr,
 )
-def test_strong_order_one(solver, m):
+def test_strong_order_is_one(solver, m):
     y0, args = _problem(jr.key(3), 1, m)
     steps, fine = [2.0**-k for k in (4, 5, 6, 7)], 2**11
 

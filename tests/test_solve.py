@@ -54,13 +54,13 @@ def _strong_slope(solver, m, steps, reference, samples=200):
 
 
 @pytest.mark.parametrize("solver", [ds.Midpoint(), ds.SRKs1()], ids=repr)
-def test_strong_order_one_for_one_noise(solver):
+def test_strong_order_is_one_for_one_noise(solver):
     steps = [2.0**-k for k in (4, 5, 6, 7)]
     assert abs(_strong_slope(solver, 1, steps, reference=11) - 1) <= 0.1
 
 
 @pytest.mark.parametrize("solver", [ds.Midpoint(), ds.SRKs1()], ids=repr)
-def test_strong_order_half_for_two_noises_that_do_not_commute(solver):
+def test_strong_order_is_half_for_two_noises_that_do_not_commute(solver):
     steps = [2.0**-k for k in (4, 5, 6, 7)]
     # Clearly below 1 too: otherwise the noises of this test would commute.
     assert 0.45 <= _strong_slope(solver, 2, steps, reference=11) <= 0.85

@@ -172,7 +172,9 @@ def test_a_singular_linear_step_is_reported():
     "name, limit",
     [("StormerVerlet", 2), ("PlateauVerlet", 4), ("Midpoint", None)],
 )
-def test_stiff_limits(name, limit):
+def test_explicit_steps_are_stable_up_to_their_limit_and_implicit_ones_always(
+    name, limit
+):
     # h times the fastest frequency.
     omegas = np.array([0.1, 1.0, 1.99, 2.01, 3.99, 4.01, 10.0])
     radii = stiff.spectral_radii(stiff.CASES[name], omegas / stiff.fastest())
@@ -188,7 +190,7 @@ def test_explicit_methods_that_are_not_symplectic_have_no_stable_step():
     np.testing.assert_allclose(radii, np.sqrt(1 + omegas**4 / 4), rtol=1e-10)
 
 
-def test_stiff_nonlinear_energies():
+def test_nonlinear_energies_are_kept_up_to_the_linear_limit():
     hs = np.array([0.5, 1.8, 2.2]) / stiff.fastest()
     midpoint = stiff.energies(stiff.CASES["Midpoint"], hs, 2.0, 256)
     verlet = stiff.energies(stiff.CASES["StormerVerlet"], hs, 2.0, 256)

@@ -201,7 +201,7 @@ def test_noise_alone_can_be_solved():
     np.testing.assert_allclose(y[0], expected, rtol=1e-13)
 
 
-def test_backwards_in_time():
+def test_a_solve_backward_in_time_returns_to_its_start():
     y0, args = random_problem(jr.key(0), 1, 1)
     terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
     there = diffrax.diffeqsolve(terms, ds.Midpoint(), 0.0, 1.0, 0.1, y0, args).ys
@@ -334,7 +334,7 @@ def test_integer_times_are_times():
     np.testing.assert_allclose(value(0, 1), value(0.0, 1.0), rtol=1e-14)
 
 
-def test_time_dependent_noise_in_single_precision():
+def test_time_dependent_noise_works_in_single_precision():
     y0, args = random_problem(jr.key(0), 1, 2, jnp.float32)
     path = weak_path(2, jr.key(0), jnp.float32, two_point=True)
     terms = ds.hamiltonian_terms(H0, noise, path)
