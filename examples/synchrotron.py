@@ -154,12 +154,12 @@ def figure_6a(full: bool) -> None:
     exact, value = transfer_weak_errors(
         make_terms_one_noise,
         solvers,
-        "SRKw4(a21=0)",
         Y0,
         phi,
         hs,
         widths=(1.0, 0.5),
         degree=14,
+        reference="SRKw4(a21=0)",
     )
     sampled = {
         name: sampled_weak_error(
