@@ -26,6 +26,9 @@ if jaxlib.__version__.startswith("0.10.") and not OPTIMIZED:
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_disable_most_optimizations", not OPTIMIZED)
+# Nobody looks up which lines an operation of a compiled program comes from, and to write
+# them down takes a tenth of the time.
+jax.config.update("jax_traceback_in_locations_limit", 0)
 
 # Tracing makes millions of objects that live on: to look through them every few hundred
 # takes a third of its time.

@@ -198,6 +198,12 @@ def test_wrappers_make_the_same_step_from_words_as_from_keys():
             np.testing.assert_allclose(a, b, rtol=1e-14)
         W = wrapped.increment(given[:2], t0, t1)
         np.testing.assert_allclose(W, wrapped.evaluate(t0, t1), rtol=1e-14)
+        # From its end to its start it is the same step.
+        back = wrapped.evaluate(t1, t0, use_levy=True)
+        np.testing.assert_allclose(back.dt, -expected.dt, rtol=1e-14)
+        for name in {"W", "H", "sign", "C", "A"} & {*dir(back)}:
+            a, b = getattr(back, name), getattr(expected, name)
+            np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
 def test_bad_arguments_are_refused():

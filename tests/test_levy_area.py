@@ -104,3 +104,9 @@ def test_areas_over_cells_follow_chens_rule():
     np.testing.assert_allclose(only_W, whole.W, atol=1e-14)
     with pytest.raises(Exception, match="multiples of `cell`"):
         evaluate(0.25, 0.7)
+
+
+def test_one_noise_has_no_area():
+    inside = Given(jnp.array([0.7]), jnp.array([0.3]))
+    path = ds.LevyAreaBrownianPath(inside, jr.key(0), terms=1)
+    np.testing.assert_array_equal(path.evaluate(0.0, 1.0, use_levy=True).A, [[0.0]])

@@ -9,6 +9,8 @@ import pytest
 
 import diffrax_symplectic as ds
 
+from .problems import Given
+
 
 @pytest.mark.parametrize("k", [1, 2, 4])
 @pytest.mark.parametrize("h", [0.2, 0.01, 1e-4])
@@ -66,3 +68,9 @@ def test_truncation_needs_steps_shorter_than_one():
     path = ds.TruncatedBrownianPath(diffrax.UnsafeBrownianPath((), jr.key(0)))
     with pytest.raises(Exception, match="shorter than one unit of time"):
         jax.block_until_ready(jax.jit(lambda t: path.evaluate(0.0, t))(1.0))
+
+
+def test_an_empty_step_has_no_increment():
+    # In a batch, paths that have ended take empty steps until all have.
+    path = ds.TruncatedBrownianPath(Given(jnp.array([5.0, -5.0])), k=1)
+    np.testing.assert_array_equal(path.evaluate(0.5, 0.5), [0.0, 0.0])
