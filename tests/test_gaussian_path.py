@@ -176,13 +176,15 @@ def test_backward_in_time_a_solve_returns_to_its_start(cell):
 
 
 def test_wrappers_make_the_same_step_from_words_as_from_keys():
-    t0, t1, key = jnp.array(0.5), jnp.array(0.75), jr.key(6)
+    t0, t1, key = jnp.array(0.5), jnp.array(0.75), jr.key(7)
     at = words.place_of(t0, t1)
     path = ds.FixedStepBrownianPath((2,), key, AREA)
     own = words.random_words(key, at, 2, 2).reshape(-1)
     more = lambda n, begin: words.random_words(key, at, 1, n, begin)[0]
     areas = ds.LevyAreaBrownianPath(path, key, terms=1)
     plateaus = ds.PlateauBrownianPath(path, key)
+    # The signs are the first bits: those of the words that the path takes are others.
+    assert np.all(more(2, 0) >> 31 != more(2, words.PLATEAU_WORDS) >> 31)
     for wrapped, given in (
         (path, own),
         (ds.TruncatedBrownianPath(path, k=1), own),
@@ -200,7 +202,7 @@ def test_wrappers_make_the_same_step_from_words_as_from_keys():
         np.testing.assert_allclose(W, wrapped.evaluate(t0, t1), rtol=1e-14)
         # From its end to its start it is the same step.
         back = wrapped.evaluate(t1, t0, use_levy=True)
-        np.testing.assert_allclose(back.dt, -expected.dt, rtol=1e-14)
+        assert (expected.dt, back.dt) == (t1 - t0, t0 - t1)
         for name in {"W", "H", "sign", "C", "A"} & {*dir(back)}:
             a, b = getattr(back, name), getattr(expected, name)
             np.testing.assert_allclose(a, b, rtol=1e-12)
