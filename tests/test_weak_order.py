@@ -116,7 +116,13 @@ def test_kubo_moments_match_the_matrix_recursion():
 
 def test_expectation_needs_one_path_of_a_known_law():
     y0 = (jnp.array(0.0), jnp.array(1.0))
-    cut = ds.TruncatedBrownianPath(diffrax.UnsafeBrownianPath((), jr.key(0)))
-    terms = kubo_terms(cut)
-    with pytest.raises(ValueError, match="exactly one Brownian path"):
-        ds.step_expectation(terms, ds.Midpoint(), 0.0, 0.1, y0, fn=lambda y: y[0])
+    area = diffrax.SpaceTimeLevyArea
+    cut = ds.TruncatedBrownianPath(diffrax.UnsafeBrownianPath((), jr.key(0), area))
+    known, other = (kubo_terms(ds.WeakBrownianPath((), jr.key(i))) for i in (0, 1))
+    for terms in (
+        kubo_terms(cut),
+        kubo_terms(ds.PlateauBrownianPath(cut, jr.key(1))),
+        diffrax.MultiTerm(known, other.terms[1]),
+    ):
+        with pytest.raises(ValueError, match="exactly one Brownian path"):
+            ds.step_expectation(terms, ds.Midpoint(), 0.0, 0.1, y0, fn=lambda y: y[0])
