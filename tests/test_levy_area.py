@@ -102,8 +102,10 @@ def test_areas_over_cells_follow_chens_rule():
     np.testing.assert_allclose(whole.H, direct.H, atol=1e-14)
     only_W = jax.jit(lambda a, b: path.evaluate(a, b))(0.25, 0.75)
     np.testing.assert_allclose(only_W, whole.W, atol=1e-14)
-    with pytest.raises(Exception, match="multiples of `cell`"):
-        evaluate(0.25, 0.7)
+    # The start, the end, the end by a little, and the order of the two.
+    for t0, t1 in ((0.2, 0.75), (0.25, 0.7), (0.25, 0.7505), (0.75, 0.25)):
+        with pytest.raises(Exception, match="multiples of `cell`"):
+            evaluate(t0, t1)
 
 
 def test_one_noise_has_no_area():
