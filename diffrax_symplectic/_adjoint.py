@@ -253,11 +253,7 @@ def _solve_bwd(
     _, *is_perturbed = perturbed
     diff, nondiff = eqx.partition(parameters, is_perturbed)
     g = jtu.tree_map(
-        lambda x, g: (
-            jnp.zeros(jnp.shape(x)[:0] + (1, *jnp.shape(x)), x.dtype)
-            if g is None
-            else g
-        ),
+        lambda x, g: jnp.zeros((1, *jnp.shape(x)), x.dtype) if g is None else g,
         y1,
         grad_out[0].save_state.ys,
         is_leaf=lambda x: x is None,
