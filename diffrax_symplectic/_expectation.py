@@ -179,8 +179,10 @@ def expectation(
     key = jr.fold_in(key, 0xFFFFFFFF)
     try:
         difference = run(_Difference(fn), key, num_coupled, before, None, _no_meter)
-    except ExpectationInterrupted as interrupt:
-        estimate = dataclasses.replace(estimate, difference=interrupt.estimate)
+    except KeyboardInterrupt as interrupt:
+        # While the program of the second level is traced, there is no estimate by it yet.
+        difference = getattr(interrupt, "estimate", before)
+        estimate = dataclasses.replace(estimate, difference=difference)
         raise ExpectationInterrupted(estimate) from None
     return dataclasses.replace(estimate, difference=difference)
 
@@ -238,7 +240,7 @@ def _run(
         return _batch(fn, key_data, lo_hi, size, impl, mesh, batch_size)
 
     # JAX caches this trace and uses it for the first batch.
-    shapes = eqx.filter_eval_shape(batch, min(first, num_paths - 1))
+    shapes = eqx.filter_eval_shape(batch, first)
     estimate = initial(shapes[2], key_data, start, num_paths)
     running = collections.deque()
     meter = progress_meter.init()

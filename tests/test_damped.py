@@ -111,4 +111,25 @@ def test_a_traced_friction_that_is_negative_fails_its_path_alone():
         sol = diffrax.diffeqsolve(terms, solver, 0.0, 0.5, 0.1, y0, throw=False)
         return sol.result == diffrax.RESULTS.successful
 
-    np.testing.assert_array_equal(run(jnp.array([0.5, -0.5])), [True, False])
+    gammas = jnp.array([0.5, -0.5, jnp.inf, jnp.nan])
+    np.testing.assert_array_equal(run(gammas), [True, False, False, False])
+
+
+def test_orders_are_those_of_the_splitting_where_the_solver_has_higher_ones():
+    terms = ds.hamiltonian_terms(_oscillator, _force, weak_path(1))
+    orders = lambda solver: [
+        getattr(ds.Damped(solver, 1.0), name)(terms)
+        for name in ("order", "weak_order", "strong_order")
+    ]
+    assert orders(ds.NinomiyaVictoir()) == [2, 2, None]
+    assert orders(ds.AdditiveGauss())[1] == 2
+    assert orders(ds.PlateauVerlet())[2] == 1.0
+    assert orders(ds.SRKs1()) == [2, 1, 1.0]
+
+
+def test_between_steps_a_solution_is_interpolated_between_their_ends():
+    terms = ds.hamiltonian_terms(_oscillator, _force, Given(jnp.array([0.3])))
+    solver, y0 = ds.Damped(ds.StormerVerlet(), 1.0), (jnp.ones(2), jnp.ones(2))
+    y1, _, dense, *_ = solver.step(terms, 0.0, 0.1, y0, None, None, False)
+    np.testing.assert_array_equal(dense["y0"], y0)
+    np.testing.assert_array_equal(dense["y1"], y1)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic import _expectation
+from diffrax_symplectic._estimate import merge
 
 from .problems import kubo_terms, RecordingMeter
 
@@ -137,6 +139,50 @@ def test_a_pair_of_paths_fails_if_one_of_them_does():
     got = ds.expectation(phi, jr.key(1), 64, levels=2, order=2)
     assert got.num_failed == 0 and got.difference.num_paths < 4
     assert got.difference.num_paths + got.difference.num_failed == 4
+
+
+def test_two_pairs_at_least_are_coupled_and_none_is_lost():
+    phi = lambda key, level: jr.normal(key) * (1 + level)
+    run = lambda n, **kwargs: ds.expectation(
+        phi, jr.key(1), n, levels=2, order=1, **kwargs
+    )
+    few = run(5)
+    assert few.difference.num_paths == 2
+    # More than a sixteenth, which are kept where it goes on.
+    more = run(16, num_coupled=8)
+    assert run(32, start=more).difference.num_paths == 8
+    assert run(16, num_coupled=8, start=more).num_paths == 16
+
+
+def test_an_interrupt_on_the_second_level_keeps_the_first(monkeypatch):
+    def traced(key, level):
+        if level == 1:
+            raise KeyboardInterrupt
+        return jr.normal(key)
+
+    run = lambda phi, **kwargs: ds.expectation(
+        phi, jr.key(1), 16, levels=2, order=1, **kwargs
+    )
+    with pytest.raises(ds.ExpectationInterrupted) as info:
+        run(traced)
+    estimate = info.value.estimate
+    assert (estimate.num_paths, estimate.order, estimate.bias) == (16, 1, None)
+
+    def interrupted(estimate, batch):
+        raise KeyboardInterrupt
+
+    # One batch on each level.
+    phi, merges = (
+        lambda key, level: jr.normal(key) * 2**level,
+        iter([merge, interrupted]),
+    )
+    monkeypatch.setattr(_expectation, "merge", lambda *args: next(merges)(*args))
+    with pytest.raises(ds.ExpectationInterrupted) as info:
+        run(phi)
+    estimate = info.value.estimate
+    assert (estimate.num_paths, estimate.difference.num_paths) == (16, 0)
+    monkeypatch.undo()
+    assert run(phi, start=estimate).bias == run(phi).bias
 
 
 @pytest.mark.parametrize(
