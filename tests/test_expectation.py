@@ -108,13 +108,16 @@ def _square(solver, steps=10):
 def test_the_estimate_of_a_solve_is_its_exact_expectation():
     # Midpoint turns by 2 atan((h + I) / 2): the moments of the method in closed form.
     n, h = 10, 0.1
-    got = ds.expectation(_square(ds.Midpoint(), n), jr.key(0), 20_000)
+    phi = _square(ds.Midpoint(), n)
+    got = ds.expectation(phi, jr.key(0), 20_000)
     increments = np.sqrt(3 * h) * np.array([-1, 0, 1])
     twice = 4 * np.arctan((h + increments) / 2)
     exact = (1 + (np.exp(1j * twice) @ np.array([1, 4, 1]) / 6) ** n).real / 2
     assert got.num_failed == 0
     assert abs(got.mean - exact) <= 4 * got.std_error
     assert 0 < got.std_error < 0.01
+    # Where no path is left to solve it stays as it is.
+    assert ds.expectation(phi, jr.key(0), 20_000, start=got).mean == got.mean
 
 
 def test_an_interrupt_loses_only_what_is_running():
