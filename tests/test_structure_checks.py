@@ -179,6 +179,10 @@ def test_friction_in_a_second_term_is_not_blamed_on_the_hamiltonian():
         with pytest.raises(ValueError, match="beside that of H0.*`Damped") as info:
             ds.StormerVerlet().init(both, 0.0, 0.1, _positive_state, None)
         assert "dH0/dq" not in str(info.value)
+    # A drift alone is that of H0, whatever it was made from.
+    alone = diffrax.MultiTerm(friction, terms.terms[1])
+    with pytest.raises(ValueError, match=r"d\(dH0/dq\)/dp does not vanish"):
+        ds.StormerVerlet().init(alone, 0.0, 0.1, _positive_state, None)
     # What could not be tested is not said to be friction.
     nowhere = diffrax.ODETerm(lambda t, y, args: (jnp.sqrt(-1 - y[0] ** 2), 0 * y[1]))
     with pytest.raises(ValueError, match="could not be tested"):
