@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._structure_checks import commuting
 
 
 def _solve(H0, noise, solver=None, args=None):
@@ -94,6 +95,18 @@ def test_structure_that_cannot_be_tested_is_refused():
     nowhere = lambda t, p, q, args: jnp.sum(p**2 + jnp.sqrt(-1 - (p * q) ** 2))
     with pytest.raises(ValueError, match="could not be tested"):
         _solve(nowhere, _good_noise)
+
+
+def test_noises_commute_only_if_that_could_be_tested():
+    path = ds.WeakBrownianPath((2,), jr.key(0))
+    for second, expected in (
+        (lambda p, q: jnp.sum(p * q) ** 2, True),
+        (lambda p, q: jnp.sum(p), False),
+        (lambda p, q: jnp.sum(jnp.sqrt(-1 - (p * q) ** 2)), False),
+    ):
+        noise = lambda t, p, q, args: jnp.stack([jnp.sum(p * q), second(p, q)])
+        term = ds.hamiltonian_terms(_good_H0, noise, path).terms[1]
+        assert commuting((term,), 0.0, _positive_state, None) == expected
 
 
 def _guarded(H0):
