@@ -15,6 +15,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
+from ._arguments import check_solver, check_takes
 from ._brownian import (
     FixedStepBrownianPath,
     LevyAreaBrownianPath,
@@ -180,8 +181,9 @@ def compare_solvers(
     is named there with the reason, and the others are compared.
 
     **Raises:** a `ValueError` if a step size does not divide the interval or is no multiple
-    of the smallest.
+    of the smallest, if `phi` does not return one number, and for what is no solver.
     """
+    check_takes("make_terms", make_terms, "path")
     dts = _checked_steps(t0, t1, dts)
     want = "paths" if phi is None else "expectations"
     terms = make_terms(WeakBrownianPath(shape, key))
@@ -189,6 +191,9 @@ def compare_solvers(
     reference = suggestions[0].solver if reference is None else reference
     if solvers is None:
         solvers = [s.solver for s in suggestions]
+    _check_solvers(solvers, reference)
+    if phi is not None:
+        _check_scalar(phi, y0)
     cell = min(dts) / _FINER
 
     def end(solver, path, dt):
@@ -256,7 +261,27 @@ def _those_that_fit(solvers, solve: Callable) -> tuple[dict, dict[str, str]]:
     return named, refused
 
 
+def _check_solvers(solvers, reference) -> None:
+    if not isinstance(solvers, Sequence) or isinstance(solvers, str):
+        raise ValueError(f"`solvers` must be a list of solvers; got {solvers!r}.")
+    for solver in solvers:
+        check_solver("solvers", solver)
+    check_solver("reference", reference)
+
+
+def _check_scalar(phi, y0: Y) -> None:
+    check_takes("phi", phi, "y")
+    out = eqx.filter_eval_shape(lambda y: jtu.tree_map(jnp.asarray, phi(y)), y0)
+    shapes = [leaf.shape for leaf in jtu.tree_leaves(out)]
+    if shapes != [()]:
+        raise ValueError(f"`phi` must return one number; got {eqx.tree_pformat(out)}.")
+
+
 def _checked_steps(t0, t1, dts: Sequence[float]) -> list[float]:
+    if not t1 > t0:
+        raise ValueError(f"`t1` must be after `t0`; got t0={t0!r} and t1={t1!r}.")
+    if np.ndim(dts) != 1:
+        raise ValueError(f"`dts` must be a list of step sizes; got {dts!r}.")
     whole = lambda x: math.isfinite(x) and x > 0.5 and abs(x - round(x)) < 1e-6
     for dt in dts:
         if not dt or not whole((t1 - t0) / dt) or not whole(dt / min(dts)):

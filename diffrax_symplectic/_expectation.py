@@ -16,6 +16,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
+from ._arguments import whole_number
 from ._brownian import check_key
 from ._estimate import (
     Expectation,
@@ -151,8 +152,8 @@ def expectation(
     on_cpu = devices[0].platform == "cpu"
     if batch_size is None:
         batch_size = 32768 if on_cpu else 262144
-    num_paths = _positive("num_paths", num_paths)
-    batch_size = _positive("batch_size", batch_size)
+    num_paths = whole_number("num_paths", num_paths)
+    batch_size = whole_number("batch_size", batch_size)
     check_key(key, "expectation")
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jr.wrap_key_data(key)
@@ -166,9 +167,9 @@ def expectation(
             "`levels` must be 1, or 2 with `order=`, the weak order of the solver; got "
             f"levels={levels!r} and order={order!r}."
         )
-    order = _positive("order", order)
+    order = whole_number("order", order)
     if num_coupled is not None:
-        num_coupled = _positive("num_coupled", num_coupled)
+        num_coupled = whole_number("num_coupled", num_coupled)
     estimate = run(_Level(fn, 0), key, num_paths, start, tol, progress_meter)
     estimate = dataclasses.replace(estimate, order=order)
     before = estimate.difference
@@ -264,13 +265,6 @@ def _run(
     return finished(estimate, tol)
 
 
-def _positive(name: str, value) -> int:
-    integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not integer or value < 1:
-        raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
-    return int(value)
-
-
 def _evaluate(fn: _Sample, key) -> tuple[PyTree[Array], Array]:
     """What `fn` returns, and whether the path succeeded."""
     out = fn(key)
@@ -284,6 +278,8 @@ def _evaluate(fn: _Sample, key) -> tuple[PyTree[Array], Array]:
             "Return a pair `(phi, sol.result)`, so that paths that failed are left out."
         )
     out = jtu.tree_map(jnp.asarray, out)
+    if len(jtu.tree_leaves(out)) == 0:
+        raise ValueError(f"`fn` must return arrays, which are averaged; got {out!r}.")
     for leaf in jtu.tree_leaves(out):
         success = success & jnp.all(jnp.isfinite(leaf))
     return out, success

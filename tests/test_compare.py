@@ -67,3 +67,25 @@ def test_weak_error_is_within_its_bars(monkeypatch):
 def test_steps_that_do_not_divide_the_interval_are_refused(dts):
     with pytest.raises(ValueError, match="`dts`"):
         ds.compare_solvers(_make_terms, Y0, 0.0, 1.0, dts=dts, key=jr.key(0))
+
+
+@pytest.mark.parametrize(
+    "message, kwargs",
+    [
+        ("`dts` must be a list of step sizes; got 0.5", dict(dts=0.5)),
+        ("`t1` must be after `t0`", dict(t1=-1.0)),
+        (r"called as `make_terms\(path\)`", dict(make_terms="terms")),
+        ("`solvers` must be a list of solvers", dict(solvers=ds.Midpoint())),
+        (r"a solver, as `Midpoint\(\)`", dict(solvers=[ds.Midpoint])),
+        ("`reference` must be a solver", dict(reference="Midpoint")),
+        (
+            r"called as `phi\(y\)`; got .* `\(t, y, args\)`",
+            dict(phi=lambda t, y, args: y),
+        ),
+        ("`phi` must return one number", dict(phi=lambda y: y)),
+    ],
+)
+def test_bad_input_is_told_what_to_pass(message, kwargs):
+    kwargs = dict(make_terms=_make_terms, t1=1.0, dts=[0.5], key=jr.key(0)) | kwargs
+    with pytest.raises(ValueError, match=message):
+        ds.compare_solvers(y0=Y0, t0=0.0, **kwargs)

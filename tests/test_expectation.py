@@ -172,6 +172,11 @@ def test_complex_values_are_refused():
         ds.expectation(lambda key: jr.normal(key) * 1j, jr.key(0), 10)
 
 
+def test_functions_that_return_nothing_are_refused():
+    with pytest.raises(ValueError, match="`fn` must return arrays"):
+        ds.expectation(lambda key: None, jr.key(0), 10)
+
+
 def test_old_style_keys_will_do():
     a = ds.expectation(_normal, jr.PRNGKey(1), 100)
     np.testing.assert_array_equal(

@@ -252,7 +252,7 @@ def test_equal_paths_are_one_brownian_motion():
         ("`num_paths` must be a power of two", dict(num_paths=1000)),
         ("`num_paths` must be an integer", dict(num_paths=1)),
         ("`replicates` must be an integer, 2 or larger", dict(replicates=1)),
-        ("`levels` must be an integer", dict(levels=0)),
+        ("`levels` must be a positive integer", dict(levels=0)),
         ("`tol` must be positive", dict(tol=0.0)),
         ("whole number of steps", dict(ts=[0.25])),
         ("whole number of steps", dict(t1=0.95)),
@@ -261,6 +261,11 @@ def test_equal_paths_are_one_brownian_motion():
         ("`phi` must return real arrays", dict(phi=lambda t, y, a: 1j * y[0])),
         ("`sort_by` must return real arrays", dict(sort_by=lambda y: None)),
         ("needs a random key", dict(key=3)),
+        ("`phi` must return real arrays", dict(phi=lambda t, y, a: None)),
+        (r"called as `phi\(t, y, args\)`; got .* `\(y\)`", dict(phi=lambda y: y[0])),
+        (r"called as `sort_by\(y\)`", dict(sort_by=lambda t, y, args: y)),
+        (r"a solver, as `StormerVerlet\(\)`", dict(solver=ds.StormerVerlet)),
+        ("`dt0` must be a number", dict(dt0=None)),
     ],
 )
 def test_bad_input_is_told_what_to_pass(message, kwargs):

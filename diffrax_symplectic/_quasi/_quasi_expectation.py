@@ -15,6 +15,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
+from .._arguments import check_solver, check_takes, whole_number
 from .._brownian import check_key
 from .._custom_types import Args, RealScalarLike, Y
 from ._chain import coordinates, Problem, replicate
@@ -127,9 +128,10 @@ def quasi_expectation(
     that sorting does not bring neighbours together.
     """
     num_paths = _power_of_two("num_paths", num_paths)
-    replicates = _whole("replicates", replicates, 2)
-    levels = _whole("levels", levels, 1)
+    replicates = whole_number("replicates", replicates, 2)
+    levels = whole_number("levels", levels, 1)
     check_key(key, "quasi_expectation")
+    check_solver("solver", solver)
     if tol is not None and not tol > 0:
         raise ValueError(f"`tol` must be positive, or `None`; got {tol!r}.")
     num_steps, saved_steps = _steps(t0, t1, dt0, ts)
@@ -213,17 +215,8 @@ def _state(y: Y) -> Y:
     return y
 
 
-def _whole(name: str, value, least: int) -> int:
-    integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not integer or value < least:
-        raise ValueError(
-            f"`{name}` must be an integer, {least} or larger; got {value!r}."
-        )
-    return int(value)
-
-
 def _power_of_two(name: str, value) -> int:
-    whole = _whole(name, value, 2)
+    whole = whole_number(name, value, 2)
     if whole & (whole - 1):
         raise ValueError(
             f"`{name}` must be a power of two, of which Sobol' points are balanced; got "
@@ -234,6 +227,8 @@ def _power_of_two(name: str, value) -> int:
 
 def _steps(t0, t1, dt0, ts) -> tuple[np.integer, np.ndarray]:
     """How many steps there are, and after how many of them to average."""
+    if dt0 is None:
+        raise ValueError("`dt0` must be a number: steps are fixed; got None.")
     t0, t1, dt0 = float(t0), float(t1), float(dt0)
     if not (dt0 > 0 and t1 > t0):
         raise ValueError(
@@ -258,16 +253,19 @@ def _steps(t0, t1, dt0, ts) -> tuple[np.integer, np.ndarray]:
 
 
 def _check_functions(phi, sort_by, t0, y0, args, num_paths: int) -> None:
+    check_takes("phi", phi, "t", "y", "args")
+    check_takes("sort_by", sort_by, "y")
     out = jtu.tree_leaves(eqx.filter_eval_shape(phi, t0, y0, args))
     batch = jtu.tree_map(lambda x: x[None], y0)
     by = eqx.filter_eval_shape(lambda y: jtu.tree_leaves(jax.vmap(sort_by)(y)), batch)
     for name, leaves in (("phi", out), ("sort_by", by)):
         kinds = jnp.floating, jnp.integer, jnp.bool_
-        real = lambda s: any(jnp.issubdtype(s.dtype, kind) for kind in kinds)
+        real = lambda s: any(jnp.issubdtype(jnp.result_type(s), k) for k in kinds)
         if len(leaves) == 0 or not all(map(real, leaves)):
             raise ValueError(
                 f"`{name}` must return real arrays; got dtypes "
-                f"{[str(s.dtype) for s in leaves]}. Return real and imaginary parts."
+                f"{[str(jnp.result_type(s)) for s in leaves]}. Return real and imaginary "
+                "parts."
             )
     dimension = jax.eval_shape(lambda y: coordinates(sort_by, y), batch).shape[1]
     # How many of the paths, sorted, there are along each coordinate.
