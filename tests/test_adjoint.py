@@ -11,6 +11,8 @@ from diffrax._term import WrapTerm
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._adjoint import _undoes_its_steps
+from diffrax_symplectic._own_inverse import is_own_inverse
+from diffrax_symplectic._tableau import FlatTableau, Stage
 
 from .problems import Given, H0, noise, random_problem, weak_path
 
@@ -58,6 +60,17 @@ def test_solvers_that_do_not_undo_their_steps_are_refused():
         *[ds.PlateauVerlet(), ds.AdditiveGauss(), diffrax.Heun()],
     )
     assert not any(map(_undoes_its_steps, refused))
+
+
+def test_own_inverses_mirror_the_times_of_stages_and_read_no_areas_of_time():
+    def midpoint(c, channels=("h", "W")):
+        stages = (Stage(channels, c, "y", "y"),)
+        return FlatTableau(stages, np.array([[0.5]]), np.array([1.0]))
+
+    assert is_own_inverse(midpoint(0.5))
+    assert not is_own_inverse(midpoint(0.3))
+    # A space-time area keeps its sign backward in time.
+    assert not is_own_inverse(midpoint(0.5, ("h", "H")))
 
 
 class Spring(eqx.Module):
