@@ -72,6 +72,13 @@ def test_own_inverses_mirror_the_times_of_stages_and_read_no_areas_of_time():
     # A space-time area keeps its sign backward in time.
     assert not is_own_inverse(midpoint(0.5, ("h", "H")))
 
+    def two_kicks(*weights):
+        stages = tuple(Stage(("h",), c, "q", "p") for c in (0.25, 0.75))
+        return FlatTableau(stages, np.zeros((2, 2)), np.array(weights))
+
+    assert is_own_inverse(two_kicks(0.5, 0.5))
+    assert not is_own_inverse(two_kicks(0.3, 0.7))
+
 
 class Spring(eqx.Module):
     stiffness: jax.Array
