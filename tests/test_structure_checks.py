@@ -97,6 +97,26 @@ def test_structure_that_cannot_be_tested_is_refused():
         _solve(nowhere, _good_noise)
 
 
+def test_one_coupled_array_of_several_is_enough_to_refuse():
+    H0 = lambda t, p, q, args: p["a"] ** 2 + q["a"] ** 2 + p["b"] * q["b"]
+    noise = lambda t, p, q, args: q["a"]
+    terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+    one = {"a": jnp.ones(()), "b": jnp.ones(())}
+    with pytest.raises(ValueError, match="does not vanish"):
+        ds.StormerVerlet().init(terms, 0.0, 0.1, (one, one), None)
+
+
+def test_keys_may_be_traced_where_numbers_decide():
+    H0 = lambda t, p, q, args: jnp.sum((p - q) ** 2 / 2 + p * q)
+    terms = lambda key: ds.hamiltonian_terms(
+        H0, _good_noise, ds.WeakBrownianPath((), key)
+    )
+    init = lambda key: ds.StormerVerlet().init(
+        terms(key), 0.0, 0.1, _positive_state, None
+    )
+    assert jax.eval_shape(init, jr.key(0)) is None
+
+
 def test_noises_commute_only_if_that_could_be_tested():
     path = ds.WeakBrownianPath((2,), jr.key(0))
     for second, expected in (
