@@ -70,7 +70,7 @@ def test_flows_follow_each_other_in_the_order_of_the_coin():
     solver = ds.NinomiyaVictoir()
 
     def end(W, coin, y0):
-        path = Given(W, two_point=coin * jnp.ones(2))
+        path = Given(W, two_point=coin * jnp.array([1, -1]))
         terms = ds.hamiltonian_terms(zero, lambda *x: noise(0.05, *x[1:]), path)
         return solver.step(terms, 0.0, 0.1, y0, args, None, False)[0]
 
@@ -82,6 +82,25 @@ def test_flows_follow_each_other_in_the_order_of_the_coin():
         np.testing.assert_allclose(got[0], expected[0], atol=1e-14)
         np.testing.assert_allclose(got[1], expected[1], atol=1e-14)
     assert abs(end(W, 1.0, y0)[0] - end(W, -1.0, y0)[0]).max() > 1e-4
+
+
+def test_a_failure_of_any_flow_is_reported():
+    # q' = q^2 has no step from 10. Before the middle of the step, after it, by the first
+    # noise, by the second; and by none.
+    def success(sizes):
+        stuck = lambda t, p, q, args: jnp.where(t < 0.5, sizes[0], sizes[1]) * p * q**2
+        noise = lambda t, p, q, args: sizes[2:] * p * q**2
+        path = Given(jnp.ones(2), two_point=jnp.ones(2))
+        y0, terms = (
+            (jnp.array(0.1), jnp.array(10.0)),
+            ds.hamiltonian_terms(stuck, noise, path),
+        )
+        *_, result = ds.NinomiyaVictoir().step(terms, 0.0, 1.0, y0, None, None, False)
+        return result == diffrax.RESULTS.successful
+
+    sizes = jnp.concatenate([jnp.eye(4), jnp.zeros((1, 4))])
+    got = jax.jit(jax.vmap(success))(sizes)
+    np.testing.assert_array_equal(got, [False, False, False, False, True])
 
 
 def test_one_noise_alone_is_that_noise_of_all():
