@@ -106,17 +106,6 @@ def test_one_coupled_array_of_several_is_enough_to_refuse():
         ds.StormerVerlet().init(terms, 0.0, 0.1, (one, one), None)
 
 
-def test_keys_may_be_traced_where_numbers_decide():
-    H0 = lambda t, p, q, args: jnp.sum((p - q) ** 2 / 2 + p * q)
-    terms = lambda key: ds.hamiltonian_terms(
-        H0, _good_noise, ds.WeakBrownianPath((), key)
-    )
-    init = lambda key: ds.StormerVerlet().init(
-        terms(key), 0.0, 0.1, _positive_state, None
-    )
-    assert jax.eval_shape(init, jr.key(0)) is None
-
-
 def test_noises_commute_only_if_that_could_be_tested():
     path = ds.WeakBrownianPath((2,), jr.key(0))
     for second, expected in (
