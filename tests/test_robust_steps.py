@@ -1,6 +1,7 @@
 """Steps that fixed-point iteration does not solve, of few and of many unknowns, and what
 their failures leave alone."""
 
+import re
 from typing import Any
 
 import diffrax
@@ -8,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import lineax as lx
 import numpy as np
 import pytest
 
@@ -179,3 +181,23 @@ def test_units_make_no_difference_to_linear_systems(n, scale):
     rhs = scale * jnp.arange(1, n + 1, dtype=jnp.float32)
     got = solve_linear(lambda x: 2 * x, rhs, None)
     np.testing.assert_allclose(got, rhs / 2, rtol=1e-2)
+
+
+def test_linear_solvers_of_the_user_solve_for_steps_and_their_derivatives():
+    term = diffrax.ODETerm(lambda t, y, args: -30 * y + jnp.sin(y[::-1]))
+
+    def factorizations(finder):
+        """How often the programs of a step and of its derivative factorize a matrix."""
+        step = lambda y: _one_step(ds.Midpoint(root_finder=finder), term, 0.1, y)[0]
+        programs = step, jax.jacrev(step)
+        return [
+            len(re.findall(r"= lu\b", _program(fn, jnp.ones(6)))) for fn in programs
+        ]
+
+    assert factorizations(ds.PicardNewton()) == [0, 0]
+    step, derivative = factorizations(ds.PicardNewton(linear_solver=lx.LU()))
+    assert 0 < step < derivative
+
+
+def _program(fn, *args) -> str:
+    return str(jax.make_jaxpr(fn)(*args))

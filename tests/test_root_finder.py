@@ -95,6 +95,17 @@ def test_leaves_that_vanish_do_not_keep_it_from_finishing():
         np.testing.assert_allclose(sol.value, (1, 0), atol=1e-13)
 
 
+@pytest.mark.parametrize("direct", [0, 6], ids=["picard", "newton"])
+def test_a_solution_of_zero_is_found_from_zero(direct):
+    # No correction at all, next to an iterate without size.
+    finder = ds.PicardNewton(direct=direct)
+    sol = optx.root_find(
+        lambda x, _: 2 * x, finder, jnp.zeros(6), max_steps=3, throw=False
+    )
+    assert sol.result == optx.RESULTS.successful
+    np.testing.assert_array_equal(sol.value, np.zeros(6))
+
+
 @pytest.mark.parametrize("direct", [0, 4], ids=["picard", "newton"])
 @pytest.mark.core
 def test_leaving_the_domain_on_the_way_is_no_failure(direct):
