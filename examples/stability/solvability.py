@@ -201,7 +201,7 @@ def _picture(page: Page, hs, strengths, results: dict[str, Shares]) -> str:
 
 
 def section(page: Page) -> str:
-    points, steps, paths = (6, 1024, 100) if page.quick else (16, 16_384, 2_000)
+    points, steps, paths = (6, 1024, 100) if page.quick else (16, 4096, 2_000)
     hs, strengths = np.geomspace(0.01, 0.9, points), np.geomspace(0.1, 4, points)
     cases: dict[str, tuple[Model, diffrax.AbstractSolver]]
     cases = {f"Midpoint, {n}": (m, ds.Midpoint()) for n, m in MODELS.items()}
