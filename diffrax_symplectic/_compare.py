@@ -25,6 +25,7 @@ from ._brownian import (
     WeakBrownianPath,
 )
 from ._custom_types import Args, Y
+from ._estimate import Expectation
 from ._expectation import expectation
 from ._suggest import suggest_solver
 from ._suggestion_rules import PATHS, RULES
@@ -223,29 +224,16 @@ def compare_solvers(
         measure(solver, dts[0], 1)
         for i, dt in enumerate(dts):
             estimate, seconds = measure(solver, dt, 1 + i)
-            if fine is None:
-                error, bar, failed = strong[name][i]
-            else:
-                error = abs(float(estimate.mean - fine.mean))
-                bar = float(np.hypot(estimate.std_error, fine.std_error))
-                failed = estimate.num_failed
+            error, bar, failed = (
+                strong[name][i] if fine is None else _weak_error(estimate, fine)
+            )
             steps.append(ComparedStep(name, dt, error, bar, seconds, failed))
     return Comparison("strong" if phi is None else "weak", tuple(steps), refused)
 
 
 def _end(terms, solver, t0, t1, dt, y0, args) -> tuple[Y, diffrax.RESULTS]:
-    sol = diffrax.diffeqsolve(
-        terms,
-        solver,
-        t0,
-        t1,
-        dt,
-        y0,
-        args,
-        max_steps=None,
-        adjoint=diffrax.ForwardMode(),
-        throw=False,
-    )
+    options: Any = dict(max_steps=None, adjoint=diffrax.ForwardMode(), throw=False)
+    sol = diffrax.diffeqsolve(terms, solver, t0, t1, dt, y0, args, **options)
     return jtu.tree_map(lambda y: y[-1], sol.ys), sol.result
 
 
@@ -314,6 +302,13 @@ def _common_path(solver, shape, key, cell) -> diffrax.AbstractBrownianPath:
         terms = 0 if cell else 2
         return LevyAreaBrownianPath(path, jr.fold_in(key, 1), terms=terms, cell=cell)
     return path
+
+
+def _weak_error(estimate: Expectation, fine: Expectation) -> tuple[float, float, int]:
+    """Error, standard error and failed paths."""
+    error = abs(float(estimate.mean - fine.mean))
+    bar = float(np.hypot(estimate.std_error, fine.std_error))
+    return error, bar, estimate.num_failed
 
 
 def _strong_errors(end, named, reference, shape, dts, cell, key, num_paths) -> dict:
