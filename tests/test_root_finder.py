@@ -150,6 +150,6 @@ def test_corrections_are_measured_by_the_scale_that_is_passed(direct, slope, mos
 
 
 def test_numbers_of_iterations_that_mean_nothing_are_refused():
-    for change in (dict(sweeps=1), dict(warmup=-1), dict(picard_steps=-1)):
+    for change in (dict(sweeps=1), dict(warmup=-1), dict(more_sweeps=0)):
         with pytest.raises(ValueError, match="must be at least"):
             ds.PicardNewton(**change)

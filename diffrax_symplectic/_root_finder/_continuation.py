@@ -1,22 +1,27 @@
 """Newton's method that does not give up: the safety net behind the cheap iterations."""
 
+import functools as ft
 from collections.abc import Callable
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import optimistix as optx
+import jax.tree_util as jtu
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
-from . import _linear
-from ._start import converged
+from . import _compact, _krylov, _linear
+from ._start import converged, Measured
 from ._tolerance import ratio
 
 
 if TYPE_CHECKING:
     from ._picard_newton import PicardNewton
+
+_T = TypeVar("_T")
+_Vector: TypeAlias = Float[Array, " n"]
 
 # How many iterations Newton's method for all of the step has before corrections must
 # shrink. From a poor guess the first few may well grow and the method still converge.
@@ -38,44 +43,40 @@ _SHORTEST = 1e-3
 
 class Equations(NamedTuple):
     """The equations `residual(y) = 0` for all unknowns as one vector, which makes a shorter
-    program than a tree of arrays. `restore` makes the tree again, and `scale` says how
-    large the state is that is changed."""
+    program than a tree of arrays. `restore` makes the tree again, and `measured` says how
+    large a change of it is."""
 
-    residual: Callable[[Float[Array, " n"]], Float[Array, " n"]]
-    restore: Callable[[Float[Array, " n"]], PyTree[Array]]
-    scale: Callable[[PyTree[Array]], PyTree[Array]]
+    residual: Callable[[_Vector], _Vector]
+    restore: Callable[[_Vector], PyTree[Array]]
+    measured: Measured
 
 
-def as_vector(
-    residual: Callable, scale: Callable, y: PyTree[Array]
-) -> tuple[Equations, Float[Array, " n"]]:
-    """The equations for a vector in place of a tree, and the vector of `y`."""
-    flat, restore = jfu.ravel_pytree(y)
+def as_vector(residual: Callable, measured: Measured, y: PyTree[Array]) -> Equations:
+    """The equations for a vector in place of the tree that is like `y`."""
+    restore = jfu.ravel_pytree(y)[1]
     as_flat = lambda y: jfu.ravel_pytree(residual(restore(y)))[0]
-    return Equations(as_flat, restore, scale), flat
+    return Equations(as_flat, restore, measured)
 
 
 class State(eqx.Module):
-    r"""Where the continuation stands. With the residual $r$ and the origin $k_0$ the
-    equations solved for $s \in [0, 1]$ are $(1 - s)(k - k_0) + s\, r(k) = 0$. For $k_0 = 0$
-    that is $k = s\, \Phi(k)$: those of a step whose length and increments are multiplied by
-    $s$.
+    r"""Where the continuation stands. With the residual $r$ the equations solved for
+    $s \in [0, 1]$ are $(1 - s) k + s\, r(k) = 0$, so $k = s\, \Phi(k)$: those of a step
+    whose length and increments are multiplied by $s$.
 
-    - `origin`: the solution for $s = 0$.
     - `y`: the iterate; `anchor`: the (rough) solution at `reached`.
     - `reached`, `target`: the $s$ that was solved for, and that which is being solved for.
-    - `tries`: how many iterations this target has had.
+    - `tries`, `steps`: how many iterations there were for this target, and in all.
     - `size`: the last correction, in units of the tolerance.
     - `lost`: whether the branch of solutions that begins at $s = 0$ was given up.
     - `solved`: whether `y` solves the equations of the whole step.
     """
 
-    origin: Float[Array, " n"]
-    y: Float[Array, " n"]
-    anchor: Float[Array, " n"]
+    y: _Vector
+    anchor: _Vector
     reached: Scalar
     target: Scalar
     tries: Int[Array, ""]
+    steps: Int[Array, ""]
     size: Scalar
     lost: Bool[Array, ""]
     solved: Bool[Array, ""]
@@ -86,17 +87,15 @@ class State(eqx.Module):
         return self.lost & ~jnp.isfinite(self.size)
 
 
-def begin(
-    origin: Float[Array, " n"], y: Float[Array, " n"], solved: Bool[Array, ""]
-) -> State:
+def begin(y: _Vector, solved: Bool[Array, ""]) -> State:
     """First all of the step at once, from the guess `y`."""
     return State(
-        origin=origin,
         y=y,
-        anchor=origin,
+        anchor=jnp.zeros_like(y),
         reached=jnp.zeros((), y.dtype),
         target=jnp.ones((), y.dtype),
         tries=jnp.array(0),
+        steps=jnp.array(0),
         size=jnp.array(jnp.inf, y.dtype),
         lost=jnp.array(False),
         solved=solved,
@@ -104,25 +103,92 @@ def begin(
 
 
 def advance(finder: "PicardNewton", equations: Equations, state: State) -> State:
-    """One iteration of Newton's method, and what follows from its correction."""
+    """One iteration of Newton's method."""
+    if _dense(finder, state):
+        return _dense_iteration(finder, equations, state)
+    iterate = ft.partial(_iterate, finder, equations)
+    first = iterate((state, _krylov.begin(state.anchor), jnp.array(True)))
+    state, *_ = lax.while_loop(lambda carry: ~carry[2], iterate, first)
+    return state
+
+
+def finish(
+    finder: "PicardNewton", residual: Callable, measured: Measured, y, solved, most: int
+) -> tuple[PyTree[Array], Bool[Array, ""]]:
+    """Goes on from `y` until the equations are solved, or `most` iterations spent. The
+    solution for no step at all is zero."""
+    equations = as_vector(residual, measured, y)
+    going = lambda s: ~s.solved & ~s.hopeless & (s.steps < most)
+    first = begin(jfu.ravel_pytree(y)[0], solved)
+    if _dense(finder, first):
+        iterate = ft.partial(_dense_iteration, finder, equations)
+        state = lax.while_loop(going, iterate, first)
+    else:
+        # The loop of Newton's method and that of GMRES are one, so that the equations occur
+        # in the program only once.
+        iterate = ft.partial(_iterate, finder, equations)
+        carry = first, _krylov.begin(first.anchor), jnp.array(True)
+        state, *_ = _compact.while_loop(lambda c: going(c[0]), iterate, carry)
+    return equations.restore(state.y), state.solved
+
+
+def _dense(finder: "PicardNewton", state: State) -> bool:
+    return finder.linear_solver is not None or state.y.size <= _linear.MAX_DENSE
+
+
+def _part(s: Scalar, y: _Vector, r: _Vector) -> _Vector:
+    return (1 - s) * y + s * r
+
+
+def _dense_iteration(finder: "PicardNewton", equations: Equations, state: State):
     s = state.target
     value, jacobian = jax.linearize(equations.residual, state.y)
-    part = lambda y, r: (1 - s) * y + s * r
-    moved = state.y - state.origin
-    diff = _linear.solve(
-        lambda x: part(x, jacobian(x)), part(moved, value), finder.linear_solver
+    apply = lambda x: _part(s, x, jacobian(x))
+    diff = _linear.solve(apply, _part(s, state.y, value), finder.linear_solver)
+    return _correct(finder, equations, state, diff)
+
+
+def _iterate(
+    finder: "PicardNewton",
+    equations: Equations,
+    carry: tuple[State, _krylov.Krylov, Bool[Array, ""]],
+) -> tuple[State, _krylov.Krylov, Bool[Array, ""]]:
+    """One evaluation: the product that GMRES needs next, or for a `fresh` iterate the
+    residual with which it begins. A correction follows when it has ended."""
+    state, krylov, fresh = carry
+    s = state.target
+    value, image = jax.jvp(equations.residual, (state.y,), (krylov.p,))
+    first = _krylov.begin(_part(s, state.y, value))
+    then = _krylov.extend(krylov, _part(s, krylov.p, image))
+    krylov = _where(fresh, first, then)
+    corrected = _correct(finder, equations, state, krylov.solution)
+    return _where(krylov.done, corrected, state), krylov, krylov.done
+
+
+def _where(which: Bool[Array, ""], a: _T, b: _T) -> _T:
+    return jtu.tree_map(lambda a, b: jnp.where(which, a, b), a, b)
+
+
+def _correct(
+    finder: "PicardNewton", equations: Equations, state: State, diff: _Vector
+) -> State:
+    """What follows from a correction."""
+    s, y = state.target, state.y - diff
+    extent, scale = equations.measured
+    # In one array, for a shorter program.
+    change, moved, scales = finder.tolerance.norms(
+        *(extent(equations.restore(x)) for x in (diff, state.y)),
+        scale(equations.restore(y)),
     )
-    y = state.y - diff
-    tree, scale = equations.restore(diff), equations.scale(equations.restore(y))
-    size = finder.tolerance.measure(tree, scale)
+    size, relative = finder.tolerance.compare(change, scales)
     shrink = jnp.where(state.tries > 0, ratio(size, state.size), 1)
     whole = s == 1
-    solved = whole & converged(finder, tree, scale, size, shrink, shrink >= 0.25)
+    solved = whole & converged(size, relative, shrink, shrink >= 0.25)
 
     at_once = whole & (state.reached == 0)
     patience = jnp.where(at_once, _PATIENCE, 2)
     stalled = (state.tries + 1 >= patience) & ~(shrink < _SHRINK)
-    near = optx.max_norm(diff) < _LOOSE * optx.max_norm(moved)
+    near = jnp.max(change) < _LOOSE * jnp.max(moved)
     arrived = near & ~whole
     slow = ~whole & (state.tries + 1 >= _PATIENCE_IN_PART)
     back = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~state.lost & ~solved
@@ -132,33 +198,13 @@ def advance(finder: "PicardNewton", equations: Equations, state: State) -> State
     stride = stride * jnp.where(arrived, _LONGER, jnp.where(back, _SHORTER, 1))
     lost = state.lost | (stride < _SHORTEST)
     return State(
-        origin=state.origin,
         y=jnp.where(back, state.anchor, y),
         anchor=jnp.where(arrived, y, state.anchor),
         reached=reached,
         target=jnp.where(lost, 1, jnp.minimum(reached + stride, 1)),
         tries=jnp.where(arrived | back, 0, state.tries + 1),
+        steps=state.steps + 1,
         size=size,
         lost=lost,
         solved=solved,
     )
-
-
-def finish(
-    finder: "PicardNewton", residual: Callable, scale, y, solved, max_steps: int
-) -> tuple[PyTree[Array], Bool[Array, ""]]:
-    """Goes on from `y` until the equations are solved, or `max_steps` iterations spent. The
-    solution for no step at all is zero."""
-    equations, flat = as_vector(residual, scale, y)
-
-    def body(carry):
-        state, step = carry
-        return advance(finder, equations, state), step + 1
-
-    def proceed(carry):
-        state, step = carry
-        return ~state.solved & ~state.hopeless & (step < max_steps)
-
-    first = begin(jnp.zeros_like(flat), flat, solved)
-    state, _ = jax.lax.while_loop(proceed, body, (first, 0))
-    return equations.restore(state.y), state.solved

@@ -25,12 +25,11 @@ def solve(
     """The `x` with `apply(x) = rhs`, or something that is not finite, or inexact, if there
     is none: nothing is raised. By `linear_solver`, or if that is `None` by elimination for
     a few unknowns and by GMRES, which needs no matrix, for more."""
-    # An absolute tolerance refers to a right-hand side of size one, and squares of very
-    # small or large numbers are zero or infinite.
+    if linear_solver is None and rhs.size > MAX_DENSE:
+        return _krylov.gmres(apply, rhs)
+    # An absolute tolerance refers to a right-hand side of size one.
     size = optx.max_norm(rhs)
     size = jnp.where(size > 0, size, 1)
-    if linear_solver is None and rhs.size > MAX_DENSE:
-        return _krylov.gmres(apply, rhs / size) * size
     linear_solver = SmallLU() if linear_solver is None else linear_solver
     operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: rhs))
     state: Any = linear_solver.init(operator, {})

@@ -1,17 +1,19 @@
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, Bool, PyTree, Scalar
+from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._compat import ω
+from .._custom_types import IntScalarLike
 from . import _continuation
-from ._start import start
+from ._start import improve, Measured, start, Sweep
 from ._tolerance import Tolerance
 
 
@@ -29,7 +31,8 @@ class PicardNewton(optx.AbstractRootFinder):
     - Up to `direct` unknowns: `warmup` fixed-point (Picard) iterations, one of Newton's
         method, and `chords` with the same Jacobian.
     - Above: `sweeps` fixed-point iterations, which need no Jacobian, without a look at the
-        error; and as many again, up to `picard_steps`, for as long as corrections shrink.
+        error; and rounds of `more_sweeps`, up to `picard_steps` in all, for as long as
+        corrections shrink.
 
     Where these do not converge, Newton's method solves all stages of the step as one
     system. It tries the whole step first. If its corrections do not shrink, it solves for a
@@ -48,10 +51,10 @@ class PicardNewton(optx.AbstractRootFinder):
     - `linear_solver`: a Lineax solver for all linear systems, those of derivatives
         included. `None` is elimination for few unknowns, and otherwise no matrix.
     - `direct`: the most unknowns for which Newton's method is used from the start.
-    - `warmup`, `chords`, `sweeps`: see above.
-    - `picard_steps`: the most fixed-point iterations, in whole rounds of `sweeps`.
+    - `warmup`, `chords`, `sweeps`, `more_sweeps`, `picard_steps`: see above.
 
-    **Raises:** a `ValueError` for negative numbers, or fewer than 2 `sweeps`.
+    **Raises:** a `ValueError` for negative numbers, fewer than 2 `sweeps`, or
+        no `more_sweeps`.
     """
 
     rtol: float | None = None
@@ -61,11 +64,14 @@ class PicardNewton(optx.AbstractRootFinder):
     direct: int = eqx.field(default=4, static=True)
     warmup: int = eqx.field(default=3, static=True)
     chords: int = eqx.field(default=1, static=True)
-    sweeps: int = eqx.field(default=10, static=True)
+    sweeps: int = eqx.field(default=9, static=True)
     picard_steps: int = eqx.field(default=40, static=True)
+    more_sweeps: int = eqx.field(default=4, static=True)
 
     def __check_init__(self):
-        least = dict(direct=0, warmup=0, chords=0, sweeps=2, picard_steps=0)
+        least = dict(
+            direct=0, warmup=0, chords=0, sweeps=2, more_sweeps=1, picard_steps=0
+        )
         for name, n in least.items():
             if getattr(self, name) < n:
                 raise ValueError(
@@ -86,14 +92,21 @@ class PicardNewton(optx.AbstractRootFinder):
         f_struct: PyTree[jax.ShapeDtypeStruct],
         aux_struct: PyTree[jax.ShapeDtypeStruct],
         tags: frozenset[object],
-    ) -> _continuation.State:
+    ) -> "_Search":
         del f_struct, aux_struct, tags
-        phi = lambda y: (y**ω - fn(y, args)[0] ** ω).ω
-        first = start(self, phi, y, _scale(options))
-        keep = first.converged | first.near
+        displaced = _Displaced(fn, args, options, y)
+
+        def improve_all(systems: list[PyTree[Array]], sweeps: IntScalarLike) -> Sweep:
+            found = improve(
+                self, displaced.image, systems[0], displaced.measured, sweeps
+            )
+            return found._replace(y=[found.y])
+
+        zero = jtu.tree_map(jnp.zeros_like, y)
+        first = start(self, improve_all, [zero], displaced.measured)
         origin, near = (jfu.ravel_pytree(y)[0] for y in (y, first.y))
-        near = jnp.where(keep, near, origin)
-        return _continuation.begin(origin, near, first.converged)
+        near = jnp.where(first.converged | first.near, near, 0)
+        return _Search(origin, _continuation.begin(near, first.converged))
 
     def step(
         self,
@@ -101,15 +114,16 @@ class PicardNewton(optx.AbstractRootFinder):
         y: PyTree[Array],
         args: PyTree[Any],
         options: dict[str, Any],
-        state: _continuation.State,
+        state: "_Search",
         tags: frozenset[object],
-    ) -> tuple[PyTree[Array], _continuation.State, Any]:
+    ) -> tuple[PyTree[Array], "_Search", Any]:
         del tags
-        residual = lambda y: fn(y, args)[0]
-        equations, _ = _continuation.as_vector(residual, _scale(options), y)
-        state = _continuation.advance(self, equations, state)
-        y = equations.restore(state.y)
-        return y, state, fn(y, args)[1]
+        origin = jfu.ravel_pytree(y)[1](state.origin)
+        displaced = _Displaced(fn, args, options, origin)
+        equations = _continuation.as_vector(displaced.residual, displaced.measured, y)
+        progress = _continuation.advance(self, equations, state.progress)
+        y = displaced.moved(equations.restore(progress.y))
+        return y, _Search(state.origin, progress), fn(y, args)[1]
 
     def terminate(
         self,
@@ -117,14 +131,14 @@ class PicardNewton(optx.AbstractRootFinder):
         y: PyTree[Array],
         args: PyTree[Any],
         options: dict[str, Any],
-        state: _continuation.State,
+        state: "_Search",
         tags: frozenset[object],
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         del fn, y, args, options, tags
         result = optx.RESULTS.where(
-            state.hopeless, optx.RESULTS.nonfinite, optx.RESULTS.successful
+            state.progress.hopeless, optx.RESULTS.nonfinite, optx.RESULTS.successful
         )
-        return state.solved, result
+        return state.progress.solved, result
 
     def postprocess(
         self,
@@ -133,15 +147,42 @@ class PicardNewton(optx.AbstractRootFinder):
         aux: Any,
         args: PyTree[Any],
         options: dict[str, Any],
-        state: _continuation.State,
+        state: "_Search",
         tags: frozenset[object],
         result: optx.RESULTS,
     ) -> tuple[PyTree[Array], Any, dict[str, Any]]:
         del fn, args, options, tags, result
-        return jfu.ravel_pytree(y)[1](state.y), aux, {}
+        found = state.origin + state.progress.y
+        return jfu.ravel_pytree(y)[1](found), aux, {}
 
 
-def _scale(options: dict[str, Any]) -> Callable[[PyTree[Array]], PyTree[Array]]:
-    # What the unknown is added to: increments are only needed to the accuracy of the state
-    # that they change.
-    return options.get("scale", lambda y: y)
+class _Search(eqx.Module):
+    """Where a search by itself stands: how far it has come from `origin`."""
+
+    origin: Float[Array, " n"]
+    progress: _continuation.State
+
+
+class _Displaced(NamedTuple):
+    """The equations `fn(y, args) = 0` for `k = y - origin`."""
+
+    fn: Callable
+    args: PyTree[Any]
+    options: dict[str, Any]
+    origin: PyTree[Array]
+
+    def moved(self, k: PyTree[Array]) -> PyTree[Array]:
+        return (self.origin**ω + k**ω).ω
+
+    def residual(self, k: PyTree[Array]) -> PyTree[Array]:
+        return self.fn(self.moved(k), self.args)[0]
+
+    def image(self, k: PyTree[Array]) -> PyTree[Array]:
+        return (k**ω - self.residual(k) ** ω).ω
+
+    @property
+    def measured(self) -> Measured:
+        # The scale is that of what the unknown is added to: increments are only needed to
+        # the accuracy of the state that they change.
+        scale = self.options.get("scale", lambda y: y)
+        return Measured(lambda change: change, lambda k: scale(self.moved(k)))

@@ -11,7 +11,8 @@ from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
 from .._compat import ω
-from .._custom_types import IntScalarLike
+from .._custom_types import BoolScalarLike, IntScalarLike
+from ._batch import any_of_batch
 from ._small_lu import SmallLU
 from ._tolerance import ratio
 
@@ -23,6 +24,29 @@ if TYPE_CHECKING:
 _NEAR = 0.1
 
 _Map = Callable[[PyTree[Array]], PyTree[Array]]
+
+
+class Measured(NamedTuple):
+    """How unknown values are measured: the `extent` of a change of them, and the `scale` of
+    the state that they change, in the same leaves."""
+
+    extent: _Map
+    scale: _Map
+
+
+class Sweep(NamedTuple):
+    """What one round of cheap iterations makes of unknown values.
+
+    - `y`: the values after it.
+    - `before`, `after`: the last two iterates of those found by fixed-point iteration.
+    - `converged`, `near`: as in `Start`, for those found by Newton's method.
+    """
+
+    y: PyTree[Array]
+    before: PyTree[Array]
+    after: PyTree[Array]
+    converged: BoolScalarLike
+    near: BoolScalarLike
 
 
 class Start(NamedTuple):
@@ -42,26 +66,80 @@ def size_of(y: PyTree) -> int:
     return sum(x.size for x in jtu.tree_leaves(y))
 
 
-def start(finder: "PicardNewton", phi: _Map, y: PyTree[Array], scale: _Map) -> Start:
-    """Solves `y = phi(y)` as a step that resolves the dynamics allows."""
+def improve(
+    finder: "PicardNewton",
+    phi: _Map,
+    y: PyTree[Array],
+    measured: Measured,
+    sweeps: IntScalarLike,
+) -> Sweep:
+    """One round for one system `y = phi(y)`: if iterations, `sweeps` of them."""
     if size_of(y) <= finder.direct:
-        return _newton(finder, phi, y, scale)
-    return _picard(finder, phi, y, scale)
+        found = _newton(finder, phi, y, measured)
+        return Sweep(found.y, [], [], found.converged, found.near)
+    # A look at the error costs as much as an iteration does. So it comes only after several
+    # of them, which are a loop of their own: XLA makes faster code of it than of iterations
+    # written out.
+    advance = lambda _, ys: (ys[1], phi(ys[1]))
+    before, after = lax.fori_loop(0, sweeps, advance, (y, y))
+    return Sweep(after, before, after, True, True)
+
+
+def start(
+    finder: "PicardNewton",
+    improve_all: Callable[[list[PyTree[Array]], IntScalarLike], Sweep],
+    y: list[PyTree[Array]],
+    measured: Measured,
+) -> Start:
+    """From the guess zero: repeats rounds until all systems `y` of a step are solved, or
+    corrections do not shrink. `improve_all` is one round, of so many iterations."""
+    if all(size_of(system) <= finder.direct for system in y):
+        once = improve_all(y, 0)
+        return Start(once.y, jnp.asarray(once.converged), jnp.asarray(once.near))
+
+    def one_round(carry: _Rounds) -> _Rounds:
+        first = carry.step == 0
+        sweeps = jnp.where(first, finder.sweeps, finder.more_sweeps)
+        new, before, after, newton, near = improve_all(carry.y, sweeps)
+        diff, change, scale = finder.tolerance.norms(
+            measured.extent((after**ω - before**ω).ω),
+            measured.extent(after),
+            measured.scale(after),
+        )
+        size, relative = finder.tolerance.compare(diff, scale)
+        # The first iteration changed the values from zero to nearly what they are now.
+        whole, _ = finder.tolerance.compare(change, scale)
+        earlier = jnp.where(first, whole, carry.size)
+        shrink = ratio(size, earlier) ** (1 / sweeps)
+        stalled = size >= 0.5 * earlier
+        done = converged(size, relative, shrink, stalled) & newton
+        near &= (relative <= _NEAR) & ~stalled
+        step = carry.step + sweeps
+        going = ~done & near & (step < finder.picard_steps)
+        # The rounds of all paths of a batch are the same, but each path has only its own.
+        y, done, near = jtu.tree_map(
+            lambda a, b: jnp.where(carry.going, a, b),
+            (new, done, near),
+            (carry.y, carry.done, carry.near),
+        )
+        return _Rounds(y, size, done, near, carry.going & going, step)
+
+    dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).dtype
+    no, yes = jnp.array(False), jnp.array(True)
+    first = _Rounds(y, jnp.array(jnp.inf, dtype), no, yes, yes, 0)
+    last = lax.while_loop(lambda carry: any_of_batch(carry.going), one_round, first)
+    return Start(last.y, last.done, last.near)
 
 
 def converged(
-    finder: "PicardNewton",
-    diff: PyTree,
-    scale: PyTree,
-    size: Scalar,
-    shrink: Scalar,
-    stalled: Bool[Array, ""],
+    size: Scalar, relative: Scalar, shrink: Scalar, stalled: Bool[Array, ""]
 ) -> Bool[Array, ""]:
-    """Whether the correction that would follow `diff` is below the tolerance, when `diff`
-    was `shrink` times as large as the one before, or corrections have `stalled`."""
+    """Whether the next correction is below the tolerance, when the last one was of this
+    `size` in units of it, and `shrink` times as large as the one before, or corrections
+    have `stalled`."""
     # Rounding errors can keep the corrections to a leaf that is small next to the others
     # above `rtol` for ever. Then they no longer shrink, and all of them are tiny.
-    stagnated = stalled & rounded(finder.tolerance.relative(diff, scale))
+    stagnated = stalled & rounded(relative)
     # A fraction of the tolerance: what remains has the same sign in every step, so that
     # over many steps it adds up to a drift where rounding errors would cancel.
     following = size * jnp.where(shrink < 1, shrink, 1)
@@ -73,7 +151,9 @@ def rounded(relative: Scalar) -> Bool[Array, ""]:
     return relative <= 100 * jnp.finfo(relative.dtype).eps
 
 
-def _newton(finder: "PicardNewton", phi: _Map, y: PyTree[Array], scale: _Map) -> Start:
+def _newton(
+    finder: "PicardNewton", phi: _Map, y: PyTree[Array], measured: Measured
+) -> Start:
     y = lax.fori_loop(0, finder.warmup, lambda _, y: phi(y), y)
     value, jacobian = jax.linearize(phi, y)
     operator = lx.FunctionLinearOperator(
@@ -81,53 +161,26 @@ def _newton(finder: "PicardNewton", phi: _Map, y: PyTree[Array], scale: _Map) ->
     )
     solver = finder.linear_solver or SmallLU()
     factors = solver.init(operator, {})
-    diff, size, shrink = y, jnp.array(jnp.inf), jnp.array(jnp.inf)
+    size = relative = shrink = jnp.array(jnp.inf)
     for i in range(finder.chords + 1):
         residual = (y**ω - (value if i == 0 else phi(y)) ** ω).ω
         diff, *_ = solver.compute(factors, residual, {})
         y = (y**ω - diff**ω).ω
-        before, size = size, finder.tolerance.measure(diff, scale(y))
+        before = size
+        extent, scale = measured.extent(diff), measured.scale(y)
+        size, relative = finder.tolerance.measure(extent, scale)
         shrink = jnp.ones_like(size) if i == 0 else ratio(size, before)
-    done = converged(finder, diff, scale(y), size, shrink, shrink >= 0.25)
+    done = converged(size, relative, shrink, shrink >= 0.25)
     return Start(y, done, shrink < 0.5)
-
-
-def _picard(finder: "PicardNewton", phi: _Map, y: PyTree[Array], scale: _Map) -> Start:
-    # A look at the error costs as much as an iteration does, and a loop that any path of a
-    # batch may leave selects between its old and its new iterate. So both come only after
-    # several iterations, which are a loop of their own: XLA makes faster code of it than of
-    # iterations written out.
-    advance = lambda _, ys: (ys[1], phi(ys[1]))
-
-    def some(carry: _Rounds) -> _Rounds:
-        before, y = lax.fori_loop(0, finder.sweeps, advance, (carry.y, carry.y))
-        diff = (y**ω - before**ω).ω
-        size = finder.tolerance.measure(diff, scale(y))
-        relative = finder.tolerance.relative(diff, scale(y))
-        stalled = size >= 0.5 * carry.size
-        # If so many iterations brought the corrections down to the tolerance, each made
-        # them smaller by a large factor: the next one is far below it. What rounding errors
-        # make of a small leaf does not become smaller.
-        done = (size <= 1) | (stalled & rounded(relative))
-        near = (relative <= _NEAR) & ~stalled
-        return _Rounds(y, size, done, near, carry.step + finder.sweeps)
-
-    def proceed(carry: _Rounds):
-        return ~carry.done & carry.near & (carry.step < finder.picard_steps)
-
-    dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).dtype
-    no, yes = jnp.array(False), jnp.array(True)
-    first = _Rounds(y, jnp.array(jnp.inf, dtype), no, yes, 0)
-    last = lax.while_loop(proceed, some, first)
-    return Start(last.y, last.done, last.near)
 
 
 class _Rounds(NamedTuple):
     """The iterate, the size of its last correction, whether that was small enough, whether
-    iteration comes nearer, and how many iterations there were."""
+    iteration comes nearer, whether it goes on, and how many iterations there were."""
 
     y: PyTree[Array]
     size: Scalar
     done: Bool[Array, ""]
     near: Bool[Array, ""]
+    going: Bool[Array, ""]
     step: IntScalarLike

@@ -1,12 +1,12 @@
 """When a correction is small enough."""
 
-import functools as ft
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree, Scalar
+from jaxtyping import Array, Float, PyTree, Scalar
 
 
 class Tolerance(eqx.Module):
@@ -17,24 +17,29 @@ class Tolerance(eqx.Module):
     atol: float
     norm: Callable[[PyTree], Scalar]
 
-    def measure(self, diff: PyTree[Array], scale: PyTree[Array]) -> Scalar:
-        """The size of a correction in units of the tolerance: 1 is just accepted."""
-        sizes, scales = self._norms(diff, scale)
-        rtol = 2 * jnp.finfo(sizes[0].dtype).eps if self.rtol is None else self.rtol
-        pairs = zip(sizes, scales)
-        return _largest([ratio(a, rtol * b + self.atol) for a, b in pairs])
+    def measure(
+        self, diff: PyTree[Array], scale: PyTree[Array]
+    ) -> tuple[Scalar, Scalar]:
+        """The size of a correction, in units of the tolerance (1 is just accepted), and
+        relative to the whole iterate."""
+        return self.compare(*self.norms(diff, scale))
 
-    def relative(self, diff: PyTree[Array], scale: PyTree[Array]) -> Scalar:
-        """The size of a correction relative to the whole iterate."""
-        sizes, scales = self._norms(diff, scale)
-        return ratio(_largest(sizes), _largest(scales))
+    def compare(
+        self, sizes: Float[Array, " leaves"], scales: Float[Array, " leaves"]
+    ) -> tuple[Scalar, Scalar]:
+        """The same from the norms of each leaf."""
+        rtol = 2 * jnp.finfo(sizes.dtype).eps if self.rtol is None else self.rtol
+        each = ratio(sizes, rtol * scales + self.atol)
+        return jnp.max(each), ratio(jnp.max(sizes), jnp.max(scales))
 
-    def _norms(self, diff, scale) -> tuple[list[Scalar], list[Scalar]]:
-        norms = lambda tree: [self.norm(x) for x in jtu.tree_leaves(tree)]
-        return norms(diff), norms(scale)
-
-
-_largest = ft.partial(ft.reduce, jnp.maximum)
+    def norms(self, *trees: PyTree[Array]) -> Float[Array, "trees leaves"]:
+        """The norm of each leaf of trees of one structure."""
+        leaves = [x for tree in trees for x in jtu.tree_leaves(tree)]
+        if len({x.shape for x in leaves}) == 1:
+            norms = jax.vmap(self.norm)(jnp.stack(leaves))
+        else:
+            norms = jnp.stack([self.norm(x) for x in leaves])
+        return norms.reshape(len(trees), -1)
 
 
 def ratio(a: Array, b: Array) -> Array:

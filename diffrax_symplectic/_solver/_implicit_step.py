@@ -1,5 +1,7 @@
 """One step: its stage equations solved, and differentiated as what they define."""
 
+import functools as ft
+import operator
 from typing import Any
 
 import diffrax
@@ -11,9 +13,17 @@ import optimistix as optx
 from jaxtyping import Array, Bool
 
 from .._compat import ω
-from .._custom_types import BoolScalarLike, Y
+from .._custom_types import BoolScalarLike, IntScalarLike, Y
 from .._plan import Plan
-from .._root_finder import differentiate, finish, PicardNewton, start
+from .._root_finder import (
+    differentiate,
+    finish,
+    improve,
+    Measured,
+    PicardNewton,
+    start,
+    Sweep,
+)
 from ._lanes import where_pending
 from ._stages import closed, Stages, Step, Unknown
 
@@ -100,9 +110,21 @@ def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
 
 def _by_blocks(stages: Stages, finder: PicardNewton):
     """The cheap iterations, block after block."""
-    values, unknown, unsolved = {}, [], jnp.array(False)
-    for block in stages.plan.blocks:
-        k = []
+    blocks = stages.plan.blocks
+    guess = [stages.zero_of(block) for block in blocks]
+    sweep = ft.partial(_sweep, stages, finder)
+    found = start(finder, sweep, guess, Measured(stages.extent, stages.scale))
+    keep = found.converged | found.near
+    unknown = jtu.tree_map(lambda k: jnp.where(keep, k, 0), found.y)
+    return stages.end(unknown, True), unknown, ~found.converged
+
+
+def _sweep(
+    stages: Stages, finder: PicardNewton, unknown: Unknown, sweeps: IntScalarLike
+) -> Sweep:
+    """One round of the cheap iterations in each block."""
+    values, found = {}, []
+    for i, (block, k) in enumerate(zip(stages.plan.blocks, unknown)):
         if len(block.unknown) > 0:
 
             def image(k, block=block, values=values):
@@ -110,17 +132,16 @@ def _by_blocks(stages: Stages, finder: PicardNewton):
                     block, stages.explicit_of(block, stages.given(block, values, k))
                 )
 
-            guess = stages.zero_of(block)
-            found = start(
-                finder, image, guess, lambda k, b=block: stages.scale_of(b, k)
-            )
-            keep = found.converged | found.near
-            k = jtu.tree_map(lambda a, b: jnp.where(keep, a, b), found.y, guess)
-            unsolved = unsolved | ~found.converged
-        values = stages.given(block, values, k)
-        values = stages.explicit_of(block, values, keep=True)
-        unknown.append(k)
-    return stages.end_of(values), unknown, unsolved
+            alone = lambda fn, i=i: lambda k: fn([[]] * i + [k])
+            measured = Measured(alone(stages.extent), alone(stages.scale))
+            found.append(improve(finder, image, k, measured, sweeps))
+            k = found[-1].y
+        else:
+            found.append(Sweep([], [], [], True, True))
+        values = stages.explicit_of(block, stages.given(block, values, k), keep=True)
+    y, before, after, converged, near = zip(*found)
+    all_of = ft.partial(ft.reduce, operator.and_)
+    return Sweep(list(y), list(before), list(after), all_of(converged), all_of(near))
 
 
 def _as_one_system(stages: Stages, value, finder: PicardNewton, max_steps: int):
@@ -128,9 +149,8 @@ def _as_one_system(stages: Stages, value, finder: PicardNewton, max_steps: int):
     ended."""
     _, unknown, unsolved = value
     residual = lambda k: (k**ω - stages.image(k) ** ω).ω
-    unknown, solved = finish(
-        finder, residual, stages.scale, unknown, ~unsolved, max_steps
-    )
+    measured = Measured(stages.extent, stages.scale)
+    unknown, solved = finish(finder, residual, measured, unknown, ~unsolved, max_steps)
     return stages.end(unknown), unknown, ~solved
 
 

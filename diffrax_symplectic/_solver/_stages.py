@@ -100,16 +100,30 @@ class Stages(eqx.Module):
         tableau = self.plan.tableau
         return _position(self.y0, tableau.stages, tableau.weights[None], values)
 
-    def scale(self, unknown: Unknown) -> Unknown:
-        """How large the state is that the unknown values change: they are only needed to
-        its accuracy."""
-        pairs = zip(self.plan.blocks, unknown)
-        return [self.scale_of(block, k) for block, k in pairs]
+    def extent(self, unknown: Unknown) -> list[Array]:
+        """For each leaf of the state that unknown values change: entry by entry, the
+        largest of them in absolute value. Blocks without values are left out."""
+        return [largest for _, largest in self._extents(unknown)]
 
-    def scale_of(self, block: Block, unknown: list[_Value]) -> list[_Value]:
-        stages = self.plan.tableau.stages
-        written = [_part(self.y0, stages[group[0]].writes) for group in block.unknown]
-        return jtu.tree_map(lambda x, k: jnp.abs(x) + jnp.abs(k), written, unknown)
+    def scale(self, unknown: Unknown) -> list[Array]:
+        """How large the state is that the unknown values change, leaf by leaf as in
+        `extent`: they are only needed to its accuracy."""
+        leaves = jtu.tree_leaves(self.y0)
+        return [jnp.abs(leaves[i]) + x for i, x in self._extents(unknown)]
+
+    def _extents(self, unknown: Unknown) -> list[tuple[int, Array]]:
+        treedef = jtu.tree_structure(self.y0)
+        numbers = treedef.unflatten(range(treedef.num_leaves))
+        largest = {}
+        for block, k in zip(self.plan.blocks, unknown):
+            for group, value in zip(block.unknown, k):
+                writes = self.plan.tableau.stages[group[0]].writes
+                changed = jtu.tree_leaves(_part(numbers, writes))
+                for stage in _unstack(group, value).values():
+                    for i, x in zip(changed, jtu.tree_leaves(stage)):
+                        x = jnp.abs(x)
+                        largest[i] = jnp.maximum(largest[i], x) if i in largest else x
+        return sorted(largest.items())
 
     def _evaluate_group(self, group: tuple[int, ...], values: Values) -> _Value:
         """The values of stages of one kind; stacked, unless it is only one."""
