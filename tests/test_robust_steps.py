@@ -128,6 +128,28 @@ def test_increments_are_solved_to_the_accuracy_of_the_state():
         assert success
 
 
+def test_paths_that_need_more_rounds_do_not_change_their_neighbours():
+    # Iterations of a batch go on for as long as any path needs them. With this tolerance
+    # those of the first path, which has had enough, would still change it.
+    solver = ds.Midpoint(root_finder=ds.PicardNewton(rtol=1e-4))
+
+    def step(frequency):
+        H0 = lambda t, p, q, args: frequency * jnp.sum(p**2 + q**2 + q**4) / 2
+        y0 = (jnp.ones(3), jnp.array([0.1, 0.2, 0.3]))
+        force = lambda t, y, args: (-jax.grad(H0, 2)(t, *y, args), y[0] * frequency)
+        terms = diffrax.ODETerm(force)
+        y1, *_, result = solver.step(terms, 0.0, 0.1, y0, None, None, False)
+        return y1, result == diffrax.RESULTS.successful
+
+    steps = jax.jit(jax.vmap(step))
+    (p, q), success = steps(jnp.array([2.0, 6.0, 2.0, 60.0]))
+    (p_alone, q_alone), _ = steps(jnp.full(4, 2.0))
+    assert jnp.all(success)
+    for i in (0, 2):
+        np.testing.assert_array_equal(p[i], p_alone[i])
+        np.testing.assert_array_equal(q[i], q_alone[i])
+
+
 def test_only_pending_paths_of_a_batch_are_served():
     double = lambda weight, x: weight * x
     serve = lambda pending, w, x: where_pending(double, pending, w, x)
