@@ -196,6 +196,12 @@ def test_a_linear_system_without_numbers_has_no_solution(n):
         assert not jnp.all(jnp.isfinite(solve_linear(lambda x: 2 * x, rhs, None)))
 
 
+def test_products_that_vanish_end_the_search_for_a_solution():
+    # The first direction has no image: there is nothing to divide by.
+    got = solve_linear(lambda x: x.at[:6].set(0), jnp.ones(12).at[6:].set(0), None)
+    np.testing.assert_array_equal(got, 0)
+
+
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
 @pytest.mark.parametrize("n", [2, 12])
 def test_units_make_no_difference_to_linear_systems(n, scale):

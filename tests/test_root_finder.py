@@ -95,6 +95,23 @@ def test_leaves_that_vanish_do_not_keep_it_from_finishing():
         np.testing.assert_allclose(sol.value, (1, 0), atol=1e-13)
 
 
+@pytest.mark.parametrize("direct", [0, 4], ids=["picard", "newton"])
+def test_a_leaf_that_rounding_errors_keep_moving_does_not_keep_it_from_finishing(
+    direct,
+):
+    # The second leaf is small, and moves by 1e-15 in each evaluation, as if it were a
+    # difference of numbers like the first: far more than its own tolerance.
+    def residual(x, _):
+        a, b = x
+        moving = 1e-15 * jnp.sin(1e17 * b)
+        return a - 1 - 0.01 * jnp.sin(a), b - 1e-8 - jax.lax.stop_gradient(moving)
+
+    finder, start = ds.PicardNewton(direct=direct), (jnp.array(0.5), jnp.array(0.0))
+    sol = optx.root_find(residual, finder, start, max_steps=0, throw=False)
+    assert sol.result == optx.RESULTS.successful
+    np.testing.assert_allclose(sol.value[1], 1e-8, atol=1e-14)
+
+
 @pytest.mark.parametrize("direct", [0, 6], ids=["picard", "newton"])
 def test_a_solution_of_zero_is_found_from_zero(direct):
     # No correction at all, next to an iterate without size.

@@ -193,7 +193,7 @@ The first column of times is microseconds per path and step of Diffrax's Heun. A
 are ratios to Heun, measured in turns: time per path and step, and in brackets the processor
 time of tracing and compiling; the time of value and gradient; the memory that the program
 of `Midpoint` sets aside, for {paths} paths and for one. Heun evaluates twice a step,
-`Midpoint` ten times, or twenty where ten do not reach rounding error.
+`Midpoint` nine times, and another four where that does not reach rounding error.
 
 One path alone needs more memory than Heun in proportion, for the vectors of GMRES, in case
 that iteration does not converge. In a batch they are set aside for a sixteenth of the
