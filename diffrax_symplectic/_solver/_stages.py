@@ -171,7 +171,7 @@ def _evaluate(step: Step, stages: list[Stage], y: Y) -> _Value:
     return jax.vmap(value)(jnp.asarray(c, jnp.result_type(step.h, float)), y)
 
 
-def _part(y: Y, part: str) -> PyTree[Array]:
+def _part(y: PyTree, part: str) -> PyTree:
     return y if part == "y" else y["pq".index(part)]
 
 
