@@ -60,7 +60,7 @@ def first_failure(first: diffrax.RESULTS, then: diffrax.RESULTS) -> diffrax.RESU
 
 def _result(unsolved: BoolScalarLike, y1: Y) -> diffrax.RESULTS:
     R = diffrax.RESULTS
-    stuck = R.promote(optx.RESULTS.nonlinear_max_steps_reached)
+    stuck: diffrax.RESULTS = R.nonlinear_max_steps_reached  # pyright: ignore
     finite = R.where(_all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
     return R.where(unsolved, stuck, finite)
 

@@ -32,7 +32,8 @@ def where_pending(
     treedef = jtu.tree_structure(dynamic)
     small = max(x.size for x in jtu.tree_leaves(value))
     # Batched more than once, but traced only here.
-    call = jax.jit(lambda dynamic, value: fn(eqx.combine(dynamic, static), value))
+    traced = eqx.filter_closure_convert(fn, args, value)
+    call = jax.jit(lambda dynamic, value: traced(eqx.combine(dynamic, static), value))
 
     @jax.custom_batching.custom_vmap
     def serve(pending, dynamic, value):
