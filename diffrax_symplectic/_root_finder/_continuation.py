@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
 from . import _compact, _krylov, _linear
 from ._start import converged, Measured
-from ._tolerance import ratio
+from ._tolerance import largest, ratio
 
 
 if TYPE_CHECKING:
@@ -188,7 +188,7 @@ def _correct(
     at_once = whole & (state.reached == 0)
     patience = jnp.where(at_once, _PATIENCE, 2)
     stalled = (state.tries + 1 >= patience) & ~(shrink < _SHRINK)
-    near = jnp.max(change) < _LOOSE * jnp.max(moved)
+    near = largest(change) < _LOOSE * largest(moved)
     arrived = near & ~whole
     slow = ~whole & (state.tries + 1 >= _PATIENCE_IN_PART)
     back = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~state.lost & ~solved

@@ -1,12 +1,13 @@
 """When a correction is small enough."""
 
+import functools as ft
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, PyTree, Scalar
+from jaxtyping import Array, PyTree, Scalar
 
 
 class Tolerance(eqx.Module):
@@ -25,21 +26,28 @@ class Tolerance(eqx.Module):
         return self.compare(*self.norms(diff, scale))
 
     def compare(
-        self, sizes: Float[Array, " leaves"], scales: Float[Array, " leaves"]
+        self, sizes: PyTree[Array], scales: PyTree[Array]
     ) -> tuple[Scalar, Scalar]:
         """The same from the norms of each leaf."""
-        rtol = 2 * jnp.finfo(sizes.dtype).eps if self.rtol is None else self.rtol
-        each = ratio(sizes, rtol * scales + self.atol)
-        return jnp.max(each), ratio(jnp.max(sizes), jnp.max(scales))
+        eps = jnp.finfo(jnp.result_type(*jtu.tree_leaves(sizes))).eps
+        rtol = 2 * eps if self.rtol is None else self.rtol
+        in_units = lambda a, b: ratio(a, rtol * b + self.atol)
+        each = jtu.tree_map(in_units, sizes, scales)
+        return largest(each), ratio(largest(sizes), largest(scales))
 
-    def norms(self, *trees: PyTree[Array]) -> Float[Array, "trees leaves"]:
-        """The norm of each leaf of trees of one structure."""
-        leaves = [x for tree in trees for x in jtu.tree_leaves(tree)]
-        if len({x.shape for x in leaves}) == 1:
-            norms = jax.vmap(self.norm)(jnp.stack(leaves))
-        else:
-            norms = jnp.stack([self.norm(x) for x in leaves])
-        return norms.reshape(len(trees), -1)
+    def norms(self, *trees: PyTree[Array]) -> list[PyTree[Array]]:
+        """For each of some trees of one structure, the norms of its leaves."""
+        leaves = [jtu.tree_leaves(tree) for tree in trees]
+        shapes = {x.shape for some in leaves for x in some}
+        # One reduction for all leaves is a shorter program. Numbers need none.
+        if len(shapes) == 1 and shapes != {()}:
+            stacked = jnp.stack([jnp.stack(some) for some in leaves])
+            return list(jax.vmap(jax.vmap(self.norm))(stacked))
+        return [[self.norm(x) for x in some] for some in leaves]
+
+
+def largest(norms: PyTree[Array]) -> Scalar:
+    return ft.reduce(jnp.maximum, map(jnp.max, jtu.tree_leaves(norms)))
 
 
 def ratio(a: Array, b: Array) -> Array:
