@@ -20,6 +20,7 @@ from equinox.internal import (
 from jax.extend.core import (
     ClosedJaxpr as ClosedJaxpr,
     Jaxpr as Jaxpr,
+    jaxpr_as_fun as jaxpr_as_fun,
     JaxprEqn as JaxprEqn,
     Literal as Literal,
 )

@@ -118,6 +118,13 @@ def test_jax_has_the_threefry_function_of_random123():
     assert [hex(int(w)) for w in words] == ["0x6b200159", "0x99ba4efe"]
 
 
+def test_a_program_of_jax_is_a_function_of_its_flat_inputs():
+    fn = _compat.jaxpr_as_fun(
+        jax.make_jaxpr(lambda x, y: {"a": x - y, "b": y})(1.0, 2.0)
+    )
+    assert [float(x) for x in fn(jnp.array(5.0), jnp.array(3.0))] == [2.0, 3.0]
+
+
 def test_adjoints_of_diffrax_run_a_loop_with_the_arguments_and_the_state_known_here():
     # `ReversingAdjoint` calls the loop of a solve, and reads these parts of its state.
     read = []

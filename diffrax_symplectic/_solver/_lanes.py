@@ -11,6 +11,8 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
+from .._compat import jaxpr_as_fun
+
 
 _T = TypeVar("_T")
 
@@ -29,15 +31,17 @@ def where_pending(
     those with a path in them for which `pending` holds. This has no derivative.
     """
     dynamic, static = eqx.partition(args, eqx.is_array)
-    treedef = jtu.tree_structure(dynamic)
+    leaves, treedef = jtu.tree_flatten(dynamic)
     small = max(x.size for x in jtu.tree_leaves(value))
     # Batched more than once, but traced only here.
-    traced = eqx.filter_closure_convert(fn, args, value)
-    call = jax.jit(lambda dynamic, value: traced(eqx.combine(dynamic, static), value))
+    merged = lambda x, y: fn(eqx.combine(treedef.unflatten(x), static), y)
+    traced = jaxpr_as_fun(jax.make_jaxpr(merged)(leaves, value))
+    unflatten = jtu.tree_structure(value).unflatten
+    call = jax.jit(lambda x, y: unflatten(traced(*x, *jtu.tree_leaves(y))))
 
     @jax.custom_batching.custom_vmap
-    def serve(pending, dynamic, value):
-        body = lambda carry: (jnp.array(False), call(dynamic, carry[1]))
+    def serve(pending, leaves, value):
+        body = lambda carry: (jnp.array(False), call(leaves, carry[1]))
         return lax.while_loop(lambda carry: carry[0], body, (pending, value))[1]
 
     # JAX batches a loop again and again until it knows what varies from path to path. This,
@@ -45,19 +49,19 @@ def where_pending(
     @ft.partial(jax.jit, static_argnums=0)
     def serve_part(axes, pending, leaves, value):
         def one(pending, leaves, value):
-            new = call(treedef.unflatten(leaves), value)
+            new = call(leaves, value)
             return jtu.tree_map(lambda a, b: jnp.where(pending, a, b), new, value)
 
         return jax.vmap(one, in_axes=(0, list(axes), 0))(pending, leaves, value)
 
     @serve.def_vmap
-    def serve_batch(size, in_batched, pending, dynamic, value):
+    def serve_batch(size, in_batched, pending, leaves, value):
         spread = lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape))
         pending, value = jtu.tree_map(
             spread, (pending, value), (in_batched[0], in_batched[2])
         )
         part = -(-size // _PARTS)
-        batched = jtu.tree_leaves(in_batched[1])
+        batched = in_batched[1]
 
         def cut(x, b, first):
             if b:
@@ -70,18 +74,17 @@ def where_pending(
             pending, value = carry
             first = jnp.minimum(jnp.argmax(pending), size - part)
             old = jtu.tree_map(lambda x: cut(x, True, first), (pending, value))
-            leaves = [cut(x, b, first) for x, b in zip(all_leaves, batched)]
-            new = serve_part(axes, old[0], leaves, old[1])
+            few = [cut(x, b, first) for x, b in zip(leaves, batched)]
+            new = serve_part(axes, old[0], few, old[1])
             paste = lambda x, y: lax.dynamic_update_slice_in_dim(x, y, first, 0)
             pending = paste(pending, jnp.zeros(part, bool))
             return pending, jtu.tree_map(paste, value, new)
 
-        all_leaves = jtu.tree_leaves(dynamic)
         axes = tuple(
-            0 if b or x.size <= small else None for x, b in zip(all_leaves, batched)
+            0 if b or x.size <= small else None for x, b in zip(leaves, batched)
         )
         some_pending = lambda carry: jnp.any(carry[0])
         _, value = lax.while_loop(some_pending, body, (pending, value))
         return value, jtu.tree_map(lambda _: True, value)
 
-    return serve(pending, dynamic, value)
+    return serve(pending, leaves, value)
