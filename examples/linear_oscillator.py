@@ -76,8 +76,9 @@ TABLE_1 = {
 }
 H = 0.2
 COUNTS = (5_000, 10_000, 25_000)
-# One for each kind of random variables and of stage equations: a quick run samples these.
-SAMPLED = ("Heun", "SRKw2", "SRKw3a", "SRKw5", "SRKs1", "SRKs4(sign=1)")
+# One for each kind of random variables: a quick run samples these. It cannot resolve the
+# biases, which are exact beside it.
+SAMPLED = ("Heun", "SRKw2", "SRKs4(sign=1)")
 
 
 class Growth(NamedTuple):

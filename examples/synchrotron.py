@@ -22,6 +22,7 @@ from ._orders import (
     plot_orders,
     report,
     resolved,
+    resolved_solvers,
     sampled_weak_error,
     strong_errors,
 )
@@ -172,7 +173,7 @@ def figure_6a(full: bool) -> None:
             resolved(hs, full),
             paths,
         )
-        for name, (solver, path) in solvers.items()
+        for name, (solver, path) in resolved_solvers(solvers, full).items()
     }
     print(f"  E(P^2) = {value:.9f}")
     report("exact", exact)
