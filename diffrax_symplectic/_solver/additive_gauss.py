@@ -57,12 +57,10 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     tableau: ClassVar[AdditiveTableau] = _tab
 
     def order(self, terms):
-        del terms
         return 4
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 3
 
 

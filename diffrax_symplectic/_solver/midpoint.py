@@ -31,7 +31,6 @@ class Midpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     tableau: ClassVar[GeneralTableau] = _tab
 
     def order(self, terms):
-        del terms
         return 2
 
     def strong_order(self, terms):
@@ -39,7 +38,6 @@ class Midpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 1
 
 

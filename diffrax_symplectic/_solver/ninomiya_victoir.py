@@ -133,12 +133,10 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         return y1, result
 
     def order(self, terms):
-        del terms
         return 4
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 2
 
 

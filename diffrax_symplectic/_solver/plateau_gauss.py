@@ -64,7 +64,6 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     )
 
     def order(self, terms):
-        del terms
         return 4
 
     def strong_order(self, terms):

@@ -59,14 +59,11 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
     tableau: ClassVar[PartitionedTableau] = _tab
 
     def order(self, terms):
-        del terms
         return 2
 
     def strong_order(self, terms):
-        del terms
         return 1.5
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 2

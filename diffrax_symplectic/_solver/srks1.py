@@ -1,11 +1,9 @@
-import functools as ft
-
-import equinox as eqx
 import numpy as np
 
-from .._tableau import GeneralTableau, real_parameter
+from .._tableau import GeneralTableau
 from .._terms import strong_order_if_commutative
 from ._implicit import AbstractImplicitStages, ROOT_FINDER
+from ._parameters import free_parameter
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -36,16 +34,13 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     section 2.2.
     """
 
-    a: float = eqx.field(
-        default=0.25, static=True, converter=ft.partial(real_parameter, "a")
-    )
+    a: float = free_parameter("a", 0.25)
 
     @property
     def tableau(self) -> GeneralTableau:
         return _srks1(self.a)
 
     def order(self, terms):
-        del terms
         return 2
 
     def strong_order(self, terms):
@@ -53,7 +48,6 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 1
 
 

@@ -39,16 +39,13 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     tableau: ClassVar[SeparableTableau] = _srks2()
 
     def order(self, terms):
-        del terms
         return 2
 
     def strong_order(self, terms):
-        del terms
         return 1.0
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 1
 
 

@@ -1,10 +1,8 @@
-import functools as ft
-
-import equinox as eqx
 import numpy as np
 
-from .._tableau import real_parameter, SeparableTableau
+from .._tableau import SeparableTableau
 from ._implicit import AbstractImplicitStages, ROOT_FINDER
+from ._parameters import free_parameter
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -48,25 +46,20 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     section 3.2.
     """
 
-    a: float = eqx.field(
-        default=0.0, static=True, converter=ft.partial(real_parameter, "a")
-    )
+    a: float = free_parameter("a", 0.0)
 
     @property
     def tableau(self) -> SeparableTableau:
         return _srks3(self.a)
 
     def order(self, terms):
-        del terms
         return 2
 
     def strong_order(self, terms):
-        del terms
         return 1.0
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 1
 
 

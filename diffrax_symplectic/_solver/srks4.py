@@ -1,11 +1,11 @@
-import functools as ft
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
-from .._tableau import AdditiveTableau, real_parameter
+from .._tableau import AdditiveTableau
 from ._implicit import AbstractImplicitStages, ROOT_FINDER
+from ._parameters import free_parameter, real_number
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -24,7 +24,7 @@ def _srks4(beta1: float, beta2: float, b: float, sign: int) -> AdditiveTableau:
 
 
 def _nonzero(value: Any) -> float:
-    beta2 = real_parameter("beta2", value)
+    beta2 = real_number("beta2", value)
     if beta2 == 0:
         raise ValueError(
             "`beta2` must not be 0: the noise is read at the times 1 + (beta1 - 1) / "
@@ -77,13 +77,9 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     section 4.1.
     """
 
-    beta1: float = eqx.field(
-        default=0.0, static=True, converter=ft.partial(real_parameter, "beta1")
-    )
+    beta1: float = free_parameter("beta1", 0.0)
     beta2: float = eqx.field(default=1.0, static=True, converter=_nonzero)
-    b: float = eqx.field(
-        default=0.0, static=True, converter=ft.partial(real_parameter, "b")
-    )
+    b: float = free_parameter("b", 0.0)
     sign: int = eqx.field(default=-1, static=True, converter=_sign)
 
     @property
@@ -91,16 +87,13 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         return _srks4(self.beta1, self.beta2, self.b, self.sign)
 
     def order(self, terms):
-        del terms
         return 2
 
     def strong_order(self, terms):
-        del terms
         return 1.5
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 2
 
 

@@ -1,10 +1,8 @@
-import functools as ft
-
-import equinox as eqx
 import numpy as np
 
-from .._tableau import GeneralTableau, real_parameter
+from .._tableau import GeneralTableau
 from ._implicit import AbstractImplicitStages, ROOT_FINDER
+from ._parameters import free_parameter
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -35,21 +33,17 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     section 2.1.
     """
 
-    b: float = eqx.field(
-        default=0.5, static=True, converter=ft.partial(real_parameter, "b")
-    )
+    b: float = free_parameter("b", 0.5)
 
     @property
     def tableau(self) -> GeneralTableau:
         return _srkw1(self.b)
 
     def order(self, terms):
-        del terms
         return 2
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 1
 
 

@@ -117,7 +117,6 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         return _srkw2(self.rows, self.conjugate)
 
     def order(self, terms):
-        del terms
         return 2
 
     def weak_order(self, terms):

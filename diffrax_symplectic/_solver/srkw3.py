@@ -64,12 +64,10 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         return _srkw3(self.variant)
 
     def order(self, terms):
-        del terms
         return 2
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 1
 
 

@@ -1,10 +1,8 @@
-import functools as ft
-
-import equinox as eqx
 import numpy as np
 
-from .._tableau import real_parameter, SeparableTableau
+from .._tableau import SeparableTableau
 from ._implicit import AbstractImplicitStages, ROOT_FINDER
+from ._parameters import free_parameter
 from .base import AbstractSymplecticRungeKutta
 
 
@@ -50,22 +48,18 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     section 3.1.
     """
 
-    a21: float = eqx.field(
-        default=0.5, static=True, converter=ft.partial(real_parameter, "a21")
-    )
+    a21: float = free_parameter("a21", 0.5)
 
     @property
     def tableau(self) -> SeparableTableau:
         return _srkw4(self.a21)
 
     def order(self, terms):
-        del terms
         gauss = abs(abs(self.a21 - 1 / 4) - np.sqrt(3) / 6) < 1e-14
         return 4 if gauss else 2
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 2
 
 

@@ -42,12 +42,10 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     tableau: ClassVar[AdditiveTableau] = _tab
 
     def order(self, terms):
-        del terms
         return 2
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 2
 
 

@@ -46,14 +46,11 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     tableau: ClassVar[PartitionedTableau] = _tab
 
     def order(self, terms):
-        del terms
         return 2
 
     def strong_order(self, terms):
-        del terms
         return 1.0
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        del terms
         return 2

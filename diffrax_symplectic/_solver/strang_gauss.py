@@ -49,7 +49,6 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     tableau: ClassVar[GeneralTableau] = _tab
 
     def order(self, terms):
-        del terms
         return 2
 
     def weak_order(self, terms):

@@ -9,7 +9,6 @@ the same for all families.
 """
 
 from ._additive import AdditiveTableau as AdditiveTableau
-from ._coefficients import real_parameter as real_parameter
 from ._flat import (
     AbstractTableau as AbstractTableau,
     FlatTableau as FlatTableau,

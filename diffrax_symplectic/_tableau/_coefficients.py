@@ -57,22 +57,3 @@ def columns(
 def variables_of(*coefficients: Mapping[str, np.ndarray]) -> list[str]:
     """All random variables, in the order of their first appearance."""
     return list(dict.fromkeys(name for c in coefficients for name in c))
-
-
-def real_parameter(name: str, value: Any) -> float:
-    """A solver's free parameter as a Python float. Parameters decide which stages are
-    used, so they have to be known while tracing.
-
-    Raises a `ValueError` unless `value` is a finite real number.
-    """
-    try:
-        real = not isinstance(value, complex)
-        number = float(value)  # pyright: ignore[reportArgumentType]
-    except Exception:
-        real, number = False, np.nan
-    if not real or not np.isfinite(number):
-        raise ValueError(
-            f"`{name}` must be a finite real number, known before tracing (a Python "
-            f"float, not a traced array); got {value!r}."
-        )
-    return number
