@@ -39,10 +39,9 @@ def symplectic_residuals(tableau: AbstractTableau) -> Float[np.ndarray, "s s"]:
     theorems 2.1, 2.2, 3.1 and 4.1.
     """
     flat = tableau.flatten()
-    reads = np.array([[b.writes in a.reads for b in flat.stages] for a in flat.stages])
     weighted = flat.weights[:, None] * flat.matrix
     residuals = np.outer(flat.weights, flat.weights) - weighted - weighted.T
-    return np.where(reads & reads.T, residuals, 0.0)
+    return np.where(flat.reads & flat.reads.T, residuals, 0.0)
 
 
 def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, float]:

@@ -37,15 +37,8 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
     for sigma in itertools.product(*map(partners, range(len(stages)))):
         paired = all(sigma[j] == i for i, j in enumerate(sigma))
         both = tableau.matrix + tableau.matrix[np.ix_(sigma, sigma)]
-        if paired and np.allclose(_read(both - b, stages), 0, atol=1e-12):
+        # A stage does not depend on values that it does not read.
+        wrong = np.where(tableau.reads, both - b, 0)
+        if paired and np.allclose(wrong, 0, atol=1e-12):
             return True
     return False
-
-
-def _read(matrix: np.ndarray, stages: tuple) -> np.ndarray:
-    """The matrix with zeros for entries that do not matter: those of stages that write what
-    the other stage does not read."""
-    matters = [
-        [i.reads == "y" or j.writes in ("y", i.reads) for j in stages] for i in stages
-    ]
-    return np.where(matters, matrix, 0)

@@ -14,8 +14,6 @@ from ._tableau import FlatTableau, Stage
 
 # Coefficients are exact up to a few roundings of order-one numbers.
 _TOLERANCE = 1e-14
-# At least this many stages of one kind are evaluated together, as one array.
-_WORTH_STACKING = 2
 # The smallest set of unknown stages of a block is found by trying all sets of one size
 # after another. Their number grows exponentially with the stages. So the search ends at a
 # size with more sets than this.
@@ -70,22 +68,15 @@ def _make_plan(stages: tuple[Stage, ...], matrix: bytes, weights: bytes) -> Plan
     s = len(stages)
     tableau = FlatTableau(stages, read(matrix).reshape(s, s), read(weights))
     previous = None
-    tableau = _mask(tableau)
+    # A stage does not depend on values that it does not read.
+    masked = np.where(tableau.reads, tableau.matrix, 0.0)
+    tableau = dataclasses.replace(tableau, matrix=_snap(masked))
     while previous is None or len(tableau.stages) < len(previous.stages):
         previous = tableau
         tableau = _merge(tableau, same_channels=True)
         tableau = _live(tableau)
         tableau = _merge(tableau, same_channels=False)
     return Plan(tableau, _blocks(tableau))
-
-
-def _mask(tableau: FlatTableau) -> FlatTableau:
-    """Zeroes the coefficients of values a stage does not read."""
-    reads = np.array(
-        [[b.writes in a.reads for b in tableau.stages] for a in tableau.stages]
-    )
-    matrix = np.where(reads, tableau.matrix, 0.0)
-    return dataclasses.replace(tableau, matrix=_snap(matrix))
 
 
 def _snap(x: np.ndarray | np.floating) -> np.ndarray:
@@ -165,11 +156,7 @@ def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
         stage = tableau.stages[i]
         kind = (stage.channels, stage.reads, stage.writes)
         groups.setdefault(kind, []).append(i)
-    return tuple(
-        piece
-        for group in groups.values()
-        for piece in ([tuple(group)] if len(group) >= _WORTH_STACKING else zip(group))
-    )
+    return tuple(map(tuple, groups.values()))
 
 
 def _cut(

@@ -5,7 +5,7 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 
 class Stage(NamedTuple):
@@ -33,6 +33,13 @@ class FlatTableau:
     stages: tuple[Stage, ...]
     matrix: Float[np.ndarray, "s s"]
     weights: Float[np.ndarray, " s"]
+
+    @property
+    def reads(self) -> Bool[np.ndarray, "s s"]:
+        """Whether a stage reads a part of the state that another one changes."""
+        return np.array(
+            [[b.writes in a.reads for b in self.stages] for a in self.stages]
+        )
 
     def take(self, keep: list[int]) -> "FlatTableau":
         """The tableau with only the stages `keep`."""
