@@ -17,7 +17,7 @@ from ._custom_types import Args, RealScalarLike, Y
 from ._hamiltonian import check_pair
 from ._quadrature import outcomes
 from ._spins import as_spins, from_spinors, to_spinors
-from ._terms import split_terms, tree_sum
+from ._terms import apply_one, number_of_noises, split_terms, tree_sum
 
 
 def _one_step(terms, solver, t0, t1, y0, args) -> tuple[Y, diffrax.RESULTS]:
@@ -277,22 +277,11 @@ def weak_order_defect(
 
 def _generator(terms, args, ito: bool) -> Callable:
     drift, noise = split_terms(terms)
-
-    def noise_fields(t):
-        """Each `b_k`, as the response to a unit control."""
-        fields = []
-        for term in noise:
-            struct = eqx.filter_eval_shape(term.contr, 0.0, 1.0)
-            zero = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
-            flat, unravel = jfu.ravel_pytree(zero)
-            for unit in np.eye(flat.size):
-                control = unravel(jnp.asarray(unit, flat.dtype))
-                fields.append(
-                    lambda y, term=term, control=control: term.vf_prod(
-                        t, y, args, control
-                    )
-                )
-        return fields
+    # Each `b_k(t, y)` is the response to one increment, of size 1.
+    fields = [
+        ft.partial(apply_one, noise, jnp.array(k), jnp.ones(()), args)
+        for k in range(number_of_noises(terms))
+    ]
 
     def L(phi):
         def L_phi(t, y):
@@ -300,14 +289,14 @@ def _generator(terms, args, ito: bool) -> Callable:
             velocity = tree_sum([still, *(term.vf(t, y, args) for term in drift)])
             along_drift = (jnp.ones_like(t), velocity)
             _, total = jax.jvp(phi, (t, y), along_drift)
-            for field in noise_fields(t):
+            for b in fields:
+                frozen = b(t, y)
+                moving = (lambda t, y: frozen) if ito else b
 
-                def derivative(y, direction):
-                    return jax.jvp(lambda y: phi(t, y), (y,), (direction(y),))[1]
+                def derivative(y):
+                    return jax.jvp(lambda y: phi(t, y), (y,), (moving(t, y),))[1]
 
-                frozen = field(y)
-                moving = (lambda y: frozen) if ito else field
-                _, second = jax.jvp(lambda y: derivative(y, moving), (y,), (frozen,))
+                _, second = jax.jvp(derivative, (y,), (frozen,))
                 total = (total**ω + second**ω / 2).ω
             return total
 
