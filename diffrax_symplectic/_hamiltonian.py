@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Shaped
 
+from ._brownian import increment_struct
 from ._compat import ω
 from ._custom_types import Args, BM, RealScalarLike
 from ._indexed_noise import IndexedNoise, OneNoise
@@ -141,7 +142,7 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         # The structure of the state, with the structure of the noises at each leaf, and
         # arrays of shape `(*state, *noise)` in that.
         check_pair(y)
-        struct = jax.eval_shape(lambda: self.path.evaluate(0.0, 1.0))
+        struct = increment_struct(self.path)
         jac = jax.jacrev(lambda y: self._hamiltonians(t, y[0], y[1], args, struct))(y)
         noise_def, state_def = jtu.tree_structure(struct), jtu.tree_structure(y)
 
@@ -166,11 +167,7 @@ class HamiltonianNoise(diffrax.AbstractTerm):
             return sum(jtu.tree_leaves(terms))
 
         is_entry = lambda x: jtu.tree_structure(x) == structure
-        dp, dq = vf
-        return (
-            jtu.tree_map(contract, dp, is_leaf=is_entry),
-            jtu.tree_map(contract, dq, is_leaf=is_entry),
-        )
+        return jtu.tree_map(contract, vf, is_leaf=is_entry)
 
     def vf_prod(
         self, t: RealScalarLike, y: _State, args: Args, control: BM | OneNoise
@@ -189,11 +186,11 @@ class HamiltonianNoise(diffrax.AbstractTerm):
 
     def is_vf_expensive(self, t0, t1, y, args) -> bool:
         # `vf` takes one reverse pass for each noise, `vf_prod` takes one in all.
-        struct = jax.eval_shape(lambda: self.path.evaluate(0.0, 1.0))
+        struct = increment_struct(self.path)
         return sum(s.size for s in jtu.tree_leaves(struct)) > 2
 
     def _one_hamiltonian(self, t, p, q, args, number) -> Array:
-        struct = jax.eval_shape(lambda: self.path.evaluate(0.0, 1.0))
+        struct = increment_struct(self.path)
         every = lambda: self._hamiltonians(t, p, q, args, struct)
         if isinstance(self.noise, IndexedNoise):
             jax.eval_shape(every)  # for its error
@@ -203,14 +200,11 @@ class HamiltonianNoise(diffrax.AbstractTerm):
     def _hamiltonians(self, t, p, q, args, struct) -> PyTree[Array]:
         """The noise Hamiltonians, in the structure and shapes of the path."""
         H = self.noise(t, p, q, args)
-        matches = jtu.tree_structure(H) == jtu.tree_structure(struct)
-        if matches:
-            for h, s in zip(jtu.tree_leaves(H), jtu.tree_leaves(struct)):
-                # One noise may come as a scalar.
-                matches = matches and (
-                    jnp.shape(h) == s.shape or jnp.size(h) == s.size == 1
-                )
-        if not matches:
+        # One noise may come as a scalar.
+        fits = lambda h, s: jnp.shape(h) == s.shape or jnp.size(h) == s.size == 1
+        if jtu.tree_structure(H) != jtu.tree_structure(struct) or not all(
+            map(fits, jtu.tree_leaves(H), jtu.tree_leaves(struct))
+        ):
             raise ValueError(
                 "`noise` must return one Hamiltonian for each noise of "
                 f"the path, which has shape {eqx.tree_pformat(struct)}; got "

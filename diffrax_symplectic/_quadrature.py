@@ -12,8 +12,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from ._brownian import AbstractLaw, increment_struct, laws_of
-from ._terms import brownian_paths
+from ._brownian import AbstractLaw, GivenPath, Increment, increment_struct, laws_of
+from ._terms import brownian_paths, replace_paths
 
 
 class Outcomes(NamedTuple):
@@ -33,8 +33,7 @@ def outcomes(terms: PyTree[diffrax.AbstractTerm], h, nodes: int) -> Outcomes:
     """All outcomes of a step of size `h`, for `terms` with one Brownian path."""
     path, laws = _the_path(terms)
     shape = increment_struct(path)
-    zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), shape)
-    flat, unravel = jfu.ravel_pytree(zeros)
+    flat, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, shape))
     scalars = [law.outcomes(nodes) for law in laws.values() for _ in range(flat.size)]
     values = np.array([*itertools.product(*[values for values, _ in scalars])])
     weights = np.array([*itertools.product(*[weights for _, weights in scalars])])
@@ -46,38 +45,20 @@ def outcomes(terms: PyTree[diffrax.AbstractTerm], h, nodes: int) -> Outcomes:
         return cast(Any, path.levy_area)(dt=dt, **dict(zip(laws, sets)))
 
     def put(increment):
-        given = _FixedIncrement(increment)  # pyright: ignore[reportCallIssue]
-        return jtu.tree_map(
-            lambda x: given if _is_path(x) else x, terms, is_leaf=_is_path
+        given = GivenPath(
+            make=jtu.Partial(_constant, increment), levy_area=type(increment)
         )
+        return replace_paths(terms, lambda _: given)
 
     return Outcomes(jax.vmap(increment)(scaled), np.prod(weights, axis=1), put)
 
 
-class _FixedIncrement(diffrax.AbstractBrownianPath):
-    """A path that has a given increment over every step."""
-
-    increment: diffrax.AbstractBrownianIncrement
-
-    @property
-    def t0(self):
-        return -jnp.inf
-
-    @property
-    def t1(self):
-        return jnp.inf
-
-    @property
-    def levy_area(self):
-        return type(self.increment)
-
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
-        del t0, t1, left
-        return self.increment if use_levy else self.increment.W
-
-
-def _is_path(x) -> bool:
-    return isinstance(x, diffrax.AbstractBrownianPath)
+def _constant(
+    increment: diffrax.AbstractBrownianIncrement, t0, t1, use_levy: bool
+) -> Increment:
+    """The same increment over every step."""
+    del t0, t1
+    return increment if use_levy else increment.W
 
 
 def _the_path(terms) -> tuple[diffrax.AbstractBrownianPath, Mapping[str, AbstractLaw]]:

@@ -13,7 +13,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import PRNGKeyArray, PyTree
 
-from ._brownian import WeakBrownianPath
+from ._brownian import increment_struct, WeakBrownianPath
 from ._custom_types import Args, RealScalarLike, Y
 from ._structure_checks import (
     additive_fault,
@@ -23,10 +23,14 @@ from ._structure_checks import (
     separable_fault,
 )
 from ._suggestion_rules import PATHS, Rule, RULES, Want
-from ._terms import apply, brownian_paths, check_state, number_of_noises, split_terms
-
-
-_Path = diffrax.AbstractBrownianPath
+from ._terms import (
+    apply,
+    brownian_paths,
+    check_state,
+    number_of_noises,
+    replace_paths,
+    split_terms,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +78,8 @@ class Suggestions(Sequence[Suggestion]):
         for number, s in enumerate(self, start=1):
             strong = "" if s.strong_order is None else f", strong {s.strong_order:g}"
             orders = f"weak order {s.weak_order:g}{strong}"
-            lines.append(f"{number}. {_name(type(s.solver)):20} {orders}")
+            name = f"{type(s.solver).__name__}()"
+            lines.append(f"{number}. {name:20} {orders}")
             lines.append(f"   path: {s.path}")
             lines += textwrap.wrap(
                 s.reason, 88, initial_indent="   ", subsequent_indent="   "
@@ -160,17 +165,17 @@ def suggest_solver(
     commute = (
         m == 1 or has["separable"] or has["additive"] or commuting(noise, t0, y0, args)
     )
-    shape = _shape(brownian_paths(noise)[0])
+    shape = increment_struct(brownian_paths(noise)[0])
     one_array = len(noise) == 1 and jtu.all_leaves([shape])
     found = []
-    for rule in RULES:
+    for rule, reason in RULES.items():
         fits = rule.want == want and has[rule.structure]
         if rule.noises != "any":
             fits = fits and commute == (rule.noises == "commuting")
         if rule.path == "Lévy areas":
             fits = fits and one_array
         if fits and rule.solver not in [type(s.solver) for s in found]:
-            found.append(_suggestion(rule, terms, shape, commute))
+            found.append(_suggestion(rule, reason, terms, shape, commute))
     structure = [name for name in has if has[name] and name != "any"]
     kind = (
         " and ".join(structure) or f"general ({getattr(not_separable, 'reason', '')})"
@@ -200,7 +205,9 @@ def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     return drift, noise
 
 
-def _suggestion(rule: Rule, terms: diffrax.AbstractTerm, shape, commute) -> Suggestion:
+def _suggestion(
+    rule: Rule, reason: str, terms: diffrax.AbstractTerm, shape, commute: bool
+) -> Suggestion:
     solver: Any = rule.solver()
     # The orders of noises that commute are those of one noise.
     counted = terms
@@ -213,7 +220,7 @@ def _suggestion(rule: Rule, terms: diffrax.AbstractTerm, shape, commute) -> Sugg
         weak_order=solver.weak_order(counted),
         strong_order=solver.strong_order(counted),
         path=kind.code.format(shape=_shape_code(shape)),
-        reason=rule.reason,
+        reason=reason,
         terms=jtu.Partial(_with_paths, kind.make, terms),
     )
 
@@ -223,20 +230,14 @@ def _with_paths(make: Callable, terms: PyTree, key: PRNGKeyArray) -> PyTree:
     one."""
     made = {}
 
-    def replace(x):
-        if not isinstance(x, _Path):
-            return x
-        if id(x) not in made:
+    def new(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
+        if id(path) not in made:
             number = len(made)
             own = key if number == 0 else jr.fold_in(key, number + 1)
-            made[id(x)] = make(_shape(x), own)
-        return made[id(x)]
+            made[id(path)] = make(increment_struct(path), own)
+        return made[id(path)]
 
-    return jtu.tree_map(replace, terms, is_leaf=lambda x: isinstance(x, _Path))
-
-
-def _shape(path: _Path) -> PyTree[jax.ShapeDtypeStruct]:
-    return eqx.filter_eval_shape(path.evaluate, 0.0, 1.0)
+    return replace_paths(terms, new)
 
 
 def _shape_code(shape: PyTree[jax.ShapeDtypeStruct]) -> str:
@@ -245,7 +246,3 @@ def _shape_code(shape: PyTree[jax.ShapeDtypeStruct]) -> str:
     if shape.dtype == jnp.result_type(float):
         return str(shape.shape)
     return f"jax.ShapeDtypeStruct({shape.shape}, jnp.{shape.dtype})"
-
-
-def _name(solver: type) -> str:
-    return f"{solver.__name__}()"

@@ -95,134 +95,57 @@ class Rule(NamedTuple):
     solver: type[diffrax.AbstractSolver]
     # One of `PATHS`.
     path: str
-    reason: str
 
 
-# The best comes first. The test of docs/choosing.md compares its tables with this one.
-RULES = (
-    Rule(
-        "expectations",
-        "constant",
-        "any",
-        AdditiveGauss,
-        "weak, four-point",
-        "Two stage vectors, and by far the smallest errors for constant noise.",
+# Each rule with its reason, in a sentence. The best comes first. A test compares the tables
+# of docs/choosing.md with this one.
+RULES = {
+    Rule("expectations", "constant", "any", AdditiveGauss, "weak, four-point"): (
+        "Two stage vectors, and by far the smallest errors for constant noise."
     ),
-    Rule(
-        "expectations",
-        "separable",
-        "any",
-        StormerVerlet,
-        "weak",
+    Rule("expectations", "separable", "any", StormerVerlet, "weak"): (
         "Explicit, the cheapest step of all. The step has to resolve the fastest "
-        "frequency: omega h < 2.",
+        "frequency: omega h < 2."
     ),
-    Rule(
-        "expectations",
-        "constant",
-        "any",
-        SRKw5,
-        "weak, second set",
-        "Few digits at the cost of the midpoint rule.",
+    Rule("expectations", "constant", "any", SRKw5, "weak, second set"): (
+        "Few digits at the cost of the midpoint rule."
     ),
-    Rule(
-        "expectations",
-        "additive",
-        "any",
-        SRKs4,
-        "space-time area",
-        "Additive noise may depend on time here.",
+    Rule("expectations", "additive", "any", SRKs4, "space-time area"): (
+        "Additive noise may depend on time here."
     ),
-    Rule(
-        "expectations",
-        "separable",
-        "any",
-        SRKw4,
-        "weak",
-        "Implicit, on half of the state: for systems too stiff for explicit steps.",
+    Rule("expectations", "separable", "any", SRKw4, "weak"): (
+        "Implicit, on half of the state: for systems too stiff for explicit steps."
     ),
-    Rule(
-        "expectations",
-        "any",
-        "commuting",
-        StrangGauss,
-        "weak",
-        "Four stage vectors in three small systems, for one noise or commuting ones.",
+    Rule("expectations", "any", "commuting", StrangGauss, "weak"): (
+        "Four stage vectors in three small systems, for one noise or commuting ones."
     ),
-    Rule(
-        "expectations",
-        "any",
-        "not commuting",
-        NinomiyaVictoir,
-        "weak, two-point",
-        "Two stage vectors for each noise and four for the drift; its errors repay them "
-        "if the noises are few.",
+    Rule("expectations", "any", "not commuting", NinomiyaVictoir, "weak, two-point"): (
+        "Two stage vectors for each noise and four for the drift; its errors repay "
+        "them if the noises are few."
     ),
-    Rule(
-        "expectations",
-        "any",
-        "any",
-        SRKw1,
-        "weak",
-        "The midpoint rule: one stage vector for any number of noises, for few digits.",
+    Rule("expectations", "any", "any", SRKw1, "weak"): (
+        "The midpoint rule: one stage vector for any number of noises, for few digits."
     ),
-    Rule(
-        "paths",
-        "separable",
-        "any",
-        PlateauVerlet,
-        "plateaus",
-        "Explicit. The step has to resolve the fastest frequency: omega h < 4.",
+    Rule("paths", "separable", "any", PlateauVerlet, "plateaus"): (
+        "Explicit. The step has to resolve the fastest frequency: omega h < 4."
     ),
-    Rule(
-        "paths",
-        "additive",
-        "any",
-        SRKs4,
-        "space-time area",
-        "Two stage vectors, one after the other.",
+    Rule("paths", "additive", "any", SRKs4, "space-time area"): (
+        "Two stage vectors, one after the other."
     ),
-    Rule(
-        "paths",
-        "any",
-        "commuting",
-        PlateauGauss,
-        "space-time area",
+    Rule("paths", "any", "commuting", PlateauGauss, "space-time area"): (
         "Two stage vectors, and brackets of the vector fields: accurate paths for one "
-        "noise or commuting ones.",
+        "noise or commuting ones."
     ),
-    Rule(
-        "paths",
-        "any",
-        "not commuting",
-        LevyAreaMidpoint,
-        "Lévy areas",
-        "The midpoint rule with Lévy areas, which bring the order if noises do not "
-        "commute.",
+    Rule("paths", "any", "not commuting", LevyAreaMidpoint, "Lévy areas"): (
+        "The midpoint rule with Lévy areas, which bring the order if noises do not commute."
     ),
-    Rule(
-        "paths",
-        "separable",
-        "any",
-        StormerVerlet,
-        "Gaussian",
-        "Explicit, the cheapest step of all, for few digits: omega h < 2.",
+    Rule("paths", "separable", "any", StormerVerlet, "Gaussian"): (
+        "Explicit, the cheapest step of all, for few digits: omega h < 2."
     ),
-    Rule(
-        "paths",
-        "any",
-        "any",
-        Midpoint,
-        "truncated",
-        "The first to try: one stage vector for any number of noises.",
+    Rule("paths", "any", "any", Midpoint, "truncated"): (
+        "The first to try: one stage vector for any number of noises."
     ),
-    Rule(
-        "paths",
-        "separable",
-        "any",
-        SRKs2,
-        "truncated",
-        "The midpoint rule on half of the state: for systems too stiff for explicit "
-        "steps.",
+    Rule("paths", "separable", "any", SRKs2, "truncated"): (
+        "The midpoint rule on half of the state: for systems too stiff for explicit steps."
     ),
-)
+}

@@ -2,6 +2,7 @@
 step, and checks that terms and state fit each other."""
 
 import functools as ft
+from collections.abc import Callable
 
 import diffrax
 import equinox as eqx
@@ -61,8 +62,16 @@ def _flatten(terms: diffrax.AbstractTerm) -> tuple:
 
 
 def brownian_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
-    is_path = lambda x: isinstance(x, diffrax.AbstractBrownianPath)
-    return [x for x in jtu.tree_leaves(terms, is_leaf=is_path) if is_path(x)]
+    return [x for x in jtu.tree_leaves(terms, is_leaf=_is_path) if _is_path(x)]
+
+
+def replace_paths(terms: PyTree, new: Callable) -> PyTree:
+    """The terms with `new(path)` in place of each Brownian path."""
+    return jtu.tree_map(lambda x: new(x) if _is_path(x) else x, terms, is_leaf=_is_path)
+
+
+def _is_path(x) -> bool:
+    return isinstance(x, diffrax.AbstractBrownianPath)
 
 
 def _is_ode(term: diffrax.AbstractTerm) -> bool:

@@ -34,8 +34,7 @@ def test_laws_have_the_variance_on_record_and_outcomes_of_their_words():
             values, weights = law.outcomes(5)
             np.testing.assert_allclose(weights.sum(), 1, rtol=1e-14)
             np.testing.assert_allclose(weights @ values, 0, atol=1e-15)
-            for variance in (law.variance, weights @ values**2):
-                np.testing.assert_allclose(variance, on_record, rtol=1e-14)
+            np.testing.assert_allclose(weights @ values**2, on_record, rtol=1e-14)
             if isinstance(law, Discrete):
                 # As many words have each value as its probability says.
                 edges = np.array([0, *law.cuts, 2**32], np.uint64)

@@ -215,9 +215,9 @@ def test_docs_give_the_rules_of_the_package():
     page = (Path(__file__).parent.parent / "docs/choosing.md").read_text()
     for want in ("expectations", "paths"):
         rows = [
-            f"| {_system(rule)} | `{rule.solver.__name__}` | {rule.reason} | "
+            f"| {_system(rule)} | `{rule.solver.__name__}` | {reason} | "
             f"`{PATHS[rule.path].code.format(shape='shape')}` |\n"
-            for rule in RULES
+            for rule, reason in RULES.items()
             if rule.want == want
         ]
         # In one piece: no row is missing, none is left over.

@@ -1,3 +1,4 @@
+from ._given import GivenPath as GivenPath
 from ._gaussian import FixedStepBrownianPath as FixedStepBrownianPath
 from ._laws import (
     AbstractLaw as AbstractLaw,
@@ -15,6 +16,7 @@ from ._plateau import (
 from ._random_words import check_key as check_key
 from ._stepwise import (
     AbstractStepwisePath as AbstractStepwisePath,
+    Increment as Increment,
     laws_of as laws_of,
     stepwise as stepwise,
 )

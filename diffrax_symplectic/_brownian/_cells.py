@@ -1,15 +1,19 @@
 """Steps put together from cells, so that steps of different sizes see one path."""
 
 from collections.abc import Callable
+from typing import Any, cast
 
+import diffrax
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from .._custom_types import RealScalarLike
+from ._stepwise import Increment
 
 
 class Piece(eqx.Module):
@@ -42,6 +46,26 @@ class Piece(eqx.Module):
             outer = jnp.outer(self.W, other.W)
             A = self.A + other.A + (outer - outer.T) / 2
         return Piece(self.h + other.h, self.W + other.W, integral, A)
+
+    def as_increment(
+        self,
+        kind: type[diffrax.AbstractBrownianIncrement],
+        shape: PyTree[jax.ShapeDtypeStruct],
+        h: RealScalarLike,
+        use_levy: bool,
+    ) -> Increment:
+        """The increment over a step of size `h` of a path of this shape. With `use_levy` it
+        is of type `kind`, and holds the areas that are known here."""
+        _, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, shape))
+        if not use_levy:
+            return unravel(self.W)
+        areas = {}
+        if self.integral is not None:
+            areas["H"] = unravel(self.H)
+        if self.A is not None:
+            areas["A"] = self.A
+        dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), shape)
+        return cast(Any, kind)(dt=dt, W=unravel(self.W), **areas)
 
 
 def or_one(h: Float[Array, ""]) -> Float[Array, ""]:

@@ -5,13 +5,17 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from ._cells import check_cell, compose, Piece
 from ._laws import AbstractLaw
 from ._random_words import check_key, place_of
-from ._stepwise import AbstractPathWithLaws, checked_shape, gaussian_laws
+from ._stepwise import (
+    AbstractPathWithLaws,
+    checked_shape,
+    GAUSSIAN_LAWS,
+    Increment,
+)
 
 
 class FixedStepBrownianPath(AbstractPathWithLaws):
@@ -85,21 +89,15 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
 
     @property
     def laws(self) -> Mapping[str, AbstractLaw]:
-        laws = gaussian_laws(self.levy_area)
-        assert laws is not None
-        return laws
+        return GAUSSIAN_LAWS[self.levy_area]
 
-    def draw(
-        self, t0: Array, t1: Array, use_levy: bool
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         if self.cell is not None:
             return self._composed(t0, t1, self.cell, use_levy)
         words = self.words(place_of(t0, t1), use_levy)
         return self.increment(words, t0, t1, use_levy)
 
-    def _composed(
-        self, t0: Array, t1: Array, cell: float, use_levy: bool
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+    def _composed(self, t0: Array, t1: Array, cell: float, use_levy: bool) -> Increment:
         # The increments are the same whether or not the areas are asked for.
         with_area = self.levy_area is diffrax.SpaceTimeLevyArea
         h = jnp.asarray(cell, t0.dtype)
@@ -115,11 +113,4 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
             return Piece(length, W, length * (W / 2 + H))
 
         piece = compose(t0, t1, cell, sample, type(self).__name__)
-        zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), self.shape)
-        _, unravel = jfu.ravel_pytree(zeros)
-        if not use_levy:
-            return unravel(piece.W)
-        dt = jtu.tree_map(lambda s: jnp.asarray(t1 - t0, s.dtype), self.shape)
-        if not with_area:
-            return diffrax.BrownianIncrement(dt, unravel(piece.W))
-        return diffrax.SpaceTimeLevyArea(dt, unravel(piece.W), unravel(piece.H))
+        return piece.as_increment(self.levy_area, self.shape, t1 - t0, use_levy)

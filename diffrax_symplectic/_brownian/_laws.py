@@ -1,5 +1,5 @@
-"""The laws of scalar random variables, for a step of size 1: their variance, what a
-quadrature over them needs, and samples of them from random words."""
+"""The laws of scalar random variables, for a step of size 1: what a quadrature over them
+needs, and samples of them from random words."""
 
 import abc
 import dataclasses
@@ -13,11 +13,6 @@ from jaxtyping import Array, Float, UInt32
 
 class AbstractLaw(abc.ABC):
     """The law of a scalar random variable with mean zero. Laws are compared by value."""
-
-    @property
-    @abc.abstractmethod
-    def variance(self) -> float:
-        """The variance, which is the second moment since the mean is zero."""
 
     @abc.abstractmethod
     def outcomes(self, nodes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -38,10 +33,6 @@ class Discrete(AbstractLaw):
     probabilities: tuple[float, ...]
     cuts: tuple[int, ...]
 
-    @property
-    def variance(self) -> float:
-        return sum(p * v**2 for v, p in zip(self.values, self.probabilities))
-
     def outcomes(self, nodes: int) -> tuple[np.ndarray, np.ndarray]:
         return np.array(self.values), np.array(self.probabilities)
 
@@ -58,7 +49,7 @@ class Gaussian(AbstractLaw):
     """The normal distribution of mean zero. One word makes one sample, a monotone function
     of it."""
 
-    variance: float = 1.0  # pyright: ignore[reportIncompatibleMethodOverride]
+    variance: float = 1.0
 
     def outcomes(self, nodes: int) -> tuple[np.ndarray, np.ndarray]:
         points, weights = np.polynomial.hermite_e.hermegauss(nodes)

@@ -3,7 +3,6 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 
@@ -12,7 +11,7 @@ from .._materialize import materialize
 from ._cells import check_cell, compose, or_one, Piece
 from ._laws import normal_from_words
 from ._random_words import AREA_WORDS, check_key, place_of, random_words
-from ._stepwise import num_noises, stepwise
+from ._stepwise import Increment, num_noises
 from ._wrapper import (
     AbstractWrappedPath,
     increment_struct,
@@ -105,52 +104,33 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     def levy_area(self):
         return LevyAreaIncrement
 
-    def draw(
-        self, t0: Array, t1: Array, use_levy: bool
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        if self.cell is not None:
-            return self._increment(self._composed(t0, t1, self.cell), t1 - t0, use_levy)
-        if not use_levy:
-            return self.path.evaluate(t0, t1)
-        return self._increment(self._sample(t0, t1), t1 - t0, use_levy)
-
     @property
     def laws(self) -> None:
         return None
 
-    def num_words(self, use_levy: bool = False) -> int:
-        words = stepwise(self.path).num_words(use_levy)
-        return words + (self._num_normals() if use_levy else 0)
-
-    def increment(
-        self,
-        words: UInt32[Array, " num_words"],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        use_levy: bool = False,
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        """Samples the step by itself, whatever `cell` is."""
-        path = stepwise(self.path)
-        increment = path.increment(words, t0, t1, use_levy)
-        if not use_levy:
-            return increment
-        piece = self._piece(increment, words[path.num_words(True) :], t1 - t0)
+    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
+        if self.cell is not None:
+            piece = self._composed(t0, t1, self.cell)
+        elif use_levy:
+            piece = self._sample(t0, t1)
+        else:
+            return self.path.evaluate(t0, t1)
         return self._increment(piece, t1 - t0, use_levy)
 
-    def _increment(
-        self, piece: Piece, h: RealScalarLike, use_levy: bool
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        struct = increment_struct(self.path)
-        zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
-        _, unravel = jfu.ravel_pytree(zeros)
+    def num_own_words(self, use_levy: bool) -> int:
         if not use_levy:
-            return unravel(piece.W)
-        dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), struct)
-        assert piece.A is not None
-        return LevyAreaIncrement(dt, unravel(piece.W), unravel(piece.H), piece.A)
-
-    def _num_normals(self) -> int:
+            return 0
         return sum(_sizes(num_noises(increment_struct(self.path)), self.terms))
+
+    def changed(self, increment, own_words, h, use_levy) -> Increment:
+        """Samples the step by itself, whatever `cell` is."""
+        if not use_levy:
+            return increment
+        return self._increment(self._piece(increment, own_words, h), h, use_levy)
+
+    def _increment(self, piece: Piece, h: RealScalarLike, use_levy: bool) -> Increment:
+        shape = increment_struct(self.path)
+        return piece.as_increment(LevyAreaIncrement, shape, h, use_levy)
 
     def _composed(self, t0, t1, cell: float) -> Piece:
         # A cell may end a rounding error beyond the end of the path.
@@ -160,7 +140,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
 
     def _sample(self, t0, t1) -> Piece:
         increment = materialize(lambda: self.path.evaluate(t0, t1, use_levy=True))
-        n = self._num_normals()
+        n = self.num_own_words(True)
         words = random_words(self.key, place_of(t0, t1), 1, n, AREA_WORDS)
         return self._piece(increment, words[0], t1 - t0)
 

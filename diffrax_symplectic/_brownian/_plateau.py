@@ -1,12 +1,12 @@
 import diffrax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from .._custom_types import BM, RealScalarLike
+from .._custom_types import BM
 from ._laws import AbstractLaw, two_point
 from ._random_words import check_key, place_of, PLATEAU_WORDS, random_words
-from ._stepwise import draw_set, laws_of, num_noises, stepwise
+from ._stepwise import draw_set, Increment, laws_of, num_noises
 from ._wrapper import (
     AbstractWrappedPath,
     increment_struct,
@@ -84,35 +84,20 @@ class PlateauBrownianPath(AbstractWrappedPath):
         # The increments here hold no space-time-time areas.
         return {"W": laws["W"], "H": laws["H"], "sign": _SIGN}
 
-    def num_words(self, use_levy: bool = False) -> int:
-        words = stepwise(self.path).num_words(use_levy)
-        return words + (num_noises(increment_struct(self.path)) if use_levy else 0)
-
-    def increment(
-        self,
-        words: UInt32[Array, " num_words"],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        use_levy: bool = False,
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        path = stepwise(self.path)
-        increment = path.increment(words, t0, t1, use_levy)
-        if not use_levy:
-            return increment
-        return _with_plateaus(increment, words[path.num_words(True) :], t1 - t0)
-
-    def draw(
-        self, t0: Array, t1: Array, use_levy: bool
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         increment = self.path.evaluate(t0, t1, use_levy=use_levy)
         if not use_levy:
             return increment
-        n = num_noises(increment_struct(self.path))
+        n = self.num_own_words(use_levy)
         words = random_words(self.key, place_of(t0, t1), 1, n, PLATEAU_WORDS)
-        return _with_plateaus(increment, words[0], t1 - t0)
+        return self.changed(increment, words[0], t1 - t0, use_levy)
 
+    def num_own_words(self, use_levy: bool) -> int:
+        return num_noises(increment_struct(self.path)) if use_levy else 0
 
-def _with_plateaus(increment, words, h) -> PlateauIncrement:
-    assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
-    sign = draw_set(_SIGN, words, h, increment.W)
-    return PlateauIncrement(increment.dt, increment.W, increment.H, sign)
+    def changed(self, increment, own_words, h, use_levy) -> Increment:
+        if not use_levy:
+            return increment
+        assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
+        sign = draw_set(_SIGN, own_words, h, increment.W)
+        return PlateauIncrement(increment.dt, increment.W, increment.H, sign)

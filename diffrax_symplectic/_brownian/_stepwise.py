@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Mapping
-from typing import Any, cast, TYPE_CHECKING
+from typing import Any, cast, TYPE_CHECKING, TypeAlias
 
 import diffrax
 import jax
@@ -24,6 +24,10 @@ else:
     from equinox import AbstractVar
 
 
+# What a step gets from its path, without and with all of its random variables.
+Increment: TypeAlias = PyTree[Array] | diffrax.AbstractBrownianIncrement
+
+
 class AbstractStepwisePath(diffrax.AbstractBrownianPath):
     """A path whose increment over a step is a function of random words of 32 bits, one for
     each scalar random variable. `evaluate` takes them from a generator. To put others in
@@ -35,7 +39,7 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         t1: RealScalarLike | None = None,
         left: bool = True,
         use_levy: bool = False,
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+    ) -> Increment:
         """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
 
         Returns the increment over the step from `t0` to `t1`, or with `use_levy=True` an
@@ -52,9 +56,7 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         return self.draw(start, end, use_levy)
 
     @abc.abstractmethod
-    def draw(
-        self, t0: Array, t1: Array, use_levy: bool
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         """What `evaluate` returns for the step from `t0` to `t1`."""
 
     @property
@@ -75,7 +77,7 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         t0: RealScalarLike,
         t1: RealScalarLike,
         use_levy: bool = False,
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+    ) -> Increment:
         """What `evaluate` returns for the step from `t0` to `t1`, from given words."""
 
 
@@ -116,7 +118,7 @@ class AbstractPathWithLaws(AbstractStepwisePath):
         t0: RealScalarLike,
         t1: RealScalarLike,
         use_levy: bool = False,
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+    ) -> Increment:
         n = num_noises(self.shape)
         sets = [words[i * n : (i + 1) * n] for i in range(len(self.laws))]
         draw = lambda law, words: draw_set(law, words, t1 - t0, self.shape)
@@ -143,22 +145,24 @@ def laws_of(path: diffrax.AbstractBrownianPath) -> Mapping[str, AbstractLaw] | N
     if isinstance(path, AbstractStepwisePath):
         return path.laws
     if isinstance(path, diffrax.UnsafeBrownianPath | diffrax.VirtualBrownianTree):
-        return gaussian_laws(path.levy_area)
+        return GAUSSIAN_LAWS.get(path.levy_area)
     return None
 
 
-def gaussian_laws(levy_area: type) -> Mapping[str, AbstractLaw] | None:
-    if levy_area is diffrax.BrownianIncrement:
-        return {"W": Gaussian()}
-    if levy_area is diffrax.SpaceTimeLevyArea:
-        return {"W": Gaussian(), "H": Gaussian(1 / 12)}
-    if levy_area is diffrax.SpaceTimeTimeLevyArea:
-        return {"W": Gaussian(), "H": Gaussian(1 / 12), "K": Gaussian(1 / 720)}
-    return None
+# The laws of Gaussian paths, by the type of their increments.
+GAUSSIAN_LAWS: Mapping[type, Mapping[str, AbstractLaw]] = {
+    diffrax.BrownianIncrement: {"W": Gaussian()},
+    diffrax.SpaceTimeLevyArea: {"W": Gaussian(), "H": Gaussian(1 / 12)},
+    diffrax.SpaceTimeTimeLevyArea: {
+        "W": Gaussian(),
+        "H": Gaussian(1 / 12),
+        "K": Gaussian(1 / 720),
+    },
+}
 
 
 def num_noises(shape: PyTree[jax.ShapeDtypeStruct]) -> int:
-    return sum(int(np.prod(leaf.shape)) for leaf in jtu.tree_leaves(shape))
+    return sum(leaf.size for leaf in jtu.tree_leaves(shape))
 
 
 def draw_set(
@@ -170,7 +174,7 @@ def draw_set(
     """A random variable for each noise, over a step of size `h`, in the structure, shapes
     and dtypes of `like`."""
     leaves, treedef = jtu.tree_flatten(like)
-    ends = np.cumsum([int(np.prod(leaf.shape)) for leaf in leaves])
+    ends = np.cumsum([leaf.size for leaf in leaves])
     root = jnp.sqrt(jnp.abs(h))
     out = [
         law.from_words(piece.reshape(leaf.shape), leaf.dtype) * root.astype(leaf.dtype)

@@ -4,10 +4,10 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree, UInt32
+from jaxtyping import Array
 
 from .._custom_types import RealScalarLike
-from ._stepwise import stepwise
+from ._stepwise import Increment
 from ._wrapper import AbstractWrappedPath
 
 
@@ -61,30 +61,23 @@ class TruncatedBrownianPath(AbstractWrappedPath):
     def levy_area(self):
         return self.path.levy_area
 
-    def draw(
-        self, t0: Array, t1: Array, use_levy: bool
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        increment = self.path.evaluate(t0, t1, use_levy=use_levy)
-        return self._clip(increment, t1 - t0)
-
     @property
     def laws(self) -> None:
         return None
 
-    def num_words(self, use_levy: bool = False) -> int:
-        return stepwise(self.path).num_words(use_levy)
-
-    def increment(
-        self,
-        words: UInt32[Array, " num_words"],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        use_levy: bool = False,
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
-        increment = stepwise(self.path).increment(words, t0, t1, use_levy)
+    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
+        increment = self.path.evaluate(t0, t1, use_levy=use_levy)
         return self._clip(increment, t1 - t0)
 
-    def _clip(self, increment, h) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+    def num_own_words(self, use_levy: bool) -> int:
+        del use_levy
+        return 0
+
+    def changed(self, increment, own_words, h, use_levy) -> Increment:
+        del own_words, use_levy
+        return self._clip(increment, h)
+
+    def _clip(self, increment: Increment, h: RealScalarLike) -> Increment:
         h = jnp.abs(h)
         h = eqx.error_if(
             h,

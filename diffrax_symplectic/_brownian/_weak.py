@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from .._custom_types import BM
 from ._laws import AbstractLaw, FOUR_POINT, THREE_POINT, two_point
 from ._random_words import check_key, place_of
-from ._stepwise import AbstractPathWithLaws, checked_shape
+from ._stepwise import AbstractPathWithLaws, checked_shape, Increment
 
 
 class WeakIncrement(diffrax.AbstractBrownianIncrement):
@@ -142,9 +142,7 @@ class WeakBrownianPath(AbstractPathWithLaws):
     def levy_area(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return WeakIncrement
 
-    def draw(
-        self, t0: Array, t1: Array, use_levy: bool
-    ) -> PyTree[Array] | diffrax.AbstractBrownianIncrement:
+    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         words = self.words(place_of(t0, t1), use_levy)
         return self.increment(words, t0, t1, use_levy)
 

@@ -1,10 +1,12 @@
+import abc
 from typing import TYPE_CHECKING
 
 import diffrax
 import jax
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree, UInt32
 
-from ._stepwise import AbstractStepwisePath
+from .._custom_types import RealScalarLike
+from ._stepwise import AbstractStepwisePath, Increment, stepwise
 
 
 if TYPE_CHECKING:
@@ -25,6 +27,35 @@ class AbstractWrappedPath(AbstractStepwisePath):
     @property
     def t1(self):
         return self.path.t1
+
+    @abc.abstractmethod
+    def num_own_words(self, use_levy: bool) -> int:
+        """How many random words `changed` needs."""
+
+    @abc.abstractmethod
+    def changed(
+        self,
+        increment: Increment,
+        own_words: UInt32[Array, " num_own_words"],
+        h: RealScalarLike,
+        use_levy: bool,
+    ) -> Increment:
+        """What this path makes of an increment of the other, over a step of size `h`."""
+
+    def num_words(self, use_levy: bool = False) -> int:
+        return stepwise(self.path).num_words(use_levy) + self.num_own_words(use_levy)
+
+    def increment(
+        self,
+        words: UInt32[Array, " num_words"],
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        use_levy: bool = False,
+    ) -> Increment:
+        path = stepwise(self.path)
+        increment = path.increment(words, t0, t1, use_levy)
+        own_words = words[path.num_words(use_levy) :]
+        return self.changed(increment, own_words, t1 - t0, use_levy)
 
 
 def increment_struct(

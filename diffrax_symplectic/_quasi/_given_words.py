@@ -7,41 +7,14 @@ import equinox as eqx
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, UInt32
 
-from .._brownian import AbstractStepwisePath, stepwise, THREE_POINT
-from .._terms import brownian_paths
-
-
-class _GivenWords(AbstractStepwisePath):
-    """The path, but each of its steps is made of the same, given words."""
-
-    path: AbstractStepwisePath
-    words: UInt32[Array, " num_words"]
-
-    @property
-    def t0(self):
-        return self.path.t0
-
-    @property
-    def t1(self):
-        return self.path.t1
-
-    @property
-    def levy_area(self):
-        return self.path.levy_area
-
-    @property
-    def laws(self):
-        return self.path.laws
-
-    def num_words(self, use_levy: bool = False) -> int:
-        return self.path.num_words(use_levy)
-
-    def increment(self, words, t0, t1, use_levy=False):
-        return self.path.increment(words, t0, t1, use_levy)
-
-    def draw(self, t0, t1, use_levy):
-        words = self.words[: self.num_words(use_levy)]
-        return self.increment(words, t0, t1, use_levy)
+from .._brownian import (
+    AbstractStepwisePath,
+    GivenPath,
+    Increment,
+    stepwise,
+    THREE_POINT,
+)
+from .._terms import brownian_paths, replace_paths
 
 
 class Layout(NamedTuple):
@@ -74,12 +47,15 @@ def with_words(
 ) -> PyTree[diffrax.AbstractTerm]:
     """The terms, with paths whose increments are made of these words."""
     slices = iter(layout.slices)
-    is_path = lambda x: isinstance(x, diffrax.AbstractBrownianPath)
 
-    def replaced(x):
-        if not is_path(x):
-            return x
+    def given(path: diffrax.AbstractBrownianPath) -> GivenPath:
         start, end = next(slices)
-        return _GivenWords(x, words[start:end])  # pyright: ignore[reportCallIssue]
+        make = jtu.Partial(_from_words, path, words[start:end])
+        return GivenPath(make=make, levy_area=path.levy_area)
 
-    return jtu.tree_map(replaced, terms, is_leaf=is_path)
+    return replace_paths(terms, given)
+
+
+def _from_words(path: AbstractStepwisePath, words, t0, t1, use_levy: bool) -> Increment:
+    """The increment of the path that is made of the first of these words."""
+    return path.increment(words[: path.num_words(use_levy)], t0, t1, use_levy)
