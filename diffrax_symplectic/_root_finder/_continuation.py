@@ -107,7 +107,9 @@ def advance(finder: "PicardNewton", equations: Equations, state: State) -> State
     if _dense(finder, state):
         return _dense_iteration(finder, equations, state)
     iterate = ft.partial(_iterate, finder, equations)
-    first = iterate((state, _krylov.begin(state.anchor), jnp.array(True)))
+    first = iterate(
+        (state, _krylov.empty(state.y.size, state.y.dtype), jnp.array(True))
+    )
     state, *_ = lax.while_loop(lambda carry: ~carry[2], iterate, first)
     return state
 
@@ -127,7 +129,7 @@ def finish(
         # The loop of Newton's method and that of GMRES are one, so that the equations occur
         # in the program only once.
         iterate = ft.partial(_iterate, finder, equations)
-        carry = first, _krylov.begin(first.anchor), jnp.array(True)
+        carry = first, _krylov.empty(first.y.size, first.y.dtype), jnp.array(True)
         state, *_ = _compact.while_loop(lambda c: going(c[0]), iterate, carry)
     return equations.restore(state.y), state.solved
 
@@ -158,9 +160,8 @@ def _iterate(
     state, krylov, fresh = carry
     s = state.target
     value, image = jax.jvp(equations.residual, (state.y,), (krylov.p,))
-    first = _krylov.begin(_part(s, state.y, value))
-    then = _krylov.extend(krylov, _part(s, krylov.p, image))
-    krylov = _where(fresh, first, then)
+    vector = _part(s, *_where(fresh, (state.y, value), (krylov.p, image)))
+    krylov = _krylov.extend(krylov, vector, fresh)
     corrected = _correct(finder, equations, state, krylov.solution)
     return _where(krylov.done, corrected, state), krylov, krylov.done
 
