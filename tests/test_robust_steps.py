@@ -41,6 +41,16 @@ def test_steps_of_stiff_networks_are_solved():
     assert jnp.max(jnp.abs(error[success])) <= 1e-14
 
 
+@pytest.mark.parametrize("most", [1, 2])
+def test_iterations_of_newton_end_at_their_number(most):
+    # The first solves a linear system, the second finds nothing to correct.
+    term = diffrax.ODETerm(lambda t, y, args: (-1000 * y[1], 1000 * y[0]))
+    y0 = jnp.array(0.6), jnp.array(0.8)
+    finder = ds.PicardNewton(direct=0)
+    solver = ds.Midpoint(root_finder=finder, root_find_max_steps=most)
+    assert _one_step(solver, term, 1.0, y0)[1] == (most == 2)
+
+
 def test_many_unknowns_are_solved_without_a_matrix():
     # A Schroedinger lattice: frequencies up to n^2, of which h resolves few.
     n, h = 100, 2e-3
@@ -106,11 +116,12 @@ def test_gradients_survive_a_path_that_fails():
 @pytest.mark.parametrize("first", [True, False])
 def test_a_failure_anywhere_in_a_step_is_reported(first):
     # Two systems one after another; what the other one's success says must not count.
-    stuck = lambda t, p, q, args: p * q**2
-    easy = lambda t, p, q, args: 0.01 * p * q
+    # One block of `StrangGauss` has more unknowns than the others, and is solved otherwise.
+    stuck = lambda t, p, q, args: jnp.sum(p * q**2)
+    easy = lambda t, p, q, args: 0.01 * jnp.sum(p * q)
     H0, H1 = (stuck, easy) if first else (easy, stuck)
     terms = ds.hamiltonian_terms(H0, H1, Given(W=jnp.array(1.0)))
-    y0 = (jnp.array(0.1), jnp.array(10.0))
+    y0 = (jnp.full(2, 0.1), jnp.full(2, 10.0))
     for solver in (ds.StrangGauss(), ds.SRKs1(), ds.NinomiyaVictoir()):
         assert not _one_step(solver, terms, 1.0, y0)[1]
 

@@ -10,6 +10,9 @@ import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._root_finder import _krylov
+from diffrax_symplectic._root_finder._batch import any_of_batch
+from diffrax_symplectic._root_finder._start import converged
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -170,3 +173,168 @@ def test_numbers_of_iterations_that_mean_nothing_are_refused():
     for change in (dict(sweeps=1), dict(warmup=-1), dict(more_sweeps=0)):
         with pytest.raises(ValueError, match="must be at least"):
             ds.PicardNewton(**change)
+
+
+def _without_a_safety_net(finder, residual, start):
+    sol = optx.root_find(residual, finder, start, max_steps=0, throw=False)
+    return sol.value, sol.result == optx.RESULTS.successful
+
+
+def _is_accepted(correction, shrink, rtol, stalled):
+    """Whether a relative correction is the last, when it was `shrink` times as long as the
+    one before."""
+    eps = np.finfo(float).eps
+    following = correction * min(shrink, 1)
+    return bool(following <= rtol / 8 or stalled and correction <= 100 * eps)
+
+
+def test_fixed_point_iterations_end_when_the_next_correction_is_small_enough():
+    # Of y = slope y + 1 each iterate is known. Each path of the batch counts by itself.
+    most = 28
+
+    @jax.jit
+    @jax.vmap
+    def solve(slope, rtol):
+        finder = ds.PicardNewton(
+            rtol=rtol, direct=0, sweeps=7, more_sweeps=3, picard_steps=most
+        )
+        residual = lambda y, _: y - slope * y - 1
+        return _without_a_safety_net(finder, residual, jnp.zeros(()))
+
+    slopes = np.array([0, 0.1, 0.2, 0.4, 0.5, 0.7, 0.78, 0.8, 0.9, -0.3, -0.7, 0.3])
+    rtols = np.array([*[1e-3] * 11, 4e-16])
+    cases = set()
+    for s, rtol, value, success in zip(slopes, rtols, *solve(slopes, rtols)):
+        iterate = lambda n: (1 - s**n) / (1 - s)
+        n, shorter = 7, abs(s**6 / iterate(7))
+        while True:
+            correction = abs(s ** (n - 1) / iterate(n))
+            shrink = shorter ** (1 / 7 if n == 7 else 1 / 3)
+            done = _is_accepted(correction, shrink, rtol, shorter >= 0.5)
+            near = bool(correction <= 0.1 and shorter < 0.5)
+            if done or n == most or not near:
+                break
+            n, shorter = n + 3, abs(s**3)
+        assert success == done
+        # Where it did not converge, Newton's method begins from there or from zero.
+        np.testing.assert_allclose(value, iterate(n) if near else 0, rtol=1e-14)
+        cases.add((n, done, near))
+    assert {(7, True, True), (7, False, False), (10, False, False)} < cases
+    assert {(10, True, True), (most, False, True)} < cases
+
+
+@pytest.mark.parametrize("chords", [0, 2])
+def test_chords_follow_fixed_point_iterations_and_one_of_newton(chords):
+    @jax.jit
+    @jax.vmap
+    def solve(a, rtol):
+        finder = ds.PicardNewton(rtol=rtol, direct=1, warmup=2, chords=chords)
+        residual = lambda y, _: y - 1 - a * y**2
+        return _without_a_safety_net(finder, residual, jnp.zeros(()))
+
+    factors = np.array([0.0, 1e-3, 0.01, 0.03, 0.1, 0.2, 0.24, 0.26, 0.4, 4e-5, 0.012])
+    rtols = np.array([*[1e-9] * 9, 4e-16, 1e-22])
+    cases = set()
+    for a, rtol, value, success in zip(factors, rtols, *solve(factors, rtols)):
+        y = 1 + a * (1 + a * 0) ** 2
+        slope, sizes = 1 - 2 * a * y, []
+        for _ in range(chords + 1):
+            correction = (y - 1 - a * y**2) / slope
+            y = y - correction
+            sizes.append(abs(correction / y))
+        shrink = sizes[-1] / sizes[-2] if chords and sizes[-1] else np.sign(sizes[-1])
+        shrink = shrink if chords else 1.0
+        done = _is_accepted(sizes[-1], shrink, rtol, shrink >= 0.25)
+        assert success == done
+        near = bool(shrink < 0.5)
+        np.testing.assert_allclose(value, y if done or near else 0, rtol=1e-13)
+        cases.add((done, near))
+    both = {(True, False), (False, False)}
+    assert cases == (both | {(True, True), (False, True)} if chords else both)
+
+
+def test_corrections_that_rounding_errors_make_grow_are_accepted_below_the_tolerance():
+    for size, expected in ((0.12, True), (0.13, False)):
+        size, relative, shrink = map(jnp.array, (size, 1.0, 9.0))
+        assert converged(size, relative, shrink, jnp.array(False)) == expected
+
+
+@pytest.mark.parametrize("rate", [0.1, 3.0])
+def test_what_else_a_function_returns_belongs_to_its_root(rate):
+    # With and without iterations of Newton's method.
+    fn = lambda x, _: (x - rate * jnp.cos(x), {"three": 3 * x})
+    sol = optx.root_find(fn, ds.PicardNewton(), jnp.array(1.0), has_aux=True)
+    assert (sol.stats["num_steps"] > 0) == (rate == 3)
+    assert abs(fn(sol.value, None)[0]) <= 1e-14
+    np.testing.assert_allclose(sol.aux["three"], 3 * sol.value, rtol=1e-14)
+
+
+def test_a_loop_of_a_batch_has_one_condition_for_all():
+    # Were it one for each path, whatever they share would be computed for each of them.
+    shared = lambda fn: jax.vmap(fn, out_axes=None)
+    flags = jnp.zeros((2, 3), bool)
+    assert not shared(shared(any_of_batch))(flags)
+    assert shared(shared(any_of_batch))(flags.at[1, 1].set(True))
+
+
+def _random_matrix(rng):
+    return np.eye(12) + 0.4 * rng.normal(size=(12, 12)), rng.normal(size=12)
+
+
+def _shift_and_identity(rng):
+    """After the first product it gains nothing in the first cycle of products."""
+    A = np.eye(16)
+    A[:12, :12] = np.roll(np.eye(12), 1, axis=0)
+    return A, np.eye(16)[0] + A[15]
+
+
+@pytest.mark.parametrize("system", [_random_matrix, _shift_and_identity])
+def test_each_product_of_gmres_reduces_the_residual_as_far_as_possible(system):
+    A, b = system(np.random.default_rng(0))
+
+    def product(state, _):
+        state = _krylov.extend(state, jnp.asarray(A) @ state.p)
+        return state, (state.x * state.unit, state.r * state.unit)
+
+    scan = jax.jit(lambda b: jax.lax.scan(product, _krylov.begin(b), None, 14))
+    last, outputs = scan(jnp.asarray(b))
+    assert last.left == _krylov.begin(b).left - 14
+    xs, rs = map(np.asarray, outputs)
+    np.testing.assert_allclose(rs, b - xs @ A.T, atol=1e-12)
+    for j, r in enumerate(rs):
+        # After ten products it begins anew.
+        first, number = (b, j + 1) if j < 10 else (rs[9], j - 9)
+        powers = [np.linalg.matrix_power(A, k) @ first for k in range(1, number + 1)]
+        images, _ = np.linalg.qr(np.stack(powers, 1))
+        least = first - images @ (images.T @ first)
+        np.testing.assert_allclose(r, least, atol=1e-7)
+
+
+def test_gmres_ends_where_it_gains_nothing_and_not_before():
+    @jax.jit
+    def solve(A, b):
+        def product(carry):
+            state, number = carry
+            return _krylov.extend(state, A @ state.p), number + 1
+
+        first = _krylov.begin(b), 0
+        last, number = jax.lax.while_loop(lambda c: ~c[0].done, product, first)
+        return last.solution, number
+
+    e = np.eye(8)
+    # A shift gains nothing until each direction was tried, and then all there is.
+    x, number = solve(np.roll(e, 1, axis=0), e[0])
+    assert number == 8
+    np.testing.assert_allclose(x, e[7], atol=1e-15)
+    # What no product reaches stays, which one more cycle shows.
+    x, number = solve(np.diag([0.0, *[2] * 7]), e[0] + e[1])
+    assert number == 16
+    np.testing.assert_allclose(x[1], 0.5, atol=1e-15)
+    # The first product leaves nearly d / 2 of it, and a thousandth may be left.
+    for d, most in ((0.0019, 1), (0.0021, 2)):
+        assert solve(np.diag([1 + d, *[1] * 7]), e[0] + e[1])[1] == most
+    # Nothing is to be done for zero, and nothing can be where there is no number.
+    x, number = solve(e, 0 * e[0])
+    assert number == 0 and np.all(x == 0)
+    assert solve(e, np.nan * e[0])[1] == 0
+    assert solve(np.nan * e, e[0])[1] == 1

@@ -151,9 +151,11 @@ class PicardNewton(optx.AbstractRootFinder):
         tags: frozenset[object],
         result: optx.RESULTS,
     ) -> tuple[PyTree[Array], Any, dict[str, Any]]:
-        del fn, args, options, tags, result
-        found = state.origin + state.progress.y
-        return jfu.ravel_pytree(y)[1](found), aux, {}
+        del options, tags, result
+        found = jfu.ravel_pytree(y)[1](state.origin + state.progress.y)
+        # If the cheap iterations solved the equations, no step has computed it.
+        aux = fn(found, args)[1] if jtu.tree_leaves(aux) else aux
+        return found, aux, {}
 
 
 class _Search(eqx.Module):
