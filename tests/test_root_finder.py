@@ -75,6 +75,28 @@ def test_overshooting_corrections_are_shortened(start):
     assert abs(sol.value) <= 1e-12
 
 
+@pytest.mark.parametrize("n", [1, 6])
+def test_part_of_a_step_is_not_taken_for_all_of_it(n):
+    # From the flat part Newton's method goes back and forth. Where it is solved for only a
+    # part of the step, that part is linear, and its corrections vanish at once.
+    def residual(x, _):
+        x = x - 1
+        return jnp.where(
+            jnp.abs(x) < 1, 10 * x, jnp.sign(x) * (9.9 + 0.1 * jnp.abs(x))
+        )
+
+    @jax.jit
+    @jax.vmap
+    def solve(start):
+        finder, start = ds.PicardNewton(), jnp.full(n, start)
+        sol = optx.root_find(residual, finder, start, max_steps=200, throw=False)
+        return sol.value, sol.result == optx.RESULTS.successful
+
+    value, success = solve(jnp.array([2.5, 4.0, -3.0, 9.0, 30.0]))
+    assert np.all(success)
+    np.testing.assert_allclose(value, 1, rtol=1e-14)
+
+
 @pytest.mark.core
 def test_equations_without_a_solution_are_reported():
     for finder in (ds.PicardNewton(), ds.PicardNewton(direct=0)):
