@@ -81,9 +81,7 @@ def test_part_of_a_step_is_not_taken_for_all_of_it(n):
     # part of the step, that part is linear, and its corrections vanish at once.
     def residual(x, _):
         x = x - 1
-        return jnp.where(
-            jnp.abs(x) < 1, 10 * x, jnp.sign(x) * (9.9 + 0.1 * jnp.abs(x))
-        )
+        return jnp.where(jnp.abs(x) < 1, 10 * x, jnp.sign(x) * (9.9 + 0.1 * jnp.abs(x)))
 
     @jax.jit
     @jax.vmap
