@@ -8,9 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
+from ._arguments import whole_number
 from ._compat import nondifferentiable_backward, reversed_in_time, while_loop, ω
 from ._custom_types import IntScalarLike, RealScalarLike, Y
 from ._own_inverse import is_own_inverse
@@ -49,13 +51,9 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     **Raises:** a `ValueError`, while tracing, for anything else.
     """
 
-    checkpoints: int = 64
-
-    def __check_init__(self):
-        if not isinstance(self.checkpoints, int) or self.checkpoints < 1:
-            raise ValueError(
-                f"`checkpoints` must be a positive integer; got {self.checkpoints!r}."
-            )
+    checkpoints: int = eqx.field(
+        default=64, converter=ft.partial(whole_number, "checkpoints")
+    )
 
     def loop(
         self,
@@ -300,12 +298,9 @@ def _begin_anew(
     whether they agree."""
     row, rest = jnp.divmod(i, every)
     exact = jtu.tree_map(lambda rows: rows[row], rows)
-    largest = lambda tree: jnp.max(
-        jnp.stack([jnp.max(jnp.abs(x)) for x in jtu.tree_leaves(tree)])
-    )
-    dtype = jnp.result_type(*jtu.tree_leaves(y))
-    error = largest((y**ω - exact**ω).ω)
-    close = error <= float(jnp.finfo(dtype).eps) ** (2 / 3) * largest(exact)
+    error = optx.max_norm((y**ω - exact**ω).ω)
+    eps = float(jnp.finfo(error.dtype).eps)
+    close = error <= eps ** (2 / 3) * optx.max_norm(exact)
     here = rest == 0
     y = jtu.tree_map(lambda walked, saved: jnp.where(here, saved, walked), y, exact)
     return y, arrived & (close | ~here)

@@ -63,8 +63,7 @@ def apply_bridge(
     drift moves by `h`. For `m` noises that is `m` double brackets.
     """
     struct = eqx.filter_eval_shape(lambda: [term.contr(0.0, 1.0) for term in noise])
-    zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
-    _, unravel = jfu.ravel_pytree(zeros)
+    _, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, struct))
     t = jnp.asarray(t, jnp.result_type(h))
 
     def along_noise(t, y, x):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Shaped
 
+from ._arguments import check_takes
 from ._brownian import increment_struct
 from ._compat import ω
 from ._custom_types import Args, BM, RealScalarLike
@@ -97,7 +98,8 @@ def hamiltonian_terms(
             "`path` must be a Brownian path, for example `diffrax_symplectic."
             f"WeakBrownianPath(shape=(m,), key=key)`; got {type(path).__name__}."
         )
-    check_functions("t, p, q, args", H0=H0, noise=noise)
+    for name, H in (("H0", H0), ("noise", noise)):
+        check_takes(name, H, "t", "p", "q", "args")
     if structure not in (None, *get_args(_Structure)):
         raise ValueError(
             f"`structure` must be one of {get_args(_Structure)}, or `None` to have it "
@@ -234,15 +236,6 @@ def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
 def _parts(term: diffrax.AbstractTerm) -> list[_Drift | HamiltonianNoise]:
     ours = lambda x: isinstance(x, _Drift | HamiltonianNoise)
     return [x for x in jtu.tree_leaves(term, is_leaf=ours) if ours(x)]
-
-
-def check_functions(arguments: str, **functions: Callable) -> None:
-    """Raises a `ValueError` unless the Hamiltonians of these names can be called."""
-    for name, fn in functions.items():
-        if not callable(fn):
-            raise ValueError(
-                f"`{name}` must be a function `{name}({arguments})`; got {fn!r}."
-            )
 
 
 def check_pair(y: PyTree) -> None:

@@ -1,3 +1,4 @@
+import functools as ft
 from collections.abc import Callable
 
 import equinox as eqx
@@ -6,6 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
+from ._arguments import whole_number
 from ._custom_types import Args, IntScalarLike, RealScalarLike
 
 
@@ -34,16 +36,12 @@ class IndexedNoise(eqx.Module):
     """
 
     H: Callable[[IntScalarLike, RealScalarLike, PyTree, PyTree, Args], Array]
-    m: int = eqx.field(static=True)
+    m: int = eqx.field(static=True, converter=ft.partial(whole_number, "m"))
 
     def __check_init__(self):
         if not callable(self.H):
             raise ValueError(
                 f"`H` must be a function `H(k, t, p, q, args)`; got {self.H!r}."
-            )
-        if not isinstance(self.m, int) or self.m < 1:
-            raise ValueError(
-                f"`m`, the number of noises, must be a positive integer; got {self.m!r}."
             )
 
     def one(

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from ._arguments import check_takes
 from ._custom_types import Args, RealScalarLike
-from ._hamiltonian import check_functions, check_pair, hamiltonian_terms
+from ._hamiltonian import check_pair, hamiltonian_terms
 from ._indexed_noise import IndexedNoise
 
 
@@ -95,10 +96,11 @@ def spin_terms(
     **Source:** [McLachlan, Modin and Verdier
     (2014)](https://doi.org/10.1088/0951-7715/27/6/1525), for systems without noise.
     """
-    check_functions("t, s, args", H0=H0, noise=noise)
+    check_takes("H0", H0, "t", "s", "args")
     if isinstance(noise, IndexedNoise):
         lifted = IndexedNoise(SpinHamiltonian(noise.H), noise.m)
     else:
+        check_takes("noise", noise, "t", "s", "args")
         lifted = SpinHamiltonian(noise)
     return hamiltonian_terms(SpinHamiltonian(H0), lifted, path)
 

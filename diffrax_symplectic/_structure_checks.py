@@ -2,7 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -115,7 +115,7 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
     struct = eqx.filter_eval_shape(lambda: [term.contr(t0, t0) for term in noise])
-    control = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
+    control = jtu.tree_map(jnp.zeros_like, struct)
 
     def brackets(y, x, z):
         along = lambda control: lambda y: apply(noise, control, args, t0, y)
@@ -167,23 +167,15 @@ def _independent(
     result is `None` if it is finite at none of them.
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
-    struct = eqx.filter_eval_shape(term.contr, t0, t0)
-    control = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
-    place = {"t": 0, "y": 1, "p": 1, "q": 1, "control": 3}[of]
+    control = jtu.tree_map(jnp.zeros_like, eqx.filter_eval_shape(term.contr, t0, t0))
+    variable = _VARIABLES[of]
 
     def change(x, *inputs):
-        values = list(inputs[1:])
-        if of == "p":
-            x = (x, values[place][1])
-        elif of == "q":
-            x = (values[place][0], x)
-        values[place] = x
-        t, y, args, control = values
-        return inputs[0].vf_prod(t, y, args, control)
+        term, t, y, args, control = eqx.tree_at(variable, inputs, x)
+        return term.vf_prod(t, y, args, control)
 
     inputs = (term, t0, y0, args, control)
-    x: Any = inputs[1 + place]
-    x = x["pq".index(of)] if of in ("p", "q") else x
+    x = variable(inputs)
     select = lambda out: out if part is None else out[part]
     if _flows_nowhere(lambda x: select(change(x, *inputs)), x):
         return True
@@ -196,6 +188,16 @@ def _independent(
         return select(value), select(rate)
 
     return _small_at_random_points(derivative, (x, x, *inputs))
+
+
+# Where each variable stands among a term and the inputs of its vector field.
+_VARIABLES = {
+    "t": lambda inputs: inputs[1],
+    "y": lambda inputs: inputs[2],
+    "p": lambda inputs: inputs[2][0],
+    "q": lambda inputs: inputs[2][1],
+    "control": lambda inputs: inputs[4],
+}
 
 
 def _flows_nowhere(fn: Callable, x: PyTree) -> bool:

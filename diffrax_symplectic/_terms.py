@@ -139,9 +139,7 @@ def _along_one(term, struct, number, increment, args: Args, t, y: Y) -> Y:
         one_array = eqx.is_array(matrix) and isinstance(struct, jax.ShapeDtypeStruct)
         if one_array and struct.ndim == 1:
             return matrix[..., number] * increment.astype(matrix.dtype)
-    flat, unravel = jfu.ravel_pytree(
-        jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
-    )
+    flat, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, struct))
     only = flat.at[number].set(increment.astype(flat.dtype))
     return term.vf_prod(t, y, args, unravel(only))
 
@@ -160,9 +158,7 @@ def apply_brackets(
     For antisymmetric `A` that is `sum_l Db_l (sum_k A_kl b_k)`: `m` derivatives.
     """
     struct = eqx.filter_eval_shape(term.contr, 0.0, 1.0)
-    _, unravel = jfu.ravel_pytree(
-        jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
-    )
+    _, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, struct))
     along = lambda y, x: term.vf_prod(t, y, args, unravel(x))
 
     def summand(column, unit):

@@ -180,7 +180,7 @@ def test_noises_given_by_their_index_are_not_all_evaluated_in_each_flow():
 
 
 def test_noises_by_their_index_are_checked():
-    with pytest.raises(ValueError, match="`m`, the number of noises"):
+    with pytest.raises(ValueError, match="`m` must be a positive integer"):
         ds.IndexedNoise(lambda k, t, p, q, args: q[k], 0)
     with pytest.raises(ValueError, match="`H` must be a function"):
         ds.IndexedNoise(3.0, 2)  # pyright: ignore[reportArgumentType]

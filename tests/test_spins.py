@@ -271,7 +271,9 @@ def test_spins_of_length_zero_are_refused_traced_or_not():
 def test_hamiltonians_that_do_not_fit_are_refused():
     y0 = ds.to_spinors(jnp.ones(3))
     path = weak_path(2)
-    with pytest.raises(ValueError, match=r"`H0` must be a function `H0\(t, s, args\)`"):
+    with pytest.raises(
+        ValueError, match=r"`H0` must be a function, called as `H0\(t, s"
+    ):
         ds.spin_terms(1.0, noise, path)
     with pytest.raises(ValueError, match="must be a Brownian path"):
         ds.spin_terms(H0, noise, None)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 
+from .._arguments import whole_number
 from .._custom_types import BM, RealScalarLike
 from .._materialize import materialize
 from ._cells import check_cell, compose, or_one, Piece
@@ -92,12 +93,10 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         """
         require_space_time_area(path, type(self).__name__)
         check_key(key, type(self).__name__)
-        if not isinstance(terms, int) or terms < 0:
-            raise ValueError(f"`terms` must be an integer from 0 on; got {terms!r}.")
         check_cell(cell)
         self.path = path
         self.key = key
-        self.terms = terms
+        self.terms = whole_number("terms", terms, 0)
         self.cell = cell
 
     @property
