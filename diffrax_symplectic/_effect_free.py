@@ -4,13 +4,14 @@ the user never chose, without printing, raising errors, or calling back into Pyt
 from collections.abc import Iterator
 from typing import Any
 
+import jax
 import jax.numpy as jnp
-from jax import lax
 
 from ._compat import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
 
 _CALLBACKS = ("pure_callback", "io_callback")
+_BRANCHES_AND_LOOPS = ("cond", "scan", "while")
 
 
 def evaluate_without_effects(jaxpr: Jaxpr, consts, args) -> list:
@@ -34,43 +35,22 @@ def _apply(eqn: JaxprEqn, inputs: list) -> list:
     if _is_call(eqn):
         (inner,) = _programs(params)
         return _run(inner, *inputs)
-    if _has_effects(eqn):
-        if name == "cond":
-            branches = [lambda *x, b=b: _run(b, *x) for b in params["branches"]]
-            return lax.switch(inputs[0], branches, *inputs[1:])
-        if name == "scan":
-            return _scan(params, inputs)
-        if name == "while":
-            return _while(params, inputs)
     if len(eqn.outvars) == 0:
         # It can only be there for its effects, such as printing.
         return []
+    if name in _BRANCHES_AND_LOOPS and _has_effects(eqn):
+        params = {key: _without_effects(value) for key, value in params.items()}
     out = eqn.primitive.bind(*inputs, **params)
     return out if eqn.primitive.multiple_results else [out]
 
 
-def _scan(params: dict, inputs: list) -> list:
-    consts, carry, xs = _split(inputs, params["num_consts"], params["num_carry"])
-
-    def body(carry, x):
-        out = _run(params["jaxpr"], *consts, *carry, *x)
-        return out[: len(carry)], out[len(carry) :]
-
-    carry, ys = lax.scan(body, carry, xs, params["length"], params["reverse"])
-    return [*carry, *ys]
-
-
-def _while(params: dict, inputs: list) -> list:
-    of_cond, of_body, carry = _split(
-        inputs, params["cond_nconsts"], params["body_nconsts"]
-    )
-    proceed = lambda carry: _run(params["cond_jaxpr"], *of_cond, *carry)[0]
-    body = lambda carry: _run(params["body_jaxpr"], *of_body, *carry)
-    return lax.while_loop(proceed, body, carry)
-
-
-def _split(inputs: list, first: int, second: int) -> tuple[list, list, list]:
-    return inputs[:first], inputs[first : first + second], inputs[first + second :]
+def _without_effects(value: Any) -> Any:
+    """A parameter of a primitive, with all programs in it replaced."""
+    if isinstance(value, tuple):
+        return tuple(map(_without_effects, value))
+    if not isinstance(value, ClosedJaxpr):
+        return value
+    return jax.make_jaxpr(lambda *x: _run(value, *x))(*value.in_avals)
 
 
 def _run(program, *args) -> list:
@@ -89,7 +69,7 @@ def _is_call(eqn: JaxprEqn) -> bool:
     `jax.checkpoint` and `jax.custom_jvp` do: inputs and outputs are then those of the
     program."""
     programs = list(_programs(eqn.params))
-    if len(programs) != 1 or eqn.primitive.name in ("cond", "scan", "while"):
+    if len(programs) != 1 or eqn.primitive.name in _BRANCHES_AND_LOOPS:
         return False
     program = getattr(programs[0], "jaxpr", programs[0])
     kinds = lambda variables: [(x.aval.shape, x.aval.dtype) for x in variables]
