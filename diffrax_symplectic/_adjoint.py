@@ -130,7 +130,8 @@ def _check_supported(solver, controller, event, saveat) -> None:
 
 
 def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:
-    # Its coin is the sign of an increment. So the step back has the reverse order of flows.
+    # The sign of an increment decides in which order its flows follow each other. So a step
+    # with negated increments takes them in the reverse order.
     if isinstance(solver, NinomiyaVictoir):
         return True
     if not isinstance(solver, AbstractSymplecticRungeKutta):
@@ -318,7 +319,7 @@ def _saved_between(t0, t1, ts, g, a_y, a_y0, saved):
         )
         return of(a_y, share), of(a_y0, 1 - share), saved - 1
 
-    # Index -1 is read, but not used.
+    # If no saved time is left, this reads the last of all. The result is not used.
     more = lambda carry: (carry[2] > 0) & (ts[carry[2] - 1] > t0)
     return lax.while_loop(more, add, (a_y, a_y0, saved))
 

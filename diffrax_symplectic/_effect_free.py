@@ -1,5 +1,6 @@
-"""Runs programs without their effects. A user's function can so be evaluated at points that
-the user never chose, without printing, raising errors, or calling back into Python."""
+"""Runs programs without their effects. In this way a user's function can be evaluated at
+points that the user never chose: nothing is printed, no error is raised, and no function is
+called back in Python."""
 
 from collections.abc import Iterator
 from typing import Any

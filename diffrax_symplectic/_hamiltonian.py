@@ -141,8 +141,8 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         return self.path.evaluate(t0, t1, **kwargs)
 
     def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
-        # The structure of the state, with the structure of the noises at each leaf, and
-        # arrays of shape `(*state, *noise)` in that.
+        # The result has the structure of the state. In place of each array there is a tree
+        # with the structure of the noises, of arrays of shape `(*state, *noise)`.
         check_pair(y)
         struct = increment_struct(self.path)
         jac = jax.jacrev(lambda y: self._hamiltonians(t, y[0], y[1], args, struct))(y)

@@ -183,7 +183,7 @@ def _independent(
     def derivative(x, tangent, *inputs):
         value, rate = jax.jvp(lambda x: change(x, *inputs), (x,), (tangent,))
         if of == "control":
-            # Half of the noise is compared to all of it.
+            # One half of the rate is compared with both halves of the noise.
             return value, tuple(r if i == part else 0 * r for i, r in enumerate(rate))
         return select(value), select(rate)
 

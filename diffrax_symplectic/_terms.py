@@ -46,8 +46,9 @@ def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     parts = _flatten(terms)
     if any(map(is_adjoint_term, parts)):
         raise ValueError(_BACKSOLVE)
+    is_ode = lambda term: isinstance(unwrapped(term), diffrax.ODETerm)
     is_noise = [
-        len(brownian_paths(term)) > 0 or (i > 0 and not _is_ode(term))
+        len(brownian_paths(term)) > 0 or (i > 0 and not is_ode(term))
         for i, term in enumerate(parts)
     ]
     drift = tuple(term for term, noise in zip(parts, is_noise) if not noise)
@@ -72,10 +73,6 @@ def replace_paths(terms: PyTree, new: Callable) -> PyTree:
 
 def _is_path(x) -> bool:
     return isinstance(x, diffrax.AbstractBrownianPath)
-
-
-def _is_ode(term: diffrax.AbstractTerm) -> bool:
-    return isinstance(unwrapped(term), diffrax.ODETerm)
 
 
 # Called at several stages, this is traced and lowered once.
@@ -178,14 +175,12 @@ def controls(
     """The random variables of the step from `t0` to `t1`, for each noise term; those of
     `optional` if all increments hold them."""
     t1 = _within_resolution(noise, t0, t1)
-    draw = (
-        _drawn
-        if _are_cheap(noise)
-        else lambda *args: materialize(ft.partial(_drawn, *args))
-    )
+    drawn = ft.partial(_drawn, noise, t0, t1, use_levy=names != ["W"])
+    # What costs less to compute again than to keep is not kept.
+    cheap = all(map(_is_cheap, brownian_paths(noise)))
+    increments = drawn() if cheap else materialize(drawn)
     if names == ["W"]:
-        return {"W": draw(noise, t0, t1, False)}
-    increments = draw(noise, t0, t1, True)
+        return {"W": increments}
     # The variables of which the increments hold most are looked for first: the advice for
     # these is right for the others, too.
     held = lambda name: all(getattr(i, name, None) is not None for i in increments)
@@ -242,12 +237,8 @@ def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPa
     return path
 
 
-def _are_cheap(noise: tuple) -> bool:
-    """Whether all random variables cost less to compute again than to keep."""
-    return all(map(_is_cheap, brownian_paths(noise)))
-
-
 def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
+    """Whether its random variables cost less to compute again than to keep."""
     while isinstance(path, TruncatedBrownianPath | PlateauBrownianPath):
         path = path.path
     return isinstance(path, WeakBrownianPath | FixedStepBrownianPath)

@@ -79,6 +79,15 @@ def test_own_inverses_mirror_the_times_of_stages_and_read_no_areas_of_time():
     assert is_own_inverse(two_kicks(0.5, 0.5))
     assert not is_own_inverse(two_kicks(0.3, 0.7))
 
+    def additive_midpoint(c):
+        stages = Stage(("h",), 0.5, "y", "y"), Stage(("W",), c, "", "y")
+        return FlatTableau(stages, np.array([[0.5, 0.5], [0, 0]]), np.ones(2))
+
+    # Noise that reads no state is read at the middle of the step, or else not the same way
+    # back.
+    assert is_own_inverse(additive_midpoint(0.5))
+    assert not is_own_inverse(additive_midpoint(0.0))
+
 
 class Spring(eqx.Module):
     stiffness: jax.Array

@@ -70,6 +70,8 @@ def test_malformed_terms_are_refused():
         ds.hamiltonian_terms(1.0, H, weak_path(1))  # pyright: ignore
     with pytest.raises(ValueError, match="`noise` must be a function"):
         ds.hamiltonian_terms(H, None, weak_path(1))  # pyright: ignore
+    with pytest.raises(ValueError, match=r"called as `H0\(t, p, q, args\)`; got a fun"):
+        ds.hamiltonian_terms(lambda p, q: p * q, H, weak_path(1))  # pyright: ignore
 
 
 @pytest.mark.filterwarnings("ignore:Complex")

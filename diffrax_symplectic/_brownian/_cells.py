@@ -1,7 +1,7 @@
 """Steps put together from cells, so that steps of different sizes see one path."""
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -31,6 +31,17 @@ class Piece(eqx.Module):
     integral: Float[Array, " m"] | None = None
     A: Float[Array, "m m"] | None = None
 
+    @staticmethod
+    def of(increment: Increment, h: Float[Array, ""]) -> "Piece":
+        """The stretch of length `h` with this increment."""
+        assert isinstance(increment, diffrax.AbstractBrownianIncrement)
+        W, _ = jfu.ravel_pytree(increment.W)
+        h = h.astype(W.dtype)
+        if not isinstance(increment, diffrax.AbstractSpaceTimeLevyArea):
+            return Piece(h, W)
+        H, _ = jfu.ravel_pytree(increment.H)
+        return Piece(h, W, h * (W / 2 + H))
+
     @property
     def H(self) -> Float[Array, " m"]:
         """The space-time Lévy area. That of an empty stretch is zero."""
@@ -49,7 +60,7 @@ class Piece(eqx.Module):
 
     def as_increment(
         self,
-        kind: type[diffrax.AbstractBrownianIncrement],
+        kind: Any,
         shape: PyTree[jax.ShapeDtypeStruct],
         h: RealScalarLike,
         use_levy: bool,
@@ -59,13 +70,13 @@ class Piece(eqx.Module):
         _, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, shape))
         if not use_levy:
             return unravel(self.W)
-        areas = {}
+        variables = {"W": unravel(self.W)}
         if self.integral is not None:
-            areas["H"] = unravel(self.H)
+            variables["H"] = unravel(self.H)
         if self.A is not None:
-            areas["A"] = self.A
+            variables["A"] = self.A
         dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), shape)
-        return cast(Any, kind)(dt=dt, W=unravel(self.W), **areas)
+        return kind(dt=dt, **variables)
 
 
 def or_one(h: Float[Array, ""]) -> Float[Array, ""]:

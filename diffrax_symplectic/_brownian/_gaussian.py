@@ -3,7 +3,6 @@ from collections.abc import Mapping
 import diffrax
 import equinox as eqx
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
@@ -98,19 +97,12 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
         return self.increment(words, t0, t1, use_levy)
 
     def _composed(self, t0: Array, t1: Array, cell: float, use_levy: bool) -> Increment:
-        # The increments are the same whether or not the areas are asked for.
-        with_area = self.levy_area is diffrax.SpaceTimeLevyArea
         h = jnp.asarray(cell, t0.dtype)
 
         def sample(i) -> Piece:
-            words = self.words((i.astype(jnp.int32), jnp.array(0)), with_area)
-            increment = self.increment(words, 0 * h, h, with_area)
-            if not with_area:
-                return Piece(h, jfu.ravel_pytree(increment)[0])
-            assert isinstance(increment, diffrax.SpaceTimeLevyArea)
-            W, H = (jfu.ravel_pytree(x)[0] for x in (increment.W, increment.H))
-            length = h.astype(W.dtype)
-            return Piece(length, W, length * (W / 2 + H))
+            # The increments are the same whether or not the areas are asked for.
+            words = self.words((i.astype(jnp.int32), jnp.array(0)), True)
+            return Piece.of(self.increment(words, 0 * h, h, True), h)
 
         piece = compose(t0, t1, cell, sample, type(self).__name__)
         return piece.as_increment(self.levy_area, self.shape, t1 - t0, use_levy)

@@ -102,7 +102,7 @@ def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]
     return two_q * half * polynomial(_NUMERATOR) / polynomial(_DENOMINATOR)
 
 
-# Up to 2^-32 the probability 1/6, and the values +-sqrt(3) equally likely.
+# The probability of each large value is 1/6, up to 2^-32, and the same for both signs.
 _SIXTH = 2**32 // 6
 # Words below 2^31 stand for negative values. The lowest of each half stand for the large
 # values, which are rare.

@@ -1,3 +1,5 @@
+import dataclasses
+
 import diffrax
 import equinox as eqx
 import jax
@@ -145,13 +147,13 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
 
     def _piece(self, increment, words: UInt32[Array, " normals"], h) -> Piece:
         assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
-        W, _ = jfu.ravel_pytree(increment.W)
         H, _ = jfu.ravel_pytree(increment.H)
-        h = jnp.abs(h).astype(W.dtype)
-        normals = normal_from_words(words, W.dtype)
-        bridge = h * _bridge_area(H / jnp.sqrt(or_one(h)), normals, self.terms)
-        outer = jnp.outer(H, W)
-        return Piece(h, W, h * (W / 2 + H), outer - outer.T + bridge)
+        piece = Piece.of(increment, jnp.abs(h))
+        normals = normal_from_words(words, H.dtype)
+        scaled = H / jnp.sqrt(or_one(piece.h))
+        bridge = piece.h * _bridge_area(scaled, normals, self.terms)
+        outer = jnp.outer(H, piece.W)
+        return dataclasses.replace(piece, A=outer - outer.T + bridge)
 
 
 def _sizes(m: int, terms: int) -> tuple[int, ...]:

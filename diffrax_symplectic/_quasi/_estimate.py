@@ -55,8 +55,8 @@ def extrapolation_weights(order: int, levels: int) -> Float[np.ndarray, " levels
     r"""The weights of the levels, with steps $h, h/2, h/4, \ldots$, in the sum that has no
     terms in $h^p, \ldots, h^{p + L - 2}$, for $L$ levels of a method of weak order $p$.
 
-    That the error has an expansion in powers of $h$:
-    [Talay and Tubaro (1990)](https://doi.org/10.1080/07362999008809220).
+    [Talay and Tubaro (1990)](https://doi.org/10.1080/07362999008809220) show that the error
+    has an expansion in powers of $h$.
     """
     powers = np.array([0, *range(order, order + levels - 1)])
     system = 2.0 ** -np.outer(powers, np.arange(levels))
@@ -88,8 +88,7 @@ def estimate(
     if levels > 1:
         # The finer levels alone, with one power of the step size less.
         before = [0.0, *extrapolation_weights(order, levels - 1)]
-        change = jtu.tree_map(np.abs, average(combined(weights - before)))
-        bias = change
+        bias = jtu.tree_map(np.abs, average(combined(weights - before)))
     reached = None
     if tol is not None:
         reached = all(bool(np.all(x <= tol)) for x in jtu.tree_leaves(std_error))

@@ -39,8 +39,8 @@ def nested_scramble(x: UInt32[Array, "..."], seed: UInt32[Array, "..."]):
     and [Burley (2020)](https://jcgt.org/published/0009/04/01/), with the constants of
     Vegdahl (2021).
     """
-    # In the other order of bits a flip has to depend on lower bits only, as the carries of
-    # sums and products do.
+    # With the order of the bits reversed, the flip of a bit has to depend on lower bits
+    # only. That is what the carries of sums and products do.
     x = _reverse_bits(x)
     x = x ^ (x * np.uint32(0x3D20ADEA))
     x = x + seed

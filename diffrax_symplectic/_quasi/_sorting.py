@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int32, UInt
 
 # A coordinate is read to this many bits at most.
 _COORDINATE_BITS = 16
-# The size of a coordinate is that of so many states.
+# The range of a coordinate is estimated from this many states.
 _SAMPLE = 256
 
 
@@ -39,7 +39,8 @@ def _resolution(d: int, total: int) -> int:
 
 
 def _on_grid(z: Float[Array, "n d"], total: int) -> list[UInt[Array, " n"]]:
-    """The coordinates in integers, as many of them and as fine as fit into so many bits.
+    """The coordinates as integers of so many bits in all. Coordinates for which there is no
+    bit are left out.
 
     The grid is three times as wide as where nearly all states are; the others lie at its
     edges. A few that are far away do not make it coarse.

@@ -51,18 +51,14 @@ class Stages(eqx.Module):
 
     def zero_of(self, block: Block) -> list[_Value]:
         """Zero for each unknown stage of a block."""
-        stages = self.plan.tableau.stages
 
-        def zero(group: tuple[int, ...], x: Array) -> Array:
-            shape = jnp.shape(x) if len(group) == 1 else (len(group), *jnp.shape(x))
-            return jnp.zeros(shape, jnp.result_type(x))
+        def zero(group: tuple[int, ...]) -> _Value:
+            first = self.plan.tableau.stages[group[0]]
+            stacked = (len(group),) if len(group) > 1 else ()
+            zeros = lambda x: jnp.zeros((*stacked, *jnp.shape(x)), jnp.result_type(x))
+            return jtu.tree_map(zeros, _part(self.y0, first.writes))
 
-        return [
-            jtu.tree_map(
-                ft.partial(zero, group), _part(self.y0, stages[group[0]].writes)
-            )
-            for group in block.unknown
-        ]
+        return [zero(group) for group in block.unknown]
 
     def given(self, block: Block, values: Values, unknown: list[_Value]) -> Values:
         """`values` with those of the unknown stages of a block."""
@@ -93,10 +89,6 @@ class Stages(eqx.Module):
         values = {}
         for block, k in zip(self.plan.blocks, unknown):
             values = self.explicit_of(block, self.given(block, values, k), keep)
-        return self.end_of(values)
-
-    def end_of(self, values: Values) -> Y:
-        """The end of the step, once all stages are known."""
         tableau = self.plan.tableau
         return _position(self.y0, tableau.stages, tableau.weights[None], values)
 

@@ -110,7 +110,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         if len(noise) == 0:
             return y0, diffrax.RESULTS.successful
         m = number_of_noises(terms)
-        # One noise has no order.
+        # The flows of several noises have an order, for which a coin is needed.
         names = ["W", "two_point"] if m > 1 else ["W"]
         drawn = controls(noise, names, t0, t1, type(self).__name__)
         increments, _ = jfu.ravel_pytree(drawn["W"])

@@ -55,4 +55,4 @@ class AbstractTableau(abc.ABC):
 
     @abc.abstractmethod
     def flatten(self) -> FlatTableau:
-        """All stages of the tableau, dead ones included, as one matrix."""
+        """All stages of the tableau, unused ones included, as one matrix."""
