@@ -106,7 +106,7 @@ def long_run(solver, path, h: float, steps: int, paths: int):
 def figure_4(full: bool) -> None:
     """One path of each method, and the mean energy of many."""
     h, steps = 0.02, 10_000
-    paths = 4096 if full else 128
+    paths = 4096 if full else 64
     print(
         f"\nFig. 4: paths to t = {h * steps:g}, h = {h}; the mean of H0 over {paths:,}"
     )
