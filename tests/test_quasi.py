@@ -173,8 +173,9 @@ def test_weights_of_levels_cancel_powers_of_the_step_size():
 
 def test_means_are_taken_at_the_times_given_over_paths_that_have_not_failed():
     def drift(t, y, args):
-        # All go up by one in the first step. What is also kicked downwards fails later.
-        lost = (t > 0.15) & (y < 0.9)
+        # All go up by one in the first step. What is also kicked downwards fails later, in
+        # one step, and stays failed.
+        lost = (t > 0.15) & (t < 0.25) & (y < 0.9)
         return jnp.where(t < 0.05, 10.0, jnp.where(lost, jnp.nan, 0.0))
 
     path = ds.WeakBrownianPath((), jr.key(0))
