@@ -289,7 +289,7 @@ def _solve_bwd(
         # What was saved at the start itself.
         before = jnp.arange(len(sub.ts)) < walk.saved
         a_y = jtu.tree_map(lambda a, g: a + jnp.tensordot(before, g, 1), a_y, g)
-    return _unless(walk.arrived, throw, (a_y, *walk.a_parameters))
+    return _if_arrived(walk.arrived, throw, (a_y, *walk.a_parameters))
 
 
 def _begin_anew(
@@ -324,7 +324,8 @@ def _saved_between(t0, t1, ts, g, a_y, a_y0, saved):
     return lax.while_loop(more, add, (a_y, a_y0, saved))
 
 
-def _unless(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyTree:
+def _if_arrived(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyTree:
+    """The gradients. If the walk did not arrive, an error when run, or NaN."""
     if throw:
         return eqx.error_if(
             gradients,

@@ -88,7 +88,7 @@ class ExpectationInterrupted(KeyboardInterrupt):
 
 
 def reached(estimate: Expectation, tol: float | None) -> bool:
-    """Whether all standard errors are at most `tol`. Of a single path there is none."""
+    """Whether all standard errors are at most `tol`. A single path has none."""
     if tol is None or estimate.num_paths < 2:
         return False
     return all(np.all(x <= tol) for x in jtu.tree_leaves(estimate.std_error))

@@ -83,8 +83,7 @@ def test_own_inverses_mirror_the_times_of_stages_and_read_no_areas_of_time():
         stages = Stage(("h",), 0.5, "y", "y"), Stage(("W",), c, "", "y")
         return FlatTableau(stages, np.array([[0.5, 0.5], [0, 0]]), np.ones(2))
 
-    # Noise that reads no state is read at the middle of the step, or else not the same way
-    # back.
+    # Noise that does not depend on the state has to be read at the middle of the step.
     assert is_own_inverse(additive_midpoint(0.5))
     assert not is_own_inverse(additive_midpoint(0.0))
 

@@ -40,10 +40,10 @@ class _Ensemble(eqx.Module):
     """The paths, in the order in which they are sorted."""
 
     y: Y
-    # Its arrays; the rest does not change.
+    # The arrays of the solver's state. The rest of it does not change.
     solver_state: PyTree[Any]
-    # What failed stays so. It goes on from `y0`, since an equation without a solution would
-    # keep the other paths of the batch waiting in each step to come.
+    # A path that failed counts as failed until the end. It goes on from `y0`: an equation
+    # without a solution would keep the other paths waiting in each step to come.
     failed: Bool[Array, " n"]
 
 

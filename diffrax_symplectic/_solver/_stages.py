@@ -67,8 +67,8 @@ class Stages(eqx.Module):
         return values
 
     def explicit_of(self, block: Block, values: Values, keep: bool = False) -> Values:
-        """`values` with those of the explicit stages of a block. If `keep`, what enters
-        several positions is computed only once."""
+        """`values` with those of the explicit stages of a block. With `keep`, values that
+        enter several positions are computed only once."""
         for group in block.explicit:
             evaluate = ft.partial(self._evaluate_group, group, values)
             shared = keep and _uses(self.plan.tableau, group) > 1

@@ -37,9 +37,8 @@ class FlatTableau:
     @property
     def reads(self) -> Bool[np.ndarray, "s s"]:
         """Whether a stage reads a part of the state that another one changes."""
-        return np.array(
-            [[b.writes in a.reads for b in self.stages] for a in self.stages]
-        )
+        reads = [b.writes in a.reads for a in self.stages for b in self.stages]
+        return np.array(reads, bool).reshape(self.matrix.shape)
 
     def take(self, keep: list[int]) -> "FlatTableau":
         """The tableau with only the stages `keep`."""
