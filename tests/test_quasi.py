@@ -5,6 +5,7 @@ the spread that is reported."""
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 
 import diffrax
 import jax
@@ -320,7 +321,10 @@ def test_progress_is_shown_after_each_replicate_and_closed_in_any_case(capfd):
 
 
 class _Remembering(diffrax.AbstractSolver):
-    """Walks at random, and fails where its state is not that of the same path."""
+    """Walks at random, and fails where its state is not that of the same path, or where
+    `lost` says so."""
+
+    lost: Callable = lambda y: False
 
     term_structure = diffrax.AbstractTerm
     interpolation_cls = diffrax.LocalLinearInterpolation
@@ -338,7 +342,8 @@ class _Remembering(diffrax.AbstractSolver):
         y1 = y0 + terms.contr(t0, t1)
         ok = diffrax.RESULTS.successful
         lost = diffrax.RESULTS.internal_error
-        result = diffrax.RESULTS.where(y0 == solver_state, ok, lost)
+        good = (y0 == solver_state) & ~jnp.asarray(self.lost(y0))
+        result = diffrax.RESULTS.where(good, ok, lost)
         return y1, None, dict(y0=y0, y1=y1), y1, result
 
 
@@ -349,3 +354,26 @@ def test_the_state_of_a_solver_goes_along_with_its_path():
     got = _estimate(_Remembering(), terms, square, y0=jnp.asarray(0.0), replicates=16)
     assert got.num_failed == 0
     assert abs(got.mean - 1) <= 5 * got.std_error < 0.1
+
+
+@pytest.mark.parametrize("by", ["result", "state", "phi"])
+def test_a_path_fails_by_its_result_its_state_or_its_phi(by):
+    # One of the three alone; a sixth of the paths goes down in the first of two steps.
+    down = lambda y: y < -1e-3
+    path = ds.WeakBrownianPath((), jr.key(0))
+    solver, y0, phi = diffrax.Euler(), jnp.zeros(()), lambda t, y, args: jnp.ones(())
+    terms = diffrax.ControlTerm(lambda t, y, args: jnp.ones(()), path)
+    if by == "result":
+        solver = _Remembering(down)
+    elif by == "phi":
+        phi = lambda t, y, args: jnp.where(down(y), jnp.nan, 1.0)
+    else:
+        y0 = jnp.zeros(2)
+        spoil = lambda t, y, args: jnp.stack([0.0, jnp.where(down(y[0]), jnp.nan, 0)])
+        noise = diffrax.ControlTerm(lambda t, y, args: jnp.array([1.0, 0.0]), path)
+        terms = diffrax.MultiTerm(diffrax.ODETerm(spoil), noise)
+    got = _estimate(
+        solver, terms, phi, y0=y0, t1=0.2, num_paths=64, sort_by=lambda y: y.ravel()[0]
+    )
+    assert 4 * 10 <= got.num_failed <= 4 * (11 if by != "phi" else 24)
+    np.testing.assert_allclose(got.mean, 1.0)
