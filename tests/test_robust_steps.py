@@ -186,6 +186,11 @@ def test_only_pending_paths_of_a_batch_are_served():
     np.testing.assert_array_equal(
         flat(pending.ravel(), jnp.array(2.0), x.ravel()), expected.ravel()
     )
+    # All or none of them, when it is the same for all.
+    together = jax.jit(jax.vmap(serve, (None, None, 0)))
+    for every in (True, False):
+        got = together(jnp.array(every), jnp.array(2.0), x[0])
+        np.testing.assert_array_equal(got, (1 + every) * x[0])
 
 
 @pytest.mark.parametrize("solver", [ds.Midpoint(), ds.StrangGauss()], ids=type)
