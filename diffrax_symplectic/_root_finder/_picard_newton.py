@@ -62,7 +62,7 @@ class PicardNewton(optx.AbstractRootFinder):
     norm: Callable[[PyTree], Scalar] = optx.max_norm
     linear_solver: lx.AbstractLinearSolver | None = None
     direct: int = eqx.field(default=4, static=True)
-    warmup: int = eqx.field(default=3, static=True)
+    warmup: int = eqx.field(default=4, static=True)
     chords: int = eqx.field(default=1, static=True)
     sweeps: int = eqx.field(default=9, static=True)
     picard_steps: int = eqx.field(default=40, static=True)

@@ -5,7 +5,7 @@ import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -45,6 +45,19 @@ def measure(
         jax.block_until_ready(compiled(*args))
         best = min(best, clock() - begin)
     return Timing(traced - start, done - traced, best)
+
+
+def race(calls: dict[str, Callable[[], Any]], rounds: int = 7) -> dict[str, float]:
+    """Seconds of the best run of each; they take turns, so that all of them have the same
+    machine."""
+    best = dict.fromkeys(calls, float("inf"))
+    for i in range(rounds + 1):
+        for name, call in calls.items():
+            begin = time.perf_counter()
+            jax.block_until_ready(call())
+            if i > 0:
+                best[name] = min(best[name], time.perf_counter() - begin)
+    return best
 
 
 def ensemble(

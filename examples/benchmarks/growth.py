@@ -16,7 +16,7 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
-from ._timing import DOCS, keys, machine
+from ._timing import DOCS, keys, machine, race
 
 
 PATHS, H, STEPS = 64, 0.01, 100
@@ -95,19 +95,6 @@ def program(fn: Callable, d: int, paths: int = PATHS, repeats: int = 1) -> Progr
     return Program(call, min(t for t, _ in attempts), memory.temp_size_in_bytes)
 
 
-def race(programs: dict[str, Program], rounds: int = 7) -> dict[str, float]:
-    """Seconds of the best run of each; they take turns, so that all of them have the same
-    machine."""
-    best = dict.fromkeys(programs, float("inf"))
-    for i in range(rounds + 1):
-        for name, candidate in programs.items():
-            begin = time.perf_counter()
-            candidate.call()
-            if i > 0:
-                best[name] = min(best[name], time.perf_counter() - begin)
-    return best
-
-
 def row(system: Callable, d: int) -> list[str]:
     fn = lambda solver: solve(system, d, solver)
 
@@ -125,7 +112,7 @@ def row(system: Callable, d: int) -> list[str]:
         for name, solver in solvers.items()
     }
     alone = [program(fn(solver), d, paths=1).memory for solver in (HEUN, ds.Midpoint())]
-    seconds = race(programs)
+    seconds = race({name: p.call for name, p in programs.items()})
     heun = programs["Heun"]
     ratio = lambda a, b: f"{a / b:.1f}"
     slopes = "–"
@@ -133,7 +120,7 @@ def row(system: Callable, d: int) -> list[str]:
         pair = {
             name: program(gradient(solvers[name]), d) for name in ("Heun", "Midpoint")
         }
-        times = race(pair)
+        times = race({name: p.call for name, p in pair.items()})
         slopes = ratio(times["Midpoint"], times["Heun"])
     cells = [str(d), f"{seconds['Heun'] / PATHS / STEPS * 1e6:.2f}"]
     for name in ("Midpoint", "StrangGauss", "SRKw2"):
@@ -168,7 +155,7 @@ def many_noises(m: int) -> list[str]:
         "SRKw3": ds.SRKw3("c"),
         "SRKw2": ds.SRKw2(),
     }
-    seconds = race({name: program(end(solver), 16) for name, solver in solvers.items()})
+    seconds = race({name: program(end(s), 16).call for name, s in solvers.items()})
     unit = PATHS * STEPS * 1e-6
     return [str(m), *(f"{seconds[name] / unit:.2f}" for name in solvers)]
 

@@ -6,6 +6,10 @@ In one run, so that ratios mean something on a noisy machine. Writes
 `docs/benchmarks/speed.md`.
 """
 
+import functools as ft
+import time
+from collections.abc import Callable
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -13,7 +17,7 @@ import jax.random as jr
 
 import diffrax_symplectic as ds
 
-from ._timing import DOCS, ensemble, keys, machine, measure
+from ._timing import DOCS, ensemble, keys, machine, race
 
 
 H, STEPS = 0.01, 200
@@ -170,36 +174,48 @@ MODELS = {
 }
 
 
+def measure(make_terms: Callable, solvers: list) -> tuple[list[dict], dict]:
+    """For each number of paths the seconds of each solver, and for the second number the
+    processor time of tracing and compiling it."""
+    times, preparation = [], {}
+    for n in SIZES:
+        calls = {}
+        for name, solver, make_path in solvers:
+            fn = by_hand
+            if solver is not None:
+                fn = ensemble(make_terms, make_path, solver, Y0, H, STEPS)
+            begin = time.process_time()
+            compiled = jax.jit(lambda keys, fn=fn: fn(keys)).lower(keys(n)).compile()
+            if n == SIZES[1]:
+                preparation[name] = time.process_time() - begin
+            calls[name] = ft.partial(compiled, keys(n))
+        times.append(race(calls))
+    return times, preparation
+
+
 def main() -> None:
+    heads = ["1 path", *(f"{n:,} paths" for n in SIZES[1:])]
+    head = [f"ns, {x}" for x in heads] + ["x Heun at 1,000", "at 50,000", "compile, s"]
     lines = [
         "# Speed",
         "",
-        f"{machine()}. float64, h = {H}, {STEPS} steps, best of 5 runs, one process. "
-        "Gaussian increments are those of `FixedStepBrownianPath`, but in the first row of "
-        "each table, to which the ratios are: Heun's method with `UnsafeBrownianPath`, the "
-        "fastest that Diffrax has. Compilation is tracing and XLA's work together, for "
-        "1,000 paths. Made by `python -m examples.benchmarks.speed`.",
+        f"{machine()}. float64, h = {H}, {STEPS} steps, best of 7 runs, in which the "
+        "solvers of a table take turns. Gaussian increments are those of "
+        "`FixedStepBrownianPath`, but in the first row of each table, to which the ratios "
+        "are: Heun's method with `UnsafeBrownianPath`, the fastest that Diffrax has. "
+        "Compilation is the processor time of tracing and XLA's work together, for 1,000 "
+        "paths. Made by `python -m examples.benchmarks.speed`.",
     ]
     for title, (make_terms, solvers) in MODELS.items():
-        heads = ["1 path", *(f"{n:,} paths" for n in SIZES[1:])]
-        lines += ["", f"## {title}", ""]
-        lines.append("| solver | " + " | ".join(f"ns, {x}" for x in heads) + " | x Heun "
-                     "at 1,000 | at 50,000 | compile, s |")  # fmt: skip
+        times, preparation = measure(make_terms, solvers)
+        lines += ["", f"## {title}", "", f"| solver | {' | '.join(head)} |"]
         lines.append("|---" * 7 + "|")
-        heun = None
-        for name, solver, make_path in solvers:
-            cells, compile_time = [], 0.0
-            for n in SIZES:
-                fn = by_hand
-                if solver is not None:
-                    fn = ensemble(make_terms, make_path, solver, Y0, H, STEPS)
-                timing = measure(fn, keys(n))
-                cells.append(timing.seconds / n / STEPS * 1e9)
-                if n == SIZES[1]:
-                    compile_time = timing.trace + timing.compile
-            heun = heun or cells
-            ratios = [f"{cells[i] / heun[i]:.2f}" for i in (1, 2)]
-            row = [name, *(f"{x:,.1f}" for x in cells), *ratios, f"{compile_time:.2f}"]
+        heun = solvers[0][0]
+        for name, *_ in solvers:
+            cells = [t[name] / n / STEPS * 1e9 for t, n in zip(times, SIZES)]
+            ratios = [f"{t[name] / t[heun]:.2f}" for t in times[1:]]
+            compiling = f"{preparation[name]:.2f}"
+            row = [name, *(f"{x:,.1f}" for x in cells), *ratios, compiling]
             lines.append("| " + " | ".join(row) + " |")
             print(lines[-1], flush=True)
     DOCS.mkdir(parents=True, exist_ok=True)
