@@ -51,7 +51,7 @@ Y0 = (jnp.array(1.0), jnp.array(0.0))
 
 def figure_2d(full: bool) -> None:
     """Strong error of P at t = 1, with 20 batches of 250 paths as in the paper."""
-    paths, fine = (5_000, 2**14) if full else (2_000, 2**11)
+    paths, fine = (5_000, 2**14) if full else (1_000, 2**11)
     print(
         f"\nFig. 2(d): strong error of P at t = 1, h = 2^-1 .. 2^-8; {paths:,} paths,"
     )

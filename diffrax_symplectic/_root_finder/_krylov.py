@@ -86,8 +86,8 @@ def extend(
     rows, single = jnp.arange(len(state.basis)), jnp.float32
     images = (rows > 0) & (rows < state.full)
     # Sums in place of matrix products make a shorter program, and as fast a one.
-    # What rounding errors leave of the other images only makes the method slower: `x` and
-    # `r` belong together whatever the directions are.
+    # What rounding errors leave of the other images only makes the method slower. Those of
+    # `pair` part `r` from the residual of `x`, by far less than it is to be reduced by.
     parts = jnp.where(images, jnp.sum(state.basis * vector.astype(single), 1), 0)
     direction = state.by_p - jnp.sum(parts[:, None] * state.directions, 0)
     # Both at once, so that the basis has been read when it is overwritten, in place.
