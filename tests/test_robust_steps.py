@@ -1,6 +1,7 @@
 """Steps that fixed-point iteration does not solve, of few and of many unknowns, and what
 their failures leave alone."""
 
+import functools as ft
 import re
 from typing import Any
 
@@ -124,6 +125,21 @@ def test_gradients_survive_a_path_that_fails():
     each = jax.jit(jax.jacfwd(values))(strength)
     assert each[1] == 0
     np.testing.assert_allclose(jnp.sum(each), gradient, rtol=1e-10)
+
+
+def test_the_derivative_of_a_failed_step_is_zero():
+    def step(f, y0):
+        term = diffrax.ODETerm(lambda t, y, args: f(y))
+        y1, success = _one_step(ds.Midpoint(), term, 1.0, y0)
+        return y1, (y1, success)
+
+    slope = lambda f, y0: jax.jit(jax.jacfwd(ft.partial(step, f), has_aux=True))(y0)
+    # k = 1 + (y0 + k / 2)^2 has no solution for positive y0.
+    derivative, (y1, success) = slope(lambda y: 1 + y**2, jnp.array(0.5))
+    assert jnp.isfinite(y1) and not success and derivative == 0
+    # Here there is one, but the end of the step overflows.
+    derivative, (y1, success) = slope(lambda y: 0 * y + 1e308, jnp.array(1.2e308))
+    assert jnp.isinf(y1) and not success and derivative == 0
 
 
 @pytest.mark.parametrize("first", [True, False])
