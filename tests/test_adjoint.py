@@ -10,7 +10,7 @@ import pytest
 from diffrax._term import WrapTerm
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._adjoint import _undoes_its_steps
+from diffrax_symplectic._adjoint import _begin_anew, _undoes_its_steps
 from diffrax_symplectic._own_inverse import is_own_inverse
 from diffrax_symplectic._tableau import FlatTableau, Stage
 
@@ -206,6 +206,17 @@ def test_a_way_back_that_is_lost_is_reported_for_that_path_alone():
     np.testing.assert_allclose(lost[0], found[0], rtol=1e-12)
     with pytest.raises(Exception, match="did not find its way back"):
         jax.block_until_ready(gradient(1, True))
+
+
+def test_a_loss_on_the_way_back_is_not_forgotten_at_the_next_saved_state():
+    # The states after no, two and four steps.
+    saved = jnp.array([3.0, 2.0, 1.0])
+    at_saved = lambda y, found: _begin_anew(y, saved, jnp.array(2), 2, jnp.array(found))
+    assert at_saved(jnp.array(2.0), True) == (2.0, True)
+    assert at_saved(jnp.array(2.1), True) == (2.0, False)
+    assert at_saved(jnp.array(2.0), False) == (2.0, False)
+    between = _begin_anew(jnp.array(1.6), saved, jnp.array(3), 2, jnp.array(True))
+    assert between == (1.6, True)
 
 
 def test_what_reversing_cannot_do_is_refused_with_advice():
