@@ -365,3 +365,21 @@ def test_gmres_ends_where_it_gains_nothing_and_not_before():
     assert number == 0 and np.all(x == 0)
     assert solve(e, np.nan * e[0])[1] == 0
     assert solve(np.nan * e, e[0])[1] == 1
+
+
+def test_gmres_forgets_a_system_that_was_not_finite():
+    A = jnp.eye(6) + jnp.triu(jnp.ones((6, 6)), 1) / 2
+    b = jnp.arange(1.0, 7.0)
+    # The residual, or a product, where there are no values.
+    nothing = jnp.full(6, jnp.nan)
+    first = _krylov.extend(_krylov.empty(6, b.dtype), b, True)
+    second = _krylov.extend(first, A @ first.p)
+    for state in (
+        _krylov.extend(second, nothing, True),
+        _krylov.extend(second, nothing),
+    ):
+        assert state.done and jnp.any(jnp.isnan(state.r))
+        state = _krylov.extend(state, b, True)
+        for _ in range(6):
+            state = _krylov.extend(state, A @ state.p)
+        np.testing.assert_allclose(A @ state.solution, b, rtol=1e-5)

@@ -36,8 +36,8 @@ class Krylov(NamedTuple):
 
     - `x`, `r`, `p`: the iterate and its residual in units of `unit`, and the direction
         whose product with `A` is needed next.
-    - `basis`: the residual with which it began, and the images, which are orthonormal. Of
-        the rows the first `full` count.
+    - `basis`: the residual with which it began, and the images, which are orthonormal. The
+        first `full` rows are in use.
     - `directions`, `by_r`, `by_p`: the directions that the images are of, the residual and
         the next direction, as combinations of `basis`.
     - `unit`, `start`: the largest entry of `b`, and the square of its length in this unit.
@@ -86,8 +86,9 @@ def extend(
     rows, single = jnp.arange(len(state.basis)), jnp.float32
     images = (rows > 0) & (rows < state.full)
     # Sums in place of matrix products make a shorter program, and as fast a one.
-    # What rounding errors leave of the other images only makes the method slower. Those of
-    # `pair` part `r` from the residual of `x`, by far less than it is to be reduced by.
+    # What rounding errors leave of the other images only makes the method slower. Rounding
+    # errors of `pair` make `r` differ from the residual of `x`. The difference is far
+    # smaller than the accuracy that is asked for.
     parts = jnp.where(images, jnp.sum(state.basis * vector.astype(single), 1), 0)
     direction = state.by_p - jnp.sum(parts[:, None] * state.directions, 0)
     # Both at once, so that the basis has been read when it is overwritten, in place.
@@ -107,11 +108,12 @@ def extend(
     last = state.full == len(rows) - 1
     forget = last | fresh
     by_residual = (size <= _LEAST_REDUCTION * state.size) | forget
-    # The next row of the basis. Rows that do not count have the weight zero, so that all
-    # must be finite.
+    # The next row of the basis. Rows that are not in use have the weight zero, and zero
+    # times NaN is NaN: so all rows must be finite, whatever the equations return.
     here = rows == jnp.where(forget, 0, state.full)
-    at = here[:, None]
-    row = jnp.where(jnp.isfinite(size), jnp.where(forget, r, q), 0)
+    at, finite = here[:, None], jnp.isfinite(size)
+    row = jnp.where(finite, jnp.where(forget, r, q), 0)
+    row_direction = jnp.where(finite & ~forget, scale * direction, 0)
     by_r = jnp.where(
         here, jnp.where(forget, 1, -along), jnp.where(forget, 0, state.by_r)
     )
@@ -123,7 +125,7 @@ def extend(
         r=r,
         p=jnp.where(by_residual, r, q),
         basis=jnp.where(at, row.astype(single), state.basis),
-        directions=jnp.where(at, scale * direction, state.directions),
+        directions=jnp.where(at, row_direction, state.directions),
         by_r=by_r,
         by_p=jnp.where(by_residual, by_r, here),
         unit=unit,
@@ -139,6 +141,5 @@ def gmres(apply: Callable[[Array], Array], b: Float[Array, " n"]) -> Float[Array
     """An `x` with `apply(x)` near `b`, or one that is no nearer than this can reach. It is
     NaN if `b` is not finite."""
     advance = lambda state: extend(state, apply(state.p))
-    return lax.while_loop(
-        lambda state: ~state.done, advance, extend(empty(b.size, b.dtype), b, True)
-    ).solution
+    first = extend(empty(b.size, b.dtype), b, True)
+    return lax.while_loop(lambda state: ~state.done, advance, first).solution
