@@ -39,8 +39,8 @@ class Model(NamedTuple):
     solver: Any
     # Those of Diffrax, and whether they need space-time area.
     others: Mapping[str, tuple[diffrax.AbstractSolver, bool]]
-    # Without it, the most accurate estimate here is the reference.
-    exact: Callable[[], float] | None = None
+    # The expectation, and its standard error if it has one.
+    exact: Callable[[], float | tuple[float, float]]
     sort_by: Callable | None = None
     # Whether moments of a linear model tell the bias of every solver.
     linear: bool = False
@@ -116,6 +116,7 @@ MODELS = {
     "chain of 32": Model(
         _chain_terms, chain.start(1.0), lambda y: jnp.mean(y[1] ** 2), 2.0,
         32, 16, 2**12, (chain.N,), ds.StormerVerlet(), _SHARK,
+        lambda: _exact.chain_square(0.5, 0.1, 2.0, 64, 2**13, 32),
     ),
 }  # fmt: skip
 
