@@ -80,13 +80,19 @@ def test_the_terms_that_backsolve_adjoint_solves_are_known(terms):
     assert set(seen) == {False, True}
 
 
+@pytest.mark.core
 def test_a_solve_of_diffrax_is_found_on_the_stack_with_its_controller(terms):
     y0 = jnp.array(0.3), jnp.array(0.7)
     adaptive = diffrax.PIDController(rtol=1e-3, atol=1e-3)
-    with pytest.raises(ValueError, match="adaptive step size controller"):
+    with pytest.raises(ValueError) as info:
         diffrax.diffeqsolve(
             terms, diffrax.Heun(), 0.0, 1.0, 0.1, y0, stepsize_controller=adaptive
         )
+    # Some versions of Diffrax raise an error of their own from it.
+    error = info.value
+    while (cause := error.__cause__ or error.__context__) is not None:
+        error = cause
+    assert "adaptive step size controller" in str(error)
 
 
 def test_omega_does_arithmetic_on_pytrees():
@@ -125,6 +131,7 @@ def test_a_program_of_jax_is_a_function_of_its_flat_inputs():
     assert [float(x) for x in fn(jnp.array(5.0), jnp.array(3.0))] == [2.0, 3.0]
 
 
+@pytest.mark.core
 def test_adjoints_of_diffrax_run_a_loop_with_the_arguments_and_the_state_known_here():
     # `ReversingAdjoint` calls the loop of a solve, and reads these parts of its state.
     read = []
