@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._plan import make_plan
 from diffrax_symplectic._root_finder._linear import solve as solve_linear
 from diffrax_symplectic._solver._lanes import where_pending
 
@@ -236,11 +235,6 @@ def test_steps_of_many_unknowns_are_symplectic(solver, d):
     h = jnp.geomspace(1e-3, 0.2, 8)
     defects = eqx.filter_jit(jax.vmap(defect))(jr.split(jr.key(d), 8), h)
     assert jnp.max(defects) <= 1e-13
-
-
-def test_plans_are_made_once_and_soon():
-    tableau = ds.SRKw2().tableau.flatten()
-    assert make_plan(tableau) is make_plan(ds.SRKw2().tableau.flatten())
 
 
 @pytest.mark.parametrize("n", [2, 12])
