@@ -223,7 +223,7 @@ class _Steps(NamedTuple):
         _, _, later, *_ = self.controller.adapt_step_size(
             first, second, None, None, None, None, 1, (i - 1, *fixed)
         )
-        return jnp.where(i == 0, first, jnp.where(i == 1, second, later))
+        return jnp.where(i == 1, second, later)
 
 
 class _Walk(NamedTuple):
@@ -251,8 +251,10 @@ def _solve_bwd(
     _, *parameters = y__args__terms
     _, *is_perturbed = perturbed
     diff, nondiff = eqx.partition(parameters, is_perturbed)
+    # What the loss does not depend on has no derivative.
+    number = 1 if sub.ts is None else len(sub.ts)
     g = jtu.tree_map(
-        lambda x, g: jnp.zeros((1, *jnp.shape(x)), x.dtype) if g is None else g,
+        lambda x, g: jnp.zeros((number, *jnp.shape(x)), x.dtype) if g is None else g,
         y1,
         grad_out[0].save_state.ys,
         is_leaf=lambda x: x is None,
@@ -314,9 +316,7 @@ def _saved_between(t0, t1, ts, g, a_y, a_y0, saved):
     def add(carry):
         a_y, a_y0, saved = carry
         share = (ts[saved - 1] - t0) / (t1 - t0)
-        of = lambda x, share: jtu.tree_map(
-            lambda x, g: x + share.astype(x.dtype) * g[saved - 1], x, g
-        )
+        of = lambda x, share: jtu.tree_map(lambda x, g: x + share * g[saved - 1], x, g)
         return of(a_y, share), of(a_y0, 1 - share), saved - 1
 
     # If no saved time is left, this reads the last of all. The result is not used.
