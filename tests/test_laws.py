@@ -1,6 +1,7 @@
 """One record says all about a random variable, and steps can be made from given words."""
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -8,9 +9,25 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import Discrete, laws_of, VARIABLES
+from diffrax_symplectic._quadrature import outcomes
 from diffrax_symplectic._terms import controls
 
 from .problems import weak_path
+
+
+def test_outcomes_of_a_step_are_those_of_each_law_for_each_noise():
+    shape = jax.ShapeDtypeStruct((2,), jnp.float32)
+    path = ds.WeakBrownianPath(shape, jr.key(0), two_point=True)
+    terms = diffrax.ControlTerm(lambda t, y, args: y, path)
+    # Backward in time.
+    increments, weights, _ = outcomes(terms, -0.3, 3)
+    assert {x.dtype.name for x in jax.tree.leaves(increments)} == {"float32"}
+    np.testing.assert_array_equal(increments.dt, np.float32(-0.3))
+    for name, law in (laws_of(path) or {}).items():
+        for noise in getattr(increments, name).T:
+            for value, weight in zip(*law.outcomes(3), strict=True):
+                found = np.isclose(noise, np.sqrt(0.3) * value)
+                np.testing.assert_allclose(weights[found].sum(), weight, rtol=1e-14)
 
 
 def test_laws_have_the_variance_on_record_and_outcomes_of_their_words():

@@ -16,6 +16,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._root_finder._linear import solve as solve_linear
+from diffrax_symplectic._root_finder._start import improve, Measured
 from diffrax_symplectic._solver._lanes import where_pending
 
 from .problems import Given
@@ -274,6 +275,14 @@ def test_linear_solvers_of_the_user_solve_for_steps_and_their_derivatives():
     assert factorizations(ds.PicardNewton()) == [0, 0]
     step, derivative = factorizations(ds.PicardNewton(linear_solver=lx.LU()))
     assert 0 < step < derivative
+
+
+def test_first_iterations_of_newton_use_the_linear_solver_of_the_user():
+    measured = Measured(lambda y: [jnp.abs(y)], lambda y: [jnp.abs(y)])
+    for linear_solver, found in ((None, False), (lx.LU(), True)):
+        finder = ds.PicardNewton(linear_solver=linear_solver)
+        first = lambda y: improve(finder, jnp.sin, y, measured, 0).y
+        assert bool(re.search(r"= lu\b", _program(first, jnp.ones(2)))) == found
 
 
 def _program(fn, *args) -> str:

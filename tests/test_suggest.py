@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._brownian import increment_struct
+from diffrax_symplectic._suggest import _shape_code, _with_paths
 from diffrax_symplectic._suggestion_rules import PATHS, RULES
 from diffrax_symplectic._terms import brownian_paths
 
@@ -166,6 +168,7 @@ def test_friction_as_a_term_gets_a_solver_and_is_told_of_damped():
     assert type(found[0].solver).__name__ == "StrangGauss"
     assert "Damped(solver, gamma)" in str(found)
     assert "Damped" not in str(without)
+    assert f"\n{len(found)}. {type(found[-1].solver).__name__}()" in repr(found)
 
 
 def test_code_of_a_path_makes_the_path():
@@ -183,6 +186,14 @@ def test_code_of_a_path_makes_the_path():
         assert jax.tree.structure(made) == jax.tree.structure(written)
 
 
+def test_shapes_are_written_with_their_precision():
+    shapes = [jax.ShapeDtypeStruct((2,), x) for x in (jnp.float32, jnp.float64)]
+    for shape in shapes:
+        written = eval(_shape_code(shape))
+        assert increment_struct(ds.WeakBrownianPath(written, jr.key(0))) == shape
+    assert _shape_code(shapes[1]) == "(2,)" and _shape_code(shapes) == "shape"
+
+
 def _same(a, b) -> bool:
     return bool(jnp.all(a == b))
 
@@ -192,10 +203,17 @@ def test_terms_that_share_a_path_share_the_new_one():
     other = ds.WeakBrownianPath((), jr.key(7))
     noise = [diffrax.ControlTerm(lambda t, y, args: y, x) for x in (path, path, other)]
     terms = diffrax.MultiTerm(diffrax.ODETerm(lambda t, y, args: -y), *noise)
-    best = ds.suggest_solver(terms, jnp.ones(2))[0]
-    paths: list = brownian_paths(best.terms(jr.key(1)))
-    a, b, c = paths
-    assert _same(a.key, b.key) and not _same(a.key, c.key)
+    for kind in PATHS.values():
+        made = _with_paths(kind.make, terms, jr.key(1))
+        keys = [
+            {jr.key_data(x).tobytes() for x in jax.tree.leaves(path) if _is_key(x)}
+            for path in brownian_paths(made)
+        ]
+        assert keys[0] == keys[1] and keys[0].isdisjoint(keys[2])
+
+
+def _is_key(x) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
 def test_strang_gauss_is_weak_order_two_for_noises_that_commute():

@@ -115,7 +115,7 @@ class Stages(eqx.Module):
                     for i, x in zip(changed, jtu.tree_leaves(stage)):
                         x = jnp.abs(x)
                         largest[i] = jnp.maximum(largest[i], x) if i in largest else x
-        return sorted(largest.items())
+        return list(largest.items())
 
     def _evaluate_group(self, group: tuple[int, ...], values: Values) -> _Value:
         """The values of stages of one kind; stacked, unless it is only one."""
