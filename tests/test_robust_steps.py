@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import lineax as lx
 import numpy as np
+import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
@@ -138,9 +139,9 @@ def test_gradients_survive_a_path_that_fails():
 
 
 def test_the_derivative_of_a_failed_step_is_zero():
-    def step(f, y0):
+    def step(f, y0, **options):
         term = diffrax.ODETerm(lambda t, y, args: f(y))
-        y1, success = _one_step(ds.Midpoint(), term, 1.0, y0)
+        y1, success = _one_step(ds.Midpoint(**options), term, 1.0, y0)
         return y1, (y1, success)
 
     slope = lambda f, y0: jax.jit(jax.jacfwd(ft.partial(step, f), has_aux=True))(y0)
@@ -149,6 +150,14 @@ def test_the_derivative_of_a_failed_step_is_zero():
     assert jnp.isfinite(y1) and not success and derivative == 0
     # Here there is one, but the end of the step overflows.
     derivative, (y1, success) = slope(lambda y: 0 * y + 1e308, jnp.array(1.2e308))
+    assert jnp.isinf(y1) and not success and derivative == 0
+    # In reverse mode, too, if the vector field has no derivative at the solution.
+    finder = ds.PicardNewton(direct=0)
+    root = lambda y: 1.2e308 + jnp.sqrt(jnp.maximum(1e308 - y, 0))
+    backward = jax.jit(
+        jax.jacrev(ft.partial(step, root, root_finder=finder), has_aux=True)
+    )
+    derivative, (y1, success) = backward(jnp.array(0.8e308))
     assert jnp.isinf(y1) and not success and derivative == 0
 
 
@@ -163,6 +172,29 @@ def test_a_failure_anywhere_in_a_step_is_reported(first):
     y0 = (jnp.full(2, 0.1), jnp.full(2, 10.0))
     for solver in (ds.StrangGauss(), ds.SRKs1(), ds.NinomiyaVictoir()):
         assert not _one_step(solver, terms, 1.0, y0)[1]
+
+
+def test_a_failure_is_reported_for_any_root_finder():
+    # There is no solution.
+    term = diffrax.ODETerm(lambda t, y, args: 1 + y**2)
+    solver = ds.Midpoint(root_finder=optx.Newton(rtol=1e-9, atol=1e-9))
+    y1, success = _one_step(solver, term, 1.0, jnp.array(0.5))
+    assert jnp.isfinite(y1) and not success
+
+
+def test_the_best_iterate_is_not_taken_for_a_solution():
+    # Of `PicardNewton` it would be the first guess.
+    finder = optx.BestSoFarRootFinder(ds.PicardNewton())
+    term = diffrax.ODETerm(lambda t, y, args: jnp.sin(y))
+    with pytest.raises(ValueError, match="Pass the root finder within it"):
+        _one_step(ds.Midpoint(root_finder=finder), term, 0.1, jnp.array(0.5))
+
+
+def test_an_overflow_in_any_part_of_the_state_is_reported():
+    grow = lambda t, y, args: jax.tree.map(lambda x: 0 * x + 1e308, y)
+    y0 = jnp.array([1.2e308, 0.0, 0.0]), jnp.array([0.0, 1.2e308, 0.0])
+    step = lambda y0: _one_step(ds.Midpoint(), diffrax.ODETerm(grow), 1.0, y0)[1]
+    assert jax.jit(jax.vmap(step))(y0).tolist() == [False, False, True]
 
 
 def test_increments_are_solved_to_the_accuracy_of_the_state():

@@ -156,13 +156,17 @@ def _as_one_system(stages: Stages, value, finder: PicardNewton, max_steps: int):
 
 def _by_root_find(stages: Stages, finder: Any, max_steps: int):
     """The whole step as one system, by any root finder."""
+    if isinstance(finder, optx.BestSoFarRootFinder):
+        raise ValueError(
+            "`BestSoFarRootFinder` returns an iterate from before the last correction. It "
+            "does not solve the stage equations. Pass the root finder within it."
+        )
     guess = stages.image([stages.zero_of(block) for block in stages.plan.blocks])
     sol = optx.root_find(
         lambda k, stages: (k**ω - stages.image(k) ** ω).ω,
         finder,
         guess,
         args=stages,
-        options=dict(scale=stages.scale),
         max_steps=max_steps,
         throw=False,
     )

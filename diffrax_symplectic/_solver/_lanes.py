@@ -72,7 +72,8 @@ def where_pending(
 
         def body(carry):
             pending, value = carry
-            first = jnp.minimum(jnp.argmax(pending), size - part)
+            # Where the batch ends before the part does, JAX begins the part earlier.
+            first = jnp.argmax(pending)
             old = jtu.tree_map(lambda x: cut(x, True, first), (pending, value))
             few = [cut(x, b, first) for x, b in zip(leaves, batched)]
             new = serve_part(axes, old[0], few, old[1])
