@@ -46,13 +46,13 @@ def _progress(names: list[str], done: set[str], jobs: int, start: float) -> None
     )
 
 
-def _hasten() -> None:
+def hasten() -> None:
     # Tracing makes millions of objects that live on, which need no looking through.
     gc.set_threshold(100_000, 50, 100)
 
 
-def _compile_quickly() -> None:
-    """Quick figures spend most of their time on compiling: the older code generator, few
+def compile_quickly() -> None:
+    """Before JAX is used for the first time. Quick figures spend most of their time on compiling: the older code generator, few
     optimizations, and no record of the lines that an operation comes from."""
     os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
     # XLA aborts for flags that it does not know, and they come and go with its versions.
@@ -85,7 +85,7 @@ def run(figures: dict[str, str]) -> None:
     # ones use all cores anyway.
     jobs = options.jobs or (1 if options.full else min(2, len(names)))
     if not options.full:
-        _compile_quickly()
+        compile_quickly()
     start = time.perf_counter()
     args = options.full, options.output.resolve()
     failed = []
@@ -98,7 +98,7 @@ def run(figures: dict[str, str]) -> None:
             _progress(names, done, jobs, start)
     else:
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_hasten) as pool:
+        with ProcessPoolExecutor(jobs, mp_context=context, initializer=hasten) as pool:
             running = {
                 pool.submit(_make_quietly, name, figures[name], *args): name
                 for name in names

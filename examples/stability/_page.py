@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import matplotlib
 
+from .._command import compile_quickly, hasten
+
 
 matplotlib.use("Agg")
 
@@ -66,6 +68,9 @@ def run(name: str, description: str | None, modules: Sequence[ModuleType]) -> No
         help="small sizes; writes to examples/output and leaves docs alone",
     )
     page = Page(name, parser.parse_args().quick)
+    if page.quick:
+        compile_quickly()
+        hasten()
     start = time.perf_counter()
     sections = [(ROOT / "examples" / name / "page.md").read_text()]
     for module in modules:
