@@ -52,8 +52,9 @@ def hasten() -> None:
 
 
 def compile_quickly() -> None:
-    """Before JAX is used for the first time. Quick figures spend most of their time on compiling: the older code generator, few
-    optimizations, and no record of the lines that an operation comes from."""
+    """To be called before JAX is used. Quick figures spend most of their time on compiling:
+    the older code generator, few optimizations, and no record of the lines that an
+    operation comes from."""
     os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
     # XLA aborts for flags that it does not know, and they come and go with its versions.
     if version("jaxlib").startswith("0.10."):

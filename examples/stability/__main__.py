@@ -1,8 +1,7 @@
 """Where methods fail and where they hold: `python -m examples.stability [--quick]`."""
 
-from . import moments, rounding, solvability, stiff
 from ._page import run
 
 
 if __name__ == "__main__":
-    run("stability", __doc__, (moments, solvability, stiff, rounding))
+    run("stability", __doc__, ("moments", "solvability", "stiff", "rounding"))

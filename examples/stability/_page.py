@@ -1,10 +1,10 @@
 """Where tables, pictures and pages go."""
 
 import argparse
+import importlib
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import matplotlib
@@ -58,9 +58,9 @@ def fill(module: str, **values) -> str:
     return Path(module).with_suffix(".md").read_text().format(**values)
 
 
-def run(name: str, description: str | None, modules: Sequence[ModuleType]) -> None:
+def run(name: str, description: str | None, modules: Sequence[str]) -> None:
     """The command that makes a page: the text of `page.md` next to the modules, and a
-    section of each."""
+    section of each. They are imported here, for they use JAX."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument(
         "--quick",
@@ -75,7 +75,8 @@ def run(name: str, description: str | None, modules: Sequence[ModuleType]) -> No
     sections = [(ROOT / "examples" / name / "page.md").read_text()]
     for module in modules:
         begin = time.perf_counter()
-        sections.append(module.section(page))
+        source = importlib.import_module(f"examples.{name}.{module}")
+        sections.append(source.section(page))
         print(f"({time.perf_counter() - begin:.0f} seconds)", flush=True)
     page.write(sections)
     print(f"\nAll done in {time.perf_counter() - start:.0f} seconds.")
