@@ -174,7 +174,7 @@ def suggest_solver(
             fits = fits and commute == (rule.noises == "commuting")
         if rule.path == "Lévy areas":
             fits = fits and one_array
-        if fits and rule.solver not in [type(s.solver) for s in found]:
+        if fits:
             found.append(_suggestion(rule, reason, terms, shape, commute))
     structure = [name for name in has if has[name] and name != "any"]
     kind = (

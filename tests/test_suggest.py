@@ -171,6 +171,31 @@ def test_friction_as_a_term_gets_a_solver_and_is_told_of_damped():
     assert f"\n{len(found)}. {type(found[-1].solver).__name__}()" in repr(found)
 
 
+def test_noises_that_do_not_commute_may_be_terms_or_arrays_of_their_own():
+    # In single precision, from the default of `t0`.
+    shape = jax.ShapeDtypeStruct((), jnp.float32)
+    matrices = jnp.array([[[0, 1], [0, 0]], [[0, 0], [1, 0]]], jnp.float32)
+    noises = [
+        diffrax.ControlTerm(
+            lambda t, y, args, A=A: A @ y, ds.WeakBrownianPath(shape, jr.key(i))
+        )
+        for i, A in enumerate(matrices)
+    ]
+    drift = diffrax.ODETerm(lambda t, y, args: y)
+    one = jnp.ones((), jnp.float32)
+    both = ds.WeakBrownianPath((shape, shape), jr.key(0))
+    crossed = diffrax.ControlTerm(lambda t, y, args: y[::-1], both)
+    for terms, y0 in ((noises, jnp.stack([one, one])), ([crossed], (one, one))):
+        with jax.disable_jit():
+            found = ds.suggest_solver(
+                diffrax.MultiTerm(drift, *terms), y0, want="paths"
+            )
+        # Lévy areas are those of one array of noises.
+        assert [type(s.solver) for s in found] == [ds.Midpoint]
+        assert found[0].strong_order == 0.5
+        assert "do not commute" in found.system and "Damped" not in found.system
+
+
 def test_code_of_a_path_makes_the_path():
     H0 = lambda t, p, q, args: p**2 / 2
     path = ds.WeakBrownianPath((2,), jr.key(0))
@@ -264,6 +289,13 @@ def test_bad_input_gets_a_clear_error():
         ds.suggest_solver(noise, y0)  # pyright: ignore
     with pytest.raises(ValueError, match="have a part without one"):
         ds.suggest_solver(diffrax.ODETerm(lambda t, y, args: y), y0)
+    ramp = diffrax.LinearInterpolation(jnp.array([0.0, 1.0]), jnp.array([0.0, 1.0]))
+    driven = diffrax.ControlTerm(lambda t, y, args: y, ramp)
+    too_long = diffrax.ODETerm(lambda t, y, args: (jnp.ones(3), jnp.ones(3)))
+    with pytest.raises(ValueError, match="broadcast"):
+        ds.suggest_solver(diffrax.MultiTerm(too_long, terms.terms[1]), y0)
+    with pytest.raises(ValueError, match="have a part without one"):
+        ds.suggest_solver(diffrax.MultiTerm(terms, driven), y0)
     with pytest.raises(ValueError, match="is a pair"):
         ds.suggest_solver(terms, jnp.ones(2))
     with pytest.raises(ValueError, match="real floating-point"):
