@@ -291,9 +291,12 @@ def test_bad_input_gets_a_clear_error():
         ds.suggest_solver(diffrax.ODETerm(lambda t, y, args: y), y0)
     ramp = diffrax.LinearInterpolation(jnp.array([0.0, 1.0]), jnp.array([0.0, 1.0]))
     driven = diffrax.ControlTerm(lambda t, y, args: y, ramp)
-    too_long = diffrax.ODETerm(lambda t, y, args: (jnp.ones(3), jnp.ones(3)))
+    too_long = diffrax.ODETerm(lambda t, y, args: jnp.ones(3))
+    noisy = diffrax.ControlTerm(
+        lambda t, y, args: y, ds.WeakBrownianPath((), jr.key(0))
+    )
     with pytest.raises(ValueError, match="broadcast"):
-        ds.suggest_solver(diffrax.MultiTerm(too_long, terms.terms[1]), y0)
+        ds.suggest_solver(diffrax.MultiTerm(too_long, noisy), jnp.ones(2))
     with pytest.raises(ValueError, match="have a part without one"):
         ds.suggest_solver(diffrax.MultiTerm(terms, driven), y0)
     with pytest.raises(ValueError, match="is a pair"):
