@@ -53,6 +53,9 @@ class PicardNewton(optx.AbstractRootFinder):
     - `direct`: the most unknowns for which Newton's method is used from the start.
     - `warmup`, `chords`, `sweeps`, `more_sweeps`, `picard_steps`: see above.
 
+    In `optimistix.root_find`, `options={"scale": f}` says how large the state is that the
+    unknowns `k` change: `f(k)` has their structure, and stands in place of `k` in `rtol`.
+
     **Raises:** a `ValueError` for negative numbers, fewer than 2 `sweeps`, or
         no `more_sweeps`.
     """
