@@ -1,6 +1,5 @@
 """Whether a system has the structure that a family of methods relies on."""
 
-import functools as ft
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from ._compat import ω
 from ._custom_types import Args, RealScalarLike, Y
@@ -232,7 +231,7 @@ def _small_at_random_points(fn: Callable, inputs: PyTree) -> bool | None:
     # Arrays that the user's functions capture keep their values, unless they are traced.
     is_traced = [isinstance(c, jax.core.Tracer) for c in closed.consts]
 
-    def sizes(seed, positive: bool):
+    def sizes(seed, positive):
         # Inputs are drawn within the program, so that those that it does not read are
         # never made.
         keys = iter(jr.split(jr.key(seed), len(closed.consts) + len(flat)))
@@ -248,28 +247,25 @@ def _small_at_random_points(fn: Callable, inputs: PyTree) -> bool | None:
         largest = lambda x: jnp.max(jnp.abs(x), initial=0, where=finite)
         return largest(reference), largest(value), jnp.any(finite)
 
-    @ft.cache
-    def program(positive: bool):
-        # Once it is compiled it runs at once, also while JAX traces what surrounds it.
-        return (
-            jax.jit(ft.partial(sizes, positive=positive)).lower(np.uint32(0)).compile()
-        )
-
     tested = False
-    # Every other time the points lie between 0 and 1, where most functions are defined even
-    # if they are not defined everywhere.
     with jax.disable_jit(False):
+        # Once it is compiled it runs at once, also while JAX traces what surrounds it.
+        program = jax.jit(sizes).lower(np.uint32(0), np.bool_(False)).compile()
+        # Every other time the points lie between 0 and 1, where most functions are defined
+        # even if they are not defined everywhere.
         for i in range(8):
-            size, error, finite = map(np.asarray, program(i % 2 == 1)(np.uint32(i)))
+            out = program(np.uint32(i), np.bool_(i % 2 == 1))
+            size, error, finite = map(np.asarray, out)
             tested = tested or bool(finite)
             if error > 1e3 * np.finfo(size.dtype).eps * size:
                 return False
     return True if tested else None
 
 
-def _draw(x: Array, key: PRNGKeyArray, positive: bool) -> Array:
+def _draw(x: Array, key: PRNGKeyArray, positive: Bool[Array, ""]) -> Array:
     if jnp.issubdtype(x.dtype, jnp.floating):
-        return (jr.uniform if positive else jr.normal)(key, x.shape, x.dtype)
+        draw = lambda law: law(key, x.shape, x.dtype)
+        return jnp.where(positive, draw(jr.uniform), draw(jr.normal))
     if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
         return jnp.broadcast_to(jr.key(0, impl=jr.key_impl(x)), x.shape)
     return jnp.ones(x.shape, x.dtype)
