@@ -313,7 +313,10 @@ def _before_any_product(b):
 
 
 @pytest.mark.parametrize("system", [_random_matrix, _shift_and_identity])
-def test_each_product_of_gmres_reduces_the_residual_as_far_as_possible(system):
+def test_each_product_of_gmres_reduces_the_residual_as_far_as_possible(
+    system, monkeypatch
+):
+    monkeypatch.setattr(_krylov, "_NO_RESTART", 0)
     A, b = system(np.random.default_rng(0))
     cycle = _krylov._IMAGES
 
@@ -335,6 +338,14 @@ def test_each_product_of_gmres_reduces_the_residual_as_far_as_possible(system):
         images, _ = np.linalg.qr(np.stack(powers, 1))
         least = first - images @ (images.T @ first)
         np.testing.assert_allclose(r, least, atol=1e-5)
+
+
+@pytest.mark.parametrize("n", [12, 30])
+def test_gmres_of_few_unknowns_needs_no_restart(n):
+    # The eigenvalues of a shift surround zero: only the last product reduces the residual.
+    b = jnp.eye(n)[0]
+    x = jax.jit(lambda b: _krylov.gmres(lambda x: jnp.roll(x, 1), b))(b)
+    np.testing.assert_allclose(jnp.roll(x, 1), b, atol=1e-5)
 
 
 def test_gmres_ends_where_it_gains_nothing_and_not_before():

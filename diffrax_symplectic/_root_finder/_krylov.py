@@ -20,7 +20,10 @@ from jaxtyping import Array, Bool, Float, Float32, Scalar
 from .._custom_types import BoolScalarLike, IntScalarLike
 
 
-# The most images that are kept; with fewer unknowns, as many as there are.
+# How many images are kept. As many as there are unknowns need no restart, after which
+# indefinite matrices, those of long steps, can stall. Up to this size they take little
+# memory.
+_NO_RESTART = 30
 _IMAGES = 8
 # By how much the residual is reduced: a correction of Newton's method needs no more
 # accuracy than the next one makes up for.
@@ -72,7 +75,8 @@ class Krylov(NamedTuple):
 
 def empty(n: int, dtype) -> Krylov:
     """Without a system."""
-    x, one, m = jnp.zeros(n, dtype), jnp.ones((), dtype), min(n, _IMAGES) + 1
+    x, one = jnp.zeros(n, dtype), jnp.ones((), dtype)
+    m = (n if n <= _NO_RESTART else _IMAGES) + 1
     basis, directions = jnp.zeros((m, n), jnp.float32), jnp.zeros((m, m), dtype)
     by = jnp.zeros(m, dtype)
     return Krylov(x, x, x, basis, directions, by, by, one, one, one, one, 1, 0)
