@@ -1,12 +1,14 @@
 """The chart of total errors against time: what it extrapolates and what it calls exact."""
 
 import numpy as np
+from scipy.linalg import expm
 
 import diffrax_symplectic as ds
 from examples import rigid_body
 from examples._gallery import weak
 from examples._transfer import transfer_expectations
 from examples.benchmarks import _exact, total_error
+from examples.hard_cases import chain
 
 
 def test_independent_paths_take_the_step_that_is_cheapest_for_an_error():
@@ -48,3 +50,19 @@ def test_the_study_runs_at_small_sizes(capsys):
     total_error.quick()
     tables = capsys.readouterr().out
     assert "| linear oscillator | 64 |" in tables and "nan" not in tables
+
+
+def test_the_mean_square_of_the_harmonic_chain_is_that_of_its_moment_equations():
+    n, s, t = chain.N, 0.3, 1.7
+    stiffness = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    zero, one = np.zeros((n, n)), np.eye(n)
+    A = np.block([[zero, -stiffness], [one, zero]])
+    noise = np.block([[s**2 * one, zero], [zero, zero]])
+    # Of Van Loan (1978): the integral of exp(At) Q exp(At)^T, by one exponential.
+    both = expm(np.block([[-A, noise], [np.zeros_like(A), A.T]]) * t)
+    covariance = both[2 * n :, 2 * n :].T @ both[: 2 * n, 2 * n :]
+    mean = (expm(A * t) @ np.concatenate(chain.start(1.0)))[n:]
+    expected = (np.sum(mean**2) + np.trace(covariance[n:, n:])) / n
+    np.testing.assert_allclose(
+        _exact._harmonic_chain_square(s, t), expected, rtol=1e-12
+    )
