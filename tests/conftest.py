@@ -1,7 +1,5 @@
 """Settings of the suite. Nearly all of its time goes into tracing and compiling programs
-that run for milliseconds, so they are compiled with little optimization. A test whose claim
-is about optimized programs, or whose programs run for long, has the fixture `optimized`;
-the examples and benchmarks always run optimized.
+that run for milliseconds, so they are compiled with little optimization.
 
 What users run is optimized. So the tests with the mark `core` are run once more with
 `JAX_DISABLE_MOST_OPTIMIZATIONS=0`, which every test then follows."""
@@ -33,16 +31,6 @@ jax.config.update("jax_traceback_in_locations_limit", 0)
 # Tracing makes millions of objects that live on: to look through them every few hundred
 # takes a third of its time.
 gc.set_threshold(100_000, 50, 100)
-
-
-@pytest.fixture
-def optimized():
-    """Programs run in the test are optimized: those compiled before are not reused."""
-    jax.clear_caches()
-    jax.config.update("jax_disable_most_optimizations", False)
-    yield
-    jax.config.update("jax_disable_most_optimizations", not OPTIMIZED)
-    jax.clear_caches()
 
 
 @pytest.fixture(autouse=True, scope="module")

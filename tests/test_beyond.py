@@ -215,9 +215,8 @@ def test_one_plateau_is_only_order_one_there():
 
 
 def _plateau_path(m=2):
-    levy = diffrax.SpaceTimeLevyArea
-    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 0.01, (m,), jr.key(0), levy)
-    return ds.PlateauBrownianPath(tree, jr.key(1))
+    path = ds.FixedStepBrownianPath((m,), jr.key(0), diffrax.SpaceTimeLevyArea)
+    return ds.PlateauBrownianPath(path, jr.key(1))
 
 
 @explicit

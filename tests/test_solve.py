@@ -97,16 +97,14 @@ def test_rigid_body_stays_on_the_sphere_over_1e5_steps(solver):
     assert _drift_of_invariant(terms, solver, y0, squared, 0.02, 10**5) <= 1e-11
 
 
-def _truncated_tree():
-    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 0.01, (2,), jr.key(3))
-    return ds.TruncatedBrownianPath(tree, k=1)
+_CUT = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((2,), jr.key(3)), k=1)
 
 
 @pytest.mark.parametrize(
     "name, path",
     [
         *[(name, weak_path(2)) for name in ("Midpoint", "SRKs1", "SRKw1", "SRKw2")],
-        ("SRKs1", _truncated_tree()),
+        ("SRKs1", _CUT),
     ],
     ids=["Midpoint", "SRKs1", "SRKw1", "SRKw2", "SRKs1-cut"],
 )
@@ -268,8 +266,8 @@ def test_everything_works_in_single_precision_mode():
 import diffrax, diffrax_symplectic as ds, jax, jax.numpy as jnp, jax.random as jr
 H = lambda t, p, q, args: (p**2 + q**2) / 2
 y0 = (jnp.array(0.0), jnp.array(1.0))
-tree = diffrax.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jr.key(0))
-weak, cut = ds.WeakBrownianPath((), jr.key(0)), ds.TruncatedBrownianPath(tree)
+fixed = ds.FixedStepBrownianPath((), jr.key(0))
+weak, cut = ds.WeakBrownianPath((), jr.key(0)), ds.TruncatedBrownianPath(fixed)
 for solver, path in ((ds.Midpoint(), cut), (ds.SRKw2(), weak)):
     terms = ds.hamiltonian_terms(H, H, path)
     def momentum(y0):

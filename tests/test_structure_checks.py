@@ -57,8 +57,8 @@ def test_wrong_structure_is_refused_by_the_derivative(solver, H0, noise, derivat
 def test_structure_is_never_refused_for_the_way_it_is_written(H0):
     # In the first, the last and the noise it takes some algebra to see.
     noise = lambda t, p, q, args: jnp.sum(jnp.sin(q + p - p))
-    sol = _solve(H0, noise, args=jnp.array(0.7))
-    assert all(jnp.all(jnp.isfinite(x)) for x in sol.ys)
+    # The structure is checked while tracing.
+    jax.eval_shape(lambda args: _solve(H0, noise, args=args), jnp.array(0.7))
 
 
 def test_general_solvers_take_any_structure():
