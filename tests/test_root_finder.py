@@ -247,30 +247,73 @@ def test_fixed_point_iterations_end_when_the_next_correction_is_small_enough():
 def test_chords_follow_fixed_point_iterations_and_one_of_newton(chords):
     @jax.jit
     @jax.vmap
-    def solve(a, rtol):
+    def solve(a, b, rtol):
         finder = ds.PicardNewton(rtol=rtol, direct=1, warmup=2, chords=chords)
-        residual = lambda y, _: y - 1 - a * y**2
+        residual = lambda y, _: y - 1 - b * y - a * y**2
         return _without_a_safety_net(finder, residual, jnp.zeros(()))
 
     factors = np.array([0.0, 1e-3, 0.01, 0.03, 0.1, 0.2, 0.24, 0.26, 0.4, 4e-5, 0.012])
-    rtols = np.array([*[1e-9] * 9, 4e-16, 1e-22])
+    slopes = np.array([*0.0 * factors, -3.0, 2.0, 0.9])
+    factors = np.array([*factors, 0.01, 0.01, 0.001])
+    rtols = np.array([*[1e-9] * 9, 4e-16, 1e-22, *[1e-9] * 3])
     cases = set()
-    for a, rtol, value, success in zip(factors, rtols, *solve(factors, rtols)):
-        y = 1 + a * (1 + a * 0) ** 2
-        slope, sizes = 1 - 2 * a * y, []
+    values = solve(factors, slopes, rtols)
+    for a, b, rtol, value, success in zip(factors, slopes, rtols, *values):
+        y = 1 + b + a
+        # Newton's method begins at zero where the second iteration changed too much.
+        y = y if abs(y - 1) <= 0.5 * abs(y) else 0.0
+        slope, sizes = 1 - b - 2 * a * y, []
         for _ in range(chords + 1):
-            correction = (y - 1 - a * y**2) / slope
+            correction = (y - 1 - b * y - a * y**2) / slope
             y = y - correction
             sizes.append(abs(correction / y))
         shrink = sizes[-1] / sizes[-2] if chords and sizes[-1] else np.sign(sizes[-1])
         shrink = shrink if chords else 1.0
         done = _is_accepted(sizes[-1], shrink, rtol, shrink >= 0.25)
         assert success == done
-        near = bool(shrink < 0.5)
+        near = bool(shrink < 0.5 and sizes[-1] <= 0.1)
         np.testing.assert_allclose(value, y if done or near else 0, rtol=1e-13)
         cases.add((done, near))
     both = {(True, False), (False, False)}
     assert cases == (both | {(True, True), (False, True)} if chords else both)
+
+
+class _NoCorrection(lx.AbstractLinearSolver):
+    """What rounding errors make of elimination where the Jacobian is very large."""
+
+    def init(self, operator, options):
+        return None
+
+    def compute(self, state, vector, options):
+        zero = jax.tree.map(jnp.zeros_like, vector)
+        return zero, lx.RESULTS.successful, {}
+
+    def transpose(self, state, options):
+        return state, options
+
+    def conj(self, state, options):
+        return state, options
+
+    def assume_full_rank(self):
+        return True
+
+
+@pytest.mark.parametrize("residual, accepted", [(0.9, True), (1.1, False)])
+def test_corrections_of_zero_are_no_solution_where_the_residual_exceeds_the_state(
+    residual, accepted
+):
+    finder = ds.PicardNewton(direct=0, linear_solver=_NoCorrection())
+    fn = lambda y, _: 5 * (y - 1) + residual
+    sol = optx.root_find(fn, finder, jnp.ones(3), throw=False)
+    assert (sol.result == optx.RESULTS.successful) == accepted
+
+
+def test_a_linear_system_that_gmres_cannot_solve_is_no_solution():
+    # It makes no progress at all with a shift until it has as many images as unknowns.
+    n = 40
+    residual = lambda y, _: jnp.roll(y, 1) - jnp.arange(n)
+    sol = optx.root_find(residual, ds.PicardNewton(), jnp.zeros(n), throw=False)
+    assert sol.result != optx.RESULTS.successful
 
 
 def test_corrections_that_rounding_errors_make_grow_are_accepted_below_the_tolerance():

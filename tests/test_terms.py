@@ -96,9 +96,12 @@ def test_terms_work_with_diffrax_solvers(m):
         (m,), jr.key(1), levy_area=diffrax.SpaceTimeTimeLevyArea
     )
     terms = ds.hamiltonian_terms(H0, noise, path)
-    solve = lambda solver: diffrax.diffeqsolve(
-        *(terms, solver, 0.0, 0.25, 2.0**-9, y0, args), adjoint=diffrax.ForwardMode()
-    ).ys
+    solve = lambda solver: (
+        diffrax.diffeqsolve(
+            *(terms, solver, 0.0, 0.25, 2.0**-9, y0, args),
+            adjoint=diffrax.ForwardMode(),
+        ).ys
+    )
     expected = solve(ds.Midpoint())
     for solver in (diffrax.Heun(), diffrax.StratonovichMilstein(), diffrax.SlowRK()):
         for a, b in zip(solve(solver), expected):

@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
+from .._custom_types import BoolScalarLike
 from . import _compact, _krylov, _linear
 from ._start import converged, Measured
 from ._tolerance import largest, ratio
@@ -147,7 +148,7 @@ def _dense_iteration(finder: "PicardNewton", equations: Equations, state: State)
     value, jacobian = jax.linearize(equations.residual, state.y)
     apply = lambda x: _part(s, x, jacobian(x))
     diff = _linear.solve(apply, _part(s, state.y, value), finder.linear_solver)
-    return _correct(finder, equations, state, diff)
+    return _correct(finder, equations, state, value, diff, True)
 
 
 def _iterate(
@@ -162,7 +163,9 @@ def _iterate(
     value, image = jax.jvp(equations.residual, (state.y,), (krylov.p,))
     vector = _part(s, *_where(fresh, (state.y, value), (krylov.p, image)))
     krylov = _krylov.extend(krylov, vector, fresh)
-    corrected = _correct(finder, equations, state, krylov.solution)
+    corrected = _correct(
+        finder, equations, state, value, krylov.solution, krylov.reduced
+    )
     return _where(krylov.done, corrected, state), krylov, krylov.done
 
 
@@ -171,20 +174,29 @@ def _where(which: Bool[Array, ""], a: _T, b: _T) -> _T:
 
 
 def _correct(
-    finder: "PicardNewton", equations: Equations, state: State, diff: _Vector
+    finder: "PicardNewton",
+    equations: Equations,
+    state: State,
+    residual: _Vector,
+    diff: _Vector,
+    exact: BoolScalarLike,
 ) -> State:
-    """What follows from a correction."""
+    """What follows from the correction `diff` for a residual; `exact` says whether its
+    linear system was solved."""
     s, y = state.target, state.y - diff
     extent, scale = equations.measured
     # In one array, for a shorter program.
-    change, moved, scales = finder.tolerance.norms(
-        *(extent(equations.restore(x)) for x in (diff, state.y)),
+    change, moved, residuals, scales = finder.tolerance.norms(
+        *(extent(equations.restore(x)) for x in (diff, state.y, residual)),
         scale(equations.restore(y)),
     )
     size, relative = finder.tolerance.compare(change, scales)
     shrink = jnp.where(state.tries > 0, ratio(size, state.size), 1)
     whole = s == 1
     solved = whole & converged(size, relative, shrink, shrink >= 0.25)
+    # Far from all solutions rounding errors of a large Jacobian hide the unknowns that it
+    # multiplies least. Then corrections are small where residuals are larger than states.
+    solved &= exact & (largest(residuals) <= largest(scales))
 
     at_once = whole & (state.reached == 0)
     patience = jnp.where(at_once, _PATIENCE, 2)

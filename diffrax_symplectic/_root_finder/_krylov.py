@@ -63,9 +63,14 @@ class Krylov(NamedTuple):
     left: IntScalarLike
 
     @property
+    def reduced(self) -> Bool[Array, ""]:
+        """Whether the residual is small enough."""
+        return ~(self.size > _REDUCTION**2 * self.start)
+
+    @property
     def done(self) -> Bool[Array, ""]:
         """Whether the residual is small enough, or becomes no smaller."""
-        return ~(self.size > _REDUCTION**2 * self.start) | (self.left <= 0)
+        return self.reduced | (self.left <= 0)
 
     @property
     def solution(self) -> Float[Array, " n"]:

@@ -14,7 +14,7 @@ from .._compat import ω
 from .._custom_types import BoolScalarLike, IntScalarLike
 from ._batch import any_of_batch
 from ._small_lu import SmallLU
-from ._tolerance import ratio
+from ._tolerance import largest, ratio
 
 
 if TYPE_CHECKING:
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 # A correction below this fraction of the state shows that iteration came near.
 _NEAR = 0.1
+# The last of the iterations before Newton's method may change the values by this fraction
+# of what all of them did.
+_SETTLED = 0.5
 
 _Map = Callable[[PyTree[Array]], PyTree[Array]]
 
@@ -78,11 +81,17 @@ def improve(
         found = _newton(finder, phi, y, measured)
         return Sweep(found.y, [], [], found.converged, found.near)
     # A look at the error costs as much as an iteration does. So it comes only after several
-    # of them, which are a loop of their own: XLA makes faster code of it than of iterations
-    # written out.
-    advance = lambda _, ys: (ys[1], phi(ys[1]))
-    before, after = lax.fori_loop(0, sweeps, advance, (y, y))
+    # of them.
+    before, after = _fixed_point(phi, y, sweeps)
     return Sweep(after, before, after, True, True)
+
+
+def _fixed_point(
+    phi: _Map, y: PyTree[Array], times: IntScalarLike
+) -> tuple[PyTree[Array], PyTree[Array]]:
+    """The last two iterates. XLA makes faster code of a loop than of iterations written
+    out."""
+    return lax.fori_loop(0, times, lambda _, ys: (ys[1], phi(ys[1])), (y, y))
 
 
 def start(
@@ -154,7 +163,14 @@ def rounded(relative: Scalar) -> Bool[Array, ""]:
 def _newton(
     finder: "PicardNewton", phi: _Map, y: PyTree[Array], measured: Measured
 ) -> Start:
-    y = lax.fori_loop(0, finder.warmup, lambda _, y: phi(y), y)
+    guess = y
+    before, y = _fixed_point(phi, guess, finder.warmup)
+    if finder.warmup > 1:
+        # Where iteration goes away from the solution, Newton's method begins at the guess.
+        last, change = map(measured.extent, ((y**ω - before**ω).ω, y))
+        last, change = map(largest, finder.tolerance.norms(last, change))
+        comes_near = last <= _SETTLED * change
+        y = jtu.tree_map(lambda a, b: jnp.where(comes_near, a, b), y, guess)
     value, jacobian = jax.linearize(phi, y)
     operator = lx.FunctionLinearOperator(
         lambda x: (x**ω - jacobian(x) ** ω).ω, jax.eval_shape(lambda: y)
@@ -167,11 +183,11 @@ def _newton(
         diff, *_ = solver.compute(factors, residual, {})
         y = (y**ω - diff**ω).ω
         before = size
-        extent, scale = measured.extent(diff), measured.scale(y)
-        size, relative = finder.tolerance.measure(extent, scale)
+        sizes = finder.tolerance.norms(measured.extent(diff), measured.scale(y))
+        size, relative = finder.tolerance.compare(*sizes)
         shrink = jnp.ones_like(size) if i == 0 else ratio(size, before)
     done = converged(size, relative, shrink, shrink >= 0.25)
-    return Start(y, done, shrink < 0.5)
+    return Start(y, done, (shrink < 0.5) & (relative <= _NEAR))
 
 
 class _Rounds(NamedTuple):

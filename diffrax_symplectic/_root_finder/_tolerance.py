@@ -18,17 +18,11 @@ class Tolerance(eqx.Module):
     atol: float
     norm: Callable[[PyTree], Scalar]
 
-    def measure(
-        self, diff: PyTree[Array], scale: PyTree[Array]
-    ) -> tuple[Scalar, Scalar]:
-        """The size of a correction, in units of the tolerance (1 is just accepted), and
-        relative to the whole iterate."""
-        return self.compare(*self.norms(diff, scale))
-
     def compare(
         self, sizes: PyTree[Array], scales: PyTree[Array]
     ) -> tuple[Scalar, Scalar]:
-        """The same from the norms of each leaf."""
+        """The size of a correction, in units of the tolerance (1 is just accepted), and
+        relative to the whole iterate, from the norms of each leaf."""
         eps = jnp.finfo(jnp.result_type(*jtu.tree_leaves(sizes))).eps
         rtol = 2 * eps if self.rtol is None else self.rtol
         in_units = lambda a, b: ratio(a, rtol * b + self.atol)
