@@ -29,7 +29,8 @@ class PicardNewton(optx.AbstractRootFinder):
     First come iterations without a safety net, for each system of a step on its own:
 
     - Up to `direct` unknowns: `warmup` fixed-point (Picard) iterations, one of Newton's
-        method, and `chords` with the same Jacobian.
+        method, and `chords` with the same Jacobian. Where the fixed-point iterations go
+        away from the solution, Newton's method begins at the guess.
     - Above: `sweeps` fixed-point iterations, which need no Jacobian, without a look at the
         error; and rounds of `more_sweeps`, up to `picard_steps` in all, for as long as
         corrections shrink.
@@ -40,7 +41,8 @@ class PicardNewton(optx.AbstractRootFinder):
     (continuation). If the branch of solutions that begins at the start of the step ends
     before the whole step, Newton's method looks for any other solution. Its linear systems
     are solved by elimination up to four unknowns, and above by GMRES, which needs no
-    matrix.
+    matrix. A small correction is no success where GMRES did not solve its system, or where
+    the residual is larger than the state.
 
     **Arguments:**
 
