@@ -236,12 +236,3 @@ def test_energy_of_a_pendulum_is_kept_but_not_to_rounding():
     half = len(quiet.steps) // 2
     first, second = (np.max(np.abs(e)) for e in np.split(quiet.errors[0], [half]))
     assert 1e-6 < second <= 1.05 * first
-
-
-@pytest.mark.parametrize("name", ["SRKs2", "SRKw3a"])
-def test_steps_far_longer_than_a_fast_period_keep_the_energy(name):
-    # Fixed-point iterations go away from the solution, each 25 times as far as the last.
-    h = 10 / stiff.fastest()
-    (energies,) = stiff.energies(stiff.CASES[name], [h], 6.0, 64)
-    assert energies.failed == 0 and np.isfinite(energies.excess)
-    assert abs(energies.excess) <= 4 * energies.excess_error

@@ -112,3 +112,34 @@ def test_defect_needs_a_pair():
     terms = diffrax.ODETerm(lambda t, y, args: -y)
     with pytest.raises(ValueError, match=r"pair `\(p, q\)`"):
         ds.symplecticity_defect(terms, ds.Midpoint(), 0.0, 0.1, jnp.ones(3))
+
+
+@pytest.mark.parametrize("solver", [ds.Midpoint(), ds.SRKs2()], ids=repr)
+@pytest.mark.core
+def test_steps_of_any_length_that_succeed_solve_their_equations(solver):
+    # Fixed-point iterations on stiff springs that are not linear leave by powers of three.
+    # What Newton's method makes of that depends on the rounding errors of the program.
+    def step(key):
+        k_w, k_c, k_y, k_h = jr.split(key, 4)
+        w = jnp.exp(jr.uniform(k_w, (2,), minval=-2, maxval=6))
+        c = jnp.exp(jr.uniform(k_c, minval=-5, maxval=5))
+
+        def H0(t, p, q, args):
+            return jnp.sum(p**2 + w**2 * q**2) / 2 + c * (q[1] - q[0]) ** 4 / 4
+
+        nothing = lambda t, p, q, args: 0.0 * jnp.sum(q)
+        terms = ds.hamiltonian_terms(H0, nothing, Given(jnp.zeros(())))
+        h, y0 = (
+            jnp.exp(jr.uniform(k_h, minval=-5, maxval=3)),
+            tuple(jr.normal(k_y, (2, 2))),
+        )
+        y1, *_, result = solver.step(terms, 0.0, h, y0, None, None, False)
+        # Without noise both solvers are the midpoint rule.
+        y0, y1 = jnp.stack(y0), jnp.stack(y1)
+        rate = jnp.stack(terms.terms[0].vf(0.0, tuple((y0 + y1) / 2), None))
+        error = jnp.max(jnp.abs(y1 - y0 - h * rate)) / jnp.max(jnp.abs(y1))
+        return result == diffrax.RESULTS.successful, error
+
+    success, error = jax.jit(jax.vmap(step))(jr.split(jr.key(0), 1000))
+    assert jnp.mean(success) >= 0.99
+    assert jnp.max(error[success]) <= 1e-6
