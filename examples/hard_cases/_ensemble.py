@@ -46,12 +46,15 @@ def weak(shape=()) -> Callable:
     return lambda key: ds.WeakBrownianPath(shape, key)
 
 
+def areas(shape=()) -> Callable:
+    levy_area = diffrax.SpaceTimeLevyArea
+    return lambda key: ds.FixedStepBrownianPath(shape, key, levy_area)
+
+
 def plateaus(shape=()) -> Callable:
     def make(key):
         k_path, k_signs = jr.split(key)
-        levy_area = diffrax.SpaceTimeLevyArea
-        path = ds.FixedStepBrownianPath(shape, k_path, levy_area)
-        return ds.PlateauBrownianPath(path, k_signs)
+        return ds.PlateauBrownianPath(areas(shape)(k_path), k_signs)
 
     return make
 

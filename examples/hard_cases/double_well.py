@@ -12,7 +12,7 @@ import diffrax_symplectic as ds
 
 from ..benchmarks._timing import ensemble as many, keys, machine, measure
 from ..stability._page import fill, Page, table
-from ._ensemble import ensemble, gaussian, Mean, plateaus, truncated
+from ._ensemble import areas, ensemble, gaussian, Mean, plateaus, truncated
 from ._stationary import stationary_bias, Step
 
 
@@ -83,9 +83,9 @@ def diffrax_terms(path):
     )
 
 
-def with_areas(levy_area):
-    # That of Diffrax, since only it has space-time-time areas.
-    return lambda key: diffrax.UnsafeBrownianPath((), key, levy_area)
+def with_third_areas(key):
+    """Diffrax's own path, for only it has space-time-time areas."""
+    return diffrax.UnsafeBrownianPath((), key, diffrax.SpaceTimeTimeLevyArea)
 
 
 def damped(solver, make_path) -> Step:
@@ -97,20 +97,9 @@ LANGEVIN = {
     "Damped(StormerVerlet)": (damped(ds.StormerVerlet(), gaussian()), 1),
     "Damped(PlateauVerlet)": (damped(ds.PlateauVerlet(), plateaus()), 2),
     "Damped(Midpoint)": (damped(ds.Midpoint(), gaussian()), None),
-    "ALIGN": (
-        Step(
-            diffrax_terms, with_areas(diffrax.SpaceTimeLevyArea), diffrax.ALIGN(), True
-        ),
-        1,
-    ),
+    "ALIGN": (Step(diffrax_terms, areas(), diffrax.ALIGN(), True), 1),
     "QUICSORT": (
-        Step(
-            diffrax_terms,
-            with_areas(diffrax.SpaceTimeTimeLevyArea),
-            diffrax.QUICSORT(),
-            True,
-            nodes=5,
-        ),
+        Step(diffrax_terms, with_third_areas, diffrax.QUICSORT(), True, nodes=5),
         2,
     ),
     "Heun": (Step(terms_with_friction, gaussian(), diffrax.Heun()), 2),
