@@ -246,18 +246,22 @@ def test_chords_follow_fixed_point_iterations_and_one_of_newton(chords):
     assert cases == (both | {(True, True), (False, True)} if chords else both)
 
 
-class _NoCorrection(lx.AbstractLinearSolver):
-    """What rounding errors make of elimination where the Jacobian is very large."""
+class _ForSmallMatrices(lx.AbstractLinearSolver):
+    """Finds no correction where an entry is larger than `limit`. Elimination may do so
+    where rounding errors are as large as what matters."""
+
+    limit: float
 
     def init(self, operator, options):
-        return None
+        return operator.as_matrix()
 
     def compute(self, state, vector, options):
-        zero = jax.tree.map(jnp.zeros_like, vector)
-        return zero, lx.RESULTS.successful, {}
+        small = jnp.max(jnp.abs(state)) <= self.limit
+        x = jnp.where(small, jnp.linalg.solve(state, vector), 0)
+        return x, lx.RESULTS.successful, {}
 
     def transpose(self, state, options):
-        return state, options
+        return state.T, options
 
     def conj(self, state, options):
         return state, options
@@ -270,18 +274,41 @@ class _NoCorrection(lx.AbstractLinearSolver):
 def test_corrections_of_zero_are_no_solution_where_the_residual_exceeds_the_state(
     residual, accepted
 ):
-    finder = ds.PicardNewton(direct=0, linear_solver=_NoCorrection())
+    finder = ds.PicardNewton(direct=0, linear_solver=_ForSmallMatrices(0))
     fn = lambda y, _: 5 * (y - 1) + residual
     sol = optx.root_find(fn, finder, jnp.ones(3), throw=False)
     assert (sol.result == optx.RESULTS.successful) == accepted
 
 
-def test_a_linear_system_that_gmres_cannot_solve_is_no_solution():
+def test_where_no_correction_is_found_the_step_is_solved_in_parts():
+    # The derivative is 5 at the start and 2.7 at the solution.
+    finder = ds.PicardNewton(
+        direct=0, picard_steps=0, linear_solver=_ForSmallMatrices(3)
+    )
+    fn = lambda y, _: 2.5 * (y - 2 + jnp.tanh(y) - jnp.tanh(2.0))
+    sol = optx.root_find(fn, finder, jnp.zeros(1), throw=False)
+    assert sol.result == optx.RESULTS.successful
+    np.testing.assert_allclose(sol.value, 2, rtol=1e-14)
+
+
+@pytest.mark.parametrize("linear_solver", [None, lx.GMRES(1e-3, 1e-3, restart=8)])
+def test_a_linear_system_that_gmres_cannot_solve_is_no_solution(linear_solver):
     # It makes no progress at all with a shift until it has as many images as unknowns.
-    n = 40
-    residual = lambda y, _: jnp.roll(y, 1) - jnp.arange(n)
-    sol = optx.root_find(residual, ds.PicardNewton(), jnp.zeros(n), throw=False)
+    unit = jnp.eye(40)
+    residual = lambda y, _: jnp.roll(y, 1) - unit[0]
+    finder = ds.PicardNewton(linear_solver=linear_solver)
+    start = unit[-1] + unit[3] / 2
+    sol = optx.root_find(residual, finder, start, throw=False)
     assert sol.result != optx.RESULTS.successful
+
+
+@pytest.mark.parametrize("start", [0.0, 0.1])
+def test_a_solution_of_zero_is_found_among_rounding_errors(start):
+    # What the function returns there is a rounding error, and larger than the solution.
+    fn = lambda x, _: 1000 * (jnp.sin(x + 0.3) - jnp.sin(0.3)) + 3e-13
+    finder = ds.PicardNewton(direct=0, atol=1e-12)
+    sol = optx.root_find(fn, finder, jnp.array(start), throw=False)
+    assert sol.result == optx.RESULTS.successful and abs(sol.value) <= 1e-12
 
 
 def test_corrections_that_rounding_errors_make_grow_are_accepted_below_the_tolerance():

@@ -147,8 +147,9 @@ def _dense_iteration(finder: "PicardNewton", equations: Equations, state: State)
     s = state.target
     value, jacobian = jax.linearize(equations.residual, state.y)
     apply = lambda x: _part(s, x, jacobian(x))
-    diff = _linear.solve(apply, _part(s, state.y, value), finder.linear_solver)
-    return _correct(finder, equations, state, value, diff, True)
+    rhs = _part(s, state.y, value)
+    diff, exact = _linear.solve_by(finder.linear_solver, apply, rhs)
+    return _correct(finder, equations, state, value, diff, exact)
 
 
 def _iterate(
@@ -196,11 +197,14 @@ def _correct(
     solved = whole & converged(size, relative, shrink, shrink >= 0.25)
     # Far from all solutions rounding errors of a large Jacobian hide the unknowns that it
     # multiplies least. Then corrections are small where residuals are larger than states.
-    solved &= exact & (largest(residuals) <= largest(scales))
+    state_size = jnp.maximum(largest(scales), largest(moved)) + finder.tolerance.atol
+    solved &= exact & (largest(residuals) <= state_size)
 
     at_once = whole & (state.reached == 0)
     patience = jnp.where(at_once, _PATIENCE, 2)
-    stalled = (state.tries + 1 >= patience) & ~(shrink < _SHRINK)
+    # No correction at all, if that is not the solution, is no progress either.
+    shrinks = (shrink < _SHRINK) & (size > 0)
+    stalled = (state.tries + 1 >= patience) & ~shrinks
     near = largest(change) < _LOOSE * largest(moved)
     arrived = near & ~whole
     slow = ~whole & (state.tries + 1 >= _PATIENCE_IN_PART)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from . import _krylov
 from ._small_lu import SmallLU
@@ -27,11 +27,20 @@ def solve(
     a few unknowns and by GMRES, which needs no matrix, for more."""
     if linear_solver is None and rhs.size > MAX_DENSE:
         return _krylov.gmres(apply, rhs)
+    return solve_by(linear_solver, apply, rhs)[0]
+
+
+def solve_by(
+    linear_solver: lx.AbstractLinearSolver[Any] | None,
+    apply: Callable[[Array], Array],
+    rhs: Float[Array, " n"],
+) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+    """The same by a solver of Lineax, or elimination, and whether it succeeded."""
     # An absolute tolerance refers to a right-hand side of size one.
     size = optx.max_norm(rhs)
     size = jnp.where(size > 0, size, 1)
     linear_solver = SmallLU() if linear_solver is None else linear_solver
     operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: rhs))
     state: Any = linear_solver.init(operator, {})
-    x, *_ = linear_solver.compute(state, rhs / size, {})
-    return x * size
+    x, result, _ = linear_solver.compute(state, rhs / size, {})
+    return x * size, result == lx.RESULTS.successful

@@ -29,8 +29,9 @@ class PicardNewton(optx.AbstractRootFinder):
     First come iterations without a safety net, for each system of a step on its own:
 
     - Up to `direct` unknowns: `warmup` fixed-point (Picard) iterations, one of Newton's
-        method, and `chords` with the same Jacobian. Where the fixed-point iterations go
-        away from the solution, Newton's method begins at the guess.
+        method, and `chords` with the same Jacobian. Newton's method begins at the guess
+        where the last of several fixed-point iterations changes the values by more than
+        half of what all of them did.
     - Above: `sweeps` fixed-point iterations, which need no Jacobian, without a look at the
         error; and rounds of `more_sweeps`, up to `picard_steps` in all, for as long as
         corrections shrink.
@@ -41,8 +42,8 @@ class PicardNewton(optx.AbstractRootFinder):
     (continuation). If the branch of solutions that begins at the start of the step ends
     before the whole step, Newton's method looks for any other solution. Its linear systems
     are solved by elimination up to four unknowns, and above by GMRES, which needs no
-    matrix. A small correction is no success where GMRES did not solve its system, or where
-    the residual is larger than the state.
+    matrix. A small correction is no success where its linear system was not solved, or
+    where the residual is larger than the state.
 
     **Arguments:**
 

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 # A correction below this fraction of the state shows that iteration came near.
 _NEAR = 0.1
-# The last of the iterations before Newton's method may change the values by this fraction
-# of what all of them did.
+# Of the fixed-point iterations before Newton's method the last may change the values by no
+# more than this fraction of what all of them did.
 _SETTLED = 0.5
 
 _Map = Callable[[PyTree[Array]], PyTree[Array]]
@@ -167,9 +167,10 @@ def _newton(
     before, y = _fixed_point(phi, guess, finder.warmup)
     if finder.warmup > 1:
         # Where iteration goes away from the solution, Newton's method begins at the guess.
-        last, change = map(measured.extent, ((y**ω - before**ω).ω, y))
-        last, change = map(largest, finder.tolerance.norms(last, change))
-        comes_near = last <= _SETTLED * change
+        changes = [(y**ω - x**ω).ω for x in (before, guess)]
+        norms = finder.tolerance.norms(*map(measured.extent, changes))
+        last, whole = map(largest, norms)
+        comes_near = last < _SETTLED * whole
         y = jtu.tree_map(lambda a, b: jnp.where(comes_near, a, b), y, guess)
     value, jacobian = jax.linearize(phi, y)
     operator = lx.FunctionLinearOperator(
