@@ -8,3 +8,4 @@ from ._start import (
     start as start,
     Sweep as Sweep,
 )
+from ._tolerance import all_finite as all_finite

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 from .._custom_types import BoolScalarLike
 from . import _compact, _krylov, _linear
 from ._start import converged, Measured
-from ._tolerance import largest, ratio
+from ._tolerance import all_finite, largest, ratio
 
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def _correct(
     # Far from all solutions rounding errors of a large Jacobian hide the unknowns that it
     # multiplies least. Then corrections are small where residuals are larger than states.
     state_size = jnp.maximum(largest(scales), largest(moved)) + finder.tolerance.atol
-    solved &= exact & (largest(residuals) <= state_size)
+    solved &= exact & (largest(residuals) <= state_size) & all_finite(y)
 
     at_once = whole & (state.reached == 0)
     patience = jnp.where(at_once, _PATIENCE, 2)

@@ -14,7 +14,7 @@ from .._compat import ω
 from .._custom_types import BoolScalarLike, IntScalarLike
 from ._batch import any_of_batch
 from ._small_lu import SmallLU
-from ._tolerance import largest, ratio
+from ._tolerance import all_finite, largest, ratio
 
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def start(
     corrections do not shrink. `improve_all` is one round, of so many iterations."""
     if all(size_of(system) <= finder.direct for system in y):
         once = improve_all(y, 0)
-        return Start(once.y, jnp.asarray(once.converged), jnp.asarray(once.near))
+        return _if_finite(once.y, once.converged, once.near)
 
     def one_round(carry: _Rounds) -> _Rounds:
         first = carry.step == 0
@@ -137,7 +137,13 @@ def start(
     no, yes = jnp.array(False), jnp.array(True)
     first = _Rounds(y, jnp.array(jnp.inf, dtype), no, yes, yes, 0)
     last = lax.while_loop(lambda carry: any_of_batch(carry.going), one_round, first)
-    return Start(last.y, last.done, last.near)
+    return _if_finite(last.y, last.done, last.near)
+
+
+def _if_finite(y: PyTree[Array], done: BoolScalarLike, near: BoolScalarLike) -> Start:
+    # The norms do not tell: on CPUs XLA may return -inf as the maximum of NaNs.
+    finite = all_finite(y)
+    return Start(y, finite & done, finite & near)
 
 
 def converged(

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree, Scalar
+from jaxtyping import Array, Bool, PyTree, Scalar
 
 
 class Tolerance(eqx.Module):
@@ -42,6 +42,10 @@ class Tolerance(eqx.Module):
 
 def largest(norms: PyTree[Array]) -> Scalar:
     return ft.reduce(jnp.maximum, map(jnp.max, jtu.tree_leaves(norms)))
+
+
+def all_finite(y: PyTree[Array]) -> Bool[Array, ""]:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(y)]))
 
 
 def ratio(a: Array, b: Array) -> Array:

@@ -16,6 +16,7 @@ from .._compat import ω
 from .._custom_types import BoolScalarLike, IntScalarLike, Y
 from .._plan import Plan
 from .._root_finder import (
+    all_finite,
     differentiate,
     finish,
     improve,
@@ -61,7 +62,7 @@ def first_failure(first: diffrax.RESULTS, then: diffrax.RESULTS) -> diffrax.RESU
 def _result(unsolved: BoolScalarLike, y1: Y) -> diffrax.RESULTS:
     R = diffrax.RESULTS
     stuck: diffrax.RESULTS = R.nonlinear_max_steps_reached  # pyright: ignore
-    finite = R.where(_all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
+    finite = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
     return R.where(unsolved, stuck, finite)
 
 
@@ -90,7 +91,7 @@ def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
     y1, unknown, unsolved = _implicit_step(stages, finder=finder, max_steps=max_steps)
     # Where there is no solution there is no derivative either. It is zero for such a
     # path, and no number that is not finite spoils what other paths have in common with it.
-    failed = unsolved | ~_all_finite(y1)
+    failed = unsolved | ~all_finite(y1)
     root = jtu.tree_map(lambda k: jnp.where(failed, 0, k), unknown)
 
     is_none = lambda x: x is None
@@ -171,7 +172,3 @@ def _by_root_find(stages: Stages, finder: Any, max_steps: int):
         throw=False,
     )
     return sol.value, sol.result != optx.RESULTS.successful
-
-
-def _all_finite(y: Y) -> Bool[Array, ""]:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(y)]))
