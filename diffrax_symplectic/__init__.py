@@ -39,7 +39,7 @@ from ._solver import (
     check_structure as check_structure,
     Damped as Damped,
     LevyAreaMidpoint as LevyAreaMidpoint,
-    Midpoint as Midpoint,
+    ImplicitMidpoint as ImplicitMidpoint,
     NinomiyaVictoir as NinomiyaVictoir,
     PlateauGauss as PlateauGauss,
     PlateauVerlet as PlateauVerlet,

@@ -38,7 +38,7 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     or with `throw=False` the gradient is NaN.
 
     **Solvers:** those that are their own inverse, which is read off their coefficients:
-    [`diffrax_symplectic.Midpoint`][], [`diffrax_symplectic.StormerVerlet`][],
+    [`diffrax_symplectic.ImplicitMidpoint`][], [`diffrax_symplectic.StormerVerlet`][],
     [`diffrax_symplectic.StrangGauss`][], [`diffrax_symplectic.LevyAreaMidpoint`][],
     [`diffrax_symplectic.NinomiyaVictoir`][] and tableaus of your own.
 
@@ -105,7 +105,8 @@ def _check_supported(solver, controller, event, saveat) -> None:
     if not _undoes_its_steps(solver):
         raise ValueError(
             f"`ReversingAdjoint` needs a solver that undoes its own steps, and `{name}` "
-            f"does not. Use `Midpoint`, `StormerVerlet` or `StrangGauss`. Or: {advice}"
+            f"does not. Use `ImplicitMidpoint`, `StormerVerlet` or `StrangGauss`. "
+            f"Or: {advice}"
         )
     if not isinstance(controller, diffrax.ConstantStepSize | diffrax.StepTo):
         raise ValueError(

@@ -29,7 +29,7 @@ def check_solver(name: str, solver: Any) -> None:
     """Raises a `ValueError` unless this is a solver."""
     if isinstance(solver, diffrax.AbstractSolver):
         return
-    example = "Midpoint"
+    example = "ImplicitMidpoint"
     if isinstance(solver, type) and issubclass(solver, diffrax.AbstractSolver):
         example = solver.__name__
     raise ValueError(f"`{name}` must be a solver, as `{example}()`; got {solver!r}.")

@@ -160,7 +160,7 @@ def compare_solvers(
                 0.0,
                 1.0,
                 dts=[0.25, 0.125],
-                solvers=[ds.StormerVerlet(), ds.Midpoint()],
+                solvers=[ds.StormerVerlet(), ds.ImplicitMidpoint()],
                 key=jr.key(0),
             )
         )

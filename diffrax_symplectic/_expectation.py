@@ -101,7 +101,8 @@ def expectation(
             path = ds.FixedStepBrownianPath((), key, cell=0.05)
             terms = ds.hamiltonian_terms(H, H, ds.TruncatedBrownianPath(path))
             sol = diffrax.diffeqsolve(
-                terms, ds.Midpoint(), t0=0, t1=1, dt0=0.1 / 2**level, y0=y0, throw=False
+                terms, ds.ImplicitMidpoint(), t0=0, t1=1, dt0=0.1 / 2**level, y0=y0,
+                throw=False,
             )
             return sol.ys[1][-1] ** 2, sol.result
 

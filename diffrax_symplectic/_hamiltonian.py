@@ -63,7 +63,7 @@ def hamiltonian_terms(
         terms = ds.hamiltonian_terms(H0, noise, path)
         y0 = (jnp.array(0.0), jnp.array(1.0))
         sol = diffrax.diffeqsolve(
-            terms, ds.Midpoint(), t0=0, t1=1, dt0=0.01, y0=y0, args=0.1
+            terms, ds.ImplicitMidpoint(), t0=0, t1=1, dt0=0.01, y0=y0, args=0.1
         )
         ```
 

@@ -138,14 +138,14 @@ def _fault(independent: bool | None, derivative: str) -> Fault | None:
 
 
 _ADVICE = (
-    "Use a solver for the general structure, for example `Midpoint` or `SRKw1`. (An array "
-    "in `args` stands for any value. If the derivative vanishes for yours, pass "
+    "Use a solver for the general structure, for example `ImplicitMidpoint` or `SRKw1`. "
+    "(An array in `args` stands for any value. If the derivative vanishes for yours, pass "
     "`structure=` to `hamiltonian_terms`.)"
 )
 _UNTESTED = (
     "Pass `structure=` to `hamiltonian_terms`, write the Hamiltonians so that variables "
     "that cancel do not enter at all, or use a solver for the general structure, for "
-    "example `Midpoint` or `SRKw1`."
+    "example `ImplicitMidpoint` or `SRKw1`."
 )
 FRICTION = "Friction -gamma p is what `Damped(solver, gamma)` is for."
 

@@ -199,8 +199,8 @@ def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     drift, noise = split_terms(terms)
     if len(noise) == 0 or any(len(brownian_paths(term)) == 0 for term in noise):
         raise ValueError(
-            f"{advice}; these have a part without one. (Without noise, `Midpoint` and "
-            "`StormerVerlet` are solvers for any path.)"
+            f"{advice}; these have a part without one. (Without noise, `ImplicitMidpoint` "
+            "and `StormerVerlet` are solvers for any path.)"
         )
     return drift, noise
 

@@ -17,8 +17,8 @@ from ._brownian import (
 )
 from ._solver import (
     AdditiveGauss,
+    ImplicitMidpoint,
     LevyAreaMidpoint,
-    Midpoint,
     NinomiyaVictoir,
     PlateauGauss,
     PlateauVerlet,
@@ -142,7 +142,7 @@ RULES = {
     Rule("paths", "separable", "any", StormerVerlet, "Gaussian"): (
         "Explicit, the cheapest step of all, for few digits: omega h < 2."
     ),
-    Rule("paths", "any", "any", Midpoint, "truncated"): (
+    Rule("paths", "any", "any", ImplicitMidpoint, "truncated"): (
         "The first to try: one stage vector for any number of noises."
     ),
     Rule("paths", "separable", "any", SRKs2, "truncated"): (

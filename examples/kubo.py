@@ -167,7 +167,7 @@ def figure_strong(full: bool) -> None:
     hs = [2.0**-k for k in range(2, 9)]
     solvers = {
         "SRKs1": ds.SRKs1(),
-        "Midpoint": ds.Midpoint(),
+        "ImplicitMidpoint": ds.ImplicitMidpoint(),
         "Milstein": diffrax.StratonovichMilstein(),
     }
     exact = {
@@ -181,7 +181,7 @@ def figure_strong(full: bool) -> None:
     figure, axes = plt.subplots(figsize=(6, 4.5))
     plot_orders(axes, "strong error of (p, q)", exact, slopes=(0.5, 1))
     save(figure, "kubo_strong.png")
-    orders = {"SRKs1": 1, "Midpoint": 1, "Milstein": 1, "Euler (Itô)": 0.5}
+    orders = {"SRKs1": 1, "ImplicitMidpoint": 1, "Milstein": 1, "Euler (Itô)": 0.5}
     claim_slopes(exact, orders)
 
 

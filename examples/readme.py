@@ -79,7 +79,7 @@ def main() -> None:
     )
     for name, solver, colour in (
         ("Heun", diffrax.Heun(), "C1"),
-        ("Midpoint", ds.Midpoint(), "C0"),
+        ("ImplicitMidpoint", ds.ImplicitMidpoint(), "C0"),
     ):
         p, q = portrait(solver)
         near = np.hypot(p, q) < 2.2

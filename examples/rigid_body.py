@@ -199,13 +199,13 @@ def figure_poisson(full: bool) -> None:
     itself = make_terms(gaussian()(jr.key(0))), X0
 
     def defects(terms, y0):
-        defect = lambda h: ds.poisson_defect(terms, ds.Midpoint(), 0.0, h, y0)
+        defect = lambda h: ds.poisson_defect(terms, ds.ImplicitMidpoint(), 0.0, h, y0)
         return np.asarray(briefly(jax.vmap(defect))(hs))
 
     of_pairs, of_X = defects(*pairs), defects(*itself)
     ts, y, success = briefly(
         lambda: trajectory(
-            spinor_terms, gaussian(3), ds.Midpoint(), y0, 0.1, steps, every=1
+            spinor_terms, gaussian(3), ds.ImplicitMidpoint(), y0, 0.1, steps, every=1
         )
     )()
     assert success
@@ -214,12 +214,12 @@ def figure_poisson(full: bool) -> None:
     local = np.abs(local_weak_errors(local_hs))
     slope = np.polyfit(np.log(local_hs), np.log(local), 1)[0]
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.5), layout="constrained")
-    axes[0].loglog(hs, of_X, "o-C1", label="Midpoint of X")
-    axes[0].loglog(hs, of_pairs, "o-C0", label="Midpoint, spin_terms")
+    axes[0].loglog(hs, of_X, "o-C1", label="ImplicitMidpoint of X")
+    axes[0].loglog(hs, of_pairs, "o-C0", label="ImplicitMidpoint, spin_terms")
     axes[0].set(xlabel="h", title="Poisson defect of one step")
     axes[0].legend(fontsize=8)
     axes[1].semilogy(ts, length + 1e-17, "C0", lw=0.5)
-    axes[1].set(xlabel="t", title="||X| - 1|, Midpoint, spin_terms, h = 0.1")
+    axes[1].set(xlabel="t", title="||X| - 1|, ImplicitMidpoint, spin_terms, h = 0.1")
     axes[2].loglog(local_hs, local, "o-C0", label=f"NinomiyaVictoir ({slope:.2f})")
     axes[2].loglog(
         local_hs, local[0] * (local_hs / local_hs[0]) ** 3, "k:", label="h^3"

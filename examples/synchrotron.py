@@ -60,7 +60,7 @@ def figure_2d(full: bool) -> None:
         make_terms,
         {"SRKs3": PAPER_SRKS3, "Euler": diffrax.Euler()},
         # Its own error is far smaller than those that are measured.
-        ds.Midpoint(),
+        ds.ImplicitMidpoint(),
         Y0,
         [2.0**-k for k in range(1, 9)],
         m=2,

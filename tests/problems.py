@@ -11,7 +11,7 @@ import diffrax_symplectic as ds
 
 
 GENERAL = {
-    "Midpoint": ds.Midpoint(),
+    "ImplicitMidpoint": ds.ImplicitMidpoint(),
     "SRKs1": ds.SRKs1(),
     "SRKw1": ds.SRKw1(),
     "SRKw1-0.2": ds.SRKw1(b=0.2),

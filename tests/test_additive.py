@@ -264,7 +264,7 @@ def test_missing_random_variables_are_refused_with_advice(solver, path, advice):
 def test_solvers_declare_the_levy_area_that_they_need():
     assert ds.SRKs4().minimal_levy_area is diffrax.AbstractSpaceTimeLevyArea
     assert ds.SRKw5().minimal_levy_area is ds.WeakIncrement
-    assert ds.Midpoint().minimal_levy_area is diffrax.AbstractBrownianIncrement
+    assert ds.ImplicitMidpoint().minimal_levy_area is diffrax.AbstractBrownianIncrement
 
 
 @pytest.mark.parametrize("value", [1j, np.nan, np.inf, "x"])

@@ -26,7 +26,7 @@ def separable_noise(t, p, q, args):
 
 
 UNDO = {
-    "general": [ds.Midpoint(), ds.StrangGauss()],
+    "general": [ds.ImplicitMidpoint(), ds.StrangGauss()],
     "several": [ds.LevyAreaMidpoint(), ds.NinomiyaVictoir()],
     "separable": [ds.StormerVerlet(), ds.SRKs2()],
 }
@@ -135,7 +135,7 @@ def gradients(solver, noise, saveat, dtype=jnp.float64, parts=slice(None), **opt
 @pytest.mark.parametrize(
     "case",
     [
-        (ds.Midpoint(), phase, diffrax.SaveAt(ts=SAVED), {}),
+        (ds.ImplicitMidpoint(), phase, diffrax.SaveAt(ts=SAVED), {}),
         (
             # Here, the first steps lie before the first saved time.
             *(ds.StormerVerlet(), kicks, diffrax.SaveAt(ts=SAVED[4::-1])),
@@ -231,7 +231,7 @@ def test_what_reversing_cannot_do_is_refused_with_advice():
     def solve(solver=None, path=None, functions=(H0, noise), **options):
         terms = ds.hamiltonian_terms(*functions, path or weak_path(1))
         return diffrax.diffeqsolve(
-            terms, solver or ds.Midpoint(), 0.0, 1.0, 0.1, y0, args, **options,
+            terms, solver or ds.ImplicitMidpoint(), 0.0, 1.0, 0.1, y0, args, **options,
             adjoint=ds.ReversingAdjoint(),
         )  # fmt: skip
 
@@ -259,7 +259,9 @@ def test_what_reversing_cannot_do_is_refused_with_advice():
         ds.ReversingAdjoint(checkpoints=0)
 
 
-@pytest.mark.parametrize("solver", [ds.Midpoint(), ds.StormerVerlet()], ids=repr)
+@pytest.mark.parametrize(
+    "solver", [ds.ImplicitMidpoint(), ds.StormerVerlet()], ids=repr
+)
 def test_backsolve_is_refused_with_advice(solver):
     # It takes steps of its own, which have other increments of a weak path, and its state
     # is no pair (p, q).

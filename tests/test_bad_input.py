@@ -14,7 +14,7 @@ from .problems import H0, noise, random_problem, weak_path
 
 
 def _solve(terms, y0, solver=None):
-    solver = ds.Midpoint() if solver is None else solver
+    solver = ds.ImplicitMidpoint() if solver is None else solver
     return diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0)
 
 
@@ -33,7 +33,7 @@ def test_state_that_is_not_a_pair_is_refused(y0):
     terms = ds.hamiltonian_terms(
         lambda t, p, q, args: jnp.sum(p), lambda t, p, q, args: q[:1], weak_path(1)
     )
-    for solver in (ds.Midpoint(), diffrax.Heun()):
+    for solver in (ds.ImplicitMidpoint(), diffrax.Heun()):
         with pytest.raises(ValueError, match=r"pass `y0=\(p0, q0\)`"):
             _solve(terms, y0, solver)
 
@@ -82,7 +82,7 @@ def test_a_matrix_of_noises_for_a_state_of_several_arrays_is_refused_with_advice
     with pytest.raises(ValueError, match="as a Lineax operator"):
         diffrax.diffeqsolve(
             diffrax.MultiTerm(drift, terms),
-            ds.Midpoint(),
+            ds.ImplicitMidpoint(),
             0.0,
             0.1,
             0.1,
@@ -95,7 +95,7 @@ def test_states_that_are_not_real_floats_are_refused():
     with pytest.raises(ValueError, match="real floating-point arrays; got.*complex"):
         _solve(terms, jnp.ones(2, complex))
     with pytest.raises(ValueError, match="real floating-point arrays; got.*int"):
-        ds.Midpoint().init(terms, 0.0, 0.1, jnp.ones(2, int), None)
+        ds.ImplicitMidpoint().init(terms, 0.0, 0.1, jnp.ones(2, int), None)
     with pytest.raises(ValueError, match="at least one array"):
         _solve(terms, ())
     # Diffrax itself turns an integer state into a floating-point one.
@@ -110,7 +110,7 @@ def test_mixed_dtypes_are_refused():
     f = jnp.float32
     y0 = jnp.ones(2, f)
     with pytest.raises(ValueError, match="the same dtype"):
-        diffrax.diffeqsolve(terms, ds.Midpoint(), f(0), f(0.2), f(0.1), y0)
+        diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), f(0), f(0.2), f(0.1), y0)
 
 
 def test_missing_levy_area_is_refused_by_diffrax_solvers():
@@ -128,15 +128,17 @@ def test_named_pairs_and_half_precision_are_refused():
     y0, args = random_problem(jr.key(0), 1, 1)
     terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
     with pytest.raises(ValueError, match=r"is a pair `\(p, q\)`"):
-        diffrax.diffeqsolve(terms, ds.Midpoint(), 0.0, 0.2, 0.1, Pair(*y0), args)
+        diffrax.diffeqsolve(
+            terms, ds.ImplicitMidpoint(), 0.0, 0.2, 0.1, Pair(*y0), args
+        )
     half = jax.tree.map(lambda x: x.astype(jnp.float16), y0)
     with pytest.raises(ValueError, match="float32 or float64"):
-        ds.Midpoint().init(terms, 0.0, 0.1, half, args)
+        ds.ImplicitMidpoint().init(terms, 0.0, 0.1, half, args)
 
 
 def test_implicit_tableaus_need_an_implicit_solver():
     class Mine(ds.AbstractSymplecticRungeKutta):
-        tableau = ds.Midpoint().tableau
+        tableau = ds.ImplicitMidpoint().tableau
 
         def order(self, terms):
             return 2

@@ -106,9 +106,9 @@ def test_steps_that_do_not_divide_the_interval_are_refused(dts):
         ("`dts` must be a list of step sizes; got 0.5", dict(dts=0.5)),
         ("`t1` must be after `t0`", dict(t1=-1.0)),
         (r"called as `make_terms\(path\)`", dict(make_terms="terms")),
-        ("`solvers` must be a list of solvers", dict(solvers=ds.Midpoint())),
-        (r"a solver, as `Midpoint\(\)`", dict(solvers=[ds.Midpoint])),
-        ("`reference` must be a solver", dict(reference="Midpoint")),
+        ("`solvers` must be a list of solvers", dict(solvers=ds.ImplicitMidpoint())),
+        (r"a solver, as `ImplicitMidpoint\(\)`", dict(solvers=[ds.ImplicitMidpoint])),
+        ("`reference` must be a solver", dict(reference="ImplicitMidpoint")),
         (
             r"called as `phi\(y\)`; got .* `\(t, y, args\)`",
             dict(phi=lambda t, y, args: y),

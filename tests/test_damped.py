@@ -25,7 +25,7 @@ _CASES = {
 }
 
 
-@pytest.mark.parametrize("inner", [ds.StormerVerlet(), ds.Midpoint()], ids=repr)
+@pytest.mark.parametrize("inner", [ds.StormerVerlet(), ds.ImplicitMidpoint()], ids=repr)
 def test_step_is_conformally_symplectic(inner):
     gamma, h = 0.7, 0.2
     terms = ds.hamiltonian_terms(_oscillator, _force, Given(jnp.array([0.3])))
@@ -74,7 +74,7 @@ def test_momentum_alone_decays_exactly_forward_and_backward():
     free = lambda t, p, q, args: 0 * jnp.sum(p * q)
     term = ds.hamiltonian_terms(free, _force, Given(jnp.zeros(1))).terms[0]
     y0 = jnp.array([1.0, 2.0]), jnp.zeros(2)
-    solver = ds.Damped(ds.Midpoint(), jnp.array([0.5, 0.0]))
+    solver = ds.Damped(ds.ImplicitMidpoint(), jnp.array([0.5, 0.0]))
     for end in (1.0, -1.0):
         sol = diffrax.diffeqsolve(term, solver, 0.0, end, end / 4, y0)
         expected = y0[0] * np.exp(-np.array([0.5, 0.0]) * end)
@@ -84,7 +84,7 @@ def test_momentum_alone_decays_exactly_forward_and_backward():
 @pytest.mark.parametrize("gamma", [-1.0, np.nan, np.inf, 1j, "much"])
 def test_friction_must_be_finite_and_not_negative(gamma):
     with pytest.raises(ValueError, match="`gamma` must be"):
-        ds.Damped(ds.Midpoint(), gamma)
+        ds.Damped(ds.ImplicitMidpoint(), gamma)
 
 
 def test_misfits_are_refused_with_advice():
@@ -92,10 +92,12 @@ def test_misfits_are_refused_with_advice():
     y0 = jnp.ones(2), jnp.ones(2)
     for gamma, match in ((jnp.ones(3), "shape of its momenta"), ([1.0], "structure")):
         with pytest.raises(ValueError, match=match):
-            ds.Damped(ds.Midpoint(), gamma).init(terms, 0.0, 0.1, y0, None)
+            ds.Damped(ds.ImplicitMidpoint(), gamma).init(terms, 0.0, 0.1, y0, None)
     with pytest.raises(ValueError, match="wraps a solver of this package"):
         ds.Damped(diffrax.Heun(), 1.0)
-    assert isinstance(ds.Damped(ds.Midpoint(), 1.0), diffrax.AbstractImplicitSolver)
+    assert isinstance(
+        ds.Damped(ds.ImplicitMidpoint(), 1.0), diffrax.AbstractImplicitSolver
+    )
     explicit = ds.Damped(ds.StormerVerlet(), 1.0)
     assert not isinstance(explicit, diffrax.AbstractImplicitSolver)
 

@@ -106,9 +106,9 @@ def _square(solver, steps=10):
 
 
 def test_the_estimate_of_a_solve_is_its_exact_expectation():
-    # Midpoint turns by 2 atan((h + I) / 2): the moments of the method in closed form.
+    # A step turns by 2 atan((h + I) / 2): the moments of the method in closed form.
     n, h = 10, 0.1
-    phi = _square(ds.Midpoint(), n)
+    phi = _square(ds.ImplicitMidpoint(), n)
     got = ds.expectation(phi, jr.key(0), 20_000)
     increments = np.sqrt(3 * h) * np.array([-1, 0, 1])
     twice = 4 * np.arctan((h + increments) / 2)
@@ -197,7 +197,7 @@ import jax.random as jr
 import diffrax_symplectic as ds
 from tests.test_expectation import _square
 assert len(jax.devices()) == int(sys.argv[1]) * (2 if len(sys.argv) > 2 else 1)
-e = ds.expectation(_square(ds.Midpoint()), jr.key(0), 3001, batch_size=100)
+e = ds.expectation(_square(ds.ImplicitMidpoint()), jr.key(0), 3001, batch_size=100)
 print(repr(float(e.mean)), repr(float(e.std_error)), e.num_paths)
 """
 
@@ -221,7 +221,7 @@ def test_the_paths_are_the_same_on_any_devices_and_hosts():
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{s.getsockname()[1]}"
-    here = ds.expectation(_square(ds.Midpoint()), jr.key(0), 3001)
+    here = ds.expectation(_square(ds.ImplicitMidpoint()), jr.key(0), 3001)
     expected = [here.mean, here.std_error, here.num_paths]
     # Three devices of one process; then two processes with two devices each.
     np.testing.assert_allclose(_read(_start(PROGRAM, 3)), expected, rtol=1e-12)
@@ -234,7 +234,9 @@ def test_results_within_phi_are_refused():
     def fn(key):
         terms = kubo_terms(ds.WeakBrownianPath((), key))
         y0 = (jnp.array(0.0), jnp.array(1.0))
-        sol = diffrax.diffeqsolve(terms, ds.Midpoint(), 0.0, 0.2, 0.1, y0, throw=False)
+        sol = diffrax.diffeqsolve(
+            terms, ds.ImplicitMidpoint(), 0.0, 0.2, 0.1, y0, throw=False
+        )
         return sol.ys[0][-1], sol.ys[1][-1], sol.result
 
     with pytest.raises(ValueError, match=r"Return a pair `\(phi, sol.result\)`"):
@@ -258,7 +260,7 @@ def test_paths_that_an_event_ends_are_no_failures():
         y0 = (jnp.array(0.0), jnp.array(1.0))
         event = diffrax.Event(lambda t, y, args, **kwargs: y[1] < 0)
         sol = diffrax.diffeqsolve(
-            terms, ds.Midpoint(), 0.0, 2.0, 0.1, y0, event=event, throw=False
+            terms, ds.ImplicitMidpoint(), 0.0, 2.0, 0.1, y0, event=event, throw=False
         )
         return sol.ts[-1], sol.result
 

@@ -94,7 +94,7 @@ def _phi(key, level):
     path = ds.FixedStepBrownianPath((), key, cell=H / 2)
     y0 = (jnp.array(0.0), jnp.array(1.0))
     sol = diffrax.diffeqsolve(
-        kubo_terms(path), ds.Midpoint(), 0.0, 1.0, H / 2**level, y0, throw=False
+        kubo_terms(path), ds.ImplicitMidpoint(), 0.0, 1.0, H / 2**level, y0, throw=False
     )
     return sol.ys[1][-1] ** 2, sol.result
 

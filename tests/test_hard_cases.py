@@ -26,7 +26,7 @@ from .problems import FineSample, slope
 
 def test_two_bodies_keep_their_angular_momentum_and_gain_energy_as_they_should():
     s, per_orbit = 0.03, 400
-    r = two_body.orbits(*two_body.SOLVERS["Midpoint"], per_orbit, 4, s, 64)
+    r = two_body.orbits(*two_body.SOLVERS["ImplicitMidpoint"], per_orbit, 4, s, 64)
     assert r.failed_share == 0
     assert r.momentum_error <= 5e-14
     balance = r.balance(two_body.PERIOD / per_orbit, s)
@@ -47,7 +47,7 @@ def test_two_body_steps_fail_exactly_where_they_have_no_solution():
         h = jnp.exp(jr.uniform(k_h, (), minval=jnp.log(0.02), maxval=jnp.log(0.5)))
         # Without noise: the path is not used.
         drift = two_body.make_terms(diffrax.UnsafeBrownianPath((), key)).terms[0]
-        *_, result = ds.Midpoint().step(drift, 0.0, h, (p, q), 0.0, None, False)
+        *_, result = ds.ImplicitMidpoint().step(drift, 0.0, h, (p, q), 0.0, None, False)
         solved = result == diffrax.RESULTS.successful
         return solved, two_body.midpoint_solvable(p, q, h)
 
@@ -67,14 +67,16 @@ def test_two_body_steps_fail_exactly_where_they_have_no_solution():
 def test_two_bodies_with_too_large_steps_fail_loudly():
     # At 12 steps for an orbit the pericentre is not resolved. A step either is reported or
     # keeps the angular momentum.
-    r = two_body.orbits(*two_body.SOLVERS["Midpoint"], 12, 5, 0.01, 32)
+    r = two_body.orbits(*two_body.SOLVERS["ImplicitMidpoint"], 12, 5, 0.01, 32)
     assert r.failed_share > 0
     if r.failed_share < 1:
         assert r.momentum_error <= 1e-12
 
 
 def test_escape_from_a_double_well_costs_the_energy_that_noise_brings():
-    e = double_well.escape(*double_well.SOLVERS["Midpoint"], 0.2, 0.1, 10.0, 10_000)
+    e = double_well.escape(
+        *double_well.SOLVERS["ImplicitMidpoint"], 0.2, 0.1, 10.0, 10_000
+    )
     assert e.failed == 0
     assert 0.2 < e.escaped.value < 0.8
     assert abs(e.balance.sigmas) <= 4
@@ -117,7 +119,7 @@ def test_double_well_with_friction_has_nearly_the_moments_of_gibbs():
 
 def test_harmonic_chain_in_64_unknowns_is_heated_as_in_closed_form():
     hs = (0.1, 1.0)
-    r = chain.heating(ds.Midpoint(), hs)
+    r = chain.heating(ds.ImplicitMidpoint(), hs)
     assert np.max(r.energy_defect) <= 1e-13
     np.testing.assert_allclose(
         r.rate, list(map(chain.midpoint_heating, hs)), rtol=1e-12
@@ -126,15 +128,15 @@ def test_harmonic_chain_in_64_unknowns_is_heated_as_in_closed_form():
 
 def test_nonlinear_chain_of_32_has_the_exact_mean_energy_and_symplectic_steps():
     args = chain.Args(beta=1.0, s=0.2)
-    r = chain.nonlinear(*chain.SOLVERS["Midpoint"], 0.05, 2.0, 64, args)
+    r = chain.nonlinear(*chain.SOLVERS["ImplicitMidpoint"], 0.05, 2.0, 64, args)
     assert r.failed == 0
     assert abs(r.excess.sigmas) <= 4
-    assert np.max(chain.symplecticity(ds.Midpoint(), (0.1, 0.4), args)) <= 1e-13
+    assert np.max(chain.symplecticity(ds.ImplicitMidpoint(), (0.1, 0.4), args)) <= 1e-13
 
 
 def test_henon_heiles_orbits_leave_for_the_energy_of_the_noise_only():
     ours = henon_heiles.stay(
-        *henon_heiles.SOLVERS["Midpoint"], 0.003, 0.2, 100.0, paths=512
+        *henon_heiles.SOLVERS["ImplicitMidpoint"], 0.003, 0.2, 100.0, paths=512
     )
     heun = henon_heiles.stay(
         *henon_heiles.SOLVERS["Heun"], 0.003, 0.2, 100.0, paths=512
@@ -152,7 +154,7 @@ def test_henon_heiles_converges_to_itself():
         terms = henon_heiles.make_terms(FineSample.draw(key, fine, 2))
         solve = lambda h: jnp.concatenate(
             diffrax.diffeqsolve(
-                terms, ds.Midpoint(), 0.0, 1.0, h, henon_heiles.start(), 0.3
+                terms, ds.ImplicitMidpoint(), 0.0, 1.0, h, henon_heiles.start(), 0.3
             ).ys,
             axis=1,
         )[0]
@@ -189,7 +191,7 @@ def test_ring_of_spins_with_noise_decays_as_in_closed_form():
 def test_schroedinger_lattice_keeps_its_norm_and_gains_the_energy_of_the_noise():
     ours, heun = (
         nls.lattice(nls.SOLVERS[name], 0.02, 1.0, 8, 0.1, n=128)
-        for name in ("Midpoint", "Heun")
+        for name in ("ImplicitMidpoint", "Heun")
     )
     assert ours.failed == heun.failed == 0
     assert ours.norm_error <= 1e-13

@@ -17,7 +17,7 @@ from .problems import kubo_terms
 # The excess of E(x^2 + y^2) over s^2 h that one step adds for h = 0.2 and s = 1, as far as
 # it is known in the literature or in closed form.
 EXCESS = [
-    (ds.Midpoint(), -0.00198020),
+    (ds.ImplicitMidpoint(), -0.00198020),
     (ds.SRKs1(a=0.25), -0.00099626),
     (ds.SRKs1(a=0.4), None),
     (ds.SRKs2(), -0.00198020),
@@ -134,7 +134,7 @@ def test_moments_of_a_multiplicative_noise_agree_with_the_closed_form():
     # A midpoint step of the Kubo oscillator turns the plane by 2 atan((h + s I) / 2).
     h, s = 0.1, 0.7
     terms = kubo_terms(ds.WeakBrownianPath((), jr.key(0)), s)
-    K = ds.second_moment_map(terms, ds.Midpoint(), 0.0, h, Y0)
+    K = ds.second_moment_map(terms, ds.ImplicitMidpoint(), 0.0, h, Y0)
     increments = np.sqrt(3 * h) * np.array([-1, 0, 1])
     twice = 4 * np.arctan((h + s * increments) / 2)
     z0 = np.array([1.0, *Y0])
@@ -170,7 +170,9 @@ def test_quadrature_over_gaussian_increments_is_exact_for_polynomials():
 
 def test_moments_work_under_jit_and_vmap():
     path = ds.WeakBrownianPath((), jr.key(0))
-    maps = lambda h: ds.second_moment_map(kubo_terms(path), ds.Midpoint(), 0.0, h, Y0)
+    maps = lambda h: ds.second_moment_map(
+        kubo_terms(path), ds.ImplicitMidpoint(), 0.0, h, Y0
+    )
     hs = jnp.array([0.1, 0.2])
     together = jax.jit(jax.vmap(maps))(hs)
     np.testing.assert_allclose(together[1], maps(hs[1]), atol=1e-13)

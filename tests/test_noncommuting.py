@@ -214,8 +214,8 @@ def test_levy_area_midpoint_is_one_step_of_the_hamiltonian_with_brackets():
     terms = ds.hamiltonian_terms(H0, noise, Given(W, A=A))
     got = ds.LevyAreaMidpoint().step(terms, t0, t0 + h, y0, args, None, False)[0]
     unit = ds.hamiltonian_terms(total, noise, Given(jnp.zeros(3)))
-    expected = ds.Midpoint().step(unit, 0.0, 1.0, y0, args, None, False)[0]
-    without = ds.Midpoint().step(terms, t0, t0 + h, y0, args, None, False)[0]
+    expected = ds.ImplicitMidpoint().step(unit, 0.0, 1.0, y0, args, None, False)[0]
+    without = ds.ImplicitMidpoint().step(terms, t0, t0 + h, y0, args, None, False)[0]
     np.testing.assert_allclose(got, expected, atol=1e-14)
     assert np.abs(np.subtract(without, expected)).max() > 1e-4
 
@@ -238,7 +238,7 @@ def test_levy_area_midpoint_is_strong_order_one_where_the_midpoint_rule_is_not()
         exact = solve(1 / fine, ds.LevyAreaMidpoint())
         return [
             jax.lax.map(lambda h: solve(h, solver) - exact, jnp.asarray(steps))
-            for solver in (ds.LevyAreaMidpoint(), ds.Midpoint())
+            for solver in (ds.LevyAreaMidpoint(), ds.ImplicitMidpoint())
         ]
 
     with_areas, without = [

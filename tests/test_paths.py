@@ -210,7 +210,7 @@ def _paths():
 
 
 @pytest.mark.parametrize("path", _paths(), ids=["weak", "truncated"])
-@pytest.mark.parametrize("solver", [ds.Midpoint(), diffrax.Heun()], ids=repr)
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), diffrax.Heun()], ids=repr)
 def test_fixed_increments_refuse_adaptive_steps(path, solver):
     terms, y0 = kubo_terms(path), (jnp.array(0.0), jnp.array(1.0))
     solve = lambda solver, **kwargs: diffrax.diffeqsolve(

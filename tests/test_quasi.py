@@ -32,7 +32,7 @@ def _midpoint_moment(n: int, h: float) -> float:
     return (1 + (np.exp(1j * twice) @ np.array([1, 4, 1]) / 6) ** n).real / 2
 
 
-MIDPOINT = ds.Midpoint()
+MIDPOINT = ds.ImplicitMidpoint()
 
 
 def _estimate(solver=MIDPOINT, terms=None, phi=SQUARE, **kwargs):

@@ -37,7 +37,7 @@ def test_steps_of_stiff_networks_are_solved(d, most):
         W1, W2 = jr.normal(a, (4, d)), 2 * jr.normal(b, (d, 4))
         y0 = jr.normal(c, (d,))
         term = diffrax.ODETerm(lambda t, y, args: W2 @ jnp.tanh(W1 @ y))
-        y1, success = _one_step(ds.Midpoint(), term, 1.0, y0)
+        y1, success = _one_step(ds.ImplicitMidpoint(), term, 1.0, y0)
         return success, y1 - y0 - W2 @ jnp.tanh(W1 @ (y0 + y1) / 2)
 
     success, error = jax.jit(jax.vmap(residual))(jr.split(jr.key(0), 400))
@@ -53,7 +53,7 @@ def test_iterations_of_newton_end_when_they_should(n):
     @eqx.filter_jit
     def success(factor, most):
         finder = ds.PicardNewton(direct=0)
-        solver = ds.Midpoint(root_finder=finder, root_find_max_steps=most)
+        solver = ds.ImplicitMidpoint(root_finder=finder, root_find_max_steps=most)
         term = diffrax.ODETerm(
             lambda t, y, args: (-factor * rate * y[1], factor * rate * y[0])
         )
@@ -71,7 +71,9 @@ def test_a_step_is_solved_though_some_iterates_have_no_values(n):
     # Newton's method for the whole step comes to roots of negative numbers.
     term = diffrax.ODETerm(lambda t, y, args: -5 * jnp.sqrt(y))
     y0 = 1 + 0.01 * jnp.arange(n)
-    y1, success = jax.jit(lambda y0: _one_step(ds.Midpoint(), term, 1.0, y0))(y0)
+    y1, success = jax.jit(lambda y0: _one_step(ds.ImplicitMidpoint(), term, 1.0, y0))(
+        y0
+    )
     assert success
     np.testing.assert_allclose(y1, y0 - 5 * jnp.sqrt((y0 + y1) / 2), atol=1e-14)
 
@@ -84,7 +86,11 @@ def test_many_unknowns_are_solved_without_a_matrix():
     term = diffrax.ODETerm(lambda t, y, args: (-laplacian(y[1]), laplacian(y[0])))
     x = jnp.arange(1, n + 1) / (n + 1) * jnp.pi
     y0 = jnp.sin(x), jnp.sin(2 * x) + 0.1 * jnp.sin(50 * x)
-    step = jax.jit(lambda y0: _one_step(ds.Midpoint(), term, h, y0)).lower(y0).compile()
+    step = (
+        jax.jit(lambda y0: _one_step(ds.ImplicitMidpoint(), term, h, y0))
+        .lower(y0)
+        .compile()
+    )
     # Twenty-five vectors of all unknowns; one dense matrix has 200.
     memory: Any = step.memory_analysis()
     assert memory.temp_size_in_bytes <= 25 * 2 * n * 8
@@ -92,7 +98,7 @@ def test_many_unknowns_are_solved_without_a_matrix():
     assert success
     norm = lambda y: jnp.sum(y[0] ** 2 + y[1] ** 2)
     assert abs(norm(y1) / norm(y0) - 1) <= 1e-13
-    dense = ds.Midpoint(root_finder=ds.PicardNewton(linear_solver=ds.SmallLU()))
+    dense = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(linear_solver=ds.SmallLU()))
     exact, success = jax.jit(lambda y0: _one_step(dense, term, h, y0))(y0)
     assert success
     np.testing.assert_allclose(y1, exact, atol=1e-13)
@@ -110,7 +116,15 @@ def _end(strength, q0, adjoint=REVERSE):
     )
     y0 = (jnp.array(0.1), q0)
     sol = diffrax.diffeqsolve(
-        terms, ds.Midpoint(), 0, 1, 0.1, y0, strength, adjoint=adjoint, throw=False
+        terms,
+        ds.ImplicitMidpoint(),
+        0,
+        1,
+        0.1,
+        y0,
+        strength,
+        adjoint=adjoint,
+        throw=False,
     )
     ys: Any = sol.ys
     success = sol.result == diffrax.RESULTS.successful
@@ -141,7 +155,7 @@ def test_gradients_survive_a_path_that_fails():
 def test_the_derivative_of_a_failed_step_is_zero():
     def step(f, y0, **options):
         term = diffrax.ODETerm(lambda t, y, args: f(y))
-        y1, success = _one_step(ds.Midpoint(**options), term, 1.0, y0)
+        y1, success = _one_step(ds.ImplicitMidpoint(**options), term, 1.0, y0)
         return y1, (y1, success)
 
     slope = lambda f, y0: jax.jit(jax.jacfwd(ft.partial(step, f), has_aux=True))(y0)
@@ -177,7 +191,7 @@ def test_a_failure_anywhere_in_a_step_is_reported(first):
 def test_a_failure_is_reported_for_any_root_finder():
     # There is no solution.
     term = diffrax.ODETerm(lambda t, y, args: 1 + y**2)
-    solver = ds.Midpoint(root_finder=optx.Newton(rtol=1e-9, atol=1e-9))
+    solver = ds.ImplicitMidpoint(root_finder=optx.Newton(rtol=1e-9, atol=1e-9))
     y1, success = _one_step(solver, term, 1.0, jnp.array(0.5))
     assert jnp.isfinite(y1) and not success
 
@@ -187,13 +201,15 @@ def test_the_best_iterate_is_not_taken_for_a_solution():
     finder = optx.BestSoFarRootFinder(ds.PicardNewton())
     term = diffrax.ODETerm(lambda t, y, args: jnp.sin(y))
     with pytest.raises(ValueError, match="Pass the root finder within it"):
-        _one_step(ds.Midpoint(root_finder=finder), term, 0.1, jnp.array(0.5))
+        _one_step(ds.ImplicitMidpoint(root_finder=finder), term, 0.1, jnp.array(0.5))
 
 
 def test_an_overflow_in_any_part_of_the_state_is_reported():
     grow = lambda t, y, args: jax.tree.map(lambda x: 0 * x + 1e308, y)
     y0 = jnp.array([1.2e308, 0.0, 0.0]), jnp.array([0.0, 1.2e308, 0.0])
-    step = lambda y0: _one_step(ds.Midpoint(), diffrax.ODETerm(grow), 1.0, y0)[1]
+    step = lambda y0: _one_step(ds.ImplicitMidpoint(), diffrax.ODETerm(grow), 1.0, y0)[
+        1
+    ]
     assert jax.jit(jax.vmap(step))(y0).tolist() == [False, False, True]
 
 
@@ -203,8 +219,10 @@ def test_increments_are_solved_to_the_accuracy_of_the_state():
     term = diffrax.ODETerm(lambda t, y, args: jnp.sin(1e3 * y))
     y0 = 1e8 + jnp.arange(6.0)
     for solver in (
-        ds.Midpoint(root_find_max_steps=0),
-        ds.Midpoint(root_finder=ds.PicardNewton(direct=6), root_find_max_steps=0),
+        ds.ImplicitMidpoint(root_find_max_steps=0),
+        ds.ImplicitMidpoint(
+            root_finder=ds.PicardNewton(direct=6), root_find_max_steps=0
+        ),
     ):
         y1, success = jax.jit(lambda y0: _one_step(solver, term, 1e-4, y0))(y0)
         assert success
@@ -213,7 +231,7 @@ def test_increments_are_solved_to_the_accuracy_of_the_state():
 def test_paths_that_need_more_rounds_do_not_change_their_neighbours():
     # Iterations of a batch go on for as long as any path needs them. With this tolerance
     # those of the first path, which has had enough, would still change it.
-    solver = ds.Midpoint(root_finder=ds.PicardNewton(rtol=1e-4))
+    solver = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(rtol=1e-4))
 
     def step(frequency):
         H0 = lambda t, p, q, args: frequency * jnp.sum(p**2 + q**2 + q**4) / 2
@@ -251,7 +269,7 @@ def test_only_pending_paths_of_a_batch_are_served():
         np.testing.assert_array_equal(got, (1 + every) * x[0])
 
 
-@pytest.mark.parametrize("solver", [ds.Midpoint(), ds.StrangGauss()], ids=type)
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.StrangGauss()], ids=type)
 @pytest.mark.parametrize("d", [4, 32])
 def test_steps_of_many_unknowns_are_symplectic(solver, d):
     def potential(t, p, q, args):
@@ -298,7 +316,9 @@ def test_linear_solvers_of_the_user_solve_for_steps_and_their_derivatives():
 
     def factorizations(finder):
         """How often the programs of a step and of its derivative factorize a matrix."""
-        step = lambda y: _one_step(ds.Midpoint(root_finder=finder), term, 0.1, y)[0]
+        step = lambda y: _one_step(
+            ds.ImplicitMidpoint(root_finder=finder), term, 0.1, y
+        )[0]
         programs = step, jax.jacrev(step)
         return [
             len(re.findall(r"= lu\b", _program(fn, jnp.ones(6)))) for fn in programs

@@ -20,7 +20,7 @@ def test_stiff_steps_are_solved_where_fixed_points_diverge(frequency, direct):
     # A midpoint step of a rotation: the fixed-point map has slope `frequency / 2`.
     turn = frequency * jnp.array([[0.0, 1.0], [-1.0, 0.0]])
     y0 = jnp.array([0.6, 0.8])
-    solver = ds.Midpoint(root_finder=ds.PicardNewton(direct=direct))
+    solver = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(direct=direct))
     term = diffrax.ODETerm(lambda t, y, args: turn @ y)
     y1, *_, result = solver.step(term, 0.0, 1.0, y0, None, None, False)
     assert result == diffrax.RESULTS.successful

@@ -207,7 +207,7 @@ def test_variants_d_e_f_are_a_b_c_at_negated_increments(pair):
 
 def test_srks2_is_the_midpoint_rule():
     W = jnp.array([0.4, -0.3])
-    for a, b in zip(_step(ds.SRKs2(), W), _step(ds.Midpoint(), W)):
+    for a, b in zip(_step(ds.SRKs2(), W), _step(ds.ImplicitMidpoint(), W)):
         np.testing.assert_allclose(a, b, atol=1e-15)
 
 
@@ -217,7 +217,7 @@ def test_srkw3_c_is_a_kick_and_a_midpoint_step():
     terms = ds.hamiltonian_terms(H0, noise, Given(W))
     drift, diffusion = terms.terms
     kicked = y0[0] + diffusion.vf_prod(0.0, y0, args, W)[0], y0[1]
-    y1, *_ = ds.Midpoint().step(drift, 0.0, 0.1, kicked, args, None, False)
+    y1, *_ = ds.ImplicitMidpoint().step(drift, 0.0, 0.1, kicked, args, None, False)
     for a, b in zip(_step(ds.SRKw3("c"), W), y1):
         np.testing.assert_allclose(a, b, atol=1e-15)
 
@@ -255,7 +255,9 @@ def test_unused_halves_of_gradients_are_not_computed():
     assert count(half(0), "tanh") == 0 and count(half(0), "exponential") > 0
     assert count(half(1), "tanh") > 0 and count(half(1), "exponential") == 0
     # A kick is evaluated once a step, the noise of the midpoint rule in each iteration.
-    assert count(step(ds.SRKw3("c")), "cosine") < count(step(ds.Midpoint()), "cosine")
+    assert count(step(ds.SRKw3("c")), "cosine") < count(
+        step(ds.ImplicitMidpoint()), "cosine"
+    )
     assert count(step(ds.SRKs3()), "cosine") < count(step(ds.SRKs2()), "cosine")
 
 

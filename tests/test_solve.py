@@ -53,13 +53,13 @@ def _strong_slope(solver, m, steps, reference, samples=200):
     return slope(np.array(steps), np.sqrt(jnp.mean(squared, axis=0)))
 
 
-@pytest.mark.parametrize("solver", [ds.Midpoint(), ds.SRKs1()], ids=repr)
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.SRKs1()], ids=repr)
 def test_strong_order_is_one_for_one_noise(solver):
     steps = [2.0**-k for k in (4, 5, 6, 7)]
     assert abs(_strong_slope(solver, 1, steps, reference=11) - 1) <= 0.1
 
 
-@pytest.mark.parametrize("solver", [ds.Midpoint(), ds.SRKs1()], ids=repr)
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.SRKs1()], ids=repr)
 def test_strong_order_is_half_for_two_noises_that_do_not_commute(solver):
     steps = [2.0**-k for k in (4, 5, 6, 7)]
     # Clearly below 1 too: otherwise the noises of this test would commute.
@@ -103,10 +103,13 @@ _CUT = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((2,), jr.key(3)), k=1)
 @pytest.mark.parametrize(
     "name, path",
     [
-        *[(name, weak_path(2)) for name in ("Midpoint", "SRKs1", "SRKw1", "SRKw2")],
+        *[
+            (name, weak_path(2))
+            for name in ("ImplicitMidpoint", "SRKs1", "SRKw1", "SRKw2")
+        ],
         ("SRKs1", _CUT),
     ],
-    ids=["Midpoint", "SRKs1", "SRKw1", "SRKw2", "SRKs1-cut"],
+    ids=["ImplicitMidpoint", "SRKs1", "SRKw1", "SRKw2", "SRKs1-cut"],
 )
 def test_gradients_equal_central_differences(name, path):
     solver = GENERAL[name]
@@ -147,7 +150,15 @@ def test_adjoints_agree():
     terms = ds.hamiltonian_terms(H0, noise, weak_path(2))
     solve = lambda y0, adjoint: jnp.sum(
         diffrax.diffeqsolve(
-            terms, ds.Midpoint(), 0.0, 0.5, 0.1, y0, args, adjoint=adjoint, max_steps=8
+            terms,
+            ds.ImplicitMidpoint(),
+            0.0,
+            0.5,
+            0.1,
+            y0,
+            args,
+            adjoint=adjoint,
+            max_steps=8,
         ).ys[0]
     )
 
@@ -205,7 +216,7 @@ def test_unsolvable_stages_are_reported():
     path = ds.WeakBrownianPath((), jr.key(0))
     y0 = (jnp.array(0.1), jnp.array(10.0))
     solve = lambda **kwargs: diffrax.diffeqsolve(
-        _explosive(path), ds.Midpoint(), 0.0, 1.0, 0.1, y0, **kwargs
+        _explosive(path), ds.ImplicitMidpoint(), 0.0, 1.0, 0.1, y0, **kwargs
     )
     with pytest.raises(Exception, match="nonlinear solver"):
         jax.block_until_ready(solve())
@@ -219,7 +230,7 @@ def test_failed_paths_do_not_spoil_their_neighbours(dtype):
         y0 = (dtype(0.1), q)
         return diffrax.diffeqsolve(
             _explosive(path),
-            ds.Midpoint(),
+            ds.ImplicitMidpoint(),
             dtype(0),
             dtype(1),
             dtype(0.1),
@@ -255,7 +266,7 @@ def test_non_finite_hamiltonians_are_reported(solver):
     args = jnp.array([[jnp.nan, 3.0], [1.0, 0.5], [1.0, 3.0]])
     success = jax.jit(jax.vmap(solve))(args).result == diffrax.RESULTS.successful
     np.testing.assert_array_equal(success, [False, False, True])
-    if isinstance(solver, ds.Midpoint):
+    if isinstance(solver, ds.ImplicitMidpoint):
         with pytest.raises(Exception, match=r"(?i)non-?finite|nonlinear solver"):
             jax.block_until_ready(solve(args[1], throw=True))
 
@@ -268,7 +279,7 @@ H = lambda t, p, q, args: (p**2 + q**2) / 2
 y0 = (jnp.array(0.0), jnp.array(1.0))
 fixed = ds.FixedStepBrownianPath((), jr.key(0))
 weak, cut = ds.WeakBrownianPath((), jr.key(0)), ds.TruncatedBrownianPath(fixed)
-for solver, path in ((ds.Midpoint(), cut), (ds.SRKw2(), weak)):
+for solver, path in ((ds.ImplicitMidpoint(), cut), (ds.SRKw2(), weak)):
     terms = ds.hamiltonian_terms(H, H, path)
     def momentum(y0):
         ys = diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.01, y0).ys

@@ -100,7 +100,7 @@ SOLVERS = GENERAL | {
 @pytest.mark.parametrize(
     "name, dtype, bound",
     [(name, jnp.float64, 1e-13) for name in SOLVERS]
-    + [(name, jnp.float32, 5e-6) for name in ("Midpoint", "LevyAreaMidpoint")],
+    + [(name, jnp.float32, 5e-6) for name in ("ImplicitMidpoint", "LevyAreaMidpoint")],
 )
 def test_step_is_a_poisson_map_for_a_thousand_random_systems(name, dtype, bound):
     def defect(key):
@@ -120,7 +120,7 @@ def test_step_is_a_poisson_map_for_a_thousand_random_systems(name, dtype, bound)
     assert jnp.max(defects) <= bound
 
 
-@pytest.mark.parametrize("solver", [ds.Midpoint(), diffrax.Heun()])
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), diffrax.Heun()])
 def test_poisson_defect_sees_a_method_for_the_spins_themselves(solver):
     # The midpoint rule keeps |s| there, but not the bracket.
     s0 = jnp.array([0.6, 0.0, 0.8])
@@ -136,7 +136,7 @@ def test_one_step_in_a_constant_field_is_the_rotation_of_the_cayley_map():
     field = lambda t, s, args: B @ s
     terms = ds.spin_terms(lambda t, s, args: 0.0, field, Given(jnp.array([h])))
     y0 = ds.to_spinors(s0)
-    y1, *_ = ds.Midpoint().step(terms, 0.0, h, y0, None, None, False)
+    y1, *_ = ds.ImplicitMidpoint().step(terms, 0.0, h, y0, None, None, False)
     length = jnp.linalg.norm(B)
     axis, angle = -B / length, 4 * jnp.arctan(h * length / 4)
     expected = (
@@ -186,7 +186,9 @@ def _end(y0, args):
     path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((4, 3), dtype), jr.key(0))
     terms = ds.spin_terms(H0, lambda t, s, args: args * s, path)
     times = jnp.array([0, 1, 0.125], dtype)
-    sol = diffrax.diffeqsolve(terms, ds.Midpoint(), *times, y0, args, throw=False)
+    sol = diffrax.diffeqsolve(
+        terms, ds.ImplicitMidpoint(), *times, y0, args, throw=False
+    )
     return ds.from_spinors(sol.ys)[0], sol.result == diffrax.RESULTS.successful
 
 
@@ -251,13 +253,15 @@ def test_what_are_no_spins_is_refused():
             ds.from_spinors(wrong)
     terms = ds.spin_terms(H0, noise, weak_path(3))
     args = _problem(jr.key(0), 5, 3)[1]
-    step = lambda y0: diffrax.diffeqsolve(terms, ds.Midpoint(), 0, 1, 0.1, y0, args)
+    step = lambda y0: diffrax.diffeqsolve(
+        terms, ds.ImplicitMidpoint(), 0, 1, 0.1, y0, args
+    )
     with pytest.raises(ValueError, match=r"for spins `y0=to_spinors\(s0\)`"):
         step(s)
     with pytest.raises(ValueError, match=r"pass `y0=to_spinors\(s0\)`"):
         step((s, s))
     with pytest.raises(ValueError, match="real array `s`"):
-        ds.poisson_defect(terms, ds.Midpoint(), 0.0, 0.1, jnp.ones(4))
+        ds.poisson_defect(terms, ds.ImplicitMidpoint(), 0.0, 0.1, jnp.ones(4))
 
 
 def test_spins_of_length_zero_are_refused_traced_or_not():

@@ -48,7 +48,7 @@ def test_explicit_methods_grow_as_in_closed_form(name, on_linear, on_kubo):
     assert np.log(factors["spring"][2, 0]) / HS[2] > 3 * exact[0]
 
 
-@pytest.mark.parametrize("name", ["Midpoint", "SRKs3"])
+@pytest.mark.parametrize("name", ["ImplicitMidpoint", "SRKs3"])
 def test_symplectic_methods_do_not_grow(name):
     factors = _factors(name)
     for model in {"linear", "kubo"} & factors.keys():
@@ -99,7 +99,11 @@ SOLVE_HS, SOLVE_STRENGTHS, SOLVE_STEPS = (
 @pytest.mark.parametrize("name", solvability.MODELS)
 def test_steps_fail_where_they_have_no_solution(name):
     r = solvability.shares(
-        solvability.MODELS[name], ds.Midpoint(), SOLVE_HS, SOLVE_STRENGTHS, SOLVE_STEPS
+        solvability.MODELS[name],
+        ds.ImplicitMidpoint(),
+        SOLVE_HS,
+        SOLVE_STRENGTHS,
+        SOLVE_STEPS,
     )
     assert not np.any(r.impossible)
     # Moderate steps: nothing is given up, and bounded increments never fail.
@@ -157,7 +161,9 @@ def test_a_singular_linear_step_is_reported():
             lambda t, p, q, args: 0 * p, lambda t, p, q, args: p * q, Given(W)
         )
         y0 = (jnp.array(1.0), jnp.array(1.0))
-        y1, *_, result = ds.Midpoint().step(terms, 0.0, 0.1, y0, None, None, False)
+        y1, *_, result = ds.ImplicitMidpoint().step(
+            terms, 0.0, 0.1, y0, None, None, False
+        )
         return y1, result == diffrax.RESULTS.successful
 
     W = np.array([-1.0, 1.0, 1.9, 2.0, 2.1])
@@ -170,7 +176,7 @@ def test_a_singular_linear_step_is_reported():
 
 @pytest.mark.parametrize(
     "name, limit",
-    [("StormerVerlet", 2), ("PlateauVerlet", 4), ("Midpoint", None)],
+    [("StormerVerlet", 2), ("PlateauVerlet", 4), ("ImplicitMidpoint", None)],
 )
 def test_explicit_steps_are_stable_up_to_their_limit_and_implicit_ones_always(
     name, limit
@@ -192,7 +198,7 @@ def test_explicit_methods_that_are_not_symplectic_have_no_stable_step():
 
 def test_nonlinear_energies_are_kept_up_to_the_linear_limit():
     hs = np.array([0.5, 1.8, 2.2]) / stiff.fastest()
-    midpoint = stiff.energies(stiff.CASES["Midpoint"], hs, 2.0, 256)
+    midpoint = stiff.energies(stiff.CASES["ImplicitMidpoint"], hs, 2.0, 256)
     verlet = stiff.energies(stiff.CASES["StormerVerlet"], hs, 2.0, 256)
     for e in (*midpoint, verlet[0]):
         assert e.failed == 0
@@ -212,7 +218,7 @@ def test_nonlinear_energies_are_kept_up_to_the_linear_limit():
     ids=["Kubo, float64", "Kubo, float32", "rigid body, float64"],
 )
 def test_rounding_errors_grow_like_the_root_of_the_number_of_steps(system, dtype):
-    g = rounding.growth(system, ds.Midpoint(), 30_000, 64, dtype)
+    g = rounding.growth(system, ds.ImplicitMidpoint(), 30_000, 64, dtype)
     eps = np.finfo(dtype).eps
     exponent, error = g.exponent()
     assert error <= 0.1
@@ -232,7 +238,7 @@ def test_a_tighter_root_finder_removes_the_bias_of_srkw2():
 
 def test_energy_of_a_pendulum_is_kept_but_not_to_rounding():
     # Not quadratic: an error of order h^2 that stays where it is without noise.
-    quiet = rounding.growth(rounding.PENDULUM, ds.Midpoint(), 20_000, 1)
+    quiet = rounding.growth(rounding.PENDULUM, ds.ImplicitMidpoint(), 20_000, 1)
     half = len(quiet.steps) // 2
     first, second = (np.max(np.abs(e)) for e in np.split(quiet.errors[0], [half]))
     assert 1e-6 < second <= 1.05 * first

@@ -62,7 +62,7 @@ def test_structure_is_never_refused_for_the_way_it_is_written(H0):
 
 
 def test_general_solvers_take_any_structure():
-    _solve(lambda t, p, q, args: jnp.sum(p * q), _good_noise, ds.Midpoint())
+    _solve(lambda t, p, q, args: jnp.sum(p * q), _good_noise, ds.ImplicitMidpoint())
 
 
 _oscillator = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2

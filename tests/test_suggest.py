@@ -191,7 +191,7 @@ def test_noises_that_do_not_commute_may_be_terms_or_arrays_of_their_own():
                 diffrax.MultiTerm(drift, *terms), y0, want="paths"
             )
         # Lévy areas are those of one array of noises.
-        assert [type(s.solver) for s in found] == [ds.Midpoint]
+        assert [type(s.solver) for s in found] == [ds.ImplicitMidpoint]
         assert found[0].strong_order == 0.5
         assert "do not commute" in found.system and "Damped" not in found.system
 

@@ -35,7 +35,9 @@ def _increments(key, h, dtype):
 @pytest.mark.parametrize(
     "solver",
     [
-        pytest.param(s, id=name, marks=[pytest.mark.core] * (name == "Midpoint"))
+        pytest.param(
+            s, id=name, marks=[pytest.mark.core] * (name == "ImplicitMidpoint")
+        )
         for name, s in GENERAL.items()
     ],
 )
@@ -80,7 +82,7 @@ def test_defect_sees_a_method_that_is_not_symplectic(solver):
 @pytest.mark.parametrize(
     "name, dtype",
     [(name, jnp.float64) for name in GENERAL]
-    + [(name, jnp.float32) for name in ("Midpoint", "SRKw2")],
+    + [(name, jnp.float32) for name in ("ImplicitMidpoint", "SRKw2")],
 )
 def test_stage_equations_are_solved_to_rounding_error(name, dtype):
     solver = GENERAL[name]
@@ -111,10 +113,10 @@ def test_stage_equations_are_solved_to_rounding_error(name, dtype):
 def test_defect_needs_a_pair():
     terms = diffrax.ODETerm(lambda t, y, args: -y)
     with pytest.raises(ValueError, match=r"pair `\(p, q\)`"):
-        ds.symplecticity_defect(terms, ds.Midpoint(), 0.0, 0.1, jnp.ones(3))
+        ds.symplecticity_defect(terms, ds.ImplicitMidpoint(), 0.0, 0.1, jnp.ones(3))
 
 
-@pytest.mark.parametrize("solver", [ds.Midpoint(), ds.SRKs2()], ids=repr)
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.SRKs2()], ids=repr)
 @pytest.mark.core
 def test_steps_of_any_length_that_succeed_solve_their_equations(solver):
     # Fixed-point iterations on stiff springs that are not linear leave by powers of three.
@@ -130,10 +132,8 @@ def test_steps_of_any_length_that_succeed_solve_their_equations(solver):
 
         nothing = lambda t, p, q, args: 0.0 * jnp.sum(q)
         terms = ds.hamiltonian_terms(H0, nothing, Given(jnp.zeros(())))
-        h, y0 = (
-            jnp.exp(jr.uniform(k_h, minval=-5, maxval=3)) / 100,
-            tuple(jr.normal(k_y, (2, 2))),
-        )
+        h = jnp.exp(jr.uniform(k_h, minval=-5, maxval=3)) / 100
+        y0 = tuple(jr.normal(k_y, (2, 2)))
         y1, *_, result = solver.step(terms, 0.0, h, y0, None, None, False)
         # Without noise both solvers are the midpoint rule.
         y0, y1 = jnp.stack(y0), jnp.stack(y1)

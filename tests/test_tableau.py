@@ -14,7 +14,7 @@ from diffrax_symplectic._plan import Block, make_plan
 
 
 TABLEAUS = {
-    "Midpoint": ds.Midpoint().tableau,
+    "ImplicitMidpoint": ds.ImplicitMidpoint().tableau,
     "SRKw2": ds.SRKw2().tableau,
     "StrangGauss": ds.StrangGauss().tableau,
     **{f"SRKs1({a})": ds.SRKs1(a=a).tableau for a in (-0.3, 0.0, 0.25, 0.4, 0.5)},
@@ -53,7 +53,7 @@ def test_other_tableaus_do_not_have_weak_order_two(name):
 
 @pytest.mark.parametrize("a", [0.0, 0.25, 0.5])
 def test_strong_tableaus_have_strong_order(a):
-    for tableau in (ds.Midpoint().tableau, ds.SRKs1(a=a).tableau):
+    for tableau in (ds.ImplicitMidpoint().tableau, ds.SRKs1(a=a).tableau):
         residuals = ds.strong_order_residuals(tableau)
         assert max(map(abs, residuals.values())) <= 1e-15
 
@@ -90,7 +90,7 @@ def test_every_member_of_srkw2_satisfies_all_conditions():
 @pytest.mark.parametrize(
     "solver, blocks",
     [
-        (ds.Midpoint(), [1]),
+        (ds.ImplicitMidpoint(), [1]),
         (ds.SRKs1(a=0.0), [1]),
         (ds.SRKs1(a=0.5), [1]),
         (ds.SRKs1(a=0.25), [1, 1]),
@@ -128,7 +128,7 @@ def test_explicit_stages_never_reach_the_root_finder():
 )
 def test_malformed_tableaus_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        dataclasses.replace(ds.Midpoint().tableau, **change)
+        dataclasses.replace(ds.ImplicitMidpoint().tableau, **change)
 
 
 @pytest.mark.parametrize("value", [1j, np.nan, np.inf, "a", None])
@@ -141,13 +141,13 @@ def test_malformed_parameters_are_refused(value):
 
 def test_weak_order_residuals_know_orders_one_and_two():
     with pytest.raises(ValueError, match="`order` must be 1 or 2"):
-        ds.weak_order_residuals(ds.Midpoint().tableau, 3)
+        ds.weak_order_residuals(ds.ImplicitMidpoint().tableau, 3)
 
 
 def test_conditions_are_known_for_known_tableaus_and_variables():
     class Other(ds.AbstractTableau):
         def flatten(self):
-            return ds.Midpoint().tableau.flatten()
+            return ds.ImplicitMidpoint().tableau.flatten()
 
     for residuals in (
         ds.strong_order_residuals,

@@ -70,11 +70,13 @@ def test_state_and_noise_may_be_any_pytrees():
         diffusion.vf_prod(0.0, (p, q), None, control),
     )
     solve = lambda solver: diffrax.diffeqsolve(terms, solver, 0.0, 0.1, 0.05, (p, q))
-    for solver in (ds.Midpoint(), ds.StrangGauss(), ds.SRKw2(), diffrax.Heun()):
+    for solver in (ds.ImplicitMidpoint(), ds.StrangGauss(), ds.SRKw2(), diffrax.Heun()):
         sol = solve(solver)
         assert jax.tree.structure(sol.ys) == jax.tree.structure((p, q))
         assert all(jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(sol.ys))
-    assert ds.symplecticity_defect(terms, ds.Midpoint(), 0.0, 0.1, (p, q)) < 1e-14
+    assert (
+        ds.symplecticity_defect(terms, ds.ImplicitMidpoint(), 0.0, 0.1, (p, q)) < 1e-14
+    )
 
 
 @pytest.mark.parametrize("shape", [(), (1,)])
@@ -84,7 +86,9 @@ def test_one_noise_may_be_a_scalar(shape):
     terms = ds.hamiltonian_terms(H, H, path)
     y0 = (jnp.array(0.0), jnp.array(1.0))
     solve = lambda solver: diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0).ys
-    np.testing.assert_allclose(sum(x**2 for x in solve(ds.Midpoint())), 1, rtol=1e-14)
+    np.testing.assert_allclose(
+        sum(x**2 for x in solve(ds.ImplicitMidpoint())), 1, rtol=1e-14
+    )
     solve(diffrax.StratonovichMilstein())
 
 
@@ -102,13 +106,13 @@ def test_terms_work_with_diffrax_solvers(m):
             adjoint=diffrax.ForwardMode(),
         ).ys
     )
-    expected = solve(ds.Midpoint())
+    expected = solve(ds.ImplicitMidpoint())
     for solver in (diffrax.Heun(), diffrax.StratonovichMilstein(), diffrax.SlowRK()):
         for a, b in zip(solve(solver), expected):
             np.testing.assert_allclose(a, b, atol=0.02)
 
 
-@pytest.mark.parametrize("name", ["Midpoint", "StrangGauss", "SRKw2"])
+@pytest.mark.parametrize("name", ["ImplicitMidpoint", "StrangGauss", "SRKw2"])
 def test_plain_diffrax_terms_give_the_same_solution(name):
     solver = GENERAL[name]
     y0, args = random_problem(jr.key(0), 2, 2)
@@ -200,7 +204,9 @@ def test_with_noise_of_size_zero_the_solvers_have_the_order_they_state(solver, p
 def test_noise_alone_can_be_solved():
     path = weak_path(1)
     term = diffrax.ControlTerm(lambda t, y, args: y[:, None], path)
-    y = diffrax.diffeqsolve(term, ds.Midpoint(), 0.0, 0.3, 0.1, jnp.ones(1)).ys[0]
+    y = diffrax.diffeqsolve(term, ds.ImplicitMidpoint(), 0.0, 0.3, 0.1, jnp.ones(1)).ys[
+        0
+    ]
     increments = jnp.stack([path.evaluate(i * 0.1, (i + 1) * 0.1)[0] for i in range(3)])
     expected = jnp.prod((1 + increments / 2) / (1 - increments / 2))
     np.testing.assert_allclose(y[0], expected, rtol=1e-13)
@@ -209,9 +215,13 @@ def test_noise_alone_can_be_solved():
 def test_a_solve_backward_in_time_returns_to_its_start():
     y0, args = random_problem(jr.key(0), 1, 1)
     terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
-    there = diffrax.diffeqsolve(terms, ds.Midpoint(), 0.0, 1.0, 0.1, y0, args).ys
+    there = diffrax.diffeqsolve(
+        terms, ds.ImplicitMidpoint(), 0.0, 1.0, 0.1, y0, args
+    ).ys
     end = jax.tree.map(lambda x: x[0], there)
-    back = diffrax.diffeqsolve(terms, ds.Midpoint(), 1.0, 0.0, -0.1, end, args).ys
+    back = diffrax.diffeqsolve(
+        terms, ds.ImplicitMidpoint(), 1.0, 0.0, -0.1, end, args
+    ).ys
     # The midpoint rule is its own inverse, and both ways see the same increments.
     for a, b in zip(back, y0):
         np.testing.assert_allclose(a[0], b, atol=1e-12)
@@ -220,8 +230,8 @@ def test_a_solve_backward_in_time_returns_to_its_start():
 @pytest.mark.parametrize(
     "solver, m, weak, strong",
     [
-        (ds.Midpoint(), 1, 1, 1.0),
-        (ds.Midpoint(), 2, 1, 0.5),
+        (ds.ImplicitMidpoint(), 1, 1, 1.0),
+        (ds.ImplicitMidpoint(), 2, 1, 0.5),
         (ds.SRKs1(), 1, 1, 1.0),
         (ds.SRKs1(), 3, 1, 0.5),
         (ds.SRKw1(), 2, 1, None),
@@ -254,12 +264,12 @@ def test_hamiltonians_may_be_networks():
         make(jr.key(0), "scalar"), make(jr.key(1), 2), weak_path(2)
     )
     y0 = (jnp.array([0.1, 0.2]), jnp.array([0.3, 0.4]))
-    for solver in (ds.Midpoint(), ds.SRKw2()):
+    for solver in (ds.ImplicitMidpoint(), ds.SRKw2()):
         assert ds.symplecticity_defect(terms, solver, 0.0, 0.1, y0) < 1e-13
 
     @eqx.filter_grad
     def gradient(terms):
-        ys = diffrax.diffeqsolve(terms, ds.Midpoint(), 0.0, 0.3, 0.1, y0).ys
+        ys = diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), 0.0, 0.3, 0.1, y0).ys
         return jnp.sum(ys[0] ** 2)
 
     leaves = jax.tree.leaves(eqx.filter(gradient(terms), eqx.is_inexact_array))
@@ -273,7 +283,7 @@ def test_terms_may_come_in_any_order_and_drift_in_pieces():
     together = diffrax.MultiTerm(diffrax.MultiTerm(drift, friction), diffusion)
     solve = lambda *terms: (
         diffrax.diffeqsolve(
-            diffrax.MultiTerm(*terms), ds.Midpoint(), 0.0, 0.3, 0.1, y0, args
+            diffrax.MultiTerm(*terms), ds.ImplicitMidpoint(), 0.0, 0.3, 0.1, y0, args
         ).ys
     )
     expected = solve(*together.terms)

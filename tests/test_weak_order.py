@@ -48,7 +48,7 @@ def test_local_weak_defect_has_the_order_of_the_solver(solver, m):
 
 
 def test_defect_sees_a_method_of_lower_order():
-    slopes = _slopes(ds.Midpoint(), 1, order=2)
+    slopes = _slopes(ds.ImplicitMidpoint(), 1, order=2)
     assert np.median(slopes) < 2.5
 
 
@@ -101,7 +101,7 @@ def test_kubo_moments_match_the_matrix_recursion():
     terms = kubo_terms(ds.WeakBrownianPath((), jr.key(0)), s)
     got = ds.step_expectation(
         terms,
-        ds.Midpoint(),
+        ds.ImplicitMidpoint(),
         0.0,
         h,
         (jnp.array(0.0), jnp.array(1.0)),
@@ -125,4 +125,6 @@ def test_expectation_needs_one_path_of_a_known_law():
         diffrax.MultiTerm(known, other.terms[1]),
     ):
         with pytest.raises(ValueError, match="exactly one Brownian path"):
-            ds.step_expectation(terms, ds.Midpoint(), 0.0, 0.1, y0, fn=lambda y: y[0])
+            ds.step_expectation(
+                terms, ds.ImplicitMidpoint(), 0.0, 0.1, y0, fn=lambda y: y[0]
+            )

@@ -1,7 +1,7 @@
 from ._structure import check_structure as check_structure
 from ._implicit import AbstractImplicitStages as AbstractImplicitStages
 from .base import AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta
-from .midpoint import Midpoint as Midpoint
+from .implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
 from .srks1 import SRKs1 as SRKs1
 from .srks2 import SRKs2 as SRKs2
 from .srks3 import SRKs3 as SRKs3

@@ -4,7 +4,7 @@ from typing import ClassVar
 from .._tableau import GeneralTableau
 from ._implicit import AbstractImplicitStages, ARGUMENTS
 from .base import AbstractSymplecticRungeKutta
-from .midpoint import Midpoint
+from .implicit_midpoint import ImplicitMidpoint
 
 
 class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -29,8 +29,8 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     The areas bring the order: without them the midpoint rule has strong order 1/2. For `m`
     noises they cost `m` directional derivatives of the noise in each evaluation. With one
-    noise, or noises that commute, it is [`diffrax_symplectic.Midpoint`][] at a higher
-    price. Weak order 1. Order 2 without noise. No free parameters.
+    noise, or noises that commute, it is [`diffrax_symplectic.ImplicitMidpoint`][] at a
+    higher price. Weak order 1. Order 2 without noise. No free parameters.
 
     !!! warning
 
@@ -43,7 +43,7 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     """
 
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
-        Midpoint.tableau, noise=("W", "A")
+        ImplicitMidpoint.tableau, noise=("W", "A")
     )
 
     def order(self, terms):

@@ -42,7 +42,7 @@ def gaussian(shape=(), area: Any = diffrax.BrownianIncrement):
 
 SOLVERS = [
     ("Kubo", "Diffrax Heun", kubo, diffrax.Heun(), gaussian()),
-    ("Kubo", "Midpoint", kubo, ds.Midpoint(), weak()),
+    ("Kubo", "ImplicitMidpoint", kubo, ds.ImplicitMidpoint(), weak()),
     ("Kubo", "StrangGauss", kubo, ds.StrangGauss(), weak()),
     ("synchrotron", "Diffrax Heun", synchrotron, diffrax.Heun(), gaussian((2,))),
     ("synchrotron", "SRKw4", synchrotron, ds.SRKw4(), weak((2,))),
@@ -86,7 +86,7 @@ def growing(sizes, dtypes, paths: int):
         "steps: nanoseconds a path, step and degree of freedom."
     )
     yield ""
-    yield "| d | dtype | Diffrax Heun | Midpoint | Midpoint to Heun |"
+    yield "| d | dtype | Diffrax Heun | ImplicitMidpoint | ImplicitMidpoint to Heun |"
     yield "|---" * 5 + "|"
     for d in sizes:
         for dtype in dtypes:
@@ -95,7 +95,7 @@ def growing(sizes, dtypes, paths: int):
             times = []
             for solver, path in (
                 (diffrax.Heun(), gaussian((1,))),
-                (ds.Midpoint(), weak((1,))),
+                (ds.ImplicitMidpoint(), weak((1,))),
             ):
                 fn = ensemble(growth.chain, path(dtype), solver, y0, t, 50)
                 seconds = measure(fn, keys(paths), repeats=3).seconds
@@ -112,8 +112,8 @@ def large(num_paths: int, batch_sizes, dtypes):
     yield "## A large ensemble"
     yield ""
     yield (
-        f"`expectation` of q^2 over {num_paths:,} paths of {STEPS} steps, Midpoint on the "
-        "quartic Kubo oscillator, by batch size."
+        f"`expectation` of q^2 over {num_paths:,} paths of {STEPS} steps, "
+        "ImplicitMidpoint on the quartic Kubo oscillator, by batch size."
     )
     yield ""
     yield "| dtype | batch size | seconds | ps a path and step | E(q^2) |"
@@ -121,7 +121,7 @@ def large(num_paths: int, batch_sizes, dtypes):
     for dtype in dtypes:
         y0 = (jnp.array(0.0, dtype), jnp.array(1.0, dtype))
         t = jnp.asarray(H, dtype)
-        solve = ensemble(kubo, weak()(dtype), ds.Midpoint(), y0, t, STEPS)
+        solve = ensemble(kubo, weak()(dtype), ds.ImplicitMidpoint(), y0, t, STEPS)
 
         def phi(key):
             _, q = solve(key[None])

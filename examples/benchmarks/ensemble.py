@@ -21,7 +21,7 @@ PATHS, STEPS, H = 10**7, 100, 0.01
 
 
 def main() -> None:
-    solve = ensemble(kubo, weak, ds.Midpoint(), Y0, H, STEPS)
+    solve = ensemble(kubo, weak, ds.ImplicitMidpoint(), Y0, H, STEPS)
 
     def phi(key):
         _, q = solve(key[None])
@@ -36,8 +36,8 @@ def main() -> None:
     lines = [
         "# A large ensemble",
         "",
-        f"{machine()}. Midpoint on the quartic Kubo oscillator, {PATHS:,} paths of {STEPS} "
-        "steps through `expectation`. Made by `python -m examples.benchmarks.ensemble`.",
+        f"{machine()}. ImplicitMidpoint on the quartic Kubo "
+        f"oscillator, {PATHS:,} paths of {STEPS} steps through `expectation`. Made by `python -m examples.benchmarks.ensemble`.",
         "",
         "| seconds | ns per path and step | cores busy | peak memory | E(q^2) |",
         "|---" * 5 + "|",

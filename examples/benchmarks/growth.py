@@ -104,32 +104,36 @@ def row(system: Callable, d: int) -> list[str]:
 
     # Compilation of one program differs by a tenth from run to run.
     repeats = 2 if d in (1, 16) else 1
-    solvers = {"Heun": HEUN, "Midpoint": ds.Midpoint()}
+    solvers = {"Heun": HEUN, "ImplicitMidpoint": ds.ImplicitMidpoint()}
     if d in (1, 16, 64):
         solvers |= {"StrangGauss": ds.StrangGauss(), "SRKw2": ds.SRKw2()}
     programs = {
         name: program(fn(solver), d, repeats=repeats)
         for name, solver in solvers.items()
     }
-    alone = [program(fn(solver), d, paths=1).memory for solver in (HEUN, ds.Midpoint())]
+    alone = [
+        program(fn(solver), d, paths=1).memory
+        for solver in (HEUN, ds.ImplicitMidpoint())
+    ]
     seconds = race({name: p.call for name, p in programs.items()})
     heun = programs["Heun"]
     ratio = lambda a, b: f"{a / b:.1f}"
     slopes = "–"
     if d <= 1024:
         pair = {
-            name: program(gradient(solvers[name]), d) for name in ("Heun", "Midpoint")
+            name: program(gradient(solvers[name]), d)
+            for name in ("Heun", "ImplicitMidpoint")
         }
         times = race({name: p.call for name, p in pair.items()})
-        slopes = ratio(times["Midpoint"], times["Heun"])
+        slopes = ratio(times["ImplicitMidpoint"], times["Heun"])
     cells = [str(d), f"{seconds['Heun'] / PATHS / STEPS * 1e6:.2f}"]
-    for name in ("Midpoint", "StrangGauss", "SRKw2"):
+    for name in ("ImplicitMidpoint", "StrangGauss", "SRKw2"):
         if name in programs:
             preparation = ratio(programs[name].preparation, heun.preparation)
             cells.append(f"{ratio(seconds[name], seconds['Heun'])} ({preparation})")
         else:
             cells.append("–")
-    memory = ratio(programs["Midpoint"].memory, heun.memory)
+    memory = ratio(programs["ImplicitMidpoint"].memory, heun.memory)
     return [*cells, slopes, memory, ratio(alone[1], alone[0])]
 
 
@@ -151,7 +155,7 @@ def many_noises(m: int) -> list[str]:
 
     solvers = {
         "Heun": HEUN,
-        "Midpoint": ds.Midpoint(),
+        "ImplicitMidpoint": ds.ImplicitMidpoint(),
         "SRKw3": ds.SRKw3("c"),
         "SRKw2": ds.SRKw2(),
     }
@@ -169,7 +173,7 @@ CASES = {
     "A network as the potential, noise 0.1 p.q": (network, (4, 16, 64, 256)),
 }
 COLUMNS = (
-    *("d", "Heun, µs", "Midpoint", "StrangGauss", "SRKw2"),
+    *("d", "Heun, µs", "ImplicitMidpoint", "StrangGauss", "SRKw2"),
     *("gradient", "memory", "memory, one path"),
 )
 INTRODUCTION = """\
@@ -179,8 +183,9 @@ solvers. Made by `python -m examples.benchmarks.growth`.
 The first column of times is microseconds per path and step of Diffrax's Heun. All others
 are ratios to Heun, measured in turns: time per path and step, and in brackets the processor
 time of tracing and compiling; the time of value and gradient; the memory that the program
-of `Midpoint` sets aside, for {paths} paths and for one. Heun evaluates twice a step,
-`Midpoint` nine times, and another four where that does not reach rounding error.
+of `ImplicitMidpoint` sets aside, for {paths} paths and for one. Heun evaluates twice a
+step, `ImplicitMidpoint` nine times, and another four where that does not reach
+rounding error.
 
 One path alone needs more memory than Heun in proportion, for the vectors of GMRES, in case
 that iteration does not converge. In a batch they are set aside for a sixteenth of the
@@ -207,7 +212,7 @@ def main() -> None:
         "",
         "Microseconds per path and step of an array of 16 oscillators with m noises.",
         "",
-        '| m | Heun | Midpoint | SRKw3("c") | SRKw2 |',
+        '| m | Heun | ImplicitMidpoint | SRKw3("c") | SRKw2 |',
         "|---" * 5 + "|",
     ]
     for m in (1, 4, 16):

@@ -122,8 +122,12 @@ MODELS = {
             ("Diffrax StratonovichMilstein", diffrax.StratonovichMilstein(), gaussian),
             ("Diffrax SlowRK", diffrax.SlowRK(), with_area),
             ("midpoint rule by hand, `lax.scan`", None, None),
-            ("Midpoint, weak increments", ds.Midpoint(), weak),
-            ("Midpoint, truncated increments", ds.Midpoint(), truncated),
+            ("ImplicitMidpoint, weak increments", ds.ImplicitMidpoint(), weak),
+            (
+                "ImplicitMidpoint, truncated increments",
+                ds.ImplicitMidpoint(),
+                truncated,
+            ),
             ("SRKs1", ds.SRKs1(), weak),
             ("SRKw1", ds.SRKw1(), weak),
             ("SRKw1(b=0)", ds.SRKw1(b=0.0), weak),
@@ -136,7 +140,7 @@ MODELS = {
         [
             ("Diffrax Heun, its own path", diffrax.Heun(), two(unsafe)),
             ("Diffrax Heun", diffrax.Heun(), two(gaussian)),
-            ("Midpoint", ds.Midpoint(), two(weak)),
+            ("ImplicitMidpoint", ds.ImplicitMidpoint(), two(weak)),
             ("SRKs2", ds.SRKs2(), two(weak)),
             ("SRKs3", ds.SRKs3(), two(weak)),
             ('SRKw3("a")', ds.SRKw3("a"), two(weak)),
@@ -151,7 +155,7 @@ MODELS = {
         [
             ("Diffrax Heun, its own path", diffrax.Heun(), two(unsafe)),
             ("Diffrax Heun", diffrax.Heun(), two(gaussian)),
-            ("Midpoint", ds.Midpoint(), two(weak)),
+            ("ImplicitMidpoint", ds.ImplicitMidpoint(), two(weak)),
             (
                 "NinomiyaVictoir",
                 ds.NinomiyaVictoir(),

@@ -25,7 +25,7 @@ def solve(d: int, rtol: float | None):
     H0 = lambda t, p, q, args: square(p, q) ** 2 / (4 * d) + square(p, q) / 2
     noise = lambda t, p, q, args: 0.3 * H0(t, p, q, args)
     y0 = (jnp.zeros(d), jnp.ones(d))
-    solver = ds.Midpoint(root_finder=ds.PicardNewton(rtol=rtol))
+    solver = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(rtol=rtol))
 
     def change(key):
         terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), key))
@@ -41,8 +41,8 @@ def main() -> None:
     lines = [
         "# Tolerance of the root finder",
         "",
-        f"{machine()}. `Midpoint`, d oscillators coupled by their energy, with one noise; "
-        f"float64, h = {H}, {STEPS:,} steps, {PATHS} paths. `PicardNewton(rtol=...)`; "
+        f"{machine()}. `ImplicitMidpoint`, d oscillators "
+        f"coupled by their energy, with one noise; float64, h = {H}, {STEPS:,} steps, {PATHS} paths. `PicardNewton(rtol=...)`; "
         "`None` is two units in the last place. The drift is the root mean square of the "
         "relative change of |p|^2 + |q|^2, which is invariant. Made by `python -m "
         "examples.benchmarks.tolerance`.",

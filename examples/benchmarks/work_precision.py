@@ -178,17 +178,17 @@ def _sampled(make_terms, y0, phi, solver, path, sort_by=None):
 
 
 _EXPLICIT = diffrax.Heun(), diffrax.StratonovichMilstein(), diffrax.SlowRK()
-_GENERAL = (ds.PlateauGauss(), ds.Midpoint(), ds.SRKs1(), *_EXPLICIT)
+_GENERAL = (ds.PlateauGauss(), ds.ImplicitMidpoint(), ds.SRKs1(), *_EXPLICIT)
 # Terms, start, shape of the path, the solver of the reference, and all solvers.
 STRONG = {
     "linear oscillator": (
         linear_oscillator.make_terms, linear_oscillator.Y0, (), ds.SRKs4(),
-        (ds.SRKs4(), ds.Midpoint(), ds.SRKs3(), diffrax.Heun(), diffrax.ShARK()),
+        (ds.SRKs4(), ds.ImplicitMidpoint(), ds.SRKs3(), diffrax.Heun(), diffrax.ShARK()),
     ),
     "Kubo oscillator": (kubo.make_terms, kubo.Y0, (), ds.PlateauGauss(), _GENERAL),
     "synchrotron": (
         synchrotron.make_terms, synchrotron.Y0, (2,), ds.PlateauVerlet(),
-        (ds.PlateauVerlet(), ds.StormerVerlet(), ds.SRKs3(), ds.Midpoint(),
+        (ds.PlateauVerlet(), ds.StormerVerlet(), ds.SRKs3(), ds.ImplicitMidpoint(),
          diffrax.Heun(), diffrax.SlowRK()),
     ),
     "rigid body": (
@@ -197,7 +197,7 @@ STRONG = {
     ),
     "two noises": (
         two_noises, kubo.Y0, (2,), ds.LevyAreaMidpoint(),
-        (ds.LevyAreaMidpoint(), ds.Midpoint(), ds.SRKs1(), diffrax.Heun()),
+        (ds.LevyAreaMidpoint(), ds.ImplicitMidpoint(), ds.SRKs1(), diffrax.Heun()),
     ),
 }  # fmt: skip
 
@@ -266,7 +266,7 @@ def draw(axes, title: str, results: dict[str, tuple[float, Errors]]) -> list[str
     lines = []
     for i, (name, (cost, e)) in enumerate(results.items()):
         seconds, clear = cost / e.hs, e.errors > 3 * e.std_errors
-        style = "--" if name in dir(diffrax) and name != "Midpoint" else "-"
+        style = "--" if name in dir(diffrax) and name != "ImplicitMidpoint" else "-"
         axes.errorbar(
             seconds[clear], e.errors[clear], 3 * e.std_errors[clear], label=name,
             color=f"C{i}", ls=style, marker="o", ms=3, lw=1, capsize=2,

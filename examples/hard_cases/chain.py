@@ -124,7 +124,7 @@ def symplecticity(solver, hs, args: Args, amplitude: float = 4.0) -> np.ndarray:
 
 
 SOLVERS = {
-    "Midpoint": (ds.Midpoint(), truncated((N,))),
+    "ImplicitMidpoint": (ds.ImplicitMidpoint(), truncated((N,))),
     "SRKs3": (ds.SRKs3(), truncated((N,))),
     "PlateauVerlet": (ds.PlateauVerlet(), plateaus((N,))),
     "Heun": (diffrax.Heun(), gaussian((N,))),
@@ -134,15 +134,15 @@ SOLVERS = {
 def section(page: Page) -> str:
     t1, paths = (2.0, 16) if page.quick else (20.0, 256)
     hs = [0.1] if page.quick else [0.8, 0.4, 0.2, 0.1]
-    names = ["Midpoint", "Heun"] if page.quick else SOLVERS
+    names = ["ImplicitMidpoint", "Heun"] if page.quick else SOLVERS
     args = Args(beta=1.0, s=0.2)
     print("\nHarmonic chain, 64 unknowns: one step, exactly; s = 1")
     rows = []
     sizes = (0.1, 1.0)
-    for name in ("Midpoint", "Heun"):
+    for name in ("ImplicitMidpoint", "Heun"):
         x = heating(SOLVERS[name][0], sizes)
         for h, defect, rate in zip(sizes, *x):
-            closed = f"{midpoint_heating(h):.10f}" if name == "Midpoint" else ""
+            closed = f"{midpoint_heating(h):.10f}" if name == "ImplicitMidpoint" else ""
             rows.append((name, h, f"{defect:.1e}", f"{rate:.10f}", closed))
     linear_table = table(
         ("solver", "h", "energy defect", "heating per unit time", "closed form"), rows
@@ -168,7 +168,9 @@ def section(page: Page) -> str:
     picture = page.picture(figure, "chain", "Chain of 32 oscillators")
     plt.close(figure)
     shown = table(("solver", "h", "lost", "excess"), rows)
-    defects = [f"{x:.0e}" for x in symplecticity(ds.Midpoint(), (0.1, 0.4), args)]
+    defects = [
+        f"{x:.0e}" for x in symplecticity(ds.ImplicitMidpoint(), (0.1, 0.4), args)
+    ]
     return fill(__file__, 
         linear_table=linear_table, table=shown, picture=picture, t1=f"{t1:g}", paths=paths,
         heat=f"{N * args.s**2 / 2 * t1:g}", s=args.s, defects=" and ".join(defects),

@@ -96,7 +96,7 @@ def damped(solver, make_path) -> Step:
 LANGEVIN = {
     "Damped(StormerVerlet)": (damped(ds.StormerVerlet(), gaussian()), 1),
     "Damped(PlateauVerlet)": (damped(ds.PlateauVerlet(), plateaus()), 2),
-    "Damped(Midpoint)": (damped(ds.Midpoint(), gaussian()), None),
+    "Damped(ImplicitMidpoint)": (damped(ds.ImplicitMidpoint(), gaussian()), None),
     "ALIGN": (Step(diffrax_terms, areas(), diffrax.ALIGN(), True), 1),
     "QUICSORT": (
         Step(diffrax_terms, with_third_areas, diffrax.QUICSORT(), True, nodes=5),
@@ -107,7 +107,7 @@ LANGEVIN = {
 
 
 SOLVERS = {
-    "Midpoint": (ds.Midpoint(), truncated()),
+    "ImplicitMidpoint": (ds.ImplicitMidpoint(), truncated()),
     "Heun": (diffrax.Heun(), gaussian()),
     "EulerHeun": (diffrax.EulerHeun(), gaussian()),
 }
@@ -116,7 +116,7 @@ SOLVERS = {
 def escapes(page: Page) -> dict[str, str]:
     paths = 1_000 if page.quick else 20_000
     hs = [0.1] if page.quick else [0.4, 0.2, 0.1]
-    names = ["Midpoint", "Heun"] if page.quick else SOLVERS
+    names = ["ImplicitMidpoint", "Heun"] if page.quick else SOLVERS
     s, t1 = 0.2, 20.0
     print(f"\nDouble well: escape until t = {t1:g}, s = {s}, {paths:,} paths")
     rows = []

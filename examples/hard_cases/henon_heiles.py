@@ -76,7 +76,7 @@ def stay(solver, make_path, s: float, h: float, t1: float, paths: int) -> Stay:
 
 
 SOLVERS = {
-    "Midpoint": (ds.Midpoint(), truncated((2,))),
+    "ImplicitMidpoint": (ds.ImplicitMidpoint(), truncated((2,))),
     "PlateauVerlet": (ds.PlateauVerlet(), plateaus((2,))),
     "Heun": (diffrax.Heun(), gaussian((2,))),
 }
@@ -85,7 +85,7 @@ SOLVERS = {
 def section(page: Page) -> str:
     t1, paths = (100.0, 64) if page.quick else (500.0, 1_000)
     hs = [0.2] if page.quick else [0.4, 0.2, 0.1]
-    names = ["Midpoint", "Heun"] if page.quick else SOLVERS
+    names = ["ImplicitMidpoint", "Heun"] if page.quick else SOLVERS
     print(f"\nHenon-Heiles from energy 0.15 until t = {t1:g}, {paths:,} paths")
     rows = []
     figure, axes = plt.subplots(1, 2, figsize=(11, 4))

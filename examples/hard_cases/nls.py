@@ -90,7 +90,7 @@ def lattice(solver, h: float, t1: float, paths: int, s: float, n: int = N) -> La
 # No dense matrix of 2,048 unknowns, should fixed points not contract.
 _MATRIX_FREE = ds.PicardNewton(linear_solver=lx.GMRES(rtol=1e-9, atol=1e-9))
 SOLVERS = {
-    "Midpoint": ds.Midpoint(root_finder=_MATRIX_FREE),
+    "ImplicitMidpoint": ds.ImplicitMidpoint(root_finder=_MATRIX_FREE),
     "Heun": diffrax.Heun(),
     "EulerHeun": diffrax.EulerHeun(),
 }
@@ -99,7 +99,7 @@ SOLVERS = {
 def section(page: Page) -> str:
     t1, paths = (0.5, 2) if page.quick else (5.0, 16)
     hs = [0.01] if page.quick else [0.04, 0.02, 0.01]
-    names = ["Midpoint", "Heun"] if page.quick else SOLVERS
+    names = ["ImplicitMidpoint", "Heun"] if page.quick else SOLVERS
     s = 0.1
     print(f"\nSchroedinger lattice, {N:,} sites, until t = {t1:g}, {paths} paths")
     rows = []

@@ -95,8 +95,8 @@ class Method(NamedTuple):
 
 
 METHODS = {
-    "Midpoint, spin_terms": Method(ds.Midpoint(), True),
-    "Midpoint of s": Method(ds.Midpoint(), False),
+    "ImplicitMidpoint, spin_terms": Method(ds.ImplicitMidpoint(), True),
+    "ImplicitMidpoint of s": Method(ds.ImplicitMidpoint(), False),
     "Heun, renormalized": Method(RenormalizedHeun(), False),
 }
 

@@ -90,7 +90,7 @@ def orbits(
 
 
 SOLVERS = {
-    "Midpoint": (ds.Midpoint(), truncated()),
+    "ImplicitMidpoint": (ds.ImplicitMidpoint(), truncated()),
     "SRKs3(a=1/4)": (ds.SRKs3(a=0.25), truncated()),
     "PlateauVerlet": (ds.PlateauVerlet(), plateaus()),
     "Heun": (diffrax.Heun(), gaussian()),
@@ -100,7 +100,7 @@ SOLVERS = {
 def section(page: Page) -> str:
     s, count, paths = (0.01, 5, 32) if page.quick else (0.01, 100, 64)
     sizes = [400, 25] if page.quick else [400, 100, 50, 25]
-    names = ["Midpoint", "Heun"] if page.quick else SOLVERS
+    names = ["ImplicitMidpoint", "Heun"] if page.quick else SOLVERS
     print(f"\nTwo-body problem, {count} orbits, s = {s}, {paths} paths")
     rows = []
     figure, axes = plt.subplots(1, 2, figsize=(11, 5))
@@ -124,9 +124,9 @@ def section(page: Page) -> str:
                 error = np.max(np.abs(r.momentum / r.momentum[:, :1] - 1), axis=0)
                 ts = np.arange(len(error)) / per_orbit
                 axes[1].loglog(ts[1:], error[1:] + 1e-17, label=name, lw=1)
-                if name == "Midpoint":
+                if name == "ImplicitMidpoint":
                     axes[0].plot(*r.position[0].T, lw=0.3)
-    axes[0].set(aspect="equal", title="one path, Midpoint")
+    axes[0].set(aspect="equal", title="one path, ImplicitMidpoint")
     axes[1].set(xlabel="orbits", title="largest error of the angular momentum")
     axes[1].legend(fontsize=7)
     picture = page.picture(figure, "two_body", "Two-body problem")

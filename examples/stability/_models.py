@@ -43,7 +43,7 @@ class Case(NamedTuple):
 
 _SEPARABLE, _ADDITIVE = ("linear", "spring"), ("linear",)
 GENERAL = {
-    "Midpoint": Case(ds.Midpoint(), weak),
+    "ImplicitMidpoint": Case(ds.ImplicitMidpoint(), weak),
     "SRKs1": Case(ds.SRKs1(), weak),
     "SRKw1(b=0)": Case(ds.SRKw1(b=0.0), weak),
     "SRKw2": Case(ds.SRKw2(), weak),

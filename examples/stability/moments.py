@@ -18,7 +18,7 @@ from ._page import fill, Page, table
 
 
 ALL = {**GENERAL, **SEPARABLE, **ADDITIVE, **EXPLICIT}
-QUICK = ("Midpoint", "SRKs3", "Heun", "Euler")
+QUICK = ("ImplicitMidpoint", "SRKs3", "Heun", "Euler")
 # Below this a growth factor is 1 but for rounding.
 ROUNDING = 1e-12
 

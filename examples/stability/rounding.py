@@ -118,15 +118,22 @@ class Run(NamedTuple):
 
 
 RUNS = [
-    Run("Kubo, Midpoint", KUBO, ds.Midpoint(), np.float64),
-    Run("Kubo, Midpoint", KUBO, ds.Midpoint(), np.float32),
+    Run("Kubo, ImplicitMidpoint", KUBO, ds.ImplicitMidpoint(), np.float64),
+    Run("Kubo, ImplicitMidpoint", KUBO, ds.ImplicitMidpoint(), np.float32),
     Run("Kubo, SRKs1", KUBO, ds.SRKs1(), np.float64),
     Run("Kubo, SRKw2", KUBO, ds.SRKw2(), np.float64),
     Run("Kubo, SRKw2", KUBO, ds.SRKw2(), np.float32),
-    Run("rigid body, Midpoint", RIGID_BODY, ds.Midpoint(), np.float64),
-    Run("rigid body, Midpoint", RIGID_BODY, ds.Midpoint(), np.float32),
-    Run("pendulum without noise, Midpoint", PENDULUM, ds.Midpoint(), np.float64),
-    Run("pendulum, Midpoint", NOISY_PENDULUM, ds.Midpoint(), np.float64),
+    Run("rigid body, ImplicitMidpoint", RIGID_BODY, ds.ImplicitMidpoint(), np.float64),
+    Run("rigid body, ImplicitMidpoint", RIGID_BODY, ds.ImplicitMidpoint(), np.float32),
+    Run(
+        "pendulum without noise, ImplicitMidpoint",
+        PENDULUM,
+        ds.ImplicitMidpoint(),
+        np.float64,
+    ),
+    Run(
+        "pendulum, ImplicitMidpoint", NOISY_PENDULUM, ds.ImplicitMidpoint(), np.float64
+    ),
 ]
 _QUICK = RUNS[:2]
 

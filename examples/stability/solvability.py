@@ -163,7 +163,7 @@ def lost_paths(hs, s: float, paths: int, t1: float = 10.0) -> dict[str, np.ndarr
                 make(key),
             )
             sol = diffrax.diffeqsolve(
-                terms, ds.Midpoint(), 0.0, t1, h, y0, max_steps=None,
+                terms, ds.ImplicitMidpoint(), 0.0, t1, h, y0, max_steps=None,
                 adjoint=diffrax.ForwardMode(), throw=False,
             )  # fmt: skip
             return sol.result != diffrax.RESULTS.successful
@@ -204,7 +204,9 @@ def section(page: Page) -> str:
     points, steps, paths = (6, 1024, 100) if page.quick else (16, 4096, 2_000)
     hs, strengths = np.geomspace(0.01, 0.9, points), np.geomspace(0.1, 4, points)
     cases: dict[str, tuple[Model, diffrax.AbstractSolver]]
-    cases = {f"Midpoint, {n}": (m, ds.Midpoint()) for n, m in MODELS.items()}
+    cases = {
+        f"ImplicitMidpoint, {n}": (m, ds.ImplicitMidpoint()) for n, m in MODELS.items()
+    }
     # Its one equation is the midpoint step of an oscillator, after the kick.
     kick = MODELS["cubic"]._replace(solvable=MODELS["rotation"].solvable)
     cases["SRKw3c, cubic"] = (kick, ds.SRKw3("c"))
@@ -230,7 +232,7 @@ def section(page: Page) -> str:
         "worst of the map",
     )
     shown = table(header, rows)
-    kept = {n: r for n, r in results.items() if n.startswith("Midpoint")}
+    kept = {n: r for n, r in results.items() if n.startswith("ImplicitMidpoint")}
     picture = _picture(page, hs, strengths, kept)
 
     print("\nPaths of `rotation` lost until t = 10, s = 2, in percent")

@@ -25,7 +25,7 @@ def plateaus(key, shape=()):
 
 
 CASES = {
-    "Midpoint": Case(ds.Midpoint(), weak),
+    "ImplicitMidpoint": Case(ds.ImplicitMidpoint(), weak),
     "SRKs2": Case(ds.SRKs2(), weak),
     "SRKs3": Case(ds.SRKs3(), weak),
     "SRKw3a": Case(ds.SRKw3("a"), weak),
@@ -38,7 +38,7 @@ CASES = {
     "Heun": Case(diffrax.Heun(), gaussian),
     "EulerHeun": Case(diffrax.EulerHeun(), gaussian),
 }
-QUICK = ("Midpoint", "StormerVerlet")
+QUICK = ("ImplicitMidpoint", "StormerVerlet")
 
 
 class Args(NamedTuple):

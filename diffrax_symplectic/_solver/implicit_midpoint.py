@@ -12,7 +12,7 @@ _half = np.array([[0.5]])
 _tab = GeneralTableau.strong(A=_half, B=_half, alpha=np.ones(1), beta=np.ones(1))
 
 
-class Midpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
+class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The implicit midpoint rule for Stratonovich systems.
 
     $$G = y_n + \tfrac12 h\,a(G) + \tfrac12 \sum_k b_k(G) I_k, \qquad
@@ -41,4 +41,4 @@ class Midpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         return 1
 
 
-Midpoint.__init__.__doc__ = ARGUMENTS
+ImplicitMidpoint.__init__.__doc__ = ARGUMENTS
