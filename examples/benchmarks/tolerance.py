@@ -41,9 +41,10 @@ def main() -> None:
     lines = [
         "# Tolerance of the root finder",
         "",
-        f"{machine()}. `ImplicitMidpoint`, d oscillators "
-        f"coupled by their energy, with one noise; float64, h = {H}, {STEPS:,} steps, {PATHS} paths. "
-        "`PicardNewton(rtol=...)`; `None` is two units in the last place. The drift is the root mean square of the "
+        f"{machine()}. `ImplicitMidpoint`, d oscillators coupled by their energy, with "
+        f"one noise; float64, h = {H}, {STEPS:,} steps, {PATHS} paths. "
+        "`PicardNewton(rtol=...)`; `None` is two units in the last place. The drift is "
+        "the root mean square of the "
         "relative change of |p|^2 + |q|^2, which is invariant. Made by `python -m "
         "examples.benchmarks.tolerance`.",
         "",
