@@ -31,7 +31,7 @@ from ._quasi import (
     quasi_expectation as quasi_expectation,
     QuasiExpectation as QuasiExpectation,
 )
-from ._root_finder import SmallLU as SmallLU, PicardNewton as PicardNewton
+from ._root_finder import PicardNewton as PicardNewton
 from ._solver import (
     AbstractImplicitStages as AbstractImplicitStages,
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,

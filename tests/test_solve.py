@@ -189,7 +189,7 @@ def test_adjoints_agree():
         ds.PicardNewton(linear_solver=lx.QR()),
         ds.PicardNewton(direct=0),
         ds.PicardNewton(direct=100),
-        ds.PicardNewton(warmup=0, chords=0),
+        ds.PicardNewton(picard_steps=0),
     ],
     ids=lambda r: type(r).__name__,
 )

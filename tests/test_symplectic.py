@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import lineax as lx
 import optimistix as optx
 import pytest
 
@@ -88,7 +89,7 @@ def test_stage_equations_are_solved_to_rounding_error(name, dtype):
     solver = GENERAL[name]
     # The Jacobian above is implicit, and would be symplectic at any approximate
     # solution. So the end of the step is compared to a solve that goes on and on.
-    stubborn = optx.Newton(rtol=0.0, atol=0.0, linear_solver=ds.SmallLU())
+    stubborn = optx.Newton(rtol=0.0, atol=0.0, linear_solver=lx.LU())
     exact = dataclasses.replace(solver, root_finder=stubborn, root_find_max_steps=30)
 
     ravel = jnp.concatenate

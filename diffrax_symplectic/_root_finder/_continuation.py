@@ -1,8 +1,7 @@
-"""Newton's method that does not give up: the safety net behind the cheap iterations."""
+"""Newton's method that does not give up, for the few paths that are left."""
 
-import functools as ft
 from collections.abc import Callable
-from typing import NamedTuple, TYPE_CHECKING, TypeAlias, TypeVar
+from typing import Any, TYPE_CHECKING, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,10 +11,10 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
+from .._compat import ω
 from .._custom_types import BoolScalarLike
-from . import _compact, _krylov, _linear
-from ._start import converged, Measured
-from ._tolerance import all_finite, largest, ratio
+from . import _krylov, _linear
+from ._tolerance import all_finite, converged, largest, ratio
 
 
 if TYPE_CHECKING:
@@ -42,42 +41,47 @@ _LONGER, _SHORTER = 2.0, 0.25
 _SHORTEST = 1e-3
 
 
-class Equations(NamedTuple):
-    """The equations `residual(y) = 0` for all unknowns as one vector, which makes a shorter
-    program than a tree of arrays. `restore` makes the tree again, and `measured` says how
-    large a change of it is."""
+class Equations(eqx.Module):
+    r"""The equations `fn(origin + k, args) = 0` for `k`, and as $k = \Phi(k)$."""
 
-    residual: Callable[[_Vector], _Vector]
-    restore: Callable[[_Vector], PyTree[Array]]
-    measured: Measured
+    fn: Callable
+    args: PyTree[Any]
+    options: dict[str, Any]
+    origin: PyTree[Array]
+
+    def moved(self, k: PyTree[Array]) -> PyTree[Array]:
+        return (self.origin**ω + k**ω).ω
+
+    def residual(self, k: PyTree[Array]) -> PyTree[Array]:
+        return self.fn(self.moved(k), self.args)[0]
+
+    def image(self, k: PyTree[Array]) -> PyTree[Array]:
+        return (k**ω - self.residual(k) ** ω).ω
+
+    def scale(self, k: PyTree[Array]) -> PyTree[Array]:
+        # The scale is that of what the unknown is added to: increments are only needed to
+        # the accuracy of the state that they change.
+        return self.options.get("scale", lambda y: y)(self.moved(k))
 
 
-def as_vector(residual: Callable, measured: Measured, y: PyTree[Array]) -> Equations:
-    """The equations for a vector in place of the tree that is like `y`."""
-    restore = jfu.ravel_pytree(y)[1]
-    as_flat = lambda y: jfu.ravel_pytree(residual(restore(y)))[0]
-    return Equations(as_flat, restore, measured)
-
-
-class State(eqx.Module):
+class Progress(eqx.Module):
     r"""Where the continuation stands. With the residual $r$ the equations solved for
     $s \in [0, 1]$ are $(1 - s) k + s\, r(k) = 0$, so $k = s\, \Phi(k)$: those of a step
     whose length and increments are multiplied by $s$.
 
-    - `y`: the iterate; `anchor`: the (rough) solution at `reached`.
+    - `k`: the iterate; `anchor`: the (rough) solution at `reached`.
     - `reached`, `target`: the $s$ that was solved for, and that which is being solved for.
-    - `tries`, `steps`: how many iterations there were for this target, and in all.
+    - `tries`: how many iterations there were for this target.
     - `size`: the last correction, in units of the tolerance.
     - `lost`: whether the branch of solutions that begins at $s = 0$ was given up.
-    - `solved`: whether `y` solves the equations of the whole step.
+    - `solved`: whether `k` solves the equations of the whole step.
     """
 
-    y: _Vector
+    k: _Vector
     anchor: _Vector
     reached: Scalar
     target: Scalar
     tries: Int[Array, ""]
-    steps: Int[Array, ""]
     size: Scalar
     lost: Bool[Array, ""]
     solved: Bool[Array, ""]
@@ -88,86 +92,42 @@ class State(eqx.Module):
         return self.lost & ~jnp.isfinite(self.size)
 
 
-def begin(y: _Vector, solved: Bool[Array, ""]) -> State:
-    """First all of the step at once, from the guess `y`."""
-    return State(
-        y=y,
-        anchor=jnp.zeros_like(y),
-        reached=jnp.zeros((), y.dtype),
-        target=jnp.ones((), y.dtype),
-        tries=jnp.array(0),
-        steps=jnp.array(0),
-        size=jnp.array(jnp.inf, y.dtype),
-        lost=jnp.array(False),
-        solved=solved,
+def begin(k: _Vector, solved: Bool[Array, ""]) -> Progress:
+    """First all of the step at once, from the guess `k`."""
+    zero, no = jnp.zeros((), k.dtype), jnp.array(False)
+    return Progress(
+        k, jnp.zeros_like(k), zero, zero + 1, jnp.array(0), zero + jnp.inf, no, solved
     )
 
 
-def advance(finder: "PicardNewton", equations: Equations, state: State) -> State:
+def advance(
+    finder: "PicardNewton", equations: Equations, progress: Progress
+) -> Progress:
     """One iteration of Newton's method."""
-    if _dense(finder, state):
-        return _dense_iteration(finder, equations, state)
-    iterate = ft.partial(_iterate, finder, equations)
-    first = iterate(
-        (state, _krylov.empty(state.y.size, state.y.dtype), jnp.array(True))
-    )
-    state, *_ = lax.while_loop(lambda carry: ~carry[2], iterate, first)
-    return state
+    restore = jfu.ravel_pytree(equations.origin)[1]
+    residual = lambda k: jfu.ravel_pytree(equations.residual(restore(k)))[0]
+    s, k = progress.target, progress.k
+    # Of the residual `r` at `k`, and of its derivative.
+    part = lambda k, r: (1 - s) * k + s * r
+    if finder.linear_solver is not None or k.size <= _linear.MAX_DENSE:
+        value, jacobian = jax.linearize(residual, k)
+        apply = lambda x: part(x, jacobian(x))
+        diff, exact = _linear.solve(apply, part(k, value), finder.linear_solver)
+        return _correct(finder, equations, progress, value, diff, exact)
 
+    def product(carry):
+        """One evaluation: the residual first, then what GMRES needs."""
+        krylov, first, value = carry
+        new, image = jax.jvp(residual, (k,), (krylov.p,))
+        vector = part(*_where(first, (k, new), (krylov.p, image)))
+        krylov = _krylov.extend(krylov, vector, first)
+        return krylov, jnp.array(False), new
 
-def finish(
-    finder: "PicardNewton", residual: Callable, measured: Measured, y, solved, most: int
-) -> tuple[PyTree[Array], Bool[Array, ""]]:
-    """Goes on from `y` until the equations are solved, or `most` iterations spent. The
-    solution for no step at all is zero."""
-    equations = as_vector(residual, measured, y)
-    going = lambda s: ~s.solved & ~s.hopeless & (s.steps < most)
-    first = begin(jfu.ravel_pytree(y)[0], solved)
-    if _dense(finder, first):
-        iterate = ft.partial(_dense_iteration, finder, equations)
-        state = lax.while_loop(going, iterate, first)
-    else:
-        # The loop of Newton's method and that of GMRES are one, so that the equations occur
-        # in the program only once.
-        iterate = ft.partial(_iterate, finder, equations)
-        carry = first, _krylov.empty(first.y.size, first.y.dtype), jnp.array(True)
-        state, *_ = _compact.while_loop(lambda c: going(c[0]), iterate, carry)
-    return equations.restore(state.y), state.solved
-
-
-def _dense(finder: "PicardNewton", state: State) -> bool:
-    return finder.linear_solver is not None or state.y.size <= _linear.MAX_DENSE
-
-
-def _part(s: Scalar, y: _Vector, r: _Vector) -> _Vector:
-    return (1 - s) * y + s * r
-
-
-def _dense_iteration(finder: "PicardNewton", equations: Equations, state: State):
-    s = state.target
-    value, jacobian = jax.linearize(equations.residual, state.y)
-    apply = lambda x: _part(s, x, jacobian(x))
-    rhs = _part(s, state.y, value)
-    diff, exact = _linear.solve_by(finder.linear_solver, apply, rhs)
-    return _correct(finder, equations, state, value, diff, exact)
-
-
-def _iterate(
-    finder: "PicardNewton",
-    equations: Equations,
-    carry: tuple[State, _krylov.Krylov, Bool[Array, ""]],
-) -> tuple[State, _krylov.Krylov, Bool[Array, ""]]:
-    """One evaluation: the product that GMRES needs next, or for a `fresh` iterate the
-    residual with which it begins. A correction follows when it has ended."""
-    state, krylov, fresh = carry
-    s = state.target
-    value, image = jax.jvp(equations.residual, (state.y,), (krylov.p,))
-    vector = _part(s, *_where(fresh, (state.y, value), (krylov.p, image)))
-    krylov = _krylov.extend(krylov, vector, fresh)
-    corrected = _correct(
-        finder, equations, state, value, krylov.solution, krylov.reduced
-    )
-    return _where(krylov.done, corrected, state), krylov, krylov.done
+    # The equations occur in the program only once.
+    carry = _krylov.empty(k.size, k.dtype), jnp.array(True), jnp.zeros_like(k)
+    going = lambda carry: carry[1] | ~carry[0].done
+    krylov, _, value = lax.while_loop(going, product, carry)
+    return _correct(finder, equations, progress, value, krylov.solution, krylov.reduced)
 
 
 def _where(which: Bool[Array, ""], a: _T, b: _T) -> _T:
@@ -177,50 +137,48 @@ def _where(which: Bool[Array, ""], a: _T, b: _T) -> _T:
 def _correct(
     finder: "PicardNewton",
     equations: Equations,
-    state: State,
+    progress: Progress,
     residual: _Vector,
     diff: _Vector,
     exact: BoolScalarLike,
-) -> State:
+) -> Progress:
     """What follows from the correction `diff` for a residual; `exact` says whether its
     linear system was solved."""
-    s, y = state.target, state.y - diff
-    extent, scale = equations.measured
-    # In one array, for a shorter program.
-    change, moved, residuals, scales = finder.tolerance.norms(
-        *(extent(equations.restore(x)) for x in (diff, state.y, residual)),
-        scale(equations.restore(y)),
+    s, k, tolerance = progress.target, progress.k - diff, finder.tolerance
+    restore = jfu.ravel_pytree(equations.origin)[1]
+    scales = tolerance.sizes(equations.scale(restore(k)))
+    change, moved, residuals = (
+        tolerance.sizes(restore(x)) for x in (diff, progress.k, residual)
     )
-    size, relative = finder.tolerance.compare(change, scales)
-    shrink = jnp.where(state.tries > 0, ratio(size, state.size), 1)
+    size, relative = tolerance.compare(change, scales)
+    shrink = jnp.where(progress.tries > 0, ratio(size, progress.size), 1)
     whole = s == 1
     solved = whole & converged(size, relative, shrink, shrink >= 0.25)
     # Far from all solutions rounding errors of a large Jacobian hide the unknowns that it
     # multiplies least. Then corrections are small where residuals are larger than states.
-    state_size = jnp.maximum(largest(scales), largest(moved)) + finder.tolerance.atol
-    solved &= exact & (largest(residuals) <= state_size) & all_finite(y)
+    state_size = jnp.maximum(largest(scales), largest(moved)) + tolerance.atol
+    solved &= exact & (largest(residuals) <= state_size) & all_finite(k)
 
-    at_once = whole & (state.reached == 0)
+    at_once = whole & (progress.reached == 0)
     patience = jnp.where(at_once, _PATIENCE, 2)
     # No correction at all, if that is not the solution, is no progress either.
     shrinks = (shrink < _SHRINK) & (size > 0)
-    stalled = (state.tries + 1 >= patience) & ~shrinks
+    stalled = (progress.tries + 1 >= patience) & ~shrinks
     near = largest(change) < _LOOSE * largest(moved)
     arrived = near & ~whole
-    slow = ~whole & (state.tries + 1 >= _PATIENCE_IN_PART)
-    back = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~state.lost & ~solved
+    slow = ~whole & (progress.tries + 1 >= _PATIENCE_IN_PART)
+    back = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~progress.lost & ~solved
 
-    stride = s - state.reached
-    reached = jnp.where(arrived, s, state.reached)
+    stride = s - progress.reached
+    reached = jnp.where(arrived, s, progress.reached)
     stride = stride * jnp.where(arrived, _LONGER, jnp.where(back, _SHORTER, 1))
-    lost = state.lost | (stride < _SHORTEST)
-    return State(
-        y=jnp.where(back, state.anchor, y),
-        anchor=jnp.where(arrived, y, state.anchor),
+    lost = progress.lost | (stride < _SHORTEST)
+    return Progress(
+        k=jnp.where(back, progress.anchor, k),
+        anchor=jnp.where(arrived, k, progress.anchor),
         reached=reached,
         target=jnp.where(lost, 1, jnp.minimum(reached + stride, 1)),
-        tries=jnp.where(arrived | back, 0, state.tries + 1),
-        steps=state.steps + 1,
+        tries=jnp.where(arrived | back, 0, progress.tries + 1),
         size=size,
         lost=lost,
         solved=solved,

@@ -1,5 +1,5 @@
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,16 +8,23 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, PyTree, Scalar
+from jaxtyping import Array, Bool, PyTree, Scalar
 
 from .._compat import ω
-from .._custom_types import IntScalarLike
 from . import _continuation
-from ._start import improve, Measured, start, Sweep
+from ._batch import where_pending
+from ._sweeps import sweep, sweep_blocks
 from ._tolerance import Tolerance
 
 
-class PicardNewton(optx.AbstractRootFinder):
+class State(eqx.Module):
+    """Where the search stands: how far it has come from `origin`, the first guess."""
+
+    origin: PyTree[Array]
+    progress: _continuation.Progress
+
+
+class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, State]):
     r"""For stage equations $k = \Phi(k)$, given as $k - \Phi(k) = 0$: solves them to
     rounding error, cheaply when the step is small and robustly when it is not.
 
@@ -26,24 +33,19 @@ class PicardNewton(optx.AbstractRootFinder):
     the *next* correction would be below it: after $\delta_{n-1}$ and $\delta_n$ that is
     about $\delta_n\, (\delta_n / \delta_{n-1})$ for a method of linear convergence.
 
-    First come iterations without a safety net, for each system of a step on its own:
+    First come iterations for all paths of a batch together, until each is solved or does
+    not converge: fixed-point (Picard) iterations, which need no Jacobian. Where these are
+    slow, and at once for two unknowns or fewer, chord iterations follow up to `direct`
+    unknowns: those of Newton's method with one Jacobian.
 
-    - Up to `direct` unknowns: `warmup` fixed-point (Picard) iterations, one of Newton's
-        method, and `chords` with the same Jacobian. Newton's method begins at the guess
-        where the last of several fixed-point iterations changes the values by more than
-        half of what all of them did.
-    - Above: `sweeps` fixed-point iterations, which need no Jacobian, without a look at the
-        error; and rounds of `more_sweeps`, up to `picard_steps` in all, for as long as
-        corrections shrink.
-
-    Where these do not converge, Newton's method solves all stages of the step as one
-    system. It tries the whole step first. If its corrections do not shrink, it solves for a
-    part of the step, with increments reduced alike, and goes on from there part by part
-    (continuation). If the branch of solutions that begins at the start of the step ends
-    before the whole step, Newton's method looks for any other solution. Its linear systems
-    are solved by elimination up to four unknowns, and above by GMRES, which needs no
-    matrix. A small correction is no success where its linear system was not solved, or
-    where the residual is larger than the state.
+    The paths that are left are gathered from the batch. For these, each step is one of
+    Newton's method. Its linear systems are solved by elimination up to 32 unknowns, and
+    above by GMRES, which needs no matrix. If its corrections do not shrink, it solves for
+    a part of the time step, with increments reduced alike, and goes on from there part by
+    part (continuation). If the branch of solutions that begins at the start of the step
+    ends before the whole step, Newton's method looks for any other solution. A small
+    correction is no success where its linear system was not solved, or where the residual
+    is larger than the state.
 
     **Arguments:**
 
@@ -53,11 +55,17 @@ class PicardNewton(optx.AbstractRootFinder):
     - `norm`: norm within a leaf.
     - `linear_solver`: a Lineax solver for all linear systems, those of derivatives
         included. `None` is elimination for few unknowns, and otherwise no matrix.
-    - `direct`: the most unknowns for which Newton's method is used from the start.
-    - `warmup`, `chords`, `sweeps`, `more_sweeps`, `picard_steps`: see above.
+    - `direct`: the most unknowns for chord iterations. The Jacobian of more, and its
+        inverse, cost more than the iterations that they save.
+    - `sweeps`, `more_sweeps`: fixed-point iterations before the first look at the error,
+        and between two of them.
+    - `picard_steps`: the most iterations before Newton's method.
 
     In `optimistix.root_find`, `options={"scale": f}` says how large the state is that the
     unknowns `k` change: `f(k)` has their structure, and stands in place of `k` in `rtol`.
+    With `options={"blocks": fs}` the unknowns are a list, and the equations come in blocks,
+    each of which reads those before it: `fs[i](k)` returns the function whose fixed point
+    is `k[i]`. First iterations then solve one block after another.
 
     **Raises:** a `ValueError` for negative numbers, fewer than 2 `sweeps`, or
         no `more_sweeps`.
@@ -67,17 +75,13 @@ class PicardNewton(optx.AbstractRootFinder):
     atol: float = 0.0
     norm: Callable[[PyTree], Scalar] = optx.max_norm
     linear_solver: lx.AbstractLinearSolver | None = None
-    direct: int = eqx.field(default=4, static=True)
-    warmup: int = eqx.field(default=4, static=True)
-    chords: int = eqx.field(default=1, static=True)
+    direct: int = eqx.field(default=6, static=True)
     sweeps: int = eqx.field(default=9, static=True)
-    picard_steps: int = eqx.field(default=40, static=True)
     more_sweeps: int = eqx.field(default=4, static=True)
+    picard_steps: int = eqx.field(default=40, static=True)
 
     def __check_init__(self):
-        least = dict(
-            direct=0, warmup=0, chords=0, sweeps=2, more_sweeps=1, picard_steps=0
-        )
+        least = dict(direct=0, sweeps=2, more_sweeps=1, picard_steps=0)
         for name, n in least.items():
             if getattr(self, name) < n:
                 raise ValueError(
@@ -98,21 +102,17 @@ class PicardNewton(optx.AbstractRootFinder):
         f_struct: PyTree[jax.ShapeDtypeStruct],
         aux_struct: PyTree[jax.ShapeDtypeStruct],
         tags: frozenset[object],
-    ) -> "_Search":
+    ) -> State:
         del f_struct, aux_struct, tags
-        displaced = _Displaced(fn, args, options, y)
-
-        def improve_all(systems: list[PyTree[Array]], sweeps: IntScalarLike) -> Sweep:
-            found = improve(
-                self, displaced.image, systems[0], displaced.measured, sweeps
-            )
-            return found._replace(y=[found.y])
-
+        equations = _continuation.Equations(fn, args, options, y)
         zero = jtu.tree_map(jnp.zeros_like, y)
-        first = start(self, improve_all, [zero], displaced.measured)
-        origin, near = (jfu.ravel_pytree(y)[0] for y in (y, first.y))
-        near = jnp.where(first.converged | first.near, near, 0)
-        return _Search(origin, _continuation.begin(near, first.converged))
+        if "blocks" in options:
+            found = sweep_blocks(self, options["blocks"], zero, equations.scale)
+        else:
+            found = sweep(self, equations.image, zero, equations.scale)
+        use = lambda k: jnp.where(found.solved | found.near, k, 0)
+        k = jfu.ravel_pytree(jtu.tree_map(use, found.y))[0]
+        return State(y, _continuation.begin(k, found.solved))
 
     def step(
         self,
@@ -120,16 +120,21 @@ class PicardNewton(optx.AbstractRootFinder):
         y: PyTree[Array],
         args: PyTree[Any],
         options: dict[str, Any],
-        state: "_Search",
+        state: State,
         tags: frozenset[object],
-    ) -> tuple[PyTree[Array], "_Search", Any]:
+    ) -> tuple[PyTree[Array], State, Any]:
         del tags
-        origin = jfu.ravel_pytree(y)[1](state.origin)
-        displaced = _Displaced(fn, args, options, origin)
-        equations = _continuation.as_vector(displaced.residual, displaced.measured, y)
-        progress = _continuation.advance(self, equations, state.progress)
-        y = displaced.moved(equations.restore(progress.y))
-        return y, _Search(state.origin, progress), fn(y, args)[1]
+        equations = _continuation.Equations(fn, args, options, state.origin)
+        pending = ~(state.progress.solved | state.progress.hopeless)
+
+        def advance(problem, progress):
+            finder, equations = problem
+            return _continuation.advance(finder, equations, progress)
+
+        problem = self, equations
+        progress = where_pending(advance, pending, problem, state.progress)
+        y = equations.moved(jfu.ravel_pytree(y)[1](progress.k))
+        return y, State(state.origin, progress), fn(y, args)[1]
 
     def terminate(
         self,
@@ -137,7 +142,7 @@ class PicardNewton(optx.AbstractRootFinder):
         y: PyTree[Array],
         args: PyTree[Any],
         options: dict[str, Any],
-        state: "_Search",
+        state: State,
         tags: frozenset[object],
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         del fn, y, args, options, tags
@@ -153,44 +158,13 @@ class PicardNewton(optx.AbstractRootFinder):
         aux: Any,
         args: PyTree[Any],
         options: dict[str, Any],
-        state: "_Search",
+        state: State,
         tags: frozenset[object],
         result: optx.RESULTS,
     ) -> tuple[PyTree[Array], Any, dict[str, Any]]:
         del options, tags, result
-        found = jfu.ravel_pytree(y)[1](state.origin + state.progress.y)
-        # If the cheap iterations solved the equations, no step has computed it.
+        k = jfu.ravel_pytree(y)[1](state.progress.k)
+        found = (state.origin**ω + k**ω).ω
+        # If the first iterations solved the equations, no step has computed it.
         aux = fn(found, args)[1] if jtu.tree_leaves(aux) else aux
         return found, aux, {}
-
-
-class _Search(eqx.Module):
-    """Where a search by itself stands: how far it has come from `origin`."""
-
-    origin: Float[Array, " n"]
-    progress: _continuation.State
-
-
-class _Displaced(NamedTuple):
-    """The equations `fn(y, args) = 0` for `k = y - origin`."""
-
-    fn: Callable
-    args: PyTree[Any]
-    options: dict[str, Any]
-    origin: PyTree[Array]
-
-    def moved(self, k: PyTree[Array]) -> PyTree[Array]:
-        return (self.origin**ω + k**ω).ω
-
-    def residual(self, k: PyTree[Array]) -> PyTree[Array]:
-        return self.fn(self.moved(k), self.args)[0]
-
-    def image(self, k: PyTree[Array]) -> PyTree[Array]:
-        return (k**ω - self.residual(k) ** ω).ω
-
-    @property
-    def measured(self) -> Measured:
-        # The scale is that of what the unknown is added to: increments are only needed to
-        # the accuracy of the state that they change.
-        scale = self.options.get("scale", lambda y: y)
-        return Measured(lambda change: change, lambda k: scale(self.moved(k)))

@@ -45,10 +45,6 @@ class Stages(eqx.Module):
     step: Step
     y0: Y
 
-    def unknown_of(self, block: Block, values: Values) -> list[_Value]:
-        """The unknown stages of a block, evaluated once all others are known."""
-        return [self._evaluate_group(group, values) for group in block.unknown]
-
     def zero_of(self, block: Block) -> list[_Value]:
         """Zero for each unknown stage of a block."""
 
@@ -60,15 +56,38 @@ class Stages(eqx.Module):
 
         return [zero(group) for group in block.unknown]
 
-    def given(self, block: Block, values: Values, unknown: list[_Value]) -> Values:
-        """`values` with those of the unknown stages of a block."""
+    def image_of(self, number: int, unknown: Unknown) -> Callable:
+        r"""$\Phi$ of the stage equations $k = \Phi(k)$ of one block, given the unknown
+        values of those before it."""
+        values = {}
+        for block, k in zip(self.plan.blocks[:number], unknown):
+            values = self._with_block(block, values, k, keep=True)
+        return ft.partial(self._image, self.plan.blocks[number], values)
+
+    def image(self, unknown: Unknown) -> Unknown:
+        r"""$\Phi$ for the whole step."""
+        values, image = {}, []
+        for block, k in zip(self.plan.blocks, unknown):
+            image.append(self._image(block, values, k))
+            values = self._with_block(block, values, k)
+        return image
+
+    def _image(self, block: Block, known: Values, k: list[_Value]) -> list[_Value]:
+        """Each group of stages reads what the groups before it have become (Gauss-Seidel),
+        which takes fewer iterations than to evaluate all at once."""
+        values, image = self._with_block(block, known, k), []
+        for group in block.unknown:
+            image.append(self._evaluate_group(group, values))
+            values = values | _unstack(group, image[-1])
+        return image
+
+    def _with_block(
+        self, block: Block, values: Values, unknown: list[_Value], keep: bool = False
+    ) -> Values:
+        """`values` with those of the stages of a block. With `keep`, explicit ones that
+        enter several positions are computed only once."""
         for group, value in zip(block.unknown, unknown):
             values = values | _unstack(group, value)
-        return values
-
-    def explicit_of(self, block: Block, values: Values, keep: bool = False) -> Values:
-        """`values` with those of the explicit stages of a block. With `keep`, values that
-        enter several positions are computed only once."""
         for group in block.explicit:
             evaluate = ft.partial(self._evaluate_group, group, values)
             shared = keep and _uses(self.plan.tableau, group) > 1
@@ -76,46 +95,25 @@ class Stages(eqx.Module):
             values = values | _unstack(group, new)
         return values
 
-    def image(self, unknown: Unknown) -> Unknown:
-        r"""$\Phi$ of the stage equations $k = \Phi(k)$ of the whole step."""
-        values, image = {}, []
-        for block, k in zip(self.plan.blocks, unknown):
-            values = self.explicit_of(block, self.given(block, values, k))
-            image.append(self.unknown_of(block, values))
-        return image
-
-    def end(self, unknown: Unknown, keep: bool = False) -> Y:
+    def end(self, unknown: Unknown) -> Y:
         """The end of the step."""
-        values = {}
+        values, tableau = {}, self.plan.tableau
         for block, k in zip(self.plan.blocks, unknown):
-            values = self.explicit_of(block, self.given(block, values, k), keep)
-        tableau = self.plan.tableau
+            values = self._with_block(block, values, k, keep=True)
         return _position(self.y0, tableau.stages, tableau.weights[None], values)
 
-    def extent(self, unknown: Unknown) -> list[Array]:
-        """For each leaf of the state that unknown values change: entry by entry, the
-        largest of them in absolute value. Blocks without values are left out."""
-        return [largest for _, largest in self._extents(unknown)]
+    def scale(self, unknown: Unknown) -> Unknown:
+        """How large the state is that unknown values change: they are only needed to its
+        accuracy."""
 
-    def scale(self, unknown: Unknown) -> list[Array]:
-        """How large the state is that the unknown values change, leaf by leaf as in
-        `extent`: they are only needed to its accuracy."""
-        leaves = jtu.tree_leaves(self.y0)
-        return [jnp.abs(leaves[i]) + x for i, x in self._extents(unknown)]
+        def scale(group: tuple[int, ...], value: _Value) -> _Value:
+            changed = _part(self.y0, self.plan.tableau.stages[group[0]].writes)
+            return jtu.tree_map(lambda y, k: jnp.abs(y) + jnp.abs(k), changed, value)
 
-    def _extents(self, unknown: Unknown) -> list[tuple[int, Array]]:
-        treedef = jtu.tree_structure(self.y0)
-        numbers = treedef.unflatten(range(treedef.num_leaves))
-        largest = {}
-        for block, k in zip(self.plan.blocks, unknown):
-            for group, value in zip(block.unknown, k):
-                writes = self.plan.tableau.stages[group[0]].writes
-                changed = jtu.tree_leaves(_part(numbers, writes))
-                for stage in _unstack(group, value).values():
-                    for i, x in zip(changed, jtu.tree_leaves(stage)):
-                        x = jnp.abs(x)
-                        largest[i] = jnp.maximum(largest[i], x) if i in largest else x
-        return list(largest.items())
+        return [
+            [scale(group, k) for group, k in zip(block.unknown, values)]
+            for block, values in zip(self.plan.blocks, unknown)
+        ]
 
     def _evaluate_group(self, group: tuple[int, ...], values: Values) -> _Value:
         """The values of stages of one kind; stacked, unless it is only one."""

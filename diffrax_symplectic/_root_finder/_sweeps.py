@@ -1,0 +1,200 @@
+"""The iterations that normally solve a step, for all paths of a batch together."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TYPE_CHECKING
+
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Bool, PyTree, Scalar
+
+from .._compat import ω
+from .._custom_types import IntScalarLike
+from ._batch import any_of_batch
+from ._linear import inverse, matrix_of
+from ._tolerance import all_finite, converged, largest, ratio
+
+
+if TYPE_CHECKING:
+    from ._picard_newton import PicardNewton
+
+_Map = Callable[[PyTree[Array]], PyTree[Array]]
+
+# Up to so many unknowns chords follow at once: they cost no more than a look at the error.
+_AT_ONCE = 2
+# Fixed-point iterations before these, and by how much the last of them may change the
+# values, as a fraction of what all of them did.
+_WARMUP, _SETTLED = 4, 0.5
+# So many more fixed-point iterations cost as much as the Jacobian and its inverse do.
+_SLOW = 24
+# Chord iterations between two looks at the error, and the most of them.
+_CHORDS, _MOST_CHORDS = 2, 20
+# A correction below this fraction of the state shows that iteration came near.
+_NEAR = 0.1
+
+
+class Found(NamedTuple):
+    """Where iteration ended.
+
+    - `y`: the last iterate.
+    - `solved`: whether the next correction would be below the tolerance.
+    - `near`: whether `y` is a better first guess than the one that it began with.
+    """
+
+    y: PyTree[Array]
+    solved: Bool[Array, ""]
+    near: Bool[Array, ""]
+
+
+class _Rounds(NamedTuple):
+    """The iterate, the size of its last correction, whether that was small enough, whether
+    iteration comes nearer, whether it goes on, and how many iterations there were."""
+
+    y: PyTree[Array]
+    size: Scalar
+    solved: Bool[Array, ""]
+    near: Bool[Array, ""]
+    going: Bool[Array, ""]
+    step: IntScalarLike
+
+
+class _Look(NamedTuple):
+    """A look at what iteration made of its values."""
+
+    finder: "PicardNewton"
+    scale: _Map
+    most: int
+    restore: _Map = lambda y: y
+
+    def size(self, change: PyTree[Array], y: PyTree[Array]) -> tuple[Scalar, Scalar]:
+        """The size of a change, in units of the tolerance and relative to the state."""
+        tolerance = self.finder.tolerance
+        return tolerance.compare(
+            tolerance.sizes(self.restore(change)),
+            tolerance.sizes(self.scale(self.restore(y))),
+        )
+
+    def at(self, y, change, earlier: Scalar, count: IntScalarLike, step) -> _Rounds:
+        """After `count` iterations, the last of which was `change`, since the correction
+        of the size `earlier`."""
+        size, relative = self.size(change, y)
+        shrink = ratio(size, earlier) ** (1 / count)
+        stalled = size >= 0.5 * earlier
+        # The norms do not tell: on CPUs XLA may return -inf as the maximum of NaNs.
+        finite = all_finite(y)
+        solved = finite & converged(size, relative, shrink, stalled)
+        near = finite & (relative <= _NEAR) & ~stalled
+        following = size * shrink**self.most
+        going = ~solved & near & (step < self.finder.picard_steps) & (following <= 1)
+        return _Rounds(y, size, solved, near, going, step)
+
+
+def _while_any(advance: Callable[[_Rounds], _Rounds], first: _Rounds) -> Found:
+    """Rounds until every path of the batch is solved or has left."""
+
+    def body(last: _Rounds) -> _Rounds:
+        new = advance(last)
+        # The rounds of all paths of a batch are the same, but each path has only its own.
+        y, solved, near = jtu.tree_map(
+            lambda a, b: jnp.where(last.going, a, b),
+            new[:1] + new[2:4],
+            last[:1] + last[2:4],
+        )
+        return _Rounds(y, new.size, solved, near, last.going & new.going, new.step)
+
+    last = lax.while_loop(lambda rounds: any_of_batch(rounds.going), body, first)
+    return Found(last.y, last.solved, last.near)
+
+
+def sweep(finder: "PicardNewton", image: _Map, y: PyTree[Array], scale: _Map) -> Found:
+    r"""Solves $y = \Phi(y)$ by $y \leftarrow y + M (\Phi(y) - y)$: fixed-point iteration
+    with $M = 1$, and chord iteration with $M = (1 - \Phi')^{-1}$ where that is slow."""
+    n = sum(x.size for x in jtu.tree_leaves(y))
+    direct = n <= finder.direct and finder.linear_solver is None
+    if direct and n <= _AT_ONCE:
+        # Not even a look at the error pays.
+        before, swept = _fixed_point(image, y, _WARMUP)
+        # Where these go away from the solution, Newton's method begins at the guess.
+        sizes = finder.tolerance.sizes
+        last, whole = sizes((swept**ω - before**ω).ω), sizes((swept**ω - y**ω).ω)
+        settled = largest(last) < _SETTLED * largest(whole)
+        y = jtu.tree_map(lambda a, b: jnp.where(settled, a, b), swept, y)
+        yes = jnp.array(True)
+        return _by_chords(finder, image, scale, Found(y, ~yes, yes))
+    slow = _SLOW if direct else finder.picard_steps
+    found = _by_sweeps(_Look(finder, scale, slow), image, y)
+    if not direct:
+        return found
+    rest = lambda found: _by_chords(finder, image, scale, found)
+    return lax.cond(any_of_batch(~found.solved), rest, lambda found: found, found)
+
+
+def _fixed_point(
+    image: _Map, y: PyTree[Array], times: IntScalarLike
+) -> tuple[PyTree[Array], PyTree[Array]]:
+    """The last two iterates. XLA makes faster code of a loop than of iterations written
+    out."""
+    return lax.fori_loop(0, times, lambda _, ys: (ys[1], image(ys[1])), (y, y))
+
+
+def sweep_blocks(
+    finder: "PicardNewton",
+    blocks: Sequence[Callable[[list[PyTree[Array]]], _Map]],
+    y: list[PyTree[Array]],
+    scale: _Map,
+) -> Found:
+    """The same for equations in blocks, of which each reads those before it. For each there
+    is a function that makes its `image` from the values of all."""
+    solved = near = jnp.array(True)
+    y = list(y)
+    for i, block in enumerate(blocks):
+        if len(y[i]) == 0:
+            continue
+        own = lambda k, i=i: scale([*y[:i], k, *y[i + 1 :]])[i]
+        found = sweep(finder, block(y), y[i], own)
+        y[i] = found.y
+        solved, near = solved & found.solved, near & (found.solved | found.near)
+    return Found(y, solved, near)
+
+
+def _by_sweeps(look: _Look, image: _Map, y: PyTree[Array]) -> Found:
+    def advance(rounds: _Rounds) -> _Rounds:
+        first = rounds.step == 0
+        count = jnp.where(first, look.finder.sweeps, look.finder.more_sweeps)
+        before, y = _fixed_point(image, rounds.y, count)
+        # The first iteration changed the values from zero to nearly what they are now.
+        earlier = jnp.where(first, look.size(y, y)[0], rounds.size)
+        change = (y**ω - before**ω).ω
+        return look.at(y, change, earlier, count, rounds.step + count)
+
+    dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).dtype
+    no, yes = jnp.array(False), jnp.array(True)
+    return _while_any(advance, _Rounds(y, jnp.zeros((), dtype), no, yes, yes, 0))
+
+
+def _by_chords(
+    finder: "PicardNewton", tree_image: _Map, scale: _Map, begin: Found
+) -> Found:
+    """From where iteration `begin`s, for paths that are not yet solved."""
+    use = lambda x: jnp.where(begin.solved | begin.near, x, 0)
+    k, restore = jfu.ravel_pytree(jtu.tree_map(use, begin.y))
+    image = lambda k: jfu.ravel_pytree(tree_image(restore(k)))[0]
+    look = _Look(finder, scale, _MOST_CHORDS, restore)
+    value, jacobian = jax.linearize(image, k)
+    one = jnp.eye(k.size, dtype=k.dtype)
+    M = inverse(one - matrix_of(jacobian, k.size, k.dtype))
+    diff = M @ (value - k)
+    moved = jnp.where(begin.solved, k, k + diff)
+    size, _ = look.size(diff, moved)
+
+    def advance(rounds: _Rounds, chords: int = _CHORDS) -> _Rounds:
+        before = k = rounds.y
+        for _ in range(chords):
+            before, k = k, k + M @ (image(k) - k)
+        return look.at(k, k - before, rounds.size, chords, rounds.step + chords)
+
+    first = _Rounds(moved, size, begin.solved, begin.near, ~begin.solved, 0)
+    found = _while_any(advance, first)
+    return found._replace(y=restore(found.y))
