@@ -15,7 +15,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from ._arguments import check_solver, check_takes
+from ._arguments import check_solver, check_takes, shapes
 from ._brownian import (
     FixedStepBrownianPath,
     LevyAreaBrownianPath,
@@ -260,9 +260,8 @@ def _check_solvers(solvers, reference) -> None:
 def _check_scalar(phi, y0: Y) -> None:
     check_takes("phi", phi, "y")
     out = eqx.filter_eval_shape(lambda y: jtu.tree_map(jnp.asarray, phi(y)), y0)
-    shapes = [leaf.shape for leaf in jtu.tree_leaves(out)]
-    if shapes != [()]:
-        raise ValueError(f"`phi` must return one number; got {eqx.tree_pformat(out)}.")
+    if [leaf.shape for leaf in jtu.tree_leaves(out)] != [()]:
+        raise ValueError(f"`phi` must return one number; got shape {shapes(out)}.")
 
 
 def _checked_steps(t0, t1, dts: Sequence[float]) -> list[float]:

@@ -1,6 +1,5 @@
 """Which structures are recognised from the flow of data, and which are refused."""
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,6 @@ from diffrax_symplectic._structure_checks import (
     constant_fault,
     separable_fault,
 )
-from diffrax_symplectic._data_flow import DataFlow
 
 
 K = jnp.array([[2.0, -1.0], [-1.0, 2.0]])
