@@ -27,6 +27,7 @@ from ._brownian import (
 from ._custom_types import Args, Y
 from ._estimate import Expectation
 from ._expectation import expectation
+from ._structure_checks import check_stratonovich
 from ._suggest import suggest_solver
 from ._suggestion_rules import PATHS, RULES
 
@@ -232,6 +233,7 @@ def compare_solvers(
 
 
 def _end(terms, solver, t0, t1, dt, y0, args) -> tuple[Y, diffrax.RESULTS]:
+    check_stratonovich(terms, solver, t0, y0, args)
     options: Any = dict(max_steps=None, adjoint=diffrax.ForwardMode(), throw=False)
     sol = diffrax.diffeqsolve(terms, solver, t0, t1, dt, y0, args, **options)
     return jtu.tree_map(lambda y: y[-1], sol.ys), sol.result

@@ -4,7 +4,7 @@ The answer holds for all values: a result that is said not to depend on an input
 The converse fails where variables cancel, as in `x - x`, which is said to depend on `x`.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,7 +13,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from ._compat import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from ._compat import ClosedJaxpr, inner_programs, Jaxpr, JaxprEqn, Literal
 
 
 # What is known of a value, the larger the less. A product with zero is zero, since values
@@ -89,7 +89,7 @@ def _through(eqn: JaxprEqn, known: list[int]) -> list[int]:
         index, *operands = known
         branches = [_run(branch, operands) for branch in params["branches"]]
         return [_DEPENDENT if index == _DEPENDENT else max(x) for x in zip(*branches)]
-    programs = list(_programs(params))
+    programs = list(inner_programs(eqn))
     if len(programs) == 1 and _is_call(eqn, programs[0]):
         return _run(programs[0], known)
     most = max(known, default=_FIXED)
@@ -134,11 +134,3 @@ def _is_call(eqn: JaxprEqn, program: Jaxpr | ClosedJaxpr) -> bool:
     kinds = lambda variables: [(x.aval.shape, x.aval.dtype) for x in variables]
     same = lambda a, b: len(a) == len(b) and kinds(a) == kinds(b)
     return same(inner.invars, eqn.invars) and same(inner.outvars, eqn.outvars)
-
-
-def _programs(params: dict) -> Iterator[Any]:
-    """The programs among the parameters of a primitive."""
-    for value in params.values():
-        for item in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(item, Jaxpr | ClosedJaxpr):
-                yield item

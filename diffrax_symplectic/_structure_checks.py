@@ -1,5 +1,5 @@
-"""Whether a system has the structure that a family of methods relies on: decided by the flow
-of data through the vector fields, or by what the user asserts."""
+"""Whether a system has the structure that a family of methods relies on: decided by the
+flow of data through the vector fields, or by what the user asserts."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from ._compat import ω
 from ._custom_types import Args, RealScalarLike, Y
 from ._data_flow import DataFlow
 from ._hamiltonian import asserted_structure, check_pair, is_hamiltonian, pair_fault
-from ._terms import apply
+from ._terms import apply, split_terms
 
 
 class Fault(NamedTuple):
@@ -115,6 +115,27 @@ def constant_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault
         if not _flow(term, t0, y0, args).independent(_of_t):
             return Fault("it depends on time", "Use `SRKs4`, which takes it.")
     return None
+
+
+def check_stratonovich(
+    terms: diffrax.AbstractTerm,
+    solver: diffrax.AbstractSolver,
+    t0: RealScalarLike,
+    y0: Y,
+    args: Args,
+) -> None:
+    """Raises a `ValueError` if a solver in the sense of Ito is to solve terms made from
+    Hamiltonians, which are in the sense of Stratonovich. For additive noise both agree."""
+    if not isinstance(solver, diffrax.AbstractItoSolver):
+        return
+    noise = tuple(filter(is_hamiltonian, split_terms(terms)[1]))
+    if additive_fault(noise, t0, y0, args) is not None:
+        raise ValueError(
+            f"`{type(solver).__name__}` solves equations in the sense of Ito. Those of "
+            "`hamiltonian_terms` are in the sense of Stratonovich, and here they differ. Use "
+            "a solver of this package, or a Stratonovich solver of Diffrax such as "
+            "`diffrax.Heun`."
+        )
 
 
 def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> DataFlow:
