@@ -68,8 +68,8 @@ def is_adjoint_term(term: diffrax.AbstractTerm) -> bool:
 
 def solves_without_throwing(program: Jaxpr) -> bool:
     """Whether a program calls `diffrax.diffeqsolve` with `throw=False`: whether no error is
-    raised after the loop of a solve. (The programs of a gradient are a solve forward and one
-    backward, of which the first may raise an error.)"""
+    raised after the loop of a solve. (The programs of a gradient are a solve forward and
+    one backward, of which the first may raise an error.)"""
     is_solve = lambda eqn: eqn.params.get("name") == "diffeqsolve"
     solves = [x for eqn in program.eqns if is_solve(eqn) for x in inner_programs(eqn)]
     if solves:

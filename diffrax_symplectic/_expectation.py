@@ -300,7 +300,8 @@ def check_failures_are_reported(program: ClosedJaxpr, out: PyTree) -> None:
             "`fn` solves with `throw=False` but does not return `sol.result`, so that "
             "paths that failed would be averaged as if they had not. Return the pair "
             "`(phi, sol.result)`: then they are left out and counted. Or pass `throw=True` "
-            "to `diffeqsolve`, which raises an error if a path fails."
+            "to `diffeqsolve`, which raises an error if a path fails. If `fn` sees to "
+            "failures itself, return `(phi, diffrax.RESULTS.successful)`."
         )
 
 

@@ -132,8 +132,8 @@ def check_stratonovich(
     if additive_fault(noise, t0, y0, args) is not None:
         raise ValueError(
             f"`{type(solver).__name__}` solves equations in the sense of Ito. Those of "
-            "`hamiltonian_terms` are in the sense of Stratonovich, and here they differ. Use "
-            "a solver of this package, or a Stratonovich solver of Diffrax such as "
+            "`hamiltonian_terms` are in the sense of Stratonovich, and here they differ. "
+            "Use a solver of this package, or a Stratonovich solver of Diffrax such as "
             "`diffrax.Heun`."
         )
 
