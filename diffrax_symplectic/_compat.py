@@ -133,9 +133,8 @@ def innermost_times() -> tuple[Any, Any, Any] | None:
     outer = None if frame is None else frame.f_back
     if outer is None or outer.f_globals.get("__name__") != "equinox._jit":
         return None
-    signature = inspect.signature(diffrax.diffeqsolve)
-    given = outer.f_locals
-    bound = signature.bind(*given["args"], **given["kwargs"]).arguments
+    args, kwargs = outer.f_locals["args"], outer.f_locals["kwargs"]
+    bound = inspect.signature(diffrax.diffeqsolve).bind(*args, **kwargs).arguments
     return bound["t0"], bound["t1"], bound["dt0"]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.core
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
@@ -61,7 +62,7 @@ def _constants(values) -> list[int]:
 
 
 def _constant(value: Any) -> int:
-    number = jax.dtypes.issubdtype(jax.dtypes.result_type(value), np.number)
+    number = jnp.issubdtype(jnp.result_type(value), np.number)
     here = getattr(value, "is_fully_addressable", True)
     return _ZERO if number and here and not np.any(np.asarray(value)) else _FIXED
 

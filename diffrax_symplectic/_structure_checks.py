@@ -6,6 +6,7 @@ from typing import NamedTuple
 import diffrax
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
@@ -187,30 +188,31 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     t0 = jnp.asarray(t0, jnp.result_type(float))
     struct = eqx.filter_eval_shape(lambda: [term.contr(t0, t0) for term in noise])
 
+    leaves, treedef = jtu.tree_flatten((y0, struct, struct))
+    # Most functions are defined between 0 and 1, even if they are not everywhere.
+    laws = jr.normal, jr.uniform
+    draw = lambda law, key: treedef.unflatten(
+        law(k, jnp.shape(x), jnp.result_type(x))
+        for k, x in zip(jr.split(key, len(leaves)), leaves)
+    )
+    largest = lambda y: jfu.ravel_pytree(
+        jtu.tree_map(jnp.max, jtu.tree_map(jnp.abs, y))
+    )
+
     @eqx.filter_jit
     @jax.vmap
-    def sizes(key, positive):
-        leaves, treedef = jtu.tree_flatten((y0, struct, struct))
-        y, x, z = treedef.unflatten(
-            # Most functions are defined between 0 and 1 even if not everywhere.
-            jnp.where(
-                positive,
-                jr.uniform(k, s.shape, s.dtype),
-                jr.normal(k, s.shape, s.dtype),
-            )
-            for k, s in zip(jr.split(key, len(leaves)), leaves)
-        )
+    def sizes(point):
+        y, x, z = point
         along = lambda control: lambda y: apply(noise, control, args, t0, y)
         first = jax.jvp(along(z), (y,), (along(x)(y),))[1]
         second = jax.jvp(along(x), (y,), (along(z)(y),))[1]
-        size = lambda tree: jnp.max(
-            jnp.stack([jnp.max(jnp.abs(v)) for v in jtu.tree_leaves(tree)])
-        )
-        return size(first), size((first**ω - second**ω).ω)
+        bracket = (first**ω - second**ω).ω
+        return jnp.max(largest(first)[0]), jnp.max(largest(bracket)[0])
 
     try:
         with jax.disable_jit(False):
-            size, bracket = sizes(jr.split(jr.key(0), 8), jnp.arange(8) % 2 == 1)
+            points = [draw(law, jr.key(i)) for i in range(4) for law in laws]
+            size, bracket = sizes(jtu.tree_map(lambda *x: jnp.stack(x), *points))
             finite = jnp.isfinite(size) & jnp.isfinite(bracket)
             small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
             return bool(jnp.any(finite) & jnp.all(small | ~finite))

@@ -1,6 +1,7 @@
 """Systems are refused for their structure, not for the way in which they are written."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -199,3 +200,14 @@ def test_friction_in_a_second_term_is_not_blamed_on_the_hamiltonian():
     alone = diffrax.MultiTerm(friction, terms.terms[1])
     with pytest.raises(ValueError, match="dH0/dq depends on p"):
         ds.StormerVerlet().init(alone, 0.0, 0.1, _positive_state, None)
+
+
+def test_a_check_of_the_users_does_not_stop_the_advice():
+    def noise(t, p, q, args):
+        q = eqx.error_if(q, jnp.any(q < 0.15), "coordinates must be positive")
+        return jnp.stack([jnp.sum(p * q), jnp.sum(p * q) ** 2])
+
+    path = ds.WeakBrownianPath((2,), jr.key(0))
+    terms = ds.hamiltonian_terms(lambda t, p, q, args: jnp.sum(p * q), noise, path)
+    assert not commuting((terms.terms[1],), 0.0, _positive_state, None)
+    assert len(ds.suggest_solver(terms, _positive_state)) > 0
