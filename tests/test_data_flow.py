@@ -7,6 +7,7 @@ import jax.random as jr
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._data_flow import DataFlow
 from diffrax_symplectic._structure_checks import (
     additive_fault,
     constant_fault,
@@ -161,3 +162,40 @@ def test_additive_and_constant_noise_is_recognised(name):
     _, noise = _terms(_over_sites, H)
     assert (additive_fault(noise, 0.0, Y0, ARGS) is None) == additive
     assert (constant_fault(noise, 0.0, Y0, ARGS) is None) == constant
+
+
+_count = lambda n, f, x: jax.lax.while_loop(
+    lambda c: c[0] < n, lambda c: (c[0] + 1, f(c[1])), (0, x)
+)[1]
+PROGRAMS = {
+    # Whether the result does not depend on x.
+    "repeated": (lambda x, y: _count(3, lambda s: 2 * s, y), True),
+    "repeated as often as x says": (lambda x, y: _count(x, lambda s: 2 * s, y), False),
+    "read in a loop": (lambda x, y: _count(3, lambda s: s + x, y), False),
+    "carried from one to the other": (
+        lambda x, y: jax.lax.fori_loop(0, 3, lambda i, s: (s[1], s[2], x), (y, y, y))[
+            0
+        ],
+        False,
+    ),
+    "zeros": (lambda x, y: jnp.zeros(2) * x + y, True),
+    "cosine of zero": (lambda x, y: jnp.cos(0 * x) * y, True),
+    "zeros by a matrix": (lambda x, y: jnp.zeros((2, 2)) @ jnp.stack([x, x]) + y, True),
+    "zeros plus": (lambda x, y: jnp.zeros(2) + x, False),
+    "chosen by": (lambda x, y: jnp.where(x > 0, y, 2 * y), False),
+    "chosen branch": (lambda x, y: jax.lax.cond(x > 0, jnp.sin, jnp.cos, y), False),
+    "sign": (lambda x, y: y + jnp.sign(x), False),
+    "call back": (
+        lambda x, y: jax.pure_callback(lambda v: v, jax.ShapeDtypeStruct((), float), x),
+        False,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_data_flow_through_programs(name):
+    fn, independent = PROGRAMS[name]
+    flow = DataFlow(fn, jnp.array(0.5), jnp.array(0.3))
+    assert flow.independent(lambda x, y: x) == independent
+    wrapped = DataFlow(jax.jit(jax.vmap(fn)), jnp.ones(3), jnp.ones(3))
+    assert wrapped.independent(lambda x, y: x) == independent
