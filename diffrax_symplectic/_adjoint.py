@@ -17,7 +17,7 @@ from ._compat import nondifferentiable_backward, reversed_in_time, while_loop, Ï
 from ._custom_types import IntScalarLike, RealScalarLike, Y
 from ._own_inverse import is_own_inverse
 from ._plan import make_plan
-from ._solver import AbstractSymplecticRungeKutta, NinomiyaVictoir
+from ._solver import AbstractSymplecticRungeKutta, Damped, NinomiyaVictoir
 
 
 class ReversingAdjoint(diffrax.AbstractAdjoint):
@@ -40,13 +40,14 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     **Solvers:** those that are their own inverse, which is read off their coefficients:
     [`diffrax_symplectic.ImplicitMidpoint`][], [`diffrax_symplectic.StormerVerlet`][],
     [`diffrax_symplectic.StrangGauss`][], [`diffrax_symplectic.LevyAreaMidpoint`][],
-    [`diffrax_symplectic.NinomiyaVictoir`][] and tableaus of your own.
+    [`diffrax_symplectic.NinomiyaVictoir`][], tableaus of your own, and
+    [`diffrax_symplectic.Damped`][] around one of these.
 
     **Steps:** `diffrax.ConstantStepSize` or `diffrax.StepTo`. **Saving:** `SaveAt(t1=True)`
     or `SaveAt(ts=...)`. No events, no forward mode; no derivatives with respect to times.
 
-    **Parameters:** what gradients are taken of is part of `args`, of the initial state or
-    of the terms. JAX refuses values that a Hamiltonian captures as a closure.
+    **Parameters:** what gradients are taken of is part of `args`, of the initial state, of
+    the terms or of the solver. JAX refuses values that a Hamiltonian captures as a closure.
 
     **Raises:** a `ValueError`, while tracing, for anything else.
     """
@@ -77,9 +78,8 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
         y = init_state.y
         init_state = eqx.tree_at(lambda s: s.y, init_state, object())
         final_state, aux_stats = _solve(
-            (y, args, terms),
+            (y, args, terms, solver),
             adjoint=self,
-            solver=solver,
             stepsize_controller=stepsize_controller,
             saveat=saveat,
             init_state=init_state,
@@ -133,6 +133,9 @@ def _check_supported(solver, controller, event, saveat) -> None:
 def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:
     # The sign of an increment decides in which order its flows follow each other. So a step
     # with negated increments takes them in the reverse order.
+    if isinstance(solver, Damped):
+        # Backward in time the momentum grows as it decayed.
+        return _undoes_its_steps(solver.solver)
     if isinstance(solver, NinomiyaVictoir):
         return True
     if not isinstance(solver, AbstractSymplecticRungeKutta):
@@ -141,18 +144,19 @@ def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:
 
 
 @eqx.filter_custom_vjp
-def _solve(y__args__terms, *, adjoint, throw, **kwargs):
+def _solve(inputs, *, adjoint, throw, **kwargs):
     del throw
-    return _run(adjoint, y__args__terms, ft.partial(while_loop, kind="lax"), kwargs)
+    return _run(adjoint, inputs, ft.partial(while_loop, kind="lax"), kwargs)
 
 
-def _run(adjoint, y__args__terms, outer_while_loop, kwargs):
-    y, args, terms = y__args__terms
+def _run(adjoint, inputs, outer_while_loop, kwargs):
+    y, args, terms, solver = inputs
     init_state = eqx.tree_at(lambda s: s.y, kwargs["init_state"], y)
     return adjoint._loop(
         **kwargs | {"init_state": init_state},
         args=args,
         terms=terms,
+        solver=solver,
         event=None,
         inner_while_loop=ft.partial(while_loop, kind="lax"),
         outer_while_loop=outer_while_loop,
@@ -160,7 +164,7 @@ def _run(adjoint, y__args__terms, outer_while_loop, kwargs):
 
 
 @_solve.def_fwd
-def _solve_fwd(perturbed, y__args__terms, *, adjoint, throw, **kwargs):
+def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
     del perturbed, throw
     every = _Steps.of(kwargs).spread(adjoint.checkpoints)
     recorded = []
@@ -190,7 +194,7 @@ def _solve_fwd(perturbed, y__args__terms, *, adjoint, throw, **kwargs):
         recorded.append(rows)
         return final
 
-    out = _run(adjoint, y__args__terms, recording_while_loop, kwargs)
+    out = _run(adjoint, inputs, recording_while_loop, kwargs)
     final_state, _ = out
     index = final_state.save_state.saveat_ts_index
     return out, (recorded[0], final_state.y, final_state.num_steps, index)
@@ -242,14 +246,12 @@ class _Walk(NamedTuple):
 
 
 @_solve.def_bwd
-def _solve_bwd(
-    residuals, grad_out, perturbed, y__args__terms, *, adjoint, throw, **kwargs
-):
+def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwargs):
     rows, y1, num_steps, saved = residuals
-    solver, sub = kwargs["solver"], kwargs["saveat"].subs
+    sub = kwargs["saveat"].subs
     init_state, steps = kwargs["init_state"], _Steps.of(kwargs)
     every = steps.spread(adjoint.checkpoints)
-    _, *parameters = y__args__terms
+    _, *parameters = inputs
     _, *is_perturbed = perturbed
     diff, nondiff = eqx.partition(parameters, is_perturbed)
     # What the loss does not depend on has no derivative.
@@ -262,7 +264,7 @@ def _solve_bwd(
     )
 
     def step(y, diff, i, back: bool):
-        args, terms = eqx.combine(diff, nondiff)
+        args, terms, solver = eqx.combine(diff, nondiff)
         t0, t1 = steps.time(i), steps.time(i + 1)
         if back:
             t0, t1, terms = -t1, -t0, reversed_in_time(terms)

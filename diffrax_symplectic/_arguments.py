@@ -4,7 +4,12 @@ import inspect
 from typing import Any
 
 import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import PyTree
 
 
 def check_takes(name: str, fn: Any, *arguments: str) -> None:
@@ -42,3 +47,10 @@ def whole_number(name: str, value: Any, least: int = 1) -> int:
         kind = "a positive integer" if least == 1 else f"an integer, {least} or larger"
         raise ValueError(f"`{name}` must be {kind}; got {value!r}.")
     return int(value)
+
+
+def shapes(tree: PyTree) -> str:
+    """The shape of an array, or all shapes of a PyTree, for messages."""
+    if jtu.all_leaves([tree]):
+        return str(jnp.shape(tree))
+    return eqx.tree_pformat(jax.eval_shape(lambda: tree), struct_as_array=True)

@@ -15,7 +15,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from ._arguments import check_solver, check_takes
+from ._arguments import check_solver, check_takes, shapes
 from ._brownian import (
     FixedStepBrownianPath,
     LevyAreaBrownianPath,
@@ -27,6 +27,7 @@ from ._brownian import (
 from ._custom_types import Args, Y
 from ._estimate import Expectation
 from ._expectation import expectation
+from ._structure_checks import check_stratonovich
 from ._suggest import suggest_solver
 from ._suggestion_rules import PATHS, RULES
 
@@ -232,6 +233,7 @@ def compare_solvers(
 
 
 def _end(terms, solver, t0, t1, dt, y0, args) -> tuple[Y, diffrax.RESULTS]:
+    check_stratonovich(terms, solver, t0, y0, args)
     options: Any = dict(max_steps=None, adjoint=diffrax.ForwardMode(), throw=False)
     sol = diffrax.diffeqsolve(terms, solver, t0, t1, dt, y0, args, **options)
     return jtu.tree_map(lambda y: y[-1], sol.ys), sol.result
@@ -260,9 +262,8 @@ def _check_solvers(solvers, reference) -> None:
 def _check_scalar(phi, y0: Y) -> None:
     check_takes("phi", phi, "y")
     out = eqx.filter_eval_shape(lambda y: jtu.tree_map(jnp.asarray, phi(y)), y0)
-    shapes = [leaf.shape for leaf in jtu.tree_leaves(out)]
-    if shapes != [()]:
-        raise ValueError(f"`phi` must return one number; got {eqx.tree_pformat(out)}.")
+    if [leaf.shape for leaf in jtu.tree_leaves(out)] != [()]:
+        raise ValueError(f"`phi` must return one number; got shape {shapes(out)}.")
 
 
 def _checked_steps(t0, t1, dts: Sequence[float]) -> list[float]:
@@ -326,7 +327,9 @@ def _strong_errors(end, named, reference, shape, dts, cell, key, num_paths) -> d
             return total, total**2, okay.astype(total.dtype)
 
         one = lambda s: jax.lax.map(lambda dt: at(s, dt), steps)
-        return {name: one(solver) for name, solver in named.items()}
+        # Those that failed are counted here, for each solver by itself.
+        errors = {name: one(solver) for name, solver in named.items()}
+        return errors, diffrax.RESULTS.successful
 
     if not named:
         return {}

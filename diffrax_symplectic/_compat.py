@@ -4,12 +4,15 @@ Nothing of the kind is used anywhere else. `tests/test_private_parts.py` tests e
 by itself.
 """
 
+import inspect
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from types import FrameType
 from typing import Any
 
 import diffrax
 import jax.tree_util as jtu
+import numpy as np
 from diffrax._term import AdjointTerm, WrapTerm
 from equinox.internal import (
     nondifferentiable as nondifferentiable,
@@ -63,14 +66,83 @@ def is_adjoint_term(term: diffrax.AbstractTerm) -> bool:
     return isinstance(unwrapped(term), AdjointTerm)
 
 
+def solves_without_throwing(program: Jaxpr) -> bool:
+    """Whether a program calls `diffrax.diffeqsolve` with `throw=False`: whether no error is
+    raised after the loop of a solve. (The programs of a gradient are a solve forward and
+    one backward, of which the first may raise an error.)"""
+    is_solve = lambda eqn: eqn.params.get("name") == "diffeqsolve"
+    solves = [x for eqn in program.eqns if is_solve(eqn) for x in inner_programs(eqn)]
+    if solves:
+        return not any(map(_ends_with_an_error, solves))
+    inner = [x for eqn in program.eqns for x in inner_programs(eqn)]
+    return any(solves_without_throwing(getattr(x, "jaxpr", x)) for x in inner)
+
+
+def _ends_with_an_error(program: ClosedJaxpr) -> bool:
+    eqns = program.jaxpr.eqns
+    loops = [i for i, eqn in enumerate(eqns) if _has_loop(eqn)]
+    after = eqns[max(loops, default=-1) + 1 :]
+    return any(eqn.params.get("name") == "branched_error_if_impl" for eqn in after)
+
+
+def _has_loop(eqn: JaxprEqn) -> bool:
+    if eqn.primitive.name in ("while", "scan"):
+        return True
+    inner = [getattr(x, "jaxpr", x) for x in inner_programs(eqn)]
+    return any(_has_loop(eqn) for program in inner for eqn in program.eqns)
+
+
+def inner_programs(eqn: JaxprEqn) -> Iterator[Any]:
+    """The programs among the parameters of a primitive."""
+    for value in eqn.params.values():
+        for item in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(item, Jaxpr | ClosedJaxpr):
+                yield item
+
+
+def unsolved_step_result(message: str) -> diffrax.RESULTS:
+    """A result of `diffrax.RESULTS` with a message of its own.
+
+    The solvers have to return one of `diffrax.RESULTS`, which Diffrax turns into an error,
+    and what is there for an unsolved equation advises to increase `max_steps`. So one more
+    is added, as a subclass of the enumeration would add it. The others stay as they are.
+    """
+    results = diffrax.RESULTS
+    names, messages = results._name_to_item, results._index_to_message
+    if "stage_equations_unsolved" not in names:
+        number = np.array(len(messages), np.int32)
+        item = type(results.successful)(number, results)  # pyright: ignore
+        names["stage_equations_unsolved"] = item  # pyright: ignore
+        messages.append(message)
+    return names["stage_equations_unsolved"]  # pyright: ignore
+
+
 def innermost_solve() -> Mapping[str, Any] | None:
     """The local variables, `terms`, `solver` and `stepsize_controller` among them, of the
     innermost `diffrax.diffeqsolve` that is being traced; `None` if there is none on the
     Python stack."""
-    frame = sys._getframe(1)
+    frame = _frame_of_solve("loop", "diffeqsolve")
+    return None if frame is None else frame.f_locals
+
+
+def innermost_times() -> tuple[Any, Any, Any] | None:
+    """`t0`, `t1` and `dt0` of the innermost solve as they were passed, numbers of Python
+    among them; `None` if there is no solve on the Python stack."""
+    frame = _frame_of_solve("diffeqsolve")
+    # Diffrax traces its numbers. Those that were passed are held by `equinox.filter_jit`.
+    outer = None if frame is None else frame.f_back
+    if outer is None or outer.f_globals.get("__name__") != "equinox._jit":
+        return None
+    args, kwargs = outer.f_locals["args"], outer.f_locals["kwargs"]
+    bound = inspect.signature(diffrax.diffeqsolve).bind(*args, **kwargs).arguments
+    return bound["t0"], bound["t1"], bound["dt0"]
+
+
+def _frame_of_solve(*functions: str) -> FrameType | None:
+    frame = sys._getframe(2)
     while frame is not None:
         in_diffrax = frame.f_globals.get("__name__") == "diffrax._integrate"
-        if in_diffrax and frame.f_code.co_name in ("loop", "diffeqsolve"):
-            return frame.f_locals
+        if in_diffrax and frame.f_code.co_name in functions:
+            return frame
         frame = frame.f_back
     return None

@@ -18,6 +18,7 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from ._arguments import whole_number
 from ._brownian import check_key
+from ._compat import ClosedJaxpr, jaxpr_as_fun, solves_without_throwing
 from ._estimate import (
     Expectation,
     ExpectationInterrupted,
@@ -115,8 +116,8 @@ def expectation(
     - `fn`: takes a random key to $\phi$, a PyTree of real arrays, or to a pair of that
         and a `diffrax.RESULTS`: as above, with `throw=False`. A path fails if its result
         is neither successful nor an event, or anything in its $\phi$ is not finite.
-        (Without `sol.result` a path that failed counts as a success: Diffrax returns where
-        it stopped.)
+        (`throw=False` without `sol.result` is refused: Diffrax returns where a path that
+        failed stopped, which would count as a success.)
     - `key`: a JAX random key.
     - `num_paths`: the number of all paths, those of `start` included.
     - `batch_size`: how many paths each device takes at once. By default 32,768 on CPUs
@@ -140,8 +141,9 @@ def expectation(
 
     **Raises:** a `ValueError` for sizes that are not positive integers, if `key` is not a
     random key, if `start` came from another key, has other shapes or more paths, if `tol`
-    is not positive, for `levels` other than 1 or 2, or 2 without `order`, or if
-    $\phi$ is not real or holds a `diffrax.RESULTS`;
+    is not positive, for `levels` other than 1 or 2, or 2 without `order`, if $\phi$ is
+    not real or holds a `diffrax.RESULTS`, or if `fn` solves with `throw=False` and does
+    not return `sol.result`;
     [`diffrax_symplectic.ExpectationInterrupted`][], with the estimate so far, on an
     interrupt from the keyboard.
 
@@ -268,7 +270,10 @@ def _run(
 
 def _evaluate(fn: _Sample, key) -> tuple[PyTree[Array], Array]:
     """What `fn` returns, and whether the path succeeded."""
-    out = fn(key)
+    program, shape = jax.make_jaxpr(fn, return_shape=True)(key)
+    check_failures_are_reported(program, shape)
+    leaves = jaxpr_as_fun(program)(key)
+    out = jtu.tree_unflatten(jtu.tree_structure(shape), leaves)
     success = jnp.array(True)
     if isinstance(out, tuple) and len(out) == 2 and _is_result(out[1]):
         out, result = out
@@ -284,6 +289,20 @@ def _evaluate(fn: _Sample, key) -> tuple[PyTree[Array], Array]:
     for leaf in jtu.tree_leaves(out):
         success = success & jnp.all(jnp.isfinite(leaf))
     return out, success
+
+
+def check_failures_are_reported(program: ClosedJaxpr, out: PyTree) -> None:
+    """Raises a `ValueError` if a function solves with `throw=False`, as its program says,
+    but what it returns holds no `diffrax.RESULTS`."""
+    reported = any(map(_is_result, jtu.tree_leaves(out, is_leaf=_is_result)))
+    if not reported and solves_without_throwing(program.jaxpr):
+        raise ValueError(
+            "`fn` solves with `throw=False` but does not return `sol.result`, so that "
+            "paths that failed would be averaged as if they had not. Return the pair "
+            "`(phi, sol.result)`: then they are left out and counted. Or pass `throw=True` "
+            "to `diffeqsolve`, which raises an error if a path fails. If `fn` sees to "
+            "failures itself, return `(phi, diffrax.RESULTS.successful)`."
+        )
 
 
 def _is_result(x) -> bool:

@@ -1,4 +1,5 @@
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import get_args, Literal
 
 import diffrax
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Shaped
 
-from ._arguments import check_takes
+from ._arguments import check_takes, shapes
 from ._brownian import increment_struct
 from ._compat import ω
 from ._custom_types import Args, BM, RealScalarLike
@@ -80,9 +81,9 @@ def hamiltonian_terms(
     - `structure`: what you know of the Hamiltonians: `"separable"`, that $H_0 = V(p) +
         U(t, q)$ and $H_k = U_k(t, q)$; or `"additive"`, that the gradients of the $H_k$ do
         not depend on the state. Solvers that need this structure then rely on it. By
-        default they find out while tracing: from the program if it tells, else by
-        evaluating derivatives at random points (where no check of yours can raise and
-        nothing is printed). Arrays in `args` are then drawn at random, too.
+        default they find out while tracing, from the program: a variable that enters a
+        derivative counts, even if it cancels or is multiplied by an array of zeros. So
+        write $H_0$ as a sum of terms that read $p$ or $q$ alone.
 
     `p` and `q` are PyTrees of arrays of the same structure and shapes.
 
@@ -90,8 +91,8 @@ def hamiltonian_terms(
 
     **Raises:** a `ValueError` if `path` is not a Brownian path or `structure` is unknown;
     and, while the solve is traced, if the state is not a pair `(p, q)` of the same
-    structure and shapes, if `H0` does not return a scalar, or if `noise` does not match
-    the path.
+    structure and shapes, if `H0` does not return a scalar, if `noise` does not match the
+    path or does not depend on the state, or if either asks for values in Python.
     """
     if not isinstance(path, diffrax.AbstractBrownianPath):
         raise ValueError(
@@ -119,11 +120,12 @@ class _Drift(eqx.Module):
         check_pair(y)
 
         def scalar(p, q):
-            out = self.H0(t, p, q, args)
+            with _named("H0"):
+                out = self.H0(t, p, q, args)
             if not jtu.all_leaves([out]) or jnp.shape(out) != ():
                 raise ValueError(
-                    "`H0` must return a scalar; got "
-                    f"{eqx.tree_pformat(out)}. Sum over the degrees of freedom."
+                    f"`H0` must return a scalar; got shape {shapes(out)}. Sum over the "
+                    "degrees of freedom."
                 )
             return jnp.asarray(out, jnp.result_type(out, float))
 
@@ -145,7 +147,9 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         # with the structure of the noises, of arrays of shape `(*state, *noise)`.
         check_pair(y)
         struct = increment_struct(self.path)
-        jac = jax.jacrev(lambda y: self._hamiltonians(t, y[0], y[1], args, struct))(y)
+        hamiltonians = lambda y: self._hamiltonians(t, y[0], y[1], args, struct)
+        with _refused_if_constant() as observe:
+            jac = jax.jacrev(lambda y: observe(hamiltonians(y)))(y)
         noise_def, state_def = jtu.tree_structure(struct), jtu.tree_structure(y)
 
         def noise_last(entry):
@@ -184,7 +188,8 @@ class HamiltonianNoise(diffrax.AbstractTerm):
             dots = jtu.tree_map(lambda h, c: jnp.sum(h * c.astype(h.dtype)), H, control)
             return sum(jtu.tree_leaves(dots))
 
-        return _symplectic_gradient(scalar, y)
+        with _refused_if_constant() as observe:
+            return _symplectic_gradient(lambda p, q: observe(scalar(p, q)), y)
 
     def is_vf_expensive(self, t0, t1, y, args) -> bool:
         # `vf` takes one reverse pass for each noise, `vf_prod` takes one in all.
@@ -196,24 +201,64 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         every = lambda: self._hamiltonians(t, p, q, args, struct)
         if isinstance(self.noise, IndexedNoise):
             jax.eval_shape(every)  # for its error
-            return self.noise.one(number, t, p, q, args)
+            with _named("noise"):
+                return self.noise.one(number, t, p, q, args)
         return jfu.ravel_pytree(every())[0][number]
 
     def _hamiltonians(self, t, p, q, args, struct) -> PyTree[Array]:
         """The noise Hamiltonians, in the structure and shapes of the path."""
-        H = self.noise(t, p, q, args)
+        with _named("noise"):
+            H = self.noise(t, p, q, args)
         # One noise may come as a scalar.
         fits = lambda h, s: jnp.shape(h) == s.shape or jnp.size(h) == s.size == 1
         if jtu.tree_structure(H) != jtu.tree_structure(struct) or not all(
             map(fits, jtu.tree_leaves(H), jtu.tree_leaves(struct))
         ):
             raise ValueError(
-                "`noise` must return one Hamiltonian for each noise of "
-                f"the path, which has shape {eqx.tree_pformat(struct)}; got "
-                f"{eqx.tree_pformat(jax.eval_shape(lambda: H))}. Return an array of "
-                "shape `(m,)` and construct the path with `shape=(m,)`."
+                "`noise` must return one Hamiltonian for each noise of the path, which has "
+                f"shape {shapes(struct)}; got shape {shapes(H)}. Return an array of shape "
+                "`(m,)` and construct the path with `shape=(m,)`."
             )
         return jtu.tree_map(lambda h, s: jnp.reshape(h, s.shape), H, struct)
+
+
+@contextlib.contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Says in which Hamiltonian Python asked JAX for a value that is not known yet."""
+    try:
+        yield
+    except jax.errors.JAXTypeError as error:
+        raise ValueError(
+            f"`{name}(t, p, q, args)` asks for values while JAX traces it, when there are "
+            "none: by `if`, `while`, `float`, or a function of NumPy. Write `jnp.where(a, "
+            "b, c)` or `jax.lax.cond` in place of `if`, and `jnp` in place of `np`."
+        ) from error
+
+
+@contextlib.contextmanager
+def _refused_if_constant() -> Iterator[Callable]:
+    """A function to pass noise Hamiltonians through within a derivative by the state.
+    Raises a `ValueError` if they turn out not to depend on the state at all."""
+    reads_state = []
+
+    @jax.custom_jvp
+    def observe(H):
+        return H
+
+    def rule(primals, tangents):
+        # JAX comes here only if one of the tangents is more than a symbolic zero.
+        reads_state.append(True)
+        return primals[0], tangents[0]
+
+    observe.defjvp(rule)
+    yield observe
+    if not reads_state:
+        raise ValueError(
+            "The noise Hamiltonians do not depend on the state, so that there is no "
+            "noise. Return Hamiltonians, not amplitudes: for a kick of constant strength "
+            "to each momentum, dp_k = sigma_k dw_k, `noise = lambda t, p, q, args: -sigma "
+            "* q`. For no noise solve the drift alone, `terms.terms[0]`."
+        )
 
 
 def _symplectic_gradient(scalar: Callable, y: _State) -> _State:
@@ -252,6 +297,11 @@ def pair_fault(y: PyTree) -> str | None:
         "the same structure and shapes: pass `y0=(p0, q0)`, or for spins "
         "`y0=to_spinors(s0)`. "
     )
+    if any(map(jnp.iscomplexobj, jtu.tree_leaves(y))):
+        return (
+            f"{advice}Both are real; got {eqx.tree_pformat(y)}. For complex amplitudes "
+            "construct the terms with `wave_terms`."
+        )
     if type(y) is not tuple or len(y) != 2:
         return f"{advice}Got {eqx.tree_pformat(y)}."
     p, q = y

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from ._arguments import whole_number
+from ._arguments import shapes, whole_number
 from ._custom_types import Args, IntScalarLike, RealScalarLike
 
 
@@ -52,7 +52,7 @@ class IndexedNoise(eqx.Module):
         if not jtu.all_leaves([out]) or jnp.shape(out) != ():
             raise ValueError(
                 "`H(k, t, p, q, args)` of `IndexedNoise` must return a scalar, the "
-                f"Hamiltonian of the noise `k`; got {eqx.tree_pformat(out)}."
+                f"Hamiltonian of the noise `k`; got shape {shapes(out)}."
             )
         return jnp.asarray(out, jnp.result_type(out, float))
 

@@ -1,24 +1,21 @@
-"""Whether a system has the structure that a family of methods relies on."""
+"""Whether a system has the structure that a family of methods relies on: decided by the
+flow of data through the vector fields, or by what the user asserts."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
-import jax.core
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-import numpy as np
-from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from ._compat import ω
 from ._custom_types import Args, RealScalarLike, Y
-from ._effect_free import evaluate_without_effects
+from ._data_flow import DataFlow
 from ._hamiltonian import asserted_structure, check_pair, is_hamiltonian, pair_fault
-from ._terms import apply
+from ._terms import apply, split_terms
 
 
 class Fault(NamedTuple):
@@ -62,210 +59,164 @@ def separable_fault(
     if it is of this form."""
     if fault := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", fault)
-    for term in _not_asserted(drift, "separable"):
-        from_H0 = is_hamiltonian(term) or len(drift) == 1
-        for part, of, derivative, dependence in (
-            (0, "p", "d(dH0/dq)/dp", "dp/dt depend on p"),
-            (1, "q", "d(dH0/dp)/dq", "dq/dt depend on q"),
-            (1, "t", "d(dH0/dp)/dt", "dq/dt depend on t"),
+    drift_flows = [
+        (x, _flow(x, t0, y0, args)) for x in _not_asserted(drift, "separable")
+    ]
+    noise_flows = [_flow(x, t0, y0, args) for x in _not_asserted(noise, "separable")]
+    fault = _separable_fault(drift_flows, noise_flows, len(drift), p=0)
+    if fault is not None and not _separable_fault(
+        drift_flows, noise_flows, len(drift), 1
+    ):
+        return Fault(f"{fault.reason}. {_WRONG_WAY_ROUND}", fault.advice)
+    return fault
+
+
+def _separable_fault(
+    drift: list, noise: list[DataFlow], num_drifts: int, p: int
+) -> Fault | None:
+    """The fault of the terms not asserted to be separable, if the momenta are the first
+    half of the state, `p = 0`, or the second one, `p = 1`."""
+    q = 1 - p
+    dp, dq = (lambda out: out[p]), (lambda out: out[q])
+    of_p, of_q = (lambda t, y, control: y[p]), (lambda t, y, control: y[q])
+    for term, flow in drift:
+        from_H0 = is_hamiltonian(term) or num_drifts == 1
+        for part, of, derivative, rate in (
+            (dp, of_p, "dH0/dq depends on p", "dp/dt depend on p"),
+            (dq, of_q, "dH0/dp depends on q", "dq/dt depend on q"),
+            (dq, _of_t, "dH0/dp depends on t", "dq/dt depend on t"),
         ):
-            independent = _independent(part, of, term, t0, y0, args)
-            if fault := _fault(independent, derivative):
-                if from_H0 or independent is None:
-                    return fault
-                beside = f"a drift term beside that of H0 makes {dependence}"
-                return Fault(beside, f"{FRICTION} {_ADVICE}")
-    for term in _not_asserted(noise, "separable"):
+            if not flow.independent(of, part):
+                if from_H0:
+                    return Fault(derivative, _advice("separable"))
+                beside = f"a drift term beside that of H0 makes {rate}"
+                return Fault(beside, f"{FRICTION} {_advice('separable')}")
+    for flow in noise:
         # The change of q is linear in the increment: if it does not depend on the
         # increment, it is zero.
-        for part, of in ((1, "control"), (0, "p")):
-            independent = _independent(part, of, term, t0, y0, args)
-            if fault := _fault(independent, "dH_k/dp"):
-                return fault
+        if not flow.independent(_of_control, dq):
+            return Fault("dH_k/dp is not zero", _advice("separable"))
+        if not flow.independent(of_p, dp):
+            return Fault("dH_k/dq depends on p", _advice("separable"))
     return None
 
 
 def additive_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
     """Why the noise is not additive; `None` if it does not depend on the state."""
-    derivative = (
-        "db_k/dy, the derivative of the noise b_k = (-dH_k/dq, dH_k/dp) by the state,"
-    )
     for term in _not_asserted(noise, "additive"):
-        if fault := _fault(_independent(None, "y", term, t0, y0, args), derivative):
-            return fault
+        if not _flow(term, t0, y0, args).independent(lambda t, y, control: y):
+            reason = "the noise b_k = (-dH_k/dq, dH_k/dp) depends on the state"
+            return Fault(reason, _advice("additive"))
     return None
 
 
 def constant_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
     """Why additive noise is not constant; `None` if it does not depend on time."""
     for term in noise:
-        fault = _fault(_independent(None, "t", term, t0, y0, args), "db_k/dt")
-        if fault is not None:
-            return Fault(fault.reason, f"Use `SRKs4`, or else another one. {_ADVICE}")
+        if not _flow(term, t0, y0, args).independent(_of_t):
+            return Fault("it depends on time", "Use `SRKs4`, which takes it.")
     return None
 
 
-def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
-    """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish at random states, for
-    these `t0` and `args`. False if this cannot be tested.
-
-    The bracket is bilinear. So it is enough to test the bracket of two random linear
-    combinations of the noises.
-    """
-    t0 = jnp.asarray(t0, jnp.result_type(float))
-    struct = eqx.filter_eval_shape(lambda: [term.contr(t0, t0) for term in noise])
-    control = jtu.tree_map(jnp.zeros_like, struct)
-
-    def brackets(y, x, z):
-        along = lambda control: lambda y: apply(noise, control, args, t0, y)
-        first = jax.jvp(along(z), (y,), (along(x)(y),))[1]
-        second = jax.jvp(along(x), (y,), (along(z)(y),))[1]
-        return first, (first**ω - second**ω).ω
-
-    return _small_at_random_points(brackets, (y0, control, control)) is True
-
-
-def _fault(independent: bool | None, derivative: str) -> Fault | None:
-    if independent:
-        return None
-    if independent is None:
-        reason = (
-            f"whether {derivative} vanishes could not be tested, because the derivatives "
-            "of the Hamiltonians were not finite at any of the points tried"
+def check_stratonovich(
+    terms: diffrax.AbstractTerm,
+    solver: diffrax.AbstractSolver,
+    t0: RealScalarLike,
+    y0: Y,
+    args: Args,
+) -> None:
+    """Raises a `ValueError` if a solver in the sense of Ito is to solve terms made from
+    Hamiltonians, which are in the sense of Stratonovich. For additive noise both agree."""
+    if not isinstance(solver, diffrax.AbstractItoSolver):
+        return
+    noise = tuple(filter(is_hamiltonian, split_terms(terms)[1]))
+    if additive_fault(noise, t0, y0, args) is not None:
+        raise ValueError(
+            f"`{type(solver).__name__}` solves equations in the sense of Ito. Those of "
+            "`hamiltonian_terms` are in the sense of Stratonovich, and here they differ. "
+            "Use a solver of this package, or a Stratonovich solver of Diffrax such as "
+            "`diffrax.Heun`."
         )
-        return Fault(reason, _UNTESTED)
-    return Fault(f"{derivative} does not vanish", _ADVICE)
 
 
-_ADVICE = (
-    "Use a solver for the general structure, for example `ImplicitMidpoint` or `SRKw1`. "
-    "(An array in `args` stands for any value. If the derivative vanishes for yours, pass "
-    "`structure=` to `hamiltonian_terms`.)"
-)
-_UNTESTED = (
-    "Pass `structure=` to `hamiltonian_terms`, write the Hamiltonians so that variables "
-    "that cancel do not enter at all, or use a solver for the general structure, for "
-    "example `ImplicitMidpoint` or `SRKw1`."
-)
-FRICTION = "Friction -gamma p is what `Damped(solver, gamma)` is for."
+def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> DataFlow:
+    """The change of the state by a term, as a program of time, state and control."""
+    t0 = jnp.asarray(t0, jnp.result_type(float))
+    control = eqx.filter_eval_shape(term.contr, t0, t0)
+    change = lambda t, y, control: term.vf_prod(t, y, args, control)
+    return DataFlow(change, t0, y0, control)
+
+
+def _of_t(t, y, control):
+    return t
+
+
+def _of_control(t, y, control):
+    return control
 
 
 def _not_asserted(terms: tuple, structure: str) -> list:
     return [term for term in terms if asserted_structure(term) != structure]
 
 
-def _independent(
-    part: int | None, of: str, term: diffrax.AbstractTerm, t0, y0: Y, args: Args
-) -> bool | None:
-    """Whether the change of the state by `term` does not depend on `t`, `y`, `p`, `q`, or
-    `control`, whichever `of` names. With `part` only its first or second half counts.
+def _advice(structure: str) -> str:
+    how = {
+        "separable": "H0 as a sum `V(p) + U(t, q)` whose summands read p or q alone",
+        "additive": "each H_k as a function linear in p and q, such as `-sigma * q`",
+    }[structure]
+    return (
+        f"If it only seems so, since variables cancel or because of a value in `args`, "
+        f'write {how}, or pass `structure="{structure}"` to `hamiltonian_terms`. If not, '
+        "use a solver for the general structure, for example `ImplicitMidpoint` or `SRKw1`."
+    )
 
-    First JAX traces the derivative. If the variable does not enter the result at all, JAX
-    finds that the derivative is zero from the rules of differentiation alone. If it does
-    enter, it may still cancel. Then the derivative is evaluated at random points; the
-    result is `None` if it is finite at none of them.
+
+_WRONG_WAY_ROUND = (
+    "With the halves of the state exchanged it would be so: is the state the wrong way "
+    "round? It is `(p, q)`, momentum first, and not (position, velocity)"
+)
+FRICTION = "Friction -gamma p is what `Damped(solver, gamma)` is for."
+
+
+def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
+    """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish at random states, for
+    these `t0` and `args`. False if this cannot be tested. This is advice, no proof.
+
+    The bracket is bilinear. So it is enough to test the bracket of two random linear
+    combinations of the noises.
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
-    control = jtu.tree_map(jnp.zeros_like, eqx.filter_eval_shape(term.contr, t0, t0))
-    variable = _VARIABLES[of]
+    struct = eqx.filter_eval_shape(lambda: [term.contr(t0, t0) for term in noise])
 
-    def change(x, *inputs):
-        term, t, y, args, control = eqx.tree_at(variable, inputs, x)
-        return term.vf_prod(t, y, args, control)
+    leaves, treedef = jtu.tree_flatten((y0, struct, struct))
+    # Most functions are defined between 0 and 1, even if they are not everywhere.
+    laws = jr.normal, jr.uniform
+    draw = lambda law, key: treedef.unflatten(
+        law(k, jnp.shape(x), jnp.result_type(x))
+        for k, x in zip(jr.split(key, len(leaves)), leaves)
+    )
+    largest = lambda y: jfu.ravel_pytree(
+        jtu.tree_map(jnp.max, jtu.tree_map(jnp.abs, y))
+    )
 
-    inputs = (term, t0, y0, args, control)
-    x = variable(inputs)
-    select = lambda out: out if part is None else out[part]
-    if _flows_nowhere(lambda x: select(change(x, *inputs)), x):
-        return True
+    @eqx.filter_jit
+    @jax.vmap
+    def sizes(point):
+        y, x, z = point
+        along = lambda control: lambda y: apply(noise, control, args, t0, y)
+        first = jax.jvp(along(z), (y,), (along(x)(y),))[1]
+        second = jax.jvp(along(x), (y,), (along(z)(y),))[1]
+        bracket = (first**ω - second**ω).ω
+        return jnp.max(largest(first)[0]), jnp.max(largest(bracket)[0])
 
-    def derivative(x, tangent, *inputs):
-        value, rate = jax.jvp(lambda x: change(x, *inputs), (x,), (tangent,))
-        if of == "control":
-            # One half of the rate is compared with both halves of the noise.
-            return value, tuple(r if i == part else 0 * r for i, r in enumerate(rate))
-        return select(value), select(rate)
-
-    return _small_at_random_points(derivative, (x, x, *inputs))
-
-
-# Where each variable stands among a term and the inputs of its vector field.
-_VARIABLES = {
-    "t": lambda inputs: inputs[1],
-    "y": lambda inputs: inputs[2],
-    "p": lambda inputs: inputs[2][0],
-    "q": lambda inputs: inputs[2][1],
-    "control": lambda inputs: inputs[4],
-}
-
-
-def _flows_nowhere(fn: Callable, x: PyTree) -> bool:
-    """Whether the derivative of `fn` is zero by the rules of differentiation alone."""
-    zero = []
-
-    @jax.custom_jvp
-    def observe(*leaves):
-        return leaves
-
-    def rule(primals, tangents):
-        zero.append(all(isinstance(t, SymbolicZero) for t in tangents))
-        return primals, tuple(jnp.zeros(p.shape, p.dtype) for p in primals)
-
-    observe.defjvp(rule, symbolic_zeros=True)
-    observed = lambda x: observe(*map(jnp.asarray, jtu.tree_leaves(fn(x))))
-    jax.eval_shape(lambda x: jax.jvp(observed, (x,), (x,)), x)
-    return all(zero)
-
-
-def _small_at_random_points(fn: Callable, inputs: PyTree) -> bool | None:
-    """Whether, of `fn(*inputs) -> (reference, value)`, the value is rounding error next
-    to the reference, with every floating-point array that enters drawn at random; `None`
-    if they were finite at no point."""
-    dynamic, static = eqx.partition(inputs, eqx.is_array)
-    flat, treedef = jtu.tree_flatten(dynamic)
-
-    def flat_fn(*flat):
-        return fn(*eqx.combine(jtu.tree_unflatten(treedef, flat), static))
-
-    closed = jax.make_jaxpr(flat_fn)(*flat)
-    # Arrays that the user's functions capture keep their values, unless they are traced.
-    is_traced = [isinstance(c, jax.core.Tracer) for c in closed.consts]
-
-    def sizes(seed, positive):
-        # Inputs are drawn within the program, so that those that it does not read are
-        # never made.
-        keys = iter(jr.split(jr.key(seed), len(closed.consts) + len(flat)))
-        draw = lambda x: _draw(x, next(keys), positive)
-        consts = [draw(c) if new else c for c, new in zip(closed.consts, is_traced)]
-        out = evaluate_without_effects(closed.jaxpr, consts, [draw(x) for x in flat])
-        half = len(out) // 2
-        reference, value = (
-            jnp.concatenate([jnp.ravel(x) for x in part])
-            for part in (out[:half], out[half:])
-        )
-        finite = jnp.isfinite(reference) & jnp.isfinite(value)
-        largest = lambda x: jnp.max(jnp.abs(x), initial=0, where=finite)
-        return largest(reference), largest(value), jnp.any(finite)
-
-    tested = False
-    with jax.disable_jit(False):
-        # Once it is compiled it runs at once, also while JAX traces what surrounds it.
-        program = jax.jit(sizes).lower(np.uint32(0), np.bool_(False)).compile()
-        # Every other time the points lie between 0 and 1, where most functions are defined
-        # even if they are not defined everywhere.
-        for i in range(8):
-            out = program(np.uint32(i), np.bool_(i % 2 == 1))
-            size, error, finite = map(np.asarray, out)
-            tested = tested or bool(finite)
-            if error > 1e3 * np.finfo(size.dtype).eps * size:
-                return False
-    return True if tested else None
-
-
-def _draw(x: Array, key: PRNGKeyArray, positive: Bool[Array, ""]) -> Array:
-    if jnp.issubdtype(x.dtype, jnp.floating):
-        draw = lambda law: law(key, x.shape, x.dtype)
-        return jnp.where(positive, draw(jr.uniform), draw(jr.normal))
-    if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
-        return jnp.broadcast_to(jr.key(0, impl=jr.key_impl(x)), x.shape)
-    return jnp.ones(x.shape, x.dtype)
+    try:
+        with jax.disable_jit(False):
+            points = [draw(law, jr.key(i)) for i in range(4) for law in laws]
+            size, bracket = sizes(jtu.tree_map(lambda *x: jnp.stack(x), *points))
+            finite = jnp.isfinite(size) & jnp.isfinite(bracket)
+            small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
+            return bool(jnp.any(finite) & jnp.all(small | ~finite))
+    except Exception:
+        # A check of the user's may raise at states that the user never chose, and nothing
+        # has values while JAX traces what surrounds this.
+        return False

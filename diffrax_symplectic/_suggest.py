@@ -99,9 +99,10 @@ def suggest_solver(
 ) -> Suggestions:
     r"""Suggests solvers for a system, best first, by the structure of its terms.
 
-    Whether $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, whether the noise is additive or
-    constant, and whether noises commute is found out as the solvers do it for themselves,
-    by derivatives. Nothing is solved. How stiff a system is cannot be seen from its terms:
+    Whether $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, and whether the noise is additive
+    or constant, is found out as the solvers do it for themselves, from the flow of data
+    through the terms. Whether noises commute is tested at random states, which is no proof.
+    Nothing is solved. How stiff a system is cannot be seen from its terms:
     if the first suggestion is explicit and takes too many steps, take the next implicit
     one.
 

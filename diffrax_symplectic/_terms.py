@@ -10,9 +10,11 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from ._arguments import shapes
 from ._bridge import apply_bridge, bridge
 from ._brownian import (
     AbstractWrappedPath,
@@ -85,20 +87,25 @@ def apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> 
 
 
 def _change(term: diffrax.AbstractTerm, t, y: Y, args: Args, control: PyTree) -> Y:
-    try:
-        return term.vf_prod(t, y, args, control)
-    except ValueError as error:
-        control_term = isinstance(unwrapped(term), diffrax.ControlTerm)
-        if not control_term or jtu.tree_structure(y) == jtu.tree_structure(control):
-            raise
+    if isinstance(unwrapped(term), diffrax.ControlTerm):
+        _check_product(term, t, y, args, control)
+    return term.vf_prod(t, y, args, control)
+
+
+def _check_product(term, t, y: Y, args: Args, control: PyTree) -> None:
+    if jtu.tree_structure(y) == jtu.tree_structure(control):
+        return
+    matrix = eqx.filter_eval_shape(term.vf, t, y, args)
+    is_operator = isinstance(matrix, lx.AbstractLinearOperator)
+    if not is_operator and jtu.tree_structure(matrix) != jtu.tree_structure(control):
         # Diffrax multiplies leaf by leaf, and JAX then speaks of trees.
         raise ValueError(
             "A `ControlTerm` multiplies arrays only if state and noise have the same "
-            f"structure; got the state {eqx.tree_pformat(y)} and the noise "
-            f"{eqx.tree_pformat(control)}. Return the matrix of noises as a Lineax "
-            "operator (`lineax.PyTreeLinearOperator`), make the state one array, or "
-            "construct the terms with `hamiltonian_terms`."
-        ) from error
+            f"structure; got a state of shape {shapes(y)} and a noise of shape "
+            f"{shapes(control)}. Return the matrix of noises as a Lineax operator "
+            "(`lineax.PyTreeLinearOperator`), make the state one array, or construct the "
+            "terms with `hamiltonian_terms`."
+        )
 
 
 @eqx.filter_jit
@@ -290,7 +297,8 @@ def check_state(y0: Y, solver: str) -> None:
             raise ValueError(
                 f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
                 f"array of dtype {dtype}. Convert it with `.astype(float)`, to float32 or "
-                "float64; split a complex one into real and imaginary parts."
+                "float64. Split a complex one into real and imaginary parts, or construct "
+                "the terms with `wave_terms`."
             )
     if len({jnp.result_type(leaf) for leaf in leaves}) > 1:
         raise ValueError(

@@ -219,7 +219,9 @@ def strong_errors(
         }
         shared = [ends[name] for name, s in solvers.items() if s is reference]
         exact = (shared[0] if shared else run(reference, jnp.array([cell])))[-1]
-        return {name: (x[: len(steps)] - exact) ** 2 for name, x in ends.items()}
+        errors = {name: (x[: len(steps)] - exact) ** 2 for name, x in ends.items()}
+        # Of a path that failed they are not finite.
+        return errors, diffrax.RESULTS.successful
 
     def study(paths: int, args=None) -> dict[str, Errors]:
         # In small batches: every path is kept in all its fine steps.

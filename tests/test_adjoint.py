@@ -274,3 +274,36 @@ def test_backsolve_is_refused_with_advice(solver):
     )
     with pytest.raises(ValueError, match="BacksolveAdjoint.*ReversingAdjoint"):
         jax.grad(end)(y0)
+
+
+@pytest.mark.parametrize("inner", [ds.StormerVerlet(), ds.ImplicitMidpoint()], ids=repr)
+def test_friction_is_walked_back_too(inner):
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 - args * jnp.sum(jnp.cos(q + t))
+    noise = lambda t, p, q, args: args * jnp.sum(jnp.sin(q))
+    terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+    y0 = (jnp.array([0.3, 0.1]), jnp.array([0.5, -0.2]))
+
+    @jax.jit
+    @jax.vmap
+    def gradients(gamma):
+        def loss(y0, args, gamma, adjoint):
+            solver = ds.Damped(inner, gamma)
+            sol = diffrax.diffeqsolve(
+                terms, solver, 0.0, 2.0, 0.1, y0, args, adjoint=adjoint
+            )
+            return jnp.sum(sol.ys[0][-1] * sol.ys[1][-1])
+
+        adjoints = ds.ReversingAdjoint(4), diffrax.RecursiveCheckpointAdjoint()
+        by = jax.grad(loss, (0, 1, 2))
+        return [by(y0, 0.7, gamma, adjoint) for adjoint in adjoints]
+
+    # Of the state, of a parameter of the terms, and of the friction itself.
+    ours, theirs = gradients(jnp.array([0.0, 0.4, 2.0]))
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs)):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+    assert jnp.all(ours[2] != 0)
+    with pytest.raises(ValueError, match="needs a solver that undoes its own steps"):
+        diffrax.diffeqsolve(
+            terms, ds.Damped(ds.SRKs3(), 0.1), 0.0, 1.0, 0.1, y0, 0.7,
+            adjoint=ds.ReversingAdjoint(),
+        )  # fmt: skip

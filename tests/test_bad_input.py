@@ -6,6 +6,8 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import lineax as lx
+import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
@@ -88,6 +90,137 @@ def test_a_matrix_of_noises_for_a_state_of_several_arrays_is_refused_with_advice
             0.1,
             {"a": jnp.ones(3)},
         )
+
+
+def test_an_error_of_the_users_own_within_a_control_term_stays():
+    # The noise is no array as the state is, but a valid operator.
+    struct = {"a": jax.ShapeDtypeStruct((3,), jnp.float64)}
+    operator = lambda: lx.PyTreeLinearOperator({"a": jnp.ones((3, 2))}, struct)
+    drift = diffrax.ODETerm(lambda t, y, args: y)
+    y0 = {"a": jnp.ones(3)}
+
+    def refuse(t, y, args):
+        if args == "refuse":
+            raise ValueError("the user's own")
+        return operator()
+
+    terms = diffrax.MultiTerm(drift, diffrax.ControlTerm(refuse, weak_path(2)))
+    solver = ds.ImplicitMidpoint()
+    step = lambda args: solver.step(terms, 0.0, 0.1, y0, args, None, False)[0]
+    assert jax.eval_shape(lambda: step("")) == struct
+    with pytest.raises(ValueError, match="the user's own"):
+        step("refuse")
+
+
+@pytest.mark.filterwarnings("ignore:Complex")
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), diffrax.Heun()], ids=repr)
+def test_complex_amplitudes_are_refused_before_a_derivative_is_taken(solver):
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: jnp.sum(p**2 + q**2),
+        lambda t, p, q, args: q[:1],
+        weak_path(1),
+    )
+    z = 1j * jnp.ones(2)
+    for y0 in ((z, z), (z, jnp.ones(2)), z):
+        with pytest.raises(ValueError, match="Both are real; got.*`wave_terms`"):
+            _solve(terms, y0, solver)
+
+
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), diffrax.Heun()], ids=repr)
+@pytest.mark.parametrize("m", [1, 3])
+def test_noise_that_does_not_depend_on_the_state_is_refused(solver, m):
+    H = lambda t, p, q, args: jnp.sum(p**2 + q**2)
+    y0 = (jnp.ones(2), jnp.ones(2))
+    # An amplitude in place of a Hamiltonian, of which the gradient is zero.
+    for amplitude in (
+        lambda t, p, q, args: 0.05 * jnp.ones(m),
+        lambda t, p, q, args: args * jnp.cos(t) * jnp.ones(m),
+        ds.IndexedNoise(lambda k, t, p, q, args: 0.05, m),
+    ):
+        terms = ds.hamiltonian_terms(H, amplitude, weak_path(m, two_point=True))
+        with pytest.raises(
+            ValueError, match=r"do not depend on the state.*-sigma \* q"
+        ):
+            diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0, jnp.array(0.05))
+        with pytest.raises(ValueError, match="do not depend on the state"):
+            ds.suggest_solver(terms, y0, jnp.array(0.05))
+    with pytest.raises(ValueError, match="do not depend on the state"):
+        diffrax.diffeqsolve(terms, ds.NinomiyaVictoir(), 0.0, 0.2, 0.1, y0)
+    # What may be zero for the values of today is none of these.
+    kick = lambda t, p, q, args: -args * q[:1] * jnp.ones(m)
+    terms = ds.hamiltonian_terms(H, kick, weak_path(m))
+    for zero in (0.0, jnp.array(0.0)):
+        diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0, zero)
+
+
+@pytest.mark.parametrize("name", ["H0", "noise"])
+def test_a_hamiltonian_that_asks_for_values_is_named(name):
+    def branches(t, p, q, args):
+        return jnp.sum(p**2) if p[0] > 0 else jnp.sum(q**2)
+
+    square = lambda t, p, q, args: jnp.sum(p**2)
+    H0, noise = (branches, square) if name == "H0" else (square, branches)
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
+    with pytest.raises(
+        ValueError, match=rf"`{name}\(t, p, q, args\)` asks for.*jnp.where"
+    ):
+        _solve(terms, (jnp.ones(2), jnp.ones(2)))
+
+
+def test_shapes_are_written_as_shapes():
+    H = lambda t, p, q, args: jnp.sum(p**2)
+    y0 = (jnp.ones(3), jnp.ones(3))
+    for energy, noises, match in (
+        (H, lambda t, p, q, args: q, r"which has shape \(2,\); got shape \(3,\)"),
+        (lambda t, p, q, args: p, lambda t, p, q, args: q[:2], r"got shape \(3,\)"),
+    ):
+        with pytest.raises(ValueError, match=match) as info:
+            _solve(ds.hamiltonian_terms(energy, noises, weak_path(2)), y0)
+        assert "ShapeDtypeStruct" not in str(info.value)
+
+
+def test_cells_that_do_not_divide_the_step_are_refused_while_tracing():
+    H = lambda t, p, q, args: jnp.sum(p**2 + q**2)
+    y0 = (jnp.ones(2), jnp.ones(2))
+    path = ds.FixedStepBrownianPath((), jr.key(0), cell=0.05)
+
+    def solve(t1, dt0, path):
+        terms = ds.hamiltonian_terms(H, H, path)
+        return diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), 0, t1, dt0, y0).ys
+
+    for wrapped in (path, ds.TruncatedBrownianPath(path)):
+        for t1, dt0 in ((1, 0.07), (0.33, 0.1), (1.0, 0.125)):
+            with pytest.raises(ValueError, match="got cell=0.05 and (t1|dt0)="):
+                jax.eval_shape(lambda: solve(t1, dt0, wrapped))
+        jax.eval_shape(lambda: solve(1, 0.1, wrapped))
+        # Times that are traced are known when run.
+        jax.eval_shape(lambda h: solve(1, h, wrapped), 0.07)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_an_unsolved_step_says_what_to_do_about_it(dtype):
+    H0 = lambda t, p, q, args: jnp.sum(p**2 * q**2) / 2
+    path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((), dtype), jr.key(0))
+    terms = ds.hamiltonian_terms(H0, H0, path)
+    solver = ds.ImplicitMidpoint(root_find_max_steps=1)
+    t0, t1 = jnp.array([0.0, 80.0], dtype)
+
+    def solve(size, throw):
+        y0 = (size * jnp.ones(2, dtype),) * 2
+        return diffrax.diffeqsolve(terms, solver, t0, t1, t1 / 2, y0, throw=throw)
+
+    with pytest.raises(RuntimeError) as info:
+        solve(jnp.array(1.0, dtype), True)
+    for advice in ("smaller steps", "TruncatedBrownianPath", "root_find_max_steps"):
+        assert advice in str(info.value)
+    # In a batch the others are solved.
+    sizes = jnp.array([1.0, 1e-3], dtype)
+    result = jax.jit(jax.vmap(lambda size: solve(size, False).result))(sizes)
+    message = diffrax.RESULTS[result]
+    assert message.count("smaller steps") == 1
+    one = diffrax.RESULTS.successful
+    good = jax.vmap(lambda r: r == one)(result)
+    np.testing.assert_array_equal(good, [False, True])
 
 
 def test_states_that_are_not_real_floats_are_refused():

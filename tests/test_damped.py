@@ -102,6 +102,32 @@ def test_misfits_are_refused_with_advice():
     assert not isinstance(explicit, diffrax.AbstractImplicitSolver)
 
 
+def test_what_has_no_canonical_momentum_is_refused():
+    solver = ds.Damped(ds.ImplicitMidpoint(), 0.1)
+    spins = ds.spin_terms(
+        lambda t, s, args: s[2],
+        lambda t, s, args: s[0],
+        ds.WeakBrownianPath((), jr.key(0)),
+    )
+    y0 = ds.to_spinors(jnp.array([0.6, 0.0, 0.8]))
+    with pytest.raises(ValueError, match="friction on a canonical momentum"):
+        diffrax.diffeqsolve(spins, solver, 0.0, 1.0, 0.1, y0)
+    # A state (x, v), of which the first half is no momentum.
+    drift = diffrax.ODETerm(lambda t, y, args: (y[1], -y[0]))
+    kick = diffrax.ControlTerm(lambda t, y, args: (y[0], y[1]), weak_path(1))
+    y0 = (jnp.ones(1), jnp.ones(1))
+    for plain in (drift, diffrax.MultiTerm(drift, kick)):
+        with pytest.raises(
+            ValueError, match="`hamiltonian_terms`, or write the friction"
+        ):
+            diffrax.diffeqsolve(plain, solver, 0.0, 1.0, 0.1, y0)
+    # The drift of Hamiltonians tells which half is the momentum.
+    terms = ds.hamiltonian_terms(_oscillator, _force, weak_path(1))
+    force = diffrax.ODETerm(lambda t, y, args: (jnp.ones(1), jnp.zeros(1)))
+    solver.init(diffrax.MultiTerm(terms, force), 0.0, 0.1, y0, None)
+    solver.init(terms.terms[0], 0.0, 0.1, y0, None)
+
+
 def test_a_traced_friction_that_is_negative_fails_its_path_alone():
     terms = ds.hamiltonian_terms(_oscillator, _force, Given(jnp.array([0.3])))
     y0 = jnp.ones(2), jnp.ones(2)

@@ -93,6 +93,34 @@ def test_failed_paths_are_counted_and_left_out():
     assert np.isnan(nothing.std_error)
 
 
+def test_failures_that_are_not_reported_are_refused_each_time():
+    H = lambda t, p, q, args: (p**2 + q**2) / 2
+
+    noise = lambda t, p, q, args: q
+    phi = jax.tree_util.Partial(_stopping, H, noise)
+    for _ in range(2):
+        with pytest.raises(ValueError, match="`throw=False` but does not return"):
+            ds.expectation(lambda key: phi(key, False).ys[1][-1], jr.key(0), 100)
+
+    # Reported they are counted, and thrown they are seen.
+    def pair(key):
+        sol = phi(key, False)
+        return sol.ys[1][-1], sol.result
+
+    assert ds.expectation(pair, jr.key(0), 100).num_failed == 100
+    with pytest.raises(RuntimeError, match="max_steps"):
+        ds.expectation(lambda key: phi(key, True).ys[1][-1], jr.key(0), 100)
+
+
+def _stopping(H0, noise, key, throw):
+    """A solve that stops after half of its steps."""
+    terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), key))
+    y0 = (jnp.array(0.0), jnp.array(1.0))
+    return diffrax.diffeqsolve(
+        terms, ds.StormerVerlet(), 0.0, 1.0, 0.1, y0, throw=throw, max_steps=5
+    )
+
+
 def _square(solver, steps=10):
     def phi(key):
         terms = kubo_terms(ds.WeakBrownianPath((), key))

@@ -7,15 +7,14 @@ import re
 from pathlib import Path
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic import _compat
-from diffrax_symplectic._effect_free import evaluate_without_effects
 
 
 def test_private_parts_of_others_are_used_in_one_module_only():
@@ -174,40 +173,65 @@ def test_loops_of_equinox_take_buffers_and_gradients_can_be_refused():
         jax.grad(refused)(2.0)
 
 
-def _custom_jvp(f):
-    f = jax.custom_jvp(f)
-    f.defjvp(lambda x, t: (f(*x), t[0]))
-    return f
+@pytest.mark.core
+def test_times_of_a_solve_are_found_as_they_were_passed(terms):
+    seen = []
+
+    class Spy(diffrax.Euler):
+        def init(self, terms, t0, t1, y0, args):
+            seen.append(_compat.innermost_times())
+
+    y0 = jnp.array(0.3), jnp.array(0.7)
+    solve = lambda dt0: diffrax.diffeqsolve(
+        terms.terms[0], Spy(), 0, 1.0, dt0=dt0, y0=y0
+    )
+    jax.eval_shape(lambda: solve(0.5).ys)
+    jax.eval_shape(lambda h: solve(h).ys, 0.5)
+    assert seen[0] == (0, 1.0, 0.5) and seen[1][:2] == (0, 1.0)
+    assert isinstance(seen[1][2], jax.core.Tracer)
+    assert _compat.innermost_times() is None
 
 
-def _custom_vjp(f):
-    f = jax.custom_vjp(f)
-    f.defvjp(lambda x: (f(x), None), lambda _, t: (t,))
-    return f
+@pytest.mark.core
+@pytest.mark.parametrize("throw", [True, False])
+def test_a_program_tells_whether_its_solves_raise_errors(terms, throw):
+    ts = diffrax.SaveAt(ts=jnp.array([0.0, 1.0]))
+
+    def end(x, adjoint, saveat):
+        sol = diffrax.diffeqsolve(
+            terms, ds.StormerVerlet(), 0.0, 1.0, x, (x, x), adjoint=adjoint,
+            saveat=saveat, throw=throw,
+        )  # fmt: skip
+        return sol.ys[0][-1]
+
+    adjoints = diffrax.RecursiveCheckpointAdjoint(), ds.ReversingAdjoint()
+    for adjoint in (*adjoints, diffrax.DirectAdjoint(), diffrax.ForwardMode()):
+        for saveat in (ts, diffrax.SaveAt(t1=True)):
+            fn = lambda x: end(x, adjoint, saveat)
+            program = jax.make_jaxpr(jax.jit(fn))(0.5)
+            assert _compat.solves_without_throwing(program.jaxpr) is not throw
+    for adjoint in adjoints:
+        gradient = jax.grad(
+            lambda x: diffrax.diffeqsolve(
+                terms, ds.StormerVerlet(), 0.0, 1.0, 0.5, (x, x), adjoint=adjoint,
+                throw=throw,
+            ).ys[0][-1]
+        )  # fmt: skip
+        program = jax.make_jaxpr(gradient)(0.5)
+        assert _compat.solves_without_throwing(program.jaxpr) is not throw
+    assert not _compat.solves_without_throwing(jax.make_jaxpr(jnp.sin)(0.5).jaxpr)
 
 
-CONTROL_FLOW = {
-    "jit": jax.jit,
-    "checkpoint": jax.checkpoint,
-    "custom_jvp": _custom_jvp,
-    "custom_vjp": _custom_vjp,
-    "vmap": lambda f: lambda x: jax.vmap(f)(x[None])[0],
-    "cond": lambda f: lambda x: jax.lax.cond(x > 0, f, lambda x: x, x),
-    "scan": lambda f: lambda x: jax.lax.scan(lambda x, _: (f(x), x), x, None, 2)[0],
-    "while": lambda f: lambda x: jax.lax.fori_loop(0, x.astype(int), lambda _, x: f(x), x),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", CONTROL_FLOW)
-def test_programs_of_jax_run_without_the_effects_within(name, capfd):
-    def function(x):
-        jax.debug.print("printed {}", x)
-        return eqx.error_if(x + 1, x > 10, "raised")
-
-    closed = jax.make_jaxpr(CONTROL_FLOW[name](function))(2.0)
-    run = lambda x: evaluate_without_effects(closed.jaxpr, closed.consts, [x])[0]
-    expected = {"scan": 4, "while": 4}.get(name, 3)
-    assert jax.jit(run)(2.0) == expected
-    assert jnp.isnan(jax.jit(run)(20.0))
-    jax.effects_barrier()
-    assert "printed" not in capfd.readouterr().out
+def test_a_result_may_have_a_message_of_its_own():
+    before = diffrax.RESULTS.successful
+    item = _compat.unsolved_step_result("unused: it has one already")
+    assert item == _compat.unsolved_step_result("")
+    # It goes through what Diffrax does with results.
+    where = jax.jit(lambda x: diffrax.RESULTS.where(x, before, item))
+    assert where(False) == item and where(True) == before
+    assert "smaller steps" in diffrax.RESULTS[item]
+    assert diffrax.RESULTS.promote(optx.RESULTS.nonfinite) == diffrax.RESULTS.nonfinite
+    assert not any(
+        bool(item == getattr(diffrax.RESULTS, name))
+        for name in ("successful", "internal_error", "nonlinear_max_steps_reached")
+    )

@@ -58,6 +58,24 @@ def test_the_estimate_is_exact_up_to_the_spread_that_it_reports():
     np.testing.assert_allclose(high - low, 2 * 2.13145 * got.std_error, rtol=1e-5)
 
 
+def test_ito_solvers_are_refused_for_terms_of_stratonovich():
+    for solver in (diffrax.Euler(), diffrax.ItoMilstein()):
+        with pytest.raises(ValueError, match="in the sense of Ito.*`diffrax.Heun`"):
+            _estimate(solver)
+    # For additive noise both senses agree, and plain terms have the sense of the solver.
+    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    noise = lambda t, p, q, args: 0.1 * q
+    additive = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+    _estimate(diffrax.Euler(), additive, num_paths=32)
+    with pytest.raises(ValueError, match="in the sense of Ito"):
+        _estimate(
+            diffrax.Euler(),
+            diffrax.MultiTerm(
+                additive, *kubo_terms(ds.WeakBrownianPath((), jr.key(1))).terms
+            ),
+        )
+
+
 def test_of_one_step_the_law_is_balanced_to_the_last_path():
     # Of 256 paths a sixth is 42.67, and blocks of six are cut off at either end.
     signs = lambda t, y, args: jnp.stack([y < -1e-3, y > 1e-3, jnp.abs(y) < 1e-3])

@@ -1,7 +1,8 @@
 import diffrax
 import jax.tree_util as jtu
+import numpy as np
 
-from .._compat import innermost_solve
+from .._compat import innermost_solve, innermost_times
 
 
 def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
@@ -22,6 +23,7 @@ def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
     solve = innermost_solve()
     if solve is None or not _holds(solve.get("terms"), type(path)):
         return
+    _check_cell(path)
     controller = solve.get("stepsize_controller")
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         raise ValueError(
@@ -36,6 +38,24 @@ def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
             "two half steps do not add up to the one of the whole step. Pass the wrapped "
             "solver itself, or use `diffrax.VirtualBrownianTree` as path."
         )
+
+
+def _check_cell(path: diffrax.AbstractBrownianPath) -> None:
+    """Raises a `ValueError` if the times of the solve, where these are numbers, are no
+    multiples of the path's `cell`. (Steps of other controllers, and times that are traced,
+    are checked when run.)"""
+    cell, times = getattr(path, "cell", None), innermost_times()
+    if cell is None or times is None:
+        return
+    for name, time in zip(("t0", "t1", "dt0"), times):
+        if isinstance(time, int | float | np.number):
+            cells = float(time) / float(cell)
+            if abs(cells - round(cells)) > 1e-3:
+                raise ValueError(
+                    f"Steps of a `{type(path).__name__}` with `cell` must begin and end at "
+                    f"multiples of `cell`; got cell={cell} and {name}={time}. Pass a "
+                    "`cell` that divides `t0`, `t1` and `dt0`."
+                )
 
 
 def _holds(terms, kind: type) -> bool:

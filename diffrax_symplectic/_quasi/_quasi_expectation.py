@@ -18,6 +18,7 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 from .._arguments import check_solver, check_takes, whole_number
 from .._brownian import check_key
 from .._custom_types import Args, RealScalarLike, Y
+from .._structure_checks import check_stratonovich
 from ._chain import coordinates, Problem, replicate
 from ._estimate import estimate, QuasiExpectation
 from ._given_words import layout
@@ -103,7 +104,8 @@ def quasi_expectation(
     - `terms`, `solver`, `t0`, `t1`, `dt0`, `y0`, `args`: as for `diffrax.diffeqsolve`,
         with `t1` after `t0` by a whole number of steps `dt0`. The paths in `terms` say
         which random variables there are; their keys are not used. Any solver of this
-        package or of Diffrax with fixed steps.
+        package or of Diffrax with fixed steps. (Plain terms mean what the solver makes of
+        them: in the sense of Ito for `diffrax.Euler`, else of Stratonovich.)
     - `key`: a JAX random key. Replicate number $r$ is a function of `fold_in(key, r)`,
         however many there are and on whichever device it is made.
     - `num_paths`: of each replicate; a power of two.
@@ -121,7 +123,8 @@ def quasi_expectation(
     **Returns:** a [`diffrax_symplectic.QuasiExpectation`][].
 
     **Raises:** a `ValueError` for a number of paths that is no power of two, fewer than two
-    replicates, times between steps, a $\phi$ that is not real, a path whose random
+    replicates, an Ito solver for terms made from Hamiltonians (unless their noise is
+    additive), times between steps, a $\phi$ that is not real, a path whose random
     variables cannot be chosen (Diffrax's own; use a
     [`diffrax_symplectic.FixedStepBrownianPath`][]), or more in a step than there are
     coordinates of Sobol' points (21,201). Warns if there are so many coordinates to sort by
@@ -173,6 +176,7 @@ def _problem(phi, sort_by, terms, solver, t0, y0, args, num_paths: int) -> Probl
     """What all replicates share. Raises for what they cannot do."""
     y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
+    check_stratonovich(terms, solver, t0, y0, args)
     words = layout(terms)
     if not 0 < words.num_words <= MAX_DIMENSION:
         raise ValueError(

@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Bool
 
-from .._compat import ω
+from .._compat import unsolved_step_result, ω
 from .._custom_types import BoolScalarLike, Y
 from .._plan import Plan
 from .._root_finder import all_finite, differentiate, PicardNewton
@@ -48,9 +48,16 @@ def first_failure(first: diffrax.RESULTS, then: diffrax.RESULTS) -> diffrax.RESU
     return diffrax.RESULTS.where(first == diffrax.RESULTS.successful, then, first)
 
 
+_UNSOLVED = (
+    "The stage equations of a step were not solved. Take smaller steps; for Gaussian paths "
+    "bound the increments with `TruncatedBrownianPath`; or, if the step is solvable but "
+    "hard, raise `root_find_max_steps` of the solver (not `max_steps` of `diffeqsolve`)."
+)
+
+
 def _result(unsolved: BoolScalarLike, y1: Y) -> diffrax.RESULTS:
     R = diffrax.RESULTS
-    stuck: diffrax.RESULTS = R.nonlinear_max_steps_reached  # pyright: ignore
+    stuck = unsolved_step_result(_UNSOLVED)
     finite = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
     return R.where(unsolved, stuck, finite)
 

@@ -10,7 +10,9 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from .._compat import direction
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
-from .._hamiltonian import check_pair
+from .._hamiltonian import check_pair, is_hamiltonian
+from .._spins import SpinHamiltonian
+from .._terms import split_terms
 from .base import AbstractSymplecticSolver
 
 
@@ -112,6 +114,7 @@ class Damped(
         y0: Y,
         args: Args,
     ) -> Any:
+        _check_has_momentum(terms)
         check_pair(y0)
         _factors(self.gamma, jnp.zeros_like(t0), y0[0])
         return self.solver.init(terms, t0, t1, y0, args)
@@ -144,6 +147,23 @@ class Damped(
         args: Args,
     ) -> VF:
         return self.solver.func(terms, t0, y0, args)
+
+
+def _check_has_momentum(terms: PyTree[diffrax.AbstractTerm]) -> None:
+    """Raises a `ValueError` unless the first half of the state is a canonical momentum."""
+    is_spin = lambda x: isinstance(x, SpinHamiltonian)
+    if any(map(is_spin, jtu.tree_leaves(terms, is_leaf=is_spin))):
+        raise ValueError(
+            "`Damped` is friction on a canonical momentum. Half of the state of "
+            "`spin_terms` is none: to damp it would make spins shorter."
+        )
+    if not any(map(is_hamiltonian, split_terms(terms)[0])):
+        raise ValueError(
+            "`Damped` is friction on the momentum p of a state `(p, q)`, which plain terms "
+            "(`ODETerm`, `ControlTerm`) do not tell from other states, such as (position, "
+            "velocity). Construct the terms with `hamiltonian_terms`, or write the "
+            "friction into the drift and take a solver without `Damped`."
+        )
 
 
 def _factors(

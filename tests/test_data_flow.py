@@ -1,0 +1,203 @@
+"""Which structures are recognised from the flow of data, and which are refused."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._data_flow import DataFlow
+from diffrax_symplectic._structure_checks import (
+    additive_fault,
+    constant_fault,
+    separable_fault,
+)
+
+
+K = jnp.array([[2.0, -1.0], [-1.0, 2.0]])
+_network = eqx.nn.MLP(2, "scalar", 4, 2, activation=jnp.tanh, key=jr.key(0))
+ARGS = {"m": jnp.array([1.0, 2.0]), "k": jnp.array(0.5), "n": jnp.array(0), "K": K}
+
+
+def _over_sites(t, p, q, args):
+    def add(total, pq):
+        p, q = pq
+        return total + p**2 / 2 + jnp.cos(q), None
+
+    return jax.lax.scan(add, jnp.zeros(()), (p, q))[0]
+
+
+@jax.custom_jvp
+def _quartic(x):
+    return jnp.sum(x**4)
+
+
+_quartic.defjvp(lambda x, t: (_quartic(*x), jnp.sum(4 * x[0] ** 3 * t[0])))
+
+
+def _printed(t, p, q, args):
+    jax.debug.print("{} {}", p, q)
+    p = eqx.error_if(p, jnp.any(p > 1e9), "too fast")
+    return jnp.sum(p**2) + jnp.sum(jnp.sin(q))
+
+
+SEPARABLE = {
+    "masses": lambda t, p, q, a: jnp.sum(p**2 / (2 * a["m"])) + a["k"] * jnp.sum(q**4),
+    "quadratic form": lambda t, p, q, a: p @ a["K"] @ p / 2 + q @ K @ q / 2,
+    "einsum": lambda t, p, q, a: (
+        jnp.einsum("i,ij,j", p, a["K"], p) + jnp.einsum("i,ij,j->", q, K, q)
+    ),
+    "network": lambda t, p, q, a: jnp.sum(p**2) + _network(q),
+    "two networks": lambda t, p, q, a: _network(p) + _network(q + t),
+    "where": lambda t, p, q, a: (
+        jnp.sum(p**2) + jnp.sum(jnp.where(q > 0, q**2, jnp.exp(-t) * q**4))
+    ),
+    "cond": lambda t, p, q, a: jax.lax.cond(
+        a["k"] > 0,
+        lambda p, q: jnp.sum(p**2 + jnp.cos(q)),
+        lambda p, q: jnp.sum(p**4 + jnp.sin(q)),
+        p,
+        q,
+    ),
+    "scan": _over_sites,
+    "loop": lambda t, p, q, a: jax.lax.fori_loop(
+        0, 2, lambda i, s: s + p[i] ** 2 / 2 + jnp.cos(q[i]), 0.0
+    ),
+    "vmap": lambda t, p, q, a: jnp.sum(
+        jax.vmap(lambda p, q, m: p**2 / m - jnp.cos(q))(p, q, a["m"])
+    ),
+    "relativistic": lambda t, p, q, a: (
+        jnp.sqrt(1 + jnp.sum(p**2)) - 1 / jnp.linalg.norm(q)
+    ),
+    "lattice": lambda t, p, q, a: (
+        jnp.sum(p**2) / 2
+        + jnp.sum(jnp.diff(q) ** 2)
+        + jnp.sum((jnp.roll(q, 1) - q) ** 4)
+    ),
+    "bodies": lambda t, p, q, a: (
+        jnp.sum(p**2) / 2 - 1 / jnp.sqrt((q[:, None] - q + jnp.eye(2)) ** 2).sum()
+    ),
+    "checkpoint": lambda t, p, q, a: jax.checkpoint(
+        lambda p, q: jnp.sum(jnp.sin(p)) + jnp.sum(jnp.exp(q))
+    )(p, q),
+    "jit": lambda t, p, q, a: jax.jit(lambda p, q: p @ p + jnp.prod(q))(p, q),
+    "own derivative": lambda t, p, q, a: _quartic(p) + _quartic(q),
+    "stacked": lambda t, p, q, a: jnp.sum(jnp.stack([p**2, jnp.cos(q)])),
+    "printed": _printed,
+    "zero coupling": lambda t, p, q, a: jnp.sum(p**2 + q**2) + 0.0 * jnp.sum(p * q),
+    "shapes": lambda t, p, q, a: jnp.sum(p**2) * q.size + jnp.sum(q**2) * len(p),
+}
+NOT_SEPARABLE = {
+    "product": lambda t, p, q, a: jnp.sum(p * q),
+    "integer": lambda t, p, q, a: jnp.sum(p**2 + q**2) + (1 - a["n"]) * jnp.sum(p * q),
+    "Boolean": lambda t, p, q, a: (
+        jnp.sum(p**2 + q**2) + jnp.where(a["n"] > 0, 0.0, 1.0) * jnp.sum(p * q)
+    ),
+    "small": lambda t, p, q, a: jnp.sum((p - 1e-30 * q) ** 2 + q**2),
+    "position-dependent mass": lambda t, p, q, a: jnp.sum(p**2 / (1 + q**2)),
+    "network of both": lambda t, p, q, a: _network(p + q),
+    "mass in time": lambda t, p, q, a: jnp.sum(p**2) * (1 + t) + jnp.sum(q**2),
+    "switch": lambda t, p, q, a: jnp.sum(p**2 + jnp.where(p > 0, 1.0, 2.0) * q),
+    "rounded": lambda t, p, q, a: jnp.sum(p**2 + q * jnp.floor(p)),
+    "not differentiated": lambda t, p, q, a: jnp.sum(
+        p**2 + q * jax.lax.stop_gradient(p)
+    ),
+    "branch": lambda t, p, q, a: jax.lax.cond(
+        p[0] > 0, lambda: jnp.sum(p**2 + q), lambda: jnp.sum(p**2 + q**2)
+    ),
+    "carried": lambda t, p, q, a: jax.lax.scan(
+        lambda s, x: (s * x[0] + x[1], None), 1.0, (p, q)
+    )[0],
+    "cancels": lambda t, p, q, a: jnp.sum((p - q) ** 2 / 2 + p * q),
+    "packed": lambda t, p, q, a: jnp.sum(jnp.concatenate([p, q]) ** 2),
+}
+NOISES = {
+    # Whether they are additive, and constant.
+    "constant kick": (lambda t, p, q, a: -a["k"] * jnp.sum(q), True, True),
+    "matrix": (lambda t, p, q, a: jnp.sum(a["K"] @ q - K @ p), True, True),
+    "einsum": (lambda t, p, q, a: jnp.einsum("ij,j->", a["K"], q), True, True),
+    "masked": (lambda t, p, q, a: jnp.sum(jnp.where(a["m"] > 1, q, 0.0)), True, True),
+    "scan": (
+        lambda t, p, q, a: jax.lax.scan(lambda s, x: (s + x, None), 0.0, q)[0],
+        True,
+        True,
+    ),
+    "in time": (lambda t, p, q, a: jnp.cos(t) * jnp.sum(q), True, False),
+    "square": (lambda t, p, q, a: jnp.sum(q**2), False, True),
+    "absolute value": (lambda t, p, q, a: jnp.sum(jnp.abs(q)), False, True),
+    "maximum": (lambda t, p, q, a: jnp.max(q), False, True),
+    "cancels": (lambda t, p, q, a: jnp.sum((p + q) ** 2 - p**2 - q**2), False, True),
+}
+Y0 = (jnp.array([0.3, 0.1]), jnp.array([0.5, -0.2]))
+
+
+def _terms(H0, noise):
+    terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+    return tuple((term,) for term in terms.terms)
+
+
+_potential = lambda t, p, q, args: jnp.sum(jnp.sin(q)) * jnp.cos(t)
+
+
+@pytest.mark.parametrize("H0", SEPARABLE.values(), ids=SEPARABLE.keys())
+def test_ordinary_separable_hamiltonians_are_recognised(H0, capfd):
+    assert separable_fault(*_terms(H0, _potential), 0.0, Y0, ARGS) is None
+    # Also if the arguments are traced, and nothing is run.
+    fault = jax.eval_shape(
+        lambda args: separable_fault(*_terms(H0, _potential), 0.0, Y0, args), ARGS
+    )
+    assert fault is None and capfd.readouterr().out == ""
+
+
+@pytest.mark.parametrize("H0", NOT_SEPARABLE.values(), ids=NOT_SEPARABLE.keys())
+def test_what_may_not_be_separable_is_refused(H0):
+    assert separable_fault(*_terms(H0, _potential), 0.0, Y0, ARGS) is not None
+    assert separable_fault(*_terms(SEPARABLE["scan"], H0), 0.0, Y0, ARGS) is not None
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_additive_and_constant_noise_is_recognised(name):
+    H, additive, constant = NOISES[name]
+    _, noise = _terms(_over_sites, H)
+    assert (additive_fault(noise, 0.0, Y0, ARGS) is None) == additive
+    assert (constant_fault(noise, 0.0, Y0, ARGS) is None) == constant
+
+
+_count = lambda n, f, x: jax.lax.while_loop(
+    lambda c: c[0] < n, lambda c: (c[0] + 1, f(c[1])), (0, x)
+)[1]
+PROGRAMS = {
+    # Whether the result does not depend on x.
+    "repeated": (lambda x, y: _count(3, lambda s: 2 * s, y), True),
+    "repeated as often as x says": (lambda x, y: _count(x, lambda s: 2 * s, y), False),
+    "read in a loop": (lambda x, y: _count(3, lambda s: s + x, y), False),
+    "carried from one to the other": (
+        lambda x, y: jax.lax.fori_loop(0, 3, lambda i, s: (s[1], s[2], x), (y, y, y))[
+            0
+        ],
+        False,
+    ),
+    "zeros": (lambda x, y: jnp.zeros(2) * x + y, True),
+    "cosine of zero": (lambda x, y: jnp.cos(0 * x) * y, True),
+    "zeros by a matrix": (lambda x, y: jnp.zeros((2, 2)) @ jnp.stack([x, x]) + y, True),
+    "zeros plus": (lambda x, y: jnp.zeros(2) + x, False),
+    "chosen by": (lambda x, y: jnp.where(x > 0, y, 2 * y), False),
+    "chosen branch": (lambda x, y: jax.lax.cond(x > 0, jnp.sin, jnp.cos, y), False),
+    "sign": (lambda x, y: y + jnp.sign(x), False),
+    "call back": (
+        lambda x, y: jax.pure_callback(
+            lambda v: v, jax.ShapeDtypeStruct((), float), x, vmap_method="sequential"
+        ),
+        False,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_data_flow_through_programs(name):
+    fn, independent = PROGRAMS[name]
+    flow = DataFlow(fn, jnp.array(0.5), jnp.array(0.3))
+    assert flow.independent(lambda x, y: x) == independent
+    wrapped = DataFlow(jax.jit(jax.vmap(fn)), jnp.ones(3), jnp.ones(3))
+    assert wrapped.independent(lambda x, y: x) == independent
