@@ -36,6 +36,7 @@ from ._solver import (
     AbstractImplicitStages as AbstractImplicitStages,
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
     AdditiveGauss as AdditiveGauss,
+    BAOAB as BAOAB,
     check_structure as check_structure,
     Damped as Damped,
     LevyAreaMidpoint as LevyAreaMidpoint,
