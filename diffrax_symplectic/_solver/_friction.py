@@ -1,5 +1,5 @@
-"""Friction `dp = -gamma p dt`: its rates, its exact flow, and the exact law of the noise that
-comes with it over a step."""
+"""Friction `dp = -gamma p dt`: its rates, its exact flow, and the exact law of the noise
+that comes with it over a step."""
 
 import functools as ft
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._compat import nondifferentiable
 from .._custom_types import RealScalarLike
+from .._materialize import materialize
 
 
 def checked(gamma: PyTree) -> PyTree:
@@ -109,7 +110,7 @@ def _for_each(gamma: PyTree[ArrayLike], p: PyTree[Array]) -> list:
 
 
 def _as_matrix(g: ArrayLike, x: Array) -> Float[Array, "n n"]:
-    return jnp.asarray(g, jnp.result_type(x)).reshape(jnp.size(x), jnp.size(x))
+    return _like(g, x).reshape(jnp.size(x), jnp.size(x))
 
 
 def _modes(matrix: Float[Array, "n n"]) -> Modes:
@@ -128,7 +129,7 @@ def decay(x: Array) -> Array:
 
 def spread(x: Array) -> Array:
     r"""The standard deviation of $\int_0^t e^{-\gamma (t - s)} \mathrm{d}w_s$ in units of
-    $\sqrt t$, with $x = \gamma t$: the root of $(1 - e^{-2 x}) / (2 x)$, at $x < 0$ as well.
+    $\sqrt t$, with $x = \gamma t$: the root of $(1 - e^{-2 x}) / (2 x)$, also at $x < 0$.
     """
     near = jnp.abs(x) < 0.1
     y = jnp.where(near, x, 0) ** 2
@@ -140,26 +141,46 @@ def spread(x: Array) -> Array:
 
 
 def apply_friction(
-    fn: Callable[[Array], Array],
     gamma: PyTree[ArrayLike],
     modes: list[Modes | None],
     time: RealScalarLike,
-    p: PyTree[Array],
+    *parts: tuple[Callable[[Array], Array], PyTree[Array]],
 ) -> PyTree[Array]:
-    """`fn(gamma time) p`, with a function of a matrix where `gamma` is one."""
+    """The sum of `fn(gamma time) p` over `(fn, p)` in `parts`, with functions of a matrix
+    where `gamma` is one."""
+    fns, ps = zip(*parts)
+    leaves = list(zip(*map(jtu.tree_leaves, ps)))
+    rates, times = _for_each(gamma, ps[0]), [_like(time, xs[0]) for xs in leaves]
 
-    def each(g, mode, x):
-        t = jnp.asarray(time, jnp.result_type(x))
-        if mode is not None:
-            flat = _of_matrix(fn, _as_matrix(g, x), mode, t, jnp.ravel(x))
-            return flat.reshape(jnp.shape(x))
-        g = jnp.asarray(g, jnp.result_type(x))
-        bad = ~jnp.all(jnp.isfinite(g) & (g >= 0))
-        # Values that are traced cannot raise an error here. They make their path fail.
-        return jnp.where(bad, jnp.nan, fn(g * t)) * x
+    def factors():
+        return [
+            [_factor(fn, _like(g, xs[0]), t) for fn in fns] if mode is None else []
+            for g, mode, t, xs in zip(rates, modes, times, leaves)
+        ]
 
-    leaves, treedef = jtu.tree_flatten(p)
-    return treedef.unflatten(map(each, _for_each(gamma, p), modes, leaves))
+    def each(factors, g, mode, t, xs):
+        if mode is None:
+            return sum(factor * x for factor, x in zip(factors, xs))
+        matrix = _as_matrix(g, xs[0])
+        parts = zip(fns, map(jnp.ravel, xs))
+        flat = sum(_of_matrix(fn, matrix, mode, t, x) for fn, x in parts)
+        return jnp.reshape(flat, jnp.shape(xs[0]))
+
+    # In a batch the factors are those of all paths. Fused into the loop over the batch,
+    # they would be computed for each of them.
+    fixed = materialize(factors)
+    summed = map(each, fixed, rates, modes, times, leaves)
+    return jtu.tree_structure(ps[0]).unflatten(summed)
+
+
+def _like(x: ArrayLike, y: Array) -> Array:
+    return jnp.asarray(x, jnp.result_type(y))
+
+
+def _factor(fn: Callable[[Array], Array], g: Array, time: Array) -> Array:
+    bad = ~jnp.all(jnp.isfinite(g) & (g >= 0))
+    # Values that are traced cannot raise an error here. They make their path fail.
+    return jnp.where(bad, jnp.nan, fn(g * time))
 
 
 _dot = ft.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)

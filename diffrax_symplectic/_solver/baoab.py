@@ -7,8 +7,8 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import ArrayLike, PyTree
 
-from .._compat import direction, unwrapped, ω
-from .._custom_types import Args, RealScalarLike, Y
+from .._compat import direction, unwrapped
+from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._root_finder import all_finite
 from .._structure_checks import check_additive, check_separable
 from .._terms import apply, check_state, controls, split_terms
@@ -105,7 +105,16 @@ class BAOAB(AbstractSymplecticSolver):
         modes = friction_modes(self.gamma, self._faults, y0[0])
         return _rate(drift, t0, y0, args)[0], modes
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: Any,
+        made_jump: BoolScalarLike,
+    ) -> tuple[Y, None, DenseInfo, Any, diffrax.RESULTS]:
         drift, noise = split_terms(terms)
         forces, modes = solver_state
         if made_jump is not False:
@@ -120,13 +129,12 @@ class BAOAB(AbstractSymplecticSolver):
         q = move(y0[1], _rate(drift, t0, (p, y0[1]), args)[1])
         # In a solve backward in time the momentum grows. Diffrax makes `t1 - t0` positive.
         time = 2 * direction(terms) * half
-        of_friction = lambda fn, p: apply_friction(fn, self.gamma, modes, time, p)
-        decayed = of_friction(decay, p)
+        parts = [(decay, p)]
         if len(noise) > 0:
             drawn = controls(noise, ["W"], t0, t1, "BAOAB")["W"]
             kick, _ = apply(noise, drawn, args, t0 + half, (p, q))
-            decayed = (decayed**ω + of_friction(spread, kick) ** ω).ω
-        p = decayed
+            parts.append((spread, kick))
+        p = apply_friction(self.gamma, modes, time, *parts)
         q = move(q, _rate(drift, t1, (p, q), args)[1])
         forces, _ = _rate(drift, t1, (p, q), args)
         y1 = move(p, forces), q

@@ -116,7 +116,7 @@ class Damped(
         # In a solve backward in time the momentum grows. Diffrax makes `t1 - t0` positive.
         time = direction(terms) * (t1 - t0) / 2
         inner, modes = solver_state
-        damp = lambda y: (apply_friction(decay, self.gamma, modes, time, y[0]), y[1])
+        damp = lambda y: (apply_friction(self.gamma, modes, time, (decay, y[0])), y[1])
         y1, error, _, inner, result = self.solver.step(
             terms, t0, t1, damp(y0), args, inner, made_jump
         )
