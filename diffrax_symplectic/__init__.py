@@ -80,3 +80,8 @@ from ._verify import (
     symplecticity_defect as symplecticity_defect,
     weak_order_defect as weak_order_defect,
 )
+from ._waves import (
+    from_pair as from_pair,
+    to_pair as to_pair,
+    wave_terms as wave_terms,
+)
