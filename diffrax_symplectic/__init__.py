@@ -40,6 +40,7 @@ from ._solver import (
     check_structure as check_structure,
     Damped as Damped,
     LevyAreaMidpoint as LevyAreaMidpoint,
+    LinearFlow as LinearFlow,
     ImplicitMidpoint as ImplicitMidpoint,
     NinomiyaVictoir as NinomiyaVictoir,
     PlateauGauss as PlateauGauss,

@@ -17,7 +17,13 @@ from ._compat import nondifferentiable_backward, reversed_in_time, while_loop, Ï
 from ._custom_types import IntScalarLike, RealScalarLike, Y
 from ._own_inverse import is_own_inverse
 from ._plan import make_plan
-from ._solver import AbstractSymplecticRungeKutta, BAOAB, Damped, NinomiyaVictoir
+from ._solver import (
+    AbstractSymplecticRungeKutta,
+    BAOAB,
+    Damped,
+    LinearFlow,
+    NinomiyaVictoir,
+)
 
 
 class ReversingAdjoint(diffrax.AbstractAdjoint):
@@ -41,7 +47,8 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     [`diffrax_symplectic.ImplicitMidpoint`][], [`diffrax_symplectic.StormerVerlet`][],
     [`diffrax_symplectic.StrangGauss`][], [`diffrax_symplectic.LevyAreaMidpoint`][],
     [`diffrax_symplectic.NinomiyaVictoir`][], [`diffrax_symplectic.BAOAB`][],
-    [`diffrax_symplectic.Damped`][] around one of these, and tableaus of your own. With
+    [`diffrax_symplectic.Damped`][] or
+    [`diffrax_symplectic.LinearFlow`][] around one of these, and tableaus of your own. With
     friction rounding errors grow by $e^{\gamma t}$ on the way back: save more states.
 
     **Steps:** `diffrax.ConstantStepSize` or `diffrax.StepTo`. **Saving:** `SaveAt(t1=True)`
@@ -148,7 +155,7 @@ def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:
     # with negated increments takes them in the reverse order.
     if isinstance(solver, NinomiyaVictoir | BAOAB):
         return True
-    if isinstance(solver, Damped):
+    if isinstance(solver, Damped | LinearFlow):
         return _undoes_its_steps(solver.solver)
     if not isinstance(solver, AbstractSymplecticRungeKutta):
         return False

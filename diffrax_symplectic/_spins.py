@@ -186,9 +186,10 @@ def from_spinors(y: _Spinors) -> _Spins:
         a = q_1 + \mathrm i p_1, \quad b = q_2 + \mathrm i p_2.$$
 
     This is the Hopf map, as in [McLachlan, Modin and Verdier
-    (2014)](https://doi.org/10.1088/0951-7715/27/6/1525). The factor $1/4$ makes the canonical brackets of its components
-    those of spins, $\{s_1, s_2\} = -s_3$ and cyclic. So canonical equations for
-    $H(s(p, q))$ push forward to $\mathrm{d}s = s \times \nabla H\,\mathrm{d}t$. The
+    (2014)](https://doi.org/10.1088/0951-7715/27/6/1525). The factor $1/4$ makes the
+    canonical brackets of its components those of spins, $\{s_1, s_2\} = -s_3$ and cyclic.
+    So canonical equations for $H(s(p, q))$ push forward to
+    $\mathrm{d}s = s \times \nabla H\,\mathrm{d}t$. The
     length is $|s| = (|p|^2 + |q|^2) / 4$.
 
     **Arguments:**

@@ -20,3 +20,4 @@ from .plateau_verlet import PlateauVerlet as PlateauVerlet
 from .stormer_verlet import StormerVerlet as StormerVerlet
 from .baoab import BAOAB as BAOAB
 from .damped import Damped as Damped
+from .linear_flow import LinearFlow as LinearFlow
