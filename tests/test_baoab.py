@@ -280,6 +280,29 @@ def test_one_evaluation_of_the_forces_in_a_step():
     assert len(calls) == 11
 
 
+def test_terms_of_diffrax_for_langevin_dynamics_translate_as_the_docs_say():
+    gamma, u = jnp.array([0.7, 0.2]), jnp.array([0.5, 2.0])
+    f = lambda x: jnp.sum(jnp.cos(x) * x)
+    grad_f = lambda x, args: jax.grad(f)(x)
+    path = diffrax.UnsafeBrownianPath((2,), jr.key(0))
+    theirs = diffrax.UnderdampedLangevinDriftTerm(gamma, u, grad_f)
+    noise = diffrax.UnderdampedLangevinDiffusionTerm(gamma, u, path)
+    drift, diffusion = ds.hamiltonian_terms(
+        lambda t, p, q, args: jnp.sum(u * p**2) / 2 + f(q),
+        lambda t, p, q, args: -jnp.sqrt(2 * gamma / u) * q,
+        path,
+    ).terms
+    x, v, W = jr.normal(jr.key(1), (3, 2))
+    p, q = v / u, x
+    dp, dq = drift.vf(0.0, (p, q), None)
+    dx, dv = theirs.vf(0.0, (x, v), None)
+    np.testing.assert_allclose(dx, dq, atol=1e-15)
+    np.testing.assert_allclose(dv, u * (dp - gamma * p), atol=1e-15)
+    dp, _ = diffusion.vf_prod(0.0, (p, q), None, W)
+    _, dv = noise.vf_prod(0.0, (x, v), None, W)
+    np.testing.assert_allclose(dv, u * dp, atol=1e-15)
+
+
 def test_after_a_jump_the_forces_are_new():
     terms = ds.hamiltonian_terms(_pendula, _bath(SIGMA), Given(jnp.array([0.3, 0.1])))
     solver, y0 = ds.BAOAB(0.5), (jnp.ones(2), jnp.zeros(2))
