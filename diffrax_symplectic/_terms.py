@@ -288,10 +288,11 @@ def check_state(y0: Y, solver: str) -> None:
         dtype = jnp.result_type(leaf)
         if jnp.issubdtype(dtype, jnp.complexfloating):
             raise ValueError(
-                f"`{solver}` needs a real state; got an array of dtype {dtype}. For "
-                "complex amplitudes `psi` with Hamiltonians construct the terms with "
-                "`wave_terms(H0, noise, path)` and pass `y0=to_pair(psi0)`. For other "
-                "equations split the state into real and imaginary parts."
+                f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
+                f"array of dtype {dtype}. For complex amplitudes `psi` with Hamiltonians "
+                "construct the terms with `wave_terms(H0, noise, path)` and pass "
+                "`y0=to_pair(psi0)`. For other equations split the state into real and "
+                "imaginary parts."
             )
         if not jnp.issubdtype(dtype, jnp.floating) or jnp.finfo(dtype).bits < 32:
             raise ValueError(
