@@ -92,6 +92,7 @@ class Lattice(NamedTuple):
 
 def lattice(solver, h: float, t1: float, paths: int, s: float, n: int = N) -> Lattice:
     y0, steps = start(n), round(t1 / h)
+    terms = make_rest if isinstance(solver, ds.LinearFlow) else make_terms
     saveat = diffrax.SaveAt(
         subs=[
             diffrax.SubSaveAt(t1=True),
@@ -99,7 +100,7 @@ def lattice(solver, h: float, t1: float, paths: int, s: float, n: int = N) -> La
         ]
     )
     _, ((p, q), (norms, energies, coherence)), failed = ensemble(
-        make_terms, weak((n,)), solver, y0, h, steps, paths, args=s, saveat=saveat
+        terms, weak((n,)), solver, y0, h, steps, paths, args=s, saveat=saveat
     )
     good = ~failed
     # Rows that were not needed are infinite.
@@ -121,6 +122,9 @@ def lattice(solver, h: float, t1: float, paths: int, s: float, n: int = N) -> La
 _MATRIX_FREE = ds.PicardNewton(linear_solver=lx.GMRES(rtol=1e-9, atol=1e-9))
 SOLVERS = {
     "ImplicitMidpoint": ds.ImplicitMidpoint(root_finder=_MATRIX_FREE),
+    "LinearFlow(ImplicitMidpoint)": ds.LinearFlow(
+        ds.ImplicitMidpoint(), hopping_flow()
+    ),
     "Heun": diffrax.Heun(),
     "EulerHeun": diffrax.EulerHeun(),
 }
