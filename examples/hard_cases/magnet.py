@@ -89,7 +89,7 @@ def monte_carlo(T: float, sweeps: int, shape=SHAPE) -> Means:
 
     def draw(s, key, half):
         k_u, k_phi = jr.split(key)
-        field = neighbours(s).at[..., 2].add(B)
+        field = jnp.asarray(neighbours(s)).at[..., 2].add(B)
         size = jnp.linalg.norm(field, axis=-1)
         x = size / T
         # cos of the angle to the field has the density exp(x cos).
