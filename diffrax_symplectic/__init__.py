@@ -36,9 +36,11 @@ from ._solver import (
     AbstractImplicitStages as AbstractImplicitStages,
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
     AdditiveGauss as AdditiveGauss,
+    BAOAB as BAOAB,
     check_structure as check_structure,
     Damped as Damped,
     LevyAreaMidpoint as LevyAreaMidpoint,
+    LinearFlow as LinearFlow,
     ImplicitMidpoint as ImplicitMidpoint,
     NinomiyaVictoir as NinomiyaVictoir,
     PlateauGauss as PlateauGauss,
@@ -78,4 +80,9 @@ from ._verify import (
     step_expectation as step_expectation,
     symplecticity_defect as symplecticity_defect,
     weak_order_defect as weak_order_defect,
+)
+from ._waves import (
+    from_pair as from_pair,
+    to_pair as to_pair,
+    wave_terms as wave_terms,
 )

@@ -17,7 +17,13 @@ from ._compat import nondifferentiable_backward, reversed_in_time, while_loop, Ï
 from ._custom_types import IntScalarLike, RealScalarLike, Y
 from ._own_inverse import is_own_inverse
 from ._plan import make_plan
-from ._solver import AbstractSymplecticRungeKutta, Damped, NinomiyaVictoir
+from ._solver import (
+    AbstractSymplecticRungeKutta,
+    BAOAB,
+    Damped,
+    LinearFlow,
+    NinomiyaVictoir,
+)
 
 
 class ReversingAdjoint(diffrax.AbstractAdjoint):
@@ -40,8 +46,10 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     **Solvers:** those that are their own inverse, which is read off their coefficients:
     [`diffrax_symplectic.ImplicitMidpoint`][], [`diffrax_symplectic.StormerVerlet`][],
     [`diffrax_symplectic.StrangGauss`][], [`diffrax_symplectic.LevyAreaMidpoint`][],
-    [`diffrax_symplectic.NinomiyaVictoir`][], tableaus of your own, and
-    [`diffrax_symplectic.Damped`][] around one of these.
+    [`diffrax_symplectic.NinomiyaVictoir`][], [`diffrax_symplectic.BAOAB`][], tableaus of
+    your own, and [`diffrax_symplectic.Damped`][] or [`diffrax_symplectic.LinearFlow`][]
+    around one of these. With friction rounding errors grow by $e^{\gamma t}$ on the way
+    back: save more states.
 
     **Steps:** `diffrax.ConstantStepSize` or `diffrax.StepTo`. **Saving:** `SaveAt(t1=True)`
     or `SaveAt(ts=...)`. No events, no forward mode; no derivatives with respect to times.
@@ -76,7 +84,14 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
             )
         _check_supported(solver, stepsize_controller, event, saveat)
         y = init_state.y
-        init_state = eqx.tree_at(lambda s: s.y, init_state, object())
+        # What a solver remembers of the state is computed anew on the way back.
+        fixed = jtu.tree_map(_without_derivative, init_state.solver_state)
+        init_state = eqx.tree_at(
+            lambda s: (s.y, s.solver_state),
+            init_state,
+            (object(), fixed),
+            is_leaf=lambda x: x is None,
+        )
         final_state, aux_stats = _solve(
             (y, args, terms, solver),
             adjoint=self,
@@ -97,6 +112,10 @@ ReversingAdjoint.__init__.__doc__ = """**Arguments:**
 
 **Raises:** a `ValueError` if `checkpoints` is not a positive integer.
 """
+
+
+def _without_derivative(x: Any) -> Any:
+    return lax.stop_gradient(x) if eqx.is_array(x) else x
 
 
 def _check_supported(solver, controller, event, saveat) -> None:
@@ -133,11 +152,10 @@ def _check_supported(solver, controller, event, saveat) -> None:
 def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:
     # The sign of an increment decides in which order its flows follow each other. So a step
     # with negated increments takes them in the reverse order.
-    if isinstance(solver, Damped):
-        # Backward in time the momentum grows as it decayed.
-        return _undoes_its_steps(solver.solver)
-    if isinstance(solver, NinomiyaVictoir):
+    if isinstance(solver, NinomiyaVictoir | BAOAB):
         return True
+    if isinstance(solver, Damped | LinearFlow):
+        return _undoes_its_steps(solver.solver)
     if not isinstance(solver, AbstractSymplecticRungeKutta):
         return False
     return is_own_inverse(make_plan(solver.tableau.flatten()).tableau)
@@ -268,7 +286,8 @@ def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwar
         t0, t1 = steps.time(i), steps.time(i + 1)
         if back:
             t0, t1, terms = -t1, -t0, reversed_in_time(terms)
-        return solver.step(terms, t0, t1, y, args, init_state.solver_state, False)[0]
+        # The solver state is that of another step: as after a jump.
+        return solver.step(terms, t0, t1, y, args, init_state.solver_state, True)[0]
 
     def body(walk: _Walk) -> _Walk:
         i = walk.i - 1

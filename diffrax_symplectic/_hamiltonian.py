@@ -110,6 +110,36 @@ def hamiltonian_terms(
     return diffrax.MultiTerm(drift, HamiltonianNoise(noise, path, structure))
 
 
+class Lifted(eqx.Module):
+    """A Hamiltonian of another variable, `H(t, chart(p, q), args)`."""
+
+    H: Callable
+    chart: Callable[[_State], PyTree]
+
+    def __call__(self, *inputs) -> PyTree[Array]:
+        # The Hamiltonian of an `IndexedNoise` has the index of the noise before the time.
+        *before, p, q, args = inputs
+        return self.H(*before, self.chart((p, q)), args)
+
+
+def lifted_terms(
+    H0: Callable,
+    noise: Callable,
+    path: diffrax.AbstractBrownianPath,
+    chart: Callable[[_State], PyTree],
+    name: str,
+) -> diffrax.MultiTerm:
+    """The terms of Hamiltonians of another variable, called `name`, which `chart` makes of
+    the pair `(p, q)`."""
+    check_takes("H0", H0, "t", name, "args")
+    if isinstance(noise, IndexedNoise):
+        lifted = IndexedNoise(Lifted(noise.H, chart), noise.m)
+    else:
+        check_takes("noise", noise, "t", name, "args")
+        lifted = Lifted(noise, chart)
+    return hamiltonian_terms(Lifted(H0, chart), lifted, path)
+
+
 class _Drift(eqx.Module):
     """The vector field `(-dH0/dq, dH0/dp)`."""
 
@@ -121,15 +151,28 @@ class _Drift(eqx.Module):
 
         def scalar(p, q):
             with _named("H0"):
-                out = self.H0(t, p, q, args)
-            if not jtu.all_leaves([out]) or jnp.shape(out) != ():
-                raise ValueError(
-                    f"`H0` must return a scalar; got shape {shapes(out)}. Sum over the "
-                    "degrees of freedom."
-                )
-            return jnp.asarray(out, jnp.result_type(out, float))
+                return scalar_energy(self.H0(t, p, q, args))
 
-        return _symplectic_gradient(scalar, y)
+        return symplectic_gradient(scalar, y)
+
+
+def scalar_energy(out: PyTree) -> Array:
+    """What `H0` returned; a `ValueError` if that is no scalar."""
+    if not jtu.all_leaves([out]) or jnp.shape(out) != ():
+        raise ValueError(
+            f"`H0` must return a scalar; got shape {shapes(out)}. Sum over the degrees of "
+            "freedom."
+        )
+    _check_real("H0", out)
+    return jnp.asarray(out, jnp.result_type(out, float))
+
+
+def _check_real(name: str, out: PyTree[Array]) -> None:
+    if any(map(jnp.iscomplexobj, jtu.tree_leaves(out))):
+        raise ValueError(
+            f"`{name}` must return real numbers; got {eqx.tree_pformat(out)}. Take "
+            "`jnp.real` of what is real by its mathematics, such as <psi| A |psi>."
+        )
 
 
 class HamiltonianNoise(diffrax.AbstractTerm):
@@ -189,7 +232,7 @@ class HamiltonianNoise(diffrax.AbstractTerm):
             return sum(jtu.tree_leaves(dots))
 
         with _refused_if_constant() as observe:
-            return _symplectic_gradient(lambda p, q: observe(scalar(p, q)), y)
+            return symplectic_gradient(lambda p, q: observe(scalar(p, q)), y)
 
     def is_vf_expensive(self, t0, t1, y, args) -> bool:
         # `vf` takes one reverse pass for each noise, `vf_prod` takes one in all.
@@ -219,6 +262,7 @@ class HamiltonianNoise(diffrax.AbstractTerm):
                 f"shape {shapes(struct)}; got shape {shapes(H)}. Return an array of shape "
                 "`(m,)` and construct the path with `shape=(m,)`."
             )
+        _check_real("noise", H)
         return jtu.tree_map(lambda h, s: jnp.reshape(h, s.shape), H, struct)
 
 
@@ -261,7 +305,8 @@ def _refused_if_constant() -> Iterator[Callable]:
         )
 
 
-def _symplectic_gradient(scalar: Callable, y: _State) -> _State:
+def symplectic_gradient(scalar: Callable, y: _State) -> _State:
+    """`(-dH/dq, dH/dp)` for `H = scalar(p, q)`."""
     p, q = y
     dp, dq = jax.grad(scalar, argnums=(0, 1))(p, q)
     return (-(dq**ω)).ω, dp
@@ -295,7 +340,7 @@ def pair_fault(y: PyTree) -> str | None:
     advice = (
         "The state of a Hamiltonian system is a pair `(p, q)` of arrays (or PyTrees) of "
         "the same structure and shapes: pass `y0=(p0, q0)`, or for spins "
-        "`y0=to_spinors(s0)`. "
+        "`y0=to_spinors(s0)`, or for complex amplitudes `y0=to_pair(psi0)`. "
     )
     if any(map(jnp.iscomplexobj, jtu.tree_leaves(y))):
         return (
@@ -309,4 +354,10 @@ def pair_fault(y: PyTree) -> str | None:
         jnp.shape(x) for x in jtu.tree_leaves(p)
     ] != [jnp.shape(x) for x in jtu.tree_leaves(q)]:
         return f"{advice}Got p = {eqx.tree_pformat(p)} and q = {eqx.tree_pformat(q)}."
+    if any(map(jnp.iscomplexobj, jtu.tree_leaves(y))):
+        return (
+            "`p` and `q` must be real; got complex arrays. For complex amplitudes `psi` "
+            "construct the terms with `wave_terms(H0, noise, path)` and pass "
+            "`y0=to_pair(psi0)`."
+        )
     return None

@@ -1,17 +1,21 @@
 """Spins and rigid bodies: canonical pairs `(p, q)` in place of vectors `s` of R^3."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import diffrax
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ._arguments import check_takes
 from ._custom_types import Args, RealScalarLike
-from ._hamiltonian import check_pair, hamiltonian_terms
-from ._indexed_noise import IndexedNoise
+from ._hamiltonian import (
+    check_pair,
+    lifted_terms,
+    scalar_energy,
+)
 
 
 _Spins = Float[Array, "*spins 3"]
@@ -20,7 +24,10 @@ _SpinHamiltonian = Callable[[RealScalarLike, _Spins, Args], PyTree[ArrayLike]]
 
 
 def spin_terms(
-    H0: _SpinHamiltonian, noise: _SpinHamiltonian, path: diffrax.AbstractBrownianPath
+    H0: _SpinHamiltonian,
+    noise: _SpinHamiltonian,
+    path: diffrax.AbstractBrownianPath,
+    damping: ArrayLike | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of spins, or of a rigid body, from their Hamiltonians.
 
@@ -46,6 +53,20 @@ def spin_terms(
     All solvers for general systems are such methods: `ImplicitMidpoint`, `SRKs1`, `SRKw1`,
     `SRKw2`, `StrangGauss`, `NinomiyaVictoir` and `LevyAreaMidpoint`. Their orders are
     those for canonical systems. The others refuse these terms.
+
+    **Damping.** With `damping=alpha` the drift has one more part,
+
+    $$\alpha\, s \times (s \times \nabla H_0)\,\mathrm{d}t,$$
+
+    which is the Landau--Lifshitz equation with damping. Without noise the energy falls by
+    $\alpha |s \times \nabla H_0|^2$ in each unit of time. Every term $s \times \omega(s)$
+    lifts to the pair as that of the Hamiltonian $\omega \cdot s$ with $\omega$ held fixed.
+    So the length of a spin stays a quadratic invariant, which the same solvers keep, with
+    the same orders. The flow is no Poisson map then.
+
+    At a temperature $T$ (in units of energy) the noise is a field along each axis of each
+    spin, `noise = lambda t, s, args: sigma * s` with $\sigma^2 = 2 \alpha T$. Then the
+    density $e^{-H_0 / T}$ is stationary, for spins of any lengths.
 
     !!! example
 
@@ -87,35 +108,74 @@ def spin_terms(
         the shape of `s`; its cost is one reverse pass. Or an
         [`diffrax_symplectic.IndexedNoise`][] of `H(k, t, s, args)`.
     - `path`: the Brownian path, as for [`diffrax_symplectic.hamiltonian_terms`][].
+    - `damping`: the number $\alpha$, or one for each spin, not negative; in units of one
+        over the length of a spin. None if it is `None`. If it is traced and negative or
+        not finite, the path fails.
 
     **Returns:** `MultiTerm(drift, diffusion)`, for the state `to_spinors(s0)`.
 
-    **Raises:** as [`diffrax_symplectic.hamiltonian_terms`][]; and a `ValueError` while
-    the solve is traced if the arrays of the state do not have the shape `(..., 2)`.
+    **Raises:** as [`diffrax_symplectic.hamiltonian_terms`][]; a `ValueError` if `damping`
+    is known to be negative or not finite; and one while the solve is traced if it does
+    not fit the spins, or if the arrays of the state do not have the shape `(..., 2)`.
 
     **Source:** [McLachlan, Modin and Verdier
-    (2014)](https://doi.org/10.1088/0951-7715/27/6/1525), for systems without noise.
+    (2014)](https://doi.org/10.1088/0951-7715/27/6/1525), for systems without noise and
+    damping; [Brown (1963)](https://doi.org/10.1103/PhysRev.130.1677) for spins at a
+    temperature.
     """
-    check_takes("H0", H0, "t", "s", "args")
-    if isinstance(noise, IndexedNoise):
-        lifted = IndexedNoise(SpinHamiltonian(noise.H), noise.m)
-    else:
-        check_takes("noise", noise, "t", "s", "args")
-        lifted = SpinHamiltonian(noise)
-    return hamiltonian_terms(SpinHamiltonian(H0), lifted, path)
+    terms = lifted_terms(H0, noise, path, from_spinors, "s")
+    if damping is None:
+        return terms
+    _, diffusion = terms.terms
+    drift = diffrax.ODETerm(_DampedPrecession(H0, damping))
+    return diffrax.MultiTerm(drift, diffusion)
 
 
-class SpinHamiltonian(eqx.Module):
-    """`H(t, s(p, q), args)`, by the Hopf map as in McLachlan, Modin and Verdier,
-    https://doi.org/10.1088/0951-7715/27/6/1525
-    """
+def _checked_damping(alpha: ArrayLike) -> ArrayLike:
+    """`alpha`, after a check of its values if they are not traced."""
+    fault = not eqx.is_array_like(alpha) or np.iscomplexobj(alpha)
+    if not fault and not isinstance(alpha, jax.core.Tracer):
+        values = np.asarray(alpha)
+        fault = not np.all(np.isfinite(values) & (values >= 0))
+    if fault:
+        raise ValueError(
+            "`damping` must be a number, or an array with one for each spin, finite and "
+            f"not negative; got {alpha!r}."
+        )
+    return alpha
 
-    H: Callable
 
-    def __call__(self, *inputs) -> PyTree[ArrayLike]:
-        # The Hamiltonian of an `IndexedNoise` has the index of the noise before the time.
-        *before, p, q, args = inputs
-        return self.H(*before, from_spinors((p, q)), args)
+class _DampedPrecession(eqx.Module):
+    """The velocity of the pair for `ds/dt = s x omega`, `omega = grad H0 + alpha s x grad
+    H0`."""
+
+    H0: _SpinHamiltonian
+    alpha: ArrayLike = eqx.field(converter=_checked_damping)
+
+    def __call__(self, t: RealScalarLike, y: _Spinors, args: Args) -> _Spinors:
+        s = from_spinors(y)
+        gradient = jax.grad(lambda s: scalar_energy(self.H0(t, s, args)))(s)
+        alpha = jnp.asarray(self.alpha, s.dtype)
+        if alpha.shape not in ((), s.shape[:-1]):
+            raise ValueError(
+                "`damping` must be a number, or have one for each spin, of shape "
+                f"{s.shape[:-1]}; got shape {alpha.shape}."
+            )
+        # Values that are traced cannot raise an error here. They make their path fail.
+        alpha = jnp.where(jnp.isfinite(alpha) & (alpha >= 0), alpha, jnp.nan)
+        (s1, s2, s3), (g1, g2, g3) = _components(s), _components(gradient)
+        # `symplectic_gradient` of `omega . s(p, q)`, written out.
+        w1 = g1 + alpha * (s2 * g3 - s3 * g2)
+        w2 = g2 + alpha * (s3 * g1 - s1 * g3)
+        w3 = g3 + alpha * (s1 * g2 - s2 * g1)
+        (p1, p2), (q1, q2) = map(_components, y)
+        dp = -(w1 * q2 - w2 * p2 + w3 * q1), -(w1 * q1 + w2 * p1 - w3 * q2)
+        dq = w1 * p2 + w2 * q2 + w3 * p1, w1 * p1 - w2 * q1 - w3 * p2
+        return jnp.stack(dp, axis=-1) / 2, jnp.stack(dq, axis=-1) / 2
+
+
+def _components(x: Float[Array, "*spins d"]) -> Sequence[Float[Array, " *spins"]]:
+    return jnp.moveaxis(jnp.asarray(x), -1, 0)  # pyright: ignore
 
 
 def from_spinors(y: _Spinors) -> _Spins:
@@ -125,9 +185,11 @@ def from_spinors(y: _Spinors) -> _Spins:
         |a|^2 - |b|^2\right), \qquad
         a = q_1 + \mathrm i p_1, \quad b = q_2 + \mathrm i p_2.$$
 
-    This is the Hopf map. The factor $1/4$ makes the canonical brackets of its components
-    those of spins, $\{s_1, s_2\} = -s_3$ and cyclic. So canonical equations for
-    $H(s(p, q))$ push forward to $\mathrm{d}s = s \times \nabla H\,\mathrm{d}t$. The
+    This is the Hopf map, as in [McLachlan, Modin and Verdier
+    (2014)](https://doi.org/10.1088/0951-7715/27/6/1525). The factor $1/4$ makes the
+    canonical brackets of its components those of spins, $\{s_1, s_2\} = -s_3$ and cyclic.
+    So canonical equations for $H(s(p, q))$ push forward to
+    $\mathrm{d}s = s \times \nabla H\,\mathrm{d}t$. The
     length is $|s| = (|p|^2 + |q|^2) / 4$.
 
     **Arguments:**

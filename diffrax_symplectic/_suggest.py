@@ -187,6 +187,9 @@ def suggest_solver(
     system = f"For {want}. The system is {kind}, with {noises}."
     if not_separable is not None and not_separable.advice.startswith(FRICTION):
         system += f" {FRICTION} Ask for a solver for the terms without friction."
+        if has["constant"]:
+            system += " With constant noise, if it is separable without friction, take "
+            system += "`BAOAB(gamma)`."
     return Suggestions(system, tuple(found))
 
 

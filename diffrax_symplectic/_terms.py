@@ -293,12 +293,19 @@ def check_state(y0: Y, solver: str) -> None:
         raise ValueError(f"`{solver}` needs a state with at least one array in it.")
     for leaf in leaves:
         dtype = jnp.result_type(leaf)
+        if jnp.issubdtype(dtype, jnp.complexfloating):
+            raise ValueError(
+                f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
+                f"array of dtype {dtype}. For complex amplitudes `psi` with Hamiltonians "
+                "construct the terms with `wave_terms(H0, noise, path)` and pass "
+                "`y0=to_pair(psi0)`. For other equations split the state into real and "
+                "imaginary parts."
+            )
         if not jnp.issubdtype(dtype, jnp.floating) or jnp.finfo(dtype).bits < 32:
             raise ValueError(
                 f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
                 f"array of dtype {dtype}. Convert it with `.astype(float)`, to float32 or "
-                "float64. Split a complex one into real and imaginary parts, or construct "
-                "the terms with `wave_terms`."
+                "float64."
             )
     if len({jnp.result_type(leaf) for leaf in leaves}) > 1:
         raise ValueError(

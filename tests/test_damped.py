@@ -158,6 +158,7 @@ def test_orders_are_those_of_the_splitting_where_the_solver_has_higher_ones():
 def test_between_steps_a_solution_is_interpolated_between_their_ends():
     terms = ds.hamiltonian_terms(_oscillator, _force, Given(jnp.array([0.3])))
     solver, y0 = ds.Damped(ds.StormerVerlet(), 1.0), (jnp.ones(2), jnp.ones(2))
-    y1, _, dense, *_ = solver.step(terms, 0.0, 0.1, y0, None, None, False)
+    state = solver.init(terms, 0.0, 0.1, y0, None)
+    y1, _, dense, *_ = solver.step(terms, 0.0, 0.1, y0, None, state, False)
     np.testing.assert_array_equal(dense["y0"], y0)
     np.testing.assert_array_equal(dense["y1"], y1)

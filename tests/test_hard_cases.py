@@ -15,6 +15,7 @@ from examples.hard_cases import (
     double_well,
     henon_heiles,
     learning,
+    magnet,
     nls,
     spins,
     two_body,
@@ -105,7 +106,7 @@ def test_stationary_law_of_an_oscillator_is_that_of_its_matrices():
 
 def test_double_well_with_friction_has_nearly_the_moments_of_gibbs():
     h, V = 0.1, lambda q: double_well.energy(0.0, q)
-    bound = {"Damped(PlateauVerlet)": 1e-4, "QUICSORT": 1e-4}
+    bound = {"BAOAB": 3e-4, "Damped(PlateauVerlet)": 1e-4, "QUICSORT": 1e-4}
     for name, most in bound.items():
         step, _ = double_well.LANGEVIN[name]
         [[q2, _]] = stationary_bias(step, V, double_well.T, [h])
@@ -176,6 +177,18 @@ def test_ring_of_spins_keeps_its_total_spin_and_gains_no_energy_without_noise():
     theirs = spins.course(heun, 0.0, 0.2, 100, 1, spins=32)
     assert theirs.length_error.max() <= 1e-15
     assert theirs.total_error > 1 and theirs.energy_error > 1
+
+
+def test_a_magnet_has_the_energy_and_magnetization_of_its_temperature():
+    shape, T = (4, 4, 4), 2.0
+    ours = magnet.dynamics(T, 0.1, 4_000, shape)
+    exact = magnet.monte_carlo(T, 20_000, shape)
+    assert ours.length_error <= 1e-13
+    error = ours.values - exact.values
+    std_error = np.hypot(ours.std_errors, exact.std_errors)
+    assert np.all(np.abs(error) <= 4 * std_error)
+    # It could be seen if it were not so.
+    assert np.all(std_error <= 0.03)
 
 
 def test_ring_of_spins_with_noise_decays_as_in_closed_form():

@@ -166,8 +166,15 @@ def test_friction_as_a_term_gets_a_solver_and_is_told_of_damped():
         found = ds.suggest_solver(damped, y0)
         without = ds.suggest_solver(terms, y0)
     assert type(found[0].solver).__name__ == "StrangGauss"
-    assert "Damped(solver, gamma)" in str(found)
+    assert "Damped(solver, gamma)" in str(found) and "BAOAB" not in str(found)
     assert "Damped" not in str(without)
+    # With constant noise there is a better one.
+    bath = ds.hamiltonian_terms(
+        H0, lambda t, p, q, args: 0.3 * q, ds.WeakBrownianPath((1,), jr.key(0))
+    )
+    langevin = diffrax.MultiTerm(*bath.terms, diffrax.ODETerm(friction))
+    with jax.disable_jit():
+        assert "BAOAB(gamma)" in ds.suggest_solver(langevin, y0).system
     assert f"\n{len(found)}. {type(found[-1].solver).__name__}()" in repr(found)
 
 

@@ -18,4 +18,6 @@ from .additive_gauss import AdditiveGauss as AdditiveGauss
 from .plateau_gauss import PlateauGauss as PlateauGauss
 from .plateau_verlet import PlateauVerlet as PlateauVerlet
 from .stormer_verlet import StormerVerlet as StormerVerlet
+from .baoab import BAOAB as BAOAB
 from .damped import Damped as Damped
+from .linear_flow import LinearFlow as LinearFlow

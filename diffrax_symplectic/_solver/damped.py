@@ -2,36 +2,15 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax.core
-import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
-from jaxtyping import Array, ArrayLike, PyTree
+from jaxtyping import ArrayLike, PyTree
 
 from .._compat import direction
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
-from .._hamiltonian import check_pair, is_hamiltonian
-from .._spins import SpinHamiltonian
+from .._hamiltonian import check_pair, is_hamiltonian, Lifted
 from .._terms import split_terms
+from ._friction import apply_friction, checked, decay, friction_modes, matrix_faults
 from .base import AbstractSymplecticSolver
-
-
-def _checked(gamma: PyTree) -> PyTree:
-    """`gamma`, after a check of those of its values that are not traced."""
-    for leaf in jtu.tree_leaves(gamma):
-        if not eqx.is_array_like(leaf) or np.iscomplexobj(leaf):
-            raise ValueError(
-                "`gamma` must be a real number, an array or a PyTree of arrays; got "
-                f"{leaf!r}."
-            )
-        if not isinstance(leaf, jax.core.Tracer):
-            values = np.asarray(leaf)
-            if not np.all(np.isfinite(values)) or np.any(values < 0):
-                raise ValueError(
-                    "`gamma` must be finite and not negative: it takes momentum away at "
-                    f"this rate; got {leaf!r}."
-                )
-    return gamma
 
 
 class Damped(
@@ -51,14 +30,21 @@ class Damped(
     smaller of 2 and that of the solver; strong order the smaller of 1 and that of the
     solver; order 2 without noise.
 
+    The friction acts on the canonical momentum $p$. In a magnetic field that is not the
+    kinetic one: there friction on $p - A(q)$ is a term of its own.
+
     With noise in the forces and $\sigma^2 = 2 \gamma T$ this is Langevin dynamics at the
-    temperature $T$.
+    temperature $T$. For constant noise [`diffrax_symplectic.BAOAB`][] has far less bias.
 
     **Source:** splitting of [Strang (1968)](https://doi.org/10.1137/0705041).
     """
 
     solver: diffrax.AbstractSolver
-    gamma: PyTree[ArrayLike] = eqx.field(converter=_checked)
+    gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
+    _faults: tuple[str | None, ...] = eqx.field(static=True, init=False, repr=False)
+
+    def __post_init__(self):
+        self._faults = matrix_faults(self.gamma)
 
     def __check_init__(self):
         if not isinstance(self.solver, AbstractSymplecticSolver):
@@ -114,10 +100,11 @@ class Damped(
         y0: Y,
         args: Args,
     ) -> Any:
+        """The state of the solver, and the modes of the friction."""
         _check_has_momentum(terms)
         check_pair(y0)
-        _factors(self.gamma, jnp.zeros_like(t0), y0[0])
-        return self.solver.init(terms, t0, t1, y0, args)
+        modes = friction_modes(self.gamma, self._faults, y0[0])
+        return self.solver.init(terms, t0, t1, y0, args), modes
 
     def step(
         self,
@@ -131,13 +118,13 @@ class Damped(
     ) -> tuple[Y, Y | None, DenseInfo, Any, diffrax.RESULTS]:
         # In a solve backward in time the momentum grows. Diffrax makes `t1 - t0` positive.
         time = direction(terms) * (t1 - t0) / 2
-        factors = _factors(self.gamma, time, y0[0])
-        damp = lambda y: (jtu.tree_map(jnp.multiply, factors, y[0]), y[1])
-        y1, error, _, solver_state, result = self.solver.step(
-            terms, t0, t1, damp(y0), args, solver_state, made_jump
+        inner, modes = solver_state
+        damp = lambda y: (apply_friction(self.gamma, modes, time, (decay, y[0])), y[1])
+        y1, error, _, inner, result = self.solver.step(
+            terms, t0, t1, damp(y0), args, inner, made_jump
         )
         y1 = damp(y1)
-        return y1, error, dict(y0=y0, y1=y1), solver_state, result
+        return y1, error, dict(y0=y0, y1=y1), (inner, modes), result
 
     def func(
         self,
@@ -151,11 +138,12 @@ class Damped(
 
 def _check_has_momentum(terms: PyTree[diffrax.AbstractTerm]) -> None:
     """Raises a `ValueError` unless the first half of the state is a canonical momentum."""
-    is_spin = lambda x: isinstance(x, SpinHamiltonian)
-    if any(map(is_spin, jtu.tree_leaves(terms, is_leaf=is_spin))):
+    is_lifted = lambda x: isinstance(x, Lifted)
+    if any(map(is_lifted, jtu.tree_leaves(terms, is_leaf=is_lifted))):
         raise ValueError(
             "`Damped` is friction on a canonical momentum. Half of the state of "
-            "`spin_terms` is none: to damp it would make spins shorter."
+            "`spin_terms` or `wave_terms` is none: to damp it would make spins shorter. "
+            "For damped spins pass `damping=` to `spin_terms`."
         )
     if not any(map(is_hamiltonian, split_terms(terms)[0])):
         raise ValueError(
@@ -166,40 +154,15 @@ def _check_has_momentum(terms: PyTree[diffrax.AbstractTerm]) -> None:
         )
 
 
-def _factors(
-    gamma: PyTree[ArrayLike], time: RealScalarLike, p: PyTree[Array]
-) -> PyTree:
-    """`exp(-gamma time)`, for each array of `p`."""
-    if jtu.treedef_is_leaf(jtu.tree_structure(gamma)):
-        gamma = jtu.tree_map(lambda _: gamma, p)
-    if jtu.tree_structure(gamma) != jtu.tree_structure(p):
-        raise ValueError(
-            "`gamma` must be one number or array, or have the structure of the momenta "
-            f"{eqx.tree_pformat(p)}; got {eqx.tree_pformat(gamma)}."
-        )
-
-    def factor(g, x):
-        shape = jnp.shape(g)
-        if shape != () and shape != jnp.shape(x):
-            raise ValueError(
-                "An array of `gamma` must be a scalar or have the shape of its momenta, "
-                f"{jnp.shape(x)}; got shape {shape}."
-            )
-        g = jnp.asarray(g, jnp.result_type(x))
-        bad = ~jnp.all(jnp.isfinite(g) & (g >= 0))
-        # Values that are traced cannot raise an error here. They make their path fail.
-        return jnp.where(bad, jnp.nan, jnp.exp(-g * jnp.asarray(time, g.dtype)))
-
-    return jtu.tree_map(factor, gamma, p)
-
-
 Damped.__init__.__doc__ = """**Arguments:**
 
 - `solver`: a solver of this package.
-- `gamma`: the friction, in units of one over time: a number, or an array or PyTree like
-    `p`, each array a scalar or of the shape of its momenta. If it is traced and negative or
-    not finite, the path fails.
+- `gamma`: the friction, in units of one over time: a number; or an array or PyTree like
+    `p`, each array a scalar, of the shape of its momenta, or a symmetric positive
+    semidefinite matrix that acts on them, of that shape twice, `(n, n)` for `n` momenta. If
+    it is traced and not so, the path fails. There are derivatives with respect to it; of
+    a matrix only first ones.
 
-**Raises:** a `ValueError` if `gamma` is known to be negative or not finite, if it does not
-    fit `p` (in the solve), or for a solver of another package.
+**Raises:** a `ValueError` if `gamma` is known to be negative, not finite or no such matrix,
+    if it does not fit `p` (in the solve), or for a solver of another package.
 """

@@ -13,6 +13,7 @@ if __name__ == "__main__":
             "chain",
             "henon_heiles",
             "spins",
+            "magnet",
             "nls",
             "learning",
         ),

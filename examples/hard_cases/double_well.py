@@ -12,7 +12,7 @@ import diffrax_symplectic as ds
 
 from ..benchmarks._timing import ensemble as many, keys, machine, measure
 from ..stability._page import fill, Page, table
-from ._ensemble import areas, ensemble, gaussian, Mean, plateaus, truncated
+from ._ensemble import areas, ensemble, gaussian, Mean, plateaus, truncated, weak
 from ._stationary import stationary_bias, Step
 
 
@@ -94,6 +94,8 @@ def damped(solver, make_path) -> Step:
 
 # Each with its evaluations of the force in a step.
 LANGEVIN = {
+    "BAOAB": (Step(langevin_terms, gaussian(), ds.BAOAB(GAMMA)), 1),
+    "BAOAB, three-point": (Step(langevin_terms, weak(), ds.BAOAB(GAMMA)), 1),
     "Damped(StormerVerlet)": (damped(ds.StormerVerlet(), gaussian()), 1),
     "Damped(PlateauVerlet)": (damped(ds.PlateauVerlet(), plateaus()), 2),
     "Damped(ImplicitMidpoint)": (damped(ds.ImplicitMidpoint(), gaussian()), None),

@@ -24,24 +24,54 @@ N = 1024
 DX = 0.25
 
 
-def energy(p, q):
-    bonds = sum(jnp.sum((jnp.roll(x, -1) - x) ** 2) for x in (p, q)) / (4 * DX**2)
+# psi = (q + i p) / sqrt(2) is sqrt(2) times smaller than the psi of the equation, so that
+# a field v(psi) = sqrt(2) psi has the equation above.
+
+
+def energy(p, q, dx: float = DX):
+    bonds = sum(jnp.sum((jnp.roll(x, -1) - x) ** 2) for x in (p, q)) / (4 * dx**2)
     return bonds - jnp.sum((p**2 + q**2) ** 2) / 4
 
 
-def make_terms(path):
-    return ds.hamiltonian_terms(
-        lambda t, p, q, s: energy(p, q),
-        lambda t, p, q, s: s * (p**2 + q**2) / 2,
-        path,
-    )
+def hopping(psi, dx: float = DX):
+    """The linear part of H0."""
+    return jnp.sum(jnp.abs(jnp.roll(psi, -1) - psi) ** 2) / (2 * dx**2)
 
 
-def start(n: int = N):
+def attraction(t, psi, s):
+    """What is left of H0."""
+    return -jnp.sum(jnp.abs(psi) ** 4)
+
+
+def noise(t, psi, s):
+    return s * jnp.abs(psi) ** 2
+
+
+def make_terms(path, dx: float = DX):
+    H0 = lambda t, psi, s: hopping(psi, dx) + attraction(t, psi, s)
+    return ds.wave_terms(H0, noise, path)
+
+
+def make_rest(path):
+    """The terms without the linear part."""
+    return ds.wave_terms(attraction, noise, path)
+
+
+def hopping_flow(n: int = N, dx: float = DX):
+    """The exact flow of the linear part, by a Fourier transform."""
+    energies = (1 - np.cos(2 * np.pi * np.arange(n) / n)) / dx**2
+
+    def flow(time, y, args):
+        waves = jnp.fft.fft(ds.from_pair(y))
+        return ds.to_pair(jnp.fft.ifft(jnp.exp(-1j * energies * time) * waves))
+
+    return flow
+
+
+def start(n: int = N, dx: float = DX):
     """A soliton of height 1 in the middle that moves to the right."""
-    x = DX * (np.arange(n) - n / 2)
-    psi = np.exp(0.5j * x) / np.cosh(x)
-    return jnp.asarray(psi.imag), jnp.asarray(psi.real)
+    x = dx * (np.arange(n) - n / 2)
+    return ds.to_pair(jnp.asarray(np.exp(0.5j * x) / np.cosh(x) / np.sqrt(2)))
 
 
 def _observe(t, y, s):
@@ -62,6 +92,7 @@ class Lattice(NamedTuple):
 
 def lattice(solver, h: float, t1: float, paths: int, s: float, n: int = N) -> Lattice:
     y0, steps = start(n), round(t1 / h)
+    terms = make_rest if isinstance(solver, ds.LinearFlow) else make_terms
     saveat = diffrax.SaveAt(
         subs=[
             diffrax.SubSaveAt(t1=True),
@@ -69,7 +100,7 @@ def lattice(solver, h: float, t1: float, paths: int, s: float, n: int = N) -> La
         ]
     )
     _, ((p, q), (norms, energies, coherence)), failed = ensemble(
-        make_terms, weak((n,)), solver, y0, h, steps, paths, args=s, saveat=saveat
+        terms, weak((n,)), solver, y0, h, steps, paths, args=s, saveat=saveat
     )
     good = ~failed
     # Rows that were not needed are infinite.
@@ -91,6 +122,9 @@ def lattice(solver, h: float, t1: float, paths: int, s: float, n: int = N) -> La
 _MATRIX_FREE = ds.PicardNewton(linear_solver=lx.GMRES(rtol=1e-9, atol=1e-9))
 SOLVERS = {
     "ImplicitMidpoint": ds.ImplicitMidpoint(root_finder=_MATRIX_FREE),
+    "LinearFlow(ImplicitMidpoint)": ds.LinearFlow(
+        ds.ImplicitMidpoint(), hopping_flow()
+    ),
     "Heun": diffrax.Heun(),
     "EulerHeun": diffrax.EulerHeun(),
 }

@@ -1,0 +1,164 @@
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import ArrayLike, PyTree
+
+from .._compat import direction, unwrapped
+from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from .._root_finder import all_finite
+from .._structure_checks import check_additive, check_separable
+from .._terms import apply, check_state, controls, split_terms
+from ._friction import (
+    apply_friction,
+    checked,
+    decay,
+    friction_modes,
+    matrix_faults,
+    spread,
+)
+from .base import AbstractSymplecticSolver
+
+
+class BAOAB(AbstractSymplecticSolver):
+    r"""Langevin dynamics, $\mathrm{d}p = -\nabla U(q)\,\mathrm{d}t - \gamma p\,\mathrm{d}t
+    + \sum_k \sigma_k\,\mathrm{d}w_k$, $\mathrm{d}q = \nabla V(p)\,\mathrm{d}t$, by a
+    splitting whose stationary positions are very accurate. Explicit, with one evaluation
+    of the forces in a step.
+
+    $$\begin{aligned}
+      \text{B:} &\quad p \gets p + \tfrac h2 f(t_n, q) \\
+      \text{A:} &\quad q \gets q + \tfrac h2 g(p) \\
+      \text{O:} &\quad p \gets e^{-\gamma h} p
+        + \Bigl(\frac{1 - e^{-2 \gamma h}}{2 \gamma h}\Bigr)^{1/2} \sum_k \sigma_k I_k \\
+      \text{A:} &\quad q \gets q + \tfrac h2 g(p) \\
+      \text{B:} &\quad p \gets p + \tfrac h2 f(t_{n+1}, q)
+    \end{aligned}$$
+
+    The terms are those without friction, of $H_0 = V(p) + U(t, q)$ and $H_k = -\sigma_k
+    \cdot q$ with constant $\sigma_k$; other ones are refused while tracing. Masses are
+    part of $V$. With $\sum_k \sigma_k \sigma_k^\top = 2 \gamma M T$ and $V(p) = p \cdot
+    M^{-1} p / 2$ the density $e^{-H_0 / T}$ is stationary. In a harmonic well the law of
+    $q$ is then exact for every step with $\omega h < 2$.
+
+    The friction acts on the canonical momentum $p$. In a magnetic field that is not the
+    kinetic one (and $H_0$ is not separable there).
+
+    O is the exact law of friction and noise together if the matrix $\gamma$ commutes with
+    $\sum_k \sigma_k \sigma_k^\top$: for one number $\gamma$, for one number and one noise
+    for each momentum, for thermal noise at equal masses. Else its covariance is right up
+    to $\mathcal O(h^3)$.
+
+    Weak order 2, strong order 1, order 2 without noise. For one number $\gamma$ a step is
+    conformally symplectic: with its Jacobian $S'$, $S'^\top J S' = e^{-\gamma h} J$. As
+    explicit methods are, it is limited to $\omega h < 2$.
+
+    Any Brownian path will do: a [`diffrax_symplectic.WeakBrownianPath`][] for
+    expectations, one of Diffrax's for paths.
+
+    **Source:** [Leimkuhler and Matthews (2013)](https://doi.org/10.1093/amrx/abs010).
+    """
+
+    gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
+    _faults: tuple[str | None, ...] = eqx.field(static=True, init=False, repr=False)
+
+    def __post_init__(self):
+        self._faults = matrix_faults(self.gamma)
+
+    @property
+    def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
+        """The least that the increments of the path have to hold."""
+        return diffrax.AbstractBrownianIncrement
+
+    def order(self, terms):
+        return 2
+
+    def strong_order(self, terms):
+        return 1.0
+
+    def weak_order(self, terms):
+        """Order of convergence of expectations."""
+        return 2
+
+    def init(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+    ) -> Any:
+        """The forces at the start, and the modes of the friction."""
+        del t1
+        check_state(y0, "BAOAB")
+        drift, noise = split_terms(terms)
+        check_separable(drift, noise, t0, y0, args, "BAOAB")
+        check_additive(noise, t0, y0, args, "BAOAB", constant=True)
+        if not all(isinstance(unwrapped(x), diffrax.ODETerm) for x in drift):
+            raise ValueError(
+                "`BAOAB` needs a drift driven by time: pass `hamiltonian_terms(H0, noise, "
+                "path)`."
+            )
+        modes = friction_modes(self.gamma, self._faults, y0[0])
+        return _rate(drift, t0, y0, args)[0], modes
+
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: Any,
+        made_jump: BoolScalarLike,
+    ) -> tuple[Y, None, DenseInfo, Any, diffrax.RESULTS]:
+        drift, noise = split_terms(terms)
+        forces, modes = solver_state
+        if made_jump is not False:
+            anew = lambda: _rate(drift, t0, y0, args)[0]
+            forces = lax.cond(made_jump, anew, lambda: forces)
+        half = (t1 - t0) / 2
+        move = lambda x, rate: jtu.tree_map(
+            lambda x, v: x + jnp.asarray(half, jnp.result_type(x)) * v, x, rate
+        )
+
+        p = move(y0[0], forces)
+        q = move(y0[1], _rate(drift, t0, (p, y0[1]), args)[1])
+        # In a solve backward in time the momentum grows. Diffrax makes `t1 - t0` positive.
+        time = 2 * direction(terms) * half
+        parts = [(decay, p)]
+        if len(noise) > 0:
+            drawn = controls(noise, ["W"], t0, t1, "BAOAB")["W"]
+            kick, _ = apply(noise, drawn, args, t0 + half, (p, q))
+            parts.append((spread, kick))
+        p = apply_friction(self.gamma, modes, time, *parts)
+        q = move(q, _rate(drift, t1, (p, q), args)[1])
+        forces, _ = _rate(drift, t1, (p, q), args)
+        y1 = move(p, forces), q
+        R = diffrax.RESULTS
+        result = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
+        return y1, None, dict(y0=y0, y1=y1), (forces, modes), result
+
+
+def _rate(drift: tuple, t: RealScalarLike, y: Y, args: Args) -> Y:
+    """The change of the state by the drift in a unit of time."""
+    t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
+    zero = jnp.zeros_like(t)
+    return apply(drift, [x.contr(zero, zero + 1) for x in drift], args, t, y)
+
+
+BAOAB.__init__.__doc__ = """**Arguments:**
+
+- `gamma`: the friction, in units of one over time: a number; or an array or PyTree like
+    `p`, each array a scalar, of the shape of its momenta, or a symmetric positive
+    semidefinite matrix that acts on them, of that shape twice, `(n, n)` for `n` momenta. If
+    it is traced and not so, the path fails. There are derivatives with respect to it; of
+    a matrix only first ones.
+
+**Raises:** a `ValueError` if `gamma` is known to be negative, not finite or no such matrix,
+    if it does not fit `p` (in the solve), or for terms that are not separable with
+    constant noise.
+"""

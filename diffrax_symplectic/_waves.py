@@ -1,0 +1,119 @@
+"""Complex amplitudes: canonical pairs `(p, q)` in place of arrays `psi`."""
+
+import math
+from collections.abc import Callable
+
+import diffrax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
+
+from ._custom_types import Args, RealScalarLike
+from ._hamiltonian import check_pair, lifted_terms
+
+
+_Waves = PyTree[Complex[Array, "..."]]
+_Pair = tuple[PyTree[Float[Array, "..."]], PyTree[Float[Array, "..."]]]
+_WaveHamiltonian = Callable[[RealScalarLike, _Waves, Args], PyTree[ArrayLike]]
+
+
+def wave_terms(
+    H0: _WaveHamiltonian, noise: _WaveHamiltonian, path: diffrax.AbstractBrownianPath
+) -> diffrax.MultiTerm:
+    r"""The terms of complex amplitudes from their real Hamiltonians.
+
+    For amplitudes $\psi$, one or many, in the sense of Stratonovich,
+
+    $$\mathrm i\,\mathrm{d}\psi = \frac{\partial H_0}{\partial \psi^*}\,\mathrm{d}t
+        + \sum_{k=1}^m \frac{\partial H_k}{\partial \psi^*} \circ \mathrm{d}w_k.$$
+
+    That is the Schrödinger equation of a quantum system, $H_k = \psi^\dagger A_k \psi$ with
+    hermitian matrices $A_k$, or a nonlinear Schrödinger equation on a lattice.
+
+    The state of these terms is not $\psi$ but the pair $(p, q)$ of real arrays with
+    $\psi = (q + \mathrm i p) / \sqrt 2$. They are
+    [`diffrax_symplectic.hamiltonian_terms`][] of the Hamiltonians $H_k(\psi(p, q))$. What
+    is quadratic in $\psi$ and conserved by $H_0$ and all $H_k$, such as the norm
+    $|\psi|^2$, is a quadratic invariant. All solvers for general systems keep it to
+    rounding.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+        import jax.random as jr
+
+        def H0(t, psi, args):  # a qubit: <psi| sigma_x |psi>
+            return 2 * jnp.real(jnp.conj(psi[0]) * psi[1])
+
+        def noise(t, psi, args):  # that dephases: args <psi| sigma_z |psi>
+            return args * (jnp.abs(psi[0]) ** 2 - jnp.abs(psi[1]) ** 2)
+
+        path = ds.WeakBrownianPath(shape=(), key=jr.key(0))
+        sol = diffrax.diffeqsolve(
+            ds.wave_terms(H0, noise, path),
+            ds.StrangGauss(),
+            t0=0,
+            t1=1,
+            dt0=0.1,
+            y0=ds.to_pair(jnp.array([1.0 + 0.0j, 0.0])),
+            args=0.3,
+        )
+        psi = ds.from_pair(sol.ys)
+        ```
+
+    **Arguments:**
+
+    - `H0`: `H0(t, psi, args)`, a real scalar. `psi` has the structure, shapes and complex
+        dtypes of the amplitudes. A function, or a Module with parameters; differentiable
+        with respect to these and to `args`. In place of `jnp.abs(psi)`, which has no
+        derivative at zero, write `jnp.abs(psi) ** 2`.
+    - `noise`: `noise(t, psi, args)`, the noise Hamiltonians $H_1, \ldots, H_m$, real, as an
+        array of shape `(m,)`, or whatever structure and shapes `path` has. Or an
+        [`diffrax_symplectic.IndexedNoise`][] of `H(k, t, psi, args)`.
+    - `path`: the Brownian path, as for [`diffrax_symplectic.hamiltonian_terms`][].
+
+    Parameters may be complex. As everywhere in JAX, the gradient of a real loss $L$ with
+    respect to $z = x + \mathrm i y$ is $\partial L / \partial x - \mathrm i\, \partial L /
+    \partial y$: to descend, subtract its conjugate.
+
+    **Returns:** `MultiTerm(drift, diffusion)`, for the state `to_pair(psi0)`.
+
+    **Raises:** as [`diffrax_symplectic.hamiltonian_terms`][]; and a `ValueError` while the
+    solve is traced if a Hamiltonian returns complex numbers, whatever their imaginary
+    part.
+    """
+    return lifted_terms(H0, noise, path, from_pair, "psi")
+
+
+def to_pair(psi: _Waves) -> _Pair:
+    r"""The state $(p, q) = \sqrt 2\, (\operatorname{Im} \psi, \operatorname{Re} \psi)$ for
+    amplitudes $\psi$, to begin a solve of [`diffrax_symplectic.wave_terms`][] with.
+
+    **Arguments:**
+
+    - `psi`: a PyTree of arrays, complex or real, of any shapes.
+
+    **Returns:** the pair `(p, q)` of real arrays, of the precision of `psi`.
+    """
+    part = lambda of: jtu.tree_map(lambda x: math.sqrt(2) * of(jnp.asarray(x)), psi)
+    return part(jnp.imag), part(jnp.real)
+
+
+def from_pair(y: _Pair) -> _Waves:
+    r"""The amplitudes $\psi = (q + \mathrm i p) / \sqrt 2$ of the state $(p, q)$ of
+    [`diffrax_symplectic.wave_terms`][].
+
+    **Arguments:**
+
+    - `y`: the pair $(p, q)$, for example `sol.ys`.
+
+    **Returns:** a PyTree of complex arrays.
+
+    **Raises:** a `ValueError` if `y` is no pair of real arrays.
+    """
+    check_pair(y)
+    p, q = y
+    return jtu.tree_map(lambda p, q: (q + 1j * p) / math.sqrt(2), p, q)

@@ -1,0 +1,215 @@
+"""Complex amplitudes: the pair (p, q) stands for psi."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from .problems import slope, weak_path
+
+
+X = jnp.array([[0, 1], [1, 0]], complex)
+Y = jnp.array([[0, -1j], [1j, 0]])
+Z = jnp.array([[1, 0], [0, -1]], complex)
+
+
+def _mean(A, psi):
+    return jnp.real(jnp.conj(psi) @ A @ psi)
+
+
+def _random(key, shape=(3,), dtype=jnp.complex128):
+    return jr.normal(key, shape, dtype)
+
+
+def _lattice(t, psi, args):
+    hops = jnp.sum(jnp.abs(jnp.roll(psi, 1) - args * psi) ** 2)
+    return hops - jnp.sum(jnp.abs(psi) ** 4) / 2 + jnp.sum(jnp.cos(t + psi.real))
+
+
+def _site_noise(t, psi, args):
+    return jnp.stack([jnp.sum(jnp.abs(psi) ** 4), jnp.sum(psi.real * psi.imag)])
+
+
+def test_solutions_push_forward_to_the_equation_of_amplitudes():
+    psi, args, W = _random(jr.key(0)), 1.2 - 0.4j, jnp.array([0.3, -0.7])
+    drift, diffusion = ds.wave_terms(_lattice, _site_noise, weak_path(2)).terms
+    y = ds.to_pair(psi)
+    for dy, H in (
+        (drift.vf(0.4, y, args), lambda psi: _lattice(0.4, psi, args)),
+        (
+            diffusion.vf_prod(0.4, y, args, W),
+            lambda psi: _site_noise(0.4, psi, args) @ W,
+        ),
+    ):
+        _, velocity = jax.jvp(ds.from_pair, (y,), (dy,))
+        # The derivative by psi*: half of the one by Re psi plus i times that by Im psi.
+        by_parts = jax.grad(lambda x, y: H(x + 1j * y), argnums=(0, 1))
+        dx, dy = by_parts(psi.real, psi.imag)
+        np.testing.assert_allclose(1j * velocity, (dx + 1j * dy) / 2, atol=1e-14)
+
+
+@pytest.mark.parametrize("dtype", [jnp.complex64, jnp.complex128])
+def test_amplitudes_of_pairs_give_them_back(dtype):
+    psi = {
+        "a": _random(jr.key(0), (2, 3), dtype),
+        "b": (_random(jr.key(1), (), dtype),),
+    }
+    p, q = ds.to_pair(psi)
+    real = jnp.finfo(dtype).dtype
+    assert all(x.dtype == real for x in jax.tree.leaves((p, q)))
+    back = ds.from_pair((p, q))
+    same = lambda a, b: np.testing.assert_allclose(a, b, rtol=4 * jnp.finfo(dtype).eps)
+    jax.tree.map(same, back, psi)
+    assert all(x.dtype == dtype for x in jax.tree.leaves(back))
+    energy = jax.tree.map(lambda p, q: jnp.sum(p**2 + q**2) / 2, p, q)
+    jax.tree.map(lambda e, x: same(e, jnp.sum(jnp.abs(x) ** 2)), energy, psi)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [ds.ImplicitMidpoint(), ds.SRKw1(), ds.StrangGauss(), ds.NinomiyaVictoir()],
+    ids=repr,
+)
+def test_norm_is_kept_over_ten_thousand_steps(solver):
+    H0 = lambda t, psi, args: _mean(X, psi) + jnp.sum(jnp.abs(psi) ** 4)
+    noise = lambda t, psi, args: 0.5 * _mean(Z, psi) + 0.2 * jnp.abs(psi[0]) ** 4
+    terms = ds.wave_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+    psi0 = jnp.array([0.6, 0.8j])
+    norm = lambda t, y, args: jnp.sum(jnp.abs(ds.from_pair(y)) ** 2)
+    sol = diffrax.diffeqsolve(
+        terms, solver, 0, 1000, 0.1, ds.to_pair(psi0), max_steps=10_001,
+        saveat=diffrax.SaveAt(ts=jnp.arange(0, 1000, 10.0), fn=norm),
+    )  # fmt: skip
+    # The norm is interpolated between the ends of steps, where it is the same.
+    assert sol.stats["num_steps"] >= 10_000
+    assert jnp.max(jnp.abs(sol.ys - 1)) <= 1e-13
+
+
+def _qubit(path, rabi=1.0, dephasing=0.6):
+    H0 = lambda t, psi, args: rabi * _mean(X, psi) / 2 + 0.3 * _mean(Z, psi)
+    noise = lambda t, psi, args: dephasing * _mean(Z + X / 2, psi) / 2
+    return ds.wave_terms(H0, noise, path)
+
+
+def _lindblad(psi0, t, rabi=1.0, dephasing=0.6):
+    """The density matrix by d rho = -i [H, rho] - [A, [A, rho]] / 2."""
+    H, A = rabi * X / 2 + 0.3 * Z, dephasing * (Z + X / 2) / 2
+    left, right = (
+        (lambda M: jnp.kron(M, jnp.eye(2))),
+        (lambda M: jnp.kron(jnp.eye(2), M.T)),
+    )
+    commutator = lambda M: left(M) - right(M)
+    L = -1j * commutator(H) - commutator(A) @ commutator(A) / 2
+    rho = jnp.outer(psi0, jnp.conj(psi0)).ravel()
+    return (jax.scipy.linalg.expm(t * L) @ rho).reshape(2, 2)
+
+
+PSI0 = jnp.array([np.sqrt(0.9), np.sqrt(0.1) * 1j])
+
+
+@pytest.mark.parametrize(
+    "solver, order",
+    [(ds.SRKw1(), 1), (ds.StrangGauss(), 2)],
+    ids=["SRKw1", "StrangGauss"],
+)
+def test_noisy_qubit_has_the_density_matrix_of_lindblad_without_sampling(solver, order):
+    y0 = ds.to_pair(PSI0)
+    flat = jnp.concatenate([jnp.ones(1), *y0])
+    exact = jnp.trace(_lindblad(PSI0, 2.0) @ X).real
+    terms = _qubit(ds.WeakBrownianPath((), jr.key(0)))
+    steps = np.array([16, 32, 64])
+    errors = []
+    for n in steps:
+        K = ds.second_moment_map(terms, solver, 0.0, 2.0 / n, y0)
+        moments = jnp.linalg.matrix_power(K, int(n)) @ jnp.kron(flat, flat)
+        m = moments.reshape(5, 5)  # of 1, p1, p2, q1, q2
+        np.testing.assert_allclose(jnp.trace(m) - 1, 2.0, rtol=1e-12)
+        errors.append(m[3, 4] + m[1, 2] - exact)
+    assert abs(slope(1 / steps, errors) - order) <= 0.1
+    assert abs(errors[-1]) <= (1e-2 if order == 1 else 1e-4)
+
+
+def test_noisy_qubit_sampled():
+    def end(key):
+        terms = _qubit(ds.WeakBrownianPath((), key))
+        sol = diffrax.diffeqsolve(
+            terms, ds.StrangGauss(), 0, 2, 0.1, ds.to_pair(PSI0), max_steps=21,
+            adjoint=diffrax.ForwardMode(),
+        )  # fmt: skip
+        return _mean(X, ds.from_pair(sol.ys)[-1])
+
+    values = jax.jit(jax.vmap(end))(jr.split(jr.key(0), 4000))
+    error = jnp.mean(values) - jnp.trace(_lindblad(PSI0, 2.0) @ X).real
+    standard_error = jnp.std(values) / np.sqrt(len(values))
+    assert standard_error <= 0.01
+    assert abs(error) <= 3 * standard_error
+
+
+def test_gradients_with_respect_to_complex_parameters_are_those_of_jax():
+    H0 = lambda t, psi, z: jnp.real(z * jnp.conj(psi[0]) * psi[1])
+    noise = lambda t, psi, z: jnp.abs(z * psi[0]) ** 2
+    terms = ds.wave_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+
+    @jax.jit
+    def loss(z, psi0):
+        sol = diffrax.diffeqsolve(
+            terms, ds.ImplicitMidpoint(), 0, 1, 0.25, ds.to_pair(psi0), z
+        )
+        return jnp.abs(ds.from_pair(sol.ys)[-1, 0]) ** 2
+
+    z, k = 0.7 - 0.2j, 1e-6
+    gradient, by_start = jax.grad(loss, argnums=(0, 1))(z, PSI0)
+    along = lambda d: (loss(z + k * d, PSI0) - loss(z - k * d, PSI0)) / (2 * k)
+    np.testing.assert_allclose(gradient, along(1) - 1j * along(1j), rtol=1e-7)
+    unit = jnp.array([0, 1j])
+    difference = (loss(z, PSI0 + k * unit) - loss(z, PSI0 - k * unit)) / (2 * k)
+    np.testing.assert_allclose(-by_start[1].imag, difference, rtol=1e-7)
+
+
+def test_noises_of_waves_may_be_indexed():
+    path = weak_path(2, two_point=True)
+    y0 = ds.to_pair(_random(jr.key(0)))
+    indexed = ds.IndexedNoise(lambda k, t, psi, args: _site_noise(t, psi, args)[k], 2)
+    ends = [
+        ds.NinomiyaVictoir().step(
+            ds.wave_terms(_lattice, fields, path), 0.0, 0.1, y0, 1.1, None, False
+        )[0]
+        for fields in (_site_noise, indexed)
+    ]
+    np.testing.assert_allclose(*map(ds.from_pair, ends), atol=1e-15)
+
+
+def test_complex_states_are_told_of_wave_terms():
+    path, psi = weak_path(2), _random(jr.key(0))
+    solve = lambda terms, y0: diffrax.diffeqsolve(
+        terms, ds.ImplicitMidpoint(), 0, 1, 0.1, y0, 1.0
+    )
+    with pytest.raises(ValueError, match=r"complex amplitudes `y0=to_pair\(psi0\)`"):
+        solve(ds.wave_terms(_lattice, _site_noise, path), psi)
+    holomorphic = ds.hamiltonian_terms(
+        lambda t, p, q, args: jnp.sum(jnp.abs(p * q)), lambda *_: jnp.zeros(2), path
+    )
+    with pytest.raises(ValueError, match="wave_terms"):
+        solve(holomorphic, (psi, psi))
+    plain = diffrax.ODETerm(lambda t, y, args: 1j * y)
+    with pytest.raises(ValueError, match="`wave_terms.*real and imaginary parts"):
+        solve(plain, psi)
+
+
+def test_hamiltonians_that_return_complex_numbers_are_refused():
+    path, y0 = weak_path(2), ds.to_pair(_random(jr.key(0), (2,)))
+    wrong = lambda t, psi, args: jnp.conj(psi) @ X @ psi
+    with pytest.raises(ValueError, match="`H0` must return real numbers.*jnp.real"):
+        ds.wave_terms(wrong, _site_noise, path).terms[0].vf(0.0, y0, None)
+    each = lambda t, psi, args: psi
+    with pytest.raises(ValueError, match="`noise` must return real numbers"):
+        ds.wave_terms(wrong, each, path).terms[1].vf(0.0, y0, None)
+    with pytest.raises(ValueError, match=r"called as `H0\(t, psi, args\)`"):
+        ds.wave_terms(lambda t, p, q, args: 0.0, each, path)
+    with pytest.raises(ValueError, match="Use a solver for the general structure"):
+        terms = ds.wave_terms(_lattice, _site_noise, path)
+        ds.StormerVerlet().init(terms, 0.0, 0.1, y0, 1.0)
