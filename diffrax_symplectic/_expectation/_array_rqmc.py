@@ -67,7 +67,9 @@ class ArrayRQMCSampler(AbstractLevelSampler):
             return with_words(p.terms, self.layout, words)
 
         def step(i, ensemble, carried):
-            order = hilbert_order(coordinates(self.sort_by, ensemble.y), ensemble.failed)
+            order = hilbert_order(
+                coordinates(self.sort_by, ensemble.y), ensemble.failed
+            )
             ensemble = jtu.tree_map(lambda x: x[order], ensemble)
 
             def one(words, y, state):
@@ -78,7 +80,9 @@ class ArrayRQMCSampler(AbstractLevelSampler):
             out = jax.vmap(one)(words(i), ensemble.y, ensemble.solver_state)
             return moved(p, ensemble, *out), carried
 
-        start = eqx.filter_vmap(lambda words: p.init(terms_of(words), level.h))(words(0))
+        start = eqx.filter_vmap(lambda words: p.init(terms_of(words), level.h))(
+            words(0)
+        )
         state, static = eqx.partition(start, eqx.is_array)
         ensemble = ensemble_of(p, n, state)
         saved, ensemble, _ = simulate(p, level, ensemble, step, None, mean_of_good)

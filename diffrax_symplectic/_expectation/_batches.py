@@ -12,7 +12,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import PRNGKeyArray
+from jaxtyping import PRNGKeyArray, PyTree
 
 from ._result import (
     Expectation,
@@ -53,7 +53,7 @@ def run(
     """The estimate from samples, of which number $i$ gets the key
     `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, whatever the batch size and the devices
     are. `about` is said of it in its fields of these names."""
-    key_data, impl = np.asarray(jr.key_data(key)), jr.key_impl(key)
+    words = _words(key)
     most, size = plan.num_samples, plan.batch_size
     # Of independent paths each that failed was a sample.
     lost = lambda e: e.num_failed if plan.paths == 1 else 0
@@ -61,23 +61,18 @@ def run(
     first = 0 if start is None else used(start)
     # A batch need not be larger than the number of samples.
     size = min(size, max(1, -(-(most - first) // len(devices))))
-    mesh = Mesh(np.array(devices), ("samples",))
     if jax.process_count() > 1:
         # Each process holds the same arrays. They become constants of its program, since
         # arguments would have to be placed on the devices of all.
         sampler = _Constant(_Holder(sampler))
 
-    def batch(begin: int):
-        lo_hi = np.array([begin & 0xFFFFFFFF, begin >> 32], np.uint32)
-        left = np.array(max(0, min(size * len(devices), most - begin)), np.int32)
-        if len(devices) == 1:
-            lo_hi, left = jax.device_put((lo_hi, left), devices[0])
-        return _batch(sampler, key_data, lo_hi, left, impl, mesh, size)
-
+    batch = lambda begin: _one_batch(sampler, words, devices, begin, most, size)
     # JAX caches this trace and uses it for the first batch.
     shapes = eqx.filter_eval_shape(batch, first)
-    values = jtu.tree_map(lambda s: jax.ShapeDtypeStruct(s.shape[1:], s.dtype), shapes[2])
-    estimate = initial(values, key_data, start, used, most)
+    values = jtu.tree_map(
+        lambda s: jax.ShapeDtypeStruct(s.shape[1:], s.dtype), shapes[2]
+    )
+    estimate = initial(values, words[0], start, used, most)
     estimate = dataclasses.replace(estimate, **about)
     running = collections.deque()
     meter = progress_meter.init()
@@ -106,6 +101,39 @@ def run(
     return finished(estimate, tol, plan.least)
 
 
+def first_spread(
+    sampler: AbstractSampler, key: PRNGKeyArray, devices: tuple, size: int
+) -> PyTree[np.ndarray]:
+    """The variance over a batch of samples of the first combination; larger where few of
+    them make up for most of it, so that it is not well known. Infinite if there are none."""
+    out = jax.device_get(_one_batch(sampler, _words(key), devices, 0, size, size))
+    (count, _, _, squares), largest = out[:4], out[4]
+
+    def bound(squares, largest):
+        squares, largest = squares[0, 0], largest[0, 0]
+        n = max(int(count[0]), 1)
+        with np.errstate(all="ignore"):
+            bound = squares / n + 2 * np.sqrt(squares / n) * largest / np.sqrt(n)
+        return np.where(np.isfinite(bound) & (count[0] > 1), bound, np.inf)
+
+    return jtu.tree_map(bound, squares, largest)
+
+
+def _words(key: PRNGKeyArray) -> tuple[np.ndarray, Any]:
+    """The random key as NumPy's, and of which kind it is."""
+    return np.asarray(jr.key_data(key)), jr.key_impl(key)
+
+
+def _one_batch(sampler, words, devices: tuple, begin: int, most: int, size: int):
+    """Of samples number `begin` to `most`, as many as a batch has on each device."""
+    lo_hi = np.array([begin & 0xFFFFFFFF, begin >> 32], np.uint32)
+    left = np.array(max(0, min(size * len(devices), most - begin)), np.int32)
+    if len(devices) == 1:
+        lo_hi, left = jax.device_put((lo_hi, left), devices[0])
+    mesh = Mesh(np.array(devices), ("samples",))
+    return _batch(sampler, *words, lo_hi, left, mesh, size)
+
+
 class _Holder:
     """Compared by identity."""
 
@@ -121,9 +149,9 @@ class _Constant(AbstractSampler):
 
 
 @eqx.filter_jit
-def _batch(sampler, key_data, lo_hi, left, impl, mesh: Mesh, n: int):
-    """Number, mean and sum of squared deviations of the good samples, and the number of
-    paths that failed, over the batch of each device."""
+def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
+    """Of the batch of each device: the number of good samples and of paths that failed; of
+    the good ones mean, sum of squared deviations from it, and the largest deviation."""
 
     def local(sampler, lo_hi, left, device: Any = 0):
         index = device * n + jnp.arange(n)
@@ -142,11 +170,12 @@ def _batch(sampler, key_data, lo_hi, left, impl, mesh: Mesh, n: int):
             add = lambda x: jnp.sum(jnp.where(keep, x, 0), axis=0)
             mean = add(x) / jnp.maximum(count, 1)
             # In two passes, so that no two large numbers are subtracted.
-            return mean, add((x - mean) ** 2)
+            off = jnp.where(keep, x - mean, 0)
+            return mean, jnp.sum(off**2, axis=0), jnp.max(jnp.abs(off), axis=0)
 
         leaves, treedef = jtu.tree_flatten(samples.values)
-        means, squares = zip(*map(moments, leaves))
-        return count, failed, treedef.unflatten(means), treedef.unflatten(squares)
+        each = map(treedef.unflatten, zip(*map(moments, leaves)))
+        return count, failed, *each
 
     if mesh.size == 1:
         return jtu.tree_map(lambda x: x[None], local(sampler, lo_hi, left))

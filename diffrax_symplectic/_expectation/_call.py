@@ -2,7 +2,7 @@
 key."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -139,13 +139,13 @@ def expectation(
     _check_stratonovich(solver)
     problem, weights = _problem(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels)
     devices = tuple(jax.devices() if devices is None else devices)
-    on_cpu, why = devices[0].platform == "cpu", ""
+    why = ""
     k_pilot = jr.fold_in(key, _NO_SAMPLE)
     if sampling is None:
         sampling = None if start is None else start.sampling
         why = "" if start is None else start.reason
     if sampling is None:
-        sampling, why = chosen(problem, weights, k_pilot, tol, on_cpu)
+        sampling, why = chosen(problem, weights, k_pilot, tol, devices)
     if not isinstance(sampling, AbstractSampling):
         raise ValueError(
             "`sampling` must be `IndependentPaths(num_paths)`, `ArrayRQMC()`, "
@@ -156,9 +156,7 @@ def expectation(
             f"`start` was sampled by {start.sampling}; got sampling={sampling}. Pass the "
             "same."
         )
-    sampler, plan, reason = sampling.prepare(problem, weights, k_pilot, on_cpu)
-    if ts is None:
-        sampler = _AtTheEnd(sampler)
+    sampler, plan, reason = sampling.prepare(problem, weights, k_pilot, devices)
     about = dict(sampling=sampling, reason="; ".join(filter(None, (why, reason))))
     estimate = run(sampler, key, plan, devices, start, tol, progress_meter, **about)
     warn_of_tol(estimate, tol)
@@ -253,25 +251,16 @@ def monte_carlo(
     check_takes("fn", fn, *(["key"] if levels == 1 else ["key", "level"]))
     order = 1 if order is None else whole_number("order", order)
     devices = tuple(jax.devices() if devices is None else devices)
-    size = batch_size_of(batch_size, devices[0].platform == "cpu")
+    size = batch_size_of(batch_size, devices)
     sampling = IndependentPaths(num_paths, size)
     # For equal weights these are equal, so that JAX compiles a function once.
     sampler = _Given(fn, tuple(map(tuple, level_weights(order, levels).tolist())))
     plan = Plan(sampling.num_paths, size)
-    estimate = run(sampler, key, plan, devices, start, tol, progress_meter, sampling=sampling)
+    estimate = run(
+        sampler, key, plan, devices, start, tol, progress_meter, sampling=sampling
+    )
     warn_of_tol(estimate, tol)
     return estimate
-
-
-class _AtTheEnd(AbstractSampler):
-    """Samples without an axis for the times."""
-
-    sampler: AbstractSampler
-
-    def __call__(self, keys):
-        samples = self.sampler(keys)
-        values = jtu.tree_map(lambda x: x[:, :, 0], samples.values)
-        return Samples(values, samples.good, samples.failed)
 
 
 class _Given(AbstractSampler):
@@ -339,7 +328,8 @@ def _problem(
         jnp.asarray(finer[:, None] * saved_steps),
     )
     most = int(finer[-1] * num_steps)
-    problem = Problem(_Arrays(phi), terms, solver, start, y0, args, grid, most)
+    at_end = ts is None
+    problem = Problem(_Arrays(phi), terms, solver, start, y0, args, grid, at_end, most)
     order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
     return problem, level_weights(order, levels)
 

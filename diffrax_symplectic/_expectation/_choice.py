@@ -1,5 +1,5 @@
 """Which sampling to take, by a short pilot."""
 
 
-def chosen(problem, weights, key, tol, on_cpu):
+def chosen(problem, weights, key, tol, devices):
     raise NotImplementedError

@@ -1,5 +1,4 @@
-"""What the noise of one step does to a function of the state: a variable with mean zero,
-and the expectation of the function."""
+"""What the noise of one step does to a function of the state."""
 
 import abc
 from collections.abc import Callable, Sequence
@@ -8,10 +7,9 @@ from typing import TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .._brownian import AbstractLaw, Discrete, random_words
 from .._custom_types import Y
@@ -22,8 +20,22 @@ from ._steps import Level, Problem
 # Up to so many outcomes a step is taken for each of them.
 _MOST_OUTCOMES = 100
 
-# A value function, on one state.
+# A function of the state.
 Function: TypeAlias = Callable[[Y], Array]
+
+
+class Ends(eqx.Module):
+    """Where a step may end: the states, whether the step to each succeeds, weights with which
+    their mean is the expectation over the step (or an estimate of it), and which of them is
+    that of the path."""
+
+    y: Y
+    success: Bool[Array, " K"]
+    weights: Float[Array, " K"]
+    own: Int[Array, ""]
+
+    def mean(self, values: Float[Array, "K ..."]) -> Array:
+        return jnp.tensordot(self.weights.astype(values.dtype), values, 1)
 
 
 class AbstractNoise(eqx.Module):
@@ -33,12 +45,8 @@ class AbstractNoise(eqx.Module):
     level: eqx.AbstractVar[Level]
 
     @abc.abstractmethod
-    def draw(self, i, key: PRNGKeyArray) -> Array:
-        """The random variables of step number `i` of a path with this key."""
-
-    @abc.abstractmethod
-    def expected(self, i, y: Y, u: Function, key: PRNGKeyArray) -> Array:
-        """The expectation of `u` after step number `i` from `y`, or an estimate of it."""
+    def ends(self, i, y: Y, key: PRNGKeyArray, draw) -> Ends:
+        """Of step number `i` from `y`. The path is that of the key and the number `draw`."""
 
     @abc.abstractmethod
     def advance(
@@ -69,38 +77,29 @@ class EnumeratedNoise(AbstractNoise):
     values: Float[np.ndarray, "K n"]
     probabilities: Float[np.ndarray, " K"]
 
-    def _after(self, i, y, u):
-        ends, success = jax.vmap(lambda x: self.step(i, y, x))(self.values)
-        values = jax.vmap(u)(ends)
-        p = jnp.asarray(self.probabilities, values.dtype)
-        return ends, success, values, jnp.tensordot(p, values, 1)
-
-    def expected(self, i, y, u, key):
-        return self._after(i, y, u)[3]
+    def ends(self, i, y, key, draw):
+        y, success = jax.vmap(lambda x: self.step(i, y, x))(self.values)
+        word = random_words(key, (draw, self.level.index), 1, 1)[0, 0]
+        cuts = np.round(np.cumsum(self.probabilities)[:-1] * 2.0**32).astype(np.uint32)
+        own = jnp.sum((word >= cuts).astype(jnp.int32))
+        return Ends(y, success, jnp.asarray(self.probabilities), own)
 
     def second(self, i, ys, u):
         return jnp.zeros(())
 
-    def _number(self, i, key):
-        word = random_words(key, (i, self.level.index), 1, 1)[0, 0]
-        cuts = np.round(np.cumsum(self.probabilities)[:-1] * 2.0**32).astype(np.uint32)
-        return jnp.sum(word >= cuts)
-
-    def draw(self, i, key):
-        return jnp.asarray(self.values)[self._number(i, key)]
-
     def advance(self, i, y, u, second, key):
-        ends, success, values, mean = self._after(i, y, u)
-        k = self._number(i, key)
-        take = lambda x: x[k]
-        return jtu.tree_map(take, ends), take(values) - mean, jnp.all(success)
+        ends = self.ends(i, y, key, i)
+        values = jax.vmap(u)(ends.y)
+        take = lambda x: x[ends.own]
+        control = take(values) - ends.mean(values)
+        return jtu.tree_map(take, ends.y), control, jnp.all(ends.success)
 
 
 class DifferentiatedNoise(AbstractNoise):
-    """For more outcomes than can be enumerated. With the random variables $x$ of a step, and
+    r"""For more outcomes than can be enumerated. With the random variables $x$ of a step, and
     the first and second derivatives $a$ and $C$ of $u(y_1(x))$ at $x = 0$, the variable is
-    $a \\cdot x + \\frac12 (x^\\top C x - \\mathrm{tr}\\, C \\Sigma)$, with the variances
-    $\\Sigma$. Its mean is zero whatever $a$ and $C$ are, so that one $C$ does for all
+    $a \cdot x + \frac12 (x^\top C x - \mathrm{tr}\, C \Sigma)$, with the variances
+    $\Sigma$. Its mean is zero whatever $a$ and $C$ are, so that one $C$ does for all
     paths. For a quadratic function and noise that enters the step linearly it is $u$ less
     its expectation."""
 
@@ -108,41 +107,36 @@ class DifferentiatedNoise(AbstractNoise):
     level: Level
     laws: tuple[AbstractLaw, ...] = eqx.field(static=True)
 
-    def draw(self, i, key):
-        words = random_words(key, (i, self.level.index), 1, len(self.laws))[0]
-        dtype = jnp.result_type(*jtu.tree_leaves(self.problem.y0))
-        kinds = [*dict.fromkeys(self.laws)]
-        which = np.array([kinds.index(law) for law in self.laws])
-        return jnp.select(
-            [which == k for k in range(len(kinds))],
-            [law.from_words(words, dtype) for law in kinds],
-        )
+    def _draw(self, key, number) -> Array:
+        words = random_words(key, (number, self.level.index), 1, len(self.laws))[0]
+        x = jnp.zeros_like(self._zero())
+        for law in dict.fromkeys(self.laws):
+            here = np.array([other == law for other in self.laws])
+            x = jnp.where(here, law.from_words(words, x.dtype), x)
+        return x
 
-    def expected(self, i, y, u, key):
-        x = self.draw(i, key)
-        return (u(self.step(i, y, x)[0]) + u(self.step(i, y, -x)[0])) / 2
+    def ends(self, i, y, key, draw):
+        x = self._draw(key, draw)
+        y, success = jax.vmap(lambda x: self.step(i, y, x))(jnp.stack([x, -x]))
+        return Ends(y, success, jnp.full(2, 0.5, x.dtype), jnp.array(0))
 
     def second(self, i, ys, u):
-        zero = self._zero()
-        at = lambda y: jax.hessian(lambda x: u(self.step(i, y, x)[0]))(zero)
-        total = jax.lax.map(at, ys)
-        return jnp.mean(total, axis=0)
+        at = lambda y: jax.hessian(lambda x: u(self.step(i, y, x)[0]))(self._zero())
+        return jnp.mean(jax.lax.map(at, ys), axis=0)
 
     def advance(self, i, y, u, second, key):
-        x, zero = self.draw(i, key), self._zero()
+        x = self._draw(key, i)
         y1, success = self.step(i, y, x)
-        first = jax.jacrev(lambda x: u(self.step(i, y, x)[0]))(zero)
-        square = jnp.outer(x, x) - jnp.diag(jnp.asarray(self._variances(), x.dtype))
+        first = jax.jacrev(lambda x: u(self.step(i, y, x)[0]))(self._zero())
+        variance = lambda values, weights: weights @ values**2
+        variances = np.array([variance(*law.outcomes(1)) for law in self.laws])
+        square = jnp.outer(x, x) - np.diag(variances).astype(x.dtype)
         control = jnp.tensordot(first, x, 1) + jnp.tensordot(second, square, 2) / 2
         return y1, control, success
 
     def _zero(self) -> Array:
         dtype = jnp.result_type(*jtu.tree_leaves(self.problem.y0))
         return jnp.zeros(len(self.laws), dtype)
-
-    def _variances(self) -> np.ndarray:
-        moment = lambda values, weights: weights @ values**2
-        return np.array([moment(*law.outcomes(1)) for law in self.laws])
 
 
 def noise_of(problem: Problem, level: Level) -> AbstractNoise:
@@ -162,6 +156,5 @@ def _check_discrete(laws: Sequence[AbstractLaw]) -> None:
         raise ValueError(
             "`ValueFunctions` sums over the outcomes of a step, of which Gaussian "
             "increments have infinitely many. Use a `WeakBrownianPath` in place of the path "
-            "in `terms` (for the area of a step with `second=True`), or pass "
-            "`sampling=ArrayRQMC(num_paths)`."
+            "in `terms`, or pass `sampling=ArrayRQMC(num_paths)`."
         )

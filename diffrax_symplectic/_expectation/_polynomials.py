@@ -2,12 +2,13 @@
 
 import functools as ft
 import itertools
+import math
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 # Deviations along the axes of the covariance are taken for no smaller than this share of
@@ -25,10 +26,11 @@ class Frame(eqx.Module):
 
     @staticmethod
     def of(
-        points: Float[Array, "n d"], good: Float[Array, " n"], unit: Float[Array, " d"]
+        points: Float[Array, "n d"], good: Bool[Array, " n"], unit: Float[Array, " d"]
     ) -> "Frame":
-        """Of the points of which `good` is 1; `unit` makes the coordinates comparable."""
-        share = good / jnp.maximum(jnp.sum(good), 1)
+        """Of the points that are good; in units of `unit` coordinates are comparable."""
+        share = good.astype(points.dtype) / jnp.maximum(jnp.sum(good), 1)
+        unit = jnp.where(unit > 0, unit, 1)
         mean = share @ points
         off = (points - mean) / unit
         variances, axes = jnp.linalg.eigh((off.T * share) @ off)
@@ -46,6 +48,10 @@ def exponents(d: int, degree: int) -> tuple[tuple[int, ...], ...]:
         for chosen in itertools.combinations_with_replacement(range(d), total):
             rows.append(tuple(chosen.count(j) for j in range(d)))
     return tuple(rows)
+
+
+def num_polynomials(d: int, degree: int) -> int:
+    return math.comb(d + degree, degree)
 
 
 def hermite(x: Float[Array, " d"], degree: int) -> list[Float[Array, ""]]:

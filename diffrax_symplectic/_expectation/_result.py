@@ -244,14 +244,16 @@ def initial(
 def merge(estimate: Expectation, batch, paths: int) -> Expectation:
     """The estimate from its own samples, of so many paths each, and those of the batch, by
     the pairwise formula of Chan, Golub and LeVeque."""
-    count, failed, mean, squares = batch
+    count, failed, mean, squares, _ = batch
     a, b = estimate.num_samples, int(count)
     n = max(a + b, 1)
     delta = jtu.tree_map(lambda x, y: y.astype(float) - x, estimate.combinations, mean)
     lost = int(failed)
     return dataclasses.replace(
         estimate,
-        combinations=jtu.tree_map(lambda x, d: x + d * (b / n), estimate.combinations, delta),
+        combinations=jtu.tree_map(
+            lambda x, d: x + d * (b / n), estimate.combinations, delta
+        ),
         sums_of_squares=jtu.tree_map(
             lambda x, y, d: x + y.astype(float) + d**2 * (a * b / n),
             estimate.sums_of_squares,

@@ -17,11 +17,12 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 from .._arguments import check_takes, whole_number
 from .._custom_types import Y
 from ._array_rqmc import ArrayRQMCSampler, coordinates, points_for
-from ._batches import Plan
+from ._batches import first_spread, Plan
+from ._fits import MOST_POLYNOMIALS, num_pilots
 from ._noise import noise_of
-from ._polynomials import exponents
+from ._polynomials import num_polynomials
 from ._steps import AbstractSampler, IndependentPathsSampler, Problem
-from ._value_functions import MOST_POLYNOMIALS, num_pilots, value_functions
+from ._value_functions import is_quadratic, value_functions
 
 
 # Fewer replicates say too little about their spread to stop because of it.
@@ -43,7 +44,7 @@ class AbstractSampling(eqx.Module):
 
     @abc.abstractmethod
     def prepare(
-        self, problem: Problem, weights: np.ndarray, key: PRNGKeyArray, on_cpu: bool
+        self, problem: Problem, weights: np.ndarray, key: PRNGKeyArray, devices: tuple
     ) -> Prepared:
         """Raises a `ValueError` for what it cannot do."""
 
@@ -67,8 +68,8 @@ class IndependentPaths(AbstractSampling):
     num_paths: int = eqx.field(converter=lambda x: whole_number("num_paths", x))
     batch_size: int | None = None
 
-    def prepare(self, problem, weights, key, on_cpu):
-        plan = Plan(self.num_paths, batch_size_of(self.batch_size, on_cpu))
+    def prepare(self, problem, weights, key, devices):
+        plan = Plan(self.num_paths, batch_size_of(self.batch_size, devices))
         return Prepared(IndependentPathsSampler(problem, weights), plan)
 
 
@@ -109,11 +110,13 @@ class ArrayRQMC(AbstractSampling):
     )
     sort_by: Callable[[Y], PyTree[ArrayLike]] | None = None
 
-    def prepare(self, problem, weights, key, on_cpu):
+    def prepare(self, problem, weights, key, devices):
         layout, points = points_for(problem.terms, self.num_paths)
         sort_by = _state if self.sort_by is None else self.sort_by
         _check_sorted(sort_by, problem.y0, self.num_paths)
-        sampler = ArrayRQMCSampler(problem, weights, sort_by, jnp.asarray(points), layout)
+        sampler = ArrayRQMCSampler(
+            problem, weights, sort_by, jnp.asarray(points), layout
+        )
         plan = Plan(self.replicates, 1, self.num_paths, _BEFORE_STOPPING)
         return Prepared(sampler, plan)
 
@@ -157,31 +160,34 @@ class ValueFunctions(AbstractSampling):
         default=512, converter=lambda x: whole_number("batch_size", x)
     )
 
-    def prepare(self, problem, weights, key, on_cpu):
+    def prepare(self, problem, weights, key, devices):
         noise_of(problem, problem.level(0))
         degrees = self._degrees(problem)
-        sampler, best, _ = value_functions(problem, weights, key, degrees)
+        size = self.batch_size
+        spread = lambda sampler, key: first_spread(sampler, key, devices, size)
+        sampler, best = value_functions(problem, weights, key, degrees, spread)
         reason = ""
         if len(degrees) > 1:
             chosen = ", ".join(map(str, np.unique(best)))
             among = ", ".join(map(str, degrees))
             reason = f"degree {chosen} was the best of {among}"
-        return Prepared(sampler, Plan(self.num_paths, self.batch_size), reason)
+        return Prepared(sampler, Plan(self.num_paths, size), reason)
 
     def _degrees(self, problem: Problem) -> tuple[int, ...]:
         d = jfu.ravel_pytree(problem.y0)[0].size
         if self.degree is None:
-            if len(exponents(d, 2) if d < 100 else range(10**4)) > MOST_POLYNOMIALS:
+            if is_quadratic(d, (2,)):
                 return 0, 1, 2
-            few = [k for k in range(9) if math.comb(d + k, k) <= MOST_POLYNOMIALS]
+            few = [k for k in range(9) if num_polynomials(d, k) <= MOST_POLYNOMIALS]
             return (*(k for k in few[:-1] if k % 2 == 0), few[-1])
         degree = whole_number("degree", self.degree, 0)
-        count = math.comb(d + degree, degree)
-        columns = sum(s.size for s in problem.outputs()) * problem.levels.saved_steps.shape[1]
+        count = num_polynomials(d, degree)
+        columns = (
+            sum(s.size for s in problem.outputs()) * problem.levels.saved_steps.shape[1]
+        )
         size = jnp.finfo(jnp.result_type(*jtu.tree_leaves(problem.y0))).bits // 8
-        need = size * count * (15 * count + problem.max_steps * columns)
-        quadratic = degree <= 2 and count > MOST_POLYNOMIALS
-        if need > _MOST_MEMORY and not quadratic:
+        need = size * count * (num_pilots(d, degree) + problem.max_steps * columns)
+        if need > _MOST_MEMORY and not is_quadratic(d, (degree,)):
             raise ValueError(
                 f"`degree={degree}` has {count:,} polynomials in {d} dimensions, the fit of "
                 f"which needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`, or `None`."
@@ -189,9 +195,9 @@ class ValueFunctions(AbstractSampling):
         return (degree,)
 
 
-def batch_size_of(batch_size: int | None, on_cpu: bool) -> int:
+def batch_size_of(batch_size: int | None, devices: tuple) -> int:
     if batch_size is None:
-        return 32768 if on_cpu else 262144
+        return 32768 if devices[0].platform == "cpu" else 262144
     return whole_number("batch_size", batch_size)
 
 

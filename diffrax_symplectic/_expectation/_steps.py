@@ -40,6 +40,8 @@ class Problem(eqx.Module):
     y0: Y
     args: Args
     levels: Level
+    # Whether there is one time at which to average, without an axis for it.
+    at_end: bool = eqx.field(static=True)
     # Steps of the finest level. (An array has to know its size when it is compiled.)
     max_steps: int = eqx.field(static=True)
 
@@ -186,6 +188,8 @@ class AbstractLevelSampler(AbstractSampler):
             return jnp.moveaxis(x, 2, 0)
 
         values = jtu.tree_map(combined, values)
+        if self.problem.at_end:
+            values = jtu.tree_map(lambda x: x[:, :, 0], values)
         # A path fails once, on however many levels.
         total = jnp.any if failed.dtype == bool else jnp.sum
         return Samples(values, jnp.all(good, axis=0), total(failed, axis=0).astype(int))
