@@ -139,13 +139,11 @@ def expectation(
     _check_stratonovich(solver)
     problem, weights = _problem(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels)
     devices = tuple(jax.devices() if devices is None else devices)
-    why = ""
-    k_pilot = jr.fold_in(key, _NO_SAMPLE)
-    if sampling is None:
-        sampling = None if start is None else start.sampling
-        why = "" if start is None else start.reason
-    if sampling is None:
-        sampling, why = chosen(problem, weights, k_pilot, tol, devices)
+    k_pilot, why, prepared = jr.fold_in(key, _NO_SAMPLE), "", None
+    if sampling is None and start is not None:
+        sampling, why = start.sampling, start.reason
+    elif sampling is None:
+        sampling, prepared, why = chosen(problem, weights, k_pilot, tol, devices)
     if not isinstance(sampling, AbstractSampling):
         raise ValueError(
             "`sampling` must be `IndependentPaths(num_paths)`, `ArrayRQMC()`, "
@@ -156,8 +154,10 @@ def expectation(
             f"`start` was sampled by {start.sampling}; got sampling={sampling}. Pass the "
             "same."
         )
-    sampler, plan, reason = sampling.prepare(problem, weights, k_pilot, devices)
-    about = dict(sampling=sampling, reason="; ".join(filter(None, (why, reason))))
+    if prepared is None:
+        prepared = sampling.prepare(problem, weights, k_pilot, devices)
+    sampler, plan, reason = prepared
+    about = dict(sampling=sampling, reason=why or reason)
     estimate = run(sampler, key, plan, devices, start, tol, progress_meter, **about)
     warn_of_tol(estimate, tol)
     return estimate

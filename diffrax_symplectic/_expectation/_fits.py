@@ -21,7 +21,7 @@ from ._steps import along, Ensemble, ensemble_of, moved, Problem
 
 # By default there are no more polynomials than this in a fit.
 MOST_POLYNOMIALS = 130
-_PILOTS_PER_POLYNOMIAL, _FEWEST_PILOTS = 15, 256
+_PILOTS_PER_POLYNOMIAL, _FEWEST_PILOTS = 30, 256
 # The pilot's states are moved at random by this share of their deviations: the paths of the
 # first steps have few different states.
 _MOVE = 0.2
@@ -92,9 +92,9 @@ def fit_polynomials(
     def body(j, carry):
         forward = j < steps
         i = jnp.where(forward, j, 2 * steps - 1 - j)
-        ensemble, states, spread, u = carry
+        ensemble, states, squares, u = carry
         good = ~ensemble.failed
-        frame = Frame.of(states[i], good, _deviation(spread, steps))
+        frame = Frame.of(states[i], good, jnp.sqrt(squares / steps))
         z = _MOVE * jr.normal(jr.fold_in(k_move, i), (n, d), y0.dtype)
         noisy = states[i] + _dot(z, frame.back.T)
         x = jnp.where(forward, jax.vmap(_ravel)(ensemble.y), noisy)
@@ -106,7 +106,11 @@ def fit_polynomials(
         def go():
             new = _own(p, ensemble, ends)
             flat = jax.vmap(_ravel)(new.y)
-            return new, states.at[i].set(flat), _added(spread, flat - y0, new.failed), u
+            # By how far they move, coordinates are comparable.
+            share = (~new.failed).astype(y0.dtype) / jnp.maximum(
+                jnp.sum(~new.failed), 1
+            )
+            return new, states.at[i].set(flat), squares + share @ (flat - y0) ** 2, u
 
         def fit():
             put = lambda all, one: all.at[i].set(one)
@@ -121,7 +125,7 @@ def fit_polynomials(
             flat = rows(values).reshape(n, len(degrees), -1)
             found = least_squares(rows(B), flat, sizes)
             c = u.coefficients.at[i].set(found.reshape(u.coefficients.shape[1:]))
-            return ensemble, states, spread, PolynomialFunctions(frames, c, degree)
+            return ensemble, states, squares, PolynomialFunctions(frames, c, degree)
 
         return lax.cond(forward, go, fit)
 
@@ -129,8 +133,7 @@ def fit_polynomials(
     frames = Frame(zero(d), zero(d, d), zero(d, d))
     c = zero(max(sizes), *_shape(p, degrees))
     u = PolynomialFunctions(frames, c, degree)
-    spread = jnp.zeros_like(y0), jnp.zeros_like(y0)
-    carry = ensemble_of(p, n, None), zero(n, d) + y0, spread, u
+    carry = ensemble_of(p, n, None), zero(n, d) + y0, jnp.zeros_like(y0), u
     _, states, _, u = lax.fori_loop(0, 2 * steps, body, carry)
     return u, states
 
@@ -147,7 +150,7 @@ def fit_quadratics(
 
     def forward(i, carry):
         ensemble, states = carry
-        one = lambda y, key: noise.ends(i, y, key, i)
+        one = lambda y, key: noise.ends(i, y, key, i, brief=True)
         ensemble = _own(p, ensemble, jax.vmap(one)(ensemble.y, keys))
         return ensemble, states.at[i].set(jax.vmap(_ravel)(ensemble.y))
 
@@ -169,7 +172,7 @@ def fit_quadratics(
 
             def value(x):
                 y = unravel(x)
-                ends = noise.ends(step, y, key, p.max_steps + i)
+                ends = noise.ends(step, y, key, p.max_steps + i, brief=True)
                 axis = lambda tree: jtu.tree_map(lambda x: x[None], tree)
                 return _values(noise, i, u, axis(y), axis(ends))[0]
 
@@ -213,19 +216,6 @@ def _own(p: Problem, ensemble: Ensemble, ends: Ends) -> Ensemble:
     """The paths at their own ends."""
     take = lambda x: jax.vmap(lambda x, k: x[k])(x, ends.own)
     return moved(p, ensemble, jtu.tree_map(take, ends.y), None, take(ends.success))
-
-
-def _added(spread, off: Float[Array, "n d"], failed) -> tuple[Array, Array]:
-    """Sums over the steps of the mean and the mean square."""
-    share = (~failed).astype(off.dtype) / jnp.maximum(jnp.sum(~failed), 1)
-    first, second = spread
-    return first + share @ off, second + share @ off**2
-
-
-def _deviation(spread, count) -> Float[Array, " d"]:
-    """Of all states of the pilot, by which coordinates are made comparable."""
-    first, second = (x / count for x in spread)
-    return jnp.sqrt(jnp.maximum(second - first**2, 0))
 
 
 def _flat(tree: PyTree[Array]) -> Float[Array, " m"]:

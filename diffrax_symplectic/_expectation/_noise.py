@@ -45,8 +45,9 @@ class AbstractNoise(eqx.Module):
     level: eqx.AbstractVar[Level]
 
     @abc.abstractmethod
-    def ends(self, i, y: Y, key: PRNGKeyArray, draw) -> Ends:
-        """Of step number `i` from `y`. The path is that of the key and the number `draw`."""
+    def ends(self, i, y: Y, key: PRNGKeyArray, draw, brief: bool = False) -> Ends:
+        """Of step number `i` from `y`. The path is that of the key and the number `draw`.
+        With `brief` the mean may be an estimate."""
 
     @abc.abstractmethod
     def advance(
@@ -77,7 +78,7 @@ class EnumeratedNoise(AbstractNoise):
     values: Float[np.ndarray, "K n"]
     probabilities: Float[np.ndarray, " K"]
 
-    def ends(self, i, y, key, draw):
+    def ends(self, i, y, key, draw, brief=False):
         y, success = jax.vmap(lambda x: self.step(i, y, x))(self.values)
         word = random_words(key, (draw, self.level.index), 1, 1)[0, 0]
         cuts = np.round(np.cumsum(self.probabilities)[:-1] * 2.0**32).astype(np.uint32)
@@ -115,10 +116,19 @@ class DifferentiatedNoise(AbstractNoise):
             x = jnp.where(here, law.from_words(words, x.dtype), x)
         return x
 
-    def ends(self, i, y, key, draw):
-        x = self._draw(key, draw)
-        y, success = jax.vmap(lambda x: self.step(i, y, x))(jnp.stack([x, -x]))
-        return Ends(y, success, jnp.full(2, 0.5, x.dtype), jnp.array(0))
+    def ends(self, i, y, key, draw, brief=False):
+        x, m = self._draw(key, draw), len(self.laws)
+        if brief:
+            points, weights = jnp.stack([x, -x]), np.full(2, 0.5)
+        else:
+            # Exact for polynomials of degree 3, and 5 in one variable; the path has no
+            # weight.
+            arms = np.diag(np.sqrt(3 * self._variances()))
+            points = np.concatenate([arms, -arms, np.zeros((1, m))]).astype(x.dtype)
+            points = jnp.concatenate([x[None], points])
+            weights = np.concatenate([[0], np.full(2 * m, 1 / 6), [1 - m / 3]])
+        y, success = jax.vmap(lambda x: self.step(i, y, x))(points)
+        return Ends(y, success, jnp.asarray(weights, x.dtype), jnp.array(0))
 
     def second(self, i, ys, u):
         at = lambda y: jax.hessian(lambda x: u(self.step(i, y, x)[0]))(self._zero())
@@ -128,11 +138,13 @@ class DifferentiatedNoise(AbstractNoise):
         x = self._draw(key, i)
         y1, success = self.step(i, y, x)
         first = jax.jacrev(lambda x: u(self.step(i, y, x)[0]))(self._zero())
-        variance = lambda values, weights: weights @ values**2
-        variances = np.array([variance(*law.outcomes(1)) for law in self.laws])
-        square = jnp.outer(x, x) - np.diag(variances).astype(x.dtype)
+        square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
         control = jnp.tensordot(first, x, 1) + jnp.tensordot(second, square, 2) / 2
         return y1, control, success
+
+    def _variances(self) -> np.ndarray:
+        variance = lambda values, weights: weights @ values**2
+        return np.array([variance(*law.outcomes(1)) for law in self.laws])
 
     def _zero(self) -> Array:
         dtype = jnp.result_type(*jtu.tree_leaves(self.problem.y0))

@@ -7,7 +7,6 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 
@@ -61,8 +60,8 @@ def hermite(x: Float[Array, " d"], degree: int) -> list[Float[Array, ""]]:
     for variable in x:
         table = [jnp.ones_like(variable), variable]
         for k in range(1, degree):
-            last = variable * table[-1] - np.sqrt(k) * table[-2]
-            table.append(last / np.sqrt(k + 1))
+            last = variable * table[-1] - math.sqrt(k) * table[-2]
+            table.append(last / math.sqrt(k + 1))
         tables.append(table)
     known = {(0,) * len(x): jnp.ones_like(x[0])}
     for powers in exponents(len(x), degree)[1:]:

@@ -114,6 +114,8 @@ class Expectation(eqx.Module):
             lines.append("`tol` was not reached")
         return "\n".join(lines)
 
+    __repr__ = __str__
+
     @property
     def _variances(self) -> _Host:
         n = self.num_samples - 1

@@ -86,7 +86,8 @@ def _fit(
     flat, unravel = jfu.ravel_pytree(problem.y0)
     fit = fit_quadratics if is_quadratic(flat.size, degrees) else fit_polynomials
     u, states = fit(noise, key, degrees)
-    few = states[:, :SECOND_PILOTS]
+    # Those before each step.
+    few = jnp.concatenate([states[:1] * 0 + flat, states[:-1]])[:, :SECOND_PILOTS]
 
     def second(i):
         return noise.second(i, jax.vmap(unravel)(few[i]), lambda y: u(i, y))
