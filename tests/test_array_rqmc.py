@@ -195,8 +195,9 @@ def test_one_device_and_eight_give_the_same_numbers():
     here = [float.fromhex(x) for x in _numbers()]
     there = [float.fromhex(x) for x in eval(out.stdout.splitlines()[-1])]
     np.testing.assert_array_equal(here[:3], there[:3])
-    # The batches of eight devices are smaller: sums are rounded in another order.
-    np.testing.assert_allclose(here, there, rtol=1e-12)
+    # The batches of eight devices are smaller: sums are rounded in another order. So are
+    # those of a fit, whatever the number of its threads.
+    np.testing.assert_allclose(here, there, rtol=1e-12, atol=1e-12)
 
 
 def test_equal_paths_are_one_brownian_motion():

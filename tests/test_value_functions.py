@@ -149,7 +149,7 @@ def test_levels_extrapolate_and_the_bias_is_known_as_well_as_the_mean():
     assert abs(got.mean + got.bias - fine.mean) <= 5 * np.hypot(
         got.bias_std_error + got.std_error, fine.std_error
     )
-    # The error of the finest step, 2e-4, is nearly gone, and what is left is said to be less.
+    # The error of the finest step is nearly gone. What is left is said to be less.
     assert abs(got.mean - finer.mean) < abs(got.bias) / 20
     assert abs(got.mean - finer.mean) < got.error + 1e-5
 

@@ -51,8 +51,8 @@ def run(
     **about: Any,
 ) -> Expectation:
     """The estimate from samples, of which number $i$ gets the key
-    `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, whatever the batch size and the devices
-    are. `about` is said of it in its fields of these names."""
+    `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, whatever the batch size and the
+    devices are. `about` is said of it in its fields of these names."""
     words = _words(key)
     most, size = plan.num_samples, plan.batch_size
     # Of independent paths each that failed was a sample.
@@ -105,7 +105,8 @@ def first_spread(
     sampler: AbstractSampler, key: PRNGKeyArray, devices: tuple, size: int
 ) -> PyTree[np.ndarray]:
     """The variance over a batch of samples of the first combination; larger where few of
-    them make up for most of it, so that it is not well known. Infinite if there are none."""
+    them make up for most of it, so that it is not well known. Infinite if there are
+    none."""
     out = jax.device_get(_one_batch(sampler, _words(key), devices, 0, size, size))
     (count, _, _, squares), largest = out[:4], out[4]
 
@@ -124,14 +125,17 @@ def _words(key: PRNGKeyArray) -> tuple[np.ndarray, Any]:
     return np.asarray(jr.key_data(key)), jr.key_impl(key)
 
 
-def _one_batch(sampler, words, devices: tuple, begin: int, most: int, size: int):
+def _one_batch(
+    sampler: AbstractSampler, words, devices: tuple, begin: int, most: int, size: int
+) -> tuple:
     """Of samples number `begin` to `most`, as many as a batch has on each device."""
     lo_hi = np.array([begin & 0xFFFFFFFF, begin >> 32], np.uint32)
     left = np.array(max(0, min(size * len(devices), most - begin)), np.int32)
     if len(devices) == 1:
         lo_hi, left = jax.device_put((lo_hi, left), devices[0])
     mesh = Mesh(np.array(devices), ("samples",))
-    return _batch(sampler, *words, lo_hi, left, mesh, size)
+    batch: Any = _batch
+    return batch(sampler, *words, lo_hi, left, mesh, size)
 
 
 class _Holder:
@@ -189,8 +193,12 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         return jtu.tree_map(lambda x: jax.lax.all_gather(x, "samples"), out)
 
     sharded = jax.shard_map(
-        shard, mesh=mesh, in_specs=PartitionSpec(), out_specs=PartitionSpec(), check_vma=False
-    )  # fmt: skip
+        shard,
+        mesh=mesh,
+        in_specs=PartitionSpec(),
+        out_specs=PartitionSpec(),
+        check_vma=False,
+    )
     try:
         return sharded(dynamic, lo_hi, left)
     except ValueError as error:

@@ -1,5 +1,5 @@
-"""Expectations with their error bars: of functions of the state, and of functions of a random
-key."""
+"""Expectations with their error bars: of functions of the state, and of functions of a
+random key."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -74,13 +74,13 @@ def expectation(
         print(estimate)
         ```
 
-    **Samples** are paths, or replicates of many paths, as `sampling` says. They are taken in
-    batches, so that memory does not grow with their number. Sample number $i$ gets the key
-    `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, whatever the batch size and the
+    **Samples** are paths, or replicates of many paths, as `sampling` says. They are taken
+    in batches, so that memory does not grow with their number. Sample number $i$ gets the
+    key `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, whatever the batch size and the
     devices are.
 
-    **Levels.** With `levels=2` (3, ...) a sample takes steps $h$ and $h/2$ (and $h/4$, ...).
-    `mean` is then extrapolated to steps of size zero, by the solver's own
+    **Levels.** With `levels=2` (3, ...) a sample takes steps $h$ and $h/2$ (and $h/4$,
+    ...). `mean` is then extrapolated to steps of size zero, by the solver's own
     `weak_order(terms)`, and order 1 for solvers that have none, as those of Diffrax. `bias`
     is the error of discretization that the finest of the levels has.
 
@@ -103,8 +103,8 @@ def expectation(
     - `sampling`: an [`diffrax_symplectic.IndependentPaths`][],
         [`diffrax_symplectic.ArrayRQMC`][] or [`diffrax_symplectic.ValueFunctions`][]. With
         `None` a short pilot tries those that can be used and takes the one with the least
-        error for its time; `reason` of the result says which and why. (It measures times. So
-        a second call may choose another.)
+        error for its time; `reason` of the result says which and why. (It measures times.
+        So a second call may choose another.)
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
         default `t1` alone.
     - `levels`: how many step sizes, each half of the one before.
@@ -117,16 +117,16 @@ def expectation(
         and gets the same result.
     - `progress_meter`: one of Diffrax's.
 
-    **Returns:** an [`diffrax_symplectic.Expectation`][]. A path that fails has no part in it
-    and is counted in `num_failed`: one with a step that the solver reports as failed, or
+    **Returns:** an [`diffrax_symplectic.Expectation`][]. A path that fails has no part in
+    it and is counted in `num_failed`: one with a step that the solver reports as failed, or
     with a state or $\phi$ that is not finite.
 
-    **Raises:** a `ValueError` for a solver of Itô equations (these terms are Stratonovich's),
-    times between steps, a $\phi$ that is not real, sizes that are not positive integers, a
-    `tol` that is not positive, a `key` that is none, a `start` from another key, of other
-    shapes or with more paths, and for paths that `sampling` cannot use (it says which ones it
-    can); [`diffrax_symplectic.ExpectationInterrupted`][], with the estimate so far, on an
-    interrupt from the keyboard. Warns if `tol` was not reached.
+    **Raises:** a `ValueError` for a solver of Itô equations (these terms are
+    Stratonovich's), times between steps, a $\phi$ that is not real, sizes that are not
+    positive integers, a `tol` that is not positive, a `key` that is none, a `start` from
+    another key, of other shapes or with more paths, and for paths that `sampling` cannot
+    use (it says which ones it can); [`diffrax_symplectic.ExpectationInterrupted`][], with
+    the estimate so far, on an interrupt from the keyboard. Warns if `tol` was not reached.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for the formula by which means
@@ -179,8 +179,8 @@ def monte_carlo(
     r"""Averages a function of a random key: whatever a path of your own makes of it.
 
     For functions of the state at given times [`diffrax_symplectic.expectation`][] is
-    simpler, and needs far fewer paths. This one is for all else: events, gradients, functions
-    of whole paths.
+    simpler, and needs far fewer paths. This one is for all else: events, gradients,
+    functions of whole paths.
 
     !!! example
 
@@ -386,8 +386,8 @@ def _check_stratonovich(solver) -> None:
     if isinstance(solver, diffrax.AbstractItoSolver):
         raise ValueError(
             f"`{type(solver).__name__}` integrates in the sense of Itô. The equation of "
-            "`terms` is a Stratonovich equation. Take `diffrax.Heun()`, or a solver of this "
-            "package that `suggest_solver` names."
+            "`terms` is a Stratonovich equation. Take `diffrax.Heun()`, or a solver of "
+            "this package that `suggest_solver` names."
         )
     if isinstance(solver, diffrax.HalfSolver):
         raise ValueError("`solver` must take fixed steps; got a `diffrax.HalfSolver`.")

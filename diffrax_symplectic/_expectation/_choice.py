@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from ._batches import Plan, run
+from ._batches import run
 from ._sampling import (
     AbstractSampling,
     ArrayRQMC,
@@ -58,12 +58,14 @@ def chosen(
         except ValueError:
             return None
         plan = dataclasses.replace(prepared.plan, num_samples=samples)
-        seconds = 0.0
-        for k in range(2):  # The first one compiles.
-            begin = time.perf_counter()
-            own = jr.fold_in(jr.fold_in(key, 0xFFFFFFFF), k)
-            e = run(prepared.sampler, own, plan, devices, None, None, _no_meter)
-            seconds = (time.perf_counter() - begin) / samples
+        own = jr.fold_in(key, 0xFFFFFFFF)
+        sample = lambda: run(
+            prepared.sampler, own, plan, devices, None, None, _no_meter
+        )
+        sample()  # compiles
+        begin = time.perf_counter()
+        e = sample()
+        seconds = (time.perf_counter() - begin) / samples
         variances = [np.max(x, initial=0.0) for x in jtu.tree_leaves(e.variance)]
         variance = max(map(float, variances))
         return _Trial(
@@ -71,15 +73,14 @@ def chosen(
         )
 
     plain = tried(IndependentPaths(_PATHS, _PATHS), _PATHS)
+    functions = rqmc = None
     assert plain is not None
-    trials = [plain]
     if tol is None or plain.work / tol**2 > _SECONDS:
         functions = ValueFunctions()
-        trials.append(tried(functions, functions.batch_size))
-        if trials[-1] is None or trials[-1].work * _CLEAR > plain.work:
-            rqmc = ArrayRQMC(_REPLICATE, _REPLICATES)
-            trials.append(tried(rqmc, _REPLICATES))
-    done = [trial for trial in trials if trial is not None]
+        functions = tried(functions, functions.batch_size)
+        if functions is None or functions.work * _CLEAR > plain.work:
+            rqmc = tried(ArrayRQMC(_REPLICATE, _REPLICATES), _REPLICATES)
+    done = [trial for trial in (plain, functions, rqmc) if trial is not None]
     best = min(done, key=lambda trial: trial.work)
     listed = [f"{type(t.sampling).__name__} {t.work:.1e}" for t in done]
     reason = f"variance times seconds: {', '.join(listed)}"

@@ -30,9 +30,9 @@ _QUADRATIC_PILOTS, SECOND_PILOTS = 128, 32
 
 
 class AbstractFunctions(eqx.Module):
-    """The value functions of a level: one after each step, for each time at which to average
-    (`S`) and each number of `phi` (`m`), and before that axis for each candidate (`C`) if
-    there are several."""
+    """The value functions of a level: one after each step, for each time at which to
+    average (`S`) and each number of `phi` (`m`), and before that axis for each candidate
+    (`C`) if there are several."""
 
     @abc.abstractmethod
     def __call__(self, i, y: Y) -> Float[Array, "*C S m"]:
@@ -51,7 +51,8 @@ class PolynomialFunctions(AbstractFunctions):
     def __call__(self, i, y):
         frame = jtu.tree_map(lambda x: x[i], self.frames)
         x = _dot(frame.to, _ravel(y) - frame.mean)
-        return sum(b * c for b, c in zip(hermite(x, self.degree), self.coefficients[i]))
+        products = zip(hermite(x, self.degree), self.coefficients[i])
+        return ft.reduce(jnp.add, [b * c for b, c in products])
 
     def replaced(self, fn):
         return PolynomialFunctions(self.frames, fn(self.coefficients), self.degree)
@@ -141,8 +142,9 @@ def fit_polynomials(
 def fit_quadratics(
     noise: AbstractNoise, key: PRNGKeyArray, degrees: tuple[int, ...]
 ) -> tuple[QuadraticFunctions, Float[Array, "steps n d"]]:
-    """By mean first and second derivatives at the pilot's states. For Gaussian states that is
-    the best quadratic function in the mean square, by Stein's lemma. Returns these, too."""
+    """By mean first and second derivatives at the pilot's states. For Gaussian states that
+    is the best quadratic function in the mean square, by Stein's lemma. Returns these,
+    too."""
     p, level = noise.problem, noise.level
     y0, unravel = jfu.ravel_pytree(p.y0)
     n, d = _QUADRATIC_PILOTS, y0.size
@@ -199,8 +201,8 @@ def fit_quadratics(
 def _values(
     noise: AbstractNoise, i, u: AbstractFunctions, ys: Y, ends: Ends
 ) -> Float[Array, "n C S m"]:
-    """What the functions after step number `i` are to be at these states: `phi` at the saved
-    steps, and before them the expectation of the functions a step later."""
+    """What the functions after step number `i` are to be at these states: `phi` at the
+    saved steps, and before them the expectation of the functions a step later."""
     p, level = noise.problem, noise.level
     after = jnp.minimum(i + 1, p.max_steps - 1)
     at_ends = jax.vmap(jax.vmap(lambda y: u(after, y)))(ends.y)

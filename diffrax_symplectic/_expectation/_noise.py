@@ -25,9 +25,9 @@ Function: TypeAlias = Callable[[Y], Array]
 
 
 class Ends(eqx.Module):
-    """Where a step may end: the states, whether the step to each succeeds, weights with which
-    their mean is the expectation over the step (or an estimate of it), and which of them is
-    that of the path."""
+    """Where a step may end: the states, whether the step to each succeeds, weights with
+    which their mean is the expectation over the step (or an estimate of it), and which of
+    them is that of the path."""
 
     y: Y
     success: Bool[Array, " K"]
@@ -54,8 +54,8 @@ class AbstractNoise(eqx.Module):
         self, i, y: Y, u: Function, second: Array, key: PRNGKeyArray
     ) -> tuple[Y, Array, Bool[Array, ""]]:
         """The state after step number `i` of a path with this key; `u` there less its
-        expectation, or another variable with mean zero that is close to it; whether the step
-        succeeded. `second` is what `second` returns."""
+        expectation, or another variable with mean zero that is close to it; whether the
+        step succeeded. `second` is what `second` returns."""
 
     @abc.abstractmethod
     def second(self, i, ys: Y, u: Function) -> Array:
@@ -97,9 +97,9 @@ class EnumeratedNoise(AbstractNoise):
 
 
 class DifferentiatedNoise(AbstractNoise):
-    r"""For more outcomes than can be enumerated. With the random variables $x$ of a step, and
-    the first and second derivatives $a$ and $C$ of $u(y_1(x))$ at $x = 0$, the variable is
-    $a \cdot x + \frac12 (x^\top C x - \mathrm{tr}\, C \Sigma)$, with the variances
+    r"""For more outcomes than can be enumerated. With the random variables $x$ of a step,
+    and the first and second derivatives $a$ and $C$ of $u(y_1(x))$ at $x = 0$, the variable
+    is $a \cdot x + \frac12 (x^\top C x - \mathrm{tr}\, C \Sigma)$, with the variances
     $\Sigma$. Its mean is zero whatever $a$ and $C$ are, so that one $C$ does for all
     paths. For a quadratic function and noise that enters the step linearly it is $u$ less
     its expectation."""
@@ -167,6 +167,6 @@ def _check_discrete(laws: Sequence[AbstractLaw]) -> None:
     if not all(isinstance(law, Discrete) for law in laws):
         raise ValueError(
             "`ValueFunctions` sums over the outcomes of a step, of which Gaussian "
-            "increments have infinitely many. Use a `WeakBrownianPath` in place of the path "
-            "in `terms`, or pass `sampling=ArrayRQMC(num_paths)`."
+            "increments have infinitely many. Use a `WeakBrownianPath` in place of the "
+            "path in `terms`, or pass `sampling=ArrayRQMC(num_paths)`."
         )

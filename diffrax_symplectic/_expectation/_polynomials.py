@@ -74,8 +74,8 @@ def hermite(x: Float[Array, " d"], degree: int) -> list[Float[Array, ""]]:
 def least_squares(
     B: Float[Array, "n P"], values: Float[Array, "n C m"], sizes: tuple[int, ...]
 ) -> Float[Array, "P C m"]:
-    """For each of `C` fits the coefficients of the first so many polynomials of `sizes`; the
-    others are zero.
+    """For each of `C` fits the coefficients of the first so many polynomials of `sizes`;
+    the others are zero.
 
     The normal equations are regularized and the solution is refined. For polynomials that
     are independent at the points this leaves rounding errors alone. Where they depend on

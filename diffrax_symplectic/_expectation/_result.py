@@ -77,20 +77,21 @@ class Expectation(eqx.Module):
     @property
     def error(self) -> _Host:
         """The error of `mean` all together: the root of the sum of the squares of
-        `std_error` and, with two levels or more, of what the last extrapolation has changed.
-        What discretization leaves after that is of a higher order in the step size, and
-        smaller as a rule. With one level nothing is known of it, and this is `std_error`."""
+        `std_error` and, with two levels or more, of what the last extrapolation has
+        changed. What discretization leaves after that is of a higher order in the step
+        size, and smaller as a rule. With one level nothing is known of it, and this is
+        `std_error`."""
         change = self._of(2, self.combinations)
         if change is None:
             return self.std_error
         return jtu.tree_map(np.hypot, self.std_error, change)
 
     def interval(self, confidence: float = 0.95) -> tuple[_Host, _Host]:
-        r"""The ends of an interval that covers the mean of infinitely many samples with this
-        probability: Student's $t$ with one degree of freedom less than there are samples,
-        times `std_error`, to either side of `mean`. (For 16 samples and 95% that is 2.13
-        standard errors, for very many 1.96.) What is left of the error of discretization is
-        not part of it: see `error`."""
+        r"""The ends of an interval that covers the mean of infinitely many samples with
+        this probability: Student's $t$ with one degree of freedom less than there are
+        samples, times `std_error`, to either side of `mean`. (For 16 samples and 95% that
+        is 2.13 standard errors, for very many 1.96.) What is left of the error of
+        discretization is not part of it: see `error`."""
         factor = student.ppf((1 + confidence) / 2, max(self.num_samples - 1, 1))
         side = lambda sign: jtu.tree_map(
             lambda m, s: m + sign * factor * s, self.mean, self.std_error
@@ -149,9 +150,9 @@ class ExpectationInterrupted(KeyboardInterrupt):
 
 def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations levels"]:
     r"""The combinations of the means with steps $h, h/2, h/4, \ldots$ that an
-    [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$. The first has
-    no terms in $h^p, \ldots, h^{p + L - 2}$ for $L$ levels, and with $L > 1$ there are two
-    more: the mean of the finest level less the first, and what the last extrapolation
+    [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$. The first
+    has no terms in $h^p, \ldots, h^{p + L - 2}$ for $L$ levels, and with $L > 1$ there are
+    two more: the mean of the finest level less the first, and what the last extrapolation
     changed.
 
     [Talay and Tubaro (1990)](https://doi.org/10.1080/07362999008809220) show that the error

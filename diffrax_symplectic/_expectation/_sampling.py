@@ -189,13 +189,13 @@ class ValueFunctions(AbstractSampling):
         need = size * count * (num_pilots(d, degree) + problem.max_steps * columns)
         if need > _MOST_MEMORY and not is_quadratic(d, (degree,)):
             raise ValueError(
-                f"`degree={degree}` has {count:,} polynomials in {d} dimensions, the fit of "
-                f"which needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`, or `None`."
+                f"`degree={degree}` has {count:,} polynomials in {d} dimensions, the fit "
+                f"of which needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`, or `None`."
             )
         return (degree,)
 
 
-def batch_size_of(batch_size: int | None, devices: tuple) -> int:
+def batch_size_of(batch_size: int | np.integer | None, devices: tuple) -> int:
     if batch_size is None:
         return 32768 if devices[0].platform == "cpu" else 262144
     return whole_number("batch_size", batch_size)

@@ -1,8 +1,8 @@
 """Fitted value functions as control variates.
 
-$u_n(y)$ stands for $\\mathbb E[\\phi(y_N) \\mid y_n = y]$. What $u_{n+1}$ does in a step, less
-its expectation over the random variables of that step, has mean zero whatever $u$ is. For
-the exact $u$ these sum up to all that is random in $\\phi(y_N)$.
+$u_n(y)$ stands for $\\mathbb E[\\phi(y_N) \\mid y_n = y]$. What $u_{n+1}$ does in a step,
+less its expectation over the random variables of that step, has mean zero whatever $u$ is.
+For the exact $u$ these sum up to all that is random in $\\phi(y_N)$.
 """
 
 from collections.abc import Callable
