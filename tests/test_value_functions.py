@@ -21,6 +21,7 @@ from .problems import kubo_terms
 KEY = jr.key(0)
 Y0 = (jnp.array(0.0), jnp.array(1.0))
 SQUARE = lambda t, y, args: y[1] ** 2
+VERLET = ds.StormerVerlet()
 WEAK = ds.WeakBrownianPath((), KEY)
 PENDULUM = ds.hamiltonian_terms(
     lambda t, p, q, args: p**2 / 2 - jnp.cos(q),
@@ -29,9 +30,7 @@ PENDULUM = ds.hamiltonian_terms(
 )
 
 
-def _estimate(
-    sampling, terms=PENDULUM, solver=ds.StormerVerlet(), phi=SQUARE, **kwargs
-):
+def _estimate(sampling, terms=PENDULUM, solver=VERLET, phi=SQUARE, **kwargs):
     kwargs = dict(t1=1.0, dt0=0.25, y0=Y0, key=jr.key(7)) | kwargs
     t1, dt0, y0 = (kwargs.pop(name) for name in ("t1", "dt0", "y0"))
     return ds.expectation(

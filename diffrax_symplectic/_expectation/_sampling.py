@@ -190,7 +190,7 @@ class ValueFunctions(AbstractSampling):
         if need > _MOST_MEMORY and not is_quadratic(d, (degree,)):
             raise ValueError(
                 f"`degree={degree}` has {count:,} polynomials in {d} dimensions, the fit "
-                f"of which needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`, or `None`."
+                f"of which needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`."
             )
         return (degree,)
 

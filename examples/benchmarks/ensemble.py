@@ -37,7 +37,8 @@ def main() -> None:
         "# A large ensemble",
         "",
         f"{machine()}. ImplicitMidpoint on the quartic Kubo "
-        f"oscillator, {PATHS:,} paths of {STEPS} steps through `monte_carlo`. Made by `python -m examples.benchmarks.ensemble`.",
+        f"oscillator, {PATHS:,} paths of {STEPS} steps through `monte_carlo`. Made by "
+        "`python -m examples.benchmarks.ensemble`.",
         "",
         "| seconds | ns per path and step | cores busy | peak memory | E(q^2) |",
         "|---" * 5 + "|",
