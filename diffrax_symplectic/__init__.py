@@ -21,7 +21,6 @@ from ._conditions import (
     weak_order_residuals as weak_order_residuals,
 )
 from ._expectation import (
-    AbstractSampling as AbstractSampling,
     ArrayRQMC as ArrayRQMC,
     Expectation as Expectation,
     expectation as expectation,

@@ -4,7 +4,6 @@ from ._result import (
     ExpectationInterrupted as ExpectationInterrupted,
 )
 from ._sampling import (
-    AbstractSampling as AbstractSampling,
     ArrayRQMC as ArrayRQMC,
     IndependentPaths as IndependentPaths,
     ValueFunctions as ValueFunctions,

@@ -148,8 +148,9 @@ class ValueFunctions(AbstractSampling):
     - `num_paths`: how many paths are averaged; with `tol` at most.
     - `batch_size`: how many of them each device takes at once.
 
-    **Source:** the regression-based control variates of [Belomestny, Häfner, Nagapetyan
-    and Urusov (2018)](https://doi.org/10.1016/j.jmaa.2017.09.049) for weak schemes.
+    **Source:** the regression-based control variates of [Belomestny and others
+    (2015)](https://doi.org/10.48550/arXiv.1510.03141), for weak schemes of [Belomestny,
+    Häfner and Urusov (2016)](https://doi.org/10.48550/arXiv.1612.05255).
     """
 
     degree: int | None = None
