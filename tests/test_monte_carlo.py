@@ -177,6 +177,13 @@ def test_functions_that_return_nothing_are_refused():
         ds.monte_carlo(lambda key: None, jr.key(0), 10)
 
 
+def test_an_estimate_prints_in_a_few_lines():
+    got = ds.monte_carlo(lambda key: {"a": jnp.ones(30), "b": 2.0}, jr.key(0), 10)
+    lines = str(got).splitlines()
+    assert len(lines) <= 6 and "2. ± 0.0e+00" in lines
+    assert "10 paths, 0 failed" in lines[-1]
+
+
 def test_old_style_keys_will_do():
     a = ds.monte_carlo(_normal, jr.PRNGKey(1), 100)
     np.testing.assert_array_equal(

@@ -1,11 +1,11 @@
-"""How far `ds.ValueFunctions` goes: total errors against exact values, and seconds, compilation
-aside:
+"""How far `ds.ValueFunctions` goes: total errors against exact values, and seconds,
+compilation aside:
 
     python -m examples.benchmarks.expectations [MODEL ...]
 
 Prints the rows of a table. Exact values are known in closed form, or they are computed
-backwards in time on Chebyshev grids (synchrotron, Hénon-Heiles). Those of the pendulum and of
-the double well come from another solver, with as many digits.
+backwards in time on Chebyshev grids (synchrotron, Hénon-Heiles). Those of the pendulum and
+of the double well come from another solver, with as many digits.
 """
 
 import sys
@@ -155,7 +155,7 @@ CASES = {
     "Hénon-Heiles": Case(
         lambda t, y, args: y[1][0] ** 2,
         _henon.make_terms(ds.WeakBrownianPath((2,), jr.key(0))), _verlet,
-        5.0, 32, _henon.y0, 3, 4, 4096, _henon.exact,
+        5.0, 32, _henon.y0, 3, 5, 4096, _henon.exact,
     ),
     "two noises, linear": Case(
         _q2, two_noises(_two()), ds.NinomiyaVictoir(), 1.0, 4, Y0, 4, 2, 512,
