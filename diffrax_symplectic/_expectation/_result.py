@@ -100,7 +100,7 @@ class Expectation(eqx.Module):
 
     def __str__(self) -> str:
         shown = lambda x: np.array2string(np.asarray(x), precision=12, threshold=6)
-        short = {"float_kind": "{:.1e}".format}
+        short: Any = {"float_kind": "{:.1e}".format}
         brief = lambda x: np.array2string(np.asarray(x), formatter=short, threshold=6)
         mean, error = jtu.tree_leaves(self.mean), jtu.tree_leaves(self.std_error)
         lines = [f"{shown(m)} ± {brief(e)}" for m, e in zip(mean[:6], error)]

@@ -39,7 +39,7 @@ class Case(NamedTuple):
     levels: int
     degree: int
     paths: int
-    exact: Callable[[], float]
+    exact: Callable[[], Any]
 
 
 Y0 = (jnp.array(0.0), jnp.array(1.0))
