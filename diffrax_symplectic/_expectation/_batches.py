@@ -61,10 +61,7 @@ def run(
     first = 0 if start is None else used(start)
     # A batch need not be larger than the number of samples.
     size = min(size, max(1, -(-(most - first) // len(devices))))
-    if jax.process_count() > 1:
-        # Each process holds the same arrays. They become constants of its program, since
-        # arguments would have to be placed on the devices of all.
-        sampler = _Constant(_Holder(sampler))
+    sampler = _shared(sampler)
 
     batch = lambda begin: _one_batch(sampler, words, devices, begin, most, size)
     # JAX caches this trace and uses it for the first batch.
@@ -107,6 +104,7 @@ def first_spread(
     """The variance over a batch of samples of the first combination; larger where few of
     them make up for most of it, so that it is not well known. Infinite if there are
     none."""
+    sampler = _shared(sampler)
     out = jax.device_get(_one_batch(sampler, _words(key), devices, 0, size, size))
     (count, _, _, squares), largest = out[:4], out[4]
 
@@ -136,6 +134,12 @@ def _one_batch(
     mesh = Mesh(np.array(devices), ("samples",))
     batch: Any = _batch
     return batch(sampler, *words, lo_hi, left, mesh, size)
+
+
+def _shared(sampler: AbstractSampler) -> AbstractSampler:
+    """For several processes: each holds the same arrays. They become constants of its
+    program, since arguments would have to be placed on the devices of all."""
+    return _Constant(_Holder(sampler)) if jax.process_count() > 1 else sampler
 
 
 class _Holder:
