@@ -20,17 +20,17 @@ from ._conditions import (
     symplectic_residuals as symplectic_residuals,
     weak_order_residuals as weak_order_residuals,
 )
-from ._estimate import (
+from ._expectation import (
+    ArrayRQMC as ArrayRQMC,
     Expectation as Expectation,
+    expectation as expectation,
     ExpectationInterrupted as ExpectationInterrupted,
+    IndependentPaths as IndependentPaths,
+    monte_carlo as monte_carlo,
+    ValueFunctions as ValueFunctions,
 )
-from ._expectation import expectation as expectation
 from ._hamiltonian import hamiltonian_terms as hamiltonian_terms
 from ._indexed_noise import IndexedNoise as IndexedNoise
-from ._quasi import (
-    quasi_expectation as quasi_expectation,
-    QuasiExpectation as QuasiExpectation,
-)
 from ._root_finder import PicardNewton as PicardNewton
 from ._solver import (
     AbstractImplicitStages as AbstractImplicitStages,

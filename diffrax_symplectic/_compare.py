@@ -25,8 +25,7 @@ from ._brownian import (
     WeakBrownianPath,
 )
 from ._custom_types import Args, Y
-from ._estimate import Expectation
-from ._expectation import expectation
+from ._expectation import Expectation, monte_carlo
 from ._structure_checks import check_stratonovich
 from ._suggest import suggest_solver
 from ._suggestion_rules import PATHS, RULES
@@ -211,7 +210,7 @@ def compare_solvers(
         """The estimate by the paths of a number, and the seconds for each."""
         fn = eqx.Partial(sample, solver, jnp.asarray(dt))
         start = time.perf_counter()
-        estimate = expectation(fn, jr.fold_in(key, number), num_paths)
+        estimate = monte_carlo(fn, jr.fold_in(key, number), num_paths)
         return estimate, (time.perf_counter() - start) / num_paths
 
     strong, fine = {}, None
@@ -333,7 +332,7 @@ def _strong_errors(end, named, reference, shape, dts, cell, key, num_paths) -> d
 
     if not named:
         return {}
-    estimate = expectation(squares, key, num_paths)
+    estimate = monte_carlo(squares, key, num_paths)
     out = {}
     for name, (square, fourth, okay) in estimate.mean.items():
         with np.errstate(all="ignore"):

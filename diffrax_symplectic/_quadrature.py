@@ -1,56 +1,60 @@
 """Quadrature over the random variables of one step: their values and probabilities."""
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast, NamedTuple
 
 import diffrax
-import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ._brownian import AbstractLaw, GivenPath, Increment, increment_struct, laws_of
 from ._terms import brownian_paths, replace_paths
 
 
-class Outcomes(NamedTuple):
-    """The outcomes of a step.
+class StepVariables(NamedTuple):
+    """The random variables of a step, all of them independent.
 
-    - `increments`: the increments, stacked along leading axes.
-    - `weights`: their probabilities, or the weights of a quadrature.
-    - `put`: makes terms with a given increment in place of the path.
+    - `laws`: the law of each, for a step of size 1.
+    - `terms_with`: takes their values, in units of the root of the step size, to terms with
+        the increment that they make in place of the path.
     """
 
-    increments: diffrax.AbstractBrownianIncrement
-    weights: np.ndarray
-    put: Callable[[diffrax.AbstractBrownianIncrement], PyTree[diffrax.AbstractTerm]]
+    laws: tuple[AbstractLaw, ...]
+    terms_with: Callable[[Float[Array, " n"]], PyTree[diffrax.AbstractTerm]]
 
 
-def outcomes(terms: PyTree[diffrax.AbstractTerm], h, nodes: int) -> Outcomes:
-    """All outcomes of a step of size `h`, for `terms` with one Brownian path."""
+def step_variables(terms: PyTree[diffrax.AbstractTerm], h) -> StepVariables:
+    """Of a step of size `h`, for `terms` with one Brownian path."""
     path, laws = _the_path(terms)
     shape = increment_struct(path)
     flat, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, shape))
-    scalars = [law.outcomes(nodes) for law in laws.values() for _ in range(flat.size)]
-    values = np.array([*itertools.product(*[values for values, _ in scalars])])
-    weights = np.array([*itertools.product(*[weights for _, weights in scalars])])
-    scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(flat.dtype)
-    dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), shape)
 
-    def increment(scaled):
+    def terms_with(values):
+        dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), shape)
+        scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(flat.dtype)
         sets = map(unravel, scaled.reshape(-1, flat.size))
-        return cast(Any, path.levy_area)(dt=dt, **dict(zip(laws, sets)))
-
-    def put(increment):
-        given = GivenPath(
-            make=jtu.Partial(_constant, increment), levy_area=type(increment)
-        )
+        increment = cast(Any, path.levy_area)(dt=dt, **dict(zip(laws, sets)))
+        make = jtu.Partial(_constant, increment)
+        given = GivenPath(make=make, levy_area=type(increment))
         return replace_paths(terms, lambda _: given)
 
-    return Outcomes(jax.vmap(increment)(scaled), np.prod(weights, axis=1), put)
+    each = tuple(law for law in laws.values() for _ in range(flat.size))
+    return StepVariables(each, terms_with)
+
+
+def outcomes(
+    laws: Sequence[AbstractLaw], nodes: int
+) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, " K"]]:
+    """All values of variables with these laws, and their probabilities or the weights of a
+    quadrature."""
+    scalars = [law.outcomes(nodes) for law in laws]
+    values = np.array([*itertools.product(*[values for values, _ in scalars])])
+    weights = np.array([*itertools.product(*[weights for _, weights in scalars])])
+    return values, np.prod(weights, axis=1)
 
 
 def _constant(

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PyTree
 from ._compat import ω
 from ._custom_types import Args, RealScalarLike, Y
 from ._hamiltonian import check_pair
-from ._quadrature import outcomes
+from ._quadrature import outcomes, step_variables
 from ._spins import as_spins, from_spinors, to_spinors
 from ._terms import apply_one, number_of_noises, split_terms, tree_sum
 
@@ -220,8 +220,9 @@ def second_moment_map(
 
 def _average(outcome: Callable, terms, h, nodes: int) -> PyTree[Array]:
     """The expectation of `outcome(terms) -> (value, result)`."""
-    increments, weights, put = outcomes(terms, h, nodes)
-    values, result = jax.vmap(lambda increment: outcome(put(increment)))(increments)
+    laws, terms_with = step_variables(terms, h)
+    variables, weights = outcomes(laws, nodes)
+    values, result = jax.vmap(lambda x: outcome(terms_with(x)))(variables)
     failed = jnp.any(result != diffrax.RESULTS.successful)
     values = eqx.error_if(
         values, failed, "A step failed: its stage equations could not be solved."

@@ -9,7 +9,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import Discrete, laws_of, VARIABLES
-from diffrax_symplectic._quadrature import outcomes
+from diffrax_symplectic._quadrature import outcomes, step_variables
 from diffrax_symplectic._terms import controls
 
 from .problems import weak_path
@@ -20,7 +20,10 @@ def test_outcomes_of_a_step_are_those_of_each_law_for_each_noise():
     path = ds.WeakBrownianPath(shape, jr.key(0), two_point=True)
     terms = diffrax.ControlTerm(lambda t, y, args: y, path)
     # Backward in time.
-    increments, weights, _ = outcomes(terms, -0.3, 3)
+    laws, terms_with = step_variables(terms, -0.3)
+    values, weights = outcomes(laws, 3)
+    of = lambda x: terms_with(x).contr(0.0, -0.3, use_levy=True)
+    increments = jax.vmap(of)(values)
     assert {x.dtype.name for x in jax.tree.leaves(increments)} == {"float32"}
     np.testing.assert_array_equal(increments.dt, np.float32(-0.3))
     for name, law in (laws_of(path) or {}).items():

@@ -13,7 +13,7 @@ from ._plateau import (
     PlateauBrownianPath as PlateauBrownianPath,
     PlateauIncrement as PlateauIncrement,
 )
-from ._random_words import check_key as check_key
+from ._random_words import check_key as check_key, random_words as random_words
 from ._stepwise import (
     AbstractStepwisePath as AbstractStepwisePath,
     Increment as Increment,

@@ -122,7 +122,7 @@ MODELS = {
 
 
 def quasi(model: Model, solver=None, area: bool = False):
-    """Estimates phi and its square, by `quasi_expectation`. One program for each number of
+    """Estimates phi and its square, by `ArrayRQMC`. One program for each number of
     paths: `terms` and the functions are made once."""
     own = solver is None
     path = model.quasi_path() if own else model.gaussian_path(jr.key(0), area)
@@ -134,29 +134,24 @@ def quasi(model: Model, solver=None, area: bool = False):
 
     def run(
         steps: int, paths: int, replicates: int, levels: int = 1, seed: int = 0
-    ) -> ds.QuasiExpectation:
-        return ds.quasi_expectation(
+    ) -> ds.Expectation:
+        return ds.expectation(
             phi, terms, solver, 0.0, model.t1, model.t1 / steps, model.y0,
-            key=jr.key(seed), num_paths=paths, replicates=replicates, levels=levels,
-            sort_by=model.sort_by,
+            key=jr.key(seed), levels=levels,
+            sampling=ds.ArrayRQMC(paths, replicates, model.sort_by),
         )  # fmt: skip
 
     return run
 
 
 def plain(model: Model):
-    """Estimates phi by `expectation`, of independent paths with weak increments."""
-
-    def fn(key):
-        sol = diffrax.diffeqsolve(
-            model.make_terms(model.weak_path(key)), model.solver, 0.0, model.t1,
-            model.t1 / model.steps, model.y0, throw=False, max_steps=None,
-            adjoint=diffrax.ForwardMode(),
-        )  # fmt: skip
-        assert sol.ys is not None
-        return model.phi(jax.tree.map(lambda y: y[-1], sol.ys)), sol.result
-
-    return lambda paths, seed: ds.expectation(fn, jr.key(seed), paths)
+    """Estimates phi by independent paths with weak increments."""
+    terms = model.make_terms(model.weak_path(jr.key(0)))
+    phi = lambda t, y, args: model.phi(y)
+    return lambda paths, seed: ds.expectation(
+        phi, terms, model.solver, 0.0, model.t1, model.t1 / model.steps, model.y0,
+        key=jr.key(seed), sampling=ds.IndependentPaths(paths),
+    )  # fmt: skip
 
 
 def other(model: Model, name: str):

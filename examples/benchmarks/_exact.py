@@ -119,10 +119,10 @@ def chain_square(
     )
     y0 = tuple(jnp.stack([x, x]) for x in chain.start(1.0))
     slowest = chain.start(1.0)[1]
-    change = ds.quasi_expectation(
-        phi, terms, ds.StormerVerlet(), 0.0, t1, t1 / steps, y0, key=jr.key(1),
-        num_paths=paths, replicates=replicates, levels=2,
-        sort_by=lambda y: (y[0][0] @ slowest, y[1][0] @ slowest),
+    sort_by = lambda y: (y[0][0] @ slowest, y[1][0] @ slowest)
+    change = ds.expectation(
+        phi, terms, ds.StormerVerlet(), 0.0, t1, t1 / steps, y0, key=jr.key(1), levels=2,
+        sampling=ds.ArrayRQMC(paths, replicates, sort_by),
     )  # fmt: skip
     return _harmonic_chain_square(s, t1) + float(change.mean), float(change.std_error)
 

@@ -32,13 +32,13 @@ def gains(
     with warnings.catch_warnings():
         # That neighbours are far apart, which is what is measured here.
         warnings.simplefilter("ignore")
-        estimate = ds.quasi_expectation(
+        estimate = ds.expectation(
             moments, terms, ds.StormerVerlet(), 0.0, ts[-1], h, y0, ts=ts,
-            key=jr.key(0), num_paths=paths, replicates=replicates, sort_by=sort_by,
+            key=jr.key(0), sampling=ds.ArrayRQMC(paths, replicates, sort_by),
         )  # fmt: skip
     assert estimate.num_failed == 0
     mean, square = np.moveaxis(estimate.mean, 1, 0)
-    spread = np.var(estimate.replicates[:, :, 0], axis=0, ddof=1)
+    spread = estimate.variance[:, 0]
     return np.exp(np.mean(np.log((square - mean**2) / paths / spread), axis=-1))
 
 

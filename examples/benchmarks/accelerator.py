@@ -112,7 +112,7 @@ def large(num_paths: int, batch_sizes, dtypes):
     yield "## A large ensemble"
     yield ""
     yield (
-        f"`expectation` of q^2 over {num_paths:,} paths of {STEPS} steps, "
+        f"`monte_carlo` of q^2 over {num_paths:,} paths of {STEPS} steps, "
         "ImplicitMidpoint on the quartic Kubo oscillator, by batch size."
     )
     yield ""
@@ -128,9 +128,9 @@ def large(num_paths: int, batch_sizes, dtypes):
             return q[-1] ** 2
 
         for batch_size in batch_sizes:
-            ds.expectation(phi, jr.key(1), batch_size, batch_size=batch_size)
+            ds.monte_carlo(phi, jr.key(1), batch_size, batch_size=batch_size)
             begin = time.perf_counter()
-            estimate = ds.expectation(phi, jr.key(0), num_paths, batch_size=batch_size)
+            estimate = ds.monte_carlo(phi, jr.key(0), num_paths, batch_size=batch_size)
             seconds = time.perf_counter() - begin
             yield (
                 f"| {dtype.__name__} | {batch_size:,} | {seconds:.3f} | "

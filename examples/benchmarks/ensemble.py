@@ -1,4 +1,4 @@
-"""Ten million paths of 100 steps through `expectation`: time, memory, cores in use:
+"""Ten million paths of 100 steps through `monte_carlo`: time, memory, cores in use:
 
     python -m examples.benchmarks.ensemble
 
@@ -27,9 +27,9 @@ def main() -> None:
         _, q = solve(key[None])
         return q[-1] ** 2
 
-    ds.expectation(phi, jr.key(1), 10**6)  # compiles
+    ds.monte_carlo(phi, jr.key(1), 10**6)  # compiles
     begin, before = time.perf_counter(), os.times()
-    estimate = ds.expectation(phi, jr.key(0), PATHS)
+    estimate = ds.monte_carlo(phi, jr.key(0), PATHS)
     seconds, after = time.perf_counter() - begin, os.times()
     busy = after.user + after.system - before.user - before.system
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
@@ -37,7 +37,7 @@ def main() -> None:
         "# A large ensemble",
         "",
         f"{machine()}. ImplicitMidpoint on the quartic Kubo "
-        f"oscillator, {PATHS:,} paths of {STEPS} steps through `expectation`. Made by "
+        f"oscillator, {PATHS:,} paths of {STEPS} steps through `monte_carlo`. Made by "
         "`python -m examples.benchmarks.ensemble`.",
         "",
         "| seconds | ns per path and step | cores busy | peak memory | E(q^2) |",

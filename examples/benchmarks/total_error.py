@@ -22,7 +22,7 @@ import jax
 import matplotlib
 import numpy as np
 
-from diffrax_symplectic._quasi._estimate import extrapolation_weights
+from diffrax_symplectic._expectation._result import level_weights
 
 from .._orders import exact_moment_map, exact_weak_error
 from ._ensembles import Model, MODELS, other, plain, quasi
@@ -70,13 +70,15 @@ def errors(model: Model, quick: bool = False) -> dict[str, Any]:
     for name, levels in LEVELS.items():
         out[name] = []
         for paths in sizes(model, levels, quick):
-            count = repetitions * REPLICATES
-            estimate = run(steps_of(model, levels), paths, count, levels)
-            assert estimate.num_failed == 0
-            variance = float(estimate.mean[1] - estimate.mean[0] ** 2)
-            each = estimate.replicates[:, 0]
-            gain = variance / paths / np.var(each, ddof=1)
-            means = np.mean(each.reshape(repetitions, REPLICATES), axis=1)
+            estimates = [
+                run(steps_of(model, levels), paths, REPLICATES, levels, seed)
+                for seed in range(repetitions)
+            ]
+            assert all(e.num_failed == 0 for e in estimates)
+            first = estimates[0].mean
+            variance = float(first[1] - first[0] ** 2)
+            gain = variance / paths / np.mean([e.variance[0] for e in estimates])
+            means = [e.mean[0] for e in estimates]
             row = _row(paths, means, exact) | {"gain": float(gain)}
             if model.linear:
                 row["systematic"] = abs(own_bias(model, levels, exact))
@@ -106,12 +108,12 @@ def own_bias(model: Model, levels: int, exact: float) -> float:
     hs = [model.t1 / (steps_of(model, levels) * 2**k) for k in range(levels)]
     e = exact_weak_error(moments, model.y0, lambda m: m[1, 1], exact, hs).signed
     order = model.solver.weak_order(model.make_terms(path(None)))
-    return float(extrapolation_weights(order, levels) @ e)
+    return float(level_weights(order, levels)[0] @ e)
 
 
 def bias(model: Model, name: str, exact: float, quick: bool) -> list[list[float]]:
     """(steps, bias, its standard error) of one of Diffrax's solvers: exact for linear
-    models, otherwise by `quasi_expectation` with that solver."""
+    models, otherwise by `ArrayRQMC` with that solver."""
     solver, area = model.others[name]
     if model.linear:
         steps = [2**k for k in range(3, 5 if quick else 12)]
@@ -208,12 +210,9 @@ def draw(results: dict[str, dict]) -> None:
         ax.grid(alpha=0.3)
     ax = axes.flat[-1]
     ax.axis("off")
-    own = lambda name: (
-        name if "quasi" not in name else name.replace("quasi", "quasi_expectation")
-    )
-    labels = [
-        own(x) if x in (*LEVELS, "expectation") else f"diffrax.{x}" for x in lines
-    ]
+    named = {"expectation": "IndependentPaths"}
+    named |= {x: x.replace("quasi", "ArrayRQMC") for x in LEVELS}
+    labels = [named.get(x, f"diffrax.{x}") for x in lines]
     ax.legend(lines.values(), labels, loc="center", fontsize=12)
     figure.tight_layout()
     DOCS.mkdir(parents=True, exist_ok=True)

@@ -159,9 +159,9 @@ def _exact(make_terms, y0, exact):
 
 def _sampled(make_terms, y0, phi, solver, path, sort_by=None):
     """By quasi-Monte Carlo."""
-    estimate = lambda solver, path, h, **kwargs: ds.quasi_expectation(
+    estimate = lambda solver, path, h, num_paths, **kwargs: ds.expectation(
         lambda t, y, args: phi(y), make_terms(path(jr.key(0))), solver, 0.0, 1.0, h, y0,
-        key=jr.key(round(1 / h)), sort_by=sort_by, **kwargs,
+        key=jr.key(round(1 / h)), sampling=ds.ArrayRQMC(num_paths, 16, sort_by), **kwargs,
     )  # fmt: skip
     reference = ft.cache(
         lambda: estimate(solver, path, HS[-1] / 2, num_paths=2**13, levels=2)

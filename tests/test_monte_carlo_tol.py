@@ -1,4 +1,4 @@
-"""How far an expectation goes: tolerances, two levels, progress, and numbers of paths
+"""How far an expectation goes: tolerances, levels, progress, and numbers of paths
 beyond 32 bits."""
 
 import dataclasses
@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic import _expectation
-from diffrax_symplectic._estimate import merge
 
 from .problems import kubo_terms, RecordingMeter
 
@@ -23,9 +21,9 @@ def _number(key):
 
 def test_keys_of_paths_beyond_32_bits_carry_into_the_second_word():
     key, n, first = jr.key(7), 10, 2**33 - 4
-    nothing = ds.expectation(lambda key: jnp.nan * jr.normal(key), key, 1)
+    nothing = ds.monte_carlo(lambda key: jnp.nan * jr.normal(key), key, 1)
     before = dataclasses.replace(nothing, num_failed=first)
-    got = ds.expectation(_number, key, first + n, batch_size=n, start=before)
+    got = ds.monte_carlo(_number, key, first + n, batch_size=n, start=before)
     words = [divmod(i, 2**32) for i in range(first, first + n)]
     keys = [jr.fold_in(jr.fold_in(key, hi), np.uint32(lo)) for hi, lo in words]
     x = np.array([_number(k) for k in keys])
@@ -37,7 +35,7 @@ def test_keys_of_paths_beyond_32_bits_carry_into_the_second_word():
 
 def test_progress_is_shown_after_each_batch_and_closed_in_any_case():
     calls = []
-    run = lambda meter: ds.expectation(
+    run = lambda meter: ds.monte_carlo(
         jr.normal, jr.key(0), 10, batch_size=4, progress_meter=meter
     )
     run(RecordingMeter(calls))
@@ -54,7 +52,7 @@ def _two(key):
 
 
 def test_paths_are_added_until_every_standard_error_is_below_tol():
-    run = lambda n, **kwargs: ds.expectation(
+    run = lambda n, **kwargs: ds.monte_carlo(
         _two, jr.key(3), n, batch_size=500, **kwargs
     )
     tol = 0.02
@@ -66,15 +64,18 @@ def test_paths_are_added_until_every_standard_error_is_below_tol():
     assert before.tol_reached is None and np.any(before.std_error["large"] > tol)
     whole = run(got.num_paths)
     np.testing.assert_array_equal(got.mean["large"], whole.mean["large"])
-    short = run(1_000, tol=tol)
+    with pytest.warns(UserWarning, match="not reached"):
+        short = run(1_000, tol=tol)
     assert short.tol_reached is False and short.num_paths == 1_000
     # It goes on from there, and not at all where nothing is left to do.
     on = run(100_000, tol=tol, start=short)
     assert on.tol_reached and on.num_paths == got.num_paths
     assert run(100_000, tol=tol, start=on).num_paths == on.num_paths
     # One path has no standard error, and nor have paths that failed.
-    assert ds.expectation(_two, jr.key(3), 1, tol=tol).tol_reached is False
-    failed = ds.expectation(lambda key: jnp.nan * jr.normal(key), jr.key(0), 9, tol=1.0)
+    nothing = lambda key: jnp.nan * jr.normal(key)
+    with pytest.warns(UserWarning, match="not reached"):
+        assert ds.monte_carlo(_two, jr.key(3), 1, tol=tol).tol_reached is False
+        failed = ds.monte_carlo(nothing, jr.key(0), 9, tol=1.0)
     assert failed.tol_reached is False and failed.num_failed == 9
 
 
@@ -99,90 +100,47 @@ def _phi(key, level):
     return sol.ys[1][-1] ** 2, sol.result
 
 
-def test_two_levels_estimate_the_bias_from_few_coupled_paths():
-    # In batches of one size: one program for each level.
-    run = lambda n, start=None: ds.expectation(
-        _phi,
-        jr.key(0),
-        n,
-        batch_size=1024,
-        levels=2,
-        order=1,
-        num_coupled=n // 4,
-        start=start,
+def test_two_levels_extrapolate_and_tell_the_bias_of_the_finer_one():
+    run = lambda n, start=None: ds.monte_carlo(
+        _phi, jr.key(0), n, batch_size=1024, levels=2, order=1, start=start
     )
-    got = run(8192)
-    assert got.difference.num_paths == 2048 and got.num_paths == 8192
-    assert got.difference.num_failed == got.num_failed == 0
-    assert abs(got.mean - _square(H)) <= 4 * got.std_error
-    # Of order 1: twice the difference of the levels.
-    bias = 2 * (_square(H) - _square(H / 2))
+    got = run(4096)
+    assert (got.num_paths, got.num_failed) == (4096, 0)
+    exact = 2 * _square(H / 2) - _square(H)
+    assert abs(got.mean - exact) <= 4 * got.std_error
+    # The mean of the finer level less the extrapolated one.
+    bias = _square(H / 2) - exact
     assert abs(got.bias - bias) <= 4 * got.bias_std_error
-    np.testing.assert_allclose(got.bias, -2 * got.difference.mean, rtol=1e-14)
-    np.testing.assert_allclose(got.bias_std_error, 2 * got.difference.std_error)
     # Paths that are not coupled would have a standard error this many times as large.
-    apart = np.sqrt(2 * got.variance / 2048)
-    assert got.difference.std_error < apart / 3
-    # It can be continued, both parts of it.
-    rest = run(8192, start=run(4096))
+    apart = np.sqrt(2 * got.variance / 5 / 4096)
+    assert got.bias_std_error < apart / 3
+    np.testing.assert_allclose(got.error, np.hypot(got.std_error, got.bias))
+    rest = run(4096, start=run(2048))
     np.testing.assert_allclose(rest.mean, got.mean, rtol=1e-13)
     np.testing.assert_allclose(rest.bias, got.bias, rtol=1e-11)
-    one = ds.expectation(jr.normal, jr.key(0), 10)
+    one = ds.monte_carlo(jr.normal, jr.key(0), 10)
     assert one.bias is None and one.bias_std_error is None
+    np.testing.assert_array_equal(one.error, one.std_error)
 
 
-def test_a_pair_of_paths_fails_if_one_of_them_does():
+def test_a_path_fails_if_it_does_on_one_of_the_levels():
     def phi(key, level):
         x = jr.uniform(key)
         return jnp.where((level == 1) & (x < 0.5), jnp.nan, x * (1 + level))
 
-    got = ds.expectation(phi, jr.key(1), 64, levels=2, order=2)
-    assert got.num_failed == 0 and got.difference.num_paths < 4
-    assert got.difference.num_paths + got.difference.num_failed == 4
-
-
-def test_two_pairs_at_least_are_coupled_and_none_is_lost():
-    phi = lambda key, level: jr.normal(key) * (1 + level)
-    run = lambda n, **kwargs: ds.expectation(
-        phi, jr.key(1), n, levels=2, order=1, **kwargs
+    got = ds.monte_carlo(phi, jr.key(1), 64, levels=2, order=2)
+    x = np.array(
+        [jr.uniform(jr.fold_in(jr.fold_in(jr.key(1), 0), i)) for i in range(64)]
     )
-    few = run(5)
-    assert few.difference.num_paths == 2
-    # More than a sixteenth, which are kept where it goes on.
-    more = run(16, num_coupled=8)
-    assert run(32, start=more).difference.num_paths == 8
-    assert run(16, num_coupled=8, start=more).num_paths == 16
+    assert got.num_failed == np.sum(x < 0.5) and got.num_paths == np.sum(x >= 0.5)
+    # 4/3 of the finer level less 1/3 of the coarser one.
+    np.testing.assert_allclose(got.mean, np.mean(x[x >= 0.5]) * 7 / 3, rtol=1e-12)
 
 
-def test_an_interrupt_on_the_second_level_keeps_the_first(monkeypatch):
-    def traced(key, level):
-        if level == 1:
-            raise KeyboardInterrupt
-        return jr.normal(key)
-
-    run = lambda phi, **kwargs: ds.expectation(
-        phi, jr.key(1), 16, levels=2, order=1, **kwargs
-    )
-    with pytest.raises(ds.ExpectationInterrupted) as info:
-        run(traced)
-    estimate = info.value.estimate
-    assert (estimate.num_paths, estimate.order, estimate.bias) == (16, 1, None)
-
-    def interrupted(estimate, batch):
-        raise KeyboardInterrupt
-
-    # One batch on each level.
-    phi, merges = (
-        lambda key, level: jr.normal(key) * 2**level,
-        iter([merge, interrupted]),
-    )
-    monkeypatch.setattr(_expectation, "merge", lambda *args: next(merges)(*args))
-    with pytest.raises(ds.ExpectationInterrupted) as info:
-        run(phi)
-    estimate = info.value.estimate
-    assert (estimate.num_paths, estimate.difference.num_paths) == (16, 0)
-    monkeypatch.undo()
-    assert run(phi, start=estimate).bias == run(phi).bias
+def test_one_word_for_a_tolerance_that_was_not_reached():
+    with pytest.warns(UserWarning, match="`tol=1e-06` was not reached: .* 100 paths"):
+        got = ds.monte_carlo(jr.normal, jr.key(0), 100, tol=1e-6)
+    assert got.tol_reached is False and "`tol` was not reached" in str(got)
 
 
 @pytest.mark.parametrize(
@@ -190,12 +148,11 @@ def test_an_interrupt_on_the_second_level_keeps_the_first(monkeypatch):
     [
         (dict(tol=0.0), "`tol` must be a positive number"),
         (dict(tol=float("nan")), "`tol` must be a positive number"),
-        (dict(levels=3, order=1), "`levels` must be 1, or 2"),
+        (dict(levels=0), "`levels` must be a positive integer"),
         (dict(levels=2), "the weak order of the solver"),
         (dict(levels=2, order=0), "`order` must be a positive integer"),
-        (dict(levels=2, order=1, num_coupled=0), "`num_coupled` must be a positive"),
     ],
 )
 def test_bad_tolerances_and_levels_are_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
-        ds.expectation(_phi, jr.key(0), 10, **kwargs)
+        ds.monte_carlo(_phi, jr.key(0), 10, **kwargs)
