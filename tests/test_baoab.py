@@ -175,7 +175,7 @@ def test_a_matrix_of_friction_is_that_of_its_own_axes():
     # Arrays of momenta have matrices of twice their shape, in PyTrees as well.
     shaped = ds.hamiltonian_terms(
         lambda t, p, q, args: jnp.sum(p["x"] ** 2) / 2,
-        lambda *_: 0.0,
+        lambda t, p, q, args: 0.0 * q["x"][0],
         Given(jnp.zeros(1)),
     )
     y0 = ({"x": jnp.ones((3, 1))},) * 2

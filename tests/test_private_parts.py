@@ -4,6 +4,8 @@ tests fails after an upgrade, its name says what broke; other failures follow fr
 import ast
 import inspect
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import diffrax
@@ -235,3 +237,9 @@ def test_a_result_may_have_a_message_of_its_own():
         bool(item == getattr(diffrax.RESULTS, name))
         for name in ("successful", "internal_error", "nonlinear_max_steps_reached")
     )
+
+
+def test_what_takes_long_to_import_is_imported_when_it_is_needed():
+    code = "import sys, diffrax_symplectic; print('scipy.stats' in sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    assert out.stdout.split() == [b"False"]

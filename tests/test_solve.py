@@ -218,7 +218,7 @@ def test_unsolvable_stages_are_reported():
     solve = lambda **kwargs: diffrax.diffeqsolve(
         _explosive(path), ds.ImplicitMidpoint(), 0.0, 1.0, 0.1, y0, **kwargs
     )
-    with pytest.raises(Exception, match="nonlinear solver"):
+    with pytest.raises(Exception, match="stage equations of a step were not solved"):
         jax.block_until_ready(solve())
     assert solve(throw=False).result != diffrax.RESULTS.successful
 
@@ -267,7 +267,7 @@ def test_non_finite_hamiltonians_are_reported(solver):
     success = jax.jit(jax.vmap(solve))(args).result == diffrax.RESULTS.successful
     np.testing.assert_array_equal(success, [False, False, True])
     if isinstance(solver, ds.ImplicitMidpoint):
-        with pytest.raises(Exception, match=r"(?i)non-?finite|nonlinear solver"):
+        with pytest.raises(Exception, match=r"(?i)non-?finite|were not solved"):
             jax.block_until_ready(solve(args[1], throw=True))
 
 

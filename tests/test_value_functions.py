@@ -158,7 +158,8 @@ def test_paths_that_fail_are_counted_and_left_out():
     def H0(t, p, q, args):
         return jnp.where((t > 0.3) & (p < -0.1), jnp.nan, 0.0) * q + 0 * p
 
-    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: -q, WEAK)
+    noise = lambda t, p, q, args: -q
+    terms = ds.hamiltonian_terms(H0, noise, WEAK, structure="separable")
     got = _estimate(
         ds.ValueFunctions(2, 600), terms, ds.SRKw3("b"), lambda t, y, args: y[0], t1=0.5
     )

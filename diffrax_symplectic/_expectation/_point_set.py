@@ -6,11 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, UInt32
-from scipy.stats import qmc
 
 
-# So many coordinates of Sobol' points have direction numbers.
-MAX_DIMENSION: int = qmc.Sobol.MAXDIM
+# For so many coordinates of Sobol' points SciPy has direction numbers.
+MAX_DIMENSION = 21201
 
 
 @ft.lru_cache(maxsize=8)
@@ -25,6 +24,9 @@ def sobol_points(num_points: int, dimension: int) -> np.ndarray:
     The direction numbers are those of
     [Joe and Kuo (2008)](https://doi.org/10.1137/070709359), as SciPy has them.
     """
+    # It takes most of a second to import.
+    from scipy.stats import qmc
+
     sequence = qmc.Sobol(dimension, scramble=False, bits=32)
     points = sequence.random_base2(num_points.bit_length() - 1)
     return (points * 2.0**32).astype(np.uint32)

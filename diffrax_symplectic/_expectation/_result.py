@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Float, PyTree
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 
 # NumPy returns scalars, which are not arrays, from operations on arrays without axes.
@@ -92,7 +92,7 @@ class Expectation(eqx.Module):
         samples, times `std_error`, to either side of `mean`. (For 16 samples and 95% that
         is 2.13 standard errors, for very many 1.96.) What is left of the error of
         discretization is not part of it: see `error`."""
-        factor = student.ppf((1 + confidence) / 2, max(self.num_samples - 1, 1))
+        factor = stdtrit(max(self.num_samples - 1, 1), (1 + confidence) / 2)
         side = lambda sign: jtu.tree_map(
             lambda m, s: m + sign * factor * s, self.mean, self.std_error
         )

@@ -74,4 +74,4 @@ def converged(
     # A fraction of the tolerance: what remains has the same sign in every step, so that
     # over many steps it adds up to a drift where rounding errors would cancel.
     following = size * jnp.where(shrink < 1, shrink, 1)
-    return (following <= 1 / 8) | (stalled & rounded)
+    return (following <= 1 / 64) | (stalled & rounded)
