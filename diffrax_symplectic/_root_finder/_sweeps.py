@@ -164,8 +164,10 @@ def _by_sweeps(look: _Look, image: _Map, y: PyTree[Array]) -> Found:
         first = rounds.step == 0
         count = jnp.where(first, look.finder.sweeps, look.finder.more_sweeps)
         before, y = _fixed_point(image, rounds.y, count)
-        # The first iteration changed the values from zero to nearly what they are now.
-        earlier = jnp.where(first, look.size(y, y)[0], rounds.size)
+        # The first iteration changed the values from zero to nearly what they are now. To
+        # measure that in every round would take a quarter of its time.
+        whole = lambda: look.size(y, y)[0]
+        earlier = lax.cond(first, whole, lambda: rounds.size)
         change = (y**ω - before**ω).ω
         return look.at(y, change, earlier, count, rounds.step + count)
 

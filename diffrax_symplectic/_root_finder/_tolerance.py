@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 
 # Up to this many entries the maximum is written out. XLA fuses no reduction with what its
 # result goes into, and on CPUs it reduces short axes slowly.
-_SHORT = 16
+_SHORT = 4
 
 
 class Tolerance(eqx.Module):
