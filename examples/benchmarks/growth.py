@@ -188,7 +188,7 @@ step, `ImplicitMidpoint` nine times, and another four where that does not reach
 rounding error.
 
 One path alone needs more memory than Heun in proportion, for the vectors of GMRES, in case
-that iteration does not converge. In a batch they are set aside for a sixteenth of the
+that iteration does not converge. In a batch they are set aside for a sixty-fourth of the
 paths.
 """
 
