@@ -63,7 +63,10 @@ def _eliminate(matrix: _Matrix, rhs: _Vector) -> _Vector:
     """The solution of a linear system, by elimination with partial pivoting."""
     n = len(rhs)
     if n > _MAX_WRITTEN_OUT:
-        return jnp.linalg.solve(matrix, rhs)
+        # On CPUs JAX makes a permutation of LAPACK's pivots by a loop with ten kernels for
+        # each row, which takes several times as long as this does.
+        Q, R = jnp.linalg.qr(matrix)
+        return jax.scipy.linalg.solve_triangular(R, Q.T @ rhs)
     # Rows as lists of scalars: XLA sees straight-line arithmetic and fuses all of it.
     rows = [[*matrix[i], rhs[i]] for i in range(n)]
     for k in range(n):

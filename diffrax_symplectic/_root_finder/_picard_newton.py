@@ -57,8 +57,6 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         included. `None` is elimination for few unknowns, and otherwise no matrix.
     - `direct`: the most unknowns for chord iterations. The Jacobian of more, and its
         inverse, cost more than the iterations that they save.
-    - `sweeps`, `more_sweeps`: fixed-point iterations before the first look at the error,
-        and between two of them.
     - `picard_steps`: the most iterations before Newton's method.
 
     In `optimistix.root_find`, `options={"scale": f}` says how large the state is that the
@@ -67,8 +65,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
     each of which reads those before it: `fs[i](k)` returns the function whose fixed point
     is `k[i]`. First iterations then solve one block after another.
 
-    **Raises:** a `ValueError` for negative numbers, fewer than 2 `sweeps`, or
-        no `more_sweeps`.
+    **Raises:** a `ValueError` for negative numbers.
     """
 
     rtol: float | None = None
@@ -76,18 +73,12 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
     norm: Callable[[PyTree], Scalar] = optx.max_norm
     linear_solver: lx.AbstractLinearSolver | None = None
     direct: int = eqx.field(default=6, static=True)
-    sweeps: int = eqx.field(default=9, static=True)
-    more_sweeps: int = eqx.field(default=4, static=True)
     picard_steps: int = eqx.field(default=40, static=True)
 
     def __check_init__(self):
-        least = dict(direct=0, sweeps=2, more_sweeps=1, picard_steps=0)
-        for name, n in least.items():
-            if getattr(self, name) < n:
-                raise ValueError(
-                    f"`{name}` of `PicardNewton` must be at least {n}; got "
-                    f"{getattr(self, name)}."
-                )
+        for name in ("direct", "picard_steps"):
+            if (n := getattr(self, name)) < 0:
+                raise ValueError(f"`{name}` of `PicardNewton` must be >= 0; got {n}.")
 
     @property
     def tolerance(self) -> Tolerance:

@@ -27,9 +27,13 @@ _AT_ONCE = 2
 # Fixed-point iterations before these, and by how much the last of them may change the
 # values, as a fraction of what all of them did.
 _WARMUP, _SETTLED = 4, 0.5
+# Fixed-point iterations between the first iterate and the first look at the error, and
+# then between two looks. They shrink by powers of two, so that the rate of one is a square
+# root, twice or three times: any other power takes as long as an iteration of few unknowns.
+_FIRST, _MORE = 8, 4
 # So many more fixed-point iterations cost as much as the Jacobian and its inverse do.
 _SLOW = 24
-# Chord iterations between two looks at the error, and the most of them.
+# Chord iterations between two looks at the error, as above, and the most of them.
 _CHORDS, _MOST_CHORDS = 2, 20
 # A correction below this fraction of the state shows that iteration came near.
 _NEAR = 0.1
@@ -76,11 +80,11 @@ class _Look(NamedTuple):
             tolerance.sizes(self.scale(self.restore(y))),
         )
 
-    def at(self, y, change, earlier: Scalar, count: IntScalarLike, step) -> _Rounds:
-        """After `count` iterations, the last of which was `change`, since the correction
-        of the size `earlier`."""
+    def at(self, y, change, earlier: Scalar, root: _Map, step) -> _Rounds:
+        """After an iteration that was a `change`. The `root` of how much it has shrunk,
+        since the one of the size `earlier`, is the rate of one iteration."""
         size, relative = self.size(change, y)
-        shrink = ratio(size, earlier) ** (1 / count)
+        shrink = root(ratio(size, earlier))
         stalled = size >= 0.5 * earlier
         # The norms do not tell: on CPUs XLA may return -inf as the maximum of NaNs.
         finite = all_finite(y)
@@ -162,14 +166,16 @@ def sweep_blocks(
 def _by_sweeps(look: _Look, image: _Map, y: PyTree[Array]) -> Found:
     def advance(rounds: _Rounds) -> _Rounds:
         first = rounds.step == 0
-        count = jnp.where(first, look.finder.sweeps, look.finder.more_sweeps)
+        count = jnp.where(first, 1 + _FIRST, _MORE)
         before, y = _fixed_point(image, rounds.y, count)
         # The first iteration changed the values from zero to nearly what they are now. To
         # measure that in every round would take a quarter of its time.
         whole = lambda: look.size(y, y)[0]
         earlier = lax.cond(first, whole, lambda: rounds.size)
         change = (y**ω - before**ω).ω
-        return look.at(y, change, earlier, count, rounds.step + count)
+        fourth = lambda x: jnp.sqrt(jnp.sqrt(x))
+        root = lambda x: jnp.where(first, jnp.sqrt(fourth(x)), fourth(x))
+        return look.at(y, change, earlier, root, rounds.step + count)
 
     dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).dtype
     no, yes = jnp.array(False), jnp.array(True)
@@ -191,11 +197,11 @@ def _by_chords(
     moved = jnp.where(begin.solved, k, k + diff)
     size, _ = look.size(diff, moved)
 
-    def advance(rounds: _Rounds, chords: int = _CHORDS) -> _Rounds:
+    def advance(rounds: _Rounds) -> _Rounds:
         before = k = rounds.y
-        for _ in range(chords):
+        for _ in range(_CHORDS):
             before, k = k, k + M @ (image(k) - k)
-        return look.at(k, k - before, rounds.size, chords, rounds.step + chords)
+        return look.at(k, k - before, rounds.size, jnp.sqrt, rounds.step + _CHORDS)
 
     first = _Rounds(moved, size, begin.solved, begin.near, ~begin.solved, 0)
     found = _while_any(advance, first)
