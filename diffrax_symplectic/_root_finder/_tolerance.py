@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
+from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
 
@@ -42,7 +43,9 @@ class Tolerance(eqx.Module):
 
 def max_norm(x: Array) -> Scalar:
     if x.size > _SHORT:
-        return jnp.max(jnp.abs(x))
+        x = jnp.abs(x).reshape(-1)
+        greater = lambda a, b: lax.select(a >= b, a, b)
+        return lax.reduce(x, jnp.zeros((), x.dtype), greater, (0,))
     x = jnp.abs(x).reshape(-1)
     while (n := x.size) > 1:
         x = jnp.maximum(x[: (n + 1) // 2], x[n // 2 :])
