@@ -47,7 +47,7 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         object of type `levy_area`. Without `t1` the step is the one from `0` to `t0`.
 
         **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
-        size controller or `diffrax.HalfSolver`.
+        size controller or `diffrax.HalfSolver`. Warns if `dt0` does not divide its time.
         """
         del left
         require_fixed_steps(self)
