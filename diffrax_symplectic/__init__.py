@@ -86,3 +86,6 @@ from ._waves import (
     to_pair as to_pair,
     wave_terms as wave_terms,
 )
+
+
+__version__ = "0.1.0"

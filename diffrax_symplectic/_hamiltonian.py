@@ -273,9 +273,9 @@ def _named(name: str) -> Iterator[None]:
         yield
     except jax.errors.JAXTypeError as error:
         raise ValueError(
-            f"`{name}(t, p, q, args)` asks for values while JAX traces it, when there are "
-            "none: by `if`, `while`, `float`, or a function of NumPy. Write `jnp.where(a, "
-            "b, c)` or `jax.lax.cond` in place of `if`, and `jnp` in place of `np`."
+            f"`{name}` asks for values while JAX traces it, when there are none: by `if`, "
+            "`while`, `float`, or a function of NumPy. Write `jnp.where(a, b, c)` or "
+            "`jax.lax.cond` in place of `if`, and `jnp` in place of `np`."
         ) from error
 
 
@@ -354,10 +354,4 @@ def pair_fault(y: PyTree) -> str | None:
         jnp.shape(x) for x in jtu.tree_leaves(p)
     ] != [jnp.shape(x) for x in jtu.tree_leaves(q)]:
         return f"{advice}Got p = {eqx.tree_pformat(p)} and q = {eqx.tree_pformat(q)}."
-    if any(map(jnp.iscomplexobj, jtu.tree_leaves(y))):
-        return (
-            "`p` and `q` must be real; got complex arrays. For complex amplitudes `psi` "
-            "construct the terms with `wave_terms(H0, noise, path)` and pass "
-            "`y0=to_pair(psi0)`."
-        )
     return None

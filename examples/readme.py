@@ -1,34 +1,40 @@
-"""The picture of README and of the first page of the documentation:
+"""The pictures of README and of the first page of the documentation:
 
     python -m examples.readme
 
-A noisy oscillator in phase space by a symplectic and an explicit method, and exact errors
-against costs as `docs/benchmarks/work_precision.md` has them.
+A noisy oscillator in phase space by a symplectic and an explicit method; and the total
+error of an expectation against the seconds to it, compilation aside. What is drawn in the
+second is kept in `docs/img/first.csv`.
 """
 
-import re
+import csv
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-import matplotlib.pyplot as plt
+import matplotlib
 import numpy as np
 
 import diffrax_symplectic as ds
 
-from .benchmarks import work_precision
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
 
 
-DOCS = Path(__file__).parent.parent / "docs"
+jax.config.update("jax_enable_x64", True)
+
+IMG = Path(__file__).parent.parent / "docs" / "img"
 H, STEPS = 0.1, 2000
-SHOWN = {
-    "AdditiveGauss": "linear oscillator",
-    "ShARK": "linear oscillator",
-    "NinomiyaVictoir": "two noises",
-    "Heun": "two noises",
-}
+# The expectation: q^2 at the time T in a double well, from (p, q) = (0, 1).
+T, REPEATS = 2.0, 8
+Y0 = (jnp.array(0.0), jnp.array(1.0))
+PLAIN, VALUES = "`StormerVerlet`, independent paths", "`ValueFunctions`, 4 levels"
+HEUN, RQMC = "Diffrax's `Heun`, independent paths", "`ArrayRQMC`, 2 levels"
 
 
 def portrait(solver) -> np.ndarray:
@@ -57,54 +63,118 @@ def portrait(solver) -> np.ndarray:
     return points[:, np.all(np.abs(points) < 1e3, axis=0)]
 
 
-def cost(model: str, solver: str) -> float:
-    """Microseconds per path and step of size 1, from the page of the benchmark. The cost of
-    a step does not depend on its size."""
-    page = (DOCS / "benchmarks/work_precision.md").read_text()
-    row = rf"^\| weak, {model} \| {solver} \| 0.0625 \| .* \| (\S+) \|$"
-    (microseconds,) = re.findall(row, page, re.M)
-    return 0.0625 * float(microseconds)
-
-
-def error(model: str, solver: str) -> np.ndarray:
-    """Exact, for all step sizes of the benchmark."""
-    _, _, solvers, errors = work_precision.weak(model)
-    method, path = solvers[solver]
-    return errors(method, path, work_precision.HS).errors
-
-
-def main() -> None:
-    figure, (left, right) = plt.subplots(
-        1, 2, figsize=(9, 3.8), layout="constrained", width_ratios=(1, 1.3)
+def double_well(path) -> diffrax.MultiTerm:
+    return ds.hamiltonian_terms(
+        lambda t, p, q, args: p**2 / 2 + q**4 / 4 - q**2 / 2,
+        lambda t, p, q, args: 0.3 * jnp.sin(q),
+        path,
     )
+
+
+def square(t, y, args):
+    return y[1] ** 2
+
+
+def expectation(path, solver, steps: int, sampling, levels: int = 1) -> Callable:
+    """A function from a key to an estimate."""
+    terms = double_well(path)  # once: other functions are compiled anew
+    return lambda key: (
+        ds.expectation(
+            square,
+            terms,
+            solver,
+            0.0,
+            T,
+            T / steps,
+            Y0,
+            key=key,
+            sampling=sampling,
+            levels=levels,
+        ).mean
+    )
+
+
+def estimates() -> list[tuple[str, int, Callable]]:
+    """What is drawn: a name, the number of paths, and an estimate of each key. Independent
+    paths have as few steps as leave the bias below the error of sampling."""
+    weak = ds.WeakBrownianPath((), jr.key(0))
+    fixed = ds.FixedStepBrownianPath((), jr.key(0))
+    unsafe = diffrax.UnsafeBrownianPath((), jr.key(0))
+    verlet, out = ds.StormerVerlet(), []
+    for n, steps in ((2**10, 20), (2**13, 40), (2**16, 80), (2**19, 160)):
+        independent = ds.IndependentPaths(n)
+        out.append((HEUN, n, expectation(unsafe, diffrax.Heun(), steps, independent)))
+        out.append((PLAIN, n, expectation(weak, verlet, steps // 4 + 5, independent)))
+    for n in (2**8, 2**10, 2**12, 2**14):
+        rqmc = ds.ArrayRQMC(n, replicates=8)
+        out.append((RQMC, 8 * n, expectation(fixed, verlet, 20, rqmc, 2)))
+    for degree, n in ((4, 2**10), (6, 2**11), (8, 2**12), (8, 2**14)):
+        values = ds.ValueFunctions(degree=degree, num_paths=n)
+        out.append((VALUES, n, expectation(weak, verlet, 20, values, 4)))
+    return out
+
+
+def exact() -> float:
+    """With shorter steps and more paths than all that is drawn."""
+    weak = ds.WeakBrownianPath((), jr.key(0))
+    values = ds.ValueFunctions(degree=8, num_paths=2**16)
+    return float(expectation(weak, ds.StormerVerlet(), 32, values, 4)(jr.key(100)))
+
+
+def measured() -> list[tuple[str, int, float, float]]:
+    """Of each: its name, the paths, the root mean square error of several estimates, and
+    the seconds of the quickest. They take turns."""
+    value, out = exact(), []
+    for name, n, estimate in estimates():
+        estimate(jr.key(0))  # compiles
+        means, seconds = [], []
+        for i in range(REPEATS):
+            begin = time.perf_counter()
+            means.append(float(estimate(jr.key(1 + i))))
+            seconds.append(time.perf_counter() - begin)
+        error = np.sqrt(np.mean((np.array(means) - value) ** 2))
+        out.append((name, n, float(error), min(seconds)))
+        print(*out[-1], flush=True)
+    return out
+
+
+def draw_portrait(ax) -> None:
     for name, solver, colour in (
         ("Heun", diffrax.Heun(), "C1"),
         ("ImplicitMidpoint", ds.ImplicitMidpoint(), "C0"),
     ):
         p, q = portrait(solver)
         near = np.hypot(p, q) < 2.2
-        left.plot(q[near], p[near], ".", ms=2, color=colour, label=name)
-    left.set(xlabel="q", ylabel="p", title=f"a noisy oscillator to t = {H * STEPS:g}")
-    left.set(xlim=(-2.3, 2.3), ylim=(-2.3, 2.9), aspect="equal")
-    left.legend(loc="upper center", ncols=2, markerscale=4, frameon=False)
-    for i, (solver, model) in enumerate(SHOWN.items()):
-        time = cost(model, solver) / np.array(work_precision.HS)
-        style = "-" if hasattr(ds, solver) else "--"
-        label = f"{solver}, {model}"
-        right.plot(
-            time,
-            error(model, solver),
-            style,
-            marker="o",
-            label=label,
-            color=f"C{i // 2}",
-        )
-    right.set(xscale="log", yscale="log", title="error of an expectation")
-    right.set(xlabel="microseconds per path", ylabel="error")
-    right.set_ylim(top=100)
-    right.legend(loc="upper center", ncols=2, fontsize=7.5, frameon=False)
-    right.grid(alpha=0.3)
-    figure.savefig(DOCS / "img/first.png", dpi=110)
+        ax.plot(q[near], p[near], ".", ms=2, color=colour, label=name)
+    ax.set(xlabel="q", ylabel="p", title=f"a noisy oscillator to t = {H * STEPS:g}")
+    ax.set(xlim=(-2.3, 2.3), ylim=(-2.3, 2.9), aspect="equal")
+    ax.legend(loc="upper center", ncols=2, markerscale=4, frameon=False)
+
+
+def draw_errors(ax, rows) -> None:
+    styles = {HEUN: "C1o--", PLAIN: "C4o--", RQMC: "C2o-", VALUES: "C0o-"}
+    for name, style in styles.items():
+        points = [(seconds, error) for x, _, error, seconds in rows if x == name]
+        ax.plot(*zip(*points), style, label=name.replace("`", ""))
+    ax.set(xscale="log", yscale="log", title="a mean in a double well")
+    ax.set(xlabel="seconds", ylabel="total error")
+    ax.legend(loc="lower left", fontsize=8, frameon=False)
+    ax.grid(alpha=0.3)
+
+
+def main() -> None:
+    rows = measured()
+    with (IMG / "first.csv").open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(("estimate", "paths", "total error", "seconds"))
+        for name, n, error, seconds in rows:
+            writer.writerow((name, n, f"{error:.1e}", f"{seconds:.2g}"))
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(9, 3.8), layout="constrained", width_ratios=(1, 1.3)
+    )
+    draw_portrait(left)
+    draw_errors(right, rows)
+    figure.savefig(IMG / "first.png", dpi=110)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Terms and states that do not fit get an error that says what to pass instead."""
 
+import warnings
 from typing import NamedTuple
 
 import diffrax
@@ -161,9 +162,7 @@ def test_a_hamiltonian_that_asks_for_values_is_named(name):
     square = lambda t, p, q, args: jnp.sum(p**2)
     H0, noise = (branches, square) if name == "H0" else (square, branches)
     terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
-    with pytest.raises(
-        ValueError, match=rf"`{name}\(t, p, q, args\)` asks for.*jnp.where"
-    ):
+    with pytest.raises(ValueError, match=f"`{name}` asks for.*jnp.where"):
         _solve(terms, (jnp.ones(2), jnp.ones(2)))
 
 
@@ -177,6 +176,9 @@ def test_shapes_are_written_as_shapes():
         with pytest.raises(ValueError, match=match) as info:
             _solve(ds.hamiltonian_terms(energy, noises, weak_path(2)), y0)
         assert "ShapeDtypeStruct" not in str(info.value)
+    struct = jax.ShapeDtypeStruct((2,), jnp.float32)
+    with pytest.raises(ValueError, match=r"got \[f32\[2\], 3\]\."):
+        ds.WeakBrownianPath([struct, 3], jr.key(0))
 
 
 def test_cells_that_do_not_divide_the_step_are_refused_while_tracing():
@@ -195,6 +197,31 @@ def test_cells_that_do_not_divide_the_step_are_refused_while_tracing():
         jax.eval_shape(lambda: solve(1, 0.1, wrapped))
         # Times that are traced are known when run.
         jax.eval_shape(lambda h: solve(1, h, wrapped), 0.07)
+
+
+def test_a_shorter_last_step_is_announced_once():
+    H = lambda t, p, q, args: jnp.sum(p**2 + q**2)
+    y0 = (jnp.ones(2), jnp.ones(2))
+
+    def announced(t1, dt0, path):
+        terms = ds.hamiltonian_terms(H, H, path)
+        solve = lambda: diffrax.diffeqsolve(
+            terms, ds.ImplicitMidpoint(), 0, t1, dt0, y0
+        )
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("default")
+            jax.eval_shape(lambda: solve().ys)
+        return [str(x.message) for x in caught]
+
+    weak = weak_path(1)
+    (message,) = announced(1, 0.3, weak)
+    assert "`dt0=0.3` does not divide the time from 0 to 1" in message
+    assert "(t1 - t0) / n" in message
+    for t1, dt0 in ((1, 0.1), (100.0, 0.05), (0.7, 0.1)):
+        assert announced(t1, dt0, weak) == []
+    # Steps of cells follow one path however they are cut.
+    cells = ds.FixedStepBrownianPath((), jr.key(0), cell=0.1)
+    assert announced(1, 0.3, cells) == []
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])

@@ -1,3 +1,5 @@
+import warnings
+
 import diffrax
 import jax.tree_util as jtu
 import numpy as np
@@ -23,7 +25,7 @@ def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
     solve = innermost_solve()
     if solve is None or not _holds(solve.get("terms"), type(path)):
         return
-    _check_cell(path)
+    _check_times(path)
     controller = solve.get("stepsize_controller")
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         raise ValueError(
@@ -40,22 +42,37 @@ def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
         )
 
 
-def _check_cell(path: diffrax.AbstractBrownianPath) -> None:
-    """Raises a `ValueError` if the times of the solve, where these are numbers, are no
-    multiples of the path's `cell`. (Steps of other controllers, and times that are traced,
-    are checked when run.)"""
-    cell, times = getattr(path, "cell", None), innermost_times()
-    if cell is None or times is None:
+def _check_times(path: diffrax.AbstractBrownianPath) -> None:
+    """Looks at the times of the solve, where these are numbers. A `ValueError` if they are
+    no multiples of the path's `cell`. Without cells, a warning if `dt0` does not divide the
+    interval. (Steps of other controllers, and times that are traced, are checked when
+    run.)"""
+    times = innermost_times()
+    if times is None:
         return
-    for name, time in zip(("t0", "t1", "dt0"), times):
-        if isinstance(time, int | float | np.number):
-            cells = float(time) / float(cell)
-            if abs(cells - round(cells)) > 1e-3:
+    cell, number = getattr(path, "cell", None), int | float | np.number
+    if cell is not None:
+        for name, time in zip(("t0", "t1", "dt0"), times):
+            if isinstance(time, number) and not _divides(cell, time):
                 raise ValueError(
                     f"Steps of a `{type(path).__name__}` with `cell` must begin and end at "
                     f"multiples of `cell`; got cell={cell} and {name}={time}. Pass a "
                     "`cell` that divides `t0`, `t1` and `dt0`."
                 )
+    elif all(isinstance(x, number) for x in times):
+        t0, t1, dt0 = times
+        if not _divides(dt0, t1 - t0):
+            warnings.warn(
+                f"`dt0={dt0}` does not divide the time from {t0} to {t1}: the last step is "
+                "a shorter one. For `n` equal steps pass `dt0=(t1 - t0) / n`.",
+                stacklevel=2,
+            )
+
+
+def _divides(part: float, whole: float) -> bool:
+    with np.errstate(all="ignore"):  # What is not finite is refused elsewhere.
+        count = np.divide(float(whole), float(part))
+        return not np.abs(count - np.rint(count)) > 1e-3
 
 
 def _holds(terms, kind: type) -> bool:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any, cast, TYPE_CHECKING, TypeAlias
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -46,7 +47,7 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         object of type `levy_area`. Without `t1` the step is the one from `0` to `t0`.
 
         **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
-        size controller or `diffrax.HalfSolver`.
+        size controller or `diffrax.HalfSolver`. Warns if `dt0` does not divide its time.
         """
         del left
         require_fixed_steps(self)
@@ -194,7 +195,8 @@ def checked_shape(
         if not isinstance(leaf, jax.ShapeDtypeStruct):
             raise ValueError(
                 "`shape` must be a tuple of integers or a PyTree of "
-                f"`jax.ShapeDtypeStruct`s; got {shape}."
+                "`jax.ShapeDtypeStruct`s; got "
+                f"{eqx.tree_pformat(shape, struct_as_array=True)}."
             )
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             raise ValueError(
