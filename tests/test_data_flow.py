@@ -7,10 +7,10 @@ import jax.random as jr
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._data_flow import DataFlow
 from diffrax_symplectic._structure_checks import (
     additive_fault,
     constant_fault,
+    DataFlow,
     separable_fault,
 )
 

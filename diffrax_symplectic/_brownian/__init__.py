@@ -1,5 +1,5 @@
-from ._given import GivenPath as GivenPath
-from ._gaussian import FixedStepBrownianPath as FixedStepBrownianPath
+from ._stepwise import GivenPath as GivenPath
+from ._paths import FixedStepBrownianPath as FixedStepBrownianPath
 from ._laws import (
     AbstractLaw as AbstractLaw,
     Discrete as Discrete,
@@ -9,7 +9,7 @@ from ._levy_area import (
     LevyAreaBrownianPath as LevyAreaBrownianPath,
     LevyAreaIncrement as LevyAreaIncrement,
 )
-from ._plateau import (
+from ._wrappers import (
     PlateauBrownianPath as PlateauBrownianPath,
     PlateauIncrement as PlateauIncrement,
 )
@@ -20,13 +20,10 @@ from ._stepwise import (
     laws_of as laws_of,
     stepwise as stepwise,
 )
-from ._truncated import TruncatedBrownianPath as TruncatedBrownianPath
+from ._wrappers import TruncatedBrownianPath as TruncatedBrownianPath
 from ._variables import VARIABLES as VARIABLES
-from ._weak import (
-    WeakBrownianPath as WeakBrownianPath,
-    WeakIncrement as WeakIncrement,
-)
-from ._wrapper import (
+from ._paths import WeakBrownianPath as WeakBrownianPath, WeakIncrement as WeakIncrement
+from ._wrappers import (
     AbstractWrappedPath as AbstractWrappedPath,
     increment_struct as increment_struct,
 )

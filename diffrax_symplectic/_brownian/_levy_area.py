@@ -15,11 +15,7 @@ from ._cells import check_cell, compose, or_one, Piece
 from ._laws import normal_from_words
 from ._random_words import AREA_WORDS, check_key, place_of, random_words
 from ._stepwise import Increment, num_noises
-from ._wrapper import (
-    AbstractWrappedPath,
-    increment_struct,
-    require_space_time_area,
-)
+from ._wrappers import AbstractWrappedPath, increment_struct, require_space_time_area
 
 
 class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):

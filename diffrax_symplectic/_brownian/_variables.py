@@ -5,8 +5,8 @@ from typing import NamedTuple
 import diffrax
 
 from ._levy_area import LevyAreaIncrement
-from ._plateau import PlateauIncrement
-from ._weak import WeakIncrement
+from ._paths import WeakIncrement
+from ._wrappers import PlateauIncrement
 
 
 class RandomVariable(NamedTuple):
