@@ -1,9 +1,10 @@
 """Which solvers fit a system, best first."""
 
 import dataclasses
+import functools as ft
 import textwrap
 from collections.abc import Callable, Sequence
-from typing import Any, get_args
+from typing import get_args
 
 import diffrax
 import equinox as eqx
@@ -13,8 +14,30 @@ import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import PRNGKeyArray, PyTree
 
-from ._brownian import increment_struct, WeakBrownianPath
+from ._brownian import increment_struct
 from ._custom_types import Args, RealScalarLike, Y
+from ._solver import (
+    AbstractSymplecticSolver,
+    AdditiveGauss,
+    ImplicitMidpoint,
+    LevyAreaMidpoint,
+    NinomiyaVictoir,
+    PlateauGauss,
+    PlateauVerlet,
+    Record,
+    SRKs1,
+    SRKs2,
+    SRKs3,
+    SRKs4,
+    SRKw1,
+    SRKw2,
+    SRKw3,
+    SRKw4,
+    SRKw5,
+    StormerVerlet,
+    StrangGauss,
+    Want,
+)
 from ._structure_checks import (
     additive_fault,
     commuting,
@@ -22,7 +45,6 @@ from ._structure_checks import (
     FRICTION,
     separable_fault,
 )
-from ._suggestion_rules import PATHS, Rule, RULES, Want
 from ._terms import (
     apply,
     brownian_paths,
@@ -33,6 +55,31 @@ from ._terms import (
 )
 
 
+# All solvers of the package with a record, in the order of the documentation.
+SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
+    ImplicitMidpoint,
+    SRKs1,
+    SRKw1,
+    SRKw2,
+    StrangGauss,
+    NinomiyaVictoir,
+    PlateauGauss,
+    LevyAreaMidpoint,
+    SRKs2,
+    SRKs3,
+    SRKw3,
+    SRKw4,
+    StormerVerlet,
+    PlateauVerlet,
+    SRKs4,
+    SRKw5,
+    AdditiveGauss,
+)
+# What a higher order may cost. In steps of a twentieth, and with constants of one size, a
+# step of order 2 is worth twenty steps of order 1.
+_MOST_STAGE_VECTORS = 20
+
+
 @dataclasses.dataclass(frozen=True)
 class Suggestion:
     """One solver for a system, as [`diffrax_symplectic.suggest_solver`][] finds it.
@@ -41,7 +88,7 @@ class Suggestion:
     - `weak_order`, `strong_order`: its orders for this system; the strong one is `None`
         for a solver for expectations alone.
     - `path`: the Brownian path that it needs, as code.
-    - `reason`: why, in a sentence.
+    - `reason`: when to choose it, in a sentence.
     - `terms`: a function of a random key, which returns the terms of the system with such
         paths in place of theirs.
     """
@@ -91,13 +138,15 @@ class Suggestions(Sequence[Suggestion]):
 
 def suggest_solver(
     terms: diffrax.AbstractTerm,
+    t0: RealScalarLike,
     y0: Y,
     args: Args = None,
     *,
-    want: Want = "expectations",
-    t0: RealScalarLike = 0.0,
+    want: Want,
 ) -> Suggestions:
-    r"""Suggests solvers for a system, best first, by the structure of its terms.
+    r"""Suggests solvers for a system, best first, by the structure of its terms: those
+    of the highest order first, and among these the one with the fewest stage vectors to
+    solve for.
 
     Whether $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, whether the noise is additive or
     constant, and whether noises commute is found out as the solvers do it for themselves,
@@ -117,7 +166,7 @@ def suggest_solver(
         noise = lambda t, p, q, args: 0.1 * jnp.sin(q)
         terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
         y0 = (jnp.array(0.0), jnp.array(1.0))
-        suggestions = ds.suggest_solver(terms, y0)
+        suggestions = ds.suggest_solver(terms, 0.0, y0, want="expectations")
         print(suggestions)
         best = suggestions[0]
         sol = diffrax.diffeqsolve(
@@ -129,10 +178,9 @@ def suggest_solver(
 
     - `terms`: the terms of a Stratonovich system, as of
         [`diffrax_symplectic.hamiltonian_terms`][], with any Brownian path.
-    - `y0`, `args`: the state and the arguments of the solve.
+    - `t0`, `y0`, `args`: where the solve begins, as for `diffrax.diffeqsolve`.
     - `want`: `"expectations"`, if means over all paths matter, or `"paths"`, if single
         ones do.
-    - `t0`: where the solve begins.
 
     **Returns:** a sequence of suggestions, each with `solver`, `weak_order`,
     `strong_order`, `path`, `reason`, and `terms(key)`, the terms with the path that the
@@ -165,17 +213,15 @@ def suggest_solver(
     commute = (
         m == 1 or has["separable"] or has["additive"] or commuting(noise, t0, y0, args)
     )
-    shape = increment_struct(brownian_paths(noise)[0])
-    one_array = len(noise) == 1 and jtu.all_leaves([shape])
-    found = []
-    for rule, reason in RULES.items():
-        fits = rule.want == want and has[rule.structure]
-        if rule.noises != "any":
-            fits = fits and commute == (rule.noises == "commuting")
-        if rule.path == "Lévy areas":
-            fits = fits and one_array
-        if fits:
-            found.append(_suggestion(rule, reason, terms, shape, commute))
+    solvers = [
+        solver() for solver in ranked(want, commute, m) if has[solver().structure]
+    ]
+    if len(noise) > 1 or not jtu.all_leaves(
+        [increment_struct(brownian_paths(noise)[0])]
+    ):
+        # Lévy areas are those between the noises of one array.
+        solvers = [s for s in solvers if "A" not in s.variables]
+    found = [_suggestion(solver, want, terms, commute) for solver in solvers]
     structure = [name for name in has if has[name] and name != "any"]
     kind = (
         " and ".join(structure) or f"general ({getattr(not_separable, 'reason', '')})"
@@ -205,27 +251,51 @@ def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     return drift, noise
 
 
+def ranked(
+    want: Want, commute: bool, num_noises: int
+) -> list[type[AbstractSymplecticSolver]]:
+    """The solvers that are suggested for such noises, whatever else the system is, best
+    first."""
+
+    def rank(solver: type[AbstractSymplecticSolver]) -> tuple:
+        # Of a separable system half of the state is solved for.
+        half = 1 / 2 if solver().structure == "separable" else 1
+        cost = half * sum(solver().stage_vectors(num_noises))
+        order = _record(solver()).order(want, commute)
+        assert order is not None
+        return cost > _MOST_STAGE_VECTORS, -order, cost
+
+    fits = ("any", "commuting" if commute else "not commuting")
+    records = ((solver, _record(solver())) for solver in SOLVERS)
+    named = [s for s, r in records if want in r.suggested and r.noises in fits]
+    return sorted(named, key=rank)
+
+
+def _record(solver: AbstractSymplecticSolver) -> Record:
+    assert solver.record is not None
+    return solver.record
+
+
 def _suggestion(
-    rule: Rule, reason: str, terms: diffrax.AbstractTerm, shape, commute: bool
+    solver: AbstractSymplecticSolver,
+    want: Want,
+    terms: diffrax.AbstractTerm,
+    commute: bool,
 ) -> Suggestion:
-    solver: Any = rule.solver()
-    # The orders of noises that commute are those of one noise.
-    counted = terms
-    if commute:
-        path = WeakBrownianPath((), jr.key(0))
-        counted = diffrax.ControlTerm(lambda t, y, args: y, path)
-    kind = PATHS[rule.path]
+    record = _record(solver)
+    shape = _shape_code(increment_struct(brownian_paths(terms)[0]))
+    name = type(solver).__name__
     return Suggestion(
         solver=solver,
-        weak_order=solver.weak_order(counted),
-        strong_order=solver.strong_order(counted),
-        path=kind.code.format(shape=_shape_code(shape)),
-        reason=reason,
-        terms=jtu.Partial(_with_paths, kind.make, terms),
+        weak_order=record.weak_order(commute),
+        strong_order=record.strong_order(commute),
+        path=f'ds.{name}().path({shape}, key, want="{want}")',
+        reason=record.choose,
+        terms=jtu.Partial(with_paths, ft.partial(solver.path, want=want), terms),
     )
 
 
-def _with_paths(make: Callable, terms: PyTree, key: PRNGKeyArray) -> PyTree:
+def with_paths(make: Callable, terms: PyTree, key: PRNGKeyArray) -> PyTree:
     """The terms with new paths in place of theirs; terms that share a path share the new
     one."""
     made = {}

@@ -16,6 +16,7 @@ import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._root_finder import SmallLU
 from diffrax_symplectic._root_finder._linear import solve as solve_linear
 from diffrax_symplectic._root_finder._start import improve, Measured
 from diffrax_symplectic._solver._lanes import where_pending
@@ -98,7 +99,7 @@ def test_many_unknowns_are_solved_without_a_matrix():
     assert success
     norm = lambda y: jnp.sum(y[0] ** 2 + y[1] ** 2)
     assert abs(norm(y1) / norm(y0) - 1) <= 1e-13
-    dense = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(linear_solver=ds.SmallLU()))
+    dense = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(linear_solver=SmallLU()))
     exact, success = jax.jit(lambda y0: _one_step(dense, term, h, y0))(y0)
     assert success
     np.testing.assert_allclose(y1, exact, atol=1e-13)

@@ -12,6 +12,7 @@ import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._root_finder import SmallLU
 
 from .problems import (
     GENERAL,
@@ -88,7 +89,7 @@ def test_stage_equations_are_solved_to_rounding_error(name, dtype):
     solver = GENERAL[name]
     # The Jacobian above is implicit, and would be symplectic at any approximate
     # solution. So the end of the step is compared to a solve that goes on and on.
-    stubborn = optx.Newton(rtol=0.0, atol=0.0, linear_solver=ds.SmallLU())
+    stubborn = optx.Newton(rtol=0.0, atol=0.0, linear_solver=SmallLU())
     exact = dataclasses.replace(solver, root_finder=stubborn, root_find_max_steps=30)
 
     ravel = jnp.concatenate

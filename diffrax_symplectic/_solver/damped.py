@@ -6,11 +6,12 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, PRNGKeyArray, PyTree
 
 from .._compat import direction
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._hamiltonian import check_pair
+from ._record import Want
 from .base import AbstractSymplecticSolver
 
 
@@ -102,7 +103,12 @@ class Damped(
 
     def weak_order(self, terms):
         """Order of convergence of expectations."""
-        return min(self.solver.weak_order(terms), 2)  # pyright: ignore
+        order = self.solver.weak_order(terms)  # pyright: ignore
+        return None if order is None else min(order, 2)
+
+    def path(self, shape: Any, key: PRNGKeyArray, *, want: Want | None = None):
+        """That of the solver."""
+        return self.solver.path(shape, key, want=want)  # pyright: ignore
 
     def init(
         self,
