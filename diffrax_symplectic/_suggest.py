@@ -3,7 +3,7 @@
 import dataclasses
 import functools as ft
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import get_args
 
 import diffrax
@@ -45,6 +45,7 @@ from ._structure_checks import (
     FRICTION,
     separable_fault,
 )
+from ._tableau import Structure
 from ._terms import (
     apply,
     brownian_paths,
@@ -202,7 +203,7 @@ def suggest_solver(
 
     not_separable = separable_fault(drift, noise, t0, y0, args)
     not_additive = additive_fault(noise, t0, y0, args)
-    has = {
+    has: dict[Structure, bool] = {
         "any": True,
         "separable": not_separable is None,
         "additive": not_additive is None,
@@ -213,9 +214,8 @@ def suggest_solver(
     commute = (
         m == 1 or has["separable"] or has["additive"] or commuting(noise, t0, y0, args)
     )
-    solvers = [
-        solver() for solver in ranked(want, commute, m) if has[solver().structure]
-    ]
+    fitting: list[Structure] = [name for name in has if has[name]]
+    solvers = ranked(want, fitting, commute, m)
     if len(noise) > 1 or not jtu.all_leaves(
         [increment_struct(brownian_paths(noise)[0])]
     ):
@@ -252,23 +252,27 @@ def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
 
 
 def ranked(
-    want: Want, commute: bool, num_noises: int
-) -> list[type[AbstractSymplecticSolver]]:
-    """The solvers that are suggested for such noises, whatever else the system is, best
+    want: Want, structures: Collection[Structure], commute: bool, num_noises: int
+) -> list[AbstractSymplecticSolver]:
+    """The solvers that are suggested for systems with such structures and noises, best
     first."""
 
-    def rank(solver: type[AbstractSymplecticSolver]) -> tuple:
+    def rank(solver: AbstractSymplecticSolver) -> tuple:
+        systems = solver.stage_vectors(num_noises)
         # Of a separable system half of the state is solved for.
-        half = 1 / 2 if solver().structure == "separable" else 1
-        cost = half * sum(solver().stage_vectors(num_noises))
-        order = _record(solver()).order(want, commute)
+        cost = sum(systems) / (2 if solver.structure == "separable" else 1)
+        order = _record(solver).order(want, commute)
         assert order is not None
-        return cost > _MOST_STAGE_VECTORS, -order, cost
+        return cost > _MOST_STAGE_VECTORS, -order, cost, max(systems, default=0)
 
-    fits = ("any", "commuting" if commute else "not commuting")
-    records = ((solver, _record(solver())) for solver in SOLVERS)
-    named = [s for s, r in records if want in r.suggested and r.noises in fits]
-    return sorted(named, key=rank)
+    noises = ("any", "commuting" if commute else "not commuting")
+
+    def fits(solver: AbstractSymplecticSolver) -> bool:
+        record = _record(solver)
+        wanted = want in record.suggested and record.noises in noises
+        return wanted and solver.structure in structures
+
+    return sorted(filter(fits, [solver() for solver in SOLVERS]), key=rank)
 
 
 def _record(solver: AbstractSymplecticSolver) -> Record:
