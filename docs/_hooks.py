@@ -6,7 +6,7 @@ import importlib.metadata
 import io
 import re
 
-from _tables import on_page
+from _tables import with_tables
 from fontTools.ttLib import TTFont
 from math_core import LatexToMathML
 from mkdocs.structure.files import File
@@ -64,7 +64,7 @@ def on_env(env, config, files):
 
 
 def on_page_markdown(markdown, page, config, files):
-    return on_page(markdown)
+    return with_tables(markdown)
 
 
 def on_page_content(page_html, page, config, files):

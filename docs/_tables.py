@@ -24,15 +24,11 @@ _NOISES = {
 }
 # What most people need.
 _README = (
-    "StormerVerlet",
-    "ImplicitMidpoint",
-    "PlateauVerlet",
-    "StrangGauss",
-    "AdditiveGauss",
+    "StormerVerlet ImplicitMidpoint PlateauVerlet StrangGauss AdditiveGauss".split()
 )
 
 
-def on_page(markdown: str) -> str:
+def with_tables(markdown: str) -> str:
     """The page with a table in place of each `<!-- solvers: ... -->`."""
     return _MARKER.sub(lambda found: table(found[1]), markdown)
 

@@ -45,9 +45,11 @@ def tables(monkeypatch):
 
 
 def test_docs_list_every_solver(tables):
-    page = tables.on_page((ROOT / "docs/solvers/index.md").read_text())
+    page = tables.with_tables((ROOT / "docs/solvers/index.md").read_text())
     folder = ROOT / "docs/solvers"
-    families = "".join(tables.on_page(p.read_text()) for p in folder.glob("[!i]*.md"))
+    families = "".join(
+        tables.with_tables(p.read_text()) for p in folder.glob("[!i]*.md")
+    )
     for name, value in vars(ds).items():
         if isinstance(value, type) and issubclass(value, diffrax.AbstractSolver):
             if not name.startswith("Abstract"):
@@ -64,7 +66,7 @@ def test_table_of_readme_is_that_of_the_records(tables):
     assert f"<!-- solvers: readme -->\n\n{tables.table('readme')}\n\n" in readme
 
 
-def test_tables_say_what_the_docstrings_say(tables):
+def test_records_say_what_the_docstrings_say():
     # The claims of a docstring that are also in the record.
     number = {1: "1", 1.5: "3/2", 2: "2", 3: "3", 0.5: "1/2"}
     for solver in SOLVERS:

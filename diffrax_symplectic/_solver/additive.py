@@ -74,7 +74,8 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     $\beta_2 \neq 0$ and $b$ free. They decide at which times the noise is evaluated: with
     the defaults $\beta_1 = b = 0$, $\beta_2 = 1$, at both ends of the step.
 
-    Order 2 without noise. Noise without the structure is refused while tracing.
+    Strong order 3/2 and weak order 2. Order 2 without noise. Noise without the structure is
+    refused while tracing.
 
     !!! warning
 
