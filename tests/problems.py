@@ -89,7 +89,8 @@ class System(eqx.Module):
 
     def draw(self, key, d: int, m: int, dtype, kind="others", strength=1.0):
         """A state and `args`: with `"one"` noise, the others being of size zero, with two
-        that are `"commuting"`, or with any `"others"`."""
+        that are `"commuting"`, or with any `"others"`, which are multiplied by
+        `strength`."""
         y0, args = self.random(key, d, m, dtype)
         sizes = jnp.ones(m, dtype)
         if kind == "one":
@@ -97,7 +98,7 @@ class System(eqx.Module):
         args["sizes"] = strength * sizes
         args["commuting"] = jnp.zeros((), dtype)
         if kind == "commuting" and self is SYSTEMS["any"]:
-            args["sizes"], args["commuting"] = 0 * sizes, jnp.asarray(strength, dtype)
+            args["sizes"], args["commuting"] = 0 * sizes, jnp.ones((), dtype)
         return y0, args
 
     def terms(self, path, sizes=(1.0, 1.0), commuting=False):
@@ -109,8 +110,8 @@ class System(eqx.Module):
             if not commuting or self is not SYSTEMS["any"]:
                 return noise * own
             # Two functions of one function, for the first two noises.
-            G = jnp.sum(p * q + q**2 / 2)
-            both = args["commuting"] * jnp.stack([G / 2, jnp.sin(G)])
+            G = jnp.sum(p**2 / 2 + jnp.cos(q) + p * q / 2)
+            both = args["commuting"] * jnp.stack([0.4 * jnp.sin(G), 0.3 * G])
             return noise * (own + jnp.zeros_like(own).at[:2].set(both[: len(own)]))
 
         H0 = lambda t, p, q, args: drift * self.H0(t, p, q, args)

@@ -195,7 +195,7 @@ def test_the_order_without_noise_is_that_of_the_coefficients(solver):
 
 # Kinds of noises, and whether they commute.
 KINDS = {"one": True, "commuting": True, "others": False}
-_WEAK_STEPS = jnp.array([0.04, 0.02, 0.01, 0.005])
+_WEAK_STEPS = jnp.array([0.01, 0.005, 0.0025])
 
 
 def _kinds(structure: str) -> dict[str, bool]:
@@ -204,12 +204,12 @@ def _kinds(structure: str) -> dict[str, bool]:
 
 @ft.cache
 def _weak_systems(structure: str):
-    """Four systems of each kind, with two noises; and the means of exact steps, but for
+    """Two systems of each kind, with two noises; and the means of exact steps, but for
     terms beyond the third or fourth order of the step."""
     order = 3 if structure == "constant" else 2
     system = SYSTEMS[structure]
-    draw = lambda kind, key: system.draw(key, 1, 2, jnp.float64, kind)
-    keys = jr.split(jr.key(4), 4)
+    draw = lambda kind, key: system.draw(key, 1, 2, jnp.float64, kind, strength=2.0)
+    keys = jr.split(jr.key(4), 2)
     drawn = [jax.vmap(ft.partial(draw, kind))(keys) for kind in _kinds(structure)]
     y0, args = jax.tree.map(lambda *x: jnp.concatenate(x), *drawn)
     terms = system.terms(ds.WeakBrownianPath((2,), jr.key(0)), commuting=True)
@@ -225,7 +225,8 @@ def _weak_systems(structure: str):
     return y0, args, jax.jit(over)(_WEAK_STEPS, y0, args)
 
 
-@each(TABLE)
+# The outcomes of Lévy areas cannot be enumerated.
+@each([solver for solver in TABLE if "A" not in solver.variables])
 def test_local_weak_order(solver):
     y0, args, exact = _weak_systems(solver.structure)
     path = solver.path((2,), jr.key(0), want="expectations")
@@ -239,9 +240,12 @@ def test_local_weak_order(solver):
     over = jax.vmap(jax.vmap(mean, (0, None, None)), (None, 0, 0))
     defects = np.asarray(jax.jit(over)(_WEAK_STEPS, y0, args) - exact)
     for i, (kind, commute) in enumerate(_kinds(solver.structure).items()):
-        sizes = np.linalg.norm(defects[4 * i : 4 * i + 4], axis=(0, 2))
+        sizes = np.linalg.norm(defects[2 * i : 2 * i + 2], axis=(0, 2))
         order = slope(_WEAK_STEPS, sizes) - 1
-        assert abs(order - solver.record.weak_order(commute)) <= 0.15, (kind, order)
+        claim = solver.record.weak_order(commute)
+        # Where a lower order is claimed for noises that do not commute, it is seen.
+        most = 0.5 if not commute and isinstance(solver.record.weak, tuple) else 0.15
+        assert claim - 0.15 <= order <= claim + most, (kind, order)
         if kind != "one":
             # A solver does not know whether noises commute.
             assert solver.weak_order(terms) == solver.record.weak_order(False)
@@ -249,14 +253,17 @@ def test_local_weak_order(solver):
     assert solver.weak_order(one) == solver.record.weak_order(True)
 
 
-_STRONG_STEPS = np.array([8, 16, 32, 64])
+_STRONG_STEPS = np.array([16, 32, 64])
 
 
 @each([*filter(lambda s: s.record.strong is not None, DEFAULTS), ds.SRKs4(0.3, -0.7)])
 def test_strong_order(solver):
-    system, m, fine = SYSTEMS[solver.structure], 2, 2**9
-    # Cells of the areas cost as many compositions for every step.
-    draw = lambda kind: system.draw(jr.key(11), 1, m, jnp.float64, kind, strength=1.5)
+    system, m, fine = (
+        SYSTEMS[solver.structure],
+        2,
+        2**8 if "L" in solver.variables else 2**9,
+    )
+    draw = lambda kind: system.draw(jr.key(11), 1, m, jnp.float64, kind)
     drawn = [draw(kind) for kind in _kinds(solver.structure)]
     y0, args = jax.tree.map(lambda *x: jnp.stack(x), *drawn)
 
@@ -276,7 +283,7 @@ def test_strong_order(solver):
 
     over = jax.vmap(end, (0, None, None, None))
     over = jax.jit(jax.vmap(over, (None, 0, 0, None)))
-    keys = jr.split(jr.key(0), 100)
+    keys = jr.split(jr.key(0), 60)
     *coarse, exact = (over(keys, y0, args, n) for n in (*_STRONG_STEPS, fine))
     squares = np.sum((np.stack(coarse) - exact) ** 2, axis=-1)
     errors = np.sqrt(np.mean(squares, axis=-1)).T

@@ -12,8 +12,6 @@ from diffrax_symplectic._brownian import increment_struct
 from diffrax_symplectic._suggest import _shape_code, ranked, SOLVERS, with_paths
 from diffrax_symplectic._terms import brownian_paths
 
-from .problems import H0, local_weak_orders, random_problem, weak_path
-
 
 # Pieces of Hamiltonians, by what they allow the whole to be.
 KINETIC = [
@@ -237,19 +235,6 @@ def test_terms_that_share_a_path_share_the_new_one():
 
 def _is_key(x) -> bool:
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-
-
-def test_strang_gauss_is_weak_order_two_for_noises_that_commute():
-    G = lambda p, q: jnp.sum(p * q + q**2 / 2)
-    noise = lambda t, p, q, args: jnp.stack([0.5 * G(p, q), jnp.sin(G(p, q))])
-    solver = ds.StrangGauss()
-    terms = ds.hamiltonian_terms(H0, noise, weak_path(2))
-    y0, args = jax.vmap(lambda key: random_problem(key, 1, 2))(
-        jr.split(jr.key(1), 24)[2:4]
-    )
-    hs = np.array([0.02, 0.01, 0.005, 0.0025])
-    slopes = local_weak_orders(terms, solver, y0, args, hs, order=2)
-    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 
 
 def test_bad_input_gets_a_clear_error():
