@@ -213,8 +213,8 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     $\mathbb E[x^2]$ at $t = 1$ is about half as large.
 
     Symplectic for any Hamiltonians, and conserves every quadratic invariant. Weak order
-    2 for one noise; weak order 1 for several, for which $B^3 = B^1$ keeps it symplectic.
-    Order 2 without noise.
+    2 for one noise and for noises that commute; weak order 1 for others. $B^3 = B^1$ keeps
+    it symplectic for several. Order 2 without noise.
 
     Use with [`diffrax_symplectic.WeakBrownianPath`][].
 
