@@ -21,7 +21,7 @@ from ._stepwise import (
     stepwise as stepwise,
 )
 from ._truncated import TruncatedBrownianPath as TruncatedBrownianPath
-from ._variables import VARIABLES as VARIABLES
+from ._variables import path_of as path_of, VARIABLES as VARIABLES
 from ._weak import (
     WeakBrownianPath as WeakBrownianPath,
     WeakIncrement as WeakIncrement,
