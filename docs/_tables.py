@@ -99,20 +99,14 @@ def _suggested(want: Want) -> str:
     of = lambda commute: ranked(want, structures, commute, 2)
     found = {type(s): s for commute in (True, False) for s in of(commute)}
     order = {"expectations": "weak order", "paths": "strong order"}[want]
-    path = "its `path(shape, key)`"
-    columns = ("solver", "structure", "noises", order, "when to choose it", path)
-    rows = [
-        [
-            f"`{type(s).__name__}`",
-            _STRUCTURES[s.structure],
-            _NOISES[s.record.noises],
-            _order(s.record.weak if want == "expectations" else s.record.strong),
-            s.record.choose,
-            f"`{_path(s, want)}`",
-        ]
-        for s in found.values()
-    ]
-    return _rows(columns, rows)
+    columns = ("structure", "chosen for noises", order, "when to choose it")
+    rows = []
+    for solver in found.values():
+        facts = _facts(solver)
+        path = f"`{_path(solver, want)}`"
+        name = f"`{type(solver).__name__}`"
+        rows.append([name, *(facts[column] for column in columns), path])
+    return _rows(["solver", *columns, "its `path(shape, key)`"], rows)
 
 
 def _path(solver: AbstractSymplecticSolver, want: Want) -> str:

@@ -148,6 +148,10 @@ def constant_noise(t, p, q, args):
     return -args["sigma"] @ q + args["gamma"] @ p
 
 
+def constant_forces(t, p, q, args):
+    return -args["sigma"] @ q
+
+
 def moving_noise(t, p, q, args):
     sigma, gamma = args["sigma"], args["gamma"]
     return -jnp.cos(2 * t) * (sigma @ q) + jnp.exp(-t) * (gamma @ p)
@@ -161,11 +165,18 @@ def additive_problem(key, d, m, dtype=jnp.float64):
     return y0, {"drift": args["drift"], "sigma": sigma, "gamma": gamma}
 
 
+def constant_problem(key, d, m, dtype=jnp.float64):
+    y0, args = separable_problem(key, d, m, dtype)
+    sigma = 0.5 * jr.normal(jr.fold_in(key, 1), (m, d), dtype)
+    return y0, {"drift": args["drift"], "sigma": sigma}
+
+
 SYSTEMS = {
     "any": System(H0, noise, random_problem),
     "separable": System(separable_H0, separable_noise, separable_problem),
     "additive": System(H0, moving_noise, additive_problem),
     "constant": System(H0, constant_noise, additive_problem),
+    "separable and constant": System(separable_H0, constant_forces, constant_problem),
 }
 
 
