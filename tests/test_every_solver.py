@@ -392,7 +392,10 @@ STRONG = [
 def test_strong_order(solver):
     for kind, (order, bar) in strong_orders(solver).items():
         claim = solver.record.strong_order(KINDS[kind])
-        assert claim - 0.1 - 3 * bar <= order <= claim + 0.2 + 3 * bar, (kind, order)
+        # Terms of higher order are still seen. Where noises that do not commute have a
+        # lower order, it is told from that of the others.
+        most = 0.2 if claim < 1 else 0.3
+        assert claim - 0.1 - 3 * bar <= order <= claim + most + 3 * bar, (kind, order)
 
 
 @each(TABLE)
@@ -445,7 +448,7 @@ def test_a_path_without_what_a_step_needs_is_refused_with_advice(solver):
     assert VARIABLES[held[0]].name in str(info.value) or name == "NinomiyaVictoir"
 
 
-@each([s for s in [*DEFAULTS, *SPLIT] if s.structure != "any"])
+@each([s for s in [*DEFAULTS, ds.BAOAB(GAMMA)] if s.structure != "any"])
 def test_systems_of_another_structure_are_refused(solver):
     y0, args = SYSTEMS["any"].draw(jr.key(0), 1, 2, jnp.float64)
     terms = SYSTEMS["any"].terms(ds.WeakBrownianPath((2,), jr.key(0)))

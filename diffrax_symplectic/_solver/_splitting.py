@@ -23,6 +23,8 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
     # The orders of the splitting. The solver may have lower ones.
     weak: ClassVar[int] = 2
     strong: ClassVar[int] = 1
+    # What to do with solvers of other packages.
+    advice: ClassVar[str] = ""
 
     @abc.abstractmethod
     def prepare(
@@ -45,9 +47,6 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
                 f"`{name}` wraps a solver of this package, such as `StormerVerlet()`; got "
                 f"`{type(self.solver).__name__}`. {self.advice}".rstrip()
             )
-
-    # What to do with solvers of other packages.
-    advice: ClassVar[str] = ""
 
     @property
     def record(self) -> Record | None:  # pyright: ignore
