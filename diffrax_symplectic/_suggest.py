@@ -242,10 +242,7 @@ def suggest_solver(
     beside = "" if gamma is None else " and friction"
     system = f"For {want}. The system is {kind}, with {noises}{beside}."
     if not_separable is not None and not_separable.advice.startswith(FRICTION):
-        system += (
-            f" {FRICTION} Ask for a solver for the terms without friction, and pass "
-        )
-        system += "`gamma=`."
+        system += f" {FRICTION} Ask for a solver for the terms without it, with `gamma=`."
     return Suggestions(system, tuple(found))
 
 
