@@ -1,3 +1,29 @@
+"""Stochastic symplectic Runge-Kutta methods for Diffrax.
+
+The state is a pair `(p, q)`, momenta first. Begin like this:
+
+    import diffrax
+    import diffrax_symplectic as ds
+    import jax.numpy as jnp
+    import jax.random as jr
+
+    H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
+    noise = lambda t, p, q, args: 0.1 * jnp.sin(q)
+    path = ds.WeakBrownianPath((), jr.key(0))
+    terms = ds.hamiltonian_terms(H0, noise, path)
+    y0 = (jnp.array(0.0), jnp.array(1.0))
+    print(ds.suggest_solver(terms, 0.0, y0, want="expectations"))
+    sol = diffrax.diffeqsolve(terms, ds.StormerVerlet(), 0.0, 1.0, 0.1, y0)
+
+- Terms: `hamiltonian_terms`, `spin_terms`, `wave_terms`.
+- Which solver: `suggest_solver`, `compare_solvers`. The first to try: `ImplicitMidpoint`.
+- Its Brownian path: `solver.path(shape, key)`.
+- Means over many paths: `expectation`.
+- Friction: `BAOAB`, `Damped`. Stiff linear parts: `LinearFlow`.
+- Gradients of long solves: `ReversingAdjoint`.
+- Tests of one step: `symplecticity_defect`, `weak_order_defect`.
+"""
+
 from ._adjoint import ReversingAdjoint as ReversingAdjoint
 from ._brownian import (
     FixedStepBrownianPath as FixedStepBrownianPath,
@@ -12,7 +38,6 @@ from ._brownian import (
 from ._citation import citation as citation
 from ._compare import (
     compare_solvers as compare_solvers,
-    ComparedStep as ComparedStep,
     Comparison as Comparison,
 )
 from ._conditions import (
@@ -37,7 +62,6 @@ from ._solver import (
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
     AdditiveGauss as AdditiveGauss,
     BAOAB as BAOAB,
-    check_structure as check_structure,
     Damped as Damped,
     LevyAreaMidpoint as LevyAreaMidpoint,
     LinearFlow as LinearFlow,

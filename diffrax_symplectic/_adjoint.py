@@ -18,10 +18,9 @@ from ._custom_types import IntScalarLike, RealScalarLike, Y
 from ._own_inverse import is_own_inverse
 from ._plan import make_plan
 from ._solver import (
+    AbstractSplitting,
     AbstractSymplecticRungeKutta,
     BAOAB,
-    Damped,
-    LinearFlow,
     NinomiyaVictoir,
 )
 
@@ -154,7 +153,7 @@ def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:
     # with negated increments takes them in the reverse order.
     if isinstance(solver, NinomiyaVictoir | BAOAB):
         return True
-    if isinstance(solver, Damped | LinearFlow):
+    if isinstance(solver, AbstractSplitting):
         return _undoes_its_steps(solver.solver)
     if not isinstance(solver, AbstractSymplecticRungeKutta):
         return False

@@ -1,6 +1,7 @@
 """Speed against accuracy of solvers on one system."""
 
 import dataclasses
+import functools as ft
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -22,13 +23,12 @@ from ._brownian import (
     LevyAreaIncrement,
     PlateauBrownianPath,
     PlateauIncrement,
-    WeakBrownianPath,
 )
 from ._custom_types import Args, Y
 from ._expectation import Expectation, monte_carlo
+from ._solver import AbstractSymplecticSolver, Want
 from ._structure_checks import check_stratonovich
-from ._suggest import suggest_solver
-from ._suggestion_rules import PATHS, RULES
+from ._suggest import suggest_solver, with_paths
 
 
 # How many steps of the reference there are in the smallest step that is compared.
@@ -58,7 +58,8 @@ class Comparison:
     """What [`diffrax_symplectic.compare_solvers`][] returns. To print it gives a table.
 
     - `kind`: `"strong"` or `"weak"`.
-    - `steps`: one [`diffrax_symplectic.ComparedStep`][] for each solver and step size.
+    - `steps`: one for each solver and step size, with `solver`, `dt`, `error` and its
+        `std_error`, `seconds` for each path, and `num_failed`.
     - `refused`: the solvers that do not fit the terms, each with the reason.
     """
 
@@ -118,24 +119,23 @@ class Comparison:
 
 
 def compare_solvers(
-    make_terms: Callable[[Any], diffrax.AbstractTerm],
-    y0: Y,
+    terms: diffrax.AbstractTerm,
+    solvers: Sequence[diffrax.AbstractSolver] | None,
     t0: float,
     t1: float,
-    *,
-    dts: Sequence[float],
-    key: PRNGKeyArray,
-    shape: Any = (),
-    solvers: Sequence[diffrax.AbstractSolver] | None = None,
-    phi: Callable[[Y], Array] | None = None,
+    dt0: Sequence[float],
+    y0: Y,
     args: Args = None,
+    *,
+    key: PRNGKeyArray,
+    phi: Callable[[Y], Array] | None = None,
     num_paths: int = 1000,
     reference: diffrax.AbstractSolver | None = None,
 ) -> Comparison:
     r"""Measures speed against accuracy on a system of your own.
 
     Without `phi` errors are strong: root mean squares of $|y - y^*|$ at `t1`, with $y^*$
-    a solution along the same Brownian path in steps an eighth of the smallest of `dts`.
+    a solution along the same Brownian path in steps an eighth of the smallest of `dt0`.
     With `phi` they are weak: $|\mathbb E \phi(y) - \mathbb E \phi(y^*)|$ at `t1`, by
     independent paths; their standard errors fall as one over the root of `num_paths`.
 
@@ -151,29 +151,23 @@ def compare_solvers(
 
         H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
         noise = lambda t, p, q, args: 0.1 * jnp.sin(q)
-        make_terms = lambda path: ds.hamiltonian_terms(H0, noise, path)
+        terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
         y0 = (jnp.array(0.0), jnp.array(1.0))
+        solvers = [ds.StormerVerlet(), ds.ImplicitMidpoint()]
         print(
-            ds.compare_solvers(
-                make_terms,
-                y0,
-                0.0,
-                1.0,
-                dts=[0.25, 0.125],
-                solvers=[ds.StormerVerlet(), ds.ImplicitMidpoint()],
-                key=jr.key(0),
-            )
+            ds.compare_solvers(terms, solvers, 0.0, 1.0, [0.25, 0.125], y0, key=jr.key(1))
         )
         ```
 
     **Arguments:**
 
-    - `make_terms`: takes a Brownian path to the terms.
-    - `y0`, `t0`, `t1`, `args`: as for `diffrax.diffeqsolve`, with numbers for the times.
-    - `dts`: the step sizes; each divides the interval, and is a multiple of the smallest.
+    - `terms`: the terms, with any Brownian path. Each solver gets the path that it needs
+        in its place.
+    - `solvers`: a list of solvers, or `None` for those that `suggest_solver` names.
+    - `t0`, `t1`, `y0`, `args`: as for `diffrax.diffeqsolve`, with numbers for the times.
+    - `dt0`: a list of step sizes; each divides the interval, and is a multiple of the
+        smallest.
     - `key`: a JAX random key.
-    - `shape`: the shape of the Brownian paths, as `(m,)` for `m` noises.
-    - `solvers`: by default those that `suggest_solver` names.
     - `phi`: takes a state to a number.
     - `num_paths`: how many paths.
     - `reference`: the solver of $y^*$; by default the first that `suggest_solver` names.
@@ -184,11 +178,9 @@ def compare_solvers(
     **Raises:** a `ValueError` if a step size does not divide the interval or is no multiple
     of the smallest, if `phi` does not return one number, and for what is no solver.
     """
-    check_takes("make_terms", make_terms, "path")
-    dts = _checked_steps(t0, t1, dts)
+    dts = _checked_steps(t0, t1, dt0)
     want = "paths" if phi is None else "expectations"
-    terms = make_terms(WeakBrownianPath(shape, key))
-    suggestions = suggest_solver(terms, y0, args, want=want, t0=t0)
+    suggestions = suggest_solver(terms, t0, y0, args, want=want)
     reference = suggestions[0].solver if reference is None else reference
     if solvers is None:
         solvers = [s.solver for s in suggestions]
@@ -197,14 +189,20 @@ def compare_solvers(
         _check_scalar(phi, y0)
     cell = min(dts) / _FINER
 
-    def end(solver, path, dt):
-        return _end(make_terms(path), solver, t0, t1, dt, y0, args)
+    def end(solver, make_path, key, dt):
+        return _end(with_paths(make_path, terms, key), solver, t0, t1, dt, y0, args)
 
     def sample(solver, dt, key):
-        y1, result = end(solver, _path(solver, shape, key, want), dt)
+        y1, result = end(solver, ft.partial(_path, solver, want), key, dt)
         return (y1 if phi is None else phi(y1)), result
 
-    named, refused = _those_that_fit(solvers, lambda s: sample(s, dts[0], key))
+    def trial(solver):
+        if phi is not None:
+            return sample(solver, dts[0], key)
+        # Errors are those along one Brownian motion, which not all solvers can follow.
+        return end(solver, ft.partial(_common_path, solver, cell), key, dts[0])
+
+    named, refused = _those_that_fit(solvers, trial)
 
     def measure(solver, dt, number: int):
         """The estimate by the paths of a number, and the seconds for each."""
@@ -215,7 +213,7 @@ def compare_solvers(
 
     strong, fine = {}, None
     if phi is None:
-        strong = _strong_errors(end, named, reference, shape, dts, cell, key, num_paths)
+        strong = _strong_errors(end, named, reference, dts, cell, key, num_paths)
     else:
         fine, _ = measure(reference, cell, 0)
     steps = []
@@ -269,38 +267,36 @@ def _checked_steps(t0, t1, dts: Sequence[float]) -> list[float]:
     if not t1 > t0:
         raise ValueError(f"`t1` must be after `t0`; got t0={t0!r} and t1={t1!r}.")
     if np.ndim(dts) != 1:
-        raise ValueError(f"`dts` must be a list of step sizes; got {dts!r}.")
+        raise ValueError(f"`dt0` must be a list of step sizes; got {dts!r}.")
     whole = lambda x: math.isfinite(x) and x > 0.5 and abs(x - round(x)) < 1e-6
     for dt in dts:
         if not dt or not whole((t1 - t0) / dt) or not whole(dt / min(dts)):
             raise ValueError(
-                f"Every step in `dts` must divide the interval from {t0} to {t1} and be a "
+                f"Every step in `dt0` must divide the interval from {t0} to {t1} and be a "
                 f"multiple of the smallest; got {dt}. Take for example "
                 "`[(t1 - t0) / 2**k for k in range(3, 8)]`."
             )
     if len(dts) == 0:
-        raise ValueError("`dts` must hold at least one step size.")
+        raise ValueError("`dt0` must hold at least one step size.")
     return [float(dt) for dt in dts]
 
 
-def _path(solver, shape, key, want: str) -> diffrax.AbstractBrownianPath:
+def _path(solver, want: Want, shape, key) -> diffrax.AbstractBrownianPath:
     """A path for `solver`, which samples each step by itself."""
-    for rule in RULES:
-        if type(solver) is rule.solver and rule.want == want:
-            return PATHS[rule.path].make(shape, key)
-    return _common_path(solver, shape, key, None)
+    if isinstance(solver, AbstractSymplecticSolver):
+        return solver.path(shape, key, want=want)
+    return _common_path(solver, None, shape, key)
 
 
-def _common_path(solver, shape, key, cell) -> diffrax.AbstractBrownianPath:
+def _common_path(solver, cell, shape, key) -> diffrax.AbstractBrownianPath:
     """The same Brownian motion for all solvers."""
     area = diffrax.SpaceTimeLevyArea
     path = FixedStepBrownianPath(shape, key, levy_area=area, cell=cell)
     needs = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
     if needs is PlateauIncrement:
-        return PlateauBrownianPath(path, jr.fold_in(key, 1))
+        return PlateauBrownianPath(path, key)
     if needs is LevyAreaIncrement:
-        terms = 0 if cell else 2
-        return LevyAreaBrownianPath(path, jr.fold_in(key, 1), terms=terms, cell=cell)
+        return LevyAreaBrownianPath(path, key, terms=0 if cell else 2, cell=cell)
     return path
 
 
@@ -311,15 +307,18 @@ def _weak_error(estimate: Expectation, fine: Expectation) -> tuple[float, float,
     return error, bar, estimate.num_failed
 
 
-def _strong_errors(end, named, reference, shape, dts, cell, key, num_paths) -> dict:
+def _strong_errors(end, named, reference, dts, cell, key, num_paths) -> dict:
     """Error, standard error and failed paths for each solver and step size."""
     steps = jnp.asarray(dts)
 
     def squares(key):
-        exact, solved = end(reference, _common_path(reference, shape, key, cell), cell)
+        along = lambda solver, dt: end(
+            solver, ft.partial(_common_path, solver, cell), key, dt
+        )
+        exact, solved = along(reference, cell)
 
         def at(solver, dt):
-            y1, result = end(solver, _common_path(solver, shape, key, cell), dt)
+            y1, result = along(solver, dt)
             squared = jtu.tree_map(lambda a, b: jnp.sum((a - b) ** 2), y1, exact)
             okay = diffrax.is_okay(result) & diffrax.is_okay(solved)
             total = jnp.where(okay, sum(jtu.tree_leaves(squared)), 0.0)

@@ -2,7 +2,9 @@
 
 import dataclasses
 import functools as ft
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +13,7 @@ from ._brownian import VARIABLES
 from ._tableau import (
     AbstractTableau,
     AdditiveTableau,
+    FlatTableau,
     GeneralTableau,
     PartitionedTableau,
     SeparableTableau,
@@ -102,6 +105,58 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
     general tableaus; [Rößler (2010)](https://doi.org/10.1137/09076636X) for the others.
     """
     return {name: float(value) for name, value in _strong(tableau).items()}
+
+
+# A rooted tree, by its subtrees at the root.
+_Tree: TypeAlias = tuple["_Tree", ...]
+# No tableau here has a higher order. One of a user's own that does gets this one.
+_HIGHEST_DRIFT_ORDER = 6
+
+
+def drift_order(tableau: FlatTableau) -> int:
+    r"""The order without noise: how many orders of Butcher's conditions hold, one for
+    each rooted tree, and for each part of the state at its root."""
+    drift = [i for i, s in enumerate(tableau.stages) if s.channels == ("h",)]
+    flat = tableau.take(drift)
+    matrix = np.where(flat.reads, flat.matrix, 0.0)
+    writes = np.array([s.writes for s in flat.stages])
+
+    def elementary(tree: _Tree) -> np.ndarray:
+        each = [matrix @ elementary(branch) for branch in tree]
+        return np.prod([np.ones(len(writes)), *each], axis=0)
+
+    for order in range(1, _HIGHEST_DRIFT_ORDER + 1):
+        for tree in _trees(order):
+            _, density = _size_and_density(tree)
+            for part in set(writes):
+                sum_at_root = (
+                    flat.weights[writes == part] @ elementary(tree)[writes == part]
+                )
+                if abs(sum_at_root - 1 / density) > 1e-12:
+                    return order - 1
+    return _HIGHEST_DRIFT_ORDER
+
+
+@ft.cache
+def _trees(size: int) -> frozenset[_Tree]:
+    if size == 1:
+        return frozenset([()])
+    return frozenset(
+        bigger for tree in _trees(size - 1) for bigger in _with_a_leaf(tree)
+    )
+
+
+def _with_a_leaf(tree: _Tree) -> Iterator[_Tree]:
+    yield ((), *tree)
+    for i, branch in enumerate(tree):
+        for bigger in _with_a_leaf(branch):
+            yield tuple(sorted([*tree[:i], bigger, *tree[i + 1 :]]))
+
+
+def _size_and_density(tree: _Tree) -> tuple[int, int]:
+    branches = [_size_and_density(branch) for branch in tree]
+    size = 1 + sum(size for size, _ in branches)
+    return size, size * math.prod(density for _, density in branches)
 
 
 @ft.singledispatch

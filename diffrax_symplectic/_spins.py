@@ -50,9 +50,8 @@ def spin_terms(
     spin is a quadratic invariant of them. A symplectic Runge--Kutta method with the same
     coefficients for $p$ and $q$ keeps it, and is a Poisson map of $s$.
 
-    All solvers for general systems are such methods: `ImplicitMidpoint`, `SRKs1`, `SRKw1`,
-    `SRKw2`, `StrangGauss`, `NinomiyaVictoir` and `LevyAreaMidpoint`. Their orders are
-    those for canonical systems. The others refuse these terms.
+    All solvers for any Stratonovich system are such methods. Their orders are those for
+    canonical systems. The others refuse these terms.
 
     **Damping.** With `damping=alpha` the drift has one more part,
 

@@ -1,7 +1,7 @@
 """Whether a system has the structure that a family of methods relies on: decided by the
 flow of data through the vector fields, or by what the user asserts."""
 
-from typing import NamedTuple
+from typing import get_args, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -15,6 +15,7 @@ from ._compat import ω
 from ._custom_types import Args, RealScalarLike, Y
 from ._data_flow import DataFlow
 from ._hamiltonian import asserted_structure, check_pair, is_hamiltonian, pair_fault
+from ._tableau import Structure
 from ._terms import apply, split_terms
 
 
@@ -23,6 +24,29 @@ class Fault(NamedTuple):
 
     reason: str
     advice: str
+
+
+def check_structure(
+    structure: Structure,
+    drift: tuple,
+    noise: tuple,
+    t0: RealScalarLike,
+    y0: Y,
+    args: Args,
+    solver: str,
+) -> None:
+    """Raises a `ValueError`, while tracing, unless a system has the structure that a solver
+    is for."""
+    if structure not in get_args(Structure):
+        raise ValueError(
+            f"`structure` of the tableau of `{solver}` must be one of "
+            f"{get_args(Structure)}; got {structure!r}."
+        )
+    if structure in ("separable", "separable and constant"):
+        check_separable(drift, noise, t0, y0, args, solver)
+    if structure in ("additive", "constant", "separable and constant"):
+        constant = structure != "additive"
+        check_additive(noise, t0, y0, args, solver, constant)
 
 
 def check_separable(

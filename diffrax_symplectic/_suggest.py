@@ -1,9 +1,10 @@
 """Which solvers fit a system, best first."""
 
 import dataclasses
+import functools as ft
 import textwrap
-from collections.abc import Callable, Sequence
-from typing import Any, get_args
+from collections.abc import Callable, Collection, Sequence
+from typing import get_args
 
 import diffrax
 import equinox as eqx
@@ -11,10 +12,34 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-from jaxtyping import PRNGKeyArray, PyTree
+from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
-from ._brownian import increment_struct, WeakBrownianPath
+from ._brownian import increment_struct
 from ._custom_types import Args, RealScalarLike, Y
+from ._solver import (
+    AbstractSymplecticSolver,
+    AdditiveGauss,
+    BAOAB,
+    Damped,
+    ImplicitMidpoint,
+    LevyAreaMidpoint,
+    NinomiyaVictoir,
+    PlateauGauss,
+    PlateauVerlet,
+    Record,
+    SRKs1,
+    SRKs2,
+    SRKs3,
+    SRKs4,
+    SRKw1,
+    SRKw2,
+    SRKw3,
+    SRKw4,
+    SRKw5,
+    StormerVerlet,
+    StrangGauss,
+    Want,
+)
 from ._structure_checks import (
     additive_fault,
     commuting,
@@ -22,7 +47,7 @@ from ._structure_checks import (
     FRICTION,
     separable_fault,
 )
-from ._suggestion_rules import PATHS, Rule, RULES, Want
+from ._tableau import Structure
 from ._terms import (
     apply,
     brownian_paths,
@@ -33,6 +58,31 @@ from ._terms import (
 )
 
 
+# All solvers without friction, in the order of the documentation.
+SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
+    ImplicitMidpoint,
+    SRKs1,
+    SRKw1,
+    SRKw2,
+    StrangGauss,
+    NinomiyaVictoir,
+    PlateauGauss,
+    LevyAreaMidpoint,
+    SRKs2,
+    SRKs3,
+    SRKw3,
+    SRKw4,
+    StormerVerlet,
+    PlateauVerlet,
+    SRKs4,
+    SRKw5,
+    AdditiveGauss,
+)
+# What a higher order may cost. In steps of a twentieth, and with constants of one size, a
+# step of order 2 is worth twenty steps of order 1.
+_MOST_STAGE_VECTORS = 20
+
+
 @dataclasses.dataclass(frozen=True)
 class Suggestion:
     """One solver for a system, as [`diffrax_symplectic.suggest_solver`][] finds it.
@@ -41,12 +91,12 @@ class Suggestion:
     - `weak_order`, `strong_order`: its orders for this system; the strong one is `None`
         for a solver for expectations alone.
     - `path`: the Brownian path that it needs, as code.
-    - `reason`: why, in a sentence.
+    - `reason`: when to choose it, in a sentence.
     - `terms`: a function of a random key, which returns the terms of the system with such
         paths in place of theirs.
     """
 
-    solver: diffrax.AbstractSolver
+    solver: AbstractSymplecticSolver
     weak_order: int
     strong_order: float | None
     path: str
@@ -78,8 +128,7 @@ class Suggestions(Sequence[Suggestion]):
         for number, s in enumerate(self, start=1):
             strong = "" if s.strong_order is None else f", strong {s.strong_order:g}"
             orders = f"weak order {s.weak_order:g}{strong}"
-            name = f"{type(s.solver).__name__}()"
-            lines.append(f"{number}. {name:20} {orders}")
+            lines.append(f"{number}. {_code(s.solver):20} {orders}")
             lines.append(f"   path: {s.path}")
             lines += textwrap.wrap(
                 s.reason, 88, initial_indent="   ", subsequent_indent="   "
@@ -91,13 +140,16 @@ class Suggestions(Sequence[Suggestion]):
 
 def suggest_solver(
     terms: diffrax.AbstractTerm,
+    t0: RealScalarLike,
     y0: Y,
     args: Args = None,
     *,
-    want: Want = "expectations",
-    t0: RealScalarLike = 0.0,
+    want: Want,
+    gamma: PyTree[ArrayLike] | None = None,
 ) -> Suggestions:
-    r"""Suggests solvers for a system, best first, by the structure of its terms.
+    r"""Suggests solvers for a system, best first, by the structure of its terms: those
+    of the highest order first, and among these the one with the fewest stage vectors to
+    solve for.
 
     Whether $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, and whether the noise is additive
     or constant, is found out as the solvers do it for themselves, from the flow of data
@@ -118,7 +170,7 @@ def suggest_solver(
         noise = lambda t, p, q, args: 0.1 * jnp.sin(q)
         terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
         y0 = (jnp.array(0.0), jnp.array(1.0))
-        suggestions = ds.suggest_solver(terms, y0)
+        suggestions = ds.suggest_solver(terms, 0.0, y0, want="expectations")
         print(suggestions)
         best = suggestions[0]
         sol = diffrax.diffeqsolve(
@@ -130,17 +182,20 @@ def suggest_solver(
 
     - `terms`: the terms of a Stratonovich system, as of
         [`diffrax_symplectic.hamiltonian_terms`][], with any Brownian path.
-    - `y0`, `args`: the state and the arguments of the solve.
+    - `t0`, `y0`, `args`: where the solve begins, as for `diffrax.diffeqsolve`.
     - `want`: `"expectations"`, if means over all paths matter, or `"paths"`, if single
         ones do.
-    - `t0`: where the solve begins.
+    - `gamma`: friction, $-\gamma p\,\mathrm{d}t$ beside these terms, as
+        [`diffrax_symplectic.Damped`][] takes it. Then solvers with this friction are
+        suggested: [`diffrax_symplectic.BAOAB`][] for Langevin dynamics.
 
     **Returns:** a sequence of suggestions, each with `solver`, `weak_order`,
     `strong_order`, `path`, `reason`, and `terms(key)`, the terms with the path that the
     solver needs.
 
     **Raises:** a `ValueError` if `want` is neither of the two, if `terms` has no Brownian
-    path, and for terms and states that no solver takes.
+    path, for terms and states that no solver takes, and for a `gamma` that is no friction
+    of their momenta.
     """
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
@@ -152,44 +207,44 @@ def suggest_solver(
         lambda: [x.contr(t0, t0) for x in (*drift, *noise)]
     )
     eqx.filter_eval_shape(apply, (*drift, *noise), controls, args, t0, y0)
+    if gamma is not None:
+        Damped(ImplicitMidpoint(), gamma).init(terms, t0, t0 + 1, y0, args)
 
     not_separable = separable_fault(drift, noise, t0, y0, args)
     not_additive = additive_fault(noise, t0, y0, args)
-    has = {
+    has: dict[Structure, bool] = {
         "any": True,
         "separable": not_separable is None,
         "additive": not_additive is None,
         "constant": not_additive is None
         and constant_fault(noise, t0, y0, args) is None,
     }
+    has["separable and constant"] = has["separable"] and has["constant"]
     m = number_of_noises(terms)
     commute = (
         m == 1 or has["separable"] or has["additive"] or commuting(noise, t0, y0, args)
     )
-    shape = increment_struct(brownian_paths(noise)[0])
-    one_array = len(noise) == 1 and jtu.all_leaves([shape])
-    found = []
-    for rule, reason in RULES.items():
-        fits = rule.want == want and has[rule.structure]
-        if rule.noises != "any":
-            fits = fits and commute == (rule.noises == "commuting")
-        if rule.path == "Lévy areas":
-            fits = fits and one_array
-        if fits:
-            found.append(_suggestion(rule, reason, terms, shape, commute))
-    structure = [name for name in has if has[name] and name != "any"]
+    fitting: list[Structure] = [name for name in has if has[name]]
+    solvers = ranked(want, fitting, commute, m, gamma)
+    if len(noise) > 1 or not jtu.all_leaves(
+        [increment_struct(brownian_paths(noise)[0])]
+    ):
+        # Lévy areas are those between the noises of one array.
+        solvers = [s for s in solvers if "A" not in s.variables]
+    found = [_suggestion(solver, want, terms, commute) for solver in solvers]
+    structure = [x for x in ("separable", "additive", "constant") if has[x]]
     kind = (
         " and ".join(structure) or f"general ({getattr(not_separable, 'reason', '')})"
     )
     noises = "one noise"
     if m > 1:
         noises = f"{m} noises that {'commute' if commute else 'do not commute'}"
-    system = f"For {want}. The system is {kind}, with {noises}."
+    beside = "" if gamma is None else " and friction"
+    system = f"For {want}. The system is {kind}, with {noises}{beside}."
     if not_separable is not None and not_separable.advice.startswith(FRICTION):
-        system += f" {FRICTION} Ask for a solver for the terms without friction."
-        if has["constant"]:
-            system += " With constant noise, if it is separable without friction, take "
-            system += "`BAOAB(gamma)`."
+        system += (
+            f" {FRICTION} Ask for a solver for the terms without it, with `gamma=`."
+        )
     return Suggestions(system, tuple(found))
 
 
@@ -209,27 +264,69 @@ def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     return drift, noise
 
 
+def ranked(
+    want: Want,
+    structures: Collection[Structure],
+    commute: bool,
+    num_noises: int,
+    gamma: PyTree[ArrayLike] | None = None,
+) -> list[AbstractSymplecticSolver]:
+    """The solvers that are suggested for systems with such structures and noises, best
+    first."""
+
+    def rank(solver: AbstractSymplecticSolver) -> tuple:
+        systems = solver.stage_vectors(num_noises)
+        # Of a separable system half of the state is solved for.
+        cost = sum(systems) / (2 if solver.structure == "separable" else 1)
+        order = _record(solver).order(want, commute)
+        assert order is not None
+        return cost > _MOST_STAGE_VECTORS, -order, cost, max(systems, default=0)
+
+    noises = ("any", "commuting" if commute else "not commuting")
+
+    def fits(solver: AbstractSymplecticSolver) -> bool:
+        record = _record(solver)
+        wanted = want in record.suggested and record.noises in noises
+        return wanted and solver.structure in structures
+
+    solvers = [solver() for solver in SOLVERS]
+    if gamma is not None:
+        solvers = [BAOAB(gamma), *(Damped(solver, gamma) for solver in solvers)]
+    return sorted(filter(fits, solvers), key=rank)
+
+
+def _record(solver: AbstractSymplecticSolver) -> Record:
+    assert solver.record is not None
+    return solver.record
+
+
+def _code(solver: AbstractSymplecticSolver, module: str = "") -> str:
+    """How the solver is constructed, for a friction called `gamma`."""
+    given = "gamma" if isinstance(solver, BAOAB) else ""
+    if isinstance(solver, Damped):
+        given = f"{_code(solver.solver, module)}, gamma"  # pyright: ignore
+    return f"{module}{type(solver).__name__}({given})"
+
+
 def _suggestion(
-    rule: Rule, reason: str, terms: diffrax.AbstractTerm, shape, commute: bool
+    solver: AbstractSymplecticSolver,
+    want: Want,
+    terms: diffrax.AbstractTerm,
+    commute: bool,
 ) -> Suggestion:
-    solver: Any = rule.solver()
-    # The orders of noises that commute are those of one noise.
-    counted = terms
-    if commute:
-        path = WeakBrownianPath((), jr.key(0))
-        counted = diffrax.ControlTerm(lambda t, y, args: y, path)
-    kind = PATHS[rule.path]
+    record = _record(solver)
+    shape = _shape_code(increment_struct(brownian_paths(terms)[0]))
     return Suggestion(
         solver=solver,
-        weak_order=solver.weak_order(counted),
-        strong_order=solver.strong_order(counted),
-        path=kind.code.format(shape=_shape_code(shape)),
-        reason=reason,
-        terms=jtu.Partial(_with_paths, kind.make, terms),
+        weak_order=record.weak_order(commute),
+        strong_order=record.strong_order(commute),
+        path=f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")',
+        reason=record.choose,
+        terms=jtu.Partial(with_paths, ft.partial(solver.path, want=want), terms),
     )
 
 
-def _with_paths(make: Callable, terms: PyTree, key: PRNGKeyArray) -> PyTree:
+def with_paths(make: Callable, terms: PyTree, key: PRNGKeyArray) -> PyTree:
     """The terms with new paths in place of theirs; terms that share a path share the new
     one."""
     made = {}

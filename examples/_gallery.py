@@ -33,9 +33,9 @@ def gaussian(m: int | None = None, area: bool = False) -> Callable:
     )
 
 
-def truncated(key) -> ds.TruncatedBrownianPath:
+def truncated(key) -> diffrax.AbstractBrownianPath:
     """One noise, with the increments that implicit strong methods are meant for."""
-    return ds.TruncatedBrownianPath(gaussian()(key), k=2)
+    return ds.ImplicitMidpoint().path((), key)
 
 
 def briefly(fn: Callable) -> Callable:

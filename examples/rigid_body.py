@@ -167,7 +167,7 @@ def local_weak_errors(hs, mu=0.5, inertia=(0.8, 0.6, 0.2)):
     r"""Of E(X1^2) after one step by NinomiyaVictoir with strong noise, exactly: the
     expectation of the step less the first terms of the exact one, $\sum_{j \le 2} h^j
     L^j \phi / j!$."""
-    path = ds.WeakBrownianPath((3,), jr.key(0), two_point=True)
+    path = ds.NinomiyaVictoir().path((3,), jr.key(0))
     terms, y0 = spinor_terms(path, mu, inertia), ds.to_spinors(X0)
 
     def expected(h):

@@ -1,6 +1,9 @@
 """Problems that several tests share."""
 
+from collections.abc import Callable
+
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -75,6 +78,106 @@ def random_problem_of_any_size(key, dtype) -> tuple[PyTree, PyTree]:
         "drift": restrict(args["drift"], True),
         "noise": restrict(args["noise"], used_m[:, None]),
     }
+
+
+class System(eqx.Module):
+    """Random systems of one structure, the parameters in `args`."""
+
+    H0: Callable = eqx.field(static=True)
+    noise: Callable = eqx.field(static=True)
+    random: Callable = eqx.field(static=True)
+
+    def draw(self, key, d: int, m: int, dtype, kind="others", strength=1.0):
+        """A state and `args`: with `"one"` noise, the others being of size zero, with two
+        that are `"commuting"`, or with any `"others"`, which are multiplied by
+        `strength`."""
+        y0, args = self.random(key, d, m, dtype)
+        sizes = jnp.ones(m, dtype)
+        if kind == "one":
+            sizes = sizes.at[1:].set(0)
+        args["sizes"] = strength * sizes
+        args["commuting"] = jnp.zeros((), dtype)
+        if kind == "commuting" and self is SYSTEMS["any"]:
+            args["sizes"], args["commuting"] = 0 * sizes, jnp.ones((), dtype)
+        return y0, args
+
+    def terms(self, path, sizes=(1.0, 1.0), commuting=False):
+        """Drift and noise, multiplied by `sizes`; with those that commute, if asked for."""
+        drift, noise = sizes
+
+        def noises(t, p, q, args):
+            own = args["sizes"] * self.noise(t, p, q, args)
+            if not commuting or self is not SYSTEMS["any"]:
+                return noise * own
+            # Two functions of one function, for the first two noises.
+            G = jnp.sum(p**2 / 2 + jnp.cos(q) + p * q / 2)
+            both = args["commuting"] * jnp.stack([0.4 * jnp.sin(G), 0.3 * G])
+            return noise * (own + jnp.zeros_like(own).at[:2].set(both[: len(own)]))
+
+        H0 = lambda t, p, q, args: drift * self.H0(t, p, q, args)
+        return ds.hamiltonian_terms(H0, noises, path)
+
+
+def _potential(t, q, a, v, phi):
+    return jnp.sum(a * jnp.cos(v @ q + phi + t), axis=-1)
+
+
+def separable_H0(t, p, q, args):
+    a, u, v, phi = args["drift"]
+    kinetic = jnp.sum(a * jnp.sin(u @ p)) + jnp.sum(p**2) / 2
+    return kinetic + _potential(t, q, a, v, phi)
+
+
+def separable_noise(t, p, q, args):
+    a, v, phi = args["noise"]
+    return jax.vmap(lambda a, v, phi: _potential(t, q, a, v, phi))(a, v, phi)
+
+
+def separable_problem(key, d, m, dtype=jnp.float64):
+    ks = jr.split(key, 8)
+    draw = lambda i, *shape: jr.normal(ks[i], shape, dtype)
+    args = {
+        "drift": (0.5 * draw(0, 4), draw(1, 4, d), draw(2, 4, d), draw(3, 4)),
+        "noise": (0.3 * draw(4, m, 4), draw(5, m, 4, d), draw(6, m, 4)),
+    }
+    p, q = jr.normal(ks[7], (2, d), dtype)
+    return (p, q), args
+
+
+def constant_noise(t, p, q, args):
+    return -args["sigma"] @ q + args["gamma"] @ p
+
+
+def constant_forces(t, p, q, args):
+    return -args["sigma"] @ q
+
+
+def moving_noise(t, p, q, args):
+    sigma, gamma = args["sigma"], args["gamma"]
+    return -jnp.cos(2 * t) * (sigma @ q) + jnp.exp(-t) * (gamma @ p)
+
+
+def additive_problem(key, d, m, dtype=jnp.float64):
+    k_drift, k_sigma, k_gamma = jr.split(key, 3)
+    y0, args = random_problem(k_drift, d, m, dtype)
+    sigma = 0.5 * jr.normal(k_sigma, (m, d), dtype)
+    gamma = 0.5 * jr.normal(k_gamma, (m, d), dtype)
+    return y0, {"drift": args["drift"], "sigma": sigma, "gamma": gamma}
+
+
+def constant_problem(key, d, m, dtype=jnp.float64):
+    y0, args = separable_problem(key, d, m, dtype)
+    sigma = 0.5 * jr.normal(jr.fold_in(key, 1), (m, d), dtype)
+    return y0, {"drift": args["drift"], "sigma": sigma}
+
+
+SYSTEMS = {
+    "any": System(H0, noise, random_problem),
+    "separable": System(separable_H0, separable_noise, separable_problem),
+    "additive": System(H0, moving_noise, additive_problem),
+    "constant": System(H0, constant_noise, additive_problem),
+    "separable and constant": System(separable_H0, constant_forces, constant_problem),
+}
 
 
 class _AnyIncrement(diffrax.AbstractSpaceTimeLevyArea, ds.WeakIncrement):

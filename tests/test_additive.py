@@ -12,7 +12,12 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._plan import Block, make_plan
 
-from .problems import FineSample, Given, H0, random_problem, slope, weak_path
+from .problems import (
+    additive_problem as _problem,
+    constant_noise as noise,
+    FineSample,
+    H0,
+)
 
 
 ADDITIVE = {
@@ -25,99 +30,11 @@ all_solvers = pytest.mark.parametrize("solver", ADDITIVE.values(), ids=ADDITIVE.
 one_of_each = pytest.mark.parametrize("solver", [ds.SRKw5(), ds.SRKs4()])
 
 
-def noise(t, p, q, args):
-    sigma, gamma = args["sigma"], args["gamma"]
-    return -sigma @ q + gamma @ p
-
-
-def moving_noise(t, p, q, args):
-    sigma, gamma = args["sigma"], args["gamma"]
-    return -jnp.cos(2 * t) * (sigma @ q) + jnp.exp(-t) * (gamma @ p)
-
-
-def _problem(key, d, m, dtype=jnp.float64):
-    k_drift, k_sigma, k_gamma = jr.split(key, 3)
-    y0, args = random_problem(k_drift, d, m, dtype)
-    sigma = 0.5 * jr.normal(k_sigma, (m, d), dtype)
-    gamma = 0.5 * jr.normal(k_gamma, (m, d), dtype)
-    return y0, {"drift": args["drift"], "sigma": sigma, "gamma": gamma}
-
-
 def test_stages_are_solved_one_after_the_other():
     blocks = make_plan(ds.SRKs4().tableau.flatten()).blocks
     assert [b.unknown for b in blocks if b.unknown] == [((0,),), ((1,),)]
     assert make_plan(ds.SRKw5().tableau.flatten()).num_unknown == 1
     assert Block((), ((5,),)) in blocks
-
-
-@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-6)])
-@pytest.mark.parametrize("name", ["SRKw5", "SRKs4"])
-def test_step_is_symplectic_for_a_thousand_random_systems(name, dtype, bound):
-    def defect(key):
-        k_problem, k_m, k_W, k_more, k_h = jr.split(key, 5)
-        y0, args = _problem(k_problem, 3, 3, dtype)
-        used = (jnp.arange(3) < jr.randint(k_m, (), 1, 4))[:, None]
-        args |= {"sigma": args["sigma"] * used, "gamma": args["gamma"] * used}
-        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
-        W, more = (jnp.sqrt(h) * jr.normal(k, (3,), dtype) for k in (k_W, k_more))
-        terms = ds.hamiltonian_terms(H0, noise, Given(W, H=more, second=more))
-        solver = ADDITIVE[name]
-        return ds.symplecticity_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
-
-    defects = jax.jit(jax.vmap(defect))(jr.split(jr.key(0), 1000))
-    assert defects.dtype == dtype
-    assert jnp.max(defects) <= bound
-
-
-def _functions(y):
-    p, q = y[0][0], y[1][0]
-    return jnp.stack([p, q**2, p * q, jnp.sin(p + q), jnp.exp(p / 2)])
-
-
-def _weak_slopes(solver, m, path, noise):
-    y0, args = jax.vmap(lambda key: _problem(key, 1, m))(jr.split(jr.key(0), 3))
-    terms = ds.hamiltonian_terms(H0, noise, path)
-    hs = np.array([0.02, 0.01, 0.005, 0.0025])
-
-    def defect(h, y0, args):
-        kwargs = dict(fn=_functions, order=2, nodes=4)
-        return ds.weak_order_defect(terms, solver, 0.1, 0.1 + h, y0, args, **kwargs)
-
-    over_steps = jax.vmap(defect, in_axes=(0, None, None))
-    defects = jax.jit(jax.vmap(over_steps, in_axes=(None, 0, 0)))(hs, y0, args)
-    return [slope(hs, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(hs))]
-
-
-@pytest.mark.parametrize("m", [1, 2])
-def test_srkw5_is_weak_order_two(m):
-    assert ds.SRKw5().weak_order(None) == 2
-    slopes = _weak_slopes(ds.SRKw5(), m, weak_path(m, second=True), noise)
-    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
-
-
-@pytest.mark.parametrize("name", ["SRKs4", "SRKs4-split"])
-def test_srks4_is_weak_order_two_too(name):
-    # Over its Gaussian variables, by quadrature.
-    gaussian = diffrax.UnsafeBrownianPath(
-        (1,), jr.key(0), levy_area=diffrax.SpaceTimeLevyArea
-    )
-    assert ds.SRKs4().weak_order(None) == 2
-    slopes = _weak_slopes(ADDITIVE[name], 1, gaussian, moving_noise)
-    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
-
-
-@pytest.mark.parametrize(
-    "name, noise",
-    [("SRKs4", noise), ("SRKs4-paper", noise), ("SRKs4", moving_noise)]
-    + [("SRKs4-split", moving_noise)],
-    ids=["default", "paper", "default-moving", "split-moving"],
-)
-def test_srks4_is_strong_order_three_halves(name, noise):
-    y0, args = _problem(jr.key(7), 1, 2)
-    terms = lambda path: ds.hamiltonian_terms(H0, noise, path)
-    errors = _strong_errors(terms, ADDITIVE[name], y0, args)
-    assert ADDITIVE[name].strong_order(None) == 1.5
-    assert slope(STEPS, errors) >= 1.45
 
 
 STEPS = np.array([2.0**-k for k in (3, 4, 5, 6)])
@@ -245,22 +162,6 @@ def test_truncated_paths_keep_their_space_time_area():
     cut = _solve(noise, ds.SRKs4(), ds.TruncatedBrownianPath(path, k=4))
     for a, b in zip(cut.ys, _solve(noise, ds.SRKs4(), path).ys):
         np.testing.assert_allclose(a, b, rtol=1e-14)
-
-
-@pytest.mark.parametrize(
-    "solver, path, advice",
-    [
-        (ds.SRKw5(), ds.WeakBrownianPath((), jr.key(0)), "second=True"),
-        (ds.SRKw5(), diffrax.UnsafeBrownianPath((), jr.key(0)), "second=True"),
-        (ds.SRKs4(), diffrax.UnsafeBrownianPath((), jr.key(0)), "SpaceTimeLevyArea"),
-        (ds.SRKs4(), ds.WeakBrownianPath((), jr.key(0)), "SpaceTimeLevyArea"),
-    ],
-    ids=["one set", "gaussian", "no area", "weak"],
-)
-def test_missing_random_variables_are_refused_with_advice(solver, path, advice):
-    with pytest.raises(ValueError, match=advice):
-        noise = lambda t, p, q, args: jnp.sum(q)
-        _solve(noise, solver, path, adjoint=diffrax.ForwardMode())
 
 
 def test_solvers_declare_the_levy_area_that_they_need():

@@ -144,7 +144,7 @@ def test_noise_that_does_not_depend_on_the_state_is_refused(solver, m):
         ):
             diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0, jnp.array(0.05))
         with pytest.raises(ValueError, match="do not depend on the state"):
-            ds.suggest_solver(terms, y0, jnp.array(0.05))
+            ds.suggest_solver(terms, 0.0, y0, jnp.array(0.05), want="expectations")
     with pytest.raises(ValueError, match="do not depend on the state"):
         diffrax.diffeqsolve(terms, ds.NinomiyaVictoir(), 0.0, 0.2, 0.1, y0)
     # What may be zero for the values of today is none of these.

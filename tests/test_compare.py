@@ -16,17 +16,17 @@ from diffrax_symplectic._compare import _strong_errors, _weak_error
 Y0 = (jnp.array(0.0), jnp.array(1.0))
 
 
-def _make_terms(path):
+def _terms():
     """The linear oscillator: additive and separable, with E(q^2) known at t = 1."""
     H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    path = ds.WeakBrownianPath((), jr.key(0))
     return ds.hamiltonian_terms(H0, lambda t, p, q, args: -q, path)
 
 
 def test_strong_errors_are_of_the_orders_of_the_solvers():
     solvers = [ds.SRKs4(), ds.StormerVerlet(), ds.SRKw5()]
     result = ds.compare_solvers(
-        _make_terms, Y0, 0.0, 1.0, dts=[0.25, 0.125], solvers=solvers, key=jr.key(0),
-        num_paths=400,
+        _terms(), solvers, 0.0, 1.0, [0.25, 0.125], Y0, key=jr.key(0), num_paths=400,
     )  # fmt: skip
     order = {}
     for name in {s.solver for s in result.steps}:
@@ -46,15 +46,15 @@ def test_strong_errors_are_of_the_orders_of_the_solvers():
 
 
 def test_strong_errors_are_means_over_the_paths_that_both_solvers_finish():
-    def end(solver, path, dt):
-        W, R = path.evaluate(0.0, 1.0), diffrax.RESULTS
+    def end(solver, make_path, key, dt):
+        W, R = make_path((), key).evaluate(0.0, 1.0), diffrax.RESULTS
         lost = W < -1 if solver == "reference" else W > 1
         result = R.where(lost, R.internal_error, R.successful)
         return jnp.where(solver == "reference", 0.0, jnp.where(W > 0, 3.0, 1.0)), result
 
     n = 4000
     ((error, bar, failed),) = _strong_errors(
-        end, dict(a="a"), "reference", (), [0.5], 0.5, jr.key(0), n
+        end, dict(a="a"), "reference", [0.5], 0.5, jr.key(0), n
     )["a"]
     # A normal variable beyond one: five standard errors.
     assert abs(failed / n - 0.3173) <= 5 * np.sqrt(0.3173 * 0.6827 / n)
@@ -75,7 +75,7 @@ def test_weak_errors_have_the_bars_of_both_means():
 
 def test_weak_error_is_within_its_bars(monkeypatch):
     result = ds.compare_solvers(
-        _make_terms, Y0, 0.0, 1.0, dts=[0.5], solvers=[ds.SRKw1()], key=jr.key(1),
+        _terms(), [ds.SRKw1()], 0.0, 1.0, [0.5], Y0, key=jr.key(1),
         phi=lambda y: y[1] ** 2, num_paths=4000,
     )  # fmt: skip
     (step,) = result.steps
@@ -96,16 +96,16 @@ def test_weak_error_is_within_its_bars(monkeypatch):
 
 @pytest.mark.parametrize("dts", [[0.3], [0.5, 1 / 3], [], [0.0], [-0.5]])
 def test_steps_that_do_not_divide_the_interval_are_refused(dts):
-    with pytest.raises(ValueError, match="`dts`"):
-        ds.compare_solvers(_make_terms, Y0, 0.0, 1.0, dts=dts, key=jr.key(0))
+    with pytest.raises(ValueError, match="`dt0`"):
+        ds.compare_solvers(_terms(), None, 0.0, 1.0, dts, Y0, key=jr.key(0))
 
 
 @pytest.mark.parametrize(
     "message, kwargs",
     [
-        ("`dts` must be a list of step sizes; got 0.5", dict(dts=0.5)),
+        ("`dt0` must be a list of step sizes; got 0.5", dict(dt0=0.5)),
         ("`t1` must be after `t0`", dict(t1=-1.0)),
-        (r"called as `make_terms\(path\)`", dict(make_terms="terms")),
+        ("with a Brownian path; got str", dict(terms="terms")),
         ("`solvers` must be a list of solvers", dict(solvers=ds.ImplicitMidpoint())),
         (r"a solver, as `ImplicitMidpoint\(\)`", dict(solvers=[ds.ImplicitMidpoint])),
         ("`reference` must be a solver", dict(reference="ImplicitMidpoint")),
@@ -117,6 +117,6 @@ def test_steps_that_do_not_divide_the_interval_are_refused(dts):
     ],
 )
 def test_bad_input_is_told_what_to_pass(message, kwargs):
-    kwargs = dict(make_terms=_make_terms, t1=1.0, dts=[0.5], key=jr.key(0)) | kwargs
+    given = dict(terms=_terms(), solvers=None, t1=1.0, dt0=[0.5], key=jr.key(0))
     with pytest.raises(ValueError, match=message):
-        ds.compare_solvers(y0=Y0, t0=0.0, **kwargs)
+        ds.compare_solvers(y0=Y0, t0=0.0, **(given | kwargs))

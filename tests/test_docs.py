@@ -1,6 +1,7 @@
 """What README and docs show works."""
 
 import csv
+import importlib
 import re
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import jax.random as jr
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._suggest import SOLVERS
 
 
 ROOT = Path(__file__).parent.parent
@@ -37,14 +39,34 @@ def test_every_page_is_looked_through():
     assert {"README.md", "docs/index.md", "docs/own_tableau.md"} <= PAGES.keys()
 
 
-def test_docs_list_every_solver():
-    table = (ROOT / "docs/solvers/index.md").read_text()
-    pages = "".join(p.read_text() for p in (ROOT / "docs/solvers").glob("*.md"))
+@pytest.fixture
+def tables(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    return importlib.import_module("_tables")
+
+
+def test_docs_list_every_solver(tables):
+    page = tables.with_tables((ROOT / "docs/solvers/index.md").read_text())
+    folder = ROOT / "docs/solvers"
+    families = "".join(
+        tables.with_tables(p.read_text()) for p in folder.glob("[!i]*.md")
+    )
     for name, value in vars(ds).items():
         if isinstance(value, type) and issubclass(value, diffrax.AbstractSolver):
-            abstract = name.startswith("Abstract")
-            assert abstract or f"| `{name}(" in table
-            assert abstract or f"::: diffrax_symplectic.{name}\n" in pages
+            if not name.startswith("Abstract"):
+                assert f"| `{name}(" in page, name
+                assert f"::: diffrax_symplectic.{name}\n" in families
+                assert value not in SOLVERS or f"| `{name}(" in families
+
+
+def test_records_say_what_the_docstrings_say():
+    # The claims of a docstring that are also in the record.
+    number = {1: "1", 1.5: "3/2", 2: "2", 3: "3", 0.5: "1/2"}
+    for solver in (*SOLVERS, ds.BAOAB):
+        record, text = solver.record, " ".join((solver.__doc__ or "").split()).lower()
+        for kind, order in (("weak", record.weak), ("strong", record.strong)):
+            for x in order if isinstance(order, tuple) else [order]:
+                assert x is None or f"{kind} order {number[x]}" in text, (solver, kind)
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/index.md"])

@@ -10,7 +10,7 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._adjoint import _undoes_its_steps
 
-from .problems import Given, slope, values_of_a_step, weak_path
+from .problems import Given, weak_path
 
 
 def lattice_waves(n, dx, mass=1.0):
@@ -71,42 +71,6 @@ def test_steps_of_stiff_lattices_are_symplectic(dtype, bound):
         assert defects.dtype == dtype
         # The Jacobian has entries up to the largest frequency.
         assert jnp.max(defects) <= 40 * bound
-
-
-@pytest.mark.parametrize(
-    "inner, noise, path",
-    [
-        (ds.StormerVerlet(), _kicks, weak_path(2)),
-        (ds.NinomiyaVictoir(), _mixed, weak_path(2, two_point=True)),
-    ],
-    ids=["StormerVerlet", "NinomiyaVictoir"],
-)
-def test_local_weak_defect_is_of_order_three(inner, noise, path):
-    omega = 1.7
-
-    def rotation(time, y, args):
-        c, s = jnp.cos(omega * time), jnp.sin(omega * time)
-        return c * y[0] - omega * s * y[1], c * y[1] + s / omega * y[0]
-
-    solver = ds.LinearFlow(inner, rotation)
-    rest = ds.hamiltonian_terms(_rest, noise, path)
-    fast = lambda t, p, q, args: jnp.sum(p**2 + omega**2 * q**2) / 2
-    whole = ds.hamiltonian_terms(lambda *a: fast(*a) + _rest(*a), noise, path)
-    y0, fn = (jnp.array([0.3]), jnp.array([0.5])), dict(fn=values_of_a_step)
-
-    # The generator is that of the whole, and the step is exchanged for that of the rest
-    # with the flow around it.
-    def defect(h):
-        step = 0.1, 0.1 + h, y0
-        other = whole, diffrax.Heun(), *step
-        exchange = ds.step_expectation(rest, solver, *step, **fn)
-        exchange = exchange - ds.step_expectation(*other, **fn)
-        return ds.weak_order_defect(*other, **fn, order=2) + exchange
-
-    hs = np.array([0.01, 0.005, 0.0025])
-    defects = jax.jit(jax.vmap(defect))(hs)
-    np.testing.assert_allclose([slope(hs, d) for d in defects.T], 3.0, atol=0.1)
-    assert solver.weak_order(rest) == 2 and solver.order(rest) == 2
 
 
 def test_linear_systems_without_a_rest_are_solved_exactly():

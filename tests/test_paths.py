@@ -58,33 +58,9 @@ def test_sampled_moments_are_within_four_standard_errors():
         assert abs(shifted.mean()) <= 4 / np.sqrt(n)
 
 
-def test_mixed_integrals_are_those_of_the_formulas():
-    for key in range(20):  # until all kinds of values have been seen
-        path = weak_path(3, jr.key(key), two_point=True)
-        inc = path.evaluate(0.0, 0.2, use_levy=True)
-        hat, tilde, sqrt_h = inc.W, inc.two_point, np.sqrt(0.2)
-        stratonovich, ito = inc.mixed_stratonovich(), inc.mixed_ito()
-        for k in range(3):
-            for j in range(3):
-                if j < k:
-                    s = hat[k] * tilde[j]
-                    i = (hat[k] * hat[j] + sqrt_h * tilde[j]) / 2
-                elif k < j:
-                    s = -hat[j] * tilde[k]
-                    i = (hat[k] * hat[j] - sqrt_h * tilde[k]) / 2
-                else:
-                    s, i = 0, (hat[k] ** 2 - 0.2) / 2
-                np.testing.assert_allclose(stratonovich[k, j], s, atol=1e-15)
-                np.testing.assert_allclose(ito[k, j], i, atol=1e-15)
-
-
-def test_mixed_integrals_need_two_point_variables():
+def test_variables_that_were_not_asked_for_are_missing():
     inc = weak_path(2).evaluate(0.0, 0.1, use_levy=True)
     assert inc.second is None and inc.two_point is None
-    with pytest.raises(ValueError, match="two_point=True"):
-        inc.mixed_ito()
-    with pytest.raises(ValueError, match="two_point=True"):
-        inc.mixed_stratonovich()
 
 
 def test_asking_for_more_does_not_change_the_increment():

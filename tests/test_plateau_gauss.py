@@ -15,12 +15,7 @@ import diffrax_symplectic as ds
 from .problems import (
     FineSample,
     Given,
-    H0,
-    local_weak_orders,
-    noise,
-    random_problem,
     rigid_body_terms,
-    slope,
     weak_path,
 )
 
@@ -35,26 +30,6 @@ def test_tableau_is_symplectic_and_of_weak_order_two_by_its_brackets():
     assert max(map(abs, ds.strong_order_residuals(tableau).values())) <= 1e-15
     without = ds.weak_order_residuals(dataclasses.replace(tableau, noise=("W",)), 2)
     assert sum(abs(r) > 0.05 for r in without.values()) == 5
-
-
-@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-6)])
-def test_step_is_symplectic_for_a_thousand_random_systems(dtype, bound):
-    def defect(key):
-        k_problem, k_m, k_h, *ks = jr.split(key, 6)
-        y0, args = random_problem(k_problem, 2, 2, dtype)
-        # One noise or two.
-        size, *phases = args["noise"]
-        used = jnp.arange(2) < jr.randint(k_m, (), 1, 3)
-        args["noise"] = (jnp.where(used[:, None], size, 0), *phases)
-        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
-        draw = lambda key, v: jnp.sqrt(v * h) * jr.normal(key, (2,), dtype)
-        W, H, K = (draw(k, v) for k, v in zip(ks, (1, 1 / 12, 1 / 720)))
-        terms = ds.hamiltonian_terms(H0, noise, Given(W, H=H, K=K))
-        return ds.symplecticity_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
-
-    defects = jax.jit(jax.vmap(defect))(jr.split(jr.key(0), 1000))
-    assert defects.dtype == dtype
-    assert jnp.max(defects) <= bound
 
 
 def _linear_terms(path, *matrices):
@@ -121,45 +96,6 @@ def _two_that_commute(t, p, q, args):
     return jnp.stack([0.4 * jnp.sin(f), 0.3 * f])
 
 
-_STEPS = np.array([2.0**-k for k in (3, 4, 5, 6)])
-
-
-@pytest.mark.parametrize("noise, m", [(_one, 1), (_two_that_commute, 2)])
-def test_strong_order_is_three_halves(noise, m):
-    """Neither is separable, and the drift depends on time, the noise in the first, too."""
-    y0, fine, samples = (jnp.array(0.3), jnp.array(0.8)), 2**9, 200
-
-    @jax.jit
-    @jax.vmap
-    def ends(key):
-        terms = ds.hamiltonian_terms(_drift, noise, FineSample.draw(key, fine, m))
-        solve = lambda h: jnp.stack(
-            diffrax.diffeqsolve(
-                terms, solver, 0.0, 1.0, h, y0, adjoint=diffrax.ForwardMode()
-            ).ys
-        )[:, -1]
-        return jax.lax.map(solve, jnp.array([*_STEPS, 1 / fine]))
-
-    ys = ends(jr.split(jr.key(0), samples))
-    squared = jnp.sum((ys[:, :-1] - ys[:, -1:]) ** 2, axis=-1)
-    measured = slope(_STEPS, np.sqrt(jnp.mean(squared, axis=0)))
-    assert abs(measured - 1.5) <= 0.1, measured
-
-
-def test_weak_order_is_two():
-    levy = diffrax.SpaceTimeLevyArea
-    path = diffrax.UnsafeBrownianPath((1,), jr.key(0), levy)
-    # In this one no leading error of a test function happens to be small.
-    y0, args = jax.vmap(lambda key: random_problem(key, 1, 1))(
-        jr.split(jr.key(0), 2)[:1]
-    )
-    terms = ds.hamiltonian_terms(H0, noise, path)
-    hs = np.array([0.02, 0.01, 0.005])
-    slopes = local_weak_orders(terms, solver, y0, args, hs, order=2, nodes=5)
-    assert solver.weak_order(terms) == 2
-    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
-
-
 def test_backward_in_time_it_undoes_its_steps():
     """The Gauss method is its own inverse, and the field of the path run backward is the
     negative of that forward."""
@@ -186,23 +122,6 @@ def test_a_shared_quadratic_invariant_is_conserved():
     kwargs = dict(adjoint=diffrax.ForwardMode())
     sol = diffrax.diffeqsolve(terms, solver, 0.0, 10.0, 0.1, X0, **kwargs)
     assert abs(jnp.linalg.norm(sol.ys[-1]) - 1) <= 1e-14
-
-
-def test_a_failed_path_of_a_batch_leaves_values_and_gradients_of_the_others():
-    H0 = lambda t, p, q, args: args * p**2 / 2 + q**4 / 4
-    given = Given(jnp.array([0.3]), H=jnp.array([0.1]))
-    terms = ds.hamiltonian_terms(H0, _one, given)
-    y0 = jnp.array(0.3), jnp.array(0.8)
-
-    def end(args):
-        y1, *_, result = solver.step(terms, 0.0, 0.125, y0, args, None, False)
-        return y1[1], result == diffrax.RESULTS.successful
-
-    args = jnp.array([1.0, 1.0 + 1e-5, jnp.inf, 1.0 - 1e-5])
-    q, success = jax.jit(jax.vmap(end))(args)
-    np.testing.assert_array_equal(success, [True, True, False, True])
-    gradient = jax.jit(jax.grad(lambda x: end(x)[0]))(args[0])
-    np.testing.assert_allclose(gradient, (q[1] - q[3]) / 2e-5, rtol=1e-7)
 
 
 def test_drift_or_noise_alone_will_do_but_not_a_path_without_area():

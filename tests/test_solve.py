@@ -18,52 +18,17 @@ import pytest
 import diffrax_symplectic as ds
 
 from .problems import (
-    FineSample,
     GENERAL,
     H0,
     kubo_terms,
     noise,
     random_problem,
     rigid_body_terms,
-    slope,
     weak_path,
 )
 
 
 all_solvers = pytest.mark.parametrize("solver", GENERAL.values(), ids=GENERAL.keys())
-
-
-def _strong_slope(solver, m, steps, reference, samples=200):
-    y0, args = random_problem(jr.key(11), 1, m)
-    fine = 2**reference
-
-    @jax.jit
-    @jax.vmap
-    def ends(key):
-        # Stronger noise than elsewhere, for its errors to lead.
-        strong = args | {"noise": (1.5 * args["noise"][0], *args["noise"][1:])}
-        terms = ds.hamiltonian_terms(H0, noise, FineSample.draw(key, fine, m))
-        solve = lambda h: jnp.concatenate(
-            diffrax.diffeqsolve(terms, solver, 0.0, 1.0, h, y0, strong).ys, axis=1
-        )[0]
-        return jax.lax.map(solve, jnp.array([*steps, 1 / fine]))
-
-    ys = ends(jr.split(jr.key(0), samples))
-    squared = jnp.sum((ys[:, :-1] - ys[:, -1:]) ** 2, axis=-1)
-    return slope(np.array(steps), np.sqrt(jnp.mean(squared, axis=0)))
-
-
-@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.SRKs1()], ids=repr)
-def test_strong_order_is_one_for_one_noise(solver):
-    steps = [2.0**-k for k in (4, 5, 6, 7)]
-    assert abs(_strong_slope(solver, 1, steps, reference=11) - 1) <= 0.1
-
-
-@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.SRKs1()], ids=repr)
-def test_strong_order_is_half_for_two_noises_that_do_not_commute(solver):
-    steps = [2.0**-k for k in (4, 5, 6, 7)]
-    # Clearly below 1 too: otherwise the noises of this test would commute.
-    assert 0.45 <= _strong_slope(solver, 2, steps, reference=11) <= 0.85
 
 
 def _drift_of_invariant(terms, solver, y0, invariant, h, steps):
@@ -102,14 +67,8 @@ _CUT = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((2,), jr.key(3)), k=1)
 
 @pytest.mark.parametrize(
     "name, path",
-    [
-        *[
-            (name, weak_path(2))
-            for name in ("ImplicitMidpoint", "SRKs1", "SRKw1", "SRKw2")
-        ],
-        ("SRKs1", _CUT),
-    ],
-    ids=["ImplicitMidpoint", "SRKs1", "SRKw1", "SRKw2", "SRKs1-cut"],
+    [("ImplicitMidpoint", weak_path(2)), ("SRKs1", _CUT)],
+    ids=["ImplicitMidpoint", "SRKs1-cut"],
 )
 def test_gradients_equal_central_differences(name, path):
     solver = GENERAL[name]
@@ -253,8 +212,8 @@ def test_failed_paths_do_not_spoil_their_neighbours(dtype):
     assert jnp.all(finite | ~success)
 
 
-@all_solvers
-def test_non_finite_hamiltonians_are_reported(solver):
+def test_non_finite_hamiltonians_are_reported():
+    solver = ds.ImplicitMidpoint()
     H0 = lambda t, p, q, args: args[0] * (q + p**2)
     noise = lambda t, p, q, args: jnp.sqrt(args[1] + q)
     terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
@@ -266,9 +225,8 @@ def test_non_finite_hamiltonians_are_reported(solver):
     args = jnp.array([[jnp.nan, 3.0], [1.0, 0.5], [1.0, 3.0]])
     success = jax.jit(jax.vmap(solve))(args).result == diffrax.RESULTS.successful
     np.testing.assert_array_equal(success, [False, False, True])
-    if isinstance(solver, ds.ImplicitMidpoint):
-        with pytest.raises(Exception, match=r"(?i)non-?finite|were not solved"):
-            jax.block_until_ready(solve(args[1], throw=True))
+    with pytest.raises(Exception, match=r"(?i)non-?finite|nonlinear solver"):
+        jax.block_until_ready(solve(args[1], throw=True))
 
 
 def test_everything_works_in_single_precision_mode():

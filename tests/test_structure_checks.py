@@ -210,4 +210,4 @@ def test_a_check_of_the_users_does_not_stop_the_advice():
     path = ds.WeakBrownianPath((2,), jr.key(0))
     terms = ds.hamiltonian_terms(lambda t, p, q, args: jnp.sum(p * q), noise, path)
     assert not commuting((terms.terms[1],), 0.0, _positive_state, None)
-    assert len(ds.suggest_solver(terms, _positive_state)) > 0
+    assert len(ds.suggest_solver(terms, 0.0, _positive_state, want="paths")) > 0

@@ -1,10 +1,8 @@
 """Every step is symplectic to rounding error, whatever the Hamiltonians."""
 
 import dataclasses
-import functools
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -20,53 +18,7 @@ from .problems import (
     H0,
     noise,
     random_problem,
-    random_problem_of_any_size,
 )
-
-
-def _increments(key, h, dtype):
-    """Three noises, as the weak and as the truncated path draw them."""
-    shape = jax.ShapeDtypeStruct((3,), dtype)
-    gaussian = diffrax.UnsafeBrownianPath(shape, key)
-    paths = ds.WeakBrownianPath(shape, key), ds.TruncatedBrownianPath(gaussian, k=2)
-    return jnp.stack([path.evaluate(jnp.zeros_like(h), h) for path in paths])
-
-
-@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-6)])
-@pytest.mark.parametrize(
-    "solver",
-    [
-        pytest.param(
-            s, id=name, marks=[pytest.mark.core] * (name == "ImplicitMidpoint")
-        )
-        for name, s in GENERAL.items()
-    ],
-)
-def test_step_is_symplectic_for_a_thousand_random_systems(solver, dtype, bound):
-    def defect(y0, args, h, W):
-        terms = ds.hamiltonian_terms(H0, noise, Given(W))
-        return ds.symplecticity_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
-
-    y0, args, h, W = _systems(dtype)
-    defect = eqx.filter_jit(jax.vmap(defect))
-    for path in range(2):
-        defects = defect(y0, args, h, W[:, path])
-        assert defects.dtype == dtype
-        assert jnp.max(defects) <= bound
-
-
-@functools.cache
-def _systems(dtype):
-    """The systems and their increments, made once for all solvers."""
-
-    def problem(key):
-        k_problem, k_path, k_h = jr.split(key, 3)
-        y0, args = random_problem_of_any_size(k_problem, dtype)
-        # Uniform in the logarithm over [1e-3, 0.2].
-        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
-        return y0, args, h, _increments(k_path, h, dtype)
-
-    return jax.jit(jax.vmap(problem))(jr.split(jr.key(0), 1000))
 
 
 def _weak(m, key, dtype=jnp.float64):

@@ -6,6 +6,8 @@ import itertools
 import pathlib
 import re
 
+import diffrax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -155,8 +157,15 @@ def test_conditions_are_known_for_known_tableaus_and_variables():
     ):
         with pytest.raises(ValueError, match="got `Other`"):
             residuals(Other())
-    with pytest.raises(ValueError, match="no check of the structure is registered"):
-        ds.check_structure(Other(), (), (), 0.0, None, None, "Mine")
+
+    class Mine(ds.AbstractSymplecticRungeKutta):
+        tableau = Other()
+
+    drift = diffrax.ODETerm(lambda t, y, args: -y)
+    with pytest.raises(
+        ValueError, match="`structure` of the tableau of `Mine` must be one of"
+    ):
+        Mine().init(drift, 0.0, 1.0, jnp.ones(2), None)
     own = ds.AdditiveTableau([1], {"W": [1]}, [[0.5]], {"W": [[1]], "mine": [[1]]}, [0])
     with pytest.raises(ValueError, match="got a tableau with `mine`"):
         ds.weak_order_residuals(own, 2)

@@ -10,7 +10,6 @@ import pytest
 import diffrax_symplectic as ds
 
 from .problems import (
-    GENERAL,
     H0,
     kubo_terms,
     local_weak_orders,
@@ -32,19 +31,6 @@ def _slopes(solver, m, order):
     ]
     y0, args = jax.vmap(lambda key: random_problem(key, 1, m))(keys)
     return local_weak_orders(terms, solver, y0, args, STEPS, order)
-
-
-@pytest.mark.parametrize("m", [1, 2])
-@pytest.mark.parametrize("solver", GENERAL.values(), ids=GENERAL.keys())
-def test_local_weak_defect_has_the_order_of_the_solver(solver, m):
-    terms = ds.hamiltonian_terms(H0, noise, weak_path(m))
-    order = solver.weak_order(terms)
-    assert order == (
-        2 if isinstance(solver, ds.SRKw2 | ds.StrangGauss) and m == 1 else 1
-    )
-    slopes = _slopes(solver, m, order)
-    assert len(slopes) == 20
-    np.testing.assert_allclose(slopes, order + 1, atol=0.1)
 
 
 def test_defect_sees_a_method_of_lower_order():

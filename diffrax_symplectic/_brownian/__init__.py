@@ -21,7 +21,7 @@ from ._stepwise import (
     stepwise as stepwise,
 )
 from ._wrappers import TruncatedBrownianPath as TruncatedBrownianPath
-from ._variables import VARIABLES as VARIABLES
+from ._variables import path_of as path_of, VARIABLES as VARIABLES
 from ._paths import WeakBrownianPath as WeakBrownianPath, WeakIncrement as WeakIncrement
 from ._wrappers import (
     AbstractWrappedPath as AbstractWrappedPath,

@@ -4,9 +4,7 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM
@@ -44,43 +42,6 @@ class WeakIncrement(diffrax.AbstractBrownianIncrement):
     second: BM | None = None
     two_point: BM | None = None
     third: BM | None = None
-
-    def _flat(self) -> tuple[Float[Array, " m"], Float[Array, " m"], Array]:
-        if self.two_point is None:
-            raise ValueError(
-                "The mixed integrals need the two-point variables. Construct the path "
-                "as `WeakBrownianPath(..., two_point=True)`."
-            )
-        ihat, _ = jfu.ravel_pytree(self.W)
-        itilde, _ = jfu.ravel_pytree(self.two_point)
-        return ihat, itilde, jnp.sqrt(jnp.abs(jtu.tree_leaves(self.dt)[0]))
-
-    def mixed_stratonovich(self) -> Float[Array, "m m"]:
-        r"""The variables $\hat I_{(k,l)}$ of the Stratonovich methods, as a matrix with
-        the `m` noises in the order of the leaves of `W`: $\hat I_k \tilde I_l$ for
-        $l < k$, $-\hat I_l \tilde I_k$ for $k < l$. The diagonal, which the methods do
-        not use, is zero.
-
-        **Raises:** a `ValueError` if the two-point variables were not asked for.
-        """
-        ihat, itilde, _ = self._flat()
-        lower = jnp.tril(jnp.outer(ihat, itilde), -1)
-        return lower - lower.T
-
-    def mixed_ito(self) -> Float[Array, "m m"]:
-        r"""The variables $\hat I_{(k,l)}$ of the Itô methods, which stand for the
-        iterated integrals $\int \int \mathrm{d}w_k \mathrm{d}w_l$, as a matrix with the
-        `m` noises in the order of the leaves of `W`:
-        $(\hat I_k \hat I_l - \sqrt h \tilde I_k) / 2$ for $k < l$,
-        $(\hat I_k \hat I_l + \sqrt h \tilde I_l) / 2$ for $l < k$, and
-        $(\hat I_k^2 - h) / 2$ for $k = l$.
-
-        **Raises:** a `ValueError` if the two-point variables were not asked for.
-        """
-        ihat, itilde, sqrt_h = self._flat()
-        upper = jnp.triu(jnp.broadcast_to(itilde[:, None], (ihat.size,) * 2), 1)
-        skew = sqrt_h * (upper.T - upper)
-        return (jnp.outer(ihat, ihat) + skew - sqrt_h**2 * jnp.eye(ihat.size)) / 2
 
 
 class WeakBrownianPath(AbstractPathWithLaws):

@@ -1,23 +1,35 @@
-from ._structure import check_structure as check_structure
-from ._implicit import AbstractImplicitStages as AbstractImplicitStages
-from .base import AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta
-from .implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
-from .srks1 import SRKs1 as SRKs1
-from .srks2 import SRKs2 as SRKs2
-from .srks3 import SRKs3 as SRKs3
-from .srks4 import SRKs4 as SRKs4
-from .srkw1 import SRKw1 as SRKw1
-from .srkw2 import SRKw2 as SRKw2
-from .srkw3 import SRKw3 as SRKw3
-from .srkw4 import SRKw4 as SRKw4
-from .srkw5 import SRKw5 as SRKw5
-from .levy_area_midpoint import LevyAreaMidpoint as LevyAreaMidpoint
-from .ninomiya_victoir import NinomiyaVictoir as NinomiyaVictoir
-from .strang_gauss import StrangGauss as StrangGauss
-from .additive_gauss import AdditiveGauss as AdditiveGauss
-from .plateau_gauss import PlateauGauss as PlateauGauss
-from .plateau_verlet import PlateauVerlet as PlateauVerlet
-from .stormer_verlet import StormerVerlet as StormerVerlet
+from .base import (
+    AbstractImplicitStages as AbstractImplicitStages,
+    AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
+    AbstractSymplecticSolver as AbstractSymplecticSolver,
+)
+from .general import (
+    ImplicitMidpoint as ImplicitMidpoint,
+    SRKs1 as SRKs1,
+    SRKw1 as SRKw1,
+    SRKw2 as SRKw2,
+)
+from .separable import (
+    PlateauVerlet as PlateauVerlet,
+    SRKs2 as SRKs2,
+    SRKs3 as SRKs3,
+    SRKw3 as SRKw3,
+    SRKw4 as SRKw4,
+    StormerVerlet as StormerVerlet,
+)
+from .additive import (
+    AdditiveGauss as AdditiveGauss,
+    SRKs4 as SRKs4,
+    SRKw5 as SRKw5,
+)
+from .beyond import (
+    LevyAreaMidpoint as LevyAreaMidpoint,
+    NinomiyaVictoir as NinomiyaVictoir,
+    PlateauGauss as PlateauGauss,
+    StrangGauss as StrangGauss,
+)
 from .baoab import BAOAB as BAOAB
 from .damped import Damped as Damped
 from .linear_flow import LinearFlow as LinearFlow
+from ._splitting import AbstractSplitting as AbstractSplitting
+from ._record import Noises as Noises, Record as Record, Want as Want

@@ -1,4 +1,4 @@
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -10,7 +10,8 @@ from jaxtyping import ArrayLike, PyTree
 from .._compat import direction, unwrapped
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._root_finder import all_finite
-from .._structure_checks import check_additive, check_separable
+from .._structure_checks import check_structure
+from .._tableau import Structure
 from .._terms import apply, check_state, controls, split_terms
 from ._friction import (
     apply_friction,
@@ -20,6 +21,7 @@ from ._friction import (
     matrix_faults,
     spread,
 )
+from ._record import Record
 from .base import AbstractSymplecticSolver
 
 
@@ -62,25 +64,24 @@ class BAOAB(AbstractSymplecticSolver):
     **Source:** [Leimkuhler and Matthews (2013)](https://doi.org/10.1093/amrx/abs010).
     """
 
+    record: ClassVar[Record] = Record(
+        weak=2,
+        strong=1,
+        choose="Langevin dynamics: explicit, and stationary positions are very accurate.",
+        suggested=("expectations", "paths"),
+    )
+    structure: ClassVar[Structure] = "separable and constant"
+    variables: ClassVar[tuple[str, ...]] = ("W",)
     gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
     _faults: tuple[str | None, ...] = eqx.field(static=True, init=False, repr=False)
 
     def __post_init__(self):
         self._faults = matrix_faults(self.gamma)
 
-    @property
-    def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
-        """The least that the increments of the path have to hold."""
-        return diffrax.AbstractBrownianIncrement
+    def stage_vectors(self, num_noises):
+        return ()
 
     def order(self, terms):
-        return 2
-
-    def strong_order(self, terms):
-        return 1.0
-
-    def weak_order(self, terms):
-        """Order of convergence of expectations."""
         return 2
 
     def init(
@@ -95,8 +96,7 @@ class BAOAB(AbstractSymplecticSolver):
         del t1
         check_state(y0, "BAOAB")
         drift, noise = split_terms(terms)
-        check_separable(drift, noise, t0, y0, args, "BAOAB")
-        check_additive(noise, t0, y0, args, "BAOAB", constant=True)
+        check_structure(self.structure, drift, noise, t0, y0, args, "BAOAB")
         if not all(isinstance(unwrapped(x), diffrax.ODETerm) for x in drift):
             raise ValueError(
                 "`BAOAB` needs a drift driven by time: pass `hamiltonian_terms(H0, noise, "

@@ -1,24 +1,35 @@
 """The solvers' common base, and the step of any tableau."""
 
+import abc
 import dataclasses
+import functools as ft
+import math
 from collections.abc import Callable
-from typing import ClassVar, TYPE_CHECKING, TypeAlias
+from typing import Any, ClassVar, TYPE_CHECKING, TypeAlias
 
 import diffrax
+import equinox as eqx
+import jax
+import optimistix as optx
+from jaxtyping import PRNGKeyArray, PyTree
 
-from .._brownian import VARIABLES
+from .._brownian import path_of, VARIABLES
+from .._conditions import drift_order
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
-from .._tableau import AbstractTableau, FlatTableau
+from .._root_finder import PicardNewton
+from .._structure_checks import check_structure
+from .._tableau import AbstractTableau, FlatTableau, Structure
 from .._terms import (
     check_state,
     drift_driven,
     noise_driven,
+    number_of_noises,
     split_terms,
 )
 from ._implicit_step import take_step
+from ._record import depends_on_noises, Record, Want
 from ._stages import Step
-from ._structure import check_structure
 
 
 if TYPE_CHECKING:
@@ -36,6 +47,81 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = (
         diffrax.LocalLinearInterpolation
     )
+    # A class of a user's own may do without.
+    record: ClassVar[Record | None] = None
+    # Which structure of the Hamiltonians the method is for.
+    structure: AbstractVar[Structure]
+    # The random variables of a step for each noise, by their names.
+    variables: AbstractVar[tuple[str, ...]]
+
+    @abc.abstractmethod
+    def stage_vectors(self, num_noises: int) -> tuple[int, ...]:
+        """How many stage vectors each system of a step has, one system after another."""
+
+    @property
+    def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
+        """The least that the increments of the path have to hold."""
+        for name, variable in VARIABLES.items():
+            if name in self.variables:
+                return variable.increment
+        return diffrax.AbstractBrownianIncrement
+
+    def strong_order(self, terms: PyTree[diffrax.AbstractTerm]) -> float | None:
+        """Order of convergence of paths."""
+        if self.record is None:
+            return None
+        alone = depends_on_noises(self.record.strong) and number_of_noises(terms) <= 1
+        return self.record.strong_order(alone)
+
+    def weak_order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | None:
+        """Order of convergence of expectations. Of several noises it is not known here
+        whether they commute. `None` if the class does not say it."""
+        if self.record is None:
+            return None
+        alone = depends_on_noises(self.record.weak) and number_of_noises(terms) <= 1
+        return self.record.weak_order(alone)
+
+    def path(
+        self,
+        shape: tuple[int, ...] | PyTree[jax.ShapeDtypeStruct],
+        key: PRNGKeyArray,
+        *,
+        want: Want | None = None,
+    ) -> diffrax.AbstractBrownianPath:
+        """A Brownian path with all that the solver needs, for fixed steps.
+
+        **Arguments:**
+
+        - `shape`: the shape of the increments, `(m,)` for `m` noises; or a PyTree of
+            `jax.ShapeDtypeStruct`s.
+        - `key`: a JAX random key.
+        - `want`: `"paths"` for the increments of a Brownian motion, `"expectations"` for
+            discrete ones, where these will do. By default what the solver is for; paths,
+            if it is for both.
+
+        **Raises:** a `ValueError` if `want` is neither, and for what is no shape or key.
+        """
+        if want not in ("paths", "expectations", None):
+            raise ValueError(f'`want` must be "paths" or "expectations"; got {want!r}.')
+        if want is None:
+            strong = self.record is not None and self.record.strong is not None
+            want = "paths" if strong else "expectations"
+        implicit = isinstance(self, diffrax.AbstractImplicitSolver)
+        kind = path_of(self.variables, gaussian=want == "paths", bounded=implicit)
+        return kind.make(shape, key)
+
+    def __repr__(self) -> str:
+        """The parameters that are not the defaults, in one line."""
+
+        values = {f: getattr(self, f.name) for f in dataclasses.fields(self) if f.repr}
+        given = ", ".join(
+            f"{f.name}={value!r}"
+            if isinstance(value, eqx.Module)
+            else f"{f.name}={eqx.tree_pformat(value)}"
+            for f, value in values.items()
+            if eqx.tree_equal(value, f.default) is not True
+        )
+        return f"{type(self).__name__}({given})"
 
     def func(
         self, terms: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
@@ -46,7 +132,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
 class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
     r"""A Runge--Kutta method with its own coefficients for drift and noise.
 
-    Subclasses give a `tableau` and their orders. If stages are implicit, they also subclass
+    Subclasses give a `tableau`. If stages are implicit, they also subclass
     [`diffrax_symplectic.AbstractImplicitStages`][]. Everything else is decided by the
     tableau: unused stages are dropped, equal ones are evaluated once, and explicit ones are
     evaluated directly. The implicit ones are solved for in small systems, one after
@@ -68,13 +154,23 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
     tableau: AbstractVar[AbstractTableau]
 
     @property
-    def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
-        """The least that the increments of the path have to hold."""
-        variables = _variables(make_plan(self.tableau.flatten()).tableau)
-        for name, variable in VARIABLES.items():
-            if name in variables:
-                return variable.increment
-        return diffrax.AbstractBrownianIncrement
+    def structure(self) -> Structure:
+        return getattr(self.tableau, "structure", None)  # pyright: ignore
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        return tuple(_variables(make_plan(self.tableau.flatten()).tableau))
+
+    def stage_vectors(self, num_noises: int) -> tuple[int, ...]:
+        del num_noises
+        blocks = make_plan(self.tableau.flatten()).blocks
+        sizes = [sum(map(len, block.unknown)) for block in blocks]
+        return tuple(size for size in sizes if size > 0)
+
+    def order(self, terms: PyTree[diffrax.AbstractTerm]) -> int:
+        """Order of convergence without noise, read off the coefficients of the drift."""
+        del terms
+        return drift_order(self.tableau.flatten())
 
     def init(
         self,
@@ -88,7 +184,7 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         check_state(y0, type(self).__name__)
         drift, noise = split_terms(terms)
         name = type(self).__name__
-        check_structure(self.tableau, drift, noise, t0, y0, args, name)
+        check_structure(self.structure, drift, noise, t0, y0, args, name)
         return None
 
     def step(
@@ -132,3 +228,47 @@ def _variables(tableau: FlatTableau) -> list[str]:
     """The random variables that drive the stages."""
     channels = [c for stage in tableau.stages for c in stage.channels]
     return [c for c in dict.fromkeys(channels) if c != "h"]
+
+
+class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
+    """A solver with implicit stages. It has the two fields that `diffrax` asks of implicit
+    solvers: the root finder for the stage equations, and the most iterations it may take in
+    each system of a step. Both are given by keyword, after the parameters of the method.
+    """
+
+    # `optimistix.root_find` takes either kind of solver.
+    root_finder: optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver = eqx.field(
+        default=PicardNewton(), kw_only=True
+    )
+    root_find_max_steps: int = eqx.field(default=100, kw_only=True)
+
+
+# The lines about these fields in the documentation of every such solver's `__init__`.
+ROOT_FINDER = """\
+- `root_finder`: any Optimistix root finder for the stage equations.
+- `root_find_max_steps`: the most iterations it may take in each step.
+"""
+ARGUMENTS = f"""**Arguments:**
+
+{ROOT_FINDER}"""
+
+
+def free_parameter(name: str, default: float) -> Any:
+    """The field of a solver for the parameter of this name, which becomes a Python float.
+    Parameters decide which stages are used, so they have to be known while tracing."""
+    converter = ft.partial(real_number, name)
+    return eqx.field(default=default, static=True, converter=converter)
+
+
+def real_number(name: str, value: Any) -> float:
+    """Raises a `ValueError` unless `value` is a finite real number."""
+    try:
+        number = math.nan if isinstance(value, complex) else float(value)
+    except Exception:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(
+            f"`{name}` must be a finite real number, known before tracing (a Python "
+            f"float, not a traced array); got {value!r}."
+        )
+    return number

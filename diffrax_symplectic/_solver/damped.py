@@ -1,21 +1,25 @@
-from typing import Any
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
 import jax.tree_util as jtu
 from jaxtyping import ArrayLike, PyTree
 
-from .._compat import direction
-from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
-from .._hamiltonian import check_pair, is_hamiltonian, Lifted
+from .._custom_types import Args, RealScalarLike, Y
+from .._hamiltonian import is_hamiltonian, Lifted
 from .._terms import split_terms
-from ._friction import apply_friction, checked, decay, friction_modes, matrix_faults
-from .base import AbstractSymplecticSolver
+from ._friction import (
+    apply_friction,
+    checked,
+    decay,
+    friction_modes,
+    matrix_faults,
+    Modes,
+)
+from ._splitting import AbstractSplitting
 
 
-class Damped(
-    diffrax.AbstractStratonovichSolver[Any], diffrax.AbstractWrappedSolver[Any]
-):
+class Damped(AbstractSplitting):
     r"""Any solver of this package with friction, $\mathrm{d}p = \ldots - \gamma p\,
     \mathrm{d}t$.
 
@@ -46,94 +50,29 @@ class Damped(
     def __post_init__(self):
         self._faults = matrix_faults(self.gamma)
 
-    def __check_init__(self):
-        if not isinstance(self.solver, AbstractSymplecticSolver):
-            raise ValueError(
-                "`Damped` wraps a solver of this package, such as `StormerVerlet()`; got "
-                f"`{type(self.solver).__name__}`. Other solvers take friction as a term: "
-                "`diffrax.MultiTerm(terms, diffrax.ODETerm(friction))`."
-            )
+    choose: ClassVar[str] = "Friction: collisions, damping, thermostats."
+    advice: ClassVar[str] = (
+        "Other solvers take friction as a term: `diffrax.MultiTerm(terms, "
+        "diffrax.ODETerm(friction))`."
+    )
 
-    @property
-    def term_structure(self):
-        return self.solver.term_structure
-
-    @property
-    def interpolation_cls(self):  # pyright: ignore
-        return self.solver.interpolation_cls
-
-    @property
-    def term_compatible_contr_kwargs(self):  # pyright: ignore
-        return self.solver.term_compatible_contr_kwargs
-
-    @property
-    def minimal_levy_area(self):
-        return self.solver.minimal_levy_area  # pyright: ignore
-
-    @property
-    def root_finder(self):
-        """That of the solver, if its stages are implicit."""
-        return self.solver.root_finder  # pyright: ignore
-
-    @property
-    def root_find_max_steps(self) -> int:
-        """That of the solver, if its stages are implicit."""
-        return self.solver.root_find_max_steps  # pyright: ignore
-
-    def order(self, terms):
-        order = self.solver.order(terms)
-        return None if order is None else min(order, 2)
-
-    def strong_order(self, terms):
-        order = self.solver.strong_order(terms)
-        return None if order is None else min(order, 1.0)
-
-    def weak_order(self, terms):
-        """Order of convergence of expectations."""
-        return min(self.solver.weak_order(terms), 2)  # pyright: ignore
-
-    def init(
+    def prepare(
         self,
         terms: PyTree[diffrax.AbstractTerm],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
+        time: RealScalarLike,
         y0: Y,
         args: Args,
-    ) -> Any:
-        """The state of the solver, and the modes of the friction."""
+    ) -> list[Modes | None]:
+        """The modes of the friction."""
+        del time, args
         _check_has_momentum(terms)
-        check_pair(y0)
-        modes = friction_modes(self.gamma, self._faults, y0[0])
-        return self.solver.init(terms, t0, t1, y0, args), modes
+        return friction_modes(self.gamma, self._faults, y0[0])
 
-    def step(
-        self,
-        terms: PyTree[diffrax.AbstractTerm],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-        solver_state: Any,
-        made_jump: BoolScalarLike,
-    ) -> tuple[Y, Y | None, DenseInfo, Any, diffrax.RESULTS]:
-        # In a solve backward in time the momentum grows. Diffrax makes `t1 - t0` positive.
-        time = direction(terms) * (t1 - t0) / 2
-        inner, modes = solver_state
-        damp = lambda y: (apply_friction(self.gamma, modes, time, (decay, y[0])), y[1])
-        y1, error, _, inner, result = self.solver.step(
-            terms, t0, t1, damp(y0), args, inner, made_jump
-        )
-        y1 = damp(y1)
-        return y1, error, dict(y0=y0, y1=y1), (inner, modes), result
-
-    def func(
-        self,
-        terms: PyTree[diffrax.AbstractTerm],
-        t0: RealScalarLike,
-        y0: Y,
-        args: Args,
-    ) -> VF:
-        return self.solver.func(terms, t0, y0, args)
+    def exact_flow(
+        self, prepared: list[Modes | None], time: RealScalarLike, y: Y, args: Args
+    ) -> Y:
+        p, q = y
+        return apply_friction(self.gamma, prepared, time, (decay, p)), q
 
 
 def _check_has_momentum(terms: PyTree[diffrax.AbstractTerm]) -> None:

@@ -1,5 +1,5 @@
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -11,11 +11,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree
 
 from .._arguments import check_takes
-from .._compat import direction
-from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
-from .._hamiltonian import check_pair
-from .base import AbstractSymplecticSolver
-from .damped import Damped
+from .._custom_types import Args, RealScalarLike, Y
+from ._splitting import AbstractSplitting
 
 
 def _checked(flow: Any) -> Any:
@@ -23,9 +20,7 @@ def _checked(flow: Any) -> Any:
     return flow
 
 
-class LinearFlow(
-    diffrax.AbstractStratonovichSolver[Any], diffrax.AbstractWrappedSolver[Any]
-):
+class LinearFlow(AbstractSplitting):
     r"""Any solver of this package for $H_0 = L + R$, with the exact flow of $L$ around a
     step for the rest $R$.
 
@@ -56,101 +51,26 @@ class LinearFlow(
     solver: diffrax.AbstractSolver
     flow: Callable[[RealScalarLike, Y, Args], Y] = eqx.field(converter=_checked)
 
-    def __check_init__(self):
-        if not isinstance(self.solver, AbstractSymplecticSolver | Damped):
-            raise ValueError(
-                "`LinearFlow` wraps a solver of this package, such as `StormerVerlet()`; "
-                f"got `{type(self.solver).__name__}`."
-            )
+    choose: ClassVar[str] = (
+        "Fast linear waves on lattices and bonds of molecules, which it moves exactly."
+    )
 
-    @property
-    def term_structure(self):
-        return self.solver.term_structure
-
-    @property
-    def interpolation_cls(self):  # pyright: ignore
-        return self.solver.interpolation_cls
-
-    @property
-    def term_compatible_contr_kwargs(self):  # pyright: ignore
-        return self.solver.term_compatible_contr_kwargs
-
-    @property
-    def minimal_levy_area(self):
-        return self.solver.minimal_levy_area  # pyright: ignore
-
-    @property
-    def root_finder(self):
-        """That of the solver, if its stages are implicit."""
-        return self.solver.root_finder  # pyright: ignore
-
-    @property
-    def root_find_max_steps(self) -> int:
-        """That of the solver, if its stages are implicit."""
-        return self.solver.root_find_max_steps  # pyright: ignore
-
-    def order(self, terms):
-        order = self.solver.order(terms)
-        return None if order is None else min(order, 2)
-
-    def strong_order(self, terms):
-        order = self.solver.strong_order(terms)
-        return None if order is None else min(order, 1.0)
-
-    def weak_order(self, terms):
-        """Order of convergence of expectations."""
-        return min(self.solver.weak_order(terms), 2)  # pyright: ignore
-
-    def init(
+    def prepare(
         self,
         terms: PyTree[diffrax.AbstractTerm],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
+        time: RealScalarLike,
         y0: Y,
         args: Args,
     ) -> Any:
-        """The state of the solver, and a zero that every step reads: reading it raises the
-        error of a flow that is not symplectic."""
-        check_pair(y0)
-        time = jnp.asarray(direction(terms) * (t1 - t0) / 2)
-        flow = lambda y: self._flow(time, y, args)
-        zero = eqx.error_if(jnp.zeros_like(time), ~_is_symplectic(flow, y0), _MESSAGE)
-        return self.solver.init(terms, t0, t1, y0, args), zero
+        """A zero that every step reads: reading it raises the error of a flow that is not
+        symplectic."""
+        del terms
+        time = jnp.asarray(time)
+        flow = lambda y: self.exact_flow(0, time, y, args)
+        return eqx.error_if(jnp.zeros_like(time), ~_is_symplectic(flow, y0), _MESSAGE)
 
-    def step(
-        self,
-        terms: PyTree[diffrax.AbstractTerm],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-        solver_state: Any,
-        made_jump: BoolScalarLike,
-    ) -> tuple[Y, Y | None, DenseInfo, Any, diffrax.RESULTS]:
-        del made_jump
-        # Diffrax makes `t1 - t0` positive in a solve backward in time, too.
-        inner, zero = solver_state
-        time = direction(terms) * (t1 - t0) / 2 + zero
-        y = self._flow(time, y0, args)
-        # What the solver remembers is the end of its last step, and this one begins
-        # elsewhere.
-        y, error, _, inner, result = self.solver.step(
-            terms, t0, t1, y, args, inner, True
-        )
-        y1 = self._flow(time, y, args)
-        return y1, error, dict(y0=y0, y1=y1), (inner, zero), result
-
-    def func(
-        self,
-        terms: PyTree[diffrax.AbstractTerm],
-        t0: RealScalarLike,
-        y0: Y,
-        args: Args,
-    ) -> VF:
-        return self.solver.func(terms, t0, y0, args)
-
-    def _flow(self, time: RealScalarLike, y: Y, args: Args) -> Y:
-        y1 = self.flow(time, y, args)
+    def exact_flow(self, prepared: Any, time: RealScalarLike, y: Y, args: Args) -> Y:
+        y1 = self.flow(time + prepared, y, args)
         shape = lambda x: jax.eval_shape(lambda: x)
         if not eqx.tree_equal(shape(y1), shape(y)):
             raise ValueError(

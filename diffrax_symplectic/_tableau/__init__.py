@@ -13,6 +13,7 @@ from ._flat import (
     AbstractTableau as AbstractTableau,
     FlatTableau as FlatTableau,
     Stage as Stage,
+    Structure as Structure,
 )
 from ._general import GeneralTableau as GeneralTableau
 from ._separable import (

@@ -13,7 +13,7 @@ from ._coefficients import (
     columns,
     variables_of,
 )
-from ._flat import AbstractTableau, FlatTableau, Stage
+from ._flat import AbstractTableau, FlatTableau, Stage, Structure
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -53,6 +53,10 @@ class AdditiveTableau(AbstractTableau):
         s, r = np.size(self.alpha), np.size(self.c1)
         check_all(self, alpha=(s,), A=(s, s), c1=(r,))
         check_by_variable(self, beta=(r,), B=(s, r))
+
+    @property
+    def structure(self) -> Structure:
+        return "constant" if self.constant else "additive"
 
     @property
     def c0(self) -> Float[np.ndarray, " s"]:

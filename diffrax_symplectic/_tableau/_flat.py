@@ -2,10 +2,18 @@
 
 import abc
 import dataclasses
-from typing import NamedTuple
+from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
+
+
+# Which structure of the Hamiltonians coefficients are for: any; `H0 = V(p) + U(t, q)` and
+# `H_k = U_k(t, q)`; noise that does not depend on the state; and on time neither; or both
+# the second and the last.
+Structure: TypeAlias = Literal[
+    "any", "separable", "additive", "constant", "separable and constant"
+]
 
 
 class Stage(NamedTuple):
@@ -50,7 +58,15 @@ class FlatTableau:
 
 
 class AbstractTableau(abc.ABC):
-    """What every tableau offers."""
+    """What every tableau offers.
+
+    - `structure`: which structure of the Hamiltonians the coefficients are for, `"any"`,
+        `"separable"`, `"additive"`, `"constant"` (additive, and not dependent on time) or
+        `"separable and constant"`.
+        Every solve checks that its terms have it, while tracing, before its first step.
+    """
+
+    structure: ClassVar[Structure]
 
     @abc.abstractmethod
     def flatten(self) -> FlatTableau:

@@ -1,12 +1,13 @@
 """Tableaus for systems without further structure."""
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
 
 from ._coefficients import check_all, Coefficients
-from ._flat import AbstractTableau, FlatTableau, Stage
+from ._flat import AbstractTableau, FlatTableau, Stage, Structure
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -43,6 +44,7 @@ class GeneralTableau(AbstractTableau):
     real numbers.
     """
 
+    structure: ClassVar[Structure] = "any"
     alpha: Coefficients
     beta: Coefficients
     A0: Coefficients

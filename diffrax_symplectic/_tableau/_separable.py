@@ -1,6 +1,7 @@
 """Tableaus for separable systems."""
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +14,7 @@ from ._coefficients import (
     columns,
     variables_of,
 )
-from ._flat import AbstractTableau, FlatTableau, Stage
+from ._flat import AbstractTableau, FlatTableau, Stage, Structure
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,6 +47,7 @@ class SeparableTableau(AbstractTableau):
     real numbers.
     """
 
+    structure: ClassVar[Structure] = "separable"
     alpha: Coefficients
     beta: CoefficientsByVariable
     A0: Coefficients
@@ -105,6 +107,7 @@ class PartitionedTableau(AbstractTableau):
     real numbers.
     """
 
+    structure: ClassVar[Structure] = "separable"
     alpha: Coefficients
     alpha_hat: Coefficients
     beta: CoefficientsByVariable

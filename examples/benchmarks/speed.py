@@ -38,11 +38,11 @@ def gaussian(key, shape=()):
 
 
 def with_area(key, shape=()):
-    return ds.FixedStepBrownianPath(shape, key, levy_area=diffrax.SpaceTimeLevyArea)
+    return ds.SRKs4().path(shape, key)
 
 
 def truncated(key):
-    return ds.TruncatedBrownianPath(gaussian(key))
+    return ds.ImplicitMidpoint().path((), key)
 
 
 def quartic(t, p, q, args):
@@ -105,11 +105,11 @@ def by_hand(keys):
 
 
 def plateaus(key):
-    return ds.PlateauBrownianPath(with_area(key, (2,)), key)
+    return ds.PlateauVerlet().path((2,), key)
 
 
 def levy_areas(key):
-    return ds.LevyAreaBrownianPath(with_area(key, (2,)), key)
+    return ds.LevyAreaMidpoint().path((2,), key)
 
 
 two = lambda path: lambda key: path(key, (2,))

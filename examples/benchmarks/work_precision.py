@@ -213,7 +213,7 @@ def strong_errors(model: str) -> dict[str, Errors]:
     """Root-mean-square errors of the state at t = 1."""
     make_terms, y0, shape, reference, solvers = STRONG[model]
     compared = ds.compare_solvers(
-        make_terms, y0, 0.0, 1.0, dts=HS[1:], shape=shape, solvers=solvers,
+        make_terms(ds.WeakBrownianPath(shape, jr.key(0))), solvers, 0.0, 1.0, HS[1:], y0,
         reference=reference, key=jr.key(0), num_paths=500,
     )  # fmt: skip
     assert not compared.refused

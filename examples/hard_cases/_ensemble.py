@@ -1,5 +1,6 @@
 """Many paths at once, and means with standard errors."""
 
+import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -39,7 +40,7 @@ def gaussian(shape=()) -> Callable:
 
 def truncated(shape=()) -> Callable:
     """Bounded, so that implicit steps stay solvable."""
-    return lambda key: ds.TruncatedBrownianPath(gaussian(shape)(key), k=2)
+    return ft.partial(ds.ImplicitMidpoint().path, shape)
 
 
 def weak(shape=()) -> Callable:
@@ -47,16 +48,11 @@ def weak(shape=()) -> Callable:
 
 
 def areas(shape=()) -> Callable:
-    levy_area = diffrax.SpaceTimeLevyArea
-    return lambda key: ds.FixedStepBrownianPath(shape, key, levy_area)
+    return ft.partial(ds.SRKs4().path, shape)
 
 
 def plateaus(shape=()) -> Callable:
-    def make(key):
-        k_path, k_signs = jr.split(key)
-        return ds.PlateauBrownianPath(areas(shape)(k_path), k_signs)
-
-    return make
+    return ft.partial(ds.PlateauVerlet().path, shape)
 
 
 def ensemble(

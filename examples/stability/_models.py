@@ -17,11 +17,11 @@ def weak(key, shape=(), **kwargs):
 
 
 def second(key, shape=()):
-    return weak(key, shape, second=True)
+    return ds.SRKw5().path(shape, key)
 
 
 def third(key, shape=()):
-    return weak(key, shape, order=3)
+    return ds.AdditiveGauss().path(shape, key)
 
 
 def gaussian(key, shape=()):
@@ -29,7 +29,7 @@ def gaussian(key, shape=()):
 
 
 def areas(key, shape=()):
-    return ds.FixedStepBrownianPath(shape, key, levy_area=diffrax.SpaceTimeLevyArea)
+    return ds.SRKs4().path(shape, key)
 
 
 class Case(NamedTuple):

@@ -20,8 +20,7 @@ SIGMA = 0.5
 
 
 def plateaus(key, shape=()):
-    k_path, k_signs = jr.split(key)
-    return ds.PlateauBrownianPath(areas(k_path, shape), k_signs)
+    return ds.PlateauVerlet().path(shape, key)
 
 
 CASES = {

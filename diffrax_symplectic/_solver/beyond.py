@@ -1,0 +1,329 @@
+"""Solvers for any Hamiltonians that Wang, Hong and Xu do not have."""
+
+import dataclasses
+from typing import ClassVar
+
+import diffrax
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .._conditions import drift_order
+from .._plan import make_plan
+from .._tableau import FlatTableau, GeneralTableau, Stage, Structure
+from .._terms import (
+    apply_one,
+    check_state,
+    controls,
+    drift_driven,
+    number_of_noises,
+    split_terms,
+)
+from ._implicit_step import first_failure, take_step
+from ._record import Record
+from ._stages import Step
+from .base import (
+    AbstractImplicitStages,
+    AbstractSymplecticRungeKutta,
+    AbstractSymplecticSolver,
+    ARGUMENTS,
+)
+from .general import ImplicitMidpoint
+
+
+_r = np.sqrt(3.0)
+_gauss = np.array([[1 / 4, 1 / 4 - _r / 6], [1 / 4 + _r / 6, 1 / 4]])
+_half = np.array([1 / 2, 1 / 2])
+
+_strang_gauss = GeneralTableau(
+    alpha=_half,
+    beta=_half,
+    A0=[[1 / 4, 0], [1 / 2, 1 / 4]],
+    B0=[[0, 0], [1 / 2, 1 / 2]],
+    A1=[[1 / 2, 0], [1 / 2, 0]],
+    B1=_gauss,
+)
+
+
+class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
+    r"""A symplectic method of weak order 2 for one noise or noises that commute: the drift
+    over half of the step by the midpoint rule, the noise by the Gauss method of order 4,
+    and the drift over the other half.
+
+    In the form of [`diffrax_symplectic.GeneralTableau`][], with $r = \sqrt 3$,
+
+    $$A^0 = \begin{pmatrix} \frac14 & 0 \\ \frac12 & \frac14 \end{pmatrix}, \quad
+      B^0 = \begin{pmatrix} 0 & 0 \\ \frac12 & \frac12 \end{pmatrix}, \quad
+      A^1 = \begin{pmatrix} \frac12 & 0 \\ \frac12 & 0 \end{pmatrix},$$
+
+    $$B^1 = \begin{pmatrix} \frac14 & \frac14 - \frac r6 \\
+        \frac14 + \frac r6 & \frac14 \end{pmatrix}, \quad
+      \alpha = \beta = (\tfrac12, \tfrac12).$$
+
+    It satisfies all 17 conditions that [`diffrax_symplectic.SRKw2`][] does, with four
+    stage vectors in place of six, solved in three small systems one after the other: the
+    cheaper of the two, and the more accurate in our tests.
+
+    Any Hamiltonians, and any Stratonovich system: quadratic invariants that drift and
+    noise share are conserved. Weak order 2 for one noise and for noises that commute, weak
+    order 1 for others.
+    Order 2 without noise. No free parameters.
+
+    **Source:** [Strang (1968)](https://doi.org/10.1137/0705041) for the splitting.
+    """
+
+    record: ClassVar[Record] = Record(
+        weak=(2, 1),
+        strong=None,
+        choose="Four stage vectors in three small systems: accurate expectations.",
+        noises="commuting",
+        suggested=("expectations",),
+    )
+    tableau: ClassVar[GeneralTableau] = _strang_gauss
+
+
+StrangGauss.__init__.__doc__ = ARGUMENTS
+
+
+# The flow of one vector field: two stages of the Gauss method, of order 4.
+_flow = make_plan(
+    FlatTableau(
+        stages=tuple(Stage(("h",), 1 / 2 + s * _r / 6, "y", "y") for s in (-1, 1)),
+        matrix=_gauss,
+        weights=_half,
+    )
+)
+# Up to so many noises their flows are written out one after another, without a loop.
+_WRITTEN_OUT = 2
+
+
+class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
+    r"""A symplectic method of weak order 2 for any Hamiltonians and any number of noises,
+    whether they commute or not: splitting in random order.
+
+    With $F_0(t)$ for the flow of the drift over time $t$, $F_k(x)$ for that of the noise
+    $b_k$ over "time" $x$, and the three-point variables $\hat I_k$, by one fair coin
+
+    $$y_{n+1} = F_0(\tfrac h2)\, F_m(\hat I_m) \cdots F_1(\hat I_1)\, F_0(\tfrac h2)\, y_n
+      \quad \text{or} \quad
+      F_0(\tfrac h2)\, F_1(\hat I_1) \cdots F_m(\hat I_m)\, F_0(\tfrac h2)\, y_n.$$
+
+    Each flow is one step of the Gauss method with two stages, of order 4. (By the midpoint
+    rule the method would fall back to weak order 1.) So a step solves $m + 2$ systems of
+    two stage vectors, one after another. Memory grows with $m$ plus the size of the state.
+
+    **Many noises.** A flow needs one noise only. What it evaluates depends on the terms:
+
+    - of an [`diffrax_symplectic.IndexedNoise`][] that noise alone: a step costs as much
+      as a few evaluations of every noise;
+    - of a function that returns all Hamiltonians, all of them: $m$ times as much;
+    - of a `diffrax.ControlTerm` the whole matrix, and multiplies one column of it.
+
+    For a thousand sites and a thousand noises that read all sites, a step of one path took
+    0.04 s with `IndexedNoise`, and 2.8 s with a function.
+
+    Symplectic path by path for any Hamiltonians, and any Stratonovich system will do:
+    quadratic invariants that drift and noises share are conserved. Weak order 2. Order 4
+    without noise. No free parameters. For one noise, [`diffrax_symplectic.StrangGauss`][]
+    has the same order and is cheaper.
+
+    !!! warning
+
+        For two noises and more the path has to be a
+        [`diffrax_symplectic.WeakBrownianPath`][] with `two_point=True`: the coin is the
+        sign of the first two-point variable.
+
+    **Source:** [Ninomiya and Victoir (2008)](https://doi.org/10.1080/13504860701413958) for
+    the splitting; [Ninomiya and Ninomiya (2009)](https://doi.org/10.1007/s00780-009-0101-4)
+    for Runge--Kutta methods of high order, the Gauss method among them, in place of the
+    flows.
+    """
+
+    record: ClassVar[Record] = Record(
+        weak=2,
+        strong=None,
+        choose=(
+            "Two stage vectors for each noise and four for the drift; its errors repay "
+            "them if the noises are few."
+        ),
+        noises="not commuting",
+        suggested=("expectations",),
+    )
+    structure: ClassVar[Structure] = "any"
+    variables: ClassVar[tuple[str, ...]] = ("W", "two_point")
+
+    def stage_vectors(self, num_noises):
+        return (2,) * (num_noises + 2)
+
+    def order(self, terms):
+        """Order of convergence without noise: that of the flows."""
+        del terms
+        return drift_order(_flow.tableau)
+
+    def init(self, terms, t0, t1, y0, args):
+        del t0, t1
+        check_state(y0, type(self).__name__)
+        return None
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        del solver_state, made_jump
+        drift, _ = split_terms(terms)
+        middle = t0 + (t1 - t0) / 2
+
+        def along_drift(t0, t1, y):
+            if len(drift) == 0:
+                return y, diffrax.RESULTS.successful
+            step = Step(t0, t1 - t0, {"h": drift_driven(drift, t0, t1, args)})
+            return take_step(_flow, step, y, self)
+
+        y, first = along_drift(t0, middle, y0)
+        y, second = self._along_noise(terms, t0, t1, middle, y, args)
+        y1, third = along_drift(middle, t1, y)
+        result = first_failure(first_failure(first, second), third)
+        return y1, None, dict(y0=y0, y1=y1), None, result
+
+    def _along_noise(self, terms, t0, t1, time, y0, args):
+        """The flows of all noises, the time standing still at `time`."""
+        _, noise = split_terms(terms)
+        if len(noise) == 0:
+            return y0, diffrax.RESULTS.successful
+        m = number_of_noises(terms)
+        # The flows of several noises have an order, for which a coin is needed.
+        names = ["W", "two_point"] if m > 1 else ["W"]
+        drawn = controls(noise, names, t0, t1, type(self).__name__)
+        increments, _ = jfu.ravel_pytree(drawn["W"])
+        numbers = jnp.arange(m)
+        if m > 1:
+            coin = jtu.tree_leaves(drawn["two_point"])[0].reshape(-1)[0] > 0
+            numbers = jnp.where(coin, numbers, numbers[::-1])
+
+        def flow(carry, this):
+            y, result = carry
+            driven = jtu.Partial(apply_one, noise, *this, args)
+            step = Step(time, 0 * (t1 - t0), {"h": driven})
+            y, flowed = take_step(_flow, step, y, self)
+            return (y, first_failure(result, flowed)), None
+
+        carry = (y0, diffrax.RESULTS.successful)
+        unroll = m if m <= _WRITTEN_OUT else 1
+        flows = (numbers, increments[numbers])
+        (y1, result), _ = jax.lax.scan(flow, carry, flows, unroll=unroll)
+        return y1, result
+
+
+NinomiyaVictoir.__init__.__doc__ = ARGUMENTS
+
+
+class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
+    r"""The implicit midpoint rule with Lévy areas, of strong order 1 for any number of
+    noises, whether they commute or not.
+
+    $$G = \tfrac12 (y_n + y_{n+1}), \qquad y_{n+1} = y_n + h\,a(G) + \sum_k b_k(G) I_k
+      + \sum_{k<l} [b_k, b_l](G)\, A_{kl}$$
+
+    with the Lie brackets $[b_k, b_l] = b_l' b_k - b_k' b_l$ and the Lévy areas
+    $A_{kl} = \frac12 \int (w_k \,\mathrm{d}w_l - w_l \,\mathrm{d}w_k)$ of the step. This is
+    one midpoint step, over unit time, of the Hamiltonian
+
+    $$h H_0 + \sum_k I_k H_k + \sum_{k<l} A_{kl} \{H_k, H_l\}, \qquad
+      \{F, G\} = \frac{\partial F}{\partial p} \cdot \frac{\partial G}{\partial q}
+      - \frac{\partial F}{\partial q} \cdot \frac{\partial G}{\partial p},$$
+
+    since the Lie bracket of two Hamiltonian vector fields is the field of their Poisson
+    bracket. So it is symplectic for any Hamiltonians, and conserves every quadratic
+    invariant of the system. JAX takes the derivatives. The terms need not come from
+    Hamiltonians, but all noises have to be in one term.
+
+    The areas bring the order: without them the midpoint rule has strong order 1/2. For `m`
+    noises they cost `m` directional derivatives of the noise in each evaluation. With one
+    noise, or noises that commute, it is [`diffrax_symplectic.ImplicitMidpoint`][] at a
+    higher price. Weak order 1. Order 2 without noise. No free parameters.
+
+    !!! warning
+
+        The path has to be a [`diffrax_symplectic.LevyAreaBrownianPath`][] around one with
+        space-time Lévy area.
+
+    **Source:** [Milstein and Tretyakov (2021)](https://doi.org/10.1007/978-3-030-82040-4)
+    for the order that Lévy areas and Lie brackets bring, which is due to Milstein. We
+    know of no source for the combination with the midpoint rule, which keeps it symplectic.
+    """
+
+    record: ClassVar[Record] = Record(
+        weak=1,
+        strong=1,
+        choose=(
+            "The midpoint rule with Lévy areas, which bring the order if noises do not "
+            "commute."
+        ),
+        noises="not commuting",
+        suggested=("paths",),
+    )
+    tableau: ClassVar[GeneralTableau] = dataclasses.replace(
+        ImplicitMidpoint.tableau, noise=("W", "A")
+    )
+
+
+LevyAreaMidpoint.__init__.__doc__ = ARGUMENTS
+
+
+class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
+    r"""A symplectic method of strong order 3/2 for any Hamiltonians, with one noise or with
+    noises that commute.
+
+    A step is one step over unit time, by the Gauss method with two stages, of the field
+
+    $$h a + \sum_k b_k W_k + h \sum_k [b_k, a] H_k + \sum_{k, l} [b_k, [b_l, a]]\, L_{kl},
+      \qquad [b, a] = a' b - b' a,$$
+
+    with the increments $W_k$, the space-time Lévy areas $H_k$, and
+
+    $$L_{kl} = \tfrac35 h H_k H_l + \tfrac{1}{30} h^2 \delta_{kl}.$$
+
+    If the path has space-time-time areas $K_k$, too (`diffrax.SpaceTimeTimeLevyArea`), then
+
+    $$L_{kl} = \tfrac35 h H_k H_l + \tfrac{60}{7} h K_k K_l
+      - \tfrac12 h (W_k K_l + K_k W_l) + \tfrac{3}{140} h^2 \delta_{kl}.$$
+
+    Both are conditional expectations of the integrals that the logarithm of the solution
+    contains, given these variables of the path. The second one is closer to the integrals:
+    with it the errors of small steps were less than half as large.
+
+    The brackets of Hamiltonian vector fields are fields of Hamiltonians, their Poisson
+    brackets. So a step is symplectic for any Hamiltonians, and conserves every quadratic
+    invariant that drift and noises share. JAX takes the derivatives: for $m$ noises, $m$
+    second derivatives of the vector fields in each evaluation. Terms that do not come from
+    Hamiltonians will do, and so do coefficients that depend on time: the brackets contain
+    their derivatives by time, and all orders hold.
+
+    Two stage vectors are solved for, in one system, whatever the number of noises. Strong
+    order 3/2 and weak order 2 for one noise and for noises that commute with each other,
+    $[b_k, b_l] = 0$. Strong order 1/2 and weak order 1 if they do not. Order 4 without
+    noise. No free parameters. For noise in the forces alone,
+    [`diffrax_symplectic.PlateauVerlet`][] is explicit and much cheaper.
+
+    !!! warning
+
+        The path has to have space-time Lévy area.
+
+    **Source:** the field is that of the log-ODE method of [Foster, Lyons and Oberhauser
+    (2020)](https://doi.org/10.1137/19M1261912), section 4. The Gauss method keeps it
+    symplectic.
+    """
+
+    record: ClassVar[Record] = Record(
+        weak=(2, 1),
+        strong=(3 / 2, 1 / 2),
+        choose="Two stage vectors, and brackets of the vector fields: accurate paths.",
+        noises="commuting",
+        suggested=("paths",),
+    )
+    tableau: ClassVar[GeneralTableau] = dataclasses.replace(
+        GeneralTableau.strong(A=_gauss, B=_gauss, alpha=_half, beta=_half),
+        noise=("W", "L"),
+    )
+
+
+PlateauGauss.__init__.__doc__ = ARGUMENTS
