@@ -250,6 +250,38 @@ def test_paths_that_need_more_rounds_do_not_change_their_neighbours():
         np.testing.assert_array_equal(q[i], q_alone[i])
 
 
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.NinomiyaVictoir()])
+def test_a_path_that_has_failed_stays_failed(solver):
+    # In a batch Diffrax goes on to step a path that has ended. Of y' = 1 + y^2 a step of
+    # length 3 has no solution, and one of length 0.01 has.
+    term = diffrax.ODETerm(lambda t, y, args: 1 + y**2)
+
+    @jax.jit
+    @jax.vmap
+    def step(h, state):
+        *_, state, result = solver.step(term, 0.0, h, jnp.zeros(2), None, state, False)
+        return state, result == diffrax.RESULTS.successful
+
+    state, success = step(jnp.array([3.0, 0.01]), jnp.array([False, False]))
+    assert state.tolist() == [True, False] and success.tolist() == [False, True]
+    state, success = step(jnp.array([0.01, 0.01]), state)
+    assert state.tolist() == [True, False] and success.tolist() == [False, True]
+
+
+def test_nothing_is_solved_for_a_path_that_has_failed():
+    residual = lambda y, args: y - 3 * (1 + y**2)
+
+    @jax.jit
+    @jax.vmap
+    def iterations(lost):
+        finder, options = ds.PicardNewton(), dict(lost=lost)
+        sol = optx.root_find(residual, finder, 0.0, options=options, throw=False)
+        return sol.stats["num_steps"]
+
+    lost, pending = iterations(jnp.array([True, False]))
+    assert lost == 0 and pending > 10
+
+
 def test_only_pending_paths_of_a_batch_are_served():
     double = lambda weight, x: weight * x
     serve = lambda pending, w, x: where_pending(double, pending, w, x)

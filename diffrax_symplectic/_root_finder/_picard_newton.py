@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from .._compat import ω
 from . import _continuation
 from ._batch import where_pending
-from ._sweeps import sweep, sweep_blocks
+from ._sweeps import Found, sweep, sweep_blocks
 from ._tolerance import Tolerance
 
 
@@ -63,7 +63,8 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
     unknowns `k` change: `f(k)` has their structure, and stands in place of `k` in `rtol`.
     With `options={"blocks": fs}` the unknowns are a list, and the equations come in blocks,
     each of which reads those before it: `fs[i](k)` returns the function whose fixed point
-    is `k[i]`. First iterations then solve one block after another.
+    is `k[i]`. First iterations then solve one block after another. Nothing waits for the
+    solution where `options={"lost": flag}` is true, and there it is of no use.
 
     **Raises:** a `ValueError` for negative numbers.
     """
@@ -96,11 +97,12 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
     ) -> State:
         del f_struct, aux_struct, tags
         equations = _continuation.Equations(fn, args, options, y)
-        zero = jtu.tree_map(jnp.zeros_like, y)
+        lost = options.get("lost", jnp.array(False))
+        begin = Found(jtu.tree_map(jnp.zeros_like, y), solved=lost, near=~lost)
         if "blocks" in options:
-            found = sweep_blocks(self, options["blocks"], zero, equations.scale)
+            found = sweep_blocks(self, options["blocks"], begin, equations.scale)
         else:
-            found = sweep(self, equations.image, zero, equations.scale)
+            found = sweep(self, equations.image, begin, equations.scale)
         use = lambda k: jnp.where(found.solved | found.near, k, 0)
         k = jfu.ravel_pytree(jtu.tree_map(use, found.y))[0]
         return State(y, _continuation.begin(k, found.solved))

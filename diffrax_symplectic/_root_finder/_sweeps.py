@@ -112,9 +112,11 @@ def _while_any(advance: Callable[[_Rounds], _Rounds], first: _Rounds) -> Found:
     return Found(last.y, last.solved, last.near)
 
 
-def sweep(finder: "PicardNewton", image: _Map, y: PyTree[Array], scale: _Map) -> Found:
-    r"""Solves $y = \Phi(y)$ by $y \leftarrow y + M (\Phi(y) - y)$: fixed-point iteration
-    with $M = 1$, and chord iteration with $M = (1 - \Phi')^{-1}$ where that is slow."""
+def sweep(finder: "PicardNewton", image: _Map, begin: Found, scale: _Map) -> Found:
+    r"""From where it `begin`s, solves $y = \Phi(y)$ by $y \leftarrow y + M (\Phi(y) - y)$:
+    fixed-point iteration with $M = 1$, and chord iteration with $M = (1 - \Phi')^{-1}$
+    where that is slow."""
+    y = begin.y
     n = sum(x.size for x in jtu.tree_leaves(y))
     direct = n <= finder.direct and finder.linear_solver is None
     if direct and n <= _AT_ONCE:
@@ -125,10 +127,9 @@ def sweep(finder: "PicardNewton", image: _Map, y: PyTree[Array], scale: _Map) ->
         last, whole = sizes((swept**ω - before**ω).ω), sizes((swept**ω - y**ω).ω)
         settled = largest(last) < _SETTLED * largest(whole)
         y = jtu.tree_map(lambda a, b: jnp.where(settled, a, b), swept, y)
-        yes = jnp.array(True)
-        return _by_chords(finder, image, scale, Found(y, ~yes, yes))
+        return _by_chords(finder, image, scale, begin._replace(y=y))
     slow = _SLOW if direct else finder.picard_steps
-    found = _by_sweeps(_Look(finder, scale, slow), image, y)
+    found = _by_sweeps(_Look(finder, scale, slow), image, begin)
     if not direct:
         return found
     rest = lambda found: _by_chords(finder, image, scale, found)
@@ -146,24 +147,24 @@ def _fixed_point(
 def sweep_blocks(
     finder: "PicardNewton",
     blocks: Sequence[Callable[[list[PyTree[Array]]], _Map]],
-    y: list[PyTree[Array]],
+    begin: Found,
     scale: _Map,
 ) -> Found:
     """The same for equations in blocks, of which each reads those before it. For each there
     is a function that makes its `image` from the values of all."""
     solved = near = jnp.array(True)
-    y = list(y)
+    y = list(begin.y)
     for i, block in enumerate(blocks):
         if len(y[i]) == 0:
             continue
         own = lambda k, i=i: scale([*y[:i], k, *y[i + 1 :]])[i]
-        found = sweep(finder, block(y), y[i], own)
+        found = sweep(finder, block(y), begin._replace(y=y[i]), own)
         y[i] = found.y
         solved, near = solved & found.solved, near & (found.solved | found.near)
     return Found(y, solved, near)
 
 
-def _by_sweeps(look: _Look, image: _Map, y: PyTree[Array]) -> Found:
+def _by_sweeps(look: _Look, image: _Map, begin: Found) -> Found:
     def advance(rounds: _Rounds) -> _Rounds:
         first = rounds.step == 0
         count = jnp.where(first, 1 + _FIRST, _MORE)
@@ -177,9 +178,9 @@ def _by_sweeps(look: _Look, image: _Map, y: PyTree[Array]) -> Found:
         root = lambda x: jnp.where(first, jnp.sqrt(fourth(x)), fourth(x))
         return look.at(y, change, earlier, root, rounds.step + count)
 
-    dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).dtype
-    no, yes = jnp.array(False), jnp.array(True)
-    return _while_any(advance, _Rounds(y, jnp.zeros((), dtype), no, yes, yes, 0))
+    y, solved, near = begin
+    size = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(y)))
+    return _while_any(advance, _Rounds(y, size, solved, near, ~solved, 0))
 
 
 def _by_chords(

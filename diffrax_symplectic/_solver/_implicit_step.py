@@ -1,7 +1,7 @@
 """One step: its stage equations solved, and differentiated as what they define."""
 
 import functools as ft
-from typing import Any
+from typing import Any, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -9,43 +9,46 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
-from jaxtyping import Array, Bool
+from jaxtyping import Array, ArrayLike, Bool
 
 from .._compat import unsolved_step_result, ω
-from .._custom_types import BoolScalarLike, Y
+from .._custom_types import Y
 from .._plan import Plan
 from .._root_finder import all_finite, differentiate, PicardNewton
 from ._stages import closed, Stages, Step, Unknown
 
 
+# Whether stage equations were not solved; `None` where there are none.
+Unsolved: TypeAlias = Bool[ArrayLike, ""] | None
+
+
 def take_step(
-    plan: Plan, step: Step, y0: Y, solver: diffrax.AbstractSolver
-) -> tuple[Y, diffrax.RESULTS]:
-    """The end of the step, and whether it was reached. Implicit stages are solved by the
-    root finder of `solver`."""
+    plan: Plan,
+    step: Step,
+    y0: Y,
+    solver: diffrax.AbstractSolver,
+    unsolved: Unsolved = None,
+) -> tuple[Y, Unsolved]:
+    """The end of the step, and whether its stage equations were not solved. The root finder
+    of `solver` solves them, unless those of an earlier step were already `unsolved`."""
     if plan.num_unknown == 0:
-        y1, unsolved = Stages(plan, step, y0).end([[]] * len(plan.blocks)), False
-    elif not isinstance(solver, diffrax.AbstractImplicitSolver):
+        return Stages(plan, step, y0).end([[]] * len(plan.blocks)), unsolved
+    if not isinstance(solver, diffrax.AbstractImplicitSolver):
         raise ValueError(
             f"The tableau of `{type(solver).__name__}` has implicit stages. Let the class "
             "also subclass `diffrax_symplectic.AbstractImplicitStages`."
         )
-    else:
-        finder, most = solver.root_finder, solver.root_find_max_steps
-        y1, unsolved = _traced_once(plan, step, y0, finder, most)
-    return y1, _result(unsolved, y1)
+    unsolved = jnp.array(False) if unsolved is None else jnp.asarray(unsolved)
+    finder, most = solver.root_finder, solver.root_find_max_steps
+    return _traced_once(plan, step, y0, unsolved, finder, most)
 
 
 # Diffrax traces a step three times, or more.
 @eqx.filter_jit
-def _traced_once(plan: Plan, step: Step, y0: Y, finder: Any, max_steps: int):
+def _traced_once(plan: Plan, step: Step, y0: Y, lost, finder: Any, max_steps: int):
     stages = Stages(plan, closed(step, y0), y0)
-    y1, _, unsolved = _implicit_step(stages, finder=finder, max_steps=max_steps)
+    y1, _, unsolved = _implicit_step(stages, lost, finder=finder, max_steps=max_steps)
     return y1, unsolved
-
-
-def first_failure(first: diffrax.RESULTS, then: diffrax.RESULTS) -> diffrax.RESULTS:
-    return diffrax.RESULTS.where(first == diffrax.RESULTS.successful, then, first)
 
 
 _UNSOLVED = (
@@ -55,19 +58,21 @@ _UNSOLVED = (
 )
 
 
-def _result(unsolved: BoolScalarLike, y1: Y) -> diffrax.RESULTS:
+def result_of(unsolved: Unsolved, y1: Y) -> diffrax.RESULTS:
+    """Whether the end of a step was reached."""
     R = diffrax.RESULTS
-    stuck = unsolved_step_result(_UNSOLVED)
     finite = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
-    return R.where(unsolved, stuck, finite)
+    if unsolved is None:
+        return finite
+    return R.where(unsolved, unsolved_step_result(_UNSOLVED), finite)
 
 
 @eqx.filter_custom_jvp
 def _implicit_step(
-    stages: Stages, *, finder: Any, max_steps: int
+    stages: Stages, lost: Bool[Array, ""], *, finder: Any, max_steps: int
 ) -> tuple[Y, Unknown, Bool[Array, ""]]:
     """The end of the step, the values of its unknown stages, and whether these do not
-    solve the stage equations."""
+    solve the stage equations. No time is spent on a path that is `lost`."""
     if isinstance(finder, optx.BestSoFarRootFinder):
         raise ValueError(
             "`BestSoFarRootFinder` returns an iterate from before the last correction. It "
@@ -84,18 +89,23 @@ def _implicit_step(
         guess,
         args=stages,
         options=dict(
-            scale=stages.scale, blocks=[ft.partial(stages.image_of, i) for i in numbers]
+            scale=stages.scale,
+            blocks=[ft.partial(stages.image_of, i) for i in numbers],
+            lost=lost,
         ),
         max_steps=max_steps,
         throw=False,
     )
-    return stages.end(sol.value), sol.value, sol.result != optx.RESULTS.successful
+    unsolved = lost | (sol.result != optx.RESULTS.successful)
+    return stages.end(sol.value), sol.value, unsolved
 
 
 @_implicit_step.def_jvp
 def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
-    (stages,), (t_stages,) = primals, tangents
-    y1, unknown, unsolved = _implicit_step(stages, finder=finder, max_steps=max_steps)
+    (stages, lost), (t_stages, _) = primals, tangents
+    y1, unknown, unsolved = _implicit_step(
+        stages, lost, finder=finder, max_steps=max_steps
+    )
     # Where there is no solution there is no derivative either. It is zero for such a
     # path, and no number that is not finite spoils what other paths have in common with it.
     failed = unsolved | ~all_finite(y1)

@@ -10,8 +10,9 @@ from typing import Any, ClassVar, TYPE_CHECKING, TypeAlias
 import diffrax
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import PRNGKeyArray, PyTree
+from jaxtyping import ArrayLike, Bool, PRNGKeyArray, PyTree
 
 from .._brownian import path_of, VARIABLES
 from .._conditions import drift_order
@@ -27,7 +28,7 @@ from .._terms import (
     number_of_noises,
     split_terms,
 )
-from ._implicit_step import take_step
+from ._implicit_step import result_of, take_step
 from ._record import depends_on_noises, Record, Want
 from ._stages import Step
 
@@ -37,7 +38,9 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractVar
 
-SolverState: TypeAlias = None
+# Of solvers with implicit stages: whether a step of this path was not solved. In a batch
+# Diffrax goes on to step paths that have ended, and drops what comes out.
+SolverState: TypeAlias = Bool[ArrayLike, ""] | None
 
 
 class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
@@ -185,7 +188,7 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         drift, noise = split_terms(terms)
         name = type(self).__name__
         check_structure(self.structure, drift, noise, t0, y0, args, name)
-        return None
+        return first_state(self)
 
     def step(
         self,
@@ -197,15 +200,21 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         solver_state: SolverState,
         made_jump: BoolScalarLike,
     ) -> tuple[Y, None, DenseInfo, SolverState, diffrax.RESULTS]:
-        del solver_state, made_jump
+        del made_jump
         drift, noise = split_terms(terms)
         plan = make_plan(_drop_absent(self.tableau.flatten(), drift, noise))
         variables = _variables(plan.tableau)
         driven = {"h": drift_driven(drift, t0, t1, args)} if drift else {}
         name = type(self).__name__
         driven |= noise_driven(drift, noise, variables, t0, t1, args, name)
-        y1, result = take_step(plan, Step(t0, t1 - t0, driven), y0, self)
-        return y1, None, dict(y0=y0, y1=y1), None, result
+        step = Step(t0, t1 - t0, driven)
+        y1, unsolved = take_step(plan, step, y0, self, solver_state)
+        return y1, None, dict(y0=y0, y1=y1), unsolved, result_of(unsolved, y1)
+
+
+def first_state(solver: AbstractSymplecticSolver) -> SolverState:
+    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+    return jnp.array(False) if implicit else None
 
 
 def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTableau:

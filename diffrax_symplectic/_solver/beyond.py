@@ -3,7 +3,6 @@
 import dataclasses
 from typing import ClassVar
 
-import diffrax
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -21,7 +20,7 @@ from .._terms import (
     number_of_noises,
     split_terms,
 )
-from ._implicit_step import first_failure, take_step
+from ._implicit_step import result_of, take_step
 from ._record import Record
 from ._stages import Step
 from .base import (
@@ -29,6 +28,7 @@ from .base import (
     AbstractSymplecticRungeKutta,
     AbstractSymplecticSolver,
     ARGUMENTS,
+    first_state,
 )
 from .general import ImplicitMidpoint
 
@@ -165,30 +165,29 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     def init(self, terms, t0, t1, y0, args):
         del t0, t1
         check_state(y0, type(self).__name__)
-        return None
+        return first_state(self)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        del solver_state, made_jump
+        del made_jump
         drift, _ = split_terms(terms)
         middle = t0 + (t1 - t0) / 2
 
-        def along_drift(t0, t1, y):
+        def along_drift(t0, t1, y, unsolved):
             if len(drift) == 0:
-                return y, diffrax.RESULTS.successful
+                return y, unsolved
             step = Step(t0, t1 - t0, {"h": drift_driven(drift, t0, t1, args)})
-            return take_step(_flow, step, y, self)
+            return take_step(_flow, step, y, self, unsolved)
 
-        y, first = along_drift(t0, middle, y0)
-        y, second = self._along_noise(terms, t0, t1, middle, y, args)
-        y1, third = along_drift(middle, t1, y)
-        result = first_failure(first_failure(first, second), third)
-        return y1, None, dict(y0=y0, y1=y1), None, result
+        y, unsolved = along_drift(t0, middle, y0, solver_state)
+        y, unsolved = self._along_noise(terms, t0, t1, middle, y, args, unsolved)
+        y1, unsolved = along_drift(middle, t1, y, unsolved)
+        return y1, None, dict(y0=y0, y1=y1), unsolved, result_of(unsolved, y1)
 
-    def _along_noise(self, terms, t0, t1, time, y0, args):
+    def _along_noise(self, terms, t0, t1, time, y, args, unsolved):
         """The flows of all noises, the time standing still at `time`."""
         _, noise = split_terms(terms)
         if len(noise) == 0:
-            return y0, diffrax.RESULTS.successful
+            return y, unsolved
         m = number_of_noises(terms)
         # The flows of several noises have an order, for which a coin is needed.
         names = ["W", "two_point"] if m > 1 else ["W"]
@@ -200,17 +199,13 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
             numbers = jnp.where(coin, numbers, numbers[::-1])
 
         def flow(carry, this):
-            y, result = carry
             driven = jtu.Partial(apply_one, noise, *this, args)
             step = Step(time, 0 * (t1 - t0), {"h": driven})
-            y, flowed = take_step(_flow, step, y, self)
-            return (y, first_failure(result, flowed)), None
+            return take_step(_flow, step, carry[0], self, carry[1]), None
 
-        carry = (y0, diffrax.RESULTS.successful)
         unroll = m if m <= _WRITTEN_OUT else 1
         flows = (numbers, increments[numbers])
-        (y1, result), _ = jax.lax.scan(flow, carry, flows, unroll=unroll)
-        return y1, result
+        return jax.lax.scan(flow, (y, unsolved), flows, unroll=unroll)[0]
 
 
 NinomiyaVictoir.__init__.__doc__ = ARGUMENTS
