@@ -201,8 +201,8 @@ def main() -> None:
     lines = [
         "# Speed",
         "",
-        f"Nanoseconds per path and step. {machine()}. float64, h = {H}, {STEPS} steps, best "
-        "of 7 runs; the solvers of a table take turns. Diffrax's fastest path is "
+        f"Nanoseconds per path and step. {machine()}. float64, h = {H}, {STEPS} steps, "
+        "best of 7 runs; the solvers of a table take turns. Diffrax's fastest path is "
         "`UnsafeBrownianPath`; all other Gaussian increments come from "
         "`FixedStepBrownianPath`. Compilation is the processor time to trace and compile "
         "the solve of 1,000 paths. Made by `python -m examples.benchmarks.speed`.",

@@ -42,10 +42,10 @@ def main() -> None:
         "# Tolerance of the root finder",
         "",
         f"{machine()}. `ImplicitMidpoint(root_finder=PicardNewton(rtol=...))` on d coupled "
-        f"oscillators with one noise; float64, h = {H}, {STEPS:,} steps, {PATHS} paths. The "
-        "default tolerance, `None`, is two units in the last place. The drift is the root "
-        "mean square of the relative change of $|p|^2 + |q|^2$, which the exact solution "
-        "keeps. Made by `python -m examples.benchmarks.tolerance`.",
+        f"oscillators with one noise; float64, h = {H}, {STEPS:,} steps, {PATHS} paths. "
+        "The default tolerance, `None`, is two units in the last place. The drift is the "
+        "root mean square of the relative change of $|p|^2 + |q|^2$, which the exact "
+        "solution keeps. Made by `python -m examples.benchmarks.tolerance`.",
         "",
         "| d | rtol | µs per path and step | ratio to default | drift |",
         "|---|---|---|---|---|",
