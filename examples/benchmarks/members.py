@@ -299,12 +299,12 @@ def main() -> None:
         "# Members of families",
         "",
         "The order conditions leave parameters free. Each family was tried on six "
-        "problems, with a strong and a weak noise. Errors are relative to one member, whose row "
-        "is 1.00. For weak families the error is the exact local error at h = 0.01, root "
-        "mean square over eight starts and all first and second moments; for strong families "
-        "the root-mean-square error of 400 paths at t = 1, h = 1/16. The table has the "
-        "smallest and largest ratio of the problems with the strong noise, and the geometric "
-        "means for both noises, whose strengths the columns name. Made by "
+        "problems, with a strong and a weak noise. Errors are relative to one member, "
+        "whose row is 1.00. For weak families the error is the exact local error at h = "
+        "0.01, root mean square over eight starts and all first and second moments; for "
+        "strong families the root-mean-square error of 400 paths at t = 1, h = 1/16. The "
+        "table has the smallest and largest ratio of the problems with the strong noise, "
+        "and the geometric means for both noises, whose strengths the columns name. Made by "
         "`python -m examples.benchmarks.members`.",
         "",
     ]
