@@ -304,8 +304,8 @@ def main() -> None:
         "0.01, root mean square over eight starts and all first and second moments; for "
         "strong families the root-mean-square error of 400 paths at t = 1, h = 1/16. The "
         "table has the smallest and largest ratio of the problems with the strong noise, "
-        "and the geometric means for both noises, whose strengths the columns name. Made by "
-        "`python -m examples.benchmarks.members`.",
+        "and the geometric means for both noises, whose strengths the columns name. Made "
+        "by `python -m examples.benchmarks.members`.",
         "",
     ]
     for title, scenes, order, (names, members) in weak:
