@@ -199,5 +199,6 @@ def section(page: Page) -> str:
     picture = _picture(page, hs, strengths, kept)
     return fill(__file__, 
         table=shown, picture=picture, steps=f"{steps:,}", h=f"{hs[i]:.2g}",
-        s=f"{strengths[j]:.2g}", given_up=f"{100 * given_up:.2f}", error=f"{100 * error:.2f}",
+        s=f"{strengths[j]:.2g}", given_up=f"{100 * given_up:.2f}",
+        error=f"{100 * error:.2f}",
     )  # fmt: skip
