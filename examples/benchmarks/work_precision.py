@@ -263,9 +263,9 @@ def programs() -> dict[Any, Program]:
 
 
 def draw(axes, title: str, results: dict[str, tuple[float, Errors]]) -> list[str]:
-    """Draws errors against seconds, and returns rows of the table. A point that is not
+    """Draws errors against seconds, and returns a table. A point that is not
     clear of its own error bar is not drawn: it says nothing."""
-    lines = []
+    lines = ["", f"## {title}", "", "| solver | error | µs |", "|---" * 3 + "|"]
     for i, (name, (cost, e)) in enumerate(results.items()):
         seconds, clear = cost / e.hs, e.errors > 3 * e.std_errors
         style = "--" if name in dir(diffrax) and name != "ImplicitMidpoint" else "-"
@@ -274,12 +274,7 @@ def draw(axes, title: str, results: dict[str, tuple[float, Errors]]) -> list[str
             color=f"C{i}", ls=style, marker="o", ms=3, lw=1, capsize=2,
         )  # fmt: skip
         bar = f" ± {e.std_errors[SHOWN]:.0e}" if e.std_errors[SHOWN] > 0 else ""
-        cells = (
-            title,
-            name,
-            f"{e.errors[SHOWN]:.1e}{bar}",
-            f"{seconds[SHOWN] * 1e6:.2f}",
-        )
+        cells = name, f"{e.errors[SHOWN]:.1e}{bar}", f"{seconds[SHOWN] * 1e6:.2f}"
         lines.append("| " + " | ".join(cells) + " |")
     axes.set(xscale="log", yscale="log", xlabel="CPU seconds per path", title=title)
     axes.legend(fontsize=7)
@@ -297,13 +292,10 @@ def main() -> None:
         "Strong errors are root mean squares over 500 Brownian paths (`compare_solvers`).",
         "Bars are three standard errors; points within their bar of zero are not drawn.",
         "Times are of one core, in batches of 10,000 paths. All solvers were timed in",
-        "turn, so that ratios are more certain than times. The table has weak errors at",
-        f"h = 1/{1 / HS[SHOWN]:g} and strong ones at h = 1/{1 / HS[1 + SHOWN]:g}.",
+        "turn, so that ratios are more certain than times. Tables have weak errors at",
+        f"h = 1/{1 / HS[SHOWN]:g} and strong ones at h = 1/{1 / HS[1 + SHOWN]:g}, and microseconds per path.",
         "",
         "![Errors against CPU seconds per path](work_precision.png)",
-        "",
-        "| error, model | solver | error | microseconds per path |",
-        "|---" * 4 + "|",
     ]
     figure, axes = plt.subplots(5, 2, figsize=(11, 22), layout="constrained")
     seconds = costs(programs())
@@ -311,7 +303,7 @@ def main() -> None:
         for ax, model in zip(column, STRONG):
             errors = kept(kind, model).items()
             results = {name: (seconds[kind, model, name], e) for name, e in errors}
-            lines += draw(ax, f"{kind}, {model}", results)
+            lines += draw(ax, f"{kind.title()} error, {model}", results)
     DOCS.mkdir(parents=True, exist_ok=True)
     figure.savefig(DOCS / "work_precision.png", dpi=90)
     (DOCS / "work_precision.md").write_text("\n".join(lines) + "\n")
