@@ -271,8 +271,8 @@ def orderings() -> tuple[list[str], Member]:
         for rows in itertools.permutations((1, 2, 3, 4))
     ]
     names = ["".join(map(str, r)) + (" conjugate" if c else "") for r, c in cases]
+    names[names.index("".join(map(str, ds.SRKw2().rows)))] += " (default)"
     names[0] += " (paper)"
-    names[cases.index((ds.SRKw2().rows, ds.SRKw2().conjugate))] += " (default)"
     return names, stack([ds.SRKw2(rows=r, conjugate=c).tableau for r, c in cases])
 
 

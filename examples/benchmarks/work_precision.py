@@ -293,7 +293,8 @@ def main() -> None:
         "Bars are three standard errors; points within their bar of zero are not drawn.",
         "Times are of one core, in batches of 10,000 paths. All solvers were timed in",
         "turn, so that ratios are more certain than times. Tables have weak errors at",
-        f"h = 1/{1 / HS[SHOWN]:g} and strong ones at h = 1/{1 / HS[1 + SHOWN]:g}, and microseconds per path.",
+        f"h = 1/{1 / HS[SHOWN]:g} and strong ones at h = 1/{1 / HS[1 + SHOWN]:g}, "
+        "and microseconds per path.",
         "",
         "![Errors against CPU seconds per path](work_precision.png)",
     ]

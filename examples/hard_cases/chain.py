@@ -163,11 +163,8 @@ def section(page: Page) -> str:
     picture = page.picture(figure, "chain", "Chain of 32 oscillators")
     plt.close(figure)
     shown = table(("solver", *[f"h = {h:g}" for h in hs]), rows)
-    defects = [
-        f"{x:.0e}" for x in symplecticity(ds.ImplicitMidpoint(), (0.1, 0.4), args)
-    ]
     return fill(__file__, 
         table=shown, picture=picture, t1=f"{t1:g}", paths=paths, midpoint=midpoint,
         heun=heun, sizes=" and ".join(map(str, sizes)),
-        heat=f"{N * args.s**2 / 2 * t1:g}", s=args.s, defects=" and ".join(defects),
+        heat=f"{N * args.s**2 / 2 * t1:g}", s=args.s,
     )  # fmt: skip

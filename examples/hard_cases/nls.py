@@ -141,7 +141,9 @@ def section(page: Page) -> str:
             r = lattice(SOLVERS[name], h, t1, paths, s)
             shown = abs(r.balance.value) < 1e3
             error = f"{r.norm_error:.1e}" if np.isfinite(r.norm_error) else "overflow"
-            rows.append((name, h, error, str(r.balance) if shown else "overflow"))
+            if h in (hs[0], hs[-1]):
+                balance = str(r.balance) if shown else "overflow"
+                rows.append((name, h, error, balance))
             errors.append(r.norm_error)
             assert r.failed == 0
             if h == 0.01:
