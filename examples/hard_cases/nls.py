@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import diffrax
 import jax.numpy as jnp
+import lineax as lx
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -117,12 +118,15 @@ def lattice(solver, h: float, t1: float, paths: int, s: float, n: int = N) -> La
     return Lattice(error, balance, density, float(np.mean(failed)))
 
 
+# No dense matrix of 2,048 unknowns, should fixed points not contract.
+_MATRIX_FREE = ds.PicardNewton(linear_solver=lx.GMRES(rtol=1e-9, atol=1e-9))
 SOLVERS = {
-    "ImplicitMidpoint": ds.ImplicitMidpoint(),
+    "ImplicitMidpoint": ds.ImplicitMidpoint(root_finder=_MATRIX_FREE),
     "LinearFlow(ImplicitMidpoint)": ds.LinearFlow(
         ds.ImplicitMidpoint(), hopping_flow()
     ),
     "Heun": diffrax.Heun(),
+    "EulerHeun": diffrax.EulerHeun(),
 }
 
 
