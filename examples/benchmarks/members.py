@@ -235,7 +235,7 @@ WEAK, STRONG = (1.0, 0.3), (0.3, 0.1)
 
 
 def table(title, names, scenes, errors: Callable, strengths: tuple[float, float]):
-    """Errors relative to the first member; it, the default and the best three."""
+    """Errors relative to the first member; it, the default and the best two."""
     relative = []
     for strength in strengths:
         absolute = [errors(scene, strength) for scene in scenes]
@@ -245,7 +245,7 @@ def table(title, names, scenes, errors: Callable, strengths: tuple[float, float]
     lines = [f"## {title}", "", _row(head), "|---" * len(head) + "|"]
     order = np.argsort(sum(map(np.log, means)), kind="stable").tolist()
     for place, i in enumerate(order):
-        if place < 3 or i == 0 or "default" in names[i]:
+        if place < 2 or i == 0 or "default" in names[i]:
             worst = np.min(relative[0][i]), np.max(relative[0][i])
             cells = [f"{x:.2f}" for x in (*worst, *(mean[i] for mean in means))]
             lines.append(_row([names[i], *cells]))
