@@ -146,8 +146,8 @@ def section(page: Page) -> str:
     picture = page.picture(figure, "magnet", "Heisenberg magnet at a temperature")
     plt.close(figure)
     header = (
-        "T", "energy, spin_terms", "energy, Monte Carlo", "magnetization, spin_terms",
-        "magnetization, Monte Carlo", "length",
+        "T", "$E$, spin_terms", "$E$, Monte Carlo", "$M$, spin_terms",
+        "$M$, Monte Carlo", "length",
     )  # fmt: skip
     return fill(
         __file__, table=table(header, rows), picture=picture, h=h, B=B, alpha=ALPHA,
