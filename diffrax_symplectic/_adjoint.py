@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, PyTree
 
 from ._arguments import whole_number
 from ._compat import nondifferentiable_backward, reversed_in_time, while_loop, ω
+from ._conditions import is_own_inverse
 from ._custom_types import IntScalarLike, RealScalarLike, Y
-from ._own_inverse import is_own_inverse
 from ._plan import make_plan
 from ._solver import (
     AbstractSplitting,

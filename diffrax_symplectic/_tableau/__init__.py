@@ -8,15 +8,15 @@ order the implicit ones are solved for can then be read off that one matrix, by 
 the same for all families.
 """
 
-from ._additive import AdditiveTableau as AdditiveTableau
+from ._families import AdditiveTableau as AdditiveTableau
 from ._flat import (
     AbstractTableau as AbstractTableau,
     FlatTableau as FlatTableau,
     Stage as Stage,
     Structure as Structure,
 )
-from ._general import GeneralTableau as GeneralTableau
-from ._separable import (
+from ._families import GeneralTableau as GeneralTableau
+from ._families import (
     PartitionedTableau as PartitionedTableau,
     SeparableTableau as SeparableTableau,
 )

@@ -1,0 +1,304 @@
+"""Coefficients by the structure of the system: any, separable, additive noise."""
+
+import dataclasses
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float
+
+from ._flat import (
+    AbstractTableau,
+    check_all,
+    check_by_variable,
+    Coefficients,
+    CoefficientsByVariable,
+    columns,
+    FlatTableau,
+    Stage,
+    Structure,
+    variables_of,
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class GeneralTableau(AbstractTableau):
+    r"""Coefficients for a Stratonovich system without further structure, with `s` drift
+    and `r` noise stages.
+
+    In the form of Rößler (2007), equations (2.6)-(2.7) of Wang, Hong and Xu (2017),
+
+    $$G^0_i = y_n + h \sum_j A^0_{ij} a(t_n + c^0_j h, G^0_j)
+      + \sum_l \sum_j B^0_{ij} b_l(t_n + c^1_j h, G^l_j) I_l$$
+
+    $$G^k_i = y_n + h \sum_j A^1_{ij} a(t_n + c^0_j h, G^0_j)
+      + \sum_j B^1_{ij} b_k(t_n + c^1_j h, G^k_j) I_k
+      + \sum_{l \neq k} \sum_j B^3_{ij} b_l(t_n + c^1_j h, G^l_j) I_l$$
+
+    $$y_{n+1} = y_n + h \sum_i \alpha_i a(t_n + c^0_i h, G^0_i)
+      + \sum_k \sum_i \beta_i b_k(t_n + c^1_i h, G^k_i) I_k$$
+
+    with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$. Here $B^3 = B^1$: with that choice
+    the stages $G^k_i$ are the same vector for every $k$, a step costs the same whatever
+    the number of noises, and the condition on $B^3$ follows from the one on $B^1$.
+
+    **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
+    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`, `B1` of shape `(r, r)`;
+    `noise`, the random variables that drive the noise stages: `("W",)`, of which `"W"` is
+    $I_k$, or `("W", "A")` for $\sum_k b_k I_k + \sum_{k<l} [b_k, b_l] A_{kl}$, with the
+    Lie brackets $[b_k, b_l] = b_l' b_k - b_k' b_l$ and the Lévy areas $A_{kl}$ of a
+    [`diffrax_symplectic.LevyAreaIncrement`][], or `("W", "L")` for
+    $\sum_k b_k I_k + h \sum_k [b_k, a] H_k + \sum_{k, l} [b_k, [b_l, a]] L_{kl}$ with the
+    variables of [`diffrax_symplectic.PlateauGauss`][].
+
+    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
+    real numbers.
+    """
+
+    structure: ClassVar[Structure] = "any"
+    alpha: Coefficients
+    beta: Coefficients
+    A0: Coefficients
+    B0: Coefficients
+    A1: Coefficients
+    B1: Coefficients
+    noise: tuple[str, ...] = ("W",)
+
+    def __post_init__(self):
+        s, r = np.size(self.alpha), np.size(self.beta)
+        check_all(
+            self, alpha=(s,), beta=(r,), A0=(s, s), B0=(s, r), A1=(r, s), B1=(r, r)
+        )
+
+    @classmethod
+    def strong(cls, A, B, alpha, beta) -> "GeneralTableau":
+        r"""The form of Burrage and Burrage (2000), equations (2.14)-(2.15) of Wang,
+        Hong and Xu (2017), in which drift and noise are evaluated at the same points:
+
+        $$G_i = y_n + h \sum_j A_{ij} a(G_j) + \sum_k \sum_j B_{ij} b_k(G_j) I_k$$
+
+        **Arguments:** `A` and `B` of shape `(s, s)`, `alpha` and `beta` of shape `(s,)`.
+        """
+        return cls(alpha=alpha, beta=beta, A0=A, B0=B, A1=A, B1=B)
+
+    @property
+    def c0(self) -> Float[np.ndarray, " s"]:
+        """Times of the drift stages, as fractions of the step."""
+        return self.A0.sum(axis=1)
+
+    @property
+    def c1(self) -> Float[np.ndarray, " r"]:
+        """Times of the noise stages, as fractions of the step."""
+        return self.A1.sum(axis=1)
+
+    def flatten(self) -> FlatTableau:
+        stages = [Stage(("h",), float(c), "y", "y") for c in self.c0]
+        stages += [Stage(self.noise, float(c), "y", "y") for c in self.c1]
+        return FlatTableau(
+            stages=tuple(stages),
+            matrix=np.block([[self.A0, self.B0], [self.A1, self.B1]]),
+            weights=np.concatenate([self.alpha, self.beta]),
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SeparableTableau(AbstractTableau):
+    r"""Coefficients for $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$, with `s` drift
+    and `r` noise stages.
+
+    With $f = -\partial U_0 / \partial q$, $g = \partial V / \partial p$ and
+    $\sigma_k = -\partial U_k / \partial q$, equations (3.4)-(3.5) and (3.13)-(3.14) of
+    Wang, Hong and Xu (2017) are
+
+    $$p_i = P + h \sum_j A^0_{ij} f(t_n + c^0_j h, q_j)
+      + \sum_k \sum_j B^0_{ij} \sigma_k(t_n + c^1_j h, \bar q_j) I_k$$
+
+    $$q_i = Q + h \sum_j A^0_{ij} g(p_j), \qquad
+      \bar q_i = Q + h \sum_j A^1_{ij} g(p_j)$$
+
+    $$P_1 = P + h \sum_i \alpha_i f(t_n + c^0_i h, q_i)
+      + \sum_k \sum_i \beta_i \sigma_k(t_n + c^1_i h, \bar q_i) I_k, \qquad
+      Q_1 = Q + h \sum_i \alpha_i g(p_i)$$
+
+    with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$.
+
+    **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
+    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`. `beta` and `B0` may also be
+    dictionaries from the names of several random variables, of which `"W"` is $I_k$, to
+    such arrays: then the equations hold with a sum over these.
+
+    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
+    real numbers.
+    """
+
+    structure: ClassVar[Structure] = "separable"
+    alpha: Coefficients
+    beta: CoefficientsByVariable
+    A0: Coefficients
+    B0: CoefficientsByVariable
+    A1: Coefficients
+
+    def __post_init__(self):
+        s, r = np.size(self.alpha), len(self.A1)
+        check_all(self, alpha=(s,), A0=(s, s), A1=(r, s))
+        check_by_variable(self, beta=(r,), B0=(s, r))
+
+    @property
+    def c0(self) -> Float[np.ndarray, " s"]:
+        """Times of the drift stages, as fractions of the step."""
+        return self.A0.sum(axis=1)
+
+    @property
+    def c1(self) -> Float[np.ndarray, " r"]:
+        """Times of the noise stages, as fractions of the step."""
+        return self.A1.sum(axis=1)
+
+    def partitioned(self) -> "PartitionedTableau":
+        """The same method with its coefficients for velocities written out."""
+        return PartitionedTableau(
+            alpha=self.alpha,
+            alpha_hat=self.alpha,
+            beta=self.beta,
+            A=self.A0,
+            A_hat=self.A0,
+            B0=self.B0,
+            A1=self.A1,
+        )
+
+    def flatten(self) -> FlatTableau:
+        return self.partitioned().flatten()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PartitionedTableau(AbstractTableau):
+    r"""As [`diffrax_symplectic.SeparableTableau`][], with coefficients $A$ and $\alpha$ for
+    the forces $f$ and others, $\hat A$ and $\hat \alpha$, for the velocities $g$: what
+    explicit symplectic methods need.
+
+    $$p_i = P + h \sum_j A_{ij} f(t_n + \hat c_j h, q_j)
+      + \sum_k \sum_j B^0_{ij} \sigma_k(t_n + c^1_j h, \bar q_j) I_k, \qquad
+      q_i = Q + h \sum_j \hat A_{ij} g(p_j)$$
+
+    with stage times $\hat c = \hat A e$ and $c^1 = A^1 e$. The other equations are those
+    of `SeparableTableau`.
+
+    **Arguments:** for `s` forces, `v` velocities and `r` noise stages: `alpha` of shape
+    `(s,)`, `alpha_hat` of shape `(v,)`, `beta` of shape `(r,)`, `A` of shape `(v, s)`,
+    `A_hat` of shape `(s, v)`, `B0` of shape `(v, r)`, `A1` of shape `(r, v)`; `beta` and
+    `B0` possibly by random variable.
+
+    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
+    real numbers.
+    """
+
+    structure: ClassVar[Structure] = "separable"
+    alpha: Coefficients
+    alpha_hat: Coefficients
+    beta: CoefficientsByVariable
+    A: Coefficients
+    A_hat: Coefficients
+    B0: CoefficientsByVariable
+    A1: Coefficients
+
+    def __post_init__(self):
+        s, v, r = np.size(self.alpha), np.size(self.alpha_hat), len(self.A1)
+        check_all(self, alpha=(s,), alpha_hat=(v,), A=(v, s), A_hat=(s, v), A1=(r, v))
+        check_by_variable(self, beta=(r,), B0=(v, r))
+
+    @property
+    def c_hat(self) -> Float[np.ndarray, " s"]:
+        """Times of the forces, as fractions of the step."""
+        return self.A_hat.sum(axis=1)
+
+    @property
+    def c1(self) -> Float[np.ndarray, " r"]:
+        """Times of the noise stages, as fractions of the step."""
+        return self.A1.sum(axis=1)
+
+    def flatten(self) -> FlatTableau:
+        s, v, r = len(self.alpha), len(self.alpha_hat), len(self.A1)
+        names = variables_of(self.B0, self.beta)
+        B0 = columns(self.B0, names, (v, r))
+        A1 = np.concatenate([self.A1] * len(names))
+        # Forces come first. Where either forces or velocities may be solved for, this makes
+        # the forces the unknowns: they cost more to evaluate.
+        stages = [Stage(("h",), float(c), "q", "p") for c in self.c_hat]
+        # Velocities do not depend on time, so that all of their stages may have the time 0.
+        stages += [Stage(("h",), 0.0, "p", "q") for _ in range(v)]
+        stages += [
+            Stage((name,), float(c), "q", "p") for name in names for c in self.c1
+        ]
+        zeros, n = np.zeros, len(A1)
+        return FlatTableau(
+            stages=tuple(stages),
+            matrix=np.block(
+                [
+                    [zeros((s, s)), self.A_hat, zeros((s, n))],
+                    [self.A, zeros((v, v)), B0],
+                    [zeros((n, s)), A1, zeros((n, n))],
+                ]
+            ),
+            weights=np.concatenate(
+                [self.alpha, self.alpha_hat, columns(self.beta, names, (r,))]
+            ),
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class AdditiveTableau(AbstractTableau):
+    r"""Coefficients for noise that does not depend on the state, $b_k(t)$, with `s` drift
+    stages and `r` times at which the noise is read.
+
+    With several random variables $\xi^\nu_k$ in a step, equations (4.4)-(4.5) and
+    (4.8)-(4.9) of Wang, Hong and Xu (2017) are
+
+    $$G_i = y_n + h \sum_j A_{ij} a(t_n + c^0_j h, G_j)
+      + \sum_\nu \sum_k \sum_j B^\nu_{ij} b_k(t_n + c^1_j h)\, \xi^\nu_k$$
+
+    $$y_{n+1} = y_n + h \sum_i \alpha_i a(t_n + c^0_i h, G_i)
+      + \sum_\nu \sum_k \sum_j \beta^\nu_j b_k(t_n + c^1_j h)\, \xi^\nu_k$$
+
+    with stage times $c^0 = A e$. Symplecticity asks nothing of $B$ and $\beta$.
+
+    **Arguments:** `alpha` of shape `(s,)`, `A` of shape `(s, s)`, `c1` of shape `(r,)`;
+    `beta` and `B`, dictionaries from the names of random variables (attributes of the
+    Brownian increment, of which `"W"` is $I_k$) to arrays of shape `(r,)` and `(s, r)`, or
+    just such an array for `"W"`; `constant`, whether the noise must not depend on time
+    either.
+
+    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
+    real numbers.
+    """
+
+    alpha: Coefficients
+    beta: CoefficientsByVariable
+    A: Coefficients
+    B: CoefficientsByVariable
+    c1: Coefficients
+    constant: bool = False
+
+    def __post_init__(self):
+        s, r = np.size(self.alpha), np.size(self.c1)
+        check_all(self, alpha=(s,), A=(s, s), c1=(r,))
+        check_by_variable(self, beta=(r,), B=(s, r))
+
+    @property
+    def structure(self) -> Structure:
+        return "constant" if self.constant else "additive"
+
+    @property
+    def c0(self) -> Float[np.ndarray, " s"]:
+        """Times of the drift stages, as fractions of the step."""
+        return self.A.sum(axis=1)
+
+    def flatten(self) -> FlatTableau:
+        s, r = len(self.alpha), len(self.c1)
+        variables = variables_of(self.B, self.beta)
+        B = columns(self.B, variables, (s, r))
+        stages = [Stage(("h",), float(c), "y", "y") for c in self.c0]
+        stages += [Stage((v,), float(c), "", "y") for v in variables for c in self.c1]
+        n = len(variables) * r
+        return FlatTableau(
+            stages=tuple(stages),
+            matrix=np.block([[self.A, B], [np.zeros((n, s + n))]]),
+            weights=np.concatenate([self.alpha, columns(self.beta, variables, (r,))]),
+        )
