@@ -1,5 +1,5 @@
-"""Conditions on the coefficients of a tableau: for being symplectic, for its orders, and for
-undoing its own steps."""
+"""Conditions on the coefficients of a tableau: for being symplectic, for its orders, and
+for undoing its own steps."""
 
 import dataclasses
 import functools as ft

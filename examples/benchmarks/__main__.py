@@ -1,12 +1,22 @@
 """All benchmarks: `python -m examples.benchmarks`."""
 
-from . import ensemble, growth, members, speed, tolerance, total_error, work_precision
+from . import (
+    ensemble,
+    growth,
+    members,
+    speed,
+    step_sizes,
+    tolerance,
+    total_error,
+    work_precision,
+)
 
 
 def main() -> None:
     speed.main()
     ensemble.main()
     growth.main()
+    step_sizes.main()
     tolerance.main()
     members.main()
     work_precision.main()

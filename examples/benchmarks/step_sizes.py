@@ -1,0 +1,275 @@
+"""What a step costs, against its size and the number of unknowns:
+
+    python -m examples.benchmarks.step_sizes
+
+Writes `docs/benchmarks/step_sizes.md` and a picture.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from jax import lax
+
+import diffrax_symplectic as ds
+
+from ._timing import DOCS, keys, machine, race
+from .growth import chain, network, ring
+
+
+SIZES = (0.01, 0.05, 0.1, 0.2, 0.4)
+STEPS = 32
+
+
+class System(NamedTuple):
+    """`terms` makes them from a Brownian path, with any function around a Hamiltonian."""
+
+    title: str
+    terms: Callable
+    y0: Any
+    solvers: tuple[diffrax.AbstractSolver, ...]
+    paths: int
+    # The largest frequency near the initial state.
+    frequency: float
+    shape: tuple[int, ...] = ()
+
+
+def _quartic(t, p, q, args):
+    return jnp.sum(p**2 + q**2) / 2 + jnp.sum(p**4 + q**4) / 10
+
+
+def _henon_heiles(t, p, q, args):
+    return jnp.sum(p**2 + q**2) / 2 + q[0] ** 2 * q[1] - q[1] ** 3 / 3
+
+
+def _systems() -> list[System]:
+    of = lambda H0, noise: lambda path: ds.hamiltonian_terms(H0, noise, path)
+    one = jnp.array(0.0), jnp.array(1.0)
+    two = jnp.array([0.2, 0.1]), jnp.array([0.0, -0.15])
+    three = ds.ImplicitMidpoint(), ds.StrangGauss(), ds.SRKw2()
+    inertia = jnp.array([0.8, 0.6, 0.2])
+
+    def rigid_body(path):
+        turn = lambda t, y, args: jnp.cross(y, y / inertia)
+        kick = lambda t, y, args: 0.5 * jnp.cross(y, jnp.eye(3)[0])
+        return diffrax.MultiTerm(diffrax.ODETerm(turn), diffrax.ControlTerm(kick, path))
+
+    top = jnp.array([jnp.cos(1.1), 0.0, jnp.sin(1.1)])
+    kubo = of(_quartic, lambda t, p, q, args: 0.3 * _quartic(t, p, q, args))
+    pair = of(_quartic, lambda t, p, q, args: 0.3 * jnp.stack([p * q, q]))
+    stretch = of(_henon_heiles, lambda t, p, q, args: 0.2 * jnp.sum(p * q))
+    kicks = of(_henon_heiles, lambda t, p, q, args: 0.1 * jnp.sum(q))
+    systems = [
+        System("quartic Kubo oscillator", kubo, one, three, 512, 1.4),
+        System(
+            "the same, two noises", pair, one, (ds.NinomiyaVictoir(),), 512, 1.4, (2,)
+        ),
+        System("Hénon-Heiles", stretch, two, three, 512, 1.0),
+        System("Hénon-Heiles, kicks", kicks, two, (ds.AdditiveGauss(),), 512, 1.0),
+        System("rigid body", rigid_body, top, three, 512, 4.0),
+    ]
+    several = ds.ImplicitMidpoint(), ds.StrangGauss()
+    for title, make, frequency, sizes in (
+        ("chain", chain, 2.0, (16, 256, 2048)),
+        ("Schrödinger ring", ring, 5.0, (64,)),
+        ("network", network, 1.0, (64,)),
+    ):
+        for d in sizes:
+            terms = lambda path, make=make, d=d: make(path, d)
+            y0 = jnp.zeros(d), jnp.sin(jnp.arange(d) + 1.0)
+            solvers = several if d < 1000 else several[:1]
+            paths = max(8, 2048 // d)
+            systems.append(
+                System(f"{title}, d = {d}", terms, y0, solvers, paths, frequency)
+            )
+    return systems
+
+
+def _terms(system: System, solver, key):
+    if isinstance(solver, diffrax.Heun):
+        return system.terms(ds.WeakBrownianPath(system.shape, key))
+    return system.terms(solver.path(system.shape, key, want="expectations"))
+
+
+def _solve(system: System, solver) -> Callable:
+    """Takes keys and a step size to the ends of paths, and whether each was reached."""
+
+    @jax.jit
+    def solve(keys, h):
+        def one(key):
+            sol = diffrax.diffeqsolve(
+                _terms(system, solver, key), solver, 0.0, STEPS * h, h, system.y0,
+                max_steps=STEPS + 2, adjoint=diffrax.ForwardMode(), throw=False,
+            )  # fmt: skip
+            return sol.ys, sol.result == diffrax.RESULTS.successful
+
+        return jax.vmap(one)(keys)
+
+    return solve
+
+
+def _handed_on(system: System, solver) -> Callable:
+    """Takes keys and a step size to the share of steps that the first iterations leave to
+    Newton's method and continuation."""
+    alone = dataclasses.replace(solver, root_find_max_steps=0)
+
+    @jax.jit
+    def share(keys, h):
+        def one(key):
+            terms = _terms(system, solver, key)
+
+            def step(y, i):
+                along = (terms, i * h, (i + 1) * h, y, None)
+                new, *_, result = solver.step(*along, jnp.array(False), False)
+                *_, cheap = alone.step(*along, jnp.array(False), False)
+                good = result == diffrax.RESULTS.successful
+                y = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, y)
+                return y, cheap != diffrax.RESULTS.successful
+
+            return lax.scan(step, system.y0, jnp.arange(STEPS))[1]
+
+        return jnp.mean(jax.vmap(one)(keys))
+
+    return share
+
+
+def _by_hand(system: System) -> Callable:
+    """The midpoint rule as one would write it: fixed-point iteration, the same number of
+    iterations for all steps, and nobody looks whether they were enough."""
+    iterations = 12
+
+    @jax.jit
+    def solve(keys, h):
+        def one(key):
+            terms = system.terms(ds.WeakBrownianPath(system.shape, key))
+
+            def step(y, i):
+                t0, t1 = i * h, (i + 1) * h
+                control = terms.contr(t0, t1)
+
+                def improve(_, k):
+                    middle = jax.tree.map(lambda y, k: y + k / 2, y, k)
+                    return terms.vf_prod((t0 + t1) / 2, middle, None, control)
+
+                zero = jax.tree.map(jnp.zeros_like, y)
+                k = lax.fori_loop(0, iterations, improve, zero)
+                return jax.tree.map(jnp.add, y, k), None
+
+            return lax.scan(step, system.y0, jnp.arange(STEPS))[0], True
+
+        return jax.vmap(one)(keys)
+
+    return solve
+
+
+def _unknowns(system: System, solver) -> int:
+    """Of the largest system of a step."""
+    size = sum(x.size for x in jax.tree.leaves(system.y0))
+    return size * max(solver.stage_vectors(1), default=0)
+
+
+class Row(NamedTuple):
+    system: System
+    name: str
+    unknowns: str
+    nanoseconds: tuple[float, ...]
+    failed: tuple[float, ...]
+    handed_on: tuple[float, ...]
+
+
+def measure(system: System) -> list[Row]:
+    calls: dict[str, Callable] = {
+        "`Heun`": _solve(system, diffrax.Heun()),
+        "midpoint by hand": _by_hand(system),
+    }
+    calls |= {f"`{type(s).__name__}`": _solve(system, s) for s in system.solvers}
+    shares = {f"`{type(s).__name__}`": _handed_on(system, s) for s in system.solvers}
+    of = {f"`{type(s).__name__}`": s for s in system.solvers}
+    batch = keys(system.paths)
+    times = {name: [] for name in calls}
+    failed = {name: [] for name in calls}
+    for h in SIZES:
+        bound = {name: lambda call=call: call(batch, h) for name, call in calls.items()}
+        seconds = race(bound, rounds=5)
+        for name, call in calls.items():
+            times[name].append(seconds[name] / system.paths / STEPS * 1e9)
+            failed[name].append(1 - float(jnp.mean(call(batch, h)[1])))
+    rows = []
+    for name in calls:
+        handed_on = tuple(
+            float(shares[name](batch, h)) for h in SIZES if name in shares
+        )
+        unknowns = str(_unknowns(system, of[name])) if name in of else ""
+        row = Row(
+            system, name, unknowns, tuple(times[name]), tuple(failed[name]), handed_on
+        )
+        print(row[1:], flush=True)
+        rows.append(row)
+    return rows
+
+
+INTRODUCTION = """\
+# Cost against step size
+
+{machine}. float64, {steps} steps, random numbers included. Made by `python -m
+examples.benchmarks.step_sizes`.
+
+Implicit methods are there for long steps. The table shows nanoseconds per path and step for
+five step sizes; beside them Diffrax's Heun, which evaluates twice, and the midpoint rule by
+hand, with twelve fixed-point iterations whatever a step needs. `n` is the number of unknowns
+of the largest system of a step. The last column is the share of steps, over all these sizes,
+that the first iterations leave to Newton's method and continuation. In brackets stands the
+share of paths with a step that was not solved: long ones need not have a solution.
+
+![Cost of a step against frequency times step size](step_sizes.png)
+
+| system | solver | n | {sizes} | handed on |
+|---|---|---|{lines}---|
+"""
+
+
+def page(rows: list[Row]) -> str:
+    sizes = " | ".join(f"h = {h}" for h in SIZES)
+    lines = "---|" * len(SIZES)
+    text = INTRODUCTION.format(machine=machine(), steps=STEPS, sizes=sizes, lines=lines)
+    for row in rows:
+        cells = [
+            f"{x:,.0f}" + (f" ({share:.1%})" if share > 0 else "")
+            for x, share in zip(row.nanoseconds, row.failed)
+        ]
+        share = f"{np.mean(row.handed_on):.2%}" if row.handed_on else ""
+        first = [row.system.title, row.name, row.unknowns]
+        text += f"| {' | '.join([*first, *cells, share])} |\n".replace("|  |", "| |")
+    return text
+
+
+def draw(rows: list[Row]) -> None:
+    titles = ("quartic Kubo oscillator", "Hénon-Heiles", "rigid body", "chain, d = 16")
+    figure, axes = plt.subplots(1, 4, figsize=(13, 3.4), layout="constrained")
+    for ax, title in zip(axes, titles):
+        for row in rows:
+            if row.system.title == title:
+                x = row.system.frequency * np.array(SIZES)
+                label = row.name.strip("`")
+                style = "--" if label in ("Heun", "midpoint by hand") else "-"
+                ax.loglog(x, row.nanoseconds, style, marker=".", label=label)
+        ax.set(title=title, xlabel=r"$\omega h$")
+        ax.legend(fontsize=7)
+    axes[0].set_ylabel("nanoseconds per path and step")
+    figure.savefig(DOCS / "step_sizes.png", dpi=120)
+    plt.close(figure)
+
+
+def main() -> None:
+    rows = [row for system in _systems() for row in measure(system)]
+    (DOCS / "step_sizes.md").write_text(page(rows))
+    draw(rows)
+
+
+if __name__ == "__main__":
+    main()
