@@ -92,7 +92,7 @@ def test_simulated_growth_is_the_exact_one():
 SOLVE_HS, SOLVE_STRENGTHS, SOLVE_STEPS = (
     np.array([0.05, 0.4]),
     np.array([0.6, 3.0]),
-    2048,
+    512,
 )
 
 
