@@ -284,7 +284,6 @@ def test_friction_is_walked_back_too(inner):
     y0 = (jnp.array([0.3, 0.1]), jnp.array([0.5, -0.2]))
 
     @jax.jit
-    @jax.vmap
     def gradients(gamma):
         def loss(y0, args, gamma, adjoint):
             solver = ds.Damped(inner, gamma)
@@ -298,10 +297,11 @@ def test_friction_is_walked_back_too(inner):
         return [by(y0, 0.7, gamma, adjoint) for adjoint in adjoints]
 
     # Of the state, of a parameter of the terms, and of the friction itself.
-    ours, theirs = gradients(jnp.array([0.0, 0.4, 2.0]))
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs)):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
-    assert jnp.all(ours[2] != 0)
+    for gamma in (0.0, 0.4, 2.0):
+        ours, theirs = gradients(gamma)
+        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs)):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+        assert ours[2] != 0
     with pytest.raises(ValueError, match="needs a solver that undoes its own steps"):
         diffrax.diffeqsolve(
             terms, ds.Damped(ds.SRKs3(), 0.1), 0.0, 1.0, 0.1, y0, 0.7,

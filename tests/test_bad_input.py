@@ -151,7 +151,8 @@ def test_noise_that_does_not_depend_on_the_state_is_refused(solver, m):
     kick = lambda t, p, q, args: -args * q[:1] * jnp.ones(m)
     terms = ds.hamiltonian_terms(H, kick, weak_path(m))
     for zero in (0.0, jnp.array(0.0)):
-        diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0, zero)
+        solve = lambda: diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0, zero).ys
+        jax.eval_shape(solve)
 
 
 @pytest.mark.parametrize("name", ["H0", "noise"])

@@ -92,7 +92,7 @@ def test_simulated_growth_is_the_exact_one():
 SOLVE_HS, SOLVE_STRENGTHS, SOLVE_STEPS = (
     np.array([0.05, 0.4]),
     np.array([0.6, 3.0]),
-    2048,
+    512,
 )
 
 
@@ -218,7 +218,7 @@ def test_nonlinear_energies_are_kept_up_to_the_linear_limit():
     ids=["Kubo, float64", "Kubo, float32", "rigid body, float64"],
 )
 def test_rounding_errors_grow_like_the_root_of_the_number_of_steps(system, dtype):
-    g = rounding.growth(system, ds.ImplicitMidpoint(), 30_000, 64, dtype)
+    g = rounding.growth(system, ds.ImplicitMidpoint(), 10_000, 64, dtype)
     eps = np.finfo(dtype).eps
     exponent, error = g.exponent()
     assert error <= 0.1
