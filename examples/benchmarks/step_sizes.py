@@ -221,10 +221,11 @@ examples.benchmarks.step_sizes`.
 
 Implicit methods are there for long steps. The table shows nanoseconds per path and step for
 five step sizes; beside them Diffrax's Heun, which evaluates twice, and the midpoint rule by
-hand, with twelve fixed-point iterations whatever a step needs. `n` is the number of unknowns
-of the largest system of a step. The last column is the share of steps, over all these sizes,
-that the first iterations leave to Newton's method and continuation. In brackets stands the
-share of paths with a step that was not solved: long ones need not have a solution.
+hand, with twelve fixed-point iterations whatever a step needs. `n` is the number of
+unknowns of the largest system of a step. The last column is the share of steps, over all
+these sizes, that the first iterations leave to Newton's method and continuation. In
+brackets stands the share of paths with a step that was not solved: long ones need not have
+a solution.
 
 ![Cost of a step against frequency times step size](step_sizes.png)
 
