@@ -22,7 +22,8 @@ if jaxlib.__version__.startswith("0.10.") and not OPTIMIZED:
     flags = (
         os.environ.get("XLA_FLAGS", ""),
         "--xla_cpu_use_fusion_emitters=false",
-        # Parts of a program are compiled in parallel otherwise, which costs small ones a tenth.
+        # Otherwise parts of a program are compiled in parallel, which costs small ones a
+        # tenth.
         "--xla_cpu_parallel_codegen_split_count=1",
     )
     os.environ["XLA_FLAGS"] = " ".join(flags)

@@ -95,8 +95,11 @@ class _Look(NamedTuple):
         return _Rounds(y, size, solved, near, going, step)
 
 
-def _while_any(advance: Callable[[_Rounds], _Rounds], first: _Rounds) -> Found:
-    """Rounds until every path of the batch is solved or has left."""
+def _while_any(
+    advance: Callable[[_Rounds], _Rounds], first: _Rounds, leave_together: bool = False
+) -> Found:
+    """Rounds until every path of the batch is solved or has left; or until the first leaves
+    unsolved, where what follows costs the same for one path as for all."""
 
     def body(last: _Rounds) -> _Rounds:
         new = advance(last)
@@ -108,7 +111,13 @@ def _while_any(advance: Callable[[_Rounds], _Rounds], first: _Rounds) -> Found:
         )
         return _Rounds(y, new.size, solved, near, last.going & new.going, new.step)
 
-    last = lax.while_loop(lambda rounds: any_of_batch(rounds.going), body, first)
+    def proceed(rounds: _Rounds) -> Bool[Array, ""]:
+        go = any_of_batch(rounds.going)
+        if not leave_together:
+            return go
+        return go & ~any_of_batch(~rounds.going & ~rounds.solved)
+
+    last = lax.while_loop(proceed, body, first)
     return Found(last.y, last.solved, last.near)
 
 
@@ -129,7 +138,7 @@ def sweep(finder: "PicardNewton", image: _Map, begin: Found, scale: _Map) -> Fou
         y = jtu.tree_map(lambda a, b: jnp.where(settled, a, b), swept, y)
         return _by_chords(finder, image, scale, begin._replace(y=y))
     slow = _SLOW if direct else finder.picard_steps
-    found = _by_sweeps(_Look(finder, scale, slow), image, begin)
+    found = _by_sweeps(_Look(finder, scale, slow), image, begin, chords_follow=direct)
     if not direct:
         return found
     rest = lambda found: _by_chords(finder, image, scale, found)
@@ -164,7 +173,7 @@ def sweep_blocks(
     return Found(y, solved, near)
 
 
-def _by_sweeps(look: _Look, image: _Map, begin: Found) -> Found:
+def _by_sweeps(look: _Look, image: _Map, begin: Found, chords_follow: bool) -> Found:
     def advance(rounds: _Rounds) -> _Rounds:
         first = rounds.step == 0
         count = jnp.where(first, 1 + _FIRST, _MORE)
@@ -180,7 +189,8 @@ def _by_sweeps(look: _Look, image: _Map, begin: Found) -> Found:
 
     y, solved, near = begin
     size = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(y)))
-    return _while_any(advance, _Rounds(y, size, solved, near, ~solved, 0))
+    first = _Rounds(y, size, solved, near, ~solved, 0)
+    return _while_any(advance, first, leave_together=chords_follow)
 
 
 def _by_chords(
