@@ -50,9 +50,9 @@ def _one_step(solver, terms, h, y0, t0=0.1):
     return solver.step(terms, t0, t0 + h, y0, None, state, False)[0]
 
 
-@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 1e-4)])
+@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-5)])
 def test_steps_of_stiff_lattices_are_symplectic(dtype, bound):
-    # omega h up to 20.
+    # omega h up to 20. The Jacobians have entries up to 40.
     flow = lattice_waves(8, 0.05)
     given = Given(jnp.array([0.3, -0.2], dtype))
     for solver, noise in (
@@ -67,10 +67,9 @@ def test_steps_of_stiff_lattices_are_symplectic(dtype, bound):
             h = jnp.asarray(0.5, dtype)
             return ds.symplecticity_defect(terms, wrapped, 0 * h, h, (p, q))
 
-        defects = jax.jit(jax.vmap(defect))(jr.split(jr.key(0), 100))
+        defects = jax.jit(jax.vmap(defect))(jr.split(jr.key(0), 1000))
         assert defects.dtype == dtype
-        # The Jacobian has entries up to the largest frequency.
-        assert jnp.max(defects) <= 40 * bound
+        assert jnp.max(defects) <= bound
 
 
 @pytest.mark.parametrize(
