@@ -69,6 +69,7 @@ def main():
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6))
     times, paths = np.arange(1, 13) * 1.0, 1_000
@@ -91,6 +92,7 @@ def main():
         found = jnp.stack([density(solver, 2.0, int(n)) for n in steps])
         bias = jnp.trace((found - lindblad(2.0)) @ X, axis1=1, axis2=2).real
         right.loglog(2 / steps, np.abs(bias), "o-", ms=3, lw=1, label=name)
+    right.xaxis.set_minor_formatter(NullFormatter())
     right.set(xlabel="h", title="bias of E <sigma_x> at t = 2, without sampling")
     for ax in (left, right):
         ax.legend(fontsize=7)
