@@ -89,7 +89,18 @@ def test_local_weak_defect_is_of_order_three(inner, noise, path):
     hs = np.array([0.01, 0.005, 0.0025])
     defects = jax.jit(jax.vmap(defect))(hs)
     np.testing.assert_allclose([slope(hs, d) for d in defects.T], 3.0, atol=0.1)
-    assert solver.weak_order(rest) == 2 and solver.order(rest) == 2
+
+
+def test_orders_are_those_of_the_splitting_where_the_solver_has_higher_ones():
+    terms = ds.hamiltonian_terms(_rest, _kicks, weak_path(2))
+    orders = lambda solver: [
+        getattr(ds.LinearFlow(solver, klein_gordon.waves(8, 0.1)), name)(terms)
+        for name in ("order", "weak_order", "strong_order")
+    ]
+    assert orders(ds.NinomiyaVictoir()) == [2, 2, None]
+    assert orders(ds.AdditiveGauss())[1] == 2
+    assert orders(ds.PlateauVerlet())[2] == 1.0
+    assert orders(ds.SRKs1()) == [2, 1, 1.0]
 
 
 def test_linear_systems_without_a_rest_are_solved_exactly():
