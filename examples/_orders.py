@@ -150,7 +150,7 @@ def quasi_weak_error(
     return Errors(np.array([*hs]), np.array(signed), np.array(std_errors))
 
 
-class _FinePath(diffrax.AbstractBrownianPath):
+class FinePath(diffrax.AbstractBrownianPath):
     """A Brownian path over [0, t1] by the values of `w` and of its integral on a fine
     grid, so that every step size sees the same path, space-time areas included. As
     `ds.FixedStepBrownianPath` with `cell`, but kept in memory: a step of any size looks
@@ -164,13 +164,13 @@ class _FinePath(diffrax.AbstractBrownianPath):
     levy_area = diffrax.SpaceTimeLevyArea
 
     @staticmethod
-    def draw(key, steps: int, m: int, t1: float) -> "_FinePath":
+    def draw(key, steps: int, m: int, t1: float) -> "FinePath":
         dw, H = jr.normal(key, (2, steps, m)) * np.sqrt(t1 / steps)
         H = H / np.sqrt(12)
         from_zero = lambda x: jnp.concatenate([jnp.zeros_like(x[:1]), jnp.cumsum(x, 0)])
         w = from_zero(dw)
         integral = from_zero((w[:-1] + dw / 2 + H) * (t1 / steps))
-        return _FinePath(w, integral, t1)  # pyright: ignore[reportCallIssue]
+        return FinePath(w, integral, t1)  # pyright: ignore[reportCallIssue]
 
     def evaluate(self, t0, t1=None, left=True, use_levy=False):
         del left
@@ -206,7 +206,7 @@ def strong_errors(
         return component(jax.tree.map(lambda y: y[-1], sol.ys)), sol.result
 
     def squares(args, key):
-        path = _FinePath.draw(key, fine, m, t1)
+        path = FinePath.draw(key, fine, m, t1)
 
         def run(solver, steps):
             x, result = jax.lax.map(lambda h: end(path, solver, h, args), steps)

@@ -105,23 +105,23 @@ def test_local_weak_defect_is_of_order_three(friction, wrap):
 
 
 def test_friction_and_noise_together_have_their_exact_law():
-    # Free momenta. The noise commutes with the friction.
+    # Free momenta. The noise commutes with the friction. The axes of two by two matrices
+    # may be their own transposes, those of three by three are not.
     h = 0.8
-    sigma = jax.scipy.linalg.sqrtm(2 * MATRIX).real
+    gamma = jnp.array([[1.0, 0.4, 0.1], [0.4, 0.7, -0.3], [0.1, -0.3, 0.5]])
+    sigma = jax.scipy.linalg.sqrtm(2 * gamma).real
     free = lambda t, p, q, args: 0 * jnp.sum(p)
-    terms = ds.hamiltonian_terms(free, _bath(sigma), Given(jnp.zeros(2)))
-    y0 = jnp.array([1.0, 2.0]), jnp.zeros(2)
-    p1, _ = _one_step(ds.BAOAB(MATRIX), terms, h, y0)
-    decay = jax.scipy.linalg.expm(-MATRIX * h)
-    np.testing.assert_allclose(p1, decay @ y0[0], rtol=1e-14)
+    y0 = jnp.array([1.0, 2.0, -0.5]), jnp.zeros(3)
 
     def after(W):
-        kicked = ds.hamiltonian_terms(free, _bath(sigma), Given(W))
-        return _one_step(ds.BAOAB(MATRIX), kicked, h, y0)[0]
+        terms = ds.hamiltonian_terms(free, _bath(sigma), Given(W))
+        return _one_step(ds.BAOAB(gamma), terms, h, y0)[0]
 
-    A = jax.jacobian(after)(jnp.zeros(2))
-    covariance = np.eye(2) - decay @ decay  # at temperature 1
-    np.testing.assert_allclose(h * A @ A.T, covariance, atol=1e-15)
+    decay = jax.scipy.linalg.expm(-gamma * h)
+    np.testing.assert_allclose(after(jnp.zeros(3)), decay @ y0[0], atol=1e-14)
+    A = jax.jacobian(after)(jnp.zeros(3))
+    covariance = np.eye(3) - decay @ decay  # at temperature 1
+    np.testing.assert_allclose(h * A @ A.T, covariance, atol=2e-15)
 
 
 def test_spread_is_smooth_and_exact_on_both_sides_of_zero():

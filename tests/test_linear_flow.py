@@ -9,28 +9,9 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._adjoint import _undoes_its_steps
+from examples.hard_cases import klein_gordon
 
 from .problems import Given, weak_path
-
-
-def lattice_waves(n, dx, mass=1.0):
-    """The flow of `sum p^2 / 2 + (q_{j + 1} - q_j)^2 / (2 dx^2) + mass^2 q^2 / 2`."""
-    k = 2 * np.pi * np.arange(n // 2 + 1) / n
-    omega = np.sqrt(mass**2 + (2 * np.sin(k / 2) / dx) ** 2)
-
-    def flow(time, y, args):
-        P, Q = map(jnp.fft.rfft, y)
-        w = omega.astype(y[0].dtype)
-        c, s = jnp.cos(w * time), jnp.sin(w * time)
-        back = lambda x: jnp.fft.irfft(x, n).astype(y[0].dtype)
-        return back(c * P - w * s * Q), back(c * Q + s / w * P)
-
-    return flow
-
-
-def linear_energy(p, q, dx, mass=1.0):
-    bonds = jnp.sum((jnp.roll(q, -1) - q) ** 2) / dx**2
-    return jnp.sum(p**2) / 2 + bonds / 2 + mass**2 * jnp.sum(q**2) / 2
 
 
 def _rest(t, p, q, args):
@@ -50,31 +31,46 @@ def _one_step(solver, terms, h, y0, t0=0.1):
     return solver.step(terms, t0, t0 + h, y0, None, state, False)[0]
 
 
-@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 1e-4)])
-def test_steps_of_stiff_lattices_are_symplectic(dtype, bound):
-    # omega h up to 20.
-    flow = lattice_waves(8, 0.05)
+@pytest.mark.parametrize(
+    "solver, noise, dtype, bound",
+    [
+        (ds.StormerVerlet(), _kicks, jnp.float64, 1e-13),
+        (ds.ImplicitMidpoint(), _mixed, jnp.float64, 1e-13),
+        (ds.ImplicitMidpoint(), _mixed, jnp.float32, 5e-5),
+    ],
+)
+def test_steps_of_stiff_lattices_are_symplectic(solver, noise, dtype, bound):
+    # omega h up to 20. The Jacobians have entries up to 40.
+    flow = klein_gordon.waves(8, 0.05)
     given = Given(jnp.array([0.3, -0.2], dtype))
-    for solver, noise in (
-        (ds.StormerVerlet(), _kicks),
-        (ds.ImplicitMidpoint(), _mixed),
-    ):
-        wrapped = ds.LinearFlow(solver, flow)
-        terms = ds.hamiltonian_terms(_rest, noise, given)
+    wrapped = ds.LinearFlow(solver, flow)
+    terms = ds.hamiltonian_terms(_rest, noise, given)
 
-        def defect(key):
-            p, q = jr.normal(key, (2, 8), dtype) * jnp.array([[1.0], [0.1]], dtype)
-            h = jnp.asarray(0.5, dtype)
-            return ds.symplecticity_defect(terms, wrapped, 0 * h, h, (p, q))
+    def defect(key):
+        p, q = jr.normal(key, (2, 8), dtype) * jnp.array([[1.0], [0.1]], dtype)
+        h = jnp.asarray(0.5, dtype)
+        return ds.symplecticity_defect(terms, wrapped, 0 * h, h, (p, q))
 
-        defects = jax.jit(jax.vmap(defect))(jr.split(jr.key(0), 100))
-        assert defects.dtype == dtype
-        # The Jacobian has entries up to the largest frequency.
-        assert jnp.max(defects) <= 40 * bound
+    defects = jax.jit(jax.vmap(defect))(jr.split(jr.key(0), 1000))
+    assert defects.dtype == dtype
+    assert jnp.max(defects) <= bound
+
+
+def test_orders_are_those_of_the_splitting_where_the_solver_has_higher_ones():
+    one_noise = lambda *a: _kicks(*a)[:1]
+    terms = ds.hamiltonian_terms(_rest, one_noise, weak_path(1))
+    orders = lambda solver: [
+        getattr(ds.LinearFlow(solver, klein_gordon.waves(8, 0.1)), name)(terms)
+        for name in ("order", "weak_order", "strong_order")
+    ]
+    assert orders(ds.NinomiyaVictoir()) == [2, 2, None]
+    assert orders(ds.AdditiveGauss())[1] == 2
+    assert orders(ds.PlateauVerlet())[2] == 1.0
+    assert orders(ds.SRKs1()) == [2, 1, 1.0]
 
 
 def test_linear_systems_without_a_rest_are_solved_exactly():
-    flow, y0 = lattice_waves(16, 0.1), tuple(jr.normal(jr.key(0), (2, 16)))
+    flow, y0 = klein_gordon.waves(16, 0.1), tuple(jr.normal(jr.key(0), (2, 16)))
     nothing = lambda t, p, q, args: 0 * jnp.sum(q)
     terms = ds.hamiltonian_terms(nothing, nothing, Given(jnp.zeros(())))
     solver = ds.LinearFlow(ds.StormerVerlet(), flow)
@@ -87,7 +83,7 @@ def test_linear_systems_without_a_rest_are_solved_exactly():
 
 def test_what_a_solver_remembers_is_not_taken_for_where_the_flow_leads():
     # BAOAB keeps the forces of the end of a step, and the flow goes on from there.
-    flow = lattice_waves(8, 0.5)
+    flow = klein_gordon.waves(8, 0.5)
     noise = lambda t, p, q, args: -0.3 * q
     terms = ds.hamiltonian_terms(_rest, noise, Given(0.1 * jnp.arange(8.0)))
     inner, y = ds.BAOAB(0.4), tuple(jr.normal(jr.key(0), (2, 8)))
@@ -101,75 +97,47 @@ def test_what_a_solver_remembers_is_not_taken_for_where_the_flow_leads():
 
 
 def test_gradients_may_walk_back_along_the_solution():
-    solver = ds.LinearFlow(ds.StormerVerlet(), lattice_waves(8, 0.1))
-    damped = ds.LinearFlow(ds.Damped(ds.StormerVerlet(), 0.5), lattice_waves(8, 0.1))
+    solver = ds.LinearFlow(ds.StormerVerlet(), klein_gordon.waves(8, 0.1))
+    damped = ds.LinearFlow(
+        ds.Damped(ds.StormerVerlet(), 0.5), klein_gordon.waves(8, 0.1)
+    )
     assert _undoes_its_steps(solver) and _undoes_its_steps(damped)
-    assert not _undoes_its_steps(ds.LinearFlow(ds.SRKw4(), lattice_waves(8, 0.1)))
+    assert not _undoes_its_steps(ds.LinearFlow(ds.SRKw4(), klein_gordon.waves(8, 0.1)))
     H0 = lambda t, p, q, args: args * _rest(t, p, q, None)
     terms = ds.hamiltonian_terms(H0, _kicks, weak_path(2))
     y0 = tuple(0.3 * jr.normal(jr.key(0), (2, 8)))
 
-    def end(y0, args, adjoint, solver):
+    def end(y0, args, adjoint):
         sol = diffrax.diffeqsolve(
-            terms, solver, 0, 2, 0.1, y0, args, adjoint=adjoint, max_steps=32
+            terms, damped, 0, 2, 0.1, y0, args, adjoint=adjoint, max_steps=32
         )
         return jnp.sum(sol.ys[0][-1] ** 2) + sol.ys[1][-1, 0]
 
-    for s in (solver, damped):
-        grad = jax.jit(
-            lambda y0, args, adjoint, s=s: jax.grad(end, (0, 1))(y0, args, adjoint, s),
-            static_argnums=2,
-        )
-        ours = grad(y0, 0.7, ds.ReversingAdjoint())
-        theirs = grad(y0, 0.7, diffrax.RecursiveCheckpointAdjoint())
-        jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9),
-            ours,
-            theirs,
-        )
+    grad = jax.jit(jax.grad(end, (0, 1)), static_argnums=2)
+    ours = grad(y0, 0.7, ds.ReversingAdjoint())
+    theirs = grad(y0, 0.7, diffrax.RecursiveCheckpointAdjoint())
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9),
+        ours,
+        theirs,
+    )
 
 
 def test_a_klein_gordon_chain_takes_ten_times_the_explicit_step():
     # omega h < 2 is h < 0.05 here.
-    n, dx, h = 4096, 0.05, 0.5
-    x = dx * np.arange(n)
-    q0 = 0.5 * jnp.asarray(np.exp(np.cos(2 * np.pi * x / (n * dx)) * 8 - 8))
-    quartic = lambda t, p, q, args: jnp.sum(q**4) / 4
-    still = lambda t, p, q, args: 0 * jnp.sum(q)
-    terms = ds.hamiltonian_terms(quartic, still, ds.WeakBrownianPath((), jr.key(0)))
-    solver = ds.LinearFlow(ds.StormerVerlet(), lattice_waves(n, dx))
-    energy = lambda t, y, args: linear_energy(*y, dx) + quartic(t, *y, None)
-    sol = diffrax.diffeqsolve(
-        terms, solver, 0, 100, h, (0 * q0, q0), max_steps=201,
-        saveat=diffrax.SaveAt(t0=True, steps=True, fn=energy),
-    )  # fmt: skip
-    energies = sol.ys[jnp.isfinite(sol.ts)]
-    error = jnp.abs(energies / energies[0] - 1)
-    assert jnp.max(error) <= 2e-2
+    energies = klein_gordon.course(klein_gordon.SPLIT, 0.5, 100.0).energies[0]
+    error = np.abs(energies / energies[0] - 1)
+    assert np.max(error) <= 1e-2
     # It does not grow.
-    assert jnp.max(error[100:]) <= jnp.max(error[:100])
+    assert np.max(error[100:]) <= np.max(error[:100])
 
 
 def test_resonances_are_where_they_should_be():
     # A mode of frequency w with a kick -e q is one matrix a step. Its trace is
     # 2 cos(w h) - (h e / w) sin(w h): beyond 2 in size just below w h = pi.
     e, omega = 0.3, 10.0
-
-    def rotation(time, y, args):
-        c, s = jnp.cos(omega * time), jnp.sin(omega * time)
-        return c * y[0] - omega * s * y[1], c * y[1] + s / omega * y[0]
-
-    soft = lambda t, p, q, args: e * q**2 / 2
-    still = lambda t, p, q, args: 0 * q
-    terms = ds.hamiltonian_terms(soft, still, Given(jnp.zeros(())))
-    solver = ds.LinearFlow(ds.StormerVerlet(), rotation)
-
-    def trace(h):
-        step = lambda x: jnp.stack(_one_step(solver, terms, h, (x[0], x[1])))
-        return jnp.trace(jax.jacfwd(step)(jnp.zeros(2)))
-
     hs = (np.pi + np.array([-0.2, -1e-3, 0.2])) / omega
-    traces = jax.vmap(trace)(hs)
+    traces = jax.vmap(lambda h: klein_gordon.trace(h, omega, e))(hs)
     expected = 2 * np.cos(omega * hs) - hs * e / omega * np.sin(omega * hs)
     np.testing.assert_allclose(traces, expected, atol=1e-12)
     np.testing.assert_array_equal(np.abs(traces) > 2, [False, True, False])
@@ -178,7 +146,7 @@ def test_resonances_are_where_they_should_be():
 def test_flows_that_are_none_are_refused():
     terms = ds.hamiltonian_terms(_rest, _kicks, weak_path(2))
     y0 = jnp.ones(8), jnp.ones(8)
-    inner, flow = ds.StormerVerlet(), lattice_waves(8, 0.1)
+    inner, flow = ds.StormerVerlet(), klein_gordon.waves(8, 0.1)
     with pytest.raises(ValueError, match=r"called as `flow\(time, y, args\)`"):
         ds.LinearFlow(inner, lambda y: y)  # pyright: ignore
     with pytest.raises(ValueError, match="wraps a solver of this package"):

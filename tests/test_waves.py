@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from examples import qubit
 
 from .problems import slope, weak_path
 
 
 X = jnp.array([[0, 1], [1, 0]], complex)
-Y = jnp.array([[0, -1j], [1j, 0]])
 Z = jnp.array([[1, 0], [0, -1]], complex)
 
 
@@ -89,64 +89,33 @@ def test_norm_is_kept_over_ten_thousand_steps(solver):
     assert jnp.max(jnp.abs(sol.ys - 1)) <= 1e-13
 
 
-def _qubit(path, rabi=1.0, dephasing=0.6):
-    H0 = lambda t, psi, args: rabi * _mean(X, psi) / 2 + 0.3 * _mean(Z, psi)
-    noise = lambda t, psi, args: dephasing * _mean(Z + X / 2, psi) / 2
-    return ds.wave_terms(H0, noise, path)
-
-
-def _lindblad(psi0, t, rabi=1.0, dephasing=0.6):
-    """The density matrix by d rho = -i [H, rho] - [A, [A, rho]] / 2."""
-    H, A = rabi * X / 2 + 0.3 * Z, dephasing * (Z + X / 2) / 2
-    left, right = (
-        (lambda M: jnp.kron(M, jnp.eye(2))),
-        (lambda M: jnp.kron(jnp.eye(2), M.T)),
-    )
-    commutator = lambda M: left(M) - right(M)
-    L = -1j * commutator(H) - commutator(A) @ commutator(A) / 2
-    rho = jnp.outer(psi0, jnp.conj(psi0)).ravel()
-    return (jax.scipy.linalg.expm(t * L) @ rho).reshape(2, 2)
-
-
-PSI0 = jnp.array([np.sqrt(0.9), np.sqrt(0.1) * 1j])
-
-
 @pytest.mark.parametrize(
     "solver, order",
     [(ds.SRKw1(), 1), (ds.StrangGauss(), 2)],
     ids=["SRKw1", "StrangGauss"],
 )
 def test_noisy_qubit_has_the_density_matrix_of_lindblad_without_sampling(solver, order):
-    y0 = ds.to_pair(PSI0)
-    flat = jnp.concatenate([jnp.ones(1), *y0])
-    exact = jnp.trace(_lindblad(PSI0, 2.0) @ X).real
-    terms = _qubit(ds.WeakBrownianPath((), jr.key(0)))
     steps = np.array([16, 32, 64])
-    errors = []
-    for n in steps:
-        K = ds.second_moment_map(terms, solver, 0.0, 2.0 / n, y0)
-        moments = jnp.linalg.matrix_power(K, int(n)) @ jnp.kron(flat, flat)
-        m = moments.reshape(5, 5)  # of 1, p1, p2, q1, q2
-        np.testing.assert_allclose(jnp.trace(m) - 1, 2.0, rtol=1e-12)
-        errors.append(m[3, 4] + m[1, 2] - exact)
+    found = jnp.stack([qubit.density(solver, 2.0, int(n)) for n in steps])
+    np.testing.assert_allclose(jnp.trace(found, axis1=1, axis2=2), 1.0, rtol=1e-12)
+    errors = jnp.max(jnp.abs(found - qubit.lindblad(2.0)), axis=(1, 2))
     assert abs(slope(1 / steps, errors) - order) <= 0.1
-    assert abs(errors[-1]) <= (1e-2 if order == 1 else 1e-4)
+    assert errors[-1] <= (1e-2 if order == 1 else 1e-4)
 
 
 def test_noisy_qubit_sampled():
-    def end(key):
-        terms = _qubit(ds.WeakBrownianPath((), key))
-        sol = diffrax.diffeqsolve(
-            terms, ds.StrangGauss(), 0, 2, 0.1, ds.to_pair(PSI0), max_steps=21,
-            adjoint=diffrax.ForwardMode(),
-        )  # fmt: skip
-        return _mean(X, ds.from_pair(sol.ys)[-1])
+    times = np.array([1.0, 2.0])
+    path = lambda key: qubit.sampled(key, times, 0.1)
+    values = jax.jit(jax.vmap(path))(jr.split(jr.key(0), 4000))
+    rho = jnp.stack([qubit.lindblad(t) for t in times])
+    exact = [jnp.trace(rho @ M, axis1=1, axis2=2).real for M in (qubit.X, qubit.Z)]
+    error = jnp.mean(values, axis=0) - jnp.stack(exact, axis=-1)
+    standard_error = jnp.std(values, axis=0) / np.sqrt(len(values))
+    assert jnp.max(standard_error) <= 0.01
+    assert jnp.max(jnp.abs(error) / standard_error) <= 3
 
-    values = jax.jit(jax.vmap(end))(jr.split(jr.key(0), 4000))
-    error = jnp.mean(values) - jnp.trace(_lindblad(PSI0, 2.0) @ X).real
-    standard_error = jnp.std(values) / np.sqrt(len(values))
-    assert standard_error <= 0.01
-    assert abs(error) <= 3 * standard_error
+
+PSI0 = jnp.asarray(qubit.PSI0)
 
 
 def test_gradients_with_respect_to_complex_parameters_are_those_of_jax():

@@ -15,6 +15,7 @@ if __name__ == "__main__":
             "spins",
             "magnet",
             "nls",
+            "klein_gordon",
             "learning",
         ),
     )

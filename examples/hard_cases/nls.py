@@ -6,16 +6,20 @@ quadratic invariant of drift and noises. With C = sum_j Re(psi_(j+1) conj(psi_j)
 E H0 grows by (s^2 / (2 dx^2)) E C in each unit of time.
 """
 
+import time
 from typing import NamedTuple
 
 import diffrax
+import jax
 import jax.numpy as jnp
+import jax.random as jr
 import lineax as lx
 import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrax_symplectic as ds
 
+from .._orders import FinePath
 from ..stability._page import fill, Page, table
 from ._ensemble import ensemble, Mean, weak
 
@@ -120,11 +124,79 @@ def lattice(solver, h: float, t1: float, paths: int, s: float, n: int = N) -> La
 
 # No dense matrix of 2,048 unknowns, should fixed points not contract.
 _MATRIX_FREE = ds.PicardNewton(linear_solver=lx.GMRES(rtol=1e-9, atol=1e-9))
+MIDPOINT = ds.ImplicitMidpoint(root_finder=_MATRIX_FREE)
+
+
+def split(dx: float = DX):
+    return ds.LinearFlow(ds.ImplicitMidpoint(), hopping_flow(dx=dx))
+
+
+class Ends(NamedTuple):
+    # psi at t = 1 of each path.
+    psi: np.ndarray
+    # Of a path, the best of all.
+    seconds: float
+
+    def distance(self, other: "Ends") -> float:
+        """Root mean square, relative to |psi|."""
+        size = lambda x: np.sum(np.abs(x) ** 2, axis=1)
+        return np.sqrt(np.mean(size(self.psi - other.psi) / size(other.psi)))
+
+
+def ends(solver, steps: int, dx: float, s: float, paths: list[FinePath]) -> Ends:
+    """Until t = 1 along each of the paths."""
+
+    @jax.jit
+    def solve(path):
+        terms = make_rest(path)
+        if not isinstance(solver, ds.LinearFlow):
+            terms = make_terms(path, dx)
+        sol = diffrax.diffeqsolve(
+            terms, solver, 0.0, 1.0, 1 / steps, start(dx=dx), s, max_steps=steps + 1,
+            adjoint=diffrax.ForwardMode(),
+        )  # fmt: skip
+        assert sol.ys is not None
+        return ds.from_pair(sol.ys)[-1]
+
+    compiled = solve.lower(paths[0]).compile()
+    psi, seconds = [], np.inf
+    for path in paths:
+        begin = time.perf_counter()
+        psi.append(np.asarray(compiled(path)))
+        seconds = min(seconds, time.perf_counter() - begin)
+    return Ends(np.array(psi), seconds)
+
+
+def strong_errors(page: Page, s: float) -> str:
+    """A table of errors along a path, and of what they cost."""
+    fine, number = (2**8, 1) if page.quick else (2**13, 2)
+    draw = jax.jit(lambda key: FinePath.draw(key, fine, N, 1.0))
+    paths = [draw(jr.key(i)) for i in range(number)]
+    # Each against the other solver, or where that is too slow against itself.
+    cases = (
+        (DX, MIDPOINT, (32, 256), (64, 256)),
+        (DX / 10, split(DX / 10), (32, 256, 1024), (4096,)),
+    )
+    print(f"\nSchroedinger lattice: errors at t = 1 along {number} paths")
+    rows = []
+    for dx, reference, of_split, of_midpoint in cases[: 1 if page.quick else 2]:
+        exact = ends(reference, fine, dx, s, paths)
+        for name, solver, many in (
+            ("LinearFlow(ImplicitMidpoint)", split(dx), of_split),
+            ("ImplicitMidpoint", MIDPOINT, of_midpoint),
+        ):
+            for steps in many:
+                found = ends(solver, steps, dx, s, paths)
+                error = f"{found.distance(exact):.1e}"
+                rows.append(
+                    (f"{dx:g}", name, f"1/{steps}", error, f"{found.seconds:.3f}")
+                )
+    return table(("dx", "solver", "h", "error", "seconds"), rows)
+
+
 SOLVERS = {
-    "ImplicitMidpoint": ds.ImplicitMidpoint(root_finder=_MATRIX_FREE),
-    "LinearFlow(ImplicitMidpoint)": ds.LinearFlow(
-        ds.ImplicitMidpoint(), hopping_flow()
-    ),
+    "ImplicitMidpoint": MIDPOINT,
+    "LinearFlow(ImplicitMidpoint)": split(),
     "Heun": diffrax.Heun(),
     "EulerHeun": diffrax.EulerHeun(),
 }
@@ -165,5 +237,5 @@ def section(page: Page) -> str:
     header = ("solver", "h", "norm error", "energy balance")
     return fill(
         __file__, table=table(header, rows), picture=picture, t1=f"{t1:g}", paths=paths,
-        s=s, n=f"{N:,}", frequency=f"{2 / DX**2:g}",
+        s=s, n=f"{N:,}", frequency=f"{2 / DX**2:g}", strong=strong_errors(page, s),
     )  # fmt: skip
