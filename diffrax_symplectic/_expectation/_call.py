@@ -267,7 +267,7 @@ def _chosen(
             prepared = sampling.prepare(problem, key, devices)
         except ValueError:
             return None
-        plan = dataclasses.replace(prepared.plan, num_samples=samples)
+        plan = prepared.plan._replace(num_samples=samples)
         own = jr.fold_in(key, 0xFFFFFFFF)
         sample = lambda: run(prepared.sampler, own, plan, devices)
         sample()  # compiles
@@ -306,5 +306,5 @@ def _sized(best: _Trial, tol: float | None) -> tuple[AbstractSampling, Prepared]
         samples = max(samples, 2 * plan.least)
     name = "replicates" if isinstance(sampling, ArrayRQMC) else "num_paths"
     sampling = dataclasses.replace(sampling, **{name: samples})
-    plan = dataclasses.replace(plan, num_samples=samples)
+    plan = plan._replace(num_samples=samples)
     return sampling, best.prepared._replace(plan=plan)
