@@ -32,10 +32,12 @@ def _midpoint_moment(n: int, h: float) -> float:
 
 
 MIDPOINT = ds.ImplicitMidpoint()
+# Made once, so that JAX compiles programs of it once.
+KUBO = kubo_terms(ds.WeakBrownianPath((), jr.key(0)))
 
 
 def _estimate(solver=MIDPOINT, terms=None, phi=SQUARE, **kwargs):
-    terms = kubo_terms(ds.WeakBrownianPath((), jr.key(0))) if terms is None else terms
+    terms = KUBO if terms is None else terms
     kwargs = dict(t1=1.0, dt0=0.1, y0=Y0, key=jr.key(7)) | kwargs
     kwargs = dict(num_paths=256, replicates=4, sort_by=None) | kwargs
     t1, dt0, y0 = (kwargs.pop(name) for name in ("t1", "dt0", "y0"))

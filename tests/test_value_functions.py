@@ -24,6 +24,8 @@ Y0 = (jnp.array(0.0), jnp.array(1.0))
 SQUARE = lambda t, y, args: y[1] ** 2
 VERLET = ds.StormerVerlet()
 WEAK = ds.WeakBrownianPath((), KEY)
+# Made once, so that JAX compiles programs of them once.
+KUBO, MIDPOINT = kubo_terms(WEAK), ds.ImplicitMidpoint()
 PENDULUM = ds.hamiltonian_terms(
     lambda t, p, q, args: p**2 / 2 - jnp.cos(q),
     lambda t, p, q, args: 0.4 * jnp.cos(q) + 0.1 * q,
@@ -86,9 +88,7 @@ def test_linear_systems_and_quadratic_functions_are_closed(dtype):
 
 
 def test_degree_zero_is_plain():
-    got = _estimate(
-        ds.ValueFunctions(0, 4000), kubo_terms(WEAK), ds.ImplicitMidpoint(), dt0=0.1
-    )
+    got = _estimate(ds.ValueFunctions(0, 4000), KUBO, MIDPOINT, dt0=0.1)
     square = (1 + _turned(2).real) / 2
     fourth = 3 / 8 + _turned(2).real / 2 + _turned(4).real / 8
     assert abs(got.mean - square) <= 4 * got.std_error
@@ -132,10 +132,8 @@ def test_noise_that_enters_nonlinearly_leaves_the_mean_as_it_is():
 def test_the_degree_is_chosen_for_each_number_by_fresh_paths_and_never_worse_than_plain():
     # A jump, which no polynomial is close to; and one that polynomials leave nothing of.
     phi = lambda t, y, args: (y[1] > 0.5, jnp.cos(40 * y[1]), y[1])
-    got = _estimate(ds.ValueFunctions(), kubo_terms(WEAK), ds.ImplicitMidpoint(), phi)
-    plain = _estimate(
-        ds.ValueFunctions(0), kubo_terms(WEAK), ds.ImplicitMidpoint(), phi
-    )
+    got = _estimate(ds.ValueFunctions(), KUBO, MIDPOINT, phi)
+    plain = _estimate(ds.ValueFunctions(0), KUBO, MIDPOINT, phi)
     for a, b in zip(got.std_error, plain.std_error):
         assert a <= 1.05 * b
     assert got.std_error[2] < 1e-9 and "64 was the best of 0, 64" in got.reason
