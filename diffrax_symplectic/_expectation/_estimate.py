@@ -284,10 +284,12 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         out = local(sampler, lo_hi, left, jax.lax.axis_index("samples"))
         return jtu.tree_map(lambda x: jax.lax.all_gather(x, "samples"), out)
 
-    no_axis = PartitionSpec()
-    specs = dict(in_specs=no_axis, out_specs=no_axis, check_vma=False)
+    none = PartitionSpec()
+    sharded = jax.shard_map(
+        shard, mesh=mesh, in_specs=none, out_specs=none, check_vma=False
+    )
     try:
-        return jax.shard_map(shard, mesh=mesh, **specs)(dynamic, lo_hi, left)
+        return sharded(dynamic, lo_hi, left)
     except ValueError as error:
         # The loop of Diffrax's default adjoint takes arrays that vary from device to
         # device for others than those it was made for.

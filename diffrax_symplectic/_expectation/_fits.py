@@ -4,6 +4,7 @@ import abc
 import functools as ft
 import itertools
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -27,9 +28,9 @@ _MOVE = 0.2
 # Deviations along the axes of the covariance are taken for no smaller than this share of
 # the largest. Along shorter ones the points of a fit say too little.
 _FLOOR = 0.1
-# A grid is this many times as wide as where the pilot was, and polynomials through so many
-# of its points along each axis go on beyond it by one of its meshes.
-_WIDER, _STENCIL = 1.5, 6
+# A grid is so many times as wide as where the pilot was: with 1.5 rare paths near its edge
+# made errors that the spread of others does not show. Points of a polynomial on an axis.
+_WIDER, _STENCIL = 2, 6
 # Derivatives are averaged over so many paths.
 _QUADRATIC_PILOTS = 128
 _dot = ft.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
@@ -39,8 +40,9 @@ class Frame(eqx.Module):
     """Coordinates of states: the axes of their covariance, or none but their mean."""
 
     mean: Float[Array, " d"]
-    to: Float[Array, "d d"] | None = None
-    back: Float[Array, "d d"] | None = None
+    # Of shape `(d, d)`, if they are there.
+    to: Any = None
+    back: Any = None
 
     def at(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         return y - self.mean if self.to is None else _dot(y - self.mean, self.to.T)
@@ -73,11 +75,12 @@ class AbstractBasis(eqx.Module):
 
 
 class AbstractFitted(AbstractBasis):
-    """Functions with coefficients from values at `num_sites` states. Their `shape` says how
-    many coefficients, and candidates with some of them, there are."""
+    """Functions with coefficients from values at some states."""
 
-    num_sites: eqx.AbstractVar[int]
-    shape: eqx.AbstractVar[tuple[int, int]]
+    @property
+    @abc.abstractmethod
+    def shape(self) -> tuple[int, int, int]:
+        """How many states, coefficients, and candidates with some of these, there are."""
 
     @abc.abstractmethod
     def sites(
@@ -97,20 +100,15 @@ class AbstractFitted(AbstractBasis):
 
 
 class Grid(AbstractFitted):
-    """Values on a grid with `size` points along each of `d` axes. Between them they are
-    interpolated by the polynomial of degree 5 in each coordinate through the 6 nearest
-    points along each axis."""
+    """Values on a grid with `size` points along each of `d` axes. In between is the
+    polynomial of degree 5 in each coordinate through the 6 nearest points on its axis."""
 
     d: int
     size: int
 
     @property
-    def num_sites(self):
-        return self.size**self.d
-
-    @property
     def shape(self):
-        return self.num_sites, 1
+        return self.size**self.d, self.size**self.d, 1
 
     def sites(self, frame, states, good, key):
         x = frame.at(states)
@@ -121,7 +119,7 @@ class Grid(AbstractFitted):
         frame = Frame(middle, frame.to / half[:, None], frame.back * half)
         axis = np.linspace(-1, 1, self.size)
         nodes = np.stack(np.meshgrid(*[axis] * self.d, indexing="ij"), -1)
-        return frame, frame.states(nodes.reshape(-1, self.d).astype(x.dtype))
+        return frame, frame.states(jnp.asarray(nodes.reshape(-1, self.d), x.dtype))
 
     def fitted(self, x, values, good):
         return jnp.where(jnp.isfinite(values), values, 0)
@@ -133,8 +131,7 @@ class Grid(AbstractFitted):
         place = jnp.clip((x + 1) * (n - 1) / 2, k // 2 - 1, n - k // 2)
         begin = jnp.minimum(jnp.floor(place) - (k // 2 - 1), n - k)
         off = (place - begin)[:, None] - np.arange(k)
-        others = [[m for m in range(k) if m != j] for j in range(k)]
-        each = enumerate(map(np.array, others))
+        each = [(j, np.delete(np.arange(k), j)) for j in range(k)]
         weights = jnp.stack([jnp.prod(off[:, m] / (j - m), axis=1) for j, m in each])
         block = lax.dynamic_slice(
             c.reshape(*[n] * self.d, *last),
@@ -147,19 +144,16 @@ class Grid(AbstractFitted):
 
 
 class Hermite(AbstractFitted):
-    """Products of Hermite polynomials in `d` variables. There is a candidate for each of
-    the total degrees."""
+    """Products of Hermite polynomials, with a candidate for each of the total degrees."""
 
     d: int
     degrees: tuple[int, ...]
 
     @property
-    def num_sites(self):
-        return max(_FEWEST_PILOTS, _PILOTS_PER_POLYNOMIAL * self.shape[0])
-
-    @property
     def shape(self):
-        return num_polynomials(self.d, max(self.degrees)), len(self.degrees)
+        count = num_polynomials(self.d, max(self.degrees))
+        pilots = max(_FEWEST_PILOTS, _PILOTS_PER_POLYNOMIAL * count)
+        return pilots, count, len(self.degrees)
 
     def sites(self, frame, states, good, key):
         z = _MOVE * jr.normal(key, states.shape, states.dtype)
@@ -179,9 +173,8 @@ class Hermite(AbstractFitted):
 
 
 class Quadratic(AbstractBasis):
-    """Linear and quadratic functions. Their coefficients are the first and the second
-    derivatives at the origin, one after another. There is a candidate for each of the
-    degrees."""
+    """Linear and quadratic functions, with a candidate for each degree. Their coefficients
+    are the first and the second derivatives at the origin, one after another."""
 
     degrees: tuple[int, ...]
 
@@ -215,7 +208,7 @@ def fit_values(
     of the steps of many paths: to compile these takes most of the time."""
     p, level = noise.problem, noise.level
     y0, unravel = jfu.ravel_pytree(p.y0)
-    d, n, steps = y0.size, basis.num_sites, level.num_steps
+    d, n, steps = y0.size, basis.shape[0], level.num_steps
     k_path, k_move = jr.split(key)
     keys = jr.split(k_path, n)
 
@@ -247,7 +240,7 @@ def fit_values(
         def fit():
             put = lambda all, one: all.at[i].set(one)
             values = _values(noise, i, u, ys, ends)
-            flat = values.reshape(n, basis.shape[1], -1)
+            flat = values.reshape(n, basis.shape[2], -1)
             found = basis.fitted(frame.at(x), flat, good)
             c = put(u.coefficients, found.reshape(u.coefficients.shape[1:]))
             frames = jtu.tree_map(put, u.frames, frame)
@@ -257,7 +250,7 @@ def fit_values(
 
     zero = lambda *shape: jnp.zeros((p.max_steps, *shape), y0.dtype)
     frames = Frame(zero(d), zero(d, d), zero(d, d))
-    u = Functions(frames, zero(*basis.shape, *p.num_outputs), basis)
+    u = Functions(frames, zero(*basis.shape[1:], *p.num_outputs), basis)
     ensemble = Ensemble.start(p, n, None)
     carry = ensemble, zero(n, d) + y0, jnp.zeros_like(y0), u
     _, states, _, u = lax.fori_loop(0, 2 * steps, body, carry)
@@ -267,20 +260,18 @@ def fit_values(
 def fit_derivatives(
     noise: AbstractNoise, key: PRNGKeyArray, basis: Quadratic
 ) -> tuple[Functions, Float[Array, "steps n d"]]:
-    """Quadratic functions, by mean first and second derivatives at the pilot's states. For
-    Gaussian states that is the best quadratic function in the mean square, by Stein's
-    lemma. Returns these, too."""
+    """By mean first and second derivatives at the pilot's states, which are returned, too.
+    For Gaussian states that is best in the mean square, by Stein's lemma."""
     p, level = noise.problem, noise.level
     y0, unravel = jfu.ravel_pytree(p.y0)
     n, d = _QUADRATIC_PILOTS, y0.size
     keys = jr.split(key, n)
-    brief = lambda i, y, key, draw: noise.ends(
-        i, y, noise.fresh(i, y), key, draw, brief=True
-    )
+    state, brief = noise.fresh, dict(brief=True)
+    ends_of = lambda i, y, key, draw: noise.ends(i, y, state(i, y), key, draw, **brief)
 
     def forward(i, carry):
         ensemble, states = carry
-        ends = jax.vmap(lambda y, key: brief(i, y, key, i))(ensemble.y, keys)
+        ends = jax.vmap(lambda y, key: ends_of(i, y, key, i))(ensemble.y, keys)
         ensemble = _own(p, ensemble, ends)
         return ensemble, states.at[i].set(jax.vmap(ravel)(ensemble.y))
 
@@ -302,7 +293,7 @@ def fit_derivatives(
 
             def value(x):
                 y = unravel(x)
-                ends = brief(step, y, key, p.max_steps + i)
+                ends = ends_of(step, y, key, p.max_steps + i)
                 axis = lambda tree: jtu.tree_map(lambda x: x[None], tree)
                 return _values(noise, i, u, axis(y), axis(ends))[0]
 

@@ -50,7 +50,7 @@ class IndependentPaths(AbstractSampling):
     """
 
     num_paths: int = eqx.field(converter=lambda x: whole_number("num_paths", x))
-    batch_size: int | None = None
+    batch_size: int | np.integer | None = None
 
     def prepare(self, problem, key, devices):
         return Prepared(IndependentPathsSampler(problem), self.plan(devices))

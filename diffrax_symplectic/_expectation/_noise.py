@@ -134,6 +134,7 @@ class DifferentiatedNoise(AbstractNoise):
         return Ends(y, state, success, jnp.asarray(weights, x.dtype), jnp.array(0))
 
     def advance(self, i, y, state, u, second, key):
+        assert second is not None
         x = self._draw(key, i)
         y1, new, success = self.step(i, y, state, x)
         first = jax.jacrev(lambda x: u(self.step(i, y, state, x)[0]))(0 * x)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from .._arguments import whole_number
 from ._estimate import Expectation, run
 from ._fits import (
-    AbstractBasis,
+    AbstractFitted,
     fit_derivatives,
     fit_values,
     Functions,
@@ -114,7 +114,9 @@ class ValueFunctions(AbstractSampling):
         return Prepared(sampler(best), plan, reason)
 
 
-def _basis(p: Problem, degree: int | None) -> tuple[AbstractBasis, str, list[str]]:
+def _basis(
+    p: Problem, degree: int | None
+) -> tuple[AbstractFitted | Quadratic, str, list[str]]:
     """The functions, and what the candidates are called. Raises a `ValueError` if there is
     not enough memory."""
     d, levels = sum(x.size for x in jtu.tree_leaves(p.y0)), len(p.levels.h)
@@ -131,10 +133,10 @@ def _basis(p: Problem, degree: int | None) -> tuple[AbstractBasis, str, list[str
     if many and max(degrees) <= 2:
         return Quadratic(degrees), "degree", [*map(str, degrees)]
     basis = Hermite(d, degrees)
-    need = item * basis.shape[0] * (basis.num_sites + len(degrees) * outputs)
+    need = item * basis.shape[1] * (basis.shape[0] + len(degrees) * outputs)
     if need > _MOST_MEMORY:
         raise ValueError(
-            f"`degree={degree}` has {basis.shape[0]:,} polynomials in {d} dimensions, the "
+            f"`degree={degree}` has {basis.shape[1]:,} polynomials in {d} dimensions, the "
             f"fit of which needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`."
         )
     return basis, "degree", [*map(str, degrees)]
@@ -150,7 +152,7 @@ def value_function(problem: Problem, key: PRNGKeyArray) -> Functions | None:
     return _chosen(fitted, np.zeros(problem.num_outputs, int))[0]
 
 
-def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis):
+def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractFitted | Quadratic):
     """For each level."""
     levels = range(len(problem.levels.h))
     keys = [jr.fold_in(key, k) for k in levels]
@@ -160,7 +162,7 @@ def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis):
 
 @eqx.filter_jit
 def _fit(
-    problem: Problem, level: Level, key: PRNGKeyArray, basis: AbstractBasis
+    problem: Problem, level: Level, key: PRNGKeyArray, basis: AbstractFitted | Quadratic
 ) -> tuple[Functions, Array | None]:
     """Functions with an axis for the candidates, and what the noise keeps of them."""
     noise = noise_of(problem, level)

@@ -130,9 +130,9 @@ CASES = {
         1.0, 4, Y0, 6, 2, 512, _exact.kubo_square,
     ),
     "pendulum": Case(
-        _q2, _pendulum(_one), _verlet, 2.0, 16, Y0, 5, None, 4096,
+        _q2, _pendulum(_one), _verlet, 2.0, 16, Y0, 4, None, 4096,
         lambda: _exact.by_splines(
-            lambda q: -np.sin(q), lambda q: 0.4 * np.sin(q) - 0.1, Y0, 2.0, 16, (5, 5)
+            lambda q: -np.sin(q), lambda q: 0.4 * np.sin(q) - 0.1, Y0, 2.0, 16, (4, 4)
         ),
     ),
     "synchrotron": Case(
@@ -145,9 +145,9 @@ CASES = {
         ),
     ),
     "double well": Case(
-        _q2, _double_well(_one), _verlet, 2.0, 20, _UP, 5, None, 4096,
+        _q2, _double_well(_one), _verlet, 2.0, 20, _UP, 4, None, 4096,
         lambda: _exact.by_splines(
-            lambda q: q - q**3, lambda q: -0.3 * np.cos(q), _UP, 2.0, 20, (4, 3)
+            lambda q: q - q**3, lambda q: -0.3 * np.cos(q), _UP, 2.0, 20, (3.5, 2.8)
         ),
     ),
     "quartic Kubo": Case(
