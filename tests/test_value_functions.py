@@ -12,6 +12,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._expectation._fits import (
     exponents,
     Frame,
+    Grid,
     hermite,
     least_squares,
 )
@@ -49,7 +50,7 @@ def _enumerated(terms, solver, y, phi, h: float, steps: int):
     return ds.step_expectation(terms, solver, 0.0, h, y, fn=then)
 
 
-@pytest.mark.parametrize("degree", [1, 6])
+@pytest.mark.parametrize("degree", [1, 6, None])
 def test_the_mean_is_that_over_all_outcomes_however_the_fit_is(degree):
     # The quartic is not a polynomial of these degrees after three steps.
     phi = lambda t, y, args: y[1] ** 4 + y[0]
@@ -57,7 +58,7 @@ def test_the_mean_is_that_over_all_outcomes_however_the_fit_is(degree):
     exact = _enumerated(PENDULUM, ds.StormerVerlet(), Y0, phi, 0.25, 3)
     assert abs(got.mean - exact) <= 4.5 * got.std_error
     # Of as many plain paths it would be 2.2e-2.
-    assert 0 < got.std_error < {1: 5e-3, 6: 1e-5}[degree]
+    assert 0 < got.std_error < {1: 5e-3, 6: 1e-5, None: 1e-9}[degree]
     assert (got.num_paths, got.num_failed) == (4096, 0)
 
 
@@ -252,6 +253,26 @@ def test_polynomials_are_orthonormal_and_fits_nested():
     got = least_squares(twice, values[:, 1:], (4,))
     smallest = np.linalg.lstsq(twice, values[:, 1], rcond=None)[0]
     np.testing.assert_allclose(got[:, 0], smallest, atol=1e-3)
+
+
+def test_a_grid_interpolates_with_degree_five_and_is_constant_beyond():
+    grid, axis = Grid(2, 12), np.linspace(-1, 1, 12)
+    fn = lambda x, y: (x**5 - x) * (y**5 + y**2)
+    c = jnp.asarray(fn(*np.meshgrid(axis, axis, indexing="ij"))).reshape(-1, 1)
+    # Two points at least are to lie on either side.
+    inner = axis[9]
+    x = jr.uniform(KEY, (50, 2), minval=-inner, maxval=inner)
+    at = jax.vmap(lambda x: grid.combined(x, c)[0])
+    np.testing.assert_allclose(at(x), fn(*x.T), atol=1e-13)
+    np.testing.assert_allclose(
+        at(3 * x), at(jnp.clip(3 * x, -inner, inner)), atol=1e-13
+    )
+    # It holds twice the range of the points, whatever they are.
+    points = jr.normal(KEY, (300, 2)) @ jnp.array([[1.0, 2.0], [0.0, 0.1]])
+    good = jnp.ones(300, bool)
+    frame, sites = grid.sites(Frame.of(points, good, jnp.ones(2)), points, good, KEY)
+    np.testing.assert_allclose(frame.at(sites)[[0, -1]], [[-1, -1], [1, 1]], atol=1e-12)
+    np.testing.assert_allclose(np.abs(frame.at(points)).max(axis=0), 0.5, atol=1e-12)
 
 
 def test_frames_do_not_depend_on_units():

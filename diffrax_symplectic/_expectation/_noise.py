@@ -45,6 +45,11 @@ class AbstractNoise(eqx.Module):
     problem: eqx.AbstractVar[Problem]
     level: eqx.AbstractVar[Level]
 
+    @property
+    @abc.abstractmethod
+    def num_outcomes(self) -> int:
+        """How many ends of a step are looked at."""
+
     @abc.abstractmethod
     def ends(
         self, i, y: Y, state: PyTree, key: PRNGKeyArray, draw, wide=False, brief=False
@@ -86,6 +91,10 @@ class EnumeratedNoise(AbstractNoise):
     values: Float[np.ndarray, "K n"]
     probabilities: Float[np.ndarray, " K"]
 
+    @property
+    def num_outcomes(self):
+        return len(self.probabilities)
+
     def ends(self, i, y, state, key, draw, wide=False, brief=False):
         one = lambda variables: self.step(i, y, state, variables)
         y, state, success = jax.vmap(one)(self.values)
@@ -118,6 +127,10 @@ class DifferentiatedNoise(AbstractNoise):
     problem: Problem
     level: Level
     laws: tuple[AbstractLaw, ...] = eqx.field(static=True)
+
+    @property
+    def num_outcomes(self):
+        return 2 * len(self.laws) + 2
 
     def ends(self, i, y, state, key, draw, wide=False, brief=False):
         x, m = self._draw(key, draw), len(self.laws)

@@ -44,8 +44,9 @@ from ._steps import (
 
 # By default there are no more polynomials than this in a fit.
 _MOST_POLYNOMIALS = 130
-# By default there is a grid in up to so many dimensions, as fine as memory allows.
-_GRID, _GRID_SIZES = 2, (64, 32)
+# By default there is a grid in up to so many dimensions, as fine as memory allows,
+# and so many steps from its points to all outcomes, for each step of a path.
+_GRID, _GRID_SIZES, _MOST_STEPS = 2, (64, 32), 50_000
 # Bytes that a fit may take.
 _MOST_MEMORY = 4 * 2**30
 # Second derivatives by the noise are averaged over so many states.
@@ -94,7 +95,6 @@ class ValueFunctions(AbstractSampling):
     )
 
     def prepare(self, problem, key, devices):
-        noise_of(problem, problem.level(0))
         basis, kind, names = _basis(problem, self.degree)
         fitted = _fits(problem, key, basis)
         sampler = lambda best: ValueFunctionsSampler(problem, *_chosen(fitted, best))
@@ -118,13 +118,15 @@ def _basis(
     p: Problem, degree: int | None
 ) -> tuple[AbstractFitted | Quadratic, str, list[str]]:
     """The functions, and what the candidates are called. Raises a `ValueError` if there is
-    not enough memory."""
+    not enough memory, or for random variables without finitely many outcomes."""
+    noise = noise_of(p, p.level(0))
     d, levels = sum(x.size for x in jtu.tree_leaves(p.y0)), len(p.levels.h)
     outputs, item = levels * p.max_steps * math.prod(p.num_outputs), p.dtype.itemsize
     many = num_polynomials(d, 2) > _MOST_POLYNOMIALS
     if degree is None:
         for size in _GRID_SIZES if d <= _GRID else ():
-            if 2 * item * size**d * outputs <= _MOST_MEMORY:
+            steps = size**d * noise.num_outcomes
+            if 2 * item * size**d * outputs <= _MOST_MEMORY and steps <= _MOST_STEPS:
                 return Grid(d, size), "grid points along an axis", ["0", str(size)]
         few = [k for k in range(9) if num_polynomials(d, k) <= _MOST_POLYNOMIALS]
         degrees = (0, 1, 2) if many else (*(k for k in few[:-1] if k % 2 == 0), few[-1])
@@ -145,10 +147,10 @@ def _basis(
 def value_function(problem: Problem, key: PRNGKeyArray) -> Functions | None:
     """A quadratic one, or none for random variables without finitely many outcomes."""
     try:
-        noise_of(problem, problem.level(0))
+        basis = _basis(problem, 2)[0]
     except ValueError:
         return None
-    fitted = _fits(problem, key, _basis(problem, 2)[0])
+    fitted = _fits(problem, key, basis)
     return _chosen(fitted, np.zeros(problem.num_outputs, int))[0]
 
 

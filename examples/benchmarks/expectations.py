@@ -247,7 +247,7 @@ def table(measured: dict[str, dict]) -> str:
     for name, m in measured.items():
         c = CASES[name]
         kind = f"degree {c.degree}" if c.degree else m["reason"].split(" was")[0]
-        kind = kind.replace("grid points along an axis: 64", "grid of 64 by 64")
+        kind = kind.replace("grid points along an axis: ", "grid, ")
         error = "" if np.isnan(m["exact"]) else f"{m['error']:.1e}"
         cells = (
             f"{name}, t = {c.t1:g}", f"`{type(c.solver).__name__}`",
