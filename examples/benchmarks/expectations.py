@@ -233,7 +233,7 @@ def draw(measured: dict[str, dict]) -> None:
         ax.set_xlabel("seconds")
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("total error")
-    axes[0].legend(fontsize=8)
+    axes[2].legend(fontsize=8, loc="lower left")
     figure.tight_layout()
     figure.savefig(DOCS / "samplings.png", dpi=110)
 
