@@ -6,13 +6,14 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from diffrax_symplectic._expectation._point_set import (
+from diffrax_symplectic._expectation._points import (
+    _curve,
+    hilbert_order,
     nested_scramble,
     num_seeds,
     randomized,
     sobol_points,
 )
-from diffrax_symplectic._expectation._sorting import _curve, hilbert_order
 
 
 def test_points_are_a_digital_net_after_scrambling():
@@ -66,7 +67,7 @@ def test_the_curve_meets_each_cell_once_and_goes_on_to_its_neighbour(
     d, bits, monkeypatch
 ):
     monkeypatch.setattr(
-        "diffrax_symplectic._expectation._sorting._COORDINATE_BITS", bits
+        "diffrax_symplectic._expectation._points._COORDINATE_BITS", bits
     )
     axes = np.meshgrid(*[np.arange(2**bits)] * d, indexing="ij")
     cells = np.stack(axes, -1).reshape(-1, d).astype(np.uint32)

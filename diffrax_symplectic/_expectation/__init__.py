@@ -1,10 +1,11 @@
-from ._call import expectation as expectation, monte_carlo as monte_carlo
-from ._result import (
+from ._array_rqmc import ArrayRQMC as ArrayRQMC
+from ._call import expectation as expectation
+from ._estimate import (
     Expectation as Expectation,
     ExpectationInterrupted as ExpectationInterrupted,
 )
-from ._sampling import (
-    ArrayRQMC as ArrayRQMC,
+from ._monte_carlo import (
     IndependentPaths as IndependentPaths,
-    ValueFunctions as ValueFunctions,
+    monte_carlo as monte_carlo,
 )
+from ._value_functions import ValueFunctions as ValueFunctions

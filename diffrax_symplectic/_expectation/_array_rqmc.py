@@ -1,5 +1,7 @@
 """All paths of one randomization, sorted before each step: array-RQMC."""
 
+import math
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -10,8 +12,9 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, PyTree, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree, UInt32
 
+from .._arguments import check_takes, whole_number
 from .._brownian import (
     AbstractStepwisePath,
     GivenPath,
@@ -21,17 +24,114 @@ from .._brownian import (
 )
 from .._custom_types import Y
 from .._terms import brownian_paths, replace_paths
-from ._point_set import MAX_DIMENSION, num_seeds, randomized, sobol_points
-from ._sorting import hilbert_order
+from ._estimate import run
+from ._fits import Functions
+from ._points import hilbert_order, num_seeds, randomized, sobol_points
 from ._steps import (
     AbstractLevelSampler,
-    ensemble_of,
-    mean_of_good,
-    moved,
+    AbstractSampling,
+    along,
+    check_real,
+    independent_steps,
+    Plan,
+    Prepared,
     Problem,
     real,
     simulate,
 )
+from ._value_functions import value_function
+
+
+# For so many coordinates of Sobol' points SciPy has direction numbers.
+_MAX_DIMENSION = 21201
+# Fewer replicates say too little about their spread to stop because of it.
+_BEFORE_STOPPING = 8
+# With fewer paths along each coordinate neighbours are far apart. Two ways to sort are
+# compared by so many replicates.
+_FEW, _TRIAL = 3, 4
+
+
+class ArrayRQMC(AbstractSampling):
+    r"""Paths that balance each other, by randomized quasi-Monte Carlo.
+
+    All paths of a replicate take a step together. Before it they are sorted, so that
+    neighbours in the state space are neighbours along Hilbert's curve. Path number $j$ in
+    this order takes the $j$-th of a scrambled set of Sobol' points, the coordinates of
+    which become the random variables of the step, one each. So neighbours take values that
+    balance each other, and what the paths have in common cancels. Each path by itself has
+    its law exactly, and the estimate has no bias but that of the solver.
+
+    The error falls faster than one over the root of the number of paths, in few dimensions
+    much faster: for up to four numbers in the state (or in `sort_by`) and $\phi$ smooth,
+    one replicate is worth hundreds to thousands of times as many independent paths. For
+    large systems that the noise moves far it is worth tens of times as many, in chaos
+    after long times no less than as many, and what is spent on sorting is lost.
+
+    **Arguments:**
+
+    - `num_paths`: of each replicate; a power of two.
+    - `replicates`: independent randomizations; with `tol` at most, and 8 at least. Each
+        device takes one at a time: memory does not grow with their number.
+    - `sort_by`: takes the state to a PyTree of those real numbers that paths are sorted
+        by, as few of them as distinguish the states that matter. By default the state
+        itself. If it has so many numbers that neighbours would be far apart, $\phi$ is one
+        number and the variables of a step are discrete, it is a function of the state that
+        is fitted to $\mathbb E[\phi \mid y_n = y]$, where a short trial finds that better.
+
+    **Source:** [L'Ecuyer, Lécot and Tuffin
+    (2008)](https://doi.org/10.1287/opre.1080.0556).
+    """
+
+    num_paths: int = eqx.field(
+        default=2**14, converter=lambda x: _power_of_two("num_paths", x)
+    )
+    replicates: int = eqx.field(
+        default=16, converter=lambda x: whole_number("replicates", x, 2)
+    )
+    sort_by: Callable[[Y], PyTree[ArrayLike]] | None = None
+
+    def prepare(self, problem, key, devices):
+        words = layout(problem.terms)
+        if not 0 < words.num_words <= _MAX_DIMENSION:
+            raise ValueError(
+                f"`terms` need {words.num_words:,} random variables in each step. There "
+                f"have to be some, and at most {_MAX_DIMENSION:,}, as Sobol' points have. "
+                "Pass `sampling=IndependentPaths(num_paths)`."
+            )
+        points = jnp.asarray(sobol_points(self.num_paths, words.num_words))
+        plan = Plan(self.replicates, 1, self.num_paths, _BEFORE_STOPPING)
+        sort_by = _state if self.sort_by is None else self.sort_by
+        dimension = _num_coordinates(sort_by, problem.y0)
+        # How many of the paths, sorted, there are along each coordinate.
+        each = self.num_paths ** (1 / dimension)
+        sampler = ArrayRQMCSampler(problem, sort_by, points, words)
+        if each >= _FEW:
+            return Prepared(sampler, plan)
+        if self.sort_by is None and problem.num_outputs == (1, 1):
+            u = value_function(problem, key)
+            trial = Plan(_TRIAL, 1, self.num_paths)
+            others = [] if u is None else [ArrayRQMCSampler(problem, u, points, words)]
+            own = jr.fold_in(key, _TRIAL)
+            spread = lambda s: float(
+                np.sum(jtu.tree_leaves(run(s, own, trial, devices).variance))
+            )
+            for other in others:
+                ratio = spread(sampler) / spread(other)
+                if ratio > 1:
+                    reason = (
+                        "sorted by a fitted value function, which divides the variance "
+                        f"by {ratio:.1f} against the state"
+                    )
+                    return Prepared(other, plan, reason)
+        warnings.warn(
+            f"{self.num_paths:,} paths are sorted by {dimension} coordinates, so that "
+            f"there are {each:.1f} along each of them: neighbours are far apart, and "
+            "`ArrayRQMC` gains little over `IndependentPaths`. Pass `sort_by` with the few "
+            "coordinates that matter most, "
+            f"{int(math.log(self.num_paths, _FEW))} at most.",
+            stacklevel=4,
+        )
+        return Prepared(sampler, plan)
 
 
 class ArrayRQMCSampler(AbstractLevelSampler):
@@ -42,8 +142,7 @@ class ArrayRQMCSampler(AbstractLevelSampler):
     step."""
 
     problem: Problem
-    weights: Float[np.ndarray, "combinations levels"]
-    sort_by: Callable[[Y], PyTree[Array]]
+    sort_by: Callable[[Y], PyTree[Array]] | Functions
     points: UInt32[Array, "n d"]
     layout: "Layout" = eqx.field(static=True)
 
@@ -58,54 +157,41 @@ class ArrayRQMCSampler(AbstractLevelSampler):
         p, n = self.problem, len(self.points)
         key = jr.fold_in(key, level.index)
 
-        def words(step):
+        def words(i):
             count = num_seeds(self.points.shape[1])
-            seeds = jr.bits(jr.fold_in(key, step), (count,), jnp.uint32)
+            seeds = jr.bits(jr.fold_in(key, i), (count,), jnp.uint32)
             return randomized(self.points, seeds, self.layout.sixths)
 
-        def terms_of(words):
-            return with_words(p.terms, self.layout, words)
+        terms_of = lambda words: with_words(p.terms, self.layout, words)
+        advance, ensemble = independent_steps(p, level, n, terms_of, words)
 
         def step(i, ensemble, carried):
-            order = hilbert_order(
-                coordinates(self.sort_by, ensemble.y), ensemble.failed
-            )
-            ensemble = jtu.tree_map(lambda x: x[order], ensemble)
+            by = self.sort_by
+            if isinstance(by, Functions):
+                u = jtu.tree_map(lambda x: x[level.index], by)
+                by = lambda y: u(i - 1, y)
+            z = _coordinates(by, ensemble.y)
+            order = hilbert_order(z, ensemble.failed)
+            return advance(i, jtu.tree_map(lambda x: x[order], ensemble), carried)
 
-            def one(words, y, state):
-                state = eqx.combine(state, static)
-                y, state, success = p.step(terms_of(words), i, level.h, y, state)
-                return y, eqx.filter(state, eqx.is_array), success
-
-            out = jax.vmap(one)(words(i), ensemble.y, ensemble.solver_state)
-            return moved(p, ensemble, *out), carried
-
-        start = eqx.filter_vmap(lambda words: p.init(terms_of(words), level.h))(
-            words(0)
-        )
-        state, static = eqx.partition(start, eqx.is_array)
-        ensemble = ensemble_of(p, n, state)
-        saved, ensemble, _ = simulate(p, level, ensemble, step, None, mean_of_good)
+        saved, ensemble, _ = simulate(p, level, ensemble, step, None, _mean_of_good)
         return saved, jnp.array(True), jnp.sum(ensemble.failed)
 
 
-def coordinates(sort_by, y: Y) -> Float[Array, "n d"]:
+def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "..."]:
+    """The mean over the paths that have not failed."""
+    x = jnp.where(along(~failed, x), x, 0)
+    # In two stages, so that rounding errors in single precision do not add up.
+    rows = 1 << ((len(x).bit_length() - 1) // 2)
+    total = jnp.sum(jnp.sum(x.reshape(rows, -1, *x.shape[1:]), axis=0), axis=0)
+    return total / jnp.sum(~failed).astype(total.dtype)
+
+
+def _coordinates(sort_by, y: Y) -> Float[Array, "n d"]:
     """What the paths are sorted by, as one array."""
     leaves = jtu.tree_leaves(jax.vmap(sort_by)(y))
     columns = [jnp.reshape(leaf, (len(leaf), -1)) for leaf in leaves]
     return jnp.concatenate([x.astype(real(x.dtype)) for x in columns], axis=1)
-
-
-def points_for(terms, num_paths: int) -> tuple["Layout", np.ndarray]:
-    """Which random variables a step has, and points with a coordinate for each."""
-    words = layout(terms)
-    if not 0 < words.num_words <= MAX_DIMENSION:
-        raise ValueError(
-            f"`terms` need {words.num_words:,} random variables in each step. There have "
-            f"to be some, and at most {MAX_DIMENSION:,}, as Sobol' points have. Pass "
-            "`sampling=IndependentPaths(num_paths)`."
-        )
-    return words, sobol_points(num_paths, words.num_words)
 
 
 class Layout(NamedTuple):
@@ -150,3 +236,26 @@ def with_words(
 def _from_words(path: AbstractStepwisePath, words, t0, t1, use_levy: bool) -> Increment:
     """The increment of the path that is made of the first of these words."""
     return path.increment(words[: path.num_words(use_levy)], t0, t1, use_levy)
+
+
+def _state(y: Y) -> Y:
+    return y
+
+
+def _power_of_two(name: str, value) -> int:
+    whole = whole_number(name, value, 2)
+    if whole & (whole - 1):
+        raise ValueError(
+            f"`{name}` must be a power of two, of which Sobol' points are balanced; got "
+            f"{whole}. Pass {2 ** (whole.bit_length() - 1)} or {2 ** whole.bit_length()}."
+        )
+    return whole
+
+
+def _num_coordinates(sort_by, y0) -> int:
+    """Of how many numbers `sort_by` makes the order."""
+    check_takes("sort_by", sort_by, "y")
+    batch = jtu.tree_map(lambda x: x[None], y0)
+    by = eqx.filter_eval_shape(lambda y: jtu.tree_leaves(jax.vmap(sort_by)(y)), batch)
+    check_real("sort_by", by)
+    return jax.eval_shape(lambda y: _coordinates(sort_by, y), batch).shape[1]

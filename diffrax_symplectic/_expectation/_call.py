@@ -1,8 +1,9 @@
-"""Expectations with their error bars: of functions of the state, and of functions of a
-random key."""
+"""Expectations of functions of the state, with their error bars."""
 
+import dataclasses
+import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -11,23 +12,35 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
+from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._arguments import check_solver, check_takes, whole_number
-from .._brownian import check_key
-from .._compat import ClosedJaxpr, jaxpr_as_fun, solves_without_throwing
 from .._custom_types import Args, RealScalarLike, Y
 from .._structure_checks import check_stratonovich
-from ._batches import Plan, run
-from ._choice import chosen
-from ._result import Expectation, level_weights, warn_of_tol
-from ._sampling import AbstractSampling, batch_size_of, check_real, IndependentPaths
-from ._steps import AbstractSampler, is_finite, Level, Problem, Samples
+from ._array_rqmc import ArrayRQMC
+from ._estimate import Expectation, NO_METER, run, warn_of_tol
+from ._monte_carlo import check_tol, checked_key, IndependentPaths
+from ._steps import (
+    AbstractSampling,
+    check_real,
+    Level,
+    level_weights,
+    Prepared,
+    Problem,
+)
+from ._value_functions import ValueFunctions
 
 
-_no_meter = diffrax.NoProgressMeter()
 # The keys made from this number belong to no sample.
 _NO_SAMPLE = 0xFFFFFFFF
+# Paths of a trial of independent paths, which is one batch; of a replicate, and how many.
+_PATHS, _REPLICATE, _REPLICATES = 2**13, 2**12, 8
+# What promises to take less time than this is taken without further trials.
+_SECONDS = 0.5
+# A gain for which no other sampling is tried.
+_CLEAR = 1e5
+# The most samples that a tolerance may ask for.
+_MOST = 10**9
 
 
 def expectation(
@@ -47,7 +60,7 @@ def expectation(
     tol: float | None = None,
     start: Expectation | None = None,
     devices: Sequence[Any] | None = None,
-    progress_meter: diffrax.AbstractProgressMeter = _no_meter,
+    progress_meter: diffrax.AbstractProgressMeter = NO_METER,
 ) -> Expectation:
     r"""Estimates $\mathbb E[\phi(t, y_t)]$, its standard error, and the error of
     discretization.
@@ -135,17 +148,17 @@ def expectation(
     and variances of batches are combined; [Talay and Tubaro
     (1990)](https://doi.org/10.1080/07362999008809220) for extrapolation.
     """
-    key = _checked_key(key, "expectation")
-    _check_tol(tol)
+    key = checked_key(key, "expectation")
+    check_tol(tol)
     levels = whole_number("levels", levels)
     _check_solver(solver)
-    problem, weights = _problem(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels)
+    problem = _problem(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels)
     devices = tuple(jax.devices() if devices is None else devices)
     k_pilot, why, prepared = jr.fold_in(key, _NO_SAMPLE), "", None
     if sampling is None and start is not None:
         sampling, why = start.sampling, start.reason
     elif sampling is None:
-        sampling, prepared, why = chosen(problem, weights, k_pilot, tol, devices)
+        sampling, prepared, why = _chosen(problem, k_pilot, tol, devices)
     if not isinstance(sampling, AbstractSampling):
         raise ValueError(
             "`sampling` must be `IndependentPaths(num_paths)`, `ArrayRQMC()`, "
@@ -157,7 +170,7 @@ def expectation(
             "same."
         )
     if prepared is None:
-        prepared = sampling.prepare(problem, weights, k_pilot, devices)
+        prepared = sampling.prepare(problem, k_pilot, devices)
     sampler, plan, reason = prepared
     about = dict(sampling=sampling, reason=why or reason)
     estimate = run(sampler, key, plan, devices, start, tol, progress_meter, **about)
@@ -165,175 +178,7 @@ def expectation(
     return estimate
 
 
-def monte_carlo(
-    fn: Callable[..., Any],
-    key: PRNGKeyArray,
-    num_paths: int | np.integer,
-    *,
-    batch_size: int | np.integer | None = None,
-    levels: int = 1,
-    order: int | None = None,
-    tol: float | None = None,
-    start: Expectation | None = None,
-    devices: Sequence[Any] | None = None,
-    progress_meter: diffrax.AbstractProgressMeter = _no_meter,
-) -> Expectation:
-    r"""Averages a function of a random key: whatever a path of your own makes of it.
-
-    For functions of the state at given times [`diffrax_symplectic.expectation`][] is
-    simpler, and needs far fewer paths. This one is for all else: events, gradients,
-    functions of whole paths.
-
-    !!! example
-
-        ```python
-        import diffrax
-        import diffrax_symplectic as ds
-        import jax.numpy as jnp
-        import jax.random as jr
-
-        H = lambda t, p, q, args: (p**2 + q**2) / 2
-        y0 = (jnp.array(0.0), jnp.array(1.0))
-
-        def phi(key):
-            terms = ds.hamiltonian_terms(H, H, ds.WeakBrownianPath((), key))
-            sol = diffrax.diffeqsolve(
-                terms, ds.SRKw1(), t0=0, t1=1, dt0=0.1, y0=y0, throw=False
-            )
-            p, q = sol.ys
-            return q[-1] ** 2, sol.result
-
-        estimate = ds.monte_carlo(phi, jr.key(0), 10_000)
-        print(estimate.mean, estimate.std_error, estimate.num_failed)
-        ```
-
-    `fn` is compiled anew for each new function. For many values of a parameter pass one
-    function and the parameter as an array, `jax.tree_util.Partial(fn, parameter)`.
-    Gradients are taken within: the mean of `jax.grad` of a path is the gradient of the
-    expectation. On several devices the solve needs the adjoint `diffrax.DirectAdjoint()` or
-    `diffrax_symplectic.ReversingAdjoint()`. This function itself is no part of a JAX
-    program: it cannot be differentiated, `jit`ted or `vmap`ped.
-
-    **Levels.** With `levels=2` (3, ...) and `order=p` the function is `fn(key, level)`,
-    which solves with the step $h$ on level 0, $h/2$ on level 1, and so on. `mean` is
-    extrapolated to steps of size zero. Let the levels follow one Brownian motion, with
-    `cell=` of [`diffrax_symplectic.FixedStepBrownianPath`][]: then `bias`, the error of
-    discretization of the finest level, is known much better than the mean.
-
-    **Arguments:**
-
-    - `fn`: takes a random key to $\phi$, a PyTree of real arrays, or to a pair of that
-        and a `diffrax.RESULTS`: as above, with `throw=False`. A path fails if its result
-        is neither successful nor an event, or anything in its $\phi$ is not finite.
-        (Without `sol.result` a path that failed counts as a success: Diffrax returns where
-        it stopped.)
-    - `key`: a JAX random key. Path number $i$ gets the key
-        `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`.
-    - `num_paths`: the number of all paths, those of `start` included.
-    - `batch_size`: as for [`diffrax_symplectic.IndependentPaths`][].
-    - `levels`: how many step sizes.
-    - `order`: with levels, the weak order $p$ of the solver for the terms, as
-        `solver.weak_order(terms)` says.
-    - `tol`, `start`, `devices`, `progress_meter`: as for
-        [`diffrax_symplectic.expectation`][].
-
-    **Returns:** an [`diffrax_symplectic.Expectation`][].
-
-    **Raises:** as [`diffrax_symplectic.expectation`][]; a `ValueError` for levels without
-    `order`, or if $\phi$ holds a `diffrax.RESULTS`.
-    """
-    key = _checked_key(key, "monte_carlo")
-    _check_tol(tol)
-    levels = whole_number("levels", levels)
-    if levels > 1 and order is None:
-        raise ValueError(
-            "`levels` need `order=`, the weak order of the solver; got "
-            f"levels={levels!r} and order=None."
-        )
-    check_takes("fn", fn, *(["key"] if levels == 1 else ["key", "level"]))
-    order = 1 if order is None else whole_number("order", order)
-    devices = tuple(jax.devices() if devices is None else devices)
-    size = batch_size_of(batch_size, devices)
-    sampling = IndependentPaths(num_paths, size)
-    # For equal weights these are equal, so that JAX compiles a function once.
-    sampler = _Given(fn, tuple(map(tuple, level_weights(order, levels).tolist())))
-    plan = Plan(sampling.num_paths, size)
-    estimate = run(
-        sampler, key, plan, devices, start, tol, progress_meter, sampling=sampling
-    )
-    warn_of_tol(estimate, tol)
-    return estimate
-
-
-class _Given(AbstractSampler):
-    """Samples by a function of a key."""
-
-    fn: Callable[..., Any]
-    weights: tuple[tuple[float, ...], ...] = eqx.field(static=True)
-
-    def __call__(self, keys):
-        def one(key):
-            if len(self.weights) == 1:
-                each = [_evaluate(self.fn, key)]
-            else:
-                levels = range(len(self.weights[0]))
-                each = [_evaluate(lambda k, i=i: self.fn(k, i), key) for i in levels]
-            values, success = zip(*each)
-            wide = lambda x: x.astype(jnp.result_type(x, float))
-
-            def combined(*xs):
-                return jnp.stack(
-                    [sum(w * wide(x) for w, x in zip(row, xs)) for row in self.weights]
-                )
-
-            return jtu.tree_map(combined, *values), jnp.all(jnp.stack(success))
-
-        values, good = jax.vmap(one)(keys)
-        return Samples(values, good, (~good).astype(int))
-
-
-def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
-    """What `fn` returns, and whether the path succeeded."""
-    program, shape = jax.make_jaxpr(fn, return_shape=True)(key)
-    check_failures_are_reported(program, shape)
-    leaves = jaxpr_as_fun(program)(key)
-    out = jtu.tree_unflatten(jtu.tree_structure(shape), leaves)
-    success = jnp.array(True)
-    if isinstance(out, tuple) and len(out) == 2 and _is_result(out[1]):
-        out, result = out
-        success = diffrax.is_okay(result)
-    if any(map(_is_result, jtu.tree_leaves(out, is_leaf=_is_result))):
-        raise ValueError(
-            "`fn` returns a `diffrax.RESULTS` within phi, where it would be averaged. "
-            "Return a pair `(phi, sol.result)`, so that paths that failed are left out."
-        )
-    out = jtu.tree_map(jnp.asarray, out)
-    if len(jtu.tree_leaves(out)) == 0:
-        raise ValueError(f"`fn` must return arrays, which are averaged; got {out!r}.")
-    return out, success & is_finite(out)
-
-
-def check_failures_are_reported(program: ClosedJaxpr, out: PyTree) -> None:
-    """Raises a `ValueError` if a function solves with `throw=False`, as its program says,
-    but what it returns holds no `diffrax.RESULTS`."""
-    reported = any(map(_is_result, jtu.tree_leaves(out, is_leaf=_is_result)))
-    if not reported and solves_without_throwing(program.jaxpr):
-        raise ValueError(
-            "`fn` solves with `throw=False` but does not return `sol.result`, so that "
-            "paths that failed would be averaged as if they had not. Return the pair "
-            "`(phi, sol.result)`: then they are left out and counted. Or pass `throw=True` "
-            "to `diffeqsolve`, which raises an error if a path fails. If `fn` sees to "
-            "failures itself, return `(phi, diffrax.RESULTS.successful)`."
-        )
-
-
-def _is_result(x) -> bool:
-    return isinstance(x, type(diffrax.RESULTS.successful))
-
-
-def _problem(
-    phi, terms, solver, t0, t1, dt0, y0, args, ts, levels: int
-) -> tuple[Problem, Float[np.ndarray, "combinations levels"]]:
+def _problem(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels: int) -> Problem:
     num_steps, saved_steps = _steps(t0, t1, dt0, ts)
     y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
     start = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
@@ -348,10 +193,10 @@ def _problem(
         jnp.asarray(finer[:, None] * saved_steps),
     )
     most = int(finer[-1] * num_steps)
-    at_end = ts is None
-    problem = Problem(_Arrays(phi), terms, solver, start, y0, args, grid, at_end, most)
     order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
-    return problem, level_weights(order, levels)
+    weights = jnp.asarray(level_weights(order, levels), float)
+    phi, at = _Arrays(phi), (grid, weights, ts is None, most)
+    return Problem(phi, terms, solver, start, y0, args, *at)
 
 
 class _Arrays(eqx.Module):
@@ -390,18 +235,76 @@ def _steps(t0, t1, dt0, ts) -> tuple[np.integer, np.ndarray]:
     return steps[-1], steps[:-1]
 
 
-def _checked_key(key, user: str) -> PRNGKeyArray:
-    check_key(key, user)
-    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-    return key if typed else jr.wrap_key_data(key)
-
-
-def _check_tol(tol: float | None) -> None:
-    if tol is not None and not 0 < tol < np.inf:
-        raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")
-
-
 def _check_solver(solver) -> None:
     check_solver("solver", solver)
     if isinstance(solver, diffrax.HalfSolver):
         raise ValueError("`solver` must take fixed steps; got a `diffrax.HalfSolver`.")
+
+
+class _Trial(NamedTuple):
+    """A sampling that was tried: the variance of a sample, the largest if there are several
+    numbers, and the seconds that it takes."""
+
+    sampling: AbstractSampling
+    prepared: Prepared
+    variance: float
+    seconds: float
+
+    @property
+    def work(self) -> float:
+        """Seconds to a standard error of 1."""
+        return self.variance * self.seconds
+
+
+def _chosen(
+    problem: Problem, key: PRNGKeyArray, tol: float | None, devices: tuple
+) -> tuple[AbstractSampling, Prepared, str]:
+    """The sampling with the least product of variance and time, of those that can be used,
+    sized for `tol`; and why."""
+
+    def tried(sampling, samples: int) -> _Trial | None:
+        try:
+            prepared = sampling.prepare(problem, key, devices)
+        except ValueError:
+            return None
+        plan = prepared.plan._replace(num_samples=samples)
+        own = jr.fold_in(key, 0xFFFFFFFF)
+        sample = lambda: run(prepared.sampler, own, plan, devices)
+        sample()  # compiles
+        begin = time.perf_counter()
+        e = sample()
+        seconds = (time.perf_counter() - begin) / samples
+        variances = [np.max(x, initial=0.0) for x in jtu.tree_leaves(e.variance)]
+        variance = max(map(float, variances))
+        return _Trial(
+            sampling, prepared, variance if np.isfinite(variance) else np.inf, seconds
+        )
+
+    plain = tried(IndependentPaths(_PATHS, _PATHS), _PATHS)
+    functions = rqmc = None
+    assert plain is not None
+    if tol is None or plain.work / tol**2 > _SECONDS:
+        functions = ValueFunctions()
+        functions = tried(functions, functions.batch_size)
+        if functions is None or functions.work * _CLEAR > plain.work:
+            rqmc = tried(ArrayRQMC(_REPLICATE, _REPLICATES), _REPLICATES)
+    done = [trial for trial in (plain, functions, rqmc) if trial is not None]
+    best = min(done, key=lambda trial: trial.work)
+    listed = [f"{type(t.sampling).__name__} {t.work:.1e}" for t in done]
+    reason = f"variance times seconds: {', '.join(listed)}"
+    return *_sized(best, tol), reason
+
+
+def _sized(best: _Trial, tol: float | None) -> tuple[AbstractSampling, Prepared]:
+    """With as many samples as the tolerance needs, and some more."""
+    sampling, plan = best.sampling, best.prepared.plan
+    if tol is None:
+        count = {IndependentPaths: 2**17, ArrayRQMC: 64, ValueFunctions: 4096}
+        samples = count[type(sampling)]
+    else:
+        samples = int(np.clip(1.5 * best.variance / tol**2, plan.batch_size, _MOST))
+        samples = max(samples, 2 * plan.least)
+    name = "replicates" if isinstance(sampling, ArrayRQMC) else "num_paths"
+    sampling = dataclasses.replace(sampling, **{name: samples})
+    plan = plan._replace(num_samples=samples)
+    return sampling, best.prepared._replace(plan=plan)

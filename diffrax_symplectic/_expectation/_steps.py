@@ -1,22 +1,20 @@
-"""Paths that take fixed steps together: the loop that all samplings share, and the paths
-that are independent of each other."""
+"""Paths that take fixed steps together: the loop that all samplings share."""
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
-from .._terms import brownian_paths, replace_paths
 
 
 class Level(eqx.Module):
@@ -40,6 +38,9 @@ class Problem(eqx.Module):
     y0: Y
     args: Args
     levels: Level
+    # The combinations of the means of the levels that are averaged, an array with equal
+    # weights being the same program.
+    weights: Float[Array, "combinations levels"]
     # Whether there is one time at which to average, without an axis for it.
     at_end: bool = eqx.field(static=True)
     # Steps of the finest level. (An array has to know its size when it is compiled.)
@@ -48,49 +49,56 @@ class Problem(eqx.Module):
     def level(self, index: int) -> Level:
         return jtu.tree_map(lambda x: x[index], self.levels)
 
-    def init(self, terms, h: Float[Array, ""]) -> PyTree:
-        return self.solver.init(terms, self.t0, self.t0 + h, self.y0, self.args)
+    def init(self, terms, i, h: Float[Array, ""], y: Y) -> PyTree[Array]:
+        """The arrays of the solver's state before step number `i`. The rest of it does not
+        change."""
+        t = self.t0 + i * h
+        state = self.solver.init(terms, t, t + h, y, self.args)
+        return eqx.filter(state, eqx.is_array)
 
     def step(self, terms, i, h, y: Y, state) -> tuple[Y, PyTree, Bool[Array, ""]]:
         """One step of one path, and whether it succeeded."""
         t, next_t = self.t0 + i * h, self.t0 + (i + 1) * h
+        fresh = eqx.filter_eval_shape(self.solver.init, terms, t, next_t, y, self.args)
+        is_struct = lambda x: isinstance(x, jax.ShapeDtypeStruct)
+        state = eqx.combine(state, eqx.filter(fresh, is_struct, inverse=True))
         y, _, _, state, result = self.solver.step(
             terms, t, next_t, y, self.args, state, made_jump=False
         )
+        state = eqx.filter(state, eqx.is_array)
         return y, state, diffrax.is_okay(result) & is_finite(y)
 
-    def outputs(self) -> list[jax.ShapeDtypeStruct]:
-        """Shapes of `phi`, and the dtypes in which it is averaged."""
-        shapes = jtu.tree_leaves(jax.eval_shape(self.phi, self.t0, self.y0, self.args))
-        return [jax.ShapeDtypeStruct(s.shape, real(s.dtype)) for s in shapes]
+    @property
+    def dtype(self) -> Any:
+        return jnp.result_type(*jtu.tree_leaves(self.y0))
+
+    @property
+    def num_outputs(self) -> tuple[int, int]:
+        """How many times there are at which to average, and how many numbers `phi` has."""
+        leaves = jtu.tree_leaves(jax.eval_shape(self.phi, self.t0, self.y0, self.args))
+        return self.levels.saved_steps.shape[1], sum(x.size for x in leaves)
 
 
 class Ensemble(eqx.Module):
     """Paths, along the first axis of each array."""
 
     y: Y
-    # The arrays of the solver's state. The rest of it does not change.
-    solver_state: PyTree[Any]
+    solver_state: PyTree[Array]
     # A path that failed counts as failed until the end. It goes on from `y0`: an equation
     # without a solution would keep the other paths waiting in each step to come.
     failed: Bool[Array, " n"]
 
+    @staticmethod
+    def start(p: Problem, n: int, state: PyTree[Array]) -> "Ensemble":
+        y = jtu.tree_map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), p.y0)
+        return Ensemble(y, state, jnp.zeros(n, bool))
 
-def ensemble_of(p: Problem, n: int, state: PyTree) -> Ensemble:
-    """`n` paths at the start."""
-    y = jtu.tree_map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), p.y0)
-    return Ensemble(y, state, jnp.zeros(n, bool))
-
-
-def moved(p: Problem, ensemble: Ensemble, y, state, success) -> Ensemble:
-    """The paths after a step to `y`, with those that failed put back."""
-    failed = ensemble.failed | ~success
-    keep = lambda new, old: jnp.where(along(failed, new), old, new)
-    return Ensemble(
-        jtu.tree_map(keep, y, p.y0),
-        jtu.tree_map(keep, state, ensemble.solver_state),
-        failed,
-    )
+    def moved(self, p: Problem, y, state, success) -> "Ensemble":
+        """The paths after a step to `y`, with those that failed put back."""
+        failed = self.failed | ~success
+        keep = lambda new, old: jnp.where(along(failed, new), old, new)
+        state = jtu.tree_map(keep, state, self.solver_state)
+        return Ensemble(jtu.tree_map(keep, y, p.y0), state, failed)
 
 
 def simulate(
@@ -141,6 +149,23 @@ def simulate(
     return saved, ensemble, carried
 
 
+def independent_steps(
+    p: Problem, level: Level, n: int, terms_of: Callable, randomness: Callable
+) -> tuple[Callable[[Any, Ensemble, Any], tuple[Ensemble, Any]], Ensemble]:
+    """What takes a step of `n` paths, and these at the start. Each has the terms
+    `terms_of` its part of `randomness(i)` in step number `i`."""
+
+    def step(i, ensemble, carried):
+        def one(random, y, state):
+            return p.step(terms_of(random), i, level.h, y, state)
+
+        out = jax.vmap(one)(randomness(i), ensemble.y, ensemble.solver_state)
+        return ensemble.moved(p, *out), carried
+
+    start = lambda random: p.init(terms_of(random), 0, level.h, p.y0)
+    return step, Ensemble.start(p, n, jax.vmap(start)(randomness(0)))
+
+
 class Samples(eqx.Module):
     """Samples along the first axis: their values, which of them are good, and how many
     paths failed in each."""
@@ -160,11 +185,10 @@ class AbstractSampler(eqx.Module):
 
 
 class AbstractLevelSampler(AbstractSampler):
-    """Estimates the means of a problem on each level. Their combinations with `weights`,
-    along a new axis in front, are what is averaged."""
+    """Estimates the means of a problem on each level. Their combinations, along a new axis
+    in front, are what is averaged."""
 
     problem: eqx.AbstractVar[Problem]
-    weights: eqx.AbstractVar[Float[np.ndarray, "combinations levels"]]
 
     @abc.abstractmethod
     def on_level(
@@ -174,91 +198,78 @@ class AbstractLevelSampler(AbstractSampler):
         samples are good; how many paths failed in each, or whether the only one did."""
 
     def __call__(self, keys: PRNGKeyArray) -> Samples:
-        levels = self.problem.levels
+        p = self.problem
         one = lambda level: self.on_level(keys, level)
-        if len(levels.h) == 1:
-            out = jtu.tree_map(lambda x: x[None], one(self.problem.level(0)))
+        if len(p.levels.h) == 1:
+            out = jtu.tree_map(lambda x: x[None], one(p.level(0)))
         else:
             # One program for all levels.
-            out = lax.map(one, levels)
+            out = lax.map(one, p.levels)
         values, good, failed = out
 
         def combined(x):
-            x = jnp.tensordot(jnp.asarray(self.weights, x.dtype), x, 1)
-            return jnp.moveaxis(x, 2, 0)
+            x = jnp.moveaxis(jnp.tensordot(p.weights.astype(x.dtype), x, 1), 2, 0)
+            return x[:, :, 0] if p.at_end else x
 
-        values = jtu.tree_map(combined, values)
-        if self.problem.at_end:
-            values = jtu.tree_map(lambda x: x[:, :, 0], values)
         # A path fails once, on however many levels.
         total = jnp.any if failed.dtype == bool else jnp.sum
-        return Samples(values, jnp.all(good, axis=0), total(failed, axis=0).astype(int))
+        failed = total(failed, axis=0).astype(int)
+        return Samples(jtu.tree_map(combined, values), jnp.all(good, axis=0), failed)
 
 
-class IndependentPathsSampler(AbstractLevelSampler):
-    """A sample is a path, on all levels with the same random key."""
+class Plan(NamedTuple):
+    """How samples are taken.
 
-    problem: Problem
-    weights: Float[np.ndarray, "combinations levels"]
+    - `num_samples`: how many at most, those of an estimate to go on from included.
+    - `batch_size`: how many each device takes at once.
+    - `paths`: how many paths a sample has, on each level.
+    - `least`: fewer samples than this do not tell their spread well enough to stop.
+    """
 
-    def on_level(self, keys, level):
-        p, n = self.problem, len(keys)
-        keys = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
-        start = lambda keys: p.init(with_keys(p.terms, keys), level.h)
-        state = eqx.filter_vmap(start)(keys)
-        state, static = eqx.partition(state, eqx.is_array)
-
-        def step(i, ensemble, carried):
-            def one(keys, y, state):
-                terms, state = with_keys(p.terms, keys), eqx.combine(state, static)
-                y, state, success = p.step(terms, i, level.h, y, state)
-                return y, eqx.filter(state, eqx.is_array), success
-
-            out = jax.vmap(one)(keys, ensemble.y, ensemble.solver_state)
-            return moved(p, ensemble, *out), carried
-
-        ensemble = ensemble_of(p, n, state)
-        saved, ensemble, _ = simulate(p, level, ensemble, step, None, lambda x, _: x)
-        return saved, ~ensemble.failed, ensemble.failed
+    num_samples: int
+    batch_size: int
+    paths: int = 1
+    least: int = 2
 
 
-def path_keys(terms: PyTree[diffrax.AbstractTerm], key: PRNGKeyArray) -> list[Array]:
-    """New random keys for the paths in `terms`, made from `key`. Paths that had the same
-    key get the same one again."""
-    new = []
-    for x in filter(is_key, jtu.tree_leaves(brownian_paths(terms))):
-        typed = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-        words = jr.key_data(x) if typed else x
-        own = key
-        for word in words.reshape(-1):
-            own = jr.fold_in(own, word)
-        data = jr.bits(own, words.shape, jnp.uint32)
-        new.append(jr.wrap_key_data(data, impl=jr.key_impl(x)) if typed else data)
-    return new
+class Prepared(NamedTuple):
+    """A sampler, how many samples it is to take, and what the result says about it."""
+
+    sampler: AbstractSampler
+    plan: Plan
+    reason: str = ""
 
 
-def with_keys(terms: PyTree[diffrax.AbstractTerm], keys: list[Array]) -> PyTree:
-    """The terms with paths that have these keys."""
-    left = iter(keys)
-    replaced = lambda x: next(left) if is_key(x) else x
-    return replace_paths(terms, lambda path: jtu.tree_map(replaced, path))
+class AbstractSampling(eqx.Module):
+    """How the samples of an expectation are taken, as users name it."""
+
+    @abc.abstractmethod
+    def prepare(self, problem: Problem, key: PRNGKeyArray, devices: tuple) -> Prepared:
+        """Raises a `ValueError` for what it cannot do."""
 
 
-def is_key(x) -> bool:
-    """Whether an array of a Brownian path is its random key."""
-    dtype = getattr(x, "dtype", None)
-    return dtype is not None and (
-        jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32
-    )
+def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations levels"]:
+    r"""The combinations of the means with steps $h, h/2, h/4, \ldots$ that an
+    [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$. The first
+    has no terms in $h^p, \ldots, h^{p + L - 2}$ for $L$ levels, and with $L > 1$ there are
+    two more: the mean of the finest level less the first, and what the last extrapolation
+    changed.
+
+    [Talay and Tubaro (1990)](https://doi.org/10.1080/07362999008809220) show that the error
+    has an expansion in powers of $h$.
+    """
+    best = _extrapolated(order, levels)
+    if levels == 1:
+        return best[None]
+    # The finer levels alone, with one power of the step size less.
+    before = np.append(0.0, _extrapolated(order, levels - 1))
+    return np.stack([best, np.eye(levels)[-1] - best, best - before])
 
 
-def mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "..."]:
-    """The mean over the paths that have not failed."""
-    x = jnp.where(along(~failed, x), x, 0)
-    # In two stages, so that rounding errors in single precision do not add up.
-    rows = 1 << ((len(x).bit_length() - 1) // 2)
-    total = jnp.sum(jnp.sum(x.reshape(rows, -1, *x.shape[1:]), axis=0), axis=0)
-    return total / jnp.sum(~failed).astype(total.dtype)
+def _extrapolated(order: int, levels: int) -> Float[np.ndarray, " levels"]:
+    powers = np.array([0, *range(order, order + levels - 1)])
+    system = 2.0 ** -np.outer(powers, np.arange(levels))
+    return np.linalg.solve(system, np.eye(levels)[0])
 
 
 def along(mask: Bool[Array, " n"], x: Array) -> Array:
@@ -273,3 +284,17 @@ def is_finite(tree: PyTree[Array]) -> Bool[Array, ""]:
 
 def real(dtype) -> Any:
     return jnp.result_type(dtype, float)
+
+
+def ravel(y: Y) -> Float[Array, " d"]:
+    return jfu.ravel_pytree(y)[0]
+
+
+def check_real(name: str, leaves: list) -> None:
+    kinds = jnp.floating, jnp.integer, jnp.bool_
+    is_real = lambda s: any(jnp.issubdtype(jnp.result_type(s), k) for k in kinds)
+    if len(leaves) == 0 or not all(map(is_real, leaves)):
+        raise ValueError(
+            f"`{name}` must return real arrays; got dtypes "
+            f"{[str(jnp.result_type(s)) for s in leaves]}. Return real and imaginary parts."
+        )

@@ -1,21 +1,26 @@
-"""How far `ds.ValueFunctions` goes: total errors against exact values, and seconds,
-compilation aside:
+"""Total errors of the three samplings against exact values, and seconds, compilation aside:
 
-    python -m examples.benchmarks.expectations [MODEL ...]
+    python -m examples.benchmarks.expectations measure [MODEL ...]
+    python -m examples.benchmarks.expectations
 
-Prints the rows of a table. Exact values are known in closed form, or they are computed
-backwards in time on Chebyshev grids (synchrotron, Hénon-Heiles). Those of the pendulum and
-of the double well come from another solver, with as many digits.
+The first measures, on a quiet machine, and keeps what it measures in `examples/output`. The
+second writes the picture and the section about it in `docs/benchmarks/total_error.md`.
+Exact values are known in closed form or computed without sampling: by quadrature (quartic
+Kubo), backwards in time by splines (pendulum, double well) or on Chebyshev grids
+(synchrotron, Hénon-Heiles).
 """
 
+import json
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import matplotlib
 import numpy as np
 
 import diffrax_symplectic as ds
@@ -24,7 +29,12 @@ from .. import linear_oscillator, synchrotron
 from ..hard_cases import chain
 from . import _exact
 from ._ensembles import MODELS
+from ._timing import DOCS
 from .work_precision import two_noises
+
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
 
 
 class Case(NamedTuple):
@@ -37,12 +47,13 @@ class Case(NamedTuple):
     steps: int
     y0: Any
     levels: int
-    degree: int
+    degree: int | None
     paths: int
     exact: Callable[[], Any]
 
 
 Y0 = (jnp.array(0.0), jnp.array(1.0))
+_UP = (jnp.array(0.0), jnp.array(1.2))
 _q2 = lambda t, y, args: y[1] ** 2
 _one = ds.WeakBrownianPath((), jr.key(0))
 
@@ -73,16 +84,6 @@ def _quartic_kubo(path):
 def _quartic_two(path):
     noise = lambda t, p, q, args: 0.3 * jnp.stack([p * q, (q**2 - p**2) / 2])
     return ds.hamiltonian_terms(_quartic, noise, path)
-
-
-def by_another_solver(terms, phi, y0, t1, steps) -> float:
-    """With `StrangGauss`, whose error of discretization is another one."""
-    return float(
-        ds.expectation(
-            phi, terms, ds.StrangGauss(), 0.0, t1, t1 / steps, y0, levels=4,
-            key=jr.key(100), sampling=ds.ValueFunctions(8, 2**14),
-        ).mean
-    )  # fmt: skip
 
 
 def quartic_kubo_square() -> float:
@@ -129,27 +130,28 @@ CASES = {
         1.0, 4, Y0, 6, 2, 512, _exact.kubo_square,
     ),
     "pendulum": Case(
-        _q2, _pendulum(_one), _verlet, 2.0, 16, Y0, 4, 8, 4096,
-        lambda: by_another_solver(_pendulum(_one), _q2, Y0, 2.0, 16),
+        _q2, _pendulum(_one), _verlet, 2.0, 16, Y0, 4, None, 4096,
+        lambda: _exact.by_splines(
+            lambda q: -np.sin(q), lambda q: 0.4 * np.sin(q) - 0.1, Y0, 2.0, 16, (4, 4)
+        ),
     ),
     "synchrotron": Case(
         lambda t, y, args: y[0] ** 2,
         synchrotron.make_terms(ds.WeakBrownianPath((2,), jr.key(0))), _verlet,
-        2.0, 16, synchrotron.Y0, 4, 8, 4096,
+        2.0, 16, synchrotron.Y0, 4, None, 4096,
         lambda: _exact.by_transfer(
             synchrotron.make_terms, synchrotron.Y0, lambda y: y[0] ** 2, 2.0, 512,
             (1.0, 0.6), 20,
         ),
     ),
     "double well": Case(
-        _q2, _double_well(_one), _verlet, 2.0, 20, (jnp.array(0.0), jnp.array(1.2)), 4, 8,
-        4096,
-        lambda: by_another_solver(
-            _double_well(_one), _q2, (jnp.array(0.0), jnp.array(1.2)), 2.0, 20
+        _q2, _double_well(_one), _verlet, 2.0, 20, _UP, 4, None, 4096,
+        lambda: _exact.by_splines(
+            lambda q: q - q**3, lambda q: -0.3 * np.cos(q), _UP, 2.0, 20, (3.5, 2.8)
         ),
     ),
     "quartic Kubo": Case(
-        _q2, _quartic_kubo(_one), ds.StrangGauss(), 1.0, 4, Y0, 5, 8, 2**14,
+        _q2, _quartic_kubo(_one), ds.StrangGauss(), 1.0, 4, Y0, 5, None, 4096,
         quartic_kubo_square,
     ),
     "Hénon-Heiles": Case(
@@ -162,7 +164,7 @@ CASES = {
         _exact.two_noises_square,
     ),
     "two noises, quartic": Case(
-        _q2, _quartic_two(_two()), ds.NinomiyaVictoir(), 1.0, 8, Y0, 3, 8, 2**14,
+        _q2, _quartic_two(_two()), ds.NinomiyaVictoir(), 1.0, 4, Y0, 3, None, 2048,
         lambda: np.nan,
     ),
     "chain of 32, s = 0.1": Case(
@@ -172,39 +174,105 @@ CASES = {
 }  # fmt: skip
 
 
-def row(name: str) -> str:
+PICTURE = "linear oscillator", "Kubo oscillator", "pendulum", "synchrotron"
+KEPT = Path(__file__).parents[1] / "output" / "expectations"
+SEEDS = range(1, 5)
+
+
+def measure(name: str) -> dict[str, Any]:
+    """Of the largest estimate by value functions more, and of the models of the picture the
+    error and the seconds of other estimates, too."""
     c = CASES[name]
 
-    def run(seed: int):
-        begin = time.perf_counter()
-        e = ds.expectation(
-            c.phi, c.terms, c.solver, 0.0, c.t1, c.t1 / c.steps, c.y0, levels=c.levels,
-            key=jr.key(seed), sampling=ds.ValueFunctions(c.degree, c.paths),
+    def run(sampling, levels: int, finer: int = 1) -> tuple[list, float, float]:
+        def one(seed: int):
+            begin = time.perf_counter()
+            e = ds.expectation(
+                c.phi, c.terms, c.solver, 0.0, c.t1, c.t1 / c.steps / finer, c.y0,
+                levels=levels, key=jr.key(seed), sampling=sampling,
+            )  # fmt: skip
+            return e, time.perf_counter() - begin
+
+        first = one(0)[1]
+        done = [one(seed) for seed in SEEDS]
+        return [e for e, _ in done], min(s for _, s in done), first
+
+    def dot(sampling, levels: int, finer: int = 1) -> list[float]:
+        estimates, seconds, _ = run(sampling, levels, finer)
+        off = [float(e.mean) - exact for e in estimates]
+        return [seconds, float(np.sqrt(np.mean(np.square(off))))]
+
+    exact = float(c.exact())
+    functions = ds.ValueFunctions(c.degree, c.paths)
+    estimates, seconds, first = run(functions, c.levels)
+    out: dict[str, Any] = {
+        "exact": exact, "mean": float(estimates[0].mean), "seconds": seconds,
+        "first": first, "reason": estimates[0].reason,
+        "std_error": float(np.median([e.std_error for e in estimates])),
+        "error": max(abs(float(e.mean) - exact) for e in estimates),
+    }  # fmt: skip
+    if name in PICTURE:
+        off = [float(e.mean) - exact for e in estimates]
+        last = [seconds, float(np.sqrt(np.mean(np.square(off))))]
+        out["ValueFunctions"] = [dot(functions, k) for k in (1, 3)] + [last]
+        rqmc = [ds.ArrayRQMC(2**k, 4) for k in (8, 12, 14)]
+        out["ArrayRQMC"] = [dot(sampling, 2, 2) for sampling in rqmc]
+        plain = [ds.IndependentPaths(2**k, 4096) for k in (12, 15, 18)]
+        out["IndependentPaths"] = [dot(sampling, 1, 4) for sampling in plain]
+    return out
+
+
+def draw(measured: dict[str, dict]) -> None:
+    figure, axes = plt.subplots(1, 4, figsize=(12, 3.4), sharey=True)
+    for ax, name in zip(axes, PICTURE):
+        for marker, sampling in zip(
+            "s^o", ("IndependentPaths", "ArrayRQMC", "ValueFunctions")
+        ):
+            ax.loglog(*zip(*measured[name][sampling]), marker + "-", label=sampling)
+        ax.set_title(name)
+        ax.set_xlabel("seconds")
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("total error")
+    axes[2].legend(fontsize=8, loc="lower left")
+    figure.tight_layout()
+    figure.savefig(DOCS / "samplings.png", dpi=110)
+
+
+def table(measured: dict[str, dict]) -> str:
+    head = (
+        "| model | solver | coarsest steps, levels | functions | paths | total error | "
+        "standard error | seconds |\n" + "|---" * 8 + "|"
+    )
+    lines = []
+    for name, m in measured.items():
+        c = CASES[name]
+        kind = f"degree {c.degree}" if c.degree else m["reason"].split(" was")[0]
+        kind = kind.replace("grid points along an axis: ", "grid, ")
+        error = "" if np.isnan(m["exact"]) else f"{m['error']:.1e}"
+        cells = (
+            f"{name}, t = {c.t1:g}", f"`{type(c.solver).__name__}`",
+            f"{c.steps}, {c.levels}", kind, f"{c.paths:,}", error,
+            f"{m['std_error']:.1e}", f"{m['seconds']:.2g}",
         )  # fmt: skip
-        return e, time.perf_counter() - begin
-
-    _, first = run(0)
-    done = [run(seed) for seed in (1, 2, 3)]
-    exact, e = c.exact(), done[0][0]
-    total = max(abs(float(e.mean) - exact) for e, _ in done)
-    change = float(np.sqrt(float(e.error) ** 2 - float(e.std_error) ** 2))
-    cells = (
-        name, f"{type(c.solver).__name__}", f"{c.steps} x {2 ** (c.levels - 1)}",
-        f"{c.degree}", f"{c.paths:,}", f"{float(e.mean):.11f}", f"{exact:.11f}",
-        f"{total:.1e}", f"{float(e.std_error):.1e}", f"{change:.1e}",
-        f"{min(s for _, s in done):.2f}", f"{first:.1f}",
-    )  # fmt: skip
-    return "| " + " | ".join(cells) + " |"
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join([head, *lines])
 
 
-HEAD = (
-    "| model | solver | steps | degree | paths | mean | exact | total error | sampling | "
-    "last extrapolation | seconds | first call |\n" + "|---" * 12 + "|"
-)
+def write() -> None:
+    read = lambda name: json.loads((KEPT / f"{name}.json").read_text())
+    measured = {name: read(name) for name in CASES if (KEPT / f"{name}.json").exists()}
+    draw(measured)
+    page = DOCS / "total_error.md"
+    before, rest = page.read_text().split("<!-- samplings -->\n")[::2]
+    marker = "<!-- samplings -->\n"
+    page.write_text(before + marker + "\n" + table(measured) + "\n\n" + marker + rest)
 
 
 if __name__ == "__main__":
-    print(HEAD)
-    for name in sys.argv[1:] or CASES:
-        print(row(name), flush=True)
+    if sys.argv[1:2] != ["measure"]:
+        write()
+    for name in sys.argv[2:] or (CASES if sys.argv[1:] else ()):
+        KEPT.mkdir(parents=True, exist_ok=True)
+        (KEPT / f"{name}.json").write_text(json.dumps(measure(name)))
+        print(name, (KEPT / f"{name}.json").read_text(), flush=True)
         jax.clear_caches()

@@ -8,7 +8,8 @@ The first measures errors, of the models named or of all, on however busy a mach
 second measures how long the estimates take, and wants a quiet one. Both keep what they
 measure in `examples/output`. The last writes `docs/benchmarks/total_error.md` and its
 picture from that, and measures what is missing; with `--quick` it goes through all of this
-at small sizes for one model and writes nothing.
+at small sizes for one model and writes nothing. The section down to 1e-10 is that of
+`expectations`, which is to be run afterwards.
 """
 
 import argparse
@@ -22,7 +23,7 @@ import jax
 import matplotlib
 import numpy as np
 
-from diffrax_symplectic._expectation._result import level_weights
+from diffrax_symplectic._expectation._steps import level_weights
 
 from .._orders import exact_moment_map, exact_weak_error
 from ._ensembles import Model, MODELS, other, plain, quasi

@@ -1,0 +1,374 @@
+"""Estimates of expectations, and how they are made: any number of samples, one batch after
+another, on any devices."""
+
+import collections
+import dataclasses
+import warnings
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import PRNGKeyArray, PyTree
+from scipy.special import stdtrit
+
+from ._steps import AbstractSampler, Plan, real
+
+
+NO_METER = diffrax.NoProgressMeter()
+# NumPy returns scalars, which are not arrays, from operations on arrays without axes.
+_Host = PyTree[np.ndarray | np.floating]
+
+
+class Expectation(eqx.Module):
+    r"""An estimate of $\mathbb E[\phi]$, as [`diffrax_symplectic.expectation`][] and
+    [`diffrax_symplectic.monte_carlo`][] return. To print it gives a few lines.
+
+    - `num_paths`: how many paths the estimate is made of, on each level.
+    - `num_failed`: how many paths failed, on all levels. They have no part in the rest.
+    - `num_samples`: how many independent samples the mean is taken over: paths, or
+        replicates of [`diffrax_symplectic.ArrayRQMC`][].
+    - `sampling`: how the samples were made.
+    - `reason`: why this one was chosen, if there was a choice; otherwise empty.
+    - `tol_reached`: whether all standard errors are at most `tol`; `None` without `tol`.
+    - `combinations`, `sums_of_squares`, `largest`: means over the samples, sums of squared
+        deviations from them, and the largest deviation within a batch, along an axis in
+        front: of the estimate, and with two levels or more of its `bias` and of what the
+        last extrapolation changed.
+    - `key_data`: the random key that the samples came from.
+    """
+
+    num_paths: int
+    num_failed: int
+    num_samples: int
+    combinations: _Host
+    sums_of_squares: _Host
+    largest: _Host
+    key_data: np.ndarray
+    sampling: Any = None
+    reason: str = ""
+    tol_reached: bool | None = None
+
+    @property
+    def mean(self) -> _Host:
+        r"""The best estimate, in the structure of $\phi$ and in float64: the mean over the
+        samples, extrapolated to steps of size zero if there are two levels or more. With
+        `ts` there is an axis in front, one place for each of them. NaN without samples."""
+        return self._of(0, self.combinations)
+
+    @property
+    def variance(self) -> _Host:
+        """The variance of a sample."""
+        return self._of(0, self._variances)
+
+    @property
+    def std_error(self) -> _Host:
+        """The standard error of `mean`, from the spread of the samples."""
+        return self._of(0, self._std_errors)
+
+    @property
+    def bias(self) -> _Host | None:
+        r"""With two levels or more the error of discretization of the finest one,
+        $\mathbb E[\phi_h] - \mathbb E[\phi]$, as extrapolation knows it; otherwise `None`.
+        `mean + bias` is the mean of that level. It is no part of `mean`."""
+        return self._of(1, self.combinations)
+
+    @property
+    def bias_std_error(self) -> _Host | None:
+        """The standard error of `bias`."""
+        return self._of(1, self._std_errors)
+
+    @property
+    def error(self) -> _Host:
+        """The error of `mean` all together: the root of the sum of the squares of
+        `std_error` and, with two levels or more, of what the last extrapolation has
+        changed. What discretization leaves after that is of a higher order in the step
+        size, and smaller as a rule. With one level nothing is known of it, and this is
+        `std_error`."""
+        change = self._of(2, self.combinations)
+        if change is None:
+            return self.std_error
+        return jtu.tree_map(np.hypot, self.std_error, change)
+
+    def interval(self, confidence: float = 0.95) -> tuple[_Host, _Host]:
+        r"""The ends of an interval that covers the mean of infinitely many samples with
+        this probability: Student's $t$ with one degree of freedom less than there are
+        samples, times `std_error`, to either side of `mean`. (For 16 samples and 95% that
+        is 2.13 standard errors, for very many 1.96.) What is left of the error of
+        discretization is not part of it: see `error`."""
+        factor = stdtrit(max(self.num_samples - 1, 1), (1 + confidence) / 2)
+        side = lambda sign: jtu.tree_map(
+            lambda m, s: m + sign * factor * s, self.mean, self.std_error
+        )
+        return side(-1), side(1)
+
+    def __str__(self) -> str:
+        shown = lambda x: np.array2string(np.asarray(x), precision=12, threshold=6)
+        short: Any = {"float_kind": "{:.1e}".format}
+        brief = lambda x: np.array2string(np.asarray(x), formatter=short, threshold=6)
+        mean, error = jtu.tree_leaves(self.mean), jtu.tree_leaves(self.std_error)
+        lines = [f"{shown(m)} ± {brief(e)}" for m, e in zip(mean[:6], error)]
+        lines += ["..."] * (len(mean) > 6)
+        if self.bias is not None:
+            biases = ", ".join(map(brief, jtu.tree_leaves(self.bias)[:6]))
+            lines.append(f"bias of the finest step, not in the mean: {biases}")
+        how = "" if self.sampling is None else f", {self.sampling}"
+        lines.append(f"{self.num_paths:,} paths, {self.num_failed:,} failed{how}")
+        lines += [self.reason] if self.reason else []
+        lines += ["`tol` was not reached"] if self.tol_reached is False else []
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    @property
+    def _variances(self) -> _Host:
+        n = self.num_samples - 1
+        share = lambda m2: m2 / n if n > 0 else np.full_like(m2, np.nan)
+        return jtu.tree_map(share, self.sums_of_squares)
+
+    @property
+    def _std_errors(self) -> _Host:
+        n = max(self.num_samples, 1)
+        return jtu.tree_map(lambda v: np.sqrt(v / n), self._variances)
+
+    def _of(self, combination: int, tree: _Host) -> Any:
+        leaves = jtu.tree_leaves(tree)
+        if leaves and len(leaves[0]) <= combination:
+            return None
+        return jtu.tree_map(lambda x: x[combination], tree)
+
+
+class ExpectationInterrupted(KeyboardInterrupt):
+    """Raised by [`diffrax_symplectic.expectation`][] and
+    [`diffrax_symplectic.monte_carlo`][] in place of a `KeyboardInterrupt`. Its attribute
+    `estimate` holds what was done until then, to go on from with `start=`."""
+
+    def __init__(self, estimate: Expectation):
+        super().__init__(
+            f"Interrupted after {estimate.num_paths + estimate.num_failed} paths. Catch "
+            "`ExpectationInterrupted` and pass its `estimate` as `start` to go on."
+        )
+        self.estimate = estimate
+
+
+def run(
+    sampler: AbstractSampler,
+    key: PRNGKeyArray,
+    plan: Plan,
+    devices: tuple,
+    start: Expectation | None = None,
+    tol: float | None = None,
+    progress_meter: diffrax.AbstractProgressMeter = NO_METER,
+    **about: Any,
+) -> Expectation:
+    """The estimate from samples, of which number $i$ gets the key
+    `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, whatever the batch size and the
+    devices are. `about` is said of it in its fields of these names.
+
+    What a device computes, and in which order its sums are added up, does not depend on
+    how many there are."""
+    key_data, most = np.asarray(jr.key_data(key)), plan.num_samples
+    size = min(plan.batch_size, most)
+    # Of independent paths each that failed was a sample.
+    lost = lambda e: e.num_failed if plan.paths == 1 else 0
+    used = lambda e: e.num_samples + lost(e)
+    first = 0 if start is None else used(start)
+    if jax.process_count() > 1:
+        # Each process holds the same arrays. They become constants of its program, since
+        # arguments would have to be placed on the devices of all.
+        sampler = _Constant(_Holder(sampler))
+    mesh = Mesh(np.array(devices), ("samples",))
+
+    def batch(begin: int) -> tuple:
+        lo_hi = np.array([begin & 0xFFFFFFFF, begin >> 32], np.uint32)
+        left = np.array(max(0, min(size * len(devices), most - begin)), np.int32)
+        if len(devices) == 1:
+            lo_hi, left = jax.device_put((lo_hi, left), devices[0])
+        one: Any = _batch
+        return one(sampler, key_data, jr.key_impl(key), lo_hi, left, mesh, size)
+
+    # JAX caches this trace and uses it for the first batch.
+    shapes = eqx.filter_eval_shape(batch, first)[2]
+    zeros = jtu.tree_map(lambda s: np.zeros(s.shape[1:]), shapes)
+    if start is None:
+        estimate = Expectation(0, 0, 0, zeros, zeros, zeros, key_data)
+    else:
+        estimate = _checked_start(start, zeros, key_data, used(start), most)
+    estimate = dataclasses.replace(estimate, **about)
+    running = collections.deque()
+    meter = progress_meter.init()
+    try:
+        while True:
+            more = first < most and not _reached(estimate, tol, plan.least)
+            if more:
+                running.append(batch(first))
+                first += size * len(devices)
+            # One batch is computed while the one before it is added up.
+            if len(running) > more:
+                done = jax.device_get(running.popleft())
+                for one in range(len(devices)):
+                    # The same samples decide, however many are made at once.
+                    if not _reached(estimate, tol, plan.least):
+                        part = jtu.tree_map(lambda x: x[one], done)
+                        estimate = _merged(estimate, part, plan.paths)
+                meter = progress_meter.step(meter, np.asarray(used(estimate) / most))
+            elif not more:
+                break
+    except KeyboardInterrupt:
+        raise ExpectationInterrupted(_finished(estimate, tol, plan.least)) from None
+    finally:
+        progress_meter.close(meter)
+    return _finished(estimate, tol, plan.least)
+
+
+class _Holder:
+    """Compared by identity."""
+
+    def __init__(self, value):
+        self.value = value
+
+
+class _Constant(AbstractSampler):
+    holder: _Holder = eqx.field(static=True)
+
+    def __call__(self, keys):
+        return self.holder.value(keys)
+
+
+@eqx.filter_jit
+def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
+    """Of the batch of each device: the number of good samples and of paths that failed; of
+    the good ones mean, sum of squared deviations from it, and the largest deviation."""
+
+    def local(sampler, lo_hi, left, device: Any = 0):
+        index = device * n + jnp.arange(n)
+        lo = lo_hi[0] + index.astype(jnp.uint32)
+        hi = lo_hi[1] + (lo < lo_hi[0]).astype(jnp.uint32)
+        key = jr.wrap_key_data(jnp.asarray(key_data), impl=impl)
+        fold = lambda hi, lo: jr.fold_in(jr.fold_in(key, hi), lo)
+        samples = sampler(jax.vmap(fold)(hi, lo))
+        wanted = index < left
+        good = samples.good & wanted
+        count, failed = jnp.sum(good), jnp.sum(jnp.where(wanted, samples.failed, 0))
+
+        def moments(x):
+            x = x.astype(real(x.dtype))
+            if jnp.iscomplexobj(x):
+                raise ValueError(
+                    "What is averaged must be real arrays; got one of dtype "
+                    f"{x.dtype}. Return real and imaginary parts."
+                )
+            keep = good.reshape(-1, *[1] * (x.ndim - 1))
+            mean = jnp.sum(jnp.where(keep, x, 0), axis=0) / jnp.maximum(count, 1)
+            # In two passes, so that no two large numbers are subtracted.
+            off = jnp.where(keep, x - mean, 0)
+            return mean, jnp.sum(off**2, axis=0), jnp.max(jnp.abs(off), axis=0)
+
+        leaves, treedef = jtu.tree_flatten(samples.values)
+        each = map(treedef.unflatten, zip(*map(moments, leaves)))
+        return count, failed, *each
+
+    if mesh.size == 1:
+        return jtu.tree_map(lambda x: x[None], local(sampler, lo_hi, left))
+    dynamic, static = eqx.partition(sampler, eqx.is_array)
+
+    # The programs of the devices know nothing of each other until they are done: so what
+    # one of them computes does not depend on how many there are.
+    def shard(dynamic, lo_hi, left):
+        sampler = eqx.combine(dynamic, static)
+        out = local(sampler, lo_hi, left, jax.lax.axis_index("samples"))
+        return jtu.tree_map(lambda x: jax.lax.all_gather(x, "samples"), out)
+
+    none = PartitionSpec()
+    sharded = jax.shard_map(
+        shard, mesh=mesh, in_specs=none, out_specs=none, check_vma=False
+    )
+    try:
+        return sharded(dynamic, lo_hi, left)
+    except ValueError as error:
+        # The loop of Diffrax's default adjoint takes arrays that vary from device to
+        # device for others than those it was made for.
+        if "Closure-converted function" not in str(error):
+            raise
+        raise ValueError(
+            "Reverse mode through `diffrax.RecursiveCheckpointAdjoint`, the default of "
+            "`diffeqsolve`, does not work on several devices. Pass `adjoint="
+            "diffrax_symplectic.ReversingAdjoint()` or `adjoint=diffrax.DirectAdjoint()` "
+            "to `diffeqsolve`, or `devices=jax.devices()[:1]` to `monte_carlo`."
+        ) from error
+
+
+def _checked_start(start: Expectation, zeros, key_data, used: int, most: int):
+    """The estimate to go on from, which has used up so many samples."""
+    if not np.array_equal(start.key_data, key_data):
+        raise ValueError(
+            "`start` is an estimate with another `key`. Pass the one that it came from, "
+            "so that no path is taken twice."
+        )
+    shapes = lambda tree: jtu.tree_map(np.shape, tree)
+    if not eqx.tree_equal(shapes(start.combinations), shapes(zeros)):
+        raise ValueError(
+            "`start` is an estimate of something of another structure or other shapes. "
+            "Pass one that came from the same function, times and levels."
+        )
+    if used > most:
+        raise ValueError(
+            "The number of paths (or of replicates) counts all, those of `start` included, "
+            f"of which there are {used} already; got {most}."
+        )
+    keep = start.num_samples > 0
+    return start if keep else dataclasses.replace(start, combinations=zeros)
+
+
+def _merged(estimate: Expectation, batch, paths: int) -> Expectation:
+    """The estimate from its own samples, of so many paths each, and those of the batch, by
+    the pairwise formula of Chan, Golub and LeVeque."""
+    count, failed, mean, squares, largest = batch
+    a, b = estimate.num_samples, int(count)
+    n, trees = max(a + b, 1), jtu.tree_map
+    delta = trees(lambda x, y: y.astype(float) - x, estimate.combinations, mean)
+    both = lambda x, y, d: x + y.astype(float) + d**2 * (a * b / n)
+    return dataclasses.replace(
+        estimate,
+        combinations=trees(lambda x, d: x + d * (b / n), estimate.combinations, delta),
+        sums_of_squares=trees(both, estimate.sums_of_squares, squares, delta),
+        largest=trees(np.maximum, estimate.largest, largest),
+        num_samples=a + b,
+        num_paths=estimate.num_paths + b * paths,
+        num_failed=estimate.num_failed + int(failed),
+    )
+
+
+def _reached(estimate: Expectation, tol: float | None, least: int) -> bool:
+    """Whether all standard errors are at most `tol`. Fewer than `least` samples say too
+    little about their spread."""
+    if tol is None or estimate.num_samples < least:
+        return False
+    return all(bool(np.all(x <= tol)) for x in jtu.tree_leaves(estimate.std_error))
+
+
+def _finished(estimate: Expectation, tol: float | None, least: int) -> Expectation:
+    """The estimate with `tol_reached`, and with NaN for the mean without samples."""
+    said = None if tol is None else _reached(estimate, tol, least)
+    estimate = dataclasses.replace(estimate, tol_reached=said)
+    if estimate.num_samples > 0:
+        return estimate
+    nothing = jtu.tree_map(lambda x: np.full_like(x, np.nan), estimate.combinations)
+    return dataclasses.replace(estimate, combinations=nothing)
+
+
+def warn_of_tol(estimate: Expectation, tol: float | None) -> None:
+    if estimate.tol_reached is False:
+        errors = jtu.tree_leaves(estimate.std_error)
+        largest = max(float(np.max(x, initial=0.0)) for x in errors)
+        warnings.warn(
+            f"`tol={tol}` was not reached: the largest standard error is {largest:.1e} "
+            f"after {estimate.num_paths:,} paths. Take more paths, going on with `start=`, "
+            "or another `sampling`.",
+            stacklevel=3,
+        )

@@ -1,0 +1,277 @@
+"""Plain averages: of independent paths, and of whatever is a function of a random key."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from .._arguments import check_takes, whole_number
+from .._brownian import check_key
+from .._compat import ClosedJaxpr, jaxpr_as_fun, solves_without_throwing
+from .._terms import brownian_paths, replace_paths
+from ._estimate import Expectation, NO_METER, run, warn_of_tol
+from ._steps import (
+    AbstractLevelSampler,
+    AbstractSampler,
+    AbstractSampling,
+    independent_steps,
+    is_finite,
+    level_weights,
+    Plan,
+    Prepared,
+    Problem,
+    real,
+    Samples,
+    simulate,
+)
+
+
+class IndependentPaths(AbstractSampling):
+    """Independent paths. Their error falls as one over the root of their number, whatever
+    the system.
+
+    With several levels a path takes the same Brownian motion on each of them if the path in
+    `terms` says so: a [`diffrax_symplectic.FixedStepBrownianPath`][] with `cell=`. Then the
+    `bias` is known much better than the mean.
+
+    **Arguments:**
+
+    - `num_paths`: how many paths; with `tol` at most.
+    - `batch_size`: how many paths each device takes at once. By default 32,768 on CPUs
+        (for a state of a few numbers, enough for all cores and little for their caches)
+        and 262,144 elsewhere. Take less for large states, and to keep several devices busy
+        with few paths: what a device computes does not depend on how many there are.
+    """
+
+    num_paths: int = eqx.field(converter=lambda x: whole_number("num_paths", x))
+    batch_size: int | np.integer | None = None
+
+    def prepare(self, problem, key, devices):
+        return Prepared(IndependentPathsSampler(problem), self.plan(devices))
+
+    def plan(self, devices: tuple) -> Plan:
+        if self.batch_size is None:
+            size = 32768 if devices[0].platform == "cpu" else 262144
+        else:
+            size = whole_number("batch_size", self.batch_size)
+        return Plan(self.num_paths, size)
+
+
+class IndependentPathsSampler(AbstractLevelSampler):
+    """A sample is a path, on all levels with the same random key."""
+
+    problem: Problem
+
+    def on_level(self, keys, level):
+        p, n = self.problem, len(keys)
+        keys = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
+        terms_of = lambda keys: with_keys(p.terms, keys)
+        step, ensemble = independent_steps(p, level, n, terms_of, lambda i: keys)
+        saved, ensemble, _ = simulate(p, level, ensemble, step, None, lambda x, _: x)
+        return saved, ~ensemble.failed, ensemble.failed
+
+
+def path_keys(terms: PyTree[diffrax.AbstractTerm], key: PRNGKeyArray) -> list[Array]:
+    """New random keys for the paths in `terms`, made from `key`. Paths that had the same
+    key get the same one again."""
+    new = []
+    for x in filter(is_key, jtu.tree_leaves(brownian_paths(terms))):
+        typed = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        words = jr.key_data(x) if typed else x
+        own = key
+        for word in words.reshape(-1):
+            own = jr.fold_in(own, word)
+        data = jr.bits(own, words.shape, jnp.uint32)
+        new.append(jr.wrap_key_data(data, impl=jr.key_impl(x)) if typed else data)
+    return new
+
+
+def with_keys(terms: PyTree[diffrax.AbstractTerm], keys: list[Array]) -> PyTree:
+    """The terms with paths that have these keys."""
+    left = iter(keys)
+    replaced = lambda x: next(left) if is_key(x) else x
+    return replace_paths(terms, lambda path: jtu.tree_map(replaced, path))
+
+
+def is_key(x) -> bool:
+    """Whether an array of a Brownian path is its random key."""
+    dtype = getattr(x, "dtype", None)
+    return dtype is not None and (
+        jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32
+    )
+
+
+def monte_carlo(
+    fn: Callable[..., Any],
+    key: PRNGKeyArray,
+    num_paths: int | np.integer,
+    *,
+    batch_size: int | np.integer | None = None,
+    levels: int = 1,
+    order: int | None = None,
+    tol: float | None = None,
+    start: Expectation | None = None,
+    devices: Sequence[Any] | None = None,
+    progress_meter: diffrax.AbstractProgressMeter = NO_METER,
+) -> Expectation:
+    r"""Averages a function of a random key: whatever a path of your own makes of it.
+
+    For functions of the state at given times [`diffrax_symplectic.expectation`][] is
+    simpler, and needs far fewer paths. This one is for all else: events, gradients,
+    functions of whole paths.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+        import jax.random as jr
+
+        H = lambda t, p, q, args: (p**2 + q**2) / 2
+        y0 = (jnp.array(0.0), jnp.array(1.0))
+
+        def phi(key):
+            terms = ds.hamiltonian_terms(H, H, ds.WeakBrownianPath((), key))
+            sol = diffrax.diffeqsolve(
+                terms, ds.SRKw1(), t0=0, t1=1, dt0=0.1, y0=y0, throw=False
+            )
+            p, q = sol.ys
+            return q[-1] ** 2, sol.result
+
+        estimate = ds.monte_carlo(phi, jr.key(0), 10_000)
+        print(estimate.mean, estimate.std_error, estimate.num_failed)
+        ```
+
+    `fn` is compiled anew for each new function. For many values of a parameter pass one
+    function and the parameter as an array, `jax.tree_util.Partial(fn, parameter)`.
+    Gradients are taken within: the mean of `jax.grad` of a path is the gradient of the
+    expectation. On several devices the solve needs the adjoint `diffrax.DirectAdjoint()` or
+    `diffrax_symplectic.ReversingAdjoint()`. This function itself is no part of a JAX
+    program: it cannot be differentiated, `jit`ted or `vmap`ped.
+
+    **Levels.** With `levels=2` (3, ...) and `order=p` the function is `fn(key, level)`,
+    which solves with the step $h$ on level 0, $h/2$ on level 1, and so on. `mean` is
+    extrapolated to steps of size zero. Let the levels follow one Brownian motion, with
+    `cell=` of [`diffrax_symplectic.FixedStepBrownianPath`][]: then `bias`, the error of
+    discretization of the finest level, is known much better than the mean.
+
+    **Arguments:**
+
+    - `fn`: takes a random key to $\phi$, a PyTree of real arrays, or to a pair of that
+        and a `diffrax.RESULTS`: as above, with `throw=False`. A path fails if its result
+        is neither successful nor an event, or anything in its $\phi$ is not finite.
+        (Without `sol.result` a path that failed counts as a success: Diffrax returns where
+        it stopped.)
+    - `key`: a JAX random key. Path number $i$ gets the key
+        `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`.
+    - `num_paths`: the number of all paths, those of `start` included.
+    - `batch_size`: as for [`diffrax_symplectic.IndependentPaths`][].
+    - `levels`: how many step sizes.
+    - `order`: with levels, the weak order $p$ of the solver for the terms, as
+        `solver.weak_order(terms)` says.
+    - `tol`, `start`, `devices`, `progress_meter`: as for
+        [`diffrax_symplectic.expectation`][].
+
+    **Returns:** an [`diffrax_symplectic.Expectation`][].
+
+    **Raises:** as [`diffrax_symplectic.expectation`][]; a `ValueError` for levels without
+    `order`, or if $\phi$ holds a `diffrax.RESULTS`.
+    """
+    key = checked_key(key, "monte_carlo")
+    check_tol(tol)
+    levels = whole_number("levels", levels)
+    if levels > 1 and order is None:
+        raise ValueError(
+            "`levels` need `order=`, the weak order of the solver; got "
+            f"levels={levels!r} and order=None."
+        )
+    check_takes("fn", fn, *(["key"] if levels == 1 else ["key", "level"]))
+    order = 1 if order is None else whole_number("order", order)
+    devices = tuple(jax.devices() if devices is None else devices)
+    sampling = IndependentPaths(num_paths, batch_size)
+    sampler, plan = _Given(fn, level_weights(order, levels)), sampling.plan(devices)
+    about = dict(sampling=sampling)
+    estimate = run(sampler, key, plan, devices, start, tol, progress_meter, **about)
+    warn_of_tol(estimate, tol)
+    return estimate
+
+
+class _Given(AbstractSampler):
+    """Samples by a function of a key."""
+
+    fn: Callable[..., Any]
+    weights: Float[np.ndarray, "combinations levels"]
+
+    def __call__(self, keys):
+        def one(key):
+            levels = self.weights.shape[1]
+            at = lambda level: lambda key: self.fn(key, level)
+            fns = [self.fn] if levels == 1 else map(at, range(levels))
+            values, success = zip(*[_evaluate(fn, key) for fn in fns])
+
+            def combined(*xs):
+                xs = jnp.stack(xs)
+                return jnp.tensordot(self.weights.astype(real(xs.dtype)), xs, 1)
+
+            return jtu.tree_map(combined, *values), jnp.all(jnp.stack(success))
+
+        values, good = jax.vmap(one)(keys)
+        return Samples(values, good, (~good).astype(int))
+
+
+def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
+    """What `fn` returns, and whether the path succeeded."""
+    program, shape = jax.make_jaxpr(fn, return_shape=True)(key)
+    _check_failures_are_reported(program, shape)
+    leaves = jaxpr_as_fun(program)(key)
+    out = jtu.tree_unflatten(jtu.tree_structure(shape), leaves)
+    success = jnp.array(True)
+    if isinstance(out, tuple) and len(out) == 2 and _is_result(out[1]):
+        out, result = out
+        success = diffrax.is_okay(result)
+    if any(map(_is_result, jtu.tree_leaves(out, is_leaf=_is_result))):
+        raise ValueError(
+            "`fn` returns a `diffrax.RESULTS` within phi, where it would be averaged. "
+            "Return a pair `(phi, sol.result)`, so that paths that failed are left out."
+        )
+    out = jtu.tree_map(jnp.asarray, out)
+    if len(jtu.tree_leaves(out)) == 0:
+        raise ValueError(f"`fn` must return arrays, which are averaged; got {out!r}.")
+    return out, success & is_finite(out)
+
+
+def _check_failures_are_reported(program: ClosedJaxpr, out: PyTree) -> None:
+    """Raises a `ValueError` if a function solves with `throw=False`, as its program says,
+    but what it returns holds no `diffrax.RESULTS`."""
+    reported = any(map(_is_result, jtu.tree_leaves(out, is_leaf=_is_result)))
+    if not reported and solves_without_throwing(program.jaxpr):
+        raise ValueError(
+            "`fn` solves with `throw=False` but does not return `sol.result`, so that "
+            "paths that failed would be averaged as if they had not. Return the pair "
+            "`(phi, sol.result)`: then they are left out and counted. Or pass `throw=True` "
+            "to `diffeqsolve`, which raises an error if a path fails. If `fn` sees to "
+            "failures itself, return `(phi, diffrax.RESULTS.successful)`."
+        )
+
+
+def _is_result(x) -> bool:
+    return isinstance(x, type(diffrax.RESULTS.successful))
+
+
+def checked_key(key, user: str) -> PRNGKeyArray:
+    check_key(key, user)
+    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    return key if typed else jr.wrap_key_data(key)
+
+
+def check_tol(tol: float | None) -> None:
+    if tol is not None and not 0 < tol < np.inf:
+        raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")
