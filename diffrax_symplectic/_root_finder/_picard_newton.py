@@ -57,7 +57,8 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         included. `None` is elimination for few unknowns, and otherwise no matrix.
     - `direct`: the most unknowns for chord iterations. The Jacobian of more, and its
         inverse, cost more than the iterations that they save.
-    - `picard_steps`: the most iterations before Newton's method.
+    - `picard_steps`: the most iterations before Newton's method. Where their rate tells
+        that so many would not do, they end at once.
 
     In `optimistix.root_find`, `options={"scale": f}` says how large the state is that the
     unknowns `k` change: `f(k)` has their structure, and stands in place of `k` in `rtol`.
@@ -74,7 +75,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
     norm: Callable[[PyTree], Scalar] = optx.max_norm
     linear_solver: lx.AbstractLinearSolver | None = None
     direct: int = eqx.field(default=6, static=True)
-    picard_steps: int = eqx.field(default=40, static=True)
+    picard_steps: int = eqx.field(default=200, static=True)
 
     def __check_init__(self):
         for name in ("direct", "picard_steps"):

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from jax import lax
+from matplotlib.ticker import NullFormatter
 
 import diffrax_symplectic as ds
 
@@ -260,7 +261,9 @@ def draw(rows: list[Row]) -> None:
                 style = "--" if label in ("Heun", "midpoint by hand") else "-"
                 ax.loglog(x, row.nanoseconds, style, marker=".", label=label)
         ax.set(title=title, xlabel=r"$\omega h$")
-        ax.legend(fontsize=7)
+        ax.xaxis.set_minor_formatter(NullFormatter())
+    lines, labels = axes[0].get_legend_handles_labels()
+    figure.legend(lines, labels, loc="outside right center", fontsize=8)
     axes[0].set_ylabel("nanoseconds per path and step")
     figure.savefig(DOCS / "step_sizes.png", dpi=120)
     plt.close(figure)
