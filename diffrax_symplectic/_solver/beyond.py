@@ -178,7 +178,8 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
             step = Step(t0, t1 - t0, {"h": drift_driven(drift, t0, t1, args)})
             return take_step(_flow, step, y, self, unsolved)
 
-        y, unsolved = along_drift(t0, middle, y0, solver_state)
+        unsolved = first_state(self) if solver_state is None else solver_state
+        y, unsolved = along_drift(t0, middle, y0, unsolved)
         y, unsolved = self._along_noise(terms, t0, t1, middle, y, args, unsolved)
         y1, unsolved = along_drift(middle, t1, y, unsolved)
         return y1, None, dict(y0=y0, y1=y1), unsolved, result_of(unsolved, y1)
