@@ -8,7 +8,7 @@ Want: TypeAlias = Literal["expectations", "paths"]
 Noises: TypeAlias = Literal["any", "commuting", "not commuting"]
 # One order for all noises; or first that for one noise and for noises that commute, then
 # that for all others.
-Order: TypeAlias = float | tuple[float, float]
+Order: TypeAlias = int | float | tuple[int | float, int | float]
 
 
 class Record(NamedTuple):
@@ -33,7 +33,7 @@ class Record(NamedTuple):
     def strong_order(self, commute: bool) -> float | None:
         return None if self.strong is None else float(_order(self.strong, commute))
 
-    def order(self, want: Want, commute: bool) -> float | None:
+    def order(self, want: Want, commute: bool) -> int | float | None:
         of = {"expectations": self.weak_order, "paths": self.strong_order}
         return of[want](commute)
 
@@ -44,14 +44,14 @@ class Record(NamedTuple):
         )
 
 
-def _at_most(order, most: float):
+def _at_most(order: Order | None, most: int) -> Order | None:
     if isinstance(order, tuple):
         first, then = (min(x, most) for x in order)
         return first if first == then else (first, then)
     return None if order is None else min(order, most)
 
 
-def _order(order: Order, commute: bool) -> float:
+def _order(order: Order, commute: bool) -> int | float:
     return order[0 if commute else 1] if isinstance(order, tuple) else order
 
 
