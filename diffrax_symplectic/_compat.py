@@ -27,7 +27,6 @@ from jax.extend.core import (
     JaxprEqn as JaxprEqn,
     Literal as Literal,
 )
-from jax.extend.random import threefry_2x32 as threefry_2x32
 from jaxtyping import PyTree
 from lineax.internal import (
     pack_structures as pack_structures,

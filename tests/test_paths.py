@@ -7,10 +7,12 @@ import jax.random as jr
 import lineax as lx
 import numpy as np
 import pytest
+from jax.extend.random import threefry_2x32
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian._laws import THREE_POINT, two_point
 from diffrax_symplectic._brownian._random_words import (
+    _threefry,
     AREA_WORDS,
     place_of,
     PLATEAU_WORDS,
@@ -262,6 +264,17 @@ def test_the_same_key_gives_the_same_path_in_every_version():
     np.testing.assert_array_equal(
         random_words(key, place, 1, 2, AREA_WORDS), [[2750506793, 1201171554]]
     )
+
+
+def test_random_words_are_those_of_the_generator_of_jax():
+    key = np.array([2**31 + 5, 77], np.uint32)
+    counters = np.random.default_rng(0).integers(0, 2**32, (2, 100), np.uint32)
+    words = jnp.concatenate(_threefry(jnp.asarray(key), *jnp.asarray(counters)))
+    np.testing.assert_array_equal(words, threefry_2x32(key, counters.reshape(-1)))
+    # The known answer of its authors for a key and counters of zeros.
+    zero = jnp.zeros((), jnp.uint32)
+    words = [int(w) for w in _threefry(jnp.zeros(2, jnp.uint32), zero, zero)]
+    assert words == [0x6B200159, 0x99BA4EFE]
 
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])

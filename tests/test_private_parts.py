@@ -119,12 +119,6 @@ def test_lineax_packs_the_structures_of_an_operator():
         assert jnp.array_equal(_compat.unravel_solution(ravelled, s), vector)
 
 
-def test_jax_has_the_threefry_function_of_random123():
-    # Known answer for the key and the counters 0 of its authors.
-    words = _compat.threefry_2x32(jnp.zeros(2, jnp.uint32), jnp.zeros(2, jnp.uint32))
-    assert [hex(int(w)) for w in words] == ["0x6b200159", "0x99ba4efe"]
-
-
 def test_a_program_of_jax_is_a_function_of_its_flat_inputs():
     fn = _compat.jaxpr_as_fun(
         jax.make_jaxpr(lambda x, y: {"a": x - y, "b": y})(1.0, 2.0)

@@ -10,7 +10,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._root_finder._batch import any_of_batch
-from diffrax_symplectic._root_finder._tolerance import converged
+from diffrax_symplectic._root_finder._tolerance import converged, max_norm
 
 
 @pytest.mark.parametrize("direct", [0, 4], ids=["picard", "newton"])
@@ -341,3 +341,18 @@ def test_a_loop_of_a_batch_has_one_condition_for_all():
     flags = jnp.zeros((2, 3), bool)
     assert not shared(shared(any_of_batch))(flags)
     assert shared(shared(any_of_batch))(flags.at[1, 1].set(True))
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("n", [3, 6, 17])
+def test_the_norm_of_a_correction_tells_what_is_not_a_number(n):
+    # In batches of thousands XLA's own maximum of NaNs is -inf on CPUs.
+    x = np.linspace(-2.0, 1.0, n)
+    for bad in (np.nan, np.inf):
+        for at in range(n):
+            spoilt = np.tile(x, (3000, 1))
+            spoilt[::7, at] = bad
+            norms = np.asarray(jax.jit(jax.vmap(max_norm))(spoilt))
+            expected = np.where(np.arange(3000) % 7 == 0, bad, 2.0)
+            np.testing.assert_array_equal(norms, expected)
+    assert np.isnan(max_norm(jnp.full((n, 1), jnp.nan)))

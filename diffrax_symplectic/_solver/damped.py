@@ -13,6 +13,7 @@ from ._friction import (
     checked,
     decay,
     friction_modes,
+    GAMMA,
     matrix_faults,
     Modes,
 )
@@ -93,14 +94,10 @@ def _check_has_momentum(terms: PyTree[diffrax.AbstractTerm]) -> None:
         )
 
 
-Damped.__init__.__doc__ = """**Arguments:**
+Damped.__init__.__doc__ = f"""**Arguments:**
 
 - `solver`: a solver of this package.
-- `gamma`: the friction, in units of one over time: a number; or an array or PyTree like
-    `p`, each array a scalar, of the shape of its momenta, or a symmetric positive
-    semidefinite matrix that acts on them, of that shape twice, `(n, n)` for `n` momenta. If
-    it is traced and not so, the path fails. There are derivatives with respect to it; of
-    a matrix only first ones.
+- `gamma`: {GAMMA}
 
 **Raises:** a `ValueError` if `gamma` is known to be negative, not finite or no such matrix,
     if it does not fit `p` (in the solve), or for a solver of another package.
