@@ -54,8 +54,6 @@ from ._expectation import (
     monte_carlo as monte_carlo,
     ValueFunctions as ValueFunctions,
 )
-from ._hamiltonian import hamiltonian_terms as hamiltonian_terms
-from ._indexed_noise import IndexedNoise as IndexedNoise
 from ._root_finder import PicardNewton as PicardNewton
 from ._solver import (
     AbstractImplicitStages as AbstractImplicitStages,
@@ -81,11 +79,6 @@ from ._solver import (
     StormerVerlet as StormerVerlet,
     StrangGauss as StrangGauss,
 )
-from ._spins import (
-    from_spinors as from_spinors,
-    spin_terms as spin_terms,
-    to_spinors as to_spinors,
-)
 from ._suggest import (
     suggest_solver as suggest_solver,
     Suggestion as Suggestion,
@@ -98,17 +91,22 @@ from ._tableau import (
     PartitionedTableau as PartitionedTableau,
     SeparableTableau as SeparableTableau,
 )
+from ._terms import (
+    from_pair as from_pair,
+    from_spinors as from_spinors,
+    hamiltonian_terms as hamiltonian_terms,
+    IndexedNoise as IndexedNoise,
+    spin_terms as spin_terms,
+    to_pair as to_pair,
+    to_spinors as to_spinors,
+    wave_terms as wave_terms,
+)
 from ._verify import (
     poisson_defect as poisson_defect,
     second_moment_map as second_moment_map,
     step_expectation as step_expectation,
     symplecticity_defect as symplecticity_defect,
     weak_order_defect as weak_order_defect,
-)
-from ._waves import (
-    from_pair as from_pair,
-    to_pair as to_pair,
-    wave_terms as wave_terms,
 )
 
 

@@ -1,4 +1,4 @@
-"""Checks of what a user passes."""
+"""Checks of what a user passes: functions, numbers, solvers, states."""
 
 import inspect
 from typing import Any
@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
+
+from ._custom_types import Y
 
 
 def check_takes(name: str, fn: Any, *arguments: str) -> None:
@@ -54,3 +56,59 @@ def shapes(tree: PyTree) -> str:
     if jtu.all_leaves([tree]):
         return str(jnp.shape(tree))
     return eqx.tree_pformat(jax.eval_shape(lambda: tree), struct_as_array=True)
+
+
+def check_state(y0: Y, solver: str) -> None:
+    leaves = jtu.tree_leaves(y0)
+    if len(leaves) == 0:
+        raise ValueError(f"`{solver}` needs a state with at least one array in it.")
+    for leaf in leaves:
+        dtype = jnp.result_type(leaf)
+        if jnp.issubdtype(dtype, jnp.complexfloating):
+            raise ValueError(
+                f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
+                f"array of dtype {dtype}. For complex amplitudes `psi` with Hamiltonians "
+                "construct the terms with `wave_terms(H0, noise, path)` and pass "
+                "`y0=to_pair(psi0)`. For other equations split the state into real and "
+                "imaginary parts."
+            )
+        if not jnp.issubdtype(dtype, jnp.floating) or jnp.finfo(dtype).bits < 32:
+            raise ValueError(
+                f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
+                f"array of dtype {dtype}. Convert it with `.astype(float)`, to float32 or "
+                "float64."
+            )
+    if len({jnp.result_type(leaf) for leaf in leaves}) > 1:
+        raise ValueError(
+            f"`{solver}` needs all arrays of `y0` in one dtype; got "
+            f"{sorted({str(jnp.result_type(leaf)) for leaf in leaves})}."
+        )
+
+
+def check_pair(y: PyTree) -> None:
+    """Raises a `ValueError` unless `y` is a pair of the same structure and shapes."""
+    if fault := pair_fault(y):
+        raise ValueError(fault)
+
+
+def pair_fault(y: PyTree) -> str | None:
+    """What to pass instead of `y`; `None` if it is a pair of the same structure and
+    shapes."""
+    advice = (
+        "The state of a Hamiltonian system is a pair `(p, q)` of arrays (or PyTrees) of "
+        "the same structure and shapes: pass `y0=(p0, q0)`, or for spins "
+        "`y0=to_spinors(s0)`, or for complex amplitudes `y0=to_pair(psi0)`. "
+    )
+    if any(map(jnp.iscomplexobj, jtu.tree_leaves(y))):
+        return (
+            f"{advice}Both are real; got {eqx.tree_pformat(y)}. For complex amplitudes "
+            "construct the terms with `wave_terms`."
+        )
+    if type(y) is not tuple or len(y) != 2:
+        return f"{advice}Got {eqx.tree_pformat(y)}."
+    p, q = y
+    if jtu.tree_structure(p) != jtu.tree_structure(q) or [
+        jnp.shape(x) for x in jtu.tree_leaves(p)
+    ] != [jnp.shape(x) for x in jtu.tree_leaves(q)]:
+        return f"{advice}Got p = {eqx.tree_pformat(p)} and q = {eqx.tree_pformat(q)}."
+    return None

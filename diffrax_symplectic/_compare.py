@@ -27,8 +27,8 @@ from ._brownian import (
 from ._custom_types import Args, Y
 from ._expectation import Expectation, monte_carlo
 from ._solver import AbstractSymplecticSolver, Want
-from ._structure_checks import check_stratonovich
 from ._suggest import suggest_solver, with_paths
+from ._terms import check_stratonovich
 
 
 # How many steps of the reference there are in the smallest step that is compared.

@@ -6,11 +6,12 @@ by itself.
 
 import inspect
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 import diffrax
+import jax
 import jax.tree_util as jtu
 import numpy as np
 from diffrax._term import AdjointTerm, WrapTerm
@@ -20,6 +21,7 @@ from equinox.internal import (
     while_loop as while_loop,
     ω as ω,
 )
+from jax import lax
 from jax.extend.core import (
     ClosedJaxpr as ClosedJaxpr,
     Jaxpr as Jaxpr,
@@ -145,3 +147,24 @@ def _frame_of_solve(*functions: str) -> FrameType | None:
             return frame
         frame = frame.f_back
     return None
+
+
+_T = TypeVar("_T")
+
+
+def materialize(fn: Callable[[], _T]) -> _T:
+    """`fn()`, computed once and kept in memory.
+
+    On CPUs, XLA may fuse a computation into every kernel that reads its result, and so
+    repeat it in each. For Gaussian numbers and transcendental functions this costs more
+    than it saves. XLA fuses nothing across the border of a conditional. So `fn` is called
+    in one branch of a conditional, and the barrier hides from XLA that the condition is
+    always true.
+    """
+
+    def in_a_conditional() -> _T:
+        shapes = jax.eval_shape(fn)
+        zeros = lambda: jtu.tree_map(lambda s: lax.full_like(s, 0), shapes)
+        return lax.cond(lax.optimization_barrier(True), fn, zeros)
+
+    return lax.platform_dependent(cpu=in_a_conditional, default=fn)

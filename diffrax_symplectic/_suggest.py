@@ -14,6 +14,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
+from ._arguments import check_state
 from ._brownian import increment_struct
 from ._custom_types import Args, RealScalarLike, Y
 from ._solver import (
@@ -40,20 +41,17 @@ from ._solver import (
     StrangGauss,
     Want,
 )
-from ._structure_checks import (
+from ._tableau import Structure
+from ._terms import (
     additive_fault,
+    apply,
+    brownian_paths,
     commuting,
     constant_fault,
     FRICTION,
-    separable_fault,
-)
-from ._tableau import Structure
-from ._terms import (
-    apply,
-    brownian_paths,
-    check_state,
     number_of_noises,
     replace_paths,
+    separable_fault,
     split_terms,
 )
 

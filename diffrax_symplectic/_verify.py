@@ -12,12 +12,20 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from ._arguments import check_pair
 from ._compat import ω
 from ._custom_types import Args, RealScalarLike, Y
-from ._hamiltonian import check_pair
-from ._quadrature import outcomes, step_variables
-from ._spins import as_spins, from_spinors, to_spinors
-from ._terms import apply_one, number_of_noises, split_terms, tree_sum
+from ._terms import (
+    apply_one,
+    as_spins,
+    from_spinors,
+    number_of_noises,
+    outcomes,
+    split_terms,
+    step_variables,
+    to_spinors,
+    tree_sum,
+)
 
 
 def _one_step(terms, solver, t0, t1, y0, args) -> tuple[Y, diffrax.RESULTS]:

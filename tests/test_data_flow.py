@@ -7,7 +7,7 @@ import jax.random as jr
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._structure_checks import (
+from diffrax_symplectic._terms._structure_checks import (
     additive_fault,
     constant_fault,
     DataFlow,

@@ -9,8 +9,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import Discrete, laws_of, VARIABLES
-from diffrax_symplectic._quadrature import outcomes, step_variables
-from diffrax_symplectic._terms import controls
+from diffrax_symplectic._terms import controls, outcomes, step_variables
 
 from .problems import weak_path
 

@@ -10,13 +10,14 @@ import pytest
 from jax.extend.random import threefry_2x32
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._brownian._laws import THREE_POINT, two_point
-from diffrax_symplectic._brownian._random_words import (
+from diffrax_symplectic._brownian._random import (
     _threefry,
     AREA_WORDS,
     place_of,
     PLATEAU_WORDS,
     random_words,
+    THREE_POINT,
+    two_point,
 )
 
 from .problems import kubo_terms, weak_path

@@ -9,13 +9,12 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 
 from .._arguments import whole_number
+from .._compat import materialize
 from .._custom_types import BM, RealScalarLike
-from .._materialize import materialize
 from ._cells import check_cell, compose, or_one, Piece
-from ._laws import normal_from_words
-from ._random_words import AREA_WORDS, check_key, place_of, random_words
-from ._stepwise import Increment, num_noises
-from ._wrappers import AbstractWrappedPath, increment_struct, require_space_time_area
+from ._random import AREA_WORDS, check_key, normal_from_words, place_of, random_words
+from ._stepwise import AbstractWrappedPath, Increment, increment_struct, num_noises
+from ._wrappers import require_space_time_area
 
 
 class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):

@@ -9,8 +9,14 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM
 from ._cells import check_cell, compose, Piece
-from ._laws import AbstractLaw, FOUR_POINT, THREE_POINT, two_point
-from ._random_words import check_key, place_of
+from ._random import (
+    AbstractLaw,
+    check_key,
+    FOUR_POINT,
+    place_of,
+    THREE_POINT,
+    two_point,
+)
 from ._stepwise import AbstractPathWithLaws, checked_shape, GAUSSIAN_LAWS, Increment
 
 

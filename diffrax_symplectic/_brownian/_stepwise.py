@@ -15,8 +15,7 @@ from jaxtyping import Array, PRNGKeyArray, PyTree, UInt32
 
 from .._compat import innermost_solve, innermost_times, nondifferentiable
 from .._custom_types import RealScalarLike
-from ._laws import AbstractLaw, Gaussian
-from ._random_words import Place, random_words
+from ._random import AbstractLaw, Gaussian, Place, random_words
 
 
 if TYPE_CHECKING:
@@ -148,6 +147,56 @@ def laws_of(path: diffrax.AbstractBrownianPath) -> Mapping[str, AbstractLaw] | N
     if isinstance(path, diffrax.UnsafeBrownianPath | diffrax.VirtualBrownianTree):
         return GAUSSIAN_LAWS.get(path.levy_area)
     return None
+
+
+class AbstractWrappedPath(AbstractStepwisePath):
+    """A Brownian path that changes the increments of another, or adds to them."""
+
+    path: AbstractVar[diffrax.AbstractBrownianPath]
+
+    @property
+    def t0(self):
+        return self.path.t0
+
+    @property
+    def t1(self):
+        return self.path.t1
+
+    @abc.abstractmethod
+    def num_own_words(self, use_levy: bool) -> int:
+        """How many random words `changed` needs."""
+
+    @abc.abstractmethod
+    def changed(
+        self,
+        increment: Increment,
+        own_words: UInt32[Array, " num_own_words"],
+        h: RealScalarLike,
+        use_levy: bool,
+    ) -> Increment:
+        """What this path makes of an increment of the other, over a step of size `h`."""
+
+    def num_words(self, use_levy: bool = False) -> int:
+        return stepwise(self.path).num_words(use_levy) + self.num_own_words(use_levy)
+
+    def increment(
+        self,
+        words: UInt32[Array, " num_words"],
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        use_levy: bool = False,
+    ) -> Increment:
+        path = stepwise(self.path)
+        increment = path.increment(words, t0, t1, use_levy)
+        own_words = words[path.num_words(use_levy) :]
+        return self.changed(increment, own_words, t1 - t0, use_levy)
+
+
+def increment_struct(
+    path: diffrax.AbstractBrownianPath,
+) -> PyTree[jax.ShapeDtypeStruct]:
+    """Shapes, dtypes and structure of an increment."""
+    return jax.eval_shape(lambda: path.evaluate(0.0, 1.0))
 
 
 # The laws of Gaussian paths, by the type of their increments.

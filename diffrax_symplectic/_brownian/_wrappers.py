@@ -1,81 +1,28 @@
-import abc
 import dataclasses
-from typing import TYPE_CHECKING
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM, RealScalarLike
-from ._laws import AbstractLaw, two_point
-from ._random_words import check_key, place_of, PLATEAU_WORDS, random_words
+from ._random import (
+    AbstractLaw,
+    check_key,
+    place_of,
+    PLATEAU_WORDS,
+    random_words,
+    two_point,
+)
 from ._stepwise import (
-    AbstractStepwisePath,
+    AbstractWrappedPath,
     draw_set,
     Increment,
+    increment_struct,
     laws_of,
     num_noises,
-    stepwise,
 )
-
-
-if TYPE_CHECKING:
-    from typing import ClassVar as AbstractVar
-else:
-    from equinox import AbstractVar
-
-
-class AbstractWrappedPath(AbstractStepwisePath):
-    """A Brownian path that changes the increments of another, or adds to them."""
-
-    path: AbstractVar[diffrax.AbstractBrownianPath]
-
-    @property
-    def t0(self):
-        return self.path.t0
-
-    @property
-    def t1(self):
-        return self.path.t1
-
-    @abc.abstractmethod
-    def num_own_words(self, use_levy: bool) -> int:
-        """How many random words `changed` needs."""
-
-    @abc.abstractmethod
-    def changed(
-        self,
-        increment: Increment,
-        own_words: UInt32[Array, " num_own_words"],
-        h: RealScalarLike,
-        use_levy: bool,
-    ) -> Increment:
-        """What this path makes of an increment of the other, over a step of size `h`."""
-
-    def num_words(self, use_levy: bool = False) -> int:
-        return stepwise(self.path).num_words(use_levy) + self.num_own_words(use_levy)
-
-    def increment(
-        self,
-        words: UInt32[Array, " num_words"],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        use_levy: bool = False,
-    ) -> Increment:
-        path = stepwise(self.path)
-        increment = path.increment(words, t0, t1, use_levy)
-        own_words = words[path.num_words(use_levy) :]
-        return self.changed(increment, own_words, t1 - t0, use_levy)
-
-
-def increment_struct(
-    path: diffrax.AbstractBrownianPath,
-) -> PyTree[jax.ShapeDtypeStruct]:
-    """Shapes, dtypes and structure of an increment."""
-    return jax.eval_shape(lambda: path.evaluate(0.0, 1.0))
 
 
 def require_space_time_area(path: diffrax.AbstractBrownianPath, wrapper: str) -> None:

@@ -16,7 +16,7 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._arguments import check_solver, check_takes, whole_number
 from .._custom_types import Args, RealScalarLike, Y
-from .._structure_checks import check_stratonovich
+from .._terms import check_stratonovich
 from ._array_rqmc import ArrayRQMC
 from ._estimate import Expectation, NO_METER, run, warn_of_tol
 from ._monte_carlo import check_tol, checked_key, IndependentPaths

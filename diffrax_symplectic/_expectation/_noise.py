@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from .._brownian import AbstractLaw, Discrete, random_words
 from .._custom_types import Y
-from .._quadrature import outcomes, step_variables
+from .._terms import outcomes, step_variables
 from ._steps import Level, Problem
 
 

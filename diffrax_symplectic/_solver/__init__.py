@@ -2,6 +2,9 @@ from .base import (
     AbstractImplicitStages as AbstractImplicitStages,
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
     AbstractSymplecticSolver as AbstractSymplecticSolver,
+    Noises as Noises,
+    Record as Record,
+    Want as Want,
 )
 from .general import (
     ImplicitMidpoint as ImplicitMidpoint,
@@ -29,7 +32,8 @@ from .beyond import (
     StrangGauss as StrangGauss,
 )
 from .baoab import BAOAB as BAOAB
-from .damped import Damped as Damped
-from .linear_flow import LinearFlow as LinearFlow
-from ._splitting import AbstractSplitting as AbstractSplitting
-from ._record import Noises as Noises, Record as Record, Want as Want
+from .splitting import (
+    AbstractSplitting as AbstractSplitting,
+    Damped as Damped,
+    LinearFlow as LinearFlow,
+)

@@ -13,9 +13,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .._compat import nondifferentiable
+from .._compat import materialize, nondifferentiable
 from .._custom_types import RealScalarLike
-from .._materialize import materialize
 
 
 # What the solvers say of this argument.

@@ -6,13 +6,13 @@ import equinox as eqx
 import numpy as np
 
 from .._tableau import AdditiveTableau
-from ._record import Record
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
     ARGUMENTS,
     free_parameter,
     real_number,
+    Record,
     ROOT_FINDER,
 )
 

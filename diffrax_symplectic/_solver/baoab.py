@@ -7,11 +7,11 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import ArrayLike, PyTree
 
+from .._arguments import check_state
 from .._compat import direction, unwrapped
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from .._structure_checks import check_structure
 from .._tableau import Structure
-from .._terms import apply, check_state, controls, split_terms
+from .._terms import apply, check_structure, controls, split_terms
 from ._friction import (
     apply_friction,
     checked,
@@ -21,9 +21,8 @@ from ._friction import (
     matrix_faults,
     spread,
 )
-from ._implicit_step import result_of
-from ._record import Record
-from .base import AbstractSymplecticSolver
+from ._step import result_of
+from .base import AbstractSymplecticSolver, Record
 
 
 class BAOAB(AbstractSymplecticSolver):

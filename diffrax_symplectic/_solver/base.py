@@ -1,11 +1,13 @@
-"""The solvers' common base, and the step of any tableau."""
+"""The solvers' common base, the record of what is known of a solver, from which its orders,
+suggestions, the tables of the documentation and the tests of all solvers are made, and the
+step of any tableau."""
 
 import abc
 import dataclasses
 import functools as ft
 import math
 from collections.abc import Callable
-from typing import Any, ClassVar, TYPE_CHECKING, TypeAlias
+from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -14,29 +16,84 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import ArrayLike, Bool, PRNGKeyArray, PyTree
 
+from .._arguments import check_state
 from .._brownian import path_of, VARIABLES
 from .._conditions import drift_order
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
 from .._root_finder import PicardNewton
-from .._structure_checks import check_structure
 from .._tableau import AbstractTableau, FlatTableau, Structure
 from .._terms import (
-    check_state,
+    check_structure,
     drift_driven,
     noise_driven,
     number_of_noises,
     split_terms,
 )
-from ._implicit_step import result_of, take_step
-from ._record import depends_on_noises, Record, Want
-from ._stages import Step
+from ._step import result_of, Step, take_step
 
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
 else:
     from equinox import AbstractVar
+
+
+Want: TypeAlias = Literal["expectations", "paths"]
+Noises: TypeAlias = Literal["any", "commuting", "not commuting"]
+# One order for all noises; or first that for one noise and for noises that commute, then
+# that for all others.
+Order: TypeAlias = int | float | tuple[int | float, int | float]
+
+
+class Record(NamedTuple):
+    """The facts about a solver that do not follow from its coefficients.
+
+    - `weak`: the order of its expectations.
+    - `strong`: the order of its paths, or `None` for a method for expectations alone.
+    - `choose`: when to choose it, in a sentence.
+    - `noises`: the noises for which it is chosen. It takes any.
+    - `suggested`: what `suggest_solver` names it for.
+    """
+
+    weak: Order
+    strong: Order | None
+    choose: str
+    noises: Noises = "any"
+    suggested: tuple[Want, ...] = ()
+
+    def weak_order(self, commute: bool) -> int:
+        return int(_order(self.weak, commute))
+
+    def strong_order(self, commute: bool) -> float | None:
+        return None if self.strong is None else float(_order(self.strong, commute))
+
+    def order(self, want: Want, commute: bool) -> int | float | None:
+        of = {"expectations": self.weak_order, "paths": self.strong_order}
+        return of[want](commute)
+
+    def at_most(self, weak: int, strong: int) -> "Record":
+        """That of a splitting of these orders around the solver."""
+        return self._replace(
+            weak=_at_most(self.weak, weak), strong=_at_most(self.strong, strong)
+        )
+
+
+def _at_most(order: Order | None, most: int) -> Order | None:
+    if isinstance(order, tuple):
+        first, then = (min(x, most) for x in order)
+        return first if first == then else (first, then)
+    return None if order is None else min(order, most)
+
+
+def _order(order: Order, commute: bool) -> int | float:
+    return order[0 if commute else 1] if isinstance(order, tuple) else order
+
+
+def depends_on_noises(order: Order | None) -> bool:
+    """Whether an order is another one for noises that do not commute."""
+    return isinstance(order, tuple)
+
 
 # Of solvers with implicit stages: whether a step of this path was not solved. In a batch
 # Diffrax goes on to step paths that have ended, and drops what comes out.

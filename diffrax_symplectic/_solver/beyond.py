@@ -9,26 +9,19 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from .._arguments import check_state
 from .._conditions import drift_order
 from .._plan import make_plan
 from .._tableau import FlatTableau, GeneralTableau, Stage, Structure
-from .._terms import (
-    apply_one,
-    check_state,
-    controls,
-    drift_driven,
-    number_of_noises,
-    split_terms,
-)
-from ._implicit_step import result_of, take_step
-from ._record import Record
-from ._stages import Step
+from .._terms import apply_one, controls, drift_driven, number_of_noises, split_terms
+from ._step import result_of, Step, take_step
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
     AbstractSymplecticSolver,
     ARGUMENTS,
     first_state,
+    Record,
 )
 from .general import ImplicitMidpoint
 

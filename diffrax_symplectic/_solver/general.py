@@ -6,12 +6,12 @@ import equinox as eqx
 import numpy as np
 
 from .._tableau import GeneralTableau
-from ._record import Record
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
     ARGUMENTS,
     free_parameter,
+    Record,
     ROOT_FINDER,
 )
 

@@ -10,12 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ._custom_types import Args, RealScalarLike
-from ._hamiltonian import (
-    check_pair,
-    lifted_terms,
-    scalar_energy,
-)
+from .._arguments import check_pair
+from .._custom_types import Args, RealScalarLike
+from ._hamiltonian import lifted_terms, scalar_energy
 
 
 _Spins = Float[Array, "*spins 3"]

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
-from ._custom_types import Args, RealScalarLike
-from ._hamiltonian import check_pair, lifted_terms
+from .._arguments import check_pair
+from .._custom_types import Args, RealScalarLike
+from ._hamiltonian import lifted_terms
 
 
 _Waves = PyTree[Complex[Array, "..."]]

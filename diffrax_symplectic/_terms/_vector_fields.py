@@ -1,8 +1,9 @@
-"""Diffrax terms as a step uses them: drift and noise apart, the random variables of the
-step, and checks that terms and state fit each other."""
+"""Diffrax terms as a step uses them: drift and noise apart, vector fields times controls, and
+the Lie brackets of vector fields."""
 
 import functools as ft
 from collections.abc import Callable
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -14,21 +15,10 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ._arguments import shapes
-from ._bridge import apply_bridge, bridge
-from ._brownian import (
-    AbstractWrappedPath,
-    FixedStepBrownianPath,
-    PlateauBrownianPath,
-    TruncatedBrownianPath,
-    VARIABLES,
-    WeakBrownianPath,
-)
-from ._compat import direction, is_adjoint_term, unwrapped, ω
-from ._custom_types import Args, IntScalarLike, RealScalarLike, Y
-from ._hamiltonian import HamiltonianNoise
-from ._indexed_noise import OneNoise
-from ._materialize import materialize
+from .._arguments import shapes
+from .._compat import is_adjoint_term, unwrapped, ω
+from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
+from ._hamiltonian import HamiltonianNoise, OneNoise
 
 
 _BACKSOLVE = (
@@ -176,142 +166,83 @@ def tree_sum(values: list[Y]) -> Y:
     return ft.reduce(lambda a, b: (a**ω + b**ω).ω, values)
 
 
-def controls(
-    noise: tuple, names: list[str], t0, t1, solver: str, optional: tuple[str, ...] = ()
-) -> dict[str, list]:
-    """The random variables of the step from `t0` to `t1`, for each noise term; those of
-    `optional` if all increments hold them."""
-    t1 = _within_resolution(noise, t0, t1)
-    drawn = ft.partial(_drawn, noise, t0, t1, use_levy=names != ["W"])
-    # What costs less to compute again than to keep is not kept.
-    cheap = all(map(_is_cheap, brownian_paths(noise)))
-    increments = drawn() if cheap else materialize(drawn)
-    if names == ["W"]:
-        return {"W": increments}
-    # The variables of which the increments hold most are looked for first: the advice for
-    # these is right for the others, too.
-    held = lambda name: all(getattr(i, name, None) is not None for i in increments)
-    for name in sorted(names, key=lambda x: [*VARIABLES, x].index(x)):
-        if not held(name):
-            variable = VARIABLES.get(name)
-            advice = f"increments with the attribute `{name}`"
-            raise ValueError(
-                f"`{solver}` needs {variable.advice if variable else advice}."
-            )
-    return {
-        name: [
-            _in_time(term, name, getattr(i, name)) for term, i in zip(noise, increments)
-        ]
-        for name in [*names, *filter(held, optional)]
-    }
+class Bridge(NamedTuple):
+    r"""Integrals over a step of size $h$ of the Brownian bridges of `m` noises: their paths
+    less the straight lines between the ends.
+
+    - `first`: the means of the bridges over the step, $H_k$.
+    - `second`: $\frac{1}{2h} \int (\text{bridge}_k + W_k (\frac sh - \frac12))
+        (\text{bridge}_l + W_l (\frac sh - \frac12))\,\mathrm{d}s - \frac{1}{24} W_k W_l$,
+        in expectation.
+    """
+
+    first: Float[Array, " m"]
+    second: Float[Array, "m m"]
 
 
-def _in_time(term: diffrax.AbstractTerm, name: str, x: PyTree[Array]) -> PyTree[Array]:
-    """Backward in time Diffrax changes the sign of all random variables. Those that stay
-    the same get it back."""
-    even = name in VARIABLES and VARIABLES[name].even
-    return (direction(term) * x**ω).ω if even else x
+def bridge(h: RealScalarLike, W: PyTree, H: PyTree, K: PyTree | None) -> Bridge:
+    r"""The expectations of these integrals given the space-time areas, and given the
+    space-time-time areas as well unless `K` is `None`.
+
+    A bridge is $6 u (1 - u) H + 120 u (1 - u) (\frac12 - u) K$ with $u = s / h$, and an
+    independent rest whose square has the mean $h / 15$ without the second summand, and
+    $3 h / 70$ with it.
+    """
+    w, first = jfu.ravel_pytree(W)[0], jfu.ravel_pytree(H)[0]
+    one = jnp.eye(first.size, dtype=first.dtype) * jnp.abs(h).astype(first.dtype)
+    second = 3 / 5 * jnp.outer(first, first)
+    if K is None:
+        return Bridge(first, second + one / 30)
+    k = jfu.ravel_pytree(K)[0]
+    mixed = jnp.outer(w, k)
+    second = second + 60 / 7 * jnp.outer(k, k) - (mixed + mixed.T) / 2
+    return Bridge(first, second + 3 / 140 * one)
 
 
-def _drawn(noise: tuple, t0, t1, use_levy: bool) -> list:
-    if use_levy:
-        return [term.contr(t0, t1, use_levy=True) for term in noise]
-    return [term.contr(t0, t1) for term in noise]
+@eqx.filter_jit
+def apply_bridge(
+    drift: jtu.Partial,
+    noise: tuple[diffrax.AbstractTerm, ...],
+    bridge: Bridge,
+    h: RealScalarLike,
+    args: Args,
+    t: RealScalarLike,
+    y: Y,
+) -> Y:
+    """`sum_k H_k [b_k, A] + sum_{k, l} L_kl [b_k, [b_l, A]]`, with `A(t, y) = drift(t, y)`
+    the drift times `h`, and `[b, A] = A' b - b' A`. Time is a part of the state that the
+    drift moves by `h`. For `m` noises that is `m` double brackets.
+    """
+    struct = eqx.filter_eval_shape(lambda: [term.contr(0.0, 1.0) for term in noise])
+    _, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, struct))
+    t = jnp.asarray(t, jnp.result_type(h))
 
+    def along_noise(t, y, x):
+        values = [term.vf_prod(t, y, args, c) for term, c in zip(noise, unravel(x))]
+        total = values[0]
+        for value in values[1:]:
+            total = (total**ω + value**ω).ω
+        return total
 
-def _within_resolution(noise: tuple, t0, t1) -> RealScalarLike:
-    """`t1`, with an error when run if a tree does not resolve the step."""
-    h = jnp.abs(t1 - t0)
-    for path in map(_innermost, brownian_paths(noise)):
-        if isinstance(path, diffrax.VirtualBrownianTree):
-            # The tree keeps its tolerance in units of its length.
-            tol = path.tol * (path.t1 - path.t0)
-            # A difference of two times that is a rounding error is not a step.
-            coarse = (h < 0.999 * tol) & (h > 1e-6 * tol)
-            t1 = eqx.error_if(
-                jnp.asarray(t1),
-                coarse,
-                "A step is shorter than `tol` of the `VirtualBrownianTree`, which only "
-                "interpolates there, so that the noise would be too small. Pass a smaller "
-                "`tol`, or for fixed steps `FixedStepBrownianPath(shape, key)`.",
-            )
-    return t1
+    def bracket(x, field, t, y, speed):
+        """The bracket of the noise along `x` with `field`, which moves time by `speed`; and
+        the value of `field`."""
+        b = along_noise(t, y, x)
+        value, change = jax.jvp(lambda y: field(t, y), (y,), (b,))
+        along = lambda t, y: along_noise(t, y, x)
+        _, carried = jax.jvp(along, (t, y), (speed, value))
+        return (change**ω - carried**ω).ω, value
 
+    def summand(unit, column):
+        single = lambda t, y: bracket(unit, drift, t, y, jnp.asarray(h, t.dtype))[0]
+        return bracket(column, single, t, y, jnp.zeros_like(t))
 
-def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
-    while isinstance(path, AbstractWrappedPath):
-        path = path.path
-    return path
-
-
-def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
-    """Whether its random variables cost less to compute again than to keep."""
-    while isinstance(path, TruncatedBrownianPath | PlateauBrownianPath):
-        path = path.path
-    return isinstance(path, WeakBrownianPath | FixedStepBrownianPath)
-
-
-def noise_driven(
-    drift: tuple, noise: tuple, names: list[str], t0, t1, args: Args, solver: str
-) -> dict[str, jtu.Partial]:
-    """What drives noise stages over the step, for each random variable."""
-    draw = lambda names, *optional: controls(noise, names, t0, t1, solver, optional)
-    if "L" not in names:
-        drawn = draw(names)
-    else:
-        # It is computed from others.
-        own = [name for name in names if name != "L"]
-        drawn = draw([*dict.fromkeys(["W", "H", *own])], "K")
-    driven = {}
-    for name in names:
-        if name == "L":
-            along = drift_driven(drift, t0, t1, args)
-            bridges = bridge(t1 - t0, drawn["W"], drawn["H"], drawn.get("K"))
-            driven[name] = jtu.Partial(
-                apply_bridge, along, noise, bridges, t1 - t0, args
-            )
-        elif name != "A":
-            driven[name] = jtu.Partial(apply, noise, drawn[name], args)
-        elif len(noise) == 1:
-            driven[name] = jtu.Partial(apply_brackets, noise[0], drawn[name][0], args)
-        else:
-            raise ValueError(
-                f"`{solver}` needs all noises in one term, whose path samples the Lévy "
-                f"areas between them; got {len(noise)} noise terms."
-            )
-    return driven
-
-
-def drift_driven(drift: tuple, t0, t1, args: Args) -> jtu.Partial:
-    """What drives drift stages over the step."""
-    return jtu.Partial(apply, drift, [x.contr(t0, t1) for x in drift], args)
-
-
-def check_state(y0: Y, solver: str) -> None:
-    leaves = jtu.tree_leaves(y0)
-    if len(leaves) == 0:
-        raise ValueError(f"`{solver}` needs a state with at least one array in it.")
-    for leaf in leaves:
-        dtype = jnp.result_type(leaf)
-        if jnp.issubdtype(dtype, jnp.complexfloating):
-            raise ValueError(
-                f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
-                f"array of dtype {dtype}. For complex amplitudes `psi` with Hamiltonians "
-                "construct the terms with `wave_terms(H0, noise, path)` and pass "
-                "`y0=to_pair(psi0)`. For other equations split the state into real and "
-                "imaginary parts."
-            )
-        if not jnp.issubdtype(dtype, jnp.floating) or jnp.finfo(dtype).bits < 32:
-            raise ValueError(
-                f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
-                f"array of dtype {dtype}. Convert it with `.astype(float)`, to float32 or "
-                "float64."
-            )
-    if len({jnp.result_type(leaf) for leaf in leaves}) > 1:
-        raise ValueError(
-            f"`{solver}` needs all arrays of `y0` in one dtype; got "
-            f"{sorted({str(jnp.result_type(leaf)) for leaf in leaves})}."
-        )
+    units = jnp.eye(bridge.first.size, dtype=bridge.first.dtype)
+    doubles, singles = jax.vmap(summand)(units, bridge.second)
+    combine = lambda double, single: (
+        jnp.sum(double, axis=0) + jnp.tensordot(bridge.first, single, axes=1)
+    )
+    return jtu.tree_map(combine, doubles, singles)
 
 
 def _check_value(value: PyTree[Array], y: PyTree[Array]) -> None:

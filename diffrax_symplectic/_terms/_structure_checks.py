@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 
-from ._compat import ω
-from ._custom_types import Args, RealScalarLike, Y
+from .._arguments import check_pair, pair_fault
+from .._compat import ω
+from .._custom_types import Args, RealScalarLike, Y
+from .._tableau import Structure
 from ._data_flow import DataFlow
-from ._hamiltonian import asserted_structure, check_pair, is_hamiltonian, pair_fault
-from ._tableau import Structure
-from ._terms import apply, split_terms
+from ._hamiltonian import asserted_structure, is_hamiltonian
+from ._vector_fields import apply, split_terms
 
 
 class Fault(NamedTuple):

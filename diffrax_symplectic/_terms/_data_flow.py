@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from ._compat import ClosedJaxpr, inner_programs, Jaxpr, JaxprEqn, Literal
+from .._compat import ClosedJaxpr, inner_programs, Jaxpr, JaxprEqn, Literal
 
 
 # What is known of a value, the larger the less. A product with zero is zero, since values

@@ -1,0 +1,313 @@
+"""Exact flows around the step of another solver: of friction, of a linear part."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, Bool, PyTree
+
+from .._arguments import check_pair, check_takes
+from .._compat import direction
+from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from .._tableau import Structure
+from .._terms import is_hamiltonian, Lifted, split_terms
+from ._friction import (
+    apply_friction,
+    checked,
+    decay,
+    friction_modes,
+    GAMMA,
+    matrix_faults,
+    Modes,
+)
+from .base import AbstractSymplecticSolver, Record
+
+
+class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
+    """An exact flow over half of the step, a step of `solver` for all else, and the flow
+    over the other half."""
+
+    # When to choose it, in a sentence.
+    choose: ClassVar[str]
+    # The orders of the splitting. The solver may have lower ones.
+    weak: ClassVar[int] = 2
+    strong: ClassVar[int] = 1
+    # What to do with solvers of other packages.
+    advice: ClassVar[str] = ""
+
+    @abc.abstractmethod
+    def prepare(
+        self,
+        terms: PyTree[diffrax.AbstractTerm],
+        time: RealScalarLike,
+        y0: Y,
+        args: Args,
+    ) -> Any:
+        """What all flows of a solve have in common."""
+
+    @abc.abstractmethod
+    def exact_flow(self, prepared: Any, time: RealScalarLike, y: Y, args: Args) -> Y:
+        """The flow over `time`, which is negative in a solve backward in time."""
+
+    def __check_init__(self):
+        if not isinstance(self.solver, AbstractSymplecticSolver):
+            name = type(self).__name__
+            raise ValueError(
+                f"`{name}` wraps a solver of this package, such as `StormerVerlet()`; got "
+                f"`{type(self.solver).__name__}`. {self.advice}".rstrip()
+            )
+
+    @property
+    def record(self) -> Record | None:  # pyright: ignore
+        record = self.solver.record  # pyright: ignore
+        return record and record.at_most(self.weak, self.strong)
+
+    @property
+    def structure(self) -> Structure:
+        return self.solver.structure  # pyright: ignore
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        return self.solver.variables  # pyright: ignore
+
+    @property
+    def root_finder(self):
+        """That of the solver, if its stages are implicit."""
+        return self.solver.root_finder  # pyright: ignore
+
+    @property
+    def root_find_max_steps(self) -> int:
+        """That of the solver, if its stages are implicit."""
+        return self.solver.root_find_max_steps  # pyright: ignore
+
+    def stage_vectors(self, num_noises):
+        return self.solver.stage_vectors(num_noises)  # pyright: ignore
+
+    def order(self, terms):
+        order = self.solver.order(terms)
+        return None if order is None else min(order, 2)
+
+    def init(
+        self,
+        terms: PyTree[diffrax.AbstractTerm],
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+    ) -> Any:
+        """The state of the solver, and what all flows have in common."""
+        check_pair(y0)
+        prepared = self.prepare(terms, direction(terms) * (t1 - t0) / 2, y0, args)
+        return self.solver.init(terms, t0, t1, y0, args), prepared
+
+    def step(
+        self,
+        terms: PyTree[diffrax.AbstractTerm],
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: Any,
+        made_jump: BoolScalarLike,
+    ) -> tuple[Y, Y | None, DenseInfo, Any, diffrax.RESULTS]:
+        del made_jump
+        inner, prepared = solver_state
+        # Diffrax makes `t1 - t0` positive in a solve backward in time, too.
+        time = direction(terms) * (t1 - t0) / 2
+        y = self.exact_flow(prepared, time, y0, args)
+        # What the solver remembers is the end of its last step, and this one begins
+        # elsewhere.
+        y, error, _, inner, result = self.solver.step(
+            terms, t0, t1, y, args, inner, True
+        )
+        y1 = self.exact_flow(prepared, time, y, args)
+        return y1, error, dict(y0=y0, y1=y1), (inner, prepared), result
+
+
+class Damped(AbstractSplitting):
+    r"""Any solver of this package with friction, $\mathrm{d}p = \ldots - \gamma p\,
+    \mathrm{d}t$.
+
+    $$p \gets e^{-\gamma h / 2} p, \qquad (p, q) \gets \text{a step of the solver}, \qquad
+      p \gets e^{-\gamma h / 2} p$$
+
+    The terms are those without friction, and keep their structure: separable solvers take
+    them. The step of the solver covers the whole time of the step.
+
+    For one constant $\gamma$ a step is conformally symplectic: with its Jacobian $S'$,
+    $S'^\top J S' = e^{-\gamma h} J$. It is explicit if the solver is. Weak order the
+    smaller of 2 and that of the solver; strong order the smaller of 1 and that of the
+    solver; order 2 without noise.
+
+    The friction acts on the canonical momentum $p$. In a magnetic field that is not the
+    kinetic one: there friction on $p - A(q)$ is a term of its own.
+
+    With noise in the forces and $\sigma^2 = 2 \gamma T$ this is Langevin dynamics at the
+    temperature $T$. For constant noise [`diffrax_symplectic.BAOAB`][] has far less bias.
+
+    **Source:** splitting of [Strang (1968)](https://doi.org/10.1137/0705041).
+    """
+
+    solver: diffrax.AbstractSolver
+    gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
+    _faults: tuple[str | None, ...] = eqx.field(static=True, init=False, repr=False)
+
+    def __post_init__(self):
+        self._faults = matrix_faults(self.gamma)
+
+    choose: ClassVar[str] = "Friction: collisions, damping, thermostats."
+    advice: ClassVar[str] = (
+        "Other solvers take friction as a term: `diffrax.MultiTerm(terms, "
+        "diffrax.ODETerm(friction))`."
+    )
+
+    def prepare(
+        self,
+        terms: PyTree[diffrax.AbstractTerm],
+        time: RealScalarLike,
+        y0: Y,
+        args: Args,
+    ) -> list[Modes | None]:
+        """The modes of the friction."""
+        del time, args
+        _check_has_momentum(terms)
+        return friction_modes(self.gamma, self._faults, y0[0])
+
+    def exact_flow(
+        self, prepared: list[Modes | None], time: RealScalarLike, y: Y, args: Args
+    ) -> Y:
+        p, q = y
+        return apply_friction(self.gamma, prepared, time, (decay, p)), q
+
+
+def _check_has_momentum(terms: PyTree[diffrax.AbstractTerm]) -> None:
+    """Raises a `ValueError` unless the first half of the state is a canonical momentum."""
+    is_lifted = lambda x: isinstance(x, Lifted)
+    if any(map(is_lifted, jtu.tree_leaves(terms, is_leaf=is_lifted))):
+        raise ValueError(
+            "`Damped` is friction on a canonical momentum. Half of the state of "
+            "`spin_terms` or `wave_terms` is none: to damp it would make spins shorter. "
+            "For damped spins pass `damping=` to `spin_terms`."
+        )
+    if not any(map(is_hamiltonian, split_terms(terms)[0])):
+        raise ValueError(
+            "`Damped` is friction on the momentum p of a state `(p, q)`, which plain terms "
+            "(`ODETerm`, `ControlTerm`) do not tell from other states, such as (position, "
+            "velocity). Construct the terms with `hamiltonian_terms`, or write the "
+            "friction into the drift and take a solver without `Damped`."
+        )
+
+
+Damped.__init__.__doc__ = f"""**Arguments:**
+
+- `solver`: a solver of this package.
+- `gamma`: {GAMMA}
+
+**Raises:** a `ValueError` if `gamma` is known to be negative, not finite or no such matrix,
+    if it does not fit `p` (in the solve), or for a solver of another package.
+"""
+
+
+def _checked(flow: Any) -> Any:
+    check_takes("flow", flow, "time", "y", "args")
+    return flow
+
+
+class LinearFlow(AbstractSplitting):
+    r"""Any solver of this package for $H_0 = L + R$, with the exact flow of $L$ around a
+    step for the rest $R$.
+
+    $$y \gets \varphi_L(\tfrac h2)\, y, \qquad y \gets \text{a step of the solver for } R
+      \text{ and the noises}, \qquad y \gets \varphi_L(\tfrac h2)\, y$$
+
+    It is for systems whose fast parts are linear, $L = \frac12 y \cdot A y$: waves on a
+    lattice, the bonds of a molecule. Their frequencies then do not limit the step, and no
+    mode is slowed down. The error is of the size of the commutators of $L$ with the rest.
+
+    The terms are those of the rest, and of all noises. What is left is often simple. If
+    $R$ and all $H_k$ depend on $q$ alone, `LinearFlow(StormerVerlet(), flow)` is explicit.
+
+    Symplectic if the solver is. Weak order the smaller of 2 and that of the solver; strong
+    order the smaller of 1 and that of the solver; order 2 without noise.
+
+    !!! warning
+
+        Where $\omega h$ of a mode is close to a multiple of $\pi$, the splitting is in
+        resonance: a part of the rest that acts on this mode makes it grow, over a band of
+        steps whose width is of the size of that part. Halve the step and see.
+
+    **Source:** splitting of [Strang (1968)](https://doi.org/10.1137/0705041); impulse
+    methods of [Grubmüller, Heller, Windemuth and Schulten
+    (1991)](https://doi.org/10.1080/08927029108022142).
+    """
+
+    solver: diffrax.AbstractSolver
+    flow: Callable[[RealScalarLike, Y, Args], Y] = eqx.field(converter=_checked)
+
+    choose: ClassVar[str] = (
+        "Fast linear waves on lattices and bonds of molecules, which it moves exactly."
+    )
+
+    def prepare(
+        self,
+        terms: PyTree[diffrax.AbstractTerm],
+        time: RealScalarLike,
+        y0: Y,
+        args: Args,
+    ) -> Any:
+        """A zero that every step reads: reading it raises the error of a flow that is not
+        symplectic."""
+        del terms
+        time = jnp.asarray(time)
+        flow = lambda y: self.exact_flow(0, time, y, args)
+        return eqx.error_if(jnp.zeros_like(time), ~_is_symplectic(flow, y0), _MESSAGE)
+
+    def exact_flow(self, prepared: Any, time: RealScalarLike, y: Y, args: Args) -> Y:
+        y1 = self.flow(time + prepared, y, args)
+        shape = lambda x: jax.eval_shape(lambda: x)
+        if not eqx.tree_equal(shape(y1), shape(y)):
+            raise ValueError(
+                "`flow(time, y, args)` must return a pair like the state, "
+                f"{eqx.tree_pformat(y)}; got {eqx.tree_pformat(y1)}."
+            )
+        return y1
+
+
+_MESSAGE = (
+    "`flow` of `LinearFlow` is not symplectic: its derivative changes the form dp ^ dq. "
+    "Pass the exact flow of a Hamiltonian, `flow(time, (p, q), args)`."
+)
+
+
+def _is_symplectic(flow: Callable[[Y], Y], y: Y) -> Bool[Array, ""]:
+    """Whether the derivative of `flow` at `y` keeps the symplectic form of two random
+    vectors."""
+    flat, unravel = jfu.ravel_pytree(y)
+    vectors = [unravel(jr.normal(jr.key(i), flat.shape, flat.dtype)) for i in (0, 1)]
+    moved = [jax.jvp(flow, (y,), (v,))[1] for v in vectors]
+    dot = lambda a, b: sum(map(jnp.vdot, jtu.tree_leaves(a), jtu.tree_leaves(b)))
+    form = lambda a, b: dot(a[0], b[1]) - dot(a[1], b[0])
+    size = jnp.sqrt(dot(moved[0], moved[0]) * dot(moved[1], moved[1]))
+    defect = jnp.abs(form(*moved) - form(*vectors))
+    # Rounding errors grow with the number of operations. What is wrong is wrong by far.
+    return defect <= jnp.finfo(flat.dtype).eps ** 0.5 * size
+
+
+LinearFlow.__init__.__doc__ = """**Arguments:**
+
+- `solver`: a solver of this package.
+- `flow`: `flow(time, y, args)`, the state after `time` (which may be negative) from the
+    state `y` by the Hamiltonian that is split off, for `y = (p, q)`. Any function or
+    Module: of Fourier transforms for a lattice, of eigenvectors made once for a molecule.
+
+**Raises:** a `ValueError` if `flow` is no such function, for a solver of another package,
+    and while the solve is traced if `flow` returns another structure or shape; an error
+    when run if it is not symplectic at the start.
+"""

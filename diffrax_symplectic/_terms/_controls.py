@@ -1,0 +1,218 @@
+"""The random variables of a step: drawn from the paths of the terms, with what they drive;
+or given, for quadrature over their values."""
+
+import functools as ft
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, cast, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._brownian import (
+    AbstractLaw,
+    AbstractWrappedPath,
+    FixedStepBrownianPath,
+    GivenPath,
+    Increment,
+    increment_struct,
+    laws_of,
+    PlateauBrownianPath,
+    TruncatedBrownianPath,
+    VARIABLES,
+    WeakBrownianPath,
+)
+from .._compat import direction, materialize, ω
+from .._custom_types import Args, RealScalarLike
+from ._vector_fields import (
+    apply,
+    apply_brackets,
+    apply_bridge,
+    bridge,
+    brownian_paths,
+    replace_paths,
+)
+
+
+class StepVariables(NamedTuple):
+    """The random variables of a step, all of them independent.
+
+    - `laws`: the law of each, for a step of size 1.
+    - `terms_with`: takes their values, in units of the root of the step size, to terms with
+        the increment that they make in place of the path.
+    """
+
+    laws: tuple[AbstractLaw, ...]
+    terms_with: Callable[[Float[Array, " n"]], PyTree[diffrax.AbstractTerm]]
+
+
+def step_variables(terms: PyTree[diffrax.AbstractTerm], h) -> StepVariables:
+    """Of a step of size `h`, for `terms` with one Brownian path."""
+    path, laws = _the_path(terms)
+    shape = increment_struct(path)
+    flat, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, shape))
+
+    def terms_with(values):
+        dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), shape)
+        scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(flat.dtype)
+        sets = map(unravel, scaled.reshape(-1, flat.size))
+        increment = cast(Any, path.levy_area)(dt=dt, **dict(zip(laws, sets)))
+        make = jtu.Partial(_constant, increment)
+        given = GivenPath(make=make, levy_area=type(increment))
+        return replace_paths(terms, lambda _: given)
+
+    each = tuple(law for law in laws.values() for _ in range(flat.size))
+    return StepVariables(each, terms_with)
+
+
+def outcomes(
+    laws: Sequence[AbstractLaw], nodes: int
+) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, " K"]]:
+    """All values of variables with these laws, and their probabilities or the weights of a
+    quadrature."""
+    scalars = [law.outcomes(nodes) for law in laws]
+    values = np.array([*itertools.product(*[values for values, _ in scalars])])
+    weights = np.array([*itertools.product(*[weights for _, weights in scalars])])
+    return values, np.prod(weights, axis=1)
+
+
+def _constant(
+    increment: diffrax.AbstractBrownianIncrement, t0, t1, use_levy: bool
+) -> Increment:
+    """The same increment over every step."""
+    del t0, t1
+    return increment if use_levy else increment.W
+
+
+def _the_path(terms) -> tuple[diffrax.AbstractBrownianPath, Mapping[str, AbstractLaw]]:
+    paths = brownian_paths(terms)
+    laws = laws_of(paths[0]) if len(paths) == 1 else None
+    if laws is None:
+        raise ValueError(
+            "`terms` must hold exactly one Brownian path, a `WeakBrownianPath`, whose "
+            "outcomes can be enumerated, or a Gaussian one, whose increments are "
+            "integrated over, with `levy_area=BrownianIncrement`, `SpaceTimeLevyArea` or "
+            "`SpaceTimeTimeLevyArea`, also within a `PlateauBrownianPath`; got "
+            f"{[_named(path) for path in paths]}."
+        )
+    return paths[0], laws
+
+
+def _named(path: diffrax.AbstractBrownianPath) -> str:
+    return f"{type(path).__name__} with {getattr(path.levy_area, '__name__', '?')}"
+
+
+def controls(
+    noise: tuple, names: list[str], t0, t1, solver: str, optional: tuple[str, ...] = ()
+) -> dict[str, list]:
+    """The random variables of the step from `t0` to `t1`, for each noise term; those of
+    `optional` if all increments hold them."""
+    t1 = _within_resolution(noise, t0, t1)
+    drawn = ft.partial(_drawn, noise, t0, t1, use_levy=names != ["W"])
+    # What costs less to compute again than to keep is not kept.
+    cheap = all(map(_is_cheap, brownian_paths(noise)))
+    increments = drawn() if cheap else materialize(drawn)
+    if names == ["W"]:
+        return {"W": increments}
+    # The variables of which the increments hold most are looked for first: the advice for
+    # these is right for the others, too.
+    held = lambda name: all(getattr(i, name, None) is not None for i in increments)
+    for name in sorted(names, key=lambda x: [*VARIABLES, x].index(x)):
+        if not held(name):
+            variable = VARIABLES.get(name)
+            advice = f"increments with the attribute `{name}`"
+            raise ValueError(
+                f"`{solver}` needs {variable.advice if variable else advice}."
+            )
+    return {
+        name: [
+            _in_time(term, name, getattr(i, name)) for term, i in zip(noise, increments)
+        ]
+        for name in [*names, *filter(held, optional)]
+    }
+
+
+def _in_time(term: diffrax.AbstractTerm, name: str, x: PyTree[Array]) -> PyTree[Array]:
+    """Backward in time Diffrax changes the sign of all random variables. Those that stay
+    the same get it back."""
+    even = name in VARIABLES and VARIABLES[name].even
+    return (direction(term) * x**ω).ω if even else x
+
+
+def _drawn(noise: tuple, t0, t1, use_levy: bool) -> list:
+    if use_levy:
+        return [term.contr(t0, t1, use_levy=True) for term in noise]
+    return [term.contr(t0, t1) for term in noise]
+
+
+def _within_resolution(noise: tuple, t0, t1) -> RealScalarLike:
+    """`t1`, with an error when run if a tree does not resolve the step."""
+    h = jnp.abs(t1 - t0)
+    for path in map(_innermost, brownian_paths(noise)):
+        if isinstance(path, diffrax.VirtualBrownianTree):
+            # The tree keeps its tolerance in units of its length.
+            tol = path.tol * (path.t1 - path.t0)
+            # A difference of two times that is a rounding error is not a step.
+            coarse = (h < 0.999 * tol) & (h > 1e-6 * tol)
+            t1 = eqx.error_if(
+                jnp.asarray(t1),
+                coarse,
+                "A step is shorter than `tol` of the `VirtualBrownianTree`, which only "
+                "interpolates there, so that the noise would be too small. Pass a smaller "
+                "`tol`, or for fixed steps `FixedStepBrownianPath(shape, key)`.",
+            )
+    return t1
+
+
+def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
+    while isinstance(path, AbstractWrappedPath):
+        path = path.path
+    return path
+
+
+def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
+    """Whether its random variables cost less to compute again than to keep."""
+    while isinstance(path, TruncatedBrownianPath | PlateauBrownianPath):
+        path = path.path
+    return isinstance(path, WeakBrownianPath | FixedStepBrownianPath)
+
+
+def noise_driven(
+    drift: tuple, noise: tuple, names: list[str], t0, t1, args: Args, solver: str
+) -> dict[str, jtu.Partial]:
+    """What drives noise stages over the step, for each random variable."""
+    draw = lambda names, *optional: controls(noise, names, t0, t1, solver, optional)
+    if "L" not in names:
+        drawn = draw(names)
+    else:
+        # It is computed from others.
+        own = [name for name in names if name != "L"]
+        drawn = draw([*dict.fromkeys(["W", "H", *own])], "K")
+    driven = {}
+    for name in names:
+        if name == "L":
+            along = drift_driven(drift, t0, t1, args)
+            bridges = bridge(t1 - t0, drawn["W"], drawn["H"], drawn.get("K"))
+            driven[name] = jtu.Partial(
+                apply_bridge, along, noise, bridges, t1 - t0, args
+            )
+        elif name != "A":
+            driven[name] = jtu.Partial(apply, noise, drawn[name], args)
+        elif len(noise) == 1:
+            driven[name] = jtu.Partial(apply_brackets, noise[0], drawn[name][0], args)
+        else:
+            raise ValueError(
+                f"`{solver}` needs all noises in one term, whose path samples the Lévy "
+                f"areas between them; got {len(noise)} noise terms."
+            )
+    return driven
+
+
+def drift_driven(drift: tuple, t0, t1, args: Args) -> jtu.Partial:
+    """What drives drift stages over the step."""
+    return jtu.Partial(apply, drift, [x.contr(t0, t1) for x in drift], args)
