@@ -19,26 +19,11 @@ from ._brownian import increment_struct
 from ._custom_types import Args, RealScalarLike, Y
 from ._solver import (
     AbstractSymplecticSolver,
-    AdditiveGauss,
     BAOAB,
     Damped,
     ImplicitMidpoint,
-    LevyAreaMidpoint,
-    NinomiyaVictoir,
-    PlateauGauss,
-    PlateauVerlet,
     Record,
-    SRKs1,
-    SRKs2,
-    SRKs3,
-    SRKs4,
-    SRKw1,
-    SRKw2,
-    SRKw3,
-    SRKw4,
-    SRKw5,
-    StormerVerlet,
-    StrangGauss,
+    SOLVERS,
     Want,
 )
 from ._tableau import Structure
@@ -56,26 +41,6 @@ from ._terms import (
 )
 
 
-# All solvers without friction, in the order of the documentation.
-SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
-    ImplicitMidpoint,
-    SRKs1,
-    SRKw1,
-    SRKw2,
-    StrangGauss,
-    NinomiyaVictoir,
-    PlateauGauss,
-    LevyAreaMidpoint,
-    SRKs2,
-    SRKs3,
-    SRKw3,
-    SRKw4,
-    StormerVerlet,
-    PlateauVerlet,
-    SRKs4,
-    SRKw5,
-    AdditiveGauss,
-)
 # What a higher order may cost. In steps of a twentieth, and with constants of one size, a
 # step of order 2 is worth twenty steps of order 1.
 _MOST_STAGE_VECTORS = 20
@@ -209,36 +174,33 @@ def suggest_solver(
         Damped(ImplicitMidpoint(), gamma).init(terms, t0, t0 + 1, y0, args)
 
     not_separable = separable_fault(drift, noise, t0, y0, args)
-    not_additive = additive_fault(noise, t0, y0, args)
-    has: dict[Structure, bool] = {
-        "any": True,
-        "separable": not_separable is None,
-        "additive": not_additive is None,
-        "constant": not_additive is None
-        and constant_fault(noise, t0, y0, args) is None,
-    }
-    has["separable and constant"] = has["separable"] and has["constant"]
+    structures: list[Structure] = ["any"]
+    if not_separable is None:
+        structures.append("separable")
+    if additive_fault(noise, t0, y0, args) is None:
+        structures.append("additive")
+        if constant_fault(noise, t0, y0, args) is None:
+            structures.append("constant")
+    kind = " and ".join(structures[1:])
+    if {"separable", "constant"} <= set(structures):
+        structures.append("separable and constant")
     m = number_of_noises(terms)
-    commute = (
-        m == 1 or has["separable"] or has["additive"] or commuting(noise, t0, y0, args)
-    )
-    fitting: list[Structure] = [name for name in has if has[name]]
-    solvers = ranked(want, fitting, commute, m, gamma)
+    commute = m == 1 or len(structures) > 1 or commuting(noise, t0, y0, args)
+    solvers = ranked(want, structures, commute, m, gamma)
     if len(noise) > 1 or not jtu.all_leaves(
         [increment_struct(brownian_paths(noise)[0])]
     ):
         # Lévy areas are those between the noises of one array.
         solvers = [s for s in solvers if "A" not in s.variables]
     found = [_suggestion(solver, want, terms, commute) for solver in solvers]
-    structure = [x for x in ("separable", "additive", "constant") if has[x]]
-    kind = (
-        " and ".join(structure) or f"general ({getattr(not_separable, 'reason', '')})"
-    )
+    if not kind:
+        kind = f"general ({getattr(not_separable, 'reason', '')})"
     noises = "one noise"
     if m > 1:
         noises = f"{m} noises that {'commute' if commute else 'do not commute'}"
-    beside = "" if gamma is None else " and friction"
-    system = f"For {want}. The system is {kind}, with {noises}{beside}."
+    if gamma is not None:
+        noises += " and friction"
+    system = f"For {want}. The system is {kind}, with {noises}."
     if not_separable is not None and not_separable.advice.startswith(FRICTION):
         system += (
             f" {FRICTION} Ask for a solver for the terms without it, with `gamma=`."

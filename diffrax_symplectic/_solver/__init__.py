@@ -37,3 +37,12 @@ from .splitting import (
     Damped as Damped,
     LinearFlow as LinearFlow,
 )
+
+
+# All solvers without friction, in the order of the documentation.
+SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
+    *(ImplicitMidpoint, SRKs1, SRKw1, SRKw2),
+    *(StrangGauss, NinomiyaVictoir, PlateauGauss, LevyAreaMidpoint),
+    *(SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet, PlateauVerlet),
+    *(SRKs4, SRKw5, AdditiveGauss),
+)

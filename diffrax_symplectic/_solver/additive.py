@@ -17,20 +17,6 @@ from .base import (
 )
 
 
-def _srks4(beta1: float, beta2: float, b: float, sign: int) -> AdditiveTableau:
-    rows = 1 + sign / np.sqrt(2), 1 - sign / np.sqrt(2)
-    B = np.array([[rows[0], 0], [rows[1] - b, b]])
-    weights = beta2 * np.array([1, -1])
-    # I_k0 / h = W / 2 + H, in the variables of Diffrax.
-    return AdditiveTableau(
-        alpha=[1 / 2, 1 / 2],
-        beta={"W": np.array([beta1, 1 - beta1]) + weights / 2, "H": weights},
-        A=[[1 / 4, 0], [1 / 2, 1 / 4]],
-        B={"W": B / 2, "H": B},
-        c1=[1 + (beta1 - 1) / beta2, 1 + beta1 / beta2],
-    )
-
-
 def _nonzero(value: Any) -> float:
     beta2 = real_number("beta2", value)
     if beta2 == 0:
@@ -99,7 +85,18 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> AdditiveTableau:
-        return _srks4(self.beta1, self.beta2, self.b, self.sign)
+        beta1, beta2, b = self.beta1, self.beta2, self.b
+        rows = 1 + self.sign / np.sqrt(2), 1 - self.sign / np.sqrt(2)
+        B = np.array([[rows[0], 0], [rows[1] - b, b]])
+        weights = beta2 * np.array([1, -1])
+        # I_k0 / h = W / 2 + H, in the variables of Diffrax.
+        return AdditiveTableau(
+            alpha=[1 / 2, 1 / 2],
+            beta={"W": np.array([beta1, 1 - beta1]) + weights / 2, "H": weights},
+            A=[[1 / 4, 0], [1 / 2, 1 / 4]],
+            B={"W": B / 2, "H": B},
+            c1=[1 + (beta1 - 1) / beta2, 1 + beta1 / beta2],
+        )
 
 
 SRKs4.__init__.__doc__ = f"""**Arguments:**
@@ -110,16 +107,6 @@ SRKs4.__init__.__doc__ = f"""**Arguments:**
 **Raises:** a `ValueError` if a parameter is not a finite real number, if `beta2` is 0, or
 if `sign` is not 1 or -1. While tracing, if the path has no space-time Lévy area.
 """
-
-
-_srkw5 = AdditiveTableau(
-    alpha=[1],
-    beta={"W": [1]},
-    A=[[1 / 2]],
-    B={"W": [[1 / 2]], "second": [[1 / 2]]},
-    c1=[0],
-    constant=True,
-)
 
 
 class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -152,7 +139,14 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose="Few digits at the cost of the midpoint rule.",
         suggested=("expectations",),
     )
-    tableau: ClassVar[AdditiveTableau] = _srkw5
+    tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
+        alpha=[1],
+        beta={"W": [1]},
+        A=[[1 / 2]],
+        B={"W": [[1 / 2]], "second": [[1 / 2]]},
+        c1=[0],
+        constant=True,
+    )
 
 
 SRKw5.__init__.__doc__ = ARGUMENTS
@@ -160,18 +154,6 @@ SRKw5.__init__.__doc__ = ARGUMENTS
 
 _r = np.sqrt(3.0)
 _s = np.sqrt(1 / 6)
-_additive_gauss = AdditiveTableau(
-    alpha=[1 / 2, 1 / 2],
-    beta={"W": [1]},
-    A=[[1 / 4, 1 / 4 - _r / 6], [1 / 4 + _r / 6, 1 / 4]],
-    B={
-        "W": [[1 / 2 - _r / 6], [1 / 2 + _r / 6]],
-        "second": [[_s], [0]],
-        "third": [[0], [_s]],
-    },
-    c1=[0],
-    constant=True,
-)
 
 
 class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -211,7 +193,18 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose="Two stage vectors, and by far the smallest errors for constant noise.",
         suggested=("expectations",),
     )
-    tableau: ClassVar[AdditiveTableau] = _additive_gauss
+    tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
+        alpha=[1 / 2, 1 / 2],
+        beta={"W": [1]},
+        A=[[1 / 4, 1 / 4 - _r / 6], [1 / 4 + _r / 6, 1 / 4]],
+        B={
+            "W": [[1 / 2 - _r / 6], [1 / 2 + _r / 6]],
+            "second": [[_s], [0]],
+            "third": [[0], [_s]],
+        },
+        c1=[0],
+        constant=True,
+    )
 
 
 AdditiveGauss.__init__.__doc__ = ARGUMENTS

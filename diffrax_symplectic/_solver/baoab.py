@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, PyTree
 
 from .._arguments import check_state
 from .._compat import direction, unwrapped
-from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from .._terms import apply, check_structure, controls, split_terms
 from ._friction import (
@@ -84,14 +84,7 @@ class BAOAB(AbstractSymplecticSolver):
     def order(self, terms):
         return 2
 
-    def init(
-        self,
-        terms: diffrax.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-    ) -> Any:
+    def init(self, terms, t0, t1, y0, args) -> Any:
         """The forces at the start, and the modes of the friction."""
         del t1
         check_state(y0, "BAOAB")
@@ -105,16 +98,7 @@ class BAOAB(AbstractSymplecticSolver):
         modes = friction_modes(self.gamma, self._faults, y0[0])
         return _rate(drift, t0, y0, args)[0], modes
 
-    def step(
-        self,
-        terms: diffrax.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-        solver_state: Any,
-        made_jump: BoolScalarLike,
-    ) -> tuple[Y, None, DenseInfo, Any, diffrax.RESULTS]:
+    def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         drift, noise = split_terms(terms)
         forces, modes = solver_state
         if made_jump is not False:
@@ -138,8 +122,7 @@ class BAOAB(AbstractSymplecticSolver):
         q = move(q, _rate(drift, t1, (p, q), args)[1])
         forces, _ = _rate(drift, t1, (p, q), args)
         y1 = move(p, forces), q
-        result = result_of(None, y1)
-        return y1, None, dict(y0=y0, y1=y1), (forces, modes), result
+        return y1, None, dict(y0=y0, y1=y1), (forces, modes), result_of(None, y1)
 
 
 def _rate(drift: tuple, t: RealScalarLike, y: Y, args: Args) -> Y:

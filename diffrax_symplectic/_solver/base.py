@@ -7,7 +7,7 @@ import dataclasses
 import functools as ft
 import math
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING, TypeAlias
+from typing import Any, cast, ClassVar, Literal, NamedTuple, TYPE_CHECKING, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -62,37 +62,15 @@ class Record(NamedTuple):
     noises: Noises = "any"
     suggested: tuple[Want, ...] = ()
 
+    def order(self, want: Want, commute: bool) -> int | float | None:
+        order = self.weak if want == "expectations" else self.strong
+        return order[0 if commute else 1] if isinstance(order, tuple) else order
+
     def weak_order(self, commute: bool) -> int:
-        return int(_order(self.weak, commute))
+        return cast(int, self.order("expectations", commute))
 
     def strong_order(self, commute: bool) -> float | None:
-        return None if self.strong is None else float(_order(self.strong, commute))
-
-    def order(self, want: Want, commute: bool) -> int | float | None:
-        of = {"expectations": self.weak_order, "paths": self.strong_order}
-        return of[want](commute)
-
-    def at_most(self, weak: int, strong: int) -> "Record":
-        """That of a splitting of these orders around the solver."""
-        return self._replace(
-            weak=_at_most(self.weak, weak), strong=_at_most(self.strong, strong)
-        )
-
-
-def _at_most(order: Order | None, most: int) -> Order | None:
-    if isinstance(order, tuple):
-        first, then = (min(x, most) for x in order)
-        return first if first == then else (first, then)
-    return None if order is None else min(order, most)
-
-
-def _order(order: Order, commute: bool) -> int | float:
-    return order[0 if commute else 1] if isinstance(order, tuple) else order
-
-
-def depends_on_noises(order: Order | None) -> bool:
-    """Whether an order is another one for noises that do not commute."""
-    return isinstance(order, tuple)
+        return self.order("paths", commute)
 
 
 # Of solvers with implicit stages: whether a step of this path was not solved. In a batch
@@ -128,18 +106,19 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
 
     def strong_order(self, terms: PyTree[diffrax.AbstractTerm]) -> float | None:
         """Order of convergence of paths."""
-        if self.record is None:
-            return None
-        alone = depends_on_noises(self.record.strong) and number_of_noises(terms) <= 1
-        return self.record.strong_order(alone)
+        return self._order_for("paths", terms)
 
     def weak_order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | None:
         """Order of convergence of expectations. Of several noises it is not known here
         whether they commute. `None` if the class does not say it."""
+        return cast(int | None, self._order_for("expectations", terms))
+
+    def _order_for(self, want: Want, terms) -> int | float | None:
         if self.record is None:
             return None
-        alone = depends_on_noises(self.record.weak) and number_of_noises(terms) <= 1
-        return self.record.weak_order(alone)
+        alone, several = (self.record.order(want, x) for x in (True, False))
+        # The terms are not looked at unless they matter.
+        return alone if alone == several or number_of_noises(terms) <= 1 else several
 
     def path(
         self,
@@ -317,6 +296,16 @@ ROOT_FINDER = """\
 ARGUMENTS = f"""**Arguments:**
 
 {ROOT_FINDER}"""
+
+
+def one_parameter(name: str) -> str:
+    """The documentation of the `__init__` of a solver with one free parameter."""
+    return f"""**Arguments:**
+
+- `{name}`: the free parameter, a Python float.
+{ROOT_FINDER}
+**Raises:** a `ValueError` if `{name}` is not a finite real number.
+"""
 
 
 def free_parameter(name: str, default: float) -> Any:

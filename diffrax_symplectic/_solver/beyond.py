@@ -30,15 +30,6 @@ _r = np.sqrt(3.0)
 _gauss = np.array([[1 / 4, 1 / 4 - _r / 6], [1 / 4 + _r / 6, 1 / 4]])
 _half = np.array([1 / 2, 1 / 2])
 
-_strang_gauss = GeneralTableau(
-    alpha=_half,
-    beta=_half,
-    A0=[[1 / 4, 0], [1 / 2, 1 / 4]],
-    B0=[[0, 0], [1 / 2, 1 / 2]],
-    A1=[[1 / 2, 0], [1 / 2, 0]],
-    B1=_gauss,
-)
-
 
 class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""A symplectic method of weak order 2 for one noise or noises that commute: the drift
@@ -74,7 +65,14 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         noises="commuting",
         suggested=("expectations",),
     )
-    tableau: ClassVar[GeneralTableau] = _strang_gauss
+    tableau: ClassVar[GeneralTableau] = GeneralTableau(
+        alpha=_half,
+        beta=_half,
+        A0=[[1 / 4, 0], [1 / 2, 1 / 4]],
+        B0=[[0, 0], [1 / 2, 1 / 2]],
+        A1=[[1 / 2, 0], [1 / 2, 0]],
+        B1=_gauss,
+    )
 
 
 StrangGauss.__init__.__doc__ = ARGUMENTS

@@ -11,12 +11,10 @@ from .base import (
     AbstractSymplecticRungeKutta,
     ARGUMENTS,
     free_parameter,
+    one_parameter,
     Record,
     ROOT_FINDER,
 )
-
-
-_half = np.array([[0.5]])
 
 
 class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -42,17 +40,11 @@ class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         suggested=("paths",),
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau.strong(
-        A=_half, B=_half, alpha=np.ones(1), beta=np.ones(1)
+        A=[[1 / 2]], B=[[1 / 2]], alpha=[1], beta=[1]
     )
 
 
 ImplicitMidpoint.__init__.__doc__ = ARGUMENTS
-
-
-def _srks1(a: float) -> GeneralTableau:
-    A = np.array([[a, 0.0], [2 * a, 0.5 - a]])
-    alpha = np.array([2 * a, 1 - 2 * a])
-    return GeneralTableau.strong(A=A, B=A, alpha=alpha, beta=alpha)
 
 
 class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -85,20 +77,12 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> GeneralTableau:
-        return _srks1(self.a)
+        a = self.a
+        A, alpha = [[a, 0], [2 * a, 1 / 2 - a]], [2 * a, 1 - 2 * a]
+        return GeneralTableau.strong(A=A, B=A, alpha=alpha, beta=alpha)
 
 
-SRKs1.__init__.__doc__ = f"""**Arguments:**
-
-- `a`: the free parameter, a Python float.
-{ROOT_FINDER}
-**Raises:** a `ValueError` if `a` is not a finite real number.
-"""
-
-
-def _srkw1(b: float) -> GeneralTableau:
-    one, half = np.ones(1), np.array([[0.5]])
-    return GeneralTableau(alpha=one, beta=one, A0=half, B0=[[b]], A1=[[1 - b]], B1=half)
+SRKs1.__init__.__doc__ = one_parameter("a")
 
 
 class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -135,43 +119,13 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> GeneralTableau:
-        return _srkw1(self.b)
+        b, half = self.b, [[1 / 2]]
+        return GeneralTableau(
+            alpha=[1], beta=[1], A0=half, B0=[[b]], A1=[[1 - b]], B1=half
+        )
 
 
-SRKw1.__init__.__doc__ = f"""**Arguments:**
-
-- `b`: the free parameter, a Python float.
-{ROOT_FINDER}
-**Raises:** a `ValueError` if `b` is not a finite real number.
-"""
-
-
-_r = np.sqrt(3.0)
-
-
-def _srkw2(rows: tuple[int, ...], conjugate: bool) -> GeneralTableau:
-    """The paper's tableau without its unused noise stages, with its drift stages in any
-    order."""
-    r = -_r if conjugate else _r
-    B0 = np.array(
-        [
-            [5 / 6 - r / 3, -1 / 2],
-            [-1 / 6 + r / 3, 1 / 2],
-            [1 / 2, 1 / 2],
-            [-1 / 6, 1 / 2],
-        ]
-    )
-    A1 = np.array([[-1 / 6 + r / 6, 1 / 3 - r / 6, 0, 1 / 3], [1 / 2, 0, 0, 0]])
-    order = np.array(rows) - 1
-    quarter = np.full(4, 1 / 4)
-    return GeneralTableau(
-        alpha=quarter,
-        beta=[1 / 2, 1 / 2],
-        A0=np.diag(quarter / 2) + np.tril(np.full((4, 4), 1 / 4), -1),
-        B0=B0[order],
-        A1=A1[:, order],
-        B1=[[1 / 4, 1 / 4 - r / 6], [1 / 4 + r / 6, 1 / 4]],
-    )
+SRKw1.__init__.__doc__ = one_parameter("b")
 
 
 def _rows(value: Any) -> tuple[int, ...]:
@@ -235,7 +189,27 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> GeneralTableau:
-        return _srkw2(self.rows, self.conjugate)
+        """The paper's tableau without its unused noise stages, with its drift stages in
+        any order."""
+        r = -np.sqrt(3) if self.conjugate else np.sqrt(3)
+        B0 = np.array(
+            [
+                [5 / 6 - r / 3, -1 / 2],
+                [-1 / 6 + r / 3, 1 / 2],
+                [1 / 2, 1 / 2],
+                [-1 / 6, 1 / 2],
+            ]
+        )
+        A1 = np.array([[-1 / 6 + r / 6, 1 / 3 - r / 6, 0, 1 / 3], [1 / 2, 0, 0, 0]])
+        order = np.array(self.rows) - 1
+        return GeneralTableau(
+            alpha=np.full(4, 1 / 4),
+            beta=[1 / 2, 1 / 2],
+            A0=np.eye(4) / 8 + np.tril(np.full((4, 4), 1 / 4), -1),
+            B0=B0[order],
+            A1=A1[:, order],
+            B1=[[1 / 4, 1 / 4 - r / 6], [1 / 4 + r / 6, 1 / 4]],
+        )
 
 
 SRKw2.__init__.__doc__ = f"""**Arguments:**

@@ -11,6 +11,7 @@ from .base import (
     AbstractSymplecticRungeKutta,
     ARGUMENTS,
     free_parameter,
+    one_parameter,
     Record,
     ROOT_FINDER,
 )
@@ -85,16 +86,6 @@ SRKw3.__init__.__doc__ = f"""**Arguments:**
 """
 
 
-def _srkw4(a21: float) -> SeparableTableau:
-    return SeparableTableau(
-        alpha=[1 / 2, 1 / 2],
-        beta=[1 / 2, 1 / 2],
-        A0=[[1 / 4, 1 / 2 - a21], [a21, 1 / 4]],
-        B0=[[1, 0], [0, 0]],
-        A1=[[-1 / 2, 1 / 2], [1 / 2, 1 / 2]],
-    )
-
-
 class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic methods SRKw4 of Wang, Hong and Xu, of weak order 2, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
@@ -129,15 +120,16 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> SeparableTableau:
-        return _srkw4(self.a21)
+        return SeparableTableau(
+            alpha=[1 / 2, 1 / 2],
+            beta=[1 / 2, 1 / 2],
+            A0=[[1 / 4, 1 / 2 - self.a21], [self.a21, 1 / 4]],
+            B0=[[1, 0], [0, 0]],
+            A1=[[-1 / 2, 1 / 2], [1 / 2, 1 / 2]],
+        )
 
 
-SRKw4.__init__.__doc__ = f"""**Arguments:**
-
-- `a21`: the free parameter, a Python float.
-{ROOT_FINDER}
-**Raises:** a `ValueError` if `a21` is not a finite real number.
-"""
+SRKw4.__init__.__doc__ = one_parameter("a21")
 
 
 class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -169,14 +161,6 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
 
 SRKs2.__init__.__doc__ = ARGUMENTS
-
-
-def _srks3(a: float) -> SeparableTableau:
-    alpha = np.array([2 * a, 1 - 2 * a])
-    A0 = [[a, 0], [2 * a, 1 / 2 - a]]
-    return SeparableTableau(
-        alpha=alpha, beta=[1], A0=A0, B0=np.zeros((2, 1)), A1=[alpha]
-    )
 
 
 class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -214,27 +198,12 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> SeparableTableau:
-        return _srks3(self.a)
+        a = self.a
+        A0, alpha = [[a, 0], [2 * a, 1 / 2 - a]], [2 * a, 1 - 2 * a]
+        return SeparableTableau(alpha=alpha, beta=[1], A0=A0, B0=[[0], [0]], A1=[alpha])
 
 
-SRKs3.__init__.__doc__ = f"""**Arguments:**
-
-- `a`: the free parameter, a Python float.
-{ROOT_FINDER}
-**Raises:** a `ValueError` if `a` is not a finite real number.
-"""
-
-
-_stormer_verlet = PartitionedTableau(
-    alpha=[1],
-    alpha_hat=[1 / 2, 1 / 2],
-    beta=[1],
-    # The momenta before and after the kick.
-    A=[[0], [1]],
-    A_hat=[[1 / 2, 0]],
-    B0=[[0], [1]],
-    A1=[[1 / 2, 0]],
-)
+SRKs3.__init__.__doc__ = one_parameter("a")
 
 
 class StormerVerlet(AbstractSymplecticRungeKutta):
@@ -273,7 +242,16 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
         ),
         suggested=("expectations", "paths"),
     )
-    tableau: ClassVar[PartitionedTableau] = _stormer_verlet
+    tableau: ClassVar[PartitionedTableau] = PartitionedTableau(
+        alpha=[1],
+        alpha_hat=[1 / 2, 1 / 2],
+        beta=[1],
+        # The momenta before and after the kick.
+        A=[[0], [1]],
+        A_hat=[[1 / 2, 0]],
+        B0=[[0], [1]],
+        A1=[[1 / 2, 0]],
+    )
 
 
 _kicks = {"W": [1 / 2, 0, 1 / 2], "H": [1, 0, -1], "C": [-1, 2, -1]}

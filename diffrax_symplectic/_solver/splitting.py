@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from .._arguments import check_pair, check_takes
 from .._compat import direction
-from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from .._terms import is_hamiltonian, Lifted, split_terms
 from ._friction import (
@@ -27,7 +27,7 @@ from ._friction import (
     matrix_faults,
     Modes,
 )
-from .base import AbstractSymplecticSolver, Record
+from .base import AbstractSymplecticSolver, Order, Record
 
 
 class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
@@ -67,7 +67,10 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
     @property
     def record(self) -> Record | None:  # pyright: ignore
         record = self.solver.record  # pyright: ignore
-        return record and record.at_most(self.weak, self.strong)
+        return record and record._replace(
+            weak=_at_most(record.weak, self.weak),
+            strong=_at_most(record.strong, self.strong),
+        )
 
     @property
     def structure(self) -> Structure:
@@ -94,29 +97,13 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
         order = self.solver.order(terms)
         return None if order is None else min(order, 2)
 
-    def init(
-        self,
-        terms: PyTree[diffrax.AbstractTerm],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-    ) -> Any:
+    def init(self, terms, t0, t1, y0, args) -> Any:
         """The state of the solver, and what all flows have in common."""
         check_pair(y0)
         prepared = self.prepare(terms, direction(terms) * (t1 - t0) / 2, y0, args)
         return self.solver.init(terms, t0, t1, y0, args), prepared
 
-    def step(
-        self,
-        terms: PyTree[diffrax.AbstractTerm],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-        solver_state: Any,
-        made_jump: BoolScalarLike,
-    ) -> tuple[Y, Y | None, DenseInfo, Any, diffrax.RESULTS]:
+    def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         del made_jump
         inner, prepared = solver_state
         # Diffrax makes `t1 - t0` positive in a solve backward in time, too.
@@ -129,6 +116,12 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
         )
         y1 = self.exact_flow(prepared, time, y, args)
         return y1, error, dict(y0=y0, y1=y1), (inner, prepared), result
+
+
+def _at_most(order: Order | None, most: int) -> Order | None:
+    if isinstance(order, tuple):
+        return min(order[0], most), min(order[1], most)
+    return None if order is None else min(order, most)
 
 
 class Damped(AbstractSplitting):
@@ -168,21 +161,13 @@ class Damped(AbstractSplitting):
         "diffrax.ODETerm(friction))`."
     )
 
-    def prepare(
-        self,
-        terms: PyTree[diffrax.AbstractTerm],
-        time: RealScalarLike,
-        y0: Y,
-        args: Args,
-    ) -> list[Modes | None]:
+    def prepare(self, terms, time, y0, args) -> list[Modes | None]:
         """The modes of the friction."""
         del time, args
         _check_has_momentum(terms)
         return friction_modes(self.gamma, self._faults, y0[0])
 
-    def exact_flow(
-        self, prepared: list[Modes | None], time: RealScalarLike, y: Y, args: Args
-    ) -> Y:
+    def exact_flow(self, prepared: list[Modes | None], time, y, args):
         p, q = y
         return apply_friction(self.gamma, prepared, time, (decay, p)), q
 
@@ -215,11 +200,6 @@ Damped.__init__.__doc__ = f"""**Arguments:**
 """
 
 
-def _checked(flow: Any) -> Any:
-    check_takes("flow", flow, "time", "y", "args")
-    return flow
-
-
 class LinearFlow(AbstractSplitting):
     r"""Any solver of this package for $H_0 = L + R$, with the exact flow of $L$ around a
     step for the rest $R$.
@@ -249,19 +229,16 @@ class LinearFlow(AbstractSplitting):
     """
 
     solver: diffrax.AbstractSolver
-    flow: Callable[[RealScalarLike, Y, Args], Y] = eqx.field(converter=_checked)
+    flow: Callable[[RealScalarLike, Y, Args], Y]
 
     choose: ClassVar[str] = (
         "Fast linear waves on lattices and bonds of molecules, which it moves exactly."
     )
 
-    def prepare(
-        self,
-        terms: PyTree[diffrax.AbstractTerm],
-        time: RealScalarLike,
-        y0: Y,
-        args: Args,
-    ) -> Any:
+    def __check_init__(self):
+        check_takes("flow", self.flow, "time", "y", "args")
+
+    def prepare(self, terms, time, y0, args):
         """A zero that every step reads: reading it raises the error of a flow that is not
         symplectic."""
         del terms
@@ -269,7 +246,7 @@ class LinearFlow(AbstractSplitting):
         flow = lambda y: self.exact_flow(0, time, y, args)
         return eqx.error_if(jnp.zeros_like(time), ~_is_symplectic(flow, y0), _MESSAGE)
 
-    def exact_flow(self, prepared: Any, time: RealScalarLike, y: Y, args: Args) -> Y:
+    def exact_flow(self, prepared, time, y, args):
         y1 = self.flow(time + prepared, y, args)
         shape = lambda x: jax.eval_shape(lambda: x)
         if not eqx.tree_equal(shape(y1), shape(y)):

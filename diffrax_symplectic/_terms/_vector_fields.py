@@ -1,5 +1,5 @@
-"""Diffrax terms as a step uses them: drift and noise apart, vector fields times controls, and
-the Lie brackets of vector fields."""
+"""Diffrax terms as a step uses them: drift and noise apart, vector fields times controls,
+and the Lie brackets of vector fields."""
 
 import functools as ft
 from collections.abc import Callable
