@@ -127,15 +127,15 @@ def drift_order(tableau: FlatTableau) -> int:
         each = [matrix @ elementary(branch) for branch in tree]
         return np.prod([np.ones(len(writes)), *each], axis=0)
 
+    def holds(tree: _Tree, part: str) -> bool:
+        of = writes == part
+        _, density = _size_and_density(tree)
+        return abs(flat.weights[of] @ elementary(tree)[of] - 1 / density) <= 1e-12
+
     for order in range(1, _HIGHEST_DRIFT_ORDER + 1):
-        for tree in _trees(order):
-            _, density = _size_and_density(tree)
-            for part in set(writes):
-                sum_at_root = (
-                    flat.weights[writes == part] @ elementary(tree)[writes == part]
-                )
-                if abs(sum_at_root - 1 / density) > 1e-12:
-                    return order - 1
+        conditions = itertools.product(_trees(order), set(writes))
+        if not all(itertools.starmap(holds, conditions)):
+            return order - 1
     return _HIGHEST_DRIFT_ORDER
 
 
@@ -179,7 +179,7 @@ def _(tableau: GeneralTableau) -> dict:
 @_strong.register
 def _(tableau: SeparableTableau) -> dict:
     # For the paper's further variables, which are not independent of `W`.
-    others = _others_vanish(tableau.beta, A1e=tableau.c1)
+    others = _others_vanish(tableau.beta, A1e=tableau.A1.sum(axis=1))
     return _strong(tableau.partitioned()) | others
 
 
@@ -257,18 +257,15 @@ def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
         **_others_vanish(tableau.beta, e=np.ones(len(A1))),
     }
     squares = sum(_variance(v) * (tableau.alpha_hat @ x**2) for v, x in B0e.items())
-    products = sum(
-        _variance(v) * (tableau.beta[v] @ A1 @ x)
-        for v, x in B0e.items()
-        if v in tableau.beta
-    )
+    both = tableau.beta.keys() & B0e.keys()
+    products = sum(_variance(v) * (tableau.beta[v] @ A1 @ B0e[v]) for v in both)
     second = {
-        "alpha.A_hat e - 1/2": tableau.alpha @ tableau.c_hat - 1 / 2,
+        "alpha.A_hat e - 1/2": tableau.alpha @ tableau.A_hat.sum(axis=1) - 1 / 2,
         "alpha_hat.Ae - 1/2": tableau.alpha_hat @ tableau.A.sum(axis=1) - 1 / 2,
         "(beta.e)(alpha_hat.B0e) - 1/2": be.sum() * (tableau.alpha_hat @ B0e["W"])
         - 1 / 2,
         "sum over variables: variance alpha_hat.(B0e)^2 - 1/2": squares - 1 / 2,
-        "(beta.e)(beta.A1e) - 1/2": be.sum() * (be @ tableau.c1) - 1 / 2,
+        "(beta.e)(beta.A1e) - 1/2": be.sum() * (be @ A1.sum(axis=1)) - 1 / 2,
         "sum over variables: variance beta.A1(B0e)": products,
     }
     return first, second
@@ -284,7 +281,9 @@ def _(tableau: SeparableTableau) -> tuple[dict, dict]:
     B0e = tableau.B0["W"].sum(axis=1)
     return first, second | {
         "beta.A1((B0e)^2)": tableau.beta["W"] @ tableau.A1 @ B0e**2,
-        **_others_vanish(tableau.beta, A1e=tableau.c1, **{"A1(B0e)": tableau.A1 @ B0e}),
+        **_others_vanish(
+            tableau.beta, A1e=tableau.A1.sum(axis=1), **{"A1(B0e)": tableau.A1 @ B0e}
+        ),
     }
 
 
@@ -297,7 +296,7 @@ def _(tableau: AdditiveTableau) -> tuple[dict, dict]:
         first[f"beta[{name}].e - {exact}"] = weights.sum() - exact
     squares = sum(_variance(name) * (al @ Be**2) for name, Be in B.items())
     second = {
-        "alpha.Ae - 1/2": al @ tableau.c0 - 1 / 2,
+        "alpha.Ae - 1/2": al @ tableau.A.sum(axis=1) - 1 / 2,
         "alpha.B[W]e - 1/2": al @ B["W"] - 1 / 2,
         "sum over variables: variance alpha.(Be)^2 - 1/2": squares - 1 / 2,
     }

@@ -105,13 +105,13 @@ def _coefficients(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def check_all(tableau, **shapes: tuple[int, ...]) -> None:
+def _check(tableau: AbstractTableau, **shapes: tuple[int, ...]) -> None:
     for name, shape in shapes.items():
         array = _coefficients(name, getattr(tableau, name), shape)
         object.__setattr__(tableau, name, array)
 
 
-def check_by_variable(tableau, **shapes: tuple[int, ...]) -> None:
+def _check_by_variable(tableau: AbstractTableau, **shapes: tuple[int, ...]) -> None:
     """Brings coefficients into the form of a dictionary over the random variables."""
     for name, shape in shapes.items():
         value = getattr(tableau, name)
@@ -122,17 +122,17 @@ def check_by_variable(tableau, **shapes: tuple[int, ...]) -> None:
         object.__setattr__(tableau, name, checked)
 
 
-def columns(
-    coefficients: Mapping[str, np.ndarray], variables: list[str], shape: tuple[int, ...]
-) -> np.ndarray:
-    """Those for all of `variables`, side by side; zero where there are none."""
-    zeros = np.zeros(shape)
-    return np.concatenate([coefficients.get(v, zeros) for v in variables], axis=-1)
-
-
-def variables_of(*coefficients: Mapping[str, np.ndarray]) -> list[str]:
-    """All random variables, in the order of their first appearance."""
-    return list(dict.fromkeys(name for c in coefficients for name in c))
+def _side_by_side(
+    *parts: tuple[Mapping[str, np.ndarray], tuple[int, ...]],
+) -> tuple[list[str], list[np.ndarray]]:
+    """For coefficients by random variable, each with their shape: all variables, in the
+    order of their first appearance; and each of the coefficients for all of these, side by
+    side, zero where there are none."""
+    names = list(dict.fromkeys(name for part, _ in parts for name in part))
+    return names, [
+        np.concatenate([part.get(name, np.zeros(shape)) for name in names], axis=-1)
+        for part, shape in parts
+    ]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -180,9 +180,7 @@ class GeneralTableau(AbstractTableau):
 
     def __post_init__(self):
         s, r = np.size(self.alpha), np.size(self.beta)
-        check_all(
-            self, alpha=(s,), beta=(r,), A0=(s, s), B0=(s, r), A1=(r, s), B1=(r, r)
-        )
+        _check(self, alpha=(s,), beta=(r,), A0=(s, s), B0=(s, r), A1=(r, s), B1=(r, r))
 
     @classmethod
     def strong(cls, A, B, alpha, beta) -> "GeneralTableau":
@@ -195,19 +193,9 @@ class GeneralTableau(AbstractTableau):
         """
         return cls(alpha=alpha, beta=beta, A0=A, B0=B, A1=A, B1=B)
 
-    @property
-    def c0(self) -> Float[np.ndarray, " s"]:
-        """Times of the drift stages, as fractions of the step."""
-        return self.A0.sum(axis=1)
-
-    @property
-    def c1(self) -> Float[np.ndarray, " r"]:
-        """Times of the noise stages, as fractions of the step."""
-        return self.A1.sum(axis=1)
-
     def flatten(self) -> FlatTableau:
-        stages = [Stage(("h",), float(c), "y", "y") for c in self.c0]
-        stages += [Stage(self.noise, float(c), "y", "y") for c in self.c1]
+        stages = [Stage(("h",), float(c), "y", "y") for c in self.A0.sum(axis=1)]
+        stages += [Stage(self.noise, float(c), "y", "y") for c in self.A1.sum(axis=1)]
         return FlatTableau(
             stages=tuple(stages),
             matrix=np.block([[self.A0, self.B0], [self.A1, self.B1]]),
@@ -254,18 +242,8 @@ class SeparableTableau(AbstractTableau):
 
     def __post_init__(self):
         s, r = np.size(self.alpha), len(self.A1)
-        check_all(self, alpha=(s,), A0=(s, s), A1=(r, s))
-        check_by_variable(self, beta=(r,), B0=(s, r))
-
-    @property
-    def c0(self) -> Float[np.ndarray, " s"]:
-        """Times of the drift stages, as fractions of the step."""
-        return self.A0.sum(axis=1)
-
-    @property
-    def c1(self) -> Float[np.ndarray, " r"]:
-        """Times of the noise stages, as fractions of the step."""
-        return self.A1.sum(axis=1)
+        _check(self, alpha=(s,), A0=(s, s), A1=(r, s))
+        _check_by_variable(self, beta=(r,), B0=(s, r))
 
     def partitioned(self) -> "PartitionedTableau":
         """The same method with its coefficients for velocities written out."""
@@ -316,31 +294,22 @@ class PartitionedTableau(AbstractTableau):
 
     def __post_init__(self):
         s, v, r = np.size(self.alpha), np.size(self.alpha_hat), len(self.A1)
-        check_all(self, alpha=(s,), alpha_hat=(v,), A=(v, s), A_hat=(s, v), A1=(r, v))
-        check_by_variable(self, beta=(r,), B0=(v, r))
-
-    @property
-    def c_hat(self) -> Float[np.ndarray, " s"]:
-        """Times of the forces, as fractions of the step."""
-        return self.A_hat.sum(axis=1)
-
-    @property
-    def c1(self) -> Float[np.ndarray, " r"]:
-        """Times of the noise stages, as fractions of the step."""
-        return self.A1.sum(axis=1)
+        _check(self, alpha=(s,), alpha_hat=(v,), A=(v, s), A_hat=(s, v), A1=(r, v))
+        _check_by_variable(self, beta=(r,), B0=(v, r))
 
     def flatten(self) -> FlatTableau:
         s, v, r = len(self.alpha), len(self.alpha_hat), len(self.A1)
-        names = variables_of(self.B0, self.beta)
-        B0 = columns(self.B0, names, (v, r))
+        names, (B0, beta) = _side_by_side((self.B0, (v, r)), (self.beta, (r,)))
         A1 = np.concatenate([self.A1] * len(names))
         # Forces come first. Where either forces or velocities may be solved for, this makes
         # the forces the unknowns: they cost more to evaluate.
-        stages = [Stage(("h",), float(c), "q", "p") for c in self.c_hat]
+        stages = [Stage(("h",), float(c), "q", "p") for c in self.A_hat.sum(axis=1)]
         # Velocities do not depend on time, so that all of their stages may have the time 0.
         stages += [Stage(("h",), 0.0, "p", "q") for _ in range(v)]
         stages += [
-            Stage((name,), float(c), "q", "p") for name in names for c in self.c1
+            Stage((name,), float(c), "q", "p")
+            for name in names
+            for c in self.A1.sum(axis=1)
         ]
         zeros, n = np.zeros, len(A1)
         return FlatTableau(
@@ -352,9 +321,7 @@ class PartitionedTableau(AbstractTableau):
                     [zeros((n, s)), A1, zeros((n, n))],
                 ]
             ),
-            weights=np.concatenate(
-                [self.alpha, self.alpha_hat, columns(self.beta, names, (r,))]
-            ),
+            weights=np.concatenate([self.alpha, self.alpha_hat, beta]),
         )
 
 
@@ -393,27 +360,21 @@ class AdditiveTableau(AbstractTableau):
 
     def __post_init__(self):
         s, r = np.size(self.alpha), np.size(self.c1)
-        check_all(self, alpha=(s,), A=(s, s), c1=(r,))
-        check_by_variable(self, beta=(r,), B=(s, r))
+        _check(self, alpha=(s,), A=(s, s), c1=(r,))
+        _check_by_variable(self, beta=(r,), B=(s, r))
 
     @property
     def structure(self) -> Structure:
         return "constant" if self.constant else "additive"
 
-    @property
-    def c0(self) -> Float[np.ndarray, " s"]:
-        """Times of the drift stages, as fractions of the step."""
-        return self.A.sum(axis=1)
-
     def flatten(self) -> FlatTableau:
         s, r = len(self.alpha), len(self.c1)
-        variables = variables_of(self.B, self.beta)
-        B = columns(self.B, variables, (s, r))
-        stages = [Stage(("h",), float(c), "y", "y") for c in self.c0]
-        stages += [Stage((v,), float(c), "", "y") for v in variables for c in self.c1]
-        n = len(variables) * r
+        names, (B, beta) = _side_by_side((self.B, (s, r)), (self.beta, (r,)))
+        stages = [Stage(("h",), float(c), "y", "y") for c in self.A.sum(axis=1)]
+        stages += [Stage((v,), float(c), "", "y") for v in names for c in self.c1]
+        n = len(beta)
         return FlatTableau(
             stages=tuple(stages),
             matrix=np.block([[self.A, B], [np.zeros((n, s + n))]]),
-            weights=np.concatenate([self.alpha, columns(self.beta, variables, (r,))]),
+            weights=np.concatenate([self.alpha, beta]),
         )

@@ -44,37 +44,22 @@ def check_structure(
             f"{get_args(Structure)}; got {structure!r}."
         )
     if structure in ("separable", "separable and constant"):
-        check_separable(drift, noise, t0, y0, args, solver)
+        check_pair(y0)
+        needs = "H0 = V(p) + U(t, q) and noise Hamiltonians H_k = U_k(t, q)"
+        _refuse(solver, needs, separable_fault(drift, noise, t0, y0, args))
     if structure in ("additive", "constant", "separable and constant"):
-        constant = structure != "additive"
-        check_additive(noise, t0, y0, args, solver, constant)
-
-
-def check_separable(
-    drift: tuple, noise: tuple, t0: RealScalarLike, y0: Y, args: Args, solver: str
-) -> None:
-    """Raises a `ValueError`, while tracing, unless `H0 = V(p) + U(t, q)` and the noise
-    Hamiltonians are functions of `t` and `q` alone."""
-    check_pair(y0)
-    needs = "needs H0 = V(p) + U(t, q) and noise Hamiltonians H_k = U_k(t, q)"
-    _refuse(solver, needs, separable_fault(drift, noise, t0, y0, args))
-
-
-def check_additive(
-    noise: tuple, t0: RealScalarLike, y0: Y, args: Args, solver: str, constant: bool
-) -> None:
-    """Raises a `ValueError`, while tracing, unless the noise does not depend on the state
-    nor, if it has to be `constant`, on time."""
-    needs = "needs additive noise, H_k = -sigma_k(t).q + gamma_k(t).p"
-    _refuse(solver, needs, additive_fault(noise, t0, y0, args))
-    if constant:
-        needs = "needs additive noise that is constant in time"
-        _refuse(solver, needs, constant_fault(noise, t0, y0, args))
+        needs = "additive noise, H_k = -sigma_k(t).q + gamma_k(t).p"
+        _refuse(solver, needs, additive_fault(noise, t0, y0, args))
+        if structure != "additive":
+            needs = "additive noise that is constant in time"
+            _refuse(solver, needs, constant_fault(noise, t0, y0, args))
 
 
 def _refuse(solver: str, needs: str, fault: Fault | None) -> None:
     if fault is not None:
-        raise ValueError(f"`{solver}` {needs}, but {fault.reason}. {fault.advice}")
+        raise ValueError(
+            f"`{solver}` needs {needs}, but {fault.reason}. {fault.advice}"
+        )
 
 
 def separable_fault(
@@ -85,41 +70,39 @@ def separable_fault(
     if fault := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", fault)
     drift_flows = [
-        (x, _flow(x, t0, y0, args)) for x in _not_asserted(drift, "separable")
+        (is_hamiltonian(x) or len(drift) == 1, _flow(x, t0, y0, args))
+        for x in _not_asserted(drift, "separable")
     ]
     noise_flows = [_flow(x, t0, y0, args) for x in _not_asserted(noise, "separable")]
-    fault = _separable_fault(drift_flows, noise_flows, len(drift), p=0)
-    if fault is not None and not _separable_fault(
-        drift_flows, noise_flows, len(drift), 1
-    ):
+    fault = _fault_with_momenta(0, drift_flows, noise_flows)
+    if fault is not None and not _fault_with_momenta(1, drift_flows, noise_flows):
         return Fault(f"{fault.reason}. {_WRONG_WAY_ROUND}", fault.advice)
     return fault
 
 
-def _separable_fault(
-    drift: list, noise: list[DataFlow], num_drifts: int, p: int
+def _fault_with_momenta(
+    p: int, drift: list[tuple[bool, DataFlow]], noise: list[DataFlow]
 ) -> Fault | None:
-    """The fault of the terms not asserted to be separable, if the momenta are the first
-    half of the state, `p = 0`, or the second one, `p = 1`."""
+    """The fault, if the momenta are the first half of the state, `p = 0`, or the second
+    one, `p = 1`. With each drift term: whether it is that of `H0`."""
     q = 1 - p
     dp, dq = (lambda out: out[p]), (lambda out: out[q])
     of_p, of_q = (lambda t, y, control: y[p]), (lambda t, y, control: y[q])
-    for term, flow in drift:
-        from_H0 = is_hamiltonian(term) or num_drifts == 1
+    for of_H0, flow in drift:
         for part, of, derivative, rate in (
             (dp, of_p, "dH0/dq depends on p", "dp/dt depend on p"),
             (dq, of_q, "dH0/dp depends on q", "dq/dt depend on q"),
             (dq, _of_t, "dH0/dp depends on t", "dq/dt depend on t"),
         ):
             if not flow.independent(of, part):
-                if from_H0:
+                if of_H0:
                     return Fault(derivative, _advice("separable"))
                 beside = f"a drift term beside that of H0 makes {rate}"
                 return Fault(beside, f"{FRICTION} {_advice('separable')}")
     for flow in noise:
         # The change of q is linear in the increment: if it does not depend on the
         # increment, it is zero.
-        if not flow.independent(_of_control, dq):
+        if not flow.independent(lambda t, y, control: control, dq):
             return Fault("dH_k/dp is not zero", _advice("separable"))
         if not flow.independent(of_p, dp):
             return Fault("dH_k/dq depends on p", _advice("separable"))
@@ -176,10 +159,6 @@ def _of_t(t, y, control):
     return t
 
 
-def _of_control(t, y, control):
-    return control
-
-
 def _not_asserted(terms: tuple, structure: str) -> list:
     return [term for term in terms if asserted_structure(term) != structure]
 
@@ -220,9 +199,7 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
         law(k, jnp.shape(x), jnp.result_type(x))
         for k, x in zip(jr.split(key, len(leaves)), leaves)
     )
-    largest = lambda y: jfu.ravel_pytree(
-        jtu.tree_map(jnp.max, jtu.tree_map(jnp.abs, y))
-    )
+    largest = lambda y: jnp.max(jnp.abs(jfu.ravel_pytree(y)[0]))
 
     @eqx.filter_jit
     @jax.vmap
@@ -232,7 +209,7 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
         first = jax.jvp(along(z), (y,), (along(x)(y),))[1]
         second = jax.jvp(along(x), (y,), (along(z)(y),))[1]
         bracket = (first**ω - second**ω).ω
-        return jnp.max(largest(first)[0]), jnp.max(largest(bracket)[0])
+        return largest(first), largest(bracket)
 
     try:
         with jax.disable_jit(False):
