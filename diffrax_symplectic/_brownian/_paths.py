@@ -95,8 +95,7 @@ class WeakBrownianPath(AbstractPathWithLaws):
         `second` and `two_point` do not change what `W` is for the same `key`.
 
         **Raises:** a `ValueError` if `key` is not a random key, if a dtype is not real
-        floating-point, or if `order` is
-        neither 2 nor 3.
+        floating-point, or if `order` is neither 2 nor 3.
         """
         if order not in (2, 3):
             raise ValueError(f"`order` must be 2 or 3; got {order!r}.")

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from .._custom_types import BM, RealScalarLike
+from .._arguments import whole_number
+from .._custom_types import BM
 from ._random import (
     AbstractLaw,
     check_key,
@@ -74,13 +75,8 @@ class TruncatedBrownianPath(AbstractWrappedPath):
                 "`TruncatedBrownianPath` wraps a Brownian path, for example "
                 f"`FixedStepBrownianPath(shape, key)`; got {type(path).__name__}."
             )
-        if isinstance(k, bool) or not isinstance(k, int) or k < 1:
-            raise ValueError(
-                "`k` must be an integer, 1 or larger (2 suits methods of strong order "
-                f"1); got {k!r}."
-            )
         self.path = path
-        self.k = k
+        self.k = whole_number("k", k)
 
     @property
     def levy_area(self):
@@ -92,17 +88,13 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         increment = self.path.evaluate(t0, t1, use_levy=use_levy)
-        return self._clip(increment, t1 - t0)
+        return self.changed(increment, None, t1 - t0, use_levy)
 
     def num_own_words(self, use_levy: bool) -> int:
-        del use_levy
         return 0
 
     def changed(self, increment, own_words, h, use_levy) -> Increment:
         del own_words, use_levy
-        return self._clip(increment, h)
-
-    def _clip(self, increment: Increment, h: RealScalarLike) -> Increment:
         h = jnp.abs(h)
         h = eqx.error_if(
             h,

@@ -198,7 +198,8 @@ def _position(
     return add("y") if stages[0].writes == "y" else (add("p"), add("q"))
 
 
-# Whether stage equations were not solved; `None` where there are none.
+# Whether the stage equations of a step, or of one before it, were not solved; `None` where
+# there are none.
 Unsolved: TypeAlias = Bool[ArrayLike, ""] | None
 
 

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import ArrayLike, Bool, PRNGKeyArray, PyTree
+from jaxtyping import PRNGKeyArray, PyTree
 
 from .._arguments import check_state
 from .._brownian import path_of, VARIABLES
@@ -30,7 +30,7 @@ from .._terms import (
     number_of_noises,
     split_terms,
 )
-from ._step import result_of, Step, take_step
+from ._step import result_of, Step, take_step, Unsolved
 
 
 if TYPE_CHECKING:
@@ -73,9 +73,8 @@ class Record(NamedTuple):
         return self.order("paths", commute)
 
 
-# Of solvers with implicit stages: whether a step of this path was not solved. In a batch
-# Diffrax goes on to step paths that have ended, and drops what comes out.
-SolverState: TypeAlias = Bool[ArrayLike, ""] | None
+# In a batch Diffrax goes on to step paths that have ended, and drops what comes out.
+SolverState: TypeAlias = Unsolved
 
 
 class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):

@@ -1,7 +1,6 @@
 """The random variables of a step: drawn from the paths of the terms, with what they drive;
 or given, for quadrature over their values."""
 
-import functools as ft
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast, NamedTuple
@@ -81,9 +80,7 @@ def outcomes(
     return values, np.prod(weights, axis=1)
 
 
-def _constant(
-    increment: diffrax.AbstractBrownianIncrement, t0, t1, use_levy: bool
-) -> Increment:
+def _constant(increment, t0, t1, use_levy: bool) -> Increment:
     """The same increment over every step."""
     del t0, t1
     return increment if use_levy else increment.W
@@ -113,7 +110,8 @@ def controls(
     """The random variables of the step from `t0` to `t1`, for each noise term; those of
     `optional` if all increments hold them."""
     t1 = _within_resolution(noise, t0, t1)
-    drawn = ft.partial(_drawn, noise, t0, t1, use_levy=names != ["W"])
+    options = {} if names == ["W"] else {"use_levy": True}
+    drawn = lambda: [term.contr(t0, t1, **options) for term in noise]
     # What costs less to compute again than to keep is not kept.
     cheap = all(map(_is_cheap, brownian_paths(noise)))
     increments = drawn() if cheap else materialize(drawn)
@@ -142,12 +140,6 @@ def _in_time(term: diffrax.AbstractTerm, name: str, x: PyTree[Array]) -> PyTree[
     the same get it back."""
     even = name in VARIABLES and VARIABLES[name].even
     return (direction(term) * x**ω).ω if even else x
-
-
-def _drawn(noise: tuple, t0, t1, use_levy: bool) -> list:
-    if use_levy:
-        return [term.contr(t0, t1, use_levy=True) for term in noise]
-    return [term.contr(t0, t1) for term in noise]
 
 
 def _within_resolution(noise: tuple, t0, t1) -> RealScalarLike:
@@ -186,13 +178,12 @@ def noise_driven(
     drift: tuple, noise: tuple, names: list[str], t0, t1, args: Args, solver: str
 ) -> dict[str, jtu.Partial]:
     """What drives noise stages over the step, for each random variable."""
-    draw = lambda names, *optional: controls(noise, names, t0, t1, solver, optional)
-    if "L" not in names:
-        drawn = draw(names)
-    else:
+    needed, optional = names, ()
+    if "L" in names:
         # It is computed from others.
         own = [name for name in names if name != "L"]
-        drawn = draw([*dict.fromkeys(["W", "H", *own])], "K")
+        needed, optional = [*dict.fromkeys(["W", "H", *own])], ("K",)
+    drawn = controls(noise, needed, t0, t1, solver, optional)
     driven = {}
     for name in names:
         if name == "L":

@@ -119,19 +119,6 @@ class IndexedNoise(eqx.Module):
     it can be used in place of a function. [`diffrax_symplectic.NinomiyaVictoir`][] follows
     the flow of one noise after another, and evaluates only the noise of that flow. With a
     function that returns all `m` it has to evaluate all of them for each of the `m` flows.
-
-    !!! example
-
-        ```python
-        import diffrax_symplectic as ds
-
-
-        def H(k, t, p, q, args):  # each site is pushed by a noise of its own
-            return -args[k] * q[k]
-
-
-        noise = ds.IndexedNoise(H, 1000)
-        ```
     """
 
     H: Callable[[IntScalarLike, RealScalarLike, PyTree, PyTree, Args], Array]

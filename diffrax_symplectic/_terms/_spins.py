@@ -64,35 +64,6 @@ def spin_terms(
     spin, `noise = lambda t, s, args: sigma * s` with $\sigma^2 = 2 \alpha T$. Then the
     density $e^{-H_0 / T}$ is stationary, for spins of any lengths.
 
-    !!! example
-
-        ```python
-        import diffrax
-        import diffrax_symplectic as ds
-        import jax.numpy as jnp
-        import jax.random as jr
-
-        inertia = jnp.array([0.8, 0.6, 0.2])
-
-        def H0(t, s, args):  # a free rigid body
-            return jnp.sum(s**2 / inertia) / 2
-
-        def noise(t, s, args):  # turned at random about each of its axes
-            return args * s
-
-        path = ds.WeakBrownianPath(shape=(3,), key=jr.key(0), two_point=True)
-        sol = diffrax.diffeqsolve(
-            ds.spin_terms(H0, noise, path),
-            ds.NinomiyaVictoir(),
-            t0=0,
-            t1=1,
-            dt0=0.1,
-            y0=ds.to_spinors(jnp.array([0.6, 0.0, 0.8])),
-            args=0.3,
-        )
-        s = ds.from_spinors(sol.ys)
-        ```
-
     **Arguments:**
 
     - `H0`: `H0(t, s, args)`, a scalar, for `s` of shape `(..., 3)`: the sum over all

@@ -71,18 +71,16 @@ def _is_path(x) -> bool:
 @eqx.filter_jit
 def apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> Y:
     """The sum over terms of vector field times control."""
-    total = tree_sum([_change(x, t, y, args, c) for x, c in zip(terms, controls)])
-    _check_value(total, y)
-    return total
-
-
-def _change(term: diffrax.AbstractTerm, t, y: Y, args: Args, control: PyTree) -> Y:
-    if isinstance(unwrapped(term), diffrax.ControlTerm):
+    parts = []
+    for term, control in zip(terms, controls):
         _check_product(term, t, y, args, control)
-    return term.vf_prod(t, y, args, control)
+        parts.append(term.vf_prod(t, y, args, control))
+    return _checked_sum(parts, y)
 
 
 def _check_product(term, t, y: Y, args: Args, control: PyTree) -> None:
+    if not isinstance(unwrapped(term), diffrax.ControlTerm):
+        return
     if jtu.tree_structure(y) == jtu.tree_structure(control):
         return
     matrix = eqx.filter_eval_shape(term.vf, t, y, args)
@@ -119,9 +117,7 @@ def apply_one(
         only = jnp.where(here, increment, 0)
         parts.append(_along_one(term, struct, local, only, args, t, y))
         before += m
-    total = tree_sum(parts)
-    _check_value(total, y)
-    return total
+    return _checked_sum(parts, y)
 
 
 def _along_one(term, struct, number, increment, args: Args, t, y: Y) -> Y:
@@ -218,11 +214,8 @@ def apply_bridge(
     t = jnp.asarray(t, jnp.result_type(h))
 
     def along_noise(t, y, x):
-        values = [term.vf_prod(t, y, args, c) for term, c in zip(noise, unravel(x))]
-        total = values[0]
-        for value in values[1:]:
-            total = (total**ω + value**ω).ω
-        return total
+        controls = zip(noise, unravel(x))
+        return tree_sum([term.vf_prod(t, y, args, c) for term, c in controls])
 
     def bracket(x, field, t, y, speed):
         """The bracket of the noise along `x` with `field`, which moves time by `speed`; and
@@ -245,7 +238,9 @@ def apply_bridge(
     return jtu.tree_map(combine, doubles, singles)
 
 
-def _check_value(value: PyTree[Array], y: PyTree[Array]) -> None:
+def _checked_sum(parts: list[Y], y: Y) -> Y:
+    """The sum, which must have the dtypes and shapes of the state."""
+
     def check(v, x):
         if jnp.result_type(v) != jnp.result_type(x) or jnp.shape(v) != jnp.shape(x):
             raise ValueError(
@@ -256,7 +251,9 @@ def _check_value(value: PyTree[Array], y: PyTree[Array]) -> None:
                 "no wider one."
             )
 
-    jtu.tree_map(check, value, y)
+    total = tree_sum(parts)
+    jtu.tree_map(check, total, y)
+    return total
 
 
 def number_of_noises(terms: diffrax.AbstractTerm) -> int:
@@ -264,9 +261,3 @@ def number_of_noises(terms: diffrax.AbstractTerm) -> int:
     _, noise = split_terms(terms)
     struct = eqx.filter_eval_shape(lambda: [term.contr(0.0, 1.0) for term in noise])
     return sum(int(np.prod(s.shape)) for s in jtu.tree_leaves(struct))
-
-
-def strong_order_if_commutative(terms: diffrax.AbstractTerm) -> float:
-    """1 for one noise, which commutes with itself, and 1/2 for several, of which it is not
-    known whether they commute."""
-    return 1.0 if number_of_noises(terms) <= 1 else 0.5

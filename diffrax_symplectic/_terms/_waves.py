@@ -38,33 +38,6 @@ def wave_terms(
     $|\psi|^2$, is a quadratic invariant. All solvers for general systems keep it to
     rounding.
 
-    !!! example
-
-        ```python
-        import diffrax
-        import diffrax_symplectic as ds
-        import jax.numpy as jnp
-        import jax.random as jr
-
-        def H0(t, psi, args):  # a qubit: <psi| sigma_x |psi>
-            return 2 * jnp.real(jnp.conj(psi[0]) * psi[1])
-
-        def noise(t, psi, args):  # that dephases: args <psi| sigma_z |psi>
-            return args * (jnp.abs(psi[0]) ** 2 - jnp.abs(psi[1]) ** 2)
-
-        path = ds.WeakBrownianPath(shape=(), key=jr.key(0))
-        sol = diffrax.diffeqsolve(
-            ds.wave_terms(H0, noise, path),
-            ds.StrangGauss(),
-            t0=0,
-            t1=1,
-            dt0=0.1,
-            y0=ds.to_pair(jnp.array([1.0 + 0.0j, 0.0])),
-            args=0.3,
-        )
-        psi = ds.from_pair(sol.ys)
-        ```
-
     **Arguments:**
 
     - `H0`: `H0(t, psi, args)`, a real scalar. `psi` has the structure, shapes and complex
