@@ -53,7 +53,7 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         start, end = (jnp.zeros_like(t0), t0) if t1 is None else (t0, t1)
         ends = jnp.asarray(start), jnp.asarray(end)
         start, end = cast(tuple[Array, Array], nondifferentiable(ends, name="t"))
-        return self.draw(start, end, use_levy)
+        return _drawn(self, start, end, use_levy)
 
     @abc.abstractmethod
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
@@ -79,6 +79,12 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         use_levy: bool = False,
     ) -> Increment:
         """What `evaluate` returns for the step from `t0` to `t1`, from given words."""
+
+
+# Diffrax traces a step three times, and `jax.vmap` what is in a loop more often.
+@eqx.filter_jit
+def _drawn(path: AbstractStepwisePath, t0: Array, t1: Array, use_levy: bool):
+    return path.draw(t0, t1, use_levy)
 
 
 class AbstractPathWithLaws(AbstractStepwisePath):

@@ -35,6 +35,25 @@ def _(size, in_batched, flag):
     return any_of_batch(jnp.any(flag, 0) if in_batched[0] else flag), False
 
 
+@jax.custom_batching.custom_vmap
+def batched_together(values: _T, others: PyTree = ()) -> _T:
+    """The same `values`, all of them batched if one is, or one of the `others`. JAX batches
+    what is in a loop anew whenever one more of its values turns out to be batched."""
+    del others
+    return values
+
+
+@batched_together.def_vmap
+def _(size, in_batched, values, others):
+    values = _spread(size, in_batched[0], values)
+    return batched_together(values, others), jtu.tree_map(lambda _: True, values)
+
+
+def _spread(size: int, in_batched: PyTree[bool], values: _T) -> _T:
+    spread = lambda b, x: x if b else jnp.broadcast_to(x, (size, *jnp.shape(x)))
+    return jtu.tree_map(spread, in_batched, values)
+
+
 def where_pending(
     fn: Callable[[PyTree, _T], _T], pending: Bool[Array, ""], args: PyTree, value: _T
 ) -> _T:
@@ -60,29 +79,33 @@ def where_pending(
     def serve(pending, leaves, value):
         return lax.cond(pending, call, lambda _, value: value, leaves, value)
 
-    serve.def_vmap(ft.partial(_serve_batch, call))
+    # Traced once, for what is in a loop is batched several times.
+    serve_batch = jax.jit(ft.partial(_serve_batch, call), static_argnums=0)
+
+    @serve.def_vmap
+    def _(size, in_batched, pending, leaves, value):
+        pending = _spread(size, in_batched[0], pending)
+        value = _spread(size, in_batched[2], value)
+        value = serve_batch(tuple(in_batched[1]), pending, leaves, value)
+        return value, jtu.tree_map(lambda _: True, value)
+
     return serve(pending, [*leaves, *traced.consts], value)
 
 
-def _serve_batch(call, size, in_batched, pending, leaves, value):
-    """The rule by which JAX serves a batch."""
-    spread = lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape))
-    pending, value = jtu.tree_map(
-        spread, (pending, value), (in_batched[0], in_batched[2])
-    )
+def _serve_batch(call, in_batched: tuple[bool, ...], pending, leaves, value):
+    size = len(pending)
     part = -(-size // _PARTS)
-    axes = [0 if b else None for b in in_batched[1]]
+    axes = [0 if b else None for b in in_batched]
 
     def body(carry):
         pending, value = carry
         # Where fewer paths are left, the numbers beyond the batch are dropped in the end.
         which = jnp.nonzero(pending, size=part, fill_value=size)[0]
         gather = lambda x: x.at[which].get(mode="clip")
-        few = [gather(x) if b else x for x, b in zip(leaves, in_batched[1])]
+        few = [gather(x) if b else x for x, b in zip(leaves, in_batched)]
         new = jax.vmap(call, (axes, 0))(few, jtu.tree_map(gather, value))
         scatter = lambda x, y: x.at[which].set(y, mode="drop")
         return scatter(pending, False), jtu.tree_map(scatter, value, new)
 
     some_pending = lambda carry: jnp.any(carry[0])
-    _, value = lax.while_loop(some_pending, body, (pending, value))
-    return value, jtu.tree_map(lambda _: True, value)
+    return lax.while_loop(some_pending, body, (pending, value))[1]

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 
 from .._compat import ω
 from . import _continuation
-from ._batch import where_pending
+from ._batch import batched_together, where_pending
 from ._sweeps import Found, sweep, sweep_blocks
 from ._tolerance import Tolerance
 
@@ -106,7 +106,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
             found = sweep(self, equations.image, begin, equations.scale)
         use = lambda k: jnp.where(found.solved | found.near, k, 0)
         k = jfu.ravel_pytree(jtu.tree_map(use, found.y))[0]
-        return State(y, _continuation.begin(k, found.solved))
+        return batched_together(State(y, _continuation.begin(k, found.solved)))
 
     def step(
         self,

@@ -209,9 +209,8 @@ def _by_chords(
     size, _ = look.size(diff, moved)
 
     def advance(rounds: _Rounds) -> _Rounds:
-        before = k = rounds.y
-        for _ in range(_CHORDS):
-            before, k = k, k + M @ (image(k) - k)
+        chord = lambda k: k + M @ (image(k) - k)
+        before, k = _fixed_point(chord, rounds.y, _CHORDS)
         return look.at(k, k - before, rounds.size, jnp.sqrt, rounds.step + _CHORDS)
 
     first = _Rounds(moved, size, begin.solved, begin.near, ~begin.solved, 0)

@@ -17,7 +17,12 @@ from jaxtyping import Array, ArrayLike, Bool, PyTree
 from .._compat import materialize, unsolved_step_result, ω
 from .._custom_types import RealScalarLike, Y
 from .._plan import Block, Plan
-from .._root_finder import all_finite, differentiate, PicardNewton
+from .._root_finder import (
+    all_finite,
+    batched_together,
+    differentiate,
+    PicardNewton,
+)
 from .._tableau import FlatTableau, Stage
 from .._terms import tree_sum
 
@@ -259,6 +264,16 @@ def _implicit_step(
             "`BestSoFarRootFinder` returns an iterate from before the last correction. It "
             "does not solve the stage equations. Pass the root finder within it."
         )
+    step = stages.step
+    t0, h, y0, lost = batched_together(
+        (step.t0, step.h, stages.y0, lost), eqx.filter(step.driven, eqx.is_array)
+    )
+    stages = Stages(stages.plan, step._replace(t0=t0, h=h), y0)
+    return _solved(stages, lost, finder, max_steps)
+
+
+@eqx.filter_jit
+def _solved(stages: Stages, lost: Bool[Array, ""], finder: Any, max_steps: int):
     guess = [stages.zero_of(block) for block in stages.plan.blocks]
     if not isinstance(finder, PicardNewton):
         # That one begins with this.
