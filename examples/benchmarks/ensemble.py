@@ -40,7 +40,7 @@ def main() -> None:
         f"oscillator, {PATHS:,} paths of {STEPS} steps through `monte_carlo`. Made by "
         "`python -m examples.benchmarks.ensemble`.",
         "",
-        "| seconds | ns per path and step | cores busy | peak memory | E(q^2) |",
+        "| seconds | ns per path and step | cores busy | peak memory | $\\mathbb E q^2$ |",
         "|---" * 5 + "|",
         f"| {seconds:.1f} | {seconds / PATHS / STEPS * 1e9:.1f} | "
         f"{busy / seconds / (os.cpu_count() or 1):.0%} | {peak:.2f} GiB | "

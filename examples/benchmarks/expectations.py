@@ -240,8 +240,9 @@ def draw(measured: dict[str, dict]) -> None:
 
 def table(measured: dict[str, dict]) -> str:
     head = (
-        "| model | solver | coarsest steps, levels | functions | paths | total error | "
-        "standard error | seconds |\n" + "|---" * 8 + "|"
+        "| model | functions | standard error | total error | seconds |\n"
+        + "|---" * 5
+        + "|"
     )
     lines = []
     for name, m in measured.items():
@@ -250,9 +251,8 @@ def table(measured: dict[str, dict]) -> str:
         kind = kind.replace("grid points along an axis: ", "grid, ")
         error = "" if np.isnan(m["exact"]) else f"{m['error']:.1e}"
         cells = (
-            f"{name}, t = {c.t1:g}", f"`{type(c.solver).__name__}`",
-            f"{c.steps}, {c.levels}", kind, f"{c.paths:,}", error,
-            f"{m['std_error']:.1e}", f"{m['seconds']:.2g}",
+            f"{name}, $t = {c.t1:g}$", kind, f"{m['std_error']:.1e}", error,
+            f"{m['seconds']:.2g}",
         )  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join([head, *lines])

@@ -41,13 +41,13 @@ def main() -> None:
     lines = [
         "# Tolerance of the root finder",
         "",
-        f"{machine()}. `ImplicitMidpoint(root_finder=PicardNewton(rtol=...))` on d coupled "
-        f"oscillators with one noise; float64, h = {H}, {STEPS:,} steps, {PATHS} paths. "
-        "The default tolerance, `None`, is two units in the last place. The drift is the "
-        "root mean square of the relative change of $|p|^2 + |q|^2$, which the exact "
-        "solution keeps. Made by `python -m examples.benchmarks.tolerance`.",
+        f"{machine()}. `ImplicitMidpoint(root_finder=PicardNewton(rtol=...))` on $d$ "
+        f"coupled oscillators with one noise; float64, $h = {H}$, {STEPS:,} steps, {PATHS} "
+        "paths. The default, `None`, is two units in the last place. The drift is the root "
+        "mean square of the relative change of $|p|^2 + |q|^2$, which the exact solution "
+        "keeps. Made by `python -m examples.benchmarks.tolerance`.",
         "",
-        "| d | rtol | time, ratio to default | drift |",
+        "| $d$ | `rtol` | time, ratio to default | drift |",
         "|---|---|---|---|",
     ]
     for d in (16, 256):

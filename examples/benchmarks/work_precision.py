@@ -273,8 +273,9 @@ def draw(axes, title: str, results: dict[str, tuple[float, Errors]]) -> list[str
             seconds[clear], e.errors[clear], 3 * e.std_errors[clear], label=name,
             color=f"C{i}", ls=style, marker="o", ms=3, lw=1, capsize=2,
         )  # fmt: skip
-        bar = f" ± {e.std_errors[SHOWN]:.0e}" if e.std_errors[SHOWN] > 0 else ""
-        cells = name, f"{e.errors[SHOWN]:.1e}{bar}", f"{seconds[SHOWN] * 1e6:.2f}"
+        error, own = e.errors[SHOWN], e.std_errors[SHOWN]
+        bar = f" ± {own:.0e}" if own > error / 10 else ""
+        cells = name, f"{error:.1e}{bar}", f"{seconds[SHOWN] * 1e6:.2f}"
         lines.append("| " + " | ".join(cells) + " |")
     axes.set(xscale="log", yscale="log", xlabel="CPU seconds per path", title=title)
     axes.legend(fontsize=7)
@@ -288,13 +289,13 @@ def main() -> None:
         "",
         f"{machine()}. Made by `python -m examples.benchmarks.work_precision`.",
         "",
-        "Weak errors are exact on linear models and come from quasi-Monte Carlo elsewhere.",
+        "Weak errors are exact on linear models and come from `ArrayRQMC` elsewhere.",
         "Strong errors are root mean squares over 500 Brownian paths (`compare_solvers`).",
         "Bars are three standard errors; points within their bar of zero are not drawn.",
-        "Times are of one core, in batches of 10,000 paths. All solvers were timed in",
-        "turn, so that ratios are more certain than times. Tables have weak errors at",
-        f"h = 1/{1 / HS[SHOWN]:g} and strong ones at h = 1/{1 / HS[1 + SHOWN]:g}, "
-        "and microseconds per path.",
+        "Times are of one core, in batches of 10,000 paths. Tables have weak errors at",
+        f"$h = 1/{1 / HS[SHOWN]:g}$ and strong ones at $h = 1/{1 / HS[1 + SHOWN]:g}$, "
+        "with a standard error",
+        "where it is more than a tenth of the error, and microseconds per path.",
         "",
         "![Errors against CPU seconds per path](work_precision.png)",
     ]

@@ -112,9 +112,9 @@ def section(page: Page) -> str:
     axes[1].set(xscale="log", xlabel="h", title="share of orbits that left, s = 0.003")
     for ax in axes:
         ax.legend(fontsize=7)
-    picture = page.picture(figure, "henon_heiles", "Henon-Heiles system")
+    picture = page.picture(figure, "henon_heiles", "Hénon–Heiles system")
     plt.close(figure)
-    shown = table(("solver", *[f"h = {h:g}" for h in hs]), rows)
+    shown = table(("solver", *[f"$h = {h:g}$" for h in hs]), rows)
     return fill(
         __file__, table=shown, picture=picture, t1=f"{t1:g}", paths=f"{paths:,}"
     )
