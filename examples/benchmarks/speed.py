@@ -203,8 +203,8 @@ def main() -> None:
         "",
         f"Nanoseconds per path and step. {machine()}. float64, $h = {H}$, {STEPS} steps, "
         "best of 7 runs. Gaussian increments come from `FixedStepBrownianPath`, but for "
-        "the first row. Compilation is the processor time to trace and compile the solve of "
-        "1,000 paths. Made by `python -m examples.benchmarks.speed`.",
+        "the first row. Compilation is the processor time to trace and compile the solve "
+        "of 1,000 paths. Made by `python -m examples.benchmarks.speed`.",
     ]
     for title, (make_terms, solvers) in MODELS.items():
         times, preparation = measure(make_terms, solvers)
