@@ -102,7 +102,7 @@ def section(page: Page) -> str:
                 else:
                     balances.append(str(r.balance))
                     left.append(r.left)
-        rows.append((name, *balances))
+        rows.append((name, *balances[:: max(1, len(hs) - 1)]))
         y, error = np.array(left).T
         axes[1].errorbar(
             hs, y, 3 * error, marker="o", ms=3, lw=1, capsize=2, label=name
@@ -114,7 +114,9 @@ def section(page: Page) -> str:
         ax.legend(fontsize=7)
     picture = page.picture(figure, "henon_heiles", "Hénon–Heiles system")
     plt.close(figure)
-    shown = table(("solver", *[f"$h = {h:g}$" for h in hs]), rows)
+    shown = table(
+        ("solver", *[f"$h = {h:g}$" for h in hs[:: max(1, len(hs) - 1)]]), rows
+    )
     return fill(
         __file__, table=shown, picture=picture, t1=f"{t1:g}", paths=f"{paths:,}"
     )

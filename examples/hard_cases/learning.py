@@ -197,7 +197,7 @@ def section(page: Page) -> str:
         ax.legend(fontsize=7)
     picture = page.picture(figure, "learning", "A learned potential")
     plt.close(figure)
-    header = "solver", "$h$", "$s$", "error of the force", "drift"
+    header = "solver", "$h$", "$s$", "force error", "energy gain"
     return fill(
         __file__, table=table(header, rows), picture=picture, pairs=f"{pairs:,}", s=S,
         spacing=SPACING, error=f"{S / np.sqrt(4 * pairs):.4f}", iterations=iterations,
