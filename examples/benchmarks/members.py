@@ -298,10 +298,11 @@ def main() -> None:
         "# Members of families",
         "",
         "The order conditions leave parameters free. The tables have the best member of a "
-        "family, the default and the paper's: errors relative to the row of 1.00, geometric "
-        "means over six problems, for two strengths of the noise. For weak families the error is the exact local one of all "
-        "first and second moments, at $h = 0.01$. For strong families it is the root mean "
-        "square of 400 paths at $t = 1$, with $h = 1/16$. Made by `python -m "
+        "family, the default and the paper's: errors relative to the row of 1.00, "
+        "geometric means over six problems, for two strengths of the noise. For weak "
+        "families the error is the exact local one of all first and second moments, at "
+        "$h = 0.01$. For strong families it is the root mean square of 400 paths at "
+        "$t = 1$, with $h = 1/16$. Made by `python -m "
         "examples.benchmarks.members`.",
         "",
     ]

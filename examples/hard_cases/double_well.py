@@ -10,7 +10,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 import diffrax_symplectic as ds
 
-from ..benchmarks._timing import ensemble as many, keys, machine, measure
+from ..benchmarks._timing import ensemble as many, keys, measure
 from ..stability._page import fill, Page, table
 from ._ensemble import areas, ensemble, gaussian, Mean, plateaus, truncated, weak
 from ._stationary import stationary_bias, Step
@@ -182,7 +182,7 @@ def temperatures(page: Page) -> dict[str, str]:
         ax.legend(fontsize=7)
     picture = page.picture(figure, "langevin", "Bias against cost")
     plt.close(figure)
-    return dict(thermal=shown, chart=picture, machine=machine())
+    return dict(thermal=shown, chart=picture)
 
 
 def section(page: Page) -> str:
