@@ -190,7 +190,7 @@ def section(page: Page) -> str:
     i, j = points - 2, points - 3
     few = [n for n, law in enumerate(LAWS) if law.label in SHOWN]
     shown = table(
-        ("step", *[LAWS[n].label for n in few]),
+        ("step", *[LAWS[n].label.replace("k = 2", "$k = 2$") for n in few]),
         [
             (name, *[f"{100 * r.failed[n, i, j]:.2f}" for n in few])
             for name, r in results.items()

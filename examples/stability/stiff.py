@@ -139,7 +139,7 @@ def limit(case: Case, omegas: np.ndarray) -> str:
     grows = radii > 1 + 1e-9
     if not grows.any():
         return "none"
-    return "every h" if grows[0] else f"{omegas[np.argmax(grows)]:.2f}"
+    return "every $h$" if grows[0] else f"{omegas[np.argmax(grows)]:.2f}"
 
 
 def section(page: Page) -> str:
