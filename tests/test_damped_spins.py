@@ -39,6 +39,33 @@ def test_solutions_push_forward_to_the_landau_lifshitz_equation():
         )
 
 
+def test_gilberts_form_is_the_same_equation_in_another_time():
+    s0, args = _problem(jr.key(0), 1, 3)
+    s, damping = s0 / jnp.linalg.norm(s0), 0.3
+    y = ds.to_spinors(s)
+    drift, _ = ds.spin_terms(H0, noise, weak_path(3), damping).terms
+    _, velocity = jax.jvp(ds.from_spinors, (y,), (drift.vf(0.4, y, args),))
+    velocity = velocity / (1 + damping**2)
+    turn = jnp.cross(s, jax.grad(H0, 1)(0.4, s, args))
+    expected = turn + damping * jnp.cross(s, velocity)
+    np.testing.assert_allclose(velocity, expected, atol=1e-14)
+
+
+def test_dampings_fit_lattices_of_spins_and_take_their_precision():
+    s = _problem(jr.key(0), 6, 3, jnp.float32)[0]
+    alpha = np.linspace(0.0, 1.0, 6)
+    args = _problem(jr.key(0), 6, 3, jnp.float32)[1]
+
+    def velocity(*lattice):
+        y = ds.to_spinors(s.reshape(*lattice, 3))
+        terms = ds.spin_terms(H0, noise, weak_path(3), alpha.reshape(lattice))
+        return terms.terms[0].vf(jnp.float32(0.4), y, args)
+
+    for flat, shaped in zip(velocity(6), velocity(2, 3)):
+        assert shaped.dtype == jnp.float32
+        np.testing.assert_array_equal(shaped.reshape(6, 2), flat)
+
+
 @pytest.mark.parametrize(
     "name, dtype, bound",
     [(name, jnp.float64, 1e-13) for name in SOLVERS]
@@ -193,9 +220,10 @@ def test_dampings_that_are_none_are_refused():
             ds.spin_terms(H0, noise, path, damping=wrong)  # pyright: ignore
     y0 = ds.to_spinors(jnp.ones((2, 3)))
     args = _problem(jr.key(0), 2, 3)[1]
-    terms = ds.spin_terms(H0, noise, path, damping=jnp.ones(3))
-    with pytest.raises(ValueError, match=r"one for each spin, of shape \(2,\)"):
-        terms.terms[0].vf(0.0, y0, args)
+    for shape in ((3,), (1,), (2, 1)):
+        terms = ds.spin_terms(H0, noise, path, damping=jnp.ones(shape))
+        with pytest.raises(ValueError, match=r"one for each spin, of shape \(2,\)"):
+            terms.terms[0].vf(0.0, y0, args)
     each = ds.spin_terms(lambda t, s, args: s, noise, path, damping=1.0)
     with pytest.raises(ValueError, match="`H0` must return a scalar"):
         each.terms[0].vf(0.0, y0, args)
