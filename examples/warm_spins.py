@@ -116,7 +116,6 @@ def main():
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
-    from matplotlib.ticker import NullFormatter
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6))
     fine = np.linspace(0.05, 3, 200)
@@ -127,7 +126,6 @@ def main():
     ):
         run = jax.jit(lambda T, what=what: sampled(what, T))
         means, errors = np.array([run(T) for T in Ts]).T
-        print(label, (means - langevin(1 / Ts)) / errors, errors, means, flush=True)
         left.errorbar(
             Ts, means, 3 * errors, fmt=f"C{i}" + "os"[i], ms=3 + 3 * i, lw=1, capsize=2,
             fillstyle="none", label=label,
@@ -137,9 +135,9 @@ def main():
     H, what = (lambda s: -s[2]), (lambda s: s[2:])
     for solver in (ds.ImplicitMidpoint(), ds.NinomiyaVictoir()):
         bias = stationary_bias(H, what, solver, hs, ALPHA, T, degree=5)[:, 0]
-        print(solver, bias, flush=True)
         right.loglog(hs, np.abs(bias), "o-", ms=3, lw=1, label=type(solver).__name__)
-    right.xaxis.set_minor_formatter(NullFormatter())
+    right.minorticks_off()
+    right.set_xticks(hs, map(str, hs))
     right.set(xlabel="h", title=f"bias of E s_z at T = {T}, without sampling")
     for ax in (left, right):
         ax.legend(fontsize=7)
