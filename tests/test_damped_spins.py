@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from examples import warm_spins
 
 from .problems import GENERAL, Given, local_weak_orders, slope, weak_path
 from .test_spins import _problem, H0, noise
@@ -37,6 +38,33 @@ def test_solutions_push_forward_to_the_landau_lifshitz_equation():
         np.testing.assert_allclose(
             power, -jnp.sum(rate * turn**2), rtol=1e-12, atol=1e-15
         )
+
+
+def test_gilberts_form_is_the_same_equation_in_another_time():
+    s0, args = _problem(jr.key(0), 1, 3)
+    s, damping = s0 / jnp.linalg.norm(s0), 0.3
+    y = ds.to_spinors(s)
+    drift, _ = ds.spin_terms(H0, noise, weak_path(3), damping).terms
+    _, velocity = jax.jvp(ds.from_spinors, (y,), (drift.vf(0.4, y, args),))
+    velocity = velocity / (1 + damping**2)
+    turn = jnp.cross(s, jax.grad(H0, 1)(0.4, s, args))
+    expected = turn + damping * jnp.cross(s, velocity)
+    np.testing.assert_allclose(velocity, expected, atol=1e-14)
+
+
+def test_dampings_fit_lattices_of_spins_and_take_their_precision():
+    s = _problem(jr.key(0), 6, 3, jnp.float32)[0]
+    alpha = np.linspace(0.0, 1.0, 6)
+    args = _problem(jr.key(0), 6, 3, jnp.float32)[1]
+
+    def velocity(*lattice):
+        y = ds.to_spinors(s.reshape(*lattice, 3))
+        terms = ds.spin_terms(H0, noise, weak_path(3), alpha.reshape(lattice))
+        return terms.terms[0].vf(jnp.float32(0.4), y, args)
+
+    for flat, shaped in zip(velocity(6), velocity(2, 3)):
+        assert shaped.dtype == jnp.float32
+        np.testing.assert_array_equal(shaped.reshape(6, 2), flat)
 
 
 @pytest.mark.parametrize(
@@ -80,70 +108,14 @@ def test_ninomiya_victoir_keeps_weak_order_two_with_damping():
     np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 
 
-def _magnet(t, s, args):
-    """One spin in a field, with an easy axis beside it."""
-    return -0.5 * s[2] - 0.4 * s[0] ** 2
-
-
-def _stationary_bias(solver, hs, alpha, T, degree=7):
-    """What is too much in the means of s_z and s_x^2 in the stationary law of the steps.
-
-    On the polynomials of the sphere up to `degree` (that is, its spherical harmonics),
-    made orthonormal in the density of Gibbs, a step is a matrix M of the means of
-    f_i(s0) f_j(s1). The moments c_j = E f_j of the stationary law solve c = c M, c_0 = 1.
-    """
-    n = 2 * degree + 4
-    z, weights = np.polynomial.legendre.leggauss(n)
-    phi = 2 * np.pi * np.arange(2 * n) / (2 * n)
-    z, phi = (x.ravel() for x in np.meshgrid(z, phi, indexing="ij"))
-    r = np.sqrt(1 - z**2)
-    s = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
-    weights = np.repeat(weights, 2 * n) * np.exp(
-        -np.array([_magnet(0, x, None) for x in s]) / T
-    )
-    weights /= np.sum(weights)
-
-    def powers(s):
-        w = s[0] + 1j * s[1]
-        values = [
-            part * s[2] ** k
-            for m in range(degree + 1)
-            for part in ([(w**m).real, (w**m).imag][: 1 + (m > 0)])
-            for k in range(degree - m + 1)
-        ]
-        return jnp.stack(values)
-
-    columns = np.sqrt(weights)[:, None] * np.asarray(jax.vmap(powers)(jnp.asarray(s)))
-    Q, R = np.linalg.qr(columns)
-    # The first polynomial is 1, and not -1.
-    Q, R = Q * np.sign(R[0, 0]), R * np.sign(R[0, 0])
-    sigma = np.sqrt(2 * alpha * T)
-    path = weak_path(3, two_point=True)
-    terms = ds.spin_terms(_magnet, lambda t, s, args: sigma * s, path, damping=alpha)
-
-    @jax.jit
-    def after(h):
-        fn = lambda y: powers(ds.from_spinors(y))
-        mean = lambda s: ds.step_expectation(
-            terms, solver, 0.0, h, ds.to_spinors(s), fn=fn
-        )
-        return jax.lax.map(mean, jnp.asarray(s), batch_size=16)
-
-    seen = Q.T @ (
-        np.sqrt(weights)[:, None] * np.stack([s[:, 2], s[:, 0] ** 2], axis=-1)
-    )
-    biases = []
-    for h in hs:
-        f1 = np.linalg.solve(R.T, np.asarray(after(h)).T).T
-        M = Q.T @ (np.sqrt(weights)[:, None] * f1)
-        c = np.linalg.solve((np.eye(len(M)) - M)[1:, 1:].T, M[0, 1:])
-        biases.append(c @ seen[1:])
-    return np.array(biases)
-
-
 def test_stationary_law_of_one_spin_is_that_of_gibbs_up_to_the_square_of_the_step():
+    # In a field, with an easy axis beside it.
+    H = lambda s: -0.5 * s[2] - 0.4 * s[0] ** 2
+    what = lambda s: jnp.stack([s[2], s[0] ** 2])
     hs = np.array([0.4, 0.2, 0.1])
-    bias = _stationary_bias(ds.NinomiyaVictoir(), hs, alpha=0.5, T=0.6)
+    bias = warm_spins.stationary_bias(
+        H, what, ds.NinomiyaVictoir(), hs, alpha=0.5, T=0.6
+    )
     assert np.max(np.abs(bias[-1])) <= 1e-3
     for column in bias.T:
         assert abs(slope(hs, column) - 2) <= 0.15
@@ -193,9 +165,10 @@ def test_dampings_that_are_none_are_refused():
             ds.spin_terms(H0, noise, path, damping=wrong)  # pyright: ignore
     y0 = ds.to_spinors(jnp.ones((2, 3)))
     args = _problem(jr.key(0), 2, 3)[1]
-    terms = ds.spin_terms(H0, noise, path, damping=jnp.ones(3))
-    with pytest.raises(ValueError, match=r"one for each spin, of shape \(2,\)"):
-        terms.terms[0].vf(0.0, y0, args)
+    for shape in ((3,), (1,), (2, 1)):
+        terms = ds.spin_terms(H0, noise, path, damping=jnp.ones(shape))
+        with pytest.raises(ValueError, match=r"one for each spin, of shape \(2,\)"):
+            terms.terms[0].vf(0.0, y0, args)
     each = ds.spin_terms(lambda t, s, args: s, noise, path, damping=1.0)
     with pytest.raises(ValueError, match="`H0` must return a scalar"):
         each.terms[0].vf(0.0, y0, args)

@@ -69,6 +69,21 @@ def test_amplitudes_of_pairs_give_them_back(dtype):
     jax.tree.map(lambda e, x: same(e, jnp.sum(jnp.abs(x) ** 2)), energy, psi)
 
 
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_real_amplitudes_have_no_momentum(dtype):
+    p, q = ds.to_pair(jnp.array([0.6, -0.8], dtype))
+    assert p.dtype == q.dtype == dtype
+    np.testing.assert_array_equal(p, 0)
+    np.testing.assert_allclose(q, np.sqrt(2) * np.array([0.6, -0.8], dtype))
+
+
+def test_what_are_no_pairs_of_real_arrays_is_refused():
+    x, psi = jnp.ones(2), _random(jr.key(0), (2,))
+    for wrong in (psi, (psi, psi), x, [x, x], (x, jnp.ones(3)), (x, {"a": x})):
+        with pytest.raises(ValueError, match=r"for complex amplitudes `y0=to_pair"):
+            ds.from_pair(wrong)  # pyright: ignore
+
+
 @pytest.mark.parametrize(
     "solver",
     [ds.ImplicitMidpoint(), ds.SRKw1(), ds.StrangGauss(), ds.NinomiyaVictoir()],
@@ -179,6 +194,8 @@ def test_hamiltonians_that_return_complex_numbers_are_refused():
         ds.wave_terms(wrong, each, path).terms[1].vf(0.0, y0, None)
     with pytest.raises(ValueError, match=r"called as `H0\(t, psi, args\)`"):
         ds.wave_terms(lambda t, p, q, args: 0.0, each, path)
+    with pytest.raises(ValueError, match=r"called as `noise\(t, psi, args\)`"):
+        ds.wave_terms(wrong, lambda t, p, q, args: 0.0, path)
     with pytest.raises(ValueError, match="use a solver for the general structure"):
         terms = ds.wave_terms(_lattice, _site_noise, path)
         ds.StormerVerlet().init(terms, 0.0, 0.1, y0, 1.0)
