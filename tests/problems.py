@@ -301,8 +301,10 @@ def local_weak_orders(terms, solver, y0, args, hs, order: int, **kwargs) -> list
         kw = dict(fn=values_of_a_step, order=order) | kwargs
         return ds.weak_order_defect(terms, solver, 0.1, 0.1 + h, y0, args, **kw)
 
-    over_steps = jax.vmap(defect, in_axes=(0, None, None))
-    defects = jax.jit(jax.vmap(over_steps, in_axes=(None, 0, 0)))(hs, y0, args)
+    # A defect is a mean over many outcomes: to batch these once more would take longer to
+    # compile.
+    each = lambda x: jax.lax.map(lambda h: defect(h, *x), jnp.asarray(hs))
+    defects = np.asarray(jax.jit(lambda x: jax.lax.map(each, x))((y0, args)))
     return [slope(hs, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(hs))]
 
 

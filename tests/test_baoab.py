@@ -85,7 +85,7 @@ def _defect_orders(solver, terms, friction, y0):
         return ds.weak_order_defect(*other, **fn, order=2) + exchange
 
     hs = np.array([0.02, 0.01, 0.005])
-    defects = jax.jit(jax.vmap(defect))(hs)
+    defects = jax.jit(lambda hs: jax.lax.map(defect, hs))(hs)
     return [slope(hs, d) for d in defects.T]
 
 

@@ -146,7 +146,6 @@ def batch(structure: str, dtype) -> Batch:
 @ft.cache
 def program(solver, dtype):
     """Ends of the steps, their derivatives by state and sizes, and which succeeded."""
-    del dtype  # Programs are kept apart.
     system = SYSTEMS[solver.structure]
 
     @jax.jit
@@ -162,7 +161,9 @@ def program(solver, dtype):
             y1, _ = jfu.ravel_pytree(y1)
             return y1, (y1, result == diffrax.RESULTS.successful)
 
-        jacobian, (y1, success) = jax.jacrev(end, has_aux=True)(flat)
+        # Double precision in reverse mode, single precision in forward mode.
+        derivative = jax.jacrev if dtype == jnp.float64 else jax.jacfwd
+        jacobian, (y1, success) = derivative(end, has_aux=True)(flat)
         return y1, jacobian, success
 
     return step
@@ -297,9 +298,10 @@ def _weak_systems(solver):
 
 
 def _over(fn, y0, args):
-    """A function of step, state and `args` for all of them, in one program."""
-    over = jax.vmap(jax.vmap(fn, (0, None, None)), (None, 0, 0))
-    return np.asarray(jax.jit(over)(_WEAK_STEPS, y0, args))
+    """A function of step, state and `args` for all of them, in one program. Each of them
+    is a mean over many outcomes: to batch these once more would take longer to compile."""
+    each = lambda x: jax.lax.map(lambda h: fn(h, *x), _WEAK_STEPS)
+    return np.asarray(jax.jit(lambda x: jax.lax.map(each, x))((y0, args)))
 
 
 def _make_weak_systems(solver):
@@ -374,10 +376,16 @@ def strong_orders(solver) -> dict[str, tuple[float, float]]:
         step = lambda i, y: take_step(solver, terms, i * h, (i + 1) * h, y, args)[0]
         return jfu.ravel_pytree(jax.lax.fori_loop(0, steps, step, y0))[0]
 
-    over = jax.vmap(end, (0, None, None, None))
-    over = jax.jit(jax.vmap(over, (None, 0, 0, None)))
-    keys = jr.split(jr.key(0), _STRONG_PATHS)
-    *coarse, exact = (over(keys, y0, args, n) for n in (*_STRONG_STEPS, fine))
+    # One batch of all paths and kinds; the number of steps is not known while compiling.
+    number = len(_kinds(solver.structure))
+    repeat = lambda x: jnp.repeat(x, _STRONG_PATHS, axis=0)
+    batch = jax.tree.map(repeat, (y0, args))
+    keys = jnp.tile(jr.split(jr.key(0), _STRONG_PATHS), number)
+    over = jax.jit(jax.vmap(end, (0, 0, 0, None)))
+    *coarse, exact = (
+        over(keys, *batch, n).reshape(number, _STRONG_PATHS, -1)
+        for n in np.array([*_STRONG_STEPS, fine])
+    )
     squares = np.sum((np.stack(coarse) - exact) ** 2, axis=-1)
     means = np.mean(squares, axis=-1, keepdims=True)
     # A slope is a sum over logarithms of errors, and so, to first order, over paths.
