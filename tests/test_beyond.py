@@ -87,6 +87,7 @@ def _strong_errors(solver, strength, m=2, fine=2**11, samples=200):
     y0, args = separable_problem(jr.key(3), 1, m)
     a, v, phi = args["noise"]
     args["noise"] = strength * a, v, phi
+
     @ft.partial(jax.jit, static_argnums=2)
     @ft.partial(jax.vmap, in_axes=(0, None, None))
     def end(key, number, solver):

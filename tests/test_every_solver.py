@@ -17,7 +17,15 @@ from diffrax_symplectic._brownian import VARIABLES
 from diffrax_symplectic._plan import make_plan
 from diffrax_symplectic._suggest import SOLVERS
 
-from .problems import FineSample, Given, slope, SYSTEMS, values_of_a_step
+from .problems import (
+    FineSample,
+    Given,
+    one_after_another,
+    over_steps,
+    slope,
+    SYSTEMS,
+    values_of_a_step,
+)
 
 
 _GAUSS = 1 / 4 + np.sqrt(3) / 6
@@ -146,6 +154,7 @@ def batch(structure: str, dtype) -> Batch:
 @ft.cache
 def program(solver, dtype):
     """Ends of the steps, their derivatives by state and sizes, and which succeeded."""
+    del dtype  # Programs are kept apart.
     system = SYSTEMS[solver.structure]
 
     @jax.jit
@@ -161,9 +170,7 @@ def program(solver, dtype):
             y1, _ = jfu.ravel_pytree(y1)
             return y1, (y1, result == diffrax.RESULTS.successful)
 
-        # Double precision in reverse mode, single precision in forward mode.
-        derivative = jax.jacrev if dtype == jnp.float64 else jax.jacfwd
-        jacobian, (y1, success) = derivative(end, has_aux=True)(flat)
+        jacobian, (y1, success) = jax.jacrev(end, has_aux=True)(flat)
         return y1, jacobian, success
 
     return step
@@ -297,13 +304,6 @@ def _weak_systems(solver):
     return _WEAK[kind_of(solver)]
 
 
-def _over(fn, y0, args):
-    """A function of step, state and `args` for all of them, in one program. Each of them
-    is a mean over many outcomes: to batch these once more would take longer to compile."""
-    each = lambda x: jax.lax.map(lambda h: fn(h, *x), _WEAK_STEPS)
-    return np.asarray(jax.jit(lambda x: jax.lax.map(each, x))((y0, args)))
-
-
 def _make_weak_systems(solver):
     order = 3 if solver.structure == "constant" else 2
     system = SYSTEMS[solver.structure]
@@ -317,11 +317,12 @@ def _make_weak_systems(solver):
 
     def exact(h, y0, args):
         kwargs = dict(fn=values_of_a_step)
-        at = (terms, ds.ImplicitMidpoint(), 0.1, 0.1 + h, y0, args)
+        # Any solver will do: its steps cancel.
+        at = (terms, diffrax.Heun(), 0.1, 0.1 + h, y0, args)
         mean = ds.step_expectation(*at, **kwargs)
         return mean - ds.weak_order_defect(*at, **kwargs, order=order)
 
-    return y0, args, _over(exact, y0, args)
+    return y0, args, np.asarray(over_steps(exact, _WEAK_STEPS, y0, args))
 
 
 def local_weak_orders(solver) -> dict[str, float]:
@@ -334,7 +335,8 @@ def local_weak_orders(solver) -> dict[str, float]:
         kwargs = dict(fn=values_of_a_step, nodes=4)
         return ds.step_expectation(terms, solver, 0.1, 0.1 + h, y0, args, **kwargs)
 
-    defects = _over(mean, y0, args) - exact
+    means = over_steps(mean, _WEAK_STEPS, y0, args, one_after_another)
+    defects = np.asarray(means) - exact
     sizes = lambda i: np.linalg.norm(defects[2 * i : 2 * i + 2], axis=(0, 2))
     kinds = _kinds(solver.structure)
     return {kind: slope(_WEAK_STEPS, sizes(i)) - 1 for i, kind in enumerate(kinds)}

@@ -159,7 +159,9 @@ def test_any_root_finder_gives_the_same_solution(root_finder):
     step = lambda s: s.step(terms, 0.0, 0.1, y0, args, None, False)[0]
     solver = GENERAL["SRKw1-0.2"]
     other = dataclasses.replace(solver, root_finder=root_finder, root_find_max_steps=50)
-    np.testing.assert_allclose(*jax.jit(lambda: (step(other), step(solver)))(), atol=1e-10)
+    np.testing.assert_allclose(
+        *jax.jit(lambda: (step(other), step(solver)))(), atol=1e-10
+    )
 
 
 # A noise for which a step can be too large: q' = q^2 has no midpoint step once the

@@ -91,7 +91,6 @@ def check_systems(seeds) -> set:
     for seed in seeds:
         terms, y0, args, t0, known = random_system(seed)
         for want in ("expectations", "paths"):
-            # The structure is the same for all arrays: no program is worth compiling.
             found = ds.suggest_solver(terms, t0, y0, args, want=want)
             for name in ("separable", "additive", "constant"):
                 assert known[name] == (name in found.system), (seed, found)
