@@ -1,6 +1,7 @@
 """Families for noise that does not depend on the state, and their strong order 3/2."""
 
 import dataclasses
+import functools as ft
 
 import diffrax
 import jax
@@ -41,15 +42,20 @@ STEPS = np.array([2.0**-k for k in (3, 4, 5, 6)])
 
 
 def _strong_errors(terms, solver, y0, args, fine=2**10):
-    def ends(key):
-        sample = FineSample.draw(key, fine, 2)
-        solve = lambda h: jnp.concatenate(
-            diffrax.diffeqsolve(terms(sample), solver, 0.0, 1.0, h, y0, args).ys
-        )
-        return jax.lax.map(solve, jnp.array([*STEPS, 1 / fine]))
+    @jax.jit
+    @ft.partial(jax.vmap, in_axes=(0, None))
+    def end(key, steps):
+        path, h = FineSample.draw(key, fine, 2), 1 / steps
+        step = lambda i, y: solver.step(
+            terms(path), i * h, (i + 1) * h, y, args, None, False
+        )[0]
+        return jnp.stack(jax.lax.fori_loop(0, steps, step, y0))
 
-    ys = jax.jit(jax.vmap(ends))(jr.split(jr.key(0), 200))
-    return np.sqrt(np.mean(np.sum((ys[:, :-1] - ys[:, -1:]) ** 2, axis=(2, 3)), axis=0))
+    keys = jr.split(jr.key(0), 200)
+    steps = np.array([*np.round(1 / STEPS), fine], int)
+    *coarse, exact = (np.asarray(end(keys, n)) for n in steps)
+    squares = np.sum((np.stack(coarse) - exact) ** 2, axis=(2, 3))
+    return np.sqrt(np.mean(squares, axis=1))
 
 
 def test_the_default_sign_has_the_smaller_strong_error():
@@ -85,17 +91,20 @@ def _weak_two(tableau):
     return ds.weak_order_residuals(tableau, 2)
 
 
-def _solve(noise, solver, path=None, d=2, **kwargs):
+def _terms(noise, solver, path=None):
     gaussian = ds.FixedStepBrownianPath((), jr.key(0), diffrax.SpaceTimeLevyArea)
     weak = ds.WeakBrownianPath((), jr.key(0), second=True)
     if path is None:
         path = weak if isinstance(solver, ds.SRKw5) else gaussian
     H0 = lambda t, p, q, args: jnp.sum(jnp.cosh(p) + p * q)
-    terms = ds.hamiltonian_terms(H0, noise, path)
-    y0 = (0.3 * jnp.ones(d), 0.5 * jnp.ones(d))
-    return diffrax.diffeqsolve(
-        terms, solver, 0.0, 0.2, 0.1, y0, jnp.array(0.7), **kwargs
-    )
+    return ds.hamiltonian_terms(H0, noise, path)
+
+
+def _check(noise, solver):
+    """What a solve does before its first step, while it is traced."""
+    y0, args = (0.3 * jnp.ones(2), 0.5 * jnp.ones(2)), jnp.array(0.7)
+    init = lambda y0, args: solver.init(_terms(noise, solver), 0.0, 0.1, y0, args)
+    jax.eval_shape(init, y0, args)
 
 
 @one_of_each
@@ -111,14 +120,14 @@ def _solve(noise, solver, path=None, d=2, **kwargs):
 )
 def test_noise_that_depends_on_the_state_is_refused(solver, noise):
     with pytest.raises(ValueError, match="depends on the state"):
-        _solve(noise, solver)
+        _check(noise, solver)
 
 
 def test_noise_that_depends_on_time_is_for_srks4():
     noise = lambda t, p, q, args: jnp.cos(t) * jnp.sum(q)
     with pytest.raises(ValueError, match="it depends on time. Use `SRKs4`"):
-        _solve(noise, ds.SRKw5())
-    _solve(noise, ds.SRKs4())
+        _check(noise, ds.SRKw5())
+    _check(noise, ds.SRKs4())
 
 
 @one_of_each
@@ -131,8 +140,7 @@ def test_noise_that_depends_on_time_is_for_srks4():
     ],
 )
 def test_linear_noise_is_recognised(solver, noise):
-    # The structure is checked while tracing.
-    jax.eval_shape(lambda: _solve(noise, solver))
+    _check(noise, solver)
 
 
 @one_of_each
@@ -159,9 +167,15 @@ def test_truncated_paths_keep_their_space_time_area():
     noise = lambda t, p, q, args: jnp.sum(q)
     levy = diffrax.SpaceTimeLevyArea
     path = ds.FixedStepBrownianPath((), jr.key(0), levy)
-    cut = _solve(noise, ds.SRKs4(), ds.TruncatedBrownianPath(path, k=4))
-    for a, b in zip(cut.ys, _solve(noise, ds.SRKs4(), path).ys):
-        np.testing.assert_allclose(a, b, rtol=1e-14)
+    solver, y0 = ds.SRKs4(), (0.3 * jnp.ones(2), 0.5 * jnp.ones(2))
+
+    @jax.jit
+    def ends():
+        paths = ds.TruncatedBrownianPath(path, k=4), path
+        step = lambda terms: solver.step(terms, 0.0, 0.1, y0, None, None, False)[0]
+        return [step(_terms(noise, solver, x)) for x in paths]
+
+    np.testing.assert_allclose(*ends(), rtol=1e-14)
 
 
 def test_solvers_declare_the_levy_area_that_they_need():

@@ -276,8 +276,15 @@ def test_backsolve_is_refused_with_advice(solver):
         jax.grad(end)(y0)
 
 
-@pytest.mark.parametrize("inner", [ds.StormerVerlet(), ds.ImplicitMidpoint()], ids=repr)
-def test_friction_is_walked_back_too(inner):
+@pytest.mark.parametrize(
+    "inner, form",
+    [
+        (ds.StormerVerlet(), jnp.array([[1.0, 0.4], [0.4, 0.7]])),
+        (ds.ImplicitMidpoint(), jnp.array(1.0)),
+    ],
+    ids=["matrix", "number"],
+)
+def test_friction_is_walked_back_too(inner, form):
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 - args * jnp.sum(jnp.cos(q + t))
     noise = lambda t, p, q, args: args * jnp.sum(jnp.sin(q))
     terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
@@ -286,7 +293,7 @@ def test_friction_is_walked_back_too(inner):
     @jax.jit
     def gradients(gamma):
         def loss(y0, args, gamma, adjoint):
-            solver = ds.Damped(inner, gamma)
+            solver = ds.Damped(inner, gamma * form)
             sol = diffrax.diffeqsolve(
                 terms, solver, 0.0, 2.0, 0.1, y0, args, adjoint=adjoint
             )

@@ -237,18 +237,20 @@ def test_an_unsolved_step_says_what_to_do_about_it(dtype):
         y0 = (size * jnp.ones(2, dtype),) * 2
         return diffrax.diffeqsolve(terms, solver, t0, t1, t1 / 2, y0, throw=throw)
 
-    with pytest.raises(RuntimeError) as info:
-        solve(jnp.array(1.0, dtype), True)
-    for advice in ("smaller steps", "TruncatedBrownianPath", "root_find_max_steps"):
-        assert advice in str(info.value)
     # In a batch the others are solved.
     sizes = jnp.array([1.0, 1e-3], dtype)
     result = jax.jit(jax.vmap(lambda size: solve(size, False).result))(sizes)
     message = diffrax.RESULTS[result]
-    assert message.count("smaller steps") == 1
+    advice = "smaller steps", "TruncatedBrownianPath", "root_find_max_steps"
+    assert [message.count(part) for part in advice] == [1, 1, 1]
     one = diffrax.RESULTS.successful
     good = jax.vmap(lambda r: r == one)(result)
     np.testing.assert_array_equal(good, [False, True])
+    if dtype == jnp.float64:
+        # Diffrax raises what the result says.
+        with pytest.raises(RuntimeError) as info:
+            solve(jnp.array(1.0), True)
+        assert all(part in str(info.value) for part in advice)
 
 
 def test_states_that_are_not_real_floats_are_refused():

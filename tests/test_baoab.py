@@ -85,7 +85,7 @@ def _defect_orders(solver, terms, friction, y0):
         return ds.weak_order_defect(*other, **fn, order=2) + exchange
 
     hs = np.array([0.02, 0.01, 0.005])
-    defects = jax.jit(jax.vmap(defect))(hs)
+    defects = jax.jit(lambda hs: jax.lax.map(defect, hs))(hs)
     return [slope(hs, d) for d in defects.T]
 
 
@@ -174,9 +174,10 @@ def test_gradients_with_respect_to_a_matrix_with_equal_rates(wrap):
         return jnp.sum(jnp.stack(sol.ys)[:, -1] * jnp.array([[1.0, 2.0], [-1.0, 0.5]]))
 
     change, k = jnp.array([[0.3, -0.2], [-0.2, 0.5]]), 1e-5
+    both = jax.jit(jax.value_and_grad(end))
     for gamma in (0.6 * jnp.eye(2), MATRIX, 5 * MATRIX):
-        slope = (end(gamma + k * change) - end(gamma - k * change)) / (2 * k)
-        gradient = jax.jit(jax.grad(end))(gamma)
+        plus, minus = (both(gamma + e * change)[0] for e in (k, -k))
+        slope, gradient = (plus - minus) / (2 * k), both(gamma)[1]
         np.testing.assert_allclose(jnp.sum(gradient * change), slope, rtol=1e-8)
     # A second derivative is refused, and not wrong.
     with pytest.raises(Exception, match="a second time"):
@@ -292,13 +293,10 @@ def test_after_a_jump_the_forces_are_new():
     assert np.max(np.abs(np.subtract(step(state, False), fresh))) > 1e-3
 
 
-@pytest.mark.parametrize(
-    "solver",
-    [ds.BAOAB(MATRIX), ds.Damped(ds.StormerVerlet(), MATRIX)],
-    ids=["BAOAB", "Damped"],
-)
-def test_gradients_may_walk_back_along_the_solution(solver):
+def test_gradients_may_walk_back_along_the_solution():
+    solver = ds.BAOAB(MATRIX)
     assert _undoes_its_steps(solver)
+    assert _undoes_its_steps(ds.Damped(ds.StormerVerlet(), MATRIX))
     assert not _undoes_its_steps(ds.Damped(ds.SRKw4(), 1.0))
     H0 = lambda t, p, q, args: _pendula(t, p, args * q, None)
     terms = ds.hamiltonian_terms(H0, _bath(SIGMA), weak_path(2))

@@ -17,7 +17,15 @@ from diffrax_symplectic._brownian import VARIABLES
 from diffrax_symplectic._plan import make_plan
 from diffrax_symplectic._suggest import SOLVERS
 
-from .problems import FineSample, Given, slope, SYSTEMS, values_of_a_step
+from .problems import (
+    FineSample,
+    Given,
+    one_after_another,
+    over_steps,
+    slope,
+    SYSTEMS,
+    values_of_a_step,
+)
 
 
 _GAUSS = 1 / 4 + np.sqrt(3) / 6
@@ -296,12 +304,6 @@ def _weak_systems(solver):
     return _WEAK[kind_of(solver)]
 
 
-def _over(fn, y0, args):
-    """A function of step, state and `args` for all of them, in one program."""
-    over = jax.vmap(jax.vmap(fn, (0, None, None)), (None, 0, 0))
-    return np.asarray(jax.jit(over)(_WEAK_STEPS, y0, args))
-
-
 def _make_weak_systems(solver):
     order = 3 if solver.structure == "constant" else 2
     system = SYSTEMS[solver.structure]
@@ -315,11 +317,12 @@ def _make_weak_systems(solver):
 
     def exact(h, y0, args):
         kwargs = dict(fn=values_of_a_step)
-        at = (terms, ds.ImplicitMidpoint(), 0.1, 0.1 + h, y0, args)
+        # Any solver will do: its steps cancel.
+        at = (terms, diffrax.Heun(), 0.1, 0.1 + h, y0, args)
         mean = ds.step_expectation(*at, **kwargs)
         return mean - ds.weak_order_defect(*at, **kwargs, order=order)
 
-    return y0, args, _over(exact, y0, args)
+    return y0, args, np.asarray(over_steps(exact, _WEAK_STEPS, y0, args))
 
 
 def local_weak_orders(solver) -> dict[str, float]:
@@ -332,7 +335,8 @@ def local_weak_orders(solver) -> dict[str, float]:
         kwargs = dict(fn=values_of_a_step, nodes=4)
         return ds.step_expectation(terms, solver, 0.1, 0.1 + h, y0, args, **kwargs)
 
-    defects = _over(mean, y0, args) - exact
+    means = over_steps(mean, _WEAK_STEPS, y0, args, one_after_another)
+    defects = np.asarray(means) - exact
     sizes = lambda i: np.linalg.norm(defects[2 * i : 2 * i + 2], axis=(0, 2))
     kinds = _kinds(solver.structure)
     return {kind: slope(_WEAK_STEPS, sizes(i)) - 1 for i, kind in enumerate(kinds)}
@@ -374,10 +378,16 @@ def strong_orders(solver) -> dict[str, tuple[float, float]]:
         step = lambda i, y: take_step(solver, terms, i * h, (i + 1) * h, y, args)[0]
         return jfu.ravel_pytree(jax.lax.fori_loop(0, steps, step, y0))[0]
 
-    over = jax.vmap(end, (0, None, None, None))
-    over = jax.jit(jax.vmap(over, (None, 0, 0, None)))
-    keys = jr.split(jr.key(0), _STRONG_PATHS)
-    *coarse, exact = (over(keys, y0, args, n) for n in (*_STRONG_STEPS, fine))
+    # One batch of all paths and kinds; the number of steps is not known while compiling.
+    number = len(_kinds(solver.structure))
+    repeat = lambda x: jnp.repeat(x, _STRONG_PATHS, axis=0)
+    batch = jax.tree.map(repeat, (y0, args))
+    keys = jnp.tile(jr.split(jr.key(0), _STRONG_PATHS), number)
+    over = jax.jit(jax.vmap(end, (0, 0, 0, None)))
+    *coarse, exact = (
+        over(keys, *batch, n).reshape(number, _STRONG_PATHS, -1)
+        for n in np.array([*_STRONG_STEPS, fine])
+    )
     squares = np.sum((np.stack(coarse) - exact) ** 2, axis=-1)
     means = np.mean(squares, axis=-1, keepdims=True)
     # A slope is a sum over logarithms of errors, and so, to first order, over paths.

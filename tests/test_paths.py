@@ -74,19 +74,20 @@ def test_asking_for_more_does_not_change_the_increment():
         )
 
 
+# The sizes follow the step; which of the three values it is, is what is random.
+_signs = jax.jit(jax.vmap(lambda t0, t1: jnp.sign(weak_path(40).evaluate(t0, t1))))
+
+
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("h", [0.01, 2**-6, 0.1, 1 / 3])
 @pytest.mark.parametrize("start", [0.0, 0.5, -2.0, 0.005])
 @pytest.mark.core
 def test_increments_do_not_depend_on_the_rounding_of_time(h, start, dtype):
-    path = weak_path(40)
-    # The sizes follow the step; which of the three values it is, is what is random.
-    evaluate = jax.jit(jax.vmap(lambda t0, t1: jnp.sign(path.evaluate(t0, t1))))
     n = 400
     ts = (start + h * np.arange(n + 1)).astype(dtype)
-    W = evaluate(ts[:-1], ts[1:])
+    W = np.asarray(_signs(ts[:-1], ts[1:]))
     nudged = [np.nextafter(ts, end, dtype=dtype) for end in (np.inf, -np.inf)]
-    same = [evaluate(a[:-1], b[1:]) == W for a in nudged for b in nudged]
+    same = [_signs(a[:-1], b[1:]) == W for a in nudged for b in nudged]
     # In single precision, one step in many thousands may sit at the edge of a count.
     assert np.mean(np.all(same, axis=(0, 2))) >= (1 if dtype == jnp.float64 else 0.99)
     # Two steps share 40 increments with probability 2^-40, if independent.

@@ -91,17 +91,14 @@ def check_systems(seeds) -> set:
     for seed in seeds:
         terms, y0, args, t0, known = random_system(seed)
         for want in ("expectations", "paths"):
-            # The structure is the same for all arrays: no program is worth compiling.
-            with jax.disable_jit():
-                found = ds.suggest_solver(terms, t0, y0, args, want=want)
+            found = ds.suggest_solver(terms, t0, y0, args, want=want)
             for name in ("separable", "additive", "constant"):
                 assert known[name] == (name in found.system), (seed, found)
             assert known["commuting"] == ("do not commute" not in found.system)
             orders = {"expectations": "weak_order", "paths": "strong_order"}
             assert getattr(found[0], orders[want]) >= 1
             for s in found:
-                with jax.disable_jit():
-                    state = s.solver.init(s.terms(jr.key(1)), t0, t0 + 0.01, y0, args)
+                state = s.solver.init(s.terms(jr.key(1)), t0, t0 + 0.01, y0, args)
                 # Of the step, only the random variables of the path may be refused.
                 if (type(s.solver), y0[0].dtype) not in traced:
                     traced.add((type(s.solver), y0[0].dtype))
@@ -134,9 +131,8 @@ def test_with_friction_solvers_that_have_it_are_suggested(want):
         terms = ds.hamiltonian_terms(
             energy, noise, ds.WeakBrownianPath((2,), jr.key(0))
         )
-        with jax.disable_jit():
-            found = ds.suggest_solver(terms, 0.0, y0, want=want, gamma=gamma)
-            names = [s.solver for s in ds.suggest_solver(terms, 0.0, y0, want=want)]
+        found = ds.suggest_solver(terms, 0.0, y0, want=want, gamma=gamma)
+        names = [s.solver for s in ds.suggest_solver(terms, 0.0, y0, want=want)]
         assert type(found[0].solver) is first and "and friction" in found.system
         # Around all that are suggested without.
         inner = [s.solver.solver for s in found if not isinstance(s.solver, ds.BAOAB)]
@@ -175,8 +171,7 @@ def test_first_suggestion_solves_as_it_stands(case):
     path = ds.WeakBrownianPath((len(noises),), jr.key(0))
     terms, y0 = ds.hamiltonian_terms(H0, noise, path), (jnp.ones(1), jnp.ones(1))
     for want, name in zip(("expectations", "paths"), expected):
-        with jax.disable_jit():
-            best = ds.suggest_solver(terms, 0.0, y0, want=want)[0]
+        best = ds.suggest_solver(terms, 0.0, y0, want=want)[0]
         assert type(best.solver).__name__ == name
         sol = diffrax.diffeqsolve(
             best.terms(jr.key(1)), best.solver, 0, 0.2, 0.1, y0, max_steps=2
@@ -192,9 +187,8 @@ def test_friction_as_a_term_gets_a_solver_and_is_told_of_damped():
     friction = lambda t, y, args: (-0.1 * y[0], jnp.zeros_like(y[1]))
     damped = diffrax.MultiTerm(*terms.terms, diffrax.ODETerm(friction))
     y0 = (jnp.ones(1), jnp.ones(1))
-    with jax.disable_jit():
-        found = ds.suggest_solver(damped, 0.0, y0, want="expectations")
-        without = ds.suggest_solver(terms, 0.0, y0, want="expectations")
+    found = ds.suggest_solver(damped, 0.0, y0, want="expectations")
+    without = ds.suggest_solver(terms, 0.0, y0, want="expectations")
     assert type(found[0].solver).__name__ == "StrangGauss"
     assert "Damped(solver, gamma)" in str(found) and "gamma=`" in str(found)
     assert "Damped" not in str(without)
@@ -216,10 +210,9 @@ def test_noises_that_do_not_commute_may_be_terms_or_arrays_of_their_own():
     both = ds.WeakBrownianPath((shape, shape), jr.key(0))
     crossed = diffrax.ControlTerm(lambda t, y, args: y[::-1], both)
     for terms, y0 in ((noises, jnp.stack([one, one])), ([crossed], (one, one))):
-        with jax.disable_jit():
-            found = ds.suggest_solver(
-                diffrax.MultiTerm(drift, *terms), 0.0, y0, want="paths"
-            )
+        found = ds.suggest_solver(
+            diffrax.MultiTerm(drift, *terms), 0.0, y0, want="paths"
+        )
         # Lévy areas are those of one array of noises.
         assert [type(s.solver) for s in found] == [ds.ImplicitMidpoint]
         assert found[0].strong_order == 0.5
