@@ -278,6 +278,7 @@ class Noise(eqx.Module):
         `second` returns."""
         x = self.draw(key, i)
         if self.outcomes is None:
+            assert second is not None
             y1, new, success = self.step(i, y, state, x)
             first = jax.jacrev(lambda x: u(self.step(i, y, state, x)[0]))(0 * x)
             square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
