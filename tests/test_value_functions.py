@@ -256,7 +256,7 @@ def test_polynomials_are_orthonormal_and_fits_nested():
 
 
 def test_a_grid_interpolates_with_degree_five_and_is_constant_beyond():
-    grid, axis = Grid(2, 12), np.linspace(-1, 1, 12)
+    grid, axis = Grid(2, (0, 12)), np.linspace(-1, 1, 12)
     fn = lambda x, y: (x**5 - x) * (y**5 + y**2)
     c = jnp.asarray(fn(*np.meshgrid(axis, axis, indexing="ij"))).reshape(-1, 1)
     # Two points at least are to lie on either side.
@@ -270,7 +270,7 @@ def test_a_grid_interpolates_with_degree_five_and_is_constant_beyond():
     # It holds twice the range of the points, whatever they are.
     points = jr.normal(KEY, (300, 2)) @ jnp.array([[1.0, 2.0], [0.0, 0.1]])
     good = jnp.ones(300, bool)
-    frame, sites = grid.sites(Frame.of(points, good, jnp.ones(2)), points, good, KEY)
+    frame, sites = grid.sites(points, good, jnp.ones(2), KEY)
     corners = np.asarray(frame.at(sites))[[0, -1]]
     np.testing.assert_allclose(corners, [[-1, -1], [1, 1]], atol=1e-12)
     np.testing.assert_allclose(np.abs(frame.at(points)).max(axis=0), 0.5, atol=1e-12)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, PyTree, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt32
 
 from .._arguments import check_takes, whole_number
 from .._brownian import (
@@ -24,20 +24,17 @@ from .._brownian import (
 )
 from .._custom_types import Y
 from .._terms import brownian_paths, replace_paths
-from ._estimate import run
+from ._estimate import Plan, run, Samples
 from ._fits import Functions
 from ._points import hilbert_order, num_seeds, randomized, sobol_points
 from ._steps import (
-    AbstractLevelSampler,
     AbstractSampling,
     along,
     check_real,
     independent_steps,
-    Plan,
-    Prepared,
+    numbers,
     Problem,
-    real,
-    simulate,
+    samples,
 )
 from ._value_functions import value_function
 
@@ -82,9 +79,7 @@ class ArrayRQMC(AbstractSampling):
     (2008)](https://doi.org/10.1287/opre.1080.0556).
     """
 
-    num_paths: int = eqx.field(
-        default=2**14, converter=lambda x: _power_of_two("num_paths", x)
-    )
+    num_paths: int = eqx.field(default=2**14, converter=lambda x: _power_of_two(x))
     replicates: int = eqx.field(
         default=16, converter=lambda x: whole_number("replicates", x, 2)
     )
@@ -99,30 +94,30 @@ class ArrayRQMC(AbstractSampling):
                 "Pass `sampling=IndependentPaths(num_paths)`."
             )
         points = jnp.asarray(sobol_points(self.num_paths, words.num_words))
-        plan = Plan(self.replicates, 1, self.num_paths, _BEFORE_STOPPING)
-        sort_by = _state if self.sort_by is None else self.sort_by
-        dimension = _num_coordinates(sort_by, problem.y0)
+        sort_by, y0 = _state if self.sort_by is None else self.sort_by, problem.y0
+        check_takes("sort_by", sort_by, "y")
+        check_real("sort_by", jtu.tree_leaves(eqx.filter_eval_shape(sort_by, y0)))
+        sampler = lambda by: jtu.Partial(_replicates, problem, by, points, words)
+        plan = Plan(
+            sampler(sort_by), self.replicates, 1, self.num_paths, _BEFORE_STOPPING
+        )
+        dimension = jax.eval_shape(lambda: numbers(sort_by(y0))).size
         # How many of the paths, sorted, there are along each coordinate.
         each = self.num_paths ** (1 / dimension)
-        sampler = ArrayRQMCSampler(problem, sort_by, points, words)
         if each >= _FEW:
-            return Prepared(sampler, plan)
-        if self.sort_by is None and problem.num_outputs == (1, 1):
-            u = value_function(problem, key)
-            trial = Plan(_TRIAL, 1, self.num_paths)
-            others = [] if u is None else [ArrayRQMCSampler(problem, u, points, words)]
-            own = jr.fold_in(key, _TRIAL)
-            spread = lambda s: float(
-                np.sum(jtu.tree_leaves(run(s, own, trial, devices).variance))
-            )
-            for other in others:
-                ratio = spread(sampler) / spread(other)
-                if ratio > 1:
-                    reason = (
-                        "sorted by a fitted value function, which divides the variance "
-                        f"by {ratio:.1f} against the state"
-                    )
-                    return Prepared(other, plan, reason)
+            return plan
+        one_number = self.sort_by is None and problem.num_outputs == (1, 1)
+        u = value_function(problem, key) if one_number else None
+        if u is not None:
+            other, own = plan._replace(sampler=sampler(u)), jr.fold_in(key, _TRIAL)
+            few = lambda plan: run(plan._replace(num_samples=_TRIAL), own, devices)
+            spread = lambda plan: float(np.sum(jtu.tree_leaves(few(plan).variance)))
+            ratio = spread(plan) / spread(other)
+            if ratio > 1:
+                return other._replace(
+                    reason="sorted by a fitted value function, which divides the variance "
+                    f"by {ratio:.1f} against the state"
+                )
         warnings.warn(
             f"{self.num_paths:,} paths are sorted by {dimension} coordinates, so that "
             f"there are {each:.1f} along each of them: neighbours are far apart, and "
@@ -131,51 +126,45 @@ class ArrayRQMC(AbstractSampling):
             f"{int(math.log(self.num_paths, _FEW))} at most.",
             stacklevel=4,
         )
-        return Prepared(sampler, plan)
+        return plan
 
 
-class ArrayRQMCSampler(AbstractLevelSampler):
+def _replicates(
+    p: Problem,
+    sort_by: Callable[[Y], PyTree[Array]] | Functions,
+    points: UInt32[Array, "n d"],
+    layout: "Layout",
+    keys: PRNGKeyArray,
+) -> Samples:
     """A sample is the mean over all paths of a replicate. Algorithm 1 of
     [L'Ecuyer, Lécot and Tuffin (2008)](https://doi.org/10.1287/opre.1080.0556).
 
     `points` are those of `sobol_points`, with a coordinate for each random variable of a
     step."""
+    n, d = points.shape
+    terms_of = lambda words: with_words(p.terms, layout, words)
+    (replicate,) = keys
 
-    problem: Problem
-    sort_by: Callable[[Y], PyTree[Array]] | Functions
-    points: UInt32[Array, "n d"]
-    layout: "Layout" = eqx.field(static=True)
-
-    def on_level(self, keys, level):
-        # (A batch is one replicate.)
-        replicates = [self._replicate(key, level) for key in keys]
-        values, good, failed = zip(*replicates)
-        values = jtu.tree_map(lambda *xs: jnp.stack(xs, axis=1), *values)
-        return values, jnp.stack(good), jnp.stack(failed)
-
-    def _replicate(self, key, level):
-        p, n = self.problem, len(self.points)
-        key = jr.fold_in(key, level.index)
+    def begin(level):
+        key = jr.fold_in(replicate, level.index)
 
         def words(i):
-            count = num_seeds(self.points.shape[1])
-            seeds = jr.bits(jr.fold_in(key, i), (count,), jnp.uint32)
-            return randomized(self.points, seeds, self.layout.sixths)
+            seeds = jr.bits(jr.fold_in(key, i), (num_seeds(d),), jnp.uint32)
+            return randomized(points, seeds, layout.sixths)
 
-        terms_of = lambda words: with_words(p.terms, self.layout, words)
-        advance, ensemble = independent_steps(p, level, n, terms_of, words)
-
-        def step(i, ensemble, carried):
-            by = self.sort_by
+        def step(i, paths):
+            by = sort_by
             if isinstance(by, Functions):
                 u = jtu.tree_map(lambda x: x[level.index], by)
                 by = lambda y: u(i - 1, y)
-            z = _coordinates(by, ensemble.y)
-            order = hilbert_order(z, ensemble.failed)
-            return advance(i, jtu.tree_map(lambda x: x[order], ensemble), carried)
+            z = jax.vmap(lambda y: numbers(by(y)))(paths.y)
+            order = hilbert_order(z, paths.failed)
+            return advance(i, jtu.tree_map(lambda x: x[order], paths))
 
-        saved, ensemble, _ = simulate(p, level, ensemble, step, None, _mean_of_good)
-        return saved, jnp.array(True), jnp.sum(ensemble.failed)
+        advance, paths = independent_steps(p, level, n, terms_of, words)
+        return step, paths
+
+    return samples(p, begin, _mean_of_good)
 
 
 def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "..."]:
@@ -185,13 +174,6 @@ def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "..."]:
     rows = 1 << ((len(x).bit_length() - 1) // 2)
     total = jnp.sum(jnp.sum(x.reshape(rows, -1, *x.shape[1:]), axis=0), axis=0)
     return total / jnp.sum(~failed).astype(total.dtype)
-
-
-def _coordinates(sort_by, y: Y) -> Float[Array, "n d"]:
-    """What the paths are sorted by, as one array."""
-    leaves = jtu.tree_leaves(jax.vmap(sort_by)(y))
-    columns = [jnp.reshape(leaf, (len(leaf), -1)) for leaf in leaves]
-    return jnp.concatenate([x.astype(real(x.dtype)) for x in columns], axis=1)
 
 
 class Layout(NamedTuple):
@@ -242,20 +224,11 @@ def _state(y: Y) -> Y:
     return y
 
 
-def _power_of_two(name: str, value) -> int:
-    whole = whole_number(name, value, 2)
+def _power_of_two(value) -> int:
+    whole = whole_number("num_paths", value, 2)
     if whole & (whole - 1):
         raise ValueError(
-            f"`{name}` must be a power of two, of which Sobol' points are balanced; got "
+            "`num_paths` must be a power of two, of which Sobol' points are balanced; got "
             f"{whole}. Pass {2 ** (whole.bit_length() - 1)} or {2 ** whole.bit_length()}."
         )
     return whole
-
-
-def _num_coordinates(sort_by, y0) -> int:
-    """Of how many numbers `sort_by` makes the order."""
-    check_takes("sort_by", sort_by, "y")
-    batch = jtu.tree_map(lambda x: x[None], y0)
-    by = eqx.filter_eval_shape(lambda y: jtu.tree_leaves(jax.vmap(sort_by)(y)), batch)
-    check_real("sort_by", by)
-    return jax.eval_shape(lambda y: _coordinates(sort_by, y), batch).shape[1]

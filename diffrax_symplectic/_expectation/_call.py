@@ -3,31 +3,19 @@
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
-from .._arguments import check_solver, check_takes, whole_number
 from .._custom_types import Args, RealScalarLike, Y
-from .._terms import check_stratonovich
 from ._array_rqmc import ArrayRQMC
-from ._estimate import Expectation, NO_METER, run, warn_of_tol
-from ._monte_carlo import check_tol, checked_key, IndependentPaths
-from ._steps import (
-    AbstractSampling,
-    check_real,
-    Level,
-    level_weights,
-    Prepared,
-    Problem,
-)
+from ._estimate import checked_call, Expectation, NO_METER, Plan, run
+from ._monte_carlo import IndependentPaths
+from ._steps import AbstractSampling, Problem
 from ._value_functions import ValueFunctions
 
 
@@ -39,7 +27,8 @@ _PATHS, _REPLICATE, _REPLICATES = 2**13, 2**12, 8
 _SECONDS = 0.5
 # A gain for which no other sampling is tried.
 _CLEAR = 1e5
-# The most samples that a tolerance may ask for.
+# How many samples there are without a tolerance, and with one at most.
+_SAMPLES = {IndependentPaths: 2**17, ArrayRQMC: 64, ValueFunctions: 4096}
 _MOST = 10**9
 
 
@@ -148,17 +137,13 @@ def expectation(
     and variances of batches are combined; [Talay and Tubaro
     (1990)](https://doi.org/10.1080/07362999008809220) for extrapolation.
     """
-    key = checked_key(key, "expectation")
-    check_tol(tol)
-    levels = whole_number("levels", levels)
-    _check_solver(solver)
-    problem = _problem(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels)
-    devices = tuple(jax.devices() if devices is None else devices)
-    k_pilot, why, prepared = jr.fold_in(key, _NO_SAMPLE), "", None
+    key, devices = checked_call("expectation", key, tol, devices)
+    problem = Problem.of(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels)
+    k_pilot, plan = jr.fold_in(key, _NO_SAMPLE), None
     if sampling is None and start is not None:
-        sampling, why = start.sampling, start.reason
+        sampling = start.sampling
     elif sampling is None:
-        sampling, prepared, why = _chosen(problem, k_pilot, tol, devices)
+        sampling, plan = _chosen(problem, k_pilot, tol, devices)
     if not isinstance(sampling, AbstractSampling):
         raise ValueError(
             "`sampling` must be `IndependentPaths(num_paths)`, `ArrayRQMC()`, "
@@ -169,142 +154,48 @@ def expectation(
             f"`start` was sampled by {start.sampling}; got sampling={sampling}. Pass the "
             "same."
         )
-    if prepared is None:
-        prepared = sampling.prepare(problem, k_pilot, devices)
-    sampler, plan, reason = prepared
-    about = dict(sampling=sampling, reason=why or reason)
-    estimate = run(sampler, key, plan, devices, start, tol, progress_meter, **about)
-    warn_of_tol(estimate, tol)
-    return estimate
-
-
-def _problem(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels: int) -> Problem:
-    num_steps, saved_steps = _steps(t0, t1, dt0, ts)
-    y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
-    start = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
-    check_stratonovich(terms, solver, start, y0, args)
-    check_takes("phi", phi, "t", "y", "args")
-    check_real("phi", jtu.tree_leaves(eqx.filter_eval_shape(phi, start, y0, args)))
-    finer = 2 ** np.arange(levels, dtype=np.int32)
-    grid = Level(
-        jnp.arange(levels, dtype=jnp.int32),
-        jnp.asarray(float(dt0) / finer, start.dtype),
-        jnp.asarray(finer * num_steps),
-        jnp.asarray(finer[:, None] * saved_steps),
-    )
-    most = int(finer[-1] * num_steps)
-    order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
-    weights = jnp.asarray(level_weights(order, levels), float)
-    phi, at = _Arrays(phi), (grid, weights, ts is None, most)
-    return Problem(phi, terms, solver, start, y0, args, *at)
-
-
-class _Arrays(eqx.Module):
-    """`phi`, with arrays for its numbers."""
-
-    phi: Callable
-
-    def __call__(self, t, y, args):
-        return jtu.tree_map(jnp.asarray, self.phi(t, y, args))
-
-
-def _steps(t0, t1, dt0, ts) -> tuple[np.integer, np.ndarray]:
-    """How many steps there are, and after how many of them to average."""
-    if dt0 is None:
-        raise ValueError("`dt0` must be a number: steps are fixed; got None.")
-    t0, t1, dt0 = float(t0), float(t1), float(dt0)
-    if not (dt0 > 0 and t1 > t0):
-        raise ValueError(
-            f"`dt0` must be positive, and `t1` after `t0`; got dt0={dt0}, t0={t0}, "
-            f"t1={t1}."
-        )
-    times = np.array([t1] if ts is None else ts, float).reshape(-1)
-    counts = (np.append(times, t1) - t0) / dt0
-    whole = np.round(counts)
-    if not np.all(np.abs(counts - whole) <= 1e-6 * np.maximum(whole, 1)):
-        raise ValueError(
-            "`t1` and each of `ts` must be a whole number of steps after `t0`; got "
-            f"steps of {dt0} from {t0} on, t1={t1} and ts={ts}. Choose a `dt0` that "
-            "divides the times between them."
-        )
-    if len(times) == 0 or np.any(whole < 0) or np.any(whole > whole[-1]):
-        raise ValueError(
-            f"`ts` must lie between `t0` and `t1`, and hold one time at least; got {ts}."
-        )
-    steps = whole.astype(np.int32)
-    return steps[-1], steps[:-1]
-
-
-def _check_solver(solver) -> None:
-    check_solver("solver", solver)
-    if isinstance(solver, diffrax.HalfSolver):
-        raise ValueError("`solver` must take fixed steps; got a `diffrax.HalfSolver`.")
-
-
-class _Trial(NamedTuple):
-    """A sampling that was tried: the variance of a sample, the largest if there are several
-    numbers, and the seconds that it takes."""
-
-    sampling: AbstractSampling
-    prepared: Prepared
-    variance: float
-    seconds: float
-
-    @property
-    def work(self) -> float:
-        """Seconds to a standard error of 1."""
-        return self.variance * self.seconds
+    if plan is None:
+        plan = sampling.prepare(problem, k_pilot, devices)
+    return run(plan, key, devices, sampling, start, tol, progress_meter)
 
 
 def _chosen(
     problem: Problem, key: PRNGKeyArray, tol: float | None, devices: tuple
-) -> tuple[AbstractSampling, Prepared, str]:
+) -> tuple[AbstractSampling, Plan]:
     """The sampling with the least product of variance and time, of those that can be used,
-    sized for `tol`; and why."""
+    with as many samples as the tolerance needs, and some more."""
+    done = []
 
-    def tried(sampling, samples: int) -> _Trial | None:
+    def work(sampling: AbstractSampling, samples: int) -> float:
+        """Seconds to a standard error of 1, by so many samples. Of several numbers the
+        largest variance counts."""
         try:
-            prepared = sampling.prepare(problem, key, devices)
+            plan = sampling.prepare(problem, key, devices)
         except ValueError:
-            return None
-        plan = prepared.plan._replace(num_samples=samples)
-        own = jr.fold_in(key, 0xFFFFFFFF)
-        sample = lambda: run(prepared.sampler, own, plan, devices)
+            return np.inf
+        own = jr.fold_in(key, _NO_SAMPLE)
+        sample = lambda: run(plan._replace(num_samples=samples), own, devices)
         sample()  # compiles
         begin = time.perf_counter()
-        e = sample()
+        variances = jtu.tree_leaves(sample().variance)
         seconds = (time.perf_counter() - begin) / samples
-        variances = [np.max(x, initial=0.0) for x in jtu.tree_leaves(e.variance)]
-        variance = max(map(float, variances))
-        return _Trial(
-            sampling, prepared, variance if np.isfinite(variance) else np.inf, seconds
-        )
+        variance = max(float(np.max(x, initial=0.0)) for x in variances)
+        variance = variance if np.isfinite(variance) else np.inf
+        done.append((variance * seconds, variance, sampling, plan))
+        return variance * seconds
 
-    plain = tried(IndependentPaths(_PATHS, _PATHS), _PATHS)
-    functions = rqmc = None
-    assert plain is not None
-    if tol is None or plain.work / tol**2 > _SECONDS:
-        functions = ValueFunctions()
-        functions = tried(functions, functions.batch_size)
-        if functions is None or functions.work * _CLEAR > plain.work:
-            rqmc = tried(ArrayRQMC(_REPLICATE, _REPLICATES), _REPLICATES)
-    done = [trial for trial in (plain, functions, rqmc) if trial is not None]
-    best = min(done, key=lambda trial: trial.work)
-    listed = [f"{type(t.sampling).__name__} {t.work:.1e}" for t in done]
-    reason = f"variance times seconds: {', '.join(listed)}"
-    return *_sized(best, tol), reason
-
-
-def _sized(best: _Trial, tol: float | None) -> tuple[AbstractSampling, Prepared]:
-    """With as many samples as the tolerance needs, and some more."""
-    sampling, plan = best.sampling, best.prepared.plan
-    if tol is None:
-        count = {IndependentPaths: 2**17, ArrayRQMC: 64, ValueFunctions: 4096}
-        samples = count[type(sampling)]
-    else:
-        samples = int(np.clip(1.5 * best.variance / tol**2, plan.batch_size, _MOST))
+    plain = work(IndependentPaths(_PATHS, _PATHS), _PATHS)
+    if tol is None or plain / tol**2 > _SECONDS:
+        functions = work(ValueFunctions(), ValueFunctions().batch_size)
+        if functions * _CLEAR > plain:
+            work(ArrayRQMC(_REPLICATE, _REPLICATES), _REPLICATES)
+    _, variance, sampling, plan = min(done, key=lambda trial: trial[0])
+    samples = _SAMPLES[type(sampling)]
+    if tol is not None:
+        samples = int(np.clip(1.5 * variance / tol**2, plan.batch_size, _MOST))
         samples = max(samples, 2 * plan.least)
+    listed = ", ".join(f"{type(x).__name__} {work:.1e}" for work, _, x, _ in done)
     name = "replicates" if isinstance(sampling, ArrayRQMC) else "num_paths"
     sampling = dataclasses.replace(sampling, **{name: samples})
-    plan = plan._replace(num_samples=samples)
-    return sampling, best.prepared._replace(plan=plan)
+    reason = f"variance times seconds: {listed}"
+    return sampling, plan._replace(num_samples=samples, reason=reason)

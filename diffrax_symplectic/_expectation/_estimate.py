@@ -4,7 +4,8 @@ another, on any devices."""
 import collections
 import dataclasses
 import warnings
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -14,15 +15,45 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from scipy.special import stdtrit
 
-from ._steps import AbstractSampler, Plan, real
+from .._brownian import check_key
 
 
 NO_METER = diffrax.NoProgressMeter()
 # NumPy returns scalars, which are not arrays, from operations on arrays without axes.
 _Host = PyTree[np.ndarray | np.floating]
+
+
+class Samples(eqx.Module):
+    """What is averaged, with axes in front for levels and samples: values on each level,
+    and which combinations of the levels to take; which of them are good; and how many
+    paths each has lost."""
+
+    values: PyTree[Array]
+    weights: Float[Array | np.ndarray, "combinations levels"]
+    good: Bool[Array, "levels n"]
+    lost: Int[Array, "levels n"] | None = None
+
+
+class Plan(NamedTuple):
+    """How samples are taken.
+
+    - `sampler`: a PyTree that makes one sample for each of several random keys.
+    - `num_samples`: how many at most, those of an estimate to go on from included.
+    - `batch_size`: how many each device takes at once.
+    - `paths`: how many paths a sample has, on each level.
+    - `least`: fewer samples than this do not tell their spread well enough to stop.
+    - `reason`: what the result says of how they were chosen.
+    """
+
+    sampler: Callable[[PRNGKeyArray], Samples]
+    num_samples: int
+    batch_size: int
+    paths: int = 1
+    least: int = 2
+    reason: str = ""
 
 
 class Expectation(eqx.Module):
@@ -59,29 +90,29 @@ class Expectation(eqx.Module):
         r"""The best estimate, in the structure of $\phi$ and in float64: the mean over the
         samples, extrapolated to steps of size zero if there are two levels or more. With
         `ts` there is an axis in front, one place for each of them. NaN without samples."""
-        return self._of(0, self.combinations)
-
-    @property
-    def variance(self) -> _Host:
-        """The variance of a sample."""
-        return self._of(0, self._variances)
+        return self._mean(0)
 
     @property
     def std_error(self) -> _Host:
         """The standard error of `mean`, from the spread of the samples."""
-        return self._of(0, self._std_errors)
+        return self._std_error(0)
+
+    @property
+    def variance(self) -> _Host:
+        """The variance of a sample."""
+        return jtu.tree_map(lambda s: self.num_samples * s**2, self.std_error)
 
     @property
     def bias(self) -> _Host | None:
         r"""With two levels or more the error of discretization of the finest one,
         $\mathbb E[\phi_h] - \mathbb E[\phi]$, as extrapolation knows it; otherwise `None`.
         `mean + bias` is the mean of that level. It is no part of `mean`."""
-        return self._of(1, self.combinations)
+        return self._mean(1)
 
     @property
     def bias_std_error(self) -> _Host | None:
         """The standard error of `bias`."""
-        return self._of(1, self._std_errors)
+        return self._std_error(1)
 
     @property
     def error(self) -> _Host:
@@ -90,7 +121,7 @@ class Expectation(eqx.Module):
         changed. What discretization leaves after that is of a higher order in the step
         size, and smaller as a rule. With one level nothing is known of it, and this is
         `std_error`."""
-        change = self._of(2, self.combinations)
+        change = self._mean(2)
         if change is None:
             return self.std_error
         return jtu.tree_map(np.hypot, self.std_error, change)
@@ -125,22 +156,20 @@ class Expectation(eqx.Module):
 
     __repr__ = __str__
 
-    @property
-    def _variances(self) -> _Host:
-        n = self.num_samples - 1
-        share = lambda m2: m2 / n if n > 0 else np.full_like(m2, np.nan)
-        return jtu.tree_map(share, self.sums_of_squares)
-
-    @property
-    def _std_errors(self) -> _Host:
-        n = max(self.num_samples, 1)
-        return jtu.tree_map(lambda v: np.sqrt(v / n), self._variances)
-
-    def _of(self, combination: int, tree: _Host) -> Any:
-        leaves = jtu.tree_leaves(tree)
+    def _mean(self, combination: int) -> Any:
+        leaves = jtu.tree_leaves(self.combinations)
         if leaves and len(leaves[0]) <= combination:
             return None
-        return jtu.tree_map(lambda x: x[combination], tree)
+        known = 1.0 if self.num_samples > 0 else np.nan
+        return jtu.tree_map(lambda x: known * x[combination], self.combinations)
+
+    def _std_error(self, combination: int) -> Any:
+        n = self.num_samples
+        share = 1 / (n * (n - 1)) if n > 1 else np.nan
+        if self._mean(combination) is None:
+            return None
+        error = lambda squares: np.sqrt(share * squares[combination])
+        return jtu.tree_map(error, self.sums_of_squares)
 
 
 class ExpectationInterrupted(KeyboardInterrupt):
@@ -156,32 +185,35 @@ class ExpectationInterrupted(KeyboardInterrupt):
         self.estimate = estimate
 
 
+def checked_call(
+    user: str, key, tol: float | None, devices: Sequence[Any] | None
+) -> tuple[PRNGKeyArray, tuple]:
+    """The key and the devices that a user means."""
+    check_key(key, user)
+    if tol is not None and not 0 < tol < np.inf:
+        raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")
+    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    devices = tuple(jax.devices() if devices is None else devices)
+    return key if typed else jr.wrap_key_data(key), devices
+
+
 def run(
-    sampler: AbstractSampler,
-    key: PRNGKeyArray,
     plan: Plan,
+    key: PRNGKeyArray,
     devices: tuple,
+    sampling: Any = None,
     start: Expectation | None = None,
     tol: float | None = None,
     progress_meter: diffrax.AbstractProgressMeter = NO_METER,
-    **about: Any,
 ) -> Expectation:
-    """The estimate from samples, of which number $i$ gets the key
-    `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, whatever the batch size and the
-    devices are. `about` is said of it in its fields of these names.
-
-    What a device computes, and in which order its sums are added up, does not depend on
-    how many there are."""
-    key_data, most = np.asarray(jr.key_data(key)), plan.num_samples
-    size = min(plan.batch_size, most)
-    # Of independent paths each that failed was a sample.
-    lost = lambda e: e.num_failed if plan.paths == 1 else 0
-    used = lambda e: e.num_samples + lost(e)
-    first = 0 if start is None else used(start)
+    """The estimate from the samples of a plan. What a device computes, and in which order
+    its sums are added up, does not depend on how many there are."""
+    sampler, most = plan.sampler, plan.num_samples
+    key_data, size = np.asarray(jr.key_data(key)), min(plan.batch_size, most)
     if jax.process_count() > 1:
-        # Each process holds the same arrays. They become constants of its program, since
-        # arguments would have to be placed on the devices of all.
-        sampler = _Constant(_Holder(sampler))
+        # Each process holds the same arrays. In a function they become constants of its
+        # program, since arguments would have to be placed on the devices of all.
+        sampler = lambda keys: plan.sampler(keys)
     mesh = Mesh(np.array(devices), ("samples",))
 
     def batch(begin: int) -> tuple:
@@ -192,19 +224,33 @@ def run(
         one: Any = _batch
         return one(sampler, key_data, jr.key_impl(key), lo_hi, left, mesh, size)
 
+    # Of independent paths each that failed was a sample.
+    used = lambda e: e.num_samples + (e.num_failed if plan.paths == 1 else 0)
+    first = 0 if start is None else used(start)
     # JAX caches this trace and uses it for the first batch.
     shapes = eqx.filter_eval_shape(batch, first)[2]
     zeros = jtu.tree_map(lambda s: np.zeros(s.shape[1:]), shapes)
     if start is None:
         estimate = Expectation(0, 0, 0, zeros, zeros, zeros, key_data)
     else:
-        estimate = _checked_start(start, zeros, key_data, used(start), most)
+        estimate = _checked_start(start, zeros, key_data, first, most)
+    about = dict(sampling=sampling, reason=plan.reason)
     estimate = dataclasses.replace(estimate, **about)
+
+    def reached() -> bool:
+        if tol is None or estimate.num_samples < plan.least:
+            return False
+        return all(bool(np.all(x <= tol)) for x in jtu.tree_leaves(estimate.std_error))
+
+    def finished() -> Expectation:
+        said = None if tol is None else reached()
+        return dataclasses.replace(estimate, tol_reached=said)
+
     running = collections.deque()
     meter = progress_meter.init()
     try:
         while True:
-            more = first < most and not _reached(estimate, tol, plan.least)
+            more = first < most and not reached()
             if more:
                 running.append(batch(first))
                 first += size * len(devices)
@@ -213,31 +259,27 @@ def run(
                 done = jax.device_get(running.popleft())
                 for one in range(len(devices)):
                     # The same samples decide, however many are made at once.
-                    if not _reached(estimate, tol, plan.least):
+                    if not reached():
                         part = jtu.tree_map(lambda x: x[one], done)
                         estimate = _merged(estimate, part, plan.paths)
                 meter = progress_meter.step(meter, np.asarray(used(estimate) / most))
             elif not more:
                 break
     except KeyboardInterrupt:
-        raise ExpectationInterrupted(_finished(estimate, tol, plan.least)) from None
+        raise ExpectationInterrupted(finished()) from None
     finally:
         progress_meter.close(meter)
-    return _finished(estimate, tol, plan.least)
-
-
-class _Holder:
-    """Compared by identity."""
-
-    def __init__(self, value):
-        self.value = value
-
-
-class _Constant(AbstractSampler):
-    holder: _Holder = eqx.field(static=True)
-
-    def __call__(self, keys):
-        return self.holder.value(keys)
+    estimate = finished()
+    if estimate.tol_reached is False:
+        errors = jtu.tree_leaves(estimate.std_error)
+        largest = max(float(np.max(x, initial=0.0)) for x in errors)
+        warnings.warn(
+            f"`tol={tol}` was not reached: the largest standard error is {largest:.1e} "
+            f"after {estimate.num_paths:,} paths. Take more paths, going on with `start=`, "
+            "or another `sampling`.",
+            stacklevel=3,
+        )
+    return estimate
 
 
 @eqx.filter_jit
@@ -253,8 +295,11 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         fold = lambda hi, lo: jr.fold_in(jr.fold_in(key, hi), lo)
         samples = sampler(jax.vmap(fold)(hi, lo))
         wanted = index < left
-        good = samples.good & wanted
-        count, failed = jnp.sum(good), jnp.sum(jnp.where(wanted, samples.failed, 0))
+        # A path fails once, on however many levels.
+        good = jnp.all(samples.good, axis=0)
+        lost = ~good + (0 if samples.lost is None else jnp.sum(samples.lost, axis=0))
+        failed, good = jnp.sum(jnp.where(wanted, lost, 0)), good & wanted
+        count = jnp.sum(good)
 
         def moments(x):
             x = x.astype(real(x.dtype))
@@ -263,11 +308,12 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
                     "What is averaged must be real arrays; got one of dtype "
                     f"{x.dtype}. Return real and imaginary parts."
                 )
-            keep = good.reshape(-1, *[1] * (x.ndim - 1))
-            mean = jnp.sum(jnp.where(keep, x, 0), axis=0) / jnp.maximum(count, 1)
+            x = jnp.tensordot(samples.weights.astype(x.dtype), x, 1)
+            keep = good.reshape(-1, *[1] * (x.ndim - 2))
+            mean = jnp.sum(jnp.where(keep, x, 0), axis=1) / jnp.maximum(count, 1)
             # In two passes, so that no two large numbers are subtracted.
-            off = jnp.where(keep, x - mean, 0)
-            return mean, jnp.sum(off**2, axis=0), jnp.max(jnp.abs(off), axis=0)
+            off = jnp.where(keep, x - mean[:, None], 0)
+            return mean, jnp.sum(off**2, axis=1), jnp.max(jnp.abs(off), axis=1)
 
         leaves, treedef = jtu.tree_flatten(samples.values)
         each = map(treedef.unflatten, zip(*map(moments, leaves)))
@@ -321,8 +367,7 @@ def _checked_start(start: Expectation, zeros, key_data, used: int, most: int):
             "The number of paths (or of replicates) counts all, those of `start` included, "
             f"of which there are {used} already; got {most}."
         )
-    keep = start.num_samples > 0
-    return start if keep else dataclasses.replace(start, combinations=zeros)
+    return start
 
 
 def _merged(estimate: Expectation, batch, paths: int) -> Expectation:
@@ -344,31 +389,5 @@ def _merged(estimate: Expectation, batch, paths: int) -> Expectation:
     )
 
 
-def _reached(estimate: Expectation, tol: float | None, least: int) -> bool:
-    """Whether all standard errors are at most `tol`. Fewer than `least` samples say too
-    little about their spread."""
-    if tol is None or estimate.num_samples < least:
-        return False
-    return all(bool(np.all(x <= tol)) for x in jtu.tree_leaves(estimate.std_error))
-
-
-def _finished(estimate: Expectation, tol: float | None, least: int) -> Expectation:
-    """The estimate with `tol_reached`, and with NaN for the mean without samples."""
-    said = None if tol is None else _reached(estimate, tol, least)
-    estimate = dataclasses.replace(estimate, tol_reached=said)
-    if estimate.num_samples > 0:
-        return estimate
-    nothing = jtu.tree_map(lambda x: np.full_like(x, np.nan), estimate.combinations)
-    return dataclasses.replace(estimate, combinations=nothing)
-
-
-def warn_of_tol(estimate: Expectation, tol: float | None) -> None:
-    if estimate.tol_reached is False:
-        errors = jtu.tree_leaves(estimate.std_error)
-        largest = max(float(np.max(x, initial=0.0)) for x in errors)
-        warnings.warn(
-            f"`tol={tol}` was not reached: the largest standard error is {largest:.1e} "
-            f"after {estimate.num_paths:,} paths. Take more paths, going on with `start=`, "
-            "or another `sampling`.",
-            stacklevel=3,
-        )
+def real(dtype) -> Any:
+    return jnp.result_type(dtype, float)

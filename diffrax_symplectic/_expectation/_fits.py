@@ -4,7 +4,8 @@ import abc
 import functools as ft
 import itertools
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax
@@ -14,11 +15,10 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .._custom_types import Y
-from ._noise import AbstractNoise, Ends
-from ._steps import along, Ensemble, Problem, ravel
+from ._steps import along, Ensemble, ravel
 
 
 _PILOTS_PER_POLYNOMIAL, _FEWEST_PILOTS = 30, 256
@@ -33,7 +33,12 @@ _FLOOR = 0.1
 _WIDER, _STENCIL = 2, 6
 # Derivatives are averaged over so many paths.
 _QUADRATIC_PILOTS = 128
+# Second derivatives by the noise are averaged over so many states.
+_SECOND = 32
 _dot = ft.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+
+# What a function is to be at a state; with a random key, an estimate of it.
+Value: TypeAlias = Callable[..., Float[Array, "C S m"]]
 
 
 class Frame(eqx.Module):
@@ -46,9 +51,6 @@ class Frame(eqx.Module):
 
     def at(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         return y - self.mean if self.to is None else _dot(y - self.mean, self.to.T)
-
-    def states(self, x: Float[Array, "n d"]) -> Float[Array, "n d"]:
-        return self.mean + _dot(x, self.back.T)
 
     @staticmethod
     def of(
@@ -67,65 +69,76 @@ class Frame(eqx.Module):
 
 
 class AbstractBasis(eqx.Module):
-    """Functions of the coordinates, of which value functions are made."""
+    """Functions of `d` coordinates, of which value functions are made. Candidates, numbers
+    of a kind, are there to choose among."""
 
-    @abc.abstractmethod
-    def combined(self, x: Float[Array, " d"], c: Float[Array, "P ..."]) -> Array:
-        """Their sum with these coefficients, at a point."""
-
-
-class AbstractFitted(AbstractBasis):
-    """Functions with coefficients from values at some states."""
+    kind: eqx.AbstractClassVar[str]
+    d: eqx.AbstractVar[int]
+    candidates: eqx.AbstractVar[tuple[int, ...]]
 
     @property
     @abc.abstractmethod
     def shape(self) -> tuple[int, int, int]:
-        """How many states, coefficients, and candidates with some of these, there are."""
+        """How many paths of a pilot are wanted, how many coefficients (`P`) there are, and
+        for how many candidates (`C`) there are some."""
 
     @abc.abstractmethod
     def sites(
-        self, frame: Frame, states, good, key
-    ) -> tuple[Frame, Float[Array, "n d"]]:
-        """The coordinates that are used, and where to take values, for the pilot's
-        states."""
+        self, states: Float[Array, "n d"], good: Bool[Array, " n"], unit, key
+    ) -> tuple[Frame, Float[Array, "sites d"]]:
+        """Coordinates, and states at which to look at the function that is to be fitted,
+        for the pilot's states, those of its paths that have not failed, the unit of each
+        coordinate, and a random key."""
 
     @abc.abstractmethod
     def fitted(
-        self,
-        x: Float[Array, "n d"],
-        values: Float[Array, "n C m"],
-        good: Bool[Array, " n"],
-    ) -> Float[Array, "P C m"]:
-        """The coefficients. `good` says which of the pilot's paths have not failed."""
+        self, value: Value, frame: Frame, sites, good, keys
+    ) -> Float[Array, "P C S m"]:
+        """The coefficients."""
+
+    @abc.abstractmethod
+    def combined(self, x: Float[Array, " d"], c: Float[Array, "P ..."]) -> Array:
+        """The sum with these coefficients, at a point."""
+
+    def chosen(self, c: Float[Array, "... C S m"], best: Int[np.ndarray, "S m"]):
+        """Of each number the coefficients of its own candidate."""
+        index = best.reshape(*[1] * (c.ndim - 2), *best.shape)
+        return jnp.take_along_axis(c, index, -3).squeeze(-3)
 
 
-class Grid(AbstractFitted):
-    """Values on a grid with `size` points along each of `d` axes. In between is the
-    polynomial of degree 5 in each coordinate through the 6 nearest points on its axis."""
+class Grid(AbstractBasis):
+    """Values on a grid with `candidates[1]` points along each axis. In between is the
+    polynomial of degree 5 in each coordinate through the 6 nearest points on its axis. The
+    other candidate, 0, is nothing at all."""
 
+    kind: ClassVar[str] = "grid points along an axis"
     d: int
-    size: int
+    candidates: tuple[int, int]
 
     @property
     def shape(self):
-        return self.size**self.d, self.size**self.d, 1
+        nodes = self.candidates[1] ** self.d
+        return nodes, nodes, 1
 
-    def sites(self, frame, states, good, key):
+    def sites(self, states, good, unit, key):
+        frame = Frame.of(states, good, unit)
         x = frame.at(states)
         low = jnp.min(jnp.where(good[:, None], x, jnp.inf), axis=0)
         high = jnp.max(jnp.where(good[:, None], x, -jnp.inf), axis=0)
         half = jnp.maximum(_WIDER * (high - low) / 2, 1)
         middle = frame.mean + _dot(frame.back, (low + high) / 2)
         frame = Frame(middle, frame.to / half[:, None], frame.back * half)
-        axis = np.linspace(-1, 1, self.size)
+        axis = np.linspace(-1, 1, self.candidates[1])
         nodes = np.stack(np.meshgrid(*[axis] * self.d, indexing="ij"), -1)
-        return frame, frame.states(jnp.asarray(nodes.reshape(-1, self.d), x.dtype))
+        nodes = jnp.asarray(nodes.reshape(-1, self.d), x.dtype)
+        return frame, frame.mean + _dot(nodes, frame.back.T)
 
-    def fitted(self, x, values, good):
+    def fitted(self, value, frame, sites, good, keys):
+        values = jax.vmap(value)(sites)
         return jnp.where(jnp.isfinite(values), values, 0)
 
     def combined(self, x, c):
-        n, k, last = self.size, _STENCIL, c.shape[1:]
+        n, k, last = self.candidates[1], _STENCIL, c.shape[1:]
         # Beyond the grid, and between points with too few others about them, it is
         # constant. To go on with the polynomial would amplify errors in each step.
         place = jnp.clip((x + 1) * (n - 1) / 2, k // 2 - 1, n - k // 2)
@@ -142,41 +155,81 @@ class Grid(AbstractFitted):
             block = jnp.tensordot(weights[:, j], block, 1)
         return block
 
+    def chosen(self, c, best):
+        return c[..., 0, :, :] * best.astype(c.dtype)
 
-class Hermite(AbstractFitted):
+
+class Hermite(AbstractBasis):
     """Products of Hermite polynomials, with a candidate for each of the total degrees."""
 
+    kind: ClassVar[str] = "degree"
     d: int
-    degrees: tuple[int, ...]
+    candidates: tuple[int, ...]
 
     @property
     def shape(self):
-        count = num_polynomials(self.d, max(self.degrees))
+        count = num_polynomials(self.d, max(self.candidates))
         pilots = max(_FEWEST_PILOTS, _PILOTS_PER_POLYNOMIAL * count)
-        return pilots, count, len(self.degrees)
+        return pilots, count, len(self.candidates)
 
-    def sites(self, frame, states, good, key):
+    def sites(self, states, good, unit, key):
+        frame = Frame.of(states, good, unit)
         z = _MOVE * jr.normal(key, states.shape, states.dtype)
         return frame, states + _dot(z, frame.back.T)
 
-    def fitted(self, x, values, good):
-        B = jax.vmap(lambda x: jnp.stack(hermite(x, max(self.degrees))))(x)
+    def fitted(self, value, frame, sites, good, keys):
+        values = jax.vmap(value)(sites)
+        flat = values.reshape(*values.shape[:2], -1)
+        B = jax.vmap(lambda x: jnp.stack(hermite(x, max(self.candidates))))(
+            frame.at(sites)
+        )
         finite = lambda x: jnp.isfinite(x).reshape(len(x), -1).all(axis=1)
-        good = good & finite(B) & finite(values)
+        good = good & finite(B) & finite(flat)
         rows = lambda x: jnp.where(along(good, x), x, 0)
-        sizes = tuple(num_polynomials(self.d, k) for k in self.degrees)
-        return least_squares(rows(B), rows(values), sizes)
+        sizes = tuple(num_polynomials(self.d, k) for k in self.candidates)
+        c = least_squares(rows(B), rows(flat), sizes)
+        return c.reshape(-1, *values.shape[1:])
 
     def combined(self, x, c):
-        products = zip(hermite(x, max(self.degrees)), c)
+        products = zip(hermite(x, max(self.candidates)), c)
         return ft.reduce(jnp.add, [b * c for b, c in products])
 
 
 class Quadratic(AbstractBasis):
     """Linear and quadratic functions, with a candidate for each degree. Their coefficients
-    are the first and the second derivatives at the origin, one after another."""
+    are the first and the second derivatives at the origin, one after another. They are the
+    means of those at the pilot's states: for Gaussian states that is best in the mean
+    square, by Stein's lemma."""
 
-    degrees: tuple[int, ...]
+    kind: ClassVar[str] = "degree"
+    d: int
+    candidates: tuple[int, ...]
+
+    @property
+    def shape(self):
+        return _QUADRATIC_PILOTS, self.d + self.d**2, len(self.candidates)
+
+    def sites(self, states, good, unit, key):
+        share = good.astype(states.dtype) / jnp.maximum(jnp.sum(good), 1)
+        return Frame(share @ states), states
+
+    def fitted(self, value, frame, sites, good, keys):
+        def derivatives(args):
+            key, x = args
+
+            def slope(x):
+                first = jax.jacrev(lambda x: value(x, key))(x)
+                return first, first
+
+            second, first = jax.jacfwd(slope, has_aux=True)(x)
+            second = second.reshape(*first.shape[:-1], -1)
+            return jnp.moveaxis(jnp.concatenate([first, second], -1), -1, 0)
+
+        each = lax.map(derivatives, (keys, sites))
+        share = good.astype(each.dtype) / jnp.maximum(jnp.sum(good), 1)
+        mean = jnp.tensordot(share, jnp.where(jnp.isfinite(each), each, 0), 1)
+        order = np.repeat([1, 2], [self.d, self.d**2])[:, None, None, None]
+        return jnp.where(order <= np.array(self.candidates)[:, None, None], mean, 0)
 
     def combined(self, x, c):
         d = len(x)
@@ -191,6 +244,8 @@ class Functions(eqx.Module):
 
     frames: Frame
     coefficients: Float[Array, "steps P *C S m"]
+    # What the noise keeps of them, to know what they do in a step.
+    second: Float[Array, "steps n n *C S m"] | None
     basis: AbstractBasis = eqx.field(static=True)
 
     def __call__(self, i, y: Y) -> Float[Array, "*C S m"]:
@@ -198,143 +253,72 @@ class Functions(eqx.Module):
         frame = jtu.tree_map(lambda x: x[i], self.frames)
         return self.basis.combined(frame.at(ravel(y)), self.coefficients[i])
 
+    def chosen(self, best: Int[np.ndarray, "S m"]) -> "Functions":
+        """With one candidate for each number."""
+        take = lambda c: self.basis.chosen(c, best)
+        c, second = jtu.tree_map(take, (self.coefficients, self.second))
+        return Functions(self.frames, c, second, self.basis)
 
-def fit_values(
-    noise: AbstractNoise, key: PRNGKeyArray, basis: AbstractFitted
-) -> tuple[Functions, Float[Array, "steps n d"]]:
-    """By values at the sites of the basis. Returns the pilot's states, too.
 
-    The pilot goes forward and the fit goes backward in one loop, since both need the ends
-    of the steps of many paths: to compile these takes most of the time."""
+def fit(noise, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
+    """The functions of a level, for its noise. A pilot goes forward, and the fit goes
+    backward."""
     p, level = noise.problem, noise.level
     y0, unravel = jfu.ravel_pytree(p.y0)
-    d, n, steps = y0.size, basis.shape[0], level.num_steps
+    (n, *shape), steps, last = basis.shape, level.num_steps, p.max_steps
     k_path, k_move = jr.split(key)
     keys = jr.split(k_path, n)
 
-    def body(j, carry):
-        forward = j < steps
-        i = jnp.where(forward, j, 2 * steps - 1 - j)
-        ensemble, states, squares, u = carry
-        good = ~ensemble.failed
-        frame = Frame.of(states[i], good, jnp.sqrt(squares / steps))
-        frame, sites = basis.sites(frame, states[i], good, jr.fold_in(k_move, i))
-        x = jnp.where(forward, jax.vmap(ravel)(ensemble.y), sites)
-        step = jnp.where(forward, i, jnp.minimum(i + 1, steps - 1))
-        draw = jnp.where(forward, i, p.max_steps + i)
-        ys = jax.vmap(unravel)(x)
-        # The pilot goes further than paths do: a fit has to hold for the last of them.
-        one = lambda y, key: noise.ends(
-            step, y, noise.fresh(step, y), key, draw, wide=True
-        )
-        ends = jax.vmap(one)(ys, keys)
-
-        def go():
-            new = _own(p, ensemble, ends)
-            flat = jax.vmap(ravel)(new.y)
-            # By how far they move, coordinates are comparable.
-            share = (~new.failed).astype(y0.dtype)
-            share = share / jnp.maximum(jnp.sum(share), 1)
-            return new, states.at[i].set(flat), squares + share @ (flat - y0) ** 2, u
-
-        def fit():
-            put = lambda all, one: all.at[i].set(one)
-            values = _values(noise, i, u, ys, ends)
-            flat = values.reshape(n, basis.shape[2], -1)
-            found = basis.fitted(frame.at(x), flat, good)
-            c = put(u.coefficients, found.reshape(u.coefficients.shape[1:]))
-            frames = jtu.tree_map(put, u.frames, frame)
-            return ensemble, states, squares, Functions(frames, c, basis)
-
-        return lax.cond(forward, go, fit)
-
-    zero = lambda *shape: jnp.zeros((p.max_steps, *shape), y0.dtype)
-    frames = Frame(zero(d), zero(d, d), zero(d, d))
-    u = Functions(frames, zero(*basis.shape[1:], *p.num_outputs), basis)
-    ensemble = Ensemble.start(p, n, None)
-    carry = ensemble, zero(n, d) + y0, jnp.zeros_like(y0), u
-    _, states, _, u = lax.fori_loop(0, 2 * steps, body, carry)
-    return u, states
-
-
-def fit_derivatives(
-    noise: AbstractNoise, key: PRNGKeyArray, basis: Quadratic
-) -> tuple[Functions, Float[Array, "steps n d"]]:
-    """By mean first and second derivatives at the pilot's states, which are returned, too.
-    For Gaussian states that is best in the mean square, by Stein's lemma."""
-    p, level = noise.problem, noise.level
-    y0, unravel = jfu.ravel_pytree(p.y0)
-    n, d = _QUADRATIC_PILOTS, y0.size
-    keys = jr.split(key, n)
-    state, brief = noise.fresh, dict(brief=True)
-    ends_of = lambda i, y, key, draw: noise.ends(i, y, state(i, y), key, draw, **brief)
-
     def forward(i, carry):
+        def one(y, key):
+            # It goes further than paths do: a fit has to hold for the last of them.
+            x = noise.draw(key, i, wide=True)
+            return noise.step(i, y, noise.fresh(i, y), x)
+
         ensemble, states = carry
-        ends = jax.vmap(lambda y, key: ends_of(i, y, key, i))(ensemble.y, keys)
-        ensemble = _own(p, ensemble, ends)
+        y, _, success = jax.vmap(one)(ensemble.y, keys)
+        ensemble = ensemble.moved(p, y, None, success)
         return ensemble, states.at[i].set(jax.vmap(ravel)(ensemble.y))
 
-    zero = lambda *shape: jnp.zeros((p.max_steps, *shape), y0.dtype)
-    carry = Ensemble.start(p, n, None), zero(n, d) + y0
-    ensemble, states = lax.fori_loop(0, level.num_steps, forward, carry)
-    share = (~ensemble.failed).astype(y0.dtype) / jnp.sum(~ensemble.failed)
-    centre = jnp.einsum("inj,n->ij", states, share)
-    uses = np.array([[x >= 1] * d + [x >= 2] * d**2 for x in basis.degrees]).T[
-        ..., None, None
-    ]
+    states = jnp.broadcast_to(y0, (last, n, y0.size))
+    carry = Ensemble.start(p, n, None), states
+    ensemble, states = lax.fori_loop(0, steps, forward, carry)
+    good = ~ensemble.failed
+    share = good.astype(y0.dtype) / jnp.maximum(jnp.sum(good), 1)
+    # By how far they move, coordinates are comparable.
+    unit = jnp.sqrt(jnp.einsum("n,ind->d", share, (states - y0) ** 2) / steps)
+    sites = lambda i: basis.sites(states[i], good, unit, jr.fold_in(k_move, i))
 
     def backward(j, u):
-        i = level.num_steps - 1 - j
-        step = jnp.minimum(i + 1, level.num_steps - 1)
+        i = steps - 1 - j
+        after = jnp.minimum(i + 1, steps - 1)
 
-        def derivatives(args):
-            key, x = args
+        def value(x, key=None):
+            y = unravel(x)
+            draw = None if key is None else noise.draw(key, last + i)
+            later = noise.mean(after, y, lambda y: u(after, y), draw)
+            phi = p.values(p.t0 + (i + 1) * level.h, y).astype(later.dtype)
+            here, before = level.saved_steps == i + 1, level.saved_steps > i + 1
+            return jnp.where(here[:, None], phi, jnp.where(before[:, None], later, 0))
 
-            def value(x):
-                y = unravel(x)
-                ends = ends_of(step, y, key, p.max_steps + i)
-                axis = lambda tree: jtu.tree_map(lambda x: x[None], tree)
-                return _values(noise, i, u, axis(y), axis(ends))[0]
+        put = lambda all, one: all.at[i].set(one)
+        frame, points = sites(i)
+        c = put(u.coefficients, basis.fitted(value, frame, points, good, keys))
+        return Functions(jtu.tree_map(put, u.frames, frame), c, None, basis)
 
-            def slope(x):
-                first = jax.jacrev(value)(x)
-                return first, first
+    zeros = lambda shape: jnp.zeros((last, *shape), y0.dtype)
+    frames = jtu.tree_map(lambda s: zeros(s.shape), jax.eval_shape(lambda: sites(0)[0]))
+    u = Functions(frames, zeros((*shape, *p.num_outputs)), None, basis)
+    u = lax.fori_loop(0, steps, backward, u)
 
-            second, first = jax.jacfwd(slope, has_aux=True)(x)
-            second = second.reshape(*first.shape[:-1], -1)
-            return jnp.moveaxis(jnp.concatenate([first, second], -1), -1, 0)
+    def kept(args):
+        i, few = args
+        return noise.second(i, jax.vmap(unravel)(few), lambda y: u(i, y))
 
-        each = lax.map(derivatives, (keys, states[i]))
-        mean = jnp.tensordot(share, jnp.where(jnp.isfinite(each), each, 0), 1)
-        c = u.coefficients.at[i].set(jnp.where(uses, mean, 0))
-        return Functions(u.frames, c, u.basis)
-
-    c = zero(d + d**2, len(basis.degrees), *p.num_outputs)
-    u = Functions(Frame(centre), c, basis)
-    return lax.fori_loop(0, level.num_steps, backward, u), states
-
-
-def _values(
-    noise: AbstractNoise, i, u: Functions, ys: Y, ends: Ends
-) -> Float[Array, "n C S m"]:
-    """What the functions after step number `i` are to be at these states: `phi` at the
-    saved steps, and before them the expectation of the functions a step later."""
-    p, level = noise.problem, noise.level
-    after = jnp.minimum(i + 1, p.max_steps - 1)
-    at_ends = jax.vmap(jax.vmap(lambda y: u(after, y)))(ends.y)
-    later = jax.vmap(lambda ends, values: ends.mean(values))(ends, at_ends)
-    t = p.t0 + (i + 1) * level.h
-    phi = jax.vmap(lambda y: ravel(p.phi(t, y, p.args)))(ys).astype(later.dtype)
-    here = (level.saved_steps == i + 1)[:, None]
-    before = (level.saved_steps > i + 1)[:, None]
-    return jnp.where(here, phi[:, None, None], jnp.where(before, later, 0))
-
-
-def _own(p: Problem, ensemble: Ensemble, ends: Ends) -> Ensemble:
-    """The paths at their own ends."""
-    take = lambda x: jax.vmap(lambda x, k: x[k])(x, ends.own)
-    return ensemble.moved(p, jtu.tree_map(take, ends.y), None, take(ends.success))
+    # The states before each step.
+    few = jnp.concatenate([states[:1] * 0 + y0, states[:-1]])[:, :_SECOND]
+    second = lax.map(kept, (jnp.arange(last), few))
+    return Functions(u.frames, u.coefficients, second, basis)
 
 
 def exponents(d: int, degree: int) -> list[tuple[int, ...]]:

@@ -10,26 +10,19 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .._arguments import check_takes, whole_number
-from .._brownian import check_key
 from .._compat import ClosedJaxpr, jaxpr_as_fun, solves_without_throwing
 from .._terms import brownian_paths, replace_paths
-from ._estimate import Expectation, NO_METER, run, warn_of_tol
+from ._estimate import checked_call, Expectation, NO_METER, Plan, run, Samples
 from ._steps import (
-    AbstractLevelSampler,
-    AbstractSampler,
     AbstractSampling,
     independent_steps,
     is_finite,
     level_weights,
-    Plan,
-    Prepared,
     Problem,
-    real,
-    Samples,
-    simulate,
+    samples,
 )
 
 
@@ -54,28 +47,22 @@ class IndependentPaths(AbstractSampling):
     batch_size: int | np.integer | None = None
 
     def prepare(self, problem, key, devices):
-        return Prepared(IndependentPathsSampler(problem), self.plan(devices))
+        return self.plan(jtu.Partial(_paths, problem), devices)
 
-    def plan(self, devices: tuple) -> Plan:
+    def plan(self, sampler: Callable, devices: tuple) -> Plan:
         if self.batch_size is None:
             size = 32768 if devices[0].platform == "cpu" else 262144
         else:
             size = whole_number("batch_size", self.batch_size)
-        return Plan(self.num_paths, size)
+        return Plan(sampler, self.num_paths, size)
 
 
-class IndependentPathsSampler(AbstractLevelSampler):
+def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
     """A sample is a path, on all levels with the same random key."""
-
-    problem: Problem
-
-    def on_level(self, keys, level):
-        p, n = self.problem, len(keys)
-        keys = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
-        terms_of = lambda keys: with_keys(p.terms, keys)
-        step, ensemble = independent_steps(p, level, n, terms_of, lambda i: keys)
-        saved, ensemble, _ = simulate(p, level, ensemble, step, None, lambda x, _: x)
-        return saved, ~ensemble.failed, ensemble.failed
+    n, own = len(keys), jax.vmap(lambda key: path_keys(p.terms, key))(keys)
+    terms_of = lambda keys: with_keys(p.terms, keys)
+    begin = lambda level: independent_steps(p, level, n, terms_of, lambda i: own)
+    return samples(p, begin)
 
 
 def path_keys(terms: PyTree[diffrax.AbstractTerm], key: PRNGKeyArray) -> list[Array]:
@@ -170,14 +157,12 @@ def monte_carlo(
         is neither successful nor an event, or anything in its $\phi$ is not finite.
         (Without `sol.result` a path that failed counts as a success: Diffrax returns where
         it stopped.)
-    - `key`: a JAX random key. Path number $i$ gets the key
-        `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`.
     - `num_paths`: the number of all paths, those of `start` included.
     - `batch_size`: as for [`diffrax_symplectic.IndependentPaths`][].
     - `levels`: how many step sizes.
     - `order`: with levels, the weak order $p$ of the solver for the terms, as
         `solver.weak_order(terms)` says.
-    - `tol`, `start`, `devices`, `progress_meter`: as for
+    - `key`, `tol`, `start`, `devices`, `progress_meter`: as for
         [`diffrax_symplectic.expectation`][].
 
     **Returns:** an [`diffrax_symplectic.Expectation`][].
@@ -185,8 +170,7 @@ def monte_carlo(
     **Raises:** as [`diffrax_symplectic.expectation`][]; a `ValueError` for levels without
     `order`, or if $\phi$ holds a `diffrax.RESULTS`.
     """
-    key = checked_key(key, "monte_carlo")
-    check_tol(tol)
+    key, devices = checked_call("monte_carlo", key, tol, devices)
     levels = whole_number("levels", levels)
     if levels > 1 and order is None:
         raise ValueError(
@@ -195,36 +179,19 @@ def monte_carlo(
         )
     check_takes("fn", fn, *(["key"] if levels == 1 else ["key", "level"]))
     order = 1 if order is None else whole_number("order", order)
-    devices = tuple(jax.devices() if devices is None else devices)
     sampling = IndependentPaths(num_paths, batch_size)
-    sampler, plan = _Given(fn, level_weights(order, levels)), sampling.plan(devices)
-    about = dict(sampling=sampling)
-    estimate = run(sampler, key, plan, devices, start, tol, progress_meter, **about)
-    warn_of_tol(estimate, tol)
-    return estimate
+    sampler = jtu.Partial(_of_function, fn, level_weights(order, levels))
+    plan = sampling.plan(sampler, devices)
+    return run(plan, key, devices, sampling, start, tol, progress_meter)
 
 
-class _Given(AbstractSampler):
-    """Samples by a function of a key."""
-
-    fn: Callable[..., Any]
-    weights: Float[np.ndarray, "combinations levels"]
-
-    def __call__(self, keys):
-        def one(key):
-            levels = self.weights.shape[1]
-            at = lambda level: lambda key: self.fn(key, level)
-            fns = [self.fn] if levels == 1 else map(at, range(levels))
-            values, success = zip(*[_evaluate(fn, key) for fn in fns])
-
-            def combined(*xs):
-                xs = jnp.stack(xs)
-                return jnp.tensordot(self.weights.astype(real(xs.dtype)), xs, 1)
-
-            return jtu.tree_map(combined, *values), jnp.all(jnp.stack(success))
-
-        values, good = jax.vmap(one)(keys)
-        return Samples(values, good, (~good).astype(int))
+def _of_function(fn: Callable, weights: np.ndarray, keys: PRNGKeyArray) -> Samples:
+    at = lambda level: lambda key: fn(key, level)
+    levels = weights.shape[1]
+    fns = [fn] if levels == 1 else [at(level) for level in range(levels)]
+    each = [jax.vmap(lambda key: _evaluate(fn, key))(keys) for fn in fns]
+    values, good = jtu.tree_map(lambda *xs: jnp.stack(xs), *each)
+    return Samples(values, weights, good)
 
 
 def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
@@ -264,14 +231,3 @@ def _check_failures_are_reported(program: ClosedJaxpr, out: PyTree) -> None:
 
 def _is_result(x) -> bool:
     return isinstance(x, type(diffrax.RESULTS.successful))
-
-
-def checked_key(key, user: str) -> PRNGKeyArray:
-    check_key(key, user)
-    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-    return key if typed else jr.wrap_key_data(key)
-
-
-def check_tol(tol: float | None) -> None:
-    if tol is not None and not 0 < tol < np.inf:
-        raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")

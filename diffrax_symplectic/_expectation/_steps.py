@@ -1,8 +1,8 @@
 """Paths that take fixed steps together: the loop that all samplings share."""
 
 import abc
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -14,7 +14,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from .._arguments import check_solver, check_takes, whole_number
 from .._custom_types import Args, RealScalarLike, Y
+from .._terms import check_stratonovich
+from ._estimate import Plan, real, Samples
 
 
 class Level(eqx.Module):
@@ -31,20 +34,46 @@ class Problem(eqx.Module):
     """What is asked for: the arguments of `expectation` of the same names, and the levels,
     along a leading axis."""
 
-    phi: Callable[[RealScalarLike, Y, Args], PyTree[Array]]
+    phi: Callable[[RealScalarLike, Y, Args], PyTree]
     terms: PyTree[diffrax.AbstractTerm]
     solver: diffrax.AbstractSolver
     t0: Float[Array, ""]
     y0: Y
     args: Args
     levels: Level
-    # The combinations of the means of the levels that are averaged, an array with equal
-    # weights being the same program.
+    # An array, equal weights being the same program.
     weights: Float[Array, "combinations levels"]
     # Whether there is one time at which to average, without an axis for it.
     at_end: bool = eqx.field(static=True)
     # Steps of the finest level. (An array has to know its size when it is compiled.)
     max_steps: int = eqx.field(static=True)
+
+    @staticmethod
+    def of(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels) -> "Problem":
+        """Raises a `ValueError` for bad arguments of `expectation`."""
+        levels = whole_number("levels", levels)
+        check_solver("solver", solver)
+        if isinstance(solver, diffrax.HalfSolver):
+            raise ValueError(
+                "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
+            )
+        saved_steps, num_steps = _steps(t0, t1, dt0, ts)
+        y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+        start = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
+        check_stratonovich(terms, solver, start, y0, args)
+        check_takes("phi", phi, "t", "y", "args")
+        check_real("phi", jtu.tree_leaves(eqx.filter_eval_shape(phi, start, y0, args)))
+        finer = 2 ** np.arange(levels, dtype=np.int32)
+        grid = Level(
+            jnp.arange(levels, dtype=jnp.int32),
+            jnp.asarray(float(dt0) / finer, start.dtype),
+            jnp.asarray(finer * num_steps),
+            jnp.asarray(finer[:, None] * saved_steps),
+        )
+        order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
+        weights = jnp.asarray(level_weights(order, levels), float)
+        at = grid, weights, ts is None, int(finer[-1] * num_steps)
+        return Problem(phi, terms, solver, start, y0, args, *at)
 
     def level(self, index: int) -> Level:
         return jtu.tree_map(lambda x: x[index], self.levels)
@@ -68,6 +97,17 @@ class Problem(eqx.Module):
         state = eqx.filter(state, eqx.is_array)
         return y, state, diffrax.is_okay(result) & is_finite(y)
 
+    def values(self, t, y: Y) -> Float[Array, " m"]:
+        return numbers(self.phi(t, y, self.args))
+
+    def unravel(self, x: Float[Array, "*axes m"]) -> PyTree[Array]:
+        """Such numbers in the structure of `phi`."""
+        shape = jax.eval_shape(lambda: self.phi(self.t0, self.y0, self.args))
+        leaves, treedef = jtu.tree_flatten(shape)
+        parts = jnp.split(x, np.cumsum([s.size for s in leaves])[:-1], axis=-1)
+        pairs = zip(parts, leaves)
+        return treedef.unflatten([y.reshape(*x.shape[:-1], *s.shape) for y, s in pairs])
+
     @property
     def dtype(self) -> Any:
         return jnp.result_type(*jtu.tree_leaves(self.y0))
@@ -75,8 +115,8 @@ class Problem(eqx.Module):
     @property
     def num_outputs(self) -> tuple[int, int]:
         """How many times there are at which to average, and how many numbers `phi` has."""
-        leaves = jtu.tree_leaves(jax.eval_shape(self.phi, self.t0, self.y0, self.args))
-        return self.levels.saved_steps.shape[1], sum(x.size for x in leaves)
+        m = jax.eval_shape(lambda: self.values(self.t0, self.y0)).size
+        return self.levels.saved_steps.shape[1], m
 
 
 class Ensemble(eqx.Module):
@@ -87,165 +127,132 @@ class Ensemble(eqx.Module):
     # A path that failed counts as failed until the end. It goes on from `y0`: an equation
     # without a solution would keep the other paths waiting in each step to come.
     failed: Bool[Array, " n"]
+    # What is to be subtracted from `phi`: nothing, or an array of shape `(n, S, m)`.
+    control: Any
 
     @staticmethod
-    def start(p: Problem, n: int, state: PyTree[Array]) -> "Ensemble":
+    def start(p: Problem, n: int, state: PyTree[Array], control=None) -> "Ensemble":
         y = jtu.tree_map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), p.y0)
-        return Ensemble(y, state, jnp.zeros(n, bool))
+        return Ensemble(y, state, jnp.zeros(n, bool), control)
 
-    def moved(self, p: Problem, y, state, success) -> "Ensemble":
+    def moved(self, p: Problem, y, state, success, control=None) -> "Ensemble":
         """The paths after a step to `y`, with those that failed put back."""
         failed = self.failed | ~success
         keep = lambda new, old: jnp.where(along(failed, new), old, new)
         state = jtu.tree_map(keep, state, self.solver_state)
-        return Ensemble(jtu.tree_map(keep, y, p.y0), state, failed)
+        return Ensemble(jtu.tree_map(keep, y, p.y0), state, failed, control)
 
 
-def simulate(
-    p: Problem,
-    level: Level,
-    ensemble: Ensemble,
-    step: Callable[[Int[Array, ""], Ensemble, Any], tuple[Ensemble, Any]],
-    carried: Any,
-    measure: Callable[[Array, Bool[Array, " n"]], Array],
-) -> tuple[PyTree[Array], Ensemble, Any]:
-    """Takes all steps of a level by `step(i, ensemble, carried)`. Returns what `measure`
-    makes of the values of `phi` and of which paths have failed, with an axis in front for
-    the saved steps; and the paths and what was carried along at the end."""
+def _simulate(
+    p: Problem, level: Level, step: Callable, paths: Ensemble, measure: Callable
+) -> tuple[Float[Array, "S ..."], Ensemble]:
+    """Takes all steps of a level by `step(i, paths)`. Returns what `measure` makes of the
+    values of `phi` and of which paths have failed, with an axis in front for the saved
+    steps; and the paths at the end."""
+    n, (saves, m) = len(paths.failed), p.num_outputs
 
-    def recorded(ensemble: Ensemble, saved, i):
-        t = p.t0 + i * level.h
-
+    def recorded(i, paths: Ensemble, saved):
         def record():
-            phi = jax.vmap(lambda y: p.phi(t, y, p.args))(ensemble.y)
-            phi = jtu.tree_map(lambda x: x.astype(real(x.dtype)), phi)
-            failed = ensemble.failed | ~jax.vmap(is_finite)(phi)
-            here = level.saved_steps == i
-            put = lambda old, x: jnp.where(along(here, old), measure(x, failed), old)
-            return failed, jtu.tree_map(put, saved, phi)
+            phi = jax.vmap(lambda y: p.values(p.t0 + i * level.h, y))(paths.y)
+            failed = paths.failed | ~jax.vmap(is_finite)(phi)
+            here = along(level.saved_steps == i, saved)
+            return failed, jnp.where(here, measure(phi, failed), saved)
 
         # A conditional with one predicate for all paths: `phi` is not evaluated otherwise.
         here = jnp.any(level.saved_steps == i)
-        failed, saved = lax.cond(here, record, lambda: (ensemble.failed, saved))
-        return Ensemble(ensemble.y, ensemble.solver_state, failed), saved
+        failed, saved = lax.cond(here, record, lambda: (paths.failed, saved))
+        return eqx.tree_at(lambda e: e.failed, paths, failed), saved
 
     def body(i, carry):
-        ensemble, carried, saved = carry
-        ensemble, carried = step(i, ensemble, carried)
-        ensemble, saved = recorded(ensemble, saved, i + 1)
-        return ensemble, carried, saved
+        paths, saved = carry
+        return recorded(i + 1, step(i, paths), saved)
 
-    n, saves = len(ensemble.failed), len(level.saved_steps)
+    dtype = jax.eval_shape(lambda: p.values(p.t0, p.y0)).dtype
+    phi = jax.ShapeDtypeStruct((n, m), dtype)
+    shape = jax.eval_shape(measure, phi, paths.failed).shape
+    carry = recorded(0, paths, jnp.zeros((saves, *shape), dtype))
+    paths, saved = lax.fori_loop(0, level.num_steps, body, carry)
+    return saved, paths
 
-    def empty(s):
-        one = jax.ShapeDtypeStruct((n, *s.shape), real(s.dtype))
-        shape = jax.eval_shape(measure, one, ensemble.failed)
-        return jnp.zeros((saves, *shape.shape), shape.dtype)
 
-    saved = jtu.tree_map(empty, jax.eval_shape(p.phi, p.t0, p.y0, p.args))
-    ensemble, saved = recorded(ensemble, saved, 0)
-    carry = ensemble, carried, saved
-    ensemble, carried, saved = lax.fori_loop(0, level.num_steps, body, carry)
-    return saved, ensemble, carried
+def samples(
+    p: Problem,
+    begin: Callable[[Level], tuple[Callable, Ensemble]],
+    mean: Callable[[Array, Bool[Array, " n"]], Array] | None = None,
+) -> Samples:
+    """Takes the paths that `begin` makes for a level through all of its steps, by the
+    function `step(i, paths)` that it makes, too. Each path is a sample, or `mean` of `phi`
+    and of which of them have failed is one."""
+
+    def on_level(level):
+        step, paths = begin(level)
+        keep = lambda phi, failed: phi
+        saved, paths = _simulate(p, level, step, paths, mean or keep)
+        if mean is not None:
+            return saved[:, None], jnp.ones(1, bool), jnp.sum(paths.failed)[None]
+        if paths.control is not None:
+            saved = saved - jnp.swapaxes(paths.control, 0, 1).astype(saved.dtype)
+        return saved, ~paths.failed, None
+
+    if len(p.levels.h) == 1:
+        out = jtu.tree_map(lambda x: x[None], on_level(p.level(0)))
+    else:
+        # One program for all levels.
+        out = lax.map(on_level, p.levels)
+    values, good, lost = out
+    values = values[:, 0] if p.at_end else jnp.swapaxes(values, 1, 2)
+    return Samples(p.unravel(values), p.weights, good, lost)
 
 
 def independent_steps(
     p: Problem, level: Level, n: int, terms_of: Callable, randomness: Callable
-) -> tuple[Callable[[Any, Ensemble, Any], tuple[Ensemble, Any]], Ensemble]:
+) -> tuple[Callable[[Any, Ensemble], Ensemble], Ensemble]:
     """What takes a step of `n` paths, and these at the start. Each has the terms
     `terms_of` its part of `randomness(i)` in step number `i`."""
 
-    def step(i, ensemble, carried):
-        def one(random, y, state):
-            return p.step(terms_of(random), i, level.h, y, state)
-
-        out = jax.vmap(one)(randomness(i), ensemble.y, ensemble.solver_state)
-        return ensemble.moved(p, *out), carried
+    def step(i, paths):
+        one = lambda random, y, state: p.step(terms_of(random), i, level.h, y, state)
+        return paths.moved(
+            p, *jax.vmap(one)(randomness(i), paths.y, paths.solver_state)
+        )
 
     start = lambda random: p.init(terms_of(random), 0, level.h, p.y0)
     return step, Ensemble.start(p, n, jax.vmap(start)(randomness(0)))
-
-
-class Samples(eqx.Module):
-    """Samples along the first axis: their values, which of them are good, and how many
-    paths failed in each."""
-
-    values: PyTree[Array]
-    good: Bool[Array, " n"]
-    failed: Int[Array, " n"]
-
-
-class AbstractSampler(eqx.Module):
-    """Makes samples of random keys: paths, or whatever else estimates of the mean can be
-    averaged."""
-
-    @abc.abstractmethod
-    def __call__(self, keys: PRNGKeyArray) -> Samples:
-        """One sample for each key."""
-
-
-class AbstractLevelSampler(AbstractSampler):
-    """Estimates the means of a problem on each level. Their combinations, along a new axis
-    in front, are what is averaged."""
-
-    problem: eqx.AbstractVar[Problem]
-
-    @abc.abstractmethod
-    def on_level(
-        self, keys: PRNGKeyArray, level: Level
-    ) -> tuple[PyTree[Array], Bool[Array, " n"], Bool[Array, " n"] | Int[Array, " n"]]:
-        """Values of `phi` with axes in front for the saved steps and the samples; which
-        samples are good; how many paths failed in each, or whether the only one did."""
-
-    def __call__(self, keys: PRNGKeyArray) -> Samples:
-        p = self.problem
-        one = lambda level: self.on_level(keys, level)
-        if len(p.levels.h) == 1:
-            out = jtu.tree_map(lambda x: x[None], one(p.level(0)))
-        else:
-            # One program for all levels.
-            out = lax.map(one, p.levels)
-        values, good, failed = out
-
-        def combined(x):
-            x = jnp.moveaxis(jnp.tensordot(p.weights.astype(x.dtype), x, 1), 2, 0)
-            return x[:, :, 0] if p.at_end else x
-
-        # A path fails once, on however many levels.
-        total = jnp.any if failed.dtype == bool else jnp.sum
-        failed = total(failed, axis=0).astype(int)
-        return Samples(jtu.tree_map(combined, values), jnp.all(good, axis=0), failed)
-
-
-class Plan(NamedTuple):
-    """How samples are taken.
-
-    - `num_samples`: how many at most, those of an estimate to go on from included.
-    - `batch_size`: how many each device takes at once.
-    - `paths`: how many paths a sample has, on each level.
-    - `least`: fewer samples than this do not tell their spread well enough to stop.
-    """
-
-    num_samples: int
-    batch_size: int
-    paths: int = 1
-    least: int = 2
-
-
-class Prepared(NamedTuple):
-    """A sampler, how many samples it is to take, and what the result says about it."""
-
-    sampler: AbstractSampler
-    plan: Plan
-    reason: str = ""
 
 
 class AbstractSampling(eqx.Module):
     """How the samples of an expectation are taken, as users name it."""
 
     @abc.abstractmethod
-    def prepare(self, problem: Problem, key: PRNGKeyArray, devices: tuple) -> Prepared:
+    def prepare(self, problem: Problem, key: PRNGKeyArray, devices: tuple) -> Plan:
         """Raises a `ValueError` for what it cannot do."""
+
+
+def _steps(t0, t1, dt0, ts: Sequence | None) -> tuple[np.ndarray, np.integer]:
+    """After how many steps to average, and how many there are."""
+    if dt0 is None:
+        raise ValueError("`dt0` must be a number: steps are fixed; got None.")
+    t0, t1, dt0 = float(t0), float(t1), float(dt0)
+    if not (dt0 > 0 and t1 > t0):
+        raise ValueError(
+            f"`dt0` must be positive, and `t1` after `t0`; got dt0={dt0}, t0={t0}, "
+            f"t1={t1}."
+        )
+    times = np.array([t1] if ts is None else ts, float).reshape(-1)
+    counts = (np.append(times, t1) - t0) / dt0
+    whole = np.round(counts)
+    if not np.all(np.abs(counts - whole) <= 1e-6 * np.maximum(whole, 1)):
+        raise ValueError(
+            "`t1` and each of `ts` must be a whole number of steps after `t0`; got "
+            f"steps of {dt0} from {t0} on, t1={t1} and ts={ts}. Choose a `dt0` that "
+            "divides the times between them."
+        )
+    if len(times) == 0 or np.any(whole < 0) or np.any(whole > whole[-1]):
+        raise ValueError(
+            f"`ts` must lie between `t0` and `t1`, and hold one time at least; got {ts}."
+        )
+    *saved, num_steps = whole.astype(np.int32)
+    return np.array(saved), num_steps
 
 
 def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations levels"]:
@@ -282,12 +289,14 @@ def is_finite(tree: PyTree[Array]) -> Bool[Array, ""]:
     return jnp.all(jnp.stack(leaves))
 
 
-def real(dtype) -> Any:
-    return jnp.result_type(dtype, float)
-
-
 def ravel(y: Y) -> Float[Array, " d"]:
     return jfu.ravel_pytree(y)[0]
+
+
+def numbers(tree: PyTree) -> Float[Array, " m"]:
+    """All that it holds, as real numbers."""
+    x = ravel(tree)
+    return x.astype(real(x.dtype))
 
 
 def check_real(name: str, leaves: list) -> None:

@@ -1,4 +1,4 @@
-"""Fitted value functions as control variates.
+"""Paths less what fitted value functions say of their noise.
 
 $u_n(y)$ stands for $\\mathbb E[\\phi(y_N) \\mid y_n = y]$. What $u_{n+1}$ does in a step,
 less its expectation over the random variables of that step, has mean zero whatever $u$ is.
@@ -6,42 +6,39 @@ For the exact $u$ these sum up to all that is random in $\\phi(y_N)$.
 """
 
 import math
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .._arguments import whole_number
-from ._estimate import Expectation, run
+from .._brownian import Discrete, random_words
+from .._custom_types import Y
+from .._terms import outcomes, step_variables
+from ._estimate import Expectation, Plan, run, Samples
 from ._fits import (
-    AbstractFitted,
-    fit_derivatives,
-    fit_values,
+    AbstractBasis,
+    fit,
     Functions,
     Grid,
     Hermite,
     num_polynomials,
     Quadratic,
 )
-from ._noise import noise_of
-from ._steps import (
-    AbstractLevelSampler,
-    AbstractSampling,
-    along,
-    Ensemble,
-    Level,
-    Plan,
-    Prepared,
-    Problem,
-    simulate,
-)
+from ._steps import AbstractSampling, along, Ensemble, Level, Problem, samples
 
 
+# Up to so many outcomes a step is taken for each of them.
+_MOST_OUTCOMES = 100
+
+# A function of the state.
+Function: TypeAlias = Callable[[Y], Array]
 # By default there are no more polynomials than this in a fit.
 _MOST_POLYNOMIALS = 130
 # By default there is a grid in up to so many dimensions, as fine as memory allows,
@@ -49,8 +46,6 @@ _MOST_POLYNOMIALS = 130
 _GRID, _GRID_SIZES, _MOST_STEPS = 2, (64, 32), 50_000
 # Bytes that a fit may take.
 _MOST_MEMORY = 4 * 2**30
-# Second derivatives by the noise are averaged over so many states.
-_SECOND = 32
 
 
 class ValueFunctions(AbstractSampling):
@@ -95,45 +90,85 @@ class ValueFunctions(AbstractSampling):
     )
 
     def prepare(self, problem, key, devices):
-        basis, kind, names = _basis(problem, self.degree)
-        fitted = _fits(problem, key, basis)
-        sampler = lambda best: ValueFunctionsSampler(problem, *_chosen(fitted, best))
-        plan, same = Plan(self.num_paths, self.batch_size), problem.num_outputs
-        if len(names) == 1:
-            return Prepared(sampler(np.zeros(same, int)), plan)
-        # The paths that choose are not those that are averaged.
-        own, few = (
-            jr.fold_in(key, len(problem.levels.h)),
-            Plan(self.batch_size, self.batch_size),
+        basis, (times, m) = _basis(problem, self.degree), problem.num_outputs
+        functions, count = _fits(problem, key, basis), len(basis.candidates)
+        sampler = lambda best: jtu.Partial(
+            _controlled_paths, problem, functions.chosen(best)
         )
-        trial = lambda k: run(sampler(np.full(same, k)), own, few, devices)
-        spreads = [_spread(trial(k), same[0]) for k in range(len(names))]
-        best = np.argmin(np.stack(spreads), axis=0)
-        chosen = ", ".join(names[k] for k in np.unique(best))
-        reason = f"{kind}: {chosen} was the best of {', '.join(names)}"
-        return Prepared(sampler(best), plan, reason)
+        all_of = lambda k: np.full((times, m), k)
+        plan = lambda best, n: Plan(sampler(best), n, self.batch_size)
+        if count == 1:
+            return plan(all_of(0), self.num_paths)
+        # The paths that choose are not those that are averaged.
+        own = jr.fold_in(key, len(problem.levels.h))
+        trials = [
+            run(plan(all_of(k), self.batch_size), own, devices) for k in range(count)
+        ]
+        best = np.argmin([_spread(e, times) for e in trials], axis=0)
+        listed = lambda which: ", ".join(str(basis.candidates[k]) for k in which)
+        chosen, among = listed(np.unique(best)), listed(range(count))
+        reason = f"{basis.kind}: {chosen} was the best of {among}"
+        return plan(best, self.num_paths)._replace(reason=reason)
 
 
-def _basis(
-    p: Problem, degree: int | None
-) -> tuple[AbstractFitted | Quadratic, str, list[str]]:
-    """The functions, and what the candidates are called. Raises a `ValueError` if there is
-    not enough memory, or for random variables without finitely many outcomes."""
-    noise = noise_of(p, p.level(0))
+def _spread(e: Expectation, times: int) -> np.ndarray:
+    """The variance of a sample of the first combination; larger where few of them make up
+    for most of it, so that it is not well known. Infinite if there are none."""
+    n = max(e.num_samples, 1)
+
+    def bound(squares, largest):
+        deviation = np.sqrt(squares[0] / n)
+        bound = deviation**2 + 2 * deviation * largest[0] / np.sqrt(n)
+        known = np.isfinite(bound) & (e.num_samples > 1)
+        return np.where(known, bound, np.inf).reshape(times, -1)
+
+    with np.errstate(all="ignore"):
+        each = jtu.tree_map(bound, e.sums_of_squares, e.largest)
+    return np.concatenate(jtu.tree_leaves(each), axis=1)
+
+
+def value_function(problem: Problem, key: PRNGKeyArray) -> Functions | None:
+    """A quadratic one for each level, or none for random variables without finitely many
+    outcomes."""
+    try:
+        basis = _basis(problem, 2)
+    except ValueError:
+        return None
+    return _fits(problem, key, basis).chosen(np.zeros(problem.num_outputs, int))
+
+
+def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
+    """For each level."""
+    levels = range(len(problem.levels.h))
+    each = [
+        _fitted(problem, problem.level(k), jr.fold_in(key, k), basis) for k in levels
+    ]
+    return jtu.tree_map(lambda *xs: jnp.stack(xs), *each)
+
+
+@eqx.filter_jit
+def _fitted(problem: Problem, level: Level, key: PRNGKeyArray, basis: AbstractBasis):
+    return fit(Noise.of(problem, level), key, basis)
+
+
+def _basis(p: Problem, degree: int | None) -> AbstractBasis:
+    """Raises a `ValueError` if there is not enough memory, or for random variables without
+    finitely many outcomes."""
+    points = len(Noise.of(p, p.level(0)).nodes()[1])
     d, levels = sum(x.size for x in jtu.tree_leaves(p.y0)), len(p.levels.h)
     outputs, item = levels * p.max_steps * math.prod(p.num_outputs), p.dtype.itemsize
     many = num_polynomials(d, 2) > _MOST_POLYNOMIALS
     if degree is None:
         for size in _GRID_SIZES if d <= _GRID else ():
-            steps = size**d * noise.num_outcomes
-            if 2 * item * size**d * outputs <= _MOST_MEMORY and steps <= _MOST_STEPS:
-                return Grid(d, size), "grid points along an axis", ["0", str(size)]
+            memory, steps = 2 * item * size**d * outputs, size**d * points
+            if memory <= _MOST_MEMORY and steps <= _MOST_STEPS:
+                return Grid(d, (0, size))
         few = [k for k in range(9) if num_polynomials(d, k) <= _MOST_POLYNOMIALS]
         degrees = (0, 1, 2) if many else (*(k for k in few[:-1] if k % 2 == 0), few[-1])
     else:
         degrees = (whole_number("degree", degree, 0),)
     if many and max(degrees) <= 2:
-        return Quadratic(degrees), "degree", [*map(str, degrees)]
+        return Quadratic(d, degrees)
     basis = Hermite(d, degrees)
     need = item * basis.shape[1] * (basis.shape[0] + len(degrees) * outputs)
     if need > _MOST_MEMORY:
@@ -141,115 +176,144 @@ def _basis(
             f"`degree={degree}` has {basis.shape[1]:,} polynomials in {d} dimensions, the "
             f"fit of which needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`."
         )
-    return basis, "degree", [*map(str, degrees)]
+    return basis
 
 
-def value_function(problem: Problem, key: PRNGKeyArray) -> Functions | None:
-    """A quadratic one, or none for random variables without finitely many outcomes."""
-    try:
-        basis = _basis(problem, 2)[0]
-    except ValueError:
-        return None
-    fitted = _fits(problem, key, basis)
-    return _chosen(fitted, np.zeros(problem.num_outputs, int))[0]
-
-
-def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractFitted | Quadratic):
-    """For each level."""
-    levels = range(len(problem.levels.h))
-    keys = [jr.fold_in(key, k) for k in levels]
-    each = [_fit(problem, problem.level(k), keys[k], basis) for k in levels]
-    return jtu.tree_map(lambda *xs: jnp.stack(xs), *each)
-
-
-@eqx.filter_jit
-def _fit(
-    problem: Problem, level: Level, key: PRNGKeyArray, basis: AbstractFitted | Quadratic
-) -> tuple[Functions, Array | None]:
-    """Functions with an axis for the candidates, and what the noise keeps of them."""
-    noise = noise_of(problem, level)
-    flat, unravel = jfu.ravel_pytree(problem.y0)
-    if isinstance(basis, Quadratic):
-        u, states = fit_derivatives(noise, key, basis)
-    else:
-        u, states = fit_values(noise, key, basis)
-    # Those before each step.
-    few = jnp.concatenate([states[:1] * 0 + flat, states[:-1]])[:, :_SECOND]
-
-    def second(i):
-        return noise.second(i, jax.vmap(unravel)(few[i]), lambda y: u(i, y))
-
-    return u, jax.lax.map(second, jnp.arange(problem.max_steps))
-
-
-def _chosen(fitted: PyTree[Array], best: np.ndarray) -> PyTree[Array]:
-    """The candidates `best`, of shape `(S, m)`. Coefficients end with the axes `C`, `S` and
-    `m`, with an axis of size 1 for a grid, before which there is nothing at all."""
-    functions, second = fitted
-
-    def take(x):
-        if isinstance(functions.basis, Grid):
-            return x[..., 0, :, :] * best.astype(x.dtype)
-        index = best.reshape(*[1] * (x.ndim - 2), *best.shape)
-        return jnp.take_along_axis(x, index, -3).squeeze(-3)
-
-    c, second = jtu.tree_map(take, (functions.coefficients, second))
-    return Functions(functions.frames, c, functions.basis), second
-
-
-def _spread(e: Expectation, times: int) -> np.ndarray:
-    """The variance of a sample of the first combination; larger where few of them make up
-    for most of it, so that it is not well known. Infinite if there are none."""
-
-    def bound(squares, largest):
-        n = max(e.num_samples, 1)
-        with np.errstate(all="ignore"):
-            bound = squares[0] / n + 2 * np.sqrt(squares[0] / n) * largest[0] / np.sqrt(
-                n
-            )
-        known = np.isfinite(bound) & (e.num_samples > 1)
-        return np.where(known, bound, np.inf).reshape(times, -1)
-
-    each = jtu.tree_map(bound, e.sums_of_squares, e.largest)
-    return np.concatenate(jtu.tree_leaves(each), axis=1)
-
-
-class ValueFunctionsSampler(AbstractLevelSampler):
+def _controlled_paths(p: Problem, functions: Functions, keys: PRNGKeyArray) -> Samples:
     """A sample is a path, with its value less what `functions`, along an axis of levels,
-    say of its noise; `second` is what the noise keeps of them."""
+    say of its noise."""
+    n = len(keys)
+
+    def begin(level):
+        noise, u = Noise.of(p, level), jtu.tree_map(lambda x: x[level.index], functions)
+
+        def step(i, paths):
+            at, second = lambda y: u(i, y), jtu.tree_map(lambda x: x[i], u.second)
+            one = lambda y, state, key: noise.advance(i, y, state, at, second, key)
+            out = jax.vmap(one)(paths.y, paths.solver_state, keys)
+            y, state, success, change = out
+            # A path that failed has no value, and its control must be finite all the same.
+            change = jnp.where(along(success, change), change, 0)
+            return paths.moved(p, y, state, success, paths.control + change)
+
+        dtype = jax.eval_shape(lambda: u(0, p.y0)).dtype
+        same = lambda x: jnp.broadcast_to(x, (n, *jnp.shape(x)))
+        state = jtu.tree_map(same, noise.fresh(0, p.y0))
+        control = jnp.zeros((n, *p.num_outputs), dtype)
+        return step, Ensemble.start(p, n, state, control)
+
+    return samples(p, begin)
+
+
+class Noise(eqx.Module):
+    r"""The random variables $x$ of the steps of a level. If their outcomes are few, a step
+    is taken for each of them, and expectations are finite sums.
+
+    Otherwise what stands for $u(y_1)$ less its expectation is made of the first and second
+    derivatives $a$ and $C$ of $u(y_1(x))$ at $x = 0$. It is $a \cdot x + \frac12 (x^\top C
+    x - \mathrm{tr}\, C \Sigma)$, with the variances $\Sigma$, and has mean zero whatever
+    $a$ and $C$ are, so that one $C$ does for all paths. For a quadratic function and noise
+    that enters the step linearly it is exact.
+    """
 
     problem: Problem
-    functions: Functions
-    second: Array | None
+    level: Level
+    laws: tuple[Discrete, ...] = eqx.field(static=True)
+    # Values and probabilities, if they are few.
+    outcomes: tuple[Float[np.ndarray, "K n"], Float[np.ndarray, " K"]] | None
 
-    def on_level(self, keys, level):
-        p, n = self.problem, len(keys)
-        noise = noise_of(p, level)
-        fitted = self.functions, self.second
-        u, second = jtu.tree_map(lambda x: x[level.index], fitted)
+    @staticmethod
+    def of(problem: Problem, level: Level) -> "Noise":
+        """Raises a `ValueError` for random variables without finitely many outcomes."""
+        laws = step_variables(problem.terms, level.h).laws
+        discrete = tuple(law for law in laws if isinstance(law, Discrete))
+        if len(discrete) < len(laws):
+            raise ValueError(
+                "`ValueFunctions` sums over the outcomes of a step, of which Gaussian "
+                "increments have infinitely many. Use a `WeakBrownianPath` in place of the "
+                "path in `terms`, or pass `sampling=ArrayRQMC(num_paths)`."
+            )
+        if math.prod(len(law.values) for law in discrete) > _MOST_OUTCOMES:
+            return Noise(problem, level, discrete, None)
+        values, probabilities = outcomes(discrete, 1)
+        few = values.astype(problem.dtype), probabilities
+        return Noise(problem, level, discrete, few)
 
-        def step(i, ensemble, control):
-            at, here = lambda y: u(i, y), jtu.tree_map(lambda x: x[i], second)
-            one = lambda y, state, key: noise.advance(i, y, state, at, here, key)
-            out = jax.vmap(one)(ensemble.y, ensemble.solver_state, keys)
-            y, state, change, success = out
-            # A path that failed has no value, and its control must be finite all the same.
-            control = control + jnp.where(along(success, change), change, 0)
-            return ensemble.moved(p, y, state, success), control
+    def draw(self, key: PRNGKeyArray, number, wide: bool = False) -> Float[Array, " n"]:
+        """The variables of the key and this number. With `wide`, few outcomes have the same
+        probability."""
+        words = random_words(key, (number, self.level.index), 1, len(self.laws))[0]
+        x = jnp.zeros(len(self.laws), self.problem.dtype)
+        for law in dict.fromkeys(self.laws):
+            own = law.from_words(words, x.dtype)
+            if wide and self.outcomes is not None:
+                own = jnp.asarray(law.values, x.dtype)[words % len(law.values)]
+            x = jnp.where(np.array([other == law for other in self.laws]), own, x)
+        return x
 
-        state = noise.fresh(0, p.y0)
-        same = jtu.tree_map(lambda x: jnp.broadcast_to(x, (n, *jnp.shape(x))), state)
-        ensemble, control = Ensemble.start(p, n, same), (n, *p.num_outputs)
-        control = jnp.zeros(control, jax.eval_shape(lambda: u(0, p.y0)).dtype)
-        keep = lambda x, failed: x
-        saved, ensemble, control = simulate(p, level, ensemble, step, control, keep)
-        return _controlled(saved, control), ~ensemble.failed, ensemble.failed
+    def nodes(self, x: Array | None = None) -> tuple[Any, np.ndarray]:
+        """Values of the variables, and weights with which their mean is the expectation;
+        with a draw `x`, and unless outcomes are few, an estimate from two values."""
+        if self.outcomes is not None:
+            return self.outcomes
+        if x is not None:
+            return jnp.stack([x, -x]), np.full(2, 0.5)
+        # Exact for polynomials of degree 3, and 5 in one variable.
+        m, arms = len(self.laws), np.diag(np.sqrt(3 * self._variances()))
+        points = np.concatenate([arms, -arms, np.zeros((1, m))])
+        weights = np.append(np.full(2 * m, 1 / 6), 1 - m / 3)
+        return points.astype(self.problem.dtype), weights
 
+    def mean(self, i, y: Y, u: Function, x: Array | None = None) -> Array:
+        """The expectation of `u` after step number `i` from `y`, by `nodes(x)`."""
+        (points, weights), state = self.nodes(x), self.fresh(i, y)
+        values = jax.vmap(lambda x: u(self.step(i, y, state, x)[0]))(points)
+        return jnp.tensordot(weights.astype(values.dtype), values, 1)
 
-def _controlled(saved: PyTree[Array], control: Float[Array, "n S m"]) -> PyTree[Array]:
-    """The values less their control variates."""
-    leaves, treedef = jtu.tree_flatten(saved)
-    ends = np.cumsum([x[0, 0].size for x in leaves])
-    parts = jnp.split(jnp.moveaxis(control, 1, 0), ends[:-1], axis=2)
-    less = lambda x, c: x - c.reshape(x.shape).astype(x.dtype)
-    return treedef.unflatten([less(x, c) for x, c in zip(leaves, parts)])
+    def advance(
+        self, i, y: Y, state: PyTree, u: Function, second: Array | None, key
+    ) -> tuple[Y, PyTree, Bool[Array, ""], Array]:
+        """The states after step number `i` of a path with this key; whether the step
+        succeeded; `u` there less its expectation, or what stands for that. `second` is what
+        `second` returns."""
+        x = self.draw(key, i)
+        if self.outcomes is None:
+            assert second is not None
+            y1, new, success = self.step(i, y, state, x)
+            first = jax.jacrev(lambda x: u(self.step(i, y, state, x)[0]))(0 * x)
+            square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
+            control = jnp.tensordot(first, x, 1) + jnp.tensordot(square, second, 2) / 2
+            return y1, new, success, control
+        points, weights = self.outcomes
+        ends, states, success = jax.vmap(lambda x: self.step(i, y, state, x))(points)
+        values, own = jax.vmap(u)(ends), jnp.argmax(jnp.all(points == x, axis=1))
+        mean = jnp.tensordot(weights.astype(values.dtype), values, 1)
+        y1, new, value = jtu.tree_map(lambda x: x[own], (ends, states, values))
+        return y1, new, jnp.all(success), value - mean
+
+    def second(self, i, ys: Y, u: Function) -> Array | None:
+        """The mean of the second derivatives at the states `ys`, if outcomes are many."""
+        if self.outcomes is not None:
+            return None
+        zero = jnp.zeros(len(self.laws), self.problem.dtype)
+        after = lambda y, x: u(self.step(i, y, self.fresh(i, y), x)[0])
+        at = lambda y: jax.hessian(lambda x: after(y, x))(zero)
+        mean = jnp.mean(jax.lax.map(at, ys), axis=0)
+        return jnp.moveaxis(mean, (-2, -1), (0, 1))
+
+    def step(self, i, y: Y, state: PyTree, x: Array):
+        return self.problem.step(self._terms(x), i, self.level.h, y, state)
+
+    def fresh(self, i, y: Y) -> PyTree[Array]:
+        """The state of a solver that begins with step number `i`. It serves for a fit,
+        which decides the variance only: a path takes its own state along."""
+        terms = self._terms(np.zeros(len(self.laws)))
+        return self.problem.init(terms, i, self.level.h, y)
+
+    def _terms(self, x):
+        return step_variables(self.problem.terms, self.level.h).terms_with(x)
+
+    def _variances(self) -> np.ndarray:
+        return np.array(
+            [np.dot(x.probabilities, np.square(x.values)) for x in self.laws]
+        )
