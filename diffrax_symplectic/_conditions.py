@@ -130,7 +130,7 @@ def drift_order(tableau: FlatTableau) -> int:
     def holds(tree: _Tree, part: str) -> bool:
         of = writes == part
         _, density = _size_and_density(tree)
-        return abs(flat.weights[of] @ elementary(tree)[of] - 1 / density) <= 1e-12
+        return bool(abs(flat.weights[of] @ elementary(tree)[of] - 1 / density) <= 1e-12)
 
     for order in range(1, _HIGHEST_DRIFT_ORDER + 1):
         conditions = itertools.product(_trees(order), set(writes))
