@@ -257,7 +257,7 @@ def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
         **_others_vanish(tableau.beta, e=np.ones(len(A1))),
     }
     squares = sum(_variance(v) * (tableau.alpha_hat @ x**2) for v, x in B0e.items())
-    both = tableau.beta.keys() & B0e.keys()
+    both = [v for v in B0e if v in tableau.beta]
     products = sum(_variance(v) * (tableau.beta[v] @ A1 @ B0e[v]) for v in both)
     second = {
         "alpha.A_hat e - 1/2": tableau.alpha @ tableau.A_hat.sum(axis=1) - 1 / 2,
