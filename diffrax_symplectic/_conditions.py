@@ -130,7 +130,7 @@ def drift_order(tableau: FlatTableau) -> int:
     def holds(tree: _Tree, part: str) -> bool:
         of = writes == part
         _, density = _size_and_density(tree)
-        return abs(flat.weights[of] @ elementary(tree)[of] - 1 / density) <= 1e-12
+        return bool(abs(flat.weights[of] @ elementary(tree)[of] - 1 / density) <= 1e-12)
 
     for order in range(1, _HIGHEST_DRIFT_ORDER + 1):
         conditions = itertools.product(_trees(order), set(writes))
@@ -257,7 +257,7 @@ def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
         **_others_vanish(tableau.beta, e=np.ones(len(A1))),
     }
     squares = sum(_variance(v) * (tableau.alpha_hat @ x**2) for v, x in B0e.items())
-    both = tableau.beta.keys() & B0e.keys()
+    both = [v for v in B0e if v in tableau.beta]
     products = sum(_variance(v) * (tableau.beta[v] @ A1 @ B0e[v]) for v in both)
     second = {
         "alpha.A_hat e - 1/2": tableau.alpha @ tableau.A_hat.sum(axis=1) - 1 / 2,
