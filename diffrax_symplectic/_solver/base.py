@@ -69,7 +69,7 @@ class Record(NamedTuple):
     def weak_order(self, commute: bool) -> int:
         return cast(int, self.order("expectations", commute))
 
-    def strong_order(self, commute: bool) -> float | None:
+    def strong_order(self, commute: bool) -> int | float | None:
         return self.order("paths", commute)
 
 
@@ -103,7 +103,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
                 return variable.increment
         return diffrax.AbstractBrownianIncrement
 
-    def strong_order(self, terms: PyTree[diffrax.AbstractTerm]) -> float | None:
+    def strong_order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | float | None:
         """Order of convergence of paths."""
         return self._order_for("paths", terms)
 
