@@ -1,24 +1,22 @@
 """Newton's method that does not give up, for the few paths that are left."""
 
 from collections.abc import Callable
-from typing import Any, TYPE_CHECKING, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import lineax as lx
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
 from .._compat import ω
 from .._custom_types import BoolScalarLike
 from . import _krylov, _linear
-from ._tolerance import all_finite, converged, largest, ratio
+from ._tolerance import all_finite, converged, largest, ratio, Tolerance
 
-
-if TYPE_CHECKING:
-    from ._picard_newton import PicardNewton
 
 _T = TypeVar("_T")
 _Vector: TypeAlias = Float[Array, " n"]
@@ -101,7 +99,10 @@ def begin(k: _Vector, solved: Bool[Array, ""]) -> Progress:
 
 
 def advance(
-    finder: "PicardNewton", equations: Equations, progress: Progress
+    tolerance: Tolerance,
+    linear_solver: lx.AbstractLinearSolver | None,
+    equations: Equations,
+    progress: Progress,
 ) -> Progress:
     """One iteration of Newton's method."""
     restore = jfu.ravel_pytree(equations.origin)[1]
@@ -109,11 +110,11 @@ def advance(
     s, k = progress.target, progress.k
     # Of the residual `r` at `k`, and of its derivative.
     part = lambda k, r: (1 - s) * k + s * r
-    if finder.linear_solver is not None or k.size <= _linear.MAX_DENSE:
+    if linear_solver is not None or k.size <= _linear.MAX_DENSE:
         value, jacobian = jax.linearize(residual, k)
         apply = lambda x: part(x, jacobian(x))
-        diff, exact = _linear.solve(apply, part(k, value), finder.linear_solver)
-        return _correct(finder, equations, progress, value, diff, exact)
+        diff, exact = _linear.solve(apply, part(k, value), linear_solver)
+        return _correct(tolerance, equations, progress, value, diff, exact)
 
     def product(carry):
         """One evaluation: the residual first, then what GMRES needs."""
@@ -127,7 +128,9 @@ def advance(
     carry = _krylov.empty(k.size, k.dtype), jnp.array(True), jnp.zeros_like(k)
     going = lambda carry: carry[1] | ~carry[0].done
     krylov, _, value = lax.while_loop(going, product, carry)
-    return _correct(finder, equations, progress, value, krylov.solution, krylov.reduced)
+    return _correct(
+        tolerance, equations, progress, value, krylov.solution, krylov.reduced
+    )
 
 
 def _where(which: Bool[Array, ""], a: _T, b: _T) -> _T:
@@ -135,7 +138,7 @@ def _where(which: Bool[Array, ""], a: _T, b: _T) -> _T:
 
 
 def _correct(
-    finder: "PicardNewton",
+    tolerance: Tolerance,
     equations: Equations,
     progress: Progress,
     residual: _Vector,
@@ -144,7 +147,7 @@ def _correct(
 ) -> Progress:
     """What follows from the correction `diff` for a residual; `exact` says whether its
     linear system was solved."""
-    s, k, tolerance = progress.target, progress.k - diff, finder.tolerance
+    s, k = progress.target, progress.k - diff
     restore = jfu.ravel_pytree(equations.origin)[1]
     scales = tolerance.sizes(equations.scale(restore(k)))
     change, moved, residuals = (

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from .._compat import ω
 from . import _continuation
 from ._batch import batched_together, where_pending
-from ._sweeps import Found, sweep, sweep_blocks
+from ._sweeps import Found, Limits, sweep, sweep_blocks
 from ._tolerance import Tolerance
 
 
@@ -100,10 +100,12 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         equations = _continuation.Equations(fn, args, options, y)
         lost = options.get("lost", jnp.array(False))
         begin = Found(jtu.tree_map(jnp.zeros_like, y), solved=lost, near=~lost)
+        direct = self.direct if self.linear_solver is None else 0
+        limits = Limits(self.tolerance, self.picard_steps, direct)
         if "blocks" in options:
-            found = sweep_blocks(self, options["blocks"], begin, equations.scale)
+            found = sweep_blocks(limits, options["blocks"], begin, equations.scale)
         else:
-            found = sweep(self, equations.image, begin, equations.scale)
+            found = sweep(limits, equations.image, begin, equations.scale)
         use = lambda k: jnp.where(found.solved | found.near, k, 0)
         k = jfu.ravel_pytree(jtu.tree_map(use, found.y))[0]
         return batched_together(State(y, _continuation.begin(k, found.solved)))
@@ -122,10 +124,10 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         pending = ~(state.progress.solved | state.progress.hopeless)
 
         def advance(problem, progress):
-            finder, equations = problem
-            return _continuation.advance(finder, equations, progress)
+            tolerance, linear_solver, equations = problem
+            return _continuation.advance(tolerance, linear_solver, equations, progress)
 
-        problem = self, equations
+        problem = self.tolerance, self.linear_solver, equations
         progress = where_pending(advance, pending, problem, state.progress)
         y = equations.moved(jfu.ravel_pytree(y)[1](progress.k))
         return y, State(state.origin, progress), fn(y, args)[1]

@@ -1,7 +1,7 @@
 """The iterations that normally solve a step, for all paths of a batch together."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 import jax
 import jax.flatten_util as jfu
@@ -14,11 +14,8 @@ from .._compat import ω
 from .._custom_types import IntScalarLike
 from ._batch import any_of_batch
 from ._linear import inverse, matrix_of
-from ._tolerance import all_finite, converged, largest, ratio
+from ._tolerance import all_finite, converged, largest, ratio, Tolerance
 
-
-if TYPE_CHECKING:
-    from ._picard_newton import PicardNewton
 
 _Map = Callable[[PyTree[Array]], PyTree[Array]]
 
@@ -37,6 +34,19 @@ _SLOW = 24
 _CHORDS, _MOST_CHORDS = 2, 20
 # A correction below this fraction of the state shows that iteration came near.
 _NEAR = 0.1
+
+
+class Limits(NamedTuple):
+    """When iteration ends.
+
+    - `tolerance`: for the next correction.
+    - `steps`: the most fixed-point iterations.
+    - `direct`: the most unknowns for chord iterations.
+    """
+
+    tolerance: Tolerance
+    steps: int
+    direct: int
 
 
 class Found(NamedTuple):
@@ -67,14 +77,14 @@ class _Rounds(NamedTuple):
 class _Look(NamedTuple):
     """A look at what iteration made of its values."""
 
-    finder: "PicardNewton"
+    limits: Limits
     scale: _Map
     most: int
     restore: _Map = lambda y: y
 
     def size(self, change: PyTree[Array], y: PyTree[Array]) -> tuple[Scalar, Scalar]:
         """The size of a change, in units of the tolerance and relative to the state."""
-        tolerance = self.finder.tolerance
+        tolerance = self.limits.tolerance
         return tolerance.compare(
             tolerance.sizes(self.restore(change)),
             tolerance.sizes(self.scale(self.restore(y))),
@@ -91,7 +101,7 @@ class _Look(NamedTuple):
         solved = finite & converged(size, relative, shrink, stalled)
         near = finite & (relative <= _NEAR) & ~stalled
         following = size * shrink**self.most
-        going = ~solved & near & (step < self.finder.picard_steps) & (following <= 1)
+        going = ~solved & near & (step < self.limits.steps) & (following <= 1)
         return _Rounds(y, size, solved, near, going, step)
 
 
@@ -121,27 +131,27 @@ def _while_any(
     return Found(last.y, last.solved, last.near)
 
 
-def sweep(finder: "PicardNewton", image: _Map, begin: Found, scale: _Map) -> Found:
+def sweep(limits: Limits, image: _Map, begin: Found, scale: _Map) -> Found:
     r"""From where it `begin`s, solves $y = \Phi(y)$ by $y \leftarrow y + M (\Phi(y) - y)$:
     fixed-point iteration with $M = 1$, and chord iteration with $M = (1 - \Phi')^{-1}$
     where that is slow."""
     y = begin.y
     n = sum(x.size for x in jtu.tree_leaves(y))
-    direct = n <= finder.direct and finder.linear_solver is None
+    direct = n <= limits.direct
     if direct and n <= _AT_ONCE:
         # Not even a look at the error pays.
         before, swept = _fixed_point(image, y, _WARMUP)
         # Where these go away from the solution, Newton's method begins at the guess.
-        sizes = finder.tolerance.sizes
+        sizes = limits.tolerance.sizes
         last, whole = sizes((swept**ω - before**ω).ω), sizes((swept**ω - y**ω).ω)
         settled = largest(last) < _SETTLED * largest(whole)
         y = jtu.tree_map(lambda a, b: jnp.where(settled, a, b), swept, y)
-        return _by_chords(finder, image, scale, begin._replace(y=y))
-    slow = _SLOW if direct else finder.picard_steps
-    found = _by_sweeps(_Look(finder, scale, slow), image, begin, chords_follow=direct)
+        return _by_chords(limits, image, scale, begin._replace(y=y))
+    slow = _SLOW if direct else limits.steps
+    found = _by_sweeps(_Look(limits, scale, slow), image, begin, chords_follow=direct)
     if not direct:
         return found
-    rest = lambda found: _by_chords(finder, image, scale, found)
+    rest = lambda found: _by_chords(limits, image, scale, found)
     return lax.cond(any_of_batch(~found.solved), rest, lambda found: found, found)
 
 
@@ -154,7 +164,7 @@ def _fixed_point(
 
 
 def sweep_blocks(
-    finder: "PicardNewton",
+    limits: Limits,
     blocks: Sequence[Callable[[list[PyTree[Array]]], _Map]],
     begin: Found,
     scale: _Map,
@@ -167,7 +177,7 @@ def sweep_blocks(
         if len(y[i]) == 0:
             continue
         own = lambda k, i=i: scale([*y[:i], k, *y[i + 1 :]])[i]
-        found = sweep(finder, block(y), begin._replace(y=y[i]), own)
+        found = sweep(limits, block(y), begin._replace(y=y[i]), own)
         y[i] = found.y
         solved, near = solved & found.solved, near & (found.solved | found.near)
     return Found(y, solved, near)
@@ -193,14 +203,12 @@ def _by_sweeps(look: _Look, image: _Map, begin: Found, chords_follow: bool) -> F
     return _while_any(advance, first, leave_together=chords_follow)
 
 
-def _by_chords(
-    finder: "PicardNewton", tree_image: _Map, scale: _Map, begin: Found
-) -> Found:
+def _by_chords(limits: Limits, tree_image: _Map, scale: _Map, begin: Found) -> Found:
     """From where iteration `begin`s, for paths that are not yet solved."""
     use = lambda x: jnp.where(begin.solved | begin.near, x, 0)
     k, restore = jfu.ravel_pytree(jtu.tree_map(use, begin.y))
     image = lambda k: jfu.ravel_pytree(tree_image(restore(k)))[0]
-    look = _Look(finder, scale, _MOST_CHORDS, restore)
+    look = _Look(limits, scale, _MOST_CHORDS, restore)
     value, jacobian = jax.linearize(image, k)
     one = jnp.eye(k.size, dtype=k.dtype)
     M = inverse(one - matrix_of(jacobian, k.size, k.dtype))
