@@ -229,6 +229,7 @@ def test_equal_paths_are_one_brownian_motion():
         ("`num_paths` must be an integer", dict(num_paths=1)),
         ("`replicates` must be an integer, 2 or larger", dict(replicates=1)),
         ("`levels` must be a positive integer", dict(levels=0)),
+        ("Pass fewer levels", dict(levels=40)),
         ("`tol` must be a positive number", dict(tol=0.0)),
         ("whole number of steps", dict(ts=[0.25])),
         ("whole number of steps", dict(t1=0.95)),

@@ -146,8 +146,9 @@ class Expectation(eqx.Module):
         lines = [f"{shown(m)} ± {brief(e)}" for m, e in zip(mean[:6], error)]
         lines += ["..."] * (len(mean) > 6)
         if self.bias is not None:
-            biases = ", ".join(map(brief, jtu.tree_leaves(self.bias)[:6]))
-            lines.append(f"bias of the finest step, not in the mean: {biases}")
+            listed = lambda x: ", ".join(map(brief, jtu.tree_leaves(x)[:6]))
+            lines.append(f"bias of the finest step, taken out: {listed(self.bias)}")
+            lines.append(f"all errors, extrapolation included: {listed(self.error)}")
         how = "" if self.sampling is None else f", {self.sampling}"
         lines.append(f"{self.num_paths:,} paths, {self.num_failed:,} failed{how}")
         lines += [self.reason] if self.reason else []

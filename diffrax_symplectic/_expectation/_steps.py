@@ -63,6 +63,11 @@ class Problem(eqx.Module):
         check_stratonovich(terms, solver, start, y0, args)
         check_takes("phi", phi, "t", "y", "args")
         check_real("phi", jtu.tree_leaves(eqx.filter_eval_shape(phi, start, y0, args)))
+        if num_steps * 2.0 ** (levels - 1) >= 2**31:
+            raise ValueError(
+                f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "
+                "2^31 steps. Pass fewer levels: two to four are enough to extrapolate."
+            )
         finer = 2 ** np.arange(levels, dtype=np.int32)
         grid = Level(
             jnp.arange(levels, dtype=jnp.int32),

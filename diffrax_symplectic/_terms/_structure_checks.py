@@ -171,7 +171,8 @@ def _advice(structure: str) -> str:
     return (
         f"If it only seems so, since variables cancel or because of a value in `args`, "
         f'write {how}, or pass `structure="{structure}"` to `hamiltonian_terms`. If not, '
-        "use a solver for the general structure, for example `ImplicitMidpoint` or `SRKw1`."
+        "use a solver for the general structure, for example `ImplicitMidpoint` or "
+        "`SRKw1`; for friction within `Damped`."
     )
 
 
