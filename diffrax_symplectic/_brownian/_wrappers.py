@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from .._arguments import whole_number
 from .._custom_types import BM
 from ._random import (
     AbstractLaw,
@@ -75,8 +74,13 @@ class TruncatedBrownianPath(AbstractWrappedPath):
                 "`TruncatedBrownianPath` wraps a Brownian path, for example "
                 f"`FixedStepBrownianPath(shape, key)`; got {type(path).__name__}."
             )
+        if isinstance(k, bool) or not isinstance(k, int) or k < 1:
+            raise ValueError(
+                "`k` must be an integer, 1 or larger (2 suits methods of strong order "
+                f"1); got {k!r}."
+            )
         self.path = path
-        self.k = whole_number("k", k)
+        self.k = k
 
     @property
     def levy_area(self):
