@@ -213,6 +213,7 @@ def test_the_quickest_sampling_is_chosen_and_gone_on_with():
     assert isinstance(got.sampling, ds.ValueFunctions) and got.tol_reached
     assert "variance times seconds: IndependentPaths" in got.reason
     more = _estimate(None, start=got)
+    assert more.reason == got.reason
     assert more.num_paths == got.num_paths and more.mean == got.mean
     # Without outcomes that can be enumerated it is another one.
     path = ds.FixedStepBrownianPath((), KEY)

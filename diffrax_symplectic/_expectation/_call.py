@@ -156,6 +156,8 @@ def expectation(
         )
     if plan is None:
         plan = sampling.prepare(problem, k_pilot, devices)
+    if start is not None:
+        plan = plan._replace(reason=start.reason)
     return run(plan, key, devices, sampling, start, tol, progress_meter)
 
 
@@ -194,7 +196,7 @@ def _chosen(
     if tol is not None:
         samples = int(np.clip(1.5 * variance / tol**2, plan.batch_size, _MOST))
         samples = max(samples, 2 * plan.least)
-    listed = ", ".join(f"{type(x).__name__} {work:.1e}" for work, _, x, _ in done)
+    listed = ", ".join(f"{type(x).__name__} {cost:.1e}" for cost, _, x, _ in done)
     name = "replicates" if isinstance(sampling, ArrayRQMC) else "num_paths"
     sampling = dataclasses.replace(sampling, **{name: samples})
     reason = f"variance times seconds: {listed}"
