@@ -14,11 +14,13 @@ from .._compat import ω
 from .._custom_types import IntScalarLike
 from ._batch import any_of_batch
 from ._linear import inverse, matrix_of
-from ._tolerance import all_finite, converged, largest, ratio, Tolerance
+from ._tolerance import converged, largest, ratio, Tolerance
 
 
 _Map = Callable[[PyTree[Array]], PyTree[Array]]
 
+# The numbers of iterations between two looks at the error are for double precision. In
+# single precision half as many reach rounding error.
 # Up to so many unknowns chords follow at once: they cost no more than a look at the error.
 _AT_ONCE = 2
 # Fixed-point iterations before these, and by how much the last of them may change the
@@ -64,7 +66,8 @@ class Found(NamedTuple):
 
 class _Rounds(NamedTuple):
     """The iterate, the size of its last correction, whether that was small enough, whether
-    iteration comes nearer, whether it goes on, and how many iterations there were."""
+    iteration comes nearer, whether it goes on, how many iterations there were, and the
+    size of each leaf of the state."""
 
     y: PyTree[Array]
     size: Scalar
@@ -72,6 +75,7 @@ class _Rounds(NamedTuple):
     near: Bool[Array, ""]
     going: Bool[Array, ""]
     step: IntScalarLike
+    scales: list[Scalar]
 
 
 class _Look(NamedTuple):
@@ -82,27 +86,28 @@ class _Look(NamedTuple):
     most: int
     restore: _Map = lambda y: y
 
-    def size(self, change: PyTree[Array], y: PyTree[Array]) -> tuple[Scalar, Scalar]:
+    def scales(self, y: PyTree[Array]) -> list[Scalar]:
+        return self.limits.tolerance.sizes(self.scale(self.restore(y)))
+
+    def size(
+        self, change: PyTree[Array], scales: list[Scalar]
+    ) -> tuple[Scalar, Scalar]:
         """The size of a change, in units of the tolerance and relative to the state."""
         tolerance = self.limits.tolerance
-        return tolerance.compare(
-            tolerance.sizes(self.restore(change)),
-            tolerance.sizes(self.scale(self.restore(y))),
-        )
+        return tolerance.compare(tolerance.sizes(self.restore(change)), scales)
 
-    def at(self, y, change, earlier: Scalar, root: _Map, step) -> _Rounds:
+    def at(self, y, change, earlier: Scalar, scales, root: _Map, step) -> _Rounds:
         """After an iteration that was a `change`. The `root` of how much it has shrunk,
         since the one of the size `earlier`, is the rate of one iteration."""
-        size, relative = self.size(change, y)
+        size, relative = self.size(change, scales)
         shrink = root(ratio(size, earlier))
         stalled = size >= 0.5 * earlier
-        # The norms do not tell: on CPUs XLA may return -inf as the maximum of NaNs.
-        finite = all_finite(y)
-        solved = finite & converged(size, relative, shrink, stalled)
-        near = finite & (relative <= _NEAR) & ~stalled
+        # If an entry is NaN, the size is, and all of these are false.
+        solved = converged(size, relative, shrink, stalled)
+        near = (relative <= _NEAR) & ~stalled
         following = size * shrink**self.most
         going = ~solved & near & (step < self.limits.steps) & (following <= 1)
-        return _Rounds(y, size, solved, near, going, step)
+        return _Rounds(y, size, solved, near, going, step, scales)
 
 
 def _while_any(
@@ -119,7 +124,8 @@ def _while_any(
             new[:1] + new[2:4],
             last[:1] + last[2:4],
         )
-        return _Rounds(y, new.size, solved, near, last.going & new.going, new.step)
+        going = last.going & new.going
+        return _Rounds(y, new.size, solved, near, going, new.step, new.scales)
 
     def proceed(rounds: _Rounds) -> Bool[Array, ""]:
         go = any_of_batch(rounds.going)
@@ -140,7 +146,7 @@ def sweep(limits: Limits, image: _Map, begin: Found, scale: _Map) -> Found:
     direct = n <= limits.direct
     if direct and n <= _AT_ONCE:
         # Not even a look at the error pays.
-        before, swept = _fixed_point(image, y, _WARMUP)
+        before, swept = _fixed_point(image, y, _paced(_WARMUP, y))
         # Where these go away from the solution, Newton's method begins at the guess.
         sizes = limits.tolerance.sizes
         last, whole = sizes((swept**ω - before**ω).ω), sizes((swept**ω - y**ω).ω)
@@ -153,6 +159,17 @@ def sweep(limits: Limits, image: _Map, begin: Found, scale: _Map) -> Found:
         return found
     rest = lambda found: _by_chords(limits, image, scale, found)
     return lax.cond(any_of_batch(~found.solved), rest, lambda found: found, found)
+
+
+def _paced(times: int, y: PyTree[Array]) -> int:
+    """How many of these iterations the precision of `y` takes."""
+    single = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).bits < 64
+    return times // 2 if single else times
+
+
+def _root(x: Scalar, power: int) -> Scalar:
+    """For powers of two."""
+    return x if power == 1 else _root(jnp.sqrt(x), power // 2)
 
 
 def _fixed_point(
@@ -184,22 +201,29 @@ def sweep_blocks(
 
 
 def _by_sweeps(look: _Look, image: _Map, begin: Found, chords_follow: bool) -> Found:
+    y, solved, near = begin
+    num_first, num_more = _paced(_FIRST, y), _paced(_MORE, y)
+
     def advance(rounds: _Rounds) -> _Rounds:
         first = rounds.step == 0
-        count = jnp.where(first, 1 + _FIRST, _MORE)
+        count = jnp.where(first, 1 + num_first, num_more)
         before, y = _fixed_point(image, rounds.y, count)
-        # The first iteration changed the values from zero to nearly what they are now. To
-        # measure that in every round would take a quarter of its time.
-        whole = lambda: look.size(y, y)[0]
-        earlier = lax.cond(first, whole, lambda: rounds.size)
-        change = (y**ω - before**ω).ω
-        fourth = lambda x: jnp.sqrt(jnp.sqrt(x))
-        root = lambda x: jnp.where(first, jnp.sqrt(fourth(x)), fourth(x))
-        return look.at(y, change, earlier, root, rounds.step + count)
 
-    y, solved, near = begin
-    size = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(y)))
-    first = _Rounds(y, size, solved, near, ~solved, 0)
+        def begun():
+            # The first iteration changed the values from zero to nearly what they are now.
+            # Nor does the size of the state change much where iteration goes on.
+            scales = look.scales(y)
+            return look.size(y, scales)[0], scales
+
+        # To measure these in every round would take a quarter of its time.
+        earlier, scales = lax.cond(first, begun, lambda: (rounds.size, rounds.scales))
+        change = (y**ω - before**ω).ω
+        root = lambda x: jnp.where(first, _root(x, num_first), _root(x, num_more))
+        return look.at(y, change, earlier, scales, root, rounds.step + count)
+
+    scales = jtu.tree_map(jnp.zeros_like, look.scales(y))
+    size = jnp.zeros((), jnp.result_type(*scales))
+    first = _Rounds(y, size, solved, near, ~solved, 0, scales)
     return _while_any(advance, first, leave_together=chords_follow)
 
 
@@ -214,13 +238,18 @@ def _by_chords(limits: Limits, tree_image: _Map, scale: _Map, begin: Found) -> F
     M = inverse(one - matrix_of(jacobian, k.size, k.dtype))
     diff = M @ (value - k)
     moved = jnp.where(begin.solved, k, k + diff)
-    size, _ = look.size(diff, moved)
+    scales = look.scales(moved)
+    size, _ = look.size(diff, scales)
+
+    chords = _paced(_CHORDS, k)
 
     def advance(rounds: _Rounds) -> _Rounds:
         chord = lambda k: k + M @ (image(k) - k)
-        before, k = _fixed_point(chord, rounds.y, _CHORDS)
-        return look.at(k, k - before, rounds.size, jnp.sqrt, rounds.step + _CHORDS)
+        before, k = _fixed_point(chord, rounds.y, chords)
+        root = lambda x: _root(x, chords)
+        step = rounds.step + chords
+        return look.at(k, k - before, rounds.size, look.scales(k), root, step)
 
-    first = _Rounds(moved, size, begin.solved, begin.near, ~begin.solved, 0)
+    first = _Rounds(moved, size, begin.solved, begin.near, ~begin.solved, 0, scales)
     found = _while_any(advance, first)
     return found._replace(y=restore(found.y))

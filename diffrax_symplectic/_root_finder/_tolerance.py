@@ -44,9 +44,10 @@ class Tolerance(eqx.Module):
 def max_norm(x: Array) -> Scalar:
     x = jnp.abs(x)
     if x.size > _SHORT:
-        # Of a number and NaN the larger is NaN. `jnp.max` loses it in large batches.
-        greater = lambda a, b: lax.select((a >= b) | (a != a), a, b)
-        return lax.reduce(x, jnp.zeros((), x.dtype), greater, range(x.ndim))
+        # The bits of floats that are not negative, read as integers, have the order of the
+        # values, and NaNs are the largest. The maximum of floats may lose these.
+        bits = lax.bitcast_convert_type(x, f"int{jnp.finfo(x.dtype).bits}")
+        return lax.bitcast_convert_type(jnp.max(bits), x.dtype)
     x = x.reshape(-1)
     while (n := x.size) > 1:
         x = jnp.maximum(x[: (n + 1) // 2], x[n // 2 :])
