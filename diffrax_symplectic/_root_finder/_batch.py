@@ -17,8 +17,8 @@ from .._compat import ClosedJaxpr, jaxpr_as_fun
 _T = TypeVar("_T")
 
 # Paths that need more than the others are gathered, and served by parts of the batch: so
-# many of them.
-_PARTS = 64
+# many of them. Mostly there are a few, and the work is that of whole parts.
+_PARTS = 256
 
 
 @jax.custom_batching.custom_vmap
