@@ -101,8 +101,8 @@ def inner_programs(eqn: JaxprEqn) -> Iterator[Any]:
                 yield item
 
 
-def unsolved_step_result(message: str) -> diffrax.RESULTS:
-    """A result of `diffrax.RESULTS` with a message of its own.
+def result_named(name: str, message: str) -> diffrax.RESULTS:
+    """A result of `diffrax.RESULTS` with a name and a message of its own.
 
     The solvers have to return one of `diffrax.RESULTS`, which Diffrax turns into an error,
     and what is there for an unsolved equation advises to increase `max_steps`. So one more
@@ -110,12 +110,12 @@ def unsolved_step_result(message: str) -> diffrax.RESULTS:
     """
     results = diffrax.RESULTS
     names, messages = results._name_to_item, results._index_to_message
-    if "stage_equations_unsolved" not in names:
+    if name not in names:
         number = np.array(len(messages), np.int32)
         item = type(results.successful)(number, results)  # pyright: ignore
-        names["stage_equations_unsolved"] = item  # pyright: ignore
+        names[name] = item  # pyright: ignore
         messages.append(message)
-    return names["stage_equations_unsolved"]  # pyright: ignore
+    return names[name]  # pyright: ignore
 
 
 def innermost_solve() -> Mapping[str, Any] | None:

@@ -38,6 +38,7 @@ from ._terms import (
     replace_paths,
     separable_fault,
     split_terms,
+    WRONG_WAY_ROUND,
 )
 
 
@@ -181,6 +182,8 @@ def suggest_solver(
     if gamma is not None:
         noises += " and friction"
     system = f"For {want}. The system is {kind}, with {noises}."
+    if not_separable is not None and kind and WRONG_WAY_ROUND in not_separable.reason:
+        system += f" It is not separable: {not_separable.reason}."
     if not_separable is not None and not_separable.advice.startswith(FRICTION):
         system += (
             f" {FRICTION} Ask for a solver for the terms without it, with `gamma=`."

@@ -88,6 +88,16 @@ def test_a_traced_friction_that_is_negative_fails_its_path_alone():
 
     gammas = jnp.array([0.5, -0.5, jnp.inf, jnp.nan])
     np.testing.assert_array_equal(run(gammas), [True, False, False, False])
+    with pytest.raises(eqx.EquinoxRuntimeError, match="`gamma` became negative"):
+        solver = ds.Damped(ds.ImplicitMidpoint(), jnp.array(0.1))
+        solver = eqx.tree_at(lambda s: s.gamma, solver, jnp.array(-0.1))
+        diffrax.diffeqsolve(terms, solver, 0.0, 0.5, 0.1, y0)
+
+
+def test_there_is_one_friction_only():
+    for solver in (ds.BAOAB(1.0), ds.Damped(ds.StormerVerlet(), 1.0)):
+        with pytest.raises(ValueError, match="has friction of its own"):
+            ds.Damped(solver, 1.0)
 
 
 def test_orders_are_those_of_the_splitting_where_the_solver_has_higher_ones():

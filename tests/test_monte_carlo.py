@@ -83,12 +83,16 @@ def test_failed_paths_are_counted_and_left_out():
         value = jnp.where(x > 0.9, jnp.nan, x)
         return value, diffrax.RESULTS.where(x < 0.2, bad, ok)
 
-    got = ds.monte_carlo(phi, jr.key(0), 5000, batch_size=999)
+    with pytest.warns(
+        UserWarning, match=r"paths failed: the mean is that of the other"
+    ):
+        got = ds.monte_carlo(phi, jr.key(0), 5000, batch_size=999)
     x = np.asarray(_by_hand(jr.uniform, jr.key(0), 5000))
     good = x[(x >= 0.2) & (x <= 0.9)]
     assert got.num_paths == len(good) and got.num_failed == 5000 - len(good)
     np.testing.assert_allclose(got.mean, good.mean(), rtol=1e-13)
-    nothing = ds.monte_carlo(lambda key: jnp.nan, jr.key(0), 10)
+    with pytest.warns(UserWarning, match="10 paths failed: there is no mean"):
+        nothing = ds.monte_carlo(lambda key: jnp.nan, jr.key(0), 10)
     assert (nothing.num_paths, nothing.num_failed) == (0, 10)
     assert np.isnan(nothing.std_error)
 

@@ -4,6 +4,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import lineax as lx
 import numpy as np
 import pytest
 
@@ -287,3 +288,15 @@ def test_bad_input_gets_a_clear_error():
         ds.suggest_solver(terms, 0.0, jnp.ones(2), want="paths")
     with pytest.raises(ValueError, match="real floating-point"):
         ds.suggest_solver(terms, 0.0, (1j * jnp.ones(()), jnp.ones(())), want="paths")
+
+
+def test_suggestions_say_what_the_other_order_of_the_state_would_allow():
+    f = lambda t, y, args: (y[1], -jnp.sin(y[0]))
+    struct = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    g = lambda t, y, args: lx.FunctionLinearOperator(lambda w: (0 * w, 0.3 * w), struct)
+    path = ds.WeakBrownianPath((), jr.key(0))
+    terms = diffrax.MultiTerm(diffrax.ODETerm(f), diffrax.ControlTerm(g, path))
+    y0 = jnp.array(0.5), jnp.array(0.1)
+    got = ds.suggest_solver(terms, 0, y0, want="paths")
+    assert "is the state the wrong way round?" in got.system
+    assert "StormerVerlet" not in str(got)

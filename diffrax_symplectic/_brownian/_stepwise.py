@@ -276,35 +276,40 @@ def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
     `jax.jit` of the user's around `evaluate`.
     """
     name = type(path).__name__
+    tree = "use `diffrax.VirtualBrownianTree` as path"
     solve = innermost_solve()
     if solve is None or not _holds(solve.get("terms"), type(path)):
         return
     _check_times(path)
     controller = solve.get("stepsize_controller")
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        # Diffrax refuses solvers without an error estimate, with any path.
+        estimates = isinstance(solve.get("solver"), diffrax.AbstractAdaptiveSolver)
         raise ValueError(
             f"`{name}` cannot be used with the adaptive step size controller "
             f"`{type(controller).__name__}`: its increments belong to one step size and "
-            "cannot be refined. Pass `stepsize_controller=diffrax.ConstantStepSize()` (or "
-            "`diffrax.StepTo`), or use `diffrax.VirtualBrownianTree` as path."
+            "cannot be refined. Pass `stepsize_controller=diffrax.ConstantStepSize()` or "
+            f"`diffrax.StepTo`{f', or {tree}' if estimates else ''}."
         )
     if isinstance(solve.get("solver"), diffrax.HalfSolver):
         raise ValueError(
             f"`{name}` cannot be used with `diffrax.HalfSolver`: the increments of the "
             "two half steps do not add up to the one of the whole step. Pass the wrapped "
-            "solver itself, or use `diffrax.VirtualBrownianTree` as path."
+            f"solver itself, or {tree}."
         )
 
 
 def _check_times(path: diffrax.AbstractBrownianPath) -> None:
     """Looks at the times of the solve, where these are numbers. A `ValueError` if they are
-    no multiples of the path's `cell`. Without cells, a warning if `dt0` does not divide the
-    interval. (Steps of other controllers, and times that are traced, are checked when
-    run.)"""
+    no multiples of the path's `cell`, or `dt0` does not divide the interval; without cells
+    that is a warning. (Steps of other controllers, and times that are traced, are checked
+    when run.)"""
     times = innermost_times()
     if times is None:
         return
     cell, number = getattr(path, "cell", None), int | float | np.number
+    numbers = all(isinstance(x, number) for x in times)
+    ends = not numbers or _divides(times[2], times[1] - times[0])
     if cell is not None:
         for name, time in zip(("t0", "t1", "dt0"), times):
             if isinstance(time, number) and not _divides(cell, time):
@@ -313,14 +318,19 @@ def _check_times(path: diffrax.AbstractBrownianPath) -> None:
                     f"multiples of `cell`; got cell={cell} and {name}={time}. Pass a "
                     "`cell` that divides `t0`, `t1` and `dt0`."
                 )
-    elif all(isinstance(x, number) for x in times):
-        t0, t1, dt0 = times
-        if not _divides(dt0, t1 - t0):
-            warnings.warn(
-                f"`dt0={dt0}` does not divide the time from {t0} to {t1}: the last step is "
-                "a shorter one. For `n` equal steps pass `dt0=(t1 - t0) / n`.",
-                stacklevel=2,
-            )
+    t0, t1, dt0 = times
+    if not ends and cell is not None:
+        raise ValueError(
+            f"All steps of a `{type(path).__name__}` with `cell` must have one size; got "
+            f"dt0={dt0}, which does not divide the time from {t0} to {t1}. For `n` equal "
+            "steps pass `dt0=(t1 - t0) / n`."
+        )
+    if not ends:
+        warnings.warn(
+            f"`dt0={dt0}` does not divide the time from {t0} to {t1}: the last step is "
+            "a shorter one. For `n` equal steps pass `dt0=(t1 - t0) / n`.",
+            stacklevel=2,
+        )
 
 
 def _divides(part: float, whole: float) -> bool:

@@ -21,6 +21,8 @@ from scipy.special import stdtrit
 from .._brownian import check_key
 
 
+# Where a larger share of the paths fails, a warning says so.
+_MANY = 0.01
 NO_METER = diffrax.NoProgressMeter()
 # NumPy returns scalars, which are not arrays, from operations on arrays without axes.
 _Host = PyTree[np.ndarray | np.floating]
@@ -146,9 +148,12 @@ class Expectation(eqx.Module):
         lines = [f"{shown(m)} ± {brief(e)}" for m, e in zip(mean[:6], error)]
         lines += ["..."] * (len(mean) > 6)
         if self.bias is not None:
-            listed = lambda x: ", ".join(map(brief, jtu.tree_leaves(x)[:6]))
-            lines.append(f"bias of the finest step, taken out: {listed(self.bias)}")
-            lines.append(f"all errors, extrapolation included: {listed(self.error)}")
+            leaves = lambda x: [brief(y) for y in jtu.tree_leaves(x)[:6]]
+            pairs = zip(leaves(self.bias), leaves(self.bias_std_error))
+            biases = ", ".join(f"{bias} ± {error}" for bias, error in pairs)
+            lines.append(f"bias of the finest step, taken out: {biases}")
+            errors = ", ".join(leaves(self.error))
+            lines.append(f"all errors, extrapolation included: {errors}")
         how = "" if self.sampling is None else f", {self.sampling}"
         lines.append(f"{self.num_paths:,} paths, {self.num_failed:,} failed{how}")
         lines += [self.reason] if self.reason else []
@@ -206,9 +211,11 @@ def run(
     start: Expectation | None = None,
     tol: float | None = None,
     progress_meter: diffrax.AbstractProgressMeter = NO_METER,
+    trial: bool = False,
 ) -> Expectation:
-    """The estimate from the samples of a plan. What a device computes, and in which order
-    its sums are added up, does not depend on how many there are."""
+    """The estimate from the samples of a plan; no warnings in a `trial`. What a device
+    computes, and in which order its sums are added up, does not depend on how many there
+    are."""
     sampler, most = plan.sampler, plan.num_samples
     key_data, size = np.asarray(jr.key_data(key)), min(plan.batch_size, most)
     if jax.process_count() > 1:
@@ -271,6 +278,22 @@ def run(
     finally:
         progress_meter.close(meter)
     estimate = finished()
+    if not trial:
+        _warn_of(estimate, tol)
+    return estimate
+
+
+def _warn_of(estimate: Expectation, tol: float | None) -> None:
+    done, lost = estimate.num_paths, estimate.num_failed
+    if lost > _MANY * (done + lost):
+        rest = f"the mean is that of the other {done:,}, and biased"
+        rest = rest if done else "there is no mean"
+        warnings.warn(
+            f"{lost:,} paths failed: {rest}. Take smaller steps or bounded "
+            "increments, such as those of a `WeakBrownianPath`; and look for NaNs in `y0`, "
+            "`args` and the Hamiltonians.",
+            stacklevel=4,
+        )
     if estimate.tol_reached is False:
         errors = jtu.tree_leaves(estimate.std_error)
         largest = max(float(np.max(x, initial=0.0)) for x in errors)
@@ -278,9 +301,8 @@ def run(
             f"`tol={tol}` was not reached: the largest standard error is {largest:.1e} "
             f"after {estimate.num_paths:,} paths. Take more paths, going on with `start=`, "
             "or another `sampling`.",
-            stacklevel=3,
+            stacklevel=4,
         )
-    return estimate
 
 
 @eqx.filter_jit

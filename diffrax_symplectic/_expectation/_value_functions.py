@@ -102,7 +102,8 @@ class ValueFunctions(AbstractSampling):
         # The paths that choose are not those that are averaged.
         own = jr.fold_in(key, len(problem.levels.h))
         trials = [
-            run(plan(all_of(k), self.batch_size), own, devices) for k in range(count)
+            run(plan(all_of(k), self.batch_size), own, devices, trial=True)
+            for k in range(count)
         ]
         best = np.argmin([_spread(e, times) for e in trials], axis=0)
         listed = lambda which: ", ".join(str(basis.candidates[k]) for k in which)

@@ -5,15 +5,16 @@ import functools as ft
 from collections.abc import Callable
 from typing import NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from .._compat import materialize, nondifferentiable
+from .._compat import materialize, nondifferentiable, result_named
 from .._custom_types import RealScalarLike
 
 
@@ -104,6 +105,37 @@ def friction_modes(
     return found
 
 
+_NO_FRICTION = (
+    "`gamma` became negative or not finite, or as a matrix not symmetric positive "
+    "semidefinite, while it was traced. To fit it, let `gamma` be the exponential of what "
+    "is fitted."
+)
+
+
+def friction_result(
+    gamma: PyTree[ArrayLike], modes: list[Modes | None], result: diffrax.RESULTS
+) -> diffrax.RESULTS:
+    """`result`, or where values of `gamma` that were traced are no friction, one that says
+    so."""
+    leaves = jtu.tree_leaves(gamma)
+    leaves = leaves if len(leaves) == len(modes) else leaves * len(modes)
+    bad = [
+        _no_rate(g) if mode is None else jnp.any(jnp.isnan(mode.rates))
+        for g, mode in zip(leaves, modes)
+        if isinstance(g, jax.core.Tracer)
+    ]
+    if len(bad) == 0:
+        return result
+    said = result_named("no_friction", _NO_FRICTION)
+    bad = ft.reduce(jnp.logical_or, bad)
+    return diffrax.RESULTS.where(bad, said, result)  # pyright: ignore
+
+
+def _no_rate(g: ArrayLike) -> Bool[Array, ""]:
+    g = jnp.asarray(g)
+    return ~jnp.all(jnp.isfinite(g) & (g >= 0))
+
+
 def _for_each(gamma: PyTree[ArrayLike], p: PyTree[Array]) -> list:
     """The array of `gamma` for each array of `p`."""
     if jtu.treedef_is_leaf(jtu.tree_structure(gamma)):
@@ -185,9 +217,8 @@ def _like(x: ArrayLike, y: Array) -> Array:
 
 
 def _factor(fn: Callable[[Array], Array], g: Array, time: Array) -> Array:
-    bad = ~jnp.all(jnp.isfinite(g) & (g >= 0))
     # Values that are traced cannot raise an error here. They make their path fail.
-    return jnp.where(bad, jnp.nan, fn(g * time))
+    return jnp.where(_no_rate(g), jnp.nan, fn(g * time))
 
 
 _dot = ft.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)

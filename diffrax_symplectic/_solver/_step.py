@@ -14,7 +14,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, PyTree
 
-from .._compat import materialize, unsolved_step_result, ω
+from .._compat import materialize, result_named, ω
 from .._custom_types import RealScalarLike, Y
 from .._plan import Block, Plan
 from .._root_finder import (
@@ -240,7 +240,8 @@ def _traced_once(plan: Plan, step: Step, y0: Y, lost, finder: Any, max_steps: in
 _UNSOLVED = (
     "The stage equations of a step were not solved. Take smaller steps; for Gaussian paths "
     "bound the increments with `TruncatedBrownianPath`; or, if the step is solvable but "
-    "hard, raise `root_find_max_steps` of the solver (not `max_steps` of `diffeqsolve`)."
+    "hard, raise `root_find_max_steps` of the solver (not `max_steps` of `diffeqsolve`). "
+    "If this is the first step, look for NaNs in `y0` and `args`."
 )
 
 
@@ -250,7 +251,8 @@ def result_of(unsolved: Unsolved, y1: Y) -> diffrax.RESULTS:
     finite = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
     if unsolved is None:
         return finite
-    return R.where(unsolved, unsolved_step_result(_UNSOLVED), finite)
+    said = result_named("stage_equations_unsolved", _UNSOLVED)
+    return R.where(unsolved, said, finite)
 
 
 @eqx.filter_custom_jvp

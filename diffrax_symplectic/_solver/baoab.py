@@ -17,6 +17,7 @@ from ._friction import (
     checked,
     decay,
     friction_modes,
+    friction_result,
     GAMMA,
     matrix_faults,
     spread,
@@ -122,7 +123,8 @@ class BAOAB(AbstractSymplecticSolver):
         q = move(q, _rate(drift, t1, (p, q), args)[1])
         forces, _ = _rate(drift, t1, (p, q), args)
         y1 = move(p, forces), q
-        return y1, None, dict(y0=y0, y1=y1), (forces, modes), result_of(None, y1)
+        result = friction_result(self.gamma, modes, result_of(None, y1))
+        return y1, None, dict(y0=y0, y1=y1), (forces, modes), result
 
 
 def _rate(drift: tuple, t: RealScalarLike, y: Y, args: Args) -> Y:

@@ -23,6 +23,7 @@ from ._friction import (
     checked,
     decay,
     friction_modes,
+    friction_result,
     GAMMA,
     matrix_faults,
     Modes,
@@ -55,6 +56,10 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
     @abc.abstractmethod
     def exact_flow(self, prepared: Any, time: RealScalarLike, y: Y, args: Args) -> Y:
         """The flow over `time`, which is negative in a solve backward in time."""
+
+    @abc.abstractmethod
+    def result_with(self, prepared: Any, result: diffrax.RESULTS) -> diffrax.RESULTS:
+        """`result` of a step of the solver, or what is wrong with the flow."""
 
     def __check_init__(self):
         if not isinstance(self.solver, AbstractSymplecticSolver):
@@ -115,6 +120,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
             terms, t0, t1, y, args, inner, True
         )
         y1 = self.exact_flow(prepared, time, y, args)
+        result = self.result_with(prepared, result)
         return y1, error, dict(y0=y0, y1=y1), (inner, prepared), result
 
 
@@ -154,6 +160,11 @@ class Damped(AbstractSplitting):
 
     def __post_init__(self):
         self._faults = matrix_faults(self.gamma)
+        if hasattr(self.solver, "gamma"):
+            raise ValueError(
+                f"`{type(self.solver).__name__}` has friction of its own. Pass it all the "
+                "friction, and take it without `Damped`."
+            )
 
     choose: ClassVar[str] = "Friction: collisions, damping, thermostats."
     advice: ClassVar[str] = (
@@ -170,6 +181,9 @@ class Damped(AbstractSplitting):
     def exact_flow(self, prepared: list[Modes | None], time, y, args):
         p, q = y
         return apply_friction(self.gamma, prepared, time, (decay, p)), q
+
+    def result_with(self, prepared, result):
+        return friction_result(self.gamma, prepared, result)
 
 
 def _check_has_momentum(terms: PyTree[diffrax.AbstractTerm]) -> None:
@@ -255,6 +269,10 @@ class LinearFlow(AbstractSplitting):
                 f"{eqx.tree_pformat(y)}; got {eqx.tree_pformat(y1)}."
             )
         return y1
+
+    def result_with(self, prepared, result):
+        del prepared
+        return result
 
 
 _MESSAGE = (

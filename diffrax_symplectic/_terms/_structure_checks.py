@@ -76,7 +76,7 @@ def separable_fault(
     noise_flows = [_flow(x, t0, y0, args) for x in _not_asserted(noise, "separable")]
     fault = _fault_with_momenta(0, drift_flows, noise_flows)
     if fault is not None and not _fault_with_momenta(1, drift_flows, noise_flows):
-        return Fault(f"{fault.reason}. {_WRONG_WAY_ROUND}", fault.advice)
+        return Fault(f"{fault.reason}. {WRONG_WAY_ROUND}", fault.advice)
     return fault
 
 
@@ -176,7 +176,7 @@ def _advice(structure: str) -> str:
     )
 
 
-_WRONG_WAY_ROUND = (
+WRONG_WAY_ROUND = (
     "With the halves of the state exchanged it would be so: is the state the wrong way "
     "round? It is `(p, q)`, momentum first, and not (position, velocity)"
 )
