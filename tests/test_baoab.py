@@ -16,7 +16,7 @@ from examples.hard_cases import double_well
 from examples.hard_cases._ensemble import gaussian, weak
 from examples.hard_cases._stationary import stationary_bias, Step
 
-from .problems import Given, slope, values_of_a_step, weak_path
+from .problems import Given, orders_of_a_splitting, weak_path
 
 
 def _bath(sigma):
@@ -71,25 +71,6 @@ def test_positions_in_a_harmonic_well_have_the_law_of_gibbs(h):
     assert abs(moments[-1] - T / stiffness) <= 1e-13
 
 
-def _defect_orders(solver, terms, friction, y0):
-    """Slopes of the local weak defect. The generator of the equation with friction comes
-    with the defect of a solver that takes friction as a term; what that one expects after
-    the step is then exchanged for what `solver` expects."""
-    both = diffrax.MultiTerm(*terms.terms, diffrax.ODETerm(friction))
-    fn = dict(fn=values_of_a_step)
-
-    def defect(h):
-        step = 0.1, 0.1 + h, y0
-        other = both, diffrax.Heun(), *step
-        exchange = ds.step_expectation(terms, solver, *step, **fn)
-        exchange = exchange - ds.step_expectation(*other, **fn)
-        return ds.weak_order_defect(*other, **fn, order=2) + exchange
-
-    hs = np.array([0.02, 0.01, 0.005])
-    defects = jax.jit(lambda hs: jax.lax.map(defect, hs))(hs)
-    return [slope(hs, d) for d in defects.T]
-
-
 @pytest.mark.parametrize(
     "wrap", [ds.BAOAB, lambda gamma: ds.Damped(ds.StormerVerlet(), gamma)]
 )
@@ -101,7 +82,8 @@ def test_local_weak_defect_is_of_order_three(friction, wrap):
     terms = ds.hamiltonian_terms(_pendula, _bath(SIGMA), weak_path(2))
     term = lambda t, y, args: (-full @ y[0], jnp.zeros_like(y[1]))
     y0 = jnp.array([0.3, -0.4]), jnp.array([0.5, 0.1])
-    slopes = _defect_orders(wrap(gamma), terms, term, y0)
+    hs = np.array([0.02, 0.01, 0.005])
+    slopes = orders_of_a_splitting(wrap(gamma), terms, term, y0, hs)
     np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 
 

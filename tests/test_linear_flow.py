@@ -11,7 +11,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._adjoint import _undoes_its_steps
 from examples.hard_cases import klein_gordon
 
-from .problems import Given, weak_path
+from .problems import Given, orders_of_a_splitting, weak_path
 
 
 def _rest(t, p, q, args):
@@ -67,6 +67,22 @@ def test_orders_are_those_of_the_splitting_where_the_solver_has_higher_ones():
     assert orders(ds.AdditiveGauss())[1] == 2
     assert orders(ds.PlateauVerlet())[2] == 1.0
     assert orders(ds.SRKs1()) == [2, 1, 1.0]
+
+
+def test_noises_that_do_not_commute_leave_the_splitting_at_weak_order_two():
+    # Neither with each other nor with the flow.
+    def noise(t, p, q, args):
+        return jnp.stack([0.3 * jnp.sum(p * q), 0.15 * jnp.sum(q**2 - p**2)])
+
+    flow = klein_gordon.waves(2, 1.0)
+    wave = lambda t, y, args: jax.jvp(lambda s: flow(s, y, args), (0.0,), (1.0,))[1]
+    terms = ds.hamiltonian_terms(_rest, noise, weak_path(2, two_point=True))
+    solver = ds.LinearFlow(ds.NinomiyaVictoir(), flow)
+    y0 = jnp.array([0.3, -0.4]), jnp.array([0.5, 0.1])
+    # The frequencies are 1 and 2.2.
+    hs = np.array([0.02, 0.01, 0.005])
+    slopes = orders_of_a_splitting(solver, terms, wave, y0, hs)
+    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 
 
 def test_linear_systems_without_a_rest_are_solved_exactly():
