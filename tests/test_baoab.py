@@ -115,6 +115,7 @@ def test_spread_is_smooth_and_exact_on_both_sides_of_zero():
     np.testing.assert_allclose(spread(-x), jnp.exp(x) * spread(x), rtol=1e-14)
     assert spread(jnp.array(0.0)) == 1 and jax.grad(spread)(0.0) == -0.5
     assert jnp.isfinite(spread(jnp.array(1e4)))
+    assert jnp.isfinite(jax.grad(spread)(1e50))
 
 
 def test_a_matrix_of_friction_is_that_of_its_own_axes():

@@ -28,6 +28,38 @@ def test_momentum_alone_decays_exactly_forward_and_backward():
         np.testing.assert_allclose(sol.ys[0][-1], expected, rtol=1e-14)
 
 
+@pytest.mark.parametrize("wrap", [ds.BAOAB, lambda gamma: ds.Damped(ds.SRKs1(), gamma)])
+def test_one_number_serves_all_momenta_in_their_precision(wrap):
+    # Without noise, too.
+    free = lambda t, p, q, args: 0 * jnp.sum(p["a"])
+    none = lambda t, p, q, args: 0 * q["a"]
+    term = ds.hamiltonian_terms(free, none, Given(jnp.zeros(2))).terms[0]
+    p = {"a": jnp.ones(2, jnp.float32), "b": jnp.full((3, 1), 2, jnp.float32)}
+    t0, t1 = jnp.float32(0), jnp.float32(0.5)
+    solver = wrap(np.float64(0.8))
+    state = solver.init(term, t0, t1, (p, p), None)
+    p1, _ = solver.step(term, t0, t1, (p, p), None, state, False)[0]
+    for name in p:
+        assert p1[name].dtype == jnp.float32
+        np.testing.assert_allclose(p1[name], p[name] * np.exp(-0.4), rtol=1e-6)
+
+
+@pytest.mark.parametrize("wrap", [ds.BAOAB, lambda gamma: ds.Damped(ds.SRKs1(), gamma)])
+def test_momenta_fall_at_the_rate_of_a_matrix_when_the_step_is_prolonged(wrap):
+    free = lambda t, p, q, args: 0 * jnp.sum(p)
+    none = lambda t, p, q, args: jnp.stack([0 * jnp.sum(q)])
+    term = ds.hamiltonian_terms(free, none, Given(jnp.zeros(1))).terms[0]
+    matrix = jnp.array([[1.0, 0.4], [0.4, 0.7]])
+    y0, solver = (jnp.array([1.0, 2.0]), jnp.zeros(2)), wrap(matrix)
+
+    def after(h):
+        state = solver.init(term, 0.0, h, y0, None)
+        return solver.step(term, 0.0, h, y0, None, state, False)[0][0]
+
+    p1, rate = jax.jvp(after, (0.3,), (1.0,))
+    np.testing.assert_allclose(rate, -matrix @ p1, atol=1e-14)
+
+
 @pytest.mark.parametrize("gamma", [-1.0, np.nan, np.inf, 1j, "much"])
 def test_friction_must_be_finite_and_not_negative(gamma):
     with pytest.raises(ValueError, match="`gamma` must be"):
@@ -110,11 +142,14 @@ def test_orders_are_those_of_the_splitting_where_the_solver_has_higher_ones():
     assert orders(ds.AdditiveGauss())[1] == 2
     assert orders(ds.PlateauVerlet())[2] == 1.0
     assert orders(ds.SRKs1()) == [2, 1, 1.0]
+    assert ds.Damped(ds.PlateauGauss(), 1.0).record.strong == (1, 0.5)
 
 
-def test_between_steps_a_solution_is_interpolated_between_their_ends():
-    terms = ds.hamiltonian_terms(_oscillator, _force, Given(jnp.array([0.3])))
-    solver, y0 = ds.Damped(ds.StormerVerlet(), 1.0), (jnp.ones(2), jnp.ones(2))
+@pytest.mark.parametrize("solver", [ds.Damped(ds.StormerVerlet(), 1.0), ds.BAOAB(1.0)])
+def test_between_steps_a_solution_is_interpolated_between_their_ends(solver):
+    push = lambda t, p, q, args: jnp.stack([jnp.sum(q)])
+    terms = ds.hamiltonian_terms(_oscillator, push, Given(jnp.array([0.3])))
+    y0 = jnp.ones(2), jnp.ones(2)
     state = solver.init(terms, 0.0, 0.1, y0, None)
     y1, _, dense, *_ = solver.step(terms, 0.0, 0.1, y0, None, state, False)
     np.testing.assert_array_equal(dense["y0"], y0)
