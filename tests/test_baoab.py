@@ -226,6 +226,14 @@ def test_systems_without_the_structure_are_refused():
             )
 
 
+def test_states_that_are_not_real_floating_point_are_refused():
+    terms = ds.hamiltonian_terms(_pendula, _bath(SIGMA), weak_path(2))
+    for dtype in (int, complex):
+        y0 = jnp.ones(2, dtype), jnp.ones(2, dtype)
+        with pytest.raises(ValueError, match="`BAOAB` needs a state `y0` of real"):
+            ds.BAOAB(1.0).init(terms, 0.0, 0.1, y0, None)
+
+
 def test_one_evaluation_of_the_forces_in_a_step():
     calls = []
 
