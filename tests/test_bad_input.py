@@ -200,7 +200,7 @@ def test_cells_that_do_not_divide_the_step_are_refused_while_tracing():
         jax.eval_shape(lambda h: solve(1, h, wrapped), 0.07)
 
 
-def test_a_shorter_last_step_is_announced_once():
+def test_steps_of_several_sizes_are_announced_once():
     H = lambda t, p, q, args: jnp.sum(p**2 + q**2)
     y0 = (jnp.ones(2), jnp.ones(2))
 
@@ -220,9 +220,10 @@ def test_a_shorter_last_step_is_announced_once():
     assert "(t1 - t0) / n" in message
     for t1, dt0 in ((1, 0.1), (100.0, 0.05), (0.7, 0.1)):
         assert announced(t1, dt0, weak) == []
-    # Steps of cells follow one path however they are cut.
+    # They do not even begin and end at cells.
     cells = ds.FixedStepBrownianPath((), jr.key(0), cell=0.1)
-    assert announced(1, 0.3, cells) == []
+    with pytest.raises(ValueError, match="must have one size; got dt0=0.3"):
+        announced(1, 0.3, cells)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
