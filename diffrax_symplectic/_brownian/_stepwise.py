@@ -327,8 +327,8 @@ def _check_times(path: diffrax.AbstractBrownianPath) -> None:
         )
     if not ends:
         warnings.warn(
-            f"`dt0={dt0}` does not divide the time from {t0} to {t1}: Diffrax takes steps of "
-            "several sizes. For `n` equal steps pass `dt0=(t1 - t0) / n`.",
+            f"`dt0={dt0}` does not divide the time from {t0} to {t1}: Diffrax takes steps "
+            "of several sizes. For `n` equal steps pass `dt0=(t1 - t0) / n`.",
             stacklevel=2,
         )
 

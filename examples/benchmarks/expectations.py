@@ -169,7 +169,8 @@ CASES = {
     ),
     "chain of 32, s = 0.1": Case(
         lambda t, y, args: jnp.mean(y[1] ** 2), _chain(0.1), _verlet, 2.0, 16,
-        chain.start(1.0), 3, 2, 4096, lambda: np.nan,
+        chain.start(1.0), 2, 2, 2**14,
+        lambda: _exact.chain_square(0.5, 0.1, 2.0, 64, 2**13, 32)[0],
     ),
 }  # fmt: skip
 
