@@ -50,6 +50,18 @@ def _enumerated(terms, solver, y, phi, h: float, steps: int):
     return ds.step_expectation(terms, solver, 0.0, h, y, fn=then)
 
 
+def test_rare_paths_that_leave_the_grid_do_not_move_the_mean():
+    # Of probability 1e-6: they are not among the paths, and so not in the standard error.
+    quartic = lambda t, p, q, args: (p**2 + q**2) / 2 + 0.1 * (p**4 + q**4)
+    noise = lambda t, p, q, args: 0.3 * jnp.stack([p * q, (q**2 - p**2) / 2])
+    path = ds.WeakBrownianPath((2,), KEY, two_point=True)
+    terms, solver = ds.hamiltonian_terms(quartic, noise, path), ds.NinomiyaVictoir()
+    got = _estimate(ds.ValueFunctions(), terms, solver, t1=0.75, key=KEY)
+    exact = jax.jit(lambda: _enumerated(terms, solver, Y0, SQUARE, 0.25, 3))()
+    assert got.std_error <= 3e-9
+    assert abs(got.mean - exact) <= 4.5 * got.std_error
+
+
 @pytest.mark.parametrize("degree", [1, 6, None])
 def test_the_mean_is_that_over_all_outcomes_however_the_fit_is(degree):
     # The quartic is not a polynomial of these degrees after three steps.
