@@ -220,8 +220,8 @@ def test_a_program_tells_whether_its_solves_raise_errors(terms, throw):
 
 def test_a_result_may_have_a_message_of_its_own():
     before = diffrax.RESULTS.successful
-    item = _compat.unsolved_step_result("unused: it has one already")
-    assert item == _compat.unsolved_step_result("")
+    item = _compat.result_named("for_a_test", "Take smaller steps.")
+    assert item == _compat.result_named("for_a_test", "unused: it has one already")
     # It goes through what Diffrax does with results.
     where = jax.jit(lambda x: diffrax.RESULTS.where(x, before, item))
     assert where(False) == item and where(True) == before
