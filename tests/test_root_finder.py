@@ -348,7 +348,7 @@ def test_a_loop_of_a_batch_has_one_condition_for_all():
 def test_the_norm_of_a_correction_tells_what_is_not_a_number(n):
     # In batches of thousands XLA's own maximum of NaNs is -inf on CPUs.
     x = np.linspace(-2.0, 1.0, n)
-    for bad in (np.nan, np.inf):
+    for bad in (np.nan, -np.nan, np.inf):
         for at in range(n):
             spoilt = np.tile(x, (3000, 1))
             spoilt[::7, at] = bad

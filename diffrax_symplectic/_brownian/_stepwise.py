@@ -307,30 +307,25 @@ def _check_times(path: diffrax.AbstractBrownianPath) -> None:
     times = innermost_times()
     if times is None:
         return
+    t0, t1, dt0 = times
     cell, number = getattr(path, "cell", None), int | float | np.number
-    numbers = all(isinstance(x, number) for x in times)
-    ends = not numbers or _divides(times[2], times[1] - times[0])
     if cell is not None:
-        for name, time in zip(("t0", "t1", "dt0"), times):
+        for name, time in dict(t0=t0, t1=t1, dt0=dt0).items():
             if isinstance(time, number) and not _divides(cell, time):
                 raise ValueError(
                     f"Steps of a `{type(path).__name__}` with `cell` must begin and end at "
                     f"multiples of `cell`; got cell={cell} and {name}={time}. Pass a "
                     "`cell` that divides `t0`, `t1` and `dt0`."
                 )
-    t0, t1, dt0 = times
-    if not ends and cell is not None:
-        raise ValueError(
-            f"All steps of a `{type(path).__name__}` with `cell` must have one size; got "
-            f"dt0={dt0}, which does not divide the time from {t0} to {t1}. For `n` equal "
-            "steps pass `dt0=(t1 - t0) / n`."
-        )
-    if not ends:
-        warnings.warn(
-            f"`dt0={dt0}` does not divide the time from {t0} to {t1}: Diffrax takes steps "
-            "of several sizes. For `n` equal steps pass `dt0=(t1 - t0) / n`.",
-            stacklevel=2,
-        )
+    if not all(isinstance(x, number) for x in times) or _divides(dt0, t1 - t0):
+        return
+    message = (
+        f"`dt0={dt0}` does not divide the time from {t0} to {t1}: Diffrax takes steps of "
+        "several sizes. For `n` equal steps pass `dt0=(t1 - t0) / n`."
+    )
+    if cell is not None:
+        raise ValueError(f"{message} With `cell` all steps must have one size.")
+    warnings.warn(message, stacklevel=2)
 
 
 def _divides(part: float, whole: float) -> bool:

@@ -164,9 +164,9 @@ def expectation(
     return run(plan, key, devices, sampling, start, tol, progress_meter)
 
 
-def _timed(run: Callable[[], Expectation]) -> tuple[Expectation, float]:
+def _timed(trial: Callable[[], Expectation]) -> tuple[Expectation, float]:
     begin = time.perf_counter()
-    return run(), time.perf_counter() - begin
+    return trial(), time.perf_counter() - begin
 
 
 def _chosen(

@@ -210,7 +210,8 @@ Damped.__init__.__doc__ = f"""**Arguments:**
 - `gamma`: {GAMMA}
 
 **Raises:** a `ValueError` if `gamma` is known to be negative, not finite or no such matrix,
-    if it does not fit `p` (in the solve), or for a solver of another package.
+    if it does not fit `p` (in the solve), or for a solver of another package or with
+    friction of its own.
 """
 
 
