@@ -245,11 +245,20 @@ def test_equal_paths_are_one_brownian_motion():
         ("`Euler` solves equations in the sense of Ito", dict(solver=diffrax.Euler())),
         ("must take fixed steps", dict(solver=diffrax.HalfSolver(diffrax.Heun()))),
         ("`dt0` must be a number", dict(dt0=None)),
+        ("`y0` must hold finite", dict(y0=(jnp.array(jnp.nan), jnp.array(0.0)))),
     ],
 )
 def test_bad_input_is_told_what_to_pass(message, kwargs):
     with pytest.raises(ValueError, match=message):
         _estimate(**kwargs)
+
+
+@pytest.mark.parametrize(
+    "traced", [dict(dt0=0.1), dict(t1=1.0), dict(y0=Y0), dict(key=jr.key(0))]
+)
+def test_within_a_jax_program_there_is_no_estimate(traced):
+    with pytest.raises(ValueError, match="no part of a JAX program.*`monte_carlo`"):
+        jax.jit(lambda x: _estimate(**x).mean)(traced)
 
 
 def test_paths_whose_words_cannot_be_chosen_are_refused():

@@ -209,6 +209,51 @@ def test_fixed_point_iterations_end_when_the_next_correction_is_small_enough():
     assert {(most, True, True), (most, False, True)} < cases
 
 
+def _oscillators(fastest, steps, rescue=0):
+    """A midpoint step of twenty oscillators of frequencies up to `fastest`, and whether it
+    was solved."""
+    turn = fastest * jnp.linspace(0.05, 1, 20)
+    term = diffrax.ODETerm(lambda t, y, args: (-turn * y[1], turn * y[0]))
+    y0 = jnp.cos(jnp.arange(20.0)), jnp.sin(jnp.arange(20.0))
+    solver = ds.ImplicitMidpoint(
+        root_finder=ds.PicardNewton(picard_steps=steps), root_find_max_steps=rescue
+    )
+    (p, q), *_, result = solver.step(term, 0.0, 1.0, y0, None, None, False)
+    # In the complex plane the exact step is a product.
+    z = (1 + 0.5j * turn) / (1 - 0.5j * turn) * (y0[0] + 1j * y0[1])
+    return result == diffrax.RESULTS.successful, jnp.max(jnp.abs(p + 1j * q - z))
+
+
+# Fixed-point iterations shrink errors by half the frequency, or make them grow.
+@pytest.mark.parametrize("fastest, steps", [(0.2, 17), (0.8, 35), (1.6, 49), (4, 160)])
+def test_many_oscillators_need_neither_newton_nor_many_iterations(fastest, steps):
+    solved, error = _oscillators(fastest, steps)
+    assert solved and error < 2e-15
+    if fastest > 1:
+        assert (fastest / 2) ** steps > 1e-5
+
+
+def test_each_path_of_many_unknowns_is_iterated_at_its_own_rate():
+    # The last one only Newton's method solves.
+    fastest = jnp.array([0.01, 0.3, 1.0, 3.0, 4.0, 300.0])
+    first, error = jax.vmap(lambda w: _oscillators(w, 200))(fastest)
+    assert first.tolist() == [True] * 5 + [False]
+    assert error[:5].max() < 2e-15
+    solved, error = jax.vmap(lambda w: _oscillators(w, 200, rescue=64))(fastest)
+    assert solved.all() and error.max() < 1e-13
+
+
+@pytest.mark.parametrize("slope", [0.6, -0.6, 0.3])
+def test_many_unknowns_that_do_not_oscillate_converge_too(slope):
+    # For `k = slope k + 1`, and by its side another slope.
+    slopes = slope * jnp.linspace(0.5, 1, 20)
+    finder = ds.PicardNewton()
+    residual = lambda k, _: k - slopes * k - 1
+    value, success = _without_a_safety_net(finder, residual, jnp.zeros(20))
+    assert success
+    np.testing.assert_allclose(value, 1 / (1 - slopes), rtol=3e-15)
+
+
 def test_chords_follow_fixed_point_iterations_and_one_of_newton():
     # Of y = 1 + b y + a y^2 each iterate is known. Each path of the batch counts by itself.
     @jax.jit

@@ -140,7 +140,8 @@ def expectation(
     and variances of batches are combined; [Talay and Tubaro
     (1990)](https://doi.org/10.1080/07362999008809220) for extrapolation.
     """
-    key, devices = checked_call("expectation", key, tol, devices)
+    given = terms, t0, t1, dt0, y0, args, ts
+    key, devices = checked_call("expectation", key, tol, devices, given)
     problem = Problem.of(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels)
     k_pilot, plan = jr.fold_in(key, _NO_SAMPLE), None
     if sampling is None and start is not None:

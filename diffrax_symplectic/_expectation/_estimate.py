@@ -192,9 +192,16 @@ class ExpectationInterrupted(KeyboardInterrupt):
 
 
 def checked_call(
-    user: str, key, tol: float | None, devices: Sequence[Any] | None
+    user: str, key, tol: float | None, devices: Sequence[Any] | None, *others: Any
 ) -> tuple[PRNGKeyArray, tuple]:
-    """The key and the devices that a user means."""
+    """The key and the devices that a user means. Raises a `ValueError` if an array of the
+    call is traced."""
+    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((key, others))):
+        raise ValueError(
+            f"`{user}` takes as many batches as numbers tell, so it is no part of a JAX "
+            "program. Call it outside of `jit`, `vmap` and `grad`. The gradient of a mean "
+            "is the mean of gradients: `monte_carlo` averages them."
+        )
     check_key(key, user)
     if tol is not None and not 0 < tol < np.inf:
         raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")

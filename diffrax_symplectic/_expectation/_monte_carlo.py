@@ -14,12 +14,12 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .._arguments import check_takes, whole_number
 from .._compat import ClosedJaxpr, jaxpr_as_fun, solves_without_throwing
+from .._root_finder import all_finite
 from .._terms import brownian_paths, replace_paths
 from ._estimate import checked_call, Expectation, NO_METER, Plan, run, Samples
 from ._steps import (
     AbstractSampling,
     independent_steps,
-    is_finite,
     level_weights,
     Problem,
     samples,
@@ -212,7 +212,7 @@ def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
     out = jtu.tree_map(jnp.asarray, out)
     if len(jtu.tree_leaves(out)) == 0:
         raise ValueError(f"`fn` must return arrays, which are averaged; got {out!r}.")
-    return out, success & is_finite(out)
+    return out, success & all_finite(out)
 
 
 def _check_failures_are_reported(program: ClosedJaxpr, out: PyTree) -> None:

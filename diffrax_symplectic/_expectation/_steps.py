@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from .._arguments import check_solver, check_takes, whole_number
 from .._custom_types import Args, RealScalarLike, Y
+from .._root_finder import all_finite
 from .._terms import check_stratonovich
 from ._estimate import Plan, real, Samples
 
@@ -59,6 +60,8 @@ class Problem(eqx.Module):
             )
         saved_steps, num_steps = _steps(t0, t1, dt0, ts)
         y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+        if not all_finite(y0):
+            raise ValueError(f"`y0` must hold finite numbers; got {y0}.")
         start = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
         check_stratonovich(terms, solver, start, y0, args)
         check_takes("phi", phi, "t", "y", "args")
@@ -100,7 +103,7 @@ class Problem(eqx.Module):
             terms, t, next_t, y, self.args, state, made_jump=False
         )
         state = eqx.filter(state, eqx.is_array)
-        return y, state, diffrax.is_okay(result) & is_finite(y)
+        return y, state, diffrax.is_okay(result) & all_finite(y)
 
     def values(self, t, y: Y) -> Float[Array, " m"]:
         return numbers(self.phi(t, y, self.args))
@@ -159,7 +162,7 @@ def _simulate(
     def recorded(i, paths: Ensemble, saved):
         def record():
             phi = jax.vmap(lambda y: p.values(p.t0 + i * level.h, y))(paths.y)
-            failed = paths.failed | ~jax.vmap(is_finite)(phi)
+            failed = paths.failed | ~jax.vmap(all_finite)(phi)
             here = along(level.saved_steps == i, saved)
             return failed, jnp.where(here, measure(phi, failed), saved)
 
@@ -287,11 +290,6 @@ def _extrapolated(order: int, levels: int) -> Float[np.ndarray, " levels"]:
 def along(mask: Bool[Array, " n"], x: Array) -> Array:
     """A mask of the first axis, to go with an array."""
     return mask.reshape(-1, *[1] * (x.ndim - 1))
-
-
-def is_finite(tree: PyTree[Array]) -> Bool[Array, ""]:
-    leaves = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(tree)]
-    return jnp.all(jnp.stack(leaves))
 
 
 def ravel(y: Y) -> Float[Array, " d"]:

@@ -36,7 +36,9 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
     First come iterations for all paths of a batch together, until each is solved or does
     not converge: fixed-point (Picard) iterations, which need no Jacobian. Where these are
     slow, and at once for two unknowns or fewer, chord iterations follow up to `direct`
-    unknowns: those of Newton's method with one Jacobian.
+    unknowns: those of Newton's method with one Jacobian. For more than 16 unknowns they
+    are accelerated by second-order Richardson iteration (Golub and Varga, Numerische
+    Mathematik 3, 1961), for the imaginary eigenvalues that oscillations have.
 
     The paths that are left are gathered from the batch. For these, each step is one of
     Newton's method. Its linear systems are solved by elimination up to 32 unknowns, and
