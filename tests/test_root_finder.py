@@ -209,16 +209,18 @@ def test_fixed_point_iterations_end_when_the_next_correction_is_small_enough():
     assert {(most, True, True), (most, False, True)} < cases
 
 
-def _oscillators(fastest, steps, rescue=0):
+def _oscillators(fastest, steps, rescue=0, dtype=jnp.float64):
     """A midpoint step of twenty oscillators of frequencies up to `fastest`, and whether it
     was solved."""
-    turn = fastest * jnp.linspace(0.05, 1, 20)
+    turn = jnp.asarray(fastest * jnp.linspace(0.05, 1, 20), dtype)
     term = diffrax.ODETerm(lambda t, y, args: (-turn * y[1], turn * y[0]))
-    y0 = jnp.cos(jnp.arange(20.0)), jnp.sin(jnp.arange(20.0))
+    angles = jnp.arange(20, dtype=dtype)
+    y0 = jnp.cos(angles), jnp.sin(angles)
+    times = jnp.zeros((), dtype), jnp.ones((), dtype)
     solver = ds.ImplicitMidpoint(
         root_finder=ds.PicardNewton(picard_steps=steps), root_find_max_steps=rescue
     )
-    (p, q), *_, result = solver.step(term, 0.0, 1.0, y0, None, None, False)
+    (p, q), *_, result = solver.step(term, *times, y0, None, None, False)
     # In the complex plane the exact step is a product.
     z = (1 + 0.5j * turn) / (1 - 0.5j * turn) * (y0[0] + 1j * y0[1])
     return result == diffrax.RESULTS.successful, jnp.max(jnp.abs(p + 1j * q - z))
@@ -231,6 +233,8 @@ def test_many_oscillators_need_neither_newton_nor_many_iterations(fastest, steps
     assert solved and error < 2e-15
     if fastest > 1:
         assert (fastest / 2) ** steps > 1e-5
+    solved, error = _oscillators(fastest, steps // 2 + 4, dtype=jnp.float32)
+    assert solved and error < 1e-6
 
 
 def test_each_path_of_many_unknowns_is_iterated_at_its_own_rate():
