@@ -247,6 +247,18 @@ def test_each_path_of_many_unknowns_is_iterated_at_its_own_rate():
     assert solved.all() and error.max() < 1e-13
 
 
+def test_what_is_not_a_number_ends_at_once():
+    evaluations = []
+
+    def residual(k, _):
+        jax.debug.callback(lambda: evaluations.append(1))
+        return k - 0.5 * k - jnp.nan
+
+    _, success = _without_a_safety_net(ds.PicardNewton(), residual, jnp.zeros(20))
+    jax.effects_barrier()
+    assert not success and 0 < len(evaluations) < 20
+
+
 @pytest.mark.parametrize("slope", [0.6, -0.6, 0.3])
 def test_many_unknowns_that_do_not_oscillate_converge_too(slope):
     # For `k = slope k + 1`, and by its side another slope.

@@ -286,10 +286,11 @@ def _by_richardson(look: _Look, image: _Map, begin: Found) -> Found:
         rate, damped = root(ratio(new.size, earlier)), 1 - weight
         # Where iteration leads away, it begins once more, with the new weight.
         anew = ~(new.size < earlier)
-        wrong = (rate**2 > damped) & ((rounds.step <= 2 * num_first + 1) | anew)
+        # If an entry is NaN, so is the rate, and all of these are true.
+        wrong = ~(rate**2 <= damped) & (anew | (rounds.step <= 2 * num_first + 1))
         a = jnp.where(wrong, (rate + damped / rate) / weight, a)
         weight = _weight(a)
-        lost = anew & (a > _FASTEST)
+        lost = anew & ~(a <= _FASTEST)
         going = ~new.solved & ~lost & (step < look.limits.steps)
         ahead = _toward(before, end, weight)
         pick = lambda x, y, z: jnp.where(new.solved, x, jnp.where(anew, z, y))
