@@ -17,7 +17,6 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
-from scipy.special import stdtrit
 
 from .._brownian import check_key
 
@@ -135,6 +134,9 @@ class Expectation(eqx.Module):
         samples, times `std_error`, to either side of `mean`. (For 16 samples and 95% that
         is 2.13 standard errors, for very many 1.96.) What is left of the error of
         discretization is not part of it: see `error`."""
+        # Half of the time to import this package, if it stood at the top.
+        from scipy.special import stdtrit
+
         factor = stdtrit(max(self.num_samples - 1, 1), (1 + confidence) / 2)
         side = lambda sign: jtu.tree_map(
             lambda m, s: m + sign * factor * s, self.mean, self.std_error
