@@ -247,6 +247,22 @@ def test_each_path_of_many_unknowns_is_iterated_at_its_own_rate():
     assert solved.all() and error.max() < 1e-13
 
 
+@pytest.mark.parametrize("others", [0.01, 0.5], ids=["one fast", "half as fast"])
+def test_of_many_unknowns_no_step_is_taken_for_solved_that_is_not(others):
+    @jax.jit
+    @jax.vmap
+    def solve(slope):
+        turn = slope * jnp.where(jnp.arange(20) == 0, 1, others)
+        residual = lambda k, _: (k[0] + turn * (1 + k[1]), k[1] - turn * (1 + k[0]))
+        start = jnp.zeros(20), jnp.zeros(20)
+        value, success = _without_a_safety_net(ds.PicardNewton(), residual, start)
+        return success, jnp.max(jnp.abs(jnp.stack(residual(value, None))))
+
+    success, size = solve(jnp.linspace(0.1, 4, 40))
+    assert success[:9].all() and success.sum() >= 20
+    assert size[success].max() < 2e-15
+
+
 def test_what_is_not_a_number_ends_at_once():
     evaluations = []
 

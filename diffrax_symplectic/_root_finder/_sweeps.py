@@ -106,12 +106,15 @@ class _Look(NamedTuple):
         tolerance = self.limits.tolerance
         return tolerance.compare(tolerance.sizes(self.restore(change)), scales)
 
-    def at(self, y, change, earlier: Scalar, scales, root: _Map, step) -> _Rounds:
+    def at(
+        self, y, change, earlier: Scalar, scales, root: _Map, step, halt=0.5
+    ) -> _Rounds:
         """After an iteration that was a `change`. The `root` of how much it has shrunk,
-        since the one of the size `earlier`, is the rate of one iteration."""
+        since the one of the size `earlier`, is the rate of one iteration. It has stalled
+        if it is not below `halt` of that."""
         size, relative = self.size(change, scales)
         shrink = root(ratio(size, earlier))
-        stalled = size >= 0.5 * earlier
+        stalled = size >= halt * earlier
         # If an entry is NaN, the size is, and all of these are false.
         solved = converged(size, relative, shrink, stalled)
         near = (relative <= _NEAR) & ~stalled
@@ -259,10 +262,10 @@ def _by_richardson(look: _Look, image: _Map, begin: Found) -> Found:
     This is the "second order Richardson" method of Golub and Varga (Numerische Mathematik
     3, 1961, 147-156), for imaginary eigenvalues.
     """
-    num_first, from_begin = _paced(_FIRST_PAIRS, begin.y), look.scales(begin.y)
+    num_first = _paced(_FIRST_PAIRS, begin.y)
 
     def advance(rounds: _Rounds) -> _Rounds:
-        first, (before, y, a) = rounds.step == 0, rounds.y
+        first, (before, y, a, begins) = rounds.step == 0, rounds.y
         weight = _weight(a)
 
         def pair(_, ys):
@@ -277,11 +280,15 @@ def _by_richardson(look: _Look, image: _Map, begin: Found) -> Found:
         before, y = lax.fori_loop(0, pairs, pair, (before, y))
         # It is read several times.
         end = materialize(lambda: image(y))
-        begun = lambda: _begun(look, end)
-        earlier, scales = lax.cond(first, begun, lambda: (rounds.size, rounds.scales))
+        # On its way back from where iteration led away, the state's size changes much.
+        whole, scales = _begun(look, end)
+        earlier = jnp.where(begins, whole, rounds.size)
         root = lambda x: x ** (1 / (2 * pairs + jnp.where(first, 0, 1)))
         step = rounds.step + 2 * pairs + 1
-        new = look.at(end, (end**ω - y**ω).ω, earlier, scales, root, step)
+        # Fast oscillations shrink unevenly from round to round.
+        halt = jnp.where(a > 1, 0.9, 0.5)
+        change = (end**ω - y**ω).ω
+        new = look.at(end, change, earlier, scales, root, step, halt)
 
         rate, damped = root(ratio(new.size, earlier)), 1 - weight
         # Where iteration leads away, it begins once more, with the new weight.
@@ -296,12 +303,11 @@ def _by_richardson(look: _Look, image: _Map, begin: Found) -> Found:
         pick = lambda x, y, z: jnp.where(new.solved, x, jnp.where(anew, z, y))
         before = jtu.tree_map(lambda y, z: jnp.where(anew, z, y), y, begin.y)
         y = jtu.tree_map(pick, end, ahead, begin.y)
-        # What is known of the state's size comes from there, too.
-        scales = [jnp.where(anew, x, z) for x, z in zip(from_begin, scales)]
-        return new._replace(y=(before, y, a), going=going, scales=scales)
+        return new._replace(y=(before, y, a, anew), going=going)
 
     first = _first(look, begin)
-    found = _while_any(advance, first._replace(y=(begin.y, begin.y, first.size)))
+    y = begin.y, begin.y, first.size, jnp.array(True)
+    found = _while_any(advance, first._replace(y=y))
     return found._replace(y=found.y[1])
 
 
