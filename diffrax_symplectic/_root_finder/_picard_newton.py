@@ -36,7 +36,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
     First come iterations for all paths of a batch together, until each is solved or does
     not converge: fixed-point (Picard) iterations, which need no Jacobian. Where these are
     slow, and at once for two unknowns or fewer, chord iterations follow up to `direct`
-    unknowns: those of Newton's method with one Jacobian. For more than 16 unknowns they
+    unknowns: those of Newton's method with one Jacobian. For more than 24 unknowns they
     are accelerated by second-order Richardson iteration (Golub and Varga, Numerische
     Mathematik 3, 1961), for the imaginary eigenvalues that oscillations have.
 

@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
 from .._compat import materialize, ω
-from .._custom_types import IntScalarLike
+from .._custom_types import IntScalarLike, RealScalarLike
 from ._batch import any_of_batch
 from ._linear import inverse, matrix_of
 from ._tolerance import converged, largest, ratio, Tolerance
@@ -34,7 +34,7 @@ _FIRST, _MORE = 8, 4
 _SLOW = 24
 # Above so many unknowns fixed-point iteration is accelerated. For fewer, the arithmetic of
 # that costs more than the iterations that it saves.
-_MANY = 16
+_MANY = 24
 # Pairs of accelerated iterations before the first look at the error, and between two
 # looks: more of them where fixed-point iteration would be slower than this rate. The look
 # itself is one iteration more.
@@ -107,7 +107,14 @@ class _Look(NamedTuple):
         return tolerance.compare(tolerance.sizes(self.restore(change)), scales)
 
     def at(
-        self, y, change, earlier: Scalar, scales, root: _Map, step, halt=0.5
+        self,
+        y: PyTree[Array],
+        change: PyTree[Array],
+        earlier: Scalar,
+        scales: list[Scalar],
+        root: _Map,
+        step: IntScalarLike,
+        halt: RealScalarLike = 0.5,
     ) -> _Rounds:
         """After an iteration that was a `change`. The `root` of how much it has shrunk,
         since the one of the size `earlier`, is the rate of one iteration. It has stalled
