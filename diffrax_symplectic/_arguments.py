@@ -15,7 +15,8 @@ from ._custom_types import Y
 
 
 def check_takes(name: str, fn: Any, *arguments: str) -> None:
-    """Raises a `ValueError` unless `fn` can be called with these arguments."""
+    """Raises a `ValueError` unless `fn` can be called with these arguments, and names none
+    of them in another order."""
     call = f"`{name}({', '.join(arguments)})`"
     if not callable(fn):
         raise ValueError(f"`{name}` must be a function, called as {call}; got {fn!r}.")
@@ -30,6 +31,12 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
             f"`{name}` is called as {call}; got a function of other arguments, "
             f"`{signature}`."
         ) from None
+    named = [x for x in signature.parameters if x in arguments]
+    if named != [x for x in arguments if x in named]:
+        raise ValueError(
+            f"`{name}` is called as {call}; got a function that names these in another "
+            f"order, `{signature}`."
+        )
 
 
 def check_solver(name: str, solver: Any) -> None:

@@ -78,6 +78,40 @@ def test_malformed_terms_are_refused():
 
 
 @pytest.mark.filterwarnings("ignore:Complex")
+def test_hamiltonians_of_position_and_momentum_are_refused():
+    path = ds.WeakBrownianPath((), jr.key(0))
+    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    noise = lambda t, q, p, args: q
+    with pytest.raises(
+        ValueError, match=r"`noise` is called as .*another order, `\(t, q"
+    ):
+        ds.hamiltonian_terms(H0, noise, path)
+
+
+@pytest.mark.parametrize("solver", [diffrax.Euler(), diffrax.ItoMilstein()])
+def test_ito_solvers_are_refused_where_the_sense_makes_a_difference(solver):
+    H = lambda t, p, q, args: (p**2 + q**2) / 2
+    linear = lambda t, p, q, args: p + q
+    kick = lambda t, p, q, args: q**2
+    y0 = (jnp.array(0.0), jnp.array(1.0))
+
+    def solve(*terms, noise):
+        path = diffrax.VirtualBrownianTree(0.0, 1.0, 0.1, (), jr.key(0))
+        drift, diffusion = ds.hamiltonian_terms(H, noise, path).terms
+        all_terms = diffrax.MultiTerm(drift, *terms, diffusion)
+        return diffrax.diffeqsolve(all_terms, solver, 0.0, 1.0, 0.5, y0)
+
+    with pytest.raises(ValueError, match="in the sense of Ito.*add the drift that"):
+        solve(noise=H)
+    # They are right for additive noise, for noise that kicks where the position says how
+    # hard, and with a drift that corrects the sense.
+    correction = lambda t, y, args: jax.tree.map(lambda x: -x / 2, y)
+    if isinstance(solver, diffrax.Euler):
+        solve(diffrax.ODETerm(correction), noise=H)
+        solve(noise=linear)
+        solve(noise=kick)
+
+
 def test_a_matrix_of_noises_for_a_state_of_several_arrays_is_refused_with_advice():
     field = lambda t, y, args: {"a": jnp.ones((3, 2))}
     terms = diffrax.ControlTerm(field, weak_path(2))

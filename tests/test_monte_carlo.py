@@ -92,7 +92,7 @@ def test_failed_paths_are_counted_and_left_out():
     assert got.num_paths == len(good) and got.num_failed == 5000 - len(good)
     np.testing.assert_allclose(got.mean, good.mean(), rtol=1e-13)
     with pytest.warns(UserWarning, match="10 paths failed: there is no mean"):
-        nothing = ds.monte_carlo(lambda key: jnp.nan, jr.key(0), 10)
+        nothing = ds.monte_carlo(lambda key: jnp.nan * jr.normal(key), jr.key(0), 10)
     assert (nothing.num_paths, nothing.num_failed) == (0, 10)
     assert np.isnan(nothing.std_error)
 
@@ -209,8 +209,14 @@ def test_functions_that_return_nothing_are_refused():
         ds.monte_carlo(lambda key: None, jr.key(0), 10)
 
 
+def test_functions_that_ignore_their_key_are_refused():
+    with pytest.raises(ValueError, match="`fn` does not use its `key`"):
+        ds.monte_carlo(lambda key: jr.normal(jr.key(1)), jr.key(0), 10)
+
+
 def test_an_estimate_prints_in_a_few_lines():
-    got = ds.monte_carlo(lambda key: {"a": jnp.ones(30), "b": 2.0}, jr.key(0), 10)
+    ones = lambda key: jnp.ones(30) + 0 * jr.normal(key)
+    got = ds.monte_carlo(lambda key: {"a": ones(key), "b": 2.0}, jr.key(0), 10)
     lines = str(got).splitlines()
     assert len(lines) <= 6 and "2. ± 0.0e+00" in lines
     assert "10 paths, 0 failed" in lines[-1]

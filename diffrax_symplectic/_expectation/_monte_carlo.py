@@ -168,7 +168,7 @@ def monte_carlo(
     **Returns:** an [`diffrax_symplectic.Expectation`][].
 
     **Raises:** as [`diffrax_symplectic.expectation`][]; a `ValueError` for levels without
-    `order`, or if $\phi$ holds a `diffrax.RESULTS`.
+    `order`, if $\phi$ holds a `diffrax.RESULTS`, or if `fn` does not use its key.
     """
     key, devices = checked_call("monte_carlo", key, tol, devices)
     levels = whole_number("levels", levels)
@@ -212,6 +212,7 @@ def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
     out = jtu.tree_map(jnp.asarray, out)
     if len(jtu.tree_leaves(out)) == 0:
         raise ValueError(f"`fn` must return arrays, which are averaged; got {out!r}.")
+    _check_reads_key(program)
     return out, success & all_finite(out)
 
 
@@ -226,6 +227,16 @@ def _check_failures_are_reported(program: ClosedJaxpr, out: PyTree) -> None:
             "`(phi, sol.result)`: then they are left out and counted. Or pass `throw=True` "
             "to `diffeqsolve`, which raises an error if a path fails. If `fn` sees to "
             "failures itself, return `(phi, diffrax.RESULTS.successful)`."
+        )
+
+
+def _check_reads_key(program: ClosedJaxpr) -> None:
+    (key,) = program.jaxpr.invars
+    read = [x for eqn in program.jaxpr.eqns for x in eqn.invars]
+    if not any(x is key for x in read):
+        raise ValueError(
+            "`fn` does not use its `key`, so that all samples would be the same. Make the "
+            "Brownian path of this key: `solver.path(shape, key)`."
         )
 
 

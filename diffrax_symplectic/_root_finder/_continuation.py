@@ -7,14 +7,12 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import lineax as lx
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
 from .._compat import ω
 from .._custom_types import BoolScalarLike
-from . import _krylov, _linear
+from ._linear import solve
 from ._tolerance import all_finite, converged, largest, ratio, Tolerance
 
 
@@ -110,31 +108,10 @@ def advance(
     s, k = progress.target, progress.k
     # Of the residual `r` at `k`, and of its derivative.
     part = lambda k, r: (1 - s) * k + s * r
-    if linear_solver is not None or k.size <= _linear.MAX_DENSE:
-        value, jacobian = jax.linearize(residual, k)
-        apply = lambda x: part(x, jacobian(x))
-        diff, exact = _linear.solve(apply, part(k, value), linear_solver)
-        return _correct(tolerance, equations, progress, value, diff, exact)
-
-    def product(carry):
-        """One evaluation: the residual first, then what GMRES needs."""
-        krylov, first, value = carry
-        new, image = jax.jvp(residual, (k,), (krylov.p,))
-        vector = part(*_where(first, (k, new), (krylov.p, image)))
-        krylov = _krylov.extend(krylov, vector, first)
-        return krylov, jnp.array(False), new
-
-    # The equations occur in the program only once.
-    carry = _krylov.empty(k.size, k.dtype), jnp.array(True), jnp.zeros_like(k)
-    going = lambda carry: carry[1] | ~carry[0].done
-    krylov, _, value = lax.while_loop(going, product, carry)
-    return _correct(
-        tolerance, equations, progress, value, krylov.solution, krylov.reduced
-    )
-
-
-def _where(which: Bool[Array, ""], a: _T, b: _T) -> _T:
-    return jtu.tree_map(lambda a, b: jnp.where(which, a, b), a, b)
+    value, jacobian = jax.linearize(residual, k)
+    apply = lambda x: part(x, jacobian(x))
+    diff, exact = solve(apply, part(k, value), linear_solver)
+    return _correct(tolerance, equations, progress, value, diff, exact)
 
 
 def _correct(

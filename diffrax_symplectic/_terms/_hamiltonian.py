@@ -203,7 +203,11 @@ class _Drift(eqx.Module):
     structure: _Structure | None = eqx.field(static=True, default=None)
 
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
+        # That module imports this one.
+        from ._structure_checks import check_sense_of_solve
+
         check_pair(y)
+        check_sense_of_solve(t, y, args)
 
         def scalar(p, q):
             with _named("H0"):

@@ -12,7 +12,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 
 from .._arguments import check_pair, pair_fault
-from .._compat import ω
+from .._compat import innermost_solve, ω
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from ._data_flow import DataFlow
@@ -134,17 +134,32 @@ def check_stratonovich(
     args: Args,
 ) -> None:
     """Raises a `ValueError` if a solver in the sense of Ito is to solve terms made from
-    Hamiltonians, which are in the sense of Stratonovich. For additive noise both agree."""
+    Hamiltonians, which are in the sense of Stratonovich. Both agree for additive noise, and
+    for noise that changes `p` and depends on `q` alone."""
     if not isinstance(solver, diffrax.AbstractItoSolver):
         return
     noise = tuple(filter(is_hamiltonian, split_terms(terms)[1]))
-    if additive_fault(noise, t0, y0, args) is not None:
+    if additive_fault(noise, t0, y0, args) and separable_fault((), noise, t0, y0, args):
         raise ValueError(
             f"`{type(solver).__name__}` solves equations in the sense of Ito. Those of "
             "`hamiltonian_terms` are in the sense of Stratonovich, and here they differ. "
             "Use a solver of this package, or a Stratonovich solver of Diffrax such as "
-            "`diffrax.Heun`."
+            "`diffrax.Heun`. If Ito's sense is meant, add the drift that corrects it."
         )
+
+
+def check_sense_of_solve(t: RealScalarLike, y: Y, args: Args) -> None:
+    """The same for the solve being traced. A drift beside that of the Hamiltonians may be
+    the correction that makes their noise one in the sense of Ito: then all is well."""
+    solve = innermost_solve()
+    if solve is None or not isinstance(solve["solver"], diffrax.AbstractItoSolver):
+        return
+    terms = solve["terms"]
+    # The solve backward of `diffrax.BacksolveAdjoint` has another term.
+    if not isinstance(terms, diffrax.MultiTerm):
+        return
+    if all(map(is_hamiltonian, split_terms(terms)[0])):
+        check_stratonovich(terms, solve["solver"], t, y, args)
 
 
 def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> DataFlow:

@@ -1,0 +1,45 @@
+"""The derivative of a solution, as the linear equation that defines it."""
+
+from collections.abc import Callable
+
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import optimistix as optx
+from jax import lax
+from jaxtyping import Array, Float, PyTree
+
+from ._batch import where_pending
+from ._linear import MAX_WRITTEN_OUT, solve, Solver
+from ._sweeps import Found, Limits, sweep
+from ._tolerance import Tolerance
+
+
+# A derivative is solved to rounding error, as the step is by default.
+_LIMITS = Limits(Tolerance(None, 0.0, optx.max_norm), steps=200, direct=6)
+
+
+def differentiate(
+    solver: Solver, linear: Callable[[PyTree], PyTree], rhs: PyTree[Array]
+) -> PyTree[Array]:
+    r"""The tangent $x = L x + b$ of the solution of $k = \Phi(k)$, for the derivatives $L$
+    of $\Phi$ along $k$ and $b$ along everything else; and by transposition its adjoint.
+
+    Up to four unknowns by elimination, by `solver` if there is one, and otherwise by the
+    iterations that solved the step: they converge where those did. Where they do not, the
+    paths that are left are gathered from the batch, and their systems solved one by one.
+    """
+    # As one vector: JAX cannot transpose a solve in whose right-hand side some arrays
+    # depend on what is differentiated and others do not.
+    flat, unravel = jfu.ravel_pytree(rhs)
+
+    def by(operator: Callable[[Array], Array], b: Float[Array, " n"]) -> Array:
+        if b.size <= MAX_WRITTEN_OUT or solver is not None:
+            return solve(operator, b, solver)[0]
+        begin = Found(jnp.zeros_like(b), solved=jnp.array(False), near=jnp.array(True))
+        found = sweep(_LIMITS, lambda x: x + (b - operator(x)), begin, lambda x: x)
+        reduction = float(jnp.finfo(b.dtype).eps) ** 0.9
+        exactly = lambda b, _: solve(operator, b, None, reduction)[0]
+        return where_pending(exactly, ~found.solved, b, found.y)
+
+    operator = lambda x: x - jfu.ravel_pytree(linear(unravel(x)))[0]
+    return unravel(lax.custom_linear_solve(operator, flat, by, by))
