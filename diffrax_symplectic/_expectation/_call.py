@@ -21,12 +21,11 @@ from ._value_functions import ValueFunctions
 
 # The keys made from this number belong to no sample.
 _NO_SAMPLE = 0xFFFFFFFF
-# Paths of a trial of independent paths, which is one batch; of a replicate, and how many.
-_PATHS, _REPLICATE, _REPLICATES = 2**13, 2**12, 8
+# Paths of a batch of independent paths, of which a trial has two; of a replicate, and how
+# many.
+_PATHS, _REPLICATE, _REPLICATES = 2**12, 2**12, 8
 # What promises to take less time than this is taken without further trials.
 _SECONDS = 0.5
-# Nothing compiles in less time than this.
-_COMPILES = 0.1
 # A gain for which no other sampling is tried.
 _CLEAR = 1e5
 # How many samples there are without a tolerance, and with one at most.
@@ -165,11 +164,6 @@ def expectation(
     return run(plan, key, devices, sampling, start, tol, progress_meter)
 
 
-def _timed(trial: Callable[[], Expectation]) -> tuple[Expectation, float]:
-    begin = time.perf_counter()
-    return trial(), time.perf_counter() - begin
-
-
 def _chosen(
     problem: Problem, key: PRNGKeyArray, tol: float | None, devices: tuple
 ) -> tuple[AbstractSampling, Plan]:
@@ -185,21 +179,24 @@ def _chosen(
         except ValueError:
             return np.inf
         own = jr.fold_in(key, _NO_SAMPLE)
-        few = plan._replace(num_samples=samples)
-        one = lambda: run(few, own, devices, trial=True)
-        tried, seconds = _timed(one)
-        if seconds > _COMPILES:
-            tried, seconds = _timed(one)
+        more = lambda n, start: run(
+            plan._replace(num_samples=n), own, devices, start=start, trial=True
+        )
+        # The first batch, which may have to be compiled, is not timed.
+        first = more(plan.batch_size, None)
+        begin = time.perf_counter()
+        tried = more(samples, first)
+        seconds = time.perf_counter() - begin
         variances = jtu.tree_leaves(tried.variance)
         variance = max(float(np.max(x, initial=0.0)) for x in variances)
         variance = variance if np.isfinite(variance) else np.inf
-        cost = variance * seconds / samples
+        cost = variance * seconds / (samples - plan.batch_size)
         done.append((cost, variance, sampling, plan))
         return cost
 
-    plain = work(IndependentPaths(_PATHS, _PATHS), _PATHS)
+    plain = work(IndependentPaths(_PATHS, _PATHS), 2 * _PATHS)
     if tol is None or plain / tol**2 > _SECONDS:
-        functions = work(ValueFunctions(), ValueFunctions().batch_size)
+        functions = work(ValueFunctions(), 2 * ValueFunctions().batch_size)
         if functions * _CLEAR > plain:
             work(ArrayRQMC(_REPLICATE, _REPLICATES), _REPLICATES)
     _, variance, sampling, plan = min(done, key=lambda trial: trial[0])

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -54,36 +55,66 @@ def by_transfer(
 
 
 def by_splines(
-    force: Callable, kick: Callable, y0, t1: float, steps: int, box, size: int = 200
+    mean_after: Callable, y0, t1: float, steps: int, box, size: int = 200
 ) -> float:
-    """E(q^2) for one degree of freedom of unit mass with one noise, without sampling and
-    without any of this package: the drift, kick and drift of a step are written here, the
-    means over its three outcomes are carried back by quintic splines in a box that no path
+    """E(q^2) for one degree of freedom, without sampling: what `mean_after(h)` says of the
+    mean of a function after a step is carried back by quintic splines in a box that no path
     leaves, and four step sizes are extrapolated."""
     axes = [np.linspace(-half, half, size) for half in box]
-    spline = lambda u: RectBivariateSpline(axes[0], axes[1], u, kx=5, ky=5)
-    grid, weights = np.meshgrid(*axes, indexing="ij"), (1 / 6, 2 / 3, 1 / 6)
+    grid = np.meshgrid(*axes, indexing="ij")
+
+    def spline(values):
+        u = RectBivariateSpline(axes[0], axes[1], values, kx=5, ky=5)
+        return lambda *y: u.ev(*(np.clip(x, -b, b) for x, b in zip(y, box)))
 
     def mean(steps: int) -> float:
-        h = t1 / steps
-
-        def ends(p, q, increment):
-            q = q + h / 2 * p
-            p = p + h * force(q) + increment * kick(q)
-            return p, q + h / 2 * p
-
-        def expected(u, p, q):
-            each = [ends(p, q, x) for x in np.sqrt(3 * h) * np.array([-1, 0, 1])]
-            within = [[np.clip(x, -b, b) for x, b in zip(y, box)] for y in each]
-            return sum(w * u.ev(*y) for w, y in zip(weights, within))
-
-        u = spline(grid[1] ** 2)
+        expected, u = mean_after(t1 / steps), spline(grid[1] ** 2)
         for _ in range(steps - 1):
             u = spline(expected(u, *grid))
         return float(expected(u, *map(np.asarray, y0)))
 
     means = [mean(steps * 2**k) for k in range(4)]
     return float(level_weights(2, 4)[0] @ means)
+
+
+def verlet(force: Callable, kick: Callable) -> Callable:
+    """The drift, kick and drift of a step for unit mass and one noise, without any of this
+    package, and the mean over its three outcomes."""
+
+    def mean_after(h: float):
+        def end(p, q, increment):
+            q = q + h / 2 * p
+            p = p + h * force(q) + increment * kick(q)
+            return p, q + h / 2 * p
+
+        outcomes = zip((1 / 6, 2 / 3, 1 / 6), np.sqrt(3 * h) * np.array([-1, 0, 1]))
+        each = [*outcomes]
+        return lambda u, p, q: sum(w * u(*end(p, q, x)) for w, x in each)
+
+    return mean_after
+
+
+def step_of(terms, solver) -> Callable:
+    """The mean over all outcomes of a step of a solver."""
+
+    def mean_after(h: float):
+        functions = []
+        number = jax.ShapeDtypeStruct((), float)
+        call = lambda p, q: functions[-1](p, q)
+
+        def fn(y):
+            return jax.pure_callback(call, number, *y, vmap_method="broadcast_all")
+
+        mean = lambda *y: ds.step_expectation(terms, solver, 0.0, h, y, fn=fn)
+        means = jax.jit(jax.vmap(mean))
+
+        def expected(u, p, q):
+            functions.append(u)
+            return np.asarray(means(np.ravel(p), np.ravel(q))).reshape(np.shape(p))
+
+        return expected
+
+    return mean_after
 
 
 def rigid_body_square(
