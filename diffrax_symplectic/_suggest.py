@@ -122,6 +122,24 @@ def suggest_solver(
     if the first suggestion is explicit and takes too many steps, take the next implicit
     one.
 
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+        import jax.random as jr
+
+        H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
+        noise = lambda t, p, q, args: 0.3 * jnp.sin(q)
+        terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+        y0 = (jnp.array(0.0), jnp.array(1.0))
+        suggestions = ds.suggest_solver(terms, 0, y0, want="expectations")
+        print(suggestions)
+        best = suggestions[0]
+        sol = diffrax.diffeqsolve(best.terms(jr.key(1)), best.solver, 0, 1, 0.1, y0)
+        ```
+
     **Arguments:**
 
     - `terms`: the terms of a Stratonovich system, as of

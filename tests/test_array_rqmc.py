@@ -238,7 +238,10 @@ def test_equal_paths_are_one_brownian_motion():
         ("`phi` must return real arrays", dict(phi=lambda t, y, a: 1j * y[0])),
         ("`sort_by` must return real arrays", dict(sort_by=lambda y: None)),
         ("needs a random key", dict(key=3)),
-        ("`phi` must return real arrays", dict(phi=lambda t, y, a: None)),
+        (
+            "`phi` must return real arrays; it returned none",
+            dict(phi=lambda t, y, a: None),
+        ),
         (r"called as `phi\(t, y, args\)`; got .* `\(y\)`", dict(phi=lambda y: y[0])),
         (r"called as `sort_by\(y\)`", dict(sort_by=lambda t, y, args: y)),
         (r"a solver, as `StormerVerlet\(\)`", dict(solver=ds.StormerVerlet)),

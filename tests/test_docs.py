@@ -2,7 +2,9 @@
 
 import csv
 import importlib
+import inspect
 import re
+import textwrap
 from pathlib import Path
 
 import diffrax
@@ -15,11 +17,27 @@ from diffrax_symplectic._suggest import SOLVERS
 
 ROOT = Path(__file__).parent.parent
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+# That of a docstring.
+INDENTED = re.compile(r"^    ```python\n(.*?)^    ```", re.DOTALL | re.MULTILINE)
 PAGES = {
     str(page.relative_to(ROOT)): blocks
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     if (blocks := BLOCK.findall(page.read_text()))
 }
+
+
+DOCSTRINGS = {
+    name: blocks
+    for name, value in vars(ds).items()
+    if not name.startswith("_")
+    and (blocks := INDENTED.findall(inspect.getdoc(value) or ""))
+}
+
+
+@pytest.mark.parametrize("name", DOCSTRINGS)
+def test_the_example_of_a_docstring_runs(name):
+    for code in DOCSTRINGS[name]:
+        exec(compile(textwrap.dedent(code), name, "exec"), {})
 
 
 @pytest.mark.parametrize("page", PAGES)

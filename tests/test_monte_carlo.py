@@ -192,11 +192,20 @@ def test_meters_of_diffrax_take_expectations(meter, capfd):
 
 
 @pytest.mark.parametrize("value", [0, -1, 1.5, "3", True])
-@pytest.mark.parametrize("name", ["num_paths", "batch_size"])
-def test_sizes_that_are_not_positive_integers_are_refused(name, value):
-    kwargs = {"num_paths": 10, "batch_size": 10, name: value}
-    with pytest.raises(ValueError, match=f"`{name}` must be a positive integer"):
-        ds.monte_carlo(_normal, jr.key(0), **kwargs)
+def test_sizes_that_are_not_positive_integers_are_refused(value):
+    with pytest.raises(ValueError, match="`batch_size` must be a positive integer"):
+        ds.monte_carlo(_normal, jr.key(0), 10, batch_size=value)
+    # One path alone says nothing of its error.
+    few = 1 if value is True else value
+    with pytest.raises(ValueError, match="`num_paths` must be an integer, 2 or larger"):
+        ds.monte_carlo(_normal, jr.key(0), few)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_values_whose_squares_overflow_are_told():
+    with pytest.warns(UserWarning, match="or its standard error is not finite"):
+        got = ds.monte_carlo(lambda key: 1e200 * jr.normal(key), jr.key(0), 100)
+    assert not np.isfinite(got.std_error) and got.num_failed == 0
 
 
 def test_complex_values_are_refused():

@@ -304,6 +304,14 @@ def _warn_of(estimate: Expectation, tol: float | None) -> None:
             "`args` and the Hamiltonians.",
             stacklevel=4,
         )
+    results = jtu.tree_leaves((estimate.mean, estimate.std_error))
+    if estimate.num_samples > 1 and not all(np.all(np.isfinite(x)) for x in results):
+        warnings.warn(
+            "The mean or its standard error is not finite: values that are averaged are "
+            "so large that their squares overflow. Take smaller steps, or a solver that is "
+            "stable with these; see whether single solutions stay bounded.",
+            stacklevel=4,
+        )
     if estimate.tol_reached is False:
         errors = jtu.tree_leaves(estimate.std_error)
         largest = max(float(np.max(x, initial=0.0)) for x in errors)
@@ -403,6 +411,7 @@ def _checked_start(start: Expectation, zeros, key_data, used: int, most: int):
     return start
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _merged(estimate: Expectation, batch, paths: int) -> Expectation:
     """The estimate from its own samples, of so many paths each, and those of the batch, by
     the pairwise formula of Chan, Golub and LeVeque."""

@@ -36,14 +36,14 @@ class IndependentPaths(AbstractSampling):
 
     **Arguments:**
 
-    - `num_paths`: how many paths; with `tol` at most.
+    - `num_paths`: how many paths, two at least; with `tol` at most.
     - `batch_size`: how many paths each device takes at once. By default 32,768 on CPUs
         (for a state of a few numbers, enough for all cores and little for their caches)
         and 262,144 elsewhere. Take less for large states, and to keep several devices busy
         with few paths: what a device computes does not depend on how many there are.
     """
 
-    num_paths: int = eqx.field(converter=lambda x: whole_number("num_paths", x))
+    num_paths: int = eqx.field(converter=lambda x: whole_number("num_paths", x, 2))
     batch_size: int | np.integer | None = None
 
     def prepare(self, problem, key, devices):

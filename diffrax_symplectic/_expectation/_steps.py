@@ -303,9 +303,11 @@ def numbers(tree: PyTree) -> Float[Array, " m"]:
 
 
 def check_real(name: str, leaves: list) -> None:
+    if len(leaves) == 0:
+        raise ValueError(f"`{name}` must return real arrays; it returned none.")
     kinds = jnp.floating, jnp.integer, jnp.bool_
     is_real = lambda s: any(jnp.issubdtype(jnp.result_type(s), k) for k in kinds)
-    if len(leaves) == 0 or not all(map(is_real, leaves)):
+    if not all(map(is_real, leaves)):
         raise ValueError(
             f"`{name}` must return real arrays; got dtypes "
             f"{[str(jnp.result_type(s)) for s in leaves]}. Return real and imaginary parts."

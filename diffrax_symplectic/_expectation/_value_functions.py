@@ -83,7 +83,7 @@ class ValueFunctions(AbstractSampling):
 
     degree: int | None = None
     num_paths: int = eqx.field(
-        default=4096, converter=lambda x: whole_number("num_paths", x)
+        default=4096, converter=lambda x: whole_number("num_paths", x, 2)
     )
     batch_size: int = eqx.field(
         default=512, converter=lambda x: whole_number("batch_size", x)

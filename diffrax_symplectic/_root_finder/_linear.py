@@ -2,11 +2,12 @@
 
 import functools as ft
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, cast, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -29,7 +30,8 @@ REDUCTION = 1e-3
 
 def matrix_of(apply: _Map, n: int, dtype) -> _Matrix:
     """The matrix of a linear map."""
-    return jax.vmap(apply, out_axes=1)(jnp.eye(n, dtype=dtype))
+    # XLA folds what is made of constants, and of `jnp.eye` it would not.
+    return jax.vmap(apply, out_axes=1)(cast(Array, np.eye(n, dtype=dtype)))
 
 
 def inverse(matrix: _Matrix) -> _Matrix:
@@ -41,7 +43,7 @@ def inverse(matrix: _Matrix) -> _Matrix:
     n = len(matrix)
 
     def eliminate(k, matrix):
-        here = jnp.arange(n) == k
+        here = np.arange(n) == k
         row = jnp.where(here, 1, matrix[k]) / matrix[k, k]
         column = jnp.where(here, 0, matrix[:, k])
         others = jnp.where(here, 0, matrix) - column[:, None] * row

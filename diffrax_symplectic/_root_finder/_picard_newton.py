@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, Bool, PyTree, Scalar
+from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._compat import ω
 from . import _continuation
@@ -18,10 +18,29 @@ from ._tolerance import Tolerance
 
 
 class State(eqx.Module):
-    """Where the search stands: how far it has come from `origin`, the first guess."""
+    """Where the search stands. A loop selects, gathers and scatters each array of its state
+    by kernels of their own, so what only Newton's method needs is one vector: for the
+    midpoint rule that leaves a fifth fewer of them to compile."""
 
-    origin: PyTree[Array]
-    progress: _continuation.Progress
+    k: Float[Array, " n"]
+    rest: Float[Array, " m"]
+    solved: Bool[Array, ""]
+
+    @staticmethod
+    def of(progress: _continuation.Progress) -> "State":
+        rest = eqx.tree_at(_apart, progress, (None, None))
+        return State(progress.k, jfu.ravel_pytree(rest)[0], progress.solved)
+
+    @property
+    def progress(self) -> _continuation.Progress:
+        like = _continuation.begin(self.k, self.solved)
+        _, restore = jfu.ravel_pytree(eqx.tree_at(_apart, like, (None, None)))
+        rest = restore(self.rest)
+        return eqx.combine(rest, like)
+
+
+def _apart(progress: _continuation.Progress) -> tuple[Array, Array]:
+    return progress.k, progress.solved
 
 
 class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, State]):
@@ -108,9 +127,8 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
             found = sweep_blocks(limits, options["blocks"], begin, equations.scale)
         else:
             found = sweep(limits, equations.image, begin, equations.scale)
-        use = lambda k: jnp.where(found.solved | found.near, k, 0)
-        k = jfu.ravel_pytree(jtu.tree_map(use, found.y))[0]
-        return batched_together(State(y, _continuation.begin(k, found.solved)))
+        k = jnp.where(found.solved | found.near, jfu.ravel_pytree(found.y)[0], 0)
+        return batched_together(State.of(_continuation.begin(k, found.solved)))
 
     def step(
         self,
@@ -122,17 +140,20 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         tags: frozenset[object],
     ) -> tuple[PyTree[Array], State, Any]:
         del tags
-        equations = _continuation.Equations(fn, args, options, state.origin)
+        # The iterate is `y`, where the search began, and how far it has come from there.
+        equations = _continuation.Equations(fn, args, options, y)
         pending = ~(state.progress.solved | state.progress.hopeless)
 
-        def advance(problem, progress):
+        def advance(problem, state):
             tolerance, linear_solver, equations = problem
-            return _continuation.advance(tolerance, linear_solver, equations, progress)
+            new = _continuation.advance(
+                tolerance, linear_solver, equations, state.progress
+            )
+            return State.of(new)
 
         problem = self.tolerance, self.linear_solver, equations
-        progress = where_pending(advance, pending, problem, state.progress)
-        y = equations.moved(jfu.ravel_pytree(y)[1](progress.k))
-        return y, State(state.origin, progress), fn(y, args)[1]
+        state = where_pending(advance, pending, problem, state)
+        return y, state, fn(y, args)[1]
 
     def terminate(
         self,
@@ -147,7 +168,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         result = optx.RESULTS.where(
             state.progress.hopeless, optx.RESULTS.nonfinite, optx.RESULTS.successful
         )
-        return state.progress.solved, result
+        return state.solved, result
 
     def postprocess(
         self,
@@ -161,8 +182,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         result: optx.RESULTS,
     ) -> tuple[PyTree[Array], Any, dict[str, Any]]:
         del options, tags, result
-        k = jfu.ravel_pytree(y)[1](state.progress.k)
-        found = (state.origin**ω + k**ω).ω
-        # If the first iterations solved the equations, no step has computed it.
+        k = jfu.ravel_pytree(y)[1](state.k)
+        found = (y**ω + k**ω).ω
         aux = fn(found, args)[1] if jtu.tree_leaves(aux) else aux
         return found, aux, {}

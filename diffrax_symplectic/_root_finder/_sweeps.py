@@ -7,6 +7,7 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
@@ -328,13 +329,13 @@ def _toward(a: PyTree[Array], b: PyTree[Array], weight: Scalar) -> PyTree[Array]
 
 def _by_chords(limits: Limits, tree_image: _Map, scale: _Map, begin: Found) -> Found:
     """From where iteration `begin`s, for paths that are not yet solved."""
-    use = lambda x: jnp.where(begin.solved | begin.near, x, 0)
-    k, restore = jfu.ravel_pytree(jtu.tree_map(use, begin.y))
+    k, restore = jfu.ravel_pytree(begin.y)
+    k = jnp.where(begin.solved | begin.near, k, 0)
     image = lambda k: jfu.ravel_pytree(tree_image(restore(k)))[0]
     look = _Look(limits, scale, _MOST_CHORDS, restore)
     value, jacobian = jax.linearize(image, k)
-    one = jnp.eye(k.size, dtype=k.dtype)
-    M = inverse(one - matrix_of(jacobian, k.size, k.dtype))
+    one = np.eye(k.size, dtype=k.dtype)
+    M = inverse(jnp.subtract(one, matrix_of(jacobian, k.size, k.dtype)))
     diff = M @ (value - k)
     moved = jnp.where(begin.solved, k, k + diff)
     scales = look.scales(moved)

@@ -119,6 +119,23 @@ class IndexedNoise(eqx.Module):
     it can be used in place of a function. [`diffrax_symplectic.NinomiyaVictoir`][] follows
     the flow of one noise after another, and evaluates only the noise of that flow. With a
     function that returns all `m` it has to evaluate all of them for each of the `m` flows.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+        import jax.random as jr
+
+        # Twenty oscillators with springs of fluctuating strength.
+        H0 = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2
+        noise = ds.IndexedNoise(lambda k, t, p, q, args: 0.1 * q[k] ** 2, m=20)
+        solver = ds.NinomiyaVictoir()
+        terms = ds.hamiltonian_terms(H0, noise, solver.path((20,), jr.key(0)))
+        y0 = (jnp.zeros(20), jnp.ones(20))
+        sol = diffrax.diffeqsolve(terms, solver, t0=0, t1=1, dt0=0.1, y0=y0)
+        ```
     """
 
     H: Callable[[IntScalarLike, RealScalarLike, PyTree, PyTree, Args], Array]

@@ -64,6 +64,24 @@ def spin_terms(
     spin, `noise = lambda t, s, args: sigma * s` with $\sigma^2 = 2 \alpha T$. Then the
     density $e^{-H_0 / T}$ is stationary, for spins of any lengths.
 
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+        import jax.random as jr
+
+        # A spin with an easy axis in a field, and a field of white noise.
+        H0 = lambda t, s, args: args * s[0] - s[2] ** 2
+        noise = lambda t, s, args: 0.1 * s
+        solver = ds.ImplicitMidpoint()
+        terms = ds.spin_terms(H0, noise, solver.path((3,), jr.key(0)))
+        y0 = ds.to_spinors(jnp.array([0.6, 0.0, 0.8]))
+        sol = diffrax.diffeqsolve(terms, solver, t0=0, t1=1, dt0=0.1, y0=y0, args=0.5)
+        s = ds.from_spinors(sol.ys)  # of shape (1, 3)
+        ```
+
     **Arguments:**
 
     - `H0`: `H0(t, s, args)`, a scalar, for `s` of shape `(..., 3)`: the sum over all

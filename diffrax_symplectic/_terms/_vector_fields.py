@@ -154,7 +154,7 @@ def apply_brackets(
     def summand(column, unit):
         return jax.jvp(lambda y: along(y, unit), (y,), (along(y, column),))[1]
 
-    summands = jax.vmap(summand)(A.T, jnp.eye(len(A), dtype=A.dtype))
+    summands = jax.vmap(summand)(A.T, np.eye(len(A), dtype=A.dtype))
     return jtu.tree_map(lambda x: jnp.sum(x, axis=0), summands)
 
 
@@ -230,7 +230,7 @@ def apply_bridge(
         single = lambda t, y: bracket(unit, drift, t, y, jnp.asarray(h, t.dtype))[0]
         return bracket(column, single, t, y, jnp.zeros_like(t))
 
-    units = jnp.eye(bridge.first.size, dtype=bridge.first.dtype)
+    units = np.eye(bridge.first.size, dtype=bridge.first.dtype)
     doubles, singles = jax.vmap(summand)(units, bridge.second)
     combine = lambda double, single: (
         jnp.sum(double, axis=0) + jnp.tensordot(bridge.first, single, axes=1)

@@ -38,6 +38,24 @@ def wave_terms(
     $|\psi|^2$, is a quadratic invariant. All solvers for general systems keep it to
     rounding.
 
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+        import jax.random as jr
+
+        # A qubit that is driven, with noise in its energy.
+        H0 = lambda t, psi, args: args * jnp.real(jnp.conj(psi[0]) * psi[1])
+        noise = lambda t, psi, args: 0.2 * jnp.abs(psi[1]) ** 2
+        solver = ds.StrangGauss()
+        terms = ds.wave_terms(H0, noise, solver.path((), jr.key(0)))
+        y0 = ds.to_pair(jnp.array([1.0 + 0j, 0.0]))
+        sol = diffrax.diffeqsolve(terms, solver, t0=0, t1=1, dt0=0.1, y0=y0, args=2.0)
+        psi = ds.from_pair(sol.ys)  # of shape (1, 2)
+        ```
+
     **Arguments:**
 
     - `H0`: `H0(t, psi, args)`, a real scalar. `psi` has the structure, shapes and complex

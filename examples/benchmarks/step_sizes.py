@@ -116,6 +116,23 @@ def _solve(system: System, solver) -> Callable:
     return solve
 
 
+def _gradient(system: System, solver) -> Callable:
+    """Takes keys and a step size to the mean of a quadratic function of the ends, and its
+    derivative in reverse mode with respect to the initial state."""
+
+    def loss(y0, keys, h):
+        def one(key):
+            sol = diffrax.diffeqsolve(
+                _terms(system, solver, key), solver, 0.0, STEPS * h, h, y0,
+                max_steps=STEPS + 2, throw=False,
+            )  # fmt: skip
+            return sum(jnp.sum(y**2) for y in jax.tree.leaves(sol.ys))
+
+        return jnp.mean(jax.vmap(one)(keys))
+
+    return jax.jit(lambda keys, h: jax.value_and_grad(loss)(system.y0, keys, h))
+
+
 def _handed_on(system: System, solver) -> Callable:
     """Takes keys and a step size to the share of steps that the first iterations leave to
     Newton's method and continuation."""
@@ -181,6 +198,8 @@ class Row(NamedTuple):
     name: str
     unknowns: str
     nanoseconds: tuple[float, ...]
+    # Value and gradient as a multiple of that, at the least and the largest step size.
+    gradient: tuple[float, ...]
     failed: tuple[float, ...]
     handed_on: tuple[float, ...]
 
@@ -193,6 +212,7 @@ def measure(system: System) -> list[Row]:
     calls |= {f"`{type(s).__name__}`": _solve(system, s) for s in system.solvers}
     shares = {f"`{type(s).__name__}`": _handed_on(system, s) for s in system.solvers}
     of = {f"`{type(s).__name__}`": s for s in system.solvers}
+    gradients = {f"`{type(s).__name__}`": _gradient(system, s) for s in system.solvers}
     batch = keys(system.paths)
     times = {name: [] for name in calls}
     failed = {name: [] for name in calls}
@@ -209,11 +229,24 @@ def measure(system: System) -> list[Row]:
         )
         unknowns = str(_unknowns(system, of[name])) if name in of else ""
         row = Row(
-            system, name, unknowns, tuple(times[name]), tuple(failed[name]), handed_on
-        )
+            system, name, unknowns, tuple(times[name]),
+            _over_value(name, calls, gradients, batch), tuple(failed[name]), handed_on,
+        )  # fmt: skip
         print(row[1:], flush=True)
         rows.append(row)
     return rows
+
+
+def _over_value(name: str, calls, gradients, batch) -> tuple[float, ...]:
+    if name not in gradients:
+        return ()
+    ratios = []
+    for h in (SIZES[0], SIZES[-1]):
+        pair = {"value": lambda: calls[name](batch, h)}
+        pair["gradient"] = lambda: gradients[name](batch, h)
+        seconds = race(pair, rounds=3)
+        ratios.append(seconds["gradient"] / seconds["value"])
+    return tuple(ratios)
 
 
 INTRODUCTION = """\
@@ -225,15 +258,16 @@ examples.benchmarks.step_sizes`.
 Implicit methods are there for long steps. The table shows nanoseconds per path and step;
 $n$ is the number of unknowns of the largest system of a step. Diffrax's Heun, which
 evaluates twice, and the midpoint rule by hand, always with twelve fixed-point iterations,
-cost nearly the same at every step size (here $h = 0.1$). The last column is the share of
-steps, over five sizes, that the first iterations leave to Newton's method and continuation.
-In brackets stands the share of paths with a step that was not solved: a long step need not
-have a solution.
+cost nearly the same at every step size (here $h = 0.1$). "Gradient" is the time of a
+value and its gradient in reverse mode over that of the value, at $h = 0.01$ and $0.4$.
+The last column is the share of steps, over five sizes, that the first iterations leave
+to Newton's method and continuation. In brackets stands the share of paths with a step
+that was not solved: a long step need not have a solution.
 
 ![Cost of a step against frequency times step size](step_sizes.png)
 
-| system | solver | $n$ | {sizes} | Heun | by hand | handed on |
-|---|---|---|{lines}---|---|---|
+| system | solver | $n$ | {sizes} | Heun | by hand | gradient | handed on |
+|---|---|---|{lines}---|---|---|---|
 """
 
 
@@ -251,9 +285,10 @@ def page(rows: list[Row]) -> str:
             for h, x, share in zip(SIZES, row.nanoseconds, row.failed)
             if h in SHOWN
         ]
-        share = f"{np.mean(row.handed_on):.2%}"
-        line = [row.system.title, row.name, row.unknowns, *cells, *explicit.values()]
-        text += f"| {' | '.join([*line, share])} |\n"
+        gradient = ", ".join(f"{x:.1f}" for x in row.gradient)
+        last = *explicit.values(), gradient, f"{np.mean(row.handed_on):.2%}"
+        line = row.system.title, row.name, row.unknowns, *cells, *last
+        text += f"| {' | '.join(line)} |\n"
     return text
 
 

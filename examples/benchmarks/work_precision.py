@@ -268,7 +268,7 @@ def draw(axes, title: str, results: dict[str, tuple[float, Errors]]) -> list[str
     lines = ["", f"## {title}", "", "| solver | error | µs |", "|---" * 3 + "|"]
     for i, (name, (cost, e)) in enumerate(results.items()):
         seconds, clear = cost / e.hs, e.errors > 3 * e.std_errors
-        style = "--" if name in dir(diffrax) and name != "ImplicitMidpoint" else "-"
+        style = "--" if name in dir(diffrax) else "-"
         axes.errorbar(
             seconds[clear], e.errors[clear], 3 * e.std_errors[clear], label=name,
             color=f"C{i}", ls=style, marker="o", ms=3, lw=1, capsize=2,
@@ -278,7 +278,9 @@ def draw(axes, title: str, results: dict[str, tuple[float, Errors]]) -> list[str
         cells = name, f"{error:.1e}{bar}", f"{seconds[SHOWN] * 1e6:.2f}"
         if name != "StratonovichMilstein":  # the picture has it
             lines.append("| " + " | ".join(cells) + " |")
-    axes.set(xscale="log", yscale="log", xlabel="CPU seconds per path", title=title)
+    kind, _, model = title.partition(", ")
+    axes.set(xscale="log", yscale="log", title=model)
+    axes.set(xlabel="CPU seconds per path", ylabel=kind.lower())
     axes.legend(fontsize=7)
     axes.grid(alpha=0.3)
     return lines

@@ -38,7 +38,10 @@ CASES = {
     "EulerHeun": Case(diffrax.EulerHeun(), gaussian),
 }
 QUICK = ("ImplicitMidpoint", "StormerVerlet")
-# The picture has all of them, the table these.
+# In the picture these have a colour each, and implicit methods, which lie upon each other,
+# one of them for all.
+COLOURS = dict(PlateauVerlet="C1", StormerVerlet="C0", Heun="C3", EulerHeun="C4")
+# The table has these.
 SHOWN = (
     "ImplicitMidpoint", "SRKs3", "SRKw4", "SRKs4", "PlateauVerlet", "StormerVerlet",
     "Heun",
@@ -147,20 +150,25 @@ def section(page: Page) -> str:
     cases = {n: CASES[n] for n in (QUICK if page.quick else CASES)}
     omegas = np.geomspace(0.1, 10, points)
     figure, axes = plt.subplots(1, 2, figsize=(11, 4))
-    for i, (name, case) in enumerate(cases.items()):
+    implicit = [name for name in cases if name not in COLOURS]
+    styles = {name: dict(color="0.6", lw=1, zorder=1) for name in implicit}
+    styles[implicit[0]]["label"] = f"implicit ({len(implicit)} methods)"
+    styles |= {name: dict(color=c, lw=1.5, label=name) for name, c in COLOURS.items()}
+    for name, case in cases.items():
         excess = spectral_radii(case, omegas / fastest()) - 1
-        style = dict(color=f"C{i % 10}", lw=1, ls="-" if i < 10 else "--")
-        axes[0].loglog(omegas, np.maximum(np.abs(excess), 1e-16), label=name, **style)
-    axes[0].set(xlabel="h omega", ylabel="spectral radius - 1", title="linear coupling")
+        axes[0].loglog(omegas, np.maximum(np.abs(excess), 1e-16), **styles[name])
+    axes[0].set(
+        xlabel=r"$h\omega$", ylabel="spectral radius - 1", title="linear coupling"
+    )
     axes[0].axvline(2, color="k", lw=0.5, ls=":")
     axes[0].axvline(4, color="k", lw=0.5, ls=":")
-    axes[0].legend(fontsize=7, loc="center left")
+    axes[0].legend(fontsize=8, loc="center left")
 
     print(f"\nStiff: mean of H0 at t = {t1:g}, less its exact value, {paths} paths")
     some = np.array([0.1, 0.5, 1.0, 1.9, 2.1, 3.9, 4.1, 10.0])
     hs = some / fastest()
     rows, errors, shown = [], [], [list(some).index(x) for x in (1.9, 10.0)]
-    for i, (name, case) in enumerate(cases.items()):
+    for name, case in cases.items():
         results = energies(case, hs, t1, paths)
         cells = [
             f"{e.excess:+.2f}" if np.isfinite(e.excess)
@@ -171,9 +179,12 @@ def section(page: Page) -> str:
             rows.append((name, limit(case, omegas), *cells))
         errors += [e.excess_error for e in results if np.isfinite(e.excess)]
         y = np.array([e.fast for e in results])
-        axes[1].loglog(some, np.where(np.isfinite(y), y, np.nan), "o-", ms=3, lw=1,
-                       color=f"C{i % 10}", label=name)  # fmt: skip
-    axes[1].set(xlabel="h omega", title="quartic coupling: mean energy of the fast one")
+        y = np.where(np.isfinite(y), y, np.nan)
+        axes[1].semilogx(some, y, "o-", ms=4, **styles[name])
+    axes[1].set(
+        xlabel=r"$h\omega$", ylabel="mean energy of the fast oscillator",
+        title="quartic coupling; beyond the last dot paths overflow", ylim=(0, None),
+    )  # fmt: skip
     axes[1].axhline(0.5, color="k", lw=0.5, ls=":")
     header = "solver", "limit", *[f"$h \\omega = {some[k]:g}$" for k in shown]
     energy_table = table(header, rows)
