@@ -255,14 +255,14 @@ INTRODUCTION = """\
 {machine}. float64, {steps} steps, random numbers included. Made by `python -m
 examples.benchmarks.step_sizes`.
 
-Implicit methods are there for long steps. The table shows nanoseconds per path and step;
-$n$ is the number of unknowns of the largest system of a step. Diffrax's Heun, which
-evaluates twice, and the midpoint rule by hand, always with twelve fixed-point iterations,
-cost nearly the same at every step size (here $h = 0.1$). "Gradient" is the time of a
-value and its gradient in reverse mode over that of the value, at $h = 0.01$ and $0.4$.
-The last column is the share of steps, over five sizes, that the first iterations leave
-to Newton's method and continuation. In brackets stands the share of paths with a step
-that was not solved: a long step need not have a solution.
+Nanoseconds per path and step; $n$ is the number of unknowns of the largest system of a
+step. Diffrax's Heun, which evaluates twice, and the midpoint rule by hand, always with
+twelve fixed-point iterations, cost nearly the same at every step size (here $h = 0.1$).
+"Gradient" is the time of a value and its gradient in reverse mode over that of the
+value, at $h = 0.01$ and $0.4$. The last column is the share of steps, over five sizes,
+that the first iterations leave to Newton's method and continuation. In brackets stands
+the share of paths with a step that was not solved: a long step need not have a
+solution.
 
 ![Cost of a step against frequency times step size](step_sizes.png)
 

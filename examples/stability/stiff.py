@@ -162,7 +162,7 @@ def section(page: Page) -> str:
     )
     axes[0].axvline(2, color="k", lw=0.5, ls=":")
     axes[0].axvline(4, color="k", lw=0.5, ls=":")
-    axes[0].legend(fontsize=8, loc="center left")
+    axes[0].legend(fontsize=8, loc="lower left", bbox_to_anchor=(0, 0.12))
 
     print(f"\nStiff: mean of H0 at t = {t1:g}, less its exact value, {paths} paths")
     some = np.array([0.1, 0.5, 1.0, 1.9, 2.1, 3.9, 4.1, 10.0])
@@ -183,7 +183,7 @@ def section(page: Page) -> str:
         axes[1].semilogx(some, y, "o-", ms=4, **styles[name])
     axes[1].set(
         xlabel=r"$h\omega$", ylabel="mean energy of the fast oscillator",
-        title="quartic coupling; beyond the last dot paths overflow", ylim=(0, None),
+        title="quartic coupling", ylim=(0, None),
     )  # fmt: skip
     axes[1].axhline(0.5, color="k", lw=0.5, ls=":")
     header = "solver", "limit", *[f"$h \\omega = {some[k]:g}$" for k in shown]
