@@ -159,7 +159,7 @@ CASES = {
     "Hénon-Heiles": Case(
         lambda t, y, args: y[1][0] ** 2,
         _henon.make_terms(ds.WeakBrownianPath((2,), jr.key(0))), _verlet,
-        5.0, 32, _henon.y0, 3, 5, 4096, _henon.exact,
+        5.0, 24, _henon.y0, 3, 5, 2048, _henon.exact,
     ),
     "two noises, linear": Case(
         _q2, two_noises(_two()), ds.NinomiyaVictoir(), 1.0, 4, Y0, 4, 2, 512,
