@@ -140,7 +140,8 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         tags: frozenset[object],
     ) -> tuple[PyTree[Array], State, Any]:
         del tags
-        # The iterate is `y`, where the search began, and how far it has come from there.
+        # `y` stays where the search began, and the state says how far it has come from
+        # there. In the end `postprocess` moves `y`, and evaluates `fn` once more.
         equations = _continuation.Equations(fn, args, options, y)
         pending = ~(state.progress.solved | state.progress.hopeless)
 
