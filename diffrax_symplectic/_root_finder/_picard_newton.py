@@ -39,7 +39,7 @@ class State(eqx.Module):
         return eqx.combine(rest, like)
 
 
-def _apart(progress: _continuation.Progress) -> tuple[Array, Array]:
+def _apart(progress: _continuation.Progress) -> tuple[Any, Any]:
     return progress.k, progress.solved
 
 
