@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from .._compat import materialize, ω
 from .._custom_types import IntScalarLike, RealScalarLike
 from ._batch import any_of_batch
-from ._linear import inverse, matrix_of
+from ._linear import inverse, matrix_of, product
 from ._tolerance import converged, largest, ratio, Tolerance
 
 
@@ -336,7 +336,7 @@ def _by_chords(limits: Limits, tree_image: _Map, scale: _Map, begin: Found) -> F
     value, jacobian = jax.linearize(image, k)
     one = np.eye(k.size, dtype=k.dtype)
     M = inverse(jnp.subtract(one, matrix_of(jacobian, k.size, k.dtype)))
-    diff = M @ (value - k)
+    diff = product(M, value - k)
     moved = jnp.where(begin.solved, k, k + diff)
     scales = look.scales(moved)
     size, _ = look.size(diff, scales)
@@ -344,7 +344,7 @@ def _by_chords(limits: Limits, tree_image: _Map, scale: _Map, begin: Found) -> F
     chords = _paced(_CHORDS, k)
 
     def advance(rounds: _Rounds) -> _Rounds:
-        chord = lambda k: k + M @ (image(k) - k)
+        chord = lambda k: k + product(M, image(k) - k)
         before, k = _fixed_point(chord, rounds.y, chords)
         root = lambda x: _root(x, chords)
         step = rounds.step + chords
