@@ -22,8 +22,8 @@ Solver: TypeAlias = lx.AbstractLinearSolver[Any] | None
 _MAX_DENSE = 32
 # Up to so many unknowns elimination is written out; its length grows with the cube.
 MAX_WRITTEN_OUT = 4
-# Up to so many columns a product is written out. For two that saves up to a fifth of a step,
-# for three nothing.
+# Up to so many columns a product is written out: for two that saves up to a fifth of a
+# step, and for three nothing.
 _MAX_SUMMED = 2
 # Restarted GMRES: so many directions, and how far the residual is reduced. A correction of
 # Newton's method needs no more accuracy than the next one makes up for.
