@@ -300,6 +300,30 @@ def test_only_pending_paths_of_a_batch_are_served():
         np.testing.assert_array_equal(got, (1 + every) * x[0])
 
 
+def test_nested_batches_are_served_as_one():
+    served = []
+
+    def combine(args, x):
+        jax.debug.callback(lambda: served.append(1))
+        of_all, of_row, of_column, of_each = args
+        return of_all * x + of_row + 10 * of_column + 100 * of_each
+
+    @jax.jit
+    def nested(pending, args, x):
+        serve = lambda pending, args, x: where_pending(combine, pending, args, x)
+        rows = jax.vmap(serve, (0, (None, None, 0, 0), 0))
+        return jax.vmap(rows, (0, (None, 0, None, 0), 0))(pending, args, x)
+
+    pending = jr.bernoulli(jr.key(0), 0.3, (3, 35))
+    x = jnp.arange(105.0).reshape(3, 35)
+    of_row, of_column = jnp.arange(3.0), jnp.arange(35.0)
+    got = nested(pending, (jnp.array(2.0), of_row, of_column, x), x)
+    everywhere = 2 * x + of_row[:, None] + 10 * of_column + 100 * x
+    np.testing.assert_array_equal(got, jnp.where(pending, everywhere, x))
+    jax.effects_barrier()
+    assert len(served) == jnp.sum(pending)
+
+
 @pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.StrangGauss()], ids=type)
 @pytest.mark.parametrize("d", [4, 32])
 def test_steps_of_many_unknowns_are_symplectic(solver, d):

@@ -75,39 +75,60 @@ def where_pending(
         own = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, leaves[num:]))
         return unflatten(own(*leaves[:num], *jtu.tree_leaves(value)))
 
-    @jax.custom_batching.custom_vmap
-    def serve(pending, leaves, value):
-        return lax.cond(pending, call, lambda _, value: value, leaves, value)
-
     # Traced once, for what is in a loop is batched several times.
-    serve_batch = jax.jit(ft.partial(_serve_batch, call), static_argnums=0)
+    serve_batch = jax.jit(ft.partial(_serve_batch, call))
 
-    @serve.def_vmap
-    def _(size, in_batched, pending, leaves, value):
-        pending = _spread(size, in_batched[0], pending)
-        value = _spread(size, in_batched[2], value)
-        value = serve_batch(tuple(in_batched[1]), pending, leaves, value)
-        return value, jtu.tree_map(lambda _: True, value)
+    def serve(depth: int) -> Callable[..., _T]:
+        """For that many axes of a batch, of which arguments have those that they need."""
 
-    return serve(pending, [*leaves, *traced.consts], value)
+        @jax.custom_batching.custom_vmap
+        def serve_all(pending, leaves, value):
+            if depth > 0:
+                return serve_batch(pending, leaves, value)
+            return lax.cond(pending, call, lambda _, value: value, leaves, value)
+
+        @serve_all.def_vmap
+        def _(size, in_batched, pending, leaves, value):
+            pending, value = _spread(
+                size, (in_batched[0], in_batched[2]), (pending, value)
+            )
+            leaves = [x if b else x[None] for b, x in zip(in_batched[1], leaves)]
+            value = serve(depth + 1)(pending, leaves, value)
+            return value, jtu.tree_map(lambda _: True, value)
+
+        return serve_all
+
+    return serve(0)(pending, [*leaves, *traced.consts], value)
 
 
-def _serve_batch(call, in_batched: tuple[bool, ...], pending, leaves, value):
-    size = len(pending)
+def _serve_batch(call, pending, leaves, value):
+    """Arrays of `leaves` have each axis of the batch, or in its place one of length 1."""
+    depth, shape, size = pending.ndim, pending.shape, pending.size
     part = -(-size // _PARTS)
-    axes = [0 if b else None for b in in_batched]
+    flat = lambda x: x.reshape(size, *x.shape[depth:])
+    own = [any(n > 1 for n in x.shape[:depth]) for x in leaves]
 
     def body(carry):
         pending, value = carry
         # As `jnp.nonzero`, which is compiled to a dozen kernels. Where fewer paths are
         # left, the numbers beyond the batch are dropped in the end.
         flag, which = lax.top_k(pending.astype(jnp.float32), part)
+        place = jnp.unravel_index(which, shape) if depth > 1 else (which,)
         which = jnp.where(flag > 0, which, size)
-        gather = lambda x: x.at[which].get(mode="clip")
-        few = [gather(x) if b else x for x, b in zip(leaves, in_batched)]
-        new = jax.vmap(call, (axes, 0))(few, jtu.tree_map(gather, value))
+
+        def gather(x, own):
+            axes = zip(place, x.shape)
+            return (
+                x[tuple(i if n > 1 else 0 for i, n in axes)] if own else x[(0,) * depth]
+            )
+
+        few = [gather(x, b) for x, b in zip(leaves, own)]
+        axes = [0 if b else None for b in own]
+        new = jax.vmap(call, (axes, 0))(few, jtu.tree_map(lambda x: x[which], value))
         scatter = lambda x, y: x.at[which].set(y, mode="drop")
         return scatter(pending, False), jtu.tree_map(scatter, value, new)
 
     some_pending = lambda carry: jnp.any(carry[0])
-    return lax.while_loop(some_pending, body, (pending, value))[1]
+    begin = flat(pending), jtu.tree_map(flat, value)
+    value = lax.while_loop(some_pending, body, begin)[1]
+    return jtu.tree_map(lambda x: x.reshape(*shape, *x.shape[1:]), value)
