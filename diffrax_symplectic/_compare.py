@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import ArrayLike, PRNGKeyArray
 
 from ._arguments import check_solver, check_takes, shapes
 from ._brownian import (
@@ -24,7 +24,7 @@ from ._brownian import (
     PlateauBrownianPath,
     PlateauIncrement,
 )
-from ._custom_types import Args, Y
+from ._custom_types import Args, RealScalarLike, Y
 from ._expectation import Expectation, monte_carlo
 from ._solver import AbstractSymplecticSolver, Want
 from ._suggest import suggest_solver, with_paths
@@ -128,7 +128,7 @@ def compare_solvers(
     args: Args = None,
     *,
     key: PRNGKeyArray,
-    phi: Callable[[Y], Array] | None = None,
+    phi: Callable[[RealScalarLike, Y, Args], ArrayLike] | None = None,
     num_paths: int = 1000,
     reference: diffrax.AbstractSolver | None = None,
 ) -> Comparison:
@@ -136,8 +136,8 @@ def compare_solvers(
 
     Without `phi` errors are strong: root mean squares of $|y - y^*|$ at `t1`, with $y^*$
     a solution along the same Brownian path in steps an eighth of the smallest of `dt0`.
-    With `phi` they are weak: $|\mathbb E \phi(y) - \mathbb E \phi(y^*)|$ at `t1`, by
-    independent paths; their standard errors fall as one over the root of `num_paths`.
+    With `phi` they are weak: $|\mathbb E \phi(t, y) - \mathbb E \phi(t, y^*)|$ at `t1`,
+    by independent paths; their standard errors fall as one over the root of `num_paths`.
 
     Times are those of a batch of paths on this machine, divided by their number, without
     compiling.
@@ -168,7 +168,7 @@ def compare_solvers(
     - `dt0`: a list of step sizes; each divides the interval, and is a multiple of the
         smallest.
     - `key`: a JAX random key.
-    - `phi`: takes a state to a number.
+    - `phi`: takes time, state and `args` to a number.
     - `num_paths`: how many paths.
     - `reference`: the solver of $y^*$; by default the first that `suggest_solver` names.
 
@@ -186,7 +186,7 @@ def compare_solvers(
         solvers = [s.solver for s in suggestions]
     _check_solvers(solvers, reference)
     if phi is not None:
-        _check_scalar(phi, y0)
+        _check_scalar(phi, t1, y0, args)
     cell = min(dts) / _FINER
 
     def end(solver, make_path, key, dt):
@@ -194,7 +194,7 @@ def compare_solvers(
 
     def sample(solver, dt, key):
         y1, result = end(solver, ft.partial(_path, solver, want), key, dt)
-        return (y1 if phi is None else phi(y1)), result
+        return (y1 if phi is None else phi(t1, y1, args)), result
 
     def trial(solver):
         if phi is not None:
@@ -256,10 +256,10 @@ def _check_solvers(solvers, reference) -> None:
     check_solver("reference", reference)
 
 
-def _check_scalar(phi, y0: Y) -> None:
-    check_takes("phi", phi, "y")
-    out = eqx.filter_eval_shape(lambda y: jtu.tree_map(jnp.asarray, phi(y)), y0)
-    if [leaf.shape for leaf in jtu.tree_leaves(out)] != [()]:
+def _check_scalar(phi, t: RealScalarLike, y0: Y, args: Args) -> None:
+    check_takes("phi", phi, "t", "y", "args")
+    out = eqx.filter_eval_shape(phi, jnp.asarray(t, float), y0, args)
+    if [jnp.shape(leaf) for leaf in jtu.tree_leaves(out)] != [()]:
         raise ValueError(f"`phi` must return one number; got shape {shapes(out)}.")
 
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Sequence
 from typing import get_args
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -29,8 +28,8 @@ from ._solver import (
 from ._tableau import Structure
 from ._terms import (
     additive_fault,
-    apply,
     brownian_paths,
+    check_fit,
     commuting,
     constant_fault,
     FRICTION,
@@ -164,11 +163,7 @@ def suggest_solver(
     drift, noise = _parts(terms)
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
-    # Raises an error if the terms do not fit the state.
-    controls = eqx.filter_eval_shape(
-        lambda: [x.contr(t0, t0) for x in (*drift, *noise)]
-    )
-    eqx.filter_eval_shape(apply, (*drift, *noise), controls, args, t0, y0)
+    check_fit(terms, t0, y0, args)
     if gamma is not None:
         Damped(ImplicitMidpoint(), gamma).init(terms, t0, t0 + 1, y0, args)
 

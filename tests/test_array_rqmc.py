@@ -231,11 +231,19 @@ def test_equal_paths_are_one_brownian_motion():
         ("`levels` must be a positive integer", dict(levels=0)),
         ("Pass fewer levels", dict(levels=40)),
         ("`tol` must be a positive number", dict(tol=0.0)),
+        ("`tol` must be a positive number", dict(tol="1e-3")),
+        ("`start` must be what `expectation` returned", dict(start=3)),
+        ("`devices` must be a list of devices", dict(devices="cpu")),
+        ("`dt0` must be numbers; got dt0='0.1'", dict(dt0="0.1")),
+        ("`dt0` must be numbers; got", dict(dt0=Y0)),
+        ("and `t1` after `t0`; got dt0=0.1, t0=0.0, t1=inf", dict(t1=np.inf)),
+        ("`terms` must be terms of Diffrax.*got function", dict(terms=lambda t: t)),
         ("whole number of steps", dict(ts=[0.25])),
         ("whole number of steps", dict(t1=0.95)),
         ("must lie between", dict(ts=[1.1])),
         ("must be positive, and `t1` after", dict(t1=-1.0)),
         ("`phi` must return real arrays", dict(phi=lambda t, y, a: 1j * y[0])),
+        ("`phi` must return real arrays", dict(phi=lambda t, y, a: "q")),
         ("`sort_by` must return real arrays", dict(sort_by=lambda y: None)),
         ("needs a random key", dict(key=3)),
         (
@@ -269,13 +277,14 @@ def test_paths_whose_words_cannot_be_chosen_are_refused():
     for path in (tree, diffrax.UnsafeBrownianPath((), jr.key(0))):
         with pytest.raises(ValueError, match="FixedStepBrownianPath"):
             _estimate(terms=kubo_terms(path))
-    with pytest.raises(ValueError, match="0 random variables in each step"):
+    with pytest.raises(ValueError, match="no Brownian path, so that nothing is ra"):
         _estimate(terms=diffrax.ODETerm(lambda t, y, args: y))
     many = diffrax.ControlTerm(
-        lambda t, y, args: y, ds.WeakBrownianPath((30_000,), jr.key(0))
+        lambda t, y, args: jnp.zeros((1, 30_000)),
+        ds.WeakBrownianPath((30_000,), jr.key(0)),
     )
     with pytest.raises(ValueError, match="30,000 random variables in each step"):
-        _estimate(terms=many)
+        _estimate(diffrax.Heun(), many, y0=jnp.ones(1))
 
 
 def test_too_many_coordinates_to_sort_by_are_warned_of():

@@ -76,7 +76,7 @@ def test_weak_errors_have_the_bars_of_both_means():
 def test_weak_error_is_within_its_bars(monkeypatch):
     result = ds.compare_solvers(
         _terms(), [ds.SRKw1()], 0.0, 1.0, [0.5], Y0, key=jr.key(1),
-        phi=lambda y: y[1] ** 2, num_paths=4000,
+        phi=lambda t, y, args: t * y[1] ** 2, num_paths=4000,
     )  # fmt: skip
     (step,) = result.steps
     # The exact error of the midpoint rule at h = 1/2, by its matrix.
@@ -110,10 +110,10 @@ def test_steps_that_do_not_divide_the_interval_are_refused(dts):
         (r"a solver, as `ImplicitMidpoint\(\)`", dict(solvers=[ds.ImplicitMidpoint])),
         ("`reference` must be a solver", dict(reference="ImplicitMidpoint")),
         (
-            r"called as `phi\(y\)`; got .* `\(t, y, args\)`",
-            dict(phi=lambda t, y, args: y),
+            r"called as `phi\(t, y, args\)`; got .* `\(y\)`",
+            dict(phi=lambda y: y),
         ),
-        ("`phi` must return one number", dict(phi=lambda y: y)),
+        ("`phi` must return one number", dict(phi=lambda t, y, args: y)),
     ],
 )
 def test_bad_input_is_told_what_to_pass(message, kwargs):

@@ -59,6 +59,13 @@ def test_single_precision_is_accumulated_in_double():
     np.testing.assert_allclose(got.variance, x.var(ddof=1), rtol=1e-4)
 
 
+@pytest.mark.parametrize("n", [1000, 1023])
+def test_the_mean_of_a_constant_in_single_precision_is_that_constant(n):
+    third = jnp.float32(1 / 3)
+    got = ds.monte_carlo(lambda key: third + 0 * jr.normal(key, (), "f4"), jr.key(0), n)
+    assert got.mean == np.float64(third) and got.std_error == 0
+
+
 def test_an_estimate_can_be_continued():
     key = jr.key(2)
     first = ds.monte_carlo(_normal, key, 300, batch_size=128)
@@ -229,6 +236,22 @@ def test_an_estimate_prints_in_a_few_lines():
     lines = str(got).splitlines()
     assert len(lines) <= 6 and "2. ± 0.0e+00" in lines
     assert "10 paths, 0 failed" in lines[-1]
+
+
+def test_an_estimate_prints_the_digits_that_it_has_and_what_it_leaves_out():
+    H = lambda t, p, q, args: (p**2 + q**2) / 2
+    terms = ds.hamiltonian_terms(H, H, ds.WeakBrownianPath((), jr.key(0)))
+    run = lambda levels: ds.expectation(
+        lambda t, y, args: y[1], terms, ds.ImplicitMidpoint(), 0, 1, 0.25,
+        (jnp.array(0.0), jnp.array(1.0)), key=jr.key(1), levels=levels,
+        sampling=ds.IndependentPaths(256),
+    )  # fmt: skip
+    one, two = run(1), run(2)
+    first, said = str(one).splitlines()[:2]
+    # A standard error of a few hundredths: four digits after the point.
+    assert 0.01 < one.std_error < 0.1 and first.startswith(f"{one.mean:.4f} ± ")
+    assert said == "not included: the error of discretization (see `levels`)"
+    assert "not included" not in str(two) and "taken out" in str(two)
 
 
 def test_old_style_keys_will_do():

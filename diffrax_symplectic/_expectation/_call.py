@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -112,7 +113,8 @@ def expectation(
         So a second call may choose another.)
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
         default `t1` alone.
-    - `levels`: how many step sizes, each half of the one before.
+    - `levels`: how many step sizes, each half of the one before. With one, the error of
+        discretization is unknown, and no part of `std_error`.
     - `tol`: no further batch begins once every standard error is at most this. The number
         of samples in `sampling` is then the most that are taken.
     - `start`: an earlier estimate to continue. It has to come from the same `key` and the
@@ -129,10 +131,11 @@ def expectation(
     **Raises:** a `ValueError` for a solver of Itô equations (these terms are
     Stratonovich's), times between steps, a $\phi$ that is not real, sizes that are not
     positive integers, a `tol` that is not positive, a `key` that is none, a `start` from
-    another key, of other shapes or with more paths, and for paths that `sampling` cannot
-    use (it says which ones it can); [`diffrax_symplectic.ExpectationInterrupted`][], with
-    the estimate so far, on an interrupt from the keyboard. Warns if `tol` was not reached,
-    and if more than one path in a hundred failed.
+    another key, of other shapes or with more paths, terms without noise, and for paths that
+    `sampling` cannot use (it says which ones it can);
+    [`diffrax_symplectic.ExpectationInterrupted`][], with the estimate so far, on an
+    interrupt from the keyboard. Warns if `tol` was not reached, and if more than one path
+    in a hundred failed.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for the formula by which means
@@ -140,7 +143,7 @@ def expectation(
     (1990)](https://doi.org/10.1080/07362999008809220) for extrapolation.
     """
     given = terms, t0, t1, dt0, y0, args, ts
-    key, devices = checked_call("expectation", key, tol, devices, given)
+    key, devices = checked_call("expectation", key, tol, start, devices, given)
     problem = Problem.of(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels)
     k_pilot, plan = jr.fold_in(key, _NO_SAMPLE), None
     if sampling is None and start is not None:
@@ -175,7 +178,9 @@ def _chosen(
         """Seconds to a standard error of 1, by so many samples. Of several numbers the
         largest variance counts."""
         try:
-            plan = sampling.prepare(problem, key, devices)
+            # What a sampling warns of is told by its error.
+            with warnings.catch_warnings(action="ignore"):
+                plan = sampling.prepare(problem, key, devices)
         except ValueError:
             return np.inf
         own = jr.fold_in(key, _NO_SAMPLE)
@@ -207,5 +212,5 @@ def _chosen(
     listed = ", ".join(f"{type(x).__name__} {cost:.1e}" for cost, _, x, _ in done)
     name = "replicates" if isinstance(sampling, ArrayRQMC) else "num_paths"
     sampling = dataclasses.replace(sampling, **{name: samples})
-    reason = f"variance times seconds: {listed}"
+    reason = f"chosen by the least variance times seconds: {listed}"
     return sampling, plan._replace(num_samples=samples, reason=reason)

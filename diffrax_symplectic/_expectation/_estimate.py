@@ -3,6 +3,7 @@ another, on any devices."""
 
 import collections
 import dataclasses
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -144,11 +145,19 @@ class Expectation(eqx.Module):
         return side(-1), side(1)
 
     def __str__(self) -> str:
-        shown = lambda x: np.array2string(np.asarray(x), precision=12, threshold=6)
+
+        def shown(mean, error) -> str:
+            """With two digits more than the least of the errors has."""
+            least = np.clip(np.min(np.nan_to_num(error), initial=1), 1e-10, 1)
+            digits = 2 - math.floor(math.log10(least))
+            mode = "fixed" if digits < 12 else "maxprec"
+            mean = np.asarray(mean)
+            return np.array2string(mean, precision=digits, threshold=6, floatmode=mode)
+
         short: Any = {"float_kind": "{:.1e}".format}
         brief = lambda x: np.array2string(np.asarray(x), formatter=short, threshold=6)
         mean, error = jtu.tree_leaves(self.mean), jtu.tree_leaves(self.std_error)
-        lines = [f"{shown(m)} ± {brief(e)}" for m, e in zip(mean[:6], error)]
+        lines = [f"{shown(m, e)} ± {brief(e)}" for m, e in zip(mean[:6], error)]
         lines += ["..."] * (len(mean) > 6)
         if self.bias is not None:
             leaves = lambda x: [brief(y) for y in jtu.tree_leaves(x)[:6]]
@@ -157,6 +166,8 @@ class Expectation(eqx.Module):
             lines.append(f"bias of the finest step, taken out: {biases}")
             errors = ", ".join(leaves(self.error))
             lines.append(f"all errors, extrapolation included: {errors}")
+        elif self.sampling is not None:
+            lines.append("not included: the error of discretization (see `levels`)")
         how = "" if self.sampling is None else f", {self.sampling}"
         lines.append(f"{self.num_paths:,} paths, {self.num_failed:,} failed{how}")
         lines += [self.reason] if self.reason else []
@@ -195,10 +206,10 @@ class ExpectationInterrupted(KeyboardInterrupt):
 
 
 def checked_call(
-    user: str, key, tol: float | None, devices: Sequence[Any] | None, *others: Any
+    user: str, key, tol, start, devices: Sequence[Any] | None, *others: Any
 ) -> tuple[PRNGKeyArray, tuple]:
-    """The key and the devices that a user means. Raises a `ValueError` if an array of the
-    call is traced."""
+    """The key and the devices that a user means. Raises a `ValueError` for what none of
+    these arguments can be, and if an array of the call is traced."""
     if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((key, others))):
         raise ValueError(
             f"`{user}` takes as many batches as numbers tell, so it is no part of a JAX "
@@ -206,10 +217,22 @@ def checked_call(
             "is the mean of gradients: `monte_carlo` averages them."
         )
     check_key(key, user)
-    if tol is not None and not 0 < tol < np.inf:
+    is_number = isinstance(tol, int | float | np.number)
+    if tol is not None and not (is_number and 0 < tol < np.inf):
         raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")
+    if start is not None and not isinstance(start, Expectation):
+        raise ValueError(
+            f"`start` must be what `{user}` returned, or `None`; got {start!r}."
+        )
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-    devices = tuple(jax.devices() if devices is None else devices)
+    devices = jax.devices() if devices is None else devices
+    is_device = lambda x: isinstance(x, jax.Device)
+    if not isinstance(devices, Sequence) or not all(map(is_device, devices)):
+        raise ValueError(
+            "`devices` must be a list of devices, such as `jax.devices()[:1]`, or `None`; "
+            f"got {devices!r}."
+        )
+    devices = tuple(devices)
     return key if typed else jr.wrap_key_data(key), devices
 
 
@@ -351,10 +374,15 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
                 )
             x = jnp.tensordot(samples.weights.astype(x.dtype), x, 1)
             keep = good.reshape(-1, *[1] * (x.ndim - 2))
-            mean = jnp.sum(jnp.where(keep, x, 0), axis=1) / jnp.maximum(count, 1)
-            # In two passes, so that no two large numbers are subtracted.
+            total = lambda x: jnp.sum(jnp.where(keep, x, 0), axis=1)
+            n = jnp.maximum(count, 1)
+            mean = total(x) / n
+            # In two passes, so that no two large numbers are subtracted. The second one
+            # finds by how much the first was rounded, too.
             off = jnp.where(keep, x - mean[:, None], 0)
-            return mean, jnp.sum(off**2, axis=1), jnp.max(jnp.abs(off), axis=1)
+            rest = total(off) / n
+            squares = jnp.maximum(total(off**2) - n * rest**2, 0)
+            return mean, rest, squares, jnp.max(jnp.abs(off), axis=1)
 
         leaves, treedef = jtu.tree_flatten(samples.values)
         each = map(treedef.unflatten, zip(*map(moments, leaves)))
@@ -415,10 +443,11 @@ def _checked_start(start: Expectation, zeros, key_data, used: int, most: int):
 def _merged(estimate: Expectation, batch, paths: int) -> Expectation:
     """The estimate from its own samples, of so many paths each, and those of the batch, by
     the pairwise formula of Chan, Golub and LeVeque."""
-    count, failed, mean, squares, largest = batch
+    count, failed, mean, rest, squares, largest = batch
     a, b = estimate.num_samples, int(count)
     n, trees = max(a + b, 1), jtu.tree_map
-    delta = trees(lambda x, y: y.astype(float) - x, estimate.combinations, mean)
+    mean = trees(lambda x, y: x.astype(float) + y, mean, rest)
+    delta = trees(lambda x, y: y - x, estimate.combinations, mean)
     both = lambda x, y, d: x + y.astype(float) + d**2 * (a * b / n)
     return dataclasses.replace(
         estimate,

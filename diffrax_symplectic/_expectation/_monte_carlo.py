@@ -170,7 +170,7 @@ def monte_carlo(
     **Raises:** as [`diffrax_symplectic.expectation`][]; a `ValueError` for levels without
     `order`, if $\phi$ holds a `diffrax.RESULTS`, or if `fn` does not use its key.
     """
-    key, devices = checked_call("monte_carlo", key, tol, devices)
+    key, devices = checked_call("monte_carlo", key, tol, start, devices)
     levels = whole_number("levels", levels)
     if levels > 1 and order is None:
         raise ValueError(

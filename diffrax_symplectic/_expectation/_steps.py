@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from .._arguments import check_solver, check_takes, whole_number
 from .._custom_types import Args, RealScalarLike, Y
 from .._root_finder import all_finite
-from .._terms import check_stratonovich
+from .._terms import brownian_paths, check_fit, check_stratonovich
 from ._estimate import Plan, real, Samples
 
 
@@ -63,6 +63,12 @@ class Problem(eqx.Module):
         if not all_finite(y0):
             raise ValueError(f"`y0` must hold finite numbers; got {y0}.")
         start = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
+        check_fit(terms, start, y0, args)
+        if len(brownian_paths(terms)) == 0:
+            raise ValueError(
+                "`terms` have no Brownian path, so that nothing is random. Solve them "
+                "once, by `diffrax.diffeqsolve`."
+            )
         check_stratonovich(terms, solver, start, y0, args)
         check_takes("phi", phi, "t", "y", "args")
         check_real("phi", jtu.tree_leaves(eqx.filter_eval_shape(phi, start, y0, args)))
@@ -240,12 +246,12 @@ def _steps(t0, t1, dt0, ts: Sequence | None) -> tuple[np.ndarray, np.integer]:
     """After how many steps to average, and how many there are."""
     if dt0 is None:
         raise ValueError("`dt0` must be a number: steps are fixed; got None.")
+    given = f"got dt0={dt0!r}, t0={t0!r}, t1={t1!r}"
+    if not all(eqx.is_array_like(x) and np.ndim(x) == 0 for x in (t0, t1, dt0)):
+        raise ValueError(f"`t0`, `t1` and `dt0` must be numbers; {given}.")
     t0, t1, dt0 = float(t0), float(t1), float(dt0)
-    if not (dt0 > 0 and t1 > t0):
-        raise ValueError(
-            f"`dt0` must be positive, and `t1` after `t0`; got dt0={dt0}, t0={t0}, "
-            f"t1={t1}."
-        )
+    if not (0 < dt0 < np.inf and t0 < t1 < np.inf):
+        raise ValueError(f"`dt0` must be positive, and `t1` after `t0`; {given}.")
     times = np.array([t1] if ts is None else ts, float).reshape(-1)
     counts = (np.append(times, t1) - t0) / dt0
     whole = np.round(counts)
@@ -306,9 +312,9 @@ def check_real(name: str, leaves: list) -> None:
     if len(leaves) == 0:
         raise ValueError(f"`{name}` must return real arrays; it returned none.")
     kinds = jnp.floating, jnp.integer, jnp.bool_
-    is_real = lambda s: any(jnp.issubdtype(jnp.result_type(s), k) for k in kinds)
-    if not all(map(is_real, leaves)):
+    dtypes = [getattr(s, "dtype", type(s)) for s in leaves]
+    if not all(any(jnp.issubdtype(d, k) for k in kinds) for d in dtypes):
         raise ValueError(
-            f"`{name}` must return real arrays; got dtypes "
-            f"{[str(jnp.result_type(s)) for s in leaves]}. Return real and imaginary parts."
+            f"`{name}` must return real arrays; got dtypes {[str(d) for d in dtypes]}. "
+            "For complex numbers return real and imaginary parts."
         )

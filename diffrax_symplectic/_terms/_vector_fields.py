@@ -73,27 +73,45 @@ def apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> 
     """The sum over terms of vector field times control."""
     parts = []
     for term, control in zip(terms, controls):
-        _check_product(term, t, y, args, control)
-        parts.append(term.vf_prod(t, y, args, control))
+        parts.append(product(term, t, y, args, control))
     return _checked_sum(parts, y)
 
 
-def _check_product(term, t, y: Y, args: Args, control: PyTree) -> None:
-    if not isinstance(unwrapped(term), diffrax.ControlTerm):
-        return
-    if jtu.tree_structure(y) == jtu.tree_structure(control):
-        return
-    matrix = eqx.filter_eval_shape(term.vf, t, y, args)
-    is_operator = isinstance(matrix, lx.AbstractLinearOperator)
-    if not is_operator and jtu.tree_structure(matrix) != jtu.tree_structure(control):
-        # Diffrax multiplies leaf by leaf, and JAX then speaks of trees.
+def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
+    """Raises a `ValueError` unless these are terms that change a state such as `y0`. (Some
+    solvers of Diffrax take more than one, each for a part of the state.)"""
+    is_term = lambda x: isinstance(x, diffrax.AbstractTerm)
+    if not any(map(is_term, jtu.tree_leaves(terms, is_leaf=is_term))):
         raise ValueError(
-            "A `ControlTerm` multiplies arrays only if state and noise have the same "
-            f"structure; got a state of shape {shapes(y)} and a noise of shape "
-            f"{shapes(control)}. Return the matrix of noises as a Lineax operator "
-            "(`lineax.PyTreeLinearOperator`), make the state one array, or construct the "
-            "terms with `hamiltonian_terms`."
+            "`terms` must be terms of Diffrax, such as `hamiltonian_terms(H0, noise, path)`"
+            f"; got {type(terms).__name__}."
         )
+    if is_term(terms):
+        parts = tuple(_flatten(terms))
+        controls = eqx.filter_eval_shape(lambda: [x.contr(t0, t0) for x in parts])
+        eqx.filter_eval_shape(apply, parts, controls, args, t0, y0)
+
+
+def product(term: diffrax.AbstractTerm, t, y: Y, args: Args, control: PyTree) -> Y:
+    """Vector field times control."""
+    try:
+        return term.vf_prod(t, y, args, control)
+    except ValueError:
+        if not isinstance(unwrapped(term), diffrax.ControlTerm):
+            raise
+        matrix = eqx.filter_eval_shape(term.vf, t, y, args)
+        is_operator = isinstance(matrix, lx.AbstractLinearOperator)
+        structures = set(map(jtu.tree_structure, (matrix, y, control)))
+        if is_operator or len(structures) == 1:
+            raise
+    # Diffrax multiplies leaf by leaf, and JAX then speaks of trees.
+    raise ValueError(
+        "A `ControlTerm` multiplies arrays only if vector field, state and noise have the "
+        f"same structure; got shapes {shapes(matrix)}, {shapes(y)} and {shapes(control)}. "
+        "Return the matrix of noises as a Lineax operator "
+        "(`lineax.PyTreeLinearOperator`), make the state one array, or construct the "
+        "terms with `hamiltonian_terms`."
+    )
 
 
 @eqx.filter_jit
