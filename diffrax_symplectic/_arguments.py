@@ -31,10 +31,16 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
             f"`{name}` is called as {call}; got a function of other arguments, "
             f"`{signature}`."
         ) from None
-    named = [x for x in signature.parameters if x in arguments]
-    if named != [x for x in arguments if x in named]:
+    by_position = (
+        inspect.Parameter.POSITIONAL_ONLY,
+        inspect.Parameter.POSITIONAL_OR_KEYWORD,
+    )
+    names = [x.name for x in signature.parameters.values() if x.kind in by_position]
+    swapped = any(x in arguments and x != y for x, y in zip(names, arguments))
+    pair = arguments[1:3] == ("p", "q") and tuple(names[1:3])
+    if swapped or pair in (("x", "v"), ("x", "p"), ("q", "v")):
         raise ValueError(
-            f"`{name}` is called as {call}; got a function that names these in another "
+            f"`{name}` is called as {call}; got a function that names them in another "
             f"order, `{signature}`."
         )
 

@@ -126,17 +126,16 @@ def innermost_solve() -> Mapping[str, Any] | None:
     return None if frame is None else frame.f_locals
 
 
-def innermost_times() -> tuple[Any, Any, Any] | None:
-    """`t0`, `t1` and `dt0` of the innermost solve as they were passed, numbers of Python
-    among them; `None` if there is no solve on the Python stack."""
+def innermost_call() -> Mapping[str, Any] | None:
+    """The arguments of the innermost solve as they were passed, numbers of Python among
+    them; `None` if there is no solve on the Python stack."""
     frame = _frame_of_solve("diffeqsolve")
     # Diffrax traces its numbers. Those that were passed are held by `equinox.filter_jit`.
     outer = None if frame is None else frame.f_back
     if outer is None or outer.f_globals.get("__name__") != "equinox._jit":
         return None
     args, kwargs = outer.f_locals["args"], outer.f_locals["kwargs"]
-    bound = inspect.signature(diffrax.diffeqsolve).bind(*args, **kwargs).arguments
-    return bound["t0"], bound["t1"], bound["dt0"]
+    return inspect.signature(diffrax.diffeqsolve).bind(*args, **kwargs).arguments
 
 
 def _frame_of_solve(*functions: str) -> FrameType | None:

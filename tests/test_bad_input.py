@@ -71,8 +71,12 @@ def test_malformed_terms_are_refused():
         ds.hamiltonian_terms(H, H, lambda t0, t1: 0.0)  # pyright: ignore
     with pytest.raises(ValueError, match="`H0` must be a function"):
         ds.hamiltonian_terms(1.0, H, weak_path(1))  # pyright: ignore
+    with pytest.raises(ValueError, match="got the class WeakBrownianPath"):
+        ds.hamiltonian_terms(H, H, ds.WeakBrownianPath)  # pyright: ignore
+    with pytest.raises(ValueError, match="got a NoneType.*pass neither"):
+        ds.hamiltonian_terms(H, H)
     with pytest.raises(ValueError, match="`noise` must be a function"):
-        ds.hamiltonian_terms(H, None, weak_path(1))  # pyright: ignore
+        ds.hamiltonian_terms(H, None, weak_path(1))
     with pytest.raises(ValueError, match=r"called as `H0\(t, p, q, args\)`; got a fun"):
         ds.hamiltonian_terms(lambda p, q: p * q, H, weak_path(1))  # pyright: ignore
 
@@ -81,11 +85,18 @@ def test_malformed_terms_are_refused():
 def test_hamiltonians_of_position_and_momentum_are_refused():
     path = ds.WeakBrownianPath((), jr.key(0))
     H0 = lambda t, p, q, args: (p**2 + q**2) / 2
-    noise = lambda t, q, p, args: q
-    with pytest.raises(
-        ValueError, match=r"`noise` is called as .*another order, `\(t, q"
+    for swapped in (
+        lambda t, q, p, args: q,
+        lambda t, x, v, args: x,
+        lambda t, x, p, args: x,
+        lambda t, q, v, args: q,
     ):
-        ds.hamiltonian_terms(H0, noise, path)
+        with pytest.raises(
+            ValueError, match=r"`noise` is called as .*another order, `\(t, [qx]"
+        ):
+            ds.hamiltonian_terms(H0, swapped, path)
+    for other in (lambda t, mom, pos, args: pos, lambda *args: args[2]):
+        ds.hamiltonian_terms(H0, other, path)
 
 
 @pytest.mark.parametrize("solver", [diffrax.Euler(), diffrax.ItoMilstein()])
@@ -260,6 +271,59 @@ def test_steps_of_several_sizes_are_announced_once():
         ValueError, match="dt0=0.3. does not divide.*must have one size"
     ):
         announced(1, 0.3, cells)
+
+
+@pytest.mark.parametrize(
+    "noises, times, match",
+    [
+        (1, dict(t1=np.nan), "`t1` .* must be a finite number; got nan"),
+        (1, dict(t1=np.inf), "`t1` .* must be a finite number; got inf"),
+        (1, dict(t0=-np.inf), "`t0` .* must be a finite number; got -inf"),
+        (1, dict(dt0=0), "`dt0` .* a finite number, not zero; got 0"),
+        (0, dict(dt0=np.nan), "`dt0` .* a finite number, not zero; got nan"),
+        (0, dict(dt0=jnp.array([0.1, 0.2])), "`dt0` .* a finite number, not zero"),
+    ],
+)
+def test_times_that_never_end_are_refused(noises, times, match):
+    H = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2
+    noise = (H, ds.WeakBrownianPath((), jr.key(0)))[: 2 * noises]
+    terms = ds.hamiltonian_terms(H, *noise)
+    times, y0 = dict(t0=0, t1=1, dt0=0.1) | times, (jnp.ones(2), jnp.ones(2))
+    with pytest.raises(ValueError, match=match):
+        diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), **times, y0=y0)
+
+
+def test_a_solve_may_go_on_until_an_event():
+    H = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2
+    event = diffrax.Event(lambda t, y, args, **kwargs: t >= 1)
+    sol = diffrax.diffeqsolve(
+        ds.hamiltonian_terms(H), ds.ImplicitMidpoint(), 0, np.inf, 0.25,
+        (jnp.ones(2), jnp.ones(2)), event=event,
+    )  # fmt: skip
+    assert sol.ts is not None and sol.ts[-1] == 1
+
+
+def test_steps_longer_than_the_whole_time_are_announced():
+    H = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2
+    terms, y0 = ds.hamiltonian_terms(H, H, weak_path(1)), (jnp.ones(2), jnp.ones(2))
+    with pytest.warns(UserWarning, match="`dt0=10` is longer than .*exchanged"):
+        diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), 0, 0.1, 10, y0)
+
+
+def test_a_forgotten_args_is_asked_about():
+    H = lambda t, p, q, args: jnp.sum(p**2) + args["k"] * jnp.sum(q**2)
+    plain = lambda t, p, q, args: jnp.sum(q**2)
+    for name, hamiltonians in (("H0", (H, plain)), ("noise", (plain, H))):
+        terms = ds.hamiltonian_terms(*hamiltonians, weak_path(1))
+        with pytest.raises(TypeError) as info:
+            _solve(terms, (jnp.ones(2), jnp.ones(2)))
+        notes = " ".join(info.value.__notes__)
+        assert f"`{name}` was called with `args=None`" in notes
+
+
+def test_shapes_with_a_negative_size_are_refused():
+    with pytest.raises(ValueError, match=r"a tuple of integers, `\(m,\)` for `m`"):
+        ds.WeakBrownianPath((-1,), jr.key(0))
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])

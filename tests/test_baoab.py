@@ -176,6 +176,8 @@ def test_frictions_that_are_none_are_refused():
     for wrong in (-1.0, jnp.nan, negative, jnp.array([[1.0, -0.5], [0.5, 1.0]])):
         with pytest.raises(ValueError, match="symmetric positive semidefinite"):
             ds.BAOAB(wrong)
+    with pytest.raises(ValueError, match="a real number, an array or a PyTree"):
+        ds.BAOAB(True)
     # For momenta of shape (2, 2) these are rates. For two momenta they are matrices.
     for wrong, match in (
         (jnp.array([[1.0, 0.5], [0.2, 1.0]]), "not symmetric"),

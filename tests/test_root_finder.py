@@ -158,9 +158,16 @@ def test_corrections_are_measured_by_the_scale_that_is_passed(direct, slope, mos
 
 
 def test_numbers_of_iterations_that_mean_nothing_are_refused():
-    for change in (dict(direct=-1), dict(picard_steps=-1)):
-        with pytest.raises(ValueError, match="must be >= 0; got -1"):
-            ds.PicardNewton(**change)
+    for name in ("direct", "picard_steps", "rtol", "atol"):
+        with pytest.raises(ValueError, match=f"`{name}` of .* must be >= 0; got -1"):
+            ds.PicardNewton(**{name: -1})
+    for name, wrong in (
+        ("root_find_max_steps", -1),
+        ("root_finder", ds.PicardNewton),
+        ("root_finder", None),
+    ):
+        with pytest.raises(ValueError, match=f"`{name}` must be an? "):
+            ds.ImplicitMidpoint(**{name: wrong})
 
 
 def _without_a_safety_net(finder, residual, start):

@@ -99,8 +99,8 @@ _pair = (jax.ShapeDtypeStruct((2,), jnp.float64),) * 2
 
 
 def test_position_before_momentum_is_asked_about():
-    H0 = lambda t, x, v, args: jnp.sum(v**2) / 2 + jnp.sum(x**4)
-    kick = lambda t, x, v, args: -jnp.sum(x)
+    H0 = lambda t, a, b, args: jnp.sum(b**2) / 2 + jnp.sum(a**4)
+    kick = lambda t, a, b, args: -jnp.sum(a)
     for solver in (ds.StormerVerlet(), ds.SRKs2()):
         with pytest.raises(ValueError, match="the wrong way round"):
             _solve(H0, kick, solver)

@@ -1,5 +1,7 @@
 """Terms from Hamiltonians: values, structures, derivatives, and use with Diffrax."""
 
+import functools as ft
+
 import diffrax
 import equinox as eqx
 import jax
@@ -160,6 +162,55 @@ def test_without_noise_the_midpoint_rule_has_order_two():
     exact = solve(diffrax.Dopri8(), 1e-3)
     coarse, fine = (np.abs(solve(solver, h) - exact).max() for h in (0.1, 0.05))
     np.testing.assert_allclose(np.log2(coarse / fine), 2, atol=0.1)
+
+
+def test_without_noise_terms_are_the_drift():
+    def harmonic(t, s, args):
+        return jnp.sum(s[..., 2] ** 2) / 2
+
+    path = weak_path(1)
+    y0, args = random_problem(jr.key(0), 2, 1)
+    waves = jnp.array([0.3 + 0.1j, 0.2 - 0.4j])
+    spinors = ds.to_spinors(jnp.array([0.6, 0.0, 0.8]))
+    amplitude = lambda t, psi, args: jnp.sum(jnp.abs(psi) ** 4)
+    for make, energy, y, parameters in (
+        (ds.hamiltonian_terms, H0, y0, args),
+        (ds.spin_terms, harmonic, spinors, None),
+        (ft.partial(ds.spin_terms, damping=0.1), harmonic, spinors, None),
+        (ds.wave_terms, amplitude, ds.to_pair(waves), None),
+    ):
+        alone, both = make(energy), make(energy, energy, path)
+        assert len(alone.terms) == 1
+        got, expected = (x.terms[0].vf(0.0, y, parameters) for x in (alone, both))
+        jax.tree.map(np.testing.assert_array_equal, got, expected)
+        run = lambda solver: diffrax.diffeqsolve(
+            alone, solver, 0, 1, 1 / 64, y, parameters
+        )
+        midpoint, exact = run(ds.ImplicitMidpoint()).ys, run(diffrax.Dopri8()).ys
+        close = ft.partial(np.testing.assert_allclose, atol=2e-3)
+        jax.tree.map(close, midpoint, exact)
+
+
+def test_a_hamiltonian_that_changes_its_args_changes_a_copy():
+    def doubles(t, p, q, args):
+        args["k"] = 2 * args["k"]
+        return (p**2 + args["k"] * q**2) / 2
+
+    plain = lambda t, p, q, args: (p**2 + 2 * args["k"] * q**2) / 2
+    args, y0 = {"k": jnp.array(1.5)}, (jnp.array(0.0), jnp.array(1.0))
+    solve = lambda H: (
+        diffrax.diffeqsolve(
+            ds.hamiltonian_terms(H, H, weak_path(1)),
+            ds.ImplicitMidpoint(),
+            0,
+            1,
+            0.1,
+            y0,
+            args,
+        ).ys
+    )
+    jax.tree.map(np.testing.assert_array_equal, solve(doubles), solve(plain))
+    assert args == {"k": 1.5}
 
 
 _GAUSSIAN = diffrax.UnsafeBrownianPath(

@@ -62,6 +62,8 @@ def test_truncation_needs_a_positive_integer(k):
 def test_truncation_needs_a_path():
     with pytest.raises(ValueError, match="wraps a Brownian path"):
         ds.TruncatedBrownianPath(lambda t0, t1: 0.0)  # pyright: ignore
+    with pytest.raises(ValueError, match="bounded already"):
+        ds.TruncatedBrownianPath(ds.WeakBrownianPath((), jr.key(0)))
 
 
 def test_truncation_needs_steps_shorter_than_one():

@@ -13,7 +13,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree, UInt32
 
-from .._compat import innermost_solve, innermost_times, nondifferentiable
+from .._compat import innermost_call, innermost_solve, nondifferentiable
 from .._custom_types import RealScalarLike
 from ._random import AbstractLaw, Gaussian, Place, random_words
 
@@ -247,10 +247,10 @@ def checked_shape(
     if isinstance(shape, tuple) and all(isinstance(n, int) for n in shape):
         shape = jax.ShapeDtypeStruct(shape, jnp.result_type(float))
     for leaf in jtu.tree_leaves(shape):
-        if not isinstance(leaf, jax.ShapeDtypeStruct):
+        if not isinstance(leaf, jax.ShapeDtypeStruct) or min(leaf.shape, default=0) < 0:
             raise ValueError(
-                "`shape` must be a tuple of integers or a PyTree of "
-                "`jax.ShapeDtypeStruct`s; got "
+                "`shape` must be a tuple of integers, `(m,)` for `m` noises, or a PyTree "
+                "of `jax.ShapeDtypeStruct`s; got "
                 f"{eqx.tree_pformat(shape, struct_as_array=True)}."
             )
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -280,7 +280,7 @@ def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
     solve = innermost_solve()
     if solve is None or not _holds(solve.get("terms"), type(path)):
         return
-    _check_times(path)
+    check_times(path)
     controller = solve.get("stepsize_controller")
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         # Diffrax refuses solvers without an error estimate, with any path.
@@ -299,16 +299,26 @@ def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
         )
 
 
-def _check_times(path: diffrax.AbstractBrownianPath) -> None:
-    """Looks at the times of the solve, where these are numbers. A `ValueError` if they are
-    no multiples of the path's `cell`, or `dt0` does not divide the interval; without cells
-    that is a warning. (Steps of other controllers, and times that are traced, are checked
-    when run.)"""
-    times = innermost_times()
-    if times is None:
+def check_times(path: diffrax.AbstractBrownianPath | None = None) -> None:
+    """Looks at the times of the solve being traced, where these are numbers. A `ValueError`
+    for those that never end, and if they are no multiples of the path's `cell`, or `dt0`
+    does not divide the interval; without cells that is a warning. (Steps of other
+    controllers, and times that are traced, are checked when run.)"""
+    call = innermost_call()
+    if call is None:
         return
-    t0, t1, dt0 = times
+    times = t0, t1, dt0 = call["t0"], call["t1"], call["dt0"]
     cell, number = getattr(path, "cell", None), int | float | np.number
+    numbers = all(isinstance(x, number) for x in times)
+    for name, x in (("t0", t0), ("t1", t1), ("dt0", dt0)):
+        known = isinstance(x, number)
+        endless = known and np.isinf(x) and call.get("event") is None
+        still = numbers and t0 != t1 and name == "dt0" and x == 0
+        if np.ndim(x) > 0 or (known and np.isnan(x)) or endless or still:
+            kind = "a finite number" + (", not zero" if name == "dt0" else "")
+            raise ValueError(f"`{name}` of `diffeqsolve` must be {kind}; got {x}.")
+    if path is None:
+        return
     if cell is not None:
         for name, time in dict(t0=t0, t1=t1, dt0=dt0).items():
             if isinstance(time, number) and not _divides(cell, time):
@@ -317,7 +327,16 @@ def _check_times(path: diffrax.AbstractBrownianPath) -> None:
                     f"multiples of `cell`; got cell={cell} and {name}={time}. Pass a "
                     "`cell` that divides `t0`, `t1` and `dt0`."
                 )
-    if not all(isinstance(x, number) for x in times) or _divides(dt0, t1 - t0):
+    if not numbers:
+        return
+    if 0 < abs(t1 - t0) < 0.999 * abs(dt0):
+        warnings.warn(
+            f"`dt0={dt0}` is longer than the time from {t0} to {t1}, which is one step "
+            "then. Are `dt0` and `t1` exchanged?",
+            stacklevel=2,
+        )
+        return
+    if _divides(dt0, t1 - t0):
         return
     message = (
         f"`dt0={dt0}` does not divide the time from {t0} to {t1}: Diffrax takes steps of "

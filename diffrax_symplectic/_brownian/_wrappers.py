@@ -7,6 +7,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM
+from ._paths import WeakBrownianPath
 from ._random import (
     AbstractLaw,
     check_key,
@@ -65,14 +66,19 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         - `path`: any Brownian path of Diffrax.
         - `k`: the integer $k \\geq 1$ above.
 
-        **Raises:** a `ValueError` if `k` is not a positive integer, or `path` is not a
-        Brownian path. An error when run if a step is not shorter than one unit of time,
-        where $A_h$ has no meaning.
+        **Raises:** a `ValueError` if `k` is not a positive integer, if `path` is no
+        Brownian path, or one of bounded increments. An error when run if a step is not
+        shorter than one unit of time, where $A_h$ has no meaning.
         """
         if not isinstance(path, diffrax.AbstractBrownianPath):
             raise ValueError(
                 "`TruncatedBrownianPath` wraps a Brownian path, for example "
                 f"`FixedStepBrownianPath(shape, key)`; got {type(path).__name__}."
+            )
+        if isinstance(path, WeakBrownianPath):
+            raise ValueError(
+                "The increments of a `WeakBrownianPath` are bounded already, and to cut "
+                "them off would change their moments. Pass it as it is."
             )
         if isinstance(k, bool) or not isinstance(k, int) or k < 1:
             raise ValueError(

@@ -99,8 +99,8 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
     picard_steps: int = eqx.field(default=200, static=True)
 
     def __check_init__(self):
-        for name in ("direct", "picard_steps"):
-            if (n := getattr(self, name)) < 0:
+        for name in ("rtol", "atol", "direct", "picard_steps"):
+            if isinstance(n := getattr(self, name), int | float) and n < 0:
                 raise ValueError(f"`{name}` of `PicardNewton` must be >= 0; got {n}.")
 
     @property

@@ -29,7 +29,8 @@ GAMMA = """the friction, in units of one over time: a number; or an array or PyT
 def checked(gamma: PyTree) -> PyTree:
     """`gamma`, after a check of those of its values that are not traced."""
     for leaf in jtu.tree_leaves(gamma):
-        if not eqx.is_array_like(leaf) or np.iscomplexobj(leaf):
+        is_number = eqx.is_array_like(leaf) and not isinstance(leaf, bool)
+        if not is_number or np.iscomplexobj(leaf):
             raise ValueError(
                 "`gamma` must be a real number, an array or a PyTree of arrays; got "
                 f"{leaf!r}."

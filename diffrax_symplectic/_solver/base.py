@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import PRNGKeyArray, PyTree
 
-from .._arguments import check_state
+from .._arguments import check_state, whole_number
 from .._brownian import path_of, VARIABLES
 from .._conditions import drift_order
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
@@ -274,6 +274,16 @@ def _variables(tableau: FlatTableau) -> list[str]:
     return [c for c in dict.fromkeys(channels) if c != "h"]
 
 
+def _checked_root_finder(value: Any) -> Any:
+    kinds = optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver
+    if not isinstance(value, kinds):
+        raise ValueError(
+            "`root_finder` must be a root finder of Optimistix, or "
+            f"`PicardNewton(rtol=...)`; got {value!r}."
+        )
+    return value
+
+
 class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
     """A solver with implicit stages. It has the two fields that `diffrax` asks of implicit
     solvers: the root finder for the stage equations, and the most iterations it may take in
@@ -282,9 +292,13 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
 
     # `optimistix.root_find` takes either kind of solver.
     root_finder: optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver = eqx.field(
-        default=PicardNewton(), kw_only=True
+        default=PicardNewton(), kw_only=True, converter=_checked_root_finder
     )
-    root_find_max_steps: int = eqx.field(default=100, kw_only=True)
+    root_find_max_steps: int = eqx.field(
+        default=100,
+        kw_only=True,
+        converter=ft.partial(whole_number, "root_find_max_steps", least=0),
+    )
 
 
 # The lines about these fields in the documentation of every such solver's `__init__`.

@@ -1,7 +1,7 @@
 import contextlib
 import functools as ft
 from collections.abc import Callable, Iterator
-from typing import get_args, Literal
+from typing import cast, get_args, Literal
 
 import diffrax
 import equinox as eqx
@@ -25,8 +25,8 @@ _Structure = Literal["separable", "additive"]
 
 def hamiltonian_terms(
     H0: _Hamiltonian,
-    noise: _Hamiltonian,
-    path: diffrax.AbstractBrownianPath,
+    noise: _Hamiltonian | None = None,
+    path: diffrax.AbstractBrownianPath | None = None,
     *,
     structure: _Structure | None = None,
 ) -> diffrax.MultiTerm:
@@ -74,7 +74,8 @@ def hamiltonian_terms(
         differentiable with respect to these and to `args`.
     - `noise`: `noise(t, p, q, args)`, the noise Hamiltonians $H_1, \ldots, H_m$ as an
         array of shape `(m,)`, or whatever structure and shapes `path` has. A scalar will
-        do if `m = 1`. Or an [`diffrax_symplectic.IndexedNoise`][].
+        do if `m = 1`. Or an [`diffrax_symplectic.IndexedNoise`][]. Leave it out, and
+        `path` with it, for a system without noise.
     - `path`: the Brownian path, of shape `(m,)`: a
         [`diffrax_symplectic.WeakBrownianPath`][], a
         [`diffrax_symplectic.TruncatedBrownianPath`][], or any of Diffrax's.
@@ -87,26 +88,33 @@ def hamiltonian_terms(
 
     `p` and `q` are PyTrees of arrays of the same structure and shapes.
 
-    **Returns:** `MultiTerm(drift, diffusion)`.
+    **Returns:** `MultiTerm(drift, diffusion)`, or without noise `MultiTerm(drift)`.
 
     **Raises:** a `ValueError` if `path` is not a Brownian path or `structure` is unknown;
     and, while the solve is traced, if the state is not a pair `(p, q)` of the same
     structure and shapes, if `H0` does not return a scalar, if `noise` does not match the
-    path or does not depend on the state, or if either asks for values in Python.
+    path or does not depend on the state, if either asks for values in Python or returns
+    what is not real, or if a time of the solve is not finite.
     """
-    if not isinstance(path, diffrax.AbstractBrownianPath):
-        raise ValueError(
-            "`path` must be a Brownian path, for example `diffrax_symplectic."
-            f"WeakBrownianPath(shape=(m,), key=key)`; got {type(path).__name__}."
-        )
-    for name, H in (("H0", H0), ("noise", noise)):
-        check_takes(name, H, "t", "p", "q", "args")
+    check_takes("H0", H0, "t", "p", "q", "args")
     if structure not in (None, *get_args(_Structure)):
         raise ValueError(
             f"`structure` must be one of {get_args(_Structure)}, or `None` to have it "
             f"found out; got {structure!r}."
         )
     drift = diffrax.ODETerm(_Drift(H0, structure))
+    if noise is None and path is None:
+        return diffrax.MultiTerm(drift)
+    noise = cast(_Hamiltonian, noise)
+    if not isinstance(path, diffrax.AbstractBrownianPath):
+        is_class = isinstance(path, type)
+        got = f"the class {path.__name__}" if is_class else f"a {type(path).__name__}"
+        raise ValueError(
+            "`path` must be a Brownian path, for example `diffrax_symplectic."
+            f"WeakBrownianPath(shape=(m,), key=key)`; got {got}. (For a system without "
+            "noise pass neither `noise` nor `path`.)"
+        )
+    check_takes("noise", noise, "t", "p", "q", "args")
     return diffrax.MultiTerm(drift, HamiltonianNoise(noise, path, structure))
 
 
@@ -151,7 +159,7 @@ class IndexedNoise(eqx.Module):
         self, k: IntScalarLike, t: RealScalarLike, p: PyTree, q: PyTree, args: Args
     ) -> Array:
         """`H_k`, for `k` from 0 to `m - 1`. Raises a `ValueError` if it is no scalar."""
-        out = self.H(k, t, p, q, args)
+        out = evaluated("H", self.H, k, t, p, q, args=args)
         if not jtu.all_leaves([out]) or jnp.shape(out) != ():
             raise ValueError(
                 "`H(k, t, p, q, args)` of `IndexedNoise` must return a scalar, the "
@@ -197,8 +205,8 @@ class Lifted(eqx.Module):
 
 def lifted_terms(
     H0: Callable,
-    noise: Callable,
-    path: diffrax.AbstractBrownianPath,
+    noise: Callable | None,
+    path: diffrax.AbstractBrownianPath | None,
     chart: Callable[[_State], PyTree],
     name: str,
 ) -> diffrax.MultiTerm:
@@ -207,6 +215,8 @@ def lifted_terms(
     check_takes("H0", H0, "t", name, "args")
     if isinstance(noise, IndexedNoise):
         lifted = IndexedNoise(Lifted(noise.H, chart), noise.m)
+    elif noise is None:
+        lifted = None
     else:
         check_takes("noise", noise, "t", name, "args")
         lifted = Lifted(noise, chart)
@@ -221,14 +231,13 @@ class _Drift(eqx.Module):
 
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
         # That module imports this one.
-        from ._structure_checks import check_sense_of_solve
+        from ._structure_checks import check_solve
 
         check_pair(y)
-        check_sense_of_solve(t, y, args)
+        check_solve(t, y, args)
 
         def scalar(p, q):
-            with _named("H0"):
-                return scalar_energy(self.H0(t, p, q, args))
+            return scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
 
         return symplectic_gradient(scalar, y)
 
@@ -245,7 +254,8 @@ def scalar_energy(out: PyTree) -> Array:
 
 
 def _check_real(name: str, out: PyTree[Array]) -> None:
-    if any(map(jnp.iscomplexobj, jtu.tree_leaves(out))):
+    is_real = lambda x: eqx.is_array_like(x) and not jnp.iscomplexobj(x)
+    if not all(map(is_real, jtu.tree_leaves(out))):
         raise ValueError(
             f"`{name}` must return real numbers; got {eqx.tree_pformat(out)}. Take "
             "`jnp.real` of what is real by its mathematics, such as <psi| A |psi>."
@@ -321,14 +331,12 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         every = lambda: self._hamiltonians(t, p, q, args, struct)
         if isinstance(self.noise, IndexedNoise):
             jax.eval_shape(every)  # for its error
-            with _named("noise"):
-                return self.noise.one(number, t, p, q, args)
+            return self.noise.one(number, t, p, q, args)
         return jfu.ravel_pytree(every())[0][number]
 
     def _hamiltonians(self, t, p, q, args, struct) -> PyTree[Array]:
         """The noise Hamiltonians, in the structure and shapes of the path."""
-        with _named("noise"):
-            H = self.noise(t, p, q, args)
+        H = evaluated("noise", self.noise, t, p, q, args=args)
         # One noise may come as a scalar.
         fits = lambda h, s: jnp.shape(h) == s.shape or jnp.size(h) == s.size == 1
         if jtu.tree_structure(H) != jtu.tree_structure(struct) or not all(
@@ -343,17 +351,23 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         return jtu.tree_map(lambda h, s: jnp.reshape(h, s.shape), H, struct)
 
 
-@contextlib.contextmanager
-def _named(name: str) -> Iterator[None]:
-    """Says in which Hamiltonian Python asked JAX for a value that is not known yet."""
+def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Array]:
+    """`H(*inputs, args)`. An error that comes from there says why, where that is known."""
+    # A function that changes the lists and dictionaries of `args` changes a copy: it would
+    # be another function each time that it is traced.
+    copy = jtu.tree_map(lambda x: x, args)
     try:
-        yield
+        return H(*inputs, copy)
     except jax.errors.JAXTypeError as error:
         raise ValueError(
             f"`{name}` asks for values while JAX traces it, when there are none: by `if`, "
             "`while`, `float`, or a function of NumPy. Write `jnp.where(a, b, c)` or "
             "`jax.lax.cond` in place of `if`, and `jnp` in place of `np`."
         ) from error
+    except (TypeError, AttributeError) as error:
+        if args is None:
+            error.add_note(f"`{name}` was called with `args=None`. Was it left out?")
+        raise
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._arguments import check_pair
 from .._custom_types import Args, RealScalarLike
-from ._hamiltonian import lifted_terms, scalar_energy
+from ._hamiltonian import evaluated, lifted_terms, scalar_energy
 
 
 _Spins = Float[Array, "*spins 3"]
@@ -22,8 +22,8 @@ _SpinHamiltonian = Callable[[RealScalarLike, _Spins, Args], PyTree[ArrayLike]]
 
 def spin_terms(
     H0: _SpinHamiltonian,
-    noise: _SpinHamiltonian,
-    path: diffrax.AbstractBrownianPath,
+    noise: _SpinHamiltonian | None = None,
+    path: diffrax.AbstractBrownianPath | None = None,
     damping: ArrayLike | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of spins, or of a rigid body, from their Hamiltonians.
@@ -111,9 +111,8 @@ def spin_terms(
     terms = lifted_terms(H0, noise, path, from_spinors, "s")
     if damping is None:
         return terms
-    _, diffusion = terms.terms
     drift = diffrax.ODETerm(_DampedPrecession(H0, damping))
-    return diffrax.MultiTerm(drift, diffusion)
+    return diffrax.MultiTerm(drift, *terms.terms[1:])
 
 
 def _checked_damping(alpha: ArrayLike) -> ArrayLike:
@@ -139,7 +138,8 @@ class _DampedPrecession(eqx.Module):
 
     def __call__(self, t: RealScalarLike, y: _Spinors, args: Args) -> _Spinors:
         s = from_spinors(y)
-        gradient = jax.grad(lambda s: scalar_energy(self.H0(t, s, args)))(s)
+        H0 = lambda s: evaluated("H0", self.H0, t, s, args=args)
+        gradient = jax.grad(lambda s: scalar_energy(H0(s)))(s)
         alpha = jnp.asarray(self.alpha, s.dtype)
         if alpha.shape not in ((), s.shape[:-1]):
             raise ValueError(

@@ -12,12 +12,13 @@ import jax.random as jr
 import jax.tree_util as jtu
 
 from .._arguments import check_pair, pair_fault
+from .._brownian import check_times
 from .._compat import innermost_solve, ω
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from ._data_flow import DataFlow
 from ._hamiltonian import asserted_structure, is_hamiltonian
-from ._vector_fields import apply, split_terms
+from ._vector_fields import apply, product, split_terms
 
 
 class Fault(NamedTuple):
@@ -148,9 +149,11 @@ def check_stratonovich(
         )
 
 
-def check_sense_of_solve(t: RealScalarLike, y: Y, args: Args) -> None:
-    """The same for the solve being traced. A drift beside that of the Hamiltonians may be
-    the correction that makes their noise one in the sense of Ito: then all is well."""
+def check_solve(t: RealScalarLike, y: Y, args: Args) -> None:
+    """The same for the solve being traced, and its times. A drift beside that of the
+    Hamiltonians may be the correction that makes their noise one in the sense of Ito: then
+    all is well."""
+    check_times()
     solve = innermost_solve()
     if solve is None or not isinstance(solve["solver"], diffrax.AbstractItoSolver):
         return
@@ -166,7 +169,7 @@ def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> DataFlow:
     """The change of the state by a term, as a program of time, state and control."""
     t0 = jnp.asarray(t0, jnp.result_type(float))
     control = eqx.filter_eval_shape(term.contr, t0, t0)
-    change = lambda t, y, control: term.vf_prod(t, y, args, control)
+    change = lambda t, y, control: product(term, t, y, args, control)
     return DataFlow(change, t0, y0, control)
 
 

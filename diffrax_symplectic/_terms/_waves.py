@@ -19,7 +19,9 @@ _WaveHamiltonian = Callable[[RealScalarLike, _Waves, Args], PyTree[ArrayLike]]
 
 
 def wave_terms(
-    H0: _WaveHamiltonian, noise: _WaveHamiltonian, path: diffrax.AbstractBrownianPath
+    H0: _WaveHamiltonian,
+    noise: _WaveHamiltonian | None = None,
+    path: diffrax.AbstractBrownianPath | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of complex amplitudes from their real Hamiltonians.
 
