@@ -15,7 +15,7 @@ from ._tolerance import Tolerance
 
 
 # A derivative is solved to rounding error, as the step is by default.
-_LIMITS = Limits(Tolerance(None, 0.0, optx.max_norm), steps=200, direct=6)
+_LIMITS = Limits(Tolerance(None, 0.0, optx.max_norm), steps=200, direct=0)
 
 
 def differentiate(
