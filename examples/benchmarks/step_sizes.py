@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -158,6 +159,48 @@ def _handed_on(system: System, solver) -> Callable:
     return share
 
 
+class _Counter:
+    """Counts how often a function of the state is evaluated where it runs."""
+
+    count = 0
+
+    def __call__(self, y):
+        @jax.custom_jvp
+        def same(x):
+            return jax.pure_callback(self._seen, x, x, vmap_method="sequential")
+
+        same.defjvp(lambda primals, tangents: (same(*primals), *tangents))
+        leaves, treedef = jax.tree.flatten(y)
+        return treedef.unflatten([same(leaves[0]), *leaves[1:]])
+
+    def _seen(self, x):
+        self.count += 1
+        return x
+
+
+def _evaluations(system: System, solver, h: float) -> float:
+    """Half of the evaluations of drift and noise in a step of one path alone. A derivative
+    along a direction is none, and noise that is constant is not evaluated."""
+    counter, number = _Counter(), 4
+
+    def counted(terms):
+        drift, noise = terms.terms
+        if isinstance(noise, diffrax.ControlTerm):
+            parts = lambda x: [x.terms[0].vector_field, x.terms[1].vector_field]
+            wrap = lambda fn: lambda t, y, args: fn(t, counter(y), args)
+        else:
+            parts = lambda x: [x.terms[0].vector_field.H0, x.terms[1].noise]
+            wrap = lambda fn: lambda t, p, q, args: fn(t, *counter((p, q)), args)
+        return eqx.tree_at(parts, terms, [wrap(x) for x in parts(terms)])
+
+    run = _solve(
+        system._replace(terms=lambda path: counted(system.terms(path))), solver
+    )
+    for key in keys(number):
+        jax.block_until_ready(run(key[None], h))
+    return counter.count / (2 * number * STEPS)
+
+
 def _by_hand(system: System) -> Callable:
     """The midpoint rule as one would write it: fixed-point iteration, the same number of
     iterations for all steps, and nobody looks whether they were enough."""
@@ -202,6 +245,8 @@ class Row(NamedTuple):
     gradient: tuple[float, ...]
     failed: tuple[float, ...]
     handed_on: tuple[float, ...]
+    # At the step sizes that are shown.
+    evaluations: tuple[float, ...]
 
 
 def measure(system: System) -> list[Row]:
@@ -231,6 +276,7 @@ def measure(system: System) -> list[Row]:
         row = Row(
             system, name, unknowns, tuple(times[name]),
             _over_value(name, calls, gradients, batch), tuple(failed[name]), handed_on,
+            tuple(_evaluations(system, of[name], h) for h in SHOWN if name in of),
         )  # fmt: skip
         print(row[1:], flush=True)
         rows.append(row)
@@ -259,15 +305,16 @@ Nanoseconds per path and step; $n$ is the number of unknowns of the largest syst
 step. Diffrax's Heun, which evaluates twice, and the midpoint rule by hand, always with
 twelve fixed-point iterations, cost nearly the same at every step size (here $h = 0.1$).
 "Gradient" is the time of a value and its gradient in reverse mode over that of the
-value, at $h = 0.01$ and $0.4$. The last column is the share of steps, over five sizes,
-that the first iterations leave to Newton's method and continuation. In brackets stands
-the share of paths with a step that was not solved: a long step need not have a
-solution.
+value, at $h = 0.01$ and $0.4$. "Evaluations" are pairs of one of the drift and one of the
+noise, in a step of one path alone, at $h = 0.01$, $0.1$ and $0.4$. The last column is the
+share of steps, over five sizes, that the first iterations leave to Newton's method and
+continuation. In brackets stands the share of paths with a step that was not solved: a
+long step need not have a solution.
 
 ![Cost of a step against frequency times step size](step_sizes.png)
 
-| system | solver | $n$ | {sizes} | Heun | by hand | gradient | handed on |
-|---|---|---|{lines}---|---|---|---|
+| system | solver | $n$ | {sizes} | Heun | by hand | gradient | evaluations | handed on |
+|---|---|---|{lines}---|---|---|---|---|
 """
 
 
@@ -286,7 +333,9 @@ def page(rows: list[Row]) -> str:
             if h in SHOWN
         ]
         gradient = ", ".join(f"{x:.1f}" for x in row.gradient)
-        last = *explicit.values(), gradient, f"{np.mean(row.handed_on):.2%}"
+        evaluations = ", ".join(f"{x:.0f}" for x in row.evaluations)
+        share = f"{np.mean(row.handed_on):.2%}"
+        last = *explicit.values(), gradient, evaluations, share
         line = row.system.title, row.name, row.unknowns, *cells, *last
         text += f"| {' | '.join(line)} |\n"
     return text
