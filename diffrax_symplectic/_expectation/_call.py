@@ -63,12 +63,13 @@ def expectation(
         import jax.numpy as jnp
         import jax.random as jr
 
-        H = lambda t, p, q, args: (p**2 + q**2) / 2
-        terms = ds.hamiltonian_terms(H, H, ds.WeakBrownianPath((), jr.key(0)))
+        H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
+        noise = lambda t, p, q, args: 0.2 * jnp.sin(q)
+        terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
         estimate = ds.expectation(
             lambda t, y, args: y[1] ** 2,
             terms,
-            ds.StrangGauss(),
+            ds.StormerVerlet(),
             t0=0,
             t1=1,
             dt0=1 / 8,
