@@ -41,7 +41,7 @@ def test_stages_are_solved_one_after_the_other():
 STEPS = np.array([2.0**-k for k in (3, 4, 5, 6)])
 
 
-def _strong_errors(terms, solver, y0, args, fine=2**10):
+def _strong_errors(terms, solver, y0, args, fine=2**9):
     @jax.jit
     @ft.partial(jax.vmap, in_axes=(0, None))
     def end(key, steps):

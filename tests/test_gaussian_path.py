@@ -197,15 +197,20 @@ def test_wrappers_make_the_same_step_from_words_as_from_keys():
     ):
         assert wrapped.num_words(use_levy=True) == len(given)
         assert wrapped.num_words() == 2
-        expected = wrapped.evaluate(t0, t1, use_levy=True)
-        got = wrapped.increment(given, t0, t1, use_levy=True)
+        expected, got, W, evaluated, back = jax.jit(
+            lambda given, t0, t1, wrapped=wrapped: (
+                wrapped.evaluate(t0, t1, use_levy=True),
+                wrapped.increment(given, t0, t1, use_levy=True),
+                wrapped.increment(given[:2], t0, t1),
+                wrapped.evaluate(t0, t1),
+                wrapped.evaluate(t1, t0, use_levy=True),
+            )
+        )(given, t0, t1)
         assert type(got) is type(expected) is wrapped.levy_area
         for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected)):
             np.testing.assert_allclose(a, b, rtol=1e-14)
-        W = wrapped.increment(given[:2], t0, t1)
-        np.testing.assert_allclose(W, wrapped.evaluate(t0, t1), rtol=1e-14)
+        np.testing.assert_allclose(W, evaluated, rtol=1e-14)
         # From its end to its start it is the same step.
-        back = wrapped.evaluate(t1, t0, use_levy=True)
         assert (expected.dt, back.dt) == (t1 - t0, t0 - t1)
         for name in {"W", "H", "sign", "C", "A"} & {*dir(back)}:
             a, b = getattr(back, name), getattr(expected, name)
