@@ -104,9 +104,8 @@ def test_one_noise_may_be_a_scalar(shape):
     solve(diffrax.StratonovichMilstein())
 
 
-def test_terms_work_with_diffrax_solvers():
-    # One noise is in the test above.
-    m = 3
+@pytest.mark.parametrize("m", [1, 3])
+def test_terms_work_with_diffrax_solvers(m):
     y0, args = random_problem(jr.key(0), 2, m)
     # Steps of the same size see the same increments.
     path = diffrax.UnsafeBrownianPath(
