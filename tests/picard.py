@@ -18,7 +18,7 @@ class Picard(optx.AbstractRootFinder):
     norm = staticmethod(optx.max_norm)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        return jnp.array(jnp.inf)
+        return jnp.full((), jnp.inf, jnp.result_type(*jax.tree.leaves(y)))
 
     def step(self, fn, y, args, options, state, tags):
         residual, aux = fn(y, args)
