@@ -158,6 +158,9 @@ def program(solver, dtype, derivatives: bool):
     succeeded."""
     del dtype  # Programs are kept apart.
     system = SYSTEMS[solver.structure]
+    if solver in MEMBERS:
+        # Their equations are of the kind that the defaults solve.
+        solver = by_picard(solver)
 
     @jax.jit
     @jax.vmap
