@@ -1,5 +1,7 @@
 """Complex amplitudes: the pair (p, q) stands for psi."""
 
+import functools as ft
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,7 @@ import pytest
 import diffrax_symplectic as ds
 from examples import qubit
 
+from .picard import by_picard
 from .problems import slope, weak_path
 
 
@@ -96,7 +99,8 @@ def test_norm_is_kept_over_ten_thousand_steps(solver):
     psi0 = jnp.array([0.6, 0.8j])
     norm = lambda t, y, args: jnp.sum(jnp.abs(ds.from_pair(y)) ** 2)
     sol = diffrax.diffeqsolve(
-        terms, solver, 0, 1000, 0.1, ds.to_pair(psi0), max_steps=10_001,
+        terms, solver, 0, 1000, 0.1, ds.to_pair(psi0), max_steps=None,
+        adjoint=diffrax.ForwardMode(),
         saveat=diffrax.SaveAt(ts=jnp.arange(0, 1000, 10.0), fn=norm),
     )  # fmt: skip
     # The norm is interpolated between the ends of steps, where it is the same.
@@ -111,6 +115,7 @@ def test_norm_is_kept_over_ten_thousand_steps(solver):
 )
 def test_noisy_qubit_has_the_density_matrix_of_lindblad_without_sampling(solver, order):
     steps = np.array([16, 32, 64])
+    solver = by_picard(solver)
     found = jnp.stack([qubit.density(solver, 2.0, int(n)) for n in steps])
     np.testing.assert_allclose(jnp.trace(found, axis1=1, axis2=2), 1.0, rtol=1e-12)
     errors = jnp.max(jnp.abs(found - qubit.lindblad(2.0)), axis=(1, 2))
@@ -130,7 +135,7 @@ def test_noisy_qubit_sampled():
     assert jnp.max(jnp.abs(error) / standard_error) <= 3
 
 
-PSI0 = jnp.asarray(qubit.PSI0)
+PSI0 = qubit.PSI0
 
 
 def test_gradients_with_respect_to_complex_parameters_are_those_of_jax():
@@ -139,17 +144,19 @@ def test_gradients_with_respect_to_complex_parameters_are_those_of_jax():
     terms = ds.wave_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
 
     @jax.jit
-    def loss(z, psi0):
-        sol = diffrax.diffeqsolve(
-            terms, ds.ImplicitMidpoint(), 0, 1, 0.25, ds.to_pair(psi0), z
-        )
+    @ft.partial(jax.value_and_grad, argnums=(0, 1))
+    def both(z, psi0):
+        solver = by_picard(ds.ImplicitMidpoint())
+        sol = diffrax.diffeqsolve(terms, solver, 0, 1, 0.25, ds.to_pair(psi0), z)
         return jnp.abs(ds.from_pair(sol.ys)[-1, 0]) ** 2
 
     z, k = 0.7 - 0.2j, 1e-6
-    gradient, by_start = jax.grad(loss, argnums=(0, 1))(z, PSI0)
+    gradient, by_start = both(z, PSI0)[1]
+    # One program for the gradient and for the values that are compared to it.
+    loss = lambda z, psi0: both(z, psi0)[0]
     along = lambda d: (loss(z + k * d, PSI0) - loss(z - k * d, PSI0)) / (2 * k)
     np.testing.assert_allclose(gradient, along(1) - 1j * along(1j), rtol=1e-7)
-    unit = jnp.array([0, 1j])
+    unit = np.array([0, 1j])
     difference = (loss(z, PSI0 + k * unit) - loss(z, PSI0 - k * unit)) / (2 * k)
     np.testing.assert_allclose(-by_start[1].imag, difference, rtol=1e-7)
 
@@ -158,13 +165,14 @@ def test_noises_of_waves_may_be_indexed():
     path = weak_path(2, two_point=True)
     y0 = ds.to_pair(_random(jr.key(0)))
     indexed = ds.IndexedNoise(lambda k, t, psi, args: _site_noise(t, psi, args)[k], 2)
-    ends = [
-        ds.NinomiyaVictoir().step(
-            ds.wave_terms(_lattice, fields, path), 0.0, 0.1, y0, 1.1, None, False
-        )[0]
-        for fields in (_site_noise, indexed)
-    ]
-    np.testing.assert_allclose(*map(ds.from_pair, ends), atol=1e-15)
+    solver = by_picard(ds.NinomiyaVictoir())
+
+    def end(y0, fields):
+        terms = ds.wave_terms(_lattice, fields, path)
+        return ds.from_pair(solver.step(terms, 0.0, 0.1, y0, 1.1, None, False)[0])
+
+    ends = jax.jit(lambda y0: [end(y0, fields) for fields in (_site_noise, indexed)])
+    np.testing.assert_allclose(*ends(y0), atol=1e-15)
 
 
 def test_complex_states_are_told_of_wave_terms():
