@@ -69,8 +69,7 @@ def test_a_failure_of_any_flow_is_reported():
         path = Given(jnp.ones(2), two_point=jnp.ones(2))
         y0 = jnp.array(0.1), jnp.array(10.0)
         terms = ds.hamiltonian_terms(stuck, noise, path)
-        solver = by_picard(ds.NinomiyaVictoir())
-        *_, result = solver.step(terms, 0.0, 1.0, y0, None, None, False)
+        *_, result = ds.NinomiyaVictoir().step(terms, 0.0, 1.0, y0, None, None, False)
         return result == diffrax.RESULTS.successful
 
     sizes = jnp.concatenate([jnp.eye(4), jnp.zeros((1, 4))])
