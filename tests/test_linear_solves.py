@@ -105,4 +105,5 @@ def test_derivatives_are_solved_whether_iteration_converges_or_not(n, dtype):
         assert x.dtype == dtype
         residual = np.linalg.norm(np.einsum("bij,bj->bi", A, x) - b, axis=1)
         size = np.linalg.norm(A, axis=(1, 2)) * np.linalg.norm(x, axis=1)
-        assert np.all(residual <= 8 * np.finfo(dtype).eps * size)
+        # At most 2 are measured, over sixty right-hand sides.
+        assert np.all(residual <= 4 * np.finfo(dtype).eps * size)

@@ -225,6 +225,8 @@ def sweep_blocks(
 
 def _by_sweeps(look: _Look, image: _Map, begin: Found, chords_follow: bool) -> Found:
     num_first, num_more = _paced(_FIRST, begin.y), _paced(_MORE, begin.y)
+    # The same rate in either precision: a slower one has not stalled in fewer iterations.
+    halt = 0.5 ** (num_more / _MORE)
 
     def advance(rounds: _Rounds) -> _Rounds:
         first = rounds.step == 0
@@ -236,7 +238,8 @@ def _by_sweeps(look: _Look, image: _Map, begin: Found, chords_follow: bool) -> F
         earlier, scales = lax.cond(first, begun, lambda: (rounds.size, rounds.scales))
         change = (y**ω - before**ω).ω
         root = lambda x: jnp.where(first, _root(x, num_first), _root(x, num_more))
-        return look.at(y, change, earlier, scales, root, rounds.step + count)
+        step = rounds.step + count
+        return look.at(y, change, earlier, scales, root, step, halt)
 
     return _while_any(advance, _first(look, begin), leave_together=chords_follow)
 
