@@ -1,0 +1,255 @@
+"""Gaussian increments for fixed steps: their law, and that they are those of one motion."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+from scipy import special
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._brownian import _random as words
+from diffrax_symplectic._brownian._random import normal_from_words
+from diffrax_symplectic._terms import controls
+
+from ..problems import kubo_terms
+
+
+AREA = diffrax.SpaceTimeLevyArea
+
+
+def _words():
+    """The ends of all octaves of words, and many between them."""
+    ends = 2.0 ** np.arange(32)[:, None] * np.linspace(1, 2, 64, endpoint=False)
+    low = np.unique(np.concatenate([[0], ends.ravel()]).astype(np.uint64))
+    low = low[low < 2**31]
+    return np.unique(np.concatenate([low, 2**32 - 1 - low])).astype(np.uint32)
+
+
+@pytest.mark.parametrize("dtype, rtol", [(jnp.float64, 1e-8), (jnp.float32, 1e-6)])
+def test_each_word_has_its_quantile(dtype, rtol):
+    words = _words()
+    got = np.asarray(normal_from_words(jnp.asarray(words), dtype))
+    assert got.dtype == dtype
+    # XLA rounds the logarithms of full vectors and of the rest differently.
+    np.testing.assert_allclose(got, -got[::-1], rtol=4 * jnp.finfo(dtype).eps)
+    # By the smaller of the two probabilities, which has all digits.
+    low = np.minimum(words, ~words).astype(float)
+    tail = -special.ndtri((low + 0.5) / 2**32)
+    middle = np.sqrt(2) * special.erfinv((2**31 - low - 0.5) / 2**31)
+    exact = np.where(low > 2**30, middle, tail) * np.where(words < 2**31, -1, 1)
+    np.testing.assert_allclose(got, exact, rtol=rtol)
+    # Neighbours, too, are in order.
+    near = np.unique((words[:, None] + np.arange(3, dtype=np.uint32)).ravel())
+    steps = np.diff(np.asarray(normal_from_words(jnp.asarray(near), jnp.float64)))
+    assert np.all(steps > 0)
+
+
+def test_moments_to_the_eighth_are_those_of_the_normal_distribution():
+    # The mean over all 2^32 words: by the rule of Gauss and Legendre in each octave of
+    # words, whose spacing is far below the length of all but the first, which are summed.
+    rare = np.arange(2**12, dtype=np.uint32)
+    x, weights = np.polynomial.legendre.leggauss(32)
+    starts = 2.0 ** np.arange(12, 31)
+    # Midpoints of words: the integral over [a - 1/2, 2 a - 1/2) is their sum.
+    nodes = starts[:, None] * (1.5 + x / 2) - 0.5
+    near = np.round(nodes).astype(np.uint32)
+    value = np.asarray(normal_from_words(jnp.asarray(near), jnp.float64))
+    # From the nearest word to the node, along the density's slope.
+    density = np.exp(-(value**2) / 2) / np.sqrt(2 * np.pi)
+    value = value + (nodes - near) / 2**32 / density
+    tail = np.asarray(normal_from_words(jnp.asarray(rare), jnp.float64))
+    for k, exact, rtol in ((2, 1, 1e-7), (4, 3, 1e-6), (6, 15, 2e-6), (8, 105, 1e-5)):
+        octaves = np.sum(value**k * weights * starts[:, None] / 2)
+        mean = 2 * (octaves + np.sum(tail**k)) / 2**32
+        np.testing.assert_allclose(mean, exact, rtol=rtol)
+
+
+def test_sampled_steps_and_noises_are_independent_with_the_right_variance():
+    n, h = 100_000, 0.3
+    path = ds.FixedStepBrownianPath((2,), jr.key(5), AREA)
+    t = h * jnp.arange(n)
+    inc = jax.vmap(lambda t: path.evaluate(t, t + h, use_levy=True))(t)
+    x = np.concatenate([inc.W, np.sqrt(12) * inc.H], axis=1) / np.sqrt(h)
+    products = [x[:, i] * x[:, j] for i in range(4) for j in range(i)]
+    products += [x[1:, i] * x[:-1, j] for i in range(4) for j in range(4)]
+    for sample in (x, *products):
+        assert np.all(np.abs(sample.mean(axis=0)) <= 4 / np.sqrt(n))
+    for k, exact, variance in ((2, 1, 2), (4, 3, 96), (8, 105, 2027025 - 105**2)):
+        error = np.abs((x**k).mean(axis=0) - exact)
+        assert np.all(error <= 4 * np.sqrt(variance / n))
+    # Tails: numbers beyond 3 standard deviations.
+    beyond = 2 * special.ndtr(-3)
+    assert np.all(
+        np.abs((np.abs(x) > 3).mean(axis=0) - beyond) <= 4 * np.sqrt(beyond / n)
+    )
+    plain = ds.FixedStepBrownianPath((2,), jr.key(5))
+    np.testing.assert_array_equal(plain.evaluate(t[7], t[7] + h), inc.W[7])
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_steps_of_cells_are_sums_and_areas_of_one_motion(dtype):
+    cell, n = 2.0**-4, 8
+    shape = {
+        "a": jax.ShapeDtypeStruct((2,), dtype),
+        "b": jax.ShapeDtypeStruct((), dtype),
+    }
+    path = ds.FixedStepBrownianPath(shape, jr.key(0), AREA, cell=cell)
+    evaluate = jax.jit(lambda t0, t1: path.evaluate(t0, t1, use_levy=True))
+    flat = lambda x: np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)])
+    t = dtype(-0.25) + cell * np.arange(n + 1, dtype=dtype)
+    cells = [evaluate(a, b) for a, b in zip(t[:-1], t[1:])]
+    w = np.array([flat(c.W) for c in cells])
+    mean = np.array([flat(c.H) for c in cells]) + w / 2
+    assert np.std(w) > 0.1
+    whole = evaluate(t[0], t[-1])
+    # The mean of the path over the step is that of its means over the cells.
+    before = np.concatenate([np.zeros((1, 3)), np.cumsum(w, axis=0)[:-1]])
+    area = np.mean(before + mean, axis=0) - w.sum(axis=0) / 2
+    np.testing.assert_allclose(flat(whole.W), w.sum(axis=0), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(flat(whole.H), area, rtol=1e-5, atol=1e-7)
+    assert whole.W["b"].dtype == whole.H["a"].dtype == whole.dt["a"].dtype == dtype
+    np.testing.assert_array_equal(flat(path.evaluate(t[0], t[-1])), flat(whole.W))
+    assert not np.any(flat(evaluate(t[2], t[2])))
+    with pytest.raises(
+        Exception, match="`FixedStepBrownianPath` with `cell` must begin"
+    ):
+        jax.block_until_ready(evaluate(t[0], t[0] + dtype(1.5 * cell)))
+
+
+def test_areas_of_composed_steps_have_their_variances():
+    n, h = 20_000, 0.5
+    path = lambda key: ds.FixedStepBrownianPath((), key, AREA, cell=h / 3)
+    draw = lambda key: path(key).evaluate(h, 2 * h, use_levy=True)
+    inc = jax.jit(jax.vmap(draw))(jr.split(jr.key(1), n))
+    for sample, exact, size in (
+        (inc.W**2, h, np.sqrt(2) * h),
+        (inc.H**2, h / 12, np.sqrt(2) * h / 12),
+        (inc.W * inc.H, 0, h / np.sqrt(12)),
+    ):
+        assert abs(np.mean(sample) - exact) <= 4 * size / np.sqrt(n)
+
+
+Y0 = (jnp.array(0.2), jnp.array(1.0))
+
+
+def _end(path, h, y0=Y0):
+    terms = kubo_terms(path, 0.4)
+    return diffrax.diffeqsolve(terms, diffrax.Heun(), 0.0, 1.0, h, y0).ys[1][-1]
+
+
+def test_solutions_with_steps_h_and_half_of_it_are_strongly_close():
+    # Strong order 1, so the difference halves with h; of independent paths it would not.
+    def differences(key):
+        path = ds.FixedStepBrownianPath((), key, cell=2.0**-7)
+        return jnp.stack([_end(path, 2.0**-k) for k in (4, 5, 6, 7)])
+
+    ends = np.asarray(jax.jit(jax.vmap(differences))(jr.split(jr.key(2), 200)))
+    coarse, middle, fine = np.sqrt(np.mean(np.diff(ends, axis=1) ** 2, axis=0))
+    assert coarse < 0.02
+    assert 1.6 < coarse / middle < 2.5 and 1.6 < middle / fine < 2.5
+
+
+@pytest.mark.parametrize("cell", [None, 0.125])
+def test_reverse_mode_sees_the_same_increments(cell):
+    def end(p):
+        path = ds.FixedStepBrownianPath((), jr.key(3), AREA, cell=cell)
+        return _end(path, 0.25, (p, Y0[1]))
+
+    value_and_grad, step = jax.jit(jax.value_and_grad(end)), 1e-6
+    _, reverse = value_and_grad(Y0[0])
+    plus, minus = (value_and_grad(Y0[0] + x)[0] for x in (step, -step))
+    np.testing.assert_allclose(reverse, (plus - minus) / (2 * step), rtol=1e-7)
+
+
+@pytest.mark.parametrize("cell", [None, 0.125])
+def test_backward_in_time_a_solve_returns_to_its_start(cell):
+    path = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((), jr.key(4), cell=cell))
+    terms = kubo_terms(path, 0.4)
+
+    @jax.jit
+    def solve(t0, t1, h, y0):
+        return diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), t0, t1, h, y0).ys
+
+    there = jax.tree.map(lambda x: x[-1], solve(0.0, 1.0, 0.25, Y0))
+    back = solve(1.0, 0.0, -0.25, there)
+    for a, b in zip(back, Y0):
+        np.testing.assert_allclose(a[-1], b, atol=1e-12)
+    assert abs(there[1] - Y0[1]) > 0.1
+
+
+def test_wrappers_make_the_same_step_from_words_as_from_keys():
+    t0, t1, key = jnp.array(0.5), jnp.array(0.75), jr.key(7)
+    at = words.place_of(t0, t1)
+    path = ds.FixedStepBrownianPath((2,), key, AREA)
+    own = words.random_words(key, at, 2, 2).reshape(-1)
+    more = lambda n, begin: words.random_words(key, at, 1, n, begin)[0]
+    areas = ds.LevyAreaBrownianPath(path, key, terms=1)
+    plateaus = ds.PlateauBrownianPath(path, key)
+    # The signs are the first bits: those of the words that the path takes are others.
+    assert np.all(more(2, 0) >> 31 != more(2, words.PLATEAU_WORDS) >> 31)
+    for wrapped, given in (
+        (path, own),
+        (ds.TruncatedBrownianPath(path, k=1), own),
+        (plateaus, jnp.append(own, more(2, words.PLATEAU_WORDS))),
+        (ds.TruncatedBrownianPath(areas), jnp.append(own, more(9, words.AREA_WORDS))),
+    ):
+        assert wrapped.num_words(use_levy=True) == len(given)
+        assert wrapped.num_words() == 2
+        expected, got, W, evaluated, back = jax.jit(
+            lambda given, t0, t1, wrapped=wrapped: (
+                wrapped.evaluate(t0, t1, use_levy=True),
+                wrapped.increment(given, t0, t1, use_levy=True),
+                wrapped.increment(given[:2], t0, t1),
+                wrapped.evaluate(t0, t1),
+                wrapped.evaluate(t1, t0, use_levy=True),
+            )
+        )(given, t0, t1)
+        assert type(got) is type(expected) is wrapped.levy_area
+        for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected)):
+            np.testing.assert_allclose(a, b, rtol=1e-14)
+        np.testing.assert_allclose(W, evaluated, rtol=1e-14)
+        # From its end to its start it is the same step.
+        assert (expected.dt, back.dt) == (t1 - t0, t0 - t1)
+        for name in {"W", "H", "sign", "C", "A"} & {*dir(back)}:
+            a, b = getattr(back, name), getattr(expected, name)
+            np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_bad_arguments_are_refused():
+    make = ds.FixedStepBrownianPath
+    with pytest.raises(ValueError, match="`levy_area` must be"):
+        make((), jr.key(0), diffrax.SpaceTimeTimeLevyArea)  # pyright: ignore
+    with pytest.raises(ValueError, match="`cell` must be positive"):
+        make((), jr.key(0), cell=0.0)
+    with pytest.raises(ValueError, match="real floating-point"):
+        make(jax.ShapeDtypeStruct((), jnp.int32), jr.key(0))
+    with pytest.raises(ValueError, match="needs a random key"):
+        make((), 0)  # pyright: ignore
+    pid = diffrax.PIDController(rtol=1e-3, atol=1e-3)
+    with pytest.raises(ValueError, match="adaptive step size"):
+        diffrax.diffeqsolve(
+            kubo_terms(make((), jr.key(0))),
+            diffrax.Heun(),
+            0.0,
+            1.0,
+            0.1,
+            Y0,
+            stepsize_controller=pid,
+        )
+
+
+def test_trees_coarser_than_the_step_are_refused():
+    # It would interpolate, and give a fraction of the variance without a word.
+    def draw(tol):
+        tree = diffrax.VirtualBrownianTree(0.0, 4.0, tol, (), jr.key(0))
+        term = diffrax.ControlTerm(lambda t, y, args: y, ds.TruncatedBrownianPath(tree))
+        return jax.jit(lambda h: controls((term,), ["W"], 1.0, 1.0 + h, "")["W"][0])
+
+    fine = draw(0.1)
+    for h in (0.1, 0.5, 1e-12):
+        assert jnp.isfinite(fine(h))
+    for step in (lambda: fine(0.09), lambda: draw(0.5)(0.1)):
+        with pytest.raises(Exception, match="Pass a smaller `tol`"):
+            jax.block_until_ready(step())

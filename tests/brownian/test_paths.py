@@ -1,0 +1,308 @@
+"""The laws of the increments, and that they are the same whenever a step is computed."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import lineax as lx
+import numpy as np
+import pytest
+from jax.extend.random import threefry_2x32
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._brownian._random import (
+    _threefry,
+    AREA_WORDS,
+    place_of,
+    PLATEAU_WORDS,
+    random_words,
+    THREE_POINT,
+    two_point,
+)
+
+from ..problems import kubo_terms, weak_path
+
+
+@pytest.mark.core
+def test_three_point_law_is_exact_in_the_bits():
+    # The law of a uniform 32-bit word: the two thresholds, and symmetry.
+    sixth = 2**32 // 6
+    edges = jnp.array([0, sixth - 1, sixth, 2**31, 2**32 - sixth - 1, 2**32 - sixth])
+    values = THREE_POINT.from_words(edges.astype(jnp.uint32), float)
+    np.testing.assert_array_equal(np.sign(values), [-1, -1, 0, 0, 0, 1])
+    assert abs(sixth / 2**32 - 1 / 6) < 2**-32
+    np.testing.assert_allclose(values[-1], np.sqrt(3), rtol=1e-15)
+    edges = jnp.array([0, 2**31 - 1, 2**31, 2**32 - 1], jnp.uint32)
+    np.testing.assert_array_equal(two_point().from_words(edges, float), [-1, -1, 1, 1])
+
+
+@pytest.mark.core
+def test_sampled_moments_are_within_four_standard_errors():
+    n, h = 200_000, 0.3
+    path = weak_path(2, second=True, two_point=True)
+    t = h * jnp.arange(n)
+    inc = jax.vmap(lambda t: path.evaluate(t, t + h, use_levy=True))(t)
+    x = np.concatenate([inc.W, inc.second, inc.two_point], axis=1) / np.sqrt(h)
+    three = lambda k: 0 if k % 2 else 3 ** (k / 2) / 3
+    two = lambda k: 0 if k % 2 else 1
+    laws = [three] * 4 + [two] * 2
+
+    def check(sample, mean, second):
+        error = np.sqrt(max(second - mean**2, 0) / n)
+        assert abs(sample.mean() - mean) <= 4 * error + 1e-10
+
+    for i, law in enumerate(laws):
+        for k in (1, 2, 3, 4):
+            check(x[:, i] ** k, law(k), law(2 * k))
+        # Independent of the other variables and of the next step.
+        for j in range(i):
+            check(x[:, i] * x[:, j], 0, 1)
+        shifted = x[1:, i] * x[:-1, i]
+        assert abs(shifted.mean()) <= 4 / np.sqrt(n)
+
+
+def test_variables_that_were_not_asked_for_are_missing():
+    inc = weak_path(2).evaluate(0.0, 0.1, use_levy=True)
+    assert inc.second is None and inc.two_point is None
+
+
+def test_asking_for_more_does_not_change_the_increment():
+    more = weak_path(2, second=True, two_point=True)
+    for t in (0.0, 0.7):
+        np.testing.assert_array_equal(
+            weak_path(2).evaluate(t, t + 0.1), more.evaluate(t, t + 0.1)
+        )
+
+
+# The sizes follow the step; which of the three values it is, is what is random.
+_signs = jax.jit(jax.vmap(lambda t0, t1: jnp.sign(weak_path(40).evaluate(t0, t1))))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("h", [0.01, 2**-6, 0.1, 1 / 3])
+@pytest.mark.parametrize("start", [0.0, 0.5, -2.0, 0.005])
+@pytest.mark.core
+def test_increments_do_not_depend_on_the_rounding_of_time(h, start, dtype):
+    n = 400
+    ts = (start + h * np.arange(n + 1)).astype(dtype)
+    W = np.asarray(_signs(ts[:-1], ts[1:]))
+    nudged = [np.nextafter(ts, end, dtype=dtype) for end in (np.inf, -np.inf)]
+    same = [_signs(a[:-1], b[1:]) == W for a in nudged for b in nudged]
+    # In single precision, one step in many thousands may sit at the edge of a count.
+    assert np.mean(np.all(same, axis=(0, 2))) >= (1 if dtype == jnp.float64 else 0.99)
+    # Two steps share 40 increments with probability 2^-40, if independent.
+    assert len(np.unique(np.asarray(W), axis=0)) == n
+
+
+@pytest.mark.core
+def test_steps_of_a_long_solve_all_differ():
+    path = weak_path(40)
+    ts = np.linspace(0, 1e4, 10**6 + 1)
+    picks = np.concatenate([np.arange(500), 10**6 - 500 + np.arange(500)])
+    W = jax.vmap(path.evaluate)(ts[picks], ts[picks + 1])
+    assert len(np.unique(np.asarray(W), axis=0)) == 1000
+
+
+@pytest.mark.parametrize("start, h", [(1e5, 0.01), (-1e5, 0.005), (2e4, 0.001)])
+@pytest.mark.core
+def test_steps_differ_even_where_single_precision_hardly_resolves_them(start, h):
+    # The sizes of these steps are one or two units in the last place of their times.
+    ts = np.unique((start + h * np.arange(500)).astype(np.float32))
+    assert np.max(np.diff(ts)) <= 2 * np.spacing(np.float32(abs(start)))
+    path = weak_path(40, dtype=jnp.float32)
+    W = np.sign(jax.jit(jax.vmap(path.evaluate))(ts[:-1], ts[1:]))
+    assert len(np.unique(W, axis=0)) == len(ts) - 1
+
+
+def test_last_steps_merged_by_diffrax_in_single_precision_have_their_variance():
+    # Diffrax makes one step of all that end within 1.2e-5 t1 of t1.
+    t1, h = 20_000.0, 0.05
+    path = weak_path(200, dtype=jnp.float32)
+    terms = diffrax.ControlTerm(
+        lambda t, y, args: lx.DiagonalLinearOperator(jnp.ones_like(y)), path
+    )
+    sol = diffrax.diffeqsolve(
+        terms,
+        diffrax.Heun(),
+        *(jnp.float32(t) for t in (t1 - 1, t1, h)),
+        jnp.zeros(200, jnp.float32),
+        saveat=diffrax.SaveAt(t0=True, steps=True),
+        max_steps=30,
+    )
+    assert sol.ts is not None
+    steps = np.diff(sol.ts[jnp.isfinite(sol.ts)])
+    assert np.sum(steps) == 1 and np.max(steps) == steps[-1] > 3 * h
+    # Each increment is 0 or of the size that belongs to its step.
+    rows = np.diff(np.asarray(sol.ys)[: len(steps) + 1], axis=0)
+    scaled = np.abs(rows) / np.sqrt(3 * steps[:, None])
+    np.testing.assert_allclose(scaled, np.round(scaled), atol=1e-4)
+    assert np.all(np.max(scaled, axis=1) > 0.99)
+
+
+def test_path_takes_any_pytree_under_jit_and_vmap():
+    shape = {
+        "a": jax.ShapeDtypeStruct((2, 3), jnp.float32),
+        "b": (jax.ShapeDtypeStruct((), jnp.float64),),
+    }
+
+    @jax.jit
+    @jax.vmap
+    def evaluate(key):
+        path = ds.WeakBrownianPath(shape, key, second=True, two_point=True)
+        return path.evaluate(0.0, 0.1, use_levy=True)
+
+    inc = evaluate(jr.split(jr.key(0), 5))
+    for part in (inc.W, inc.second, inc.two_point):
+        assert part["a"].shape == (5, 2, 3) and part["a"].dtype == jnp.float32
+        assert part["b"][0].shape == (5,) and part["b"][0].dtype == jnp.float64
+    # An increment from 0 can be had by its end alone, as from Diffrax's paths.
+    path = ds.WeakBrownianPath(shape, jr.key(0))
+    assert jax.tree.all(
+        jax.tree.map(
+            lambda a, b: jnp.all(a == b), path.evaluate(0.1), path.evaluate(0.0, 0.1)
+        )
+    )
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_increments_have_the_dtype_of_the_path(dtype):
+    inc = weak_path(2, dtype=dtype).evaluate(dtype(0.0), dtype(0.1), use_levy=True)
+    assert inc.W.dtype == inc.dt.dtype == dtype
+
+
+@pytest.mark.parametrize(
+    "shape, message",
+    [
+        (jax.ShapeDtypeStruct((2,), jnp.int32), "real floating-point"),
+        (jax.ShapeDtypeStruct((2,), jnp.complex64), "real floating-point"),
+        (3, "tuple of integers"),
+        ([2], "tuple of integers"),
+    ],
+)
+def test_malformed_shapes_are_refused(shape, message):
+    with pytest.raises(ValueError, match=message):
+        ds.WeakBrownianPath(shape, jr.key(0))
+
+
+def _paths():
+    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jr.key(0))
+    return [ds.WeakBrownianPath((), jr.key(0)), ds.TruncatedBrownianPath(tree)]
+
+
+@pytest.mark.parametrize("path", _paths(), ids=["weak", "truncated"])
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), diffrax.Heun()], ids=repr)
+def test_fixed_increments_refuse_adaptive_steps(path, solver):
+    terms, y0 = kubo_terms(path), (jnp.array(0.0), jnp.array(1.0))
+    solve = lambda solver, **kwargs: diffrax.diffeqsolve(
+        terms, solver, 0.0, 0.5, 0.1, y0, **kwargs
+    )
+    pid = diffrax.PIDController(rtol=1e-3, atol=1e-3, error_order=1.0)
+    # With another path a solver without an error estimate would be refused as well.
+    estimates = isinstance(solver, diffrax.AbstractAdaptiveSolver)
+    end = "VirtualBrownianTree` as path" if estimates else "`diffrax.StepTo`"
+    with pytest.raises(ValueError, match=f"adaptive step size controller.*{end}\\."):
+        solve(solver, stepsize_controller=pid)
+    with pytest.raises(ValueError, match="adaptive step size controller"):
+        solve(solver, stepsize_controller=diffrax.ClipStepSizeController(pid))
+    half = diffrax.HalfSolver(solver)
+    with pytest.raises(ValueError, match="`diffrax.HalfSolver`"):
+        solve(half)
+    with pytest.raises(ValueError, match="adaptive step size|`diffrax.HalfSolver`"):
+        solve(half, stepsize_controller=pid)
+    # Prescribed steps are fixed steps.
+    ts = jnp.array([0.0, 0.1, 0.3, 0.5])
+    diffrax.diffeqsolve(
+        terms, solver, 0.0, 0.5, None, y0, stepsize_controller=diffrax.StepTo(ts)
+    )
+
+
+def test_half_steps_work_where_the_path_can_be_refined():
+    tree = diffrax.VirtualBrownianTree(0.0, 0.5, 1e-3, (), jr.key(0))
+    H0 = lambda t, p, q, args: p**2 / 2 + q**4 / 4
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: jnp.sin(q), tree)
+    pid = diffrax.PIDController(rtol=1e-3, atol=1e-3, dtmin=1e-2, error_order=1.0)
+    sol = diffrax.diffeqsolve(
+        terms,
+        diffrax.HalfSolver(ds.StormerVerlet()),
+        0.0,
+        0.5,
+        0.1,
+        (jnp.array(0.0), jnp.array(1.0)),
+        stepsize_controller=pid,
+    )
+    assert sol.stats["num_steps"] > 0
+
+
+def test_another_solve_may_change_its_steps():
+    # An adaptive solve that evaluates the path, but is not driven by it.
+    path = ds.WeakBrownianPath((), jr.key(0))
+    field = lambda t, y, args: y * path.evaluate(0.0, 0.1)
+    pid = diffrax.PIDController(rtol=1e-3, atol=1e-3)
+    diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        diffrax.Heun(),
+        0.0,
+        0.5,
+        0.1,
+        jnp.array(1.0),
+        stepsize_controller=pid,
+    )
+
+
+def test_the_same_key_gives_the_same_path_in_every_version():
+    # By hand: 1.37 h lies in [2^(e + 1), 2^(e + 2)), and the middle of the step is counted
+    # in units of 2^e, shifted by 0.29.
+    for step, place in (
+        ((0.0, 0.25), (1, -3)),
+        ((7.5, 7.75), (61, -3)),
+        ((-3.0, -2.9), (-47, -4)),
+        ((100.0, 101.0), (201, -1)),
+        # Counts begin again after 2^31.
+        ((2.0**31 + 7.5, 2.0**31 + 7.75), (61, -3)),
+    ):
+        assert tuple(map(int, place_of(*map(jnp.array, step)))) == place
+    # The generator is that of Random123. What is recorded is how its counters are used.
+    place = jnp.array(5, jnp.int32), jnp.array(-3, jnp.int32)
+    first, second = [3384798094, 3537045821], [1887961620, 1291108390]
+    key = jr.key(7, impl="threefry2x32")
+    np.testing.assert_array_equal(random_words(key, place, 2, 2), [first, second])
+    np.testing.assert_array_equal(
+        random_words(key, place, 1, 2, AREA_WORDS), [[2750506793, 1201171554]]
+    )
+
+
+def test_random_words_are_those_of_the_generator_of_jax():
+    key = np.array([2**31 + 5, 77], np.uint32)
+    counters = np.random.default_rng(0).integers(0, 2**32, (2, 100), np.uint32)
+    words = jnp.concatenate(_threefry(jnp.asarray(key), *jnp.asarray(counters)))
+    np.testing.assert_array_equal(words, threefry_2x32(key, counters.reshape(-1)))
+    # The known answer of its authors for a key and counters of zeros.
+    zero = jnp.zeros((), jnp.uint32)
+    words = [int(w) for w in _threefry(jnp.zeros(2, jnp.uint32), zero, zero)]
+    assert words == [0x6B200159, 0x99BA4EFE]
+
+
+@pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])
+def test_more_sets_of_words_leave_the_first_ones_and_wrappers_have_their_own(impl):
+    key, place = jr.key(3, impl=impl), place_of(jnp.array(0.5), jnp.array(0.75))
+    words = random_words(key, place, 3, 4)
+    np.testing.assert_array_equal(random_words(key, place, 1, 4), words[:1])
+    others = random_words(key, place, 3, 4, PLATEAU_WORDS)
+    assert len(np.unique(np.concatenate([words, others]))) == 24
+    # A million words, too, stay clear of those of the place that is counted next.
+    many = random_words(key, place, 1, 2**20 + 2, AREA_WORDS)
+    after = random_words(key, (place[0], place[1] + 1), 1, 2)
+    assert not np.isin(after, many).all()
+
+
+def test_what_is_no_key_is_refused():
+    tree = diffrax.UnsafeBrownianPath((2,), jr.key(0), diffrax.SpaceTimeLevyArea)
+    for make in (
+        lambda key: ds.WeakBrownianPath((2,), key),
+        lambda key: ds.PlateauBrownianPath(tree, key),
+        lambda key: ds.LevyAreaBrownianPath(tree, key),
+    ):
+        with pytest.raises(ValueError, match="needs a random key"):
+            make(0)
+    with pytest.raises(ValueError, match=r"array of keys of shape \(5,\)"):
+        ds.WeakBrownianPath((2,), jr.split(jr.key(0), 5)).evaluate(0.0, 0.1)

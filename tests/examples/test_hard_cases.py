@@ -1,0 +1,266 @@
+"""Systems that people bring, by what is known of them exactly: `docs/hard_cases.md`."""
+
+import functools
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+
+import diffrax_symplectic as ds
+from examples.hard_cases import (
+    chain,
+    double_well,
+    henon_heiles,
+    learning,
+    magnet,
+    nls,
+    spins,
+    two_body,
+)
+from examples.hard_cases._stationary import stationary_bias, Step
+
+from ..problems import FineSample, slope
+
+
+def test_two_bodies_keep_their_angular_momentum_and_gain_energy_as_they_should():
+    s, per_orbit = 0.03, 400
+    r = two_body.orbits(*two_body.SOLVERS["ImplicitMidpoint"], per_orbit, 4, s, 64)
+    assert r.failed_share == 0
+    assert r.momentum_error <= 5e-14
+    balance = r.balance(two_body.PERIOD / per_orbit, s)
+    assert abs(balance.sigmas) <= 4
+
+
+def test_two_bodies_by_an_explicit_method_lose_their_angular_momentum():
+    r = two_body.orbits(*two_body.SOLVERS["Heun"], 100, 4, 0.01, 32)
+    assert r.momentum_error > 1e-3
+    # And gain energy that nobody gave them.
+    assert r.balance(two_body.PERIOD / 100, 0.01).sigmas > 10
+
+
+def test_two_body_steps_fail_exactly_where_they_have_no_solution():
+    def step(key):
+        k_p, k_q, k_h = jr.split(key, 3)
+        p, q = jr.normal(k_p, (2,)), jr.normal(k_q, (2,))
+        h = jnp.exp(jr.uniform(k_h, (), minval=jnp.log(0.02), maxval=jnp.log(0.5)))
+        # Without noise: the path is not used.
+        drift = two_body.make_terms(diffrax.UnsafeBrownianPath((), key)).terms[0]
+        *_, result = ds.ImplicitMidpoint().step(drift, 0.0, h, (p, q), 0.0, None, False)
+        solved = result == diffrax.RESULTS.successful
+        return solved, two_body.midpoint_solvable(p, q, h)
+
+    solved, solvable = map(np.asarray, jax.vmap(step)(jr.split(jr.key(0), 4096)))
+    assert not np.any(solved & ~solvable)
+    assert np.mean(~solvable) > 0.01
+    # Next to the fold some that exist are given up.
+    assert np.mean(solvable & ~solved) <= 0.01
+    # The first step at 25 and at 50 to an orbit.
+    h = two_body.PERIOD / np.array([25, 50])
+    start = two_body.start()
+    np.testing.assert_array_equal(
+        jax.vmap(lambda h: two_body.midpoint_solvable(*start, h))(h), [False, True]
+    )
+
+
+def test_two_bodies_with_too_large_steps_fail_loudly():
+    # At 12 steps for an orbit the pericentre is not resolved. A step either is reported or
+    # keeps the angular momentum.
+    r = two_body.orbits(*two_body.SOLVERS["ImplicitMidpoint"], 12, 5, 0.01, 32)
+    assert r.failed_share > 0
+    if r.failed_share < 1:
+        assert r.momentum_error <= 1e-12
+
+
+def test_escape_from_a_double_well_costs_the_energy_that_noise_brings():
+    e = double_well.escape(
+        *double_well.SOLVERS["ImplicitMidpoint"], 0.2, 0.1, 10.0, 10_000
+    )
+    assert e.failed == 0
+    assert 0.2 < e.escaped.value < 0.8
+    assert abs(e.balance.sigmas) <= 4
+    # It could be seen if it were not so.
+    assert e.balance.std_error <= 0.02 * -double_well.BOTTOM
+
+
+def test_stationary_law_of_an_oscillator_is_that_of_its_matrices():
+    gamma, T, h = 0.7, 0.5, 0.3
+    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    noise = lambda t, p, q, args: -np.sqrt(2 * gamma * T) * q
+    step = Step(
+        lambda path: ds.hamiltonian_terms(H0, noise, path),
+        lambda key: diffrax.UnsafeBrownianPath((), key),
+        ds.Damped(ds.StormerVerlet(), gamma),
+    )
+    [bias] = stationary_bias(step, lambda q: q**2 / 2, T, [h], degrees=(2, 2))
+    # For (q, p): friction, half a drift, kick, half a drift, friction.
+    friction = np.diag([1, np.exp(-gamma * h / 2)])
+    drift, kick = np.array([[1, h / 2], [0, 1]]), np.array([[1, 0], [-h, 1]])
+    after = friction @ drift
+    A, b = after @ kick @ drift @ friction, after @ [0, np.sqrt(2 * gamma * T * h)]
+    moments = np.linalg.solve(np.eye(4) - np.kron(A, A), np.kron(b, b))
+    np.testing.assert_allclose(bias, moments[[0, 3]] - T, atol=1e-13)
+
+
+def test_double_well_with_friction_has_nearly_the_moments_of_gibbs():
+    h, V = 0.1, lambda q: double_well.energy(0.0, q)
+    bound = {"BAOAB": 3e-4, "Damped(PlateauVerlet)": 1e-4, "QUICSORT": 1e-4}
+    for name, most in bound.items():
+        step, _ = double_well.LANGEVIN[name]
+        [[q2, _]] = stationary_bias(step, V, double_well.T, [h])
+        assert abs(q2) <= most
+    # One evaluation for each step is enough where the well is cold.
+    cold = functools.partial(double_well.langevin_terms, T=0.1)
+    step = double_well.LANGEVIN["Damped(StormerVerlet)"][0]._replace(make_terms=cold)
+    [[q2, _]] = stationary_bias(step, V, 0.1, [h])
+    assert abs(q2) <= 1e-3
+
+
+def test_harmonic_chain_in_64_unknowns_is_heated_as_in_closed_form():
+    hs = (0.1, 1.0)
+    r = chain.heating(ds.ImplicitMidpoint(), hs)
+    assert np.max(r.energy_defect) <= 1e-13
+    np.testing.assert_allclose(
+        r.rate, list(map(chain.midpoint_heating, hs)), rtol=1e-12
+    )
+
+
+def test_nonlinear_chain_of_32_has_the_exact_mean_energy_and_symplectic_steps():
+    args = chain.Args(beta=1.0, s=0.2)
+    r = chain.nonlinear(*chain.SOLVERS["ImplicitMidpoint"], 0.05, 2.0, 64, args)
+    assert r.failed == 0
+    assert abs(r.excess.sigmas) <= 4
+    assert np.max(chain.symplecticity(ds.ImplicitMidpoint(), (0.1, 0.4), args)) <= 1e-13
+
+
+def test_henon_heiles_orbits_leave_for_the_energy_of_the_noise_only():
+    ours = henon_heiles.stay(
+        *henon_heiles.SOLVERS["ImplicitMidpoint"], 0.003, 0.2, 100.0, paths=512
+    )
+    heun = henon_heiles.stay(
+        *henon_heiles.SOLVERS["Heun"], 0.003, 0.2, 100.0, paths=512
+    )
+    assert ours.failed == heun.failed == 0
+    assert abs(ours.balance.sigmas) <= 4
+    assert heun.balance.sigmas > 20
+    assert heun.left.value > ours.left.value + 0.2
+
+
+def test_henon_heiles_converges_to_itself():
+    steps, fine = [2.0**-k for k in (3, 4, 5)], 2**9
+
+    def ends(key):
+        terms = henon_heiles.make_terms(FineSample.draw(key, fine, 2))
+        solve = lambda h: jnp.concatenate(
+            diffrax.diffeqsolve(
+                terms, ds.ImplicitMidpoint(), 0.0, 1.0, h, henon_heiles.start(), 0.3
+            ).ys,
+            axis=1,
+        )[0]
+        return jax.lax.map(solve, jnp.array([*steps, 1 / fine]))
+
+    ys = jax.jit(jax.vmap(ends))(jr.split(jr.key(0), 50))
+    squared = jnp.sum((ys[:, :-1] - ys[:, -1:]) ** 2, axis=-1)
+    measured = slope(np.array(steps), np.sqrt(jnp.mean(squared, axis=0)))
+    assert abs(measured - 1) <= 0.15
+
+
+def test_ring_of_spins_keeps_its_total_spin_and_gains_no_energy_without_noise():
+    lift, _, heun = spins.METHODS.values()
+    ours = spins.course(lift, 0.0, 0.2, 100, 1, spins=32)
+    assert ours.length_error.max() <= 1e-13
+    assert ours.total_error <= 1e-12
+    # A hundredth of what it is.
+    assert ours.energy_error <= 0.01 * abs(ours.energy[0, 0])
+    theirs = spins.course(heun, 0.0, 0.2, 100, 1, spins=32)
+    assert theirs.length_error.max() <= 1e-15
+    assert theirs.total_error > 1 and theirs.energy_error > 1
+
+
+def test_a_magnet_has_the_energy_and_magnetization_of_its_temperature():
+    # More damping forgets faster.
+    shape, T = (4, 4, 2), 2.0
+    ours = magnet.dynamics(T, 0.1, 2_000, shape, alpha=2.0)
+    exact = magnet.monte_carlo(T, 8_000, shape)
+    assert ours.length_error <= 1e-13
+    error = ours.values - exact.values
+    std_error = np.hypot(ours.std_errors, exact.std_errors)
+    assert np.all(np.abs(error) <= 4 * std_error)
+    # It could be seen if it were not so.
+    assert np.all(std_error <= 0.02)
+
+
+def test_ring_of_spins_with_noise_decays_as_in_closed_form():
+    sigma = 0.5
+    c = spins.course(next(iter(spins.METHODS.values())), sigma, 0.1, 20, 512, spins=8)
+    for mean in (c.excess(sigma), c.total_excess(sigma)):
+        assert abs(mean.sigmas) <= 4
+        assert mean.std_error <= 0.2
+    # Both would be seen if they stayed what they were.
+    assert abs(c.energy[0, 0]) * (1 - np.exp(-2 * sigma**2 * 2)) > 1
+
+
+def test_schroedinger_lattice_keeps_its_norm_and_gains_the_energy_of_the_noise():
+    ours, heun = (
+        nls.lattice(nls.SOLVERS[name], 0.02, 1.0, 8, 0.1, n=128)
+        for name in ("ImplicitMidpoint", "Heun")
+    )
+    assert ours.failed == heun.failed == 0
+    assert ours.norm_error <= 1e-13
+    assert abs(ours.balance.sigmas) <= 4
+    # Heun multiplies the highest modes, of frequency 32, in each step.
+    assert heun.norm_error > 1e-3
+
+
+class Known(eqx.Module):
+    log_s: jax.Array
+
+    def __call__(self, q):
+        return q**2 / 2
+
+
+def test_likelihood_of_an_oscillator_is_that_of_its_gaussian_transitions():
+    # Of dp = -q dt + s dw, dq = p dt over the spacing T, in closed form.
+    T, s, y, then = learning.SPACING, 0.3, np.array([0.2, -0.5]), np.array([0.7, -0.3])
+    got = learning.negative_log_likelihood(
+        Known(jnp.log(s)), ds.StormerVerlet(), 64, jnp.asarray(y), jnp.asarray(then)
+    )
+    cos, sin = np.cos(T), np.sin(T)
+    away = then - np.array([[cos, -sin], [sin, cos]]) @ y
+    pq = np.sin(T) ** 2 / 2
+    covariance = s**2 * np.array(
+        [[T / 2 + np.sin(2 * T) / 4, pq], [pq, T / 2 - np.sin(2 * T) / 4]]
+    )
+    fit = away @ np.linalg.solve(covariance, away)
+    expected = (fit + np.linalg.slogdet(covariance)[1]) / 2
+    np.testing.assert_allclose(got, expected, rtol=1e-3)
+
+
+def test_noise_strength_is_found_if_steps_are_small_and_heun_is_farther_from_it():
+    observed = learning.observe(jr.key(2), 64, 9)
+    now, then = (
+        jnp.moveaxis(x, 1, 0).reshape(2, -1) for x in (observed[:-1], observed[1:])
+    )
+
+    class True_(Known):
+        def __call__(self, q):
+            return learning.true_potential(q)
+
+    def found(name, steps):
+        def loss(log_s):
+            each = lambda now, then: learning.negative_log_likelihood(
+                True_(log_s), learning.SOLVERS[name], steps, now, then
+            )
+            return jnp.mean(jax.vmap(each, (1, 1))(now, then))
+
+        # The loss is fit exp(-2 log s) / 2 + 2 log s, up to a constant.
+        fit = 2 - jax.jit(jax.grad(loss))(0.0)
+        return float(jnp.sqrt(fit / 2))
+
+    std_error = learning.S / np.sqrt(4 * now.shape[1])
+    assert abs(found("StormerVerlet", 4) - learning.S) <= 4 * std_error
+    # Two steps are not enough for either of them.
+    ours, heun = (found(name, 2) - learning.S for name in ("StormerVerlet", "Heun"))
+    assert heun > 1.5 * ours

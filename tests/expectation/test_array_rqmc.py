@@ -1,0 +1,391 @@
+"""Expectations by `ArrayRQMC` and what all samplings share: each path has its law, and what
+is estimated is exact up to the spread that is reported."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._expectation._array_rqmc import layout
+from diffrax_symplectic._expectation._steps import level_weights
+
+from ..problems import kubo_terms, RecordingMeter
+
+
+Y0 = (jnp.array(0.0), jnp.array(1.0))
+SQUARE = lambda t, y, args: y[1] ** 2
+
+
+def _midpoint_moment(n: int, h: float) -> float:
+    """E(q^2) after n steps of the midpoint rule on the Kubo oscillator, in closed form: it
+    turns by 2 atan((h + I) / 2)."""
+    twice = 4 * np.arctan((h + np.sqrt(3 * h) * np.array([-1, 0, 1])) / 2)
+    return (1 + (np.exp(1j * twice) @ np.array([1, 4, 1]) / 6) ** n).real / 2
+
+
+MIDPOINT = ds.ImplicitMidpoint()
+# Made once, so that JAX compiles programs of it once.
+KUBO = kubo_terms(ds.WeakBrownianPath((), jr.key(0)))
+
+
+def _estimate(solver=MIDPOINT, terms=None, phi=SQUARE, **kwargs):
+    terms = KUBO if terms is None else terms
+    kwargs = dict(t1=1.0, dt0=0.1, y0=Y0, key=jr.key(7)) | kwargs
+    kwargs = dict(num_paths=256, replicates=4, sort_by=None) | kwargs
+    t1, dt0, y0 = (kwargs.pop(name) for name in ("t1", "dt0", "y0"))
+    own = [kwargs.pop(name) for name in ("num_paths", "replicates", "sort_by")]
+    sampling = kwargs.pop("sampling", None) or ds.ArrayRQMC(*own)
+    return ds.expectation(
+        phi, terms, solver, 0.0, t1, dt0, y0, sampling=sampling, **kwargs
+    )
+
+
+def test_the_estimate_is_exact_up_to_the_spread_that_it_reports():
+    got = _estimate(replicates=16, num_paths=2048)
+    exact = _midpoint_moment(10, 0.1)
+    # Student's distribution with 15 degrees of freedom is beyond 4.9 once in 5,000.
+    assert abs(got.mean - exact) <= 4.9 * got.std_error
+    # Of as many independent paths the standard error would be 1.9e-3.
+    assert 0 < got.std_error < 6e-4
+    assert (got.num_samples, got.num_paths, got.num_failed) == (16, 2**15, 0)
+    assert got.bias is None and got.tol_reached is None
+    low, high = got.interval(0.95)
+    np.testing.assert_allclose(high - low, 2 * 2.13145 * got.std_error, rtol=1e-5)
+
+
+def test_ito_solvers_are_refused_for_terms_of_stratonovich():
+    for solver in (diffrax.Euler(), diffrax.ItoMilstein()):
+        with pytest.raises(ValueError, match="in the sense of Ito.*`diffrax.Heun`"):
+            _estimate(solver)
+    # For additive noise both senses agree, and plain terms have the sense of the solver.
+    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    noise = lambda t, p, q, args: 0.1 * q
+    additive = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+    _estimate(diffrax.Euler(), additive, num_paths=32)
+    with pytest.raises(ValueError, match="in the sense of Ito"):
+        _estimate(
+            diffrax.Euler(),
+            diffrax.MultiTerm(
+                additive, *kubo_terms(ds.WeakBrownianPath((), jr.key(1))).terms
+            ),
+        )
+
+
+def test_of_one_step_the_law_is_balanced_to_the_last_path():
+    # Of 256 paths a sixth is 42.67, and blocks of six are cut off at either end.
+    signs = lambda t, y, args: jnp.stack([y < -1e-3, y > 1e-3, jnp.abs(y) < 1e-3])
+    path = ds.WeakBrownianPath((), jr.key(0))
+    terms = diffrax.ControlTerm(lambda t, y, args: jnp.ones(()), path)
+    at = lambda n, seed: _estimate(
+        diffrax.Heun(), terms, signs, y0=jnp.zeros(()), t1=0.1, replicates=n,
+        key=jr.key(seed),
+    )  # fmt: skip
+    for seed in range(10):
+        counts = 2 * 256 * at(2, seed).mean
+        assert np.all(np.abs(counts[:2] - 2 * 256 / 6) <= 2 * 5 / 3)
+        np.testing.assert_allclose(counts.sum(), 2 * 256)
+    got = at(64, 0)
+    assert np.all(np.abs(got.mean - [1 / 6, 1 / 6, 2 / 3]) <= 5 * got.std_error)
+
+
+def test_two_levels_extrapolate_by_the_weak_order_and_tell_the_bias():
+    got = _estimate(levels=2, replicates=4, num_paths=128)
+    one, other = _midpoint_moment(10, 0.1), _midpoint_moment(20, 0.05)
+    assert abs(got.mean - (2 * other - one)) <= 10 * got.std_error
+    # Of the finer level, with its sign.
+    assert abs(got.bias - (one - other)) <= 20 * got.std_error
+    assert got.bias_std_error < 2 * got.std_error
+
+
+def test_weights_of_levels_cancel_powers_of_the_step_size():
+    for order, levels in ((1, 1), (1, 2), (2, 2), (2, 3), (3, 4)):
+        weights = level_weights(order, levels)
+        h = 0.5 ** np.arange(levels)
+        np.testing.assert_allclose(weights[0].sum(), 1)
+        for power in range(order, order + levels - 1):
+            assert abs(weights[0] @ h**power) < 1e-13
+        if levels > 1:
+            # The finest level is the best estimate and its bias. What the last power but
+            # one leaves is what the last extrapolation takes away.
+            np.testing.assert_allclose(
+                weights[0] + weights[1], np.eye(levels)[-1], atol=1e-13
+            )
+            np.testing.assert_allclose(weights[2].sum(), 0, atol=1e-13)
+            before = weights[0] - weights[2]
+            assert before[0] == 0 and abs(before @ h ** (order + levels - 2)) > 1e-4
+
+
+def test_means_are_taken_at_the_times_given_over_paths_that_have_not_failed():
+    def drift(t, y, args):
+        # All go up by one in the first step. What is also kicked downwards fails later, in
+        # one step, and stays failed.
+        lost = (t > 0.15) & (t < 0.25) & (y < 0.9)
+        return jnp.where(t < 0.05, 10.0, jnp.where(lost, jnp.nan, 0.0))
+
+    path = ds.WeakBrownianPath((), jr.key(0))
+    kick = diffrax.ControlTerm(lambda t, y, args: jnp.where(t < 0.05, 1.0, 0.0), path)
+    terms = diffrax.MultiTerm(diffrax.ODETerm(drift), kick)
+    got = _estimate(
+        diffrax.EulerHeun(), terms, lambda t, y, args: {"t": t, "y": y}, y0=jnp.zeros(()),
+        ts=[0.4, 0.0, 0.1], t1=0.4, num_paths=64,
+    )  # fmt: skip
+    np.testing.assert_allclose(got.mean["t"], [0.4, 0.0, 0.1], atol=1e-15)
+    np.testing.assert_allclose(got.mean["y"][1], 0.0)
+    # 10 or 11 of 64 go down, as many go up, and these stay where they are.
+    assert 4 * 10 <= got.num_failed <= 4 * 11
+    up = 1 + np.sqrt(0.3) * np.array([10 / 54, 11 / 53])
+    assert up[0] - 1e-12 <= got.mean["y"][0] <= up[1] + 1e-12
+
+
+def test_it_stops_at_the_tolerance_with_the_replicates_of_the_whole():
+    whole = _estimate(replicates=8)
+    got = _estimate(replicates=12, tol=1.0)
+    assert got.tol_reached and got.num_samples == 8
+    assert (got.mean, got.std_error) == (whole.mean, whole.std_error)
+    with pytest.warns(UserWarning, match="`tol=1e-12` was not reached"):
+        never = _estimate(replicates=3, tol=1e-12)
+    assert never.tol_reached is False and never.num_samples == 3
+    # It goes on where it stopped.
+    rest = _estimate(replicates=8, start=never)
+    np.testing.assert_allclose(rest.mean, whole.mean, rtol=1e-14)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_solvers_of_diffrax_work_in_both_precisions(dtype):
+    shape, area = jax.ShapeDtypeStruct((1,), dtype), diffrax.SpaceTimeLevyArea
+    path = ds.FixedStepBrownianPath(shape, jr.key(0), levy_area=area)
+    drift = diffrax.ODETerm(lambda t, y, args: -y)
+    noise = diffrax.ControlTerm(lambda t, y, args: jnp.full((1, 1), 0.5, dtype), path)
+    terms = diffrax.MultiTerm(drift, noise)
+    square = lambda t, y, args: y[0] ** 2
+    y0 = jnp.zeros(1, dtype)
+    got = _estimate(diffrax.ShARK(), terms, square, y0=y0, num_paths=512)
+    # An Ornstein-Uhlenbeck process, up to the error of the steps.
+    assert abs(got.mean - 0.125 * (1 - np.exp(-2))) <= 1e-3
+    assert got.std_error < 5e-4
+    assert got.mean.dtype == np.float64
+
+
+PROGRAM = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
+from tests.expectation.test_array_rqmc import _numbers
+print(_numbers())
+"""
+
+
+def _numbers() -> list[str]:
+    """Of each sampling, to the last bit."""
+    samplings = (
+        ds.ArrayRQMC(64, 5),
+        ds.ValueFunctions(2, 96, 16),
+        ds.ValueFunctions(None, 96, 16),
+        ds.IndependentPaths(96, 16),
+    )
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: (p**2 + q**4) / 2,
+        lambda t, p, q, args: jnp.cos(q) / 2,
+        ds.WeakBrownianPath((), jr.key(0)),
+    )
+    each = [
+        _estimate(ds.StormerVerlet(), terms, sampling=s, dt0=0.25, levels=2)
+        for s in samplings
+    ]
+    return [float(x).hex() for e in each for x in (e.mean, e.bias, e.std_error)]
+
+
+def test_one_device_and_eight_give_the_same_numbers():
+    root = str(Path(__file__).parents[2])
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}
+    out = subprocess.run(
+        [sys.executable, "-c", PROGRAM, "8"],
+        env=environment, cwd=root, stdout=subprocess.PIPE, text=True, check=True,
+    )  # fmt: skip
+    assert eval(out.stdout.splitlines()[-1]) == _numbers()
+
+
+def test_equal_paths_are_one_brownian_motion():
+    path = ds.WeakBrownianPath((2,), jr.key(0), two_point=True)
+    other = ds.WeakBrownianPath((2,), jr.key(1), two_point=True)
+    term = lambda path: diffrax.ControlTerm(lambda t, y, args: y, path)
+    terms = diffrax.MultiTerm(term(path), term(other), term(path))
+    assert layout(terms) == (((0, 4), (4, 8), (0, 4)), 8, False)
+
+
+@pytest.mark.parametrize(
+    "message, kwargs",
+    [
+        ("`num_paths` must be a power of two", dict(num_paths=1000)),
+        ("`num_paths` must be an integer", dict(num_paths=1)),
+        ("`replicates` must be an integer, 2 or larger", dict(replicates=1)),
+        ("`levels` must be a positive integer", dict(levels=0)),
+        ("Pass fewer levels", dict(levels=40)),
+        ("`tol` must be a positive number", dict(tol=0.0)),
+        ("`tol` must be a positive number", dict(tol="1e-3")),
+        ("`start` must be what `expectation` returned", dict(start=3)),
+        ("`devices` must be a list of devices", dict(devices="cpu")),
+        ("`dt0` must be numbers; got dt0='0.1'", dict(dt0="0.1")),
+        ("`dt0` must be numbers; got", dict(dt0=Y0)),
+        ("and `t1` after `t0`; got dt0=0.1, t0=0.0, t1=inf", dict(t1=np.inf)),
+        ("`terms` must be terms of Diffrax.*got function", dict(terms=lambda t: t)),
+        ("whole number of steps", dict(ts=[0.25])),
+        ("whole number of steps", dict(t1=0.95)),
+        ("must lie between", dict(ts=[1.1])),
+        ("must be positive, and `t1` after", dict(t1=-1.0)),
+        ("`phi` must return real arrays", dict(phi=lambda t, y, a: 1j * y[0])),
+        ("`phi` must return real arrays", dict(phi=lambda t, y, a: "q")),
+        ("`sort_by` must return real arrays", dict(sort_by=lambda y: None)),
+        ("needs a random key", dict(key=3)),
+        (
+            "`phi` must return real arrays; it returned none",
+            dict(phi=lambda t, y, a: None),
+        ),
+        (r"called as `phi\(t, y, args\)`; got .* `\(y\)`", dict(phi=lambda y: y[0])),
+        (r"called as `sort_by\(y\)`", dict(sort_by=lambda t, y, args: y)),
+        (r"a solver, as `StormerVerlet\(\)`", dict(solver=ds.StormerVerlet)),
+        ("`Euler` solves equations in the sense of Ito", dict(solver=diffrax.Euler())),
+        ("must take fixed steps", dict(solver=diffrax.HalfSolver(diffrax.Heun()))),
+        ("`dt0` must be a number", dict(dt0=None)),
+        ("`y0` must hold finite", dict(y0=(jnp.array(jnp.nan), jnp.array(0.0)))),
+    ],
+)
+def test_bad_input_is_told_what_to_pass(message, kwargs):
+    with pytest.raises(ValueError, match=message):
+        _estimate(**kwargs)
+
+
+@pytest.mark.parametrize(
+    "traced", [dict(dt0=0.1), dict(t1=1.0), dict(y0=Y0), dict(key=jr.key(0))]
+)
+def test_within_a_jax_program_there_is_no_estimate(traced):
+    with pytest.raises(ValueError, match="no part of a JAX program.*`monte_carlo`"):
+        jax.jit(lambda x: _estimate(**x).mean)(traced)
+
+
+def test_paths_whose_words_cannot_be_chosen_are_refused():
+    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jr.key(0))
+    for path in (tree, diffrax.UnsafeBrownianPath((), jr.key(0))):
+        with pytest.raises(ValueError, match="FixedStepBrownianPath"):
+            _estimate(terms=kubo_terms(path))
+    with pytest.raises(ValueError, match="no Brownian path, so that nothing is ra"):
+        _estimate(terms=diffrax.ODETerm(lambda t, y, args: y))
+    many = diffrax.ControlTerm(
+        lambda t, y, args: jnp.zeros((1, 30_000)),
+        ds.WeakBrownianPath((30_000,), jr.key(0)),
+    )
+    with pytest.raises(ValueError, match="30,000 random variables in each step"):
+        _estimate(diffrax.Heun(), many, y0=jnp.ones(1))
+
+
+def test_too_many_coordinates_to_sort_by_are_warned_of():
+    path = ds.FixedStepBrownianPath((), jr.key(0))
+    terms = diffrax.ControlTerm(lambda t, y, args: y, path)
+    phi = lambda t, y, args: y[0]
+    with pytest.warns(
+        UserWarning, match="by 8 coordinates.* 2.0 along each.* 5 at most"
+    ):
+        _estimate(diffrax.Heun(), terms, phi, y0=jnp.ones(8), dt0=1.0)
+
+
+def test_many_coordinates_are_sorted_by_a_fitted_function():
+    # Only the last coordinates matter, which are lost among the bits of all.
+    noise = lambda t, y, args: jnp.eye(12)[:, -2:] * jnp.exp(y[-1] / 4)
+    terms = diffrax.ControlTerm(noise, ds.WeakBrownianPath((2,), jr.key(0)))
+    phi = lambda t, y, args: jnp.sum(y[-2:])
+    got = _estimate(diffrax.Heun(), terms, phi, y0=jnp.ones(12), dt0=0.25)
+    assert "sorted by a fitted value function" in got.reason
+    plain = np.sqrt(2 * np.exp(0.6) / 1024)
+    assert got.std_error < plain / 4
+
+
+def test_progress_is_shown_after_each_replicate_and_closed_in_any_case(capfd):
+    # One device: several would make several replicates at once.
+    run = lambda meter, **kwargs: _estimate(
+        progress_meter=meter, devices=jax.devices()[:1], num_paths=16, **kwargs
+    )
+    calls = []
+    run(RecordingMeter(calls))
+    assert calls == ["init", 0.25, 0.5, 0.75, 1.0, ("closed after", 4)]
+    calls.clear()
+    with pytest.raises(RuntimeError, match="stop here"):
+        run(RecordingMeter(calls, fails_at=1))
+    assert calls == ["init", 0.25, 0.5, ("closed after", 1)]
+    calls.clear()
+    # A tolerance that is reached ends it before the last replicate.
+    assert run(RecordingMeter(calls), tol=1.0, replicates=64).tol_reached
+    assert calls[-1][0] == "closed after" and 1.0 not in calls
+    run(diffrax.TextProgressMeter())
+    assert "100" in capfd.readouterr().out
+
+
+class _Remembering(diffrax.AbstractSolver):
+    """Walks at random, and fails where its state is not that of the same path, or where
+    `lost` says so."""
+
+    lost: Callable = lambda y: False
+
+    term_structure = diffrax.AbstractTerm
+    interpolation_cls = diffrax.LocalLinearInterpolation
+
+    def order(self, terms):
+        return 1
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def init(self, terms, t0, t1, y0, args):
+        return y0
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y1 = y0 + terms.contr(t0, t1)
+        ok = diffrax.RESULTS.successful
+        lost = diffrax.RESULTS.internal_error
+        good = (y0 == solver_state) & ~jnp.asarray(self.lost(y0))
+        result = diffrax.RESULTS.where(good, ok, lost)
+        return y1, None, dict(y0=y0, y1=y1), y1, result
+
+
+def test_the_state_of_a_solver_goes_along_with_its_path():
+    path = ds.WeakBrownianPath((), jr.key(0))
+    terms = diffrax.ControlTerm(lambda t, y, args: jnp.ones(()), path)
+    square = lambda t, y, args: y**2
+    got = _estimate(_Remembering(), terms, square, y0=jnp.asarray(0.0), replicates=16)
+    assert got.num_failed == 0
+    assert abs(got.mean - 1) <= 5 * got.std_error < 0.1
+
+
+@pytest.mark.parametrize("by", ["result", "state", "phi"])
+def test_a_path_fails_by_its_result_its_state_or_its_phi(by):
+    # One of the three alone; a sixth of the paths goes down in the first of two steps.
+    down = lambda y: y < -1e-3
+    path = ds.WeakBrownianPath((), jr.key(0))
+    solver, y0, phi = diffrax.Heun(), jnp.zeros(()), lambda t, y, args: jnp.ones(())
+    terms = diffrax.ControlTerm(lambda t, y, args: jnp.ones(()), path)
+    if by == "result":
+        solver = _Remembering(down)
+    elif by == "phi":
+        phi = lambda t, y, args: jnp.where(down(y), jnp.nan, 1.0)
+    else:
+        y0 = jnp.zeros(2)
+        spoil = lambda t, y, args: jnp.stack([0.0, jnp.where(down(y[0]), jnp.nan, 0)])
+        noise = diffrax.ControlTerm(lambda t, y, args: jnp.array([1.0, 0.0]), path)
+        terms, solver = (
+            diffrax.MultiTerm(diffrax.ODETerm(spoil), noise),
+            diffrax.EulerHeun(),
+        )
+    got = _estimate(
+        solver, terms, phi, y0=y0, t1=0.2, num_paths=64, sort_by=lambda y: y.ravel()[0]
+    )
+    assert 4 * 10 <= got.num_failed <= 4 * (11 if by != "phi" else 24)
+    np.testing.assert_allclose(got.mean, 1.0)

@@ -1,0 +1,157 @@
+"""How far an expectation goes: tolerances, levels, progress, and numbers of paths
+beyond 32 bits."""
+
+import dataclasses
+
+import diffrax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from ..problems import kubo_terms, RecordingMeter
+
+
+def _number(key):
+    """Which word the key has: no two paths share it."""
+    return jr.bits(key, (), jnp.uint32).astype(float)
+
+
+def test_keys_of_paths_beyond_32_bits_carry_into_the_second_word():
+    key, n, first = jr.key(7), 10, 2**33 - 4
+    nothing = ds.monte_carlo(lambda key: jnp.nan * jr.normal(key), key, 2)
+    before = dataclasses.replace(nothing, num_failed=first)
+    got = ds.monte_carlo(_number, key, first + n, batch_size=n, start=before)
+    words = [divmod(i, 2**32) for i in range(first, first + n)]
+    keys = [jr.fold_in(jr.fold_in(key, hi), np.uint32(lo)) for hi, lo in words]
+    x = np.array([_number(k) for k in keys])
+    assert {hi for hi, _ in words} == {1, 2}
+    assert (got.num_paths, got.num_failed) == (n, first)
+    np.testing.assert_allclose(got.mean, x.mean(), rtol=1e-14)
+    np.testing.assert_allclose(got.variance, x.var(ddof=1), rtol=1e-12)
+
+
+def test_progress_is_shown_after_each_batch_and_closed_in_any_case():
+    calls = []
+    run = lambda meter: ds.monte_carlo(
+        jr.normal, jr.key(0), 10, batch_size=4, progress_meter=meter
+    )
+    run(RecordingMeter(calls))
+    assert calls == ["init", 0.4, 0.8, 1.0, ("closed after", 3)]
+    calls.clear()
+    with pytest.raises(RuntimeError, match="stop here"):
+        run(RecordingMeter(calls, fails_at=1))
+    assert calls == ["init", 0.4, 0.8, ("closed after", 1)]
+
+
+def _two(key):
+    x = jr.normal(key, (2,))
+    return {"small": 1e-3 * x[0], "large": x}
+
+
+def test_paths_are_added_until_every_standard_error_is_below_tol():
+    run = lambda n, **kwargs: ds.monte_carlo(
+        _two, jr.key(3), n, batch_size=500, **kwargs
+    )
+    tol = 0.02
+    got = run(100_000, tol=tol)
+    # 2,500 paths are about enough for a deviation of 1; one batch more is under way.
+    assert 2_000 <= got.num_paths <= 4_000 and got.num_paths % 500 == 0
+    assert got.tol_reached and np.all(got.std_error["large"] <= tol)
+    before = run(got.num_paths - 1_000)
+    assert before.tol_reached is None and np.any(before.std_error["large"] > tol)
+    whole = run(got.num_paths)
+    np.testing.assert_array_equal(got.mean["large"], whole.mean["large"])
+    with pytest.warns(UserWarning, match="not reached"):
+        short = run(1_000, tol=tol)
+    assert short.tol_reached is False and short.num_paths == 1_000
+    # It goes on from there, and not at all where nothing is left to do.
+    on = run(100_000, tol=tol, start=short)
+    assert on.tol_reached and on.num_paths == got.num_paths
+    assert run(100_000, tol=tol, start=on).num_paths == on.num_paths
+    # Paths that failed have no standard error.
+    nothing = lambda key: jnp.nan * jr.normal(key)
+    with pytest.warns(UserWarning, match="not reached"):
+        failed = ds.monte_carlo(nothing, jr.key(0), 9, tol=1.0)
+    assert failed.tol_reached is False and failed.num_failed == 9
+
+
+H = 0.125
+
+
+def _square(h):
+    """The exact expectation of q(1)^2 for the midpoint rule with Gaussian increments, which
+    turns by 2 atan((h + I) / 2) in a step."""
+    x, weights = np.polynomial.hermite_e.hermegauss(80)
+    weights = weights / weights.sum()
+    turn = 4 * np.arctan((h + np.sqrt(h) * x) / 2)
+    return (1 + (np.exp(1j * turn) @ weights) ** round(1 / h)).real / 2
+
+
+def _phi(key, level):
+    path = ds.FixedStepBrownianPath((), key, cell=H / 2)
+    y0 = (jnp.array(0.0), jnp.array(1.0))
+    sol = diffrax.diffeqsolve(
+        kubo_terms(path), ds.ImplicitMidpoint(), 0.0, 1.0, H / 2**level, y0, throw=False
+    )
+    return sol.ys[1][-1] ** 2, sol.result
+
+
+def test_two_levels_extrapolate_and_tell_the_bias_of_the_finer_one():
+    run = lambda n, start=None: ds.monte_carlo(
+        _phi, jr.key(0), n, batch_size=1024, levels=2, order=1, start=start
+    )
+    got = run(4096)
+    assert (got.num_paths, got.num_failed) == (4096, 0)
+    exact = 2 * _square(H / 2) - _square(H)
+    assert abs(got.mean - exact) <= 4 * got.std_error
+    # The mean of the finer level less the extrapolated one.
+    bias = _square(H / 2) - exact
+    assert abs(got.bias - bias) <= 4 * got.bias_std_error
+    # Paths that are not coupled would have a standard error this many times as large.
+    apart = np.sqrt(2 * got.variance / 5 / 4096)
+    assert got.bias_std_error < apart / 3
+    np.testing.assert_allclose(got.error, np.hypot(got.std_error, got.bias))
+    rest = run(4096, start=run(2048))
+    np.testing.assert_allclose(rest.mean, got.mean, rtol=1e-13)
+    np.testing.assert_allclose(rest.bias, got.bias, rtol=1e-11)
+    one = ds.monte_carlo(jr.normal, jr.key(0), 10)
+    assert one.bias is None and one.bias_std_error is None
+    np.testing.assert_array_equal(one.error, one.std_error)
+
+
+def test_a_path_fails_if_it_does_on_one_of_the_levels():
+    def phi(key, level):
+        x = jr.uniform(key)
+        return jnp.where((level == 1) & (x < 0.5), jnp.nan, x * (1 + level))
+
+    got = ds.monte_carlo(phi, jr.key(1), 64, levels=2, order=2)
+    x = np.array(
+        [jr.uniform(jr.fold_in(jr.fold_in(jr.key(1), 0), i)) for i in range(64)]
+    )
+    assert got.num_failed == np.sum(x < 0.5) and got.num_paths == np.sum(x >= 0.5)
+    # 4/3 of the finer level less 1/3 of the coarser one.
+    np.testing.assert_allclose(got.mean, np.mean(x[x >= 0.5]) * 7 / 3, rtol=1e-12)
+
+
+def test_one_word_for_a_tolerance_that_was_not_reached():
+    with pytest.warns(UserWarning, match="`tol=1e-06` was not reached: .* 100 paths"):
+        got = ds.monte_carlo(jr.normal, jr.key(0), 100, tol=1e-6)
+    assert got.tol_reached is False and "`tol` was not reached" in str(got)
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        (dict(tol=0.0), "`tol` must be a positive number"),
+        (dict(tol=float("nan")), "`tol` must be a positive number"),
+        (dict(levels=0), "`levels` must be a positive integer"),
+        (dict(levels=2), "the weak order of the solver"),
+        (dict(levels=2, order=0), "`order` must be a positive integer"),
+    ],
+)
+def test_bad_tolerances_and_levels_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        ds.monte_carlo(_phi, jr.key(0), 10, **kwargs)

@@ -1,0 +1,326 @@
+"""Fitted value functions: they never change the mean, and where a fit can be exact nothing
+random is left."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._expectation._fits import (
+    exponents,
+    Frame,
+    Grid,
+    hermite,
+    least_squares,
+)
+from diffrax_symplectic._terms import outcomes, step_variables
+
+from ..problems import kubo_terms
+
+
+KEY = jr.key(0)
+Y0 = (jnp.array(0.0), jnp.array(1.0))
+SQUARE = lambda t, y, args: y[1] ** 2
+VERLET = ds.StormerVerlet()
+WEAK = ds.WeakBrownianPath((), KEY)
+# Made once, so that JAX compiles programs of them once.
+KUBO, MIDPOINT = kubo_terms(WEAK), ds.ImplicitMidpoint()
+
+
+def _pendulum(path):
+    return ds.hamiltonian_terms(
+        lambda t, p, q, args: p**2 / 2 - jnp.cos(q),
+        lambda t, p, q, args: 0.4 * jnp.cos(q) + 0.1 * q,
+        path,
+    )
+
+
+PENDULUM = _pendulum(WEAK)
+
+
+def _estimate(sampling, terms=PENDULUM, solver=VERLET, phi=SQUARE, **kwargs):
+    kwargs = dict(t1=1.0, dt0=0.25, y0=Y0, key=jr.key(7)) | kwargs
+    t1, dt0, y0 = (kwargs.pop(name) for name in ("t1", "dt0", "y0"))
+    return ds.expectation(
+        phi, terms, solver, 0.0, t1, dt0, y0, sampling=sampling, **kwargs
+    )
+
+
+def _enumerated(terms, solver, y, phi, h: float, steps: int):
+    """The mean over all sequences of outcomes."""
+    step = step_variables(terms, h)
+    points, p = outcomes(step.laws, 1)
+
+    @jax.jit
+    def ends(y):
+        def end(x):
+            own = step.terms_with(x)
+            state = solver.init(own, 0.0, h, y, None)
+            return solver.step(own, 0.0, h, y, None, state, False)[0]
+
+        return jax.vmap(end)(points)
+
+    ys, w = jax.tree.map(lambda x: np.asarray(x)[None], y), np.ones(1)
+    for _ in range(steps):
+        new = [ends(jax.tree.map(lambda x: x[i], ys)) for i in range(len(w))]
+        ys, w = (
+            jax.tree.map(lambda *xs: np.concatenate(xs), *new),
+            np.outer(w, p).ravel(),
+        )
+    return w @ jax.vmap(lambda y: phi(0.0, y, None))(ys)
+
+
+def test_rare_paths_that_leave_the_grid_do_not_move_the_mean():
+    # Of probability 1e-6: they are not among the paths, and so not in the standard error.
+    quartic = lambda t, p, q, args: (p**2 + q**2) / 2 + 0.1 * (p**4 + q**4)
+    noise = lambda t, p, q, args: 0.3 * jnp.stack([p * q, (q**2 - p**2) / 2])
+    path = ds.WeakBrownianPath((2,), KEY, two_point=True)
+    terms, solver = ds.hamiltonian_terms(quartic, noise, path), ds.NinomiyaVictoir()
+    got = _estimate(ds.ValueFunctions(), terms, solver, t1=0.75, key=KEY)
+    exact = _enumerated(terms, solver, Y0, SQUARE, 0.25, 3)
+    assert got.std_error <= 3e-9
+    assert abs(got.mean - exact) <= 4.5 * got.std_error
+
+
+@pytest.mark.parametrize("degree", [1, 6, None])
+def test_the_mean_is_that_over_all_outcomes_however_the_fit_is(degree):
+    # The quartic is not a polynomial of these degrees after three steps.
+    phi = lambda t, y, args: y[1] ** 4 + y[0]
+    got = _estimate(ds.ValueFunctions(degree), phi=phi, t1=0.75)
+    exact = _enumerated(PENDULUM, ds.StormerVerlet(), Y0, phi, 0.25, 3)
+    assert abs(got.mean - exact) <= 4.5 * got.std_error
+    # Of as many plain paths it would be 2.2e-2.
+    assert 0 < got.std_error < {1: 5e-3, 6: 1e-5, None: 1e-9}[degree]
+    assert (got.num_paths, got.num_failed) == (4096, 0)
+
+
+def _turned(power: int) -> complex:
+    """The mean of exp(i power angle) after ten steps of the midpoint rule on the Kubo
+    oscillator, which turns by 2 atan((h + I) / 2) in a step."""
+    turn = 2 * np.arctan((0.1 + np.sqrt(0.3) * np.array([-1, 0, 1])) / 2)
+    return (np.exp(1j * power * turn) @ np.array([1, 4, 1]) / 6) ** 10
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_linear_systems_and_quadratic_functions_are_closed(dtype):
+    shape = jax.ShapeDtypeStruct((), dtype)
+    terms = kubo_terms(ds.WeakBrownianPath(shape, KEY))
+    y0 = tuple(x.astype(dtype) for x in Y0)
+    phi = lambda t, y, args: {"q2": y[1] ** 2, "both": jnp.stack([y[0], y[0] * y[1]])}
+    got = _estimate(
+        ds.ValueFunctions(2, 600), terms, ds.ImplicitMidpoint(), phi, dt0=0.1, y0=y0,
+        ts=[0.0, 1.0],
+    )  # fmt: skip
+    # From (p, q) = (0, 1) the oscillator is at (-sin, cos) of the angle.
+    one, two = _turned(1), _turned(2)
+    rounding = 50 * np.finfo(dtype).eps
+    np.testing.assert_allclose(got.mean["q2"], [1.0, (1 + two.real) / 2], atol=rounding)
+    expected = [[0.0, 0.0], [-one.imag, -two.imag / 2]]
+    np.testing.assert_allclose(got.mean["both"], expected, atol=rounding)
+    assert max(map(np.max, jax.tree.leaves(got.std_error))) < rounding
+
+
+def test_degree_zero_is_plain():
+    got = _estimate(ds.ValueFunctions(0, 4000), KUBO, MIDPOINT, dt0=0.1)
+    square = (1 + _turned(2).real) / 2
+    fourth = 3 / 8 + _turned(2).real / 2 + _turned(4).real / 8
+    assert abs(got.mean - square) <= 4 * got.std_error
+    np.testing.assert_allclose(got.variance, fourth - square**2, rtol=0.1)
+
+
+def _harmonic(n: int, m: int):
+    """A chain of oscillators with m constant noises."""
+    share = np.sin(1.0 + np.arange(m)[:, None] * (1 + np.arange(n)))
+    return ds.hamiltonian_terms(
+        lambda t, p, q, args: (p @ p + q @ q + jnp.sum(jnp.diff(q) ** 2)) / 2,
+        lambda t, p, q, args: 0.3 * jnp.asarray(share) @ q,
+        ds.WeakBrownianPath((m,), KEY),
+    )
+
+
+@pytest.mark.parametrize("n, m", [(1, 5), (8, 2), (8, 6)])
+def test_many_noises_and_many_dimensions_are_closed_where_they_can_be(n, m):
+    # 243 and 729 outcomes: by derivatives. 16 dimensions: by mean derivatives.
+    terms, y0 = _harmonic(n, m), (jnp.zeros(n), jnp.ones(n))
+    phi = lambda t, y, args: y[1] @ y[1]
+    got = _estimate(ds.ValueFunctions(2, 256), terms, phi=phi, dt0=0.125, y0=y0)
+    plain = _estimate(ds.IndependentPaths(20_000), terms, phi=phi, dt0=0.125, y0=y0)
+    assert abs(got.mean - plain.mean) <= 4 * plain.std_error
+    assert got.std_error < 1e-12
+
+
+def test_noise_that_enters_nonlinearly_leaves_the_mean_as_it_is():
+    H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
+    noise = lambda t, p, q, args: 0.5 * jnp.sin(q + jnp.arange(5.0))
+    terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((5,), KEY))
+    phi = lambda t, y, args: jnp.exp(y[0]) + y[1] ** 2
+    solver = ds.SRKw3("b")
+    got = _estimate(ds.ValueFunctions(4), terms, solver, phi, t1=0.4, dt0=0.4)
+    exact = ds.step_expectation(terms, solver, 0, 0.4, Y0, fn=lambda y: phi(0, y, None))
+    assert abs(got.mean - exact) <= 4.5 * got.std_error
+    plain = _estimate(ds.IndependentPaths(4096), terms, solver, phi, t1=0.4, dt0=0.4)
+    assert got.std_error < plain.std_error / 3
+
+
+def test_the_degree_is_chosen_for_each_number_by_fresh_paths_and_never_worse_than_plain():
+    # A jump, which no polynomial is close to; and one that polynomials leave nothing of.
+    phi = lambda t, y, args: (y[1] > 0.5, jnp.cos(40 * y[1]), y[1])
+    got = _estimate(ds.ValueFunctions(), phi=phi)
+    plain = _estimate(ds.ValueFunctions(0), phi=phi)
+    for a, b in zip(got.std_error, plain.std_error):
+        assert a <= 1.05 * b
+    assert got.std_error[2] < 1e-9 and "64 was the best of 0, 64" in got.reason
+
+
+def test_levels_extrapolate_and_the_bias_is_known_as_well_as_the_mean():
+    got = _estimate(ds.ValueFunctions(6), levels=3)
+    fine, finer = (
+        _estimate(ds.ValueFunctions(6), dt0=0.25 / 2**k, key=jr.key(k)) for k in (2, 5)
+    )
+    assert abs(got.mean + got.bias - fine.mean) <= 5 * np.hypot(
+        got.bias_std_error + got.std_error, fine.std_error
+    )
+    # The error of the finest step is nearly gone. What is left is said to be less.
+    assert abs(got.mean - finer.mean) < abs(got.bias) / 20
+    assert abs(got.mean - finer.mean) < got.error + 1e-5
+
+
+class _Counting(diffrax.AbstractSolver):
+    """Moves by the number of steps that it remembers, and by the noise."""
+
+    term_structure = diffrax.AbstractTerm
+    interpolation_cls = diffrax.LocalLinearInterpolation
+
+    def order(self, terms):
+        return 1
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def init(self, terms, t0, t1, y0, args):
+        return jnp.zeros(())
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y1 = y0 + solver_state + terms.contr(t0, t1)
+        ok = diffrax.RESULTS.successful
+        return y1, None, dict(y0=y0, y1=y1), solver_state + 1, ok
+
+
+def test_a_solver_that_remembers_steps_goes_on_with_its_own_state():
+    terms = diffrax.ControlTerm(lambda t, y, args: jnp.ones(()), WEAK)
+    solver, y0, phi = _Counting(), jnp.zeros(()), lambda t, y, args: y
+    got = _estimate(ds.ValueFunctions(1, 64), terms, solver, phi, y0=y0)
+    np.testing.assert_allclose(got.mean, 0 + 1 + 2 + 3, atol=1e-12)
+    assert got.std_error < 1e-12
+
+
+def test_paths_that_fail_are_counted_and_left_out():
+    # Kicks downwards in the first step are lost in the second.
+    def H0(t, p, q, args):
+        return jnp.where((t > 0.3) & (p < -0.1), jnp.nan, 0.0) * q + 0 * p
+
+    noise = lambda t, p, q, args: -q
+    terms = ds.hamiltonian_terms(H0, noise, WEAK, structure="separable")
+    got = _estimate(
+        ds.ValueFunctions(2, 600), terms, phi=lambda t, y, args: y[0], t1=0.5
+    )
+    assert got.num_paths + got.num_failed == 600 and 60 < got.num_failed < 140
+    assert np.isfinite(got.mean)
+
+
+def test_it_goes_on_where_it_stopped_and_stops_at_a_tolerance():
+    sampling = lambda n: ds.ValueFunctions(3, n, 64)
+    whole = _estimate(sampling(320))
+    rest = _estimate(sampling(320), start=_estimate(sampling(128)))
+    np.testing.assert_allclose(rest.mean, whole.mean, rtol=1e-13)
+    np.testing.assert_allclose(rest.std_error, whole.std_error, rtol=1e-9)
+    got = _estimate(sampling(10**6), tol=float(whole.std_error))
+    assert got.tol_reached and 200 < got.num_paths < 600
+    with pytest.raises(ValueError, match="was sampled by ValueFunctions"):
+        _estimate(ds.IndependentPaths(1000), start=whole)
+
+
+def test_the_quickest_sampling_is_chosen_and_gone_on_with():
+    got = _estimate(None, tol=1e-6)
+    assert isinstance(got.sampling, ds.ValueFunctions) and got.tol_reached
+    assert "variance times seconds: IndependentPaths" in got.reason
+    more = _estimate(None, start=got)
+    assert more.reason == got.reason
+    assert more.num_paths == got.num_paths and more.mean == got.mean
+    # Without outcomes that can be enumerated it is another one.
+    path = ds.FixedStepBrownianPath((), KEY)
+    gaussian = _estimate(None, _pendulum(path), tol=0.05)
+    assert isinstance(gaussian.sampling, ds.IndependentPaths)
+
+
+def test_bad_input_is_told_what_to_pass():
+    gaussian = kubo_terms(ds.FixedStepBrownianPath((), KEY))
+    with pytest.raises(ValueError, match="Use a `WeakBrownianPath` in place"):
+        _estimate(ds.ValueFunctions(2), gaussian, ds.ImplicitMidpoint())
+    many = _harmonic(32, 2)
+    y0 = (jnp.zeros(32), jnp.ones(32))
+    with pytest.raises(ValueError, match=r"has 47,905 polynomials in 64 dimensions"):
+        _estimate(ds.ValueFunctions(3), many, y0=y0)
+    with pytest.raises(ValueError, match="`degree` must be an integer, 0 or larger"):
+        _estimate(ds.ValueFunctions(-1))
+    with pytest.raises(ValueError, match="`num_paths` must be an integer, 2 or larger"):
+        ds.ValueFunctions(2, 0)
+    with pytest.raises(ValueError, match="`sampling` must be `IndependentPaths"):
+        _estimate(1000)
+
+
+def test_polynomials_are_orthonormal_and_fits_nested():
+    x, w = np.polynomial.hermite_e.hermegauss(12)
+    grid = jnp.stack(jnp.meshgrid(x, x), -1).reshape(-1, 2)
+    weights = np.outer(w, w).ravel() / (2 * np.pi)
+    B = jax.jit(jax.vmap(lambda z: jnp.stack(hermite(z, 4))))(grid)
+    assert B.shape[1] == len(exponents(2, 4)) == 15
+    np.testing.assert_allclose((B.T * weights) @ B, np.eye(15), atol=1e-12)
+    values = jr.normal(KEY, (144, 2, 1)).at[:, 1].set(B[:, :6] @ np.ones((6, 1)))
+    fit = jax.jit(least_squares, static_argnums=2)
+    got = fit(B, values, (3, 6))
+    expected = np.linalg.lstsq(B[:, :3], values[:, 0], rcond=None)[0]
+    np.testing.assert_allclose(got[:3, 0], expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(got[:, 1, 0], [1] * 6 + [0] * 9, atol=1e-9)
+    # Of two columns that are one, none explodes.
+    twice = jnp.concatenate([B[:, :3], B[:, 2:3]], axis=1)
+    got = fit(twice, values[:, 1:], (4,))
+    smallest = np.linalg.lstsq(twice, values[:, 1], rcond=None)[0]
+    np.testing.assert_allclose(got[:, 0], smallest, atol=1e-3)
+
+
+def test_a_grid_interpolates_with_degree_five_and_is_constant_beyond():
+    grid, axis = Grid(2, (0, 12)), np.linspace(-1, 1, 12)
+    fn = lambda x, y: (x**5 - x) * (y**5 + y**2)
+    c = jnp.asarray(fn(*np.meshgrid(axis, axis, indexing="ij"))).reshape(-1, 1)
+    # Two points at least are to lie on either side.
+    inner = axis[9]
+    x = jr.uniform(KEY, (50, 2), minval=-inner, maxval=inner)
+    at = jax.vmap(lambda x: grid.combined(x, c)[0])
+    np.testing.assert_allclose(at(x), fn(*x.T), atol=1e-13)
+    np.testing.assert_allclose(
+        at(3 * x), at(jnp.clip(3 * x, -inner, inner)), atol=1e-13
+    )
+    # It holds twice the range of the points, whatever they are.
+    points = jr.normal(KEY, (300, 2)) @ jnp.array([[1.0, 2.0], [0.0, 0.1]])
+    good = jnp.ones(300, bool)
+    frame, sites = grid.sites(points, good, jnp.ones(2), KEY)
+    corners = np.asarray(frame.at(sites))[[0, -1]]
+    np.testing.assert_allclose(corners, [[-1, -1], [1, 1]], atol=1e-12)
+    np.testing.assert_allclose(np.abs(frame.at(points)).max(axis=0), 0.5, atol=1e-12)
+
+
+def test_frames_do_not_depend_on_units():
+    mixed = jnp.array([[3.0, 1, 0], [0, 2, 0], [1, 0, 1]])
+    points, good = jr.normal(KEY, (500, 3)) @ mixed, jnp.ones(500, bool)
+    frame = Frame.of(points, good, jnp.ones(3))
+    z = (points - frame.mean) @ frame.to.T
+    np.testing.assert_allclose(z.T @ z / 500, np.eye(3), atol=1e-10)
+    np.testing.assert_allclose(frame.to @ frame.back, np.eye(3), atol=1e-12)
+    scale = jnp.array([1.0, 1e6, 1e-6])
+    other = Frame.of(points * scale, good, scale)
+    z2 = (points * scale - other.mean) @ other.to.T
+    np.testing.assert_allclose(np.abs(z2), np.abs(z), atol=1e-6)

@@ -1,0 +1,375 @@
+"""Steps that fixed-point iteration does not solve, of few and of many unknowns, and what
+their failures leave alone."""
+
+import functools as ft
+import re
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import lineax as lx
+import numpy as np
+import optimistix as optx
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._root_finder._batch import where_pending
+
+from ..problems import Given
+
+
+def _one_step(solver, term, h, y0):
+    y1, *_, result = solver.step(term, 0.0, h, y0, None, None, False)
+    return y1, result == diffrax.RESULTS.successful
+
+
+@pytest.mark.parametrize("d, most", [(2, 1), (6, 6)])
+def test_steps_of_stiff_networks_are_solved(d, most):
+    # For two unknowns Newton's method alone fails in 26 of these, and shortened corrections
+    # stall in more.
+    def residual(key):
+        a, b, c = jr.split(key, 3)
+        W1, W2 = jr.normal(a, (4, d)), 2 * jr.normal(b, (d, 4))
+        y0 = jr.normal(c, (d,))
+        term = diffrax.ODETerm(lambda t, y, args: W2 @ jnp.tanh(W1 @ y))
+        y1, success = _one_step(ds.ImplicitMidpoint(), term, 1.0, y0)
+        return success, y1 - y0 - W2 @ jnp.tanh(W1 @ (y0 + y1) / 2)
+
+    success, error = jax.jit(jax.vmap(residual))(jr.split(jr.key(0), 400))
+    assert jnp.sum(~success) <= most
+    assert jnp.max(jnp.abs(error[success])) <= d**2 * 5e-15
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_iterations_of_newton_end_when_they_should(n):
+    rate = 1000 * jnp.arange(1.0, n + 1)
+    y0 = jnp.full(n, 0.6), jnp.full(n, 0.8)
+
+    @eqx.filter_jit
+    def success(factor, most):
+        finder = ds.PicardNewton(direct=0)
+        solver = ds.ImplicitMidpoint(root_finder=finder, root_find_max_steps=most)
+        term = diffrax.ODETerm(
+            lambda t, y, args: (-factor * rate * y[1], factor * rate * y[0])
+        )
+        return _one_step(solver, term, 1.0, y0)[1]
+
+    # The first correction solves a linear system, up to what GMRES leaves.
+    assert not success(1.0, 1)
+    # However many there may be, they end with the solution, and where there is none.
+    assert success(jnp.array(1.0), 10**9)
+    assert not success(jnp.array(jnp.nan), 10**9)
+
+
+@pytest.mark.parametrize("n", [1, 6])
+def test_a_step_is_solved_though_some_iterates_have_no_values(n):
+    # Newton's method for the whole step comes to roots of negative numbers.
+    term = diffrax.ODETerm(lambda t, y, args: -5 * jnp.sqrt(y))
+    y0 = 1 + 0.01 * jnp.arange(n)
+    y1, success = jax.jit(lambda y0: _one_step(ds.ImplicitMidpoint(), term, 1.0, y0))(
+        y0
+    )
+    assert success
+    np.testing.assert_allclose(y1, y0 - 5 * jnp.sqrt((y0 + y1) / 2), atol=1e-14)
+
+
+def test_many_unknowns_are_solved_without_a_matrix():
+    # A Schroedinger lattice: frequencies up to n^2, of which h resolves few.
+    n, h = 100, 2e-3
+    pad = lambda u: jnp.pad(u, 1)
+    laplacian = lambda u: (2 * u - pad(u)[2:] - pad(u)[:-2]) * n**2 / 10
+    term = diffrax.ODETerm(lambda t, y, args: (-laplacian(y[1]), laplacian(y[0])))
+    x = jnp.arange(1, n + 1) / (n + 1) * jnp.pi
+    y0 = jnp.sin(x), jnp.sin(2 * x) + 0.1 * jnp.sin(50 * x)
+    step = (
+        jax.jit(lambda y0: _one_step(ds.ImplicitMidpoint(), term, h, y0))
+        .lower(y0)
+        .compile()
+    )
+    # Fifty-five vectors of all unknowns; one dense matrix has 200.
+    memory: Any = step.memory_analysis()
+    assert memory.temp_size_in_bytes <= 55 * 2 * n * 8
+    y1, success = step(y0)
+    assert success
+    norm = lambda y: jnp.sum(y[0] ** 2 + y[1] ** 2)
+    assert abs(norm(y1) / norm(y0) - 1) <= 1e-13
+    dense = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(linear_solver=lx.LU()))
+    exact, success = jax.jit(lambda y0: _one_step(dense, term, h, y0))(y0)
+    assert success
+    np.testing.assert_allclose(y1, exact, atol=1e-13)
+
+
+REVERSE = diffrax.RecursiveCheckpointAdjoint()
+
+
+def _end(strength, q0, adjoint=REVERSE):
+    # Steps from q > 1 / (2 I) have no solution.
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: args * p**2 / 2,
+        lambda t, p, q, args: p * q**2,
+        Given(W=jnp.array(0.3)),
+    )
+    y0 = (jnp.array(0.1), q0)
+    sol = diffrax.diffeqsolve(
+        terms,
+        ds.ImplicitMidpoint(),
+        0,
+        1,
+        0.1,
+        y0,
+        strength,
+        adjoint=adjoint,
+        throw=False,
+    )
+    ys: Any = sol.ys
+    success = sol.result == diffrax.RESULTS.successful
+    return jnp.where(success, ys[1][-1], 0.0), success
+
+
+def test_gradients_survive_a_path_that_fails():
+    q0 = jnp.array([0.1, 50.0, 0.2])
+    ends = lambda s, **kwargs: jax.vmap(lambda q: _end(s, q, **kwargs))(q0)
+
+    def loss(strength):
+        values, success = ends(strength)
+        return jnp.sum(values), success
+
+    strength, h = jnp.array(0.5), 1e-5
+    value_and_grad = jax.jit(jax.value_and_grad(loss, has_aux=True))
+    (_, success), gradient = value_and_grad(strength)
+    np.testing.assert_array_equal(success, [True, False, True])
+    plus, minus = (value_and_grad(strength + e)[0][0] for e in (h, -h))
+    slope = (plus - minus) / (2 * h)
+    np.testing.assert_allclose(gradient, slope, rtol=1e-7)
+    # Forward mode, path by path.
+    values = lambda s: ends(s, adjoint=diffrax.ForwardMode())[0]
+    each = jax.jit(jax.jacfwd(values))(strength)
+    assert each[1] == 0
+    np.testing.assert_allclose(jnp.sum(each), gradient, rtol=1e-10)
+
+
+def test_the_derivative_of_a_failed_step_is_zero():
+    def step(f, y0, **options):
+        term = diffrax.ODETerm(lambda t, y, args: f(y))
+        y1, success = _one_step(ds.ImplicitMidpoint(**options), term, 1.0, y0)
+        return y1, (y1, success)
+
+    slope = lambda f, y0: jax.jit(jax.jacfwd(ft.partial(step, f), has_aux=True))(y0)
+    # k = 1 + (y0 + k / 2)^2 has no solution for positive y0.
+    derivative, (y1, success) = slope(lambda y: 1 + y**2, jnp.array(0.5))
+    assert jnp.isfinite(y1) and not success and derivative == 0
+    # Here there is one, but the end of the step overflows.
+    derivative, (y1, success) = slope(lambda y: 0 * y + 1e308, jnp.array(1.2e308))
+    assert jnp.isinf(y1) and not success and derivative == 0
+    # In reverse mode, too, if the vector field has no derivative at the solution.
+    finder = ds.PicardNewton(direct=0)
+    root = lambda y: 1.2e308 + jnp.sqrt(jnp.maximum(1e308 - y, 0))
+    backward = jax.jit(
+        jax.jacrev(ft.partial(step, root, root_finder=finder), has_aux=True)
+    )
+    derivative, (y1, success) = backward(jnp.array(0.8e308))
+    assert jnp.isinf(y1) and not success and derivative == 0
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_failure_anywhere_in_a_step_is_reported(first):
+    # Two systems one after another; what the other one's success says must not count.
+    # One block of `StrangGauss` has more unknowns than the others, and is solved otherwise.
+    stuck = lambda t, p, q, args: jnp.sum(p * q**2)
+    easy = lambda t, p, q, args: 0.01 * jnp.sum(p * q)
+    H0, H1 = (stuck, easy) if first else (easy, stuck)
+    terms = ds.hamiltonian_terms(H0, H1, Given(W=jnp.array(1.0)))
+    y0 = (jnp.full(2, 0.1), jnp.full(2, 10.0))
+    for solver in (ds.StrangGauss(), ds.SRKs1(), ds.NinomiyaVictoir()):
+        assert not _one_step(solver, terms, 1.0, y0)[1]
+
+
+def test_a_failure_is_reported_for_any_root_finder():
+    # There is no solution.
+    term = diffrax.ODETerm(lambda t, y, args: 1 + y**2)
+    solver = ds.ImplicitMidpoint(root_finder=optx.Newton(rtol=1e-9, atol=1e-9))
+    y1, success = _one_step(solver, term, 1.0, jnp.array(0.5))
+    assert jnp.isfinite(y1) and not success
+
+
+def test_the_best_iterate_is_not_taken_for_a_solution():
+    # Of `PicardNewton` it would be the first guess.
+    finder = optx.BestSoFarRootFinder(ds.PicardNewton())
+    term = diffrax.ODETerm(lambda t, y, args: jnp.sin(y))
+    with pytest.raises(ValueError, match="Pass the root finder within it"):
+        _one_step(ds.ImplicitMidpoint(root_finder=finder), term, 0.1, jnp.array(0.5))
+
+
+def test_an_overflow_in_any_part_of_the_state_is_reported():
+    grow = lambda t, y, args: jax.tree.map(lambda x: 0 * x + 1e308, y)
+    y0 = jnp.array([1.2e308, 0.0, 0.0]), jnp.array([0.0, 1.2e308, 0.0])
+    step = lambda y0: _one_step(ds.ImplicitMidpoint(), diffrax.ODETerm(grow), 1.0, y0)[
+        1
+    ]
+    assert jax.jit(jax.vmap(step))(y0).tolist() == [False, False, True]
+
+
+def test_increments_are_solved_to_the_accuracy_of_the_state():
+    # Rounding errors of a state of 1e8 make the force uncertain by 1e-5 of its size. Zero
+    # iterations of Newton's method: the cheap iterations have to find that out.
+    term = diffrax.ODETerm(lambda t, y, args: jnp.sin(1e3 * y))
+    y0 = 1e8 + jnp.arange(6.0)
+    for solver in (
+        ds.ImplicitMidpoint(root_find_max_steps=0),
+        ds.ImplicitMidpoint(
+            root_finder=ds.PicardNewton(direct=6), root_find_max_steps=0
+        ),
+    ):
+        y1, success = jax.jit(lambda y0: _one_step(solver, term, 1e-4, y0))(y0)
+        assert success
+
+
+def test_paths_that_need_more_rounds_do_not_change_their_neighbours():
+    # Iterations of a batch go on for as long as any path needs them. With this tolerance
+    # those of the first path, which has had enough, would still change it.
+    solver = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(rtol=1e-4))
+
+    def step(frequency):
+        H0 = lambda t, p, q, args: frequency * jnp.sum(p**2 + q**2 + q**4) / 2
+        y0 = (jnp.ones(3), jnp.array([0.1, 0.2, 0.3]))
+        force = lambda t, y, args: (-jax.grad(H0, 2)(t, *y, args), y[0] * frequency)
+        terms = diffrax.ODETerm(force)
+        y1, *_, result = solver.step(terms, 0.0, 0.1, y0, None, None, False)
+        return y1, result == diffrax.RESULTS.successful
+
+    steps = jax.jit(jax.vmap(step))
+    (p, q), success = steps(jnp.array([2.0, 6.0, 2.0, 60.0]))
+    (p_alone, q_alone), _ = steps(jnp.full(4, 2.0))
+    assert jnp.all(success)
+    for i in (0, 2):
+        np.testing.assert_array_equal(p[i], p_alone[i])
+        np.testing.assert_array_equal(q[i], q_alone[i])
+
+
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.NinomiyaVictoir()])
+def test_a_path_that_has_failed_stays_failed(solver):
+    # In a batch Diffrax goes on to step a path that has ended. Of y' = 1 + y^2 a step of
+    # length 3 has no solution, and one of length 0.01 has.
+    term = diffrax.ODETerm(lambda t, y, args: 1 + y**2)
+
+    @jax.jit
+    @jax.vmap
+    def step(h, state):
+        *_, state, result = solver.step(term, 0.0, h, jnp.zeros(2), None, state, False)
+        return state, result == diffrax.RESULTS.successful
+
+    state, success = step(jnp.array([3.0, 0.01]), jnp.array([False, False]))
+    assert state.tolist() == [True, False] and success.tolist() == [False, True]
+    state, success = step(jnp.array([0.01, 0.01]), state)
+    assert state.tolist() == [True, False] and success.tolist() == [False, True]
+
+
+def test_nothing_is_solved_for_a_path_that_has_failed():
+    residual = lambda y, args: y - 3 * (1 + y**2)
+
+    @jax.jit
+    @jax.vmap
+    def iterations(lost):
+        finder, options = ds.PicardNewton(), dict(lost=lost)
+        sol = optx.root_find(residual, finder, 0.0, options=options, throw=False)
+        return sol.stats["num_steps"]
+
+    lost, pending = iterations(jnp.array([True, False]))
+    assert lost == 0 and pending > 10
+
+
+def test_only_pending_paths_of_a_batch_are_served():
+    double = lambda weight, x: weight * x
+    serve = lambda pending, w, x: where_pending(double, pending, w, x)
+    pending = jr.bernoulli(jr.key(0), 0.3, (3, 35))
+    x = jnp.arange(105.0).reshape(3, 35)
+    expected = jnp.where(pending, 2 * x, x)
+    nested = jax.jit(jax.vmap(jax.vmap(serve, (0, None, 0)), (0, None, 0)))
+    np.testing.assert_array_equal(nested(pending, jnp.array(2.0), x), expected)
+    flat = jax.jit(jax.vmap(serve, (0, None, 0)))
+    np.testing.assert_array_equal(
+        flat(pending.ravel(), jnp.array(2.0), x.ravel()), expected.ravel()
+    )
+    # All or none of them, when it is the same for all.
+    together = jax.jit(jax.vmap(serve, (None, None, 0)))
+    for every in (True, False):
+        got = together(jnp.array(every), jnp.array(2.0), x[0])
+        np.testing.assert_array_equal(got, (1 + every) * x[0])
+
+
+def test_nested_batches_are_served_as_one():
+    served = []
+
+    def combine(args, x):
+        jax.debug.callback(lambda: served.append(1))
+        of_all, of_row, of_column, of_each = args
+        return of_all * x + of_row + 10 * of_column + 100 * of_each
+
+    @jax.jit
+    def nested(pending, args, x):
+        serve = lambda pending, args, x: where_pending(combine, pending, args, x)
+        rows = jax.vmap(serve, (0, (None, None, 0, 0), 0))
+        return jax.vmap(rows, (0, (None, 0, None, 0), 0))(pending, args, x)
+
+    pending = jr.bernoulli(jr.key(0), 0.3, (3, 35))
+    x = jnp.arange(105.0).reshape(3, 35)
+    of_row, of_column = jnp.arange(3.0), jnp.arange(35.0)
+    got = nested(pending, (jnp.array(2.0), of_row, of_column, x), x)
+    everywhere = 2 * x + of_row[:, None] + 10 * of_column + 100 * x
+    np.testing.assert_array_equal(got, jnp.where(pending, everywhere, x))
+    jax.effects_barrier()
+    assert len(served) == jnp.sum(pending)
+
+
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.StrangGauss()], ids=type)
+@pytest.mark.parametrize("d", [4, 32])
+def test_steps_of_many_unknowns_are_symplectic(solver, d):
+    def potential(t, p, q, args):
+        stretch = jnp.diff(q, prepend=0.0, append=0.0)
+        return jnp.sum(jnp.sqrt(1 + p**2)) + jnp.sum(stretch**2 / 2 + stretch**4 / 4)
+
+    kicks = lambda t, p, q, args: 0.2 * jnp.sum(p * q) + jnp.sum(jnp.cos(q + p))
+
+    def defect(key, h):
+        p, q = jr.normal(key, (2, d))
+        terms = ds.hamiltonian_terms(potential, kicks, Given(W=jnp.sqrt(h)))
+        return ds.symplecticity_defect(terms, solver, jnp.zeros(()), h, (p, q))
+
+    h = jnp.geomspace(1e-3, 0.2, 8)
+    defects = eqx.filter_jit(jax.vmap(defect))(jr.split(jr.key(d), 8), h)
+    assert jnp.max(defects) <= 1e-13
+
+
+def test_linear_solvers_of_the_user_solve_for_steps_and_their_derivatives():
+    term = diffrax.ODETerm(lambda t, y, args: -30 * y + jnp.sin(y[::-1]))
+
+    def factorizations(finder):
+        """How often the programs of a step and of its derivative factorize a matrix."""
+        step = lambda y: _one_step(
+            ds.ImplicitMidpoint(root_finder=finder), term, 0.1, y
+        )[0]
+        programs = [_program(fn, jnp.ones(6)) for fn in (step, jax.jacrev(step))]
+        return [len(re.findall(r"= geqrf\b", program)) for program in programs]
+
+    assert factorizations(ds.PicardNewton()) == [0, 0]
+    step, derivative = factorizations(ds.PicardNewton(linear_solver=lx.QR()))
+    assert 0 < step < derivative
+
+
+def test_linear_solvers_of_the_user_replace_elimination():
+    # With one there are no chords, and so no inverse of the Jacobian that nobody asked for.
+    residual = lambda y, _: y - 3 * jnp.sin(y) - 1
+
+    def factorizations(linear_solver):
+        finder = ds.PicardNewton(linear_solver=linear_solver)
+        root = lambda y: optx.root_find(residual, finder, y, throw=False).value
+        return len(re.findall(r"= lu\b", _program(root, jnp.ones(2))))
+
+    assert factorizations(None) == 0 < factorizations(lx.LU())
+
+
+def _program(fn, *args) -> str:
+    return str(jax.make_jaxpr(fn)(*args))

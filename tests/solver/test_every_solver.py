@@ -1,0 +1,529 @@
+"""What the record of each solver claims. One table of solvers; one compiled program for
+each, solver and precision, that takes one step of many systems."""
+
+import functools as ft
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._brownian import VARIABLES
+from diffrax_symplectic._plan import make_plan
+from diffrax_symplectic._suggest import SOLVERS
+
+from ..picard import by_picard
+from ..problems import (
+    FineSample,
+    Given,
+    one_after_another,
+    over_steps,
+    slope,
+    SYSTEMS,
+    values_of_a_step,
+)
+
+
+_GAUSS = 1 / 4 + np.sqrt(3) / 6
+# Members of families that differ in what they do, beside the defaults.
+MEMBERS = [
+    ds.SRKw1(b=0.2),
+    ds.SRKw2((1, 2, 3, 4)),
+    *(ds.SRKw3(variant) for variant in "abdef"),
+    ds.SRKw4(a21=_GAUSS),
+    ds.SRKs3(a=0.25),
+    ds.SRKs4(sign=1),
+    ds.SRKs4(beta1=0.3, beta2=-0.7, b=0.4),
+]
+DEFAULTS = [solver() for solver in SOLVERS]
+GAMMA = 0.7
+
+
+def oscillator(time, y, args):
+    """The exact flow of p^2 / 2 + 2 q^2."""
+    p, q = y
+    c, s = jnp.cos(2 * time), jnp.sin(2 * time)
+    return c * p - 2 * s * q, s / 2 * p + c * q
+
+
+# Those whose terms leave a part of the drift out, which the solver adds.
+SPLIT = [
+    ds.BAOAB(GAMMA),
+    ds.Damped(ds.StrangGauss(), GAMMA),
+    ds.LinearFlow(ds.StormerVerlet(), oscillator),
+]
+TABLE = [*DEFAULTS, *SPLIT, *MEMBERS]
+# Those whose step is another program. The others negate the increment, or are of the same
+# blocks with other numbers.
+STEPS = [
+    *DEFAULTS,
+    *SPLIT,
+    ds.SRKw1(b=0.2),
+    ds.SRKw3("a"),
+    ds.SRKs3(a=0.25),
+    ds.SRKw4(a21=_GAUSS),
+]
+
+
+def left_out(solver):
+    """What the solver adds to the drift of its terms, for a reference."""
+    if isinstance(solver, ds.LinearFlow):
+        return lambda t, y, args: (-4 * y[1], y[0])
+    if isinstance(solver, ds.Damped | ds.BAOAB):
+        return lambda t, y, args: (-GAMMA * y[0], jnp.zeros_like(y[1]))
+    return None
+
+
+def whole(terms, solver):
+    """The terms of the system that the solver solves."""
+    if left_out(solver) is None:
+        return terms
+    return diffrax.MultiTerm(*terms.terms, diffrax.ODETerm(left_out(solver)))
+
+
+def kind_of(solver) -> tuple:
+    """Solvers of one kind have one reference."""
+    return solver.structure, type(solver).__name__ if left_out(solver) else ""
+
+
+def take_step(solver, terms, t0, t1, y0, args):
+    """One step from a state of the solver made anew, if it has one."""
+    state = None
+    if left_out(solver) is not None:
+        state = solver.init(terms, t0, t1, y0, args)
+    y1, _, _, _, result = solver.step(terms, t0, t1, y0, args, state, False)
+    return y1, result
+
+
+# By the scope all tests of one solver follow each other, in the process that has compiled
+# its program.
+each = lambda solvers: pytest.mark.parametrize(
+    "solver", solvers, ids=repr, scope="module"
+)
+# Optimized, a step with its derivative takes ten seconds to compile. So the core has one
+# solver for each kind of step: one system of equations, several, none, and flows.
+CORE = "ImplicitMidpoint()", "SRKw2()", "StormerVerlet()", "NinomiyaVictoir()"
+
+
+def core(solvers):
+    """Of these, those in `CORE` with the mark `core`."""
+    marks = {True: pytest.mark.core, False: ()}
+    return [pytest.param(s, marks=marks[repr(s) in CORE]) for s in solvers]
+
+
+N, D, M = 1000, 2, 2
+
+
+class Batch(eqx.Module):
+    """One step of each of many systems."""
+
+    y0: tuple
+    args: dict
+    # Factors of the drift and of the noise.
+    sizes: jax.Array
+    h: jax.Array
+    variables: dict
+
+
+@ft.cache
+def batch(structure: str, dtype) -> Batch:
+    @jax.vmap
+    def draw(key):
+        k_system, k_size, k_h, k_A, *ks = jr.split(key, 11)
+        y0, args = SYSTEMS[structure].draw(k_system, D, M, dtype)
+        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
+        # One noise or two.
+        used = jnp.arange(M) < jr.randint(k_size, (), 1, M + 1)
+        names = ("W", "H", "K", "C", "second", "third", "two_point")
+        drawn = {
+            name: jnp.sqrt(h) * used * jr.normal(k, (M,), dtype)
+            for name, k in zip(names, ks)
+        }
+        drawn["H"], drawn["K"] = drawn["H"] / 12**0.5, drawn["K"] / 720**0.5
+        A = h / 2 * used[:, None] * used * jr.normal(k_A, (M, M), dtype)
+        drawn["A"] = A - A.T
+        return Batch(y0, args, jnp.ones(2, dtype), h, drawn)
+
+    return jax.jit(draw)(jr.split(jr.key(0), N))
+
+
+@ft.cache
+def program(solver, dtype, derivatives: bool):
+    """Ends of the steps, their derivatives by state and sizes, if asked for, and which
+    succeeded."""
+    del dtype  # Programs are kept apart.
+    system = SYSTEMS[solver.structure]
+    if solver in MEMBERS:
+        # Their equations are of the kind that the defaults solve.
+        solver = by_picard(solver)
+
+    @jax.jit
+    @jax.vmap
+    def step(x: Batch):
+        flat, unravel = jfu.ravel_pytree((x.y0, x.sizes))
+
+        def end(flat):
+            y0, sizes = unravel(flat)
+            terms = system.terms(Given(**x.variables), sizes)
+            zero = jnp.zeros_like(x.h)
+            y1, result = take_step(solver, terms, zero, x.h, y0, x.args)
+            y1, _ = jfu.ravel_pytree(y1)
+            return y1, (y1, result == diffrax.RESULTS.successful)
+
+        if not derivatives:
+            y1, success = end(flat)[1]
+            return y1, None, success
+        jacobian, (y1, success) = jax.jacrev(end, has_aux=True)(flat)
+        return y1, jacobian, success
+
+    return step
+
+
+@each(core(STEPS))
+def test_steps_of_a_thousand_random_systems_are_symplectic(solver):
+    _assert_symplectic(solver, jnp.float64, 1e-13)
+
+
+@each([s for s in DEFAULTS if repr(s) in CORE])
+@pytest.mark.core
+def test_steps_in_single_precision_are_symplectic(solver):
+    _assert_symplectic(solver, jnp.float32, 5e-6)
+
+
+@each([*DEFAULTS, *SPLIT])
+def test_steps_in_single_precision_are_those_in_double_precision(solver):
+    # Which are symplectic. Their derivatives are more than half of a program.
+    x = batch(solver.structure, jnp.float32)
+    y1, _, success = program(solver, jnp.float32, repr(solver) in CORE)(x)
+    assert y1.dtype == jnp.float32
+    assert np.all(success)
+    doubled = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), x)
+    exact, _, _ = program(solver, jnp.float64, True)(doubled)
+    size = np.max(np.abs(exact), axis=1, keepdims=True)
+    # Of `ImplicitMidpoint` 6.5e-7 are measured, six units in the last place.
+    assert np.max(np.abs(y1 - exact) / size) <= 1.5e-6
+
+
+def _assert_symplectic(solver, dtype, bound):
+    y1, jacobian, success = program(solver, dtype, True)(batch(solver.structure, dtype))
+    assert y1.dtype == jacobian.dtype == dtype
+    assert np.all(success)
+    J = np.asarray(jacobian[:, :, : 2 * D])
+    zero, one = np.zeros((D, D)), np.eye(D)
+    omega = np.block([[zero, one], [-one, zero]]).astype(dtype)
+    # Friction shrinks areas.
+    shrunk = 1.0
+    if isinstance(solver, ds.Damped | ds.BAOAB):
+        h = batch(solver.structure, dtype).h
+        shrunk = np.asarray(jnp.exp(-GAMMA * h))[:, None, None]
+    defects = np.swapaxes(J, 1, 2) @ omega @ J - shrunk * omega
+    assert np.max(np.abs(defects)) <= bound
+
+
+def _some(x: Batch, number: int) -> Batch:
+    """The first so many systems, again and again: of the size of the whole batch."""
+    return jax.tree.map(lambda leaf: leaf[jnp.arange(N) % number], x)
+
+
+@each(STEPS)
+def test_derivatives_equal_central_differences(solver):
+    # Each system is moved along each of its unknowns and sizes, forward and back.
+    n = 2 * D + 2
+    x = _some(batch(solver.structure, jnp.float64), 40)
+    moved = np.arange(N) // 40
+    along = jnp.asarray(np.eye(n + 1, n)[moved % (n + 1)])
+    sign = jnp.where(moved >= n + 1, -1.0, 1.0)[:, None]
+    flat = jnp.concatenate([*x.y0, x.sizes], axis=1) + 1e-5 * sign * along
+    p, q, sizes = jnp.split(flat, [D, 2 * D], axis=1)
+    x = eqx.tree_at(lambda x: (x.y0, x.sizes), x, ((p, q), sizes))
+    y1, jacobian, success = program(solver, jnp.float64, True)(x)
+    assert np.all(success)
+    plus, minus = y1[: 40 * n], y1[40 * (n + 1) : 40 * (2 * n + 1)]
+    differences = ((plus - minus) / 2e-5).reshape(n, 40, 2 * D)
+    exact = jacobian[40 * n : 40 * (n + 1)]
+    np.testing.assert_allclose(np.moveaxis(differences, 0, 2), exact, atol=1e-8)
+
+
+@each(STEPS)
+def test_failures_are_reported_and_leave_others_as_they_are(solver):
+    x = batch(solver.structure, jnp.float64)
+    sizes = np.ones((N, 2))
+    sizes[7, 0], sizes[9, 1] = np.nan, np.nan
+    broken = eqx.tree_at(lambda x: x.sizes, x, jnp.asarray(sizes))
+    step = program(solver, jnp.float64, True)
+    fine, others = step(x), step(broken)
+    whole = np.all(np.isfinite(sizes), axis=1)
+    np.testing.assert_array_equal(others[2], whole)
+    for a, b in zip(fine[:2], others[:2]):
+        np.testing.assert_allclose(a[whole], b[whole], rtol=1e-12, atol=1e-13)
+
+
+_FLOWS = {}
+
+
+def _flows(solver) -> jax.Array:
+    """Exact flows of the drift over 0.1 and over 0.05."""
+    if kind_of(solver) not in _FLOWS:
+        _FLOWS[kind_of(solver)] = _make_flows(solver)
+    return _FLOWS[kind_of(solver)]
+
+
+def _make_flows(solver) -> jax.Array:
+    system, x = SYSTEMS[solver.structure], batch(solver.structure, jnp.float64)
+
+    @jax.jit
+    @jax.vmap
+    def flow(y0, args, h):
+        terms = whole(system.terms(Given(jnp.zeros(M)), jnp.ones(2)), solver)
+        drift = diffrax.MultiTerm(
+            *(terms.terms[i] for i in (0, *range(2, len(terms.terms))))
+        )
+        y, unravel = jfu.ravel_pytree(y0)
+        dt = h / 100
+
+        # Runge's and Kutta's method of order four, one program for all of its stages.
+        def stage(carry, coefficients):
+            (t, y, k, change), (a, b) = carry, coefficients
+            at = t + a * dt, unravel(y + a * k), args
+            k, _ = jfu.ravel_pytree(drift.vf_prod(*at, drift.contr(0.0, dt)))
+            return (t, y, k, change + b * k), None
+
+        def step(i, y):
+            stages = jnp.array([0, 1 / 2, 1 / 2, 1]), jnp.array([1, 2, 2, 1]) / 6
+            begin = i * dt, y, jnp.zeros_like(y), jnp.zeros_like(y)
+            return y + jax.lax.scan(stage, begin, stages)[0][3]
+
+        return jax.lax.fori_loop(0, 100, step, y)
+
+    some = jax.tree.map(lambda leaf: leaf[:50], (x.y0, x.args))
+    return jnp.stack([flow(*some, jnp.full(50, h)) for h in (0.1, 0.05)])
+
+
+@each(STEPS)
+def test_the_order_without_noise_is_that_of_the_coefficients(solver):
+    x = _some(batch(solver.structure, jnp.float64), 50)
+    sizes = jnp.ones((N, 2)).at[:, 1].set(0)
+    h = jnp.repeat(jnp.array([0.1, 0.05, 0.001]), np.array([50, 50, N - 100]))
+    x = eqx.tree_at(lambda x: (x.sizes, x.h), x, (sizes, h))
+    y1, _, _ = program(solver, jnp.float64, True)(x)
+    ends = jnp.stack([y1[:50], y1[50:100]])
+    errors = np.linalg.norm(ends - _flows(solver), axis=(1, 2))
+    order = slope(np.array([0.1, 0.05]), errors) - 1
+    assert abs(order - solver.order(None)) <= 0.2
+
+
+# Kinds of noises, and whether they commute.
+KINDS = {"one": True, "commuting": True, "others": False}
+# Small enough for the leading term of the error, to 0.1 of an order.
+_WEAK_STEPS = jnp.array([0.002, 0.001, 0.0005])
+
+
+def _kinds(structure: str) -> dict[str, bool]:
+    return KINDS if structure == "any" else {"one": True, "commuting": True}
+
+
+_WEAK = {}
+
+
+def _weak_systems(solver):
+    """Two systems of each kind, with two noises; and the means of exact steps, but for
+    terms beyond the third or fourth order of the step."""
+    if kind_of(solver) not in _WEAK:
+        _WEAK[kind_of(solver)] = _make_weak_systems(solver)
+    return _WEAK[kind_of(solver)]
+
+
+def _make_weak_systems(solver):
+    order = 3 if solver.structure == "constant" else 2
+    system = SYSTEMS[solver.structure]
+    draw = lambda kind, key: system.draw(key, 1, 2, jnp.float64, kind, strength=2.0)
+    keys = jr.split(jr.key(4), 2)
+    kinds = _kinds(solver.structure)
+    drawn = [jax.vmap(ft.partial(draw, kind))(keys) for kind in kinds]
+    y0, args = jax.tree.map(lambda *x: jnp.concatenate(x), *drawn)
+    terms = system.terms(ds.WeakBrownianPath((2,), jr.key(0)), commuting=True)
+    terms = whole(terms, solver)
+
+    def exact(h, y0, args):
+        kwargs = dict(fn=values_of_a_step)
+        # Any solver will do: its steps cancel.
+        at = (terms, diffrax.Heun(), 0.1, 0.1 + h, y0, args)
+        mean = ds.step_expectation(*at, **kwargs)
+        return mean - ds.weak_order_defect(*at, **kwargs, order=order)
+
+    return y0, args, np.asarray(over_steps(exact, _WEAK_STEPS, y0, args))
+
+
+def local_weak_orders(solver) -> dict[str, float]:
+    y0, args, exact = _weak_systems(solver)
+    path = solver.path((2,), jr.key(0), want="expectations")
+    terms = SYSTEMS[solver.structure].terms(path, commuting=True)
+    solver = by_picard(solver)
+
+    def mean(h, y0, args):
+        # Gaussian variables by quadrature.
+        kwargs = dict(fn=values_of_a_step, nodes=4)
+        return ds.step_expectation(terms, solver, 0.1, 0.1 + h, y0, args, **kwargs)
+
+    means = over_steps(mean, _WEAK_STEPS, y0, args, one_after_another)
+    defects = np.asarray(means) - exact
+    sizes = lambda i: np.linalg.norm(defects[2 * i : 2 * i + 2], axis=(0, 2))
+    kinds = _kinds(solver.structure)
+    return {kind: slope(_WEAK_STEPS, sizes(i)) - 1 for i, kind in enumerate(kinds)}
+
+
+# The outcomes of Lévy areas cannot be enumerated.
+@each([solver for solver in TABLE if "A" not in solver.variables])
+def test_local_weak_order(solver):
+    for kind, order in local_weak_orders(solver).items():
+        claim = solver.record.weak_order(KINDS[kind])
+        assert abs(order - claim) <= 0.1, (kind, order)
+    system = SYSTEMS[solver.structure]
+    for m in (1, 2):
+        terms = system.terms(solver.path((m,), jr.key(0)))
+        # A solver does not know whether several noises commute.
+        assert solver.weak_order(terms) == solver.record.weak_order(m == 1)
+
+
+_STRONG_STEPS = np.array([16, 32, 64])
+_STRONG_PATHS = 60
+
+
+def strong_orders(solver) -> dict[str, tuple[float, float]]:
+    """Slopes of root mean squares over common paths, and their standard errors."""
+    system, m = SYSTEMS[solver.structure], 2
+    fine = 2**8 if "L" in solver.variables else 2**9
+    # The errors that are measured are larger than 1e-6.
+    quick = by_picard(solver, 1e-11)
+    draw = lambda kind: system.draw(jr.key(11), 1, m, jnp.float64, kind)
+    drawn = [draw(kind) for kind in _kinds(solver.structure)]
+    y0, args = jax.tree.map(lambda *x: jnp.stack(x), *drawn)
+
+    def end(key, y0, args, steps):
+        k_sample, k_more = jr.split(key)
+        path = FineSample.draw(k_sample, fine, m)
+        if "C" in solver.variables:
+            path = ds.PlateauBrownianPath(path, k_more)
+        if "A" in solver.variables:
+            path = ds.LevyAreaBrownianPath(path, k_more, terms=0, cell=1 / fine)
+        terms, h = system.terms(path, commuting=True), 1 / steps
+        step = lambda i, y: take_step(quick, terms, i * h, (i + 1) * h, y, args)[0]
+        return jfu.ravel_pytree(jax.lax.fori_loop(0, steps, step, y0))[0]
+
+    # One batch of all paths and kinds; the number of steps is not known while compiling.
+    number = len(_kinds(solver.structure))
+    repeat = lambda x: jnp.repeat(x, _STRONG_PATHS, axis=0)
+    batch = jax.tree.map(repeat, (y0, args))
+    keys = jnp.tile(jr.split(jr.key(0), _STRONG_PATHS), number)
+    over = jax.jit(jax.vmap(end, (0, 0, 0, None)))
+    *coarse, exact = (
+        over(keys, *batch, n).reshape(number, _STRONG_PATHS, -1)
+        for n in np.array([*_STRONG_STEPS, fine])
+    )
+    squares = np.sum((np.stack(coarse) - exact) ** 2, axis=-1)
+    means = np.mean(squares, axis=-1, keepdims=True)
+    # A slope is a sum over logarithms of errors, and so, to first order, over paths.
+    x = -np.log(_STRONG_STEPS)
+    weights = (x - x.mean()) / np.sum((x - x.mean()) ** 2) / 2
+    orders = np.einsum("i,ik->k", weights, np.log(means[..., 0]))
+    parts = np.einsum("i,ikn->kn", weights, squares / means)
+    bars = np.std(parts, axis=-1) / np.sqrt(_STRONG_PATHS)
+    return dict(zip(_kinds(solver.structure), zip(orders.tolist(), bars.tolist())))
+
+
+STRONG = [
+    *filter(lambda s: s.record.strong is not None, DEFAULTS),
+    ds.SRKs4(0.3, -0.7),
+    *(s for s in SPLIT if s.record.strong is not None),
+]
+
+
+@each(STRONG)
+def test_strong_order(solver):
+    for kind, (order, bar) in strong_orders(solver).items():
+        claim = solver.record.strong_order(KINDS[kind])
+        # Terms of higher order are still seen. Where noises that do not commute have a
+        # lower order, it is told from that of the others.
+        most = 0.2 if claim < 1 else 0.3
+        assert claim - 0.1 - 3 * bar <= order <= claim + most + 3 * bar, (kind, order)
+
+
+@each(TABLE)
+def test_coefficients_are_symplectic_and_of_the_claimed_order(solver):
+    if not hasattr(solver, "tableau"):
+        return
+    tableau, record = solver.tableau, solver.record
+    worst = [np.max(np.abs(ds.symplectic_residuals(tableau)))]
+    order = min(record.weak_order(True), 2)
+    worst += map(abs, ds.weak_order_residuals(tableau, order).values())
+    if record.strong is not None:
+        worst += map(abs, ds.strong_order_residuals(tableau).values())
+    assert max(worst) <= 1e-14
+    assert solver.stage_vectors(5) == tuple(
+        n
+        for block in make_plan(tableau.flatten()).blocks
+        if (n := sum(len(group) for group in block.unknown))
+    )
+
+
+@each([*DEFAULTS, *SPLIT])
+def test_own_paths_hold_what_a_step_needs(solver):
+    system = SYSTEMS[solver.structure]
+    y0, args = system.draw(jr.key(0), 1, 2, jnp.float64)
+    # The test of weak orders takes a step along the other path.
+    path = solver.path((2,), jr.key(0), want="paths")
+    quick = by_picard(solver)
+    step = lambda y0: take_step(quick, system.terms(path), 0.0, 0.1, y0, args)[0]
+    y1 = eqx.filter_eval_shape(step, y0)
+    assert [x.shape for x in y1] == [(1,), (1,)]
+    assert issubclass(path.levy_area, solver.minimal_levy_area) or (
+        solver.variables == ("W",)
+    )
+    meant = "expectations" if solver.record.strong is None else "paths"
+    default, asked = (solver.path((2,), jr.key(0), want=w) for w in (None, meant))
+    assert eqx.tree_equal(default, asked)
+
+
+@each(DEFAULTS)
+def test_a_path_without_what_a_step_needs_is_refused_with_advice(solver):
+    if solver.variables == ("W",):
+        return
+    y0, args = SYSTEMS[solver.structure].draw(jr.key(0), 1, 2, jnp.float64)
+    plain = ds.FixedStepBrownianPath((2,), jr.key(0))
+    terms = SYSTEMS[solver.structure].terms(plain)
+    name = type(solver).__name__
+    held = [v for v in VARIABLES if v in solver.variables]
+    with pytest.raises(ValueError, match=f"`{name}` needs") as info:
+        solver.step(terms, 0.0, 0.1, y0, args, None, False)
+    assert "Pass `solver.path(shape, key)`, or `" in str(info.value)
+    assert VARIABLES[held[0]].name in str(info.value) or name == "NinomiyaVictoir"
+
+
+@each([s for s in [*DEFAULTS, ds.BAOAB(GAMMA)] if s.structure != "any"])
+def test_systems_of_another_structure_are_refused(solver):
+    y0, args = SYSTEMS["any"].draw(jr.key(0), 1, 2, jnp.float64)
+    terms = SYSTEMS["any"].terms(ds.WeakBrownianPath((2,), jr.key(0)))
+    with pytest.raises(ValueError, match=f"`{type(solver).__name__}` needs"):
+        solver.init(terms, 0.0, 0.1, y0, args)
+
+
+def test_bad_shapes_keys_and_wants_are_refused():
+    path = ds.ImplicitMidpoint().path
+    with pytest.raises(ValueError, match="`want` must be"):
+        path((2,), jr.key(0), want="moments")  # pyright: ignore
+    with pytest.raises(ValueError, match="key"):
+        path((2,), 3)  # pyright: ignore
+    with pytest.raises(ValueError, match="`shape`"):
+        path(3, jr.key(0))  # pyright: ignore
+
+
+def test_solvers_print_in_a_line():
+    assert repr(ds.ImplicitMidpoint()) == "ImplicitMidpoint()"
+    assert repr(ds.SRKw1(b=0.2)) == "SRKw1(b=0.2)"
+    own = ds.SRKs1(root_finder=ds.PicardNewton(rtol=1e-3), root_find_max_steps=5)
+    assert repr(own).startswith("SRKs1(root_finder=PicardNewton(rtol=0.001")

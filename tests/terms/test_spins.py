@@ -1,0 +1,310 @@
+"""Spins and rigid bodies: the pair (p, q) stands for s, and each step is a Poisson map."""
+
+import functools as ft
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from ..picard import by_picard
+from ..problems import Given, local_weak_orders, rigid_body_terms, weak_path
+
+
+def H0(t, s, args):
+    """`sum_j a_j cos(u_j . s + phi_j)` of all components: smooth, and no structure."""
+    a, u, phi = args["drift"]
+    return jnp.sum(a * jnp.cos(u @ s.ravel() + phi + t))
+
+
+def noise(t, s, args):
+    a, u, phi = args["noise"]
+    return jnp.sum(a * jnp.cos(u @ s.ravel() + phi - t), axis=-1)
+
+
+@ft.partial(jax.jit, static_argnums=(1, 2, 3))
+def _problem(key, spins: int, m: int, dtype=jnp.float64):
+    """Random spins of lengths from 1/2 to 2, some at a pole, and random `args`."""
+    k_s, k_length, k_pole, kd, kn = jr.split(key, 5)
+    s = jr.normal(k_s, (spins, 3), dtype)
+    pole = jr.randint(k_pole, (spins, 1), 0, 8)
+    s = jnp.where(pole == 0, jnp.array([0, 0, 1], dtype), s)
+    s = jnp.where(pole == 1, jnp.array([0, 0, -1], dtype), s)
+    length = 2 ** jr.uniform(k_length, (spins, 1), dtype, -1, 1)
+    s = length * s / jnp.linalg.norm(s, axis=-1, keepdims=True)
+
+    def coefficients(key, shape, size):
+        ka, ku, kphi = jr.split(key, 3)
+        u = jr.normal(ku, (*shape, 3 * spins), dtype) / np.sqrt(spins)
+        phase = jr.uniform(kphi, shape, dtype, 0, 2 * np.pi)
+        return size * jr.normal(ka, shape, dtype), u, phase
+
+    args = {
+        "drift": coefficients(kd, (4,), 0.5),
+        "noise": coefficients(kn, (m, 4), 0.2),
+    }
+    return s, args
+
+
+POLES = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+EQUATOR = np.array([[1.0, 0.0, 0.0], [-0.6, 0.8, -0.0], [0.3, -0.4, 1e-300]])
+
+
+def test_solutions_push_forward_to_the_equation_of_spins():
+    s, args = _problem(jr.key(0), 40, 3)
+    s = jnp.concatenate([s[:-5], POLES, EQUATOR])
+    W = jnp.array([0.3, -0.7, 0.4])
+    drift, diffusion = ds.spin_terms(H0, noise, weak_path(3)).terms
+    y = ds.to_spinors(s)
+    velocity = lambda dy: jax.jvp(ds.from_spinors, (y,), (dy,))[1]
+    for dy, H in (
+        (drift.vf(0.4, y, args), lambda s: H0(0.4, s, args)),
+        (diffusion.vf_prod(0.4, y, args, W), lambda s: noise(0.4, s, args) @ W),
+    ):
+        expected = jnp.cross(s, jax.grad(H)(s))
+        np.testing.assert_allclose(velocity(dy), expected, atol=1e-14)
+        assert jnp.max(jnp.abs(expected)) > 0.1
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_spinors_of_spins_give_them_back_with_their_derivatives_everywhere(dtype):
+    eps = jnp.finfo(dtype).eps
+    s = np.concatenate([_problem(jr.key(0), 100, 1)[0], POLES, EQUATOR])
+    # And where squares leave the range of the numbers.
+    extreme = float(jnp.finfo(dtype).max) ** 0.7
+    s = np.concatenate([s, s * extreme, s / extreme]).astype(dtype)
+    p, q = map(np.asarray, jax.jit(ds.to_spinors)(s))
+    assert p.shape == q.shape == s.shape[:-1] + (2,) and p.dtype == q.dtype == dtype
+    largest = np.max(np.abs(s), axis=-1)
+    length = np.linalg.norm(s / largest[:, None], axis=-1) * largest
+    again = jax.jit(ds.from_spinors)((p, q))
+    assert np.max(np.abs(again - s) / length[:, None]) <= 4 * eps
+    np.testing.assert_allclose(np.sum(p**2 + q**2, axis=-1) / 4, length, rtol=8 * eps)
+
+    identity = lambda s: ds.from_spinors(ds.to_spinors(s))
+    backward, forward = jax.jacrev(identity), jax.jacfwd(identity)
+    both = lambda s: (backward(s), forward(s), jax.jacfwd(backward)(s))
+    *jacobians, hessian = map(np.asarray, jax.jit(jax.vmap(both))(s))
+    assert np.max(np.abs(jacobians - np.eye(3))) <= 8 * eps
+    # The second derivative, at moderate lengths.
+    sizes = np.abs(hessian[:105]) * length[:105, None, None, None]
+    assert np.max(sizes) <= 32 * eps
+
+
+# A symplectic step for (p, q) is a Poisson map for s, whatever the solver, and every solver
+# has a test that its steps are symplectic. So here is one for each kind of step.
+@pytest.mark.parametrize(
+    "solver, dtype, bound",
+    [
+        (ds.ImplicitMidpoint(), jnp.float64, 1e-13),
+        (ds.ImplicitMidpoint(), jnp.float32, 5e-6),
+        (by_picard(ds.SRKw1(b=0.2)), jnp.float64, 1e-13),
+        (by_picard(ds.NinomiyaVictoir()), jnp.float64, 1e-13),
+        (by_picard(ds.LevyAreaMidpoint()), jnp.float64, 1e-13),
+    ],
+    ids=["ImplicitMidpoint", "float32", "SRKw1", "NinomiyaVictoir", "LevyAreaMidpoint"],
+)
+def test_step_is_a_poisson_map_for_a_thousand_random_systems(solver, dtype, bound):
+    def defect(key):
+        k_problem, k_h, k_W, k_A, k_coin = jr.split(key, 5)
+        s0, args = _problem(k_problem, 2, 3, dtype)
+        # Uniform in the logarithm over [1e-3, 0.2].
+        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
+        W = jnp.sqrt(h) * jnp.clip(jr.normal(k_W, (3,), dtype), -2.5, 2.5)
+        A = h / 2 * jr.normal(k_A, (3, 3), dtype)
+        coin = jr.rademacher(k_coin, (3,), dtype)
+        terms = ds.spin_terms(H0, noise, Given(W, A=A - A.T, two_point=coin))
+        y0 = ds.to_spinors(s0)
+        return ds.poisson_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
+
+    defects = jax.jit(jax.vmap(defect))(jr.split(jr.key(0), 1000))
+    assert defects.dtype == dtype
+    assert jnp.max(defects) <= bound
+
+
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), diffrax.Heun()])
+def test_poisson_defect_sees_a_method_for_the_spins_themselves(solver):
+    # The midpoint rule keeps |s| there, but not the bracket.
+    s0 = jnp.array([0.6, 0.0, 0.8])
+    terms = rigid_body_terms(Given(jnp.array(0.1)))
+    defect = ds.poisson_defect(terms, solver, 0.0, 0.2, s0)
+    assert 1e-4 < defect < 1e-2
+
+
+def test_one_step_in_a_constant_field_is_the_rotation_of_the_cayley_map():
+    # In a field B the lift is linear with frequency |B| / 2, so that a midpoint step of
+    # it turns s about -B by four times the angle arctan(h |B| / 4).
+    B, s0, h = jnp.array([0.3, -0.5, 0.8]), jnp.array([0.2, 0.9, -0.4]), 0.5
+    field = lambda t, s, args: B @ s
+    terms = ds.spin_terms(lambda t, s, args: 0.0, field, Given(jnp.array([h])))
+    y0 = ds.to_spinors(s0)
+    y1, *_ = ds.ImplicitMidpoint().step(terms, 0.0, h, y0, None, None, False)
+    length = jnp.linalg.norm(B)
+    axis, angle = -B / length, 4 * jnp.arctan(h * length / 4)
+    expected = (
+        jnp.cos(angle) * s0
+        + jnp.sin(angle) * jnp.cross(axis, s0)
+        + (1 - jnp.cos(angle)) * (axis @ s0) * axis
+    )
+    np.testing.assert_allclose(ds.from_spinors(y1), expected, atol=1e-15)
+
+
+def test_ninomiya_victoir_is_weak_order_two_for_noises_that_do_not_commute():
+    terms = ds.spin_terms(H0, noise, weak_path(2, two_point=True))
+    s0, args = jax.vmap(lambda key: _problem(key, 1, 2))(jr.split(jr.key(2), 2))
+
+    def fn(y):
+        s = ds.from_spinors(y)[0]
+        return jnp.stack([s[2], s[0] * s[1], jnp.exp(s[1] / 2)])
+
+    hs = np.array([0.02, 0.01, 0.005, 0.0025])
+    y0 = ds.to_spinors(s0)
+    solver = by_picard(ds.NinomiyaVictoir())
+    slopes = local_weak_orders(terms, solver, y0, args, hs, order=2, fn=fn)
+    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
+
+
+def test_noises_of_spins_may_be_indexed():
+    s0, args = _problem(jr.key(0), 2, 3)
+    y0 = ds.to_spinors(s0)
+    path = weak_path(3, two_point=True)
+    indexed = ds.IndexedNoise(lambda k, t, s, args: noise(t, s, args)[k], 3)
+    solver = by_picard(ds.NinomiyaVictoir())
+
+    def end(y0, args, fields):
+        terms = ds.spin_terms(H0, fields, path)
+        y1, *_ = solver.step(terms, 0.0, 0.1, y0, args, None, False)
+        return ds.from_spinors(y1)
+
+    ends = jax.jit(lambda *x: [end(*x, fields) for fields in (noise, indexed)])(
+        y0, args
+    )
+    np.testing.assert_allclose(*ends, atol=1e-15)
+
+
+def _end(y0, args, solver=ds.ImplicitMidpoint()):  # noqa: B008
+    """Of a chain of spins with a field along each axis of each spin."""
+
+    def H0(t, s, args):
+        return -jnp.sum(s[1:] * s[:-1])
+
+    dtype = y0[0].dtype
+    path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((4, 3), dtype), jr.key(0))
+    terms = ds.spin_terms(H0, lambda t, s, args: args * s, path)
+    times = jnp.array([0, 1, 0.125], dtype)
+    sol = diffrax.diffeqsolve(terms, solver, *times, y0, args, throw=False)
+    return ds.from_spinors(sol.ys)[0], sol.result == diffrax.RESULTS.successful
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_a_batch_of_chains_keeps_lengths_and_does_not_see_the_phase(dtype):
+    eps = jnp.finfo(dtype).eps
+    s0 = jax.vmap(lambda key: _problem(key, 4, 1, dtype)[0])(jr.split(jr.key(0), 3))
+    p, q = map(np.asarray, jax.jit(ds.to_spinors)(s0))
+    # Another phase for each spin.
+    phase = 2 * np.pi * np.random.default_rng(1).random((3, 4, 1))
+    c, s = np.cos(phase).astype(dtype), np.sin(phase).astype(dtype)
+    turned = c * p + s * q, c * q - s * p
+    # The second path of the batch has no finite numbers.
+    args = jnp.array([0.3, jnp.nan, 0.5], dtype)
+    end = jax.jit(jax.vmap(_end))
+    s1, success = map(np.asarray, end((p, q), args))
+    np.testing.assert_array_equal(success, [True, False, True])
+    again = np.asarray(end(turned, args)[0])[success]
+    s1, s0 = s1[success], np.asarray(s0)[success]
+    assert s1.dtype == dtype
+    assert np.max(np.linalg.norm(s1 - s0, axis=-1)) > 0.1
+    lengths = [np.linalg.norm(s, axis=-1) for s in (s0, s1)]
+    np.testing.assert_allclose(*lengths, rtol=64 * eps)
+    np.testing.assert_allclose(again, s1, atol=256 * eps)
+
+
+def test_gradients_go_through_a_solve_from_the_poles():
+    s0 = np.concatenate([POLES, EQUATOR[:2]])
+    weights, direction = np.random.default_rng(1).normal(size=(2, 4, 3))
+    solver = by_picard(ds.ImplicitMidpoint())
+    value = lambda s, args: jnp.sum(weights * _end(ds.to_spinors(s), args, solver)[0])
+    # One program for the gradient and for the values that are compared to it.
+    both = jax.jit(jax.value_and_grad(value, argnums=(0, 1)))
+    _, (by_s, by_args) = both(s0, 0.3)
+    k = 1e-5
+    along = lambda ds, dargs: [both(s0 + x * ds, 0.3 + x * dargs)[0] for x in (k, -k)]
+    slopes = [-np.diff(along(*d))[0] / (2 * k) for d in ((direction, 0), (0, 1))]
+    got = [np.sum(by_s * direction), by_args]
+    np.testing.assert_allclose(got, slopes, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [ds.SRKs2(), ds.SRKs4(), ds.SRKw3(), ds.SRKw5(), ds.StormerVerlet(),
+     ds.PlateauVerlet(), ds.AdditiveGauss()],
+    ids=repr,
+)  # fmt: skip
+def test_solvers_that_need_more_structure_refuse_spins(solver):
+    s0, args = _problem(jr.key(0), 1, 1)
+    terms = ds.spin_terms(H0, noise, weak_path(1))
+    with pytest.raises(ValueError, match="use a solver for the general structure"):
+        solver.init(terms, 0.0, 0.1, ds.to_spinors(s0), args)
+
+
+def test_what_are_no_spins_is_refused():
+    s = jnp.ones((5, 3))
+    for wrong in (jnp.ones((3, 5)), 1.0, None, (s, s), s.astype(complex)):
+        with pytest.raises(ValueError, match=r"real array `s` of shape `\(..., 3\)`"):
+            ds.to_spinors(wrong)
+    for wrong in ((s, s), (jnp.array(1.0),) * 2, ({"s": s}, {"s": s})):
+        with pytest.raises(ValueError, match=r"pass `y0=to_spinors\(s0\)`"):
+            ds.from_spinors(wrong)
+    terms = ds.spin_terms(H0, noise, weak_path(3))
+    args = _problem(jr.key(0), 5, 3)[1]
+    step = lambda y0: diffrax.diffeqsolve(
+        terms, ds.ImplicitMidpoint(), 0, 1, 0.1, y0, args
+    )
+    with pytest.raises(ValueError, match=r"for spins `y0=to_spinors\(s0\)`"):
+        step(s)
+    with pytest.raises(ValueError, match=r"pass `y0=to_spinors\(s0\)`"):
+        step((s, s))
+    with pytest.raises(ValueError, match="real array `s`"):
+        ds.poisson_defect(terms, ds.ImplicitMidpoint(), 0.0, 0.1, jnp.ones(4))
+
+
+def test_spins_of_length_zero_are_refused_traced_or_not():
+    s = jnp.ones((2, 3)).at[1].set(0.0)
+    jitted = jax.jit(ds.to_spinors)
+    for to_spinors in (ds.to_spinors, jitted, jax.vmap(jitted)):
+        with pytest.raises(Exception, match="whose length is not zero"):
+            jax.block_until_ready(to_spinors(s))
+
+
+def test_hamiltonians_that_do_not_fit_are_refused():
+    y0 = ds.to_spinors(jnp.ones(3))
+    path = weak_path(2)
+    with pytest.raises(
+        ValueError, match=r"`H0` must be a function, called as `H0\(t, s"
+    ):
+        ds.spin_terms(1.0, noise, path)
+    with pytest.raises(ValueError, match="must be a Brownian path"):
+        ds.spin_terms(H0, noise, None)
+    each = lambda t, s, args: s
+    with pytest.raises(ValueError, match="`H0` must return a scalar"):
+        ds.spin_terms(each, each, path).terms[0].vf(0.0, y0, None)
+    with pytest.raises(ValueError, match="one Hamiltonian for each noise of the path"):
+        ds.spin_terms(H0, each, path).terms[1].vf(0.0, y0, None)
+
+
+def test_a_field_on_each_of_many_spins_costs_one_reverse_pass():
+    n = 1024
+    path = ds.WeakBrownianPath((n, 3), jr.key(0))
+    terms = ds.spin_terms(lambda t, s, args: 0.0, lambda t, s, args: s, path)
+    y0 = ds.to_spinors(jnp.ones((n, 3)))
+    noise = terms.terms[1]
+    increment = jax.eval_shape(lambda: noise.contr(0.0, 0.1))
+    evaluate = lambda y, W: noise.vf_prod(0.0, y, None, W)
+    shapes = eqx.filter_make_jaxpr(evaluate)(y0, increment)[0].jaxpr.eqns
+    largest = max(v.aval.size for eqn in shapes for v in eqn.outvars)
+    assert largest <= 4 * n
