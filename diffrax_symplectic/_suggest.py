@@ -33,6 +33,7 @@ from ._terms import (
     commuting,
     constant_fault,
     FRICTION,
+    is_hamiltonian,
     number_of_noises,
     replace_paths,
     separable_fault,
@@ -164,8 +165,6 @@ def suggest_solver(
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
     check_fit(terms, t0, y0, args)
-    if gamma is not None:
-        Damped(ImplicitMidpoint(), gamma).init(terms, t0, t0 + 1, y0, args)
 
     not_separable = separable_fault(drift, noise, t0, y0, args)
     structures: list[Structure] = ["any"]
@@ -181,6 +180,12 @@ def suggest_solver(
     m = number_of_noises(terms)
     commute = m == 1 or len(structures) > 1 or commuting(noise, t0, y0, args)
     solvers = ranked(want, structures, commute, m, gamma)
+    if gamma is not None:
+        if not any(map(is_hamiltonian, drift)):
+            # Of these `BAOAB` finds the momenta, by the structure that it needs.
+            solvers = [solver for solver in solvers if isinstance(solver, BAOAB)]
+        probe = next(iter(solvers), Damped(ImplicitMidpoint(), gamma))
+        probe.init(terms, t0, t0 + 1, y0, args)  # refuses what is no friction
     if len(noise) > 1 or not jtu.all_leaves(
         [increment_struct(brownian_paths(noise)[0])]
     ):
@@ -197,10 +202,8 @@ def suggest_solver(
     system = f"For {want}. The system is {kind}, with {noises}."
     if not_separable is not None and kind and WRONG_WAY_ROUND in not_separable.reason:
         system += f" It is not separable: {not_separable.reason}."
-    if not_separable is not None and not_separable.advice.startswith(FRICTION):
-        system += (
-            f" {FRICTION} Ask for a solver for the terms without it, with `gamma=`."
-        )
+    if not_separable is not None and not_separable.friction:
+        system += f" {FRICTION} Without it, ask with `gamma=`."
     return Suggestions(system, tuple(found))
 
 

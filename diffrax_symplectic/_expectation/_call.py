@@ -60,9 +60,11 @@ def expectation(
 
         ```python
         import diffrax_symplectic as ds
+        import jax
         import jax.numpy as jnp
         import jax.random as jr
 
+        jax.config.update("jax_enable_x64", True)
         H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
         noise = lambda t, p, q, args: 0.2 * jnp.sin(q)
         terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
@@ -103,13 +105,13 @@ def expectation(
     - `phi`: takes time, state and `args` to a PyTree of real arrays.
     - `terms`, `solver`, `t0`, `t1`, `dt0`, `y0`, `args`: as for `diffrax.diffeqsolve`,
         with `t1` after `t0` by a whole number of steps `dt0`. The paths in `terms` say
-        which random variables there are; that their keys are equal or not says which of
-        them are one Brownian motion. Any solver of this package, and those of Diffrax with
+        which random variables there are, and paths with equal keys are one Brownian
+        motion. Any solver of this package, and those of Diffrax with
         fixed steps for Stratonovich equations.
     - `key`: a JAX random key.
     - `sampling`: an [`diffrax_symplectic.IndependentPaths`][],
         [`diffrax_symplectic.ArrayRQMC`][] or [`diffrax_symplectic.ValueFunctions`][]. With
-        `None` a short pilot tries those that can be used and takes the one with the least
+        `None` a pilot tries those that can be used and takes the one with the least
         error for its time; `reason` of the result says which and why. (It measures times.
         So a second call may choose another.)
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
@@ -129,14 +131,15 @@ def expectation(
     it and is counted in `num_failed`: one with a step that the solver reports as failed, or
     with a state or $\phi$ that is not finite.
 
-    **Raises:** a `ValueError` for a solver of Itô equations (these terms are
-    Stratonovich's), times between steps, a $\phi$ that is not real, sizes that are not
+    **Raises:** a `ValueError` for a solver of Itô equations where these differ from
+    Stratonovich's, times between steps, a $\phi$ that is not real, sizes that are not
     positive integers, a `tol` that is not positive, a `key` that is none, a `start` from
     another key, of other shapes or with more paths, terms without noise, and for paths that
     `sampling` cannot use (it says which ones it can);
     [`diffrax_symplectic.ExpectationInterrupted`][], with the estimate so far, on an
-    interrupt from the keyboard. Warns if `tol` was not reached, and if more than one path
-    in a hundred failed.
+    interrupt from the keyboard. Warns if `tol` was not reached, if more than one path in a
+    hundred failed, and where rounding in single precision may be more than the standard
+    error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for the formula by which means
@@ -165,7 +168,28 @@ def expectation(
         plan = sampling.prepare(problem, k_pilot, devices)
     if start is not None:
         plan = plan._replace(reason=start.reason)
-    return run(plan, key, devices, sampling, start, tol, progress_meter)
+    estimate = run(plan, key, devices, sampling, start, tol, progress_meter)
+    _warn_of_rounding(estimate, problem)
+    return estimate
+
+
+def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
+    """Of single precision, in which many small sampling errors are below rounding."""
+    numbers = np.finfo(problem.dtype)
+    if numbers.bits >= 64:
+        return
+    # Sizes of steps are rounded with times, so that errors of one sign add up.
+    fraction = float(numbers.eps) * problem.max_steps
+    rounding = lambda mean: fraction * np.abs(mean)
+    pairs = zip(jtu.tree_leaves(estimate.mean), jtu.tree_leaves(estimate.std_error))
+    if any(np.any(error < rounding(mean)) for mean, error in pairs):
+        warnings.warn(
+            "Rounding errors may be larger than the standard error, which does not include "
+            f"them: over {problem.max_steps:,} steps in {numbers.dtype} some "
+            f"{fraction:.0e} of the mean. For more digits call "
+            '`jax.config.update("jax_enable_x64", True)` first.',
+            stacklevel=3,
+        )
 
 
 def _chosen(

@@ -157,15 +157,16 @@ class Expectation(eqx.Module):
         short: Any = {"float_kind": "{:.1e}".format}
         brief = lambda x: np.array2string(np.asarray(x), formatter=short, threshold=6)
         mean, error = jtu.tree_leaves(self.mean), jtu.tree_leaves(self.std_error)
+        leaves = lambda x: [brief(y) for y in jtu.tree_leaves(x)[:6]]
         lines = [f"{shown(m, e)} ± {brief(e)}" for m, e in zip(mean[:6], error)]
+        if self.bias is not None:
+            whole = zip(lines, leaves(self.error))
+            lines = [f"{x} (sampling), {e} (with extrapolation)" for x, e in whole]
         lines += ["..."] * (len(mean) > 6)
         if self.bias is not None:
-            leaves = lambda x: [brief(y) for y in jtu.tree_leaves(x)[:6]]
             pairs = zip(leaves(self.bias), leaves(self.bias_std_error))
             biases = ", ".join(f"{bias} ± {error}" for bias, error in pairs)
             lines.append(f"bias of the finest step, taken out: {biases}")
-            errors = ", ".join(leaves(self.error))
-            lines.append(f"all errors, extrapolation included: {errors}")
         elif self.sampling is not None:
             lines.append("not included: the error of discretization (see `levels`)")
         how = "" if self.sampling is None else f", {self.sampling}"

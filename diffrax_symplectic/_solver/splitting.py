@@ -17,7 +17,7 @@ from .._arguments import check_pair, check_takes
 from .._compat import direction
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
-from .._terms import is_hamiltonian, Lifted, split_terms
+from .._terms import DataFlow, has_lifted, is_hamiltonian, split_terms
 from ._friction import (
     apply_friction,
     checked,
@@ -188,8 +188,7 @@ class Damped(AbstractSplitting):
 
 def _check_has_momentum(terms: PyTree[diffrax.AbstractTerm]) -> None:
     """Raises a `ValueError` unless the first half of the state is a canonical momentum."""
-    is_lifted = lambda x: isinstance(x, Lifted)
-    if any(map(is_lifted, jtu.tree_leaves(terms, is_leaf=is_lifted))):
+    if has_lifted(terms):
         raise ValueError(
             "`Damped` is friction on a canonical momentum. Half of the state of "
             "`spin_terms` or `wave_terms` is none: to damp it would make spins shorter. "
@@ -199,8 +198,9 @@ def _check_has_momentum(terms: PyTree[diffrax.AbstractTerm]) -> None:
         raise ValueError(
             "`Damped` is friction on the momentum p of a state `(p, q)`, which plain terms "
             "(`ODETerm`, `ControlTerm`) do not tell from other states, such as (position, "
-            "velocity). Construct the terms with `hamiltonian_terms`, or write the "
-            "friction into the drift and take a solver without `Damped`."
+            "velocity). Construct the terms with `hamiltonian_terms`; or take "
+            "`BAOAB(gamma)`, if the noise is constant and in the forces; or write the "
+            "friction into the drift, for solvers of general systems."
         )
 
 
@@ -226,8 +226,9 @@ class LinearFlow(AbstractSplitting):
     lattice, the bonds of a molecule. Their frequencies then do not limit the step, and no
     mode is slowed down. The error is of the size of the commutators of $L$ with the rest.
 
-    The terms are those of the rest, and of all noises. What is left is often simple. If
-    $R$ and all $H_k$ depend on $q$ alone, `LinearFlow(StormerVerlet(), flow)` is explicit.
+    The terms are those of the rest, without $L$, and of all noises. What is left is often
+    simple. If $R$ and all $H_k$ depend on $q$ alone, `LinearFlow(StormerVerlet(), flow)` is
+    explicit.
 
     Symplectic if the solver is. Weak order the smaller of 2 and that of the solver; strong
     order the smaller of 1 and that of the solver; order 2 without noise.
@@ -258,6 +259,13 @@ class LinearFlow(AbstractSplitting):
         symplectic."""
         del terms
         time = jnp.asarray(time)
+        program = DataFlow(lambda time, y: self.exact_flow(0, time, y, args), time, y0)
+        if program.independent(lambda time, y: time):
+            raise ValueError(
+                "`flow(time, y, args)` of `LinearFlow` does not read `time`, so that it is "
+                "no flow: for `time = 0` it has to return `y`. It is called with half of "
+                "each step, whatever the step is."
+            )
         flow = lambda y: self.exact_flow(0, time, y, args)
         return eqx.error_if(jnp.zeros_like(time), ~_is_symplectic(flow, y0), _MESSAGE)
 
@@ -304,6 +312,7 @@ LinearFlow.__init__.__doc__ = """**Arguments:**
     Module: of Fourier transforms for a lattice, of eigenvectors made once for a molecule.
 
 **Raises:** a `ValueError` if `flow` is no such function, for a solver of another package,
-    and while the solve is traced if `flow` returns another structure or shape; an error
+    and while the solve is traced if `flow` returns another structure or shape, or does not
+    read `time`; an error
     when run if it is not symplectic at the start.
 """

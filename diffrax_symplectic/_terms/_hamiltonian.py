@@ -203,6 +203,12 @@ class Lifted(eqx.Module):
         return self.H(*before, self.chart((p, q)), args)
 
 
+def has_lifted(terms: PyTree) -> bool:
+    """Whether these are the terms of Hamiltonians of another variable."""
+    is_lifted = lambda x: isinstance(x, Lifted)
+    return any(map(is_lifted, jtu.tree_leaves(terms, is_leaf=is_lifted)))
+
+
 def lifted_terms(
     H0: Callable,
     noise: Callable | None,
@@ -247,7 +253,8 @@ def scalar_energy(out: PyTree) -> Array:
     if not jtu.all_leaves([out]) or jnp.shape(out) != ():
         raise ValueError(
             f"`H0` must return a scalar; got shape {shapes(out)}. Sum over the degrees of "
-            "freedom."
+            "freedom. (If these are paths of a batch: write H0 for one, and `jax.vmap` the "
+            "solve over states and keys.)"
         )
     _check_real("H0", out)
     return jnp.asarray(out, jnp.result_type(out, float))

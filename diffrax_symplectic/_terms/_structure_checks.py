@@ -17,15 +17,17 @@ from .._compat import innermost_solve, ω
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from ._data_flow import DataFlow
-from ._hamiltonian import asserted_structure, is_hamiltonian
+from ._hamiltonian import asserted_structure, has_lifted, is_hamiltonian
 from ._vector_fields import apply, product, split_terms
 
 
 class Fault(NamedTuple):
-    """Why a system does not have a structure, and what may be done about it."""
+    """Why a system does not have a structure, what may be done about it, and whether it is
+    a force of plain terms that depends on the momentum, as friction does."""
 
     reason: str
     advice: str
+    friction: bool = False
 
 
 def check_structure(
@@ -44,23 +46,25 @@ def check_structure(
             f"`structure` of the tableau of `{solver}` must be one of "
             f"{get_args(Structure)}; got {structure!r}."
         )
+
+    def refuse(needs: str, fault: Fault | None) -> None:
+        if fault is None:
+            return
+        advice = fault.advice
+        if has_lifted((drift, noise)):
+            advice = f"For spins and complex amplitudes {_GENERAL}."
+        raise ValueError(f"`{solver}` needs {needs}, but {fault.reason}. {advice}")
+
     if structure in ("separable", "separable and constant"):
         check_pair(y0)
         needs = "H0 = V(p) + U(t, q) and noise Hamiltonians H_k = U_k(t, q)"
-        _refuse(solver, needs, separable_fault(drift, noise, t0, y0, args))
+        refuse(needs, separable_fault(drift, noise, t0, y0, args))
     if structure in ("additive", "constant", "separable and constant"):
         needs = "additive noise, H_k = -sigma_k(t).q + gamma_k(t).p"
-        _refuse(solver, needs, additive_fault(noise, t0, y0, args))
+        refuse(needs, additive_fault(noise, t0, y0, args))
         if structure != "additive":
             needs = "additive noise that is constant in time"
-            _refuse(solver, needs, constant_fault(noise, t0, y0, args))
-
-
-def _refuse(solver: str, needs: str, fault: Fault | None) -> None:
-    if fault is not None:
-        raise ValueError(
-            f"`{solver}` needs {needs}, but {fault.reason}. {fault.advice}"
-        )
+            refuse(needs, constant_fault(noise, t0, y0, args))
 
 
 def separable_fault(
@@ -71,43 +75,49 @@ def separable_fault(
     if fault := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", fault)
     drift_flows = [
-        (is_hamiltonian(x) or len(drift) == 1, _flow(x, t0, y0, args))
+        (is_hamiltonian(x), len(drift) > 1, _flow(x, t0, y0, args))
         for x in _not_asserted(drift, "separable")
     ]
     noise_flows = [_flow(x, t0, y0, args) for x in _not_asserted(noise, "separable")]
-    fault = _fault_with_momenta(0, drift_flows, noise_flows)
-    if fault is not None and not _fault_with_momenta(1, drift_flows, noise_flows):
-        return Fault(f"{fault.reason}. {WRONG_WAY_ROUND}", fault.advice)
-    return fault
+    here, exchanged = (_faults(p, drift_flows, noise_flows) for p in (0, 1))
+    if not here:
+        return None
+    only_friction = lambda faults: all(fault.friction for fault in faults)
+    reason, advice, _ = here[0]
+    friction = only_friction(here)
+    if not friction and only_friction(exchanged):
+        reason, friction = f"{reason}. {WRONG_WAY_ROUND}", len(exchanged) > 0
+    return Fault(reason, f"{FRICTION} {advice}" if friction else advice, friction)
 
 
-def _fault_with_momenta(
-    p: int, drift: list[tuple[bool, DataFlow]], noise: list[DataFlow]
-) -> Fault | None:
-    """The fault, if the momenta are the first half of the state, `p = 0`, or the second
-    one, `p = 1`. With each drift term: whether it is that of `H0`."""
-    q = 1 - p
+def _faults(
+    p: int, drift: list[tuple[bool, bool, DataFlow]], noise: list[DataFlow]
+) -> list[Fault]:
+    """The faults, if the momenta are the first half of the state, `p = 0`, or the second
+    one, `p = 1`. With each drift term: whether it is that of `H0`, and whether there are
+    others."""
+    q, faults, advice = 1 - p, [], _advice("separable")
     dp, dq = (lambda out: out[p]), (lambda out: out[q])
     of_p, of_q = (lambda t, y, control: y[p]), (lambda t, y, control: y[q])
-    for of_H0, flow in drift:
+    for hamiltonian, others, flow in drift:
         for part, of, derivative, rate in (
             (dp, of_p, "dH0/dq depends on p", "dp/dt depend on p"),
             (dq, of_q, "dH0/dp depends on q", "dq/dt depend on q"),
             (dq, _of_t, "dH0/dp depends on t", "dq/dt depend on t"),
         ):
             if not flow.independent(of, part):
-                if of_H0:
-                    return Fault(derivative, _advice("separable"))
+                friction = part is dp and not hamiltonian
                 beside = f"a drift term beside that of H0 makes {rate}"
-                return Fault(beside, f"{FRICTION} {_advice('separable')}")
+                reason = beside if others and not hamiltonian else derivative
+                faults.append(Fault(reason, advice, friction))
     for flow in noise:
         # The change of q is linear in the increment: if it does not depend on the
         # increment, it is zero.
         if not flow.independent(lambda t, y, control: control, dq):
-            return Fault("dH_k/dp is not zero", _advice("separable"))
-        if not flow.independent(of_p, dp):
-            return Fault("dH_k/dq depends on p", _advice("separable"))
-    return None
+            faults.append(Fault("dH_k/dp is not zero", advice))
+        elif not flow.independent(of_p, dp):
+            faults.append(Fault("dH_k/dq depends on p", advice))
+    return faults
 
 
 def additive_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
@@ -189,16 +199,21 @@ def _advice(structure: str) -> str:
     return (
         f"If it only seems so, since variables cancel or because of a value in `args`, "
         f'write {how}, or pass `structure="{structure}"` to `hamiltonian_terms`. If not, '
-        "use a solver for the general structure, for example `ImplicitMidpoint` or "
-        "`SRKw1`; for friction within `Damped`."
+        f"{_GENERAL}."
     )
+
+
+_GENERAL = "use a solver for general systems, for example `ImplicitMidpoint` or `SRKw1`"
 
 
 WRONG_WAY_ROUND = (
     "With the halves of the state exchanged it would be so: is the state the wrong way "
     "round? It is `(p, q)`, momentum first, and not (position, velocity)"
 )
-FRICTION = "Friction -gamma p is what `Damped(solver, gamma)` is for."
+FRICTION = (
+    "Leave friction -gamma p out of the terms, and take `BAOAB(gamma)`, or for terms of "
+    "`hamiltonian_terms` `Damped(solver, gamma)`."
+)
 
 
 def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:

@@ -234,22 +234,21 @@ def strong_errors(
 WEAK, STRONG = (1.0, 0.3), (0.3, 0.1)
 
 
-def table(title, names, scenes, errors: Callable, strengths: tuple[float, float]):
+def rows(title, names, scenes, errors: Callable, strengths: tuple[float, float]):
     """Errors relative to the first member; it, the default and the best one."""
     relative = []
     for strength in strengths:
         absolute = [errors(scene, strength) for scene in scenes]
         relative.append(np.stack([e / e[0] for e in absolute], axis=1))
     means = [np.exp(np.mean(np.log(r), axis=1)) for r in relative]
-    head = ["member", *(f"noise {s}" for s in strengths)]
-    lines = [f"## {title}", "", _row(head), "|---" * len(head) + "|"]
+    lines = []
     order = np.argsort(sum(map(np.log, means)), kind="stable").tolist()
     for place, i in enumerate(order):
         if place == 0 or i == 0 or "default" in names[i]:
             cells = [f"{mean[i]:.2f}" for mean in means]
-            lines.append(_row([names[i], *cells]))
+            lines.append(_row([title, names[i], *cells]))
     print("\n".join(lines), flush=True)
-    return [*lines, ""]
+    return lines
 
 
 def _row(cells: list[str]) -> str:
@@ -297,24 +296,27 @@ def main() -> None:
     lines = [
         "# Members of families",
         "",
-        "The order conditions leave parameters free. The tables have the best member of a "
+        "The order conditions leave parameters free. The table has the best member of a "
         "family, the default and the paper's: errors relative to the row of 1.00, "
         "geometric means over six problems, for two strengths of the noise. For weak "
-        "families the error is the exact local one of all first and second moments, at "
-        "$h = 0.01$. For strong families it is the root mean square of 400 paths at "
-        "$t = 1$, with $h = 1/16$. Made by `python -m "
+        "families, SRKw, the error is the exact local one of all first and second "
+        f"moments, at $h = 0.01$, for strengths {WEAK[0]} and {WEAK[1]}. For strong "
+        "ones, SRKs, it is the root mean square of 400 paths at $t = 1$, with "
+        f"$h = 1/16$, for {STRONG[0]} and {STRONG[1]}. Made by `python -m "
         "examples.benchmarks.members`.",
         "",
+        _row(["family", "member", "stronger", "weaker"]),
+        "|---|---|---|---|",
     ]
     for title, scenes, order, (names, members) in weak:
         errors = lambda s, x, m=members, o=order: weak_constants(m, s, o, x)
-        lines += table(f"{title}: weak", names, scenes, errors, WEAK)
+        lines += rows(title, names, scenes, errors, WEAK)
     for title, scenes, noises, (names, members) in strong:
         first = jtu.tree_map(lambda x: x[0], members)
         errors = lambda s, x, m=members, f=first, n=noises: strong_errors(m, s, f, n, x)
-        lines += table(f"{title}: strong", names, scenes, errors, STRONG)
+        lines += rows(title, names, scenes, errors, STRONG)
     DOCS.mkdir(parents=True, exist_ok=True)
-    (DOCS / "members.md").write_text("\n".join(lines))
+    (DOCS / "members.md").write_text("\n".join([*lines, ""]))
 
 
 if __name__ == "__main__":

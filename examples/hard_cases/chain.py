@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullFormatter
 
 import diffrax_symplectic as ds
 
@@ -153,7 +154,9 @@ def section(page: Page) -> str:
             print(f"  {name}, h = {h}: {shown}", flush=True)
         y, error = np.array(means).T
         axes.errorbar(hs, y, 3 * error, marker="o", ms=3, lw=1, capsize=2, label=name)
-    axes.set(xscale="log", xlabel="h", title="energy less its exact mean")
+    axes.set(xscale="log", xlabel="h", ylabel="energy less its exact mean")
+    axes.set_xticks(hs, [f"{h:g}" for h in hs])
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_yscale("symlog", linthresh=1)
     axes.axhline(0, color="k", lw=0.5)
     axes.legend(fontsize=7)

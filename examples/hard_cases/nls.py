@@ -16,6 +16,7 @@ import jax.random as jr
 import lineax as lx
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullFormatter
 
 import diffrax_symplectic as ds
 
@@ -211,7 +212,7 @@ def section(page: Page) -> str:
     found = {}
     figure, axes = plt.subplots(1, 2, figsize=(11, 4))
     x = DX * (np.arange(N) - N / 2)
-    for name in names:
+    for name, style in zip(names, ("-", "--", ":", "-.")):
         errors = []
         for h in hs:
             r = lattice(SOLVERS[name], h, t1, paths, s)
@@ -219,8 +220,9 @@ def section(page: Page) -> str:
             errors.append(r.norm_error)
             assert r.failed == 0
             if h == 0.01:
-                axes[0].plot(x, r.density, lw=0.8, label=name)
-        axes[1].plot(hs, errors, marker="o", ms=3, lw=1, label=name)
+                axes[0].plot(x, r.density, style, lw=1, label=name)
+        if np.any(np.isfinite(errors)):
+            axes[1].plot(hs, errors, style, marker="o", ms=3, lw=1, label=name)
     axes[0].plot(x, np.sum(np.square(start()), axis=0), "k:", lw=0.8, label="start")
     axes[0].set(xlim=(-20, 20), ylim=(0, 1.6), xlabel="x", title="one path, h = 0.01")
     axes[1].set(
@@ -228,6 +230,9 @@ def section(page: Page) -> str:
     )
     for ax in axes:
         ax.legend(fontsize=7)
+    axes[0].set_ylabel(r"$|\psi|^2$")
+    axes[1].set_xticks(hs, [f"{h:g}" for h in hs])
+    axes[1].xaxis.set_minor_formatter(NullFormatter())
     picture = page.picture(figure, "nls", "Stochastic nonlinear Schrödinger lattice")
     plt.close(figure)
     ours, divided = (found[name, hs[0]] for name in SOLVERS if "Midpoint" in name)

@@ -123,8 +123,10 @@ def section(page: Page) -> str:
             assert r.failed_share == 0
             balance = r.balance(PERIOD / per_orbit, s)
             rows.append((name, f"{r.momentum_error:.1e}", str(balance)))
-    axes[0].set(aspect="equal", title="one path, ImplicitMidpoint")
-    axes[1].set(xlabel="orbits", title="largest error of the angular momentum")
+    title = f"one path, ImplicitMidpoint, {sizes[0]} steps per orbit"
+    axes[0].set(aspect="equal", title=title, xlabel="$q_1$", ylabel="$q_2$")
+    title = f"largest error of the angular momentum, {sizes[0]} steps"
+    axes[1].set(xlabel="orbits", title=title)
     axes[1].legend(fontsize=7)
     picture = page.picture(figure, "two_body", "Two-body problem")
     plt.close(figure)

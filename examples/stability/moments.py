@@ -30,13 +30,16 @@ ROUNDING = 1e-12
 
 def _linear(page: Page, hs, factors: dict[str, np.ndarray]) -> str:
     figure, axes = plt.subplots(figsize=(6, 4))
+    alike = {}  # the names of the methods that grow in the same way
     for name, factor in factors.items():
         x = factor - 1
         rate = np.maximum(np.abs(x) / hs, 1e-17)
         if np.any(x > ROUNDING):
-            axes.loglog(hs, rate, label=name, ls="--")
+            alike.setdefault(f"{rate[-1]:.6g}", (rate, []))[1].append(name)
         else:
             axes.loglog(hs, rate, "k-", lw=0.4)
+    for rate, names in alike.values():
+        axes.loglog(hs, rate, label=", ".join(names), ls="--")
     axes.plot([], [], "k-", lw=0.4, label="the symplectic ones")
     axes.set(xlabel="h", ylabel="growth per unit time", ylim=(1e-17, 1e3))
     axes.legend(fontsize=7)

@@ -1,6 +1,8 @@
 """Fitted value functions: they never change the mean, and where a fit can be exact nothing
 random is left."""
 
+import contextlib
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -110,10 +112,13 @@ def test_linear_systems_and_quadratic_functions_are_closed(dtype):
     terms = kubo_terms(ds.WeakBrownianPath(shape, KEY))
     y0 = tuple(x.astype(dtype) for x in Y0)
     phi = lambda t, y, args: {"q2": y[1] ** 2, "both": jnp.stack([y[0], y[0] * y[1]])}
-    got = _estimate(
-        ds.ValueFunctions(2, 600), terms, ds.ImplicitMidpoint(), phi, dt0=0.1, y0=y0,
-        ts=[0.0, 1.0],
-    )  # fmt: skip
+    # In single precision rounding is the larger error, which is told.
+    told = pytest.warns(UserWarning, match="over 10 steps in float32")
+    with told if dtype == jnp.float32 else contextlib.nullcontext():
+        got = _estimate(
+            ds.ValueFunctions(2, 600), terms, ds.ImplicitMidpoint(), phi, dt0=0.1,
+            y0=y0, ts=[0.0, 1.0],
+        )  # fmt: skip
     # From (p, q) = (0, 1) the oscillator is at (-sin, cos) of the angle.
     one, two = _turned(1), _turned(2)
     rounding = 50 * np.finfo(dtype).eps

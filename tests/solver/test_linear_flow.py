@@ -174,6 +174,9 @@ def test_flows_that_are_none_are_refused():
         init(lambda time, y, args: (y[0], y[1][:4]))
     with pytest.raises(ValueError, match="is a pair"):
         init(flow, jnp.ones(8))
+    # One propagator for all steps.
+    with pytest.raises(ValueError, match="does not read `time`"):
+        init(lambda time, y, args: flow(0.05, y, args))
     shrink = lambda time, y, args: (y[0] * jnp.exp(-time), y[1])
     swapped = lambda time, y, args: flow(time, y[::-1], args)
     for wrong in (shrink, swapped):

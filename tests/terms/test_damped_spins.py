@@ -183,7 +183,7 @@ def test_dampings_that_are_none_are_refused():
         each.terms[0].vf(0.0, y0, args)
     for solver in (ds.StormerVerlet(), ds.SRKw5(), ds.BAOAB(1.0)):
         damped = ds.spin_terms(H0, noise, path, damping=1.0)
-        with pytest.raises(ValueError, match="use a solver for the general structure"):
+        with pytest.raises(ValueError, match="use a solver for general systems"):
             solver.init(damped, 0.0, 0.1, y0, args)
 
     @jax.jit

@@ -248,7 +248,7 @@ def test_gradients_go_through_a_solve_from_the_poles():
 def test_solvers_that_need_more_structure_refuse_spins(solver):
     s0, args = _problem(jr.key(0), 1, 1)
     terms = ds.spin_terms(H0, noise, weak_path(1))
-    with pytest.raises(ValueError, match="use a solver for the general structure"):
+    with pytest.raises(ValueError, match="use a solver for general systems"):
         solver.init(terms, 0.0, 0.1, ds.to_spinors(s0), args)
 
 

@@ -118,6 +118,56 @@ def test_position_before_momentum_is_asked_about():
     assert "wrong way" not in str(info.value)
 
 
+def _langevin(friction: float, momentum_first: bool) -> diffrax.MultiTerm:
+    """Plain terms with the friction in the drift."""
+    order = (lambda x, v: (v, x)) if momentum_first else (lambda x, v: (x, v))
+    noises = jax.ShapeDtypeStruct((2,), jnp.float64)
+
+    def drift(t, y, args):
+        x, v = order(*y)
+        return order(v, -(x**3) - friction * v)
+
+    kick = lambda w: order(jnp.zeros(2), 0.3 * w)
+    operator = lambda t, y, args: lx.FunctionLinearOperator(kick, noises)
+    path = ds.WeakBrownianPath((2,), jr.key(0))
+    return diffrax.MultiTerm(
+        diffrax.ODETerm(drift), diffrax.ControlTerm(operator, path)
+    )
+
+
+def test_friction_in_the_drift_is_told_to_be_left_out():
+    y0 = jnp.ones(2), jnp.zeros(2)
+    start = lambda terms: ds.BAOAB(0.5).init(terms, 0.0, 0.1, y0, None)
+    suggest = lambda terms, **options: ds.suggest_solver(
+        terms, 0.0, y0, want="expectations", **options
+    )
+    for first in (True, False):
+        with pytest.raises(
+            ValueError, match=r"Leave friction .* `BAOAB\(gamma\)`"
+        ) as info:
+            start(_langevin(0.5, first))
+        assert ("wrong way round?" in str(info.value)) is not first
+        assert "ask with `gamma=`" in suggest(_langevin(0.5, first)).system
+    # Without it, and with the momentum first, plain terms are taken as they are.
+    terms = _langevin(0.0, True)
+    start(terms)
+    (only,) = suggest(terms, gamma=0.5)
+    assert isinstance(only.solver, ds.BAOAB)
+    with pytest.raises(ValueError, match="or take `BAOAB"):
+        suggest(_langevin(0.0, False), gamma=0.5)
+
+
+def test_spins_are_not_told_to_write_sums():
+    terms = ds.spin_terms(
+        lambda t, s, args: s[2],
+        lambda t, s, args: s,
+        ds.WeakBrownianPath((3,), jr.key(0)),
+    )
+    y0 = ds.to_spinors(jnp.array([1.0, 0.0, 0.0]))
+    with pytest.raises(ValueError, match="For spins and complex .* `ImplicitMidpoint`"):
+        ds.StormerVerlet().init(terms, 0.0, 0.1, y0, None)
+
+
 def test_plain_terms_of_a_separable_system_are_taken():
     # The noise is written out, with a block of zeros.
     kick = diffrax.ControlTerm(
