@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ._arguments import check_pair
+from ._arguments import check_pair, check_state
 from ._compat import ω
 from ._custom_types import Args, RealScalarLike, Y
 from ._terms import (
@@ -66,10 +66,11 @@ def symplecticity_defect(
 
     **Returns:** a scalar.
 
-    **Raises:** a `ValueError` if `y0` is not a pair of the same structure and shapes; an
-    error when run if the solver reports that the step failed.
+    **Raises:** a `ValueError` if `y0` is not a pair of the same structure and shapes, of
+    floating-point numbers; an error when run if the solver reports that the step failed.
     """
     check_pair(y0)
+    check_state(y0, "symplecticity_defect")
     flat, unravel = jfu.ravel_pytree(y0)
 
     def step(x):

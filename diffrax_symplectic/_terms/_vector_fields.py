@@ -260,12 +260,13 @@ def _checked_sum(parts: list[Y], y: Y) -> Y:
     """The sum, which must have the dtypes and shapes of the state."""
 
     def check(v, x):
-        if jnp.result_type(v) != jnp.result_type(x) or jnp.shape(v) != jnp.shape(x):
+        # The result type of an array made before 64 bits were enabled may not be its own.
+        v, x = jnp.asarray(v), jnp.asarray(x)
+        if (v.dtype, v.shape) != (x.dtype, x.shape):
             raise ValueError(
-                "The terms change an array of dtype and shape "
-                f"{jnp.result_type(x)}{jnp.shape(x)} by one of {jnp.result_type(v)}"
-                f"{jnp.shape(v)}. Give the state, the vector fields and the path (as "
-                "`shape=jax.ShapeDtypeStruct(shape, dtype)`) the same dtype, and time "
+                f"The terms change an array of dtype and shape {x.dtype}{x.shape} by one "
+                f"of {v.dtype}{v.shape}. Give the state, the vector fields and the path "
+                "(as `shape=jax.ShapeDtypeStruct(shape, dtype)`) the same dtype, and time "
                 "no wider one."
             )
 

@@ -219,7 +219,7 @@ def section(page: Page) -> str:
             found[name, h] = r
             errors.append(r.norm_error)
             assert r.failed == 0
-            if h == 0.01:
+            if h == 0.01 and np.all(np.isfinite(r.density)):
                 axes[0].plot(x, r.density, style, lw=1, label=name)
         if np.any(np.isfinite(errors)):
             axes[1].plot(hs, errors, style, marker="o", ms=3, lw=1, label=name)
