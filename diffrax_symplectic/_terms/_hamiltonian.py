@@ -1,6 +1,5 @@
-import contextlib
 import functools as ft
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import cast, get_args, Literal
 
 import diffrax
@@ -9,12 +8,14 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, PyTree, Shaped
 
 from .._arguments import check_pair, check_takes, shapes, whole_number
 from .._brownian import increment_struct
 from .._compat import ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike
+from ._data_flow import DataFlow
 
 
 _P = PyTree[Shaped[Array, "?*p"], "P"]
@@ -285,8 +286,8 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         check_pair(y)
         struct = increment_struct(self.path)
         hamiltonians = lambda y: self._hamiltonians(t, y[0], y[1], args, struct)
-        with _refused_if_constant() as observe:
-            jac = jax.jacrev(lambda y: observe(hamiltonians(y)))(y)
+        _check_reads_state(hamiltonians, y)
+        jac = jax.jacrev(hamiltonians)(y)
         noise_def, state_def = jtu.tree_structure(struct), jtu.tree_structure(y)
 
         def noise_last(entry):
@@ -317,6 +318,9 @@ class HamiltonianNoise(diffrax.AbstractTerm):
     ) -> _State:
         check_pair(y)
 
+        struct = increment_struct(self.path)
+        _check_reads_state(lambda y: self._hamiltonians(t, *y, args, struct), y)
+
         def scalar(p, q):
             if isinstance(control, OneNoise):
                 H = self._one_hamiltonian(t, p, q, args, control.number)
@@ -325,8 +329,7 @@ class HamiltonianNoise(diffrax.AbstractTerm):
             dots = jtu.tree_map(lambda h, c: jnp.sum(h * c.astype(h.dtype)), H, control)
             return sum(jtu.tree_leaves(dots))
 
-        with _refused_if_constant() as observe:
-            return symplectic_gradient(lambda p, q: observe(scalar(p, q)), y)
+        return symplectic_gradient(scalar, y)
 
     def is_vf_expensive(self, t0, t1, y, args) -> bool:
         # `vf` takes one reverse pass for each noise, `vf_prod` takes one in all.
@@ -334,12 +337,11 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         return sum(s.size for s in jtu.tree_leaves(struct)) > 2
 
     def _one_hamiltonian(self, t, p, q, args, number) -> Array:
-        struct = increment_struct(self.path)
-        every = lambda: self._hamiltonians(t, p, q, args, struct)
         if isinstance(self.noise, IndexedNoise):
-            jax.eval_shape(every)  # for its error
             return self.noise.one(number, t, p, q, args)
-        return jfu.ravel_pytree(every())[0][number]
+        struct = increment_struct(self.path)
+        H = self._hamiltonians(t, p, q, args, struct)
+        return jfu.ravel_pytree(H)[0][number]
 
     def _hamiltonians(self, t, p, q, args, struct) -> PyTree[Array]:
         """The noise Hamiltonians, in the structure and shapes of the path."""
@@ -377,30 +379,25 @@ def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Arr
         raise
 
 
-@contextlib.contextmanager
-def _refused_if_constant() -> Iterator[Callable]:
-    """A function to pass noise Hamiltonians through within a derivative by the state.
-    Raises a `ValueError` if they turn out not to depend on the state at all."""
-    reads_state = []
-
-    @jax.custom_jvp
-    def observe(H):
-        return H
-
-    def rule(primals, tangents):
-        # JAX comes here only if one of the tangents is more than a symbolic zero.
-        reads_state.append(True)
-        return primals[0], tangents[0]
-
-    observe.defjvp(rule)
-    yield observe
-    if not reads_state:
-        raise ValueError(
-            "The noise Hamiltonians do not depend on the state, so that there is no "
-            "noise. Return Hamiltonians, not amplitudes: for a kick of constant strength "
-            "to each momentum, dp_k = sigma_k dw_k, `noise = lambda t, p, q, args: -sigma "
-            "* q`. For no noise solve the drift alone, `terms.terms[0]`."
-        )
+def _check_reads_state(hamiltonians: Callable[[_State], PyTree], y: _State) -> None:
+    """Raises a `ValueError` if one of the noise Hamiltonians does not depend on the
+    state."""
+    derivative = lambda y, dy: jax.jvp(hamiltonians, (y,), (dy,))[1]
+    reached = DataFlow(derivative, y, y).reached(lambda y, dy: dy)
+    reads = np.concatenate([np.ravel(x) for x in reached])
+    if np.all(reads):
+        return
+    which, those = "The noise Hamiltonians do", "there is no noise"
+    if np.any(reads):
+        numbers = ", ".join(map(str, np.flatnonzero(~reads)))
+        which = f"Of the noise Hamiltonians those with the index {numbers} do"
+        those = "these noises change nothing"
+    raise ValueError(
+        f"{which} not depend on the state, so that {those}. Return Hamiltonians, not "
+        "amplitudes: for a kick of constant strength to each momentum, dp_k = sigma_k "
+        "dw_k, `noise = lambda t, p, q, args: -sigma * q`. For no noise solve the drift "
+        "alone, `terms.terms[0]`."
+    )
 
 
 def symplectic_gradient(scalar: Callable, y: _State) -> _State:

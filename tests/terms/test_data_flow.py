@@ -84,6 +84,7 @@ SEPARABLE = {
     "jit": lambda t, p, q, a: jax.jit(lambda p, q: p @ p + jnp.prod(q))(p, q),
     "own derivative": lambda t, p, q, a: _quartic(p) + _quartic(q),
     "stacked": lambda t, p, q, a: jnp.sum(jnp.stack([p**2, jnp.cos(q)])),
+    "packed": lambda t, p, q, a: jnp.sum(jnp.concatenate([p, q]) ** 2),
     "printed": _printed,
     "zero coupling": lambda t, p, q, a: jnp.sum(p**2 + q**2) + 0.0 * jnp.sum(p * q),
     "shapes": lambda t, p, q, a: jnp.sum(p**2) * q.size + jnp.sum(q**2) * len(p),
@@ -110,7 +111,12 @@ NOT_SEPARABLE = {
         lambda s, x: (s * x[0] + x[1], None), 1.0, (p, q)
     )[0],
     "cancels": lambda t, p, q, a: jnp.sum((p - q) ** 2 / 2 + p * q),
-    "packed": lambda t, p, q, a: jnp.sum(jnp.concatenate([p, q]) ** 2),
+    "overlapping": lambda t, p, q, a: jnp.sum(jnp.concatenate([p, q])[1:3]) ** 2,
+    "strided": lambda t, p, q, a: jnp.sum(jnp.concatenate([p, q])[::2]) ** 2,
+    "beside": lambda t, p, q, a: jnp.sum(jnp.sum(jnp.stack([p, q], 1), 1) ** 2),
+    "columns": lambda t, p, q, a: jnp.sum(
+        jnp.sum(jnp.concatenate([p, q]).reshape(2, 2), 0) ** 2
+    ),
 }
 NOISES = {
     # Whether they are additive, and constant.
