@@ -302,7 +302,7 @@ def _by_richardson(look: _Look, image: _Map, begin: Found) -> Found:
         new = look.at(end, change, earlier, scales, root, step, halt)
 
         rate, damped = root(ratio(new.size, earlier)), 1 - weight
-        # Where iteration leads away, it begins once more, with the new weight.
+        # Where iteration leads away, it begins once more at zero, with the new weight.
         anew = ~(new.size < earlier)
         # If an entry is NaN, so is the rate, and all of these are true.
         wrong = ~(rate**2 <= damped) & (anew | (rounds.step <= 2 * num_first + 1))
@@ -311,9 +311,9 @@ def _by_richardson(look: _Look, image: _Map, begin: Found) -> Found:
         lost = anew & ~(a <= _FASTEST)
         going = ~new.solved & ~lost & (step < look.limits.steps)
         ahead = _toward(before, end, weight)
-        pick = lambda x, y, z: jnp.where(new.solved, x, jnp.where(anew, z, y))
-        before = jtu.tree_map(lambda y, z: jnp.where(anew, z, y), y, begin.y)
-        y = jtu.tree_map(pick, end, ahead, begin.y)
+        pick = lambda x, y: jnp.where(new.solved, x, jnp.where(anew, 0, y))
+        before = jtu.tree_map(lambda y: jnp.where(anew, 0, y), y)
+        y = jtu.tree_map(pick, end, ahead)
         return new._replace(y=(before, y, a, anew), going=going)
 
     first = _first(look, begin)

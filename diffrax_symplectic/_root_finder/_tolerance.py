@@ -14,6 +14,9 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 # Up to this many entries the maximum is written out. XLA fuses no reduction with what its
 # result goes into, and on CPUs it reduces short axes slowly.
 _SHORT = 4
+# Longer ones are folded to this length, by what fuses with the program that makes them. Of
+# what is longer XLA keeps another array for each maximum.
+_WIDE = 32
 
 
 class Tolerance(eqx.Module):
@@ -42,16 +45,13 @@ class Tolerance(eqx.Module):
 
 
 def max_norm(x: Array) -> Scalar:
-    x = jnp.abs(x)
-    if x.size > _SHORT:
-        # The bits of floats that are not negative, read as integers, have the order of the
-        # values, and NaNs are the largest. The maximum of floats may lose these.
-        bits = lax.bitcast_convert_type(x, f"int{jnp.finfo(x.dtype).bits}")
-        return lax.bitcast_convert_type(jnp.max(bits), x.dtype)
-    x = x.reshape(-1)
-    while (n := x.size) > 1:
-        x = jnp.maximum(x[: (n + 1) // 2], x[n // 2 :])
-    return x[0]
+    # The bits of floats that are not negative, read as integers, have the order of the
+    # values, and NaNs are the largest. The maximum of floats may lose these.
+    kind = f"int{jnp.finfo(x.dtype).bits}"
+    bits = lax.bitcast_convert_type(jnp.abs(x), kind).reshape(-1)
+    while (n := bits.size) > (1 if x.size <= _SHORT else _WIDE):
+        bits = jnp.maximum(bits[: (n + 1) // 2], bits[n // 2 :])
+    return lax.bitcast_convert_type(bits[0] if n == 1 else jnp.max(bits), x.dtype)
 
 
 def largest(norms: list[Scalar]) -> Scalar:
