@@ -130,10 +130,10 @@ def _correct(
     change, moved, residuals = (
         tolerance.sizes(restore(x)) for x in (diff, progress.k, residual)
     )
-    size, relative = tolerance.compare(change, scales)
+    size, below = tolerance.compare(change, scales)
     shrink = jnp.where(progress.tries > 0, ratio(size, progress.size), 1)
     whole = s == 1
-    solved = whole & converged(size, relative, shrink, shrink >= 0.25)
+    solved = whole & converged(size, below, shrink, shrink >= 0.25)
     # Far from all solutions rounding errors of a large Jacobian hide the unknowns that it
     # multiplies least. Then corrections are small where residuals are larger than states.
     state_size = jnp.maximum(largest(scales), largest(moved)) + tolerance.atol

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Scalar
 
 
 _Vector: TypeAlias = Float[Array, " n"]
@@ -22,9 +21,6 @@ Solver: TypeAlias = lx.AbstractLinearSolver[Any] | None
 _MAX_DENSE = 32
 # Up to so many unknowns elimination is written out; its length grows with the cube.
 MAX_WRITTEN_OUT = 4
-# Up to so many columns a product is written out: for two that saves up to a fifth of a
-# step, and for three nothing.
-_MAX_SUMMED = 2
 # Restarted GMRES: so many directions, and how far the residual is reduced. A correction of
 # Newton's method needs no more accuracy than the next one makes up for.
 _DIRECTIONS = 20
@@ -37,59 +33,48 @@ def matrix_of(apply: _Map, n: int, dtype) -> _Matrix:
     return jax.vmap(apply, out_axes=1)(cast(Array, np.eye(n, dtype=dtype)))
 
 
-def inverse(matrix: _Matrix) -> _Matrix:
-    """The inverse of a matrix near the identity, by Gauss-Jordan elimination without
-    exchanging rows. What this spoils is seen when the equations are not solved.
-
-    LAPACK takes a call for each matrix of a batch, and here XLA fuses all of it.
-    """
-    n = len(matrix)
-
-    def eliminate(k, matrix):
-        here = np.arange(n) == k
-        row = jnp.where(here, 1, matrix[k]) / matrix[k, k]
-        column = jnp.where(here, 0, matrix[:, k])
-        others = jnp.where(here, 0, matrix) - column[:, None] * row
-        return jnp.where(here[:, None], row, others)
-
-    if n <= MAX_WRITTEN_OUT:
-        return ft.reduce(lambda matrix, k: eliminate(k, matrix), range(n), matrix)
-    return lax.fori_loop(0, n, eliminate, matrix)
+def inverse(matrix: list[list[Scalar]]) -> list[list[Scalar]]:
+    """The inverse of a matrix of scalars near the identity, without exchanging rows. What
+    this spoils is seen when the equations are not solved."""
+    units = np.eye(len(matrix), dtype=matrix[0][0].dtype)
+    rows = [[*row, *unit] for row, unit in zip(matrix, units)]
+    return _solutions(rows, exchange=False)
 
 
-def product(matrix: _Matrix, x: _Vector) -> _Vector:
-    """`matrix @ x`. Of few columns XLA fuses their sum with what `x` is made of, as it does
-    no product of matrices."""
-    if len(x) > _MAX_SUMMED:
-        return matrix @ x
-    return ft.reduce(jnp.add, [column * entry for column, entry in zip(matrix.T, x)])
+def _solutions(rows: list[list[Scalar]], exchange: bool) -> list[list[Scalar]]:
+    """The solutions of linear systems with one matrix, whose rows are each followed by
+    their right-hand sides: by elimination, with partial pivoting if rows may `exchange`.
 
-
-def _eliminate(matrix: _Matrix, rhs: _Vector) -> _Vector:
-    """The solution of a linear system, by elimination with partial pivoting."""
-    n = len(rhs)
-    if n > MAX_WRITTEN_OUT:
-        # On CPUs JAX makes a permutation of LAPACK's pivots by a loop with ten kernels for
-        # each row, which takes several times as long as this does.
-        Q, R = jnp.linalg.qr(matrix)
-        return jax.scipy.linalg.solve_triangular(R, Q.T @ rhs)
-    # Rows as lists of scalars: XLA sees straight-line arithmetic and fuses all of it.
-    rows = [[*matrix[i], rhs[i]] for i in range(n)]
+    LAPACK takes a call for each matrix of a batch. XLA fuses arithmetic that is written
+    out."""
+    n = len(rows)
     for k in range(n):
-        for i in range(k + 1, n):
+        for i in range(k + 1, n) if exchange else ():
             # The largest pivot comes up by comparisons of two rows.
             swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
             upper = [jnp.where(swap, b, a) for a, b in zip(rows[k], rows[i])]
             lower = [jnp.where(swap, a, b) for a, b in zip(rows[k], rows[i])]
             rows[k], rows[i] = upper, lower
-        for i in range(k + 1, n):
-            factor = rows[i][k] / rows[k][k]
-            rows[i] = [b - factor * a for a, b in zip(rows[k], rows[i])]
-    solution = [rhs[0]] * n
-    for i in reversed(range(n)):
-        known = sum((rows[i][j] * solution[j] for j in range(i + 1, n)), 0.0)
-        solution[i] = (rows[i][n] - known) / rows[i][i]
-    return jnp.stack(solution)
+        scale = 1 / rows[k][k]
+        rows[k] = [scale * x for x in rows[k]]
+        for i in {*range(n)} - {k}:
+            rows[i] = [x - rows[i][k] * y for x, y in zip(rows[i], rows[k])]
+    return [row[n:] for row in rows]
+
+
+def product(matrix: list[list[Scalar]], x: list[Scalar]) -> list[Scalar]:
+    return [ft.reduce(jnp.add, map(jnp.multiply, row, x)) for row in matrix]
+
+
+def _eliminate(matrix: _Matrix, rhs: _Vector) -> _Vector:
+    """The solution of a linear system."""
+    if len(rhs) > MAX_WRITTEN_OUT:
+        # On CPUs JAX makes a permutation of LAPACK's pivots by a loop with ten kernels for
+        # each row, which takes several times as long as this does.
+        Q, R = jnp.linalg.qr(matrix)
+        return jax.scipy.linalg.solve_triangular(R, Q.T @ rhs)
+    rows = [[*row, x] for row, x in zip(matrix, rhs)]
+    return jnp.stack([x for (x,) in _solutions(rows, exchange=True)])
 
 
 def solve(

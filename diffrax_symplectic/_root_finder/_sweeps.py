@@ -1,10 +1,10 @@
 """The iterations that normally solve a step, for all paths of a batch together."""
 
+import functools as ft
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from .._compat import materialize, ω
 from .._custom_types import IntScalarLike, RealScalarLike
 from ._batch import any_of_batch
-from ._linear import inverse, matrix_of, product
+from ._linear import inverse, product
 from ._tolerance import converged, largest, ratio, Tolerance
 
 
@@ -27,10 +27,12 @@ _AT_ONCE = 2
 # Fixed-point iterations before these, and by how much the last of them may change the
 # values, as a fraction of what all of them did.
 _WARMUP, _SETTLED = 4, 0.5
-# Fixed-point iterations between the first iterate and the first look at the error, and
-# then between two looks. They shrink by powers of two, so that the rate of one is a square
-# root, twice or three times: any other power takes as long as an iteration of few unknowns.
-_FIRST, _MORE = 8, 4
+# Fixed-point iterations before the first look at the error, and between two looks.
+_FIRST, _MORE = 11, 4
+# The rate of one iteration is a square root of what so many do, twice or three times: any
+# other power takes as long as an iteration of few unknowns. Before the first look there
+# are up to two more of them, so that the rate is rather less than this says.
+_POWER_FIRST, _POWER_MORE = 8, 4
 # So many more fixed-point iterations cost as much as the Jacobian and its inverse do.
 _SLOW = 24
 # Above so many unknowns fixed-point iteration is accelerated. For fewer, the arithmetic of
@@ -102,8 +104,9 @@ class _Look(NamedTuple):
 
     def size(
         self, change: PyTree[Array], scales: list[Scalar]
-    ) -> tuple[Scalar, Scalar]:
-        """The size of a change, in units of the tolerance and relative to the state."""
+    ) -> tuple[Scalar, Callable[[float], Bool[Array, ""]]]:
+        """The size of a change in units of the tolerance, and whether it is below a
+        fraction of the state."""
         tolerance = self.limits.tolerance
         return tolerance.compare(tolerance.sizes(self.restore(change)), scales)
 
@@ -120,12 +123,12 @@ class _Look(NamedTuple):
         """After an iteration that was a `change`. The `root` of how much it has shrunk,
         since the one of the size `earlier`, is the rate of one iteration. It has stalled
         if it is not below `halt` of that."""
-        size, relative = self.size(change, scales)
+        size, below = self.size(change, scales)
         shrink = root(ratio(size, earlier))
-        stalled = size >= halt * earlier
         # If an entry is NaN, the size is, and all of these are false.
-        solved = converged(size, relative, shrink, stalled)
-        near = (relative <= _NEAR) & ~stalled
+        stalled, shrinks = size >= halt * earlier, size < halt * earlier
+        solved = converged(size, below, shrink, stalled)
+        near = below(_NEAR) & shrinks
         following = size * shrink**self.most
         going = ~solved & near & (step < self.limits.steps) & (following <= 1)
         return _Rounds(y, size, solved, near, going, step, scales)
@@ -225,19 +228,23 @@ def sweep_blocks(
 
 def _by_sweeps(look: _Look, image: _Map, begin: Found, chords_follow: bool) -> Found:
     num_first, num_more = _paced(_FIRST, begin.y), _paced(_MORE, begin.y)
+    power_first, power_more = (
+        _paced(_POWER_FIRST, begin.y),
+        _paced(_POWER_MORE, begin.y),
+    )
     # The same rate in either precision: a slower one has not stalled in fewer iterations.
     halt = 0.5 ** (num_more / _MORE)
 
     def advance(rounds: _Rounds) -> _Rounds:
         first = rounds.step == 0
-        count = jnp.where(first, 1 + num_first, num_more)
+        count = jnp.where(first, num_first, num_more)
         before, y = _fixed_point(image, rounds.y, count)
 
         begun = lambda: _begun(look, y)
         # To measure these in every round would take a quarter of its time.
         earlier, scales = lax.cond(first, begun, lambda: (rounds.size, rounds.scales))
         change = (y**ω - before**ω).ω
-        root = lambda x: jnp.where(first, _root(x, num_first), _root(x, num_more))
+        root = lambda x: jnp.where(first, _root(x, power_first), _root(x, power_more))
         step = rounds.step + count
         return look.at(y, change, earlier, scales, root, step, halt)
 
@@ -331,28 +338,43 @@ def _toward(a: PyTree[Array], b: PyTree[Array], weight: Scalar) -> PyTree[Array]
 
 
 def _by_chords(limits: Limits, tree_image: _Map, scale: _Map, begin: Found) -> Found:
-    """From where iteration `begin`s, for paths that are not yet solved."""
-    k, restore = jfu.ravel_pytree(begin.y)
-    k = jnp.where(begin.solved | begin.near, k, 0)
-    image = lambda k: jfu.ravel_pytree(tree_image(restore(k)))[0]
+    """From where iteration `begin`s, for paths that are not yet solved.
+
+    All of it is written out in scalars. Of arrays of two or three entries for each path
+    XLA makes loops that take twice as long.
+    """
+    restore = ft.partial(_from_scalars, begin.y)
+    image = lambda k: _scalars(tree_image(restore(k)))
     look = _Look(limits, scale, _MOST_CHORDS, restore)
+    k = [jnp.where(begin.solved | begin.near, x, 0) for x in _scalars(begin.y)]
     value, jacobian = jax.linearize(image, k)
-    one = np.eye(k.size, dtype=k.dtype)
-    M = inverse(jnp.subtract(one, matrix_of(jacobian, k.size, k.dtype)))
-    diff = product(M, value - k)
-    moved = jnp.where(begin.solved, k, k + diff)
+    one = np.eye(len(k), dtype=k[0].dtype)
+    columns = [(list(unit) ** ω - jacobian(list(unit)) ** ω).ω for unit in one]
+    M = inverse([list(row) for row in zip(*columns)])
+    diff = product(M, (value**ω - k**ω).ω)
+    moved = [jnp.where(begin.solved, x, x + y) for x, y in zip(k, diff)]
     scales = look.scales(moved)
     size, _ = look.size(diff, scales)
 
     chords = _paced(_CHORDS, k)
+    chord = lambda k: (k**ω + product(M, (image(k) ** ω - k**ω).ω) ** ω).ω
 
     def advance(rounds: _Rounds) -> _Rounds:
-        chord = lambda k: k + product(M, image(k) - k)
         before, k = _fixed_point(chord, rounds.y, chords)
         root = lambda x: _root(x, chords)
-        step = rounds.step + chords
-        return look.at(k, k - before, rounds.size, look.scales(k), root, step)
+        step, change = rounds.step + chords, (k**ω - before**ω).ω
+        return look.at(k, change, rounds.size, look.scales(k), root, step)
 
     first = _Rounds(moved, size, begin.solved, begin.near, ~begin.solved, 0, scales)
     found = _while_any(advance, first)
     return found._replace(y=restore(found.y))
+
+
+def _scalars(y: PyTree[Array]) -> list[Scalar]:
+    return [x for leaf in jtu.tree_leaves(y) for x in jnp.ravel(leaf)]
+
+
+def _from_scalars(like: PyTree[Array], scalars: list[Scalar]) -> PyTree[Array]:
+    rest = iter(scalars)
+    leaf = lambda x: jnp.stack([next(rest) for _ in range(x.size)]).reshape(x.shape)
+    return jtu.tree_map(leaf, like)

@@ -34,14 +34,16 @@ class Tolerance(eqx.Module):
 
     def compare(
         self, sizes: list[Scalar], scales: list[Scalar]
-    ) -> tuple[Scalar, Scalar]:
-        """The size of a correction, in units of the tolerance (1 is just accepted), and
-        relative to the whole iterate, from the norms of each leaf."""
+    ) -> tuple[Scalar, Callable[[float], Bool[Array, ""]]]:
+        """The size of a correction in units of the tolerance (1 is just accepted), and
+        whether it is at most a fraction of the whole iterate, from the norms of each
+        leaf."""
         eps = jnp.finfo(jnp.result_type(*sizes)).eps
         rtol = 2 * eps if self.rtol is None else self.rtol
         in_units = lambda a, b: ratio(a, rtol * b + self.atol)
         each = [in_units(a, b) for a, b in zip(sizes, scales)]
-        return largest(each), ratio(largest(sizes), largest(scales))
+        below = lambda fraction: largest(sizes) <= fraction * largest(scales)
+        return largest(each), below
 
 
 def max_norm(x: Array) -> Scalar:
@@ -68,14 +70,17 @@ def ratio(a: Array, b: Array) -> Array:
 
 
 def converged(
-    size: Scalar, relative: Scalar, shrink: Scalar, stalled: Bool[Array, ""]
+    size: Scalar,
+    below: Callable[[float], Bool[Array, ""]],
+    shrink: Scalar,
+    stalled: Bool[Array, ""],
 ) -> Bool[Array, ""]:
     """Whether the next correction is below the tolerance, when the last one was of this
     `size` in units of it, and `shrink` times as large as the one before, or corrections
     have `stalled`."""
     # Rounding errors can keep the corrections to a leaf that is small next to the others
     # above `rtol` for ever. Then they no longer shrink, and all of them are tiny.
-    rounded = relative <= 100 * jnp.finfo(relative.dtype).eps
+    rounded = below(100 * float(jnp.finfo(size.dtype).eps))
     # A fraction of the tolerance: what remains has the same sign in every step, so that
     # over many steps it adds up to a drift where rounding errors would cancel.
     following = size * jnp.where(shrink < 1, shrink, 1)
