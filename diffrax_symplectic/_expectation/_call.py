@@ -253,7 +253,7 @@ def _chosen(
         name, cost = type(sampling).__name__, min(trial.cost for trial in done)
         left = _MOST_SECONDS if tol is None else cost / tol**2
         if tol is not None and left <= _SECONDS:
-            without.append(f"{name} not needed: {left:.1g} s to `tol`")
+            without.append(f"{name} not needed: `tol` takes less than {_SECONDS} s")
         elif cost * _CLEAR < plain.cost:
             without.append(f"{name} not tried: the gain is large already")
         else:
