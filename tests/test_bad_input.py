@@ -321,12 +321,30 @@ def test_steps_longer_than_the_whole_time_are_announced():
 def test_a_forgotten_args_is_asked_about():
     H = lambda t, p, q, args: jnp.sum(p**2) + args["k"] * jnp.sum(q**2)
     plain = lambda t, p, q, args: jnp.sum(q**2)
-    for name, hamiltonians in (("H0", (H, plain)), ("noise", (plain, H))):
+    one = ds.IndexedNoise(lambda k, t, p, q, args: args["k"] * q[k], 1)
+    y0 = (jnp.ones(2), jnp.ones(2))
+
+    def asked(name, kind, call):
+        with pytest.raises(kind) as info:
+            call()
+        said = f"`{name}` was called with `args=None`. Was it left out? 'NoneType' obj"
+        assert str(info.value).startswith(said)
+
+    phi = lambda t, y, args: y[0]
+    mean = lambda phi, terms: ds.expectation(
+        phi, terms, ds.ImplicitMidpoint(), 0, 1, 0.1, y0, key=jr.key(0)
+    )
+    for name, hamiltonians in (
+        ("H0", (H, plain)),
+        ("noise", (plain, H)),
+        ("H", (plain, one)),
+    ):
         terms = ds.hamiltonian_terms(*hamiltonians, weak_path(1))
-        with pytest.raises(TypeError) as info:
-            _solve(terms, (jnp.ones(2), jnp.ones(2)))
-        notes = " ".join(info.value.__notes__)
-        assert f"`{name}` was called with `args=None`" in notes
+        asked(name, TypeError, lambda: _solve(terms, y0))
+        asked(name, TypeError, lambda: ds.suggest_solver(terms, 0, y0, want="paths"))
+        asked(name, TypeError, lambda: mean(phi, terms))
+    terms = ds.hamiltonian_terms(plain, plain, weak_path(1))
+    asked("phi", AttributeError, lambda: mean(lambda t, y, args: args.k, terms))
 
 
 def test_shapes_with_a_negative_size_are_refused():
@@ -360,6 +378,22 @@ def test_an_unsolved_step_says_what_to_do_about_it(dtype):
         with pytest.raises(RuntimeError) as info:
             solve(jnp.array(1.0), True)
         assert all(part in str(info.value) for part in advice)
+
+
+def test_a_step_that_is_not_finite_says_where_to_look():
+    path = ds.WeakBrownianPath((2,), jr.key(0))
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + jnp.linalg.norm(q)
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: q, path)
+    solve = lambda q, throw: diffrax.diffeqsolve(
+        terms, ds.StormerVerlet(), 0.0, 1.0, 0.25, (jnp.zeros(2), q), throw=throw
+    )
+    # The gradient of a norm at zero. In a batch the others are solved.
+    starts = jnp.array([[0.0, 0.0], [3.0, 4.0]])
+    result = jax.jit(jax.vmap(lambda q: solve(q, False).result))(starts)
+    good = jax.vmap(lambda r: r == diffrax.RESULTS.successful)(result)
+    np.testing.assert_array_equal(good, [False, True])
+    with pytest.raises(RuntimeError, match="look for NaNs in `y0`.*norm at zero"):
+        solve(starts[0], True)
 
 
 def test_states_that_are_not_real_floats_are_refused():

@@ -110,9 +110,7 @@ class ArrayRQMC(AbstractSampling):
         u = value_function(problem, key) if one_number else None
         if u is not None:
             other, own = plan._replace(sampler=sampler(u)), jr.fold_in(key, _TRIAL)
-            few = lambda plan: run(
-                plan._replace(num_samples=_TRIAL), own, devices, trial=True
-            )
+            few = lambda plan: run(plan._replace(num_samples=_TRIAL), own, devices)
             spread = lambda plan: float(np.sum(jtu.tree_leaves(few(plan).variance)))
             ratio = spread(plan) / spread(other)
             if ratio > 1:

@@ -161,7 +161,7 @@ class Expectation(eqx.Module):
         lines = [f"{shown(m, e)} ± {brief(e)}" for m, e in zip(mean[:6], error)]
         if self.bias is not None:
             whole = zip(lines, leaves(self.error))
-            lines = [f"{x} (sampling), {e} (with extrapolation)" for x, e in whole]
+            lines = [f"{x} (sampling), {e} (total)" for x, e in whole]
         lines += ["..."] * (len(mean) > 6)
         if self.bias is not None:
             pairs = zip(leaves(self.bias), leaves(self.bias_std_error))
@@ -237,6 +237,22 @@ def checked_call(
     return key if typed else jr.wrap_key_data(key), devices
 
 
+class Meter:
+    """A progress meter that is shown from here on until it is left."""
+
+    def __init__(self, meter: diffrax.AbstractProgressMeter):
+        self._meter, self._state = meter, meter.init()
+
+    def step(self, progress: float) -> None:
+        self._state = self._meter.step(self._state, np.asarray(progress))
+
+    def __enter__(self) -> "Meter":
+        return self
+
+    def __exit__(self, *error) -> None:
+        self._meter.close(self._state)
+
+
 def run(
     plan: Plan,
     key: PRNGKeyArray,
@@ -244,12 +260,11 @@ def run(
     sampling: Any = None,
     start: Expectation | None = None,
     tol: float | None = None,
-    progress_meter: diffrax.AbstractProgressMeter = NO_METER,
-    trial: bool = False,
+    meter: Meter | None = None,
 ) -> Expectation:
-    """The estimate from the samples of a plan; no warnings in a `trial`. What a device
-    computes, and in which order its sums are added up, does not depend on how many there
-    are."""
+    """The estimate from the samples of a plan. Without a meter it is a trial, which warns
+    of nothing. What a device computes, and in which order its sums are added up, does not
+    depend on how many there are."""
     sampler, most = plan.sampler, plan.num_samples
     key_data, size = np.asarray(jr.key_data(key)), min(plan.batch_size, most)
     if jax.process_count() > 1:
@@ -289,7 +304,6 @@ def run(
         return dataclasses.replace(estimate, tol_reached=said)
 
     running = collections.deque()
-    meter = progress_meter.init()
     try:
         while True:
             more = first < most and not reached()
@@ -304,15 +318,14 @@ def run(
                     if not reached():
                         part = jtu.tree_map(lambda x: x[one], done)
                         estimate = _merged(estimate, part, plan.paths)
-                meter = progress_meter.step(meter, np.asarray(used(estimate) / most))
+                if meter is not None:
+                    meter.step(used(estimate) / most)
             elif not more:
                 break
     except KeyboardInterrupt:
         raise ExpectationInterrupted(finished()) from None
-    finally:
-        progress_meter.close(meter)
     estimate = finished()
-    if not trial:
+    if meter is not None:
         _warn_of(estimate, tol)
     return estimate
 

@@ -16,7 +16,7 @@ from .._arguments import check_takes, whole_number
 from .._compat import ClosedJaxpr, jaxpr_as_fun, solves_without_throwing
 from .._root_finder import all_finite
 from .._terms import brownian_paths, replace_paths
-from ._estimate import checked_call, Expectation, NO_METER, Plan, run, Samples
+from ._estimate import checked_call, Expectation, Meter, NO_METER, Plan, run, Samples
 from ._steps import (
     AbstractSampling,
     independent_steps,
@@ -182,7 +182,8 @@ def monte_carlo(
     sampling = IndependentPaths(num_paths, batch_size)
     sampler = jtu.Partial(_of_function, fn, level_weights(order, levels))
     plan = sampling.plan(sampler, devices)
-    return run(plan, key, devices, sampling, start, tol, progress_meter)
+    with Meter(progress_meter) as meter:
+        return run(plan, key, devices, sampling, start, tol, meter)
 
 
 def _of_function(fn: Callable, weights: np.ndarray, keys: PRNGKeyArray) -> Samples:

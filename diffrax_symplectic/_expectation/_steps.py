@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from .._arguments import check_solver, check_takes, whole_number
 from .._custom_types import Args, RealScalarLike, Y
 from .._root_finder import all_finite
-from .._terms import brownian_paths, check_fit, check_stratonovich
+from .._terms import brownian_paths, check_fit, check_stratonovich, evaluated
 from ._estimate import Plan, real, Samples
 
 
@@ -71,7 +71,8 @@ class Problem(eqx.Module):
             )
         check_stratonovich(terms, solver, start, y0, args)
         check_takes("phi", phi, "t", "y", "args")
-        check_real("phi", jtu.tree_leaves(eqx.filter_eval_shape(phi, start, y0, args)))
+        once = lambda t, y, args: evaluated("phi", phi, t, y, args=args)
+        check_real("phi", jtu.tree_leaves(eqx.filter_eval_shape(once, start, y0, args)))
         if num_steps * 2.0 ** (levels - 1) >= 2**31:
             raise ValueError(
                 f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "

@@ -102,14 +102,22 @@ class ValueFunctions(AbstractSampling):
         # The paths that choose are not those that are averaged.
         own = jr.fold_in(key, len(problem.levels.h))
         trials = [
-            run(plan(all_of(k), self.batch_size), own, devices, trial=True)
-            for k in range(count)
+            run(plan(all_of(k), self.batch_size), own, devices) for k in range(count)
         ]
         best = np.argmin([_spread(e, times) for e in trials], axis=0)
         listed = lambda which: ", ".join(str(basis.candidates[k]) for k in which)
         chosen, among = listed(np.unique(best)), listed(range(count))
         reason = f"{basis.kind}: {chosen} was the best of {among}"
         return plan(best, self.num_paths)._replace(reason=reason)
+
+
+def paths_of_a_fit(problem: Problem) -> int:
+    """How many paths take as many steps as the fit does, which takes longer: it evaluates
+    functions, too. Raises a `ValueError` where there can be no fit."""
+    basis = _basis(problem, None)
+    pilots, nodes, _ = basis.shape
+    outcomes = len(Noise.of(problem, problem.level(0)).nodes()[1])
+    return pilots + outcomes * (nodes if isinstance(basis, Grid) else pilots)
 
 
 def _spread(e: Expectation, times: int) -> np.ndarray:

@@ -243,12 +243,17 @@ _UNSOLVED = (
     "hard, raise `root_find_max_steps` of the solver (not `max_steps` of `diffeqsolve`). "
     "If this is the first step, look for NaNs in `y0` and `args`."
 )
+_NOT_FINITE = (
+    "A step did not end in finite numbers: look for NaNs in `y0`, `args` and the gradients "
+    "of the Hamiltonians (such as that of a norm at zero), or take smaller steps."
+)
 
 
 def result_of(unsolved: Unsolved, y1: Y) -> diffrax.RESULTS:
     """Whether the end of a step was reached."""
     R = diffrax.RESULTS
-    finite = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
+    lost = result_named("step_not_finite", _NOT_FINITE)
+    finite = R.where(all_finite(y1), R.successful, lost)
     if unsolved is None:
         return finite
     said = result_named("stage_equations_unsolved", _UNSOLVED)

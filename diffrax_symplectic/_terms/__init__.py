@@ -1,6 +1,7 @@
 from ._controls import controls, drift_driven, noise_driven, outcomes, step_variables
 from ._data_flow import DataFlow
-from ._hamiltonian import hamiltonian_terms, has_lifted, IndexedNoise, is_hamiltonian
+from ._hamiltonian import evaluated, hamiltonian_terms, has_lifted, IndexedNoise
+from ._hamiltonian import is_hamiltonian
 from ._spins import as_spins, from_spinors, spin_terms, to_spinors
 from ._structure_checks import additive_fault, check_stratonovich, check_structure
 from ._structure_checks import commuting, constant_fault, FRICTION, separable_fault

@@ -360,6 +360,9 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         return jtu.tree_map(lambda h, s: jnp.reshape(h, s.shape), H, struct)
 
 
+_LEFT_OUT = "`args=None`. Was it left out?"
+
+
 def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Array]:
     """`H(*inputs, args)`. An error that comes from there says why, where that is known."""
     # A function that changes the lists and dictionaries of `args` changes a copy: it would
@@ -374,9 +377,12 @@ def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Arr
             "`jax.lax.cond` in place of `if`, and `jnp` in place of `np`."
         ) from error
     except (TypeError, AttributeError) as error:
-        if args is None:
-            error.add_note(f"`{name}` was called with `args=None`. Was it left out?")
-        raise
+        # Of an `IndexedNoise` it has been said by the Hamiltonian of one noise.
+        if args is not None or _LEFT_OUT in str(error):
+            raise
+        kind = TypeError if isinstance(error, TypeError) else AttributeError
+        # A note would not be part of what `str` of the error says.
+        raise kind(f"`{name}` was called with {_LEFT_OUT} {error}") from error
 
 
 def _check_reads_state(hamiltonians: Callable[[_State], PyTree], y: _State) -> None:

@@ -2,6 +2,7 @@
 random is left."""
 
 import contextlib
+import re
 
 import diffrax
 import jax
@@ -11,6 +12,8 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation import _call
+from diffrax_symplectic._expectation._estimate import Plan
 from diffrax_symplectic._expectation._fits import (
     exponents,
     Frame,
@@ -20,7 +23,7 @@ from diffrax_symplectic._expectation._fits import (
 )
 from diffrax_symplectic._terms import outcomes, step_variables
 
-from ..problems import kubo_terms
+from ..problems import kubo_terms, RecordingMeter
 
 
 KEY = jr.key(0)
@@ -259,6 +262,56 @@ def test_the_quickest_sampling_is_chosen_and_gone_on_with():
     path = ds.FixedStepBrownianPath((), KEY)
     gaussian = _estimate(None, _pendulum(path), tol=0.05)
     assert isinstance(gaussian.sampling, ds.IndependentPaths)
+
+
+def test_the_reason_says_why_others_were_not_taken():
+    path = ds.FixedStepBrownianPath((), KEY)
+    plain = _estimate(None, tol=0.5)
+    gaussian = _estimate(None, _pendulum(path), tol=1e-4)
+    for got, said in (
+        (
+            plain,
+            r"ValueFunctions not needed: `tol` takes less than 0.5 s; ArrayRQMC not needed",
+        ),
+        (
+            gaussian,
+            "; ValueFunctions not possible: .* Gaussian increments have infinitel",
+        ),
+    ):
+        assert re.search(said, got.reason) and "\n" not in got.reason
+
+
+def test_without_a_tolerance_the_time_bounds_the_number_of_samples(monkeypatch):
+    monkeypatch.setattr(_call, "_MOST_SECONDS", 1e-9)
+    few, enough = _estimate(None), _estimate(None, tol=0.05)
+    assert few.num_paths == 2 and enough.tol_reached and enough.num_paths > 100
+    for name in ("ValueFunctions", "ArrayRQMC"):
+        assert f"{name} not tried: that takes" in few.reason
+
+
+@pytest.mark.parametrize(
+    "seconds, samples", [(1e-9, 4096), (0.01, 512), (0.1, 100), (100, 2)]
+)
+def test_samples_that_take_ten_seconds_are_whole_batches_if_they_can(seconds, samples):
+    sampling = ds.ValueFunctions()
+    plan = Plan(lambda keys: None, 4096, sampling.batch_size)  # pyright: ignore
+    trial = _call._Trial(sampling, plan, 1.0, seconds)
+    assert _call._num_samples(trial, None) == samples
+    # A tolerance is another matter.
+    assert _call._num_samples(trial, 0.01) == 15_000
+
+
+def test_a_meter_is_shown_before_the_trials_and_closed_if_they_fail(monkeypatch):
+    calls = []
+
+    def fails(*args):
+        assert calls == ["init"]
+        raise RuntimeError("a trial")
+
+    monkeypatch.setattr(_call, "_chosen", fails)
+    with pytest.raises(RuntimeError, match="a trial"):
+        _estimate(None, progress_meter=RecordingMeter(calls))
+    assert calls == ["init", ("closed after", 0)]
 
 
 def test_bad_input_is_told_what_to_pass():
