@@ -1,44 +1,19 @@
 """Expectations of functions of the state, with their error bars."""
 
-import dataclasses
-import time
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
-import jax
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
-from ._array_rqmc import ArrayRQMC
-from ._estimate import checked_call, Expectation, Meter, NO_METER, Plan, run
-from ._monte_carlo import IndependentPaths
+from ._estimate import checked_call, Expectation, Meter, NO_METER, run
+from ._pilot import choose, NO_SAMPLE
 from ._steps import AbstractSampling, Problem
-from ._value_functions import paths_of_a_fit, ValueFunctions
-
-
-# The keys made from this number belong to no sample.
-_NO_SAMPLE = 0xFFFFFFFF
-# Paths of a batch of independent paths, of which a trial has two; of a replicate, and how
-# many.
-_PATHS, _REPLICATE, _REPLICATES = 2**12, 2**12, 8
-# Of large systems a batch has fewer paths: as many as make so many numbers in all steps,
-# some seconds at most.
-_NUMBERS, _FEWEST_PATHS = 2**26, 2**8
-# What promises to take less time than this is taken without further trials.
-_SECONDS = 0.5
-# Without a tolerance nobody has asked for more: about the seconds that the samples take. A
-# trial may take half of what is left to gain.
-_MOST_SECONDS = 10.0
-# A gain for which no other sampling is tried.
-_CLEAR = 1e5
-# How many samples there are without a tolerance at most, and with one.
-_SAMPLES = {IndependentPaths: 2**17, ArrayRQMC: 64, ValueFunctions: 4096}
-_MOST = 10**9
 
 
 def expectation(
@@ -162,11 +137,11 @@ def expectation(
         sampling = start.sampling
     if sampling is not None:
         _check_sampling(sampling, start)
-    k_pilot = jr.fold_in(key, _NO_SAMPLE)
+    k_pilot = jr.fold_in(key, NO_SAMPLE)
     # It is shown while trials run, too.
     with Meter(progress_meter) as meter:
         if sampling is None:
-            sampling, plan = _chosen(problem, k_pilot, tol, devices)
+            sampling, plan = choose(problem, k_pilot, tol, devices)
         else:
             plan = sampling.prepare(problem, k_pilot, devices)
         if start is not None:
@@ -206,113 +181,3 @@ def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
             '`jax.config.update("jax_enable_x64", True)` first.',
             stacklevel=3,
         )
-
-
-def _chosen(
-    problem: Problem, key: PRNGKeyArray, tol: float | None, devices: tuple
-) -> tuple[AbstractSampling, Plan]:
-    """The sampling with the least product of variance and time, of those that can be used
-    and whose trial does not take too long. It gets as many samples as the tolerance needs,
-    and some more; without one as many as do not take too long."""
-    done: list[_Trial] = []
-
-    def prepared(sampling: AbstractSampling) -> Plan:
-        # What a sampling warns of is told by its error.
-        with warnings.catch_warnings(action="ignore"):
-            return sampling.prepare(problem, key, devices)
-
-    def work(sampling: AbstractSampling, plan: Plan, samples: int) -> None:
-        own = jr.fold_in(key, _NO_SAMPLE)
-        more = lambda n, start: run(
-            plan._replace(num_samples=n), own, devices, start=start
-        )
-        # The first batch, which may have to be compiled, is not timed.
-        first = more(plan.batch_size, None)
-        begin = time.perf_counter()
-        tried = more(samples, first)
-        seconds = _agreed(time.perf_counter() - begin) / (samples - plan.batch_size)
-        variances = jtu.tree_leaves(tried.variance)
-        variance = max(float(np.max(x, initial=0.0)) for x in variances)
-        variance = variance if np.isfinite(variance) else np.inf
-        done.append(_Trial(sampling, plan, variance, seconds))
-
-    numbers = sum(x.size for x in jtu.tree_leaves(problem.y0))
-    steps = int(np.sum(problem.levels.num_steps))
-    size = int(np.clip(_NUMBERS // (numbers * steps), _FEWEST_PATHS, _PATHS))
-    independent = IndependentPaths(size, size)
-    work(independent, prepared(independent), 2 * size)
-    (plain,) = done
-    functions, balanced = ValueFunctions(), ArrayRQMC(_REPLICATE, _REPLICATES)
-    # With how many samples they are tried, and how many paths take as long, at least.
-    others = [
-        (functions, 2 * functions.batch_size, lambda: paths_of_a_fit(problem)),
-        (balanced, _REPLICATES, lambda: _REPLICATE * (_REPLICATES + 1)),
-    ]
-    without = []
-    for sampling, samples, paths in others:
-        name, cost = type(sampling).__name__, min(trial.cost for trial in done)
-        left = _MOST_SECONDS if tol is None else cost / tol**2
-        if tol is not None and left <= _SECONDS:
-            without.append(f"{name} not needed: `tol` takes less than {_SECONDS} s")
-        elif cost * _CLEAR < plain.cost:
-            without.append(f"{name} not tried: the gain is large already")
-        else:
-            try:
-                least = plain.seconds * paths()
-                if least > left / 2:
-                    without.append(
-                        f"{name} not tried: that takes {least:.2g} s or more"
-                    )
-                    continue
-                plan = prepared(sampling)
-            except ValueError as error:
-                why = " ".join(str(error).split()).split(". ")[0]
-                without.append(f"{name} not possible: {why}")
-                continue
-            work(sampling, plan, samples)
-    best = min(done, key=lambda trial: trial.cost)
-    samples = _num_samples(best, tol)
-    name = "replicates" if isinstance(best.sampling, ArrayRQMC) else "num_paths"
-    sampling = dataclasses.replace(best.sampling, **{name: samples})
-    listed = ", ".join(f"{type(x.sampling).__name__} {x.cost:.1e}" for x in done)
-    reason = "; ".join(
-        [f"chosen by the least variance times seconds: {listed}", *without]
-    )
-    return sampling, best.plan._replace(num_samples=samples, reason=reason)
-
-
-def _agreed(seconds: float) -> float:
-    """Those of the first process: all have to choose the same."""
-    if jax.process_count() == 1:
-        return seconds
-    from jax.experimental import multihost_utils
-
-    return float(multihost_utils.broadcast_one_to_all(np.float32(seconds)))
-
-
-class _Trial(NamedTuple):
-    """A sampling, and of its samples the variance (of several numbers the largest) and the
-    seconds that one takes."""
-
-    sampling: AbstractSampling
-    plan: Plan
-    variance: float
-    seconds: float
-
-    @property
-    def cost(self) -> float:
-        """Seconds to a standard error of 1."""
-        return self.variance * self.seconds
-
-
-def _num_samples(trial: _Trial, tol: float | None) -> int:
-    plan = trial.plan
-    if tol is not None:
-        samples = int(np.clip(1.5 * trial.variance / tol**2, plan.batch_size, _MOST))
-        return max(samples, 2 * plan.least)
-    usual = _SAMPLES[type(trial.sampling)]
-    samples = int(min(_MOST_SECONDS / trial.seconds, usual))
-    # Whole batches: a part of one takes as long.
-    if samples > plan.batch_size:
-        samples -= samples % plan.batch_size
-    return max(samples, plan.least)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation import _call
+from diffrax_symplectic._expectation import _call, _pilot
 from diffrax_symplectic._expectation._estimate import Plan
 from diffrax_symplectic._expectation._fits import (
     exponents,
@@ -282,7 +282,7 @@ def test_the_reason_says_why_others_were_not_taken():
 
 
 def test_without_a_tolerance_the_time_bounds_the_number_of_samples(monkeypatch):
-    monkeypatch.setattr(_call, "_MOST_SECONDS", 1e-9)
+    monkeypatch.setattr(_pilot, "_MOST_SECONDS", 1e-9)
     few, enough = _estimate(None), _estimate(None, tol=0.05)
     assert few.num_paths == 2 and enough.tol_reached and enough.num_paths > 100
     for name in ("ValueFunctions", "ArrayRQMC"):
@@ -295,10 +295,10 @@ def test_without_a_tolerance_the_time_bounds_the_number_of_samples(monkeypatch):
 def test_samples_that_take_ten_seconds_are_whole_batches_if_they_can(seconds, samples):
     sampling = ds.ValueFunctions()
     plan = Plan(lambda keys: None, 4096, sampling.batch_size)  # pyright: ignore
-    trial = _call._Trial(sampling, plan, 1.0, seconds)
-    assert _call._num_samples(trial, None) == samples
+    trial = _pilot._Trial(sampling, plan, 1.0, seconds)
+    assert _pilot._num_samples(trial, None) == samples
     # A tolerance is another matter.
-    assert _call._num_samples(trial, 0.01) == 15_000
+    assert _pilot._num_samples(trial, 0.01) == 15_000
 
 
 def test_a_meter_is_shown_before_the_trials_and_closed_if_they_fail(monkeypatch):
@@ -308,7 +308,7 @@ def test_a_meter_is_shown_before_the_trials_and_closed_if_they_fail(monkeypatch)
         assert calls == ["init"]
         raise RuntimeError("a trial")
 
-    monkeypatch.setattr(_call, "_chosen", fails)
+    monkeypatch.setattr(_call, "choose", fails)
     with pytest.raises(RuntimeError, match="a trial"):
         _estimate(None, progress_meter=RecordingMeter(calls))
     assert calls == ["init", ("closed after", 0)]
