@@ -41,7 +41,7 @@ def inverse(matrix: list[list[Scalar]]) -> list[list[Scalar]]:
     return _solutions(rows, exchange=False)
 
 
-def _solutions(rows: list[list[Scalar]], exchange: bool) -> list[list[Scalar]]:
+def _solutions(rows: list[list[Any]], exchange: bool) -> list[list[Scalar]]:
     """The solutions of linear systems with one matrix, whose rows are each followed by
     their right-hand sides: by elimination, with partial pivoting if rows may `exchange`.
 

@@ -54,7 +54,8 @@ class DataFlow:
         products with zero are, too."""
         shapes = [jnp.shape(x) for x in jtu.tree_leaves(self._out)]
         found = self._follow(of, _REACHED)
-        return [np.broadcast_to(x, s) >= _DEPENDENT for x, s in zip(found, shapes)]
+        levels = [np.broadcast_to(x, s) for x, s in zip(found, shapes)]
+        return [np.asarray(x >= _DEPENDENT) for x in levels]
 
     def _follow(self, of: Callable, level: int) -> Sequence[_Known]:
         marked = _marked(lambda inputs: of(*inputs), self._inputs)
