@@ -17,6 +17,9 @@ from ._sweeps import Found, Limits, sweep, sweep_blocks
 from ._tolerance import Tolerance
 
 
+_MOST_DIRECT = 6
+
+
 class State(eqx.Module):
     """Where the search stands. A loop selects, gathers and scatters each array of its state
     by kernels of their own, so what only Newton's method needs is one vector: for the
@@ -76,8 +79,8 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
     - `norm`: norm within a leaf.
     - `linear_solver`: a Lineax solver for all linear systems, those of derivatives
         included. `None` is elimination for few unknowns, and otherwise no matrix.
-    - `direct`: the most unknowns for chord iterations. With four to six these save at
-        most a fifth of a long step, and make it a quarter slower to compile.
+    - `direct`: the most unknowns for chord iterations, from 0 to 6. With four to six these
+        save up to a third of a long step, which then takes up to 80% longer to compile.
     - `picard_steps`: the most iterations before Newton's method. Where their rate tells
         that so many would not do, they end at once.
 
@@ -88,7 +91,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
     is `k[i]`. First iterations then solve one block after another. Nothing waits for the
     solution where `options={"lost": flag}` is true, and there it is of no use.
 
-    **Raises:** a `ValueError` for negative numbers.
+    **Raises:** a `ValueError` for negative numbers, or `direct` above 6.
     """
 
     rtol: float | None = None
@@ -102,6 +105,13 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         for name in ("rtol", "atol", "direct", "picard_steps"):
             if isinstance(n := getattr(self, name), int | float) and n < 0:
                 raise ValueError(f"`{name}` of `PicardNewton` must be >= 0; got {n}.")
+        if self.direct > _MOST_DIRECT:
+            # Their linear algebra is written out: its length grows with the cube.
+            raise ValueError(
+                f"`direct` of `PicardNewton` must be at most {_MOST_DIRECT}; got "
+                f"{self.direct}. For dense elimination with more unknowns pass "
+                "`linear_solver=lineax.LU()`."
+            )
 
     @property
     def tolerance(self) -> Tolerance:

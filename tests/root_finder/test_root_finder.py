@@ -161,6 +161,8 @@ def test_numbers_of_iterations_that_mean_nothing_are_refused():
     for name in ("direct", "picard_steps", "rtol", "atol"):
         with pytest.raises(ValueError, match=f"`{name}` of .* must be >= 0; got -1"):
             ds.PicardNewton(**{name: -1})
+    with pytest.raises(ValueError, match="`direct` .* at most 6; got 7.*LU"):
+        ds.PicardNewton(direct=7)
     for name, wrong in (
         ("root_find_max_steps", -1),
         ("root_finder", ds.PicardNewton),

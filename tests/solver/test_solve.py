@@ -151,7 +151,7 @@ def test_adjoints_agree():
         optx.LevenbergMarquardt(rtol=1e-12, atol=1e-14),
         ds.PicardNewton(linear_solver=lx.QR()),
         ds.PicardNewton(direct=0),
-        ds.PicardNewton(direct=100),
+        ds.PicardNewton(direct=6),
         ds.PicardNewton(picard_steps=0),
     ],
     ids=lambda r: type(r).__name__,
