@@ -35,15 +35,25 @@ def _(size, in_batched, flag):
     return any_of_batch(jnp.any(flag, 0) if in_batched[0] else flag), False
 
 
-@jax.custom_batching.custom_vmap
+@jax.custom_jvp
 def batched_together(values: _T, others: PyTree = ()) -> _T:
     """The same `values`, all of them batched if one is, or one of the `others`. JAX batches
     what is in a loop anew whenever one more of its values turns out to be batched."""
+    return _batched_together(values, others)
+
+
+@batched_together.defjvp
+def _(primals, tangents):
+    return batched_together(*primals), tangents[0]
+
+
+@jax.custom_batching.custom_vmap
+def _batched_together(values: _T, others: PyTree) -> _T:
     del others
     return values
 
 
-@batched_together.def_vmap
+@_batched_together.def_vmap
 def _(size, in_batched, values, others):
     values = _spread(size, in_batched[0], values)
     return batched_together(values, others), jtu.tree_map(lambda _: True, values)

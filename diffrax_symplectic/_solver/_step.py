@@ -271,17 +271,13 @@ def _implicit_step(
             "`BestSoFarRootFinder` returns an iterate from before the last correction. It "
             "does not solve the stage equations. Pass the root finder within it."
         )
-    step = stages.step
-    t0, h, y0, lost = batched_together(
-        (step.t0, step.h, stages.y0, lost), eqx.filter(step.driven, eqx.is_array)
-    )
-    stages = Stages(stages.plan, step._replace(t0=t0, h=h), y0)
     return _solved(stages, lost, finder, max_steps)
 
 
 @eqx.filter_jit
 def _solved(stages: Stages, lost: Bool[Array, ""], finder: Any, max_steps: int):
     guess = [stages.zero_of(block) for block in stages.plan.blocks]
+    guess = batched_together(guess, stages.y0)
     if not isinstance(finder, PicardNewton):
         # That one begins with this.
         guess = stages.image(guess)

@@ -21,7 +21,7 @@ from .._brownian import path_of, VARIABLES
 from .._conditions import drift_order
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
-from .._root_finder import PicardNewton
+from .._root_finder import batched_together, PicardNewton
 from .._tableau import AbstractTableau, FlatTableau, Structure
 from .._terms import (
     check_structure,
@@ -239,11 +239,14 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         drift, noise = split_terms(terms)
         plan = make_plan(_drop_absent(self.tableau.flatten(), drift, noise))
         variables = _variables(plan.tableau)
-        driven = {"h": drift_driven(drift, t0, t1, args)} if drift else {}
+        begin, end, y0, solver_state = batched_together(
+            (t0, t1, y0, solver_state), eqx.filter((terms, args), eqx.is_array)
+        )
+        along, h = drift_driven(drift, begin, end, args), end - begin
+        driven = {"h": along} if drift else {}
         name = type(self).__name__
-        driven |= noise_driven(drift, noise, variables, t0, t1, args, name)
-        step = Step(t0, t1 - t0, driven)
-        y1, unsolved = take_step(plan, step, y0, self, solver_state)
+        driven |= noise_driven(along, h, noise, variables, t0, t1, args, name)
+        y1, unsolved = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
         return y1, None, dict(y0=y0, y1=y1), unsolved, result_of(unsolved, y1)
 
 

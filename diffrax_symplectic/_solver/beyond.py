@@ -3,6 +3,7 @@
 import dataclasses
 from typing import ClassVar
 
+import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import numpy as np
 from .._arguments import check_state
 from .._conditions import drift_order
 from .._plan import make_plan
+from .._root_finder import batched_together
 from .._tableau import FlatTableau, GeneralTableau, Stage, Structure
 from .._terms import apply_one, controls, drift_driven, number_of_noises, split_terms
 from ._step import result_of, Step, take_step
@@ -161,7 +163,11 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del made_jump
         drift, _ = split_terms(terms)
-        middle = t0 + (t1 - t0) / 2
+        unsolved = first_state(self) if solver_state is None else solver_state
+        begin, end, y0, unsolved = batched_together(
+            (t0, t1, y0, unsolved), eqx.filter((terms, args), eqx.is_array)
+        )
+        middle = begin + (end - begin) / 2
 
         def along_drift(t0, t1, y, unsolved):
             if len(drift) == 0:
@@ -169,10 +175,9 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
             step = Step(t0, t1 - t0, {"h": drift_driven(drift, t0, t1, args)})
             return take_step(_flow, step, y, self, unsolved)
 
-        unsolved = first_state(self) if solver_state is None else solver_state
-        y, unsolved = along_drift(t0, middle, y0, unsolved)
+        y, unsolved = along_drift(begin, middle, y0, unsolved)
         y, unsolved = self._along_noise(terms, t0, t1, middle, y, args, unsolved)
-        y1, unsolved = along_drift(middle, t1, y, unsolved)
+        y1, unsolved = along_drift(middle, end, y, unsolved)
         return y1, None, dict(y0=y0, y1=y1), unsolved, result_of(unsolved, y1)
 
     def _along_noise(self, terms, t0, t1, time, y, args, unsolved):
@@ -192,7 +197,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
 
         def flow(carry, this):
             driven = jtu.Partial(apply_one, noise, *this, args)
-            step = Step(time, 0 * (t1 - t0), {"h": driven})
+            step = Step(time, jnp.zeros_like(time), {"h": driven})
             return take_step(_flow, step, carry[0], self, carry[1]), None
 
         unroll = m if m <= _WRITTEN_OUT else 1

@@ -175,9 +175,10 @@ def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
 
 
 def noise_driven(
-    drift: tuple, noise: tuple, names: list[str], t0, t1, args: Args, solver: str
+    along: jtu.Partial, h, noise: tuple, names: list[str], t0, t1, args: Args, solver: str
 ) -> dict[str, jtu.Partial]:
-    """What drives noise stages over the step, for each random variable."""
+    """What drives noise stages over the step of size `h`, for each random variable;
+    `along` drives those of the drift."""
     needed, optional = names, ()
     if "L" in names:
         # It is computed from others.
@@ -187,11 +188,8 @@ def noise_driven(
     driven = {}
     for name in names:
         if name == "L":
-            along = drift_driven(drift, t0, t1, args)
-            bridges = bridge(t1 - t0, drawn["W"], drawn["H"], drawn.get("K"))
-            driven[name] = jtu.Partial(
-                apply_bridge, along, noise, bridges, t1 - t0, args
-            )
+            bridges = bridge(h, drawn["W"], drawn["H"], drawn.get("K"))
+            driven[name] = jtu.Partial(apply_bridge, along, noise, bridges, h, args)
         elif name != "A":
             driven[name] = jtu.Partial(apply, noise, drawn[name], args)
         elif len(noise) == 1:

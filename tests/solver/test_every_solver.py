@@ -132,6 +132,9 @@ class Batch(eqx.Module):
 
 @ft.cache
 def batch(structure: str, dtype) -> Batch:
+    if dtype != jnp.float64:
+        return jax.tree.map(dtype, batch(structure, jnp.float64))
+
     @jax.vmap
     def draw(key):
         k_system, k_size, k_h, k_A, *ks = jr.split(key, 11)
@@ -149,7 +152,9 @@ def batch(structure: str, dtype) -> Batch:
         drawn["A"] = A - A.T
         return Batch(y0, args, jnp.ones(2, dtype), h, drawn)
 
-    return jax.jit(draw)(jr.split(jr.key(0), N))
+    # It runs once.
+    options = {"xla_backend_optimization_level": 0}
+    return jax.jit(draw, compiler_options=options)(jr.split(jr.key(0), N))
 
 
 @ft.cache
