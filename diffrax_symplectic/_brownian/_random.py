@@ -40,8 +40,9 @@ def random_words(
             count.astype(jnp.uint32),
             (exponent.astype(jnp.uint32) << 20) + numbers,
         )
-        words = materialize(lambda: _threefry(jr.key_data(key), *counter))
-        words = jnp.stack(words, axis=1)
+        hashed = lambda: _threefry(jr.key_data(key), *counter)
+        # For one word, one of the two: XLA computes each by a kernel of its own.
+        words = jnp.stack(materialize(lambda: hashed()[: sets * n]), axis=1)
         return words.reshape(-1)[: sets * n].reshape(sets, n)
     at = jr.fold_in(jr.fold_in(key, count), exponent)
     return jnp.stack(
@@ -97,17 +98,28 @@ def place_of(t0, t1) -> Place:
     longer than it, so that two steps have the same integers only if they overlap. The two
     odd constants keep round numbers away from where the roundings change.
     """
-    h = jnp.abs(t1 - t0)
-    _, exponent = jnp.frexp(h * 1.37)
-    exponent = exponent.astype(jnp.int32) - 2
+    unit, exponent = _power_of_two(jnp.abs(t1 - t0) * 1.37)
     # The middle itself would be rounded to the resolution of time. Late in a long solve
     # in float32 that is not far below the step, and two steps may have one middle. So the
     # integer part of the start, which is exact, is split off before half a step is added.
-    start, half = (jnp.ldexp(x, -exponent) for x in (t0, (t1 - t0) / 2))
+    start, half = t0 / unit, (t1 - t0) / 2 / unit
     whole = jnp.floor(start)
     rest = jnp.floor(start - whole + half + 0.29)
-    # Starts again after 2^31 counts. (`fmod` is exact, also for negative times.)
-    return jnp.fmod(whole, 2.0**31).astype(jnp.int32) + rest.astype(jnp.int32), exponent
+    # Starts again after 2^31 counts, or fewer where these are more than there are numbers.
+    period = 2.0 ** min(31, jnp.finfo(whole.dtype).maxexp - 1)
+    whole = whole - period * jnp.trunc(whole / period)
+    return whole.astype(jnp.int32) + rest.astype(jnp.int32), exponent
+
+
+def _power_of_two(x: Array) -> tuple[Array, Integer[Array, ""]]:
+    """The power of two from a quarter to half of a positive number, and its exponent, by
+    the bits of the number: `jnp.frexp` and `jnp.ldexp` take as long as a random word."""
+    info = jnp.finfo(x.dtype)
+    bits = lax.bitcast_convert_type(x, f"int{info.bits}")
+    biased = bits >> info.nmant
+    power = lax.bitcast_convert_type(biased << info.nmant, x.dtype) / 2
+    exponent = biased.astype(jnp.int32) - (2 ** (info.nexp - 1))
+    return jnp.where(power > 0, power, 1), exponent
 
 
 class AbstractLaw(abc.ABC):

@@ -1,14 +1,14 @@
 """Newton's method that does not give up, for the few paths that are left."""
 
 from collections.abc import Callable
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
+from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._compat import ω
 from .._custom_types import BoolScalarLike
@@ -60,49 +60,66 @@ class Equations(eqx.Module):
         return self.options.get("scale", lambda y: y)(self.moved(k))
 
 
-class Progress(eqx.Module):
+class Progress(NamedTuple):
     r"""Where the continuation stands. With the residual $r$ the equations solved for
     $s \in [0, 1]$ are $(1 - s) k + s\, r(k) = 0$, so $k = s\, \Phi(k)$: those of a step
     whose length and increments are multiplied by $s$.
 
     - `k`: the iterate; `anchor`: the (rough) solution at `reached`.
     - `reached`, `target`: the $s$ that was solved for, and that which is being solved for.
+        Beyond 1 the target says that `k` solves the equations of the whole step; and what
+        was reached is negative once the branch of solutions from $s = 0$ was given up.
     - `tries`: how many iterations there were for this target.
     - `size`: the last correction, in units of the tolerance.
-    - `lost`: whether the branch of solutions that begins at $s = 0$ was given up.
-    - `solved`: whether `k` solves the equations of the whole step.
     """
 
     k: _Vector
     anchor: _Vector
     reached: Scalar
     target: Scalar
-    tries: Int[Array, ""]
+    tries: Scalar
     size: Scalar
-    lost: Bool[Array, ""]
-    solved: Bool[Array, ""]
+
+    @property
+    def solved(self) -> Bool[Array, ""]:
+        return self.target > 1
+
+    @property
+    def lost(self) -> Bool[Array, ""]:
+        return self.reached < 0
 
     @property
     def hopeless(self) -> Bool[Array, ""]:
         """Whether even the search for any solution has left where there are values."""
         return self.lost & ~jnp.isfinite(self.size)
 
+    def packed(self) -> _Vector:
+        return jnp.concatenate([self.k, self.anchor, jnp.stack(self[2:])])
+
+    @staticmethod
+    def unpacked(x: _Vector) -> "Progress":
+        n = (x.size - 4) // 2
+        return Progress(x[:n], x[n:-4], *x[-4:])
+
+
+_SOLVED, _LOST = 2, -1
+
 
 def begin(k: _Vector, solved: Bool[Array, ""]) -> Progress:
     """First all of the step at once, from the guess `k`."""
-    zero, no = jnp.zeros((), k.dtype), jnp.array(False)
-    return Progress(
-        k, jnp.zeros_like(k), zero, zero + 1, jnp.array(0), zero + jnp.inf, no, solved
-    )
+    zero = jnp.zeros((), k.dtype)
+    target = jnp.where(solved, zero + _SOLVED, zero + 1)
+    return Progress(k, jnp.zeros_like(k), zero, target, zero, zero + jnp.inf)
 
 
 def advance(
     tolerance: Tolerance,
     linear_solver: lx.AbstractLinearSolver | None,
     equations: Equations,
-    progress: Progress,
-) -> Progress:
+    packed: _Vector,
+) -> _Vector:
     """One iteration of Newton's method."""
+    progress = Progress.unpacked(packed)
     restore = jfu.ravel_pytree(equations.origin)[1]
     residual = lambda k: jfu.ravel_pytree(equations.residual(restore(k)))[0]
     s, k = progress.target, progress.k
@@ -121,7 +138,7 @@ def _correct(
     residual: _Vector,
     diff: _Vector,
     exact: BoolScalarLike,
-) -> Progress:
+) -> _Vector:
     """What follows from the correction `diff` for a residual; `exact` says whether its
     linear system was solved."""
     s, k = progress.target, progress.k - diff
@@ -149,17 +166,23 @@ def _correct(
     slow = ~whole & (progress.tries + 1 >= _PATIENCE_IN_PART)
     back = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~progress.lost & ~solved
 
-    stride = s - progress.reached
-    reached = jnp.where(arrived, s, progress.reached)
-    stride = stride * jnp.where(arrived, _LONGER, jnp.where(back, _SHORTER, 1))
-    lost = progress.lost | (stride < _SHORTEST)
-    return Progress(
-        k=jnp.where(back, progress.anchor, k),
-        anchor=jnp.where(arrived, k, progress.anchor),
-        reached=reached,
-        target=jnp.where(lost, 1, jnp.minimum(reached + stride, 1)),
-        tries=jnp.where(arrived | back, 0, progress.tries + 1),
+    # Each of these is simple, so that XLA computes once which of them it is.
+    going = Progress(k, progress.anchor, progress.reached, s, progress.tries + 1, size)
+    zero, stride = jnp.zeros_like(s), s - progress.reached
+    longer = jnp.minimum(s + _LONGER * stride, 1)
+    onward = Progress(k, k, s, longer, zero, size)
+    shorter = progress.reached + _SHORTER * stride
+    turned = _SHORTER * stride < _SHORTEST
+    retry = Progress(
+        k=progress.anchor,
+        anchor=progress.anchor,
+        reached=jnp.where(turned, _LOST, progress.reached),
+        target=jnp.where(turned, 1, shorter),
+        tries=zero,
         size=size,
-        lost=lost,
-        solved=solved,
     )
+    done = going._replace(target=zero + _SOLVED)
+    new = going.packed()
+    for case, then in (arrived, onward), (back, retry), (solved, done):
+        new = jnp.where(case, then.packed(), new)
+    return new

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._compat import ω
 from . import _continuation
-from ._batch import batched_together, where_pending
+from ._batch import where_pending
 from ._sweeps import Found, Limits, sweep, sweep_blocks
 from ._tolerance import Tolerance
 
@@ -21,29 +21,14 @@ _MOST_DIRECT = 6
 
 
 class State(eqx.Module):
-    """Where the search stands. A loop selects, gathers and scatters each array of its state
-    by kernels of their own, so what only Newton's method needs is one vector: for the
-    midpoint rule that leaves a fifth fewer of them to compile."""
+    """Where the search stands: one array, since a loop selects, gathers and scatters each
+    by kernels of their own."""
 
-    k: Float[Array, " n"]
-    rest: Float[Array, " m"]
-    solved: Bool[Array, ""]
-
-    @staticmethod
-    def of(progress: _continuation.Progress) -> "State":
-        rest = eqx.tree_at(_apart, progress, (None, None))
-        return State(progress.k, jfu.ravel_pytree(rest)[0], progress.solved)
+    packed: Float[Array, " m"]
 
     @property
     def progress(self) -> _continuation.Progress:
-        like = _continuation.begin(self.k, self.solved)
-        _, restore = jfu.ravel_pytree(eqx.tree_at(_apart, like, (None, None)))
-        rest = restore(self.rest)
-        return eqx.combine(rest, like)
-
-
-def _apart(progress: _continuation.Progress) -> tuple[Any, Any]:
-    return progress.k, progress.solved
+        return _continuation.Progress.unpacked(self.packed)
 
 
 class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, State]):
@@ -138,7 +123,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         else:
             found = sweep(limits, equations.image, begin, equations.scale)
         k = jnp.where(found.solved | found.near, jfu.ravel_pytree(found.y)[0], 0)
-        return batched_together(State.of(_continuation.begin(k, found.solved)))
+        return State(_continuation.begin(k, found.solved).packed())
 
     def step(
         self,
@@ -156,11 +141,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         pending = ~(state.progress.solved | state.progress.hopeless)
 
         def advance(problem, state):
-            tolerance, linear_solver, equations = problem
-            new = _continuation.advance(
-                tolerance, linear_solver, equations, state.progress
-            )
-            return State.of(new)
+            return State(_continuation.advance(*problem, state.packed))
 
         problem = self.tolerance, self.linear_solver, equations
         state = where_pending(advance, pending, problem, state)
@@ -179,7 +160,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         result = optx.RESULTS.where(
             state.progress.hopeless, optx.RESULTS.nonfinite, optx.RESULTS.successful
         )
-        return state.solved, result
+        return state.progress.solved, result
 
     def postprocess(
         self,
@@ -193,7 +174,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         result: optx.RESULTS,
     ) -> tuple[PyTree[Array], Any, dict[str, Any]]:
         del options, tags, result
-        k = jfu.ravel_pytree(y)[1](state.k)
+        k = jfu.ravel_pytree(y)[1](state.progress.k)
         found = (y**ω + k**ω).ω
         aux = fn(found, args)[1] if jtu.tree_leaves(aux) else aux
         return found, aux, {}
