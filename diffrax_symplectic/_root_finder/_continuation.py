@@ -74,11 +74,11 @@ class Progress(NamedTuple):
     """
 
     k: _Vector
-    anchor: _Vector
-    reached: Scalar
     target: Scalar
+    reached: Scalar
     tries: Scalar
     size: Scalar
+    anchor: _Vector
 
     @property
     def solved(self) -> Bool[Array, ""]:
@@ -94,22 +94,22 @@ class Progress(NamedTuple):
         return self.lost & ~jnp.isfinite(self.size)
 
     def packed(self) -> _Vector:
-        return jnp.concatenate([self.k, self.anchor, jnp.stack(self[2:])])
+        return jnp.concatenate([self.k, jnp.stack(self[1:5]), self.anchor])
 
     @staticmethod
     def unpacked(x: _Vector) -> "Progress":
         n = (x.size - 4) // 2
-        return Progress(x[:n], x[n:-4], *x[-4:])
+        return Progress(x[:n], *x[n : n + 4], x[n + 4 :])
 
 
 _SOLVED, _LOST = 2, -1
 
 
-def begin(k: _Vector, solved: Bool[Array, ""]) -> Progress:
+def begin(k: _Vector, solved: Bool[Array, ""]) -> _Vector:
     """First all of the step at once, from the guess `k`."""
-    zero = jnp.zeros((), k.dtype)
-    target = jnp.where(solved, zero + _SOLVED, zero + 1)
-    return Progress(k, jnp.zeros_like(k), zero, target, zero, zero + jnp.inf)
+    target = jnp.where(solved, _SOLVED, 1).astype(k.dtype)
+    # All else is zero.
+    return jnp.concatenate([k, target[None], jnp.zeros(3 + k.size, k.dtype)])
 
 
 def advance(
@@ -167,19 +167,19 @@ def _correct(
     back = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~progress.lost & ~solved
 
     # Each of these is simple, so that XLA computes once which of them it is.
-    going = Progress(k, progress.anchor, progress.reached, s, progress.tries + 1, size)
+    going = progress._replace(k=k, tries=progress.tries + 1, size=size)
     zero, stride = jnp.zeros_like(s), s - progress.reached
     longer = jnp.minimum(s + _LONGER * stride, 1)
-    onward = Progress(k, k, s, longer, zero, size)
+    onward = Progress(k, longer, s, zero, size, anchor=k)
     shorter = progress.reached + _SHORTER * stride
     turned = _SHORTER * stride < _SHORTEST
     retry = Progress(
         k=progress.anchor,
-        anchor=progress.anchor,
-        reached=jnp.where(turned, _LOST, progress.reached),
         target=jnp.where(turned, 1, shorter),
+        reached=jnp.where(turned, _LOST, progress.reached),
         tries=zero,
         size=size,
+        anchor=progress.anchor,
     )
     done = going._replace(target=zero + _SOLVED)
     new = going.packed()

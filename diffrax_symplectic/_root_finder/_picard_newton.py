@@ -123,7 +123,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         else:
             found = sweep(limits, equations.image, begin, equations.scale)
         k = jnp.where(found.solved | found.near, jfu.ravel_pytree(found.y)[0], 0)
-        return State(_continuation.begin(k, found.solved).packed())
+        return State(_continuation.begin(k, found.solved))
 
     def step(
         self,

@@ -175,7 +175,14 @@ def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
 
 
 def noise_driven(
-    along: jtu.Partial, h, noise: tuple, names: list[str], t0, t1, args: Args, solver: str
+    along: jtu.Partial,
+    h,
+    noise: tuple,
+    names: list[str],
+    t0,
+    t1,
+    args: Args,
+    solver: str,
 ) -> dict[str, jtu.Partial]:
     """What drives noise stages over the step of size `h`, for each random variable;
     `along` drives those of the drift."""
