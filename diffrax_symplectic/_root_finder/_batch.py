@@ -4,7 +4,6 @@ import functools as ft
 from collections.abc import Callable
 from typing import TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -64,26 +63,20 @@ def _spread(size: int, in_batched: PyTree[bool], values: _T) -> _T:
     return jtu.tree_map(spread, in_batched, values)
 
 
-def where_pending(
-    fn: Callable[[PyTree, _T], _T], pending: Bool[Array, ""], args: PyTree, value: _T
-) -> _T:
-    """`fn(args, value)` where `pending`, and `value` elsewhere.
+def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -> _T:
+    """`fn(value)` where `pending`, and `value` elsewhere.
 
     A conditional would do, but under `vmap` it becomes a selection: all paths compute, and
     memory is set aside for all of them. Here the paths for which `pending` holds are
     gathered from the batch, and served by parts. This has no derivative.
     """
-    dynamic, static = eqx.partition(args, eqx.is_array)
-    leaves, treedef = jtu.tree_flatten(dynamic)
     # Batched more than once, but traced only here. What `fn` captures is batched, too.
-    merged = lambda x, y: fn(eqx.combine(treedef.unflatten(x), static), y)
-    traced = jax.make_jaxpr(merged)(leaves, value)
-    unflatten, num = jtu.tree_structure(value).unflatten, len(leaves)
+    traced = jax.make_jaxpr(fn)(value)
+    unflatten = jtu.tree_structure(value).unflatten
 
-    @jax.jit
-    def call(leaves, value):
-        own = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, leaves[num:]))
-        return unflatten(own(*leaves[:num], *jtu.tree_leaves(value)))
+    def call(captured, value):
+        own = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, captured))
+        return unflatten(own(*jtu.tree_leaves(value)))
 
     # Traced once, for what is in a loop is batched several times.
     serve_batch = jax.jit(ft.partial(_serve_batch, call))
@@ -92,31 +85,31 @@ def where_pending(
         """For that many axes of a batch, of which arguments have those that they need."""
 
         @jax.custom_batching.custom_vmap
-        def serve_all(pending, leaves, value):
+        def serve_all(pending, captured, value):
             if depth > 0:
-                return serve_batch(pending, leaves, value)
-            return lax.cond(pending, call, lambda _, value: value, leaves, value)
+                return serve_batch(pending, captured, value)
+            return lax.cond(pending, call, lambda _, value: value, captured, value)
 
         @serve_all.def_vmap
-        def _(size, in_batched, pending, leaves, value):
+        def _(size, in_batched, pending, captured, value):
             pending, value = _spread(
                 size, (in_batched[0], in_batched[2]), (pending, value)
             )
-            leaves = [x if b else x[None] for b, x in zip(in_batched[1], leaves)]
-            value = serve(depth + 1)(pending, leaves, value)
+            captured = [x if b else x[None] for b, x in zip(in_batched[1], captured)]
+            value = serve(depth + 1)(pending, captured, value)
             return value, jtu.tree_map(lambda _: True, value)
 
         return serve_all
 
-    return serve(0)(pending, [*leaves, *traced.consts], value)
+    return serve(0)(pending, list(traced.consts), value)
 
 
-def _serve_batch(call, pending, leaves, value):
-    """Arrays of `leaves` have each axis of the batch, or in its place one of length 1."""
+def _serve_batch(call, pending, captured, value):
+    """What was `captured` has each axis of the batch, or in its place one of length 1."""
     depth, shape, size = pending.ndim, pending.shape, pending.size
     part = -(-size // _PARTS)
     flat = lambda x: x.reshape(size, *x.shape[depth:])
-    own = [any(n > 1 for n in x.shape[:depth]) for x in leaves]
+    own = [any(n > 1 for n in x.shape[:depth]) for x in captured]
 
     def body(carry):
         pending, value = carry
@@ -132,7 +125,7 @@ def _serve_batch(call, pending, leaves, value):
                 x[tuple(i if n > 1 else 0 for i, n in axes)] if own else x[(0,) * depth]
             )
 
-        few = [gather(x, b) for x, b in zip(leaves, own)]
+        few = [gather(x, b) for x, b in zip(captured, own)]
         axes = [0 if b else None for b in own]
         new = jax.vmap(call, (axes, 0))(few, jtu.tree_map(lambda x: x[which], value))
         scatter = lambda x, y: x.at[which].set(y, mode="drop")

@@ -1,10 +1,9 @@
 """Newton's method that does not give up, for the few paths that are left."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import lineax as lx
@@ -12,11 +11,10 @@ from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._compat import ω
 from .._custom_types import BoolScalarLike
-from ._linear import solve
+from ._linear import linearized, solve
 from ._tolerance import all_finite, converged, largest, ratio, Tolerance
 
 
-_T = TypeVar("_T")
 _Vector: TypeAlias = Float[Array, " n"]
 
 # How many iterations Newton's method for all of the step has before corrections must
@@ -99,9 +97,11 @@ class Progress(NamedTuple):
     @staticmethod
     def unpacked(x: _Vector) -> "Progress":
         n = (x.size - 4) // 2
-        return Progress(x[:n], *x[n : n + 4], x[n + 4 :])
+        target, reached, tries, size = x[n : n + 4]
+        return Progress(x[:n], target, reached, tries, size, x[n + 4 :])
 
 
+# What stands in place of a target, and of what was reached.
 _SOLVED, _LOST = 2, -1
 
 
@@ -125,7 +125,7 @@ def advance(
     s, k = progress.target, progress.k
     # Of the residual `r` at `k`, and of its derivative.
     part = lambda k, r: (1 - s) * k + s * r
-    value, jacobian = jax.linearize(residual, k)
+    value, jacobian = linearized(residual, k, linear_solver)
     apply = lambda x: part(x, jacobian(x))
     diff, exact = solve(apply, part(k, value), linear_solver)
     return _correct(tolerance, equations, progress, value, diff, exact)

@@ -38,8 +38,8 @@ def differentiate(
         begin = Found(jnp.zeros_like(b), solved=jnp.array(False), near=jnp.array(True))
         found = sweep(_LIMITS, lambda x: x + (b - operator(x)), begin, lambda x: x)
         reduction = float(jnp.finfo(b.dtype).eps) ** 0.9
-        exactly = lambda b, _: solve(operator, b, None, reduction)[0]
-        return where_pending(exactly, ~found.solved, b, found.y)
+        exactly = lambda _: solve(operator, b, None, reduction)[0]
+        return where_pending(exactly, ~found.solved, found.y)
 
     operator = lambda x: x - jfu.ravel_pytree(linear(unravel(x)))[0]
     return unravel(lax.custom_linear_solve(operator, flat, by, by))

@@ -1,5 +1,6 @@
+import functools as ft
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -11,8 +12,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._compat import ω
-from . import _continuation
 from ._batch import where_pending
+from ._continuation import advance, begin, Equations, Progress
 from ._sweeps import Found, Limits, sweep, sweep_blocks
 from ._tolerance import Tolerance
 
@@ -20,18 +21,12 @@ from ._tolerance import Tolerance
 _MOST_DIRECT = 6
 
 
-class State(eqx.Module):
-    """Where the search stands: one array, since a loop selects, gathers and scatters each
-    by kernels of their own."""
-
-    packed: Float[Array, " m"]
-
-    @property
-    def progress(self) -> _continuation.Progress:
-        return _continuation.Progress.unpacked(self.packed)
+# Where the search stands, `Progress` in one array: loops select, gather and scatter each
+# array of its state by kernels of their own.
+_State: TypeAlias = Float[Array, " m"]
 
 
-class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, State]):
+class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _State]):
     r"""For stage equations $k = \Phi(k)$, given as $k - \Phi(k) = 0$: solves them to
     rounding error, cheaply when the step is small and robustly when it is not.
 
@@ -111,19 +106,19 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         f_struct: PyTree[jax.ShapeDtypeStruct],
         aux_struct: PyTree[jax.ShapeDtypeStruct],
         tags: frozenset[object],
-    ) -> State:
+    ) -> _State:
         del f_struct, aux_struct, tags
-        equations = _continuation.Equations(fn, args, options, y)
+        equations = Equations(fn, args, options, y)
         lost = options.get("lost", jnp.array(False))
-        begin = Found(jtu.tree_map(jnp.zeros_like, y), solved=lost, near=~lost)
+        guess = Found(jtu.tree_map(jnp.zeros_like, y), solved=lost, near=~lost)
         direct = self.direct if self.linear_solver is None else 0
         limits = Limits(self.tolerance, self.picard_steps, direct)
         if "blocks" in options:
-            found = sweep_blocks(limits, options["blocks"], begin, equations.scale)
+            found = sweep_blocks(limits, options["blocks"], guess, equations.scale)
         else:
-            found = sweep(limits, equations.image, begin, equations.scale)
+            found = sweep(limits, equations.image, guess, equations.scale)
         k = jnp.where(found.solved | found.near, jfu.ravel_pytree(found.y)[0], 0)
-        return State(_continuation.begin(k, found.solved))
+        return begin(k, found.solved)
 
     def step(
         self,
@@ -131,21 +126,17 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         y: PyTree[Array],
         args: PyTree[Any],
         options: dict[str, Any],
-        state: State,
+        state: _State,
         tags: frozenset[object],
-    ) -> tuple[PyTree[Array], State, Any]:
+    ) -> tuple[PyTree[Array], _State, Any]:
         del tags
         # `y` stays where the search began, and the state says how far it has come from
         # there. In the end `postprocess` moves `y`, and evaluates `fn` once more.
-        equations = _continuation.Equations(fn, args, options, y)
-        pending = ~(state.progress.solved | state.progress.hopeless)
-
-        def advance(problem, state):
-            return State(_continuation.advance(*problem, state.packed))
-
-        problem = self.tolerance, self.linear_solver, equations
-        state = where_pending(advance, pending, problem, state)
-        return y, state, fn(y, args)[1]
+        equations = Equations(fn, args, options, y)
+        progress = Progress.unpacked(state)
+        pending = ~(progress.solved | progress.hopeless)
+        newton = ft.partial(advance, self.tolerance, self.linear_solver, equations)
+        return y, where_pending(newton, pending, state), fn(y, args)[1]
 
     def terminate(
         self,
@@ -153,14 +144,15 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         y: PyTree[Array],
         args: PyTree[Any],
         options: dict[str, Any],
-        state: State,
+        state: _State,
         tags: frozenset[object],
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         del fn, y, args, options, tags
+        progress = Progress.unpacked(state)
         result = optx.RESULTS.where(
-            state.progress.hopeless, optx.RESULTS.nonfinite, optx.RESULTS.successful
+            progress.hopeless, optx.RESULTS.nonfinite, optx.RESULTS.successful
         )
-        return state.progress.solved, result
+        return progress.solved, result
 
     def postprocess(
         self,
@@ -169,12 +161,12 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, St
         aux: Any,
         args: PyTree[Any],
         options: dict[str, Any],
-        state: State,
+        state: _State,
         tags: frozenset[object],
         result: optx.RESULTS,
     ) -> tuple[PyTree[Array], Any, dict[str, Any]]:
         del options, tags, result
-        k = jfu.ravel_pytree(y)[1](state.progress.k)
+        k = jfu.ravel_pytree(y)[1](Progress.unpacked(state).k)
         found = (y**ω + k**ω).ω
         aux = fn(found, args)[1] if jtu.tree_leaves(aux) else aux
         return found, aux, {}
