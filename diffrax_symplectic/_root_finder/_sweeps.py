@@ -21,19 +21,20 @@ from ._tolerance import converged, largest, ratio, Tolerance
 _Map = Callable[[PyTree[Array]], PyTree[Array]]
 
 # The numbers of iterations between two looks at the error are for double precision. In
-# single precision half as many reach rounding error.
+# single precision half as many reach rounding error, or where it says so.
 # Up to so many unknowns chords follow at once: they cost no more than a look at the error.
 _AT_ONCE = 2
 # Fixed-point iterations before these, and by how much the last of them may change the
 # values, as a fraction of what all of them did.
 _WARMUP, _SETTLED = 4, 0.5
-# Fixed-point iterations before the first look at the error, and between two looks.
-_FIRST, _MORE = 11, 4
+# Fixed-point iterations before the first look at the error, and between two looks, in
+# double and in single precision.
+_FIRST, _MORE = (11, 7), (4, 2)
 # The rate of one iteration is a square root of what so many do, twice or three times: any
 # other power takes as long as an iteration of few unknowns. From the first iterate to the
-# first look there are ten iterations. Taken for eight, they show too large a rate, which is
-# on the safe side.
-_POWER_FIRST, _POWER_MORE = 8, 4
+# first look there are ten iterations, or six. Taken for eight, or four, they show too large
+# a rate, which is on the safe side.
+_POWER_FIRST, _POWER_MORE = (8, 4), _MORE
 # So many more fixed-point iterations cost as much as the Jacobian and its inverse do.
 _SLOW = 24
 # Above so many unknowns fixed-point iteration is accelerated. For fewer, the arithmetic of
@@ -190,8 +191,11 @@ def sweep(limits: Limits, image: _Map, begin: Found, scale: _Map) -> Found:
 
 def _paced(times: int, y: PyTree[Array]) -> int:
     """How many of these iterations the precision of `y` takes."""
-    single = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).bits < 64
-    return times // 2 if single else times
+    return times // 2 if _is_single(y) else times
+
+
+def _is_single(y: PyTree[Array]) -> bool:
+    return jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).bits < 64
 
 
 def _root(x: Scalar, power: int) -> Scalar:
@@ -228,13 +232,11 @@ def sweep_blocks(
 
 
 def _by_sweeps(look: _Look, image: _Map, begin: Found, chords_follow: bool) -> Found:
-    num_first, num_more = _paced(_FIRST, begin.y), _paced(_MORE, begin.y)
-    power_first, power_more = (
-        _paced(_POWER_FIRST, begin.y),
-        _paced(_POWER_MORE, begin.y),
-    )
+    precision = int(_is_single(begin.y))
+    num_first, num_more = _FIRST[precision], _MORE[precision]
+    power_first, power_more = _POWER_FIRST[precision], _POWER_MORE[precision]
     # The same rate in either precision: a slower one has not stalled in fewer iterations.
-    halt = 0.5 ** (num_more / _MORE)
+    halt = 0.5 ** (num_more / _MORE[0])
 
     def advance(rounds: _Rounds) -> _Rounds:
         first = rounds.step == 0
