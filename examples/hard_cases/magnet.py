@@ -121,7 +121,7 @@ def monte_carlo(T: float, sweeps: int, shape=SHAPE) -> Means:
 
 
 def section(page: Page) -> str:
-    steps, sweeps = (200, 500) if page.quick else (2_000, 6_000)
+    steps, sweeps = (50, 100) if page.quick else (2_000, 6_000)
     Ts = [0.8, 2.0] if page.quick else [0.4, 1.0, 1.6, 2.2]
     h = 0.1
     print(f"\nHeisenberg magnet of {np.prod(SHAPE):,} spins, h = {h:g}")
