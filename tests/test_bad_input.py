@@ -273,6 +273,10 @@ def test_steps_of_several_sizes_are_announced_once():
     assert "(t1 - t0) / n" in message
     for t1, dt0 in ((1, 0.1), (100.0, 0.05), (0.7, 0.1)):
         assert announced(t1, dt0, weak) == []
+    assert announced(1.0, np.float32(0.1), weak) == []
+    y0 = jnp.array(0.0), jnp.array(1.0)  # Weakly typed: they become what times are.
+    (message,) = announced(1.0, np.float32(0.1), weak)
+    assert "The times are float32" in message
     # They do not even begin and end at cells.
     cells = ds.FixedStepBrownianPath((), jr.key(0), cell=0.1)
     with pytest.raises(

@@ -319,6 +319,13 @@ def check_times(path: diffrax.AbstractBrownianPath | None = None) -> None:
             raise ValueError(f"`{name}` of `diffeqsolve` must be {kind}; got {x}.")
     if path is None:
         return
+    dtype = jnp.result_type(*[x for x in times if x is not None])
+    if any(_narrowed(x, dtype) for x in jtu.tree_leaves(call["y0"])):
+        warnings.warn(
+            f"The times are {dtype}, which Diffrax makes the state, too: less precise than "
+            "`y0`. Pass numbers of Python as `t0`, `t1` and `dt0`.",
+            stacklevel=2,
+        )
     if cell is not None:
         for name, time in dict(t0=t0, t1=t1, dt0=dt0).items():
             if isinstance(time, number) and not _divides(cell, time):
@@ -345,6 +352,15 @@ def check_times(path: diffrax.AbstractBrownianPath | None = None) -> None:
     if cell is not None:
         raise ValueError(f"{message} With `cell` all steps must have one size.")
     warnings.warn(message, stacklevel=2)
+
+
+def _narrowed(x: Any, dtype: Any) -> bool:
+    """Whether Diffrax makes `x` less precise, if times are of this dtype. So it does with
+    numbers and what JAX made of them, such as `jnp.array(0.5)`."""
+    own = jnp.result_type(x)
+    if not jnp.issubdtype(own, jnp.floating):
+        return False
+    return jnp.finfo(jnp.result_type(x, dtype)).bits < jnp.finfo(own).bits
 
 
 def _divides(part: float, whole: float) -> bool:

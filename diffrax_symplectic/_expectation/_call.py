@@ -11,7 +11,14 @@ import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
-from ._estimate import checked_call, Expectation, Meter, NO_METER, run
+from ._estimate import (
+    checked_call,
+    Expectation,
+    ExpectationInterrupted,
+    Meter,
+    NO_METER,
+    run,
+)
 from ._pilot import choose, NO_SAMPLE
 from ._steps import AbstractSampling, Problem
 
@@ -121,9 +128,9 @@ def expectation(
     another key, of other shapes or with more paths, terms without noise, and for paths that
     `sampling` cannot use (it says which ones it can);
     [`diffrax_symplectic.ExpectationInterrupted`][], with the estimate so far, on an
-    interrupt from the keyboard. Warns if `tol` was not reached, if more than one path in a
-    hundred failed, and where rounding in single precision may be more than the standard
-    error.
+    interrupt from the keyboard, once the sampling is chosen. Warns if `tol` was not
+    reached, if more than one path in a hundred failed, and where rounding in single
+    precision may be more than the standard error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for the formula by which means
@@ -141,7 +148,11 @@ def expectation(
     # It is shown while trials run, too.
     with Meter(progress_meter) as meter:
         if sampling is None:
-            sampling, plan = choose(problem, k_pilot, tol, devices)
+            try:
+                sampling, plan = choose(problem, k_pilot, tol, devices)
+            except ExpectationInterrupted:
+                # A trial's samples are not those of an estimate, to go on from.
+                raise KeyboardInterrupt from None
         else:
             plan = sampling.prepare(problem, k_pilot, devices)
         if start is not None:

@@ -176,7 +176,7 @@ IndexedNoise.__init__.__doc__ = """**Arguments:**
 
 - `H`: `H(k, t, p, q, args)`, the Hamiltonian of the noise `k`, a scalar. A function, or
     a Module with parameters. `k` is a traced integer from `0` to `m - 1`: index arrays
-    with it.
+    with it. (Beyond the end of an array JAX takes its last entry.)
 - `m`: the number of noises.
 
 **Raises:** a `ValueError` if `H` is not callable or `m` not a positive integer; and, while

@@ -264,6 +264,19 @@ def test_the_quickest_sampling_is_chosen_and_gone_on_with():
     assert isinstance(gaussian.sampling, ds.IndependentPaths)
 
 
+def test_from_an_interrupted_trial_nobody_is_told_to_go_on(monkeypatch):
+    class Interrupting:
+        def step(self, progress):
+            raise KeyboardInterrupt
+
+    run = _pilot.run
+    trial = lambda *args, **kwargs: run(*args, **kwargs, meter=Interrupting())
+    monkeypatch.setattr(_pilot, "run", trial)
+    with pytest.raises(KeyboardInterrupt) as info:
+        _estimate(None)
+    assert info.type is KeyboardInterrupt
+
+
 def test_the_reason_says_why_others_were_not_taken():
     path = ds.FixedStepBrownianPath((), KEY)
     plain = _estimate(None, tol=0.5)
