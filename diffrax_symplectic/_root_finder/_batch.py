@@ -34,16 +34,22 @@ def _(size, in_batched, flag):
     return any_of_batch(jnp.any(flag, 0) if in_batched[0] else flag), False
 
 
-@jax.custom_jvp
+# Outside of a program, arrays of NumPy may be batched, for which JAX has not these rules.
+@jax.jit
 def batched_together(values: _T, others: PyTree = ()) -> _T:
     """The same `values`, all of them batched if one is, or one of the `others`. JAX batches
     what is in a loop anew whenever one more of its values turns out to be batched."""
+    return _differentiable(values, others)
+
+
+@jax.custom_jvp
+def _differentiable(values: _T, others: PyTree) -> _T:
     return _batched_together(values, others)
 
 
-@batched_together.defjvp
+@_differentiable.defjvp
 def _(primals, tangents):
-    return batched_together(*primals), tangents[0]
+    return _differentiable(*primals), tangents[0]
 
 
 @jax.custom_batching.custom_vmap
