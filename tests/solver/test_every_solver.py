@@ -194,7 +194,7 @@ def test_steps_of_a_thousand_random_systems_are_symplectic(solver):
     _assert_symplectic(solver, jnp.float64, 1e-13)
 
 
-@each(core([s for s in DEFAULTS if repr(s) in CORE], CORE[:2]))
+@each(core([s for s in DEFAULTS if repr(s) in CORE[:3]], CORE[:2]))
 def test_steps_in_single_precision_are_symplectic(solver):
     _assert_symplectic(solver, jnp.float32, 5e-6)
 
@@ -203,7 +203,7 @@ def test_steps_in_single_precision_are_symplectic(solver):
 def test_steps_in_single_precision_are_those_in_double_precision(solver):
     # Which are symplectic. Their derivatives are more than half of a program.
     x = batch(solver.structure, jnp.float32)
-    y1, _, success = program(solver, jnp.float32, repr(solver) in CORE)(x)
+    y1, _, success = program(solver, jnp.float32, repr(solver) in CORE[:3])(x)
     assert y1.dtype == jnp.float32
     assert np.all(success)
     doubled = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), x)

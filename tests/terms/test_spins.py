@@ -98,6 +98,22 @@ def test_spinors_of_spins_give_them_back_with_their_derivatives_everywhere(dtype
 
 # A symplectic step for (p, q) is a Poisson map for s, whatever the solver, and every solver
 # has a test that its steps are symplectic. So here is one for each kind of step.
+@ft.cache
+def _thousand_systems():
+    """States, parameters, step sizes and random variables."""
+
+    def draw(key):
+        k_problem, k_h, k_W, k_A, k_coin = jr.split(key, 5)
+        s0, args = _problem(k_problem, 2, 3, float)
+        # Uniform in the logarithm over [1e-3, 0.2].
+        h = jnp.exp(jr.uniform(k_h, (), float, jnp.log(1e-3), jnp.log(0.2)))
+        W = jnp.sqrt(h) * jnp.clip(jr.normal(k_W, (3,)), -2.5, 2.5)
+        A = h / 2 * jr.normal(k_A, (3, 3))
+        return s0, args, h, W, A - A.T, jr.rademacher(k_coin, (3,), float)
+
+    return jax.jit(jax.vmap(draw))(jr.split(jr.key(0), 1000))
+
+
 @pytest.mark.parametrize(
     "solver, dtype, bound",
     [
@@ -110,19 +126,13 @@ def test_spinors_of_spins_give_them_back_with_their_derivatives_everywhere(dtype
     ids=["ImplicitMidpoint", "float32", "SRKw1", "NinomiyaVictoir", "LevyAreaMidpoint"],
 )
 def test_step_is_a_poisson_map_for_a_thousand_random_systems(solver, dtype, bound):
-    def defect(key):
-        k_problem, k_h, k_W, k_A, k_coin = jr.split(key, 5)
-        s0, args = _problem(k_problem, 2, 3, dtype)
-        # Uniform in the logarithm over [1e-3, 0.2].
-        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
-        W = jnp.sqrt(h) * jnp.clip(jr.normal(k_W, (3,), dtype), -2.5, 2.5)
-        A = h / 2 * jr.normal(k_A, (3, 3), dtype)
-        coin = jr.rademacher(k_coin, (3,), dtype)
-        terms = ds.spin_terms(H0, noise, Given(W, A=A - A.T, two_point=coin))
+    def defect(s0, args, h, W, A, coin):
+        terms = ds.spin_terms(H0, noise, Given(W, A=A, two_point=coin))
         y0 = ds.to_spinors(s0)
         return ds.poisson_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
 
-    defects = jax.jit(jax.vmap(defect))(jr.split(jr.key(0), 1000))
+    systems = jax.tree.map(dtype, _thousand_systems())
+    defects = jax.jit(jax.vmap(defect))(*systems)
     assert defects.dtype == dtype
     assert jnp.max(defects) <= bound
 
