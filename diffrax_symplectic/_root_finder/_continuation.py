@@ -91,6 +91,10 @@ class Progress(NamedTuple):
         """Whether even the search for any solution has left where there are values."""
         return self.lost & ~jnp.isfinite(self.size)
 
+    @property
+    def ended(self) -> Bool[Array, ""]:
+        return self.solved | self.hopeless
+
     def packed(self) -> _Vector:
         return jnp.concatenate([self.k, jnp.stack(self[1:5]), self.anchor])
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
+from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._compat import ω
@@ -19,6 +20,9 @@ from ._tolerance import Tolerance
 
 
 _MOST_DIRECT = 6
+# Iterations of Newton's method in a step of the search: to gather paths from a large batch,
+# and to put them back, takes longer than several of these.
+ITERATIONS = 8
 
 
 # Where the search stands, `Progress` in one array: loops select, gather and scatter each
@@ -42,14 +46,14 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     are accelerated by second-order Richardson iteration (Golub and Varga, Numerische
     Mathematik 3, 1961), for the imaginary eigenvalues that oscillations have.
 
-    The paths that are left are gathered from the batch. For these, each step is one of
-    Newton's method. Its linear systems are solved by elimination up to 32 unknowns, and
-    above by GMRES, which needs no matrix. If its corrections do not shrink, it solves for
-    a part of the time step, with increments reduced alike, and goes on from there part by
-    part (continuation). If the branch of solutions that begins at the start of the step
-    ends before the whole step, Newton's method looks for any other solution. A small
-    correction is no success where its linear system was not solved, or where the residual
-    is larger than the state.
+    The paths that are left are gathered from the batch. For these, a step of the search is
+    up to eight iterations of Newton's method. Its linear systems are solved by elimination
+    up to 32 unknowns, and above by GMRES, which needs no matrix. If its corrections do not
+    shrink, it solves for a part of the time step, with increments reduced alike, and goes
+    on from there part by part (continuation). If the branch of solutions that begins at the
+    start of the step ends before the whole step, Newton's method looks for any other
+    solution. A small correction is no success where its linear system was not solved, or
+    where the residual is larger than the state.
 
     **Arguments:**
 
@@ -69,7 +73,8 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     With `options={"blocks": fs}` the unknowns are a list, and the equations come in blocks,
     each of which reads those before it: `fs[i](k)` returns the function whose fixed point
     is `k[i]`. First iterations then solve one block after another. Nothing waits for the
-    solution where `options={"lost": flag}` is true, and there it is of no use.
+    solution where `options={"lost": flag}` is true, and there it is of no use. Of Newton's
+    method there are `options={"iterations": n}` in a step, or eight.
 
     **Raises:** a `ValueError` for negative numbers, or `direct` above 6.
     """
@@ -133,9 +138,14 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         # `y` stays where the search began, and the state says how far it has come from
         # there. In the end `postprocess` moves `y`, and evaluates `fn` once more.
         equations = Equations(fn, args, options, y)
-        progress = Progress.unpacked(state)
-        pending = ~(progress.solved | progress.hopeless)
-        newton = ft.partial(advance, self.tolerance, self.linear_solver, equations)
+        pending = ~Progress.unpacked(state).ended
+        once = ft.partial(advance, self.tolerance, self.linear_solver, equations)
+
+        def another(_, state):
+            return jnp.where(Progress.unpacked(state).ended, state, once(state))
+
+        times = options.get("iterations", ITERATIONS)
+        newton = lambda state: lax.fori_loop(0, times, another, state)
         return y, where_pending(newton, pending, state), fn(y, args)[1]
 
     def terminate(

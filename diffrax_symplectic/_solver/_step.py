@@ -2,6 +2,7 @@
 as what they define."""
 
 import functools as ft
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
@@ -21,6 +22,7 @@ from .._root_finder import (
     all_finite,
     batched_together,
     differentiate,
+    ITERATIONS,
     PicardNewton,
 )
 from .._tableau import FlatTableau, Stage
@@ -281,6 +283,7 @@ def _solved(stages: Stages, lost: Bool[Array, ""], finder: Any, max_steps: int):
     if not isinstance(finder, PicardNewton):
         # That one begins with this.
         guess = stages.image(guess)
+    iterations = min(ITERATIONS, max_steps) if isinstance(finder, PicardNewton) else 1
     numbers = range(len(stages.plan.blocks))
     sol = optx.root_find(
         lambda k, stages: (k**ω - stages.image(k) ** ω).ω,
@@ -291,8 +294,9 @@ def _solved(stages: Stages, lost: Bool[Array, ""], finder: Any, max_steps: int):
             scale=stages.scale,
             blocks=[ft.partial(stages.image_of, i) for i in numbers],
             lost=lost,
+            iterations=iterations,
         ),
-        max_steps=max_steps,
+        max_steps=math.ceil(max_steps / max(iterations, 1)),
         throw=False,
     )
     unsolved = lost | (sol.result != optx.RESULTS.successful)
