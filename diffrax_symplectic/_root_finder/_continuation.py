@@ -16,6 +16,9 @@ from ._tolerance import all_finite, converged, largest, ratio, Tolerance
 
 
 _Vector: TypeAlias = Float[Array, " n"]
+# `Progress` in one array: a loop selects, gathers and scatters each array of its state by
+# kernels of their own.
+Packed: TypeAlias = Float[Array, " m"]
 
 # How many iterations Newton's method for all of the step has before corrections must
 # shrink. From a poor guess the first few may well grow and the method still converge.
@@ -95,11 +98,11 @@ class Progress(NamedTuple):
     def ended(self) -> Bool[Array, ""]:
         return self.solved | self.hopeless
 
-    def packed(self) -> _Vector:
+    def packed(self) -> Packed:
         return jnp.concatenate([self.k, jnp.stack(self[1:5]), self.anchor])
 
     @staticmethod
-    def unpacked(x: _Vector) -> "Progress":
+    def unpacked(x: Packed) -> "Progress":
         n = (x.size - 4) // 2
         target, reached, tries, size = x[n : n + 4]
         return Progress(x[:n], target, reached, tries, size, x[n + 4 :])
@@ -109,7 +112,7 @@ class Progress(NamedTuple):
 _SOLVED, _LOST = 2, -1
 
 
-def begin(k: _Vector, solved: Bool[Array, ""]) -> _Vector:
+def begin(k: _Vector, solved: Bool[Array, ""]) -> Packed:
     """First all of the step at once, from the guess `k`."""
     target = jnp.where(solved, _SOLVED, 1).astype(k.dtype)
     # All else is zero.
@@ -120,8 +123,8 @@ def advance(
     tolerance: Tolerance,
     linear_solver: lx.AbstractLinearSolver | None,
     equations: Equations,
-    packed: _Vector,
-) -> _Vector:
+    packed: Packed,
+) -> Packed:
     """One iteration of Newton's method."""
     progress = Progress.unpacked(packed)
     restore = jfu.ravel_pytree(equations.origin)[1]
@@ -142,7 +145,7 @@ def _correct(
     residual: _Vector,
     diff: _Vector,
     exact: BoolScalarLike,
-) -> _Vector:
+) -> Packed:
     """What follows from the correction `diff` for a residual; `exact` says whether its
     linear system was solved."""
     s, k = progress.target, progress.k - diff

@@ -1,6 +1,6 @@
 import functools as ft
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,11 +10,11 @@ import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, Bool, Float, PyTree, Scalar
+from jaxtyping import Array, Bool, PyTree, Scalar
 
 from .._compat import ω
 from ._batch import where_pending
-from ._continuation import advance, begin, Equations, Progress
+from ._continuation import advance, begin, Equations, Packed, Progress
 from ._sweeps import Found, Limits, sweep, sweep_blocks
 from ._tolerance import Tolerance
 
@@ -25,12 +25,7 @@ _MOST_DIRECT = 6
 ITERATIONS = 8
 
 
-# Where the search stands, `Progress` in one array: loops select, gather and scatter each
-# array of its state by kernels of their own.
-_State: TypeAlias = Float[Array, " m"]
-
-
-class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _State]):
+class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Packed]):
     r"""For stage equations $k = \Phi(k)$, given as $k - \Phi(k) = 0$: solves them to
     rounding error, cheaply when the step is small and robustly when it is not.
 
@@ -111,7 +106,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         f_struct: PyTree[jax.ShapeDtypeStruct],
         aux_struct: PyTree[jax.ShapeDtypeStruct],
         tags: frozenset[object],
-    ) -> _State:
+    ) -> Packed:
         del f_struct, aux_struct, tags
         equations = Equations(fn, args, options, y)
         lost = options.get("lost", jnp.array(False))
@@ -131,9 +126,9 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         y: PyTree[Array],
         args: PyTree[Any],
         options: dict[str, Any],
-        state: _State,
+        state: Packed,
         tags: frozenset[object],
-    ) -> tuple[PyTree[Array], _State, Any]:
+    ) -> tuple[PyTree[Array], Packed, Any]:
         del tags
         # `y` stays where the search began, and the state says how far it has come from
         # there. In the end `postprocess` moves `y`, and evaluates `fn` once more.
@@ -154,7 +149,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         y: PyTree[Array],
         args: PyTree[Any],
         options: dict[str, Any],
-        state: _State,
+        state: Packed,
         tags: frozenset[object],
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         del fn, y, args, options, tags
@@ -171,7 +166,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         aux: Any,
         args: PyTree[Any],
         options: dict[str, Any],
-        state: _State,
+        state: Packed,
         tags: frozenset[object],
         result: optx.RESULTS,
     ) -> tuple[PyTree[Array], Any, dict[str, Any]]:
