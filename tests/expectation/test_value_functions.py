@@ -23,6 +23,7 @@ from diffrax_symplectic._expectation._fits import (
 )
 from diffrax_symplectic._terms import outcomes, step_variables
 
+from ..picard import by_picard
 from ..problems import kubo_terms, RecordingMeter
 
 
@@ -32,7 +33,7 @@ SQUARE = lambda t, y, args: y[1] ** 2
 VERLET = ds.StormerVerlet()
 WEAK = ds.WeakBrownianPath((), KEY)
 # Made once, so that JAX compiles programs of them once.
-KUBO, MIDPOINT = kubo_terms(WEAK), ds.ImplicitMidpoint()
+KUBO, MIDPOINT = kubo_terms(WEAK), by_picard(ds.ImplicitMidpoint())
 
 
 def _pendulum(path):
@@ -83,7 +84,10 @@ def test_rare_paths_that_leave_the_grid_do_not_move_the_mean():
     quartic = lambda t, p, q, args: (p**2 + q**2) / 2 + 0.1 * (p**4 + q**4)
     noise = lambda t, p, q, args: 0.3 * jnp.stack([p * q, (q**2 - p**2) / 2])
     path = ds.WeakBrownianPath((2,), KEY, two_point=True)
-    terms, solver = ds.hamiltonian_terms(quartic, noise, path), ds.NinomiyaVictoir()
+    terms, solver = (
+        ds.hamiltonian_terms(quartic, noise, path),
+        by_picard(ds.NinomiyaVictoir()),
+    )
     got = _estimate(ds.ValueFunctions(), terms, solver, t1=0.75, key=KEY)
     exact = _enumerated(terms, solver, Y0, SQUARE, 0.25, 3)
     assert got.std_error <= 3e-9
@@ -119,7 +123,7 @@ def test_linear_systems_and_quadratic_functions_are_closed(dtype):
     told = pytest.warns(UserWarning, match="over 10 steps in float32")
     with told if dtype == jnp.float32 else contextlib.nullcontext():
         got = _estimate(
-            ds.ValueFunctions(2, 600), terms, ds.ImplicitMidpoint(), phi, dt0=0.1,
+            ds.ValueFunctions(2, 600), terms, MIDPOINT, phi, dt0=0.1,
             y0=y0, ts=[0.0, 1.0],
         )  # fmt: skip
     # From (p, q) = (0, 1) the oscillator is at (-sin, cos) of the angle.
