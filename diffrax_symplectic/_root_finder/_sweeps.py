@@ -21,7 +21,7 @@ from ._tolerance import converged, largest, ratio, Tolerance
 _Map = Callable[[PyTree[Array]], PyTree[Array]]
 
 # The numbers of iterations between two looks at the error are for double precision. In
-# single precision half as many reach rounding error, or where it says so.
+# single precision half as many reach rounding error, unless another number is given.
 # Up to so many unknowns chords follow at once: they cost no more than a look at the error.
 _AT_ONCE = 2
 # Fixed-point iterations before these, and by how much the last of them may change the

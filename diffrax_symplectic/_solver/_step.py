@@ -280,10 +280,10 @@ def _implicit_step(
 def _solved(stages: Stages, lost: Bool[Array, ""], finder: Any, max_steps: int):
     guess = [stages.zero_of(block) for block in stages.plan.blocks]
     guess = batched_together(guess, stages.y0)
+    iterations = min(ITERATIONS, max_steps)
     if not isinstance(finder, PicardNewton):
         # That one begins with this.
-        guess = stages.image(guess)
-    iterations = min(ITERATIONS, max_steps) if isinstance(finder, PicardNewton) else 1
+        guess, iterations = stages.image(guess), 1
     numbers = range(len(stages.plan.blocks))
     sol = optx.root_find(
         lambda k, stages: (k**ω - stages.image(k) ** ω).ω,

@@ -84,10 +84,8 @@ def test_rare_paths_that_leave_the_grid_do_not_move_the_mean():
     quartic = lambda t, p, q, args: (p**2 + q**2) / 2 + 0.1 * (p**4 + q**4)
     noise = lambda t, p, q, args: 0.3 * jnp.stack([p * q, (q**2 - p**2) / 2])
     path = ds.WeakBrownianPath((2,), KEY, two_point=True)
-    terms, solver = (
-        ds.hamiltonian_terms(quartic, noise, path),
-        by_picard(ds.NinomiyaVictoir()),
-    )
+    terms = ds.hamiltonian_terms(quartic, noise, path)
+    solver = by_picard(ds.NinomiyaVictoir())
     got = _estimate(ds.ValueFunctions(), terms, solver, t1=0.75, key=KEY)
     exact = _enumerated(terms, solver, Y0, SQUARE, 0.25, 3)
     assert got.std_error <= 3e-9

@@ -96,8 +96,6 @@ def test_spinors_of_spins_give_them_back_with_their_derivatives_everywhere(dtype
     assert np.max(sizes) <= 32 * eps
 
 
-# A symplectic step for (p, q) is a Poisson map for s, whatever the solver, and every solver
-# has a test that its steps are symplectic. So here is one for each kind of step.
 @ft.cache
 def _thousand_systems():
     """States, parameters, step sizes and random variables."""
@@ -114,6 +112,8 @@ def _thousand_systems():
     return jax.jit(jax.vmap(draw))(jr.split(jr.key(0), 1000))
 
 
+# A symplectic step for (p, q) is a Poisson map for s, whatever the solver, and every solver
+# has a test that its steps are symplectic. So here is one for each kind of step.
 @pytest.mark.parametrize(
     "solver, dtype, bound",
     [
