@@ -41,6 +41,11 @@ class Stage(NamedTuple):
     reads: str
     writes: str
 
+    @property
+    def kind(self) -> tuple[tuple[str, ...], str, str]:
+        """Stages of one kind evaluate the same vector field."""
+        return self.channels, self.reads, self.writes
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FlatTableau:

@@ -301,30 +301,35 @@ def _by_richardson(look: _Look, image: _Map, begin: Found) -> Found:
         before, y = lax.fori_loop(0, pairs, pair, (before, y))
         # It is read several times.
         end = materialize(lambda: image(y))
-        # On its way back from where iteration led away, the state's size changes much.
-        whole, scales = _begun(look, end)
-        earlier = jnp.where(begins, whole, rounds.size)
-        root = lambda x: x ** (1 / (2 * pairs + jnp.where(first, 0, 1)))
         step = rounds.step + 2 * pairs + 1
-        # Fast oscillations shrink unevenly from round to round.
-        halt = jnp.where(a > 1, 0.9, 0.5)
-        change = (end**ω - y**ω).ω
-        new = look.at(end, change, earlier, scales, root, step, halt)
 
-        rate, damped = root(ratio(new.size, earlier)), 1 - weight
-        # Where iteration leads away, it begins once more at zero, with the new weight.
-        anew = ~(new.size < earlier)
-        # If an entry is NaN, so is the rate, and all of these are true.
-        wrong = ~(rate**2 <= damped) & (anew | (rounds.step <= 2 * num_first + 1))
-        a = jnp.where(wrong, (rate + damped / rate) / weight, a)
-        weight = _weight(a)
-        lost = anew & ~(a <= _FASTEST)
-        going = ~new.solved & ~lost & (step < look.limits.steps)
+        def judged() -> tuple[_Rounds, Scalar, Scalar, Bool[Array, ""]]:
+            # On its way back from where iteration led away, the state's size changes much.
+            whole, scales = _begun(look, end)
+            earlier = jnp.where(begins, whole, rounds.size)
+            root = lambda x: x ** (1 / (2 * pairs + jnp.where(first, 0, 1)))
+            # Fast oscillations shrink unevenly from round to round.
+            halt = jnp.where(a > 1, 0.9, 0.5)
+            change = (end**ω - y**ω).ω
+            new = look.at((), change, earlier, scales, root, step, halt)
+
+            rate, damped = root(ratio(new.size, earlier)), 1 - weight
+            # Where iteration leads away, it begins once more at zero, with the new weight.
+            anew = ~(new.size < earlier)
+            # If an entry is NaN, so is the rate, and all of these are true.
+            wrong = ~(rate**2 <= damped) & (anew | (rounds.step <= 2 * num_first + 1))
+            other = jnp.where(wrong, (rate + damped / rate) / weight, a)
+            lost = anew & ~(other <= _FASTEST)
+            going = ~new.solved & ~lost & (step < look.limits.steps)
+            return new._replace(going=going), other, _weight(other), anew
+
+        # It decides over every array of the state.
+        new, a, weight, anew = materialize(judged)
         ahead = _toward(before, end, weight)
         pick = lambda x, y: jnp.where(new.solved, x, jnp.where(anew, 0, y))
         before = jtu.tree_map(lambda y: jnp.where(anew, 0, y), y)
         y = jtu.tree_map(pick, end, ahead)
-        return new._replace(y=(before, y, a, anew), going=going)
+        return new._replace(y=(before, y, a, anew))
 
     first = _first(look, begin)
     y = begin.y, begin.y, first.size, jnp.array(True)

@@ -2,6 +2,7 @@
 as what they define."""
 
 import functools as ft
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
@@ -83,12 +84,15 @@ class Stages(eqx.Module):
         return image
 
     def _image(self, block: Block, known: Values, k: list[_Value]) -> list[_Value]:
-        """Each group of stages reads what the groups before it have become (Gauss-Seidel),
+        """Stages of each kind read what those of the kinds before have become (Gauss-Seidel),
         which takes fewer iterations than to evaluate all at once."""
         values, image = self._with_block(block, known, k), []
-        for group in block.unknown:
-            image.append(self._evaluate_group(group, values))
-            values = values | _unstack(group, image[-1])
+        kind = lambda group: self.plan.tableau.stages[group[0]].kind
+        for _, groups in itertools.groupby(block.unknown, kind):
+            new = {group: self._evaluate_group(group, values) for group in groups}
+            image.extend(new.values())
+            for group, value in new.items():
+                values = values | _unstack(group, value)
         return image
 
     def _with_block(
