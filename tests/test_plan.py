@@ -125,7 +125,10 @@ def _check_blocks(plan):
         for group in (*block.unknown, *block.explicit):
             assert list(group) == sorted(group) and len({*map(kind, group)}) == 1
         unknown = [i for group in block.unknown for i in group]
-        assert len(block.unknown) == len({*map(kind, unknown)})
+        # All in one group, or of several kinds, each alone, those of a kind in a row.
+        kinds = {*map(kind, unknown)}
+        assert len(block.unknown) == (len(kinds) if len(kinds) < 2 else len(unknown))
+        assert len(kinds) == len([*itertools.groupby(unknown, kind)])
         known |= {*unknown}
         for group in block.explicit:
             assert known.issuperset(np.flatnonzero(depends[list(group)].any(0)))

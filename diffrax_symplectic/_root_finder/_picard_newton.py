@@ -38,8 +38,9 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Pa
     not converge: fixed-point (Picard) iterations, which need no Jacobian. Where these are
     slow, and at once for two unknowns or fewer, chord iterations follow up to `direct`
     unknowns: those of Newton's method with one Jacobian. For more than 24 unknowns they
-    are accelerated by second-order Richardson iteration (Golub and Varga, Numerische
-    Mathematik 3, 1961), for the imaginary eigenvalues that oscillations have.
+    are accelerated (in single precision where they are slow) by second-order Richardson
+    iteration (Golub and Varga, Numerische Mathematik 3, 1961), for the imaginary
+    eigenvalues that oscillations have.
 
     The paths that are left are gathered from the batch. For these, a step of the search is
     up to eight iterations of Newton's method. Its linear systems are solved by elimination

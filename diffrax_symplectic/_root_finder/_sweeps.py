@@ -40,6 +40,9 @@ _SLOW = 24
 # Above so many unknowns fixed-point iteration is accelerated. For fewer, the arithmetic of
 # that costs more than the iterations that it saves.
 _MANY = 24
+# In single precision few iterations are left once their rate is known: it is accelerated
+# where it would take more than these, the first of which come before the look at the rate.
+_SLOW_FOR_MANY, _FIRST_OF_MANY = 32, 5
 # Pairs of accelerated iterations before the first look at the error, and between two
 # looks: more of them where fixed-point iteration would be slower than this rate. The look
 # itself is one iteration more.
@@ -165,8 +168,8 @@ def _while_any(
 
 def sweep(limits: Limits, image: _Map, begin: Found, scale: _Map) -> Found:
     r"""From where it `begin`s, solves $y = \Phi(y)$ by $y \leftarrow y + M (\Phi(y) - y)$:
-    fixed-point iteration with $M = 1$, and chord iteration with $M = (1 - \Phi')^{-1}$
-    where that is slow, or for many unknowns an accelerated iteration."""
+    fixed-point iteration with $M = 1$, and where that is slow, chord iteration with
+    $M = (1 - \Phi')^{-1}$, or for many unknowns an accelerated iteration."""
     y = begin.y
     n = sum(x.size for x in jtu.tree_leaves(y))
     direct = n <= limits.direct
@@ -179,13 +182,18 @@ def sweep(limits: Limits, image: _Map, begin: Found, scale: _Map) -> Found:
         settled = largest(last) < _SETTLED * largest(whole)
         y = jtu.tree_map(lambda a, b: jnp.where(settled, a, b), swept, y)
         return _by_chords(limits, image, scale, begin._replace(y=y))
-    if not direct and n > _MANY:
-        return _by_richardson(_Look(limits, scale, limits.steps), image, begin)
-    slow = _SLOW if direct else limits.steps
-    found = _by_sweeps(_Look(limits, scale, slow), image, begin, chords_follow=direct)
-    if not direct:
+    most, first, rest = limits.steps, _FIRST[_is_single(y)], None
+    if direct:
+        most, rest = _SLOW, ft.partial(_by_chords, limits, image, scale)
+    elif n > _MANY:
+        rest = ft.partial(_by_richardson, _Look(limits, scale, limits.steps), image)
+        if not _is_single(y):
+            return rest(begin)
+        most, first = _SLOW_FOR_MANY, _FIRST_OF_MANY
+    look = _Look(limits, scale, most)
+    found = _by_sweeps(look, image, begin, first, leave_together=rest is not None)
+    if rest is None:
         return found
-    rest = lambda found: _by_chords(limits, image, scale, found)
     return lax.cond(any_of_batch(~found.solved), rest, lambda found: found, found)
 
 
@@ -231,9 +239,11 @@ def sweep_blocks(
     return Found(y, solved, near)
 
 
-def _by_sweeps(look: _Look, image: _Map, begin: Found, chords_follow: bool) -> Found:
+def _by_sweeps(
+    look: _Look, image: _Map, begin: Found, num_first: int, leave_together: bool
+) -> Found:
     precision = int(_is_single(begin.y))
-    num_first, num_more = _FIRST[precision], _MORE[precision]
+    num_more = _MORE[precision]
     power_first, power_more = _POWER_FIRST[precision], _POWER_MORE[precision]
     # The same rate in either precision: a slower one has not stalled in fewer iterations.
     halt = 0.5 ** (num_more / _MORE[0])
@@ -251,7 +261,7 @@ def _by_sweeps(look: _Look, image: _Map, begin: Found, chords_follow: bool) -> F
         step = rounds.step + count
         return look.at(y, change, earlier, scales, root, step, halt)
 
-    return _while_any(advance, _first(look, begin), leave_together=chords_follow)
+    return _while_any(advance, _first(look, begin), leave_together)
 
 
 def _first(look: _Look, begin: Found) -> _Rounds:
@@ -331,8 +341,9 @@ def _by_richardson(look: _Look, image: _Map, begin: Found) -> Found:
         y = jtu.tree_map(pick, end, ahead)
         return new._replace(y=(before, y, a, anew))
 
-    first = _first(look, begin)
-    y = begin.y, begin.y, first.size, jnp.array(True)
+    first, from_here = _first(look, begin), begin.solved | begin.near
+    y = jtu.tree_map(lambda y: jnp.where(from_here, y, 0), begin.y)
+    y = y, y, first.size, jnp.array(True)
     found = _while_any(advance, first._replace(y=y))
     return found._replace(y=found.y[1])
 

@@ -84,8 +84,8 @@ class Stages(eqx.Module):
         return image
 
     def _image(self, block: Block, known: Values, k: list[_Value]) -> list[_Value]:
-        """Stages of each kind read what those of the kinds before have become (Gauss-Seidel),
-        which takes fewer iterations than to evaluate all at once."""
+        """Stages of each kind read what those of the kinds before have become, which takes
+        fewer iterations than to evaluate all at once (Gauss-Seidel)."""
         values, image = self._with_block(block, known, k), []
         kind = lambda group: self.plan.tableau.stages[group[0]].kind
         for _, groups in itertools.groupby(block.unknown, kind):
