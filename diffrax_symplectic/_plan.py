@@ -158,8 +158,7 @@ def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
     """Groups the stages that evaluate the same vector field."""
     groups: dict[tuple, list[int]] = {}
     for i in stages:
-        stage = tableau.stages[i]
-        groups.setdefault(stage.kind, []).append(i)
+        groups.setdefault(tableau.stages[i].kind, []).append(i)
     return tuple(map(tuple, groups.values()))
 
 

@@ -117,7 +117,7 @@ def _check_blocks(plan):
     """That the blocks can be carried out in order, and that the unknowns are as few as
     possible."""
     depends = plan.tableau.matrix != 0
-    kind = lambda i: plan.tableau.stages[i]._replace(c=0)
+    kind = lambda i: plan.tableau.stages[i].kind
     known: set[int] = set()
     for block in plan.blocks:
         members = [i for group in (*block.unknown, *block.explicit) for i in group]
