@@ -62,6 +62,8 @@ def compile_quickly() -> None:
             os.environ.get("XLA_FLAGS", ""),
             "--xla_cpu_use_fusion_emitters=false",
             "--xla_backend_optimization_level=1",
+            # Of small programs the parts are not worth threads of their own.
+            "--xla_cpu_parallel_codegen_split_count=1",
         )
         os.environ["XLA_FLAGS"] = " ".join(flags)
 

@@ -37,6 +37,7 @@ from ._orders import (
     plot_orders,
     quasi_weak_error,
     report,
+    resolved,
     second_moments,
     strong_errors,
 )
@@ -217,8 +218,9 @@ def figure_2a(full: bool) -> None:
         moment_map = exact_moment_map(make_terms, path, solver, Y0)
         exact[name] = exact_weak_error(moment_map, Y0, lambda m: m[1, 1], value, hs)
         sampled[name] = quasi_weak_error(
-            make_terms, path, solver, Y0, lambda y: y[1] ** 2, value, hs[:5], paths
-        )
+            make_terms, path, solver, Y0, lambda y: y[1] ** 2, value,
+            resolved(hs[:5], full), paths,
+        )  # fmt: skip
     report("exact", exact)
     report("quasi-Monte Carlo", sampled)
     figure, axes = plt.subplots(figsize=(6, 4.5))
