@@ -10,9 +10,8 @@ import lineax as lx
 from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._compat import ω
-from .._custom_types import BoolScalarLike
-from ._linear import linearized, solve
-from ._tolerance import all_finite, converged, largest, ratio, Tolerance
+from ._linear import correction
+from ._tolerance import all_finite, converged, largest, max_norm, ratio, Tolerance
 
 
 _Vector: TypeAlias = Float[Array, " n"]
@@ -129,46 +128,27 @@ def advance(
     progress = Progress.unpacked(packed)
     restore = jfu.ravel_pytree(equations.origin)[1]
     residual = lambda k: jfu.ravel_pytree(equations.residual(restore(k)))[0]
-    s, k = progress.target, progress.k
-    # Of the residual `r` at `k`, and of its derivative.
-    part = lambda k, r: (1 - s) * k + s * r
-    value, jacobian = linearized(residual, k, linear_solver)
-    apply = lambda x: part(x, jacobian(x))
-    diff, exact = solve(apply, part(k, value), linear_solver)
-    return _correct(tolerance, equations, progress, value, diff, exact)
+    s, whole = progress.target, progress.target == 1
+    part = lambda k: (1 - s) * k + s * residual(k)
+    value, diff, exact = correction(part, progress.k, linear_solver)
 
-
-def _correct(
-    tolerance: Tolerance,
-    equations: Equations,
-    progress: Progress,
-    residual: _Vector,
-    diff: _Vector,
-    exact: BoolScalarLike,
-) -> Packed:
-    """What follows from the correction `diff` for a residual; `exact` says whether its
-    linear system was solved."""
-    s, k = progress.target, progress.k - diff
-    restore = jfu.ravel_pytree(equations.origin)[1]
+    k = progress.k - diff
     scales = tolerance.sizes(equations.scale(restore(k)))
-    change, moved, residuals = (
-        tolerance.sizes(restore(x)) for x in (diff, progress.k, residual)
-    )
-    size, below = tolerance.compare(change, scales)
+    size, below = tolerance.compare(tolerance.sizes(restore(diff)), scales)
     shrink = jnp.where(progress.tries > 0, ratio(size, progress.size), 1)
-    whole = s == 1
     solved = whole & converged(size, below, shrink, shrink >= 0.25)
     # Far from all solutions rounding errors of a large Jacobian hide the unknowns that it
     # multiplies least. Then corrections are small where residuals are larger than states.
-    state_size = jnp.maximum(largest(scales), largest(moved)) + tolerance.atol
-    solved &= exact & (largest(residuals) <= state_size) & all_finite(k)
+    moved = max_norm(progress.k)
+    state_size = jnp.maximum(largest(scales), moved) + tolerance.atol
+    solved &= exact & (max_norm(value) <= state_size) & all_finite(k)
 
     at_once = whole & (progress.reached == 0)
     patience = jnp.where(at_once, _PATIENCE, 2)
     # No correction at all, if that is not the solution, is no progress either.
     shrinks = (shrink < _SHRINK) & (size > 0)
     stalled = (progress.tries + 1 >= patience) & ~shrinks
-    near = largest(change) < _LOOSE * largest(moved)
+    near = max_norm(diff) < _LOOSE * moved
     arrived = near & ~whole
     slow = ~whole & (progress.tries + 1 >= _PATIENCE_IN_PART)
     back = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~progress.lost & ~solved

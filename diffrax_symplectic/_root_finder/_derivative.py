@@ -8,14 +8,14 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from ._batch import where_pending
+from .._batch import where_pending
 from ._linear import MAX_WRITTEN_OUT, solve, Solver
 from ._sweeps import Found, Limits, sweep
 from ._tolerance import Tolerance
 
 
 # A derivative is solved to rounding error, as the step is by default.
-_LIMITS = Limits(Tolerance(None, 0.0, optx.max_norm), steps=200, direct=0)
+_LIMITS = Limits(Tolerance(None, 0.0, optx.max_norm), lambda x: x, steps=200, direct=0)
 
 
 def differentiate(
@@ -36,7 +36,7 @@ def differentiate(
         if b.size <= MAX_WRITTEN_OUT or solver is not None:
             return solve(operator, b, solver)[0]
         begin = Found(jnp.zeros_like(b), solved=jnp.array(False), near=jnp.array(True))
-        found = sweep(_LIMITS, lambda x: x + (b - operator(x)), begin, lambda x: x)
+        found = sweep(_LIMITS, lambda x: x + (b - operator(x)), begin)
         reduction = float(jnp.finfo(b.dtype).eps) ** 0.9
         exactly = lambda _: solve(operator, b, None, reduction)[0]
         return where_pending(exactly, ~found.solved, found.y)

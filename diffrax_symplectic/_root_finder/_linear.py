@@ -27,10 +27,53 @@ _DIRECTIONS = 20
 REDUCTION = 1e-3
 
 
-def matrix_of(apply: _Map, n: int, dtype) -> _Matrix:
-    """The matrix of a linear map."""
+def correction(
+    fn: _Map, x: _Vector, solver: Solver
+) -> tuple[_Vector, _Vector, Bool[Array, ""]]:
+    """`fn(x)`, the correction that Newton's method subtracts from `x`, and whether it was
+    found."""
+    if solver is not None or x.size > _MAX_DENSE:
+        value, derivative = jax.linearize(fn, x)
+        return value, *solve(derivative, value, solver)
+    value, matrix = _with_matrix(fn, x)
+    return value, _eliminate(matrix, value), jnp.array(True)
+
+
+def solve(
+    apply: _Map, rhs: _Vector, solver: Solver, reduction: float = REDUCTION
+) -> tuple[_Vector, Bool[Array, ""]]:
+    """The `x` with `apply(x) = rhs`, and whether it was found, by a solver of Lineax. If
+    that is `None`, by elimination, or for many unknowns by GMRES with this `reduction` of
+    the residual. If there is none, `x` is inexact or not finite: nothing is raised."""
+    if solver is None and rhs.size <= _MAX_DENSE:
+        matrix = _with_matrix(apply, jnp.zeros_like(rhs))[1]
+        return _eliminate(matrix, rhs), jnp.array(True)
+    solver = solver or lx.GMRES(reduction, reduction, restart=_DIRECTIONS)
+    # An absolute tolerance refers to a right-hand side of size one.
+    size = optx.max_norm(rhs)
+    size = jnp.where(size > 0, size, 1)
+    operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: rhs))
+    x, result, _ = solver.compute(solver.init(operator, {}), rhs / size, {})
+    return x * size, result == lx.RESULTS.successful
+
+
+def _with_matrix(fn: _Map, x: _Vector) -> tuple[_Vector, _Matrix]:
+    """`fn(x)` and the Jacobian, by a program that has `fn` only once."""
+    both = lambda v: jax.jvp(fn, (x,), (v,))
     # XLA folds what is made of constants, and of `jnp.eye` it would not.
-    return jax.vmap(apply, out_axes=1)(cast(Array, np.eye(n, dtype=dtype)))
+    units = cast(Array, np.eye(x.size, dtype=x.dtype))
+    return jax.vmap(both, out_axes=(None, 1))(units)
+
+
+def _eliminate(matrix: _Matrix, rhs: _Vector) -> _Vector:
+    """The solution of a linear system."""
+    if len(rhs) > MAX_WRITTEN_OUT:
+        # On CPUs JAX makes a permutation of LAPACK's pivots by a loop with ten kernels for
+        # each row, which takes several times as long as this does.
+        Q, R = jnp.linalg.qr(matrix)
+        return jax.scipy.linalg.solve_triangular(R, Q.T @ rhs)
+    rows = [[*row, x] for row, x in zip(matrix, rhs)]
+    return jnp.stack([x for (x,) in _solutions(rows, exchange=True)])
 
 
 def inverse(matrix: list[list[Scalar]]) -> list[list[Scalar]]:
@@ -64,43 +107,3 @@ def _solutions(rows: list[list[Any]], exchange: bool) -> list[list[Scalar]]:
 
 def product(matrix: list[list[Scalar]], x: list[Scalar]) -> list[Scalar]:
     return [ft.reduce(jnp.add, map(jnp.multiply, row, x)) for row in matrix]
-
-
-def _eliminate(matrix: _Matrix, rhs: _Vector) -> _Vector:
-    """The solution of a linear system."""
-    if len(rhs) > MAX_WRITTEN_OUT:
-        # On CPUs JAX makes a permutation of LAPACK's pivots by a loop with ten kernels for
-        # each row, which takes several times as long as this does.
-        Q, R = jnp.linalg.qr(matrix)
-        return jax.scipy.linalg.solve_triangular(R, Q.T @ rhs)
-    rows = [[*row, x] for row, x in zip(matrix, rhs)]
-    return jnp.stack([x for (x,) in _solutions(rows, exchange=True)])
-
-
-def linearized(
-    fn: _Map, x: _Vector, solver: Solver
-) -> tuple[_Vector, Callable[[_Vector], _Vector]]:
-    """`fn(x)`, and the derivative there, for `solve`."""
-    if solver is None and x.size <= _MAX_DENSE:
-        # For a matrix, that is: in half of the time that it takes to linearize.
-        return fn(x), lambda v: jax.jvp(fn, (x,), (v,))[1]
-    return jax.linearize(fn, x)
-
-
-def solve(
-    apply: _Map, rhs: _Vector, solver: Solver, reduction: float = REDUCTION
-) -> tuple[_Vector, Bool[Array, ""]]:
-    """The `x` with `apply(x) = rhs`, and whether it was found, by a solver of Lineax. If
-    that is `None`, by elimination, or for many unknowns by GMRES with this `reduction` of
-    the residual. If there is none, `x` is inexact or not finite: nothing is raised."""
-    # An absolute tolerance refers to a right-hand side of size one.
-    size = optx.max_norm(rhs)
-    size = jnp.where(size > 0, size, 1)
-    if solver is None and rhs.size > _MAX_DENSE:
-        solver = lx.GMRES(reduction, reduction, restart=_DIRECTIONS)
-    if solver is None:
-        matrix = matrix_of(apply, rhs.size, rhs.dtype)
-        return _eliminate(matrix, rhs / size) * size, jnp.array(True)
-    operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: rhs))
-    x, result, _ = solver.compute(solver.init(operator, {}), rhs / size, {})
-    return x * size, result == lx.RESULTS.successful

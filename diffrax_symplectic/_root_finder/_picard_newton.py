@@ -12,8 +12,8 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
+from .._batch import where_pending
 from .._compat import ω
-from ._batch import where_pending
 from ._continuation import advance, begin, Equations, Packed, Progress
 from ._sweeps import Found, Limits, sweep, sweep_blocks
 from ._tolerance import Tolerance
@@ -113,11 +113,11 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Pa
         lost = options.get("lost", jnp.array(False))
         guess = Found(jtu.tree_map(jnp.zeros_like, y), solved=lost, near=~lost)
         direct = self.direct if self.linear_solver is None else 0
-        limits = Limits(self.tolerance, self.picard_steps, direct)
+        limits = Limits(self.tolerance, equations.scale, self.picard_steps, direct)
         if "blocks" in options:
-            found = sweep_blocks(limits, options["blocks"], guess, equations.scale)
+            found = sweep_blocks(limits, options["blocks"], guess)
         else:
-            found = sweep(limits, equations.image, guess, equations.scale)
+            found = sweep(limits, equations.image, guess)
         k = jnp.where(found.solved | found.near, jfu.ravel_pytree(found.y)[0], 0)
         return begin(k, found.solved)
 

@@ -16,12 +16,12 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, PyTree
 
+from .._batch import batched_together
 from .._compat import materialize, result_named, ω
 from .._custom_types import RealScalarLike, Y
 from .._plan import Block, Plan
 from .._root_finder import (
     all_finite,
-    batched_together,
     differentiate,
     ITERATIONS,
     PicardNewton,

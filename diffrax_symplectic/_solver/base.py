@@ -17,11 +17,12 @@ import optimistix as optx
 from jaxtyping import PRNGKeyArray, PyTree
 
 from .._arguments import check_state, whole_number
+from .._batch import batched_together
 from .._brownian import path_of, VARIABLES
 from .._conditions import drift_order
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
-from .._root_finder import batched_together, PicardNewton
+from .._root_finder import PicardNewton
 from .._tableau import AbstractTableau, FlatTableau, Structure
 from .._terms import (
     check_structure,

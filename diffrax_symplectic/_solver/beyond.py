@@ -11,9 +11,9 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._arguments import check_state
+from .._batch import batched_together
 from .._conditions import drift_order
 from .._plan import make_plan
-from .._root_finder import batched_together
 from .._tableau import FlatTableau, GeneralTableau, Stage, Structure
 from .._terms import apply_one, controls, drift_driven, number_of_noises, split_terms
 from ._step import result_of, Step, take_step

@@ -16,7 +16,7 @@ import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._root_finder._batch import where_pending
+from diffrax_symplectic._batch import where_pending
 
 from ..problems import Given
 

@@ -9,7 +9,7 @@ import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._root_finder._batch import any_of_batch
+from diffrax_symplectic._batch import any_of_batch
 from diffrax_symplectic._root_finder._tolerance import converged, max_norm
 
 
