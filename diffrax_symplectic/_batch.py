@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Bool, PyTree, Shaped
+from jaxtyping import Array, Bool, PyTree
 
 from ._compat import ClosedJaxpr, jaxpr_as_fun
 
@@ -21,21 +21,17 @@ _PARTS = 256
 
 
 @jax.custom_batching.custom_vmap
-def most_of_batch(x: Shaped[Array, ""]) -> Shaped[Array, ""]:
-    """The largest `x` of all paths of a batch: one answer for all of them."""
-    return x
-
-
-@most_of_batch.def_vmap
-def _(size, in_batched, x):
-    del size
-    return most_of_batch(jnp.max(x, 0) if in_batched[0] else x), False
-
-
 def any_of_batch(flag: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether `flag` holds for any path of a batch. As the condition of a loop it leaves
-    what is the same for all paths the same, and the body selects which paths it changes."""
-    return most_of_batch(flag)
+    """Whether `flag` holds for any path of a batch: one answer for all of them. As the
+    condition of a loop it leaves what is the same for all paths the same, and the body
+    selects which paths it changes."""
+    return flag
+
+
+@any_of_batch.def_vmap
+def _(size, in_batched, flag):
+    del size
+    return any_of_batch(jnp.any(flag, 0) if in_batched[0] else flag), False
 
 
 # Outside of a program, arrays of NumPy may be batched, for which JAX has not these rules.

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from .._batch import any_of_batch, most_of_batch
+from .._batch import any_of_batch
 from .._compat import materialize, ω
 from .._custom_types import IntScalarLike
 from ._linear import inverse, product
@@ -42,9 +42,10 @@ _MANY = 24
 # In single precision few iterations are left once their rate is known: it is accelerated
 # where it would take more than these, the first of which come before the look at the rate.
 _SLOW_FOR_MANY, _FIRST_OF_MANY = 32, 5
-# Pairs of accelerated iterations before the first look at the error, and the most between
-# two looks. The look itself is one iteration more.
-_FIRST_PAIRS, _MOST_PAIRS = (4, 2), 4
+# Pairs of accelerated iterations before the first look at the error, and between two
+# looks: more of them where fixed-point iteration would be slower than this rate. The look
+# itself is one iteration more.
+_FIRST_PAIRS, _PAIRS, _PAIRS_IF_SLOW, _SLOW_RATE = (4, 2), 1, 2, 0.6
 # The largest rate of fixed-point iteration that this makes up for: errors then shrink by
 # 0.72 in an iteration.
 _FASTEST = 3.0
@@ -90,8 +91,8 @@ class Found(NamedTuple):
 
 class _Rounds(NamedTuple):
     """The iterate, the size of its last correction, whether that was small enough, whether
-    iteration comes nearer, whether it goes on, how many iterations there were, the size of
-    each leaf of the state, and how many pairs of iterations come next."""
+    iteration comes nearer, whether it goes on, how many iterations there were, and the
+    size of each leaf of the state."""
 
     y: PyTree[Array]
     size: Scalar
@@ -100,7 +101,6 @@ class _Rounds(NamedTuple):
     going: Bool[Array, ""]
     step: IntScalarLike
     scales: list[Scalar]
-    pairs: IntScalarLike = 0
 
 
 def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
@@ -188,14 +188,11 @@ def _judged(
     return rounds._replace(size=size, solved=solved, near=near, going=going)
 
 
-def _first(limits: Limits, begin: Found, y: PyTree[Array], pairs: int = 0) -> _Rounds:
+def _first(limits: Limits, begin: Found, y: PyTree[Array]) -> _Rounds:
     """Before the first round."""
     scales = jtu.tree_map(jnp.zeros_like, limits.scales(begin.y))
     size = jnp.zeros((), jnp.result_type(*scales))
-    going = ~begin.solved
-    return _Rounds(
-        y, size, begin.solved, begin.near, going, 0, scales, jnp.array(pairs)
-    )
+    return _Rounds(y, size, begin.solved, begin.near, ~begin.solved, 0, scales)
 
 
 def _begun(limits: Limits, y: PyTree[Array]) -> tuple[Scalar, list[Scalar]]:
@@ -252,7 +249,9 @@ def _by_richardson(limits: Limits, image: _Map, begin: Found) -> Found:
 
     def advance(rounds: _Rounds) -> _Rounds:
         first, (before, y, a, begins) = rounds.step == 0, rounds.y
-        weight, pairs = _weight(a), rounds.pairs
+        weight, slow = _weight(a), any_of_batch(rounds.going & (a > _SLOW_RATE))
+        pairs = jnp.where(slow, _PAIRS_IF_SLOW, _PAIRS)
+        pairs = jnp.where(first, num_first, pairs)
 
         def pair(_, ys):
             # Two iterations, each of which overwrites the older values.
@@ -283,12 +282,7 @@ def _by_richardson(limits: Limits, image: _Map, begin: Found) -> Found:
             other = jnp.where(wrong, (rate + damped / rate) / weight, a)
             lost = anew & ~(other <= _FASTEST)
             going = ~new.solved & ~lost & (step < limits.steps)
-            # So many iterations shrink the last change to the tolerance.
-            weight_ = _weight(other)
-            left = -2 * jnp.log(new.size) / jnp.log1p(-weight_)
-            more = jnp.clip(jnp.ceil(left / 2) - 1, 1, _MOST_PAIRS)
-            more = jnp.where(going & rounds.going, more, 0).astype(int)
-            return new._replace(going=going, pairs=more), other, weight_, anew
+            return new._replace(going=going), other, _weight(other), anew
 
         # It decides over every array of the state.
         new, a, weight, anew = materialize(decided)
@@ -296,11 +290,11 @@ def _by_richardson(limits: Limits, image: _Map, begin: Found) -> Found:
         pick = lambda x, y: jnp.where(new.solved, x, jnp.where(anew, 0, y))
         before = jtu.tree_map(lambda y: jnp.where(anew, 0, y), y)
         y = before, jtu.tree_map(pick, end, ahead), a, anew
-        return new._replace(y=y, pairs=most_of_batch(new.pairs))
+        return new._replace(y=y)
 
     from_here = begin.solved | begin.near
     y = jtu.tree_map(lambda y: jnp.where(from_here, y, 0), begin.y)
-    first = _first(limits, begin, (), num_first)
+    first = _first(limits, begin, ())
     found = _rounds(advance, first._replace(y=(y, y, first.size, jnp.array(True))))
     return found._replace(y=found.y[1])
 
