@@ -20,8 +20,8 @@ from ._tolerance import converged, largest, ratio, Tolerance
 
 _Map = Callable[[PyTree[Array]], PyTree[Array]]
 
-# Pairs are for double and for single precision, where half as many iterations reach
-# rounding error.
+# Where a constant has two numbers of iterations, the first is for double precision and the
+# second for single precision, in which half as many reach rounding error.
 #
 # Up to so many unknowns chords follow four or two fixed-point iterations at once: they cost
 # no more than a look at the error. The last of these may change the values by at most this
