@@ -2,7 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable
-from typing import Any, cast, TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,9 @@ def correction(
     if solver is not None or x.size > _MAX_DENSE:
         value, derivative = jax.linearize(fn, x)
         return value, *solve(derivative, value, solver)
-    value, matrix = _with_matrix(fn, x)
+    # So that a program has `fn` only once.
+    both = lambda v: jax.jvp(fn, (x,), (v,))
+    value, matrix = jax.vmap(both, out_axes=(None, 1))(_units(x))
     return value, _eliminate(matrix, value), jnp.array(True)
 
 
@@ -46,9 +48,10 @@ def solve(
     that is `None`, by elimination, or for many unknowns by GMRES with this `reduction` of
     the residual. If there is none, `x` is inexact or not finite: nothing is raised."""
     if solver is None and rhs.size <= _MAX_DENSE:
-        matrix = _with_matrix(apply, jnp.zeros_like(rhs))[1]
+        matrix = jax.vmap(apply, out_axes=1)(_units(rhs))
         return _eliminate(matrix, rhs), jnp.array(True)
-    solver = solver or lx.GMRES(reduction, reduction, restart=_DIRECTIONS)
+    if solver is None:
+        solver = lx.GMRES(reduction, reduction, restart=_DIRECTIONS)
     # An absolute tolerance refers to a right-hand side of size one.
     size = _size(rhs)
     operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: rhs))
@@ -56,12 +59,9 @@ def solve(
     return x * size, result == lx.RESULTS.successful
 
 
-def _with_matrix(fn: _Map, x: _Vector) -> tuple[_Vector, _Matrix]:
-    """`fn(x)` and the Jacobian, by a program that has `fn` only once."""
-    both = lambda v: jax.jvp(fn, (x,), (v,))
+def _units(x: _Vector) -> Any:
     # XLA folds what is made of constants, and of `jnp.eye` it would not.
-    units = cast(Array, np.eye(x.size, dtype=x.dtype))
-    return jax.vmap(both, out_axes=(None, 1))(units)
+    return np.eye(x.size, dtype=x.dtype)
 
 
 def _size(rhs: _Vector) -> Scalar:
