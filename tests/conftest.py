@@ -25,6 +25,9 @@ if jaxlib.__version__.startswith("0.10.") and not OPTIMIZED:
         # Otherwise parts of a program are compiled in parallel, which costs small ones a
         # tenth.
         "--xla_cpu_parallel_codegen_split_count=1",
+        # These gain little without the optimization that follows them.
+        "--xla_disable_hlo_passes=simplify-while-loops,while-loop-constant-sinking,"
+        "while-loop-invariant-code-motion",
     )
     os.environ["XLA_FLAGS"] = " ".join(flags)
 

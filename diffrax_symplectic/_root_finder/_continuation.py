@@ -1,17 +1,14 @@
 """Newton's method that does not give up, for the few paths that are left."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
-import equinox as eqx
-import jax.flatten_util as jfu
 import jax.numpy as jnp
-import lineax as lx
 from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
-from .._compat import ω
-from ._linear import correction
-from ._tolerance import all_finite, converged, largest, max_norm, ratio, Tolerance
+from ._linear import correction, Solver
+from ._sweeps import Limits
+from ._tolerance import all_finite, converged, largest, max_norm, ratio
 
 
 _Vector: TypeAlias = Float[Array, " n"]
@@ -37,33 +34,11 @@ _LONGER, _SHORTER = 2.0, 0.25
 _SHORTEST = 1e-3
 
 
-class Equations(eqx.Module):
-    r"""The equations `fn(origin + k, args) = 0` for `k`, and as $k = \Phi(k)$."""
-
-    fn: Callable
-    args: PyTree[Any]
-    options: dict[str, Any]
-    origin: PyTree[Array]
-
-    def moved(self, k: PyTree[Array]) -> PyTree[Array]:
-        return (self.origin**ω + k**ω).ω
-
-    def residual(self, k: PyTree[Array]) -> PyTree[Array]:
-        return self.fn(self.moved(k), self.args)[0]
-
-    def image(self, k: PyTree[Array]) -> PyTree[Array]:
-        return (k**ω - self.residual(k) ** ω).ω
-
-    def scale(self, k: PyTree[Array]) -> PyTree[Array]:
-        # The scale is that of what the unknown is added to: increments are only needed to
-        # the accuracy of the state that they change.
-        return self.options.get("scale", lambda y: y)(self.moved(k))
-
-
 class Progress(NamedTuple):
-    r"""Where the continuation stands. With the residual $r$ the equations solved for
-    $s \in [0, 1]$ are $(1 - s) k + s\, r(k) = 0$, so $k = s\, \Phi(k)$: those of a step
-    whose length and increments are multiplied by $s$.
+    r"""Where the continuation stands. With the residual $r$ and the guess $k_0$ the
+    equations solved for $s \in [0, 1]$ are $(1 - s) (k - k_0) + s\, r(k) = 0$. From zero
+    these are $k = s\, \Phi(k)$: those of a step whose length and increments are multiplied
+    by $s$.
 
     - `k`: the iterate; `anchor`: the (rough) solution at `reached`.
     - `reached`, `target`: the $s$ that was solved for, and that which is being solved for.
@@ -111,36 +86,36 @@ class Progress(NamedTuple):
 _SOLVED, _LOST = 2, -1
 
 
-def begin(k: _Vector, solved: Bool[Array, ""]) -> Packed:
-    """First all of the step at once, from the guess `k`."""
+def begin(k: _Vector, solved: Bool[Array, ""], guess: _Vector) -> Packed:
+    """First all of the step at once, from `k`; and where that fails, from the `guess`."""
     target = jnp.where(solved, _SOLVED, 1).astype(k.dtype)
-    # All else is zero.
-    return jnp.concatenate([k, target[None], jnp.zeros(3 + k.size, k.dtype)])
+    return jnp.concatenate([k, target[None], jnp.zeros(3, k.dtype), guess])
 
 
 def advance(
-    tolerance: Tolerance,
-    linear_solver: lx.AbstractLinearSolver | None,
-    equations: Equations,
+    limits: Limits,
+    linear_solver: Solver,
+    residual: Callable[[_Vector], _Vector],
+    restore: Callable[[_Vector], PyTree[Array]],
+    guess: _Vector,
     packed: Packed,
 ) -> Packed:
-    """One iteration of Newton's method."""
+    """One iteration of Newton's method for the `residual` of a vector. Limits know the
+    PyTree that it is `restore`d to."""
     progress = Progress.unpacked(packed)
-    restore = jfu.ravel_pytree(equations.origin)[1]
-    residual = lambda k: jfu.ravel_pytree(equations.residual(restore(k)))[0]
     s, whole = progress.target, progress.target == 1
-    part = lambda k: (1 - s) * k + s * residual(k)
+    part = lambda k: (1 - s) * (k - guess) + s * residual(k)
     value, diff, exact = correction(part, progress.k, linear_solver)
 
     k = progress.k - diff
-    scales = tolerance.sizes(equations.scale(restore(k)))
-    size, below = tolerance.compare(tolerance.sizes(restore(diff)), scales)
+    scales = limits.scales(restore(k))
+    size, below = limits.compare(restore(diff), scales)
     shrink = jnp.where(progress.tries > 0, ratio(size, progress.size), 1)
     solved = whole & converged(size, below, shrink, shrink >= 0.25)
     # Far from all solutions rounding errors of a large Jacobian hide the unknowns that it
     # multiplies least. Then corrections are small where residuals are larger than states.
     moved = max_norm(progress.k)
-    state_size = jnp.maximum(largest(scales), moved) + tolerance.atol
+    state_size = jnp.maximum(largest(scales), moved) + limits.tolerance.atol
     solved &= exact & (max_norm(value) <= state_size) & all_finite(k)
 
     at_once = whole & (progress.reached == 0)

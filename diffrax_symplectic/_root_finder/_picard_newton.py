@@ -1,6 +1,6 @@
 import functools as ft
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 
 from .._batch import where_pending
 from .._compat import ω
-from ._continuation import advance, begin, Equations, Packed, Progress
+from ._continuation import advance, begin, Packed, Progress
 from ._sweeps import Found, Limits, sweep, sweep_blocks
 from ._tolerance import Tolerance
 
@@ -24,8 +24,12 @@ _MOST_DIRECT = 6
 # and to put them back, takes longer than several of these.
 ITERATIONS = 8
 
+# How far the search has come, and of what kind the auxiliary output of the function is,
+# which `postprocess` evaluates at the end.
+_State: TypeAlias = tuple[Packed, Any]
 
-class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Packed]):
+
+class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _State]):
     r"""For stage equations $k = \Phi(k)$, given as $k - \Phi(k) = 0$: solves them to
     rounding error, cheaply when the step is small and robustly when it is not.
 
@@ -98,6 +102,12 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Pa
     def tolerance(self) -> Tolerance:
         return Tolerance(self.rtol, self.atol, self.norm)
 
+    def _limits(self, options: dict[str, Any]) -> Limits:
+        # Increments are only needed to the accuracy of the state that they change.
+        scale = options.get("scale", lambda k: k)
+        direct = self.direct if self.linear_solver is None else 0
+        return Limits(self.tolerance, scale, self.picard_steps, direct)
+
     def init(
         self,
         fn: Callable,
@@ -107,19 +117,22 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Pa
         f_struct: PyTree[jax.ShapeDtypeStruct],
         aux_struct: PyTree[jax.ShapeDtypeStruct],
         tags: frozenset[object],
-    ) -> Packed:
-        del f_struct, aux_struct, tags
-        equations = Equations(fn, args, options, y)
+    ) -> _State:
+        del f_struct, tags
         lost = options.get("lost", jnp.array(False))
-        guess = Found(jtu.tree_map(jnp.zeros_like, y), solved=lost, near=~lost)
-        direct = self.direct if self.linear_solver is None else 0
-        limits = Limits(self.tolerance, equations.scale, self.picard_steps, direct)
+        guess = Found(y, solved=lost, near=~lost)
+        limits = self._limits(options)
         if "blocks" in options:
             found = sweep_blocks(limits, options["blocks"], guess)
         else:
-            found = sweep(limits, equations.image, guess)
-        k = jnp.where(found.solved | found.near, jfu.ravel_pytree(found.y)[0], 0)
-        return begin(k, found.solved)
+            image = lambda k: (k**ω - fn(k, args)[0] ** ω).ω
+            found = sweep(limits, image, guess)
+        k, guess = jfu.ravel_pytree(found.y)[0], jfu.ravel_pytree(y)[0]
+        k = jnp.where(found.solved | found.near, k, guess)
+        of_array = lambda x: isinstance(x, jax.ShapeDtypeStruct)
+        zeros = lambda x: jnp.zeros(x.shape, x.dtype) if of_array(x) else x
+        aux = jtu.tree_map(zeros, aux_struct)
+        return begin(k, found.solved, guess), aux
 
     def step(
         self,
@@ -127,22 +140,23 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Pa
         y: PyTree[Array],
         args: PyTree[Any],
         options: dict[str, Any],
-        state: Packed,
+        state: _State,
         tags: frozenset[object],
-    ) -> tuple[PyTree[Array], Packed, Any]:
+    ) -> tuple[PyTree[Array], _State, Any]:
         del tags
-        # `y` stays where the search began, and the state says how far it has come from
-        # there. In the end `postprocess` moves `y`, and evaluates `fn` once more.
-        equations = Equations(fn, args, options, y)
-        pending = ~Progress.unpacked(state).ended
-        once = ft.partial(advance, self.tolerance, self.linear_solver, equations)
+        # `y` stays the guess. The state has the iterate, which `postprocess` returns.
+        (packed, aux), (guess, restore) = state, jfu.ravel_pytree(y)
+        residual = lambda k: jfu.ravel_pytree(fn(restore(k), args)[0])[0]
+        pending = ~Progress.unpacked(packed).ended
+        solver, limits = self.linear_solver, self._limits(options)
+        once = ft.partial(advance, limits, solver, residual, restore, guess)
 
-        def another(_, state):
-            return jnp.where(Progress.unpacked(state).ended, state, once(state))
+        def another(_, packed):
+            return jnp.where(Progress.unpacked(packed).ended, packed, once(packed))
 
         times = options.get("iterations", ITERATIONS)
-        newton = lambda state: lax.fori_loop(0, times, another, state)
-        return y, where_pending(newton, pending, state), fn(y, args)[1]
+        newton = lambda packed: lax.fori_loop(0, times, another, packed)
+        return y, (where_pending(newton, pending, packed), aux), aux
 
     def terminate(
         self,
@@ -150,11 +164,11 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Pa
         y: PyTree[Array],
         args: PyTree[Any],
         options: dict[str, Any],
-        state: Packed,
+        state: _State,
         tags: frozenset[object],
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         del fn, y, args, options, tags
-        progress = Progress.unpacked(state)
+        progress = Progress.unpacked(state[0])
         result = optx.RESULTS.where(
             progress.hopeless, optx.RESULTS.nonfinite, optx.RESULTS.successful
         )
@@ -167,12 +181,11 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Pa
         aux: Any,
         args: PyTree[Any],
         options: dict[str, Any],
-        state: Packed,
+        state: _State,
         tags: frozenset[object],
         result: optx.RESULTS,
     ) -> tuple[PyTree[Array], Any, dict[str, Any]]:
         del options, tags, result
-        k = jfu.ravel_pytree(y)[1](Progress.unpacked(state).k)
-        found = (y**ω + k**ω).ω
+        found = jfu.ravel_pytree(y)[1](Progress.unpacked(state[0]).k)
         aux = fn(found, args)[1] if jtu.tree_leaves(aux) else aux
         return found, aux, {}

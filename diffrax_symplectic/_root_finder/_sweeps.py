@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from .._batch import any_of_batch
+from .._batch import any_of_batch, batched_together
 from .._compat import materialize, ω
 from .._custom_types import IntScalarLike
 from ._linear import inverse, product
@@ -162,6 +162,7 @@ def _rounds(
         left = ~rounds.going & ~rounds.solved
         return go & ~any_of_batch(left) if leave_together else go
 
+    first = batched_together(first._replace(step=()))._replace(step=first.step)
     last = lax.while_loop(proceed, body, first)
     return Found(last.y, last.solved, last.near)
 

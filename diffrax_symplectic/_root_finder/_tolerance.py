@@ -47,6 +47,8 @@ class Tolerance(eqx.Module):
 
 
 def max_norm(x: Array) -> Scalar:
+    if x.size == 1:
+        return jnp.abs(x).reshape(())
     # The bits of floats that are not negative, read as integers, have the order of the
     # values, and NaNs are the largest. The maximum of floats may lose these.
     kind = f"int{jnp.finfo(x.dtype).bits}"
