@@ -160,6 +160,7 @@ def materialize(fn: Callable[[], _T]) -> _T:
     in one branch of a conditional, and the barrier hides from XLA that the condition is
     always true.
     """
+    fn = jax.jit(fn)  # traced once
 
     def in_a_conditional() -> _T:
         shapes = jax.eval_shape(fn)

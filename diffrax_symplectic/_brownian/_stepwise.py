@@ -202,7 +202,9 @@ def increment_struct(
     path: diffrax.AbstractBrownianPath,
 ) -> PyTree[jax.ShapeDtypeStruct]:
     """Shapes, dtypes and structure of an increment."""
-    return jax.eval_shape(lambda: path.evaluate(0.0, 1.0))
+    # Times of this kind are those of a solve, for which it is not traced once more.
+    time = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    return jax.eval_shape(path.evaluate, time, time)
 
 
 # The laws of Gaussian paths, by the type of their increments.

@@ -72,9 +72,9 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     unknowns `k` change: `f(k)` has their structure, and stands in place of `k` in `rtol`.
     With `options={"blocks": fs}` the unknowns are a list, and the equations come in blocks,
     each of which reads those before it: `fs[i](k)` returns the function whose fixed point
-    is `k[i]`. First iterations then solve one block after another. Nothing waits for the
-    solution where `options={"lost": flag}` is true, and there it is of no use. Of Newton's
-    method there are `options={"iterations": n}` in a step, or eight.
+    is `k[i]`. First iterations then solve one block after another, from zero. Nothing waits
+    for the solution where `options={"lost": flag}` is true, and there it is of no use. Of
+    Newton's method there are `options={"iterations": n}` in a step, or eight.
 
     **Raises:** a `ValueError` for negative numbers, or `direct` above 6.
     """
@@ -120,18 +120,21 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     ) -> _State:
         del f_struct, tags
         lost = options.get("lost", jnp.array(False))
-        guess = Found(y, solved=lost, near=~lost)
-        limits = self._limits(options)
+        limits, zeros = self._limits(options), jtu.tree_map(jnp.zeros_like, y)
+        begun = Found(zeros, solved=lost, near=~lost)
         if "blocks" in options:
-            found = sweep_blocks(limits, options["blocks"], guess)
+            found = sweep_blocks(limits, options["blocks"], begun)
         else:
-            image = lambda k: (k**ω - fn(k, args)[0] ** ω).ω
-            found = sweep(limits, image, guess)
+            moved = lambda k: (y**ω + k**ω).ω
+            image = lambda k: (k**ω - fn(moved(k), args)[0] ** ω).ω
+            scale = lambda k: limits.scale(moved(k))
+            found = sweep(limits._replace(scale=scale), image, begun)
+            found = found._replace(y=moved(found.y))
         k, guess = jfu.ravel_pytree(found.y)[0], jfu.ravel_pytree(y)[0]
         k = jnp.where(found.solved | found.near, k, guess)
         of_array = lambda x: isinstance(x, jax.ShapeDtypeStruct)
-        zeros = lambda x: jnp.zeros(x.shape, x.dtype) if of_array(x) else x
-        aux = jtu.tree_map(zeros, aux_struct)
+        zero = lambda x: jnp.zeros(x.shape, x.dtype) if of_array(x) else x
+        aux = jtu.tree_map(zero, aux_struct)
         return begin(k, found.solved, guess), aux
 
     def step(
