@@ -204,7 +204,7 @@ def increment_struct(
     """Shapes, dtypes and structure of an increment."""
     # Times of this kind are those of a solve, for which it is not traced once more.
     time = jax.ShapeDtypeStruct((), jnp.result_type(float))
-    return jax.eval_shape(path.evaluate, time, time)
+    return jax.eval_shape(lambda *ends: path.evaluate(*ends), time, time)
 
 
 # The laws of Gaussian paths, by the type of their increments.
