@@ -162,6 +162,7 @@ def _rounds(
         left = ~rounds.going & ~rounds.solved
         return go & ~any_of_batch(left) if leave_together else go
 
+    # All but the number of iterations, which all paths have in common.
     first = batched_together(first._replace(step=()))._replace(step=first.step)
     last = lax.while_loop(proceed, body, first)
     return Found(last.y, last.solved, last.near)
