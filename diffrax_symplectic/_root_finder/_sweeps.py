@@ -50,7 +50,7 @@ _FIRST_PAIRS, _PAIRS, _PAIRS_IF_SLOW, _SLOW_RATE = (4, 2), 1, 2, 0.6
 # 0.72 in an iteration.
 _FASTEST = 3.0
 # Chord iterations between two looks at the error, and the most of them.
-_CHORDS, _MOST_CHORDS = (2, 1), 20
+_CHORDS, _MOST_CHORDS = 2, 20
 # A correction below this fraction of the state shows that iteration came near.
 _NEAR = 0.1
 
@@ -342,13 +342,12 @@ def _by_chords(limits: Limits, image: _Map, begin: Found) -> Found:
     diff = product(M, (value**ω - k**ω).ω)
     moved = [jnp.where(begin.solved, x, x + y) for x, y in zip(k, diff)]
     chord = lambda k: (k**ω + product(M, (rhs(k) ** ω - k**ω).ω) ** ω).ω
-    chords = _CHORDS[_is_single(k)]
 
     def advance(rounds: _Rounds) -> _Rounds:
-        before, k = _fixed_point(chord, rounds.y, chords)
+        before, k = _fixed_point(chord, rounds.y, _CHORDS)
         scales, change = limits.scales(restore(k)), restore((k**ω - before**ω).ω)
-        new = rounds._replace(y=k, step=rounds.step + chords, scales=scales)
-        root = lambda x: _root(x, chords)
+        new = rounds._replace(y=k, step=rounds.step + _CHORDS, scales=scales)
+        root = lambda x: _root(x, _CHORDS)
         return _judged(limits, new, change, rounds.size, root, _MOST_CHORDS)
 
     scales = limits.scales(restore(moved))
