@@ -24,8 +24,8 @@ _MOST_DIRECT = 6
 # and to put them back, takes longer than several of these.
 ITERATIONS = 8
 
-# How far the search has come, and of what kind the auxiliary output of the function is,
-# which `postprocess` evaluates at the end.
+# The progress of the search; and zeros in place of auxiliary output, which `postprocess`
+# evaluates once, at the solution.
 _State: TypeAlias = tuple[Packed, Any]
 
 
