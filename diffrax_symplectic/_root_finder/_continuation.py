@@ -7,8 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from ._linear import correction, Solver
-from ._sweeps import Limits
-from ._tolerance import all_finite, converged, largest, max_norm, ratio
+from ._tolerance import all_finite, converged, largest, Limits, max_norm, ratio
 
 
 _Vector: TypeAlias = Float[Array, " n"]
@@ -115,7 +114,7 @@ def advance(
     # Far from all solutions rounding errors of a large Jacobian hide the unknowns that it
     # multiplies least. Then corrections are small where residuals are larger than states.
     moved = max_norm(progress.k)
-    state_size = jnp.maximum(largest(scales), moved) + limits.tolerance.atol
+    state_size = jnp.maximum(largest(scales), moved) + limits.atol
     solved &= exact & (max_norm(value) <= state_size) & all_finite(k)
 
     at_once = whole & (progress.reached == 0)

@@ -10,12 +10,12 @@ from jaxtyping import Array, Float, PyTree
 
 from .._batch import where_pending
 from ._linear import MAX_WRITTEN_OUT, solve, Solver
-from ._sweeps import Found, Limits, sweep
-from ._tolerance import Tolerance
+from ._sweeps import Found, sweep
+from ._tolerance import Limits
 
 
 # A derivative is solved to rounding error, as the step is by default.
-_LIMITS = Limits(Tolerance(None, 0.0, optx.max_norm), lambda x: x, steps=200, direct=0)
+_LIMITS = Limits(None, 0.0, optx.max_norm, lambda x: x, steps=200, direct=0)
 
 
 def differentiate(

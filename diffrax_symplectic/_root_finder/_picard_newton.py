@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from .._batch import where_pending
 from .._compat import ω
 from ._continuation import advance, begin, Packed, Progress
-from ._sweeps import Found, Limits, sweep, sweep_blocks
-from ._tolerance import Tolerance
+from ._sweeps import Found, sweep, sweep_blocks
+from ._tolerance import Limits
 
 
 _MOST_DIRECT = 6
@@ -98,15 +98,12 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
                 "`linear_solver=lineax.LU()`."
             )
 
-    @property
-    def tolerance(self) -> Tolerance:
-        return Tolerance(self.rtol, self.atol, self.norm)
-
     def _limits(self, options: dict[str, Any]) -> Limits:
         # Increments are only needed to the accuracy of the state that they change.
         scale = options.get("scale", lambda k: k)
         direct = self.direct if self.linear_solver is None else 0
-        return Limits(self.tolerance, scale, self.picard_steps, direct)
+        steps = self.picard_steps
+        return Limits(self.rtol, self.atol, self.norm, scale, steps, direct)
 
     def init(
         self,

@@ -15,7 +15,7 @@ from .._batch import any_of_batch, batched_together
 from .._compat import materialize, ω
 from .._custom_types import IntScalarLike
 from ._linear import inverse, product
-from ._tolerance import converged, largest, ratio, Tolerance
+from ._tolerance import converged, largest, Limits, ratio
 
 
 _Map = Callable[[PyTree[Array]], PyTree[Array]]
@@ -53,27 +53,6 @@ _FASTEST = 3.0
 _CHORDS, _MOST_CHORDS = 2, 20
 # A correction below this fraction of the state shows that iteration came near.
 _NEAR = 0.1
-
-
-class Limits(NamedTuple):
-    """When iteration ends.
-
-    - `tolerance`: for the next correction.
-    - `scale`: how large the state is that values change.
-    - `steps`: the most iterations.
-    - `direct`: the most unknowns for chord iterations.
-    """
-
-    tolerance: Tolerance
-    scale: _Map
-    steps: int
-    direct: int
-
-    def scales(self, y: PyTree[Array]) -> list[Scalar]:
-        return self.tolerance.sizes(self.scale(y))
-
-    def compare(self, change: PyTree[Array], scales: list[Scalar]):
-        return self.tolerance.compare(self.tolerance.sizes(change), scales)
 
 
 class Found(NamedTuple):
@@ -312,7 +291,7 @@ def _toward(a: PyTree[Array], b: PyTree[Array], weight: Scalar) -> PyTree[Array]
 def _warmed_up(limits: Limits, image: _Map, begin: Found) -> Found:
     """After a few fixed-point iterations; or where these go away from the solution, as it
     was before."""
-    y, sizes = begin.y, limits.tolerance.sizes
+    y, sizes = begin.y, limits.sizes
     before, swept = _fixed_point(image, y, _WARMUP[_is_single(y)])
     last, whole = sizes((swept**ω - before**ω).ω), sizes((swept**ω - y**ω).ω)
     settled = largest(last) < _SETTLED * largest(whole)

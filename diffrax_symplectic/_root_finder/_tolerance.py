@@ -1,9 +1,9 @@
-"""When a correction is small enough."""
+"""When a correction is small enough, and when iteration gives up."""
 
 import functools as ft
 from collections.abc import Callable
+from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
@@ -19,25 +19,38 @@ _SHORT = 4
 _WIDE = 32
 
 
-class Tolerance(eqx.Module):
-    """A correction is measured in units of `rtol * scale + atol`, leaf by leaf. `rtol` of
-    `None` stands for two units in the last place."""
+class Limits(NamedTuple):
+    """When iteration ends.
+
+    - `rtol`, `atol`: a correction is measured in units of `rtol * scale + atol`, leaf by
+        leaf. `rtol` of `None` stands for two units in the last place.
+    - `norm`: the norm within a leaf.
+    - `scale`: how large the state is that values change.
+    - `steps`: the most iterations.
+    - `direct`: the most unknowns for chord iterations.
+    """
 
     rtol: float | None
     atol: float
     norm: Callable[[PyTree], Scalar]
+    scale: Callable[[PyTree[Array]], PyTree[Array]]
+    steps: int
+    direct: int
 
     def sizes(self, y: PyTree[Array]) -> list[Scalar]:
         """The norm of each leaf."""
         norm = max_norm if self.norm is optx.max_norm else self.norm
         return [norm(x) for x in jtu.tree_leaves(y)]
 
+    def scales(self, y: PyTree[Array]) -> list[Scalar]:
+        return self.sizes(self.scale(y))
+
     def compare(
-        self, sizes: list[Scalar], scales: list[Scalar]
+        self, change: PyTree[Array], scales: list[Scalar]
     ) -> tuple[Scalar, Callable[[float], Bool[Array, ""]]]:
         """The size of a correction in units of the tolerance (1 is just accepted), and
-        whether it is at most a fraction of the whole iterate, from the norms of each
-        leaf."""
+        whether it is at most a fraction of the whole iterate."""
+        sizes = self.sizes(change)
         eps = jnp.finfo(jnp.result_type(*sizes)).eps
         rtol = 2 * eps if self.rtol is None else self.rtol
         in_units = lambda a, b: ratio(a, rtol * b + self.atol)
