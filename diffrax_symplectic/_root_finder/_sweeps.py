@@ -31,8 +31,9 @@ _AT_ONCE, _WARMUP, _SETTLED = 2, (4, 2), 0.5
 _FIRST, _MORE = (11, 7), (4, 2)
 # The rate of one iteration is a square root of what so many do, twice or three times: any
 # other power takes as long as an iteration of few unknowns. From the first iterate to the
-# first look there are ten iterations, or six. Taken for eight, or four, they show a rate of
-# 0.42, or 0.35, where it is 0.5. The margin of `converged` is many times that.
+# first look there are ten iterations, or six (five for many unknowns). Taken for eight, or
+# four, they show a rate of 0.42, or 0.35, where it is 0.5. The margin of `converged` is
+# many times that.
 _POWER_FIRST = (8, 4)
 # So many more fixed-point iterations cost as much as the Jacobian and its inverse do.
 _SLOW = 24
@@ -41,7 +42,7 @@ _SLOW = 24
 _MANY = 24
 # In single precision few iterations are left once their rate is known: it is accelerated
 # where it would take more than these, the first of which come before the look at the rate.
-_SLOW_FOR_MANY, _FIRST_OF_MANY = 32, 5
+_SLOW_FOR_MANY, _FIRST_OF_MANY = 32, 6
 # Pairs of accelerated iterations before the first look at the error, and between two
 # looks: more of them where fixed-point iteration would be slower than this rate. The look
 # itself is one iteration more.
