@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
 from ._compat import ClosedJaxpr, jaxpr_as_fun
+from ._custom_types import IntScalarLike
 
 
 _T = TypeVar("_T")
@@ -21,17 +22,16 @@ _PARTS = 256
 
 
 @jax.custom_batching.custom_vmap
-def any_of_batch(flag: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether `flag` holds for any path of a batch: one answer for all of them. As the
-    condition of a loop it leaves what is the same for all paths the same, and the body
-    selects which paths it changes."""
-    return flag
+def most_of_batch(number: IntScalarLike) -> IntScalarLike:
+    """The largest `number` of all paths of a batch: one for all of them. As the length of a
+    loop it leaves what is the same for all paths the same."""
+    return number
 
 
-@any_of_batch.def_vmap
-def _(size, in_batched, flag):
+@most_of_batch.def_vmap
+def _(size, in_batched, number):
     del size
-    return any_of_batch(jnp.any(flag, 0) if in_batched[0] else flag), False
+    return most_of_batch(jnp.max(number, 0) if in_batched[0] else number), False
 
 
 # Outside of a program, arrays of NumPy may be batched, for which JAX has not these rules.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from ._linear import correction, Solver
-from ._tolerance import all_finite, converged, largest, Limits, max_norm, ratio
+from ._tolerance import all_finite, converged, largest, Limits, log2, max_norm, ratio
 
 
 _Vector: TypeAlias = Float[Array, " n"]
@@ -108,9 +108,9 @@ def advance(
 
     k = progress.k - diff
     scales = limits.scales(restore(k))
-    size, below = limits.compare(restore(diff), scales)
+    size, rounded, _ = limits.compare(restore(diff), scales)
     shrink = jnp.where(progress.tries > 0, ratio(size, progress.size), 1)
-    solved = whole & converged(size, below, shrink, shrink >= 0.25)
+    solved = whole & converged(log2(size), log2(shrink), rounded, shrink >= 0.25)
     # Far from all solutions rounding errors of a large Jacobian hide the unknowns that it
     # multiplies least. Then corrections are small where residuals are larger than states.
     moved = max_norm(progress.k)

@@ -15,7 +15,7 @@ from ._tolerance import Limits
 
 
 # A derivative is solved to rounding error, as the step is by default.
-_LIMITS = Limits(None, 0.0, optx.max_norm, lambda x: x, steps=200, direct=0)
+_LIMITS = Limits(None, 0.0, optx.max_norm, lambda x: x, steps=200)
 
 
 def differentiate(

@@ -1,6 +1,5 @@
 """Linear systems with the Jacobian of the stage equations."""
 
-import functools as ft
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
@@ -83,14 +82,6 @@ def _eliminate(matrix: _Matrix, rhs: _Vector) -> _Vector:
     return size * jnp.stack([x for (x,) in _solutions(rows, exchange=True)])
 
 
-def inverse(matrix: list[list[Scalar]]) -> list[list[Scalar]]:
-    """The inverse of a matrix of scalars near the identity, without exchanging rows. What
-    this spoils is seen when the equations are not solved."""
-    units = np.eye(len(matrix), dtype=matrix[0][0].dtype)
-    rows = [[*row, *unit] for row, unit in zip(matrix, units)]
-    return _solutions(rows, exchange=False)
-
-
 def _solutions(rows: list[list[Any]], exchange: bool) -> list[list[Scalar]]:
     """The solutions of linear systems with one matrix, whose rows are each followed by
     their right-hand sides: by elimination, with partial pivoting if rows may `exchange`.
@@ -110,7 +101,3 @@ def _solutions(rows: list[list[Any]], exchange: bool) -> list[list[Scalar]]:
         for i in {*range(n)} - {k}:
             rows[i] = [x - rows[i][k] * y for x, y in zip(rows[i], rows[k])]
     return [row[n:] for row in rows]
-
-
-def product(matrix: list[list[Scalar]], x: list[Scalar]) -> list[Scalar]:
-    return [ft.reduce(jnp.add, map(jnp.multiply, row, x)) for row in matrix]

@@ -19,7 +19,6 @@ from ._sweeps import Found, sweep, sweep_blocks
 from ._tolerance import Limits
 
 
-_MOST_DIRECT = 6
 # Iterations of Newton's method in a step of the search: to gather paths from a large batch,
 # and to put them back, takes longer than several of these.
 ITERATIONS = 8
@@ -63,8 +62,6 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     - `norm`: norm within a leaf.
     - `linear_solver`: a Lineax solver for all linear systems, those of derivatives
         included. `None` is elimination for few unknowns, and otherwise no matrix.
-    - `direct`: the most unknowns for chord iterations, from 0 to 6. With four to six these
-        save up to a third of a long step, which then takes up to 80% longer to compile.
     - `picard_steps`: the most iterations before Newton's method. Where their rate tells
         that so many would not do, they end at once.
 
@@ -76,34 +73,24 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     for the solution where `options={"lost": flag}` is true, and there it is of no use. Of
     Newton's method there are `options={"iterations": n}` in a step, or eight.
 
-    **Raises:** a `ValueError` for negative numbers, or `direct` above 6.
+    **Raises:** a `ValueError` for negative numbers.
     """
 
     rtol: float | None = None
     atol: float = 0.0
     norm: Callable[[PyTree], Scalar] = optx.max_norm
     linear_solver: lx.AbstractLinearSolver | None = None
-    direct: int = eqx.field(default=3, static=True)
     picard_steps: int = eqx.field(default=200, static=True)
 
     def __check_init__(self):
-        for name in ("rtol", "atol", "direct", "picard_steps"):
+        for name in ("rtol", "atol", "picard_steps"):
             if isinstance(n := getattr(self, name), int | float) and n < 0:
                 raise ValueError(f"`{name}` of `PicardNewton` must be >= 0; got {n}.")
-        if self.direct > _MOST_DIRECT:
-            # Their linear algebra is written out: its length grows with the cube.
-            raise ValueError(
-                f"`direct` of `PicardNewton` must be at most {_MOST_DIRECT}; got "
-                f"{self.direct}. For dense elimination with more unknowns pass "
-                "`linear_solver=lineax.LU()`."
-            )
 
     def _limits(self, options: dict[str, Any]) -> Limits:
         # Increments are only needed to the accuracy of the state that they change.
         scale = options.get("scale", lambda k: k)
-        direct = self.direct if self.linear_solver is None else 0
-        steps = self.picard_steps
-        return Limits(self.rtol, self.atol, self.norm, scale, steps, direct)
+        return Limits(self.rtol, self.atol, self.norm, scale, self.picard_steps)
 
     def init(
         self,

@@ -1,59 +1,36 @@
-"""The iterations that normally solve a step, for all paths of a batch together."""
+"""The iteration that normally solves a step, for all paths of a batch together."""
 
-import functools as ft
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from .._batch import any_of_batch, batched_together
+from .._batch import batched_together, most_of_batch
 from .._compat import materialize, ω
 from .._custom_types import IntScalarLike
-from ._linear import inverse, product
-from ._tolerance import converged, largest, Limits, ratio
+from ._tolerance import converged, largest, Limits, log2, MARGIN
 
 
-_Map = Callable[[PyTree[Array]], PyTree[Array]]
+_Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]
 
-# Where a constant has two numbers of iterations, the first is for double precision and the
-# second for single precision, in which half as many reach rounding error.
-#
-# Up to so many unknowns chords follow four or two fixed-point iterations at once: they cost
-# no more than a look at the error. The last of these may change the values by at most this
-# fraction of what all of them did.
-_AT_ONCE, _WARMUP, _SETTLED = 2, (4, 2), 0.5
-# Fixed-point iterations before the first look at the error, and between two looks.
-_FIRST, _MORE = (11, 7), (4, 2)
-# The rate of one iteration is a square root of what so many do, twice or three times: any
-# other power takes as long as an iteration of few unknowns. From the first iterate to the
-# first look there are ten iterations, or six (five for many unknowns). Taken for eight, or
-# four, they show a rate of 0.42, or 0.35, where it is 0.5. The margin of `converged` is
-# many times that.
-_POWER_FIRST = (8, 4)
-# So many more fixed-point iterations cost as much as the Jacobian and its inverse do.
-_SLOW = 24
-# Above so many unknowns fixed-point iteration is accelerated. For fewer, the arithmetic of
-# that costs more than the iterations that it saves.
-_MANY = 24
-# In single precision few iterations are left once their rate is known: it is accelerated
-# where it would take more than these, the first of which come before the look at the rate.
-_SLOW_FOR_MANY, _FIRST_OF_MANY = 32, 6
-# Pairs of accelerated iterations before the first look at the error, and between two
-# looks: more of them where fixed-point iteration would be slower than this rate. The look
-# itself is one iteration more.
-_FIRST_PAIRS, _PAIRS, _PAIRS_IF_SLOW, _SLOW_RATE = (4, 2), 1, 2, 0.6
-# The largest rate of fixed-point iteration that this makes up for: errors then shrink by
-# 0.72 in an iteration.
-_FASTEST = 3.0
-# Chord iterations between two looks at the error, and the most of them.
-_CHORDS, _MOST_CHORDS = 2, 20
-# A correction below this fraction of the state shows that iteration came near.
-_NEAR = 0.1
+# Sweeps before the first look at the error, in double and in single precision; and those
+# with copies, each of which evaluates everything twice.
+_FIRST, _FIRST_WITH_COPIES = (9, 6), (6, 4)
+# The most sweeps between two looks.
+_MOST = 32
+# The same where corrections are as small as rounding errors.
+_LAST = 3
+# Above this rate of convergence sweeps are damped. Below, that would gain nothing.
+_SLOW = 0.3
+# How much they are damped where they led away from the solution: the best for a rate of 8.
+_MOST_DAMPED = 0.5
+# The logarithm of a rate that is expected of sweeps once they are damped.
+_DAMPED = -2.0
+# A rate above this, of which this is the logarithm, is taken for none.
+_STALLED = -0.2
 
 
 class Found(NamedTuple):
@@ -70,37 +47,115 @@ class Found(NamedTuple):
 
 
 class _Rounds(NamedTuple):
-    """The iterate, the size of its last correction, whether that was small enough, whether
-    iteration comes nearer, whether it goes on, how many iterations there were, and the
-    size of each leaf of the state."""
+    """The iterate, how much sweeps are damped, the logarithm of the size of the last
+    correction, whether that was small enough, whether iteration comes nearer, whether it
+    goes on, how many sweeps there were, and how many there are before the next look."""
 
     y: PyTree[Array]
-    size: Scalar
+    damping: Scalar
+    level: Scalar
     solved: Bool[Array, ""]
     near: Bool[Array, ""]
     going: Bool[Array, ""]
     step: IntScalarLike
-    scales: list[Scalar]
+    count: IntScalarLike
 
 
 def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
-    r"""From where it `begin`s, solves $y = \Phi(y)$ by $y \leftarrow y + M (\Phi(y) - y)$:
-    fixed-point iteration with $M = 1$, and where that is slow, chord iteration with
-    $M = (1 - \Phi')^{-1}$, or for many unknowns an accelerated iteration."""
-    n, single = sum(x.size for x in jtu.tree_leaves(begin.y)), _is_single(begin.y)
-    if n <= min(limits.direct, _AT_ONCE):
-        return _by_chords(limits, image, _warmed_up(limits, image, begin))
-    if n <= limits.direct:
-        most, first, rest = _SLOW, _FIRST[single], _by_chords
-    elif n <= _MANY:
-        return _by_sweeps(limits, image, begin, limits.steps, _FIRST[single])
-    elif single:
-        most, first, rest = _SLOW_FOR_MANY, _FIRST_OF_MANY, _by_richardson
+    r"""From where it `begin`s, solves $y = \Phi(y)$ by sweeps for all paths of a batch
+    together, until each is solved or has left.
+
+    In a sweep $q$ reads what $p$ has become (Gauss--Seidel). Where a Hamiltonian system
+    oscillates, the error after that is the one after two evaluations of both, for the price
+    of one where $H = T(p) + V(q)$. For values that are no pairs, two copies of them stand
+    in place of $p$ and $q$, and read each other.
+
+    Each look at the error shows the rate at which it shrinks, and from that, how many
+    sweeps the slowest path needs before the next look. For an oscillation the rate $a$ is
+    that of an eigenvalue $-a$: then sweeps in which values stay behind by a fraction
+    $v = 1 - 2 / (1 + \sqrt{1 + a})$ of their change converge at the rate $v$ (D. M. Young,
+    Transactions of the American Mathematical Society 76, 1954, 92-111; for copies G. H.
+    Golub and R. S. Varga, Numerische Mathematik 3, 1961, 147-156). Where sweeps led away,
+    they begin once more, damped like this.
+    """
+    if pairs := type(begin.y) is list and all(_is_pair(x) for x in begin.y):
+        join = lambda p, q: list(zip(p, q))
+        halves = lambda y: tuple(list(half) for half in zip(*y))
+        first = lambda p, q: halves(image(join(p, q)))[0]
+        second = lambda p, q: halves(image(join(p, q)))[1]
+        change = lambda before, y: join(*(y**ω - before**ω).ω)
     else:
-        return _by_richardson(limits, image, begin)
-    found = _by_sweeps(limits, image, begin, most, first, leave_together=True)
-    others = ft.partial(rest, limits, image)
-    return lax.cond(any_of_batch(~found.solved), others, lambda found: found, found)
+        join, halves = lambda a, b: b, lambda y: (y, y)
+        first, second = lambda a, b: image(b), lambda a, b: image(a)
+        # Where both are solutions of y = \Phi(\Phi(y)), only their difference shows it.
+        change = lambda _, y: (y[1] ** ω - y[0] ** ω).ω
+    dtype = jnp.result_type(*jtu.tree_leaves(begin.y))
+    single = jnp.finfo(dtype).bits < 64
+    num_first = (_FIRST if pairs else _FIRST_WITH_COPIES)[single]
+
+    def advance(last: _Rounds) -> _Rounds:
+        def behind(new: PyTree[Array], old: PyTree[Array]) -> PyTree[Array]:
+            stay = lambda x, y: x + last.damping.astype(x.dtype) * (y - x)
+            return jtu.tree_map(stay, new, old)
+
+        def once(_, iterates):
+            _, (p, q) = iterates
+            new = behind(first(p, q), p)
+            return (p, q), (new, behind(second(new, q), q))
+
+        before, y = lax.fori_loop(0, last.count, once, (last.y, last.y))
+        scales = limits.scales(join(*y))
+        size, rounded, close = limits.compare(change(before, y), scales)
+        whole = limits.in_units([largest(scales)], [largest(scales)])
+        # The first of the sweeps changed the values by no more than the state is.
+        level, earlier = log2(size), jnp.minimum(last.level, log2(whole))
+
+        def decided() -> _Rounds:
+            rate = (level - earlier) / last.count
+            stalled, step = rate >= _STALLED, last.step + last.count
+            solved = converged(level, rate, rounded, stalled)
+            a = jnp.exp2(rate)
+            tuned = (last.step == 0) & (a > _SLOW) & ~stalled
+            further = (level + MARGIN) / jnp.where(tuned, -_DAMPED, -rate)
+            again = stalled & (last.damping < _MOST_DAMPED)
+            on = again | (~stalled & (step + further < limits.steps))
+            going = last.going & ~solved & on & (step < limits.steps)
+            near = ~stalled & (close | going)
+            count = jnp.where(again, num_first, further)
+            # What is as small as rounding errors shows no rate.
+            count = jnp.where(rounded, jnp.minimum(count, _LAST), count)
+            count = jnp.ceil(jnp.where(going, count, 0)).astype(int)
+            damping = jnp.where(tuned, 1 - 2 / (1 + jnp.sqrt(1 + a)), last.damping)
+            return _Rounds(
+                y=(),
+                damping=jnp.where(again, _MOST_DAMPED, damping),
+                level=jnp.where(again, jnp.inf, level),
+                solved=jnp.where(last.going, solved, last.solved),
+                near=jnp.where(last.going, near, last.near),
+                going=going,
+                step=step,
+                count=jnp.minimum(most_of_batch(count), _MOST),
+            )
+
+        # What follows reads it several times, and would compute it as often.
+        new = materialize(decided)
+        again = new.going & ~new.near
+        y = jtu.tree_map(lambda y: jnp.where(again, 0, y), y)
+        # The sweeps of all paths of a batch are the same, but each path has only its own.
+        select = lambda a, b: jnp.where(last.going, a, b)
+        return new._replace(y=jtu.tree_map(select, y, last.y))
+
+    none, level = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype)
+    y, solved, near = halves(begin.y), begin.solved, begin.near
+    begun = _Rounds(y, none, level, solved, near, ~solved, step=0, count=0)
+    # All but the numbers of sweeps, which all paths have in common.
+    begun = batched_together(begun)._replace(step=0, count=num_first)
+    last = lax.while_loop(lambda rounds: rounds.count > 0, advance, begun)
+    return Found(join(*last.y), last.solved, last.near)
+
+
+def _is_pair(x: PyTree[Array]) -> bool:
+    return type(x) is tuple and len(x) == 2
 
 
 def sweep_blocks(
@@ -120,235 +175,3 @@ def sweep_blocks(
         y[i] = found.y
         solved, near = solved & found.solved, near & (found.solved | found.near)
     return Found(y, solved, near)
-
-
-def _rounds(
-    advance: Callable[[_Rounds], _Rounds], first: _Rounds, leave_together: bool = False
-) -> Found:
-    """Rounds until every path of the batch is solved or has left; or until the first leaves
-    unsolved, where what follows costs the same for one path as for all."""
-
-    def body(last: _Rounds) -> _Rounds:
-        new = advance(last)
-        # The rounds of all paths of a batch are the same, but each path has only its own.
-        kept = lambda x: (x.y, x.solved, x.near)
-        select = lambda a, b: jnp.where(last.going, a, b)
-        y, solved, near = jtu.tree_map(select, kept(new), kept(last))
-        going = last.going & new.going
-        return new._replace(y=y, solved=solved, near=near, going=going)
-
-    def proceed(rounds: _Rounds) -> Bool[Array, ""]:
-        go = any_of_batch(rounds.going)
-        left = ~rounds.going & ~rounds.solved
-        return go & ~any_of_batch(left) if leave_together else go
-
-    # All but the number of iterations, which all paths have in common.
-    first = batched_together(first._replace(step=()))._replace(step=first.step)
-    last = lax.while_loop(proceed, body, first)
-    return Found(last.y, last.solved, last.near)
-
-
-def _judged(
-    limits: Limits,
-    rounds: _Rounds,
-    change: PyTree[Array],
-    earlier: Scalar,
-    root: _Map,
-    most: int,
-    halt: Scalar | float = 0.5,
-) -> _Rounds:
-    """What follows from the last `change` of `rounds`. The `root` of how much it has
-    shrunk, since the one of the size `earlier`, is the rate of one iteration, of which
-    there may be `most`. It has stalled if it is not below `halt` of that."""
-    size, below = limits.compare(change, rounds.scales)
-    shrink = root(ratio(size, earlier))
-    # If an entry is NaN, the size is, and all of these are false.
-    stalled, shrinks = size >= halt * earlier, size < halt * earlier
-    solved = converged(size, below, shrink, stalled)
-    near = below(_NEAR) & shrinks
-    going = near & ~solved & (rounds.step < limits.steps) & (size * shrink**most <= 1)
-    return rounds._replace(size=size, solved=solved, near=near, going=going)
-
-
-def _first(limits: Limits, begin: Found, y: PyTree[Array]) -> _Rounds:
-    """Before the first round."""
-    scales = jtu.tree_map(jnp.zeros_like, limits.scales(begin.y))
-    size = jnp.zeros((), jnp.result_type(*scales))
-    return _Rounds(y, size, begin.solved, begin.near, ~begin.solved, 0, scales)
-
-
-def _begun(limits: Limits, y: PyTree[Array]) -> tuple[Scalar, list[Scalar]]:
-    """The size of the first change, and that of the state, known after the first round."""
-    # The first iteration changed the values from zero to nearly what they are now. Nor
-    # does the size of the state change much where iteration goes on.
-    scales = limits.scales(y)
-    return limits.compare(y, scales)[0], scales
-
-
-def _by_sweeps(
-    limits: Limits,
-    image: _Map,
-    begin: Found,
-    most: int,
-    num_first: int,
-    leave_together: bool = False,
-) -> Found:
-    """Fixed-point iteration, as long as `most` further ones would do."""
-    single = _is_single(begin.y)
-    powers = _POWER_FIRST[single], _MORE[single]
-    # The same rate in either precision: a slower one has not stalled in fewer iterations.
-    halt = 0.5 ** (_MORE[single] / _MORE[0])
-
-    def advance(rounds: _Rounds) -> _Rounds:
-        first = rounds.step == 0
-        count = jnp.where(first, num_first, _MORE[single])
-        before, y = _fixed_point(image, rounds.y, count)
-        # To measure these in every round would take a quarter of its time.
-        last = lambda: (rounds.size, rounds.scales)
-        earlier, scales = lax.cond(first, lambda: _begun(limits, y), last)
-        change = (y**ω - before**ω).ω
-        root = lambda x: jnp.where(first, *(_root(x, power) for power in powers))
-        new = rounds._replace(y=y, step=rounds.step + count, scales=scales)
-        return _judged(limits, new, change, earlier, root, most, halt)
-
-    return _rounds(advance, _first(limits, begin, begin.y), leave_together)
-
-
-def _by_richardson(limits: Limits, image: _Map, begin: Found) -> Found:
-    r"""Solves $y = \Phi(y)$ by $y_{m+1} = y_{m-1} + w (\Phi(y_m) - y_{m-1})$.
-
-    Where a Hamiltonian system oscillates, the eigenvalues of $\Phi'$ for the midpoint rule
-    are imaginary, $\pm ib$ with $b \le a$. With $w = 2 / (1 + \sqrt{1 + a^2})$ errors
-    shrink by $\sqrt{1 - w} = a / (1 + \sqrt{1 + a^2})$ in an iteration, where those of
-    fixed-point iteration ($w = 1$) shrink by $a$, or grow. The first round is fixed-point
-    iteration and shows $a$, and the second corrects it. Real eigenvalues are no obstacle,
-    but errors then shrink more slowly than by $a$.
-
-    This is the "second order Richardson" method of Golub and Varga (Numerische Mathematik
-    3, 1961, 147-156), for imaginary eigenvalues.
-    """
-    num_first = _FIRST_PAIRS[_is_single(begin.y)]
-
-    def advance(rounds: _Rounds) -> _Rounds:
-        first, (before, y, a, begins) = rounds.step == 0, rounds.y
-        weight, slow = _weight(a), any_of_batch(rounds.going & (a > _SLOW_RATE))
-        pairs = jnp.where(slow, _PAIRS_IF_SLOW, _PAIRS)
-        pairs = jnp.where(first, num_first, pairs)
-
-        def pair(_, ys):
-            # Two iterations, each of which overwrites the older values.
-            before, y = ys
-            before = _toward(before, image(y), weight)
-            return before, _toward(y, image(before), weight)
-
-        before, y = lax.fori_loop(0, pairs, pair, (before, y))
-        # It is read several times.
-        end = materialize(lambda: image(y))
-
-        def decided():
-            # On its way back from where iteration led away, the state's size changes much.
-            whole, scales = _begun(limits, end)
-            earlier = jnp.where(begins, whole, rounds.size)
-            root = lambda x: x ** (1 / (2 * pairs + jnp.where(first, 0, 1)))
-            step, change = rounds.step + 2 * pairs + 1, (end**ω - y**ω).ω
-            # Fast oscillations shrink unevenly from round to round.
-            halt = jnp.where(a > 1, 0.9, 0.5)
-            new = rounds._replace(y=(), step=step, scales=scales)
-            new = _judged(limits, new, change, earlier, root, 0, halt)
-
-            rate, damped = root(ratio(new.size, earlier)), 1 - weight
-            # Where iteration leads away, it begins once more at zero, with the new weight.
-            anew = ~(new.size < earlier)
-            # If an entry is NaN, so is the rate, and all of these are true.
-            wrong = ~(rate**2 <= damped) & (anew | (rounds.step <= 2 * num_first + 1))
-            other = jnp.where(wrong, (rate + damped / rate) / weight, a)
-            lost = anew & ~(other <= _FASTEST)
-            going = ~new.solved & ~lost & (step < limits.steps)
-            return new._replace(going=going), other, _weight(other), anew
-
-        # It decides over every array of the state.
-        new, a, weight, anew = materialize(decided)
-        ahead = _toward(before, end, weight)
-        pick = lambda x, y: jnp.where(new.solved, x, jnp.where(anew, 0, y))
-        before = jtu.tree_map(lambda y: jnp.where(anew, 0, y), y)
-        y = before, jtu.tree_map(pick, end, ahead), a, anew
-        return new._replace(y=y)
-
-    from_here = begin.solved | begin.near
-    y = jtu.tree_map(lambda y: jnp.where(from_here, y, 0), begin.y)
-    first = _first(limits, begin, ())
-    found = _rounds(advance, first._replace(y=(y, y, first.size, jnp.array(True))))
-    return found._replace(y=found.y[1])
-
-
-def _weight(a: Scalar) -> Scalar:
-    return 2 / (1 + jnp.sqrt(1 + a**2))
-
-
-def _toward(a: PyTree[Array], b: PyTree[Array], weight: Scalar) -> PyTree[Array]:
-    return jtu.tree_map(lambda a, b: a + weight.astype(a.dtype) * (b - a), a, b)
-
-
-def _warmed_up(limits: Limits, image: _Map, begin: Found) -> Found:
-    """After a few fixed-point iterations; or where these go away from the solution, as it
-    was before."""
-    y, sizes = begin.y, limits.sizes
-    before, swept = _fixed_point(image, y, _WARMUP[_is_single(y)])
-    last, whole = sizes((swept**ω - before**ω).ω), sizes((swept**ω - y**ω).ω)
-    settled = largest(last) < _SETTLED * largest(whole)
-    y = jtu.tree_map(lambda a, b: jnp.where(settled, a, b), swept, y)
-    return begin._replace(y=y)
-
-
-def _by_chords(limits: Limits, image: _Map, begin: Found) -> Found:
-    """From where iteration `begin`s, for paths that are not yet solved.
-
-    All of it is written out in scalars. Of arrays with two or three entries for each path
-    XLA makes slow loops: with these a step of one oscillator takes a fifth longer.
-    """
-
-    def restore(scalars: list[Scalar]) -> PyTree[Array]:
-        rest = iter(scalars)
-        leaf = lambda x: jnp.stack([next(rest) for _ in range(x.size)]).reshape(x.shape)
-        return jtu.tree_map(leaf, begin.y)
-
-    ravel = lambda y: [x for leaf in jtu.tree_leaves(y) for x in jnp.ravel(leaf)]
-    rhs = lambda k: ravel(image(restore(k)))
-    k = [jnp.where(begin.solved | begin.near, x, 0) for x in ravel(begin.y)]
-    value, jacobian = jax.linearize(rhs, k)
-    one = np.eye(len(k), dtype=k[0].dtype)
-    columns = [(list(unit) ** ω - jacobian(list(unit)) ** ω).ω for unit in one]
-    M = inverse([list(row) for row in zip(*columns)])
-    diff = product(M, (value**ω - k**ω).ω)
-    moved = [jnp.where(begin.solved, x, x + y) for x, y in zip(k, diff)]
-    chord = lambda k: (k**ω + product(M, (rhs(k) ** ω - k**ω).ω) ** ω).ω
-
-    def advance(rounds: _Rounds) -> _Rounds:
-        before, k = _fixed_point(chord, rounds.y, _CHORDS)
-        scales, change = limits.scales(restore(k)), restore((k**ω - before**ω).ω)
-        new = rounds._replace(y=k, step=rounds.step + _CHORDS, scales=scales)
-        root = lambda x: _root(x, _CHORDS)
-        return _judged(limits, new, change, rounds.size, root, _MOST_CHORDS)
-
-    scales = limits.scales(restore(moved))
-    size, _ = limits.compare(restore(diff), scales)
-    first = _first(limits, begin, moved)._replace(size=size, scales=scales)
-    found = _rounds(advance, first)
-    return found._replace(y=restore(found.y))
-
-
-def _is_single(y: PyTree[Array]) -> bool:
-    return jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).bits < 64
-
-
-def _root(x: Scalar, power: int) -> Scalar:
-    """For powers of two."""
-    return x if power == 1 else _root(jnp.sqrt(x), power // 2)
-
-
-def _fixed_point(
-    image: _Map, y: PyTree[Array], times: IntScalarLike
-) -> tuple[PyTree[Array], PyTree[Array]]:
-    """The last two iterates. XLA makes faster code of a loop than of iterations written
-    out."""
-    return lax.fori_loop(0, times, lambda _, ys: (ys[1], image(ys[1])), (y, y))

@@ -17,6 +17,8 @@ _SHORT = 4
 # Longer ones are folded to this length, by what fuses with the program that makes them. Of
 # what is longer XLA keeps another array for each maximum.
 _WIDE = 32
+# A correction below this fraction of the state shows that iteration came near.
+_NEAR = 0.01
 
 
 class Limits(NamedTuple):
@@ -27,7 +29,6 @@ class Limits(NamedTuple):
     - `norm`: the norm within a leaf.
     - `scale`: how large the state is that values change.
     - `steps`: the most iterations.
-    - `direct`: the most unknowns for chord iterations.
     """
 
     rtol: float | None
@@ -35,7 +36,6 @@ class Limits(NamedTuple):
     norm: Callable[[PyTree], Scalar]
     scale: Callable[[PyTree[Array]], PyTree[Array]]
     steps: int
-    direct: int
 
     def sizes(self, y: PyTree[Array]) -> list[Scalar]:
         """The norm of each leaf."""
@@ -45,18 +45,25 @@ class Limits(NamedTuple):
     def scales(self, y: PyTree[Array]) -> list[Scalar]:
         return self.sizes(self.scale(y))
 
-    def compare(
-        self, change: PyTree[Array], scales: list[Scalar]
-    ) -> tuple[Scalar, Callable[[float], Bool[Array, ""]]]:
-        """The size of a correction in units of the tolerance (1 is just accepted), and
-        whether it is at most a fraction of the whole iterate."""
-        sizes = self.sizes(change)
+    def in_units(self, sizes: list[Scalar], scales: list[Scalar]) -> Scalar:
+        """The largest of `sizes` in units of the tolerance: 1 is just accepted."""
         eps = jnp.finfo(jnp.result_type(*sizes)).eps
         rtol = 2 * eps if self.rtol is None else self.rtol
-        in_units = lambda a, b: ratio(a, rtol * b + self.atol)
-        each = [in_units(a, b) for a, b in zip(sizes, scales)]
-        below = lambda fraction: largest(sizes) <= fraction * largest(scales)
-        return largest(each), below
+        each = [ratio(a, rtol * b + self.atol) for a, b in zip(sizes, scales)]
+        return largest(each)
+
+    def compare(
+        self, change: PyTree[Array], scales: list[Scalar]
+    ) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:
+        """The size of a correction in units of the tolerance, and next to the whole state
+        whether it is no larger than rounding errors, and whether it is small at all."""
+        sizes = self.sizes(change)
+        size, whole = self.in_units(sizes, scales), largest(scales)
+        # Rounding errors can keep the corrections to a leaf that is small next to the
+        # others above `rtol` for ever. Then they no longer shrink, and all are tiny.
+        eps = float(jnp.finfo(size.dtype).eps)
+        below = lambda fraction: (largest(sizes) <= fraction * whole) & (size < jnp.inf)
+        return size, below(100 * eps), below(_NEAR)
 
 
 def max_norm(x: Array) -> Scalar:
@@ -84,19 +91,27 @@ def ratio(a: Array, b: Array) -> Array:
     return jnp.where(a == 0, 0, a / b)
 
 
+def log2(x: Scalar) -> Scalar:
+    """The logarithm of a positive number to within 0.09, for what takes no time next to
+    that of a library: the exponent, and the mantissa as a straight line. That of zero is
+    that of the least number, and that of NaN above all others."""
+    info = jnp.finfo(x.dtype)
+    bits = lax.bitcast_convert_type(jnp.abs(x), f"int{info.bits}").astype(x.dtype)
+    return bits * 2.0**-info.nmant + float(info.minexp - 1)
+
+
+# What remains may be this fraction of the tolerance, or its logarithm: it has the same sign
+# in every step, so that over many steps it adds up to a drift where rounding errors cancel.
+MARGIN = 6
+
+
 def converged(
-    size: Scalar,
-    below: Callable[[float], Bool[Array, ""]],
-    shrink: Scalar,
+    level: Scalar,
+    rate: Scalar,
+    rounded: Bool[Array, ""],
     stalled: Bool[Array, ""],
 ) -> Bool[Array, ""]:
-    """Whether the next correction is below the tolerance, when the last one was of this
-    `size` in units of it, and `shrink` times as large as the one before, or corrections
-    have `stalled`."""
-    # Rounding errors can keep the corrections to a leaf that is small next to the others
-    # above `rtol` for ever. Then they no longer shrink, and all of them are tiny.
-    rounded = below(100 * float(jnp.finfo(size.dtype).eps))
-    # A fraction of the tolerance: what remains has the same sign in every step, so that
-    # over many steps it adds up to a drift where rounding errors would cancel.
-    following = size * jnp.where(shrink < 1, shrink, 1)
-    return (following <= 1 / 64) | (stalled & rounded)
+    """Whether the next correction is below the tolerance, when logarithms of the size of
+    the last one, in units of it, and of its ratio to the one before, are `level` and
+    `rate`; or corrections have `stalled`, and all of them are tiny."""
+    return (level + jnp.minimum(rate, 0) <= -MARGIN) | (stalled & rounded)

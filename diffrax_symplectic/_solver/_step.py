@@ -2,7 +2,6 @@
 as what they define."""
 
 import functools as ft
-import itertools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
@@ -84,16 +83,8 @@ class Stages(eqx.Module):
         return image
 
     def _image(self, block: Block, known: Values, k: list[_Value]) -> list[_Value]:
-        """Stages of each kind read what those of the kinds before have become, which takes
-        fewer iterations than to evaluate all at once (Gauss-Seidel)."""
-        values, image = self._with_block(block, known, k), []
-        kind = lambda group: self.plan.tableau.stages[group[0]].kind
-        for _, groups in itertools.groupby(block.unknown, kind):
-            new = {group: self._evaluate_group(group, values) for group in groups}
-            image.extend(new.values())
-            for group, value in new.items():
-                values = values | _unstack(group, value)
-        return image
+        values = self._with_block(block, known, k)
+        return [self._evaluate_group(group, values) for group in block.unknown]
 
     def _with_block(
         self, block: Block, values: Values, unknown: list[_Value], keep: bool = False
