@@ -37,13 +37,11 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     the *next* correction would be below it: after $\delta_{n-1}$ and $\delta_n$ that is
     about $\delta_n\, (\delta_n / \delta_{n-1})$ for a method of linear convergence.
 
-    First come iterations for all paths of a batch together, until each is solved or does
-    not converge: fixed-point (Picard) iterations, which need no Jacobian. Where these are
-    slow, and at once for two unknowns or fewer, chord iterations follow up to `direct`
-    unknowns: those of Newton's method with one Jacobian. For more than 24 unknowns they
-    are accelerated (in single precision where they are slow) by second-order Richardson
-    iteration (Golub and Varga, Numerische Mathematik 3, 1961), for the imaginary
-    eigenvalues that oscillations have.
+    First come sweeps for all paths of a batch together, until each is solved or does not
+    converge: fixed-point (Picard) iterations, which need no Jacobian. In a sweep $q$ reads
+    what $p$ has become, and where that converges slowly, values stay behind by a fraction
+    of their change (successive over-relaxation: Young, Transactions of the American
+    Mathematical Society 76, 1954).
 
     The paths that are left are gathered from the batch. For these, a step of the search is
     up to eight iterations of Newton's method. Its linear systems are solved by elimination
@@ -62,8 +60,8 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     - `norm`: norm within a leaf.
     - `linear_solver`: a Lineax solver for all linear systems, those of derivatives
         included. `None` is elimination for few unknowns, and otherwise no matrix.
-    - `picard_steps`: the most iterations before Newton's method. Where their rate tells
-        that so many would not do, they end at once.
+    - `picard_steps`: the most sweeps before Newton's method. Where their rate tells that so
+        many would not do, they end at once.
 
     In `optimistix.root_find`, `options={"scale": f}` says how large the state is that the
     unknowns `k` change: `f(k)` has their structure, and stands in place of `k` in `rtol`.
