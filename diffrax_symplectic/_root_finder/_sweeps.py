@@ -58,7 +58,7 @@ class _Rounds(NamedTuple):
     near: Bool[Array, ""]
     going: Bool[Array, ""]
     step: IntScalarLike
-    count: IntScalarLike
+    ahead: IntScalarLike
 
 
 def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
@@ -103,7 +103,7 @@ def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
             new = behind(first(p, q), p)
             return (p, q), (new, behind(second(new, q), q))
 
-        before, y = lax.fori_loop(0, last.count, once, (last.y, last.y))
+        before, y = lax.fori_loop(0, last.ahead, once, (last.y, last.y))
         scales = limits.scales(join(*y))
         size, rounded, close = limits.compare(change(before, y), scales)
         whole = limits.in_units([largest(scales)], [largest(scales)])
@@ -111,8 +111,8 @@ def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
         level, earlier = log2(size), jnp.minimum(last.level, log2(whole))
 
         def decided() -> _Rounds:
-            rate = (level - earlier) / last.count
-            stalled, step = rate >= _STALLED, last.step + last.count
+            rate = (level - earlier) / last.ahead
+            stalled, step = rate >= _STALLED, last.step + last.ahead
             solved = converged(level, rate, rounded, stalled)
             a = jnp.exp2(rate)
             tuned = (last.step == 0) & (a > _SLOW) & ~stalled
@@ -134,7 +134,7 @@ def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
                 near=jnp.where(last.going, near, last.near),
                 going=going,
                 step=step,
-                count=jnp.minimum(most_of_batch(count), _MOST),
+                ahead=jnp.minimum(most_of_batch(count), _MOST),
             )
 
         # What follows reads it several times, and would compute it as often.
@@ -147,10 +147,10 @@ def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
 
     none, level = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype)
     y, solved, near = halves(begin.y), begin.solved, begin.near
-    begun = _Rounds(y, none, level, solved, near, ~solved, step=0, count=0)
+    begun = _Rounds(y, none, level, solved, near, ~solved, step=0, ahead=0)
     # All but the numbers of sweeps, which all paths have in common.
-    begun = batched_together(begun)._replace(step=0, count=num_first)
-    last = lax.while_loop(lambda rounds: rounds.count > 0, advance, begun)
+    begun = batched_together(begun)._replace(step=0, ahead=num_first)
+    last = lax.while_loop(lambda rounds: rounds.ahead > 0, advance, begun)
     return Found(join(*last.y), last.solved, last.near)
 
 
