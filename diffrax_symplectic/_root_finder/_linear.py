@@ -69,8 +69,10 @@ def _size(rhs: _Vector) -> Scalar:
 
 
 def _eliminate(matrix: _Matrix, rhs: _Vector) -> _Vector:
-    """The solution of a linear system."""
-    if len(rhs) > MAX_WRITTEN_OUT:
+    """The solution of a linear system. Of few unknowns it is written out, with partial
+    pivoting: LAPACK takes a call for each matrix of a batch, where XLA fuses arithmetic."""
+    n = len(rhs)
+    if n > MAX_WRITTEN_OUT:
         # On CPUs JAX makes a permutation of LAPACK's pivots by a loop with ten kernels for
         # each row, which takes several times as long as this does.
         Q, R = jnp.linalg.qr(matrix)
@@ -79,18 +81,8 @@ def _eliminate(matrix: _Matrix, rhs: _Vector) -> _Vector:
     # in each entry of what is written out: with four unknowns 0.1 s more to compile.
     size = _size(rhs)
     rows = [[*row, x] for row, x in zip(matrix, rhs / size)]
-    return size * jnp.stack([x for (x,) in _solutions(rows, exchange=True)])
-
-
-def _solutions(rows: list[list[Any]], exchange: bool) -> list[list[Scalar]]:
-    """The solutions of linear systems with one matrix, whose rows are each followed by
-    their right-hand sides: by elimination, with partial pivoting if rows may `exchange`.
-
-    LAPACK takes a call for each matrix of a batch. XLA fuses arithmetic that is written
-    out."""
-    n = len(rows)
     for k in range(n):
-        for i in range(k + 1, n) if exchange else ():
+        for i in range(k + 1, n):
             # The largest pivot comes up by comparisons of two rows.
             swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
             upper = [jnp.where(swap, b, a) for a, b in zip(rows[k], rows[i])]
@@ -100,4 +92,4 @@ def _solutions(rows: list[list[Any]], exchange: bool) -> list[list[Scalar]]:
         rows[k] = [scale * x for x in rows[k]]
         for i in {*range(n)} - {k}:
             rows[i] = [x - rows[i][k] * y for x, y in zip(rows[i], rows[k])]
-    return [row[n:] for row in rows]
+    return size * jnp.stack([row[n] for row in rows])

@@ -39,9 +39,10 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
 
     First come sweeps for all paths of a batch together, until each is solved or does not
     converge: fixed-point (Picard) iterations, which need no Jacobian. In a sweep $q$ reads
-    what $p$ has become, and where that converges slowly, values stay behind by a fraction
-    of their change (successive over-relaxation: Young, Transactions of the American
-    Mathematical Society 76, 1954).
+    what $p$ has become. This is for a list of pairs `(p, q)`; of other unknowns two copies
+    read each other. Where that converges slowly, values stay behind by a fraction of their
+    change (successive over-relaxation: Young, Transactions of the American Mathematical
+    Society 76, 1954).
 
     The paths that are left are gathered from the batch. For these, a step of the search is
     up to eight iterations of Newton's method. Its linear systems are solved by elimination

@@ -16,20 +16,22 @@ from ._tolerance import converged, largest, Limits, log2, MARGIN
 
 _Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]
 
-# Sweeps before the first look at the error, in double and in single precision; and those
-# with copies, each of which evaluates everything twice.
+# Sweeps before the first look at the error, in double and in single precision: those that
+# a short step needs. With copies a sweep has two evaluations, and two thirds of them do.
 _FIRST, _FIRST_WITH_COPIES = (9, 6), (6, 4)
-# The most sweeps between two looks.
+# The most sweeps between two looks. A rate that is near one is not known well.
 _MOST = 32
 # The same where corrections are as small as rounding errors.
 _LAST = 3
-# Above this rate of convergence sweeps are damped. Below, that would gain nothing.
+# Above this rate of convergence sweeps are damped. Below, that saves less than a sweep.
 _SLOW = 0.3
-# How much they are damped where they led away from the solution: the best for a rate of 8.
+# How much they are damped where they led away from the solution. It is the best for a rate
+# of 8.
 _MOST_DAMPED = 0.5
-# The logarithm of a rate that is expected of sweeps once they are damped.
+# The logarithm of the rate that is expected once they are damped. By the formula it is 0.17
+# or better for rates up to one, but later than in the first few sweeps.
 _DAMPED = -2.0
-# A rate above this, of which this is the logarithm, is taken for none.
+# The logarithm of the rate of 0.87, above which sweeps are not taken to converge.
 _STALLED = -0.2
 
 
@@ -95,6 +97,7 @@ def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
 
     def advance(last: _Rounds) -> _Rounds:
         def behind(new: PyTree[Array], old: PyTree[Array]) -> PyTree[Array]:
+            # Of what is infinite this makes NaN, which passes for no rounding error.
             stay = lambda x, y: x + last.damping.astype(x.dtype) * (y - x)
             return jtu.tree_map(stay, new, old)
 

@@ -62,7 +62,7 @@ class Limits(NamedTuple):
         # Rounding errors can keep the corrections to a leaf that is small next to the
         # others above `rtol` for ever. Then they no longer shrink, and all are tiny.
         eps = float(jnp.finfo(size.dtype).eps)
-        below = lambda fraction: (largest(sizes) <= fraction * whole) & (size < jnp.inf)
+        below = lambda fraction: largest(sizes) <= fraction * whole
         return size, below(100 * eps), below(_NEAR)
 
 
@@ -92,16 +92,17 @@ def ratio(a: Array, b: Array) -> Array:
 
 
 def log2(x: Scalar) -> Scalar:
-    """The logarithm of a positive number to within 0.09, for what takes no time next to
-    that of a library: the exponent, and the mantissa as a straight line. That of zero is
-    that of the least number, and that of NaN above all others."""
+    """The logarithm of a positive number to within 0.09: the exponent, and the mantissa as
+    a straight line. That of a library would take as long as several sweeps. Zero has that
+    of a number below all others, and NaN one above all."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(jnp.abs(x), f"int{info.bits}").astype(x.dtype)
     return bits * 2.0**-info.nmant + float(info.minexp - 1)
 
 
-# What remains may be this fraction of the tolerance, or its logarithm: it has the same sign
-# in every step, so that over many steps it adds up to a drift where rounding errors cancel.
+# The next correction has to be below the tolerance by a factor of 64, of which this is the
+# logarithm. What is left out has the same sign in every step. Over many steps it adds up to
+# a drift, where rounding errors cancel.
 MARGIN = 6
 
 
