@@ -18,7 +18,7 @@ _Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]
 
 # Sweeps before the first look at the error, in double and in single precision: those that
 # a short step needs. With copies a sweep has two evaluations, and two thirds of them do.
-_FIRST, _FIRST_WITH_COPIES = (9, 6), (6, 4)
+_FIRST, _FIRST_WITH_COPIES = (9, 6), (6, 5)
 # The most sweeps between two looks. A rate that is near one is not known well.
 _MOST = 32
 # The same where corrections are as small as rounding errors.

@@ -4,11 +4,11 @@ import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax import lax
 
 from .._arguments import check_state
 from .._batch import batched_together
@@ -88,8 +88,6 @@ _flow = make_plan(
         weights=_half,
     )
 )
-# Up to so many noises their flows are written out one after another, without a loop.
-_WRITTEN_OUT = 2
 
 
 class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
@@ -162,29 +160,51 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del made_jump
-        drift, _ = split_terms(terms)
+        drift, noise = split_terms(terms)
         unsolved = first_state(self) if solver_state is None else solver_state
         begin, end, y0, unsolved = batched_together(
             (t0, t1, y0, unsolved), eqx.filter((terms, args), eqx.is_array)
         )
         middle = begin + (end - begin) / 2
+        numbers, increments = self._in_order(terms, t0, t1)
+        still = [middle] * (numbers.size + 1)
+        # First and last the drift, which has no number: what it gets is not read.
+        flows = (
+            np.pad(np.full(numbers.size, False), 1, constant_values=True),
+            jnp.stack([begin, *still]),
+            jnp.stack([*still, end]),
+            jnp.pad(numbers, 1),
+            jnp.pad(increments, 1),
+        )
 
-        def along_drift(t0, t1, y, unsolved):
+        def along_drift(t0, t1, number, increment, y, unsolved):
+            del number, increment
             if len(drift) == 0:
                 return y, unsolved
             step = Step(t0, t1 - t0, {"h": drift_driven(drift, t0, t1, args)})
             return take_step(_flow, step, y, self, unsolved)
 
-        y, unsolved = along_drift(begin, middle, y0, unsolved)
-        y, unsolved = self._along_noise(terms, t0, t1, middle, y, args, unsolved)
-        y1, unsolved = along_drift(middle, end, y, unsolved)
+        def along_noise(t0, t1, number, increment, y, unsolved):
+            del t1
+            if len(noise) == 0:
+                return y, unsolved
+            driven = jtu.Partial(apply_one, noise, number, increment, args)
+            step = Step(t0, jnp.zeros_like(t0), {"h": driven})
+            return take_step(_flow, step, y, self, unsolved)
+
+        # In a loop, so that each kind of flow is compiled only once.
+        def along(carry, flow):
+            is_drift, *which = flow
+            return lax.cond(is_drift, along_drift, along_noise, *which, *carry), None
+
+        (y1, unsolved), _ = lax.scan(along, (y0, unsolved), flows)
         return y1, None, dict(y0=y0, y1=y1), unsolved, result_of(unsolved, y1)
 
-    def _along_noise(self, terms, t0, t1, time, y, args, unsolved):
-        """The flows of all noises, the time standing still at `time`."""
+    def _in_order(self, terms, t0, t1):
+        """The numbers of the noises in the order of their flows, and their increments."""
         _, noise = split_terms(terms)
         if len(noise) == 0:
-            return y, unsolved
+            return jnp.zeros(0, int), jnp.zeros(0)
         m = number_of_noises(terms)
         # The flows of several noises have an order, for which a coin is needed.
         names = ["W", "two_point"] if m > 1 else ["W"]
@@ -194,15 +214,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         if m > 1:
             coin = jtu.tree_leaves(drawn["two_point"])[0].reshape(-1)[0] > 0
             numbers = jnp.where(coin, numbers, numbers[::-1])
-
-        def flow(carry, this):
-            driven = jtu.Partial(apply_one, noise, *this, args)
-            step = Step(time, jnp.zeros_like(time), {"h": driven})
-            return take_step(_flow, step, carry[0], self, carry[1]), None
-
-        unroll = m if m <= _WRITTEN_OUT else 1
-        flows = (numbers, increments[numbers])
-        return jax.lax.scan(flow, (y, unsolved), flows, unroll=unroll)[0]
+        return numbers, increments[numbers]
 
 
 NinomiyaVictoir.__init__.__doc__ = ARGUMENTS
