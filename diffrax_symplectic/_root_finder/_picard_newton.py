@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, Bool, PyTree, Scalar
+from jaxtyping import Array, PyTree, Scalar
 
 from .._batch import where_pending
 from .._compat import ω
@@ -91,16 +91,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         scale = options.get("scale", lambda k: k)
         return Limits(self.rtol, self.atol, self.norm, scale, self.picard_steps)
 
-    def init(
-        self,
-        fn: Callable,
-        y: PyTree[Array],
-        args: PyTree[Any],
-        options: dict[str, Any],
-        f_struct: PyTree[jax.ShapeDtypeStruct],
-        aux_struct: PyTree[jax.ShapeDtypeStruct],
-        tags: frozenset[object],
-    ) -> _State:
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
         del f_struct, tags
         lost = options.get("lost", jnp.array(False))
         limits, zeros = self._limits(options), jtu.tree_map(jnp.zeros_like, y)
@@ -120,15 +111,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         aux = jtu.tree_map(zero, aux_struct)
         return begin(k, found.solved, guess), aux
 
-    def step(
-        self,
-        fn: Callable,
-        y: PyTree[Array],
-        args: PyTree[Any],
-        options: dict[str, Any],
-        state: _State,
-        tags: frozenset[object],
-    ) -> tuple[PyTree[Array], _State, Any]:
+    def step(self, fn, y, args, options, state, tags):
         del tags
         # `y` stays the guess. The state has the iterate, which `postprocess` returns.
         (packed, aux), (guess, restore) = state, jfu.ravel_pytree(y)
@@ -144,15 +127,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         newton = lambda packed: lax.fori_loop(0, times, another, packed)
         return y, (where_pending(newton, pending, packed), aux), aux
 
-    def terminate(
-        self,
-        fn: Callable,
-        y: PyTree[Array],
-        args: PyTree[Any],
-        options: dict[str, Any],
-        state: _State,
-        tags: frozenset[object],
-    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+    def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
         progress = Progress.unpacked(state[0])
         result = optx.RESULTS.where(
@@ -160,17 +135,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         )
         return progress.solved, result
 
-    def postprocess(
-        self,
-        fn: Callable,
-        y: PyTree[Array],
-        aux: Any,
-        args: PyTree[Any],
-        options: dict[str, Any],
-        state: _State,
-        tags: frozenset[object],
-        result: optx.RESULTS,
-    ) -> tuple[PyTree[Array], Any, dict[str, Any]]:
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del options, tags, result
         found = jfu.ravel_pytree(y)[1](Progress.unpacked(state[0]).k)
         aux = fn(found, args)[1] if jtu.tree_leaves(aux) else aux
