@@ -59,13 +59,9 @@ class Progress(NamedTuple):
         return self.target > 1
 
     @property
-    def lost(self) -> Bool[Array, ""]:
-        return self.reached < 0
-
-    @property
     def hopeless(self) -> Bool[Array, ""]:
         """Whether even the search for any solution has left where there are values."""
-        return self.lost & ~jnp.isfinite(self.size)
+        return (self.reached < 0) & ~jnp.isfinite(self.size)
 
     @property
     def ended(self) -> Bool[Array, ""]:
@@ -125,7 +121,8 @@ def advance(
     near = max_norm(diff) < _LOOSE * moved
     arrived = near & ~whole
     slow = ~whole & (progress.tries + 1 >= _PATIENCE_IN_PART)
-    back = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~progress.lost & ~solved
+    on_branch = progress.reached >= 0
+    back = (~jnp.isfinite(size) | stalled | slow) & ~arrived & on_branch & ~solved
 
     # Each of these is simple, so that XLA computes once which of them it is.
     going = progress._replace(k=k, tries=progress.tries + 1, size=size)
@@ -134,14 +131,9 @@ def advance(
     onward = Progress(k, longer, s, zero, size, anchor=k)
     shorter = progress.reached + _SHORTER * stride
     turned = _SHORTER * stride < _SHORTEST
-    retry = Progress(
-        k=progress.anchor,
-        target=jnp.where(turned, 1, shorter),
-        reached=jnp.where(turned, _LOST, progress.reached),
-        tries=zero,
-        size=size,
-        anchor=progress.anchor,
-    )
+    target = jnp.where(turned, 1, shorter)
+    reached = jnp.where(turned, _LOST, progress.reached)
+    retry = Progress(progress.anchor, target, reached, zero, size, progress.anchor)
     done = going._replace(target=zero + _SOLVED)
     new = going.packed()
     for case, then in (arrived, onward), (back, retry), (solved, done):

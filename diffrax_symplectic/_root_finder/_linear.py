@@ -15,7 +15,6 @@ from .._custom_types import IntScalarLike
 
 
 _Vector: TypeAlias = Float[Array, " n"]
-_Matrix: TypeAlias = Float[Array, "n n"]
 _Map: TypeAlias = Callable[[_Vector], _Vector]
 Solver: TypeAlias = lx.AbstractLinearSolver[Any] | None
 
@@ -71,7 +70,7 @@ def _size(rhs: _Vector) -> Scalar:
     return jnp.where(size > 0, size, 1)
 
 
-def _eliminate(matrix: _Matrix, rhs: _Vector) -> _Vector:
+def _eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     """The solution of a linear system, by elimination with partial pivoting. By operations
     of XLA: LAPACK takes a call for each matrix of a batch, and 0.1 s to load."""
     n = len(rhs)

@@ -15,7 +15,7 @@ from jaxtyping import Array, PyTree, Scalar
 from .._batch import where_pending
 from .._compat import ω
 from ._continuation import advance, begin, Packed, Progress
-from ._sweeps import Found, sweep, sweep_blocks
+from ._sweeps import Found, sweep
 from ._tolerance import Limits
 
 
@@ -66,11 +66,8 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
 
     In `optimistix.root_find`, `options={"scale": f}` says how large the state is that the
     unknowns `k` change: `f(k)` has their structure, and stands in place of `k` in `rtol`.
-    With `options={"blocks": fs}` the unknowns are a list, and the equations come in blocks,
-    each of which reads those before it: `fs[i](k)` returns the function whose fixed point
-    is `k[i]`. First iterations then solve one block after another, from zero. Nothing waits
-    for the solution where `options={"lost": flag}` is true, and there it is of no use. Of
-    Newton's method there are `options={"iterations": n}` in a step, or eight.
+    Nothing waits for the solution where `options={"lost": flag}` is true, and there it is
+    of no use. Of Newton's method there are `options={"iterations": n}` in a step, or eight.
 
     **Raises:** a `ValueError` for negative numbers.
     """
@@ -96,8 +93,9 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         lost = options.get("lost", jnp.array(False))
         limits, zeros = self._limits(options), jtu.tree_map(jnp.zeros_like, y)
         begun = Found(zeros, solved=lost, near=~lost)
-        if "blocks" in options:
-            found = sweep_blocks(limits, options["blocks"], begun)
+        # A step sweeps the blocks of its plan one after another.
+        if "sweep" in options:
+            found = options["sweep"](limits, begun)
         else:
             moved = lambda k: (y**ω + k**ω).ω
             image = lambda k: (k**ω - fn(moved(k), args)[0] ** ω).ω
@@ -105,35 +103,28 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
             found = sweep(limits._replace(scale=scale), image, begun)
             found = found._replace(y=moved(found.y))
         k, guess = jfu.ravel_pytree(found.y)[0], jfu.ravel_pytree(y)[0]
-        k = jnp.where(found.solved | found.near, k, guess)
+        k = jnp.where(found.near, k, guess)
         of_array = lambda x: isinstance(x, jax.ShapeDtypeStruct)
         zero = lambda x: jnp.zeros(x.shape, x.dtype) if of_array(x) else x
-        aux = jtu.tree_map(zero, aux_struct)
-        return begin(k, found.solved, guess), aux
+        return begin(k, found.solved, guess), jtu.tree_map(zero, aux_struct)
 
     def step(self, fn, y, args, options, state, tags):
         del tags
         # `y` stays the guess. The state has the iterate, which `postprocess` returns.
         (packed, aux), (guess, restore) = state, jfu.ravel_pytree(y)
         residual = lambda k: jfu.ravel_pytree(fn(restore(k), args)[0])[0]
-        pending = ~Progress.unpacked(packed).ended
+        ended = lambda packed: Progress.unpacked(packed).ended
         solver, limits = self.linear_solver, self._limits(options)
         once = ft.partial(advance, limits, solver, residual, restore, guess)
-
-        def another(_, packed):
-            return jnp.where(Progress.unpacked(packed).ended, packed, once(packed))
-
+        another = lambda _, packed: jnp.where(ended(packed), packed, once(packed))
         times = options.get("iterations", ITERATIONS)
         newton = lambda packed: lax.fori_loop(0, times, another, packed)
-        return y, (where_pending(newton, pending, packed), aux), aux
+        return y, (where_pending(newton, ~ended(packed), packed), aux), aux
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
-        progress = Progress.unpacked(state[0])
-        result = optx.RESULTS.where(
-            progress.hopeless, optx.RESULTS.nonfinite, optx.RESULTS.successful
-        )
-        return progress.solved, result
+        progress, R = Progress.unpacked(state[0]), optx.RESULTS
+        return progress.solved, R.where(progress.hopeless, R.nonfinite, R.successful)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del options, tags, result

@@ -1,6 +1,6 @@
 """The iteration that normally solves a step, for all paths of a batch together."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
@@ -40,7 +40,7 @@ class Found(NamedTuple):
 
     - `y`: the last iterate.
     - `solved`: whether the next correction would be below the tolerance.
-    - `near`: whether `y` is a better first guess than the one that it began with.
+    - `near`: whether `y` is solved, or a better first guess than where it began.
     """
 
     y: PyTree[Array]
@@ -80,7 +80,8 @@ def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
     Golub and R. S. Varga, Numerische Mathematik 3, 1961, 147-156). Where sweeps led away,
     they begin once more, damped like this.
     """
-    if pairs := type(begin.y) is list and all(_is_pair(x) for x in begin.y):
+    is_pair = lambda x: type(x) is tuple and len(x) == 2
+    if pairs := type(begin.y) is list and all(map(is_pair, begin.y)):
         join = lambda p, q: list(zip(p, q))
         halves = lambda y: tuple(list(half) for half in zip(*y))
         first = lambda p, q: halves(image(join(p, q)))[0]
@@ -143,10 +144,9 @@ def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
         # What follows reads it several times, and would compute it as often.
         new = materialize(decided)
         again = new.going & ~new.near
-        y = jtu.tree_map(lambda y: jnp.where(again, 0, y), y)
         # The sweeps of all paths of a batch are the same, but each path has only its own.
-        select = lambda a, b: jnp.where(last.going, a, b)
-        return new._replace(y=jtu.tree_map(select, y, last.y))
+        own = lambda y, old: jnp.where(last.going, jnp.where(again, 0, y), old)
+        return new._replace(y=jtu.tree_map(own, y, last.y))
 
     none, level = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype)
     y, solved, near = halves(begin.y), begin.solved, begin.near
@@ -154,27 +154,4 @@ def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
     # All but the numbers of sweeps, which all paths have in common.
     begun = batched_together(begun)._replace(step=0, ahead=num_first)
     last = lax.while_loop(lambda rounds: rounds.ahead > 0, advance, begun)
-    return Found(join(*last.y), last.solved, last.near)
-
-
-def _is_pair(x: PyTree[Array]) -> bool:
-    return type(x) is tuple and len(x) == 2
-
-
-def sweep_blocks(
-    limits: Limits,
-    blocks: Sequence[Callable[[list[PyTree[Array]]], _Map]],
-    begin: Found,
-) -> Found:
-    """The same for equations in blocks, of which each reads those before it. For each there
-    is a function that makes its `image` from the values of all."""
-    solved = near = jnp.array(True)
-    y = list(begin.y)
-    for i, block in enumerate(blocks):
-        if len(y[i]) == 0:
-            continue
-        own = lambda k, i=i: limits.scale([*y[:i], k, *y[i + 1 :]])[i]
-        found = sweep(limits._replace(scale=own), block(y), begin._replace(y=y[i]))
-        y[i] = found.y
-        solved, near = solved & found.solved, near & (found.solved | found.near)
-    return Found(y, solved, near)
+    return Found(join(*last.y), last.solved, last.solved | last.near)

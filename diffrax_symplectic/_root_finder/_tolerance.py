@@ -2,7 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -10,6 +10,8 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
+
+_Flag: TypeAlias = Bool[Array, ""]
 
 # Up to this many entries the maximum is written out. XLA fuses no reduction with what its
 # result goes into, and on CPUs it reduces short axes slowly.
@@ -54,7 +56,7 @@ class Limits(NamedTuple):
 
     def compare(
         self, change: PyTree[Array], scales: list[Scalar]
-    ) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:
+    ) -> tuple[Scalar, _Flag, _Flag]:
         """The size of a correction in units of the tolerance, and next to the whole state
         whether it is no larger than rounding errors, and whether it is small at all."""
         sizes = self.sizes(change)
@@ -82,7 +84,7 @@ def largest(norms: list[Scalar]) -> Scalar:
     return ft.reduce(jnp.maximum, norms)
 
 
-def all_finite(y: PyTree[Array]) -> Bool[Array, ""]:
+def all_finite(y: PyTree[Array]) -> _Flag:
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(y)]))
 
 
@@ -106,12 +108,7 @@ def log2(x: Scalar) -> Scalar:
 MARGIN = 6
 
 
-def converged(
-    level: Scalar,
-    rate: Scalar,
-    rounded: Bool[Array, ""],
-    stalled: Bool[Array, ""],
-) -> Bool[Array, ""]:
+def converged(level: Scalar, rate: Scalar, rounded: _Flag, stalled: _Flag) -> _Flag:
     """Whether the next correction is below the tolerance, when logarithms of the size of
     the last one, in units of it, and of its ratio to the one before, are `level` and
     `rate`; or corrections have `stalled`, and all of them are tiny."""

@@ -22,8 +22,11 @@ from .._plan import Block, Plan
 from .._root_finder import (
     all_finite,
     differentiate,
+    Found,
     ITERATIONS,
+    Limits,
     PicardNewton,
+    sweep,
 )
 from .._tableau import FlatTableau, Stage
 from .._terms import tree_sum
@@ -66,13 +69,20 @@ class Stages(eqx.Module):
 
         return [zero(group) for group in block.unknown]
 
-    def image_of(self, number: int, unknown: Unknown) -> Callable:
-        r"""$\Phi$ of the stage equations $k = \Phi(k)$ of one block, given the unknown
-        values of those before it."""
-        values = {}
-        for block, k in zip(self.plan.blocks[:number], unknown):
+    def sweep(self, limits: Limits, begin: Found) -> Found:
+        """First iterations for the stage equations: block after block, each from the values
+        of those before it."""
+        values, y = {}, []
+        solved = near = jnp.array(True)
+        for block, k in zip(self.plan.blocks, begin.y):
+            if block.unknown:
+                own = limits._replace(scale=ft.partial(self._scale, block))
+                image = ft.partial(self._image, block, values)
+                k, is_solved, is_near = sweep(own, image, begin._replace(y=k))
+                solved, near = solved & is_solved, near & is_near
+            y.append(k)
             values = self._with_block(block, values, k, keep=True)
-        return ft.partial(self._image, self.plan.blocks[number], values)
+        return Found(y, solved, near)
 
     def image(self, unknown: Unknown) -> Unknown:
         r"""$\Phi$ for the whole step."""
@@ -110,15 +120,14 @@ class Stages(eqx.Module):
     def scale(self, unknown: Unknown) -> Unknown:
         """How large the state is that unknown values change: they are only needed to its
         accuracy."""
+        return [self._scale(block, k) for block, k in zip(self.plan.blocks, unknown)]
 
+    def _scale(self, block: Block, unknown: list[_Value]) -> list[_Value]:
         def scale(group: tuple[int, ...], value: _Value) -> _Value:
             changed = _part(self.y0, self.plan.tableau.stages[group[0]].writes)
             return jtu.tree_map(lambda y, k: jnp.abs(y) + jnp.abs(k), changed, value)
 
-        return [
-            [scale(group, k) for group, k in zip(block.unknown, values)]
-            for block, values in zip(self.plan.blocks, unknown)
-        ]
+        return [scale(group, k) for group, k in zip(block.unknown, unknown)]
 
     def _evaluate_group(self, group: tuple[int, ...], values: Values) -> _Value:
         """The values of stages of one kind; stacked, unless it is only one."""
@@ -279,7 +288,6 @@ def _solved(stages: Stages, lost: Bool[Array, ""], finder: Any, max_steps: int):
     if not isinstance(finder, PicardNewton):
         # That one begins with this.
         guess, iterations = stages.image(guess), 1
-    numbers = range(len(stages.plan.blocks))
     sol = optx.root_find(
         lambda k, stages: (k**ω - stages.image(k) ** ω).ω,
         finder,
@@ -287,7 +295,7 @@ def _solved(stages: Stages, lost: Bool[Array, ""], finder: Any, max_steps: int):
         args=stages,
         options=dict(
             scale=stages.scale,
-            blocks=[ft.partial(stages.image_of, i) for i in numbers],
+            sweep=stages.sweep,
             lost=lost,
             iterations=iterations,
         ),
