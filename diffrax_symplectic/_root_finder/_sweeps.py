@@ -17,7 +17,7 @@ from ._tolerance import converged, largest, Limits, log2, MARGIN
 _Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]
 
 # Sweeps before the first look at the error, in double and in single precision: those that
-# a short step needs. With copies a sweep has two evaluations, and two thirds of them do.
+# a short step needs. A sweep with copies evaluates everything twice, so that fewer will do.
 _FIRST, _FIRST_WITH_COPIES = (9, 6), (6, 5)
 # The most sweeps between two looks. A rate that is near one is not known well.
 _MOST = 32
