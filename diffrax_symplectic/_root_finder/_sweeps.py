@@ -102,12 +102,14 @@ def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
             stay = lambda x, y: x + last.damping.astype(x.dtype) * (y - x)
             return jtu.tree_map(stay, new, old)
 
-        def once(_, iterates):
-            _, (p, q) = iterates
+        def once(_, y):
+            p, q = y
             new = behind(first(p, q), p)
-            return (p, q), (new, behind(second(new, q), q))
+            return new, behind(second(new, q), q)
 
-        before, y = lax.fori_loop(0, last.ahead, once, (last.y, last.y))
+        # A loop that also kept the iterate before would copy it in each sweep.
+        before = lax.fori_loop(0, last.ahead - 1, once, last.y)
+        y = once(None, before)
         scales = limits.scales(join(*y))
         size, rounded, close = limits.compare(change(before, y), scales)
         whole = limits.in_units([largest(scales)], [largest(scales)])

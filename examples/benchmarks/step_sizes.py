@@ -78,6 +78,13 @@ def _systems() -> list[System]:
         System("rigid body", rigid_body, top, three, 512, 4.0),
     ]
     several = ds.ImplicitMidpoint(), ds.StrangGauss()
+    areas, many = (ds.LevyAreaMidpoint(), ds.PlateauGauss()), 16_384
+    systems += [
+        System(f"quartic Kubo, {many:,} paths", kubo, one, several, many, 1.4),
+        System(
+            f"quartic, two noises, {many:,} paths", pair, one, areas, many, 1.4, (2,)
+        ),
+    ]
     for title, make, frequency, sizes in (
         ("chain", chain, 2.0, (16, 256, 2048)),
         ("Schrödinger ring", ring, 5.0, (64,)),
@@ -298,7 +305,8 @@ def _over_value(name: str, calls, gradients, batch) -> tuple[float, ...]:
 INTRODUCTION = """\
 # Cost against step size
 
-{machine}. float64, {steps} steps, random numbers included. Made by `python -m
+{machine}. float64, {steps} steps, 512 paths if not said otherwise (2,048 divided by $d$
+for a system of size $d$), random numbers included. Made by `python -m
 examples.benchmarks.step_sizes`.
 
 Nanoseconds per path and step; $n$ is the number of unknowns of the largest system of a
