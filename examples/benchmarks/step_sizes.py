@@ -306,7 +306,7 @@ INTRODUCTION = """\
 # Cost against step size
 
 {machine}. float64, {steps} steps, 512 paths if not said otherwise (2,048 divided by $d$
-for a system of size $d$), random numbers included. Made by `python -m
+for a system of size $d$, at least 8), random numbers included. Made by `python -m
 examples.benchmarks.step_sizes`.
 
 Nanoseconds per path and step; $n$ is the number of unknowns of the largest system of a
