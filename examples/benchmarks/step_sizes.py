@@ -65,20 +65,22 @@ def _systems() -> list[System]:
 
     top = jnp.array([jnp.cos(1.1), 0.0, jnp.sin(1.1)])
     kubo = of(_quartic, lambda t, p, q, args: 0.3 * _quartic(t, p, q, args))
+    general = ds.ImplicitMidpoint(), ds.SRKs1(), ds.SRKw1(), *three[1:]
+    areas = ds.LevyAreaMidpoint(), ds.PlateauGauss()
+    several_noises = ds.NinomiyaVictoir(), *areas
+    separable = ds.SRKs2(), ds.SRKs3(), ds.SRKw3(), ds.SRKw4()
+    additive = ds.AdditiveGauss(), ds.SRKs4(), ds.SRKw5()
     pair = of(_quartic, lambda t, p, q, args: 0.3 * jnp.stack([p * q, q]))
     stretch = of(_henon_heiles, lambda t, p, q, args: 0.2 * jnp.sum(p * q))
     kicks = of(_henon_heiles, lambda t, p, q, args: 0.1 * jnp.sum(q))
     systems = [
-        System("quartic Kubo", kubo, one, three, 512, 1.4),
-        System(
-            "quartic, two noises", pair, one, (ds.NinomiyaVictoir(),), 512, 1.4, (2,)
-        ),
+        System("quartic Kubo", kubo, one, general, 512, 1.4),
+        System("quartic, two noises", pair, one, several_noises, 512, 1.4, (2,)),
         System("Hénon-Heiles", stretch, two, three, 512, 1.0),
-        System("Hénon-Heiles, kicks", kicks, two, (ds.AdditiveGauss(),), 512, 1.0),
+        System("Hénon-Heiles, kicks", kicks, two, (*additive, *separable), 512, 1.0),
         System("rigid body", rigid_body, top, three, 512, 4.0),
     ]
-    several = ds.ImplicitMidpoint(), ds.StrangGauss()
-    areas, many = (ds.LevyAreaMidpoint(), ds.PlateauGauss()), 16_384
+    several, many = (ds.ImplicitMidpoint(), ds.StrangGauss()), 16_384
     systems += [
         System(f"quartic Kubo, {many:,} paths", kubo, one, several, many, 1.4),
         System(
@@ -352,13 +354,18 @@ def page(rows: list[Row]) -> str:
 def draw(rows: list[Row]) -> None:
     titles = ("quartic Kubo", "Hénon-Heiles", "rigid body", "chain, d = 16")
     figure, axes = plt.subplots(1, 4, figsize=(13, 3.4), layout="constrained")
+    names = dict.fromkeys(row.name for row in rows if row.system.title in titles)
+    colors = {name: f"C{i}" for i, name in enumerate(names)}
     for ax, title in zip(axes, titles):
         for row in rows:
             if row.system.title == title:
                 x = row.system.frequency * np.array(SIZES)
                 label = row.name.strip("`")
                 style = "--" if label in ("Heun", "midpoint by hand") else "-"
-                ax.loglog(x, row.nanoseconds, style, marker=".", label=label)
+                ax.loglog(
+                    x, row.nanoseconds, style,
+                    marker=".", color=colors[row.name], label=label,
+                )  # fmt: skip
         ax.set(title=title, xlabel=r"$\omega h$")
         ax.xaxis.set_minor_formatter(NullFormatter())
     lines, labels = axes[0].get_legend_handles_labels()
