@@ -29,6 +29,7 @@ from jax.extend.core import (
     JaxprEqn as JaxprEqn,
     Literal as Literal,
 )
+from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 from jaxtyping import PyTree
 from lineax.internal import (
     pack_structures as pack_structures,
