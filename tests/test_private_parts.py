@@ -11,7 +11,6 @@ from pathlib import Path
 import diffrax
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import optimistix as optx
 import pytest
 
@@ -81,21 +80,6 @@ def test_the_terms_that_backsolve_adjoint_solves_are_known(terms):
     assert set(seen) == {False, True}
 
 
-@pytest.mark.core
-def test_a_solve_of_diffrax_is_found_on_the_stack_with_its_controller(terms):
-    y0 = jnp.array(0.3), jnp.array(0.7)
-    adaptive = diffrax.PIDController(rtol=1e-3, atol=1e-3)
-    with pytest.raises(ValueError) as info:
-        diffrax.diffeqsolve(
-            terms, diffrax.Heun(), 0.0, 1.0, 0.1, y0, stepsize_controller=adaptive
-        )
-    # Some versions of Diffrax raise an error of their own from it.
-    error = info.value
-    while (cause := error.__cause__ or error.__context__) is not None:
-        error = cause
-    assert "adaptive step size controller" in str(error)
-
-
 def test_omega_does_arithmetic_on_pytrees():
     x = {"a": jnp.array([1.0, 2.0]), "b": (jnp.array(3.0),)}
     y = (2 * x**_compat.ω - x**_compat.ω / 2).ω
@@ -107,16 +91,6 @@ def test_equinox_refuses_derivatives_of_what_is_nondifferentiable():
     assert f(2.0) == 2.0
     with pytest.raises(RuntimeError, match="t"):
         jax.jvp(f, (2.0,), (1.0,))
-
-
-def test_lineax_packs_the_structures_of_an_operator():
-    operator = lx.MatrixLinearOperator(jnp.eye(2))
-    structures = _compat.pack_structures(operator)
-    vector = jnp.array([1.0, 2.0])
-    ravelled = _compat.ravel_vector(vector, structures)
-    turned = _compat.transpose_packed_structures(structures)
-    for s in (structures, turned):
-        assert jnp.array_equal(_compat.unravel_solution(ravelled, s), vector)
 
 
 def test_a_program_of_jax_is_a_function_of_its_flat_inputs():
@@ -167,26 +141,6 @@ def test_loops_of_equinox_take_buffers_and_gradients_can_be_refused():
     assert jax.jvp(refused, (2.0,), (1.0,))[1] == 1
     with pytest.raises(RuntimeError, match="[Rr]everse-mode"):
         jax.grad(refused)(2.0)
-
-
-@pytest.mark.core
-def test_times_of_a_solve_are_found_as_they_were_passed(terms):
-    seen = []
-
-    class Spy(diffrax.Euler):
-        def init(self, terms, t0, t1, y0, args):
-            call = _compat.innermost_call()
-            seen.append([call[name] for name in ("t0", "t1", "dt0")])
-
-    y0 = jnp.array(0.3), jnp.array(0.7)
-    solve = lambda dt0: diffrax.diffeqsolve(
-        terms.terms[0], Spy(), 0, 1.0, dt0=dt0, y0=y0
-    )
-    jax.eval_shape(lambda: solve(0.5).ys)
-    jax.eval_shape(lambda h: solve(h).ys, 0.5)
-    assert seen[0] == [0, 1.0, 0.5] and seen[1][:2] == [0, 1.0]
-    assert isinstance(seen[1][2], jax.core.Tracer)
-    assert _compat.innermost_call() is None
 
 
 @pytest.mark.core

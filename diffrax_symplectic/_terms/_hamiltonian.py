@@ -93,8 +93,8 @@ def hamiltonian_terms(
     **Raises:** a `ValueError` if `path` is not a Brownian path or `structure` is unknown;
     and, while the solve is traced, if the state is not a pair `(p, q)` of the same
     structure and shapes, if `H0` does not return a scalar, if `noise` does not match the
-    path or does not depend on the state, if either asks for values in Python or returns
-    what is not real, or if a time of the solve is not finite.
+    path or does not depend on the state, or if either asks for values in Python or returns
+    what is not real.
     """
     check_takes("H0", H0, "t", "p", "q", "args")
     if structure not in (None, *get_args(_Structure)):

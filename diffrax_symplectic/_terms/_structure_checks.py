@@ -155,9 +155,12 @@ def check_stratonovich(
     """Raises a `ValueError` if a solver in the sense of Ito is to solve terms made from
     Hamiltonians, which are in the sense of Stratonovich. Both agree for additive noise, and
     for noise that changes `p` and depends on `q` alone."""
-    if not isinstance(solver, diffrax.AbstractItoSolver):
+    drift, noise = split_terms(terms)
+    # A drift beside `H0` may be the correction from one sense to the other.
+    corrected = not all(map(is_hamiltonian, drift))
+    if corrected or not isinstance(solver, diffrax.AbstractItoSolver):
         return
-    noise = tuple(filter(is_hamiltonian, split_terms(terms)[1]))
+    noise = tuple(filter(is_hamiltonian, noise))
     if additive_fault(noise, t0, y0, args) and separable_fault((), noise, t0, y0, args):
         raise ValueError(
             f"`{type(solver).__name__}` solves equations in the sense of Ito. Those of "

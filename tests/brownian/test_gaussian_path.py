@@ -227,17 +227,6 @@ def test_bad_arguments_are_refused():
         make(jax.ShapeDtypeStruct((), jnp.int32), jr.key(0))
     with pytest.raises(ValueError, match="needs a random key"):
         make((), 0)  # pyright: ignore
-    pid = diffrax.PIDController(rtol=1e-3, atol=1e-3)
-    with pytest.raises(ValueError, match="adaptive step size"):
-        diffrax.diffeqsolve(
-            kubo_terms(make((), jr.key(0))),
-            diffrax.Heun(),
-            0.0,
-            1.0,
-            0.1,
-            Y0,
-            stepsize_controller=pid,
-        )
 
 
 def test_trees_coarser_than_the_step_are_refused():
