@@ -12,7 +12,7 @@ The state is a pair `(p, q)`, momenta first. Begin like this:
     path = ds.WeakBrownianPath((), jr.key(0))
     terms = ds.hamiltonian_terms(H0, noise, path)
     y0 = (jnp.array(0.0), jnp.array(1.0))
-    print(ds.suggest_solver(terms, 0.0, y0, want="expectations"))
+    print(ds.suggest_solver(terms, 0.0, y0, want="weak"))
     sol = diffrax.diffeqsolve(terms, ds.StormerVerlet(), 0.0, 1.0, 0.1, y0)
 
 - Terms: `hamiltonian_terms`, `spin_terms`, `wave_terms`.
@@ -58,6 +58,7 @@ from ._root_finder import PicardNewton as PicardNewton
 from ._solver import (
     AbstractImplicitStages as AbstractImplicitStages,
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
+    AbstractSymplecticSolver as AbstractSymplecticSolver,
     AdditiveGauss as AdditiveGauss,
     BAOAB as BAOAB,
     Damped as Damped,

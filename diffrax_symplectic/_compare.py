@@ -151,7 +151,7 @@ def compare_solvers(
 
         H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
         noise = lambda t, p, q, args: 0.1 * jnp.sin(q)
-        terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+        terms = ds.hamiltonian_terms(H0, noise, ())  # the shape of one noise
         y0 = (jnp.array(0.0), jnp.array(1.0))
         solvers = [ds.StormerVerlet(), ds.ImplicitMidpoint()]
         print(
@@ -161,8 +161,8 @@ def compare_solvers(
 
     **Arguments:**
 
-    - `terms`: the terms, with any Brownian path. Each solver gets the path that it needs
-        in its place.
+    - `terms`: the terms, with any Brownian path, or with the shape of its increments in
+        place of a path. Each solver gets the path that it needs.
     - `solvers`: a list of solvers, or `None` for those that `suggest_solver` names.
     - `t0`, `t1`, `y0`, `args`: as for `diffrax.diffeqsolve`, with numbers for the times.
     - `dt0`: a list of step sizes; each divides the interval, and is a multiple of the
@@ -179,7 +179,7 @@ def compare_solvers(
     of the smallest, if `phi` does not return one number, and for what is no solver.
     """
     dts = _checked_steps(t0, t1, dt0)
-    want = "paths" if phi is None else "expectations"
+    want = "strong" if phi is None else "weak"
     suggestions = suggest_solver(terms, t0, y0, args, want=want)
     reference = suggestions[0].solver if reference is None else reference
     if solvers is None:
@@ -296,7 +296,7 @@ def _common_path(solver, cell, shape, key) -> diffrax.AbstractBrownianPath:
     if needs is PlateauIncrement:
         return PlateauBrownianPath(path, key)
     if needs is LevyAreaIncrement:
-        return LevyAreaBrownianPath(path, key, terms=0 if cell else 2, cell=cell)
+        return LevyAreaBrownianPath(path, key, num_terms=0 if cell else 2, cell=cell)
     return path
 
 

@@ -38,10 +38,10 @@ def with_tables(markdown: str) -> str:
 
 
 def table(name: str) -> str:
-    """The table of all solvers, of a family, or of what is suggested for `expectations` or
-    `paths`; or the names of those for any system."""
+    """The table of all solvers, of a family, or of what is suggested for `weak` or
+    `strong` approximation; or the names of those for any system."""
     solvers = [*(solver() for solver in SOLVERS), *_SPLIT]
-    if name in ("expectations", "paths"):
+    if name in ("weak", "strong"):
         return _suggested(name)
     if name == "names any":
         names = [f"`{s.__name__}`" for s in SOLVERS if s().structure == "any"]
@@ -90,7 +90,7 @@ def _suggested(want: Want) -> str:
     structures = tuple(_STRUCTURES)
     of = lambda commute: ranked(want, structures, commute, 2)
     found = {type(s): s for commute in (True, False) for s in of(commute)}
-    order = {"expectations": "weak order", "paths": "strong order"}[want]
+    order = {"weak": "weak order", "strong": "strong order"}[want]
     columns = ("structure", "chosen for noises", order, "when to choose it")
     rows = []
     for solver in found.values():
@@ -103,7 +103,7 @@ def _suggested(want: Want) -> str:
 
 def _path(solver: AbstractSymplecticSolver, want: Want) -> str:
     bounded = len(solver.stage_vectors(1)) > 0
-    return path_of(solver.variables, gaussian=want == "paths", bounded=bounded).code
+    return path_of(solver.variables, gaussian=want == "strong", bounded=bounded).code
 
 
 def _rows(columns, rows: list[list[str]]) -> str:

@@ -1,5 +1,11 @@
 from ._stepwise import AbstractStepwisePath, AbstractWrappedPath, GivenPath, Increment
-from ._stepwise import increment_struct, laws_of, stepwise
+from ._stepwise import (
+    checked_shape,
+    increment_struct,
+    laws_of,
+    stepwise,
+    UnspecifiedPath,
+)
 from ._paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
 from ._random import AbstractLaw, check_key, Discrete, random_words, THREE_POINT
 from ._levy_area import LevyAreaBrownianPath, LevyAreaIncrement

@@ -197,6 +197,8 @@ def increment_struct(
     path: diffrax.AbstractBrownianPath,
 ) -> PyTree[jax.ShapeDtypeStruct]:
     """Shapes, dtypes and structure of an increment."""
+    if isinstance(path, UnspecifiedPath):
+        return path.shape
     # Times of this kind are those of a solve, for which it is not traced once more.
     time = jax.ShapeDtypeStruct((), jnp.result_type(float))
     return jax.eval_shape(lambda *ends: path.evaluate(*ends), time, time)
@@ -256,6 +258,30 @@ def checked_shape(
                 f"got {leaf.dtype}."
             )
     return shape
+
+
+class UnspecifiedPath(diffrax.AbstractBrownianPath):
+    """The shape of a Brownian path that is chosen later, when the solver is known."""
+
+    shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
+    levy_area: type = eqx.field(static=True, default=diffrax.AbstractBrownianIncrement)
+
+    @property
+    def t0(self):
+        return -jnp.inf
+
+    @property
+    def t1(self):
+        return jnp.inf
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        del t0, t1, left, use_levy
+        raise ValueError(
+            "These terms have the shape of a Brownian path in place of the path itself, "
+            "which is enough for `suggest_solver`, `compare_solvers` and `expectation`. To "
+            "solve them, pass `path=solver.path(shape, key)` to the function that makes "
+            "the terms."
+        )
 
 
 class GivenPath(diffrax.AbstractBrownianPath):

@@ -40,7 +40,7 @@ else:
     from equinox import AbstractVar
 
 
-Want: TypeAlias = Literal["expectations", "paths"]
+Want: TypeAlias = Literal["weak", "strong"]
 Noises: TypeAlias = Literal["any", "commuting", "not commuting"]
 # One order for all noises; or first that for one noise and for noises that commute, then
 # that for all others.
@@ -64,14 +64,14 @@ class Record(NamedTuple):
     suggested: tuple[Want, ...] = ()
 
     def order(self, want: Want, commute: bool) -> int | float | None:
-        order = self.weak if want == "expectations" else self.strong
+        order = self.weak if want == "weak" else self.strong
         return order[0 if commute else 1] if isinstance(order, tuple) else order
 
     def weak_order(self, commute: bool) -> int:
-        return cast(int, self.order("expectations", commute))
+        return cast(int, self.order("weak", commute))
 
     def strong_order(self, commute: bool) -> int | float | None:
-        return self.order("paths", commute)
+        return self.order("strong", commute)
 
 
 # In a batch Diffrax goes on to step paths that have ended, and drops what comes out.
@@ -106,12 +106,12 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
 
     def strong_order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | float | None:
         """Order of convergence of paths."""
-        return self._order_for("paths", terms)
+        return self._order_for("strong", terms)
 
     def weak_order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | None:
         """Order of convergence of expectations. Of several noises it is not known here
         whether they commute. `None` if the class does not say it."""
-        return cast(int | None, self._order_for("expectations", terms))
+        return cast(int | None, self._order_for("weak", terms))
 
     def _order_for(self, want: Want, terms) -> int | float | None:
         if self.record is None:
@@ -134,19 +134,19 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
         - `shape`: the shape of the increments, `(m,)` for `m` noises; or a PyTree of
             `jax.ShapeDtypeStruct`s.
         - `key`: a JAX random key.
-        - `want`: `"paths"` for the increments of a Brownian motion, `"expectations"` for
-            discrete ones, where these will do. By default what the solver is for; paths,
-            if it is for both.
+        - `want`: `"strong"` for the increments of a Brownian motion, `"weak"` for
+            discrete ones, where these suffice. By default `"strong"` if the solver has a
+            strong order, otherwise `"weak"`.
 
         **Raises:** a `ValueError` if `want` is neither, and for what is no shape or key.
         """
-        if want not in ("paths", "expectations", None):
-            raise ValueError(f'`want` must be "paths" or "expectations"; got {want!r}.')
+        if want not in ("strong", "weak", None):
+            raise ValueError(f'`want` must be "strong" or "weak"; got {want!r}.')
         if want is None:
             strong = self.record is not None and self.record.strong is not None
-            want = "paths" if strong else "expectations"
+            want = "strong" if strong else "weak"
         implicit = isinstance(self, diffrax.AbstractImplicitSolver)
-        kind = path_of(self.variables, gaussian=want == "paths", bounded=implicit)
+        kind = path_of(self.variables, gaussian=want == "strong", bounded=implicit)
         return kind.make(shape, key)
 
     def __repr__(self) -> str:

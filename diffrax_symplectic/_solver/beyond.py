@@ -65,7 +65,7 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=None,
         choose="Four stage vectors in three small systems: accurate expectations.",
         noises="commuting",
-        suggested=("expectations",),
+        suggested=("weak",),
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(
         alpha=_half,
@@ -140,7 +140,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
             "them if the noises are few."
         ),
         noises="not commuting",
-        suggested=("expectations",),
+        suggested=("weak",),
     )
     structure: ClassVar[Structure] = "any"
     variables: ClassVar[tuple[str, ...]] = ("W", "two_point")
@@ -263,7 +263,7 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
             "commute."
         ),
         noises="not commuting",
-        suggested=("paths",),
+        suggested=("strong",),
     )
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
         ImplicitMidpoint.tableau, noise=("W", "A")
@@ -322,7 +322,7 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=(3 / 2, 1 / 2),
         choose="Two stage vectors, and brackets of the vector fields: accurate paths.",
         noises="commuting",
-        suggested=("paths",),
+        suggested=("strong",),
     )
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
         GeneralTableau.strong(A=_gauss, B=_gauss, alpha=_half, beta=_half),

@@ -37,7 +37,7 @@ class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=1,
         strong=(1, 1 / 2),
         choose="The first to try: one stage vector for any number of noises.",
-        suggested=("paths",),
+        suggested=("strong",),
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau.strong(
         A=[[1 / 2]], B=[[1 / 2]], alpha=[1], beta=[1]
@@ -113,7 +113,7 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose=(
             "The midpoint rule: one stage vector for any number of noises, for few digits."
         ),
-        suggested=("expectations",),
+        suggested=("weak",),
     )
     b: float = free_parameter("b", 0.5)
 

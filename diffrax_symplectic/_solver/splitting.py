@@ -77,6 +77,14 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
             strong=_at_most(record.strong, self.strong),
         )
 
+    def weak_order(self, terms):
+        order = self.solver.weak_order(terms)  # pyright: ignore
+        return None if order is None else min(order, self.weak)
+
+    def strong_order(self, terms):
+        order = self.solver.strong_order(terms)  # pyright: ignore
+        return None if order is None else min(order, self.strong)
+
     @property
     def structure(self) -> Structure:
         return self.solver.structure  # pyright: ignore

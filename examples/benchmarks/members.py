@@ -185,7 +185,7 @@ def weak_constants(
     noise = lambda *x: scene.noise(*x)[:1]
     terms = ds.hamiltonian_terms(scene.H0, noise, ds.WeakBrownianPath((1,), jr.key(0)))
 
-    def functions(y):
+    def functions(t, y, args):
         p, q = y
         both = jnp.concatenate([p, q])
         return jnp.concatenate([both, jnp.outer(both, both).reshape(-1)])

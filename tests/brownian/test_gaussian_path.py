@@ -185,7 +185,7 @@ def test_wrappers_make_the_same_step_from_words_as_from_keys():
     path = ds.FixedStepBrownianPath((2,), key, AREA)
     own = words.random_words(key, at, 2, 2).reshape(-1)
     more = lambda n, begin: words.random_words(key, at, 1, n, begin)[0]
-    areas = ds.LevyAreaBrownianPath(path, key, terms=1)
+    areas = ds.LevyAreaBrownianPath(path, key, num_terms=1)
     plateaus = ds.PlateauBrownianPath(path, key)
     # The signs are the first bits: those of the words that the path takes are others.
     assert np.all(more(2, 0) >> 31 != more(2, words.PLATEAU_WORDS) >> 31)

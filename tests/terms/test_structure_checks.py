@@ -133,7 +133,7 @@ def test_friction_in_the_drift_is_told_to_be_left_out():
     y0 = jnp.ones(2), jnp.zeros(2)
     start = lambda terms: ds.BAOAB(0.5).init(terms, 0.0, 0.1, y0, None)
     suggest = lambda terms, **options: ds.suggest_solver(
-        terms, 0.0, y0, want="expectations", **options
+        terms, 0.0, y0, want="weak", **options
     )
     for first in (True, False):
         with pytest.raises(
@@ -254,4 +254,4 @@ def test_a_check_of_the_users_does_not_stop_the_advice():
     path = ds.WeakBrownianPath((2,), jr.key(0))
     terms = ds.hamiltonian_terms(lambda t, p, q, args: jnp.sum(p * q), noise, path)
     assert not commuting((terms.terms[1],), 0.0, _positive_state, None)
-    assert len(ds.suggest_solver(terms, 0.0, _positive_state, want="paths")) > 0
+    assert len(ds.suggest_solver(terms, 0.0, _positive_state, want="strong")) > 0
