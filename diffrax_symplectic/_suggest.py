@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from ._arguments import check_state
-from ._brownian import increment_struct, UnspecifiedPath, WeakBrownianPath
+from ._brownian import drives, increment_struct, UnspecifiedPath, WeakBrownianPath
 from ._custom_types import Args, RealScalarLike, Y
 from ._solver import (
     AbstractSymplecticSolver,
@@ -197,7 +197,8 @@ def suggest_solver(
         [increment_struct(brownian_paths(noise)[0])]
     ):
         # Lévy areas are those between the noises of one array.
-        solvers = [s for s in solvers if "A" not in s.variables]
+        areas = lambda solver: "noise brackets" in map(drives, solver.variables)
+        solvers = [solver for solver in solvers if not areas(solver)]
     found = [_suggestion(solver, want, terms, commute) for solver in solvers]
     if not kind:
         kind = f"general ({getattr(not_separable, 'reason', '')})"

@@ -18,7 +18,7 @@ from jaxtyping import PRNGKeyArray, PyTree
 
 from .._arguments import check_state, whole_number
 from .._batch import batched_together
-from .._brownian import path_of, VARIABLES
+from .._brownian import drives, path_of, VARIABLES
 from .._conditions import drift_order
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
@@ -267,7 +267,8 @@ def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTablea
     tableau = tableau.take(keep)
     if len(drift) > 0:
         return tableau
-    without = lambda stage: tuple(c for c in stage.channels if c != "L")
+    stays = lambda c: drives(c) != "drift brackets"
+    without = lambda stage: tuple(filter(stays, stage.channels))
     stages = tuple(stage._replace(channels=without(stage)) for stage in tableau.stages)
     return dataclasses.replace(tableau, stages=stages)
 
