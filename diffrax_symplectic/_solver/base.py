@@ -337,7 +337,7 @@ def real_number(name: str, value: Any) -> float:
     """Raises a `ValueError` unless `value` is a finite real number."""
     try:
         number = math.nan if isinstance(value, complex) else float(value)
-    except Exception:
+    except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
         raise ValueError(
