@@ -79,7 +79,17 @@ SolverState: TypeAlias = Unsolved
 
 
 class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
-    """The base of all solvers of this package."""
+    """The base of all solvers of this package, and of solvers of your own that are no
+    Runge--Kutta methods.
+
+    A subclass is a Diffrax solver: it has `order`, `init` and `step`, which take any
+    Stratonovich terms. It states `structure` (`"any"`, `"separable"`, `"additive"`,
+    `"constant"` or `"separable and constant"`), `variables` (the names of the random
+    variables of a step, such as `("W",)`), and `stage_vectors(num_noises)`, and overrides
+    `weak_order(terms)` and `strong_order(terms)`. Then [`diffrax_symplectic.Damped`][] and
+    [`diffrax_symplectic.LinearFlow`][] take it, and `solver.path(shape, key)` makes the
+    path that it needs.
+    """
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = (
