@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 import diffrax
 import jax
 import jax.tree_util as jtu
-import numpy as np
 from diffrax._term import AdjointTerm, WrapTerm
 from equinox.internal import (
     nondifferentiable as nondifferentiable,
@@ -89,23 +88,6 @@ def inner_programs(eqn: JaxprEqn) -> Iterator[Any]:
         for item in value if isinstance(value, tuple | list) else (value,):
             if isinstance(item, Jaxpr | ClosedJaxpr):
                 yield item
-
-
-def result_named(name: str, message: str) -> diffrax.RESULTS:
-    """A result of `diffrax.RESULTS` with a name and a message of its own.
-
-    The solvers have to return one of `diffrax.RESULTS`, which Diffrax turns into an error,
-    and what is there for an unsolved equation advises to increase `max_steps`. So one more
-    is added, as a subclass of the enumeration would add it. The others stay as they are.
-    """
-    results = diffrax.RESULTS
-    names, messages = results._name_to_item, results._index_to_message
-    if name not in names:
-        number = np.array(len(messages), np.int32)
-        item = type(results.successful)(number, results)  # pyright: ignore
-        names[name] = item  # pyright: ignore
-        messages.append(message)
-    return names[name]  # pyright: ignore
 
 
 _T = TypeVar("_T")

@@ -11,7 +11,6 @@ from pathlib import Path
 import diffrax
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
@@ -171,21 +170,6 @@ def test_a_program_tells_whether_its_solves_raise_errors(terms, throw):
         program = jax.make_jaxpr(gradient)(0.5)
         assert _compat.solves_without_throwing(program.jaxpr) is not throw
     assert not _compat.solves_without_throwing(jax.make_jaxpr(jnp.sin)(0.5).jaxpr)
-
-
-def test_a_result_may_have_a_message_of_its_own():
-    before = diffrax.RESULTS.successful
-    item = _compat.result_named("for_a_test", "Take smaller steps.")
-    assert item == _compat.result_named("for_a_test", "unused: it has one already")
-    # It goes through what Diffrax does with results.
-    where = jax.jit(lambda x: diffrax.RESULTS.where(x, before, item))
-    assert where(False) == item and where(True) == before
-    assert "smaller steps" in diffrax.RESULTS[item]
-    assert diffrax.RESULTS.promote(optx.RESULTS.nonfinite) == diffrax.RESULTS.nonfinite
-    assert not any(
-        bool(item == getattr(diffrax.RESULTS, name))
-        for name in ("successful", "internal_error", "nonlinear_max_steps_reached")
-    )
 
 
 def test_what_takes_long_to_import_is_imported_when_it_is_needed():
