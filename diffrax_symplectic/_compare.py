@@ -208,7 +208,7 @@ def compare_solvers(
         """The estimate by the paths of a number, and the seconds for each."""
         fn = eqx.Partial(sample, solver, jnp.asarray(dt))
         start = time.perf_counter()
-        estimate = monte_carlo(fn, jr.fold_in(key, number), num_paths)
+        estimate = monte_carlo(fn, key=jr.fold_in(key, number), num_paths=num_paths)
         return estimate, (time.perf_counter() - start) / num_paths
 
     strong, fine = {}, None
@@ -331,7 +331,7 @@ def _strong_errors(end, named, reference, dts, cell, key, num_paths) -> dict:
 
     if not named:
         return {}
-    estimate = monte_carlo(squares, key, num_paths)
+    estimate = monte_carlo(squares, key=key, num_paths=num_paths)
     out = {}
     for name, (square, fourth, okay) in estimate.mean.items():
         with np.errstate(all="ignore"):

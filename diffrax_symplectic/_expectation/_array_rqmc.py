@@ -24,11 +24,11 @@ from .._brownian import (
 )
 from .._custom_types import Y
 from .._terms import brownian_paths, replace_paths
-from ._estimate import Plan, run, Samples
 from ._fits import Functions
 from ._points import hilbert_order, num_seeds, randomized, sobol_points
+from ._run import run
+from ._sampling import AbstractSampling, Plan, Samples
 from ._steps import (
-    AbstractSampling,
     along,
     check_real,
     independent_steps,

@@ -1,6 +1,5 @@
 """Paths that take fixed steps together: the loop that all samplings share."""
 
-import abc
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,7 +17,8 @@ from .._arguments import check_solver, check_takes, whole_number
 from .._custom_types import Args, RealScalarLike, Y
 from .._root_finder import all_finite
 from .._terms import brownian_paths, check_fit, check_stratonovich, evaluated
-from ._estimate import Plan, real, Samples
+from ._run import real
+from ._sampling import Samples, Tails
 
 
 class Level(eqx.Module):
@@ -142,7 +142,7 @@ class Ensemble(eqx.Module):
     # A path that failed counts as failed until the end. It goes on from `y0`: an equation
     # without a solution would keep the other paths waiting in each step to come.
     failed: Bool[Array, " n"]
-    # What is to be subtracted from `phi`: nothing, or an array of shape `(n, S, m)`.
+    # What is known of their noise, if anything.
     control: Any
 
     @staticmethod
@@ -194,29 +194,41 @@ def samples(
     p: Problem,
     begin: Callable[[Level], tuple[Callable, Ensemble]],
     mean: Callable[[Array, Bool[Array, " n"]], Array] | None = None,
+    finish: Callable[[Level, Array, Ensemble], tuple] | None = None,
+    beyond: Array | None = None,
 ) -> Samples:
     """Takes the paths that `begin` makes for a level through all of its steps, by the
     function `step(i, paths)` that it makes, too. Each path is a sample, or `mean` of `phi`
-    and of which of them have failed is one."""
+    and of which of them have failed is one. What `finish` returns of a level, `phi` and
+    the paths at the end are values, control, what it promises, and the logarithms of
+    ratios, for `Tails` of numbers `beyond`."""
 
     def on_level(level):
         step, paths = begin(level)
         keep = lambda phi, failed: phi
         saved, paths = _simulate(p, level, step, paths, mean or keep)
         if mean is not None:
-            return saved[:, None], jnp.ones(1, bool), jnp.sum(paths.failed)[None]
-        if paths.control is not None:
-            saved = saved - jnp.swapaxes(paths.control, 0, 1).astype(saved.dtype)
-        return saved, ~paths.failed, None
+            lost = jnp.sum(paths.failed)[None]
+            return (saved[:, None],), None, jnp.ones(1, bool), lost
+        if finish is None:
+            return (saved,), None, ~paths.failed, None
+        *arrays, log_ratio = finish(level, saved, paths)
+        return tuple(arrays), log_ratio, ~paths.failed, None
 
     if len(p.levels.h) == 1:
         out = jtu.tree_map(lambda x: x[None], on_level(p.level(0)))
     else:
         # One program for all levels.
         out = lax.map(on_level, p.levels)
-    values, good, lost = out
-    values = values[:, 0] if p.at_end else jnp.swapaxes(values, 1, 2)
-    return Samples(p.unravel(values), p.weights, good, lost)
+    arrays, log_ratio, good, lost = out
+    flat = lambda x: p.unravel(x[:, 0] if p.at_end else jnp.swapaxes(x, 1, 2))
+    values, *others = map(flat, arrays)
+    if beyond is None:
+        return Samples(values, p.weights, good, lost)
+    control, promised = others
+    beyond = p.unravel(beyond[:, 0] if p.at_end else beyond)
+    tails = Tails(promised, beyond, jnp.exp(-jnp.sum(log_ratio, axis=0)))
+    return Samples(values, p.weights, good, lost, control, tails)
 
 
 def independent_steps(
@@ -233,14 +245,6 @@ def independent_steps(
 
     start = lambda random: p.init(terms_of(random), 0, level.h, p.y0)
     return step, Ensemble.start(p, n, jax.vmap(start)(randomness(0)))
-
-
-class AbstractSampling(eqx.Module):
-    """How the samples of an expectation are taken, as users name it."""
-
-    @abc.abstractmethod
-    def prepare(self, problem: Problem, key: PRNGKeyArray, devices: tuple) -> Plan:
-        """Raises a `ValueError` for what it cannot do."""
 
 
 def _steps(t0, t1, dt0, ts: Sequence | None) -> tuple[np.ndarray, np.integer]:

@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation import _call, _pilot
-from diffrax_symplectic._expectation._estimate import Plan
-from diffrax_symplectic._expectation._fits import (
+from diffrax_symplectic._expectation import _call
+from diffrax_symplectic._expectation._bases import Frame, Grid, Stretched
+from diffrax_symplectic._expectation._polynomials import (
     exponents,
-    Frame,
-    Grid,
     hermite,
     least_squares,
 )
