@@ -281,14 +281,16 @@ class _Leaf:
             r = np.minimum(r, 1 - 1e-6)
             error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
             # Combinations of levels are differences of numbers as large as the mean.
-            rounding = float(jnp.finfo(dtype).eps) * np.abs(mean[:, :1])
+            size = np.fmax.reduce(np.abs(mean[:2, :1]))
+            rounding = float(jnp.finfo(dtype).eps) * size
             # Rounding errors have heavy tails, too.
             r = np.where(error > _ROUNDING * rounding, r, 0)
             error = np.maximum(error, rounding)
             self._drop = np.zeros(mean.shape[2:], bool)
             if len(mean) > 1:
                 # Of a control with heavy tails the standard error says too little.
-                fine = (np.abs(mean[2]) <= _SURE * error[2]) | (r[2] > _HEAVY_CONTROL)
+                fine = np.abs(mean[2]) <= np.fmax(_SURE * error[2], _ROUNDING * rounding)
+                fine |= r[2] > _HEAVY_CONTROL
                 self._drop = ~np.all(fine & np.isfinite(mean[0]), axis=0)
                 # Where enough is seen of it, that is in the spread. (NaN, where the trial
                 # had no value, says nothing.)

@@ -294,7 +294,7 @@ class Noise(eqx.Module):
         log_ratio = jnp.zeros_like(x)
         for law in dict.fromkeys(self.laws):
             mine = np.array([other == law for other in self.laws])
-            own, p = law.from_words(words, x.dtype), np.array(law.probabilities)
+            own, p = law.from_words(words, x.dtype), np.array(law.probabilities, x.dtype)
             if wide is not None:
                 q = (1 - wide) * p + wide / len(p)
                 cuts = (jnp.cumsum(q)[:-1] * 2.0**32).astype(jnp.uint32)
