@@ -104,7 +104,9 @@ class AbstractBasis(eqx.Module):
         """Coefficients of functions that are zero."""
 
     @abc.abstractmethod
-    def frame(self, states: Float[Array, "n d"], good: Bool[Array, " n"], unit) -> PyTree:
+    def frame(
+        self, states: Float[Array, "n d"], good: Bool[Array, " n"], unit
+    ) -> PyTree:
         """Coordinates for the pilot's states, those of its paths that have not failed, and
         the unit of each coordinate."""
 
@@ -195,7 +197,9 @@ class Grid(AbstractBasis):
     def fitted(self, value, frame, states, good, keys):
         few, inner = slice(None, self._few), frame.inner
         axis = np.linspace(-1, 1, self.size)
-        x = np.stack(np.meshgrid(*[axis] * self.d, indexing="ij"), -1).reshape(-1, self.d)
+        x = np.stack(np.meshgrid(*[axis] * self.d, indexing="ij"), -1).reshape(
+            -1, self.d
+        )
         nodes = inner.states(frame.back(jnp.asarray(x, states.dtype)))
         points = jnp.concatenate([inner.moved(states[few]), nodes])
         values = jax.vmap(value)(points)

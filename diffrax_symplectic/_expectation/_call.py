@@ -158,7 +158,7 @@ def expectation(
         plan = sampling.prepare(problem, jr.fold_in(key, _NO_SAMPLE), devices)
         reason = "; ".join(filter(None, (reason, plan.reason)))
         reason = reason if start is None else start.reason
-        plan = plan._replace(reason=reason)
+        plan = plan._replace(reason=reason, roundings=problem.max_steps)
         estimate = run(plan, key, devices, sampling, begin, tol, meter)
     _warn_of_rounding(estimate, problem)
     return estimate
@@ -186,11 +186,11 @@ def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
     fraction = float(numbers.eps) * problem.max_steps
     rounding = lambda mean: fraction * np.abs(mean)
     pairs = zip(jtu.tree_leaves(estimate.mean), jtu.tree_leaves(estimate.std_error))
-    if any(np.any(error < rounding(mean)) for mean, error in pairs):
+    if any(np.any(error <= 2 * rounding(mean)) for mean, error in pairs):
         warnings.warn(
-            "Rounding errors may be larger than the standard error, which does not include "
-            f"them: over {problem.max_steps:,} steps in {numbers.dtype} some "
-            f"{fraction:.0e} of the mean. For more digits call "
+            "Rounding errors may be larger than the sampling error: over "
+            f"{problem.max_steps:,} steps in {numbers.dtype} some {fraction:.0e} of the "
+            "mean, the least that `std_error` is. For more digits call "
             '`jax.config.update("jax_enable_x64", True)` first.',
             stacklevel=3,
         )

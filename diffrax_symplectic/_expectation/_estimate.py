@@ -1,5 +1,6 @@
 """Estimates of expectations: what is kept of the samples, and what it says of the mean."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -18,7 +19,7 @@ from ._saved import arrays_of, described, rebuilt
 # Standard errors of the mean of a control, which is zero.
 _SURE, _HEAVY_CONTROL = 5, 0.1
 # Standard errors of so many roundings of the mean are roundings of the paths.
-_ROUNDING = 1e4
+_ROUNDING = 1e3
 # What paths with wider noise show of the tails counts if it is so many times as much as
 # what is seen of them.
 _SEEN = 4
@@ -46,6 +47,8 @@ class Expectation(eqx.Module):
     moments: tuple[Moments, ...]
     key_data: np.ndarray
     paths_per_sample: int = 1
+    # How many roundings of the mean are the least standard error.
+    roundings: int = 1
     sampling: Any = None
     reason: str = ""
     tol_reached: bool | None = None
@@ -90,7 +93,8 @@ class Expectation(eqx.Module):
 
         where $M$ is the largest deviation from the mean. $M$ is larger than
         $s \sqrt{4.5 \log n}$ for heavy tails only, and $r = 1$ if one sample makes up for
-        all that is seen of the spread. For value functions $b$ is the part of the mean
+        all that is seen of the spread. (Of sorted paths it is that of the paths in a
+        replicate, too.) For value functions $b$ is the part of the mean
         absolute deviation that only paths with wider noise show. It is never less than the
         rounding of the mean."""
         return self._each("std_error", 0)
@@ -170,8 +174,7 @@ class Expectation(eqx.Module):
                     f"Samples {after.begin:,} to {min(one.end, after.end) - 1:,} are in "
                     "two of the estimates to merge. Pass another `first` for each part."
                 )
-        about = self.sampling, self.reason, None, self.far
-        return Expectation(joined(parts), self.key_data, self.paths_per_sample, *about)
+        return dataclasses.replace(self, moments=joined(parts), tol_reached=None)
 
     def check_same(self, other: "Expectation", name: str) -> None:
         """Raises a `ValueError` if the estimates are not of the same numbers."""
@@ -247,7 +250,8 @@ class Expectation(eqx.Module):
             return None
         if far is None:
             far = jtu.tree_map(lambda x: np.zeros(x.shape[1:]), whole.mean)
-        one = lambda *leaves: getattr(_Leaf(whole.count, *leaves), name)(combination)
+        numbers = whole.count, self.roundings
+        one = lambda *leaves: getattr(_Leaf(*numbers, *leaves), name)(combination)
         return jtu.tree_map(
             one, whole.mean, whole.norm, whole.largest, whole.dtypes, far
         )
@@ -269,27 +273,34 @@ class Expectation(eqx.Module):
 
 class _Leaf:
     """What the moments of an array say. Its first axis is for kinds: the estimate, and with
-    a control variate the estimate without it, the control, and absolute deviations; its
-    second axis is for the combinations of levels."""
+    sorted paths the mean of their `r`, or with a control variate the estimate without it,
+    the control, and what is known of tails; its second axis is for the combinations of
+    levels."""
 
-    def __init__(self, count: int, mean, norm, largest, dtype: str, far):
+    def __init__(
+        self, count: int, roundings: int, mean, norm, largest, dtype: str, far
+    ):
         n = count
         with np.errstate(all="ignore"):
             s = norm / np.sqrt(n - 1) if n > 1 else np.full_like(norm, np.nan)
             beyond = np.maximum(largest - s * np.sqrt(4.5 * np.log(max(n, 2))), 0)
             r = np.where(s > 0, beyond / (s * np.sqrt(n)), 0)
+            if len(mean) == 2:
+                r[0] = np.fmax(r[0], mean[1])
             r = np.minimum(r, 1 - 1e-6)
             error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
             # Combinations of levels are differences of numbers as large as the mean.
-            size = np.fmax.reduce(np.abs(mean[:2, :1]))
-            rounding = float(jnp.finfo(dtype).eps) * size
+            size = np.fmax.reduce(np.abs(mean[: 1 + (len(mean) > 2), :1]))
+            rounding = roundings * float(jnp.finfo(dtype).eps) * size
             # Rounding errors have heavy tails, too.
             r = np.where(error > _ROUNDING * rounding, r, 0)
             error = np.maximum(error, rounding)
             self._drop = np.zeros(mean.shape[2:], bool)
-            if len(mean) > 1:
+            if len(mean) > 2:
                 # Of a control with heavy tails the standard error says too little.
-                fine = np.abs(mean[2]) <= np.fmax(_SURE * error[2], _ROUNDING * rounding)
+                fine = np.abs(mean[2]) <= np.fmax(
+                    _SURE * error[2], _ROUNDING * rounding
+                )
                 fine |= r[2] > _HEAVY_CONTROL
                 self._drop = ~np.all(fine & np.isfinite(mean[0]), axis=0)
                 # Where enough is seen of it, that is in the spread. (NaN, where the trial
@@ -301,7 +312,7 @@ class _Leaf:
 
     def _one(self, x, combination: int):
         x = x[:, combination]
-        return x[0] if len(x) == 1 else np.where(self._drop, x[1], x[0])[()]
+        return x[0] if len(x) < 3 else np.where(self._drop, x[1], x[0])[()]
 
     def mean(self, combination: int):
         return self._known * self._one(self._mean, combination)

@@ -1,4 +1,4 @@
-"""How estimates are made: any number of samples, one batch after another, on any devices."""
+"""How estimates are made: any number of samples, batch after batch, on any devices."""
 
 import collections
 import dataclasses
@@ -125,7 +125,7 @@ def run(
     zeros = jtu.tree_map(lambda s: np.zeros(s.shape[1:]), shapes)
     dtypes = jtu.tree_map(lambda s: str(s.dtype), shapes)
     none = Moments(at, at, 0, 0, zeros, zeros, zeros, zeros, dtypes)
-    about = sampling, plan.reason, None, plan.far
+    about = plan.roundings, sampling, plan.reason, None, plan.far
     estimate = Expectation((none,), key_data, plan.paths, *about)
     if begin.start is not None:
         begin.start.check_same(estimate, "`start`")
@@ -231,7 +231,7 @@ def _warnings_of_spread(estimate: Expectation) -> Iterator[str]:
     whole = total(estimate.moments)
     kinds = zip(jtu.tree_leaves(whole.size), jtu.tree_leaves(whole.dtypes))
     # Of the plain values, with or without control.
-    low = [dtype for x, dtype in kinds if np.max(x[int(len(x) > 1), 0]) < _least(dtype)]
+    low = [dtype for x, dtype in kinds if np.max(x[int(len(x) > 2), 0]) < _least(dtype)]
     if low:
         yield (
             f"A number is zero, or smaller than what {low[0]} holds, on all paths. If it "
@@ -274,6 +274,8 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         kinds = [samples.values]
         if tails is not None:
             kinds += [samples.control, tails.promised, tails.beyond]
+        elif samples.heaviest is not None:
+            kinds += [samples.heaviest]
         ratio = None if tails is None else tails.ratio
         values = zip(*map(jtu.tree_leaves, kinds))
         each = [_spread(samples.weights, good, count, ratio, *x) for x in values]
@@ -310,7 +312,7 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         ) from error
 
 
-def _spread(weights, good, count, ratio, x, control=0, promised=0, beyond=0) -> tuple:
+def _spread(weights, good, count, ratio, x, *others) -> tuple:
     """Of the good samples the mean; what rounding has left out of it; the root of the sum
     of squared deviations from both; the largest deviation; the largest size. With axes in
     front for kinds and combinations."""
@@ -323,7 +325,11 @@ def _spread(weights, good, count, ratio, x, control=0, promised=0, beyond=0) -> 
     combined = lambda x: jnp.tensordot(weights.astype(x.dtype), x, 1)
     if ratio is None:
         x = combined(x)[None]
+        # Of the level where it is most.
+        most = [jnp.broadcast_to(jnp.max(y, axis=0), x.shape) for y in others]
+        x = jnp.concatenate([x, *most])
     else:
+        control, promised, beyond = others
         left = combined(x - control)
         far = jnp.abs(left - combined(promised))
         ratio = ratio.reshape(-1, *[1] * (far.ndim - 2)).astype(x.dtype)

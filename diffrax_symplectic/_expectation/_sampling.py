@@ -31,6 +31,8 @@ class Samples(eqx.Module):
     lost: Int[Array, "levels n"] | None = None
     control: PyTree[Array] | None = None
     tails: Tails | None = None
+    # Or how much of the spread the largest of many paths makes up for.
+    heaviest: PyTree[Array] | None = None
 
 
 class Plan(NamedTuple):
@@ -42,7 +44,7 @@ class Plan(NamedTuple):
     - `paths`: how many paths a sample has, on each level.
     - `least`: fewer samples than this do not tell their spread well enough to stop.
     - `reason`: what the result says of how they were chosen.
-    - `far`: as in an estimate.
+    - `far`, `roundings`: as in an estimate.
     """
 
     sampler: Callable[[PRNGKeyArray], Samples]
@@ -52,6 +54,7 @@ class Plan(NamedTuple):
     least: int = 2
     reason: str = ""
     far: PyTree[np.ndarray] | None = None
+    roundings: int = 1
 
 
 class AbstractSampling(eqx.Module):

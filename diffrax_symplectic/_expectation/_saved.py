@@ -1,6 +1,5 @@
 """Estimates in files: arrays, and a description of what they make up in JSON."""
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -25,6 +24,7 @@ def described(estimate: Any) -> dict[str, Any]:
         "structure": _structure(one.mean),
         "dtypes": jtu.tree_leaves(one.dtypes),
         "paths_per_sample": estimate.paths_per_sample,
+        "roundings": estimate.roundings,
         "sampling": None if sampling is None else type(sampling).__name__,
         "fields": {k: x for k, x in kept.items() if plain(x)},
         "reason": estimate.reason,
@@ -64,8 +64,9 @@ def rebuilt(
     name, fields = header["sampling"], header["fields"]
     sampling = None if name is None else kinds[name](**fields)
     far = tree("far") if header["far"] else None
-    about = sampling, header["reason"], header["tol_reached"], far
-    return kind(moments, arrays["key_data"], header["paths_per_sample"], *about)
+    names = "paths_per_sample", "roundings", "reason", "tol_reached"
+    about = {name: header[name] for name in names}
+    return kind(moments, arrays["key_data"], sampling=sampling, far=far, **about)
 
 
 def _structure(tree: Any) -> Any:

@@ -119,7 +119,9 @@ class ValueFunctions(AbstractSampling):
                 stacklevel=4,
             )
         # Paths with wider noise say what deviations there are beyond those of the trial.
-        largest = [jtu.tree_map(lambda x: x[0], total(e.moments).largest) for e in tried]
+        largest = [
+            jtu.tree_map(lambda x: x[0], total(e.moments).largest) for e in tried
+        ]
         largest = np.stack([flat(x, len(problem.weights)) for x in largest])
         beyond = np.take_along_axis(largest, best[None, None], 0)[0]
         wide = trial(plan(best, _WIDE * self.batch_size, narrow + 1, beyond))
@@ -294,13 +296,18 @@ class Noise(eqx.Module):
         log_ratio = jnp.zeros_like(x)
         for law in dict.fromkeys(self.laws):
             mine = np.array([other == law for other in self.laws])
-            own, p = law.from_words(words, x.dtype), np.array(law.probabilities, x.dtype)
+            own, p = (
+                law.from_words(words, x.dtype),
+                np.array(law.probabilities, x.dtype),
+            )
             if wide is not None:
                 q = (1 - wide) * p + wide / len(p)
                 cuts = (jnp.cumsum(q)[:-1] * 2.0**32).astype(jnp.uint32)
                 place = jnp.sum(words[:, None] >= cuts, axis=1)
                 own = jnp.where(wide > 0, jnp.asarray(law.values, x.dtype)[place], own)
-                log_ratio = jnp.where(mine & (wide > 0), jnp.log(q / p)[place], log_ratio)
+                log_ratio = jnp.where(
+                    mine & (wide > 0), jnp.log(q / p)[place], log_ratio
+                )
             x = jnp.where(mine, own, x)
         return x, jnp.sum(log_ratio)
 
@@ -314,7 +321,9 @@ class Noise(eqx.Module):
         low, high = np.zeros(levels), np.ones(levels)
         for _ in range(30):
             share = (low + high) / 2
-            enough = steps * sum(_information(x, share) for x in self.laws) > _NATS / levels
+            enough = (
+                steps * sum(_information(x, share) for x in self.laws) > _NATS / levels
+            )
             low, high = np.where(enough, low, share), np.where(enough, share, high)
         return jnp.asarray(low, self.problem.dtype)[self.level.index]
 
