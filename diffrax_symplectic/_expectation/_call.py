@@ -153,7 +153,7 @@ def expectation(
         sampling = start.sampling
     elif sampling is None:
         sampling, reason = choose(problem, tol)
-    _check_sampling(sampling, start)
+    sampling = _checked_sampling(sampling, start)
     with Meter(progress_meter) as meter:
         plan = sampling.prepare(problem, jr.fold_in(key, _NO_SAMPLE), devices)
         reason = "; ".join(filter(None, (reason, plan.reason)))
@@ -164,7 +164,7 @@ def expectation(
     return estimate
 
 
-def _check_sampling(sampling: Any, start: Expectation | None) -> None:
+def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampling:
     if not isinstance(sampling, AbstractSampling):
         raise ValueError(
             "`sampling` must be `IndependentPaths(num_paths)`, `ArrayRQMC()`, "
@@ -175,6 +175,7 @@ def _check_sampling(sampling: Any, start: Expectation | None) -> None:
             f"`start` was sampled by {start.sampling}; got sampling={sampling}. Pass the "
             "same."
         )
+    return sampling
 
 
 def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:

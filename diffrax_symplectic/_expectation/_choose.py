@@ -5,9 +5,10 @@ import numpy as np
 
 from ._array_rqmc import ArrayRQMC, layout
 from ._monte_carlo import IndependentPaths
+from ._noise import num_outcomes
 from ._sampling import AbstractSampling
 from ._steps import Problem
-from ._value_functions import num_outcomes, ValueFunctions
+from ._value_functions import ValueFunctions
 
 
 # Value functions in so many dimensions and for so many outcomes of all steps together, and

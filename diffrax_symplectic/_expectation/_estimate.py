@@ -58,7 +58,7 @@ class Expectation(eqx.Module):
 
     @property
     def num_samples(self) -> int:
-        return sum(x.count for x in self.moments)
+        return sum(x.good for x in self.moments)
 
     @property
     def num_paths(self) -> int:
@@ -198,9 +198,9 @@ class Expectation(eqx.Module):
         arrays["header"] = np.array(json.dumps(header))
         if isinstance(file, str | Path):
             with open(file, "wb") as opened:
-                np.savez(opened, **arrays)
+                np.savez(opened, **arrays)  # pyright: ignore
         else:
-            np.savez(file, **arrays)
+            np.savez(file, **arrays)  # pyright: ignore
 
     @staticmethod
     def load(file: str | Path | BinaryIO) -> "Expectation":
@@ -250,7 +250,7 @@ class Expectation(eqx.Module):
             return None
         if far is None:
             far = jtu.tree_map(lambda x: np.zeros(x.shape[1:]), whole.mean)
-        numbers = whole.count, self.roundings
+        numbers = whole.good, self.roundings
         one = lambda *leaves: getattr(_Leaf(*numbers, *leaves), name)(combination)
         return jtu.tree_map(
             one, whole.mean, whole.norm, whole.largest, whole.dtypes, far

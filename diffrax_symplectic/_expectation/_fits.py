@@ -82,12 +82,14 @@ def fit(noise: Any, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
     def backward(j, u):
         i = steps - 1 - j
         put = lambda all, one: all.at[i].set(one)
-        both = jtu.tree_map(put, (u.frames, u.coefficients), fitted(i, u))
-        return Functions(*both, None, basis)
+        own, c = fitted(i, u)
+        frames = jtu.tree_map(put, u.frames, own)
+        return Functions(frames, jtu.tree_map(put, u.coefficients, c), None, basis)
 
-    shapes = jax.eval_shape(lambda: (frame(0), basis.zeros(p.num_outputs, p.dtype)))
     zeros = lambda s: jnp.zeros((last, *s.shape), s.dtype)
-    u = Functions(*jtu.tree_map(zeros, shapes), None, basis)
+    frames = jtu.tree_map(zeros, jax.eval_shape(lambda: frame(0)))
+    c = jtu.tree_map(zeros, basis.zeros(p.num_outputs, p.dtype))
+    u = Functions(frames, c, None, basis)
     u = lax.fori_loop(0, steps, backward, u)
 
     def kept(args):

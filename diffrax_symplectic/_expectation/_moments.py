@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 class Moments(NamedTuple):
     """Of the samples with numbers from `begin` up to `end`, on the host and in float64.
 
-    - `count`: how many are good; `failed`: how many paths failed.
+    - `good`: how many are good; `failed`: how many paths failed.
     - `mean`: of the good ones, with two axes in front for kinds and for combinations of
         levels.
     - `norm`: the root of the sum of the squared deviations from it. (Squares overflow and
@@ -23,7 +23,7 @@ class Moments(NamedTuple):
 
     begin: int
     end: int
-    count: int
+    good: int
     failed: int
     mean: PyTree[np.ndarray]
     norm: PyTree[np.ndarray]
@@ -63,14 +63,14 @@ def _are_halves(a: Moments, b: Moments) -> bool:
 @np.errstate(over="ignore", invalid="ignore", under="ignore")
 def _both(a: Moments, b: Moments) -> Moments:
     """By the pairwise formula of Chan, Golub and LeVeque."""
-    n, trees = max(a.count + b.count, 1), jtu.tree_map
-    share, part = np.sqrt(a.count / n * b.count), b.count / n
+    n, trees = max(a.good + b.good, 1), jtu.tree_map
+    share, part = np.sqrt(a.good / n * b.good), b.good / n
     delta = trees(lambda x, y: y - x, a.mean, b.mean)
     norm = lambda x, y, d: np.hypot(np.hypot(x, y), share * d)
     # A mean of no samples is no number to start from.
-    mean = lambda x, y, d: y if a.count == 0 else x + d * part
+    mean = lambda x, y, d: y if a.good == 0 else x + d * part
     return Moments(
-        a.begin, b.end, a.count + b.count, a.failed + b.failed,
+        a.begin, b.end, a.good + b.good, a.failed + b.failed,
         trees(mean, a.mean, b.mean, delta),
         trees(norm, a.norm, b.norm, delta),
         trees(np.maximum, a.largest, b.largest),

@@ -180,9 +180,10 @@ def run(
 def _moments(part, begin: int, end: int, dtypes) -> Moments:
     count, failed, *trees = part
     wide = lambda tree: jtu.tree_map(lambda x: x.astype(float), tree)
-    mean, rest, *others = map(wide, trees)
+    mean, rest, norm, largest, size = map(wide, trees)
     mean = jtu.tree_map(np.add, mean, rest)
-    return Moments(begin, end, int(count), int(failed), mean, *others, dtypes)
+    numbers = begin, end, int(count), int(failed)
+    return Moments(*numbers, mean, norm, largest, size, dtypes)
 
 
 def _warnings(estimate: Expectation, tol: float | None) -> Iterator[str]:

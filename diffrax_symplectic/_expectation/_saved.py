@@ -20,7 +20,7 @@ def described(estimate: Any) -> dict[str, Any]:
     plain = lambda x: x is None or isinstance(x, int | float | str | np.integer)
     kept = {k: int(x) if isinstance(x, np.integer) else x for k, x in fields.items()}
     return {
-        "ranges": [(x.begin, x.end, x.count, x.failed) for x in estimate.moments],
+        "ranges": [(x.begin, x.end, x.good, x.failed) for x in estimate.moments],
         "structure": _structure(one.mean),
         "dtypes": jtu.tree_leaves(one.dtypes),
         "paths_per_sample": estimate.paths_per_sample,
@@ -57,7 +57,7 @@ def rebuilt(
 
     dtypes = _filled(structure, iter(header["dtypes"]))
     moments = tuple(
-        Moments(*numbers, *[tree(f"{name}_{i}") for name in _TREES], dtypes)
+        Moments(*numbers, dtypes=dtypes, **{k: tree(f"{k}_{i}") for k in _TREES})
         for i, numbers in enumerate(header["ranges"])
     )
     kinds = {x.__name__: x for x in AbstractSampling.__subclasses__()}

@@ -16,8 +16,14 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from .._arguments import check_solver, check_takes, whole_number
 from .._custom_types import Args, RealScalarLike, Y
 from .._root_finder import all_finite
-from .._terms import additive_fault, brownian_paths, check_fit, evaluated
-from .._terms import separable_fault, split_terms
+from .._terms import (
+    additive_fault,
+    brownian_paths,
+    check_fit,
+    evaluated,
+    separable_fault,
+    split_terms,
+)
 from ._run import real
 from ._sampling import Samples, Tails
 

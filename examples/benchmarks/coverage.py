@@ -3,8 +3,9 @@
     python -m examples.benchmarks.coverage [REPETITIONS]
 
 An oscillator with additive noise, `H_1 = s q`, and with multiplicative noise,
-`H_1 = s q^2 / 2`, in 20 steps to t = 1 and 5. With multiplicative noise the mean of exp(q) is that of the
-Kubo oscillator, `H_1 = s (p^2 + q^2) / 2`: the other one has none for long times.
+`H_1 = s q^2 / 2`, in 20 steps to t = 1 and 5. With multiplicative noise the mean of exp(q)
+is that of the Kubo oscillator, `H_1 = s (p^2 + q^2) / 2`: the other one has none for long
+times.
 
 The exact means are those of the method, in closed form; that of the indicator has a
 standard error, which is below a tenth of those that are tested.
