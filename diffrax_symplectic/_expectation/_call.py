@@ -56,7 +56,7 @@ def expectation(
         jax.config.update("jax_enable_x64", True)
         H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
         noise = lambda t, p, q, args: 0.2 * jnp.sin(q)
-        terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+        terms = ds.hamiltonian_terms(H0, noise, ())  # the shape of one noise
         estimate = ds.expectation(
             lambda t, y, args: y[1] ** 2,
             terms,
