@@ -125,10 +125,17 @@ def _newton(value: tuple[Any, _State], rest: Any) -> tuple[Any, _State]:
     finder, fn, guess, args, scale = rest
     k, restore = jfu.ravel_pytree(value[0])
     start, _ = jfu.ravel_pytree(guess)
-    tolerance = finder.rtol, finder.atol, finder.norm
+    newton = Newton(
+        start=start,
+        restore=restore,
+        rtol=finder.rtol,
+        atol=finder.atol,
+        norm=finder.norm,
+        linear_solver=finder.linear_solver,
+    )
     sol = optx.root_find(
         lambda k, args: jfu.ravel_pytree(fn(restore(k), args)[0])[0],
-        Newton(start, restore, *tolerance, finder.linear_solver),
+        newton,
         k,
         args,
         dict(scale=scale),
