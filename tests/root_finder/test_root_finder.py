@@ -198,7 +198,7 @@ def test_sweeps_end_when_the_next_correction_is_small_enough(most):
 
 
 def test_what_overflows_on_the_way_is_not_taken_for_solved():
-    # Of some of these the iterates overflow between two checks, of some at a check: there an
+    # Of some of these the iterates overflow between two checks, of some at one: there an
     # infinite correction stands next to an infinite state.
     @jax.jit
     @jax.vmap
