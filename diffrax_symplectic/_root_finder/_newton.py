@@ -9,6 +9,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
+from .._batch import batched_like
 from .._custom_types import IntScalarLike
 from ._linear import correction
 from ._tolerance import all_finite, converged, largest, log2, max_norm, ratio, Tolerance
@@ -72,9 +73,10 @@ class Newton(optx.AbstractRootFinder[_Vector, _Vector, Any, Progress]):
     linear_solver: lx.AbstractLinearSolver | None
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Progress:
-        del fn, y, args, options, f_struct, aux_struct, tags
+        del fn, args, options, f_struct, aux_struct, tags
         zero, no = jnp.zeros((), self.start.dtype), jnp.array(False)
-        return Progress(self.start, zero, zero + 1, jnp.array(0), zero, no, no)
+        begun = Progress(self.start, zero, zero + 1, jnp.array(0), zero, no, no)
+        return batched_like(begun, y)
 
     def step(self, fn, y, args, options, state, tags):
         del tags

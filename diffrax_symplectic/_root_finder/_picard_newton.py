@@ -10,7 +10,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from .._batch import where_pending
+from .._batch import batched_like, where_pending
 from .._compat import ω
 from ._newton import Newton
 from ._sweeps import sweep
@@ -18,6 +18,9 @@ from ._tolerance import all_finite, Tolerance
 
 
 _Found: TypeAlias = tuple[Any, Bool[Array, ""]]
+
+
+_SUCCESSFUL = optx.RESULTS.successful
 
 
 class AbstractBlocks(eqx.Module):
@@ -90,8 +93,8 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
                 raise ValueError(f"`{name}` of `PicardNewton` must be >= 0; got {n}.")
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
-        del fn, y, args, options, f_struct, aux_struct, tags
-        return _State(jnp.array(False), optx.RESULTS.successful)
+        del fn, args, options, f_struct, aux_struct, tags
+        return batched_like(_State(jnp.array(False), _SUCCESSFUL), y)
 
     def step(self, fn, y, args, options, state, tags):
         del state, tags
@@ -99,7 +102,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         pending = all_finite(y)
         start, solved = self._sweep(fn, y, args, scale, pending)
         rest = self, fn, y, args, scale
-        value = start, _State(solved, optx.RESULTS.successful)
+        value = start, batched_like(_State(solved, _SUCCESSFUL), start)
         y, state = where_pending(_newton, pending & ~solved, value, rest)
         return y, state, fn(y, args)[1]
 

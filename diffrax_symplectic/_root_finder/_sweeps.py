@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from .._batch import materialize, most_of_batch
+from .._batch import batched_like, materialize, most_of_batch
 from .._compat import ω
 from .._custom_types import IntScalarLike
 from ._tolerance import converged, Correction, log2, MARGIN, Tolerance
@@ -139,6 +139,7 @@ def sweep(
         return new._replace(y=jtu.tree_map(own, y, start, state.y))
 
     one, inf, no = jnp.ones((), dtype), jnp.full((), jnp.inf, dtype), jnp.array(False)
+    start, pending, one, inf, no = batched_like((start, pending, one, inf, no), guess)
     ahead = most_of_batch(jnp.where(pending, first, 0))
     state = _State(start, one, inf, no, pending, 0, ahead)
     state = lax.while_loop(lambda state: state.ahead > 0, step, state)

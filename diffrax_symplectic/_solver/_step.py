@@ -14,7 +14,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
-from .._batch import materialize
+from .._batch import batched_like, materialize
 from .._compat import ω
 from .._custom_types import RealScalarLike, Y
 from .._plan import Block, Plan
@@ -272,6 +272,7 @@ def _implicit_step(
         )
     lost = _failed(before)
     guess = [stages.zero_of(block) for block in stages.plan.blocks]
+    guess, lost = batched_like((guess, lost), (stages, before))
     # Optimistix ends at once where the guess is not finite.
     guess = jtu.tree_map(lambda k: jnp.where(lost, jnp.nan, k), guess)
     sol = optx.root_find(

@@ -16,6 +16,7 @@ import optimistix as optx
 from jaxtyping import PRNGKeyArray, PyTree
 
 from .._arguments import check_state, whole_number
+from .._batch import batched_like
 from .._brownian import drives, path_of, VARIABLES
 from .._conditions import drift_order
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
@@ -248,11 +249,13 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         drift, noise = split_terms(terms)
         plan = make_plan(_drop_absent(self.tableau.flatten(), drift, noise))
         variables = _variables(plan.tableau)
-        along, h = drift_driven(drift, t0, t1, args), t1 - t0
+        begun = t0, t1, y0, solver_state
+        begin, end, y0, solver_state = batched_like(begun, (begun, terms, args))
+        along, h = drift_driven(drift, begin, end, args), end - begin
         driven = {"h": along} if drift else {}
         name = type(self).__name__
         driven |= noise_driven(along, h, noise, variables, t0, t1, args, name)
-        y1, solved = take_step(plan, Step(t0, h, driven), y0, self, solver_state)
+        y1, solved = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
         return y1, None, dict(y0=y0, y1=y1), solved, result_of(solved, y1)
 
 
