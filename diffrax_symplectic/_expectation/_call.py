@@ -12,7 +12,7 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
 from ._choose import choose
-from ._estimate import Expectation
+from ._estimate import Expectation, ExpectationInterrupted
 from ._run import checked_call, Meter, NO_METER, run
 from ._sampling import AbstractSampling
 from ._steps import Problem
@@ -155,7 +155,11 @@ def expectation(
         sampling, reason = choose(problem, tol)
     sampling = _checked_sampling(sampling, start)
     with Meter(progress_meter) as meter:
-        plan = sampling.prepare(problem, jr.fold_in(key, _NO_SAMPLE), devices)
+        try:
+            plan = sampling.prepare(problem, jr.fold_in(key, _NO_SAMPLE), devices)
+        except ExpectationInterrupted:
+            # A trial's samples are not those of an estimate, to go on from.
+            raise KeyboardInterrupt from None
         reason = "; ".join(filter(None, (reason, plan.reason)))
         reason = reason if start is None else start.reason
         plan = plan._replace(reason=reason, roundings=problem.max_steps)

@@ -165,7 +165,8 @@ def run(
                         estimate = dataclasses.replace(estimate, moments=both)
                         done = new.end
                 if meter is not None:
-                    meter.step((done - first) / plan.num_samples)
+                    share = (done - first) / plan.num_samples
+                    meter.step(max(share, _share_of_tolerance(estimate, tol)))
             elif not more:
                 break
     except KeyboardInterrupt:
@@ -175,6 +176,15 @@ def run(
         for message in _warnings(estimate, tol):
             warnings.warn(message, stacklevel=3)
     return estimate
+
+
+def _share_of_tolerance(estimate: Expectation, tol: float | None) -> float:
+    """Of the samples that it takes, as far as is known."""
+    if tol is None or estimate.num_samples < 2:
+        return 0.0
+    errors = jtu.tree_leaves(estimate.std_error)
+    largest = max(float(np.max(x, initial=tol)) for x in errors)
+    return (tol / largest) ** 2 if np.isfinite(largest) else 0.0
 
 
 def _moments(part, begin: int, end: int, dtypes) -> Moments:
