@@ -15,7 +15,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
 from .._arguments import whole_number
 from .._brownian import check_key
@@ -349,19 +349,29 @@ def _spread(weights, good, count, ratio, x, *others) -> tuple:
     keep = good.reshape(-1, *[1] * (x.ndim - 3))
     x = jnp.where(keep, x, 0)
     total, n = lambda x: jnp.sum(x, axis=2), jnp.maximum(count, 1)
-    # Numbers of size one: sums of them and of their squares stay in range.
     largest = lambda x: jnp.max(jnp.abs(x), axis=2)
-    unit = lambda size: jnp.where(size > 0, size, 1)[:, :, None]
     size = largest(x)
-    mean = size * (total(x / unit(size)) / n)
+    to_unit, from_unit = _powers(size)
+    mean = from_unit * (total(x * to_unit[:, :, None]) / n)
     # In two passes, so that no two large numbers are subtracted. The second one finds by
     # how much the first was rounded, too.
     off = jnp.where(keep, x - mean[:, :, None], 0)
     far = largest(off)
-    z = off / unit(far)
+    to_unit, from_unit = _powers(far)
+    z = off * to_unit[:, :, None]
     rest = total(z) / n
     squares = jnp.maximum(total(z**2) - n * rest**2, 0)
-    return mean, far * rest, far * jnp.sqrt(squares), far, size
+    return mean, from_unit * rest, from_unit * jnp.sqrt(squares), far, size
+
+
+def _powers(size: Array) -> tuple[Array, Array]:
+    """A power of two that makes numbers of this size of size one, so that sums of them and
+    of their squares stay in range; and its inverse. (XLA divides by products with inverses,
+    which may underflow.)"""
+    most = jnp.finfo(size.dtype).maxexp - 24
+    exponent = jnp.clip(jnp.frexp(size)[1], -most, most)
+    one = jnp.ones_like(size)
+    return jnp.ldexp(one, -exponent), jnp.ldexp(one, exponent)
 
 
 def real(dtype) -> Any:
