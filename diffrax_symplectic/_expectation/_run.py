@@ -28,6 +28,8 @@ from ._sampling import Plan
 _MANY = 0.01
 # With an `r` of `std_error` above this, intervals of 95% covered as few as 73%.
 _HEAVY = 0.6
+# Deviations of so many roundings are none.
+_ROUNDING = 1e3
 NO_METER = diffrax.NoProgressMeter()
 
 
@@ -344,7 +346,8 @@ def _spread(weights, good, count, ratio, x, *others) -> tuple:
         left = combined(x - control)
         far = jnp.abs(left - combined(promised))
         ratio = ratio.reshape(-1, *[1] * (far.ndim - 2)).astype(x.dtype)
-        far = jnp.where(far > beyond[:, None], ratio * far, 0)
+        rounding = _ROUNDING * jnp.finfo(x.dtype).eps * jnp.abs(combined(x))
+        far = jnp.where(far > beyond[:, None] + rounding, ratio * far, 0)
         x = jnp.stack([left, combined(x), combined(control), far])
     keep = good.reshape(-1, *[1] * (x.ndim - 3))
     x = jnp.where(keep, x, 0)
