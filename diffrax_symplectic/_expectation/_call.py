@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
-from ._choose import choose
+from ._choose import choose, MOST
 from ._estimate import Expectation, ExpectationInterrupted
 from ._run import checked_call, Meter, NO_METER, run
 from ._sampling import AbstractSampling
@@ -163,6 +163,10 @@ def expectation(
         reason = "; ".join(filter(None, (reason, plan.reason)))
         reason = reason if start is None else start.reason
         plan = plan._replace(reason=reason, roundings=problem.max_steps)
+        if start is not None and tol is None and plan.num_samples == MOST:
+            # Only a tolerance has asked for more.
+            used = start.moments[-1].end - start.moments[0].begin
+            plan = plan._replace(num_samples=used)
         estimate = run(plan, key, devices, sampling, begin, tol, meter)
     _warn_of_rounding(estimate, problem)
     return estimate
