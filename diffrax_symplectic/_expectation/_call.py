@@ -101,7 +101,7 @@ def expectation(
     - `sampling`: an [`diffrax_symplectic.IndependentPaths`][],
         [`diffrax_symplectic.ArrayRQMC`][] or [`diffrax_symplectic.ValueFunctions`][].
         `None` is a rule, and `reason` of the result says how it came out:
-        `ValueFunctions` for one or two numbers in the state, if a step has at most 32
+        `ValueFunctions` for one or two numbers in the state, if a step has at most 48
         outcomes and all steps together 4,096; otherwise `ArrayRQMC` for up to four
         numbers, if the paths in `terms` can be made of given words; `IndependentPaths`
         for all else. Without `tol` it takes 4,096 paths with value functions, 16

@@ -13,7 +13,7 @@ from ._value_functions import ValueFunctions
 
 # Value functions in so many dimensions and for so many outcomes of all steps together, and
 # for so many of one. Others sort by so many coordinates.
-_FUNCTIONS, _OUTCOMES, _FEW_OUTCOMES, _SORTED = 2, 2**12, 32, 4
+_FUNCTIONS, _OUTCOMES, _FEW_OUTCOMES, _SORTED = 2, 2**12, 48, 4
 # How many samples there are without a tolerance, and at most with one.
 _PATHS_OF_FUNCTIONS, _PATHS, _REPLICATE, _REPLICATES = 2**12, 2**17, 2**14, 16
 MOST = 10**9

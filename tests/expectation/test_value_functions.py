@@ -315,7 +315,7 @@ def test_a_fit_that_would_take_long_is_coarser_or_told(monkeypatch):
     sites = [at(steps).sites for steps in (100, 10_000, 100_000)]
     assert sites == sorted(sites, reverse=True) and len(set(sites)) == 3
     assert 100_000 * 3 * sites[-1] < 2**27
-    monkeypatch.setattr(_value_functions, "_OUT_OF_PROPORTION", 10_000)
+    monkeypatch.setattr(_value_functions, "_OUT_OF_PROPORTION", 1000)
     with pytest.warns(UserWarning, match="takes as long as .* plain paths"):
         _estimate(ds.ValueFunctions(2, 64))
 
@@ -389,7 +389,7 @@ def test_a_grid_is_even_where_most_states_are_and_holds_all(heavy):
     grid = Grid(2, 64).frame(points, jnp.ones(2000, bool), jnp.ones(2))
     z = grid.inner.at(points)
     x = grid.at(z)
-    assert 0.5 < np.abs(x).max() < 0.75
+    assert 0.5 < np.abs(x).max() < (1 if heavy else 0.75)
     np.testing.assert_allclose(grid.back(x), z, rtol=1e-9, atol=1e-12)
     # Between the quartiles there are ten points, at least.
     between = np.diff(np.quantile(x, [0.25, 0.75], axis=0), axis=0)
