@@ -159,12 +159,12 @@ class Expectation(eqx.Module):
         for other in others:
             if not isinstance(other, Expectation):
                 raise ValueError(f"`merge` takes estimates; got {other!r}.")
-            self.check_same(other, "An estimate to merge")
             if type(other.sampling) is not type(self.sampling):
                 raise ValueError(
                     f"Estimates to merge were sampled by {self.sampling} and by "
                     f"{other.sampling}."
                 )
+            self.check_same(other, "An estimate to merge")
         parts = sorted(
             (x for e in (self, *others) for x in e.moments), key=lambda x: x.begin
         )
