@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
-from ._choose import choose
-from ._estimate import Expectation
+from ._choose import choose, MOST
+from ._estimate import Expectation, ExpectationInterrupted
 from ._run import checked_call, Meter, NO_METER, run
 from ._sampling import AbstractSampling
 from ._steps import Problem
@@ -102,7 +102,7 @@ def expectation(
     - `sampling`: an [`diffrax_symplectic.IndependentPaths`][],
         [`diffrax_symplectic.ArrayRQMC`][] or [`diffrax_symplectic.ValueFunctions`][].
         `None` is a rule, and `reason` of the result says how it came out:
-        `ValueFunctions` for one or two numbers in the state, if a step has at most 32
+        `ValueFunctions` for one or two numbers in the state, if a step has at most 48
         outcomes and all steps together 4,096; otherwise `ArrayRQMC` for up to four
         numbers, if the paths in `terms` can be made of given words; `IndependentPaths`
         for all else. Without `tol` it takes 4,096 paths with value functions, 16
@@ -156,10 +156,18 @@ def expectation(
         sampling, reason = choose(problem, tol)
     sampling = _checked_sampling(sampling, start)
     with Meter(progress_meter) as meter:
-        plan = sampling.prepare(problem, jr.fold_in(key, _NO_SAMPLE), devices)
+        try:
+            plan = sampling.prepare(problem, jr.fold_in(key, _NO_SAMPLE), devices)
+        except ExpectationInterrupted:
+            # A trial's samples are not those of an estimate, to go on from.
+            raise KeyboardInterrupt from None
         reason = "; ".join(filter(None, (reason, plan.reason)))
         reason = reason if start is None else start.reason
         plan = plan._replace(reason=reason, roundings=problem.max_steps)
+        if start is not None and tol is None and plan.num_samples == MOST:
+            # Only a tolerance has asked for more.
+            used = start.moments[-1].end - start.moments[0].begin
+            plan = plan._replace(num_samples=used)
         estimate = run(plan, key, devices, sampling, begin, tol, meter)
     _warn_of_rounding(estimate, problem)
     return estimate

@@ -13,10 +13,10 @@ from ._value_functions import ValueFunctions
 
 # Value functions in so many dimensions and for so many outcomes of all steps together, and
 # for so many of one. Others sort by so many coordinates.
-_FUNCTIONS, _OUTCOMES, _FEW_OUTCOMES, _SORTED = 2, 2**12, 32, 4
+_FUNCTIONS, _OUTCOMES, _FEW_OUTCOMES, _SORTED = 2, 2**12, 48, 4
 # How many samples there are without a tolerance, and at most with one.
 _PATHS_OF_FUNCTIONS, _PATHS, _REPLICATE, _REPLICATES = 2**12, 2**17, 2**14, 16
-_MOST = 10**9
+MOST = 10**9
 # More random variables of a step take long to scramble.
 _MOST_WORDS = 2**8
 # Fewer paths where all steps of all would make more numbers: ten seconds or so.
@@ -33,13 +33,13 @@ def choose(problem: Problem, tol: float | None) -> tuple[AbstractSampling, str]:
     paths = int(np.clip(_NUMBERS // (steps * d), _FEWEST, _PATHS))
     if d <= _FUNCTIONS and outcomes and outcomes <= _FEW_OUTCOMES:
         if steps * outcomes <= _OUTCOMES:
-            sampling = ValueFunctions(None, _MOST if tol else _PATHS_OF_FUNCTIONS)
+            sampling = ValueFunctions(None, MOST if tol else _PATHS_OF_FUNCTIONS)
             return sampling, f"value functions for {why}"
     if d <= _SORTED and _can_be_sorted(problem):
         fewer = max(_NUMBERS // (steps * d * _REPLICATES), _FEWEST)
         size = min(2 ** (fewer.bit_length() - 1), _REPLICATE)
-        return ArrayRQMC(size, _MOST if tol else _REPLICATES), f"sorted paths for {why}"
-    return IndependentPaths(_MOST if tol else paths), f"independent paths for {why}"
+        return ArrayRQMC(size, MOST if tol else _REPLICATES), f"sorted paths for {why}"
+    return IndependentPaths(MOST if tol else paths), f"independent paths for {why}"
 
 
 def _can_be_sorted(problem: Problem) -> bool:

@@ -18,7 +18,7 @@ from ._saved import arrays_of, described, rebuilt
 
 # Standard errors of the mean of a control, which is zero.
 _SURE, _HEAVY_CONTROL = 5, 0.1
-# Standard errors of so many roundings of the mean are roundings of the paths.
+# Deviations of so many roundings of the mean are roundings of the paths.
 _ROUNDING = 1e3
 # What paths with wider noise show of the tails counts if it is so many times as much as
 # what is seen of them.
@@ -159,12 +159,12 @@ class Expectation(eqx.Module):
         for other in others:
             if not isinstance(other, Expectation):
                 raise ValueError(f"`merge` takes estimates; got {other!r}.")
-            self.check_same(other, "An estimate to merge")
             if type(other.sampling) is not type(self.sampling):
                 raise ValueError(
                     f"Estimates to merge were sampled by {self.sampling} and by "
                     f"{other.sampling}."
                 )
+            self.check_same(other, "An estimate to merge")
         parts = sorted(
             (x for e in (self, *others) for x in e.moments), key=lambda x: x.begin
         )
@@ -287,13 +287,12 @@ class _Leaf:
             r = np.where(s > 0, beyond / (s * np.sqrt(n)), 0)
             if len(mean) == 2:
                 r[0] = np.fmax(r[0], mean[1])
-            r = np.minimum(r, 1 - 1e-6)
-            error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
             # Combinations of levels are differences of numbers as large as the mean.
             size = np.fmax.reduce(np.abs(mean[: 1 + (len(mean) > 2), :1]))
             rounding = roundings * float(jnp.finfo(dtype).eps) * size
             # Rounding errors have heavy tails, too.
-            r = np.where(error > _ROUNDING * rounding, r, 0)
+            r = np.where(largest > _ROUNDING * rounding, np.minimum(r, 1 - 1e-6), 0)
+            error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
             error = np.maximum(error, rounding)
             self._drop = np.zeros(mean.shape[2:], bool)
             if len(mean) > 2:

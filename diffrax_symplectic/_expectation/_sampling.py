@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 class Tails(eqx.Module):
     """What the mean absolute deviation from `promised` is made of that lies `beyond` some
-    deviation, if a sample weighs as much as its `ratio` says. The arrays have an axis for
-    levels and one of length 1 in front, one for combinations of the levels, and one for
-    samples."""
+    deviation, if a sample weighs as much as its `ratio` says, one at most. The arrays have
+    an axis for levels and one of length 1 in front, one for combinations of the levels, and
+    one for samples."""
 
     promised: PyTree[Array]
     beyond: PyTree[Array]

@@ -241,7 +241,9 @@ def samples(
         return Samples(values, p.weights, good, lost, heaviest=next(iter(others), None))
     control, promised = others
     beyond = p.unravel(beyond[:, 0] if p.at_end else beyond)
-    tails = Tails(promised, beyond, jnp.exp(-jnp.sum(log_ratio, axis=0)))
+    # What is more likely without the wider noise is seen without it.
+    ratio = jnp.exp(-jnp.maximum(jnp.sum(log_ratio, axis=0), 0))
+    tails = Tails(promised, beyond, ratio)
     return Samples(values, p.weights, good, lost, control, tails)
 
 

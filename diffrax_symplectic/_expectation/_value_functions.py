@@ -192,8 +192,8 @@ def _controlled_paths(
     p: Problem, functions: Functions, wide, beyond, keys: PRNGKeyArray
 ) -> Samples:
     """A sample is a path, with its value and what `functions`, along an axis of levels, say
-    of its noise. With `wide=1` the noise is wider, and of deviations `beyond` these there
-    is an unbiased estimate nonetheless."""
+    of its noise. With `wide=1` the noise is wider: that tells of deviations `beyond` those
+    that paths usually have."""
     n = len(keys)
 
     def begin(level):
