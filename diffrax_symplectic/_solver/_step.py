@@ -69,16 +69,16 @@ class Stages(eqx.Module):
 
         return [zero(group) for group in block.unknown]
 
-    def sweep(self, limits: Limits, begin: Found) -> Found:
-        """First iterations for the stage equations: block after block, each from the values
-        of those before it."""
+    def sweep(self, limits: Limits, begin: Found, solve: Callable = sweep) -> Found:
+        """First iterations for the stage equations, by `solve`: block after block, each
+        from the values of those before it."""
         values, y = {}, []
         solved = near = jnp.array(True)
         for block, k in zip(self.plan.blocks, begin.y):
             if block.unknown:
                 own = limits._replace(scale=ft.partial(self._scale, block))
                 image = ft.partial(self._image, block, values)
-                k, is_solved, is_near = sweep(own, image, begin._replace(y=k))
+                k, is_solved, is_near = solve(own, image, begin._replace(y=k))
                 solved, near = solved & is_solved, near & is_near
             y.append(k)
             values = self._with_block(block, values, k, keep=True)

@@ -1,0 +1,1 @@
+from ._call import Ensemble, ensemble
