@@ -14,11 +14,16 @@ from ._backend import drjit
 
 def _maximum(a, b):
     # As in JAX, what is not a number stays that.
-    return drjit().select((a > b) | (a != a), a, b)
+    return drjit().select((a > b) | _is_nan(a), a, b)
 
 
 def _minimum(a, b):
-    return drjit().select((a < b) | (a != a), a, b)
+    return drjit().select((a < b) | _is_nan(a), a, b)
+
+
+def _is_nan(a):
+    # In Dr.Jit, NaN is neither equal to itself nor not equal.
+    return ~(a == a)
 
 
 def _clamp(low, a, high):
@@ -26,24 +31,45 @@ def _clamp(low, a, high):
 
 
 def _divide(a, b):
-    # Of integers Dr.Jit's `//` rounds to zero, as StableHLO does.
-    return a / b if drjit().is_float_v(a) else a // b
+    if drjit().is_float_v(a):
+        return a / b
+    by, zero, _ = _divisor(a, b)
+    # Dr.Jit's `//` of integers rounds to zero, as StableHLO does.
+    return drjit().select(zero, type(a)(-1), a // by)
+
+
+def _divisor(a, b):
+    """What an integer can be divided by: the processor traps for zero, and for the least
+    number divided by -1. And where it is zero, and where -1."""
+    dr = drjit()
+    zero = b == 0
+    minus = (b == -1) if dr.is_signed_v(b) else ~zero & zero
+    overflow = minus & (a == _least(a))
+    return dr.select(zero | overflow, type(b)(1), b), zero, minus
+
+
+def _least(a):
+    bits = 8 * drjit().itemsize_v(a)
+    return type(a)(-(2 ** (bits - 1)) if drjit().is_signed_v(a) else 0)
 
 
 def _remainder(a, b):
     dr = drjit()
     if not dr.is_float_v(a):
-        return a - (a // b) * b
-    rest = a - dr.trunc(a / b) * b
-    # Where the quotient was rounded up.
-    rest = dr.select(rest * dr.sign(a) < 0, rest + dr.abs(b) * dr.sign(a), rest)
-    return dr.select(dr.isinf(b) & dr.isfinite(a), a, rest)
+        by, zero, minus = _divisor(a, b)
+        return dr.select(zero, a, dr.select(minus, type(a)(0), a - (a // by) * by))
+    size, by = dr.abs(a), dr.abs(b)
+    rest = dr.fma(-dr.trunc(size / by), by, size)
+    # Where the quotient was rounded to the next whole number.
+    rest = dr.select(rest < 0, rest + by, dr.select(rest >= by, rest - by, rest))
+    rest = dr.select(dr.isinf(b) & dr.isfinite(a), size, rest)
+    return dr.select(dr.isfinite(a) & ~(b == 0), dr.copysign(rest, a), type(a)(np.nan))
 
 
 def _sign(a):
     dr = drjit()
     if dr.is_float_v(a):
-        return dr.select((a == 0) | (a != a), a, dr.copysign(type(a)(1), a))
+        return dr.select((a == 0) | _is_nan(a), a, dr.copysign(type(a)(1), a))
     return dr.select(a == 0, 0, dr.select(a > 0, type(a)(1), type(a)(-1)))
 
 
@@ -54,7 +80,8 @@ def _power(a, b):
         return _integer_power(a, int(b[0]))
     size = dr.exp(dr.log(dr.abs(a)) * b)
     whole, odd = dr.floor(b) == b, dr.floor(b / 2) * 2 != b
-    negative = dr.select(whole, dr.select(odd, -size, size), T(np.nan))
+    other = dr.select(dr.isinf(a), size, T(np.nan))
+    negative = dr.select(whole, dr.select(odd, -size, size), other)
     size = dr.select(a < 0, negative, size)
     size = dr.select((a == 0) & (b > 0), T(0), size)
     return dr.select((b == 0) | (a == 1), T(1), size)
@@ -88,6 +115,25 @@ def _tan(a):
     return sine / cosine
 
 
+def _atan(a):
+    return drjit().select(_is_nan(a), a, drjit().atan(a))
+
+
+def _atan2(a, b):
+    dr, T = drjit(), type(a)
+    to_left = dr.copysign(T(1), b) < 0
+    angle = dr.select(a == 0, dr.select(to_left, T(np.pi), T(0)), dr.atan2(dr.abs(a), b))
+    return dr.select(_is_nan(a) | _is_nan(b), a + b, dr.copysign(angle, a))
+
+
+def _erf(a):
+    return drjit().select(_is_nan(a), a, drjit().erf(a))
+
+
+def _rsqrt(a):
+    return 1 / drjit().sqrt(a)
+
+
 def _atanh(a):
     return (_log1p(a) - _log1p(-a)) / 2
 
@@ -97,15 +143,16 @@ def _logistic(a):
 
 
 def _erf_inv(a):
-    """Of double precision, Dr.Jit's has the digits of single precision. A step of Halley's
-    method triples them."""
+    """In double precision, Dr.Jit's has the digits of single precision, or fewer in its
+    tails. Each step of Halley's method triples them."""
     dr = drjit()
-    y = dr.erfinv(a)
-    if not dr.is_float_v(a) or dr.itemsize_v(a) < 8:
+    start = y = dr.erfinv(a)
+    if dr.itemsize_v(a) < 8:
         return y
-    newton = (dr.erf(y) - a) * (np.sqrt(np.pi) / 2) * dr.exp(y * y)
-    better = y - newton / (1 + y * newton)
-    return dr.select(dr.abs(a) < 1, better, y)
+    for _ in range(2):
+        newton = (dr.erf(y) - a) * (np.sqrt(np.pi) / 2) * dr.exp(y * y)
+        y = y - newton / (1 + y * newton)
+    return dr.select(dr.abs(a) < 1, y, start)
 
 
 def _shifted(shift: Callable) -> Callable:
@@ -137,8 +184,8 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "and": lambda a, b: a & b,
         "asin": dr.asin,
         "asinh": dr.asinh,
-        "atan": dr.atan,
-        "atan2": dr.atan2,
+        "atan": _atan,
+        "atan2": _atan2,
         "atanh": _atanh,
         "cbrt": dr.cbrt,
         "ceil": dr.ceil,
@@ -147,7 +194,7 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "cosine": dr.cos,
         "count_leading_zeros": dr.lzcnt,
         "divide": _divide,
-        "erf": dr.erf,
+        "erf": _erf,
         "erf_inv": _erf_inv,
         "exponential": dr.exp,
         "exponential_minus_one": _expm1,
@@ -167,7 +214,7 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "remainder": _remainder,
         "round_nearest_afz": lambda a: dr.trunc(a + dr.copysign(type(a)(0.5), a)),
         "round_nearest_even": dr.round,
-        "rsqrt": dr.rsqrt,
+        "rsqrt": _rsqrt,
         "select": dr.select,
         "shift_left": _shifted(lambda a, b: a << b),
         "shift_right_arithmetic": _arithmetic,

@@ -71,7 +71,9 @@ def by_drjit(p: Problem, key: PRNGKeyArray, numbers: np.ndarray) -> Batch:
             kept[step], done = [*map(np.asarray, paths.y)], step
         stopped = np.asarray(paths.stopped)
     except Exception as error:
-        raise _explained(error) from error
+        if (refused := _refused(error)) is not None:
+            raise refused from None
+        raise
     at_times = [np.stack([kept[s][k] for s in saves], axis=1) for k in range(len(paths.y))]
     y = _unraveled(p.y0, at_times)
     (which,) = np.nonzero(stopped)
@@ -102,16 +104,15 @@ def _unraveled(y0: PyTree, numbers: list[np.ndarray]) -> PyTree[np.ndarray]:
     return treedef.unflatten(each)
 
 
-def _explained(error: BaseException) -> BaseException:
-    """The error that a user gets for one that Dr.Jit, which calls what records a loop, may
-    have wrapped."""
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, NotReplayed):
-        cause = cause.__cause__ or cause.__context__
-    if cause is None:
-        return error
+def _refused(error: BaseException | None) -> ValueError | None:
+    """What a user gets to know if an operation cannot be replayed. Dr.Jit, which calls what
+    records a loop, wraps the error."""
+    while error is not None and not isinstance(error, NotReplayed):
+        error = error.__cause__ or error.__context__
+    if error is None:
+        return None
     return ValueError(
-        f'`engine="drjit"` cannot replay {cause}{_origin(cause.location)}. Pass '
+        f'`engine="drjit"` cannot replay {error}{_origin(error.location)}. Pass '
         '`engine="jax"`, or write the function without it.'
     )
 

@@ -6,9 +6,10 @@ A rule takes an operation and its operands to its results. StableHLO's specifica
 """
 
 import itertools
+import math
 import operator
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -159,8 +160,12 @@ def _pad(o, x, value):
     return [Tensor([*x.entries, value.item()], ()).take(places)]
 
 
+# An index that differs from path to path chooses by as many comparisons as there are places.
+_MOST_PLACES = 64
+
+
 def _windows(
-    x: Tensor, starts: list[Tensor], sizes: tuple[int, ...]
+    o: Operation, x: Tensor, starts: Sequence[Tensor], sizes: Sequence[int]
 ) -> Iterator[tuple[tuple[slice, ...], Any]]:
     """Where a window of these sizes can be in `x`, and in which lanes it is there."""
     axes = []
@@ -172,6 +177,9 @@ def _windows(
         s = start.item()
         first, last = [(0, s <= 0)], [(most, s >= most)]
         axes.append([*first, *[(k, s == k) for k in range(1, most)], *last])
+    if (number := math.prod(map(len, axes))) > _MOST_PLACES:
+        what = f"`{o.op.name}` with an index of each path among {number} places"
+        raise NotReplayed(o.op, what)
     for choice in itertools.product(*axes):
         here = True
         for _, also in choice:
@@ -185,74 +193,80 @@ def _in_lanes(here: Any, new: Tensor, old: Tensor | None) -> Tensor:
     return each(lambda a, b: drjit().select(here, a, b), new, old)
 
 
+def _window(o: Operation, x: Tensor, starts, sizes) -> Tensor:
+    out = None
+    for window, here in _windows(o, x, starts, sizes):
+        out = _in_lanes(here, x.take(x.places[window]), out)
+    assert out is not None
+    return out
+
+
 @_rule
 def _dynamic_slice(o, x, *starts):
-    out = None
-    for window, here in _windows(x, [*starts], o.shape):
-        out = _in_lanes(here, x.take(x.places[window]), out)
-    return [out]
+    return [_window(o, x, starts, o.shape)]
 
 
 @_rule
 def _dynamic_update_slice(o, x, update, *starts):
     out = None
-    for window, here in _windows(x, [*starts], update.shape):
+    for window, here in _windows(o, x, starts, update.shape):
         places = x.places.copy()
         places[window] = len(x.entries) + update.places
         out = _in_lanes(here, Tensor([*flat([x, update])], ()).take(places), out)
     return [out]
 
 
-def _places_of(o, name: str, x: Tensor, indices: Tensor, sizes, axes, batching):
-    """Where in `x` the windows of these sizes begin, along a last axis; and the places in a
-    window."""
-    values = known(indices)
-    if values is None or batching:
-        what = "`{}` with an index that depends on the path"
-        raise NotReplayed(o.op, what.format(o.op.name))
-    (vector,) = o.part(name, "index_vector_dim") or [0]
-    values = values.reshape(*values.shape, *[1] * (vector == values.ndim))
-    values = np.moveaxis(values, vector, -1)
-    starts = np.zeros((*values.shape[:-1], len(x.shape)), int)
-    starts[..., axes] = values
-    inner = np.stack(np.meshgrid(*map(np.arange, sizes), indexing="ij"), -1)
-    return starts, inner
+def _starts(o: Operation, name: str, x: Tensor, indices: Tensor, axes: list[int]):
+    """For each of `indices` where a window in `x` begins."""
+    if o.part(name, "operand_batching_dims") or o.part(name, "input_batching_dims"):
+        raise NotReplayed(o.op, f"`{o.op.name}` with an axis of a batch")
+    # Written only if it is not zero.
+    vector = sum(o.part(name, "index_vector_dim"))
+    places = indices.places.reshape(*indices.shape, *[1] * (vector == len(indices.shape)))
+    places = np.moveaxis(places, vector, -1)
+    zero = constant(type(indices.entries[0]), np.zeros(()))
+
+    def start(row: np.ndarray) -> list[Tensor]:
+        own = {axis: Tensor([indices.entries[i]], ()) for axis, i in zip(axes, row)}
+        return [own.get(d, zero) for d in range(len(x.shape))]
+
+    batch = places.shape[:-1]
+    return batch, [start(row) for row in places.reshape(math.prod(batch), -1)]
 
 
 @_rule
 def _gather(o, x, indices):
     name, sizes = "dimension_numbers", o.ints("slice_sizes")
-    axes, offsets = o.part(name, "start_index_map"), o.part(name, "offset_dims")
-    batching = o.part(name, "operand_batching_dims")
-    starts, inner = _places_of(o, name, x, indices, sizes, axes, batching)
-    starts = np.clip(starts, 0, np.array(x.shape) - sizes)
-    at = starts.reshape(*starts.shape[:-1], *[1] * len(sizes), -1) + inner
-    places = x.places[tuple(np.moveaxis(at, -1, 0))]
-    collapsed = o.part(name, "collapsed_slice_dims")
-    places = places.squeeze(tuple(starts.ndim - 1 + d for d in collapsed))
-    batch = starts.ndim - 1
-    return [x.take(np.moveaxis(places, range(batch, places.ndim), offsets))]
+    batch, starts = _starts(o, name, x, indices, o.part(name, "start_index_map"))
+    windows = Tensor([*flat([_window(o, x, s, sizes) for s in starts])], (*batch, *sizes))
+    collapsed = tuple(len(batch) + d for d in o.part(name, "collapsed_slice_dims"))
+    places = windows.places.squeeze(collapsed)
+    moved = range(len(batch), places.ndim)
+    return [windows.take(np.moveaxis(places, moved, o.part(name, "offset_dims")))]
 
 
 @_rule
 def _scatter(o, x, indices, updates):
     name = "scatter_dimension_numbers"
-    axes = o.part(name, "scatter_dims_to_operand_dims")
-    windows = o.part(name, "update_window_dims")
     inserted = o.part(name, "inserted_window_dims")
-    batching = o.part(name, "input_batching_dims")
-    sizes, left = [], iter(windows)
+    window = o.part(name, "update_window_dims")
+    sizes, left = [], iter(window)
     for d in range(len(x.shape)):
         sizes.append(1 if d in inserted else updates.shape[next(left)])
-    starts, inner = _places_of(o, name, x, indices, sizes, axes, batching)
-    at = starts.reshape(*starts.shape[:-1], *[1] * len(sizes), -1) + inner
-    fits = np.all((at >= 0) & (at < np.array(x.shape)), axis=-1)
-    batch = starts.ndim - 1
-    source = np.moveaxis(updates.places, windows, range(batch, updates.places.ndim))
+    axes = o.part(name, "scatter_dims_to_operand_dims")
+    batch, starts = _starts(o, name, x, indices, axes)
+    source = np.moveaxis(updates.places, window, range(len(batch), updates.places.ndim))
     out = [*x.entries]
-    for place, ok, k in zip(at.reshape(-1, len(sizes)), fits.flat, source.flat):
-        if ok:
-            i = x.places[tuple(place)]
+    for start, row in zip(starts, source.reshape(math.prod(batch), -1)):
+        values = [known(s) for s in start]
+        if any(v is None for v in values):
+            raise NotReplayed(o.op, f"`{o.op.name}` with an index of each path")
+        begin = [int(v) for v in values if v is not None]
+        fits = [0 <= b <= n - size for b, n, size in zip(begin, x.shape, sizes)]
+        if not all(fits):
+            continue  # It is dropped.
+        at = tuple(slice(b, b + size) for b, size in zip(begin, sizes))
+        for i, k in zip(x.places[at].flat, row):
             one = [Tensor([e], ()) for e in (out[i], updates.entries[k])]
             out[i] = o.run(0, one)[0].item()
     return [Tensor(out, x.shape)]
@@ -264,7 +278,7 @@ def _scatter(o, x, indices, updates):
 @_rule
 def _convert(o, x):
     if o.kind is array_types()["i1"]:
-        return [each(lambda a: a if type(a) is o.kind else a != 0, x)]
+        return [each(lambda a: a if type(a) is o.kind else ~(a == 0), x)]
     return [each(o.kind, x)]
 
 
@@ -276,6 +290,9 @@ def _bitcast_convert(o, x):
 @_rule
 def _compare(o, a, b):
     name = o.word("comparison_direction").lower()
+    if name == "ne":
+        # What is not a number differs from all. In Dr.Jit it does not.
+        return [each(lambda a, b: ~(a == b), a, b)]
     return [each(getattr(operator, name), a, b)]
 
 
