@@ -123,7 +123,9 @@ def ensemble(
     or of more than 256 numbers; an `ImportError` where Dr.Jit or a library of LLVM is
     missing. Warns if paths failed, and if many are left to JAX.
     """
-    key, _ = checked_call("ensemble", key, None, None, None, (terms, t0, t1, dt0, y0, args))
+    key, _ = checked_call(
+        "ensemble", key, None, None, None, (terms, t0, t1, dt0, y0, args)
+    )
     num_paths = whole_number("num_paths", num_paths)
     engine = "jax" if engine is None else engine
     if engine not in ENGINES:
@@ -137,7 +139,9 @@ def ensemble(
     for begin in range(0, num_paths, size):
         # JAX compiles for a size. What is too much is dropped.
         n = min(size, num_paths if engine == "jax" else num_paths - begin)
-        batches.append(ENGINES[engine](problem, key, np.arange(begin, begin + n, dtype=np.uint64)))
+        batches.append(
+            ENGINES[engine](problem, key, np.arange(begin, begin + n, dtype=np.uint64))
+        )
     joined = _joined(batches, num_paths, at_end=ts is None)
     saved = np.asarray(problem.levels.saved_steps[0])
     at = float(problem.t0) + saved * float(problem.levels.h[0])

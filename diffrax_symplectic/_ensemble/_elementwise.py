@@ -122,7 +122,9 @@ def _atan(a):
 def _atan2(a, b):
     dr, T = drjit(), type(a)
     to_left = dr.copysign(T(1), b) < 0
-    angle = dr.select(a == 0, dr.select(to_left, T(np.pi), T(0)), dr.atan2(dr.abs(a), b))
+    angle = dr.select(
+        a == 0, dr.select(to_left, T(np.pi), T(0)), dr.atan2(dr.abs(a), b)
+    )
     return dr.select(_is_nan(a) | _is_nan(b), a + b, dr.copysign(angle, a))
 
 

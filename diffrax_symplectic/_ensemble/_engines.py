@@ -74,7 +74,9 @@ def by_drjit(p: Problem, key: PRNGKeyArray, numbers: np.ndarray) -> Batch:
         if (refused := _refused(error)) is not None:
             raise refused from None
         raise
-    at_times = [np.stack([kept[s][k] for s in saves], axis=1) for k in range(len(paths.y))]
+    at_times = [
+        np.stack([kept[s][k] for s in saves], axis=1) for k in range(len(paths.y))
+    ]
     y = _unraveled(p.y0, at_times)
     (which,) = np.nonzero(stopped)
     if len(which) == 0:
@@ -100,7 +102,9 @@ def _unraveled(y0: PyTree, numbers: list[np.ndarray]) -> PyTree[np.ndarray]:
     leaves, treedef = jtu.tree_flatten(y0)
     ends = np.cumsum([0, *[x.size for x in leaves]])
     stack = lambda x, i: np.stack(numbers[i : i + x.size], axis=-1)
-    each = [stack(x, i).reshape(*numbers[0].shape, *x.shape) for x, i in zip(leaves, ends)]
+    each = [
+        stack(x, i).reshape(*numbers[0].shape, *x.shape) for x, i in zip(leaves, ends)
+    ]
     return treedef.unflatten(each)
 
 

@@ -101,9 +101,13 @@ class Kernels:
 
         @jax.jit
         def start(arrays, key):
-            of = jax.vmap(lambda lo: layout.path_keys(arrays, key, jnp.zeros_like(lo), lo))
+            of = jax.vmap(
+                lambda lo: layout.path_keys(arrays, key, jnp.zeros_like(lo), lo)
+            )
             # No solver remembers random numbers at the start: all paths begin as one.
-            return jax.vmap(layout.start, (None, 0), None)(arrays, of(jnp.zeros(1, word.dtype)))
+            return jax.vmap(layout.start, (None, 0), None)(
+                arrays, of(jnp.zeros(1, word.dtype))
+            )
 
         self._start = start
         self._keys = Program(layout.path_keys, arrays, key, word, word)
@@ -116,7 +120,9 @@ class Kernels:
         self._make_keys = freeze(self._record_keys)
         self._take_steps = freeze(self._record_steps)
 
-    def begin(self, arrays: list[Array], key: PRNGKeyArray, h: Array, first: int, n: int):
+    def begin(
+        self, arrays: list[Array], key: PRNGKeyArray, h: Array, first: int, n: int
+    ):
         """The paths of `n` samples from number `first` on; and the parameters of their steps
         of size `h`."""
         dr, kinds = drjit(), array_types()
@@ -140,7 +146,9 @@ class Kernels:
     def advance(self, paths: Paths, parameters, begin: int, end: int) -> Paths:
         """The paths after the steps number `begin` to `end`, without that."""
         number = ft.partial(drjit().opaque, array_types()["i32"])
-        y, memory, stopped = self._take_steps(parameters, number(begin), number(end), *paths)
+        y, memory, stopped = self._take_steps(
+            parameters, number(begin), number(end), *paths
+        )
         return Paths(paths.keys, y, memory, stopped)
 
     @property

@@ -65,7 +65,9 @@ class Operation(NamedTuple):
         number = len(self.errors)
         out = fn(*args, mode="symbolic", **kwargs)
         if len(self.errors) > number:
-            raise NotReplayed(self.op, "an error that is raised within a loop or branch")
+            raise NotReplayed(
+                self.op, "an error that is raised within a loop or branch"
+            )
         return out
 
     def part(self, name: str, key: str) -> list[int]:
@@ -104,7 +106,9 @@ def rule_of(name: str) -> Rule | None:
 
 @_rule
 def _constant(o):
-    return [constant(o.kind, np.broadcast_to(np.asarray(o.op.attributes["value"]), o.shape))]
+    return [
+        constant(o.kind, np.broadcast_to(np.asarray(o.op.attributes["value"]), o.shape))
+    ]
 
 
 @_rule
@@ -222,7 +226,9 @@ def _starts(o: Operation, name: str, x: Tensor, indices: Tensor, axes: list[int]
         raise NotReplayed(o.op, f"`{o.op.name}` with an axis of a batch")
     # Written only if it is not zero.
     vector = sum(o.part(name, "index_vector_dim"))
-    places = indices.places.reshape(*indices.shape, *[1] * (vector == len(indices.shape)))
+    places = indices.places.reshape(
+        *indices.shape, *[1] * (vector == len(indices.shape))
+    )
     places = np.moveaxis(places, vector, -1)
     zero = constant(type(indices.entries[0]), np.zeros(()))
 
@@ -238,7 +244,9 @@ def _starts(o: Operation, name: str, x: Tensor, indices: Tensor, axes: list[int]
 def _gather(o, x, indices):
     name, sizes = "dimension_numbers", o.ints("slice_sizes")
     batch, starts = _starts(o, name, x, indices, o.part(name, "start_index_map"))
-    windows = Tensor([*flat([_window(o, x, s, sizes) for s in starts])], (*batch, *sizes))
+    windows = Tensor(
+        [*flat([_window(o, x, s, sizes) for s in starts])], (*batch, *sizes)
+    )
     collapsed = tuple(len(batch) + d for d in o.part(name, "collapsed_slice_dims"))
     places = windows.places.squeeze(collapsed)
     moved = range(len(batch), places.ndim)
@@ -301,7 +309,9 @@ def _compare(o, a, b):
 
 @_rule
 def _dot_general(o, a, b):
-    part = lambda side, kind: o.part("dot_dimension_numbers", f"{side}_{kind}_dimensions")
+    part = lambda side, kind: o.part(
+        "dot_dimension_numbers", f"{side}_{kind}_dimensions"
+    )
 
     def matrices(x: Tensor, side: str) -> np.ndarray:
         batch, summed = part(side, "batching"), part(side, "contracting")
@@ -313,9 +323,7 @@ def _dot_general(o, a, b):
     left, right = matrices(a, "lhs"), matrices(b, "rhs")
     out = []
     for k, i, j in np.ndindex(len(left), left.shape[1], right.shape[1]):
-        terms = [
-            a.entries[m] * b.entries[n] for m, n in zip(left[k, i], right[k, j])
-        ]
+        terms = [a.entries[m] * b.entries[n] for m, n in zip(left[k, i], right[k, j])]
         out.append(sum(terms[1:], terms[0]) if terms else o.kind(0))
     return [Tensor(out, o.shape)]
 
@@ -341,7 +349,14 @@ def _reduce(o, *xs):
 def _changes_nothing(o, starts) -> bool:
     value = known(starts[0])
     name = [*o.op.regions[0].blocks[0].operations][0].operation.name.split(".")[-1]
-    neutral = {"add": 0, "multiply": 1, "maximum": -np.inf, "minimum": np.inf, "or": False, "and": True}
+    neutral = {
+        "add": 0,
+        "multiply": 1,
+        "maximum": -np.inf,
+        "minimum": np.inf,
+        "or": False,
+        "and": True,
+    }
     return len(starts) == 1 and value is not None and neutral.get(name) == value
 
 

@@ -17,7 +17,9 @@ class Replay:
     def __init__(self, module: Any):
         self._module = module  # It owns the operations.
         self._errors: list[Any] = []
-        functions = [f for f in module.body.operations if f.operation.name == "func.func"]
+        functions = [
+            f for f in module.body.operations if f.operation.name == "func.func"
+        ]
         self._functions = {f.attributes["sym_name"].value: f for f in functions}
 
     @property
@@ -55,9 +57,16 @@ class Replay:
             values.update(zip(op.results, self._results(op, operands, values)))
         raise AssertionError("A block ends with what it returns.")
 
-    def _results(self, op: Any, operands: list[Tensor], values: ChainMap) -> list[Tensor]:
+    def _results(
+        self, op: Any, operands: list[Tensor], values: ChainMap
+    ) -> list[Tensor]:
         if op.name == "func.call":
-            return self._call(op.attributes["callee"].value, operands)
+            try:
+                return self._call(op.attributes["callee"].value, operands)
+            except NotReplayed as error:
+                # Functions that are called know only their own operations.
+                error.location += str(op.location)
+                raise
         run = lambda i, args: self._block(op.regions[i].blocks[0], args, values)
         operation = Operation(op, run, self._errors)
         rule = rule_of(operation.name)

@@ -115,7 +115,9 @@ def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
     halves = _Pairs(image) if pairs else _Copies(image)
 
     def once(y: _Halves, damping: Scalar) -> _Halves:
-        stay = lambda new, old: jtu.tree_map(lambda a, b: a + damping * (b - a), new, old)
+        stay = lambda new, old: jtu.tree_map(
+            lambda a, b: a + damping * (b - a), new, old
+        )
         y = stay(halves.first(y), y[0]), y[1]
         return y[0], stay(halves.second(y), y[1])
 
@@ -127,7 +129,9 @@ def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
     weights = [_inverse(2 * jnp.finfo(zero.dtype).eps * x) for x in scales]
     rounding = _ROUNDING * 2 * jnp.finfo(zero.dtype).eps * _largest(scales)
 
-    def judge(old: _Halves, new: _Halves, before: Scalar) -> tuple[Scalar, Bool[Array, ""]]:
+    def judge(
+        old: _Halves, new: _Halves, before: Scalar
+    ) -> tuple[Scalar, Bool[Array, ""]]:
         """The size of a correction, after one of size `before`, and whether it is the last
         that is needed."""
         gaps = _sizes(halves.change(old, new))

@@ -50,7 +50,9 @@ def each(fn: Callable, *xs: Tensor) -> Tensor:
     """A function of the entries. One entry stands for as many as the others have."""
     size = max(xs, key=lambda x: len(x.entries))
     spread = [
-        x.entries if len(x.entries) == len(size.entries) else x.entries * len(size.entries)
+        x.entries
+        if len(x.entries) == len(size.entries)
+        else x.entries * len(size.entries)
         for x in xs
     ]
     return Tensor([fn(*es) for es in zip(*spread)], size.shape)

@@ -101,10 +101,14 @@ def _assert_of_solver(solver, dtype):
 
 PATHS = {
     "weak": lambda key: ds.WeakBrownianPath((2,), key),
-    "weak, order 3": lambda key: ds.WeakBrownianPath((2,), key, order=3, two_point=True),
+    "weak, order 3": lambda key: ds.WeakBrownianPath(
+        (2,), key, order=3, two_point=True
+    ),
     "Gaussian": lambda key: ds.FixedStepBrownianPath((2,), key),
     "Gaussian of cells": lambda key: ds.FixedStepBrownianPath((2,), key, cell=H / 4),
-    "truncated": lambda key: ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((2,), key)),
+    "truncated": lambda key: ds.TruncatedBrownianPath(
+        ds.FixedStepBrownianPath((2,), key)
+    ),
     "tree": lambda key: diffrax.VirtualBrownianTree(0.0, 1.0, H / 2, (2,), key),
     "truncated tree": lambda key: ds.TruncatedBrownianPath(
         diffrax.VirtualBrownianTree(0.0, 1.0, H / 2, (2,), key)
