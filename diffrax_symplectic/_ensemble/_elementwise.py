@@ -136,6 +136,24 @@ def _rsqrt(a):
     return 1 / drjit().sqrt(a)
 
 
+# Dr.Jit's own three are of single precision on GPUs.
+
+
+def _sinh(a):
+    u = _expm1(drjit().abs(a))
+    return drjit().copysign(drjit().select(drjit().isinf(u), u, (u + u / (u + 1)) / 2), a)
+
+
+def _cosh(a):
+    u = drjit().exp(drjit().abs(a))
+    return u / 2 + 0.5 / u
+
+
+def _tanh(a):
+    u = _expm1(-2 * drjit().abs(a))
+    return drjit().copysign(-u / (u + 2), a)
+
+
 def _atanh(a):
     return (_log1p(a) - _log1p(-a)) / 2
 
@@ -192,7 +210,7 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "cbrt": dr.cbrt,
         "ceil": dr.ceil,
         "clamp": _clamp,
-        "cosh": dr.cosh,
+        "cosh": _cosh,
         "cosine": dr.cos,
         "count_leading_zeros": dr.lzcnt,
         "divide": _divide,
@@ -223,11 +241,11 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "shift_right_logical": _shifted(lambda a, b: a >> b),
         "sign": _sign,
         "sine": dr.sin,
-        "sinh": dr.sinh,
+        "sinh": _sinh,
         "sqrt": dr.sqrt,
         "square": lambda a: a * a,
         "subtract": lambda a, b: a - b,
         "tan": _tan,
-        "tanh": dr.tanh,
+        "tanh": _tanh,
         "xor": lambda a, b: a ^ b,
     }

@@ -29,8 +29,9 @@ class Program:
     """A function lowered for one path, and how its arguments lie in memory."""
 
     def __init__(self, fn: Callable, *args: PyTree):
-        traced = jax.jit(fn, keep_unused=True).trace(*args)
-        lowered = traced.lower(lowering_platforms=("cpu",))
+        # For CPUs on any device: for others JAX calls libraries.
+        with jax.default_device(jax.devices("cpu")[0]):
+            lowered = jax.jit(fn, keep_unused=True).lower(*args)
         self.replay = Replay(lowered.compiler_ir("stablehlo"))
         types = iter(self.replay.arguments)
         self.types = [[next(types) for _ in jtu.tree_leaves(x)] for x in args]
