@@ -136,7 +136,7 @@ def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
         that is needed."""
         gaps = _sizes(halves.change(old, new))
         size = _largest([x * weight for x, weight in zip(gaps, weights)])
-        below = _MARGIN * size * jnp.minimum(size, before) <= before
+        below = _MARGIN * size * jnp.where(size < before, size, before) <= before
         stays = (size >= 0.9 * before) & (_largest(gaps) <= rounding)
         return size, below | stays
 
@@ -181,11 +181,17 @@ def _difference(a: PyTree[Array], b: PyTree[Array]) -> PyTree[Array]:
 
 
 def _sizes(y: PyTree[Array]) -> list[Scalar]:
-    return [jnp.max(jnp.abs(x)) for x in jtu.tree_leaves(y)]
+    return [_largest([*jnp.abs(x).reshape(-1)]) for x in jtu.tree_leaves(y)]
 
 
 def _largest(x: list[Scalar]) -> Scalar:
-    return ft.reduce(jnp.maximum, x)
+    return ft.reduce(_larger, x)
+
+
+def _larger(a: Scalar, b: Scalar) -> Scalar:
+    # `jnp.maximum` would keep what is not a number, for the price of three operations. The
+    # end of the step shows that, too.
+    return jnp.where(a > b, a, b)
 
 
 class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Found]):
