@@ -9,11 +9,12 @@ The state is a pair `(p, q)`, momenta first. Begin like this:
 
     H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
     noise = lambda t, p, q, args: 0.1 * jnp.sin(q)
-    path = ds.WeakBrownianPath((), jr.key(0))
-    terms = ds.hamiltonian_terms(H0, noise, path)
+    terms = ds.hamiltonian_terms(H0, noise, ())  # () is the shape of one noise
     y0 = (jnp.array(0.0), jnp.array(1.0))
-    print(ds.suggest_solver(terms, 0.0, y0, want="expectations"))
-    sol = diffrax.diffeqsolve(terms, ds.StormerVerlet(), 0.0, 1.0, 0.1, y0)
+    suggestions = ds.suggest_solver(terms, 0.0, y0, want="strong")
+    print(suggestions)
+    best = suggestions[0]
+    sol = diffrax.diffeqsolve(best.terms(jr.key(0)), best.solver, 0.0, 1.0, 0.1, y0)
 
 - Terms: `hamiltonian_terms`, `spin_terms`, `wave_terms`.
 - Which solver: `suggest_solver`, `compare_solvers`. The first to try: `ImplicitMidpoint`.
@@ -59,6 +60,7 @@ from ._root_finder import PicardNewton as PicardNewton
 from ._solver import (
     AbstractImplicitStages as AbstractImplicitStages,
     AbstractSymplecticRungeKutta as AbstractSymplecticRungeKutta,
+    AbstractSymplecticSolver as AbstractSymplecticSolver,
     AdditiveGauss as AdditiveGauss,
     BAOAB as BAOAB,
     Damped as Damped,

@@ -4,16 +4,12 @@ Nothing of the kind is used anywhere else. `tests/test_private_parts.py` tests e
 by itself.
 """
 
-import inspect
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from types import FrameType
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import diffrax
 import jax
 import jax.tree_util as jtu
-import numpy as np
 from diffrax._term import AdjointTerm, WrapTerm
 from equinox.internal import (
     nondifferentiable as nondifferentiable,
@@ -27,16 +23,9 @@ from jax.extend.core import (
     Jaxpr as Jaxpr,
     jaxpr_as_fun as jaxpr_as_fun,
     JaxprEqn as JaxprEqn,
-    Literal as Literal,
 )
+from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 from jaxtyping import PyTree
-from lineax.internal import (
-    pack_structures as pack_structures,
-    PackedStructures as PackedStructures,
-    ravel_vector as ravel_vector,
-    transpose_packed_structures as transpose_packed_structures,
-    unravel_solution as unravel_solution,
-)
 
 
 def unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
@@ -99,53 +88,6 @@ def inner_programs(eqn: JaxprEqn) -> Iterator[Any]:
         for item in value if isinstance(value, tuple | list) else (value,):
             if isinstance(item, Jaxpr | ClosedJaxpr):
                 yield item
-
-
-def result_named(name: str, message: str) -> diffrax.RESULTS:
-    """A result of `diffrax.RESULTS` with a name and a message of its own.
-
-    The solvers have to return one of `diffrax.RESULTS`, which Diffrax turns into an error,
-    and what is there for an unsolved equation advises to increase `max_steps`. So one more
-    is added, as a subclass of the enumeration would add it. The others stay as they are.
-    """
-    results = diffrax.RESULTS
-    names, messages = results._name_to_item, results._index_to_message
-    if name not in names:
-        number = np.array(len(messages), np.int32)
-        item = type(results.successful)(number, results)  # pyright: ignore
-        names[name] = item  # pyright: ignore
-        messages.append(message)
-    return names[name]  # pyright: ignore
-
-
-def innermost_solve() -> Mapping[str, Any] | None:
-    """The local variables, `terms`, `solver` and `stepsize_controller` among them, of the
-    innermost `diffrax.diffeqsolve` that is being traced; `None` if there is none on the
-    Python stack."""
-    frame = _frame_of_solve("loop", "diffeqsolve")
-    return None if frame is None else frame.f_locals
-
-
-def innermost_call() -> Mapping[str, Any] | None:
-    """The arguments of the innermost solve as they were passed, numbers of Python among
-    them; `None` if there is no solve on the Python stack."""
-    frame = _frame_of_solve("diffeqsolve")
-    # Diffrax traces its numbers. Those that were passed are held by `equinox.filter_jit`.
-    outer = None if frame is None else frame.f_back
-    if outer is None or outer.f_globals.get("__name__") != "equinox._jit":
-        return None
-    args, kwargs = outer.f_locals["args"], outer.f_locals["kwargs"]
-    return inspect.signature(diffrax.diffeqsolve).bind(*args, **kwargs).arguments
-
-
-def _frame_of_solve(*functions: str) -> FrameType | None:
-    frame = sys._getframe(2)
-    while frame is not None:
-        in_diffrax = frame.f_globals.get("__name__") == "diffrax._integrate"
-        if in_diffrax and frame.f_code.co_name in functions:
-            return frame
-        frame = frame.f_back
-    return None
 
 
 _T = TypeVar("_T")

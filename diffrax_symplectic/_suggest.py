@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from ._arguments import check_state
-from ._brownian import increment_struct
+from ._brownian import drives, increment_struct, UnspecifiedPath, WeakBrownianPath
 from ._custom_types import Args, RealScalarLike, Y
 from ._solver import (
     AbstractSymplecticSolver,
@@ -132,9 +132,9 @@ def suggest_solver(
 
         H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
         noise = lambda t, p, q, args: 0.3 * jnp.sin(q)
-        terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+        terms = ds.hamiltonian_terms(H0, noise, ())  # the shape of one noise
         y0 = (jnp.array(0.0), jnp.array(1.0))
-        suggestions = ds.suggest_solver(terms, 0, y0, want="expectations")
+        suggestions = ds.suggest_solver(terms, 0, y0, want="weak")
         print(suggestions)
         best = suggestions[0]
         sol = diffrax.diffeqsolve(best.terms(jr.key(1)), best.solver, 0, 1, 0.1, y0)
@@ -143,10 +143,10 @@ def suggest_solver(
     **Arguments:**
 
     - `terms`: the terms of a Stratonovich system, as of
-        [`diffrax_symplectic.hamiltonian_terms`][], with any Brownian path.
+        [`diffrax_symplectic.hamiltonian_terms`][], with any Brownian path, or with the
+        shape of its increments in place of a path.
     - `t0`, `y0`, `args`: where the solve begins, as for `diffrax.diffeqsolve`.
-    - `want`: `"expectations"`, if means over all paths matter, or `"paths"`, if single
-        ones do.
+    - `want`: `"weak"` for expectations, or `"strong"` for single paths.
     - `gamma`: friction, $-\gamma p\,\mathrm{d}t$ beside these terms, as
         [`diffrax_symplectic.Damped`][] takes it. Then solvers with this friction are
         suggested: [`diffrax_symplectic.BAOAB`][] for Langevin dynamics.
@@ -161,6 +161,13 @@ def suggest_solver(
     """
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
+    if isinstance(terms, diffrax.AbstractTerm):
+        # Any path will do to look at the terms.
+        some = lambda path: WeakBrownianPath(increment_struct(path), jr.key(0))
+        is_known = lambda path: not isinstance(path, UnspecifiedPath)
+        terms = replace_paths(
+            terms, lambda path: path if is_known(path) else some(path)
+        )
     drift, noise = _parts(terms)
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
@@ -190,7 +197,8 @@ def suggest_solver(
         [increment_struct(brownian_paths(noise)[0])]
     ):
         # Lévy areas are those between the noises of one array.
-        solvers = [s for s in solvers if "A" not in s.variables]
+        areas = lambda solver: "noise brackets" in map(drives, solver.variables)
+        solvers = [solver for solver in solvers if not areas(solver)]
     found = [_suggestion(solver, want, terms, commute) for solver in solvers]
     if not kind:
         kind = f"general ({getattr(not_separable, 'reason', '')})"
@@ -199,7 +207,7 @@ def suggest_solver(
         noises = f"{m} noises that {'commute' if commute else 'do not commute'}"
     if gamma is not None:
         noises += " and friction"
-    system = f"For {want}. The system is {kind}, with {noises}."
+    system = f"For {want} approximation. The system is {kind}, with {noises}."
     if not_separable is not None and kind and WRONG_WAY_ROUND in not_separable.reason:
         system += f" It is not separable: {not_separable.reason}."
     if not_separable is not None and not_separable.friction:

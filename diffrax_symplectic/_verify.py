@@ -146,10 +146,10 @@ def step_expectation(
     y0: Y,
     args: Args = None,
     *,
-    fn: Callable[[Y], PyTree[Array]],
+    fn: Callable[[RealScalarLike, Y, Args], PyTree[Array]],
     nodes: int = 8,
 ) -> PyTree[Array]:
-    r"""The expectation $\mathbb E[\phi(y_1)]$ after one step from `y0`, without sampling.
+    r"""The expectation $\mathbb E[\phi(t_1, y_1)]$ after one step, without sampling.
 
     The random variables of a [`diffrax_symplectic.WeakBrownianPath`][] take finitely
     many values, so that the expectation is a finite sum: $3^m$ outcomes for $m$ noises,
@@ -164,7 +164,7 @@ def step_expectation(
     - `terms`, `solver`, `y0`, `args`: as for `diffrax.diffeqsolve`; `terms` with one
         Brownian path.
     - `t0`, `t1`: start and end of the step.
-    - `fn`: the function $\phi$ of the state, to arrays.
+    - `fn`: the function $\phi$, `fn(t, y, args)`, to arrays; `t` is the end of the step.
     - `nodes`: points of the quadrature in each Gaussian variable.
 
     **Returns:** what `fn` returns, averaged.
@@ -175,7 +175,7 @@ def step_expectation(
 
     def outcome(terms):
         y1, result = _one_step(terms, solver, t0, t1, y0, args)
-        return fn(y1), result
+        return fn(t1, y1, args), result
 
     return _average(outcome, terms, t1 - t0, nodes)
 
@@ -249,13 +249,13 @@ def weak_order_defect(
     y0: Y,
     args: Args = None,
     *,
-    fn: Callable[[Y], PyTree[Array]],
+    fn: Callable[[RealScalarLike, Y, Args], PyTree[Array]],
     order: int,
     nodes: int = 8,
 ) -> PyTree[Array]:
     r"""The exact local weak error of one step,
 
-    $$\mathbb E[\phi(y_1)] - \sum_{j=0}^{r} \frac{h^j}{j!} (L^j \phi)(y_0),$$
+    $$\mathbb E[\phi(t_1, y_1)] - \sum_{j=0}^{r} \frac{h^j}{j!} (L^j \phi)(t_0, y_0),$$
 
     with the generator $L$ of the equation. A method has weak order $r$ if this is
     $O(h^{r+1})$, so that a few values of $h$ show the order to two digits, without any
@@ -275,7 +275,7 @@ def weak_order_defect(
     """
     expected = step_expectation(terms, solver, t0, t1, y0, args, fn=fn, nodes=nodes)
     L = _generator(terms, args, ito=isinstance(solver, diffrax.AbstractItoSolver))
-    phi = lambda t, y: fn(y)
+    phi = lambda t, y: fn(t, y, args)
     h, factor = t1 - t0, 1.0
     defect = expected
     for j in range(order + 1):

@@ -58,7 +58,7 @@ def transfer_expectations(
     def back(u, h, box0, box1):
         """The polynomial on `box0` of that on `box1`, and the mean from the centre."""
 
-        def fn(y):
+        def fn(t, y, args):
             return _chebyshev_series(u, (ravel(y) - box1[0]) / box1[1]), ravel(y)
 
         def expected(x):
@@ -153,5 +153,7 @@ def enumerated_expectation(terms, solver, y0, phi: Callable, h, steps: int):
     r"""The same by all paths there are: $3^N$ for one noise and $N$ steps."""
     if steps == 0:
         return phi(y0)
-    then = lambda y: enumerated_expectation(terms, solver, y, phi, h, steps - 1)
+    then = lambda t, y, args: enumerated_expectation(
+        terms, solver, y, phi, h, steps - 1
+    )
     return ds.step_expectation(terms, solver, 0.0, h, y0, fn=then)

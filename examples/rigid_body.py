@@ -171,7 +171,7 @@ def local_weak_errors(hs, mu=0.5, inertia=(0.8, 0.6, 0.2)):
     terms, y0 = spinor_terms(path, mu, inertia), ds.to_spinors(X0)
 
     def expected(h):
-        square = lambda y: ds.from_spinors(y)[0] ** 2
+        square = lambda t, y, args: ds.from_spinors(y)[0] ** 2
         return ds.step_expectation(terms, ds.NinomiyaVictoir(), 0.0, h, y0, fn=square)
 
     # For X itself and not for spinors, whose derivatives are long: turns of X about each

@@ -91,11 +91,11 @@ def stationary_bias(
     Q, R = np.linalg.qr(weighted(powers))
     # The first polynomial is 1, and not -1.
     Q, R = Q * np.sign(R[0, 0]), R * np.sign(R[0, 0])
-    terms = warm_terms(H, solver.path((3,), jr.key(0), want="expectations"), alpha, T)
+    terms = warm_terms(H, solver.path((3,), jr.key(0), want="weak"), alpha, T)
 
     @jax.jit
     def after(h):
-        fn = lambda y: powers(ds.from_spinors(y))
+        fn = lambda t, y, args: powers(ds.from_spinors(y))
         mean = lambda s: ds.step_expectation(
             terms, solver, 0.0, h, ds.to_spinors(s), fn=fn
         )

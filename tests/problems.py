@@ -287,7 +287,7 @@ def slope(hs, errors):
     return np.polyfit(np.log(hs), np.log(np.abs(errors)), 1)[0]
 
 
-def values_of_a_step(y):
+def values_of_a_step(t, y, args):
     """Test functions of one degree of freedom."""
     p, q = y[0][0], y[1][0]
     return jnp.stack([p, q**2, p * q, jnp.sin(p + q), jnp.exp(p / 2)])

@@ -174,7 +174,7 @@ def test_quadrature_over_gaussian_increments_is_exact_for_polynomials():
         0.0,
         h,
         Y0,
-        fn=lambda y: y[0] ** 2 + y[1] ** 2,
+        fn=lambda t, y, args: y[0] ** 2 + y[1] ** 2,
         nodes=nodes,
     )
     # |1 + i x - x^2 / 2|^2 = 1 + x^4 / 4 with x = h + I.

@@ -11,8 +11,6 @@ from pathlib import Path
 import diffrax
 import jax
 import jax.numpy as jnp
-import lineax as lx
-import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
@@ -81,21 +79,6 @@ def test_the_terms_that_backsolve_adjoint_solves_are_known(terms):
     assert set(seen) == {False, True}
 
 
-@pytest.mark.core
-def test_a_solve_of_diffrax_is_found_on_the_stack_with_its_controller(terms):
-    y0 = jnp.array(0.3), jnp.array(0.7)
-    adaptive = diffrax.PIDController(rtol=1e-3, atol=1e-3)
-    with pytest.raises(ValueError) as info:
-        diffrax.diffeqsolve(
-            terms, diffrax.Heun(), 0.0, 1.0, 0.1, y0, stepsize_controller=adaptive
-        )
-    # Some versions of Diffrax raise an error of their own from it.
-    error = info.value
-    while (cause := error.__cause__ or error.__context__) is not None:
-        error = cause
-    assert "adaptive step size controller" in str(error)
-
-
 def test_omega_does_arithmetic_on_pytrees():
     x = {"a": jnp.array([1.0, 2.0]), "b": (jnp.array(3.0),)}
     y = (2 * x**_compat.ω - x**_compat.ω / 2).ω
@@ -107,16 +90,6 @@ def test_equinox_refuses_derivatives_of_what_is_nondifferentiable():
     assert f(2.0) == 2.0
     with pytest.raises(RuntimeError, match="t"):
         jax.jvp(f, (2.0,), (1.0,))
-
-
-def test_lineax_packs_the_structures_of_an_operator():
-    operator = lx.MatrixLinearOperator(jnp.eye(2))
-    structures = _compat.pack_structures(operator)
-    vector = jnp.array([1.0, 2.0])
-    ravelled = _compat.ravel_vector(vector, structures)
-    turned = _compat.transpose_packed_structures(structures)
-    for s in (structures, turned):
-        assert jnp.array_equal(_compat.unravel_solution(ravelled, s), vector)
 
 
 def test_a_program_of_jax_is_a_function_of_its_flat_inputs():
@@ -170,26 +143,6 @@ def test_loops_of_equinox_take_buffers_and_gradients_can_be_refused():
 
 
 @pytest.mark.core
-def test_times_of_a_solve_are_found_as_they_were_passed(terms):
-    seen = []
-
-    class Spy(diffrax.Euler):
-        def init(self, terms, t0, t1, y0, args):
-            call = _compat.innermost_call()
-            seen.append([call[name] for name in ("t0", "t1", "dt0")])
-
-    y0 = jnp.array(0.3), jnp.array(0.7)
-    solve = lambda dt0: diffrax.diffeqsolve(
-        terms.terms[0], Spy(), 0, 1.0, dt0=dt0, y0=y0
-    )
-    jax.eval_shape(lambda: solve(0.5).ys)
-    jax.eval_shape(lambda h: solve(h).ys, 0.5)
-    assert seen[0] == [0, 1.0, 0.5] and seen[1][:2] == [0, 1.0]
-    assert isinstance(seen[1][2], jax.core.Tracer)
-    assert _compat.innermost_call() is None
-
-
-@pytest.mark.core
 @pytest.mark.parametrize("throw", [True, False])
 def test_a_program_tells_whether_its_solves_raise_errors(terms, throw):
     ts = diffrax.SaveAt(ts=jnp.array([0.0, 1.0]))
@@ -217,21 +170,6 @@ def test_a_program_tells_whether_its_solves_raise_errors(terms, throw):
         program = jax.make_jaxpr(gradient)(0.5)
         assert _compat.solves_without_throwing(program.jaxpr) is not throw
     assert not _compat.solves_without_throwing(jax.make_jaxpr(jnp.sin)(0.5).jaxpr)
-
-
-def test_a_result_may_have_a_message_of_its_own():
-    before = diffrax.RESULTS.successful
-    item = _compat.result_named("for_a_test", "Take smaller steps.")
-    assert item == _compat.result_named("for_a_test", "unused: it has one already")
-    # It goes through what Diffrax does with results.
-    where = jax.jit(lambda x: diffrax.RESULTS.where(x, before, item))
-    assert where(False) == item and where(True) == before
-    assert "smaller steps" in diffrax.RESULTS[item]
-    assert diffrax.RESULTS.promote(optx.RESULTS.nonfinite) == diffrax.RESULTS.nonfinite
-    assert not any(
-        bool(item == getattr(diffrax.RESULTS, name))
-        for name in ("successful", "internal_error", "nonlinear_max_steps_reached")
-    )
 
 
 def test_what_takes_long_to_import_is_imported_when_it_is_needed():

@@ -91,12 +91,12 @@ def check_systems(seeds) -> set:
     traced = set()
     for seed in seeds:
         terms, y0, args, t0, known = random_system(seed)
-        for want in ("expectations", "paths"):
+        for want in ("weak", "strong"):
             found = ds.suggest_solver(terms, t0, y0, args, want=want)
             for name in ("separable", "additive", "constant"):
                 assert known[name] == (name in found.system), (seed, found)
             assert known["commuting"] == ("do not commute" not in found.system)
-            orders = {"expectations": "weak_order", "paths": "strong_order"}
+            orders = {"weak": "weak_order", "strong": "strong_order"}
             assert getattr(found[0], orders[want]) >= 1
             for s in found:
                 state = s.solver.init(s.terms(jr.key(1)), t0, t0 + 0.01, y0, args)
@@ -117,7 +117,7 @@ def test_no_suggestion_is_refused():
     assert suggested == {s for s in SOLVERS if s.record.suggested}
 
 
-@pytest.mark.parametrize("want", ["expectations", "paths"])
+@pytest.mark.parametrize("want", ["weak", "strong"])
 def test_with_friction_solvers_that_have_it_are_suggested(want):
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 - jnp.sum(jnp.cos(q))
     mixed = lambda t, p, q, args: H0(t, p, q, args) + jnp.sum(p * q) ** 2
@@ -147,7 +147,7 @@ def test_with_friction_solvers_that_have_it_are_suggested(want):
 
 
 def test_many_noises_that_do_not_commute_do_not_ask_for_a_flow_of_each():
-    first = lambda m: type(ranked("expectations", ["any"], False, m)[0])
+    first = lambda m: type(ranked("weak", ["any"], False, m)[0])
     assert first(2) is ds.NinomiyaVictoir and first(300) is ds.SRKw1
 
 
@@ -171,7 +171,7 @@ def test_first_suggestion_solves_as_it_stands(case):
     noise = lambda t, p, q, args: 0.1 * jnp.stack([f(t, p, q) for f in noises])
     path = ds.WeakBrownianPath((len(noises),), jr.key(0))
     terms, y0 = ds.hamiltonian_terms(H0, noise, path), (jnp.ones(1), jnp.ones(1))
-    for want, name in zip(("expectations", "paths"), expected):
+    for want, name in zip(("weak", "strong"), expected):
         best = ds.suggest_solver(terms, 0.0, y0, want=want)[0]
         assert type(best.solver).__name__ == name
         sol = diffrax.diffeqsolve(
@@ -188,8 +188,8 @@ def test_friction_as_a_term_gets_a_solver_and_is_told_of_damped():
     friction = lambda t, y, args: (-0.1 * y[0], jnp.zeros_like(y[1]))
     damped = diffrax.MultiTerm(*terms.terms, diffrax.ODETerm(friction))
     y0 = (jnp.ones(1), jnp.ones(1))
-    found = ds.suggest_solver(damped, 0.0, y0, want="expectations")
-    without = ds.suggest_solver(terms, 0.0, y0, want="expectations")
+    found = ds.suggest_solver(damped, 0.0, y0, want="weak")
+    without = ds.suggest_solver(terms, 0.0, y0, want="weak")
     assert type(found[0].solver).__name__ == "StrangGauss"
     assert "Damped(solver, gamma)" in str(found) and "gamma=`" in str(found)
     assert "Damped" not in str(without)
@@ -212,7 +212,7 @@ def test_noises_that_do_not_commute_may_be_terms_or_arrays_of_their_own():
     crossed = diffrax.ControlTerm(lambda t, y, args: y[::-1], both)
     for terms, y0 in ((noises, jnp.stack([one, one])), ([crossed], (one, one))):
         found = ds.suggest_solver(
-            diffrax.MultiTerm(drift, *terms), 0.0, y0, want="paths"
+            diffrax.MultiTerm(drift, *terms), 0.0, y0, want="strong"
         )
         # Lévy areas are those of one array of noises.
         assert [type(s.solver) for s in found] == [ds.ImplicitMidpoint]
@@ -225,7 +225,7 @@ def test_code_of_a_path_makes_the_path():
     path = ds.WeakBrownianPath((2,), jr.key(0))
     terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: jnp.stack([q, p]), path)
     names, y0 = dict(ds=ds, key=jr.key(3)), (jnp.ones(()), jnp.ones(()))
-    for want in ("expectations", "paths"):
+    for want in ("weak", "strong"):
         for s in ds.suggest_solver(terms, 0.0, y0, want=want):
             made = brownian_paths(s.terms(jr.key(3)))[0]
             assert jax.tree.all(jax.tree.map(_same, eval(s.path, names), made))
@@ -269,9 +269,9 @@ def test_bad_input_gets_a_clear_error():
     with pytest.raises(ValueError, match="`want` must be one of"):
         ds.suggest_solver(terms, 0.0, y0, want="moments")  # pyright: ignore
     with pytest.raises(ValueError, match="with a Brownian path; got function"):
-        ds.suggest_solver(noise, 0.0, y0, want="paths")  # pyright: ignore
+        ds.suggest_solver(noise, 0.0, y0, want="strong")  # pyright: ignore
     with pytest.raises(ValueError, match="have a part without one"):
-        ds.suggest_solver(diffrax.ODETerm(lambda t, y, args: y), 0.0, y0, want="paths")
+        ds.suggest_solver(diffrax.ODETerm(lambda t, y, args: y), 0.0, y0, want="strong")
     ramp = diffrax.LinearInterpolation(jnp.array([0.0, 1.0]), jnp.array([0.0, 1.0]))
     driven = diffrax.ControlTerm(lambda t, y, args: y, ramp)
     too_long = diffrax.ODETerm(lambda t, y, args: jnp.ones(3))
@@ -280,14 +280,14 @@ def test_bad_input_gets_a_clear_error():
     )
     with pytest.raises(ValueError, match="broadcast"):
         ds.suggest_solver(
-            diffrax.MultiTerm(too_long, noisy), 0.0, jnp.ones(2), want="paths"
+            diffrax.MultiTerm(too_long, noisy), 0.0, jnp.ones(2), want="strong"
         )
     with pytest.raises(ValueError, match="have a part without one"):
-        ds.suggest_solver(diffrax.MultiTerm(terms, driven), 0.0, y0, want="paths")
+        ds.suggest_solver(diffrax.MultiTerm(terms, driven), 0.0, y0, want="strong")
     with pytest.raises(ValueError, match="is a pair"):
-        ds.suggest_solver(terms, 0.0, jnp.ones(2), want="paths")
+        ds.suggest_solver(terms, 0.0, jnp.ones(2), want="strong")
     with pytest.raises(ValueError, match="real floating-point"):
-        ds.suggest_solver(terms, 0.0, (1j * jnp.ones(()), jnp.ones(())), want="paths")
+        ds.suggest_solver(terms, 0.0, (1j * jnp.ones(()), jnp.ones(())), want="strong")
 
 
 def test_suggestions_say_what_the_other_order_of_the_state_would_allow():
@@ -297,6 +297,6 @@ def test_suggestions_say_what_the_other_order_of_the_state_would_allow():
     path = ds.WeakBrownianPath((), jr.key(0))
     terms = diffrax.MultiTerm(diffrax.ODETerm(f), diffrax.ControlTerm(g, path))
     y0 = jnp.array(0.5), jnp.array(0.1)
-    got = ds.suggest_solver(terms, 0, y0, want="paths")
+    got = ds.suggest_solver(terms, 0, y0, want="strong")
     assert "is the state the wrong way round?" in got.system
     assert "StormerVerlet" not in str(got)

@@ -1,7 +1,13 @@
 from ._stepwise import AbstractStepwisePath, AbstractWrappedPath, GivenPath, Increment
-from ._stepwise import check_times, increment_struct, laws_of, stepwise
+from ._stepwise import (
+    checked_shape,
+    increment_struct,
+    laws_of,
+    stepwise,
+    UnspecifiedPath,
+)
 from ._paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
 from ._random import AbstractLaw, check_key, Discrete, random_words, THREE_POINT
 from ._levy_area import LevyAreaBrownianPath, LevyAreaIncrement
 from ._wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPath
-from ._variables import path_of, VARIABLES
+from ._variables import drives, path_of, VARIABLES

@@ -41,14 +41,14 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     increments of a Brownian path with space-time Lévy area. Step sizes have to be fixed.
 
     Over a stretch of time the Brownian path is the line $\frac t h W$ plus a bridge. The
-    first `terms` Fourier terms of the bridge are drawn at random, such that the bridge has
-    the given integral $H$, which is minus the sum of all cosine coefficients. The terms
+    first `num_terms` Fourier terms of the bridge are drawn at random, such that it has the
+    given integral $H$, which is minus the sum of all cosine coefficients. The terms
     that are left out are replaced by Gaussian variables, with the mean and the covariances
     that those terms have given $H$. So for any number of terms the mean and all
     covariances of $W$, $H$ and $A$ are exact. The law of $A$ itself is approximated, with
-    an error in mean square of $\mathcal O(h / \text{terms})$ (Mrongowius and Rößler).
-    With `terms=0` this is the approximation of Davie. A step draws
-    $2 m\, (\text{terms} + 1) + \frac12 m (m - 1)$ normal numbers for $m$ noises.
+    an error in mean square of $\mathcal O(h / \text{num\_terms})$ (Mrongowius and Rößler).
+    With `num_terms=0` this is the approximation of Davie. A step draws
+    $2 m\, (\text{num\_terms} + 1) + \frac12 m (m - 1)$ normal numbers for $m$ noises.
 
     With `cell`, the path is refined consistently: it is sampled over cells of that size,
     and what it returns over a longer stretch is put together from these by Chen's rule, so
@@ -64,7 +64,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
 
     path: diffrax.AbstractBrownianPath
     key: PRNGKeyArray
-    terms: int = eqx.field(static=True)
+    num_terms: int = eqx.field(static=True)
     cell: float | None = eqx.field(static=True)
 
     def __init__(
@@ -72,7 +72,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         path: diffrax.AbstractBrownianPath,
         key: PRNGKeyArray,
         *,
-        terms: int = 2,
+        num_terms: int = 2,
         cell: float | None = None,
     ):
         """**Arguments:**
@@ -80,11 +80,11 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         - `path`: a Brownian path with space-time Lévy area, for example
             `FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`.
         - `key`: a JAX random key for the areas, which may be that of the path.
-        - `terms`: Fourier terms over each step, or each cell.
+        - `num_terms`: Fourier terms over each step, or each cell.
         - `cell`: the finest stretch that is sampled, of which every step is a multiple;
             or `None` to sample each step by itself.
 
-        **Raises:** a `ValueError` if `path` has no space-time Lévy area, if `terms` is
+        **Raises:** a `ValueError` if `path` has no space-time Lévy area, if `num_terms` is
         negative or `cell` is not positive; an error when run if a step does not consist of
         cells.
         """
@@ -93,7 +93,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         check_cell(cell)
         self.path = path
         self.key = key
-        self.terms = whole_number("terms", terms, 0)
+        self.num_terms = whole_number("num_terms", num_terms, 0)
         self.cell = cell
 
     @property
@@ -116,7 +116,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     def num_own_words(self, use_levy: bool) -> int:
         if not use_levy:
             return 0
-        return sum(_sizes(num_noises(increment_struct(self.path)), self.terms))
+        return sum(_sizes(num_noises(increment_struct(self.path)), self.num_terms))
 
     def changed(self, increment, own_words, h, use_levy) -> Increment:
         """Samples the step by itself, whatever `cell` is."""
@@ -146,7 +146,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         piece = Piece.of(increment, jnp.abs(h))
         normals = normal_from_words(words, H.dtype)
         scaled = H / jnp.sqrt(or_one(piece.h))
-        bridge = piece.h * _bridge_area(scaled, normals, self.terms)
+        bridge = piece.h * _bridge_area(scaled, normals, self.num_terms)
         outer = jnp.outer(H, piece.W)
         return dataclasses.replace(piece, A=outer - outer.T + bridge)
 

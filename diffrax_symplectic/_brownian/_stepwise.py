@@ -1,7 +1,6 @@
 """Brownian paths that draw every step by itself, as a function of random words."""
 
 import abc
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, cast, TYPE_CHECKING, TypeAlias
 
@@ -13,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree, UInt32
 
-from .._compat import innermost_call, innermost_solve, nondifferentiable
+from .._compat import nondifferentiable
 from .._custom_types import RealScalarLike
 from ._random import AbstractLaw, Gaussian, Place, random_words
 
@@ -44,12 +43,8 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
 
         Returns the increment over the step from `t0` to `t1`, or with `use_levy=True` an
         object of type `levy_area`. Without `t1` the step is the one from `0` to `t0`.
-
-        **Raises:** a `ValueError`, while tracing, inside a solve with an adaptive step
-        size controller or `diffrax.HalfSolver`. Warns if `dt0` does not divide its time.
         """
         del left
-        require_fixed_steps(self)
         start, end = (jnp.zeros_like(t0), t0) if t1 is None else (t0, t1)
         ends = jnp.asarray(start), jnp.asarray(end)
         start, end = cast(tuple[Array, Array], nondifferentiable(ends, name="t"))
@@ -202,6 +197,8 @@ def increment_struct(
     path: diffrax.AbstractBrownianPath,
 ) -> PyTree[jax.ShapeDtypeStruct]:
     """Shapes, dtypes and structure of an increment."""
+    if isinstance(path, UnspecifiedPath):
+        return path.shape
     # Times of this kind are those of a solve, for which it is not traced once more.
     time = jax.ShapeDtypeStruct((), jnp.result_type(float))
     return jax.eval_shape(lambda *ends: path.evaluate(*ends), time, time)
@@ -263,119 +260,28 @@ def checked_shape(
     return shape
 
 
-def require_fixed_steps(path: diffrax.AbstractBrownianPath) -> None:
-    """Raises a `ValueError` if the solve being traced may change its step size, as far as
-    that can be known.
+class UnspecifiedPath(diffrax.AbstractBrownianPath):
+    """The shape of a Brownian path that is chosen later, when the solver is known."""
 
-    Weak and truncated increments, whose law depends on the size of the step, are not the
-    increments of one path. They cannot be refined. To accept or reject a step depending on
-    them would change their law. Diffrax refuses its own `UnsafeBrownianPath` for this
-    reason, by name, and tells a path nothing about the step size controller.
+    shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
+    levy_area: type = eqx.field(static=True, default=diffrax.AbstractBrownianIncrement)
 
-    The solvers of this package give no error estimate, and without one Diffrax refuses
-    adaptive steps. For other solvers this function looks for the innermost solve on the
-    Python stack. It does not find a solve if the increments were traced before, by a
-    `jax.jit` of the user's around `evaluate`.
-    """
-    name = type(path).__name__
-    tree = "use `diffrax.VirtualBrownianTree` as path"
-    solve = innermost_solve()
-    if solve is None or not _holds(solve.get("terms"), type(path)):
-        return
-    check_times(path)
-    controller = solve.get("stepsize_controller")
-    if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
-        # Diffrax refuses solvers without an error estimate, with any path.
-        estimates = isinstance(solve.get("solver"), diffrax.AbstractAdaptiveSolver)
+    @property
+    def t0(self):
+        return -jnp.inf
+
+    @property
+    def t1(self):
+        return jnp.inf
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        del t0, t1, left, use_levy
         raise ValueError(
-            f"`{name}` cannot be used with the adaptive step size controller "
-            f"`{type(controller).__name__}`: its increments belong to one step size and "
-            "cannot be refined. Pass `stepsize_controller=diffrax.ConstantStepSize()` or "
-            f"`diffrax.StepTo`{f', or {tree}' if estimates else ''}."
+            "These terms have the shape of a Brownian path in place of the path itself, "
+            "which is enough for `suggest_solver`, `compare_solvers` and `expectation`. To "
+            "solve them, pass `path=solver.path(shape, key)` to the function that makes "
+            "the terms."
         )
-    if isinstance(solve.get("solver"), diffrax.HalfSolver):
-        raise ValueError(
-            f"`{name}` cannot be used with `diffrax.HalfSolver`: the increments of the "
-            "two half steps do not add up to the one of the whole step. Pass the wrapped "
-            f"solver itself, or {tree}."
-        )
-
-
-def check_times(path: diffrax.AbstractBrownianPath | None = None) -> None:
-    """Looks at the times of the solve being traced, where these are numbers. A `ValueError`
-    for those that never end, and if they are no multiples of the path's `cell`, or `dt0`
-    does not divide the interval; without cells that is a warning. (Steps of other
-    controllers, and times that are traced, are checked when run.)"""
-    call = innermost_call()
-    if call is None:
-        return
-    times = t0, t1, dt0 = call["t0"], call["t1"], call["dt0"]
-    cell, number = getattr(path, "cell", None), int | float | np.number
-    numbers = all(isinstance(x, number) for x in times)
-    for name, x in (("t0", t0), ("t1", t1), ("dt0", dt0)):
-        known = isinstance(x, number)
-        endless = known and np.isinf(x) and call.get("event") is None
-        still = numbers and t0 != t1 and name == "dt0" and x == 0
-        if np.ndim(x) > 0 or (known and np.isnan(x)) or endless or still:
-            kind = "a finite number" + (", not zero" if name == "dt0" else "")
-            raise ValueError(f"`{name}` of `diffeqsolve` must be {kind}; got {x}.")
-    if path is None:
-        return
-    dtype = jnp.result_type(*[x for x in times if x is not None])
-    if any(_narrowed(x, dtype) for x in jtu.tree_leaves(call["y0"])):
-        warnings.warn(
-            f"The times are {dtype}, which Diffrax makes the state, too: less precise than "
-            "`y0`. Pass numbers of Python as `t0`, `t1` and `dt0`.",
-            stacklevel=2,
-        )
-    if cell is not None:
-        for name, time in dict(t0=t0, t1=t1, dt0=dt0).items():
-            if isinstance(time, number) and not _divides(cell, time):
-                raise ValueError(
-                    f"Steps of a `{type(path).__name__}` with `cell` must begin and end at "
-                    f"multiples of `cell`; got cell={cell} and {name}={time}. Pass a "
-                    "`cell` that divides `t0`, `t1` and `dt0`."
-                )
-    if not numbers:
-        return
-    if 0 < abs(t1 - t0) < 0.999 * abs(dt0):
-        warnings.warn(
-            f"`dt0={dt0}` is longer than the time from {t0} to {t1}, which is one step "
-            "then. Are `dt0` and `t1` exchanged?",
-            stacklevel=2,
-        )
-        return
-    if _divides(dt0, t1 - t0):
-        return
-    message = (
-        f"`dt0={dt0}` does not divide the time from {t0} to {t1}: Diffrax takes steps of "
-        "several sizes. For `n` equal steps pass `dt0=(t1 - t0) / n`."
-    )
-    if cell is not None:
-        raise ValueError(f"{message} With `cell` all steps must have one size.")
-    warnings.warn(message, stacklevel=2)
-
-
-def _narrowed(x: Any, dtype: Any) -> bool:
-    """Whether Diffrax makes `x` less precise, if times are of this dtype. So it does with
-    numbers and what JAX made of them, such as `jnp.array(0.5)`."""
-    own = jnp.result_type(x)
-    if not jnp.issubdtype(own, jnp.floating):
-        return False
-    return jnp.finfo(jnp.result_type(x, dtype)).bits < jnp.finfo(own).bits
-
-
-def _divides(part: float, whole: float) -> bool:
-    with np.errstate(all="ignore"):  # What is not finite is refused elsewhere.
-        count = np.divide(float(whole), float(part))
-        return not np.abs(count - np.rint(count)) > 1e-3
-
-
-def _holds(terms, kind: type) -> bool:
-    """Whether a path of this kind drives the terms. A path may also be evaluated within a
-    solve that it does not drive, whose steps it does not restrict."""
-    is_path = lambda x: isinstance(x, kind)
-    return any(map(is_path, jtu.tree_leaves(terms, is_leaf=is_path)))
 
 
 class GivenPath(diffrax.AbstractBrownianPath):

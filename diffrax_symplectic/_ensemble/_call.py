@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, PRNGKeyArray, PyTree
 
 from .._arguments import whole_number
 from .._custom_types import Args, Y
-from .._expectation._estimate import checked_call
 from .._expectation._monte_carlo import path_keys, with_keys
+from .._expectation._run import checked_call
 from .._expectation._steps import Problem
 from ._engines import Batch, ENGINES
 from ._layout import sample_key
@@ -123,9 +123,8 @@ def ensemble(
     or of more than 256 numbers; an `ImportError` where Dr.Jit or a library of LLVM is
     missing. Warns if paths failed, and if many are left to JAX.
     """
-    key, _ = checked_call(
-        "ensemble", key, None, None, None, (terms, t0, t1, dt0, y0, args)
-    )
+    given = terms, t0, t1, dt0, y0, args
+    key, _, _ = checked_call("ensemble", key, None, None, 0, None, given)
     num_paths = whole_number("num_paths", num_paths)
     engine = "jax" if engine is None else engine
     if engine not in ENGINES:

@@ -2,7 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,16 +12,20 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from .._root_finder import PicardNewton
+from .._root_finder import (
+    AbstractBlocks,
+    all_finite,
+    Doubled,
+    Halves,
+    Partitioned,
+    PicardNewton,
+)
 from .._solver import AbstractImplicitStages
 
 
-_Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]
-_Halves: TypeAlias = tuple[PyTree[Array], PyTree[Array]]
-
 # Where this many do not solve a step, the path is left to JAX's program.
 _MOST_SWEEPS = 48
-# Above this rate of convergence they are damped.
+# Above this rate of convergence sweeps are relaxed.
 _SLOW = 0.3
 # The next correction is below two units in the last place by this factor: what is left out
 # has the same sign in every step, and adds up.
@@ -32,138 +36,70 @@ _ROUNDING = 50.0
 _HUGE = 1e30
 
 
-class Limits(NamedTuple):
-    """`scale(y)` is how large the state is that unknown values `y` change."""
+class _State(NamedTuple):
+    """The iterate; the size of its last correction in units of the tolerance; whether the
+    equations are solved; how many sweeps there were."""
 
-    scale: Callable[[PyTree[Array]], PyTree[Array]] = lambda y: y
-
-
-class Found(NamedTuple):
-    """Where sweeps ended, and whether they solved the equations: they are `near` only if
-    they did."""
-
-    y: PyTree[Array]
-    solved: Bool[Array, ""]
-    near: Bool[Array, ""]
-
-
-class _Progress(NamedTuple):
-    """The iterate, as two halves that read each other; the size of its last correction in
-    units of the tolerance; whether the equations are solved; how many sweeps there were."""
-
-    y: _Halves
+    y: Halves
     size: Scalar
     solved: Bool[Array, ""]
     count: Array
 
 
-class _Pairs(NamedTuple):
-    """Unknown values that are a list of pairs `(p, q)`. In a sweep `q` reads what `p` has
-    become (Gauss--Seidel)."""
+def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, ""]):
+    r"""Solves $y = \Phi(y)$ from a `guess`. Returns where it ended, and whether that is a
+    solution.
 
-    image: _Map
-
-    def split(self, y: PyTree[Array]) -> _Halves:
-        p, q = zip(*y)
-        return list(p), list(q)
-
-    def join(self, y: _Halves) -> PyTree[Array]:
-        return list(zip(*y))
-
-    def first(self, y: _Halves) -> PyTree[Array]:
-        return self.split(self.image(self.join(y)))[0]
-
-    def second(self, y: _Halves) -> PyTree[Array]:
-        return self.split(self.image(self.join(y)))[1]
-
-    def change(self, old: _Halves, new: _Halves) -> PyTree[Array]:
-        return _difference(self.join(new), self.join(old))
-
-
-class _Copies(NamedTuple):
-    """Of other unknown values two copies read each other."""
-
-    image: _Map
-
-    def split(self, y: PyTree[Array]) -> _Halves:
-        return y, y
-
-    def join(self, y: _Halves) -> PyTree[Array]:
-        return y[1]
-
-    def first(self, y: _Halves) -> PyTree[Array]:
-        return self.image(y[1])
-
-    def second(self, y: _Halves) -> PyTree[Array]:
-        return self.image(y[0])
-
-    def change(self, old: _Halves, new: _Halves) -> PyTree[Array]:
-        # Copies that no longer move may still differ: then neither is a solution.
-        del old
-        return _difference(new[1], new[0])
-
-
-def sweep(limits: Limits, image: _Map, begin: Found) -> Found:
-    r"""Solves $y = \Phi(y)$ from `begin` on, or reports that sweeps do not.
-
-    After the third sweep values stay behind by a fraction of their change where that makes
-    sweeps converge faster, as in [`diffrax_symplectic.PicardNewton`][]. In a fused kernel
-    each path ends by itself, and to look at the error after each sweep costs little.
+    As in [`diffrax_symplectic.PicardNewton`][], but that a path is alone: in a fused kernel
+    each ends by itself, and a convergence check after each sweep costs little.
     """
-    is_pair = lambda x: type(x) is tuple and len(x) == 2
-    pairs = type(begin.y) is list and all(map(is_pair, begin.y))
-    halves = _Pairs(image) if pairs else _Copies(image)
+    system = (Partitioned if isinstance(guess, Halves) else Doubled)(image)
+    start = system.start(guess)
+    one = jnp.ones((), jnp.result_type(*jtu.tree_leaves(guess)))
+    unit = 2 * jnp.finfo(one.dtype).eps
 
-    def once(y: _Halves, damping: Scalar) -> _Halves:
-        stay = lambda new, old: jtu.tree_map(
-            lambda a, b: a + damping * (b - a), new, old
-        )
-        y = stay(halves.first(y), y[0]), y[1]
-        return y[0], stay(halves.second(y), y[1])
+    def once(y: Halves, omega: Scalar) -> Halves:
+        behind = lambda x, old: jtu.tree_map(lambda a, b: b + omega * (a - b), x, old)
+        relaxed = (lambda x, _: x) if omega is one else behind
+        y = Halves(relaxed(system.p(y), y.p), y.q)
+        return Halves(y.p, relaxed(system.q(y), y.q))
 
-    zero = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(begin.y)))
-    start = halves.split(begin.y)
-    first = once(start, zero)
+    first = once(start, one)
     # The tolerance is that of the state after the first sweep, which there is in any case.
-    scales = _sizes(limits.scale(halves.join(first)))
-    weights = [_inverse(2 * jnp.finfo(zero.dtype).eps * x) for x in scales]
-    rounding = _ROUNDING * 2 * jnp.finfo(zero.dtype).eps * _largest(scales)
+    scales = _sizes(scale(system.value(first)))
+    weights = [_inverse(unit * x) for x in scales]
+    rounding = _ROUNDING * unit * _largest(scales)
 
-    def judge(
-        old: _Halves, new: _Halves, before: Scalar
-    ) -> tuple[Scalar, Bool[Array, ""]]:
+    def check(old: Halves, new: Halves, before: Scalar) -> tuple[Scalar, Bool[Array, ""]]:
         """The size of a correction, after one of size `before`, and whether it is the last
         that is needed."""
-        gaps = _sizes(halves.change(old, new))
+        gaps = _sizes(system.correction(old, new))
         size = _largest([x * weight for x, weight in zip(gaps, weights)])
         below = _MARGIN * size * jnp.where(size < before, size, before) <= before
-        stays = (size >= 0.9 * before) & (_largest(gaps) <= rounding)
-        return size, below | stays
+        return size, below | ((size >= 0.9 * before) & (_largest(gaps) <= rounding))
 
-    second = once(first, zero)
-    third = once(second, zero)
-    before, _ = judge(first, second, zero)
-    size, solved = judge(second, third, before)
+    second = once(first, one)
+    third = once(second, one)
+    before, _ = check(first, second, one)
+    size, solved = check(second, third, before)
 
-    def damped() -> Scalar:
-        """For the rate at which the sweeps converge."""
-        return 1 - 2 / (1 + jnp.sqrt(1 + jnp.minimum(size / before, 4)))
+    def best() -> Scalar:
+        """The relaxation factor for the rate at which sweeps converge."""
+        return 2 / (1 + jnp.sqrt(1 + jnp.minimum(size / before, 4)))
 
-    damping = lax.cond(size > _SLOW * before, damped, lambda: zero)
+    omega = lax.cond(size > _SLOW * before, best, lambda: one)
 
-    def advance(last: _Progress) -> _Progress:
-        y = once(last.y, damping)
-        size, solved = judge(last.y, y, last.size)
-        return _Progress(y, size, solved, last.count + 1)
+    def step(last: _State) -> _State:
+        y = once(last.y, omega)
+        size, solved = check(last.y, y, last.size)
+        return _State(y, size, solved, last.count + 1)
 
-    def going(last: _Progress) -> Bool[Array, ""]:
-        on = (last.count < _MOST_SWEEPS) & (last.size < _HUGE)
-        return ~last.solved & on
+    def going(last: _State) -> Bool[Array, ""]:
+        return ~last.solved & (last.count < _MOST_SWEEPS) & (last.size < _HUGE)
 
-    count = jnp.full((), 3, jnp.int32)
-    begun = _Progress(third, size, begin.solved | solved, count)
-    last = lax.while_loop(going, advance, begun)
-    return Found(halves.join(last.y), last.solved, last.solved)
+    state = _State(third, size, ~pending | solved, jnp.full((), 3, jnp.int32))
+    last = lax.while_loop(going, step, state)
+    return system.value(last.y), last.solved
 
 
 def _inverse(x: Scalar) -> Scalar:
@@ -176,25 +112,17 @@ def _inverse(x: Scalar) -> Scalar:
     return lax.bitcast_convert_type(jnp.asarray(2 * one, kind) - exponent, x.dtype)
 
 
-def _difference(a: PyTree[Array], b: PyTree[Array]) -> PyTree[Array]:
-    return jtu.tree_map(lambda a, b: a - b, a, b)
-
-
 def _sizes(y: PyTree[Array]) -> list[Scalar]:
     return [_largest([*jnp.abs(x).reshape(-1)]) for x in jtu.tree_leaves(y)]
 
 
 def _largest(x: list[Scalar]) -> Scalar:
-    return ft.reduce(_larger, x)
-
-
-def _larger(a: Scalar, b: Scalar) -> Scalar:
     # `jnp.maximum` would keep what is not a number, for the price of three operations. The
     # end of the step shows that, too.
-    return jnp.where(a > b, a, b)
+    return ft.reduce(lambda a, b: jnp.where(a > b, a, b), x)
 
 
-class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Found]):
+class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
     """Sweeps, and a failure where they do not solve the stage equations. All is done in
     `init`: there are no steps after it."""
 
@@ -202,11 +130,11 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Found]):
     atol: float = 0.0
     norm: Callable[[PyTree], Scalar] = optx.max_norm
 
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Found:
-        del fn, args, f_struct, aux_struct, tags
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        del fn, options, f_struct, aux_struct, tags
+        assert isinstance(args, AbstractBlocks)
         zeros = jtu.tree_map(jnp.zeros_like, y)
-        begun = Found(zeros, solved=options["lost"], near=options["lost"])
-        return options["sweep"](Limits(), begun, sweep)
+        return args.sweep(sweep, zeros, all_finite(y))
 
     def step(self, fn, y, args, options, state, tags):
         del fn, args, options, tags
@@ -214,11 +142,11 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Found]):
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
-        return state.solved, optx.RESULTS.successful
+        return state[1], optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del fn, y, args, options, tags, result
-        return state.y, aux, {}
+        return state[0], aux, {}
 
 
 def without_rescue(solver: Any) -> Any:

@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from .._compat import materialize, nondifferentiable, result_named
+from .._compat import materialize, nondifferentiable
 from .._custom_types import RealScalarLike
 
 
@@ -106,18 +106,11 @@ def friction_modes(
     return found
 
 
-_NO_FRICTION = (
-    "`gamma` became negative or not finite, or as a matrix not symmetric positive "
-    "semidefinite, while it was traced. To fit it, let `gamma` be the exponential of what "
-    "is fitted."
-)
-
-
 def friction_result(
     gamma: PyTree[ArrayLike], modes: list[Modes | None], result: diffrax.RESULTS
 ) -> diffrax.RESULTS:
-    """`result`, or where values of `gamma` that were traced are no friction, one that says
-    so."""
+    """`result`, or where values of `gamma` that were traced are no friction (negative, not
+    finite, or as a matrix not symmetric positive semidefinite) `RESULTS.nonfinite`."""
     leaves = jtu.tree_leaves(gamma)
     leaves = leaves if len(leaves) == len(modes) else leaves * len(modes)
     bad = [
@@ -127,9 +120,8 @@ def friction_result(
     ]
     if len(bad) == 0:
         return result
-    said = result_named("no_friction", _NO_FRICTION)
-    bad = ft.reduce(jnp.logical_or, bad)
-    return diffrax.RESULTS.where(bad, said, result)  # pyright: ignore
+    R, bad = diffrax.RESULTS, ft.reduce(jnp.logical_or, bad)
+    return R.where(bad, R.nonfinite, result)  # pyright: ignore
 
 
 def _no_rate(g: ArrayLike) -> Bool[Array, ""]:

@@ -76,7 +76,7 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=2,
         strong=3 / 2,
         choose="Two stage vectors, one after the other. The noise may depend on time.",
-        suggested=("expectations", "paths"),
+        suggested=("weak", "strong"),
     )
     beta1: float = free_parameter("beta1", 0.0)
     beta2: float = eqx.field(default=1.0, static=True, converter=_nonzero)
@@ -137,7 +137,7 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=2,
         strong=None,
         choose="Few digits at the cost of the midpoint rule.",
-        suggested=("expectations",),
+        suggested=("weak",),
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
         alpha=[1],
@@ -191,7 +191,7 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=3,
         strong=None,
         choose="Two stage vectors, and by far the smallest errors for constant noise.",
-        suggested=("expectations",),
+        suggested=("weak",),
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
         alpha=[1 / 2, 1 / 2],

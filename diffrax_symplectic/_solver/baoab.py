@@ -69,7 +69,7 @@ class BAOAB(AbstractSymplecticSolver):
         weak=2,
         strong=1,
         choose="Langevin dynamics: explicit, and stationary positions are very accurate.",
-        suggested=("expectations", "paths"),
+        suggested=("weak", "strong"),
     )
     structure: ClassVar[Structure] = "separable and constant"
     variables: ClassVar[tuple[str, ...]] = ("W",)

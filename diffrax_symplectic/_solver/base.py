@@ -12,13 +12,11 @@ from typing import Any, cast, ClassVar, Literal, NamedTuple, TYPE_CHECKING, Type
 import diffrax
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import PRNGKeyArray, PyTree
 
 from .._arguments import check_state, whole_number
-from .._batch import batched_together
-from .._brownian import path_of, VARIABLES
+from .._brownian import drives, path_of, VARIABLES
 from .._conditions import drift_order
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
@@ -31,7 +29,7 @@ from .._terms import (
     number_of_noises,
     split_terms,
 )
-from ._step import result_of, Step, take_step, Unsolved
+from ._step import no_failure, result_of, Solved, Step, take_step
 
 
 if TYPE_CHECKING:
@@ -40,7 +38,7 @@ else:
     from equinox import AbstractVar
 
 
-Want: TypeAlias = Literal["expectations", "paths"]
+Want: TypeAlias = Literal["weak", "strong"]
 Noises: TypeAlias = Literal["any", "commuting", "not commuting"]
 # One order for all noises; or first that for one noise and for noises that commute, then
 # that for all others.
@@ -64,22 +62,32 @@ class Record(NamedTuple):
     suggested: tuple[Want, ...] = ()
 
     def order(self, want: Want, commute: bool) -> int | float | None:
-        order = self.weak if want == "expectations" else self.strong
+        order = self.weak if want == "weak" else self.strong
         return order[0 if commute else 1] if isinstance(order, tuple) else order
 
     def weak_order(self, commute: bool) -> int:
-        return cast(int, self.order("expectations", commute))
+        return cast(int, self.order("weak", commute))
 
     def strong_order(self, commute: bool) -> int | float | None:
-        return self.order("paths", commute)
+        return self.order("strong", commute)
 
 
 # In a batch Diffrax goes on to step paths that have ended, and drops what comes out.
-SolverState: TypeAlias = Unsolved
+SolverState: TypeAlias = Solved
 
 
 class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
-    """The base of all solvers of this package."""
+    """The base of all solvers of this package, and of solvers of your own that are no
+    Runge--Kutta methods.
+
+    A subclass is a Diffrax solver: it has `order`, `init` and `step`, which take any
+    Stratonovich terms. It states `structure` (`"any"`, `"separable"`, `"additive"`,
+    `"constant"` or `"separable and constant"`), `variables` (the names of the random
+    variables of a step, such as `("W",)`), and `stage_vectors(num_noises)`, and overrides
+    `weak_order(terms)` and `strong_order(terms)`. Then [`diffrax_symplectic.Damped`][] and
+    [`diffrax_symplectic.LinearFlow`][] take it, and `solver.path(shape, key)` makes the
+    path that it needs.
+    """
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = (
@@ -106,12 +114,12 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
 
     def strong_order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | float | None:
         """Order of convergence of paths."""
-        return self._order_for("paths", terms)
+        return self._order_for("strong", terms)
 
     def weak_order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | None:
         """Order of convergence of expectations. Of several noises it is not known here
         whether they commute. `None` if the class does not say it."""
-        return cast(int | None, self._order_for("expectations", terms))
+        return cast(int | None, self._order_for("weak", terms))
 
     def _order_for(self, want: Want, terms) -> int | float | None:
         if self.record is None:
@@ -134,19 +142,19 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
         - `shape`: the shape of the increments, `(m,)` for `m` noises; or a PyTree of
             `jax.ShapeDtypeStruct`s.
         - `key`: a JAX random key.
-        - `want`: `"paths"` for the increments of a Brownian motion, `"expectations"` for
-            discrete ones, where these will do. By default what the solver is for; paths,
-            if it is for both.
+        - `want`: `"strong"` for the increments of a Brownian motion, `"weak"` for
+            discrete ones, where these suffice. By default `"strong"` if the solver has a
+            strong order, otherwise `"weak"`.
 
         **Raises:** a `ValueError` if `want` is neither, and for what is no shape or key.
         """
-        if want not in ("paths", "expectations", None):
-            raise ValueError(f'`want` must be "paths" or "expectations"; got {want!r}.')
+        if want not in ("strong", "weak", None):
+            raise ValueError(f'`want` must be "strong" or "weak"; got {want!r}.')
         if want is None:
             strong = self.record is not None and self.record.strong is not None
-            want = "paths" if strong else "expectations"
+            want = "strong" if strong else "weak"
         implicit = isinstance(self, diffrax.AbstractImplicitSolver)
-        kind = path_of(self.variables, gaussian=want == "paths", bounded=implicit)
+        kind = path_of(self.variables, gaussian=want == "strong", bounded=implicit)
         return kind.make(shape, key)
 
     def __repr__(self) -> str:
@@ -240,20 +248,17 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         drift, noise = split_terms(terms)
         plan = make_plan(_drop_absent(self.tableau.flatten(), drift, noise))
         variables = _variables(plan.tableau)
-        begin, end, y0, solver_state = batched_together(
-            (t0, t1, y0, solver_state), eqx.filter((terms, args), eqx.is_array)
-        )
-        along, h = drift_driven(drift, begin, end, args), end - begin
+        along, h = drift_driven(drift, t0, t1, args), t1 - t0
         driven = {"h": along} if drift else {}
         name = type(self).__name__
         driven |= noise_driven(along, h, noise, variables, t0, t1, args, name)
-        y1, unsolved = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
-        return y1, None, dict(y0=y0, y1=y1), unsolved, result_of(unsolved, y1)
+        y1, solved = take_step(plan, Step(t0, h, driven), y0, self, solver_state)
+        return y1, None, dict(y0=y0, y1=y1), solved, result_of(solved, y1)
 
 
 def first_state(solver: AbstractSymplecticSolver) -> SolverState:
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    return jnp.array(False) if implicit else None
+    return no_failure() if implicit else None
 
 
 def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTableau:
@@ -267,7 +272,8 @@ def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTablea
     tableau = tableau.take(keep)
     if len(drift) > 0:
         return tableau
-    without = lambda stage: tuple(c for c in stage.channels if c != "L")
+    stays = lambda c: drives(c) != "drift brackets"
+    without = lambda stage: tuple(filter(stays, stage.channels))
     stages = tuple(stage._replace(channels=without(stage)) for stage in tableau.stages)
     return dataclasses.replace(tableau, stages=stages)
 
@@ -290,8 +296,8 @@ def _checked_root_finder(value: Any) -> Any:
 
 class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
     """A solver with implicit stages. It has the two fields that `diffrax` asks of implicit
-    solvers: the root finder for the stage equations, and the most iterations it may take in
-    each system of a step. Both are given by keyword, after the parameters of the method.
+    solvers: the root finder for the stage equations, and the most steps it may take in each
+    step of the solver. Both are given by keyword, after the parameters of the method.
     """
 
     # `optimistix.root_find` takes either kind of solver.
@@ -308,7 +314,8 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
 # The lines about these fields in the documentation of every such solver's `__init__`.
 ROOT_FINDER = """\
 - `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in each step.
+- `root_find_max_steps`: the most steps that the root finder may take. `PicardNewton` takes
+    one, and has bounds of its own for its iterations.
 """
 ARGUMENTS = f"""**Arguments:**
 
@@ -336,7 +343,7 @@ def real_number(name: str, value: Any) -> float:
     """Raises a `ValueError` unless `value` is a finite real number."""
     try:
         number = math.nan if isinstance(value, complex) else float(value)
-    except Exception:
+    except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
         raise ValueError(

@@ -114,7 +114,7 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=2,
         strong=None,
         choose="Implicit, on half of the state: for systems too stiff for explicit steps.",
-        suggested=("expectations",),
+        suggested=("weak",),
     )
     a21: float = free_parameter("a21", 0.5)
 
@@ -155,7 +155,7 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
             "The midpoint rule on half of the state: for systems too stiff for explicit "
             "steps."
         ),
-        suggested=("paths",),
+        suggested=("strong",),
     )
     tableau: ClassVar[SeparableTableau] = _srkw3("a")
 
@@ -240,7 +240,7 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
             "Explicit, the cheapest step of all. It has to resolve the fastest frequency: "
             "omega h < 2."
         ),
-        suggested=("expectations", "paths"),
+        suggested=("weak", "strong"),
     )
     tableau: ClassVar[PartitionedTableau] = PartitionedTableau(
         alpha=[1],
@@ -313,6 +313,6 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
             "Explicit, for accurate paths. The step has to resolve the fastest frequency: "
             "omega h < 4."
         ),
-        suggested=("paths",),
+        suggested=("strong",),
     )
     tableau: ClassVar[PartitionedTableau] = _plateau_verlet

@@ -17,7 +17,7 @@ from .._arguments import check_pair, check_takes
 from .._compat import direction
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
-from .._terms import DataFlow, has_lifted, is_hamiltonian, split_terms
+from .._terms import Dependence, has_lifted, is_hamiltonian, split_terms
 from ._friction import (
     apply_friction,
     checked,
@@ -76,6 +76,14 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
             weak=_at_most(record.weak, self.weak),
             strong=_at_most(record.strong, self.strong),
         )
+
+    def weak_order(self, terms) -> int | None:
+        order = self.solver.weak_order(terms)  # pyright: ignore
+        return None if order is None else min(order, self.weak)
+
+    def strong_order(self, terms) -> int | float | None:
+        order: Any = self.solver.strong_order(terms)  # pyright: ignore
+        return None if order is None else min(order, self.strong)
 
     @property
     def structure(self) -> Structure:
@@ -259,7 +267,9 @@ class LinearFlow(AbstractSplitting):
         symplectic."""
         del terms
         time = jnp.asarray(time)
-        program = DataFlow(lambda time, y: self.exact_flow(0, time, y, args), time, y0)
+        program = Dependence(
+            lambda time, y: self.exact_flow(0, time, y, args), time, y0
+        )
         if program.independent(lambda time, y: time):
             raise ValueError(
                 "`flow(time, y, args)` of `LinearFlow` does not read `time`, so that it is "

@@ -1,5 +1,5 @@
 from ._controls import controls, drift_driven, noise_driven, outcomes, step_variables
-from ._data_flow import DataFlow
+from ._dependence import Dependence
 from ._hamiltonian import evaluated, hamiltonian_terms, has_lifted, IndexedNoise
 from ._hamiltonian import is_hamiltonian
 from ._spins import as_spins, from_spinors, spin_terms, to_spinors

@@ -1,6 +1,6 @@
 import functools as ft
 from collections.abc import Callable
-from typing import cast, get_args, Literal
+from typing import Any, cast, get_args, Literal
 
 import diffrax
 import equinox as eqx
@@ -8,14 +8,13 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array, PyTree, Shaped
 
 from .._arguments import check_pair, check_takes, shapes, whole_number
-from .._brownian import increment_struct
+from .._brownian import checked_shape, increment_struct, UnspecifiedPath
 from .._compat import ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike
-from ._data_flow import DataFlow
+from ._dependence import Dependence
 
 
 _P = PyTree[Shaped[Array, "?*p"], "P"]
@@ -27,7 +26,7 @@ _Structure = Literal["separable", "additive"]
 def hamiltonian_terms(
     H0: _Hamiltonian,
     noise: _Hamiltonian | None = None,
-    path: diffrax.AbstractBrownianPath | None = None,
+    path: diffrax.AbstractBrownianPath | PyTree | None = None,
     *,
     structure: _Structure | None = None,
 ) -> diffrax.MultiTerm:
@@ -79,7 +78,10 @@ def hamiltonian_terms(
         `path` with it, for a system without noise.
     - `path`: the Brownian path, of shape `(m,)`: a
         [`diffrax_symplectic.WeakBrownianPath`][], a
-        [`diffrax_symplectic.TruncatedBrownianPath`][], or any of Diffrax's.
+        [`diffrax_symplectic.TruncatedBrownianPath`][], or any of Diffrax's. Or its shape,
+        `(m,)` or a PyTree of `jax.ShapeDtypeStruct`s, where the solver is not known yet:
+        [`diffrax_symplectic.suggest_solver`][], [`diffrax_symplectic.compare_solvers`][]
+        and [`diffrax_symplectic.expectation`][] then make the path that the solver needs.
     - `structure`: what you know of the Hamiltonians: `"separable"`, that $H_0 = V(p) +
         U(t, q)$ and $H_k = U_k(t, q)$; or `"additive"`, that the gradients of the $H_k$ do
         not depend on the state. Solvers that need this structure then rely on it. By
@@ -91,11 +93,11 @@ def hamiltonian_terms(
 
     **Returns:** `MultiTerm(drift, diffusion)`, or without noise `MultiTerm(drift)`.
 
-    **Raises:** a `ValueError` if `path` is not a Brownian path or `structure` is unknown;
-    and, while the solve is traced, if the state is not a pair `(p, q)` of the same
+    **Raises:** a `ValueError` if `path` is no Brownian path and no shape, or `structure` is
+    unknown; and, while the solve is traced, if the state is not a pair `(p, q)` of the same
     structure and shapes, if `H0` does not return a scalar, if `noise` does not match the
-    path or does not depend on the state, if either asks for values in Python or returns
-    what is not real, or if a time of the solve is not finite.
+    path or does not depend on the state, or if either asks for values in Python or returns
+    what is not real.
     """
     check_takes("H0", H0, "t", "p", "q", "args")
     if structure not in (None, *get_args(_Structure)):
@@ -107,16 +109,26 @@ def hamiltonian_terms(
     if noise is None and path is None:
         return diffrax.MultiTerm(drift)
     noise = cast(_Hamiltonian, noise)
-    if not isinstance(path, diffrax.AbstractBrownianPath):
-        is_class = isinstance(path, type)
-        got = f"the class {path.__name__}" if is_class else f"a {type(path).__name__}"
-        raise ValueError(
-            "`path` must be a Brownian path, for example `diffrax_symplectic."
-            f"WeakBrownianPath(shape=(m,), key=key)`; got {got}. (For a system without "
-            "noise pass neither `noise` nor `path`.)"
-        )
     check_takes("noise", noise, "t", "p", "q", "args")
-    return diffrax.MultiTerm(drift, HamiltonianNoise(noise, path, structure))
+    return diffrax.MultiTerm(drift, HamiltonianNoise(noise, as_path(path), structure))
+
+
+def as_path(path: Any) -> diffrax.AbstractBrownianPath:
+    """`path`, or for a shape a path that is not specified yet. A `ValueError` for anything
+    else."""
+    if isinstance(path, diffrax.AbstractBrownianPath):
+        return path
+    is_struct = lambda x: isinstance(x, jax.ShapeDtypeStruct)
+    is_tuple = isinstance(path, tuple) and all(isinstance(n, int) for n in path)
+    if is_tuple or (leaves := jtu.tree_leaves(path)) and all(map(is_struct, leaves)):
+        return UnspecifiedPath(shape=checked_shape(path, "path"))
+    is_class = isinstance(path, type)
+    got = f"the class {path.__name__}" if is_class else f"a {type(path).__name__}"
+    raise ValueError(
+        "`path` must be a Brownian path, for example `solver.path((m,), key)`, or its "
+        f"shape `(m,)`; got {got}. (For a system without noise pass neither `noise` nor "
+        "`path`.)"
+    )
 
 
 class IndexedNoise(eqx.Module):
@@ -213,7 +225,7 @@ def has_lifted(terms: PyTree) -> bool:
 def lifted_terms(
     H0: Callable,
     noise: Callable | None,
-    path: diffrax.AbstractBrownianPath | None,
+    path: diffrax.AbstractBrownianPath | PyTree | None,
     chart: Callable[[_State], PyTree],
     name: str,
 ) -> diffrax.MultiTerm:
@@ -237,11 +249,7 @@ class _Drift(eqx.Module):
     structure: _Structure | None = eqx.field(static=True, default=None)
 
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
-        # That module imports this one.
-        from ._structure_checks import check_solve
-
         check_pair(y)
-        check_solve(t, y, args)
 
         def scalar(p, q):
             return scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
@@ -386,24 +394,14 @@ def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Arr
 
 
 def _check_reads_state(hamiltonians: Callable[[_State], PyTree], y: _State) -> None:
-    """Raises a `ValueError` if one of the noise Hamiltonians does not depend on the
-    state."""
-    derivative = lambda y, dy: jax.jvp(hamiltonians, (y,), (dy,))[1]
-    reached = DataFlow(derivative, y, y).reached(lambda y, dy: dy)
-    reads = np.concatenate([np.ravel(x) for x in reached])
-    if np.all(reads):
-        return
-    which, those = "The noise Hamiltonians do", "there is no noise"
-    if np.any(reads):
-        numbers = ", ".join(map(str, np.flatnonzero(~reads)))
-        which = f"Of the noise Hamiltonians those with the index {numbers} do"
-        those = "these noises change nothing"
-    raise ValueError(
-        f"{which} not depend on the state, so that {those}. Return Hamiltonians, not "
-        "amplitudes: for a kick of constant strength to each momentum, dp_k = sigma_k "
-        "dw_k, `noise = lambda t, p, q, args: -sigma * q`. For no noise solve the drift "
-        "alone, `terms.terms[0]`."
-    )
+    """Raises a `ValueError` if the noise Hamiltonians do not depend on the state."""
+    if Dependence(hamiltonians, y).independent(lambda y: y):
+        raise ValueError(
+            "`noise` does not depend on the state, so that there is no noise. Return "
+            "Hamiltonians, not amplitudes: for a kick of constant strength to each "
+            "momentum, dp_k = sigma_k dw_k, `noise = lambda t, p, q, args: -sigma * q`. "
+            "For no noise solve the drift alone, `terms.terms[0]`."
+        )
 
 
 def symplectic_gradient(scalar: Callable, y: _State) -> _State:

@@ -23,7 +23,7 @@ _SpinHamiltonian = Callable[[RealScalarLike, _Spins, Args], PyTree[ArrayLike]]
 def spin_terms(
     H0: _SpinHamiltonian,
     noise: _SpinHamiltonian | None = None,
-    path: diffrax.AbstractBrownianPath | None = None,
+    path: diffrax.AbstractBrownianPath | PyTree | None = None,
     damping: ArrayLike | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of spins, or of a rigid body, from their Hamiltonians.
@@ -92,7 +92,8 @@ def spin_terms(
         each axis of each spin is `noise = lambda t, s, args: args * s` with a path of
         the shape of `s`; its cost is one reverse pass. Or an
         [`diffrax_symplectic.IndexedNoise`][] of `H(k, t, s, args)`.
-    - `path`: the Brownian path, as for [`diffrax_symplectic.hamiltonian_terms`][].
+    - `path`: the Brownian path or its shape, as for
+        [`diffrax_symplectic.hamiltonian_terms`][].
     - `damping`: the number $\alpha$, or one for each spin, not negative; in units of one
         over the length of a spin. None if it is `None`. If it is traced and negative or
         not finite, the path fails.

@@ -1,22 +1,25 @@
 """Whether a system has the structure that a family of methods relies on: decided by the
 flow of data through the vector fields, or by what the user asserts."""
 
+import functools as ft
+from collections.abc import Callable
 from typing import get_args, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
+import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
+import numpy as np
 
 from .._arguments import check_pair, pair_fault
-from .._brownian import check_times
-from .._compat import innermost_solve, ω
+from .._compat import unwrapped, ω
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
-from ._data_flow import DataFlow
+from ._dependence import Dependence
 from ._hamiltonian import asserted_structure, has_lifted, is_hamiltonian
 from ._vector_fields import apply, product, split_terms
 
@@ -78,7 +81,10 @@ def separable_fault(
         (is_hamiltonian(x), len(drift) > 1, _flow(x, t0, y0, args))
         for x in _not_asserted(drift, "separable")
     ]
-    noise_flows = [_flow(x, t0, y0, args) for x in _not_asserted(noise, "separable")]
+    noise_flows = [
+        (_flow(x, t0, y0, args), ft.partial(_is_zero, x, t0, y0, args))
+        for x in _not_asserted(noise, "separable")
+    ]
     here, exchanged = (_faults(p, drift_flows, noise_flows) for p in (0, 1))
     if not here:
         return None
@@ -91,11 +97,13 @@ def separable_fault(
 
 
 def _faults(
-    p: int, drift: list[tuple[bool, bool, DataFlow]], noise: list[DataFlow]
+    p: int,
+    drift: list[tuple[bool, bool, Dependence]],
+    noise: list[tuple[Dependence, Callable[[int], bool]]],
 ) -> list[Fault]:
     """The faults, if the momenta are the first half of the state, `p = 0`, or the second
-    one, `p = 1`. With each drift term: whether it is that of `H0`, and whether there are
-    others."""
+    one, `p = 1`. With each drift term: whether it comes from `H0`, and whether there are
+    others. With each noise term: a function that tells whether a half stays unchanged."""
     q, faults, advice = 1 - p, [], _advice("separable")
     dp, dq = (lambda out: out[p]), (lambda out: out[q])
     of_p, of_q = (lambda t, y, control: y[p]), (lambda t, y, control: y[q])
@@ -110,10 +118,10 @@ def _faults(
                 beside = f"a drift term beside that of H0 makes {rate}"
                 reason = beside if others and not hamiltonian else derivative
                 faults.append(Fault(reason, advice, friction))
-    for flow in noise:
+    for flow, zero in noise:
         # The change of q is linear in the increment: if it does not depend on the
         # increment, it is zero.
-        if not flow.independent(lambda t, y, control: control, dq):
+        if not flow.independent(lambda t, y, control: control, dq) and not zero(q):
             faults.append(Fault("dH_k/dp is not zero", advice))
         elif not flow.independent(of_p, dp):
             faults.append(Fault("dH_k/dq depends on p", advice))
@@ -147,9 +155,12 @@ def check_stratonovich(
     """Raises a `ValueError` if a solver in the sense of Ito is to solve terms made from
     Hamiltonians, which are in the sense of Stratonovich. Both agree for additive noise, and
     for noise that changes `p` and depends on `q` alone."""
-    if not isinstance(solver, diffrax.AbstractItoSolver):
+    drift, noise = split_terms(terms)
+    # A drift beside `H0` may be the correction from one sense to the other.
+    corrected = not all(map(is_hamiltonian, drift))
+    if corrected or not isinstance(solver, diffrax.AbstractItoSolver):
         return
-    noise = tuple(filter(is_hamiltonian, split_terms(terms)[1]))
+    noise = tuple(filter(is_hamiltonian, noise))
     if additive_fault(noise, t0, y0, args) and separable_fault((), noise, t0, y0, args):
         raise ValueError(
             f"`{type(solver).__name__}` solves equations in the sense of Ito. Those of "
@@ -159,28 +170,29 @@ def check_stratonovich(
         )
 
 
-def check_solve(t: RealScalarLike, y: Y, args: Args) -> None:
-    """The same for the solve being traced, and its times. A drift beside that of the
-    Hamiltonians may be the correction that makes their noise one in the sense of Ito: then
-    all is well."""
-    check_times()
-    solve = innermost_solve()
-    if solve is None or not isinstance(solve["solver"], diffrax.AbstractItoSolver):
-        return
-    terms = solve["terms"]
-    # The solve backward of `diffrax.BacksolveAdjoint` has another term.
-    if not isinstance(terms, diffrax.MultiTerm):
-        return
-    if all(map(is_hamiltonian, split_terms(terms)[0])):
-        check_stratonovich(terms, solve["solver"], t, y, args)
-
-
-def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> DataFlow:
+def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> Dependence:
     """The change of the state by a term, as a program of time, state and control."""
     t0 = jnp.asarray(t0, jnp.result_type(float))
     control = eqx.filter_eval_shape(term.contr, t0, t0)
     change = lambda t, y, control: product(term, t, y, args, control)
-    return DataFlow(change, t0, y0, control)
+    return Dependence(change, t0, y0, control)
+
+
+def _is_zero(term: diffrax.AbstractTerm, t0, y0: Y, args: Args, half: int) -> bool:
+    """Whether the noise of a plain term is known while tracing to leave one half of the
+    state unchanged, as a matrix of noises with a block of zeros does."""
+    if is_hamiltonian(term):
+        return False
+    struct = eqx.filter_eval_shape(term.contr, t0, t0)
+    with jax.ensure_compile_time_eval():
+        zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
+        flat, unravel = jfu.ravel_pytree(zeros)
+        changes = [
+            product(unwrapped(term), t0, y0, args, unravel(unit))[half]
+            for unit in jnp.eye(flat.size, dtype=flat.dtype)
+        ]
+    known = lambda x: not isinstance(x, jax.core.Tracer)
+    return all(known(x) and not np.asarray(x).any() for x in jtu.tree_leaves(changes))
 
 
 def _of_t(t, y, control):
@@ -197,9 +209,9 @@ def _advice(structure: str) -> str:
         "additive": "each H_k as a function linear in p and q, such as `-sigma * q`",
     }[structure]
     return (
-        f"If it only seems so, since variables cancel or because of a value in `args`, "
-        f'write {how}, or pass `structure="{structure}"` to `hamiltonian_terms`. If not, '
-        f"{_GENERAL}."
+        "Variables count that cancel, are multiplied by zero or printed, or share an array "
+        f"with others. If it is only that, write {how}, or pass "
+        f'`structure="{structure}"` to `hamiltonian_terms`. If not, {_GENERAL}.'
     )
 
 
@@ -251,8 +263,9 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
             size, bracket = sizes(jtu.tree_map(lambda *x: jnp.stack(x), *points))
             finite = jnp.isfinite(size) & jnp.isfinite(bracket)
             small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
-            return bool(jnp.any(finite) & jnp.all(small | ~finite))
-    except Exception:
-        # A check of the user's may raise at states that the user never chose, and nothing
-        # has values while JAX traces what surrounds this.
+            found = jax.block_until_ready(jnp.any(finite) & jnp.all(small | ~finite))
+    except RuntimeError:
+        # A check of the user's, by `equinox.error_if`, at states the user never chose.
         return False
+    # While JAX traces what surrounds this, there are no values.
+    return not isinstance(found, jax.core.Tracer) and bool(found)

@@ -21,7 +21,7 @@ _WaveHamiltonian = Callable[[RealScalarLike, _Waves, Args], PyTree[ArrayLike]]
 def wave_terms(
     H0: _WaveHamiltonian,
     noise: _WaveHamiltonian | None = None,
-    path: diffrax.AbstractBrownianPath | None = None,
+    path: diffrax.AbstractBrownianPath | PyTree | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of complex amplitudes from their real Hamiltonians.
 
@@ -67,7 +67,8 @@ def wave_terms(
     - `noise`: `noise(t, psi, args)`, the noise Hamiltonians $H_1, \ldots, H_m$, real, as an
         array of shape `(m,)`, or whatever structure and shapes `path` has. Or an
         [`diffrax_symplectic.IndexedNoise`][] of `H(k, t, psi, args)`.
-    - `path`: the Brownian path, as for [`diffrax_symplectic.hamiltonian_terms`][].
+    - `path`: the Brownian path or its shape, as for
+        [`diffrax_symplectic.hamiltonian_terms`][].
 
     Parameters may be complex. As everywhere in JAX, the gradient of a real loss $L$ with
     respect to $z = x + \mathrm i y$ is $\partial L / \partial x - \mathrm i\, \partial L /

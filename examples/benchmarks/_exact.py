@@ -102,7 +102,7 @@ def step_of(terms, solver) -> Callable:
         number = jax.ShapeDtypeStruct((), float)
         call = lambda p, q: functions[-1](p, q)
 
-        def fn(y):
+        def fn(t, y, args):
             return jax.pure_callback(call, number, *y, vmap_method="broadcast_all")
 
         mean = lambda *y: ds.step_expectation(terms, solver, 0.0, h, y, fn=fn)

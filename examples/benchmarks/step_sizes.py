@@ -106,7 +106,7 @@ def _systems() -> list[System]:
 def _terms(system: System, solver, key):
     if isinstance(solver, diffrax.Heun):
         return system.terms(ds.WeakBrownianPath(system.shape, key))
-    return system.terms(solver.path(system.shape, key, want="expectations"))
+    return system.terms(solver.path(system.shape, key, want="weak"))
 
 
 def _solve(system: System, solver) -> Callable:

@@ -207,7 +207,9 @@ STRONG = {
 # What solvers ask of a path beyond space-time area.
 WRAP = {
     ds.PlateauVerlet: ds.PlateauBrownianPath,
-    ds.LevyAreaMidpoint: lambda path, key: ds.LevyAreaBrownianPath(path, key, terms=2),
+    ds.LevyAreaMidpoint: lambda path, key: ds.LevyAreaBrownianPath(
+        path, key, num_terms=2
+    ),
 }
 
 

@@ -87,7 +87,7 @@ def stationary_bias(
         def after(x):
             q, p = x
             order = 1 if step.q_first else -1
-            y0, fn = (q, p)[::order], lambda y: basis(*y[::order])
+            y0, fn = (q, p)[::order], lambda t, y, args: basis(*y[::order])
             return ds.step_expectation(
                 terms, step.solver, 0.0, h, y0, fn=fn, nodes=step.nodes
             )

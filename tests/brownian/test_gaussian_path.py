@@ -185,7 +185,7 @@ def test_wrappers_make_the_same_step_from_words_as_from_keys():
     path = ds.FixedStepBrownianPath((2,), key, AREA)
     own = words.random_words(key, at, 2, 2).reshape(-1)
     more = lambda n, begin: words.random_words(key, at, 1, n, begin)[0]
-    areas = ds.LevyAreaBrownianPath(path, key, terms=1)
+    areas = ds.LevyAreaBrownianPath(path, key, num_terms=1)
     plateaus = ds.PlateauBrownianPath(path, key)
     # The signs are the first bits: those of the words that the path takes are others.
     assert np.all(more(2, 0) >> 31 != more(2, words.PLATEAU_WORDS) >> 31)
@@ -227,17 +227,6 @@ def test_bad_arguments_are_refused():
         make(jax.ShapeDtypeStruct((), jnp.int32), jr.key(0))
     with pytest.raises(ValueError, match="needs a random key"):
         make((), 0)  # pyright: ignore
-    pid = diffrax.PIDController(rtol=1e-3, atol=1e-3)
-    with pytest.raises(ValueError, match="adaptive step size"):
-        diffrax.diffeqsolve(
-            kubo_terms(make((), jr.key(0))),
-            diffrax.Heun(),
-            0.0,
-            1.0,
-            0.1,
-            Y0,
-            stepsize_controller=pid,
-        )
 
 
 def test_trees_coarser_than_the_step_are_refused():

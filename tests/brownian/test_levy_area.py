@@ -24,7 +24,7 @@ def _areas(terms, cell, m=3, h=0.5):
     def draw(key):
         k_path, k_area = jr.split(key)
         path = diffrax.UnsafeBrownianPath((m,), k_path, diffrax.SpaceTimeLevyArea)
-        path = ds.LevyAreaBrownianPath(path, k_area, terms=terms, cell=cell)
+        path = ds.LevyAreaBrownianPath(path, k_area, num_terms=terms, cell=cell)
         increment = path.evaluate(0.0, h, use_levy=True)
         return increment.W / np.sqrt(h), increment.H / np.sqrt(h), increment.A / h
 
@@ -62,7 +62,7 @@ def test_bridge_areas_have_their_moments_given_the_integral(terms):
     W, H = jnp.array([0.7, -1.0, 0.4]), jnp.array([0.3, -0.5, 0.2])
 
     def draw(key):
-        path = ds.LevyAreaBrownianPath(Given(W, H), key, terms=terms)
+        path = ds.LevyAreaBrownianPath(Given(W, H), key, num_terms=terms)
         return path.evaluate(0.0, 1.0, use_levy=True).A
 
     A = jax.jit(jax.vmap(draw))(jr.split(jr.key(0), n))
@@ -94,7 +94,7 @@ def test_kurtosis_without_terms_is_short_of_the_law_and_terms_mend_it():
 
 def test_areas_over_cells_follow_chens_rule():
     sample = FineSample.draw(jr.key(0), 32, 3)
-    path = ds.LevyAreaBrownianPath(sample, jr.key(1), terms=2, cell=1 / 16)
+    path = ds.LevyAreaBrownianPath(sample, jr.key(1), num_terms=2, cell=1 / 16)
     evaluate = jax.jit(lambda a, b: path.evaluate(a, b, use_levy=True))
     whole = evaluate(0.25, 0.75)
     left, right = evaluate(0.25, 0.5), evaluate(0.5, 0.75 + 1e-12)
@@ -116,5 +116,5 @@ def test_areas_over_cells_follow_chens_rule():
 
 def test_one_noise_has_no_area():
     inside = Given(jnp.array([0.7]), jnp.array([0.3]))
-    path = ds.LevyAreaBrownianPath(inside, jr.key(0), terms=1)
+    path = ds.LevyAreaBrownianPath(inside, jr.key(0), num_terms=1)
     np.testing.assert_array_equal(path.evaluate(0.0, 1.0, use_levy=True).A, [[0.0]])

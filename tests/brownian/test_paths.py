@@ -20,7 +20,7 @@ from diffrax_symplectic._brownian._random import (
     two_point,
 )
 
-from ..problems import kubo_terms, weak_path
+from ..problems import weak_path
 
 
 @pytest.mark.core
@@ -184,38 +184,6 @@ def test_malformed_shapes_are_refused(shape, message):
         ds.WeakBrownianPath(shape, jr.key(0))
 
 
-def _paths():
-    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jr.key(0))
-    return [ds.WeakBrownianPath((), jr.key(0)), ds.TruncatedBrownianPath(tree)]
-
-
-@pytest.mark.parametrize("path", _paths(), ids=["weak", "truncated"])
-@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), diffrax.Heun()], ids=repr)
-def test_fixed_increments_refuse_adaptive_steps(path, solver):
-    terms, y0 = kubo_terms(path), (jnp.array(0.0), jnp.array(1.0))
-    solve = lambda solver, **kwargs: diffrax.diffeqsolve(
-        terms, solver, 0.0, 0.5, 0.1, y0, **kwargs
-    )
-    pid = diffrax.PIDController(rtol=1e-3, atol=1e-3, error_order=1.0)
-    # With another path a solver without an error estimate would be refused as well.
-    estimates = isinstance(solver, diffrax.AbstractAdaptiveSolver)
-    end = "VirtualBrownianTree` as path" if estimates else "`diffrax.StepTo`"
-    with pytest.raises(ValueError, match=f"adaptive step size controller.*{end}\\."):
-        solve(solver, stepsize_controller=pid)
-    with pytest.raises(ValueError, match="adaptive step size controller"):
-        solve(solver, stepsize_controller=diffrax.ClipStepSizeController(pid))
-    half = diffrax.HalfSolver(solver)
-    with pytest.raises(ValueError, match="`diffrax.HalfSolver`"):
-        solve(half)
-    with pytest.raises(ValueError, match="adaptive step size|`diffrax.HalfSolver`"):
-        solve(half, stepsize_controller=pid)
-    # Prescribed steps are fixed steps.
-    ts = jnp.array([0.0, 0.1, 0.3, 0.5])
-    diffrax.diffeqsolve(
-        terms, solver, 0.0, 0.5, None, y0, stepsize_controller=diffrax.StepTo(ts)
-    )
-
-
 def test_half_steps_work_where_the_path_can_be_refined():
     tree = diffrax.VirtualBrownianTree(0.0, 0.5, 1e-3, (), jr.key(0))
     H0 = lambda t, p, q, args: p**2 / 2 + q**4 / 4
@@ -231,22 +199,6 @@ def test_half_steps_work_where_the_path_can_be_refined():
         stepsize_controller=pid,
     )
     assert sol.stats["num_steps"] > 0
-
-
-def test_another_solve_may_change_its_steps():
-    # An adaptive solve that evaluates the path, but is not driven by it.
-    path = ds.WeakBrownianPath((), jr.key(0))
-    field = lambda t, y, args: y * path.evaluate(0.0, 0.1)
-    pid = diffrax.PIDController(rtol=1e-3, atol=1e-3)
-    diffrax.diffeqsolve(
-        diffrax.ODETerm(field),
-        diffrax.Heun(),
-        0.0,
-        0.5,
-        0.1,
-        jnp.array(1.0),
-        stepsize_controller=pid,
-    )
 
 
 def test_the_same_key_gives_the_same_path_in_every_version():

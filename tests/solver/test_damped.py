@@ -152,3 +152,31 @@ def test_between_steps_a_solution_is_interpolated_between_their_ends(solver):
     y1, _, dense, *_ = solver.step(terms, 0.0, 0.1, y0, None, state, False)
     np.testing.assert_array_equal(dense["y0"], y0)
     np.testing.assert_array_equal(dense["y1"], y1)
+
+
+class _OwnOrders(ds.AbstractSymplecticSolver):
+    """A solver that states its orders by methods."""
+
+    structure = "any"
+    variables = ("W",)
+    order = lambda self, terms: 3
+    weak_order = lambda self, terms: 1
+    strong_order = lambda self, terms: 0.5
+    stage_vectors = lambda self, num_noises: ()
+    init = lambda self, terms, t0, t1, y0, args: None
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        return y0, None, dict(y0=y0, y1=y0), None, diffrax.RESULTS.successful
+
+
+def test_the_orders_of_the_wrapped_solver_bound_those_of_the_splitting():
+    terms = ds.hamiltonian_terms(_oscillator, _force, weak_path(1))
+    for wrap in (
+        lambda solver: ds.Damped(solver, 0.5),
+        lambda solver: ds.LinearFlow(solver, lambda time, y, args: y),
+    ):
+        own = wrap(_OwnOrders())
+        assert (own.weak_order(terms), own.strong_order(terms)) == (1, 0.5)
+        assert own.order(terms) == 2
+        weak_only = wrap(ds.SRKw2())
+        assert (weak_only.weak_order(terms), weak_only.strong_order(terms)) == (2, None)

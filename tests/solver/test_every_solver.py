@@ -33,7 +33,6 @@ _GAUSS = 1 / 4 + np.sqrt(3) / 6
 # Members of families that differ in what they do, beside the defaults.
 MEMBERS = [
     ds.SRKw1(b=0.2),
-    ds.SRKw2((1, 2, 3, 4)),
     *(ds.SRKw3(variant) for variant in "abdef"),
     ds.SRKw4(a21=_GAUSS),
     ds.SRKs3(a=0.25),
@@ -364,7 +363,7 @@ def _make_weak_systems(solver):
 
 def local_weak_orders(solver) -> dict[str, float]:
     y0, args, exact = _weak_systems(solver)
-    path = solver.path((2,), jr.key(0), want="expectations")
+    path = solver.path((2,), jr.key(0), want="weak")
     terms = SYSTEMS[solver.structure].terms(path, commuting=True)
     solver = by_picard(solver)
 
@@ -413,7 +412,7 @@ def strong_orders(solver) -> dict[str, tuple[float, float]]:
         if "C" in solver.variables:
             path = ds.PlateauBrownianPath(path, k_more)
         if "A" in solver.variables:
-            path = ds.LevyAreaBrownianPath(path, k_more, terms=0, cell=1 / fine)
+            path = ds.LevyAreaBrownianPath(path, k_more, num_terms=0, cell=1 / fine)
         terms, h = system.terms(path, commuting=True), 1 / steps
         step = lambda i, y: take_step(quick, terms, i * h, (i + 1) * h, y, args)[0]
         return jfu.ravel_pytree(jax.lax.fori_loop(0, steps, step, y0))[0]
@@ -479,7 +478,7 @@ def test_own_paths_hold_what_a_step_needs(solver):
     system = SYSTEMS[solver.structure]
     y0, args = system.draw(jr.key(0), 1, 2, jnp.float64)
     # The test of weak orders takes a step along the other path.
-    path = solver.path((2,), jr.key(0), want="paths")
+    path = solver.path((2,), jr.key(0), want="strong")
     quick = by_picard(solver)
     step = lambda y0: take_step(quick, system.terms(path), 0.0, 0.1, y0, args)[0]
     y1 = eqx.filter_eval_shape(step, y0)
@@ -487,7 +486,7 @@ def test_own_paths_hold_what_a_step_needs(solver):
     assert issubclass(path.levy_area, solver.minimal_levy_area) or (
         solver.variables == ("W",)
     )
-    meant = "expectations" if solver.record.strong is None else "paths"
+    meant = "weak" if solver.record.strong is None else "strong"
     default, asked = (solver.path((2,), jr.key(0), want=w) for w in (None, meant))
     assert eqx.tree_equal(default, asked)
 

@@ -44,7 +44,7 @@ def test_defect_knows_ito_from_stratonovich():
     drift = diffrax.ODETerm(lambda t, y, args: jnp.zeros_like(y))
     diffusion = diffrax.ControlTerm(lambda t, y, args: y[:, None], path)
     terms = diffrax.MultiTerm(drift, diffusion)
-    kwargs = dict(fn=lambda y: y[0] ** 2, order=1)
+    kwargs = dict(fn=lambda t, y, args: y[0] ** 2, order=1)
     y0 = jnp.array([1.0])
     defect = ds.weak_order_defect(terms, diffrax.Euler(), 0.0, 0.1, y0, **kwargs)
     np.testing.assert_allclose(defect, 0, atol=1e-15)
@@ -72,7 +72,7 @@ def test_expectation_enumerates_second_and_two_point_variables():
         diffrax.ControlTerm(identity, Read(path)),
     )
     h = 0.3
-    powers = lambda y: jnp.stack([jnp.outer(y, y), jnp.outer(y**2, y**2)])
+    powers = lambda t, y, args: jnp.stack([jnp.outer(y, y), jnp.outer(y**2, y**2)])
     second, fourth = ds.step_expectation(
         terms, diffrax.Euler(), 0.0, h, jnp.zeros(3), fn=powers
     )
@@ -91,7 +91,7 @@ def test_kubo_moments_match_the_matrix_recursion():
         0.0,
         h,
         (jnp.array(0.0), jnp.array(1.0)),
-        fn=lambda y: jnp.stack([*y]),
+        fn=lambda t, y, args: jnp.stack([*y]),
     )
     increments = np.sqrt(3 * h) * np.array([-1, 0, 1])
     angles = 2 * np.arctan((h + s * increments) / 2)
@@ -112,5 +112,5 @@ def test_expectation_needs_one_path_of_a_known_law():
     ):
         with pytest.raises(ValueError, match="exactly one Brownian path"):
             ds.step_expectation(
-                terms, ds.ImplicitMidpoint(), 0.0, 0.1, y0, fn=lambda y: y[0]
+                terms, ds.ImplicitMidpoint(), 0.0, 0.1, y0, fn=lambda t, y, a: y[0]
             )

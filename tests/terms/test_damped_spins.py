@@ -105,7 +105,7 @@ def test_ninomiya_victoir_keeps_weak_order_two_with_damping():
     terms = ds.spin_terms(H0, noise, path, damping=0.6)
     s0, args = jax.vmap(lambda key: _problem(key, 1, 2))(jr.split(jr.key(5), 2))
 
-    def fn(y):
+    def fn(t, y, args):
         s = ds.from_spinors(y)[0]
         return jnp.stack([s[2], s[0] * s[1], jnp.exp(s[1] / 2)])
 

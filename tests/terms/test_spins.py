@@ -168,7 +168,7 @@ def test_ninomiya_victoir_is_weak_order_two_for_noises_that_do_not_commute():
     terms = ds.spin_terms(H0, noise, weak_path(2, two_point=True))
     s0, args = jax.vmap(lambda key: _problem(key, 1, 2))(jr.split(jr.key(2), 2))
 
-    def fn(y):
+    def fn(t, y, args):
         s = ds.from_spinors(y)[0]
         return jnp.stack([s[2], s[0] * s[1], jnp.exp(s[1] / 2)])
 

@@ -75,12 +75,6 @@ def test_integers_and_booleans_in_args_stand_for_any_value(H0, args):
     # With these values, p and q couple. With others they do not.
     with pytest.raises(ValueError, match="dH0/dq depends on p.*structure="):
         _solve(H0, _good_noise, ds.StormerVerlet(), args)
-    # As numbers of Python they are part of the program.
-    if args.dtype != bool:
-        known = lambda n: lambda t, p, q, _: H0(t, p, q, n)
-        with pytest.raises(ValueError, match="dH0/dq depends on p"):
-            _solve(known(0), _good_noise, ds.StormerVerlet())
-        _solve(known(1), _good_noise, ds.StormerVerlet())
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -125,7 +119,7 @@ def _langevin(friction: float, momentum_first: bool) -> diffrax.MultiTerm:
 
     def drift(t, y, args):
         x, v = order(*y)
-        return order(v, -(x**3) - friction * v)
+        return order(v, -(x**3) - friction * v if friction else -(x**3))
 
     kick = lambda w: order(jnp.zeros(2), 0.3 * w)
     operator = lambda t, y, args: lx.FunctionLinearOperator(kick, noises)
@@ -139,7 +133,7 @@ def test_friction_in_the_drift_is_told_to_be_left_out():
     y0 = jnp.ones(2), jnp.zeros(2)
     start = lambda terms: ds.BAOAB(0.5).init(terms, 0.0, 0.1, y0, None)
     suggest = lambda terms, **options: ds.suggest_solver(
-        terms, 0.0, y0, want="expectations", **options
+        terms, 0.0, y0, want="weak", **options
     )
     for first in (True, False):
         with pytest.raises(
@@ -236,7 +230,7 @@ def _solve_from(H0, y0):
 
 
 def test_friction_in_a_second_term_is_not_blamed_on_the_hamiltonian():
-    friction = diffrax.ODETerm(lambda t, y, args: (-0.1 * y[0], 0 * y[1]))
+    friction = diffrax.ODETerm(lambda t, y, args: (-0.1 * y[0], jnp.zeros(2)))
     path = ds.WeakBrownianPath((), jr.key(0))
     terms = ds.hamiltonian_terms(_good_H0, _good_noise, path)
     for both in (
@@ -260,4 +254,4 @@ def test_a_check_of_the_users_does_not_stop_the_advice():
     path = ds.WeakBrownianPath((2,), jr.key(0))
     terms = ds.hamiltonian_terms(lambda t, p, q, args: jnp.sum(p * q), noise, path)
     assert not commuting((terms.terms[1],), 0.0, _positive_state, None)
-    assert len(ds.suggest_solver(terms, 0.0, _positive_state, want="paths")) > 0
+    assert len(ds.suggest_solver(terms, 0.0, _positive_state, want="strong")) > 0

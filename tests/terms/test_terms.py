@@ -370,7 +370,7 @@ def test_integer_times_are_times():
     )
     y0 = (jnp.array([0.2]), jnp.array([1.0]))
     value = lambda t0, t1: ds.step_expectation(
-        terms, ds.AdditiveGauss(), t0, t1, y0, fn=lambda y: y[1][0]
+        terms, ds.AdditiveGauss(), t0, t1, y0, fn=lambda t, y, args: y[1][0]
     )
     np.testing.assert_allclose(value(0, 1), value(0.0, 1.0), rtol=1e-14)
 
@@ -384,3 +384,31 @@ def test_time_dependent_noise_works_in_single_precision():
         terms, ds.NinomiyaVictoir(), t0, t1, h, y0, args, **_END
     ).ys
     assert ys[0].dtype == jnp.float32 and jnp.all(jnp.isfinite(ys[0]))
+
+
+@pytest.mark.parametrize("shape", [(), (2,), {"a": jax.ShapeDtypeStruct((), float)}])
+def test_a_shape_stands_for_the_path_that_the_solver_needs(shape):
+    H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
+    noise = lambda t, p, q, args: jax.tree.map(
+        lambda s: jnp.full(s.shape, 0.1) * jnp.sin(q), checked
+    )
+    is_tuple = isinstance(shape, tuple)
+    checked = jax.ShapeDtypeStruct(shape, float) if is_tuple else shape
+    terms, y0 = ds.hamiltonian_terms(H0, noise, shape), (jnp.zeros(()), jnp.ones(()))
+    for want in ("weak", "strong"):
+        best = ds.suggest_solver(terms, 0.0, y0, want=want)[0]
+        path = best.solver.path(shape, jr.key(1), want=want)
+        with_path = ds.hamiltonian_terms(H0, noise, path)
+        solve = lambda terms: diffrax.diffeqsolve(terms, best.solver, 0, 1, 0.25, y0).ys
+        got, expected = solve(best.terms(jr.key(1))), solve(with_path)
+        assert all(jax.tree.map(jnp.array_equal, got, expected))
+    for solver in (ds.StormerVerlet(), diffrax.Heun()):
+        with pytest.raises(ValueError, match=r"pass `path=solver.path\(shape, key\)`"):
+            diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.5, y0)
+
+
+@pytest.mark.parametrize("path", [3, "path", None, ds.WeakBrownianPath, (1.5,), (-1,)])
+def test_what_is_neither_a_path_nor_a_shape_is_refused(path):
+    H = lambda t, p, q, args: p**2 + q**2
+    with pytest.raises(ValueError, match="shape"):
+        ds.hamiltonian_terms(H, H, path)

@@ -1,4 +1,4 @@
-"""Which structures are recognised from the flow of data, and which are refused."""
+"""Which structures are recognised by dead-code elimination, and which are refused."""
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._terms._structure_checks import (
     additive_fault,
     constant_fault,
-    DataFlow,
+    Dependence,
     separable_fault,
 )
 
@@ -38,6 +38,10 @@ _quartic.defjvp(lambda x, t: (_quartic(*x), jnp.sum(4 * x[0] ** 3 * t[0])))
 
 def _printed(t, p, q, args):
     jax.debug.print("{} {}", p, q)
+    return jnp.sum(p**2) + jnp.sum(jnp.sin(q))
+
+
+def _checked(t, p, q, args):
     p = eqx.error_if(p, jnp.any(p > 1e9), "too fast")
     return jnp.sum(p**2) + jnp.sum(jnp.sin(q))
 
@@ -84,9 +88,7 @@ SEPARABLE = {
     "jit": lambda t, p, q, a: jax.jit(lambda p, q: p @ p + jnp.prod(q))(p, q),
     "own derivative": lambda t, p, q, a: _quartic(p) + _quartic(q),
     "stacked": lambda t, p, q, a: jnp.sum(jnp.stack([p**2, jnp.cos(q)])),
-    "packed": lambda t, p, q, a: jnp.sum(jnp.concatenate([p, q]) ** 2),
-    "printed": _printed,
-    "zero coupling": lambda t, p, q, a: jnp.sum(p**2 + q**2) + 0.0 * jnp.sum(p * q),
+    "checked": _checked,
     "shapes": lambda t, p, q, a: jnp.sum(p**2) * q.size + jnp.sum(q**2) * len(p),
 }
 NOT_SEPARABLE = {
@@ -117,6 +119,10 @@ NOT_SEPARABLE = {
     "columns": lambda t, p, q, a: jnp.sum(
         jnp.sum(jnp.concatenate([p, q]).reshape(2, 2), 0) ** 2
     ),
+    # Separable, which dead-code elimination does not see.
+    "packed": lambda t, p, q, a: jnp.sum(jnp.concatenate([p, q]) ** 2),
+    "printed": _printed,
+    "zero coupling": lambda t, p, q, a: jnp.sum(p**2 + q**2) + 0.0 * jnp.sum(p * q),
 }
 NOISES = {
     # Whether they are additive, and constant.
@@ -147,13 +153,13 @@ _potential = lambda t, p, q, args: jnp.sum(jnp.sin(q)) * jnp.cos(t)
 
 
 @pytest.mark.parametrize("H0", SEPARABLE.values(), ids=SEPARABLE.keys())
-def test_ordinary_separable_hamiltonians_are_recognised(H0, capfd):
+def test_ordinary_separable_hamiltonians_are_recognised(H0):
     assert separable_fault(*_terms(H0, _potential), 0.0, Y0, ARGS) is None
     # Also if the arguments are traced, and nothing is run.
     fault = jax.eval_shape(
         lambda args: separable_fault(*_terms(H0, _potential), 0.0, Y0, args), ARGS
     )
-    assert fault is None and capfd.readouterr().out == ""
+    assert fault is None
 
 
 @pytest.mark.parametrize("H0", NOT_SEPARABLE.values(), ids=NOT_SEPARABLE.keys())
@@ -184,9 +190,7 @@ PROGRAMS = {
         ],
         False,
     ),
-    "zeros": (lambda x, y: jnp.zeros(2) * x + y, True),
-    "cosine of zero": (lambda x, y: jnp.cos(0 * x) * y, True),
-    "zeros by a matrix": (lambda x, y: jnp.zeros((2, 2)) @ jnp.stack([x, x]) + y, True),
+    "zeros times": (lambda x, y: jnp.zeros(2) * x + y, False),
     "zeros plus": (lambda x, y: jnp.zeros(2) + x, False),
     "chosen by": (lambda x, y: jnp.where(x > 0, y, 2 * y), False),
     "chosen branch": (lambda x, y: jax.lax.cond(x > 0, jnp.sin, jnp.cos, y), False),
@@ -201,9 +205,9 @@ PROGRAMS = {
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_data_flow_through_programs(name):
+def test_dependence_through_programs(name):
     fn, independent = PROGRAMS[name]
-    flow = DataFlow(fn, jnp.array(0.5), jnp.array(0.3))
+    flow = Dependence(fn, jnp.array(0.5), jnp.array(0.3))
     assert flow.independent(lambda x, y: x) == independent
-    wrapped = DataFlow(jax.jit(jax.vmap(fn)), jnp.ones(3), jnp.ones(3))
+    wrapped = Dependence(jax.jit(jax.vmap(fn)), jnp.ones(3), jnp.ones(3))
     assert wrapped.independent(lambda x, y: x) == independent
