@@ -1,4 +1,5 @@
-"""What all paths of a batch do together, and what only a few of them need."""
+"""What all paths of a batch do together, what only a few of them need, and what is kept in
+memory for all of them."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -95,3 +96,22 @@ def _by_parts(call, pending, value, own, common):
 
     some_pending = lambda carry: jnp.any(carry[0])
     return lax.while_loop(some_pending, serve_part, (pending, value))[1]
+
+
+def materialize(fn: Callable[[], _T]) -> _T:
+    """`fn()`, computed once and kept in memory.
+
+    On CPUs, XLA may fuse a computation into every kernel that reads its result, and so
+    repeat it in each. For Gaussian numbers and transcendental functions this costs more
+    than it saves. XLA fuses nothing across the border of a conditional. So `fn` is called
+    in one branch of a conditional, and the barrier hides from XLA that the condition is
+    always true.
+    """
+    fn = jax.jit(fn)  # traced once
+
+    def in_a_conditional() -> _T:
+        shapes = jax.eval_shape(fn)
+        zeros = lambda: jtu.tree_map(lambda s: lax.full_like(s, 0), shapes)
+        return lax.cond(lax.optimization_barrier(True), fn, zeros)
+
+    return lax.platform_dependent(cpu=in_a_conditional, default=fn)

@@ -10,8 +10,8 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from .._batch import most_of_batch
-from .._compat import materialize, ω
+from .._batch import materialize, most_of_batch
+from .._compat import ω
 from .._custom_types import IntScalarLike
 from ._tolerance import converged, Correction, log2, MARGIN, Tolerance
 

@@ -14,7 +14,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from .._compat import materialize, nondifferentiable
+from .._batch import materialize
+from .._compat import nondifferentiable
 from .._custom_types import RealScalarLike
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
-from .._compat import materialize, ω
+from .._batch import materialize
+from .._compat import ω
 from .._custom_types import RealScalarLike, Y
 from .._plan import Block, Plan
 from .._root_finder import (

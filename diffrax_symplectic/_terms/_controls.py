@@ -13,6 +13,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._batch import materialize
 from .._brownian import (
     AbstractLaw,
     AbstractWrappedPath,
@@ -27,7 +28,7 @@ from .._brownian import (
     VARIABLES,
     WeakBrownianPath,
 )
-from .._compat import direction, materialize, ω
+from .._compat import direction, ω
 from .._custom_types import Args, RealScalarLike
 from ._vector_fields import (
     apply,
