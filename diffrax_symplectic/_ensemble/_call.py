@@ -18,7 +18,7 @@ from .._custom_types import Args, Y
 from .._expectation._monte_carlo import path_keys, with_keys
 from .._expectation._run import checked_call
 from .._expectation._steps import Problem
-from ._engines import Batch, ENGINES
+from ._engines import Batch, ENGINES, state_itself
 from ._layout import sample_key
 
 
@@ -130,7 +130,7 @@ def ensemble(
     if engine not in ENGINES:
         raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
     times = [t1] if ts is None else ts
-    problem = Problem.of(_state, terms, solver, t0, t1, dt0, y0, args, times, 1)
+    problem = Problem.of(state_itself, terms, solver, t0, t1, dt0, y0, args, times, 1)
     if batch_size is None:
         batch_size = _default_size(engine, problem)
     size = whole_number("batch_size", batch_size)
@@ -146,11 +146,6 @@ def ensemble(
     at = float(problem.t0) + saved * float(problem.levels.h[0])
     _warn_of(joined, engine)
     return Ensemble(at, *joined, engine, terms, key)
-
-
-def _state(t, y, args):
-    del t, args
-    return y
 
 
 def _default_size(engine: str, problem: Problem) -> int:

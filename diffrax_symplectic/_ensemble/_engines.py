@@ -35,12 +35,20 @@ class Batch(NamedTuple):
     stragglers: int = 0
 
 
-def by_jax(p: Problem, key: PRNGKeyArray, numbers: np.ndarray) -> Batch:
+def state_itself(t, y, args):
+    """What a problem averages if it is the states that are asked for."""
+    del t, args
+    return y
+
+
+def by_jax(
+    p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0
+) -> Batch:
     """By the loop of `expectation`."""
     low = (numbers & np.uint64(0xFFFFFFFF)).astype(np.uint32)
     high = (numbers >> np.uint64(32)).astype(np.uint32)
     y, failed = jax.device_get(_paths(p, key, high, low))
-    return Batch(y, failed)
+    return Batch(jtu.tree_map(lambda x: x[level], y), failed[level])
 
 
 @eqx.filter_jit
@@ -50,20 +58,22 @@ def _paths(p: Problem, key: PRNGKeyArray, hi, lo):
     terms_of = lambda keys: with_keys(p.terms, keys)
     begin = lambda level: independent_steps(p, level, len(lo), terms_of, lambda i: own)
     out = samples(p, begin)
-    return jtu.tree_map(lambda x: x[0], out.values), ~out.good[0]
+    return out.values, ~out.good
 
 
-def by_drjit(p: Problem, key: PRNGKeyArray, numbers: np.ndarray) -> Batch:
+def by_drjit(
+    p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0
+) -> Batch:
     """By a fused kernel. Paths with a step that this does not solve, and those that fail,
     are taken by JAX.
 
     Raises an `ImportError` without Dr.Jit, and a `ValueError` for what it cannot do."""
     layout, arrays = split(p, key)
-    level, n = p.level(0), len(numbers)
+    grid, n = p.level(level), len(numbers)
     try:
         kernels = _kernels(layout)
-        paths, parameters = kernels.begin(arrays, key, level.h, int(numbers[0]), n)
-        saves = np.asarray(level.saved_steps)
+        paths, parameters = kernels.begin(arrays, key, grid.h, int(numbers[0]), n)
+        saves = np.asarray(grid.saved_steps)
         kept, done = {}, 0
         for step in np.unique(saves):
             if step > done:
@@ -83,7 +93,7 @@ def by_drjit(p: Problem, key: PRNGKeyArray, numbers: np.ndarray) -> Batch:
         return Batch(y, stopped)
     # So many that few programs are compiled, whatever their number is.
     size = min(n, 4 ** int(np.ceil(np.log(len(which)) / np.log(4))))
-    rest = by_jax(p, key, numbers[np.resize(which, size)])
+    rest = by_jax(p, key, numbers[np.resize(which, size)], level)
     y = jtu.tree_map(np.array, y)
     for x, own in zip(jtu.tree_leaves(y), jtu.tree_leaves(rest.y)):
         x[which] = own[: len(which)]
@@ -132,7 +142,7 @@ def _origin(location: str) -> str:
     return ""
 
 
-ENGINES: dict[str, Callable[[Problem, PRNGKeyArray, np.ndarray], Batch]] = {
+ENGINES: dict[str, Callable[..., Batch]] = {
     "jax": by_jax,
     "drjit": by_drjit,
 }
