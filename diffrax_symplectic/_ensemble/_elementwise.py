@@ -141,7 +141,9 @@ def _rsqrt(a):
 
 def _sinh(a):
     u = _expm1(drjit().abs(a))
-    return drjit().copysign(drjit().select(drjit().isinf(u), u, (u + u / (u + 1)) / 2), a)
+    return drjit().copysign(
+        drjit().select(drjit().isinf(u), u, (u + u / (u + 1)) / 2), a
+    )
 
 
 def _cosh(a):

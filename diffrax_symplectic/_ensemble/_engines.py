@@ -1,5 +1,5 @@
-"""The paths of a batch, by either engine. Both take a problem, the random key of all samples,
-and the numbers of those in the batch, which follow each other."""
+"""The paths of a batch, by either engine. Both take a problem, the random key of all
+samples, and the numbers of those in the batch, which follow each other."""
 
 import functools as ft
 import re
@@ -9,17 +9,15 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Bool, PRNGKeyArray, PyTree
 
 from .._expectation._monte_carlo import path_keys, with_keys
 from .._expectation._steps import independent_steps, Problem, samples
-from ._backend import drjit
 from ._kernels import Kernels
 from ._layout import sample_key, split
-from ._operations import NotReplayed
+from ._operation import NotReplayed
 
 
 class Batch(NamedTuple):
@@ -41,9 +39,7 @@ def state_itself(t, y, args):
     return y
 
 
-def by_jax(
-    p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0
-) -> Batch:
+def by_jax(p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0) -> Batch:
     """By the loop of `expectation`."""
     low = (numbers & np.uint64(0xFFFFFFFF)).astype(np.uint32)
     high = (numbers >> np.uint64(32)).astype(np.uint32)

@@ -124,8 +124,8 @@ class Kernels:
     def begin(
         self, arrays: list[Array], key: PRNGKeyArray, h: Array, first: int, n: int
     ):
-        """The paths of `n` samples from number `first` on; and the parameters of their steps
-        of size `h`."""
+        """The paths of `n` samples from number `first` on; and the parameters of their
+        steps of size `h`."""
         dr, kinds = drjit(), array_types()
         own = self._keys.entries(0) + self._keys.entries(1)
         numbers = dr.arange(kinds["ui64"], n) + first

@@ -87,7 +87,7 @@ def split(problem: Problem, key: PRNGKeyArray) -> tuple[Layout, list[Array]]:
     arrays = [jnp.asarray(x) if is_array(x) else None for x in leaves]
     static = tuple(None if is_array(x) else x for x in leaves)
     struct = lambda x: None if x is None else jax.ShapeDtypeStruct(x.shape, x.dtype)
-    settings = jax.default_backend(), jax.config.jax_enable_x64
+    settings = jax.default_backend(), jax.config.read("jax_enable_x64")
     impl = str(jr.key_impl(key))
     layout = Layout(treedef, static, tuple(map(struct, arrays)), impl, settings)
     return layout, [x for x in arrays if x is not None]

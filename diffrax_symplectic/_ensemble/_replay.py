@@ -3,7 +3,8 @@
 from collections import ChainMap
 from typing import Any
 
-from ._operations import NotReplayed, Operation, rule_of
+from ._operation import NotReplayed, Operation
+from ._operations import rule_of
 from ._tensor import Tensor
 
 

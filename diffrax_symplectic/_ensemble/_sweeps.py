@@ -43,7 +43,7 @@ class _State(NamedTuple):
     y: Halves
     size: Scalar
     solved: Bool[Array, ""]
-    count: Array
+    done: Array
 
 
 def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, ""]):
@@ -70,7 +70,9 @@ def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, 
     weights = [_inverse(unit * x) for x in scales]
     rounding = _ROUNDING * unit * _largest(scales)
 
-    def check(old: Halves, new: Halves, before: Scalar) -> tuple[Scalar, Bool[Array, ""]]:
+    def check(
+        old: Halves, new: Halves, before: Scalar
+    ) -> tuple[Scalar, Bool[Array, ""]]:
         """The size of a correction, after one of size `before`, and whether it is the last
         that is needed."""
         gaps = _sizes(system.correction(old, new))
@@ -92,10 +94,10 @@ def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, 
     def step(last: _State) -> _State:
         y = once(last.y, omega)
         size, solved = check(last.y, y, last.size)
-        return _State(y, size, solved, last.count + 1)
+        return _State(y, size, solved, last.done + 1)
 
     def going(last: _State) -> Bool[Array, ""]:
-        return ~last.solved & (last.count < _MOST_SWEEPS) & (last.size < _HUGE)
+        return ~last.solved & (last.done < _MOST_SWEEPS) & (last.size < _HUGE)
 
     state = _State(third, size, ~pending | solved, jnp.full((), 3, jnp.int32))
     last = lax.while_loop(going, step, state)

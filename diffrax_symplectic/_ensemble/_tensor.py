@@ -1,7 +1,7 @@
 """Arrays of JAX as lists of Dr.Jit arrays: one entry of each, for all paths."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,6 +62,6 @@ def flat(xs: Sequence[Tensor]) -> tuple:
     return tuple(entry for x in xs for entry in x.entries)
 
 
-def unflat(entries: Sequence[Any], shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
+def unflat(entries: Iterable[Any], shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
     left = iter(entries)
     return [Tensor([next(left) for _ in range(math.prod(s))], s) for s in shapes]

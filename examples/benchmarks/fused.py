@@ -2,8 +2,8 @@
 
     pip install '.[fused,examples]' && python -m examples.benchmarks.fused
 
-Prints the tables of `docs/ensembles.md` and draws its picture. What a call costs in any case
-is left out: nanoseconds are those of the steps that a longer call takes more.
+Prints the table of `docs/ensembles.md` and draws its picture. What a call costs in any
+case is left out: nanoseconds are those of the steps that a longer call takes more.
 """
 
 import re
@@ -132,7 +132,10 @@ def nanoseconds(case: Case, n: int, steps: int, dtype=jnp.float64, rounds: int =
 
 def by_c() -> Callable[[int], dict[float, float]]:
     """From a number of paths to the nanoseconds of a program in C, for its step sizes."""
-    source, binary = Path(__file__).with_name("midpoint.c"), tempfile.mkdtemp() + "/midpoint"
+    source, binary = (
+        Path(__file__).with_name("midpoint.c"),
+        tempfile.mkdtemp() + "/midpoint",
+    )
     flags = "-O3", "-march=native", "-ffast-math", "-fopenmp"
     subprocess.run(["gcc", *flags, str(source), "-o", binary, "-lm"], check=True)
 
@@ -169,7 +172,9 @@ def draw(c: Callable) -> None:
     rows = [nanoseconds(midpoint(0.01), n, max(4, 2**16 // n)) for n in numbers]
     fig, ax = plt.subplots(figsize=(5, 3.2), layout="constrained")
     ax.loglog(numbers, [b for _, b in rows], "o-", label="vmap(diffeqsolve)")
-    ax.loglog(numbers, [a for a, _ in rows], "s-", label='ensemble(..., engine="drjit")')
+    ax.loglog(
+        numbers, [a for a, _ in rows], "s-", label='ensemble(..., engine="drjit")'
+    )
     ax.loglog(numbers, [c(n)[0.01] for n in numbers], "^--", label="a program in C")
     ax.set(xlabel="paths", ylabel="nanoseconds a path and step", ylim=(1, None))
     ax.legend(frameon=False, fontsize=8)
