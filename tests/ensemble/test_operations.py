@@ -91,7 +91,8 @@ CASES = {
     "add": (jnp.add, [(F, ()), (F, ())], 0),
     "add of integers": (jnp.add, [(U, ()), (U, ())], 0),
     "and": (jnp.bitwise_and, [(I, ()), (I, ())], 0),
-    "asin": (unit(jnp.arcsin), [(F, ())], 4),
+    # JAX 0.12's own, in single precision and without optimizations, is off by 10.
+    "asin": (unit(jnp.arcsin), [(F, ())], 12),
     "asinh": (domain(-1e9, 1e9)(jnp.arcsinh), [(F, ())], 4),
     "atan": (jnp.arctan, [(F, ())], 16),
     "atan2": (lambda y, x: jnp.arctan2(jnp.clip(y, -9, 9), jnp.clip(x, -9, 9)), [(F, ()), (F, ())], 16),
