@@ -228,6 +228,7 @@ def test_without_drjit_an_error_says_how_to_install_it(monkeypatch, fresh):
 
 
 @needs_drjit
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="a GPU needs no LLVM")
 def test_without_llvm_an_error_says_how_to_install_it(monkeypatch, fresh):
     monkeypatch.setattr(_backend.drjit(), "has_backend", lambda backend: False)
     with pytest.raises(ImportError, match="libllvm19.*DRJIT_LIBLLVM_PATH"):

@@ -183,6 +183,13 @@ CASES = {
 }  # fmt: skip
 
 
+# In single precision Dr.Jit takes these from a GPU's hardware, whose error is absolute.
+HARDWARE = (
+    "sine", "cosine", "exponential", "log", "log_plus_one", "exponential_minus_one",
+    "sinh", "tanh",
+)  # fmt: skip
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["f32", "f64"])
 @pytest.mark.parametrize("name", CASES)
 def test_a_replayed_operation_gives_what_jax_gives(name, dtype):
@@ -195,6 +202,9 @@ def test_a_replayed_operation_gives_what_jax_gives(name, dtype):
         eps = np.finfo(dtype).eps
         ok = np.all([np.abs(x.reshape(LANES, -1)).max(1) < 1e6 for x in args if x.dtype == dtype], axis=0)  # fmt: skip
         np.testing.assert_allclose(actual[ok], exact[ok], rtol=0, atol=200 * eps)
+    elif name in HARDWARE and dtype == np.float32 and jax.default_backend() != "cpu":
+        ok = np.isfinite(exact)
+        np.testing.assert_allclose(actual[ok], exact[ok], rtol=1e-6, atol=1e-6)
     else:
         assert_close(actual, exact, ulps)
 
