@@ -18,16 +18,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree
 
 from ._arguments import check_solver, check_takes, shapes
-from ._brownian import (
-    FixedStepBrownianPath,
-    LevyAreaBrownianPath,
-    LevyAreaIncrement,
-    PlateauBrownianPath,
-    PlateauIncrement,
-)
 from ._custom_types import Args, RealScalarLike, Y
-from ._solver import AbstractSymplecticSolver, Want
-from ._suggest import suggest_solver, with_paths
+from ._suggest import path_for, suggest_solver, with_paths
 from ._terms import check_stratonovich
 
 
@@ -193,11 +185,11 @@ def compare_solvers(
     cell = min(dts) / _FINER
 
     def own_path(solver):
-        return lambda shape, key: _path(solver, want, None, shape, key)
+        return lambda shape, key: path_for(solver, want, None, shape, key)
 
     def error_path(solver):
         # Strong errors are along one Brownian motion, which not all solvers can follow.
-        common = lambda shape, key: _path(solver, None, cell, shape, key)
+        common = lambda shape, key: path_for(solver, None, cell, shape, key)
         return common if phi is None else own_path(solver)
 
     def batch(solver, make_path):
@@ -275,22 +267,6 @@ def _mean(x: np.ndarray, okay: np.ndarray) -> tuple[float, float]:
         warnings.simplefilter("ignore", RuntimeWarning)  # no path is left
         kept = x[okay].astype(np.float64)
         return float(np.mean(kept)), float(np.std(kept) / np.sqrt(len(kept)))
-
-
-def _path(solver, want: Want | None, cell, shape, key) -> diffrax.AbstractBrownianPath:
-    """The path that a solver chooses for itself; without `want` or for other solvers
-    Gaussian increments, over cells the same Brownian motion for all."""
-    if want is not None and isinstance(solver, AbstractSymplecticSolver):
-        return solver.path(shape, key, want=want)
-    area = diffrax.SpaceTimeLevyArea
-    path = FixedStepBrownianPath(shape, key, levy_area=area, cell=cell)
-    needs = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
-    if needs is PlateauIncrement:
-        return PlateauBrownianPath(path, key)
-    if needs is LevyAreaIncrement:
-        num_terms = 0 if cell else 2
-        return LevyAreaBrownianPath(path, key, num_terms=num_terms, cell=cell)
-    return path
 
 
 def _check_solvers(solvers, reference) -> None:

@@ -15,9 +15,7 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from .._root_finder import (
     AbstractBlocks,
     all_finite,
-    Doubled,
     Halves,
-    Partitioned,
     PicardNewton,
 )
 from .._solver import AbstractImplicitStages
@@ -53,20 +51,27 @@ def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, 
     As in [`diffrax_symplectic.PicardNewton`][], but that a path is alone: in a fused kernel
     each ends by itself, and a convergence check after each sweep costs little.
     """
-    system = (Partitioned if isinstance(guess, Halves) else Doubled)(image)
-    start = system.start(guess)
+    paired = isinstance(guess, Halves)
+    # What has no halves is iterated as a doubled system, y = \Phi(z), z = \Phi(y). Where
+    # both solve y = \Phi(\Phi(y)), only their difference shows it.
+    start = guess if paired else Halves(guess, guess)
+    p = lambda y: image(y).p if paired else image(y.q)
+    q = lambda y: image(y).q if paired else image(y.p)
+    value = lambda y: y if paired else y.q
+    minus = lambda y, z: jtu.tree_map(lambda a, b: a - b, y, z)
+    correction = lambda old, new: minus(new, old) if paired else minus(new.q, new.p)
     one = jnp.ones((), jnp.result_type(*jtu.tree_leaves(guess)))
     unit = 2 * jnp.finfo(one.dtype).eps
 
     def once(y: Halves, omega: Scalar) -> Halves:
         behind = lambda x, old: jtu.tree_map(lambda a, b: b + omega * (a - b), x, old)
         relaxed = (lambda x, _: x) if omega is one else behind
-        y = Halves(relaxed(system.p(y), y.p), y.q)
-        return Halves(y.p, relaxed(system.q(y), y.q))
+        y = Halves(relaxed(p(y), y.p), y.q)
+        return Halves(y.p, relaxed(q(y), y.q))
 
     first = once(start, one)
     # The tolerance is that of the state after the first sweep, which there is in any case.
-    scales = _sizes(scale(system.value(first)))
+    scales = _sizes(scale(value(first)))
     weights = [_inverse(unit * x) for x in scales]
     rounding = _ROUNDING * unit * _largest(scales)
 
@@ -75,7 +80,7 @@ def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, 
     ) -> tuple[Scalar, Bool[Array, ""]]:
         """The size of a correction, after one of size `before`, and whether it is the last
         that is needed."""
-        gaps = _sizes(system.correction(old, new))
+        gaps = _sizes(correction(old, new))
         size = _largest([x * weight for x, weight in zip(gaps, weights)])
         below = _MARGIN * size * jnp.where(size < before, size, before) <= before
         return size, below | ((size >= 0.9 * before) & (_largest(gaps) <= rounding))
@@ -101,7 +106,7 @@ def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, 
 
     state = _State(third, size, ~pending | solved, jnp.full((), 3, jnp.int32))
     last = lax.while_loop(going, step, state)
-    return system.value(last.y), last.solved
+    return value(last.y), last.solved
 
 
 def _inverse(x: Scalar) -> Scalar:

@@ -57,7 +57,7 @@ def expectation(
         jax.config.update("jax_enable_x64", True)
         H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
         noise = lambda t, p, q, args: 0.2 * jnp.sin(q)
-        terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+        terms = ds.hamiltonian_terms(H0, noise, ())  # the shape of one noise
         estimate = ds.expectation(
             lambda t, y, args: y[1] ** 2,
             terms,
@@ -94,8 +94,9 @@ def expectation(
 
     - `phi`: takes time, state and `args` to a PyTree of real arrays.
     - `terms`, `solver`, `t0`, `t1`, `dt0`, `y0`, `args`: as for `diffrax.diffeqsolve`,
-        with `t1` after `t0` by a whole number of steps `dt0`. The paths in `terms` say
-        which random variables there are, and paths with equal keys are one Brownian
+        with `t1` after `t0` by a whole number of steps `dt0`. `terms` may have the
+        shape of a path in its place; then the path is the one that the solver needs. Paths
+        say which random variables there are, and paths with equal keys are one Brownian
         motion. Any solver of this package, and those of Diffrax with
         fixed steps for Stratonovich equations.
     - `key`: a JAX random key.

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
@@ -16,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from .._arguments import check_solver, check_takes, whole_number
 from .._custom_types import Args, RealScalarLike, Y
 from .._root_finder import all_finite
+from .._suggest import path_for, specified
 from .._terms import (
     additive_fault,
     brownian_paths,
@@ -65,6 +67,9 @@ class Problem(eqx.Module):
             raise ValueError(
                 "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
             )
+        # Each path gets a key of its own.
+        make = lambda shape: path_for(solver, "weak", None, shape, jr.key(0))
+        terms = specified(terms, make)
         saved_steps, num_steps = _steps(t0, t1, dt0, ts)
         y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
         if not all_finite(y0):

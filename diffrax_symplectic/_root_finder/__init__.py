@@ -3,5 +3,5 @@ from ._picard_newton import (
     AbstractBlocks as AbstractBlocks,
     PicardNewton as PicardNewton,
 )
-from ._sweeps import Doubled as Doubled, Halves as Halves, Partitioned as Partitioned
+from ._sweeps import Halves as Halves
 from ._tolerance import all_finite as all_finite
