@@ -19,7 +19,7 @@ The state is a pair `(p, q)`, momenta first. Begin like this:
 - Terms: `hamiltonian_terms`, `spin_terms`, `wave_terms`.
 - Which solver: `suggest_solver`, `compare_solvers`. The first to try: `ImplicitMidpoint`.
 - Its Brownian path: `solver.path(shape, key)`.
-- Means over many paths: `expectation`.
+- Means over many paths: `expectation`. Their states: `ensemble`.
 - Friction: `BAOAB`, `Damped`. Stiff linear parts: `LinearFlow`.
 - Gradients of long solves: `ReversingAdjoint`.
 - Tests of one step: `symplecticity_defect`, `weak_order_defect`.
@@ -46,6 +46,7 @@ from ._conditions import (
     symplectic_residuals as symplectic_residuals,
     weak_order_residuals as weak_order_residuals,
 )
+from ._ensemble import Ensemble as Ensemble, ensemble as ensemble
 from ._expectation import (
     ArrayRQMC as ArrayRQMC,
     Expectation as Expectation,

@@ -98,11 +98,11 @@ def place_of(t0, t1) -> Place:
     longer than it, so that two steps have the same integers only if they overlap. The two
     odd constants keep round numbers away from where the roundings change.
     """
-    unit, exponent = _power_of_two(jnp.abs(t1 - t0) * 1.37)
+    per_unit, exponent = _inverse_power_of_two(jnp.abs(t1 - t0) * 1.37)
     # The middle itself would be rounded to the resolution of time. Late in a long solve
     # in float32 that is not far below the step, and two steps may have one middle. So the
     # integer part of the start, which is exact, is split off before half a step is added.
-    start, half = t0 / unit, (t1 - t0) / 2 / unit
+    start, half = t0 * per_unit, (t1 - t0) / 2 * per_unit
     whole = jnp.floor(start)
     rest = jnp.floor(start - whole + half + 0.29)
     # Starts again after 2^31 counts, or fewer where these are more than there are numbers.
@@ -111,15 +111,17 @@ def place_of(t0, t1) -> Place:
     return whole.astype(jnp.int32) + rest.astype(jnp.int32), exponent
 
 
-def _power_of_two(x: Array) -> tuple[Array, Integer[Array, ""]]:
-    """The power of two from a quarter to half of a positive number, and its exponent, by
-    the bits of the number: `jnp.frexp` and `jnp.ldexp` take as long as a random word."""
+def _inverse_power_of_two(x: Array) -> tuple[Array, Integer[Array, ""]]:
+    """One over the power of two from a quarter to half of a positive number, and the
+    exponent of the number, by its bits: `jnp.frexp`, `jnp.ldexp` and a division take as
+    long as a random word."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(x, f"int{info.bits}")
     biased = bits >> info.nmant
-    power = lax.bitcast_convert_type(biased << info.nmant, x.dtype) / 2
-    exponent = biased.astype(jnp.int32) - (2 ** (info.nexp - 1))
-    return jnp.where(power > 0, power, 1), exponent
+    bias = 2 ** (info.nexp - 1) - 1
+    inverse = lax.bitcast_convert_type((2 * bias - biased) << info.nmant, x.dtype) * 2
+    exponent = biased.astype(jnp.int32) - (bias + 1)
+    return jnp.where(biased > 0, inverse, 1), exponent
 
 
 class AbstractLaw(abc.ABC):

@@ -3,7 +3,7 @@
 import collections
 import dataclasses
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -111,7 +111,12 @@ def run(
         sampler = lambda keys: plan.sampler(keys)
     mesh = Mesh(np.array(devices), ("samples",))
 
-    def batch(at: int) -> tuple:
+    def sampler_at(at: int) -> Callable:
+        if plan.paths_of is None:
+            return sampler
+        return jtu.Partial(sampler, plan.paths_of(at, size))
+
+    def batch(at: int, sampler: Callable) -> tuple:
         lo_hi = np.array([at & 0xFFFFFFFF, at >> 32], np.uint32)
         left = np.array(max(0, min(size * len(devices), most - at)), np.int32)
         if len(devices) == 1:
@@ -124,7 +129,7 @@ def run(
         first, at = begin.start.moments[0].begin, begin.start.moments[-1].end
     most = first + plan.num_samples
     # JAX caches this trace and uses it for the first batch.
-    shapes = eqx.filter_eval_shape(batch, at)[2]
+    shapes = eqx.filter_eval_shape(batch, at, sampler_at(at))[2]
     zeros = jtu.tree_map(lambda s: np.zeros(s.shape[1:]), shapes)
     dtypes = jtu.tree_map(lambda s: str(s.dtype), shapes)
     none = Moments(at, at, 0, 0, zeros, zeros, zeros, zeros, dtypes)
@@ -154,7 +159,7 @@ def run(
         while True:
             more = at < most and not reached()
             if more:
-                running.append(batch(at))
+                running.append(batch(at, sampler_at(at)))
                 at += size * len(devices)
             # One batch is computed while the one before it is added up.
             if len(running) > more:

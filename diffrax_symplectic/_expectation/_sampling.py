@@ -45,9 +45,11 @@ class Plan(NamedTuple):
     - `least`: fewer samples than this do not tell their spread well enough to stop.
     - `reason`: what the result says of how they were chosen.
     - `far`, `roundings`: as in an estimate.
+    - `paths_of`: takes the number of the first sample, and how many there are, to what the
+        sampler takes before the keys, if that is made by no program of JAX.
     """
 
-    sampler: Callable[[PRNGKeyArray], Samples]
+    sampler: Callable[..., Samples]
     num_samples: int
     batch_size: int
     paths: int = 1
@@ -55,6 +57,7 @@ class Plan(NamedTuple):
     reason: str = ""
     far: PyTree[np.ndarray] | None = None
     roundings: int = 1
+    paths_of: Callable[[int, int], Any] | None = None
 
 
 class AbstractSampling(eqx.Module):

@@ -1,0 +1,56 @@
+"""Dr.Jit, and the types of its arrays on the devices of JAX. It is no dependency of this
+package, so it is imported only where it is used."""
+
+import functools as ft
+import importlib
+from typing import Any
+
+import jax
+
+
+_HOW = (
+    "Install it with `pip install '.[fused]'` in a checkout (or `pip install 'drjit>=1.5'`)"
+    '; or pass `engine="jax"`, which needs nothing else.'
+)
+_LLVM = (
+    'On a CPU `engine="drjit"` needs a shared library of LLVM, and Dr.Jit found none. '
+    "Install one (Debian and Ubuntu: `apt-get install libllvm19`; conda-forge: `libllvm`; "
+    "Homebrew: `llvm`), and if it lies where Dr.Jit does not look, set the environment "
+    "variable `DRJIT_LIBLLVM_PATH` to the file before you start Python."
+)
+_CUDA = (
+    "JAX runs on a GPU, but Dr.Jit found no driver of CUDA. Start Python with "
+    '`JAX_PLATFORMS=cpu` to use the CPU, or pass `engine="jax"`.'
+)
+
+
+@ft.cache
+def drjit() -> Any:
+    """The module. Raises an `ImportError` that says how to install it."""
+    try:
+        return importlib.import_module("drjit")
+    except ImportError as error:
+        message = f'`engine="drjit"` needs Dr.Jit, which cannot be imported. {_HOW}'
+        raise ImportError(message) from error
+
+
+@ft.cache
+def array_types() -> dict[str, Any]:
+    """The types of arrays on JAX's default device, by the names that StableHLO has for
+    those of their entries. Raises an `ImportError` if Dr.Jit cannot compile for it."""
+    dr, on_cpu = drjit(), jax.default_backend() == "cpu"
+    needed = dr.JitBackend.LLVM if on_cpu else dr.JitBackend.CUDA
+    if not dr.has_backend(needed):
+        raise ImportError(_LLVM if on_cpu else _CUDA)
+    types = importlib.import_module("drjit.llvm" if on_cpu else "drjit.cuda")
+    return {
+        "f32": types.Float,
+        "f64": types.Float64,
+        "i1": types.Bool,
+        "i8": types.Int8,
+        "i32": types.Int,
+        "i64": types.Int64,
+        "ui8": types.UInt8,
+        "ui32": types.UInt,
+        "ui64": types.UInt64,
+    }

@@ -1,0 +1,87 @@
+"""Operations that run their regions: conditionals and loops."""
+
+from typing import Any
+
+from ._backend import drjit
+from ._operation import NotReplayed, rule
+from ._tensor import flat, known, Tensor, unflat
+
+
+@rule
+def _optimization_barrier(o, *xs):
+    return [*xs]
+
+
+@rule
+def _sharding_constraint(o, x):
+    return [x]
+
+
+@rule
+def _custom_call(o, *xs):
+    raise NotReplayed(o.op, f"a call of `{o.op.attributes['call_target_name'].value}`")
+
+
+def _raises(region: Any) -> bool:
+    """Whether it calls back to Python, as `equinox.error_if` does to raise its error."""
+    calls = [op for op in region.blocks[0].operations if "custom_call" in op.name]
+    return any("callback" in op.attributes["call_target_name"].value for op in calls)
+
+
+@rule
+def _case(o, index):
+    value, number = known(index), len(o.op.regions)
+    if value is not None:
+        return o.run(int(value) if 0 <= value < number else number - 1, [])
+    branches = [i for i in range(number) if not _raises(o.op.regions[i])]
+    o.errors.extend(index.item() == i for i in range(number) if i not in branches)
+
+    def taken(left: list[int]) -> tuple:
+        """The first of the branches, or another one."""
+        first, *others = left
+        if not others:
+            return flat(o.run(first, []))
+        here = index.item() == first
+        run, rest = lambda: flat(o.run(first, [])), lambda: taken(others)
+        return o.recorded(drjit().if_stmt, (), here, run, rest)
+
+    return unflat(taken(branches), o.shapes())
+
+
+@rule
+def _if(o, condition):
+    value = known(condition)
+    if value is not None:
+        return o.run(0 if value else 1, [])
+    yes, no = (lambda i=i: flat(o.run(i, [])) for i in (0, 1))
+    out = o.recorded(drjit().if_stmt, (), condition.item(), yes, no)
+    return unflat(out, o.shapes())
+
+
+# The first so many times around, a loop is written out, as long as it is known to go on.
+_WRITTEN_OUT = 8
+
+
+@rule
+def _while(o, *xs):
+    body = o.op.regions[1].blocks[0]
+    returned = [*[*body.operations][-1].operands]
+    # What stays the same is no part of the loop's state, and constants stay known.
+    moves = [a != b for a, b in zip(returned, body.arguments)]
+    moving = lambda xs: [x for x, m in zip(xs, moves) if m]
+    xs, number = [*xs], 0
+    while (go := known(o.run(0, xs)[0])) is not None and number < _WRITTEN_OUT:
+        if not go:
+            return xs
+        xs, number = o.run(1, xs), number + 1
+    start, fixed = moving(xs), xs
+    shapes = [x.shape for x in start]
+
+    def whole(entries) -> list[Tensor]:
+        left = iter(unflat(entries, shapes))
+        return [next(left) if m else x for x, m in zip(fixed, moves)]
+
+    on = lambda *y: o.run(0, whole(y))[0].item()
+    once = lambda *y: flat(moving(o.run(1, whole(y))))
+    out = o.recorded(drjit().while_loop, flat(start), on, once, compress=False)
+    return whole(out)

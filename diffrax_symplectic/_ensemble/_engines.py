@@ -1,0 +1,144 @@
+"""The paths of a batch, by either engine. Both take a problem, the random key of all
+samples, and the numbers of those in the batch, which follow each other."""
+
+import functools as ft
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Bool, PRNGKeyArray, PyTree
+
+from .._expectation._monte_carlo import path_keys, with_keys
+from .._expectation._steps import independent_steps, Problem, samples
+from ._kernels import Kernels
+from ._layout import sample_key, split
+from ._operation import NotReplayed
+
+
+class Batch(NamedTuple):
+    """Paths, along the first axis of each array; the saved times come second.
+
+    - `y`: their states.
+    - `failed`: which failed. Of these the states mean nothing.
+    - `stragglers`: how many of them the other engine had to take.
+    """
+
+    y: PyTree[np.ndarray]
+    failed: Bool[np.ndarray, " n"]
+    stragglers: int = 0
+
+
+def state_itself(t, y, args):
+    """What a problem averages if it is the states that are asked for."""
+    del t, args
+    return y
+
+
+def by_jax(p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0) -> Batch:
+    """By the loop of `expectation`."""
+    low = (numbers & np.uint64(0xFFFFFFFF)).astype(np.uint32)
+    high = (numbers >> np.uint64(32)).astype(np.uint32)
+    y, failed = jax.device_get(_paths(p, key, high, low))
+    return Batch(jtu.tree_map(lambda x: x[level], y), failed[level])
+
+
+@eqx.filter_jit
+def _paths(p: Problem, key: PRNGKeyArray, hi, lo):
+    keys = jax.vmap(ft.partial(sample_key, key))(hi, lo)
+    own = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
+    terms_of = lambda keys: with_keys(p.terms, keys)
+    begin = lambda level: independent_steps(p, level, len(lo), terms_of, lambda i: own)
+    out = samples(p, begin)
+    return out.values, ~out.good
+
+
+def by_drjit(
+    p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0
+) -> Batch:
+    """By a fused kernel. Paths with a step that this does not solve, and those that fail,
+    are taken by JAX.
+
+    Raises an `ImportError` without Dr.Jit, and a `ValueError` for what it cannot do."""
+    layout, arrays = split(p, key)
+    grid, n = p.level(level), len(numbers)
+    try:
+        kernels = _kernels(layout)
+        paths, parameters = kernels.begin(arrays, key, grid.h, int(numbers[0]), n)
+        saves = np.asarray(grid.saved_steps)
+        kept, done = {}, 0
+        for step in np.unique(saves):
+            if step > done:
+                paths = kernels.advance(paths, parameters, done, int(step))
+            kept[step], done = [*map(np.asarray, paths.y)], step
+        stopped = np.asarray(paths.stopped)
+    except Exception as error:
+        if (refused := _refused(error)) is not None:
+            raise refused from None
+        raise
+    at_times = [
+        np.stack([kept[s][k] for s in saves], axis=1) for k in range(len(paths.y))
+    ]
+    y = _unraveled(p.y0, at_times)
+    (which,) = np.nonzero(stopped)
+    if len(which) == 0:
+        return Batch(y, stopped)
+    # So many that few programs are compiled, whatever their number is.
+    size = min(n, 4 ** int(np.ceil(np.log(len(which)) / np.log(4))))
+    rest = by_jax(p, key, numbers[np.resize(which, size)], level)
+    y = jtu.tree_map(np.array, y)
+    for x, own in zip(jtu.tree_leaves(y), jtu.tree_leaves(rest.y)):
+        x[which] = own[: len(which)]
+    failed = np.zeros(n, bool)
+    failed[which] = rest.failed[: len(which)]
+    return Batch(y, failed, len(which))
+
+
+@ft.lru_cache(maxsize=128)
+def _kernels(layout: Any) -> Kernels:
+    return Kernels(layout)
+
+
+def _unraveled(y0: PyTree, numbers: list[np.ndarray]) -> PyTree[np.ndarray]:
+    """Of the numbers of a state, each with axes for paths and times, the state."""
+    leaves, treedef = jtu.tree_flatten(y0)
+    ends = np.cumsum([0, *[x.size for x in leaves]])
+    stack = lambda x, i: np.stack(numbers[i : i + x.size], axis=-1)
+    each = [
+        stack(x, i).reshape(*numbers[0].shape, *x.shape) for x, i in zip(leaves, ends)
+    ]
+    return treedef.unflatten(each)
+
+
+def _refused(error: BaseException | None) -> ValueError | None:
+    """What a user gets to know if an operation cannot be replayed. Dr.Jit, which calls what
+    records a loop, wraps the error."""
+    while error is not None and not isinstance(error, NotReplayed):
+        error = error.__cause__ or error.__context__
+    if error is None:
+        return None
+    return ValueError(
+        f'`engine="drjit"` cannot replay {error}{_origin(error.location)}. Pass '
+        '`engine="jax"`, or write the function without it.'
+    )
+
+
+def _origin(location: str) -> str:
+    """The function of the user's that an operation comes from, if JAX has kept it: the
+    first one in no installed package."""
+    frames = re.findall(r'"([^"]*)"\("([^"]+)":(\d+)', location)
+    own = str(Path(__file__).parents[1])
+    for name, file, line in frames:
+        if "site-packages" not in file and not file.startswith(own):
+            return f", which `{name.split('.')[-1]}` needs ({file}, line {line})"
+    return ""
+
+
+ENGINES: dict[str, Callable[..., Batch]] = {
+    "jax": by_jax,
+    "drjit": by_drjit,
+}

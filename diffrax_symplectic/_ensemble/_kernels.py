@@ -1,0 +1,207 @@
+"""Kernels that take paths through their steps. Each is recorded and compiled once for a
+layout; step sizes, times, parameters and numbers of steps are what it reads."""
+
+import functools as ft
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PRNGKeyArray, PyTree
+
+from ._backend import array_types, drjit
+from ._layout import Layout
+from ._replay import Replay
+from ._tensor import flat, scalar, Tensor, unflat
+
+
+# The kernel of a larger system would take long to compile.
+_MOST_NUMBERS = 256
+# Where a function is recorded more often, Dr.Jit warns.
+_RECORDINGS = 100
+
+
+class Program:
+    """A function lowered for one path, and how its arguments lie in memory."""
+
+    def __init__(self, fn: Callable, *args: PyTree):
+        # For CPUs on any device: for others JAX calls libraries.
+        with jax.default_device(jax.devices("cpu")[0]):
+            lowered = jax.jit(fn, keep_unused=True).lower(*args)
+        self.replay = Replay(lowered.compiler_ir("stablehlo"))
+        types = iter(self.replay.arguments)
+        self.types = [[next(types) for _ in jtu.tree_leaves(x)] for x in args]
+
+    def entries(self, argument: int) -> list[str]:
+        """The types of the numbers of an argument."""
+        return [t for shape, t in self.types[argument] for _ in range(math.prod(shape))]
+
+    def tensors(self, argument: int, entries: Iterable[Any]) -> list[Tensor]:
+        return unflat(entries, [shape for shape, _ in self.types[argument]])
+
+
+def _packed(types: list[str], arrays: Iterable[Array]) -> dict[str, Any]:
+    """All numbers, those of each type in one array."""
+    of_type: dict[str, list] = {t: [] for t in types}
+    numbers = [x for a in arrays for x in _numbers(a).flat]
+    for t, x in zip(types, numbers, strict=True):
+        of_type[t].append(x)
+    # Memory of NumPy must not be freed while Dr.Jit records a function. Lists are copied.
+    return {t: array_types()[t]([v.item() for v in x]) for t, x in of_type.items()}
+
+
+def _unpacked(types: list[str], packed: dict[str, Any]) -> list[Any]:
+    """The same numbers as the kernel reads them."""
+    dr, count, out = drjit(), dict.fromkeys(packed, 0), []
+    for t in types:
+        place = array_types()["ui32"](count[t])
+        out.append(dr.gather(array_types()[t], packed[t], place))
+        count[t] += 1
+    return out
+
+
+def _numbers(x: Array) -> np.ndarray:
+    typed = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return np.asarray(jr.key_data(x) if typed else x)
+
+
+class Paths(NamedTuple):
+    """The paths of a batch. Each entry is an array with a lane for each of them.
+
+    - `keys`: the words of their random keys.
+    - `y`: the numbers of their states.
+    - `memory`: what the solver remembers of each.
+    - `stopped`: whether a step was not solved.
+    """
+
+    keys: list[Any]
+    y: list[Any]
+    memory: list[Any]
+    stopped: Any
+
+
+class Kernels:
+    """The kernels of a layout. Raises a `ValueError` for systems that are too large."""
+
+    def __init__(self, layout: Layout):
+        arrays, key = layout.arrays, layout.key
+        word, number = (jax.ShapeDtypeStruct((), x) for x in ("uint32", "int32"))
+        keys = jax.eval_shape(layout.path_keys, arrays, key, word, word)
+        y, memory = jax.eval_shape(layout.start, arrays, keys)
+        size = sum(math.prod(x.shape) for x in y)
+        if size > _MOST_NUMBERS:
+            raise ValueError(
+                f'`engine="drjit"` takes states of up to {_MOST_NUMBERS} numbers; got '
+                f'{size}. Pass `engine="jax"`.'
+            )
+        h = jax.ShapeDtypeStruct((), jnp.result_type(*y))
+
+        @jax.jit
+        def start(arrays, key):
+            of = jax.vmap(
+                lambda lo: layout.path_keys(arrays, key, jnp.zeros_like(lo), lo)
+            )
+            # No solver remembers random numbers at the start: all paths begin as one.
+            return jax.vmap(layout.start, (None, 0), None)(
+                arrays, of(jnp.zeros(1, word.dtype))
+            )
+
+        self._start = start
+        self._keys = Program(layout.path_keys, arrays, key, word, word)
+        self._step = Program(layout.step, arrays, keys, h, number, y, memory)
+        # What a step only hands on is a parameter.
+        begin = sum(map(len, self._step.types[:-1]))
+        handed_on = self._step.replay.handed_on[len(y) : -1]
+        self._moves = [i != begin + k for k, i in enumerate(handed_on)]
+        freeze = ft.partial(drjit().freeze, warn_after=_RECORDINGS)
+        self._make_keys = freeze(self._record_keys)
+        self._take_steps = freeze(self._record_steps)
+
+    def begin(
+        self, arrays: list[Array], key: PRNGKeyArray, h: Array, first: int, n: int
+    ):
+        """The paths of `n` samples from number `first` on; and the parameters of their
+        steps of size `h`."""
+        dr, kinds = drjit(), array_types()
+        own = self._keys.entries(0) + self._keys.entries(1)
+        numbers = dr.arange(kinds["ui64"], n) + first
+        hi, lo = kinds["ui32"](numbers >> 32), kinds["ui32"](numbers)
+        dr.eval(hi, lo)
+        keys = self._make_keys(_packed(own, [*arrays, key]), hi, lo)
+        y, memory = self._start(arrays, key)
+        fixed = [x for x, moves in zip(memory, self._moves) if not moves]
+        parameters = _packed(self._uniform, [*arrays, h, *fixed])
+
+        def for_all(types: list[str], leaves) -> list[Any]:
+            values = [x for leaf in leaves for x in _numbers(leaf).flat]
+            return [dr.opaque(kinds[t], x.item(), n) for t, x in zip(types, values)]
+
+        moving = [x for x, moves in zip(memory, self._moves) if moves]
+        y, memory = for_all(self._step.entries(4), y), for_all(self._moving, moving)
+        return Paths(keys, y, memory, dr.opaque(kinds["i1"], False, n)), parameters
+
+    def advance(self, paths: Paths, parameters, begin: int, end: int) -> Paths:
+        """The paths after the steps number `begin` to `end`, without that."""
+        number = ft.partial(drjit().opaque, array_types()["i32"])
+        y, memory, stopped = self._take_steps(
+            parameters, number(begin), number(end), *paths
+        )
+        return Paths(paths.keys, y, memory, stopped)
+
+    @property
+    def _uniform(self) -> list[str]:
+        fixed = self._types_of_memory(False)
+        return [*self._step.entries(0), *self._step.entries(2), *fixed]
+
+    @property
+    def _moving(self) -> list[str]:
+        return self._types_of_memory(True)
+
+    def _types_of_memory(self, moves: bool) -> list[str]:
+        pairs = zip(self._step.types[5], self._moves)
+        return [t for (s, t), m in pairs if m == moves for _ in range(math.prod(s))]
+
+    def _record_keys(self, packed, hi, lo) -> list[Any]:
+        program = self._keys
+        types = program.entries(0) + program.entries(1)
+        entries = iter(_unpacked(types, packed))
+        args = [*program.tensors(0, entries), *program.tensors(1, entries)]
+        out, _ = program.replay(*args, scalar(hi), scalar(lo))
+        return [*flat(out)]
+
+    def _record_steps(self, packed, begin, end, keys, y, memory, stopped):
+        dr, step = drjit(), self._step
+        entries = iter(_unpacked(self._uniform, packed))
+        arrays, h = step.tensors(0, entries), step.tensors(2, entries)
+        shapes = lambda moves: [
+            s for (s, _), m in zip(step.types[5], self._moves) if m == moves
+        ]
+        fixed = unflat(entries, shapes(False))
+        uniform = [*arrays, *step.tensors(1, iter(keys)), *h]
+
+        def once(i, stopped, *numbers):
+            left = iter(numbers)
+            y, moving = step.tensors(4, left), iter(unflat(left, shapes(True)))
+            still = iter(fixed)
+            memory = [next(moving if m else still) for m in self._moves]
+            out, errors = step.replay(*uniform, scalar(i), *y, *memory)
+            *out, success = out
+            for lost in (~success.item(), *errors):
+                stopped = stopped | lost
+            new = [*flat(out[: len(y)])]
+            new += flat([x for x, m in zip(out[len(y) :], self._moves) if m])
+            kept = [dr.select(stopped, a, b) for a, b in zip(numbers, new)]
+            return i + 1, stopped, *kept
+
+        _, stopped, *numbers = dr.while_loop(
+            (begin, stopped, *y, *memory),
+            lambda i, *_: i < end,
+            once,
+            mode="symbolic",
+            compress=False,
+        )
+        return numbers[: len(y)], numbers[len(y) :], stopped

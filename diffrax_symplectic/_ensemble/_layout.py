@@ -1,0 +1,93 @@
+"""What a fused kernel is compiled for, and what it only reads."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PRNGKeyArray
+
+from .._expectation._monte_carlo import path_keys, with_keys
+from .._expectation._steps import Level, Problem
+from ._sweeps import without_rescue
+
+
+class Layout(NamedTuple):
+    """What programs depend on: all of a `Problem` but the values of its arrays; the kind of
+    random key; and settings of JAX. It can be hashed."""
+
+    treedef: Any
+    static: tuple[Any, ...]
+    structs: tuple[jax.ShapeDtypeStruct | None, ...]
+    impl: str
+    settings: tuple[Any, ...]
+
+    @property
+    def arrays(self) -> list[jax.ShapeDtypeStruct]:
+        return [s for s in self.structs if s is not None]
+
+    @property
+    def key(self) -> Any:
+        return jax.eval_shape(lambda: jr.key(0, impl=self.impl))
+
+    def problem(self, arrays: Sequence[Array]) -> Problem:
+        left = iter(arrays)
+        pairs = zip(self.static, self.structs)
+        leaves = [x if s is None else next(left) for x, s in pairs]
+        return self.treedef.unflatten(leaves)
+
+    # The programs, each of one path
+
+    def path_keys(self, arrays: list[Array], key, hi, lo) -> list[Array]:
+        return path_keys(self.problem(arrays).terms, sample_key(key, hi, lo))
+
+    def start(self, arrays: list[Array], keys: list[Array]) -> tuple[list, list]:
+        """The leaves of the state, and of the state of the solver."""
+        p = self.problem(arrays)
+        state = p.init(with_keys(p.terms, keys), 0, p.levels.h[0], p.y0)
+        return jtu.tree_leaves(p.y0), jtu.tree_leaves(state)
+
+    def step(self, arrays, keys, h, i, y: list, state: list):
+        """The leaves after step number `i` of size `h`, and whether it succeeded."""
+        p = self.problem(arrays)
+        terms = with_keys(p.terms, keys)
+        likes = p.y0, eqx.filter_eval_shape(p.init, terms, 0, h, p.y0)
+        y, state = (
+            jtu.tree_unflatten(jtu.tree_structure(like), x)
+            for like, x in zip(likes, (y, state))
+        )
+        y, state, success = p.step(terms, i, h, y, state)
+        return jtu.tree_leaves(y), jtu.tree_leaves(state), success
+
+
+def sample_key(key: PRNGKeyArray, hi, lo) -> PRNGKeyArray:
+    """The key of sample number `hi * 2^32 + lo`."""
+    return jr.fold_in(jr.fold_in(key, hi), lo)
+
+
+def split(problem: Problem, key: PRNGKeyArray) -> tuple[Layout, list[Array]]:
+    """The layout and the arrays of a problem, with sweeps alone, and without the times and
+    numbers of its steps."""
+    none = jnp.zeros(1, jnp.int32)
+    bare = dataclasses.replace(
+        problem,
+        solver=without_rescue(problem.solver),
+        levels=Level(none, jnp.ones_like(problem.levels.h[:1]), none, none[None]),
+        weights=jnp.ones((1, 1)),
+        at_end=True,
+        max_steps=1,
+    )
+    is_array = lambda x: isinstance(x, jax.Array | np.ndarray)
+    leaves, treedef = jtu.tree_flatten(bare)
+    arrays = [jnp.asarray(x) if is_array(x) else None for x in leaves]
+    static = tuple(None if is_array(x) else x for x in leaves)
+    struct = lambda x: None if x is None else jax.ShapeDtypeStruct(x.shape, x.dtype)
+    settings = jax.default_backend(), jax.config.read("jax_enable_x64")
+    impl = str(jr.key_impl(key))
+    layout = Layout(treedef, static, tuple(map(struct, arrays)), impl, settings)
+    return layout, [x for x in arrays if x is not None]

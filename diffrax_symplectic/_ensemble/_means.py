@@ -1,0 +1,72 @@
+"""Samples of `expectation` by a fused kernel."""
+
+import dataclasses
+import functools as ft
+from typing import Any
+
+import jax
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
+
+from .._expectation._monte_carlo import IndependentPaths
+from .._expectation._sampling import Plan, Samples
+from .._expectation._steps import Problem
+from .._root_finder import all_finite
+from ._engines import by_drjit, state_itself
+
+
+# Paths in a batch, by default: many, for a call of the kernel.
+_BATCH = 2**19
+
+
+def fused_plan(
+    problem: Problem, key: PRNGKeyArray, sampling: Any, devices: tuple
+) -> Plan:
+    """A plan with the states of independent paths from a kernel, and $\\phi$ of them from
+    JAX. Raises a `ValueError` for another `sampling`, or several devices."""
+    if not isinstance(sampling, IndependentPaths):
+        raise ValueError(
+            '`engine="drjit"` takes independent paths: pass '
+            f"`sampling=IndependentPaths(num_paths)`; got sampling={sampling!r}."
+        )
+    if len(devices) > 1:
+        raise ValueError(
+            f'`engine="drjit"` uses all cores, or one GPU; got {len(devices)} devices. '
+            "Pass `devices=jax.devices()[:1]`."
+        )
+    states = dataclasses.replace(problem, phi=state_itself, at_end=False)
+
+    # The first batch is asked for twice.
+    @ft.lru_cache(maxsize=1)
+    def paths(first: int, n: int) -> tuple[PyTree[np.ndarray], np.ndarray]:
+        numbers = np.arange(first, first + n, dtype=np.uint64)
+        levels = range(len(problem.levels.h))
+        batches = [by_drjit(states, key, numbers, level) for level in levels]
+        stack = lambda *x: np.stack(x)
+        return jtu.tree_map(stack, *[b.y for b in batches]), stack(
+            *[b.failed for b in batches]
+        )
+
+    plan = sampling.plan(jtu.Partial(_samples, problem), devices)
+    if sampling.batch_size is None:
+        plan = plan._replace(batch_size=_BATCH)
+    return plan._replace(paths_of=paths)
+
+
+def _samples(
+    p: Problem,
+    paths: tuple[PyTree[Array], Bool[Array, "levels n"]],
+    keys: PRNGKeyArray,
+) -> Samples:
+    del keys
+    y, failed = paths
+
+    def values(level, y):
+        times = p.t0 + level.saved_steps * level.h
+        return jax.vmap(jax.vmap(p.values), (None, 0))(times, y)
+
+    phi = jax.vmap(values)(p.levels, y)
+    finite = jax.vmap(jax.vmap(all_finite))(phi)
+    phi = phi[:, :, 0] if p.at_end else phi
+    return Samples(p.unravel(phi), p.weights, ~failed & finite)

@@ -1,0 +1,273 @@
+"""Operations that move entries about, convert or combine them."""
+
+import itertools
+import math
+import operator
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from ._backend import array_types, drjit
+from ._operation import NotReplayed, Operation, rule
+from ._tensor import constant, each, flat, known, Tensor
+
+
+# Entries are moved about
+
+
+@rule
+def _constant(o):
+    return [
+        constant(o.kind, np.broadcast_to(np.asarray(o.op.attributes["value"]), o.shape))
+    ]
+
+
+@rule
+def _iota(o):
+    places = np.indices(o.shape)[o.number("iota_dimension")]
+    return [constant(o.kind, places)]
+
+
+@rule
+def _broadcast_in_dim(o, x):
+    sizes = [1] * len(o.shape)
+    for d, n in zip(o.ints("broadcast_dimensions"), x.shape):
+        sizes[d] = n
+    return [x.take(np.broadcast_to(x.places.reshape(sizes), o.shape))]
+
+
+@rule
+def _reshape(o, x):
+    return [Tensor(x.entries, o.shape)]
+
+
+@rule
+def _transpose(o, x):
+    return [x.take(x.places.transpose(o.ints("permutation")))]
+
+
+@rule
+def _slice(o, x):
+    ends = map(slice, *map(o.ints, ("start_indices", "limit_indices", "strides")))
+    return [x.take(x.places[tuple(ends)])]
+
+
+@rule
+def _reverse(o, x):
+    return [x.take(np.flip(x.places, o.ints("dimensions")))]
+
+
+@rule
+def _concatenate(o, *xs):
+    begins = np.cumsum([0, *[len(x.entries) for x in xs]])
+    places = [x.places + begin for x, begin in zip(xs, begins)]
+    whole = Tensor([*flat(xs)], ())
+    return [whole.take(np.concatenate(places, o.number("dimension")))]
+
+
+@rule
+def _pad(o, x, value):
+    low, inner = o.ints("edge_padding_low"), o.ints("interior_padding")
+    at = [a + np.arange(n) * (i + 1) for a, i, n in zip(low, inner, x.shape)]
+    inside = [(0 <= k) & (k < n) for k, n in zip(at, o.shape)]
+    places = np.full(o.shape, len(x.entries))
+    places[np.ix_(*[k[b] for k, b in zip(at, inside)])] = x.places[np.ix_(*inside)]
+    return [Tensor([*x.entries, value.item()], ()).take(places)]
+
+
+# An index of each path chooses by as many comparisons as there are places.
+_MOST_PLACES = 64
+
+
+def _windows(
+    o: Operation, x: Tensor, starts: Sequence[Tensor], sizes: Sequence[int]
+) -> Iterator[tuple[tuple[slice, ...], Any]]:
+    """Where a window of these sizes can be in `x`, and in which lanes it is there."""
+    axes = []
+    for start, n, size in zip(starts, x.shape, sizes):
+        most, value = n - size, known(start)
+        if most == 0 or value is not None:
+            axes.append([(0 if value is None else int(np.clip(value, 0, most)), True)])
+            continue
+        s = start.item()
+        first, last = [(0, s <= 0)], [(most, s >= most)]
+        axes.append([*first, *[(k, s == k) for k in range(1, most)], *last])
+    if (number := math.prod(map(len, axes))) > _MOST_PLACES:
+        what = f"`{o.op.name}` with an index of each path among {number} places"
+        raise NotReplayed(o.op, what)
+    for choice in itertools.product(*axes):
+        here = True
+        for _, also in choice:
+            here = also if here is True else here if also is True else here & also
+        yield tuple(slice(k, k + n) for (k, _), n in zip(choice, sizes)), here
+
+
+def _in_lanes(here: Any, new: Tensor, old: Tensor | None) -> Tensor:
+    if old is None or here is True:
+        return new
+    return each(lambda a, b: drjit().select(here, a, b), new, old)
+
+
+def _window(o: Operation, x: Tensor, starts, sizes) -> Tensor:
+    out = None
+    for window, here in _windows(o, x, starts, sizes):
+        out = _in_lanes(here, x.take(x.places[window]), out)
+    assert out is not None
+    return out
+
+
+@rule
+def _dynamic_slice(o, x, *starts):
+    return [_window(o, x, starts, o.shape)]
+
+
+@rule
+def _dynamic_update_slice(o, x, update, *starts):
+    out, both = None, Tensor([*flat([x, update])], ())
+    for window, here in _windows(o, x, starts, update.shape):
+        places = x.places.copy()
+        places[window] = len(x.entries) + update.places
+        out = _in_lanes(here, both.take(places), out)
+    assert out is not None
+    return [out]
+
+
+def _starts(o: Operation, name: str, x: Tensor, indices: Tensor, axes: list[int]):
+    """For each of `indices` where a window in `x` begins."""
+    if o.part(name, "operand_batching_dims") or o.part(name, "input_batching_dims"):
+        raise NotReplayed(o.op, f"`{o.op.name}` with an axis of a batch")
+    # Written only if it is not zero.
+    vector = sum(o.part(name, "index_vector_dim"))
+    places = indices.places.reshape(
+        *indices.shape, *[1] * (vector == len(indices.shape))
+    )
+    places = np.moveaxis(places, vector, -1)
+    zero = constant(type(indices.entries[0]), np.zeros(()))
+
+    def start(row: np.ndarray) -> list[Tensor]:
+        own = {axis: Tensor([indices.entries[i]], ()) for axis, i in zip(axes, row)}
+        return [own.get(d, zero) for d in range(len(x.shape))]
+
+    batch = places.shape[:-1]
+    return batch, [start(row) for row in places.reshape(math.prod(batch), -1)]
+
+
+@rule
+def _gather(o, x, indices):
+    name, sizes = "dimension_numbers", o.ints("slice_sizes")
+    batch, starts = _starts(o, name, x, indices, o.part(name, "start_index_map"))
+    windows = Tensor(
+        [*flat([_window(o, x, s, sizes) for s in starts])], (*batch, *sizes)
+    )
+    collapsed = tuple(len(batch) + d for d in o.part(name, "collapsed_slice_dims"))
+    places = windows.places.squeeze(collapsed)
+    moved = range(len(batch), places.ndim)
+    return [windows.take(np.moveaxis(places, moved, o.part(name, "offset_dims")))]
+
+
+@rule
+def _scatter(o, x, indices, updates):
+    name = "scatter_dimension_numbers"
+    inserted = o.part(name, "inserted_window_dims")
+    window = o.part(name, "update_window_dims")
+    sizes, left = [], iter(window)
+    for d in range(len(x.shape)):
+        sizes.append(1 if d in inserted else updates.shape[next(left)])
+    axes = o.part(name, "scatter_dims_to_operand_dims")
+    batch, starts = _starts(o, name, x, indices, axes)
+    source = np.moveaxis(updates.places, window, range(len(batch), updates.places.ndim))
+    out = [*x.entries]
+    for start, row in zip(starts, source.reshape(math.prod(batch), -1)):
+        values = [known(s) for s in start]
+        if any(v is None for v in values):
+            raise NotReplayed(o.op, f"`{o.op.name}` with an index of each path")
+        begin = [int(v) for v in values if v is not None]
+        fits = [0 <= b <= n - size for b, n, size in zip(begin, x.shape, sizes)]
+        if not all(fits):
+            continue  # It is dropped.
+        at = tuple(slice(b, b + size) for b, size in zip(begin, sizes))
+        for i, k in zip(x.places[at].flat, row):
+            one = [Tensor([e], ()) for e in (out[i], updates.entries[k])]
+            out[i] = o.run(0, one)[0].item()
+    return [Tensor(out, x.shape)]
+
+
+# Entries are converted
+
+
+@rule
+def _convert(o, x):
+    if o.kind is array_types()["i1"]:
+        return [each(lambda a: a if type(a) is o.kind else ~(a == 0), x)]
+    return [each(o.kind, x)]
+
+
+@rule
+def _bitcast_convert(o, x):
+    return [each(lambda a: drjit().reinterpret_array(o.kind, a), x)]
+
+
+@rule
+def _compare(o, a, b):
+    name = o.word("comparison_direction").lower()
+    if name == "ne":
+        # What is not a number differs from all. In Dr.Jit it does not.
+        return [each(lambda a, b: ~(a == b), a, b)]
+    return [each(getattr(operator, name), a, b)]
+
+
+# Entries are combined
+
+
+@rule
+def _dot_general(o, a, b):
+    part = lambda side, kind: o.part(
+        "dot_dimension_numbers", f"{side}_{kind}_dimensions"
+    )
+
+    def matrices(x: Tensor, side: str) -> np.ndarray:
+        batch, summed = part(side, "batching"), part(side, "contracting")
+        free = [d for d in range(len(x.shape)) if d not in (*batch, *summed)]
+        size = lambda axes: int(np.prod([x.shape[d] for d in axes]))
+        places = x.places.transpose(*batch, *free, *summed)
+        return places.reshape(size(batch), size(free), size(summed))
+
+    left, right = matrices(a, "lhs"), matrices(b, "rhs")
+    out = []
+    for k, i, j in np.ndindex(len(left), left.shape[1], right.shape[1]):
+        terms = [a.entries[m] * b.entries[n] for m, n in zip(left[k, i], right[k, j])]
+        out.append(sum(terms[1:], terms[0]) if terms else o.kind(0))
+    return [Tensor(out, o.shape)]
+
+
+@rule
+def _reduce(o, *xs):
+    axes, n = o.ints("dimensions"), len(xs) // 2
+    rest = [d for d in range(len(xs[0].shape)) if d not in axes]
+    kept = [xs[0].shape[d] for d in rest]
+    rows = xs[0].places.transpose(*rest, *axes).reshape(int(np.prod(kept)), -1)
+    outs = [[] for _ in range(n)]
+    for row in rows:
+        parts = [[Tensor([x.entries[i]], ()) for x in xs[:n]] for i in row]
+        # Most reductions begin with what changes nothing, such as zero in a sum.
+        total = parts.pop(0) if parts and _changes_nothing(o, xs[n:]) else [*xs[n:]]
+        for part in parts:
+            total = o.run(0, [*total, *part])
+        for out, t in zip(outs, total):
+            out.append(t.item())
+    return [Tensor(out, tuple(kept)) for out in outs]
+
+
+def _changes_nothing(o, starts) -> bool:
+    value = known(starts[0])
+    name = [*o.op.regions[0].blocks[0].operations][0].operation.name.split(".")[-1]
+    neutral = {
+        "add": 0,
+        "multiply": 1,
+        "maximum": -np.inf,
+        "minimum": np.inf,
+        "or": False,
+        "and": True,
+    }
+    return len(starts) == 1 and value is not None and neutral.get(name) == value

@@ -1,0 +1,76 @@
+"""A program that JAX has lowered for one path, carried out for many at once."""
+
+from collections import ChainMap
+from typing import Any
+
+from ._operation import NotReplayed, Operation
+from ._operations import rule_of
+from ._tensor import Tensor
+
+
+_RETURNS = ("func.return", "stablehlo.return")
+
+
+class Replay:
+    """A module of StableHLO as a function of tensors. Dr.Jit records its operations; they
+    become part of the kernel that it compiles for what calls this."""
+
+    def __init__(self, module: Any):
+        self._module = module  # It owns the operations.
+        self._errors: list[Any] = []
+        functions = [
+            f for f in module.body.operations if f.operation.name == "func.func"
+        ]
+        self._functions = {f.attributes["sym_name"].value: f for f in functions}
+
+    @property
+    def arguments(self) -> list[tuple[tuple[int, ...], str]]:
+        """Shape and type of each."""
+        types = [x.type for x in self._main.arguments]
+        return [(tuple(t.shape), str(t.element_type)) for t in types]
+
+    @property
+    def handed_on(self) -> list[int | None]:
+        """For each result the number of the argument that it is."""
+        (*_, last), arguments = self._main.operations, [*self._main.arguments]
+        where = lambda x: next((i for i, a in enumerate(arguments) if a == x), None)
+        return [where(x) for x in last.operands]
+
+    @property
+    def _main(self) -> Any:
+        return self._functions["main"].regions[0].blocks[0]
+
+    def __call__(self, *args: Tensor) -> tuple[list[Tensor], list[Any]]:
+        """The results, and masks of the lanes in which an error is raised."""
+        self._errors.clear()
+        return self._call("main", args), [*self._errors]
+
+    def _call(self, name: str, args) -> list[Tensor]:
+        return self._block(self._functions[name].regions[0].blocks[0], args, ChainMap())
+
+    def _block(self, block: Any, args, outer: ChainMap) -> list[Tensor]:
+        values = outer.new_child(dict(zip(block.arguments, args)))
+        for op in block.operations:
+            op = op.operation
+            operands = [values[x] for x in op.operands]
+            if op.name in _RETURNS:
+                return operands
+            values.update(zip(op.results, self._results(op, operands, values)))
+        raise AssertionError("A block ends with what it returns.")
+
+    def _results(
+        self, op: Any, operands: list[Tensor], values: ChainMap
+    ) -> list[Tensor]:
+        if op.name == "func.call":
+            try:
+                return self._call(op.attributes["callee"].value, operands)
+            except NotReplayed as error:
+                # Functions that are called know only their own operations.
+                error.location += str(op.location)
+                raise
+        run = lambda i, args: self._block(op.regions[i].blocks[0], args, values)
+        operation = Operation(op, run, self._errors)
+        rule = rule_of(operation.name)
+        if rule is None:
+            raise NotReplayed(op)
+        return rule(operation, *operands)

@@ -1,0 +1,169 @@
+"""The root finder of a fused step: sweeps of one path, and no rescue."""
+
+import functools as ft
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import optimistix as optx
+from jax import lax
+from jaxtyping import Array, Bool, PyTree, Scalar
+
+from .._root_finder import (
+    AbstractBlocks,
+    all_finite,
+    Halves,
+    PicardNewton,
+)
+from .._solver import AbstractImplicitStages
+
+
+# Where this many do not solve a step, the path is left to JAX's program.
+_MOST_SWEEPS = 48
+# Above this rate of convergence sweeps are relaxed.
+_SLOW = 0.3
+# The next correction is below two units in the last place by this factor: what is left out
+# has the same sign in every step, and adds up.
+_MARGIN = 64.0
+# Corrections of so many units of the largest value that no longer shrink are rounding.
+_ROUNDING = 50.0
+# Corrections beyond this many units lead nowhere.
+_HUGE = 1e30
+
+
+class _State(NamedTuple):
+    """The iterate; the size of its last correction in units of the tolerance; whether the
+    equations are solved; how many sweeps there were."""
+
+    y: Halves
+    size: Scalar
+    solved: Bool[Array, ""]
+    done: Array
+
+
+def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, ""]):
+    r"""Solves $y = \Phi(y)$ from a `guess`. Returns where it ended, and whether that is a
+    solution.
+
+    As in [`diffrax_symplectic.PicardNewton`][], but that a path is alone: in a fused kernel
+    each ends by itself, and a convergence check after each sweep costs little.
+    """
+    paired = isinstance(guess, Halves)
+    # What has no halves is iterated as a doubled system, y = \Phi(z), z = \Phi(y). Where
+    # both solve y = \Phi(\Phi(y)), only their difference shows it.
+    start = guess if paired else Halves(guess, guess)
+    p = lambda y: image(y).p if paired else image(y.q)
+    q = lambda y: image(y).q if paired else image(y.p)
+    value = lambda y: y if paired else y.q
+    minus = lambda y, z: jtu.tree_map(lambda a, b: a - b, y, z)
+    correction = lambda old, new: minus(new, old) if paired else minus(new.q, new.p)
+    one = jnp.ones((), jnp.result_type(*jtu.tree_leaves(guess)))
+    unit = 2 * jnp.finfo(one.dtype).eps
+
+    def once(y: Halves, omega: Scalar) -> Halves:
+        behind = lambda x, old: jtu.tree_map(lambda a, b: b + omega * (a - b), x, old)
+        relaxed = (lambda x, _: x) if omega is one else behind
+        y = Halves(relaxed(p(y), y.p), y.q)
+        return Halves(y.p, relaxed(q(y), y.q))
+
+    first = once(start, one)
+    # The tolerance is that of the state after the first sweep, which there is in any case.
+    scales = _sizes(scale(value(first)))
+    weights = [_inverse(unit * x) for x in scales]
+    rounding = _ROUNDING * unit * _largest(scales)
+
+    def check(
+        old: Halves, new: Halves, before: Scalar
+    ) -> tuple[Scalar, Bool[Array, ""]]:
+        """The size of a correction, after one of size `before`, and whether it is the last
+        that is needed."""
+        gaps = _sizes(correction(old, new))
+        size = _largest([x * weight for x, weight in zip(gaps, weights)])
+        below = _MARGIN * size * jnp.where(size < before, size, before) <= before
+        return size, below | ((size >= 0.9 * before) & (_largest(gaps) <= rounding))
+
+    second = once(first, one)
+    third = once(second, one)
+    before, _ = check(first, second, one)
+    size, solved = check(second, third, before)
+
+    def best() -> Scalar:
+        """The relaxation factor for the rate at which sweeps converge."""
+        return 2 / (1 + jnp.sqrt(1 + jnp.minimum(size / before, 4)))
+
+    omega = lax.cond(size > _SLOW * before, best, lambda: one)
+
+    def step(last: _State) -> _State:
+        y = once(last.y, omega)
+        size, solved = check(last.y, y, last.size)
+        return _State(y, size, solved, last.done + 1)
+
+    def going(last: _State) -> Bool[Array, ""]:
+        return ~last.solved & (last.done < _MOST_SWEEPS) & (last.size < _HUGE)
+
+    state = _State(third, size, ~pending | solved, jnp.full((), 3, jnp.int32))
+    last = lax.while_loop(going, step, state)
+    return value(last.y), last.solved
+
+
+def _inverse(x: Scalar) -> Scalar:
+    """Of a positive number, to within a factor of two: by its exponent, since a division
+    takes as long as a sweep. That of zero is large, not infinite."""
+    info = jnp.finfo(x.dtype)
+    kind = jnp.dtype(f"int{info.bits}")
+    one = int(np.asarray(1, x.dtype).view(kind))
+    exponent = lax.bitcast_convert_type(x, kind) >> info.nmant << info.nmant
+    return lax.bitcast_convert_type(jnp.asarray(2 * one, kind) - exponent, x.dtype)
+
+
+def _sizes(y: PyTree[Array]) -> list[Scalar]:
+    return [_largest([*jnp.abs(x).reshape(-1)]) for x in jtu.tree_leaves(y)]
+
+
+def _largest(x: list[Scalar]) -> Scalar:
+    # `jnp.maximum` would keep what is not a number, for the price of three operations. The
+    # end of the step shows that, too.
+    return ft.reduce(lambda a, b: jnp.where(a > b, a, b), x)
+
+
+class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
+    """Sweeps, and a failure where they do not solve the stage equations. All is done in
+    `init`: there are no steps after it."""
+
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable[[PyTree], Scalar] = optx.max_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        del fn, options, f_struct, aux_struct, tags
+        assert isinstance(args, AbstractBlocks)
+        zeros = jtu.tree_map(jnp.zeros_like, y)
+        return args.sweep(sweep, zeros, all_finite(y))
+
+    def step(self, fn, y, args, options, state, tags):
+        del fn, args, options, tags
+        return y, state, None
+
+    def terminate(self, fn, y, args, options, state, tags):
+        del fn, y, args, options, tags
+        return state[1], optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        del fn, y, args, options, tags, result
+        return state[0], aux, {}
+
+
+def without_rescue(solver: Any) -> Any:
+    """The same solver, and within it each that has a `PicardNewton`, with sweeps alone."""
+    is_implicit = lambda x: isinstance(x, AbstractImplicitStages)
+
+    def replace(x: Any) -> Any:
+        if not (is_implicit(x) and isinstance(x.root_finder, PicardNewton)):
+            return x
+        fields = lambda s: (s.root_finder, s.root_find_max_steps)
+        return eqx.tree_at(fields, x, (Sweeps(), 0))
+
+    return jtu.tree_map(replace, solver, is_leaf=is_implicit)

@@ -1,0 +1,67 @@
+"""Arrays of JAX as lists of Dr.Jit arrays: one entry of each, for all paths."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ._backend import drjit
+
+
+class Tensor(NamedTuple):
+    """An array in which each entry is an array of Dr.Jit, with a lane for each path. The
+    entries are in row-major order."""
+
+    entries: list[Any]
+    shape: tuple[int, ...]
+
+    @property
+    def places(self) -> np.ndarray:
+        """Where each entry is: what moves entries about is done to these numbers."""
+        return np.arange(len(self.entries)).reshape(self.shape)
+
+    def take(self, places: np.ndarray) -> "Tensor":
+        """The entries at these places."""
+        return Tensor([self.entries[i] for i in places.flat], places.shape)
+
+    def item(self) -> Any:
+        (entry,) = self.entries
+        return entry
+
+
+def scalar(entry: Any) -> Tensor:
+    return Tensor([entry], ())
+
+
+def constant(kind: type, values: np.ndarray) -> Tensor:
+    return Tensor([kind(x.item()) for x in values.flat], values.shape)
+
+
+def known(x: Tensor) -> np.ndarray | None:
+    """The values, if Dr.Jit knows them: those of constants, and what it made of these."""
+    literal = drjit().VarState.Literal
+    if not all(e.state == literal for e in x.entries):
+        return None
+    return np.array([e[0] for e in x.entries]).reshape(x.shape)
+
+
+def each(fn: Callable, *xs: Tensor) -> Tensor:
+    """A function of the entries. One entry stands for as many as the others have."""
+    size = max(xs, key=lambda x: len(x.entries))
+    spread = [
+        x.entries
+        if len(x.entries) == len(size.entries)
+        else x.entries * len(size.entries)
+        for x in xs
+    ]
+    return Tensor([fn(*es) for es in zip(*spread)], size.shape)
+
+
+def flat(xs: Sequence[Tensor]) -> tuple:
+    return tuple(entry for x in xs for entry in x.entries)
+
+
+def unflat(entries: Iterable[Any], shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
+    left = iter(entries)
+    return [Tensor([next(left) for _ in range(math.prod(s))], s) for s in shapes]
