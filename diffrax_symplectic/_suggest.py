@@ -17,10 +17,11 @@ from ._arguments import check_state
 from ._brownian import increment_struct, UnspecifiedPath, WeakBrownianPath
 from ._custom_types import Args, RealScalarLike, Y
 from ._solver import (
+    AbstractLangevinSplitting,
     AbstractSymplecticSolver,
-    BAOAB,
     Damped,
     ImplicitMidpoint,
+    LANGEVIN,
     Record,
     SOLVERS,
     Want,
@@ -149,7 +150,9 @@ def suggest_solver(
     - `want`: `"weak"` for expectations, or `"strong"` for single paths.
     - `gamma`: friction, $-\gamma p\,\mathrm{d}t$ beside these terms, as
         [`diffrax_symplectic.Damped`][] takes it. Then solvers with this friction are
-        suggested: [`diffrax_symplectic.BAOAB`][] for Langevin dynamics.
+        suggested: for Langevin dynamics [`diffrax_symplectic.BAOAB`][], whose positions
+        are accurate, and [`diffrax_symplectic.LangevinMiddle`][], whose momenta are so as
+        well.
 
     **Returns:** a sequence of suggestions, each with `solver`, `weak_order`,
     `strong_order`, `path`, `reason`, and `terms(key)`, the terms with the path that the
@@ -190,7 +193,7 @@ def suggest_solver(
     if gamma is not None:
         if not any(map(is_hamiltonian, drift)):
             # Of these `BAOAB` finds the momenta, by the structure that it needs.
-            solvers = [solver for solver in solvers if isinstance(solver, BAOAB)]
+            solvers = [s for s in solvers if isinstance(s, AbstractLangevinSplitting)]
         probe = next(iter(solvers), Damped(ImplicitMidpoint(), gamma))
         probe.init(terms, t0, t0 + 1, y0, args)  # refuses what is no friction
     if len(noise) > 1 or not jtu.all_leaves(
@@ -257,7 +260,8 @@ def ranked(
 
     solvers = [solver() for solver in SOLVERS]
     if gamma is not None:
-        solvers = [BAOAB(gamma), *(Damped(solver, gamma) for solver in solvers)]
+        langevin = [solver(gamma) for solver in LANGEVIN]
+        solvers = [*langevin, *(Damped(solver, gamma) for solver in solvers)]
     return sorted(filter(fits, solvers), key=rank)
 
 
@@ -268,7 +272,7 @@ def _record(solver: AbstractSymplecticSolver) -> Record:
 
 def _code(solver: AbstractSymplecticSolver, module: str = "") -> str:
     """How the solver is constructed, for a friction called `gamma`."""
-    given = "gamma" if isinstance(solver, BAOAB) else ""
+    given = "gamma" if isinstance(solver, AbstractLangevinSplitting) else ""
     if isinstance(solver, Damped):
         given = f"{_code(solver.solver, module)}, gamma"  # pyright: ignore
     return f"{module}{type(solver).__name__}({given})"

@@ -77,6 +77,13 @@ def apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> 
     return _checked_sum(parts, y)
 
 
+def rate(drift: tuple, t: RealScalarLike, y: Y, args: Args) -> Y:
+    """The change of the state by the drift in a unit of time."""
+    t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
+    zero = jnp.zeros_like(t)
+    return apply(drift, [x.contr(zero, zero + 1) for x in drift], args, t, y)
+
+
 def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
     """Raises a `ValueError` unless these are terms that change a state such as `y0`. (Some
     solvers of Diffrax take more than one, each for a part of the state.)"""

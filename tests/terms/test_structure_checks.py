@@ -145,7 +145,7 @@ def test_friction_in_the_drift_is_told_to_be_left_out():
     # Without it, and with the momentum first, plain terms are taken as they are.
     terms = _langevin(0.0, True)
     start(terms)
-    (only,) = suggest(terms, gamma=0.5)
+    only, _ = suggest(terms, gamma=0.5)
     assert isinstance(only.solver, ds.BAOAB)
     with pytest.raises(ValueError, match="or take `BAOAB"):
         suggest(_langevin(0.0, False), gamma=0.5)
