@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from ._arguments import check_state
-from ._brownian import increment_struct, UnspecifiedPath, WeakBrownianPath
+from ._brownian import increment_struct, is_random, UnspecifiedPath, WeakBrownianPath
 from ._custom_types import Args, RealScalarLike, Y
 from ._solver import (
     AbstractLangevinSplitting,
@@ -58,7 +58,8 @@ class Suggestion:
     - `path`: the Brownian path that it needs, as code.
     - `reason`: when to choose it, in a sentence.
     - `terms`: a function of a random key, which returns the terms of the system with such
-        paths in place of theirs.
+        paths in place of theirs. A path without a random key in it, such as recorded
+        noise, stays.
     """
 
     solver: AbstractSymplecticSolver
@@ -201,6 +202,9 @@ def suggest_solver(
     ):
         # Lévy areas are those between the noises of one array.
         solvers = [s for s in solvers if "A" not in s.variables]
+    paths = brownian_paths(noise)
+    given = [path for path in paths if not is_random(path)]
+    solvers = [s for s in solvers if all(_holds(path, s) for path in given)]
     found = [_suggestion(solver, want, terms, commute) for solver in solvers]
     if not kind:
         kind = f"general ({getattr(not_separable, 'reason', '')})"
@@ -214,7 +218,23 @@ def suggest_solver(
         system += f" It is not separable: {not_separable.reason}."
     if not_separable is not None and not_separable.friction:
         system += f" {FRICTION} Without it, ask with `gamma=`."
+    if any(isinstance(path, diffrax.UnsafeBrownianPath) for path in paths):
+        system += f" {_UNSAFE}"
     return Suggestions(system, tuple(found))
+
+
+_UNSAFE = (
+    "Its `diffrax.UnsafeBrownianPath` takes times as numbers of 32 bits, and late in a run "
+    "repeats its noise (Diffrax's issue 733): take one of the paths below."
+)
+
+
+def _holds(
+    path: diffrax.AbstractBrownianPath, solver: AbstractSymplecticSolver
+) -> bool:
+    """Whether a path that is given has what the solver needs."""
+    area = getattr(path, "levy_area", diffrax.AbstractBrownianIncrement)
+    return solver.variables == ("W",) or issubclass(area, solver.minimal_levy_area)
 
 
 def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
@@ -285,12 +305,16 @@ def _suggestion(
     commute: bool,
 ) -> Suggestion:
     record = _record(solver)
-    shape = _shape_code(increment_struct(brownian_paths(terms)[0]))
+    random = [path for path in brownian_paths(terms) if is_random(path)]
+    code = "that of the terms, which holds given noise"
+    if random:
+        shape = _shape_code(increment_struct(random[0]))
+        code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
     return Suggestion(
         solver=solver,
         weak_order=record.weak_order(commute),
         strong_order=record.strong_order(commute),
-        path=f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")',
+        path=code,
         reason=record.choose,
         terms=jtu.Partial(with_paths, ft.partial(solver.path, want=want), terms),
     )
@@ -298,10 +322,12 @@ def _suggestion(
 
 def with_paths(make: Callable, terms: PyTree, key: PRNGKeyArray) -> PyTree:
     """The terms with new paths in place of theirs; terms that share a path share the new
-    one."""
+    one. A path that holds given noise stays."""
     made = {}
 
     def new(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
+        if not is_random(path):
+            return path
         if id(path) not in made:
             number = len(made)
             own = key if number == 0 else jr.fold_in(key, number + 1)

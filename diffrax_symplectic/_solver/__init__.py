@@ -10,7 +10,7 @@ from .thermal import thermal_noise
 
 
 # Those of Langevin dynamics, which take the friction as their one argument.
-LANGEVIN: tuple[type[AbstractLangevinSplitting], ...] = (BAOAB, LangevinMiddle)
+LANGEVIN: tuple[type[BAOAB] | type[LangevinMiddle], ...] = (BAOAB, LangevinMiddle)
 # All solvers without friction, in the order of the documentation.
 SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
     *(ImplicitMidpoint, SRKs1, SRKw1, SRKw2),

@@ -32,6 +32,7 @@ from .._terms import (
     split_terms,
 )
 from ._step import result_of, Step, take_step, Unsolved
+from ._times import result_at
 
 
 if TYPE_CHECKING:
@@ -185,8 +186,9 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
 
     **State.** Any PyTree of real floating-point arrays.
 
-    **Failures.** If a stage equation is not solved, or the step does not end at finite
-    numbers, `diffeqsolve` stops there and says so: as an error, or with `throw=False`
+    **Failures.** If a stage equation is not solved, the step does not end at finite
+    numbers, is shorter than a hundred times the rounding of the time, or leaves the times
+    of its path, `diffeqsolve` stops there and says so: as an error, or with `throw=False`
     through `sol.result`. In a batch the other paths go on.
     """
 
@@ -248,7 +250,8 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         name = type(self).__name__
         driven |= noise_driven(along, h, noise, variables, t0, t1, args, name)
         y1, unsolved = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
-        return y1, None, dict(y0=y0, y1=y1), unsolved, result_of(unsolved, y1)
+        result = result_at(terms, t0, t1, result_of(unsolved, y1))
+        return y1, None, dict(y0=y0, y1=y1), unsolved, result
 
 
 def first_state(solver: AbstractSymplecticSolver) -> SolverState:

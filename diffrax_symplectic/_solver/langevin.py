@@ -29,6 +29,7 @@ from ._friction import (
     velocity_of,
 )
 from ._step import result_of
+from ._times import result_at
 from .base import AbstractSymplecticSolver, Record
 
 
@@ -80,7 +81,8 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         q = moved(q, half, rate(drift, t1, (p, q), args)[1])
         p, kept = self.last_kick(drift, t0, t1, (p, q), args)
         y1 = p, q
-        result = friction_result(self.gamma, modes, result_of(None, y1))
+        result = result_at(terms, t0, t1, result_of(None, y1))
+        result = friction_result(self.gamma, modes, result)
         return y1, None, dict(y0=y0, y1=y1), (kept, modes), result
 
     @abc.abstractmethod
