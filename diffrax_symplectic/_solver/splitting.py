@@ -160,7 +160,8 @@ class Damped(AbstractSplitting):
     kinetic one: there friction on $p - A(q)$ is a term of its own.
 
     With noise in the forces and $\sigma^2 = 2 \gamma T$ this is Langevin dynamics at the
-    temperature $T$. For constant noise [`diffrax_symplectic.BAOAB`][] has far less bias.
+    temperature $T$. For constant noise [`diffrax_symplectic.BAOAB`][] and
+    [`diffrax_symplectic.LangevinMiddle`][] have far less bias.
 
     **Source:** splitting of [Strang (1968)](https://doi.org/10.1137/0705041).
     """
@@ -240,7 +241,8 @@ class LinearFlow(AbstractSplitting):
 
     The terms are those of the rest, without $L$, and of all noises. What is left is often
     simple. If $R$ and all $H_k$ depend on $q$ alone, `LinearFlow(StormerVerlet(), flow)` is
-    explicit.
+    explicit. With friction and thermal noise take `LinearFlow(BAOAB(gamma), flow)`, in
+    which both are exact.
 
     Symplectic if the solver is. Weak order the smaller of 2 and that of the solver; strong
     order the smaller of 1 and that of the solver; order 2 without noise.
