@@ -1,23 +1,23 @@
-"""What all paths of a batch do together, and what only a few of them need."""
+"""What all paths of a batch do together, what only a few of them need, and what is kept in
+memory for all of them."""
 
-import functools as ft
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool
 
-from ._compat import ClosedJaxpr, jaxpr_as_fun
 from ._custom_types import IntScalarLike
 
 
 _T = TypeVar("_T")
 
-# Paths that need more than the others are gathered, and served by parts of the batch: so
-# many of them. Mostly there are a few, and the work is that of whole parts.
+# Stragglers are gathered, and served by parts of the batch: so many of them. Mostly there
+# are a few, and the work is that of whole parts.
 _PARTS = 256
 
 
@@ -34,110 +34,84 @@ def _(size, in_batched, number):
     return most_of_batch(jnp.max(number, 0) if in_batched[0] else number), False
 
 
-# Outside of a program, arrays of NumPy may be batched, for which JAX has not these rules.
-@jax.jit
-def batched_together(values: _T, others: PyTree = ()) -> _T:
-    """The same `values`, all of them batched if one is, or one of the `others`. JAX batches
-    what is in a loop anew whenever one more of its values turns out to be batched."""
-    return _differentiable(values, others)
+def where_pending(
+    fn: Callable[[_T, Any], _T], pending: Bool[Array, ""], value: _T, args: Any
+) -> _T:
+    """`fn(value, args)` where `pending`, and `value` elsewhere. This has no derivative, and
+    `fn` must capture no arrays.
 
-
-@jax.custom_jvp
-def _differentiable(values: _T, others: PyTree) -> _T:
-    return _batched_together(values, others)
-
-
-@_differentiable.defjvp
-def _(primals, tangents):
-    return _differentiable(*primals), tangents[0]
-
-
-@jax.custom_batching.custom_vmap
-def _batched_together(values: _T, others: PyTree) -> _T:
-    del others
-    return values
-
-
-@_batched_together.def_vmap
-def _(size, in_batched, values, others):
-    values = _spread(size, in_batched[0], values)
-    return batched_together(values, others), jtu.tree_map(lambda _: True, values)
-
-
-def _spread(size: int, in_batched: PyTree[bool], values: _T) -> _T:
-    spread = lambda b, x: x if b else jnp.broadcast_to(x, (size, *jnp.shape(x)))
-    return jtu.tree_map(spread, in_batched, values)
-
-
-def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -> _T:
-    """`fn(value)` where `pending`, and `value` elsewhere.
-
-    A conditional would do, but under `vmap` it becomes a selection: all paths compute, and
-    memory is set aside for all of them. Here the paths for which `pending` holds are
-    gathered from the batch, and served by parts. This has no derivative.
+    Under `vmap` a conditional becomes a selection: all paths compute, and memory is set
+    aside for all of them. Here the stragglers, for which `pending` holds, are gathered from
+    the batch, and served by parts.
     """
-    # Batched more than once, but traced only here. What `fn` captures is batched, too.
-    traced = jax.make_jaxpr(fn)(value)
-    unflatten = jtu.tree_structure(value).unflatten
+    arrays, static = eqx.partition(args, eqx.is_array)
+    # Traced once, though JAX batches what is in a loop several times.
+    call = jax.jit(lambda value, arrays: fn(value, eqx.combine(arrays, static)))
 
-    def call(captured, value):
-        own = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, captured))
-        return unflatten(own(*jtu.tree_leaves(value)))
+    # What each path has of its own, along a first axis, and what all have in common.
+    @jax.custom_batching.custom_vmap
+    def serve(pending, value, own, common):
+        return _by_parts(call, pending, value, own, common)
 
-    # Traced once, for what is in a loop is batched several times.
-    serve_batch = jax.jit(ft.partial(_serve_batch, call))
+    @serve.def_vmap
+    def _(size, in_batched, pending, value, own, common):
+        # Nested batches are one long batch.
+        n = pending.shape[1 if in_batched[0] else 0]
 
-    def serve(depth: int) -> Callable[..., _T]:
-        """For that many axes of a batch, of which arguments have those that they need."""
+        def joined(batched, x):
+            x = x if batched else jnp.broadcast_to(x, (size, *x.shape))
+            return x.reshape(size * n, *x.shape[2:])
 
-        @jax.custom_batching.custom_vmap
-        def serve_all(pending, captured, value):
-            if depth > 0:
-                return serve_batch(pending, captured, value)
-            return lax.cond(pending, call, lambda _, value: value, captured, value)
+        def repeated(batched, x):
+            return jnp.repeat(x, n, axis=0) if batched else None
 
-        @serve_all.def_vmap
-        def _(size, in_batched, pending, captured, value):
-            pending, value = _spread(
-                size, (in_batched[0], in_batched[2]), (pending, value)
-            )
-            captured = [x if b else x[None] for b, x in zip(in_batched[1], captured)]
-            value = serve(depth + 1)(pending, captured, value)
-            return value, jtu.tree_map(lambda _: True, value)
+        each = jtu.tree_map(joined, tuple(in_batched[:3]), (pending, value, own))
+        more = jtu.tree_map(repeated, in_batched[3], common)
+        rest = jtu.tree_map(lambda b, x: None if b else x, in_batched[3], common)
+        pending, value, own = each
+        value = serve(pending, value, eqx.combine(own, more), rest)
+        apart = lambda x: x.reshape(size, n, *x.shape[1:])
+        return jtu.tree_map(apart, value), jtu.tree_map(lambda _: True, value)
 
-        return serve_all
-
-    return serve(0)(pending, list(traced.consts), value)
+    one = lambda x: jnp.asarray(x)[None]
+    value = serve(one(pending), jtu.tree_map(one, value), None, arrays)
+    return jtu.tree_map(lambda x: x[0], value)
 
 
-def _serve_batch(call, pending, captured, value):
-    """What was `captured` has each axis of the batch, or in its place one of length 1."""
-    depth, shape, size = pending.ndim, pending.shape, pending.size
+def _by_parts(call, pending, value, own, common):
+    size = len(pending)
     part = -(-size // _PARTS)
-    flat = lambda x: x.reshape(size, *x.shape[depth:])
-    own = [any(n > 1 for n in x.shape[:depth]) for x in captured]
 
-    def body(carry):
+    def serve_part(carry):
         pending, value = carry
         # As `jnp.nonzero`, which is compiled to a dozen kernels. Where fewer paths are
         # left, the numbers beyond the batch are dropped in the end.
         flag, which = lax.top_k(pending.astype(jnp.float32), part)
-        place = jnp.unravel_index(which, shape) if depth > 1 else (which,)
         which = jnp.where(flag > 0, which, size)
-
-        def gather(x, own):
-            axes = zip(place, x.shape)
-            return (
-                x[tuple(i if n > 1 else 0 for i, n in axes)] if own else x[(0,) * depth]
-            )
-
-        few = [gather(x, b) for x, b in zip(captured, own)]
-        axes = [0 if b else None for b in own]
-        new = jax.vmap(call, (axes, 0))(few, jtu.tree_map(lambda x: x[which], value))
+        few, few_own = jtu.tree_map(lambda x: x[which], (value, own))
+        one = lambda value, own: call(value, eqx.combine(own, common))
+        new = jax.vmap(one)(few, few_own)
         scatter = lambda x, y: x.at[which].set(y, mode="drop")
         return scatter(pending, False), jtu.tree_map(scatter, value, new)
 
     some_pending = lambda carry: jnp.any(carry[0])
-    begin = flat(pending), jtu.tree_map(flat, value)
-    value = lax.while_loop(some_pending, body, begin)[1]
-    return jtu.tree_map(lambda x: x.reshape(*shape, *x.shape[1:]), value)
+    return lax.while_loop(some_pending, serve_part, (pending, value))[1]
+
+
+def materialize(fn: Callable[[], _T]) -> _T:
+    """`fn()`, computed once and kept in memory.
+
+    On CPUs, XLA may fuse a computation into every kernel that reads its result, and so
+    repeat it in each. For Gaussian numbers and transcendental functions this costs more
+    than it saves. XLA fuses nothing across the border of a conditional. So `fn` is called
+    in one branch of a conditional, and the barrier hides from XLA that the condition is
+    always true.
+    """
+    fn = jax.jit(fn)  # traced once
+
+    def in_a_conditional() -> _T:
+        shapes = jax.eval_shape(fn)
+        zeros = lambda: jtu.tree_map(lambda s: lax.full_like(s, 0), shapes)
+        return lax.cond(lax.optimization_barrier(True), fn, zeros)
+
+    return lax.platform_dependent(cpu=in_a_conditional, default=fn)

@@ -4,8 +4,9 @@ import dataclasses
 import functools as ft
 import math
 import time
+import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -14,22 +15,16 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import ArrayLike, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree
 
 from ._arguments import check_solver, check_takes, shapes
-from ._brownian import (
-    FixedStepBrownianPath,
-    LevyAreaBrownianPath,
-    LevyAreaIncrement,
-    PlateauBrownianPath,
-    PlateauIncrement,
-)
 from ._custom_types import Args, RealScalarLike, Y
-from ._expectation import Expectation, monte_carlo
-from ._solver import AbstractSymplecticSolver, Want
-from ._suggest import suggest_solver, with_paths
+from ._suggest import path_for, suggest_solver, with_paths
 from ._terms import check_stratonovich
 
+
+# The results of a batch of paths, and which of them were solved.
+_Batch: TypeAlias = tuple[PyTree[Array], Bool[Array, " num_paths"]]
 
 # How many steps of the reference there are in the smallest step that is compared.
 _FINER = 8
@@ -189,63 +184,89 @@ def compare_solvers(
         _check_scalar(phi, t1, y0, args)
     cell = min(dts) / _FINER
 
-    def end(solver, make_path, key, dt):
-        return _end(with_paths(make_path, terms, key), solver, t0, t1, dt, y0, args)
+    def own_path(solver):
+        return lambda shape, key: path_for(solver, want, None, shape, key)
 
-    def sample(solver, dt, key):
-        y1, result = end(solver, ft.partial(_path, solver, want), key, dt)
-        return (y1 if phi is None else phi(t1, y1, args)), result
+    def error_path(solver):
+        # Strong errors are along one Brownian motion, which not all solvers can follow.
+        common = lambda shape, key: path_for(solver, None, cell, shape, key)
+        return common if phi is None else own_path(solver)
 
-    def trial(solver):
-        if phi is not None:
-            return sample(solver, dts[0], key)
-        # Errors are those along one Brownian motion, which not all solvers can follow.
-        return end(solver, ft.partial(_common_path, solver, cell), key, dts[0])
+    def batch(solver, make_path):
+        """The results of paths, by their keys and the step size, and which were solved."""
 
-    named, refused = _those_that_fit(solvers, trial)
-
-    def measure(solver, dt, number: int):
-        """The estimate by the paths of a number, and the seconds for each."""
-        fn = eqx.Partial(sample, solver, jnp.asarray(dt))
-        start = time.perf_counter()
-        estimate = monte_carlo(fn, jr.fold_in(key, number), num_paths)
-        return estimate, (time.perf_counter() - start) / num_paths
-
-    strong, fine = {}, None
-    if phi is None:
-        strong = _strong_errors(end, named, reference, dts, cell, key, num_paths)
-    else:
-        fine, _ = measure(reference, cell, 0)
-    steps = []
-    for name, solver in named.items():
-        # Compiles the program, in which the step size is an array.
-        measure(solver, dts[0], 1)
-        for i, dt in enumerate(dts):
-            estimate, seconds = measure(solver, dt, 1 + i)
-            error, bar, failed = (
-                strong[name][i] if fine is None else _weak_error(estimate, fine)
+        @eqx.filter_jit
+        @ft.partial(jax.vmap, in_axes=(0, None))
+        def results(key, dt):
+            own = with_paths(make_path, terms, key)
+            check_stratonovich(own, solver, t0, y0, args)
+            sol = diffrax.diffeqsolve(
+                own, solver, t0, t1, dt, y0, args, max_steps=None,
+                adjoint=diffrax.ForwardMode(), throw=False,
+            )  # fmt: skip
+            y1 = jtu.tree_map(lambda y: y[-1], sol.ys)
+            return (y1 if phi is None else phi(t1, y1, args)), diffrax.is_okay(
+                sol.result
             )
-            steps.append(ComparedStep(name, dt, error, bar, seconds, failed))
-    return Comparison("strong" if phi is None else "weak", tuple(steps), refused)
 
+        return results
 
-def _end(terms, solver, t0, t1, dt, y0, args) -> tuple[Y, diffrax.RESULTS]:
-    check_stratonovich(terms, solver, t0, y0, args)
-    options: Any = dict(max_steps=None, adjoint=diffrax.ForwardMode(), throw=False)
-    sol = diffrax.diffeqsolve(terms, solver, t0, t1, dt, y0, args, **options)
-    return jtu.tree_map(lambda y: y[-1], sol.ys), sol.result
-
-
-def _those_that_fit(solvers, solve: Callable) -> tuple[dict, dict[str, str]]:
-    """Solvers by their names, and why those left out do not fit."""
-    named, refused = {}, {}
+    keys = lambda number: jr.split(jr.fold_in(key, number), num_paths)
+    fine = batch(reference, error_path(reference))(keys(0), jnp.asarray(cell))
+    steps, refused = [], {}
     for solver in solvers:
+        name, natural = repr(solver), batch(solver, own_path(solver))
+        compared = batch(solver, error_path(solver)) if phi is None else natural
         try:
-            eqx.filter_eval_shape(solve, solver)
-            named[repr(solver)] = solver
+            eqx.filter_eval_shape(compared, keys(0), jnp.asarray(dts[0]))
         except ValueError as error:
-            refused[repr(solver)] = str(error).splitlines()[0]
-    return named, refused
+            refused[name] = str(error).splitlines()[0]
+            continue
+        jax.block_until_ready(natural(keys(1), jnp.asarray(dts[0])))  # compiles
+        for number, dt in enumerate(map(jnp.asarray, dts), start=1):
+            begin = time.perf_counter()
+            out = jax.block_until_ready(natural(keys(number), dt))
+            seconds = (time.perf_counter() - begin) / num_paths
+            if phi is None:
+                error = strong_error(compared(keys(0), dt), fine)
+            else:
+                error = weak_error(out, fine)
+            steps.append(ComparedStep(name, float(dt), *error[:2], seconds, error[2]))
+    return Comparison(want, tuple(steps), refused)
+
+
+def strong_error(out: _Batch, fine: _Batch) -> tuple[float, float, int]:
+    """The root mean square of the difference over the paths that both solvers finish, its
+    standard error, and how many paths `out` or `fine` does not finish."""
+    okay = np.asarray(out[1] & fine[1])
+    squares = jtu.tree_map(
+        lambda a, b: np.asarray(a - b, np.float64) ** 2, out[0], fine[0]
+    )
+    flat = [x.reshape(len(okay), -1) for x in jtu.tree_leaves(squares)]
+    square, bar = _mean(np.concatenate(flat, axis=1).sum(axis=1), okay)
+    with np.errstate(all="ignore"):
+        rms = np.sqrt(square)
+        return float(rms), float(bar / (2 * rms)), int(np.sum(~okay))
+
+
+def weak_error(out: _Batch, fine: _Batch) -> tuple[float, float, int]:
+    """The difference of the means, its standard error, and how many paths failed."""
+    (mean, bar), (exact, other) = (
+        _mean(np.asarray(x), np.asarray(k)) for x, k in (out, fine)
+    )
+    return (
+        abs(mean - exact),
+        float(np.hypot(bar, other)),
+        int(np.sum(~np.asarray(out[1]))),
+    )
+
+
+def _mean(x: np.ndarray, okay: np.ndarray) -> tuple[float, float]:
+    """The mean of the values that are `okay`, and its standard error."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # no path is left
+        kept = x[okay].astype(np.float64)
+        return float(np.mean(kept)), float(np.std(kept) / np.sqrt(len(kept)))
 
 
 def _check_solvers(solvers, reference) -> None:
@@ -279,67 +300,3 @@ def _checked_steps(t0, t1, dts: Sequence[float]) -> list[float]:
     if len(dts) == 0:
         raise ValueError("`dt0` must hold at least one step size.")
     return [float(dt) for dt in dts]
-
-
-def _path(solver, want: Want, shape, key) -> diffrax.AbstractBrownianPath:
-    """A path for `solver`, which samples each step by itself."""
-    if isinstance(solver, AbstractSymplecticSolver):
-        return solver.path(shape, key, want=want)
-    return _common_path(solver, None, shape, key)
-
-
-def _common_path(solver, cell, shape, key) -> diffrax.AbstractBrownianPath:
-    """The same Brownian motion for all solvers."""
-    area = diffrax.SpaceTimeLevyArea
-    path = FixedStepBrownianPath(shape, key, levy_area=area, cell=cell)
-    needs = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
-    if needs is PlateauIncrement:
-        return PlateauBrownianPath(path, key)
-    if needs is LevyAreaIncrement:
-        return LevyAreaBrownianPath(path, key, num_terms=0 if cell else 2, cell=cell)
-    return path
-
-
-def _weak_error(estimate: Expectation, fine: Expectation) -> tuple[float, float, int]:
-    """Error, standard error and failed paths."""
-    error = abs(float(estimate.mean - fine.mean))
-    bar = float(np.hypot(estimate.std_error, fine.std_error))
-    return error, bar, estimate.num_failed
-
-
-def _strong_errors(end, named, reference, dts, cell, key, num_paths) -> dict:
-    """Error, standard error and failed paths for each solver and step size."""
-    steps = jnp.asarray(dts)
-
-    def squares(key):
-        along = lambda solver, dt: end(
-            solver, ft.partial(_common_path, solver, cell), key, dt
-        )
-        exact, solved = along(reference, cell)
-
-        def at(solver, dt):
-            y1, result = along(solver, dt)
-            squared = jtu.tree_map(lambda a, b: jnp.sum((a - b) ** 2), y1, exact)
-            okay = diffrax.is_okay(result) & diffrax.is_okay(solved)
-            total = jnp.where(okay, sum(jtu.tree_leaves(squared)), 0.0)
-            return total, total**2, okay.astype(total.dtype)
-
-        one = lambda s: jax.lax.map(lambda dt: at(s, dt), steps)
-        # Those that failed are counted here, for each solver by itself.
-        errors = {name: one(solver) for name, solver in named.items()}
-        return errors, diffrax.RESULTS.successful
-
-    if not named:
-        return {}
-    estimate = monte_carlo(squares, key, num_paths)
-    out = {}
-    for name, (square, fourth, okay) in estimate.mean.items():
-        with np.errstate(all="ignore"):
-            count = okay * estimate.num_paths
-            mean = square / okay
-            deviation = np.sqrt(np.maximum(fourth / okay - mean**2, 0) / count)
-            rms = np.sqrt(mean)
-            bars = deviation / (2 * rms)
-        failed = np.round(num_paths - count).astype(int)
-        out[name] = list(zip(rms.tolist(), bars.tolist(), failed.tolist()))
-    return out

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from ._brownian import VARIABLES
+from ._brownian import drives, VARIABLES
 from ._tableau import (
     AbstractTableau,
     AdditiveTableau,
@@ -221,7 +221,8 @@ def _(tableau: GeneralTableau) -> tuple[dict, dict]:
     A0e, A1e, B0e, B1e = (x.sum(axis=1) for x in (A0, A1, B0, B1))
     # The expectation of the double brackets, E L_kl = h^2 delta_kl / 12 in front of
     # [b, [b, a]] = a''bb + a'b'b - b''ba - 2 b'a'b + b'b'a.
-    L = be.sum() / 12 if "L" in tableau.noise else 0.0
+    brackets = "drift brackets" in map(drives, tableau.noise)
+    L = be.sum() / 12 if brackets else 0.0
     first = {
         "alpha.e - 1": al.sum() - 1,
         "(beta.e)^2 - 1": be.sum() ** 2 - 1,
@@ -335,7 +336,7 @@ def _unknown(tableau) -> ValueError:
 
 
 # The step size and the random variables that change their sign if a step is undone.
-_NEGATED = {"h", "W", "second", "two_point", "third", "A"}
+_NEGATED = {"h", *(name for name, variable in VARIABLES.items() if not variable.even)}
 
 
 def is_own_inverse(tableau: FlatTableau) -> bool:

@@ -14,7 +14,18 @@ import jax.tree_util as jtu
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from ._arguments import check_state
-from ._brownian import increment_struct, is_random, UnspecifiedPath, WeakBrownianPath
+from ._brownian import (
+    drives,
+    FixedStepBrownianPath,
+    increment_struct,
+    is_random,
+    LevyAreaBrownianPath,
+    LevyAreaIncrement,
+    PlateauBrownianPath,
+    PlateauIncrement,
+    UnspecifiedPath,
+    WeakBrownianPath,
+)
 from ._custom_types import Args, RealScalarLike, Y
 from ._solver import (
     AbstractLangevinSplitting,
@@ -165,13 +176,8 @@ def suggest_solver(
     """
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
-    if isinstance(terms, diffrax.AbstractTerm):
-        # Any path will do to look at the terms.
-        some = lambda path: WeakBrownianPath(increment_struct(path), jr.key(0))
-        is_known = lambda path: not isinstance(path, UnspecifiedPath)
-        terms = replace_paths(
-            terms, lambda path: path if is_known(path) else some(path)
-        )
+    # Any path will do to look at the terms.
+    terms = specified(terms, lambda shape: WeakBrownianPath(shape, jr.key(0)))
     drift, noise = _parts(terms)
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
@@ -201,7 +207,8 @@ def suggest_solver(
         [increment_struct(brownian_paths(noise)[0])]
     ):
         # Lévy areas are those between the noises of one array.
-        solvers = [s for s in solvers if "A" not in s.variables]
+        areas = lambda solver: "noise brackets" in map(drives, solver.variables)
+        solvers = [solver for solver in solvers if not areas(solver)]
     paths = brownian_paths(noise)
     given = [path for path in paths if not is_random(path)]
     solvers = [s for s in solvers if all(_holds(path, s) for path in given)]
@@ -318,6 +325,31 @@ def _suggestion(
         reason=record.choose,
         terms=jtu.Partial(with_paths, ft.partial(solver.path, want=want), terms),
     )
+
+
+def specified(terms: PyTree, make: Callable) -> PyTree:
+    """The terms with `make(shape)` where they have the shape of a path in its place."""
+    is_shape = lambda path: isinstance(path, UnspecifiedPath)
+    return replace_paths(terms, lambda x: make(x.shape) if is_shape(x) else x)
+
+
+def path_for(
+    solver: diffrax.AbstractSolver, want: Want | None, cell: float | None, shape, key
+) -> diffrax.AbstractBrownianPath:
+    """The path that a solver of this package chooses. For other solvers, or if `want` is
+    `None`, Gaussian increments with what the solver needs; over cells they are the same
+    Brownian motion for all solvers."""
+    if want is not None and isinstance(solver, AbstractSymplecticSolver):
+        return solver.path(shape, key, want=want)
+    area = diffrax.SpaceTimeLevyArea
+    path = FixedStepBrownianPath(shape, key, levy_area=area, cell=cell)
+    needs = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
+    if needs is PlateauIncrement:
+        return PlateauBrownianPath(path, key)
+    if needs is LevyAreaIncrement:
+        num_terms = 0 if cell else 2
+        return LevyAreaBrownianPath(path, key, num_terms=num_terms, cell=cell)
+    return path
 
 
 def with_paths(make: Callable, terms: PyTree, key: PRNGKeyArray) -> PyTree:

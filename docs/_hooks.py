@@ -6,7 +6,6 @@ import importlib.metadata
 import io
 import re
 
-from _tables import with_tables
 from fontTools.ttLib import TTFont
 from math_core import LatexToMathML
 from mkdocs.structure.files import File
@@ -61,10 +60,6 @@ def on_env(env, config, files):
     for identifier, url in _ELSEWHERE.items():
         config.plugins["autorefs"].register_url(identifier, url)
     return env
-
-
-def on_page_markdown(markdown, page, config, files):
-    return with_tables(markdown)
 
 
 def on_page_content(page_html, page, config, files):

@@ -1,15 +1,20 @@
-"""The tables of solvers on the site, made from the solvers' records."""
+"""The tables of solvers in these pages, made from the solvers' records:
+
+    python docs/_tables.py
+
+writes them into the files. A test tells if that was forgotten.
+"""
 
 import dataclasses
 import re
+from pathlib import Path
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._brownian import path_of
 from diffrax_symplectic._solver import AbstractSplitting, AbstractSymplecticSolver, Want
 from diffrax_symplectic._suggest import ranked, SOLVERS
 
 
-_MARKER = re.compile(r"<!-- solvers: (.*?) -->")
+_TABLE = re.compile(r"<!-- solvers: (.*?) -->.*?<!-- end -->", re.DOTALL)
 # The family of a solver, which has a page, is the module that it stands in.
 _FAMILIES = ("general", "separable", "additive", "beyond")
 _STRUCTURES = {
@@ -21,8 +26,8 @@ _STRUCTURES = {
 }
 _NOISES = {
     "any": "any number",
-    "commuting": "one, or those that commute",
-    "not commuting": "those that do not commute",
+    "commuting": "one noise, or noises that commute",
+    "not commuting": "noises that do not commute",
 }
 # Examples of those that have no defaults. A splitting is shown as one around any solver.
 _SPLIT = (
@@ -34,8 +39,15 @@ _SPLIT = (
 
 
 def with_tables(markdown: str) -> str:
-    """The page with a table in place of each `<!-- solvers: ... -->`."""
-    return _MARKER.sub(lambda found: table(found[1]), markdown)
+    """The page with its tables, each between `<!-- solvers: ... -->` and `<!-- end -->`,
+    as they are now."""
+
+    def current(found: re.Match) -> str:
+        text = table(found[1])
+        inside = f"\n\n{text}\n\n" if text.startswith("|") else text
+        return f"<!-- solvers: {found[1]} -->{inside}<!-- end -->"
+
+    return _TABLE.sub(current, markdown)
 
 
 def table(name: str) -> str:
@@ -92,19 +104,15 @@ def _suggested(want: Want) -> str:
     of = lambda commute: ranked(want, structures, commute, 2)
     found = {type(s): s for commute in (True, False) for s in of(commute)}
     order = {"weak": "weak order", "strong": "strong order"}[want]
-    columns = ("structure", "chosen for noises", order, "when to choose it")
     rows = []
     for solver in found.values():
         facts = _facts(solver)
-        path = f"`{_path(solver, want)}`"
+        system, noises = facts["structure"], solver.record.noises
+        if noises != "any":
+            system += f"; {_NOISES[noises]}"
         name = f"`{type(solver).__name__}`"
-        rows.append([name, *(facts[column] for column in columns), path])
-    return _rows(["solver", *columns, "its `path(shape, key)`"], rows)
-
-
-def _path(solver: AbstractSymplecticSolver, want: Want) -> str:
-    bounded = len(solver.stage_vectors(1)) > 0
-    return path_of(solver.variables, gaussian=want == "strong", bounded=bounded).code
+        rows.append([name, system, facts[order], facts["when to choose it"]])
+    return _rows(["solver", "structure and noises", order, "when to choose it"], rows)
 
 
 def _rows(columns, rows: list[list[str]]) -> str:
@@ -148,3 +156,8 @@ def _stage_vectors(solver: AbstractSymplecticSolver) -> str:
         return f"{one[0]} for each noise, and {' + '.join(map(str, one[:2]))}"
     text = " + ".join(map(str, one))
     return f"half of {text}" if solver.structure == "separable" else text
+
+
+if __name__ == "__main__":
+    for page in Path(__file__).parent.rglob("*.md"):
+        page.write_text(with_tables(page.read_text()))

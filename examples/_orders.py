@@ -117,7 +117,7 @@ def sampled_weak_error(
         with jax.enable_x64(False):
             # The step size as an array: compiled once for all of them.
             at_h = eqx.Partial(sample, jnp.asarray(h))
-            estimate = ds.monte_carlo(at_h, jr.key(round(t1 / h)), paths)
+            estimate = ds.monte_carlo(at_h, key=jr.key(round(t1 / h)), num_paths=paths)
         assert estimate.num_failed == 0
         signed.append(float(estimate.mean) - exact)
         std_errors.append(float(estimate.std_error))
@@ -226,7 +226,7 @@ def strong_errors(
     def study(paths: int, args=None) -> dict[str, Errors]:
         # In small batches: every path is kept in all its fine steps.
         fn = eqx.Partial(squares, args)
-        estimate = ds.monte_carlo(fn, jr.key(0), paths, batch_size=250)
+        estimate = ds.monte_carlo(fn, key=jr.key(0), num_paths=paths, batch_size=250)
         assert estimate.num_failed == 0
         out = {}
         for name, mean in estimate.mean.items():

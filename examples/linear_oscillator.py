@@ -111,7 +111,7 @@ def growth(name: str, steps: int, paths: int, full: bool) -> Growth:
 
         # In single precision: its rounding errors are far below what sampling leaves.
         with jax.enable_x64(False):
-            estimate = ds.monte_carlo(phi, jr.key(0), paths)
+            estimate = ds.monte_carlo(phi, key=jr.key(0), num_paths=paths)
         assert estimate.num_failed == 0
         sampled[: steps // 1000] = estimate.mean
         std_errors[: steps // 1000] = estimate.std_error

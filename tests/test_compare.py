@@ -1,16 +1,14 @@
 """Comparisons of solvers: their errors are what they are, and their solvers are named."""
 
 import sys
-from types import SimpleNamespace
 
-import diffrax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._compare import _strong_errors, _weak_error
+from diffrax_symplectic._compare import strong_error, weak_error
 
 
 Y0 = (jnp.array(0.0), jnp.array(1.0))
@@ -45,32 +43,23 @@ def test_strong_errors_are_of_the_orders_of_the_solvers():
     assert len(result.plot().get_legend().get_texts()) == 2
 
 
-def test_strong_errors_are_means_over_the_paths_that_both_solvers_finish():
-    def end(solver, make_path, key, dt):
-        W, R = make_path((), key).evaluate(0.0, 1.0), diffrax.RESULTS
-        lost = W < -1 if solver == "reference" else W > 1
-        result = R.where(lost, R.internal_error, R.successful)
-        return jnp.where(solver == "reference", 0.0, jnp.where(W > 0, 3.0, 1.0)), result
-
-    n = 4000
-    ((error, bar, failed),) = _strong_errors(
-        end, dict(a="a"), "reference", [0.5], 0.5, jr.key(0), n
-    )["a"]
-    # A normal variable beyond one: five standard errors.
-    assert abs(failed / n - 0.3173) <= 5 * np.sqrt(0.3173 * 0.6827 / n)
-    # Squares are 9 with a probability that the mean tells, and 1 otherwise.
-    often = (error**2 - 1) / 8
-    number = often * (n - failed)
-    assert abs(number - round(number)) <= 1e-6
-    assert abs(often - 0.5) <= 5 * np.sqrt(0.25 / (n - failed))
-    deviation = 8 * np.sqrt(often * (1 - often) / (n - failed))
-    assert bar == pytest.approx(deviation / (2 * error))
+def test_strong_errors_are_root_mean_squares_over_the_paths_that_both_finish():
+    okay = jnp.array([True, True, True, False, True])
+    solved = jnp.array([True, True, False, True, True])
+    p, q = jnp.array([3.0, 0.0, 7.0, jnp.nan, 1.0]), jnp.zeros((5, 2))
+    exact = jnp.zeros(5), jnp.array([[4.0, 0], [0, 0], [0, 0], [0, 0], [0, 2.0]])
+    error, bar, failed = strong_error(((p, q), okay), (exact, solved))
+    squares = np.array([25.0, 0.0, 5.0])
+    assert error == pytest.approx(np.sqrt(10)) and failed == 2
+    assert bar == pytest.approx(np.std(squares) / np.sqrt(3) / (2 * np.sqrt(10)))
 
 
-def test_weak_errors_have_the_bars_of_both_means():
-    one = SimpleNamespace(mean=np.array(3.0), std_error=np.array(0.3), num_failed=7)
-    other = SimpleNamespace(mean=np.array(5.0), std_error=np.array(0.4), num_failed=9)
-    assert _weak_error(one, other) == pytest.approx((2.0, 0.5, 7))  # pyright: ignore
+def test_weak_errors_have_the_standard_errors_of_both_means():
+    okay = jnp.array([True, True, True, False])
+    out, fine = jnp.array([1.0, 2.0, 3.0, jnp.nan]), jnp.array([5.0, 6.0, 5.0, 6.0])
+    error, bar, failed = weak_error((out, okay), (fine, jnp.ones(4, bool)))
+    assert error == pytest.approx(3.5) and failed == 1
+    assert bar == pytest.approx(np.hypot(np.std([1, 2, 3]) / np.sqrt(3), 0.5 / 2))
 
 
 def test_weak_error_is_within_its_bars(monkeypatch):

@@ -11,7 +11,6 @@ from pathlib import Path
 import diffrax
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
@@ -93,13 +92,6 @@ def test_equinox_refuses_derivatives_of_what_is_nondifferentiable():
         jax.jvp(f, (2.0,), (1.0,))
 
 
-def test_a_program_of_jax_is_a_function_of_its_flat_inputs():
-    fn = _compat.jaxpr_as_fun(
-        jax.make_jaxpr(lambda x, y: {"a": x - y, "b": y})(1.0, 2.0)
-    )
-    assert [float(x) for x in fn(jnp.array(5.0), jnp.array(3.0))] == [2.0, 3.0]
-
-
 @pytest.mark.core
 def test_adjoints_of_diffrax_run_a_loop_with_the_arguments_and_the_state_known_here():
     # `ReversingAdjoint` calls the loop of a solve, and reads these parts of its state.
@@ -141,51 +133,6 @@ def test_loops_of_equinox_take_buffers_and_gradients_can_be_refused():
     assert jax.jvp(refused, (2.0,), (1.0,))[1] == 1
     with pytest.raises(RuntimeError, match="[Rr]everse-mode"):
         jax.grad(refused)(2.0)
-
-
-@pytest.mark.core
-@pytest.mark.parametrize("throw", [True, False])
-def test_a_program_tells_whether_its_solves_raise_errors(terms, throw):
-    ts = diffrax.SaveAt(ts=jnp.array([0.0, 1.0]))
-
-    def end(x, adjoint, saveat):
-        sol = diffrax.diffeqsolve(
-            terms, ds.StormerVerlet(), 0.0, 1.0, x, (x, x), adjoint=adjoint,
-            saveat=saveat, throw=throw,
-        )  # fmt: skip
-        return sol.ys[0][-1]
-
-    adjoints = diffrax.RecursiveCheckpointAdjoint(), ds.ReversingAdjoint()
-    for adjoint in (*adjoints, diffrax.DirectAdjoint(), diffrax.ForwardMode()):
-        for saveat in (ts, diffrax.SaveAt(t1=True)):
-            fn = lambda x: end(x, adjoint, saveat)
-            program = jax.make_jaxpr(jax.jit(fn))(0.5)
-            assert _compat.solves_without_throwing(program.jaxpr) is not throw
-    for adjoint in adjoints:
-        gradient = jax.grad(
-            lambda x: diffrax.diffeqsolve(
-                terms, ds.StormerVerlet(), 0.0, 1.0, 0.5, (x, x), adjoint=adjoint,
-                throw=throw,
-            ).ys[0][-1]
-        )  # fmt: skip
-        program = jax.make_jaxpr(gradient)(0.5)
-        assert _compat.solves_without_throwing(program.jaxpr) is not throw
-    assert not _compat.solves_without_throwing(jax.make_jaxpr(jnp.sin)(0.5).jaxpr)
-
-
-def test_a_result_may_have_a_message_of_its_own():
-    before = diffrax.RESULTS.successful
-    item = _compat.result_named("for_a_test", "Take smaller steps.")
-    assert item == _compat.result_named("for_a_test", "unused: it has one already")
-    # It goes through what Diffrax does with results.
-    where = jax.jit(lambda x: diffrax.RESULTS.where(x, before, item))
-    assert where(False) == item and where(True) == before
-    assert "smaller steps" in diffrax.RESULTS[item]
-    assert diffrax.RESULTS.promote(optx.RESULTS.nonfinite) == diffrax.RESULTS.nonfinite
-    assert not any(
-        bool(item == getattr(diffrax.RESULTS, name))
-        for name in ("successful", "internal_error", "nonlinear_max_steps_reached")
-    )
 
 
 def test_what_takes_long_to_import_is_imported_when_it_is_needed():

@@ -12,4 +12,4 @@ from ._paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
 from ._random import AbstractLaw, check_key, Discrete, random_words, THREE_POINT
 from ._levy_area import LevyAreaBrownianPath, LevyAreaIncrement
 from ._wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPath
-from ._variables import path_of, VARIABLES
+from ._variables import drives, path_of, VARIABLES

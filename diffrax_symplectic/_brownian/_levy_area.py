@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 
 from .._arguments import whole_number
-from .._compat import materialize
+from .._batch import materialize
 from .._custom_types import BM, RealScalarLike
 from ._cells import check_cell, compose, or_one, Piece
 from ._random import AREA_WORDS, check_key, normal_from_words, place_of, random_words

@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Integer, PRNGKeyArray, UInt32
 
-from .._compat import materialize
+from .._batch import materialize
 
 
 # A number that counts places, and one that says what is counted.

@@ -2,7 +2,7 @@
 the path that holds them among it."""
 
 from collections.abc import Callable, Collection
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import diffrax
 from jaxtyping import PRNGKeyArray
@@ -51,6 +51,10 @@ class RandomVariable(NamedTuple):
         it has no law of its own.
     - `even`: whether it stays the same when time runs backward. Diffrax changes the sign
         of all.
+    - `drives`: what it multiplies: the vector fields of the noise, the brackets between
+        them, or their brackets with the drift.
+    - `held`: the attributes of the increment that it is computed from, if it is not an
+        attribute itself; and those that are read if the increment holds them.
     """
 
     increment: type[diffrax.AbstractBrownianIncrement]
@@ -58,6 +62,8 @@ class RandomVariable(NamedTuple):
     path: PathKind
     variance: float | None
     even: bool = False
+    drives: Literal["noise", "noise brackets", "drift brackets"] = "noise"
+    held: tuple[tuple[str, ...], tuple[str, ...]] | None = None
 
     @property
     def advice(self) -> str:
@@ -73,17 +79,19 @@ VARIABLES = {
         "Lévy areas",
         _around(LevyAreaBrownianPath, _AREA),
         variance=None,
+        drives="noise brackets",
     ),
     "C": RandomVariable(PlateauIncrement, "plateaus", _PLATEAUS, variance=1 / 6),
     # The sign of `C`, which alone is drawn: its size is a function of `W` and `H`.
     "sign": RandomVariable(PlateauIncrement, "plateaus", _PLATEAUS, variance=1.0),
-    # No increment has this attribute. It is computed from `W`, `H` and, if there is one,
-    # from `K`.
     "L": RandomVariable(
         diffrax.AbstractSpaceTimeLevyArea,
         "space-time Lévy area",
         _AREA,
         variance=None,
+        even=True,
+        drives="drift brackets",
+        held=(("W", "H"), ("K",)),
     ),
     "H": RandomVariable(
         diffrax.AbstractSpaceTimeLevyArea,
@@ -115,6 +123,12 @@ VARIABLES = {
         variance=1.0,
     ),
 }
+
+
+def drives(name: str) -> str:
+    """What the random variable of this name multiplies. Variables of a user's own
+    increments multiply the vector fields of the noise."""
+    return VARIABLES[name].drives if name in VARIABLES else "noise"
 
 
 def path_of(variables: Collection[str], *, gaussian: bool, bounded: bool) -> PathKind:

@@ -24,11 +24,11 @@ from .._brownian import (
 )
 from .._custom_types import Y
 from .._terms import brownian_paths, replace_paths
-from ._estimate import Plan, run, Samples
 from ._fits import Functions
 from ._points import hilbert_order, num_seeds, randomized, sobol_points
+from ._run import run
+from ._sampling import AbstractSampling, Plan, Samples
 from ._steps import (
-    AbstractSampling,
     along,
     check_real,
     independent_steps,
@@ -167,13 +167,25 @@ def _replicates(
     return samples(p, begin, _mean_of_good)
 
 
-def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "..."]:
-    """The mean over the paths that have not failed."""
-    x = jnp.where(along(~failed, x), x, 0)
-    # In two stages, so that rounding errors in single precision do not add up.
-    rows = 1 << ((len(x).bit_length() - 1) // 2)
-    total = jnp.sum(jnp.sum(x.reshape(rows, -1, *x.shape[1:]), axis=0), axis=0)
-    return total / jnp.sum(~failed).astype(total.dtype)
+def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "2 ..."]:
+    """The mean over the paths that have not failed, and `r` of an estimate from them."""
+    keep = along(~failed, x)
+    count = jnp.sum(~failed).astype(x.dtype)
+
+    def mean(x):
+        # In two stages, so that rounding errors in single precision do not add up.
+        x, rows = jnp.where(keep, x, 0), 1 << ((len(x).bit_length() - 1) // 2)
+        total = jnp.sum(jnp.sum(x.reshape(rows, -1, *x.shape[1:]), axis=0), axis=0)
+        return total / count
+
+    own = mean(x)
+    off = jnp.where(keep, jnp.abs(x - own), 0)
+    most = jnp.max(off, axis=0)
+    # In units of the largest.
+    s = jnp.sqrt(mean((off / jnp.where(most > 0, most, 1)) ** 2))
+    beyond = jnp.maximum(1 - s * jnp.sqrt(4.5 * jnp.log(jnp.maximum(count, 2))), 0)
+    r = jnp.where(s > 0, beyond / (s * jnp.sqrt(count)), 0)
+    return jnp.stack([own, r])
 
 
 class Layout(NamedTuple):

@@ -11,16 +11,15 @@ import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
-from ._estimate import (
-    checked_call,
-    Expectation,
-    ExpectationInterrupted,
-    Meter,
-    NO_METER,
-    run,
-)
-from ._pilot import choose, NO_SAMPLE
-from ._steps import AbstractSampling, Problem
+from ._choose import choose
+from ._estimate import Expectation
+from ._run import checked_call, Meter, NO_METER, run
+from ._sampling import AbstractSampling
+from ._steps import Problem
+
+
+# The key made from this number belongs to no sample.
+_NO_SAMPLE = 0xFFFFFFFF
 
 
 def expectation(
@@ -39,6 +38,7 @@ def expectation(
     levels: int = 1,
     tol: float | None = None,
     start: Expectation | None = None,
+    first: int = 0,
     devices: Sequence[Any] | None = None,
     progress_meter: diffrax.AbstractProgressMeter = NO_METER,
 ) -> Expectation:
@@ -56,7 +56,7 @@ def expectation(
         jax.config.update("jax_enable_x64", True)
         H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
         noise = lambda t, p, q, args: 0.2 * jnp.sin(q)
-        terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+        terms = ds.hamiltonian_terms(H0, noise, ())  # the shape of one noise
         estimate = ds.expectation(
             lambda t, y, args: y[1] ** 2,
             terms,
@@ -93,18 +93,21 @@ def expectation(
 
     - `phi`: takes time, state and `args` to a PyTree of real arrays.
     - `terms`, `solver`, `t0`, `t1`, `dt0`, `y0`, `args`: as for `diffrax.diffeqsolve`,
-        with `t1` after `t0` by a whole number of steps `dt0`. The paths in `terms` say
-        which random variables there are, and paths with equal keys are one Brownian
+        with `t1` after `t0` by a whole number of steps `dt0`. `terms` may have the
+        shape of a path in its place; then the path is the one that the solver needs. Paths
+        say which random variables there are, and paths with equal keys are one Brownian
         motion. Any solver of this package, and those of Diffrax with
         fixed steps for Stratonovich equations.
     - `key`: a JAX random key.
     - `sampling`: an [`diffrax_symplectic.IndependentPaths`][],
-        [`diffrax_symplectic.ArrayRQMC`][] or [`diffrax_symplectic.ValueFunctions`][]. With
-        `None` a pilot tries those that can be used and takes the one with the least
-        error for its time; `reason` of the result says which and why. Without `tol` it
-        then takes as many samples as it can in about 10 seconds, and no more than 131,072
-        paths, 64 replicates or 4,096 paths with value functions. (It measures times. So a
-        second call may choose another, or another number.)
+        [`diffrax_symplectic.ArrayRQMC`][] or [`diffrax_symplectic.ValueFunctions`][].
+        `None` is a rule, and `reason` of the result says how it came out:
+        `ValueFunctions` for one or two numbers in the state, if a step has at most 32
+        outcomes and all steps together 4,096; otherwise `ArrayRQMC` for up to four
+        numbers, if the paths in `terms` can be made of given words; `IndependentPaths`
+        for all else. Without `tol` it takes 4,096 paths with value functions, 16
+        replicates of 16,384 paths, or 131,072 paths, and fewer where all steps of all
+        paths would make more than $2^{28}$ numbers: about ten seconds.
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
         default `t1` alone.
     - `levels`: how many step sizes, each half of the one before. With one, the error of
@@ -113,6 +116,9 @@ def expectation(
         of samples in `sampling` is then the most that are taken.
     - `start`: an earlier estimate to continue. It has to come from the same `key` and the
         same arguments; of these only the shapes are checked.
+    - `first`: the number of the first sample. Parts of an estimate, made anywhere with
+        another `first` each, are put together by `Expectation.merge`: see [many
+        machines](many_machines.md).
     - `devices`: the devices that share the work, by default all of `jax.devices()`: under
         `jax.distributed` those of every process, each of which has to make the same call
         and gets the same result.
@@ -128,8 +134,9 @@ def expectation(
     another key, of other shapes or with more paths, terms without noise, and for paths that
     `sampling` cannot use (it says which ones it can);
     [`diffrax_symplectic.ExpectationInterrupted`][], with the estimate so far, on an
-    interrupt from the keyboard, once the sampling is chosen. Warns if `tol` was not
-    reached, if more than one path in a hundred failed, and where rounding in single
+    interrupt from the keyboard. Warns if `tol` was not reached, if more than one path in a
+    hundred failed, if few samples make up for most of the spread, if a fit was dropped or
+    takes long, if all samples are equal or underflow, and where rounding in single
     precision may be more than the standard error.
 
     **Source:** [Chan, Golub and LeVeque
@@ -138,31 +145,27 @@ def expectation(
     (1990)](https://doi.org/10.1080/07362999008809220) for extrapolation.
     """
     given = terms, t0, t1, dt0, y0, args, ts
-    key, devices = checked_call("expectation", key, tol, start, devices, given)
+    key, begin, devices = checked_call(
+        "expectation", key, tol, start, first, devices, given
+    )
     problem = Problem.of(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels)
+    reason = ""
     if sampling is None and start is not None:
         sampling = start.sampling
-    if sampling is not None:
-        _check_sampling(sampling, start)
-    k_pilot = jr.fold_in(key, NO_SAMPLE)
-    # It is shown while trials run, too.
+    elif sampling is None:
+        sampling, reason = choose(problem, tol)
+    sampling = _checked_sampling(sampling, start)
     with Meter(progress_meter) as meter:
-        if sampling is None:
-            try:
-                sampling, plan = choose(problem, k_pilot, tol, devices)
-            except ExpectationInterrupted:
-                # A trial's samples are not those of an estimate, to go on from.
-                raise KeyboardInterrupt from None
-        else:
-            plan = sampling.prepare(problem, k_pilot, devices)
-        if start is not None:
-            plan = plan._replace(reason=start.reason)
-        estimate = run(plan, key, devices, sampling, start, tol, meter)
+        plan = sampling.prepare(problem, jr.fold_in(key, _NO_SAMPLE), devices)
+        reason = "; ".join(filter(None, (reason, plan.reason)))
+        reason = reason if start is None else start.reason
+        plan = plan._replace(reason=reason, roundings=problem.max_steps)
+        estimate = run(plan, key, devices, sampling, begin, tol, meter)
     _warn_of_rounding(estimate, problem)
     return estimate
 
 
-def _check_sampling(sampling: Any, start: Expectation | None) -> None:
+def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampling:
     if not isinstance(sampling, AbstractSampling):
         raise ValueError(
             "`sampling` must be `IndependentPaths(num_paths)`, `ArrayRQMC()`, "
@@ -173,6 +176,7 @@ def _check_sampling(sampling: Any, start: Expectation | None) -> None:
             f"`start` was sampled by {start.sampling}; got sampling={sampling}. Pass the "
             "same."
         )
+    return sampling
 
 
 def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
@@ -184,11 +188,11 @@ def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
     fraction = float(numbers.eps) * problem.max_steps
     rounding = lambda mean: fraction * np.abs(mean)
     pairs = zip(jtu.tree_leaves(estimate.mean), jtu.tree_leaves(estimate.std_error))
-    if any(np.any(error < rounding(mean)) for mean, error in pairs):
+    if any(np.any(error <= 2 * rounding(mean)) for mean, error in pairs):
         warnings.warn(
-            "Rounding errors may be larger than the standard error, which does not include "
-            f"them: over {problem.max_steps:,} steps in {numbers.dtype} some "
-            f"{fraction:.0e} of the mean. For more digits call "
+            "Rounding errors may be larger than the sampling error: over "
+            f"{problem.max_steps:,} steps in {numbers.dtype} some {fraction:.0e} of the "
+            "mean, the least that `std_error` is. For more digits call "
             '`jax.config.update("jax_enable_x64", True)` first.',
             stacklevel=3,
         )

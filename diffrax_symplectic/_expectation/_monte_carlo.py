@@ -13,17 +13,12 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .._arguments import check_takes, whole_number
-from .._compat import ClosedJaxpr, jaxpr_as_fun, solves_without_throwing
 from .._root_finder import all_finite
 from .._terms import brownian_paths, replace_paths
-from ._estimate import checked_call, Expectation, Meter, NO_METER, Plan, run, Samples
-from ._steps import (
-    AbstractSampling,
-    independent_steps,
-    level_weights,
-    Problem,
-    samples,
-)
+from ._estimate import Expectation
+from ._run import checked_call, Meter, NO_METER, run
+from ._sampling import AbstractSampling, Plan, Samples
+from ._steps import independent_steps, level_weights, Problem, samples
 
 
 class IndependentPaths(AbstractSampling):
@@ -97,14 +92,15 @@ def is_key(x) -> bool:
 
 def monte_carlo(
     fn: Callable[..., Any],
+    *,
     key: PRNGKeyArray,
     num_paths: int | np.integer,
-    *,
     batch_size: int | np.integer | None = None,
     levels: int = 1,
     order: int | None = None,
     tol: float | None = None,
     start: Expectation | None = None,
+    first: int = 0,
     devices: Sequence[Any] | None = None,
     progress_meter: diffrax.AbstractProgressMeter = NO_METER,
 ) -> Expectation:
@@ -133,7 +129,7 @@ def monte_carlo(
             p, q = sol.ys
             return q[-1] ** 2, sol.result
 
-        estimate = ds.monte_carlo(phi, jr.key(0), 10_000)
+        estimate = ds.monte_carlo(phi, key=jr.key(0), num_paths=10_000)
         print(estimate.mean, estimate.std_error, estimate.num_failed)
         ```
 
@@ -155,22 +151,23 @@ def monte_carlo(
     - `fn`: takes a random key to $\phi$, a PyTree of real arrays, or to a pair of that
         and a `diffrax.RESULTS`: as above, with `throw=False`. A path fails if its result
         is neither successful nor an event, or anything in its $\phi$ is not finite.
-        (Without `sol.result` a path that failed counts as a success: Diffrax returns where
-        it stopped.)
+        Do not leave `sol.result` out where you pass `throw=False`: a path that failed then
+        counts as a success, with the state where it stopped.
     - `num_paths`: the number of all paths, those of `start` included.
     - `batch_size`: as for [`diffrax_symplectic.IndependentPaths`][].
     - `levels`: how many step sizes.
     - `order`: with levels, the weak order $p$ of the solver for the terms, as
         `solver.weak_order(terms)` says.
-    - `key`, `tol`, `start`, `devices`, `progress_meter`: as for
+    - `key`, `tol`, `start`, `first`, `devices`, `progress_meter`: as for
         [`diffrax_symplectic.expectation`][].
 
     **Returns:** an [`diffrax_symplectic.Expectation`][].
 
     **Raises:** as [`diffrax_symplectic.expectation`][]; a `ValueError` for levels without
-    `order`, if $\phi$ holds a `diffrax.RESULTS`, or if `fn` does not use its key.
+    `order`, or if $\phi$ holds a `diffrax.RESULTS`. Warns if all samples are equal, as
+    they are if `fn` does not use its key.
     """
-    key, devices = checked_call("monte_carlo", key, tol, start, devices)
+    key, begin, devices = checked_call("monte_carlo", key, tol, start, first, devices)
     levels = whole_number("levels", levels)
     if levels > 1 and order is None:
         raise ValueError(
@@ -183,7 +180,7 @@ def monte_carlo(
     sampler = jtu.Partial(_of_function, fn, level_weights(order, levels))
     plan = sampling.plan(sampler, devices)
     with Meter(progress_meter) as meter:
-        return run(plan, key, devices, sampling, start, tol, meter)
+        return run(plan, key, devices, sampling, begin, tol, meter)
 
 
 def _of_function(fn: Callable, weights: np.ndarray, keys: PRNGKeyArray) -> Samples:
@@ -197,11 +194,7 @@ def _of_function(fn: Callable, weights: np.ndarray, keys: PRNGKeyArray) -> Sampl
 
 def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
     """What `fn` returns, and whether the path succeeded."""
-    program, shape = jax.make_jaxpr(fn, return_shape=True)(key)
-    _check_failures_are_reported(program, shape)
-    leaves = jaxpr_as_fun(program)(key)
-    out = jtu.tree_unflatten(jtu.tree_structure(shape), leaves)
-    success = jnp.array(True)
+    out, success = fn(key), jnp.array(True)
     if isinstance(out, tuple) and len(out) == 2 and _is_result(out[1]):
         out, result = out
         success = diffrax.is_okay(result)
@@ -213,32 +206,7 @@ def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
     out = jtu.tree_map(jnp.asarray, out)
     if len(jtu.tree_leaves(out)) == 0:
         raise ValueError(f"`fn` must return arrays, which are averaged; got {out!r}.")
-    _check_reads_key(program)
     return out, success & all_finite(out)
-
-
-def _check_failures_are_reported(program: ClosedJaxpr, out: PyTree) -> None:
-    """Raises a `ValueError` if a function solves with `throw=False`, as its program says,
-    but what it returns holds no `diffrax.RESULTS`."""
-    reported = any(map(_is_result, jtu.tree_leaves(out, is_leaf=_is_result)))
-    if not reported and solves_without_throwing(program.jaxpr):
-        raise ValueError(
-            "`fn` solves with `throw=False` but does not return `sol.result`, so that "
-            "paths that failed would be averaged as if they had not. Return the pair "
-            "`(phi, sol.result)`: then they are left out and counted. Or pass `throw=True` "
-            "to `diffeqsolve`, which raises an error if a path fails. If `fn` sees to "
-            "failures itself, return `(phi, diffrax.RESULTS.successful)`."
-        )
-
-
-def _check_reads_key(program: ClosedJaxpr) -> None:
-    (key,) = program.jaxpr.invars
-    read = [x for eqn in program.jaxpr.eqns for x in eqn.invars]
-    if not any(x is key for x in read):
-        raise ValueError(
-            "`fn` does not use its `key`, so that all samples would be the same. Make the "
-            "Brownian path of this key: `solver.path(shape, key)`."
-        )
 
 
 def _is_result(x) -> bool:

@@ -1,6 +1,5 @@
 """Paths that take fixed steps together: the loop that all samplings share."""
 
-import abc
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -9,16 +8,26 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._arguments import check_solver, check_takes, whole_number
 from .._custom_types import Args, RealScalarLike, Y
 from .._root_finder import all_finite
-from .._terms import brownian_paths, check_fit, check_stratonovich, evaluated
-from ._estimate import Plan, real, Samples
+from .._suggest import path_for, specified
+from .._terms import (
+    additive_fault,
+    brownian_paths,
+    check_fit,
+    evaluated,
+    separable_fault,
+    split_terms,
+)
+from ._run import real
+from ._sampling import Samples, Tails
 
 
 class Level(eqx.Module):
@@ -58,6 +67,9 @@ class Problem(eqx.Module):
             raise ValueError(
                 "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
             )
+        # Each path gets a key of its own.
+        make = lambda shape: path_for(solver, "weak", None, shape, jr.key(0))
+        terms = specified(terms, make)
         saved_steps, num_steps = _steps(t0, t1, dt0, ts)
         y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
         if not all_finite(y0):
@@ -69,7 +81,8 @@ class Problem(eqx.Module):
                 "`terms` have no Brownian path, so that nothing is random. Solve them "
                 "once, by `diffrax.diffeqsolve`."
             )
-        check_stratonovich(terms, solver, start, y0, args)
+        _check_sense(terms, solver, start, y0, args)
+        _check_cells(terms, t0, float(dt0) / 2 ** (levels - 1))
         check_takes("phi", phi, "t", "y", "args")
         once = lambda t, y, args: evaluated("phi", phi, t, y, args=args)
         check_real("phi", jtu.tree_leaves(eqx.filter_eval_shape(once, start, y0, args)))
@@ -142,7 +155,7 @@ class Ensemble(eqx.Module):
     # A path that failed counts as failed until the end. It goes on from `y0`: an equation
     # without a solution would keep the other paths waiting in each step to come.
     failed: Bool[Array, " n"]
-    # What is to be subtracted from `phi`: nothing, or an array of shape `(n, S, m)`.
+    # What is known of their noise, if anything.
     control: Any
 
     @staticmethod
@@ -194,29 +207,42 @@ def samples(
     p: Problem,
     begin: Callable[[Level], tuple[Callable, Ensemble]],
     mean: Callable[[Array, Bool[Array, " n"]], Array] | None = None,
+    finish: Callable[[Level, Array, Ensemble], tuple] | None = None,
+    beyond: Array | None = None,
 ) -> Samples:
     """Takes the paths that `begin` makes for a level through all of its steps, by the
     function `step(i, paths)` that it makes, too. Each path is a sample, or `mean` of `phi`
-    and of which of them have failed is one."""
+    and of which of them have failed is one, with how heavy its tails are. What `finish`
+    returns of a level, `phi` and the paths at the end are values, control, what it
+    promises, and the logarithms of ratios, for `Tails` of numbers `beyond`."""
 
     def on_level(level):
         step, paths = begin(level)
         keep = lambda phi, failed: phi
         saved, paths = _simulate(p, level, step, paths, mean or keep)
         if mean is not None:
-            return saved[:, None], jnp.ones(1, bool), jnp.sum(paths.failed)[None]
-        if paths.control is not None:
-            saved = saved - jnp.swapaxes(paths.control, 0, 1).astype(saved.dtype)
-        return saved, ~paths.failed, None
+            lost = jnp.sum(paths.failed)[None]
+            both = jnp.moveaxis(saved, 1, 0)[:, :, None]
+            return tuple(both), None, jnp.ones(1, bool), lost
+        if finish is None:
+            return (saved,), None, ~paths.failed, None
+        *arrays, log_ratio = finish(level, saved, paths)
+        return tuple(arrays), log_ratio, ~paths.failed, None
 
     if len(p.levels.h) == 1:
         out = jtu.tree_map(lambda x: x[None], on_level(p.level(0)))
     else:
         # One program for all levels.
         out = lax.map(on_level, p.levels)
-    values, good, lost = out
-    values = values[:, 0] if p.at_end else jnp.swapaxes(values, 1, 2)
-    return Samples(p.unravel(values), p.weights, good, lost)
+    arrays, log_ratio, good, lost = out
+    flat = lambda x: p.unravel(x[:, 0] if p.at_end else jnp.swapaxes(x, 1, 2))
+    values, *others = map(flat, arrays)
+    if beyond is None:
+        return Samples(values, p.weights, good, lost, heaviest=next(iter(others), None))
+    control, promised = others
+    beyond = p.unravel(beyond[:, 0] if p.at_end else beyond)
+    tails = Tails(promised, beyond, jnp.exp(-jnp.sum(log_ratio, axis=0)))
+    return Samples(values, p.weights, good, lost, control, tails)
 
 
 def independent_steps(
@@ -233,14 +259,6 @@ def independent_steps(
 
     start = lambda random: p.init(terms_of(random), 0, level.h, p.y0)
     return step, Ensemble.start(p, n, jax.vmap(start)(randomness(0)))
-
-
-class AbstractSampling(eqx.Module):
-    """How the samples of an expectation are taken, as users name it."""
-
-    @abc.abstractmethod
-    def prepare(self, problem: Problem, key: PRNGKeyArray, devices: tuple) -> Plan:
-        """Raises a `ValueError` for what it cannot do."""
 
 
 def _steps(t0, t1, dt0, ts: Sequence | None) -> tuple[np.ndarray, np.integer]:
@@ -268,6 +286,36 @@ def _steps(t0, t1, dt0, ts: Sequence | None) -> tuple[np.ndarray, np.integer]:
         )
     *saved, num_steps = whole.astype(np.int32)
     return np.array(saved), num_steps
+
+
+def _check_sense(terms, solver, t0, y0: Y, args: Args) -> None:
+    """Raises a `ValueError` for solvers in the sense of Ito, unless that is
+    Stratonovich's: for additive noise, and noise that changes `p` and depends on `q`."""
+    if not isinstance(solver, diffrax.AbstractItoSolver):
+        return
+    noise = tuple(split_terms(terms)[1])
+    if additive_fault(noise, t0, y0, args) and separable_fault((), noise, t0, y0, args):
+        raise ValueError(
+            f"`{type(solver).__name__}` solves equations in the sense of Ito. "
+            "`expectation` takes all terms in the sense of Stratonovich, as those of "
+            "`hamiltonian_terms` are, and here they differ. Use a solver of this package, "
+            "or a Stratonovich solver of Diffrax such as `diffrax.Heun`. If Ito's sense is "
+            "meant, add the drift that corrects it, or pass your own solve to "
+            "`monte_carlo`."
+        )
+
+
+def _check_cells(terms, t0, h: float) -> None:
+    """Raises a `ValueError` for steps that are not made of the cells of a path."""
+    for path in brownian_paths(terms):
+        cell = getattr(path, "cell", None)
+        whole = lambda x: abs(x / cell - round(x / cell)) <= 1e-3
+        if cell is not None and not (whole(float(t0)) and whole(h)):
+            raise ValueError(
+                f"Steps of a `{type(path).__name__}` with `cell` must begin and end at "
+                f"multiples of `cell`; got cell={cell}, t0={t0} and the smallest step {h}. "
+                "Pass a `cell` that divides `t0` and the steps of all `levels`."
+            )
 
 
 def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations levels"]:

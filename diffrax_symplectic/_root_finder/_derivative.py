@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import optimistix as optx
@@ -10,12 +11,13 @@ from jaxtyping import Array, Float, PyTree
 
 from .._batch import where_pending
 from ._linear import MAX_WRITTEN_OUT, solve, Solver
-from ._sweeps import Found, sweep
-from ._tolerance import Limits
+from ._sweeps import sweep
+from ._tolerance import Tolerance
 
 
 # A derivative is solved to rounding error, as the step is by default.
-_LIMITS = Limits(None, 0.0, optx.max_norm, lambda x: x, steps=200)
+_TOLERANCE = Tolerance(None, 0.0, optx.max_norm)
+_MOST_SWEEPS = 200
 
 
 def differentiate(
@@ -35,11 +37,17 @@ def differentiate(
     def by(operator: Callable[[Array], Array], b: Float[Array, " n"]) -> Array:
         if b.size <= MAX_WRITTEN_OUT or solver is not None:
             return solve(operator, b, solver)[0]
-        begin = Found(jnp.zeros_like(b), solved=jnp.array(False), near=jnp.array(True))
-        found = sweep(_LIMITS, lambda x: x + (b - operator(x)), begin)
-        reduction = float(jnp.finfo(b.dtype).eps) ** 0.9
-        exactly = lambda _: solve(operator, b, None, reduction)[0]
-        return where_pending(exactly, ~found.solved, found.y)
+        operator = eqx.filter_closure_convert(operator, b)
+        image = lambda x: x + (b - operator(x))
+        zero, yes = jnp.zeros_like(b), jnp.array(True)
+        found, solved = sweep(_TOLERANCE, _MOST_SWEEPS, image, lambda x: x, zero, yes)
+        return where_pending(_exactly, ~solved, found, (operator, b))
 
     operator = lambda x: x - jfu.ravel_pytree(linear(unravel(x)))[0]
     return unravel(lax.custom_linear_solve(operator, flat, by, by))
+
+
+def _exactly(x: Float[Array, " n"], system) -> Float[Array, " n"]:
+    del x
+    operator, b = system
+    return solve(operator, b, None, float(jnp.finfo(b.dtype).eps) ** 0.9)[0]

@@ -1,31 +1,38 @@
+import abc
 import functools as ft
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
-import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
-from jax import lax
-from jaxtyping import Array, PyTree, Scalar
+from jaxtyping import Array, Bool, PyTree, Scalar
 
 from .._batch import where_pending
 from .._compat import ω
-from ._continuation import advance, begin, Packed, Progress
-from ._sweeps import Found, sweep
-from ._tolerance import Limits
+from ._newton import Newton
+from ._sweeps import sweep
+from ._tolerance import all_finite, Tolerance
 
 
-# Iterations of Newton's method in a step of the search: to gather paths from a large batch,
-# and to put them back, takes longer than several of these.
-ITERATIONS = 8
+_Found: TypeAlias = tuple[Any, Bool[Array, ""]]
 
-# The progress of the search; and zeros in place of auxiliary output, which `postprocess`
-# evaluates once, at the solution.
-_State: TypeAlias = tuple[Packed, Any]
+
+class AbstractBlocks(eqx.Module):
+    """Arguments `args` that know their equations block by block."""
+
+    @abc.abstractmethod
+    def sweep(self, solve: Callable[..., _Found], guess: Any, pending: Any) -> _Found:
+        """Solves block after block, each from the values of those before it, by
+        `solve(image, scale, guess, pending)`."""
+
+
+class _State(NamedTuple):
+    """Whether the equations are solved, and if they cannot be, why."""
+
+    solved: Bool[Array, ""]
+    result: optx.RESULTS
 
 
 class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _State]):
@@ -37,21 +44,19 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     the *next* correction would be below it: after $\delta_{n-1}$ and $\delta_n$ that is
     about $\delta_n\, (\delta_n / \delta_{n-1})$ for a method of linear convergence.
 
-    First come sweeps for all paths of a batch together, until each is solved or does not
-    converge: fixed-point (Picard) iterations, which need no Jacobian. In a sweep $q$ reads
-    what $p$ has become. This is for a list of pairs `(p, q)`; of other unknowns two copies
-    read each other. Where that converges slowly, values stay behind by a fraction of their
-    change (successive over-relaxation: Young, Transactions of the American Mathematical
-    Society 76, 1954).
+    There is one step. First come sweeps for all paths of a batch together, until each
+    is solved or does not converge: fixed-point (Picard) iterations, which need no Jacobian,
+    in which $q$ reads the new $p$ (Gauss--Seidel). Unknowns that are no pairs $(p, q)$ are
+    iterated as a doubled system. Where that converges slowly, it is under-relaxed (Young,
+    Transactions of the American Mathematical Society 76, 1954).
 
-    The paths that are left are gathered from the batch. For these, a step of the search is
-    up to eight iterations of Newton's method. Its linear systems are solved by elimination
-    up to 32 unknowns, and above by GMRES, which needs no matrix. If its corrections do not
-    shrink, it solves for a part of the time step, with increments reduced alike, and goes
-    on from there part by part (continuation). If the branch of solutions that begins at the
-    start of the step ends before the whole step, Newton's method looks for any other
-    solution. A small correction is no success where its linear system was not solved, or
-    where the residual is larger than the state.
+    Then come the stragglers, gathered from the batch, by Newton's method. Its linear
+    systems are solved by elimination up to 32 unknowns, and above by GMRES, which needs no
+    matrix. If its corrections do not shrink, it solves for a part of the time step, with
+    increments reduced alike, and goes on from there part by part (continuation). If the
+    branch of solutions that begins at the start of the step ends before the whole step,
+    Newton's method looks for any other solution. A small correction is no success where
+    its linear system was not solved, or where the residual is larger than the state.
 
     **Arguments:**
 
@@ -63,11 +68,10 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         included. `None` is elimination for few unknowns, and otherwise no matrix.
     - `picard_steps`: the most sweeps before Newton's method. Where their rate tells that so
         many would not do, they end at once.
+    - `newton_steps`: the most iterations of Newton's method after them.
 
     In `optimistix.root_find`, `options={"scale": f}` says how large the state is that the
     unknowns `k` change: `f(k)` has their structure, and stands in place of `k` in `rtol`.
-    Nothing waits for the solution where `options={"lost": flag}` is true, and there it is
-    of no use. Of Newton's method there are `options={"iterations": n}` in a step, or eight.
 
     **Raises:** a `ValueError` for negative numbers.
     """
@@ -77,57 +81,54 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     norm: Callable[[PyTree], Scalar] = optx.max_norm
     linear_solver: lx.AbstractLinearSolver | None = None
     picard_steps: int = eqx.field(default=200, static=True)
+    newton_steps: int = eqx.field(default=100, static=True)
 
     def __check_init__(self):
-        for name in ("rtol", "atol", "picard_steps"):
+        for name in ("rtol", "atol", "picard_steps", "newton_steps"):
             if isinstance(n := getattr(self, name), int | float) and n < 0:
                 raise ValueError(f"`{name}` of `PicardNewton` must be >= 0; got {n}.")
 
-    def _limits(self, options: dict[str, Any]) -> Limits:
-        # Increments are only needed to the accuracy of the state that they change.
-        scale = options.get("scale", lambda k: k)
-        return Limits(self.rtol, self.atol, self.norm, scale, self.picard_steps)
-
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
-        del f_struct, tags
-        lost = options.get("lost", jnp.array(False))
-        limits, zeros = self._limits(options), jtu.tree_map(jnp.zeros_like, y)
-        begun = Found(zeros, solved=lost, near=~lost)
-        # A step sweeps the blocks of its plan one after another.
-        if "sweep" in options:
-            found = options["sweep"](limits, begun)
-        else:
-            moved = lambda k: (y**ω + k**ω).ω
-            image = lambda k: (k**ω - fn(moved(k), args)[0] ** ω).ω
-            scale = lambda k: limits.scale(moved(k))
-            found = sweep(limits._replace(scale=scale), image, begun)
-            found = found._replace(y=moved(found.y))
-        k, guess = jfu.ravel_pytree(found.y)[0], jfu.ravel_pytree(y)[0]
-        k = jnp.where(found.near, k, guess)
-        of_array = lambda x: isinstance(x, jax.ShapeDtypeStruct)
-        zero = lambda x: jnp.zeros(x.shape, x.dtype) if of_array(x) else x
-        return begin(k, found.solved, guess), jtu.tree_map(zero, aux_struct)
+        del fn, y, args, options, f_struct, aux_struct, tags
+        return _State(jnp.array(False), optx.RESULTS.successful)
 
     def step(self, fn, y, args, options, state, tags):
-        del tags
-        # `y` stays the guess. The state has the iterate, which `postprocess` returns.
-        (packed, aux), (guess, restore) = state, jfu.ravel_pytree(y)
-        residual = lambda k: jfu.ravel_pytree(fn(restore(k), args)[0])[0]
-        ended = lambda packed: Progress.unpacked(packed).ended
-        solver, limits = self.linear_solver, self._limits(options)
-        once = ft.partial(advance, limits, solver, residual, restore, guess)
-        another = lambda _, packed: jnp.where(ended(packed), packed, once(packed))
-        times = options.get("iterations", ITERATIONS)
-        newton = lambda packed: lax.fori_loop(0, times, another, packed)
-        return y, (where_pending(newton, ~ended(packed), packed), aux), aux
+        del state, tags
+        scale = eqx.filter_closure_convert(options.get("scale", lambda k: k), y)
+        pending = all_finite(y)
+        start, solved = self._sweep(fn, y, args, scale, pending)
+        newton = Newton(y, self.rtol, self.atol, self.norm, self.linear_solver)
+        rest = newton, self.newton_steps, fn, args, scale
+        value = start, _State(solved, optx.RESULTS.successful)
+        y, state = where_pending(_newton, pending & ~solved, value, rest)
+        return y, state, fn(y, args)[1]
+
+    def _sweep(self, fn, y, args, scale, pending) -> _Found:
+        tolerance = Tolerance(self.rtol, self.atol, self.norm)
+        solve = ft.partial(sweep, tolerance, self.picard_steps)
+        if isinstance(args, AbstractBlocks):
+            return args.sweep(solve, y, pending)
+        return solve(lambda y: (y**ω - fn(y, args)[0] ** ω).ω, scale, y, pending)
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
-        progress, R = Progress.unpacked(state[0]), optx.RESULTS
-        return progress.solved, R.where(progress.hopeless, R.nonfinite, R.successful)
+        return state.solved, state.result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        del options, tags, result
-        found = jfu.ravel_pytree(y)[1](Progress.unpacked(state[0]).k)
-        aux = fn(found, args)[1] if jtu.tree_leaves(aux) else aux
-        return found, aux, {}
+        del fn, args, options, state, tags, result
+        return y, aux, {}
+
+
+def _newton(value: tuple[Any, _State], rest: Any) -> tuple[Any, _State]:
+    newton, most, fn, args, scale = rest
+    sol = optx.root_find(
+        fn,
+        newton,
+        value[0],
+        args,
+        dict(scale=scale),
+        has_aux=True,
+        max_steps=most,
+        throw=False,
+    )
+    return sol.value, _State(sol.result == optx.RESULTS.successful, sol.result)

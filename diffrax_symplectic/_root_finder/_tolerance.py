@@ -1,4 +1,4 @@
-"""When a correction is small enough, and when iteration gives up."""
+"""When a correction is small enough."""
 
 import functools as ft
 from collections.abc import Callable
@@ -19,53 +19,52 @@ _SHORT = 4
 # Longer ones are folded to this length, by what fuses with the program that makes them. Of
 # what is longer XLA keeps another array for each maximum.
 _WIDE = 32
-# A correction below this fraction of the state shows that iteration came near.
-_NEAR = 0.01
 
 
-class Limits(NamedTuple):
-    """When iteration ends.
+class Correction(NamedTuple):
+    """How large a correction is.
 
-    - `rtol`, `atol`: a correction is measured in units of `rtol * scale + atol`, leaf by
-        leaf. `rtol` of `None` stands for two units in the last place.
-    - `norm`: the norm within a leaf.
-    - `scale`: how large the state is that values change.
-    - `steps`: the most iterations.
+    - `size`: in units of the tolerance, leaf by leaf: 1 is just accepted.
+    - `bound`: what its `size` would be if it were as large as the whole state.
+    - `rounded`: whether it is as small as rounding errors of the whole state. These can
+        keep the corrections to a leaf that is small next to the others above its own
+        tolerance for ever.
+    - `small`: whether it is below a hundredth of the whole state.
     """
+
+    size: Scalar
+    bound: Scalar
+    rounded: _Flag
+    small: _Flag
+
+
+class Tolerance(NamedTuple):
+    """A correction is measured in units of `rtol * scale + atol`, leaf by leaf. `rtol` of
+    `None` stands for two units in the last place."""
 
     rtol: float | None
     atol: float
     norm: Callable[[PyTree], Scalar]
-    scale: Callable[[PyTree[Array]], PyTree[Array]]
-    steps: int
 
     def sizes(self, y: PyTree[Array]) -> list[Scalar]:
         """The norm of each leaf."""
         norm = max_norm if self.norm is optx.max_norm else self.norm
         return [norm(x) for x in jtu.tree_leaves(y)]
 
-    def scales(self, y: PyTree[Array]) -> list[Scalar]:
-        return self.sizes(self.scale(y))
+    def measure(self, change: PyTree[Array], scale: PyTree[Array]) -> Correction:
+        sizes, scales = self.sizes(change), self.sizes(scale)
+        whole = largest(scales)
+        size, bound = self._in_units(sizes, scales), self._in_units([whole], [whole])
+        # An infinite correction to an infinite state is neither.
+        eps = float(jnp.finfo(size.dtype).eps)
+        below = lambda fraction: largest(sizes) < fraction * whole
+        return Correction(size, bound, below(100 * eps), below(0.01))
 
-    def in_units(self, sizes: list[Scalar], scales: list[Scalar]) -> Scalar:
-        """The largest of `sizes` in units of the tolerance: 1 is just accepted."""
+    def _in_units(self, sizes: list[Scalar], scales: list[Scalar]) -> Scalar:
         eps = jnp.finfo(jnp.result_type(*sizes)).eps
         rtol = 2 * eps if self.rtol is None else self.rtol
         each = [ratio(a, rtol * b + self.atol) for a, b in zip(sizes, scales)]
         return largest(each)
-
-    def compare(
-        self, change: PyTree[Array], scales: list[Scalar]
-    ) -> tuple[Scalar, _Flag, _Flag]:
-        """The size of a correction in units of the tolerance, and next to the whole state
-        whether it is no larger than rounding errors, and whether it is small at all."""
-        sizes = self.sizes(change)
-        size, whole = self.in_units(sizes, scales), largest(scales)
-        # Rounding errors can keep the corrections to a leaf that is small next to the
-        # others above `rtol` for ever. Then they no longer shrink, and all are tiny.
-        eps = float(jnp.finfo(size.dtype).eps)
-        below = lambda fraction: largest(sizes) <= fraction * whole
-        return size, below(100 * eps), below(_NEAR)
 
 
 def max_norm(x: Array) -> Scalar:

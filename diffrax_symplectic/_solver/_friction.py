@@ -14,7 +14,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from .._compat import direction, materialize, nondifferentiable, result_named, ω
+from .._batch import materialize
+from .._compat import direction, nondifferentiable, ω
 from .._custom_types import Args, RealScalarLike, Y
 from .._terms import rate, split_terms
 
@@ -168,18 +169,11 @@ def _inverse_mass(velocity: Callable, p: PyTree[Array], number: int) -> Array:
     return jax.lax.stop_gradient(jax.jacfwd(of)(jnp.ravel(x)))
 
 
-_NO_FRICTION = (
-    "`gamma` is negative or not finite, or as a matrix not symmetric positive "
-    "semidefinite, neither by itself nor with the masses of H0. To fit it, let `gamma` be "
-    "the exponential of what is fitted."
-)
-
-
 def friction_result(
     gamma: PyTree[ArrayLike], modes: list[Modes | None], result: diffrax.RESULTS
 ) -> diffrax.RESULTS:
-    """`result`, or where values of `gamma` that were traced are no friction, one that says
-    so."""
+    """`result`, or where values of `gamma` that were traced are no friction (negative, not
+    finite, or as a matrix not symmetric positive semidefinite) `RESULTS.nonfinite`."""
     leaves = jtu.tree_leaves(gamma)
     leaves = leaves if len(leaves) == len(modes) else leaves * len(modes)
     traced = lambda x: isinstance(x, jax.core.Tracer)
@@ -190,9 +184,8 @@ def friction_result(
     ]
     if len(bad) == 0:
         return result
-    said = result_named("no_friction", _NO_FRICTION)
-    bad = ft.reduce(jnp.logical_or, bad)
-    return diffrax.RESULTS.where(bad, said, result)  # pyright: ignore
+    R, bad = diffrax.RESULTS, ft.reduce(jnp.logical_or, bad)
+    return R.where(bad, R.nonfinite, result)  # pyright: ignore
 
 
 def _no_rate(g: ArrayLike) -> Bool[Array, ""]:

@@ -2,7 +2,6 @@
 as what they define."""
 
 import functools as ft
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
@@ -13,20 +12,17 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, PyTree
+from jaxtyping import Array, Bool, PyTree
 
-from .._batch import batched_together
-from .._compat import materialize, result_named, ω
+from .._batch import materialize
+from .._compat import ω
 from .._custom_types import RealScalarLike, Y
 from .._plan import Block, Plan
 from .._root_finder import (
+    AbstractBlocks,
     all_finite,
     differentiate,
-    Found,
-    ITERATIONS,
-    Limits,
-    PicardNewton,
-    sweep,
+    Halves,
 )
 from .._tableau import FlatTableau, Stage
 from .._terms import tree_sum
@@ -50,7 +46,7 @@ class Step(NamedTuple):
     driven: dict[str, Driven]
 
 
-class Stages(eqx.Module):
+class Stages(AbstractBlocks):
     """The stages of one step, in the blocks of its plan. Values of stages that are not
     known count as zero."""
 
@@ -69,20 +65,22 @@ class Stages(eqx.Module):
 
         return [zero(group) for group in block.unknown]
 
-    def sweep(self, limits: Limits, begin: Found) -> Found:
+    def sweep(self, solve: Callable, guess: Unknown, pending):
         """First iterations for the stage equations: block after block, each from the values
         of those before it."""
         values, y = {}, []
-        solved = near = jnp.array(True)
-        for block, k in zip(self.plan.blocks, begin.y):
+        solved = jnp.array(True)
+        for block, k in zip(self.plan.blocks, guess):
             if block.unknown:
-                own = limits._replace(scale=ft.partial(self._scale, block))
-                image = ft.partial(self._image, block, values)
-                k, is_solved, is_near = sweep(own, image, begin._replace(y=k))
-                solved, near = solved & is_solved, near & is_near
+                pairs = all(type(x) is tuple and len(x) == 2 for x in k)
+                pack, unpack = (_halves, _pairs) if pairs else (_same, _same)
+                image = lambda k: pack(self._image(block, values, unpack(k)))
+                scale = lambda k: pack(self._scale(block, unpack(k)))
+                k, is_solved = solve(image, scale, pack(k), pending)
+                k, solved = unpack(k), solved & is_solved
             y.append(k)
             values = self._with_block(block, values, k, keep=True)
-        return Found(y, solved, near)
+        return y, solved
 
     def image(self, unknown: Unknown) -> Unknown:
         r"""$\Phi$ for the whole step."""
@@ -134,6 +132,19 @@ class Stages(eqx.Module):
         stages, matrix = self.plan.tableau.stages, self.plan.tableau.matrix
         position = _position(self.y0, stages, matrix[list(group)], values)
         return _evaluate(self.step, [stages[i] for i in group], position)
+
+
+def _same(k: list[_Value]) -> list[_Value]:
+    return k
+
+
+def _halves(k: list[_Value]) -> Halves:
+    p, q = zip(*k)
+    return Halves([*p], [*q])
+
+
+def _pairs(k: Halves) -> list[_Value]:
+    return [*zip(*k)]
 
 
 def closed(step: Step, y0: Y) -> Step:
@@ -209,9 +220,9 @@ def _position(
     return add("y") if stages[0].writes == "y" else (add("p"), add("q"))
 
 
-# Whether the stage equations of a step, or of one before it, were not solved; `None` where
-# there are none.
-Unsolved: TypeAlias = Bool[ArrayLike, ""] | None
+# What became of the stage equations of a step, or of one before it that failed; `None`
+# where there are none.
+Solved: TypeAlias = optx.RESULTS | None
 
 
 def take_step(
@@ -219,102 +230,84 @@ def take_step(
     step: Step,
     y0: Y,
     solver: diffrax.AbstractSolver,
-    unsolved: Unsolved = None,
-) -> tuple[Y, Unsolved]:
-    """The end of the step, and whether its stage equations were not solved. The root finder
-    of `solver` solves them, unless those of an earlier step were already `unsolved`."""
+    before: Solved = None,
+) -> tuple[Y, Solved]:
+    """The end of the step, and whether its stage equations were solved. The root finder of
+    `solver` solves them, unless a step `before` has failed."""
     if plan.num_unknown == 0:
-        return Stages(plan, step, y0).end([[]] * len(plan.blocks)), unsolved
+        return Stages(plan, step, y0).end([[]] * len(plan.blocks)), before
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         raise ValueError(
             f"The tableau of `{type(solver).__name__}` has implicit stages. Let the class "
             "also subclass `diffrax_symplectic.AbstractImplicitStages`."
         )
-    unsolved = jnp.array(False) if unsolved is None else jnp.asarray(unsolved)
+    before = no_failure() if before is None else before
     finder, most = solver.root_finder, solver.root_find_max_steps
-    return _traced_once(plan, step, y0, unsolved, finder, most)
+    return _traced_once(plan, step, y0, before, finder, most)
+
+
+def no_failure() -> optx.RESULTS:
+    return jtu.tree_map(jnp.asarray, optx.RESULTS.successful)
+
+
+def _failed(result: optx.RESULTS) -> Bool[Array, ""]:
+    return result != optx.RESULTS.successful
+
+
+def result_of(solved: Solved, y1: Y) -> diffrax.RESULTS:
+    """Whether the end of a step was reached."""
+    R = diffrax.RESULTS
+    finite = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
+    if solved is None:
+        return finite
+    return R.where(_failed(solved), R.promote(solved), finite)
 
 
 # Diffrax traces a step three times, or more.
 @eqx.filter_jit
-def _traced_once(plan: Plan, step: Step, y0: Y, lost, finder: Any, max_steps: int):
+def _traced_once(plan: Plan, step: Step, y0: Y, before, finder: Any, max_steps: int):
     stages = Stages(plan, closed(step, y0), y0)
-    y1, _, unsolved = _implicit_step(stages, lost, finder=finder, max_steps=max_steps)
-    return y1, unsolved
-
-
-_UNSOLVED = (
-    "The stage equations of a step were not solved. Take smaller steps; for Gaussian paths "
-    "bound the increments with `TruncatedBrownianPath`; or, if the step is solvable but "
-    "hard, raise `root_find_max_steps` of the solver (not `max_steps` of `diffeqsolve`). "
-    "If this is the first step, look for NaNs in `y0` and `args`."
-)
-_NOT_FINITE = (
-    "A step did not end in finite numbers: look for NaNs in `y0`, `args` and the gradients "
-    "of the Hamiltonians (such as that of a norm at zero), or take smaller steps."
-)
-
-
-def result_of(unsolved: Unsolved, y1: Y) -> diffrax.RESULTS:
-    """Whether the end of a step was reached."""
-    R = diffrax.RESULTS
-    lost = result_named("step_not_finite", _NOT_FINITE)
-    finite = R.where(all_finite(y1), R.successful, lost)
-    if unsolved is None:
-        return finite
-    said = result_named("stage_equations_unsolved", _UNSOLVED)
-    return R.where(unsolved, said, finite)
+    y1, _, solved = _implicit_step(stages, before, finder=finder, max_steps=max_steps)
+    return y1, solved
 
 
 @eqx.filter_custom_jvp
 def _implicit_step(
-    stages: Stages, lost: Bool[Array, ""], *, finder: Any, max_steps: int
-) -> tuple[Y, Unknown, Bool[Array, ""]]:
-    """The end of the step, the values of its unknown stages, and whether these do not
-    solve the stage equations. No time is spent on a path that is `lost`."""
+    stages: Stages, before: optx.RESULTS, *, finder: Any, max_steps: int
+) -> tuple[Y, Unknown, optx.RESULTS]:
+    """The end of the step, the values of its unknown stages, and whether these solve the
+    stage equations. No time is spent on a path that failed `before`."""
     if isinstance(finder, optx.BestSoFarRootFinder):
         raise ValueError(
             "`BestSoFarRootFinder` returns an iterate from before the last correction. It "
             "does not solve the stage equations. Pass the root finder within it."
         )
-    return _solved(stages, lost, finder, max_steps)
-
-
-@eqx.filter_jit
-def _solved(stages: Stages, lost: Bool[Array, ""], finder: Any, max_steps: int):
+    lost = _failed(before)
     guess = [stages.zero_of(block) for block in stages.plan.blocks]
-    guess = batched_together(guess, stages.y0)
-    iterations = min(ITERATIONS, max_steps)
-    if not isinstance(finder, PicardNewton):
-        # That one begins with this.
-        guess, iterations = stages.image(guess), 1
+    # Optimistix ends at once where the guess is not finite.
+    guess = jtu.tree_map(lambda k: jnp.where(lost, jnp.nan, k), guess)
     sol = optx.root_find(
         lambda k, stages: (k**ω - stages.image(k) ** ω).ω,
         finder,
         guess,
         args=stages,
-        options=dict(
-            scale=stages.scale,
-            sweep=stages.sweep,
-            lost=lost,
-            iterations=iterations,
-        ),
-        max_steps=math.ceil(max_steps / max(iterations, 1)),
+        options=dict(scale=stages.scale),
+        max_steps=max_steps,
         throw=False,
     )
-    unsolved = lost | (sol.result != optx.RESULTS.successful)
-    return stages.end(sol.value), sol.value, unsolved
+    result = optx.RESULTS.where(lost, before, sol.result)
+    return stages.end(sol.value), sol.value, result
 
 
 @_implicit_step.def_jvp
 def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
-    (stages, lost), (t_stages, _) = primals, tangents
-    y1, unknown, unsolved = _implicit_step(
-        stages, lost, finder=finder, max_steps=max_steps
+    (stages, before), (t_stages, _) = primals, tangents
+    y1, unknown, result = _implicit_step(
+        stages, before, finder=finder, max_steps=max_steps
     )
     # Where there is no solution there is no derivative either. It is zero for such a
     # path, and no number that is not finite spoils what other paths have in common with it.
-    failed = unsolved | ~all_finite(y1)
+    failed = _failed(result) | ~all_finite(y1)
     root = jtu.tree_map(lambda k: jnp.where(failed, 0, k), unknown)
 
     is_none = lambda x: x is None
@@ -329,4 +322,5 @@ def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
     end = lambda x, k: eqx.combine(x, still).end(k)
     _, t_y1 = jax.jvp(end, (moving, root), (t_stages, t_unknown))
     t_y1, t_unknown = jtu.tree_map(lambda t: jnp.where(failed, 0, t), (t_y1, t_unknown))
-    return (y1, unknown, unsolved), (t_y1, t_unknown, None)
+    no_tangent = jtu.tree_map(lambda _: None, result)
+    return (y1, unknown, result), (t_y1, t_unknown, no_tangent)

@@ -12,13 +12,11 @@ from typing import Any, cast, ClassVar, Literal, NamedTuple, TYPE_CHECKING, Type
 import diffrax
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import PRNGKeyArray, PyTree
 
 from .._arguments import check_state, whole_number
-from .._batch import batched_together
-from .._brownian import path_of, VARIABLES
+from .._brownian import drives, path_of, VARIABLES
 from .._conditions import drift_order
 from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
@@ -31,7 +29,7 @@ from .._terms import (
     number_of_noises,
     split_terms,
 )
-from ._step import result_of, Step, take_step, Unsolved
+from ._step import no_failure, result_of, Solved, Step, take_step
 from ._times import result_at
 
 
@@ -76,11 +74,21 @@ class Record(NamedTuple):
 
 
 # In a batch Diffrax goes on to step paths that have ended, and drops what comes out.
-SolverState: TypeAlias = Unsolved
+SolverState: TypeAlias = Solved
 
 
 class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
-    """The base of all solvers of this package."""
+    """The base of all solvers of this package, and of solvers of your own that are no
+    Runge--Kutta methods.
+
+    A subclass is a Diffrax solver: it has `order`, `init` and `step`, which take any
+    Stratonovich terms. It states `structure` (`"any"`, `"separable"`, `"additive"`,
+    `"constant"` or `"separable and constant"`), `variables` (the names of the random
+    variables of a step, such as `("W",)`), and `stage_vectors(num_noises)`, and overrides
+    `weak_order(terms)` and `strong_order(terms)`. Then [`diffrax_symplectic.Damped`][] and
+    [`diffrax_symplectic.LinearFlow`][] take it, and `solver.path(shape, key)` makes the
+    path that it needs.
+    """
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = (
@@ -242,21 +250,18 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         drift, noise = split_terms(terms)
         plan = make_plan(_drop_absent(self.tableau.flatten(), drift, noise))
         variables = _variables(plan.tableau)
-        begin, end, y0, solver_state = batched_together(
-            (t0, t1, y0, solver_state), eqx.filter((terms, args), eqx.is_array)
-        )
-        along, h = drift_driven(drift, begin, end, args), end - begin
+        along, h = drift_driven(drift, t0, t1, args), t1 - t0
         driven = {"h": along} if drift else {}
         name = type(self).__name__
         driven |= noise_driven(along, h, noise, variables, t0, t1, args, name)
-        y1, unsolved = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
-        result = result_at(terms, t0, t1, result_of(unsolved, y1))
-        return y1, None, dict(y0=y0, y1=y1), unsolved, result
+        y1, solved = take_step(plan, Step(t0, h, driven), y0, self, solver_state)
+        result = result_at(terms, t0, t1, result_of(solved, y1))
+        return y1, None, dict(y0=y0, y1=y1), solved, result
 
 
 def first_state(solver: AbstractSymplecticSolver) -> SolverState:
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    return jnp.array(False) if implicit else None
+    return no_failure() if implicit else None
 
 
 def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTableau:
@@ -270,7 +275,8 @@ def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTablea
     tableau = tableau.take(keep)
     if len(drift) > 0:
         return tableau
-    without = lambda stage: tuple(c for c in stage.channels if c != "L")
+    stays = lambda c: drives(c) != "drift brackets"
+    without = lambda stage: tuple(filter(stays, stage.channels))
     stages = tuple(stage._replace(channels=without(stage)) for stage in tableau.stages)
     return dataclasses.replace(tableau, stages=stages)
 
@@ -293,8 +299,8 @@ def _checked_root_finder(value: Any) -> Any:
 
 class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
     """A solver with implicit stages. It has the two fields that `diffrax` asks of implicit
-    solvers: the root finder for the stage equations, and the most iterations it may take in
-    each system of a step. Both are given by keyword, after the parameters of the method.
+    solvers: the root finder for the stage equations, and the most steps it may take in each
+    step of the solver. Both are given by keyword, after the parameters of the method.
     """
 
     # `optimistix.root_find` takes either kind of solver.
@@ -311,7 +317,8 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
 # The lines about these fields in the documentation of every such solver's `__init__`.
 ROOT_FINDER = """\
 - `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most iterations it may take in each step.
+- `root_find_max_steps`: the most steps that the root finder may take. `PicardNewton` takes
+    one, and has bounds of its own for its iterations.
 """
 ARGUMENTS = f"""**Arguments:**
 
@@ -339,7 +346,7 @@ def real_number(name: str, value: Any) -> float:
     """Raises a `ValueError` unless `value` is a finite real number."""
     try:
         number = math.nan if isinstance(value, complex) else float(value)
-    except Exception:
+    except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
         raise ValueError(

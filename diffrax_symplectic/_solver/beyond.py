@@ -3,7 +3,6 @@
 import dataclasses
 from typing import ClassVar
 
-import equinox as eqx
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -11,7 +10,6 @@ import numpy as np
 from jax import lax
 
 from .._arguments import check_state
-from .._batch import batched_together
 from .._conditions import drift_order
 from .._plan import make_plan
 from .._tableau import FlatTableau, GeneralTableau, Stage, Structure
@@ -171,45 +169,42 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del made_jump
         drift, noise = split_terms(terms)
-        unsolved = first_state(self) if solver_state is None else solver_state
-        begin, end, y0, unsolved = batched_together(
-            (t0, t1, y0, unsolved), eqx.filter((terms, args), eqx.is_array)
-        )
-        middle = begin + (end - begin) / 2
+        solved = first_state(self) if solver_state is None else solver_state
+        middle = t0 + (t1 - t0) / 2
         numbers, increments = self._in_order(terms, t0, t1)
         still = [middle] * (numbers.size + 1)
         # First and last the drift, which has no number: what it gets is not read.
         flows = (
             np.pad(np.full(numbers.size, False), 1, constant_values=True),
-            jnp.stack([begin, *still]),
-            jnp.stack([*still, end]),
+            jnp.stack([t0, *still]),
+            jnp.stack([*still, t1]),
             jnp.pad(numbers, 1),
             jnp.pad(increments, 1),
         )
 
-        def along_drift(t0, t1, number, increment, y, unsolved):
+        def along_drift(t0, t1, number, increment, y, solved):
             del number, increment
             if len(drift) == 0:
-                return y, unsolved
+                return y, solved
             step = Step(t0, t1 - t0, {"h": drift_driven(drift, t0, t1, args)})
-            return take_step(_flow, step, y, self, unsolved)
+            return take_step(_flow, step, y, self, solved)
 
-        def along_noise(t0, t1, number, increment, y, unsolved):
+        def along_noise(t0, t1, number, increment, y, solved):
             del t1
             if len(noise) == 0:
-                return y, unsolved
+                return y, solved
             driven = jtu.Partial(apply_one, noise, number, increment, args)
             step = Step(t0, jnp.zeros_like(t0), {"h": driven})
-            return take_step(_flow, step, y, self, unsolved)
+            return take_step(_flow, step, y, self, solved)
 
         # In a loop, so that each kind of flow is compiled only once.
         def along(carry, flow):
             is_drift, *which = flow
             return lax.cond(is_drift, along_drift, along_noise, *which, *carry), None
 
-        (y1, unsolved), _ = lax.scan(along, (y0, unsolved), flows)
-        result = result_at(terms, t0, t1, result_of(unsolved, y1))
-        return y1, None, dict(y0=y0, y1=y1), unsolved, result
+        (y1, solved), _ = lax.scan(along, (y0, solved), flows)
+        result = result_at(terms, t0, t1, result_of(solved, y1))
+        return y1, None, dict(y0=y0, y1=y1), solved, result
 
     def _in_order(self, terms, t0, t1):
         """The numbers of the noises in the order of their flows, and their increments."""

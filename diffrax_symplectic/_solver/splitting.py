@@ -80,12 +80,12 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
             strong=_at_most(record.strong, self.strong),
         )
 
-    def weak_order(self, terms):
+    def weak_order(self, terms) -> int | None:
         order = self.solver.weak_order(terms)  # pyright: ignore
         return None if order is None else min(order, self.weak)
 
-    def strong_order(self, terms):
-        order = self.solver.strong_order(terms)  # pyright: ignore
+    def strong_order(self, terms) -> int | float | None:
+        order: Any = self.solver.strong_order(terms)  # pyright: ignore
         return None if order is None else min(order, self.strong)
 
     @property

@@ -13,9 +13,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._batch import materialize
 from .._brownian import (
     AbstractLaw,
     AbstractWrappedPath,
+    drives,
     FixedStepBrownianPath,
     GivenPath,
     Increment,
@@ -26,7 +28,7 @@ from .._brownian import (
     VARIABLES,
     WeakBrownianPath,
 )
-from .._compat import direction, materialize, ω
+from .._compat import direction, ω
 from .._custom_types import Args, RealScalarLike
 from ._vector_fields import (
     apply,
@@ -186,26 +188,28 @@ def noise_driven(
 ) -> dict[str, jtu.Partial]:
     """What drives noise stages over the step of size `h`, for each random variable;
     `along` drives those of the drift."""
-    needed, optional = names, ()
-    if "L" in names:
-        # It is computed from others.
-        own = [name for name in names if name != "L"]
-        needed, optional = [*dict.fromkeys(["W", "H", *own])], ("K",)
-    drawn = controls(noise, needed, t0, t1, solver, optional)
+    own = [VARIABLES[name].held if name in VARIABLES else None for name in names]
+    needed = [
+        x for name, held in zip(names, own) for x in (held[0] if held else [name])
+    ]
+    optional = tuple(x for held in own if held for x in held[1])
+    drawn = controls(noise, [*dict.fromkeys(needed)], t0, t1, solver, optional)
     driven = {}
     for name in names:
-        if name == "L":
-            bridges = bridge(h, drawn["W"], drawn["H"], drawn.get("K"))
-            driven[name] = jtu.Partial(apply_bridge, along, noise, bridges, h, args)
-        elif name != "A":
-            driven[name] = jtu.Partial(apply, noise, drawn[name], args)
-        elif len(noise) == 1:
-            driven[name] = jtu.Partial(apply_brackets, noise[0], drawn[name][0], args)
-        else:
-            raise ValueError(
-                f"`{solver}` needs all noises in one term, whose path samples the Lévy "
-                f"areas between them; got {len(noise)} noise terms."
-            )
+        match drives(name):
+            case "noise":
+                driven[name] = jtu.Partial(apply, noise, drawn[name], args)
+            case "drift brackets":
+                bridges = bridge(h, drawn["W"], drawn["H"], drawn.get("K"))
+                driven[name] = jtu.Partial(apply_bridge, along, noise, bridges, h, args)
+            case "noise brackets" if len(noise) == 1:
+                A = drawn[name][0]
+                driven[name] = jtu.Partial(apply_brackets, noise[0], A, args)
+            case _:
+                raise ValueError(
+                    f"`{solver}` needs all noises in one term, whose path samples the Lévy "
+                    f"areas between them; got {len(noise)} noise terms."
+                )
     return driven
 
 

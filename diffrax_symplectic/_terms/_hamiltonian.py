@@ -121,7 +121,7 @@ def as_path(path: Any) -> diffrax.AbstractBrownianPath:
     is_struct = lambda x: isinstance(x, jax.ShapeDtypeStruct)
     is_tuple = isinstance(path, tuple) and all(isinstance(n, int) for n in path)
     if is_tuple or (leaves := jtu.tree_leaves(path)) and all(map(is_struct, leaves)):
-        return UnspecifiedPath(checked_shape(path, "path"))
+        return UnspecifiedPath(shape=checked_shape(path, "path"))
     is_class = isinstance(path, type)
     got = f"the class {path.__name__}" if is_class else f"a {type(path).__name__}"
     raise ValueError(

@@ -275,8 +275,9 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
             size, bracket = sizes(jtu.tree_map(lambda *x: jnp.stack(x), *points))
             finite = jnp.isfinite(size) & jnp.isfinite(bracket)
             small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
-            return bool(jnp.any(finite) & jnp.all(small | ~finite))
-    except Exception:
-        # A check of the user's may raise at states that the user never chose, and nothing
-        # has values while JAX traces what surrounds this.
+            found = jax.block_until_ready(jnp.any(finite) & jnp.all(small | ~finite))
+    except RuntimeError:
+        # A check of the user's, by `equinox.error_if`, at states the user never chose.
         return False
+    # While JAX traces what surrounds this, there are no values.
+    return not isinstance(found, jax.core.Tracer) and bool(found)

@@ -128,9 +128,13 @@ def large(num_paths: int, batch_sizes, dtypes):
             return q[-1] ** 2
 
         for batch_size in batch_sizes:
-            ds.monte_carlo(phi, jr.key(1), batch_size, batch_size=batch_size)
+            ds.monte_carlo(
+                phi, key=jr.key(1), num_paths=batch_size, batch_size=batch_size
+            )
             begin = time.perf_counter()
-            estimate = ds.monte_carlo(phi, jr.key(0), num_paths, batch_size=batch_size)
+            estimate = ds.monte_carlo(
+                phi, key=jr.key(0), num_paths=num_paths, batch_size=batch_size
+            )
             seconds = time.perf_counter() - begin
             yield (
                 f"| {dtype.__name__} | {batch_size:,} | {seconds:.3f} | "

@@ -27,9 +27,9 @@ def main() -> None:
         _, q = solve(key[None])
         return q[-1] ** 2
 
-    ds.monte_carlo(phi, jr.key(1), 10**6)  # compiles
+    ds.monte_carlo(phi, key=jr.key(1), num_paths=10**6)  # compiles
     begin, before = time.perf_counter(), os.times()
-    estimate = ds.monte_carlo(phi, jr.key(0), PATHS)
+    estimate = ds.monte_carlo(phi, key=jr.key(0), num_paths=PATHS)
     seconds, after = time.perf_counter() - begin, os.times()
     busy = after.user + after.system - before.user - before.system
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

@@ -253,8 +253,8 @@ def table(measured: dict[str, dict]) -> str:
     lines = []
     for name, m in measured.items():
         c = CASES[name]
-        kind = f"degree {c.degree}" if c.degree else m["reason"].split(" was")[0]
-        kind = kind.replace("grid points along an axis: ", "grid, ")
+        best = str(c.degree or m["reason"].split(" was")[0].split(": ")[-1])
+        kind = f"grid, {best}" if best in ("32", "64") else f"degree {best}"
         error = "" if np.isnan(m["exact"]) else f"{m['error']:.1e}"
         cells = (
             f"{name}, $t = {c.t1:g}$", kind, f"{m['std_error']:.1e}", error,

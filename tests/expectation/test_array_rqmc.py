@@ -390,3 +390,22 @@ def test_a_path_fails_by_its_result_its_state_or_its_phi(by):
     )
     assert 4 * 10 <= got.num_failed <= 4 * (11 if by != "phi" else 24)
     np.testing.assert_allclose(got.mean, 1.0)
+
+
+@pytest.mark.parametrize("solver", [ds.StormerVerlet(), ds.SRKw2(), diffrax.Heun()])
+def test_a_shape_stands_for_the_path_that_the_solver_needs(solver):
+    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    noise = lambda t, p, q, args: 0.3 * q
+    phi, y0 = lambda t, y, args: y[0] ** 2, (jnp.array(0.0), jnp.array(1.0))
+    make = lambda path: ds.hamiltonian_terms(H0, noise, path)
+    own = isinstance(solver, ds.AbstractSymplecticSolver)
+    path = ds.FixedStepBrownianPath((), jr.key(0), diffrax.SpaceTimeLevyArea)
+    path = solver.path((), jr.key(0), want="weak") if own else path
+    sampling = ds.IndependentPaths(64)
+    got, expected = (
+        ds.expectation(
+            phi, make(x), solver, 0.0, 1.0, 0.25, y0, key=jr.key(1), sampling=sampling
+        )
+        for x in ((), path)
+    )
+    assert got.mean == expected.mean

@@ -2,7 +2,6 @@
 random is left."""
 
 import contextlib
-import re
 
 import diffrax
 import jax
@@ -12,15 +11,14 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation import _call, _pilot
-from diffrax_symplectic._expectation._estimate import Plan
-from diffrax_symplectic._expectation._fits import (
+from diffrax_symplectic._expectation._bases import Frame, Grid
+from diffrax_symplectic._expectation._choose import choose
+from diffrax_symplectic._expectation._polynomials import (
     exponents,
-    Frame,
-    Grid,
     hermite,
     least_squares,
 )
+from diffrax_symplectic._expectation._steps import Problem
 from diffrax_symplectic._terms import outcomes, step_variables
 
 from ..picard import by_picard
@@ -182,7 +180,7 @@ def test_the_degree_is_chosen_for_each_number_by_fresh_paths_and_never_worse_tha
     plain = _estimate(ds.ValueFunctions(0), phi=phi)
     for a, b in zip(got.std_error, plain.std_error):
         assert a <= 1.05 * b
-    assert got.std_error[2] < 1e-9 and "64 was the best of 0, 64" in got.reason
+    assert got.std_error[2] < 1e-9 and "64 was the best of 0, 2, 4, 64" in got.reason
 
 
 def test_levels_extrapolate_and_the_bias_is_known_as_well_as_the_mean():
@@ -253,67 +251,47 @@ def test_it_goes_on_where_it_stopped_and_stops_at_a_tolerance():
         _estimate(ds.IndependentPaths(1000), start=whole)
 
 
-def test_the_quickest_sampling_is_chosen_and_gone_on_with():
+@pytest.mark.parametrize(
+    "state, noises, steps, gaussian, kind",
+    [
+        (2, 1, 4, False, ds.ValueFunctions),
+        (2, 1, 2**11, False, ds.ArrayRQMC),
+        (2, 4, 4, False, ds.ArrayRQMC),
+        (2, 1, 4, True, ds.ArrayRQMC),
+        (4, 1, 4, False, ds.ArrayRQMC),
+        (6, 1, 4, False, ds.IndependentPaths),
+    ],
+)
+def test_the_sampling_follows_from_dimension_outcomes_and_steps(
+    state, noises, steps, gaussian, kind
+):
+    path = (ds.FixedStepBrownianPath if gaussian else ds.WeakBrownianPath)(
+        (noises,), KEY
+    )
+    H0 = lambda t, p, q, args: (p @ p + q @ q) / 2
+    noise = lambda t, p, q, args: jnp.arange(1.0, noises + 1) * jnp.sum(q)
+    terms = ds.hamiltonian_terms(H0, noise, path)
+    y0 = (jnp.zeros(state // 2), jnp.ones(state // 2))
+    problem = Problem.of(SQUARE, terms, VERLET, 0, 1, 1 / steps, y0, None, None, 1)
+    for tol in (None, 1e-3):
+        sampling, reason = choose(problem, tol)
+        assert type(sampling) is kind
+        assert f"{state} numbers in the state, {steps:,} steps" in reason
+    # Paths that cannot be made of given words.
+    other = ds.hamiltonian_terms(H0, noise, diffrax.UnsafeBrownianPath((noises,), KEY))
+    problem = Problem.of(SQUARE, other, VERLET, 0, 1, 1 / steps, y0, None, None, 1)
+    assert type(choose(problem, None)[0]) is ds.IndependentPaths
+
+
+def test_the_default_is_the_same_each_time_and_goes_on_with_itself():
     got = _estimate(None, tol=1e-6)
     assert isinstance(got.sampling, ds.ValueFunctions) and got.tol_reached
-    assert "variance times seconds: IndependentPaths" in got.reason
-    more = _estimate(None, start=got)
-    assert more.reason == got.reason
-    assert more.num_paths == got.num_paths and more.mean == got.mean
-    # Without outcomes that can be enumerated it is another one.
-    path = ds.FixedStepBrownianPath((), KEY)
-    gaussian = _estimate(None, _pendulum(path), tol=0.05)
-    assert isinstance(gaussian.sampling, ds.IndependentPaths)
-
-
-def test_from_an_interrupted_trial_nobody_is_told_to_go_on(monkeypatch):
-    class Interrupting:
-        def step(self, progress):
-            raise KeyboardInterrupt
-
-    run = _pilot.run
-    trial = lambda *args, **kwargs: run(*args, **kwargs, meter=Interrupting())
-    monkeypatch.setattr(_pilot, "run", trial)
-    with pytest.raises(KeyboardInterrupt) as info:
-        _estimate(None)
-    assert info.type is KeyboardInterrupt
-
-
-def test_the_reason_says_why_others_were_not_taken():
-    path = ds.FixedStepBrownianPath((), KEY)
-    plain = _estimate(None, tol=0.5)
-    gaussian = _estimate(None, _pendulum(path), tol=1e-4)
-    for got, said in (
-        (
-            plain,
-            r"ValueFunctions not needed: `tol` takes less than 0.5 s; ArrayRQMC not needed",
-        ),
-        (
-            gaussian,
-            "; ValueFunctions not possible: .* Gaussian increments have infinitel",
-        ),
-    ):
-        assert re.search(said, got.reason) and "\n" not in got.reason
-
-
-def test_without_a_tolerance_the_time_bounds_the_number_of_samples(monkeypatch):
-    monkeypatch.setattr(_pilot, "_MOST_SECONDS", 1e-9)
-    few, enough = _estimate(None), _estimate(None, tol=0.05)
-    assert few.num_paths == 2 and enough.tol_reached and enough.num_paths > 100
-    for name in ("ValueFunctions", "ArrayRQMC"):
-        assert f"{name} not tried: that takes" in few.reason
-
-
-@pytest.mark.parametrize(
-    "seconds, samples", [(1e-9, 4096), (0.01, 512), (0.1, 100), (100, 2)]
-)
-def test_samples_that_take_ten_seconds_are_whole_batches_if_they_can(seconds, samples):
-    sampling = ds.ValueFunctions()
-    plan = Plan(lambda keys: None, 4096, sampling.batch_size)  # pyright: ignore
-    trial = _pilot._Trial(sampling, plan, 1.0, seconds)
-    assert _pilot._num_samples(trial, None) == samples
-    # A tolerance is another matter.
-    assert _pilot._num_samples(trial, 0.01) == 15_000
+    assert got.reason.startswith(
+        "value functions for 2 numbers in the state, 4 steps of 3"
+    )
+    again, more = _estimate(None, tol=1e-6), _estimate(None, start=got)
+    assert (again.mean, again.std_error) == (got.mean, got.std_error)
+    assert more.reason == got.reason and more.num_paths >= got.num_paths
 
 
 def test_a_meter_is_shown_before_the_trials_and_closed_if_they_fail(monkeypatch):
@@ -323,9 +301,9 @@ def test_a_meter_is_shown_before_the_trials_and_closed_if_they_fail(monkeypatch)
         assert calls == ["init"]
         raise RuntimeError("a trial")
 
-    monkeypatch.setattr(_call, "choose", fails)
+    monkeypatch.setattr(ds.ValueFunctions, "prepare", fails)
     with pytest.raises(RuntimeError, match="a trial"):
-        _estimate(None, progress_meter=RecordingMeter(calls))
+        _estimate(ds.ValueFunctions(), progress_meter=RecordingMeter(calls))
     assert calls == ["init", ("closed after", 0)]
 
 
@@ -365,35 +343,44 @@ def test_polynomials_are_orthonormal_and_fits_nested():
     np.testing.assert_allclose(got[:, 0], smallest, atol=1e-3)
 
 
-def test_a_grid_interpolates_with_degree_five_and_is_constant_beyond():
-    grid, axis = Grid(2, (0, 12)), np.linspace(-1, 1, 12)
+def test_a_grid_interpolates_with_degree_five_and_is_zero_beyond():
+    grid, axis = Grid(2, 12), np.linspace(-1, 1, 12)
     fn = lambda x, y: (x**5 - x) * (y**5 + y**2)
     c = jnp.asarray(fn(*np.meshgrid(axis, axis, indexing="ij"))).reshape(-1, 1)
     # Two points at least are to lie on either side.
     inner = axis[9]
     x = jr.uniform(KEY, (50, 2), minval=-inner, maxval=inner)
-    at = jax.vmap(lambda x: grid.combined(x, c)[0])
+    at = jax.vmap(lambda x: grid._interpolated(x, c)[0])
     np.testing.assert_allclose(at(x), fn(*x.T), atol=1e-13)
-    np.testing.assert_allclose(
-        at(3 * x), at(jnp.clip(3 * x, -inner, inner)), atol=1e-13
-    )
-    # It holds twice the range of the points, whatever they are.
-    points = jr.normal(KEY, (300, 2)) @ jnp.array([[1.0, 2.0], [0.0, 0.1]])
-    good = jnp.ones(300, bool)
-    frame, sites = grid.sites(points, good, jnp.ones(2), KEY)
-    corners = np.asarray(frame.at(sites))[[0, -1]]
-    np.testing.assert_allclose(corners, [[-1, -1], [1, 1]], atol=1e-12)
-    np.testing.assert_allclose(np.abs(frame.at(points)).max(axis=0), 0.5, atol=1e-12)
+    assert not np.any(at(jnp.where(jnp.abs(x) < inner / 2, x + jnp.sign(x), 2 * x)))
 
 
-def test_frames_do_not_depend_on_units():
+@pytest.mark.parametrize("heavy", [False, True])
+def test_a_grid_is_even_where_most_states_are_and_holds_all(heavy):
+    points = jr.normal(KEY, (2000, 2))
+    points = jnp.sign(points) * jnp.expm1(3 * jnp.abs(points)) if heavy else points
+    points = points @ jnp.array([[1.0, 2.0], [0.0, 0.1]])
+    grid = Grid(2, 64).frame(points, jnp.ones(2000, bool), jnp.ones(2))
+    z = grid.inner.at(points)
+    x = grid.at(z)
+    assert 0.5 < np.abs(x).max() < 0.75
+    np.testing.assert_allclose(grid.back(x), z, rtol=1e-9, atol=1e-12)
+    # Between the quartiles there are ten points, at least.
+    between = np.diff(np.quantile(x, [0.25, 0.75], axis=0), axis=0)
+    assert np.all(between > 3 * 2 / 63), between * 63 / 2
+
+
+def test_frames_do_not_depend_on_units_and_leave_out_what_does_not_move():
     mixed = jnp.array([[3.0, 1, 0], [0, 2, 0], [1, 0, 1]])
     points, good = jr.normal(KEY, (500, 3)) @ mixed, jnp.ones(500, bool)
     frame = Frame.of(points, good, jnp.ones(3))
-    z = (points - frame.mean) @ frame.to.T
+    z = frame.at(points)
     np.testing.assert_allclose(z.T @ z / 500, np.eye(3), atol=1e-10)
-    np.testing.assert_allclose(frame.to @ frame.back, np.eye(3), atol=1e-12)
-    scale = jnp.array([1.0, 1e6, 1e-6])
+    np.testing.assert_allclose(frame.states(z), points, atol=1e-12)
+    scale = jnp.array([1.0, 2.0**90, 2.0**-90])
     other = Frame.of(points * scale, good, scale)
-    z2 = (points * scale - other.mean) @ other.to.T
-    np.testing.assert_allclose(np.abs(z2), np.abs(z), atol=1e-6)
+    np.testing.assert_array_equal(other.at(points * scale), z)
+    still = jnp.append(points, jnp.full((500, 1), 7e-30), axis=1)
+    frame = Frame.of(still, good, jnp.array([1.0, 1, 1, 0]))
+    np.testing.assert_array_equal(frame.moved(still)[:, 3], still[:, 3])
+    assert np.all(np.isfinite(frame.at(still)))

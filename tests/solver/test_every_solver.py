@@ -33,7 +33,6 @@ _GAUSS = 1 / 4 + np.sqrt(3) / 6
 # Members of families that differ in what they do, beside the defaults.
 MEMBERS = [
     ds.SRKw1(b=0.2),
-    ds.SRKw2((1, 2, 3, 4)),
     *(ds.SRKw3(variant) for variant in "abdef"),
     ds.SRKw4(a21=_GAUSS),
     ds.SRKs3(a=0.25),

@@ -241,7 +241,7 @@ def test_missing_variables_are_refused_with_advice():
         ds.LevyAreaBrownianPath(weak_path(2), jr.key(0))
     levy = diffrax.SpaceTimeLevyArea
     tree = diffrax.VirtualBrownianTree(0.0, 1.0, 0.1, (1,), jr.key(0), levy)
-    with pytest.raises(ValueError, match="`terms` must be"):
+    with pytest.raises(ValueError, match="`num_terms` must be"):
         ds.LevyAreaBrownianPath(tree, jr.key(0), num_terms=-1)
     with pytest.raises(ValueError, match="`cell` must be"):
         ds.LevyAreaBrownianPath(tree, jr.key(0), cell=0.0)

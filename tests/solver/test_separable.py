@@ -12,6 +12,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._plan import Block, make_plan
+from examples._srkw2 import PaperSRKw2
 
 from .. import paper
 from ..problems import (
@@ -66,7 +67,7 @@ def test_conditions_hold_and_see_every_live_coefficient(solver):
 @pytest.mark.parametrize(
     "make, solver",
     [
-        (lambda x: paper.srkw2(b1=x[0], b2=x[1], b3=x[2]), ds.SRKw2((1, 2, 3, 4))),
+        (lambda x: paper.srkw2(b1=x[0], b2=x[1], b3=x[2]), PaperSRKw2()),
         (
             lambda x: paper.srkw4(0.2, a31=x[0], a32=x[1], b33=x[2], b=x[3]),
             ds.SRKw4(0.2),

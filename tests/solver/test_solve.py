@@ -185,7 +185,7 @@ def test_unsolvable_stages_are_reported():
         _explosive(path), ds.ImplicitMidpoint(), 0.0, 1.0, 0.1, y0, **kwargs,
         max_steps=None, adjoint=diffrax.ForwardMode(),
     )  # fmt: skip
-    with pytest.raises(Exception, match="stage equations of a step were not solved"):
+    with pytest.raises(Exception, match="(?i)nonlinear solve"):
         jax.block_until_ready(solve())
     assert solve(throw=False).result != diffrax.RESULTS.successful
 
@@ -236,7 +236,7 @@ def test_non_finite_hamiltonians_are_reported():
     args = jnp.array([[jnp.nan, 3.0], [1.0, 0.5], [1.0, 3.0]])
     success = jax.jit(jax.vmap(solve))(args).result == diffrax.RESULTS.successful
     np.testing.assert_array_equal(success, [False, False, True])
-    with pytest.raises(Exception, match=r"(?i)non-?finite|were not solved"):
+    with pytest.raises(Exception, match=r"(?i)non-?finite|nonlinear solve"):
         jax.block_until_ready(solve(args[1], throw=True))
 
 

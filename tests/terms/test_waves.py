@@ -105,7 +105,9 @@ def test_norm_is_kept_over_ten_thousand_steps(solver):
     )  # fmt: skip
     # The norm is interpolated between the ends of steps, where it is the same.
     assert sol.stats["num_steps"] >= 10_000
-    assert jnp.max(jnp.abs(sol.ys - 1)) <= 1e-13
+    # One rounding error a step, all of one sign.
+    bound = sol.stats["num_steps"] * jnp.finfo(sol.ys.dtype).eps
+    assert jnp.max(jnp.abs(sol.ys - 1)) <= bound
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,79 @@
+"""Means and spreads of batches of samples, and how they are put together."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import PyTree
+
+
+class Moments(NamedTuple):
+    """Of the samples with numbers from `begin` up to `end`, on the host and in float64.
+
+    - `good`: how many are good; `failed`: how many paths failed.
+    - `mean`: of the good ones, with two axes in front for kinds and for combinations of
+        levels.
+    - `norm`: the root of the sum of the squared deviations from it. (Squares overflow and
+        underflow where roots do not.)
+    - `largest`: the largest deviation within a batch.
+    - `size`: the largest absolute value.
+    - `dtypes`: what each array was computed in.
+    """
+
+    begin: int
+    end: int
+    good: int
+    failed: int
+    mean: PyTree[np.ndarray]
+    norm: PyTree[np.ndarray]
+    largest: PyTree[np.ndarray]
+    size: PyTree[np.ndarray]
+    dtypes: PyTree[str]
+
+
+def joined(parts: Iterable[Moments]) -> tuple[Moments, ...]:
+    """The moments, in order, with neighbours put together as a binary counter carries. So
+    what comes out depends on the batches alone, not on the order in which they came, and
+    only a few are kept."""
+    out: list[Moments] = []
+    for one in parts:
+        out.append(one)
+        while len(out) > 1 and _are_halves(out[-2], out[-1]):
+            last = out.pop()
+            out.append(_both(out.pop(), last))
+    return tuple(out)
+
+
+def total(parts: tuple[Moments, ...]) -> Moments:
+    """Of all samples."""
+    whole, *rest = parts
+    for one in rest:
+        whole = _both(whole, one)
+    return whole
+
+
+def _are_halves(a: Moments, b: Moments) -> bool:
+    length = a.end - a.begin
+    if a.end != b.begin or length == 0:
+        return a.end == b.begin
+    return b.end - b.begin == length and (a.begin // length) % 2 == 0
+
+
+@np.errstate(over="ignore", invalid="ignore", under="ignore")
+def _both(a: Moments, b: Moments) -> Moments:
+    """By the pairwise formula of Chan, Golub and LeVeque."""
+    n, trees = max(a.good + b.good, 1), jtu.tree_map
+    share, part = np.sqrt(a.good / n * b.good), b.good / n
+    delta = trees(lambda x, y: y - x, a.mean, b.mean)
+    norm = lambda x, y, d: np.hypot(np.hypot(x, y), share * d)
+    # A mean of no samples is no number to start from.
+    mean = lambda x, y, d: y if a.good == 0 else x + d * part
+    return Moments(
+        a.begin, b.end, a.good + b.good, a.failed + b.failed,
+        trees(mean, a.mean, b.mean, delta),
+        trees(norm, a.norm, b.norm, delta),
+        trees(np.maximum, a.largest, b.largest),
+        trees(np.maximum, a.size, b.size),
+        b.dtypes,
+    )  # fmt: skip

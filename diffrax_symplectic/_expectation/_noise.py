@@ -1,0 +1,185 @@
+"""The random variables of a step, and what a function of the state does in it."""
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+
+from .._brownian import Discrete, random_words
+from .._custom_types import Y
+from .._terms import outcomes, step_variables
+from ._steps import Level, Problem
+
+
+# Up to so many outcomes a step is taken for each of them.
+_MOST_OUTCOMES = 100
+# What is known of a path from its wider noise: about that it is one of e^8.
+_NATS = 8.0
+
+# A function of the state.
+Function: TypeAlias = Callable[[Y], Array]
+
+
+class Noise(eqx.Module):
+    r"""The random variables $x$ of the steps of a level. If their outcomes are few, a step
+    is taken for each of them, and expectations are finite sums.
+
+    Otherwise what stands for $u(y_1)$ less its expectation is made of the first and second
+    derivatives $a$ and $C$ of $u(y_1(x))$ at $x = 0$. It is $a \cdot x + \frac12 (x^\top C
+    x - \mathrm{tr}\, C \Sigma)$, with the variances $\Sigma$, and has mean zero whatever
+    $a$ and $C$ are, so that one $C$ does for all paths. For a quadratic function and noise
+    that enters the step linearly it is exact.
+    """
+
+    problem: Problem
+    level: Level
+    laws: tuple[Discrete, ...] = eqx.field(static=True)
+    # Values and probabilities, if they are few.
+    outcomes: tuple[Float[np.ndarray, "K n"], Float[np.ndarray, " K"]] | None
+
+    @staticmethod
+    def of(problem: Problem, level: Level) -> "Noise":
+        """Raises a `ValueError` for random variables without finitely many outcomes."""
+        laws = step_variables(problem.terms, level.h).laws
+        discrete = tuple(law for law in laws if isinstance(law, Discrete))
+        if len(discrete) < len(laws):
+            raise ValueError(
+                "`ValueFunctions` sums over the outcomes of a step, of which Gaussian "
+                "increments have infinitely many. Use a `WeakBrownianPath` in place of the "
+                "path in `terms`, or pass `sampling=ArrayRQMC(num_paths)`."
+            )
+        if math.prod(len(law.values) for law in discrete) > _MOST_OUTCOMES:
+            return Noise(problem, level, discrete, None)
+        values, probabilities = outcomes(discrete, 1)
+        few = values.astype(problem.dtype), probabilities
+        return Noise(problem, level, discrete, few)
+
+    def draw(
+        self, key: PRNGKeyArray, number, wide: Any = None
+    ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+        """The variables of the key and this number. With the share `wide`, from 0 to 1, all
+        outcomes have the same probability. And the logarithm of how much more often that
+        makes the variables what they are."""
+        words = random_words(key, (number, self.level.index), 1, len(self.laws))[0]
+        x = jnp.zeros(len(self.laws), self.problem.dtype)
+        log_ratio = jnp.zeros_like(x)
+        for law in dict.fromkeys(self.laws):
+            mine = np.array([other == law for other in self.laws])
+            own, p = (
+                law.from_words(words, x.dtype),
+                np.array(law.probabilities, x.dtype),
+            )
+            if wide is not None:
+                q = (1 - wide) * p + wide / len(p)
+                cuts = (jnp.cumsum(q)[:-1] * 2.0**32).astype(jnp.uint32)
+                place = jnp.sum(words[:, None] >= cuts, axis=1)
+                own = jnp.where(wide > 0, jnp.asarray(law.values, x.dtype)[place], own)
+                log_ratio = jnp.where(
+                    mine & (wide > 0), jnp.log(q / p)[place], log_ratio
+                )
+            x = jnp.where(mine, own, x)
+        return x, jnp.sum(log_ratio)
+
+    @property
+    def share(self) -> Array:
+        """Of `draw`, so that all variables of a path together have an information of 8 nats
+        against the law that they should have."""
+        levels = len(self.problem.levels.h)
+        coarser = 2 ** np.arange(levels)[::-1]
+        steps = self.problem.max_steps / coarser
+        low, high = np.zeros(levels), np.ones(levels)
+        for _ in range(30):
+            share = (low + high) / 2
+            enough = (
+                steps * sum(_information(x, share) for x in self.laws) > _NATS / levels
+            )
+            low, high = np.where(enough, low, share), np.where(enough, share, high)
+        return jnp.asarray(low, self.problem.dtype)[self.level.index]
+
+    def nodes(self, x: Array | None = None) -> tuple[Any, np.ndarray]:
+        """Values of the variables, and weights with which their mean is the expectation;
+        with a draw `x`, and unless outcomes are few, an estimate from two values."""
+        if self.outcomes is not None:
+            return self.outcomes
+        if x is not None:
+            return jnp.stack([x, -x]), np.full(2, 0.5)
+        # Exact for polynomials of degree 3, and 5 in one variable.
+        m, arms = len(self.laws), np.diag(np.sqrt(3 * self._variances()))
+        points = np.concatenate([arms, -arms, np.zeros((1, m))])
+        weights = np.append(np.full(2 * m, 1 / 6), 1 - m / 3)
+        return points.astype(self.problem.dtype), weights
+
+    def mean(self, i, y: Y, u: Function, x: Array | None = None) -> Array:
+        """The expectation of `u` after step number `i` from `y`, by `nodes(x)`."""
+        (points, weights), state = self.nodes(x), self.fresh(i, y)
+        values = jax.vmap(lambda x: u(self.step(i, y, state, x)[0]))(points)
+        return jnp.tensordot(weights.astype(values.dtype), values, 1)
+
+    def advance(
+        self, i, y: Y, state: PyTree, u: Function, second: Array | None, x: Array
+    ) -> tuple[Y, PyTree, Bool[Array, ""], Array]:
+        """The states after step number `i` of a path with these variables; whether the step
+        succeeded; `u` there less its expectation, or what stands for that. `second` is what
+        `second` returns."""
+        if self.outcomes is None:
+            assert second is not None
+            y1, new, success = self.step(i, y, state, x)
+            first = jax.jacrev(lambda x: u(self.step(i, y, state, x)[0]))(0 * x)
+            square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
+            control = jnp.tensordot(first, x, 1) + jnp.tensordot(square, second, 2) / 2
+            return y1, new, success, control
+        points, weights = self.outcomes
+        ends, states, success = jax.vmap(lambda x: self.step(i, y, state, x))(points)
+        values, own = jax.vmap(u)(ends), jnp.argmax(jnp.all(points == x, axis=1))
+        mean = jnp.tensordot(weights.astype(values.dtype), values, 1)
+        y1, new, value = jtu.tree_map(lambda x: x[own], (ends, states, values))
+        return y1, new, jnp.all(success), value - mean
+
+    def second(self, i, ys: Y, u: Function) -> Array | None:
+        """The mean of the second derivatives at the states `ys`, if outcomes are many."""
+        if self.outcomes is not None:
+            return None
+        zero = jnp.zeros(len(self.laws), self.problem.dtype)
+        after = lambda y, x: u(self.step(i, y, self.fresh(i, y), x)[0])
+        at = lambda y: jax.hessian(lambda x: after(y, x))(zero)
+        mean = jnp.mean(jax.lax.map(at, ys), axis=0)
+        return jnp.moveaxis(mean, (-2, -1), (0, 1))
+
+    def step(self, i, y: Y, state: PyTree, x: Array):
+        return self.problem.step(self._terms(x), i, self.level.h, y, state)
+
+    def fresh(self, i, y: Y) -> PyTree[Array]:
+        """The state of a solver that begins with step number `i`. It serves for a fit,
+        which decides the variance only: a path takes its own state along."""
+        terms = self._terms(np.zeros(len(self.laws)))
+        return self.problem.init(terms, i, self.level.h, y)
+
+    def _terms(self, x):
+        return step_variables(self.problem.terms, self.level.h).terms_with(x)
+
+    def _variances(self) -> np.ndarray:
+        return np.array(
+            [np.dot(x.probabilities, np.square(x.values)) for x in self.laws]
+        )
+
+
+def _information(law: Discrete, share: np.ndarray) -> np.ndarray:
+    """Of a draw with this share of equal probabilities, against its law."""
+    p = np.array(law.probabilities)
+    q = (1 - share[:, None]) * p + share[:, None] / len(p)
+    return np.sum(q * np.log(q / p), axis=1)
+
+
+def num_outcomes(problem: Problem) -> int | None:
+    """Of a step, if they are few."""
+    try:
+        outcomes = Noise.of(problem, problem.level(0)).outcomes
+    except ValueError:
+        return None
+    return None if outcomes is None else len(outcomes[1])

@@ -1,0 +1,358 @@
+"""How estimates are made: any number of samples, batch after batch, on any devices."""
+
+import collections
+import dataclasses
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import PRNGKeyArray
+
+from .._arguments import whole_number
+from .._brownian import check_key
+from ._estimate import Expectation, ExpectationInterrupted
+from ._moments import joined, Moments, total
+from ._sampling import Plan
+
+
+# Where a larger share of the paths fails, a warning says so.
+_MANY = 0.01
+# With an `r` of `std_error` above this, intervals of 95% covered as few as 73%.
+_HEAVY = 0.6
+NO_METER = diffrax.NoProgressMeter()
+
+
+class Begin(NamedTuple):
+    """An estimate to go on from, or the number of the first sample."""
+
+    start: Expectation | None = None
+    first: int = 0
+
+
+def checked_call(
+    user: str, key, tol, start, first, devices: Sequence[Any] | None, *others: Any
+) -> tuple[PRNGKeyArray, Begin, tuple]:
+    """The key and the devices that a user means. Raises a `ValueError` for what none of
+    these arguments can be, and if an array of the call is traced."""
+    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((key, others))):
+        raise ValueError(
+            f"`{user}` takes as many batches as numbers tell, so it is no part of a JAX "
+            "program. Call it outside of `jit`, `vmap` and `grad`. The gradient of a mean "
+            "is the mean of gradients: `monte_carlo` averages them."
+        )
+    check_key(key, user)
+    if start is not None and first != 0:
+        raise ValueError("Pass `start`, which goes on where it ended, or `first`.")
+    begin = Begin(start, whole_number("first", first, 0))
+    is_number = isinstance(tol, int | float | np.number)
+    if tol is not None and not (is_number and 0 < tol < np.inf):
+        raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")
+    if start is not None and not isinstance(start, Expectation):
+        raise ValueError(
+            f"`start` must be what `{user}` returned, or `None`; got {start!r}."
+        )
+    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    devices = jax.devices() if devices is None else devices
+    is_device = lambda x: isinstance(x, jax.Device)
+    if not isinstance(devices, Sequence) or not all(map(is_device, devices)):
+        raise ValueError(
+            "`devices` must be a list of devices, such as `jax.devices()[:1]`, or `None`; "
+            f"got {devices!r}."
+        )
+    devices = tuple(devices)
+    return key if typed else jr.wrap_key_data(key), begin, devices
+
+
+class Meter:
+    """A progress meter that is shown from here on until it is left."""
+
+    def __init__(self, meter: diffrax.AbstractProgressMeter):
+        self._meter, self._state = meter, meter.init()
+
+    def step(self, progress: float) -> None:
+        self._state = self._meter.step(self._state, np.asarray(progress))
+
+    def __enter__(self) -> "Meter":
+        return self
+
+    def __exit__(self, *error) -> None:
+        self._meter.close(self._state)
+
+
+def run(
+    plan: Plan,
+    key: PRNGKeyArray,
+    devices: tuple,
+    sampling: Any = None,
+    begin: Begin = Begin(),  # noqa: B008 (it does not change)
+    tol: float | None = None,
+    meter: Meter | None = None,
+) -> Expectation:
+    """The estimate from the samples of a plan. Without a meter it is a trial, which warns
+    of nothing. What a device computes, and in which order its sums are added up, does not
+    depend on how many there are."""
+    sampler, size = plan.sampler, min(plan.batch_size, plan.num_samples)
+    key_data = np.asarray(jr.key_data(key))
+    if jax.process_count() > 1:
+        # Each process holds the same arrays. In a function they become constants of its
+        # program, since arguments would have to be placed on the devices of all.
+        sampler = lambda keys: plan.sampler(keys)
+    mesh = Mesh(np.array(devices), ("samples",))
+
+    def batch(at: int) -> tuple:
+        lo_hi = np.array([at & 0xFFFFFFFF, at >> 32], np.uint32)
+        left = np.array(max(0, min(size * len(devices), most - at)), np.int32)
+        if len(devices) == 1:
+            lo_hi, left = jax.device_put((lo_hi, left), devices[0])
+        one: Any = _batch
+        return one(sampler, key_data, jr.key_impl(key), lo_hi, left, mesh, size)
+
+    first, at = begin.first, begin.first
+    if begin.start is not None:
+        first, at = begin.start.moments[0].begin, begin.start.moments[-1].end
+    most = first + plan.num_samples
+    # JAX caches this trace and uses it for the first batch.
+    shapes = eqx.filter_eval_shape(batch, at)[2]
+    zeros = jtu.tree_map(lambda s: np.zeros(s.shape[1:]), shapes)
+    dtypes = jtu.tree_map(lambda s: str(s.dtype), shapes)
+    none = Moments(at, at, 0, 0, zeros, zeros, zeros, zeros, dtypes)
+    about = plan.roundings, sampling, plan.reason, None, plan.far
+    estimate = Expectation((none,), key_data, plan.paths, *about)
+    if begin.start is not None:
+        begin.start.check_same(estimate, "`start`")
+        if at > most:
+            raise ValueError(
+                "The number of paths (or of replicates) counts all, those of `start` "
+                f"included, of which there are {at - first} already; got "
+                f"{plan.num_samples}."
+            )
+        estimate = dataclasses.replace(estimate, moments=begin.start.moments)
+
+    def reached() -> bool:
+        if tol is None or estimate.num_samples < plan.least:
+            return False
+        return all(bool(np.all(x <= tol)) for x in jtu.tree_leaves(estimate.std_error))
+
+    def finished() -> Expectation:
+        said = None if tol is None else reached()
+        return dataclasses.replace(estimate, tol_reached=said)
+
+    running, done = collections.deque(), at
+    try:
+        while True:
+            more = at < most and not reached()
+            if more:
+                running.append(batch(at))
+                at += size * len(devices)
+            # One batch is computed while the one before it is added up.
+            if len(running) > more:
+                parts = jax.device_get(running.popleft())
+                for one in range(len(devices)):
+                    # The same samples decide, however many are made at once.
+                    if done < most and not reached():
+                        part = jtu.tree_map(lambda x: x[one], parts)
+                        new = _moments(part, done, min(done + size, most), dtypes)
+                        both = joined((*estimate.moments, new))
+                        estimate = dataclasses.replace(estimate, moments=both)
+                        done = new.end
+                if meter is not None:
+                    meter.step((done - first) / plan.num_samples)
+            elif not more:
+                break
+    except KeyboardInterrupt:
+        raise ExpectationInterrupted(finished()) from None
+    estimate = finished()
+    if meter is not None:
+        for message in _warnings(estimate, tol):
+            warnings.warn(message, stacklevel=3)
+    return estimate
+
+
+def _moments(part, begin: int, end: int, dtypes) -> Moments:
+    count, failed, *trees = part
+    wide = lambda tree: jtu.tree_map(lambda x: x.astype(float), tree)
+    mean, rest, norm, largest, size = map(wide, trees)
+    mean = jtu.tree_map(np.add, mean, rest)
+    numbers = begin, end, int(count), int(failed)
+    return Moments(*numbers, mean, norm, largest, size, dtypes)
+
+
+def _warnings(estimate: Expectation, tol: float | None) -> Iterator[str]:
+    done, lost = estimate.num_paths, estimate.num_failed
+    if lost > _MANY * (done + lost):
+        rest = f"the mean is that of the other {done:,}, and biased"
+        rest = rest if done else "there is no mean"
+        yield (
+            f"{lost:,} paths failed: {rest}. Take smaller steps or bounded "
+            "increments, such as those of a `WeakBrownianPath`; and look for NaNs in `y0`, "
+            "`args` and the Hamiltonians."
+        )
+    if estimate.num_samples > 1:
+        yield from _warnings_of_spread(estimate)
+    if estimate.tol_reached is False:
+        errors = jtu.tree_leaves(estimate.std_error)
+        largest = max(float(np.max(x, initial=0.0)) for x in errors)
+        yield (
+            f"`tol={tol}` was not reached: the largest standard error is {largest:.1e} "
+            f"after {estimate.num_paths:,} paths. Take more paths, going on with `start=`, "
+            "or another `sampling`."
+        )
+
+
+def _warnings_of_spread(estimate: Expectation) -> Iterator[str]:
+    results = jtu.tree_leaves((estimate.mean, estimate.std_error))
+    if not all(np.all(np.isfinite(x)) for x in results):
+        yield (
+            "The mean or its standard error is not finite: values that are averaged "
+            "overflow. Take smaller steps, or a solver that is stable with these; see "
+            "whether single solutions stay bounded."
+        )
+    if estimate.dropped:
+        yield (
+            "A fitted value function was dropped: on these paths the mean of what it takes "
+            "away is more than five standard errors from zero, or not finite. The mean is "
+            "that of plain paths. Pass a smaller `degree`, or another `sampling`."
+        )
+    if estimate.heaviest > _HEAVY:
+        yield (
+            f"Few of the {estimate.num_samples:,} samples make up for most of the spread: "
+            "others that are too rare to be among them may hold much of the mean, and the "
+            "standard error may be too small. Take many more, or a function that grows "
+            "more slowly."
+        )
+    whole = total(estimate.moments)
+    kinds = zip(jtu.tree_leaves(whole.size), jtu.tree_leaves(whole.dtypes))
+    # Of the plain values, with or without control.
+    low = [dtype for x, dtype in kinds if np.max(x[int(len(x) > 2), 0]) < _least(dtype)]
+    if low:
+        yield (
+            f"A number is zero, or smaller than what {low[0]} holds, on all paths. If it "
+            'underflows, measure it in other units, or call `jax.config.update("jax_enable'
+            '_x64", True)` first. If it is the indicator of something rare, no path met '
+            "it, and the standard error says nothing."
+        )
+    elif not any(np.any(x > 0) for x in jtu.tree_leaves(estimate.variance)):
+        yield (
+            f"All {estimate.num_samples:,} samples are equal, so that nothing is known of "
+            "the error. Does what is averaged depend on the noise, and a function for "
+            "`monte_carlo` on its key?"
+        )
+
+
+def _least(dtype: str) -> float:
+    """Smaller numbers are rounded to multiples of the smallest, or to zero."""
+    return float(jnp.finfo(dtype).tiny / jnp.finfo(dtype).eps)
+
+
+@eqx.filter_jit
+def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
+    """Of the batch of each device: the number of good samples and of paths that failed; of
+    the good ones what `_moments` makes their moments of."""
+
+    def local(sampler, lo_hi, left, device: Any = 0):
+        index = device * n + jnp.arange(n)
+        lo = lo_hi[0] + index.astype(jnp.uint32)
+        hi = lo_hi[1] + (lo < lo_hi[0]).astype(jnp.uint32)
+        key = jr.wrap_key_data(jnp.asarray(key_data), impl=impl)
+        fold = lambda hi, lo: jr.fold_in(jr.fold_in(key, hi), lo)
+        samples = sampler(jax.vmap(fold)(hi, lo))
+        wanted = index < left
+        # A path fails once, on however many levels.
+        good = jnp.all(samples.good, axis=0)
+        lost = ~good + (0 if samples.lost is None else jnp.sum(samples.lost, axis=0))
+        failed, good = jnp.sum(jnp.where(wanted, lost, 0)), good & wanted
+        count = jnp.sum(good)
+        tails = samples.tails
+        kinds = [samples.values]
+        if tails is not None:
+            kinds += [samples.control, tails.promised, tails.beyond]
+        elif samples.heaviest is not None:
+            kinds += [samples.heaviest]
+        ratio = None if tails is None else tails.ratio
+        values = zip(*map(jtu.tree_leaves, kinds))
+        each = [_spread(samples.weights, good, count, ratio, *x) for x in values]
+        treedef = jtu.tree_structure(samples.values)
+        return count, failed, *map(treedef.unflatten, zip(*each))
+
+    if mesh.size == 1:
+        return jtu.tree_map(lambda x: x[None], local(sampler, lo_hi, left))
+    dynamic, static = eqx.partition(sampler, eqx.is_array)
+
+    # The programs of the devices know nothing of each other until they are done: so what
+    # one of them computes does not depend on how many there are.
+    def shard(dynamic, lo_hi, left):
+        sampler = eqx.combine(dynamic, static)
+        out = local(sampler, lo_hi, left, jax.lax.axis_index("samples"))
+        return jtu.tree_map(lambda x: jax.lax.all_gather(x, "samples"), out)
+
+    none = PartitionSpec()
+    sharded = jax.shard_map(
+        shard, mesh=mesh, in_specs=none, out_specs=none, check_vma=False
+    )
+    try:
+        return sharded(dynamic, lo_hi, left)
+    except ValueError as error:
+        # The loop of Diffrax's default adjoint takes arrays that vary from device to
+        # device for others than those it was made for.
+        if "Closure-converted function" not in str(error):
+            raise
+        raise ValueError(
+            "Reverse mode through `diffrax.RecursiveCheckpointAdjoint`, the default of "
+            "`diffeqsolve`, does not work on several devices. Pass `adjoint="
+            "diffrax_symplectic.ReversingAdjoint()` or `adjoint=diffrax.DirectAdjoint()` "
+            "to `diffeqsolve`, or `devices=jax.devices()[:1]` to `monte_carlo`."
+        ) from error
+
+
+def _spread(weights, good, count, ratio, x, *others) -> tuple:
+    """Of the good samples the mean; what rounding has left out of it; the root of the sum
+    of squared deviations from both; the largest deviation; the largest size. With axes in
+    front for kinds and combinations."""
+    x = x.astype(real(x.dtype))
+    if jnp.iscomplexobj(x):
+        raise ValueError(
+            "What is averaged must be real arrays; got one of dtype "
+            f"{x.dtype}. Return real and imaginary parts."
+        )
+    combined = lambda x: jnp.tensordot(weights.astype(x.dtype), x, 1)
+    if ratio is None:
+        x = combined(x)[None]
+        # Of the level where it is most.
+        most = [jnp.broadcast_to(jnp.max(y, axis=0), x.shape) for y in others]
+        x = jnp.concatenate([x, *most])
+    else:
+        control, promised, beyond = others
+        left = combined(x - control)
+        far = jnp.abs(left - combined(promised))
+        ratio = ratio.reshape(-1, *[1] * (far.ndim - 2)).astype(x.dtype)
+        far = jnp.where(far > beyond[:, None], ratio * far, 0)
+        x = jnp.stack([left, combined(x), combined(control), far])
+    keep = good.reshape(-1, *[1] * (x.ndim - 3))
+    x = jnp.where(keep, x, 0)
+    total, n = lambda x: jnp.sum(x, axis=2), jnp.maximum(count, 1)
+    # Numbers of size one: sums of them and of their squares stay in range.
+    largest = lambda x: jnp.max(jnp.abs(x), axis=2)
+    unit = lambda size: jnp.where(size > 0, size, 1)[:, :, None]
+    size = largest(x)
+    mean = size * (total(x / unit(size)) / n)
+    # In two passes, so that no two large numbers are subtracted. The second one finds by
+    # how much the first was rounded, too.
+    off = jnp.where(keep, x - mean[:, :, None], 0)
+    far = largest(off)
+    z = off / unit(far)
+    rest = total(z) / n
+    squares = jnp.maximum(total(z**2) - n * rest**2, 0)
+    return mean, far * rest, far * jnp.sqrt(squares), far, size
+
+
+def real(dtype) -> Any:
+    return jnp.result_type(dtype, float)

@@ -1,0 +1,191 @@
+"""An error bar is never too small without a word: in any units and either precision, for
+rare paths, and for fits that are not good."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._expectation._run import run
+from diffrax_symplectic._expectation._sampling import Plan, Samples, Tails
+from examples.benchmarks.coverage import CELLS, covered, SAMPLINGS
+
+from ..problems import kubo_terms
+
+
+KEY = jr.key(0)
+Y0 = (jnp.array(0.0), jnp.array(1.0))
+WEAK = ds.WeakBrownianPath((), KEY)
+
+
+def _harmonic(t, p, q, args):
+    return (p**2 + q**2) / 2
+
+
+PARAMETRIC = ds.hamiltonian_terms(_harmonic, lambda t, p, q, args: q**2 / 2, WEAK)
+ENERGY = lambda t, y, args: y[0] ** 2 + y[1] ** 2
+
+
+def _in_units(mass: float, length: float, sampling):
+    """The energy in units of that at the start of an oscillator of which one coordinate
+    rests."""
+    H0 = lambda t, p, q, a: jnp.sum(p**2) / (2 * mass) + mass * jnp.sum(q**2) / 2
+    noise = lambda t, p, q, a: 0.1 * mass * jnp.sum(q**2) / 2
+    terms = ds.hamiltonian_terms(H0, noise, WEAK)
+    phi = lambda t, y, a: H0(t, *y, None) / (mass * length**2 / 2)
+    y0 = (jnp.zeros(2), jnp.array([length, 0.0]))
+    return ds.expectation(
+        phi, terms, ds.StormerVerlet(), 0.0, 2.0, 0.1, y0, key=jr.key(2),
+        sampling=sampling,
+    )  # fmt: skip
+
+
+def _energy(s: float, h: float, steps: int) -> float:
+    """The mean of p^2 + q^2 from (0, 1), by second moments."""
+    terms = ds.hamiltonian_terms(_harmonic, lambda t, p, q, args: s * q**2 / 2, WEAK)
+    one = ds.second_moment_map(terms, ds.StormerVerlet(), 0.0, h, Y0)
+    z = np.array([1.0, 0.0, 1.0])
+    end = np.linalg.matrix_power(np.asarray(one), steps) @ np.kron(z, z)
+    return end[4] + end[8]
+
+
+def test_means_do_not_depend_on_units():
+    exact = _energy(0.1, 0.1, 20)
+    units = [(1.0, 1.0), (2.0**-83, 2.0**-19), (1e-25, 2e-6)]
+    ones = [_in_units(*unit, ds.ValueFunctions(2, 64, 32)) for unit in units]
+    for got in ones:
+        assert got.std_error < 1e-13
+        np.testing.assert_allclose(got.mean, exact, rtol=1e-13)
+    # That of the default, too.
+    got = _in_units(1e-25, 2e-6, None)
+    assert abs(got.mean - exact) <= 5 * got.std_error < 1e-4
+
+
+@pytest.mark.parametrize("sampling", [ds.ValueFunctions(), None])
+def test_rare_paths_that_carry_the_mean_are_not_lost(sampling):
+    got = ds.expectation(
+        ENERGY, PARAMETRIC, ds.StormerVerlet(), 0.0, 5.0, 0.05, Y0, key=jr.key(1),
+        sampling=sampling,
+    )  # fmt: skip
+    exact = _energy(1.0, 0.05, 100)
+    assert abs(exact - 10.689544) < 1e-6
+    assert abs(got.mean - exact) <= 4 * got.std_error < 1e-11
+
+
+def test_a_fit_that_overflows_leaves_plain_paths():
+    # A close encounter.
+    H0 = lambda t, p, q, args: p @ p / 2 - 1 / jnp.sqrt(q @ q + 1e-4)
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: 0.05 * q[0], WEAK)
+    y0 = (jnp.array([0.0, 0.15]), jnp.array([1.0, 0.0]))
+    run = lambda sampling: ds.expectation(
+        lambda t, y, args: y[1][0], terms, ds.StormerVerlet(), 0.0, 6.0, 0.005, y0,
+        key=jr.key(2), sampling=sampling,
+    )  # fmt: skip
+    with pytest.warns(UserWarning, match="`degree=2` is no better|was dropped"):
+        got = run(ds.ValueFunctions(2, 512))
+    plain = run(ds.IndependentPaths(2048))
+    assert np.isfinite(got.mean) and got.std_error > plain.std_error
+    assert abs(got.mean - plain.mean) <= 5 * np.hypot(got.std_error, plain.std_error)
+
+
+@pytest.mark.parametrize("size", [1e-21, 1e-19, 1e15, 1e30])
+def test_single_precision_knows_the_spread_of_small_and_large_numbers(size):
+    size = jnp.float32(size)
+    fn = lambda scale: lambda key: scale * (1 + jr.normal(key, (), jnp.float32))
+    run = lambda scale, **kwargs: ds.monte_carlo(
+        fn(scale), key=KEY, num_paths=4000, batch_size=1000, **kwargs
+    )
+    one, got = run(jnp.float32(1)), run(size)
+    np.testing.assert_allclose(got.std_error / float(size), one.std_error, rtol=1e-5)
+    np.testing.assert_allclose(got.mean / float(size), one.mean, rtol=1e-5)
+    with pytest.warns(UserWarning, match="was not reached"):
+        assert run(size, tol=0.01 * float(size)).num_paths == 4000
+
+
+def test_an_expectation_in_single_precision_does_not_know_units():
+    f4 = jax.ShapeDtypeStruct((), jnp.float32)
+    terms = kubo_terms(ds.WeakBrownianPath(f4, KEY))
+    y0 = tuple(x.astype(jnp.float32) for x in Y0)
+    energy = lambda t, y, scale: scale * y[1] ** 2
+    run = lambda scale: ds.expectation(
+        energy, terms, ds.ImplicitMidpoint(), 0.0, 1.0, 0.25, y0, jnp.float32(scale),
+        key=KEY, sampling=ds.IndependentPaths(1000),
+    )  # fmt: skip
+    one, got = run(1.0), run(1e-21)
+    np.testing.assert_allclose(got.std_error, 1e-21 * one.std_error, rtol=1e-5)
+    with pytest.warns(UserWarning, match="smaller than what float32 holds"):
+        run(1e-36)
+
+
+def test_an_indicator_that_no_path_meets_is_told():
+    with pytest.warns(UserWarning, match="indicator of something rare"):
+        ds.monte_carlo(lambda key: jr.normal(key) > 9, key=KEY, num_paths=100)
+
+
+def test_the_standard_error_is_no_less_than_rounding():
+    got = ds.monte_carlo(
+        lambda key: 1e6 + 1e-12 * jr.normal(key), key=KEY, num_paths=1000
+    )
+    assert got.std_error >= 1e6 * np.finfo(float).eps
+
+
+def test_few_samples_that_make_up_for_the_spread_widen_it_and_are_told():
+    heavy = lambda key: jnp.exp(5 * jr.normal(key))
+    with pytest.warns(UserWarning, match="Few of the 2,000 samples make up for most"):
+        got = ds.monte_carlo(heavy, key=KEY, num_paths=2000)
+    assert got.std_error > 1.5 * np.sqrt(got.variance / 2000)
+    light = ds.monte_carlo(jr.normal, key=KEY, num_paths=2000)
+    np.testing.assert_allclose(light.std_error, np.sqrt(light.variance / 2000))
+
+
+def _with_control(shift: float, spread: float = 1.0):
+    """Standard normal numbers, less a control that has the mean `shift`."""
+
+    def sampler(keys):
+        x = jax.vmap(jr.normal)(keys)[None]
+        zero = jnp.zeros((1, 1))
+        tails = Tails(zero, jnp.full(1, jnp.inf), jnp.ones(len(keys)))
+        return Samples(
+            x, np.ones((1, 1)), jnp.ones(x.shape, bool), None, spread * x + shift, tails
+        )
+
+    far = np.zeros(1)
+    plan = Plan(jax.tree_util.Partial(sampler), 1000, 250, far=far)
+    return run(plan, KEY, tuple(jax.devices()[:1]))
+
+
+def test_a_control_whose_mean_is_not_zero_is_dropped():
+    # What is left is an eighth of the noise, and the whole mean of the control.
+    fine, biased = _with_control(0.0, 0.875), _with_control(0.5, 0.875)
+    plain = ds.monte_carlo(jr.normal, key=KEY, num_paths=1000)
+    assert not fine.dropped and biased.dropped
+    np.testing.assert_allclose(fine.std_error, plain.std_error / 8, rtol=1e-12)
+    np.testing.assert_allclose(biased.mean, plain.mean, rtol=1e-12)
+    np.testing.assert_allclose(biased.std_error, plain.std_error, rtol=1e-12)
+    assert _with_control(np.nan).mean == biased.mean
+
+
+def test_plain_terms_are_refused_where_a_solver_takes_them_for_ito():
+    noise = lambda coefficient: diffrax.MultiTerm(
+        diffrax.ODETerm(lambda t, y, args: -y), diffrax.ControlTerm(coefficient, WEAK)
+    )
+    run = lambda coefficient: ds.expectation(
+        lambda t, y, args: y, noise(coefficient), diffrax.Euler(), 0.0, 1.0, 0.25,
+        jnp.ones(()), key=KEY, sampling=ds.IndependentPaths(64),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="in the sense of Ito"):
+        run(lambda t, y, args: 0.1 * y)
+    run(lambda t, y, args: jnp.array(0.1))
+
+
+# Additive and strong; multiplicative and strong, for heavy tails.
+@pytest.mark.parametrize("name", SAMPLINGS)
+@pytest.mark.parametrize("cell", [CELLS[4], CELLS[10]])
+def test_intervals_cover_as_often_as_they_say(name, cell):
+    repetitions = 60
+    shares = covered(cell, SAMPLINGS[name], repetitions)
+    # Four standard errors of a binomial below 95%.
+    assert np.all(shares >= 0.95 - 4 * np.sqrt(0.95 * 0.05 / repetitions)), shares

@@ -1,0 +1,128 @@
+"""An estimate in parts, made anywhere, is that of one run to the last bit."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from ..problems import kubo_terms
+
+
+KEY = jr.key(3)
+Y0 = (jnp.array(0.0), jnp.array(1.0))
+KUBO = kubo_terms(ds.WeakBrownianPath((), jr.key(0)))
+SAMPLINGS = {
+    "IndependentPaths": lambda n: ds.IndependentPaths(n, 16),
+    "ValueFunctions": lambda n: ds.ValueFunctions(1, n, 16),
+    "ArrayRQMC": lambda n: ds.ArrayRQMC(64, n),
+}
+
+
+def _part(name: str, n: int, first: int = 0, **kwargs) -> ds.Expectation:
+    phi = lambda t, y, args: {"q2": y[1] ** 2, "both": (y[0], jnp.stack(y))}
+    return ds.expectation(
+        phi, KUBO, ds.ImplicitMidpoint(), 0.0, 1.0, 0.25, Y0, key=KEY, levels=2,
+        sampling=SAMPLINGS[name](n), first=first, **kwargs,
+    )  # fmt: skip
+
+
+def _bits(e: ds.Expectation) -> list[str]:
+    leaves = e.mean, e.std_error, e.bias, e.error
+    flat = [np.ravel(x) for tree in leaves for x in _leaves(tree)]
+    return [float(x).hex() for x in np.concatenate(flat)]
+
+
+def _leaves(tree) -> list:
+    return [tree["q2"], tree["both"][0], tree["both"][1]]
+
+
+@pytest.mark.parametrize("name", SAMPLINGS)
+def test_parts_are_one_run_to_the_last_bit_in_any_order(name, tmp_path):
+    unit = 2 if name == "ArrayRQMC" else 16
+    cut = [0, 2 * unit, 3 * unit, 7 * unit]
+    whole = _part(name, cut[-1])
+    parts = [_part(name, b - a, a) for a, b in zip(cut, cut[1:])]
+    for order in ((0, 1, 2), (2, 0, 1), (1, 2, 0)):
+        one, *others = [parts[k] for k in order]
+        got = one.merge(*others)
+        assert _bits(got) == _bits(whole) and got.samples == [(0, cut[-1])]
+        assert (got.num_paths, got.num_samples) == (whole.num_paths, cut[-1])
+    # And through files.
+    for k, part in enumerate(parts):
+        part.save(tmp_path / f"{k}.npz")
+    one, *others = [ds.Expectation.load(tmp_path / f"{k}.npz") for k in (2, 0, 1)]
+    merged = one.merge(*others)
+    assert _bits(merged) == _bits(whole)
+    assert str(merged.sampling) == str(parts[2].sampling)
+    assert merged.reason == whole.reason
+    # It can go on.
+    more = _part(name, cut[-1] + 2 * unit, start=merged)
+    assert _bits(more) == _bits(_part(name, cut[-1] + 2 * unit))
+
+
+def test_parts_that_do_not_fit_are_refused(tmp_path):
+    name = "IndependentPaths"
+    one, next_ = _part(name, 32), _part(name, 32, 32)
+    gap = one.merge(_part(name, 32, 64))
+    assert gap.samples == [(0, 32), (64, 96)] and gap.num_paths == 64
+    with pytest.raises(ValueError, match="Samples 48 to 63 are in two"):
+        gap.merge(next_, _part(name, 16, 48))
+    other = ds.monte_carlo(jr.normal, key=KEY, num_paths=10, first=100)
+    with pytest.raises(ValueError, match="of another structure or other shapes"):
+        one.merge(other)
+    with pytest.raises(ValueError, match="has another `key`"):
+        other.merge(ds.monte_carlo(jr.normal, key=jr.key(4), num_paths=10))
+    with pytest.raises(ValueError, match="were sampled by IndependentPaths"):
+        one.merge(_part("ValueFunctions", 32, 32))
+    with pytest.raises(ValueError, match="`merge` takes estimates; got 3"):
+        one.merge(3)  # pyright: ignore
+    with pytest.raises(ValueError, match="`first` must be an integer, 0 or larger"):
+        _part(name, 32, -1)
+    with pytest.raises(ValueError, match="Pass `start`.*, or `first`"):
+        _part(name, 64, 32, start=one)
+    np.savez(tmp_path / "other.npz", x=1)
+    with pytest.raises(ValueError, match="did not write"):
+        ds.Expectation.load(tmp_path / "other.npz")
+
+
+PROGRAM = """
+import os, signal, sys
+import jax
+jax.config.update("jax_enable_x64", True)
+from tests.expectation.test_many_machines import _part
+import diffrax
+class Killing(diffrax.AbstractProgressMeter):
+    def init(self): return 0
+    def step(self, state, progress):
+        if state == 1 and sys.argv[3] == "killed":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return state + 1
+    def close(self, state): pass
+part = int(sys.argv[1])
+e = _part("IndependentPaths", 64, 64 * part, progress_meter=Killing())
+e.save(sys.argv[2])
+"""
+
+
+def test_two_processes_are_one_and_a_part_that_was_killed_is_done_again(tmp_path):
+    root = str(Path(__file__).parents[2])
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}
+    file = lambda part: tmp_path / f"part{part}.npz"
+    start = lambda part, how: subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, str(part), str(file(part)), how],
+        env=environment, cwd=root,
+    )  # fmt: skip
+    processes = [start(0, "done"), start(1, "killed")]
+    codes = [process.wait(timeout=300) for process in processes]
+    assert codes == [0, -signal.SIGKILL] and not file(1).exists()
+    assert start(1, "done").wait(timeout=300) == 0
+    one, other = (ds.Expectation.load(file(part)) for part in (0, 1))
+    assert _bits(other.merge(one)) == _bits(_part("IndependentPaths", 128))
