@@ -23,6 +23,16 @@ _OUTSIDE = (
 )
 
 
+def check_resolution(h: float, t0: float, t1: float, dtype: Any) -> None:
+    """Raises a `ValueError` if steps of this size are reported as failed by `result_at`."""
+    if h < ROUNDINGS * float(jnp.finfo(dtype).eps) * max(abs(t0), abs(t1)):
+        raise ValueError(
+            f"Steps of {h:g} are shorter than {ROUNDINGS} times the rounding of the time "
+            f"in {dtype} at t0={t0} and t1={t1}. Call `jax.config.update("
+            '"jax_enable_x64", True)` first, take longer steps, or begin at `t0=0`.'
+        )
+
+
 def result_at(
     terms: PyTree[diffrax.AbstractTerm],
     t0: RealScalarLike,
