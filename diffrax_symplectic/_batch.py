@@ -17,7 +17,8 @@ from ._custom_types import IntScalarLike
 _T = TypeVar("_T")
 
 # Stragglers are gathered, and served by parts of the batch: so many of them. Mostly there
-# are a few, and the work is that of whole parts.
+# are a few, and the work is that of whole parts. Where all paths computed as long as any is
+# pending, ensembles with some hard paths took 8 to 85 times as long.
 _PARTS = 256
 
 

@@ -28,7 +28,7 @@ def differentiate(
 
     Up to four unknowns by elimination, by `solver` if there is one, and otherwise by the
     iterations that solved the step: they converge where those did. Where they do not, the
-    paths that are left are gathered from the batch, and their systems solved one by one.
+    stragglers are gathered from the batch, and their systems solved one by one.
     """
     # As one vector: JAX cannot transpose a solve in whose right-hand side some arrays
     # depend on what is differentiated and others do not.

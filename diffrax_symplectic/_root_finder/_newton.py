@@ -3,15 +3,15 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
-import jax.flatten_util as jfu
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._custom_types import IntScalarLike
 from ._linear import correction
-from ._tolerance import all_finite, converged, log2, max_norm, ratio, Tolerance
+from ._tolerance import all_finite, converged, largest, log2, max_norm, ratio, Tolerance
 
 
 _Vector: TypeAlias = Float[Array, " n"]
@@ -40,7 +40,7 @@ class Progress(NamedTuple):
     these are $k = s\, \Phi(k)$: those of a step whose length and increments are multiplied
     by $s$.
 
-    - `guess`: $k_0$; `anchor`: the (rough) solution at `reached`.
+    - `anchor`: the (rough) solution at `reached`.
     - `reached`, `target`: the $s$ that was solved for, and the one being solved for.
     - `tries`: how many iterations there were for this target.
     - `size`: the last correction, in units of the tolerance.
@@ -49,7 +49,6 @@ class Progress(NamedTuple):
     - `solved`: whether the whole equations are solved.
     """
 
-    guess: _Vector
     anchor: _Vector
     reached: Scalar
     target: Scalar
@@ -59,11 +58,13 @@ class Progress(NamedTuple):
     solved: Bool[Array, ""]
 
 
-class Newton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Progress]):
-    """Newton's method with continuation: first for the whole equations at once; and where
-    that fails, part by part from `start`."""
+class Newton(optx.AbstractRootFinder[_Vector, _Vector, Any, Progress]):
+    """Newton's method with continuation, for a vector: first for the whole equations at
+    once; and where that fails, part by part from `start`. Corrections are measured in the
+    PyTree that a vector is `restore`d to."""
 
-    start: PyTree[Array]
+    start: _Vector
+    restore: Callable[[_Vector], PyTree[Array]]
 
     rtol: float | None
     atol: float
@@ -72,29 +73,26 @@ class Newton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Progress
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Progress:
         del fn, y, args, options, f_struct, aux_struct, tags
-        guess, _ = jfu.ravel_pytree(self.start)
-        zero, no = jnp.zeros((), guess.dtype), jnp.array(False)
-        return Progress(guess, guess, zero, zero + 1, jnp.array(0), zero, no, no)
+        zero, no = jnp.zeros((), self.start.dtype), jnp.array(False)
+        return Progress(self.start, zero, zero + 1, jnp.array(0), zero, no, no)
 
     def step(self, fn, y, args, options, state, tags):
         del tags
         tolerance = Tolerance(self.rtol, self.atol, self.norm)
         scale = options.get("scale", lambda k: k)
-        k, restore = jfu.ravel_pytree(y)
         s, whole = state.target, state.target == 1
-        residual = lambda k: jfu.ravel_pytree(fn(restore(k), args)[0])[0]
-        part = lambda k: (1 - s) * (k - state.guess) + s * residual(k)
-        value, diff, found = correction(part, k, self.linear_solver)
-        moved, near = max_norm(k), max_norm(diff) < _LOOSE * max_norm(k)
-        k = k - diff
-        measured = tolerance.measure(restore(diff), scale(restore(k)))
+        part = lambda k: (1 - s) * (k - self.start) + s * fn(k, args)[0]
+        value, diff, found = correction(part, y, self.linear_solver)
+        moved, k = max_norm(y), y - diff
+        states = scale(self.restore(k))
+        measured = tolerance.measure(self.restore(diff), states)
         size, tries = measured.size, state.tries + 1
         shrink = jnp.where(state.tries > 0, ratio(size, state.size), 1)
         solved = converged(log2(size), log2(shrink), measured.rounded, shrink >= 0.25)
         # Far from all solutions rounding errors of a large Jacobian hide the unknowns that
         # it multiplies least. Then corrections are small where residuals are larger than
         # states.
-        whole_state = max_norm(jfu.ravel_pytree(scale(restore(k)))[0])
+        whole_state = largest([max_norm(x) for x in jtu.tree_leaves(states)])
         state_size = jnp.maximum(whole_state, moved) + self.atol
         solved &= whole & found & (max_norm(value) <= state_size) & all_finite(k)
 
@@ -103,11 +101,11 @@ class Newton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Progress
         # No correction at all, if that is not the solution, is no progress either.
         stalled = (tries >= patience) & ~((shrink < _SHRINK) & (size > 0))
         slow = ~whole & (tries >= _PATIENCE_IN_PART)
-        arrived = near & ~whole
+        arrived = (max_norm(diff) < _LOOSE * moved) & ~whole
         failed = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~solved
         state = state._replace(tries=tries, size=size, solved=solved)
         k, state = _next_target(state, k, arrived, failed & ~state.searching)
-        return restore(k), state, fn(y, args)[1]
+        return k, state, fn(y, args)[1]
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags

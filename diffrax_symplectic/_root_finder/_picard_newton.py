@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
@@ -97,8 +98,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         scale = eqx.filter_closure_convert(options.get("scale", lambda k: k), y)
         pending = all_finite(y)
         start, solved = self._sweep(fn, y, args, scale, pending)
-        newton = Newton(y, self.rtol, self.atol, self.norm, self.linear_solver)
-        rest = newton, self.newton_steps, fn, args, scale
+        rest = self, fn, y, args, scale
         value = start, _State(solved, optx.RESULTS.successful)
         y, state = where_pending(_newton, pending & ~solved, value, rest)
         return y, state, fn(y, args)[1]
@@ -120,15 +120,27 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
 
 
 def _newton(value: tuple[Any, _State], rest: Any) -> tuple[Any, _State]:
-    newton, most, fn, args, scale = rest
+    """The solution by Newton's method, on a vector: a loop selects, gathers and scatters
+    each array of its state by kernels of their own."""
+    finder, fn, guess, args, scale = rest
+    k, restore = jfu.ravel_pytree(value[0])
+    start, _ = jfu.ravel_pytree(guess)
+    newton = Newton(
+        start=start,
+        restore=restore,
+        rtol=finder.rtol,
+        atol=finder.atol,
+        norm=finder.norm,
+        linear_solver=finder.linear_solver,
+    )
     sol = optx.root_find(
-        fn,
+        lambda k, args: jfu.ravel_pytree(fn(restore(k), args)[0])[0],
         newton,
-        value[0],
+        k,
         args,
         dict(scale=scale),
-        has_aux=True,
-        max_steps=most,
+        max_steps=finder.newton_steps,
         throw=False,
     )
-    return sol.value, _State(sol.result == optx.RESULTS.successful, sol.result)
+    solved = sol.result == optx.RESULTS.successful
+    return restore(sol.value), _State(solved, sol.result)

@@ -2,9 +2,8 @@
 
 import functools as ft
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
-import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
@@ -41,53 +40,33 @@ class Halves(NamedTuple):
     q: PyTree[Array]
 
 
-class _Partitioned(eqx.Module):
-    r"""$(p, q) = \Phi(p, q)$, of which a sweep evaluates each half once."""
+class _System(NamedTuple):
+    """Equations in two halves, $p = P(p, q)$ and $q = Q(p, q)$.
 
-    image: Map
-    # Sweeps before the first convergence check, in double and in single precision: those
-    # that a short step needs.
-    first: ClassVar[tuple[int, int]] = (9, 6)
+    - `p`, `q`: these functions of both halves.
+    - `correction`: how far the halves are from a solution, by those before a sweep and
+        after it.
+    - `first`: sweeps before the first convergence check, in double and in single precision:
+        those that a short step needs.
+    """
 
-    def start(self, y: Halves) -> Halves:
-        return y
-
-    def p(self, y: Halves) -> PyTree[Array]:
-        return self.image(y).p
-
-    def q(self, y: Halves) -> PyTree[Array]:
-        return self.image(y).q
-
-    def correction(self, before: Halves, y: Halves) -> PyTree[Array]:
-        return (y**ω - before**ω).ω
-
-    def value(self, y: Halves) -> Halves:
-        return y
+    p: Callable[[Halves], PyTree[Array]]
+    q: Callable[[Halves], PyTree[Array]]
+    correction: Callable[[Halves, Halves], PyTree[Array]]
+    first: tuple[int, int]
 
 
-class _Doubled(eqx.Module):
-    r"""$y = \Phi(y)$ as the doubled system $p = \Phi(q)$, $q = \Phi(p)$."""
+def _partitioned(image: Map) -> _System:
+    change = lambda before, y: (y**ω - before**ω).ω
+    return _System(lambda y: image(y).p, lambda y: image(y).q, change, (9, 6))
 
-    image: Map
-    # A sweep evaluates everything twice, so that fewer will do.
-    first: ClassVar[tuple[int, int]] = (6, 5)
 
-    def start(self, y: PyTree[Array]) -> Halves:
-        return Halves(y, y)
-
-    def p(self, y: Halves) -> PyTree[Array]:
-        return self.image(y.q)
-
-    def q(self, y: Halves) -> PyTree[Array]:
-        return self.image(y.p)
-
-    def correction(self, before: Halves, y: Halves) -> PyTree[Array]:
-        # Where both solve y = \Phi(\Phi(y)), only their difference shows it.
-        del before
-        return (y.q**ω - y.p**ω).ω
-
-    def value(self, y: Halves) -> PyTree[Array]:
-        return y.q
+def _doubled(image: Map) -> _System:
+    r"""$y = \Phi(y)$ as $p = \Phi(q)$, $q = \Phi(p)$. A sweep evaluates everything
+    twice, so that fewer will do."""
+    # Where both solve y = \Phi(\Phi(y)), only their difference shows it.
+    apart = lambda before, y: (y.q**ω - y.p**ω).ω
+    return _System(lambda y: image(y.q), lambda y: image(y.p), apart, (6, 5))
 
 
 class _State(NamedTuple):
@@ -121,7 +100,7 @@ def sweep(
 ) -> tuple[PyTree[Array], Bool[Array, ""]]:
     r"""Solves $y = \Phi(y)$ from a `guess` for all paths of a batch that are `pending`,
     until each is solved or does not converge, by at most so many sweeps. Returns what was
-    found, and whether that is a solution. Where sweeps led away it is the guess.
+    found, and whether that is a solution. Where sweeps diverged it is the guess.
 
     In a sweep $q$ reads the new $p$ (Gauss--Seidel). Where a Hamiltonian system oscillates,
     the error after that is the one after two evaluations of both, for the price of one
@@ -135,20 +114,24 @@ def sweep(
     R. S. Varga, Numerische Mathematik 3, 1961, 147-156). Where sweeps diverged, they begin
     once more, relaxed like this.
     """
-    system = (_Partitioned if isinstance(guess, Halves) else _Doubled)(image)
+    in_halves = isinstance(guess, Halves)
+    system = _partitioned(image) if in_halves else _doubled(image)
+    start = guess if in_halves else Halves(guess, guess)
+    value_of = lambda y: y if in_halves else y.q
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
-    first, start = system.first[jnp.finfo(dtype).bits < 64], system.start(guess)
+    first = system.first[jnp.finfo(dtype).bits < 64]
 
     def step(state: _State) -> _State:
         before, y = _iterate(system, state)
-        value = system.value(y)
-        correction = tolerance.measure(system.correction(before, y), scale(value))
-        level, earlier = log2(correction.size), log2(correction.bound)
+        change = system.correction(before, y)
+        correction = tolerance.measure(change, scale(value_of(y)))
         # The first of the sweeps changed the values by no more than the state is.
-        fall = level - jnp.minimum(state.level, earlier)
-        check = ft.partial(_check, state, level, fall, correction, first, most)
+        earlier = jnp.minimum(state.level, log2(correction.bound))
+        level = log2(correction.size)
+        check = ft.partial(_check, state, level, earlier, correction, first, most)
         # What follows reads it several times, and would compute it as often: steps of small
-        # systems took 1.3 to 2.8 times as long.
+        # systems took 1.3 to 2.8 times as long. So would the logarithms if more than one
+        # kernel read them: 1.1 times for ten arrays.
         new, back = materialize(check)
         # The sweeps of all paths of a batch are the same, but each path has only its own.
         restart = lambda y, start: jnp.where(back, start, y)
@@ -159,10 +142,10 @@ def sweep(
     ahead = most_of_batch(jnp.where(pending, first, 0))
     state = _State(start, one, inf, no, pending, 0, ahead)
     state = lax.while_loop(lambda state: state.ahead > 0, step, state)
-    return system.value(state.y), state.solved
+    return value_of(state.y), state.solved
 
 
-def _iterate(system: _Partitioned | _Doubled, state: _State) -> tuple[Halves, Halves]:
+def _iterate(system: _System, state: _State) -> tuple[Halves, Halves]:
     """The iterate after all sweeps until the next check, and the one before it."""
 
     def relaxed(new: PyTree[Array], old: PyTree[Array]) -> PyTree[Array]:
@@ -179,12 +162,16 @@ def _iterate(system: _Partitioned | _Doubled, state: _State) -> tuple[Halves, Ha
 
 
 def _check(
-    state: _State, level: Scalar, fall: Scalar, last: Correction, first: int, most: int
+    state: _State,
+    level: Scalar,
+    earlier: Scalar,
+    last: Correction,
+    first: int,
+    most: int,
 ) -> tuple[_State, Bool[Array, ""]]:
     """What the last correction says of convergence, for all but the iterate, and whether
-    that goes back to the guess. The logarithm of its size is `level`; `fall` is the change
-    of that since the check before."""
-    rate, done = fall / state.ahead, state.done + state.ahead
+    that goes back to the guess. The logarithm of its size is `level`, and was `earlier`."""
+    rate, done = (level - earlier) / state.ahead, state.done + state.ahead
     stalled = rate >= _STALLED
     solved = converged(level, rate, last.rounded, stalled)
     again = stalled & (state.relaxation > _STRONGEST)

@@ -94,8 +94,8 @@ def ratio(a: Array, b: Array) -> Array:
 
 def log2(x: Scalar) -> Scalar:
     """The logarithm of a positive number to within 0.09: the exponent, and the mantissa as
-    a straight line. That of a library would take as long as several sweeps. Zero has that
-    of a number below all others, and NaN one above all."""
+    a straight line. With that of a library steps took 1.05 to 1.4 times as long. Zero has
+    that of a number below all others, and NaN one above all."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(jnp.abs(x), f"int{info.bits}").astype(x.dtype)
     return bits * 2.0**-info.nmant + float(info.minexp - 1)

@@ -73,7 +73,8 @@ class Stages(AbstractBlocks):
         for block, k in zip(self.plan.blocks, guess):
             if block.unknown:
                 pairs = all(type(x) is tuple and len(x) == 2 for x in k)
-                pack, unpack = (_halves, _pairs) if pairs else (_same, _same)
+                pack = lambda k, pairs=pairs: Halves(*zip(*k)) if pairs else k
+                unpack = lambda k, pairs=pairs: [*zip(*k)] if pairs else k
                 image = lambda k: pack(self._image(block, values, unpack(k)))
                 scale = lambda k: pack(self._scale(block, unpack(k)))
                 k, is_solved = solve(image, scale, pack(k), pending)
@@ -132,19 +133,6 @@ class Stages(AbstractBlocks):
         stages, matrix = self.plan.tableau.stages, self.plan.tableau.matrix
         position = _position(self.y0, stages, matrix[list(group)], values)
         return _evaluate(self.step, [stages[i] for i in group], position)
-
-
-def _same(k: list[_Value]) -> list[_Value]:
-    return k
-
-
-def _halves(k: list[_Value]) -> Halves:
-    p, q = zip(*k)
-    return Halves([*p], [*q])
-
-
-def _pairs(k: Halves) -> list[_Value]:
-    return [*zip(*k)]
 
 
 def closed(step: Step, y0: Y) -> Step:

@@ -146,7 +146,7 @@ def _gradient(system: System, solver) -> Callable:
 def _handed_on(system: System, solver) -> Callable:
     """Takes keys and a step size to the share of steps that the first iterations leave to
     Newton's method and continuation."""
-    alone = dataclasses.replace(solver, root_find_max_steps=0)
+    alone = dataclasses.replace(solver, root_finder=ds.PicardNewton(newton_steps=0))
 
     @jax.jit
     def share(keys, h):
@@ -155,8 +155,8 @@ def _handed_on(system: System, solver) -> Callable:
 
             def step(y, i):
                 along = (terms, i * h, (i + 1) * h, y, None)
-                new, *_, result = solver.step(*along, jnp.array(False), False)
-                *_, cheap = alone.step(*along, jnp.array(False), False)
+                new, *_, result = solver.step(*along, None, False)
+                *_, cheap = alone.step(*along, None, False)
                 good = result == diffrax.RESULTS.successful
                 y = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, y)
                 return y, cheap != diffrax.RESULTS.successful

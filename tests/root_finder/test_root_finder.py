@@ -174,7 +174,7 @@ def _without_a_safety_net(finder, residual, start):
 @pytest.mark.parametrize("most", [8, 200])
 def test_sweeps_end_when_the_next_correction_is_small_enough(most):
     # Of y = slope y + 1 each iterate is known. There are two in each sweep, and six sweeps
-    # before the first look. Each path of the batch counts by itself.
+    # before the first convergence check. Each path of the batch counts by itself.
     @jax.jit
     @jax.vmap
     def solve(slope, rtol):
@@ -198,7 +198,7 @@ def test_sweeps_end_when_the_next_correction_is_small_enough(most):
 
 
 def test_what_overflows_on_the_way_is_not_taken_for_solved():
-    # Of some of these the iterates overflow between two looks, of some at a look: there an
+    # Of some of these the iterates overflow between two checks, of some at one: there an
     # infinite correction stands next to an infinite state.
     @jax.jit
     @jax.vmap
@@ -212,10 +212,10 @@ def test_what_overflows_on_the_way_is_not_taken_for_solved():
 
 
 @pytest.mark.parametrize("slope", [0.7, -0.7, 0.8, -1.5, -3.0, 1.5])
-def test_slow_sweeps_are_damped_or_leave(slope):
+def test_slow_sweeps_are_relaxed_or_given_up(slope):
     residual = lambda y, _: y - slope * y - 1
     value, success = _without_a_safety_net(ds.PicardNewton(), residual, jnp.zeros(()))
-    # The eigenvalue of a sweep with two copies is the square of the slope.
+    # The eigenvalue of a sweep of the doubled system is the square of the slope.
     assert success == (abs(slope) < 1)
     # Where it did not converge, Newton's method begins from zero.
     expected = 1 / (1 - slope) if success else 0

@@ -22,7 +22,7 @@ def test_small_changes_are_added_before_they_are_added_to_the_state():
 
 def test_blocks_without_unknowns_do_not_call_for_the_safety_net():
     # It has no iterations here.
-    solver = ds.SRKw3("b", root_find_max_steps=0)
+    solver = ds.SRKw3("b", root_finder=ds.PicardNewton(newton_steps=0))
     assert [len(b.unknown) for b in make_plan(solver.tableau.flatten()).blocks] == [
         1,
         0,
