@@ -262,9 +262,8 @@ def checked_shape(
 
 def covers_all_times(path: diffrax.AbstractBrownianPath) -> bool:
     """Whether it is known while tracing that a path has no beginning and no end."""
-    is_number = lambda x: isinstance(x, int | float | np.number)
-    ends = path.t0, path.t1
-    return all(map(is_number, ends)) and bool(np.all(np.isinf(ends)))
+    known = lambda x: isinstance(x, int | float | np.number)
+    return all(known(x) and abs(x) == np.inf for x in (path.t0, path.t1))
 
 
 def is_random(path: diffrax.AbstractBrownianPath) -> bool:
