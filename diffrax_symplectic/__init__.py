@@ -20,7 +20,8 @@ The state is a pair `(p, q)`, momenta first. Begin like this:
 - Which solver: `suggest_solver`, `compare_solvers`. The first to try: `ImplicitMidpoint`.
 - Its Brownian path: `solver.path(shape, key)`.
 - Means over many paths: `expectation`. Their states: `ensemble`.
-- Friction: `BAOAB`, `Damped`. Stiff linear parts: `LinearFlow`.
+- Friction: `BAOAB`, `LangevinMiddle`, `Damped`, `thermal_noise`.
+- Stiff linear parts: `LinearFlow`.
 - Gradients of long solves: `ReversingAdjoint`.
 - Tests of one step: `symplecticity_defect`, `weak_order_defect`.
 """
@@ -64,6 +65,7 @@ from ._solver import (
     AdditiveGauss as AdditiveGauss,
     BAOAB as BAOAB,
     Damped as Damped,
+    LangevinMiddle as LangevinMiddle,
     LevyAreaMidpoint as LevyAreaMidpoint,
     LinearFlow as LinearFlow,
     ImplicitMidpoint as ImplicitMidpoint,
@@ -81,6 +83,7 @@ from ._solver import (
     SRKw5 as SRKw5,
     StormerVerlet as StormerVerlet,
     StrangGauss as StrangGauss,
+    thermal_noise as thermal_noise,
 )
 from ._suggest import (
     suggest_solver as suggest_solver,

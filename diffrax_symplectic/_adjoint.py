@@ -40,7 +40,8 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     it arrives at one, it is compared with what was saved. If they differ by more than
     $\varepsilon^{2/3}$ of the largest number in the state, where $\varepsilon$ is the
     machine epsilon (4e-11 in float64), the gradient is not returned: an error is raised,
-    or with `throw=False` the gradient is NaN.
+    or with `throw=False` the gradient is NaN. Near rest, where a state says little of its
+    size, that of the states to come counts, less a tenth for each step.
 
     **Solvers:** those that are their own inverse, which is read off their coefficients:
     [`diffrax_symplectic.ImplicitMidpoint`][], [`diffrax_symplectic.StormerVerlet`][],
@@ -259,6 +260,8 @@ class _Walk(NamedTuple):
     a_parameters: PyTree[Array]
     # How many of the saved times lie before here.
     saved: Array
+    # How large states are near here.
+    size: Array
     arrived: Bool[Array, ""]
 
 
@@ -290,9 +293,9 @@ def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwar
 
     def body(walk: _Walk) -> _Walk:
         i = walk.i - 1
-        y, arrived = _begin_anew(
-            step(walk.y, diff, i, True), rows, i, every, walk.arrived
-        )
+        before = step(walk.y, diff, i, True)
+        size = jnp.maximum(optx.max_norm(before), _PER_STEP * walk.size)
+        y, arrived = _begin_anew(before, rows, i, every, walk.arrived, size)
         a_y, a_y0, saved = walk.a_y, (0 * walk.a_y**ω).ω, walk.saved
         if sub.ts is not None:
             t0, t1 = steps.time(i), steps.time(i + 1)
@@ -300,12 +303,12 @@ def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwar
         _, vjp = jax.vjp(lambda y, diff: step(y, diff, i, False), y, diff)
         through, a_parameters = vjp(a_y)
         total = (walk.a_parameters**ω + a_parameters**ω).ω
-        return _Walk(i, y, (a_y0**ω + through**ω).ω, total, saved, arrived)
+        return _Walk(i, y, (a_y0**ω + through**ω).ω, total, saved, size, arrived)
 
     start = jtu.tree_map(lambda g: g[-1] if sub.ts is None else 0 * g[0], g)
     zeros = jtu.tree_map(jnp.zeros_like, diff)
-    saved = jnp.asarray(saved)
-    walk = _Walk(jnp.asarray(num_steps), y1, start, zeros, saved, jnp.array(True))
+    at, size, yes = jnp.asarray(num_steps), optx.max_norm(y1), jnp.array(True)
+    walk = _Walk(at, y1, start, zeros, jnp.asarray(saved), size, yes)
     walk = lax.while_loop(lambda walk: walk.i > 0, body, walk)
     a_y = walk.a_y
     if sub.ts is not None:
@@ -315,16 +318,21 @@ def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwar
     return _if_arrived(walk.arrived, throw, (a_y, *walk.a_parameters))
 
 
+# How much less the size of a state counts for the one a step before it. A start at rest
+# has the size of the steps to come, of which weak increments may leave dozens at rest, too.
+_PER_STEP = 0.9
+
+
 def _begin_anew(
-    y: Y, rows: PyTree[Array], i, every, arrived
+    y: Y, rows: PyTree[Array], i, every, arrived, size: Array
 ) -> tuple[Y, Bool[Array, ""]]:
     """The saved state in place of the one walked to, if there is one after `i` steps; and
-    whether they agree."""
+    whether they agree, for states of this `size`."""
     row, rest = jnp.divmod(i, every)
     exact = jtu.tree_map(lambda rows: rows[row], rows)
     error = optx.max_norm((y**ω - exact**ω).ω)
     eps = float(jnp.finfo(error.dtype).eps)
-    close = error <= eps ** (2 / 3) * optx.max_norm(exact)
+    close = error <= eps ** (2 / 3) * jnp.maximum(size, optx.max_norm(exact))
     here = rest == 0
     y = jtu.tree_map(lambda walked, saved: jnp.where(here, saved, walked), y, exact)
     return y, arrived & (close | ~here)

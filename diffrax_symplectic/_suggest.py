@@ -18,6 +18,7 @@ from ._brownian import (
     drives,
     FixedStepBrownianPath,
     increment_struct,
+    is_random,
     LevyAreaBrownianPath,
     LevyAreaIncrement,
     PlateauBrownianPath,
@@ -27,10 +28,11 @@ from ._brownian import (
 )
 from ._custom_types import Args, RealScalarLike, Y
 from ._solver import (
+    AbstractLangevinSplitting,
     AbstractSymplecticSolver,
-    BAOAB,
     Damped,
     ImplicitMidpoint,
+    LANGEVIN,
     Record,
     SOLVERS,
     Want,
@@ -67,7 +69,8 @@ class Suggestion:
     - `path`: the Brownian path that it needs, as code.
     - `reason`: when to choose it, in a sentence.
     - `terms`: a function of a random key, which returns the terms of the system with such
-        paths in place of theirs.
+        paths in place of theirs. A path without a random key in it, such as recorded
+        noise, stays.
     """
 
     solver: AbstractSymplecticSolver
@@ -159,7 +162,9 @@ def suggest_solver(
     - `want`: `"weak"` for expectations, or `"strong"` for single paths.
     - `gamma`: friction, $-\gamma p\,\mathrm{d}t$ beside these terms, as
         [`diffrax_symplectic.Damped`][] takes it. Then solvers with this friction are
-        suggested: [`diffrax_symplectic.BAOAB`][] for Langevin dynamics.
+        suggested: for Langevin dynamics [`diffrax_symplectic.BAOAB`][], whose positions
+        are accurate, and [`diffrax_symplectic.LangevinMiddle`][], whose momenta are so as
+        well.
 
     **Returns:** a sequence of suggestions, each with `solver`, `weak_order`,
     `strong_order`, `path`, `reason`, and `terms(key)`, the terms with the path that the
@@ -195,7 +200,7 @@ def suggest_solver(
     if gamma is not None:
         if not any(map(is_hamiltonian, drift)):
             # Of these `BAOAB` finds the momenta, by the structure that it needs.
-            solvers = [solver for solver in solvers if isinstance(solver, BAOAB)]
+            solvers = [s for s in solvers if isinstance(s, AbstractLangevinSplitting)]
         probe = next(iter(solvers), Damped(ImplicitMidpoint(), gamma))
         probe.init(terms, t0, t0 + 1, y0, args)  # refuses what is no friction
     if len(noise) > 1 or not jtu.all_leaves(
@@ -204,6 +209,9 @@ def suggest_solver(
         # Lévy areas are those between the noises of one array.
         areas = lambda solver: "noise brackets" in map(drives, solver.variables)
         solvers = [solver for solver in solvers if not areas(solver)]
+    paths = brownian_paths(noise)
+    given = [path for path in paths if not is_random(path)]
+    solvers = [s for s in solvers if all(_holds(path, s) for path in given)]
     found = [_suggestion(solver, want, terms, commute) for solver in solvers]
     if not kind:
         kind = f"general ({getattr(not_separable, 'reason', '')})"
@@ -217,7 +225,23 @@ def suggest_solver(
         system += f" It is not separable: {not_separable.reason}."
     if not_separable is not None and not_separable.friction:
         system += f" {FRICTION} Without it, ask with `gamma=`."
+    if any(isinstance(path, diffrax.UnsafeBrownianPath) for path in paths):
+        system += f" {_UNSAFE}"
     return Suggestions(system, tuple(found))
+
+
+_UNSAFE = (
+    "Its `diffrax.UnsafeBrownianPath` takes times as numbers of 32 bits, and late in a run "
+    "repeats its noise (Diffrax's issue 733): take one of the paths below."
+)
+
+
+def _holds(
+    path: diffrax.AbstractBrownianPath, solver: AbstractSymplecticSolver
+) -> bool:
+    """Whether a path that is given has what the solver needs."""
+    area = getattr(path, "levy_area", diffrax.AbstractBrownianIncrement)
+    return solver.variables == ("W",) or issubclass(area, solver.minimal_levy_area)
 
 
 def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
@@ -263,7 +287,8 @@ def ranked(
 
     solvers = [solver() for solver in SOLVERS]
     if gamma is not None:
-        solvers = [BAOAB(gamma), *(Damped(solver, gamma) for solver in solvers)]
+        langevin = [solver(gamma) for solver in LANGEVIN]
+        solvers = [*langevin, *(Damped(solver, gamma) for solver in solvers)]
     return sorted(filter(fits, solvers), key=rank)
 
 
@@ -274,7 +299,7 @@ def _record(solver: AbstractSymplecticSolver) -> Record:
 
 def _code(solver: AbstractSymplecticSolver, module: str = "") -> str:
     """How the solver is constructed, for a friction called `gamma`."""
-    given = "gamma" if isinstance(solver, BAOAB) else ""
+    given = "gamma" if isinstance(solver, AbstractLangevinSplitting) else ""
     if isinstance(solver, Damped):
         given = f"{_code(solver.solver, module)}, gamma"  # pyright: ignore
     return f"{module}{type(solver).__name__}({given})"
@@ -287,12 +312,16 @@ def _suggestion(
     commute: bool,
 ) -> Suggestion:
     record = _record(solver)
-    shape = _shape_code(increment_struct(brownian_paths(terms)[0]))
+    random = [path for path in brownian_paths(terms) if is_random(path)]
+    code = "that of the terms, which holds given noise"
+    if random:
+        shape = _shape_code(increment_struct(random[0]))
+        code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
     return Suggestion(
         solver=solver,
         weak_order=record.weak_order(commute),
         strong_order=record.strong_order(commute),
-        path=f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")',
+        path=code,
         reason=record.choose,
         terms=jtu.Partial(with_paths, ft.partial(solver.path, want=want), terms),
     )
@@ -325,10 +354,12 @@ def path_for(
 
 def with_paths(make: Callable, terms: PyTree, key: PRNGKeyArray) -> PyTree:
     """The terms with new paths in place of theirs; terms that share a path share the new
-    one."""
+    one. A path that holds given noise stays."""
     made = {}
 
     def new(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
+        if not is_random(path):
+            return path
         if id(path) not in made:
             number = len(made)
             own = key if number == 0 else jr.fold_in(key, number + 1)

@@ -32,6 +32,7 @@ _NOISES = {
 # Examples of those that have no defaults. A splitting is shown as one around any solver.
 _SPLIT = (
     ds.BAOAB(1.0),
+    ds.LangevinMiddle(1.0),
     ds.Damped(ds.NinomiyaVictoir(), 1.0),
     ds.LinearFlow(ds.NinomiyaVictoir(), lambda time, y, args: y),
 )

@@ -200,8 +200,8 @@ class Given(diffrax.AbstractBrownianPath):
     A: jax.Array | None = None
     two_point: jax.Array | None = None
     K: jax.Array | None = None
-    t0 = 0
-    t1 = 1
+    t0 = -jnp.inf
+    t1 = jnp.inf
     levy_area = _AnyIncrement
 
     def evaluate(self, t0, t1=None, left=True, use_levy=False):

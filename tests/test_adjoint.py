@@ -213,16 +213,47 @@ def test_a_way_back_that_is_lost_is_reported_for_that_path_alone():
         jax.block_until_ready(gradient(1, True))
 
 
+@pytest.mark.parametrize("y0", [0.0, 1e-12])
+@pytest.mark.parametrize(
+    "path", [weak_path(1), ds.FixedStepBrownianPath((1,), jr.key(3))]
+)
+def test_the_way_back_leads_to_rest(path, y0):
+    # Three-point increments are zero in two steps of three: several first steps may rest.
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + 1 - jnp.sum(jnp.cos(q))
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: args * q, path)
+
+    @jax.jit
+    def gradients(y0):
+        def end(args, key, adjoint):
+            new = eqx.tree_at(lambda x: x.terms[1].path.key, terms, key)
+            sol = diffrax.diffeqsolve(
+                new, ds.StormerVerlet(), 0.0, 20.0, 0.01, y0, args, adjoint=adjoint
+            )
+            return jnp.sum(sol.ys[1][-1] ** 2)
+
+        adjoints = ds.ReversingAdjoint(), diffrax.RecursiveCheckpointAdjoint()
+        over = lambda by: lambda key: jax.grad(end)(jnp.array([0.5]), key, by)
+        return [jax.vmap(over(by))(jr.split(jr.key(1), 100)) for by in adjoints]
+
+    ours, theirs = gradients((jnp.array([y0]), jnp.zeros(1)))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-7)
+
+
 def test_a_loss_on_the_way_back_is_not_forgotten_at_the_next_saved_state():
     # The states after no, two and four steps.
     saved = jnp.array([3.0, 2.0, 1.0])
-    at_saved = lambda y, found: _begin_anew(y, saved, jnp.array(2), 2, jnp.array(found))
+    at_saved = lambda y, found, size=0.0: _begin_anew(
+        y, saved, jnp.array(2), 2, jnp.array(found), jnp.array(size)
+    )
     assert at_saved(jnp.array(2.0), True) == (2.0, True)
     bound = 2 * jnp.finfo(float).eps ** (2 / 3)
     assert at_saved(jnp.array(2 + 0.99 * bound), True) == (2.0, True)
     assert at_saved(jnp.array(2 + 1.01 * bound), True) == (2.0, False)
+    assert at_saved(jnp.array(2 + 1.01 * bound), True, 2.1) == (2.0, True)
     assert at_saved(jnp.array(2.0), False) == (2.0, False)
-    between = _begin_anew(jnp.array(1.6), saved, jnp.array(3), 2, jnp.array(True))
+    between = _begin_anew(
+        jnp.array(1.6), saved, jnp.array(3), 2, jnp.array(True), jnp.array(0.0)
+    )
     assert between == (1.6, True)
 
 

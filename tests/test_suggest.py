@@ -136,7 +136,7 @@ def test_with_friction_solvers_that_have_it_are_suggested(want):
         names = [s.solver for s in ds.suggest_solver(terms, 0.0, y0, want=want)]
         assert type(found[0].solver) is first and "and friction" in found.system
         # Around all that are suggested without.
-        inner = [s.solver.solver for s in found if not isinstance(s.solver, ds.BAOAB)]
+        inner = [s.solver.solver for s in found if isinstance(s.solver, ds.Damped)]
         assert {*map(repr, inner)} == {*map(repr, names)}
         for s in found:
             assert s.weak_order <= 2 and (s.strong_order or 0) <= 1

@@ -135,8 +135,9 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
     of `key` and of where the step lies, as those of
     [`diffrax_symplectic.WeakBrownianPath`][]. A step that is computed again gets the same
     increments. So reverse-mode gradients work, which `diffrax.UnsafeBrownianPath` does not
-    allow. A step costs as much as its random numbers, whereas a
-    `diffrax.VirtualBrownianTree` descends to its leaves for each of them.
+    allow; and no noise repeats late in a run, as it does there. A step costs as much as
+    its random numbers, whereas a `diffrax.VirtualBrownianTree` descends to its leaves for
+    each of them.
 
     Without `cell`, steps of another size belong to another Brownian motion. With `cell`,
     one Brownian motion is sampled over cells of that size, and the increment over a step

@@ -260,6 +260,27 @@ def checked_shape(
     return shape
 
 
+def covers_all_times(path: diffrax.AbstractBrownianPath) -> bool:
+    """Whether it is known while tracing that a path has no beginning and no end."""
+    known = lambda x: isinstance(x, int | float | np.number)
+    return all(known(x) and abs(x) == np.inf for x in (path.t0, path.t1))
+
+
+def is_random(path: diffrax.AbstractBrownianPath) -> bool:
+    """Whether a path draws its noise, by a random key within it. Others hold noise that is
+    given: recorded, or made by a rule."""
+    if isinstance(path, UnspecifiedPath):
+        return True
+
+    def is_key(x) -> bool:
+        if not eqx.is_array(x):
+            return False
+        typed = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        return typed or x.dtype == jnp.uint32 and x.shape[-1:] in ((2,), (4,))
+
+    return any(map(is_key, jtu.tree_leaves(path)))
+
+
 class UnspecifiedPath(diffrax.AbstractBrownianPath):
     """The shape of a Brownian path that is chosen later, when the solver is known."""
 

@@ -42,6 +42,7 @@ def expectation(
     engine: str | None = None,
     devices: Sequence[Any] | None = None,
     progress_meter: diffrax.AbstractProgressMeter = NO_METER,
+    **others: Any,
 ) -> Expectation:
     r"""Estimates $\mathbb E[\phi(t, y_t)]$, its standard error, and the error of
     discretization.
@@ -147,6 +148,12 @@ def expectation(
     and variances of batches are combined; [Talay and Tubaro
     (1990)](https://doi.org/10.1080/07362999008809220) for extrapolation.
     """
+    if others:
+        raise TypeError(
+            f"`expectation` takes no {', '.join(f'`{name}`' for name in others)}. Solves "
+            "with events, or with other arguments of `diffrax.diffeqsolve`, are averaged "
+            "by `monte_carlo`: write one as a function of a random key."
+        )
     given = terms, t0, t1, dt0, y0, args, ts
     key, begin, devices = checked_call(
         "expectation", key, tol, start, first, devices, given

@@ -15,14 +15,17 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._arguments import check_solver, check_takes, whole_number
+from .._brownian import is_random
 from .._custom_types import Args, RealScalarLike, Y
 from .._root_finder import all_finite
+from .._solver import AbstractSymplecticSolver, check_resolution
 from .._suggest import path_for, specified
 from .._terms import (
     additive_fault,
     brownian_paths,
     check_fit,
     evaluated,
+    has_lifted,
     separable_fault,
     split_terms,
 )
@@ -71,6 +74,11 @@ class Problem(eqx.Module):
         make = lambda shape: path_for(solver, "weak", None, shape, jr.key(0))
         terms = specified(terms, make)
         saved_steps, num_steps = _steps(t0, t1, dt0, ts)
+        if callable(y0):
+            raise ValueError(
+                "`y0` must be a state; got a function. For a random start average "
+                "`lambda key: ...`, which draws the state and solves, by `monte_carlo`."
+            )
         y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
         if not all_finite(y0):
             raise ValueError(f"`y0` must hold finite numbers; got {y0}.")
@@ -81,11 +89,20 @@ class Problem(eqx.Module):
                 "`terms` have no Brownian path, so that nothing is random. Solve them "
                 "once, by `diffrax.diffeqsolve`."
             )
+        if not any(map(is_random, brownian_paths(terms))):
+            raise ValueError(
+                "No Brownian path in `terms` has a random key, so that all samples would "
+                "have the same noise. Solve once, by `diffrax.diffeqsolve`. If your path "
+                "draws its noise, make a JAX random key one of its fields; to average over "
+                "many records, write a function that draws one for `monte_carlo`."
+            )
+        if isinstance(solver, AbstractSymplecticSolver):
+            h = float(dt0) / 2 ** (levels - 1)
+            check_resolution(h, float(t0), float(t1), start.dtype)
         _check_sense(terms, solver, start, y0, args)
         _check_cells(terms, t0, float(dt0) / 2 ** (levels - 1))
         check_takes("phi", phi, "t", "y", "args")
-        once = lambda t, y, args: evaluated("phi", phi, t, y, args=args)
-        check_real("phi", jtu.tree_leaves(eqx.filter_eval_shape(once, start, y0, args)))
+        check_real("phi", jtu.tree_leaves(_shape_of(phi, terms, start, y0, args)))
         if num_steps * 2.0 ** (levels - 1) >= 2**31:
             raise ValueError(
                 f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "
@@ -318,6 +335,26 @@ def _check_cells(terms, t0, h: float) -> None:
                 f"multiples of `cell`; got cell={cell}, t0={t0} and the smallest step {h}. "
                 "Pass a `cell` that divides `t0` and the steps of all `levels`."
             )
+
+
+# What functions of spins or amplitudes raise for a pair.
+_NOT_OF_A_PAIR = (TypeError, AttributeError, IndexError)
+
+
+def _shape_of(phi: Callable, terms, t0, y0: Y, args: Args) -> PyTree:
+    """What `phi` returns, and an error that says of which state it is a function."""
+    once = lambda t, y, args: evaluated("phi", phi, t, y, args=args)
+    try:
+        return eqx.filter_eval_shape(once, t0, y0, args)
+    except _NOT_OF_A_PAIR as error:
+        if not has_lifted(terms):
+            raise
+        kind = next(kind for kind in _NOT_OF_A_PAIR if isinstance(error, kind))
+        raise kind(
+            "`phi(t, y, args)` gets the pair `(p, q)` that the terms of spins and of "
+            "complex amplitudes move: take `from_spinors(y)` or `from_pair(y)` in it. "
+            f"{error}"
+        ) from error
 
 
 def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations levels"]:

@@ -4,10 +4,14 @@ from .general import ImplicitMidpoint, SRKs1, SRKw1, SRKw2
 from .separable import PlateauVerlet, SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet
 from .additive import AdditiveGauss, SRKs4, SRKw5
 from .beyond import LevyAreaMidpoint, NinomiyaVictoir, PlateauGauss, StrangGauss
-from .baoab import BAOAB
+from .langevin import AbstractLangevinSplitting, BAOAB, LangevinMiddle
+from ._times import check_resolution
 from .splitting import AbstractSplitting, Damped, LinearFlow
+from .thermal import thermal_noise
 
 
+# Those of Langevin dynamics, which take the friction as their one argument.
+LANGEVIN: tuple[type[BAOAB] | type[LangevinMiddle], ...] = (BAOAB, LangevinMiddle)
 # All solvers without friction, in the order of the documentation.
 SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
     *(ImplicitMidpoint, SRKs1, SRKw1, SRKw2),

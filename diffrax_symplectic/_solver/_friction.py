@@ -15,16 +15,30 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from .._batch import materialize
-from .._compat import nondifferentiable
-from .._custom_types import RealScalarLike
+from .._compat import direction, nondifferentiable, ω
+from .._custom_types import Args, RealScalarLike, Y
+from .._terms import rate, split_terms
 
 
 # What the solvers say of this argument.
 GAMMA = """the friction, in units of one over time: a number; or an array or PyTree like
-    `p`, each array a scalar, of the shape of its momenta, or a symmetric positive
-    semidefinite matrix that acts on them, of that shape twice, `(n, n)` for `n` momenta. If
-    it is traced and not so, the path fails. There are derivatives with respect to it; of
-    a matrix only first ones."""
+    `p`, each array a scalar, of the shape of its momenta, or a matrix that acts on them, of
+    that shape twice, `(n, n)` for `n` momenta. A matrix is symmetric positive semidefinite,
+    or it is so with the masses $M$ of $V(p) = p \\cdot M^{-1} p / 2$: of a tensor $\\Gamma$
+    with $\\mathrm{d}p = -\\Gamma M^{-1} p\\,\\mathrm{d}t$ pass `Gamma / mass`. If it is
+    traced and not so, the path fails. There are derivatives with respect to it; of a matrix
+    only first ones."""
+
+
+class Fault(NamedTuple):
+    """Why an array of `gamma` cannot serve as a matrix, or not without masses that make it
+    symmetric."""
+
+    reason: str
+    masses: bool = False
+
+
+UNKNOWN = Fault("its values are traced", masses=True)
 
 
 def checked(gamma: PyTree) -> PyTree:
@@ -39,56 +53,77 @@ def checked(gamma: PyTree) -> PyTree:
         if isinstance(leaf, jax.core.Tracer):
             continue
         values = np.asarray(leaf)
-        negative = np.any(values < 0) and _matrix_fault(values) is not None
-        if not np.all(np.isfinite(values)) or negative:
+        if not np.all(np.isfinite(values)):
+            raise ValueError(f"`gamma` must be finite; got {leaf!r}.")
+        if np.all(values >= 0):
+            continue
+        fault = _matrix_fault(values)
+        if fault == _NO_SQUARE:
             raise ValueError(
-                "`gamma` must be finite and not negative, or a symmetric positive "
-                "semidefinite matrix: it takes momentum away at this rate; got "
+                "`gamma` must not be negative: it takes momentum away at this rate; got "
                 f"{leaf!r}."
+            )
+        if fault is not None and not fault.masses:
+            raise ValueError(
+                "`gamma` has negative entries, which only a symmetric positive "
+                f"semidefinite matrix may have, but {fault.reason}; got {leaf!r}."
             )
     return gamma
 
 
-def matrix_faults(gamma: PyTree) -> tuple[str | None, ...]:
-    """Why each array of `gamma` cannot serve as a matrix; `None` if it can, or if its
-    values are traced. Whether it has to serve as one is seen from the momenta only."""
+def matrix_faults(gamma: PyTree) -> tuple[Fault | None, ...]:
+    """Why each array of `gamma` cannot serve as a matrix; `None` if it can. Whether it has
+    to serve as one is seen from the momenta only."""
     known = lambda x: not isinstance(x, jax.core.Tracer)
     leaves = jtu.tree_leaves(gamma)
-    return tuple(_matrix_fault(np.asarray(x)) if known(x) else None for x in leaves)
+    return tuple(_matrix_fault(np.asarray(x)) if known(x) else UNKNOWN for x in leaves)
 
 
-def _matrix_fault(values: np.ndarray) -> str | None:
+_NO_SQUARE = Fault("it is no square matrix")
+
+
+def _matrix_fault(values: np.ndarray) -> Fault | None:
     half = values.shape[: values.ndim // 2]
     if values.ndim == 0 or values.shape != half + half:
-        return "it is no square matrix"
+        return _NO_SQUARE
     matrix = values.reshape(int(np.prod(half)), -1)
     if not np.all(np.isfinite(matrix)):
-        return "it is not finite"
+        return Fault("it is not finite")
     eps = np.finfo(np.result_type(matrix, np.float32)).eps
     size = 100 * eps * np.max(np.abs(matrix), initial=0)
-    if np.any(np.abs(matrix - matrix.T) > size):
-        return "it is not symmetric"
-    if np.any(np.linalg.eigvalsh(matrix) < -size * len(matrix)):
-        return "it has a negative eigenvalue"
-    return None
+    symmetric = np.all(np.abs(matrix - matrix.T) <= size)
+    # Of a matrix that is symmetric with some masses the eigenvalues are real, too.
+    rates = np.linalg.eigvalsh(matrix) if symmetric else np.linalg.eigvals(matrix)
+    bound = size * len(matrix) * (1 if symmetric else eps**-0.5)
+    if not symmetric and np.any(np.abs(rates.imag) > bound):
+        return Fault("it is not symmetric, and has complex eigenvalues")
+    if np.any(rates.real < -bound):
+        return Fault(f"it has the negative eigenvalue {np.min(rates.real):.3g}")
+    return None if symmetric else Fault("it is not symmetric", masses=True)
 
 
 class Modes(NamedTuple):
-    """The eigenvalues and eigenvectors of a matrix of friction."""
+    r"""A matrix of friction as `left @ diag(rates) @ right`, where `left` and `right` are
+    inverse to each other."""
 
     rates: Float[Array, " n"]
-    axes: Float[Array, "n n"]
+    left: Float[Array, "n n"]
+    right: Float[Array, "n n"]
 
 
 def friction_modes(
-    gamma: PyTree[ArrayLike], faults: tuple[str | None, ...], p: PyTree[Array]
+    gamma: PyTree[ArrayLike],
+    faults: tuple[Fault | None, ...],
+    p: PyTree[Array],
+    velocity: Callable[[PyTree[Array]], PyTree[Array]],
 ) -> list[Modes | None]:
     """The modes of `gamma` for each array of `p`; `None` where it is no matrix. They do not
-    change during a solve. Raises a `ValueError` if `gamma` does not fit `p`."""
+    change during a solve. `velocity(p)` tells the masses. Raises a `ValueError` if `gamma`
+    does not fit `p`."""
     leaves = jtu.tree_leaves(p)
     faults = faults if len(faults) == len(leaves) else faults * len(leaves)
     found = []
-    for g, x, fault in zip(_for_each(gamma, p), leaves, faults):
+    for i, (g, x, fault) in enumerate(zip(_for_each(gamma, p), leaves, faults)):
         if jnp.shape(g) in ((), jnp.shape(x)):
             found.append(None)
             continue
@@ -98,13 +133,40 @@ def friction_modes(
                 f"{jnp.shape(x)}, or for a matrix of them {jnp.shape(x) * 2}; got shape "
                 f"{jnp.shape(g)}."
             )
-        if fault is not None:
+        matrix = _as_matrix(jax.lax.stop_gradient(g), x)
+        if fault is None:
+            found.append(_modes(matrix))
+            continue
+        modes = _with_masses(matrix, _inverse_mass(velocity, p, i))
+        known = not isinstance(modes.rates, jax.core.Tracer)
+        if not fault.masses or known and np.any(np.isnan(modes.rates)):
             raise ValueError(
                 "`gamma` must be a symmetric positive semidefinite matrix for momenta of "
-                f"shape {jnp.shape(x)}, but {fault}; got {g}."
+                f"shape {jnp.shape(x)}, or become one with the masses of H0, but "
+                f"{fault.reason}."
             )
-        found.append(_modes(_as_matrix(jax.lax.stop_gradient(g), x)))
+        found.append(modes)
     return found
+
+
+def velocity_of(terms: PyTree[diffrax.AbstractTerm], t0, y0: Y, args: Args) -> Callable:
+    """The velocities as a function of the momenta, at the start of a solve."""
+    drift, _ = split_terms(terms)
+    # In a solve backward in time they change their signs.
+    return lambda p: (direction(terms) * rate(drift, t0, (p, y0[1]), args)[1] ** ω).ω
+
+
+def _inverse_mass(velocity: Callable, p: PyTree[Array], number: int) -> Array:
+    """The derivative of the velocities by the momenta, for one of the arrays of `p`."""
+    leaves, treedef = jtu.tree_flatten(jax.lax.stop_gradient(p))
+    x = leaves[number]
+
+    def of(flat):
+        changed = [*leaves]
+        changed[number] = flat.reshape(jnp.shape(x))
+        return jnp.ravel(jtu.tree_leaves(velocity(treedef.unflatten(changed)))[number])
+
+    return jax.lax.stop_gradient(jax.jacfwd(of)(jnp.ravel(x)))
 
 
 def friction_result(
@@ -114,10 +176,11 @@ def friction_result(
     finite, or as a matrix not symmetric positive semidefinite) `RESULTS.nonfinite`."""
     leaves = jtu.tree_leaves(gamma)
     leaves = leaves if len(leaves) == len(modes) else leaves * len(modes)
+    traced = lambda x: isinstance(x, jax.core.Tracer)
     bad = [
         _no_rate(g) if mode is None else jnp.any(jnp.isnan(mode.rates))
         for g, mode in zip(leaves, modes)
-        if isinstance(g, jax.core.Tracer)
+        if traced(g) or mode is not None and traced(mode.rates)
     ]
     if len(bad) == 0:
         return result
@@ -149,10 +212,27 @@ def _as_matrix(g: ArrayLike, x: Array) -> Float[Array, "n n"]:
 def _modes(matrix: Float[Array, "n n"]) -> Modes:
     rates, axes = jnp.linalg.eigh(matrix)
     size = 100 * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
-    skew = jnp.max(jnp.abs(matrix - matrix.T))
     # As below: values that are traced cannot raise an error.
-    bad = ~(skew <= size) | ~jnp.all(rates >= -size * len(matrix))
-    return Modes(jnp.where(bad, jnp.nan, jnp.maximum(rates, 0)), axes)
+    bad = ~_is_symmetric(matrix) | ~jnp.all(rates >= -size * len(matrix))
+    return Modes(jnp.where(bad, jnp.nan, jnp.maximum(rates, 0)), axes, axes.T)
+
+
+def _with_masses(
+    matrix: Float[Array, "n n"], inverse_mass: Float[Array, "n n"]
+) -> Modes:
+    r"""Of a matrix that is symmetric, or else of $\gamma = \Gamma M^{-1}$ with a symmetric
+    $\Gamma$: with $M^{-1} = L L^\top$ that is $L^{-\top} (L^\top \Gamma L) L^\top$."""
+    one = jnp.eye(len(matrix), dtype=matrix.dtype)
+    root = jnp.linalg.cholesky(inverse_mass)
+    up = jnp.where(_is_symmetric(matrix), one, root.T)
+    down = jax.scipy.linalg.solve_triangular(up, one)
+    modes = _modes(_dot(_dot(up, matrix), down))
+    return Modes(modes.rates, _dot(down, modes.left), _dot(modes.right, up))
+
+
+def _is_symmetric(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
+    size = 100 * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
+    return jnp.max(jnp.abs(matrix - matrix.T)) <= size
 
 
 def decay(x: Array) -> Array:
@@ -221,8 +301,8 @@ _dot = ft.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
 # The modes of equal rates are not unique and have no derivative. The function has one.
 @ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _of_matrix(fn, matrix, modes: Modes, time, x) -> Array:
-    rates, axes = modes
-    return _dot(axes, fn(rates * time) * _dot(axes.T, x))
+    rates, left, right = modes
+    return _dot(left, fn(rates * time) * _dot(right, x))
 
 
 @_of_matrix.defjvp
@@ -232,12 +312,20 @@ def _(fn, primals, tangents):
     # The modes are constants here, so that a second derivative would be wrong.
     matrix = nondifferentiable(matrix, name="the matrix `gamma`, a second time")
     del matrix
-    rates, axes = modes
-    along = lambda v: _dot(axes.T, v)
-    change = _dot(along(d_matrix), axes) * time + jnp.diag(rates * d_time)
+    rates, left, right = modes
+    along = lambda v: _dot(right, v)
+    change = _dot(along(d_matrix), left) * time + jnp.diag(rates * d_time)
     quotients = _divided_differences(fn, rates * time)
     d_out = fn(rates * time) * along(d_x) + _dot(quotients * change, along(x))
-    return _of_matrix(fn, primals[0], modes, time, x), _dot(axes, d_out)
+    return _of_matrix(fn, primals[0], modes, time, x), _dot(left, d_out)
+
+
+def root_of_matrix(matrix: Array) -> Array:
+    """The symmetric root of a symmetric positive semidefinite matrix, in its shape."""
+    flat = matrix.reshape(round(matrix.size**0.5), -1)
+    modes = _modes(jax.lax.stop_gradient(flat))
+    of = lambda x: _of_matrix(jnp.sqrt, flat, modes, jnp.ones((), flat.dtype), x)
+    return jax.vmap(of)(jnp.eye(len(flat), dtype=flat.dtype)).reshape(matrix.shape)
 
 
 def _divided_differences(fn: Callable, x: Float[Array, " n"]) -> Float[Array, "n n"]:

@@ -31,6 +31,7 @@ from .._terms import (
     split_terms,
 )
 from ._step import no_failure, result_of, Solved, Step, take_step
+from ._times import result_at
 
 
 if TYPE_CHECKING:
@@ -194,8 +195,9 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
 
     **State.** Any PyTree of real floating-point arrays.
 
-    **Failures.** If a stage equation is not solved, or the step does not end at finite
-    numbers, `diffeqsolve` stops there and says so: as an error, or with `throw=False`
+    **Failures.** If a stage equation is not solved, the step does not end at finite
+    numbers, is shorter than a hundred times the rounding of the time, or leaves the times
+    of its path, `diffeqsolve` stops there and says so: as an error, or with `throw=False`
     through `sol.result`. In a batch the other paths go on.
     """
 
@@ -256,7 +258,8 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         name = type(self).__name__
         driven |= noise_driven(along, h, noise, variables, t0, t1, args, name)
         y1, solved = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
-        return y1, None, dict(y0=y0, y1=y1), solved, result_of(solved, y1)
+        result = result_at(terms, t0, t1, result_of(solved, y1))
+        return y1, None, dict(y0=y0, y1=y1), solved, result
 
 
 def first_state(solver: AbstractSymplecticSolver) -> SolverState:

@@ -13,8 +13,16 @@ from .._arguments import check_state
 from .._conditions import drift_order
 from .._plan import make_plan
 from .._tableau import FlatTableau, GeneralTableau, Stage, Structure
-from .._terms import apply_one, controls, drift_driven, number_of_noises, split_terms
+from .._terms import (
+    apply_one,
+    check_structure,
+    controls,
+    drift_driven,
+    number_of_noises,
+    split_terms,
+)
 from ._step import result_of, Step, take_step
+from ._times import result_at
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
@@ -152,8 +160,10 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         return drift_order(_flow.tableau)
 
     def init(self, terms, t0, t1, y0, args):
-        del t0, t1
-        check_state(y0, type(self).__name__)
+        del t1
+        name = type(self).__name__
+        check_state(y0, name)
+        check_structure(self.structure, *split_terms(terms), t0, y0, args, name)
         return first_state(self)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
@@ -193,7 +203,8 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
             return lax.cond(is_drift, along_drift, along_noise, *which, *carry), None
 
         (y1, solved), _ = lax.scan(along, (y0, solved), flows)
-        return y1, None, dict(y0=y0, y1=y1), solved, result_of(solved, y1)
+        result = result_at(terms, t0, t1, result_of(solved, y1))
+        return y1, None, dict(y0=y0, y1=y1), solved, result
 
     def _in_order(self, terms, t0, t1):
         """The numbers of the noises in the order of their flows, and their increments."""

@@ -226,7 +226,7 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     fastest frequency $\omega$ of $H_0$: $\omega h < 2$.
 
     Any Brownian path will do: a [`diffrax_symplectic.WeakBrownianPath`][] for expectations,
-    one of Diffrax's for paths.
+    a [`diffrax_symplectic.FixedStepBrownianPath`][] for paths.
 
     **Source:** [Strang (1968)](https://doi.org/10.1137/0705041) for the splitting;
     [Ninomiya and Victoir (2008)](https://doi.org/10.1080/13504860701413958) for the weak

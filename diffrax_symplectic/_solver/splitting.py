@@ -22,11 +22,13 @@ from ._friction import (
     apply_friction,
     checked,
     decay,
+    Fault,
     friction_modes,
     friction_result,
     GAMMA,
     matrix_faults,
     Modes,
+    velocity_of,
 )
 from .base import AbstractSymplecticSolver, Order, Record
 
@@ -47,11 +49,12 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
     def prepare(
         self,
         terms: PyTree[diffrax.AbstractTerm],
+        t0: RealScalarLike,
         time: RealScalarLike,
         y0: Y,
         args: Args,
     ) -> Any:
-        """What all flows of a solve have in common."""
+        """What all flows of a solve from `t0` on, each over `time`, have in common."""
 
     @abc.abstractmethod
     def exact_flow(self, prepared: Any, time: RealScalarLike, y: Y, args: Args) -> Y:
@@ -113,7 +116,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
     def init(self, terms, t0, t1, y0, args) -> Any:
         """The state of the solver, and what all flows have in common."""
         check_pair(y0)
-        prepared = self.prepare(terms, direction(terms) * (t1 - t0) / 2, y0, args)
+        prepared = self.prepare(terms, t0, direction(terms) * (t1 - t0) / 2, y0, args)
         return self.solver.init(terms, t0, t1, y0, args), prepared
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
@@ -157,14 +160,15 @@ class Damped(AbstractSplitting):
     kinetic one: there friction on $p - A(q)$ is a term of its own.
 
     With noise in the forces and $\sigma^2 = 2 \gamma T$ this is Langevin dynamics at the
-    temperature $T$. For constant noise [`diffrax_symplectic.BAOAB`][] has far less bias.
+    temperature $T$. For constant noise [`diffrax_symplectic.BAOAB`][] and
+    [`diffrax_symplectic.LangevinMiddle`][] have far less bias.
 
     **Source:** splitting of [Strang (1968)](https://doi.org/10.1137/0705041).
     """
 
     solver: diffrax.AbstractSolver
     gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
-    _faults: tuple[str | None, ...] = eqx.field(static=True, init=False, repr=False)
+    _faults: tuple[Fault | None, ...] = eqx.field(static=True, init=False, repr=False)
 
     def __post_init__(self):
         self._faults = matrix_faults(self.gamma)
@@ -180,11 +184,12 @@ class Damped(AbstractSplitting):
         "diffrax.ODETerm(friction))`."
     )
 
-    def prepare(self, terms, time, y0, args) -> list[Modes | None]:
+    def prepare(self, terms, t0, time, y0, args) -> list[Modes | None]:
         """The modes of the friction."""
-        del time, args
+        del time
         _check_has_momentum(terms)
-        return friction_modes(self.gamma, self._faults, y0[0])
+        velocity = velocity_of(terms, t0, y0, args)
+        return friction_modes(self.gamma, self._faults, y0[0], velocity)
 
     def exact_flow(self, prepared: list[Modes | None], time, y, args):
         p, q = y
@@ -236,7 +241,8 @@ class LinearFlow(AbstractSplitting):
 
     The terms are those of the rest, without $L$, and of all noises. What is left is often
     simple. If $R$ and all $H_k$ depend on $q$ alone, `LinearFlow(StormerVerlet(), flow)` is
-    explicit.
+    explicit. With friction and thermal noise take `LinearFlow(BAOAB(gamma), flow)`, in
+    which both are exact.
 
     Symplectic if the solver is. Weak order the smaller of 2 and that of the solver; strong
     order the smaller of 1 and that of the solver; order 2 without noise.
@@ -262,10 +268,10 @@ class LinearFlow(AbstractSplitting):
     def __check_init__(self):
         check_takes("flow", self.flow, "time", "y", "args")
 
-    def prepare(self, terms, time, y0, args):
+    def prepare(self, terms, t0, time, y0, args):
         """A zero that every step reads: reading it raises the error of a flow that is not
         symplectic."""
-        del terms
+        del terms, t0
         time = jnp.asarray(time)
         program = Dependence(
             lambda time, y: self.exact_flow(0, time, y, args), time, y0

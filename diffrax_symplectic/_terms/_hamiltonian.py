@@ -385,8 +385,9 @@ def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Arr
             "`jax.lax.cond` in place of `if`, and `jnp` in place of `np`."
         ) from error
     except (TypeError, AttributeError) as error:
-        # Of an `IndexedNoise` it has been said by the Hamiltonian of one noise.
-        if args is not None or _LEFT_OUT in str(error):
+        # Of an `IndexedNoise` it has been said by the Hamiltonian of one noise. What `None`
+        # is no good for is named in the message.
+        if args is not None or _LEFT_OUT in str(error) or "None" not in str(error):
             raise
         kind = TypeError if isinstance(error, TypeError) else AttributeError
         # A note would not be part of what `str` of the error says.

@@ -21,7 +21,7 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from ._dependence import Dependence
 from ._hamiltonian import asserted_structure, has_lifted, is_hamiltonian
-from ._vector_fields import apply, product, split_terms
+from ._vector_fields import apply, check_controls, product, split_terms
 
 
 class Fault(NamedTuple):
@@ -49,6 +49,7 @@ def check_structure(
             f"`structure` of the tableau of `{solver}` must be one of "
             f"{get_args(Structure)}; got {structure!r}."
         )
+    check_controls(noise, t0, y0, args)
 
     def refuse(needs: str, fault: Fault | None) -> None:
         if fault is None:
@@ -82,7 +83,11 @@ def separable_fault(
         for x in _not_asserted(drift, "separable")
     ]
     noise_flows = [
-        (_flow(x, t0, y0, args), ft.partial(_is_zero, x, t0, y0, args))
+        (
+            is_hamiltonian(x),
+            _flow(x, t0, y0, args),
+            ft.partial(_is_zero, x, t0, y0, args),
+        )
         for x in _not_asserted(noise, "separable")
     ]
     here, exchanged = (_faults(p, drift_flows, noise_flows) for p in (0, 1))
@@ -99,11 +104,12 @@ def separable_fault(
 def _faults(
     p: int,
     drift: list[tuple[bool, bool, Dependence]],
-    noise: list[tuple[Dependence, Callable[[int], bool]]],
+    noise: list[tuple[bool, Dependence, Callable[[int], bool]]],
 ) -> list[Fault]:
     """The faults, if the momenta are the first half of the state, `p = 0`, or the second
-    one, `p = 1`. With each drift term: whether it comes from `H0`, and whether there are
-    others. With each noise term: a function that tells whether a half stays unchanged."""
+    one, `p = 1`. With each term: whether it comes from Hamiltonians. With each drift term:
+    whether there are others. With each noise term: a function that tells whether a half
+    stays unchanged."""
     q, faults, advice = 1 - p, [], _advice("separable")
     dp, dq = (lambda out: out[p]), (lambda out: out[q])
     of_p, of_q = (lambda t, y, control: y[p]), (lambda t, y, control: y[q])
@@ -115,16 +121,21 @@ def _faults(
         ):
             if not flow.independent(of, part):
                 friction = part is dp and not hamiltonian
-                beside = f"a drift term beside that of H0 makes {rate}"
-                reason = beside if others and not hamiltonian else derivative
+                beside = " beside that of H0" if others else ""
+                plain = f"a drift term{beside} makes {rate}"
+                reason = derivative if hamiltonian else plain
                 faults.append(Fault(reason, advice, friction))
-    for flow, zero in noise:
+    for hamiltonian, flow, zero in noise:
         # The change of q is linear in the increment: if it does not depend on the
         # increment, it is zero.
         if not flow.independent(lambda t, y, control: control, dq) and not zero(q):
-            faults.append(Fault("dH_k/dp is not zero", advice))
+            plain = "a noise term changes q, the second half of the state"
+            reason = "dH_k/dp is not zero" if hamiltonian else plain
+            faults.append(Fault(reason, advice))
         elif not flow.independent(of_p, dp):
-            faults.append(Fault("dH_k/dq depends on p", advice))
+            plain = "a noise term changes p by what depends on p"
+            reason = "dH_k/dq depends on p" if hamiltonian else plain
+            faults.append(Fault(reason, advice))
     return faults
 
 
@@ -132,7 +143,8 @@ def additive_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault
     """Why the noise is not additive; `None` if it does not depend on the state."""
     for term in _not_asserted(noise, "additive"):
         if not _flow(term, t0, y0, args).independent(lambda t, y, control: y):
-            reason = "the noise b_k = (-dH_k/dq, dH_k/dp) depends on the state"
+            of = " = (-dH_k/dq, dH_k/dp)" if is_hamiltonian(term) else ""
+            reason = f"the noise b_k{of} depends on the state"
             return Fault(reason, _advice("additive"))
     return None
 

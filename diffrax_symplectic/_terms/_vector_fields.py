@@ -77,6 +77,13 @@ def apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> 
     return _checked_sum(parts, y)
 
 
+def rate(drift: tuple, t: RealScalarLike, y: Y, args: Args) -> Y:
+    """The change of the state by the drift in a unit of time."""
+    t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
+    zero = jnp.zeros_like(t)
+    return apply(drift, [x.contr(zero, zero + 1) for x in drift], args, t, y)
+
+
 def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
     """Raises a `ValueError` unless these are terms that change a state such as `y0`. (Some
     solvers of Diffrax take more than one, each for a part of the state.)"""
@@ -90,6 +97,66 @@ def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
         parts = tuple(_flatten(terms))
         controls = eqx.filter_eval_shape(lambda: [x.contr(t0, t0) for x in parts])
         eqx.filter_eval_shape(apply, parts, controls, args, t0, y0)
+
+
+def check_controls(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> None:
+    """Raises a `ValueError` unless the vector fields of `ControlTerm`s take increments of
+    the shapes of their paths to changes of `y0`."""
+    for term in noise:
+        if isinstance(unwrapped(term), diffrax.ControlTerm):
+            _check_control(term, t0, y0, args)
+
+
+def _check_control(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> None:
+    zeros = ft.partial(jtu.tree_map, lambda s: jnp.zeros(s.shape, s.dtype))
+
+    def field():
+        """The vector field, or for an operator what it takes and what it returns."""
+        out = term.vf(t0, y0, args)
+        if not isinstance(out, lx.AbstractLinearOperator):
+            return False, False, out
+        exact = isinstance(out, lx.FunctionLinearOperator)
+        return True, exact, zeros((out.in_structure(), out.out_structure()))
+
+    is_operator, exact, out = eqx.filter_eval_shape(field)
+    path = eqx.filter_eval_shape(term.contr, t0, t0)
+    like = jax.eval_shape(lambda: y0)
+    if is_operator:
+        known = lambda x: jtu.tree_map(lambda s: s.dtype if exact else 0, x)
+        takes, returns = out
+        same = lambda a, b: (
+            jtu.tree_structure(a) == jtu.tree_structure(b) and _shapes(a) == _shapes(b)
+        )
+        if not same(takes, path) or exact and known(takes) != known(path):
+            raise ValueError(
+                "The operator that the vector field of a `ControlTerm` returns takes noise "
+                f"of {_spelled(takes)}, and the path has increments of {_spelled(path)}. "
+                "Construct the path with `shape=` what the operator takes."
+            )
+        if not same(returns, like):
+            raise ValueError(
+                "The operator that the vector field of a `ControlTerm` returns makes "
+                f"{_spelled(returns)}, and the state is {_spelled(like)}."
+            )
+        return
+    if len({*map(jtu.tree_structure, (out, path, like))}) > 1:
+        return  # `product` says so.
+    for matrix, increment, x in zip(*map(jtu.tree_leaves, (out, path, like))):
+        if jnp.shape(matrix) != x.shape + increment.shape:
+            raise ValueError(
+                "The vector field of a `ControlTerm` must return an array of the shape of "
+                f"the state and then of the noise, {x.shape + increment.shape}; got "
+                f"{jnp.shape(matrix)}. Is the `shape={increment.shape}` of the path that "
+                "of the noise?"
+            )
+
+
+def _shapes(tree: PyTree) -> list[tuple[int, ...]]:
+    return [leaf.shape for leaf in jtu.tree_leaves(tree)]
+
+
+def _spelled(tree: PyTree) -> str:
+    return eqx.tree_pformat(tree, struct_as_array=True)
 
 
 def product(term: diffrax.AbstractTerm, t, y: Y, args: Args, control: PyTree) -> Y:

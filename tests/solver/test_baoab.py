@@ -175,19 +175,27 @@ def test_frictions_that_are_none_are_refused():
     terms = ds.hamiltonian_terms(_pendula, _bath(SIGMA), Given(jnp.zeros(2)))
     y0 = jnp.ones(2), jnp.ones(2)
     negative = jnp.array([[1.0, -3.0], [-3.0, 1.0]])
-    for wrong in (-1.0, jnp.nan, negative, jnp.array([[1.0, -0.5], [0.5, 1.0]])):
-        with pytest.raises(ValueError, match="symmetric positive semidefinite"):
+    for wrong, match in (
+        (-1.0, "must not be negative: .*; got -1.0"),
+        (jnp.nan, "must be finite"),
+        (negative, "but it has the negative eigenvalue -2"),
+        (
+            jnp.array([[1.0, -0.5], [0.5, 1.0]]),
+            "but it is not symmetric, and has complex",
+        ),
+    ):
+        with pytest.raises(ValueError, match=f"`gamma` .*{match}"):
             ds.BAOAB(wrong)
     with pytest.raises(ValueError, match="a real number, an array or a PyTree"):
         ds.BAOAB(True)
     # For momenta of shape (2, 2) these are rates. For two momenta they are matrices.
     for wrong, match in (
         (jnp.array([[1.0, 0.5], [0.2, 1.0]]), "not symmetric"),
-        (jnp.array([[1.0, 3.0], [3.0, 1.0]]), "a negative eigenvalue"),
+        (jnp.array([[1.0, 3.0], [3.0, 1.0]]), "the negative eigenvalue -2"),
     ):
         for solver in (ds.BAOAB(wrong), ds.Damped(ds.StormerVerlet(), wrong)):
             with pytest.raises(ValueError, match=f"semidefinite matrix.*{match}"):
-                jax.jit(lambda s=solver: s.init(terms, 0.0, 0.1, y0, None))()
+                solver.init(terms, 0.0, 0.1, y0, None)
     with pytest.raises(ValueError, match=r"for a matrix of them \(2, 2\)"):
         ds.BAOAB(jnp.ones(3)).init(terms, 0.0, 0.1, y0, None)
 

@@ -60,9 +60,18 @@ def test_momenta_fall_at_the_rate_of_a_matrix_when_the_step_is_prolonged(wrap):
     np.testing.assert_allclose(rate, -matrix @ p1, atol=1e-14)
 
 
-@pytest.mark.parametrize("gamma", [-1.0, np.nan, np.inf, 1j, "much"])
-def test_friction_must_be_finite_and_not_negative(gamma):
-    with pytest.raises(ValueError, match="`gamma` must be"):
+@pytest.mark.parametrize(
+    "gamma, match",
+    [
+        (-1.0, "must not be negative: .*; got -1.0"),
+        (np.nan, "must be finite; got nan"),
+        (np.array([1.0, np.inf]), "must be finite"),
+        (1j, "must be a real number"),
+        ("much", "must be a real number"),
+    ],
+)
+def test_friction_must_be_finite_and_not_negative(gamma, match):
+    with pytest.raises(ValueError, match=f"`gamma` {match}"):
         ds.Damped(ds.ImplicitMidpoint(), gamma)
 
 
@@ -118,7 +127,7 @@ def test_a_traced_friction_that_is_negative_fails_its_path_alone():
 
     gammas = jnp.array([0.5, -0.5, jnp.inf, jnp.nan])
     np.testing.assert_array_equal(run(gammas), [True, False, False, False])
-    with pytest.raises(eqx.EquinoxRuntimeError, match="`gamma` became negative"):
+    with pytest.raises(eqx.EquinoxRuntimeError, match="Nonfinite"):
         solver = ds.Damped(ds.ImplicitMidpoint(), jnp.array(0.1))
         solver = eqx.tree_at(lambda s: s.gamma, solver, jnp.array(-0.1))
         diffrax.diffeqsolve(terms, solver, 0.0, 0.5, 0.1, y0)

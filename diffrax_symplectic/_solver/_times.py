@@ -1,0 +1,60 @@
+"""Whether a step can be taken at its time: whether numbers resolve it, and Brownian paths
+cover it."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from .._brownian import covers_all_times
+from .._compat import direction
+from .._custom_types import RealScalarLike
+from .._terms import brownian_paths
+
+
+# Diffrax takes what is left of a solve in one step if it is shorter than a hundred units in
+# the last place of its end.
+ROUNDINGS = 100
+_OUTSIDE = (
+    "A step goes beyond `path.t0` or `path.t1` of a Brownian path, where its noise is not "
+    "known. Solve within these times, or pass a longer path."
+)
+
+
+def check_resolution(h: float, t0: float, t1: float, dtype: Any) -> None:
+    """Raises a `ValueError` if steps of this size are reported as failed by `result_at`."""
+    if h < ROUNDINGS * float(jnp.finfo(dtype).eps) * max(abs(t0), abs(t1)):
+        raise ValueError(
+            f"Steps of {h:g} are shorter than {ROUNDINGS} times the rounding of the time "
+            f"in {dtype} at t0={t0} and t1={t1}. Call `jax.config.update("
+            '"jax_enable_x64", True)` first, take longer steps, or begin at `t0=0`.'
+        )
+
+
+def result_at(
+    terms: PyTree[diffrax.AbstractTerm],
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    result: diffrax.RESULTS,
+) -> diffrax.RESULTS:
+    """`result` of the step from `t0` to `t1`, or `RESULTS.dt_min_reached` if it is so short
+    that the length of a step is not that of others. An error when run if a path does not
+    cover it."""
+    R: Any = diffrax.RESULTS
+    t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
+    h, eps = t1 - t0, float(jnp.finfo(jnp.result_type(t0, jnp.float32)).eps)
+    short = h < ROUNDINGS * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    result = R.where(short, R.dt_min_reached, result)
+    for path in brownian_paths(terms):
+        if covers_all_times(path):
+            continue
+        # In a solve backward in time Diffrax counts it from minus `t0` on.
+        forward = direction(terms) > 0
+        begin, end = jnp.where(forward, t0, -t1), jnp.where(forward, t1, -t0)
+        # Times are rounded.
+        slack = 0.01 * h
+        outside = (begin < path.t0 - slack) | (end > path.t1 + slack)
+        result = eqx.error_if(result, outside, _OUTSIDE)
+    return result

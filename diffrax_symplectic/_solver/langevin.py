@@ -1,0 +1,247 @@
+"""Langevin dynamics by splitting: kicks of the forces, drifts of the positions, and the
+exact Ornstein--Uhlenbeck process of friction and noise between them."""
+
+import abc
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import ArrayLike, PyTree
+
+from .._arguments import check_state
+from .._compat import direction, unwrapped
+from .._custom_types import Args, RealScalarLike, Y
+from .._tableau import Structure
+from .._terms import apply, check_structure, controls, rate, split_terms
+from ._friction import (
+    apply_friction,
+    checked,
+    decay,
+    Fault,
+    friction_modes,
+    friction_result,
+    GAMMA,
+    matrix_faults,
+    spread,
+    velocity_of,
+)
+from ._step import result_of
+from ._times import result_at
+from .base import AbstractSymplecticSolver, Record
+
+
+class AbstractLangevinSplitting(AbstractSymplecticSolver):
+    """What the splittings of Langevin dynamics have in common: terms, friction, and the
+    Ornstein--Uhlenbeck process in the middle of the step, between two half drifts."""
+
+    structure: ClassVar[Structure] = "separable and constant"
+    variables: ClassVar[tuple[str, ...]] = ("W",)
+    gamma: eqx.AbstractVar[PyTree[ArrayLike]]
+    _faults: eqx.AbstractVar[tuple[Fault | None, ...]]
+
+    def __post_init__(self):
+        self._faults = matrix_faults(self.gamma)
+
+    def stage_vectors(self, num_noises):
+        return ()
+
+    def init(self, terms, t0, t1, y0, args) -> Any:
+        """What the solver remembers of the state, and the modes of the friction."""
+        del t1
+        name = type(self).__name__
+        check_state(y0, name)
+        drift, noise = split_terms(terms)
+        check_structure(self.structure, drift, noise, t0, y0, args, name)
+        if not all(isinstance(unwrapped(x), diffrax.ODETerm) for x in drift):
+            raise ValueError(
+                f"`{name}` needs a drift driven by time: pass `hamiltonian_terms(H0, "
+                "noise, path)`."
+            )
+        velocity = velocity_of(terms, t0, y0, args)
+        modes = friction_modes(self.gamma, self._faults, y0[0], velocity)
+        return self.remembered(drift, t0, y0, args), modes
+
+    def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
+        drift, noise = split_terms(terms)
+        kept, modes = solver_state
+        p = self.first_kick(drift, t0, t1, y0, args, kept, made_jump)
+        half = (t1 - t0) / 2
+        q = moved(y0[1], half, rate(drift, t0, (p, y0[1]), args)[1])
+        # In a solve backward in time the momentum grows. Diffrax makes `t1 - t0` positive.
+        time = 2 * direction(terms) * half
+        parts = [(decay, p)]
+        if len(noise) > 0:
+            drawn = controls(noise, ["W"], t0, t1, type(self).__name__)["W"]
+            kick, _ = apply(noise, drawn, args, t0 + half, (p, q))
+            parts.append((spread, kick))
+        p = apply_friction(self.gamma, modes, time, *parts)
+        q = moved(q, half, rate(drift, t1, (p, q), args)[1])
+        p, kept = self.last_kick(drift, t0, t1, (p, q), args)
+        y1 = p, q
+        result = result_at(terms, t0, t1, result_of(None, y1))
+        result = friction_result(self.gamma, modes, result)
+        return y1, None, dict(y0=y0, y1=y1), (kept, modes), result
+
+    @abc.abstractmethod
+    def remembered(self, drift: tuple, t0, y0: Y, args: Args) -> Any:
+        """What the solver remembers from one step to the next, before the first one."""
+
+    @abc.abstractmethod
+    def first_kick(self, drift, t0, t1, y0: Y, args: Args, kept, made_jump) -> PyTree:
+        """The momentum after the kick at the start of the step."""
+
+    @abc.abstractmethod
+    def last_kick(self, drift, t0, t1, y: Y, args: Args) -> tuple[PyTree, Any]:
+        """The momentum after the kick at the end of the step, and what is remembered."""
+
+
+class BAOAB(AbstractLangevinSplitting):
+    r"""Langevin dynamics, $\mathrm{d}p = -\nabla U(q)\,\mathrm{d}t - \gamma p\,\mathrm{d}t
+    + \sum_k \sigma_k\,\mathrm{d}w_k$, $\mathrm{d}q = \nabla V(p)\,\mathrm{d}t$, by a
+    splitting whose stationary positions are very accurate. Explicit, with one evaluation
+    of the forces in a step.
+
+    $$\begin{aligned}
+      \text{B:} &\quad p \gets p + \tfrac h2 f(t_n, q) \\
+      \text{A:} &\quad q \gets q + \tfrac h2 g(p) \\
+      \text{O:} &\quad p \gets e^{-\gamma h} p
+        + \Bigl(\frac{1 - e^{-2 \gamma h}}{2 \gamma h}\Bigr)^{1/2} \sum_k \sigma_k I_k \\
+      \text{A:} &\quad q \gets q + \tfrac h2 g(p) \\
+      \text{B:} &\quad p \gets p + \tfrac h2 f(t_{n+1}, q)
+    \end{aligned}$$
+
+    The terms are those without friction, of $H_0 = V(p) + U(t, q)$ and $H_k = -\sigma_k
+    \cdot q$ with constant $\sigma_k$; other ones are refused while tracing. Masses are
+    part of $V$. With $\sum_k \sigma_k \sigma_k^\top = 2 \gamma M T$, which
+    [`diffrax_symplectic.thermal_noise`][] gives, and $V(p) = p \cdot M^{-1} p / 2$ the
+    density $e^{-H_0 / T}$ is stationary.
+
+    **Positions, momenta, transport.** In a harmonic well of frequency $\omega$ the law of
+    $q$ is exact for every step with $\omega h < 2$. Momenta are too cold,
+    $\langle p^2 \rangle = m T (1 - \omega^2 h^2 / 4)$: for functions of these, kinetic
+    temperatures and heat flows take [`diffrax_symplectic.LangevinMiddle`][], which has
+    the same positions. Mobility and free diffusion are too large in both by the factor
+    $x \coth x$, $x = \gamma h / 2$: 0.3% at $\gamma h = 0.2$, 8% at $\gamma h = 1$. They
+    are exact for the friction $\gamma' = \frac2h \operatorname{artanh} \frac{\gamma h}2$
+    in place of $\gamma$, in the solver and in the noise.
+
+    The friction acts on the canonical momentum $p$. In a magnetic field that is not the
+    kinetic one (and $H_0$ is not separable there).
+
+    O is the exact law of friction and noise together if the matrix $\gamma$ commutes with
+    $\sum_k \sigma_k \sigma_k^\top$: for one number $\gamma$, for one number and one noise
+    for each momentum; and for thermal noise. Else its covariance is right up to
+    $\mathcal O(h^3)$.
+
+    Weak order 2, strong order 1, order 2 without noise. For one number $\gamma$ a step is
+    conformally symplectic: with its Jacobian $S'$, $S'^\top J S' = e^{-\gamma h} J$. As
+    explicit methods are, it is limited to $\omega h < 2$.
+
+    Any Brownian path will do: a [`diffrax_symplectic.WeakBrownianPath`][] for
+    expectations, a [`diffrax_symplectic.FixedStepBrownianPath`][] for paths.
+
+    **Source:** [Leimkuhler and Matthews (2013)](https://doi.org/10.1093/amrx/abs010).
+    """
+
+    record: ClassVar[Record] = Record(
+        weak=2,
+        strong=1,
+        choose="Langevin dynamics: explicit, and stationary positions are very accurate. "
+        "Mobility and diffusion are too large by x coth x, x = gamma h / 2.",
+        suggested=("weak", "strong"),
+    )
+    gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
+    _faults: tuple[Fault | None, ...] = eqx.field(static=True, init=False, repr=False)
+
+    def order(self, terms):
+        return 2
+
+    def remembered(self, drift, t0, y0, args):
+        """The forces at the end of the last step, which are those at the start of this."""
+        return rate(drift, t0, y0, args)[0]
+
+    def first_kick(self, drift, t0, t1, y0, args, kept, made_jump):
+        if made_jump is not False:
+            anew = lambda: rate(drift, t0, y0, args)[0]
+            kept = lax.cond(made_jump, anew, lambda: kept)
+        return moved(y0[0], (t1 - t0) / 2, kept)
+
+    def last_kick(self, drift, t0, t1, y, args):
+        forces, _ = rate(drift, t1, y, args)
+        return moved(y[0], (t1 - t0) / 2, forces), forces
+
+
+class LangevinMiddle(AbstractLangevinSplitting):
+    r"""Langevin dynamics as [`diffrax_symplectic.BAOAB`][] solves it, with momenta that
+    are as accurate as the positions. Explicit, with one evaluation of the forces in a
+    step.
+
+    $$\begin{aligned}
+      \text{B:} &\quad p \gets p + h f(t_n, q) \\
+      \text{A:} &\quad q \gets q + \tfrac h2 g(p) \\
+      \text{O:} &\quad p \gets e^{-\gamma h} p
+        + \Bigl(\frac{1 - e^{-2 \gamma h}}{2 \gamma h}\Bigr)^{1/2} \sum_k \sigma_k I_k \\
+      \text{A:} &\quad q \gets q + \tfrac h2 g(p)
+    \end{aligned}$$
+
+    Terms, friction, noise and paths are those of [`diffrax_symplectic.BAOAB`][].
+
+    **Positions, momenta, transport.** In a harmonic well the laws of $q$ and of $p$ are
+    exact, each by itself, for every step with $\omega h < 2$. The momenta belong to half a
+    step before the positions, so that $\langle p q \rangle = h T / 2$ and not zero. Take
+    it for functions of the momenta or of the positions, and for the heat that friction and
+    noise exchange with the bath, and [`diffrax_symplectic.BAOAB`][] for functions of both,
+    such as a correlation $\langle p q \rangle$. Mobility and free diffusion are those of
+    [`diffrax_symplectic.BAOAB`][], which says how to make them exact.
+
+    Its steps are those of [`diffrax_symplectic.BAOAB`][] in other variables: where it has
+    $p$ and $q$, BAOAB has $p + \frac h2 f(t, q)$ and $q$ along the same path. Weak order 1,
+    strong order 1, order 1 without noise, since momenta are late; order 2 for stationary
+    means of functions of $q$ alone or of $p$ alone. For one number $\gamma$ a step is
+    conformally symplectic.
+
+    **Source:** [Zhang, Liu, Yan, Tuckerman and Liu
+    (2019)](https://doi.org/10.1021/acs.jpca.9b02771).
+    """
+
+    record: ClassVar[Record] = Record(
+        weak=1,
+        strong=1,
+        choose="Langevin dynamics: for momenta and heat flows. It has the positions of "
+        "`BAOAB`, and momenta of half a step before.",
+        suggested=("weak", "strong"),
+    )
+    gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
+    _faults: tuple[Fault | None, ...] = eqx.field(static=True, init=False, repr=False)
+
+    def order(self, terms):
+        return 1
+
+    def remembered(self, drift, t0, y0, args):
+        return None
+
+    def first_kick(self, drift, t0, t1, y0, args, kept, made_jump):
+        return moved(y0[0], t1 - t0, rate(drift, t0, y0, args)[0])
+
+    def last_kick(self, drift, t0, t1, y, args):
+        return y[0], None
+
+
+def moved(x: PyTree, time: RealScalarLike, rate: PyTree) -> PyTree:
+    """`x` after `time` at a constant rate."""
+    along = lambda x, v: x + jnp.asarray(time, jnp.result_type(x)) * v
+    return jtu.tree_map(along, x, rate)
+
+
+_INIT = f"""**Arguments:**
+
+- `gamma`: {GAMMA}
+
+**Raises:** a `ValueError` if `gamma` is known to be negative, not finite or no such matrix,
+    if it does not fit `p` (in the solve), or for terms that are not separable with
+    constant noise.
+"""
+BAOAB.__init__.__doc__ = LangevinMiddle.__init__.__doc__ = _INIT

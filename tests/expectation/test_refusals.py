@@ -1,0 +1,97 @@
+"""What `expectation` cannot do is refused with advice that fits."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from ..solver.test_times_and_paths import RECORD
+
+
+def H0(t, p, q, args):
+    return p**2 / 2 + q**2 / 2
+
+
+Y0 = jnp.zeros(()), jnp.ones(())
+
+
+def _mean(path, sampling=None, y0=Y0, t0=0.0, t1=1.0, dt0=0.1, **others):
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: 0.1 * q, path)
+    phi = lambda t, y, args: y[1] ** 2
+    return ds.expectation(
+        phi, terms, ds.StormerVerlet(), t0, t1, dt0, y0, key=jr.key(0),
+        sampling=sampling, **others,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "sampling", [None, ds.IndependentPaths(100), ds.ArrayRQMC(), ds.ValueFunctions()]
+)
+def test_recorded_noise_has_no_mean(sampling):
+    with pytest.raises(ValueError, match="has a random key.*`diffrax.diffeqsolve`"):
+        _mean(RECORD, sampling)
+
+
+class Kicks(diffrax.AbstractBrownianPath):
+    """A path of a user's own that draws its noise."""
+
+    key: jax.Array
+    t0 = 0.0
+    t1 = jnp.inf
+    levy_area = diffrax.BrownianIncrement
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        number = jnp.round(10 * t0).astype(int)
+        return jnp.sqrt(t1 - t0) * jr.normal(jr.fold_in(self.key, number))
+
+
+def test_random_noise_of_a_path_of_ones_own_has_one():
+    estimate = _mean(Kicks(jr.key(0)), ds.IndependentPaths(4000))
+    theirs = _mean(ds.FixedStepBrownianPath((), jr.key(0)), ds.IndependentPaths(4000))
+    error = np.hypot(estimate.std_error, theirs.std_error)
+    assert 0 < estimate.std_error and abs(estimate.mean - theirs.mean) <= 4 * error
+
+
+def test_arguments_of_other_solves_lead_to_monte_carlo():
+    path = ds.WeakBrownianPath((), jr.key(0))
+    with pytest.raises(TypeError, match="takes no `event`.*`monte_carlo`"):
+        _mean(path, event=diffrax.Event(lambda t, y, args, **kwargs: y[0] > 1))
+    with pytest.raises(ValueError, match="random start.*`monte_carlo`"):
+        _mean(path, y0=lambda key: Y0)
+
+
+def test_steps_that_single_precision_does_not_resolve_are_refused_at_once():
+    single = jax.ShapeDtypeStruct((), jnp.float32)
+    path = ds.WeakBrownianPath(single, jr.key(0))
+    y0 = jnp.zeros((), jnp.float32), jnp.ones((), jnp.float32)
+    with pytest.raises(ValueError, match="100 times the rounding.*float32"):
+        _mean(path, y0=y0, t0=1e6, t1=1e6 + 1)
+    _mean(path, ds.IndependentPaths(10), y0=y0, t0=100.0, t1=101.0)
+
+
+def test_a_function_of_spins_is_told_that_it_gets_a_pair():
+    terms = ds.spin_terms(
+        lambda t, s, args: s[2],
+        lambda t, s, args: 0.1 * s[0],
+        ds.WeakBrownianPath((), jr.key(0)),
+    )
+    y0 = ds.to_spinors(jnp.array([0.6, 0.0, 0.8]))
+    mean = lambda phi: ds.expectation(
+        phi, terms, ds.ImplicitMidpoint(), 0.0, 0.2, 0.1, y0, key=jr.key(0),
+        sampling=ds.IndependentPaths(10),
+    )  # fmt: skip
+    for phi in (
+        lambda t, s, args: s[2],
+        lambda t, s, args: s[..., 2],
+        lambda t, s, args: s.sum(),
+    ):
+        with pytest.raises(Exception, match=r"from_spinors\(y\)") as info:
+            mean(phi)
+        assert "left out" not in str(info.value)
+    # What was left out is still told.
+    with pytest.raises(TypeError, match="Was it left out"):
+        mean(lambda t, y, args: args["size"] * ds.from_spinors(y)[2])

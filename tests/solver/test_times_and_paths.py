@@ -1,0 +1,198 @@
+"""Steps that cannot be taken at their times: numbers do not resolve them, or a path does
+not cover them; and paths that hold given noise."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import lineax as lx
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+
+TOO_SHORT = diffrax.RESULTS.dt_min_reached
+SOLVERS = [
+    ds.StormerVerlet(),
+    ds.ImplicitMidpoint(),
+    ds.NinomiyaVictoir(),
+    ds.BAOAB(0.1),
+    ds.Damped(ds.StormerVerlet(), 0.1),
+]
+each = pytest.mark.parametrize("solver", SOLVERS, ids=repr)
+
+
+def _oscillator(path):
+    H0 = lambda t, p, q, args: p**2 / 2 + q**2 / 2
+    return ds.hamiltonian_terms(H0, lambda t, p, q, args: 0.1 * q, path)
+
+
+def _solve(solver, path, t0, t1, dt0, dtype=jnp.float64, **options):
+    y0 = jnp.zeros((), dtype), jnp.ones((), dtype)
+    times = [jnp.asarray(t, dtype) for t in (t0, t1, dt0)]
+    options = dict(max_steps=None, adjoint=diffrax.ForwardMode()) | options
+    return diffrax.diffeqsolve(_oscillator(path), solver, *times, y0, **options)
+
+
+def _single(solver):
+    return solver.path(jax.ShapeDtypeStruct((), jnp.float32), jr.key(0))
+
+
+@each
+def test_steps_that_single_precision_does_not_resolve_fail(solver):
+    # At 58,000 a solve of a hundred steps had 62, and at a million nearly all had length 0.
+    path = _single(solver)
+    for t0, t1, dt0 in (
+        (1e6, 1e6 + 100, 0.01),
+        (58e3, 58001, 0.01),
+        (-1e4, -9999, 1e-2),
+    ):
+        sol = _solve(solver, path, t0, t1, dt0, jnp.float32, throw=False)
+        assert sol.result == TOO_SHORT and sol.stats["num_steps"] == 1
+    sol = _solve(solver, path, 58e3, 58000, -0.01, jnp.float32)
+    assert sol.result == diffrax.RESULTS.successful
+    # In double precision there is no fault.
+    path = solver.path((), jr.key(0))
+    sol = _solve(solver, path, 1e6, 1e6 + 0.1, 0.01)
+    assert sol.stats["num_steps"] == 10
+
+
+def test_the_error_comes_where_the_times_become_too_coarse():
+    solver = ds.StormerVerlet()
+    path = _single(solver)
+    # The FAQ has this message.
+    with pytest.raises(eqx.EquinoxRuntimeError, match="minimum step size was reached"):
+        _solve(solver, path, 1e6, 1e6 + 100, 0.01, jnp.float32)
+    # 100 roundings are 100 eps t: steps of 0.01 are too short beyond 839, and those that
+    # are rounded down a little before.
+    saveat = diffrax.SaveAt(t1=True)
+    run = lambda t1: _solve(
+        solver, path, 0.0, t1, 0.01, jnp.float32, throw=False, saveat=saveat
+    )
+    assert run(800.0).result == diffrax.RESULTS.successful
+    late = run(1000.0)
+    assert late.result == TOO_SHORT
+    assert 830 < late.stats["num_steps"] * 0.01 < 839
+
+
+def test_other_paths_of_a_batch_go_on():
+    solver = ds.StormerVerlet()
+    path = _single(solver)
+
+    @jax.vmap
+    def run(t0):
+        sol = _solve(solver, path, t0, t0 + 1, 0.01, jnp.float32, throw=False)
+        return sol.result == diffrax.RESULTS.successful, sol.ys[0][0]
+
+    good, p = jax.jit(run)(jnp.array([0.0, 1e6], jnp.float32))
+    np.testing.assert_array_equal(good, [True, False])
+    alone = _solve(solver, path, 0.0, 1.0, 0.01, jnp.float32).ys[0][0]
+    np.testing.assert_allclose(p[0], alone, rtol=1e-5)
+
+
+class Recorded(diffrax.AbstractBrownianPath):
+    """Noise that was measured, at equal times."""
+
+    W: jax.Array
+    t0: float = 0.0
+    t1: float = 1.0
+    levy_area: type = eqx.field(static=True, default=diffrax.BrownianIncrement)
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        at = lambda t: jnp.interp(
+            t, jnp.linspace(self.t0, self.t1, len(self.W)), self.W
+        )
+        W = at(t1) - at(t0)
+        return diffrax.BrownianIncrement(dt=t1 - t0, W=W) if use_levy else W
+
+
+RECORD = Recorded(jnp.cumsum(0.3 * jr.normal(jr.key(0), (11,))))
+
+
+@each
+def test_beyond_the_end_of_recorded_noise_there_is_an_error(solver):
+    for t0, t1, covered in (
+        (0.0, 1.0, True),
+        (1.0, 0.0, True),
+        (0.0, 1.1, False),
+        (-0.1, 0.9, False),
+        (1.0, -0.1, False),
+    ):
+        if covered:
+            sol = _solve(solver, RECORD, t0, t1, (t1 - t0) / 10)
+            assert np.all(np.isfinite(sol.ys[0]))
+            continue
+        with pytest.raises(eqx.EquinoxRuntimeError, match="pass a longer path"):
+            sol = _solve(solver, RECORD, t0, t1, (t1 - t0) / 10, throw=False)
+            jax.block_until_ready(sol.ys)
+
+
+def test_suggestions_keep_recorded_noise():
+    y0 = jnp.zeros(()), jnp.ones(())
+    for want in ("strong", "weak"):
+        found = ds.suggest_solver(_oscillator(RECORD), 0.0, y0, want=want)
+        # It has no Lévy areas.
+        assert {s.solver.variables for s in found} == {("W",)}
+        for s in found:
+            assert "given noise" in s.path
+            terms = s.terms(jr.key(1))
+            assert eqx.tree_equal(terms.terms[1].path, RECORD)
+    # Beside random noise, which is made anew.
+    random = ds.WeakBrownianPath((), jr.key(0))
+    both = diffrax.MultiTerm(*_oscillator(RECORD).terms, _oscillator(random).terms[1])
+    best = ds.suggest_solver(both, 0.0, y0, want="weak")[0]
+    assert best.path == 'ds.StormerVerlet().path((), key, want="weak")'
+    *_, kept, new = best.terms(jr.key(1)).terms
+    assert eqx.tree_equal(kept.path, RECORD) and new.path.key == jr.key(1)
+    # Keys of both kinds are seen.
+    for key in (jr.key(0), jr.PRNGKey(0)):
+        tree = diffrax.VirtualBrownianTree(0.0, 1.0, 1e-3, (), key)
+        best = ds.suggest_solver(_oscillator(tree), 0.0, y0, want="weak")[0]
+        assert isinstance(best.terms(jr.key(1)).terms[1].path, ds.WeakBrownianPath)
+
+
+def test_a_path_of_diffrax_that_repeats_its_noise_is_told_of():
+    y0 = jnp.zeros(()), jnp.ones(())
+    unsafe = diffrax.UnsafeBrownianPath((), jr.key(0))
+    said = lambda path: ds.suggest_solver(_oscillator(path), 0, y0, want="weak").system
+    assert "repeats its noise" in said(unsafe)
+    ours = ds.FixedStepBrownianPath((), jr.key(0))
+    assert "repeats" not in said(ours)
+    # If Diffrax has mended it, take this sentence out.
+    t = 4096 + 1e-4 * jnp.arange(10_001)
+    draw = lambda path: jax.vmap(path.evaluate)(t[:-1], t[1:]) / jnp.sqrt(jnp.diff(t))
+    distinct = lambda path: len(np.unique(np.round(draw(path), 9)))
+    assert distinct(unsafe) < 5_000 and distinct(ours) == 10_000
+
+
+@pytest.mark.parametrize(
+    "solver", [ds.ImplicitMidpoint(), ds.NinomiyaVictoir()], ids=repr
+)
+@pytest.mark.parametrize("operator", [True, False])
+def test_noises_that_do_not_fit_their_control_term_are_refused(solver, operator):
+    def field(t, y, args):
+        struct = jax.ShapeDtypeStruct((2,), jnp.float64)
+        kick = lambda w: 0.1 * w
+        return lx.FunctionLinearOperator(kick, struct) if operator else 0.1 * jnp.eye(2)
+
+    def solve(shape, y0):
+        path = ds.WeakBrownianPath(shape, jr.key(0), two_point=True)
+        drift = diffrax.ODETerm(lambda t, y, args: -y)
+        terms = diffrax.MultiTerm(drift, diffrax.ControlTerm(field, path))
+        return diffrax.diffeqsolve(terms, solver, 0, 1, 0.5, y0, max_steps=2).ys
+
+    with pytest.raises(ValueError, match=r"`ControlTerm`.*(f64\[3\]|shape=\(3,\))"):
+        solve((3,), jnp.ones(2))
+    with pytest.raises(ValueError, match=r"`ControlTerm`.*(f64\[3\]|\(3, 2\))"):
+        solve((2,), jnp.ones(3))
+    single = jax.ShapeDtypeStruct((2,), jnp.float32)
+    if operator:
+        with pytest.raises(ValueError, match=r"increments of f32\[2\]"):
+            solve(single, jnp.ones(2))
+    else:
+        # Diffrax multiplies arrays of different precision.
+        np.testing.assert_allclose(
+            solve(single, jnp.ones(2)), solve((2,), jnp.ones(2)), rtol=1e-6
+        )
