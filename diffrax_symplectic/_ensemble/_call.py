@@ -103,7 +103,7 @@ def ensemble(
     [Dr.Jit](https://drjit.readthedocs.io): in this each path is alone in the registers of
     a processor, which is several times as fast. States are the same up to rounding.
     Implicit steps that a few sweeps do not solve are rare; such paths are taken anew by
-    JAX, and counted. See [Large ensembles](../ensembles.md).
+    JAX, and counted. See [Large ensembles][large-ensembles].
 
     **Arguments:**
 

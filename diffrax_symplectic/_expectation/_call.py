@@ -122,7 +122,7 @@ def expectation(
         another `first` each, are put together by `Expectation.merge`: see [many
         machines](many_machines.md).
     - `engine`: with `"drjit"` independent paths are taken by one fused kernel, several
-        times as fast; see [Large ensembles](../ensembles.md). `"jax"` or `None` is JAX.
+        times as fast; see [Large ensembles][large-ensembles]. `"jax"` or `None` is JAX.
     - `devices`: the devices that share the work, by default all of `jax.devices()`: under
         `jax.distributed` those of every process, each of which has to make the same call
         and gets the same result.
