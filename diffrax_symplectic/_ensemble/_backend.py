@@ -1,5 +1,4 @@
-"""Dr.Jit, and the types of its arrays on the devices of JAX. It is no dependency of this
-package, so it is imported only where it is used."""
+"""Imports Dr.Jit, an optional dependency, on first use; and its types of arrays."""
 
 import functools as ft
 import importlib
@@ -36,8 +35,8 @@ def drjit() -> Any:
 
 @ft.cache
 def array_types() -> dict[str, Any]:
-    """The types of arrays on JAX's default device, by the names that StableHLO has for
-    those of their entries. Raises an `ImportError` if Dr.Jit cannot compile for it."""
+    """The types of arrays for JAX's default device, by StableHLO's names of the types of
+    their entries. Raises an `ImportError` if Dr.Jit cannot compile for it."""
     dr, on_cpu = drjit(), jax.default_backend() == "cpu"
     needed = dr.JitBackend.LLVM if on_cpu else dr.JitBackend.CUDA
     if not dr.has_backend(needed):

@@ -20,11 +20,11 @@ from ._engines import Batch, ENGINES, state_itself
 from ._layout import sample_key
 
 
-# Numbers of states in a batch: enough for all cores, and memory of a few tens of megabytes.
+# Entries of all states in a batch: enough to keep every core busy, in tens of megabytes.
 _NUMBERS = {"jax": 2**17, "drjit": 2**20}
-# On accelerators, for which more paths are needed.
+# Accelerators need more.
 _MORE = 16
-# Where a larger share of the paths is left to JAX, that takes most of the time.
+# Beyond this share, stragglers take most of the time.
 _MANY = 0.05
 
 
@@ -32,10 +32,10 @@ class Ensemble(eqx.Module):
     """The paths of [`diffrax_symplectic.ensemble`][].
 
     - `ts`: the times.
-    - `ys`: the states at these, arrays of NumPy with axes in front for the paths, and with
-        `ts` for the times. NaN, at all times, for a path that failed.
+    - `ys`: the states at these times, as NumPy arrays. The first axis is the path; if `ts`
+        was passed, the second is the time. All states of a failed path are NaN.
     - `failed`: which paths failed.
-    - `num_stragglers`: how many paths `engine="drjit"` left to JAX.
+    - `num_stragglers`: how many paths `engine="drjit"` handed back to JAX.
     """
 
     ts: Float[np.ndarray, " times"]
@@ -51,8 +51,9 @@ class Ensemble(eqx.Module):
         return int(np.sum(self.failed))
 
     def terms(self, number: int) -> PyTree[diffrax.AbstractTerm]:
-        """The terms of path number `number`, with its own random keys: with these
-        `diffrax.diffeqsolve` follows it, to save it at more times, say."""
+        """The terms of path number `number`, with its random keys. Passed to
+        `diffrax.diffeqsolve` they give the same path, for example to save it at more
+        times."""
         high, low = (np.uint32(x) for x in divmod(int(number), 2**32))
         key = sample_key(self._key, high, low)
         return with_keys(self._terms, path_keys(self._terms, key))
@@ -73,7 +74,8 @@ def ensemble(
     engine: str | None = None,
     batch_size: int | None = None,
 ) -> Ensemble:
-    r"""The states of many paths: for histograms, spectra, clouds in phase space.
+    r"""The states of many independent paths, for histograms, spectra, and clouds in phase
+    space.
 
     !!! example
 
@@ -93,33 +95,34 @@ def ensemble(
         print(q.shape, q.std(), paths.num_failed)
         ```
 
-    Path number $i$ has random keys of its own, made from `key` and $i$, whatever
-    `num_paths`, `batch_size` and `engine` are. `ensemble(...).terms(i)` has them, for
-    `diffrax.diffeqsolve`. Each path begins at `y0`. They are taken in batches, so that
-    memory grows with their number only by what is returned.
+    Every path starts at `y0`. The random keys of path number $i$ depend on `key` and $i$
+    only, not on `num_paths`, `batch_size` or `engine`. `ensemble(...).terms(i)` returns
+    terms with these keys, for `diffrax.diffeqsolve`. Paths are simulated in batches, so
+    that only the returned arrays grow with their number.
 
-    **Engines.** `engine="jax"`, the default, takes all paths through each step together.
-    `engine="drjit"` makes one kernel of all steps, by
-    [Dr.Jit](https://drjit.readthedocs.io): in this each path is alone in the registers of
-    a processor, which is several times as fast. States are the same up to rounding.
-    Implicit steps that a few sweeps do not solve are rare; such paths are taken anew by
-    JAX, and counted. See [Large ensembles][large-ensembles].
+    **Engines.** `engine="jax"`, the default, moves all paths through each step together.
+    `engine="drjit"` compiles all steps to one kernel with
+    [Dr.Jit](https://drjit.readthedocs.io), which keeps each path in registers and is
+    several times as fast. The states agree up to rounding. The few paths with an implicit
+    step that simple sweeps do not solve ("stragglers") are simulated again by JAX, and
+    counted. See [Large ensembles][large-ensembles].
 
     **Arguments:**
 
     - `terms`, `solver`, `t0`, `t1`, `dt0`, `y0`, `args`, `key`, `ts`: as for
         [`diffrax_symplectic.expectation`][].
-    - `num_paths`: how many.
-    - `engine`: `"jax"`, `"drjit"`, or `None` for the first.
-    - `batch_size`: how many paths are taken at once. By default as many as have 131,072
-        numbers of state, or with Dr.Jit a million; on accelerators 16 times as many.
+    - `num_paths`: the number of paths.
+    - `engine`: `"jax"`, `"drjit"`, or `None`, which means `"jax"`.
+    - `batch_size`: the number of paths to simulate at once. By default, the states of a
+        batch have 131,072 entries, with Dr.Jit a million; on accelerators 16 times as many.
 
     **Returns:** an [`diffrax_symplectic.Ensemble`][].
 
-    **Raises:** as [`diffrax_symplectic.expectation`][]; a `ValueError` for another
-    `engine`, and with `engine="drjit"` for a system with an operation that Dr.Jit has not,
-    or of more than 256 numbers; an `ImportError` where Dr.Jit or a library of LLVM is
-    missing. Warns if paths failed, and if many are left to JAX.
+    **Raises:** what [`diffrax_symplectic.expectation`][] raises, and a `ValueError` if
+    `engine` is unknown. With `engine="drjit"`: a `ValueError` if the system uses an
+    operation that cannot be replayed or its state has more than 256 entries, and an
+    `ImportError` if Dr.Jit or LLVM is missing. Warns if paths failed, and if many are
+    stragglers.
     """
     given = terms, t0, t1, dt0, y0, args
     key, _, _ = checked_call("ensemble", key, None, None, 0, None, given)
@@ -134,7 +137,7 @@ def ensemble(
     size = whole_number("batch_size", batch_size)
     batches = []
     for begin in range(0, num_paths, size):
-        # JAX compiles for a size. What is too much is dropped.
+        # JAX compiles for one batch size: the last batch is cut afterwards.
         n = min(size, num_paths if engine == "jax" else num_paths - begin)
         batches.append(
             ENGINES[engine](problem, key, np.arange(begin, begin + n, dtype=np.uint64))
@@ -168,14 +171,16 @@ def _warn_of(joined: Batch, engine: str) -> None:
     count, lost = len(joined.failed), int(np.sum(joined.failed))
     if lost > 0:
         warnings.warn(
-            f"{lost:,} of {count:,} paths failed. Their states are NaN: leave them out by "
-            "`~failed`. Take smaller steps or bounded increments, such as those of a "
-            "`WeakBrownianPath`; and look for NaNs in `y0`, `args` and the Hamiltonians.",
+            f"{lost:,} of {count:,} paths failed. Their states are NaN: select the others "
+            "with `~failed`. Take smaller steps or bounded increments (a "
+            "`WeakBrownianPath` has them), and look for NaNs in `y0`, `args` and the "
+            "Hamiltonians.",
             stacklevel=3,
         )
     if joined.stragglers - lost > _MANY * count:
         warnings.warn(
             f"{joined.stragglers:,} of {count:,} paths had steps that the fused kernel did "
-            'not solve, and were taken anew by JAX. Take smaller steps, or `engine="jax"`.',
+            "not solve, and were simulated again by JAX. Take smaller steps, or "
+            '`engine="jax"`.',
             stacklevel=3,
         )

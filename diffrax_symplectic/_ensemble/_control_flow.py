@@ -1,4 +1,4 @@
-"""Operations that run their regions: conditionals and loops."""
+"""Operations with regions: conditionals and loops."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ def _custom_call(o, *xs):
 
 
 def _raises(region: Any) -> bool:
-    """Whether it calls back to Python, as `equinox.error_if` does to raise its error."""
+    """Whether it calls back to Python, as `equinox.error_if` does to raise an error."""
     calls = [op for op in region.blocks[0].operations if "custom_call" in op.name]
     return any("callback" in op.attributes["call_target_name"].value for op in calls)
 
@@ -37,7 +37,7 @@ def _case(o, index):
     o.errors.extend(index.item() == i for i in range(number) if i not in branches)
 
     def taken(left: list[int]) -> tuple:
-        """The first of the branches, or another one."""
+        """The first of the branches, or one of the others."""
         first, *others = left
         if not others:
             return flat(o.run(first, []))
@@ -58,7 +58,7 @@ def _if(o, condition):
     return unflat(out, o.shapes())
 
 
-# The first so many times around, a loop is written out, as long as it is known to go on.
+# The most iterations to unroll, of a loop whose condition is known.
 _WRITTEN_OUT = 8
 
 
@@ -66,7 +66,7 @@ _WRITTEN_OUT = 8
 def _while(o, *xs):
     body = o.op.regions[1].blocks[0]
     returned = [*[*body.operations][-1].operands]
-    # What stays the same is no part of the loop's state, and constants stay known.
+    # Values that do not change stay out of the loop's state, so that constants stay known.
     moves = [a != b for a, b in zip(returned, body.arguments)]
     moving = lambda xs: [x for x, m in zip(xs, moves) if m]
     xs, number = [*xs], 0

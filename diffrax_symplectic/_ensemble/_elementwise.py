@@ -1,7 +1,7 @@
-"""Operations of StableHLO that act on each entry by itself, as functions of Dr.Jit arrays.
+"""Elementwise operations of StableHLO, as functions of Dr.Jit arrays.
 
-Where Dr.Jit has another convention than StableHLO, for numbers that are not finite or are
-integers, or loses digits, the function is put together here.
+Functions are defined here where Dr.Jit differs from StableHLO (NaN, infinities, integers)
+or is less accurate.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from ._backend import drjit
 
 
 def _maximum(a, b):
-    # As in JAX, what is not a number stays that.
+    # NaN propagates, as in JAX.
     return drjit().select((a > b) | _is_nan(a), a, b)
 
 
@@ -22,7 +22,7 @@ def _minimum(a, b):
 
 
 def _is_nan(a):
-    # In Dr.Jit, NaN is neither equal to itself nor not equal.
+    # In Dr.Jit, both `NaN == NaN` and `NaN != NaN` are false.
     return ~(a == a)
 
 
@@ -39,8 +39,8 @@ def _divide(a, b):
 
 
 def _divisor(a, b):
-    """What an integer can be divided by: the processor traps for zero, and for the least
-    number divided by -1. And where it is zero, and where -1."""
+    """A safe divisor for integers, and where the given one is 0 and -1: processors trap on
+    division by zero, and of the smallest integer by -1."""
     dr = drjit()
     zero = b == 0
     minus = (b == -1) if dr.is_signed_v(b) else ~zero & zero
@@ -74,7 +74,7 @@ def _sign(a):
 
 
 def _power(a, b):
-    """By logarithms, and small whole exponents by multiplication."""
+    """Uses logarithms, or multiplication for small integer exponents."""
     dr, T = drjit(), type(a)
     if b.state == dr.VarState.Literal and float(b[0]).is_integer() and abs(b[0]) <= 64:
         return _integer_power(a, int(b[0]))
@@ -96,7 +96,7 @@ def _integer_power(a, n: int):
 
 
 def _expm1(a):
-    """By a formula of Kahan's, that forgives the rounding of the exponential."""
+    """Kahan's formula, in which the rounding error of the exponential cancels."""
     dr = drjit()
     u = dr.exp(a)
     near = (u - 1) * a / dr.log(u)
@@ -136,7 +136,7 @@ def _rsqrt(a):
     return 1 / drjit().sqrt(a)
 
 
-# Dr.Jit's own three are of single precision on GPUs.
+# Dr.Jit's own versions of these three have single precision on GPUs.
 
 
 def _sinh(a):
@@ -165,8 +165,8 @@ def _logistic(a):
 
 
 def _erf_inv(a):
-    """In double precision, Dr.Jit's has the digits of single precision, or fewer in its
-    tails. Each step of Halley's method triples them."""
+    """In double precision Dr.Jit's version has at most the digits of single precision. Each
+    step of Halley's method triples their number."""
     dr = drjit()
     start = y = dr.erfinv(a)
     if dr.itemsize_v(a) < 8:
@@ -178,7 +178,7 @@ def _erf_inv(a):
 
 
 def _shifted(shift: Callable) -> Callable:
-    """Shifts by at least as many bits as there are leave zero."""
+    """A shift by all bits or more gives zero."""
 
     def fn(a, b):
         return drjit().select(b < 8 * drjit().itemsize_v(a), shift(a, b), 0)
@@ -196,7 +196,7 @@ def _not(a):
 
 
 def elementwise() -> dict[str, Callable[..., Any]]:
-    """The functions, by the names that StableHLO and CHLO have for them."""
+    """The functions, by their names in StableHLO and CHLO."""
     dr = drjit()
     return {
         "abs": dr.abs,

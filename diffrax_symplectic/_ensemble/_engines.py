@@ -1,5 +1,5 @@
-"""The paths of a batch, by either engine. Both take a problem, the random key of all
-samples, and the numbers of those in the batch, which follow each other."""
+"""Simulates the paths of a batch with either engine. Both take a problem, the random key
+that all samples share, and consecutive sample numbers."""
 
 import functools as ft
 import re
@@ -21,11 +21,11 @@ from ._operation import NotReplayed
 
 
 class Batch(NamedTuple):
-    """Paths, along the first axis of each array; the saved times come second.
+    """Paths along the first axis of each array, saved times along the second.
 
-    - `y`: their states.
-    - `failed`: which failed. Of these the states mean nothing.
-    - `stragglers`: how many of them the other engine had to take.
+    - `y`: the states.
+    - `failed`: which paths failed. Their states are meaningless.
+    - `stragglers`: how many paths the fused kernel handed back to JAX.
     """
 
     y: PyTree[np.ndarray]
@@ -34,13 +34,13 @@ class Batch(NamedTuple):
 
 
 def state_itself(t, y, args):
-    """What a problem averages if it is the states that are asked for."""
+    """The function to average if the states themselves are wanted."""
     del t, args
     return y
 
 
 def by_jax(p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0) -> Batch:
-    """By the loop of `expectation`."""
+    """With the loop of `expectation`."""
     low = (numbers & np.uint64(0xFFFFFFFF)).astype(np.uint32)
     high = (numbers >> np.uint64(32)).astype(np.uint32)
     y, failed = jax.device_get(_paths(p, key, high, low))
@@ -60,10 +60,10 @@ def _paths(p: Problem, key: PRNGKeyArray, hi, lo):
 def by_drjit(
     p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0
 ) -> Batch:
-    """By a fused kernel. Paths with a step that this does not solve, and those that fail,
-    are taken by JAX.
+    """With a fused kernel. JAX simulates again the paths that the kernel could not finish.
 
-    Raises an `ImportError` without Dr.Jit, and a `ValueError` for what it cannot do."""
+    Raises an `ImportError` without Dr.Jit, and a `ValueError` if the system cannot be
+    replayed."""
     layout, arrays = split(p, key)
     grid, n = p.level(level), len(numbers)
     try:
@@ -87,7 +87,7 @@ def by_drjit(
     (which,) = np.nonzero(stopped)
     if len(which) == 0:
         return Batch(y, stopped)
-    # So many that few programs are compiled, whatever their number is.
+    # Rounded up to a power of four, so that JAX compiles few programs.
     size = min(n, 4 ** int(np.ceil(np.log(len(which)) / np.log(4))))
     rest = by_jax(p, key, numbers[np.resize(which, size)], level)
     y = jtu.tree_map(np.array, y)
@@ -104,7 +104,7 @@ def _kernels(layout: Any) -> Kernels:
 
 
 def _unraveled(y0: PyTree, numbers: list[np.ndarray]) -> PyTree[np.ndarray]:
-    """Of the numbers of a state, each with axes for paths and times, the state."""
+    """The state, from its entries, each with axes for paths and times."""
     leaves, treedef = jtu.tree_flatten(y0)
     ends = np.cumsum([0, *[x.size for x in leaves]])
     stack = lambda x, i: np.stack(numbers[i : i + x.size], axis=-1)
@@ -115,8 +115,8 @@ def _unraveled(y0: PyTree, numbers: list[np.ndarray]) -> PyTree[np.ndarray]:
 
 
 def _refused(error: BaseException | None) -> ValueError | None:
-    """What a user gets to know if an operation cannot be replayed. Dr.Jit, which calls what
-    records a loop, wraps the error."""
+    """The error for the user if an operation cannot be replayed. Dr.Jit wraps errors of the
+    functions with which it records a loop."""
     while error is not None and not isinstance(error, NotReplayed):
         error = error.__cause__ or error.__context__
     if error is None:
@@ -128,8 +128,8 @@ def _refused(error: BaseException | None) -> ValueError | None:
 
 
 def _origin(location: str) -> str:
-    """The function of the user's that an operation comes from, if JAX has kept it: the
-    first one in no installed package."""
+    """The function of the user's code that an operation comes from, if JAX recorded it: the
+    first one outside of installed packages."""
     frames = re.findall(r'"([^"]*)"\("([^"]+)":(\d+)', location)
     own = str(Path(__file__).parents[1])
     for name, file, line in frames:

@@ -1,5 +1,5 @@
-"""Kernels that take paths through their steps. Each is recorded and compiled once for a
-layout; step sizes, times, parameters and numbers of steps are what it reads."""
+"""Kernels that move paths through their steps. Each is recorded and compiled once for a
+layout, and reads step sizes, times, parameters and numbers of steps."""
 
 import functools as ft
 import math
@@ -19,17 +19,17 @@ from ._replay import Replay
 from ._tensor import flat, scalar, Tensor, unflat
 
 
-# The kernel of a larger system would take long to compile.
+# Kernels of larger systems take long to compile.
 _MOST_NUMBERS = 256
-# Where a function is recorded more often, Dr.Jit warns.
+# Dr.Jit warns if a function is recorded more often.
 _RECORDINGS = 100
 
 
 class Program:
-    """A function lowered for one path, and how its arguments lie in memory."""
+    """A function lowered for one path, with the layout of its arguments."""
 
     def __init__(self, fn: Callable, *args: PyTree):
-        # For CPUs on any device: for others JAX calls libraries.
+        # Lowered for CPUs on every device: for others JAX emits calls of libraries.
         with jax.default_device(jax.devices("cpu")[0]):
             lowered = jax.jit(fn, keep_unused=True).lower(*args)
         self.replay = Replay(lowered.compiler_ir("stablehlo"))
@@ -37,7 +37,7 @@ class Program:
         self.types = [[next(types) for _ in jtu.tree_leaves(x)] for x in args]
 
     def entries(self, argument: int) -> list[str]:
-        """The types of the numbers of an argument."""
+        """The types of all entries of an argument."""
         return [t for shape, t in self.types[argument] for _ in range(math.prod(shape))]
 
     def tensors(self, argument: int, entries: Iterable[Any]) -> list[Tensor]:
@@ -45,17 +45,17 @@ class Program:
 
 
 def _packed(types: list[str], arrays: Iterable[Array]) -> dict[str, Any]:
-    """All numbers, those of each type in one array."""
+    """All entries, in one array for each type."""
     of_type: dict[str, list] = {t: [] for t in types}
     numbers = [x for a in arrays for x in _numbers(a).flat]
     for t, x in zip(types, numbers, strict=True):
         of_type[t].append(x)
-    # Memory of NumPy must not be freed while Dr.Jit records a function. Lists are copied.
+    # As lists, which are copied: memory of NumPy could be freed while Dr.Jit records.
     return {t: array_types()[t]([v.item() for v in x]) for t, x in of_type.items()}
 
 
 def _unpacked(types: list[str], packed: dict[str, Any]) -> list[Any]:
-    """The same numbers as the kernel reads them."""
+    """The inverse of `_packed`, within a kernel."""
     dr, count, out = drjit(), dict.fromkeys(packed, 0), []
     for t in types:
         place = array_types()["ui32"](count[t])
@@ -70,12 +70,12 @@ def _numbers(x: Array) -> np.ndarray:
 
 
 class Paths(NamedTuple):
-    """The paths of a batch. Each entry is an array with a lane for each of them.
+    """The paths of a batch. Each Dr.Jit array has one lane for each path.
 
-    - `keys`: the words of their random keys.
-    - `y`: the numbers of their states.
-    - `memory`: what the solver remembers of each.
-    - `stopped`: whether a step was not solved.
+    - `keys`: the words of the random keys.
+    - `y`: the entries of the states.
+    - `memory`: the entries of the solver states.
+    - `stopped`: whether a step of the path was not solved.
     """
 
     keys: list[Any]
@@ -85,7 +85,7 @@ class Paths(NamedTuple):
 
 
 class Kernels:
-    """The kernels of a layout. Raises a `ValueError` for systems that are too large."""
+    """The kernels of a layout. Raises a `ValueError` if the system is too large."""
 
     def __init__(self, layout: Layout):
         arrays, key = layout.arrays, layout.key
@@ -105,7 +105,7 @@ class Kernels:
             of = jax.vmap(
                 lambda lo: layout.path_keys(arrays, key, jnp.zeros_like(lo), lo)
             )
-            # No solver remembers random numbers at the start: all paths begin as one.
+            # No solver draws random numbers in `init`: all paths start alike.
             return jax.vmap(layout.start, (None, 0), None)(
                 arrays, of(jnp.zeros(1, word.dtype))
             )
@@ -113,7 +113,7 @@ class Kernels:
         self._start = start
         self._keys = Program(layout.path_keys, arrays, key, word, word)
         self._step = Program(layout.step, arrays, keys, h, number, y, memory)
-        # What a step only hands on is a parameter.
+        # Entries of the solver state that a step returns unchanged are parameters.
         begin = sum(map(len, self._step.types[:-1]))
         handed_on = self._step.replay.handed_on[len(y) : -1]
         self._moves = [i != begin + k for k, i in enumerate(handed_on)]
@@ -124,7 +124,7 @@ class Kernels:
     def begin(
         self, arrays: list[Array], key: PRNGKeyArray, h: Array, first: int, n: int
     ):
-        """The paths of `n` samples from number `first` on; and the parameters of their
+        """The paths of the samples `first` to `first + n - 1`, and the parameters of their
         steps of size `h`."""
         dr, kinds = drjit(), array_types()
         own = self._keys.entries(0) + self._keys.entries(1)
@@ -145,7 +145,7 @@ class Kernels:
         return Paths(keys, y, memory, dr.opaque(kinds["i1"], False, n)), parameters
 
     def advance(self, paths: Paths, parameters, begin: int, end: int) -> Paths:
-        """The paths after the steps number `begin` to `end`, without that."""
+        """The paths after the steps `begin` to `end - 1`."""
         number = ft.partial(drjit().opaque, array_types()["i32"])
         y, memory, stopped = self._take_steps(
             parameters, number(begin), number(end), *paths

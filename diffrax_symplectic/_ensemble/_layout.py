@@ -1,4 +1,4 @@
-"""What a fused kernel is compiled for, and what it only reads."""
+"""Splits a problem into what a fused kernel is compiled for and what it reads."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,8 +18,8 @@ from ._sweeps import without_rescue
 
 
 class Layout(NamedTuple):
-    """What programs depend on: all of a `Problem` but the values of its arrays; the kind of
-    random key; and settings of JAX. It can be hashed."""
+    """What a kernel is compiled for: a `Problem` without the values of its arrays, the
+    implementation of random keys, and settings of JAX. Hashable."""
 
     treedef: Any
     static: tuple[Any, ...]
@@ -41,7 +41,7 @@ class Layout(NamedTuple):
         leaves = [x if s is None else next(left) for x, s in pairs]
         return self.treedef.unflatten(leaves)
 
-    # The programs, each of one path
+    # The programs, each for one path
 
     def path_keys(self, arrays: list[Array], key, hi, lo) -> list[Array]:
         return path_keys(self.problem(arrays).terms, sample_key(key, hi, lo))
@@ -71,8 +71,8 @@ def sample_key(key: PRNGKeyArray, hi, lo) -> PRNGKeyArray:
 
 
 def split(problem: Problem, key: PRNGKeyArray) -> tuple[Layout, list[Array]]:
-    """The layout and the arrays of a problem, with sweeps alone, and without the times and
-    numbers of its steps."""
+    """The layout and the arrays of a problem. Its root finders become plain sweeps, and the
+    step size, times and numbers of steps are left out: they are inputs of the kernel."""
     none = jnp.zeros(1, jnp.int32)
     bare = dataclasses.replace(
         problem,

@@ -1,4 +1,4 @@
-"""Samples of `expectation` by a fused kernel."""
+"""Samples of `expectation` from a fused kernel."""
 
 import dataclasses
 import functools as ft
@@ -16,15 +16,15 @@ from .._root_finder import all_finite
 from ._engines import by_drjit, state_itself
 
 
-# Paths in a batch, by default: many, for a call of the kernel.
+# Default number of paths in a batch: large, to amortize the call of the kernel.
 _BATCH = 2**19
 
 
 def fused_plan(
     problem: Problem, key: PRNGKeyArray, sampling: Any, devices: tuple
 ) -> Plan:
-    """A plan with the states of independent paths from a kernel, and $\\phi$ of them from
-    JAX. Raises a `ValueError` for another `sampling`, or several devices."""
+    """A plan in which a kernel simulates independent paths, and JAX evaluates $\\phi$.
+    Raises a `ValueError` for another `sampling`, or several devices."""
     if not isinstance(sampling, IndependentPaths):
         raise ValueError(
             '`engine="drjit"` takes independent paths: pass '
@@ -37,7 +37,7 @@ def fused_plan(
         )
     states = dataclasses.replace(problem, phi=state_itself, at_end=False)
 
-    # The first batch is asked for twice.
+    # `expectation` asks for the first batch twice.
     @ft.lru_cache(maxsize=1)
     def paths(first: int, n: int) -> tuple[PyTree[np.ndarray], np.ndarray]:
         numbers = np.arange(first, first + n, dtype=np.uint64)

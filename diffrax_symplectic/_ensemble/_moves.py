@@ -1,4 +1,4 @@
-"""Operations that move entries about, convert or combine them."""
+"""Operations that move, convert or combine entries."""
 
 import itertools
 import math
@@ -13,7 +13,7 @@ from ._operation import NotReplayed, Operation, rule
 from ._tensor import constant, each, flat, known, Tensor
 
 
-# Entries are moved about
+# Moves
 
 
 @rule
@@ -76,14 +76,14 @@ def _pad(o, x, value):
     return [Tensor([*x.entries, value.item()], ()).take(places)]
 
 
-# An index of each path chooses by as many comparisons as there are places.
+# An index that differs between paths selects by comparison with each position.
 _MOST_PLACES = 64
 
 
 def _windows(
     o: Operation, x: Tensor, starts: Sequence[Tensor], sizes: Sequence[int]
 ) -> Iterator[tuple[tuple[slice, ...], Any]]:
-    """Where a window of these sizes can be in `x`, and in which lanes it is there."""
+    """The possible positions of a window of these sizes in `x`, with masks of the lanes."""
     axes = []
     for start, n, size in zip(starts, x.shape, sizes):
         most, value = n - size, known(start)
@@ -94,7 +94,7 @@ def _windows(
         first, last = [(0, s <= 0)], [(most, s >= most)]
         axes.append([*first, *[(k, s == k) for k in range(1, most)], *last])
     if (number := math.prod(map(len, axes))) > _MOST_PLACES:
-        what = f"`{o.op.name}` with an index of each path among {number} places"
+        what = f"`{o.op.name}` with an index per path, among {number} places"
         raise NotReplayed(o.op, what)
     for choice in itertools.product(*axes):
         here = True
@@ -134,10 +134,10 @@ def _dynamic_update_slice(o, x, update, *starts):
 
 
 def _starts(o: Operation, name: str, x: Tensor, indices: Tensor, axes: list[int]):
-    """For each of `indices` where a window in `x` begins."""
+    """The start of the window in `x` for each of `indices`."""
     if o.part(name, "operand_batching_dims") or o.part(name, "input_batching_dims"):
-        raise NotReplayed(o.op, f"`{o.op.name}` with an axis of a batch")
-    # Written only if it is not zero.
+        raise NotReplayed(o.op, f"`{o.op.name}` with a batch axis")
+    # The attribute is printed only if it is not zero.
     vector = sum(o.part(name, "index_vector_dim"))
     places = indices.places.reshape(
         *indices.shape, *[1] * (vector == len(indices.shape))
@@ -181,11 +181,11 @@ def _scatter(o, x, indices, updates):
     for start, row in zip(starts, source.reshape(math.prod(batch), -1)):
         values = [known(s) for s in start]
         if any(v is None for v in values):
-            raise NotReplayed(o.op, f"`{o.op.name}` with an index of each path")
+            raise NotReplayed(o.op, f"`{o.op.name}` with an index per path")
         begin = [int(v) for v in values if v is not None]
         fits = [0 <= b <= n - size for b, n, size in zip(begin, x.shape, sizes)]
         if not all(fits):
-            continue  # It is dropped.
+            continue  # Updates out of bounds are dropped.
         at = tuple(slice(b, b + size) for b, size in zip(begin, sizes))
         for i, k in zip(x.places[at].flat, row):
             one = [Tensor([e], ()) for e in (out[i], updates.entries[k])]
@@ -193,7 +193,7 @@ def _scatter(o, x, indices, updates):
     return [Tensor(out, x.shape)]
 
 
-# Entries are converted
+# Conversions
 
 
 @rule
@@ -212,12 +212,12 @@ def _bitcast_convert(o, x):
 def _compare(o, a, b):
     name = o.word("comparison_direction").lower()
     if name == "ne":
-        # What is not a number differs from all. In Dr.Jit it does not.
+        # NaN differs from everything, but not in Dr.Jit.
         return [each(lambda a, b: ~(a == b), a, b)]
     return [each(getattr(operator, name), a, b)]
 
 
-# Entries are combined
+# Combinations
 
 
 @rule
@@ -250,7 +250,7 @@ def _reduce(o, *xs):
     outs = [[] for _ in range(n)]
     for row in rows:
         parts = [[Tensor([x.entries[i]], ()) for x in xs[:n]] for i in row]
-        # Most reductions begin with what changes nothing, such as zero in a sum.
+        # Most reductions start from a neutral element, such as zero in a sum.
         total = parts.pop(0) if parts and _changes_nothing(o, xs[n:]) else [*xs[n:]]
         for part in parts:
             total = o.run(0, [*total, *part])

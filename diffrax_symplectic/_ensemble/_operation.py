@@ -1,6 +1,6 @@
-"""An operation of StableHLO, as a rule sees it.
+"""Operations of StableHLO, as rules see them.
 
-StableHLO's specification (https://openxla.org/stablehlo/spec) says what each of them does.
+Their semantics: https://openxla.org/stablehlo/spec.
 """
 
 import re
@@ -12,12 +12,11 @@ from ._tensor import Tensor
 
 
 class Operation(NamedTuple):
-    """An operation of a program, and what carries out its regions: the number of one and
-    its arguments make its results."""
+    """An operation of a program. `run(i, arguments)` runs its region `i`."""
 
     op: Any
     run: Callable[..., list[Tensor]]
-    # In which lanes an error is raised. JAX takes these paths, and raises it.
+    # Masks of the lanes that raise an error. JAX simulates these paths, and raises it.
     errors: list[Any]
 
     @property
@@ -33,7 +32,7 @@ class Operation(NamedTuple):
         return self.kind_of(self.op.results[0])
 
     def kind_of(self, value: Any) -> Any:
-        """The type of Dr.Jit's arrays for a value of the program."""
+        """The type of Dr.Jit arrays for a value of the program."""
         name = str(getattr(value.type, "element_type", value.type))
         if name not in array_types():
             raise NotReplayed(self.op, f"numbers of type `{name}`")
@@ -46,14 +45,14 @@ class Operation(NamedTuple):
         return self.op.attributes[name].value
 
     def word(self, name: str) -> str:
-        """Of an enumeration, written `#stablehlo<comparison_direction LT>`."""
+        """The value of an enumeration, such as `#stablehlo<comparison_direction LT>`."""
         return re.findall(r"\w+", str(self.op.attributes[name]))[-1]
 
     def shapes(self) -> list[tuple[int, ...]]:
         return [tuple(x.type.shape) for x in self.op.results]
 
     def recorded(self, fn: Callable, *args: Any, **kwargs: Any) -> list[Tensor]:
-        """The results, if Dr.Jit records a loop or a conditional by `fn`."""
+        """The results of a loop or conditional that Dr.Jit records with `fn`."""
         number = len(self.errors)
         out = fn(*args, mode="symbolic", **kwargs)
         if len(self.errors) > number:
@@ -63,26 +62,26 @@ class Operation(NamedTuple):
         return out
 
     def part(self, name: str, key: str) -> list[int]:
-        """Of an attribute, written `#stablehlo.gather<offset_dims = [0], ...>`."""
+        """An entry of an attribute such as `#stablehlo.gather<offset_dims = [0], ...>`."""
         text = str(self.op.attributes[name])
         found = re.search(rf"\b{key} = (\[[^\]]*\]|\d+)", text)
         return [int(i) for i in re.findall(r"\d+", found[1])] if found else []
 
 
 class NotReplayed(Exception):
-    """An operation that cannot be replayed, and what of it."""
+    """An operation that cannot be replayed, and which part of it."""
 
     def __init__(self, op: Any, what: str | None = None):
         super().__init__(what or f"`{op.name}`")
         self.location = str(op.location)
 
 
-# It takes an operation and its operands to its results.
+# From an operation and its operands to its results.
 Rule: TypeAlias = Callable[..., list[Tensor]]
 RULES: dict[str, Rule] = {}
 
 
 def rule(fn: Rule) -> Rule:
-    """The rule for the operation of the name of the function."""
+    """Registers a function as the rule for the operation of the same name."""
     RULES[fn.__name__.strip("_")] = fn
     return fn

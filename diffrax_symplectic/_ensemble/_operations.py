@@ -1,5 +1,5 @@
-"""The table of the operations that can be replayed. One that acts on each entry by itself
-is a line in `_elementwise`; any other is a function with the decorator `rule`."""
+"""The table of operations that can be replayed. An elementwise operation is a line in
+`_elementwise`; any other is a function with the decorator `rule`."""
 
 from . import _control_flow, _moves  # noqa: F401 (they fill the table)
 from ._elementwise import elementwise
@@ -8,12 +8,12 @@ from ._tensor import each
 
 
 def rule_of(name: str) -> Rule | None:
-    """The rule for the operation of this name, without that of its dialect."""
+    """The rule for an operation, by its name without the dialect."""
     if fn := elementwise().get(name):
         return lambda o, *xs: [each(fn, *xs)]
     return RULES.get(name)
 
 
 def names() -> set[str]:
-    """All of the table."""
+    """All operations in the table."""
     return {*elementwise(), *RULES}

@@ -1,4 +1,4 @@
-"""A program that JAX has lowered for one path, carried out for many at once."""
+"""Replays a program that JAX lowered for one path on arrays with many paths."""
 
 from collections import ChainMap
 from typing import Any
@@ -12,8 +12,8 @@ _RETURNS = ("func.return", "stablehlo.return")
 
 
 class Replay:
-    """A module of StableHLO as a function of tensors. Dr.Jit records its operations; they
-    become part of the kernel that it compiles for what calls this."""
+    """A module of StableHLO as a function of tensors. Dr.Jit records the operations as part
+    of the kernel of the caller."""
 
     def __init__(self, module: Any):
         self._module = module  # It owns the operations.
@@ -25,13 +25,13 @@ class Replay:
 
     @property
     def arguments(self) -> list[tuple[tuple[int, ...], str]]:
-        """Shape and type of each."""
+        """The shape and type of each argument."""
         types = [x.type for x in self._main.arguments]
         return [(tuple(t.shape), str(t.element_type)) for t in types]
 
     @property
     def handed_on(self) -> list[int | None]:
-        """For each result the number of the argument that it is."""
+        """For each result, the number of the argument that it equals, or `None`."""
         (*_, last), arguments = self._main.operations, [*self._main.arguments]
         where = lambda x: next((i for i, a in enumerate(arguments) if a == x), None)
         return [where(x) for x in last.operands]
@@ -41,7 +41,7 @@ class Replay:
         return self._functions["main"].regions[0].blocks[0]
 
     def __call__(self, *args: Tensor) -> tuple[list[Tensor], list[Any]]:
-        """The results, and masks of the lanes in which an error is raised."""
+        """The results, and masks of the lanes that raise an error."""
         self._errors.clear()
         return self._call("main", args), [*self._errors]
 
@@ -65,7 +65,7 @@ class Replay:
             try:
                 return self._call(op.attributes["callee"].value, operands)
             except NotReplayed as error:
-                # Functions that are called know only their own operations.
+                # The location of a called function does not name its caller.
                 error.location += str(op.location)
                 raise
         run = lambda i, args: self._block(op.regions[i].blocks[0], args, values)

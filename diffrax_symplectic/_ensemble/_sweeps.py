@@ -1,4 +1,4 @@
-"""The root finder of a fused step: sweeps of one path, and no rescue."""
+"""The root finder of a fused step: sweeps for one path, without a fallback."""
 
 import functools as ft
 from collections.abc import Callable
@@ -21,22 +21,22 @@ from .._root_finder import (
 from .._solver import AbstractImplicitStages
 
 
-# Where this many do not solve a step, the path is left to JAX's program.
+# A path with a step that needs more sweeps is handed back to JAX.
 _MOST_SWEEPS = 48
-# Above this rate of convergence sweeps are relaxed.
+# Sweeps that converge at a slower rate are under-relaxed.
 _SLOW = 0.3
-# The next correction is below two units in the last place by this factor: what is left out
-# has the same sign in every step, and adds up.
+# Sweeps end when the expected next correction is below two units in the last place by this
+# factor: the remaining error has the same sign in every step, and accumulates.
 _MARGIN = 64.0
-# Corrections of so many units of the largest value that no longer shrink are rounding.
+# Corrections below this many units of the largest value that no longer shrink are rounding.
 _ROUNDING = 50.0
-# Corrections beyond this many units lead nowhere.
+# Corrections beyond this many units: the sweeps diverge.
 _HUGE = 1e30
 
 
 class _State(NamedTuple):
-    """The iterate; the size of its last correction in units of the tolerance; whether the
-    equations are solved; how many sweeps there were."""
+    """The iterate, the size of its last correction in units of the tolerance, whether the
+    equations are solved, and the number of sweeps."""
 
     y: Halves
     size: Scalar
@@ -45,15 +45,15 @@ class _State(NamedTuple):
 
 
 def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, ""]):
-    r"""Solves $y = \Phi(y)$ from a `guess`. Returns where it ended, and whether that is a
+    r"""Solves $y = \Phi(y)$ from a `guess`. Returns the last iterate, and whether it is a
     solution.
 
-    As in [`diffrax_symplectic.PicardNewton`][], but that a path is alone: in a fused kernel
-    each ends by itself, and a convergence check after each sweep costs little.
+    The sweeps are those of [`diffrax_symplectic.PicardNewton`][]. In a fused kernel each
+    path ends by itself, so that a convergence check after each sweep costs little.
     """
     paired = isinstance(guess, Halves)
-    # What has no halves is iterated as a doubled system, y = \Phi(z), z = \Phi(y). Where
-    # both solve y = \Phi(\Phi(y)), only their difference shows it.
+    # Without halves: Gauss-Seidel on the doubled system y = \Phi(z), z = \Phi(y). It is
+    # solved when y = z: a cycle of period two solves it, too, with y != z.
     start = guess if paired else Halves(guess, guess)
     p = lambda y: image(y).p if paired else image(y.q)
     q = lambda y: image(y).q if paired else image(y.p)
@@ -70,7 +70,7 @@ def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, 
         return Halves(y.p, relaxed(q(y), y.q))
 
     first = once(start, one)
-    # The tolerance is that of the state after the first sweep, which there is in any case.
+    # The tolerance is taken at the first sweep, which is needed in any case.
     scales = _sizes(scale(value(first)))
     weights = [_inverse(unit * x) for x in scales]
     rounding = _ROUNDING * unit * _largest(scales)
@@ -78,8 +78,8 @@ def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, 
     def check(
         old: Halves, new: Halves, before: Scalar
     ) -> tuple[Scalar, Bool[Array, ""]]:
-        """The size of a correction, after one of size `before`, and whether it is the last
-        that is needed."""
+        """The size of a correction that follows one of size `before`, and whether the
+        sweeps have converged."""
         gaps = _sizes(correction(old, new))
         size = _largest([x * weight for x, weight in zip(gaps, weights)])
         below = _MARGIN * size * jnp.where(size < before, size, before) <= before
@@ -91,7 +91,7 @@ def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, 
     size, solved = check(second, third, before)
 
     def best() -> Scalar:
-        """The relaxation factor for the rate at which sweeps converge."""
+        """The relaxation factor for the observed rate of convergence."""
         return 2 / (1 + jnp.sqrt(1 + jnp.minimum(size / before, 4)))
 
     omega = lax.cond(size > _SLOW * before, best, lambda: one)
@@ -110,8 +110,8 @@ def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, 
 
 
 def _inverse(x: Scalar) -> Scalar:
-    """Of a positive number, to within a factor of two: by its exponent, since a division
-    takes as long as a sweep. That of zero is large, not infinite."""
+    """The inverse of a positive number up to a factor of two, from its exponent: a division
+    takes as long as a sweep. The inverse of zero is large, not infinite."""
     info = jnp.finfo(x.dtype)
     kind = jnp.dtype(f"int{info.bits}")
     one = int(np.asarray(1, x.dtype).view(kind))
@@ -124,14 +124,13 @@ def _sizes(y: PyTree[Array]) -> list[Scalar]:
 
 
 def _largest(x: list[Scalar]) -> Scalar:
-    # `jnp.maximum` would keep what is not a number, for the price of three operations. The
-    # end of the step shows that, too.
+    # `jnp.maximum` propagates NaN at the price of three operations. The check at the end of
+    # the step finds NaN in any case.
     return ft.reduce(lambda a, b: jnp.where(a > b, a, b), x)
 
 
 class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
-    """Sweeps, and a failure where they do not solve the stage equations. All is done in
-    `init`: there are no steps after it."""
+    """Solves the stage equations by sweeps, in `init`; fails if they do not converge."""
 
     rtol: float = 0.0
     atol: float = 0.0
@@ -157,7 +156,7 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
 
 
 def without_rescue(solver: Any) -> Any:
-    """The same solver, and within it each that has a `PicardNewton`, with sweeps alone."""
+    """The solver, and all solvers in it, with `Sweeps` in place of `PicardNewton`."""
     is_implicit = lambda x: isinstance(x, AbstractImplicitStages)
 
     def replace(x: Any) -> Any:

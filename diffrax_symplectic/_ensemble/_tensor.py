@@ -1,4 +1,4 @@
-"""Arrays of JAX as lists of Dr.Jit arrays: one entry of each, for all paths."""
+"""Arrays of one path as lists of Dr.Jit arrays, each with one entry for all paths."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -10,19 +10,19 @@ from ._backend import drjit
 
 
 class Tensor(NamedTuple):
-    """An array in which each entry is an array of Dr.Jit, with a lane for each path. The
-    entries are in row-major order."""
+    """An array whose entries, in row-major order, are Dr.Jit arrays with one lane for each
+    path."""
 
     entries: list[Any]
     shape: tuple[int, ...]
 
     @property
     def places(self) -> np.ndarray:
-        """Where each entry is: what moves entries about is done to these numbers."""
+        """The positions of the entries. Rules that move entries act on these."""
         return np.arange(len(self.entries)).reshape(self.shape)
 
     def take(self, places: np.ndarray) -> "Tensor":
-        """The entries at these places."""
+        """The entries at these positions."""
         return Tensor([self.entries[i] for i in places.flat], places.shape)
 
     def item(self) -> Any:
@@ -39,7 +39,7 @@ def constant(kind: type, values: np.ndarray) -> Tensor:
 
 
 def known(x: Tensor) -> np.ndarray | None:
-    """The values, if Dr.Jit knows them: those of constants, and what it made of these."""
+    """The values, if Dr.Jit knows them: constants, and what it folded from constants."""
     literal = drjit().VarState.Literal
     if not all(e.state == literal for e in x.entries):
         return None
@@ -47,7 +47,7 @@ def known(x: Tensor) -> np.ndarray | None:
 
 
 def each(fn: Callable, *xs: Tensor) -> Tensor:
-    """A function of the entries. One entry stands for as many as the others have."""
+    """Applies a function entry by entry. A single entry is repeated as needed."""
     size = max(xs, key=lambda x: len(x.entries))
     spread = [
         x.entries

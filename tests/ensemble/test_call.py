@@ -169,7 +169,10 @@ def solved(t, p, q, args):
 REFUSED = [
     (waves, "numbers of type `complex<f64>`"),
     (ordered, "`stablehlo.sort`"),
-    (table, "`stablehlo.dynamic_slice` with an index of each path among 100 places"),
+    (
+        table,
+        "`stablehlo.dynamic_slice` with an index per path, among 100 places",
+    ),
     (solved, "a call of `lapack_dgetrf"),
 ]
 
