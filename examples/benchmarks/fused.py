@@ -2,15 +2,16 @@
 
     pip install '.[fused,examples]' && python -m examples.benchmarks.fused
 
-Prints the table of `docs/ensembles.md` and draws its picture. Only steps are timed: a call
-of `ensemble` takes some ten milliseconds more to check its arguments. All take turns, in
-many short runs, and the best run of each counts, so that it matters less what else the
-machine does.
+Prints the tables of `docs/ensembles.md` and draws its picture. Only steps are timed, and
+first calls: each later call of `ensemble` takes 10 to 30 milliseconds more to check its
+arguments. The engines take turns, in many short runs, and the best run of each counts, so
+that other load on the machine matters less.
 """
 
 import re
 import subprocess
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +28,7 @@ from diffrax_symplectic._ensemble._kernels import Kernels
 from diffrax_symplectic._ensemble._layout import split
 from diffrax_symplectic._expectation._steps import Problem
 
+from .. import rigid_body
 from ._timing import ensemble, keys, machine, race
 
 
@@ -67,19 +69,26 @@ def kicks(t, p, q, args):
     return 0.2 * q
 
 
+def field(t, s, args):
+    return s[2] + jnp.sum(s**2 * jnp.array([1.0, 0.5, 0.0]))
+
+
+def shake(t, s, args):
+    return 0.2 * s[0]
+
+
 class Case(NamedTuple):
-    H0: Callable
-    noise: Callable
+    """`make` takes a path to the terms of the system."""
+
+    make: Callable
     solver: diffrax.AbstractSolver
     y0: Any
     h: float
     shape: tuple[int, ...] = ()
-    path: Callable | None = None
+    path: Callable = ds.WeakBrownianPath
 
     def terms(self, key, dtype):
-        shape = jax.ShapeDtypeStruct(self.shape, dtype)
-        path = self.path or ds.WeakBrownianPath
-        return ds.hamiltonian_terms(self.H0, self.noise, path(shape, key))
+        return self.make(self.path(jax.ShapeDtypeStruct(self.shape, dtype), key))
 
     def start(self, dtype):
         return jax.tree.map(lambda x: jnp.asarray(x, dtype), self.y0)
@@ -87,21 +96,39 @@ class Case(NamedTuple):
 
 ONE, TWO = (0.0, 1.0), (jnp.array([0.2, 0.1]), jnp.array([0.0, -0.15]))
 line = lambda d: (jnp.linspace(-0.5, 0.5, d), jnp.linspace(0.3, 1.0, d))
-midpoint = lambda h: Case(kubo, kubo_noise, ds.ImplicitMidpoint(), ONE, h)
+of = lambda H0, noise: lambda path: ds.hamiltonian_terms(H0, noise, path)
+midpoint = lambda h: Case(of(kubo, kubo_noise), ds.ImplicitMidpoint(), ONE, h)
+coin = lambda shape, key: ds.WeakBrownianPath(shape, key, two_point=True)
 CASES = {
-    "pendulum, `StormerVerlet`": Case(pendulum, push, ds.StormerVerlet(), ONE, 0.02),
-    "oscillators, `BAOAB`": Case(pendulum, kicks, ds.BAOAB(0.5), ONE, 0.02),
+    "pendulum, `StormerVerlet`": Case(
+        of(pendulum, push), ds.StormerVerlet(), ONE, 0.02
+    ),
+    "pendulum, `BAOAB`": Case(of(pendulum, kicks), ds.BAOAB(0.5), ONE, 0.02),
     **{f"Kubo, `ImplicitMidpoint`, h = {h}": midpoint(h) for h in (0.01, 0.2, 0.4)},
-    "Kubo, `StrangGauss`, h = 0.1": Case(kubo, kubo_noise, ds.StrangGauss(), ONE, 0.1),
+    "Kubo, `StrangGauss`, h = 0.1": Case(
+        of(kubo, kubo_noise), ds.StrangGauss(), ONE, 0.1
+    ),
     "Henon-Heiles, `ImplicitMidpoint`, h = 0.1": Case(
-        henon_heiles, turn, ds.ImplicitMidpoint(), TWO, 0.1
+        of(henon_heiles, turn), ds.ImplicitMidpoint(), TWO, 0.1
+    ),
+    "Henon-Heiles, `NinomiyaVictoir`, h = 0.1": Case(
+        of(henon_heiles, turn), ds.NinomiyaVictoir(), TWO, 0.1, path=coin
+    ),
+    "rigid body, `ImplicitMidpoint`, h = 0.1": Case(
+        rigid_body.make_terms, ds.ImplicitMidpoint(), rigid_body.X0, 0.1
+    ),
+    "spin, `ImplicitMidpoint`, h = 0.1": Case(
+        lambda path: ds.spin_terms(field, shake, path),
+        ds.ImplicitMidpoint(),
+        ds.to_spinors(jnp.array([0.6, 0.0, 0.8])),
+        0.1,
     ),
     "pendulum, Diffrax's `Heun`, `UnsafeBrownianPath`": Case(
-        pendulum, push, diffrax.Heun(), ONE, 0.02, path=diffrax.UnsafeBrownianPath
+        of(pendulum, push), diffrax.Heun(), ONE, 0.02, path=diffrax.UnsafeBrownianPath
     ),
     **{
         f"chain of {d}, `StormerVerlet`": Case(
-            chain, kicks, ds.StormerVerlet(), line(d), 0.02, (d,)
+            of(chain, kicks), ds.StormerVerlet(), line(d), 0.02, (d,)
         )
         for d in (4, 16, 64)
     },
@@ -128,10 +155,9 @@ def by_drjit(case: Case, n: int, steps: int, dtype) -> Callable:
 
 
 def by_jax(case: Case, n: int, steps: int) -> Callable:
-    make = lambda path: ds.hamiltonian_terms(case.H0, case.noise, path)
-    path = lambda key: case.terms(key, jnp.float64).terms[1].path
+    path = lambda key: case.path(jax.ShapeDtypeStruct(case.shape, jnp.float64), key)
     y0, own = case.start(jnp.float64), keys(n)
-    batch = jax.jit(ensemble(make, path, case.solver, y0, case.h, steps))
+    batch = jax.jit(ensemble(case.make, path, case.solver, y0, case.h, steps))
     return lambda: batch(own)
 
 
@@ -145,6 +171,26 @@ def nanoseconds(case: Case, n: int, steps: int, single: bool = True) -> list[flo
         runs["float32"] = by_drjit(case, n, steps, jnp.float32)
     best = race(runs, ROUNDS)
     return [best[name] * 1e9 / (n * steps) for name in runs]
+
+
+def first_call(case: Case, engine: str, steps: int = 100) -> float:
+    """Seconds of the first call of `ensemble`, less those of the second."""
+    y0, terms, seconds = case.start(jnp.float64), case.terms(jr.key(0), jnp.float64), []
+    for _ in range(2):
+        begin = time.perf_counter()
+        ds.ensemble(
+            terms,
+            case.solver,
+            0.0,
+            steps * case.h,
+            case.h,
+            y0,
+            key=jr.key(1),
+            num_paths=FEW,
+            engine=engine,
+        )
+        seconds.append(time.perf_counter() - begin)
+    return seconds[0] - seconds[1]
 
 
 def by_c() -> Callable[[int], dict[float, float]]:
@@ -168,18 +214,46 @@ def main() -> None:
     print(f"{machine()}. float64, nanoseconds a path and step, {FEW:,} paths.\n")
     c = by_c()
     in_c = c(FEW)
-    print("| | fused | `vmap(diffeqsolve)` | ratio | in C | fused, float32 |")
-    print("|---|---|---|---|---|---|")
+    first_call(midpoint(0.1), "drjit")  # starts LLVM
+    print(
+        "| | fused | `vmap(diffeqsolve)` | ratio | in C | fused, float32 | "
+        "16,384 paths: fused | ratio | first call: fused | JAX |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
     for name, case in CASES.items():
         fused, jax_ns, single = nanoseconds(case, FEW, 20 if "of 64" in name else 100)
-        own = isinstance(case.solver, ds.ImplicitMidpoint) and case.H0 is kubo
-        shown = f"{in_c[case.h]:.1f}" if own else ""
+        many, jax_many = nanoseconds(case, 16 * FEW, 10, False)
+        first = [first_call(case, engine) for engine in ("drjit", "jax")]
+        shown = f"{in_c[case.h]:.1f}" if name.startswith("Kubo, `Impl") else ""
         print(
             f"| {name} | {fused:.1f} | {jax_ns:.0f} | {jax_ns / fused:.1f} | {shown} | "
-            f"{single:.1f} |",
+            f"{single:.1f} | {many:.1f} | {jax_many / many:.1f} | "
+            f"{first[0]:.1f} s | {first[1]:.1f} s |",
             flush=True,
         )
     draw(c)
+    print(f"Mean over 10^7 paths of 100 steps: {mean_of(10**7):.1f} s")
+
+
+def mean_of(n: int) -> float:
+    """Seconds of a second call of `expectation`, with 100 steps of the pendulum."""
+    case = CASES["pendulum, `StormerVerlet`"]
+    square = lambda t, y, args: y[1] ** 2
+    for number in (2**20, n):
+        begin = time.perf_counter()
+        ds.expectation(
+            square,
+            case.terms(jr.key(0), jnp.float64),
+            case.solver,
+            0.0,
+            100 * case.h,
+            case.h,
+            case.start(jnp.float64),
+            key=jr.key(1),
+            sampling=ds.IndependentPaths(number),
+            engine="drjit",
+        )
+    return time.perf_counter() - begin
 
 
 def draw(c: Callable) -> None:
