@@ -213,11 +213,10 @@ def test_a_way_back_that_is_lost_is_reported_for_that_path_alone():
         jax.block_until_ready(gradient(1, True))
 
 
-@pytest.mark.parametrize("y0", [0.0, 1e-12])
 @pytest.mark.parametrize(
     "path", [weak_path(1), ds.FixedStepBrownianPath((1,), jr.key(3))]
 )
-def test_the_way_back_leads_to_rest(path, y0):
+def test_the_way_back_leads_to_rest(path):
     # Three-point increments are zero in two steps of three: several first steps may rest.
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + 1 - jnp.sum(jnp.cos(q))
     terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: args * q, path)
@@ -233,10 +232,11 @@ def test_the_way_back_leads_to_rest(path, y0):
 
         adjoints = ds.ReversingAdjoint(), diffrax.RecursiveCheckpointAdjoint()
         over = lambda by: lambda key: jax.grad(end)(jnp.array([0.5]), key, by)
-        return [jax.vmap(over(by))(jr.split(jr.key(1), 100)) for by in adjoints]
+        return [jax.vmap(over(by))(jr.split(jr.key(1), 50)) for by in adjoints]
 
-    ours, theirs = gradients((jnp.array([y0]), jnp.zeros(1)))
-    np.testing.assert_allclose(ours, theirs, rtol=1e-7)
+    for momentum in (0.0, 1e-12):
+        ours, theirs = gradients((jnp.array([momentum]), jnp.zeros(1)))
+        np.testing.assert_allclose(ours, theirs, rtol=1e-7)
 
 
 def test_a_loss_on_the_way_back_is_not_forgotten_at_the_next_saved_state():
