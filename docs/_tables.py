@@ -54,7 +54,7 @@ def with_tables(markdown: str) -> str:
 
     def current(found: re.Match) -> str:
         text = table(found[1])
-        inside = f"\n\n{text}\n\n" if text.startswith("|") else text
+        inside = f"\n\n{text}\n\n" if text.startswith(("|", "**")) else text
         return f"<!-- solvers: {found[1]} -->{inside}<!-- end -->"
 
     return _TABLE.sub(current, markdown)
@@ -90,16 +90,17 @@ def _page(solver: AbstractSymplecticSolver) -> str:
 
 
 def _names() -> str:
-    """All public names in alphabetical order, each with the page that describes it."""
-    found = {}
-    for page in sorted(_DOCS.rglob("*.md")):
-        text, path = page.read_text(), page.relative_to(_DOCS)
-        for name in _OBJECT.findall(text):
-            title = re.findall("^# (.*)$", text, re.MULTILINE)[0]
-            link = f"[`{name}`]({path}#diffrax_symplectic.{name})"
-            found[name] = [link, title]
-    rows = [found[name] for name in sorted(found, key=str.lower)]
-    return _rows(["name", "described in"], rows)
+    """All public names in alphabetical order, a line for each letter, linked to where they
+    are described."""
+    lines: dict[str, dict[str, str]] = {}
+    for page in _DOCS.rglob("*.md"):
+        for name in _OBJECT.findall(page.read_text()):
+            where = f"{page.relative_to(_DOCS)}#diffrax_symplectic.{name}"
+            lines.setdefault(name[0].upper(), {})[name] = f"[`{name}`]({where})"
+    ordered = lambda names: [
+        names[x] for x in sorted(names, key=lambda x: (x.lower(), x))
+    ]
+    return "\n\n".join(f"**{x}** {', '.join(ordered(lines[x]))}" for x in sorted(lines))
 
 
 def _facts(solver: AbstractSymplecticSolver) -> dict[str, str]:
