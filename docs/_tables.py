@@ -17,6 +17,7 @@ from diffrax_symplectic._suggest import ranked, SOLVERS
 
 _TABLE = re.compile(r"<!-- solvers: (.*?) -->.*?<!-- end -->", re.DOTALL)
 _DOCS = Path(__file__).parent
+_SEVERAL = re.compile(r"; (\S+) if noises do not commute")
 _OBJECT = re.compile(r"^::: diffrax_symplectic\.(\w+)$", re.MULTILINE)
 # The page of a solver, by the module that it stands in.
 _PAGES = {
@@ -76,13 +77,15 @@ def table(name: str) -> str:
     elif name in _PAGES.values():
         solvers = [s for s in solvers if _page(s) == name]
         columns = ("solver", "noises", "when to choose it")
-        if name == "langevin":
+        if name in ("separable", "additive", "langevin"):  # any number of noises
             columns = ("solver", "when to choose it")
     else:
         raise ValueError(f"There is no table `{name}` of solvers.")
     rows = [_facts(s) for s in solvers]
     heads = [column.replace("name", "solver") for column in columns]
-    return _rows(heads, [[row[column] for column in columns] for row in rows])
+    text = _rows(heads, [[row[column] for column in columns] for row in rows])
+    # The overview is narrow.
+    return _SEVERAL.sub(r" (\1)", text) if name == "all" else text
 
 
 def _page(solver: AbstractSymplecticSolver) -> str:
