@@ -136,7 +136,7 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=None,
-        choose="Low accuracy at the cost of the midpoint rule.",
+        choose="Few digits at the cost of the midpoint rule.",
         suggested=("weak",),
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(

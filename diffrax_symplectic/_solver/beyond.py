@@ -142,8 +142,8 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         weak=2,
         strong=None,
         choose=(
-            "Two stage vectors for each noise and four for the drift: small errors, worth "
-            "the cost if the noises are few."
+            "Two stage vectors for each noise and four for the drift; its errors repay "
+            "them if the noises are few."
         ),
         noises="not commuting",
         suggested=("weak",),
@@ -265,7 +265,8 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=1,
         strong=1,
         choose=(
-            "The midpoint rule with Lévy areas: strong order 1 if noises do not commute."
+            "The midpoint rule with Lévy areas, which bring the order if noises do not "
+            "commute."
         ),
         noises="not commuting",
         suggested=("strong",),
@@ -325,7 +326,7 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=(2, 1),
         strong=(3 / 2, 1 / 2),
-        choose="Two stage vectors, and Lie brackets: accurate paths.",
+        choose="Two stage vectors, and brackets of the vector fields: accurate paths.",
         noises="commuting",
         suggested=("strong",),
     )

@@ -69,7 +69,7 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=(1, 1 / 2),
-        choose="Two midpoint steps in one: for paths if the error of the drift dominates.",
+        choose="Two midpoint steps in one: for paths whose error is that of the drift.",
     )
     a: float = free_parameter("a", 0.25)
 
@@ -109,7 +109,7 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=1,
         strong=None,
         choose=(
-            "The midpoint rule, for low accuracy: one stage vector, any number of noises."
+            "The midpoint rule: one stage vector for any number of noises, for few digits."
         ),
         suggested=("weak",),
     )
@@ -168,7 +168,7 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=(2, 1),
         strong=None,
-        choose="The paper's method of weak order 2. `StrangGauss` is cheaper.",
+        choose="The paper's method of its order. `StrangGauss` is cheaper.",
         noises="commuting",
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(

@@ -211,7 +211,7 @@ class LangevinMiddle(AbstractLangevinSplitting):
         weak=1,
         strong=1,
         choose="Langevin dynamics: for momenta and heat flows. It has the positions of "
-        "`BAOAB`, and momenta from half a step before.",
+        "`BAOAB`, and momenta of half a step before.",
         suggested=("weak", "strong"),
     )
     gamma: PyTree[ArrayLike] = eqx.field(converter=checked)

@@ -63,7 +63,7 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=None,
-        choose="Half of a stage vector, explicit noise: low accuracy for stiff systems.",
+        choose="Half of a stage vector, and the noise a kick: few digits of stiff systems.",
     )
     variant: Variant = eqx.field(default="c", static=True)
 
@@ -191,7 +191,7 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=1,
         strong=1,
         choose=(
-            "As `SRKs2`, with explicit noise: for many noises that are slow to evaluate."
+            "As `SRKs2`, with explicit noise: for many noises that cost much to evaluate."
         ),
     )
     a: float = free_parameter("a", 0.0)

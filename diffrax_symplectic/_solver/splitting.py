@@ -262,7 +262,7 @@ class LinearFlow(AbstractSplitting):
     flow: Callable[[RealScalarLike, Y, Args], Y]
 
     choose: ClassVar[str] = (
-        "Fast linear vibrations of lattices and molecules, which it moves exactly."
+        "Fast linear waves on lattices and bonds of molecules, which it moves exactly."
     )
 
     def __check_init__(self):
