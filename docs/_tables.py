@@ -1,4 +1,5 @@
-"""The tables of solvers in these pages, made from the solvers' records:
+"""The tables of solvers in these pages, made from the solvers' records, and the list of
+all public names:
 
     python docs/_tables.py
 
@@ -15,8 +16,18 @@ from diffrax_symplectic._suggest import ranked, SOLVERS
 
 
 _TABLE = re.compile(r"<!-- solvers: (.*?) -->.*?<!-- end -->", re.DOTALL)
-# The family of a solver, which has a page, is the module that it stands in.
-_FAMILIES = ("general", "separable", "additive", "beyond")
+_DOCS = Path(__file__).parent
+_SEVERAL = re.compile(r"; (\S+) if noises do not commute")
+_OBJECT = re.compile(r"^::: diffrax_symplectic\.(\w+)$", re.MULTILINE)
+# The page of a solver, by the module that it stands in.
+_PAGES = {
+    "general": "general",
+    "separable": "separable",
+    "additive": "additive",
+    "beyond": "beyond",
+    "langevin": "langevin",
+    "splitting": "langevin",
+}
 _STRUCTURES = {
     "any": "any Stratonovich system",
     "separable": "separable",
@@ -29,7 +40,7 @@ _NOISES = {
     "commuting": "one noise, or noises that commute",
     "not commuting": "noises that do not commute",
 }
-# Examples of those that have no defaults. A splitting is shown as one around any solver.
+# Examples of solvers without defaults. A splitting is shown around any solver.
 _SPLIT = (
     ds.BAOAB(1.0),
     ds.LangevinMiddle(1.0),
@@ -44,55 +55,79 @@ def with_tables(markdown: str) -> str:
 
     def current(found: re.Match) -> str:
         text = table(found[1])
-        inside = f"\n\n{text}\n\n" if text.startswith("|") else text
+        inside = f"\n\n{text}\n\n" if text.startswith(("|", "**")) else text
         return f"<!-- solvers: {found[1]} -->{inside}<!-- end -->"
 
     return _TABLE.sub(current, markdown)
 
 
 def table(name: str) -> str:
-    """The table of all solvers, of a family, or of what is suggested for `weak` or
-    `strong` approximation; or the names of those for any system."""
+    """The table of all solvers, of those of a page, or of what is suggested for `weak` or
+    `strong` approximation; the names of those for any system; or all public names."""
     solvers = [*(solver() for solver in SOLVERS), *_SPLIT]
     if name in ("weak", "strong"):
         return _suggested(name)
     if name == "names any":
         names = [f"`{s.__name__}`" for s in SOLVERS if s().structure == "any"]
         return f"{', '.join(names[:-1])} and {names[-1]}"
-    if name in _FAMILIES:
-        solvers = [s for s in solvers if type(s).__module__.endswith(f".{name}")]
-    elif name != "all":
+    if name == "names":
+        return _names()
+    if name == "all":
+        columns = ("name", "structure", "strong", "weak", "without noise", "solves for")
+    elif name in _PAGES.values():
+        solvers = [s for s in solvers if _page(s) == name]
+        columns = ("solver", "noises", "when to choose it")
+        if name in ("separable", "additive", "langevin"):  # any number of noises
+            columns = ("solver", "when to choose it")
+    else:
         raise ValueError(f"There is no table `{name}` of solvers.")
-    left_out: tuple[str, ...] = ()
-    if name in _FAMILIES:
-        left_out = ("when to choose it",)
-    if name in ("general", "beyond"):
-        left_out += ("structure",)
     rows = [_facts(s) for s in solvers]
-    columns = [column for column in rows[0] if column not in left_out]
-    return _rows(columns, [[row[column] for column in columns] for row in rows])
+    heads = [column.replace("name", "solver") for column in columns]
+    text = _rows(heads, [[row[column] for column in columns] for row in rows])
+    # The overview is narrow.
+    return _SEVERAL.sub(r" (\1)", text) if name == "all" else text
+
+
+def _page(solver: AbstractSymplecticSolver) -> str:
+    return _PAGES[type(solver).__module__.split(".")[-1]]
+
+
+def _names() -> str:
+    """All public names in alphabetical order, a line for each letter, linked to where they
+    are described."""
+    lines: dict[str, dict[str, str]] = {}
+    for page in _DOCS.rglob("*.md"):
+        for name in _OBJECT.findall(page.read_text()):
+            where = f"{page.relative_to(_DOCS)}#diffrax_symplectic.{name}"
+            lines.setdefault(name[0].upper(), {})[name] = f"[`{name}`]({where})"
+    ordered = lambda names: [
+        names[x] for x in sorted(names, key=lambda x: (x.lower(), x))
+    ]
+    return "\n\n".join(f"**{x}** {', '.join(ordered(lines[x]))}" for x in sorted(lines))
 
 
 def _facts(solver: AbstractSymplecticSolver) -> dict[str, str]:
     record = solver.record
     assert record is not None
     facts = {
+        "name": f"[`{type(solver).__name__}`]({_page(solver)}.md)",
         "solver": _code(solver),
         "structure": _STRUCTURES[solver.structure],
-        "chosen for noises": _NOISES[record.noises],
-        "strong order": _order(record.strong),
-        "weak order": _order(record.weak),
-        "order without noise": str(solver.order(None)),
-        "stage vectors solved": _stage_vectors(solver),
+        "noises": _NOISES[record.noises],
+        "strong": _order(record.strong),
+        "weak": _order(record.weak),
+        "without noise": str(solver.order(None)),
+        "solves for": _stage_vectors(solver),
         "when to choose it": record.choose,
     }
     if isinstance(solver, AbstractSplitting):
-        own = ("solver", "strong order", "weak order", "order without noise")
-        facts |= {column: "as `solver`" for column in facts if column not in own}
         facts |= {
-            "strong order": f"at most {solver.strong}",
-            "weak order": f"at most {solver.weak}",
-            "order without noise": "at most 2",
+            "structure": "as `solver`",
+            "noises": "as `solver`",
+            "strong": f"at most {solver.strong}",
+            "weak": f"at most {solver.weak}",
+            "without noise": "at most 2",
+            "solves for": "as `solver`",
             "when to choose it": solver.choose,
         }
     return facts
@@ -103,7 +138,6 @@ def _suggested(want: Want) -> str:
     structures = tuple(_STRUCTURES)
     of = lambda commute: ranked(want, structures, commute, 2)
     found = {type(s): s for commute in (True, False) for s in of(commute)}
-    order = {"weak": "weak order", "strong": "strong order"}[want]
     rows = []
     for solver in found.values():
         facts = _facts(solver)
@@ -111,8 +145,9 @@ def _suggested(want: Want) -> str:
         if noises != "any":
             system += f"; {_NOISES[noises]}"
         name = f"`{type(solver).__name__}`"
-        rows.append([name, system, facts[order], facts["when to choose it"]])
-    return _rows(["solver", "structure and noises", order, "when to choose it"], rows)
+        rows.append([name, system, facts[want], facts["when to choose it"]])
+    heads = ["solver", "structure and noises", f"{want} order", "when to choose it"]
+    return _rows(heads, rows)
 
 
 def _rows(columns, rows: list[list[str]]) -> str:
@@ -159,5 +194,5 @@ def _stage_vectors(solver: AbstractSymplecticSolver) -> str:
 
 
 if __name__ == "__main__":
-    for page in Path(__file__).parent.rglob("*.md"):
+    for page in _DOCS.rglob("*.md"):
         page.write_text(with_tables(page.read_text()))
