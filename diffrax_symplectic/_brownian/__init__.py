@@ -1,7 +1,6 @@
 from ._stepwise import AbstractStepwisePath, AbstractWrappedPath, GivenPath, Increment
 from ._stepwise import (
     checked_shape,
-    covers_all_times,
     increment_struct,
     is_random,
     laws_of,

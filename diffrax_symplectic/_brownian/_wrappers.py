@@ -41,17 +41,14 @@ class TruncatedBrownianPath(AbstractWrappedPath):
     r"""Bounds the increments of a Brownian path, for implicit strong methods.
 
     Over a step of size $h < 1$ an increment $\sqrt h\,\xi$ becomes
-    $\sqrt h\,\max(-A_h, \min(\xi, A_h))$ with $A_h = \sqrt{2 k |\ln h|}$. A Gaussian
-    increment is unbounded, so that at any step size an implicit stage has, with positive
-    probability, no solution; a truncated one is bounded by $\sqrt{2 k h |\ln h|}$. The
-    price is a mean-square error $\mathbb E[(\xi - \xi_h)^2] \leq h^k$: take $k$ at least
-    twice the strong order of the method.
+    $\sqrt h\,\max(-A_h, \min(\xi, A_h))$ with $A_h = \sqrt{2 k |\ln h|}$. With unbounded
+    Gaussian increments an implicit stage has no solution, with positive probability, at any
+    step size. The price is a mean-square error $\mathbb E[(\xi - \xi_h)^2] \leq h^k$: take
+    $k$ at least twice the strong order of the method.
 
     Steps have to be well below one unit of time, where the bound becomes 0: for `k=2` an
     increment keeps 97% of its variance at $h = 1/4$, 84% at $h = 1/2$ and 28% at
-    $h = 0.9$.
-
-    Lévy areas of the wrapped path are kept as they are. Step sizes have to be fixed.
+    $h = 0.9$. Lévy areas do not change. Step sizes have to be fixed.
 
     **Source:** [Milstein, Repin and Tretyakov
     (2002)](https://doi.org/10.1137/S0036142901395588).
@@ -66,9 +63,9 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         - `path`: any Brownian path of Diffrax.
         - `k`: the integer $k \\geq 1$ above.
 
-        **Raises:** a `ValueError` if `k` is not a positive integer, if `path` is no
-        Brownian path, or one of bounded increments. An error when run if a step is not
-        shorter than one unit of time, where $A_h$ has no meaning.
+        **Raises:** a `ValueError` if `k` is not a positive integer, or if `path` is no
+        Brownian path, or has bounded increments; an error when run if a step is not shorter
+        than one unit of time.
         """
         if not isinstance(path, diffrax.AbstractBrownianPath):
             raise ValueError(
@@ -77,8 +74,8 @@ class TruncatedBrownianPath(AbstractWrappedPath):
             )
         if isinstance(path, WeakBrownianPath):
             raise ValueError(
-                "The increments of a `WeakBrownianPath` are bounded already, and to cut "
-                "them off would change their moments. Pass it as it is."
+                "The increments of a `WeakBrownianPath` are bounded already, and "
+                "truncation would change their moments. Pass it as it is."
             )
         if isinstance(k, bool) or not isinstance(k, int) or k < 1:
             raise ValueError(
@@ -98,14 +95,12 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         increment = self.path.evaluate(t0, t1, use_levy=use_levy)
-        no_words = jnp.zeros(0, jnp.uint32)
-        return self.changed(increment, no_words, t1 - t0, use_levy)
+        return self.changed(increment, None, t1 - t0, use_levy)
 
     def num_own_words(self, use_levy: bool) -> int:
         return 0
 
     def changed(self, increment, own_words, h, use_levy) -> Increment:
-        del own_words, use_levy
         h = jnp.abs(h)
         h = eqx.error_if(
             h,
@@ -129,9 +124,8 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
     r"""Increment, space-time Lévy area and plateaus over a step of size $h$.
 
-    The path over the step stands for two plateaus, of height $M - C$ over its first half
-    and $M + C$ over its second. $M = W / 2 + H$ is the mean of the Brownian path over the
-    step, and
+    The Brownian path is replaced by two plateaus, of height $M - C$ over the first half of
+    the step and $M + C$ over the second. $M = W / 2 + H$ is its mean over the step, and
 
     $$C = \pm\sqrt{\tfrac{1}{15} h + \tfrac{1}{12} W^2 + \tfrac15 H^2}$$
 
@@ -154,7 +148,7 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
 
 
 def _offset(h, W, H, sign):
-    # In a solve backward in time Diffrax changes all signs, that of the step size included.
+    # In a solve backward in time Diffrax changes all signs, also of the step size.
     h = jnp.abs(h).astype(W.dtype)
     size = jnp.sqrt(h / 15 + W**2 / 12 + H**2 / 5)
     return jnp.copysign(size, sign)
