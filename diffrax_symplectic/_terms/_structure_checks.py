@@ -1,5 +1,5 @@
-"""Whether a system has the structure that a family of methods relies on: decided by the
-flow of data through the vector fields, or by what the user asserts."""
+"""Whether a system has the structure that a family of methods relies on: decided by what
+the vector fields depend on, or by what the user asserts."""
 
 import functools as ft
 from collections.abc import Callable
@@ -21,12 +21,12 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from ._dependence import Dependence
 from ._hamiltonian import asserted_structure, has_lifted, is_hamiltonian
-from ._vector_fields import apply, check_controls, product, split_terms
+from ._vector_fields import apply, split_terms
 
 
 class Fault(NamedTuple):
-    """Why a system does not have a structure, what may be done about it, and whether it is
-    a force of plain terms that depends on the momentum, as friction does."""
+    """Why a system does not have a structure, what can be done about it, and whether the
+    fault is a force of plain terms that depends on the momentum, as friction does."""
 
     reason: str
     advice: str
@@ -42,14 +42,12 @@ def check_structure(
     args: Args,
     solver: str,
 ) -> None:
-    """Raises a `ValueError`, while tracing, unless a system has the structure that a solver
-    is for."""
+    """Raises a `ValueError` unless a system has the structure that a solver needs."""
     if structure not in get_args(Structure):
         raise ValueError(
             f"`structure` of the tableau of `{solver}` must be one of "
             f"{get_args(Structure)}; got {structure!r}."
         )
-    check_controls(noise, t0, y0, args)
 
     def refuse(needs: str, fault: Fault | None) -> None:
         if fault is None:
@@ -78,17 +76,15 @@ def separable_fault(
     if it is of this form."""
     if fault := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", fault)
-    drift_flows = [
-        (is_hamiltonian(x), len(drift) > 1, _flow(x, t0, y0, args))
-        for x in _not_asserted(drift, "separable")
-    ]
+    drift, noise = (_not_asserted(terms, "separable") for terms in (drift, noise))
+    drift_flows = [(is_hamiltonian(x), _flow(x, t0, y0, args)) for x in drift]
     noise_flows = [
         (
             is_hamiltonian(x),
             _flow(x, t0, y0, args),
             ft.partial(_is_zero, x, t0, y0, args),
         )
-        for x in _not_asserted(noise, "separable")
+        for x in noise
     ]
     here, exchanged = (_faults(p, drift_flows, noise_flows) for p in (0, 1))
     if not here:
@@ -103,17 +99,17 @@ def separable_fault(
 
 def _faults(
     p: int,
-    drift: list[tuple[bool, bool, Dependence]],
+    drift: list[tuple[bool, Dependence]],
     noise: list[tuple[bool, Dependence, Callable[[int], bool]]],
 ) -> list[Fault]:
-    """The faults, if the momenta are the first half of the state, `p = 0`, or the second
-    one, `p = 1`. With each term: whether it comes from Hamiltonians. With each drift term:
-    whether there are others. With each noise term: a function that tells whether a half
-    stays unchanged."""
+    """The faults, if momenta are the first half of the state, `p = 0`, or the second one,
+    `p = 1`. Each term comes with whether it is Hamiltonian, and noise also with a function
+    that tells whether it leaves a half of the state unchanged."""
     q, faults, advice = 1 - p, [], _advice("separable")
     dp, dq = (lambda out: out[p]), (lambda out: out[q])
     of_p, of_q = (lambda t, y, control: y[p]), (lambda t, y, control: y[q])
-    for hamiltonian, others, flow in drift:
+    beside = " beside that of H0" if len(drift) > 1 else ""
+    for hamiltonian, flow in drift:
         for part, of, derivative, rate in (
             (dp, of_p, "dH0/dq depends on p", "dp/dt depend on p"),
             (dq, of_q, "dH0/dp depends on q", "dq/dt depend on q"),
@@ -121,10 +117,10 @@ def _faults(
         ):
             if not flow.independent(of, part):
                 friction = part is dp and not hamiltonian
-                beside = " beside that of H0" if others else ""
                 plain = f"a drift term{beside} makes {rate}"
-                reason = derivative if hamiltonian else plain
-                faults.append(Fault(reason, advice, friction))
+                faults.append(
+                    Fault(derivative if hamiltonian else plain, advice, friction)
+                )
     for hamiltonian, flow, zero in noise:
         # The change of q is linear in the increment: if it does not depend on the
         # increment, it is zero.
@@ -133,7 +129,7 @@ def _faults(
             reason = "dH_k/dp is not zero" if hamiltonian else plain
             faults.append(Fault(reason, advice))
         elif not flow.independent(of_p, dp):
-            plain = "a noise term changes p by what depends on p"
+            plain = "a noise term changes p by an amount that depends on p"
             reason = "dH_k/dq depends on p" if hamiltonian else plain
             faults.append(Fault(reason, advice))
     return faults
@@ -164,9 +160,9 @@ def check_stratonovich(
     y0: Y,
     args: Args,
 ) -> None:
-    """Raises a `ValueError` if a solver in the sense of Ito is to solve terms made from
-    Hamiltonians, which are in the sense of Stratonovich. Both agree for additive noise, and
-    for noise that changes `p` and depends on `q` alone."""
+    """Raises a `ValueError` if an Ito solver is to solve the terms of Hamiltonians, which
+    are Stratonovich. Both agree for additive noise, and for noise that changes `p` and
+    depends on `q` alone."""
     drift, noise = split_terms(terms)
     # A drift beside `H0` may be the correction from one sense to the other.
     corrected = not all(map(is_hamiltonian, drift))
@@ -175,10 +171,10 @@ def check_stratonovich(
     noise = tuple(filter(is_hamiltonian, noise))
     if additive_fault(noise, t0, y0, args) and separable_fault((), noise, t0, y0, args):
         raise ValueError(
-            f"`{type(solver).__name__}` solves equations in the sense of Ito. Those of "
+            f"`{type(solver).__name__}` solves equations in the sense of Ito. The terms of "
             "`hamiltonian_terms` are in the sense of Stratonovich, and here they differ. "
             "Use a solver of this package, or a Stratonovich solver of Diffrax such as "
-            "`diffrax.Heun`. If Ito's sense is meant, add the drift that corrects it."
+            "`diffrax.Heun`. If you mean an Ito equation, add the drift that corrects it."
         )
 
 
@@ -186,13 +182,13 @@ def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> Dependence:
     """The change of the state by a term, as a program of time, state and control."""
     t0 = jnp.asarray(t0, jnp.result_type(float))
     control = eqx.filter_eval_shape(term.contr, t0, t0)
-    change = lambda t, y, control: product(term, t, y, args, control)
+    change = lambda t, y, control: term.vf_prod(t, y, args, control)
     return Dependence(change, t0, y0, control)
 
 
 def _is_zero(term: diffrax.AbstractTerm, t0, y0: Y, args: Args, half: int) -> bool:
-    """Whether the noise of a plain term is known while tracing to leave one half of the
-    state unchanged, as a matrix of noises with a block of zeros does."""
+    """Whether a plain noise term is known while tracing to leave one half of the state
+    unchanged, by a block of zeros in its matrix."""
     if is_hamiltonian(term):
         return False
     struct = eqx.filter_eval_shape(term.contr, t0, t0)
@@ -200,7 +196,7 @@ def _is_zero(term: diffrax.AbstractTerm, t0, y0: Y, args: Args, half: int) -> bo
         zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
         flat, unravel = jfu.ravel_pytree(zeros)
         changes = [
-            product(unwrapped(term), t0, y0, args, unravel(unit))[half]
+            unwrapped(term).vf_prod(t0, y0, args, unravel(unit))[half]
             for unit in jnp.eye(flat.size, dtype=flat.dtype)
         ]
     known = lambda x: not isinstance(x, jax.core.Tracer)
@@ -221,9 +217,9 @@ def _advice(structure: str) -> str:
         "additive": "each H_k as a function linear in p and q, such as `-sigma * q`",
     }[structure]
     return (
-        "Variables count that cancel, are multiplied by zero or printed, or share an array "
-        f"with others. If it is only that, write {how}, or pass "
-        f'`structure="{structure}"` to `hamiltonian_terms`. If not, {_GENERAL}.'
+        "Variables also count if they cancel, are multiplied by zero or printed, or share "
+        f"an array with others. In that case write {how}, or pass "
+        f'`structure="{structure}"` to `hamiltonian_terms`. Otherwise {_GENERAL}.'
     )
 
 
@@ -242,16 +238,15 @@ FRICTION = (
 
 def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish at random states, for
-    these `t0` and `args`. False if this cannot be tested. This is advice, no proof.
+    these `t0` and `args`; false if this cannot be tested. This is advice, no proof.
 
-    The bracket is bilinear. So it is enough to test the bracket of two random linear
-    combinations of the noises.
+    The bracket is bilinear: it is tested for two random combinations of the noises.
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
     struct = eqx.filter_eval_shape(lambda: [term.contr(t0, t0) for term in noise])
 
     leaves, treedef = jtu.tree_flatten((y0, struct, struct))
-    # Most functions are defined between 0 and 1, even if they are not everywhere.
+    # Most functions are defined between 0 and 1.
     laws = jr.normal, jr.uniform
     draw = lambda law, key: treedef.unflatten(
         law(k, jnp.shape(x), jnp.result_type(x))
@@ -263,9 +258,9 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     @jax.vmap
     def sizes(point):
         y, x, z = point
-        along = lambda control: lambda y: apply(noise, control, args, t0, y)
-        first = jax.jvp(along(z), (y,), (along(x)(y),))[1]
-        second = jax.jvp(along(x), (y,), (along(z)(y),))[1]
+        b = lambda control: lambda y: apply(noise, control, args, t0, y)
+        first = jax.jvp(b(z), (y,), (b(x)(y),))[1]
+        second = jax.jvp(b(x), (y,), (b(z)(y),))[1]
         bracket = (first**ω - second**ω).ω
         return largest(first), largest(bracket)
 
@@ -277,7 +272,7 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
             small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
             found = jax.block_until_ready(jnp.any(finite) & jnp.all(small | ~finite))
     except RuntimeError:
-        # A check of the user's, by `equinox.error_if`, at states the user never chose.
+        # A user's `equinox.error_if`, at states that the user never chose.
         return False
     # While JAX traces what surrounds this, there are no values.
     return not isinstance(found, jax.core.Tracer) and bool(found)
