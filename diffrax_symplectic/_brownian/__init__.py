@@ -4,6 +4,7 @@ from ._stepwise import (
     increment_struct,
     is_random,
     laws_of,
+    step_size,
     stepwise,
     UnspecifiedPath,
 )

@@ -261,39 +261,21 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         return self.path.evaluate(t0, t1, **kwargs)
 
     def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
-        # The result has the structure of the state. In place of each array there is a tree
-        # with the structure of the noises, of arrays of shape `(*state, *noise)`.
-        struct, hamiltonians = self._checked(t, y, args)
-        jac = jax.jacrev(hamiltonians)(y)
-        noise_def, state_def = jtu.tree_structure(struct), jtu.tree_structure(y)
-
-        def noise_last(entry):
-            move = lambda x, s: jnp.moveaxis(x, range(s.ndim), range(-s.ndim, 0))
-            return jtu.tree_map(move, jtu.tree_unflatten(noise_def, entry), struct)
-
-        rows = [state_def.flatten_up_to(row) for row in noise_def.flatten_up_to(jac)]
-        entries = [noise_last(entry) for entry in zip(*rows)]
-        dp, dq = jtu.tree_unflatten(state_def, entries)
+        # For each array of the state, with an axis of all noises behind its own.
+        hamiltonians = self._checked(t, y, args)
+        flat = lambda y: jfu.ravel_pytree(hamiltonians(y))[0]
+        last = lambda x: jnp.moveaxis(x, 0, -1)
+        dp, dq = jtu.tree_map(last, jax.jacrev(flat)(y))
         return (-(dq**ω)).ω, dp
 
     def prod(self, vf: PyTree[Array], control: BM) -> _State:
-        structure = jtu.tree_structure(control)
-
-        def contract(entry):
-            terms = jtu.tree_map(
-                lambda v, c: jnp.tensordot(v, c.astype(v.dtype), axes=c.ndim),
-                entry,
-                control,
-            )
-            return sum(jtu.tree_leaves(terms))
-
-        is_entry = lambda x: jtu.tree_structure(x) == structure
-        return jtu.tree_map(contract, vf, is_leaf=is_entry)
+        flat, _ = jfu.ravel_pytree(control)
+        return jtu.tree_map(lambda v: jnp.tensordot(v, flat.astype(v.dtype), 1), vf)
 
     def vf_prod(
         self, t: RealScalarLike, y: _State, args: Args, control: BM | OneNoise
     ) -> _State:
-        _, hamiltonians = self._checked(t, y, args)
+        hamiltonians = self._checked(t, y, args)
 
         def scalar(p, q):
             if isinstance(control, OneNoise):
@@ -313,9 +295,9 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         struct = increment_struct(self.path)
         return sum(s.size for s in jtu.tree_leaves(struct)) > 2
 
-    def _checked(self, t, y: _State, args) -> tuple[PyTree, Callable]:
-        """The structure of the noise, and its Hamiltonians as a function of the state. A
-        `ValueError` if they do not depend on it."""
+    def _checked(self, t, y: _State, args) -> Callable:
+        """The noise Hamiltonians as a function of the state; a `ValueError` if they do not
+        depend on it."""
         check_pair(y)
         struct = increment_struct(self.path)
         hamiltonians = lambda y: self._hamiltonians(t, *y, args, struct)
@@ -326,7 +308,7 @@ class HamiltonianNoise(diffrax.AbstractTerm):
                 "momentum, dp_k = sigma_k dw_k, `noise = lambda t, p, q, args: -sigma * "
                 "q`. For no noise solve the drift alone, `terms.terms[0]`."
             )
-        return struct, hamiltonians
+        return hamiltonians
 
     def _hamiltonians(self, t, p, q, args, struct) -> PyTree[Array]:
         """The noise Hamiltonians, in the structure and shapes of the path."""
