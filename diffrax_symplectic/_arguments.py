@@ -15,8 +15,7 @@ from ._custom_types import Y
 
 
 def check_takes(name: str, fn: Any, *arguments: str) -> None:
-    """Raises a `ValueError` unless `fn` can be called with these arguments, and names none
-    of them in another order."""
+    """Raises a `ValueError` unless `fn` takes these arguments, in this order."""
     call = f"`{name}({', '.join(arguments)})`"
     if not callable(fn):
         raise ValueError(f"`{name}` must be a function, called as {call}; got {fn!r}.")

@@ -1,11 +1,8 @@
-"""Coefficients as data.
+"""Coefficients as data, in the notation of the paper.
 
-A tableau holds the coefficients of a family of methods in the notation of the paper. Every
-tableau also *flattens*: each evaluation of one vector field becomes one `Stage`, and the
-tableau becomes one square matrix between stages and one vector of weights, whatever the
-family. Whether a method is symplectic, which stages are used, which are equal, and in which
-order the implicit ones are solved for can then be read off that one matrix, by code that is
-the same for all families.
+A tableau flattens to one square matrix between stages, each one evaluation of a vector
+field, and one vector of weights. They decide, for all families alike, whether a method is
+symplectic, which stages are used or equal, and in which order they are solved.
 """
 
 import abc
@@ -17,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 
-# Which structure of the Hamiltonians coefficients are for: any; `H0 = V(p) + U(t, q)` and
-# `H_k = U_k(t, q)`; noise that does not depend on the state; and on time neither; or both
-# the second and the last.
+# The Hamiltonians that coefficients are for: any; `H0 = V(p) + U(t, q)` and `H_k = U_k(t,
+# q)`; noise that does not depend on the state; noise that depends neither on the state nor
+# on time; the second and the last together.
 Structure: TypeAlias = Literal[
     "any", "separable", "additive", "constant", "separable and constant"
 ]
@@ -28,9 +25,8 @@ Structure: TypeAlias = Literal[
 class Stage(NamedTuple):
     """One evaluation, `y -> sum over channels of (vector field times control)`.
 
-    - `channels`: the controls that drive it: `"h"` is the drift, driven by time; any
-        other name is the noise, driven by the random variable of that name among the
-        attributes of the Brownian increment.
+    - `channels`: the controls that drive it: `"h"` for the drift, or the name of a random
+        variable, an attribute of the Brownian increment, for the noise.
     - `c`: where in the step it is evaluated, as a fraction of the step.
     - `reads`: the part of the state it depends on, `"y"` (all), `"p"`, `"q"` or `""`.
     - `writes`: the part of the state it changes, `"y"`, `"p"` or `"q"`.
@@ -74,10 +70,9 @@ class FlatTableau:
 class AbstractTableau(abc.ABC):
     """What every tableau offers.
 
-    - `structure`: which structure of the Hamiltonians the coefficients are for, `"any"`,
+    - `structure`: the structure of the Hamiltonians that the coefficients are for, `"any"`,
         `"separable"`, `"additive"`, `"constant"` (additive, and not dependent on time) or
-        `"separable and constant"`.
-        Every solve checks that its terms have it, while tracing, before its first step.
+        `"separable and constant"`. Every solve checks it, while tracing.
     """
 
     structure: ClassVar[Structure]
@@ -117,7 +112,7 @@ def _check(tableau: AbstractTableau, **shapes: tuple[int, ...]) -> None:
 
 
 def _check_by_variable(tableau: AbstractTableau, **shapes: tuple[int, ...]) -> None:
-    """Brings coefficients into the form of a dictionary over the random variables."""
+    """As `_check`, for dictionaries over the random variables."""
     for name, shape in shapes.items():
         value = getattr(tableau, name)
         named = value if isinstance(value, Mapping) else {"W": value}
@@ -130,9 +125,8 @@ def _check_by_variable(tableau: AbstractTableau, **shapes: tuple[int, ...]) -> N
 def _side_by_side(
     *parts: tuple[Mapping[str, np.ndarray], tuple[int, ...]],
 ) -> tuple[list[str], list[np.ndarray]]:
-    """For coefficients by random variable, each with their shape: all variables, in the
-    order of their first appearance; and each of the coefficients for all of these, side by
-    side, zero where there are none."""
+    """All random variables of some coefficients, each with their shape, in the order of
+    first appearance; and the coefficients for all of these, side by side."""
     names = list(dict.fromkeys(name for part, _ in parts for name in part))
     return names, [
         np.concatenate([part.get(name, np.zeros(shape)) for name in names], axis=-1)
@@ -157,9 +151,9 @@ class GeneralTableau(AbstractTableau):
     $$y_{n+1} = y_n + h \sum_i \alpha_i a(t_n + c^0_i h, G^0_i)
       + \sum_k \sum_i \beta_i b_k(t_n + c^1_i h, G^k_i) I_k$$
 
-    with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$. Here $B^3 = B^1$: with that choice
-    the stages $G^k_i$ are the same vector for every $k$, a step costs the same whatever
-    the number of noises, and the condition on $B^3$ follows from the one on $B^1$.
+    with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$. Here $B^3 = B^1$: then the stages
+    $G^k_i$ are the same vector for every $k$, whatever the number of noises, and the
+    condition on $B^3$ follows from the one on $B^1$.
 
     **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
     `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`, `B1` of shape `(r, r)`;
@@ -230,9 +224,9 @@ class SeparableTableau(AbstractTableau):
     with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$.
 
     **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
-    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`. `beta` and `B0` may also be
-    dictionaries from the names of several random variables, of which `"W"` is $I_k$, to
-    such arrays: then the equations hold with a sum over these.
+    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`. For a sum over several random
+    variables `beta` and `B0` are dictionaries from their names, of which `"W"` is $I_k$, to
+    such arrays.
 
     **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
     real numbers.
@@ -252,15 +246,8 @@ class SeparableTableau(AbstractTableau):
 
     def partitioned(self) -> "PartitionedTableau":
         """The same method with its coefficients for velocities written out."""
-        return PartitionedTableau(
-            alpha=self.alpha,
-            alpha_hat=self.alpha,
-            beta=self.beta,
-            A=self.A0,
-            A_hat=self.A0,
-            B0=self.B0,
-            A1=self.A1,
-        )
+        alpha, A = self.alpha, self.A0
+        return PartitionedTableau(alpha, alpha, self.beta, A, A, self.B0, self.A1)
 
     def flatten(self) -> FlatTableau:
         return self.partitioned().flatten()
@@ -269,8 +256,8 @@ class SeparableTableau(AbstractTableau):
 @dataclasses.dataclass(frozen=True, eq=False)
 class PartitionedTableau(AbstractTableau):
     r"""As [`diffrax_symplectic.SeparableTableau`][], with coefficients $A$ and $\alpha$ for
-    the forces $f$ and others, $\hat A$ and $\hat \alpha$, for the velocities $g$: what
-    explicit symplectic methods need.
+    the forces $f$, and others, $\hat A$ and $\hat \alpha$, for the velocities $g$, as
+    explicit symplectic methods have them.
 
     $$p_i = P + h \sum_j A_{ij} f(t_n + \hat c_j h, q_j)
       + \sum_k \sum_j B^0_{ij} \sigma_k(t_n + c^1_j h, \bar q_j) I_k, \qquad
@@ -306,10 +293,9 @@ class PartitionedTableau(AbstractTableau):
         s, v, r = len(self.alpha), len(self.alpha_hat), len(self.A1)
         names, (B0, beta) = _side_by_side((self.B0, (v, r)), (self.beta, (r,)))
         A1 = np.concatenate([self.A1] * len(names))
-        # Forces come first. Where either forces or velocities may be solved for, this makes
-        # the forces the unknowns: they cost more to evaluate.
+        # Forces come first, which makes them the unknowns: they cost more to evaluate.
         stages = [Stage(("h",), float(c), "q", "p") for c in self.A_hat.sum(axis=1)]
-        # Velocities do not depend on time, so that all of their stages may have the time 0.
+        # Velocities do not depend on time.
         stages += [Stage(("h",), 0.0, "p", "q") for _ in range(v)]
         stages += [
             Stage((name,), float(c), "q", "p")

@@ -1,6 +1,6 @@
 """Spins and rigid bodies: canonical pairs `(p, q)` in place of vectors `s` of R^3."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import diffrax
 import equinox as eqx
@@ -12,12 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._arguments import check_pair
 from .._custom_types import Args, RealScalarLike
-from ._hamiltonian import (
-    evaluated,
-    lifted_terms,
-    scalar_energy,
-    symplectic_gradient,
-)
+from ._hamiltonian import evaluated, lifted_terms, scalar_energy
 
 
 _Spins = Float[Array, "*spins 3"]
@@ -125,10 +120,19 @@ class _DampedPrecession(eqx.Module):
             )
         # Traced values cannot raise an error here: they make their path fail.
         alpha = jnp.where(jnp.isfinite(alpha) & (alpha >= 0), alpha, jnp.nan)
-        # Held fixed, so that the drift is that of the Hamiltonian `omega . s(p, q)`.
-        omega = gradient + alpha[..., None] * jnp.cross(s, gradient)
-        lifted = lambda p, q: jnp.sum(omega * from_spinors((p, q)))
-        return symplectic_gradient(lifted, y)
+        (s1, s2, s3), (g1, g2, g3) = _components(s), _components(gradient)
+        w1 = g1 + alpha * (s2 * g3 - s3 * g2)
+        w2 = g2 + alpha * (s3 * g1 - s1 * g3)
+        w3 = g3 + alpha * (s1 * g2 - s2 * g1)
+        # `symplectic_gradient` of `omega . s(p, q)`, which would take 1.3 times as long.
+        (p1, p2), (q1, q2) = map(_components, y)
+        dp = -(w1 * q2 - w2 * p2 + w3 * q1), -(w1 * q1 + w2 * p1 - w3 * q2)
+        dq = w1 * p2 + w2 * q2 + w3 * p1, w1 * p1 - w2 * q1 - w3 * p2
+        return jnp.stack(dp, axis=-1) / 2, jnp.stack(dq, axis=-1) / 2
+
+
+def _components(x: Float[Array, "*spins d"]) -> Sequence[Float[Array, " *spins"]]:
+    return jnp.moveaxis(jnp.asarray(x), -1, 0)  # pyright: ignore
 
 
 def from_spinors(y: _Spinors) -> _Spins:
@@ -158,7 +162,7 @@ def from_spinors(y: _Spinors) -> _Spins:
             "The state of spins is a pair `(p, q)` of arrays of shape `(..., 2)`: pass "
             f"`y0=to_spinors(s0)`. Got {eqx.tree_pformat(y)}."
         )
-    (p1, p2), (q1, q2) = jnp.moveaxis(jnp.asarray(p), -1, 0), jnp.moveaxis(q, -1, 0)
+    (p1, p2), (q1, q2) = _components(p), _components(q)
     s1 = (q1 * q2 + p1 * p2) / 2
     s2 = (p1 * q2 - q1 * p2) / 2
     s3 = (q1**2 + p1**2 - q2**2 - p2**2) / 4
