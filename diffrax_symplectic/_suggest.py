@@ -4,7 +4,7 @@ import dataclasses
 import functools as ft
 import textwrap
 from collections.abc import Callable, Collection, Sequence
-from typing import get_args
+from typing import cast, get_args
 
 import diffrax
 import jax
@@ -288,8 +288,8 @@ def _suggestion(
         code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
     return Suggestion(
         solver=solver,
-        weak_order=record.weak_order(commute),
-        strong_order=record.strong_order(commute),
+        weak_order=cast(int, record.order("weak", commute)),
+        strong_order=record.order("strong", commute),
         path=code,
         reason=record.choose,
         terms=jtu.Partial(with_paths, ft.partial(solver.path, want=want), terms),

@@ -43,28 +43,6 @@ def hamiltonian_terms(
     a step is the gradient of one scalar, $\sum_k I_k H_k$, and costs one reverse pass
     whatever the number of noises.
 
-    !!! example
-
-        ```python
-        import diffrax
-        import diffrax_symplectic as ds
-        import jax.numpy as jnp
-        import jax.random as jr
-
-        def H0(t, p, q, args):
-            return (p**2 + q**2) / 2
-
-        def noise(t, p, q, args):
-            return jnp.stack([args * q, args * p * q])
-
-        path = ds.WeakBrownianPath(shape=(2,), key=jr.key(0))
-        terms = ds.hamiltonian_terms(H0, noise, path)
-        y0 = (jnp.array(0.0), jnp.array(1.0))
-        sol = diffrax.diffeqsolve(
-            terms, ds.ImplicitMidpoint(), t0=0, t1=1, dt0=0.01, y0=y0, args=0.1
-        )
-        ```
-
     **Arguments:**
 
     - `H0`: `H0(t, p, q, args)`, a scalar. A function, or a Module with parameters;

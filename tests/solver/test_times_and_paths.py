@@ -181,11 +181,11 @@ def test_noises_that_do_not_fit_their_control_term_are_refused(solver, operator)
 
     # By Lineax, JAX, or what the terms return in place of the state.
     for shape, y0 in (((3,), jnp.ones(2)), ((2,), jnp.ones(3))):
-        with pytest.raises((TypeError, ValueError), match="shape|structure|mv|different dynamic"):
+        with pytest.raises((TypeError, ValueError), match="shape|structure|different"):
             solve(shape, y0)
     single = jax.ShapeDtypeStruct((2,), jnp.float32)
     if operator:
-        with pytest.raises(ValueError, match="structure|mv|different dynamic"):
+        with pytest.raises(ValueError, match="structure|different"):
             solve(single, jnp.ones(2))
     else:
         # Diffrax multiplies arrays of different precision.
