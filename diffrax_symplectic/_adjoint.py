@@ -115,29 +115,38 @@ ReversingAdjoint.__init__.__doc__ = """**Arguments:**
 
 
 def _check_supported(solver, controller, event, saveat) -> None:
-    name = type(solver).__name__
-    advice = "Or pass `adjoint=diffrax.RecursiveCheckpointAdjoint()`."
-    if not _undoes_its_steps(solver):
-        raise ValueError(
-            f"`ReversingAdjoint` needs a solver that undoes its own steps, and `{name}` "
-            f"does not. Use `ImplicitMidpoint`, `StormerVerlet` or `StrangGauss`. {advice}"
-        )
-    if not isinstance(controller, diffrax.ConstantStepSize | diffrax.StepTo):
-        raise ValueError(
-            "`ReversingAdjoint` needs steps that are known beforehand: `stepsize_"
-            "controller=diffrax.ConstantStepSize()` or `diffrax.StepTo(ts)`; got "
-            f"`{type(controller).__name__}`. {advice}"
-        )
-    if event is not None:
-        raise ValueError(f"`ReversingAdjoint` cannot do events. {advice}")
     sub = saveat.subs
     one = isinstance(sub, diffrax.SubSaveAt) and not saveat.dense
-    own_fn = one and sub.fn is not diffrax.SubSaveAt(t1=True).fn
-    if not one or sub.steps or sub.t0 or (sub.t1 and sub.ts is not None) or own_fn:
-        raise ValueError(
-            "`ReversingAdjoint` saves states, by `SaveAt(t1=True)` or `SaveAt(ts=...)`. In "
-            f"place of `SaveAt(fn=...)` apply the function to `sol.ys`. {advice}"
-        )
+    saves_states = (
+        one
+        and sub.fn is diffrax.SubSaveAt(t1=True).fn
+        and not (sub.steps or sub.t0 or (sub.t1 and sub.ts is not None))
+    )
+    known_steps = diffrax.ConstantStepSize | diffrax.StepTo
+    for fits, advice in (
+        (
+            _undoes_its_steps(solver),
+            "needs a solver that undoes its own steps, such as `ImplicitMidpoint`, "
+            f"`StormerVerlet` or `StrangGauss`; got `{type(solver).__name__}`.",
+        ),
+        (
+            isinstance(controller, known_steps),
+            "needs steps that are known beforehand: `stepsize_controller=diffrax."
+            "ConstantStepSize()` or `diffrax.StepTo(ts)`; got "
+            f"`{type(controller).__name__}`.",
+        ),
+        (event is None, "cannot do events."),
+        (
+            saves_states,
+            "saves states, by `SaveAt(t1=True)` or `SaveAt(ts=...)`. In place of "
+            "`SaveAt(fn=...)` apply the function to `sol.ys`.",
+        ),
+    ):
+        if not fits:
+            raise ValueError(
+                f"`ReversingAdjoint` {advice} Or pass `adjoint=diffrax."
+                "RecursiveCheckpointAdjoint()`."
+            )
 
 
 def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:

@@ -155,8 +155,8 @@ def _sizes(m: int, terms: int) -> tuple[int, ...]:
 def _bridge_area(
     H: Float[Array, " m"], normals: Float[Array, " normals"], terms: int
 ) -> Float[Array, "m m"]:
-    r"""The Lévy areas of a Brownian bridge over unit time, given the integral `H` of it,
-    from independent standard normal numbers.
+    r"""The Lévy areas of a Brownian bridge over unit time with the integral `H`, from
+    independent standard normal numbers.
 
     The bridge is $\sum_r a_r (\cos 2 \pi r t - 1) + b_r \sin 2 \pi r t$ with independent
     coefficients of variance $s_r = 1 / (2 \pi^2 r^2)$, its integral $-\sum_r a_r$ and its
@@ -174,8 +174,8 @@ def _bridge_area(
     # Conditioned on the sum of all cosine coefficients, the rest included, which is -H.
     a = a - cast(12 * s) * (total + H)[:, None]
     series = _weighted_product(a, b, np.pi * r)
-    # The area of the rest. Its cosine coefficients have the mean -12 s_r H, which gives
-    # the first part, and the variance s_r - 12 s_r^2, which gives the second.
+    # The rest has cosine coefficients of mean -12 s_r H, which gives the first part of its
+    # area, and variance s_r - 12 s_r^2, which gives the second.
     mean = jnp.outer(H, np.sqrt(72 * rest_squared) * by_mean)
     size = np.sqrt(rest - 12 * rest_squared)
     area = series - mean + size * _strictly_upper(by_area, m)

@@ -82,9 +82,8 @@ class WeakBrownianPath(AbstractPathWithLaws):
     ):
         r"""**Arguments:**
 
-        - `shape`: a PyTree of `jax.ShapeDtypeStruct`s, the shape, dtype and structure of
-            an increment; or a tuple of integers for one array of the default
-            floating-point dtype. For `m` noises, `(m,)`.
+        - `shape`: the shape of an increment, for `m` noises `(m,)`; or a PyTree of
+            `jax.ShapeDtypeStruct`s.
         - `key`: a JAX random key, as from `jax.random.key(seed)`.
         - `second`: whether to draw a second, independent set of three-point variables.
         - `two_point`: whether to draw the two-point variables.
@@ -161,10 +160,7 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
     ):
         """**Arguments:**
 
-        - `shape`: a PyTree of `jax.ShapeDtypeStruct`s, the shape, dtype and structure of
-            an increment; or a tuple of integers for one array of the default
-            floating-point dtype. For `m` noises, `(m,)`.
-        - `key`: a JAX random key, as from `jax.random.key(seed)`.
+        - `shape`, `key`: as for [`diffrax_symplectic.WeakBrownianPath`][].
         - `levy_area`: `diffrax.BrownianIncrement` or `diffrax.SpaceTimeLevyArea`.
         - `cell`: the length of the cells, of which every step is a multiple; or `None` to
             sample each step by itself.

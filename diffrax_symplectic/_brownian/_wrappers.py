@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from .._arguments import whole_number
 from .._custom_types import BM
 from ._paths import WeakBrownianPath
 from ._random import (
@@ -77,13 +78,8 @@ class TruncatedBrownianPath(AbstractWrappedPath):
                 "The increments of a `WeakBrownianPath` are bounded already, and "
                 "truncation would change their moments. Pass it as it is."
             )
-        if isinstance(k, bool) or not isinstance(k, int) or k < 1:
-            raise ValueError(
-                "`k` must be an integer, 1 or larger (2 suits methods of strong order "
-                f"1); got {k!r}."
-            )
         self.path = path
-        self.k = k
+        self.k = whole_number("k", k)
 
     @property
     def levy_area(self):
@@ -109,7 +105,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
             "the bound is a multiple of sqrt(|ln h|). Pass a smaller `dt0`, or measure "
             "time in larger units.",
         )
-        # The bound of an empty step is zero, as h |ln h| tends to 0 with h.
+        # The bound of an empty step is zero.
         log_h = jnp.log(jnp.where(h > 0, h, 1))
         bound = jnp.sqrt(2 * self.k * h * jnp.abs(log_h))
 

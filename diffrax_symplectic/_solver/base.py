@@ -6,7 +6,7 @@ import dataclasses
 import functools as ft
 import math
 from collections.abc import Callable
-from typing import Any, cast, ClassVar, Literal, NamedTuple, TYPE_CHECKING, TypeAlias
+from typing import Any, cast, ClassVar, Literal, NamedTuple, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -18,7 +18,7 @@ from .._arguments import check_state, whole_number
 from .._batch import batched_like
 from .._brownian import drives, path_of, VARIABLES
 from .._conditions import drift_order
-from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
+from .._custom_types import AbstractVar, Args, DenseInfo, RealScalarLike, VF, Y
 from .._plan import make_plan
 from .._root_finder import PicardNewton
 from .._tableau import AbstractTableau, FlatTableau, Structure
@@ -31,12 +31,6 @@ from .._terms import (
 )
 from ._step import no_failure, result_of, Solved, Step, take_step
 from ._times import result_at
-
-
-if TYPE_CHECKING:
-    from typing import ClassVar as AbstractVar
-else:
-    from equinox import AbstractVar
 
 
 Want: TypeAlias = Literal["weak", "strong"]
@@ -151,7 +145,6 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
 
     def __repr__(self) -> str:
         """The parameters that are not the defaults, in one line."""
-
         values = {f: getattr(self, f.name) for f in dataclasses.fields(self) if f.repr}
         given = ", ".join(
             f"{f.name}={value!r}"
@@ -210,14 +203,7 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         del terms
         return drift_order(self.tableau.flatten())
 
-    def init(
-        self,
-        terms: diffrax.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-    ) -> SolverState:
+    def init(self, terms, t0, t1, y0: Y, args: Args) -> SolverState:
         del t1
         name = type(self).__name__
         check_state(y0, name)
@@ -225,14 +211,7 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         return first_state(self)
 
     def step(
-        self,
-        terms: diffrax.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-        solver_state: SolverState,
-        made_jump: BoolScalarLike,
+        self, terms, t0, t1, y0: Y, args: Args, solver_state: SolverState, made_jump
     ) -> tuple[Y, None, DenseInfo, SolverState, diffrax.RESULTS]:
         del made_jump
         drift, noise = split_terms(terms)

@@ -278,7 +278,7 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         depend on it."""
         check_pair(y)
         struct = increment_struct(self.path)
-        hamiltonians = lambda y: self._hamiltonians(t, *y, args, struct)
+        hamiltonians = lambda y: self._hamiltonians(t, y[0], y[1], args, struct)
         if Dependence(hamiltonians, y).independent(lambda y: y):
             raise ValueError(
                 "`noise` does not depend on the state, so that there is no noise. Return "

@@ -76,17 +76,15 @@ def separable_fault(
     if it is of this form."""
     if fault := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", fault)
-    drift, noise = (_not_asserted(terms, "separable") for terms in (drift, noise))
-    drift_flows = [(is_hamiltonian(x), _flow(x, t0, y0, args)) for x in drift]
-    noise_flows = [
-        (
-            is_hamiltonian(x),
-            _flow(x, t0, y0, args),
-            ft.partial(_is_zero, x, t0, y0, args),
-        )
-        for x in noise
+    flows = [
+        [
+            (term, _flow(term, t0, y0, args))
+            for term in _not_asserted(terms, "separable")
+        ]
+        for terms in (drift, noise)
     ]
-    here, exchanged = (_faults(p, drift_flows, noise_flows) for p in (0, 1))
+    still = ft.partial(_is_zero, t0, y0, args)
+    here, exchanged = (_faults(p, *flows, still) for p in (0, 1))
     if not here:
         return None
     only_friction = lambda faults: all(fault.friction for fault in faults)
@@ -99,32 +97,33 @@ def separable_fault(
 
 def _faults(
     p: int,
-    drift: list[tuple[bool, Dependence]],
-    noise: list[tuple[bool, Dependence, Callable[[int], bool]]],
+    drift: list[tuple[diffrax.AbstractTerm, Dependence]],
+    noise: list[tuple[diffrax.AbstractTerm, Dependence]],
+    still: Callable[[diffrax.AbstractTerm, int], bool],
 ) -> list[Fault]:
     """The faults, if momenta are the first half of the state, `p = 0`, or the second one,
-    `p = 1`. Each term comes with whether it is Hamiltonian, and noise also with a function
-    that tells whether it leaves a half of the state unchanged."""
+    `p = 1`. `still` tells whether a noise term leaves a half of the state unchanged."""
     q, faults, advice = 1 - p, [], _advice("separable")
     dp, dq = (lambda out: out[p]), (lambda out: out[q])
     of_p, of_q = (lambda t, y, control: y[p]), (lambda t, y, control: y[q])
     beside = " beside that of H0" if len(drift) > 1 else ""
-    for hamiltonian, flow in drift:
+    for term, flow in drift:
         for part, of, derivative, rate in (
             (dp, of_p, "dH0/dq depends on p", "dp/dt depend on p"),
             (dq, of_q, "dH0/dp depends on q", "dq/dt depend on q"),
             (dq, _of_t, "dH0/dp depends on t", "dq/dt depend on t"),
         ):
             if not flow.independent(of, part):
-                friction = part is dp and not hamiltonian
-                plain = f"a drift term{beside} makes {rate}"
-                faults.append(
-                    Fault(derivative if hamiltonian else plain, advice, friction)
-                )
-    for hamiltonian, flow, zero in noise:
+                plain = not is_hamiltonian(term)
+                reason = f"a drift term{beside} makes {rate}" if plain else derivative
+                faults.append(Fault(reason, advice, friction=plain and part is dp))
+    for term, flow in noise:
+        hamiltonian = is_hamiltonian(term)
         # The change of q is linear in the increment: if it does not depend on the
         # increment, it is zero.
-        if not flow.independent(lambda t, y, control: control, dq) and not zero(q):
+        if not flow.independent(lambda t, y, control: control, dq) and not still(
+            term, q
+        ):
             plain = "a noise term changes q, the second half of the state"
             reason = "dH_k/dp is not zero" if hamiltonian else plain
             faults.append(Fault(reason, advice))
@@ -186,7 +185,7 @@ def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> Dependence:
     return Dependence(change, t0, y0, control)
 
 
-def _is_zero(term: diffrax.AbstractTerm, t0, y0: Y, args: Args, half: int) -> bool:
+def _is_zero(t0, y0: Y, args: Args, term: diffrax.AbstractTerm, half: int) -> bool:
     """Whether a plain noise term is known while tracing to leave one half of the state
     unchanged, by a block of zeros in its matrix."""
     if is_hamiltonian(term):
