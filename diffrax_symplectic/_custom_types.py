@@ -5,14 +5,10 @@ from jaxtyping import Array, ArrayLike, Bool, Int, PyTree, Real, Shaped
 
 
 if TYPE_CHECKING:
-    from typing import ClassVar as AbstractVar
-
     BoolScalarLike: TypeAlias = bool | Array | np.ndarray
     IntScalarLike: TypeAlias = int | Array | np.ndarray
     RealScalarLike: TypeAlias = int | float | Array | np.ndarray
 else:
-    from equinox import AbstractVar as AbstractVar
-
     BoolScalarLike = Bool[ArrayLike, ""]
     IntScalarLike = Int[ArrayLike, ""]
     RealScalarLike = Real[ArrayLike, ""]

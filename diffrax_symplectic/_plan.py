@@ -176,12 +176,11 @@ def _cut(
                 return unknown, rounds
     # Make stage after stage explicit unless that closes a cycle, fewest neighbours first.
     links = depends | depends.T
-    explicit = []
+    explicit, rounds = [], []
     for i in sorted(block, key=lambda i: links[i, list(block)].sum()):
-        if _rounds([*explicit, i], depends) is not None:
-            explicit.append(i)
-    rounds = _rounds(sorted(explicit), depends)
-    assert rounds is not None
+        new = _rounds(sorted([*explicit, i]), depends)
+        if new is not None:
+            explicit, rounds = [*explicit, i], new
     return tuple(i for i in block if i not in explicit), rounds
 
 

@@ -105,20 +105,21 @@ def _coefficients(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def _check(tableau: AbstractTableau, **shapes: tuple[int, ...]) -> None:
-    for name, shape in shapes.items():
-        array = _coefficients(name, getattr(tableau, name), shape)
-        object.__setattr__(tableau, name, array)
-
-
-def _check_by_variable(tableau: AbstractTableau, **shapes: tuple[int, ...]) -> None:
-    """As `_check`, for dictionaries over the random variables."""
+def _check(
+    tableau: AbstractTableau,
+    by_variable: tuple[str, ...] = (),
+    **shapes: tuple[int, ...],
+) -> None:
+    """Replaces coefficients by checked arrays, or dictionaries of these."""
     for name, shape in shapes.items():
         value = getattr(tableau, name)
-        named = value if isinstance(value, Mapping) else {"W": value}
-        checked = {
-            k: _coefficients(f"{name}[{k!r}]", v, shape) for k, v in named.items()
-        }
+        if name in by_variable:
+            named = value if isinstance(value, Mapping) else {"W": value}
+            checked = {
+                k: _coefficients(f"{name}[{k!r}]", x, shape) for k, x in named.items()
+            }
+        else:
+            checked = _coefficients(name, value, shape)
         object.__setattr__(tableau, name, checked)
 
 
@@ -241,8 +242,8 @@ class SeparableTableau(AbstractTableau):
 
     def __post_init__(self):
         s, r = np.size(self.alpha), len(self.A1)
-        _check(self, alpha=(s,), A0=(s, s), A1=(r, s))
-        _check_by_variable(self, beta=(r,), B0=(s, r))
+        noise = dict(beta=(r,), B0=(s, r))
+        _check(self, ("beta", "B0"), alpha=(s,), A0=(s, s), A1=(r, s), **noise)
 
     def partitioned(self) -> "PartitionedTableau":
         """The same method with its coefficients for velocities written out."""
@@ -286,8 +287,8 @@ class PartitionedTableau(AbstractTableau):
 
     def __post_init__(self):
         s, v, r = np.size(self.alpha), np.size(self.alpha_hat), len(self.A1)
-        _check(self, alpha=(s,), alpha_hat=(v,), A=(v, s), A_hat=(s, v), A1=(r, v))
-        _check_by_variable(self, beta=(r,), B0=(v, r))
+        drift = dict(alpha=(s,), alpha_hat=(v,), A=(v, s), A_hat=(s, v))
+        _check(self, ("beta", "B0"), beta=(r,), B0=(v, r), A1=(r, v), **drift)
 
     def flatten(self) -> FlatTableau:
         s, v, r = len(self.alpha), len(self.alpha_hat), len(self.A1)
@@ -351,8 +352,8 @@ class AdditiveTableau(AbstractTableau):
 
     def __post_init__(self):
         s, r = np.size(self.alpha), np.size(self.c1)
-        _check(self, alpha=(s,), A=(s, s), c1=(r,))
-        _check_by_variable(self, beta=(r,), B=(s, r))
+        noise = dict(beta=(r,), B=(s, r), c1=(r,))
+        _check(self, ("beta", "B"), alpha=(s,), A=(s, s), **noise)
 
     @property
     def structure(self) -> Structure:

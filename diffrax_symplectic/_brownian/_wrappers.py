@@ -91,7 +91,8 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         increment = self.path.evaluate(t0, t1, use_levy=use_levy)
-        return self.changed(increment, None, t1 - t0, use_levy)
+        no_words = jnp.zeros(0, jnp.uint32)
+        return self.changed(increment, no_words, t1 - t0, use_levy)
 
     def num_own_words(self, use_levy: bool) -> int:
         return 0

@@ -1,15 +1,11 @@
 """The noise that belongs to a friction at a temperature."""
 
-from typing import Any
-
 import equinox as eqx
-import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
+from .._arguments import real_array
 from .._custom_types import Args, RealScalarLike
 from ._friction import checked, Fault, matrix_faults, root_of_matrix, UNKNOWN
 
@@ -45,7 +41,8 @@ def thermal_noise(
     """
     for name, value in (("mass", mass), ("T", T)):
         for leaf in jtu.tree_leaves(value):
-            _check_number(name, leaf)
+            kind = "a real number, or an array or PyTree of such"
+            real_array(name, leaf, positive=name == "mass", kind=kind)
     given = dict(gamma=checked(gamma), mass=mass, T=T)
     is_one = lambda x: jtu.all_leaves([x])
     like = next((x for x in given.values() if not is_one(x)), 0.0)
@@ -121,18 +118,3 @@ class ThermalNoise(eqx.Module):
             )
         of = lambda x, q: x.hamiltonians(q)
         return jtu.tree_map(of, amplitudes, q, is_leaf=is_one)
-
-
-def _check_number(name: str, value: Any) -> None:
-    """Raises a `ValueError` unless this is a positive mass, or a temperature."""
-    least = {"mass": "positive", "T": "not negative"}[name]
-    fits = eqx.is_array_like(value) and not isinstance(value, bool)
-    if fits and not isinstance(value, jax.core.Tracer):
-        values = np.asarray(value)
-        inside = values > 0 if name == "mass" else values >= 0
-        fits = not np.iscomplexobj(values) and np.all(inside & np.isfinite(values))
-    if not fits:
-        raise ValueError(
-            f"`{name}` must be a finite real number, {least}, or an array or PyTree of "
-            f"such; got {value!r}."
-        )

@@ -5,12 +5,10 @@ from collections.abc import Callable, Sequence
 import diffrax
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .._arguments import check_pair
+from .._arguments import check_pair, real_array
 from .._custom_types import Args, RealScalarLike
 from ._hamiltonian import evaluated, lifted_terms, scalar_energy
 
@@ -88,17 +86,8 @@ def spin_terms(
 
 
 def _checked_damping(alpha: ArrayLike) -> ArrayLike:
-    """`alpha`, after a check of its values if they are not traced."""
-    fault = not eqx.is_array_like(alpha) or np.iscomplexobj(alpha)
-    if not fault and not isinstance(alpha, jax.core.Tracer):
-        values = np.asarray(alpha)
-        fault = not np.all(np.isfinite(values) & (values >= 0))
-    if fault:
-        raise ValueError(
-            "`damping` must be a number, or an array with one for each spin, finite and "
-            f"not negative; got {alpha!r}."
-        )
-    return alpha
+    kind = "a number, or an array with one for each spin"
+    return real_array("damping", alpha, positive=False, kind=kind)
 
 
 class _DampedPrecession(eqx.Module):

@@ -76,15 +76,12 @@ def separable_fault(
     if it is of this form."""
     if fault := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", fault)
-    flows = [
-        [
-            (term, _flow(term, t0, y0, args))
-            for term in _not_asserted(terms, "separable")
-        ]
-        for terms in (drift, noise)
+    flows = lambda terms: [
+        (term, _flow(term, t0, y0, args)) for term in _not_asserted(terms, "separable")
     ]
     still = ft.partial(_is_zero, t0, y0, args)
-    here, exchanged = (_faults(p, *flows, still) for p in (0, 1))
+    of = flows(drift), flows(noise)
+    here, exchanged = (_faults(p, *of, still) for p in (0, 1))
     if not here:
         return None
     only_friction = lambda faults: all(fault.friction for fault in faults)
