@@ -117,34 +117,24 @@ ReversingAdjoint.__init__.__doc__ = """**Arguments:**
 def _check_supported(solver, controller, event, saveat) -> None:
     sub = saveat.subs
     one = isinstance(sub, diffrax.SubSaveAt) and not saveat.dense
-    saves_states = (
-        one
-        and sub.fn is diffrax.SubSaveAt(t1=True).fn
-        and not (sub.steps or sub.t0 or (sub.t1 and sub.ts is not None))
-    )
-    known_steps = diffrax.ConstantStepSize | diffrax.StepTo
-    for fits, advice in (
-        (
-            _undoes_its_steps(solver),
-            "needs a solver that undoes its own steps, such as `ImplicitMidpoint`, "
-            f"`StormerVerlet` or `StrangGauss`; got `{type(solver).__name__}`.",
-        ),
-        (
-            isinstance(controller, known_steps),
-            "needs steps that are known beforehand: `stepsize_controller=diffrax."
-            "ConstantStepSize()` or `diffrax.StepTo(ts)`; got "
-            f"`{type(controller).__name__}`.",
-        ),
-        (event is None, "cannot do events."),
-        (
-            saves_states,
-            "saves states, by `SaveAt(t1=True)` or `SaveAt(ts=...)`. In place of "
-            "`SaveAt(fn=...)` apply the function to `sol.ys`.",
-        ),
-    ):
-        if not fits:
+    more = not one or sub.steps or sub.t0 or (sub.t1 and sub.ts is not None)
+    known = diffrax.ConstantStepSize | diffrax.StepTo
+    faults = {
+        "needs a solver that undoes its own steps, such as `ImplicitMidpoint`, "
+        f"`StormerVerlet` or `StrangGauss`; got `{type(solver).__name__}`":
+            not _undoes_its_steps(solver),
+        "needs steps that are known beforehand: `stepsize_controller=diffrax."
+        "ConstantStepSize()` or `diffrax.StepTo(ts)`; got "
+        f"`{type(controller).__name__}`": not isinstance(controller, known),
+        "cannot do events": event is not None,
+        "saves states, by `SaveAt(t1=True)` or `SaveAt(ts=...)`. In place of "
+        "`SaveAt(fn=...)` apply the function to `sol.ys`":
+            more or sub.fn is not diffrax.SubSaveAt(t1=True).fn,
+    }  # fmt: skip
+    for fault, found in faults.items():
+        if found:
             raise ValueError(
-                f"`ReversingAdjoint` {advice} Or pass `adjoint=diffrax."
+                f"`ReversingAdjoint` {fault}. Or pass `adjoint=diffrax."
                 "RecursiveCheckpointAdjoint()`."
             )
 

@@ -131,16 +131,13 @@ def compare_solvers(
         noise = lambda t, p, q, args: 0.1 * jnp.sin(q)
         terms = ds.hamiltonian_terms(H0, noise, ())  # the shape of one noise
         y0 = (jnp.array(0.0), jnp.array(1.0))
-        solvers = [ds.StormerVerlet(), ds.ImplicitMidpoint()]
-        print(
-            ds.compare_solvers(terms, solvers, 0.0, 1.0, [0.25, 0.125], y0, key=jr.key(1))
-        )
+        print(ds.compare_solvers(terms, None, 0.0, 1.0, [0.25, 0.125], y0, key=jr.key(1)))
         ```
 
     **Arguments:**
 
-    - `terms`: the terms, with any Brownian path, or with the shape of its increments in
-        place of a path. Each solver gets the path that it needs.
+    - `terms`: the terms, with any Brownian path or its shape. Each solver gets the path
+        that it needs.
     - `solvers`: a list of solvers, or `None` for those that `suggest_solver` names.
     - `t0`, `t1`, `y0`, `args`: as for `diffrax.diffeqsolve`, with numbers for the times.
     - `dt0`: a list of step sizes; each divides the interval, and is a multiple of the

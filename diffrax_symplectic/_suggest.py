@@ -55,8 +55,8 @@ from ._terms import (
 )
 
 
-# What a higher order may cost. In steps of a twentieth, and with constants of one size, a
-# step of order 2 is worth twenty steps of order 1.
+# What a higher order may cost: for steps of a twentieth, a step of order 2 is worth about
+# twenty of order 1.
 _MOST_STAGE_VECTORS = 20
 
 
@@ -135,9 +135,7 @@ def suggest_solver(
 
     **Arguments:**
 
-    - `terms`: the terms of a Stratonovich system, as of
-        [`diffrax_symplectic.hamiltonian_terms`][], with any Brownian path, or with the
-        shape of its increments in place of a path.
+    - `terms`: the terms of a Stratonovich system, with any Brownian path or its shape.
     - `t0`, `y0`, `args`: where the solve begins, as for `diffrax.diffeqsolve`.
     - `want`: `"weak"` for expectations, or `"strong"` for single paths.
     - `gamma`: friction, $-\gamma p\,\mathrm{d}t$ beside these terms, as

@@ -158,15 +158,11 @@ class GeneralTableau(AbstractTableau):
 
     **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
     `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`, `B1` of shape `(r, r)`;
-    `noise`, the random variables that drive the noise stages: `("W",)`, of which `"W"` is
-    $I_k$, or `("W", "A")` for $\sum_k b_k I_k + \sum_{k<l} [b_k, b_l] A_{kl}$, with the
-    Lie brackets $[b_k, b_l] = b_l' b_k - b_k' b_l$ and the Lévy areas $A_{kl}$ of a
-    [`diffrax_symplectic.LevyAreaIncrement`][], or `("W", "L")` for
-    $\sum_k b_k I_k + h \sum_k [b_k, a] H_k + \sum_{k, l} [b_k, [b_l, a]] L_{kl}$ with the
-    variables of [`diffrax_symplectic.PlateauGauss`][].
+    `noise`, the random variables that drive the noise stages: `("W",)` for $I_k$,
+    `("W", "A")` for the field of [`diffrax_symplectic.LevyAreaMidpoint`][], or `("W", "L")`
+    for the field of [`diffrax_symplectic.PlateauGauss`][].
 
-    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
-    real numbers.
+    **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """
 
     structure: ClassVar[Structure] = "any"
@@ -184,8 +180,8 @@ class GeneralTableau(AbstractTableau):
 
     @classmethod
     def strong(cls, A, B, alpha, beta) -> "GeneralTableau":
-        r"""The form of Burrage and Burrage (2000), equations (2.14)-(2.15) of Wang,
-        Hong and Xu (2017), in which drift and noise are evaluated at the same points:
+        r"""The form of Burrage and Burrage (2000), equations (2.14)-(2.15) of Wang, Hong
+        and Xu (2017), with drift and noise at the same points:
 
         $$G_i = y_n + h \sum_j A_{ij} a(G_j) + \sum_k \sum_j B_{ij} b_k(G_j) I_k$$
 
@@ -229,8 +225,7 @@ class SeparableTableau(AbstractTableau):
     variables `beta` and `B0` are dictionaries from their names, of which `"W"` is $I_k$, to
     such arrays.
 
-    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
-    real numbers.
+    **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """
 
     structure: ClassVar[Structure] = "separable"
@@ -272,8 +267,7 @@ class PartitionedTableau(AbstractTableau):
     `A_hat` of shape `(s, v)`, `B0` of shape `(v, r)`, `A1` of shape `(r, v)`; `beta` and
     `B0` possibly by random variable.
 
-    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
-    real numbers.
+    **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """
 
     structure: ClassVar[Structure] = "separable"
@@ -334,13 +328,11 @@ class AdditiveTableau(AbstractTableau):
     with stage times $c^0 = A e$. Symplecticity asks nothing of $B$ and $\beta$.
 
     **Arguments:** `alpha` of shape `(s,)`, `A` of shape `(s, s)`, `c1` of shape `(r,)`;
-    `beta` and `B`, dictionaries from the names of random variables (attributes of the
-    Brownian increment, of which `"W"` is $I_k$) to arrays of shape `(r,)` and `(s, r)`, or
-    just such an array for `"W"`; `constant`, whether the noise must not depend on time
-    either.
+    `beta` and `B`, arrays of shape `(r,)` and `(s, r)`, or dictionaries from the names of
+    random variables, of which `"W"` is $I_k$, to such; `constant`, whether the noise must
+    not depend on time either.
 
-    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
-    real numbers.
+    **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """
 
     alpha: Coefficients

@@ -159,7 +159,7 @@ def step_expectation(
     - `terms`, `solver`, `y0`, `args`: as for `diffrax.diffeqsolve`; `terms` with one
         Brownian path.
     - `t0`, `t1`: start and end of the step.
-    - `fn`: the function $\phi$, `fn(t, y, args)`, to arrays; `t` is the end of the step.
+    - `fn`: the function $\phi$, `fn(t, y, args)`, to arrays.
     - `nodes`: points of the quadrature in each Gaussian variable.
 
     **Returns:** what `fn` returns, averaged.

@@ -126,8 +126,8 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
 
     $$C = \pm\sqrt{\tfrac{1}{15} h + \tfrac{1}{12} W^2 + \tfrac15 H^2}$$
 
-    with a fair sign: $M^2 + C^2$ is the mean square of the Brownian path over the step, in
-    expectation given $W$ and $H$. The mean of $C^2$ is $h / 6$.
+    with a fair sign: in expectation given $W$ and $H$, $M^2 + C^2$ is the mean square of
+    the Brownian path over the step. The mean of $C^2$ is $h / 6$.
 
     - `dt`, `W`, `H`: as in Diffrax.
     - `sign`: the signs of $C$, times $\sqrt h$.

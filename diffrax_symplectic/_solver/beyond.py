@@ -113,8 +113,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
 
     **Source:** [Ninomiya and Victoir (2008)](https://doi.org/10.1080/13504860701413958) for
     the splitting; [Ninomiya and Ninomiya (2009)](https://doi.org/10.1007/s00780-009-0101-4)
-    for Runge--Kutta methods of high order, the Gauss method among them, in place of the
-    flows.
+    for Runge--Kutta methods of high order in place of the flows.
     """
 
     record: ClassVar[Record] = Record(
@@ -227,8 +226,8 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     [`diffrax_symplectic.ImplicitMidpoint`][].
 
     **Source:** [Milstein and Tretyakov (2021)](https://doi.org/10.1007/978-3-030-82040-4)
-    for the order that Lévy areas and Lie brackets bring, which is due to Milstein. We
-    know of no source for the combination with the midpoint rule, which keeps it symplectic.
+    for the order by Lévy areas and Lie brackets, due to Milstein. We know of no source for
+    the combination with the midpoint rule.
     """
 
     record: ClassVar[Record] = Record(
@@ -279,9 +278,8 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     noise in the forces alone [`diffrax_symplectic.PlateauVerlet`][] is explicit and much
     cheaper.
 
-    **Source:** the field is that of the log-ODE method of [Foster, Lyons and Oberhauser
-    (2020)](https://doi.org/10.1137/19M1261912), section 4. The Gauss method keeps it
-    symplectic.
+    **Source:** the field is from the log-ODE method of [Foster, Lyons and Oberhauser
+    (2020)](https://doi.org/10.1137/19M1261912), section 4.
     """
 
     record: ClassVar[Record] = Record(

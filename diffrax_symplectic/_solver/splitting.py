@@ -150,8 +150,7 @@ class Damped(AbstractSplitting):
     The friction acts on the canonical momentum $p$. In a magnetic field friction on the
     kinetic momentum $p - A(q)$ is a term of its own.
 
-    With noise in the forces and $\sigma^2 = 2 \gamma T$ this is Langevin dynamics at the
-    temperature $T$. For constant noise [`diffrax_symplectic.BAOAB`][] and
+    For Langevin dynamics with constant noise [`diffrax_symplectic.BAOAB`][] and
     [`diffrax_symplectic.LangevinMiddle`][] have far less bias.
 
     **Source:** splitting of [Strang (1968)](https://doi.org/10.1137/0705041).

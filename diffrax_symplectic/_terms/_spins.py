@@ -43,21 +43,16 @@ def spin_terms(
     systems keeps it and is a Poisson map of $s$, with its orders for canonical systems.
     Other solvers refuse these terms.
 
-    **Damping.** `damping=alpha` adds the drift of the Landau--Lifshitz equation,
-
-    $$\alpha\, s \times (s \times \nabla H_0)\,\mathrm{d}t.$$
-
-    Without noise the energy falls by $\alpha |s \times \nabla H_0|^2$ in each unit of time.
-    The same solvers keep the lengths, with the same orders; the flow is no Poisson map
-    then. With the noise `lambda t, s, args: sigma * s` and $\sigma^2 = 2 \alpha T$, the
-    density $e^{-H_0 / T}$ of the temperature $T$ (in units of energy) is stationary, for
-    spins of any lengths.
+    **Damping.** `damping=alpha` adds $\alpha\, s \times (s \times \nabla H_0)\,
+    \mathrm{d}t$, the drift of the Landau--Lifshitz equation. The same solvers keep the
+    lengths, with the same orders; the flow is no Poisson map then. With the noise
+    `lambda t, s, args: sigma * s` and $\sigma^2 = 2 \alpha T$, the density $e^{-H_0 / T}$
+    of the temperature $T$ (in units of energy) is stationary, for spins of any lengths.
 
     **Arguments:**
 
-    - `H0`: `H0(t, s, args)`, a scalar, for `s` of shape `(..., 3)`: the sum over all
-        spins. A function, or a Module with parameters; differentiable with respect to
-        these and to `args`.
+    - `H0`: `H0(t, s, args)`, a scalar, for `s` of shape `(..., 3)`. A function, or a
+        Module with parameters; differentiable with respect to these and to `args`.
     - `noise`: `noise(t, s, args)`, the noise Hamiltonians $H_1, \ldots, H_m$ as an array
         of shape `(m,)`, or in the structure and shapes of `path`: a field along each axis
         of each spin is `lambda t, s, args: args * s` with a path of the shape of `s`. Or

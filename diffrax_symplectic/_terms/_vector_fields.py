@@ -29,8 +29,8 @@ _BACKSOLVE = (
 
 
 def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
-    """Drift terms and noise terms, in any order and however nested. A term is noise if it
-    has a Brownian path, or if it is not the first one and time does not drive it.
+    """Drift terms and noise terms. A term is noise if it has a Brownian path, or if it is
+    not the first one and not driven by time.
 
     Raises a `ValueError` for the terms of `diffrax.BacksolveAdjoint`."""
     parts = _flatten(terms)
