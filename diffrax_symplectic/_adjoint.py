@@ -277,7 +277,7 @@ def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwar
         t0, t1 = steps.time(i), steps.time(i + 1)
         if back:
             t0, t1, terms = -t1, -t0, reversed_in_time(terms)
-        # The solver state is that of another step: as after a jump.
+        # The solver state belongs to another step, as after a jump.
         return solver.step(terms, t0, t1, y, args, init_state.solver_state, True)[0]
 
     def body(walk: _Walk) -> _Walk:

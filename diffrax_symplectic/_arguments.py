@@ -1,4 +1,4 @@
-"""Checks of what a user passes: functions, numbers, solvers, states."""
+"""Checks of arguments: functions, numbers, solvers, states."""
 
 import inspect
 from typing import Any

@@ -77,7 +77,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
 
         - `path`: a Brownian path with space-time Lévy area, for example
             `FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`.
-        - `key`: a JAX random key for the areas, which may be that of the path.
+        - `key`: a JAX random key for the areas, which may be the key of the path.
         - `num_terms`: Fourier terms over each step, or each cell.
         - `cell`: the length of the cells, of which every step is a multiple; or `None` to
             sample each step by itself.

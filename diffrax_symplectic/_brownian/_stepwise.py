@@ -77,7 +77,7 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         """What `evaluate` returns for the step from `t0` to `t1`, from given words."""
 
 
-# Diffrax traces a step three times, and `jax.vmap` what is in a loop more often.
+# Diffrax traces a step three times, and `jax.vmap` traces the body of a loop more often.
 @eqx.filter_jit
 def _drawn(path: AbstractStepwisePath, t0: Array, t1: Array, use_levy: bool):
     return path.draw(t0, t1, use_levy)

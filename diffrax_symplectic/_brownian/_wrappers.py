@@ -166,7 +166,7 @@ class PlateauBrownianPath(AbstractWrappedPath):
 
         - `path`: a Brownian path with space-time Lévy area, for example
             `FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`.
-        - `key`: a JAX random key for the signs, which may be that of the path.
+        - `key`: a JAX random key for the signs, which may be the key of the path.
 
         **Raises:** a `ValueError` if `path` has no space-time Lévy area.
         """

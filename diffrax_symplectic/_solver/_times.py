@@ -13,8 +13,8 @@ from .._custom_types import RealScalarLike
 from .._terms import brownian_paths
 
 
-# Diffrax takes what is left of a solve in one step if it is shorter than a hundred units in
-# the last place of its end.
+# Diffrax merges the rest of a solve into its last step if it is shorter than a hundred
+# units in the last place of the end.
 ROUNDINGS = 100
 _OUTSIDE = (
     "A step goes beyond `path.t0` or `path.t1` of a Brownian path, where its noise is not "

@@ -148,7 +148,7 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     For any $H_0$ and $H_k = -\sigma_k \cdot q + \gamma_k \cdot p$, or any
     $\mathrm{d}y = a(t, y)\,\mathrm{d}t + \sum_k b_k\,\mathrm{d}w_k$ with constant $b_k$,
-    and with $A$, $\alpha$ and $c$ those of the Gauss method,
+    and with $A$, $\alpha$ and $c$ of the Gauss method,
 
     $$G_i = y_n + h \sum_j A_{ij} a(t_n + c_j h, G_j) + \sum_k b_k \xi_{ki}, \qquad
       \xi_{ki} = c_i \hat W_k + \sqrt{\tfrac16}\, \eta_{ki}$$

@@ -91,8 +91,8 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     r"""A symplectic method of weak order 2 for any Hamiltonians and any number of noises,
     whether they commute or not: splitting in random order.
 
-    With $F_0(t)$ for the flow of the drift over time $t$, $F_k(x)$ for that of the noise
-    $b_k$ over "time" $x$, and the three-point variables $\hat I_k$, by one fair coin
+    With $F_0(t)$ for the flow of the drift over time $t$, $F_k(x)$ for the flow of the
+    noise $b_k$ over "time" $x$, and the three-point variables $\hat I_k$, by one fair coin
 
     $$y_{n+1} = F_0(\tfrac h2)\, F_m(\hat I_m) \cdots F_1(\hat I_1)\, F_0(\tfrac h2)\, y_n
       \quad \text{or} \quad
@@ -133,7 +133,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         return (2,) * (num_noises + 2)
 
     def order(self, terms):
-        """Order of convergence without noise: that of the flows."""
+        """The order without noise is the order of the flows."""
         del terms
         return drift_order(_flow.tableau)
 

@@ -262,9 +262,9 @@ class LinearFlow(AbstractSplitting):
         flow = lambda time, y: self.exact_flow(None, time, y, args)
         if Dependence(flow, jnp.asarray(time), y0).independent(lambda time, y: time):
             raise ValueError(
-                "`flow(time, y, args)` of `LinearFlow` does not read `time`, so that it is "
-                "no flow: for `time = 0` it has to return `y`. It is called with half of "
-                "each step, whatever the step is."
+                "`flow(time, y, args)` of `LinearFlow` does not depend on `time`, so that "
+                "it is no flow: for `time = 0` it has to return `y`. It is called with "
+                "half of each step."
             )
 
     def exact_flow(self, prepared, time, y, args):

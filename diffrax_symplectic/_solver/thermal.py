@@ -87,7 +87,7 @@ class _Amplitudes(eqx.Module):
         if shape != q.shape * 2:
             raise ValueError(
                 "`gamma`, `mass` and `T` of `thermal_noise` must be numbers or have the "
-                f"shape of `q`, {q.shape}, or `gamma` that of a matrix, {q.shape * 2}; "
+                f"shape of `q`, {q.shape}, or `gamma` be a matrix of shape {q.shape * 2}; "
                 f"`2 * gamma * mass * T` has shape {shape}."
             )
         if self.root is None:

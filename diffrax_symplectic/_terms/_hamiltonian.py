@@ -209,7 +209,7 @@ class _Drift(eqx.Module):
 
 
 def scalar_energy(out: PyTree) -> Array:
-    """What `H0` returned; a `ValueError` if that is no scalar."""
+    """The output of `H0`; a `ValueError` if it is no scalar."""
     if not jtu.all_leaves([out]) or jnp.shape(out) != ():
         raise ValueError(
             f"`H0` must return a scalar; got shape {shapes(out)}. Sum over the degrees of "
@@ -325,7 +325,6 @@ def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Arr
         if args is not None or _LEFT_OUT in str(error) or "None" not in str(error):
             raise
         kind = TypeError if isinstance(error, TypeError) else AttributeError
-        # A note would not be part of what `str` of the error says.
         raise kind(f"`{name}` was called with {_LEFT_OUT} {error}") from error
 
 

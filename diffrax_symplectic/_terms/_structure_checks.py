@@ -240,20 +240,14 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
     struct = eqx.filter_eval_shape(lambda: [term.contr(t0, t0) for term in noise])
-
-    leaves, treedef = jtu.tree_flatten((y0, struct, struct))
-    # Most functions are defined between 0 and 1.
-    laws = jr.normal, jr.uniform
-    draw = lambda law, key: treedef.unflatten(
-        law(k, jnp.shape(x), jnp.result_type(x))
-        for k, x in zip(jr.split(key, len(leaves)), leaves)
-    )
+    zeros = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), (struct, struct))
+    flat, unravel = jfu.ravel_pytree((y0, *zeros))
     largest = lambda y: jnp.max(jnp.abs(jfu.ravel_pytree(y)[0]))
 
     @eqx.filter_jit
     @jax.vmap
     def sizes(point):
-        y, x, z = point
+        y, x, z = unravel(point)
         b = lambda control: lambda y: apply(noise, control, args, t0, y)
         first = jax.jvp(b(z), (y,), (b(x)(y),))[1]
         second = jax.jvp(b(x), (y,), (b(z)(y),))[1]
@@ -262,13 +256,15 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
 
     try:
         with jax.disable_jit(False):
-            points = [draw(law, jr.key(i)) for i in range(4) for law in laws]
-            size, bracket = sizes(jtu.tree_map(lambda *x: jnp.stack(x), *points))
+            # Most functions are defined between 0 and 1.
+            draw = lambda law: law(jr.key(0), (4, *flat.shape), flat.dtype)
+            points = jnp.concatenate([draw(jr.normal), draw(jr.uniform)])
+            size, bracket = sizes(points)
             finite = jnp.isfinite(size) & jnp.isfinite(bracket)
             small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
             found = jax.block_until_ready(jnp.any(finite) & jnp.all(small | ~finite))
     except RuntimeError:
         # A user's `equinox.error_if`, at states that the user never chose.
         return False
-    # While JAX traces what surrounds this, there are no values.
+    # Within `jax.jit` there are no values.
     return not isinstance(found, jax.core.Tracer) and bool(found)

@@ -175,5 +175,5 @@ def test_flows_that_are_none_are_refused():
     with pytest.raises(ValueError, match="is a pair"):
         init(flow, jnp.ones(8))
     # One propagator for all steps.
-    with pytest.raises(ValueError, match="does not read `time`"):
+    with pytest.raises(ValueError, match="does not depend on `time`"):
         init(lambda time, y, args: flow(0.05, y, args))
