@@ -1,4 +1,5 @@
 import dataclasses
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -64,6 +65,8 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     key: PRNGKeyArray
     num_terms: int = eqx.field(static=True)
     cell: float | None = eqx.field(static=True)
+    levy_area: ClassVar = LevyAreaIncrement
+    laws: ClassVar[None] = None
 
     def __init__(
         self,
@@ -93,14 +96,6 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         self.key = key
         self.num_terms = whole_number("num_terms", num_terms, 0)
         self.cell = cell
-
-    @property
-    def levy_area(self):
-        return LevyAreaIncrement
-
-    @property
-    def laws(self) -> None:
-        return None
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         cell = self.cell

@@ -1,5 +1,5 @@
 from collections.abc import Mapping
-from typing import Any
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -70,6 +70,7 @@ class WeakBrownianPath(AbstractPathWithLaws):
     second: bool = eqx.field(static=True)
     two_point: bool = eqx.field(static=True)
     order: int = eqx.field(static=True)
+    levy_area: ClassVar = WeakIncrement
 
     def __init__(
         self,
@@ -103,10 +104,6 @@ class WeakBrownianPath(AbstractPathWithLaws):
         self.second = second or order == 3
         self.two_point = two_point
         self.order = order
-
-    @property
-    def levy_area(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return WeakIncrement
 
     @property
     def laws(self) -> dict[str, AbstractLaw]:

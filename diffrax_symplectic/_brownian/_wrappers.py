@@ -1,4 +1,5 @@
 import dataclasses
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -57,6 +58,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
     path: diffrax.AbstractBrownianPath
     k: int = eqx.field(static=True)
+    laws: ClassVar[None] = None
 
     def __init__(self, path: diffrax.AbstractBrownianPath, *, k: int = 2):
         """**Arguments:**
@@ -84,10 +86,6 @@ class TruncatedBrownianPath(AbstractWrappedPath):
     @property
     def levy_area(self):
         return self.path.levy_area
-
-    @property
-    def laws(self) -> None:
-        return None
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         increment = self.path.evaluate(t0, t1, use_levy=use_levy)
@@ -160,6 +158,7 @@ class PlateauBrownianPath(AbstractWrappedPath):
 
     path: diffrax.AbstractBrownianPath
     key: PRNGKeyArray
+    levy_area: ClassVar = PlateauIncrement
 
     def __init__(self, path: diffrax.AbstractBrownianPath, key: PRNGKeyArray):
         """**Arguments:**
@@ -174,10 +173,6 @@ class PlateauBrownianPath(AbstractWrappedPath):
         check_key(key, type(self).__name__)
         self.path = path
         self.key = key
-
-    @property
-    def levy_area(self):
-        return PlateauIncrement
 
     @property
     def laws(self) -> dict[str, AbstractLaw] | None:

@@ -43,14 +43,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
     advice: ClassVar[str] = ""
 
     @abc.abstractmethod
-    def prepare(
-        self,
-        terms: PyTree[diffrax.AbstractTerm],
-        t0: RealScalarLike,
-        time: RealScalarLike,
-        y0: Y,
-        args: Args,
-    ) -> Any:
+    def prepare(self, terms, t0, time: RealScalarLike, y0: Y, args: Args) -> Any:
         """Computes, before a solve from `t0`, what its flows over `time` share."""
 
     @abc.abstractmethod
