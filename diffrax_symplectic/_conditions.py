@@ -25,11 +25,7 @@ def symplectic_residuals(tableau: AbstractTableau) -> Float[np.ndarray, "s s"]:
 
     With all stages of the tableau in one list, `matrix` $M$ and `weights` $w$ of its
     flat form, these are $w_i w_j - w_i M_{ij} - w_j M_{ji}$ for every two stages that
-    depend on each other's values. For a [`diffrax_symplectic.GeneralTableau`][] that is
-
-    $$\alpha_i \alpha_j - \alpha_i A^0_{ij} - \alpha_j A^0_{ji}, \qquad
-      \alpha_i \beta_j - \alpha_i B^0_{ij} - \beta_j A^1_{ji}, \qquad
-      \beta_i \beta_j - \beta_i B^1_{ij} - \beta_j B^1_{ji}.$$
+    depend on each other's values.
 
     **Arguments:**
 

@@ -255,8 +255,8 @@ def weak_order_defect(
     $O(h^{r+1})$: a few values of $h$ show the order to two digits.
 
     $L \phi = \partial_t \phi + a \cdot \nabla \phi + \frac12 \sum_k b_k \cdot \nabla
-    (b_k \cdot \nabla \phi)$ for a Stratonovich solver, and with $b_k^\top (\nabla^2
-    \phi)\, b_k$ in place of the last term's summands for an Itô solver.
+    (b_k \cdot \nabla \phi)$ for a Stratonovich solver, with the summands $b_k^\top
+    (\nabla^2 \phi)\, b_k$ for an Itô solver.
 
     **Arguments:** as for [`diffrax_symplectic.step_expectation`][], and
 

@@ -40,11 +40,8 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         left: bool = True,
         use_levy: bool = False,
     ) -> Increment:
-        """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
-
-        Returns the increment over the step from `t0` to `t1`, or with `use_levy=True` an
-        object of type `levy_area`. Without `t1` the step is the one from `0` to `t0`.
-        """
+        """The increment over the step from `t0` to `t1` (from `0` to `t0` without `t1`), or
+        with `use_levy=True` an object of type `levy_area`."""
         del left
         start, end = (jnp.zeros_like(t0), t0) if t1 is None else (t0, t1)
         ends = jnp.asarray(start), jnp.asarray(end)

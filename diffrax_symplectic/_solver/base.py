@@ -18,7 +18,7 @@ from .._arguments import check_state, whole_number
 from .._batch import batched_like
 from .._brownian import drives, path_of, VARIABLES
 from .._conditions import drift_order
-from .._custom_types import Args, DenseInfo, RealScalarLike, VF, Y
+from .._custom_types import Args, DenseInfo, VF, Y
 from .._plan import make_plan
 from .._root_finder import PicardNewton
 from .._tableau import AbstractTableau, FlatTableau, Structure
@@ -151,19 +151,16 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
 
     def __repr__(self) -> str:
         """The parameters that are not the defaults, in one line."""
-        values = {f: getattr(self, f.name) for f in dataclasses.fields(self) if f.repr}
-        given = ", ".join(
-            f"{f.name}={value!r}"
-            if isinstance(value, eqx.Module)
-            else f"{f.name}={eqx.tree_pformat(value)}"
-            for f, value in values.items()
-            if eqx.tree_equal(value, f.default) is not True
-        )
-        return f"{type(self).__name__}({given})"
+        given = []
+        for f in dataclasses.fields(self):
+            value = getattr(self, f.name)
+            if f.repr and eqx.tree_equal(value, f.default) is not True:
+                module = isinstance(value, eqx.Module)
+                text = repr(value) if module else eqx.tree_pformat(value)
+                given.append(f"{f.name}={text}")
+        return f"{type(self).__name__}({', '.join(given)})"
 
-    def func(
-        self, terms: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
-    ) -> VF:
+    def func(self, terms, t0, y0: Y, args: Args) -> VF:
         return terms.vf(t0, y0, args)
 
 

@@ -125,13 +125,7 @@ class IndexedNoise(eqx.Module):
         self, k: IntScalarLike, t: RealScalarLike, p: PyTree, q: PyTree, args: Args
     ) -> Array:
         """`H_k`, for `k` from 0 to `m - 1`. Raises a `ValueError` if it is no scalar."""
-        out = evaluated("H", self.H, k, t, p, q, args=args)
-        if not jtu.all_leaves([out]) or jnp.shape(out) != ():
-            raise ValueError(
-                "`H(k, t, p, q, args)` of `IndexedNoise` must return a scalar, the "
-                f"Hamiltonian of the noise `k`; got shape {shapes(out)}."
-            )
-        return jnp.asarray(out, jnp.result_type(out, float))
+        return scalar_energy(evaluated("H", self.H, k, t, p, q, args=args), "H")
 
     def __call__(self, t: RealScalarLike, p: PyTree, q: PyTree, args: Args) -> Array:
         return jax.vmap(lambda k: self.one(k, t, p, q, args))(jnp.arange(self.m))
@@ -208,14 +202,14 @@ class _Drift(eqx.Module):
         return symplectic_gradient(scalar, y)
 
 
-def scalar_energy(out: PyTree) -> Array:
-    """The output of `H0`; a `ValueError` if it is no scalar."""
+def scalar_energy(out: PyTree, name: str = "H0") -> Array:
+    """The output of a Hamiltonian; a `ValueError` if it is no real scalar."""
     if not jtu.all_leaves([out]) or jnp.shape(out) != ():
         raise ValueError(
-            f"`H0` must return a scalar; got shape {shapes(out)}. Sum over the degrees of "
-            "freedom. (For a batch of paths write H0 for one, and `jax.vmap` the solve.)"
+            f"`{name}` must return a scalar; got shape {shapes(out)}. Sum over the degrees "
+            "of freedom. (For a batch of paths write it for one, and `jax.vmap` the solve.)"
         )
-    _check_real("H0", out)
+    _check_real(name, out)
     return jnp.asarray(out, jnp.result_type(out, float))
 
 
