@@ -25,10 +25,7 @@ from ._brownian import (
     WeakIncrement as WeakIncrement,
 )
 from ._citation import citation as citation
-from ._compare import (
-    compare_solvers as compare_solvers,
-    Comparison as Comparison,
-)
+from ._compare import compare_solvers as compare_solvers, Comparison as Comparison
 from ._conditions import (
     strong_order_residuals as strong_order_residuals,
     symplectic_residuals as symplectic_residuals,

@@ -1,5 +1,6 @@
 """Gradients by walking back along the solution, for solvers that undo their own steps."""
 
+import dataclasses
 import functools as ft
 from typing import Any, cast, NamedTuple
 
@@ -86,19 +87,13 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
         # The solver state is computed anew on the way back.
         stop = lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x
         fixed = jtu.tree_map(stop, init_state.solver_state)
-        init_state = eqx.tree_at(
-            lambda s: (s.y, s.solver_state),
-            init_state,
-            (object(), fixed),
-            is_leaf=lambda x: x is None,
-        )
-        final_state, aux_stats = _solve(
-            (y, args, terms, solver),
-            adjoint=self,
+        kwargs |= dict(
             stepsize_controller=stepsize_controller,
             saveat=saveat,
-            init_state=init_state,
-            **kwargs,
+            init_state=dataclasses.replace(init_state, y=object(), solver_state=fixed),
+        )
+        final_state, aux_stats = _solve(
+            (y, args, terms, solver), adjoint=self, **kwargs
         )
         ys = final_state.save_state.ys
         final_state = nondifferentiable_backward(final_state, symbolic=False)
