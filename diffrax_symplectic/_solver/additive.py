@@ -124,7 +124,7 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=None,
-        choose="Few digits at the cost of the midpoint rule.",
+        choose="Low accuracy at the cost of the midpoint rule.",
         suggested=("weak",),
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(

@@ -119,10 +119,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=None,
-        choose=(
-            "Two stage vectors for each noise and four for the drift; its errors repay "
-            "them if the noises are few."
-        ),
+        choose="For few noises: two stage vectors for each and four for the drift.",
         noises="not commuting",
         suggested=("weak",),
     )
@@ -233,10 +230,7 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose=(
-            "The midpoint rule with Lévy areas, which bring the order if noises do not "
-            "commute."
-        ),
+        choose="The midpoint rule with Lévy areas, for noises that do not commute.",
         noises="not commuting",
         suggested=("strong",),
     )

@@ -59,7 +59,7 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=(1, 1 / 2),
-        choose="Two midpoint steps in one: for paths whose error is that of the drift.",
+        choose="Two midpoint steps in one, for errors dominated by the drift.",
     )
     a: float = free_parameter("a", 0.25)
 
@@ -93,9 +93,7 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=None,
-        choose=(
-            "The midpoint rule: one stage vector for any number of noises, for few digits."
-        ),
+        choose="The midpoint rule for expectations: low accuracy at low cost.",
         suggested=("weak",),
     )
     b: float = free_parameter("b", 0.5)
@@ -149,7 +147,7 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=(2, 1),
         strong=None,
-        choose="The paper's method of its order. `StrangGauss` is cheaper.",
+        choose="The method of the paper. `StrangGauss` is cheaper.",
         noises="commuting",
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(

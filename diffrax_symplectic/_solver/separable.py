@@ -53,7 +53,7 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=None,
-        choose="Half of a stage vector, and the noise a kick: few digits of stiff systems.",
+        choose="Implicit on half of the state, noise as a kick: low accuracy.",
     )
     variant: Variant = eqx.field(default="c", static=True)
 
@@ -102,7 +102,7 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=None,
-        choose="Implicit, on half of the state: for systems too stiff for explicit steps.",
+        choose="Implicit on half of the state: for stiff systems.",
         suggested=("weak",),
     )
     a21: float = free_parameter("a21", 0.5)
@@ -136,10 +136,7 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose=(
-            "The midpoint rule on half of the state: for systems too stiff for explicit "
-            "steps."
-        ),
+        choose="The midpoint rule on half of the state: for stiff systems.",
         suggested=("strong",),
     )
     tableau: ClassVar[SeparableTableau] = SeparableTableau(
@@ -171,9 +168,7 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose=(
-            "As `SRKs2`, with explicit noise: for many noises that cost much to evaluate."
-        ),
+        choose="As `SRKs2` with explicit noise: for many expensive noises.",
     )
     a: float = free_parameter("a", 0.0)
 
@@ -210,10 +205,7 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=1,
-        choose=(
-            "Explicit, the cheapest step of all. It has to resolve the fastest frequency: "
-            "omega h < 2."
-        ),
+        choose="Explicit, the cheapest step. Fastest frequency: omega h < 2.",
         suggested=("weak", "strong"),
     )
     tableau: ClassVar[PartitionedTableau] = PartitionedTableau(
@@ -274,10 +266,7 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=3 / 2,
-        choose=(
-            "Explicit, for accurate paths. The step has to resolve the fastest frequency: "
-            "omega h < 4."
-        ),
+        choose="Explicit, for accurate paths. Fastest frequency: omega h < 4.",
         suggested=("strong",),
     )
     tableau: ClassVar[PartitionedTableau] = _plateau_verlet
