@@ -3,7 +3,6 @@ and the Lie brackets of vector fields."""
 
 import functools as ft
 from collections.abc import Callable
-from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -167,44 +166,32 @@ def tree_sum(values: list[Y]) -> Y:
     return ft.reduce(lambda a, b: (a**ω + b**ω).ω, values)
 
 
-class Bridge(NamedTuple):
-    r"""Integrals over a step of size $h$ of the Brownian bridges of `m` noises: their paths
-    less the straight lines between the ends.
+def bridge(
+    h: RealScalarLike, W: PyTree, H: PyTree, K: PyTree | None
+) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
+    r"""$H_k$ and $L_{kl} / h$ of [`diffrax_symplectic.PlateauGauss`][] for `m` noises,
+    given the space-time areas, and space-time-time areas unless `K` is `None`.
 
-    - `first`: the means of the bridges over the step, $H_k$.
-    - `second`: $\frac{1}{2h} \int (\text{bridge}_k + W_k (\frac sh - \frac12))
-        (\text{bridge}_l + W_l (\frac sh - \frac12))\,\mathrm{d}s - \frac{1}{24} W_k W_l$,
-        in expectation.
-    """
-
-    first: Float[Array, " m"]
-    second: Float[Array, "m m"]
-
-
-def bridge(h: RealScalarLike, W: PyTree, H: PyTree, K: PyTree | None) -> Bridge:
-    r"""The expectations of these integrals given the space-time areas, and given the
-    space-time-time areas as well unless `K` is `None`.
-
-    A bridge is $6 u (1 - u) H + 120 u (1 - u) (\frac12 - u) K$ with $u = s / h$, and an
-    independent rest whose square has the mean $h / 15$ without the second summand, and
-    $3 h / 70$ with it.
+    A Brownian bridge is $6 u (1 - u) H + 120 u (1 - u) (\frac12 - u) K$ with $u = s / h$,
+    and an independent rest whose square has the mean $h / 15$ without the second summand,
+    and $3 h / 70$ with it.
     """
     w, first = jfu.ravel_pytree(W)[0], jfu.ravel_pytree(H)[0]
     one = jnp.eye(first.size, dtype=first.dtype) * jnp.abs(h).astype(first.dtype)
     second = 3 / 5 * jnp.outer(first, first)
     if K is None:
-        return Bridge(first, second + one / 30)
+        return first, second + one / 30
     k = jfu.ravel_pytree(K)[0]
     mixed = jnp.outer(w, k)
     second = second + 60 / 7 * jnp.outer(k, k) - (mixed + mixed.T) / 2
-    return Bridge(first, second + 3 / 140 * one)
+    return first, second + 3 / 140 * one
 
 
 @eqx.filter_jit
 def apply_bridge(
     drift: jtu.Partial,
     noise: tuple[diffrax.AbstractTerm, ...],
-    bridge: Bridge,
+    bridge: tuple[Float[Array, " m"], Float[Array, "m m"]],
     h: RealScalarLike,
     args: Args,
     t: RealScalarLike,
@@ -234,7 +221,7 @@ def apply_bridge(
         double, single = bracket(column, inner, t, y, jnp.zeros_like(t))
         return (double**ω + first * single**ω).ω
 
-    units = np.eye(bridge.first.size, dtype=bridge.first.dtype)
+    units = np.eye(bridge[0].size, dtype=bridge[0].dtype)
     return _total(jax.vmap(summand)(units, *bridge), len(units))
 
 
