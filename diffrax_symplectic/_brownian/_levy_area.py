@@ -65,8 +65,8 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     key: PRNGKeyArray
     num_terms: int = eqx.field(static=True)
     cell: float | None = eqx.field(static=True)
-    levy_area: ClassVar = LevyAreaIncrement
-    laws: ClassVar[None] = None
+    levy_area: ClassVar = LevyAreaIncrement  # pyright: ignore
+    laws: ClassVar[None] = None  # pyright: ignore
 
     def __init__(
         self,

@@ -70,7 +70,7 @@ class WeakBrownianPath(AbstractPathWithLaws):
     second: bool = eqx.field(static=True)
     two_point: bool = eqx.field(static=True)
     order: int = eqx.field(static=True)
-    levy_area: ClassVar = WeakIncrement
+    levy_area: ClassVar = WeakIncrement  # pyright: ignore
 
     def __init__(
         self,

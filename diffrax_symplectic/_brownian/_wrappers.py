@@ -58,7 +58,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
     path: diffrax.AbstractBrownianPath
     k: int = eqx.field(static=True)
-    laws: ClassVar[None] = None
+    laws: ClassVar[None] = None  # pyright: ignore
 
     def __init__(self, path: diffrax.AbstractBrownianPath, *, k: int = 2):
         """**Arguments:**
@@ -158,7 +158,7 @@ class PlateauBrownianPath(AbstractWrappedPath):
 
     path: diffrax.AbstractBrownianPath
     key: PRNGKeyArray
-    levy_area: ClassVar = PlateauIncrement
+    levy_area: ClassVar = PlateauIncrement  # pyright: ignore
 
     def __init__(self, path: diffrax.AbstractBrownianPath, key: PRNGKeyArray):
         """**Arguments:**
