@@ -1,24 +1,11 @@
 """Stochastic symplectic Runge-Kutta methods for Diffrax.
 
-The state is a pair `(p, q)`, momenta first. Begin like this:
-
-    import diffrax
-    import diffrax_symplectic as ds
-    import jax.numpy as jnp
-    import jax.random as jr
-
-    H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
-    noise = lambda t, p, q, args: 0.1 * jnp.sin(q)
-    terms = ds.hamiltonian_terms(H0, noise, ())  # () is the shape of one noise
-    y0 = (jnp.array(0.0), jnp.array(1.0))
-    suggestions = ds.suggest_solver(terms, 0.0, y0, want="strong")
-    print(suggestions)
-    best = suggestions[0]
-    sol = diffrax.diffeqsolve(best.terms(jr.key(0)), best.solver, 0.0, 1.0, 0.1, y0)
+The state is a pair `(p, q)`, momenta first.
 
 - Terms: `hamiltonian_terms`, `spin_terms`, `wave_terms`.
 - Which solver: `suggest_solver`, `compare_solvers`. The first to try: `ImplicitMidpoint`.
 - Its Brownian path: `solver.path(shape, key)`.
+- A solution: `diffrax.diffeqsolve(terms, solver, t0, t1, dt0, y0)`.
 - Means over many paths: `expectation`. Their states: `ensemble`.
 - Friction: `BAOAB`, `LangevinMiddle`, `Damped`, `thermal_noise`.
 - Stiff linear parts: `LinearFlow`.
@@ -38,10 +25,7 @@ from ._brownian import (
     WeakIncrement as WeakIncrement,
 )
 from ._citation import citation as citation
-from ._compare import (
-    compare_solvers as compare_solvers,
-    Comparison as Comparison,
-)
+from ._compare import compare_solvers as compare_solvers, Comparison as Comparison
 from ._conditions import (
     strong_order_residuals as strong_order_residuals,
     symplectic_residuals as symplectic_residuals,

@@ -1,5 +1,6 @@
 """Gradients by walking back along the solution, for solvers that undo their own steps."""
 
+import dataclasses
 import functools as ft
 from typing import Any, cast, NamedTuple
 
@@ -31,31 +32,30 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
 
     Some solvers undo their own steps: the step from $t_{n+1}$ to $t_n$ with the same
     increments, negated, leads from $y_{n+1}$ to $y_n$. So the states need not be stored.
-    The backward pass walks along the solution, from its end to its beginning, and
-    multiplies with the transposed Jacobian of one step after another. In exact arithmetic
-    these are the gradients of `diffrax.RecursiveCheckpointAdjoint`.
+    The backward pass walks from the end of the solution to its beginning, and multiplies
+    with the transposed Jacobian of one step after another. In exact arithmetic these are
+    the gradients of `diffrax.RecursiveCheckpointAdjoint`.
 
-    Rounding errors grow on the way. Therefore the solution is saved at `checkpoints`
-    states, evenly spread over the steps, and the walk begins anew at each of them. Where
-    it arrives at one, it is compared with what was saved. If they differ by more than
-    $\varepsilon^{2/3}$ of the largest number in the state, where $\varepsilon$ is the
-    machine epsilon (4e-11 in float64), the gradient is not returned: an error is raised,
-    or with `throw=False` the gradient is NaN. Near rest, where a state says little of its
-    size, that of the states to come counts, less a tenth for each step.
+    Rounding errors grow on the way. Therefore `checkpoints` states of the solution are
+    saved, evenly spread over the steps, from which the walk begins anew. If it arrives at
+    one with an error of more than $\varepsilon^{2/3}$ of the largest number in the state,
+    with the machine epsilon $\varepsilon$ (4e-11 in float64), an error is raised, or with
+    `throw=False` the gradient is NaN. Near rest the size of later states counts, a tenth
+    less for each step.
 
-    **Solvers:** those that are their own inverse, which is read off their coefficients:
+    **Solvers:** tableaus that are their own inverse, which is read off the coefficients:
     [`diffrax_symplectic.ImplicitMidpoint`][], [`diffrax_symplectic.StormerVerlet`][],
-    [`diffrax_symplectic.StrangGauss`][], [`diffrax_symplectic.LevyAreaMidpoint`][],
-    [`diffrax_symplectic.NinomiyaVictoir`][], [`diffrax_symplectic.BAOAB`][], tableaus of
-    your own, and [`diffrax_symplectic.Damped`][] or [`diffrax_symplectic.LinearFlow`][]
-    around one of these. With friction rounding errors grow by $e^{\gamma t}$ on the way
-    back: save more states.
+    [`diffrax_symplectic.StrangGauss`][], [`diffrax_symplectic.LevyAreaMidpoint`][], and
+    some of your own; [`diffrax_symplectic.NinomiyaVictoir`][],
+    [`diffrax_symplectic.BAOAB`][]; and [`diffrax_symplectic.Damped`][] or
+    [`diffrax_symplectic.LinearFlow`][] around one of these. With friction rounding errors
+    grow by $e^{\gamma t}$ on the way back: save more states.
 
     **Steps:** `diffrax.ConstantStepSize` or `diffrax.StepTo`. **Saving:** `SaveAt(t1=True)`
     or `SaveAt(ts=...)`. No events, no forward mode; no derivatives with respect to times.
 
-    **Parameters:** what gradients are taken of is part of `args`, of the initial state, of
-    the terms or of the solver. JAX refuses values that a Hamiltonian captures as a closure.
+    **Parameters:** gradients are taken of `args`, the initial state, the terms and the
+    solver. JAX refuses values that a Hamiltonian captures as a closure.
 
     **Raises:** a `ValueError`, while tracing, for anything else.
     """
@@ -84,21 +84,16 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
             )
         _check_supported(solver, stepsize_controller, event, saveat)
         y = init_state.y
-        # What a solver remembers of the state is computed anew on the way back.
-        fixed = jtu.tree_map(_without_derivative, init_state.solver_state)
-        init_state = eqx.tree_at(
-            lambda s: (s.y, s.solver_state),
-            init_state,
-            (object(), fixed),
-            is_leaf=lambda x: x is None,
-        )
-        final_state, aux_stats = _solve(
-            (y, args, terms, solver),
-            adjoint=self,
+        # The solver state is computed anew on the way back.
+        stop = lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x
+        fixed = jtu.tree_map(stop, init_state.solver_state)
+        kwargs |= dict(
             stepsize_controller=stepsize_controller,
             saveat=saveat,
-            init_state=init_state,
-            **kwargs,
+            init_state=dataclasses.replace(init_state, y=object(), solver_state=fixed),
+        )
+        final_state, aux_stats = _solve(
+            (y, args, terms, solver), adjoint=self, **kwargs
         )
         ys = final_state.save_state.ys
         final_state = nondifferentiable_backward(final_state, symbolic=False)
@@ -107,51 +102,40 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
 
 ReversingAdjoint.__init__.__doc__ = """**Arguments:**
 
-- `checkpoints`: how many states of the solution are saved. More of them cost memory, and
-    save no time; they are for systems in which rounding errors grow fast.
+- `checkpoints`: how many states of the solution are saved: more where rounding errors grow
+    fast. They cost memory, and save no time.
 
 **Raises:** a `ValueError` if `checkpoints` is not a positive integer.
 """
 
 
-def _without_derivative(x: Any) -> Any:
-    return lax.stop_gradient(x) if eqx.is_array(x) else x
-
-
 def _check_supported(solver, controller, event, saveat) -> None:
-    name = type(solver).__name__
-    advice = "Pass `adjoint=diffrax.RecursiveCheckpointAdjoint()`."
-    if not _undoes_its_steps(solver):
-        raise ValueError(
-            f"`ReversingAdjoint` needs a solver that undoes its own steps, and `{name}` "
-            f"does not. Use `ImplicitMidpoint`, `StormerVerlet` or `StrangGauss`. "
-            f"Or: {advice}"
-        )
-    if not isinstance(controller, diffrax.ConstantStepSize | diffrax.StepTo):
-        raise ValueError(
-            "`ReversingAdjoint` needs steps that are known beforehand: `stepsize_"
-            "controller=diffrax.ConstantStepSize()` or `diffrax.StepTo(ts)`; got "
-            f"`{type(controller).__name__}`. Or: {advice}"
-        )
-    if event is not None:
-        raise ValueError(f"`ReversingAdjoint` knows no events. {advice}")
     sub = saveat.subs
     one = isinstance(sub, diffrax.SubSaveAt) and not saveat.dense
-    if not one or sub.steps or sub.t0 or (sub.t1 and sub.ts is not None):
-        raise ValueError(
-            "`ReversingAdjoint` can do `SaveAt(t1=True)` and `SaveAt(ts=...)`. For all "
-            f"else: {advice[0].lower()}{advice[1:]}"
-        )
-    if sub.fn is not diffrax.SubSaveAt(t1=True).fn:
-        raise ValueError(
-            "`ReversingAdjoint` cannot do `SaveAt(fn=...)`. Save the state, and apply the "
-            f"function to `sol.ys`. Or: {advice}"
-        )
+    more = not one or sub.steps or sub.t0 or (sub.t1 and sub.ts is not None)
+    known = diffrax.ConstantStepSize | diffrax.StepTo
+    faults = {
+        "needs a solver that undoes its own steps, such as `ImplicitMidpoint`, "
+        f"`StormerVerlet` or `StrangGauss`; got `{type(solver).__name__}`":
+            not _undoes_its_steps(solver),
+        "needs steps that are known beforehand: `stepsize_controller=diffrax."
+        "ConstantStepSize()` or `diffrax.StepTo(ts)`; got "
+        f"`{type(controller).__name__}`": not isinstance(controller, known),
+        "cannot do events": event is not None,
+        "saves states, by `SaveAt(t1=True)` or `SaveAt(ts=...)`. In place of "
+        "`SaveAt(fn=...)` apply the function to `sol.ys`":
+            more or sub.fn is not diffrax.SubSaveAt(t1=True).fn,
+    }  # fmt: skip
+    for fault, found in faults.items():
+        if found:
+            raise ValueError(
+                f"`ReversingAdjoint` {fault}. Or pass `adjoint=diffrax."
+                "RecursiveCheckpointAdjoint()`."
+            )
 
 
 def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:
-    # The sign of an increment decides in which order its flows follow each other. So a step
-    # with negated increments takes them in the reverse order.
+    # A step of `NinomiyaVictoir` with negated increments takes its flows in reverse order.
     if isinstance(solver, NinomiyaVictoir | BAOAB):
         return True
     if isinstance(solver, AbstractSplitting):
@@ -184,7 +168,7 @@ def _run(adjoint, inputs, outer_while_loop, kwargs):
 @_solve.def_fwd
 def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
     del perturbed, throw
-    every = _Steps.of(kwargs).spread(adjoint.checkpoints)
+    every = _Steps.of(kwargs).between(adjoint.checkpoints)
     recorded = []
 
     def recording_while_loop(cond_fun, body_fun, init_val, *, buffers, **options):
@@ -228,7 +212,7 @@ class _Steps(NamedTuple):
     def of(kwargs: dict) -> "_Steps":
         return _Steps(kwargs["stepsize_controller"], kwargs["init_state"])
 
-    def spread(self, checkpoints: int) -> IntScalarLike:
+    def between(self, checkpoints: int) -> IntScalarLike:
         """The number of steps between two saved states."""
         if isinstance(self.controller, diffrax.StepTo):
             number = len(self.controller.ts) - 1
@@ -270,7 +254,7 @@ def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwar
     rows, y1, num_steps, saved = residuals
     sub = kwargs["saveat"].subs
     init_state, steps = kwargs["init_state"], _Steps.of(kwargs)
-    every = steps.spread(adjoint.checkpoints)
+    every = steps.between(adjoint.checkpoints)
     _, *parameters = inputs
     _, *is_perturbed = perturbed
     diff, nondiff = eqx.partition(parameters, is_perturbed)
@@ -288,7 +272,7 @@ def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwar
         t0, t1 = steps.time(i), steps.time(i + 1)
         if back:
             t0, t1, terms = -t1, -t0, reversed_in_time(terms)
-        # The solver state is that of another step: as after a jump.
+        # The solver state belongs to another step, as after a jump.
         return solver.step(terms, t0, t1, y, args, init_state.solver_state, True)[0]
 
     def body(walk: _Walk) -> _Walk:
@@ -318,8 +302,8 @@ def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwar
     return _if_arrived(walk.arrived, throw, (a_y, *walk.a_parameters))
 
 
-# How much less the size of a state counts for the one a step before it. A start at rest
-# has the size of the steps to come, of which weak increments may leave dozens at rest, too.
+# How much of its size a state passes to the one before it. A start at rest gets the size of
+# later states, and weak increments may leave it at rest for dozens of steps.
 _PER_STEP = 0.9
 
 
@@ -339,8 +323,8 @@ def _begin_anew(
 
 
 def _saved_between(t0, t1, ts, g, a_y, a_y0, saved):
-    """Adds the derivatives with respect to what was saved in the step from `t0` to `t1`,
-    which Diffrax interpolates linearly."""
+    """Adds the derivatives with respect to states saved between `t0` and `t1`, which are
+    interpolated linearly."""
 
     def add(carry):
         a_y, a_y0, saved = carry
@@ -348,7 +332,7 @@ def _saved_between(t0, t1, ts, g, a_y, a_y0, saved):
         of = lambda x, share: jtu.tree_map(lambda x, g: x + share * g[saved - 1], x, g)
         return of(a_y, share), of(a_y0, 1 - share), saved - 1
 
-    # If no saved time is left, this reads the last of all. The result is not used.
+    # If no saved time is left, this reads the last one, and the result is not used.
     more = lambda carry: (carry[2] > 0) & (ts[carry[2] - 1] > t0)
     return lax.while_loop(more, add, (a_y, a_y0, saved))
 

@@ -1,4 +1,4 @@
-"""Checks of what a user passes: functions, numbers, solvers, states."""
+"""Checks of arguments: functions, numbers, solvers, states."""
 
 import inspect
 from typing import Any
@@ -6,17 +6,17 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import ArrayLike, PyTree
 
 from ._custom_types import Y
 
 
 def check_takes(name: str, fn: Any, *arguments: str) -> None:
-    """Raises a `ValueError` unless `fn` can be called with these arguments, and names none
-    of them in another order."""
+    """Raises a `ValueError` unless `fn` takes these arguments, in this order."""
     call = f"`{name}({', '.join(arguments)})`"
     if not callable(fn):
         raise ValueError(f"`{name}` must be a function, called as {call}; got {fn!r}.")
@@ -62,6 +62,22 @@ def whole_number(name: str, value: Any, least: int = 1) -> int:
         kind = "a positive integer" if least == 1 else f"an integer, {least} or larger"
         raise ValueError(f"`{name}` must be {kind}; got {value!r}.")
     return int(value)
+
+
+def real_array(name: str, value: Any, *, positive: bool, kind: str) -> ArrayLike:
+    """Raises a `ValueError` unless this is a real number or array, as far as it is known
+    while tracing finite and positive, or not negative."""
+    fits = eqx.is_array_like(value) and not isinstance(value, bool)
+    if fits and not isinstance(value, jax.core.Tracer):
+        values = np.asarray(value)
+        fits = not np.iscomplexobj(values) and np.all(np.isfinite(values))
+        fits = fits and np.all(values > 0 if positive else values >= 0)
+    elif fits:
+        fits = not jnp.iscomplexobj(value)
+    if not fits:
+        least = "positive" if positive else "not negative"
+        raise ValueError(f"`{name}` must be {kind}, finite and {least}; got {value!r}.")
+    return value
 
 
 def shapes(tree: PyTree) -> str:

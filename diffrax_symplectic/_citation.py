@@ -14,14 +14,11 @@ _DOI = re.compile(r"https://doi\.org/([^\s)]+)")
 
 def citation(*args: Any, **kwargs: Any) -> None:
     """Prints BibTeX for the numerical methods of a solve: what `diffrax.citation` prints,
-    and then the sources of the solver and the Brownian path, if they are of this package.
+    and the sources of solvers and Brownian paths of this package.
 
     ```python
     ds.citation(terms, ds.SRKw2(), t0=0, t1=1, dt0=0.01, y0=y0)
     ```
-
-    Diffrax offers other packages no way to add to its list, so this is a function of its
-    own.
 
     **Arguments:** any of those of `diffrax.diffeqsolve`.
     """
@@ -36,7 +33,7 @@ def citation(*args: Any, **kwargs: Any) -> None:
             )
             print(*(f"% - {doi}" for doi in dois), sep="\n")
         for doi in dois:
-            # What two classes share is printed once: BibTeX refuses a key that repeats.
+            # BibTeX refuses a key that repeats.
             if doi in entries:
                 print(entries.pop(doi))
 

@@ -37,7 +37,7 @@ class ComparedStep(NamedTuple):
     - `dt`: the step size.
     - `error`, `std_error`: the error, and its standard error.
     - `seconds`: the measured time of a path.
-    - `num_failed`: how many paths failed; they have no part in the error.
+    - `num_failed`: how many paths failed; they do not count in the error.
     """
 
     solver: str
@@ -50,7 +50,7 @@ class ComparedStep(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Comparison:
-    """What [`diffrax_symplectic.compare_solvers`][] returns. To print it gives a table.
+    """What [`diffrax_symplectic.compare_solvers`][] returns. Printed, it is a table.
 
     - `kind`: `"strong"` or `"weak"`.
     - `steps`: one for each solver and step size, with `solver`, `dt`, `error` and its
@@ -76,39 +76,24 @@ class Comparison:
     __repr__ = __str__
 
     def plot(self, axes: Any = None) -> Any:
-        """Draws errors against times, with three standard errors, and returns the axes.
+        """Draws errors against times with Matplotlib, with three standard errors.
 
         **Arguments:**
 
         - `axes`: Matplotlib's axes; by default new ones.
 
-        **Raises:** an `ImportError` without Matplotlib.
+        **Returns:** the axes.
         """
-        try:
-            import matplotlib.pyplot as plt
-        except ImportError as error:
-            raise ImportError(
-                "To plot needs Matplotlib: `pip install 'diffrax_symplectic[examples]'`, "
-                "or `pip install matplotlib`."
-            ) from error
-        if axes is None:
-            _, axes = plt.subplots(layout="constrained")
+        import matplotlib.pyplot as plt
+
+        axes = plt.subplots(layout="constrained")[1] if axes is None else axes
         for name in dict.fromkeys(s.solver for s in self.steps):
             own = [s for s in self.steps if s.solver == name]
-            axes.errorbar(
-                [s.seconds for s in own],
-                [s.error for s in own],
-                [3 * s.std_error for s in own],
-                label=name,
-                marker="o",
-                capsize=2,
-            )
-        axes.set(
-            xscale="log",
-            yscale="log",
-            xlabel="seconds per path",
-            ylabel=f"{self.kind} error",
-        )
+            x, y = [s.seconds for s in own], [s.error for s in own]
+            bars = [3 * s.std_error for s in own]
+            axes.errorbar(x, y, bars, label=name, marker="o", capsize=2)
+        axes.set(xscale="log", yscale="log")
+        axes.set(xlabel="seconds per path", ylabel=f"{self.kind} error")
         axes.legend()
         return axes
 
@@ -132,10 +117,8 @@ def compare_solvers(
     Without `phi` errors are strong: root mean squares of $|y - y^*|$ at `t1`, with $y^*$
     a solution along the same Brownian path in steps an eighth of the smallest of `dt0`.
     With `phi` they are weak: $|\mathbb E \phi(t, y) - \mathbb E \phi(t, y^*)|$ at `t1`,
-    by independent paths; their standard errors fall as one over the root of `num_paths`.
-
-    Times are those of a batch of paths on this machine, divided by their number, without
-    compiling.
+    by independent paths. Times are measured for a batch of paths on this machine, divided
+    by their number, without compiling.
 
     !!! example
 
@@ -148,16 +131,13 @@ def compare_solvers(
         noise = lambda t, p, q, args: 0.1 * jnp.sin(q)
         terms = ds.hamiltonian_terms(H0, noise, ())  # the shape of one noise
         y0 = (jnp.array(0.0), jnp.array(1.0))
-        solvers = [ds.StormerVerlet(), ds.ImplicitMidpoint()]
-        print(
-            ds.compare_solvers(terms, solvers, 0.0, 1.0, [0.25, 0.125], y0, key=jr.key(1))
-        )
+        print(ds.compare_solvers(terms, None, 0.0, 1.0, [0.25, 0.125], y0, key=jr.key(1)))
         ```
 
     **Arguments:**
 
-    - `terms`: the terms, with any Brownian path, or with the shape of its increments in
-        place of a path. Each solver gets the path that it needs.
+    - `terms`: the terms, with any Brownian path or its shape. Each solver gets the path
+        that it needs.
     - `solvers`: a list of solvers, or `None` for those that `suggest_solver` names.
     - `t0`, `t1`, `y0`, `args`: as for `diffrax.diffeqsolve`, with numbers for the times.
     - `dt0`: a list of step sizes; each divides the interval, and is a multiple of the
@@ -167,11 +147,12 @@ def compare_solvers(
     - `num_paths`: how many paths.
     - `reference`: the solver of $y^*$; by default the first that `suggest_solver` names.
 
-    **Returns:** a [`diffrax_symplectic.Comparison`][]. A solver that does not fit the terms
-    is named there with the reason, and the others are compared.
+    **Returns:** a [`diffrax_symplectic.Comparison`][], which names solvers that do not fit
+    the terms with the reason.
 
     **Raises:** a `ValueError` if a step size does not divide the interval or is no multiple
-    of the smallest, if `phi` does not return one number, and for what is no solver.
+    of the smallest, if `phi` does not return one number, and for anything that is no
+    solver.
     """
     dts = _checked_steps(t0, t1, dt0)
     want = "strong" if phi is None else "weak"
@@ -182,18 +163,47 @@ def compare_solvers(
     _check_solvers(solvers, reference)
     if phi is not None:
         _check_scalar(phi, t1, y0, args)
+    problem = _Problem(terms, t0, t1, y0, args, phi)
     cell = min(dts) / _FINER
+    own_path = lambda solver: ft.partial(path_for, solver, want, None)
+    # Strong errors are along one Brownian motion, which not all solvers can follow.
+    common = lambda solver: ft.partial(path_for, solver, None, cell)
+    error_path = common if phi is None else own_path
+    keys = lambda number: jr.split(jr.fold_in(key, number), num_paths)
+    fine = problem.batch(reference, error_path(reference))(keys(0), jnp.asarray(cell))
+    steps, refused = [], {}
+    for solver in solvers:
+        name, own = repr(solver), problem.batch(solver, own_path(solver))
+        compared = problem.batch(solver, common(solver)) if phi is None else own
+        try:
+            eqx.filter_eval_shape(compared, keys(0), jnp.asarray(dts[0]))
+        except ValueError as error:
+            refused[name] = str(error).splitlines()[0]
+            continue
+        jax.block_until_ready(own(keys(1), jnp.asarray(dts[0])))  # compiles
+        for number, dt in enumerate(map(jnp.asarray, dts), start=1):
+            begin = time.perf_counter()
+            out = jax.block_until_ready(own(keys(number), dt))
+            seconds = (time.perf_counter() - begin) / num_paths
+            if phi is None:
+                error, bar, failed = strong_error(compared(keys(0), dt), fine)
+            else:
+                error, bar, failed = weak_error(out, fine)
+            steps.append(ComparedStep(name, float(dt), error, bar, seconds, failed))
+    return Comparison(want, tuple(steps), refused)
 
-    def own_path(solver):
-        return lambda shape, key: path_for(solver, want, None, shape, key)
 
-    def error_path(solver):
-        # Strong errors are along one Brownian motion, which not all solvers can follow.
-        common = lambda shape, key: path_for(solver, None, cell, shape, key)
-        return common if phi is None else own_path(solver)
+class _Problem(NamedTuple):
+    terms: diffrax.AbstractTerm
+    t0: float
+    t1: float
+    y0: Y
+    args: Args
+    phi: Callable[[RealScalarLike, Y, Args], ArrayLike] | None
 
-    def batch(solver, make_path):
-        """The results of paths, by their keys and the step size, and which were solved."""
+    def batch(self, solver: diffrax.AbstractSolver, make_path: Callable) -> Callable:
+        """The results of paths, as a function of their keys and the step size."""
+        terms, t0, t1, y0, args, phi = self
 
         @eqx.filter_jit
         @ft.partial(jax.vmap, in_axes=(0, None))
@@ -205,67 +215,35 @@ def compare_solvers(
                 adjoint=diffrax.ForwardMode(), throw=False,
             )  # fmt: skip
             y1 = jtu.tree_map(lambda y: y[-1], sol.ys)
-            return (y1 if phi is None else phi(t1, y1, args)), diffrax.is_okay(
-                sol.result
-            )
+            result = y1 if phi is None else phi(t1, y1, args)
+            return result, diffrax.is_okay(sol.result)
 
         return results
-
-    keys = lambda number: jr.split(jr.fold_in(key, number), num_paths)
-    fine = batch(reference, error_path(reference))(keys(0), jnp.asarray(cell))
-    steps, refused = [], {}
-    for solver in solvers:
-        name, natural = repr(solver), batch(solver, own_path(solver))
-        compared = batch(solver, error_path(solver)) if phi is None else natural
-        try:
-            eqx.filter_eval_shape(compared, keys(0), jnp.asarray(dts[0]))
-        except ValueError as error:
-            refused[name] = str(error).splitlines()[0]
-            continue
-        jax.block_until_ready(natural(keys(1), jnp.asarray(dts[0])))  # compiles
-        for number, dt in enumerate(map(jnp.asarray, dts), start=1):
-            begin = time.perf_counter()
-            out = jax.block_until_ready(natural(keys(number), dt))
-            seconds = (time.perf_counter() - begin) / num_paths
-            if phi is None:
-                error = strong_error(compared(keys(0), dt), fine)
-            else:
-                error = weak_error(out, fine)
-            steps.append(ComparedStep(name, float(dt), *error[:2], seconds, error[2]))
-    return Comparison(want, tuple(steps), refused)
 
 
 def strong_error(out: _Batch, fine: _Batch) -> tuple[float, float, int]:
     """The root mean square of the difference over the paths that both solvers finish, its
     standard error, and how many paths `out` or `fine` does not finish."""
     okay = np.asarray(out[1] & fine[1])
-    squares = jtu.tree_map(
-        lambda a, b: np.asarray(a - b, np.float64) ** 2, out[0], fine[0]
-    )
-    flat = [x.reshape(len(okay), -1) for x in jtu.tree_leaves(squares)]
-    square, bar = _mean(np.concatenate(flat, axis=1).sum(axis=1), okay)
+    square = lambda a, b: np.asarray(a - b, np.float64).reshape(len(okay), -1) ** 2
+    squares = jtu.tree_leaves(jtu.tree_map(square, out[0], fine[0]))
+    mean, bar = _mean(np.concatenate(squares, axis=1).sum(axis=1), okay)
     with np.errstate(all="ignore"):
-        rms = np.sqrt(square)
+        rms = np.sqrt(mean)
         return float(rms), float(bar / (2 * rms)), int(np.sum(~okay))
 
 
 def weak_error(out: _Batch, fine: _Batch) -> tuple[float, float, int]:
     """The difference of the means, its standard error, and how many paths failed."""
-    (mean, bar), (exact, other) = (
-        _mean(np.asarray(x), np.asarray(k)) for x, k in (out, fine)
-    )
-    return (
-        abs(mean - exact),
-        float(np.hypot(bar, other)),
-        int(np.sum(~np.asarray(out[1]))),
-    )
+    (mean, bar), (exact, other) = _mean(*out), _mean(*fine)
+    return abs(mean - exact), math.hypot(bar, other), int(np.sum(~np.asarray(out[1])))
 
 
-def _mean(x: np.ndarray, okay: np.ndarray) -> tuple[float, float]:
+def _mean(x, okay) -> tuple[float, float]:
     """The mean of the values that are `okay`, and its standard error."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # no path is left
-        kept = x[okay].astype(np.float64)
+        kept = np.asarray(x, np.float64)[np.asarray(okay)]
         return float(np.mean(kept)), float(np.std(kept) / np.sqrt(len(kept)))
 
 
@@ -287,7 +265,7 @@ def _check_scalar(phi, t: RealScalarLike, y0: Y, args: Args) -> None:
 def _checked_steps(t0, t1, dts: Sequence[float]) -> list[float]:
     if not t1 > t0:
         raise ValueError(f"`t1` must be after `t0`; got t0={t0!r} and t1={t1!r}.")
-    if np.ndim(dts) != 1:
+    if np.ndim(dts) != 1 or len(dts) == 0:
         raise ValueError(f"`dt0` must be a list of step sizes; got {dts!r}.")
     whole = lambda x: math.isfinite(x) and x > 0.5 and abs(x - round(x)) < 1e-6
     for dt in dts:
@@ -297,6 +275,4 @@ def _checked_steps(t0, t1, dts: Sequence[float]) -> list[float]:
                 f"multiple of the smallest; got {dt}. Take for example "
                 "`[(t1 - t0) / 2**k for k in range(3, 8)]`."
             )
-    if len(dts) == 0:
-        raise ValueError("`dt0` must hold at least one step size.")
     return [float(dt) for dt in dts]

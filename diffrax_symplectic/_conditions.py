@@ -1,12 +1,10 @@
-"""Conditions on the coefficients of a tableau: for being symplectic, for its orders, and
-for undoing its own steps."""
+"""Conditions on the coefficients of a tableau: for symplecticity, orders, and undoing its
+own steps."""
 
 import dataclasses
 import functools as ft
 import itertools
-import math
-from collections.abc import Iterator, Mapping
-from typing import TypeAlias
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
@@ -27,11 +25,7 @@ def symplectic_residuals(tableau: AbstractTableau) -> Float[np.ndarray, "s s"]:
 
     With all stages of the tableau in one list, `matrix` $M$ and `weights` $w$ of its
     flat form, these are $w_i w_j - w_i M_{ij} - w_j M_{ji}$ for every two stages that
-    depend on each other's values. For a [`diffrax_symplectic.GeneralTableau`][] that is
-
-    $$\alpha_i \alpha_j - \alpha_i A^0_{ij} - \alpha_j A^0_{ji}, \qquad
-      \alpha_i \beta_j - \alpha_i B^0_{ij} - \beta_j A^1_{ji}, \qquad
-      \beta_i \beta_j - \beta_i B^1_{ij} - \beta_j B^1_{ji}.$$
+    depend on each other's values.
 
     **Arguments:**
 
@@ -53,22 +47,20 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     r"""Residuals of the conditions for weak order 1 or 2.
 
     - For a [`diffrax_symplectic.GeneralTableau`][] with three-point increments: weak
-        order 1 for any number of noises, weak order 2 for one. If the tableau has the
-        variable `"L"`, the conditions contain what its brackets contribute.
+        order 1 for any number of noises, weak order 2 for one.
     - For a [`diffrax_symplectic.PartitionedTableau`][] or
-        [`diffrax_symplectic.SeparableTableau`][] (where $\hat\alpha = \alpha$ and
-        $A = \hat A = A^0$): those of the conditions for Itô equations that matter where the
-        noise changes $p$ alone and does not depend on it.
-    - For a [`diffrax_symplectic.AdditiveTableau`][]: any number of noises, with
+        [`diffrax_symplectic.SeparableTableau`][]: the conditions for Itô equations that
+        matter where the noise changes $p$ alone and does not depend on it.
+    - For an [`diffrax_symplectic.AdditiveTableau`][]: any number of noises, with
         constant $b_k$ if the tableau is `constant`.
 
     **Arguments:**
 
-    - `tableau`: any tableau of these.
+    - `tableau`: one of these tableaus.
     - `order`: 1 or 2.
 
-    **Returns:** the residual of each condition, by its formula. The conditions for order
-    2 contain those for order 1.
+    **Returns:** the residual of each condition, by its formula; for order 2 also of the
+    conditions for order 1.
 
     **Raises:** a `ValueError` for any other order, for other tableaus, or for random
     variables of unknown variance.
@@ -84,14 +76,12 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
 
 
 def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
-    r"""Residuals of the conditions for the strong order that tableaus of one kind can
-    have, with Gaussian increments:
+    r"""Residuals of the conditions for a strong order, with Gaussian increments:
 
     - 1/2 for a [`diffrax_symplectic.GeneralTableau`][], and 1 if the noises commute,
         since every noise has the same coefficients;
     - 1 for a [`diffrax_symplectic.SeparableTableau`][] or
-        [`diffrax_symplectic.PartitionedTableau`][] (with more variables than $I_k$ these
-        may have 3/2, which is not tested here);
+        [`diffrax_symplectic.PartitionedTableau`][];
     - 3/2 for an [`diffrax_symplectic.AdditiveTableau`][], in the variables $I_k = W_k$
         and $I_{k0} / h = W_k / 2 + H_k$.
 
@@ -109,56 +99,26 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
     return {name: float(value) for name, value in _strong(tableau).items()}
 
 
-# A rooted tree, by its subtrees at the root.
-_Tree: TypeAlias = tuple["_Tree", ...]
-# No tableau here has a higher order. One of a user's own that does gets this one.
-_HIGHEST_DRIFT_ORDER = 6
-
-
 def drift_order(tableau: FlatTableau) -> int:
-    r"""The order without noise: how many orders of Butcher's conditions hold, one for
-    each rooted tree, and for each part of the state at its root."""
+    """The order without noise, up to 4, by Butcher's conditions for each part of the state
+    that stages write."""
     drift = [i for i, s in enumerate(tableau.stages) if s.channels == ("h",)]
     flat = tableau.take(drift)
-    matrix = np.where(flat.reads, flat.matrix, 0.0)
-    writes = np.array([s.writes for s in flat.stages])
-
-    def elementary(tree: _Tree) -> np.ndarray:
-        each = [matrix @ elementary(branch) for branch in tree]
-        return np.prod([np.ones(len(writes)), *each], axis=0)
-
-    def holds(tree: _Tree, part: str) -> bool:
-        of = writes == part
-        _, density = _size_and_density(tree)
-        return bool(abs(flat.weights[of] @ elementary(tree)[of] - 1 / density) <= 1e-12)
-
-    for order in range(1, _HIGHEST_DRIFT_ORDER + 1):
-        conditions = itertools.product(_trees(order), set(writes))
-        if not all(itertools.starmap(holds, conditions)):
-            return order - 1
-    return _HIGHEST_DRIFT_ORDER
-
-
-@ft.cache
-def _trees(size: int) -> frozenset[_Tree]:
-    if size == 1:
-        return frozenset([()])
-    return frozenset(
-        bigger for tree in _trees(size - 1) for bigger in _with_a_leaf(tree)
+    M = np.where(flat.reads, flat.matrix, 0.0)
+    e, writes = np.ones(len(drift)), np.array([s.writes for s in flat.stages])
+    c = M @ e
+    conditions = (
+        [(e, 1)],
+        [(c, 1 / 2)],
+        [(c**2, 1 / 3), (M @ c, 1 / 6)],
+        [(c**3, 1 / 4), (c * (M @ c), 1 / 8), (M @ c**2, 1 / 12), (M @ M @ c, 1 / 24)],
     )
-
-
-def _with_a_leaf(tree: _Tree) -> Iterator[_Tree]:
-    yield ((), *tree)
-    for i, branch in enumerate(tree):
-        for bigger in _with_a_leaf(branch):
-            yield tuple(sorted([*tree[:i], bigger, *tree[i + 1 :]]))
-
-
-def _size_and_density(tree: _Tree) -> tuple[int, int]:
-    branches = [_size_and_density(branch) for branch in tree]
-    size = 1 + sum(size for size, _ in branches)
-    return size, size * math.prod(density for _, density in branches)
+    for order, of_this_order in enumerate(conditions):
+        for (x, exact), part in itertools.product(of_this_order, set(writes)):
+            of = writes == part
+            if abs(flat.weights[of] @ x[of] - exact) > 1e-12:
+                return order
+    return len(conditions)
 
 
 @ft.singledispatch
@@ -178,7 +138,7 @@ def _(tableau: GeneralTableau) -> dict:
 
 @_strong.register
 def _(tableau: SeparableTableau) -> dict:
-    # For the paper's further variables, which are not independent of `W`.
+    # The paper's further variables are not independent of `W`.
     others = _others_vanish(tableau.beta, A1e=tableau.A1.sum(axis=1))
     return _strong(tableau.partitioned()) | others
 
@@ -274,8 +234,7 @@ def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
 
 @_weak.register
 def _(tableau: SeparableTableau) -> tuple[dict, dict]:
-    """With the paper's conditions on further variables, which are not independent of `W`:
-    the end of the step must not depend on those in `B0`."""
+    """With conditions on the paper's further variables, which depend on `W`."""
     B0 = {"W": tableau.B0["W"]}
     partitioned = dataclasses.replace(tableau.partitioned(), B0=B0)
     first, second = _weak(partitioned)
@@ -335,13 +294,13 @@ def _unknown(tableau) -> ValueError:
     )
 
 
-# The step size and the random variables that change their sign if a step is undone.
+# The controls that change their sign if a step is undone.
 _NEGATED = {"h", *(name for name, variable in VARIABLES.items() if not variable.even)}
 
 
 def is_own_inverse(tableau: FlatTableau) -> bool:
-    r"""Whether the step with all controls negated undoes the step: whether the stages can
-    be paired, $i \leftrightarrow \sigma(i)$, such that
+    r"""Whether the step with all controls negated undoes the step: stages can be paired,
+    $i \leftrightarrow \sigma(i)$, such that
 
     $$a_{ij} + a_{\sigma(i)\sigma(j)} = b_j, \qquad b_{\sigma(j)} = b_j, \qquad
       c_i + c_{\sigma(i)} = 1.$$

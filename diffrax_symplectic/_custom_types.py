@@ -1,15 +1,13 @@
 from typing import Any, TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Int, PyTree, Real, Shaped
+from jaxtyping import Array, ArrayLike, Int, PyTree, Real, Shaped
 
 
 if TYPE_CHECKING:
-    BoolScalarLike: TypeAlias = bool | Array | np.ndarray
     IntScalarLike: TypeAlias = int | Array | np.ndarray
     RealScalarLike: TypeAlias = int | float | Array | np.ndarray
 else:
-    BoolScalarLike = Bool[ArrayLike, ""]
     IntScalarLike = Int[ArrayLike, ""]
     RealScalarLike = Real[ArrayLike, ""]
 

@@ -14,9 +14,8 @@ from ._tableau import FlatTableau, Stage
 
 # Coefficients are exact up to a few roundings of order-one numbers.
 _TOLERANCE = 1e-14
-# The smallest set of unknown stages of a block is found by trying all sets of one size
-# after another. Their number grows exponentially with the stages. So the search ends at a
-# size with more sets than this.
+# The fewest unknown stages of a block are found by trying all sets, up to a size of which
+# there are more than this.
 _MOST_CHOICES = 1000
 
 
@@ -28,9 +27,9 @@ class Block(NamedTuple):
     """Stages that depend on each other: a strongly connected component of the graph of
     dependencies.
 
-    - `unknown`: the stages whose values are solved for; empty if the block is explicit.
-    - `explicit`: the other stages, in an order in which each can be evaluated once the
-        unknown ones and the earlier ones are known.
+    - `unknown`: the stages that are solved for; none if the block is explicit.
+    - `explicit`: the other stages, in an order in which each follows from the unknown ones
+        and the earlier ones.
 
     Both in groups of stages that can be evaluated together.
     """
@@ -54,8 +53,8 @@ class Plan:
 
 
 def make_plan(tableau: FlatTableau) -> Plan:
-    """Drops unused stages, evaluates equal ones once, and orders the rest. Plans of equal
-    tableaus are one object, found again in every trace."""
+    """Drops unused stages, evaluates equal ones once, and orders the rest. Equal tableaus
+    have one plan, the same object in every trace."""
     as_bytes = lambda x: np.asarray(x, np.float64).tobytes()
     return _make_plan(
         tableau.stages, as_bytes(tableau.matrix), as_bytes(tableau.weights)
@@ -147,8 +146,8 @@ def _blocks(tableau: FlatTableau) -> tuple[Block, ...]:
         explicit = [group for ready in rounds for group in _groups(ready, tableau)]
         groups = _groups(unknown, tableau)
         if len(groups) > 1:
-            # Where stages of other kinds read them, stacked values are taken apart again:
-            # apart, an iteration of five stages takes a third less time.
+            # Stages of other kinds would take stacked values apart again: an iteration of
+            # five stages takes a third less time without stacking.
             groups = tuple((i,) for group in groups for i in group)
         blocks.append(Block(groups, tuple(explicit)))
     return tuple(blocks)
@@ -165,9 +164,9 @@ def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
 def _cut(
     block: tuple[int, ...], depends: np.ndarray
 ) -> tuple[tuple[int, ...], list[list[int]]]:
-    """Stages such that the others depend on each other in no cycle once these are known,
-    and the rounds in which the others can be evaluated. As few as possible, unless finding
-    the smallest set would take too long."""
+    """Stages without which no cycle of dependencies is left, and the rounds in which the
+    other stages can then be evaluated. As few as possible, unless there are many choices.
+    """
     for size in range(len(block) + 1):
         if math.comb(len(block), size) > _MOST_CHOICES:
             break
@@ -175,15 +174,13 @@ def _cut(
             rounds = _rounds([i for i in block if i not in unknown], depends)
             if rounds is not None:
                 return unknown, rounds
-    # Then stage after stage is made explicit unless that closes a cycle, beginning with the
-    # stages that have the fewest neighbours in the graph.
+    # Make stage after stage explicit unless that closes a cycle, fewest neighbours first.
     links = depends | depends.T
-    explicit = []
+    explicit, rounds = [], []
     for i in sorted(block, key=lambda i: links[i, list(block)].sum()):
-        if _rounds([*explicit, i], depends) is not None:
-            explicit.append(i)
-    rounds = _rounds(sorted(explicit), depends)
-    assert rounds is not None
+        new = _rounds(sorted([*explicit, i]), depends)
+        if new is not None:
+            explicit, rounds = [*explicit, i], new
     return tuple(i for i in block if i not in explicit), rounds
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import functools as ft
 import textwrap
 from collections.abc import Callable, Collection, Sequence
-from typing import get_args
+from typing import cast, get_args
 
 import diffrax
 import jax
@@ -44,6 +44,7 @@ from ._terms import (
     check_fit,
     commuting,
     constant_fault,
+    Fault,
     FRICTION,
     is_hamiltonian,
     number_of_noises,
@@ -54,8 +55,8 @@ from ._terms import (
 )
 
 
-# What a higher order may cost. In steps of a twentieth, and with constants of one size, a
-# step of order 2 is worth twenty steps of order 1.
+# What a higher order may cost: for steps of a twentieth, a step of order 2 is worth about
+# twenty of order 1.
 _MOST_STAGE_VECTORS = 20
 
 
@@ -69,8 +70,7 @@ class Suggestion:
     - `path`: the Brownian path that it needs, as code.
     - `reason`: when to choose it, in a sentence.
     - `terms`: a function of a random key, which returns the terms of the system with such
-        paths in place of theirs. A path without a random key in it, such as recorded
-        noise, stays.
+        paths in place of theirs. Paths that hold given noise, such as a record, stay.
     """
 
     solver: AbstractSymplecticSolver
@@ -86,7 +86,7 @@ class Suggestion:
 @dataclasses.dataclass(frozen=True, repr=False)
 class Suggestions(Sequence[Suggestion]):
     """What [`diffrax_symplectic.suggest_solver`][] returns: the suggestions, best first.
-    To print it gives a table.
+    Printed, it is a table.
 
     - `system`: what was found out about the system, in a sentence.
     """
@@ -124,55 +124,29 @@ def suggest_solver(
     want: Want,
     gamma: PyTree[ArrayLike] | None = None,
 ) -> Suggestions:
-    r"""Suggests solvers for a system, best first, by the structure of its terms: those
-    of the highest order first, and among these the one with the fewest stage vectors to
-    solve for.
+    r"""Suggests solvers for a system by the structure of its terms: highest order first,
+    and then fewest stage vectors to solve for.
 
     Whether $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, and whether the noise is additive
-    or constant, is found out as the solvers do it for themselves, from the flow of data
-    through the terms. Whether noises commute is tested at random states, which is no proof.
-    Nothing is solved. How stiff a system is cannot be seen from its terms:
-    if the first suggestion is explicit and takes too many steps, take the next implicit
-    one.
-
-    !!! example
-
-        ```python
-        import diffrax
-        import diffrax_symplectic as ds
-        import jax.numpy as jnp
-        import jax.random as jr
-
-        H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
-        noise = lambda t, p, q, args: 0.3 * jnp.sin(q)
-        terms = ds.hamiltonian_terms(H0, noise, ())  # the shape of one noise
-        y0 = (jnp.array(0.0), jnp.array(1.0))
-        suggestions = ds.suggest_solver(terms, 0, y0, want="weak")
-        print(suggestions)
-        best = suggestions[0]
-        sol = diffrax.diffeqsolve(best.terms(jr.key(1)), best.solver, 0, 1, 0.1, y0)
-        ```
+    or constant, is found out while tracing, as the solvers do it. Whether noises commute is
+    tested at random states, which is no proof. Nothing is solved. How stiff a system is
+    cannot be seen from its terms: if the first suggestion is explicit and takes too many
+    steps, take the next implicit one.
 
     **Arguments:**
 
-    - `terms`: the terms of a Stratonovich system, as of
-        [`diffrax_symplectic.hamiltonian_terms`][], with any Brownian path, or with the
-        shape of its increments in place of a path.
+    - `terms`: the terms of a Stratonovich system, with any Brownian path or its shape.
     - `t0`, `y0`, `args`: where the solve begins, as for `diffrax.diffeqsolve`.
     - `want`: `"weak"` for expectations, or `"strong"` for single paths.
     - `gamma`: friction, $-\gamma p\,\mathrm{d}t$ beside these terms, as
-        [`diffrax_symplectic.Damped`][] takes it. Then solvers with this friction are
-        suggested: for Langevin dynamics [`diffrax_symplectic.BAOAB`][], whose positions
-        are accurate, and [`diffrax_symplectic.LangevinMiddle`][], whose momenta are so as
-        well.
+        [`diffrax_symplectic.Damped`][] takes it, for which solvers with friction are
+        suggested.
 
-    **Returns:** a sequence of suggestions, each with `solver`, `weak_order`,
-    `strong_order`, `path`, `reason`, and `terms(key)`, the terms with the path that the
-    solver needs.
+    **Returns:** a sequence of [`diffrax_symplectic.Suggestion`][]s.
 
     **Raises:** a `ValueError` if `want` is neither of the two, if `terms` has no Brownian
-    path, for terms and states that no solver takes, and for a `gamma` that is no friction
-    of their momenta.
+    path, for terms and states that no solver takes, and for a `gamma` that does not fit the
+    momenta.
     """
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
@@ -182,64 +156,54 @@ def suggest_solver(
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
     check_fit(terms, t0, y0, args)
-
     not_separable = separable_fault(drift, noise, t0, y0, args)
-    structures: list[Structure] = ["any"]
-    if not_separable is None:
-        structures.append("separable")
+    structures: list[Structure] = [] if not_separable else ["separable"]
     if additive_fault(noise, t0, y0, args) is None:
         structures.append("additive")
         if constant_fault(noise, t0, y0, args) is None:
             structures.append("constant")
-    kind = " and ".join(structures[1:])
-    if {"separable", "constant"} <= set(structures):
-        structures.append("separable and constant")
     m = number_of_noises(terms)
-    commute = m == 1 or len(structures) > 1 or commuting(noise, t0, y0, args)
+    commute = m == 1 or len(structures) > 0 or commuting(noise, t0, y0, args)
     solvers = ranked(want, structures, commute, m, gamma)
     if gamma is not None:
         if not any(map(is_hamiltonian, drift)):
-            # Of these `BAOAB` finds the momenta, by the structure that it needs.
+            # `Damped` does not know the momenta of plain terms; the others do.
             solvers = [s for s in solvers if isinstance(s, AbstractLangevinSplitting)]
         probe = next(iter(solvers), Damped(ImplicitMidpoint(), gamma))
-        probe.init(terms, t0, t0 + 1, y0, args)  # refuses what is no friction
-    if len(noise) > 1 or not jtu.all_leaves(
-        [increment_struct(brownian_paths(noise)[0])]
-    ):
-        # Lévy areas are those between the noises of one array.
+        probe.init(terms, t0, t0 + 1, y0, args)  # refuses a `gamma` that does not fit
+    paths = brownian_paths(noise)
+    if len(noise) > 1 or not jtu.all_leaves([increment_struct(paths[0])]):
+        # Lévy areas are sampled between the noises of one array.
         areas = lambda solver: "noise brackets" in map(drives, solver.variables)
         solvers = [solver for solver in solvers if not areas(solver)]
-    paths = brownian_paths(noise)
     given = [path for path in paths if not is_random(path)]
     solvers = [s for s in solvers if all(_holds(path, s) for path in given)]
-    found = [_suggestion(solver, want, terms, commute) for solver in solvers]
-    if not kind:
-        kind = f"general ({getattr(not_separable, 'reason', '')})"
+    found = tuple(_suggestion(solver, want, terms, commute) for solver in solvers)
     noises = "one noise"
     if m > 1:
         noises = f"{m} noises that {'commute' if commute else 'do not commute'}"
     if gamma is not None:
         noises += " and friction"
-    system = f"For {want} approximation. The system is {kind}, with {noises}."
-    if not_separable is not None and kind and WRONG_WAY_ROUND in not_separable.reason:
-        system += f" It is not separable: {not_separable.reason}."
-    if not_separable is not None and not_separable.friction:
-        system += f" {FRICTION} Without it, ask with `gamma=`."
-    if any(isinstance(path, diffrax.UnsafeBrownianPath) for path in paths):
-        system += f" {_UNSAFE}"
-    return Suggestions(system, tuple(found))
+    system = _system(structures, not_separable, noises)
+    return Suggestions(f"For {want} approximation. {system}", found)
 
 
-_UNSAFE = (
-    "Its `diffrax.UnsafeBrownianPath` takes times as numbers of 32 bits, and late in a run "
-    "repeats its noise (Diffrax's issue 733): take one of the paths below."
-)
+def _system(structures: list[Structure], fault: Fault | None, noises: str) -> str:
+    """What was found out about the system; `fault` is why it is not separable."""
+    kind = " and ".join(structures) or f"general ({fault.reason if fault else ''})"
+    system = f"The system is {kind}, with {noises}."
+    if fault is not None:
+        if structures and WRONG_WAY_ROUND in fault.reason:
+            system += f" It is not separable: {fault.reason}."
+        if fault.friction:
+            system += f" {FRICTION} Without it, ask with `gamma=`."
+    return system
 
 
 def _holds(
     path: diffrax.AbstractBrownianPath, solver: AbstractSymplecticSolver
 ) -> bool:
-    """Whether a path that is given has what the solver needs."""
+    """Whether a given path has the random variables that the solver needs."""
     area = getattr(path, "levy_area", diffrax.AbstractBrownianIncrement)
     return solver.variables == ("W",) or issubclass(area, solver.minimal_levy_area)
 
@@ -267,12 +231,15 @@ def ranked(
     num_noises: int,
     gamma: PyTree[ArrayLike] | None = None,
 ) -> list[AbstractSymplecticSolver]:
-    """The solvers that are suggested for systems with such structures and noises, best
-    first."""
+    """The solvers that are suggested for systems with these structures, beside `"any"`, and
+    noises, best first."""
+    structures = {"any", *structures}
+    if {"separable", "constant"} <= structures:
+        structures.add("separable and constant")
 
     def rank(solver: AbstractSymplecticSolver) -> tuple:
         systems = solver.stage_vectors(num_noises)
-        # Of a separable system half of the state is solved for.
+        # In a separable system half of the state is solved for.
         cost = sum(systems) / (2 if solver.structure == "separable" else 1)
         order = _record(solver).order(want, commute)
         assert order is not None
@@ -313,14 +280,14 @@ def _suggestion(
 ) -> Suggestion:
     record = _record(solver)
     random = [path for path in brownian_paths(terms) if is_random(path)]
-    code = "that of the terms, which holds given noise"
+    code = "the path of the terms, which holds given noise"
     if random:
         shape = _shape_code(increment_struct(random[0]))
         code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
     return Suggestion(
         solver=solver,
-        weak_order=record.weak_order(commute),
-        strong_order=record.strong_order(commute),
+        weak_order=cast(int, record.order("weak", commute)),
+        strong_order=record.order("strong", commute),
         path=code,
         reason=record.choose,
         terms=jtu.Partial(with_paths, ft.partial(solver.path, want=want), terms),
@@ -337,7 +304,7 @@ def path_for(
     solver: diffrax.AbstractSolver, want: Want | None, cell: float | None, shape, key
 ) -> diffrax.AbstractBrownianPath:
     """The path that a solver of this package chooses. For other solvers, or if `want` is
-    `None`, Gaussian increments with what the solver needs; over cells they are the same
+    `None`, a Gaussian path with the areas that the solver needs; with `cell` the same
     Brownian motion for all solvers."""
     if want is not None and isinstance(solver, AbstractSymplecticSolver):
         return solver.path(shape, key, want=want)
@@ -354,7 +321,7 @@ def path_for(
 
 def with_paths(make: Callable, terms: PyTree, key: PRNGKeyArray) -> PyTree:
     """The terms with new paths in place of theirs; terms that share a path share the new
-    one. A path that holds given noise stays."""
+    one. Paths that hold given noise stay."""
     made = {}
 
     def new(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:

@@ -1,11 +1,8 @@
-"""Coefficients as data.
+"""Coefficients as data, in the notation of the paper.
 
-A tableau holds the coefficients of a family of methods in the notation of the paper. Every
-tableau also *flattens*: each evaluation of one vector field becomes one `Stage`, and the
-tableau becomes one square matrix between stages and one vector of weights, whatever the
-family. Whether a method is symplectic, which stages are used, which are equal, and in which
-order the implicit ones are solved for can then be read off that one matrix, by code that is
-the same for all families.
+A tableau flattens to one square matrix between stages, each one evaluation of a vector
+field, and one vector of weights. They decide, for all families alike, whether a method is
+symplectic, which stages are used or equal, and in which order they are solved.
 """
 
 import abc
@@ -17,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 
-# Which structure of the Hamiltonians coefficients are for: any; `H0 = V(p) + U(t, q)` and
-# `H_k = U_k(t, q)`; noise that does not depend on the state; and on time neither; or both
-# the second and the last.
+# The Hamiltonians that coefficients are for: any; `H0 = V(p) + U(t, q)` and `H_k = U_k(t,
+# q)`; noise that does not depend on the state; noise that depends neither on the state nor
+# on time; the second and the last together.
 Structure: TypeAlias = Literal[
     "any", "separable", "additive", "constant", "separable and constant"
 ]
@@ -28,9 +25,8 @@ Structure: TypeAlias = Literal[
 class Stage(NamedTuple):
     """One evaluation, `y -> sum over channels of (vector field times control)`.
 
-    - `channels`: the controls that drive it: `"h"` is the drift, driven by time; any
-        other name is the noise, driven by the random variable of that name among the
-        attributes of the Brownian increment.
+    - `channels`: the controls that drive it: `"h"` for the drift, or the name of a random
+        variable, an attribute of the Brownian increment, for the noise.
     - `c`: where in the step it is evaluated, as a fraction of the step.
     - `reads`: the part of the state it depends on, `"y"` (all), `"p"`, `"q"` or `""`.
     - `writes`: the part of the state it changes, `"y"`, `"p"` or `"q"`.
@@ -74,10 +70,9 @@ class FlatTableau:
 class AbstractTableau(abc.ABC):
     """What every tableau offers.
 
-    - `structure`: which structure of the Hamiltonians the coefficients are for, `"any"`,
+    - `structure`: the structure of the Hamiltonians that the coefficients are for, `"any"`,
         `"separable"`, `"additive"`, `"constant"` (additive, and not dependent on time) or
-        `"separable and constant"`.
-        Every solve checks that its terms have it, while tracing, before its first step.
+        `"separable and constant"`. Every solve checks it, while tracing.
     """
 
     structure: ClassVar[Structure]
@@ -110,29 +105,29 @@ def _coefficients(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def _check(tableau: AbstractTableau, **shapes: tuple[int, ...]) -> None:
-    for name, shape in shapes.items():
-        array = _coefficients(name, getattr(tableau, name), shape)
-        object.__setattr__(tableau, name, array)
-
-
-def _check_by_variable(tableau: AbstractTableau, **shapes: tuple[int, ...]) -> None:
-    """Brings coefficients into the form of a dictionary over the random variables."""
+def _check(
+    tableau: AbstractTableau,
+    by_variable: tuple[str, ...] = (),
+    **shapes: tuple[int, ...],
+) -> None:
+    """Replaces coefficients by checked arrays, or dictionaries of these."""
     for name, shape in shapes.items():
         value = getattr(tableau, name)
-        named = value if isinstance(value, Mapping) else {"W": value}
-        checked = {
-            k: _coefficients(f"{name}[{k!r}]", v, shape) for k, v in named.items()
-        }
+        if name in by_variable:
+            named = value if isinstance(value, Mapping) else {"W": value}
+            checked = {
+                k: _coefficients(f"{name}[{k!r}]", x, shape) for k, x in named.items()
+            }
+        else:
+            checked = _coefficients(name, value, shape)
         object.__setattr__(tableau, name, checked)
 
 
 def _side_by_side(
     *parts: tuple[Mapping[str, np.ndarray], tuple[int, ...]],
 ) -> tuple[list[str], list[np.ndarray]]:
-    """For coefficients by random variable, each with their shape: all variables, in the
-    order of their first appearance; and each of the coefficients for all of these, side by
-    side, zero where there are none."""
+    """All random variables of some coefficients, each with their shape, in the order of
+    first appearance; and the coefficients for all of these, side by side."""
     names = list(dict.fromkeys(name for part, _ in parts for name in part))
     return names, [
         np.concatenate([part.get(name, np.zeros(shape)) for name in names], axis=-1)
@@ -157,21 +152,17 @@ class GeneralTableau(AbstractTableau):
     $$y_{n+1} = y_n + h \sum_i \alpha_i a(t_n + c^0_i h, G^0_i)
       + \sum_k \sum_i \beta_i b_k(t_n + c^1_i h, G^k_i) I_k$$
 
-    with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$. Here $B^3 = B^1$: with that choice
-    the stages $G^k_i$ are the same vector for every $k$, a step costs the same whatever
-    the number of noises, and the condition on $B^3$ follows from the one on $B^1$.
+    with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$. Here $B^3 = B^1$: then the stages
+    $G^k_i$ are the same vector for every $k$, whatever the number of noises, and the
+    condition on $B^3$ follows from the one on $B^1$.
 
     **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
     `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`, `B1` of shape `(r, r)`;
-    `noise`, the random variables that drive the noise stages: `("W",)`, of which `"W"` is
-    $I_k$, or `("W", "A")` for $\sum_k b_k I_k + \sum_{k<l} [b_k, b_l] A_{kl}$, with the
-    Lie brackets $[b_k, b_l] = b_l' b_k - b_k' b_l$ and the Lévy areas $A_{kl}$ of a
-    [`diffrax_symplectic.LevyAreaIncrement`][], or `("W", "L")` for
-    $\sum_k b_k I_k + h \sum_k [b_k, a] H_k + \sum_{k, l} [b_k, [b_l, a]] L_{kl}$ with the
-    variables of [`diffrax_symplectic.PlateauGauss`][].
+    `noise`, the random variables that drive the noise stages: `("W",)` for $I_k$,
+    `("W", "A")` for the field of [`diffrax_symplectic.LevyAreaMidpoint`][], or `("W", "L")`
+    for the field of [`diffrax_symplectic.PlateauGauss`][].
 
-    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
-    real numbers.
+    **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """
 
     structure: ClassVar[Structure] = "any"
@@ -189,8 +180,8 @@ class GeneralTableau(AbstractTableau):
 
     @classmethod
     def strong(cls, A, B, alpha, beta) -> "GeneralTableau":
-        r"""The form of Burrage and Burrage (2000), equations (2.14)-(2.15) of Wang,
-        Hong and Xu (2017), in which drift and noise are evaluated at the same points:
+        r"""The form of Burrage and Burrage (2000), equations (2.14)-(2.15) of Wang, Hong
+        and Xu (2017), with drift and noise at the same points:
 
         $$G_i = y_n + h \sum_j A_{ij} a(G_j) + \sum_k \sum_j B_{ij} b_k(G_j) I_k$$
 
@@ -230,12 +221,11 @@ class SeparableTableau(AbstractTableau):
     with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$.
 
     **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
-    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`. `beta` and `B0` may also be
-    dictionaries from the names of several random variables, of which `"W"` is $I_k$, to
-    such arrays: then the equations hold with a sum over these.
+    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`. For a sum over several random
+    variables `beta` and `B0` are dictionaries from their names, of which `"W"` is $I_k$, to
+    such arrays.
 
-    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
-    real numbers.
+    **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """
 
     structure: ClassVar[Structure] = "separable"
@@ -247,20 +237,13 @@ class SeparableTableau(AbstractTableau):
 
     def __post_init__(self):
         s, r = np.size(self.alpha), len(self.A1)
-        _check(self, alpha=(s,), A0=(s, s), A1=(r, s))
-        _check_by_variable(self, beta=(r,), B0=(s, r))
+        noise = dict(beta=(r,), B0=(s, r))
+        _check(self, ("beta", "B0"), alpha=(s,), A0=(s, s), A1=(r, s), **noise)
 
     def partitioned(self) -> "PartitionedTableau":
         """The same method with its coefficients for velocities written out."""
-        return PartitionedTableau(
-            alpha=self.alpha,
-            alpha_hat=self.alpha,
-            beta=self.beta,
-            A=self.A0,
-            A_hat=self.A0,
-            B0=self.B0,
-            A1=self.A1,
-        )
+        alpha, A = self.alpha, self.A0
+        return PartitionedTableau(alpha, alpha, self.beta, A, A, self.B0, self.A1)
 
     def flatten(self) -> FlatTableau:
         return self.partitioned().flatten()
@@ -269,8 +252,8 @@ class SeparableTableau(AbstractTableau):
 @dataclasses.dataclass(frozen=True, eq=False)
 class PartitionedTableau(AbstractTableau):
     r"""As [`diffrax_symplectic.SeparableTableau`][], with coefficients $A$ and $\alpha$ for
-    the forces $f$ and others, $\hat A$ and $\hat \alpha$, for the velocities $g$: what
-    explicit symplectic methods need.
+    the forces $f$, and others, $\hat A$ and $\hat \alpha$, for the velocities $g$, as
+    explicit symplectic methods have them.
 
     $$p_i = P + h \sum_j A_{ij} f(t_n + \hat c_j h, q_j)
       + \sum_k \sum_j B^0_{ij} \sigma_k(t_n + c^1_j h, \bar q_j) I_k, \qquad
@@ -284,8 +267,7 @@ class PartitionedTableau(AbstractTableau):
     `A_hat` of shape `(s, v)`, `B0` of shape `(v, r)`, `A1` of shape `(r, v)`; `beta` and
     `B0` possibly by random variable.
 
-    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
-    real numbers.
+    **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """
 
     structure: ClassVar[Structure] = "separable"
@@ -299,17 +281,16 @@ class PartitionedTableau(AbstractTableau):
 
     def __post_init__(self):
         s, v, r = np.size(self.alpha), np.size(self.alpha_hat), len(self.A1)
-        _check(self, alpha=(s,), alpha_hat=(v,), A=(v, s), A_hat=(s, v), A1=(r, v))
-        _check_by_variable(self, beta=(r,), B0=(v, r))
+        drift = dict(alpha=(s,), alpha_hat=(v,), A=(v, s), A_hat=(s, v))
+        _check(self, ("beta", "B0"), beta=(r,), B0=(v, r), A1=(r, v), **drift)
 
     def flatten(self) -> FlatTableau:
         s, v, r = len(self.alpha), len(self.alpha_hat), len(self.A1)
         names, (B0, beta) = _side_by_side((self.B0, (v, r)), (self.beta, (r,)))
         A1 = np.concatenate([self.A1] * len(names))
-        # Forces come first. Where either forces or velocities may be solved for, this makes
-        # the forces the unknowns: they cost more to evaluate.
+        # Forces come first, which makes them the unknowns: they cost more to evaluate.
         stages = [Stage(("h",), float(c), "q", "p") for c in self.A_hat.sum(axis=1)]
-        # Velocities do not depend on time, so that all of their stages may have the time 0.
+        # Velocities do not depend on time.
         stages += [Stage(("h",), 0.0, "p", "q") for _ in range(v)]
         stages += [
             Stage((name,), float(c), "q", "p")
@@ -347,13 +328,11 @@ class AdditiveTableau(AbstractTableau):
     with stage times $c^0 = A e$. Symplecticity asks nothing of $B$ and $\beta$.
 
     **Arguments:** `alpha` of shape `(s,)`, `A` of shape `(s, s)`, `c1` of shape `(r,)`;
-    `beta` and `B`, dictionaries from the names of random variables (attributes of the
-    Brownian increment, of which `"W"` is $I_k$) to arrays of shape `(r,)` and `(s, r)`, or
-    just such an array for `"W"`; `constant`, whether the noise must not depend on time
-    either.
+    `beta` and `B`, arrays of shape `(r,)` and `(s, r)`, or dictionaries from the names of
+    random variables, of which `"W"` is $I_k$, to such; `constant`, whether the noise must
+    not depend on time either.
 
-    **Raises:** a `ValueError` for other shapes, or coefficients that are not finite
-    real numbers.
+    **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """
 
     alpha: Coefficients
@@ -365,8 +344,8 @@ class AdditiveTableau(AbstractTableau):
 
     def __post_init__(self):
         s, r = np.size(self.alpha), np.size(self.c1)
-        _check(self, alpha=(s,), A=(s, s), c1=(r,))
-        _check_by_variable(self, beta=(r,), B=(s, r))
+        noise = dict(beta=(r,), B=(s, r), c1=(r,))
+        _check(self, ("beta", "B"), alpha=(s,), A=(s, s), **noise)
 
     @property
     def structure(self) -> Structure:

@@ -49,11 +49,10 @@ def symplecticity_defect(
     of the step at fixed random variables and
     $\Omega = \begin{pmatrix} 0 & I \\ -I & 0 \end{pmatrix}$.
 
-    Exact up to rounding: for a symplectic method whose stage equations are solved this is a
-    small multiple of the machine epsilon, whatever the Hamiltonians, the step and the
-    increment. For any other method it is not small. (The solvers of this package
-    differentiate their stage equations implicitly. So the defect is that of the method, and
-    does not depend on the tolerance of its root finder.)
+    Exact up to rounding: for a symplectic method this is a small multiple of the machine
+    epsilon, whatever the Hamiltonians, the step and the increment, and for any other method
+    it is not small. (The solvers of this package differentiate their stage equations
+    implicitly, so that it does not depend on the tolerance of the root finder.)
 
     Works under `jit` and `vmap`, and with any solver and terms of Diffrax.
 
@@ -61,8 +60,8 @@ def symplecticity_defect(
 
     - `terms`, `solver`, `y0`, `args`: as for `diffrax.diffeqsolve`, for a state
         `y0 = (p, q)`.
-    - `t0`, `t1`: start and end of the step. The increments are those that the path in
-        `terms` has over it.
+    - `t0`, `t1`: start and end of the step, for which the path in `terms` gives the
+        increments.
 
     **Returns:** a scalar.
 
@@ -99,19 +98,16 @@ def poisson_defect(
     r"""How far one step of spins is from a Poisson map: the largest entry of
     $|J\, P(s_0)\, J^\top - P(s_1)|$, where $J = \partial s_1 / \partial s_0$ is the
     Jacobian of the step at fixed random variables and $P(s)\, v = s \times v$ for each
-    spin. In other words: of $\{s_i \circ S, s_j \circ S\} - \{s_i, s_j\} \circ S$ for
-    the step $S$ and all pairs of components.
+    spin, or of $\{s_i \circ S, s_j \circ S\} - \{s_i, s_j\} \circ S$ for the step $S$ and
+    all pairs of components.
 
-    Exact up to rounding, as [`diffrax_symplectic.symplecticity_defect`][]. Works under
-    `jit` and `vmap`, and with any solver and terms of Diffrax.
+    Exact up to rounding. Works under `jit` and `vmap`, and with any solver and terms of
+    Diffrax.
 
-    **Arguments:**
+    **Arguments:** as for [`diffrax_symplectic.symplecticity_defect`][], except
 
-    - `terms`, `solver`, `args`: as for `diffrax.diffeqsolve`.
-    - `t0`, `t1`: start and end of the step. The increments are those that the path in
-        `terms` has over it.
     - `y0`: the state, `to_spinors(s0)` for the terms of
-        [`diffrax_symplectic.spin_terms`][]. For terms in the spins themselves, their
+        [`diffrax_symplectic.spin_terms`][]; for terms in the spins themselves, their
         array `s0` of shape `(..., 3)`.
 
     **Returns:** a scalar.
@@ -152,19 +148,18 @@ def step_expectation(
     r"""The expectation $\mathbb E[\phi(t_1, y_1)]$ after one step, without sampling.
 
     The random variables of a [`diffrax_symplectic.WeakBrownianPath`][] take finitely
-    many values, so that the expectation is a finite sum: $3^m$ outcomes for $m$ noises,
-    $9^m$ with the second set of three-point variables, and $2^m$ times as many with the
-    two-point ones. For Gaussian increments of a path of Diffrax (and their
-    space-time and space-time-time Lévy areas, and plateaus) it is computed by
-    Gauss--Hermite quadrature, exact if $\phi(y_1)$ is a polynomial in these of degree less
-    than twice `nodes`.
+    many values, so that the expectation is a finite sum, over $3^m$ outcomes for $m$ noises
+    with one set of three-point variables. Over Gaussian increments (and their space-time
+    and space-time-time Lévy areas, and plateaus) it is integrated by Gauss--Hermite
+    quadrature, exact if $\phi(y_1)$ is a polynomial in these of degree less than twice
+    `nodes`.
 
     **Arguments:**
 
     - `terms`, `solver`, `y0`, `args`: as for `diffrax.diffeqsolve`; `terms` with one
         Brownian path.
     - `t0`, `t1`: start and end of the step.
-    - `fn`: the function $\phi$, `fn(t, y, args)`, to arrays; `t` is the end of the step.
+    - `fn`: the function $\phi$, `fn(t, y, args)`, to arrays.
     - `nodes`: points of the quadrature in each Gaussian variable.
 
     **Returns:** what `fn` returns, averaged.
@@ -195,14 +190,13 @@ def second_moment_map(
 
     There a step is $z_1 = Z z_0$ with a random matrix $Z$, for $z = (1, y)$ and $y$ the
     state as one vector of length $n$. So $\mathrm{vec}\, \mathbb E[z_1 z_1^\top] = K\,
-    \mathrm{vec}\, \mathbb E[z_0 z_0^\top]$ with $K = \mathbb E[Z \otimes Z]$, and $N$
-    steps are $K^N$: moments over a whole solve, without sampling. The spectral radius of
-    $K$ is the growth of the mean square per step. Random variables are treated as in
-    [`diffrax_symplectic.step_expectation`][].
+    \mathrm{vec}\, \mathbb E[z_0 z_0^\top]$ with $K = \mathbb E[Z \otimes Z]$, and $K^N$
+    gives the moments after $N$ steps. The spectral radius of $K$ is the growth of the mean
+    square per step.
 
-    **Arguments:** as for [`diffrax_symplectic.step_expectation`][]; of `y0` only the
-    structure, shapes and dtype matter. The system has to be linear and autonomous, which
-    is not checked.
+    **Arguments:** as for [`diffrax_symplectic.step_expectation`][]; only the structure,
+    shapes and dtype of `y0` matter. The system has to be linear and autonomous, which is
+    not checked.
 
     **Returns:** the matrix $K$, of shape `((n + 1)**2, (n + 1)**2)`.
 
@@ -210,8 +204,8 @@ def second_moment_map(
     """
     flat, unravel = jfu.ravel_pytree(y0)
     n = flat.size
-    # The step is affine: its values at zero and at the unit vectors give its matrix, up to
-    # rounding, and take far less tracing than its derivative.
+    # The step is affine: its values at zero and at the unit vectors give its matrix. Its
+    # derivative would take far more tracing.
     starts = jnp.eye(n + 1, n, k=-1, dtype=flat.dtype)
 
     def outcome(terms):
@@ -258,12 +252,11 @@ def weak_order_defect(
     $$\mathbb E[\phi(t_1, y_1)] - \sum_{j=0}^{r} \frac{h^j}{j!} (L^j \phi)(t_0, y_0),$$
 
     with the generator $L$ of the equation. A method has weak order $r$ if this is
-    $O(h^{r+1})$, so that a few values of $h$ show the order to two digits, without any
-    sampling.
+    $O(h^{r+1})$: a few values of $h$ show the order to two digits.
 
     $L \phi = \partial_t \phi + a \cdot \nabla \phi + \frac12 \sum_k b_k \cdot \nabla
-    (b_k \cdot \nabla \phi)$ for a Stratonovich solver, and with $b_k^\top (\nabla^2
-    \phi)\, b_k$ in place of the last term's summands for an Itô solver.
+    (b_k \cdot \nabla \phi)$ for a Stratonovich solver, with the summands $b_k^\top
+    (\nabla^2 \phi)\, b_k$ for an Itô solver.
 
     **Arguments:** as for [`diffrax_symplectic.step_expectation`][], and
 
@@ -276,16 +269,16 @@ def weak_order_defect(
     expected = step_expectation(terms, solver, t0, t1, y0, args, fn=fn, nodes=nodes)
     L = _generator(terms, args, ito=isinstance(solver, diffrax.AbstractItoSolver))
     phi = lambda t, y: fn(t, y, args)
-    h, factor = t1 - t0, 1.0
-    defect = expected
+    factor, defect = 1.0, expected
     for j in range(order + 1):
         exact = phi(jnp.asarray(t0, jnp.result_type(float)), y0)
         defect = (defect**ω - factor * exact**ω).ω
-        phi, factor = L(phi), factor * h / (j + 1)
+        phi, factor = L(phi), factor * (t1 - t0) / (j + 1)
     return defect
 
 
 def _generator(terms, args, ito: bool) -> Callable:
+    """The generator of the equation, from functions of time and state to such functions."""
     drift, noise = split_terms(terms)
     # Each `b_k(t, y)` is the response to one increment, of size 1.
     fields = [
@@ -297,8 +290,7 @@ def _generator(terms, args, ito: bool) -> Callable:
         def L_phi(t, y):
             still = jtu.tree_map(jnp.zeros_like, y)
             velocity = tree_sum([still, *(term.vf(t, y, args) for term in drift)])
-            along_drift = (jnp.ones_like(t), velocity)
-            _, total = jax.jvp(phi, (t, y), along_drift)
+            _, total = jax.jvp(phi, (t, y), (jnp.ones_like(t), velocity))
             for b in fields:
                 frozen = b(t, y)
                 moving = (lambda t, y: frozen) if ito else b

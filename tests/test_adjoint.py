@@ -274,9 +274,9 @@ def test_what_reversing_cannot_do_is_refused_with_advice():
     at_end = diffrax.SubSaveAt(t1=True)
     outside = diffrax.Event(lambda t, y, args, **kwargs: y[0][0] > 9)
     for message, options in (
-        ("`SRKw2` does not", dict(solver=ds.SRKw2(), path=weak_path(1, second=True))),
+        ("got `SRKw2`", dict(solver=ds.SRKw2(), path=weak_path(1, second=True))),
         ("steps that are known beforehand", dict(**adaptive, stepsize_controller=pid)),
-        ("knows no events", dict(event=outside)),
+        ("cannot do events", dict(event=outside)),
         (r"SaveAt\(ts=...\)", dict(saveat=diffrax.SaveAt(steps=True))),
         (r"SaveAt\(ts=...\)", dict(saveat=diffrax.SaveAt(t0=True, t1=True))),
         (r"SaveAt\(ts=...\)", dict(saveat=diffrax.SaveAt(t1=True, ts=[0.5]))),

@@ -6,7 +6,6 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-import lineax as lx
 import numpy as np
 import pytest
 
@@ -120,41 +119,6 @@ def test_ito_solvers_are_refused_where_the_sense_makes_a_difference(solver):
     solve(diffrax.ODETerm(correction), noise=H)
     solve(noise=linear)
     solve(noise=kick)
-
-
-def test_a_matrix_of_noises_for_a_state_of_several_arrays_is_refused_with_advice():
-    field = lambda t, y, args: {"a": jnp.ones((3, 2))}
-    terms = diffrax.ControlTerm(field, weak_path(2))
-    drift = diffrax.ODETerm(lambda t, y, args: y)
-    with pytest.raises(ValueError, match="as a Lineax operator"):
-        diffrax.diffeqsolve(
-            diffrax.MultiTerm(drift, terms),
-            ds.ImplicitMidpoint(),
-            0.0,
-            0.1,
-            0.1,
-            {"a": jnp.ones(3)},
-        )
-
-
-def test_an_error_of_the_users_own_within_a_control_term_stays():
-    # The noise is no array as the state is, but a valid operator.
-    struct = {"a": jax.ShapeDtypeStruct((3,), jnp.float64)}
-    operator = lambda: lx.PyTreeLinearOperator({"a": jnp.ones((3, 2))}, struct)
-    drift = diffrax.ODETerm(lambda t, y, args: y)
-    y0 = {"a": jnp.ones(3)}
-
-    def refuse(t, y, args):
-        if args == "refuse":
-            raise ValueError("the user's own")
-        return operator()
-
-    terms = diffrax.MultiTerm(drift, diffrax.ControlTerm(refuse, weak_path(2)))
-    solver = ds.ImplicitMidpoint()
-    step = lambda args: solver.step(terms, 0.0, 0.1, y0, args, None, False)[0]
-    assert jax.eval_shape(lambda: step("")) == struct
-    with pytest.raises(ValueError, match="the user's own"):
-        step("refuse")
 
 
 @pytest.mark.filterwarnings("ignore:Complex")

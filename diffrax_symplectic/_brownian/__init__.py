@@ -1,10 +1,10 @@
-from ._stepwise import AbstractStepwisePath, AbstractWrappedPath, GivenPath, Increment
+from ._stepwise import AbstractStepwisePath, GivenPath, Increment
 from ._stepwise import (
     checked_shape,
-    covers_all_times,
     increment_struct,
     is_random,
     laws_of,
+    step_size,
     stepwise,
     UnspecifiedPath,
 )

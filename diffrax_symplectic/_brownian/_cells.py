@@ -1,4 +1,4 @@
-"""Steps put together from cells, so that steps of different sizes see one path."""
+"""Steps put together from cells, so that steps of different sizes follow one path."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
 from .._custom_types import RealScalarLike
-from ._stepwise import Increment
+from ._stepwise import Increment, step_size
 
 
 class Piece(eqx.Module):
@@ -21,8 +21,7 @@ class Piece(eqx.Module):
 
     - `h`: its length.
     - `W`: the increment over it.
-    - `integral`: the integral over the stretch of the path less its value at the start, or
-        `None`.
+    - `integral`: the integral of the path, less its value at the start, or `None`.
     - `A`: the Lévy areas, or `None`.
     """
 
@@ -44,7 +43,7 @@ class Piece(eqx.Module):
 
     @property
     def H(self) -> Float[Array, " m"]:
-        """The space-time Lévy area. That of an empty stretch is zero."""
+        """The space-time Lévy area, zero over an empty stretch."""
         assert self.integral is not None
         return self.integral / or_one(self.h) - self.W / 2
 
@@ -75,13 +74,12 @@ class Piece(eqx.Module):
             variables["H"] = unravel(self.H)
         if self.A is not None:
             variables["A"] = self.A
-        dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), shape)
-        return kind(dt=dt, **variables)
+        return kind(dt=step_size(h, shape), **variables)
 
 
 def or_one(h: Float[Array, ""]) -> Float[Array, ""]:
-    """`h`, but 1 for an empty stretch, so that one can divide by it. In a batch, the paths
-    that have reached their end take empty steps until all have."""
+    """`h`, but 1 for an empty stretch, to divide by. In a batch, paths that have reached
+    their end take empty steps until all have."""
     return jnp.where(h > 0, h, 1)
 
 
@@ -97,8 +95,8 @@ def compose(
     sample: Callable[[Int[Array, ""]], Piece],
     path_name: str,
 ) -> Piece:
-    """The stretch from `t0` to `t1`, where `sample(i)` is the one from `i * cell` to
-    `(i + 1) * cell`. An error when run if it does not consist of cells."""
+    """The stretch from `t0` to `t1`, where `sample(i)` is the cell that begins at
+    `i * cell`. An error when run if it does not consist of cells."""
     first, last = (jnp.round(t / cell).astype(int) for t in (t0, t1))
     off = jnp.maximum(jnp.abs(first * cell - t0), jnp.abs(last * cell - t1))
     last = eqx.error_if(

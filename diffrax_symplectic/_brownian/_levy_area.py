@@ -1,4 +1,5 @@
 import dataclasses
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -40,20 +41,18 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     r"""Adds the Lévy areas of a [`diffrax_symplectic.LevyAreaIncrement`][] to the
     increments of a Brownian path with space-time Lévy area. Step sizes have to be fixed.
 
-    Over a stretch of time the Brownian path is the line $\frac t h W$ plus a bridge. The
-    first `num_terms` Fourier terms of the bridge are drawn at random, such that it has the
-    given integral $H$, which is minus the sum of all cosine coefficients. The terms
-    that are left out are replaced by Gaussian variables, with the mean and the covariances
-    that those terms have given $H$. So for any number of terms the mean and all
-    covariances of $W$, $H$ and $A$ are exact. The law of $A$ itself is approximated, with
-    an error in mean square of $\mathcal O(h / \text{num\_terms})$ (Mrongowius and Rößler).
-    With `num_terms=0` this is the approximation of Davie. A step draws
-    $2 m\, (\text{num\_terms} + 1) + \frac12 m (m - 1)$ normal numbers for $m$ noises.
+    Over a step the Brownian path is the line $\frac t h W$ plus a bridge. The first
+    `num_terms` Fourier terms of the bridge are drawn such that it has the given integral
+    $H$. The other terms are replaced by Gaussian variables with their mean and covariances
+    given $H$. So for any number of terms the mean and all covariances of $W$, $H$ and $A$
+    are exact. The law of $A$ itself is approximated, with an error in mean square of
+    $\mathcal O(h / \text{num\_terms})$ (Mrongowius and Rößler); `num_terms=0` is the
+    approximation of Davie. A step draws $2 m\, (\text{num\_terms} + 1) + \frac12 m (m -
+    1)$ normal numbers for $m$ noises.
 
-    With `cell`, the path is refined consistently: it is sampled over cells of that size,
-    and what it returns over a longer stretch is put together from these by Chen's rule, so
-    that solutions with different step sizes, multiples of `cell`, follow the same path. An
-    evaluation then costs as many samples as there are cells in the step.
+    With `cell`, the path is sampled over cells of that size, and steps are put together
+    from these by Chen's rule, so that solutions whose steps are multiples of `cell` follow
+    one path. A step then costs as much as all cells in it.
 
     **Source:** [Kloeden, Platen and Wright
     (1992)](https://doi.org/10.1080/07362999208809281) for the Fourier series; [Mrongowius
@@ -66,6 +65,8 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     key: PRNGKeyArray
     num_terms: int = eqx.field(static=True)
     cell: float | None = eqx.field(static=True)
+    levy_area: ClassVar = LevyAreaIncrement  # pyright: ignore
+    laws: ClassVar[None] = None  # pyright: ignore
 
     def __init__(
         self,
@@ -79,10 +80,10 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
 
         - `path`: a Brownian path with space-time Lévy area, for example
             `FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`.
-        - `key`: a JAX random key for the areas, which may be that of the path.
+        - `key`: a JAX random key for the areas, which may be the key of the path.
         - `num_terms`: Fourier terms over each step, or each cell.
-        - `cell`: the finest stretch that is sampled, of which every step is a multiple;
-            or `None` to sample each step by itself.
+        - `cell`: the length of the cells, of which every step is a multiple; or `None` to
+            sample each step by itself.
 
         **Raises:** a `ValueError` if `path` has no space-time Lévy area, if `num_terms` is
         negative or `cell` is not positive; an error when run if a step does not consist of
@@ -96,17 +97,13 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         self.num_terms = whole_number("num_terms", num_terms, 0)
         self.cell = cell
 
-    @property
-    def levy_area(self):
-        return LevyAreaIncrement
-
-    @property
-    def laws(self) -> None:
-        return None
-
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
-        if self.cell is not None:
-            piece = self._composed(t0, t1, self.cell)
+        cell = self.cell
+        if cell is not None:
+            # A cell may end a rounding error beyond the end of the path.
+            at = lambda i: jnp.clip(i * cell, self.path.t0, self.path.t1)
+            sample = lambda i: self._sample(at(i), at(i + 1))
+            piece = compose(t0, t1, cell, sample, type(self).__name__)
         elif use_levy:
             piece = self._sample(t0, t1)
         else:
@@ -127,12 +124,6 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     def _increment(self, piece: Piece, h: RealScalarLike, use_levy: bool) -> Increment:
         shape = increment_struct(self.path)
         return piece.as_increment(LevyAreaIncrement, shape, h, use_levy)
-
-    def _composed(self, t0, t1, cell: float) -> Piece:
-        # A cell may end a rounding error beyond the end of the path.
-        at = lambda i: jnp.clip(i * cell, self.path.t0, self.path.t1)
-        sample = lambda i: self._sample(at(i), at(i + 1))
-        return compose(t0, t1, cell, sample, type(self).__name__)
 
     def _sample(self, t0, t1) -> Piece:
         increment = materialize(lambda: self.path.evaluate(t0, t1, use_levy=True))
@@ -159,8 +150,8 @@ def _sizes(m: int, terms: int) -> tuple[int, ...]:
 def _bridge_area(
     H: Float[Array, " m"], normals: Float[Array, " normals"], terms: int
 ) -> Float[Array, "m m"]:
-    r"""The Lévy areas of a Brownian bridge over unit time, given the integral `H` of it,
-    from independent standard normal numbers.
+    r"""The Lévy areas of a Brownian bridge over unit time with the integral `H`, from
+    independent standard normal numbers.
 
     The bridge is $\sum_r a_r (\cos 2 \pi r t - 1) + b_r \sin 2 \pi r t$ with independent
     coefficients of variance $s_r = 1 / (2 \pi^2 r^2)$, its integral $-\sum_r a_r$ and its
@@ -178,8 +169,8 @@ def _bridge_area(
     # Conditioned on the sum of all cosine coefficients, the rest included, which is -H.
     a = a - cast(12 * s) * (total + H)[:, None]
     series = _weighted_product(a, b, np.pi * r)
-    # The area of the rest. Its cosine coefficients have the mean -12 s_r H, which gives
-    # the first part, and the variance s_r - 12 s_r^2, which gives the second.
+    # The rest has cosine coefficients of mean -12 s_r H, which gives the first part of its
+    # area, and variance s_r - 12 s_r^2, which gives the second.
     mean = jnp.outer(H, np.sqrt(72 * rest_squared) * by_mean)
     size = np.sqrt(rest - 12 * rest_squared)
     area = series - mean + size * _strictly_upper(by_area, m)

@@ -1,5 +1,5 @@
 from collections.abc import Mapping
-from typing import Any
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -21,17 +21,17 @@ from ._stepwise import AbstractPathWithLaws, checked_shape, GAUSSIAN_LAWS, Incre
 
 
 class WeakIncrement(diffrax.AbstractBrownianIncrement):
-    r"""The random variables of one step of a weak method, for a step of size $h$.
+    r"""The random variables of one step of size $h$ of a weak method.
 
-    Their low moments, which are all that a weak method needs, are those of Gaussian
-    increments. They are bounded, so that implicit stages stay solvable and moments finite.
+    Their low moments agree with Gaussian increments, which is all a weak method needs.
+    They are bounded, so that implicit stages stay solvable and moments finite.
 
     - `dt`: the step size $h$.
     - `W`: the three-point variables $\hat I_k$, $\pm\sqrt{3h}$ with probability $1/6$
-        each and $0$ with probability $2/3$, with moments 1 to 5 those of
-        $\mathcal N(0, h)$. For methods of order 3 the four-point variables, $\pm\sqrt{h
-        (3 + \sqrt 6)}$ with probability $(3 - \sqrt 6) / 12$ each and $\pm\sqrt{h (3 -
-        \sqrt 6)}$ with probability $(3 + \sqrt 6) / 12$ each: moments 1 to 7.
+        each and $0$ with probability $2/3$, with moments 1 to 5 of $\mathcal N(0, h)$.
+        For methods of order 3 the four-point variables, $\pm\sqrt{h (3 + \sqrt 6)}$ with
+        probability $(3 - \sqrt 6) / 12$ each and $\pm\sqrt{h (3 - \sqrt 6)}$ with
+        probability $(3 + \sqrt 6) / 12$ each, with moments 1 to 7.
     - `second`, `third`: further, independent three-point variables $\hat I_{k+m}$ and
         $\hat I_{k+2m}$, or `None`.
     - `two_point`: the variables $\tilde I_k = \pm\sqrt h$ with probability $1/2$ each,
@@ -53,15 +53,14 @@ class WeakIncrement(diffrax.AbstractBrownianIncrement):
 class WeakBrownianPath(AbstractPathWithLaws):
     r"""Discrete random variables in place of Brownian increments, for weak methods.
 
-    Over each step this gives a [`diffrax_symplectic.WeakIncrement`][]. Steps are
-    independent. Use it for expectations, and not for single paths: these are not the
-    increments of a Brownian motion, so that a step cannot be divided into shorter ones.
-    Step sizes have to be fixed (`diffrax.ConstantStepSize` or `diffrax.StepTo`).
+    Each step has a [`diffrax_symplectic.WeakIncrement`][] of its own. Use it for
+    expectations only: these are not the increments of a Brownian motion, so a step cannot
+    be divided into shorter ones. Step sizes have to be fixed (`diffrax.ConstantStepSize` or
+    `diffrax.StepTo`).
 
     The increments are a function of `key` and of where the step lies, up to a fraction of
     its size, so that rounding errors of the time do not matter. A step that is computed
-    again (for example by the backward pass of `diffrax.RecursiveCheckpointAdjoint`) gets
-    the same increments.
+    again, as in a backward pass, gets the same increments.
 
     Probabilities are exact up to $2^{-32}$, odd moments exactly zero.
     """
@@ -71,6 +70,7 @@ class WeakBrownianPath(AbstractPathWithLaws):
     second: bool = eqx.field(static=True)
     two_point: bool = eqx.field(static=True)
     order: int = eqx.field(static=True)
+    levy_area: ClassVar = WeakIncrement  # pyright: ignore
 
     def __init__(
         self,
@@ -83,9 +83,8 @@ class WeakBrownianPath(AbstractPathWithLaws):
     ):
         r"""**Arguments:**
 
-        - `shape`: a PyTree of `jax.ShapeDtypeStruct`s, the shape, dtype and structure of
-            an increment; or a tuple of integers for one array of the default
-            floating-point dtype. For `m` noises, `(m,)`.
+        - `shape`: the shape of an increment, for `m` noises `(m,)`; or a PyTree of
+            `jax.ShapeDtypeStruct`s.
         - `key`: a JAX random key, as from `jax.random.key(seed)`.
         - `second`: whether to draw a second, independent set of three-point variables.
         - `two_point`: whether to draw the two-point variables.
@@ -107,51 +106,36 @@ class WeakBrownianPath(AbstractPathWithLaws):
         self.order = order
 
     @property
-    def levy_area(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return WeakIncrement
-
-    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
-        words = self.words(place_of(t0, t1), use_levy)
-        return self.increment(words, t0, t1, use_levy)
-
-    @property
     def laws(self) -> dict[str, AbstractLaw]:
-        laws: dict[str, AbstractLaw]
-        laws = {"W": THREE_POINT if self.order == 2 else FOUR_POINT}
-        if self.second:
-            laws["second"] = THREE_POINT
-        if self.order == 3:
-            laws["third"] = THREE_POINT
-        if self.two_point:
-            laws["two_point"] = two_point()
-        return laws
+        laws = {
+            "W": THREE_POINT if self.order == 2 else FOUR_POINT,
+            "second": THREE_POINT if self.second else None,
+            "third": THREE_POINT if self.order == 3 else None,
+            "two_point": two_point() if self.two_point else None,
+        }
+        return {name: law for name, law in laws.items() if law is not None}
 
 
 class FixedStepBrownianPath(AbstractPathWithLaws):
     r"""Gaussian increments of a Brownian motion, for fixed steps.
 
     Over a step of size $h$ the increment is $W \sim \mathcal N(0, h)$, and with space-time
-    Lévy area there is an independent $H \sim \mathcal N(0, h / 12)$. They are a function
-    of `key` and of where the step lies, as those of
-    [`diffrax_symplectic.WeakBrownianPath`][]. A step that is computed again gets the same
-    increments. So reverse-mode gradients work, which `diffrax.UnsafeBrownianPath` does not
-    allow; and no noise repeats late in a run, as it does there. A step costs as much as
-    its random numbers, whereas a `diffrax.VirtualBrownianTree` descends to its leaves for
-    each of them.
+    Lévy area there is an independent $H \sim \mathcal N(0, h / 12)$. As for
+    [`diffrax_symplectic.WeakBrownianPath`][], they are a function of `key` and of where the
+    step lies. So reverse-mode gradients work and no noise repeats late in a run, unlike
+    with `diffrax.UnsafeBrownianPath`, and a step costs no more than its random numbers,
+    unlike with `diffrax.VirtualBrownianTree`.
 
     Without `cell`, steps of another size belong to another Brownian motion. With `cell`,
     one Brownian motion is sampled over cells of that size, and the increment over a step
-    is put together from those of its cells. So solutions with different steps, all
-    multiples of `cell`, follow one path. That is needed for strong errors against a fine
-    solution, and for the difference of the results of two step sizes. A step then costs as
-    much as all cells in it.
+    is the sum over its cells. So solutions whose steps are multiples of `cell` follow one
+    path, as strong errors against a fine solution need it. A step then costs as much as all
+    cells in it.
 
-    Each number is made from one random word of 32 bits, by the inverse of the normal
-    distribution function, with a relative error below $10^{-8}$ in float64 and rounding
-    error in float32. So there are $2^{32}$ different values, up to 6.3 standard
-    deviations. Odd moments vanish up to rounding, and even moments to the eighth are those
-    of the normal distribution up to a relative error of $10^{-5}$, the variance up to
-    $10^{-7}$.
+    Each number is the inverse of the normal distribution function at one random word of 32
+    bits, with a relative error below $10^{-8}$ in float64: $2^{32}$ different values, up to
+    6.3 standard deviations. The variance is exact up to a relative error of $10^{-7}$, even
+    moments to the eighth up to $10^{-5}$, and odd moments vanish up to rounding.
     """
 
     shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
@@ -173,13 +157,10 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
     ):
         """**Arguments:**
 
-        - `shape`: a PyTree of `jax.ShapeDtypeStruct`s, the shape, dtype and structure of
-            an increment; or a tuple of integers for one array of the default
-            floating-point dtype. For `m` noises, `(m,)`.
-        - `key`: a JAX random key, as from `jax.random.key(seed)`.
+        - `shape`, `key`: as for [`diffrax_symplectic.WeakBrownianPath`][].
         - `levy_area`: `diffrax.BrownianIncrement` or `diffrax.SpaceTimeLevyArea`.
-        - `cell`: the finest stretch that is sampled, of which every step is a multiple;
-            or `None` to sample each step by itself.
+        - `cell`: the length of the cells, of which every step is a multiple; or `None` to
+            sample each step by itself.
 
         **Raises:** a `ValueError` if `key` is not a random key, if a dtype is not real
         floating-point, for another `levy_area`, or if `cell` is not positive; an error
@@ -202,18 +183,15 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
         return GAUSSIAN_LAWS[self.levy_area]
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
-        if self.cell is not None:
-            return self._composed(t0, t1, self.cell, use_levy)
-        words = self.words(place_of(t0, t1), use_levy)
-        return self.increment(words, t0, t1, use_levy)
-
-    def _composed(self, t0: Array, t1: Array, cell: float, use_levy: bool) -> Increment:
-        h = jnp.asarray(cell, t0.dtype)
+        if self.cell is None:
+            words = self.words(place_of(t0, t1), use_levy)
+            return self.increment(words, t0, t1, use_levy)
+        h = jnp.asarray(self.cell, t0.dtype)
 
         def sample(i) -> Piece:
             # The increments are the same whether or not the areas are asked for.
             words = self.words((i.astype(jnp.int32), jnp.array(0)), True)
             return Piece.of(self.increment(words, 0 * h, h, True), h)
 
-        piece = compose(t0, t1, cell, sample, type(self).__name__)
+        piece = compose(t0, t1, self.cell, sample, type(self).__name__)
         return piece.as_increment(self.levy_area, self.shape, t1 - t0, use_levy)

@@ -1,5 +1,5 @@
 """Random words for a step, as a function of a key and of where the step lies; and the laws
-of the scalar random variables that are made of them, for a step of size 1."""
+of the scalar random variables that are made of them."""
 
 import abc
 import dataclasses
@@ -16,32 +16,32 @@ from jaxtyping import Array, Float, Integer, PRNGKeyArray, UInt32
 from .._batch import materialize
 
 
-# A number that counts places, and one that says what is counted.
+# Where a step lies, in units of a power of two, and the exponent of that power.
 Place: TypeAlias = tuple[Integer[Array, ""], Integer[Array, ""]]
 
-# The words of one step are numbered. Those of wrappers begin at these numbers.
+# The words of one step are numbered. Wrappers begin at these numbers.
 PLATEAU_WORDS, AREA_WORDS = 2**18, 2**19
 
 
 def random_words(
     key, place: Place, sets: int, n: int, begin: int = 0
 ) -> UInt32[Array, "sets n"]:
-    """Random words for a step at `place`: `sets` sets of `n` words each. To ask for more
-    sets does not change the first ones. Words for different values of `begin` are
-    independent, so that a path and a wrapper around it may have the same key."""
+    """Random words for a step at `place`: `sets` sets of `n` words each, of which the first
+    do not depend on `sets`. Words for different values of `begin` are independent, so that
+    a path and a wrapper around it may have the same key."""
     key = _typed(key)
     count, exponent = place
     blocks = (sets * n + 1) // 2
     if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks < 2**20 - begin:
-        # The place is used as the counter of the generator: one hash then makes two words.
-        # With folded and split keys the first word alone would take three hashes.
+        # With the place as its counter, one hash of the generator makes two words. Folded
+        # and split keys would take three hashes for the first word.
         numbers = np.arange(begin, begin + blocks, dtype=np.uint32)
         counter = (
             count.astype(jnp.uint32),
             (exponent.astype(jnp.uint32) << 20) + numbers,
         )
         hashed = lambda: _threefry(jr.key_data(key), *counter)
-        # For one word, one of the two: XLA computes each by a kernel of its own.
+        # XLA computes each of the two words by a kernel of its own.
         words = jnp.stack(materialize(lambda: hashed()[: sets * n]), axis=1)
         return words.reshape(-1)[: sets * n].reshape(sets, n)
     at = jr.fold_in(jr.fold_in(key, count), exponent)
@@ -52,11 +52,9 @@ def random_words(
 
 def _threefry(key: UInt32[Array, "2"], a: Array, b: Array) -> tuple[Array, Array]:
     """Threefry-2x32 with 20 rounds, by Salmon et al. (SC'11, doi:10.1145/2063384.2063405):
-    the words that JAX's generator makes for this key, for counters `(a, b)`.
-
-    On CPUs JAX's own is a loop of eighty kernels. Written out, XLA fuses all of it into
-    one or two: three words for each of 512 paths take 3 ns a path in place of 16.
-    """
+    the words that JAX's generator makes for this key, for counters `(a, b)`. Written out,
+    since on CPUs JAX's own is a loop of eighty kernels: three words for each of 512 paths
+    take 3 ns a path in place of 16."""
     keys = key[0], key[1], key[0] ^ key[1] ^ np.uint32(0x1BD11BDA)
     a, b = a + keys[0], b + keys[1]
     for i in range(5):
@@ -93,19 +91,19 @@ def _typed(key) -> PRNGKeyArray:
 def place_of(t0, t1) -> Place:
     """Where a step lies, in integers, the same for times that differ by rounding.
 
-    The middle of the step is counted in units of a power of two, which is the second
-    integer and lies between a third and 0.7 of the step. All steps with the same unit are
-    longer than it, so that two steps have the same integers only if they overlap. The two
-    odd constants keep round numbers away from where the roundings change.
+    The middle of the step is counted in units of a power of two, between a third and 0.7 of
+    the step, and the exponent is the second integer. So two steps have the same integers
+    only if they overlap. The two odd constants keep round numbers away from where the
+    roundings change.
     """
     per_unit, exponent = _inverse_power_of_two(jnp.abs(t1 - t0) * 1.37)
-    # The middle itself would be rounded to the resolution of time. Late in a long solve
-    # in float32 that is not far below the step, and two steps may have one middle. So the
-    # integer part of the start, which is exact, is split off before half a step is added.
+    # Late in a long solve in float32, two steps may have the same middle after rounding. So
+    # the integer part of the start, which is exact, is split off before half a step is
+    # added.
     start, half = t0 * per_unit, (t1 - t0) / 2 * per_unit
     whole = jnp.floor(start)
     rest = jnp.floor(start - whole + half + 0.29)
-    # Starts again after 2^31 counts, or fewer where these are more than there are numbers.
+    # Start again after 2^31 counts, or fewer in half precision.
     period = 2.0 ** min(31, jnp.finfo(whole.dtype).maxexp - 1)
     whole = whole - period * jnp.trunc(whole / period)
     return whole.astype(jnp.int32) + rest.astype(jnp.int32), exponent
@@ -113,7 +111,7 @@ def place_of(t0, t1) -> Place:
 
 def _inverse_power_of_two(x: Array) -> tuple[Array, Integer[Array, ""]]:
     """One over the power of two from a quarter to half of a positive number, and the
-    exponent of the number, by its bits: `jnp.frexp`, `jnp.ldexp` and a division take as
+    exponent of the number, by its bits: with `jnp.frexp` and `jnp.ldexp` this would take as
     long as a random word."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(x, f"int{info.bits}")
@@ -129,8 +127,8 @@ class AbstractLaw(abc.ABC):
 
     @abc.abstractmethod
     def outcomes(self, nodes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Values and their probabilities: those of a discrete law, or quadrature points
-        and weights that integrate polynomials of degree `2 nodes - 1` exactly."""
+        """Values and probabilities of a discrete law, or quadrature points and weights that
+        integrate polynomials of degree `2 nodes - 1` exactly."""
 
     @abc.abstractmethod
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
@@ -159,8 +157,7 @@ class Discrete(AbstractLaw):
 
 @dataclasses.dataclass(frozen=True)
 class Gaussian(AbstractLaw):
-    """The normal distribution of mean zero. One word makes one sample, a monotone function
-    of it."""
+    """The normal distribution of mean zero. A sample is a monotone function of its word."""
 
     variance: float = 1.0
 
@@ -176,10 +173,9 @@ class Gaussian(AbstractLaw):
 
 
 # With p the distance of a probability from the nearer of 0 and 1, and q = 1/2 - p, the
-# normal quantile is q F(-log(4 p (1 - p))), where F is smooth, growing, and so well
-# approximated by one ratio of polynomials that no branch is needed. These (lowest degree
-# first) are the best of degrees 6 and 5 for p from 2^-33 on, found by weighted least
-# squares: the largest relative error is 9.7e-9. All are positive, so that nothing cancels.
+# normal quantile is q F(-log(4 p (1 - p))) with a smooth F. These polynomials, lowest
+# degree first, were fitted by weighted least squares for p from 2^-33 on: the largest
+# relative error is 9.7e-9. All coefficients are positive, so that nothing cancels.
 _NUMERATOR = (
     2.506628250602876, 0.894851053435387, 0.18198359950254517, 0.025040486604300607,
     0.002275143781368971, 0.00011854314661164789, 3.8177635593160345e-07,
@@ -206,13 +202,10 @@ def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]
     return two_q * half * polynomial(_NUMERATOR) / polynomial(_DENOMINATOR)
 
 
-# The probability of each large value is 1/6, up to 2^-32, and the same for both signs.
 _SIXTH = 2**32 // 6
-# Words below 2^31 stand for negative values. The lowest of each half stand for the large
-# values, which are rare.
-_RARE = round(2**32 * (3 - np.sqrt(6)) / 12)
 _SMALL, _LARGE = (float(np.sqrt(3 + s * np.sqrt(6))) for s in (-1, 1))
 _LESS, _MORE = (float((3 + s * np.sqrt(6)) / 12) for s in (-1, 1))
+_RARE = round(2**32 * _LESS)
 
 # Moments 1 to 5 of the normal distribution.
 THREE_POINT = Discrete(
@@ -220,7 +213,7 @@ THREE_POINT = Discrete(
     probabilities=(1 / 6, 2 / 3, 1 / 6),
     cuts=(_SIXTH, 2**32 - _SIXTH),
 )
-# Moments 1 to 7.
+# Moments 1 to 7. Words below 2^31 stand for negative values.
 FOUR_POINT = Discrete(
     values=(-_LARGE, -_SMALL, _LARGE, _SMALL),
     probabilities=(_LESS, _MORE, _LESS, _MORE),

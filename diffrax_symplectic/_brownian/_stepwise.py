@@ -1,8 +1,9 @@
-"""Brownian paths that draw every step by itself, as a function of random words."""
+"""Brownian paths that draw each step by itself, as a function of random words."""
 
 import abc
+import math
 from collections.abc import Callable, Mapping
-from typing import Any, cast, TYPE_CHECKING, TypeAlias
+from typing import Any, cast, ClassVar, TYPE_CHECKING, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -14,7 +15,7 @@ from jaxtyping import Array, PRNGKeyArray, PyTree, UInt32
 
 from .._compat import nondifferentiable
 from .._custom_types import RealScalarLike
-from ._random import AbstractLaw, Gaussian, Place, random_words
+from ._random import AbstractLaw, Gaussian, Place, place_of, random_words
 
 
 if TYPE_CHECKING:
@@ -23,14 +24,14 @@ else:
     from equinox import AbstractVar
 
 
-# What a step gets from its path, without and with all of its random variables.
+# What a path returns for a step, with `use_levy=False` and with `use_levy=True`.
 Increment: TypeAlias = PyTree[Array] | diffrax.AbstractBrownianIncrement
 
 
 class AbstractStepwisePath(diffrax.AbstractBrownianPath):
     """A path whose increment over a step is a function of random words of 32 bits, one for
-    each scalar random variable. `evaluate` takes them from a generator. To put others in
-    their place, such as those of a low-discrepancy set of points, call `increment`."""
+    each scalar random variable. `evaluate` draws the words from a generator; `increment`
+    takes others, such as a low-discrepancy point set."""
 
     def evaluate(
         self,
@@ -39,11 +40,8 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         left: bool = True,
         use_levy: bool = False,
     ) -> Increment:
-        """Implements [`diffrax.AbstractBrownianPath.evaluate`][].
-
-        Returns the increment over the step from `t0` to `t1`, or with `use_levy=True` an
-        object of type `levy_area`. Without `t1` the step is the one from `0` to `t0`.
-        """
+        """The increment over the step from `t0` to `t1` (from `0` to `t0` without `t1`), or
+        with `use_levy=True` an object of type `levy_area`."""
         del left
         start, end = (jnp.zeros_like(t0), t0) if t1 is None else (t0, t1)
         ends = jnp.asarray(start), jnp.asarray(end)
@@ -57,9 +55,9 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
     @property
     @abc.abstractmethod
     def laws(self) -> Mapping[str, AbstractLaw] | None:
-        """The laws of the random variables of a step, all of them independent, by their
-        name on the increment and for a step of size 1: over a step of size `h` they are
-        `sqrt(h)` times as large. `None` if the increments are not made of such only."""
+        """The laws of the random variables of a step of size 1, all independent, by their
+        name on the increment; over a step of size `h` they are `sqrt(h)` times as large.
+        `None` if increments are made of anything else."""
 
     @abc.abstractmethod
     def num_words(self, use_levy: bool = False) -> int:
@@ -76,78 +74,46 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         """What `evaluate` returns for the step from `t0` to `t1`, from given words."""
 
 
-# Diffrax traces a step three times, and `jax.vmap` what is in a loop more often.
+# Diffrax traces a step three times, and `jax.vmap` traces the body of a loop more often.
 @eqx.filter_jit
 def _drawn(path: AbstractStepwisePath, t0: Array, t1: Array, use_levy: bool):
     return path.draw(t0, t1, use_levy)
 
 
 class AbstractPathWithLaws(AbstractStepwisePath):
-    """A path whose steps are made of independent random variables with its `laws`, one
-    from each law for each noise."""
+    """A path whose steps consist of independent random variables: for each noise, one from
+    each of its `laws`. The law of the increment, `"W"`, comes first."""
 
     shape: AbstractVar[PyTree[jax.ShapeDtypeStruct]]
     key: AbstractVar[PRNGKeyArray]
-
-    @property
-    def t0(self):
-        return -jnp.inf
-
-    @property
-    def t1(self):
-        return jnp.inf
+    t0: ClassVar[float] = -math.inf
+    t1: ClassVar[float] = math.inf
 
     @property
     @abc.abstractmethod
-    def laws(self) -> Mapping[str, AbstractLaw]:
-        """The law of the increment, `"W"`, comes first."""
-
-    def _num_sets(self, use_levy: bool) -> int:
-        return len(self.laws) if use_levy else 1
+    def laws(self) -> Mapping[str, AbstractLaw]: ...
 
     def num_words(self, use_levy: bool = False) -> int:
-        return self._num_sets(use_levy) * num_noises(self.shape)
+        return (len(self.laws) if use_levy else 1) * num_noises(self.shape)
 
     def words(self, place: Place, use_levy: bool) -> UInt32[Array, " num_words"]:
-        """The path's own random words for a place on the axis of time."""
-        sets, n = self._num_sets(use_levy), num_noises(self.shape)
+        """The path's own random words for a place on the time axis."""
+        sets, n = len(self.laws) if use_levy else 1, num_noises(self.shape)
         return random_words(self.key, place, sets, n).reshape(-1)
 
-    def increment(
-        self,
-        words: UInt32[Array, " num_words"],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        use_levy: bool = False,
-    ) -> Increment:
-        n = num_noises(self.shape)
-        sets = [words[i * n : (i + 1) * n] for i in range(len(self.laws))]
-        draw = lambda law, words: draw_set(law, words, t1 - t0, self.shape)
+    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
+        words = self.words(place_of(t0, t1), use_levy)
+        return self.increment(words, t0, t1, use_levy)
+
+    def increment(self, words, t0, t1, use_levy: bool = False) -> Increment:
+        h, n = t1 - t0, num_noises(self.shape)
         if not use_levy:
-            return draw(self.laws["W"], sets[0])
-        dt = jtu.tree_map(lambda s: jnp.asarray(t1 - t0, s.dtype), self.shape)
-        drawn = {k: draw(law, x) for (k, law), x in zip(self.laws.items(), sets)}
-        return cast(Any, self.levy_area)(dt=dt, **drawn)
-
-
-def stepwise(path: diffrax.AbstractBrownianPath) -> AbstractStepwisePath:
-    """`path` if its steps can be made from given words, otherwise a `ValueError`."""
-    if not isinstance(path, AbstractStepwisePath):
-        raise ValueError(
-            "The random variables of this path cannot be chosen from outside. Use a "
-            "`WeakBrownianPath`, or a `FixedStepBrownianPath` in place of Diffrax's "
-            f"Gaussian paths; got `{type(path).__name__}`."
-        )
-    return path
-
-
-def laws_of(path: diffrax.AbstractBrownianPath) -> Mapping[str, AbstractLaw] | None:
-    """The laws of the random variables of a step, or `None` if they are unknown."""
-    if isinstance(path, AbstractStepwisePath):
-        return path.laws
-    if isinstance(path, diffrax.UnsafeBrownianPath | diffrax.VirtualBrownianTree):
-        return GAUSSIAN_LAWS.get(path.levy_area)
-    return None
+            return draw_set(self.laws["W"], words[:n], h, self.shape)
+        drawn = {
+            name: draw_set(law, words[i * n : (i + 1) * n], h, self.shape)
+            for i, (name, law) in enumerate(self.laws.items())
+        }
+        return cast(Any, self.levy_area)(dt=step_size(h, self.shape), **drawn)
 
 
 class AbstractWrappedPath(AbstractStepwisePath):
@@ -180,28 +146,52 @@ class AbstractWrappedPath(AbstractStepwisePath):
     def num_words(self, use_levy: bool = False) -> int:
         return stepwise(self.path).num_words(use_levy) + self.num_own_words(use_levy)
 
-    def increment(
-        self,
-        words: UInt32[Array, " num_words"],
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        use_levy: bool = False,
-    ) -> Increment:
+    def increment(self, words, t0, t1, use_levy: bool = False) -> Increment:
         path = stepwise(self.path)
         increment = path.increment(words, t0, t1, use_levy)
         own_words = words[path.num_words(use_levy) :]
         return self.changed(increment, own_words, t1 - t0, use_levy)
 
 
-def increment_struct(
-    path: diffrax.AbstractBrownianPath,
-) -> PyTree[jax.ShapeDtypeStruct]:
-    """Shapes, dtypes and structure of an increment."""
-    if isinstance(path, UnspecifiedPath):
-        return path.shape
-    # Times of this kind are those of a solve, for which it is not traced once more.
-    time = jax.ShapeDtypeStruct((), jnp.result_type(float))
-    return jax.eval_shape(lambda *ends: path.evaluate(*ends), time, time)
+class GivenPath(diffrax.AbstractBrownianPath):
+    """A path whose increment from `t0` to `t1` is `make(t0, t1, use_levy)`."""
+
+    make: Callable[[RealScalarLike, RealScalarLike | None, bool], Increment]
+    levy_area: type = eqx.field(static=True)
+    t0: ClassVar[float] = -math.inf
+    t1: ClassVar[float] = math.inf
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        del left
+        return self.make(t0, t1, use_levy)
+
+
+class UnspecifiedPath(diffrax.AbstractBrownianPath):
+    """The shape of a Brownian path that is chosen later, when the solver is known."""
+
+    shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
+    levy_area: ClassVar[type] = diffrax.AbstractBrownianIncrement
+    t0: ClassVar[float] = -math.inf
+    t1: ClassVar[float] = math.inf
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        raise ValueError(
+            "These terms have the shape of a Brownian path in place of the path itself, "
+            "which is enough for `suggest_solver`, `compare_solvers` and `expectation`. To "
+            "solve them, pass `path=solver.path(shape, key)` to the function that makes "
+            "the terms."
+        )
+
+
+def stepwise(path: diffrax.AbstractBrownianPath) -> AbstractStepwisePath:
+    """`path` if its steps can be made from given words, otherwise a `ValueError`."""
+    if not isinstance(path, AbstractStepwisePath):
+        raise ValueError(
+            "The random variables of this path cannot be chosen from outside. Use a "
+            "`WeakBrownianPath`, or a `FixedStepBrownianPath` in place of Diffrax's "
+            f"Gaussian paths; got `{type(path).__name__}`."
+        )
+    return path
 
 
 # The laws of Gaussian paths, by the type of their increments.
@@ -216,8 +206,46 @@ GAUSSIAN_LAWS: Mapping[type, Mapping[str, AbstractLaw]] = {
 }
 
 
+def laws_of(path: diffrax.AbstractBrownianPath) -> Mapping[str, AbstractLaw] | None:
+    """The laws of the random variables of a step, or `None` if they are unknown."""
+    if isinstance(path, AbstractStepwisePath):
+        return path.laws
+    if isinstance(path, diffrax.UnsafeBrownianPath | diffrax.VirtualBrownianTree):
+        return GAUSSIAN_LAWS.get(path.levy_area)
+    return None
+
+
+def is_random(path: diffrax.AbstractBrownianPath) -> bool:
+    """Whether a path draws its noise from a random key, rather than holding given noise,
+    such as a record."""
+
+    def is_key(x) -> bool:
+        if not eqx.is_array(x):
+            return False
+        typed = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        return typed or x.dtype == jnp.uint32 and x.shape[-1:] in ((2,), (4,))
+
+    return isinstance(path, UnspecifiedPath) or any(map(is_key, jtu.tree_leaves(path)))
+
+
+def increment_struct(
+    path: diffrax.AbstractBrownianPath,
+) -> PyTree[jax.ShapeDtypeStruct]:
+    """Shapes, dtypes and structure of an increment."""
+    if isinstance(path, UnspecifiedPath):
+        return path.shape
+    # With times as in a solve, the trace of `evaluate` is shared with it.
+    time = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    return jax.eval_shape(lambda *ends: path.evaluate(*ends), time, time)
+
+
 def num_noises(shape: PyTree[jax.ShapeDtypeStruct]) -> int:
     return sum(leaf.size for leaf in jtu.tree_leaves(shape))
+
+
+def step_size(h: RealScalarLike, shape: PyTree[jax.ShapeDtypeStruct]) -> PyTree[Array]:
+    """The field `dt` of an increment of this shape."""
+    return jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), shape)
 
 
 def draw_set(
@@ -241,8 +269,8 @@ def draw_set(
 def checked_shape(
     shape: tuple[int, ...] | PyTree[jax.ShapeDtypeStruct], path_name: str
 ) -> PyTree[jax.ShapeDtypeStruct]:
-    """The shape of the increments of a path, of which a tuple of integers is short for
-    one array. Raises a `ValueError` for what is no shape, or not of real numbers."""
+    """The shape of the increments of a path; a tuple of integers stands for one array.
+    Raises a `ValueError` for anything else, and for dtypes that are not real."""
     if isinstance(shape, tuple) and all(isinstance(n, int) for n in shape):
         shape = jax.ShapeDtypeStruct(shape, jnp.result_type(float))
     for leaf in jtu.tree_leaves(shape):
@@ -258,68 +286,3 @@ def checked_shape(
                 f"got {leaf.dtype}."
             )
     return shape
-
-
-def covers_all_times(path: diffrax.AbstractBrownianPath) -> bool:
-    """Whether it is known while tracing that a path has no beginning and no end."""
-    known = lambda x: isinstance(x, int | float | np.number)
-    return all(known(x) and abs(x) == np.inf for x in (path.t0, path.t1))
-
-
-def is_random(path: diffrax.AbstractBrownianPath) -> bool:
-    """Whether a path draws its noise, by a random key within it. Others hold noise that is
-    given: recorded, or made by a rule."""
-    if isinstance(path, UnspecifiedPath):
-        return True
-
-    def is_key(x) -> bool:
-        if not eqx.is_array(x):
-            return False
-        typed = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-        return typed or x.dtype == jnp.uint32 and x.shape[-1:] in ((2,), (4,))
-
-    return any(map(is_key, jtu.tree_leaves(path)))
-
-
-class UnspecifiedPath(diffrax.AbstractBrownianPath):
-    """The shape of a Brownian path that is chosen later, when the solver is known."""
-
-    shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
-    levy_area: type = eqx.field(static=True, default=diffrax.AbstractBrownianIncrement)
-
-    @property
-    def t0(self):
-        return -jnp.inf
-
-    @property
-    def t1(self):
-        return jnp.inf
-
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
-        del t0, t1, left, use_levy
-        raise ValueError(
-            "These terms have the shape of a Brownian path in place of the path itself, "
-            "which is enough for `suggest_solver`, `compare_solvers` and `expectation`. To "
-            "solve them, pass `path=solver.path(shape, key)` to the function that makes "
-            "the terms."
-        )
-
-
-class GivenPath(diffrax.AbstractBrownianPath):
-    """A path whose increments come from elsewhere: that of the step from `t0` to `t1` is
-    `make(t0, t1, use_levy)`."""
-
-    make: Callable[[RealScalarLike, RealScalarLike | None, bool], Increment]
-    levy_area: type = eqx.field(static=True)
-
-    @property
-    def t0(self):
-        return -jnp.inf
-
-    @property
-    def t1(self):
-        return jnp.inf
-
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
-        del left
-        return self.make(t0, t1, use_levy)

@@ -1,4 +1,5 @@
 import dataclasses
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -6,6 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from .._arguments import whole_number
 from .._custom_types import BM
 from ._paths import WeakBrownianPath
 from ._random import (
@@ -41,17 +43,14 @@ class TruncatedBrownianPath(AbstractWrappedPath):
     r"""Bounds the increments of a Brownian path, for implicit strong methods.
 
     Over a step of size $h < 1$ an increment $\sqrt h\,\xi$ becomes
-    $\sqrt h\,\max(-A_h, \min(\xi, A_h))$ with $A_h = \sqrt{2 k |\ln h|}$. A Gaussian
-    increment is unbounded, so that at any step size an implicit stage has, with positive
-    probability, no solution; a truncated one is bounded by $\sqrt{2 k h |\ln h|}$. The
-    price is a mean-square error $\mathbb E[(\xi - \xi_h)^2] \leq h^k$: take $k$ at least
-    twice the strong order of the method.
+    $\sqrt h\,\max(-A_h, \min(\xi, A_h))$ with $A_h = \sqrt{2 k |\ln h|}$. With unbounded
+    Gaussian increments an implicit stage has no solution, with positive probability, at any
+    step size. The price is a mean-square error $\mathbb E[(\xi - \xi_h)^2] \leq h^k$: take
+    $k$ at least twice the strong order of the method.
 
     Steps have to be well below one unit of time, where the bound becomes 0: for `k=2` an
     increment keeps 97% of its variance at $h = 1/4$, 84% at $h = 1/2$ and 28% at
-    $h = 0.9$.
-
-    Lévy areas of the wrapped path are kept as they are. Step sizes have to be fixed.
+    $h = 0.9$. Lévy areas do not change. Step sizes have to be fixed.
 
     **Source:** [Milstein, Repin and Tretyakov
     (2002)](https://doi.org/10.1137/S0036142901395588).
@@ -59,6 +58,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
     path: diffrax.AbstractBrownianPath
     k: int = eqx.field(static=True)
+    laws: ClassVar[None] = None  # pyright: ignore
 
     def __init__(self, path: diffrax.AbstractBrownianPath, *, k: int = 2):
         """**Arguments:**
@@ -66,9 +66,9 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         - `path`: any Brownian path of Diffrax.
         - `k`: the integer $k \\geq 1$ above.
 
-        **Raises:** a `ValueError` if `k` is not a positive integer, if `path` is no
-        Brownian path, or one of bounded increments. An error when run if a step is not
-        shorter than one unit of time, where $A_h$ has no meaning.
+        **Raises:** a `ValueError` if `k` is not a positive integer, or if `path` is no
+        Brownian path, or has bounded increments; an error when run if a step is not shorter
+        than one unit of time.
         """
         if not isinstance(path, diffrax.AbstractBrownianPath):
             raise ValueError(
@@ -77,24 +77,15 @@ class TruncatedBrownianPath(AbstractWrappedPath):
             )
         if isinstance(path, WeakBrownianPath):
             raise ValueError(
-                "The increments of a `WeakBrownianPath` are bounded already, and to cut "
-                "them off would change their moments. Pass it as it is."
-            )
-        if isinstance(k, bool) or not isinstance(k, int) or k < 1:
-            raise ValueError(
-                "`k` must be an integer, 1 or larger (2 suits methods of strong order "
-                f"1); got {k!r}."
+                "The increments of a `WeakBrownianPath` are bounded already, and "
+                "truncation would change their moments. Pass it as it is."
             )
         self.path = path
-        self.k = k
+        self.k = whole_number("k", k)
 
     @property
     def levy_area(self):
         return self.path.levy_area
-
-    @property
-    def laws(self) -> None:
-        return None
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         increment = self.path.evaluate(t0, t1, use_levy=use_levy)
@@ -105,7 +96,6 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         return 0
 
     def changed(self, increment, own_words, h, use_levy) -> Increment:
-        del own_words, use_levy
         h = jnp.abs(h)
         h = eqx.error_if(
             h,
@@ -114,7 +104,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
             "the bound is a multiple of sqrt(|ln h|). Pass a smaller `dt0`, or measure "
             "time in larger units.",
         )
-        # The bound of an empty step is zero, as h |ln h| tends to 0 with h.
+        # The bound of an empty step is zero.
         log_h = jnp.log(jnp.where(h > 0, h, 1))
         bound = jnp.sqrt(2 * self.k * h * jnp.abs(log_h))
 
@@ -129,14 +119,13 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
     r"""Increment, space-time Lévy area and plateaus over a step of size $h$.
 
-    The path over the step stands for two plateaus, of height $M - C$ over its first half
-    and $M + C$ over its second. $M = W / 2 + H$ is the mean of the Brownian path over the
-    step, and
+    The Brownian path is replaced by two plateaus, of height $M - C$ over the first half of
+    the step and $M + C$ over the second. $M = W / 2 + H$ is its mean over the step, and
 
     $$C = \pm\sqrt{\tfrac{1}{15} h + \tfrac{1}{12} W^2 + \tfrac15 H^2}$$
 
-    with a fair sign: $M^2 + C^2$ is the mean square of the Brownian path over the step, in
-    expectation given $W$ and $H$. The mean of $C^2$ is $h / 6$.
+    with a fair sign: in expectation given $W$ and $H$, $M^2 + C^2$ is the mean square of
+    the Brownian path over the step. The mean of $C^2$ is $h / 6$.
 
     - `dt`, `W`, `H`: as in Diffrax.
     - `sign`: the signs of $C$, times $\sqrt h$.
@@ -154,7 +143,7 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
 
 
 def _offset(h, W, H, sign):
-    # In a solve backward in time Diffrax changes all signs, that of the step size included.
+    # In a solve backward in time Diffrax changes all signs, also of the step size.
     h = jnp.abs(h).astype(W.dtype)
     size = jnp.sqrt(h / 15 + W**2 / 12 + H**2 / 5)
     return jnp.copysign(size, sign)
@@ -169,13 +158,14 @@ class PlateauBrownianPath(AbstractWrappedPath):
 
     path: diffrax.AbstractBrownianPath
     key: PRNGKeyArray
+    levy_area: ClassVar = PlateauIncrement  # pyright: ignore
 
     def __init__(self, path: diffrax.AbstractBrownianPath, key: PRNGKeyArray):
         """**Arguments:**
 
         - `path`: a Brownian path with space-time Lévy area, for example
             `FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`.
-        - `key`: a JAX random key for the signs, which may be that of the path.
+        - `key`: a JAX random key for the signs, which may be the key of the path.
 
         **Raises:** a `ValueError` if `path` has no space-time Lévy area.
         """
@@ -183,10 +173,6 @@ class PlateauBrownianPath(AbstractWrappedPath):
         check_key(key, type(self).__name__)
         self.path = path
         self.key = key
-
-    @property
-    def levy_area(self):
-        return PlateauIncrement
 
     @property
     def laws(self) -> dict[str, AbstractLaw] | None:

@@ -1,5 +1,5 @@
 from .base import AbstractImplicitStages, AbstractSymplecticRungeKutta
-from .base import AbstractSymplecticSolver, Noises, Record, Want
+from .base import AbstractSymplecticSolver, ARGUMENTS, Record, Want
 from .general import ImplicitMidpoint, SRKs1, SRKw1, SRKw2
 from .separable import PlateauVerlet, SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet
 from .additive import AdditiveGauss, SRKs4, SRKw5
@@ -19,3 +19,9 @@ SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
     *(SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet, PlateauVerlet),
     *(SRKs4, SRKw5, AdditiveGauss),
 )
+
+# Solvers whose only arguments are those of the root finder.
+for _solver in (ImplicitMidpoint, SRKw2, StrangGauss, NinomiyaVictoir, PlateauGauss):
+    _solver.__init__.__doc__ = ARGUMENTS
+for _solver in (LevyAreaMidpoint, SRKs2, SRKw5, AdditiveGauss):
+    _solver.__init__.__doc__ = ARGUMENTS

@@ -1,21 +1,20 @@
-"""Whether a step can be taken at its time: whether numbers resolve it, and Brownian paths
-cover it."""
+"""Whether floating-point times resolve a step, and Brownian paths cover it."""
 
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import PyTree
 
-from .._brownian import covers_all_times
 from .._compat import direction
 from .._custom_types import RealScalarLike
 from .._terms import brownian_paths
 
 
-# Diffrax takes what is left of a solve in one step if it is shorter than a hundred units in
-# the last place of its end.
+# Diffrax merges the rest of a solve into its last step if it is shorter than a hundred
+# units in the last place of the end.
 ROUNDINGS = 100
 _OUTSIDE = (
     "A step goes beyond `path.t0` or `path.t1` of a Brownian path, where its noise is not "
@@ -39,22 +38,21 @@ def result_at(
     t1: RealScalarLike,
     result: diffrax.RESULTS,
 ) -> diffrax.RESULTS:
-    """`result` of the step from `t0` to `t1`, or `RESULTS.dt_min_reached` if it is so short
-    that the length of a step is not that of others. An error when run if a path does not
-    cover it."""
+    """`result` of the step from `t0` to `t1`, or `RESULTS.dt_min_reached` if its length is
+    changed by rounding. An error when run if a path does not cover it."""
     R: Any = diffrax.RESULTS
     t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
     h, eps = t1 - t0, float(jnp.finfo(jnp.result_type(t0, jnp.float32)).eps)
     short = h < ROUNDINGS * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     result = R.where(short, R.dt_min_reached, result)
     for path in brownian_paths(terms):
-        if covers_all_times(path):
+        numbers = isinstance(path.t0, float) and isinstance(path.t1, float)
+        if numbers and (path.t0, path.t1) == (-np.inf, np.inf):
             continue
-        # In a solve backward in time Diffrax counts it from minus `t0` on.
+        # In a solve backward in time Diffrax changes the sign of all times.
         forward = direction(terms) > 0
         begin, end = jnp.where(forward, t0, -t1), jnp.where(forward, t1, -t0)
-        # Times are rounded.
-        slack = 0.01 * h
+        slack = 0.01 * h  # for rounded times
         outside = (begin < path.t0 - slack) | (end > path.t1 + slack)
         result = eqx.error_if(result, outside, _OUTSIDE)
     return result

@@ -9,7 +9,6 @@ from .._tableau import AdditiveTableau
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
-    ARGUMENTS,
     free_parameter,
     real_number,
     Record,
@@ -56,17 +55,12 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     Two stage vectors are solved for, one after the other. If the noise is constant, only
     the sign $s$ matters. The paper has $s = +1$. The default here is $s = -1$: over six
     problems with two noises its strong error at $h = 1/16$ was half as large as for
-    $s = +1$, and 0.7 times as large with weak noise. The conditions leave $\beta_1$,
-    $\beta_2 \neq 0$ and $b$ free. They decide at which times the noise is evaluated: with
-    the defaults $\beta_1 = b = 0$, $\beta_2 = 1$, at both ends of the step.
+    $s = +1$, and 0.7 times as large with weak noise. The parameters $\beta_1$,
+    $\beta_2 \neq 0$ and $b$ decide at which times the noise is evaluated: with the defaults
+    $\beta_1 = b = 0$, $\beta_2 = 1$, at both ends of the step.
 
-    Strong order 3/2 and weak order 2. Order 2 without noise. Noise without the structure is
-    refused while tracing.
-
-    !!! warning
-
-        The path has to provide space-time Lévy area, from which $I_{k0}$ follows: for
-        example `FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`.
+    Strong order 3/2 and weak order 2. The path needs space-time Lévy area, from which
+    $I_{k0}$ follows.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 4.1.
@@ -105,7 +99,7 @@ SRKs4.__init__.__doc__ = f"""**Arguments:**
 - `sign`: the sign $s$, 1 or -1.
 {ROOT_FINDER}
 **Raises:** a `ValueError` if a parameter is not a finite real number, if `beta2` is 0, or
-if `sign` is not 1 or -1. While tracing, if the path has no space-time Lévy area.
+if `sign` is not 1 or -1.
 """
 
 
@@ -121,13 +115,7 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       y_{n+1} = y_n + h\, a(t_n + \tfrac h2, G) + \sum_k b_k \hat I_k.$$
 
     One stage vector is solved for, as in the midpoint rule. The second order comes from the
-    second, independent variable $\hat I_{k+m}$. No free parameters.
-
-    Order 2 without noise. Noise without the structure is refused while tracing.
-
-    !!! warning
-
-        The path has to be `WeakBrownianPath(..., second=True)`.
+    second, independent variable $\hat I_{k+m}$, of `WeakBrownianPath(..., second=True)`.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 4.2.
@@ -136,7 +124,7 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=None,
-        choose="Few digits at the cost of the midpoint rule.",
+        choose="Low accuracy at the cost of the midpoint rule.",
         suggested=("weak",),
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
@@ -147,9 +135,6 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         c1=[0],
         constant=True,
     )
-
-
-SRKw5.__init__.__doc__ = ARGUMENTS
 
 
 _r = np.sqrt(3.0)
@@ -163,7 +148,7 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     For any $H_0$ and $H_k = -\sigma_k \cdot q + \gamma_k \cdot p$, or any
     $\mathrm{d}y = a(t, y)\,\mathrm{d}t + \sum_k b_k\,\mathrm{d}w_k$ with constant $b_k$,
-    and with $A$, $\alpha$ and $c$ those of the Gauss method,
+    and with $A$, $\alpha$ and $c$ of the Gauss method,
 
     $$G_i = y_n + h \sum_j A_{ij} a(t_n + c_j h, G_j) + \sum_k b_k \xi_{ki}, \qquad
       \xi_{ki} = c_i \hat W_k + \sqrt{\tfrac16}\, \eta_{ki}$$
@@ -171,17 +156,12 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     $$y_{n+1} = y_n + h \sum_i \alpha_i a(t_n + c_i h, G_i) + \sum_k b_k \hat W_k$$
 
     where $\hat W_k$ is the four-point variable with seven moments of $\mathcal N(0, h)$ and
-    $\eta_{k1}$, $\eta_{k2}$ are independent three-point variables of variance $h$. The
-    variances $c_i^2 h + h / 6 = c_i h$ of $\xi_{ki}$ are those of the Brownian motion at
-    the time $c_i h$, since $c_i - c_i^2 = 1/6$.
+    $\eta_{k1}$, $\eta_{k2}$ are independent three-point variables of variance $h$, of
+    `WeakBrownianPath(..., order=3)`. Since $c_i - c_i^2 = 1/6$, $\xi_{ki}$ has the variance
+    $c_i^2 h + h / 6 = c_i h$ of the Brownian motion at the time $c_i h$.
 
-    Order 4 without noise. Noise without the structure is refused while tracing. Wang,
-    Hong and Xu (2017) report that they found no symplectic method of weak order 3 with
-    fewer than seven stages (remark 4.2).
-
-    !!! warning
-
-        The path has to be `WeakBrownianPath(..., order=3)`.
+    Wang, Hong and Xu (2017) found no symplectic method of weak order 3 with fewer than
+    seven stages (remark 4.2).
 
     **Source:** [Debrabant (2010)](https://doi.org/10.1007/s10543-010-0276-2) for the
     conditions.
@@ -205,6 +185,3 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         c1=[0],
         constant=True,
     )
-
-
-AdditiveGauss.__init__.__doc__ = ARGUMENTS

@@ -1,6 +1,5 @@
-"""The solvers' common base, the record of what is known of a solver, from which its orders,
-suggestions, the tables of the documentation and the tests of all solvers are made, and the
-step of any tableau."""
+"""The common base of all solvers, the record of facts about a solver, and the step of any
+tableau."""
 
 import abc
 import dataclasses
@@ -19,7 +18,7 @@ from .._arguments import check_state, whole_number
 from .._batch import batched_like
 from .._brownian import drives, path_of, VARIABLES
 from .._conditions import drift_order
-from .._custom_types import Args, BoolScalarLike, DenseInfo, RealScalarLike, VF, Y
+from .._custom_types import Args, DenseInfo, VF, Y
 from .._plan import make_plan
 from .._root_finder import PicardNewton
 from .._tableau import AbstractTableau, FlatTableau, Structure
@@ -42,13 +41,13 @@ else:
 
 Want: TypeAlias = Literal["weak", "strong"]
 Noises: TypeAlias = Literal["any", "commuting", "not commuting"]
-# One order for all noises; or first that for one noise and for noises that commute, then
-# that for all others.
+# One order for all noises; or the order for noises that commute, and for other noises.
 Order: TypeAlias = int | float | tuple[int | float, int | float]
 
 
 class Record(NamedTuple):
-    """The facts about a solver that do not follow from its coefficients.
+    """Facts about a solver that do not follow from its coefficients. Orders, suggestions,
+    the tables of the documentation and the tests of all solvers are made from it.
 
     - `weak`: the order of its expectations.
     - `strong`: the order of its paths, or `None` for a method for expectations alone.
@@ -67,20 +66,15 @@ class Record(NamedTuple):
         order = self.weak if want == "weak" else self.strong
         return order[0 if commute else 1] if isinstance(order, tuple) else order
 
-    def weak_order(self, commute: bool) -> int:
-        return cast(int, self.order("weak", commute))
 
-    def strong_order(self, commute: bool) -> int | float | None:
-        return self.order("strong", commute)
-
-
-# In a batch Diffrax goes on to step paths that have ended, and drops what comes out.
+# Whether the stage equations were solved so far: in a batch Diffrax goes on to step paths
+# that have failed.
 SolverState: TypeAlias = Solved
 
 
 class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
-    """The base of all solvers of this package, and of solvers of your own that are no
-    Runge--Kutta methods.
+    """The base of all solvers of this package, and of your own that are no Runge--Kutta
+    methods.
 
     A subclass is a Diffrax solver: it has `order`, `init` and `step`, which take any
     Stratonovich terms. It states `structure` (`"any"`, `"separable"`, `"additive"`,
@@ -95,11 +89,8 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = (
         diffrax.LocalLinearInterpolation
     )
-    # A class of a user's own may do without.
     record: ClassVar[Record | None] = None
-    # Which structure of the Hamiltonians the method is for.
     structure: AbstractVar[Structure]
-    # The random variables of a step for each noise, by their names.
     variables: AbstractVar[tuple[str, ...]]
 
     @abc.abstractmethod
@@ -119,15 +110,14 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
         return self._order_for("strong", terms)
 
     def weak_order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | None:
-        """Order of convergence of expectations. Of several noises it is not known here
-        whether they commute. `None` if the class does not say it."""
+        """Order of convergence of expectations; for several noises the order if they do not
+        commute. `None` if it is not stated."""
         return cast(int | None, self._order_for("weak", terms))
 
     def _order_for(self, want: Want, terms) -> int | float | None:
         if self.record is None:
             return None
         alone, several = (self.record.order(want, x) for x in (True, False))
-        # The terms are not looked at unless they matter.
         return alone if alone == several or number_of_noises(terms) <= 1 else several
 
     def path(
@@ -137,7 +127,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
         *,
         want: Want | None = None,
     ) -> diffrax.AbstractBrownianPath:
-        """A Brownian path with all that the solver needs, for fixed steps.
+        """A Brownian path with the random variables that the solver needs, for fixed steps.
 
         **Arguments:**
 
@@ -148,7 +138,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
             discrete ones, where these suffice. By default `"strong"` if the solver has a
             strong order, otherwise `"weak"`.
 
-        **Raises:** a `ValueError` if `want` is neither, and for what is no shape or key.
+        **Raises:** a `ValueError` if `want`, `shape` or `key` is anything else.
         """
         if want not in ("strong", "weak", None):
             raise ValueError(f'`want` must be "strong" or "weak"; got {want!r}.')
@@ -161,20 +151,16 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
 
     def __repr__(self) -> str:
         """The parameters that are not the defaults, in one line."""
+        given = []
+        for f in dataclasses.fields(self):
+            value = getattr(self, f.name)
+            if f.repr and eqx.tree_equal(value, f.default) is not True:
+                module = isinstance(value, eqx.Module)
+                text = repr(value) if module else eqx.tree_pformat(value)
+                given.append(f"{f.name}={text}")
+        return f"{type(self).__name__}({', '.join(given)})"
 
-        values = {f: getattr(self, f.name) for f in dataclasses.fields(self) if f.repr}
-        given = ", ".join(
-            f"{f.name}={value!r}"
-            if isinstance(value, eqx.Module)
-            else f"{f.name}={eqx.tree_pformat(value)}"
-            for f, value in values.items()
-            if eqx.tree_equal(value, f.default) is not True
-        )
-        return f"{type(self).__name__}({given})"
-
-    def func(
-        self, terms: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
-    ) -> VF:
+    def func(self, terms, t0, y0: Y, args: Args) -> VF:
         return terms.vf(t0, y0, args)
 
 
@@ -182,23 +168,21 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
     r"""A Runge--Kutta method with its own coefficients for drift and noise.
 
     Subclasses give a `tableau`. If stages are implicit, they also subclass
-    [`diffrax_symplectic.AbstractImplicitStages`][]. Everything else is decided by the
-    tableau: unused stages are dropped, equal ones are evaluated once, and explicit ones are
-    evaluated directly. The implicit ones are solved for in small systems, one after
-    another, as far as the coefficients allow. The unknowns are the stage values $k_i$, not
-    the stages, so that the end of the step is their weighted sum and needs no further
-    evaluation.
+    [`diffrax_symplectic.AbstractImplicitStages`][]. Everything else follows from the
+    tableau: unused stages are dropped, equal ones are evaluated once, and implicit ones are
+    solved for in small systems, one after another, as far as the coefficients allow.
 
     **Terms.** `MultiTerm(drift, noise)` as from
     [`diffrax_symplectic.hamiltonian_terms`][] or of Diffrax's own `ODETerm` and
-    `ControlTerm`; any number of noise terms; or the drift alone.
+    `ControlTerm`; any number of noise terms; or the drift alone. A `ValueError` is raised
+    while tracing unless they have the structure of the tableau.
 
     **State.** Any PyTree of real floating-point arrays.
 
-    **Failures.** If a stage equation is not solved, the step does not end at finite
+    **Failures.** If a stage equation is not solved, or the step does not end at finite
     numbers, is shorter than a hundred times the rounding of the time, or leaves the times
-    of its path, `diffeqsolve` stops there and says so: as an error, or with `throw=False`
-    through `sol.result`. In a batch the other paths go on.
+    of its path, `diffeqsolve` raises an error, or with `throw=False` returns a
+    `sol.result`. In a batch the other paths go on.
     """
 
     tableau: AbstractVar[AbstractTableau]
@@ -222,30 +206,15 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         del terms
         return drift_order(self.tableau.flatten())
 
-    def init(
-        self,
-        terms: diffrax.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-    ) -> SolverState:
+    def init(self, terms, t0, t1, y0: Y, args: Args) -> SolverState:
         del t1
-        check_state(y0, type(self).__name__)
-        drift, noise = split_terms(terms)
         name = type(self).__name__
-        check_structure(self.structure, drift, noise, t0, y0, args, name)
+        check_state(y0, name)
+        check_structure(self.structure, *split_terms(terms), t0, y0, args, name)
         return first_state(self)
 
     def step(
-        self,
-        terms: diffrax.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-        solver_state: SolverState,
-        made_jump: BoolScalarLike,
+        self, terms, t0, t1, y0: Y, args: Args, solver_state: SolverState, made_jump
     ) -> tuple[Y, None, DenseInfo, SolverState, diffrax.RESULTS]:
         del made_jump
         drift, noise = split_terms(terms)
@@ -253,10 +222,10 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         variables = _variables(plan.tableau)
         begun = t0, t1, y0, solver_state
         begin, end, y0, solver_state = batched_like(begun, (begun, terms, args))
-        along, h = drift_driven(drift, begin, end, args), end - begin
-        driven = {"h": along} if drift else {}
+        from_drift, h = drift_driven(drift, begin, end, args), end - begin
+        driven = {"h": from_drift} if drift else {}
         name = type(self).__name__
-        driven |= noise_driven(along, h, noise, variables, t0, t1, args, name)
+        driven |= noise_driven(from_drift, h, noise, variables, t0, t1, args, name)
         y1, solved = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
         result = result_at(terms, t0, t1, result_of(solved, y1))
         return y1, None, dict(y0=y0, y1=y1), solved, result
@@ -301,10 +270,9 @@ def _checked_root_finder(value: Any) -> Any:
 
 
 class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
-    """A solver with implicit stages. It has the two fields that `diffrax` asks of implicit
-    solvers: the root finder for the stage equations, and the most steps it may take in each
-    step of the solver. Both are given by keyword, after the parameters of the method.
-    """
+    """A solver with implicit stages, with the two fields that Diffrax asks for: the root
+    finder for the stage equations, and the most steps it may take in each step of the
+    solver. Both are given by keyword."""
 
     # `optimistix.root_find` takes either kind of solver.
     root_finder: optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver = eqx.field(
@@ -339,8 +307,8 @@ def one_parameter(name: str) -> str:
 
 
 def free_parameter(name: str, default: float) -> Any:
-    """The field of a solver for the parameter of this name, which becomes a Python float.
-    Parameters decide which stages are used, so they have to be known while tracing."""
+    """The field of a solver for a parameter. Parameters decide which stages are used, so
+    they have to be known while tracing."""
     converter = ft.partial(real_number, name)
     return eqx.field(default=default, static=True, converter=converter)
 

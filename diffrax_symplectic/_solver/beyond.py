@@ -27,7 +27,6 @@ from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
     AbstractSymplecticSolver,
-    ARGUMENTS,
     first_state,
     Record,
 )
@@ -54,14 +53,9 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         \frac14 + \frac r6 & \frac14 \end{pmatrix}, \quad
       \alpha = \beta = (\tfrac12, \tfrac12).$$
 
-    It satisfies all 17 conditions that [`diffrax_symplectic.SRKw2`][] does, with four
-    stage vectors in place of six, solved in three small systems one after the other: the
-    cheaper of the two, and the more accurate in our tests.
-
-    Any Hamiltonians, and any Stratonovich system: quadratic invariants that drift and
-    noise share are conserved. Weak order 2 for one noise and for noises that commute, weak
-    order 1 for others.
-    Order 2 without noise. No free parameters.
+    It satisfies the 17 conditions of [`diffrax_symplectic.SRKw2`][] with four stage vectors
+    in place of six, in three small systems one after the other. Weak order 2 for one noise
+    and for noises that commute, weak order 1 for others.
 
     **Source:** [Strang (1968)](https://doi.org/10.1137/0705041) for the splitting.
     """
@@ -83,9 +77,6 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     )
 
 
-StrangGauss.__init__.__doc__ = ARGUMENTS
-
-
 # The flow of one vector field: two stages of the Gauss method, of order 4.
 _flow = make_plan(
     FlatTableau(
@@ -100,51 +91,35 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     r"""A symplectic method of weak order 2 for any Hamiltonians and any number of noises,
     whether they commute or not: splitting in random order.
 
-    With $F_0(t)$ for the flow of the drift over time $t$, $F_k(x)$ for that of the noise
-    $b_k$ over "time" $x$, and the three-point variables $\hat I_k$, by one fair coin
+    With $F_0(t)$ for the flow of the drift over time $t$, $F_k(x)$ for the flow of the
+    noise $b_k$ over "time" $x$, and the three-point variables $\hat I_k$, by one fair coin
 
     $$y_{n+1} = F_0(\tfrac h2)\, F_m(\hat I_m) \cdots F_1(\hat I_1)\, F_0(\tfrac h2)\, y_n
       \quad \text{or} \quad
       F_0(\tfrac h2)\, F_1(\hat I_1) \cdots F_m(\hat I_m)\, F_0(\tfrac h2)\, y_n.$$
 
-    Each flow is one step of the Gauss method with two stages, of order 4. (By the midpoint
-    rule the method would fall back to weak order 1.) So a step solves $m + 2$ systems of
-    two stage vectors, one after another. Memory grows with $m$ plus the size of the state.
+    Each flow is one step of the Gauss method with two stages, of order 4. (With the
+    midpoint rule the method would have weak order 1.) So a step solves $m + 2$ systems of
+    two stage vectors, one after another. For one noise [`diffrax_symplectic.StrangGauss`][]
+    has the same order, weak order 2, and is cheaper.
 
-    **Many noises.** A flow needs one noise only. What it evaluates depends on the terms:
+    **Many noises.** A flow needs one noise only. With an
+    [`diffrax_symplectic.IndexedNoise`][] it evaluates only that noise, otherwise all of
+    them: for a thousand sites and a thousand noises that read all sites, a step of one path
+    took 0.04 s with `IndexedNoise`, and 2.8 s with a function.
 
-    - of an [`diffrax_symplectic.IndexedNoise`][] that noise alone: a step costs as much
-      as a few evaluations of every noise;
-    - of a function that returns all Hamiltonians, all of them: $m$ times as much;
-    - of a `diffrax.ControlTerm` the whole matrix, and multiplies one column of it.
-
-    For a thousand sites and a thousand noises that read all sites, a step of one path took
-    0.04 s with `IndexedNoise`, and 2.8 s with a function.
-
-    Symplectic path by path for any Hamiltonians, and any Stratonovich system will do:
-    quadratic invariants that drift and noises share are conserved. Weak order 2. Order 4
-    without noise. No free parameters. For one noise, [`diffrax_symplectic.StrangGauss`][]
-    has the same order and is cheaper.
-
-    !!! warning
-
-        For two noises and more the path has to be a
-        [`diffrax_symplectic.WeakBrownianPath`][] with `two_point=True`: the coin is the
-        sign of the first two-point variable.
+    For two noises and more the path has to be a [`diffrax_symplectic.WeakBrownianPath`][]
+    with `two_point=True`: the coin is the sign of the first two-point variable.
 
     **Source:** [Ninomiya and Victoir (2008)](https://doi.org/10.1080/13504860701413958) for
     the splitting; [Ninomiya and Ninomiya (2009)](https://doi.org/10.1007/s00780-009-0101-4)
-    for Runge--Kutta methods of high order, the Gauss method among them, in place of the
-    flows.
+    for Runge--Kutta methods of high order in place of the flows.
     """
 
     record: ClassVar[Record] = Record(
         weak=2,
         strong=None,
-        choose=(
-            "Two stage vectors for each noise and four for the drift; its errors repay "
-            "them if the noises are few."
-        ),
+        choose="For few noises: two stage vectors for each and four for the drift.",
         noises="not commuting",
         suggested=("weak",),
     )
@@ -155,7 +130,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         return (2,) * (num_noises + 2)
 
     def order(self, terms):
-        """Order of convergence without noise: that of the flows."""
+        """The order without noise is the order of the flows."""
         del terms
         return drift_order(_flow.tableau)
 
@@ -173,7 +148,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         middle = t0 + (t1 - t0) / 2
         numbers, increments = self._in_order(terms, t0, t1)
         still = [middle] * (numbers.size + 1)
-        # First and last the drift, which has no number: what it gets is not read.
+        # First and last the drift, which does not read the number.
         flows = (
             np.pad(np.full(numbers.size, False), 1, constant_values=True),
             jnp.stack([t0, *still]),
@@ -182,14 +157,14 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
             jnp.pad(increments, 1),
         )
 
-        def along_drift(t0, t1, number, increment, y, solved):
+        def drift_flow(t0, t1, number, increment, y, solved):
             del number, increment
             if len(drift) == 0:
                 return y, solved
             step = Step(t0, t1 - t0, {"h": drift_driven(drift, t0, t1, args)})
             return take_step(_flow, step, y, self, solved)
 
-        def along_noise(t0, t1, number, increment, y, solved):
+        def noise_flow(t0, t1, number, increment, y, solved):
             del t1
             if len(noise) == 0:
                 return y, solved
@@ -198,11 +173,11 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
             return take_step(_flow, step, y, self, solved)
 
         # In a loop, so that each kind of flow is compiled only once.
-        def along(carry, flow):
+        def one_flow(carry, flow):
             is_drift, *which = flow
-            return lax.cond(is_drift, along_drift, along_noise, *which, *carry), None
+            return lax.cond(is_drift, drift_flow, noise_flow, *which, *carry), None
 
-        (y1, solved), _ = lax.scan(along, (y0, solved), flows)
+        (y1, solved), _ = lax.scan(one_flow, (y0, solved), flows)
         result = result_at(terms, t0, t1, result_of(solved, y1))
         return y1, None, dict(y0=y0, y1=y1), solved, result
 
@@ -223,9 +198,6 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         return numbers, increments[numbers]
 
 
-NinomiyaVictoir.__init__.__doc__ = ARGUMENTS
-
-
 class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The implicit midpoint rule with Lévy areas, of strong order 1 for any number of
     noises, whether they commute or not.
@@ -233,50 +205,38 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     $$G = \tfrac12 (y_n + y_{n+1}), \qquad y_{n+1} = y_n + h\,a(G) + \sum_k b_k(G) I_k
       + \sum_{k<l} [b_k, b_l](G)\, A_{kl}$$
 
-    with the Lie brackets $[b_k, b_l] = b_l' b_k - b_k' b_l$ and the Lévy areas
-    $A_{kl} = \frac12 \int (w_k \,\mathrm{d}w_l - w_l \,\mathrm{d}w_k)$ of the step. This is
-    one midpoint step, over unit time, of the Hamiltonian
+    with the Lie brackets $[b_k, b_l] = b_l' b_k - b_k' b_l$ and the Lévy areas $A_{kl}$ of
+    a [`diffrax_symplectic.LevyAreaBrownianPath`][]. This is one midpoint step, over unit
+    time, of the Hamiltonian
 
     $$h H_0 + \sum_k I_k H_k + \sum_{k<l} A_{kl} \{H_k, H_l\}, \qquad
       \{F, G\} = \frac{\partial F}{\partial p} \cdot \frac{\partial G}{\partial q}
       - \frac{\partial F}{\partial q} \cdot \frac{\partial G}{\partial p},$$
 
     since the Lie bracket of two Hamiltonian vector fields is the field of their Poisson
-    bracket. So it is symplectic for any Hamiltonians, and conserves every quadratic
-    invariant of the system. JAX takes the derivatives. The terms need not come from
-    Hamiltonians, but all noises have to be in one term.
+    bracket. JAX takes the derivatives. The terms need not come from Hamiltonians, but all
+    noises have to be in one term.
 
-    The areas bring the order: without them the midpoint rule has strong order 1/2. For `m`
-    noises they cost `m` directional derivatives of the noise in each evaluation. With one
-    noise, or noises that commute, it is [`diffrax_symplectic.ImplicitMidpoint`][] at a
-    higher price. Weak order 1. Order 2 without noise. No free parameters.
-
-    !!! warning
-
-        The path has to be a [`diffrax_symplectic.LevyAreaBrownianPath`][] around one with
-        space-time Lévy area.
+    Strong order 1 and weak order 1; without the areas the midpoint rule has strong order
+    1/2. For `m` noises they cost `m` directional derivatives of the noise in each
+    evaluation. For one noise, or noises that commute, use
+    [`diffrax_symplectic.ImplicitMidpoint`][].
 
     **Source:** [Milstein and Tretyakov (2021)](https://doi.org/10.1007/978-3-030-82040-4)
-    for the order that Lévy areas and Lie brackets bring, which is due to Milstein. We
-    know of no source for the combination with the midpoint rule, which keeps it symplectic.
+    for the order by Lévy areas and Lie brackets, due to Milstein. We know of no source for
+    the combination with the midpoint rule.
     """
 
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose=(
-            "The midpoint rule with Lévy areas, which bring the order if noises do not "
-            "commute."
-        ),
+        choose="The midpoint rule with Lévy areas, for noises that do not commute.",
         noises="not commuting",
         suggested=("strong",),
     )
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
         ImplicitMidpoint.tableau, noise=("W", "A")
     )
-
-
-LevyAreaMidpoint.__init__.__doc__ = ARGUMENTS
 
 
 class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -297,30 +257,23 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     $$L_{kl} = \tfrac35 h H_k H_l + \tfrac{60}{7} h K_k K_l
       - \tfrac12 h (W_k K_l + K_k W_l) + \tfrac{3}{140} h^2 \delta_{kl}.$$
 
-    Both are conditional expectations of the integrals that the logarithm of the solution
-    contains, given these variables of the path. The second one is closer to the integrals:
-    with it the errors of small steps were less than half as large.
+    Both are conditional expectations, given these variables of the path, of integrals in
+    the logarithm of the solution. With the second one the errors of small steps were less
+    than half as large.
 
-    The brackets of Hamiltonian vector fields are fields of Hamiltonians, their Poisson
-    brackets. So a step is symplectic for any Hamiltonians, and conserves every quadratic
-    invariant that drift and noises share. JAX takes the derivatives: for $m$ noises, $m$
-    second derivatives of the vector fields in each evaluation. Terms that do not come from
-    Hamiltonians will do, and so do coefficients that depend on time: the brackets contain
-    their derivatives by time, and all orders hold.
+    The brackets of Hamiltonian vector fields are the fields of their Poisson brackets, so
+    that a step is symplectic. JAX takes the derivatives: for $m$ noises, $m$ second
+    derivatives of the vector fields in each evaluation. Terms need not come from
+    Hamiltonians, and may depend on time: the brackets contain their derivatives by time.
 
     Two stage vectors are solved for, in one system, whatever the number of noises. Strong
-    order 3/2 and weak order 2 for one noise and for noises that commute with each other,
-    $[b_k, b_l] = 0$. Strong order 1/2 and weak order 1 if they do not. Order 4 without
-    noise. No free parameters. For noise in the forces alone,
-    [`diffrax_symplectic.PlateauVerlet`][] is explicit and much cheaper.
+    order 3/2 and weak order 2 for one noise and for noises that commute, $[b_k, b_l] = 0$;
+    strong order 1/2 and weak order 1 for others. The path needs space-time Lévy area. For
+    noise in the forces alone [`diffrax_symplectic.PlateauVerlet`][] is explicit and much
+    cheaper.
 
-    !!! warning
-
-        The path has to have space-time Lévy area.
-
-    **Source:** the field is that of the log-ODE method of [Foster, Lyons and Oberhauser
-    (2020)](https://doi.org/10.1137/19M1261912), section 4. The Gauss method keeps it
-    symplectic.
+    **Source:** the field is from the log-ODE method of [Foster, Lyons and Oberhauser
+    (2020)](https://doi.org/10.1137/19M1261912), section 4.
     """
 
     record: ClassVar[Record] = Record(
@@ -334,6 +287,3 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         GeneralTableau.strong(A=_gauss, B=_gauss, alpha=_half, beta=_half),
         noise=("W", "L"),
     )
-
-
-PlateauGauss.__init__.__doc__ = ARGUMENTS

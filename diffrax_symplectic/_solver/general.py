@@ -8,7 +8,6 @@ from .._tableau import GeneralTableau
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
-    ARGUMENTS,
     free_parameter,
     one_parameter,
     Record,
@@ -21,11 +20,8 @@ class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     $$G = y_n + \tfrac12 h\,a(G) + \tfrac12 \sum_k b_k(G) I_k, \qquad
       y_{n+1} = y_n + h\,a(G) + \sum_k b_k(G) I_k$$
 
-    Symplectic for any Hamiltonians, and conserves every quadratic invariant. One stage
-    vector is solved for, whatever the number of noises.
-
-    Strong order 1/2, and 1 if there is one noise or the noises commute. Weak order 1.
-    Order 2 without noise.
+    One stage vector is solved for, whatever the number of noises. Strong order 1/2, or
+    strong order 1 if there is one noise or the noises commute. Weak order 1.
 
     **Source:** [Milstein, Repin and Tretyakov
     (2002)](https://doi.org/10.1137/S0036142901395588).
@@ -42,9 +38,6 @@ class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     )
 
 
-ImplicitMidpoint.__init__.__doc__ = ARGUMENTS
-
-
 class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The two-stage symplectic methods SRKs1 of Wang, Hong and Xu.
 
@@ -52,15 +45,12 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       \alpha = \beta = (2a,\; 1 - 2a)$$
 
     These are two steps of the midpoint rule, over the fractions $2a$ and $1 - 2a$ of the
-    step and of its increment. For $a = 0$ and $a = 1/2$ this is the midpoint rule itself,
-    with one stage vector to solve for. For any other value there are two, solved one after
-    the other. The default $a = 1/4$ makes two half steps and has the smallest strong
-    errors. Where the error of the drift dominates, it is a quarter of the midpoint rule's.
-    Where that of the noise dominates, nothing is gained.
+    step and of its increment. The default $a = 1/4$ has the smallest strong errors: where
+    the error of the drift dominates, a quarter of the midpoint rule's; where the error of
+    the noise dominates, nothing is gained.
 
-    Symplectic for any Hamiltonians, and conserves every quadratic invariant. Strong
-    order 1/2, and 1 if there is one noise or the noises commute. Weak order 1. Order 2
-    without noise.
+    Strong order 1/2, or strong order 1 if there is one noise or the noises commute. Weak
+    order 1.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 2.2.
@@ -69,7 +59,7 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=(1, 1 / 2),
-        choose="Two midpoint steps in one: for paths whose error is that of the drift.",
+        choose="Two midpoint steps in one, for errors dominated by the drift.",
     )
     a: float = free_parameter("a", 0.25)
 
@@ -91,15 +81,10 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     $$y_{n+1} = y_n + h\,a(G^0) + \sum_k b_k(G^1) \hat I_k$$
 
-    The parameter matters. At $b = 1/2$, the default, $G^0 = G^1$ and this is the
-    midpoint rule, with one stage vector to solve for. At $b = 0$ and $b = 1$ it is a
-    midpoint step of the drift followed by one of the noise, or the other way round: two
-    small systems one after the other. Any other value couples the two.
-
-    Symplectic for any Hamiltonians, and conserves every quadratic invariant. Weak order
-    1 for any number of noises. Order 2 without noise.
-
-    Use with [`diffrax_symplectic.WeakBrownianPath`][].
+    At $b = 1/2$, the default, $G^0 = G^1$ and this is the midpoint rule, with one stage
+    vector to solve for. At $b = 0$ and $b = 1$ it is a midpoint step of the drift followed
+    by one of the noise, or the other way round: two small systems one after the other. Any
+    other value couples the two. Weak order 1 for any number of noises.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 2.1.
@@ -108,9 +93,7 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=None,
-        choose=(
-            "The midpoint rule: one stage vector for any number of noises, for few digits."
-        ),
+        choose="The midpoint rule for expectations: low accuracy at low cost.",
         suggested=("weak",),
     )
     b: float = free_parameter("b", 0.5)
@@ -149,17 +132,13 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         \frac14 + \frac r6 & \frac14 \end{pmatrix}, \quad
       \beta = \begin{pmatrix} \frac12 \\ \frac12 \end{pmatrix}$$
 
-    The paper's third and fourth noise stage are unused, and so are its free parameters. All
+    The paper's third and fourth noise stages, and its free parameters, are unused. All
     conditions hold for any order of the rows of $B^0$ (and the columns of $A^1$). In this
     one, rows 1, 4, 2, 3 of the paper, five stage vectors are solved for together and then
     one; in the paper's, six together. Its local weak error is the smallest of all orders,
     4% below the paper's with strong noise.
 
-    Symplectic for any Hamiltonians, and conserves every quadratic invariant. Weak order
-    2 for one noise and for noises that commute; weak order 1 for others. $B^3 = B^1$ keeps
-    it symplectic for several. Order 2 without noise.
-
-    Use with [`diffrax_symplectic.WeakBrownianPath`][].
+    Weak order 2 for one noise and for noises that commute; weak order 1 for others.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 2.1.
@@ -168,7 +147,7 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=(2, 1),
         strong=None,
-        choose="The paper's method of its order. `StrangGauss` is cheaper.",
+        choose="The method of the paper. `StrangGauss` is cheaper.",
         noises="commuting",
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(
@@ -184,6 +163,3 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         A1=[[-1 / 6 + _r / 6, 1 / 3, 1 / 3 - _r / 6, 0], [1 / 2, 0, 0, 0]],
         B1=[[1 / 4, 1 / 4 - _r / 6], [1 / 4 + _r / 6, 1 / 4]],
     )
-
-
-SRKw2.__init__.__doc__ = ARGUMENTS

@@ -3,13 +3,11 @@
 from typing import ClassVar, get_args, Literal, TypeAlias
 
 import equinox as eqx
-import numpy as np
 
 from .._tableau import PartitionedTableau, SeparableTableau
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
-    ARGUMENTS,
     free_parameter,
     one_parameter,
     Record,
@@ -20,7 +18,7 @@ from .base import (
 Variant: TypeAlias = Literal["a", "b", "c", "d", "e", "f"]
 
 # variant: (beta, A1, B0)
-_coefficients = {
+_srkw3 = {
     "a": (1, 1 / 2, 1 / 2),
     "b": (1, 1, 0),
     "c": (1, 0, 1),
@@ -28,12 +26,6 @@ _coefficients = {
     "e": (-1, 1, 0),
     "f": (-1, 0, -1),
 }
-
-
-def _srkw3(variant: Variant) -> SeparableTableau:
-    beta, A1, B0 = _coefficients[variant]
-    half = np.array([[0.5]])
-    return SeparableTableau(alpha=[1], beta=[beta], A0=half, B0=[[B0]], A1=[[A1]])
 
 
 class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -49,12 +41,10 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     | $A^1$ | 1/2 | 1 | 0 | 1/2 | 1 | 0 |
     | $B^0$ | 1/2 | 0 | 1 | -1/2 | 0 | -1 |
 
-    `"a"` is the midpoint rule; `"b"` a midpoint step of the drift, then a kick by the
-    noise; `"c"`, the default, a kick, then a midpoint step. Kicks are explicit. `"d"`,
-    `"e"` and `"f"` are these with the increments negated, which have the same law.
-
-    Weak order 1 for any number of noises. Order 2 without noise. A Hamiltonian without
-    the structure is refused while tracing.
+    `"a"` is the midpoint rule; `"b"` a midpoint step of the drift, then an explicit kick by
+    the noise; `"c"`, the default, a kick, then a midpoint step. `"d"`, `"e"` and `"f"` are
+    these with the increments negated, which have the same law. Weak order 1 for any number
+    of noises.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 3.1.
@@ -63,7 +53,7 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=None,
-        choose="Half of a stage vector, and the noise a kick: few digits of stiff systems.",
+        choose="Implicit on half of the state, noise as a kick: low accuracy.",
     )
     variant: Variant = eqx.field(default="c", static=True)
 
@@ -75,7 +65,8 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> SeparableTableau:
-        return _srkw3(self.variant)
+        beta, A1, B0 = _srkw3[self.variant]
+        return SeparableTableau([1], [beta], A0=[[1 / 2]], B0=[[B0]], A1=[[A1]])
 
 
 SRKw3.__init__.__doc__ = f"""**Arguments:**
@@ -100,11 +91,9 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     These are the coefficients that a step depends on. The paper's third drift stage has
     weight 0, its second and third noise stages are at the same point, and its other
     parameters belong to these. For $a_{21} = 0$ and $1/2$ the matrix $A^0$ is triangular;
-    $\frac14 \pm \frac{\sqrt 3}{6}$ make it that of the Gauss method, of order 4 without
-    noise.
+    $\frac14 \pm \frac{\sqrt 3}{6}$ make it the Gauss method, of order 4 without noise.
 
-    Weak order 2: in the paper for one noise, and measured for two and three. A Hamiltonian
-    without the structure is refused while tracing.
+    Weak order 2: in the paper for one noise, and measured for two and three.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 3.1.
@@ -113,7 +102,7 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=None,
-        choose="Implicit, on half of the state: for systems too stiff for explicit steps.",
+        choose="Implicit on half of the state: for stiff systems.",
         suggested=("weak",),
     )
     a21: float = free_parameter("a21", 0.5)
@@ -136,13 +125,9 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKs2 of Wang, Hong and Xu, of strong order 1, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
 
-    Two of the paper's three noise stages read the same point and enter with opposite
-    weights. What remains is the midpoint rule on the separable system: in the form of
-    [`diffrax_symplectic.SeparableTableau`][], $\alpha = \beta = 1$ and
-    $A^0 = B^0 = A^1 = \frac12$.
-
-    Strong order 1 and weak order 1. Order 2 without noise. A Hamiltonian without the
-    structure is refused while tracing.
+    Two of the paper's three noise stages read the same point and have opposite weights. The
+    rest is the midpoint rule: in the form of [`diffrax_symplectic.SeparableTableau`][],
+    $\alpha = \beta = 1$ and $A^0 = B^0 = A^1 = \frac12$. Strong order 1 and weak order 1.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 3.2.
@@ -151,16 +136,12 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose=(
-            "The midpoint rule on half of the state: for systems too stiff for explicit "
-            "steps."
-        ),
+        choose="The midpoint rule on half of the state: for stiff systems.",
         suggested=("strong",),
     )
-    tableau: ClassVar[SeparableTableau] = _srkw3("a")
-
-
-SRKs2.__init__.__doc__ = ARGUMENTS
+    tableau: ClassVar[SeparableTableau] = SeparableTableau(
+        alpha=[1], beta=[1], A0=[[1 / 2]], B0=[[1 / 2]], A1=[[1 / 2]]
+    )
 
 
 class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -177,11 +158,8 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     Two midpoint steps of the drift over the fractions $2a$ and $1 - 2a$ of the step, then
     the kick $\sum_k \sigma_k(t_{n+1}, Q_1) I_k$. The default $a = 0$ makes one midpoint
     step: over six problems $a$ changed the strong error by 3% at most, and any other value
-    but 1/2 costs twice as much. The paper's second noise weight, and
-    with it its other parameters, cancels, since both noise stages read $Q_1$.
-
-    Strong order 1 and weak order 1. Order 2 without noise. A Hamiltonian without the
-    structure is refused while tracing.
+    but 1/2 costs twice as much. The paper's other parameters cancel, since both of its
+    noise stages read $Q_1$. Strong order 1 and weak order 1.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 3.2.
@@ -190,9 +168,7 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose=(
-            "As `SRKs2`, with explicit noise: for many noises that cost much to evaluate."
-        ),
+        choose="As `SRKs2` with explicit noise: for many expensive noises.",
     )
     a: float = free_parameter("a", 0.0)
 
@@ -217,16 +193,9 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
       Q_1 = \bar q + \tfrac h2 g(P_1)$$
 
     in the notation of [`diffrax_symplectic.SeparableTableau`][]. Force and noise are
-    evaluated at the same $q$, so that the kick is the exact flow of both together. A
-    symmetric splitting of the generator has weak order 2. A step takes one evaluation of
-    the forces, and no equation is solved.
-
-    Order 2 without noise. No free parameters. A Hamiltonian without the structure is
-    refused while tracing. As explicit methods are, it is limited to steps that resolve the
-    fastest frequency $\omega$ of $H_0$: $\omega h < 2$.
-
-    Any Brownian path will do: a [`diffrax_symplectic.WeakBrownianPath`][] for expectations,
-    a [`diffrax_symplectic.FixedStepBrownianPath`][] for paths.
+    evaluated at the same $q$, so that the kick is the exact flow of both together. A step
+    takes one evaluation of the forces. It has to resolve the fastest frequency $\omega$ of
+    $H_0$: $\omega h < 2$.
 
     **Source:** [Strang (1968)](https://doi.org/10.1137/0705041) for the splitting;
     [Ninomiya and Victoir (2008)](https://doi.org/10.1080/13504860701413958) for the weak
@@ -236,10 +205,7 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=1,
-        choose=(
-            "Explicit, the cheapest step of all. It has to resolve the fastest frequency: "
-            "omega h < 2."
-        ),
+        choose="Explicit, the cheapest step. Fastest frequency: omega h < 2.",
         suggested=("weak", "strong"),
     )
     tableau: ClassVar[PartitionedTableau] = PartitionedTableau(
@@ -280,39 +246,27 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
     independent signs: kick by
     $\sum_k \sigma_k (M_k - C_k)$; one Störmer--Verlet step of $H_0$ over $h / 2$; kick by
     $\sum_k 2 \sigma_k C_k$; Störmer--Verlet over $h / 2$; kick by
-    $\sum_k \sigma_k (W_k - M_k - C_k)$, each time at the $q$ that was reached. In other
-    words, the Brownian path over the step is replaced by two plateaus, $M \mp C$. They have
-    the mean of the path, which brings order 3/2 where the noise is constant along the step.
-    In expectation given $W$ and $H$ they have its mean square, which brings that order
-    where the noise is not constant.
+    $\sum_k \sigma_k (W_k - M_k - C_k)$, each time at the current $q$. So the Brownian path
+    over the step is replaced by two plateaus, $M \mp C$, with its mean, and in expectation
+    given $W$ and $H$ with its mean square, which brings order 3/2 where the noise is not
+    constant.
 
-    No equation is solved. Weak order 2, and order 2 without noise. No free parameters. A
-    Hamiltonian without the structure is refused while tracing. As explicit methods are, it
-    is limited to steps that resolve the fastest frequency $\omega$ of $H_0$:
-    $\omega h < 4$.
+    Strong order 3/2 and weak order 2. The step has to resolve the fastest frequency
+    $\omega$ of $H_0$: $\omega h < 4$. The path has to be a
+    [`diffrax_symplectic.PlateauBrownianPath`][].
 
-    !!! warning
-
-        The path has to be [`diffrax_symplectic.PlateauBrownianPath`][] around one with
-        space-time Lévy area.
-
-    **Source:** the path is that of [Foster, dos Reis and Strange
-    (2024)](https://doi.org/10.1137/23M155147X), whose $C_k$ have this size, and the sign of
-    a third integral of the path. The signs here are independent of the path. Against
-    $C_k = \pm\sqrt{h / 6}$ the errors in our tests were 0.76 to 0.86 as large at
-    $h = 1/64$, 0.93 to 1.0 at $h = 1/8$, and 0.84 to 1.06 for noise six times as strong;
-    with variables like theirs half as large. For
-    additive noise and second order systems see [Milstein and Tretyakov
-    (2021)](https://doi.org/10.1007/978-3-030-82040-4), chapters 4 and 5.
+    **Source:** the plateaus are from [Foster, dos Reis and Strange
+    (2024)](https://doi.org/10.1137/23M155147X), where the signs of the $C_k$ depend on a
+    third integral of the path, and here they are independent of it. With signs as theirs
+    errors were half as large; with $C_k = \pm\sqrt{h / 6}$ they were up to 1.3 times as
+    large for small steps. For additive noise and second order systems see [Milstein and
+    Tretyakov (2021)](https://doi.org/10.1007/978-3-030-82040-4), chapters 4 and 5.
     """
 
     record: ClassVar[Record] = Record(
         weak=2,
         strong=3 / 2,
-        choose=(
-            "Explicit, for accurate paths. The step has to resolve the fastest frequency: "
-            "omega h < 4."
-        ),
+        choose="Explicit, for accurate paths. Fastest frequency: omega h < 4.",
         suggested=("strong",),
     )
     tableau: ClassVar[PartitionedTableau] = _plateau_verlet

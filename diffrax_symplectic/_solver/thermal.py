@@ -1,15 +1,11 @@
 """The noise that belongs to a friction at a temperature."""
 
-from typing import Any
-
 import equinox as eqx
-import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
+from .._arguments import real_array
 from .._custom_types import Args, RealScalarLike
 from ._friction import checked, Fault, matrix_faults, root_of_matrix, UNKNOWN
 
@@ -22,35 +18,16 @@ def thermal_noise(
 
     With the friction $-\gamma p$ of [`diffrax_symplectic.BAOAB`][],
     [`diffrax_symplectic.LangevinMiddle`][] or [`diffrax_symplectic.Damped`][] and $V(p) =
-    p \cdot M^{-1} p / 2$ the density $e^{-H_0 / T}$ is then stationary. There is one noise
-    for each momentum: the path has the shape of `q`.
-
-    !!! example
-
-        ```python
-        import diffrax
-        import diffrax_symplectic as ds
-        import jax.numpy as jnp
-        import jax.random as jr
-
-        mass, T = jnp.array([1.0, 4.0]), 0.5
-        Gamma = jnp.array([[1.0, 0.3], [0.3, 0.5]])  # dp = -Gamma v dt
-        gamma = Gamma / mass  # dp = -gamma p dt
-        terms = ds.hamiltonian_terms(
-            lambda t, p, q, args: jnp.sum(p**2 / (2 * mass)) + jnp.sum(q**4),
-            ds.thermal_noise(gamma, mass, T),
-            ds.WeakBrownianPath((2,), jr.key(0)),
-        )
-        y0 = jnp.zeros(2), jnp.ones(2)
-        sol = diffrax.diffeqsolve(terms, ds.LangevinMiddle(gamma), 0, 1, 0.1, y0)
-        ```
+    p \cdot M^{-1} p / 2$ the density $e^{-H_0 / T}$ is then stationary. The path has the
+    shape of `q`.
 
     **Arguments:**
 
-    - `gamma`: the friction, as the solvers take it, in units of one over time. Of a tensor
-        with $\mathrm{d}p = -\Gamma M^{-1} p\,\mathrm{d}t$ it is `Gamma / mass`.
-    - `mass`: the masses, as they stand in $V(p)$: a number; or an array of the shape of
-        `q`, or a PyTree of such.
+    - `gamma`: the friction, as the solvers take it, in units of one over time. For a
+        friction tensor, $\mathrm{d}p = -\Gamma M^{-1} p\,\mathrm{d}t$, pass
+        `Gamma / mass`.
+    - `mass`: the masses in $V(p)$: a number, an array of the shape of `q`, or a PyTree of
+        such.
     - `T`: the temperature, in units of energy: a number; or one for each momentum, as
         `mass`, where `gamma` is no matrix.
 
@@ -59,31 +36,28 @@ def thermal_noise(
 
     **Raises:** a `ValueError` if a mass is known not to be positive, a temperature to be
     negative, or either not to be finite, for a `gamma` that no solver takes, and in the
-    solve if one of them does not fit `q`. If values of a matrix `gamma` are traced, and
-    `gamma * mass` is not symmetric positive semidefinite, the noise is NaN, and the solve
-    fails.
+    solve if one of them does not fit `q`. The solve fails if a matrix `gamma` is traced and
+    `gamma * mass` is not symmetric positive semidefinite.
     """
     for name, value in (("mass", mass), ("T", T)):
         for leaf in jtu.tree_leaves(value):
-            _check_number(name, leaf)
+            kind = "a real number, or an array or PyTree of such"
+            real_array(name, leaf, positive=name == "mass", kind=kind)
     given = dict(gamma=checked(gamma), mass=mass, T=T)
-    trees = [x for x in given.values() if not jtu.all_leaves([x])]
-    treedef = jtu.tree_structure([*trees, gamma][0])
+    is_one = lambda x: jtu.all_leaves([x])
+    like = next((x for x in given.values() if not is_one(x)), 0.0)
     for name, x in given.items():
-        if not jtu.all_leaves([x]) and jtu.tree_structure(x) != treedef:
+        if not is_one(x) and jtu.tree_structure(x) != jtu.tree_structure(like):
             raise ValueError(
                 f"`{name}` must be one number or array, or have the structure of `q`, as "
                 f"the other arguments have; got {eqx.tree_pformat(given)}."
             )
-    leaves = [jtu.tree_leaves(x) for x in given.values()]
-    most = max(map(len, leaves))
-    each = zip(*(x if len(x) == most else x * most for x in leaves))
-    return ThermalNoise(treedef.unflatten([_Amplitudes.of(*x) for x in each]))
+    each = [jtu.tree_map(lambda _: x, like) if is_one(x) else x for x in given.values()]
+    return ThermalNoise(jtu.tree_map(_Amplitudes.of, *each))
 
 
 class _Amplitudes(eqx.Module):
-    r"""For the momenta of one array: $2 \gamma M T$, and if that may be a matrix its root,
-    which is computed here and not in each step."""
+    r"""For the momenta of one array: $2 \gamma M T$, and its root if it may be a matrix."""
 
     variance: Array
     root: Array | None
@@ -113,7 +87,7 @@ class _Amplitudes(eqx.Module):
         if shape != q.shape * 2:
             raise ValueError(
                 "`gamma`, `mass` and `T` of `thermal_noise` must be numbers or have the "
-                f"shape of `q`, {q.shape}, or `gamma` that of a matrix, {q.shape * 2}; "
+                f"shape of `q`, {q.shape}, or `gamma` be a matrix of shape {q.shape * 2}; "
                 f"`2 * gamma * mass * T` has shape {shape}."
             )
         if self.root is None:
@@ -134,30 +108,13 @@ class ThermalNoise(eqx.Module):
     def __call__(self, t: RealScalarLike, p: PyTree, q: PyTree, args: Args) -> PyTree:
         del t, p, args
         amplitudes = self.amplitudes
-        if isinstance(amplitudes, _Amplitudes):
-            return jtu.tree_map(amplitudes.hamiltonians, q)
         is_one = lambda x: isinstance(x, _Amplitudes)
+        if is_one(amplitudes):
+            return jtu.tree_map(amplitudes.hamiltonians, q)
         if jtu.tree_structure(amplitudes, is_leaf=is_one) != jtu.tree_structure(q):
             raise ValueError(
                 "`gamma`, `mass` and `T` of `thermal_noise` must be numbers or arrays, or "
                 f"have the structure of `q`; got q = {eqx.tree_pformat(q)}."
             )
-        along = lambda x, q: x.hamiltonians(q)
-        return jtu.tree_map(along, amplitudes, q, is_leaf=is_one)
-
-
-def _check_number(name: str, value: Any) -> None:
-    """Raises a `ValueError` unless this is a positive mass, or a temperature."""
-    least = {"mass": "positive", "T": "not negative"}[name]
-    is_number = eqx.is_array_like(value) and not isinstance(value, bool)
-    if is_number and isinstance(value, jax.core.Tracer):
-        return
-    if is_number and not np.iscomplexobj(value):
-        values = np.asarray(value)
-        fits = values > 0 if name == "mass" else values >= 0
-        if np.all(fits & np.isfinite(values)):
-            return
-    raise ValueError(
-        f"`{name}` must be a finite real number, {least}, or an array or PyTree of such; "
-        f"got {value!r}."
-    )
+        of = lambda x, q: x.hamiltonians(q)
+        return jtu.tree_map(of, amplitudes, q, is_leaf=is_one)

@@ -4,8 +4,8 @@ from ._hamiltonian import evaluated, hamiltonian_terms, has_lifted, IndexedNoise
 from ._hamiltonian import is_hamiltonian
 from ._spins import as_spins, from_spinors, spin_terms, to_spinors
 from ._structure_checks import additive_fault, check_stratonovich, check_structure
-from ._structure_checks import commuting, constant_fault, FRICTION, separable_fault
-from ._structure_checks import WRONG_WAY_ROUND
+from ._structure_checks import commuting, constant_fault, Fault, FRICTION
+from ._structure_checks import separable_fault, WRONG_WAY_ROUND
 from ._vector_fields import apply, apply_one, brownian_paths, check_fit
 from ._vector_fields import number_of_noises, rate, replace_paths, split_terms
 from ._vector_fields import tree_sum

@@ -1,12 +1,11 @@
-"""The random variables of a step: drawn from the paths of the terms, with what they drive;
-or given, for quadrature over their values."""
+"""The random variables of a step: drawn from the paths of the terms, or given, for
+quadrature over their values."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -16,7 +15,6 @@ from jaxtyping import Array, Float, PyTree
 from .._batch import materialize
 from .._brownian import (
     AbstractLaw,
-    AbstractWrappedPath,
     drives,
     FixedStepBrownianPath,
     GivenPath,
@@ -24,12 +22,13 @@ from .._brownian import (
     increment_struct,
     laws_of,
     PlateauBrownianPath,
+    step_size,
     TruncatedBrownianPath,
     VARIABLES,
     WeakBrownianPath,
 )
 from .._compat import direction, ω
-from .._custom_types import Args, RealScalarLike
+from .._custom_types import Args
 from ._vector_fields import (
     apply,
     apply_brackets,
@@ -45,7 +44,7 @@ class StepVariables(NamedTuple):
 
     - `laws`: the law of each, for a step of size 1.
     - `terms_with`: takes their values, in units of the root of the step size, to terms with
-        the increment that they make in place of the path.
+        this increment in place of the path.
     """
 
     laws: tuple[AbstractLaw, ...]
@@ -53,16 +52,15 @@ class StepVariables(NamedTuple):
 
 
 def step_variables(terms: PyTree[diffrax.AbstractTerm], h) -> StepVariables:
-    """Of a step of size `h`, for `terms` with one Brownian path."""
+    """The variables of a step of size `h`, for `terms` with one Brownian path."""
     path, laws = _the_path(terms)
     shape = increment_struct(path)
     flat, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, shape))
 
     def terms_with(values):
-        dt = jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), shape)
         scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(flat.dtype)
-        sets = map(unravel, scaled.reshape(-1, flat.size))
-        increment = cast(Any, path.levy_area)(dt=dt, **dict(zip(laws, sets)))
+        sets = dict(zip(laws, map(unravel, scaled.reshape(-1, flat.size))))
+        increment = cast(Any, path.levy_area)(dt=step_size(h, shape), **sets)
         make = jtu.Partial(_constant, increment)
         given = GivenPath(make=make, levy_area=type(increment))
         return replace_paths(terms, lambda _: given)
@@ -74,8 +72,8 @@ def step_variables(terms: PyTree[diffrax.AbstractTerm], h) -> StepVariables:
 def outcomes(
     laws: Sequence[AbstractLaw], nodes: int
 ) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, " K"]]:
-    """All values of variables with these laws, and their probabilities or the weights of a
-    quadrature."""
+    """All values of variables with these laws, and their probabilities or quadrature
+    weights."""
     scalars = [law.outcomes(nodes) for law in laws]
     values = np.array([*itertools.product(*[values for values, _ in scalars])])
     weights = np.array([*itertools.product(*[weights for _, weights in scalars])])
@@ -93,9 +91,8 @@ def _the_path(terms) -> tuple[diffrax.AbstractBrownianPath, Mapping[str, Abstrac
     laws = laws_of(paths[0]) if len(paths) == 1 else None
     if laws is None:
         raise ValueError(
-            "`terms` must hold exactly one Brownian path, a `WeakBrownianPath`, whose "
-            "outcomes can be enumerated, or a Gaussian one, whose increments are "
-            "integrated over, with `levy_area=BrownianIncrement`, `SpaceTimeLevyArea` or "
+            "`terms` must hold exactly one Brownian path, a `WeakBrownianPath` or a "
+            "Gaussian path with `levy_area=BrownianIncrement`, `SpaceTimeLevyArea` or "
             "`SpaceTimeTimeLevyArea`, also within a `PlateauBrownianPath`; got "
             f"{[_named(path) for path in paths]}."
         )
@@ -109,18 +106,15 @@ def _named(path: diffrax.AbstractBrownianPath) -> str:
 def controls(
     noise: tuple, names: list[str], t0, t1, solver: str, optional: tuple[str, ...] = ()
 ) -> dict[str, list]:
-    """The random variables of the step from `t0` to `t1`, for each noise term; those of
-    `optional` if all increments hold them."""
-    t1 = _within_resolution(noise, t0, t1)
+    """The random variables of the step from `t0` to `t1`, for each noise term, and the
+    `optional` ones if all increments hold them."""
     options = {} if names == ["W"] else {"use_levy": True}
     drawn = lambda: [term.contr(t0, t1, **options) for term in noise]
-    # What costs less to compute again than to keep is not kept.
     cheap = all(map(_is_cheap, brownian_paths(noise)))
     increments = drawn() if cheap else materialize(drawn)
     if names == ["W"]:
         return {"W": increments}
-    # The variables of which the increments hold most are looked for first: the advice for
-    # these is right for the others, too.
+    # Those whose paths hold most come first: that advice is right for the others, too.
     held = lambda name: all(getattr(i, name, None) is not None for i in increments)
     for name in sorted(names, key=lambda x: [*VARIABLES, x].index(x)):
         if not held(name):
@@ -138,35 +132,10 @@ def controls(
 
 
 def _in_time(term: diffrax.AbstractTerm, name: str, x: PyTree[Array]) -> PyTree[Array]:
-    """Backward in time Diffrax changes the sign of all random variables. Those that stay
-    the same get it back."""
+    """Backward in time Diffrax changes the sign of all random variables. Even ones get it
+    back."""
     even = name in VARIABLES and VARIABLES[name].even
     return (direction(term) * x**ω).ω if even else x
-
-
-def _within_resolution(noise: tuple, t0, t1) -> RealScalarLike:
-    """`t1`, with an error when run if a tree does not resolve the step."""
-    h = jnp.abs(t1 - t0)
-    for path in map(_innermost, brownian_paths(noise)):
-        if isinstance(path, diffrax.VirtualBrownianTree):
-            # The tree keeps its tolerance in units of its length.
-            tol = path.tol * (path.t1 - path.t0)
-            # A difference of two times that is a rounding error is not a step.
-            coarse = (h < 0.999 * tol) & (h > 1e-6 * tol)
-            t1 = eqx.error_if(
-                jnp.asarray(t1),
-                coarse,
-                "A step is shorter than `tol` of the `VirtualBrownianTree`, which only "
-                "interpolates there, so that the noise would be too small. Pass a smaller "
-                "`tol`, or for fixed steps `FixedStepBrownianPath(shape, key)`.",
-            )
-    return t1
-
-
-def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
-    while isinstance(path, AbstractWrappedPath):
-        path = path.path
-    return path
 
 
 def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
@@ -177,7 +146,7 @@ def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
 
 
 def noise_driven(
-    along: jtu.Partial,
+    drift: jtu.Partial,
     h,
     noise: tuple,
     names: list[str],
@@ -186,8 +155,8 @@ def noise_driven(
     args: Args,
     solver: str,
 ) -> dict[str, jtu.Partial]:
-    """What drives noise stages over the step of size `h`, for each random variable;
-    `along` drives those of the drift."""
+    """What drives noise stages over the step of size `h`, for each random variable; `drift`
+    drives drift stages."""
     own = [VARIABLES[name].held if name in VARIABLES else None for name in names]
     needed = [
         x for name, held in zip(names, own) for x in (held[0] if held else [name])
@@ -201,7 +170,7 @@ def noise_driven(
                 driven[name] = jtu.Partial(apply, noise, drawn[name], args)
             case "drift brackets":
                 bridges = bridge(h, drawn["W"], drawn["H"], drawn.get("K"))
-                driven[name] = jtu.Partial(apply_bridge, along, noise, bridges, h, args)
+                driven[name] = jtu.Partial(apply_bridge, drift, noise, bridges, h, args)
             case "noise brackets" if len(noise) == 1:
                 A = drawn[name][0]
                 driven[name] = jtu.Partial(apply_brackets, noise[0], A, args)

@@ -39,55 +39,27 @@ def hamiltonian_terms(
       \mathrm{d}q = \frac{\partial H_0}{\partial p}\,\mathrm{d}t
         + \sum_{k=1}^m \frac{\partial H_k}{\partial p} \circ \mathrm{d}w_k.$$
 
-    The result goes to `diffrax.diffeqsolve`, with the solvers of this package or with
-    any Stratonovich solver of Diffrax. All derivatives are taken by JAX. The noise of a
-    step is the gradient of one scalar, $\sum_k I_k H_k$, so that it costs one reverse
-    pass whatever the number of noises. ([`diffrax_symplectic.NinomiyaVictoir`][] needs
-    the noises one at a time. If there are many, give them to it as a
-    [`diffrax_symplectic.IndexedNoise`][].)
-
-    !!! example
-
-        ```python
-        import diffrax
-        import diffrax_symplectic as ds
-        import jax.numpy as jnp
-        import jax.random as jr
-
-        def H0(t, p, q, args):
-            return (p**2 + q**2) / 2
-
-        def noise(t, p, q, args):
-            return jnp.stack([args * q, args * p * q])
-
-        path = ds.WeakBrownianPath(shape=(2,), key=jr.key(0))
-        terms = ds.hamiltonian_terms(H0, noise, path)
-        y0 = (jnp.array(0.0), jnp.array(1.0))
-        sol = diffrax.diffeqsolve(
-            terms, ds.ImplicitMidpoint(), t0=0, t1=1, dt0=0.01, y0=y0, args=0.1
-        )
-        ```
+    Any Stratonovich solver, of this package or of Diffrax, takes these terms. The noise of
+    a step is the gradient of one scalar, $\sum_k I_k H_k$, and costs one reverse pass
+    whatever the number of noises.
 
     **Arguments:**
 
     - `H0`: `H0(t, p, q, args)`, a scalar. A function, or a Module with parameters;
         differentiable with respect to these and to `args`.
     - `noise`: `noise(t, p, q, args)`, the noise Hamiltonians $H_1, \ldots, H_m$ as an
-        array of shape `(m,)`, or whatever structure and shapes `path` has. A scalar will
-        do if `m = 1`. Or an [`diffrax_symplectic.IndexedNoise`][]. Leave it out, and
-        `path` with it, for a system without noise.
-    - `path`: the Brownian path, of shape `(m,)`: a
-        [`diffrax_symplectic.WeakBrownianPath`][], a
-        [`diffrax_symplectic.TruncatedBrownianPath`][], or any of Diffrax's. Or its shape,
-        `(m,)` or a PyTree of `jax.ShapeDtypeStruct`s, where the solver is not known yet:
+        array of shape `(m,)`, or in the structure and shapes of `path`; a scalar if `m =
+        1`. Or an [`diffrax_symplectic.IndexedNoise`][]. For a system without noise leave
+        out `noise` and `path`.
+    - `path`: a Brownian path of shape `(m,)`. Or, where the solver is not known yet, its
+        shape, `(m,)` or a PyTree of `jax.ShapeDtypeStruct`s:
         [`diffrax_symplectic.suggest_solver`][], [`diffrax_symplectic.compare_solvers`][]
         and [`diffrax_symplectic.expectation`][] then make the path that the solver needs.
-    - `structure`: what you know of the Hamiltonians: `"separable"`, that $H_0 = V(p) +
-        U(t, q)$ and $H_k = U_k(t, q)$; or `"additive"`, that the gradients of the $H_k$ do
-        not depend on the state. Solvers that need this structure then rely on it. By
-        default they find out while tracing, from the program: a variable that enters a
-        derivative counts, even if it cancels or is multiplied by an array of zeros. So
-        write $H_0$ as a sum of terms that read $p$ or $q$ alone.
+    - `structure`: `"separable"`, for $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$; or
+        `"additive"`, if the gradients of the $H_k$ do not depend on the state. Solvers that
+        need this structure then rely on it. By default they find it out while tracing,
+        where a variable counts that enters a derivative, even if it cancels or is
+        multiplied by zeros: write $H_0$ as a sum of terms that read $p$ or $q$ alone.
 
     `p` and `q` are PyTrees of arrays of the same structure and shapes.
 
@@ -96,14 +68,14 @@ def hamiltonian_terms(
     **Raises:** a `ValueError` if `path` is no Brownian path and no shape, or `structure` is
     unknown; and, while the solve is traced, if the state is not a pair `(p, q)` of the same
     structure and shapes, if `H0` does not return a scalar, if `noise` does not match the
-    path or does not depend on the state, or if either asks for values in Python or returns
-    what is not real.
+    path or does not depend on the state, or if either needs values while it is traced or
+    returns anything but real numbers.
     """
     check_takes("H0", H0, "t", "p", "q", "args")
     if structure not in (None, *get_args(_Structure)):
         raise ValueError(
-            f"`structure` must be one of {get_args(_Structure)}, or `None` to have it "
-            f"found out; got {structure!r}."
+            f"`structure` must be one of {get_args(_Structure)}, or `None` to find it "
+            f"out; got {structure!r}."
         )
     drift = diffrax.ODETerm(_Drift(H0, structure))
     if noise is None and path is None:
@@ -114,8 +86,7 @@ def hamiltonian_terms(
 
 
 def as_path(path: Any) -> diffrax.AbstractBrownianPath:
-    """`path`, or for a shape a path that is not specified yet. A `ValueError` for anything
-    else."""
+    """`path`, or for a shape an unspecified path; a `ValueError` for anything else."""
     if isinstance(path, diffrax.AbstractBrownianPath):
         return path
     is_struct = lambda x: isinstance(x, jax.ShapeDtypeStruct)
@@ -135,28 +106,10 @@ class IndexedNoise(eqx.Module):
     r"""Noise Hamiltonians that can be evaluated one at a time, for
     [`diffrax_symplectic.hamiltonian_terms`][].
 
-    $H_1, \ldots, H_m$ are given by one function of the index. Called as
-    `noise(t, p, q, args)` it returns all of them, by `jax.vmap` over the index, so that
-    it can be used in place of a function. [`diffrax_symplectic.NinomiyaVictoir`][] follows
-    the flow of one noise after another, and evaluates only the noise of that flow. With a
-    function that returns all `m` it has to evaluate all of them for each of the `m` flows.
-
-    !!! example
-
-        ```python
-        import diffrax
-        import diffrax_symplectic as ds
-        import jax.numpy as jnp
-        import jax.random as jr
-
-        # Twenty oscillators with springs of fluctuating strength.
-        H0 = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2
-        noise = ds.IndexedNoise(lambda k, t, p, q, args: 0.1 * q[k] ** 2, m=20)
-        solver = ds.NinomiyaVictoir()
-        terms = ds.hamiltonian_terms(H0, noise, solver.path((20,), jr.key(0)))
-        y0 = (jnp.zeros(20), jnp.ones(20))
-        sol = diffrax.diffeqsolve(terms, solver, t0=0, t1=1, dt0=0.1, y0=y0)
-        ```
+    $H_1, \ldots, H_m$ are given by one function of the index, and
+    [`diffrax_symplectic.NinomiyaVictoir`][], which follows the flow of one noise after
+    another, evaluates only that noise. Called as `noise(t, p, q, args)` it returns all of
+    them, by `jax.vmap` over the index, for any other solver.
     """
 
     H: Callable[[IntScalarLike, RealScalarLike, PyTree, PyTree, Args], Array]
@@ -172,13 +125,7 @@ class IndexedNoise(eqx.Module):
         self, k: IntScalarLike, t: RealScalarLike, p: PyTree, q: PyTree, args: Args
     ) -> Array:
         """`H_k`, for `k` from 0 to `m - 1`. Raises a `ValueError` if it is no scalar."""
-        out = evaluated("H", self.H, k, t, p, q, args=args)
-        if not jtu.all_leaves([out]) or jnp.shape(out) != ():
-            raise ValueError(
-                "`H(k, t, p, q, args)` of `IndexedNoise` must return a scalar, the "
-                f"Hamiltonian of the noise `k`; got shape {shapes(out)}."
-            )
-        return jnp.asarray(out, jnp.result_type(out, float))
+        return scalar_energy(evaluated("H", self.H, k, t, p, q, args=args), "H")
 
     def __call__(self, t: RealScalarLike, p: PyTree, q: PyTree, args: Args) -> Array:
         return jax.vmap(lambda k: self.one(k, t, p, q, args))(jnp.arange(self.m))
@@ -187,8 +134,7 @@ class IndexedNoise(eqx.Module):
 IndexedNoise.__init__.__doc__ = """**Arguments:**
 
 - `H`: `H(k, t, p, q, args)`, the Hamiltonian of the noise `k`, a scalar. A function, or
-    a Module with parameters. `k` is a traced integer from `0` to `m - 1`: index arrays
-    with it. (Beyond the end of an array JAX takes its last entry.)
+    a Module with parameters. `k` is a traced integer from `0` to `m - 1`.
 - `m`: the number of noises.
 
 **Raises:** a `ValueError` if `H` is not callable or `m` not a positive integer; and, while
@@ -197,8 +143,8 @@ the solve is traced, if `H` does not return a scalar.
 
 
 class OneNoise(eqx.Module):
-    """The control of the noise term of `hamiltonian_terms` in which all noises vanish but
-    one. `number` counts the noises in the order of the flattened path."""
+    """A control in which all noises vanish but one. `number` counts the noises in the order
+    of the flattened path."""
 
     number: IntScalarLike
     increment: RealScalarLike
@@ -229,8 +175,7 @@ def lifted_terms(
     chart: Callable[[_State], PyTree],
     name: str,
 ) -> diffrax.MultiTerm:
-    """The terms of Hamiltonians of another variable, called `name`, which `chart` makes of
-    the pair `(p, q)`."""
+    """The terms of Hamiltonians of `chart((p, q))`, a variable called `name`."""
     check_takes("H0", H0, "t", name, "args")
     if isinstance(noise, IndexedNoise):
         lifted = IndexedNoise(Lifted(noise.H, chart), noise.m)
@@ -257,15 +202,14 @@ class _Drift(eqx.Module):
         return symplectic_gradient(scalar, y)
 
 
-def scalar_energy(out: PyTree) -> Array:
-    """What `H0` returned; a `ValueError` if that is no scalar."""
+def scalar_energy(out: PyTree, name: str = "H0") -> Array:
+    """The output of a Hamiltonian; a `ValueError` if it is no real scalar."""
     if not jtu.all_leaves([out]) or jnp.shape(out) != ():
         raise ValueError(
-            f"`H0` must return a scalar; got shape {shapes(out)}. Sum over the degrees of "
-            "freedom. (If these are paths of a batch: write H0 for one, and `jax.vmap` the "
-            "solve over states and keys.)"
+            f"`{name}` must return a scalar; got shape {shapes(out)}. Sum over the degrees "
+            "of freedom. (For a batch of paths write it for one, and `jax.vmap` the solve.)"
         )
-    _check_real("H0", out)
+    _check_real(name, out)
     return jnp.asarray(out, jnp.result_type(out, float))
 
 
@@ -274,7 +218,7 @@ def _check_real(name: str, out: PyTree[Array]) -> None:
     if not all(map(is_real, jtu.tree_leaves(out))):
         raise ValueError(
             f"`{name}` must return real numbers; got {eqx.tree_pformat(out)}. Take "
-            "`jnp.real` of what is real by its mathematics, such as <psi| A |psi>."
+            "`jnp.real` of numbers that are mathematically real, such as <psi| A |psi>."
         )
 
 
@@ -289,52 +233,31 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         return self.path.evaluate(t0, t1, **kwargs)
 
     def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
-        # The result has the structure of the state. In place of each array there is a tree
-        # with the structure of the noises, of arrays of shape `(*state, *noise)`.
-        check_pair(y)
-        struct = increment_struct(self.path)
-        hamiltonians = lambda y: self._hamiltonians(t, y[0], y[1], args, struct)
-        _check_reads_state(hamiltonians, y)
-        jac = jax.jacrev(hamiltonians)(y)
-        noise_def, state_def = jtu.tree_structure(struct), jtu.tree_structure(y)
-
-        def noise_last(entry):
-            move = lambda x, s: jnp.moveaxis(x, range(s.ndim), range(-s.ndim, 0))
-            return jtu.tree_map(move, jtu.tree_unflatten(noise_def, entry), struct)
-
-        rows = [state_def.flatten_up_to(row) for row in noise_def.flatten_up_to(jac)]
-        entries = [noise_last(entry) for entry in zip(*rows)]
-        dp, dq = jtu.tree_unflatten(state_def, entries)
+        # For each array of the state, with an axis of all noises behind its own.
+        hamiltonians = self._checked(t, y, args)
+        flat = lambda y: jfu.ravel_pytree(hamiltonians(y))[0]
+        last = lambda x: jnp.moveaxis(x, 0, -1)
+        dp, dq = jtu.tree_map(last, jax.jacrev(flat)(y))
         return (-(dq**ω)).ω, dp
 
     def prod(self, vf: PyTree[Array], control: BM) -> _State:
-        structure = jtu.tree_structure(control)
-
-        def contract(entry):
-            terms = jtu.tree_map(
-                lambda v, c: jnp.tensordot(v, c.astype(v.dtype), axes=c.ndim),
-                entry,
-                control,
-            )
-            return sum(jtu.tree_leaves(terms))
-
-        is_entry = lambda x: jtu.tree_structure(x) == structure
-        return jtu.tree_map(contract, vf, is_leaf=is_entry)
+        flat, _ = jfu.ravel_pytree(control)
+        return jtu.tree_map(lambda v: jnp.tensordot(v, flat.astype(v.dtype), 1), vf)
 
     def vf_prod(
         self, t: RealScalarLike, y: _State, args: Args, control: BM | OneNoise
     ) -> _State:
-        check_pair(y)
-
-        struct = increment_struct(self.path)
-        _check_reads_state(lambda y: self._hamiltonians(t, *y, args, struct), y)
+        hamiltonians = self._checked(t, y, args)
 
         def scalar(p, q):
             if isinstance(control, OneNoise):
-                H = self._one_hamiltonian(t, p, q, args, control.number)
+                if isinstance(self.noise, IndexedNoise):
+                    H = self.noise.one(control.number, t, p, q, args)
+                else:
+                    H = jfu.ravel_pytree(hamiltonians((p, q)))[0][control.number]
                 return H * jnp.asarray(control.increment, H.dtype)
-            H = self._hamiltonians(t, p, q, args, control)
-            dots = jtu.tree_map(lambda h, c: jnp.sum(h * c.astype(h.dtype)), H, control)
+            dot = lambda h, c: jnp.sum(h * c.astype(h.dtype))
+            dots = jtu.tree_map(dot, hamiltonians((p, q)), control)
             return sum(jtu.tree_leaves(dots))
 
         return symplectic_gradient(scalar, y)
@@ -344,12 +267,20 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         struct = increment_struct(self.path)
         return sum(s.size for s in jtu.tree_leaves(struct)) > 2
 
-    def _one_hamiltonian(self, t, p, q, args, number) -> Array:
-        if isinstance(self.noise, IndexedNoise):
-            return self.noise.one(number, t, p, q, args)
+    def _checked(self, t, y: _State, args) -> Callable:
+        """The noise Hamiltonians as a function of the state; a `ValueError` if they do not
+        depend on it."""
+        check_pair(y)
         struct = increment_struct(self.path)
-        H = self._hamiltonians(t, p, q, args, struct)
-        return jfu.ravel_pytree(H)[0][number]
+        hamiltonians = lambda y: self._hamiltonians(t, y[0], y[1], args, struct)
+        if Dependence(hamiltonians, y).independent(lambda y: y):
+            raise ValueError(
+                "`noise` does not depend on the state, so that there is no noise. Return "
+                "Hamiltonians, not amplitudes: for a kick of constant strength to each "
+                "momentum, dp_k = sigma_k dw_k, `noise = lambda t, p, q, args: -sigma * "
+                "q`. For no noise solve the drift alone, `terms.terms[0]`."
+            )
+        return hamiltonians
 
     def _hamiltonians(self, t, p, q, args, struct) -> PyTree[Array]:
         """The noise Hamiltonians, in the structure and shapes of the path."""
@@ -372,37 +303,23 @@ _LEFT_OUT = "`args=None`. Was it left out?"
 
 
 def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Array]:
-    """`H(*inputs, args)`. An error that comes from there says why, where that is known."""
-    # A function that changes the lists and dictionaries of `args` changes a copy: it would
-    # be another function each time that it is traced.
+    """`H(*inputs, args)`, with advice on its errors."""
+    # A function that changes `args` in place would be another one in each trace.
     copy = jtu.tree_map(lambda x: x, args)
     try:
         return H(*inputs, copy)
     except jax.errors.JAXTypeError as error:
         raise ValueError(
-            f"`{name}` asks for values while JAX traces it, when there are none: by `if`, "
-            "`while`, `float`, or a function of NumPy. Write `jnp.where(a, b, c)` or "
-            "`jax.lax.cond` in place of `if`, and `jnp` in place of `np`."
+            f"`{name}` asks for values while JAX traces it, by `if`, `while`, `float`, or "
+            "a function of NumPy. Write `jnp.where(a, b, c)` or `jax.lax.cond` in place of "
+            "`if`, and `jnp` in place of `np`."
         ) from error
     except (TypeError, AttributeError) as error:
-        # Of an `IndexedNoise` it has been said by the Hamiltonian of one noise. What `None`
-        # is no good for is named in the message.
+        # An `IndexedNoise` calls this twice.
         if args is not None or _LEFT_OUT in str(error) or "None" not in str(error):
             raise
         kind = TypeError if isinstance(error, TypeError) else AttributeError
-        # A note would not be part of what `str` of the error says.
         raise kind(f"`{name}` was called with {_LEFT_OUT} {error}") from error
-
-
-def _check_reads_state(hamiltonians: Callable[[_State], PyTree], y: _State) -> None:
-    """Raises a `ValueError` if the noise Hamiltonians do not depend on the state."""
-    if Dependence(hamiltonians, y).independent(lambda y: y):
-        raise ValueError(
-            "`noise` does not depend on the state, so that there is no noise. Return "
-            "Hamiltonians, not amplitudes: for a kick of constant strength to each "
-            "momentum, dp_k = sigma_k dw_k, `noise = lambda t, p, q, args: -sigma * q`. "
-            "For no noise solve the drift alone, `terms.terms[0]`."
-        )
 
 
 def symplectic_gradient(scalar: Callable, y: _State) -> _State:
@@ -418,7 +335,7 @@ def is_hamiltonian(term: diffrax.AbstractTerm) -> bool:
 
 
 def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
-    """What the user said of the Hamiltonians that a term came from."""
+    """The `structure` that was passed with the Hamiltonians of a term."""
     asserted = {part.structure for part in _parts(term)}
     return asserted.pop() if len(asserted) == 1 else None
 

@@ -5,12 +5,10 @@ from collections.abc import Callable, Sequence
 import diffrax
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .._arguments import check_pair
+from .._arguments import check_pair, real_array
 from .._custom_types import Args, RealScalarLike
 from ._hamiltonian import evaluated, lifted_terms, scalar_energy
 
@@ -36,73 +34,39 @@ def spin_terms(
     That is the angular momentum of a rigid body, the stochastic Landau--Lifshitz
     equation of magnetic moments, or the motion of point vortices on a sphere. The length
     of each $s$ is constant, and the flow is a Poisson map: $\{F \circ S, G \circ S\} =
-    \{F, G\} \circ S$ for the bracket $\{F, G\} = s \cdot (\nabla G \times \nabla F)$. A
-    symplectic method for $s$ itself need not be: the midpoint rule keeps the length but
-    not the bracket.
+    \{F, G\} \circ S$ for the bracket $\{F, G\} = s \cdot (\nabla G \times \nabla F)$.
 
-    So the state of these terms is not $s$ but a pair $(p, q)$ of arrays of shape
-    `(..., 2)`, from which [`diffrax_symplectic.from_spinors`][] makes $s$. They are
-    [`diffrax_symplectic.hamiltonian_terms`][] of the Hamiltonians $H_k(s(p, q))$, whose
-    solutions $(p, q)$ give solutions $s(p, q)$ of the equation above. The length of a
-    spin is a quadratic invariant of them. A symplectic Runge--Kutta method with the same
-    coefficients for $p$ and $q$ keeps it, and is a Poisson map of $s$.
+    The state of these terms is a pair $(p, q)$ of arrays of shape `(..., 2)`, from which
+    [`diffrax_symplectic.from_spinors`][] makes $s$. They are
+    [`diffrax_symplectic.hamiltonian_terms`][] of the Hamiltonians $H_k(s(p, q))$. The
+    length of a spin is a quadratic invariant of these, so that every solver for general
+    systems keeps it and is a Poisson map of $s$, with its orders for canonical systems.
+    Other solvers refuse these terms.
 
-    All solvers for any Stratonovich system are such methods. Their orders are those for
-    canonical systems. The others refuse these terms.
-
-    **Damping.** With `damping=alpha` the drift has one more part,
-
-    $$\alpha\, s \times (s \times \nabla H_0)\,\mathrm{d}t,$$
-
-    which is the Landau--Lifshitz equation with damping. Without noise the energy falls by
-    $\alpha |s \times \nabla H_0|^2$ in each unit of time. Every term $s \times \omega(s)$
-    lifts to the pair as that of the Hamiltonian $\omega \cdot s$ with $\omega$ held fixed.
-    So the length of a spin stays a quadratic invariant, which the same solvers keep, with
-    the same orders. The flow is no Poisson map then.
-
-    At a temperature $T$ (in units of energy) the noise is a field along each axis of each
-    spin, `noise = lambda t, s, args: sigma * s` with $\sigma^2 = 2 \alpha T$. Then the
-    density $e^{-H_0 / T}$ is stationary, for spins of any lengths.
-
-    !!! example
-
-        ```python
-        import diffrax
-        import diffrax_symplectic as ds
-        import jax.numpy as jnp
-        import jax.random as jr
-
-        # A spin with an easy axis in a field, and a field of white noise.
-        H0 = lambda t, s, args: args * s[0] - s[2] ** 2
-        noise = lambda t, s, args: 0.1 * s
-        solver = ds.ImplicitMidpoint()
-        terms = ds.spin_terms(H0, noise, solver.path((3,), jr.key(0)))
-        y0 = ds.to_spinors(jnp.array([0.6, 0.0, 0.8]))
-        sol = diffrax.diffeqsolve(terms, solver, t0=0, t1=1, dt0=0.1, y0=y0, args=0.5)
-        s = ds.from_spinors(sol.ys)  # of shape (1, 3)
-        ```
+    **Damping.** `damping=alpha` adds $\alpha\, s \times (s \times \nabla H_0)\,
+    \mathrm{d}t$, the drift of the Landau--Lifshitz equation. The same solvers keep the
+    lengths, with the same orders; the flow is no Poisson map then. With the noise
+    `lambda t, s, args: sigma * s` and $\sigma^2 = 2 \alpha T$, the density $e^{-H_0 / T}$
+    of the temperature $T$ (in units of energy) is stationary, for spins of any lengths.
 
     **Arguments:**
 
-    - `H0`: `H0(t, s, args)`, a scalar, for `s` of shape `(..., 3)`: the sum over all
-        spins. A function, or a Module with parameters; differentiable with respect to
-        these and to `args`.
-    - `noise`: `noise(t, s, args)`, the noise Hamiltonians $H_1, \ldots, H_m$ as an
-        array of shape `(m,)`, or whatever structure and shapes `path` has. A field along
-        each axis of each spin is `noise = lambda t, s, args: args * s` with a path of
-        the shape of `s`; its cost is one reverse pass. Or an
-        [`diffrax_symplectic.IndexedNoise`][] of `H(k, t, s, args)`.
+    - `H0`: `H0(t, s, args)`, a scalar, for `s` of shape `(..., 3)`. A function, or a
+        Module with parameters; differentiable with respect to these and to `args`.
+    - `noise`: `noise(t, s, args)`, the noise Hamiltonians $H_1, \ldots, H_m$ as an array
+        of shape `(m,)`, or in the structure and shapes of `path`: a field along each axis
+        of each spin is `lambda t, s, args: args * s` with a path of the shape of `s`. Or
+        an [`diffrax_symplectic.IndexedNoise`][] of `H(k, t, s, args)`.
     - `path`: the Brownian path or its shape, as for
         [`diffrax_symplectic.hamiltonian_terms`][].
     - `damping`: the number $\alpha$, or one for each spin, not negative; in units of one
-        over the length of a spin. None if it is `None`. If it is traced and negative or
-        not finite, the path fails.
+        over the length of a spin. A path fails if it is traced and negative or not finite.
 
     **Returns:** `MultiTerm(drift, diffusion)`, for the state `to_spinors(s0)`.
 
     **Raises:** as [`diffrax_symplectic.hamiltonian_terms`][]; a `ValueError` if `damping`
-    is known to be negative or not finite; and one while the solve is traced if it does
-    not fit the spins, or if the arrays of the state do not have the shape `(..., 2)`.
+    is known to be negative or not finite; and, while the solve is traced, if it does not
+    fit the spins, or if the arrays of the state do not have the shape `(..., 2)`.
 
     **Source:** [McLachlan, Modin and Verdier
     (2014)](https://doi.org/10.1088/0951-7715/27/6/1525), for systems without noise and
@@ -117,17 +81,8 @@ def spin_terms(
 
 
 def _checked_damping(alpha: ArrayLike) -> ArrayLike:
-    """`alpha`, after a check of its values if they are not traced."""
-    fault = not eqx.is_array_like(alpha) or np.iscomplexobj(alpha)
-    if not fault and not isinstance(alpha, jax.core.Tracer):
-        values = np.asarray(alpha)
-        fault = not np.all(np.isfinite(values) & (values >= 0))
-    if fault:
-        raise ValueError(
-            "`damping` must be a number, or an array with one for each spin, finite and "
-            f"not negative; got {alpha!r}."
-        )
-    return alpha
+    kind = "a number, or an array with one for each spin"
+    return real_array("damping", alpha, positive=False, kind=kind)
 
 
 class _DampedPrecession(eqx.Module):
@@ -147,13 +102,13 @@ class _DampedPrecession(eqx.Module):
                 "`damping` must be a number, or have one for each spin, of shape "
                 f"{s.shape[:-1]}; got shape {alpha.shape}."
             )
-        # Values that are traced cannot raise an error here. They make their path fail.
+        # Traced values cannot raise an error here: they make their path fail.
         alpha = jnp.where(jnp.isfinite(alpha) & (alpha >= 0), alpha, jnp.nan)
         (s1, s2, s3), (g1, g2, g3) = _components(s), _components(gradient)
-        # `symplectic_gradient` of `omega . s(p, q)`, written out.
         w1 = g1 + alpha * (s2 * g3 - s3 * g2)
         w2 = g2 + alpha * (s3 * g1 - s1 * g3)
         w3 = g3 + alpha * (s1 * g2 - s2 * g1)
+        # `symplectic_gradient` of `omega . s(p, q)`, which would take 1.3 times as long.
         (p1, p2), (q1, q2) = map(_components, y)
         dp = -(w1 * q2 - w2 * p2 + w3 * q1), -(w1 * q1 + w2 * p1 - w3 * q2)
         dq = w1 * p2 + w2 * q2 + w3 * p1, w1 * p1 - w2 * q1 - w3 * p2
@@ -172,10 +127,8 @@ def from_spinors(y: _Spinors) -> _Spins:
         a = q_1 + \mathrm i p_1, \quad b = q_2 + \mathrm i p_2.$$
 
     This is the Hopf map, as in [McLachlan, Modin and Verdier
-    (2014)](https://doi.org/10.1088/0951-7715/27/6/1525). The factor $1/4$ makes the
-    canonical brackets of its components those of spins, $\{s_1, s_2\} = -s_3$ and cyclic.
-    So canonical equations for $H(s(p, q))$ push forward to
-    $\mathrm{d}s = s \times \nabla H\,\mathrm{d}t$. The
+    (2014)](https://doi.org/10.1088/0951-7715/27/6/1525). With the factor $1/4$ its
+    components have the canonical brackets of spins, $\{s_1, s_2\} = -s_3$ and cyclic. The
     length is $|s| = (|p|^2 + |q|^2) / 4$.
 
     **Arguments:**
@@ -193,7 +146,7 @@ def from_spinors(y: _Spinors) -> _Spins:
             "The state of spins is a pair `(p, q)` of arrays of shape `(..., 2)`: pass "
             f"`y0=to_spinors(s0)`. Got {eqx.tree_pformat(y)}."
         )
-    (p1, p2), (q1, q2) = jnp.moveaxis(jnp.asarray(p), -1, 0), jnp.moveaxis(q, -1, 0)
+    (p1, p2), (q1, q2) = _components(p), _components(q)
     s1 = (q1 * q2 + p1 * p2) / 2
     s2 = (p1 * q2 - q1 * p2) / 2
     s3 = (q1**2 + p1**2 - q2**2 - p2**2) / 4
@@ -204,13 +157,10 @@ def to_spinors(s: _Spins) -> _Spinors:
     r"""A state $(p, q)$ for the vectors $s$, to begin a solve of
     [`diffrax_symplectic.spin_terms`][] with: `from_spinors(to_spinors(s))` is $s$.
 
-    There is a circle of such states for each $s$, all $(\mathrm e^{\mathrm i \phi} a,
-    \mathrm e^{\mathrm i \phi} b)$. The phase $\phi$ is a gauge: neither the equations nor
-    the solvers for general systems see it, and $s$ does not depend on it at any time. No
-    choice of it is continuous on the whole sphere. Here $a > 0$ where $s_3 \ge 0$ and
-    $b > 0$ where $s_3 < 0$. So $(p, q)$ jumps where $s$ crosses the equator, and depends
-    smoothly on $s$ on both sides, poles included. Derivatives of what is made of $s$ are
-    right everywhere.
+    The states $(\mathrm e^{\mathrm i \phi} a, \mathrm e^{\mathrm i \phi} b)$ all give the
+    same $s$ at any time. No choice of the phase $\phi$ is continuous on the whole sphere.
+    Here $a > 0$ where $s_3 \ge 0$ and $b > 0$ where $s_3 < 0$. So $(p, q)$ jumps where $s$
+    crosses the equator. Derivatives of functions of $s$ are right everywhere.
 
     **Arguments:**
 
@@ -219,12 +169,11 @@ def to_spinors(s: _Spins) -> _Spinors:
     **Returns:** the pair `(p, q)` of arrays of shape `(..., 2)`.
 
     **Raises:** a `ValueError` if `s` has another shape; an error when run if a spin has
-    length zero. Such a spin has no direction and never moves; and $(p, q)$, which grows
-    like $|s|^{1/2}$, has no derivative there.
+    length zero, where $(p, q)$, which grows like $|s|^{1/2}$, has no derivative.
     """
     s = as_spins(s)
-    # Squares of very short and of very long vectors leave the range of the numbers. The
-    # state grows like the square root of the scale, which thus needs no derivative.
+    # Squares of very short and very long vectors leave the range of the numbers. The result
+    # does not depend on the scale, which thus needs no derivative.
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(s), axis=-1, keepdims=True))
     scale = eqx.error_if(
         scale,

@@ -1,5 +1,5 @@
-"""Whether a system has the structure that a family of methods relies on: decided by the
-flow of data through the vector fields, or by what the user asserts."""
+"""Whether a system has the structure that a family of methods relies on: decided by what
+the vector fields depend on, or by what the user asserts."""
 
 import functools as ft
 from collections.abc import Callable
@@ -21,12 +21,12 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from ._dependence import Dependence
 from ._hamiltonian import asserted_structure, has_lifted, is_hamiltonian
-from ._vector_fields import apply, check_controls, product, split_terms
+from ._vector_fields import apply, split_terms
 
 
 class Fault(NamedTuple):
-    """Why a system does not have a structure, what may be done about it, and whether it is
-    a force of plain terms that depends on the momentum, as friction does."""
+    """Why a system does not have a structure, what can be done about it, and whether the
+    fault is a force of plain terms that depends on the momentum, as friction does."""
 
     reason: str
     advice: str
@@ -42,14 +42,12 @@ def check_structure(
     args: Args,
     solver: str,
 ) -> None:
-    """Raises a `ValueError`, while tracing, unless a system has the structure that a solver
-    is for."""
+    """Raises a `ValueError` unless a system has the structure that a solver needs."""
     if structure not in get_args(Structure):
         raise ValueError(
             f"`structure` of the tableau of `{solver}` must be one of "
             f"{get_args(Structure)}; got {structure!r}."
         )
-    check_controls(noise, t0, y0, args)
 
     def refuse(needs: str, fault: Fault | None) -> None:
         if fault is None:
@@ -78,19 +76,12 @@ def separable_fault(
     if it is of this form."""
     if fault := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", fault)
-    drift_flows = [
-        (is_hamiltonian(x), len(drift) > 1, _flow(x, t0, y0, args))
-        for x in _not_asserted(drift, "separable")
+    flows = lambda terms: [
+        (term, _flow(term, t0, y0, args)) for term in _not_asserted(terms, "separable")
     ]
-    noise_flows = [
-        (
-            is_hamiltonian(x),
-            _flow(x, t0, y0, args),
-            ft.partial(_is_zero, x, t0, y0, args),
-        )
-        for x in _not_asserted(noise, "separable")
-    ]
-    here, exchanged = (_faults(p, drift_flows, noise_flows) for p in (0, 1))
+    still = ft.partial(_is_zero, t0, y0, args)
+    of = flows(drift), flows(noise)
+    here, exchanged = (_faults(p, *of, still) for p in (0, 1))
     if not here:
         return None
     only_friction = lambda faults: all(fault.friction for fault in faults)
@@ -103,37 +94,38 @@ def separable_fault(
 
 def _faults(
     p: int,
-    drift: list[tuple[bool, bool, Dependence]],
-    noise: list[tuple[bool, Dependence, Callable[[int], bool]]],
+    drift: list[tuple[diffrax.AbstractTerm, Dependence]],
+    noise: list[tuple[diffrax.AbstractTerm, Dependence]],
+    still: Callable[[diffrax.AbstractTerm, int], bool],
 ) -> list[Fault]:
-    """The faults, if the momenta are the first half of the state, `p = 0`, or the second
-    one, `p = 1`. With each term: whether it comes from Hamiltonians. With each drift term:
-    whether there are others. With each noise term: a function that tells whether a half
-    stays unchanged."""
+    """The faults, if momenta are the first half of the state, `p = 0`, or the second one,
+    `p = 1`. `still` tells whether a noise term leaves a half of the state unchanged."""
     q, faults, advice = 1 - p, [], _advice("separable")
     dp, dq = (lambda out: out[p]), (lambda out: out[q])
     of_p, of_q = (lambda t, y, control: y[p]), (lambda t, y, control: y[q])
-    for hamiltonian, others, flow in drift:
+    beside = " beside that of H0" if len(drift) > 1 else ""
+    for term, flow in drift:
         for part, of, derivative, rate in (
             (dp, of_p, "dH0/dq depends on p", "dp/dt depend on p"),
             (dq, of_q, "dH0/dp depends on q", "dq/dt depend on q"),
             (dq, _of_t, "dH0/dp depends on t", "dq/dt depend on t"),
         ):
             if not flow.independent(of, part):
-                friction = part is dp and not hamiltonian
-                beside = " beside that of H0" if others else ""
-                plain = f"a drift term{beside} makes {rate}"
-                reason = derivative if hamiltonian else plain
-                faults.append(Fault(reason, advice, friction))
-    for hamiltonian, flow, zero in noise:
+                plain = not is_hamiltonian(term)
+                reason = f"a drift term{beside} makes {rate}" if plain else derivative
+                faults.append(Fault(reason, advice, friction=plain and part is dp))
+    for term, flow in noise:
+        hamiltonian = is_hamiltonian(term)
         # The change of q is linear in the increment: if it does not depend on the
         # increment, it is zero.
-        if not flow.independent(lambda t, y, control: control, dq) and not zero(q):
+        if not flow.independent(lambda t, y, control: control, dq) and not still(
+            term, q
+        ):
             plain = "a noise term changes q, the second half of the state"
             reason = "dH_k/dp is not zero" if hamiltonian else plain
             faults.append(Fault(reason, advice))
         elif not flow.independent(of_p, dp):
-            plain = "a noise term changes p by what depends on p"
+            plain = "a noise term changes p by an amount that depends on p"
             reason = "dH_k/dq depends on p" if hamiltonian else plain
             faults.append(Fault(reason, advice))
     return faults
@@ -164,9 +156,9 @@ def check_stratonovich(
     y0: Y,
     args: Args,
 ) -> None:
-    """Raises a `ValueError` if a solver in the sense of Ito is to solve terms made from
-    Hamiltonians, which are in the sense of Stratonovich. Both agree for additive noise, and
-    for noise that changes `p` and depends on `q` alone."""
+    """Raises a `ValueError` if an Ito solver is to solve the terms of Hamiltonians, which
+    are Stratonovich. Both agree for additive noise, and for noise that changes `p` and
+    depends on `q` alone."""
     drift, noise = split_terms(terms)
     # A drift beside `H0` may be the correction from one sense to the other.
     corrected = not all(map(is_hamiltonian, drift))
@@ -175,10 +167,10 @@ def check_stratonovich(
     noise = tuple(filter(is_hamiltonian, noise))
     if additive_fault(noise, t0, y0, args) and separable_fault((), noise, t0, y0, args):
         raise ValueError(
-            f"`{type(solver).__name__}` solves equations in the sense of Ito. Those of "
+            f"`{type(solver).__name__}` solves equations in the sense of Ito. The terms of "
             "`hamiltonian_terms` are in the sense of Stratonovich, and here they differ. "
             "Use a solver of this package, or a Stratonovich solver of Diffrax such as "
-            "`diffrax.Heun`. If Ito's sense is meant, add the drift that corrects it."
+            "`diffrax.Heun`. If you mean an Ito equation, add the drift that corrects it."
         )
 
 
@@ -186,13 +178,13 @@ def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> Dependence:
     """The change of the state by a term, as a program of time, state and control."""
     t0 = jnp.asarray(t0, jnp.result_type(float))
     control = eqx.filter_eval_shape(term.contr, t0, t0)
-    change = lambda t, y, control: product(term, t, y, args, control)
+    change = lambda t, y, control: term.vf_prod(t, y, args, control)
     return Dependence(change, t0, y0, control)
 
 
-def _is_zero(term: diffrax.AbstractTerm, t0, y0: Y, args: Args, half: int) -> bool:
-    """Whether the noise of a plain term is known while tracing to leave one half of the
-    state unchanged, as a matrix of noises with a block of zeros does."""
+def _is_zero(t0, y0: Y, args: Args, term: diffrax.AbstractTerm, half: int) -> bool:
+    """Whether a plain noise term is known while tracing to leave one half of the state
+    unchanged, by a block of zeros in its matrix."""
     if is_hamiltonian(term):
         return False
     struct = eqx.filter_eval_shape(term.contr, t0, t0)
@@ -200,7 +192,7 @@ def _is_zero(term: diffrax.AbstractTerm, t0, y0: Y, args: Args, half: int) -> bo
         zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
         flat, unravel = jfu.ravel_pytree(zeros)
         changes = [
-            product(unwrapped(term), t0, y0, args, unravel(unit))[half]
+            unwrapped(term).vf_prod(t0, y0, args, unravel(unit))[half]
             for unit in jnp.eye(flat.size, dtype=flat.dtype)
         ]
     known = lambda x: not isinstance(x, jax.core.Tracer)
@@ -221,9 +213,9 @@ def _advice(structure: str) -> str:
         "additive": "each H_k as a function linear in p and q, such as `-sigma * q`",
     }[structure]
     return (
-        "Variables count that cancel, are multiplied by zero or printed, or share an array "
-        f"with others. If it is only that, write {how}, or pass "
-        f'`structure="{structure}"` to `hamiltonian_terms`. If not, {_GENERAL}.'
+        "Variables also count if they cancel, are multiplied by zero or printed, or share "
+        f"an array with others. In that case write {how}, or pass "
+        f'`structure="{structure}"` to `hamiltonian_terms`. Otherwise {_GENERAL}.'
     )
 
 
@@ -242,42 +234,37 @@ FRICTION = (
 
 def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish at random states, for
-    these `t0` and `args`. False if this cannot be tested. This is advice, no proof.
+    these `t0` and `args`; false if this cannot be tested. This is advice, no proof.
 
-    The bracket is bilinear. So it is enough to test the bracket of two random linear
-    combinations of the noises.
+    The bracket is bilinear: it is tested for two random combinations of the noises.
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
     struct = eqx.filter_eval_shape(lambda: [term.contr(t0, t0) for term in noise])
-
-    leaves, treedef = jtu.tree_flatten((y0, struct, struct))
-    # Most functions are defined between 0 and 1, even if they are not everywhere.
-    laws = jr.normal, jr.uniform
-    draw = lambda law, key: treedef.unflatten(
-        law(k, jnp.shape(x), jnp.result_type(x))
-        for k, x in zip(jr.split(key, len(leaves)), leaves)
-    )
+    zeros = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), (struct, struct))
+    flat, unravel = jfu.ravel_pytree((y0, *zeros))
     largest = lambda y: jnp.max(jnp.abs(jfu.ravel_pytree(y)[0]))
 
     @eqx.filter_jit
     @jax.vmap
     def sizes(point):
-        y, x, z = point
-        along = lambda control: lambda y: apply(noise, control, args, t0, y)
-        first = jax.jvp(along(z), (y,), (along(x)(y),))[1]
-        second = jax.jvp(along(x), (y,), (along(z)(y),))[1]
+        y, x, z = unravel(point)
+        b = lambda control: lambda y: apply(noise, control, args, t0, y)
+        first = jax.jvp(b(z), (y,), (b(x)(y),))[1]
+        second = jax.jvp(b(x), (y,), (b(z)(y),))[1]
         bracket = (first**ω - second**ω).ω
         return largest(first), largest(bracket)
 
     try:
         with jax.disable_jit(False):
-            points = [draw(law, jr.key(i)) for i in range(4) for law in laws]
-            size, bracket = sizes(jtu.tree_map(lambda *x: jnp.stack(x), *points))
+            # Most functions are defined between 0 and 1.
+            draw = lambda law: law(jr.key(0), (4, *flat.shape), flat.dtype)
+            points = jnp.concatenate([draw(jr.normal), draw(jr.uniform)])
+            size, bracket = sizes(points)
             finite = jnp.isfinite(size) & jnp.isfinite(bracket)
             small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
             found = jax.block_until_ready(jnp.any(finite) & jnp.all(small | ~finite))
     except RuntimeError:
-        # A check of the user's, by `equinox.error_if`, at states the user never chose.
+        # A user's `equinox.error_if`, at states that the user never chose.
         return False
-    # While JAX traces what surrounds this, there are no values.
+    # Within `jax.jit` there are no values.
     return not isinstance(found, jax.core.Tracer) and bool(found)

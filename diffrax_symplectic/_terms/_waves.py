@@ -33,39 +33,19 @@ def wave_terms(
     That is the Schrödinger equation of a quantum system, $H_k = \psi^\dagger A_k \psi$ with
     hermitian matrices $A_k$, or a nonlinear Schrödinger equation on a lattice.
 
-    The state of these terms is not $\psi$ but the pair $(p, q)$ of real arrays with
+    The state of these terms is the pair $(p, q)$ of real arrays with
     $\psi = (q + \mathrm i p) / \sqrt 2$. They are
-    [`diffrax_symplectic.hamiltonian_terms`][] of the Hamiltonians $H_k(\psi(p, q))$. What
-    is quadratic in $\psi$ and conserved by $H_0$ and all $H_k$, such as the norm
-    $|\psi|^2$, is a quadratic invariant. All solvers for general systems keep it to
-    rounding.
-
-    !!! example
-
-        ```python
-        import diffrax
-        import diffrax_symplectic as ds
-        import jax.numpy as jnp
-        import jax.random as jr
-
-        # A qubit that is driven, with noise in its energy.
-        H0 = lambda t, psi, args: args * jnp.real(jnp.conj(psi[0]) * psi[1])
-        noise = lambda t, psi, args: 0.2 * jnp.abs(psi[1]) ** 2
-        solver = ds.StrangGauss()
-        terms = ds.wave_terms(H0, noise, solver.path((), jr.key(0)))
-        y0 = ds.to_pair(jnp.array([1.0 + 0j, 0.0]))
-        sol = diffrax.diffeqsolve(terms, solver, t0=0, t1=1, dt0=0.1, y0=y0, args=2.0)
-        psi = ds.from_pair(sol.ys)  # of shape (1, 2)
-        ```
+    [`diffrax_symplectic.hamiltonian_terms`][] of the Hamiltonians $H_k(\psi(p, q))$. All
+    solvers for general systems keep quadratic functions of $\psi$ that are conserved by
+    $H_0$ and all $H_k$, such as the norm $|\psi|^2$, to rounding.
 
     **Arguments:**
 
-    - `H0`: `H0(t, psi, args)`, a real scalar. `psi` has the structure, shapes and complex
-        dtypes of the amplitudes. A function, or a Module with parameters; differentiable
-        with respect to these and to `args`. In place of `jnp.abs(psi)`, which has no
-        derivative at zero, write `jnp.abs(psi) ** 2`.
+    - `H0`: `H0(t, psi, args)`, a real scalar; `psi` is a PyTree of complex arrays. A
+        function, or a Module with parameters; differentiable with respect to these and to
+        `args`. Write `jnp.abs(psi) ** 2`, since `jnp.abs(psi)` has no derivative at zero.
     - `noise`: `noise(t, psi, args)`, the noise Hamiltonians $H_1, \ldots, H_m$, real, as an
-        array of shape `(m,)`, or whatever structure and shapes `path` has. Or an
+        array of shape `(m,)`, or in the structure and shapes of `path`. Or an
         [`diffrax_symplectic.IndexedNoise`][] of `H(k, t, psi, args)`.
     - `path`: the Brownian path or its shape, as for
         [`diffrax_symplectic.hamiltonian_terms`][].

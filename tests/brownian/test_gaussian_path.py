@@ -11,7 +11,6 @@ from scipy import special
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import _random as words
 from diffrax_symplectic._brownian._random import normal_from_words
-from diffrax_symplectic._terms import controls
 
 from ..problems import kubo_terms
 
@@ -227,18 +226,3 @@ def test_bad_arguments_are_refused():
         make(jax.ShapeDtypeStruct((), jnp.int32), jr.key(0))
     with pytest.raises(ValueError, match="needs a random key"):
         make((), 0)  # pyright: ignore
-
-
-def test_trees_coarser_than_the_step_are_refused():
-    # It would interpolate, and give a fraction of the variance without a word.
-    def draw(tol):
-        tree = diffrax.VirtualBrownianTree(0.0, 4.0, tol, (), jr.key(0))
-        term = diffrax.ControlTerm(lambda t, y, args: y, ds.TruncatedBrownianPath(tree))
-        return jax.jit(lambda h: controls((term,), ["W"], 1.0, 1.0 + h, "")["W"][0])
-
-    fine = draw(0.1)
-    for h in (0.1, 0.5, 1e-12):
-        assert jnp.isfinite(fine(h))
-    for step in (lambda: fine(0.09), lambda: draw(0.5)(0.1)):
-        with pytest.raises(Exception, match="Pass a smaller `tol`"):
-            jax.block_until_ready(step())

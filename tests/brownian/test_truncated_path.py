@@ -55,7 +55,7 @@ def test_truncation_bound_is_that_of_the_docstring(k):
 
 @pytest.mark.parametrize("k", [0, -1, 1.5, True, None])
 def test_truncation_needs_a_positive_integer(k):
-    with pytest.raises(ValueError, match="`k` must be an integer"):
+    with pytest.raises(ValueError, match="`k` must be a positive integer"):
         ds.TruncatedBrownianPath(diffrax.UnsafeBrownianPath((), jr.key(0)), k=k)
 
 

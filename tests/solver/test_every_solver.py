@@ -384,13 +384,13 @@ def local_weak_orders(solver) -> dict[str, float]:
 @each([solver for solver in TABLE if "A" not in solver.variables])
 def test_local_weak_order(solver):
     for kind, order in local_weak_orders(solver).items():
-        claim = solver.record.weak_order(KINDS[kind])
+        claim = solver.record.order("weak", KINDS[kind])
         assert abs(order - claim) <= 0.1, (kind, order)
     system = SYSTEMS[solver.structure]
     for m in (1, 2):
         terms = system.terms(solver.path((m,), jr.key(0)))
         # A solver does not know whether several noises commute.
-        assert solver.weak_order(terms) == solver.record.weak_order(m == 1)
+        assert solver.weak_order(terms) == solver.record.order("weak", m == 1)
 
 
 _STRONG_STEPS = np.array([16, 32, 64])
@@ -449,7 +449,7 @@ STRONG = [
 @each(STRONG)
 def test_strong_order(solver):
     for kind, (order, bar) in strong_orders(solver).items():
-        claim = solver.record.strong_order(KINDS[kind])
+        claim = solver.record.order("strong", KINDS[kind])
         # Terms of higher order are still seen. Where noises that do not commute have a
         # lower order, it is told from that of the others.
         most = 0.2 if claim < 1 else 0.3
@@ -462,7 +462,7 @@ def test_coefficients_are_symplectic_and_of_the_claimed_order(solver):
         return
     tableau, record = solver.tableau, solver.record
     worst = [np.max(np.abs(ds.symplectic_residuals(tableau)))]
-    order = min(record.weak_order(True), 2)
+    order = min(record.order("weak", True), 2)
     worst += map(abs, ds.weak_order_residuals(tableau, order).values())
     if record.strong is not None:
         worst += map(abs, ds.strong_order_residuals(tableau).values())

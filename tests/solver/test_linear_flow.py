@@ -175,13 +175,5 @@ def test_flows_that_are_none_are_refused():
     with pytest.raises(ValueError, match="is a pair"):
         init(flow, jnp.ones(8))
     # One propagator for all steps.
-    with pytest.raises(ValueError, match="does not read `time`"):
+    with pytest.raises(ValueError, match="does not depend on `time`"):
         init(lambda time, y, args: flow(0.05, y, args))
-    shrink = lambda time, y, args: (y[0] * jnp.exp(-time), y[1])
-    swapped = lambda time, y, args: flow(time, y[::-1], args)
-    for wrong in (shrink, swapped):
-        with pytest.raises(Exception, match="`LinearFlow` is not symplectic"):
-            sol = diffrax.diffeqsolve(
-                terms, ds.LinearFlow(inner, wrong), 0, 1, 0.1, y0, max_steps=11
-            )
-            jax.block_until_ready(sol.ys)

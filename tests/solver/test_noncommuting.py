@@ -167,7 +167,7 @@ def test_noises_by_their_index_are_checked():
 
     with pytest.raises(ValueError, match="must return one Hamiltonian for each noise"):
         step(lambda k, t, p, q, args: q[k], 3)
-    with pytest.raises(ValueError, match="must return a scalar, the Hamiltonian of"):
+    with pytest.raises(ValueError, match="`H` must return a scalar"):
         step(lambda k, t, p, q, args: q, 2)
 
 

@@ -153,14 +153,10 @@ def test_suggestions_keep_recorded_noise():
         assert isinstance(best.terms(jr.key(1)).terms[1].path, ds.WeakBrownianPath)
 
 
-def test_a_path_of_diffrax_that_repeats_its_noise_is_told_of():
-    y0 = jnp.zeros(()), jnp.ones(())
+def test_noise_does_not_repeat_late_in_a_run_as_it_does_on_a_path_of_diffrax():
     unsafe = diffrax.UnsafeBrownianPath((), jr.key(0))
-    said = lambda path: ds.suggest_solver(_oscillator(path), 0, y0, want="weak").system
-    assert "repeats its noise" in said(unsafe)
     ours = ds.FixedStepBrownianPath((), jr.key(0))
-    assert "repeats" not in said(ours)
-    # If Diffrax has mended it, take this sentence out.
+    # If Diffrax has mended it, take it out of the docstring of `FixedStepBrownianPath`.
     t = 4096 + 1e-4 * jnp.arange(10_001)
     draw = lambda path: jax.vmap(path.evaluate)(t[:-1], t[1:]) / jnp.sqrt(jnp.diff(t))
     distinct = lambda path: len(np.unique(np.round(draw(path), 9)))
@@ -183,13 +179,13 @@ def test_noises_that_do_not_fit_their_control_term_are_refused(solver, operator)
         terms = diffrax.MultiTerm(drift, diffrax.ControlTerm(field, path))
         return diffrax.diffeqsolve(terms, solver, 0, 1, 0.5, y0, max_steps=2).ys
 
-    with pytest.raises(ValueError, match=r"`ControlTerm`.*(f64\[3\]|shape=\(3,\))"):
-        solve((3,), jnp.ones(2))
-    with pytest.raises(ValueError, match=r"`ControlTerm`.*(f64\[3\]|\(3, 2\))"):
-        solve((2,), jnp.ones(3))
+    # By Lineax, JAX, or what the terms return in place of the state.
+    for shape, y0 in (((3,), jnp.ones(2)), ((2,), jnp.ones(3))):
+        with pytest.raises((TypeError, ValueError), match="shape|structure|different"):
+            solve(shape, y0)
     single = jax.ShapeDtypeStruct((2,), jnp.float32)
     if operator:
-        with pytest.raises(ValueError, match=r"increments of f32\[2\]"):
+        with pytest.raises(ValueError, match="structure|different"):
             solve(single, jnp.ones(2))
     else:
         # Diffrax multiplies arrays of different precision.

@@ -81,8 +81,7 @@ def test_state_and_noise_may_be_any_pytrees():
         return vf, products, ends, defect
 
     vf, products, ends, defect = all_at_once((p, q))
-    assert vf[0]["x"]["bath"].shape == (1, 2, 2)
-    assert vf[0]["x"]["drive"].shape == (1, 2)
+    assert vf[0]["x"].shape == (1, 2, 3)
     jax.tree.map(ft.partial(np.testing.assert_allclose, atol=1e-15), *products)
     for ys in ends:
         assert jax.tree.structure(ys) == jax.tree.structure((p, q))
