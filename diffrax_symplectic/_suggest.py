@@ -185,6 +185,11 @@ def suggest_solver(
     if gamma is not None:
         noises += " and friction"
     system = _system(structures, not_separable, noises)
+    if any(isinstance(path, diffrax.UnsafeBrownianPath) for path in paths):
+        system += (
+            " Its `diffrax.UnsafeBrownianPath` rounds times to 32 bits, and repeats its "
+            "noise late in a run (Diffrax's issue 733): use one of the paths below."
+        )
     return Suggestions(f"For {want} approximation. {system}", found)
 
 

@@ -1,4 +1,4 @@
-from ._stepwise import AbstractStepwisePath, GivenPath, Increment
+from ._stepwise import AbstractStepwisePath, AbstractWrappedPath, GivenPath, Increment
 from ._stepwise import (
     checked_shape,
     increment_struct,

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -15,6 +16,7 @@ from jaxtyping import Array, Float, PyTree
 from .._batch import materialize
 from .._brownian import (
     AbstractLaw,
+    AbstractWrappedPath,
     drives,
     FixedStepBrownianPath,
     GivenPath,
@@ -28,7 +30,7 @@ from .._brownian import (
     WeakBrownianPath,
 )
 from .._compat import direction, ω
-from .._custom_types import Args
+from .._custom_types import Args, RealScalarLike
 from ._vector_fields import (
     apply,
     apply_brackets,
@@ -108,6 +110,7 @@ def controls(
 ) -> dict[str, list]:
     """The random variables of the step from `t0` to `t1`, for each noise term, and the
     `optional` ones if all increments hold them."""
+    t1 = _within_resolution(noise, t0, t1)
     options = {} if names == ["W"] else {"use_levy": True}
     drawn = lambda: [term.contr(t0, t1, **options) for term in noise]
     cheap = all(map(_is_cheap, brownian_paths(noise)))
@@ -136,6 +139,29 @@ def _in_time(term: diffrax.AbstractTerm, name: str, x: PyTree[Array]) -> PyTree[
     back."""
     even = name in VARIABLES and VARIABLES[name].even
     return (direction(term) * x**ω).ω if even else x
+
+
+def _within_resolution(noise: tuple, t0, t1) -> RealScalarLike:
+    """`t1`, with an error when run if a tree interpolates within the step."""
+    h = jnp.abs(t1 - t0)
+    for path in map(_innermost, brownian_paths(noise)):
+        if isinstance(path, diffrax.VirtualBrownianTree):
+            tol = path.tol * (path.t1 - path.t0)  # kept in units of its length
+            # A step of a rounding error is none: Diffrax takes such at the end of a solve.
+            t1 = eqx.error_if(
+                jnp.asarray(t1),
+                (h < 0.999 * tol) & (h > 1e-6 * tol),
+                "A step is shorter than `tol` of the `VirtualBrownianTree`, which only "
+                "interpolates there, so that the noise would be too small. Pass a smaller "
+                "`tol`, or for fixed steps `FixedStepBrownianPath(shape, key)`.",
+            )
+    return t1
+
+
+def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
+    while isinstance(path, AbstractWrappedPath):
+        path = path.path
+    return path
 
 
 def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:

@@ -226,3 +226,22 @@ def test_bad_arguments_are_refused():
         make(jax.ShapeDtypeStruct((), jnp.int32), jr.key(0))
     with pytest.raises(ValueError, match="needs a random key"):
         make((), 0)  # pyright: ignore
+
+
+def test_steps_shorter_than_the_tolerance_of_a_tree_are_an_error():
+    # The tree would interpolate, and the noise have a fraction of its variance.
+    def solve(h, tol):
+        tree = diffrax.VirtualBrownianTree(0.0, 4.0, tol, (), jr.key(0))
+        path = ds.TruncatedBrownianPath(tree)
+        terms = ds.hamiltonian_terms(
+            lambda t, p, q, a: p**2 / 2, lambda t, p, q, a: q, path
+        )
+        y0 = jnp.array(0.0), jnp.array(1.0)
+        return diffrax.diffeqsolve(
+            terms, ds.StormerVerlet(), 1.0, 1.0 + 2 * h, h, y0
+        ).ys
+
+    assert jnp.all(jnp.isfinite(jnp.array(solve(0.1, 0.1))))
+    for h, tol in ((0.09, 0.1), (0.1, 0.5)):
+        with pytest.raises(Exception, match="Pass a smaller `tol`"):
+            jax.block_until_ready(solve(h, tol))

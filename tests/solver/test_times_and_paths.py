@@ -153,10 +153,14 @@ def test_suggestions_keep_recorded_noise():
         assert isinstance(best.terms(jr.key(1)).terms[1].path, ds.WeakBrownianPath)
 
 
-def test_noise_does_not_repeat_late_in_a_run_as_it_does_on_a_path_of_diffrax():
+def test_suggestions_tell_of_a_path_of_diffrax_that_repeats_its_noise():
+    y0 = jnp.zeros(()), jnp.ones(())
     unsafe = diffrax.UnsafeBrownianPath((), jr.key(0))
     ours = ds.FixedStepBrownianPath((), jr.key(0))
-    # If Diffrax has mended it, take it out of the docstring of `FixedStepBrownianPath`.
+    said = lambda path: ds.suggest_solver(_oscillator(path), 0, y0, want="weak").system
+    assert "repeats its noise" in said(unsafe)
+    assert "repeats" not in said(ours)
+    # If Diffrax has mended it, take out this sentence, and the ones in FAQ and docstrings.
     t = 4096 + 1e-4 * jnp.arange(10_001)
     draw = lambda path: jax.vmap(path.evaluate)(t[:-1], t[1:]) / jnp.sqrt(jnp.diff(t))
     distinct = lambda path: len(np.unique(np.round(draw(path), 9)))
