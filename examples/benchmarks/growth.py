@@ -173,12 +173,11 @@ CASES = {
 }
 COLUMNS = (*("$d$", "Heun, µs", "time", "compilation", "value and gradient", "memory"),)
 INTRODUCTION = """\
-{machine}. float64, $h = {h}$, {steps} steps, {paths} paths, three-point increments for all
-solvers, $d$ degrees of freedom. Made by `python -m examples.benchmarks.growth`.
+{machine}. float64, $h = {h}$, {steps} steps, {paths} paths, three-point increments, $d$
+degrees of freedom. Made by `python -m examples.benchmarks.growth`.
 
-The first column of times is microseconds per path and step of Diffrax's Heun, which
-evaluates twice a step. The others are ratios of `ImplicitMidpoint` to Heun: time per path
-and step, processor time of tracing and compiling, time of value and gradient, and memory.
+The cost of `ImplicitMidpoint` relative to Diffrax's Heun, and microseconds per path and step
+of Heun. "Compilation" is the processor time to trace and compile.
 """
 
 
@@ -201,7 +200,7 @@ def main() -> None:
     lines += [
         "## Many noises",
         "",
-        "Microseconds per path and step of an array of 16 oscillators with $m$ noises.",
+        "Microseconds per path and step, for 16 oscillators with $m$ noises.",
         "",
         '| $m$ | Heun | ImplicitMidpoint | SRKw3("c") | SRKw2 |',
         "|---" * 5 + "|",

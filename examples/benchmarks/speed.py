@@ -199,7 +199,7 @@ def main() -> None:
         "# Speed",
         "",
         f"Nanoseconds per path and step. {machine()}. float64, $h = {H}$, {STEPS} steps, "
-        "best of 7 runs. Gaussian increments come from `FixedStepBrownianPath`, but for "
+        "best of 7 runs. Gaussian increments come from `FixedStepBrownianPath`, except in "
         "the first row. Compilation is the processor time to trace and compile the solve "
         "of 1,000 paths. Made by `python -m examples.benchmarks.speed`.",
     ]
