@@ -214,16 +214,9 @@ def _by_hand(system: System) -> Callable:
     return solve
 
 
-def _unknowns(system: System, solver) -> int:
-    """Of the largest system of a step."""
-    size = sum(x.size for x in jax.tree.leaves(system.y0))
-    return size * max(solver.stage_vectors(1), default=0)
-
-
 class Row(NamedTuple):
     system: System
     name: str
-    unknowns: str
     nanoseconds: tuple[float, ...]
     # Value and gradient as a multiple of that, at the least and the largest step size.
     gradient: tuple[float, ...]
@@ -251,9 +244,8 @@ def measure(system: System) -> list[Row]:
             failed[name].append(1 - float(jnp.mean(call(batch, h)[1])))
     rows = []
     for name in calls:
-        unknowns = str(_unknowns(system, of[name])) if name in of else ""
         row = Row(
-            system, name, unknowns, tuple(times[name]),
+            system, name, tuple(times[name]),
             _over_value(name, calls, gradients, batch), tuple(failed[name]),
             tuple(_evaluations(system, of[name], h) for h in SHOWN if name in of),
         )  # fmt: skip
@@ -281,7 +273,6 @@ Nanoseconds per path and step, random numbers included. {machine}. float64, {ste
 512 paths unless stated (2,048 divided by $d$ for a system of size $d$, at least 8). Made by
 `python -m examples.benchmarks.step_sizes`.
 
-- $n$ is the number of unknowns of the largest system in a step.
 - Diffrax's `Heun` costs nearly the same at every step size, here $h = 0.1$. So does the midpoint
   rule by hand in the picture, with twelve fixed-point iterations in every step.
 - "Gradient" is the time of value and gradient in reverse mode relative to the value, at
@@ -292,8 +283,8 @@ Nanoseconds per path and step, random numbers included. {machine}. float64, {ste
 
 ![Cost of a step against frequency times step size](step_sizes.png)
 
-| system | solver | $n$ | {sizes} | `Heun` | gradient | evaluations |
-|---|---|---|{lines}---|---|---|
+| system | solver | {sizes} | `Heun` | gradient | evaluations |
+|---|---|{lines}---|---|---|
 """
 
 
@@ -316,7 +307,7 @@ def page(rows: list[Row]) -> str:
         ]
         gradient = "/".join(f"{x:.1f}" for x in row.gradient)
         evaluations = "/".join(f"{x:.0f}" for x in row.evaluations)
-        line = system, row.name, row.unknowns, *cells, heun, gradient, evaluations
+        line = system, row.name, *cells, heun, gradient, evaluations
         text += f"| {' | '.join(line)} |\n".replace("|  |", "| |")
         system, heun = "", ""
     return text
