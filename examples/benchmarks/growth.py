@@ -174,8 +174,8 @@ INTRODUCTION = """\
 {machine}. float64, $h = {h}$, {steps} steps, {paths} paths, three-point increments, $d$
 degrees of freedom. Made by `python -m examples.benchmarks.growth`.
 
-The cost of `ImplicitMidpoint` relative to Diffrax's Heun, and microseconds per path and step
-of Heun. "Compilation" is the processor time to trace and compile. The noise is
+The cost of `ImplicitMidpoint` relative to Diffrax's Heun, and microseconds per path and
+step of Heun. "Compilation" is the processor time to trace and compile. The noise is
 $H_1 = 0.1\\, p \\cdot q$, for the ring $H_1 = 0.1 (|p|^2 + |q|^2)$.
 """
 

@@ -301,8 +301,8 @@ def main() -> None:
         "best member, the default and the paper's, relative to the row with 1.00: "
         "geometric means over six problems, with stronger and weaker noise. For weak "
         "families (SRKw), exact local errors of all first and second moments, "
-        f"$h = 0.01$, noise of strength {WEAK[0]} and {WEAK[1]}. For strong ones (SRKs), root "
-        "mean square errors of 400 paths at $t = 1$, $h = 1/16$, strength "
+        f"$h = 0.01$, noise of strength {WEAK[0]} and {WEAK[1]}. For strong ones (SRKs), "
+        "root mean square errors of 400 paths at $t = 1$, $h = 1/16$, strength "
         f"{STRONG[0]} and {STRONG[1]}. Made by `python -m examples.benchmarks.members`.",
         "",
         _row(["family", "member", "stronger", "weaker"]),

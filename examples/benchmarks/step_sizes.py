@@ -273,12 +273,12 @@ Nanoseconds per path and step, random numbers included. {machine}. float64, {ste
 512 paths unless stated (2,048 divided by $d$ for a system of size $d$, at least 8). Made by
 `python -m examples.benchmarks.step_sizes`.
 
-- Diffrax's `Heun` costs nearly the same at every step size, here $h = 0.1$. So does the midpoint
-  rule by hand in the picture, with twelve fixed-point iterations in every step.
+- Diffrax's `Heun` costs nearly the same at every step size, here $h = 0.1$. So does the
+  midpoint rule by hand in the picture, with twelve fixed-point iterations in every step.
 - "Gradient" is the time of value and gradient in reverse mode relative to the value, at
   $h = 0.01$ and $0.4$.
-- "Evaluations" counts pairs of one evaluation of the drift and one of the noise, in a step of a
-  single path, at the three step sizes.
+- "Evaluations" counts pairs of one evaluation of the drift and one of the noise, in a step
+  of a single path, at the three step sizes.
 - In brackets: the share of paths with a failed step. A long step may have no solution.
 
 ![Cost of a step against frequency times step size](step_sizes.png)
