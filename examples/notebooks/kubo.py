@@ -2,8 +2,8 @@
 # %% [markdown]
 # # The Kubo oscillator
 #
-# An oscillator has a noisy frequency, as a spin has in a fluctuating magnetic field. In
-# the Stratonovich sense it follows
+# An oscillator has a noisy frequency, like a spin in a fluctuating magnetic field. In the
+# Stratonovich sense it follows
 #
 # $$\mathrm{d}p = -q\,\mathrm{d}t - \sigma q \circ \mathrm{d}w, \qquad
 #   \mathrm{d}q = p\,\mathrm{d}t + \sigma p \circ \mathrm{d}w.$$
@@ -122,8 +122,9 @@ estimate = ds.expectation(
 )
 times = np.array([1.0, 2.0, 3.0, 4.0])
 exact = np.exp(-(sigma**2) * times / 2) * np.cos(times)
-for values in (estimate.mean, estimate.error, exact):
-    print(np.array(values).round(5))
+rows = {"estimate": estimate.mean, "its error": estimate.error, "exact": exact}
+for name, values in rows.items():
+    print(f"{name:10}", *(f"{x:9.5f}" for x in np.asarray(values)))
 
 # %% [markdown]
 # ## Exercise
