@@ -110,10 +110,10 @@ for name, (system, solver, start) in cases.items():
     print(f"{name:33} Poisson defect {defect:.1e}")
 
 # %% [markdown]
-# A Poisson integrator also keeps the energy close to its initial value in long runs without
-# noise, where the exact energy is constant. Heun's method with $X$ renormalized does not,
-# although every point lies on the sphere. (The midpoint rule for $X$ conserves the energy of
-# this body, but only because it is quadratic.)
+# A Poisson integrator also keeps the energy close to its initial value in long runs
+# without noise, where the exact energy is constant. Heun's method with $X$ renormalized
+# does not, although every point lies on the sphere. (The midpoint rule for $X$ conserves
+# the energy of this body, but only because it is quadratic.)
 
 
 # %%

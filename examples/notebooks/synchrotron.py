@@ -102,8 +102,8 @@ plt.show()
 # With or without noise, each step of Euler's method multiplies the energy of small
 # oscillations by $1 + \omega^2 h^2$. Here it grows by a factor of $e$ in 12 units of
 # time, and soon nearly all particles have left the bucket. Shorter steps only delay this.
-# A symplectic step preserves area in phase space, so it adds no such heating: what is left
-# is the effect of the noise.
+# A symplectic step preserves area in phase space, so it adds no such heating: what is
+# left is the effect of the noise.
 
 # %%
 separatrix = omega**2  # the energy at the edge of the bucket
