@@ -1,5 +1,8 @@
 """Runs the scripts in Jupyter and writes them as notebooks, with what they print and draw:
-`python -m examples.notebooks [--output folder]`."""
+`python -m examples.notebooks [--output folder]`. Needs the extra `docs`."""
+
+# The checks of types run without that extra.
+# pyright: reportMissingImports=false
 
 import argparse
 import os
