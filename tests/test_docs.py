@@ -3,6 +3,7 @@
 import csv
 import importlib
 import inspect
+import json
 import re
 import textwrap
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._suggest import LANGEVIN, SOLVERS
+from examples.notebooks import read_cells, SCRIPTS
 
 
 ROOT = Path(__file__).parent.parent
@@ -67,6 +69,27 @@ def test_tables_of_solvers_are_up_to_date(tables):
     for page in (ROOT / "docs").rglob("*.md"):
         text = page.read_text()
         assert tables.with_tables(text) == text, "run `python docs/_tables.py`"
+
+
+def test_notebooks_are_made_from_their_scripts():
+    assert len(SCRIPTS) == 4
+    folder = ROOT / "docs" / "examples"
+    assert {p.stem for p in folder.glob("*.ipynb")} == {p.stem for p in SCRIPTS}
+    for script in SCRIPTS:
+        file = folder / f"{script.stem}.ipynb"
+        cells = json.loads(file.read_text())["cells"]
+        found = [
+            (c["cell_type"], c["metadata"].get("title", ""), "".join(c["source"]))
+            for c in cells
+        ]
+        assert found == read_cells(script), "run `python -m examples.notebooks`"
+        # They were run from top to bottom, drew what has a title, and are small.
+        code = [c for c in cells if c["cell_type"] == "code"]
+        assert [c["execution_count"] for c in code] == [*range(1, len(code) + 1)]
+        for cell in code:
+            drawn = [o for o in cell["outputs"] if "image/png" in o.get("data", {})]
+            assert len(drawn) == ("title" in cell["metadata"])
+        assert file.stat().st_size < 150_000
 
 
 def test_docs_list_every_solver():

@@ -297,14 +297,13 @@ def main() -> None:
     lines = [
         "# Members of families",
         "",
-        "The order conditions leave parameters free. The table has the best member of a "
-        "family, the default and the paper's: errors relative to the row of 1.00, "
-        "geometric means over six problems, for two strengths of the noise. For weak "
-        "families, SRKw, the error is the exact local one of all first and second "
-        f"moments, at $h = 0.01$, for strengths {WEAK[0]} and {WEAK[1]}. For strong "
-        "ones, SRKs, it is the root mean square of 400 paths at $t = 1$, with "
-        f"$h = 1/16$, for {STRONG[0]} and {STRONG[1]}. Made by `python -m "
-        "examples.benchmarks.members`.",
+        "Some families have parameters that the order conditions leave free. Errors of the "
+        "best member, the default and the paper's, relative to the row with 1.00: "
+        "geometric means over six problems, with stronger and weaker noise. For weak "
+        "families (SRKw), exact local errors of all first and second moments, "
+        f"$h = 0.01$, noise of strength {WEAK[0]} and {WEAK[1]}. For strong ones (SRKs), "
+        "root mean square errors of 400 paths at $t = 1$, $h = 1/16$, strength "
+        f"{STRONG[0]} and {STRONG[1]}. Made by `python -m examples.benchmarks.members`.",
         "",
         _row(["family", "member", "stronger", "weaker"]),
         "|---|---|---|---|",

@@ -194,24 +194,28 @@ def measure(make_terms: Callable, solvers: list) -> tuple[list[dict], dict]:
 
 
 def main() -> None:
-    head = [*(f"{n:,} paths" for n in SIZES), "compile, s"]
+    head = ["system", "solver", *(f"{n:,} paths" for n in SIZES), "compile, s"]
     lines = [
         "# Speed",
         "",
         f"Nanoseconds per path and step. {machine()}. float64, $h = {H}$, {STEPS} steps, "
-        "best of 7 runs. Gaussian increments come from `FixedStepBrownianPath`, but for "
-        "the first row. Compilation is the processor time to trace and compile the solve "
-        "of 1,000 paths. Made by `python -m examples.benchmarks.speed`.",
+        "best of 7 runs. Gaussian increments come from `FixedStepBrownianPath`, except for "
+        "`Heun` with `UnsafeBrownianPath`. Compilation is the processor time to trace and "
+        "compile the solve of 1,000 paths. Made by `python -m examples.benchmarks.speed`.",
+        "",
+        f"| {' | '.join(head)} |",
+        "|---" * len(head) + "|",
     ]
     for title, (make_terms, solvers) in MODELS.items():
         times, preparation = measure(make_terms, solvers)
-        lines += ["", f"## {title}", "", f"| solver | {' | '.join(head)} |"]
-        lines.append("|---" * 4 + "|")
         for name, *_ in solvers:
             cells = [t[name] / n / STEPS * 1e9 for t, n in zip(times, SIZES)]
-            row = [name, *(f"{x:,.1f}" for x in cells), f"{preparation[name]:.2f}"]
-            lines.append("| " + " | ".join(row) + " |")
+            row = [*(f"{x:,.1f}" for x in cells), f"{preparation[name]:.2f}"]
+            lines.append(
+                f"| {' | '.join([title, name, *row])} |".replace("|  |", "| |")
+            )
             print(lines[-1], flush=True)
+            title = ""  # only in the first row of a system
     DOCS.mkdir(parents=True, exist_ok=True)
     (DOCS / "speed.md").write_text("\n".join(lines) + "\n")
 

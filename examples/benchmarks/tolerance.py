@@ -45,7 +45,7 @@ def main() -> None:
         f"coupled oscillators with one noise; float64, $h = {H}$, {STEPS:,} steps, {PATHS} "
         "paths. The default, `None`, is two units in the last place. The drift is the root "
         "mean square of the relative change of $|p|^2 + |q|^2$, which the exact solution "
-        "keeps. Made by `python -m examples.benchmarks.tolerance`.",
+        "conserves. Made by `python -m examples.benchmarks.tolerance`.",
         "",
         "| `rtol` | time, ratio to default | drift |",
         "|---|---|---|",

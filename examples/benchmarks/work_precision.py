@@ -265,9 +265,11 @@ def programs() -> dict[Any, Program]:
 
 
 def draw(axes, title: str, results: dict[str, tuple[float, Errors]]) -> list[str]:
-    """Draws errors against seconds, and returns a table. A point that is not
+    """Draws errors against seconds, and returns rows of a table. A point that is not
     clear of its own error bar is not drawn: it says nothing."""
-    lines = ["", f"## {title}", "", "| solver | error | µs |", "|---" * 3 + "|"]
+    lines = []
+    kind, _, model = title.partition(", ")
+    system = model
     for i, (name, (cost, e)) in enumerate(results.items()):
         seconds, clear = cost / e.hs, e.errors > 3 * e.std_errors
         style = "--" if name in dir(diffrax) else "-"
@@ -277,15 +279,24 @@ def draw(axes, title: str, results: dict[str, tuple[float, Errors]]) -> list[str
         )  # fmt: skip
         error, own = e.errors[SHOWN], e.std_errors[SHOWN]
         bar = f" ± {own:.0e}" if own > error / 10 else ""
-        cells = name, f"{error:.1e}{bar}", f"{seconds[SHOWN] * 1e6:.2f}"
         if name != "StratonovichMilstein":  # the picture has it
-            lines.append("| " + " | ".join(cells) + " |")
-    kind, _, model = title.partition(", ")
+            cells = system, name, f"{error:.1e}{bar}", f"{seconds[SHOWN] * 1e6:.2f}"
+            lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |"))
+            system = ""  # only in the first row of a system
     axes.set(xscale="log", yscale="log", title=model)
     axes.set(xlabel="CPU seconds per path", ylabel=kind.lower())
     axes.legend(fontsize=7)
     axes.grid(alpha=0.3)
     return lines
+
+
+EXPLAINED = {
+    "weak": f"At $h = 1/{1 / HS[SHOWN]:g}$; exact on linear models, from `ArrayRQMC` on "
+    "the others.",
+    "strong": f"At $h = 1/{1 / HS[1 + SHOWN]:g}$; root mean squares over 500 Brownian "
+    "paths (`compare_solvers`).",
+}
+HEAD = "| system | solver | error | µs |", "|---" * 4 + "|"
 
 
 def main() -> None:
@@ -294,19 +305,16 @@ def main() -> None:
         "",
         f"{machine()}. Made by `python -m examples.benchmarks.work_precision`.",
         "",
-        "Weak errors are exact on linear models and come from `ArrayRQMC` elsewhere.",
-        "Strong errors are root mean squares over 500 Brownian paths (`compare_solvers`).",
         "Bars are three standard errors; points within their bar of zero are not drawn.",
-        "Times are of one core, in batches of 10,000 paths. Tables have weak errors at",
-        f"$h = 1/{1 / HS[SHOWN]:g}$ and strong ones at $h = 1/{1 / HS[1 + SHOWN]:g}$, "
-        "with a standard error",
-        "where it is more than a tenth of the error, and microseconds per path.",
+        "Times are of one core, in batches of 10,000 paths. The tables have a standard",
+        "error where it is more than a tenth of the error, and microseconds per path.",
         "",
         "![Errors against CPU seconds per path](work_precision.png)",
     ]
     figure, axes = plt.subplots(5, 2, figsize=(11, 22), layout="constrained")
     seconds = costs(programs())
     for column, kind in zip(axes.T, ERRORS):
+        lines += ["", f"## {kind.title()} errors", "", EXPLAINED[kind], "", *HEAD]
         for ax, model in zip(column, STRONG):
             errors = kept(kind, model).items()
             results = {name: (seconds[kind, model, name], e) for name, e in errors}
