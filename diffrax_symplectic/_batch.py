@@ -62,9 +62,11 @@ def where_pending(
     the batch, and served by parts.
     """
     arrays, static = eqx.partition(args, eqx.is_array)
-    # Traced once for each structure, though JAX batches what is in a loop several times:
-    # that saves a quarter of the tracing of `StrangGauss`.
-    call = jax.jit(lambda value, arrays: fn(value, eqx.combine(arrays, static)))
+    # Traced once, here: `vmap` would have `jax.jit` trace it once more.
+    traced = eqx.filter_closure_convert(
+        lambda value, arrays: fn(value, eqx.combine(arrays, static)), value, arrays
+    )
+    call = lambda value, arrays: traced(value, arrays)
     by_parts = jax.jit(ft.partial(_by_parts, call))
 
     # What each path has of its own, along a first axis, and what all have in common.
