@@ -52,21 +52,18 @@ def batched_like(values: _T, others: PyTree) -> _T:
 
 
 def where_pending(
-    fn: Callable[[_T, Any], _T], pending: Bool[Array, ""], value: _T, args: Any
+    fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T
 ) -> _T:
-    """`fn(value, args)` where `pending`, and `value` elsewhere. This has no derivative, and
-    `fn` must capture no arrays.
+    """`fn(value)` where `pending`, and `value` elsewhere. This has no derivative.
 
     Under `vmap` a conditional becomes a selection: all paths compute, and memory is set
     aside for all of them. Here the stragglers, for which `pending` holds, are gathered from
     the batch, and served by parts.
     """
-    arrays, static = eqx.partition(args, eqx.is_array)
     # Traced once, here: `vmap` would have `jax.jit` trace it once more.
-    traced = eqx.filter_closure_convert(
-        lambda value, arrays: fn(value, eqx.combine(arrays, static)), value, arrays
-    )
-    call = lambda value, arrays: traced(value, arrays)
+    traced = eqx.filter_closure_convert(fn, value)
+    arrays, static = eqx.partition(traced, eqx.is_array)
+    call = lambda value, arrays: eqx.combine(arrays, static)(value)
     by_parts = jax.jit(ft.partial(_by_parts, call))
 
     # What each path has of its own, along a first axis, and what all have in common.

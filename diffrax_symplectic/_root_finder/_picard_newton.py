@@ -98,13 +98,36 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
 
     def step(self, fn, y, args, options, state, tags):
         del state, tags
-        scale = eqx.filter_closure_convert(options.get("scale", lambda k: k), y)
+        scale = options.get("scale", lambda k: k)
         pending = all_finite(y)
-        start, solved = self._sweep(fn, y, args, scale, pending)
-        rest = self, fn, y, args, scale
-        value = start, batched_like(_State(solved, _SUCCESSFUL), start)
-        y, state = where_pending(_newton, pending & ~solved, value, rest)
-        return y, state, fn(y, args)[1]
+        found, solved = self._sweep(fn, y, args, scale, pending)
+        # As vectors: a loop selects, gathers and scatters each array of its state by
+        # kernels of their own.
+        guess, restore = jfu.ravel_pytree(y)
+        residual = lambda k: jfu.ravel_pytree(fn(restore(k), args)[0])[0]
+        newton = Newton(
+            start=guess,
+            restore=restore,
+            rtol=self.rtol,
+            atol=self.atol,
+            norm=self.norm,
+            linear_solver=self.linear_solver,
+        )
+
+        def rescue(value):
+            sol = optx.root_find(
+                lambda k, _: residual(k),
+                newton,
+                value[0],
+                options=dict(scale=scale),
+                max_steps=self.newton_steps,
+                throw=False,
+            )
+            return sol.value, sol.result == optx.RESULTS.successful, sol.result
+
+        value = jfu.ravel_pytree(found)[0], solved, _SUCCESSFUL
+        k, solved, result = where_pending(rescue, pending & ~solved, value)
+        return restore(k), _State(solved, result), None
 
     def _sweep(self, fn, y, args, scale, pending) -> _Found:
         tolerance = Tolerance(self.rtol, self.atol, self.norm)
@@ -120,30 +143,3 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del fn, args, options, state, tags, result
         return y, aux, {}
-
-
-def _newton(value: tuple[Any, _State], rest: Any) -> tuple[Any, _State]:
-    """The solution by Newton's method, on a vector: a loop selects, gathers and scatters
-    each array of its state by kernels of their own."""
-    finder, fn, guess, args, scale = rest
-    k, restore = jfu.ravel_pytree(value[0])
-    start, _ = jfu.ravel_pytree(guess)
-    newton = Newton(
-        start=start,
-        restore=restore,
-        rtol=finder.rtol,
-        atol=finder.atol,
-        norm=finder.norm,
-        linear_solver=finder.linear_solver,
-    )
-    sol = optx.root_find(
-        lambda k, args: jfu.ravel_pytree(fn(restore(k), args)[0])[0],
-        newton,
-        k,
-        args,
-        dict(scale=scale),
-        max_steps=finder.newton_steps,
-        throw=False,
-    )
-    solved = sol.result == optx.RESULTS.successful
-    return restore(sol.value), _State(solved, sol.result)
