@@ -44,11 +44,27 @@ def batched_like(values: _T, others: PyTree) -> _T:
     and loops within loops as many times each. So what a loop begins with is batched before
     it. XLA removes this. `StrangGauss` is traced in half the time.
     """
-    arrays = [x for x in jtu.tree_leaves(others) if eqx.is_array(x) and x.size]
-    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-    first = [(jr.key_data(x) if is_key(x) else x).reshape(-1)[0] for x in arrays]
-    no = ft.reduce(jnp.logical_or, [x != x for x in first], jnp.array(False)) & False
-    return jtu.tree_map(lambda x: jnp.where(no, x, x), values)
+    arrays = [x for x in jtu.tree_leaves(others) if eqx.is_array(x)]
+    return _batched_like(values, arrays)
+
+
+@jax.custom_jvp
+@jax.custom_batching.custom_vmap
+def _batched_like(values: _T, others: list[Array]) -> _T:
+    del others
+    return values
+
+
+@_batched_like.fun.def_vmap
+def _(size, in_batched, values, others):
+    spread = lambda b, x: x if b else jnp.broadcast_to(x, (size, *jnp.shape(x)))
+    values = jtu.tree_map(spread, in_batched[0], values)
+    return _batched_like(values, others), jtu.tree_map(lambda _: True, values)
+
+
+@_batched_like.defjvp
+def _(primals, tangents):
+    return _batched_like(*primals), tangents[0]
 
 
 def where_pending(
@@ -115,9 +131,10 @@ def _by_parts(call, pending, value, own, common):
     def serve_part(carry):
         pending, value = carry
         # As `jnp.nonzero`, which is compiled to a dozen kernels. Where fewer paths are
-        # left, the numbers beyond the batch are dropped in the end.
+        # left, the numbers beyond the batch are dropped in the end. Unsigned ones need no
+        # code for counting from the end.
         flag, which = lax.top_k(pending.astype(jnp.float32), part)
-        which = jnp.where(flag > 0, which, size)
+        which = jnp.where(flag > 0, which, size).astype(jnp.uint32)
         few, few_own = jtu.tree_map(lambda x: x[which], (value, own))
         one = lambda value, own: call(value, eqx.combine(own, common))
         new = jax.vmap(one)(few, few_own)
