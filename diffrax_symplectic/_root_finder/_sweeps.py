@@ -17,6 +17,9 @@ from ._tolerance import converged, Correction, log2, MARGIN, Tolerance
 
 Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]
 
+# Sweeps before the first convergence check, in double and in single precision: those that a
+# short step needs. A sweep of a doubled system evaluates everything twice: fewer will do.
+_FIRST, _FIRST_DOUBLED = (9, 6), (6, 5)
 # The most sweeps between two convergence checks. A rate near one is not known well.
 _MOST = 32
 # The same where corrections are as small as rounding errors.
@@ -41,32 +44,16 @@ class Halves(NamedTuple):
 
 
 class _System(NamedTuple):
-    """Equations in two halves, $p = P(p, q)$ and $q = Q(p, q)$.
+    r"""Equations in two halves, $p = P(p, q)$ and $q = Q(p, q)$.
 
     - `p`, `q`: these functions of both halves.
-    - `correction`: how far the halves are from a solution, by those before a sweep and
-        after it.
-    - `first`: sweeps before the first convergence check, in double and in single precision:
-        those that a short step needs.
+    - `doubled`: whether both halves are copies of the same unknowns, for $y = \Phi(y)$ as
+        $p = \Phi(q)$, $q = \Phi(p)$.
     """
 
     p: Callable[[Halves], PyTree[Array]]
     q: Callable[[Halves], PyTree[Array]]
-    correction: Callable[[Halves, Halves], PyTree[Array]]
-    first: tuple[int, int]
-
-
-def _partitioned(image: Map) -> _System:
-    change = lambda before, y: (y**ω - before**ω).ω
-    return _System(lambda y: image(y).p, lambda y: image(y).q, change, (9, 6))
-
-
-def _doubled(image: Map) -> _System:
-    r"""$y = \Phi(y)$ as $p = \Phi(q)$, $q = \Phi(p)$. A sweep evaluates everything
-    twice, so that fewer will do."""
-    # Where both solve y = \Phi(\Phi(y)), only their difference shows it.
-    apart = lambda before, y: (y.q**ω - y.p**ω).ω
-    return _System(lambda y: image(y.q), lambda y: image(y.p), apart, (6, 5))
+    doubled: bool
 
 
 class _State(NamedTuple):
@@ -115,15 +102,17 @@ def sweep(
     once more, relaxed like this.
     """
     in_halves = isinstance(guess, Halves)
-    system = _partitioned(image) if in_halves else _doubled(image)
-    start = guess if in_halves else Halves(guess, guess)
-    value_of = lambda y: y if in_halves else y.q
+    if in_halves:
+        start, value_of, first = guess, lambda y: y, _FIRST
+        system = _System(lambda y: image(y).p, lambda y: image(y).q, doubled=False)
+    else:
+        start, value_of, first = Halves(guess, guess), lambda y: y.q, _FIRST_DOUBLED
+        system = _System(lambda y: image(y.q), lambda y: image(y.p), doubled=True)
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
-    first = system.first[jnp.finfo(dtype).bits < 64]
+    first = first[jnp.finfo(dtype).bits < 64]
 
     def step(state: _State) -> _State:
-        before, y = _iterate(system, state)
-        change = system.correction(before, y)
+        change, y = _iterate(system, state)
         correction = tolerance.measure(change, scale(value_of(y)))
         # The first of the sweeps changed the values by no more than the state is.
         earlier = jnp.minimum(state.level, log2(correction.bound))
@@ -146,8 +135,9 @@ def sweep(
     return value_of(state.y), state.solved
 
 
-def _iterate(system: _System, state: _State) -> tuple[Halves, Halves]:
-    """The iterate after all sweeps until the next check, and the one before it."""
+def _iterate(system: _System, state: _State) -> tuple[PyTree[Array], Halves]:
+    """How far the halves are from a solution after all sweeps until the next check, and
+    these halves."""
 
     def relaxed(new: PyTree[Array], old: PyTree[Array]) -> PyTree[Array]:
         omega = lambda x: state.relaxation.astype(x.dtype)
@@ -157,9 +147,15 @@ def _iterate(system: _System, state: _State) -> tuple[Halves, Halves]:
         y = Halves(relaxed(system.p(y), y.p), y.q)
         return Halves(y.p, relaxed(system.q(y), y.q))
 
-    # A loop that also kept the iterate before would copy it in each sweep.
+    if system.doubled:
+        y = lax.fori_loop(0, state.ahead, once, state.y)
+        # Where both solve y = \Phi(\Phi(y)), only their difference shows it.
+        return (y.q**ω - y.p**ω).ω, y
+    # A loop that also kept the iterate before would copy it in each sweep: 1.1 to 1.4 times
+    # as long for 64 unknown pairs.
     before = lax.fori_loop(0, state.ahead - 1, once, state.y)
-    return before, once(None, before)
+    y = once(None, before)
+    return (y**ω - before**ω).ω, y
 
 
 def _check(
