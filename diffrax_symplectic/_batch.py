@@ -3,12 +3,11 @@ memory for all of them."""
 
 import functools as ft
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, PyTree
@@ -67,9 +66,7 @@ def _(primals, tangents):
     return _batched_like(*primals), tangents[0]
 
 
-def where_pending(
-    fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T
-) -> _T:
+def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -> _T:
     """`fn(value)` where `pending`, and `value` elsewhere. This has no derivative.
 
     Under `vmap` a conditional becomes a selection: all paths compute, and memory is set
@@ -96,37 +93,29 @@ def where_pending(
             x = x if batched else jnp.broadcast_to(x, (size, *x.shape))
             return x.reshape(size * n, *x.shape[2:])
 
-        def repeated(batched, x):
-            return jnp.repeat(x, n, axis=0) if batched else None
-
         each = jtu.tree_map(joined, tuple(in_batched[:3]), (pending, value, own))
-        more = jtu.tree_map(repeated, in_batched[3], common)
-        rest = jtu.tree_map(lambda b, x: None if b else x, in_batched[3], common)
         pending, value, own = each
+        repeat = lambda b, x: jnp.repeat(x, n, axis=0) if b else None
+        more = jtu.tree_map(repeat, in_batched[3], common)
+        rest = jtu.tree_map(lambda b, x: None if b else x, in_batched[3], common)
         value = serve(pending, value, eqx.combine(own, more), rest)
         apart = lambda x: x.reshape(size, n, *x.shape[1:])
         return jtu.tree_map(apart, value), jtu.tree_map(lambda _: True, value)
 
-    @jax.custom_batching.custom_vmap
-    def alone(pending, value, arrays):
-        keep = lambda value, arrays: value
-        return lax.cond(pending, call, keep, value, arrays)
-
-    @alone.def_vmap
-    def _(size, in_batched, pending, value, arrays):
-        spread = lambda b, x: x if b else jnp.broadcast_to(x, (size, *jnp.shape(x)))
-        pending, value = jtu.tree_map(spread, tuple(in_batched[:2]), (pending, value))
-        own = jtu.tree_map(lambda b, x: x if b else None, in_batched[2], arrays)
-        common = jtu.tree_map(lambda b, x: None if b else x, in_batched[2], arrays)
-        value = serve(pending, value, own, common)
-        return value, jtu.tree_map(lambda _: True, value)
-
-    return alone(pending, value, arrays)
+    # One path is a batch of one.
+    none = jtu.tree_map(lambda _: None, arrays)
+    value = serve(*jtu.tree_map(lambda x: x[None], (pending, value)), none, arrays)
+    return jtu.tree_map(lambda x: x[0], value)
 
 
 def _by_parts(call, pending, value, own, common):
     size = len(pending)
     part = -(-size // _PARTS)
+    one = lambda value, own: call(value, eqx.combine(own, common))
+    if size == 1:
+        alone = jtu.tree_map(lambda x: x[0], (value, own))
+        new = lax.cond(pending[0], one, lambda value, _: value, *alone)
+        return jtu.tree_map(lambda x: x[None], new)
 
     def serve_part(carry):
         pending, value = carry
@@ -135,9 +124,7 @@ def _by_parts(call, pending, value, own, common):
         # code for counting from the end.
         flag, which = lax.top_k(pending.astype(jnp.float32), part)
         which = jnp.where(flag > 0, which, size).astype(jnp.uint32)
-        few, few_own = jtu.tree_map(lambda x: x[which], (value, own))
-        one = lambda value, own: call(value, eqx.combine(own, common))
-        new = jax.vmap(one)(few, few_own)
+        new = jax.vmap(one)(*jtu.tree_map(lambda x: x[which], (value, own)))
         scatter = lambda x, y: x.at[which].set(y, mode="drop")
         return scatter(pending, False), jtu.tree_map(scatter, value, new)
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, TypeAlias
 import equinox as eqx
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree, Scalar
@@ -33,10 +34,12 @@ class AbstractBlocks(eqx.Module):
 
 
 class _State(NamedTuple):
-    """Whether the equations are solved, and if they cannot be, why."""
+    """Whether the equations are solved, if they cannot be, why, and the structure of
+    auxiliary output."""
 
     solved: Bool[Array, ""]
     result: optx.RESULTS
+    aux: Any
 
 
 class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _State]):
@@ -93,11 +96,11 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
                 raise ValueError(f"`{name}` of `PicardNewton` must be >= 0; got {n}.")
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
-        del fn, args, options, f_struct, aux_struct, tags
-        return batched_like(_State(jnp.array(False), _SUCCESSFUL), y)
+        del fn, args, options, f_struct, tags
+        return _State(*batched_like((jnp.array(False), _SUCCESSFUL), y), aux_struct)
 
     def step(self, fn, y, args, options, state, tags):
-        del state, tags
+        del tags
         scale = options.get("scale", lambda k: k)
         pending = all_finite(y)
         found, solved = self._sweep(fn, y, args, scale, pending)
@@ -123,11 +126,14 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
                 max_steps=self.newton_steps,
                 throw=False,
             )
-            return sol.value, sol.result == optx.RESULTS.successful, sol.result
+            return sol.value, sol.result
 
-        value = jfu.ravel_pytree(found)[0], solved, _SUCCESSFUL
-        k, solved, result = where_pending(rescue, pending & ~solved, value)
-        return restore(k), _State(solved, result), None
+        value = jfu.ravel_pytree(found)[0], _SUCCESSFUL
+        k, result = where_pending(rescue, pending & ~solved, value)
+        y, solved = restore(k), result == _SUCCESSFUL
+        # The equations once more only where there is auxiliary output.
+        aux = fn(y, args)[1] if jtu.tree_leaves(state.aux) else state.aux
+        return y, _State(solved, result, state.aux), aux
 
     def _sweep(self, fn, y, args, scale, pending) -> _Found:
         tolerance = Tolerance(self.rtol, self.atol, self.norm)
