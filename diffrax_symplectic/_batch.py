@@ -41,29 +41,31 @@ def batched_like(values: _T, others: PyTree) -> _T:
 
     JAX batches a loop anew whenever one more of the values in it turns out to be batched,
     and loops within loops as many times each. So what a loop begins with is batched before
-    it. XLA removes this. `StrangGauss` is traced in half the time.
+    it: `StrangGauss` is traced in half the time.
     """
-    arrays = [x for x in jtu.tree_leaves(others) if eqx.is_array(x)]
-    return _batched_like(values, arrays)
+    return _batched(values, [x for x in jtu.tree_leaves(others) if eqx.is_array(x)])
 
 
-@jax.custom_jvp
 @jax.custom_batching.custom_vmap
-def _batched_like(values: _T, others: list[Array]) -> _T:
+def _all_or_none(values: _T, others: list[Array]) -> _T:
     del others
     return values
 
 
-@_batched_like.fun.def_vmap
+@_all_or_none.def_vmap
 def _(size, in_batched, values, others):
     spread = lambda b, x: x if b else jnp.broadcast_to(x, (size, *jnp.shape(x)))
     values = jtu.tree_map(spread, in_batched[0], values)
-    return _batched_like(values, others), jtu.tree_map(lambda _: True, values)
+    return _all_or_none(values, others), jtu.tree_map(lambda _: True, values)
 
 
-@_batched_like.defjvp
+# Rules of batching have no derivatives in reverse mode.
+_batched = jax.custom_jvp(_all_or_none)
+
+
+@_batched.defjvp
 def _(primals, tangents):
-    return _batched_like(*primals), tangents[0]
+    return _batched(*primals), tangents[0]
 
 
 def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -> _T:

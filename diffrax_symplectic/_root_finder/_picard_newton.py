@@ -104,22 +104,22 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         scale = options.get("scale", lambda k: k)
         pending = all_finite(y)
         found, solved = self._sweep(fn, y, args, scale, pending)
-        # As vectors: a loop selects, gathers and scatters each array of its state by
+        # As a vector: a loop selects, gathers and scatters each array of its state by
         # kernels of their own.
-        guess, restore = jfu.ravel_pytree(y)
-        residual = lambda k: jfu.ravel_pytree(fn(restore(k), args)[0])[0]
-        newton = Newton(
-            start=guess,
-            restore=restore,
-            rtol=self.rtol,
-            atol=self.atol,
-            norm=self.norm,
-            linear_solver=self.linear_solver,
-        )
+        k, restore = jfu.ravel_pytree(found)
+        residual = lambda k, _: jfu.ravel_pytree(fn(restore(k), args)[0])[0]
 
         def rescue(value):
+            newton = Newton(
+                start=jfu.ravel_pytree(y)[0],
+                restore=restore,
+                rtol=self.rtol,
+                atol=self.atol,
+                norm=self.norm,
+                linear_solver=self.linear_solver,
+            )
             sol = optx.root_find(
-                lambda k, _: residual(k),
+                residual,
                 newton,
                 value[0],
                 options=dict(scale=scale),
@@ -128,12 +128,11 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
             )
             return sol.value, sol.result
 
-        value = jfu.ravel_pytree(found)[0], _SUCCESSFUL
-        k, result = where_pending(rescue, pending & ~solved, value)
-        y, solved = restore(k), result == _SUCCESSFUL
+        k, result = where_pending(rescue, pending & ~solved, (k, _SUCCESSFUL))
+        y_new, solved = restore(k), result == _SUCCESSFUL
         # The equations once more only where there is auxiliary output.
-        aux = fn(y, args)[1] if jtu.tree_leaves(state.aux) else state.aux
-        return y, _State(solved, result, state.aux), aux
+        aux = fn(y_new, args)[1] if jtu.tree_leaves(state.aux) else state.aux
+        return y_new, _State(solved, result, state.aux), aux
 
     def _sweep(self, fn, y, args, scale, pending) -> _Found:
         tolerance = Tolerance(self.rtol, self.atol, self.norm)
