@@ -13,6 +13,13 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 
 _Flag: TypeAlias = Bool[Array, ""]
 
+# Up to this many entries the maximum is written out. XLA fuses no reduction with what its
+# result goes into, and on CPUs it reduces short axes slowly.
+_SHORT = 4
+# Longer ones are folded to this length, by what fuses with the program that makes them. Of
+# what is longer XLA keeps another array for each maximum.
+_WIDE = 32
+
 
 class Correction(NamedTuple):
     """How large a correction is.
@@ -63,9 +70,14 @@ class Tolerance(NamedTuple):
 def max_norm(x: Array) -> Scalar:
     if x.size == 1:
         return jnp.abs(x).reshape(())
-    x = jnp.abs(x)
-    # The maximum of XLA on CPUs may lose what is not a number.
-    return jnp.where(jnp.isnan(jnp.sum(x)), jnp.nan, jnp.max(x))
+    # The bits of floats that are not negative, read as integers, have the order of the
+    # values, and NaNs are the largest. The maximum of floats may lose these; together with
+    # a test for them, steps of 16 pairs took 1.1 times as long in single precision.
+    kind = f"int{jnp.finfo(x.dtype).bits}"
+    bits = lax.bitcast_convert_type(jnp.abs(x), kind).reshape(-1)
+    while (n := bits.size) > (1 if x.size <= _SHORT else _WIDE):
+        bits = jnp.maximum(bits[: (n + 1) // 2], bits[n // 2 :])
+    return lax.bitcast_convert_type(bits[0] if n == 1 else jnp.max(bits), x.dtype)
 
 
 def largest(norms: list[Scalar]) -> Scalar:
