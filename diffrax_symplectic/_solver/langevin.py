@@ -1,7 +1,6 @@
 """Langevin dynamics by splitting: kicks of the forces, drifts of the positions, and the
 exact Ornstein--Uhlenbeck process of friction and noise between them."""
 
-import abc
 from typing import Any, ClassVar
 
 import diffrax
@@ -13,7 +12,7 @@ from jaxtyping import ArrayLike, PyTree
 
 from .._arguments import check_state
 from .._compat import direction, unwrapped
-from .._custom_types import Args, RealScalarLike, Y
+from .._custom_types import RealScalarLike
 from .._tableau import Structure
 from .._terms import apply, check_structure, controls, rate, split_terms
 from ._friction import (
@@ -34,11 +33,13 @@ from .base import AbstractSymplecticSolver, Record
 
 
 class AbstractLangevinSplitting(AbstractSymplecticSolver):
-    """What the splittings of Langevin dynamics have in common: terms, friction, and the
-    Ornstein--Uhlenbeck process in the middle of the step, between two half drifts."""
+    """A kick, a half drift, the Ornstein--Uhlenbeck process, a half drift, and in a
+    symmetric splitting another kick. One that is not symmetric makes all of its kick at the
+    start of the step."""
 
     structure: ClassVar[Structure] = "separable and constant"
     variables: ClassVar[tuple[str, ...]] = ("W",)
+    symmetric: eqx.AbstractClassVar[bool]
     gamma: eqx.AbstractVar[PyTree[ArrayLike]]
     _faults: eqx.AbstractVar[tuple[Fault | None, ...]]
 
@@ -48,8 +49,12 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
     def stage_vectors(self, num_noises):
         return ()
 
+    def order(self, terms):
+        return 2 if self.symmetric else 1
+
     def init(self, terms, t0, t1, y0, args) -> Any:
-        """What the solver remembers of the state, and the modes of the friction."""
+        """The forces, which end a step of a symmetric splitting and begin the next one, and
+        the modes of the friction."""
         del t1
         name = type(self).__name__
         check_state(y0, name)
@@ -62,13 +67,19 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
             )
         velocity = velocity_of(terms, t0, y0, args)
         modes = friction_modes(self.gamma, self._faults, y0[0], velocity)
-        return self.remembered(drift, t0, y0, args), modes
+        forces = rate(drift, t0, y0, args)[0] if self.symmetric else None
+        return forces, modes
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         drift, noise = split_terms(terms)
-        kept, modes = solver_state
-        p = self.first_kick(drift, t0, t1, y0, args, kept, made_jump)
+        forces, modes = solver_state
+        anew = lambda: rate(drift, t0, y0, args)[0]
+        if not self.symmetric:
+            forces = anew()
+        elif made_jump is not False:
+            forces = lax.cond(made_jump, anew, lambda: solver_state[0])
         half = (t1 - t0) / 2
+        p = moved(y0[0], half if self.symmetric else t1 - t0, forces)
         q = moved(y0[1], half, rate(drift, t0, (p, y0[1]), args)[1])
         # In a solve backward in time the momentum grows. Diffrax makes `t1 - t0` positive.
         time = 2 * direction(terms) * half
@@ -79,23 +90,14 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
             parts.append((spread, kick))
         p = apply_friction(self.gamma, modes, time, *parts)
         q = moved(q, half, rate(drift, t1, (p, q), args)[1])
-        p, kept = self.last_kick(drift, t0, t1, (p, q), args)
+        if self.symmetric:
+            forces, _ = rate(drift, t1, (p, q), args)
+            p = moved(p, half, forces)
         y1 = p, q
         result = result_at(terms, t0, t1, result_of(None, y1))
         result = friction_result(self.gamma, modes, result)
-        return y1, None, dict(y0=y0, y1=y1), (kept, modes), result
-
-    @abc.abstractmethod
-    def remembered(self, drift: tuple, t0, y0: Y, args: Args) -> Any:
-        """What the solver remembers from one step to the next, before the first one."""
-
-    @abc.abstractmethod
-    def first_kick(self, drift, t0, t1, y0: Y, args: Args, kept, made_jump) -> PyTree:
-        """The momentum after the kick at the start of the step."""
-
-    @abc.abstractmethod
-    def last_kick(self, drift, t0, t1, y: Y, args: Args) -> tuple[PyTree, Any]:
-        """The momentum after the kick at the end of the step, and what is remembered."""
+        state = forces if self.symmetric else None, modes
+        return y1, None, dict(y0=y0, y1=y1), state, result
 
 
 class BAOAB(AbstractLangevinSplitting):
@@ -146,6 +148,7 @@ class BAOAB(AbstractLangevinSplitting):
     **Source:** [Leimkuhler and Matthews (2013)](https://doi.org/10.1093/amrx/abs010).
     """
 
+    symmetric: ClassVar[bool] = True
     record: ClassVar[Record] = Record(
         weak=2,
         strong=1,
@@ -155,23 +158,6 @@ class BAOAB(AbstractLangevinSplitting):
     )
     gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
     _faults: tuple[Fault | None, ...] = eqx.field(static=True, init=False, repr=False)
-
-    def order(self, terms):
-        return 2
-
-    def remembered(self, drift, t0, y0, args):
-        """The forces at the end of the last step, which are those at the start of this."""
-        return rate(drift, t0, y0, args)[0]
-
-    def first_kick(self, drift, t0, t1, y0, args, kept, made_jump):
-        if made_jump is not False:
-            anew = lambda: rate(drift, t0, y0, args)[0]
-            kept = lax.cond(made_jump, anew, lambda: kept)
-        return moved(y0[0], (t1 - t0) / 2, kept)
-
-    def last_kick(self, drift, t0, t1, y, args):
-        forces, _ = rate(drift, t1, y, args)
-        return moved(y[0], (t1 - t0) / 2, forces), forces
 
 
 class LangevinMiddle(AbstractLangevinSplitting):
@@ -207,6 +193,7 @@ class LangevinMiddle(AbstractLangevinSplitting):
     (2019)](https://doi.org/10.1021/acs.jpca.9b02771).
     """
 
+    symmetric: ClassVar[bool] = False
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
@@ -216,18 +203,6 @@ class LangevinMiddle(AbstractLangevinSplitting):
     )
     gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
     _faults: tuple[Fault | None, ...] = eqx.field(static=True, init=False, repr=False)
-
-    def order(self, terms):
-        return 1
-
-    def remembered(self, drift, t0, y0, args):
-        return None
-
-    def first_kick(self, drift, t0, t1, y0, args, kept, made_jump):
-        return moved(y0[0], t1 - t0, rate(drift, t0, y0, args)[0])
-
-    def last_kick(self, drift, t0, t1, y, args):
-        return y[0], None
 
 
 def moved(x: PyTree, time: RealScalarLike, rate: PyTree) -> PyTree:

@@ -278,7 +278,7 @@ def test_nothing_is_solved_for_a_path_that_has_failed():
 
 
 def test_only_pending_paths_of_a_batch_are_served():
-    serve = lambda pending, w, x: where_pending(lambda x, w: w * x, pending, x, w)
+    serve = lambda pending, w, x: where_pending(lambda x: w * x, pending, x)
     pending = jr.bernoulli(jr.key(0), 0.3, (3, 35))
     x = jnp.arange(105.0).reshape(3, 35)
     expected = jnp.where(pending, 2 * x, x)
@@ -306,7 +306,7 @@ def test_nested_batches_are_served_as_one():
     @jax.jit
     def nested(pending, args, x):
         def serve(pending, args, x):
-            return where_pending(lambda x, args: combine(args, x), pending, x, args)
+            return where_pending(lambda x: combine(args, x), pending, x)
 
         rows = jax.vmap(serve, (0, (None, None, 0, 0), 0))
         return jax.vmap(rows, (0, (None, 0, None, 0), 0))(pending, args, x)
@@ -321,8 +321,9 @@ def test_nested_batches_are_served_as_one():
     assert len(served) == jnp.sum(pending)
 
 
-@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.StrangGauss()], ids=type)
-@pytest.mark.parametrize("d", [4, 32])
+@pytest.mark.parametrize(
+    "solver, d", [(ds.StrangGauss(), 4), (ds.ImplicitMidpoint(), 32)], ids=str
+)
 def test_steps_of_many_unknowns_are_symplectic(solver, d):
     def potential(t, p, q, args):
         stretch = jnp.diff(q, prepend=0.0, append=0.0)

@@ -27,7 +27,7 @@ from ..problems import (
 
 @pytest.mark.parametrize("m", [3])
 def test_ninomiya_victoir_is_weak_order_two(m):
-    solver = by_picard(ds.NinomiyaVictoir())
+    solver = ds.NinomiyaVictoir()
     terms = ds.hamiltonian_terms(H0, noise, weak_path(m, two_point=True))
     # Two systems in which no test function's leading error happens to be small.
     draw = jax.jit(jax.vmap(lambda key: random_problem(key, 1, m)))
@@ -43,7 +43,7 @@ def test_flows_follow_each_other_in_the_order_of_the_coin():
     y0, args = random_problem(jr.key(0), 2, 2)
     W = jnp.array([0.3, -0.2])
     zero = lambda t, p, q, args: 0.0 * jnp.sum(p)
-    solver = by_picard(ds.NinomiyaVictoir())
+    solver = ds.NinomiyaVictoir()
 
     def end(W, coin, y0):
         path = Given(W, two_point=coin * jnp.array([1, -1]))
@@ -190,7 +190,7 @@ def test_levy_area_midpoint_is_one_step_of_the_hamiltonian_with_brackets():
 
     @jax.jit
     def ends(y0, args):
-        end = lambda solver, *x: by_picard(solver).step(*x, y0, args, None, False)[0]
+        end = lambda solver, *x: solver.step(*x, y0, args, None, False)[0]
         midpoint = ds.ImplicitMidpoint()
         return (
             end(ds.LevyAreaMidpoint(), terms, t0, t0 + h),
@@ -220,7 +220,7 @@ def test_flows_of_an_oscillator_are_those_of_the_gauss_method():
         (diffrax.MultiTerm(drift, first, second), half**2 * R(-1j * x) * R(-1j * y)),
     ):
         step = jax.jit(
-            lambda terms=terms: by_picard(ds.NinomiyaVictoir()).step(
+            lambda terms=terms: ds.NinomiyaVictoir().step(
                 terms, 0.0, h, (jnp.zeros(1), jnp.ones(1)), None, None, False
             )[0]
         )

@@ -18,7 +18,6 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from ..picard import by_picard
 from ..problems import (
     GENERAL,
     H0,
@@ -72,7 +71,7 @@ _CUT = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((2,), jr.key(3)), k=1)
 
 @pytest.mark.parametrize(
     "solver, path",
-    [(ds.ImplicitMidpoint(), weak_path(2)), (by_picard(ds.SRKs1()), _CUT)],
+    [(ds.ImplicitMidpoint(), weak_path(2)), (ds.SRKs1(), _CUT)],
     ids=["ImplicitMidpoint", "SRKs1-cut"],
 )
 def test_gradients_equal_central_differences(solver, path):
@@ -114,7 +113,7 @@ def test_adjoints_agree():
     solve = lambda y0, adjoint: jnp.sum(
         diffrax.diffeqsolve(
             terms,
-            by_picard(ds.ImplicitMidpoint()),
+            ds.ImplicitMidpoint(),
             0.0,
             0.5,
             0.1,
