@@ -33,9 +33,9 @@ from .base import AbstractSymplecticSolver, Record
 
 
 class AbstractLangevinSplitting(AbstractSymplecticSolver):
-    """A kick, a half drift, the Ornstein--Uhlenbeck process, a half drift, and in a
-    symmetric splitting another kick. One that is not symmetric makes all of its kick at the
-    start of the step."""
+    """A kick, half a drift, the Ornstein--Uhlenbeck process, half a drift. A symmetric
+    splitting makes one half of the kick at the start of the step and one at its end; any
+    other makes the whole kick at the start."""
 
     structure: ClassVar[Structure] = "separable and constant"
     variables: ClassVar[tuple[str, ...]] = ("W",)
@@ -53,8 +53,8 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         return 2 if self.symmetric else 1
 
     def init(self, terms, t0, t1, y0, args) -> Any:
-        """The forces, which end a step of a symmetric splitting and begin the next one, and
-        the modes of the friction."""
+        """The forces, which a symmetric splitting hands on from the end of a step to the
+        start of the next one, and the modes of the friction."""
         del t1
         name = type(self).__name__
         check_state(y0, name)
@@ -115,34 +115,34 @@ class BAOAB(AbstractLangevinSplitting):
       \text{B:} &\quad p \gets p + \tfrac h2 f(t_{n+1}, q)
     \end{aligned}$$
 
-    The terms are those without friction, of $H_0 = V(p) + U(t, q)$ and $H_k = -\sigma_k
-    \cdot q$ with constant $\sigma_k$; other ones are refused while tracing. Masses are
+    Pass the terms without friction, with $H_0 = V(p) + U(t, q)$ and $H_k = -\sigma_k
+    \cdot q$ for constant $\sigma_k$; other terms raise an error while tracing. Masses are
     part of $V$. With $\sum_k \sigma_k \sigma_k^\top = 2 \gamma M T$, which
     [`diffrax_symplectic.thermal_noise`][] gives, and $V(p) = p \cdot M^{-1} p / 2$ the
     density $e^{-H_0 / T}$ is stationary.
 
     **Positions, momenta, transport.** In a harmonic well of frequency $\omega$ the law of
     $q$ is exact for every step with $\omega h < 2$. Momenta are too cold,
-    $\langle p^2 \rangle = m T (1 - \omega^2 h^2 / 4)$: for functions of these, kinetic
-    temperatures and heat flows take [`diffrax_symplectic.LangevinMiddle`][], which has
-    the same positions. Mobility and free diffusion are too large in both by the factor
+    $\langle p^2 \rangle = m T (1 - \omega^2 h^2 / 4)$: for functions of momenta, such as
+    kinetic temperatures and heat flows, use [`diffrax_symplectic.LangevinMiddle`][], which
+    has the same positions. Mobility and free diffusion are too large in both by the factor
     $x \coth x$, $x = \gamma h / 2$: 0.3% at $\gamma h = 0.2$, 8% at $\gamma h = 1$. They
     are exact for the friction $\gamma' = \frac2h \operatorname{artanh} \frac{\gamma h}2$
     in place of $\gamma$, in the solver and in the noise.
 
-    The friction acts on the canonical momentum $p$. In a magnetic field that is not the
-    kinetic one (and $H_0$ is not separable there).
+    The friction acts on the canonical momentum $p$, which in a magnetic field differs from
+    the kinetic one. ($H_0$ is not separable there.)
 
-    O is the exact law of friction and noise together if the matrix $\gamma$ commutes with
-    $\sum_k \sigma_k \sigma_k^\top$: for one number $\gamma$, for one number and one noise
-    for each momentum; and for thermal noise. Else its covariance is right up to
+    O has the exact law of friction and noise together for thermal noise, and if the matrix
+    $\gamma$ commutes with $\sum_k \sigma_k \sigma_k^\top$: for one number $\gamma$, or
+    one number and one noise for each momentum. Otherwise its covariance has an error of
     $\mathcal O(h^3)$.
 
     Weak order 2, strong order 1, order 2 without noise. For one number $\gamma$ a step is
-    conformally symplectic: with its Jacobian $S'$, $S'^\top J S' = e^{-\gamma h} J$. As
-    explicit methods are, it is limited to $\omega h < 2$.
+    conformally symplectic: with its Jacobian $S'$, $S'^\top J S' = e^{-\gamma h} J$. As an
+    explicit method it is limited to $\omega h < 2$.
 
-    Any Brownian path will do: a [`diffrax_symplectic.WeakBrownianPath`][] for
+    Takes any Brownian path: a [`diffrax_symplectic.WeakBrownianPath`][] for
     expectations, a [`diffrax_symplectic.FixedStepBrownianPath`][] for paths.
 
     **Source:** [Leimkuhler and Matthews (2013)](https://doi.org/10.1093/amrx/abs010).
@@ -161,9 +161,8 @@ class BAOAB(AbstractLangevinSplitting):
 
 
 class LangevinMiddle(AbstractLangevinSplitting):
-    r"""Langevin dynamics as [`diffrax_symplectic.BAOAB`][] solves it, with momenta that
-    are as accurate as the positions. Explicit, with one evaluation of the forces in a
-    step.
+    r"""Langevin dynamics, by a splitting whose stationary momenta are as accurate as its
+    positions. Explicit, with one evaluation of the forces in a step.
 
     $$\begin{aligned}
       \text{B:} &\quad p \gets p + h f(t_n, q) \\
@@ -173,21 +172,22 @@ class LangevinMiddle(AbstractLangevinSplitting):
       \text{A:} &\quad q \gets q + \tfrac h2 g(p)
     \end{aligned}$$
 
-    Terms, friction, noise and paths are those of [`diffrax_symplectic.BAOAB`][].
+    Takes the same terms, friction, noise and paths as [`diffrax_symplectic.BAOAB`][].
 
     **Positions, momenta, transport.** In a harmonic well the laws of $q$ and of $p$ are
     exact, each by itself, for every step with $\omega h < 2$. The momenta belong to half a
-    step before the positions, so that $\langle p q \rangle = h T / 2$ and not zero. Take
-    it for functions of the momenta or of the positions, and for the heat that friction and
-    noise exchange with the bath, and [`diffrax_symplectic.BAOAB`][] for functions of both,
-    such as a correlation $\langle p q \rangle$. Mobility and free diffusion are those of
-    [`diffrax_symplectic.BAOAB`][], which says how to make them exact.
+    step before the positions, so that $\langle p q \rangle = h T / 2$ and not zero. Use it
+    for functions of the momenta or of the positions, and [`diffrax_symplectic.BAOAB`][] for
+    functions of both, such as a correlation $\langle p q \rangle$. Momenta come right after
+    friction and noise: in a step, the bath gives a particle of mass $m$ the mean energy
+    $\frac12 (e^{2 \gamma h} - 1) \langle T - p^2 / m \rangle$. Mobility and free diffusion
+    are as in [`diffrax_symplectic.BAOAB`][], which says how to make them exact.
 
-    Its steps are those of [`diffrax_symplectic.BAOAB`][] in other variables: where it has
-    $p$ and $q$, BAOAB has $p + \frac h2 f(t, q)$ and $q$ along the same path. Weak order 1,
-    strong order 1, order 1 without noise, since momenta are late; order 2 for stationary
-    means of functions of $q$ alone or of $p$ alone. For one number $\gamma$ a step is
-    conformally symplectic.
+    The steps are those of [`diffrax_symplectic.BAOAB`][] in other variables: if this solver
+    has $p$ and $q$, then BAOAB has $p + \frac h2 f(t, q)$ and $q$ along the same path. Weak
+    order 1, strong order 1, and order 1 without noise, since momenta are late; order 2 for
+    stationary means of functions of $q$ alone or of $p$ alone. For one number $\gamma$ a
+    step is conformally symplectic.
 
     **Source:** [Zhang, Liu, Yan, Tuckerman and Liu
     (2019)](https://doi.org/10.1021/acs.jpca.9b02771).
@@ -215,8 +215,8 @@ _INIT = f"""**Arguments:**
 
 - `gamma`: {GAMMA}
 
-**Raises:** a `ValueError` if `gamma` is known to be negative, not finite or no such matrix,
-    if it does not fit `p` (in the solve), or for terms that are not separable with
+**Raises:** a `ValueError` if `gamma` is known to be negative, not finite or not such a
+    matrix; and in the solve if it does not fit `p`, or if the terms are not separable with
     constant noise.
 """
 BAOAB.__init__.__doc__ = LangevinMiddle.__init__.__doc__ = _INIT
