@@ -21,13 +21,13 @@ from .._terms import rate, split_terms
 
 
 # What the solvers say of this argument.
-GAMMA = """the friction, in units of one over time: a number; or an array or PyTree like
-    `p`, each array a scalar, of the shape of its momenta, or a matrix that acts on them, of
-    that shape twice, `(n, n)` for `n` momenta. A matrix is symmetric positive semidefinite,
-    or it is so with the masses $M$ of $V(p) = p \\cdot M^{-1} p / 2$: of a tensor $\\Gamma$
-    with $\\mathrm{d}p = -\\Gamma M^{-1} p\\,\\mathrm{d}t$ pass `Gamma / mass`. If it is
-    traced and not so, the path fails. There are derivatives with respect to it; of a matrix
-    only first ones."""
+GAMMA = """the friction rate, in units of one over time: a number; or an array or PyTree
+    like `p`, whose arrays are scalars, have one rate for each momentum, or are matrices
+    (with the shape of the momenta twice, `(n, n)` for `n` momenta). A matrix must be
+    symmetric positive semidefinite, or become so with the masses $M$ of $V(p) = p \\cdot
+    M^{-1} p / 2$: for a friction tensor $\\Gamma$ with $\\mathrm{d}p = -\\Gamma M^{-1}
+    p\\,\\mathrm{d}t$ pass `Gamma / mass`. Paths whose traced `gamma` violates this fail.
+    Differentiable, with respect to matrices only once."""
 
 
 class Fault(NamedTuple):
