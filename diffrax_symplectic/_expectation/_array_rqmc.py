@@ -34,7 +34,7 @@ from ._steps import (
     independent_steps,
     numbers,
     Problem,
-    samples,
+    simulate,
 )
 from ._value_functions import value_function
 
@@ -164,7 +164,12 @@ def _replicates(
         advance, paths = independent_steps(p, level, n, terms_of, words)
         return step, paths
 
-    return samples(p, begin, _mean_of_good)
+    saved, failed, _ = simulate(p, begin, _mean_of_good)
+    means, heavy = jnp.moveaxis(saved[:, :, :, None], 2, 0)
+    means = p.combined(means)
+    # Of the level where it is most.
+    heavy = jnp.broadcast_to(jnp.max(heavy, axis=0), means.shape)
+    return Samples(p.averaged([means, heavy]), jnp.ones(1, bool), jnp.sum(failed)[None])
 
 
 def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "2 ..."]:

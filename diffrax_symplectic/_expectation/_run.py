@@ -15,7 +15,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._arguments import whole_number
 from .._brownian import check_key
@@ -29,8 +29,6 @@ _MANY = 0.01
 # With an `r` of `std_error` above this, means of exp(5 x), x normal, were off by forty
 # standard errors, and those of exp(3 x) by five.
 _HEAVY = 0.35
-# Deviations of so many roundings are none.
-_ROUNDING = 1e3
 NO_METER = diffrax.NoProgressMeter()
 
 
@@ -284,22 +282,10 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         fold = lambda hi, lo: jr.fold_in(jr.fold_in(key, hi), lo)
         samples = sampler(jax.vmap(fold)(hi, lo))
         wanted = index < left
-        # A path fails once, on however many levels.
-        good = jnp.all(samples.good, axis=0)
-        lost = ~good + (0 if samples.lost is None else jnp.sum(samples.lost, axis=0))
-        failed, good = jnp.sum(jnp.where(wanted, lost, 0)), good & wanted
-        count = jnp.sum(good)
-        tails = samples.tails
-        kinds = [samples.values]
-        if tails is not None:
-            kinds += [samples.control, tails.promised, tails.beyond]
-        elif samples.heaviest is not None:
-            kinds += [samples.heaviest]
-        ratio = None if tails is None else tails.ratio
-        values = zip(*map(jtu.tree_leaves, kinds))
-        each = [_spread(samples.weights, good, count, ratio, *x) for x in values]
-        treedef = jtu.tree_structure(samples.values)
-        return count, failed, *map(treedef.unflatten, zip(*each))
+        good, failed = samples.good & wanted, jnp.where(wanted, samples.lost, 0)
+        leaves, treedef = jtu.tree_flatten(samples.values)
+        each = [_spread(x, good) for x in leaves]
+        return jnp.sum(good), jnp.sum(failed), *map(treedef.unflatten, zip(*each))
 
     if mesh.size == 1:
         return jtu.tree_map(lambda x: x[None], local(sampler, lo_hi, left))
@@ -331,33 +317,12 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         ) from error
 
 
-def _spread(weights, good, count, ratio, x, *others) -> tuple:
+def _spread(x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]):
     """Of the good samples the mean; what rounding has left out of it; the root of the sum
-    of squared deviations from both; the largest deviation; the largest size. With axes in
-    front for kinds and combinations."""
-    x = x.astype(real(x.dtype))
-    if jnp.iscomplexobj(x):
-        raise ValueError(
-            "What is averaged must be real arrays; got one of dtype "
-            f"{x.dtype}. Return real and imaginary parts."
-        )
-    combined = lambda x: jnp.tensordot(weights.astype(x.dtype), x, 1)
-    if ratio is None:
-        x = combined(x)[None]
-        # Of the level where it is most.
-        most = [jnp.broadcast_to(jnp.max(y, axis=0), x.shape) for y in others]
-        x = jnp.concatenate([x, *most])
-    else:
-        control, promised, beyond = others
-        left = combined(x - control)
-        far = jnp.abs(left - combined(promised))
-        ratio = ratio.reshape(-1, *[1] * (far.ndim - 2)).astype(x.dtype)
-        rounding = _ROUNDING * jnp.finfo(x.dtype).eps * jnp.abs(combined(x))
-        far = jnp.where(far > beyond[:, None] + rounding, ratio * far, 0)
-        x = jnp.stack([left, combined(x), combined(control), far])
+    of squared deviations from both; the largest deviation; the largest size."""
     keep = good.reshape(-1, *[1] * (x.ndim - 3))
     x = jnp.where(keep, x, 0)
-    total, n = lambda x: jnp.sum(x, axis=2), jnp.maximum(count, 1)
+    total, n = lambda x: jnp.sum(x, axis=2), jnp.maximum(jnp.sum(good), 1)
     largest = lambda x: jnp.max(jnp.abs(x), axis=2)
     size = largest(x)
     to_unit, from_unit = _powers(size)
@@ -381,7 +346,3 @@ def _powers(size: Array) -> tuple[Array, Array]:
     exponent = jnp.clip(jnp.frexp(size)[1], -most, most)
     one = jnp.ones_like(size)
     return jnp.ldexp(one, -exponent), jnp.ldexp(one, exponent)
-
-
-def real(dtype) -> Any:
-    return jnp.result_type(dtype, float)

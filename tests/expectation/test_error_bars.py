@@ -11,7 +11,7 @@ from scipy import stats
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation._run import run
-from diffrax_symplectic._expectation._sampling import Plan, Samples, Tails
+from diffrax_symplectic._expectation._sampling import Plan, Samples
 from examples.benchmarks.coverage import CELLS, covered, SAMPLINGS
 
 from ..problems import kubo_terms
@@ -146,12 +146,10 @@ def _with_control(shift: float, spread: float = 1.0):
     """Standard normal numbers, less a control that has the mean `shift`."""
 
     def sampler(keys):
-        x = jax.vmap(jr.normal)(keys)[None]
-        zero = jnp.zeros((1, 1))
-        tails = Tails(zero, jnp.full(1, jnp.inf), jnp.ones(len(keys)))
-        return Samples(
-            x, np.ones((1, 1)), jnp.ones(x.shape, bool), None, spread * x + shift, tails
-        )
+        x = jax.vmap(jr.normal)(keys)
+        control = spread * x + shift
+        kinds = jnp.stack([x - control, x, control, jnp.zeros_like(x)])[:, None]
+        return Samples(kinds, jnp.ones(len(keys), bool), jnp.zeros(len(keys), bool))
 
     far = np.zeros(1)
     plan = Plan(jax.tree_util.Partial(sampler), 1000, 250, far=far)
