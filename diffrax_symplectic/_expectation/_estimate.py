@@ -13,13 +13,12 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ._moments import joined, Moments, total
+from ._sampling import ROUNDING
 from ._saved import arrays_of, described, rebuilt
 
 
 # Standard errors of the mean of a control, which is zero.
 _SURE, _HEAVY_CONTROL = 5, 0.1
-# Deviations of so many roundings of the mean are roundings of the paths.
-_ROUNDING = 1e3
 # What paths with wider noise show of the tails counts if it is so many times as much as
 # what is seen of them.
 _SEEN = 4
@@ -284,19 +283,20 @@ def _results(
     outlying = np.maximum(largest - s * np.sqrt(4.5 * np.log(max(n, 2))), 0)
     r = np.where(s > 0, outlying / (s * np.sqrt(n)), 0)
     controlled = len(mean) > 2
-    if len(mean) == 2:
-        r[0] = np.fmax(r[0], mean[1])
     # Combinations of levels are differences of numbers as large as the mean.
     size = np.fmax.reduce(np.abs(mean[: 1 + controlled, :1]))
     rounding = roundings * float(jnp.finfo(dtype).eps) * size
     # Rounding errors have heavy tails, too.
-    r = np.where(largest > _ROUNDING * rounding, np.minimum(r, 1 - 1e-6), 0)
+    r = np.where(largest > ROUNDING * rounding, r, 0)
+    if len(mean) == 2:
+        r[0] = np.fmax(r[0], mean[1])
+    r = np.minimum(r, 1 - 1e-6)
     error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
     error = np.maximum(error, rounding)
     dropped = np.zeros(mean.shape[1:], bool)
     if controlled:
         # Of a control with heavy tails the standard error says too little.
-        fine = np.abs(mean[2]) <= np.fmax(_SURE * error[2], _ROUNDING * rounding)
+        fine = np.abs(mean[2]) <= np.fmax(_SURE * error[2], ROUNDING * rounding)
         fine |= r[2] > _HEAVY_CONTROL
         dropped |= ~np.all(fine & np.isfinite(mean[0]), axis=0)
         # Where enough is seen of it, that is in the spread. (NaN, where the trial had no

@@ -240,7 +240,7 @@ def _warnings_of_spread(estimate: Expectation) -> Iterator[str]:
         )
     if estimate.heaviest > _HEAVY:
         yield (
-            f"Few of the {estimate.num_samples:,} samples make up for most of the spread: "
+            f"Few of the {estimate.num_paths:,} paths make up for most of the spread: "
             "others that are too rare to be among them may hold much of the mean, and the "
             "standard error may be too small. Take many more, or a function that grows "
             "more slowly."

@@ -10,6 +10,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
 
 
+# Deviations of so many roundings of the mean are roundings of the paths.
+ROUNDING = 1e3
+
+
 class Samples(eqx.Module):
     """What is averaged, with axes in front for kinds, for combinations of the levels, and
     for samples; which samples are good; and how many paths each has lost.

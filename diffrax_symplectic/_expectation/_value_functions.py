@@ -23,7 +23,7 @@ from ._moments import total
 from ._noise import Noise
 from ._polynomials import num_polynomials
 from ._run import run
-from ._sampling import AbstractSampling, Plan, Samples
+from ._sampling import AbstractSampling, Plan, ROUNDING, Samples
 from ._steps import along, Ensemble, Level, Problem, simulate
 
 
@@ -37,8 +37,6 @@ _GRID, _GRID_SIZES, _MOST_ENDS, _MOST = 2, (64, 32), 50_000, 2**25
 _MOST_MEMORY, _OUT_OF_PROPORTION = 4 * 2**30, 2**31
 # The number that makes the key of trials, and how many batches have wider noise.
 _TRIAL, _WIDE = 0xFFFFFFFE, 2
-# Deviations of so many roundings are none.
-_ROUNDING = 1e3
 
 
 class ValueFunctions(AbstractSampling):
@@ -234,7 +232,7 @@ def _controlled_paths(
     left, plain, control, promised = map(p.combined, each)
     off = jnp.abs(left - promised)
     # More than rounding.
-    beyond = beyond[:, :, None] + _ROUNDING * jnp.finfo(off.dtype).eps * jnp.abs(plain)
+    beyond = beyond[:, :, None] + ROUNDING * jnp.finfo(off.dtype).eps * jnp.abs(plain)
     # What is more likely without the wider noise is seen without it.
     ratio = jnp.exp(-jnp.maximum(jnp.sum(log_ratio, axis=0), 0))[:, None]
     far, lost = jnp.where(off > beyond, ratio * off, 0), jnp.any(failed, axis=0)
