@@ -3,7 +3,7 @@
 import collections
 import dataclasses
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -101,38 +101,13 @@ def run(
     """The estimate from the samples of a plan. Without a meter it is a trial, which warns
     of nothing. What a device computes, and in which order its sums are added up, does not
     depend on how many there are."""
-    sampler, size = plan.sampler, min(plan.batch_size, plan.num_samples)
-    key_data = np.asarray(jr.key_data(key))
-    if jax.process_count() > 1:
-        # Each process holds the same arrays. In a function they become constants of its
-        # program, since arguments would have to be placed on the devices of all.
-        sampler = lambda keys: plan.sampler(keys)
-    mesh = Mesh(np.array(devices), ("samples",))
-
-    def sampler_at(at: int) -> Callable:
-        if plan.paths_of is None:
-            return sampler
-        return jtu.Partial(sampler, plan.paths_of(at, size))
-
-    def batch(at: int, sampler: Callable) -> tuple:
-        lo_hi = np.array([at & 0xFFFFFFFF, at >> 32], np.uint32)
-        left = np.array(max(0, min(size * len(devices), most - at)), np.int32)
-        if len(devices) == 1:
-            lo_hi, left = jax.device_put((lo_hi, left), devices[0])
-        one: Any = _batch
-        return one(sampler, key_data, jr.key_impl(key), lo_hi, left, mesh, size)
-
     first, at = begin.first, begin.first
     if begin.start is not None:
         first, at = begin.start.moments[0].begin, begin.start.moments[-1].end
-    most = first + plan.num_samples
-    # JAX caches this trace and uses it for the first batch.
-    shapes = eqx.filter_eval_shape(batch, at, sampler_at(at))[2]
-    zeros = jtu.tree_map(lambda s: np.zeros(s.shape[1:]), shapes)
-    dtypes = jtu.tree_map(lambda s: str(s.dtype), shapes)
-    none = Moments(at, at, 0, 0, zeros, zeros, zeros, zeros, dtypes)
+    most, batches = first + plan.num_samples, _Batches(plan, key, devices)
+    none = batches.nothing(at, most)
     about = plan.roundings, sampling, plan.reason, None, plan.far
-    estimate = Expectation((none,), key_data, plan.paths, *about)
+    estimate = Expectation((none,), batches.key_data, plan.paths, *about)
     if begin.start is not None:
         begin.start.check_same(estimate, "`start`")
         if at > most:
@@ -142,46 +117,94 @@ def run(
                 f"{plan.num_samples}."
             )
         estimate = dataclasses.replace(estimate, moments=begin.start.moments)
-
-    def reached() -> bool:
-        if tol is None or estimate.num_samples < plan.least:
-            return False
-        return all(bool(np.all(x <= tol)) for x in jtu.tree_leaves(estimate.std_error))
-
-    def finished() -> Expectation:
-        said = None if tol is None else reached()
-        return dataclasses.replace(estimate, tol_reached=said)
-
+    reached = lambda: _reached(estimate, plan.least, tol)
     running, done = collections.deque(), at
     try:
         while True:
             more = at < most and not reached()
             if more:
-                running.append(batch(at, sampler_at(at)))
-                at += size * len(devices)
+                running.append(batches.started(at, most))
+                at += batches.size * len(devices)
             # One batch is computed while the one before it is added up.
             if len(running) > more:
-                parts = jax.device_get(running.popleft())
-                for one in range(len(devices)):
+                for part in batches.parts(running.popleft()):
                     # The same samples decide, however many are made at once.
                     if done < most and not reached():
-                        part = jtu.tree_map(lambda x: x[one], parts)
-                        new = _moments(part, done, min(done + size, most), dtypes)
+                        end = min(done + batches.size, most)
+                        new = _moments(part, done, end, none.dtypes)
                         both = joined((*estimate.moments, new))
                         estimate = dataclasses.replace(estimate, moments=both)
-                        done = new.end
+                        done = end
                 if meter is not None:
                     share = (done - first) / plan.num_samples
                     meter.step(max(share, _share_of_tolerance(estimate, tol)))
             elif not more:
                 break
     except KeyboardInterrupt:
-        raise ExpectationInterrupted(finished()) from None
-    estimate = finished()
+        raise ExpectationInterrupted(_finished(estimate, plan.least, tol)) from None
+    estimate = _finished(estimate, plan.least, tol)
     if meter is not None:
         for message in _warnings(estimate, tol):
             warnings.warn(message, stacklevel=3)
     return estimate
+
+
+class _Batches:
+    """The samples of a plan. Each device takes `size` at once."""
+
+    def __init__(self, plan: Plan, key: PRNGKeyArray, devices: tuple):
+        self.size = min(plan.batch_size, plan.num_samples)
+        self.key_data, self._impl = np.asarray(jr.key_data(key)), jr.key_impl(key)
+        self._sampler, self._paths_of, self._devices = (
+            plan.sampler,
+            plan.paths_of,
+            devices,
+        )
+        if jax.process_count() > 1:
+            # Each process holds the same arrays. In a function they become constants of
+            # its program, since arguments would have to be placed on the devices of all.
+            self._sampler = lambda keys: plan.sampler(keys)
+        self._mesh = Mesh(np.array(devices), ("samples",))
+
+    def started(self, at: int, most: int) -> tuple:
+        """Of the batches from sample number `at` on, less than `most`, what is being
+        computed."""
+        sampler, count = self._sampler, len(self._devices)
+        if self._paths_of is not None:
+            sampler = jtu.Partial(sampler, self._paths_of(at, self.size))
+        lo_hi = np.array([at & 0xFFFFFFFF, at >> 32], np.uint32)
+        left = np.array(max(0, min(self.size * count, most - at)), np.int32)
+        if count == 1:
+            lo_hi, left = jax.device_put((lo_hi, left), self._devices[0])
+        one: Any = _batch
+        return one(
+            sampler, self.key_data, self._impl, lo_hi, left, self._mesh, self.size
+        )
+
+    def parts(self, running: tuple) -> list[tuple]:
+        """What each device has computed."""
+        arrays = jax.device_get(running)
+        at = lambda k: jtu.tree_map(lambda x: x[k], arrays)
+        return [at(k) for k in range(len(self._devices))]
+
+    def nothing(self, at: int, most: int) -> Moments:
+        """The moments of no samples."""
+        # JAX caches this trace and uses it for the first batch.
+        shapes = eqx.filter_eval_shape(self.started, at, most)[2]
+        zeros = jtu.tree_map(lambda s: np.zeros(s.shape[1:]), shapes)
+        dtypes = jtu.tree_map(lambda s: str(s.dtype), shapes)
+        return Moments(at, at, 0, 0, zeros, zeros, zeros, zeros, dtypes)
+
+
+def _reached(estimate: Expectation, least: int, tol: float | None) -> bool:
+    if tol is None or estimate.num_samples < least:
+        return False
+    return all(bool(np.all(x <= tol)) for x in jtu.tree_leaves(estimate.std_error))
+
+
+def _finished(estimate: Expectation, least: int, tol: float | None) -> Expectation:
+    said = None if tol is None else _reached(estimate, least, tol)
+    return dataclasses.replace(estimate, tol_reached=said)
 
 
 def _share_of_tolerance(estimate: Expectation, tol: float | None) -> float:

@@ -84,23 +84,12 @@ class Problem(eqx.Module):
             raise ValueError(f"`y0` must hold finite numbers; got {y0}.")
         start = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
         check_fit(terms, start, y0, args)
-        if len(brownian_paths(terms)) == 0:
-            raise ValueError(
-                "`terms` have no Brownian path, so that nothing is random. Solve them "
-                "once, by `diffrax.diffeqsolve`."
-            )
-        if not any(map(is_random, brownian_paths(terms))):
-            raise ValueError(
-                "No Brownian path in `terms` has a random key, so that all samples would "
-                "have the same noise. Solve once, by `diffrax.diffeqsolve`. If your path "
-                "draws its noise, make a JAX random key one of its fields; to average over "
-                "many records, write a function that draws one for `monte_carlo`."
-            )
+        _check_noise(terms)
+        smallest = float(dt0) / 2 ** (levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):
-            h = float(dt0) / 2 ** (levels - 1)
-            check_resolution(h, float(t0), float(t1), start.dtype)
+            check_resolution(smallest, float(t0), float(t1), start.dtype)
         _check_sense(terms, solver, start, y0, args)
-        _check_cells(terms, t0, float(dt0) / 2 ** (levels - 1))
+        _check_cells(terms, t0, smallest)
         check_takes("phi", phi, "t", "y", "args")
         check_real("phi", jtu.tree_leaves(_shape_of(phi, terms, start, y0, args)))
         if num_steps * 2.0 ** (levels - 1) >= 2**31:
@@ -285,6 +274,22 @@ def _steps(t0, t1, dt0, ts: Sequence | None) -> tuple[np.ndarray, np.integer]:
         )
     *saved, num_steps = whole.astype(np.int32)
     return np.array(saved), num_steps
+
+
+def _check_noise(terms) -> None:
+    """Raises a `ValueError` if nothing in them is random."""
+    if len(brownian_paths(terms)) == 0:
+        raise ValueError(
+            "`terms` have no Brownian path, so that nothing is random. Solve them once, by "
+            "`diffrax.diffeqsolve`."
+        )
+    if not any(map(is_random, brownian_paths(terms))):
+        raise ValueError(
+            "No Brownian path in `terms` has a random key, so that all samples would have "
+            "the same noise. Solve once, by `diffrax.diffeqsolve`. If your path draws its "
+            "noise, make a JAX random key one of its fields; to average over many records, "
+            "write a function that draws one for `monte_carlo`."
+        )
 
 
 def _check_sense(terms, solver, t0, y0: Y, args: Args) -> None:
