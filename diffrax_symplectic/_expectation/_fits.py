@@ -84,7 +84,7 @@ def fit(noise: Any, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
         i = steps - 1 - j
         put = lambda all, one: all.at[i].set(one)
         both = jtu.tree_map(put, (u.frames, u.coefficients), fitted(i, u))
-        return Functions(*both, None, basis)
+        return Functions(both[0], both[1], None, basis)
 
     zeros = lambda s: jnp.zeros((last, *s.shape), s.dtype)
     frames = jtu.tree_map(zeros, jax.eval_shape(lambda: frame(0)))

@@ -62,29 +62,23 @@ class Noise(eqx.Module):
         return Noise(problem, level, discrete, few)
 
     def draw(
-        self, key: PRNGKeyArray, number, wide: Any = None
+        self, key: PRNGKeyArray, number, share: Any = 0.0
     ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-        """The variables of the key and this number. With the share `wide`, from 0 to 1, all
-        outcomes have the same probability. And the logarithm of how much more often that
-        makes the variables what they are."""
+        """The variables of the key and this number, if for this share of draws, from 0 to
+        1, all outcomes have the same probability; and the logarithm of how much more often
+        that makes them what they are."""
         words = random_words(key, (number, self.level.index), 1, len(self.laws))[0]
         x = jnp.zeros(len(self.laws), self.problem.dtype)
         log_ratio = jnp.zeros_like(x)
         for law in dict.fromkeys(self.laws):
             mine = np.array([other == law for other in self.laws])
-            own, p = (
-                law.from_words(words, x.dtype),
-                np.array(law.probabilities, x.dtype),
-            )
-            if wide is not None:
-                q = (1 - wide) * p + wide / len(p)
-                cuts = (jnp.cumsum(q)[:-1] * 2.0**32).astype(jnp.uint32)
-                place = jnp.sum(words[:, None] >= cuts, axis=1)
-                own = jnp.where(wide > 0, jnp.asarray(law.values, x.dtype)[place], own)
-                log_ratio = jnp.where(
-                    mine & (wide > 0), jnp.log(q / p)[place], log_ratio
-                )
-            x = jnp.where(mine, own, x)
+            p = np.array(law.probabilities, x.dtype)
+            q = (1 - share) * p + share / len(p)
+            cuts = (jnp.cumsum(q)[:-1] * 2.0**32).astype(jnp.uint32)
+            cuts = jnp.where(share > 0, cuts, np.array(law.cuts, np.uint32))
+            place = jnp.sum(words[:, None] >= cuts, axis=1)
+            x = jnp.where(mine, jnp.asarray(law.values, x.dtype)[place], x)
+            log_ratio = jnp.where(mine, jnp.log(q / p)[place], log_ratio)
         return x, jnp.sum(log_ratio)
 
     @property

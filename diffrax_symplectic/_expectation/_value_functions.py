@@ -50,11 +50,10 @@ class ValueFunctions(AbstractSampling):
     pilot has been. How close they are decides the standard error, and nothing else: the
     estimate has no bias but that of the solver.
 
-    In one or two dimensions the functions are polynomials and what these leave, on a grid;
-    in up to 14 they are polynomials, and in more they are quadratic, by the mean of their
-    derivatives. For more
-    than 100 outcomes of a step (five noises or more) the variables with mean zero come from
-    first and second derivatives by the noise.
+    In one or two dimensions a function is a polynomial of degree 4 or less and what it
+    leaves, on a grid; in up to 14 it is a polynomial, and in more it is quadratic, by the
+    mean of its derivatives. For more than 100 outcomes of a step (five noises or more) the
+    variables with mean zero come from first and second derivatives by the noise.
 
     In a few dimensions standard errors are $10^{-4}$ to $10^{-8}$ of those of as many
     independent paths. In more than two dimensions it gains little in chaos, after times in
