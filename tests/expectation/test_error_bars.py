@@ -13,7 +13,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._expectation._run import run
 from diffrax_symplectic._expectation._sampling import Plan, Samples
 from diffrax_symplectic._expectation._steps import Problem
-from examples.benchmarks.coverage import arguments, Cell, exact
+from examples.benchmarks.coverage import arguments, Cell, estimate, exact
 
 from ..problems import kubo_terms
 
@@ -205,3 +205,12 @@ def test_intervals_cover_as_often_as_they_say(name, noise):
     hits = hits[[0, 1, 3]] if noise == "multiplicative" else hits
     # So few hits have the probability of four standard errors of a normal variable.
     assert np.all(stats.binom.cdf(hits, 40, 0.95) > stats.norm.cdf(-4)), hits
+
+
+def test_heavy_tails_within_replicates_widen_the_standard_error_and_are_told():
+    # A batch is one replicate, the spread of which is zero.
+    cell = Cell("multiplicative", 1.0, 5.0, steps=10)
+    with pytest.warns(UserWarning, match="Few of the 4,096 paths make up for most"):
+        got = estimate(cell, ds.ArrayRQMC(256, 16), 0)
+    assert got.std_error[1] > 1.3 * np.sqrt(got.variance[1] / 16)
+    np.testing.assert_allclose(got.std_error[3], np.sqrt(got.variance[3] / 16))
