@@ -3,7 +3,7 @@
 import collections
 import dataclasses
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -123,7 +123,7 @@ def run(
         while True:
             more = at < most and not reached()
             if more:
-                running.append(batches.started(at, most))
+                running.append(batches.started(at, most, batches.sampler_at(at)))
                 at += batches.size * len(devices)
             # One batch is computed while the one before it is added up.
             if len(running) > more:
@@ -166,12 +166,15 @@ class _Batches:
             self._sampler = lambda keys: plan.sampler(keys)
         self._mesh = Mesh(np.array(devices), ("samples",))
 
-    def started(self, at: int, most: int) -> tuple:
+    def sampler_at(self, at: int) -> Callable:
+        if self._paths_of is None:
+            return self._sampler
+        return jtu.Partial(self._sampler, self._paths_of(at, self.size))
+
+    def started(self, at: int, most: int, sampler: Callable) -> tuple:
         """Of the batches from sample number `at` on, less than `most`, what is being
         computed."""
-        sampler, count = self._sampler, len(self._devices)
-        if self._paths_of is not None:
-            sampler = jtu.Partial(sampler, self._paths_of(at, self.size))
+        count = len(self._devices)
         lo_hi = np.array([at & 0xFFFFFFFF, at >> 32], np.uint32)
         left = np.array(max(0, min(self.size * count, most - at)), np.int32)
         if count == 1:
@@ -190,7 +193,8 @@ class _Batches:
     def nothing(self, at: int, most: int) -> Moments:
         """The moments of no samples."""
         # JAX caches this trace and uses it for the first batch.
-        shapes = eqx.filter_eval_shape(self.started, at, most)[2]
+        sampler = self.sampler_at(at)
+        shapes = eqx.filter_eval_shape(self.started, at, most, sampler)[2]
         zeros = jtu.tree_map(lambda s: np.zeros(s.shape[1:]), shapes)
         dtypes = jtu.tree_map(lambda s: str(s.dtype), shapes)
         return Moments(at, at, 0, 0, zeros, zeros, zeros, zeros, dtypes)
