@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Bool, PRNGKeyArray, PyTree
 
 from .._expectation._monte_carlo import path_keys, with_keys
-from .._expectation._steps import independent_steps, Problem, samples
+from .._expectation._steps import independent_steps, Problem, simulate
 from ._kernels import Kernels
 from ._layout import sample_key, split
 from ._operation import NotReplayed
@@ -53,8 +54,8 @@ def _paths(p: Problem, key: PRNGKeyArray, hi, lo):
     own = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
     terms_of = lambda keys: with_keys(p.terms, keys)
     begin = lambda level: independent_steps(p, level, len(lo), terms_of, lambda i: own)
-    out = samples(p, begin)
-    return out.values, ~out.good
+    states, failed, _ = simulate(p, begin)
+    return p.unravel(jnp.swapaxes(states, 1, 2)), failed
 
 
 def by_drjit(

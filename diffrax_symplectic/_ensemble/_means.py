@@ -5,6 +5,7 @@ import functools as ft
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
@@ -67,6 +68,6 @@ def _samples(
         return jax.vmap(jax.vmap(p.values), (None, 0))(times, y)
 
     phi = jax.vmap(values)(p.levels, y)
-    finite = jax.vmap(jax.vmap(all_finite))(phi)
-    phi = phi[:, :, 0] if p.at_end else phi
-    return Samples(p.unravel(phi), p.weights, ~failed & finite)
+    lost = jnp.any(failed | ~jax.vmap(jax.vmap(all_finite))(phi), axis=0)
+    combined = p.combined(jnp.swapaxes(phi, 1, 2))
+    return Samples(p.averaged([combined]), ~lost, lost)

@@ -27,14 +27,14 @@ from .._terms import brownian_paths, replace_paths
 from ._fits import Functions
 from ._points import hilbert_order, num_seeds, randomized, sobol_points
 from ._run import run
-from ._sampling import AbstractSampling, Plan, Samples
+from ._sampling import AbstractSampling, Plan, ROUNDING, Samples
 from ._steps import (
     along,
     check_real,
     independent_steps,
     numbers,
     Problem,
-    samples,
+    simulate,
 )
 from ._value_functions import value_function
 
@@ -164,7 +164,12 @@ def _replicates(
         advance, paths = independent_steps(p, level, n, terms_of, words)
         return step, paths
 
-    return samples(p, begin, _mean_of_good)
+    saved, failed, _ = simulate(p, begin, _mean_of_good)
+    means, heavy = jnp.moveaxis(saved[:, :, :, None], 2, 0)
+    means = p.combined(means)
+    # Of the level where it is most.
+    heavy = jnp.broadcast_to(jnp.max(heavy, axis=0), means.shape)
+    return Samples(p.averaged([means, heavy]), jnp.ones(1, bool), jnp.sum(failed)[None])
 
 
 def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "2 ..."]:
@@ -184,7 +189,9 @@ def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "2 ..."]:
     # In units of the largest.
     s = jnp.sqrt(mean((off / jnp.where(most > 0, most, 1)) ** 2))
     beyond = jnp.maximum(1 - s * jnp.sqrt(4.5 * jnp.log(jnp.maximum(count, 2))), 0)
-    r = jnp.where(s > 0, beyond / (s * jnp.sqrt(count)), 0)
+    # Rounding errors have heavy tails, too.
+    some = most > ROUNDING * jnp.finfo(x.dtype).eps * jnp.abs(own)
+    r = jnp.where(some, beyond / (s * jnp.sqrt(count)), 0)
     return jnp.stack([own, r])
 
 

@@ -2,6 +2,8 @@
 
 import abc
 import functools as ft
+import itertools
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeAlias
 
@@ -10,10 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from ._polynomials import dot, hermite, least_squares, num_polynomials
-from ._steps import along
+from ._polynomials import dot, hermite, least_squares, num_polynomials, tensordot
 
 
 _PILOTS_PER_POLYNOMIAL, _FEWEST_PILOTS = 30, 256
@@ -29,7 +30,7 @@ _WIDER, _FALLS, _STENCIL = 1.5, 0.9, 6
 # With 1,024 paths in the pilot of a grid with 32 points, means were off by 15 standard
 # errors: paths of probability 1e-6 left it. Not so with these, at no loss.
 _PILOTS_OF_GRID = 2**13
-# What a grid adds to: polynomials of these degrees.
+# What a grid adds to: the best polynomial of these degrees.
 _BASE = 0, 2, 4
 # Derivatives are averaged over so many paths, in many dimensions fewer.
 _QUADRATIC_PILOTS, _QUADRATIC_NUMBERS = 128, 2**13
@@ -39,55 +40,59 @@ Value: TypeAlias = Callable[..., Float[Array, "C S m"]]
 
 
 class Frame(eqx.Module):
-    """Coordinates of states: in units of their spread, and along the axes of their
-    covariance if `to` is there. What does not move has the unit zero, and is left out."""
+    """Coordinates of states, in which they have mean zero and deviations of about one.
+    Coordinates of the state that do not move are left out."""
 
     mean: Float[Array, " d"]
-    unit: Float[Array, " d"]
-    # Of shape `(d, d)`, if they are there.
-    to: Any = None
-    back: Any = None
+    to: Float[Array, "d d"]
+    back: Float[Array, "d d"]
 
     def at(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
-        moves = self.unit > 0
-        z = jnp.where(moves, (y - self.mean) / jnp.where(moves, self.unit, 1), 0)
-        return z if self.to is None else dot(z, self.to.T)
+        return dot(y - self.mean, self.to.T)
 
     def states(self, z: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
-        z = z if self.back is None else dot(z, self.back.T)
-        return self.mean + self.unit * z
+        return self.mean + dot(z, self.back.T)
 
     @staticmethod
     def of(
         points: Float[Array, "n d"], good: Bool[Array, " n"], unit: Float[Array, " d"]
     ) -> "Frame":
-        """In which the points that are good have mean zero and deviations of about one. In
-        units of `unit` coordinates are comparable."""
+        """For the points that are good, along the axes of their covariance. In units of
+        `unit`, which is zero for what does not move, coordinates are comparable."""
         share = good.astype(points.dtype) / jnp.maximum(jnp.sum(good), 1)
-        mean = share @ points
-        off = Frame(mean, unit).at(points)
+        mean, inverse = share @ points, _inverse(unit)
+        off = (points - mean) * inverse
         variances, axes = jnp.linalg.eigh((off.T * share) @ off)
         tiny = jnp.finfo(points.dtype).eps ** 2
         size = jnp.sqrt(jnp.maximum(variances, _FLOOR**2 * variances[-1]) + tiny)
-        return Frame(mean, unit, axes.T / size[:, None], axes * size)
+        return Frame(
+            mean, axes.T / size[:, None] * inverse, unit[:, None] * axes * size
+        )
 
     def moved(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
         # The same in all steps: what a program makes of keys takes long to compile.
         z = np.random.default_rng(0).normal(0, _MOVE, states.shape)
-        return states + self.unit * dot(jnp.asarray(z, states.dtype), self.back.T)
+        return states + dot(jnp.asarray(z, states.dtype), self.back.T)
+
+
+def _inverse(unit: Float[Array, " d"]) -> Float[Array, " d"]:
+    return jnp.where(unit > 0, 1 / jnp.where(unit > 0, unit, 1), 0)
 
 
 class AbstractBasis(eqx.Module):
     """Functions of `d` coordinates. Candidates, numbers of a kind, are there to choose
-    among; the first is 0, a constant, which takes nothing away from a path.
-
-    Coefficients are a PyTree of arrays whose last axes are those of the times at which to
-    average and of the numbers of `phi`, with one for the candidates before them.
-    """
+    among. A function is a sum with `size` coefficients, an array of which the last axes are
+    those of the times at which to average and of the numbers of `phi`, with one for the
+    candidates before them."""
 
     kind: eqx.AbstractClassVar[str]
     d: eqx.AbstractVar[int]
     candidates: eqx.AbstractVar[tuple[int, ...]]
+
+    @property
+    @abc.abstractmethod
+    def size(self) -> int:
+        """How many coefficients a function has."""
 
     @property
     @abc.abstractmethod
@@ -100,10 +105,6 @@ class AbstractBasis(eqx.Module):
         """At how many states a function is looked at."""
 
     @abc.abstractmethod
-    def zeros(self, outputs: tuple[int, int], dtype) -> PyTree[Array]:
-        """Coefficients of functions that are zero."""
-
-    @abc.abstractmethod
     def frame(
         self, states: Float[Array, "n d"], good: Bool[Array, " n"], unit
     ) -> PyTree:
@@ -113,160 +114,14 @@ class AbstractBasis(eqx.Module):
     @abc.abstractmethod
     def fitted(
         self, value: Value, frame: Any, states, good, keys: PRNGKeyArray
-    ) -> PyTree[Array]:
+    ) -> Float[Array, "size C S m"]:
         """The coefficients. `keys` are those of the pilot's paths, for estimates."""
 
     @abc.abstractmethod
-    def combined(self, frame: Any, y: Float[Array, " d"], c: PyTree[Array]) -> Array:
+    def combined(
+        self, frame: Any, y: Float[Array, " d"], c: Float[Array, "size *C S m"]
+    ) -> Float[Array, "*C S m"]:
         """The function with these coefficients, at a state."""
-
-    def chosen(self, c: PyTree[Array], best: Int[np.ndarray, "S m"]) -> PyTree[Array]:
-        """Of each number the coefficients of its own candidate."""
-        return _taken(c, best)
-
-
-def _taken(c: Float[Array, "... C S m"], best: Int[np.ndarray, "S m"]) -> Array:
-    index = best.reshape(*[1] * (c.ndim - 2), *best.shape)
-    return jnp.take_along_axis(c, index, -3).squeeze(-3)
-
-
-class Stretched(eqx.Module):
-    """Coordinates from -1 to 1 on a grid: about a middle they are even, further out they
-    grow with the logarithm, where few paths go far."""
-
-    inner: Frame
-    middle: Float[Array, " d"]
-    # `asinh(factor * z) / width`
-    factor: Float[Array, " d"]
-    width: Float[Array, " d"]
-
-    def at(self, z: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
-        return jnp.arcsinh(self.factor * (z - self.middle)) / self.width
-
-    def back(self, x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
-        return self.middle + jnp.sinh(self.width * x) / self.factor
-
-
-class Grid(AbstractBasis):
-    """Polynomials, and what they leave on a grid with `size` points along each axis. In
-    between is the polynomial of degree 5 in each coordinate through the 6 nearest points on
-    its axis. Towards the edge it falls to zero: beyond it the polynomial stays, of the
-    degree that is closest near the edge. Candidates are the polynomials alone, and with the
-    grid."""
-
-    kind: ClassVar[str] = "degree, or grid points along an axis"
-    d: int
-    size: int
-
-    @property
-    def candidates(self):
-        return *_BASE, self.size
-
-    @property
-    def pilots(self):
-        return _PILOTS_OF_GRID
-
-    @property
-    def sites(self):
-        return self.size**self.d + self._few
-
-    @property
-    def _few(self) -> int:
-        return max(
-            _FEWEST_PILOTS, _PILOTS_PER_POLYNOMIAL * num_polynomials(self.d, _BASE[-1])
-        )
-
-    def zeros(self, outputs, dtype):
-        count = num_polynomials(self.d, _BASE[-1])
-        polynomials = jnp.zeros((count, len(self.candidates), *outputs), dtype)
-        return polynomials, jnp.zeros((self.size**self.d, *outputs), dtype)
-
-    def frame(self, states, good, unit):
-        inner = Frame.of(states, good, unit)
-        z = inner.at(states)
-        at = lambda q: jnp.nanquantile(jnp.where(good[:, None], z, jnp.nan), q, axis=0)
-        low, quarter, middle, other, high = map(at, (0.0, 0.25, 0.5, 0.75, 1.0))
-        half = jnp.maximum(_WIDER * jnp.maximum(high - middle, middle - low), 1)
-        # As far from each other in the middle as on an even grid of eight times the
-        # quartile's distance to either side, or of all if that is less.
-        even = jnp.clip(8 * (other - quarter), half / 1e4, half)
-        width = _asinh_width(half / even)
-        factor = jnp.sinh(width) / half
-        return Stretched(inner, middle, factor, width)
-
-    def fitted(self, value, frame, states, good, keys):
-        few, inner = slice(None, self._few), frame.inner
-        axis = np.linspace(-1, 1, self.size)
-        x = np.stack(np.meshgrid(*[axis] * self.d, indexing="ij"), -1).reshape(
-            -1, self.d
-        )
-        nodes = inner.states(frame.back(jnp.asarray(x, states.dtype)))
-        points = jnp.concatenate([inner.moved(states[few]), nodes])
-        values = jax.vmap(value)(points)
-        B = jax.vmap(lambda x: jnp.stack(hermite(x, _BASE[-1])))(inner.at(points))
-        # Of the last candidate, the grid, with each of the polynomials.
-        grids = values[:, -1:]
-        each = jnp.concatenate([values[few], *[grids[few]] * (len(_BASE) - 1)], axis=1)
-        sizes = [num_polynomials(self.d, k) for k in _BASE]
-        c = _polynomials(B[few], each, good[few], (*sizes, *sizes))
-        alone, base = c[:, : len(_BASE)], c[:, len(_BASE) :]
-        nodes = slice(self._few, None)
-        left = grids[nodes] - jnp.tensordot(B[nodes], base, 1)
-        finite = jnp.isfinite(left)
-        far = np.max(np.abs(x), axis=1)
-        edge = (far > _FALLS * 0.8) & (far < _FALLS)
-        near_edge = jnp.where(finite & edge[:, None, None, None], jnp.abs(left), 0)
-        best = jnp.argmin(jnp.max(near_edge, axis=0), axis=0)[None, None]
-        left = jnp.take_along_axis(jnp.where(finite, left, 0), best, 1)[:, 0]
-        falling = np.prod(_falling((np.abs(x) - _FALLS) / (1 - _FALLS)), axis=1)
-        grid = left * jnp.asarray(falling, left.dtype)[:, None, None]
-        return jnp.concatenate([alone, jnp.take_along_axis(base, best, 1)], 1), grid
-
-    def combined(self, frame, y, c):
-        polynomials, grid = c
-        z = frame.inner.at(y)
-        out = jnp.tensordot(jnp.stack(hermite(z, _BASE[-1])), polynomials, 1)
-        there = self._interpolated(frame.at(z), grid)
-        return out.at[-1].add(there) if polynomials.ndim > grid.ndim else out + there
-
-    def _interpolated(self, x, c):
-        n, k, last = self.size, _STENCIL, c.shape[1:]
-        place = (x + 1) * (n - 1) / 2
-        inside = jnp.all((place >= k // 2 - 1) & (place <= n - k // 2))
-        place = jnp.clip(jnp.where(inside, place, n / 2), k // 2 - 1, n - k // 2)
-        begin = jnp.minimum(jnp.floor(place) - (k // 2 - 1), n - k)
-        off = (place - begin)[:, None] - np.arange(k)
-        each = [(j, np.delete(np.arange(k), j)) for j in range(k)]
-        weights = jnp.stack([jnp.prod(off[:, m] / (j - m), axis=1) for j, m in each])
-        block = lax.dynamic_slice(
-            c.reshape(*[n] * self.d, *last),
-            jnp.pad(begin.astype(jnp.int32), (0, len(last))),
-            (*[k] * self.d, *last),
-        )
-        for j in range(self.d):
-            block = jnp.tensordot(weights[:, j], block, 1)
-        return jnp.where(inside, block, 0)
-
-    def chosen(self, c, best):
-        polynomials, grid = c
-        last = len(self.candidates) - 1
-        return _taken(polynomials, best), grid * (best == last).astype(grid.dtype)
-
-
-def _asinh_width(ratio):
-    """`w` with `sinh(w) / w = ratio`, by Newton's method for its logarithm from above;
-    no smaller than 0.1, which is even."""
-    w = jnp.log(2 * ratio) + jnp.log(jnp.log(2 * ratio) + 1) + 1
-    for _ in range(12):
-        f = jnp.log(jnp.sinh(w) / w) - jnp.log(ratio)
-        w = jnp.maximum(w - f / jnp.maximum(1 / jnp.tanh(w) - 1 / w, 0.03), 0.1)
-    return w
-
-
-def _falling(x: np.ndarray) -> np.ndarray:
-    """From 1 at 0 to 0 at 1, with two derivatives that are zero at both."""
-    x = np.clip(x, 0, 1)
-    return 1 - x**3 * (10 - 15 * x + 6 * x**2)
 
 
 class Hermite(AbstractBasis):
@@ -277,42 +132,170 @@ class Hermite(AbstractBasis):
     candidates: tuple[int, ...]
 
     @property
+    def size(self):
+        return num_polynomials(self.d, max(self.candidates))
+
+    @property
     def pilots(self):
-        count = num_polynomials(self.d, max(self.candidates))
-        return max(_FEWEST_PILOTS, _PILOTS_PER_POLYNOMIAL * count)
+        return max(_FEWEST_PILOTS, _PILOTS_PER_POLYNOMIAL * self.size)
 
     @property
     def sites(self):
         return self.pilots
-
-    def zeros(self, outputs, dtype):
-        count = num_polynomials(self.d, max(self.candidates))
-        return jnp.zeros((count, len(self.candidates), *outputs), dtype)
 
     def frame(self, states, good, unit):
         return Frame.of(states, good, unit)
 
     def fitted(self, value, frame, states, good, keys):
         points = frame.moved(states)
-        degree = max(self.candidates)
-        B = jax.vmap(lambda x: jnp.stack(hermite(x, degree)))(frame.at(points))
-        sizes = tuple(num_polynomials(self.d, k) for k in self.candidates)
-        return _polynomials(B, jax.vmap(value)(points), good, sizes)
+        return self.fitted_to(jax.vmap(value)(points), frame, points, good)
+
+    def fitted_to(self, values, frame, points, good):
+        """The polynomials that are closest to the values at the points that are good."""
+        B, flat = self.at(frame, points), values.reshape(*values.shape[:2], -1)
+        finite = lambda x: jnp.isfinite(x).reshape(len(x), -1).all(axis=1)
+        good = good & finite(B) & finite(flat)
+        B, flat = (
+            jnp.where(good[:, None], B, 0),
+            jnp.where(good[:, None, None], flat, 0),
+        )
+        c = least_squares(
+            B, flat, [num_polynomials(self.d, k) for k in self.candidates]
+        )
+        return c.reshape(-1, *values.shape[1:])
+
+    def at(self, frame, points: Float[Array, "n d"]) -> Float[Array, "n size"]:
+        each = lambda z: jnp.stack(hermite(z, max(self.candidates)))
+        return jax.vmap(each)(frame.at(points))
 
     def combined(self, frame, y, c):
         products = zip(hermite(frame.at(y), max(self.candidates)), c)
         return ft.reduce(jnp.add, [b * c for b, c in products])
 
 
-def _polynomials(B, values, good, sizes) -> Float[Array, "P C S m"]:
-    """The fit to the values at the points where the polynomials are `B`, of those that are
-    good and finite."""
-    flat = values.reshape(*values.shape[:2], -1)
-    finite = lambda x: jnp.isfinite(x).reshape(len(x), -1).all(axis=1)
-    good = good & finite(B) & finite(flat)
-    rows = lambda x: jnp.where(along(good, x), x, 0)
-    c = least_squares(rows(B), rows(flat), sizes)
-    return c.reshape(-1, *values.shape[1:])
+class Stretched(eqx.Module):
+    """Coordinates from -1 to 1 on a grid: about a middle they are even, further out they
+    grow with the fourth root, where few paths go far."""
+
+    inner: Frame
+    middle: Float[Array, " d"]
+    # `_bent(_bent(factor * (z - middle))) / edge`
+    factor: Float[Array, " d"]
+    edge: Float[Array, " d"]
+
+    def at(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
+        return _bent(_bent(self.factor * (self.inner.at(y) - self.middle))) / self.edge
+
+    def states(self, x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
+        far = _straight(_straight(self.edge * x))
+        return self.inner.states(self.middle + far / self.factor)
+
+
+def _bent(x):
+    """An odd function with the slope 1 at zero, which grows with the square root. (It takes
+    a quarter of the time of a logarithm.)"""
+    return x / jnp.sqrt(jnp.sqrt(1 + x**2))
+
+
+def _straight(x):
+    """Its inverse."""
+    return x * jnp.sqrt(x**2 / 2 + jnp.sqrt(1 + x**4 / 4))
+
+
+class Grid(AbstractBasis):
+    """A polynomial, and what it leaves on a grid with so many points along each axis. In
+    between is the polynomial of degree 5 in each coordinate through the 6 nearest points on
+    its axis. Towards the edge it falls to zero: beyond it the polynomial stays, of the
+    degree that is closest near the edge."""
+
+    kind: ClassVar[str] = "grid points along an axis"
+    d: int
+    candidates: tuple[int]
+
+    @property
+    def size(self):
+        return self._base.size + self.candidates[0] ** self.d
+
+    @property
+    def pilots(self):
+        return _PILOTS_OF_GRID
+
+    @property
+    def sites(self):
+        return self._base.pilots + self.candidates[0] ** self.d
+
+    @property
+    def _base(self) -> Hermite:
+        return Hermite(self.d, _BASE)
+
+    def frame(self, states, good, unit):
+        inner = Frame.of(states, good, unit)
+        z = inner.at(states)
+        low = jnp.min(jnp.where(good[:, None], z, jnp.inf), axis=0)
+        high = jnp.max(jnp.where(good[:, None], z, -jnp.inf), axis=0)
+        # A few of them tell quartiles well enough.
+        few = jnp.where(good[:, None], z, jnp.nan)[: self._base.pilots]
+        quarter, middle, other = jnp.nanquantile(
+            few, jnp.array([0.25, 0.5, 0.75]), axis=0
+        )
+        half = jnp.maximum(_WIDER * jnp.maximum(high - middle, middle - low), 1)
+        # As far from each other in the middle as on an even grid of seven times the
+        # quartile's distance to either side, or of all if that is less.
+        even = jnp.clip(7 * (other - quarter), half / 1e4, half)
+        bend = jnp.sqrt(jnp.maximum((half / even) ** (8 / 3) - 1, 0.01))
+        return Stretched(inner, middle, bend / half, _bent(_bent(bend)))
+
+    def fitted(self, value, frame, states, good, keys):
+        base, inner, n = self._base, frame.inner, self._base.pilots
+        axes = [np.linspace(-1, 1, self.candidates[0])] * self.d
+        x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, self.d)
+        nodes = frame.states(jnp.asarray(x, states.dtype))
+        points = jnp.concatenate([inner.moved(states[:n]), nodes])
+        values = jax.vmap(value)(points)
+        few = jnp.repeat(values[:n], len(_BASE), axis=1)
+        c = base.fitted_to(few, inner, points[:n], good[:n])
+        left = values[n:] - tensordot(base.at(inner, nodes), c, 1)
+        # Where it grows fast it is not finite.
+        left = jnp.where(jnp.isfinite(left), left, 0)
+        far = np.max(np.abs(x), axis=1)
+        near_edge = left[(far > _FALLS * 0.8) & (far < _FALLS)]
+        best = jnp.argmin(jnp.max(jnp.abs(near_edge), axis=0), axis=0)[None, None]
+        left, c = (jnp.take_along_axis(y, best, 1) for y in (left, c))
+        falling = np.prod(_falling((np.abs(x) - _FALLS) / (1 - _FALLS)), axis=1)
+        falling = jnp.asarray(falling, left.dtype)[:, None, None, None]
+        return jnp.concatenate([c, left * falling])
+
+    def combined(self, frame, y, c):
+        there = self.interpolated(frame.at(y), c[self._base.size :])
+        return self._base.combined(frame.inner, y, c[: self._base.size]) + there
+
+    def interpolated(self, x: Float[Array, " d"], c: Float[Array, "nodes ..."]):
+        """What is on the grid, at a point."""
+        n, k, last = self.candidates[0], _STENCIL, c.shape[1:]
+        place = (x + 1) * (n - 1) / 2
+        inside = jnp.all((place >= k // 2 - 1) & (place <= n - k // 2))
+        place = jnp.clip(jnp.where(inside, place, n / 2), k // 2 - 1, n - k // 2)
+        begin = jnp.minimum(jnp.floor(place) - (k // 2 - 1), n - k)
+        start = jnp.pad(begin.astype(jnp.int32), (0, len(last)))
+        shape = *[k] * self.d, *last
+        block = lax.dynamic_slice(c.reshape(*[n] * self.d, *last), start, shape)
+        # Lagrange's polynomials, as products of what is left and right of each point.
+        off = [place - begin - j for j in range(k)]
+        left = [*itertools.accumulate(off[:-1], jnp.multiply, initial=1.0)]
+        right = [*itertools.accumulate(off[:0:-1], jnp.multiply, initial=1.0)][::-1]
+        signed = [(-1) ** (k - 1 - j) * math.factorial(j) for j in range(k)]
+        scale = [s * math.factorial(k - 1 - j) for j, s in enumerate(signed)]
+        weights = [x * y / s for x, y, s in zip(left, right, scale)]
+        for j in range(self.d):
+            products = [w[j] * values for w, values in zip(weights, block)]
+            block = ft.reduce(jnp.add, products)
+        return jnp.where(inside, block, 0)
+
+
+def _falling(x: np.ndarray) -> np.ndarray:
+    """From 1 at 0 to 0 at 1, with two derivatives that are zero at both."""
+    x = np.clip(x, 0, 1)
+    return 1 - x**3 * (10 - 15 * x + 6 * x**2)
 
 
 class Quadratic(AbstractBasis):
@@ -326,6 +309,10 @@ class Quadratic(AbstractBasis):
     candidates: tuple[int, ...]
 
     @property
+    def size(self):
+        return self.d + self.d**2
+
+    @property
     def pilots(self):
         return int(np.clip(_QUADRATIC_NUMBERS // self.d, 16, _QUADRATIC_PILOTS))
 
@@ -334,18 +321,14 @@ class Quadratic(AbstractBasis):
         # A Hessian takes as long as `d` gradients, and a gradient as two values.
         return 2 * self.d * self.pilots
 
-    def zeros(self, outputs, dtype):
-        shape = self.d + self.d**2, len(self.candidates), *outputs
-        return jnp.zeros(shape, dtype)
-
     def frame(self, states, good, unit):
         share = good.astype(states.dtype) / jnp.maximum(jnp.sum(good), 1)
-        return Frame(share @ states, unit)
+        return share @ states, unit
 
     def fitted(self, value, frame, states, good, keys):
         def derivatives(args):
             key, y = args
-            at = lambda z: value(y + frame.unit * z, key)
+            at = lambda z: value(y + frame[1] * z, key)
 
             def slope(z):
                 first = jax.jacrev(at)(z)
@@ -357,11 +340,12 @@ class Quadratic(AbstractBasis):
 
         each = lax.map(derivatives, (keys, states))
         share = good.astype(each.dtype) / jnp.maximum(jnp.sum(good), 1)
-        mean = jnp.tensordot(share, jnp.where(jnp.isfinite(each), each, 0), 1)
+        mean = tensordot(share, jnp.where(jnp.isfinite(each), each, 0), 1)
         order = np.repeat([1, 2], [self.d, self.d**2])[:, None, None, None]
         return jnp.where(order <= np.array(self.candidates)[:, None, None], mean, 0)
 
     def combined(self, frame, y, c):
-        z, d = frame.at(y), len(y)
+        mean, unit = frame
+        z, d = (y - mean) * _inverse(unit), len(y)
         second = c[d:].reshape(d, d, *c.shape[1:])
-        return jnp.tensordot(z, c[:d] + jnp.tensordot(z, second, 1) / 2, 1)
+        return tensordot(z, c[:d] + tensordot(z, second, 1) / 2, 1)

@@ -13,13 +13,12 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ._moments import joined, Moments, total
+from ._sampling import ROUNDING
 from ._saved import arrays_of, described, rebuilt
 
 
 # Standard errors of the mean of a control, which is zero.
 _SURE, _HEAVY_CONTROL = 5, 0.1
-# Deviations of so many roundings of the mean are roundings of the paths.
-_ROUNDING = 1e3
 # What paths with wider noise show of the tails counts if it is so many times as much as
 # what is seen of them.
 _SEEN = 4
@@ -250,11 +249,14 @@ class Expectation(eqx.Module):
             return None
         if far is None:
             far = jtu.tree_map(lambda x: np.zeros(x.shape[1:]), whole.mean)
-        numbers = whole.good, self.roundings
-        one = lambda *leaves: getattr(_Leaf(*numbers, *leaves), name)(combination)
-        return jtu.tree_map(
-            one, whole.mean, whole.norm, whole.largest, whole.dtypes, far
-        )
+        one = lambda *leaves: _results(whole.good, self.roundings, *leaves)[name]
+        trees = whole.mean, whole.norm, whole.largest, whole.dtypes, far
+        return jtu.tree_map(lambda *leaves: one(*leaves)[combination], *trees)
+
+    @property
+    def plain_std_error(self) -> _Host:
+        """The standard error without the control variate, if there is one."""
+        return self._each("plain_std_error", 0)
 
     @property
     def heaviest(self) -> float:
@@ -271,63 +273,45 @@ class Expectation(eqx.Module):
         return max((float(np.max(x, initial=0.0)) for x in each), default=0.0)
 
 
-class _Leaf:
-    """What the moments of an array say. Its first axis is for kinds: the estimate, and with
-    sorted paths the mean of their `r`, or with a control variate the estimate without it,
-    the control, and what is known of tails; its second axis is for the combinations of
-    levels."""
-
-    def __init__(
-        self, count: int, roundings: int, mean, norm, largest, dtype: str, far
-    ):
-        n = count
-        with np.errstate(all="ignore"):
-            s = norm / np.sqrt(n - 1) if n > 1 else np.full_like(norm, np.nan)
-            beyond = np.maximum(largest - s * np.sqrt(4.5 * np.log(max(n, 2))), 0)
-            r = np.where(s > 0, beyond / (s * np.sqrt(n)), 0)
-            if len(mean) == 2:
-                r[0] = np.fmax(r[0], mean[1])
-            # Combinations of levels are differences of numbers as large as the mean.
-            size = np.fmax.reduce(np.abs(mean[: 1 + (len(mean) > 2), :1]))
-            rounding = roundings * float(jnp.finfo(dtype).eps) * size
-            # Rounding errors have heavy tails, too.
-            r = np.where(largest > _ROUNDING * rounding, np.minimum(r, 1 - 1e-6), 0)
-            error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
-            error = np.maximum(error, rounding)
-            self._drop = np.zeros(mean.shape[2:], bool)
-            if len(mean) > 2:
-                # Of a control with heavy tails the standard error says too little.
-                fine = np.abs(mean[2]) <= np.fmax(
-                    _SURE * error[2], _ROUNDING * rounding
-                )
-                fine |= r[2] > _HEAVY_CONTROL
-                self._drop = ~np.all(fine & np.isfinite(mean[0]), axis=0)
-                # Where enough is seen of it, that is in the spread. (NaN, where the trial
-                # had no value, says nothing.)
-                unseen = np.where(far > _SEEN * mean[3], far - mean[3], 0)
-                error[0] = np.hypot(error[0], unseen)
-        self._known = 1.0 if n > 0 else np.nan
-        self._mean, self._error, self._s, self._r = mean, error, s, r
-
-    def _one(self, x, combination: int):
-        x = x[:, combination]
-        return x[0] if len(x) < 3 else np.where(self._drop, x[1], x[0])[()]
-
-    def mean(self, combination: int):
-        return self._known * self._one(self._mean, combination)
-
-    def std_error(self, combination: int):
-        return self._one(self._error, combination)
-
-    def variance(self, combination: int):
-        with np.errstate(over="ignore"):
-            return self._one(self._s, combination) ** 2
-
-    def weight(self, combination: int):
-        return self._one(self._r, combination)
-
-    def dropped(self, combination: int):
-        return self._drop
+@np.errstate(all="ignore")
+def _results(
+    n: int, roundings: int, mean, norm, largest, dtype: str, far
+) -> dict[str, np.ndarray]:
+    """What the moments of an array say, of each combination of levels. The first axis of
+    the moments is for the kinds of `Samples`."""
+    s = norm / np.sqrt(n - 1) if n > 1 else np.full_like(norm, np.nan)
+    outlying = np.maximum(largest - s * np.sqrt(4.5 * np.log(max(n, 2))), 0)
+    r = np.where(s > 0, outlying / (s * np.sqrt(n)), 0)
+    controlled = len(mean) > 2
+    # Combinations of levels are differences of numbers as large as the mean.
+    size = np.fmax.reduce(np.abs(mean[: 1 + controlled, :1]))
+    rounding = roundings * float(jnp.finfo(dtype).eps) * size
+    # Rounding errors have heavy tails, too.
+    r = np.where(largest > ROUNDING * rounding, r, 0)
+    if len(mean) == 2:
+        r[0] = np.fmax(r[0], mean[1])
+    r = np.minimum(r, 1 - 1e-6)
+    error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
+    error = np.maximum(error, rounding)
+    dropped = np.zeros(mean.shape[1:], bool)
+    if controlled:
+        # Of a control with heavy tails the standard error says too little.
+        fine = np.abs(mean[2]) <= np.fmax(_SURE * error[2], ROUNDING * rounding)
+        fine |= r[2] > _HEAVY_CONTROL
+        dropped |= ~np.all(fine & np.isfinite(mean[0]), axis=0)
+        # Where enough is seen of it, that is in the spread. (NaN, where the trial had no
+        # value, says nothing.)
+        unseen = np.where(far > _SEEN * mean[3], far - mean[3], 0)
+        error[0] = np.hypot(error[0], unseen)
+    best = lambda x: np.where(dropped, x[1], x[0]) if controlled else x[0]
+    return {
+        "mean": best(mean) if n > 0 else np.full_like(mean[0], np.nan),
+        "std_error": best(error),
+        "plain_std_error": error[int(controlled)],
+        "variance": best(s) ** 2,
+        "weight": best(r),
+        "dropped": dropped,
+    }
 
 
 class ExpectationInterrupted(KeyboardInterrupt):

@@ -28,23 +28,24 @@ class Functions(eqx.Module):
 
     # Along a first axis of steps.
     frames: PyTree[Array]
-    coefficients: PyTree[Array]
+    coefficients: Float[Array, "steps P *C S m"]
     # What the noise keeps of them, to know what they do in a step.
     second: Float[Array, "steps n n *C S m"] | None
     basis: AbstractBasis = eqx.field(static=True)
 
     def __call__(self, i, y: Y) -> Float[Array, "*C S m"]:
         """Their values at a state after step number `i`."""
-        frame, c = jtu.tree_map(lambda x: x[i], (self.frames, self.coefficients))
-        return self.basis.combined(frame, ravel(y), c)
+        frame = jtu.tree_map(lambda x: x[i], self.frames)
+        return self.basis.combined(frame, ravel(y), self.coefficients[i])
 
     def chosen(self, best: Int[np.ndarray, "S m"]) -> "Functions":
         """With one candidate for each number."""
-        c = self.basis.chosen(self.coefficients, best)
-        second = self.second
-        if second is not None:
-            index = best.reshape(*[1] * (second.ndim - 2), *best.shape)
-            second = jnp.take_along_axis(second, index, -3).squeeze(-3)
+
+        def take(c):
+            index = best.reshape(*[1] * (c.ndim - 2), *best.shape)
+            return jnp.take_along_axis(c, index, -3).squeeze(-3)
+
+        c, second = jtu.tree_map(take, (self.coefficients, self.second))
         return Functions(self.frames, c, second, self.basis)
 
 
@@ -82,14 +83,13 @@ def fit(noise: Any, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
     def backward(j, u):
         i = steps - 1 - j
         put = lambda all, one: all.at[i].set(one)
-        own, c = fitted(i, u)
-        frames = jtu.tree_map(put, u.frames, own)
-        return Functions(frames, jtu.tree_map(put, u.coefficients, c), None, basis)
+        both = jtu.tree_map(put, (u.frames, u.coefficients), fitted(i, u))
+        return Functions(both[0], both[1], None, basis)
 
     zeros = lambda s: jnp.zeros((last, *s.shape), s.dtype)
     frames = jtu.tree_map(zeros, jax.eval_shape(lambda: frame(0)))
-    c = jtu.tree_map(zeros, basis.zeros(p.num_outputs, p.dtype))
-    u = Functions(frames, c, None, basis)
+    shape = last, basis.size, len(basis.candidates), *p.num_outputs
+    u = Functions(frames, jnp.zeros(shape, p.dtype), None, basis)
     u = lax.fori_loop(0, steps, backward, u)
 
     def kept(args):

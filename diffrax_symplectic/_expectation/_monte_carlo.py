@@ -16,9 +16,10 @@ from .._arguments import check_takes, whole_number
 from .._root_finder import all_finite
 from .._terms import brownian_paths, replace_paths
 from ._estimate import Expectation
+from ._polynomials import tensordot
 from ._run import checked_call, Meter, NO_METER, run
-from ._sampling import AbstractSampling, Plan, Samples
-from ._steps import independent_steps, level_weights, Problem, samples
+from ._sampling import AbstractSampling, Plan, real, Samples
+from ._steps import independent_steps, level_weights, Problem, simulate
 
 
 class IndependentPaths(AbstractSampling):
@@ -57,7 +58,10 @@ def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
     n, own = len(keys), jax.vmap(lambda key: path_keys(p.terms, key))(keys)
     terms_of = lambda keys: with_keys(p.terms, keys)
     begin = lambda level: independent_steps(p, level, n, terms_of, lambda i: own)
-    return samples(p, begin)
+    saved, failed, _ = simulate(p, begin)
+    # A path fails once, on however many levels.
+    lost = jnp.any(failed, axis=0)
+    return Samples(p.averaged([p.combined(saved)]), ~lost, lost)
 
 
 def path_keys(terms: PyTree[diffrax.AbstractTerm], key: PRNGKeyArray) -> list[Array]:
@@ -189,7 +193,9 @@ def _of_function(fn: Callable, weights: np.ndarray, keys: PRNGKeyArray) -> Sampl
     fns = [fn] if levels == 1 else [at(level) for level in range(levels)]
     each = [jax.vmap(lambda key: _evaluate(fn, key))(keys) for fn in fns]
     values, good = jtu.tree_map(lambda *xs: jnp.stack(xs), *each)
-    return Samples(values, weights, good)
+    combined = lambda x: tensordot(weights.astype(x.dtype), x, 1)[None]
+    lost = ~jnp.all(good, axis=0)
+    return Samples(jtu.tree_map(combined, values), ~lost, lost)
 
 
 def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
@@ -203,9 +209,14 @@ def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
             "`fn` returns a `diffrax.RESULTS` within phi, where it would be averaged. "
             "Return a pair `(phi, sol.result)`, so that paths that failed are left out."
         )
-    out = jtu.tree_map(jnp.asarray, out)
+    out = jtu.tree_map(lambda x: jnp.asarray(x, real(jnp.result_type(x))), out)
     if len(jtu.tree_leaves(out)) == 0:
         raise ValueError(f"`fn` must return arrays, which are averaged; got {out!r}.")
+    if any(map(jnp.iscomplexobj, jtu.tree_leaves(out))):
+        raise ValueError(
+            "What is averaged must be real arrays; `fn` returned complex ones. Return real "
+            "and imaginary parts."
+        )
     return out, success & all_finite(out)
 
 

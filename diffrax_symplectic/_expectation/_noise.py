@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from .._brownian import Discrete, random_words
 from .._custom_types import Y
 from .._terms import outcomes, step_variables
+from ._polynomials import tensordot
 from ._steps import Level, Problem
 
 
@@ -61,29 +62,23 @@ class Noise(eqx.Module):
         return Noise(problem, level, discrete, few)
 
     def draw(
-        self, key: PRNGKeyArray, number, wide: Any = None
+        self, key: PRNGKeyArray, number, share: Any = 0.0
     ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-        """The variables of the key and this number. With the share `wide`, from 0 to 1, all
-        outcomes have the same probability. And the logarithm of how much more often that
-        makes the variables what they are."""
+        """The variables of the key and this number, if for this share of draws, from 0 to
+        1, all outcomes have the same probability; and the logarithm of how much more often
+        that makes them what they are."""
         words = random_words(key, (number, self.level.index), 1, len(self.laws))[0]
         x = jnp.zeros(len(self.laws), self.problem.dtype)
         log_ratio = jnp.zeros_like(x)
         for law in dict.fromkeys(self.laws):
             mine = np.array([other == law for other in self.laws])
-            own, p = (
-                law.from_words(words, x.dtype),
-                np.array(law.probabilities, x.dtype),
-            )
-            if wide is not None:
-                q = (1 - wide) * p + wide / len(p)
-                cuts = (jnp.cumsum(q)[:-1] * 2.0**32).astype(jnp.uint32)
-                place = jnp.sum(words[:, None] >= cuts, axis=1)
-                own = jnp.where(wide > 0, jnp.asarray(law.values, x.dtype)[place], own)
-                log_ratio = jnp.where(
-                    mine & (wide > 0), jnp.log(q / p)[place], log_ratio
-                )
-            x = jnp.where(mine, own, x)
+            p = np.array(law.probabilities, x.dtype)
+            q = (1 - share) * p + share / len(p)
+            cuts = (jnp.cumsum(q)[:-1] * 2.0**32).astype(jnp.uint32)
+            cuts = jnp.where(share > 0, cuts, np.array(law.cuts, np.uint32))
+            place = jnp.sum(words[:, None] >= cuts, axis=1)
+            x = jnp.where(mine, jnp.asarray(law.values, x.dtype)[place], x)
+            log_ratio = jnp.where(mine, jnp.log(q / p)[place], log_ratio)
         return x, jnp.sum(log_ratio)
 
     @property
@@ -119,27 +114,27 @@ class Noise(eqx.Module):
         """The expectation of `u` after step number `i` from `y`, by `nodes(x)`."""
         (points, weights), state = self.nodes(x), self.fresh(i, y)
         values = jax.vmap(lambda x: u(self.step(i, y, state, x)[0]))(points)
-        return jnp.tensordot(weights.astype(values.dtype), values, 1)
+        return tensordot(weights.astype(values.dtype), values, 1)
 
     def advance(
         self, i, y: Y, state: PyTree, u: Function, second: Array | None, x: Array
-    ) -> tuple[Y, PyTree, Bool[Array, ""], Array]:
+    ) -> tuple[Y, PyTree, Bool[Array, ""], tuple[Array, Array]]:
         """The states after step number `i` of a path with these variables; whether the step
-        succeeded; `u` there less its expectation, or what stands for that. `second` is what
-        `second` returns."""
+        succeeded; `u` there, and less its expectation, or what stands for that. `second` is
+        what `second` returns."""
         if self.outcomes is None:
             assert second is not None
             y1, new, success = self.step(i, y, state, x)
             first = jax.jacrev(lambda x: u(self.step(i, y, state, x)[0]))(0 * x)
             square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
-            control = jnp.tensordot(first, x, 1) + jnp.tensordot(square, second, 2) / 2
-            return y1, new, success, control
+            control = tensordot(first, x, 1) + tensordot(square, second, 2) / 2
+            return y1, new, success, (u(y1), control)
         points, weights = self.outcomes
         ends, states, success = jax.vmap(lambda x: self.step(i, y, state, x))(points)
         values, own = jax.vmap(u)(ends), jnp.argmax(jnp.all(points == x, axis=1))
-        mean = jnp.tensordot(weights.astype(values.dtype), values, 1)
+        mean = tensordot(weights.astype(values.dtype), values, 1)
         y1, new, value = jtu.tree_map(lambda x: x[own], (ends, states, values))
-        return y1, new, jnp.all(success), value - mean
+        return y1, new, jnp.all(success), (value, value - mean)
 
     def second(self, i, ys: Y, u: Function) -> Array | None:
         """The mean of the second derivatives at the states `ys`, if outcomes are many."""

@@ -3,6 +3,7 @@
 import functools as ft
 import itertools
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
-dot = ft.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+_EXACT = jax.lax.Precision.HIGHEST
+dot = ft.partial(jnp.matmul, precision=_EXACT)
+tensordot = ft.partial(jnp.tensordot, precision=_EXACT)
 
 
 def exponents(d: int, degree: int) -> list[tuple[int, ...]]:
@@ -44,7 +47,7 @@ def hermite(x: Float[Array, " d"], degree: int) -> list[Float[Array, ""]]:
 
 
 def least_squares(
-    B: Float[Array, "n P"], values: Float[Array, "n C m"], sizes: tuple[int, ...]
+    B: Float[Array, "n P"], values: Float[Array, "n C m"], sizes: Sequence[int]
 ) -> Float[Array, "P C m"]:
     """For each of `C` fits the coefficients of the first so many polynomials of `sizes`;
     the others are zero.

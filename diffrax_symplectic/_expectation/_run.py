@@ -15,7 +15,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._arguments import whole_number
 from .._brownian import check_key
@@ -29,8 +29,6 @@ _MANY = 0.01
 # With an `r` of `std_error` above this, means of exp(5 x), x normal, were off by forty
 # standard errors, and those of exp(3 x) by five.
 _HEAVY = 0.35
-# Deviations of so many roundings are none.
-_ROUNDING = 1e3
 NO_METER = diffrax.NoProgressMeter()
 
 
@@ -103,38 +101,13 @@ def run(
     """The estimate from the samples of a plan. Without a meter it is a trial, which warns
     of nothing. What a device computes, and in which order its sums are added up, does not
     depend on how many there are."""
-    sampler, size = plan.sampler, min(plan.batch_size, plan.num_samples)
-    key_data = np.asarray(jr.key_data(key))
-    if jax.process_count() > 1:
-        # Each process holds the same arrays. In a function they become constants of its
-        # program, since arguments would have to be placed on the devices of all.
-        sampler = lambda keys: plan.sampler(keys)
-    mesh = Mesh(np.array(devices), ("samples",))
-
-    def sampler_at(at: int) -> Callable:
-        if plan.paths_of is None:
-            return sampler
-        return jtu.Partial(sampler, plan.paths_of(at, size))
-
-    def batch(at: int, sampler: Callable) -> tuple:
-        lo_hi = np.array([at & 0xFFFFFFFF, at >> 32], np.uint32)
-        left = np.array(max(0, min(size * len(devices), most - at)), np.int32)
-        if len(devices) == 1:
-            lo_hi, left = jax.device_put((lo_hi, left), devices[0])
-        one: Any = _batch
-        return one(sampler, key_data, jr.key_impl(key), lo_hi, left, mesh, size)
-
     first, at = begin.first, begin.first
     if begin.start is not None:
         first, at = begin.start.moments[0].begin, begin.start.moments[-1].end
-    most = first + plan.num_samples
-    # JAX caches this trace and uses it for the first batch.
-    shapes = eqx.filter_eval_shape(batch, at, sampler_at(at))[2]
-    zeros = jtu.tree_map(lambda s: np.zeros(s.shape[1:]), shapes)
-    dtypes = jtu.tree_map(lambda s: str(s.dtype), shapes)
-    none = Moments(at, at, 0, 0, zeros, zeros, zeros, zeros, dtypes)
+    most, batches = first + plan.num_samples, _Batches(plan, key, devices)
+    none = batches.nothing(at, most)
     about = plan.roundings, sampling, plan.reason, None, plan.far
-    estimate = Expectation((none,), key_data, plan.paths, *about)
+    estimate = Expectation((none,), batches.key_data, plan.paths, *about)
     if begin.start is not None:
         begin.start.check_same(estimate, "`start`")
         if at > most:
@@ -144,46 +117,98 @@ def run(
                 f"{plan.num_samples}."
             )
         estimate = dataclasses.replace(estimate, moments=begin.start.moments)
-
-    def reached() -> bool:
-        if tol is None or estimate.num_samples < plan.least:
-            return False
-        return all(bool(np.all(x <= tol)) for x in jtu.tree_leaves(estimate.std_error))
-
-    def finished() -> Expectation:
-        said = None if tol is None else reached()
-        return dataclasses.replace(estimate, tol_reached=said)
-
+    reached = lambda: _reached(estimate, plan.least, tol)
     running, done = collections.deque(), at
     try:
         while True:
             more = at < most and not reached()
             if more:
-                running.append(batch(at, sampler_at(at)))
-                at += size * len(devices)
+                running.append(batches.started(at, most, batches.sampler_at(at)))
+                at += batches.size * len(devices)
             # One batch is computed while the one before it is added up.
             if len(running) > more:
-                parts = jax.device_get(running.popleft())
-                for one in range(len(devices)):
+                for part in batches.parts(running.popleft()):
                     # The same samples decide, however many are made at once.
                     if done < most and not reached():
-                        part = jtu.tree_map(lambda x: x[one], parts)
-                        new = _moments(part, done, min(done + size, most), dtypes)
+                        end = min(done + batches.size, most)
+                        new = _moments(part, done, end, none.dtypes)
                         both = joined((*estimate.moments, new))
                         estimate = dataclasses.replace(estimate, moments=both)
-                        done = new.end
+                        done = end
                 if meter is not None:
                     share = (done - first) / plan.num_samples
                     meter.step(max(share, _share_of_tolerance(estimate, tol)))
             elif not more:
                 break
     except KeyboardInterrupt:
-        raise ExpectationInterrupted(finished()) from None
-    estimate = finished()
+        raise ExpectationInterrupted(_finished(estimate, plan.least, tol)) from None
+    estimate = _finished(estimate, plan.least, tol)
     if meter is not None:
         for message in _warnings(estimate, tol):
             warnings.warn(message, stacklevel=3)
     return estimate
+
+
+class _Batches:
+    """The samples of a plan. Each device takes `size` at once."""
+
+    def __init__(self, plan: Plan, key: PRNGKeyArray, devices: tuple):
+        self.size = min(plan.batch_size, plan.num_samples)
+        self.key_data, self._impl = np.asarray(jr.key_data(key)), jr.key_impl(key)
+        self._sampler, self._paths_of, self._devices = (
+            plan.sampler,
+            plan.paths_of,
+            devices,
+        )
+        if jax.process_count() > 1:
+            # Each process holds the same arrays. In a function they become constants of
+            # its program, since arguments would have to be placed on the devices of all.
+            self._sampler = lambda keys: plan.sampler(keys)
+        self._mesh = Mesh(np.array(devices), ("samples",))
+
+    def sampler_at(self, at: int) -> Callable:
+        if self._paths_of is None:
+            return self._sampler
+        return jtu.Partial(self._sampler, self._paths_of(at, self.size))
+
+    def started(self, at: int, most: int, sampler: Callable) -> tuple:
+        """Of the batches from sample number `at` on, less than `most`, what is being
+        computed."""
+        count = len(self._devices)
+        lo_hi = np.array([at & 0xFFFFFFFF, at >> 32], np.uint32)
+        left = np.array(max(0, min(self.size * count, most - at)), np.int32)
+        if count == 1:
+            lo_hi, left = jax.device_put((lo_hi, left), self._devices[0])
+        one: Any = _batch
+        return one(
+            sampler, self.key_data, self._impl, lo_hi, left, self._mesh, self.size
+        )
+
+    def parts(self, running: tuple) -> list[tuple]:
+        """What each device has computed."""
+        arrays = jax.device_get(running)
+        at = lambda k: jtu.tree_map(lambda x: x[k], arrays)
+        return [at(k) for k in range(len(self._devices))]
+
+    def nothing(self, at: int, most: int) -> Moments:
+        """The moments of no samples."""
+        # JAX caches this trace and uses it for the first batch.
+        sampler = self.sampler_at(at)
+        shapes = eqx.filter_eval_shape(self.started, at, most, sampler)[2]
+        zeros = jtu.tree_map(lambda s: np.zeros(s.shape[1:]), shapes)
+        dtypes = jtu.tree_map(lambda s: str(s.dtype), shapes)
+        return Moments(at, at, 0, 0, zeros, zeros, zeros, zeros, dtypes)
+
+
+def _reached(estimate: Expectation, least: int, tol: float | None) -> bool:
+    if tol is None or estimate.num_samples < least:
+        return False
+    return all(bool(np.all(x <= tol)) for x in jtu.tree_leaves(estimate.std_error))
+
+
+def _finished(estimate: Expectation, least: int, tol: float | None) -> Expectation:
+    said = None if tol is None else _reached(estimate, least, tol)
+    return dataclasses.replace(estimate, tol_reached=said)
 
 
 def _share_of_tolerance(estimate: Expectation, tol: float | None) -> float:
@@ -242,7 +267,7 @@ def _warnings_of_spread(estimate: Expectation) -> Iterator[str]:
         )
     if estimate.heaviest > _HEAVY:
         yield (
-            f"Few of the {estimate.num_samples:,} samples make up for most of the spread: "
+            f"Few of the {estimate.num_paths:,} paths make up for most of the spread: "
             "others that are too rare to be among them may hold much of the mean, and the "
             "standard error may be too small. Take many more, or a function that grows "
             "more slowly."
@@ -284,22 +309,10 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         fold = lambda hi, lo: jr.fold_in(jr.fold_in(key, hi), lo)
         samples = sampler(jax.vmap(fold)(hi, lo))
         wanted = index < left
-        # A path fails once, on however many levels.
-        good = jnp.all(samples.good, axis=0)
-        lost = ~good + (0 if samples.lost is None else jnp.sum(samples.lost, axis=0))
-        failed, good = jnp.sum(jnp.where(wanted, lost, 0)), good & wanted
-        count = jnp.sum(good)
-        tails = samples.tails
-        kinds = [samples.values]
-        if tails is not None:
-            kinds += [samples.control, tails.promised, tails.beyond]
-        elif samples.heaviest is not None:
-            kinds += [samples.heaviest]
-        ratio = None if tails is None else tails.ratio
-        values = zip(*map(jtu.tree_leaves, kinds))
-        each = [_spread(samples.weights, good, count, ratio, *x) for x in values]
-        treedef = jtu.tree_structure(samples.values)
-        return count, failed, *map(treedef.unflatten, zip(*each))
+        good, failed = samples.good & wanted, jnp.where(wanted, samples.lost, 0)
+        leaves, treedef = jtu.tree_flatten(samples.values)
+        each = [_spread(x, good) for x in leaves]
+        return jnp.sum(good), jnp.sum(failed), *map(treedef.unflatten, zip(*each))
 
     if mesh.size == 1:
         return jtu.tree_map(lambda x: x[None], local(sampler, lo_hi, left))
@@ -331,33 +344,12 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         ) from error
 
 
-def _spread(weights, good, count, ratio, x, *others) -> tuple:
+def _spread(x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]):
     """Of the good samples the mean; what rounding has left out of it; the root of the sum
-    of squared deviations from both; the largest deviation; the largest size. With axes in
-    front for kinds and combinations."""
-    x = x.astype(real(x.dtype))
-    if jnp.iscomplexobj(x):
-        raise ValueError(
-            "What is averaged must be real arrays; got one of dtype "
-            f"{x.dtype}. Return real and imaginary parts."
-        )
-    combined = lambda x: jnp.tensordot(weights.astype(x.dtype), x, 1)
-    if ratio is None:
-        x = combined(x)[None]
-        # Of the level where it is most.
-        most = [jnp.broadcast_to(jnp.max(y, axis=0), x.shape) for y in others]
-        x = jnp.concatenate([x, *most])
-    else:
-        control, promised, beyond = others
-        left = combined(x - control)
-        far = jnp.abs(left - combined(promised))
-        ratio = ratio.reshape(-1, *[1] * (far.ndim - 2)).astype(x.dtype)
-        rounding = _ROUNDING * jnp.finfo(x.dtype).eps * jnp.abs(combined(x))
-        far = jnp.where(far > beyond[:, None] + rounding, ratio * far, 0)
-        x = jnp.stack([left, combined(x), combined(control), far])
+    of squared deviations from both; the largest deviation; the largest size."""
     keep = good.reshape(-1, *[1] * (x.ndim - 3))
     x = jnp.where(keep, x, 0)
-    total, n = lambda x: jnp.sum(x, axis=2), jnp.maximum(count, 1)
+    total, n = lambda x: jnp.sum(x, axis=2), jnp.maximum(jnp.sum(good), 1)
     largest = lambda x: jnp.max(jnp.abs(x), axis=2)
     size = largest(x)
     to_unit, from_unit = _powers(size)
@@ -381,7 +373,3 @@ def _powers(size: Array) -> tuple[Array, Array]:
     exponent = jnp.clip(jnp.frexp(size)[1], -most, most)
     one = jnp.ones_like(size)
     return jnp.ldexp(one, -exponent), jnp.ldexp(one, exponent)
-
-
-def real(dtype) -> Any:
-    return jnp.result_type(dtype, float)

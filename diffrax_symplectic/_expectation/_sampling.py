@@ -5,34 +5,27 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
 
 
-class Tails(eqx.Module):
-    """What the mean absolute deviation from `promised` is made of that lies `beyond` some
-    deviation, if a sample weighs as much as its `ratio` says, one at most. The arrays have
-    an axis for levels and one of length 1 in front, one for combinations of the levels, and
-    one for samples."""
-
-    promised: PyTree[Array]
-    beyond: PyTree[Array]
-    ratio: Float[Array, " n"]
+# Deviations of so many roundings of the mean are roundings of the paths.
+ROUNDING = 1e3
 
 
 class Samples(eqx.Module):
-    """What is averaged, with axes in front for levels and samples: values on each level,
-    and which combinations of the levels to take; which of them are good; and how many
-    paths each has lost. With a control variate, this, and what to look for in tails."""
+    """What is averaged, with axes in front for kinds, for combinations of the levels, and
+    for samples; which samples are good; and how many paths each has lost.
+
+    The first kind is the estimate. Of many paths a second one is how heavy their tails are,
+    `r` of `Expectation.std_error`. Of paths less a control variate there are the plain
+    path, the control, and what the path says of tails.
+    """
 
     values: PyTree[Array]
-    weights: Float[Array | np.ndarray, "combinations levels"]
-    good: Bool[Array, "levels n"]
-    lost: Int[Array, "levels n"] | None = None
-    control: PyTree[Array] | None = None
-    tails: Tails | None = None
-    # Or how much of the spread the largest of many paths makes up for.
-    heaviest: PyTree[Array] | None = None
+    good: Bool[Array, " n"]
+    lost: Int[Array, " n"] | Bool[Array, " n"]
 
 
 class Plan(NamedTuple):
@@ -66,3 +59,8 @@ class AbstractSampling(eqx.Module):
     @abc.abstractmethod
     def prepare(self, problem: Any, key: PRNGKeyArray, devices: tuple) -> Plan:
         """Raises a `ValueError` for what it cannot do."""
+
+
+def real(dtype) -> Any:
+    """The type in which numbers of this one are averaged."""
+    return jnp.result_type(dtype, float)

@@ -29,8 +29,8 @@ from .._terms import (
     separable_fault,
     split_terms,
 )
-from ._run import real
-from ._sampling import Samples, Tails
+from ._polynomials import tensordot
+from ._sampling import real
 
 
 class Level(eqx.Module):
@@ -84,23 +84,12 @@ class Problem(eqx.Module):
             raise ValueError(f"`y0` must hold finite numbers; got {y0}.")
         start = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
         check_fit(terms, start, y0, args)
-        if len(brownian_paths(terms)) == 0:
-            raise ValueError(
-                "`terms` have no Brownian path, so that nothing is random. Solve them "
-                "once, by `diffrax.diffeqsolve`."
-            )
-        if not any(map(is_random, brownian_paths(terms))):
-            raise ValueError(
-                "No Brownian path in `terms` has a random key, so that all samples would "
-                "have the same noise. Solve once, by `diffrax.diffeqsolve`. If your path "
-                "draws its noise, make a JAX random key one of its fields; to average over "
-                "many records, write a function that draws one for `monte_carlo`."
-            )
+        _check_noise(terms)
+        smallest = float(dt0) / 2 ** (levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):
-            h = float(dt0) / 2 ** (levels - 1)
-            check_resolution(h, float(t0), float(t1), start.dtype)
+            check_resolution(smallest, float(t0), float(t1), start.dtype)
         _check_sense(terms, solver, start, y0, args)
-        _check_cells(terms, t0, float(dt0) / 2 ** (levels - 1))
+        _check_cells(terms, t0, smallest)
         check_takes("phi", phi, "t", "y", "args")
         check_real("phi", jtu.tree_leaves(_shape_of(phi, terms, start, y0, args)))
         if num_steps * 2.0 ** (levels - 1) >= 2**31:
@@ -153,6 +142,18 @@ class Problem(eqx.Module):
         pairs = zip(parts, leaves)
         return treedef.unflatten([y.reshape(*x.shape[:-1], *s.shape) for y, s in pairs])
 
+    def combined(
+        self, x: Float[Array, "levels ..."]
+    ) -> Float[Array, "combinations ..."]:
+        return tensordot(self.weights.astype(x.dtype), x, 1)
+
+    def averaged(
+        self, kinds: list[Float[Array, "combinations S n m"]]
+    ) -> PyTree[Array]:
+        """What `Samples` hold of such numbers."""
+        x = jnp.stack(kinds)
+        return self.unravel(x[:, :, 0] if self.at_end else jnp.swapaxes(x, 2, 3))
+
     @property
     def dtype(self) -> Any:
         return jnp.result_type(*jtu.tree_leaves(self.y0))
@@ -188,80 +189,48 @@ class Ensemble(eqx.Module):
         return Ensemble(jtu.tree_map(keep, y, p.y0), state, failed, control)
 
 
-def _simulate(
-    p: Problem, level: Level, step: Callable, paths: Ensemble, measure: Callable
-) -> tuple[Float[Array, "S ..."], Ensemble]:
-    """Takes all steps of a level by `step(i, paths)`. Returns what `measure` makes of the
-    values of `phi` and of which paths have failed, with an axis in front for the saved
-    steps; and the paths at the end."""
-    n, (saves, m) = len(paths.failed), p.num_outputs
-
-    def recorded(i, paths: Ensemble, saved):
-        def record():
-            phi = jax.vmap(lambda y: p.values(p.t0 + i * level.h, y))(paths.y)
-            failed = paths.failed | ~jax.vmap(all_finite)(phi)
-            here = along(level.saved_steps == i, saved)
-            return failed, jnp.where(here, measure(phi, failed), saved)
-
-        # A conditional with one predicate for all paths: `phi` is not evaluated otherwise.
-        here = jnp.any(level.saved_steps == i)
-        failed, saved = lax.cond(here, record, lambda: (paths.failed, saved))
-        return eqx.tree_at(lambda e: e.failed, paths, failed), saved
-
-    def body(i, carry):
-        paths, saved = carry
-        return recorded(i + 1, step(i, paths), saved)
-
-    dtype = jax.eval_shape(lambda: p.values(p.t0, p.y0)).dtype
-    phi = jax.ShapeDtypeStruct((n, m), dtype)
-    shape = jax.eval_shape(measure, phi, paths.failed).shape
-    carry = recorded(0, paths, jnp.zeros((saves, *shape), dtype))
-    paths, saved = lax.fori_loop(0, level.num_steps, body, carry)
-    return saved, paths
-
-
-def samples(
+def simulate(
     p: Problem,
     begin: Callable[[Level], tuple[Callable, Ensemble]],
-    mean: Callable[[Array, Bool[Array, " n"]], Array] | None = None,
-    finish: Callable[[Level, Array, Ensemble], tuple] | None = None,
-    beyond: Array | None = None,
-) -> Samples:
-    """Takes the paths that `begin` makes for a level through all of its steps, by the
-    function `step(i, paths)` that it makes, too. Each path is a sample, or `mean` of `phi`
-    and of which of them have failed is one, with how heavy its tails are. What `finish`
-    returns of a level, `phi` and the paths at the end are values, control, what it
-    promises, and the logarithms of ratios, for `Tails` of numbers `beyond`."""
+    measure: Callable[[Array, Bool[Array, " n"]], Array] = lambda phi, failed: phi,
+) -> tuple[Float[Array, "levels S ..."], Bool[Array, "levels n"], Any]:
+    """Takes the paths that `begin` makes for each level through all of its steps, by the
+    function `step(i, paths)` that it makes, too. Returns what `measure` makes of the values
+    of `phi` after the saved steps, and of which paths have failed by then; and of the paths
+    at the end which have failed, and their control."""
 
     def on_level(level):
         step, paths = begin(level)
-        keep = lambda phi, failed: phi
-        saved, paths = _simulate(p, level, step, paths, mean or keep)
-        if mean is not None:
-            lost = jnp.sum(paths.failed)[None]
-            both = jnp.moveaxis(saved, 1, 0)[:, :, None]
-            return tuple(both), None, jnp.ones(1, bool), lost
-        if finish is None:
-            return (saved,), None, ~paths.failed, None
-        *arrays, log_ratio = finish(level, saved, paths)
-        return tuple(arrays), log_ratio, ~paths.failed, None
+        n, (saves, m) = len(paths.failed), p.num_outputs
+
+        def recorded(i, paths: Ensemble, saved):
+            def record():
+                phi = jax.vmap(lambda y: p.values(p.t0 + i * level.h, y))(paths.y)
+                failed = paths.failed | ~jax.vmap(all_finite)(phi)
+                here = along(level.saved_steps == i, saved)
+                return failed, jnp.where(here, measure(phi, failed), saved)
+
+            # A conditional with one predicate for all paths: `phi` is not evaluated
+            # otherwise.
+            here = jnp.any(level.saved_steps == i)
+            failed, saved = lax.cond(here, record, lambda: (paths.failed, saved))
+            return eqx.tree_at(lambda e: e.failed, paths, failed), saved
+
+        def body(i, carry):
+            paths, saved = carry
+            return recorded(i + 1, step(i, paths), saved)
+
+        dtype = jax.eval_shape(lambda: p.values(p.t0, p.y0)).dtype
+        phi = jax.ShapeDtypeStruct((n, m), dtype)
+        shape = jax.eval_shape(measure, phi, paths.failed).shape
+        carry = recorded(0, paths, jnp.zeros((saves, *shape), dtype))
+        paths, saved = lax.fori_loop(0, level.num_steps, body, carry)
+        return saved, paths.failed, paths.control
 
     if len(p.levels.h) == 1:
-        out = jtu.tree_map(lambda x: x[None], on_level(p.level(0)))
-    else:
-        # One program for all levels.
-        out = lax.map(on_level, p.levels)
-    arrays, log_ratio, good, lost = out
-    flat = lambda x: p.unravel(x[:, 0] if p.at_end else jnp.swapaxes(x, 1, 2))
-    values, *others = map(flat, arrays)
-    if beyond is None:
-        return Samples(values, p.weights, good, lost, heaviest=next(iter(others), None))
-    control, promised = others
-    beyond = p.unravel(beyond[:, 0] if p.at_end else beyond)
-    # What is more likely without the wider noise is seen without it.
-    ratio = jnp.exp(-jnp.maximum(jnp.sum(log_ratio, axis=0), 0))
-    tails = Tails(promised, beyond, ratio)
-    return Samples(values, p.weights, good, lost, control, tails)
+        return jtu.tree_map(lambda x: x[None], on_level(p.level(0)))
+    # One program for all levels.
+    return lax.map(on_level, p.levels)
 
 
 def independent_steps(
@@ -305,6 +274,22 @@ def _steps(t0, t1, dt0, ts: Sequence | None) -> tuple[np.ndarray, np.integer]:
         )
     *saved, num_steps = whole.astype(np.int32)
     return np.array(saved), num_steps
+
+
+def _check_noise(terms) -> None:
+    """Raises a `ValueError` if nothing in them is random."""
+    if len(brownian_paths(terms)) == 0:
+        raise ValueError(
+            "`terms` have no Brownian path, so that nothing is random. Solve them once, by "
+            "`diffrax.diffeqsolve`."
+        )
+    if not any(map(is_random, brownian_paths(terms))):
+        raise ValueError(
+            "No Brownian path in `terms` has a random key, so that all samples would have "
+            "the same noise. Solve once, by `diffrax.diffeqsolve`. If your path draws its "
+            "noise, make a JAX random key one of its fields; to average over many records, "
+            "write a function that draws one for `monte_carlo`."
+        )
 
 
 def _check_sense(terms, solver, t0, y0: Y, args: Args) -> None:

@@ -23,8 +23,8 @@ from ._moments import total
 from ._noise import Noise
 from ._polynomials import num_polynomials
 from ._run import run
-from ._sampling import AbstractSampling, Plan, Samples
-from ._steps import along, Ensemble, Level, Problem, samples
+from ._sampling import AbstractSampling, Plan, ROUNDING, Samples
+from ._steps import along, Ensemble, Level, Problem, simulate
 
 
 # By default there are no more polynomials than this in a fit.
@@ -50,11 +50,10 @@ class ValueFunctions(AbstractSampling):
     pilot has been. How close they are decides the standard error, and nothing else: the
     estimate has no bias but that of the solver.
 
-    In one or two dimensions the functions are polynomials and what these leave, on a grid;
-    in up to 14 they are polynomials, and in more they are quadratic, by the mean of their
-    derivatives. For more
-    than 100 outcomes of a step (five noises or more) the variables with mean zero come from
-    first and second derivatives by the noise.
+    In one or two dimensions a function is a polynomial of degree 4 or less and what it
+    leaves, on a grid; in up to 14 it is a polynomial, and in more it is quadratic, by the
+    mean of its derivatives. For more than 100 outcomes of a step (five noises or more) the
+    variables with mean zero come from first and second derivatives by the noise.
 
     In a few dimensions standard errors are $10^{-4}$ to $10^{-8}$ of those of as many
     independent paths. In more than two dimensions it gains little in chaos, after times in
@@ -83,43 +82,48 @@ class ValueFunctions(AbstractSampling):
 
     def prepare(self, problem, key, devices):
         basis, (times, m) = _basis(problem, self.degree), problem.num_outputs
-        functions, count = _fits(problem, key, basis), len(basis.candidates)
-        shape = len(problem.weights), times, m
-        narrow, never = np.zeros((), problem.dtype), np.full(shape, np.inf)
+        functions, shape = _fits(problem, key, basis), (len(problem.weights), times, m)
+        never, narrow = np.full(shape, np.inf), np.zeros((), problem.dtype)
 
-        def plan(best, n: int, wide=narrow, beyond=never):
-            u, beyond = functions.chosen(best), beyond.astype(problem.dtype)
-            sampler = jtu.Partial(_controlled_paths, problem, u, wide, beyond)
-            return Plan(sampler, n, self.batch_size)
+        def plan(best, used, n: int, beyond=never, wide=narrow):
+            arrays = used, beyond.astype(problem.dtype), wide
+            u = functions.chosen(best)
+            return Plan(
+                jtu.Partial(_controlled_paths, problem, u, *arrays), n, self.batch_size
+            )
 
         # The paths that choose are not those that are averaged.
-        trial = lambda plan: run(plan, jr.fold_in(key, _TRIAL), devices)
-        tried = [
-            trial(plan(np.full((times, m), k), self.batch_size)) for k in range(count)
-        ]
+        trial = lambda *args: run(plan(*args), jr.fold_in(key, _TRIAL), devices)
         flat = lambda tree, *axes: np.concatenate(
             [np.reshape(x, (*axes, times, -1)) for x in jtu.tree_leaves(tree)], axis=-1
         )
+        all_of, used = (lambda k: np.full((times, m), k)), np.ones((times, m), bool)
+        count = len(basis.candidates)
+        tried = [trial(all_of(k), used, self.batch_size) for k in range(count)]
         errors = np.stack([flat(e.std_error) for e in tried])
-        best = np.argmin(np.nan_to_num(errors, nan=np.inf), axis=0)
-        if self.degree and not np.any(best):
+        errors = np.nan_to_num(errors, nan=np.inf)
+        best, plain = np.argmin(errors, axis=0), flat(tried[0].plain_std_error)
+        used = ~(np.min(errors, axis=0) >= plain)
+        if self.degree and not np.any(used):
             warnings.warn(
                 f"`degree={self.degree}` is no better than plain paths, which are taken. "
                 "Pass another `degree`, or another `sampling`.",
                 stacklevel=4,
             )
         # Paths with wider noise say what deviations there are beyond those of the trial.
-        largest = [
-            jtu.tree_map(lambda x: x[0], total(e.moments).largest) for e in tried
-        ]
-        largest = np.stack([flat(x, len(problem.weights)) for x in largest])
-        beyond = np.take_along_axis(largest, best[None, None], 0)[0]
-        wide = trial(plan(best, _WIDE * self.batch_size, narrow + 1, beyond))
+        largest = lambda e, kind: flat(
+            jtu.tree_map(lambda x: x[kind], total(e.moments).largest), shape[0]
+        )
+        with_fit = np.stack([largest(e, 0) for e in tried])
+        with_fit = np.take_along_axis(with_fit, best[None, None], 0)[0]
+        beyond = np.where(used, with_fit, largest(tried[0], 1))
+        wide = trial(best, used, _WIDE * self.batch_size, beyond, narrow + 1)
         far = jtu.tree_map(lambda x: x[3], total(wide.moments).mean)
-        listed = lambda which: ", ".join(str(basis.candidates[k]) for k in which)
-        chosen, among = listed(np.unique(best)), listed(range(count))
+        names = np.array([0, *basis.candidates])
+        chosen = ", ".join(map(str, np.unique(names[np.where(used, best + 1, 0)])))
+        among = ", ".join(map(str, np.unique(names)))
         reason = f"{basis.kind}: {chosen} was the best of {among}"
-        final = plan(best, self.num_paths, beyond=beyond)
+        final = plan(best, used, self.num_paths, beyond)
         return final._replace(reason=reason, far=far)
 
 
@@ -130,8 +134,7 @@ def value_function(problem: Problem, key: PRNGKeyArray) -> Functions | None:
         basis = _basis(problem, 2)
     except ValueError:
         return None
-    best = np.full(problem.num_outputs, len(basis.candidates) - 1)
-    return _fits(problem, key, basis).chosen(best)
+    return _fits(problem, key, basis).chosen(np.zeros(problem.num_outputs, int))
 
 
 def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
@@ -158,24 +161,24 @@ def _basis(p: Problem, degree: int | None) -> AbstractBasis:
     steps = int(np.sum(p.levels.num_steps))
     if degree is None:
         for size in _GRID_SIZES if d <= _GRID else ():
-            memory, ends = 2 * item * size**d * outputs, size**d * points
+            grid = Grid(d, (size,))
+            memory, ends = 2 * item * grid.size * outputs, size**d * points
             if memory <= _MOST_MEMORY and ends <= _MOST_ENDS and ends * steps <= _MOST:
-                return Grid(d, size)  # pyright: ignore (it has its candidates)
-        few = [k for k in range(9) if num_polynomials(d, k) <= _MOST_POLYNOMIALS]
+                return grid
+        few = [k for k in range(1, 9) if num_polynomials(d, k) <= _MOST_POLYNOMIALS]
         # The largest degree whose fit does not take too long.
-        cheap = lambda k: Hermite(d, (0, k)).sites * points * steps <= _MOST
+        cheap = lambda k: Hermite(d, (k,)).sites * points * steps <= _MOST
         few = [k for k in few if k <= 2 or cheap(k)]
-        degrees = (0, 1, 2) if many else (*(k for k in few[:-1] if k % 2 == 0), few[-1])
+        degrees = (1, 2) if many else (*(k for k in few[:-1] if k % 2 == 0), few[-1])
     else:
-        degrees = tuple({0: 0, whole_number("degree", degree, 0): 0})
+        degrees = (whole_number("degree", degree, 0),)
     basis = Quadratic(d, degrees) if many and degrees[-1] <= 2 else Hermite(d, degrees)
     if isinstance(basis, Hermite):
-        count = num_polynomials(d, degrees[-1])
-        need = item * count * (basis.pilots + len(degrees) * outputs)
+        need = item * basis.size * (basis.pilots + len(degrees) * outputs)
         if need > _MOST_MEMORY:
             raise ValueError(
-                f"`degree={degree}` has {count:,} polynomials in {d} dimensions, the fit "
-                f"of which needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`."
+                f"`degree={degree}` has {basis.size:,} polynomials in {d} dimensions, the "
+                f"fit of which needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`."
             )
     numbers = basis.sites * points * steps * d
     if numbers > _OUT_OF_PROPORTION:
@@ -189,11 +192,11 @@ def _basis(p: Problem, degree: int | None) -> AbstractBasis:
 
 
 def _controlled_paths(
-    p: Problem, functions: Functions, wide, beyond, keys: PRNGKeyArray
+    p: Problem, functions: Functions, used, beyond, wide, keys: PRNGKeyArray
 ) -> Samples:
-    """A sample is a path, with its value and what `functions`, along an axis of levels, say
-    of its noise. With `wide=1` the noise is wider: that tells of deviations `beyond` those
-    that paths usually have."""
+    """A sample is a path, less what `functions`, along an axis of levels, say of its noise
+    where they are `used`. With `wide=1` the noise is wider: that tells of deviations
+    `beyond` those that paths usually have."""
     n = len(keys)
 
     def begin(level):
@@ -207,26 +210,29 @@ def _controlled_paths(
                 return *noise.advance(i, y, state, at, second, x), log_ratio
 
             out = jax.vmap(one)(paths.y, paths.solver_state, keys)
-            y, state, success, change, log_ratio = out
+            y, state, success, (value, change), log_ratio = out
             # A path that failed has no value, and its control must be finite all the same.
             change = jnp.where(along(success, change), change, 0)
-            control, ratios = paths.control
-            control = control + change, ratios + log_ratio
+            control, promised, ratios = paths.control
+            promised = jnp.where(i == 0, value - change, promised)
+            control = control + jnp.where(used, change, 0), promised, ratios + log_ratio
             return paths.moved(p, y, state, success, control)
 
         dtype = jax.eval_shape(lambda: u(0, p.y0)).dtype
         same = lambda x: jnp.broadcast_to(x, (n, *jnp.shape(x)))
         state = jtu.tree_map(same, noise.fresh(0, p.y0))
-        control = jnp.zeros((n, *p.num_outputs), dtype), jnp.zeros(n, dtype)
-        return step, Ensemble.start(p, n, state, control)
+        zero = jnp.zeros((n, *p.num_outputs), dtype)
+        return step, Ensemble.start(p, n, state, (zero, zero, jnp.zeros(n, dtype)))
 
-    def controlled(level, saved, paths):
-        noise, u = Noise.of(p, level), jtu.tree_map(lambda x: x[level.index], functions)
-        control, log_ratio = paths.control
-        promised = noise.mean(0, p.y0, lambda y: u(0, y))
-        first = (level.saved_steps == 0)[:, None]
-        promised = jnp.where(first, p.values(p.t0, p.y0), promised)
-        control = jnp.swapaxes(control, 0, 1).astype(saved.dtype)
-        return saved, control, promised[:, None].astype(saved.dtype), log_ratio
-
-    return samples(p, begin, finish=controlled, beyond=beyond)
+    saved, failed, (*known, log_ratio) = simulate(p, begin)
+    control, promised = (jnp.swapaxes(x, 1, 2).astype(saved.dtype) for x in known)
+    promised = jnp.where(along(p.levels.saved_steps[0] == 0, saved[0]), saved, promised)
+    each = saved - control, saved, control, promised
+    left, plain, control, promised = map(p.combined, each)
+    off = jnp.abs(left - promised)
+    # More than rounding.
+    beyond = beyond[:, :, None] + ROUNDING * jnp.finfo(off.dtype).eps * jnp.abs(plain)
+    # What is more likely without the wider noise is seen without it.
+    ratio = jnp.exp(-jnp.maximum(jnp.sum(log_ratio, axis=0), 0))[:, None]
+    far, lost = jnp.where(off > beyond, ratio * off, 0), jnp.any(failed, axis=0)
+    return Samples(p.averaged([left, plain, control, far]), ~lost, lost)

@@ -45,6 +45,7 @@ class Cell(NamedTuple):
     noise: str
     strength: float
     t1: float
+    steps: int = STEPS
 
 
 CELLS = [Cell(n, s, t) for n in NOISES for s in STRENGTHS for t in TIMES]
@@ -77,7 +78,7 @@ def _exponential(t, y, args):
 
 def _steps(cell: Cell) -> np.ndarray:
     """What a step makes of (p, q, 1), for each of its outcomes."""
-    h = cell.t1 / STEPS
+    h = cell.t1 / cell.steps
     drift = np.array([[1, 0, 0], [h / 2, 1, 0], [0, 0, 1]])
     additive = cell.noise == "additive"
     out = []
@@ -93,7 +94,7 @@ def _moment(cell: Cell, power: int) -> np.ndarray:
     """The mean of the power of (p, q, 1) by Kronecker's product."""
     mean = sum(w * _kron(M, power) for w, M in zip(_LIKELY, _steps(cell)))
     start = _kron(np.array([0.0, 1.0, 1.0]), power)
-    return np.linalg.matrix_power(mean, STEPS) @ start
+    return np.linalg.matrix_power(mean, cell.steps) @ start
 
 
 def _kron(x: np.ndarray, power: int) -> np.ndarray:
@@ -101,45 +102,44 @@ def _kron(x: np.ndarray, power: int) -> np.ndarray:
 
 
 def _exponential_mean(cell: Cell) -> float:
-    h, s = cell.t1 / STEPS, cell.strength
+    h, s, n = cell.t1 / cell.steps, cell.strength, cell.steps
     if cell.noise == "additive":
         # q is a sum of independent variables.
         low, middle, high = _steps(cell)
-        mean = np.linalg.matrix_power(middle, STEPS)[1] @ [0, 1, 1]
+        mean = np.linalg.matrix_power(middle, n)[1] @ [0, 1, 1]
         shift = (high - low)[:, 2] / 2
-        each = [np.linalg.matrix_power(middle, k)[1] @ shift for k in range(STEPS)]
+        each = [np.linalg.matrix_power(middle, k)[1] @ shift for k in range(n)]
         return float(np.exp(mean) * np.prod(_LIKELY @ np.exp(np.outer(_POINTS, each))))
     # It turns by independent angles, and exp(cos x) is a Fourier series.
     turn = 2 * np.arctan((h + s * np.sqrt(3 * h) * _POINTS) / 2)
     k = np.arange(-40, 41)
-    return float(
-        np.real(iv(k, 1) @ (_LIKELY @ np.exp(1j * np.outer(turn, k))) ** STEPS)
-    )
+    return float(np.real(iv(k, 1) @ (_LIKELY @ np.exp(1j * np.outer(turn, k))) ** n))
 
 
 @ft.cache
-def exact(cell: Cell) -> tuple[np.ndarray, np.ndarray]:
-    """The means, and their standard errors."""
+def exact(cell: Cell, paths: int = 2**15) -> tuple[np.ndarray, np.ndarray]:
+    """The means, and their standard errors: that of the indicator is from so many paths of
+    each of 32 replicates."""
     second, fourth = _moment(cell, 2), _moment(cell, 4)
-    likely = estimate(cell, ds.ArrayRQMC(2**15, 32), 10**6)
+    likely = estimate(cell, ds.ArrayRQMC(paths, 32), 10**6)
     means = [second[4], fourth[0], _exponential_mean(cell), likely.mean[3]]
     return np.array(means), np.array([0, 0, 0, float(likely.std_error[3])])
 
 
+def arguments(cell: Cell) -> tuple:
+    """Of `expectation`, for all four functions."""
+    step, s = cell.t1 / cell.steps, jnp.array(cell.strength)
+    return _phi, _TERMS[cell.noise], ds.StormerVerlet(), 0.0, cell.t1, step, Y0, s
+
+
 def estimate(cell: Cell, sampling: Any, seed: int) -> ds.Expectation:
-    """Of all four functions, that of `exp(q)` by itself for multiplicative noise."""
-    run = lambda phi, terms, solver: ds.expectation(
-        phi, terms, solver, 0.0, cell.t1, cell.t1 / STEPS, Y0, jnp.array(cell.strength),
-        key=jr.key(seed), sampling=sampling,
-    )  # fmt: skip
-    return run(_phi, _TERMS[cell.noise], ds.StormerVerlet())
+    return ds.expectation(*arguments(cell), key=jr.key(seed), sampling=sampling)
 
 
 def kubo(cell: Cell, sampling: Any, seed: int) -> ds.Expectation:
-    return ds.expectation(
-        _exponential, _KUBO, ds.ImplicitMidpoint(), 0.0, cell.t1, cell.t1 / STEPS, Y0,
-        jnp.array(cell.strength), key=jr.key(seed), sampling=sampling,
-    )  # fmt: skip
+    """Of `exp(q)` by itself, for multiplicative noise."""
+    own = _exponential, _KUBO, ds.ImplicitMidpoint(), *arguments(cell)[3:]
+    return ds.expectation(*own, key=jr.key(seed), sampling=sampling)
 
 
 def covered(cell: Cell, sampling: Any, repetitions: int) -> np.ndarray:

@@ -11,8 +11,9 @@ from scipy import stats
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation._run import run
-from diffrax_symplectic._expectation._sampling import Plan, Samples, Tails
-from examples.benchmarks.coverage import CELLS, covered, SAMPLINGS
+from diffrax_symplectic._expectation._sampling import Plan, Samples
+from diffrax_symplectic._expectation._steps import Problem
+from examples.benchmarks.coverage import arguments, Cell, estimate, exact
 
 from ..problems import kubo_terms
 
@@ -135,7 +136,7 @@ def test_the_standard_error_is_no_less_than_rounding():
 
 def test_few_samples_that_make_up_for_the_spread_widen_it_and_are_told():
     heavy = lambda key: jnp.exp(5 * jr.normal(key))
-    with pytest.warns(UserWarning, match="Few of the 2,000 samples make up for most"):
+    with pytest.warns(UserWarning, match="Few of the 2,000 paths make up for most"):
         got = ds.monte_carlo(heavy, key=KEY, num_paths=2000)
     assert got.std_error > 1.3 * np.sqrt(got.variance / 2000)
     light = ds.monte_carlo(jr.normal, key=KEY, num_paths=2000)
@@ -146,12 +147,10 @@ def _with_control(shift: float, spread: float = 1.0):
     """Standard normal numbers, less a control that has the mean `shift`."""
 
     def sampler(keys):
-        x = jax.vmap(jr.normal)(keys)[None]
-        zero = jnp.zeros((1, 1))
-        tails = Tails(zero, jnp.full(1, jnp.inf), jnp.ones(len(keys)))
-        return Samples(
-            x, np.ones((1, 1)), jnp.ones(x.shape, bool), None, spread * x + shift, tails
-        )
+        x = jax.vmap(jr.normal)(keys)
+        control = spread * x + shift
+        kinds = jnp.stack([x - control, x, control, jnp.zeros_like(x)])[:, None]
+        return Samples(kinds, jnp.ones(len(keys), bool), jnp.zeros(len(keys), bool))
 
     far = np.zeros(1)
     plan = Plan(jax.tree_util.Partial(sampler), 1000, 250, far=far)
@@ -182,12 +181,36 @@ def test_plain_terms_are_refused_where_a_solver_takes_them_for_ito():
     run(lambda t, y, args: jnp.array(0.1))
 
 
+# Fewer paths, steps and fits than there, for less time.
+_FEW = {
+    "IndependentPaths": ds.IndependentPaths(1024),
+    "ArrayRQMC": ds.ArrayRQMC(256, 16),
+    "ValueFunctions": ds.ValueFunctions(num_paths=1024, batch_size=256),
+}
+
+
 # Additive and strong; multiplicative and strong, for heavy tails.
-@pytest.mark.parametrize("name", SAMPLINGS)
-@pytest.mark.parametrize("cell", [CELLS[4], CELLS[10]])
-def test_intervals_cover_as_often_as_they_say(name, cell):
-    repetitions = 12 if name == "ValueFunctions()" else 40
-    shares = covered(cell, SAMPLINGS[name], repetitions)
+@pytest.mark.parametrize("name", _FEW)
+@pytest.mark.parametrize("noise", ["additive", "multiplicative"])
+def test_intervals_cover_as_often_as_they_say(name, noise):
+    cell, devices = Cell(noise, 1.0, 1.0, steps=10), tuple(jax.devices()[:1])
+    problem = Problem.of(*arguments(cell), None, 1)
+    # One fit: its paths have nothing to do with those that are averaged.
+    plan = _FEW[name].prepare(problem, jr.key(1), devices)._replace(roundings=10)
+    ends = [run(plan, jr.key(seed), devices).interval() for seed in range(40)]
+    low, high = np.array(ends).swapaxes(0, 1)
+    means, errors = exact(cell, 2**12)
+    hits = np.sum((low <= means + errors) & (means - errors <= high), axis=0)
+    # Of exp(q) with multiplicative noise the mean is not known.
+    hits = hits[[0, 1, 3]] if noise == "multiplicative" else hits
     # So few hits have the probability of four standard errors of a normal variable.
-    likely = stats.binom.cdf(np.rint(shares * repetitions), repetitions, 0.95)
-    assert np.all(likely > stats.norm.cdf(-4)), shares
+    assert np.all(stats.binom.cdf(hits, 40, 0.95) > stats.norm.cdf(-4)), hits
+
+
+def test_heavy_tails_within_replicates_widen_the_standard_error_and_are_told():
+    # A batch is one replicate, the spread of which is zero.
+    cell = Cell("multiplicative", 1.0, 5.0, steps=10)
+    with pytest.warns(UserWarning, match="Few of the 4,096 paths make up for most"):
+        got = estimate(cell, ds.ArrayRQMC(256, 16), 0)
+    assert got.std_error[1] > 1.3 * np.sqrt(got.variance[1] / 16)
+    np.testing.assert_allclose(got.std_error[3], np.sqrt(got.variance[3] / 16))

@@ -13,12 +13,14 @@ import pytest
 
 import diffrax_symplectic as ds
 
+from ..picard import by_picard
 from ..problems import kubo_terms
 
 
 KEY = jr.key(3)
 Y0 = (jnp.array(0.0), jnp.array(1.0))
 KUBO = kubo_terms(ds.WeakBrownianPath((), jr.key(0)))
+MIDPOINT = by_picard(ds.ImplicitMidpoint())
 SAMPLINGS = {
     "IndependentPaths": lambda n: ds.IndependentPaths(n, 16),
     "ValueFunctions": lambda n: ds.ValueFunctions(1, n, 16),
@@ -26,10 +28,14 @@ SAMPLINGS = {
 }
 
 
+# Made once, so that JAX compiles programs of it once.
+def _phi(t, y, args):
+    return {"q2": y[1] ** 2, "both": (y[0], jnp.stack(y))}
+
+
 def _part(name: str, n: int, first: int = 0, **kwargs) -> ds.Expectation:
-    phi = lambda t, y, args: {"q2": y[1] ** 2, "both": (y[0], jnp.stack(y))}
     return ds.expectation(
-        phi, KUBO, ds.ImplicitMidpoint(), 0.0, 1.0, 0.25, Y0, key=KEY, levels=2,
+        _phi, KUBO, MIDPOINT, 0.0, 1.0, 0.25, Y0, key=KEY, levels=2,
         sampling=SAMPLINGS[name](n), first=first, **kwargs,
     )  # fmt: skip
 
