@@ -271,8 +271,8 @@ def test_an_estimate_prints_the_digits_that_it_has_and_what_it_leaves_out():
     first, said = str(one).splitlines()[:2]
     # A standard error of a few hundredths: four digits after the point.
     assert 0.01 < one.std_error < 0.1 and first.startswith(f"{one.mean:.4f} ± ")
-    assert said == "not included: the error of discretization (see `levels`)"
-    assert "not included" not in str(two) and "taken out" in str(two)
+    assert said == "not included: the discretization error (see `levels`)"
+    assert "not included" not in str(two) and "(removed)" in str(two)
 
 
 def test_old_style_keys_will_do():
