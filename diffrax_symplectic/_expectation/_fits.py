@@ -102,7 +102,7 @@ def fit(noise: Any, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
 
 
 def _pilot(noise: Any, keys: PRNGKeyArray, y0: Array):
-    """The states of the pilot's paths after each step, and which of them have not failed."""
+    """The states of the pilot's paths after each step, and which paths are good."""
     p, n, last = noise.problem, len(keys), noise.problem.max_steps
 
     def forward(i, carry):

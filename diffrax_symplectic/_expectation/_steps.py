@@ -160,7 +160,7 @@ class Problem(eqx.Module):
 
     @property
     def num_outputs(self) -> tuple[int, int]:
-        """The number of times at which to average, and the number of components of `phi`."""
+        """The number of times at which to average, and of components of `phi`."""
         m = jax.eval_shape(lambda: self.values(self.t0, self.y0)).size
         return self.levels.saved_steps.shape[1], m
 
