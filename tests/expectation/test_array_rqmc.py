@@ -270,9 +270,7 @@ def test_bad_input_is_told_what_to_pass(message, kwargs):
     "traced", [dict(dt0=0.1), dict(t1=1.0), dict(y0=Y0), dict(key=jr.key(0))]
 )
 def test_within_a_jax_program_there_is_no_estimate(traced):
-    with pytest.raises(
-        ValueError, match="cannot run inside JAX.*`monte_carlo`"
-    ):
+    with pytest.raises(ValueError, match="cannot run inside JAX.*`monte_carlo`"):
         jax.jit(lambda x: _estimate(**x).mean)(traced)
 
 
