@@ -330,6 +330,7 @@ def test_implicit_tableaus_need_an_implicit_solver():
     y0, args = random_problem(jr.key(0), 1, 1)
     terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
     with pytest.raises(
-        ValueError, match="also subclass `diffrax_symplectic.AbstractImplicitStages`"
+        ValueError,
+        match="also inherit from `diffrax_symplectic.AbstractImplicitStages`",
     ):
         diffrax.diffeqsolve(terms, Mine(), 0.0, 0.2, 0.1, y0, args)
