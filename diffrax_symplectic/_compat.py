@@ -19,7 +19,7 @@ from jaxtyping import PyTree
 
 
 def unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
-    """The term that the user passed. In a solve Diffrax wraps it, to run backward in time."""
+    """The user's term. In a solve Diffrax wraps it, to be able to run backward in time."""
     return term.term if isinstance(term, WrapTerm) else term
 
 
