@@ -41,7 +41,7 @@ class Block(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Plan:
-    """The distinct stages that a tableau uses, in blocks that are solved one after another."""
+    """The distinct stages that a tableau uses, in blocks to be solved in order."""
 
     tableau: FlatTableau
     blocks: tuple[Block, ...]
