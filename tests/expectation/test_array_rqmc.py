@@ -239,7 +239,7 @@ def test_equal_paths_are_one_brownian_motion():
         ("`dt0` must be numbers; got dt0='0.1'", dict(dt0="0.1")),
         ("`dt0` must be numbers; got", dict(dt0=Y0)),
         ("and `t1` after `t0`; got dt0=0.1, t0=0.0, t1=inf", dict(t1=np.inf)),
-        ("`terms` must be terms of Diffrax.*got function", dict(terms=lambda t: t)),
+        ("`terms` must be Diffrax terms.*got function", dict(terms=lambda t: t)),
         ("whole number of steps", dict(ts=[0.25])),
         ("whole number of steps", dict(t1=0.95)),
         ("all between `t0` and `t1`", dict(ts=[1.1])),
