@@ -87,7 +87,10 @@ def test_steps_that_do_not_divide_the_interval_are_refused(dts):
         ("`t1` must be after `t0`", dict(t1=-1.0)),
         ("with a Brownian path; got str", dict(terms="terms")),
         ("`solvers` must be a list of solvers", dict(solvers=ds.ImplicitMidpoint())),
-        (r"a solver, as `ImplicitMidpoint\(\)`", dict(solvers=[ds.ImplicitMidpoint])),
+        (
+            r"a solver, such as `ImplicitMidpoint\(\)`",
+            dict(solvers=[ds.ImplicitMidpoint]),
+        ),
         ("`reference` must be a solver", dict(reference="ImplicitMidpoint")),
         (
             r"called as `phi\(t, y, args\)`; got .* `\(y\)`",

@@ -20,8 +20,8 @@ def _nonzero(value: Any) -> float:
     beta2 = real_number("beta2", value)
     if beta2 == 0:
         raise ValueError(
-            "`beta2` must not be 0: the noise is read at the times 1 + (beta1 - 1) / "
-            "beta2 and 1 + beta1 / beta2 of the step. The default is 1."
+            "`beta2` must not be 0: the noise is evaluated at the fractions 1 + (beta1 - "
+            "1) / beta2 and 1 + beta1 / beta2 of the step. The default is 1."
         )
     return beta2
 
@@ -39,7 +39,7 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     For any $H_0$ and $H_k = -\sigma_k(t) \cdot q + \gamma_k(t) \cdot p$, or any
     $\mathrm{d}y = a(t, y)\,\mathrm{d}t + \sum_k b_k(t)\,\mathrm{d}w_k$. With
     $I_k = \int \mathrm{d}w_k$ and $I_{k0} = \int (w_k(s) - w_k(t_n))\,\mathrm{d}s$ over
-    the step, the drift is read at $c^0 = (\frac14, \frac34)$, the noise at
+    the step, the drift is evaluated at $c^0 = (\frac14, \frac34)$, the noise at
     $c^1 = (1 + \frac{\beta_1 - 1}{\beta_2},\; 1 + \frac{\beta_1}{\beta_2})$, and
 
     $$G_1 = y_n + \tfrac h4 a(G_1) + \sum_k (1 + \tfrac{s}{\sqrt 2})\, b_k(c^1_1)
@@ -52,15 +52,15 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       \tfrac{I_{k0}}{h}\big) b_k(c^1_1) + \big((1 - \beta_1) I_k - \beta_2
       \tfrac{I_{k0}}{h}\big) b_k(c^1_2) \Big).$$
 
-    Two stage vectors are solved for, one after the other. If the noise is constant, only
-    the sign $s$ matters. The paper has $s = +1$. The default here is $s = -1$: over six
+    A step solves for two stage vectors, one after the other. If the noise is constant, only
+    the sign $s$ matters. The paper has $s = +1$. The default here is $s = -1$: in six
     problems with two noises its strong error at $h = 1/16$ was half as large as for
-    $s = +1$, and 0.7 times as large with weak noise. The parameters $\beta_1$,
-    $\beta_2 \neq 0$ and $b$ decide at which times the noise is evaluated: with the defaults
-    $\beta_1 = b = 0$, $\beta_2 = 1$, at both ends of the step.
+    $s = +1$, or 0.7 times as large with weak noise. The parameters $\beta_1$,
+    $\beta_2 \neq 0$ and $b$ determine the times at which the noise is evaluated: with the
+    defaults $\beta_1 = b = 0$, $\beta_2 = 1$, at both ends of the step.
 
-    Strong order 3/2 and weak order 2. The path needs space-time Lévy area, from which
-    $I_{k0}$ follows.
+    Strong order 3/2 and weak order 2. The path needs space-time Lévy area, which determines
+    $I_{k0}$.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 4.1.
@@ -83,7 +83,7 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         rows = 1 + self.sign / np.sqrt(2), 1 - self.sign / np.sqrt(2)
         B = np.array([[rows[0], 0], [rows[1] - b, b]])
         weights = beta2 * np.array([1, -1])
-        # I_k0 / h = W / 2 + H, in the variables of Diffrax.
+        # I_k0 / h = W / 2 + H, in Diffrax's variables.
         return AdditiveTableau(
             alpha=[1 / 2, 1 / 2],
             beta={"W": np.array([beta1, 1 - beta1]) + weights / 2, "H": weights},
@@ -114,8 +114,8 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       + \sum_k b_k \frac{\hat I_k + \hat I_{k+m}}{2}, \qquad
       y_{n+1} = y_n + h\, a(t_n + \tfrac h2, G) + \sum_k b_k \hat I_k.$$
 
-    One stage vector is solved for, as in the midpoint rule. The second order comes from the
-    second, independent variable $\hat I_{k+m}$, of `WeakBrownianPath(..., second=True)`.
+    A step solves for one stage vector, as in the midpoint rule. Order 2 needs the second,
+    independent variable $\hat I_{k+m}$, from `WeakBrownianPath(..., second=True)`.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 4.2.
@@ -156,9 +156,9 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     $$y_{n+1} = y_n + h \sum_i \alpha_i a(t_n + c_i h, G_i) + \sum_k b_k \hat W_k$$
 
     where $\hat W_k$ is the four-point variable with seven moments of $\mathcal N(0, h)$ and
-    $\eta_{k1}$, $\eta_{k2}$ are independent three-point variables of variance $h$, of
+    $\eta_{k1}$, $\eta_{k2}$ are independent three-point variables of variance $h$, from
     `WeakBrownianPath(..., order=3)`. Since $c_i - c_i^2 = 1/6$, $\xi_{ki}$ has the variance
-    $c_i^2 h + h / 6 = c_i h$ of the Brownian motion at the time $c_i h$.
+    $c_i^2 h + h / 6 = c_i h$ of Brownian motion at time $c_i h$.
 
     Wang, Hong and Xu (2017) found no symplectic method of weak order 3 with fewer than
     seven stages (remark 4.2).

@@ -1,4 +1,4 @@
-"""Solvers for any Hamiltonians that Wang, Hong and Xu do not have."""
+"""Solvers for any Hamiltonians that are not from Wang, Hong and Xu."""
 
 import dataclasses
 from typing import ClassVar
@@ -39,9 +39,9 @@ _half = np.array([1 / 2, 1 / 2])
 
 
 class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
-    r"""A symplectic method of weak order 2 for one noise or noises that commute: the drift
-    over half of the step by the midpoint rule, the noise by the Gauss method of order 4,
-    and the drift over the other half.
+    r"""A symplectic method of weak order 2 for one noise or noises that commute: half a
+    step of the drift by the midpoint rule, the noise by the Gauss method of order 4, and
+    another half step of the drift.
 
     In the form of [`diffrax_symplectic.GeneralTableau`][], with $r = \sqrt 3$,
 
@@ -54,8 +54,8 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       \alpha = \beta = (\tfrac12, \tfrac12).$$
 
     It satisfies the 17 conditions of [`diffrax_symplectic.SRKw2`][] with four stage vectors
-    in place of six, in three small systems one after the other. Weak order 2 for one noise
-    and for noises that commute, weak order 1 for others.
+    instead of six, in three small systems, solved one after the other. Weak order 2 for one
+    noise or noises that commute; otherwise weak order 1.
 
     **Source:** [Strang (1968)](https://doi.org/10.1137/0705041) for the splitting.
     """
@@ -91,8 +91,8 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     r"""A symplectic method of weak order 2 for any Hamiltonians and any number of noises,
     whether they commute or not: splitting in random order.
 
-    With $F_0(t)$ for the flow of the drift over time $t$, $F_k(x)$ for the flow of the
-    noise $b_k$ over "time" $x$, and the three-point variables $\hat I_k$, by one fair coin
+    Let $F_0(t)$ be the flow of the drift over time $t$, $F_k(x)$ the flow of the noise
+    $b_k$ over "time" $x$, and $\hat I_k$ three-point variables. A fair coin chooses
 
     $$y_{n+1} = F_0(\tfrac h2)\, F_m(\hat I_m) \cdots F_1(\hat I_1)\, F_0(\tfrac h2)\, y_n
       \quad \text{or} \quad
@@ -101,19 +101,19 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     Each flow is one step of the Gauss method with two stages, of order 4. (With the
     midpoint rule the method would have weak order 1.) So a step solves $m + 2$ systems of
     two stage vectors, one after another. For one noise [`diffrax_symplectic.StrangGauss`][]
-    has the same order, weak order 2, and is cheaper.
+    also has weak order 2, and is cheaper.
 
-    **Many noises.** A flow needs one noise only. With an
+    **Many noises.** Each flow needs only one noise. With an
     [`diffrax_symplectic.IndexedNoise`][] it evaluates only that noise, otherwise all of
-    them: for a thousand sites and a thousand noises that read all sites, a step of one path
-    took 0.04 s with `IndexedNoise`, and 2.8 s with a function.
+    them: for a thousand sites and a thousand noises that depend on all sites, a step of one
+    path took 0.04 s with `IndexedNoise`, and 2.8 s with a function.
 
-    For two noises and more the path has to be a [`diffrax_symplectic.WeakBrownianPath`][]
-    with `two_point=True`: the coin is the sign of the first two-point variable.
+    For two or more noises the path must be a [`diffrax_symplectic.WeakBrownianPath`][] with
+    `two_point=True`: the coin is the sign of the first two-point variable.
 
     **Source:** [Ninomiya and Victoir (2008)](https://doi.org/10.1080/13504860701413958) for
     the splitting; [Ninomiya and Ninomiya (2009)](https://doi.org/10.1007/s00780-009-0101-4)
-    for Runge--Kutta methods of high order in place of the flows.
+    for high-order Runge--Kutta methods in place of the flows.
     """
 
     record: ClassVar[Record] = Record(
@@ -130,7 +130,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         return (2,) * (num_noises + 2)
 
     def order(self, terms):
-        """The order without noise is the order of the flows."""
+        """The order without noise, which is the order of the flows."""
         del terms
         return drift_order(_flow.tableau)
 
@@ -148,7 +148,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         middle = t0 + (t1 - t0) / 2
         numbers, increments = self._in_order(terms, t0, t1)
         still = [middle] * (numbers.size + 1)
-        # First and last the drift, which does not read the number.
+        # The drift comes first and last, and ignores the number.
         flows = (
             np.pad(np.full(numbers.size, False), 1, constant_values=True),
             jnp.stack([t0, *still]),
@@ -172,7 +172,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
             step = Step(t0, jnp.zeros_like(t0), {"h": driven})
             return take_step(_flow, step, y, self, solved)
 
-        # In a loop, so that each kind of flow is compiled only once.
+        # A loop compiles each kind of flow only once.
         def one_flow(carry, flow):
             is_drift, *which = flow
             return lax.cond(is_drift, drift_flow, noise_flow, *which, *carry), None
@@ -182,12 +182,12 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         return y1, None, dict(y0=y0, y1=y1), solved, result
 
     def _in_order(self, terms, t0, t1):
-        """The numbers of the noises in the order of their flows, and their increments."""
+        """The indices of the noises in the order of their flows, and their increments."""
         _, noise = split_terms(terms)
         if len(noise) == 0:
             return jnp.zeros(0, int), jnp.zeros(0)
         m = number_of_noises(terms)
-        # The flows of several noises have an order, for which a coin is needed.
+        # The order of several noises is chosen by a coin.
         names = ["W", "two_point"] if m > 1 else ["W"]
         drawn = controls(noise, names, t0, t1, type(self).__name__)
         increments, _ = jfu.ravel_pytree(drawn["W"])
@@ -199,8 +199,8 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
 
 
 class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
-    r"""The implicit midpoint rule with Lévy areas, of strong order 1 for any number of
-    noises, whether they commute or not.
+    r"""The implicit midpoint rule with Lévy areas: strong order 1 for any number of noises,
+    whether they commute or not.
 
     $$G = \tfrac12 (y_n + y_{n+1}), \qquad y_{n+1} = y_n + h\,a(G) + \sum_k b_k(G) I_k
       + \sum_{k<l} [b_k, b_l](G)\, A_{kl}$$
@@ -213,18 +213,18 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       \{F, G\} = \frac{\partial F}{\partial p} \cdot \frac{\partial G}{\partial q}
       - \frac{\partial F}{\partial q} \cdot \frac{\partial G}{\partial p},$$
 
-    since the Lie bracket of two Hamiltonian vector fields is the field of their Poisson
-    bracket. JAX takes the derivatives. The terms need not come from Hamiltonians, but all
-    noises have to be in one term.
+    since the Lie bracket of two Hamiltonian vector fields is the vector field of their
+    Poisson bracket. Derivatives are computed by JAX. The terms need not come from
+    Hamiltonians, but all noises must be in one term.
 
     Strong order 1 and weak order 1; without the areas the midpoint rule has strong order
-    1/2. For `m` noises they cost `m` directional derivatives of the noise in each
+    1/2. For `m` noises the areas cost `m` directional derivatives of the noise per
     evaluation. For one noise, or noises that commute, use
     [`diffrax_symplectic.ImplicitMidpoint`][].
 
     **Source:** [Milstein and Tretyakov (2021)](https://doi.org/10.1007/978-3-030-82040-4)
-    for the order by Lévy areas and Lie brackets, due to Milstein. We know of no source for
-    the combination with the midpoint rule.
+    for strong order 1 by Lévy areas and Lie brackets, due to Milstein. We know of no source
+    for the combination with the midpoint rule.
     """
 
     record: ClassVar[Record] = Record(
@@ -243,7 +243,7 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""A symplectic method of strong order 3/2 for any Hamiltonians, with one noise or with
     noises that commute.
 
-    A step is one step over unit time, by the Gauss method with two stages, of the field
+    A step is one step of the two-stage Gauss method, over unit time, with the vector field
 
     $$h a + \sum_k b_k W_k + h \sum_k [b_k, a] H_k + \sum_{k, l} [b_k, [b_l, a]]\, L_{kl},
       \qquad [b, a] = a' b - b' a,$$
@@ -252,27 +252,27 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     $$L_{kl} = \tfrac35 h H_k H_l + \tfrac{1}{30} h^2 \delta_{kl}.$$
 
-    If the path has space-time-time areas $K_k$, too (`diffrax.SpaceTimeTimeLevyArea`), then
+    If the path also has space-time-time areas $K_k$ (`diffrax.SpaceTimeTimeLevyArea`), then
 
     $$L_{kl} = \tfrac35 h H_k H_l + \tfrac{60}{7} h K_k K_l
       - \tfrac12 h (W_k K_l + K_k W_l) + \tfrac{3}{140} h^2 \delta_{kl}.$$
 
     Both are conditional expectations, given these variables of the path, of integrals in
-    the logarithm of the solution. With the second one the errors of small steps were less
-    than half as large.
+    the logarithm of the solution. With the second, errors of small steps were less than
+    half as large.
 
-    The brackets of Hamiltonian vector fields are the fields of their Poisson brackets, so
-    that a step is symplectic. JAX takes the derivatives: for $m$ noises, $m$ second
-    derivatives of the vector fields in each evaluation. Terms need not come from
-    Hamiltonians, and may depend on time: the brackets contain their derivatives by time.
+    The brackets of Hamiltonian vector fields are the vector fields of their Poisson
+    brackets, so a step is symplectic. Derivatives are computed by JAX: for $m$ noises, $m$
+    second derivatives of the vector fields per evaluation. The terms need not come from
+    Hamiltonians, and may depend on time: the brackets include time derivatives.
 
-    Two stage vectors are solved for, in one system, whatever the number of noises. Strong
-    order 3/2 and weak order 2 for one noise and for noises that commute, $[b_k, b_l] = 0$;
-    strong order 1/2 and weak order 1 for others. The path needs space-time Lévy area. For
-    noise in the forces alone [`diffrax_symplectic.PlateauVerlet`][] is explicit and much
-    cheaper.
+    A step solves for two stage vectors, in one system, for any number of noises. Strong
+    order 3/2 and weak order 2 for one noise or noises that commute, $[b_k, b_l] = 0$;
+    otherwise strong order 1/2 and weak order 1. The path needs space-time Lévy area. If the
+    noise is in the forces alone, [`diffrax_symplectic.PlateauVerlet`][] is explicit and
+    much cheaper.
 
-    **Source:** the field is from the log-ODE method of [Foster, Lyons and Oberhauser
+    **Source:** the vector field is from the log-ODE method of [Foster, Lyons and Oberhauser
     (2020)](https://doi.org/10.1137/19M1261912), section 4.
     """
 

@@ -1,4 +1,4 @@
-"""Solvers for any Hamiltonians, of Wang, Hong and Xu and the midpoint rule."""
+"""Solvers for any Hamiltonians: the midpoint rule, and methods of Wang, Hong and Xu."""
 
 from typing import ClassVar
 
@@ -20,7 +20,7 @@ class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     $$G = y_n + \tfrac12 h\,a(G) + \tfrac12 \sum_k b_k(G) I_k, \qquad
       y_{n+1} = y_n + h\,a(G) + \sum_k b_k(G) I_k$$
 
-    One stage vector is solved for, whatever the number of noises. Strong order 1/2, or
+    A step solves for one stage vector, for any number of noises. Strong order 1/2, or
     strong order 1 if there is one noise or the noises commute. Weak order 1.
 
     **Source:** [Milstein, Repin and Tretyakov
@@ -45,9 +45,9 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       \alpha = \beta = (2a,\; 1 - 2a)$$
 
     These are two steps of the midpoint rule, over the fractions $2a$ and $1 - 2a$ of the
-    step and of its increment. The default $a = 1/4$ has the smallest strong errors: where
-    the error of the drift dominates, a quarter of the midpoint rule's; where the error of
-    the noise dominates, nothing is gained.
+    step and of its increment. The default $a = 1/4$ has the smallest strong errors: a
+    quarter of the midpoint rule's error if the drift dominates it, but no gain if the noise
+    does.
 
     Strong order 1/2, or strong order 1 if there is one noise or the noises commute. Weak
     order 1.
@@ -81,9 +81,9 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     $$y_{n+1} = y_n + h\,a(G^0) + \sum_k b_k(G^1) \hat I_k$$
 
-    At $b = 1/2$, the default, $G^0 = G^1$ and this is the midpoint rule, with one stage
-    vector to solve for. At $b = 0$ and $b = 1$ it is a midpoint step of the drift followed
-    by one of the noise, or the other way round: two small systems one after the other. Any
+    For the default $b = 1/2$, $G^0 = G^1$ and this is the midpoint rule, with one stage
+    vector to solve for. For $b = 0$ and $b = 1$ it is a midpoint step of the drift followed
+    by one of the noise, or vice versa: two small systems, solved one after the other. Any
     other value couples the two. Weak order 1 for any number of noises.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
@@ -115,7 +115,7 @@ _r = np.sqrt(3)
 class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKw2 of Wang, Hong and Xu, of weak order 2 for one noise.
 
-    Four drift and two noise stages in the form of
+    It has four drift and two noise stages in the form of
     [`diffrax_symplectic.GeneralTableau`][], with the coefficients, for $r = \sqrt 3$,
 
     $$A^0 = \begin{pmatrix} \frac18 & & & \\ \frac14 & \frac18 & & \\
@@ -132,13 +132,13 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         \frac14 + \frac r6 & \frac14 \end{pmatrix}, \quad
       \beta = \begin{pmatrix} \frac12 \\ \frac12 \end{pmatrix}$$
 
-    The paper's third and fourth noise stages, and its free parameters, are unused. All
-    conditions hold for any order of the rows of $B^0$ (and the columns of $A^1$). In this
-    one, rows 1, 4, 2, 3 of the paper, five stage vectors are solved for together and then
-    one; in the paper's, six together. Its local weak error is the smallest of all orders,
-    4% below the paper's with strong noise.
+    The paper's third and fourth noise stages, and its free parameters, have no effect. All
+    conditions hold for any permutation of the rows of $B^0$ (and the columns of $A^1$).
+    With this one, rows 1, 4, 2, 3 of the paper, a step solves for five stage vectors
+    together and then for one; with the paper's, for six together. It has the smallest local
+    weak error of all permutations, 4% below the paper's with strong noise.
 
-    Weak order 2 for one noise and for noises that commute; weak order 1 for others.
+    Weak order 2 for one noise or noises that commute; otherwise weak order 1.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 2.1.

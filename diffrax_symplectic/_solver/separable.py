@@ -41,10 +41,10 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     | $A^1$ | 1/2 | 1 | 0 | 1/2 | 1 | 0 |
     | $B^0$ | 1/2 | 0 | 1 | -1/2 | 0 | -1 |
 
-    `"a"` is the midpoint rule; `"b"` a midpoint step of the drift, then an explicit kick by
-    the noise; `"c"`, the default, a kick, then a midpoint step. `"d"`, `"e"` and `"f"` are
-    these with the increments negated, which have the same law. Weak order 1 for any number
-    of noises.
+    `"a"` is the midpoint rule; `"b"` is a midpoint step of the drift, then an explicit kick
+    by the noise; `"c"`, the default, is the kick, then the midpoint step. `"d"`, `"e"` and
+    `"f"` are the same with negated increments, which have the same law. Weak order 1 for
+    any number of noises.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 3.1.
@@ -88,12 +88,13 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       \end{pmatrix}, \quad B^0 = \begin{pmatrix} 1 & 0 \\ 0 & 0 \end{pmatrix}, \quad
       A^1 = \begin{pmatrix} -\frac12 & \frac12 \\ \frac12 & \frac12 \end{pmatrix}.$$
 
-    These are the coefficients that a step depends on. The paper's third drift stage has
-    weight 0, its second and third noise stages are at the same point, and its other
-    parameters belong to these. For $a_{21} = 0$ and $1/2$ the matrix $A^0$ is triangular;
-    $\frac14 \pm \frac{\sqrt 3}{6}$ make it the Gauss method, of order 4 without noise.
+    A step depends only on these coefficients: the paper's third drift stage has weight 0,
+    its second and third noise stages are evaluated at the same point, and its other
+    parameters only affect these stages. For $a_{21} = 0$ and $1/2$ the matrix $A^0$ is
+    triangular; for $\frac14 \pm \frac{\sqrt 3}{6}$ it is the Gauss method, of order 4
+    without noise.
 
-    Weak order 2: in the paper for one noise, and measured for two and three.
+    Weak order 2: by the paper for one noise, and measured for two and three noises.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 3.1.
@@ -125,9 +126,10 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKs2 of Wang, Hong and Xu, of strong order 1, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
 
-    Two of the paper's three noise stages read the same point and have opposite weights. The
-    rest is the midpoint rule: in the form of [`diffrax_symplectic.SeparableTableau`][],
-    $\alpha = \beta = 1$ and $A^0 = B^0 = A^1 = \frac12$. Strong order 1 and weak order 1.
+    Two of the paper's three noise stages are evaluated at the same point, with opposite
+    weights. What remains is the midpoint rule: in the form of
+    [`diffrax_symplectic.SeparableTableau`][], $\alpha = \beta = 1$ and
+    $A^0 = B^0 = A^1 = \frac12$. Strong order 1 and weak order 1.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 3.2.
@@ -155,11 +157,11 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       A^1 = (2a,\; 1 - 2a), \quad
       \beta = 1.$$
 
-    Two midpoint steps of the drift over the fractions $2a$ and $1 - 2a$ of the step, then
-    the kick $\sum_k \sigma_k(t_{n+1}, Q_1) I_k$. The default $a = 0$ makes one midpoint
-    step: over six problems $a$ changed the strong error by 3% at most, and any other value
-    but 1/2 costs twice as much. The paper's other parameters cancel, since both of its
-    noise stages read $Q_1$. Strong order 1 and weak order 1.
+    These are two midpoint steps of the drift over the fractions $2a$ and $1 - 2a$ of the
+    step, then the kick $\sum_k \sigma_k(t_{n+1}, Q_1) I_k$. The default $a = 0$ gives a
+    single midpoint step: in six problems $a$ changed the strong error by at most 3%, and
+    any value other than 0 and 1/2 costs twice as much. The paper's other parameters cancel,
+    since both of its noise stages are evaluated at $Q_1$. Strong order 1 and weak order 1.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 3.2.
@@ -193,9 +195,9 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
       Q_1 = \bar q + \tfrac h2 g(P_1)$$
 
     in the notation of [`diffrax_symplectic.SeparableTableau`][]. Force and noise are
-    evaluated at the same $q$, so that the kick is the exact flow of both together. A step
-    takes one evaluation of the forces. It has to resolve the fastest frequency $\omega$ of
-    $H_0$: $\omega h < 2$.
+    evaluated at the same $q$, so the kick is the exact flow of both together. A step takes
+    one evaluation of the forces, and must resolve the fastest frequency $\omega$ of $H_0$:
+    $\omega h < 2$.
 
     **Source:** [Strang (1968)](https://doi.org/10.1137/0705041) for the splitting;
     [Ninomiya and Victoir (2008)](https://doi.org/10.1080/13504860701413958) for the weak
@@ -240,27 +242,26 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
     r"""An explicit symplectic method of strong order 3/2 for any number of noises, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
 
-    With $M_k = \frac1h \int (w_k(s) - w_k(t_n))\,\mathrm{d}s$ (half of the increment $W_k$,
-    and the space-time Lévy area $H_k$) and
+    Let $M_k = \frac1h \int (w_k(s) - w_k(t_n))\,\mathrm{d}s = \frac12 W_k + H_k$, with the
+    increment $W_k$ and the space-time Lévy area $H_k$, and
     $C_k = \pm\sqrt{\frac{1}{15} h + \frac{1}{12} W_k^2 + \frac15 H_k^2}$ with fair,
-    independent signs: kick by
-    $\sum_k \sigma_k (M_k - C_k)$; one Störmer--Verlet step of $H_0$ over $h / 2$; kick by
-    $\sum_k 2 \sigma_k C_k$; Störmer--Verlet over $h / 2$; kick by
-    $\sum_k \sigma_k (W_k - M_k - C_k)$, each time at the current $q$. So the Brownian path
-    over the step is replaced by two plateaus, $M \mp C$, with its mean, and in expectation
-    given $W$ and $H$ with its mean square, which brings order 3/2 where the noise is not
-    constant.
+    independent signs. A step is: a kick by $\sum_k \sigma_k (M_k - C_k)$; a
+    Störmer--Verlet step of $H_0$ over $h / 2$; a kick by $\sum_k 2 \sigma_k C_k$; a
+    Störmer--Verlet step over $h / 2$; a kick by $\sum_k \sigma_k (W_k - M_k - C_k)$; each
+    kick at the current $q$. Thus the Brownian path is replaced by two plateaus,
+    $M \mp C$, with the same mean and, in expectation given $W$ and $H$, the same mean
+    square, which gives order 3/2 if the noise is not constant.
 
-    Strong order 3/2 and weak order 2. The step has to resolve the fastest frequency
-    $\omega$ of $H_0$: $\omega h < 4$. The path has to be a
+    Strong order 3/2 and weak order 2. The step must resolve the fastest frequency $\omega$
+    of $H_0$: $\omega h < 4$. The path must be a
     [`diffrax_symplectic.PlateauBrownianPath`][].
 
     **Source:** the plateaus are from [Foster, dos Reis and Strange
-    (2024)](https://doi.org/10.1137/23M155147X), where the signs of the $C_k$ depend on a
-    third integral of the path, and here they are independent of it. With signs as theirs
-    errors were half as large; with $C_k = \pm\sqrt{h / 6}$ they were up to 1.3 times as
-    large for small steps. For additive noise and second order systems see [Milstein and
-    Tretyakov (2021)](https://doi.org/10.1007/978-3-030-82040-4), chapters 4 and 5.
+    (2024)](https://doi.org/10.1137/23M155147X). There the signs of the $C_k$ depend on a
+    third integral of the path; here they are independent of it. With their signs, errors
+    were half as large; with $C_k = \pm\sqrt{h / 6}$, up to 1.3 times as large for small
+    steps. For additive noise and second-order systems see [Milstein and Tretyakov
+    (2021)](https://doi.org/10.1007/978-3-030-82040-4), chapters 4 and 5.
     """
 
     record: ClassVar[Record] = Record(

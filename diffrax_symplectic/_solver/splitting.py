@@ -1,4 +1,4 @@
-"""Exact flows around the step of another solver: of friction, of a linear part."""
+"""Exact flows around the step of another solver: friction, or a linear part."""
 
 import abc
 from collections.abc import Callable
@@ -31,20 +31,20 @@ from .base import AbstractSymplecticSolver, Order, Record
 
 
 class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
-    """An exact flow over half of the step, a step of `solver` for the rest of the system,
-    and the flow over the other half."""
+    """Strang splitting: an exact flow over half a step, a step of `solver` for the rest of
+    the system, and the flow over the other half."""
 
     # When to choose it, in a sentence.
     choose: ClassVar[str]
     # The highest orders of the splitting.
     weak: ClassVar[int] = 2
     strong: ClassVar[int] = 1
-    # What to do with solvers of other packages.
+    # What to do for solvers of other packages.
     advice: ClassVar[str] = ""
 
     @abc.abstractmethod
     def prepare(self, terms, t0, time: RealScalarLike, y0: Y, args: Args) -> Any:
-        """Computes, before a solve from `t0`, what its flows over `time` share."""
+        """What all flows over `time` of a solve from `t0` share, computed once."""
 
     @abc.abstractmethod
     def exact_flow(self, prepared: Any, time: RealScalarLike, y: Y, args: Args) -> Y:
@@ -52,7 +52,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
 
     @abc.abstractmethod
     def result_with(self, prepared: Any, result: diffrax.RESULTS) -> diffrax.RESULTS:
-        """`result` of a step of the solver, or the failure of the flow."""
+        """The `result` of a step of the solver, or the failure of the flow."""
 
     def __check_init__(self):
         if not isinstance(self.solver, AbstractSymplecticSolver):
@@ -109,10 +109,10 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         del made_jump
         inner, prepared = solver_state
-        # Diffrax makes `t1 - t0` positive in a solve backward in time, too.
+        # In Diffrax `t1 - t0` is positive even in a solve backward in time.
         time = direction(terms) * (t1 - t0) / 2
         y = self.exact_flow(prepared, time, y0, args)
-        # For the solver, which may remember the end of its last step, this is a jump.
+        # The flow is a jump for a solver that remembers the end of its last step.
         y, error, _, inner, result = self.solver.step(
             terms, t0, t1, y, args, inner, True
         )
@@ -134,19 +134,19 @@ class Damped(AbstractSplitting):
     $$p \gets e^{-\gamma h / 2} p, \qquad (p, q) \gets \text{a step of the solver}, \qquad
       p \gets e^{-\gamma h / 2} p$$
 
-    The terms leave the friction out, and keep their structure: separable solvers take them.
+    The terms do not include the friction, so they remain separable for separable solvers.
 
-    For one constant $\gamma$ a step is conformally symplectic: with its Jacobian $S'$,
-    $S'^\top J S' = e^{-\gamma h} J$. It is explicit if the solver is. Orders are those of
-    the solver, at most weak order 2, strong order 1, and 2 without noise.
+    For a single constant $\gamma$ a step is conformally symplectic: with its Jacobian $S'$,
+    $S'^\top J S' = e^{-\gamma h} J$. It is explicit if the solver is. The orders are the
+    solver's, but at most weak order 2, strong order 1, and order 2 without noise.
 
-    The friction acts on the canonical momentum $p$. In a magnetic field friction on the
-    kinetic momentum $p - A(q)$ is a term of its own.
+    The friction acts on the canonical momentum $p$. In a magnetic field, friction on the
+    kinetic momentum $p - A(q)$ needs its own term.
 
-    For Langevin dynamics with constant noise [`diffrax_symplectic.BAOAB`][] and
+    For Langevin dynamics with constant noise, [`diffrax_symplectic.BAOAB`][] and
     [`diffrax_symplectic.LangevinMiddle`][] have far less bias.
 
-    **Source:** splitting of [Strang (1968)](https://doi.org/10.1137/0705041).
+    **Source:** the splitting of [Strang (1968)](https://doi.org/10.1137/0705041).
     """
 
     solver: diffrax.AbstractSolver
@@ -157,7 +157,7 @@ class Damped(AbstractSplitting):
         self._faults = matrix_faults(self.gamma)
         if hasattr(self.solver, "gamma"):
             raise ValueError(
-                f"`{type(self.solver).__name__}` has friction of its own. Pass all the "
+                f"`{type(self.solver).__name__}` already includes friction. Pass all "
                 "friction to it, without `Damped`."
             )
 
@@ -186,17 +186,17 @@ def _check_has_momentum(terms: PyTree[diffrax.AbstractTerm]) -> None:
     """Raises a `ValueError` unless the first half of the state is a canonical momentum."""
     if has_lifted(terms):
         raise ValueError(
-            "`Damped` is friction on a canonical momentum, which the state of `spin_terms` "
-            "or `wave_terms` does not have: spins would get shorter. For damped spins pass "
-            "`damping=` to `spin_terms`."
+            "`Damped` applies friction to a canonical momentum, which the state of "
+            "`spin_terms` or `wave_terms` does not have: spins would get shorter. For "
+            "damped spins pass `damping=` to `spin_terms`."
         )
     if not any(map(is_hamiltonian, split_terms(terms)[0])):
         raise ValueError(
-            "`Damped` is friction on the momentum p of a state `(p, q)`. Plain terms "
+            "`Damped` applies friction to the momentum p of a state `(p, q)`. Plain terms "
             "(`ODETerm`, `ControlTerm`) may have other states, such as (position, "
-            "velocity). Construct the terms with `hamiltonian_terms`; or take "
-            "`BAOAB(gamma)`, if the noise is constant and in the forces; or write the "
-            "friction into the drift, for solvers of general systems."
+            "velocity). Construct the terms with `hamiltonian_terms`; or use "
+            "`BAOAB(gamma)`, if the noise is constant and in the forces; or include the "
+            "friction in the drift, for solvers of general systems."
         )
 
 
@@ -205,9 +205,9 @@ Damped.__init__.__doc__ = f"""**Arguments:**
 - `solver`: a solver of this package.
 - `gamma`: {GAMMA}
 
-**Raises:** a `ValueError` if `gamma` is known to be negative, not finite or no such matrix,
-    if it does not fit `p` (in the solve), or for a solver of another package or with
-    friction of its own.
+**Raises:** a `ValueError` if `gamma` is negative, not finite or an invalid matrix (unless
+    it is traced), if it does not fit `p` (in the solve), or for a solver of another package
+    or one that already includes friction.
 """
 
 
@@ -218,25 +218,25 @@ class LinearFlow(AbstractSplitting):
     $$y \gets \varphi_L(\tfrac h2)\, y, \qquad y \gets \text{a step of the solver for } R
       \text{ and the noises}, \qquad y \gets \varphi_L(\tfrac h2)\, y$$
 
-    It is for systems whose fast parts are linear, $L = \frac12 y \cdot A y$: waves on a
-    lattice, the bonds of a molecule. Their frequencies then do not limit the step. The
-    error is of the size of the commutators of $L$ with the rest.
+    Use it for systems whose fast parts are linear, $L = \frac12 y \cdot A y$, such as waves
+    on a lattice or the bonds of a molecule. Their frequencies then do not limit the step.
+    The error is proportional to commutators of $L$ with the rest.
 
-    The terms are $R$ and all noises, without $L$. If they depend on $q$ alone,
-    `LinearFlow(StormerVerlet(), flow)` is explicit. With friction and thermal noise take
+    The terms contain $R$ and all noises, without $L$. If they depend on $q$ alone,
+    `LinearFlow(StormerVerlet(), flow)` is explicit. With friction and thermal noise use
     `LinearFlow(BAOAB(gamma), flow)`, in which both are exact.
 
-    Symplectic if the solver and `flow` are, which
-    [`diffrax_symplectic.symplecticity_defect`][] tests. Orders are those of the solver, at
-    most weak order 2, strong order 1, and 2 without noise.
+    The method is symplectic if the solver and `flow` are, which
+    [`diffrax_symplectic.symplecticity_defect`][] tests. The orders are the solver's, but at
+    most weak order 2, strong order 1, and order 2 without noise.
 
     !!! warning
 
-        Where $\omega h$ of a mode is close to a multiple of $\pi$, the splitting is in
-        resonance: the rest makes this mode grow, over a band of steps whose width is of the
-        size of the rest. Compare with half the step.
+        If $\omega h$ is close to a multiple of $\pi$ for a mode of frequency $\omega$, the
+        splitting is in resonance and the rest makes this mode grow. The width of the
+        resonance is proportional to the rest. To detect it, compare with half the step.
 
-    **Source:** splitting of [Strang (1968)](https://doi.org/10.1137/0705041); impulse
+    **Source:** the splitting of [Strang (1968)](https://doi.org/10.1137/0705041); impulse
     methods of [Grubmüller, Heller, Windemuth and Schulten
     (1991)](https://doi.org/10.1080/08927029108022142).
     """
@@ -255,9 +255,9 @@ class LinearFlow(AbstractSplitting):
         flow = lambda time, y: self.exact_flow(None, time, y, args)
         if Dependence(flow, jnp.asarray(time), y0).independent(lambda time, y: time):
             raise ValueError(
-                "`flow(time, y, args)` of `LinearFlow` does not depend on `time`, so that "
-                "it is no flow: for `time = 0` it has to return `y`. It is called with "
-                "half of each step."
+                "`flow(time, y, args)` of `LinearFlow` does not depend on `time`, so it is "
+                "not a flow: for `time = 0` it must return `y`. It is called with half of "
+                "each step."
             )
 
     def exact_flow(self, prepared, time, y, args):
@@ -278,11 +278,11 @@ class LinearFlow(AbstractSplitting):
 LinearFlow.__init__.__doc__ = """**Arguments:**
 
 - `solver`: a solver of this package.
-- `flow`: `flow(time, y, args)`, the exact flow of the Hamiltonian that is split off: the
-    state after `time` (which may be negative) from `y = (p, q)`. Any function or Module, by
-    Fourier transforms for a lattice, by eigenvectors for a molecule.
+- `flow`: `flow(time, y, args)`, the exact flow of $L$: the state after `time` (which may be
+    negative) from `y = (p, q)`. Any function or Module, for example by Fourier transforms
+    for a lattice, or by eigenvectors for a molecule.
 
-**Raises:** a `ValueError` if `flow` is no such function, for a solver of another package,
-    and while the solve is traced if `flow` returns another structure or shape, or does not
-    read `time`.
+**Raises:** a `ValueError` if `flow` is not such a function, for a solver of another
+    package, and while the solve is traced if `flow` returns another structure or shape, or
+    does not depend on `time`.
 """

@@ -1,4 +1,4 @@
-"""The noise that belongs to a friction at a temperature."""
+"""The thermal noise that belongs to a friction."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,35 +13,35 @@ from ._friction import checked, Fault, matrix_faults, root_of_matrix, UNKNOWN
 def thermal_noise(
     gamma: PyTree[ArrayLike], mass: PyTree[ArrayLike], T: PyTree[ArrayLike]
 ) -> "ThermalNoise":
-    r"""The noise Hamiltonians that keep a system with friction at a temperature:
+    r"""The noise Hamiltonians that balance friction at temperature $T$:
     $H_k = -\sum_j \sigma_{jk} q_j$ with $\sigma \sigma^\top = 2 \gamma M T$.
 
     With the friction $-\gamma p$ of [`diffrax_symplectic.BAOAB`][],
     [`diffrax_symplectic.LangevinMiddle`][] or [`diffrax_symplectic.Damped`][] and $V(p) =
-    p \cdot M^{-1} p / 2$ the density $e^{-H_0 / T}$ is then stationary. The path has the
-    shape of `q`.
+    p \cdot M^{-1} p / 2$, the density $e^{-H_0 / T}$ is then stationary. The path must have
+    the shape of `q`.
 
     **Arguments:**
 
-    - `gamma`: the friction, as the solvers take it, in units of one over time. For a
+    - `gamma`: the friction rate, as for the solvers, in units of one over time. For a
         friction tensor, $\mathrm{d}p = -\Gamma M^{-1} p\,\mathrm{d}t$, pass
         `Gamma / mass`.
-    - `mass`: the masses in $V(p)$: a number, an array of the shape of `q`, or a PyTree of
-        such.
-    - `T`: the temperature, in units of energy: a number; or one for each momentum, as
-        `mass`, where `gamma` is no matrix.
+    - `mass`: the masses in $V(p)$: a number, an array with the shape of `q`, or a PyTree of
+        these.
+    - `T`: the temperature, in units of energy: a number, or, if `gamma` is not a matrix,
+        one for each momentum, like `mass`.
 
     **Returns:** a function `noise(t, p, q, args)` for
     [`diffrax_symplectic.hamiltonian_terms`][].
 
-    **Raises:** a `ValueError` if a mass is known not to be positive, a temperature to be
-    negative, or either not to be finite, for a `gamma` that no solver takes, and in the
-    solve if one of them does not fit `q`. The solve fails if a matrix `gamma` is traced and
-    `gamma * mass` is not symmetric positive semidefinite.
+    **Raises:** a `ValueError` if a mass is not positive, a temperature is negative, or
+    either is not finite (as far as they are not traced), if no solver accepts `gamma`, and
+    in the solve if one of them does not fit `q`. The solve fails if a matrix `gamma` is
+    traced and `gamma * mass` is not symmetric positive semidefinite.
     """
     for name, value in (("mass", mass), ("T", T)):
         for leaf in jtu.tree_leaves(value):
-            kind = "a real number, or an array or PyTree of such"
+            kind = "a real number, or an array or PyTree of them"
             real_array(name, leaf, positive=name == "mass", kind=kind)
     given = dict(gamma=checked(gamma), mass=mass, T=T)
     is_one = lambda x: jtu.all_leaves([x])
@@ -49,15 +49,15 @@ def thermal_noise(
     for name, x in given.items():
         if not is_one(x) and jtu.tree_structure(x) != jtu.tree_structure(like):
             raise ValueError(
-                f"`{name}` must be one number or array, or have the structure of `q`, as "
-                f"the other arguments have; got {eqx.tree_pformat(given)}."
+                f"`{name}` must be one number or array, or have the structure of `q`, like "
+                f"the other arguments; got {eqx.tree_pformat(given)}."
             )
     each = [jtu.tree_map(lambda _: x, like) if is_one(x) else x for x in given.values()]
     return ThermalNoise(jtu.tree_map(_Amplitudes.of, *each))
 
 
 class _Amplitudes(eqx.Module):
-    r"""For the momenta of one array: $2 \gamma M T$, and its root if it may be a matrix."""
+    r"""$2 \gamma M T$ for the momenta of one array, and its root if it may be a matrix."""
 
     variance: Array
     root: Array | None
@@ -69,7 +69,7 @@ class _Amplitudes(eqx.Module):
             variance = 2 * jnp.asarray(gamma) * jnp.asarray(mass) * jnp.asarray(T)
         except (TypeError, ValueError):
             raise ValueError(
-                "`gamma`, `mass` and `T` must have shapes that go together; got "
+                "`gamma`, `mass` and `T` must have shapes that broadcast; got "
                 f"{jnp.shape(gamma)}, {jnp.shape(mass)} and {jnp.shape(T)}."
             ) from None
         (fault,) = matrix_faults(variance)
@@ -94,14 +94,14 @@ class _Amplitudes(eqx.Module):
             reason = getattr(self.fault, "reason", "")
             raise ValueError(
                 "`gamma * mass` of `thermal_noise` must be a symmetric positive "
-                f"semidefinite matrix, but {reason}. Of a tensor with dp = -Gamma v dt "
+                f"semidefinite matrix, but {reason}. For a tensor with dp = -Gamma v dt "
                 "pass `gamma=Gamma / mass`."
             )
         return -jnp.tensordot(self.root.astype(q.dtype), q, q.ndim)
 
 
 class ThermalNoise(eqx.Module):
-    """What [`diffrax_symplectic.thermal_noise`][] returns."""
+    """The result of [`diffrax_symplectic.thermal_noise`][]."""
 
     amplitudes: PyTree[_Amplitudes]
 

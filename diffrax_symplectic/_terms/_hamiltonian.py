@@ -86,7 +86,7 @@ def hamiltonian_terms(
 
 
 def as_path(path: Any) -> diffrax.AbstractBrownianPath:
-    """`path`, or an unspecified path for a shape. Raises a `ValueError` for anything else."""
+    """`path`, or an `UnspecifiedPath` for a shape. Otherwise raises a `ValueError`."""
     if isinstance(path, diffrax.AbstractBrownianPath):
         return path
     is_struct = lambda x: isinstance(x, jax.ShapeDtypeStruct)
@@ -143,7 +143,7 @@ while the solve is traced, if `H` does not return a scalar.
 
 
 class OneNoise(eqx.Module):
-    """A control with a single nonzero noise. `number` is its index in the flattened path."""
+    """A control with a single nonzero noise, at index `number` of the flattened path."""
 
     number: IntScalarLike
     increment: RealScalarLike

@@ -226,7 +226,7 @@ def apply_bridge(
 
 
 def _checked_sum(parts: list[Y], y: Y) -> Y:
-    """The sum. Raises a `ValueError` unless all parts have the state's dtypes and shapes."""
+    """The sum. Raises a `ValueError` unless all have the dtypes and shapes of the state."""
 
     def check(v, x):
         # An array made before 64 bits were enabled may have a dtype unlike its result type.

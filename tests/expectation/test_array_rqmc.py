@@ -254,7 +254,7 @@ def test_equal_paths_are_one_brownian_motion():
         ),
         (r"called as `phi\(t, y, args\)`; got .* `\(y\)`", dict(phi=lambda y: y[0])),
         (r"called as `sort_by\(y\)`", dict(sort_by=lambda t, y, args: y)),
-        (r"a solver, as `StormerVerlet\(\)`", dict(solver=ds.StormerVerlet)),
+        (r"a solver, such as `StormerVerlet\(\)`", dict(solver=ds.StormerVerlet)),
         ("`Euler` solves equations in the sense of Ito", dict(solver=diffrax.Euler())),
         ("must take fixed steps", dict(solver=diffrax.HalfSolver(diffrax.Heun()))),
         ("`dt0` must be a number", dict(dt0=None)),

@@ -98,14 +98,14 @@ def test_what_has_no_canonical_momentum_is_refused():
         ds.WeakBrownianPath((), jr.key(0)),
     )
     y0 = ds.to_spinors(jnp.array([0.6, 0.0, 0.8]))
-    with pytest.raises(ValueError, match="friction on a canonical momentum"):
+    with pytest.raises(ValueError, match="friction to a canonical momentum"):
         diffrax.diffeqsolve(spins, solver, 0.0, 1.0, 0.1, y0)
     # A state (x, v), of which the first half is no momentum.
     drift = diffrax.ODETerm(lambda t, y, args: (y[1], -y[0]))
     kick = diffrax.ControlTerm(lambda t, y, args: (y[0], y[1]), weak_path(1))
     y0 = (jnp.ones(1), jnp.ones(1))
     for plain in (drift, diffrax.MultiTerm(drift, kick)):
-        with pytest.raises(ValueError, match="`hamiltonian_terms`; or take `BAOAB"):
+        with pytest.raises(ValueError, match="`hamiltonian_terms`; or use `BAOAB"):
             diffrax.diffeqsolve(plain, solver, 0.0, 1.0, 0.1, y0)
     # The drift of Hamiltonians tells which half is the momentum.
     terms = ds.hamiltonian_terms(_oscillator, _force, weak_path(1))
@@ -135,7 +135,7 @@ def test_a_traced_friction_that_is_negative_fails_its_path_alone():
 
 def test_there_is_one_friction_only():
     for solver in (ds.BAOAB(1.0), ds.Damped(ds.StormerVerlet(), 1.0)):
-        with pytest.raises(ValueError, match="has friction of its own"):
+        with pytest.raises(ValueError, match="already includes friction"):
             ds.Damped(solver, 1.0)
 
 

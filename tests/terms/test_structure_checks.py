@@ -147,7 +147,7 @@ def test_friction_in_the_drift_is_told_to_be_left_out():
     start(terms)
     only, _ = suggest(terms, gamma=0.5)
     assert isinstance(only.solver, ds.BAOAB)
-    with pytest.raises(ValueError, match="or take `BAOAB"):
+    with pytest.raises(ValueError, match="or use `BAOAB"):
         suggest(_langevin(0.0, False), gamma=0.5)
 
 
