@@ -3,14 +3,14 @@
 The state is a pair `(p, q)`, momenta first.
 
 - Terms: `hamiltonian_terms`, `spin_terms`, `wave_terms`.
-- Which solver: `suggest_solver`, `compare_solvers`. The first to try: `ImplicitMidpoint`.
+- Choosing a solver: `suggest_solver`, `compare_solvers`; try `ImplicitMidpoint` first.
 - Its Brownian path: `solver.path(shape, key)`.
-- A solution: `diffrax.diffeqsolve(terms, solver, t0, t1, dt0, y0)`.
-- Means over many paths: `expectation`. Their states: `ensemble`.
+- Solving: `diffrax.diffeqsolve(terms, solver, t0, t1, dt0, y0)`.
+- Means over many paths: `expectation`; the states of many paths: `ensemble`.
 - Friction: `BAOAB`, `LangevinMiddle`, `Damped`, `thermal_noise`.
 - Stiff linear parts: `LinearFlow`.
 - Gradients of long solves: `ReversingAdjoint`.
-- Tests of one step: `symplecticity_defect`, `weak_order_defect`.
+- Checks of one step: `symplecticity_defect`, `weak_order_defect`.
 """
 
 from ._adjoint import ReversingAdjoint as ReversingAdjoint

@@ -1,4 +1,4 @@
-"""Steps put together from cells, so that steps of different sizes follow one path."""
+"""Steps composed of cells, so that steps of different sizes follow the same path."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,11 +17,11 @@ from ._stepwise import Increment, step_size
 
 
 class Piece(eqx.Module):
-    """A stretch of a Brownian path of `m` noises.
+    """A segment of a Brownian path of `m` noises.
 
     - `h`: its length.
     - `W`: the increment over it.
-    - `integral`: the integral of the path, less its value at the start, or `None`.
+    - `integral`: the integral of the path relative to its start, or `None`.
     - `A`: the Lévy areas, or `None`.
     """
 
@@ -32,7 +32,7 @@ class Piece(eqx.Module):
 
     @staticmethod
     def of(increment: Increment, h: Float[Array, ""]) -> "Piece":
-        """The stretch of length `h` with this increment."""
+        """The segment of length `h` with this increment."""
         assert isinstance(increment, diffrax.AbstractBrownianIncrement)
         W, _ = jfu.ravel_pytree(increment.W)
         h = h.astype(W.dtype)
@@ -43,12 +43,12 @@ class Piece(eqx.Module):
 
     @property
     def H(self) -> Float[Array, " m"]:
-        """The space-time Lévy area, zero over an empty stretch."""
+        """The space-time Lévy area; zero for an empty segment."""
         assert self.integral is not None
         return self.integral / or_one(self.h) - self.W / 2
 
     def then(self, other: "Piece") -> "Piece":
-        """The two stretches one after the other, by Chen's rule."""
+        """This segment followed by another, by Chen's rule."""
         integral = A = None
         if self.integral is not None and other.integral is not None:
             integral = self.integral + other.integral + self.W * other.h
@@ -64,8 +64,8 @@ class Piece(eqx.Module):
         h: RealScalarLike,
         use_levy: bool,
     ) -> Increment:
-        """The increment over a step of size `h` of a path of this shape. With `use_levy` it
-        is of type `kind`, and holds the areas that are known here."""
+        """The increment over a step of size `h` for a path of this shape. With `use_levy`
+        it is of type `kind`, with the areas of this segment."""
         _, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, shape))
         if not use_levy:
             return unravel(self.W)
@@ -78,8 +78,8 @@ class Piece(eqx.Module):
 
 
 def or_one(h: Float[Array, ""]) -> Float[Array, ""]:
-    """`h`, but 1 for an empty stretch, to divide by. In a batch, paths that have reached
-    their end take empty steps until all have."""
+    """`h`, or 1 for an empty segment, as a divisor. In a batch, paths that have reached
+    their end take empty steps until all paths have."""
     return jnp.where(h > 0, h, 1)
 
 
@@ -95,8 +95,8 @@ def compose(
     sample: Callable[[Int[Array, ""]], Piece],
     path_name: str,
 ) -> Piece:
-    """The stretch from `t0` to `t1`, where `sample(i)` is the cell that begins at
-    `i * cell`. An error when run if it does not consist of cells."""
+    """The segment from `t0` to `t1`, where `sample(i)` is the cell that starts at
+    `i * cell`. An error when run if it does not consist of whole cells."""
     first, last = (jnp.round(t / cell).astype(int) for t in (t0, t1))
     off = jnp.maximum(jnp.abs(first * cell - t0), jnp.abs(last * cell - t1))
     last = eqx.error_if(

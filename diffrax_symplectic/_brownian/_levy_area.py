@@ -23,8 +23,8 @@ class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
 
     - `dt`, `W`, `H`: as in Diffrax.
     - `A`: the Lévy areas $A_{kl} = \frac12 \int (w_k \,\mathrm{d}w_l - w_l \,\mathrm{d}
-        w_k)$ with $w$ counted from the start of the step, as an antisymmetric matrix of
-        shape `(m, m)`, with the `m` noises in the order of the leaves of `W`.
+        w_k)$, with $w = 0$ at the start of the step, as an antisymmetric matrix of shape
+        `(m, m)`, with the `m` noises in the order of the leaves of `W`.
     """
 
     dt: PyTree[Float[Array, ""], "BM"]
@@ -33,26 +33,26 @@ class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
     A: Float[Array, "m m"]
 
 
-# Matrix products over at most this many Fourier terms are written out as sums.
+# Matrix products over at most this many Fourier terms are unrolled.
 _WRITTEN_OUT = 4
 
 
 class LevyAreaBrownianPath(AbstractWrappedPath):
     r"""Adds the Lévy areas of a [`diffrax_symplectic.LevyAreaIncrement`][] to the
-    increments of a Brownian path with space-time Lévy area. Step sizes have to be fixed.
+    increments of a Brownian path with space-time Lévy area. Step sizes must be fixed.
 
     Over a step the Brownian path is the line $\frac t h W$ plus a bridge. The first
-    `num_terms` Fourier terms of the bridge are drawn such that it has the given integral
-    $H$. The other terms are replaced by Gaussian variables with their mean and covariances
-    given $H$. So for any number of terms the mean and all covariances of $W$, $H$ and $A$
-    are exact. The law of $A$ itself is approximated, with an error in mean square of
-    $\mathcal O(h / \text{num\_terms})$ (Mrongowius and Rößler); `num_terms=0` is the
-    approximation of Davie. A step draws $2 m\, (\text{num\_terms} + 1) + \frac12 m (m -
-    1)$ normal numbers for $m$ noises.
+    `num_terms` Fourier terms of the bridge are drawn conditional on its integral $H$. The
+    other terms are replaced by Gaussian variables with the same mean and covariances given
+    $H$. So for any number of terms the mean and all covariances of $W$, $H$ and $A$ are
+    exact. The law of $A$ itself is approximated, with a mean-square error of
+    $\mathcal O(h / \text{num\_terms})$ (Mrongowius and Rößler); `num_terms=0` is Davie's
+    approximation. A step draws $2 m\, (\text{num\_terms} + 1) + \frac12 m (m - 1)$ normal
+    numbers for $m$ noises.
 
-    With `cell`, the path is sampled over cells of that size, and steps are put together
-    from these by Chen's rule, so that solutions whose steps are multiples of `cell` follow
-    one path. A step then costs as much as all cells in it.
+    With `cell`, the path is sampled over cells of this size, and steps are composed of them
+    by Chen's rule, so that solutions whose steps are multiples of `cell` follow the same
+    path. A step then costs as much as all cells in it.
 
     **Source:** [Kloeden, Platen and Wright
     (1992)](https://doi.org/10.1080/07362999208809281) for the Fourier series; [Mrongowius
@@ -81,13 +81,13 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         - `path`: a Brownian path with space-time Lévy area, for example
             `FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`.
         - `key`: a JAX random key for the areas, which may be the key of the path.
-        - `num_terms`: Fourier terms over each step, or each cell.
-        - `cell`: the length of the cells, of which every step is a multiple; or `None` to
-            sample each step by itself.
+        - `num_terms`: the number of Fourier terms in each step or cell.
+        - `cell`: the length of the cells, of which every step must be a multiple; or `None`
+            to sample each step separately.
 
         **Raises:** a `ValueError` if `path` has no space-time Lévy area, if `num_terms` is
         negative or `cell` is not positive; an error when run if a step does not consist of
-        cells.
+        whole cells.
         """
         require_space_time_area(path, type(self).__name__)
         check_key(key, type(self).__name__)
@@ -100,7 +100,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         cell = self.cell
         if cell is not None:
-            # A cell may end a rounding error beyond the end of the path.
+            # Through rounding a cell may end just beyond the end of the path.
             at = lambda i: jnp.clip(i * cell, self.path.t0, self.path.t1)
             sample = lambda i: self._sample(at(i), at(i + 1))
             piece = compose(t0, t1, cell, sample, type(self).__name__)
@@ -116,7 +116,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         return sum(_sizes(num_noises(increment_struct(self.path)), self.num_terms))
 
     def changed(self, increment, own_words, h, use_levy) -> Increment:
-        """Samples the step by itself, whatever `cell` is."""
+        """Samples the step as a whole, regardless of `cell`."""
         if not use_levy:
             return increment
         return self._increment(self._piece(increment, own_words, h), h, use_levy)
@@ -143,7 +143,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
 
 
 def _sizes(m: int, terms: int) -> tuple[int, ...]:
-    """How many normal numbers each part of the area needs."""
+    """The number of normal variables that each part of the area needs."""
     return m * terms, m * terms, m, m, m * (m - 1) // 2
 
 
@@ -166,11 +166,11 @@ def _bridge_area(
     a, b, from_rest, by_mean, by_area = jnp.split(normals, ends[:-1])
     a, b = (cast(np.sqrt(s)) * x.reshape(m, terms) for x in (a, b))
     total = jnp.sum(a, axis=1) + np.sqrt(rest) * from_rest
-    # Conditioned on the sum of all cosine coefficients, the rest included, which is -H.
+    # Condition on the sum of all cosine coefficients, including the remainder: it is -H.
     a = a - cast(12 * s) * (total + H)[:, None]
     series = _weighted_product(a, b, np.pi * r)
-    # The rest has cosine coefficients of mean -12 s_r H, which gives the first part of its
-    # area, and variance s_r - 12 s_r^2, which gives the second.
+    # Cosine coefficients of the remainder have mean -12 s_r H, which gives the first part
+    # of its area, and variance s_r - 12 s_r^2, which gives the second.
     mean = jnp.outer(H, np.sqrt(72 * rest_squared) * by_mean)
     size = np.sqrt(rest - 12 * rest_squared)
     area = series - mean + size * _strictly_upper(by_area, m)
@@ -184,7 +184,7 @@ def _weighted_product(
     if len(weights) > _WRITTEN_OUT:
         a = a * jnp.asarray(weights, a.dtype)
         return jnp.matmul(a, b.T, precision=jax.lax.Precision.HIGHEST)
-    # A product of small matrices for each path of a batch costs more than its arithmetic.
+    # Batched products of small matrices cost more than their arithmetic.
     outer = [float(w) * jnp.outer(a[:, i], b[:, i]) for i, w in enumerate(weights)]
     return sum(outer, jnp.zeros((len(a), len(a)), a.dtype))
 
@@ -193,6 +193,6 @@ def _strictly_upper(x: Float[Array, " n"], m: int) -> Float[Array, "m m"]:
     """The matrix with the entries `x` above its diagonal."""
     place = np.zeros((m, m), int)
     place[np.triu_indices(m, 1)] = np.arange(x.size)
-    # By gathering: scattering is slow.
+    # Gather, since scattering is slow.
     padded = jnp.append(x, 0) if x.size == 0 else x
     return jnp.triu(padded[place], 1)

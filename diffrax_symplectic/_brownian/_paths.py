@@ -21,18 +21,18 @@ from ._stepwise import AbstractPathWithLaws, checked_shape, GAUSSIAN_LAWS, Incre
 
 
 class WeakIncrement(diffrax.AbstractBrownianIncrement):
-    r"""The random variables of one step of size $h$ of a weak method.
+    r"""The random variables of a weak method over a step of size $h$.
 
-    Their low moments agree with Gaussian increments, which is all a weak method needs.
-    They are bounded, so that implicit stages stay solvable and moments finite.
+    Their low moments agree with Gaussian increments, which is all that a weak method needs.
+    They are bounded, so implicit stages remain solvable and moments finite.
 
     - `dt`: the step size $h$.
     - `W`: the three-point variables $\hat I_k$, $\pm\sqrt{3h}$ with probability $1/6$
         each and $0$ with probability $2/3$, with moments 1 to 5 of $\mathcal N(0, h)$.
-        For methods of order 3 the four-point variables, $\pm\sqrt{h (3 + \sqrt 6)}$ with
+        For methods of order 3, the four-point variables, $\pm\sqrt{h (3 + \sqrt 6)}$ with
         probability $(3 - \sqrt 6) / 12$ each and $\pm\sqrt{h (3 - \sqrt 6)}$ with
         probability $(3 + \sqrt 6) / 12$ each, with moments 1 to 7.
-    - `second`, `third`: further, independent three-point variables $\hat I_{k+m}$ and
+    - `second`, `third`: additional independent three-point variables $\hat I_{k+m}$ and
         $\hat I_{k+2m}$, or `None`.
     - `two_point`: the variables $\tilde I_k = \pm\sqrt h$ with probability $1/2$ each,
         independent of the others, or `None`.
@@ -53,16 +53,16 @@ class WeakIncrement(diffrax.AbstractBrownianIncrement):
 class WeakBrownianPath(AbstractPathWithLaws):
     r"""Discrete random variables in place of Brownian increments, for weak methods.
 
-    Each step has a [`diffrax_symplectic.WeakIncrement`][] of its own. Use it for
+    Each step has its own [`diffrax_symplectic.WeakIncrement`][]. Use this path for
     expectations only: these are not the increments of a Brownian motion, so a step cannot
-    be divided into shorter ones. Step sizes have to be fixed (`diffrax.ConstantStepSize` or
+    be divided into shorter ones. Step sizes must be fixed (`diffrax.ConstantStepSize` or
     `diffrax.StepTo`).
 
-    The increments are a function of `key` and of where the step lies, up to a fraction of
-    its size, so that rounding errors of the time do not matter. A step that is computed
-    again, as in a backward pass, gets the same increments.
+    The increments are a function of `key` and the position of the step, which tolerates
+    rounding errors of the times. A step that is recomputed, as in a backward pass, gets the
+    same increments.
 
-    Probabilities are exact up to $2^{-32}$, odd moments exactly zero.
+    Probabilities are exact up to $2^{-32}$, and odd moments are exactly zero.
     """
 
     shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
@@ -83,15 +83,15 @@ class WeakBrownianPath(AbstractPathWithLaws):
     ):
         r"""**Arguments:**
 
-        - `shape`: the shape of an increment, for `m` noises `(m,)`; or a PyTree of
+        - `shape`: the shape of an increment, `(m,)` for `m` noises; or a PyTree of
             `jax.ShapeDtypeStruct`s.
-        - `key`: a JAX random key, as from `jax.random.key(seed)`.
+        - `key`: a JAX random key, such as `jax.random.key(seed)`.
         - `second`: whether to draw a second, independent set of three-point variables.
         - `two_point`: whether to draw the two-point variables.
-        - `order`: 2 for the three-point variables, which serve methods of weak order 1
-            and 2; 3 for the four-point ones, with `second` and `third`.
+        - `order`: 2 for the three-point variables, which suffice for methods of weak order
+            1 and 2; 3 for the four-point variables, with `second` and `third`.
 
-        `second` and `two_point` do not change what `W` is for the same `key`.
+        For the same `key`, `second` and `two_point` do not change `W`.
 
         **Raises:** a `ValueError` if `key` is not a random key, if a dtype is not real
         floating-point, or if `order` is neither 2 nor 3.
@@ -121,21 +121,21 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
 
     Over a step of size $h$ the increment is $W \sim \mathcal N(0, h)$, and with space-time
     Lévy area there is an independent $H \sim \mathcal N(0, h / 12)$. As for
-    [`diffrax_symplectic.WeakBrownianPath`][], they are a function of `key` and of where the
-    step lies. So reverse-mode gradients work and no noise repeats late in a run, unlike
-    with `diffrax.UnsafeBrownianPath`, and a step costs no more than its random numbers,
-    unlike with `diffrax.VirtualBrownianTree`.
+    [`diffrax_symplectic.WeakBrownianPath`][], they are a function of `key` and the position
+    of the step. So reverse-mode gradients work and noise does not repeat late in a run,
+    unlike with `diffrax.UnsafeBrownianPath`, and a step costs no more than its random
+    numbers, unlike with `diffrax.VirtualBrownianTree`.
 
     Without `cell`, steps of another size belong to another Brownian motion. With `cell`,
-    one Brownian motion is sampled over cells of that size, and the increment over a step
-    is the sum over its cells. So solutions whose steps are multiples of `cell` follow one
-    path, as strong errors against a fine solution need it. A step then costs as much as all
-    cells in it.
+    one Brownian motion is sampled over cells of this size, and the increment over a step is
+    the sum over its cells. So solutions whose steps are multiples of `cell` follow the same
+    path, as needed for strong errors against a fine solution. A step then costs as much as
+    all cells in it.
 
-    Each number is the inverse of the normal distribution function at one random word of 32
-    bits, with a relative error below $10^{-8}$ in float64: $2^{32}$ different values, up to
-    6.3 standard deviations. The variance is exact up to a relative error of $10^{-7}$, even
-    moments to the eighth up to $10^{-5}$, and odd moments vanish up to rounding.
+    Each number is the inverse of the normal distribution function at a random 32-bit word,
+    with a relative error below $10^{-8}$ in float64: $2^{32}$ different values, up to 6.3
+    standard deviations. The relative error of the variance is $10^{-7}$, and of even
+    moments up to the eighth $10^{-5}$; odd moments vanish up to rounding.
     """
 
     shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
@@ -159,12 +159,12 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
 
         - `shape`, `key`: as for [`diffrax_symplectic.WeakBrownianPath`][].
         - `levy_area`: `diffrax.BrownianIncrement` or `diffrax.SpaceTimeLevyArea`.
-        - `cell`: the length of the cells, of which every step is a multiple; or `None` to
-            sample each step by itself.
+        - `cell`: the length of the cells, of which every step must be a multiple; or `None`
+            to sample each step separately.
 
         **Raises:** a `ValueError` if `key` is not a random key, if a dtype is not real
         floating-point, for another `levy_area`, or if `cell` is not positive; an error
-        when run if a step does not consist of cells.
+        when run if a step does not consist of whole cells.
         """
         if levy_area not in (diffrax.BrownianIncrement, diffrax.SpaceTimeLevyArea):
             raise ValueError(
@@ -189,7 +189,7 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
         h = jnp.asarray(self.cell, t0.dtype)
 
         def sample(i) -> Piece:
-            # The increments are the same whether or not the areas are asked for.
+            # Always draw the areas, so that increments do not depend on `use_levy`.
             words = self.words((i.astype(jnp.int32), jnp.array(0)), True)
             return Piece.of(self.increment(words, 0 * h, h, True), h)
 

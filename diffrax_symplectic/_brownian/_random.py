@@ -1,5 +1,5 @@
-"""Random words for a step, as a function of a key and of where the step lies; and the laws
-of the scalar random variables that are made of them."""
+"""Random words for a step, as a function of a key and of the position of the step; and the
+laws of the scalar random variables computed from them."""
 
 import abc
 import dataclasses
@@ -16,32 +16,32 @@ from jaxtyping import Array, Float, Integer, PRNGKeyArray, UInt32
 from .._batch import materialize
 
 
-# Where a step lies, in units of a power of two, and the exponent of that power.
+# The position of a step, in units of a power of two, and the exponent of that power.
 Place: TypeAlias = tuple[Integer[Array, ""], Integer[Array, ""]]
 
-# The words of one step are numbered. Wrappers begin at these numbers.
+# The words of a step are numbered. The words of wrappers start at these numbers.
 PLATEAU_WORDS, AREA_WORDS = 2**18, 2**19
 
 
 def random_words(
     key, place: Place, sets: int, n: int, begin: int = 0
 ) -> UInt32[Array, "sets n"]:
-    """Random words for a step at `place`: `sets` sets of `n` words each, of which the first
-    do not depend on `sets`. Words for different values of `begin` are independent, so that
-    a path and a wrapper around it may have the same key."""
+    """Random words for a step at `place`, in `sets` sets of `n` words each. More sets leave
+    the first ones unchanged. Words for different values of `begin` are independent, so a
+    path and a wrapper around it may share a key."""
     key = _typed(key)
     count, exponent = place
     blocks = (sets * n + 1) // 2
     if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks < 2**20 - begin:
-        # With the place as its counter, one hash of the generator makes two words. Folded
-        # and split keys would take three hashes for the first word.
+        # With the place as counter, one hash yields two words. Folding and splitting keys
+        # would take three hashes for the first word.
         numbers = np.arange(begin, begin + blocks, dtype=np.uint32)
         counter = (
             count.astype(jnp.uint32),
             (exponent.astype(jnp.uint32) << 20) + numbers,
         )
         hashed = lambda: _threefry(jr.key_data(key), *counter)
-        # XLA computes each of the two words by a kernel of its own.
+        # XLA would compute each of the two words in a separate kernel.
         words = jnp.stack(materialize(lambda: hashed()[: sets * n]), axis=1)
         return words.reshape(-1)[: sets * n].reshape(sets, n)
     at = jr.fold_in(jr.fold_in(key, count), exponent)
@@ -52,9 +52,9 @@ def random_words(
 
 def _threefry(key: UInt32[Array, "2"], a: Array, b: Array) -> tuple[Array, Array]:
     """Threefry-2x32 with 20 rounds, by Salmon et al. (SC'11, doi:10.1145/2063384.2063405):
-    the words that JAX's generator makes for this key, for counters `(a, b)`. Written out,
-    since on CPUs JAX's own is a loop of eighty kernels: three words for each of 512 paths
-    take 3 ns a path in place of 16."""
+    the words of JAX's generator for this key and counters `(a, b)`. Unrolled, since JAX's
+    version is a loop of eighty kernels on CPUs: three words for each of 512 paths take 3 ns
+    per path instead of 16."""
     keys = key[0], key[1], key[0] ^ key[1] ^ np.uint32(0x1BD11BDA)
     a, b = a + keys[0], b + keys[1]
     for i in range(5):
@@ -66,14 +66,14 @@ def _threefry(key: UInt32[Array, "2"], a: Array, b: Array) -> tuple[Array, Array
 
 
 def check_key(key, user: str) -> None:
-    """Raises a `ValueError` unless `key` is a random key (as from `jax.random.key` or
-    `jax.random.PRNGKey`) or an array of keys, which is meant for `jax.vmap`."""
+    """Raises a `ValueError` unless `key` is a random key (from `jax.random.key` or
+    `jax.random.PRNGKey`) or an array of keys, to be used with `jax.vmap`."""
     dtype = getattr(key, "dtype", None)
     if dtype is None or not (
         jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32
     ):
         raise ValueError(
-            f"`{user}` needs a random key, as from `jax.random.key(0)`; got {key!r}."
+            f"`{user}` needs a random key, such as `jax.random.key(0)`; got {key!r}."
         )
 
 
@@ -89,30 +89,29 @@ def _typed(key) -> PRNGKeyArray:
 
 
 def place_of(t0, t1) -> Place:
-    """Where a step lies, in integers, the same for times that differ by rounding.
+    """The position of a step as two integers, which do not change if times are rounded.
 
-    The middle of the step is counted in units of a power of two, between a third and 0.7 of
-    the step, and the exponent is the second integer. So two steps have the same integers
-    only if they overlap. The two odd constants keep round numbers away from where the
-    roundings change.
+    The first counts the middle of the step in units of a power of two that is between a
+    third and 0.7 of the step; the second is the exponent. So two steps have the same
+    integers only if they overlap. The two odd constants keep round numbers away from the
+    boundaries of rounding.
     """
     per_unit, exponent = _inverse_power_of_two(jnp.abs(t1 - t0) * 1.37)
-    # Late in a long solve in float32, two steps may have the same middle after rounding. So
-    # the integer part of the start, which is exact, is split off before half a step is
-    # added.
+    # Late in a long float32 solve, two steps may round to the same middle. So the integer
+    # part of the start, which is exact, is split off before adding half a step.
     start, half = t0 * per_unit, (t1 - t0) / 2 * per_unit
     whole = jnp.floor(start)
     rest = jnp.floor(start - whole + half + 0.29)
-    # Start again after 2^31 counts, or fewer in half precision.
+    # Wrap around after 2^31 counts, or fewer in half precision.
     period = 2.0 ** min(31, jnp.finfo(whole.dtype).maxexp - 1)
     whole = whole - period * jnp.trunc(whole / period)
     return whole.astype(jnp.int32) + rest.astype(jnp.int32), exponent
 
 
 def _inverse_power_of_two(x: Array) -> tuple[Array, Integer[Array, ""]]:
-    """One over the power of two from a quarter to half of a positive number, and the
-    exponent of the number, by its bits: with `jnp.frexp` and `jnp.ldexp` this would take as
-    long as a random word."""
+    """One over a power of two that is between a quarter and half of `x > 0`, and the
+    exponent of `x`, from its bits: `jnp.frexp` and `jnp.ldexp` would take as long as a
+    random word."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(x, f"int{info.bits}")
     biased = bits >> info.nmant
@@ -132,13 +131,13 @@ class AbstractLaw(abc.ABC):
 
     @abc.abstractmethod
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
-        """A sample for each uniformly distributed word of 32 bits."""
+        """A sample for each uniformly distributed 32-bit word."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Discrete(AbstractLaw):
-    """Takes `values[i]` with probability `probabilities[i]`, for words from `cuts[i - 1]`
-    on and below `cuts[i]`."""
+    """Takes `values[i]` with probability `probabilities[i]`, for words `w` with
+    `cuts[i - 1] <= w < cuts[i]`."""
 
     values: tuple[float, ...]
     probabilities: tuple[float, ...]
@@ -157,7 +156,7 @@ class Discrete(AbstractLaw):
 
 @dataclasses.dataclass(frozen=True)
 class Gaussian(AbstractLaw):
-    """The normal distribution of mean zero. A sample is a monotone function of its word."""
+    """The normal distribution with mean zero. A sample is a monotone function of its word."""
 
     variance: float = 1.0
 
@@ -173,9 +172,10 @@ class Gaussian(AbstractLaw):
 
 
 # With p the distance of a probability from the nearer of 0 and 1, and q = 1/2 - p, the
-# normal quantile is q F(-log(4 p (1 - p))) with a smooth F. These polynomials, lowest
-# degree first, were fitted by weighted least squares for p from 2^-33 on: the largest
-# relative error is 9.7e-9. All coefficients are positive, so that nothing cancels.
+# normal quantile is q F(-log(4 p (1 - p))) with a smooth F. The coefficients of this
+# rational approximation of F, lowest degree first, were fitted by weighted least squares
+# for p >= 2^-33: the largest relative error is 9.7e-9. All are positive, so nothing
+# cancels.
 _NUMERATOR = (
     2.506628250602876, 0.894851053435387, 0.18198359950254517, 0.025040486604300607,
     0.002275143781368971, 0.00011854314661164789, 3.8177635593160345e-07,
@@ -187,13 +187,13 @@ _DENOMINATOR = (
 
 
 def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
-    """The inverse of the normal distribution function, at the middle of the interval of
-    length `2^-32` that each word stands for."""
+    """The inverse of the normal distribution function, at the middle of each word's
+    interval of length `2^-32`."""
     constant = lambda x: np.asarray(x, dtype)
     half, unit = constant(0.5), constant(2.0**-31)
-    # Signed integers, which processors convert to numbers faster.
+    # Processors convert signed integers to floats faster.
     signed = lax.bitcast_convert_type(words ^ np.uint32(2**31), np.int32)
-    # 2 q with its sign, and 2 p: one of them is precise where the other is not.
+    # 2 q with its sign, and 2 p: each is accurate where the other is not.
     two_q = (signed.astype(dtype) + half) * unit
     tail = lax.bitcast_convert_type(jnp.minimum(words, ~words), np.int32)
     two_p = (tail.astype(dtype) + half) * unit
@@ -207,13 +207,13 @@ _SMALL, _LARGE = (float(np.sqrt(3 + s * np.sqrt(6))) for s in (-1, 1))
 _LESS, _MORE = (float((3 + s * np.sqrt(6)) / 12) for s in (-1, 1))
 _RARE = round(2**32 * _LESS)
 
-# Moments 1 to 5 of the normal distribution.
+# Matches moments 1 to 5 of the normal distribution.
 THREE_POINT = Discrete(
     values=(-float(np.sqrt(3.0)), 0.0, float(np.sqrt(3.0))),
     probabilities=(1 / 6, 2 / 3, 1 / 6),
     cuts=(_SIXTH, 2**32 - _SIXTH),
 )
-# Moments 1 to 7. Words below 2^31 stand for negative values.
+# Matches moments 1 to 7. Words below 2^31 give negative values.
 FOUR_POINT = Discrete(
     values=(-_LARGE, -_SMALL, _LARGE, _SMALL),
     probabilities=(_LESS, _MORE, _LESS, _MORE),

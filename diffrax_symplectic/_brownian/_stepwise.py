@@ -1,4 +1,4 @@
-"""Brownian paths that draw each step by itself, as a function of random words."""
+"""Brownian paths that draw each step separately, as a function of random words."""
 
 import abc
 import math
@@ -24,14 +24,14 @@ else:
     from equinox import AbstractVar
 
 
-# What a path returns for a step, with `use_levy=False` and with `use_levy=True`.
+# The value of a path over a step, with `use_levy=False` or with `use_levy=True`.
 Increment: TypeAlias = PyTree[Array] | diffrax.AbstractBrownianIncrement
 
 
 class AbstractStepwisePath(diffrax.AbstractBrownianPath):
-    """A path whose increment over a step is a function of random words of 32 bits, one for
-    each scalar random variable. `evaluate` draws the words from a generator; `increment`
-    takes others, such as a low-discrepancy point set."""
+    """A path whose increment over a step is a function of random 32-bit words, one for each
+    scalar random variable. `evaluate` draws the words from a generator; `increment` takes
+    given words, such as low-discrepancy points."""
 
     def evaluate(
         self,
@@ -50,18 +50,18 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
 
     @abc.abstractmethod
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
-        """What `evaluate` returns for the step from `t0` to `t1`."""
+        """The result of `evaluate` for the step from `t0` to `t1`."""
 
     @property
     @abc.abstractmethod
     def laws(self) -> Mapping[str, AbstractLaw] | None:
-        """The laws of the random variables of a step of size 1, all independent, by their
-        name on the increment; over a step of size `h` they are `sqrt(h)` times as large.
-        `None` if increments are made of anything else."""
+        """The laws of the independent random variables of a step of size 1, by their name
+        in the increment; over a step of size `h` they are scaled by `sqrt(h)`. `None` if
+        increments contain anything else."""
 
     @abc.abstractmethod
     def num_words(self, use_levy: bool = False) -> int:
-        """How many words `increment` needs."""
+        """The number of words that `increment` needs."""
 
     @abc.abstractmethod
     def increment(
@@ -71,7 +71,7 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         t1: RealScalarLike,
         use_levy: bool = False,
     ) -> Increment:
-        """What `evaluate` returns for the step from `t0` to `t1`, from given words."""
+        """The increment over the step from `t0` to `t1`, from given words."""
 
 
 # Diffrax traces a step three times, and `jax.vmap` traces the body of a loop more often.
@@ -81,7 +81,7 @@ def _drawn(path: AbstractStepwisePath, t0: Array, t1: Array, use_levy: bool):
 
 
 class AbstractPathWithLaws(AbstractStepwisePath):
-    """A path whose steps consist of independent random variables: for each noise, one from
+    """A path whose steps consist of independent random variables: for each noise, one with
     each of its `laws`. The law of the increment, `"W"`, comes first."""
 
     shape: AbstractVar[PyTree[jax.ShapeDtypeStruct]]
@@ -97,7 +97,7 @@ class AbstractPathWithLaws(AbstractStepwisePath):
         return (len(self.laws) if use_levy else 1) * num_noises(self.shape)
 
     def words(self, place: Place, use_levy: bool) -> UInt32[Array, " num_words"]:
-        """The path's own random words for a place on the time axis."""
+        """The path's random words for a place on the time axis."""
         sets, n = len(self.laws) if use_levy else 1, num_noises(self.shape)
         return random_words(self.key, place, sets, n).reshape(-1)
 
@@ -117,7 +117,7 @@ class AbstractPathWithLaws(AbstractStepwisePath):
 
 
 class AbstractWrappedPath(AbstractStepwisePath):
-    """A Brownian path that changes the increments of another, or adds to them."""
+    """A Brownian path that changes or extends the increments of another."""
 
     path: AbstractVar[diffrax.AbstractBrownianPath]
 
@@ -131,7 +131,7 @@ class AbstractWrappedPath(AbstractStepwisePath):
 
     @abc.abstractmethod
     def num_own_words(self, use_levy: bool) -> int:
-        """How many random words `changed` needs."""
+        """The number of random words that `changed` needs."""
 
     @abc.abstractmethod
     def changed(
@@ -141,7 +141,7 @@ class AbstractWrappedPath(AbstractStepwisePath):
         h: RealScalarLike,
         use_levy: bool,
     ) -> Increment:
-        """What this path makes of an increment of the other, over a step of size `h`."""
+        """This path's increment, from the other's over a step of size `h`."""
 
     def num_words(self, use_levy: bool = False) -> int:
         return stepwise(self.path).num_words(use_levy) + self.num_own_words(use_levy)
@@ -167,7 +167,7 @@ class GivenPath(diffrax.AbstractBrownianPath):
 
 
 class UnspecifiedPath(diffrax.AbstractBrownianPath):
-    """The shape of a Brownian path that is chosen later, when the solver is known."""
+    """The shape of a Brownian path to be chosen later, once the solver is known."""
 
     shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
     levy_area: ClassVar[type] = diffrax.AbstractBrownianIncrement
@@ -176,19 +176,19 @@ class UnspecifiedPath(diffrax.AbstractBrownianPath):
 
     def evaluate(self, t0, t1=None, left=True, use_levy=False):
         raise ValueError(
-            "These terms have the shape of a Brownian path in place of the path itself, "
-            "which is enough for `suggest_solver`, `compare_solvers` and `expectation`. To "
+            "These terms have the shape of a Brownian path instead of the path itself, "
+            "which suffices for `suggest_solver`, `compare_solvers` and `expectation`. To "
             "solve them, pass `path=solver.path(shape, key)` to the function that makes "
             "the terms."
         )
 
 
 def stepwise(path: diffrax.AbstractBrownianPath) -> AbstractStepwisePath:
-    """`path` if its steps can be made from given words, otherwise a `ValueError`."""
+    """`path`. Raises a `ValueError` if its steps cannot be computed from given words."""
     if not isinstance(path, AbstractStepwisePath):
         raise ValueError(
-            "The random variables of this path cannot be chosen from outside. Use a "
-            "`WeakBrownianPath`, or a `FixedStepBrownianPath` in place of Diffrax's "
+            "The random variables of this path cannot be set from outside. Use a "
+            "`WeakBrownianPath`, or a `FixedStepBrownianPath` instead of Diffrax's "
             f"Gaussian paths; got `{type(path).__name__}`."
         )
     return path
@@ -216,8 +216,8 @@ def laws_of(path: diffrax.AbstractBrownianPath) -> Mapping[str, AbstractLaw] | N
 
 
 def is_random(path: diffrax.AbstractBrownianPath) -> bool:
-    """Whether a path draws its noise from a random key, rather than holding given noise,
-    such as a record."""
+    """Whether a path draws its noise from a random key, instead of holding given noise such
+    as a record."""
 
     def is_key(x) -> bool:
         if not eqx.is_array(x):
@@ -234,7 +234,7 @@ def increment_struct(
     """Shapes, dtypes and structure of an increment."""
     if isinstance(path, UnspecifiedPath):
         return path.shape
-    # With times as in a solve, the trace of `evaluate` is shared with it.
+    # With times as in a solve, both share the trace of `evaluate`.
     time = jax.ShapeDtypeStruct((), jnp.result_type(float))
     return jax.eval_shape(lambda *ends: path.evaluate(*ends), time, time)
 
@@ -269,7 +269,7 @@ def draw_set(
 def checked_shape(
     shape: tuple[int, ...] | PyTree[jax.ShapeDtypeStruct], path_name: str
 ) -> PyTree[jax.ShapeDtypeStruct]:
-    """The shape of the increments of a path; a tuple of integers stands for one array.
+    """The shape of the increments of a path; a tuple of integers means a single array.
     Raises a `ValueError` for anything else, and for dtypes that are not real."""
     if isinstance(shape, tuple) and all(isinstance(n, int) for n in shape):
         shape = jax.ShapeDtypeStruct(shape, jnp.result_type(float))

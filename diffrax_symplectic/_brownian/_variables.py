@@ -1,5 +1,5 @@
-"""The random variables of a step: one record for each, which the solvers, conditions and
-suggestions read."""
+"""The random variables of a step: a record of each, for solvers, conditions and
+suggestions."""
 
 import functools as ft
 from collections.abc import Callable, Collection
@@ -20,7 +20,7 @@ class PathKind(NamedTuple):
     make: Callable[[Any, PRNGKeyArray], diffrax.AbstractBrownianPath]
 
     def within(self, wrapper: Callable, code: str) -> "PathKind":
-        """Such a path within another; `code` is what comes before and after it."""
+        """Such a path within a wrapper; `code` is a template for both."""
         make = lambda shape, key: wrapper(self.make(shape, key), key)
         return PathKind(code.format(self.code), make)
 
@@ -38,7 +38,7 @@ _AREA = PathKind(
 _TRUNCATED = _GAUSSIAN.within(
     lambda path, key: TruncatedBrownianPath(path), "TruncatedBrownianPath({})"
 )
-# Wrappers draw random words of their own from the same key.
+# Wrappers draw other random words from the same key.
 _LEVY_AREA = _AREA.within(LevyAreaBrownianPath, "LevyAreaBrownianPath({}, key)")
 _PLATEAUS = _AREA.within(PlateauBrownianPath, "PlateauBrownianPath({}, key)")
 
@@ -46,17 +46,17 @@ _PLATEAUS = _AREA.within(PlateauBrownianPath, "PlateauBrownianPath({}, key)")
 class RandomVariable(NamedTuple):
     """One random variable of a step for each noise (or for each pair of noises).
 
-    - `increment`: the increments that hold it.
-    - `name`: what it is called.
+    - `increment`: the type of increments that contain it.
+    - `name`: its name in messages.
     - `path`: a path that has it.
     - `variance`: in units of the step size, the same for all laws; `None` if it has no law
         of its own.
-    - `even`: whether it stays the same when time runs backward, where Diffrax changes the
-        sign of all.
-    - `drives`: what it multiplies: the vector fields of the noise, the brackets between
-        them, or their brackets with the drift.
-    - `held`: if it is not an attribute of the increment itself, the attributes that it is
-        computed from, and those that are used if the increment has them.
+    - `even`: whether it is unchanged when time runs backward, although Diffrax negates all
+        random variables.
+    - `drives`: the vector fields that it multiplies: the noise, the brackets between
+        noises, or their brackets with the drift.
+    - `held`: if it is not an attribute of the increment itself, the attributes from which
+        it is computed, and optional attributes that are used if present.
     """
 
     increment: type[diffrax.AbstractBrownianIncrement]
@@ -69,7 +69,7 @@ class RandomVariable(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """What it is called, and how to get it."""
+        """Its name, and how to get it."""
         return f"{self.name}. Pass `solver.path(shape, key)`, or `{self.path.code}`"
 
 
@@ -78,17 +78,17 @@ _area = ft.partial(
 )
 _plateau = ft.partial(RandomVariable, PlateauIncrement, "plateaus", _PLATEAUS)
 
-# By the attribute of the increment that holds the variable. Variables whose increments hold
-# most come first: that is the order in which missing ones are named.
+# By the attribute of the increment. Variables whose increments contain the most come first:
+# messages name missing variables in this order.
 VARIABLES = {
     "A": RandomVariable(
         LevyAreaIncrement, "Lévy areas", _LEVY_AREA, None, drives="noise brackets"
     ),
     "C": _plateau(1 / 6),
-    # The sign of `C`, which alone is drawn: its size is a function of `W` and `H`.
+    # The sign of `C`. Only the sign is drawn: the size is a function of `W` and `H`.
     "sign": _plateau(1.0),
     "L": _area(None, even=True, drives="drift brackets", held=(("W", "H"), ("K",))),
-    # The bridge from the end of the step to its start has the same integral.
+    # The time-reversed bridge has the same integral.
     "H": _area(1 / 12, even=True),
     "third": RandomVariable(
         WeakIncrement,
@@ -110,14 +110,14 @@ VARIABLES = {
 
 
 def drives(name: str) -> str:
-    """What the random variable of this name multiplies. Variables of other increments
-    multiply the vector fields of the noise."""
+    """The `drives` of the random variable of this name. Unknown variables drive the vector
+    fields of the noise."""
     return VARIABLES[name].drives if name in VARIABLES else "noise"
 
 
 def path_of(variables: Collection[str], *, gaussian: bool, bounded: bool) -> PathKind:
-    """The path with these random variables. If they are increments alone, it may have to be
-    `gaussian`, and then also `bounded`, for implicit equations."""
+    """The path with these random variables. If only increments are needed, they may be
+    `gaussian`, and then also `bounded`, for implicit methods."""
     for name, variable in VARIABLES.items():
         if name in variables and (name != "W" or not gaussian):
             return variable.path

@@ -40,17 +40,18 @@ def require_space_time_area(path: diffrax.AbstractBrownianPath, wrapper: str) ->
 
 
 class TruncatedBrownianPath(AbstractWrappedPath):
-    r"""Bounds the increments of a Brownian path, for implicit strong methods.
+    r"""Truncates the increments of a Brownian path, for implicit strong methods.
 
     Over a step of size $h < 1$ an increment $\sqrt h\,\xi$ becomes
     $\sqrt h\,\max(-A_h, \min(\xi, A_h))$ with $A_h = \sqrt{2 k |\ln h|}$. With unbounded
-    Gaussian increments an implicit stage has no solution, with positive probability, at any
-    step size. The price is a mean-square error $\mathbb E[(\xi - \xi_h)^2] \leq h^k$: take
-    $k$ at least twice the strong order of the method.
+    Gaussian increments, the stage equations of an implicit method have no solution with
+    positive probability, at any step size. The cost of truncation is a mean-square error
+    $\mathbb E[(\xi - \xi_h)^2] \leq h^k$: choose $k$ at least twice the strong order of the
+    method.
 
-    Steps have to be well below one unit of time, where the bound becomes 0: for `k=2` an
+    Steps must be well below one unit of time, where the bound becomes 0: for `k=2` an
     increment keeps 97% of its variance at $h = 1/4$, 84% at $h = 1/2$ and 28% at
-    $h = 0.9$. Lévy areas do not change. Step sizes have to be fixed.
+    $h = 0.9$. Lévy areas are not changed. Step sizes must be fixed.
 
     **Source:** [Milstein, Repin and Tretyakov
     (2002)](https://doi.org/10.1137/S0036142901395588).
@@ -63,12 +64,12 @@ class TruncatedBrownianPath(AbstractWrappedPath):
     def __init__(self, path: diffrax.AbstractBrownianPath, *, k: int = 2):
         """**Arguments:**
 
-        - `path`: any Brownian path of Diffrax.
+        - `path`: any Diffrax Brownian path.
         - `k`: the integer $k \\geq 1$ above.
 
-        **Raises:** a `ValueError` if `k` is not a positive integer, or if `path` is no
-        Brownian path, or has bounded increments; an error when run if a step is not shorter
-        than one unit of time.
+        **Raises:** a `ValueError` if `k` is not a positive integer, or if `path` is not a
+        Brownian path or already has bounded increments; an error when run if a step is not
+        shorter than one unit of time.
         """
         if not isinstance(path, diffrax.AbstractBrownianPath):
             raise ValueError(
@@ -77,8 +78,8 @@ class TruncatedBrownianPath(AbstractWrappedPath):
             )
         if isinstance(path, WeakBrownianPath):
             raise ValueError(
-                "The increments of a `WeakBrownianPath` are bounded already, and "
-                "truncation would change their moments. Pass it as it is."
+                "The increments of a `WeakBrownianPath` are already bounded, and "
+                "truncation would change their moments. Pass it without truncation."
             )
         self.path = path
         self.k = whole_number("k", k)
@@ -101,8 +102,8 @@ class TruncatedBrownianPath(AbstractWrappedPath):
             h,
             h >= 1,
             "`TruncatedBrownianPath` needs steps shorter than one unit of time, since "
-            "the bound is a multiple of sqrt(|ln h|). Pass a smaller `dt0`, or measure "
-            "time in larger units.",
+            "the bound is proportional to sqrt(|ln h|). Pass a smaller `dt0`, or use "
+            "larger units of time.",
         )
         # The bound of an empty step is zero.
         log_h = jnp.log(jnp.where(h > 0, h, 1))
@@ -120,11 +121,12 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
     r"""Increment, space-time Lévy area and plateaus over a step of size $h$.
 
     The Brownian path is replaced by two plateaus, of height $M - C$ over the first half of
-    the step and $M + C$ over the second. $M = W / 2 + H$ is its mean over the step, and
+    the step and $M + C$ over the second, where $M = W / 2 + H$ is its mean over the step,
+    and
 
     $$C = \pm\sqrt{\tfrac{1}{15} h + \tfrac{1}{12} W^2 + \tfrac15 H^2}$$
 
-    with a fair sign: in expectation given $W$ and $H$, $M^2 + C^2$ is the mean square of
+    with a fair sign. In expectation given $W$ and $H$, $M^2 + C^2$ is the mean square of
     the Brownian path over the step. The mean of $C^2$ is $h / 6$.
 
     - `dt`, `W`, `H`: as in Diffrax.
@@ -143,7 +145,7 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
 
 
 def _offset(h, W, H, sign):
-    # In a solve backward in time Diffrax changes all signs, also of the step size.
+    # In a solve backward in time Diffrax negates everything, including the step size.
     h = jnp.abs(h).astype(W.dtype)
     size = jnp.sqrt(h / 15 + W**2 / 12 + H**2 / 5)
     return jnp.copysign(size, sign)
@@ -154,7 +156,7 @@ _SIGN = two_point()
 
 class PlateauBrownianPath(AbstractWrappedPath):
     """Adds the plateaus of a [`diffrax_symplectic.PlateauIncrement`][] to the increments of
-    a Brownian path with space-time Lévy area. Step sizes have to be fixed."""
+    a Brownian path with space-time Lévy area. Step sizes must be fixed."""
 
     path: diffrax.AbstractBrownianPath
     key: PRNGKeyArray
@@ -179,7 +181,7 @@ class PlateauBrownianPath(AbstractWrappedPath):
         laws = laws_of(self.path)
         if laws is None:
             return None
-        # The increments here hold no space-time-time areas.
+        # These increments do not include space-time-time areas.
         return {"W": laws["W"], "H": laws["H"], "sign": _SIGN}
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:

@@ -88,7 +88,7 @@ def test_increments_can_be_made_from_words_given_in_place_of_the_random_ones():
         ds.PlateauBrownianPath(tree, jr.key(1)),
         ds.LevyAreaBrownianPath(tree, jr.key(1)),
     ):
-        with pytest.raises(ValueError, match="cannot be chosen from outside"):
+        with pytest.raises(ValueError, match="cannot be set from outside"):
             unknown.num_words()
 
 

@@ -62,7 +62,7 @@ def test_truncation_needs_a_positive_integer(k):
 def test_truncation_needs_a_path():
     with pytest.raises(ValueError, match="wraps a Brownian path"):
         ds.TruncatedBrownianPath(lambda t0, t1: 0.0)  # pyright: ignore
-    with pytest.raises(ValueError, match="bounded already"):
+    with pytest.raises(ValueError, match="already bounded"):
         ds.TruncatedBrownianPath(ds.WeakBrownianPath((), jr.key(0)))
 
 
