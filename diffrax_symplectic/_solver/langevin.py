@@ -152,8 +152,8 @@ class BAOAB(AbstractLangevinSplitting):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=1,
-        choose="Langevin dynamics: explicit, and stationary positions are very accurate. "
-        "Mobility and diffusion are too large by x coth x, x = gamma h / 2.",
+        choose="Langevin dynamics: explicit, with very accurate stationary positions. "
+        "Mobility and diffusion are too large by a factor of x coth x, x = gamma h / 2.",
         suggested=("weak", "strong"),
     )
     gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
@@ -197,8 +197,8 @@ class LangevinMiddle(AbstractLangevinSplitting):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose="Langevin dynamics: for momenta and heat flows. It has the positions of "
-        "`BAOAB`, and momenta of half a step before.",
+        choose="Langevin dynamics, for momenta and heat flows. Same positions as "
+        "`BAOAB`; momenta lag by half a step.",
         suggested=("weak", "strong"),
     )
     gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
