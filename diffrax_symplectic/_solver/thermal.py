@@ -69,8 +69,9 @@ class _Amplitudes(eqx.Module):
             variance = 2 * jnp.asarray(gamma) * jnp.asarray(mass) * jnp.asarray(T)
         except (TypeError, ValueError):
             raise ValueError(
-                "`gamma`, `mass` and `T` must have shapes that go together; got "
-                f"{jnp.shape(gamma)}, {jnp.shape(mass)} and {jnp.shape(T)}."
+                "`gamma`, `mass` and `T` must have shapes that broadcast; got "
+                f"{jnp.shape(gamma)}, {jnp.shape(mass)} and {jnp.shape(T)}. A matrix "
+                "`gamma` has the shape of `q` twice: (n, d, n, d) for `q` of shape (n, d)."
             ) from None
         (fault,) = matrix_faults(variance)
         half = variance.shape[: variance.ndim // 2]
@@ -94,7 +95,7 @@ class _Amplitudes(eqx.Module):
             reason = getattr(self.fault, "reason", "")
             raise ValueError(
                 "`gamma * mass` of `thermal_noise` must be a symmetric positive "
-                f"semidefinite matrix, but {reason}. Of a tensor with dp = -Gamma v dt "
+                f"semidefinite matrix, but {reason}. For a tensor with dp = -Gamma v dt "
                 "pass `gamma=Gamma / mass`."
             )
         return -jnp.tensordot(self.root.astype(q.dtype), q, q.ndim)

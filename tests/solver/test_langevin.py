@@ -253,7 +253,7 @@ def test_thermal_noises_that_fit_nothing_are_refused_with_advice():
         ((1.0, 1.0, jnp.inf), "`T` must be a real number.*finite and not negative"),
         ((1.0, 1.0, "hot"), "`T` must be"),
         ((-1.0, 1.0, T), "`gamma` must not be negative"),
-        ((jnp.ones(2), jnp.ones(3), T), "shapes that go together"),
+        ((jnp.ones(2), jnp.ones(3), T), "shapes that broadcast"),
         (({"a": 1.0}, [1.0], T), "structure of `q`"),
     ):
         with pytest.raises(ValueError, match=match):
