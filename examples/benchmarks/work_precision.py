@@ -305,9 +305,8 @@ def main() -> None:
         "",
         f"{machine()}. Made by `python -m examples.benchmarks.work_precision`.",
         "",
-        "Bars are three standard errors; points within their bar of zero are not drawn.",
-        "Times are of one core, in batches of 10,000 paths. The tables have a standard",
-        "error where it is more than a tenth of the error, and microseconds per path.",
+        "Bars are three standard errors; points that are not clear of zero are not drawn.",
+        "Times are CPU times per path, for one core and batches of 10,000 paths.",
         "",
         "![Errors against CPU seconds per path](work_precision.png)",
     ]
