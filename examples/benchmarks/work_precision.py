@@ -291,8 +291,8 @@ def draw(axes, title: str, results: dict[str, tuple[float, Errors]]) -> list[str
 
 
 EXPLAINED = {
-    "weak": f"At $h = 1/{1 / HS[SHOWN]:g}$; exact on linear models, from `ArrayRQMC` on "
-    "the others.",
+    "weak": f"At $h = 1/{1 / HS[SHOWN]:g}$; exact for linear models, with "
+    "`ArrayRQMC` for the others.",
     "strong": f"At $h = 1/{1 / HS[1 + SHOWN]:g}$; root mean squares over 500 Brownian "
     "paths (`compare_solvers`).",
 }
