@@ -16,7 +16,6 @@ from diffrax_symplectic._suggest import ranked, SOLVERS
 
 _TABLE = re.compile(r"<!-- solvers: (.*?) -->.*?<!-- end -->", re.DOTALL)
 _DOCS = Path(__file__).parent
-_SEVERAL = re.compile(r"; (\S+) if noises do not commute")
 _OBJECT = re.compile(r"^::: diffrax_symplectic\.(\w+)$", re.MULTILINE)
 # The page of a solver, by the module that it stands in.
 _PAGES = {
@@ -28,7 +27,7 @@ _PAGES = {
     "splitting": "langevin",
 }
 _STRUCTURES = {
-    "any": "any Stratonovich system",
+    "any": "any",
     "separable": "separable",
     "additive": "additive noise",
     "constant": "additive, constant noise",
@@ -36,7 +35,7 @@ _STRUCTURES = {
 }
 _NOISES = {
     "any": "any number",
-    "commuting": "one noise, or noises that commute",
+    "commuting": "commuting noises",
     "not commuting": "noises that do not commute",
 }
 # Examples of solvers without defaults. A splitting is shown around any solver.
@@ -76,8 +75,7 @@ def table(name: str) -> str:
     columns = ("solver", "structure", "strong", "weak", "without noise")
     columns += ("when to choose it",)
     rows = [_facts(solver) for solver in solvers]
-    text = _rows(columns, [[row[column] for column in columns] for row in rows])
-    return _SEVERAL.sub(r" (\1)", text).replace("any Stratonovich system", "any")
+    return _rows(columns, [[row[column] for column in columns] for row in rows])
 
 
 def _page(solver: AbstractSymplecticSolver) -> str:
@@ -147,7 +145,7 @@ def _order(order) -> str:
         return ""
     if isinstance(order, tuple):
         commuting, others = map(_fraction, order)
-        return f"{commuting}; {others} if noises do not commute"
+        return f"{commuting} ({others})"  # if noises do not commute
     return _fraction(order)
 
 
