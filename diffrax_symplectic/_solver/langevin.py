@@ -124,7 +124,7 @@ class BAOAB(AbstractLangevinSplitting):
     **Positions, momenta, transport.** In a harmonic well of frequency $\omega$ the law of
     $q$ is exact for every step with $\omega h < 2$. Momenta are too cold,
     $\langle p^2 \rangle = m T (1 - \omega^2 h^2 / 4)$: for functions of momenta, such as
-    kinetic temperatures and heat flows, use [`diffrax_symplectic.LangevinMiddle`][], which
+    kinetic temperatures, use [`diffrax_symplectic.LangevinMiddle`][], which
     has the same positions. Mobility and free diffusion are too large in both by the factor
     $x \coth x$, $x = \gamma h / 2$: 0.3% at $\gamma h = 0.2$, 8% at $\gamma h = 1$. They
     are exact for the friction $\gamma' = \frac2h \operatorname{artanh} \frac{\gamma h}2$
@@ -197,7 +197,7 @@ class LangevinMiddle(AbstractLangevinSplitting):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose="Langevin dynamics, for momenta and heat flows. Same positions as "
+        choose="Langevin dynamics, for functions of momenta. Same positions as "
         "`BAOAB`; momenta lag by half a step.",
         suggested=("weak", "strong"),
     )
