@@ -63,6 +63,7 @@ def damped(solver, make_path) -> Step:
 LANGEVIN = {
     "BAOAB": (Step(langevin_terms, gaussian(), ds.BAOAB(GAMMA)), 1),
     "BAOAB, three-point": (Step(langevin_terms, weak(), ds.BAOAB(GAMMA)), 1),
+    "LangevinMiddle": (Step(langevin_terms, gaussian(), ds.LangevinMiddle(GAMMA)), 1),
     "Damped(StormerVerlet)": (damped(ds.StormerVerlet(), gaussian()), 1),
     "Damped(PlateauVerlet)": (damped(ds.PlateauVerlet(), plateaus()), 2),
     "Damped(ImplicitMidpoint)": (damped(ds.ImplicitMidpoint(), gaussian()), None),
@@ -75,7 +76,8 @@ LANGEVIN = {
 }
 # The picture has all of them, the table these.
 SHOWN = (
-    "BAOAB", "Damped(StormerVerlet)", "Damped(PlateauVerlet)", "ALIGN", "QUICSORT", "Heun",
+    "BAOAB", "LangevinMiddle", "Damped(StormerVerlet)", "Damped(PlateauVerlet)", "ALIGN",
+    "QUICSORT", "Heun",
 )  # fmt: skip
 
 
