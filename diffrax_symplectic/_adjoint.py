@@ -1,4 +1,4 @@
-"""Gradients by walking back along the solution, for solvers that undo their own steps."""
+"""Gradients by stepping back along the solution, for reversible solvers."""
 
 import dataclasses
 import functools as ft
@@ -30,32 +30,33 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     r"""Reverse-mode gradients in memory that does not grow with the number of steps, for
     `diffrax.diffeqsolve(..., adjoint=...)`.
 
-    Some solvers undo their own steps: the step from $t_{n+1}$ to $t_n$ with the same
-    increments, negated, leads from $y_{n+1}$ to $y_n$. So the states need not be stored.
-    The backward pass walks from the end of the solution to its beginning, and multiplies
-    with the transposed Jacobian of one step after another. In exact arithmetic these are
-    the gradients of `diffrax.RecursiveCheckpointAdjoint`.
+    Some solvers are reversible: the step from $t_{n+1}$ to $t_n$ with negated increments
+    leads from $y_{n+1}$ back to $y_n$, so the states need not be stored. The backward pass
+    steps from the end of the solution to its start, and multiplies by the transposed
+    Jacobian of each step. In exact arithmetic these are the gradients of
+    `diffrax.RecursiveCheckpointAdjoint`.
 
-    Rounding errors grow on the way. Therefore `checkpoints` states of the solution are
-    saved, evenly spread over the steps, from which the walk begins anew. If it arrives at
-    one with an error of more than $\varepsilon^{2/3}$ of the largest number in the state,
-    with the machine epsilon $\varepsilon$ (4e-11 in float64), an error is raised, or with
-    `throw=False` the gradient is NaN. Near rest the size of later states counts, a tenth
-    less for each step.
+    Rounding errors grow on the way back. Therefore the forward pass saves up to
+    `checkpoints` states, evenly spaced over the steps, from which the backward pass
+    restarts. If it arrives at one of them with an error above $\varepsilon^{2/3}$ of the
+    largest entry of the state, with the machine epsilon $\varepsilon$ (4e-11 in float64),
+    an error is raised, or with `throw=False` the gradient is NaN. Near rest the error is
+    compared with the size of later states, reduced by a tenth for each step.
 
-    **Solvers:** tableaus that are their own inverse, which is read off the coefficients:
+    **Solvers:** tableaus that are reversible, as determined from their coefficients:
     [`diffrax_symplectic.ImplicitMidpoint`][], [`diffrax_symplectic.StormerVerlet`][],
     [`diffrax_symplectic.StrangGauss`][], [`diffrax_symplectic.LevyAreaMidpoint`][], and
-    some of your own; [`diffrax_symplectic.NinomiyaVictoir`][],
+    possibly your own; [`diffrax_symplectic.NinomiyaVictoir`][] and
     [`diffrax_symplectic.BAOAB`][]; and [`diffrax_symplectic.Damped`][] or
-    [`diffrax_symplectic.LinearFlow`][] around one of these. With friction rounding errors
-    grow by $e^{\gamma t}$ on the way back: save more states.
+    [`diffrax_symplectic.LinearFlow`][] around one of these. With friction, rounding errors
+    grow by $e^{\gamma t}$ on the way back: use more checkpoints.
 
     **Steps:** `diffrax.ConstantStepSize` or `diffrax.StepTo`. **Saving:** `SaveAt(t1=True)`
-    or `SaveAt(ts=...)`. No events, no forward mode; no derivatives with respect to times.
+    or `SaveAt(ts=...)`. Events, forward mode and derivatives with respect to times are not
+    supported.
 
-    **Parameters:** gradients are taken of `args`, the initial state, the terms and the
-    solver. JAX refuses values that a Hamiltonian captures as a closure.
+    **Parameters:** gradients are with respect to `args`, the initial state, the terms and
+    the solver. JAX raises an error for traced values that a Hamiltonian closes over.
 
     **Raises:** a `ValueError`, while tracing, for anything else.
     """
@@ -84,7 +85,7 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
             )
         _check_supported(solver, stepsize_controller, event, saveat)
         y = init_state.y
-        # The solver state is computed anew on the way back.
+        # Each step of the backward pass recomputes the solver state (see `made_jump`).
         stop = lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x
         fixed = jtu.tree_map(stop, init_state.solver_state)
         kwargs |= dict(
@@ -102,8 +103,8 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
 
 ReversingAdjoint.__init__.__doc__ = """**Arguments:**
 
-- `checkpoints`: how many states of the solution are saved: more where rounding errors grow
-    fast. They cost memory, and save no time.
+- `checkpoints`: the number of states to save. Use more if rounding errors grow fast. They
+    cost memory, and do not save time.
 
 **Raises:** a `ValueError` if `checkpoints` is not a positive integer.
 """
@@ -115,27 +116,27 @@ def _check_supported(solver, controller, event, saveat) -> None:
     more = not one or sub.steps or sub.t0 or (sub.t1 and sub.ts is not None)
     known = diffrax.ConstantStepSize | diffrax.StepTo
     faults = {
-        "needs a solver that undoes its own steps, such as `ImplicitMidpoint`, "
+        "needs a reversible solver, such as `ImplicitMidpoint`, "
         f"`StormerVerlet` or `StrangGauss`; got `{type(solver).__name__}`":
             not _undoes_its_steps(solver),
-        "needs steps that are known beforehand: `stepsize_controller=diffrax."
+        "needs steps that are known in advance: `stepsize_controller=diffrax."
         "ConstantStepSize()` or `diffrax.StepTo(ts)`; got "
         f"`{type(controller).__name__}`": not isinstance(controller, known),
-        "cannot do events": event is not None,
-        "saves states, by `SaveAt(t1=True)` or `SaveAt(ts=...)`. In place of "
+        "does not support events": event is not None,
+        "only saves states, by `SaveAt(t1=True)` or `SaveAt(ts=...)`. Instead of "
         "`SaveAt(fn=...)` apply the function to `sol.ys`":
             more or sub.fn is not diffrax.SubSaveAt(t1=True).fn,
     }  # fmt: skip
     for fault, found in faults.items():
         if found:
             raise ValueError(
-                f"`ReversingAdjoint` {fault}. Or pass `adjoint=diffrax."
-                "RecursiveCheckpointAdjoint()`."
+                f"`ReversingAdjoint` {fault}. Alternatively pass "
+                "`adjoint=diffrax.RecursiveCheckpointAdjoint()`."
             )
 
 
 def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:
-    # A step of `NinomiyaVictoir` with negated increments takes its flows in reverse order.
+    # With negated increments `NinomiyaVictoir` takes its flows in reverse order.
     if isinstance(solver, NinomiyaVictoir | BAOAB):
         return True
     if isinstance(solver, AbstractSplitting):
@@ -180,7 +181,7 @@ def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
         def body(carry):
             state, rows = carry
             row, rest = jnp.divmod(state.num_steps, every)
-            # Beyond the last row nothing is written.
+            # Indices beyond the last row are dropped.
             row = jnp.where(rest == 0, row, adjoint.checkpoints)
             save = lambda x, rows: rows.at[row].set(x, mode="drop")
             return body_fun(state), jtu.tree_map(save, state.y, rows)
@@ -203,7 +204,7 @@ def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
 
 
 class _Steps(NamedTuple):
-    """The times of the steps of a solve, computed as its controller computes them."""
+    """The times of the steps of a solve, computed by its controller."""
 
     controller: diffrax.AbstractStepSizeController
     init_state: Any
@@ -226,7 +227,7 @@ class _Steps(NamedTuple):
             return self.controller.ts[i]
         _, *fixed = self.init_state.controller_state
         first, second = self.init_state.tprev, self.init_state.tnext
-        # The controller computes times from their number, and reads nothing else.
+        # The controller computes times from the number of steps alone.
         _, _, later, *_ = self.controller.adapt_step_size(
             first, second, None, None, None, None, 1, (i - 1, *fixed)
         )
@@ -234,17 +235,17 @@ class _Steps(NamedTuple):
 
 
 class _Walk(NamedTuple):
-    """Where the backward pass stands."""
+    """The state of the backward pass."""
 
-    # The number of steps between here and the start, and the state here.
+    # The number of steps from the start, and the state there.
     i: Array
     y: Y
-    # The derivatives of the loss: with respect to this state and to the parameters so far.
+    # The derivatives of the loss with respect to this state, and to the parameters so far.
     a_y: Y
     a_parameters: PyTree[Array]
-    # How many of the saved times lie before here.
+    # The number of saved times before this one.
     saved: Array
-    # How large states are near here.
+    # The size of nearby states.
     size: Array
     arrived: Bool[Array, ""]
 
@@ -258,7 +259,7 @@ def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwar
     _, *parameters = inputs
     _, *is_perturbed = perturbed
     diff, nondiff = eqx.partition(parameters, is_perturbed)
-    # What the loss does not depend on has no derivative.
+    # Outputs that the loss does not depend on have no derivative.
     number = 1 if sub.ts is None else len(sub.ts)
     g = jtu.tree_map(
         lambda x, g: jnp.zeros((number, *jnp.shape(x)), x.dtype) if g is None else g,
@@ -272,7 +273,7 @@ def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwar
         t0, t1 = steps.time(i), steps.time(i + 1)
         if back:
             t0, t1, terms = -t1, -t0, reversed_in_time(terms)
-        # The solver state belongs to another step, as after a jump.
+        # As after a jump, since the solver state belongs to another step.
         return solver.step(terms, t0, t1, y, args, init_state.solver_state, True)[0]
 
     def body(walk: _Walk) -> _Walk:
@@ -296,22 +297,22 @@ def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwar
     walk = lax.while_loop(lambda walk: walk.i > 0, body, walk)
     a_y = walk.a_y
     if sub.ts is not None:
-        # What was saved at the start itself.
+        # States saved at the start itself.
         before = jnp.arange(len(sub.ts)) < walk.saved
         a_y = jtu.tree_map(lambda a, g: a + jnp.tensordot(before, g, 1), a_y, g)
     return _if_arrived(walk.arrived, throw, (a_y, *walk.a_parameters))
 
 
-# How much of its size a state passes to the one before it. A start at rest gets the size of
-# later states, and weak increments may leave it at rest for dozens of steps.
+# The fraction of its size that a state passes to the one before it. Thus a start at rest,
+# where weak increments may leave it for dozens of steps, gets the size of later states.
 _PER_STEP = 0.9
 
 
 def _begin_anew(
     y: Y, rows: PyTree[Array], i, every, arrived, size: Array
 ) -> tuple[Y, Bool[Array, ""]]:
-    """The saved state in place of the one walked to, if there is one after `i` steps; and
-    whether they agree, for states of this `size`."""
+    """The state after `i` steps, replaced by the checkpoint if there is one, and whether
+    both agree, for states of this `size`."""
     row, rest = jnp.divmod(i, every)
     exact = jtu.tree_map(lambda rows: rows[row], rows)
     error = optx.max_norm((y**ω - exact**ω).ω)
@@ -323,8 +324,8 @@ def _begin_anew(
 
 
 def _saved_between(t0, t1, ts, g, a_y, a_y0, saved):
-    """Adds the derivatives with respect to states saved between `t0` and `t1`, which are
-    interpolated linearly."""
+    """Adds the derivatives with respect to the states saved between `t0` and `t1`, which
+    are interpolated linearly."""
 
     def add(carry):
         a_y, a_y0, saved = carry
@@ -332,20 +333,20 @@ def _saved_between(t0, t1, ts, g, a_y, a_y0, saved):
         of = lambda x, share: jtu.tree_map(lambda x, g: x + share * g[saved - 1], x, g)
         return of(a_y, share), of(a_y0, 1 - share), saved - 1
 
-    # If no saved time is left, this reads the last one, and the result is not used.
+    # If no saved time is left, this reads the last one, but does not use it.
     more = lambda carry: (carry[2] > 0) & (ts[carry[2] - 1] > t0)
     return lax.while_loop(more, add, (a_y, a_y0, saved))
 
 
 def _if_arrived(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyTree:
-    """The gradients. If the walk did not arrive, an error when run, or NaN."""
+    """The gradients; or if the backward pass failed, an error when run, or NaN."""
     if throw:
         return eqx.error_if(
             gradients,
             ~arrived,
-            "`ReversingAdjoint` did not find its way back: rounding errors grew between "
-            "two saved states. Raise `checkpoints`, or pass `adjoint=diffrax."
-            "RecursiveCheckpointAdjoint()`.",
+            "`ReversingAdjoint` could not reconstruct the solution: rounding errors grew "
+            "too large between two checkpoints. Increase `checkpoints`, or pass "
+            "`adjoint=diffrax.RecursiveCheckpointAdjoint()`.",
         )
     nan = lambda x: jnp.where(arrived, x, cast(Array, jnp.nan))
     return jtu.tree_map(nan, gradients)

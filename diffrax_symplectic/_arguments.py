@@ -23,12 +23,12 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
     try:
         signature = inspect.signature(fn)
     except ValueError:
-        return  # Some functions written in C have none.
+        return  # Some functions written in C have no signature.
     try:
         signature.bind(*arguments)
     except TypeError:
         raise ValueError(
-            f"`{name}` is called as {call}; got a function of other arguments, "
+            f"`{name}` is called as {call}; got a function with other arguments, "
             f"`{signature}`."
         ) from None
     by_position = (
@@ -40,7 +40,7 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
     pair = arguments[1:3] == ("p", "q") and tuple(names[1:3])
     if swapped or pair in (("x", "v"), ("x", "p"), ("q", "v")):
         raise ValueError(
-            f"`{name}` is called as {call}; got a function that names them in another "
+            f"`{name}` is called as {call}; got a function with its arguments in another "
             f"order, `{signature}`."
         )
 
@@ -52,7 +52,9 @@ def check_solver(name: str, solver: Any) -> None:
     example = "ImplicitMidpoint"
     if isinstance(solver, type) and issubclass(solver, diffrax.AbstractSolver):
         example = solver.__name__
-    raise ValueError(f"`{name}` must be a solver, as `{example}()`; got {solver!r}.")
+    raise ValueError(
+        f"`{name}` must be a solver, such as `{example}()`; got {solver!r}."
+    )
 
 
 def whole_number(name: str, value: Any, least: int = 1) -> int:
@@ -65,8 +67,8 @@ def whole_number(name: str, value: Any, least: int = 1) -> int:
 
 
 def real_array(name: str, value: Any, *, positive: bool, kind: str) -> ArrayLike:
-    """Raises a `ValueError` unless this is a real number or array, as far as it is known
-    while tracing finite and positive, or not negative."""
+    """Raises a `ValueError` unless this is a real number or array that is finite and
+    positive (or not negative), as far as its values are known while tracing."""
     fits = eqx.is_array_like(value) and not isinstance(value, bool)
     if fits and not isinstance(value, jax.core.Tracer):
         values = np.asarray(value)
@@ -90,7 +92,7 @@ def shapes(tree: PyTree) -> str:
 def check_state(y0: Y, solver: str) -> None:
     leaves = jtu.tree_leaves(y0)
     if len(leaves) == 0:
-        raise ValueError(f"`{solver}` needs a state with at least one array in it.")
+        raise ValueError(f"`{solver}` needs a state with at least one array.")
     for leaf in leaves:
         dtype = jnp.result_type(leaf)
         if jnp.issubdtype(dtype, jnp.complexfloating):
@@ -98,7 +100,7 @@ def check_state(y0: Y, solver: str) -> None:
                 f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
                 f"array of dtype {dtype}. For complex amplitudes `psi` with Hamiltonians "
                 "construct the terms with `wave_terms(H0, noise, path)` and pass "
-                "`y0=to_pair(psi0)`. For other equations split the state into real and "
+                "`y0=to_pair(psi0)`. For other equations split the state into its real and "
                 "imaginary parts."
             )
         if not jnp.issubdtype(dtype, jnp.floating) or jnp.finfo(dtype).bits < 32:
@@ -109,7 +111,7 @@ def check_state(y0: Y, solver: str) -> None:
             )
     if len({jnp.result_type(leaf) for leaf in leaves}) > 1:
         raise ValueError(
-            f"`{solver}` needs all arrays of `y0` in one dtype; got "
+            f"`{solver}` needs all arrays of `y0` to have one dtype; got "
             f"{sorted({str(jnp.result_type(leaf)) for leaf in leaves})}."
         )
 

@@ -1,5 +1,5 @@
-"""What all paths of a batch do together, what only a few of them need, and what is kept in
-memory for all of them."""
+"""Control flow for batches: loops that all paths share, work that only stragglers need, and
+values that are computed once."""
 
 import functools as ft
 from collections.abc import Callable
@@ -17,16 +17,16 @@ from ._custom_types import IntScalarLike
 
 _T = TypeVar("_T")
 
-# Stragglers are gathered, and served by parts of the batch: so many of them. Mostly there
-# are a few, and the work is that of whole parts. Where all paths computed as long as any is
-# pending, ensembles with some hard paths took 8 to 85 times as long.
+# Stragglers are gathered and served in groups of a batch's size over this number. Usually
+# there are few, and each group costs its full size. When all paths computed for as long as
+# any was pending, ensembles with a few hard paths took 8 to 85 times as long.
 _PARTS = 256
 
 
 @jax.custom_batching.custom_vmap
 def most_of_batch(number: IntScalarLike) -> IntScalarLike:
-    """The largest `number` of all paths of a batch: one for all of them. As the length of a
-    loop it leaves what is the same for all paths the same."""
+    """The largest `number` over all paths of a batch, itself not batched. A loop of this
+    length keeps unbatched values unbatched."""
     return number
 
 
@@ -37,11 +37,11 @@ def _(size, in_batched, number):
 
 
 def batched_like(values: _T, others: PyTree) -> _T:
-    """The same `values`, batched if one of the arrays in `others` is.
+    """The same `values`, batched if any array in `others` is.
 
-    JAX batches a loop anew whenever one more of the values in it turns out to be batched,
-    and loops within loops as many times each. So what a loop begins with is batched before
-    it: `StrangGauss` is traced in half the time.
+    JAX traces a loop again whenever one more of its values turns out to be batched, and
+    nested loops again each time. Batching the initial values before the loop halves the
+    time to trace `StrangGauss`.
     """
     return _batched(values, [x for x in jtu.tree_leaves(others) if eqx.is_array(x)])
 
@@ -59,7 +59,7 @@ def _(size, in_batched, values, others):
     return _all_or_none(values, others), jtu.tree_map(lambda _: True, values)
 
 
-# Rules of batching have no derivatives in reverse mode.
+# Custom batching rules cannot be differentiated in reverse mode.
 _batched = jax.custom_jvp(_all_or_none)
 
 
@@ -69,26 +69,25 @@ def _(primals, tangents):
 
 
 def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -> _T:
-    """`fn(value)` where `pending`, and `value` elsewhere. This has no derivative.
+    """`fn(value)` where `pending`, and `value` elsewhere. Not differentiable.
 
-    Under `vmap` a conditional becomes a selection: all paths compute, and memory is set
-    aside for all of them. Here the stragglers, for which `pending` holds, are gathered from
-    the batch, and served by parts.
+    Under `vmap` a conditional becomes a select: all paths compute, with memory for all.
+    Here the stragglers (`pending` paths) are gathered from the batch and served in groups.
     """
-    # Traced once, here: `vmap` would have `jax.jit` trace it once more.
+    # Trace `fn` once, here: under `vmap`, `jax.jit` would trace it again.
     traced = eqx.filter_closure_convert(fn, value)
     arrays, static = eqx.partition(traced, eqx.is_array)
     call = lambda value, arrays: eqx.combine(arrays, static)(value)
     by_parts = jax.jit(ft.partial(_by_parts, call))
 
-    # What each path has of its own, along a first axis, and what all have in common.
+    # Each path's `own` arrays have a leading axis; `common` arrays are shared.
     @jax.custom_batching.custom_vmap
     def serve(pending, value, own, common):
         return by_parts(pending, value, own, common)
 
     @serve.def_vmap
     def _(size, in_batched, pending, value, own, common):
-        # Nested batches are one long batch.
+        # Nested batches are joined into one.
         n = pending.shape[1 if in_batched[0] else 0]
 
         def joined(batched, x):
@@ -121,9 +120,9 @@ def _by_parts(call, pending, value, own, common):
 
     def serve_part(carry):
         pending, value = carry
-        # As `jnp.nonzero`, which is compiled to a dozen kernels. Where fewer paths are
-        # left, the numbers beyond the batch are dropped in the end. Unsigned ones need no
-        # code for counting from the end.
+        # Like `jnp.nonzero`, which compiles to a dozen kernels. If fewer paths are pending,
+        # the surplus indices lie beyond the batch and are dropped. Unsigned indices need no
+        # code for negative ones.
         flag, which = lax.top_k(pending.astype(jnp.float32), part)
         which = jnp.where(flag > 0, which, size).astype(jnp.uint32)
         new = jax.vmap(one)(*jtu.tree_map(lambda x: x[which], (value, own)))
@@ -135,13 +134,12 @@ def _by_parts(call, pending, value, own, common):
 
 
 def materialize(fn: Callable[[], _T]) -> _T:
-    """`fn()`, computed once and kept in memory.
+    """`fn()`, computed once and stored.
 
     On CPUs, XLA may fuse a computation into every kernel that reads its result, and so
-    repeat it in each. For Gaussian numbers and transcendental functions this costs more
-    than it saves. XLA fuses nothing across the border of a conditional. So `fn` is called
-    in one branch of a conditional, and the barrier hides from XLA that the condition is
-    always true.
+    repeat it. For Gaussian numbers and transcendental functions this costs more than it
+    saves. XLA does not fuse across the boundary of a conditional, so `fn` is called in one
+    branch of a conditional, and a barrier hides that the condition is always true.
     """
     fn = jax.jit(fn)  # traced once
 

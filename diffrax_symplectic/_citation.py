@@ -1,4 +1,4 @@
-"""BibTeX for what a solve uses."""
+"""BibTeX for the methods of a solve."""
 
 import importlib.resources
 import inspect
@@ -13,14 +13,14 @@ _DOI = re.compile(r"https://doi\.org/([^\s)]+)")
 
 
 def citation(*args: Any, **kwargs: Any) -> None:
-    """Prints BibTeX for the numerical methods of a solve: what `diffrax.citation` prints,
-    and the sources of solvers and Brownian paths of this package.
+    """Prints BibTeX for the numerical methods of a solve: the output of `diffrax.citation`,
+    and the sources of this package's solvers and Brownian paths.
 
     ```python
     ds.citation(terms, ds.SRKw2(), t0=0, t1=1, dt0=0.01, y0=y0)
     ```
 
-    **Arguments:** any of those of `diffrax.diffeqsolve`.
+    **Arguments:** any arguments of `diffrax.diffeqsolve`.
     """
     diffrax.citation(*args, **kwargs)
     bound = inspect.signature(diffrax.diffeqsolve).bind_partial(*args, **kwargs)
@@ -33,7 +33,7 @@ def citation(*args: Any, **kwargs: Any) -> None:
             )
             print(*(f"% - {doi}" for doi in dois), sep="\n")
         for doi in dois:
-            # BibTeX refuses a key that repeats.
+            # BibTeX rejects repeated keys.
             if doi in entries:
                 print(entries.pop(doi))
 

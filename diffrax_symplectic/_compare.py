@@ -1,4 +1,4 @@
-"""Speed against accuracy of solvers on one system."""
+"""Comparison of solvers on one system: speed against accuracy."""
 
 import dataclasses
 import functools as ft
@@ -23,10 +23,10 @@ from ._suggest import path_for, suggest_solver, with_paths
 from ._terms import check_stratonovich
 
 
-# The results of a batch of paths, and which of them were solved.
+# The results of a batch of paths, and which paths succeeded.
 _Batch: TypeAlias = tuple[PyTree[Array], Bool[Array, " num_paths"]]
 
-# How many steps of the reference there are in the smallest step that is compared.
+# The number of steps of the reference in the smallest compared step.
 _FINER = 8
 
 
@@ -35,9 +35,9 @@ class ComparedStep(NamedTuple):
 
     - `solver`: the name of the solver.
     - `dt`: the step size.
-    - `error`, `std_error`: the error, and its standard error.
-    - `seconds`: the measured time of a path.
-    - `num_failed`: how many paths failed; they do not count in the error.
+    - `error`, `std_error`: the error and its standard error.
+    - `seconds`: the measured time per path.
+    - `num_failed`: the number of failed paths, which are excluded from the error.
     """
 
     solver: str
@@ -50,12 +50,12 @@ class ComparedStep(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Comparison:
-    """What [`diffrax_symplectic.compare_solvers`][] returns. Printed, it is a table.
+    """The result of [`diffrax_symplectic.compare_solvers`][]. Printed, it is a table.
 
     - `kind`: `"strong"` or `"weak"`.
-    - `steps`: one for each solver and step size, with `solver`, `dt`, `error` and its
-        `std_error`, `seconds` for each path, and `num_failed`.
-    - `refused`: the solvers that do not fit the terms, each with the reason.
+    - `steps`: an entry for each solver and step size, with `solver`, `dt`, `error` and its
+        `std_error`, `seconds` per path, and `num_failed`.
+    - `refused`: the solvers that do not accept the terms, each with the reason.
     """
 
     kind: str
@@ -76,11 +76,11 @@ class Comparison:
     __repr__ = __str__
 
     def plot(self, axes: Any = None) -> Any:
-        """Draws errors against times with Matplotlib, with three standard errors.
+        """Plots errors against times with Matplotlib, with bars of three standard errors.
 
         **Arguments:**
 
-        - `axes`: Matplotlib's axes; by default new ones.
+        - `axes`: Matplotlib axes; by default new ones.
 
         **Returns:** the axes.
         """
@@ -112,13 +112,13 @@ def compare_solvers(
     num_paths: int = 1000,
     reference: diffrax.AbstractSolver | None = None,
 ) -> Comparison:
-    r"""Measures speed against accuracy on a system of your own.
+    r"""Measures speed against accuracy on your own system.
 
-    Without `phi` errors are strong: root mean squares of $|y - y^*|$ at `t1`, with $y^*$
-    a solution along the same Brownian path in steps an eighth of the smallest of `dt0`.
-    With `phi` they are weak: $|\mathbb E \phi(t, y) - \mathbb E \phi(t, y^*)|$ at `t1`,
-    by independent paths. Times are measured for a batch of paths on this machine, divided
-    by their number, without compiling.
+    Without `phi`, errors are strong: the root mean square of $|y - y^*|$ at `t1`, where
+    $y^*$ is solved along the same Brownian path with an eighth of the smallest step in
+    `dt0`. With `phi` errors are weak: $|\mathbb E \phi(t, y) - \mathbb E \phi(t, y^*)|$ at
+    `t1`, from independent paths. Times are measured on this machine for a batch of paths,
+    without compilation, and divided by the number of paths.
 
     !!! example
 
@@ -138,21 +138,21 @@ def compare_solvers(
 
     - `terms`: the terms, with any Brownian path or its shape. Each solver gets the path
         that it needs.
-    - `solvers`: a list of solvers, or `None` for those that `suggest_solver` names.
+    - `solvers`: a list of solvers, or `None` for the suggestions of `suggest_solver`.
     - `t0`, `t1`, `y0`, `args`: as for `diffrax.diffeqsolve`, with numbers for the times.
-    - `dt0`: a list of step sizes; each divides the interval, and is a multiple of the
-        smallest.
+    - `dt0`: a list of step sizes, each of which divides the interval and is a multiple of
+        the smallest.
     - `key`: a JAX random key.
-    - `phi`: takes time, state and `args` to a number.
-    - `num_paths`: how many paths.
-    - `reference`: the solver of $y^*$; by default the first that `suggest_solver` names.
+    - `phi`: maps time, state and `args` to a number.
+    - `num_paths`: the number of paths.
+    - `reference`: the solver of $y^*$; by default the first suggestion of `suggest_solver`.
 
-    **Returns:** a [`diffrax_symplectic.Comparison`][], which names solvers that do not fit
-    the terms with the reason.
+    **Returns:** a [`diffrax_symplectic.Comparison`][], which also lists solvers that do not
+    accept the terms, with the reason.
 
-    **Raises:** a `ValueError` if a step size does not divide the interval or is no multiple
-    of the smallest, if `phi` does not return one number, and for anything that is no
-    solver.
+    **Raises:** a `ValueError` if a step size does not divide the interval or is not a
+    multiple of the smallest, if `phi` does not return one number, or if a solver is not a
+    Diffrax solver.
     """
     dts = _checked_steps(t0, t1, dt0)
     want = "strong" if phi is None else "weak"
@@ -166,7 +166,7 @@ def compare_solvers(
     problem = _Problem(terms, t0, t1, y0, args, phi)
     cell = min(dts) / _FINER
     own_path = lambda solver: ft.partial(path_for, solver, want, None)
-    # Strong errors are along one Brownian motion, which not all solvers can follow.
+    # Strong errors need a common Brownian motion, which not all solvers can use.
     common = lambda solver: ft.partial(path_for, solver, None, cell)
     error_path = common if phi is None else own_path
     keys = lambda number: jr.split(jr.fold_in(key, number), num_paths)
@@ -202,7 +202,7 @@ class _Problem(NamedTuple):
     phi: Callable[[RealScalarLike, Y, Args], ArrayLike] | None
 
     def batch(self, solver: diffrax.AbstractSolver, make_path: Callable) -> Callable:
-        """The results of paths, as a function of their keys and the step size."""
+        """The results of paths as a function of their keys and the step size."""
         terms, t0, t1, y0, args, phi = self
 
         @eqx.filter_jit
@@ -223,7 +223,7 @@ class _Problem(NamedTuple):
 
 def strong_error(out: _Batch, fine: _Batch) -> tuple[float, float, int]:
     """The root mean square of the difference over the paths that both solvers finish, its
-    standard error, and how many paths `out` or `fine` does not finish."""
+    standard error, and the number of paths that either does not finish."""
     okay = np.asarray(out[1] & fine[1])
     square = lambda a, b: np.asarray(a - b, np.float64).reshape(len(okay), -1) ** 2
     squares = jtu.tree_leaves(jtu.tree_map(square, out[0], fine[0]))
@@ -234,7 +234,7 @@ def strong_error(out: _Batch, fine: _Batch) -> tuple[float, float, int]:
 
 
 def weak_error(out: _Batch, fine: _Batch) -> tuple[float, float, int]:
-    """The difference of the means, its standard error, and how many paths failed."""
+    """The difference of the means, its standard error, and the number of failed paths."""
     (mean, bar), (exact, other) = _mean(*out), _mean(*fine)
     return abs(mean - exact), math.hypot(bar, other), int(np.sum(~np.asarray(out[1])))
 

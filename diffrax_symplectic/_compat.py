@@ -1,7 +1,6 @@
-"""What the package uses of other packages that these do not promise to keep.
+"""The private parts of other packages that this one uses, and may change without notice.
 
-Nothing of the kind is used anywhere else. `tests/test_private_parts.py` tests each of these
-by itself.
+They are used nowhere else. `tests/test_private_parts.py` tests each of them.
 """
 
 from typing import Any
@@ -20,20 +19,19 @@ from jaxtyping import PyTree
 
 
 def unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
-    """The term that the user passed. In a solve Diffrax has wrapped it, to be able to go
-    backward in time."""
+    """The user's term. In a solve Diffrax wraps it, to be able to run backward in time."""
     return term.term if isinstance(term, WrapTerm) else term
 
 
 def direction(terms: PyTree[diffrax.AbstractTerm]) -> Any:
-    """The sign of the direction of time in the solve that the terms come from. Terms that
-    are in no solve run forward."""
+    """The sign of the direction of time in the solve that the terms come from. Terms from
+    outside a solve run forward."""
     leaves = jtu.tree_leaves(terms, is_leaf=_is_wrapped)
     return next((x.direction for x in leaves if _is_wrapped(x)), 1)
 
 
 def reversed_in_time(terms: PyTree[diffrax.AbstractTerm]) -> PyTree:
-    """The terms of a solve, with time running the other way."""
+    """The terms of a solve with the direction of time reversed."""
     turn = lambda x: WrapTerm(x.term, -x.direction) if _is_wrapped(x) else x
     return jtu.tree_map(turn, terms, is_leaf=_is_wrapped)
 
@@ -43,5 +41,5 @@ def _is_wrapped(x: Any) -> bool:
 
 
 def is_adjoint_term(term: diffrax.AbstractTerm) -> bool:
-    """Whether the term is one of those that `diffrax.BacksolveAdjoint` solves."""
+    """Whether the term comes from `diffrax.BacksolveAdjoint`."""
     return isinstance(unwrapped(term), AdjointTerm)

@@ -1,5 +1,4 @@
-"""Conditions on the coefficients of a tableau: for symplecticity, orders, and undoing its
-own steps."""
+"""Conditions on the coefficients of a tableau: symplecticity, orders, reversibility."""
 
 import dataclasses
 import functools as ft
@@ -21,11 +20,11 @@ from ._tableau import (
 
 
 def symplectic_residuals(tableau: AbstractTableau) -> Float[np.ndarray, "s s"]:
-    r"""Residuals of the conditions under which a method is symplectic.
+    r"""Residuals of the conditions for a symplectic method.
 
-    With all stages of the tableau in one list, `matrix` $M$ and `weights` $w$ of its
-    flat form, these are $w_i w_j - w_i M_{ij} - w_j M_{ji}$ for every two stages that
-    depend on each other's values.
+    With $M$ and $w$ the `matrix` and `weights` of the flat tableau, these are
+    $w_i w_j - w_i M_{ij} - w_j M_{ji}$ for all pairs of stages that depend on each other's
+    values.
 
     **Arguments:**
 
@@ -49,8 +48,8 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     - For a [`diffrax_symplectic.GeneralTableau`][] with three-point increments: weak
         order 1 for any number of noises, weak order 2 for one.
     - For a [`diffrax_symplectic.PartitionedTableau`][] or
-        [`diffrax_symplectic.SeparableTableau`][]: the conditions for Itô equations that
-        matter where the noise changes $p$ alone and does not depend on it.
+        [`diffrax_symplectic.SeparableTableau`][]: those conditions for Itô equations that
+        apply if the noise changes only $p$ and does not depend on it.
     - For an [`diffrax_symplectic.AdditiveTableau`][]: any number of noises, with
         constant $b_k$ if the tableau is `constant`.
 
@@ -59,8 +58,8 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     - `tableau`: one of these tableaus.
     - `order`: 1 or 2.
 
-    **Returns:** the residual of each condition, by its formula; for order 2 also of the
-    conditions for order 1.
+    **Returns:** a dictionary from the formula of each condition to its residual. Order 2
+    includes the conditions for order 1.
 
     **Raises:** a `ValueError` for any other order, for other tableaus, or for random
     variables of unknown variance.
@@ -89,7 +88,7 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
 
     - `tableau`: any tableau of this package.
 
-    **Returns:** the residual of each condition, by its formula.
+    **Returns:** a dictionary from the formula of each condition to its residual.
 
     **Raises:** a `ValueError` for other tableaus, or random variables of unknown variance.
 
@@ -101,7 +100,7 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
 
 def drift_order(tableau: FlatTableau) -> int:
     """The order without noise, up to 4, by Butcher's conditions for each part of the state
-    that stages write."""
+    that the stages write."""
     drift = [i for i, s in enumerate(tableau.stages) if s.channels == ("h",)]
     flat = tableau.take(drift)
     M = np.where(flat.reads, flat.matrix, 0.0)
@@ -138,7 +137,7 @@ def _(tableau: GeneralTableau) -> dict:
 
 @_strong.register
 def _(tableau: SeparableTableau) -> dict:
-    # The paper's further variables are not independent of `W`.
+    # The paper's other random variables are not independent of `W`.
     others = _others_vanish(tableau.beta, A1e=tableau.A1.sum(axis=1))
     return _strong(tableau.partitioned()) | others
 
@@ -170,7 +169,7 @@ def _(tableau: AdditiveTableau) -> dict:
 
 @ft.singledispatch
 def _weak(tableau: AbstractTableau) -> tuple[dict, dict]:
-    """The conditions for weak order 1, and those that order 2 adds."""
+    """The conditions for weak order 1, and the additional conditions for order 2."""
     raise _unknown(tableau)
 
 
@@ -179,7 +178,7 @@ def _(tableau: GeneralTableau) -> tuple[dict, dict]:
     al, be = tableau.alpha, tableau.beta
     A0, A1, B0, B1 = tableau.A0, tableau.A1, tableau.B0, tableau.B1
     A0e, A1e, B0e, B1e = (x.sum(axis=1) for x in (A0, A1, B0, B1))
-    # The expectation of the double brackets, E L_kl = h^2 delta_kl / 12 in front of
+    # The expectation of the double brackets: E L_kl = h^2 delta_kl / 12 times
     # [b, [b, a]] = a''bb + a'b'b - b''ba - 2 b'a'b + b'b'a.
     brackets = "drift brackets" in map(drives, tableau.noise)
     L = be.sum() / 12 if brackets else 0.0
@@ -234,7 +233,7 @@ def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
 
 @_weak.register
 def _(tableau: SeparableTableau) -> tuple[dict, dict]:
-    """With conditions on the paper's further variables, which depend on `W`."""
+    """With conditions on the paper's other random variables, which depend on `W`."""
     B0 = {"W": tableau.B0["W"]}
     partitioned = dataclasses.replace(tableau.partitioned(), B0=B0)
     first, second = _weak(partitioned)
@@ -282,7 +281,8 @@ def _variance(name: str) -> float:
         known = [name for name, x in VARIABLES.items() if x.variance is not None]
         raise ValueError(
             f"The conditions are known for the random variables {', '.join(known)}; got a "
-            f"tableau with `{name}`. `weak_order_defect` measures the order of any solver."
+            f"tableau with `{name}`. To measure the order of any solver use "
+            "`weak_order_defect`."
         )
     return variable.variance
 
@@ -294,13 +294,13 @@ def _unknown(tableau) -> ValueError:
     )
 
 
-# The controls that change their sign if a step is undone.
+# The controls that change sign when a step is reversed.
 _NEGATED = {"h", *(name for name, variable in VARIABLES.items() if not variable.even)}
 
 
 def is_own_inverse(tableau: FlatTableau) -> bool:
-    r"""Whether the step with all controls negated undoes the step: stages can be paired,
-    $i \leftrightarrow \sigma(i)$, such that
+    r"""Whether the method is reversible: the step with negated controls undoes the step.
+    This holds if stages can be paired, $i \leftrightarrow \sigma(i)$, such that
 
     $$a_{ij} + a_{\sigma(i)\sigma(j)} = b_j, \qquad b_{\sigma(j)} = b_j, \qquad
       c_i + c_{\sigma(i)} = 1.$$
@@ -316,7 +316,7 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
             for j, that in enumerate(stages)
             if (that.channels, that.reads, that.writes)
             == (this.channels, this.reads, this.writes)
-            # In a separable system what depends on p does not depend on time.
+            # In a separable system, functions of p do not depend on time.
             and (this.reads == "p" or np.isclose(that.c, 1 - this.c))
             and np.isclose(b[i], b[j])
         ]
@@ -324,7 +324,7 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
     for sigma in itertools.product(*map(partners, range(len(stages)))):
         paired = all(sigma[j] == i for i, j in enumerate(sigma))
         both = tableau.matrix + tableau.matrix[np.ix_(sigma, sigma)]
-        # A stage does not depend on values that it does not read.
+        # Ignore coefficients of values that a stage does not read.
         wrong = np.where(tableau.reads, both - b, 0)
         if paired and np.allclose(wrong, 0, atol=1e-12):
             return True

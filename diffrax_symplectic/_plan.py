@@ -1,4 +1,5 @@
-"""From a tableau to the work of one step, decided before anything is traced."""
+"""The plan of a step: which stages of a tableau to solve for or evaluate, and in which
+order. It is made before tracing."""
 
 import dataclasses
 import functools as ft
@@ -12,10 +13,10 @@ import numpy as np
 from ._tableau import FlatTableau, Stage
 
 
-# Coefficients are exact up to a few roundings of order-one numbers.
+# Coefficients are exact up to a few roundings of numbers of order one.
 _TOLERANCE = 1e-14
-# The fewest unknown stages of a block are found by trying all sets, up to a size of which
-# there are more than this.
+# The smallest set of unknown stages of a block is found by trying all sets, up to a size
+# with more than this many choices.
 _MOST_CHOICES = 1000
 
 
@@ -24,14 +25,14 @@ Group: TypeAlias = tuple[int, ...]
 
 
 class Block(NamedTuple):
-    """Stages that depend on each other: a strongly connected component of the graph of
-    dependencies.
+    """Stages that depend on each other: a strongly connected component of the dependency
+    graph.
 
-    - `unknown`: the stages that are solved for; none if the block is explicit.
-    - `explicit`: the other stages, in an order in which each follows from the unknown ones
-        and the earlier ones.
+    - `unknown`: the stages to solve for; none if the block is explicit.
+    - `explicit`: the other stages, ordered so that each follows from the unknown stages and
+        earlier ones.
 
-    Both in groups of stages that can be evaluated together.
+    Both are in groups of stages that can be evaluated together.
     """
 
     unknown: tuple[Group, ...]
@@ -40,21 +41,20 @@ class Block(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Plan:
-    """The stages of a tableau that are used, without repetitions, in blocks that are solved
-    one after another."""
+    """The distinct stages that a tableau uses, in blocks to be solved in order."""
 
     tableau: FlatTableau
     blocks: tuple[Block, ...]
 
     @property
     def num_unknown(self) -> int:
-        """Stage vectors that are solved for in one step."""
+        """The number of stage vectors to solve for in one step."""
         return sum(len(group) for block in self.blocks for group in block.unknown)
 
 
 def make_plan(tableau: FlatTableau) -> Plan:
-    """Drops unused stages, evaluates equal ones once, and orders the rest. Equal tableaus
-    have one plan, the same object in every trace."""
+    """Drops unused stages, merges equal ones, and orders the rest. Equal tableaus share one
+    plan, the same object in every trace."""
     as_bytes = lambda x: np.asarray(x, np.float64).tobytes()
     return _make_plan(
         tableau.stages, as_bytes(tableau.matrix), as_bytes(tableau.weights)
@@ -67,7 +67,7 @@ def _make_plan(stages: tuple[Stage, ...], matrix: bytes, weights: bytes) -> Plan
     s = len(stages)
     tableau = FlatTableau(stages, read(matrix).reshape(s, s), read(weights))
     previous = None
-    # A stage does not depend on values that it does not read.
+    # Ignore coefficients of values that a stage does not read.
     masked = np.where(tableau.reads, tableau.matrix, 0.0)
     tableau = dataclasses.replace(tableau, matrix=_snap(masked))
     while previous is None or len(tableau.stages) < len(previous.stages):
@@ -93,8 +93,8 @@ def _live(tableau: FlatTableau) -> FlatTableau:
 def _merge(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
     """Merges pairs of stages that are evaluated at the same point.
 
-    With the same channels they have the same value: their coefficients add up. With
-    different channels they can still be one stage if they always enter together.
+    With the same channels they have the same value, and their coefficients are added. With
+    different channels they can be merged if they always enter together.
     """
     stages, matrix, weights = tableau.stages, tableau.matrix, tableau.weights
     for i, j in itertools.combinations(range(len(stages)), 2):
@@ -123,7 +123,7 @@ def _merge(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
             merged = a._replace(channels=a.channels + b.channels)
         stages = stages[:i] + (merged,) + stages[i + 1 :]
         keep = [k for k in range(len(stages)) if k != j]
-        # One pair at a time: the merged stage may now equal another.
+        # Merge one pair at a time: the merged stage may equal another.
         return _merge(FlatTableau(stages, matrix, weights).take(keep), same_channels)
     return tableau
 
@@ -146,15 +146,15 @@ def _blocks(tableau: FlatTableau) -> tuple[Block, ...]:
         explicit = [group for ready in rounds for group in _groups(ready, tableau)]
         groups = _groups(unknown, tableau)
         if len(groups) > 1:
-            # Stages of other kinds would take stacked values apart again: an iteration of
-            # five stages takes a third less time without stacking.
+            # Stages of other kinds would unstack the values again: without stacking, an
+            # iteration of five stages takes a third less time.
             groups = tuple((i,) for group in groups for i in group)
         blocks.append(Block(groups, tuple(explicit)))
     return tuple(blocks)
 
 
 def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
-    """Groups the stages that evaluate the same vector field."""
+    """Groups stages that evaluate the same vector field."""
     groups: dict[tuple, list[int]] = {}
     for i in stages:
         groups.setdefault(tableau.stages[i].kind, []).append(i)
@@ -164,9 +164,8 @@ def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
 def _cut(
     block: tuple[int, ...], depends: np.ndarray
 ) -> tuple[tuple[int, ...], list[list[int]]]:
-    """Stages without which no cycle of dependencies is left, and the rounds in which the
-    other stages can then be evaluated. As few as possible, unless there are many choices.
-    """
+    """Stages whose removal breaks all dependency cycles, and the rounds in which the other
+    stages can then be evaluated. As few as possible, unless there are many choices."""
     for size in range(len(block) + 1):
         if math.comb(len(block), size) > _MOST_CHOICES:
             break
@@ -174,7 +173,7 @@ def _cut(
             rounds = _rounds([i for i in block if i not in unknown], depends)
             if rounds is not None:
                 return unknown, rounds
-    # Make stage after stage explicit unless that closes a cycle, fewest neighbours first.
+    # Make stages explicit unless that closes a cycle, those with fewest neighbours first.
     links = depends | depends.T
     explicit, rounds = [], []
     for i in sorted(block, key=lambda i: links[i, list(block)].sum()):

@@ -1,4 +1,4 @@
-"""Which solvers fit a system, best first."""
+"""Suggestions of solvers for a system."""
 
 import dataclasses
 import functools as ft
@@ -55,22 +55,22 @@ from ._terms import (
 )
 
 
-# What a higher order may cost: for steps of a twentieth, a step of order 2 is worth about
-# twenty of order 1.
+# The most that a higher order may cost: with steps of a twentieth, a step of order 2 is
+# worth about twenty of order 1.
 _MOST_STAGE_VECTORS = 20
 
 
 @dataclasses.dataclass(frozen=True)
 class Suggestion:
-    """One solver for a system, as [`diffrax_symplectic.suggest_solver`][] finds it.
+    """A solver for a system, as suggested by [`diffrax_symplectic.suggest_solver`][].
 
     - `solver`: the solver.
-    - `weak_order`, `strong_order`: its orders for this system; the strong one is `None`
-        for a solver for expectations alone.
+    - `weak_order`, `strong_order`: its orders for this system; the strong order of a weak
+        method is `None`.
     - `path`: the Brownian path that it needs, as code.
     - `reason`: when to choose it, in a sentence.
-    - `terms`: a function of a random key, which returns the terms of the system with such
-        paths in place of theirs. Paths that hold given noise, such as a record, stay.
+    - `terms`: a function of a random key that returns the terms of the system with such
+        paths. Paths of given noise, such as a record, are not replaced.
     """
 
     solver: AbstractSymplecticSolver
@@ -85,10 +85,10 @@ class Suggestion:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Suggestions(Sequence[Suggestion]):
-    """What [`diffrax_symplectic.suggest_solver`][] returns: the suggestions, best first.
-    Printed, it is a table.
+    """The suggestions of [`diffrax_symplectic.suggest_solver`][], best first. Printed, they
+    are a table.
 
-    - `system`: what was found out about the system, in a sentence.
+    - `system`: the structure of the system, in a sentence.
     """
 
     system: str
@@ -124,33 +124,33 @@ def suggest_solver(
     want: Want,
     gamma: PyTree[ArrayLike] | None = None,
 ) -> Suggestions:
-    r"""Suggests solvers for a system by the structure of its terms: highest order first,
-    and then fewest stage vectors to solve for.
+    r"""Suggests solvers for a system by the structure of its terms, sorted by highest order
+    and then by fewest stage vectors to solve for.
 
     Whether $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, and whether the noise is additive
-    or constant, is found out while tracing, as the solvers do it. Whether noises commute is
-    tested at random states, which is no proof. Nothing is solved. How stiff a system is
-    cannot be seen from its terms: if the first suggestion is explicit and takes too many
-    steps, take the next implicit one.
+    or constant, is determined by tracing, as in the solvers. Whether noises commute is
+    tested at random states, which is not a proof. Nothing is solved. Stiffness cannot be
+    detected from the terms: if the first suggestion is explicit and needs too many steps,
+    use the next implicit one.
 
     **Arguments:**
 
     - `terms`: the terms of a Stratonovich system, with any Brownian path or its shape.
-    - `t0`, `y0`, `args`: where the solve begins, as for `diffrax.diffeqsolve`.
+    - `t0`, `y0`, `args`: the initial time and state, and `args`, as for
+        `diffrax.diffeqsolve`.
     - `want`: `"weak"` for expectations, or `"strong"` for single paths.
-    - `gamma`: friction, $-\gamma p\,\mathrm{d}t$ beside these terms, as
-        [`diffrax_symplectic.Damped`][] takes it, for which solvers with friction are
-        suggested.
+    - `gamma`: the rate of additional friction $-\gamma p\,\mathrm{d}t$, as for
+        [`diffrax_symplectic.Damped`][]. Then solvers with friction are suggested.
 
     **Returns:** a sequence of [`diffrax_symplectic.Suggestion`][]s.
 
     **Raises:** a `ValueError` if `want` is neither of the two, if `terms` has no Brownian
-    path, for terms and states that no solver takes, and for a `gamma` that does not fit the
-    momenta.
+    path, for terms and states that no solver accepts, and for a `gamma` that does not fit
+    the momenta.
     """
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
-    # Any path will do to look at the terms.
+    # Any path serves to inspect the terms.
     terms = specified(terms, lambda shape: WeakBrownianPath(shape, jr.key(0)))
     drift, noise = _parts(terms)
     check_state(y0, "suggest_solver")
@@ -167,13 +167,13 @@ def suggest_solver(
     solvers = ranked(want, structures, commute, m, gamma)
     if gamma is not None:
         if not any(map(is_hamiltonian, drift)):
-            # `Damped` does not know the momenta of plain terms; the others do.
+            # `Damped` does not accept plain terms; the Langevin splittings do.
             solvers = [s for s in solvers if isinstance(s, AbstractLangevinSplitting)]
         probe = next(iter(solvers), Damped(ImplicitMidpoint(), gamma))
-        probe.init(terms, t0, t0 + 1, y0, args)  # refuses a `gamma` that does not fit
+        probe.init(terms, t0, t0 + 1, y0, args)  # raises if `gamma` does not fit
     paths = brownian_paths(noise)
     if len(noise) > 1 or not jtu.all_leaves([increment_struct(paths[0])]):
-        # Lévy areas are sampled between the noises of one array.
+        # Lévy areas are only sampled between the noises of one array.
         areas = lambda solver: "noise brackets" in map(drives, solver.variables)
         solvers = [solver for solver in solvers if not areas(solver)]
     given = [path for path in paths if not is_random(path)]
@@ -187,14 +187,14 @@ def suggest_solver(
     system = _system(structures, not_separable, noises)
     if any(isinstance(path, diffrax.UnsafeBrownianPath) for path in paths):
         system += (
-            " Its `diffrax.UnsafeBrownianPath` rounds times to 32 bits, and repeats its "
-            "noise late in a run (Diffrax's issue 733): use one of the paths below."
+            " Its `diffrax.UnsafeBrownianPath` rounds times to 32 bits and repeats its "
+            "noise late in a run (Diffrax issue 733): use one of the paths below."
         )
     return Suggestions(f"For {want} approximation. {system}", found)
 
 
 def _system(structures: list[Structure], fault: Fault | None, noises: str) -> str:
-    """What was found out about the system; `fault` is why it is not separable."""
+    """The structure of the system, in a sentence. `fault` is why it is not separable."""
     kind = " and ".join(structures) or f"general ({fault.reason if fault else ''})"
     system = f"The system is {kind}, with {noises}."
     if fault is not None:
@@ -216,15 +216,15 @@ def _holds(
 def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     advice = (
         "Pass the terms of a Stratonovich system, `hamiltonian_terms(H0, noise, path)` or "
-        "`MultiTerm(ODETerm(f), ControlTerm(g, path))`, with a Brownian path"
+        "`MultiTerm(ODETerm(f), ControlTerm(g, path))`, with a Brownian path in each noise"
     )
     if not isinstance(terms, diffrax.AbstractTerm):
         raise ValueError(f"{advice}; got {type(terms).__name__}.")
     drift, noise = split_terms(terms)
     if len(noise) == 0 or any(len(brownian_paths(term)) == 0 for term in noise):
         raise ValueError(
-            f"{advice}; these have a part without one. (Without noise, `ImplicitMidpoint` "
-            "and `StormerVerlet` are solvers for any path.)"
+            f"{advice}; got terms without one. (For a system without noise use "
+            "`ImplicitMidpoint` or `StormerVerlet`.)"
         )
     return drift, noise
 
@@ -236,15 +236,15 @@ def ranked(
     num_noises: int,
     gamma: PyTree[ArrayLike] | None = None,
 ) -> list[AbstractSymplecticSolver]:
-    """The solvers that are suggested for systems with these structures, beside `"any"`, and
-    noises, best first."""
+    """The suggested solvers for these structures (`"any"` is implied) and noises, best
+    first."""
     structures = {"any", *structures}
     if {"separable", "constant"} <= structures:
         structures.add("separable and constant")
 
     def rank(solver: AbstractSymplecticSolver) -> tuple:
         systems = solver.stage_vectors(num_noises)
-        # In a separable system half of the state is solved for.
+        # In a separable system only half of the state is solved for.
         cost = sum(systems) / (2 if solver.structure == "separable" else 1)
         order = _record(solver).order(want, commute)
         assert order is not None
@@ -273,7 +273,7 @@ def _record(solver: AbstractSymplecticSolver) -> Record:
 
 
 def _code(solver: AbstractSymplecticSolver, module: str = "") -> str:
-    """How the solver is constructed, for a friction called `gamma`."""
+    """The code that constructs the solver, with friction called `gamma`."""
     given = "gamma" if isinstance(solver, AbstractLangevinSplitting) else ""
     if isinstance(solver, Damped):
         given = f"{_code(solver.solver, module)}, gamma"  # pyright: ignore
@@ -303,7 +303,7 @@ def _suggestion(
 
 
 def specified(terms: PyTree, make: Callable) -> PyTree:
-    """The terms with `make(shape)` where they have the shape of a path in its place."""
+    """The terms with `make(shape)` in place of the shape of a path."""
     is_shape = lambda path: isinstance(path, UnspecifiedPath)
     return replace_paths(terms, lambda x: make(x.shape) if is_shape(x) else x)
 
@@ -311,9 +311,9 @@ def specified(terms: PyTree, make: Callable) -> PyTree:
 def path_for(
     solver: diffrax.AbstractSolver, want: Want | None, cell: float | None, shape, key
 ) -> diffrax.AbstractBrownianPath:
-    """The path that a solver of this package chooses. For other solvers, or if `want` is
-    `None`, a Gaussian path with the areas that the solver needs; with `cell` the same
-    Brownian motion for all solvers."""
+    """The path of a solver of this package. For other solvers, or if `want` is `None`, a
+    Gaussian path with the Lévy areas that the solver needs. With `cell` all solvers get the
+    same Brownian motion."""
     if want is not None and isinstance(solver, AbstractSymplecticSolver):
         return solver.path(shape, key, want=want)
     area = diffrax.SpaceTimeLevyArea
@@ -328,8 +328,8 @@ def path_for(
 
 
 def with_paths(make: Callable, terms: PyTree, key: PRNGKeyArray) -> PyTree:
-    """The terms with new paths in place of theirs; terms that share a path share the new
-    one. Paths that hold given noise stay."""
+    """The terms with new paths. Terms that share a path share the new one. Paths of given
+    noise are not replaced."""
     made = {}
 
     def new(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:

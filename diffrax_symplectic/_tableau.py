@@ -1,8 +1,8 @@
 """Coefficients as data, in the notation of the paper.
 
-A tableau flattens to one square matrix between stages, each one evaluation of a vector
-field, and one vector of weights. They decide, for all families alike, whether a method is
-symplectic, which stages are used or equal, and in which order they are solved.
+A tableau of any family flattens to one square matrix and one vector of weights for all its
+stages, where each stage is one evaluation of a vector field. From these follow whether a
+method is symplectic, which stages are unused or equal, and the order of their solution.
 """
 
 import abc
@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 
-# The Hamiltonians that coefficients are for: any; `H0 = V(p) + U(t, q)` and `H_k = U_k(t,
-# q)`; noise that does not depend on the state; noise that depends neither on the state nor
-# on time; the second and the last together.
+# The Hamiltonians that coefficients apply to: any; `H0 = V(p) + U(t, q)` and `H_k = U_k(t,
+# q)`; noise independent of the state; noise independent of state and time; the second and
+# fourth together.
 Structure: TypeAlias = Literal[
     "any", "separable", "additive", "constant", "separable and constant"
 ]
@@ -25,9 +25,9 @@ Structure: TypeAlias = Literal[
 class Stage(NamedTuple):
     """One evaluation, `y -> sum over channels of (vector field times control)`.
 
-    - `channels`: the controls that drive it: `"h"` for the drift, or the name of a random
-        variable, an attribute of the Brownian increment, for the noise.
-    - `c`: where in the step it is evaluated, as a fraction of the step.
+    - `channels`: the controls that drive it: `"h"` for the drift; for noise the name of a
+        random variable, which is an attribute of the Brownian increment.
+    - `c`: the time of evaluation, as a fraction of the step.
     - `reads`: the part of the state it depends on, `"y"` (all), `"p"`, `"q"` or `""`.
     - `writes`: the part of the state it changes, `"y"`, `"p"` or `"q"`.
     """
@@ -45,8 +45,8 @@ class Stage(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FlatTableau:
-    """Stage `i` is evaluated at `y0 + sum_j matrix[i, j] k_j` and has the value `k_i`;
-    the step ends at `y0 + sum_i weights[i] k_i`."""
+    """Stage `i` is evaluated at `y0 + sum_j matrix[i, j] k_j`, with value `k_i`, and the
+    step ends at `y0 + sum_i weights[i] k_i`."""
 
     stages: tuple[Stage, ...]
     matrix: Float[np.ndarray, "s s"]
@@ -54,7 +54,7 @@ class FlatTableau:
 
     @property
     def reads(self) -> Bool[np.ndarray, "s s"]:
-        """Whether a stage reads a part of the state that another one changes."""
+        """Whether stage `i` reads a part of the state that stage `j` changes."""
         reads = [b.writes in a.reads for a in self.stages for b in self.stages]
         return np.array(reads, bool).reshape(self.matrix.shape)
 
@@ -68,23 +68,23 @@ class FlatTableau:
 
 
 class AbstractTableau(abc.ABC):
-    """What every tableau offers.
+    """The base class of all tableaus.
 
-    - `structure`: the structure of the Hamiltonians that the coefficients are for, `"any"`,
-        `"separable"`, `"additive"`, `"constant"` (additive, and not dependent on time) or
-        `"separable and constant"`. Every solve checks it, while tracing.
+    - `structure`: the structure of the Hamiltonians that the coefficients apply to:
+        `"any"`, `"separable"`, `"additive"`, `"constant"` (additive and independent of
+        time) or `"separable and constant"`. Every solve checks it while tracing.
     """
 
     structure: ClassVar[Structure]
 
     @abc.abstractmethod
     def flatten(self) -> FlatTableau:
-        """All stages of the tableau, unused ones included, as one matrix."""
+        """All stages of the tableau, including unused ones, as one matrix."""
 
 
-# Anything that NumPy makes an array of; a read-only array of float64 once checked.
+# Anything that NumPy converts to an array; after the checks a read-only float64 array.
 Coefficients: TypeAlias = Any
-# The same for each random variable of a step, by its name. Without a name it is "W".
+# A dictionary from names of random variables to coefficients, or coefficients for "W".
 CoefficientsByVariable: TypeAlias = Any
 
 
@@ -110,7 +110,7 @@ def _check(
     by_variable: tuple[str, ...] = (),
     **shapes: tuple[int, ...],
 ) -> None:
-    """Replaces coefficients by checked arrays, or dictionaries of these."""
+    """Replaces coefficients by checked arrays, or dictionaries of them."""
     for name, shape in shapes.items():
         value = getattr(tableau, name)
         if name in by_variable:
@@ -126,8 +126,9 @@ def _check(
 def _side_by_side(
     *parts: tuple[Mapping[str, np.ndarray], tuple[int, ...]],
 ) -> tuple[list[str], list[np.ndarray]]:
-    """All random variables of some coefficients, each with their shape, in the order of
-    first appearance; and the coefficients for all of these, side by side."""
+    """The names of all random variables, in order of first appearance, and for each part
+    its coefficients for all of them, concatenated. Parts are pairs of coefficients and
+    their shape."""
     names = list(dict.fromkeys(name for part, _ in parts for name in part))
     return names, [
         np.concatenate([part.get(name, np.zeros(shape)) for name in names], axis=-1)
@@ -153,14 +154,14 @@ class GeneralTableau(AbstractTableau):
       + \sum_k \sum_i \beta_i b_k(t_n + c^1_i h, G^k_i) I_k$$
 
     with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$. Here $B^3 = B^1$: then the stages
-    $G^k_i$ are the same vector for every $k$, whatever the number of noises, and the
-    condition on $B^3$ follows from the one on $B^1$.
+    $G^k_i$ are the same vector for every $k$, for any number of noises, and the condition
+    on $B^3$ follows from the one on $B^1$.
 
     **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
     `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`, `B1` of shape `(r, r)`;
     `noise`, the random variables that drive the noise stages: `("W",)` for $I_k$,
-    `("W", "A")` for the field of [`diffrax_symplectic.LevyAreaMidpoint`][], or `("W", "L")`
-    for the field of [`diffrax_symplectic.PlateauGauss`][].
+    `("W", "A")` for the vector field of [`diffrax_symplectic.LevyAreaMidpoint`][], or
+    `("W", "L")` for the vector field of [`diffrax_symplectic.PlateauGauss`][].
 
     **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """
@@ -221,9 +222,8 @@ class SeparableTableau(AbstractTableau):
     with stage times $c^0 = A^0 e$ and $c^1 = A^1 e$.
 
     **Arguments:** `alpha` of shape `(s,)`, `beta` of shape `(r,)`, `A0` of shape
-    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`. For a sum over several random
-    variables `beta` and `B0` are dictionaries from their names, of which `"W"` is $I_k$, to
-    such arrays.
+    `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`. For several random variables,
+    `beta` and `B0` are dictionaries from their names to such arrays, where `"W"` is $I_k$.
 
     **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """
@@ -241,7 +241,7 @@ class SeparableTableau(AbstractTableau):
         _check(self, ("beta", "B0"), alpha=(s,), A0=(s, s), A1=(r, s), **noise)
 
     def partitioned(self) -> "PartitionedTableau":
-        """The same method with its coefficients for velocities written out."""
+        """The same method, with explicit coefficients for the velocities."""
         alpha, A = self.alpha, self.A0
         return PartitionedTableau(alpha, alpha, self.beta, A, A, self.B0, self.A1)
 
@@ -251,21 +251,21 @@ class SeparableTableau(AbstractTableau):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PartitionedTableau(AbstractTableau):
-    r"""As [`diffrax_symplectic.SeparableTableau`][], with coefficients $A$ and $\alpha$ for
-    the forces $f$, and others, $\hat A$ and $\hat \alpha$, for the velocities $g$, as
-    explicit symplectic methods have them.
+    r"""Like [`diffrax_symplectic.SeparableTableau`][], but with coefficients $A$ and
+    $\alpha$ for the forces $f$, and different ones, $\hat A$ and $\hat \alpha$, for the
+    velocities $g$, as in explicit symplectic methods.
 
     $$p_i = P + h \sum_j A_{ij} f(t_n + \hat c_j h, q_j)
       + \sum_k \sum_j B^0_{ij} \sigma_k(t_n + c^1_j h, \bar q_j) I_k, \qquad
       q_i = Q + h \sum_j \hat A_{ij} g(p_j)$$
 
-    with stage times $\hat c = \hat A e$ and $c^1 = A^1 e$. The other equations are those
-    of `SeparableTableau`.
+    with stage times $\hat c = \hat A e$ and $c^1 = A^1 e$. The other equations are as for
+    `SeparableTableau`.
 
     **Arguments:** for `s` forces, `v` velocities and `r` noise stages: `alpha` of shape
     `(s,)`, `alpha_hat` of shape `(v,)`, `beta` of shape `(r,)`, `A` of shape `(v, s)`,
     `A_hat` of shape `(s, v)`, `B0` of shape `(v, r)`, `A1` of shape `(r, v)`; `beta` and
-    `B0` possibly by random variable.
+    `B0` may be dictionaries over random variables.
 
     **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """
@@ -288,7 +288,7 @@ class PartitionedTableau(AbstractTableau):
         s, v, r = len(self.alpha), len(self.alpha_hat), len(self.A1)
         names, (B0, beta) = _side_by_side((self.B0, (v, r)), (self.beta, (r,)))
         A1 = np.concatenate([self.A1] * len(names))
-        # Forces come first, which makes them the unknowns: they cost more to evaluate.
+        # Forces come first, which makes them the unknowns, as they cost more to evaluate.
         stages = [Stage(("h",), float(c), "q", "p") for c in self.A_hat.sum(axis=1)]
         # Velocities do not depend on time.
         stages += [Stage(("h",), 0.0, "p", "q") for _ in range(v)]
@@ -314,9 +314,9 @@ class PartitionedTableau(AbstractTableau):
 @dataclasses.dataclass(frozen=True, eq=False)
 class AdditiveTableau(AbstractTableau):
     r"""Coefficients for noise that does not depend on the state, $b_k(t)$, with `s` drift
-    stages and `r` times at which the noise is read.
+    stages and `r` times at which the noise is evaluated.
 
-    With several random variables $\xi^\nu_k$ in a step, equations (4.4)-(4.5) and
+    With several random variables $\xi^\nu_k$ per step, equations (4.4)-(4.5) and
     (4.8)-(4.9) of Wang, Hong and Xu (2017) are
 
     $$G_i = y_n + h \sum_j A_{ij} a(t_n + c^0_j h, G_j)
@@ -325,12 +325,12 @@ class AdditiveTableau(AbstractTableau):
     $$y_{n+1} = y_n + h \sum_i \alpha_i a(t_n + c^0_i h, G_i)
       + \sum_\nu \sum_k \sum_j \beta^\nu_j b_k(t_n + c^1_j h)\, \xi^\nu_k$$
 
-    with stage times $c^0 = A e$. Symplecticity asks nothing of $B$ and $\beta$.
+    with stage times $c^0 = A e$. Symplecticity does not restrict $B$ and $\beta$.
 
     **Arguments:** `alpha` of shape `(s,)`, `A` of shape `(s, s)`, `c1` of shape `(r,)`;
-    `beta` and `B`, arrays of shape `(r,)` and `(s, r)`, or dictionaries from the names of
-    random variables, of which `"W"` is $I_k$, to such; `constant`, whether the noise must
-    not depend on time either.
+    `beta` and `B`, arrays of shape `(r,)` and `(s, r)`, or dictionaries from names of
+    random variables to such arrays, where `"W"` is $I_k$; `constant`, whether the noise
+    must also be independent of time.
 
     **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """

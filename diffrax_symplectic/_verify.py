@@ -1,4 +1,4 @@
-"""Measures of one step of a solver that are exact, without Monte Carlo errors."""
+"""Exact checks of one step of a solver, without Monte Carlo errors."""
 
 import functools as ft
 from collections.abc import Callable
@@ -50,23 +50,22 @@ def symplecticity_defect(
     $\Omega = \begin{pmatrix} 0 & I \\ -I & 0 \end{pmatrix}$.
 
     Exact up to rounding: for a symplectic method this is a small multiple of the machine
-    epsilon, whatever the Hamiltonians, the step and the increment, and for any other method
-    it is not small. (The solvers of this package differentiate their stage equations
-    implicitly, so that it does not depend on the tolerance of the root finder.)
+    epsilon, for any Hamiltonians, step and increments; for other methods it is not small.
+    (The solvers of this package differentiate their stage equations implicitly, so it does
+    not depend on the tolerance of the root finder.)
 
     Works under `jit` and `vmap`, and with any solver and terms of Diffrax.
 
     **Arguments:**
 
-    - `terms`, `solver`, `y0`, `args`: as for `diffrax.diffeqsolve`, for a state
+    - `terms`, `solver`, `y0`, `args`: as for `diffrax.diffeqsolve`, with a state
         `y0 = (p, q)`.
-    - `t0`, `t1`: start and end of the step, for which the path in `terms` gives the
-        increments.
+    - `t0`, `t1`: start and end of the step. The increments come from the path in `terms`.
 
     **Returns:** a scalar.
 
     **Raises:** a `ValueError` if `y0` is not a pair of the same structure and shapes, of
-    floating-point numbers; an error when run if the solver reports that the step failed.
+    floating-point numbers; an error when run if the solver reports a failed step.
     """
     check_pair(y0)
     check_state(y0, "symplecticity_defect")
@@ -113,7 +112,7 @@ def poisson_defect(
     **Returns:** a scalar.
 
     **Raises:** a `ValueError` if `y0` is neither; an error when run if a spin of the pair
-    `y0` has length zero, or if the solver reports that the step failed.
+    `y0` has length zero, or if the solver reports a failed step.
     """
     lifted = isinstance(y0, tuple)
     s0 = from_spinors(y0) if lifted else as_spins(y0)
@@ -126,7 +125,7 @@ def poisson_defect(
 
     jacobian, (s1, result) = jax.jacrev(step, has_aux=True)(s0)
     jacobian = result.error_if(jacobian, result != diffrax.RESULTS.successful)
-    # Row i of the first holds ds1_i / ds0, of the second the gradient of s_i itself.
+    # Row i of `gradients` is ds1_i / ds0, and row i of `units` the gradient of s_i itself.
     rows = lambda x: x.reshape(s0.size, *s0.shape)
     flat = lambda x: x.reshape(s0.size, s0.size)
     gradients, units = rows(jacobian), rows(jnp.eye(s0.size, dtype=s0.dtype))
@@ -148,24 +147,23 @@ def step_expectation(
     r"""The expectation $\mathbb E[\phi(t_1, y_1)]$ after one step, without sampling.
 
     The random variables of a [`diffrax_symplectic.WeakBrownianPath`][] take finitely
-    many values, so that the expectation is a finite sum, over $3^m$ outcomes for $m$ noises
-    with one set of three-point variables. Over Gaussian increments (and their space-time
-    and space-time-time Lévy areas, and plateaus) it is integrated by Gauss--Hermite
-    quadrature, exact if $\phi(y_1)$ is a polynomial in these of degree less than twice
-    `nodes`.
+    many values, so the expectation is a finite sum: over $3^m$ outcomes for $m$ noises with
+    one set of three-point variables. Gaussian increments (and their space-time and
+    space-time-time Lévy areas, and plateaus) are integrated by Gauss--Hermite quadrature,
+    which is exact if $\phi(y_1)$ is a polynomial in them of degree less than twice `nodes`.
 
     **Arguments:**
 
     - `terms`, `solver`, `y0`, `args`: as for `diffrax.diffeqsolve`; `terms` with one
         Brownian path.
     - `t0`, `t1`: start and end of the step.
-    - `fn`: the function $\phi$, `fn(t, y, args)`, to arrays.
-    - `nodes`: points of the quadrature in each Gaussian variable.
+    - `fn`: the function $\phi$, `fn(t, y, args)`, which returns a PyTree of arrays.
+    - `nodes`: the number of quadrature points in each Gaussian variable.
 
-    **Returns:** what `fn` returns, averaged.
+    **Returns:** the average of `fn`, in its structure.
 
-    **Raises:** a `ValueError` if `terms` does not hold exactly one path of a known law; an
-    error when run if the solver reports that a step failed.
+    **Raises:** a `ValueError` if `terms` does not contain exactly one path of a known law;
+    an error when run if the solver reports a failed step.
     """
 
     def outcome(terms):
@@ -185,18 +183,18 @@ def second_moment_map(
     *,
     nodes: int = 8,
 ) -> Float[Array, "N N"]:
-    r"""The linear map by which one step moves first and second moments, for a linear
-    system (with additive or multiplicative noise).
+    r"""The linear map of first and second moments by one step, for a linear system (with
+    additive or multiplicative noise).
 
-    There a step is $z_1 = Z z_0$ with a random matrix $Z$, for $z = (1, y)$ and $y$ the
-    state as one vector of length $n$. So $\mathrm{vec}\, \mathbb E[z_1 z_1^\top] = K\,
-    \mathrm{vec}\, \mathbb E[z_0 z_0^\top]$ with $K = \mathbb E[Z \otimes Z]$, and $K^N$
-    gives the moments after $N$ steps. The spectral radius of $K$ is the growth of the mean
-    square per step.
+    For such a system a step is $z_1 = Z z_0$ with a random matrix $Z$, where $z = (1, y)$
+    and $y$ is the state as a vector of length $n$. So $\mathrm{vec}\, \mathbb E[z_1
+    z_1^\top] = K\, \mathrm{vec}\, \mathbb E[z_0 z_0^\top]$ with $K = \mathbb E[Z \otimes
+    Z]$, and $K^N$ gives the moments after $N$ steps. The spectral radius of $K$ is the
+    growth factor of the mean square per step.
 
     **Arguments:** as for [`diffrax_symplectic.step_expectation`][]; only the structure,
-    shapes and dtype of `y0` matter. The system has to be linear and autonomous, which is
-    not checked.
+    shapes and dtype of `y0` matter. The system must be linear and autonomous, which is not
+    checked.
 
     **Returns:** the matrix $K$, of shape `((n + 1)**2, (n + 1)**2)`.
 
@@ -204,8 +202,8 @@ def second_moment_map(
     """
     flat, unravel = jfu.ravel_pytree(y0)
     n = flat.size
-    # The step is affine: its values at zero and at the unit vectors give its matrix. Its
-    # derivative would take far more tracing.
+    # The step is affine, so its values at zero and at the unit vectors give its matrix.
+    # Differentiating it would take far more tracing.
     starts = jnp.eye(n + 1, n, k=-1, dtype=flat.dtype)
 
     def outcome(terms):
@@ -252,17 +250,17 @@ def weak_order_defect(
     $$\mathbb E[\phi(t_1, y_1)] - \sum_{j=0}^{r} \frac{h^j}{j!} (L^j \phi)(t_0, y_0),$$
 
     with the generator $L$ of the equation. A method has weak order $r$ if this is
-    $O(h^{r+1})$: a few values of $h$ show the order to two digits.
+    $O(h^{r+1})$: a few values of $h$ suffice to find the order to two digits.
 
-    $L \phi = \partial_t \phi + a \cdot \nabla \phi + \frac12 \sum_k b_k \cdot \nabla
-    (b_k \cdot \nabla \phi)$ for a Stratonovich solver, with the summands $b_k^\top
-    (\nabla^2 \phi)\, b_k$ for an Itô solver.
+    For a Stratonovich solver, $L \phi = \partial_t \phi + a \cdot \nabla \phi + \frac12
+    \sum_k b_k \cdot \nabla (b_k \cdot \nabla \phi)$. For an Itô solver the summands are
+    $b_k^\top (\nabla^2 \phi)\, b_k$.
 
     **Arguments:** as for [`diffrax_symplectic.step_expectation`][], and
 
-    - `order`: the number $r$. The cost of differentiating grows fast with it.
+    - `order`: the order $r$. The cost of differentiation grows fast with it.
 
-    **Returns:** what `fn` returns.
+    **Returns:** the local error, in the structure of `fn`.
 
     **Raises:** as [`diffrax_symplectic.step_expectation`][].
     """
@@ -278,9 +276,9 @@ def weak_order_defect(
 
 
 def _generator(terms, args, ito: bool) -> Callable:
-    """The generator of the equation, from functions of time and state to such functions."""
+    """The generator of the equation, acting on functions of time and state."""
     drift, noise = split_terms(terms)
-    # Each `b_k(t, y)` is the response to one increment, of size 1.
+    # Each `b_k(t, y)` is the response to a unit increment of one noise.
     fields = [
         ft.partial(apply_one, noise, jnp.array(k), jnp.ones(()), args)
         for k in range(number_of_noises(terms))

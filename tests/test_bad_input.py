@@ -111,7 +111,9 @@ def test_ito_solvers_are_refused_where_the_sense_makes_a_difference(solver):
         all_terms = diffrax.MultiTerm(drift, *terms, diffusion)
         check_stratonovich(all_terms, solver, 0.0, y0, None)
 
-    with pytest.raises(ValueError, match="in the sense of Ito.*add the drift that"):
+    with pytest.raises(
+        ValueError, match="in the sense of Ito.*add its drift correction"
+    ):
         solve(noise=H)
     # They are right for additive noise, for noise that kicks where the position says how
     # hard, and with a drift that corrects the sense.
@@ -171,7 +173,7 @@ def test_a_hamiltonian_that_asks_for_values_is_named(name):
     square = lambda t, p, q, args: jnp.sum(p**2)
     H0, noise = (branches, square) if name == "H0" else (square, branches)
     terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
-    with pytest.raises(ValueError, match=f"`{name}` asks for.*jnp.where"):
+    with pytest.raises(ValueError, match=f"`{name}` needs concrete.*jnp.where"):
         _solve(terms, (jnp.ones(2), jnp.ones(2)))
 
 
@@ -330,6 +332,7 @@ def test_implicit_tableaus_need_an_implicit_solver():
     y0, args = random_problem(jr.key(0), 1, 1)
     terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
     with pytest.raises(
-        ValueError, match="also subclass `diffrax_symplectic.AbstractImplicitStages`"
+        ValueError,
+        match="also inherit from `diffrax_symplectic.AbstractImplicitStages`",
     ):
         diffrax.diffeqsolve(terms, Mine(), 0.0, 0.2, 0.1, y0, args)

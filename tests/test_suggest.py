@@ -270,7 +270,7 @@ def test_bad_input_gets_a_clear_error():
         ds.suggest_solver(terms, 0.0, y0, want="moments")  # pyright: ignore
     with pytest.raises(ValueError, match="with a Brownian path; got function"):
         ds.suggest_solver(noise, 0.0, y0, want="strong")  # pyright: ignore
-    with pytest.raises(ValueError, match="have a part without one"):
+    with pytest.raises(ValueError, match="got terms without one"):
         ds.suggest_solver(diffrax.ODETerm(lambda t, y, args: y), 0.0, y0, want="strong")
     ramp = diffrax.LinearInterpolation(jnp.array([0.0, 1.0]), jnp.array([0.0, 1.0]))
     driven = diffrax.ControlTerm(lambda t, y, args: y, ramp)
@@ -282,7 +282,7 @@ def test_bad_input_gets_a_clear_error():
         ds.suggest_solver(
             diffrax.MultiTerm(too_long, noisy), 0.0, jnp.ones(2), want="strong"
         )
-    with pytest.raises(ValueError, match="have a part without one"):
+    with pytest.raises(ValueError, match="got terms without one"):
         ds.suggest_solver(diffrax.MultiTerm(terms, driven), 0.0, y0, want="strong")
     with pytest.raises(ValueError, match="is a pair"):
         ds.suggest_solver(terms, 0.0, jnp.ones(2), want="strong")

@@ -1,4 +1,4 @@
-"""All paths of one randomization, sorted before each step: array-RQMC."""
+"""Array-RQMC: all paths of a randomization step together, sorted before each step."""
 
 import math
 import warnings
@@ -39,41 +39,42 @@ from ._steps import (
 from ._value_functions import value_function
 
 
-# For so many coordinates of Sobol' points SciPy has direction numbers.
+# SciPy has direction numbers for this many coordinates of Sobol' points.
 _MAX_DIMENSION = 21201
-# Fewer replicates say too little about their spread to stop because of it.
+# Fewer replicates do not estimate their variance well enough to stop.
 _BEFORE_STOPPING = 8
-# With fewer paths along each coordinate neighbours are far apart. Two ways to sort are
-# compared by so many replicates.
+# With fewer paths along each coordinate, neighbours are far apart. The number of replicates
+# by which two ways to sort are compared.
 _FEW, _TRIAL = 3, 4
 
 
 class ArrayRQMC(AbstractSampling):
-    r"""Paths that balance each other, by randomized quasi-Monte Carlo.
+    r"""Array-RQMC: randomized quasi-Monte Carlo across all paths of a replicate.
 
-    All paths of a replicate take a step together. Before it they are sorted, so that
-    neighbours in the state space are neighbours along Hilbert's curve. Path number $j$ in
-    this order takes the $j$-th of a scrambled set of Sobol' points, the coordinates of
-    which become the random variables of the step, one each. So neighbours take values that
-    balance each other, and what the paths have in common cancels. Each path by itself has
-    its law exactly, and the estimate has no bias but that of the solver.
+    All paths of a replicate take each step together. Before the step they are sorted along
+    Hilbert's curve, so that neighbours in this order are close in state space. Path $j$ of
+    the order takes the $j$-th of a scrambled set of Sobol' points, whose coordinates become
+    the random variables of the step. Neighbours thus get complementary values, and their
+    sampling errors cancel. Each single path has exactly its own law, so the only bias of
+    the estimate is the solver's.
 
-    The error falls faster than one over the root of the number of paths, in few dimensions
-    much faster: for up to four numbers in the state (or in `sort_by`) and $\phi$ smooth,
-    one replicate is worth hundreds to thousands of times as many independent paths. For
-    large systems that the noise moves far it is worth tens of times as many, in chaos
-    after long times no less than as many, and what is spent on sorting is lost.
+    The error decreases faster than one over the square root of the number of paths, much
+    faster in few dimensions: for up to four components of the state (or of `sort_by`) and
+    smooth $\phi$, a replicate is as accurate as hundreds to thousands of times as many
+    independent paths. For large systems with strong noise the factor is in the tens; in
+    chaos after long times it falls to one, and the time spent on sorting is wasted.
 
     **Arguments:**
 
-    - `num_paths`: of each replicate; a power of two.
-    - `replicates`: independent randomizations; with `tol` at most, and 8 at least. Each
-        device takes one at a time: memory does not grow with their number.
-    - `sort_by`: takes the state to a PyTree of those real numbers that paths are sorted
-        by, as few of them as distinguish the states that matter. By default the state
-        itself. If it has so many numbers that neighbours would be far apart, $\phi$ is one
-        number and the variables of a step are discrete, it is a function of the state that
-        is fitted to $\mathbb E[\phi \mid y_n = y]$, where a short trial finds that better.
+    - `num_paths`: the number of paths in each replicate, a power of two.
+    - `replicates`: the number of independent randomizations; with `tol` an upper limit, of
+        which at least 8 are drawn. Each device solves one at a time, so memory does not
+        grow with their number.
+    - `sort_by`: maps the state to a PyTree of real numbers to sort the paths by: the fewest
+        that distinguish the states that matter. By default the state itself, unless it has
+        so many components that neighbours would be far apart. Then, if $\phi$ is a scalar
+        and the random variables are discrete, a value function fitted to
+        $\mathbb E[\phi \mid y_n = y]$ is used if it does better in a short trial.
 
     **Source:** [L'Ecuyer, Lécot and Tuffin
     (2008)](https://doi.org/10.1287/opre.1080.0556).
@@ -89,9 +90,9 @@ class ArrayRQMC(AbstractSampling):
         words = layout(problem.terms)
         if not 0 < words.num_words <= _MAX_DIMENSION:
             raise ValueError(
-                f"`terms` need {words.num_words:,} random variables in each step. There "
-                f"have to be some, and at most {_MAX_DIMENSION:,}, as Sobol' points have. "
-                "Pass `sampling=IndependentPaths(num_paths)`."
+                f"`terms` need {words.num_words:,} random variables in each step; "
+                f"`ArrayRQMC` takes 1 to {_MAX_DIMENSION:,}, the dimensions of Sobol' "
+                "points. Pass `sampling=IndependentPaths(num_paths)`."
             )
         points = jnp.asarray(sobol_points(self.num_paths, words.num_words))
         sort_by, y0 = _state if self.sort_by is None else self.sort_by, problem.y0
@@ -102,7 +103,7 @@ class ArrayRQMC(AbstractSampling):
             sampler(sort_by), self.replicates, 1, self.num_paths, _BEFORE_STOPPING
         )
         dimension = jax.eval_shape(lambda: numbers(sort_by(y0))).size
-        # How many of the paths, sorted, there are along each coordinate.
+        # The number of sorted paths along each coordinate.
         each = self.num_paths ** (1 / dimension)
         if each >= _FEW:
             return plan
@@ -116,14 +117,14 @@ class ArrayRQMC(AbstractSampling):
             if ratio > 1:
                 return other._replace(
                     reason="sorted by a fitted value function, which divides the variance "
-                    f"by {ratio:.1f} against the state"
+                    f"of sorting by the state by {ratio:.1f}"
                 )
         warnings.warn(
-            f"{self.num_paths:,} paths are sorted by {dimension} coordinates, so that "
-            f"there are {each:.1f} along each of them: neighbours are far apart, and "
-            "`ArrayRQMC` gains little over `IndependentPaths`. Pass `sort_by` with the few "
-            "coordinates that matter most, "
-            f"{int(math.log(self.num_paths, _FEW))} at most.",
+            f"{self.num_paths:,} paths are sorted by {dimension} coordinates, which leaves "
+            f"{each:.1f} along each: neighbours are far apart, and `ArrayRQMC` gains "
+            "little over `IndependentPaths`. Pass a `sort_by` that returns the few "
+            "coordinates that matter most, at most "
+            f"{int(math.log(self.num_paths, _FEW))}.",
             stacklevel=4,
         )
         return plan
@@ -139,8 +140,8 @@ def _replicates(
     """A sample is the mean over all paths of a replicate. Algorithm 1 of
     [L'Ecuyer, Lécot and Tuffin (2008)](https://doi.org/10.1287/opre.1080.0556).
 
-    `points` are those of `sobol_points`, with a coordinate for each random variable of a
-    step."""
+    `points` come from `sobol_points`, with a coordinate for each random variable of a step.
+    """
     n, d = points.shape
     terms_of = lambda words: with_words(p.terms, layout, words)
     (replicate,) = keys
@@ -167,13 +168,14 @@ def _replicates(
     saved, failed, _ = simulate(p, begin, _mean_of_good)
     means, heavy = jnp.moveaxis(saved[:, :, :, None], 2, 0)
     means = p.combined(means)
-    # Of the level where it is most.
+    # The largest over all levels.
     heavy = jnp.broadcast_to(jnp.max(heavy, axis=0), means.shape)
     return Samples(p.averaged([means, heavy]), jnp.ones(1, bool), jnp.sum(failed)[None])
 
 
 def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "2 ..."]:
-    """The mean over the paths that have not failed, and `r` of an estimate from them."""
+    """The mean over the paths that have not failed, and the `r` of these paths as in
+    `Expectation.std_error`."""
     keep = along(~failed, x)
     count = jnp.sum(~failed).astype(x.dtype)
 
@@ -186,18 +188,18 @@ def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "2 ..."]:
     own = mean(x)
     off = jnp.where(keep, jnp.abs(x - own), 0)
     most = jnp.max(off, axis=0)
-    # In units of the largest.
+    # In units of the largest deviation.
     s = jnp.sqrt(mean((off / jnp.where(most > 0, most, 1)) ** 2))
     beyond = jnp.maximum(1 - s * jnp.sqrt(4.5 * jnp.log(jnp.maximum(count, 2))), 0)
-    # Rounding errors have heavy tails, too.
+    # Rounding errors can have heavy tails, too.
     some = most > ROUNDING * jnp.finfo(x.dtype).eps * jnp.abs(own)
     r = jnp.where(some, beyond / (s * jnp.sqrt(count)), 0)
     return jnp.stack([own, r])
 
 
 class Layout(NamedTuple):
-    """Which of the words of a step each path in `terms` takes, how many there are, and
-    whether there is but one three-point variable."""
+    """Which words of a step each path in `terms` takes, the number of words, and whether
+    there is only a single three-point variable."""
 
     slices: tuple[tuple[int, int], ...]
     num_words: int
@@ -205,8 +207,9 @@ class Layout(NamedTuple):
 
 
 def layout(terms: PyTree[diffrax.AbstractTerm]) -> Layout:
-    """Equal paths are one Brownian motion, and take the same words. Raises a `ValueError`
-    for a path whose increments cannot be made of given words."""
+    """The layout of the words. Equal paths are one Brownian motion, and take the same
+    words. Raises a `ValueError` for a path whose increments cannot be computed from words.
+    """
     paths = [stepwise(path) for path in brownian_paths(terms)]
     slices, end = [], 0
     for i, path in enumerate(paths):
@@ -223,7 +226,7 @@ def with_words(
     layout: Layout,
     words: UInt32[Array, " num_words"],
 ) -> PyTree[diffrax.AbstractTerm]:
-    """The terms, with paths whose increments are made of these words."""
+    """The terms, with paths whose increments are computed from these words."""
     slices = iter(layout.slices)
 
     def given(path: diffrax.AbstractBrownianPath) -> GivenPath:
@@ -235,7 +238,7 @@ def with_words(
 
 
 def _from_words(path: AbstractStepwisePath, words, t0, t1, use_levy: bool) -> Increment:
-    """The increment of the path that is made of the first of these words."""
+    """The increment of the path, computed from the first of these words."""
     return path.increment(words[: path.num_words(use_levy)], t0, t1, use_levy)
 
 
@@ -247,7 +250,7 @@ def _power_of_two(value) -> int:
     whole = whole_number("num_paths", value, 2)
     if whole & (whole - 1):
         raise ValueError(
-            "`num_paths` must be a power of two, of which Sobol' points are balanced; got "
+            "`num_paths` must be a power of two, for which Sobol' points are balanced; got "
             f"{whole}. Pass {2 ** (whole.bit_length() - 1)} or {2 ** whole.bit_length()}."
         )
     return whole

@@ -1,4 +1,4 @@
-"""Functions of the state of which value functions are made, and how they are fitted."""
+"""The bases in which value functions are fitted."""
 
 import abc
 import functools as ft
@@ -18,30 +18,30 @@ from ._polynomials import dot, hermite, least_squares, num_polynomials, tensordo
 
 
 _PILOTS_PER_POLYNOMIAL, _FEWEST_PILOTS = 30, 256
-# The pilot's states are moved at random by this share of their deviations: the paths of the
-# first steps have few different states.
+# The pilot's states are perturbed by this fraction of their standard deviations: after the
+# first steps the paths are in only a few different states.
 _MOVE = 0.2
-# Deviations along the axes of the covariance are taken for no smaller than this share of
-# the largest. Along shorter ones the points of a fit say too little.
+# Lower bound of the standard deviations along the axes of the covariance, as a fraction of
+# the largest. Along shorter axes the points do not determine a fit.
 _FLOOR = 0.1
-# A grid is so many times as wide as where the pilot was, and what it holds begins to fall
-# to zero at this share of that. Points of a polynomial on an axis.
+# The width of a grid relative to the pilot's range; the fraction of the width at which its
+# values start to fall to zero; the interpolation points along each axis.
 _WIDER, _FALLS, _STENCIL = 1.5, 0.9, 6
-# With 1,024 paths in the pilot of a grid with 32 points, means were off by 15 standard
-# errors: paths of probability 1e-6 left it. Not so with these, at no loss.
+# With 1,024 pilot paths for a grid of 32 points, means were off by 15 standard errors:
+# paths of probability 1e-6 left the grid. This many suffice, at no loss of speed.
 _PILOTS_OF_GRID = 2**13
-# What a grid adds to: the best polynomial of these degrees.
+# A grid corrects the best polynomial of these degrees.
 _BASE = 0, 2, 4
-# Derivatives are averaged over so many paths, in many dimensions fewer.
+# Derivatives are averaged over this many paths, fewer in many dimensions.
 _QUADRATIC_PILOTS, _QUADRATIC_NUMBERS = 128, 2**13
 
-# What a function is to be at a state; with a random key, an estimate of it.
+# The target value of a function at a state; with a random key, an estimate of it.
 Value: TypeAlias = Callable[..., Float[Array, "C S m"]]
 
 
 class Frame(eqx.Module):
-    """Coordinates of states, in which they have mean zero and deviations of about one.
-    Coordinates of the state that do not move are left out."""
+    """Coordinates in which the states have mean zero and standard deviations of about one.
+    Components of the state that do not move are ignored."""
 
     mean: Float[Array, " d"]
     to: Float[Array, "d d"]
@@ -57,8 +57,8 @@ class Frame(eqx.Module):
     def of(
         points: Float[Array, "n d"], good: Bool[Array, " n"], unit: Float[Array, " d"]
     ) -> "Frame":
-        """For the points that are good, along the axes of their covariance. In units of
-        `unit`, which is zero for what does not move, coordinates are comparable."""
+        """The frame along the axes of the covariance of the good points. `unit` makes the
+        components comparable, and is zero for components that do not move."""
         share = good.astype(points.dtype) / jnp.maximum(jnp.sum(good), 1)
         mean, inverse = share @ points, _inverse(unit)
         off = (points - mean) * inverse
@@ -70,7 +70,7 @@ class Frame(eqx.Module):
         )
 
     def moved(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
-        # The same in all steps: what a program makes of keys takes long to compile.
+        # The same in all steps: drawing from keys would take long to compile.
         z = np.random.default_rng(0).normal(0, _MOVE, states.shape)
         return states + dot(jnp.asarray(z, states.dtype), self.back.T)
 
@@ -80,10 +80,9 @@ def _inverse(unit: Float[Array, " d"]) -> Float[Array, " d"]:
 
 
 class AbstractBasis(eqx.Module):
-    """Functions of `d` coordinates. Candidates, numbers of a kind, are there to choose
-    among. A function is a sum with `size` coefficients, an array of which the last axes are
-    those of the times at which to average and of the numbers of `phi`, with one for the
-    candidates before them."""
+    """Functions of `d` coordinates, with several candidates (such as degrees) to choose
+    from. A function is a linear combination with `size` coefficients. The trailing axes of
+    the coefficients are candidates, times at which to average, and components of `phi`."""
 
     kind: eqx.AbstractClassVar[str]
     d: eqx.AbstractVar[int]
@@ -92,40 +91,40 @@ class AbstractBasis(eqx.Module):
     @property
     @abc.abstractmethod
     def size(self) -> int:
-        """How many coefficients a function has."""
+        """The number of coefficients of a function."""
 
     @property
     @abc.abstractmethod
     def pilots(self) -> int:
-        """How many paths of a pilot are wanted."""
+        """The number of pilot paths that a fit needs."""
 
     @property
     @abc.abstractmethod
     def sites(self) -> int:
-        """At how many states a function is looked at."""
+        """The number of states at which a fit evaluates its target."""
 
     @abc.abstractmethod
     def frame(
         self, states: Float[Array, "n d"], good: Bool[Array, " n"], unit
     ) -> PyTree:
-        """Coordinates for the pilot's states, those of its paths that have not failed, and
-        the unit of each coordinate."""
+        """The coordinates, from the pilot's states, its good paths, and the unit of each
+        component."""
 
     @abc.abstractmethod
     def fitted(
         self, value: Value, frame: Any, states, good, keys: PRNGKeyArray
     ) -> Float[Array, "size C S m"]:
-        """The coefficients. `keys` are those of the pilot's paths, for estimates."""
+        """The coefficients. `keys` are the keys of the pilot's paths, for estimates."""
 
     @abc.abstractmethod
     def combined(
         self, frame: Any, y: Float[Array, " d"], c: Float[Array, "size *C S m"]
     ) -> Float[Array, "*C S m"]:
-        """The function with these coefficients, at a state."""
+        """The function with these coefficients at a state."""
 
 
 class Hermite(AbstractBasis):
-    """Products of Hermite polynomials, with a candidate for each of the total degrees."""
+    """Products of Hermite polynomials, with a candidate for each total degree."""
 
     kind: ClassVar[str] = "degree"
     d: int
@@ -151,7 +150,7 @@ class Hermite(AbstractBasis):
         return self.fitted_to(jax.vmap(value)(points), frame, points, good)
 
     def fitted_to(self, values, frame, points, good):
-        """The polynomials that are closest to the values at the points that are good."""
+        """The least-squares fit to the values at the good points."""
         B, flat = self.at(frame, points), values.reshape(*values.shape[:2], -1)
         finite = lambda x: jnp.isfinite(x).reshape(len(x), -1).all(axis=1)
         good = good & finite(B) & finite(flat)
@@ -174,8 +173,8 @@ class Hermite(AbstractBasis):
 
 
 class Stretched(eqx.Module):
-    """Coordinates from -1 to 1 on a grid: about a middle they are even, further out they
-    grow with the fourth root, where few paths go far."""
+    """Coordinates from -1 to 1 on a grid: linear near the middle, and growing with the
+    fourth root further out, where there are few paths."""
 
     inner: Frame
     middle: Float[Array, " d"]
@@ -192,21 +191,21 @@ class Stretched(eqx.Module):
 
 
 def _bent(x):
-    """An odd function with the slope 1 at zero, which grows with the square root. (It takes
-    a quarter of the time of a logarithm.)"""
+    """An odd function with slope 1 at zero, which grows like the square root. (It takes a
+    quarter of the time of a logarithm.)"""
     return x / jnp.sqrt(jnp.sqrt(1 + x**2))
 
 
 def _straight(x):
-    """Its inverse."""
+    """The inverse of `_bent`."""
     return x * jnp.sqrt(x**2 / 2 + jnp.sqrt(1 + x**4 / 4))
 
 
 class Grid(AbstractBasis):
-    """A polynomial, and what it leaves on a grid with so many points along each axis. In
-    between is the polynomial of degree 5 in each coordinate through the 6 nearest points on
-    its axis. Towards the edge it falls to zero: beyond it the polynomial stays, of the
-    degree that is closest near the edge."""
+    """A polynomial plus a correction on a grid, interpolated by polynomials of degree 5
+    through the 6 nearest points along each axis. The candidate is the number of points
+    along an axis. The correction falls to zero towards the edge of the grid; beyond it only
+    the polynomial remains, whose degree is the one that fits best near the edge."""
 
     kind: ClassVar[str] = "grid points along an axis"
     d: int
@@ -233,14 +232,14 @@ class Grid(AbstractBasis):
         z = inner.at(states)
         low = jnp.min(jnp.where(good[:, None], z, jnp.inf), axis=0)
         high = jnp.max(jnp.where(good[:, None], z, -jnp.inf), axis=0)
-        # A few of them tell quartiles well enough.
+        # A few states suffice for the quartiles.
         few = jnp.where(good[:, None], z, jnp.nan)[: self._base.pilots]
         quarter, middle, other = jnp.nanquantile(
             few, jnp.array([0.25, 0.5, 0.75]), axis=0
         )
         half = jnp.maximum(_WIDER * jnp.maximum(high - middle, middle - low), 1)
-        # As far from each other in the middle as on an even grid of seven times the
-        # quartile's distance to either side, or of all if that is less.
+        # The spacing in the middle is that of a uniform grid of half-width seven times the
+        # interquartile range, or `half` if that is less.
         even = jnp.clip(7 * (other - quarter), half / 1e4, half)
         bend = jnp.sqrt(jnp.maximum((half / even) ** (8 / 3) - 1, 0.01))
         return Stretched(inner, middle, bend / half, _bent(_bent(bend)))
@@ -255,7 +254,7 @@ class Grid(AbstractBasis):
         few = jnp.repeat(values[:n], len(_BASE), axis=1)
         c = base.fitted_to(few, inner, points[:n], good[:n])
         left = values[n:] - tensordot(base.at(inner, nodes), c, 1)
-        # Where it grows fast it is not finite.
+        # The target may overflow where it grows fast.
         left = jnp.where(jnp.isfinite(left), left, 0)
         far = np.max(np.abs(x), axis=1)
         near_edge = left[(far > _FALLS * 0.8) & (far < _FALLS)]
@@ -270,7 +269,7 @@ class Grid(AbstractBasis):
         return self._base.combined(frame.inner, y, c[: self._base.size]) + there
 
     def interpolated(self, x: Float[Array, " d"], c: Float[Array, "nodes ..."]):
-        """What is on the grid, at a point."""
+        """The values on the grid, interpolated at a point."""
         n, k, last = self.candidates[0], _STENCIL, c.shape[1:]
         place = (x + 1) * (n - 1) / 2
         inside = jnp.all((place >= k // 2 - 1) & (place <= n - k // 2))
@@ -279,7 +278,7 @@ class Grid(AbstractBasis):
         start = jnp.pad(begin.astype(jnp.int32), (0, len(last)))
         shape = *[k] * self.d, *last
         block = lax.dynamic_slice(c.reshape(*[n] * self.d, *last), start, shape)
-        # Lagrange's polynomials, as products of what is left and right of each point.
+        # Lagrange polynomials, as products over the points to the left and to the right.
         off = [place - begin - j for j in range(k)]
         left = [*itertools.accumulate(off[:-1], jnp.multiply, initial=1.0)]
         right = [*itertools.accumulate(off[:0:-1], jnp.multiply, initial=1.0)][::-1]
@@ -293,16 +292,15 @@ class Grid(AbstractBasis):
 
 
 def _falling(x: np.ndarray) -> np.ndarray:
-    """From 1 at 0 to 0 at 1, with two derivatives that are zero at both."""
+    """Falls from 1 at 0 to 0 at 1, with two vanishing derivatives at both ends."""
     x = np.clip(x, 0, 1)
     return 1 - x**3 * (10 - 15 * x + 6 * x**2)
 
 
 class Quadratic(AbstractBasis):
-    """Linear and quadratic functions, with a candidate for each degree. Their coefficients
-    are the first and the second derivatives at the origin, one after another. They are the
-    means of those at the pilot's states: for Gaussian states that is best in the mean
-    square, by Stein's lemma."""
+    """Linear and quadratic functions, with a candidate for each degree. The coefficients
+    are the first and then the second derivatives, averaged over the pilot's states. For
+    Gaussian states this is the least-squares fit, by Stein's lemma."""
 
     kind: ClassVar[str] = "degree"
     d: int
@@ -318,7 +316,7 @@ class Quadratic(AbstractBasis):
 
     @property
     def sites(self):
-        # A Hessian takes as long as `d` gradients, and a gradient as two values.
+        # A Hessian costs as much as `d` gradients, and a gradient as much as two values.
         return 2 * self.d * self.pilots
 
     def frame(self, states, good, unit):

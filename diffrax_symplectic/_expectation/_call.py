@@ -1,4 +1,4 @@
-"""Expectations of functions of the state, with their error bars."""
+"""Expectations of functions of the state, with error bars."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from ._sampling import AbstractSampling
 from ._steps import Problem
 
 
-# The key made from this number belongs to no sample.
+# No sample's key is folded from this number.
 _NO_SAMPLE = 0xFFFFFFFF
 
 
@@ -44,8 +44,8 @@ def expectation(
     progress_meter: diffrax.AbstractProgressMeter = NO_METER,
     **others: Any,
 ) -> Expectation:
-    r"""Estimates $\mathbb E[\phi(t, y_t)]$, its standard error, and the error of
-    discretization.
+    r"""Estimates $\mathbb E[\phi(t, y_t)]$, with its standard error and the discretization
+    error.
 
     !!! example
 
@@ -74,85 +74,83 @@ def expectation(
         print(estimate)
         ```
 
-    **Samples** are paths, or replicates of many paths, as `sampling` says. They are taken
-    in batches, so that memory does not grow with their number. Sample number $i$ gets the
-    key `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, whatever the batch size and the
-    devices are.
+    **Samples** are single paths or replicates of many paths, depending on `sampling`. They
+    are drawn in batches, so memory does not grow with their number. Sample $i$ gets the key
+    `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, whatever the batch size and devices.
 
-    **Levels.** With `levels=2` (3, ...) a sample takes steps $h$ and $h/2$ (and $h/4$,
-    ...). `mean` is then extrapolated to steps of size zero, by the solver's own
-    `weak_order(terms)`, and order 1 for solvers that have none, as those of Diffrax. `bias`
-    is the error of discretization that the finest of the levels has.
+    **Levels.** With `levels=2` (3, ...) each sample is solved with steps $h$ and $h/2$ (and
+    $h/4$, ...). `mean` is then extrapolated to step size zero, using the solver's
+    `weak_order(terms)`, or order 1 for solvers without one, such as Diffrax's. `bias` is
+    the discretization error of the finest level.
 
-    This function is no part of a JAX program: it cannot be differentiated, `jit`ted or
-    `vmap`ped. The gradient of an expectation is the expectation of the gradient, by
+    This function runs outside JAX transformations: it cannot be differentiated, `jit`ted or
+    `vmap`ped. To differentiate an expectation, average gradients with
     [`diffrax_symplectic.monte_carlo`][].
 
-    It compiles anew for each new `phi`, `sort_by` and function in `terms`. For many values
-    of a parameter pass the same functions, and the parameter as an array in `args`.
+    Each new `phi`, `sort_by` or function in `terms` is compiled anew. For many values of a
+    parameter, pass the same functions and the parameter as an array in `args`.
 
     **Arguments:**
 
-    - `phi`: takes time, state and `args` to a PyTree of real arrays.
+    - `phi`: maps time, state and `args` to a PyTree of real arrays.
     - `terms`, `solver`, `t0`, `t1`, `dt0`, `y0`, `args`: as for `diffrax.diffeqsolve`,
-        with `t1` after `t0` by a whole number of steps `dt0`. `terms` may have the
-        shape of a path in its place; then the path is the one that the solver needs. Paths
-        say which random variables there are, and paths with equal keys are one Brownian
-        motion. Any solver of this package, and those of Diffrax with
-        fixed steps for Stratonovich equations.
+        with `t1 - t0` a whole number of steps `dt0`. `terms` may have a shape in place of
+        a path; the solver then chooses the path. Paths determine the random variables, and
+        paths with equal keys are one Brownian motion. `solver` is any solver of this
+        package, or a Stratonovich solver of Diffrax with fixed steps.
     - `key`: a JAX random key.
     - `sampling`: an [`diffrax_symplectic.IndependentPaths`][],
         [`diffrax_symplectic.ArrayRQMC`][] or [`diffrax_symplectic.ValueFunctions`][].
-        `None` is a rule, and `reason` of the result says how it came out:
-        `ValueFunctions` for one or two numbers in the state, if a step has at most 48
-        outcomes and all steps together 4,096; otherwise `ArrayRQMC` for up to four
-        numbers, if the paths in `terms` can be made of given words; `IndependentPaths`
-        for all else. Without `tol` it takes 4,096 paths with value functions, 16
-        replicates of 16,384 paths, or 131,072 paths, and fewer where all steps of all
-        paths would make more than $2^{28}$ numbers: about ten seconds.
+        `None` chooses one, and the result's `reason` says why: `ValueFunctions` for a
+        state of one or two components, if a step has at most 48 outcomes and all steps
+        together have at most 4,096; otherwise `ArrayRQMC` for up to four components, if
+        the increments can be computed from quasi-random points; and otherwise
+        `IndependentPaths`. Without `tol` these draw 4,096 paths, 16 replicates of 16,384
+        paths, and 131,072 paths, or fewer where all steps of all paths would exceed
+        $2^{28}$ numbers (about ten seconds).
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
-        default `t1` alone.
-    - `levels`: how many step sizes, each half of the one before. With one, the error of
-        discretization is unknown, and no part of `std_error`.
-    - `tol`: no further batch begins once every standard error is at most this. The number
-        of samples in `sampling` is then the most that are taken.
-    - `start`: an earlier estimate to continue. It has to come from the same `key` and the
-        same arguments; of these only the shapes are checked.
-    - `first`: the number of the first sample. Parts of an estimate, made anywhere with
-        another `first` each, are put together by `Expectation.merge`: see [many
-        machines](many_machines.md).
-    - `engine`: with `"drjit"` independent paths are taken by one fused kernel, several
-        times as fast; see [Large ensembles][large-ensembles]. `"jax"` or `None` is JAX.
-    - `devices`: the devices that share the work, by default all of `jax.devices()`: under
-        `jax.distributed` those of every process, each of which has to make the same call
-        and gets the same result.
-    - `progress_meter`: one of Diffrax's.
+        default only `t1`.
+    - `levels`: the number of step sizes, each half the previous one. With one level the
+        discretization error is unknown, and not part of `std_error`.
+    - `tol`: no further batch starts once every standard error is at most `tol`. The number
+        of samples in `sampling` is then an upper limit.
+    - `start`: an earlier estimate to continue. It must come from the same `key` and the
+        same arguments; only their shapes are checked.
+    - `first`: the number of the first sample. Parts of an estimate that were computed
+        separately, each with its own `first`, are combined by `Expectation.merge`: see
+        [many machines](many_machines.md).
+    - `engine`: `"drjit"` solves independent paths in one fused kernel, several times as
+        fast; see [Large ensembles][large-ensembles]. `"jax"` or `None` is JAX.
+    - `devices`: the devices that share the work, by default all of `jax.devices()`. Under
+        `jax.distributed` these include the devices of every process; each process must make
+        the same call, and gets the same result.
+    - `progress_meter`: a Diffrax progress meter.
 
-    **Returns:** an [`diffrax_symplectic.Expectation`][]. A path that fails has no part in
-    it and is counted in `num_failed`: one with a step that the solver reports as failed, or
-    with a state or $\phi$ that is not finite.
+    **Returns:** an [`diffrax_symplectic.Expectation`][]. A path fails if the solver reports
+    a failed step, or if its state or $\phi$ is not finite. Failed paths are excluded, and
+    counted in `num_failed`.
 
-    **Raises:** a `ValueError` for a solver of Itô equations where these differ from
-    Stratonovich's, times between steps, a $\phi$ that is not real, sizes that are not
-    positive integers, a `tol` that is not positive, a `key` that is none, a `start` from
-    another key, of other shapes or with more paths, terms without noise, and for paths that
-    `sampling` cannot use (it says which ones it can);
-    [`diffrax_symplectic.ExpectationInterrupted`][], with the estimate so far, on an
-    interrupt from the keyboard. Warns if `tol` was not reached, if more than one path in a
-    hundred failed, if few samples make up for most of the spread, if a fit was dropped or
-    takes long, if all samples are equal or underflow, and where rounding in single
-    precision may be more than the standard error.
+    **Raises:** a `ValueError` for an Itô solver where the Itô and Stratonovich equations
+    differ, times between steps, a $\phi$ that is not real, sizes that are not positive
+    integers, a `tol` that is not positive, an invalid `key`, a `start` with another key,
+    other shapes or more paths, terms without noise, and for paths that `sampling` cannot
+    use (the message names those it can use); a
+    [`diffrax_symplectic.ExpectationInterrupted`][] holding the estimate so far, on a
+    keyboard interrupt. Warns if `tol` was not reached, if more than one path in a hundred
+    failed, if a few samples account for most of the variance, if a fit was dropped or takes
+    long, if all samples are equal or underflow, and if rounding in single precision may
+    exceed the standard error.
 
     **Source:** [Chan, Golub and LeVeque
-    (1983)](https://doi.org/10.1080/00031305.1983.10483115) for the formula by which means
-    and variances of batches are combined; [Talay and Tubaro
+    (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and
+    variances of batches; [Talay and Tubaro
     (1990)](https://doi.org/10.1080/07362999008809220) for extrapolation.
     """
     if others:
         raise TypeError(
-            f"`expectation` takes no {', '.join(f'`{name}`' for name in others)}. Solves "
-            "with events, or with other arguments of `diffrax.diffeqsolve`, are averaged "
-            "by `monte_carlo`: write one as a function of a random key."
+            f"`expectation` takes no {', '.join(f'`{name}`' for name in others)}. To use "
+            "events or other arguments of `diffrax.diffeqsolve`, write the solve as a "
+            "function of a random key and average it with `monte_carlo`."
         )
     given = terms, t0, t1, dt0, y0, args, ts
     key, begin, devices = checked_call(
@@ -172,19 +170,19 @@ def expectation(
             if engine == "drjit":
                 from .._ensemble import (
                     fused_plan,
-                )  # It is made of parts of this folder.
+                )  # It imports from this folder.
 
                 plan = fused_plan(problem, key, sampling, devices)
             else:
                 plan = sampling.prepare(problem, jr.fold_in(key, _NO_SAMPLE), devices)
         except ExpectationInterrupted:
-            # A trial's samples are not those of an estimate, to go on from.
+            # Trial samples are not part of the estimate, and cannot be continued.
             raise KeyboardInterrupt from None
         reason = "; ".join(filter(None, (reason, plan.reason)))
         reason = reason if start is None else start.reason
         plan = plan._replace(reason=reason, roundings=problem.max_steps)
         if start is not None and tol is None and plan.num_samples == MOST:
-            # Only a tolerance has asked for more.
+            # Without `tol` the number of samples stays as it was.
             used = start.moments[-1].end - start.moments[0].begin
             plan = plan._replace(num_samples=used)
         estimate = run(plan, key, devices, sampling, begin, tol, meter)
@@ -201,25 +199,25 @@ def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampl
     if start is not None and type(start.sampling) is not type(sampling):
         raise ValueError(
             f"`start` was sampled by {start.sampling}; got sampling={sampling}. Pass the "
-            "same."
+            "same `sampling`."
         )
     return sampling
 
 
 def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
-    """Of single precision, in which many small sampling errors are below rounding."""
+    """In single precision, rounding can exceed a small sampling error."""
     numbers = np.finfo(problem.dtype)
     if numbers.bits >= 64:
         return
-    # Sizes of steps are rounded with times, so that errors of one sign add up.
+    # Step sizes are rounded along with times, so errors of the same sign add up.
     fraction = float(numbers.eps) * problem.max_steps
     rounding = lambda mean: fraction * np.abs(mean)
     pairs = zip(jtu.tree_leaves(estimate.mean), jtu.tree_leaves(estimate.std_error))
     if any(np.any(error <= 2 * rounding(mean)) for mean, error in pairs):
         warnings.warn(
             "Rounding errors may be larger than the sampling error: over "
-            f"{problem.max_steps:,} steps in {numbers.dtype} some {fraction:.0e} of the "
-            "mean, the least that `std_error` is. For more digits call "
+            f"{problem.max_steps:,} steps in {numbers.dtype} they are about {fraction:.0e} "
+            "of the mean, which is the smallest `std_error` reported. For more digits call "
             '`jax.config.update("jax_enable_x64", True)` first.',
             stacklevel=3,
         )

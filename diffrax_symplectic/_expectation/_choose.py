@@ -1,4 +1,4 @@
-"""Which sampling an expectation takes, if it was not told."""
+"""The default choice of `sampling` in `expectation`."""
 
 import jax.tree_util as jtu
 import numpy as np
@@ -11,24 +11,24 @@ from ._steps import Problem
 from ._value_functions import ValueFunctions
 
 
-# Value functions in so many dimensions and for so many outcomes of all steps together, and
-# for so many of one. Others sort by so many coordinates.
+# Limits for value functions: the dimension, and the outcomes of all steps and of one step.
+# The dimension up to which paths are sorted.
 _FUNCTIONS, _OUTCOMES, _FEW_OUTCOMES, _SORTED = 2, 2**12, 48, 4
-# How many samples there are without a tolerance, and at most with one.
+# The number of samples without a tolerance, and the maximum with one.
 _PATHS_OF_FUNCTIONS, _PATHS, _REPLICATE, _REPLICATES = 2**12, 2**17, 2**14, 16
 MOST = 10**9
-# More random variables of a step take long to scramble.
+# Scrambling more random variables per step takes long.
 _MOST_WORDS = 2**8
-# Fewer paths where all steps of all would make more numbers: ten seconds or so.
+# Limit on the numbers in all steps of all paths (about ten seconds), and the fewest paths.
 _NUMBERS, _FEWEST = 2**28, 2**8
 
 
 def choose(problem: Problem, tol: float | None) -> tuple[AbstractSampling, str]:
-    """The sampling, and why. The docstring of `expectation` states this rule."""
+    """The sampling, and the reason. The docstring of `expectation` documents the rule."""
     d = sum(x.size for x in jtu.tree_leaves(problem.y0))
     steps = int(np.sum(problem.levels.num_steps))
     outcomes = num_outcomes(problem)
-    why = f"{d} numbers in the state, {steps:,} steps"
+    why = f"{d} components of the state, {steps:,} steps"
     why += f" of {outcomes} outcomes each" if outcomes else ""
     paths = int(np.clip(_NUMBERS // (steps * d), _FEWEST, _PATHS))
     if d <= _FUNCTIONS and outcomes and outcomes <= _FEW_OUTCOMES:

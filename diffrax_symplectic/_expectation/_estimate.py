@@ -1,4 +1,4 @@
-"""Estimates of expectations: what is kept of the samples, and what it says of the mean."""
+"""Estimates of expectations, with error bars from the moments of the samples."""
 
 import dataclasses
 import json
@@ -17,42 +17,44 @@ from ._sampling import ROUNDING
 from ._saved import arrays_of, described, rebuilt
 
 
-# Standard errors of the mean of a control, which is zero.
+# A control variate is dropped if its mean is this many standard errors from zero, unless
+# its own `r` exceeds this value.
 _SURE, _HEAVY_CONTROL = 5, 0.1
-# What paths with wider noise show of the tails counts if it is so many times as much as
-# what is seen of them.
+# Tails that paths with wider noise show count if they exceed the tails seen in the samples
+# by this factor.
 _SEEN = 4
-# NumPy returns scalars, which are not arrays, from operations on arrays without axes.
+# NumPy operations on zero-dimensional arrays return scalars.
 _Host = PyTree[np.ndarray | np.floating]
 
 
 class Expectation(eqx.Module):
-    r"""An estimate of $\mathbb E[\phi]$, as [`diffrax_symplectic.expectation`][] and
-    [`diffrax_symplectic.monte_carlo`][] return. To print it gives a few lines.
+    r"""An estimate of $\mathbb E[\phi]$, as returned by
+    [`diffrax_symplectic.expectation`][] and [`diffrax_symplectic.monte_carlo`][]. Printed,
+    it is a short summary.
 
-    - `num_paths`: how many paths the estimate is made of, on each level.
-    - `num_failed`: how many paths failed, on all levels. They have no part in the rest.
-    - `num_samples`: how many independent samples the mean is taken over: paths, or
-        replicates of [`diffrax_symplectic.ArrayRQMC`][].
-    - `samples`: the numbers of the samples, as pairs of the first and the one after the
-        last: one pair, unless parts have been merged between which some are missing.
-    - `sampling`: how the samples were made.
-    - `reason`: why this one was chosen, if there was a choice; otherwise empty.
+    - `num_paths`: the number of paths in the estimate, on each level.
+    - `num_failed`: the number of failed paths, which are excluded from the estimate.
+    - `num_samples`: the number of independent samples: paths, or replicates of
+        [`diffrax_symplectic.ArrayRQMC`][].
+    - `samples`: the ranges of sample numbers, as pairs of the first number and one past the
+        last: a single pair, unless merged parts leave gaps.
+    - `sampling`: the sampling.
+    - `reason`: why this sampling was chosen, or empty if there was no choice.
     - `tol_reached`: whether all standard errors are at most `tol`; `None` without `tol`.
-    - `key_data`: the random key that the samples came from.
+    - `key_data`: the data of the random key.
     """
 
-    # The moments of batches, of which neighbours have been put together.
+    # The moments of batches, with neighbours combined.
     moments: tuple[Moments, ...]
     key_data: np.ndarray
     paths_per_sample: int = 1
-    # How many roundings of the mean are the least standard error.
+    # The smallest standard error, in roundings of the mean.
     roundings: int = 1
     sampling: Any = None
     reason: str = ""
     tol_reached: bool | None = None
-    # Of value functions: the mean of the absolute deviations from the fitted mean, as paths
-    # say that go where others seldom do.
+    # For value functions: the mean absolute deviation from the fitted mean in the tails, as
+    # estimated by paths with wider noise.
     far: PyTree[np.ndarray] | None = None
 
     @property
@@ -77,25 +79,25 @@ class Expectation(eqx.Module):
 
     @property
     def mean(self) -> _Host:
-        r"""The best estimate, in the structure of $\phi$ and in float64: the mean over the
-        samples, extrapolated to steps of size zero if there are two levels or more. With
-        `ts` there is an axis in front, one place for each of them. NaN without samples."""
+        r"""The estimate, in the structure of $\phi$ and in float64: the mean over the
+        samples, extrapolated to step size zero if there are several levels. With `ts` there
+        is a leading axis of times. NaN without samples."""
         return self._each("mean", 0)
 
     @property
     def std_error(self) -> _Host:
-        r"""The standard error of `mean`: from the spread $s$ of the $n$ samples, and from
-        what they say of values too rare to be among them. It is
+        r"""The standard error of `mean`, from the standard deviation $s$ of the $n$ samples
+        and an allowance for values too rare to be among them. It is
 
         $$ \sqrt{\frac{s^2}{n} \Bigl(1 + \frac{4 r^2}{(1 - r^2)^4}\Bigr) + b^2}, \qquad
         r = \frac{(M - s \sqrt{4.5 \log n})_+}{s \sqrt n}, $$
 
-        where $M$ is the largest deviation from the mean. $M$ is larger than
-        $s \sqrt{4.5 \log n}$ for heavy tails only, and $r = 1$ if one sample makes up for
-        all that is seen of the spread. (Of sorted paths it is that of the paths in a
-        replicate, too.) For value functions $b$ is the part of the mean
-        absolute deviation that only paths with wider noise show. It is never less than the
-        rounding of the mean."""
+        where $M$ is the largest deviation from the mean. $M$ exceeds
+        $s \sqrt{4.5 \log n}$ only for heavy tails, and $r = 1$ if a single sample accounts
+        for all of the variance. (For sorted paths, $r$ is also computed for the paths
+        within a replicate, and the larger value is used.) For value functions, $b$ is the
+        part of the mean absolute deviation that only paths with wider noise show; otherwise
+        it is zero. The standard error is never less than the rounding of the mean."""
         return self._each("std_error", 0)
 
     @property
@@ -105,9 +107,9 @@ class Expectation(eqx.Module):
 
     @property
     def bias(self) -> _Host | None:
-        r"""With two levels or more the error of discretization of the finest one,
-        $\mathbb E[\phi_h] - \mathbb E[\phi]$, as extrapolation knows it; otherwise `None`.
-        `mean + bias` is the mean of that level. It is no part of `mean`."""
+        r"""The discretization error of the finest level, $\mathbb E[\phi_h] - \mathbb
+        E[\phi]$, as estimated by extrapolation; `None` with a single level. It has already
+        been removed from `mean`: `mean + bias` is the mean of the finest level."""
         return self._each("mean", 1)
 
     @property
@@ -117,23 +119,22 @@ class Expectation(eqx.Module):
 
     @property
     def error(self) -> _Host:
-        """The error of `mean` all together: the root of the sum of the squares of
-        `std_error` and, with two levels or more, of what the last extrapolation has
-        changed. What discretization leaves after that is of a higher order in the step
-        size, and smaller as a rule. With one level nothing is known of it, and this is
-        `std_error`."""
+        """The total error of `mean`: the root of the sum of squares of `std_error` and,
+        with several levels, of the change by the last extrapolation. The remaining
+        discretization error is of higher order in the step size, and usually smaller. With
+        one level the discretization error is unknown, and this is `std_error`."""
         change = self._each("mean", 2)
         if change is None:
             return self.std_error
         return jtu.tree_map(np.hypot, self.std_error, change)
 
     def interval(self, confidence: float = 0.95) -> tuple[_Host, _Host]:
-        r"""The ends of an interval that covers the mean of infinitely many samples with
-        this probability: Student's $t$ with one degree of freedom less than there are
-        samples, times `std_error`, to either side of `mean`. (For 16 samples and 95% that
-        is 2.13 standard errors, for very many 1.96.) What is left of the error of
-        discretization is not part of it: see `error`."""
-        # Half of the time to import this package, if it stood at the top.
+        r"""The ends of a confidence interval for the mean of infinitely many samples:
+        `mean` plus and minus `std_error` times the quantile of Student's $t$ with
+        `num_samples - 1` degrees of freedom. (For 95% this is 2.13 standard errors with 16
+        samples, and 1.96 with very many.) The remaining discretization error is not
+        included: see `error`."""
+        # Imported here: it would double the time to import this package.
         from scipy.special import stdtrit
 
         factor = stdtrit(max(self.num_samples - 1, 1), (1 + confidence) / 2)
@@ -143,11 +144,11 @@ class Expectation(eqx.Module):
         return side(-1), side(1)
 
     def merge(self, *others: "Expectation") -> "Expectation":
-        """The estimate from the samples of this and of other ones, which come from the same
-        `key` and arguments, and by `first=` from other samples.
+        """Combines this estimate with others from the same `key` and arguments, but with
+        different samples (see `first` of `expectation`).
 
-        If the parts begin at multiples of the batch size, the numbers are those of one
-        estimate from all samples, to the last bit, in whatever order they are merged.
+        If the parts start at multiples of the batch size, the result is bitwise equal to a
+        single estimate from all samples, whatever the order of merging.
 
         **Raises:** a `ValueError` for parts with another key, of other shapes, by another
         `sampling`, or with samples in common.
@@ -171,28 +172,28 @@ class Expectation(eqx.Module):
             if after.begin < one.end:
                 raise ValueError(
                     f"Samples {after.begin:,} to {min(one.end, after.end) - 1:,} are in "
-                    "two of the estimates to merge. Pass another `first` for each part."
+                    "two of the estimates to merge. Pass a different `first` for each part."
                 )
         return dataclasses.replace(self, moments=joined(parts), tol_reached=None)
 
     def check_same(self, other: "Expectation", name: str) -> None:
-        """Raises a `ValueError` if the estimates are not of the same numbers."""
+        """Raises a `ValueError` if the estimates have different keys or shapes."""
         if not np.array_equal(self.key_data, other.key_data):
             raise ValueError(
-                f"{name} has another `key`. Pass the one that it came from, so that no "
-                "path is taken twice."
+                f"{name} has another `key`. Pass the same `key` for all parts of an "
+                "estimate."
             )
         shapes = lambda e: jtu.tree_map(np.shape, e.moments[0].mean)
         if not eqx.tree_equal(shapes(self), shapes(other)):
             raise ValueError(
-                f"{name} is of something of another structure or other shapes. Pass one "
-                "that came from the same function, times and levels."
+                f"{name} has another structure or other shapes. Pass one from the same "
+                "function, times and levels."
             )
 
     def save(self, file: str | Path | BinaryIO) -> None:
-        """Writes it to a file of NumPy's format `.npz`, which `Expectation.load` reads.
-        $\\phi$ has to be made of dictionaries, lists, tuples and arrays. The functions of
-        `sampling`, such as `sort_by`, are left out."""
+        """Writes the estimate to a NumPy `.npz` file, which `Expectation.load` reads.
+        $\\phi$ must be made of dictionaries, lists, tuples and arrays. Functions in
+        `sampling`, such as `sort_by`, are not saved."""
         header, arrays = described(self), arrays_of(self)
         arrays["header"] = np.array(json.dumps(header))
         if isinstance(file, str | Path):
@@ -203,16 +204,16 @@ class Expectation(eqx.Module):
 
     @staticmethod
     def load(file: str | Path | BinaryIO) -> "Expectation":
-        """The estimate that `save` wrote. It runs nothing that the file holds."""
+        """Reads an estimate written by `save`. No code from the file is executed."""
         with np.load(file, allow_pickle=False) as arrays:
             if "header" not in arrays:
-                raise ValueError(f"`Expectation.save` did not write {file}.")
+                raise ValueError(f"{file} was not written by `Expectation.save`.")
             return rebuilt(Expectation, json.loads(str(arrays["header"])), arrays)
 
     def __str__(self) -> str:
 
         def shown(mean, error) -> str:
-            """With two digits more than the least of the errors has."""
+            """With two digits beyond the smallest error."""
             least = np.clip(np.min(np.nan_to_num(error), initial=1), 1e-10, 1)
             digits = 2 - math.floor(math.log10(least))
             mode = "fixed" if digits < 12 else "maxprec"
@@ -231,9 +232,9 @@ class Expectation(eqx.Module):
         if self.bias is not None:
             pairs = zip(leaves(self.bias), leaves(self.bias_std_error))
             biases = ", ".join(f"{bias} ± {error}" for bias, error in pairs)
-            lines.append(f"bias of the finest step, taken out: {biases}")
+            lines.append(f"bias of the finest step (removed): {biases}")
         elif self.sampling is not None:
-            lines.append("not included: the error of discretization (see `levels`)")
+            lines.append("not included: the discretization error (see `levels`)")
         how = "" if self.sampling is None else f", {self.sampling}"
         lines.append(f"{self.num_paths:,} paths, {self.num_failed:,} failed{how}")
         lines += [self.reason] if self.reason else []
@@ -243,7 +244,7 @@ class Expectation(eqx.Module):
     __repr__ = __str__
 
     def _each(self, name: str, combination: int) -> Any:
-        """A number of each leaf, or `None` if there is no such combination of levels."""
+        """A result for each leaf, or `None` if there is no such combination of levels."""
         whole, far = total(self.moments), self.far
         if any(x.shape[1] <= combination for x in jtu.tree_leaves(whole.mean)):
             return None
@@ -255,7 +256,7 @@ class Expectation(eqx.Module):
 
     @property
     def plain_std_error(self) -> _Host:
-        """The standard error without the control variate, if there is one."""
+        """The standard error without a control variate."""
         return self._each("plain_std_error", 0)
 
     @property
@@ -265,7 +266,7 @@ class Expectation(eqx.Module):
 
     @property
     def dropped(self) -> bool:
-        """Whether a control variate was dropped, its mean not being zero."""
+        """Whether a control variate was dropped because its mean is not zero."""
         return self._largest("dropped") > 0
 
     def _largest(self, name: str) -> float:
@@ -277,16 +278,16 @@ class Expectation(eqx.Module):
 def _results(
     n: int, roundings: int, mean, norm, largest, dtype: str, far
 ) -> dict[str, np.ndarray]:
-    """What the moments of an array say, of each combination of levels. The first axis of
-    the moments is for the kinds of `Samples`."""
+    """The results for an array, for each combination of levels, from its moments. Their
+    first axis is for the kinds of `Samples`."""
     s = norm / np.sqrt(n - 1) if n > 1 else np.full_like(norm, np.nan)
     outlying = np.maximum(largest - s * np.sqrt(4.5 * np.log(max(n, 2))), 0)
     r = np.where(s > 0, outlying / (s * np.sqrt(n)), 0)
     controlled = len(mean) > 2
-    # Combinations of levels are differences of numbers as large as the mean.
+    # Combinations of levels are differences of values as large as the mean.
     size = np.fmax.reduce(np.abs(mean[: 1 + controlled, :1]))
     rounding = roundings * float(jnp.finfo(dtype).eps) * size
-    # Rounding errors have heavy tails, too.
+    # Rounding errors can have heavy tails, too.
     r = np.where(largest > ROUNDING * rounding, r, 0)
     if len(mean) == 2:
         r[0] = np.fmax(r[0], mean[1])
@@ -295,12 +296,12 @@ def _results(
     error = np.maximum(error, rounding)
     dropped = np.zeros(mean.shape[1:], bool)
     if controlled:
-        # Of a control with heavy tails the standard error says too little.
+        # For a control with heavy tails its standard error is not reliable.
         fine = np.abs(mean[2]) <= np.fmax(_SURE * error[2], ROUNDING * rounding)
         fine |= r[2] > _HEAVY_CONTROL
         dropped |= ~np.all(fine & np.isfinite(mean[0]), axis=0)
-        # Where enough is seen of it, that is in the spread. (NaN, where the trial had no
-        # value, says nothing.)
+        # Tails that the samples show are in their variance already. (NaN, from a trial
+        # without a value, is ignored.)
         unseen = np.where(far > _SEEN * mean[3], far - mean[3], 0)
         error[0] = np.hypot(error[0], unseen)
     best = lambda x: np.where(dropped, x[1], x[0]) if controlled else x[0]
@@ -317,11 +318,11 @@ def _results(
 class ExpectationInterrupted(KeyboardInterrupt):
     """Raised by [`diffrax_symplectic.expectation`][] and
     [`diffrax_symplectic.monte_carlo`][] in place of a `KeyboardInterrupt`. Its attribute
-    `estimate` holds what was done until then, to go on from with `start=`."""
+    `estimate` holds the estimate so far, which `start=` continues."""
 
     def __init__(self, estimate: Expectation):
         super().__init__(
             f"Interrupted after {estimate.num_paths + estimate.num_failed} paths. Catch "
-            "`ExpectationInterrupted` and pass its `estimate` as `start` to go on."
+            "`ExpectationInterrupted` and pass its `estimate` as `start` to continue."
         )
         self.estimate = estimate

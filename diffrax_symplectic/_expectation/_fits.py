@@ -1,4 +1,4 @@
-"""Value functions, fitted backwards in time from where a pilot was."""
+"""Value functions, fitted backwards in time at the states of a pilot run."""
 
 from typing import Any
 
@@ -17,29 +17,29 @@ from ._bases import AbstractBasis
 from ._steps import Ensemble, ravel
 
 
-# Second derivatives by the noise are averaged over so many states.
+# The number of states over which second derivatives along the noise are averaged.
 _SECOND = 32
 
 
 class Functions(eqx.Module):
-    """The value functions of a level: one after each step, for each time at which to
-    average (`S`) and each number of `phi` (`m`), and before that axis for each candidate
-    (`C`) if there are several."""
+    """The value functions of a level, one after each step, for each time at which to
+    average (`S`) and each component of `phi` (`m`); and for each candidate (`C`), until one
+    is chosen."""
 
-    # Along a first axis of steps.
+    # With a leading axis of steps.
     frames: PyTree[Array]
     coefficients: Float[Array, "steps P *C S m"]
-    # What the noise keeps of them, to know what they do in a step.
+    # Second derivatives along the noise, from `Noise.second`.
     second: Float[Array, "steps n n *C S m"] | None
     basis: AbstractBasis = eqx.field(static=True)
 
     def __call__(self, i, y: Y) -> Float[Array, "*C S m"]:
-        """Their values at a state after step number `i`."""
+        """Their values at a state after step `i`."""
         frame = jtu.tree_map(lambda x: x[i], self.frames)
         return self.basis.combined(frame, ravel(y), self.coefficients[i])
 
     def chosen(self, best: Int[np.ndarray, "S m"]) -> "Functions":
-        """With one candidate for each number."""
+        """The functions with one candidate for each component."""
 
         def take(c):
             index = best.reshape(*[1] * (c.ndim - 2), *best.shape)
@@ -50,15 +50,14 @@ class Functions(eqx.Module):
 
 
 def fit(noise: Any, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
-    """The functions of a level, for its noise. A pilot goes forward, and the fit goes
-    backward."""
+    """The functions of a level, for its noise: a pilot run forward, and fits backward."""
     p, level = noise.problem, noise.level
     y0, unravel = jfu.ravel_pytree(p.y0)
     steps, last = level.num_steps, p.max_steps
     keys = jr.split(key, basis.pilots)
     states, good = _pilot(noise, keys, y0)
-    # By how far they move, coordinates are comparable. (Squares of small numbers are zero
-    # in single precision.)
+    # Coordinates are scaled by how far they move. (Dividing by the largest value first
+    # avoids underflow of squares in single precision.)
     off = jnp.where(good[:, None], jnp.abs(states - y0), 0)
     most = jnp.max(off, axis=(0, 1))
     share = good.astype(y0.dtype) / jnp.maximum(jnp.sum(good), 1)
@@ -96,19 +95,20 @@ def fit(noise: Any, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
         i, few = args
         return noise.second(i, jax.vmap(unravel)(few), lambda y: u(i, y))
 
-    # The states before each step.
+    # Some states before each step.
     few = jnp.concatenate([states[:1] * 0 + y0, states[:-1]])[:, :_SECOND]
     second = lax.map(kept, (jnp.arange(last), few))
     return Functions(u.frames, u.coefficients, second, basis)
 
 
 def _pilot(noise: Any, keys: PRNGKeyArray, y0: Array):
-    """The states of some paths after each step, and which of them have not failed."""
+    """The states of the pilot's paths after each step, and which paths are good."""
     p, n, last = noise.problem, len(keys), noise.problem.max_steps
 
     def forward(i, carry):
         def one(y, key):
-            # It goes further than paths do: a fit has to hold for the last of them.
+            # With equal probabilities the pilot spreads further than the paths, so that
+            # the fit also holds for outliers.
             x, _ = noise.draw(key, i, jnp.ones(()))
             return noise.step(i, y, noise.fresh(i, y), x)
 

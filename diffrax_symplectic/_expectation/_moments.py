@@ -1,4 +1,4 @@
-"""Means and spreads of batches of samples, and how they are put together."""
+"""Means and variances of batches of samples, and their combination."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -9,16 +9,16 @@ from jaxtyping import PyTree
 
 
 class Moments(NamedTuple):
-    """Of the samples with numbers from `begin` up to `end`, on the host and in float64.
+    """Statistics of samples `begin` to `end - 1`, on the host and in float64.
 
-    - `good`: how many are good; `failed`: how many paths failed.
-    - `mean`: of the good ones, with two axes in front for kinds and for combinations of
-        levels.
-    - `norm`: the root of the sum of the squared deviations from it. (Squares overflow and
-        underflow where roots do not.)
+    - `good`: the number of good samples; `failed`: the number of failed paths.
+    - `mean`: the mean of the good samples, with two leading axes for kinds and for
+        combinations of levels.
+    - `norm`: the root of the sum of squared deviations from the mean. (The sum itself would
+        overflow or underflow sooner.)
     - `largest`: the largest deviation within a batch.
     - `size`: the largest absolute value.
-    - `dtypes`: what each array was computed in.
+    - `dtypes`: the dtype in which each array was computed.
     """
 
     begin: int
@@ -33,9 +33,9 @@ class Moments(NamedTuple):
 
 
 def joined(parts: Iterable[Moments]) -> tuple[Moments, ...]:
-    """The moments, in order, with neighbours put together as a binary counter carries. So
-    what comes out depends on the batches alone, not on the order in which they came, and
-    only a few are kept."""
+    """The moments in order, with neighbours combined in the way a binary counter carries.
+    The result depends on the batches but not on the order of their arrival, and only a few
+    entries remain."""
     out: list[Moments] = []
     for one in parts:
         out.append(one)
@@ -46,7 +46,7 @@ def joined(parts: Iterable[Moments]) -> tuple[Moments, ...]:
 
 
 def total(parts: tuple[Moments, ...]) -> Moments:
-    """Of all samples."""
+    """The moments of all samples."""
     whole, *rest = parts
     for one in rest:
         whole = _both(whole, one)
@@ -62,12 +62,12 @@ def _are_halves(a: Moments, b: Moments) -> bool:
 
 @np.errstate(over="ignore", invalid="ignore", under="ignore")
 def _both(a: Moments, b: Moments) -> Moments:
-    """By the pairwise formula of Chan, Golub and LeVeque."""
+    """The pairwise formula of Chan, Golub and LeVeque."""
     n, trees = max(a.good + b.good, 1), jtu.tree_map
     share, part = np.sqrt(a.good / n * b.good), b.good / n
     delta = trees(lambda x, y: y - x, a.mean, b.mean)
     norm = lambda x, y, d: np.hypot(np.hypot(x, y), share * d)
-    # A mean of no samples is no number to start from.
+    # Without samples `a` has no mean.
     mean = lambda x, y, d: y if a.good == 0 else x + d * part
     return Moments(
         a.begin, b.end, a.good + b.good, a.failed + b.failed,

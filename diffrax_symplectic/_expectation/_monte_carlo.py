@@ -1,4 +1,4 @@
-"""Plain averages: of independent paths, and of whatever is a function of a random key."""
+"""Crude Monte Carlo: averages over independent paths, or of a function of a random key."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -23,20 +23,20 @@ from ._steps import independent_steps, level_weights, Problem, simulate
 
 
 class IndependentPaths(AbstractSampling):
-    """Independent paths. Their error falls as one over the root of their number, whatever
-    the system.
+    """Independent paths (crude Monte Carlo). For any system the error is proportional to
+    one over the square root of their number.
 
-    With several levels a path takes the same Brownian motion on each of them if the path in
-    `terms` says so: a [`diffrax_symplectic.FixedStepBrownianPath`][] with `cell=`. Then the
-    `bias` is known much better than the mean.
+    With several levels, each path uses the same Brownian motion on all of them if `terms`
+    have a [`diffrax_symplectic.FixedStepBrownianPath`][] with `cell=`. Then the `bias` is
+    estimated much more accurately than the mean.
 
     **Arguments:**
 
-    - `num_paths`: how many paths, two at least; with `tol` at most.
-    - `batch_size`: how many paths each device takes at once. By default 32,768 on CPUs
-        (for a state of a few numbers, enough for all cores and little for their caches)
-        and 262,144 elsewhere. Take less for large states, and to keep several devices busy
-        with few paths: what a device computes does not depend on how many there are.
+    - `num_paths`: the number of paths, at least two; with `tol` an upper limit.
+    - `batch_size`: the number of paths that each device solves at once. By default 32,768
+        on CPUs (for a state of a few components this keeps all cores busy and fits their
+        caches) and 262,144 elsewhere. Choose less for large states, or to share few paths
+        among several devices: the size of a batch does not depend on their number.
     """
 
     num_paths: int = eqx.field(converter=lambda x: whole_number("num_paths", x, 2))
@@ -54,19 +54,19 @@ class IndependentPaths(AbstractSampling):
 
 
 def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
-    """A sample is a path, on all levels with the same random key."""
+    """A sample is a path, with the same random key on all levels."""
     n, own = len(keys), jax.vmap(lambda key: path_keys(p.terms, key))(keys)
     terms_of = lambda keys: with_keys(p.terms, keys)
     begin = lambda level: independent_steps(p, level, n, terms_of, lambda i: own)
     saved, failed, _ = simulate(p, begin)
-    # A path fails once, on however many levels.
+    # A path that fails on several levels counts once.
     lost = jnp.any(failed, axis=0)
     return Samples(p.averaged([p.combined(saved)]), ~lost, lost)
 
 
 def path_keys(terms: PyTree[diffrax.AbstractTerm], key: PRNGKeyArray) -> list[Array]:
-    """New random keys for the paths in `terms`, made from `key`. Paths that had the same
-    key get the same one again."""
+    """New random keys for the paths in `terms`, derived from `key`. Paths that share a key
+    get the same new one."""
     new = []
     for x in filter(is_key, jtu.tree_leaves(brownian_paths(terms))):
         typed = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
@@ -80,7 +80,7 @@ def path_keys(terms: PyTree[diffrax.AbstractTerm], key: PRNGKeyArray) -> list[Ar
 
 
 def with_keys(terms: PyTree[diffrax.AbstractTerm], keys: list[Array]) -> PyTree:
-    """The terms with paths that have these keys."""
+    """The terms, with these keys in their paths."""
     left = iter(keys)
     replaced = lambda x: next(left) if is_key(x) else x
     return replace_paths(terms, lambda path: jtu.tree_map(replaced, path))
@@ -108,11 +108,11 @@ def monte_carlo(
     devices: Sequence[Any] | None = None,
     progress_meter: diffrax.AbstractProgressMeter = NO_METER,
 ) -> Expectation:
-    r"""Averages a function of a random key: whatever a path of your own makes of it.
+    r"""Averages any function of a random key, typically one that solves for a path.
 
-    For functions of the state at given times [`diffrax_symplectic.expectation`][] is
-    simpler, and needs far fewer paths. This one is for all else: events, gradients,
-    functions of whole paths.
+    For functions of the state at given times, [`diffrax_symplectic.expectation`][] is
+    simpler and needs far fewer paths. Use `monte_carlo` for everything else: events,
+    gradients, functions of whole paths.
 
     !!! example
 
@@ -137,45 +137,45 @@ def monte_carlo(
         print(estimate.mean, estimate.std_error, estimate.num_failed)
         ```
 
-    `fn` is compiled anew for each new function. For many values of a parameter pass one
-    function and the parameter as an array, `jax.tree_util.Partial(fn, parameter)`.
-    Gradients are taken within: the mean of `jax.grad` of a path is the gradient of the
-    expectation. On several devices the solve needs the adjoint `diffrax.DirectAdjoint()` or
-    `diffrax_symplectic.ReversingAdjoint()`. This function itself is no part of a JAX
-    program: it cannot be differentiated, `jit`ted or `vmap`ped.
+    Each new `fn` is compiled anew. For many values of a parameter, pass one function with
+    the parameter as an array: `jax.tree_util.Partial(fn, parameter)`. To differentiate an
+    expectation, call `jax.grad` inside `fn`: the mean of the gradients is the gradient of
+    the mean. On several devices the solve then needs the adjoint `diffrax.DirectAdjoint()`
+    or `diffrax_symplectic.ReversingAdjoint()`. `monte_carlo` itself runs outside JAX
+    transformations: it cannot be differentiated, `jit`ted or `vmap`ped.
 
     **Levels.** With `levels=2` (3, ...) and `order=p` the function is `fn(key, level)`,
-    which solves with the step $h$ on level 0, $h/2$ on level 1, and so on. `mean` is
-    extrapolated to steps of size zero. Let the levels follow one Brownian motion, with
-    `cell=` of [`diffrax_symplectic.FixedStepBrownianPath`][]: then `bias`, the error of
-    discretization of the finest level, is known much better than the mean.
+    which solves with step $h$ on level 0, $h/2$ on level 1, and so on. `mean` is
+    extrapolated to step size zero. If all levels use the same Brownian motion, by `cell=`
+    of [`diffrax_symplectic.FixedStepBrownianPath`][], then `bias` (the discretization error
+    of the finest level) is estimated much more accurately than the mean.
 
     **Arguments:**
 
-    - `fn`: takes a random key to $\phi$, a PyTree of real arrays, or to a pair of that
-        and a `diffrax.RESULTS`: as above, with `throw=False`. A path fails if its result
-        is neither successful nor an event, or anything in its $\phi$ is not finite.
-        Do not leave `sol.result` out where you pass `throw=False`: a path that failed then
-        counts as a success, with the state where it stopped.
-    - `num_paths`: the number of all paths, those of `start` included.
+    - `fn`: maps a random key to $\phi$, a PyTree of real arrays, or to a pair of $\phi$
+        and a `diffrax.RESULTS`, as above with `throw=False`. A path fails if its result is
+        neither successful nor an event, or if anything in its $\phi$ is not finite. With
+        `throw=False` always return `sol.result`: otherwise a failed path counts as a
+        success, with the state at which it stopped.
+    - `num_paths`: the total number of paths, including the paths of `start`.
     - `batch_size`: as for [`diffrax_symplectic.IndependentPaths`][].
-    - `levels`: how many step sizes.
-    - `order`: with levels, the weak order $p$ of the solver for the terms, as
-        `solver.weak_order(terms)` says.
+    - `levels`: the number of step sizes.
+    - `order`: with several levels, the weak order $p$ of the solver for these terms, as
+        returned by `solver.weak_order(terms)`.
     - `key`, `tol`, `start`, `first`, `devices`, `progress_meter`: as for
         [`diffrax_symplectic.expectation`][].
 
     **Returns:** an [`diffrax_symplectic.Expectation`][].
 
-    **Raises:** as [`diffrax_symplectic.expectation`][]; a `ValueError` for levels without
-    `order`, or if $\phi$ holds a `diffrax.RESULTS`. Warns if all samples are equal, as
-    they are if `fn` does not use its key.
+    **Raises:** as [`diffrax_symplectic.expectation`][]; a `ValueError` for several levels
+    without `order`, or if $\phi$ contains a `diffrax.RESULTS`. Warns if all samples are
+    equal, as they are if `fn` does not use its key.
     """
     key, begin, devices = checked_call("monte_carlo", key, tol, start, first, devices)
     levels = whole_number("levels", levels)
     if levels > 1 and order is None:
         raise ValueError(
-            "`levels` need `order=`, the weak order of the solver; got "
+            "Several `levels` need `order=`, the weak order of the solver; got "
             f"levels={levels!r} and order=None."
         )
     check_takes("fn", fn, *(["key"] if levels == 1 else ["key", "level"]))
@@ -199,7 +199,7 @@ def _of_function(fn: Callable, weights: np.ndarray, keys: PRNGKeyArray) -> Sampl
 
 
 def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
-    """What `fn` returns, and whether the path succeeded."""
+    """The $\\phi$ that `fn` returns, and whether the path succeeded."""
     out, success = fn(key), jnp.array(True)
     if isinstance(out, tuple) and len(out) == 2 and _is_result(out[1]):
         out, result = out
@@ -207,15 +207,15 @@ def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
     if any(map(_is_result, jtu.tree_leaves(out, is_leaf=_is_result))):
         raise ValueError(
             "`fn` returns a `diffrax.RESULTS` within phi, where it would be averaged. "
-            "Return a pair `(phi, sol.result)`, so that paths that failed are left out."
+            "Return a pair `(phi, sol.result)`, so that failed paths are excluded."
         )
     out = jtu.tree_map(lambda x: jnp.asarray(x, real(jnp.result_type(x))), out)
     if len(jtu.tree_leaves(out)) == 0:
-        raise ValueError(f"`fn` must return arrays, which are averaged; got {out!r}.")
+        raise ValueError(f"`fn` must return arrays to average; got {out!r}.")
     if any(map(jnp.iscomplexobj, jtu.tree_leaves(out))):
         raise ValueError(
-            "What is averaged must be real arrays; `fn` returned complex ones. Return real "
-            "and imaginary parts."
+            "`fn` must return real arrays; got complex arrays. Return their real and "
+            "imaginary parts."
         )
     return out, success & all_finite(out)
 

@@ -1,4 +1,4 @@
-"""The random variables of a step, and what a function of the state does in it."""
+"""The random variables of a step, and expectations over them."""
 
 import math
 from collections.abc import Callable
@@ -18,9 +18,9 @@ from ._polynomials import tensordot
 from ._steps import Level, Problem
 
 
-# Up to so many outcomes a step is taken for each of them.
+# Up to this many outcomes, a step is taken for each of them.
 _MOST_OUTCOMES = 100
-# What is known of a path from its wider noise: about that it is one of e^8.
+# The relative entropy of a whole path's wider noise with respect to its own law, in nats.
 _NATS = 8.0
 
 # A function of the state.
@@ -28,20 +28,20 @@ Function: TypeAlias = Callable[[Y], Array]
 
 
 class Noise(eqx.Module):
-    r"""The random variables $x$ of the steps of a level. If their outcomes are few, a step
+    r"""The random variables $x$ of the steps of a level. If there are few outcomes, a step
     is taken for each of them, and expectations are finite sums.
 
-    Otherwise what stands for $u(y_1)$ less its expectation is made of the first and second
-    derivatives $a$ and $C$ of $u(y_1(x))$ at $x = 0$. It is $a \cdot x + \frac12 (x^\top C
-    x - \mathrm{tr}\, C \Sigma)$, with the variances $\Sigma$, and has mean zero whatever
-    $a$ and $C$ are, so that one $C$ does for all paths. For a quadratic function and noise
-    that enters the step linearly it is exact.
+    Otherwise $u(y_1) - \mathbb E[u(y_1)]$ is replaced by $a \cdot x + \frac12 (x^\top C x -
+    \mathrm{tr}\, C \Sigma)$, with the first and second derivatives $a$ and $C$ of
+    $u(y_1(x))$ at $x = 0$ and the variances $\Sigma$. Its mean is zero for any $a$ and $C$,
+    so one $C$ serves all paths. For a quadratic function and noise that enters the step
+    linearly it is exact.
     """
 
     problem: Problem
     level: Level
     laws: tuple[Discrete, ...] = eqx.field(static=True)
-    # Values and probabilities, if they are few.
+    # Values and probabilities, if there are few.
     outcomes: tuple[Float[np.ndarray, "K n"], Float[np.ndarray, " K"]] | None
 
     @staticmethod
@@ -64,9 +64,8 @@ class Noise(eqx.Module):
     def draw(
         self, key: PRNGKeyArray, number, share: Any = 0.0
     ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-        """The variables of the key and this number, if for this share of draws, from 0 to
-        1, all outcomes have the same probability; and the logarithm of how much more often
-        that makes them what they are."""
+        """The variables drawn from the key and this number, and their log likelihood ratio.
+        In a fraction `share` (from 0 to 1) of draws all outcomes are equally probable."""
         words = random_words(key, (number, self.level.index), 1, len(self.laws))[0]
         x = jnp.zeros(len(self.laws), self.problem.dtype)
         log_ratio = jnp.zeros_like(x)
@@ -83,8 +82,8 @@ class Noise(eqx.Module):
 
     @property
     def share(self) -> Array:
-        """Of `draw`, so that all variables of a path together have an information of 8 nats
-        against the law that they should have."""
+        """The `share` for `draw` that gives all variables of a path together a relative
+        entropy of 8 nats with respect to their own law."""
         levels = len(self.problem.levels.h)
         coarser = 2 ** np.arange(levels)[::-1]
         steps = self.problem.max_steps / coarser
@@ -98,20 +97,20 @@ class Noise(eqx.Module):
         return jnp.asarray(low, self.problem.dtype)[self.level.index]
 
     def nodes(self, x: Array | None = None) -> tuple[Any, np.ndarray]:
-        """Values of the variables, and weights with which their mean is the expectation;
-        with a draw `x`, and unless outcomes are few, an estimate from two values."""
+        """Nodes and weights of the expectation over the variables. Given a draw `x`, unless
+        there are few outcomes, two nodes that estimate it."""
         if self.outcomes is not None:
             return self.outcomes
         if x is not None:
             return jnp.stack([x, -x]), np.full(2, 0.5)
-        # Exact for polynomials of degree 3, and 5 in one variable.
+        # Exact for polynomials of degree 3, or 5 in one variable.
         m, arms = len(self.laws), np.diag(np.sqrt(3 * self._variances()))
         points = np.concatenate([arms, -arms, np.zeros((1, m))])
         weights = np.append(np.full(2 * m, 1 / 6), 1 - m / 3)
         return points.astype(self.problem.dtype), weights
 
     def mean(self, i, y: Y, u: Function, x: Array | None = None) -> Array:
-        """The expectation of `u` after step number `i` from `y`, by `nodes(x)`."""
+        """The expectation of `u` after step `i` from `y`, over `nodes(x)`."""
         (points, weights), state = self.nodes(x), self.fresh(i, y)
         values = jax.vmap(lambda x: u(self.step(i, y, state, x)[0]))(points)
         return tensordot(weights.astype(values.dtype), values, 1)
@@ -119,9 +118,9 @@ class Noise(eqx.Module):
     def advance(
         self, i, y: Y, state: PyTree, u: Function, second: Array | None, x: Array
     ) -> tuple[Y, PyTree, Bool[Array, ""], tuple[Array, Array]]:
-        """The states after step number `i` of a path with these variables; whether the step
-        succeeded; `u` there, and less its expectation, or what stands for that. `second` is
-        what `second` returns."""
+        """The states of the path and the solver after step `i` with variables `x`; whether
+        the step succeeded; and a pair of `u` at the end and its control variate. `second`
+        comes from the method of the same name."""
         if self.outcomes is None:
             assert second is not None
             y1, new, success = self.step(i, y, state, x)
@@ -137,7 +136,7 @@ class Noise(eqx.Module):
         return y1, new, jnp.all(success), (value, value - mean)
 
     def second(self, i, ys: Y, u: Function) -> Array | None:
-        """The mean of the second derivatives at the states `ys`, if outcomes are many."""
+        """The mean of the second derivatives over `ys`, if there are many outcomes."""
         if self.outcomes is not None:
             return None
         zero = jnp.zeros(len(self.laws), self.problem.dtype)
@@ -150,8 +149,8 @@ class Noise(eqx.Module):
         return self.problem.step(self._terms(x), i, self.level.h, y, state)
 
     def fresh(self, i, y: Y) -> PyTree[Array]:
-        """The state of a solver that begins with step number `i`. It serves for a fit,
-        which decides the variance only: a path takes its own state along."""
+        """The state of a solver that starts at step `i`. It is used in fits, which affect
+        only the variance; paths carry their own solver state."""
         terms = self._terms(np.zeros(len(self.laws)))
         return self.problem.init(terms, i, self.level.h, y)
 
@@ -165,14 +164,14 @@ class Noise(eqx.Module):
 
 
 def _information(law: Discrete, share: np.ndarray) -> np.ndarray:
-    """Of a draw with this share of equal probabilities, against its law."""
+    """The relative entropy of a draw with this share of equal probabilities."""
     p = np.array(law.probabilities)
     q = (1 - share[:, None]) * p + share[:, None] / len(p)
     return np.sum(q * np.log(q / p), axis=1)
 
 
 def num_outcomes(problem: Problem) -> int | None:
-    """Of a step, if they are few."""
+    """The number of outcomes of a step, or `None` if there are many."""
     try:
         outcomes = Noise.of(problem, problem.level(0)).outcomes
     except ValueError:

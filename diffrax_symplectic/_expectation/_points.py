@@ -1,5 +1,5 @@
-"""Randomized low-discrepancy points, as random words of 32 bits, and an order in which
-states that lie close together follow each other."""
+"""Randomized low-discrepancy points, as random 32-bit words, and the sorting of states
+along Hilbert's curve."""
 
 import functools as ft
 
@@ -10,27 +10,27 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int32, UInt, UInt32
 
 
-# A coordinate to sort by is read to this many bits at most.
+# The most bits of a coordinate that sorting uses.
 _COORDINATE_BITS = 16
-# The range of a coordinate is estimated from this many states.
+# The number of states from which the range of a coordinate is estimated.
 _SAMPLE = 256
-# One three-point variable is balanced among so many consecutive points.
+# The number of consecutive points among which a single three-point variable is balanced.
 _BLOCK = 6
 
 
 @ft.lru_cache(maxsize=8)
 def sobol_points(num_points: int, dimension: int) -> np.ndarray:
-    r"""The first points of the Sobol' sequence, as words of 32 bits, for a power of two of
-    points.
+    r"""The first points of the Sobol' sequence, as 32-bit words. `num_points` is a power of
+    two.
 
-    With the number of a point before its coordinates they are a digital net: of every
-    $2^k$ consecutive points from a multiple of $2^k$ on, each coordinate has one in each
-    interval of length $2^{-k}$.
+    With its index as an extra coordinate the sequence is a digital net: in every aligned
+    block of $2^k$ consecutive points, each coordinate has one point in each interval of
+    length $2^{-k}$.
 
-    The direction numbers are those of
-    [Joe and Kuo (2008)](https://doi.org/10.1137/070709359), as SciPy has them.
+    The direction numbers are from
+    [Joe and Kuo (2008)](https://doi.org/10.1137/070709359), as in SciPy.
     """
-    # It takes most of a second to import.
+    # Imported here because it takes most of a second.
     from scipy.stats import qmc
 
     sequence = qmc.Sobol(dimension, scramble=False, bits=32)
@@ -39,16 +39,16 @@ def sobol_points(num_points: int, dimension: int) -> np.ndarray:
 
 
 def nested_scramble(x: UInt32[Array, "..."], seed: UInt32[Array, "..."]):
-    """Owen's nested uniform scrambling of words of 32 bits, by a hash: each bit is flipped
-    or not at random, as a function of the bits above it. A bijection for each seed, that
-    keeps what is in one interval of length `2^-k` together for all `k`.
+    """Owen's nested uniform scrambling of 32-bit words, by a hash: each bit is flipped or
+    not at random, as a function of the bits above it. For each seed this is a bijection
+    which maps intervals of length `2^-k` to such intervals, for all `k`.
 
     Section 4 of [Laine and Karras (2011)](https://doi.org/10.1111/j.1467-8659.2011.01978.x)
     and [Burley (2020)](https://jcgt.org/published/0009/04/01/), with the constants of
     Vegdahl (2021).
     """
-    # With the order of the bits reversed, the flip of a bit has to depend on lower bits
-    # only. That is what the carries of sums and products do.
+    # With the bits reversed, the flip of a bit must depend on lower bits only, as the
+    # carries of sums and products do.
     x = _reverse_bits(x)
     x = x ^ (x * np.uint32(0x3D20ADEA))
     x = x + seed
@@ -71,30 +71,29 @@ def _reverse_bits(x: UInt32[Array, "..."]) -> UInt32[Array, "..."]:
 
 
 def num_seeds(dimension: int) -> int:
-    """How many random words `randomized` needs."""
+    """The number of random words that `randomized` needs."""
     return 3 + 2 * dimension
 
 
 def randomized(
     points: UInt32[Array, "n d"], seeds: UInt32[Array, " s"], sixths: bool = False
 ) -> UInt32[Array, "n d"]:
-    """The points of `sobol_points`, scrambled. Each word has the uniform distribution
-    exactly, whatever its place.
+    """The points of `sobol_points`, scrambled. Each word is exactly uniform.
 
-    The numbers of the points are scrambled like their coordinates. Otherwise neighbours
-    would have complementary coordinates in the same order everywhere, and whatever
-    alternates along the paths as they are sorted would add up.
+    The indices of the points are scrambled as well as their coordinates. Otherwise
+    neighbours would have complementary coordinates in the same order everywhere, and errors
+    that alternate along the sorted paths would add up.
 
-    With `sixths` all that matters of the only coordinate is whether it lies in the first
-    sixth of its range, in the last, or between. A power of two of points cannot be divided
-    so. Then of six consecutive points the smallest gets the first word of the range, the
-    largest the last, and the others the middle.
+    `sixths` is for a single coordinate of which only the first sixth, the last sixth and
+    the range between are told apart. A power of two is not divisible by six, so of each six
+    consecutive points the smallest becomes the first word of the range, the largest the
+    last, and the others the middle.
     """
     n, d = points.shape
     if not sixths or n < _BLOCK:
         return _scrambled(points, jnp.arange(n, dtype=jnp.uint32), seeds)
-    # The blocks of six begin anywhere, and so do the points: the law is the same at each
-    # place, and one in six is the smallest of its block.
+    # Blocks of six and points both start at random, so each point has the same law, and is
+    # the smallest of its block with probability 1/6.
     start, offset = seeds[-2], seeds[-1] % np.uint32(_BLOCK)
     blocks = n // _BLOCK + 2
     number = jnp.arange(_BLOCK * blocks, dtype=jnp.uint32) + start
@@ -112,25 +111,25 @@ def _scrambled(
 ) -> UInt32[Array, "m d"]:
     n, d = points.shape
     bits = np.uint32(32 - (n.bit_length() - 1))
-    # (A shift by all 32 bits is undefined.)
+    # (A shift by 32 bits is undefined.)
     number = number << min(bits, np.uint32(31))
     number = nested_scramble(number, seeds[0]) >> min(bits, np.uint32(31))
     number = number if n > 1 else jnp.zeros_like(number)
     words = nested_scramble(points[number.astype(jnp.int32)], seeds[1 : 1 + d])
-    # The hash of one seed is no uniform permutation; a digital shift makes up for it.
+    # The hash of one seed is not quite uniform; a digital shift makes it so.
     return words ^ seeds[1 + d : 1 + 2 * d]
 
 
 def hilbert_order(
     z: Float[Array, "n d"], last: Bool[Array, " n"]
 ) -> Int32[Array, " n"]:
-    """The numbers of the rows of `z` in the order in which Hilbert's curve meets them,
-    with those of which `last` is true at the end."""
+    """The indices of the rows of `z` in order along Hilbert's curve, with the rows marked
+    `last` at the end."""
     n, d = z.shape
     index_bits = max(1, (n - 1).bit_length())
     if jax.dtypes.canonicalize_dtype(np.uint64) == np.uint64 and index_bits <= 32:
-        # XLA sorts one operand of unsigned integers ten times as fast as anything else on
-        # CPUs, so that the number of a row lies in the bits below its place on the curve.
+        # On CPUs XLA sorts a single array of unsigned integers ten times as fast as
+        # anything else, so the row's index is packed into the bits below its curve index.
         key = _curve(_on_grid(z, 63 - index_bits), 63 - index_bits, jnp.uint64)
         key = jnp.where(last, np.uint64(2 ** (63 - index_bits)), key)
         packed = (key << np.uint64(index_bits)) | jnp.arange(n, dtype=jnp.uint64)
@@ -146,11 +145,11 @@ def _resolution(d: int, total: int) -> int:
 
 
 def _on_grid(z: Float[Array, "n d"], total: int) -> list[UInt[Array, " n"]]:
-    """The coordinates as integers of so many bits in all. Coordinates for which there is no
-    bit are left out.
+    """The coordinates as integers of `total` bits together. Coordinates for which no bit is
+    left are dropped.
 
-    The grid is three times as wide as where nearly all states are; the others lie at its
-    edges. A few that are far away do not make it coarse.
+    The grid is three times as wide as the range of nearly all states, and outliers are
+    clipped to its edges, so that they do not coarsen it.
     """
     n, d = z.shape
     d, bits = min(d, total), _resolution(d, total)
@@ -165,7 +164,7 @@ def _on_grid(z: Float[Array, "n d"], total: int) -> list[UInt[Array, " n"]]:
 
 
 def _curve(x: list[UInt[Array, " n"]], total: int, dtype) -> UInt[Array, " n"]:
-    """The place on Hilbert's curve, by the algorithm of
+    """The index along Hilbert's curve, by the algorithm of
     [Skilling (2004)](https://doi.org/10.1063/1.1751381)."""
     d, x = len(x), [*x]
     bits = _resolution(d, total)
@@ -173,14 +172,14 @@ def _curve(x: list[UInt[Array, " n"]], total: int, dtype) -> UInt[Array, " n"]:
         for b in range(bits - 1, 0, -1):
             bit, below = np.uint32(1 << b), np.uint32((1 << b) - 1)
             for i in range(d):
-                # Inverts the lower bits of the first coordinate, or exchanges them with
-                # those of this one.
+                # Invert the lower bits of the first coordinate, or exchange them with the
+                # lower bits of this one.
                 inverts = (x[i] & bit) != 0
                 t = jnp.where(inverts, np.uint32(0), (x[0] ^ x[i]) & below)
                 x[0] = x[0] ^ jnp.where(inverts, below, t)
                 if i > 0:
                     x[i] = x[i] ^ t
-        # From the Gray code.
+        # Decode the Gray code.
         for i in range(1, d):
             x[i] = x[i] ^ x[i - 1]
         t = jnp.zeros_like(x[0])

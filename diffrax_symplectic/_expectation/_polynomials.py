@@ -1,4 +1,4 @@
-"""Hermite polynomials of several variables, and fits of them."""
+"""Hermite polynomials of several variables, and least-squares fits."""
 
 import functools as ft
 import itertools
@@ -17,7 +17,7 @@ tensordot = ft.partial(jnp.tensordot, precision=_EXACT)
 
 
 def exponents(d: int, degree: int) -> list[tuple[int, ...]]:
-    """Of all products of powers of `d` variables up to the total degree, lower degrees
+    """The exponents of all monomials in `d` variables up to the total degree, lower degrees
     first."""
     choices = itertools.combinations_with_replacement
     chosen = [c for total in range(degree + 1) for c in choices(range(d), total)]
@@ -29,8 +29,9 @@ def num_polynomials(d: int, degree: int) -> int:
 
 
 def hermite(x: Float[Array, " d"], degree: int) -> list[Float[Array, ""]]:
-    """Products of normalized Hermite polynomials, in the order of `exponents`. Each is one
-    product of two that are known, so that a sum over them is one loop without memory."""
+    """Products of normalized Hermite polynomials, in the order of `exponents`. Each is a
+    product of two known factors, so that a sum over them compiles to one loop without
+    temporary arrays."""
     tables = []
     for variable in x:
         table = [jnp.ones_like(variable), variable]
@@ -49,12 +50,12 @@ def hermite(x: Float[Array, " d"], degree: int) -> list[Float[Array, ""]]:
 def least_squares(
     B: Float[Array, "n P"], values: Float[Array, "n C m"], sizes: Sequence[int]
 ) -> Float[Array, "P C m"]:
-    """For each of `C` fits the coefficients of the first so many polynomials of `sizes`;
-    the others are zero.
+    """The coefficients of `C` fits, of which fit `k` uses the first `sizes[k]` polynomials
+    and has zeros for the others.
 
-    The normal equations are regularized and the solution is refined. For polynomials that
-    are independent at the points this leaves rounding errors alone. Where they depend on
-    each other the solution stays small.
+    The normal equations are regularized, and the solution is refined. If the polynomials
+    are linearly independent at the points, only rounding errors remain; if not, the
+    solution stays small.
     """
     scale = jnp.sqrt(jnp.sum(B**2, axis=0))
     B = B / jnp.where(scale > 0, scale, 1)

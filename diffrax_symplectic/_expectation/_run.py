@@ -1,4 +1,4 @@
-"""How estimates are made: any number of samples, batch after batch, on any devices."""
+"""The loop that computes estimates, batch after batch, on any devices."""
 
 import collections
 import dataclasses
@@ -24,16 +24,16 @@ from ._moments import joined, Moments, total
 from ._sampling import Plan
 
 
-# Where a larger share of the paths fails, a warning says so.
+# If a larger fraction of the paths fails, there is a warning.
 _MANY = 0.01
-# With an `r` of `std_error` above this, means of exp(5 x), x normal, were off by forty
-# standard errors, and those of exp(3 x) by five.
+# With an `r` of `std_error` above this, means of exp(5 x) with normal x were off by forty
+# standard errors, and means of exp(3 x) by five.
 _HEAVY = 0.35
 NO_METER = diffrax.NoProgressMeter()
 
 
 class Begin(NamedTuple):
-    """An estimate to go on from, or the number of the first sample."""
+    """An estimate to continue, or the number of the first sample."""
 
     start: Expectation | None = None
     first: int = 0
@@ -42,17 +42,19 @@ class Begin(NamedTuple):
 def checked_call(
     user: str, key, tol, start, first, devices: Sequence[Any] | None, *others: Any
 ) -> tuple[PRNGKeyArray, Begin, tuple]:
-    """The key and the devices that a user means. Raises a `ValueError` for what none of
-    these arguments can be, and if an array of the call is traced."""
+    """The key as a typed key, where to begin, and the devices. Raises a `ValueError` for
+    invalid arguments, and if any array is traced."""
     if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((key, others))):
         raise ValueError(
-            f"`{user}` takes as many batches as numbers tell, so it is no part of a JAX "
-            "program. Call it outside of `jit`, `vmap` and `grad`. The gradient of a mean "
-            "is the mean of gradients: `monte_carlo` averages them."
+            f"`{user}` cannot run inside JAX transformations, because the number of "
+            "batches depends on values. Call it outside of `jit`, `vmap` and `grad`. To "
+            "differentiate a mean, average gradients with `monte_carlo`."
         )
     check_key(key, user)
     if start is not None and first != 0:
-        raise ValueError("Pass `start`, which goes on where it ended, or `first`.")
+        raise ValueError(
+            "Pass either `start`, which continues after its last sample, or `first`."
+        )
     begin = Begin(start, whole_number("first", first, 0))
     is_number = isinstance(tol, int | float | np.number)
     if tol is not None and not (is_number and 0 < tol < np.inf):
@@ -74,7 +76,7 @@ def checked_call(
 
 
 class Meter:
-    """A progress meter that is shown from here on until it is left."""
+    """A progress meter, as a context manager."""
 
     def __init__(self, meter: diffrax.AbstractProgressMeter):
         self._meter, self._state = meter, meter.init()
@@ -98,9 +100,8 @@ def run(
     tol: float | None = None,
     meter: Meter | None = None,
 ) -> Expectation:
-    """The estimate from the samples of a plan. Without a meter it is a trial, which warns
-    of nothing. What a device computes, and in which order its sums are added up, does not
-    depend on how many there are."""
+    """The estimate from the samples of a plan. Without a meter it is a trial, without
+    warnings. The result does not depend on the number of devices."""
     first, at = begin.first, begin.first
     if begin.start is not None:
         first, at = begin.start.moments[0].begin, begin.start.moments[-1].end
@@ -112,9 +113,8 @@ def run(
         begin.start.check_same(estimate, "`start`")
         if at > most:
             raise ValueError(
-                "The number of paths (or of replicates) counts all, those of `start` "
-                f"included, of which there are {at - first} already; got "
-                f"{plan.num_samples}."
+                "The number of paths (or replicates) includes those of `start`, which has "
+                f"{at - first} already; got {plan.num_samples}. Pass a larger number."
             )
         estimate = dataclasses.replace(estimate, moments=begin.start.moments)
     reached = lambda: _reached(estimate, plan.least, tol)
@@ -125,10 +125,10 @@ def run(
             if more:
                 running.append(batches.started(at, most, batches.sampler_at(at)))
                 at += batches.size * len(devices)
-            # One batch is computed while the one before it is added up.
+            # While one batch is being computed, the previous one is added up.
             if len(running) > more:
                 for part in batches.parts(running.popleft()):
-                    # The same samples decide, however many are made at once.
+                    # Where to stop does not depend on how many devices there are.
                     if done < most and not reached():
                         end = min(done + batches.size, most)
                         new = _moments(part, done, end, none.dtypes)
@@ -150,7 +150,7 @@ def run(
 
 
 class _Batches:
-    """The samples of a plan. Each device takes `size` at once."""
+    """The batches of a plan: each device takes `size` samples at once."""
 
     def __init__(self, plan: Plan, key: PRNGKeyArray, devices: tuple):
         self.size = min(plan.batch_size, plan.num_samples)
@@ -161,8 +161,8 @@ class _Batches:
             devices,
         )
         if jax.process_count() > 1:
-            # Each process holds the same arrays. In a function they become constants of
-            # its program, since arguments would have to be placed on the devices of all.
+            # All processes hold the same arrays. Captured by a function they become
+            # constants; as arguments they would have to be placed on all devices.
             self._sampler = lambda keys: plan.sampler(keys)
         self._mesh = Mesh(np.array(devices), ("samples",))
 
@@ -172,8 +172,7 @@ class _Batches:
         return jtu.Partial(self._sampler, self._paths_of(at, self.size))
 
     def started(self, at: int, most: int, sampler: Callable) -> tuple:
-        """Of the batches from sample number `at` on, less than `most`, what is being
-        computed."""
+        """Starts one batch on each device, from sample `at` on and up to `most`."""
         count = len(self._devices)
         lo_hi = np.array([at & 0xFFFFFFFF, at >> 32], np.uint32)
         left = np.array(max(0, min(self.size * count, most - at)), np.int32)
@@ -185,7 +184,7 @@ class _Batches:
         )
 
     def parts(self, running: tuple) -> list[tuple]:
-        """What each device has computed."""
+        """The results of each device."""
         arrays = jax.device_get(running)
         at = lambda k: jtu.tree_map(lambda x: x[k], arrays)
         return [at(k) for k in range(len(self._devices))]
@@ -212,7 +211,7 @@ def _finished(estimate: Expectation, least: int, tol: float | None) -> Expectati
 
 
 def _share_of_tolerance(estimate: Expectation, tol: float | None) -> float:
-    """Of the samples that it takes, as far as is known."""
+    """The estimated share of the samples needed that has been taken."""
     if tol is None or estimate.num_samples < 2:
         return 0.0
     errors = jtu.tree_leaves(estimate.std_error)
@@ -232,12 +231,12 @@ def _moments(part, begin: int, end: int, dtypes) -> Moments:
 def _warnings(estimate: Expectation, tol: float | None) -> Iterator[str]:
     done, lost = estimate.num_paths, estimate.num_failed
     if lost > _MANY * (done + lost):
-        rest = f"the mean is that of the other {done:,}, and biased"
+        rest = f"the mean is over the other {done:,}, and biased"
         rest = rest if done else "there is no mean"
         yield (
-            f"{lost:,} paths failed: {rest}. Take smaller steps or bounded "
-            "increments, such as those of a `WeakBrownianPath`; and look for NaNs in `y0`, "
-            "`args` and the Hamiltonians."
+            f"{lost:,} paths failed: {rest}. Take smaller steps or bounded increments, as "
+            "from a `WeakBrownianPath`, and look for NaNs in `y0`, `args` and the "
+            "Hamiltonians."
         )
     if estimate.num_samples > 1:
         yield from _warnings_of_spread(estimate)
@@ -246,8 +245,8 @@ def _warnings(estimate: Expectation, tol: float | None) -> Iterator[str]:
         largest = max(float(np.max(x, initial=0.0)) for x in errors)
         yield (
             f"`tol={tol}` was not reached: the largest standard error is {largest:.1e} "
-            f"after {estimate.num_paths:,} paths. Take more paths, going on with `start=`, "
-            "or another `sampling`."
+            f"after {estimate.num_paths:,} paths. Take more paths, continuing with "
+            "`start=`, or another `sampling`."
         )
 
 
@@ -255,51 +254,50 @@ def _warnings_of_spread(estimate: Expectation) -> Iterator[str]:
     results = jtu.tree_leaves((estimate.mean, estimate.std_error))
     if not all(np.all(np.isfinite(x)) for x in results):
         yield (
-            "The mean or its standard error is not finite: values that are averaged "
-            "overflow. Take smaller steps, or a solver that is stable with these; see "
-            "whether single solutions stay bounded."
+            "The mean or its standard error is not finite: the averaged values overflow. "
+            "Take smaller steps or a more stable solver, and check whether single paths "
+            "stay bounded."
         )
     if estimate.dropped:
         yield (
-            "A fitted value function was dropped: on these paths the mean of what it takes "
-            "away is more than five standard errors from zero, or not finite. The mean is "
-            "that of plain paths. Pass a smaller `degree`, or another `sampling`."
+            "A control variate was dropped: its mean over these paths is more than five "
+            "standard errors from zero, or not finite. The estimate is crude Monte Carlo. "
+            "Pass a smaller `degree`, or another `sampling`."
         )
     if estimate.heaviest > _HEAVY:
         yield (
-            f"Few of the {estimate.num_paths:,} paths make up for most of the spread: "
-            "others that are too rare to be among them may hold much of the mean, and the "
-            "standard error may be too small. Take many more, or a function that grows "
-            "more slowly."
+            f"A few of the {estimate.num_paths:,} paths account for most of the variance: "
+            "still rarer paths may contribute much to the mean, and the standard error may "
+            "be too small. Take many more paths, or a function that grows more slowly."
         )
     whole = total(estimate.moments)
     kinds = zip(jtu.tree_leaves(whole.size), jtu.tree_leaves(whole.dtypes))
-    # Of the plain values, with or without control.
+    # The values without control.
     low = [dtype for x, dtype in kinds if np.max(x[int(len(x) > 2), 0]) < _least(dtype)]
     if low:
         yield (
-            f"A number is zero, or smaller than what {low[0]} holds, on all paths. If it "
-            'underflows, measure it in other units, or call `jax.config.update("jax_enable'
-            '_x64", True)` first. If it is the indicator of something rare, no path met '
-            "it, and the standard error says nothing."
+            f"A component is zero, or underflows {low[0]}, on all paths. If it "
+            'underflows, use other units, or call `jax.config.update("jax_enable'
+            '_x64", True)` first. If it is the indicator of a rare event, the event did '
+            "not occur, and the standard error is meaningless."
         )
     elif not any(np.any(x > 0) for x in jtu.tree_leaves(estimate.variance)):
         yield (
-            f"All {estimate.num_samples:,} samples are equal, so that nothing is known of "
-            "the error. Does what is averaged depend on the noise, and a function for "
-            "`monte_carlo` on its key?"
+            f"All {estimate.num_samples:,} samples are equal, so the error is unknown. "
+            "Check that phi depends on the noise, and a function for `monte_carlo` on its "
+            "key."
         )
 
 
 def _least(dtype: str) -> float:
-    """Smaller numbers are rounded to multiples of the smallest, or to zero."""
+    """The smallest number whose rounding errors do not underflow."""
     return float(jnp.finfo(dtype).tiny / jnp.finfo(dtype).eps)
 
 
 @eqx.filter_jit
 def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
-    """Of the batch of each device: the number of good samples and of paths that failed; of
-    the good ones what `_moments` makes their moments of."""
+    """The batches of all devices: the numbers of good samples and of failed paths, and the
+    sums from which `_moments` computes the moments of the good samples."""
 
     def local(sampler, lo_hi, left, device: Any = 0):
         index = device * n + jnp.arange(n)
@@ -318,8 +316,8 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         return jtu.tree_map(lambda x: x[None], local(sampler, lo_hi, left))
     dynamic, static = eqx.partition(sampler, eqx.is_array)
 
-    # The programs of the devices know nothing of each other until they are done: so what
-    # one of them computes does not depend on how many there are.
+    # The devices do not communicate until the end, so each one's result does not depend on
+    # how many there are.
     def shard(dynamic, lo_hi, left):
         sampler = eqx.combine(dynamic, static)
         out = local(sampler, lo_hi, left, jax.lax.axis_index("samples"))
@@ -332,8 +330,7 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
     try:
         return sharded(dynamic, lo_hi, left)
     except ValueError as error:
-        # The loop of Diffrax's default adjoint takes arrays that vary from device to
-        # device for others than those it was made for.
+        # The loop of Diffrax's default adjoint rejects arrays that vary between devices.
         if "Closure-converted function" not in str(error):
             raise
         raise ValueError(
@@ -345,8 +342,9 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
 
 
 def _spread(x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]):
-    """Of the good samples the mean; what rounding has left out of it; the root of the sum
-    of squared deviations from both; the largest deviation; the largest size."""
+    """For the good samples: the mean, its rounding error, the root of the sum of squared
+    deviations from the exact mean, the largest deviation, and the largest absolute value.
+    """
     keep = good.reshape(-1, *[1] * (x.ndim - 3))
     x = jnp.where(keep, x, 0)
     total, n = lambda x: jnp.sum(x, axis=2), jnp.maximum(jnp.sum(good), 1)
@@ -354,8 +352,7 @@ def _spread(x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]
     size = largest(x)
     to_unit, from_unit = _powers(size)
     mean = from_unit * (total(x * to_unit[:, :, None]) / n)
-    # In two passes, so that no two large numbers are subtracted. The second one finds by
-    # how much the first was rounded, too.
+    # Two passes avoid cancellation. The second also finds the rounding error of the mean.
     off = jnp.where(keep, x - mean[:, :, None], 0)
     far = largest(off)
     to_unit, from_unit = _powers(far)
@@ -366,9 +363,9 @@ def _spread(x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]
 
 
 def _powers(size: Array) -> tuple[Array, Array]:
-    """A power of two that makes numbers of this size of size one, so that sums of them and
-    of their squares stay in range; and its inverse. (XLA divides by products with inverses,
-    which may underflow.)"""
+    """A power of two that scales numbers of this size to about one, so that sums of them
+    and of their squares stay in range; and its inverse. (XLA divides by multiplying with
+    the inverse, which may underflow.)"""
     most = jnp.finfo(size.dtype).maxexp - 24
     exponent = jnp.clip(jnp.frexp(size)[1], -most, most)
     one = jnp.ones_like(size)

@@ -1,4 +1,4 @@
-"""What a way to take samples has to say."""
+"""The interface between samplings and the loop over batches."""
 
 import abc
 from collections.abc import Callable
@@ -10,17 +10,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
 
 
-# Deviations of so many roundings of the mean are roundings of the paths.
+# Deviations up to this many roundings of the mean count as rounding errors.
 ROUNDING = 1e3
 
 
 class Samples(eqx.Module):
-    """What is averaged, with axes in front for kinds, for combinations of the levels, and
-    for samples; which samples are good; and how many paths each has lost.
+    """The values to average, with leading axes for kinds, combinations of levels, and
+    samples; which samples are good; and how many paths failed in each.
 
-    The first kind is the estimate. Of many paths a second one is how heavy their tails are,
-    `r` of `Expectation.std_error`. Of paths less a control variate there are the plain
-    path, the control, and what the path says of tails.
+    The first kind is the estimate. Replicates of many paths have a second one, which
+    measures how heavy their tails are: `r` of `Expectation.std_error`. With a control
+    variate there are four kinds: with the control, without it, the control itself, and the
+    deviations in the tails.
     """
 
     values: PyTree[Array]
@@ -31,15 +32,15 @@ class Samples(eqx.Module):
 class Plan(NamedTuple):
     """How samples are taken.
 
-    - `sampler`: a PyTree that makes one sample for each of several random keys.
-    - `num_samples`: how many at most, those of an estimate to go on from included.
-    - `batch_size`: how many each device takes at once.
-    - `paths`: how many paths a sample has, on each level.
-    - `least`: fewer samples than this do not tell their spread well enough to stop.
-    - `reason`: what the result says of how they were chosen.
-    - `far`, `roundings`: as in an estimate.
-    - `paths_of`: takes the number of the first sample, and how many there are, to what the
-        sampler takes before the keys, if that is made by no program of JAX.
+    - `sampler`: a callable PyTree that makes one sample for each of several random keys.
+    - `num_samples`: the most samples, including the samples of an estimate to continue.
+    - `batch_size`: the number of samples that each device takes at once.
+    - `paths`: the number of paths in a sample, on each level.
+    - `least`: the fewest samples whose variance is estimated well enough to stop.
+    - `reason`: why this sampling was chosen, for the result.
+    - `far`, `roundings`: as in `Expectation`.
+    - `paths_of`: for paths computed outside JAX, maps the number of the first sample and
+        the number of samples to an argument that the sampler takes before the keys.
     """
 
     sampler: Callable[..., Samples]
@@ -54,13 +55,13 @@ class Plan(NamedTuple):
 
 
 class AbstractSampling(eqx.Module):
-    """How the samples of an expectation are taken, as users name it."""
+    """How the samples of an expectation are taken: the public classes."""
 
     @abc.abstractmethod
     def prepare(self, problem: Any, key: PRNGKeyArray, devices: tuple) -> Plan:
-        """Raises a `ValueError` for what it cannot do."""
+        """Raises a `ValueError` for a problem that it cannot sample."""
 
 
 def real(dtype) -> Any:
-    """The type in which numbers of this one are averaged."""
+    """The floating-point type in which values of `dtype` are averaged."""
     return jnp.result_type(dtype, float)

@@ -1,4 +1,4 @@
-"""Estimates in files: arrays, and a description of what they make up in JSON."""
+"""Estimates in files: arrays, and their structure as JSON."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,7 +14,7 @@ _TREES = "mean", "norm", "largest", "size"
 
 
 def described(estimate: Any) -> dict[str, Any]:
-    """Raises a `ValueError` for structures that JSON does not have."""
+    """Raises a `ValueError` for PyTree nodes that JSON cannot express."""
     sampling, one = estimate.sampling, estimate.moments[0]
     fields = {} if sampling is None else vars(sampling)
     plain = lambda x: x is None or isinstance(x, int | float | str | np.integer)

@@ -1,4 +1,4 @@
-"""Paths that take fixed steps together: the loop that all samplings share."""
+"""The loop over fixed steps that all samplings share."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -34,8 +34,8 @@ from ._sampling import real
 
 
 class Level(eqx.Module):
-    """One step size: which one, counted from the coarsest, how many steps there are, and
-    after which of them to average."""
+    """One step size: its index, counted from the coarsest, the number of steps, and the
+    steps after which to average."""
 
     index: Int[Array, ""]
     h: Float[Array, ""]
@@ -44,8 +44,8 @@ class Level(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """What is asked for: the arguments of `expectation` of the same names, and the levels,
-    along a leading axis."""
+    """The arguments of `expectation`, by the same names, and the levels, along a leading
+    axis."""
 
     phi: Callable[[RealScalarLike, Y, Args], PyTree]
     terms: PyTree[diffrax.AbstractTerm]
@@ -54,11 +54,11 @@ class Problem(eqx.Module):
     y0: Y
     args: Args
     levels: Level
-    # An array, equal weights being the same program.
+    # An array, so that other weights do not compile anew.
     weights: Float[Array, "combinations levels"]
-    # Whether there is one time at which to average, without an axis for it.
+    # Whether to average at `t1` only, without an axis of times.
     at_end: bool = eqx.field(static=True)
-    # Steps of the finest level. (An array has to know its size when it is compiled.)
+    # The number of steps on the finest level. (Shapes must be known when compiling.)
     max_steps: int = eqx.field(static=True)
 
     @staticmethod
@@ -70,14 +70,14 @@ class Problem(eqx.Module):
             raise ValueError(
                 "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
             )
-        # Each path gets a key of its own.
+        # The key is replaced for each sample.
         make = lambda shape: path_for(solver, "weak", None, shape, jr.key(0))
         terms = specified(terms, make)
         saved_steps, num_steps = _steps(t0, t1, dt0, ts)
         if callable(y0):
             raise ValueError(
-                "`y0` must be a state; got a function. For a random start average "
-                "`lambda key: ...`, which draws the state and solves, by `monte_carlo`."
+                "`y0` must be a state; got a function. For a random initial state, use "
+                "`monte_carlo` with a function of the key that draws the state and solves."
             )
         y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
         if not all_finite(y0):
@@ -113,7 +113,7 @@ class Problem(eqx.Module):
         return jtu.tree_map(lambda x: x[index], self.levels)
 
     def init(self, terms, i, h: Float[Array, ""], y: Y) -> PyTree[Array]:
-        """The arrays of the solver's state before step number `i`. The rest of it does not
+        """The arrays of the solver's state before step `i`. The rest of the state does not
         change."""
         t = self.t0 + i * h
         state = self.solver.init(terms, t, t + h, y, self.args)
@@ -135,7 +135,7 @@ class Problem(eqx.Module):
         return numbers(self.phi(t, y, self.args))
 
     def unravel(self, x: Float[Array, "*axes m"]) -> PyTree[Array]:
-        """Such numbers in the structure of `phi`."""
+        """Flat values of `phi` in its own structure."""
         shape = jax.eval_shape(lambda: self.phi(self.t0, self.y0, self.args))
         leaves, treedef = jtu.tree_flatten(shape)
         parts = jnp.split(x, np.cumsum([s.size for s in leaves])[:-1], axis=-1)
@@ -150,7 +150,7 @@ class Problem(eqx.Module):
     def averaged(
         self, kinds: list[Float[Array, "combinations S n m"]]
     ) -> PyTree[Array]:
-        """What `Samples` hold of such numbers."""
+        """The `values` of `Samples` from these kinds."""
         x = jnp.stack(kinds)
         return self.unravel(x[:, :, 0] if self.at_end else jnp.swapaxes(x, 2, 3))
 
@@ -160,7 +160,7 @@ class Problem(eqx.Module):
 
     @property
     def num_outputs(self) -> tuple[int, int]:
-        """How many times there are at which to average, and how many numbers `phi` has."""
+        """The number of times at which to average, and of components of `phi`."""
         m = jax.eval_shape(lambda: self.values(self.t0, self.y0)).size
         return self.levels.saved_steps.shape[1], m
 
@@ -170,10 +170,10 @@ class Ensemble(eqx.Module):
 
     y: Y
     solver_state: PyTree[Array]
-    # A path that failed counts as failed until the end. It goes on from `y0`: an equation
-    # without a solution would keep the other paths waiting in each step to come.
+    # A failed path stays failed, and continues from `y0`: otherwise stage equations without
+    # a solution would hold up the other paths in every later step.
     failed: Bool[Array, " n"]
-    # What is known of their noise, if anything.
+    # The control variate, if any.
     control: Any
 
     @staticmethod
@@ -182,7 +182,7 @@ class Ensemble(eqx.Module):
         return Ensemble(y, state, jnp.zeros(n, bool), control)
 
     def moved(self, p: Problem, y, state, success, control=None) -> "Ensemble":
-        """The paths after a step to `y`, with those that failed put back."""
+        """The paths after a step to `y`, with failed paths reset."""
         failed = self.failed | ~success
         keep = lambda new, old: jnp.where(along(failed, new), old, new)
         state = jtu.tree_map(keep, state, self.solver_state)
@@ -194,10 +194,9 @@ def simulate(
     begin: Callable[[Level], tuple[Callable, Ensemble]],
     measure: Callable[[Array, Bool[Array, " n"]], Array] = lambda phi, failed: phi,
 ) -> tuple[Float[Array, "levels S ..."], Bool[Array, "levels n"], Any]:
-    """Takes the paths that `begin` makes for each level through all of its steps, by the
-    function `step(i, paths)` that it makes, too. Returns what `measure` makes of the values
-    of `phi` after the saved steps, and of which paths have failed by then; and of the paths
-    at the end which have failed, and their control."""
+    """Solves all levels. For each level `begin` returns `step(i, paths)` and the initial
+    paths. Returns `measure(phi, failed)` after each saved step, which paths have failed at
+    the end, and their control variates."""
 
     def on_level(level):
         step, paths = begin(level)
@@ -210,8 +209,8 @@ def simulate(
                 here = along(level.saved_steps == i, saved)
                 return failed, jnp.where(here, measure(phi, failed), saved)
 
-            # A conditional with one predicate for all paths: `phi` is not evaluated
-            # otherwise.
+            # One predicate for all paths, so that `phi` is evaluated only after saved
+            # steps.
             here = jnp.any(level.saved_steps == i)
             failed, saved = lax.cond(here, record, lambda: (paths.failed, saved))
             return eqx.tree_at(lambda e: e.failed, paths, failed), saved
@@ -229,15 +228,15 @@ def simulate(
 
     if len(p.levels.h) == 1:
         return jtu.tree_map(lambda x: x[None], on_level(p.level(0)))
-    # One program for all levels.
+    # All levels share one compiled program.
     return lax.map(on_level, p.levels)
 
 
 def independent_steps(
     p: Problem, level: Level, n: int, terms_of: Callable, randomness: Callable
 ) -> tuple[Callable[[Any, Ensemble], Ensemble], Ensemble]:
-    """What takes a step of `n` paths, and these at the start. Each has the terms
-    `terms_of` its part of `randomness(i)` in step number `i`."""
+    """The step of `n` independent paths, and these paths at the start. In step `i` each
+    path has the terms `terms_of(r)`, with `r` its own row of `randomness(i)`."""
 
     def step(i, paths):
         one = lambda random, y, state: p.step(terms_of(random), i, level.h, y, state)
@@ -250,7 +249,7 @@ def independent_steps(
 
 
 def _steps(t0, t1, dt0, ts: Sequence | None) -> tuple[np.ndarray, np.integer]:
-    """After how many steps to average, and how many there are."""
+    """The numbers of steps after which to average, and the number of all steps."""
     if dt0 is None:
         raise ValueError("`dt0` must be a number: steps are fixed; got None.")
     given = f"got dt0={dt0!r}, t0={t0!r}, t1={t1!r}"
@@ -265,52 +264,51 @@ def _steps(t0, t1, dt0, ts: Sequence | None) -> tuple[np.ndarray, np.integer]:
     if not np.all(np.abs(counts - whole) <= 1e-6 * np.maximum(whole, 1)):
         raise ValueError(
             "`t1` and each of `ts` must be a whole number of steps after `t0`; got "
-            f"steps of {dt0} from {t0} on, t1={t1} and ts={ts}. Choose a `dt0` that "
-            "divides the times between them."
+            f"t0={t0}, dt0={dt0}, t1={t1} and ts={ts}. Choose a `dt0` that divides the "
+            "intervals between them."
         )
     if len(times) == 0 or np.any(whole < 0) or np.any(whole > whole[-1]):
         raise ValueError(
-            f"`ts` must lie between `t0` and `t1`, and hold one time at least; got {ts}."
+            f"`ts` must hold at least one time, all between `t0` and `t1`; got {ts}."
         )
     *saved, num_steps = whole.astype(np.int32)
     return np.array(saved), num_steps
 
 
 def _check_noise(terms) -> None:
-    """Raises a `ValueError` if nothing in them is random."""
+    """Raises a `ValueError` if nothing in the terms is random."""
     if len(brownian_paths(terms)) == 0:
         raise ValueError(
-            "`terms` have no Brownian path, so that nothing is random. Solve them once, by "
+            "`terms` have no Brownian path, so nothing is random. Solve them once, with "
             "`diffrax.diffeqsolve`."
         )
     if not any(map(is_random, brownian_paths(terms))):
         raise ValueError(
-            "No Brownian path in `terms` has a random key, so that all samples would have "
-            "the same noise. Solve once, by `diffrax.diffeqsolve`. If your path draws its "
-            "noise, make a JAX random key one of its fields; to average over many records, "
-            "write a function that draws one for `monte_carlo`."
+            "No Brownian path in `terms` has a random key, so all samples would have the "
+            "same noise. Solve once, with `diffrax.diffeqsolve`. If your path draws its "
+            "own noise, give it a field that holds a JAX random key. To average over many "
+            "records, pass `monte_carlo` a function that draws one of them."
         )
 
 
 def _check_sense(terms, solver, t0, y0: Y, args: Args) -> None:
-    """Raises a `ValueError` for solvers in the sense of Ito, unless that is
-    Stratonovich's: for additive noise, and noise that changes `p` and depends on `q`."""
+    """Raises a `ValueError` for Ito solvers, unless both senses agree: for additive noise,
+    and for noise that changes `p` and depends on `q`."""
     if not isinstance(solver, diffrax.AbstractItoSolver):
         return
     noise = tuple(split_terms(terms)[1])
     if additive_fault(noise, t0, y0, args) and separable_fault((), noise, t0, y0, args):
         raise ValueError(
-            f"`{type(solver).__name__}` solves equations in the sense of Ito. "
-            "`expectation` takes all terms in the sense of Stratonovich, as those of "
-            "`hamiltonian_terms` are, and here they differ. Use a solver of this package, "
-            "or a Stratonovich solver of Diffrax such as `diffrax.Heun`. If Ito's sense is "
-            "meant, add the drift that corrects it, or pass your own solve to "
-            "`monte_carlo`."
+            f"`{type(solver).__name__}` solves equations in the sense of Ito, but "
+            "`expectation` takes all terms in the sense of Stratonovich, and here the two "
+            "differ. Use a solver of this package, or a Stratonovich solver of Diffrax "
+            "such as `diffrax.Heun`. If you mean the Ito equation, add its drift "
+            "correction, or pass your own solve to `monte_carlo`."
         )
 
 
 def _check_cells(terms, t0, h: float) -> None:
-    """Raises a `ValueError` for steps that are not made of the cells of a path."""
+    """Raises a `ValueError` for steps that are not made up of whole cells of a path."""
     for path in brownian_paths(terms):
         cell = getattr(path, "cell", None)
         whole = lambda x: abs(x / cell - round(x / cell)) <= 1e-3
@@ -322,12 +320,12 @@ def _check_cells(terms, t0, h: float) -> None:
             )
 
 
-# What functions of spins or amplitudes raise for a pair.
+# Errors from a function of spins or amplitudes that gets a pair instead.
 _NOT_OF_A_PAIR = (TypeError, AttributeError, IndexError)
 
 
 def _shape_of(phi: Callable, terms, t0, y0: Y, args: Args) -> PyTree:
-    """What `phi` returns, and an error that says of which state it is a function."""
+    """The shape of `phi`'s result. Errors explain which state `phi` gets."""
     once = lambda t, y, args: evaluated("phi", phi, t, y, args=args)
     try:
         return eqx.filter_eval_shape(once, t0, y0, args)
@@ -336,18 +334,18 @@ def _shape_of(phi: Callable, terms, t0, y0: Y, args: Args) -> PyTree:
             raise
         kind = next(kind for kind in _NOT_OF_A_PAIR if isinstance(error, kind))
         raise kind(
-            "`phi(t, y, args)` gets the pair `(p, q)` that the terms of spins and of "
-            "complex amplitudes move: take `from_spinors(y)` or `from_pair(y)` in it. "
+            "For spins and complex amplitudes `phi(t, y, args)` gets the pair `(p, q)`: "
+            "call `from_spinors(y)` or `from_pair(y)` in it. "
             f"{error}"
         ) from error
 
 
 def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations levels"]:
     r"""The combinations of the means with steps $h, h/2, h/4, \ldots$ that an
-    [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$. The first
-    has no terms in $h^p, \ldots, h^{p + L - 2}$ for $L$ levels, and with $L > 1$ there are
-    two more: the mean of the finest level less the first, and what the last extrapolation
-    changed.
+    [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$. For $L$
+    levels the first eliminates the error terms in $h^p, \ldots, h^{p + L - 2}$. With
+    $L > 1$ there are two more: the finest level's mean minus the first, and the change by
+    the last extrapolation.
 
     [Talay and Tubaro (1990)](https://doi.org/10.1080/07362999008809220) show that the error
     has an expansion in powers of $h$.
@@ -355,7 +353,7 @@ def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations le
     best = _extrapolated(order, levels)
     if levels == 1:
         return best[None]
-    # The finer levels alone, with one power of the step size less.
+    # The finer levels alone, which eliminate one power of the step size less.
     before = np.append(0.0, _extrapolated(order, levels - 1))
     return np.stack([best, np.eye(levels)[-1] - best, best - before])
 
@@ -367,7 +365,7 @@ def _extrapolated(order: int, levels: int) -> Float[np.ndarray, " levels"]:
 
 
 def along(mask: Bool[Array, " n"], x: Array) -> Array:
-    """A mask of the first axis, to go with an array."""
+    """A mask of the first axis, broadcastable against `x`."""
     return mask.reshape(-1, *[1] * (x.ndim - 1))
 
 
@@ -376,7 +374,7 @@ def ravel(y: Y) -> Float[Array, " d"]:
 
 
 def numbers(tree: PyTree) -> Float[Array, " m"]:
-    """All that it holds, as real numbers."""
+    """The leaves as one vector of real numbers."""
     x = ravel(tree)
     return x.astype(real(x.dtype))
 
@@ -389,5 +387,5 @@ def check_real(name: str, leaves: list) -> None:
     if not all(any(jnp.issubdtype(d, k) for k in kinds) for d in dtypes):
         raise ValueError(
             f"`{name}` must return real arrays; got dtypes {[str(d) for d in dtypes]}. "
-            "For complex numbers return real and imaginary parts."
+            "For complex numbers return their real and imaginary parts."
         )

@@ -1,8 +1,8 @@
-"""Paths less what fitted value functions say of their noise.
+"""Independent paths with control variates from fitted value functions.
 
-$u_n(y)$ stands for $\\mathbb E[\\phi(y_N) \\mid y_n = y]$. What $u_{n+1}$ does in a step,
-less its expectation over the random variables of that step, has mean zero whatever $u$ is.
-For the exact $u$ these sum up to all that is random in $\\phi(y_N)$.
+The value function $u_n(y)$ approximates $\\mathbb E[\\phi(y_N) \\mid y_n = y]$. In each
+step, $u_{n+1}$ minus its expectation over the step's random variables has mean zero for any
+$u$. For the exact $u$ the sum of these differences is $\\phi(y_N)$ minus its mean.
 """
 
 import math
@@ -27,45 +27,48 @@ from ._sampling import AbstractSampling, Plan, ROUNDING, Samples
 from ._steps import along, Ensemble, Level, Problem, simulate
 
 
-# By default there are no more polynomials than this in a fit.
+# The most polynomials in a fit by default.
 _MOST_POLYNOMIALS = 130
-# By default there is a grid in up to so many dimensions, as fine as memory and time allow:
-# so many steps from its points to all outcomes, for each step of a path and for all.
+# By default a grid is used in up to this many dimensions, with the largest of these sizes
+# that memory and time allow: the most evaluations (points times outcomes) for one step of a
+# path, and for all steps.
 _GRID, _GRID_SIZES, _MOST_ENDS, _MOST = 2, (64, 32), 50_000, 2**25
-# Bytes that a fit may take, and numbers of states in it before a warning says that it will
-# take long: a minute or so.
+# Bytes that a fit may take, and the numbers it may compute before a warning that it will
+# take long (about a minute).
 _MOST_MEMORY, _OUT_OF_PROPORTION = 4 * 2**30, 2**31
-# The number that makes the key of trials, and how many batches have wider noise.
+# The number folded into the key of trials, and the number of batches with wider noise.
 _TRIAL, _WIDE = 0xFFFFFFFE, 2
 
 
 class ValueFunctions(AbstractSampling):
-    r"""Independent paths, less most of what is random in them.
+    r"""Independent paths with a control variate that removes most of their variance.
 
-    The random variables of a weak method take finitely many values in a step. So the mean
-    over a step is a finite sum, and for any function $u_n$ of the state
-    $\sum_n u_{n+1}(y_{n+1}) - \mathbb E[u_{n+1}(y_{n+1}) \mid y_n]$ has mean zero exactly.
-    Subtracted from $\phi$, it leaves nothing random if $u_n(y) = \mathbb E[\phi(y_N) \mid
-    y_n = y]$. These functions are found approximately, backwards in time, where a short
-    pilot has been. How close they are decides the standard error, and nothing else: the
-    estimate has no bias but that of the solver.
+    The random variables of a weak method take finitely many values in a step, so the mean
+    over a step is a finite sum. For any functions $u_n$ of the state, the control variate
+    $\sum_n u_{n+1}(y_{n+1}) - \mathbb E[u_{n+1}(y_{n+1}) \mid y_n]$ therefore has mean zero
+    exactly. Subtracting it from $\phi$ removes all of the variance if $u_n(y) = \mathbb
+    E[\phi(y_N) \mid y_n = y]$. These value functions are fitted backwards in time, at the
+    states of a short pilot run. The quality of the fit affects only the standard error: the
+    only bias of the estimate is the solver's.
 
-    In one or two dimensions a function is a polynomial of degree 4 or less and what it
-    leaves, on a grid; in up to 14 it is a polynomial, and in more it is quadratic, by the
-    mean of its derivatives. For more than 100 outcomes of a step (five noises or more) the
-    variables with mean zero come from first and second derivatives by the noise.
+    In one or two dimensions the fit is a polynomial of degree 4 or less plus a correction
+    on a grid. In up to 14 dimensions it is a polynomial, and in more it is quadratic, from
+    averaged derivatives. If a step has more than 100 outcomes (five noises or more), the
+    control variate is built from first and second derivatives along the noise.
 
-    In a few dimensions standard errors are $10^{-4}$ to $10^{-8}$ of those of as many
-    independent paths. In more than two dimensions it gains little in chaos, after times in
-    which the noise has spread the paths all over, and for functions with kinks.
+    In a few dimensions, standard errors are $10^{-4}$ to $10^{-8}$ times the standard error
+    of as many independent paths. In more than two dimensions the gain is small for chaotic
+    systems, for times after which the noise has spread the paths over the whole phase
+    space, and for functions with kinks.
 
     **Arguments:**
 
-    - `degree`: the total degree of polynomials. By default what is best of those above for
-        each number of $\phi$, or nothing at all (which is plain), as fresh paths say; of
-        polynomials up to degree 8, and 130 of them. Fits that would take long are coarser.
-    - `num_paths`: how many paths are averaged; with `tol` at most.
-    - `batch_size`: how many of them each device takes at once.
+    - `degree`: the total degree of the polynomials; degree 0 disables the control variate.
+        By default the best of the fits above is chosen for each component of $\phi$, or
+        none, by trials with fresh paths; polynomials have degree 8 at most and 130 terms at
+        most. Fits that would take long are made coarser.
+    - `num_paths`: the number of paths to average; with `tol` an upper limit.
+    - `batch_size`: the number of paths that each device solves at once.
 
     **Source:** the regression-based control variates of [Belomestny and others
     (2015)](https://doi.org/10.48550/arXiv.1510.03141), for weak schemes of [Belomestny,
@@ -92,7 +95,7 @@ class ValueFunctions(AbstractSampling):
                 jtu.Partial(_controlled_paths, problem, u, *arrays), n, self.batch_size
             )
 
-        # The paths that choose are not those that are averaged.
+        # The trials' paths are not part of the estimate.
         trial = lambda *args: run(plan(*args), jr.fold_in(key, _TRIAL), devices)
         flat = lambda tree, *axes: np.concatenate(
             [np.reshape(x, (*axes, times, -1)) for x in jtu.tree_leaves(tree)], axis=-1
@@ -106,11 +109,11 @@ class ValueFunctions(AbstractSampling):
         used = ~(np.min(errors, axis=0) >= plain)
         if self.degree and not np.any(used):
             warnings.warn(
-                f"`degree={self.degree}` is no better than plain paths, which are taken. "
-                "Pass another `degree`, or another `sampling`.",
+                f"`degree={self.degree}` is no better than no control variate, so none is "
+                "used. Pass another `degree`, or another `sampling`.",
                 stacklevel=4,
             )
-        # Paths with wider noise say what deviations there are beyond those of the trial.
+        # Paths with wider noise estimate the deviations beyond the largest in the trial.
         largest = lambda e, kind: flat(
             jtu.tree_map(lambda x: x[kind], total(e.moments).largest), shape[0]
         )
@@ -128,8 +131,8 @@ class ValueFunctions(AbstractSampling):
 
 
 def value_function(problem: Problem, key: PRNGKeyArray) -> Functions | None:
-    """A quadratic one for each level, or none for random variables without finitely many
-    outcomes."""
+    """A quadratic value function for each level, or `None` if the random variables do not
+    have finitely many outcomes."""
     try:
         basis = _basis(problem, 2)
     except ValueError:
@@ -138,7 +141,7 @@ def value_function(problem: Problem, key: PRNGKeyArray) -> Functions | None:
 
 
 def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
-    """For each level."""
+    """The fits of all levels."""
     levels = range(len(problem.levels.h))
     each = [
         _fitted(problem, problem.level(k), jr.fold_in(key, k), basis) for k in levels
@@ -152,8 +155,8 @@ def _fitted(problem: Problem, level: Level, key: PRNGKeyArray, basis: AbstractBa
 
 
 def _basis(p: Problem, degree: int | None) -> AbstractBasis:
-    """Raises a `ValueError` if there is not enough memory, or for random variables without
-    finitely many outcomes."""
+    """Raises a `ValueError` if the fit needs too much memory, or for random variables
+    without finitely many outcomes."""
     points = len(Noise.of(p, p.level(0)).nodes()[1])
     d, levels = sum(x.size for x in jtu.tree_leaves(p.y0)), len(p.levels.h)
     outputs, item = levels * p.max_steps * math.prod(p.num_outputs), p.dtype.itemsize
@@ -166,7 +169,7 @@ def _basis(p: Problem, degree: int | None) -> AbstractBasis:
             if memory <= _MOST_MEMORY and ends <= _MOST_ENDS and ends * steps <= _MOST:
                 return grid
         few = [k for k in range(1, 9) if num_polynomials(d, k) <= _MOST_POLYNOMIALS]
-        # The largest degree whose fit does not take too long.
+        # Drop degrees whose fit would take too long.
         cheap = lambda k: Hermite(d, (k,)).sites * points * steps <= _MOST
         few = [k for k in few if k <= 2 or cheap(k)]
         degrees = (1, 2) if many else (*(k for k in few[:-1] if k % 2 == 0), few[-1])
@@ -177,14 +180,14 @@ def _basis(p: Problem, degree: int | None) -> AbstractBasis:
         need = item * basis.size * (basis.pilots + len(degrees) * outputs)
         if need > _MOST_MEMORY:
             raise ValueError(
-                f"`degree={degree}` has {basis.size:,} polynomials in {d} dimensions, the "
-                f"fit of which needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`."
+                f"`degree={degree}` has {basis.size:,} polynomials in {d} dimensions, and "
+                f"its fit needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`."
             )
     numbers = basis.sites * points * steps * d
     if numbers > _OUT_OF_PROPORTION:
         warnings.warn(
-            f"The fit of `ValueFunctions` takes as long as {basis.sites * points:,} plain "
-            "paths. Where `tol` or the time do not ask for it, pass "
+            f"The fit of `ValueFunctions` takes as long as {basis.sites * points:,} "
+            "independent paths. If fewer paths are accurate enough, pass "
             "`sampling=IndependentPaths(num_paths)`.",
             stacklevel=5,
         )
@@ -194,9 +197,9 @@ def _basis(p: Problem, degree: int | None) -> AbstractBasis:
 def _controlled_paths(
     p: Problem, functions: Functions, used, beyond, wide, keys: PRNGKeyArray
 ) -> Samples:
-    """A sample is a path, less what `functions`, along an axis of levels, say of its noise
-    where they are `used`. With `wide=1` the noise is wider: that tells of deviations
-    `beyond` those that paths usually have."""
+    """A sample is a path minus the control variate of `functions` (with a leading axis of
+    levels) where they are `used`. With `wide=1` the noise is wider, to estimate deviations
+    `beyond` the usual ones."""
     n = len(keys)
 
     def begin(level):
@@ -211,7 +214,7 @@ def _controlled_paths(
 
             out = jax.vmap(one)(paths.y, paths.solver_state, keys)
             y, state, success, (value, change), log_ratio = out
-            # A path that failed has no value, and its control must be finite all the same.
+            # A failed path has no value, but its control must be finite.
             change = jnp.where(along(success, change), change, 0)
             control, promised, ratios = paths.control
             promised = jnp.where(i == 0, value - change, promised)
@@ -230,9 +233,9 @@ def _controlled_paths(
     each = saved - control, saved, control, promised
     left, plain, control, promised = map(p.combined, each)
     off = jnp.abs(left - promised)
-    # More than rounding.
+    # Deviations must exceed rounding.
     beyond = beyond[:, :, None] + ROUNDING * jnp.finfo(off.dtype).eps * jnp.abs(plain)
-    # What is more likely without the wider noise is seen without it.
+    # Ratios are capped at one: what is likelier without the wider noise is seen without it.
     ratio = jnp.exp(-jnp.maximum(jnp.sum(log_ratio, axis=0), 0))[:, None]
     far, lost = jnp.where(off > beyond, ratio * off, 0), jnp.any(failed, axis=0)
     return Samples(p.averaged([left, plain, control, far]), ~lost, lost)

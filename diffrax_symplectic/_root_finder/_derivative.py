@@ -1,4 +1,4 @@
-"""The derivative of a solution, as the linear equation that defines it."""
+"""Derivatives of a solution, by implicit differentiation."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,7 @@ from ._sweeps import sweep
 from ._tolerance import Tolerance
 
 
-# A derivative is solved to rounding error, as the step is by default.
+# Derivatives are solved to rounding error, as steps are by default.
 _TOLERANCE = Tolerance(None, 0.0, optx.max_norm)
 _MOST_SWEEPS = 200
 
@@ -22,15 +22,16 @@ _MOST_SWEEPS = 200
 def differentiate(
     solver: Solver, linear: Callable[[PyTree], PyTree], rhs: PyTree[Array]
 ) -> PyTree[Array]:
-    r"""The tangent $x = L x + b$ of the solution of $k = \Phi(k)$, for the derivatives $L$
-    of $\Phi$ along $k$ and $b$ along everything else; and by transposition its adjoint.
+    r"""The tangent $x = L x + b$ of the solution of $k = \Phi(k)$, where $L$ is the
+    derivative of $\Phi$ along $k$ and $b$ the derivative along everything else; and by
+    transposition its adjoint.
 
-    Up to four unknowns by elimination, by `solver` if there is one, and otherwise by the
-    iterations that solved the step: they converge where those did. Where they do not, the
-    stragglers are gathered from the batch, and their systems solved one by one.
+    Up to four unknowns are solved for by elimination, and more by `solver` if there is one.
+    Otherwise the sweeps that solved the step are used: they converge if those did.
+    Stragglers are gathered from the batch, and their systems are solved one by one.
     """
-    # As one vector: JAX cannot transpose a solve in whose right-hand side some arrays
-    # depend on what is differentiated and others do not.
+    # As one vector: JAX cannot transpose a solve if only some arrays of the right-hand side
+    # depend on the differentiated inputs.
     flat, unravel = jfu.ravel_pytree(rhs)
 
     def by(operator: Callable[[Array], Array], b: Float[Array, " n"]) -> Array:

@@ -1,4 +1,4 @@
-"""Newton's method with continuation, for the stragglers."""
+"""Newton's method with continuation, for stragglers."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
@@ -17,37 +17,36 @@ from ._tolerance import all_finite, converged, largest, log2, max_norm, ratio, T
 
 _Vector: TypeAlias = Float[Array, " n"]
 
-# How many iterations Newton's method for all of the step has before corrections must
-# shrink. From a poor guess the first few may well grow and the method still converge.
+# The number of iterations for the whole step after which corrections must shrink. From a
+# poor guess the first few may grow although the method converges.
 _PATIENCE = 8
-# The same for a part of the step, which begins near a solution: there it converges soon
-# or not at all.
+# The same for a part of the step, which starts near a solution: there Newton's method
+# converges soon or not at all.
 _PATIENCE_IN_PART = 4
-# The most by which a correction may be longer than this multiple of the one before.
+# A correction makes progress if it is below this fraction of the previous one.
 _SHRINK = 0.5
-# Corrections below this fraction of the iterate end the solution of a part of the step,
-# which only serves as the first guess for the next part.
+# A part of the step is solved once corrections are below this fraction of the iterate. It
+# only serves as the guess for the next part.
 _LOOSE = 0.1
-# After a part that was solved the next is twice as long, after one that was not a quarter.
+# The next part is twice as long after a success, and a quarter as long after a failure.
 _LONGER, _SHORTER = 2.0, 0.25
-# Parts this short mean that the branch of solutions turns back: there is none beyond that
-# begins at the start of the step. From here on Newton's method looks for any solution.
+# When parts get this short, the branch of solutions from the start of the step has turned
+# back. From then on Newton's method searches for any solution.
 _SHORTEST = 1e-3
 
 
 class Progress(NamedTuple):
-    r"""Where the continuation stands. With the residual $r$ and the guess $k_0$ the
-    equations solved for $s \in [0, 1]$ are $(1 - s) (k - k_0) + s\, r(k) = 0$. From zero
-    these are $k = s\, \Phi(k)$: those of a step whose length and increments are multiplied
-    by $s$.
+    r"""The state of the continuation. With the residual $r$ and the guess $k_0$ it solves
+    $(1 - s) (k - k_0) + s\, r(k) = 0$ for $s \in [0, 1]$. For $k_0 = 0$ this is
+    $k = s\, \Phi(k)$: the equations of a step with its length and increments scaled by $s$.
 
-    - `anchor`: the (rough) solution at `reached`.
-    - `reached`, `target`: the $s$ that was solved for, and the one being solved for.
-    - `tries`: how many iterations there were for this target.
+    - `anchor`: the approximate solution at `reached`.
+    - `reached`, `target`: the last $s$ solved, and the $s$ being solved for.
+    - `tries`: the number of iterations for this target.
     - `size`: the last correction, in units of the tolerance.
-    - `searching`: whether the branch of solutions from $s = 0$ was given up. Then any
-        solution of the whole equations will do.
-    - `solved`: whether the whole equations are solved.
+    - `searching`: whether the branch of solutions from $s = 0$ was given up, so that any
+        solution of the full equations is accepted.
+    - `solved`: whether the full equations are solved.
     """
 
     anchor: _Vector
@@ -60,9 +59,9 @@ class Progress(NamedTuple):
 
 
 class Newton(optx.AbstractRootFinder[_Vector, _Vector, Any, Progress]):
-    """Newton's method with continuation, for a vector: first for the whole equations at
-    once; and where that fails, part by part from `start`. Corrections are measured in the
-    PyTree that a vector is `restore`d to."""
+    """Newton's method with continuation, for a vector: first for the full equations, and if
+    that fails, part by part from `start`. Corrections are measured after `restore`, which
+    maps the vector to a PyTree."""
 
     start: _Vector
     restore: Callable[[_Vector], PyTree[Array]]
@@ -95,16 +94,16 @@ class Newton(optx.AbstractRootFinder[_Vector, _Vector, Any, Progress]):
         size, tries = measured.size, state.tries + 1
         shrink = jnp.where(state.tries > 0, ratio(size, state.size), 1)
         solved = converged(log2(size), log2(shrink), measured.rounded, shrink >= 0.25)
-        # Far from all solutions rounding errors of a large Jacobian hide the unknowns that
-        # it multiplies least. Then corrections are small where residuals are larger than
-        # states.
+        # Far from any solution, rounding errors of a large Jacobian can hide the unknowns
+        # with small coefficients. Corrections are then small, but residuals exceed the
+        # state.
         whole_state = largest([max_norm(x) for x in jtu.tree_leaves(states)])
         state_size = jnp.maximum(whole_state, moved) + self.atol
         solved &= whole & found & (max_norm(value) <= state_size) & all_finite(k)
 
         at_once = whole & (state.reached == 0) & ~state.searching
         patience = jnp.where(at_once, _PATIENCE, 2)
-        # No correction at all, if that is not the solution, is no progress either.
+        # A zero correction away from a solution is no progress either.
         stalled = (tries >= patience) & ~((shrink < _SHRINK) & (size > 0))
         slow = ~whole & (tries >= _PATIENCE_IN_PART)
         arrived = (max_norm(diff) < _LOOSE * moved) & ~whole
@@ -116,7 +115,7 @@ class Newton(optx.AbstractRootFinder[_Vector, _Vector, Any, Progress]):
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
         R = optx.RESULTS
-        # Even the search for any solution has left where there are values.
+        # Even the search for any solution has left the domain of the equations.
         hopeless = state.searching & ~jnp.isfinite(state.size)
         return state.solved, R.where(hopeless, R.nonfinite, R.successful)
 
@@ -128,7 +127,7 @@ class Newton(optx.AbstractRootFinder[_Vector, _Vector, Any, Progress]):
 def _next_target(
     progress: Progress, k: _Vector, arrived: Bool[Array, ""], failed: Bool[Array, ""]
 ) -> tuple[_Vector, Progress]:
-    """Onward where the target was reached, and back where Newton's method `failed`."""
+    """Advances if the target was reached, and goes back if Newton's method `failed`."""
     s, stride = progress.target, progress.target - progress.reached
     turned = failed & (_SHORTER * stride < _SHORTEST)
     longer = jnp.minimum(s + _LONGER * stride, 1)

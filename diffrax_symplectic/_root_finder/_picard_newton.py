@@ -25,17 +25,17 @@ _SUCCESSFUL = optx.RESULTS.successful
 
 
 class AbstractBlocks(eqx.Module):
-    """Arguments `args` that know their equations block by block."""
+    """An `args` whose equations can be solved block by block."""
 
     @abc.abstractmethod
     def sweep(self, solve: Callable[..., _Found], guess: Any, pending: Any) -> _Found:
-        """Solves block after block, each from the values of those before it, by
+        """Solves the blocks in order, each with the values of earlier blocks, by
         `solve(image, scale, guess, pending)`."""
 
 
 class _State(NamedTuple):
-    """Whether the equations are solved, if they cannot be, why, and the structure of
-    auxiliary output."""
+    """Whether the equations are solved, the reason if they cannot be, and the structure of
+    the auxiliary output."""
 
     solved: Bool[Array, ""]
     result: optx.RESULTS
@@ -43,42 +43,43 @@ class _State(NamedTuple):
 
 
 class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _State]):
-    r"""For stage equations $k = \Phi(k)$, given as $k - \Phi(k) = 0$: solves them to
-    rounding error, cheaply when the step is small and robustly when it is not.
+    r"""Solves stage equations $k = \Phi(k)$, given as $k - \Phi(k) = 0$, to rounding error:
+    cheaply for small steps, and robustly for large ones.
 
-    A step is as symplectic as its stage equations are solved. So the default tolerance
-    is two units in the last place of whatever dtype the state has. Iteration ends when
-    the *next* correction would be below it: after $\delta_{n-1}$ and $\delta_n$ that is
-    about $\delta_n\, (\delta_n / \delta_{n-1})$ for a method of linear convergence.
+    A step is only as symplectic as its stage equations are accurate, so the default
+    tolerance is two units in the last place of the state's dtype. Iteration ends when the
+    *next* correction would be below the tolerance; with linear convergence it is estimated
+    from the last two, as $\delta_n\, (\delta_n / \delta_{n-1})$.
 
-    There is one step. First come sweeps for all paths of a batch together, until each
-    is solved or does not converge: fixed-point (Picard) iterations, which need no Jacobian,
-    in which $q$ reads the new $p$ (Gauss--Seidel). Unknowns that are no pairs $(p, q)$ are
-    iterated as a doubled system. Where that converges slowly, it is under-relaxed (Young,
-    Transactions of the American Mathematical Society 76, 1954).
+    First all paths of a batch are solved together by sweeps, until each has converged or is
+    seen not to converge. A sweep is a fixed-point (Picard) iteration, without a Jacobian,
+    in which $q$ is updated with the new $p$ (Gauss--Seidel). Unknowns other than pairs
+    $(p, q)$ are iterated by Gauss--Seidel on the doubled system. Slow convergence is
+    accelerated by under-relaxation (Young, Transactions of the American Mathematical
+    Society 76, 1954).
 
-    Then come the stragglers, gathered from the batch, by Newton's method. Its linear
-    systems are solved by elimination up to 32 unknowns, and above by GMRES, which needs no
-    matrix. If its corrections do not shrink, it solves for a part of the time step, with
-    increments reduced alike, and goes on from there part by part (continuation). If the
-    branch of solutions that begins at the start of the step ends before the whole step,
-    Newton's method looks for any other solution. A small correction is no success where
-    its linear system was not solved, or where the residual is larger than the state.
+    Then the stragglers are gathered from the batch and solved by Newton's method. Its
+    linear systems are solved by elimination up to 32 unknowns, and by matrix-free GMRES
+    above. If the corrections do not shrink, it solves a fraction of the time step, with the
+    increments scaled alike, and continues from there part by part (continuation). If the
+    branch of solutions from the start of the step ends before the full step, Newton's
+    method searches for any other solution. A small correction does not count as convergence
+    if its linear system was not solved, or if the residual is larger than the state.
 
     **Arguments:**
 
-    - `rtol`: bound on the next correction, relative to the largest entry of each leaf of
-        the state that it changes. `None` stands for two units in the last place.
+    - `rtol`: bound on the next correction, relative to the largest entry of the leaf of
+        the state that it changes. `None` is two units in the last place.
     - `atol`: absolute bound on the next correction.
-    - `norm`: norm within a leaf.
-    - `linear_solver`: a Lineax solver for all linear systems, those of derivatives
-        included. `None` is elimination for few unknowns, and otherwise no matrix.
-    - `picard_steps`: the most sweeps before Newton's method. Where their rate tells that so
-        many would not do, they end at once.
-    - `newton_steps`: the most iterations of Newton's method after them.
+    - `norm`: the norm within a leaf.
+    - `linear_solver`: a Lineax solver for all linear systems, including derivatives.
+        `None` is elimination for few unknowns, and matrix-free iteration otherwise.
+    - `picard_steps`: the most sweeps before Newton's method. They end early if their
+        convergence rate shows that this many would not suffice.
+    - `newton_steps`: the most iterations of Newton's method.
 
-    In `optimistix.root_find`, `options={"scale": f}` says how large the state is that the
-    unknowns `k` change: `f(k)` has their structure, and stands in place of `k` in `rtol`.
+    In `optimistix.root_find`, `options={"scale": f}` gives the size of the state that the
+    unknowns `k` change: `f(k)` has their structure, and replaces `k` in `rtol`.
 
     **Raises:** a `ValueError` for negative numbers.
     """
@@ -104,8 +105,8 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         scale = options.get("scale", lambda k: k)
         pending = all_finite(y)
         found, solved = self._sweep(fn, y, args, scale, pending)
-        # As a vector: a loop selects, gathers and scatters each array of its state by
-        # kernels of their own.
+        # As one vector: a loop needs separate kernels to select, gather and scatter each
+        # array of its state.
         k, restore = jfu.ravel_pytree(found)
         residual = lambda k, _: jfu.ravel_pytree(fn(restore(k), args)[0])[0]
 
@@ -130,7 +131,7 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
 
         k, result = where_pending(rescue, pending & ~solved, (k, _SUCCESSFUL))
         y_new, solved = restore(k), result == _SUCCESSFUL
-        # The equations once more only where there is auxiliary output.
+        # Evaluate the equations once more only if there is auxiliary output.
         aux = fn(y_new, args)[1] if jtu.tree_leaves(state.aux) else state.aux
         return y_new, _State(solved, result, state.aux), aux
 

@@ -1,4 +1,4 @@
-"""Sweeps, the iteration that normally solves a step, for all paths of a batch together."""
+"""Sweeps: the iteration that usually solves a step, for all paths of a batch together."""
 
 import functools as ft
 from collections.abc import Callable
@@ -17,43 +17,44 @@ from ._tolerance import converged, Correction, log2, MARGIN, Tolerance
 
 Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]
 
-# Sweeps before the first convergence check, in double and in single precision: those that a
-# short step needs. A sweep of a doubled system, y = \Phi(y) as p = \Phi(q), q = \Phi(p),
-# evaluates everything twice: fewer will do.
+# Sweeps before the first convergence check, in double and single precision, as needed for a
+# short step. For a doubled system (y = \Phi(y) as p = \Phi(q), q = \Phi(p)) a sweep
+# evaluates everything twice, so fewer suffice.
 _FIRST, _FIRST_DOUBLED = (9, 6), (6, 5)
-# The most sweeps between two convergence checks. A rate near one is not known well.
+# The most sweeps between two convergence checks: rates near one are not known accurately.
 _MOST = 32
-# The same where corrections are as small as rounding errors.
+# The same when corrections are as small as rounding errors.
 _MOST_ROUNDED = 3
-# Above this rate of convergence sweeps are relaxed. Below, that saves less than a sweep.
+# Sweeps with a slower rate of convergence are under-relaxed. Faster ones would gain less
+# than one sweep.
 _SLOW = 0.3
-# The relaxation factor where sweeps diverged. It is the best for a rate of 8.
+# The relaxation factor after divergence, which is optimal for a rate of 8.
 _STRONGEST = 0.5
-# The logarithm of the rate that is expected of relaxed sweeps. By the formula it is 0.17 or
-# better for rates up to one, but later than in the first few sweeps.
+# The base-2 logarithm of the rate expected of relaxed sweeps. By the formula the rate is
+# 0.17 or better for rates up to one, but only after the first few sweeps.
 _RELAXED = -2.0
-# The logarithm of the rate of 0.87, above which sweeps are not taken to converge.
+# The base-2 logarithm of 0.87, the rate above which sweeps count as not converging.
 _STALLED = -0.2
 
 
 class Halves(NamedTuple):
-    """Unknowns of which each half changes mostly with the other one, such as momenta and
-    positions."""
+    """Unknowns in two halves, each of which depends mostly on the other, such as momenta
+    and positions."""
 
     p: PyTree[Array]
     q: PyTree[Array]
 
 
 class _State(NamedTuple):
-    """Where sweeps stand at a convergence check.
+    """The state of the sweeps at a convergence check.
 
     - `y`: the iterate.
-    - `relaxation`: the fraction of its change that a value takes in a sweep.
-    - `level`: the logarithm of the size of the last correction.
-    - `solved`: whether that was small enough.
-    - `pending`: whether sweeps go on.
-    - `done`: how many there were, for any path of the batch.
-    - `ahead`: how many there are until the next check; zero at the end.
+    - `relaxation`: the relaxation factor.
+    - `level`: the base-2 logarithm of the size of the last correction.
+    - `solved`: whether it was small enough.
+    - `pending`: whether to continue.
+    - `done`: the number of sweeps so far, for any path of the batch.
+    - `ahead`: the number of sweeps until the next check; zero at the end.
     """
 
     y: Halves | None
@@ -73,21 +74,22 @@ def sweep(
     guess: PyTree[Array],
     pending: Bool[Array, ""],
 ) -> tuple[PyTree[Array], Bool[Array, ""]]:
-    r"""Solves $y = \Phi(y)$ from a `guess` for all paths of a batch that are `pending`,
-    until each is solved or does not converge, by at most so many sweeps. Returns what was
-    found, and whether that is a solution. Where sweeps diverged it is the guess.
+    r"""Solves $y = \Phi(y)$ from a `guess` for all `pending` paths of a batch, with at most
+    `most` sweeps, until each path has converged or is seen not to converge. Returns the
+    iterate (the guess if sweeps diverged), and whether it is a solution.
 
-    In a sweep $q$ reads the new $p$ (Gauss--Seidel). Where a Hamiltonian system oscillates,
-    the error after that is the one after two evaluations of both, for the price of one
-    where $H = T(p) + V(q)$. Unknowns that are no `Halves` are iterated as a doubled system.
+    In a sweep $q$ is updated with the new $p$ (Gauss--Seidel). For an oscillating
+    Hamiltonian system this reduces the error as much as two evaluations of both halves, for
+    the cost of one if $H = T(p) + V(q)$. Unknowns other than `Halves` are iterated by
+    Gauss--Seidel on the doubled system.
 
-    Each convergence check shows the rate at which corrections shrink, and from that, how
-    many sweeps the slowest path needs before the next check. For an oscillation the rate
-    $a$ is that of an eigenvalue $-a$: then sweeps with the relaxation factor $2 / (1 +
-    \sqrt{1 + a})$ converge at the rate of one minus that (D. M. Young, Transactions of the
-    American Mathematical Society 76, 1954, 92-111; for doubled systems G. H. Golub and
-    R. S. Varga, Numerische Mathematik 3, 1961, 147-156). Where sweeps diverged, they begin
-    once more, relaxed like this.
+    Each convergence check measures the rate at which corrections shrink, and from it the
+    number of sweeps that the slowest path needs before the next check. For an oscillation a
+    rate $a$ belongs to an eigenvalue $-a$. With the relaxation factor $\omega = 2 / (1 +
+    \sqrt{1 + a})$ sweeps then converge at the rate $1 - \omega$ (D. M. Young, Transactions
+    of the American Mathematical Society 76, 1954, 92-111; for doubled systems G. H. Golub
+    and R. S. Varga, Numerische Mathematik 3, 1961, 147-156). Sweeps that diverged are
+    started again with strong under-relaxation.
     """
     in_halves = isinstance(guess, Halves)
     start = guess if in_halves else Halves(guess, guess)
@@ -98,15 +100,15 @@ def sweep(
     def step(state: _State) -> _State:
         change, y = _iterate(image, state, in_halves)
         correction = tolerance.measure(change, scale(value_of(y)))
-        # The first of the sweeps changed the values by no more than the state is.
+        # The first correction is bounded by the size of the state.
         earlier = jnp.minimum(state.level, log2(correction.bound))
         level = log2(correction.size)
         check = ft.partial(_check, state, level, earlier, correction, first, most)
-        # What follows reads it several times, and would compute it as often: steps of small
-        # systems took 1.3 to 2.8 times as long. So would the logarithms if more than one
-        # kernel read them: 1.1 times for ten arrays.
+        # Without `materialize` the result would be recomputed wherever it is used: steps of
+        # small systems took 1.3 to 2.8 times as long. The logarithms are inside, so that
+        # only one kernel reads them: otherwise ten arrays took 1.1 times as long.
         new, back = materialize(check)
-        # The sweeps of all paths of a batch are the same, but each path has only its own.
+        # All paths of a batch sweep together, but each keeps only its own sweeps.
         restart = lambda y, start: jnp.where(back, start, y)
         own = lambda y, start, old: jnp.where(state.pending, restart(y, start), old)
         return new._replace(y=jtu.tree_map(own, y, start, state.y))
@@ -121,8 +123,7 @@ def sweep(
 def _iterate(
     image: Map, state: _State, in_halves: bool
 ) -> tuple[PyTree[Array], Halves]:
-    """How far the halves are from a solution after all sweeps until the next check, and
-    these halves."""
+    """The last correction after all sweeps until the next check, and the iterate."""
     p_of = lambda y: image(y).p if in_halves else image(y.q)
     q_of = lambda y: image(y).q if in_halves else image(y.p)
 
@@ -136,10 +137,11 @@ def _iterate(
 
     if not in_halves:
         y = lax.fori_loop(0, state.ahead, once, state.y)
-        # Where both solve y = \Phi(\Phi(y)), only their difference shows it.
+        # The halves may converge to different solutions of y = \Phi(\Phi(y)); only their
+        # difference shows that.
         return (y.q**ω - y.p**ω).ω, y
-    # A loop that also kept the iterate before would copy it in each sweep: steps of 64
-    # pairs took 1.1 to 1.4 times as long, though the program was a tenth shorter.
+    # A loop that also carried the previous iterate would copy it in each sweep: steps of 64
+    # pairs took 1.1 to 1.4 times as long, although the program was a tenth shorter.
     before = lax.fori_loop(0, state.ahead - 1, once, state.y)
     y = once(None, before)
     return (y**ω - before**ω).ω, y
@@ -153,8 +155,8 @@ def _check(
     first: int,
     most: int,
 ) -> tuple[_State, Bool[Array, ""]]:
-    """What the last correction says of convergence, for all but the iterate, and whether
-    that goes back to the guess. The logarithm of its size is `level`, and was `earlier`."""
+    """The next state, except for the iterate, and whether to go back to the guess. The
+    base-2 logarithms of the last and an earlier correction are `level` and `earlier`."""
     rate, done = (level - earlier) / state.ahead, state.done + state.ahead
     stalled = rate >= _STALLED
     solved = converged(level, rate, last.rounded, stalled)
@@ -166,7 +168,7 @@ def _check(
     pending = state.pending & ~solved & in_time & (done < most)
     near = ~stalled & (last.small | pending)
     count = jnp.where(again, first, further)
-    # What is as small as rounding errors shows no rate.
+    # Corrections as small as rounding errors show no rate.
     count = jnp.where(last.rounded, jnp.minimum(count, _MOST_ROUNDED), count)
     count = jnp.ceil(jnp.where(pending, count, 0)).astype(int)
     relaxation = jnp.where(tuned, 2 / (1 + jnp.sqrt(1 + a)), state.relaxation)

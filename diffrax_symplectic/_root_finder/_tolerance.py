@@ -1,4 +1,4 @@
-"""When a correction is small enough."""
+"""The convergence criterion: when a correction is small enough."""
 
 import functools as ft
 from collections.abc import Callable
@@ -13,22 +13,21 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 
 _Flag: TypeAlias = Bool[Array, ""]
 
-# Up to this many entries the maximum is written out. XLA fuses no reduction with what its
-# result goes into, and on CPUs it reduces short axes slowly.
+# Up to this many entries the maximum is unrolled. XLA does not fuse a reduction with the
+# users of its result, and reduces short axes slowly on CPUs.
 _SHORT = 4
-# Longer ones are folded to this length, by what fuses with the program that makes them. Of
-# what is longer XLA keeps another array for each maximum.
+# Longer arrays are first folded to this length, elementwise, which fuses with their
+# computation. Each reduction of a longer array would need a temporary array.
 _WIDE = 32
 
 
 class Correction(NamedTuple):
-    """How large a correction is.
+    """The size of a correction.
 
-    - `size`: in units of the tolerance, leaf by leaf: 1 is just accepted.
-    - `bound`: what its `size` would be if it were as large as the whole state.
-    - `rounded`: whether it is as small as rounding errors of the whole state. These can
-        keep the corrections to a leaf that is small next to the others above its own
-        tolerance for ever.
+    - `size`: the largest over all leaves, in units of their tolerances: 1 is just accepted.
+    - `bound`: the `size` of a correction as large as the whole state.
+    - `rounded`: whether it is as small as rounding errors of the whole state, which can
+        keep the corrections of a comparatively small leaf above its own tolerance forever.
     - `small`: whether it is below a hundredth of the whole state.
     """
 
@@ -39,8 +38,8 @@ class Correction(NamedTuple):
 
 
 class Tolerance(NamedTuple):
-    """A correction is measured in units of `rtol * scale + atol`, leaf by leaf. `rtol` of
-    `None` stands for two units in the last place."""
+    """Measures corrections in units of `rtol * scale + atol`, leaf by leaf. An `rtol` of
+    `None` is two units in the last place."""
 
     rtol: float | None
     atol: float
@@ -55,7 +54,7 @@ class Tolerance(NamedTuple):
         sizes, scales = self.sizes(change), self.sizes(scale)
         whole = largest(scales)
         size, bound = self._in_units(sizes, scales), self._in_units([whole], [whole])
-        # An infinite correction to an infinite state is neither.
+        # Strictly below, so that an infinite correction to an infinite state is neither.
         eps = float(jnp.finfo(size.dtype).eps)
         below = lambda fraction: largest(sizes) < fraction * whole
         return Correction(size, bound, below(100 * eps), below(0.01))
@@ -70,9 +69,9 @@ class Tolerance(NamedTuple):
 def max_norm(x: Array) -> Scalar:
     if x.size == 1:
         return jnp.abs(x).reshape(())
-    # The bits of floats that are not negative, read as integers, have the order of the
-    # values, and NaNs are the largest. The maximum of floats may lose these; together with
-    # a test for them, steps of 16 pairs took 1.1 times as long in single precision.
+    # The bits of nonnegative floats, read as integers, are ordered like their values, with
+    # NaNs largest. The maximum of floats may lose NaNs; with an extra test for them, steps
+    # of 16 pairs took 1.1 times as long in single precision.
     kind = f"int{jnp.finfo(x.dtype).bits}"
     bits = lax.bitcast_convert_type(jnp.abs(x), kind).reshape(-1)
     while (n := bits.size) > (1 if x.size <= _SHORT else _WIDE):
@@ -89,27 +88,27 @@ def all_finite(y: PyTree[Array]) -> _Flag:
 
 
 def ratio(a: Array, b: Array) -> Array:
-    """`a / b`, with `0 / 0 = 0`: no correction at all is no error at all."""
+    """`a / b`, with `0 / 0 = 0`: a zero correction is no error."""
     return jnp.where(a == 0, 0, a / b)
 
 
 def log2(x: Scalar) -> Scalar:
-    """The logarithm of a positive number to within 0.09: the exponent, and the mantissa as
-    a straight line. With that of a library steps took 1.05 to 1.4 times as long. Zero has
-    that of a number below all others, and NaN one above all."""
+    """The base-2 logarithm of a positive number to within 0.09, with the mantissa as a
+    linear interpolation. With the library function steps took 1.05 to 1.4 times as long.
+    Zero is below all other numbers, and NaN above."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(jnp.abs(x), f"int{info.bits}").astype(x.dtype)
     return bits * 2.0**-info.nmant + float(info.minexp - 1)
 
 
-# The next correction has to be below the tolerance by a factor of 64, of which this is the
-# logarithm. What is left out has the same sign in every step. Over many steps it adds up to
-# a drift, where rounding errors cancel.
+# The base-2 logarithm of 64, the factor by which the next correction must be below the
+# tolerance. The remaining error has the same sign in every step and would add up to a
+# drift, while rounding errors cancel.
 MARGIN = 6
 
 
 def converged(level: Scalar, rate: Scalar, rounded: _Flag, stalled: _Flag) -> _Flag:
-    """Whether the next correction is below the tolerance, when logarithms of the size of
-    the last one, in units of it, and of its ratio to the one before, are `level` and
-    `rate`; or corrections have `stalled`, and all of them are tiny."""
+    """Whether the next correction will be below the tolerance; or corrections have
+    `stalled` at rounding errors. `level` and `rate` are the base-2 logarithms of the last
+    correction, in units of the tolerance, and of its ratio to the previous one."""
     return (level + jnp.minimum(rate, 0) <= -MARGIN) | (stalled & rounded)

@@ -1,5 +1,5 @@
-"""Friction `dp = -gamma p dt`: its rates, its exact flow, and the exact law of the noise
-that comes with it over a step."""
+"""Friction `dp = -gamma p dt`: its rates, its exact flow, and the exact law of its noise
+over a step."""
 
 import functools as ft
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._terms import rate, split_terms
 
 
-# What the solvers say of this argument.
+# The documentation of this argument in all solvers.
 GAMMA = """the friction rate, in units of one over time: a number; or an array or PyTree
     like `p`, whose arrays are scalars, have one rate for each momentum, or are matrices
     (with the shape of the momenta twice, `(n, n)` for `n` momenta). A matrix must be
@@ -31,7 +31,7 @@ GAMMA = """the friction rate, in units of one over time: a number; or an array o
 
 
 class Fault(NamedTuple):
-    """Why an array of `gamma` cannot serve as a matrix, or not without masses that make it
+    """Why an array of `gamma` cannot serve as a matrix, or only with `masses` that make it
     symmetric."""
 
     reason: str
@@ -42,7 +42,7 @@ UNKNOWN = Fault("its values are traced", masses=True)
 
 
 def checked(gamma: PyTree) -> PyTree:
-    """`gamma`, after a check of those of its values that are not traced."""
+    """`gamma`, after a check of all values that are not traced."""
     for leaf in jtu.tree_leaves(gamma):
         is_number = eqx.is_array_like(leaf) and not isinstance(leaf, bool)
         if not is_number or np.iscomplexobj(leaf):
@@ -60,8 +60,8 @@ def checked(gamma: PyTree) -> PyTree:
         fault = _matrix_fault(values)
         if fault == _NO_SQUARE:
             raise ValueError(
-                "`gamma` must not be negative: it takes momentum away at this rate; got "
-                f"{leaf!r}."
+                "`gamma` must not be negative: it is the rate at which momentum decays; "
+                f"got {leaf!r}."
             )
         if fault is not None and not fault.masses:
             raise ValueError(
@@ -72,14 +72,14 @@ def checked(gamma: PyTree) -> PyTree:
 
 
 def matrix_faults(gamma: PyTree) -> tuple[Fault | None, ...]:
-    """Why each array of `gamma` cannot serve as a matrix; `None` if it can. Whether it has
-    to serve as one is seen from the momenta only."""
+    """Why each array of `gamma` cannot serve as a matrix; `None` if it can. Whether it must
+    is known only from the shape of the momenta."""
     known = lambda x: not isinstance(x, jax.core.Tracer)
     leaves = jtu.tree_leaves(gamma)
     return tuple(_matrix_fault(np.asarray(x)) if known(x) else UNKNOWN for x in leaves)
 
 
-_NO_SQUARE = Fault("it is no square matrix")
+_NO_SQUARE = Fault("it is not a square matrix")
 
 
 def _matrix_fault(values: np.ndarray) -> Fault | None:
@@ -92,7 +92,7 @@ def _matrix_fault(values: np.ndarray) -> Fault | None:
     eps = np.finfo(np.result_type(matrix, np.float32)).eps
     size = 100 * eps * np.max(np.abs(matrix), initial=0)
     symmetric = np.all(np.abs(matrix - matrix.T) <= size)
-    # Of a matrix that is symmetric with some masses the eigenvalues are real, too.
+    # A matrix that some masses make symmetric has real eigenvalues, too.
     rates = np.linalg.eigvalsh(matrix) if symmetric else np.linalg.eigvals(matrix)
     bound = size * len(matrix) * (1 if symmetric else eps**-0.5)
     if not symmetric and np.any(np.abs(rates.imag) > bound):
@@ -103,8 +103,8 @@ def _matrix_fault(values: np.ndarray) -> Fault | None:
 
 
 class Modes(NamedTuple):
-    r"""A matrix of friction as `left @ diag(rates) @ right`, where `left` and `right` are
-    inverse to each other."""
+    r"""A friction matrix as `left @ diag(rates) @ right`, where `left` and `right` are
+    inverses of each other."""
 
     rates: Float[Array, " n"]
     left: Float[Array, "n n"]
@@ -117,9 +117,9 @@ def friction_modes(
     p: PyTree[Array],
     velocity: Callable[[PyTree[Array]], PyTree[Array]],
 ) -> list[Modes | None]:
-    """The modes of `gamma` for each array of `p`; `None` where it is no matrix. They do not
-    change during a solve. `velocity(p)` tells the masses. Raises a `ValueError` if `gamma`
-    does not fit `p`."""
+    """The modes of `gamma` for each array of `p`; `None` where it is not a matrix. They are
+    constant during a solve. The masses come from `velocity(p)`. Raises a `ValueError` if
+    `gamma` does not fit `p`."""
     leaves = jtu.tree_leaves(p)
     faults = faults if len(faults) == len(leaves) else faults * len(leaves)
     found = []
@@ -130,7 +130,7 @@ def friction_modes(
         if jnp.shape(g) != jnp.shape(x) * 2:
             raise ValueError(
                 "An array of `gamma` must be a scalar, or have the shape of its momenta, "
-                f"{jnp.shape(x)}, or for a matrix of them {jnp.shape(x) * 2}; got shape "
+                f"{jnp.shape(x)}, or as a matrix the shape {jnp.shape(x) * 2}; got shape "
                 f"{jnp.shape(g)}."
             )
         matrix = _as_matrix(jax.lax.stop_gradient(g), x)
@@ -152,12 +152,12 @@ def friction_modes(
 def velocity_of(terms: PyTree[diffrax.AbstractTerm], t0, y0: Y, args: Args) -> Callable:
     """The velocities as a function of the momenta, at the start of a solve."""
     drift, _ = split_terms(terms)
-    # In a solve backward in time they change their signs.
+    # In a solve backward in time they change sign.
     return lambda p: (direction(terms) * rate(drift, t0, (p, y0[1]), args)[1] ** ω).ω
 
 
 def _inverse_mass(velocity: Callable, p: PyTree[Array], number: int) -> Array:
-    """The derivative of the velocities by the momenta, for one of the arrays of `p`."""
+    """The derivative of the velocities with respect to one of the arrays of `p`."""
     leaves, treedef = jtu.tree_flatten(jax.lax.stop_gradient(p))
     x = leaves[number]
 
@@ -172,8 +172,8 @@ def _inverse_mass(velocity: Callable, p: PyTree[Array], number: int) -> Array:
 def friction_result(
     gamma: PyTree[ArrayLike], modes: list[Modes | None], result: diffrax.RESULTS
 ) -> diffrax.RESULTS:
-    """`result`, or where values of `gamma` that were traced are no friction (negative, not
-    finite, or as a matrix not symmetric positive semidefinite) `RESULTS.nonfinite`."""
+    """`result`, or `RESULTS.nonfinite` if traced values of `gamma` are invalid (negative,
+    not finite, or as a matrix not symmetric positive semidefinite)."""
     leaves = jtu.tree_leaves(gamma)
     leaves = leaves if len(leaves) == len(modes) else leaves * len(modes)
     traced = lambda x: isinstance(x, jax.core.Tracer)
@@ -212,7 +212,7 @@ def _as_matrix(g: ArrayLike, x: Array) -> Float[Array, "n n"]:
 def _modes(matrix: Float[Array, "n n"]) -> Modes:
     rates, axes = jnp.linalg.eigh(matrix)
     size = 100 * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
-    # As below: values that are traced cannot raise an error.
+    # Traced values cannot raise an error; NaN makes their path fail.
     bad = ~_is_symmetric(matrix) | ~jnp.all(rates >= -size * len(matrix))
     return Modes(jnp.where(bad, jnp.nan, jnp.maximum(rates, 0)), axes, axes.T)
 
@@ -220,8 +220,8 @@ def _modes(matrix: Float[Array, "n n"]) -> Modes:
 def _with_masses(
     matrix: Float[Array, "n n"], inverse_mass: Float[Array, "n n"]
 ) -> Modes:
-    r"""Of a matrix that is symmetric, or else of $\gamma = \Gamma M^{-1}$ with a symmetric
-    $\Gamma$: with $M^{-1} = L L^\top$ that is $L^{-\top} (L^\top \Gamma L) L^\top$."""
+    r"""The modes of a symmetric matrix, or of $\gamma = \Gamma M^{-1}$ with a symmetric
+    $\Gamma$. With $M^{-1} = L L^\top$, $\gamma = L^{-\top} (L^\top \Gamma L) L^\top$."""
     one = jnp.eye(len(matrix), dtype=matrix.dtype)
     root = jnp.linalg.cholesky(inverse_mass)
     up = jnp.where(_is_symmetric(matrix), one, root.T)
@@ -236,17 +236,17 @@ def _is_symmetric(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
 
 
 def decay(x: Array) -> Array:
-    """What is left of a momentum after `x` times the time in which it falls by e."""
+    """The factor by which a momentum decays in `x` times its relaxation time."""
     return jnp.exp(-x)
 
 
 def spread(x: Array) -> Array:
     r"""The standard deviation of $\int_0^t e^{-\gamma (t - s)} \mathrm{d}w_s$ in units of
-    $\sqrt t$, with $x = \gamma t$: the root of $(1 - e^{-2 x}) / (2 x)$, also at $x < 0$.
-    """
+    $\sqrt t$, with $x = \gamma t$: the root of $(1 - e^{-2 x}) / (2 x)$. $x$ may be
+    negative."""
     near = jnp.abs(x) < 0.1
     y = jnp.where(near, x, 0) ** 2
-    # sinh(x) / x, and no cancellation.
+    # sinh(x) / x, without cancellation.
     sinhc = 1 + y / 6 * (1 + y / 20 * (1 + y / 42 * (1 + y / 72)))
     far = jnp.where(near, 1, x)
     other = -jnp.expm1(-2 * far) / (2 * far)
@@ -259,8 +259,8 @@ def apply_friction(
     time: RealScalarLike,
     *parts: tuple[Callable[[Array], Array], PyTree[Array]],
 ) -> PyTree[Array]:
-    """The sum of `fn(gamma time) p` over `(fn, p)` in `parts`, with functions of a matrix
-    where `gamma` is one."""
+    """The sum of `fn(gamma time) p` over `(fn, p)` in `parts`. Where `gamma` is a matrix,
+    `fn` is a matrix function."""
     fns, ps = zip(*parts)
     leaves = list(zip(*map(jtu.tree_leaves, ps)))
     rates, times = _for_each(gamma, ps[0]), [_like(time, xs[0]) for xs in leaves]
@@ -279,8 +279,8 @@ def apply_friction(
         flat = sum(_of_matrix(fn, matrix, mode, t, x) for fn, x in parts)
         return jnp.reshape(flat, jnp.shape(xs[0]))
 
-    # In a batch the factors are those of all paths. Fused into the loop over the batch,
-    # they would be computed for each of them.
+    # All paths of a batch share these factors. Fused into the loop over the batch, they
+    # would be recomputed for each path.
     fixed = materialize(factors)
     summed = map(each, fixed, rates, modes, times, leaves)
     return jtu.tree_structure(ps[0]).unflatten(summed)
@@ -291,14 +291,14 @@ def _like(x: ArrayLike, y: Array) -> Array:
 
 
 def _factor(fn: Callable[[Array], Array], g: Array, time: Array) -> Array:
-    # Values that are traced cannot raise an error here. They make their path fail.
+    # Traced values cannot raise an error; NaN makes their path fail.
     return jnp.where(_no_rate(g), jnp.nan, fn(g * time))
 
 
 _dot = ft.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
 
 
-# The modes of equal rates are not unique and have no derivative. The function has one.
+# Modes with equal rates are not unique and have no derivative, but the matrix function has.
 @ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _of_matrix(fn, matrix, modes: Modes, time, x) -> Array:
     rates, left, right = modes
@@ -309,7 +309,7 @@ def _of_matrix(fn, matrix, modes: Modes, time, x) -> Array:
 def _(fn, primals, tangents):
     matrix, modes, time, x = primals
     d_matrix, _, d_time, d_x = tangents
-    # The modes are constants here, so that a second derivative would be wrong.
+    # The modes are treated as constants, so a second derivative would be wrong.
     matrix = nondifferentiable(matrix, name="the matrix `gamma`, a second time")
     del matrix
     rates, left, right = modes
@@ -333,7 +333,7 @@ def _divided_differences(fn: Callable, x: Float[Array, " n"]) -> Float[Array, "n
     gap = x[:, None] - x[None, :]
     near = jnp.abs(gap) < 1
     quotient = (fn(x)[:, None] - fn(x)[None, :]) / jnp.where(near, 1, gap)
-    # The mean of the derivative between them, by Gauss's rule.
+    # The mean of the derivative between the two, by Gauss quadrature.
     points, weights = np.polynomial.legendre.leggauss(8)
     share = jnp.asarray((1 + points) / 2, x.dtype)
     between = x[None, :, None] + jnp.where(near, gap, 0)[..., None] * share

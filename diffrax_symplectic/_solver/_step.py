@@ -1,5 +1,5 @@
-"""One step by the plan of a tableau: its stages, their equations solved, and differentiated
-as what they define."""
+"""A step by the plan of a tableau: its stages, and the solution of the stage equations with
+implicit differentiation."""
 
 import functools as ft
 from collections.abc import Callable
@@ -28,18 +28,18 @@ from .._tableau import FlatTableau, Stage
 from .._terms import tree_sum
 
 
-# The value of one stage: the change of the part of the state that it writes.
+# The value of a stage: the change of the part of the state that it writes.
 _Value: TypeAlias = PyTree[Array]
-# The values of the stages known so far, by their numbers.
+# The values of the stages known so far, by stage number.
 Values: TypeAlias = dict[int, _Value]
 # The values of the unknown stages: for each block, for each of its groups.
 Unknown: TypeAlias = list[list[_Value]]
-# What drives stages of one channel: from time and state to vector field times control.
+# The vector field of one channel times its control, as a function of time and state.
 Driven: TypeAlias = Callable[[RealScalarLike, Y], Y]
 
 
 class Step(NamedTuple):
-    """One step from `t0` over `h`, driven by `driven`, a function for each channel."""
+    """One step from `t0` over `h`, with a function for each channel."""
 
     t0: RealScalarLike
     h: RealScalarLike
@@ -47,8 +47,7 @@ class Step(NamedTuple):
 
 
 class Stages(AbstractBlocks):
-    """The stages of one step, in the blocks of its plan. Values of stages that are not
-    known count as zero."""
+    """The stages of one step, in the blocks of its plan. Unknown values count as zero."""
 
     plan: Plan = eqx.field(static=True)
     step: Step
@@ -66,8 +65,8 @@ class Stages(AbstractBlocks):
         return [zero(group) for group in block.unknown]
 
     def sweep(self, solve: Callable, guess: Unknown, pending):
-        """First iterations for the stage equations: block after block, each from the values
-        of those before it."""
+        """Sweeps for the stage equations, block by block, each with the values of earlier
+        blocks."""
         values, y = {}, []
         solved = jnp.array(True)
         for block, k in zip(self.plan.blocks, guess):
@@ -98,7 +97,7 @@ class Stages(AbstractBlocks):
     def _with_block(
         self, block: Block, values: Values, unknown: list[_Value], keep: bool = False
     ) -> Values:
-        """`values` with those of the stages of a block. With `keep`, explicit ones that
+        """`values` with the stages of a block added. With `keep`, explicit stages that
         enter several positions are computed only once."""
         for group, value in zip(block.unknown, unknown):
             values = values | _unstack(group, value)
@@ -117,8 +116,7 @@ class Stages(AbstractBlocks):
         return _position(self.y0, tableau.stages, tableau.weights[None], values)
 
     def scale(self, unknown: Unknown) -> Unknown:
-        """How large the state is that unknown values change: they are only needed to its
-        accuracy."""
+        """The size of the state that unknown values change, which sets their tolerance."""
         return [self._scale(block, k) for block, k in zip(self.plan.blocks, unknown)]
 
     def _scale(self, block: Block, unknown: list[_Value]) -> list[_Value]:
@@ -129,14 +127,14 @@ class Stages(AbstractBlocks):
         return [scale(group, k) for group, k in zip(block.unknown, unknown)]
 
     def _evaluate_group(self, group: tuple[int, ...], values: Values) -> _Value:
-        """The values of stages of one kind; stacked, unless it is only one."""
+        """The values of stages of one kind, stacked unless there is only one."""
         stages, matrix = self.plan.tableau.stages, self.plan.tableau.matrix
         position = _position(self.y0, stages, matrix[list(group)], values)
         return _evaluate(self.step, [stages[i] for i in group], position)
 
 
 def closed(step: Step, y0: Y) -> Step:
-    """The same step, with all arrays that its functions capture as parts of it. Each
+    """The same step, with the arrays that its functions capture made explicit. Each
     function is traced once, here."""
     dtype = jnp.result_type(step.t0, step.h, float)
     t0, h = jnp.asarray(step.t0, dtype), jnp.asarray(step.h, dtype)
@@ -145,7 +143,8 @@ def closed(step: Step, y0: Y) -> Step:
 
 
 def _uses(tableau: FlatTableau, group: tuple[int, ...]) -> int:
-    """How many positions the values of `group` enter, the end of the step included."""
+    """The number of positions that the values of `group` enter, including the end of the
+    step."""
     columns = np.vstack([tableau.matrix, tableau.weights])[:, list(group)]
     return int(np.count_nonzero(columns.any(axis=1)))
 
@@ -167,7 +166,7 @@ def _evaluate(step: Step, stages: list[Stage], y: Y) -> _Value:
 
     if len(stages) == 1:
         return value(first.c, y)
-    # Under `vmap`, for code and arrays of the size of one evaluation, not of many.
+    # `vmap` keeps the compiled code as small as for one evaluation.
     c = [stage.c for stage in stages]
     if len(set(c)) == 1:
         return jax.vmap(value, in_axes=(None, 0))(c[0], y)
@@ -181,8 +180,8 @@ def _part(y: PyTree, part: str) -> PyTree:
 def _position(
     y0: Y, stages: tuple[Stage, ...], rows: np.ndarray, values: dict[int, _Value]
 ) -> PyTree[Array]:
-    """`y0 + sum_i rows[:, i] values[i]`, over the values there are. Stacked, unless it is
-    only one row."""
+    """`y0 + sum_i rows[:, i] values[i]` over the known values, stacked unless there is only
+    one row."""
 
     def scaled(i: int) -> PyTree[Array]:
         column = rows[:, i]
@@ -202,14 +201,13 @@ def _position(
         if total is None:
             stack = lambda x: jnp.broadcast_to(x, (len(rows), *jnp.shape(x)))
             return base if len(rows) == 1 else jtu.tree_map(stack, base)
-        # The small terms first: fewer roundings of the size of the state.
+        # Add the small terms first, for fewer roundings at the size of the state.
         return (base**ω + total**ω).ω
 
     return add("y") if stages[0].writes == "y" else (add("p"), add("q"))
 
 
-# What became of the stage equations of a step, or of one before it that failed; `None`
-# where there are none.
+# The result of the stage equations, or of an earlier failed step; `None` if there are none.
 Solved: TypeAlias = optx.RESULTS | None
 
 
@@ -220,14 +218,14 @@ def take_step(
     solver: diffrax.AbstractSolver,
     before: Solved = None,
 ) -> tuple[Y, Solved]:
-    """The end of the step, and whether its stage equations were solved. The root finder of
-    `solver` solves them, unless a step `before` has failed."""
+    """The end of the step, and whether its stage equations were solved, by the root finder
+    of `solver`. A path that failed `before` is skipped."""
     if plan.num_unknown == 0:
         return Stages(plan, step, y0).end([[]] * len(plan.blocks)), before
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         raise ValueError(
             f"The tableau of `{type(solver).__name__}` has implicit stages. Let the class "
-            "also subclass `diffrax_symplectic.AbstractImplicitStages`."
+            "also inherit from `diffrax_symplectic.AbstractImplicitStages`."
         )
     before = no_failure() if before is None else before
     finder, most = solver.root_finder, solver.root_find_max_steps
@@ -243,7 +241,7 @@ def _failed(result: optx.RESULTS) -> Bool[Array, ""]:
 
 
 def result_of(solved: Solved, y1: Y) -> diffrax.RESULTS:
-    """Whether the end of a step was reached."""
+    """The result of a step."""
     R = diffrax.RESULTS
     finite = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
     if solved is None:
@@ -251,7 +249,7 @@ def result_of(solved: Solved, y1: Y) -> diffrax.RESULTS:
     return R.where(_failed(solved), R.promote(solved), finite)
 
 
-# Diffrax traces a step three times, or more.
+# Diffrax traces a step three times or more.
 @eqx.filter_jit
 def _traced_once(plan: Plan, step: Step, y0: Y, before, finder: Any, max_steps: int):
     stages = Stages(plan, closed(step, y0), y0)
@@ -263,17 +261,17 @@ def _traced_once(plan: Plan, step: Step, y0: Y, before, finder: Any, max_steps: 
 def _implicit_step(
     stages: Stages, before: optx.RESULTS, *, finder: Any, max_steps: int
 ) -> tuple[Y, Unknown, optx.RESULTS]:
-    """The end of the step, the values of its unknown stages, and whether these solve the
-    stage equations. No time is spent on a path that failed `before`."""
+    """The end of the step, the values of its unknown stages, and whether they solve the
+    stage equations. No time is spent on paths that failed `before`."""
     if isinstance(finder, optx.BestSoFarRootFinder):
         raise ValueError(
-            "`BestSoFarRootFinder` returns an iterate from before the last correction. It "
-            "does not solve the stage equations. Pass the root finder within it."
+            "`BestSoFarRootFinder` returns an iterate from before the last correction, "
+            "which does not solve the stage equations. Pass the root finder that it wraps."
         )
     lost = _failed(before)
     guess = [stages.zero_of(block) for block in stages.plan.blocks]
     guess, lost = batched_like((guess, lost), (stages, before))
-    # Optimistix ends at once where the guess is not finite.
+    # Optimistix stops at once if the guess is not finite.
     guess = jtu.tree_map(lambda k: jnp.where(lost, jnp.nan, k), guess)
     sol = optx.root_find(
         lambda k, stages: (k**ω - stages.image(k) ** ω).ω,
@@ -294,8 +292,8 @@ def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
     y1, unknown, result = _implicit_step(
         stages, before, finder=finder, max_steps=max_steps
     )
-    # Where there is no solution there is no derivative either. It is zero for such a
-    # path, and no number that is not finite spoils what other paths have in common with it.
+    # Without a solution there is no derivative. It is set to zero, so that a failed path
+    # does not spoil gradients that are summed over a batch.
     failed = _failed(result) | ~all_finite(y1)
     root = jtu.tree_map(lambda k: jnp.where(failed, 0, k), unknown)
 

@@ -1,4 +1,4 @@
-"""Whether floating-point times resolve a step, and Brownian paths cover it."""
+"""Checks that floating-point times resolve a step, and that Brownian paths cover it."""
 
 from typing import Any
 
@@ -13,22 +13,22 @@ from .._custom_types import RealScalarLike
 from .._terms import brownian_paths
 
 
-# Diffrax merges the rest of a solve into its last step if it is shorter than a hundred
-# units in the last place of the end.
+# Diffrax merges the remainder of a solve into its last step if it is shorter than a hundred
+# units in the last place of `t1`.
 ROUNDINGS = 100
 _OUTSIDE = (
-    "A step goes beyond `path.t0` or `path.t1` of a Brownian path, where its noise is not "
-    "known. Solve within these times, or pass a longer path."
+    "A step goes beyond `path.t0` or `path.t1` of a Brownian path, where its noise is "
+    "undefined. Solve within these times, or pass a longer path."
 )
 
 
 def check_resolution(h: float, t0: float, t1: float, dtype: Any) -> None:
-    """Raises a `ValueError` if steps of this size are reported as failed by `result_at`."""
+    """Raises a `ValueError` if `result_at` would report steps of this size as failed."""
     if h < ROUNDINGS * float(jnp.finfo(dtype).eps) * max(abs(t0), abs(t1)):
         raise ValueError(
             f"Steps of {h:g} are shorter than {ROUNDINGS} times the rounding of the time "
             f"in {dtype} at t0={t0} and t1={t1}. Call `jax.config.update("
-            '"jax_enable_x64", True)` first, take longer steps, or begin at `t0=0`.'
+            '"jax_enable_x64", True)` first, take longer steps, or start at `t0=0`.'
         )
 
 
@@ -38,8 +38,8 @@ def result_at(
     t1: RealScalarLike,
     result: diffrax.RESULTS,
 ) -> diffrax.RESULTS:
-    """`result` of the step from `t0` to `t1`, or `RESULTS.dt_min_reached` if its length is
-    changed by rounding. An error when run if a path does not cover it."""
+    """`result` of the step from `t0` to `t1`, or `RESULTS.dt_min_reached` if it is too
+    short for the rounding of times. An error when run if a path does not cover the step."""
     R: Any = diffrax.RESULTS
     t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
     h, eps = t1 - t0, float(jnp.finfo(jnp.result_type(t0, jnp.float32)).eps)

@@ -1,4 +1,4 @@
-"""The common base of all solvers, the record of facts about a solver, and the step of any
+"""The base classes of all solvers, the record of facts about a solver, and the step of a
 tableau."""
 
 import abc
@@ -41,7 +41,7 @@ else:
 
 Want: TypeAlias = Literal["weak", "strong"]
 Noises: TypeAlias = Literal["any", "commuting", "not commuting"]
-# One order for all noises; or the order for noises that commute, and for other noises.
+# One order for all noises; or the orders for noises that commute and for others.
 Order: TypeAlias = int | float | tuple[int | float, int | float]
 
 
@@ -49,11 +49,11 @@ class Record(NamedTuple):
     """Facts about a solver that do not follow from its coefficients. Orders, suggestions,
     the tables of the documentation and the tests of all solvers are made from it.
 
-    - `weak`: the order of its expectations.
-    - `strong`: the order of its paths, or `None` for a method for expectations alone.
+    - `weak`: its weak order.
+    - `strong`: its strong order, or `None` for a weak method.
     - `choose`: when to choose it, in a sentence.
-    - `noises`: the noises for which it is chosen. It takes any.
-    - `suggested`: what `suggest_solver` names it for.
+    - `noises`: the noises for which it is recommended. It accepts any.
+    - `suggested`: the kinds of convergence for which `suggest_solver` returns it.
     """
 
     weak: Order
@@ -67,21 +67,21 @@ class Record(NamedTuple):
         return order[0 if commute else 1] if isinstance(order, tuple) else order
 
 
-# Whether the stage equations were solved so far: in a batch Diffrax goes on to step paths
-# that have failed.
+# Whether all stage equations were solved so far: in a batch Diffrax continues to step
+# failed paths.
 SolverState: TypeAlias = Solved
 
 
 class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
-    """The base of all solvers of this package, and of your own that are no Runge--Kutta
-    methods.
+    """The base class of all solvers of this package, and of your own solvers that are not
+    Runge--Kutta methods.
 
-    A subclass is a Diffrax solver: it has `order`, `init` and `step`, which take any
-    Stratonovich terms. It states `structure` (`"any"`, `"separable"`, `"additive"`,
+    A subclass is a Diffrax solver, with `order`, `init` and `step`, which accept any
+    Stratonovich terms. It defines `structure` (`"any"`, `"separable"`, `"additive"`,
     `"constant"` or `"separable and constant"`), `variables` (the names of the random
     variables of a step, such as `("W",)`), and `stage_vectors(num_noises)`, and overrides
     `weak_order(terms)` and `strong_order(terms)`. Then [`diffrax_symplectic.Damped`][] and
-    [`diffrax_symplectic.LinearFlow`][] take it, and `solver.path(shape, key)` makes the
+    [`diffrax_symplectic.LinearFlow`][] can wrap it, and `solver.path(shape, key)` makes the
     path that it needs.
     """
 
@@ -95,23 +95,24 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
 
     @abc.abstractmethod
     def stage_vectors(self, num_noises: int) -> tuple[int, ...]:
-        """How many stage vectors each system of a step has, one system after another."""
+        """The number of unknown stage vectors in each system of equations of a step, in the
+        order in which the systems are solved."""
 
     @property
     def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
-        """The least that the increments of the path have to hold."""
+        """The least that the path's increments must contain."""
         for name, variable in VARIABLES.items():
             if name in self.variables:
                 return variable.increment
         return diffrax.AbstractBrownianIncrement
 
     def strong_order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | float | None:
-        """Order of convergence of paths."""
+        """Strong order of convergence. `None` for a weak method, or if it is not stated."""
         return self._order_for("strong", terms)
 
     def weak_order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | None:
-        """Order of convergence of expectations; for several noises the order if they do not
-        commute. `None` if it is not stated."""
+        """Weak order of convergence; with several noises, the order if they do not commute.
+        `None` if it is not stated."""
         return cast(int | None, self._order_for("weak", terms))
 
     def _order_for(self, want: Want, terms) -> int | float | None:
@@ -127,7 +128,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
         *,
         want: Want | None = None,
     ) -> diffrax.AbstractBrownianPath:
-        """A Brownian path with the random variables that the solver needs, for fixed steps.
+        """A Brownian path for fixed steps, with the random variables that the solver needs.
 
         **Arguments:**
 
@@ -135,8 +136,8 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
             `jax.ShapeDtypeStruct`s.
         - `key`: a JAX random key.
         - `want`: `"strong"` for the increments of a Brownian motion, `"weak"` for
-            discrete ones, where these suffice. By default `"strong"` if the solver has a
-            strong order, otherwise `"weak"`.
+            discrete increments where they suffice. By default `"strong"` if the solver has
+            a strong order, otherwise `"weak"`.
 
         **Raises:** a `ValueError` if `want`, `shape` or `key` is anything else.
         """
@@ -150,7 +151,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
         return kind.make(shape, key)
 
     def __repr__(self) -> str:
-        """The parameters that are not the defaults, in one line."""
+        """The parameters that differ from the defaults, in one line."""
         given = []
         for f in dataclasses.fields(self):
             value = getattr(self, f.name)
@@ -167,22 +168,22 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
 class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
     r"""A Runge--Kutta method with its own coefficients for drift and noise.
 
-    Subclasses give a `tableau`. If stages are implicit, they also subclass
+    Subclasses define a `tableau`. If it has implicit stages, they also inherit from
     [`diffrax_symplectic.AbstractImplicitStages`][]. Everything else follows from the
-    tableau: unused stages are dropped, equal ones are evaluated once, and implicit ones are
-    solved for in small systems, one after another, as far as the coefficients allow.
+    tableau: unused stages are dropped, equal stages are evaluated once, and implicit stages
+    are solved for one small system after another, as far as the coefficients allow.
 
-    **Terms.** `MultiTerm(drift, noise)` as from
-    [`diffrax_symplectic.hamiltonian_terms`][] or of Diffrax's own `ODETerm` and
-    `ControlTerm`; any number of noise terms; or the drift alone. A `ValueError` is raised
-    while tracing unless they have the structure of the tableau.
+    **Terms.** `MultiTerm(drift, noise)`, from [`diffrax_symplectic.hamiltonian_terms`][] or
+    made of Diffrax's own `ODETerm` and `ControlTerm`, with any number of noise terms; or
+    the drift alone. A `ValueError` is raised while tracing if they do not have the
+    structure of the tableau.
 
     **State.** Any PyTree of real floating-point arrays.
 
-    **Failures.** If a stage equation is not solved, or the step does not end at finite
-    numbers, is shorter than a hundred times the rounding of the time, or leaves the times
-    of its path, `diffeqsolve` raises an error, or with `throw=False` returns a
-    `sol.result`. In a batch the other paths go on.
+    **Failures.** A step fails if a stage equation is not solved, if its end is not finite,
+    if it is shorter than a hundred times the rounding of the time, or if it leaves the time
+    interval of its path. Then `diffeqsolve` raises an error, or with `throw=False` reports
+    it in `sol.result`. The other paths of a batch continue.
     """
 
     tableau: AbstractVar[AbstractTableau]
@@ -202,7 +203,7 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         return tuple(size for size in sizes if size > 0)
 
     def order(self, terms: PyTree[diffrax.AbstractTerm]) -> int:
-        """Order of convergence without noise, read off the coefficients of the drift."""
+        """Order of convergence without noise, computed from the coefficients."""
         del terms
         return drift_order(self.tableau.flatten())
 
@@ -237,8 +238,8 @@ def first_state(solver: AbstractSymplecticSolver) -> SolverState:
 
 
 def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTableau:
-    """Leaves out the stages that no term drives (an ODE has no noise), and the brackets of
-    drift and noise unless there are both."""
+    """Drops stages that no term drives (an ODE has no noise), and without drift the
+    brackets of drift and noise."""
     keep = [
         i
         for i, stage in enumerate(tableau.stages)
@@ -263,18 +264,18 @@ def _checked_root_finder(value: Any) -> Any:
     kinds = optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver
     if not isinstance(value, kinds):
         raise ValueError(
-            "`root_finder` must be a root finder of Optimistix, or "
+            "`root_finder` must be an Optimistix root finder, or "
             f"`PicardNewton(rtol=...)`; got {value!r}."
         )
     return value
 
 
 class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
-    """A solver with implicit stages, with the two fields that Diffrax asks for: the root
-    finder for the stage equations, and the most steps it may take in each step of the
-    solver. Both are given by keyword."""
+    """A solver with implicit stages. It adds the two fields that Diffrax requires, both
+    keyword-only: the root finder for the stage equations, and its maximum number of steps
+    in each step of the solver."""
 
-    # `optimistix.root_find` takes either kind of solver.
+    # `optimistix.root_find` accepts either kind of solver.
     root_finder: optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver = eqx.field(
         default=PicardNewton(), kw_only=True, converter=_checked_root_finder
     )
@@ -285,11 +286,11 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
     )
 
 
-# The lines about these fields in the documentation of every such solver's `__init__`.
+# The documentation of these fields in every implicit solver's `__init__`.
 ROOT_FINDER = """\
 - `root_finder`: any Optimistix root finder for the stage equations.
 - `root_find_max_steps`: the most steps that the root finder may take. `PicardNewton` takes
-    one, and has bounds of its own for its iterations.
+    one step, and limits its iterations itself.
 """
 ARGUMENTS = f"""**Arguments:**
 
@@ -297,7 +298,7 @@ ARGUMENTS = f"""**Arguments:**
 
 
 def one_parameter(name: str) -> str:
-    """The documentation of the `__init__` of a solver with one free parameter."""
+    """The documentation of `__init__` for a solver with one free parameter."""
     return f"""**Arguments:**
 
 - `{name}`: the free parameter, a Python float.
@@ -307,8 +308,8 @@ def one_parameter(name: str) -> str:
 
 
 def free_parameter(name: str, default: float) -> Any:
-    """The field of a solver for a parameter. Parameters decide which stages are used, so
-    they have to be known while tracing."""
+    """A solver's field for a free parameter. Parameters determine which stages are used, so
+    they must be known while tracing."""
     converter = ft.partial(real_number, name)
     return eqx.field(default=default, static=True, converter=converter)
 

@@ -1,5 +1,5 @@
-"""The random variables of a step: drawn from the paths of the terms, or given, for
-quadrature over their values."""
+"""The random variables of a step: drawn from the paths of the terms, or given values for
+quadrature."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -42,11 +42,11 @@ from ._vector_fields import (
 
 
 class StepVariables(NamedTuple):
-    """The random variables of a step, all of them independent.
+    """The independent random variables of a step.
 
     - `laws`: the law of each, for a step of size 1.
-    - `terms_with`: takes their values, in units of the root of the step size, to terms with
-        this increment in place of the path.
+    - `terms_with`: maps their values, in units of the square root of the step size, to
+        terms whose path has this increment.
     """
 
     laws: tuple[AbstractLaw, ...]
@@ -109,8 +109,8 @@ def _named(path: diffrax.AbstractBrownianPath) -> str:
 def controls(
     noise: tuple, names: list[str], t0, t1, solver: str, optional: tuple[str, ...] = ()
 ) -> dict[str, list]:
-    """The random variables of the step from `t0` to `t1`, for each noise term, and the
-    `optional` ones if all increments hold them."""
+    """The random variables of the step from `t0` to `t1` for each noise term, and the
+    `optional` ones if all increments have them."""
     t1 = _within_resolution(noise, t0, t1)
     options = {} if names == ["W"] else {"use_levy": True}
     drawn = lambda: [term.contr(t0, t1, **options) for term in noise]
@@ -118,7 +118,7 @@ def controls(
     increments = drawn() if cheap else materialize(drawn)
     if names == ["W"]:
         return {"W": increments}
-    # Those whose paths hold most come first: that advice is right for the others, too.
+    # Check the variable first whose paths hold most: its advice fits the others, too.
     held = lambda name: all(getattr(i, name, None) is not None for i in increments)
     for name in sorted(names, key=lambda x: [*VARIABLES, x].index(x)):
         if not held(name):
@@ -136,25 +136,25 @@ def controls(
 
 
 def _in_time(term: diffrax.AbstractTerm, name: str, x: PyTree[Array]) -> PyTree[Array]:
-    """Backward in time Diffrax changes the sign of all random variables. Even ones get it
-    back."""
+    """Restores the sign of even random variables, since backward in time Diffrax negates
+    all of them."""
     even = name in VARIABLES and VARIABLES[name].even
     return (direction(term) * x**ω).ω if even else x
 
 
 def _within_resolution(noise: tuple, t0, t1) -> RealScalarLike:
-    """`t1`, with an error when run if a tree interpolates within the step."""
+    """`t1`, with an error when run if a `VirtualBrownianTree` does not resolve the step."""
     h = jnp.abs(t1 - t0)
     for path in map(_innermost, brownian_paths(noise)):
         if isinstance(path, diffrax.VirtualBrownianTree):
-            tol = path.tol * (path.t1 - path.t0)  # kept in units of its length
-            # A step of a rounding error is none: Diffrax takes such at the end of a solve.
+            tol = path.tol * (path.t1 - path.t0)  # stored in units of its length
+            # Ignore steps of a rounding error, which Diffrax may take at the end.
             t1 = eqx.error_if(
                 jnp.asarray(t1),
                 (h < 0.999 * tol) & (h > 1e-6 * tol),
                 "A step is shorter than `tol` of the `VirtualBrownianTree`, which only "
-                "interpolates there, so that the noise would be too small. Pass a smaller "
-                "`tol`, or for fixed steps `FixedStepBrownianPath(shape, key)`.",
+                "interpolates at this scale, so the noise would be too small. Pass a "
+                "smaller `tol`, or for fixed steps `FixedStepBrownianPath(shape, key)`.",
             )
     return t1
 
@@ -166,7 +166,7 @@ def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPa
 
 
 def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
-    """Whether its random variables cost less to compute again than to keep."""
+    """Whether its random variables are cheaper to recompute than to store."""
     while isinstance(path, TruncatedBrownianPath | PlateauBrownianPath):
         path = path.path
     return isinstance(path, WeakBrownianPath | FixedStepBrownianPath)
@@ -182,8 +182,8 @@ def noise_driven(
     args: Args,
     solver: str,
 ) -> dict[str, jtu.Partial]:
-    """What drives noise stages over the step of size `h`, for each random variable; `drift`
-    drives drift stages."""
+    """For each random variable, the function that drives noise stages over the step of size
+    `h`; `drift` drives drift stages."""
     own = [VARIABLES[name].held if name in VARIABLES else None for name in names]
     needed = [
         x for name, held in zip(names, own) for x in (held[0] if held else [name])
@@ -204,11 +204,11 @@ def noise_driven(
             case _:
                 raise ValueError(
                     f"`{solver}` needs all noises in one term, whose path samples the Lévy "
-                    f"areas between them; got {len(noise)} noise terms."
+                    f"areas between them; got {len(noise)} noise terms. Combine them."
                 )
     return driven
 
 
 def drift_driven(drift: tuple, t0, t1, args: Args) -> jtu.Partial:
-    """What drives drift stages over the step."""
+    """The function that drives drift stages over the step."""
     return jtu.Partial(apply, drift, [x.contr(t0, t1) for x in drift], args)

@@ -1,4 +1,4 @@
-"""Which inputs the results of a function depend on."""
+"""Detects which inputs the results of a function depend on."""
 
 from collections.abc import Callable
 
@@ -10,12 +10,12 @@ from .._compat import dce_jaxpr
 
 
 class Dependence:
-    """The program of `fn(*inputs)`, traced once, whose results are known not to depend on
-    the inputs that JAX's dead-code elimination removes.
+    """The dependencies of `fn(*inputs)`, traced once: its results do not depend on inputs
+    that JAX's dead-code elimination removes.
 
-    This holds for all values of the inputs. The converse does not: variables that cancel,
-    as in `x - x`, or that are multiplied by zeros, count as read. Arrays are followed as
-    wholes, not entry by entry.
+    This holds for all values of the inputs. The converse does not hold: variables that
+    cancel, as in `x - x`, or are multiplied by zero count as read. Arrays are tracked as a
+    whole, not entry by entry.
     """
 
     def __init__(self, fn: Callable, *inputs: PyTree):
@@ -23,7 +23,7 @@ class Dependence:
         self._jaxpr, self._inputs = closed.jaxpr, inputs
 
     def independent(self, of: Callable, part: Callable = lambda out: out) -> bool:
-        """Whether `part(result)` does not depend on `of(*inputs)`, PyTrees of arrays."""
+        """Whether `part(result)` is independent of `of(*inputs)`, PyTrees of arrays."""
         _, read = dce_jaxpr(self._jaxpr, _marked(part, self._out))
         marked = _marked(lambda inputs: of(*inputs), self._inputs)
         return not any(a and b for a, b in zip(read, marked))

@@ -39,9 +39,9 @@ def hamiltonian_terms(
       \mathrm{d}q = \frac{\partial H_0}{\partial p}\,\mathrm{d}t
         + \sum_{k=1}^m \frac{\partial H_k}{\partial p} \circ \mathrm{d}w_k.$$
 
-    Any Stratonovich solver, of this package or of Diffrax, takes these terms. The noise of
-    a step is the gradient of one scalar, $\sum_k I_k H_k$, and costs one reverse pass
-    whatever the number of noises.
+    Any Stratonovich solver, from this package or from Diffrax, accepts these terms. The
+    noise of a step is the gradient of one scalar, $\sum_k I_k H_k$, and costs one reverse
+    pass for any number of noises.
 
     **Arguments:**
 
@@ -49,33 +49,33 @@ def hamiltonian_terms(
         differentiable with respect to these and to `args`.
     - `noise`: `noise(t, p, q, args)`, the noise Hamiltonians $H_1, \ldots, H_m$ as an
         array of shape `(m,)`, or in the structure and shapes of `path`; a scalar if `m =
-        1`. Or an [`diffrax_symplectic.IndexedNoise`][]. For a system without noise leave
-        out `noise` and `path`.
-    - `path`: a Brownian path of shape `(m,)`. Or, where the solver is not known yet, its
+        1`. Or an [`diffrax_symplectic.IndexedNoise`][]. For a system without noise omit
+        `noise` and `path`.
+    - `path`: a Brownian path of shape `(m,)`. If the solver is not known yet, pass its
         shape, `(m,)` or a PyTree of `jax.ShapeDtypeStruct`s:
         [`diffrax_symplectic.suggest_solver`][], [`diffrax_symplectic.compare_solvers`][]
         and [`diffrax_symplectic.expectation`][] then make the path that the solver needs.
-    - `structure`: `"separable"`, for $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$; or
-        `"additive"`, if the gradients of the $H_k$ do not depend on the state. Solvers that
-        need this structure then rely on it. By default they find it out while tracing,
-        where a variable counts that enters a derivative, even if it cancels or is
-        multiplied by zeros: write $H_0$ as a sum of terms that read $p$ or $q$ alone.
+    - `structure`: asserts a structure that some solvers need: `"separable"` for $H_0 = V(p)
+        + U(t, q)$ and $H_k = U_k(t, q)$, or `"additive"` if the gradients of the $H_k$ do
+        not depend on the state. By default it is detected by tracing, which counts every
+        variable that enters a derivative, even if it cancels or is multiplied by zero:
+        write $H_0$ as a sum of terms that depend on $p$ or $q$ alone.
 
     `p` and `q` are PyTrees of arrays of the same structure and shapes.
 
     **Returns:** `MultiTerm(drift, diffusion)`, or without noise `MultiTerm(drift)`.
 
-    **Raises:** a `ValueError` if `path` is no Brownian path and no shape, or `structure` is
-    unknown; and, while the solve is traced, if the state is not a pair `(p, q)` of the same
-    structure and shapes, if `H0` does not return a scalar, if `noise` does not match the
-    path or does not depend on the state, or if either needs values while it is traced or
-    returns anything but real numbers.
+    **Raises:** a `ValueError` if `path` is neither a Brownian path nor a shape, or if
+    `structure` is unknown; and, while the solve is traced, if the state is not a pair
+    `(p, q)` of the same structure and shapes, if `H0` does not return a scalar, if `noise`
+    does not match the path or does not depend on the state, or if either needs concrete
+    values or does not return real numbers.
     """
     check_takes("H0", H0, "t", "p", "q", "args")
     if structure not in (None, *get_args(_Structure)):
         raise ValueError(
-            f"`structure` must be one of {get_args(_Structure)}, or `None` to find it "
-            f"out; got {structure!r}."
+            f"`structure` must be one of {get_args(_Structure)}, or `None` to detect it; "
+            f"got {structure!r}."
         )
     drift = diffrax.ODETerm(_Drift(H0, structure))
     if noise is None and path is None:
@@ -86,7 +86,7 @@ def hamiltonian_terms(
 
 
 def as_path(path: Any) -> diffrax.AbstractBrownianPath:
-    """`path`, or for a shape an unspecified path; a `ValueError` for anything else."""
+    """`path`, or an unspecified path for a shape. Raises a `ValueError` for anything else."""
     if isinstance(path, diffrax.AbstractBrownianPath):
         return path
     is_struct = lambda x: isinstance(x, jax.ShapeDtypeStruct)
@@ -106,10 +106,10 @@ class IndexedNoise(eqx.Module):
     r"""Noise Hamiltonians that can be evaluated one at a time, for
     [`diffrax_symplectic.hamiltonian_terms`][].
 
-    $H_1, \ldots, H_m$ are given by one function of the index, and
+    $H_1, \ldots, H_m$ are given as one function of the index, so that
     [`diffrax_symplectic.NinomiyaVictoir`][], which follows the flow of one noise after
-    another, evaluates only that noise. Called as `noise(t, p, q, args)` it returns all of
-    them, by `jax.vmap` over the index, for any other solver.
+    another, evaluates only one of them at a time. Other solvers call `noise(t, p, q,
+    args)`, which returns all of them, by `jax.vmap` over the index.
     """
 
     H: Callable[[IntScalarLike, RealScalarLike, PyTree, PyTree, Args], Array]
@@ -124,7 +124,7 @@ class IndexedNoise(eqx.Module):
     def one(
         self, k: IntScalarLike, t: RealScalarLike, p: PyTree, q: PyTree, args: Args
     ) -> Array:
-        """`H_k`, for `k` from 0 to `m - 1`. Raises a `ValueError` if it is no scalar."""
+        """`H_k`, for `k` from 0 to `m - 1`. Raises a `ValueError` if it is not a scalar."""
         return scalar_energy(evaluated("H", self.H, k, t, p, q, args=args), "H")
 
     def __call__(self, t: RealScalarLike, p: PyTree, q: PyTree, args: Args) -> Array:
@@ -133,37 +133,36 @@ class IndexedNoise(eqx.Module):
 
 IndexedNoise.__init__.__doc__ = """**Arguments:**
 
-- `H`: `H(k, t, p, q, args)`, the Hamiltonian of the noise `k`, a scalar. A function, or
-    a Module with parameters. `k` is a traced integer from `0` to `m - 1`.
+- `H`: `H(k, t, p, q, args)`, the Hamiltonian of noise `k`, a scalar. A function, or a
+    Module with parameters. `k` is a traced integer from `0` to `m - 1`.
 - `m`: the number of noises.
 
-**Raises:** a `ValueError` if `H` is not callable or `m` not a positive integer; and, while
-the solve is traced, if `H` does not return a scalar.
+**Raises:** a `ValueError` if `H` is not callable or `m` is not a positive integer; and,
+while the solve is traced, if `H` does not return a scalar.
 """
 
 
 class OneNoise(eqx.Module):
-    """A control in which all noises vanish but one. `number` counts the noises in the order
-    of the flattened path."""
+    """A control with a single nonzero noise. `number` is its index in the flattened path."""
 
     number: IntScalarLike
     increment: RealScalarLike
 
 
 class Lifted(eqx.Module):
-    """A Hamiltonian of another variable, `H(t, chart(p, q), args)`."""
+    """A Hamiltonian in another variable, `H(t, chart(p, q), args)`."""
 
     H: Callable
     chart: Callable[[_State], PyTree]
 
     def __call__(self, *inputs) -> PyTree[Array]:
-        # The Hamiltonian of an `IndexedNoise` has the index of the noise before the time.
+        # An `IndexedNoise` passes the index before the time.
         *before, p, q, args = inputs
         return self.H(*before, self.chart((p, q)), args)
 
 
 def has_lifted(terms: PyTree) -> bool:
-    """Whether these are the terms of Hamiltonians of another variable."""
+    """Whether these terms have Hamiltonians in another variable."""
     is_lifted = lambda x: isinstance(x, Lifted)
     return any(map(is_lifted, jtu.tree_leaves(terms, is_leaf=is_lifted)))
 
@@ -175,7 +174,7 @@ def lifted_terms(
     chart: Callable[[_State], PyTree],
     name: str,
 ) -> diffrax.MultiTerm:
-    """The terms of Hamiltonians of `chart((p, q))`, a variable called `name`."""
+    """The terms of Hamiltonians in `chart((p, q))`, a variable called `name`."""
     check_takes("H0", H0, "t", name, "args")
     if isinstance(noise, IndexedNoise):
         lifted = IndexedNoise(Lifted(noise.H, chart), noise.m)
@@ -203,11 +202,12 @@ class _Drift(eqx.Module):
 
 
 def scalar_energy(out: PyTree, name: str = "H0") -> Array:
-    """The output of a Hamiltonian; a `ValueError` if it is no real scalar."""
+    """The output of a Hamiltonian. Raises a `ValueError` if it is not a real scalar."""
     if not jtu.all_leaves([out]) or jnp.shape(out) != ():
         raise ValueError(
             f"`{name}` must return a scalar; got shape {shapes(out)}. Sum over the degrees "
-            "of freedom. (For a batch of paths write it for one, and `jax.vmap` the solve.)"
+            "of freedom. (For a batch of paths write it for one path, and `jax.vmap` the "
+            "solve.)"
         )
     _check_real(name, out)
     return jnp.asarray(out, jnp.result_type(out, float))
@@ -223,7 +223,8 @@ def _check_real(name: str, out: PyTree[Array]) -> None:
 
 
 class HamiltonianNoise(diffrax.AbstractTerm):
-    """The noise part: control `I`, product the symplectic gradient of `I . H`."""
+    """The noise term. Its product with the control `I` is the symplectic gradient of
+    `I . H`."""
 
     noise: _Hamiltonian
     path: diffrax.AbstractBrownianPath
@@ -233,7 +234,7 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         return self.path.evaluate(t0, t1, **kwargs)
 
     def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
-        # For each array of the state, with an axis of all noises behind its own.
+        # For each array of the state, with a trailing axis of noises.
         hamiltonians = self._checked(t, y, args)
         flat = lambda y: jfu.ravel_pytree(hamiltonians(y))[0]
         last = lambda x: jnp.moveaxis(x, 0, -1)
@@ -263,29 +264,29 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         return symplectic_gradient(scalar, y)
 
     def is_vf_expensive(self, t0, t1, y, args) -> bool:
-        # `vf` takes one reverse pass for each noise, `vf_prod` takes one in all.
+        # `vf` takes one reverse pass per noise, `vf_prod` a single one.
         struct = increment_struct(self.path)
         return sum(s.size for s in jtu.tree_leaves(struct)) > 2
 
     def _checked(self, t, y: _State, args) -> Callable:
-        """The noise Hamiltonians as a function of the state; a `ValueError` if they do not
-        depend on it."""
+        """The noise Hamiltonians as a function of the state. Raises a `ValueError` if they
+        do not depend on it."""
         check_pair(y)
         struct = increment_struct(self.path)
         hamiltonians = lambda y: self._hamiltonians(t, y[0], y[1], args, struct)
         if Dependence(hamiltonians, y).independent(lambda y: y):
             raise ValueError(
-                "`noise` does not depend on the state, so that there is no noise. Return "
-                "Hamiltonians, not amplitudes: for a kick of constant strength to each "
-                "momentum, dp_k = sigma_k dw_k, `noise = lambda t, p, q, args: -sigma * "
-                "q`. For no noise solve the drift alone, `terms.terms[0]`."
+                "`noise` does not depend on the state, so there is no noise. Return "
+                "Hamiltonians, not amplitudes: for kicks of constant strength to each "
+                "momentum, dp_k = sigma_k dw_k, pass `noise = lambda t, p, q, args: -sigma "
+                "* q`. Without noise, solve the drift alone, `terms.terms[0]`."
             )
         return hamiltonians
 
     def _hamiltonians(self, t, p, q, args, struct) -> PyTree[Array]:
         """The noise Hamiltonians, in the structure and shapes of the path."""
         H = evaluated("noise", self.noise, t, p, q, args=args)
-        # One noise may come as a scalar.
+        # A single noise may be a scalar.
         fits = lambda h, s: jnp.shape(h) == s.shape or jnp.size(h) == s.size == 1
         if jtu.tree_structure(H) != jtu.tree_structure(struct) or not all(
             map(fits, jtu.tree_leaves(H), jtu.tree_leaves(struct))
@@ -304,18 +305,18 @@ _LEFT_OUT = "`args=None`. Was it left out?"
 
 def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Array]:
     """`H(*inputs, args)`, with advice on its errors."""
-    # A function that changes `args` in place would be another one in each trace.
+    # A copy, so that functions which modify `args` in place are the same in each trace.
     copy = jtu.tree_map(lambda x: x, args)
     try:
         return H(*inputs, copy)
     except jax.errors.JAXTypeError as error:
         raise ValueError(
-            f"`{name}` asks for values while JAX traces it, by `if`, `while`, `float`, or "
-            "a function of NumPy. Write `jnp.where(a, b, c)` or `jax.lax.cond` in place of "
-            "`if`, and `jnp` in place of `np`."
+            f"`{name}` needs concrete values while JAX traces it, in an `if`, `while`, "
+            "`float`, or a NumPy function. Write `jnp.where(a, b, c)` or `jax.lax.cond` "
+            "instead of `if`, and `jnp` instead of `np`."
         ) from error
     except (TypeError, AttributeError) as error:
-        # An `IndexedNoise` calls this twice.
+        # An `IndexedNoise` calls this function twice.
         if args is not None or _LEFT_OUT in str(error) or "None" not in str(error):
             raise
         kind = TypeError if isinstance(error, TypeError) else AttributeError
@@ -330,12 +331,12 @@ def symplectic_gradient(scalar: Callable, y: _State) -> _State:
 
 
 def is_hamiltonian(term: diffrax.AbstractTerm) -> bool:
-    """Whether a term came from Hamiltonians."""
+    """Whether a term comes from Hamiltonians."""
     return len(_parts(term)) > 0
 
 
 def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
-    """The `structure` that was passed with the Hamiltonians of a term."""
+    """The `structure` that the user asserted for a term."""
     asserted = {part.structure for part in _parts(term)}
     return asserted.pop() if len(asserted) == 1 else None
 

@@ -1,4 +1,4 @@
-"""Spins and rigid bodies: canonical pairs `(p, q)` in place of vectors `s` of R^3."""
+"""Spins and rigid bodies: vectors `s` in R^3, as canonical pairs `(p, q)`."""
 
 from collections.abc import Callable, Sequence
 
@@ -26,41 +26,43 @@ def spin_terms(
 ) -> diffrax.MultiTerm:
     r"""The terms of spins, or of a rigid body, from their Hamiltonians.
 
-    For vectors $s$ of $\mathbb R^3$, one or many, in the sense of Stratonovich,
+    For one or many vectors $s$ in $\mathbb R^3$, in the sense of Stratonovich,
 
     $$\mathrm{d}s = s \times \nabla H_0\,\mathrm{d}t
         + \sum_{k=1}^m s \times \nabla H_k \circ \mathrm{d}w_k.$$
 
-    That is the angular momentum of a rigid body, the stochastic Landau--Lifshitz
-    equation of magnetic moments, or the motion of point vortices on a sphere. The length
+    Examples are the angular momentum of a rigid body, the stochastic Landau--Lifshitz
+    equation of magnetic moments, and the motion of point vortices on a sphere. The length
     of each $s$ is constant, and the flow is a Poisson map: $\{F \circ S, G \circ S\} =
     \{F, G\} \circ S$ for the bracket $\{F, G\} = s \cdot (\nabla G \times \nabla F)$.
 
-    The state of these terms is a pair $(p, q)$ of arrays of shape `(..., 2)`, from which
-    [`diffrax_symplectic.from_spinors`][] makes $s$. They are
+    The state of these terms is a pair $(p, q)$ of arrays of shape `(..., 2)`, which
+    [`diffrax_symplectic.from_spinors`][] maps to $s$. The terms are
     [`diffrax_symplectic.hamiltonian_terms`][] of the Hamiltonians $H_k(s(p, q))$. The
-    length of a spin is a quadratic invariant of these, so that every solver for general
-    systems keeps it and is a Poisson map of $s$, with its orders for canonical systems.
-    Other solvers refuse these terms.
+    length of a spin is a quadratic invariant of them, so every solver for general systems
+    conserves it and is a Poisson map of $s$, with the same orders as for canonical systems.
+    Other solvers reject these terms.
 
     **Damping.** `damping=alpha` adds $\alpha\, s \times (s \times \nabla H_0)\,
-    \mathrm{d}t$, the drift of the Landau--Lifshitz equation. The same solvers keep the
-    lengths, with the same orders; the flow is no Poisson map then. With the noise
-    `lambda t, s, args: sigma * s` and $\sigma^2 = 2 \alpha T$, the density $e^{-H_0 / T}$
-    of the temperature $T$ (in units of energy) is stationary, for spins of any lengths.
+    \mathrm{d}t$, the damping of the Landau--Lifshitz equation. The same solvers conserve
+    the lengths, with the same orders, but the flow is no longer a Poisson map. With the
+    noise `lambda t, s, args: sigma * s` and $\sigma^2 = 2 \alpha T$, the density
+    $e^{-H_0 / T}$ at temperature $T$ (in units of energy) is stationary, for spins of any
+    length.
 
     **Arguments:**
 
     - `H0`: `H0(t, s, args)`, a scalar, for `s` of shape `(..., 3)`. A function, or a
         Module with parameters; differentiable with respect to these and to `args`.
     - `noise`: `noise(t, s, args)`, the noise Hamiltonians $H_1, \ldots, H_m$ as an array
-        of shape `(m,)`, or in the structure and shapes of `path`: a field along each axis
-        of each spin is `lambda t, s, args: args * s` with a path of the shape of `s`. Or
-        an [`diffrax_symplectic.IndexedNoise`][] of `H(k, t, s, args)`.
+        of shape `(m,)`, or in the structure and shapes of `path`. For a random field along
+        each axis of each spin, use `lambda t, s, args: args * s` and a path with the shape
+        of `s`. Or an [`diffrax_symplectic.IndexedNoise`][] of `H(k, t, s, args)`.
     - `path`: the Brownian path or its shape, as for
         [`diffrax_symplectic.hamiltonian_terms`][].
     - `damping`: the number $\alpha$, or one for each spin, not negative; in units of one
-        over the length of a spin. A path fails if it is traced and negative or not finite.
+        over the length of a spin. If it is traced, a path fails where it is negative or not
+        finite.
 
     **Returns:** `MultiTerm(drift, diffusion)`, for the state `to_spinors(s0)`.
 
@@ -69,8 +71,8 @@ def spin_terms(
     fit the spins, or if the arrays of the state do not have the shape `(..., 2)`.
 
     **Source:** [McLachlan, Modin and Verdier
-    (2014)](https://doi.org/10.1088/0951-7715/27/6/1525), for systems without noise and
-    damping; [Brown (1963)](https://doi.org/10.1103/PhysRev.130.1677) for spins at a
+    (2014)](https://doi.org/10.1088/0951-7715/27/6/1525) for systems without noise and
+    damping; [Brown (1963)](https://doi.org/10.1103/PhysRev.130.1677) for spins at finite
     temperature.
     """
     terms = lifted_terms(H0, noise, path, from_spinors, "s")
@@ -102,7 +104,7 @@ class _DampedPrecession(eqx.Module):
                 "`damping` must be a number, or have one for each spin, of shape "
                 f"{s.shape[:-1]}; got shape {alpha.shape}."
             )
-        # Traced values cannot raise an error here: they make their path fail.
+        # Traced values cannot raise an error; NaN makes their path fail.
         alpha = jnp.where(jnp.isfinite(alpha) & (alpha >= 0), alpha, jnp.nan)
         (s1, s2, s3), (g1, g2, g3) = _components(s), _components(gradient)
         w1 = g1 + alpha * (s2 * g3 - s3 * g2)
@@ -129,7 +131,7 @@ def from_spinors(y: _Spinors) -> _Spins:
     This is the Hopf map, as in [McLachlan, Modin and Verdier
     (2014)](https://doi.org/10.1088/0951-7715/27/6/1525). With the factor $1/4$ its
     components have the canonical brackets of spins, $\{s_1, s_2\} = -s_3$ and cyclic. The
-    length is $|s| = (|p|^2 + |q|^2) / 4$.
+    length of $s$ is $(|p|^2 + |q|^2) / 4$.
 
     **Arguments:**
 
@@ -154,17 +156,17 @@ def from_spinors(y: _Spinors) -> _Spins:
 
 
 def to_spinors(s: _Spins) -> _Spinors:
-    r"""A state $(p, q)$ for the vectors $s$, to begin a solve of
-    [`diffrax_symplectic.spin_terms`][] with: `from_spinors(to_spinors(s))` is $s$.
+    r"""A state $(p, q)$ for the vectors $s$: the initial state of a solve of
+    [`diffrax_symplectic.spin_terms`][]. `from_spinors(to_spinors(s))` is $s$.
 
-    The states $(\mathrm e^{\mathrm i \phi} a, \mathrm e^{\mathrm i \phi} b)$ all give the
-    same $s$ at any time. No choice of the phase $\phi$ is continuous on the whole sphere.
-    Here $a > 0$ where $s_3 \ge 0$ and $b > 0$ where $s_3 < 0$. So $(p, q)$ jumps where $s$
-    crosses the equator. Derivatives of functions of $s$ are right everywhere.
+    The states $(\mathrm e^{\mathrm i \phi} a, \mathrm e^{\mathrm i \phi} b)$ give the same
+    $s$ for every phase $\phi$, at all times. No choice of the phase is continuous on the
+    whole sphere. Here $a > 0$ if $s_3 \ge 0$ and $b > 0$ if $s_3 < 0$, so $(p, q)$ jumps
+    where $s$ crosses the equator. Derivatives of functions of $s$ are correct everywhere.
 
     **Arguments:**
 
-    - `s`: an array of shape `(..., 3)`, of any lengths but zero.
+    - `s`: an array of shape `(..., 3)`, with vectors of nonzero length.
 
     **Returns:** the pair `(p, q)` of arrays of shape `(..., 2)`.
 
@@ -172,19 +174,19 @@ def to_spinors(s: _Spins) -> _Spinors:
     length zero, where $(p, q)$, which grows like $|s|^{1/2}$, has no derivative.
     """
     s = as_spins(s)
-    # Squares of very short and very long vectors leave the range of the numbers. The result
-    # does not depend on the scale, which thus needs no derivative.
+    # Scaling avoids overflow and underflow of squares. The result does not depend on the
+    # scale, which therefore needs no derivative.
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(s), axis=-1, keepdims=True))
     scale = eqx.error_if(
         scale,
         scale == 0,
-        "`to_spinors(s)` needs spins whose length is not zero. A spin of length zero "
-        "never moves: leave it out.",
+        "`to_spinors(s)` needs spins of nonzero length. A spin of length zero never moves: "
+        "leave it out.",
     )
     x, y, z = jnp.moveaxis(s / scale, -1, 0)
     north = z >= 0
     length = jnp.sqrt(x**2 + y**2 + z**2)
-    # The larger of |a| and |b|, which is real, and the other one.
+    # The larger of |a| and |b|, whose number is real, and the other number.
     real = jnp.sqrt(2 * (length + jnp.where(north, z, -z)))
     other_q, other_p = 2 * x / real, 2 * y / real
     p1, p2 = jnp.where(north, 0, other_p), jnp.where(north, -other_p, 0)
@@ -194,7 +196,8 @@ def to_spinors(s: _Spins) -> _Spinors:
 
 
 def as_spins(s: PyTree) -> _Spins:
-    """`s` as an array of floating-point numbers; a `ValueError` if it holds no spins."""
+    """`s` as an array of floating-point numbers. Raises a `ValueError` if it cannot hold
+    spins."""
     if (
         not eqx.is_array_like(s)
         or jnp.shape(s)[-1:] != (3,)

@@ -1,5 +1,5 @@
-"""Whether a system has the structure that a family of methods relies on: decided by what
-the vector fields depend on, or by what the user asserts."""
+"""Checks that a system has the structure that a family of methods needs: by tracing what
+the vector fields depend on, or by the user's assertion."""
 
 import functools as ft
 from collections.abc import Callable
@@ -25,8 +25,8 @@ from ._vector_fields import apply, split_terms
 
 
 class Fault(NamedTuple):
-    """Why a system does not have a structure, what can be done about it, and whether the
-    fault is a force of plain terms that depends on the momentum, as friction does."""
+    """Why a system does not have a structure, advice, and whether the fault is a force of
+    plain terms that depends on the momentum, such as friction."""
 
     reason: str
     advice: str
@@ -72,8 +72,8 @@ def check_structure(
 def separable_fault(
     drift: tuple, noise: tuple, t0: RealScalarLike, y0: Y, args: Args
 ) -> Fault | None:
-    """Why the system is not of the form `H0 = V(p) + U(t, q)`, `H_k = U_k(t, q)`; `None`
-    if it is of this form."""
+    """Why the system is not of the form `H0 = V(p) + U(t, q)`, `H_k = U_k(t, q)`; `None` if
+    it is."""
     if fault := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", fault)
     flows = lambda terms: [
@@ -98,8 +98,8 @@ def _faults(
     noise: list[tuple[diffrax.AbstractTerm, Dependence]],
     still: Callable[[diffrax.AbstractTerm, int], bool],
 ) -> list[Fault]:
-    """The faults, if momenta are the first half of the state, `p = 0`, or the second one,
-    `p = 1`. `still` tells whether a noise term leaves a half of the state unchanged."""
+    """The faults, if momenta are the first half of the state, `p = 0`, or the second,
+    `p = 1`. `still` says whether a noise term leaves a half of the state unchanged."""
     q, faults, advice = 1 - p, [], _advice("separable")
     dp, dq = (lambda out: out[p]), (lambda out: out[q])
     of_p, of_q = (lambda t, y, control: y[p]), (lambda t, y, control: y[q])
@@ -116,8 +116,8 @@ def _faults(
                 faults.append(Fault(reason, advice, friction=plain and part is dp))
     for term, flow in noise:
         hamiltonian = is_hamiltonian(term)
-        # The change of q is linear in the increment: if it does not depend on the
-        # increment, it is zero.
+        # The change of q is linear in the increment, so it is zero if it does not depend
+        # on the increment.
         if not flow.independent(lambda t, y, control: control, dq) and not still(
             term, q
         ):
@@ -145,7 +145,7 @@ def constant_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault
     """Why additive noise is not constant; `None` if it does not depend on time."""
     for term in noise:
         if not _flow(term, t0, y0, args).independent(_of_t):
-            return Fault("it depends on time", "Use `SRKs4`, which takes it.")
+            return Fault("it depends on time", "Use `SRKs4`, which accepts such noise.")
     return None
 
 
@@ -156,9 +156,9 @@ def check_stratonovich(
     y0: Y,
     args: Args,
 ) -> None:
-    """Raises a `ValueError` if an Ito solver is to solve the terms of Hamiltonians, which
-    are Stratonovich. Both agree for additive noise, and for noise that changes `p` and
-    depends on `q` alone."""
+    """Raises a `ValueError` if an Ito solver gets terms from Hamiltonians, which are in the
+    sense of Stratonovich, unless both senses agree: for additive noise, and for noise that
+    changes only `p` and depends only on `q`."""
     drift, noise = split_terms(terms)
     # A drift beside `H0` may be the correction from one sense to the other.
     corrected = not all(map(is_hamiltonian, drift))
@@ -168,14 +168,15 @@ def check_stratonovich(
     if additive_fault(noise, t0, y0, args) and separable_fault((), noise, t0, y0, args):
         raise ValueError(
             f"`{type(solver).__name__}` solves equations in the sense of Ito. The terms of "
-            "`hamiltonian_terms` are in the sense of Stratonovich, and here they differ. "
-            "Use a solver of this package, or a Stratonovich solver of Diffrax such as "
-            "`diffrax.Heun`. If you mean an Ito equation, add the drift that corrects it."
+            "`hamiltonian_terms` are in the sense of Stratonovich, and here the two "
+            "differ. Use a solver of this package, or a Stratonovich solver of Diffrax "
+            "such as `diffrax.Heun`. If you mean the Ito equation, add its drift "
+            "correction."
         )
 
 
 def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> Dependence:
-    """The change of the state by a term, as a program of time, state and control."""
+    """The dependencies of the change by a term on time, state and control."""
     t0 = jnp.asarray(t0, jnp.result_type(float))
     control = eqx.filter_eval_shape(term.contr, t0, t0)
     change = lambda t, y, control: term.vf_prod(t, y, args, control)
@@ -183,8 +184,8 @@ def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> Dependence:
 
 
 def _is_zero(t0, y0: Y, args: Args, term: diffrax.AbstractTerm, half: int) -> bool:
-    """Whether a plain noise term is known while tracing to leave one half of the state
-    unchanged, by a block of zeros in its matrix."""
+    """Whether a plain noise term leaves one half of the state unchanged because its matrix
+    has a block of zeros that is known while tracing."""
     if is_hamiltonian(term):
         return False
     struct = eqx.filter_eval_shape(term.contr, t0, t0)
@@ -209,12 +210,12 @@ def _not_asserted(terms: tuple, structure: str) -> list:
 
 def _advice(structure: str) -> str:
     how = {
-        "separable": "H0 as a sum `V(p) + U(t, q)` whose summands read p or q alone",
+        "separable": "H0 as a sum `V(p) + U(t, q)`, each summand of p or q alone",
         "additive": "each H_k as a function linear in p and q, such as `-sigma * q`",
     }[structure]
     return (
-        "Variables also count if they cancel, are multiplied by zero or printed, or share "
-        f"an array with others. In that case write {how}, or pass "
+        "Variables also count if they cancel, are multiplied by zero, are printed, or "
+        f"share an array with others: in that case write {how}, or pass "
         f'`structure="{structure}"` to `hamiltonian_terms`. Otherwise {_GENERAL}.'
     )
 
@@ -223,20 +224,20 @@ _GENERAL = "use a solver for general systems, for example `ImplicitMidpoint` or 
 
 
 WRONG_WAY_ROUND = (
-    "With the halves of the state exchanged it would be so: is the state the wrong way "
-    "round? It is `(p, q)`, momentum first, and not (position, velocity)"
+    "With the halves of the state exchanged it would be separable: is the state the wrong "
+    "way round? It is `(p, q)`, momentum first, not (position, velocity)"
 )
 FRICTION = (
-    "Leave friction -gamma p out of the terms, and take `BAOAB(gamma)`, or for terms of "
-    "`hamiltonian_terms` `Damped(solver, gamma)`."
+    "Leave friction -gamma p out of the terms, and use `BAOAB(gamma)`, or for terms from "
+    "`hamiltonian_terms` use `Damped(solver, gamma)`."
 )
 
 
 def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish at random states, for
-    these `t0` and `args`; false if this cannot be tested. This is advice, no proof.
+    these `t0` and `args`; false if this cannot be tested. This is not a proof.
 
-    The bracket is bilinear: it is tested for two random combinations of the noises.
+    The bracket is bilinear, so it is tested for two random combinations of the noises.
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
     struct = eqx.filter_eval_shape(lambda: [term.contr(t0, t0) for term in noise])
@@ -264,7 +265,7 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
             small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
             found = jax.block_until_ready(jnp.any(finite) & jnp.all(small | ~finite))
     except RuntimeError:
-        # A user's `equinox.error_if`, at states that the user never chose.
+        # From a user's `equinox.error_if`, at states that the user did not choose.
         return False
-    # Within `jax.jit` there are no values.
+    # Inside `jax.jit` the result is not known.
     return not isinstance(found, jax.core.Tracer) and bool(found)

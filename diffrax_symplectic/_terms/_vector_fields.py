@@ -1,5 +1,5 @@
-"""Diffrax terms as a step uses them: drift and noise apart, vector fields times controls,
-and the Lie brackets of vector fields."""
+"""Operations on Diffrax terms: splitting drift and noise, vector fields times controls, and
+Lie brackets of vector fields."""
 
 import functools as ft
 from collections.abc import Callable
@@ -19,17 +19,17 @@ from ._hamiltonian import HamiltonianNoise, OneNoise
 
 
 _BACKSOLVE = (
-    "`diffrax.BacksolveAdjoint` cannot be used with the solvers of `diffrax_symplectic`. "
-    "It takes other steps backward in time, over which a weak path has other increments, "
-    "so its gradients would be wrong. Pass `adjoint=diffrax_symplectic."
-    "ReversingAdjoint()`, whose memory does not grow with the steps either, or "
+    "`diffrax.BacksolveAdjoint` cannot be used with the solvers of `diffrax_symplectic`: "
+    "its steps backward in time differ from the forward steps, so a weak path has other "
+    "increments, and the gradients would be wrong. Pass `adjoint=diffrax_symplectic."
+    "ReversingAdjoint()`, whose memory does not grow with the number of steps either, or "
     "`adjoint=diffrax.RecursiveCheckpointAdjoint()`."
 )
 
 
 def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     """Drift terms and noise terms. A term is noise if it has a Brownian path, or if it is
-    not the first one and not driven by time.
+    neither the first term nor an `ODETerm`.
 
     Raises a `ValueError` for the terms of `diffrax.BacksolveAdjoint`."""
     parts = _flatten(terms)
@@ -45,7 +45,7 @@ def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
 
 
 def _flatten(terms: diffrax.AbstractTerm) -> tuple:
-    """The terms of a `MultiTerm`, and of every `MultiTerm` among these."""
+    """The terms of a `MultiTerm`, including nested ones."""
     if isinstance(terms, diffrax.MultiTerm):
         return tuple(part for term in terms.terms for part in _flatten(term))
     return (terms,)
@@ -64,7 +64,7 @@ def _is_path(x) -> bool:
     return isinstance(x, diffrax.AbstractBrownianPath)
 
 
-# Called at several stages, this is traced and lowered once.
+# With `jit` this is traced and lowered once for several stages.
 @eqx.filter_jit
 def apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> Y:
     """The sum over terms of vector field times control."""
@@ -73,19 +73,19 @@ def apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> 
 
 
 def rate(drift: tuple, t: RealScalarLike, y: Y, args: Args) -> Y:
-    """The change of the state by the drift in a unit of time."""
+    """The rate of change of the state by the drift."""
     t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
     zero = jnp.zeros_like(t)
     return apply(drift, [x.contr(zero, zero + 1) for x in drift], args, t, y)
 
 
 def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
-    """Raises a `ValueError` unless these are terms that change a state such as `y0`. (A
-    PyTree of terms, as some solvers of Diffrax take, is not checked further.)"""
+    """Raises a `ValueError` unless these are terms that fit the state `y0`. (A PyTree of
+    terms, as some Diffrax solvers take, is not checked further.)"""
     is_term = lambda x: isinstance(x, diffrax.AbstractTerm)
     if not any(map(is_term, jtu.tree_leaves(terms, is_leaf=is_term))):
         raise ValueError(
-            "`terms` must be terms of Diffrax, such as `hamiltonian_terms(H0, noise, path)`"
+            "`terms` must be Diffrax terms, such as `hamiltonian_terms(H0, noise, path)`"
             f"; got {type(terms).__name__}."
         )
     if is_term(terms):
@@ -103,8 +103,8 @@ def apply_one(
     t: RealScalarLike,
     y: Y,
 ) -> Y:
-    """The vector field of one noise times its increment. `number` counts the noises of
-    all terms, in the order of their flattened controls."""
+    """The vector field of one noise times its increment. `number` is its index among the
+    noises of all terms, in the order of their flattened controls."""
     parts, before = [], 0
     for term in terms:
         struct = eqx.filter_eval_shape(term.contr, 0.0, 1.0)
@@ -124,7 +124,7 @@ def _one_product(term, struct, number, increment, args: Args, t, y: Y) -> Y:
         return term.vf_prod(t, y, args, OneNoise(number, increment))
     if isinstance(unwrapped(term), diffrax.ControlTerm):
         matrix = term.vf(t, y, args)
-        # One array of noises, not a Lineax operator and no other PyTree.
+        # A single array of noises, not a Lineax operator or another PyTree.
         one_array = eqx.is_array(matrix) and isinstance(struct, jax.ShapeDtypeStruct)
         if one_array and matrix.shape[-1:] == struct.shape:
             return matrix[..., number] * increment.astype(matrix.dtype)
@@ -144,7 +144,7 @@ def apply_brackets(
     """`sum_{k<l} A_kl [b_k, b_l]`, with the Lie brackets `Db_l b_k - Db_k b_l` of the
     vector fields of one term.
 
-    For antisymmetric `A` that is `sum_l Db_l (sum_k A_kl b_k)`: `m` derivatives.
+    For antisymmetric `A` this is `sum_l Db_l (sum_k A_kl b_k)`, with `m` derivatives.
     """
     struct = eqx.filter_eval_shape(term.contr, 0.0, 1.0)
     _, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, struct))
@@ -157,8 +157,8 @@ def apply_brackets(
 
 
 def _total(summands: Y, m: int) -> Y:
-    """The sum of `m` of them, written out, which XLA fuses with what follows: a sum over an
-    axis made a step of 8,000 paths three times slower."""
+    """The sum of `m` summands, unrolled, so that XLA fuses it with its uses: a reduction
+    over the axis made a step of 8,000 paths three times slower."""
     return tree_sum([jtu.tree_map(lambda x: x[k], summands) for k in range(m)])
 
 
@@ -172,9 +172,9 @@ def bridge(
     r"""$H_k$ and $L_{kl} / h$ of [`diffrax_symplectic.PlateauGauss`][] for `m` noises,
     given the space-time areas, and space-time-time areas unless `K` is `None`.
 
-    A Brownian bridge is $6 u (1 - u) H + 120 u (1 - u) (\frac12 - u) K$ with $u = s / h$,
-    and an independent rest whose square has the mean $h / 15$ without the second summand,
-    and $3 h / 70$ with it.
+    A Brownian bridge is $6 u (1 - u) H + 120 u (1 - u) (\frac12 - u) K$ with $u = s / h$
+    plus an independent remainder. The time average of its mean square is $h / 15$ without
+    the second summand, and $3 h / 70$ with it.
     """
     w, first = jfu.ravel_pytree(W)[0], jfu.ravel_pytree(H)[0]
     one = jnp.eye(first.size, dtype=first.dtype) * jnp.abs(h).astype(first.dtype)
@@ -197,21 +197,21 @@ def apply_bridge(
     t: RealScalarLike,
     y: Y,
 ) -> Y:
-    """`sum_k H_k [b_k, A] + sum_{k, l} L_kl [b_k, [b_l, A]]`, with `A(t, y) = drift(t, y)`
-    the drift times `h`, and `[b, A] = A' b - b' A`. Time is a part of the state that the
-    drift moves by `h`. For `m` noises that is `m` double brackets.
+    """`sum_k H_k [b_k, A] + sum_{k, l} L_kl [b_k, [b_l, A]]`, where `A(t, y) = drift(t, y)`
+    is the drift times `h`, and `[b, A] = A' b - b' A`. Time is treated as a component of
+    the state that the drift advances by `h`. Computes `m` double brackets for `m` noises.
     """
     struct = eqx.filter_eval_shape(lambda: [term.contr(0.0, 1.0) for term in noise])
     _, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, struct))
     t = jnp.asarray(t, jnp.result_type(h))
 
     def b(x, t, y):
-        """The noise with the increments `x`."""
+        """The noise with increments `x`."""
         controls = zip(noise, unravel(x))
         return tree_sum([term.vf_prod(t, y, args, c) for term, c in controls])
 
     def bracket(x, field, t, y, speed):
-        """`[b(x), field]`, where `field` moves time by `speed`; and `field` itself."""
+        """`[b(x), field]`, where `field` advances time by `speed`; and `field` itself."""
         value, change = jax.jvp(lambda y: field(t, y), (y,), (b(x, t, y),))
         _, carried = jax.jvp(lambda t, y: b(x, t, y), (t, y), (speed, value))
         return (change**ω - carried**ω).ω, value
@@ -226,17 +226,17 @@ def apply_bridge(
 
 
 def _checked_sum(parts: list[Y], y: Y) -> Y:
-    """The sum; a `ValueError` unless all have the dtypes and shapes of the state."""
+    """The sum. Raises a `ValueError` unless all parts have the state's dtypes and shapes."""
 
     def check(v, x):
-        # The result type of an array made before 64 bits were enabled may not be its own.
+        # An array made before 64 bits were enabled may have a dtype unlike its result type.
         v, x = jnp.asarray(v), jnp.asarray(x)
         if (v.dtype, v.shape) != (x.dtype, x.shape):
             raise ValueError(
                 f"The terms change an array of dtype and shape {x.dtype}{x.shape} by one "
                 f"of {v.dtype}{v.shape}. Give the state, the vector fields and the path "
-                "(as `shape=jax.ShapeDtypeStruct(shape, dtype)`) the same dtype, and time "
-                "no wider one."
+                "(as `shape=jax.ShapeDtypeStruct(shape, dtype)`) the same dtype, and times "
+                "a dtype that is not wider."
             )
 
     for part in parts:
@@ -245,7 +245,7 @@ def _checked_sum(parts: list[Y], y: Y) -> Y:
 
 
 def number_of_noises(terms: diffrax.AbstractTerm) -> int:
-    """How many scalar random variables drive the noise terms."""
+    """The number of scalar Brownian motions that drive the noise terms."""
     _, noise = split_terms(terms)
     struct = eqx.filter_eval_shape(lambda: [term.contr(0.0, 1.0) for term in noise])
     return sum(int(np.prod(s.shape)) for s in jtu.tree_leaves(struct))

@@ -82,7 +82,7 @@ def test_parts_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(ValueError, match="Samples 48 to 63 are in two"):
         gap.merge(next_, _part(name, 16, 48))
     other = ds.monte_carlo(jr.normal, key=KEY, num_paths=10, first=100)
-    with pytest.raises(ValueError, match="of another structure or other shapes"):
+    with pytest.raises(ValueError, match="another structure or other shapes"):
         one.merge(other)
     with pytest.raises(ValueError, match="has another `key`"):
         other.merge(ds.monte_carlo(jr.normal, key=jr.key(4), num_paths=10))
@@ -92,10 +92,10 @@ def test_parts_that_do_not_fit_are_refused(tmp_path):
         one.merge(3)  # pyright: ignore
     with pytest.raises(ValueError, match="`first` must be an integer, 0 or larger"):
         _part(name, 32, -1)
-    with pytest.raises(ValueError, match="Pass `start`.*, or `first`"):
+    with pytest.raises(ValueError, match="Pass either `start`.*, or `first`"):
         _part(name, 64, 32, start=one)
     np.savez(tmp_path / "other.npz", x=1)
-    with pytest.raises(ValueError, match="did not write"):
+    with pytest.raises(ValueError, match="was not written by"):
         ds.Expectation.load(tmp_path / "other.npz")
 
 

@@ -99,7 +99,7 @@ def test_the_mean_is_that_over_all_outcomes_however_the_fit_is(degree):
     got = _estimate(ds.ValueFunctions(degree), phi=phi, t1=0.75)
     exact = _enumerated(PENDULUM, ds.StormerVerlet(), Y0, phi, 0.25, 3)
     assert abs(got.mean - exact) <= 4.5 * got.std_error
-    # Of as many plain paths it would be 2.2e-2.
+    # Of as many independent paths it would be 2.2e-2.
     assert 0 < got.std_error < {1: 5e-3, 6: 1e-5, None: 1e-9}[degree]
     assert (got.num_paths, got.num_failed) == (4096, 0)
 
@@ -278,7 +278,7 @@ def test_the_sampling_follows_from_dimension_outcomes_and_steps(
     for tol in (None, 1e-3):
         sampling, reason = choose(problem, tol)
         assert type(sampling) is kind
-        assert f"{state} numbers in the state, {steps:,} steps" in reason
+        assert f"{state} components of the state, {steps:,} steps" in reason
     # Paths that cannot be made of given words.
     other = ds.hamiltonian_terms(H0, noise, diffrax.UnsafeBrownianPath((noises,), KEY))
     problem = Problem.of(SQUARE, other, VERLET, 0, 1, 1 / steps, y0, None, None, 1)
@@ -289,7 +289,7 @@ def test_the_default_is_the_same_each_time_and_goes_on_with_itself():
     got = _estimate(None, tol=1e-6)
     assert isinstance(got.sampling, ds.ValueFunctions) and got.tol_reached
     assert got.reason.startswith(
-        "value functions for 2 numbers in the state, 4 steps of 3"
+        "value functions for 2 components of the state, 4 steps of 3"
     )
     again, more = _estimate(None, tol=1e-6), _estimate(None, start=got)
     assert (again.mean, again.std_error) == (got.mean, got.std_error)
@@ -316,7 +316,7 @@ def test_a_fit_that_would_take_long_is_coarser_or_told(monkeypatch):
     assert sites == sorted(sites, reverse=True) and len(set(sites)) == 3
     assert 100_000 * 3 * sites[-1] < 2**27
     monkeypatch.setattr(_value_functions, "_OUT_OF_PROPORTION", 1000)
-    with pytest.warns(UserWarning, match="takes as long as .* plain paths"):
+    with pytest.warns(UserWarning, match="takes as long as .* independent paths"):
         _estimate(ds.ValueFunctions(2, 64))
 
 

@@ -199,7 +199,7 @@ def test_the_best_iterate_is_not_taken_for_a_solution():
     # Of `PicardNewton` it would be the first guess.
     finder = optx.BestSoFarRootFinder(ds.PicardNewton())
     term = diffrax.ODETerm(lambda t, y, args: jnp.sin(y))
-    with pytest.raises(ValueError, match="Pass the root finder within it"):
+    with pytest.raises(ValueError, match="Pass the root finder that it wraps"):
         _one_step(ds.ImplicitMidpoint(root_finder=finder), term, 0.1, jnp.array(0.5))
 
 

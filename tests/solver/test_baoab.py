@@ -196,7 +196,7 @@ def test_frictions_that_are_none_are_refused():
         for solver in (ds.BAOAB(wrong), ds.Damped(ds.StormerVerlet(), wrong)):
             with pytest.raises(ValueError, match=f"semidefinite matrix.*{match}"):
                 solver.init(terms, 0.0, 0.1, y0, None)
-    with pytest.raises(ValueError, match=r"for a matrix of them \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"as a matrix the shape \(2, 2\)"):
         ds.BAOAB(jnp.ones(3)).init(terms, 0.0, 0.1, y0, None)
 
 
