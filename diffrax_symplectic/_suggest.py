@@ -183,7 +183,7 @@ def suggest_solver(
     if m > 1:
         noises = f"{m} noises that {'commute' if commute else 'do not commute'}"
     if gamma is not None:
-        noises += " and friction"
+        noises = f"friction and {noises}"
     system = _system(structures, not_separable, noises)
     if any(isinstance(path, diffrax.UnsafeBrownianPath) for path in paths):
         system += (
@@ -248,7 +248,10 @@ def ranked(
         cost = sum(systems) / (2 if solver.structure == "separable" else 1)
         order = _record(solver).order(want, commute)
         assert order is not None
-        return cost > _MOST_STAGE_VECTORS, -order, cost, max(systems, default=0)
+        # Langevin splittings have the stationary means of a higher order.
+        other = not isinstance(solver, AbstractLangevinSplitting)
+        too_many = cost > _MOST_STAGE_VECTORS
+        return other, too_many, -order, cost, max(systems, default=0)
 
     noises = ("any", "commuting" if commute else "not commuting")
 

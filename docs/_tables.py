@@ -6,7 +6,6 @@ all public names:
 writes them into the files. A test tells if that was forgotten.
 """
 
-import dataclasses
 import re
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from diffrax_symplectic._suggest import ranked, SOLVERS
 
 _TABLE = re.compile(r"<!-- solvers: (.*?) -->.*?<!-- end -->", re.DOTALL)
 _DOCS = Path(__file__).parent
-_SEVERAL = re.compile(r"; (\S+) if noises do not commute")
 _OBJECT = re.compile(r"^::: diffrax_symplectic\.(\w+)$", re.MULTILINE)
 # The page of a solver, by the module that it stands in.
 _PAGES = {
@@ -29,7 +27,7 @@ _PAGES = {
     "splitting": "langevin",
 }
 _STRUCTURES = {
-    "any": "any Stratonovich system",
+    "any": "any",
     "separable": "separable",
     "additive": "additive noise",
     "constant": "additive, constant noise",
@@ -37,7 +35,7 @@ _STRUCTURES = {
 }
 _NOISES = {
     "any": "any number",
-    "commuting": "one noise, or noises that commute",
+    "commuting": "commuting noises",
     "not commuting": "noises that do not commute",
 }
 # Examples of solvers without defaults. A splitting is shown around any solver.
@@ -62,8 +60,8 @@ def with_tables(markdown: str) -> str:
 
 
 def table(name: str) -> str:
-    """The table of all solvers, of those of a page, or of what is suggested for `weak` or
-    `strong` approximation; the names of those for any system; or all public names."""
+    """The table of all solvers, or of those suggested for `weak` or `strong` approximation;
+    the names of the solvers for any system; or all public names."""
     solvers = [*(solver() for solver in SOLVERS), *_SPLIT]
     if name in ("weak", "strong"):
         return _suggested(name)
@@ -72,20 +70,12 @@ def table(name: str) -> str:
         return f"{', '.join(names[:-1])} and {names[-1]}"
     if name == "names":
         return _names()
-    if name == "all":
-        columns = ("name", "structure", "strong", "weak", "without noise", "solves for")
-    elif name in _PAGES.values():
-        solvers = [s for s in solvers if _page(s) == name]
-        columns = ("solver", "noises", "when to choose it")
-        if name in ("separable", "additive", "langevin"):  # any number of noises
-            columns = ("solver", "when to choose it")
-    else:
+    if name != "all":
         raise ValueError(f"There is no table `{name}` of solvers.")
-    rows = [_facts(s) for s in solvers]
-    heads = [column.replace("name", "solver") for column in columns]
-    text = _rows(heads, [[row[column] for column in columns] for row in rows])
-    # The overview is narrow.
-    return _SEVERAL.sub(r" (\1)", text) if name == "all" else text
+    columns = ("solver", "structure", "strong", "weak", "without noise")
+    columns += ("when to choose it",)
+    rows = [_facts(solver) for solver in solvers]
+    return _rows(columns, [[row[column] for column in columns] for row in rows])
 
 
 def _page(solver: AbstractSymplecticSolver) -> str:
@@ -110,24 +100,19 @@ def _facts(solver: AbstractSymplecticSolver) -> dict[str, str]:
     record = solver.record
     assert record is not None
     facts = {
-        "name": f"[`{type(solver).__name__}`]({_page(solver)}.md)",
-        "solver": _code(solver),
+        "solver": f"[`{type(solver).__name__}`]({_page(solver)}.md)",
         "structure": _STRUCTURES[solver.structure],
-        "noises": _NOISES[record.noises],
         "strong": _order(record.strong),
         "weak": _order(record.weak),
         "without noise": str(solver.order(None)),
-        "solves for": _stage_vectors(solver),
         "when to choose it": record.choose,
     }
     if isinstance(solver, AbstractSplitting):
         facts |= {
             "structure": "as `solver`",
-            "noises": "as `solver`",
             "strong": f"at most {solver.strong}",
             "weak": f"at most {solver.weak}",
             "without noise": "at most 2",
-            "solves for": "as `solver`",
             "when to choose it": solver.choose,
         }
     return facts
@@ -155,42 +140,17 @@ def _rows(columns, rows: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |") for line in lines)
 
 
-def _code(solver: AbstractSymplecticSolver) -> str:
-    """How the solver is constructed, with the parameters of the method."""
-    stages = ("root_finder", "root_find_max_steps")
-    own = [f for f in dataclasses.fields(solver) if f.init and f.name not in stages]
-    given = ", ".join(
-        f.name if f.default is dataclasses.MISSING else f"{f.name}={_plain(f.default)}"
-        for f in own
-    )
-    return f"`{type(solver).__name__}({given})`"
-
-
-def _plain(value) -> str:
-    return f"{value:g}" if type(value) is float else repr(value)
-
-
 def _order(order) -> str:
     if order is None:
         return ""
     if isinstance(order, tuple):
         commuting, others = map(_fraction, order)
-        return f"{commuting}; {others} if noises do not commute"
+        return f"{commuting} ({others})"  # if noises do not commute
     return _fraction(order)
 
 
 def _fraction(x: float) -> str:
     return f"{x:g}" if x == int(x) else f"{int(2 * x)}/2"
-
-
-def _stage_vectors(solver: AbstractSymplecticSolver) -> str:
-    one, two = solver.stage_vectors(1), solver.stage_vectors(2)
-    if len(one) == 0:
-        return "none: explicit"
-    if len(one) != len(two):
-        return f"{one[0]} for each noise, and {' + '.join(map(str, one[:2]))}"
-    text = " + ".join(map(str, one))
-    return f"half of {text}" if solver.structure == "separable" else text
 
 
 if __name__ == "__main__":

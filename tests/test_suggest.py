@@ -134,7 +134,7 @@ def test_with_friction_solvers_that_have_it_are_suggested(want):
         )
         found = ds.suggest_solver(terms, 0.0, y0, want=want, gamma=gamma)
         names = [s.solver for s in ds.suggest_solver(terms, 0.0, y0, want=want)]
-        assert type(found[0].solver) is first and "and friction" in found.system
+        assert type(found[0].solver) is first and "with friction" in found.system
         # Around all that are suggested without.
         inner = [s.solver.solver for s in found if isinstance(s.solver, ds.Damped)]
         assert {*map(repr, inner)} == {*map(repr, names)}

@@ -222,12 +222,18 @@ class Expectation(eqx.Module):
 
         short: Any = {"float_kind": "{:.1e}".format}
         brief = lambda x: np.array2string(np.asarray(x), formatter=short, threshold=6)
-        mean, error = jtu.tree_leaves(self.mean), jtu.tree_leaves(self.std_error)
+        named, error = (
+            jtu.tree_leaves_with_path(self.mean),
+            jtu.tree_leaves(self.std_error),
+        )
+        names = [jtu.keystr(path) for path, _ in named] if len(named) > 1 else [""]
+        mean = [x for _, x in named]
         leaves = lambda x: [brief(y) for y in jtu.tree_leaves(x)[:6]]
         lines = [f"{shown(m, e)} ± {brief(e)}" for m, e in zip(mean[:6], error)]
         if self.bias is not None:
             whole = zip(lines, leaves(self.error))
             lines = [f"{x} (sampling), {e} (total)" for x, e in whole]
+        lines = [f"{name}: {x}" if name else x for name, x in zip(names, lines)]
         lines += ["..."] * (len(mean) > 6)
         if self.bias is not None:
             pairs = zip(leaves(self.bias), leaves(self.bias_std_error))

@@ -125,7 +125,7 @@ class ValueFunctions(AbstractSampling):
         names = np.array([0, *basis.candidates])
         chosen = ", ".join(map(str, np.unique(names[np.where(used, best + 1, 0)])))
         among = ", ".join(map(str, np.unique(names)))
-        reason = f"{basis.kind}: {chosen} was the best of {among}"
+        reason = f"{basis.kind}: {chosen}, chosen among {among}"
         final = plan(best, used, self.num_paths, beyond)
         return final._replace(reason=reason, far=far)
 

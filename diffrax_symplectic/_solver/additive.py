@@ -124,7 +124,7 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=None,
-        choose="Low accuracy at the cost of the midpoint rule.",
+        choose="As cheap as the midpoint rule, for low accuracy.",
         suggested=("weak",),
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(

@@ -63,7 +63,7 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=(2, 1),
         strong=None,
-        choose="Four stage vectors in three small systems: accurate expectations.",
+        choose="For accurate expectations: four stage vectors in three small systems.",
         noises="commuting",
         suggested=("weak",),
     )
@@ -119,7 +119,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=None,
-        choose="For few noises: two stage vectors for each and four for the drift.",
+        choose="For few noises: two stage vectors per noise, and four for the drift.",
         noises="not commuting",
         suggested=("weak",),
     )
@@ -279,7 +279,7 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=(2, 1),
         strong=(3 / 2, 1 / 2),
-        choose="Two stage vectors, and brackets of the vector fields: accurate paths.",
+        choose="For accurate paths: two stage vectors, and brackets of vector fields.",
         noises="commuting",
         suggested=("strong",),
     )

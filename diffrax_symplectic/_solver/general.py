@@ -30,7 +30,7 @@ class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=(1, 1 / 2),
-        choose="The first to try: one stage vector for any number of noises.",
+        choose="A good first choice: one stage vector for any number of noises.",
         suggested=("strong",),
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau.strong(
@@ -59,7 +59,7 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=(1, 1 / 2),
-        choose="Two midpoint steps in one, for errors dominated by the drift.",
+        choose="Two midpoint substeps, for errors dominated by the drift.",
     )
     a: float = free_parameter("a", 0.25)
 
@@ -93,7 +93,7 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=None,
-        choose="The midpoint rule for expectations: low accuracy at low cost.",
+        choose="The midpoint rule for expectations. Cheap, for low accuracy.",
         suggested=("weak",),
     )
     b: float = free_parameter("b", 0.5)
@@ -147,7 +147,7 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=(2, 1),
         strong=None,
-        choose="The method of the paper. `StrangGauss` is cheaper.",
+        choose="Six stage vectors. `StrangGauss` is cheaper.",
         noises="commuting",
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(

@@ -124,7 +124,7 @@ class BAOAB(AbstractLangevinSplitting):
     **Positions, momenta, transport.** In a harmonic well of frequency $\omega$ the law of
     $q$ is exact for every step with $\omega h < 2$. Momenta are too cold,
     $\langle p^2 \rangle = m T (1 - \omega^2 h^2 / 4)$: for functions of momenta, such as
-    kinetic temperatures and heat flows, use [`diffrax_symplectic.LangevinMiddle`][], which
+    kinetic temperatures, use [`diffrax_symplectic.LangevinMiddle`][], which
     has the same positions. Mobility and free diffusion are too large in both by the factor
     $x \coth x$, $x = \gamma h / 2$: 0.3% at $\gamma h = 0.2$, 8% at $\gamma h = 1$. They
     are exact for the friction $\gamma' = \frac2h \operatorname{artanh} \frac{\gamma h}2$
@@ -152,8 +152,8 @@ class BAOAB(AbstractLangevinSplitting):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=1,
-        choose="Langevin dynamics: explicit, and stationary positions are very accurate. "
-        "Mobility and diffusion are too large by x coth x, x = gamma h / 2.",
+        choose="Langevin dynamics: explicit, with very accurate stationary positions. "
+        "Mobility and diffusion are too large by a factor of x coth x, x = gamma h / 2.",
         suggested=("weak", "strong"),
     )
     gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
@@ -197,8 +197,8 @@ class LangevinMiddle(AbstractLangevinSplitting):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose="Langevin dynamics: for momenta and heat flows. It has the positions of "
-        "`BAOAB`, and momenta of half a step before.",
+        choose="Langevin dynamics, for functions of momenta. Same positions as "
+        "`BAOAB`; momenta lag by half a step.",
         suggested=("weak", "strong"),
     )
     gamma: PyTree[ArrayLike] = eqx.field(converter=checked)

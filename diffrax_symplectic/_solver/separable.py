@@ -53,7 +53,7 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=None,
-        choose="Implicit on half of the state, noise as a kick: low accuracy.",
+        choose="Solves for half of the state, with explicit noise. For low accuracy.",
     )
     variant: Variant = eqx.field(default="c", static=True)
 
@@ -103,7 +103,7 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=None,
-        choose="Implicit on half of the state: for stiff systems.",
+        choose="Solves for half of the state. For stiff systems.",
         suggested=("weak",),
     )
     a21: float = free_parameter("a21", 0.5)
@@ -138,7 +138,7 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose="The midpoint rule on half of the state: for stiff systems.",
+        choose="The midpoint rule on half of the state. For stiff systems.",
         suggested=("strong",),
     )
     tableau: ClassVar[SeparableTableau] = SeparableTableau(
@@ -170,7 +170,7 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose="As `SRKs2` with explicit noise: for many expensive noises.",
+        choose="`SRKs2` with explicit noise. For many expensive noises.",
     )
     a: float = free_parameter("a", 0.0)
 
@@ -207,7 +207,7 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=1,
-        choose="Explicit, the cheapest step. Fastest frequency: omega h < 2.",
+        choose="Explicit, with the cheapest step. For frequencies omega < 2 / h.",
         suggested=("weak", "strong"),
     )
     tableau: ClassVar[PartitionedTableau] = PartitionedTableau(
@@ -267,7 +267,7 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=3 / 2,
-        choose="Explicit, for accurate paths. Fastest frequency: omega h < 4.",
+        choose="Explicit, with accurate paths. For frequencies omega < 4 / h.",
         suggested=("strong",),
     )
     tableau: ClassVar[PartitionedTableau] = _plateau_verlet

@@ -245,7 +245,7 @@ class LinearFlow(AbstractSplitting):
     flow: Callable[[RealScalarLike, Y, Args], Y]
 
     choose: ClassVar[str] = (
-        "Fast linear waves on lattices and bonds of molecules, which it moves exactly."
+        "Solves the fast linear waves of lattices and molecules exactly."
     )
 
     def __check_init__(self):

@@ -70,7 +70,8 @@ class _Amplitudes(eqx.Module):
         except (TypeError, ValueError):
             raise ValueError(
                 "`gamma`, `mass` and `T` must have shapes that broadcast; got "
-                f"{jnp.shape(gamma)}, {jnp.shape(mass)} and {jnp.shape(T)}."
+                f"{jnp.shape(gamma)}, {jnp.shape(mass)} and {jnp.shape(T)}. A matrix "
+                "`gamma` has the shape of `q` twice: (n, d, n, d) for `q` of shape (n, d)."
             ) from None
         (fault,) = matrix_faults(variance)
         half = variance.shape[: variance.ndim // 2]

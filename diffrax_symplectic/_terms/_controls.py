@@ -96,7 +96,8 @@ def _the_path(terms) -> tuple[diffrax.AbstractBrownianPath, Mapping[str, Abstrac
             "`terms` must hold exactly one Brownian path, a `WeakBrownianPath` or a "
             "Gaussian path with `levy_area=BrownianIncrement`, `SpaceTimeLevyArea` or "
             "`SpaceTimeTimeLevyArea`, also within a `PlateauBrownianPath`; got "
-            f"{[_named(path) for path in paths]}."
+            f"{[_named(path) for path in paths]}. (For a system without noise, pass a "
+            "noise that is zero, such as `0 * q`.)"
         )
     return paths[0], laws
 

@@ -2,7 +2,7 @@
 
     python -m examples.benchmarks.ensemble
 
-Writes `docs/benchmarks/ensemble.md`.
+Prints the figures in `docs/benchmarks/index.md`.
 """
 
 import os
@@ -13,7 +13,7 @@ import jax.random as jr
 
 import diffrax_symplectic as ds
 
-from ._timing import DOCS, ensemble, machine
+from ._timing import ensemble, machine
 from .speed import kubo, weak, Y0
 
 
@@ -33,22 +33,12 @@ def main() -> None:
     seconds, after = time.perf_counter() - begin, os.times()
     busy = after.user + after.system - before.user - before.system
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    lines = [
-        "# A large ensemble",
-        "",
-        f"{machine()}. ImplicitMidpoint on the quartic Kubo "
-        f"oscillator, {PATHS:,} paths of {STEPS} steps through `monte_carlo`. Made by "
-        "`python -m examples.benchmarks.ensemble`.",
-        "",
-        "| seconds | ns per path and step | cores busy | peak memory | $\\mathbb E q^2$ |",
-        "|---" * 5 + "|",
-        f"| {seconds:.1f} | {seconds / PATHS / STEPS * 1e9:.1f} | "
-        f"{busy / seconds / (os.cpu_count() or 1):.0%} | {peak:.2f} GiB | "
-        f"{estimate.mean:.6f} ± {estimate.std_error:.6f} |",
-    ]
-    print(lines[-1])
-    DOCS.mkdir(parents=True, exist_ok=True)
-    (DOCS / "ensemble.md").write_text("\n".join(lines) + "\n")
+    print(machine())
+    print(
+        f"{seconds:.1f} s, {seconds / PATHS / STEPS * 1e9:.1f} ns per path and step, "
+        f"{busy / seconds / (os.cpu_count() or 1):.0%} of the cores, {peak:.2f} GiB, "
+        f"E q^2 = {estimate.mean:.6f} ± {estimate.std_error:.6f}"
+    )
 
 
 if __name__ == "__main__":

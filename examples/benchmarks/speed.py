@@ -21,7 +21,7 @@ from ._timing import DOCS, ensemble, keys, machine, race
 
 
 H, STEPS = 0.01, 200
-SIZES = (1_000, 50_000)
+PATHS = 1_000
 Y0 = (jnp.array(0.0), jnp.array(1.0))
 
 
@@ -175,33 +175,29 @@ MODELS = {
 }
 
 
-def measure(make_terms: Callable, solvers: list) -> tuple[list[dict], dict]:
-    """For each number of paths the seconds of each solver, and for the first number the
-    processor time of tracing and compiling it."""
-    times, preparation = [], {}
-    for n in SIZES:
-        calls = {}
-        for name, solver, make_path in solvers:
-            fn = by_hand
-            if solver is not None:
-                fn = ensemble(make_terms, make_path, solver, Y0, H, STEPS)
-            begin = time.process_time()
-            compiled = jax.jit(lambda keys, fn=fn: fn(keys)).lower(keys(n)).compile()
-            preparation.setdefault(name, time.process_time() - begin)
-            calls[name] = ft.partial(compiled, keys(n))
-        times.append(race(calls))
-    return times, preparation
+def measure(make_terms: Callable, solvers: list) -> tuple[dict, dict]:
+    """The seconds of each solver, and the processor time of tracing and compiling it."""
+    calls, preparation = {}, {}
+    for name, solver, make_path in solvers:
+        fn = by_hand
+        if solver is not None:
+            fn = ensemble(make_terms, make_path, solver, Y0, H, STEPS)
+        begin = time.process_time()
+        compiled = jax.jit(lambda keys, fn=fn: fn(keys)).lower(keys(PATHS)).compile()
+        preparation[name] = time.process_time() - begin
+        calls[name] = ft.partial(compiled, keys(PATHS))
+    return race(calls), preparation
 
 
 def main() -> None:
-    head = ["system", "solver", *(f"{n:,} paths" for n in SIZES), "compile, s"]
+    head = ["system", "solver", "ns", "compile, s"]
     lines = [
         "# Speed",
         "",
-        f"Nanoseconds per path and step. {machine()}. float64, $h = {H}$, {STEPS} steps, "
-        "best of 7 runs. Gaussian increments come from `FixedStepBrownianPath`, except for "
-        "`Heun` with `UnsafeBrownianPath`. Compilation is the processor time to trace and "
-        "compile the solve of 1,000 paths. Made by `python -m examples.benchmarks.speed`.",
+        f"Nanoseconds per path and step, for {PATHS:,} paths of {STEPS} steps. "
+        f"{machine()}. float64, $h = {H}$, best of 7 runs. Gaussian increments come from "
+        "`FixedStepBrownianPath`, except for `Heun` with `UnsafeBrownianPath`. Compilation "
+        "is processor time. Made by `python -m examples.benchmarks.speed`.",
         "",
         f"| {' | '.join(head)} |",
         "|---" * len(head) + "|",
@@ -209,8 +205,8 @@ def main() -> None:
     for title, (make_terms, solvers) in MODELS.items():
         times, preparation = measure(make_terms, solvers)
         for name, *_ in solvers:
-            cells = [t[name] / n / STEPS * 1e9 for t, n in zip(times, SIZES)]
-            row = [*(f"{x:,.1f}" for x in cells), f"{preparation[name]:.2f}"]
+            nanoseconds = times[name] / PATHS / STEPS * 1e9
+            row = [f"{nanoseconds:,.1f}", f"{preparation[name]:.2f}"]
             lines.append(
                 f"| {' | '.join([title, name, *row])} |".replace("|  |", "| |")
             )

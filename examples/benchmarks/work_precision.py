@@ -291,8 +291,8 @@ def draw(axes, title: str, results: dict[str, tuple[float, Errors]]) -> list[str
 
 
 EXPLAINED = {
-    "weak": f"At $h = 1/{1 / HS[SHOWN]:g}$; exact on linear models, from `ArrayRQMC` on "
-    "the others.",
+    "weak": f"At $h = 1/{1 / HS[SHOWN]:g}$; exact for linear models, with "
+    "`ArrayRQMC` for the others.",
     "strong": f"At $h = 1/{1 / HS[1 + SHOWN]:g}$; root mean squares over 500 Brownian "
     "paths (`compare_solvers`).",
 }
@@ -305,9 +305,8 @@ def main() -> None:
         "",
         f"{machine()}. Made by `python -m examples.benchmarks.work_precision`.",
         "",
-        "Bars are three standard errors; points within their bar of zero are not drawn.",
-        "Times are of one core, in batches of 10,000 paths. The tables have a standard",
-        "error where it is more than a tenth of the error, and microseconds per path.",
+        "Bars are three standard errors; points that are not clear of zero are not drawn.",
+        "Times are CPU times per path, for one core and batches of 10,000 paths.",
         "",
         "![Errors against CPU seconds per path](work_precision.png)",
     ]

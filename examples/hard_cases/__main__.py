@@ -15,7 +15,6 @@ if __name__ == "__main__":
             "spins",
             "magnet",
             "nls",
-            "klein_gordon",
             "learning",
         ),
     )

@@ -130,7 +130,7 @@ def section(page: Page) -> str:
     axes[1].legend(fontsize=7)
     picture = page.picture(figure, "two_body", "Two-body problem")
     plt.close(figure)
-    shown = table(("solver", "angular momentum", "energy balance"), rows)
+    shown = table(("solver", "angular momentum", "mean energy"), rows)
     return fill(
         __file__, table=shown, picture=picture, count=count, s=s, part=f"1/{sizes[-1]}"
     )

@@ -253,7 +253,7 @@ def test_an_estimate_prints_in_a_few_lines():
         lambda key: {"a": ones(key), "b": 2.0}, key=jr.key(0), num_paths=10
     )
     lines = str(got).splitlines()
-    assert len(lines) <= 6 and "2. ± 4.4e-16" in lines
+    assert len(lines) <= 6 and "['b']: 2. ± 4.4e-16" in lines
     assert "10 paths, 0 failed" in lines[-1]
 
 

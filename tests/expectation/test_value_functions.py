@@ -182,7 +182,7 @@ def test_the_degree_is_chosen_for_each_number_by_fresh_paths_and_never_worse_tha
     plain = _estimate(ds.ValueFunctions(0), phi=phi)
     for a, b in zip(got.std_error, plain.std_error):
         assert a <= 1.05 * b
-    assert got.std_error[2] < 1e-9 and "64 was the best of 0, 64" in got.reason
+    assert got.std_error[2] < 1e-9 and "64, chosen among 0, 64" in got.reason
 
 
 def test_levels_extrapolate_and_the_bias_is_known_as_well_as_the_mean():
