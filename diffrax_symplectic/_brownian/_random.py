@@ -156,7 +156,7 @@ class Discrete(AbstractLaw):
 
 @dataclasses.dataclass(frozen=True)
 class Gaussian(AbstractLaw):
-    """The normal distribution with mean zero. A sample is a monotone function of its word."""
+    """The centred normal distribution. A sample is a monotone function of its word."""
 
     variance: float = 1.0
 
