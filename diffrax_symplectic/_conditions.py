@@ -48,7 +48,7 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     - For a [`diffrax_symplectic.GeneralTableau`][] with three-point increments: weak
         order 1 for any number of noises, weak order 2 for one.
     - For a [`diffrax_symplectic.PartitionedTableau`][] or
-        [`diffrax_symplectic.SeparableTableau`][]: those conditions for Itô equations that
+        [`diffrax_symplectic.SeparableTableau`][]: the conditions for Itô equations that
         apply if the noise changes only $p$ and does not depend on it.
     - For an [`diffrax_symplectic.AdditiveTableau`][]: any number of noises, with
         constant $b_k$ if the tableau is `constant`.

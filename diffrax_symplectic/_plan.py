@@ -173,7 +173,7 @@ def _cut(
             rounds = _rounds([i for i in block if i not in unknown], depends)
             if rounds is not None:
                 return unknown, rounds
-    # Make stages explicit unless that closes a cycle, those with fewest neighbours first.
+    # Make stages explicit unless that closes a cycle, fewest neighbours first.
     links = depends | depends.T
     explicit, rounds = [], []
     for i in sorted(block, key=lambda i: links[i, list(block)].sum()):

@@ -238,8 +238,8 @@ class Grid(AbstractBasis):
             few, jnp.array([0.25, 0.5, 0.75]), axis=0
         )
         half = jnp.maximum(_WIDER * jnp.maximum(high - middle, middle - low), 1)
-        # The spacing in the middle is that of a uniform grid of half-width seven times the
-        # interquartile range, or `half` if that is less.
+        # In the middle the spacing is as on a uniform grid whose half-width is seven times
+        # the interquartile range, or `half` if that is less.
         even = jnp.clip(7 * (other - quarter), half / 1e4, half)
         bend = jnp.sqrt(jnp.maximum((half / even) ** (8 / 3) - 1, 0.01))
         return Stretched(inner, middle, bend / half, _bent(_bent(bend)))

@@ -76,7 +76,7 @@ def expectation(
 
     **Samples** are single paths or replicates of many paths, depending on `sampling`. They
     are drawn in batches, so memory does not grow with their number. Sample $i$ gets the key
-    `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, whatever the batch size and devices.
+    `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, for any batch size and devices.
 
     **Levels.** With `levels=2` (3, ...) each sample is solved with steps $h$ and $h/2$ (and
     $h/4$, ...). `mean` is then extrapolated to step size zero, using the solver's
@@ -134,7 +134,7 @@ def expectation(
     differ, times between steps, a $\phi$ that is not real, sizes that are not positive
     integers, a `tol` that is not positive, an invalid `key`, a `start` with another key,
     other shapes or more paths, terms without noise, and for paths that `sampling` cannot
-    use (the message names those it can use); a
+    use (the message names suitable ones); a
     [`diffrax_symplectic.ExpectationInterrupted`][] holding the estimate so far, on a
     keyboard interrupt. Warns if `tol` was not reached, if more than one path in a hundred
     failed, if a few samples account for most of the variance, if a fit was dropped or takes

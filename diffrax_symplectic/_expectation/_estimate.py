@@ -148,7 +148,7 @@ class Expectation(eqx.Module):
         different samples (see `first` of `expectation`).
 
         If the parts start at multiples of the batch size, the result is bitwise equal to a
-        single estimate from all samples, whatever the order of merging.
+        single estimate from all samples, for any order of merging.
 
         **Raises:** a `ValueError` for parts with another key, of other shapes, by another
         `sampling`, or with samples in common.

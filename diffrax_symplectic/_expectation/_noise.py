@@ -51,7 +51,7 @@ class Noise(eqx.Module):
         discrete = tuple(law for law in laws if isinstance(law, Discrete))
         if len(discrete) < len(laws):
             raise ValueError(
-                "`ValueFunctions` sums over the outcomes of a step, of which Gaussian "
+                "`ValueFunctions` sums over the outcomes of a step, but Gaussian "
                 "increments have infinitely many. Use a `WeakBrownianPath` in place of the "
                 "path in `terms`, or pass `sampling=ArrayRQMC(num_paths)`."
             )

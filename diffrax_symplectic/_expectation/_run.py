@@ -113,7 +113,7 @@ def run(
         begin.start.check_same(estimate, "`start`")
         if at > most:
             raise ValueError(
-                "The number of paths (or replicates) includes those of `start`, which has "
+                "The number of paths (or replicates) includes `start`, which has "
                 f"{at - first} already; got {plan.num_samples}. Pass a larger number."
             )
         estimate = dataclasses.replace(estimate, moments=begin.start.moments)

@@ -235,7 +235,7 @@ def _controlled_paths(
     off = jnp.abs(left - promised)
     # Deviations must exceed rounding.
     beyond = beyond[:, :, None] + ROUNDING * jnp.finfo(off.dtype).eps * jnp.abs(plain)
-    # Ratios are capped at one: what is likelier without the wider noise is seen without it.
+    # Cap ratios at one: paths that are likelier without wider noise are seen without it.
     ratio = jnp.exp(-jnp.maximum(jnp.sum(log_ratio, axis=0), 0))[:, None]
     far, lost = jnp.where(off > beyond, ratio * off, 0), jnp.any(failed, axis=0)
     return Samples(p.averaged([left, plain, control, far]), ~lost, lost)

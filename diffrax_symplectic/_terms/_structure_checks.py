@@ -103,7 +103,7 @@ def _faults(
     q, faults, advice = 1 - p, [], _advice("separable")
     dp, dq = (lambda out: out[p]), (lambda out: out[q])
     of_p, of_q = (lambda t, y, control: y[p]), (lambda t, y, control: y[q])
-    beside = " beside that of H0" if len(drift) > 1 else ""
+    beside = " besides H0" if len(drift) > 1 else ""
     for term, flow in drift:
         for part, of, derivative, rate in (
             (dp, of_p, "dH0/dq depends on p", "dp/dt depend on p"),

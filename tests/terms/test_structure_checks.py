@@ -237,7 +237,7 @@ def test_friction_in_a_second_term_is_not_blamed_on_the_hamiltonian():
         diffrax.MultiTerm(friction, terms),
         diffrax.MultiTerm(*terms.terms, friction),
     ):
-        with pytest.raises(ValueError, match="beside that of H0.*`Damped") as info:
+        with pytest.raises(ValueError, match="besides H0.*`Damped") as info:
             ds.StormerVerlet().init(both, 0.0, 0.1, _positive_state, None)
         assert "dH0/dq" not in str(info.value)
     # A drift alone is that of H0, whatever it was made from.
