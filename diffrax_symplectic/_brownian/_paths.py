@@ -58,9 +58,9 @@ class WeakBrownianPath(AbstractPathWithLaws):
     be divided into shorter ones. Step sizes must be fixed (`diffrax.ConstantStepSize` or
     `diffrax.StepTo`).
 
-    The increments are a function of `key` and the position of the step, which tolerates
-    rounding errors of the times. A step that is recomputed, as in a backward pass, gets the
-    same increments.
+    The increments are a function of `key` and the position of the step, up to a fraction of
+    its size, so rounding errors of the times do not matter. A step that is recomputed, as
+    in a backward pass, gets the same increments.
 
     Probabilities are exact up to $2^{-32}$, and odd moments are exactly zero.
     """
