@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, Bool, PyTree
 
 from ._custom_types import IntScalarLike
@@ -43,7 +44,10 @@ def batched_like(values: _T, others: PyTree) -> _T:
     nested loops again each time. Batching the initial values before the loop halves the
     time to trace `StrangGauss`.
     """
-    return _batched(values, [x for x in jtu.tree_leaves(others) if eqx.is_array(x)])
+    arrays = [x for x in jtu.tree_leaves(others) if eqx.is_array(x)]
+    # Copies, which are no operations of the program: `custom_jvp` does not convert arrays
+    # of NumPy, over which a user may have batched.
+    return _batched(*jtu.tree_map(jnp.array, (values, arrays)))
 
 
 @jax.custom_batching.custom_vmap
@@ -74,10 +78,15 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
     Under `vmap` a conditional becomes a select: all paths compute, with memory for all.
     Here the stragglers (`pending` paths) are gathered from the batch and served in groups.
     """
-    # Trace `fn` once, here: under `vmap`, `jax.jit` would trace it again.
-    traced = eqx.filter_closure_convert(fn, value)
-    arrays, static = eqx.partition(traced, eqx.is_array)
-    call = lambda value, arrays: eqx.combine(arrays, static)(value)
+    # Trace `fn` once, here: under `vmap`, `jax.jit` would trace it again. (The function of
+    # `eqx.filter_closure_convert` refuses its arguments within `shard_map`.)
+    traced, struct = jax.make_jaxpr(fn, return_shape=True)(value)
+    arrays, treedef = traced.consts, jtu.tree_structure(struct)
+
+    def call(value, arrays):
+        new = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, arrays))
+        return treedef.unflatten(new(*jtu.tree_leaves(value)))
+
     by_parts = jax.jit(ft.partial(_by_parts, call))
 
     # Each path's `own` arrays have a leading axis; `common` arrays are shared.

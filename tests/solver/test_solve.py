@@ -276,3 +276,17 @@ def test_results_under_jit_and_vmap_are_those_without():
     for i, key in enumerate(keys):
         for a, b in zip(batch, solve(key)):
             np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-13)
+
+
+def test_a_batch_over_an_array_of_numpy_within_jit():
+    terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
+    y0, args = random_problem(jr.key(0), 1, 1)
+
+    def end(q):
+        solver = ds.ImplicitMidpoint()
+        return diffrax.diffeqsolve(terms, solver, 0, 0.2, 0.1, (y0[0], q), args).ys
+
+    q = np.array([[0.1], [0.2]])
+    batch = jax.jit(lambda: jax.vmap(end)(q))()
+    same = ft.partial(np.testing.assert_allclose, rtol=1e-14)
+    jax.tree.map(same, batch, jax.jit(jax.vmap(end))(jnp.asarray(q)))
