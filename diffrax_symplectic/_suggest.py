@@ -216,7 +216,7 @@ def _holds(
 def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     advice = (
         "Pass the terms of a Stratonovich system, `hamiltonian_terms(H0, noise, path)` or "
-        "`MultiTerm(ODETerm(f), ControlTerm(g, path))`, with a Brownian path in each noise"
+        "`MultiTerm(ODETerm(f), ControlTerm(g, path))`, with a Brownian path"
     )
     if not isinstance(terms, diffrax.AbstractTerm):
         raise ValueError(f"{advice}; got {type(terms).__name__}.")
