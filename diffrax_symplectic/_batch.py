@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, Bool, PyTree
 
+from ._compat import captured_arrays
 from ._custom_types import IntScalarLike
 
 
@@ -78,15 +78,8 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
     Under `vmap` a conditional becomes a select: all paths compute, with memory for all.
     Here the stragglers (`pending` paths) are gathered from the batch and served in groups.
     """
-    # Trace `fn` once, here: under `vmap`, `jax.jit` would trace it again. (The function of
-    # `eqx.filter_closure_convert` refuses its arguments within `shard_map`.)
-    traced, struct = jax.make_jaxpr(fn, return_shape=True)(value)
-    arrays, treedef = traced.consts, jtu.tree_structure(struct)
-
-    def call(value, arrays):
-        new = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, arrays))
-        return treedef.unflatten(new(*jtu.tree_leaves(value)))
-
+    # Trace `fn` once, here: under `vmap`, `jax.jit` would trace it again.
+    call, arrays = captured_arrays(fn, value)
     by_parts = jax.jit(ft.partial(_by_parts, call))
 
     # Each path's `own` arrays have a leading axis; `common` arrays are shared.

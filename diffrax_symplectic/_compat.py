@@ -3,9 +3,11 @@
 They are used nowhere else. `tests/test_private_parts.py` tests each of them.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
+import jax
 import jax.tree_util as jtu
 from diffrax._term import AdjointTerm, WrapTerm
 from equinox.internal import (
@@ -14,8 +16,9 @@ from equinox.internal import (
     while_loop as while_loop,
     ω as ω,
 )
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 
 def unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
@@ -43,3 +46,13 @@ def _is_wrapped(x: Any) -> bool:
 def is_adjoint_term(term: diffrax.AbstractTerm) -> bool:
     """Whether the term comes from `diffrax.BacksolveAdjoint`."""
     return isinstance(unwrapped(term), AdjointTerm)
+
+
+def captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[Array]]:
+    """`fn(value)` as a function of `value` and of the arrays that `fn` captures; and these.
+    (`eqx.filter_closure_convert` checks types that `shard_map` changes.)"""
+    traced, struct = jax.make_jaxpr(fn, return_shape=True)(value)
+    treedef = jtu.tree_structure(struct)
+    closed = lambda arrays: jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, arrays))
+    call = lambda x, arrays: treedef.unflatten(closed(arrays)(*jtu.tree_leaves(x)))
+    return call, traced.consts

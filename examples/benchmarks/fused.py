@@ -221,9 +221,9 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     for name, case in CASES.items():
+        first = [first_call(case, engine) for engine in ("drjit", "jax")]
         fused, jax_ns, single = nanoseconds(case, FEW, 20 if "of 64" in name else 100)
         many, jax_many = nanoseconds(case, 16 * FEW, 10, False)
-        first = [first_call(case, engine) for engine in ("drjit", "jax")]
         shown = f"{in_c[case.h]:.1f}" if name.startswith("Kubo, `Impl") else ""
         print(
             f"| {name} | {fused:.1f} | {jax_ns:.0f} | {jax_ns / fused:.1f} | {shown} | "
