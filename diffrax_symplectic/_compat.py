@@ -18,7 +18,7 @@ from equinox.internal import (
 )
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 
 def unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
@@ -48,7 +48,7 @@ def is_adjoint_term(term: diffrax.AbstractTerm) -> bool:
     return isinstance(unwrapped(term), AdjointTerm)
 
 
-def captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[Array]]:
+def captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[Any]]:
     """`fn(value)` as a function of `value` and of the arrays that `fn` captures; and these.
     (`eqx.filter_closure_convert` checks types that `shard_map` changes.)"""
     traced, struct = jax.make_jaxpr(fn, return_shape=True)(value)

@@ -55,11 +55,11 @@ def hamiltonian_terms(
         shape, `(m,)` or a PyTree of `jax.ShapeDtypeStruct`s:
         [`diffrax_symplectic.suggest_solver`][], [`diffrax_symplectic.compare_solvers`][]
         and [`diffrax_symplectic.expectation`][] then make the path that the solver needs.
-    - `structure`: asserts a structure that some solvers need: `"separable"` for $H_0 = V(p)
-        + U(t, q)$ and $H_k = U_k(t, q)$, or `"additive"` if the gradients of the $H_k$ do
-        not depend on the state. By default it is detected by tracing, which counts every
-        variable that enters a derivative, even if it cancels or is multiplied by zero:
-        write $H_0$ as a sum of terms that depend on $p$ or $q$ alone.
+    - `structure`: asserts a structure that some solvers need: `"separable"` for
+        $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, `"additive"` if the gradients of the
+        $H_k$ do not depend on the state. By default it is detected by tracing, which counts
+        every variable that enters a derivative, even if it cancels or is multiplied by
+        zero: write $H_0$ as a sum of terms that depend on $p$ or $q$ alone.
 
     `p` and `q` are PyTrees of arrays of the same structure and shapes.
 
