@@ -77,7 +77,7 @@ def by_drjit(
                 paths = kernels.advance(paths, parameters, done, int(step))
             kept[step], done = [*map(np.asarray, paths.y)], step
         stopped = np.asarray(paths.stopped)
-    except Exception as error:
+    except (NotReplayed, RuntimeError) as error:
         if (refused := _refused(error)) is not None:
             raise refused from None
         raise

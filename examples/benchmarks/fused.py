@@ -87,8 +87,11 @@ class Case(NamedTuple):
     shape: tuple[int, ...] = ()
     path: Callable = ds.WeakBrownianPath
 
+    def new_path(self, key, dtype=jnp.float64):
+        return self.path(jax.ShapeDtypeStruct(self.shape, dtype), key)
+
     def terms(self, key, dtype):
-        return self.make(self.path(jax.ShapeDtypeStruct(self.shape, dtype), key))
+        return self.make(self.new_path(key, dtype))
 
     def start(self, dtype):
         return jax.tree.map(lambda x: jnp.asarray(x, dtype), self.y0)
@@ -155,9 +158,8 @@ def by_drjit(case: Case, n: int, steps: int, dtype) -> Callable:
 
 
 def by_jax(case: Case, n: int, steps: int) -> Callable:
-    path = lambda key: case.path(jax.ShapeDtypeStruct(case.shape, jnp.float64), key)
     y0, own = case.start(jnp.float64), keys(n)
-    batch = jax.jit(ensemble(case.make, path, case.solver, y0, case.h, steps))
+    batch = jax.jit(ensemble(case.make, case.new_path, case.solver, y0, case.h, steps))
     return lambda: batch(own)
 
 
