@@ -12,12 +12,7 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from .._root_finder import (
-    AbstractBlocks,
-    all_finite,
-    Halves,
-    PicardNewton,
-)
+from .._root_finder import all_finite, Halves, PicardNewton
 from .._solver import AbstractImplicitStages
 
 
@@ -137,10 +132,9 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
     norm: Callable[[PyTree], Scalar] = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        del fn, options, f_struct, aux_struct, tags
-        assert isinstance(args, AbstractBlocks)
+        del fn, f_struct, aux_struct, tags
         zeros = jtu.tree_map(jnp.zeros_like, y)
-        return args.sweep(sweep, zeros, all_finite(y))
+        return options["sweep"](args, sweep, zeros, all_finite(y))
 
     def step(self, fn, y, args, options, state, tags):
         del fn, args, options, tags

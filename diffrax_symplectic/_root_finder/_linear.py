@@ -29,17 +29,17 @@ REDUCTION = 1e-3
 
 
 def correction(
-    fn: Callable[[_Vector], tuple[_Vector, Any]], x: _Vector, solver: Solver
-) -> tuple[_Vector, _Vector, Bool[Array, ""], Any]:
-    """The value of `fn` at `x`, the Newton correction to subtract from `x`, whether it was
-    found, and the auxiliary output of `fn`."""
+    fn: _Map, x: _Vector, solver: Solver
+) -> tuple[_Vector, _Vector, Bool[Array, ""]]:
+    """The value of `fn` at `x`, the Newton correction to subtract from `x`, and whether it
+    was found."""
     if solver is not None or x.size > _MAX_DENSE:
-        value, derivative, aux = jax.linearize(fn, x, has_aux=True)
-        return value, *solve(derivative, value, solver), aux
+        value, derivative = jax.linearize(fn, x)
+        return value, *solve(derivative, value, solver)
     # With `jvp` the compiled program contains `fn` only once.
-    both = lambda v: jax.jvp(fn, (x,), (v,), has_aux=True)
-    value, matrix, aux = jax.vmap(both, out_axes=(None, 1, None))(_units(x))
-    return value, _eliminate(matrix, value), jnp.array(True), aux
+    both = lambda v: jax.jvp(fn, (x,), (v,))
+    value, matrix = jax.vmap(both, out_axes=(None, 1))(_units(x))
+    return value, _eliminate(matrix, value), jnp.array(True)
 
 
 def solve(

@@ -1,7 +1,6 @@
-import abc
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.flatten_util as jfu
@@ -11,6 +10,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree, Scalar
 
+from .._arguments import whole_number
 from .._batch import batched_like, where_pending
 from .._compat import ω
 from ._newton import Newton
@@ -18,19 +18,7 @@ from ._sweeps import sweep
 from ._tolerance import all_finite, Tolerance
 
 
-_Found: TypeAlias = tuple[Any, Bool[Array, ""]]
-
-
 _SUCCESSFUL = optx.RESULTS.successful
-
-
-class AbstractBlocks(eqx.Module):
-    """An `args` whose equations can be solved block by block."""
-
-    @abc.abstractmethod
-    def sweep(self, solve: Callable[..., _Found], guess: Any, pending: Any) -> _Found:
-        """Solves the blocks in order, each with the values of earlier blocks, by
-        `solve(image, scale, guess, pending)`."""
 
 
 class _State(NamedTuple):
@@ -40,6 +28,11 @@ class _State(NamedTuple):
     solved: Bool[Array, ""]
     result: optx.RESULTS
     aux: Any
+
+
+def _number_of_steps(name: str, default: int) -> Any:
+    converter = ft.partial(whole_number, name, least=0)
+    return eqx.field(default=default, converter=converter, static=True)
 
 
 class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _State]):
@@ -78,8 +71,11 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         convergence rate shows that this many would not suffice.
     - `newton_steps`: the most iterations of Newton's method.
 
-    In `optimistix.root_find`, `options={"scale": f}` gives the size of the state that the
-    unknowns `k` change: `f(k)` has their structure, and replaces `k` in `rtol`.
+    In `optimistix.root_find`, `options` may hold two functions. `scale(k)`, in the
+    structure of the unknowns `k`, is the size of the state that they change, and replaces
+    `k` in `rtol`. `sweep(args, solve, k, pending)` solves the equations block by block,
+    each with the values of earlier blocks, by `solve(image, scale, k, pending)`; both
+    return the unknowns and whether they are solved.
 
     **Raises:** a `ValueError` for negative numbers.
     """
@@ -88,13 +84,17 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     atol: float = 0.0
     norm: Callable[[PyTree], Scalar] = optx.max_norm
     linear_solver: lx.AbstractLinearSolver | None = None
-    picard_steps: int = eqx.field(default=200, static=True)
-    newton_steps: int = eqx.field(default=100, static=True)
+    picard_steps: int = _number_of_steps("picard_steps", 200)
+    newton_steps: int = _number_of_steps("newton_steps", 100)
 
     def __check_init__(self):
-        for name in ("rtol", "atol", "picard_steps", "newton_steps"):
-            if isinstance(n := getattr(self, name), int | float) and n < 0:
+        for name in ("rtol", "atol"):
+            if isinstance(n := getattr(self, name), int | float) and not n >= 0:
                 raise ValueError(f"`{name}` of `PicardNewton` must be >= 0; got {n}.")
+
+    @property
+    def _tolerance(self) -> Tolerance:
+        return Tolerance(self.rtol, self.atol, self.norm)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
         del fn, args, options, f_struct, tags
@@ -104,43 +104,26 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
         del tags
         scale = options.get("scale", lambda k: k)
         pending = all_finite(y)
-        found, solved = self._sweep(fn, y, args, scale, pending)
+        solve = ft.partial(sweep, self._tolerance, self.picard_steps)
+        if "sweep" in options:
+            found, solved = options["sweep"](args, solve, y, pending)
+        else:
+            image = lambda y: (y**ω - fn(y, args)[0] ** ω).ω
+            found, solved = solve(image, scale, y, pending)
         # As one vector: a loop needs separate kernels to select, gather and scatter each
         # array of its state.
         k, restore = jfu.ravel_pytree(found)
-        residual = lambda k, _: jfu.ravel_pytree(fn(restore(k), args)[0])[0]
-
-        def rescue(value):
-            newton = Newton(
-                start=jfu.ravel_pytree(y)[0],
-                restore=restore,
-                rtol=self.rtol,
-                atol=self.atol,
-                norm=self.norm,
-                linear_solver=self.linear_solver,
-            )
-            sol = optx.root_find(
-                residual,
-                newton,
-                value[0],
-                options=dict(scale=scale),
-                max_steps=self.newton_steps,
-                throw=False,
-            )
-            return sol.value, sol.result
-
+        residual = lambda k: jfu.ravel_pytree(fn(restore(k), args)[0])[0]
+        start, _ = jfu.ravel_pytree(y)
+        newton = Newton(
+            residual, start, restore, scale, self._tolerance, self.linear_solver
+        )
+        rescue = lambda value: newton.solve(value[0], self.newton_steps)
         k, result = where_pending(rescue, pending & ~solved, (k, _SUCCESSFUL))
         y_new, solved = restore(k), result == _SUCCESSFUL
         # Evaluate the equations once more only if there is auxiliary output.
         aux = fn(y_new, args)[1] if jtu.tree_leaves(state.aux) else state.aux
         return y_new, _State(solved, result, state.aux), aux
-
-    def _sweep(self, fn, y, args, scale, pending) -> _Found:
-        tolerance = Tolerance(self.rtol, self.atol, self.norm)
-        solve = ft.partial(sweep, tolerance, self.picard_steps)
-        if isinstance(args, AbstractBlocks):
-            return args.sweep(solve, y, pending)
-        return solve(lambda y: (y**ω - fn(y, args)[0] ** ω).ω, scale, y, pending)
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags

@@ -67,6 +67,8 @@ class Tolerance(NamedTuple):
 
 
 def max_norm(x: Array) -> Scalar:
+    if x.size == 0:
+        return jnp.zeros((), x.dtype)
     if x.size == 1:
         return jnp.abs(x).reshape(())
     # The bits of nonnegative floats, read as integers, are ordered like their values, with

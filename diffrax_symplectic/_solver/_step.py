@@ -18,12 +18,7 @@ from .._batch import batched_like, materialize
 from .._compat import ω
 from .._custom_types import RealScalarLike, Y
 from .._plan import Block, Plan
-from .._root_finder import (
-    AbstractBlocks,
-    all_finite,
-    differentiate,
-    Halves,
-)
+from .._root_finder import all_finite, differentiate, Halves
 from .._tableau import FlatTableau, Stage
 from .._terms import tree_sum
 
@@ -46,7 +41,7 @@ class Step(NamedTuple):
     driven: dict[str, Driven]
 
 
-class Stages(AbstractBlocks):
+class Stages(eqx.Module):
     """The stages of one step, in the blocks of its plan. Unknown values count as zero."""
 
     plan: Plan = eqx.field(static=True)
@@ -278,7 +273,7 @@ def _implicit_step(
         finder,
         guess,
         args=stages,
-        options=dict(scale=stages.scale),
+        options=dict(scale=stages.scale, sweep=Stages.sweep),
         max_steps=max_steps,
         throw=False,
     )

@@ -153,9 +153,14 @@ def test_corrections_are_measured_by_the_scale_that_is_passed(slope, most):
 
 
 def test_numbers_of_iterations_that_mean_nothing_are_refused():
-    for name in ("picard_steps", "newton_steps", "rtol", "atol"):
-        with pytest.raises(ValueError, match=f"`{name}` of .* must be >= 0; got -1"):
-            ds.PicardNewton(**{name: -1})
+    for name in ("rtol", "atol"):
+        for wrong in (-1, float("nan")):
+            with pytest.raises(ValueError, match=f"`{name}` of .* must be >= 0; got"):
+                ds.PicardNewton(**{name: wrong})
+    for name in ("picard_steps", "newton_steps"):
+        for wrong in (np.int64(-1), 2.5):
+            with pytest.raises(ValueError, match=f"`{name}` must be an integer, 0 or"):
+                ds.PicardNewton(**{name: wrong})
     for name, wrong in (
         ("root_find_max_steps", -1),
         ("root_finder", ds.PicardNewton),

@@ -177,6 +177,19 @@ def _explosive(path):
     )
 
 
+def test_parts_of_the_state_may_be_empty():
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: (p["x"] ** 2 + q["x"] ** 2) / 2,
+        lambda t, p, q, args: q["x"],
+        ds.WeakBrownianPath((), jr.key(0)),
+    )
+    half = {"x": jnp.array(1.0), "none": jnp.zeros(0)}
+    solver = ds.ImplicitMidpoint()
+    y1, *_, result = solver.step(terms, 0.0, 0.1, (half, half), None, None, False)
+    assert result == diffrax.RESULTS.successful
+    assert y1[0]["none"].shape == (0,) and jnp.isfinite(y1[0]["x"])
+
+
 def test_unsolvable_stages_are_reported():
     path = ds.WeakBrownianPath((), jr.key(0))
     y0 = (jnp.array(0.1), jnp.array(10.0))
