@@ -176,6 +176,14 @@ class GeneralTableau(AbstractTableau):
     noise: tuple[str, ...] = ("W",)
 
     def __post_init__(self):
+        if isinstance(self.noise, str) or not all(
+            isinstance(x, str) for x in self.noise
+        ):
+            raise ValueError(
+                '`noise` must hold the names of random variables, as in `("W",)`; got '
+                f"{self.noise!r}."
+            )
+        object.__setattr__(self, "noise", tuple(self.noise))
         s, r = np.size(self.alpha), np.size(self.beta)
         _check(self, alpha=(s,), beta=(r,), A0=(s, s), B0=(s, r), A1=(r, s), B1=(r, r))
 

@@ -174,6 +174,14 @@ def test_conditions_are_known_for_known_tableaus_and_variables():
     assert abs(strong["beta[H].c1 + 1"]) == 1
 
 
+def test_noise_of_a_tableau_is_a_tuple_of_names():
+    one = dict(alpha=[1], beta=[1], A0=[[0.5]], B0=[[0.5]], A1=[[0.5]], B1=[[0.5]])
+    assert ds.GeneralTableau(**one, noise=["W"]).noise == ("W",)
+    for wrong in ("W", [0]):
+        with pytest.raises(ValueError, match="`noise` must hold the names"):
+            ds.GeneralTableau(**one, noise=wrong)
+
+
 def test_tableaus_know_nothing_of_jax():
     file = pathlib.Path(ds.__file__).parent / "_tableau.py"
     imported = set()

@@ -4,6 +4,8 @@ from ._stepwise import (
     increment_struct,
     is_random,
     laws_of,
+    num_noises,
+    raveled,
     step_size,
     stepwise,
     UnspecifiedPath,

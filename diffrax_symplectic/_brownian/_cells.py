@@ -6,14 +6,16 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
+import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
 from .._custom_types import RealScalarLike
-from ._stepwise import Increment, step_size
+from ._stepwise import Increment, raveled, step_size
 
 
 class Piece(eqx.Module):
@@ -66,7 +68,7 @@ class Piece(eqx.Module):
     ) -> Increment:
         """The increment over a step of size `h` for a path of this shape. With `use_levy`
         it is of type `kind`, with the areas of this segment."""
-        _, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, shape))
+        _, unravel = raveled(shape)
         if not use_levy:
             return unravel(self.W)
         variables = {"W": unravel(self.W)}
@@ -83,9 +85,16 @@ def or_one(h: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(h > 0, h, 1)
 
 
-def check_cell(cell: float | None) -> None:
-    if cell is not None and not cell > 0:
-        raise ValueError(f"`cell` must be positive, or `None`; got {cell!r}.")
+def checked_cell(cell: float | None) -> float | None:
+    """Raises a `ValueError` unless this is a positive number or `None`."""
+    if cell is None:
+        return None
+    known = eqx.is_array_like(cell) and not isinstance(cell, jax.core.Tracer)
+    if not known or np.ndim(cell) != 0 or not 0 < float(cell) < np.inf:
+        raise ValueError(
+            f"`cell` must be a positive number that is not traced, or `None`; got {cell!r}."
+        )
+    return float(cell)
 
 
 def compose(

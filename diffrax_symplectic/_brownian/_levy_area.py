@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 from .._arguments import whole_number
 from .._batch import materialize
 from .._custom_types import BM, RealScalarLike
-from ._cells import check_cell, compose, or_one, Piece
+from ._cells import checked_cell, compose, or_one, Piece
 from ._random import AREA_WORDS, check_key, normal_from_words, place_of, random_words
 from ._stepwise import AbstractWrappedPath, Increment, increment_struct, num_noises
 from ._wrappers import require_space_time_area
@@ -91,11 +91,10 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         """
         require_space_time_area(path, type(self).__name__)
         check_key(key, type(self).__name__)
-        check_cell(cell)
         self.path = path
         self.key = key
         self.num_terms = whole_number("num_terms", num_terms, 0)
-        self.cell = cell
+        self.cell = checked_cell(cell)
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         cell = self.cell

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM
-from ._cells import check_cell, compose, Piece
+from ._cells import checked_cell, compose, Piece
 from ._random import (
     AbstractLaw,
     check_key,
     FOUR_POINT,
     place_of,
     THREE_POINT,
-    two_point,
+    TWO_POINT,
 )
 from ._stepwise import AbstractPathWithLaws, checked_shape, GAUSSIAN_LAWS, Increment
 
@@ -111,7 +111,7 @@ class WeakBrownianPath(AbstractPathWithLaws):
             "W": THREE_POINT if self.order == 2 else FOUR_POINT,
             "second": THREE_POINT if self.second else None,
             "third": THREE_POINT if self.order == 3 else None,
-            "two_point": two_point() if self.two_point else None,
+            "two_point": TWO_POINT if self.two_point else None,
         }
         return {name: law for name, law in laws.items() if law is not None}
 
@@ -172,11 +172,10 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
                 f"`diffrax.SpaceTimeLevyArea`; got {levy_area!r}."
             )
         check_key(key, type(self).__name__)
-        check_cell(cell)
         self.shape = checked_shape(shape, type(self).__name__)
         self.key = key
         self.levy_area = levy_area
-        self.cell = cell
+        self.cell = checked_cell(cell)
 
     @property
     def laws(self) -> Mapping[str, AbstractLaw]:

@@ -19,8 +19,9 @@ from .._batch import materialize
 # The position of a step, in units of a power of two, and the exponent of that power.
 Place: TypeAlias = tuple[Integer[Array, ""], Integer[Array, ""]]
 
-# The words of a step are numbered. The words of wrappers start at these numbers.
-PLATEAU_WORDS, AREA_WORDS = 2**18, 2**19
+# Pairs of words of a step are numbered. The pairs of wrappers begin at these numbers.
+_MOST = 2**18
+PLATEAU_WORDS, AREA_WORDS = _MOST, 2 * _MOST
 
 
 def random_words(
@@ -32,7 +33,7 @@ def random_words(
     key = _typed(key)
     count, exponent = place
     blocks = (sets * n + 1) // 2
-    if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks < 2**20 - begin:
+    if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks <= _MOST:
         # With the place as counter, one hash yields two words. Folding and splitting keys
         # would take three hashes for the first word.
         numbers = np.arange(begin, begin + blocks, dtype=np.uint32)
@@ -220,8 +221,5 @@ FOUR_POINT = Discrete(
     cuts=(_RARE, 2**31, 2**31 + _RARE),
 )
 
-
-def two_point(variance: float = 1.0) -> Discrete:
-    """A fair sign."""
-    size = float(np.sqrt(variance))
-    return Discrete((-size, size), (1 / 2, 1 / 2), (2**31,))
+# A fair sign.
+TWO_POINT = Discrete(values=(-1.0, 1.0), probabilities=(1 / 2, 1 / 2), cuts=(2**31,))

@@ -8,6 +8,7 @@ from typing import Any, cast, ClassVar, TYPE_CHECKING, TypeAlias
 import diffrax
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -241,6 +242,12 @@ def increment_struct(
 
 def num_noises(shape: PyTree[jax.ShapeDtypeStruct]) -> int:
     return sum(leaf.size for leaf in jtu.tree_leaves(shape))
+
+
+def raveled(like: PyTree) -> tuple[Array, Callable]:
+    """Zeros in the structure, shapes and dtypes of `like` as one vector, and what restores
+    the structure of such a vector."""
+    return jfu.ravel_pytree(jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like))
 
 
 def step_size(h: RealScalarLike, shape: PyTree[jax.ShapeDtypeStruct]) -> PyTree[Array]:

@@ -3,7 +3,7 @@ suggestions."""
 
 import functools as ft
 from collections.abc import Callable, Collection
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import diffrax
 from jaxtyping import PRNGKeyArray
@@ -13,34 +13,23 @@ from ._paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
 from ._wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPath
 
 
-class PathKind(NamedTuple):
-    """A way to make Brownian paths, as code and as a function of a shape and a key."""
+# Makes a Brownian path of a shape from a key.
+_MakePath: TypeAlias = Callable[[Any, PRNGKeyArray], diffrax.AbstractBrownianPath]
 
-    code: str
-    make: Callable[[Any, PRNGKeyArray], diffrax.AbstractBrownianPath]
-
-    def within(self, wrapper: Callable, code: str) -> "PathKind":
-        """Such a path within a wrapper; `code` is a template for both."""
-        make = lambda shape, key: wrapper(self.make(shape, key), key)
-        return PathKind(code.format(self.code), make)
+_AREA = ft.partial(FixedStepBrownianPath, levy_area=diffrax.SpaceTimeLevyArea)
 
 
-def _weak(more: str, **kwargs) -> PathKind:
-    code = f"WeakBrownianPath(shape, key{more})"
-    return PathKind(code, ft.partial(WeakBrownianPath, **kwargs))
+def _truncated(shape, key) -> TruncatedBrownianPath:
+    return TruncatedBrownianPath(FixedStepBrownianPath(shape, key))
 
 
-_GAUSSIAN = PathKind("FixedStepBrownianPath(shape, key)", FixedStepBrownianPath)
-_AREA = PathKind(
-    "FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)",
-    ft.partial(FixedStepBrownianPath, levy_area=diffrax.SpaceTimeLevyArea),
-)
-_TRUNCATED = _GAUSSIAN.within(
-    lambda path, key: TruncatedBrownianPath(path), "TruncatedBrownianPath({})"
-)
 # Wrappers draw other random words from the same key.
-_LEVY_AREA = _AREA.within(LevyAreaBrownianPath, "LevyAreaBrownianPath({}, key)")
-_PLATEAUS = _AREA.within(PlateauBrownianPath, "PlateauBrownianPath({}, key)")
+def _with_levy_areas(shape, key) -> LevyAreaBrownianPath:
+    return LevyAreaBrownianPath(_AREA(shape, key), key)
+
+
+def _with_plateaus(shape, key) -> PlateauBrownianPath:
+    return PlateauBrownianPath(_AREA(shape, key), key)
 
 
 class RandomVariable(NamedTuple):
@@ -48,7 +37,7 @@ class RandomVariable(NamedTuple):
 
     - `increment`: the type of increments that contain it.
     - `name`: its name in messages.
-    - `path`: a path that has it.
+    - `path`: makes a path that has it.
     - `variance`: in units of the step size, the same for all laws; `None` if it has no law
         of its own.
     - `even`: whether it is unchanged when time runs backward, although Diffrax negates all
@@ -61,7 +50,7 @@ class RandomVariable(NamedTuple):
 
     increment: type[diffrax.AbstractBrownianIncrement]
     name: str
-    path: PathKind
+    path: _MakePath
     variance: float | None = 1.0
     even: bool = False
     drives: Literal["noise", "noise brackets", "drift brackets"] = "noise"
@@ -70,19 +59,19 @@ class RandomVariable(NamedTuple):
     @property
     def advice(self) -> str:
         """Its name, and how to get it."""
-        return f"{self.name}. Pass `solver.path(shape, key)`, or `{self.path.code}`"
+        return f"{self.name}. Make its path by `solver.path(shape, key)`"
 
 
 _area = ft.partial(
     RandomVariable, diffrax.AbstractSpaceTimeLevyArea, "space-time Lévy area", _AREA
 )
-_plateau = ft.partial(RandomVariable, PlateauIncrement, "plateaus", _PLATEAUS)
+_plateau = ft.partial(RandomVariable, PlateauIncrement, "plateaus", _with_plateaus)
 
 # By the attribute of the increment. Variables whose increments contain the most come first:
 # messages name missing variables in this order.
 VARIABLES = {
     "A": RandomVariable(
-        LevyAreaIncrement, "Lévy areas", _LEVY_AREA, None, drives="noise brackets"
+        LevyAreaIncrement, "Lévy areas", _with_levy_areas, None, drives="noise brackets"
     ),
     "C": _plateau(1 / 6),
     # The sign of `C`. Only the sign is drawn: the size is a function of `W` and `H`.
@@ -93,18 +82,22 @@ VARIABLES = {
     "third": RandomVariable(
         WeakIncrement,
         "four-point variables and two more sets",
-        _weak(", order=3", order=3),
+        ft.partial(WeakBrownianPath, order=3),
     ),
     "second": RandomVariable(
         WeakIncrement,
         "a second set of three-point variables",
-        _weak(", second=True", second=True),
+        ft.partial(WeakBrownianPath, second=True),
     ),
     "two_point": RandomVariable(
-        WeakIncrement, "two-point variables", _weak(", two_point=True", two_point=True)
+        WeakIncrement,
+        "two-point variables",
+        ft.partial(WeakBrownianPath, two_point=True),
     ),
     "W": RandomVariable(
-        diffrax.AbstractBrownianIncrement, "the increment of a Brownian path", _weak("")
+        diffrax.AbstractBrownianIncrement,
+        "the increment of a Brownian path",
+        WeakBrownianPath,
     ),
 }
 
@@ -115,10 +108,10 @@ def drives(name: str) -> str:
     return VARIABLES[name].drives if name in VARIABLES else "noise"
 
 
-def path_of(variables: Collection[str], *, gaussian: bool, bounded: bool) -> PathKind:
-    """The path with these random variables. If only increments are needed, they may be
+def path_of(variables: Collection[str], *, gaussian: bool, bounded: bool) -> _MakePath:
+    """Makes a path with these random variables. If only increments are needed, they may be
     `gaussian`, and then also `bounded`, for implicit methods."""
     for name, variable in VARIABLES.items():
         if name in variables and (name != "W" or not gaussian):
             return variable.path
-    return _TRUNCATED if bounded else _GAUSSIAN
+    return _truncated if bounded else FixedStepBrownianPath

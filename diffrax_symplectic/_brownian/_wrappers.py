@@ -16,7 +16,7 @@ from ._random import (
     place_of,
     PLATEAU_WORDS,
     random_words,
-    two_point,
+    TWO_POINT,
 )
 from ._stepwise import (
     AbstractWrappedPath,
@@ -151,9 +151,6 @@ def _offset(h, W, H, sign):
     return jnp.copysign(size, sign)
 
 
-_SIGN = two_point()
-
-
 class PlateauBrownianPath(AbstractWrappedPath):
     """Adds the plateaus of a [`diffrax_symplectic.PlateauIncrement`][] to the increments of
     a Brownian path with space-time Lévy area. Step sizes must be fixed."""
@@ -182,7 +179,7 @@ class PlateauBrownianPath(AbstractWrappedPath):
         if laws is None:
             return None
         # These increments do not include space-time-time areas.
-        return {"W": laws["W"], "H": laws["H"], "sign": _SIGN}
+        return {"W": laws["W"], "H": laws["H"], "sign": TWO_POINT}
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         increment = self.path.evaluate(t0, t1, use_levy=use_levy)
@@ -199,5 +196,5 @@ class PlateauBrownianPath(AbstractWrappedPath):
         if not use_levy:
             return increment
         assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
-        sign = draw_set(_SIGN, own_words, h, increment.W)
+        sign = draw_set(TWO_POINT, own_words, h, increment.W)
         return PlateauIncrement(increment.dt, increment.W, increment.H, sign)

@@ -147,8 +147,8 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
             strong = self.record is not None and self.record.strong is not None
             want = "strong" if strong else "weak"
         implicit = isinstance(self, diffrax.AbstractImplicitSolver)
-        kind = path_of(self.variables, gaussian=want == "strong", bounded=implicit)
-        return kind.make(shape, key)
+        make = path_of(self.variables, gaussian=want == "strong", bounded=implicit)
+        return make(shape, key)
 
     def __repr__(self) -> str:
         """The parameters that differ from the defaults, in one line."""

@@ -7,7 +7,6 @@ from typing import Any, cast, NamedTuple
 
 import diffrax
 import equinox as eqx
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -23,9 +22,9 @@ from .._brownian import (
     Increment,
     increment_struct,
     laws_of,
-    PlateauBrownianPath,
+    LevyAreaBrownianPath,
+    raveled,
     step_size,
-    TruncatedBrownianPath,
     VARIABLES,
     WeakBrownianPath,
 )
@@ -57,7 +56,7 @@ def step_variables(terms: PyTree[diffrax.AbstractTerm], h) -> StepVariables:
     """The variables of a step of size `h`, for `terms` with one Brownian path."""
     path, laws = _the_path(terms)
     shape = increment_struct(path)
-    flat, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, shape))
+    flat, unravel = raveled(shape)
 
     def terms_with(values):
         scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(flat.dtype)
@@ -167,9 +166,9 @@ def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPa
 
 def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
     """Whether its random variables are cheaper to recompute than to store."""
-    while isinstance(path, TruncatedBrownianPath | PlateauBrownianPath):
-        path = path.path
-    return isinstance(path, WeakBrownianPath | FixedStepBrownianPath)
+    cheap = WeakBrownianPath | FixedStepBrownianPath
+    areas = isinstance(path, LevyAreaBrownianPath)
+    return isinstance(_innermost(path), cheap) and not areas
 
 
 def noise_driven(

@@ -16,12 +16,13 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._arguments import check_pair, pair_fault
+from .._brownian import raveled
 from .._compat import unwrapped, ω
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from ._dependence import Dependence
 from ._hamiltonian import asserted_structure, has_lifted, is_hamiltonian
-from ._vector_fields import apply, split_terms
+from ._vector_fields import apply, control_struct, split_terms
 
 
 class Fault(NamedTuple):
@@ -178,7 +179,7 @@ def check_stratonovich(
 def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> Dependence:
     """The dependencies of the change by a term on time, state and control."""
     t0 = jnp.asarray(t0, jnp.result_type(float))
-    control = eqx.filter_eval_shape(term.contr, t0, t0)
+    control = control_struct(term, t0)
     change = lambda t, y, control: term.vf_prod(t, y, args, control)
     return Dependence(change, t0, y0, control)
 
@@ -188,10 +189,9 @@ def _is_zero(t0, y0: Y, args: Args, term: diffrax.AbstractTerm, half: int) -> bo
     has a block of zeros that is known while tracing."""
     if is_hamiltonian(term):
         return False
-    struct = eqx.filter_eval_shape(term.contr, t0, t0)
+    struct = control_struct(term, t0)
     with jax.ensure_compile_time_eval():
-        zeros = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), struct)
-        flat, unravel = jfu.ravel_pytree(zeros)
+        flat, unravel = raveled(struct)
         changes = [
             unwrapped(term).vf_prod(t0, y0, args, unravel(unit))[half]
             for unit in jnp.eye(flat.size, dtype=flat.dtype)
@@ -240,9 +240,8 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     The bracket is bilinear, so it is tested for two random combinations of the noises.
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
-    struct = eqx.filter_eval_shape(lambda: [term.contr(t0, t0) for term in noise])
-    zeros = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), (struct, struct))
-    flat, unravel = jfu.ravel_pytree((y0, *zeros))
+    struct = [control_struct(term, t0) for term in noise]
+    flat, unravel = raveled((jtu.tree_map(jnp.asarray, y0), struct, struct))
     largest = lambda y: jnp.max(jnp.abs(jfu.ravel_pytree(y)[0]))
 
     @eqx.filter_jit

@@ -13,6 +13,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._brownian import num_noises, raveled
 from .._compat import is_adjoint_term, unwrapped, ω
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from ._hamiltonian import HamiltonianNoise, OneNoise
@@ -94,6 +95,13 @@ def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
         eqx.filter_eval_shape(apply, parts, controls, args, t0, y0)
 
 
+def control_struct(
+    term: diffrax.AbstractTerm, t: RealScalarLike = 0.0
+) -> PyTree[jax.ShapeDtypeStruct]:
+    """The shapes and dtypes of the control of a term, for times with the dtype of `t`."""
+    return eqx.filter_eval_shape(term.contr, t, t + 1)
+
+
 @eqx.filter_jit
 def apply_one(
     terms: tuple,
@@ -107,8 +115,8 @@ def apply_one(
     noises of all terms, in the order of their flattened controls."""
     parts, before = [], 0
     for term in terms:
-        struct = eqx.filter_eval_shape(term.contr, 0.0, 1.0)
-        m = sum(s.size for s in jtu.tree_leaves(struct))
+        struct = control_struct(term)
+        m = num_noises(struct)
         # If the noise belongs to another term, this one adds zero.
         here = (before <= number) & (number < before + m)
         local = jnp.clip(number - before, 0, m - 1)
@@ -128,7 +136,7 @@ def _one_product(term, struct, number, increment, args: Args, t, y: Y) -> Y:
         one_array = eqx.is_array(matrix) and isinstance(struct, jax.ShapeDtypeStruct)
         if one_array and matrix.shape[-1:] == struct.shape:
             return matrix[..., number] * increment.astype(matrix.dtype)
-    flat, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, struct))
+    flat, unravel = raveled(struct)
     only = flat.at[number].set(increment.astype(flat.dtype))
     return term.vf_prod(t, y, args, unravel(only))
 
@@ -146,8 +154,7 @@ def apply_brackets(
 
     For antisymmetric `A` this is `sum_l Db_l (sum_k A_kl b_k)`, with `m` derivatives.
     """
-    struct = eqx.filter_eval_shape(term.contr, 0.0, 1.0)
-    _, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, struct))
+    _, unravel = raveled(control_struct(term))
     field = lambda y, x: term.vf_prod(t, y, args, unravel(x))
 
     def summand(column, unit):
@@ -201,8 +208,7 @@ def apply_bridge(
     is the drift times `h`, and `[b, A] = A' b - b' A`. Time is treated as a component of
     the state that the drift advances by `h`. Computes `m` double brackets for `m` noises.
     """
-    struct = eqx.filter_eval_shape(lambda: [term.contr(0.0, 1.0) for term in noise])
-    _, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, struct))
+    _, unravel = raveled([control_struct(term) for term in noise])
     t = jnp.asarray(t, jnp.result_type(h))
 
     def b(x, t, y):
@@ -247,5 +253,4 @@ def _checked_sum(parts: list[Y], y: Y) -> Y:
 def number_of_noises(terms: diffrax.AbstractTerm) -> int:
     """The number of scalar Brownian motions that drive the noise terms."""
     _, noise = split_terms(terms)
-    struct = eqx.filter_eval_shape(lambda: [term.contr(0.0, 1.0) for term in noise])
-    return sum(int(np.prod(s.shape)) for s in jtu.tree_leaves(struct))
+    return num_noises([control_struct(term) for term in noise])

@@ -220,8 +220,12 @@ def test_bad_arguments_are_refused():
     make = ds.FixedStepBrownianPath
     with pytest.raises(ValueError, match="`levy_area` must be"):
         make((), jr.key(0), diffrax.SpaceTimeTimeLevyArea)  # pyright: ignore
-    with pytest.raises(ValueError, match="`cell` must be positive"):
-        make((), jr.key(0), cell=0.0)
+    assert type(make((), jr.key(0), cell=jnp.array(0.5)).cell) is float
+    for wrong in (0.0, np.nan, np.inf, jnp.ones(1), "1"):
+        with pytest.raises(ValueError, match="`cell` must be a positive number"):
+            make((), jr.key(0), cell=wrong)  # pyright: ignore
+    with pytest.raises(ValueError, match="that is not traced"):
+        jax.eval_shape(lambda cell: make((), jr.key(0), cell=cell), 0.5)
     with pytest.raises(ValueError, match="real floating-point"):
         make(jax.ShapeDtypeStruct((), jnp.int32), jr.key(0))
     with pytest.raises(ValueError, match="needs a random key"):

@@ -17,7 +17,7 @@ from diffrax_symplectic._brownian._random import (
     PLATEAU_WORDS,
     random_words,
     THREE_POINT,
-    two_point,
+    TWO_POINT,
 )
 
 from ..problems import weak_path
@@ -33,7 +33,7 @@ def test_three_point_law_is_exact_in_the_bits():
     assert abs(sixth / 2**32 - 1 / 6) < 2**-32
     np.testing.assert_allclose(values[-1], np.sqrt(3), rtol=1e-15)
     edges = jnp.array([0, 2**31 - 1, 2**31, 2**32 - 1], jnp.uint32)
-    np.testing.assert_array_equal(two_point().from_words(edges, float), [-1, -1, 1, 1])
+    np.testing.assert_array_equal(TWO_POINT.from_words(edges, float), [-1, -1, 1, 1])
 
 
 @pytest.mark.core
@@ -245,6 +245,15 @@ def test_more_sets_of_words_leave_the_first_ones_and_wrappers_have_their_own(imp
     many = random_words(key, place, 1, 2**20 + 2, AREA_WORDS)
     after = random_words(key, (place[0], place[1] + 1), 1, 2)
     assert not np.isin(after, many).all()
+
+
+def test_a_path_of_many_noises_has_other_words_than_its_wrappers():
+    place, n = (jnp.array(3), jnp.array(0)), 2**18 + 2
+    words = lambda sets, begin: random_words(jr.key(0), place, sets, n, begin)
+    own, plateaus, areas = words(4, 0), words(1, PLATEAU_WORDS), words(1, AREA_WORDS)
+    # Of so many random words a few hundred pairs are equal by chance.
+    for one, other in ((own, plateaus), (own, areas), (plateaus, areas)):
+        assert len(np.intersect1d(one, other)) <= 1000
 
 
 def test_what_is_no_key_is_refused():
