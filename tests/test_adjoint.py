@@ -14,7 +14,6 @@ from diffrax_symplectic._adjoint import _begin_anew, _undoes_its_steps
 from diffrax_symplectic._conditions import is_own_inverse
 from diffrax_symplectic._tableau import FlatTableau, Stage
 
-from .picard import by_picard
 from .problems import Given, H0, noise, random_problem, weak_path
 
 
@@ -27,8 +26,8 @@ def separable_noise(t, p, q, args):
 
 
 UNDO = {
-    "general": [by_picard(ds.ImplicitMidpoint()), by_picard(ds.StrangGauss())],
-    "several": [by_picard(ds.LevyAreaMidpoint()), by_picard(ds.NinomiyaVictoir())],
+    "general": [ds.ImplicitMidpoint(), ds.StrangGauss()],
+    "several": [ds.LevyAreaMidpoint(), ds.NinomiyaVictoir()],
     "separable": [ds.StormerVerlet(), ds.SRKs2()],
 }
 
@@ -136,7 +135,7 @@ def gradients(solver, noise, saveat, dtype=jnp.float64, parts=slice(None), **opt
 @pytest.mark.parametrize(
     "case",
     [
-        (by_picard(ds.ImplicitMidpoint()), phase, diffrax.SaveAt(ts=SAVED), {}),
+        (ds.ImplicitMidpoint(), phase, diffrax.SaveAt(ts=SAVED), {}),
         (
             # Here, the first steps lie before the first saved time.
             *(ds.StormerVerlet(), kicks, diffrax.SaveAt(ts=SAVED[4::-1])),
@@ -312,7 +311,7 @@ def test_backsolve_is_refused_with_advice(solver):
     "inner, form",
     [
         (ds.StormerVerlet(), jnp.array([[1.0, 0.4], [0.4, 0.7]])),
-        (by_picard(ds.ImplicitMidpoint()), jnp.array(1.0)),
+        (ds.ImplicitMidpoint(), jnp.array(1.0)),
     ],
     ids=["matrix", "number"],
 )

@@ -18,7 +18,6 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._expectation._array_rqmc import layout
 from diffrax_symplectic._expectation._steps import level_weights
 
-from ..picard import by_picard
 from ..problems import kubo_terms, RecordingMeter
 
 
@@ -33,7 +32,7 @@ def _midpoint_moment(n: int, h: float) -> float:
     return (1 + (np.exp(1j * twice) @ np.array([1, 4, 1]) / 6) ** n).real / 2
 
 
-MIDPOINT = by_picard(ds.ImplicitMidpoint())
+MIDPOINT = ds.ImplicitMidpoint()
 # Made once, so that JAX compiles programs of it once.
 KUBO = kubo_terms(ds.WeakBrownianPath((), jr.key(0)))
 

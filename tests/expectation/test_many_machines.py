@@ -13,14 +13,13 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from ..picard import by_picard
 from ..problems import kubo_terms
 
 
 KEY = jr.key(3)
 Y0 = (jnp.array(0.0), jnp.array(1.0))
 KUBO = kubo_terms(ds.WeakBrownianPath((), jr.key(0)))
-MIDPOINT = by_picard(ds.ImplicitMidpoint())
+MIDPOINT = ds.ImplicitMidpoint()
 SAMPLINGS = {
     "IndependentPaths": lambda n: ds.IndependentPaths(n, 16),
     "ValueFunctions": lambda n: ds.ValueFunctions(1, n, 16),

@@ -23,7 +23,6 @@ from diffrax_symplectic._expectation._steps import Problem
 from diffrax_symplectic._expectation._value_functions import _basis
 from diffrax_symplectic._terms import outcomes, step_variables
 
-from ..picard import by_picard
 from ..problems import kubo_terms, RecordingMeter
 
 
@@ -33,7 +32,7 @@ SQUARE = lambda t, y, args: y[1] ** 2
 VERLET = ds.StormerVerlet()
 WEAK = ds.WeakBrownianPath((), KEY)
 # Made once, so that JAX compiles programs of them once.
-KUBO, MIDPOINT = kubo_terms(WEAK), by_picard(ds.ImplicitMidpoint())
+KUBO, MIDPOINT = kubo_terms(WEAK), ds.ImplicitMidpoint()
 
 
 def _pendulum(path):
@@ -85,7 +84,7 @@ def test_rare_paths_that_leave_the_grid_do_not_move_the_mean():
     noise = lambda t, p, q, args: 0.3 * jnp.stack([p * q, (q**2 - p**2) / 2])
     path = ds.WeakBrownianPath((2,), KEY, two_point=True)
     terms = ds.hamiltonian_terms(quartic, noise, path)
-    solver = by_picard(ds.NinomiyaVictoir())
+    solver = ds.NinomiyaVictoir()
     got = _estimate(ds.ValueFunctions(), terms, solver, t1=0.75, key=KEY)
     exact = _enumerated(terms, solver, Y0, SQUARE, 0.25, 3)
     assert got.std_error <= 3e-9

@@ -503,7 +503,7 @@ def test_a_path_without_what_a_step_needs_is_refused_with_advice(solver):
     held = [v for v in VARIABLES if v in solver.variables]
     with pytest.raises(ValueError, match=f"`{name}` needs") as info:
         solver.step(terms, 0.0, 0.1, y0, args, None, False)
-    assert "Pass `solver.path(shape, key)`, or `" in str(info.value)
+    assert "by `solver.path(shape, key)`." in str(info.value)
     assert VARIABLES[held[0]].name in str(info.value) or name == "NinomiyaVictoir"
 
 

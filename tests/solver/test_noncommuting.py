@@ -14,7 +14,6 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._terms import apply, apply_one
 
-from ..picard import by_picard
 from ..problems import (
     Given,
     H0,
@@ -267,7 +266,7 @@ def test_paths_of_a_batch_may_end_at_different_times(cell):
 
     def end(scale, t1):
         y = jax.tree.map(lambda x: scale * x, y0)
-        solver = by_picard(ds.LevyAreaMidpoint())
+        solver = ds.LevyAreaMidpoint()
         return diffrax.diffeqsolve(terms, solver, 0.0, t1, 0.05, y, args).ys[1][-1, 0]
 
     what = end if cell else jax.grad(end)

@@ -10,7 +10,6 @@ import pytest
 import diffrax_symplectic as ds
 from examples import warm_spins
 
-from ..picard import by_picard
 from ..problems import Given, local_weak_orders, slope, weak_path
 from .test_spins import _problem, H0, noise
 
@@ -68,9 +67,9 @@ def test_dampings_fit_lattices_of_spins_and_take_their_precision():
     [
         (ds.ImplicitMidpoint(), jnp.float64, 1e-13),
         (ds.ImplicitMidpoint(), jnp.float32, 1e-5),
-        (by_picard(ds.NinomiyaVictoir()), jnp.float64, 1e-13),
-        (by_picard(ds.LevyAreaMidpoint()), jnp.float64, 1e-13),
-        (by_picard(ds.PlateauGauss()), jnp.float64, 1e-13),
+        (ds.NinomiyaVictoir(), jnp.float64, 1e-13),
+        (ds.LevyAreaMidpoint(), jnp.float64, 1e-13),
+        (ds.PlateauGauss(), jnp.float64, 1e-13),
     ],
     ids=[
         "ImplicitMidpoint",
@@ -111,7 +110,7 @@ def test_ninomiya_victoir_keeps_weak_order_two_with_damping():
 
     hs = np.array([0.008, 0.004, 0.002, 0.001])
     y0 = ds.to_spinors(s0)
-    solver = by_picard(ds.NinomiyaVictoir())
+    solver = ds.NinomiyaVictoir()
     slopes = local_weak_orders(terms, solver, y0, args, hs, order=2, fn=fn)
     np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 
@@ -121,7 +120,7 @@ def test_stationary_law_of_one_spin_is_that_of_gibbs_up_to_the_square_of_the_ste
     H = lambda s: -0.5 * s[2] - 0.4 * s[0] ** 2
     what = lambda s: jnp.stack([s[2], s[0] ** 2])
     hs = np.array([0.4, 0.2, 0.1])
-    solver = by_picard(ds.NinomiyaVictoir())
+    solver = ds.NinomiyaVictoir()
     # Beyond this degree the biases change in their fourth digit.
     bias = warm_spins.stationary_bias(H, what, solver, hs, alpha=0.5, T=0.6, degree=5)
     assert np.max(np.abs(bias[-1])) <= 1e-3
@@ -152,7 +151,7 @@ def test_gradients_with_respect_to_damping_and_parameters():
 
     def end(alpha, args):
         terms = ds.spin_terms(H, lambda t, s, args: 0.3 * s, path, damping=alpha)
-        solver = by_picard(ds.ImplicitMidpoint())
+        solver = ds.ImplicitMidpoint()
         sol = diffrax.diffeqsolve(terms, solver, 0, 1, 0.25, ds.to_spinors(s0), args)
         return jnp.sum(ds.from_spinors(sol.ys)[-1] * weights)
 

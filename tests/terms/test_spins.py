@@ -12,7 +12,6 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from ..picard import by_picard
 from ..problems import Given, local_weak_orders, rigid_body_terms, weak_path
 
 
@@ -119,9 +118,9 @@ def _thousand_systems():
     [
         (ds.ImplicitMidpoint(), jnp.float64, 1e-13),
         (ds.ImplicitMidpoint(), jnp.float32, 5e-6),
-        (by_picard(ds.SRKw1(b=0.2)), jnp.float64, 1e-13),
-        (by_picard(ds.NinomiyaVictoir()), jnp.float64, 1e-13),
-        (by_picard(ds.LevyAreaMidpoint()), jnp.float64, 1e-13),
+        (ds.SRKw1(b=0.2), jnp.float64, 1e-13),
+        (ds.NinomiyaVictoir(), jnp.float64, 1e-13),
+        (ds.LevyAreaMidpoint(), jnp.float64, 1e-13),
     ],
     ids=["ImplicitMidpoint", "float32", "SRKw1", "NinomiyaVictoir", "LevyAreaMidpoint"],
 )
@@ -174,7 +173,7 @@ def test_ninomiya_victoir_is_weak_order_two_for_noises_that_do_not_commute():
 
     hs = np.array([0.02, 0.01, 0.005, 0.0025])
     y0 = ds.to_spinors(s0)
-    solver = by_picard(ds.NinomiyaVictoir())
+    solver = ds.NinomiyaVictoir()
     slopes = local_weak_orders(terms, solver, y0, args, hs, order=2, fn=fn)
     np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 
@@ -184,7 +183,7 @@ def test_noises_of_spins_may_be_indexed():
     y0 = ds.to_spinors(s0)
     path = weak_path(3, two_point=True)
     indexed = ds.IndexedNoise(lambda k, t, s, args: noise(t, s, args)[k], 3)
-    solver = by_picard(ds.NinomiyaVictoir())
+    solver = ds.NinomiyaVictoir()
 
     def end(y0, args, fields):
         terms = ds.spin_terms(H0, fields, path)
@@ -237,7 +236,7 @@ def test_a_batch_of_chains_keeps_lengths_and_does_not_see_the_phase(dtype):
 def test_gradients_go_through_a_solve_from_the_poles():
     s0 = np.concatenate([POLES, EQUATOR[:2]])
     weights, direction = np.random.default_rng(1).normal(size=(2, 4, 3))
-    solver = by_picard(ds.ImplicitMidpoint())
+    solver = ds.ImplicitMidpoint()
     value = lambda s, args: jnp.sum(weights * _end(ds.to_spinors(s), args, solver)[0])
     # One program for the gradient and for the values that are compared to it.
     both = jax.jit(jax.value_and_grad(value, argnums=(0, 1)))

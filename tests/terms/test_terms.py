@@ -12,7 +12,6 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from ..picard import by_picard
 from ..problems import (
     H0,
     local_weak_orders,
@@ -325,7 +324,7 @@ def test_nested_terms_are_the_terms_within():
     friction = diffrax.ODETerm(lambda t, y, args: (-0.1 * y[0], jnp.zeros_like(y[1])))
     nested = diffrax.MultiTerm(friction, diffrax.MultiTerm(hamiltonian))
     flat = diffrax.MultiTerm(friction, *hamiltonian.terms)
-    solver = by_picard(ds.StrangGauss())
+    solver = ds.StrangGauss()
     assert solver.weak_order(nested) == 2
     hs = jnp.array([0.05, 0.1])
     slopes = local_weak_orders(nested, solver, y0, args, hs, order=2)

@@ -12,7 +12,6 @@ import pytest
 import diffrax_symplectic as ds
 from examples import qubit
 
-from ..picard import by_picard
 from ..problems import slope, weak_path
 
 
@@ -117,7 +116,6 @@ def test_norm_is_kept_over_ten_thousand_steps(solver):
 )
 def test_noisy_qubit_has_the_density_matrix_of_lindblad_without_sampling(solver, order):
     steps = np.array([16, 32, 64])
-    solver = by_picard(solver)
     found = jnp.stack([qubit.density(solver, 2.0, int(n)) for n in steps])
     np.testing.assert_allclose(jnp.trace(found, axis1=1, axis2=2), 1.0, rtol=1e-12)
     errors = jnp.max(jnp.abs(found - qubit.lindblad(2.0)), axis=(1, 2))
@@ -148,7 +146,7 @@ def test_gradients_with_respect_to_complex_parameters_are_those_of_jax():
     @jax.jit
     @ft.partial(jax.value_and_grad, argnums=(0, 1))
     def both(z, psi0):
-        solver = by_picard(ds.ImplicitMidpoint())
+        solver = ds.ImplicitMidpoint()
         sol = diffrax.diffeqsolve(terms, solver, 0, 1, 0.25, ds.to_pair(psi0), z)
         return jnp.abs(ds.from_pair(sol.ys)[-1, 0]) ** 2
 
@@ -167,7 +165,7 @@ def test_noises_of_waves_may_be_indexed():
     path = weak_path(2, two_point=True)
     y0 = ds.to_pair(_random(jr.key(0)))
     indexed = ds.IndexedNoise(lambda k, t, psi, args: _site_noise(t, psi, args)[k], 2)
-    solver = by_picard(ds.NinomiyaVictoir())
+    solver = ds.NinomiyaVictoir()
 
     def end(y0, fields):
         terms = ds.wave_terms(_lattice, fields, path)
