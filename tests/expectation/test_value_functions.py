@@ -4,6 +4,7 @@ random is left."""
 import contextlib
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -115,15 +116,23 @@ def _turned(power: int) -> complex:
 def test_linear_systems_and_quadratic_functions_are_closed(dtype):
     shape = jax.ShapeDtypeStruct((), dtype)
     terms = kubo_terms(ds.WeakBrownianPath(shape, KEY))
-    y0 = tuple(x.astype(dtype) for x in Y0)
-    phi = lambda t, y, args: {"q2": y[1] ** 2, "both": jnp.stack([y[0], y[0] * y[1]])}
+    # Squares of states of this size underflow in single precision.
+    size = 2.0**-70
+    solver = by_picard(ds.ImplicitMidpoint(), 5 * size * float(np.finfo(dtype).eps))
+    y0 = tuple((size * x).astype(dtype) for x in Y0)
+
+    def phi(t, y, args):
+        p, q = y[0] / size, y[1] / size
+        return {"q2": q**2, "both": jnp.stack([p, p * q])}
+
     # In single precision rounding is the larger error, which is told.
     told = pytest.warns(UserWarning, match="over 10 steps in float32")
     with told if dtype == jnp.float32 else contextlib.nullcontext():
         got = _estimate(
-            ds.ValueFunctions(2, 600), terms, MIDPOINT, phi, dt0=0.1,
+            ds.ValueFunctions(2, 600), terms, solver, phi, dt0=0.1,
             y0=y0, ts=[0.0, 1.0],
         )  # fmt: skip
+    assert got.num_failed == 0
     # From (p, q) = (0, 1) the oscillator is at (-sin, cos) of the angle.
     one, two = _turned(1), _turned(2)
     rounding = 50 * np.finfo(dtype).eps
@@ -176,13 +185,51 @@ def test_noise_that_enters_nonlinearly_leaves_the_mean_as_it_is():
 
 
 def test_the_degree_is_chosen_for_each_number_by_fresh_paths_and_never_worse_than_plain():
-    # A jump, which no polynomial is close to; and one that polynomials leave nothing of.
-    phi = lambda t, y, args: (y[1] > 0.5, jnp.cos(40 * y[1]), y[1])
-    got = _estimate(ds.ValueFunctions(), phi=phi)
-    plain = _estimate(ds.ValueFunctions(0), phi=phi)
-    for a, b in zip(got.std_error, plain.std_error):
+    got = _estimate(ds.ValueFunctions(), phi=_jumps)
+    plain = _estimate(ds.ValueFunctions(0), phi=_jumps)
+    for a, b in zip(got.std_error[:3], plain.std_error):
         assert a <= 1.05 * b
     assert got.std_error[2] < 1e-9 and "64, chosen among 0, 64" in got.reason
+
+
+def _jumps(t, y, args):
+    """A jump, which no polynomial is close to; one that polynomials leave nothing of; and
+    an event that only four kicks in one direction lead to."""
+    p, q = y
+    return q > 0.5, jnp.cos(40 * q), q, q > 0.976
+
+
+def test_an_event_that_no_path_meets_is_within_the_standard_error():
+    with pytest.warns(UserWarning, match="the event did not occur"):
+        got = _estimate(ds.ValueFunctions(num_paths=512), phi=_jumps, key=KEY)
+    exact = 1 / 6**4
+    assert got.mean[3] == 0 and exact / 3 < got.std_error[3] < 3 * exact
+
+
+def test_a_fit_that_is_worse_than_none_is_not_used(monkeypatch):
+    fits = _value_functions._fits
+    negative = lambda u: eqx.tree_at(lambda u: u.coefficients, u, -u.coefficients)
+    monkeypatch.setattr(_value_functions, "_fits", lambda *args: negative(fits(*args)))
+    with pytest.warns(UserWarning, match="`degree=3` is no better"):
+        got = _estimate(ds.ValueFunctions(3, 128, 64))
+    assert got.reason == "degree: 0, chosen among 0, 3"
+    assert got.std_error == got.plain_std_error and not got.dropped
+
+
+def test_the_paths_that_choose_are_not_those_that_estimate(monkeypatch):
+    trials, run = [], _value_functions.run
+
+    def recorded(plan, key, devices):
+        trials.append(key)
+        return run(plan, key, devices)
+
+    monkeypatch.setattr(_value_functions, "run", recorded)
+    key = jr.key(7)
+    _estimate(ds.ValueFunctions(3, 128, 64), key=key)
+    sample = lambda key, i: jr.key_data(jr.fold_in(jr.fold_in(key, 0), i))
+    keys = lambda key: {tuple(map(int, sample(key, i))) for i in range(128)}
+    assert len(trials) == 2
+    assert all(keys(key).isdisjoint(keys(trial)) for trial in trials)
 
 
 def test_levels_extrapolate_and_the_bias_is_known_as_well_as_the_mean():
@@ -285,6 +332,18 @@ def test_the_sampling_follows_from_dimension_outcomes_and_steps(
     assert type(choose(problem, None)[0]) is ds.IndependentPaths
 
 
+@pytest.mark.parametrize("state, steps", [(2, 2**15), (4, 2**13), (6, 2**14)])
+def test_the_default_takes_fewer_paths_of_more_steps(state, steps):
+    H0 = lambda t, p, q, args: (p @ p + q @ q) / 2
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: jnp.sum(q), WEAK)
+    y0 = (jnp.zeros(state // 2), jnp.ones(state // 2))
+    problem = Problem.of(SQUARE, terms, VERLET, 0, 1, 1 / steps, y0, None, None, 1)
+    sampling, _ = choose(problem, None)
+    paths = sampling.num_paths * getattr(sampling, "replicates", 1)
+    # About ten seconds.
+    assert 2**27 <= paths * steps * state <= 2**28
+
+
 def test_the_default_is_the_same_each_time_and_goes_on_with_itself():
     got = _estimate(None, tol=1e-6)
     assert isinstance(got.sampling, ds.ValueFunctions) and got.tol_reached
@@ -379,6 +438,27 @@ def test_a_grid_interpolates_with_degree_five_and_is_zero_beyond():
     at = jax.vmap(lambda x: grid.interpolated(x, c)[0])
     np.testing.assert_allclose(at(x), fn(*x.T), atol=1e-13)
     assert not np.any(at(jnp.where(jnp.abs(x) < inner / 2, x + jnp.sign(x), 2 * x)))
+
+
+def test_what_a_grid_corrects_is_exact_at_its_points_and_falls_to_zero_at_its_edge():
+    grid, good = Grid(2, (16,)), jnp.ones(1000, bool)
+    points, axis = jr.normal(KEY, (1000, 2)), np.linspace(-1, 1, 16)
+    fn = lambda y: jnp.exp(y[0] - y[1] / 2)
+    inner = np.stack(np.meshgrid(axis[3:-3], axis[3:-3]), -1).reshape(-1, 2)
+
+    @jax.jit
+    def fitted(points):
+        frame = grid.frame(points, good, jnp.ones(2))
+        value = lambda y: fn(y)[None, None, None]
+        c = grid.fitted(value, frame, points, good, None)
+        nodes = frame.states(inner)
+        at_nodes = jax.vmap(lambda y: grid.combined(frame, y, c)[0, 0, 0])(nodes)
+        return c[-(16**2) :].reshape(16, 16), at_nodes, jax.vmap(fn)(nodes)
+
+    correction, got, expected = fitted(points)
+    np.testing.assert_allclose(got, expected, rtol=1e-9)
+    rim = np.pad(np.zeros((14, 14), bool), 1, constant_values=True)
+    assert np.all(correction[rim] == 0) and np.all(correction[~rim] != 0)
 
 
 @pytest.mark.parametrize("heavy", [False, True])
