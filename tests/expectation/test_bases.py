@@ -6,7 +6,7 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from diffrax_symplectic._expectation._bases import Frame, Grid
+from diffrax_symplectic._expectation._bases import Frame, Grid, Hermite
 from diffrax_symplectic._expectation._polynomials import (
     exponents,
     hermite,
@@ -35,6 +35,16 @@ def test_polynomials_are_orthonormal_and_fits_nested():
     got = fit(twice, values[:, 1:], (4,))
     smallest = np.linalg.lstsq(twice, values[:, 1], rcond=None)[0]
     np.testing.assert_allclose(got[:, 0], smallest, atol=1e-3)
+
+
+def test_points_whose_values_overflow_are_left_out_of_a_fit():
+    basis, good = Hermite(2, (2,)), jnp.ones(200, bool)
+    points = jr.normal(KEY, (200, 2))
+    frame = Frame.of(points, good, jnp.ones(2))
+    values = (points[:, 0] ** 2 - points[:, 1])[:, None, None, None]
+    spoiled = values.at[:5].set(jnp.inf).at[5].set(jnp.nan)
+    fitted = jax.jit(lambda values: basis.fitted_to(values, frame, points, good))
+    np.testing.assert_allclose(fitted(spoiled), fitted(values), atol=1e-9)
 
 
 def test_a_grid_interpolates_with_degree_five_and_is_zero_beyond():
