@@ -192,17 +192,21 @@ def test_noises_that_do_not_fit_their_control_term_are_refused(solver, operator)
         kick = lambda w: 0.1 * w
         return lx.FunctionLinearOperator(kick, struct) if operator else 0.1 * jnp.eye(2)
 
-    def solve(shape, y0):
+    def terms(shape):
         path = ds.WeakBrownianPath(shape, jr.key(0), two_point=True)
         drift = diffrax.ODETerm(lambda t, y, args: -y)
-        terms = diffrax.MultiTerm(drift, diffrax.ControlTerm(field, path))
-        return diffrax.diffeqsolve(terms, solver, 0, 1, 0.5, y0, max_steps=2).ys
+        return diffrax.MultiTerm(drift, diffrax.ControlTerm(field, path))
+
+    def solve(shape, y0):
+        return diffrax.diffeqsolve(terms(shape), solver, 0, 1, 0.5, y0, max_steps=2).ys
 
     single, y0 = jax.ShapeDtypeStruct((2,), jnp.float32), jnp.ones(2)
     takes = "operator on" if operator else "array"
     says = rf"vector field, .*{takes} f64\[2.*increments of its path, f{{}}\. Construct"
     with pytest.raises(ValueError, match=says.format(r"64\[3\]")):
         solve((3,), y0)
+    with pytest.raises(ValueError, match=says.format(r"64\[3\]")):
+        ds.suggest_solver(terms((3,)), 0, y0, want="weak")
     with pytest.raises(ValueError, match="state|The terms change an array"):
         solve((2,), jnp.ones(3))
     if operator:
@@ -210,6 +214,4 @@ def test_noises_that_do_not_fit_their_control_term_are_refused(solver, operator)
             solve(single, y0)
     else:
         # Diffrax multiplies arrays of different precision.
-        np.testing.assert_allclose(
-            solve(single, jnp.ones(2)), solve((2,), jnp.ones(2)), rtol=1e-6
-        )
+        np.testing.assert_allclose(solve(single, y0), solve((2,), y0), rtol=1e-6)
