@@ -274,15 +274,6 @@ def test_within_a_jax_program_there_is_no_estimate(traced):
         jax.jit(lambda x: _estimate(**x).mean)(traced)
 
 
-def test_functions_that_close_over_traced_values_have_no_estimate():
-    mean = lambda size: ds.monte_carlo(
-        lambda key: size * jr.normal(key), key=jr.key(0), num_paths=2
-    )
-    for transform in (jax.grad, jax.jit):
-        with pytest.raises(ValueError, match="cannot run inside JAX.*`monte_carlo`"):
-            transform(lambda size: mean(size).mean)(1.0)
-
-
 def test_paths_whose_words_cannot_be_chosen_are_refused():
     tree = diffrax.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jr.key(0))
     for path in (tree, diffrax.UnsafeBrownianPath((), jr.key(0))):
