@@ -56,7 +56,8 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     supported.
 
     **Parameters:** gradients are with respect to `args`, the initial state, the terms and
-    the solver. JAX raises an error for traced values that a Hamiltonian closes over.
+    the solver. JAX raises an error for traced values that a Hamiltonian closes over: pass
+    them through `args`.
 
     **Raises:** a `ValueError`, while tracing, for anything else.
     """

@@ -59,6 +59,13 @@ def test_every_page_is_looked_through():
     assert {"README.md", "docs/index.md", "docs/own_tableau.md"} <= PAGES.keys()
 
 
+def test_no_code_takes_a_path_that_repeats_its_noise():
+    shown = [*PAGES.values(), *DOCSTRINGS.values()]
+    assert not any("UnsafeBrownianPath" in code for blocks in shown for code in blocks)
+    faq = (ROOT / "docs" / "faq.md").read_text()
+    assert "UnsafeBrownianPath` for short runs" in faq and "diffrax/issues/733" in faq
+
+
 @pytest.fixture
 def tables(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs"))

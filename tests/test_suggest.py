@@ -142,6 +142,11 @@ def test_with_friction_solvers_that_have_it_are_suggested(want):
             assert s.weak_order <= 2 and (s.strong_order or 0) <= 1
             s.solver.init(s.terms(jr.key(1)), 0.0, 0.1, y0, None)
             assert "gamma).path((2,), key" in s.path
+        # Which of the two is for momenta, and what both do to transport.
+        reason = {type(s.solver): s.reason for s in found}
+        if first is ds.BAOAB:
+            assert "momenta" in reason[ds.LangevinMiddle]
+            assert "positions. Mobility and diffusion are too" in reason[ds.BAOAB]
     with pytest.raises(ValueError, match="shape of its momenta"):
         ds.suggest_solver(terms, 0.0, y0, want=want, gamma=jnp.ones(3))
 

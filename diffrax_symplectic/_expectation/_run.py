@@ -44,12 +44,7 @@ def checked_call(
 ) -> tuple[PRNGKeyArray, Begin, tuple]:
     """The key as a typed key, where to begin, and the devices. Raises a `ValueError` for
     invalid arguments, and if any array is traced."""
-    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((key, others))):
-        raise ValueError(
-            f"`{user}` cannot run inside JAX transformations, because the number of "
-            "batches depends on values. Call it outside of `jit`, `vmap` and `grad`. To "
-            "differentiate a mean, average gradients with `monte_carlo`."
-        )
+    _check_untraced((key, others))
     check_key(key, user)
     if start is not None and first != 0:
         raise ValueError(
@@ -73,6 +68,15 @@ def checked_call(
         )
     devices = tuple(devices)
     return key if typed else jr.wrap_key_data(key), begin, devices
+
+
+def _check_untraced(tree: Any) -> None:
+    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(tree)):
+        raise ValueError(
+            "`expectation` and `monte_carlo` cannot run inside JAX transformations: the "
+            "number of batches depends on values. Call them outside of `jit`, `vmap` and "
+            "`grad`. To differentiate a mean, average gradients with `monte_carlo`."
+        )
 
 
 class Meter:
@@ -185,6 +189,8 @@ class _Batches:
 
     def parts(self, running: tuple) -> list[tuple]:
         """The results of each device."""
+        # They are traced if a function closes over traced values.
+        _check_untraced(running)
         arrays = jax.device_get(running)
         at = lambda k: jtu.tree_map(lambda x: x[k], arrays)
         return [at(k) for k in range(len(self._devices))]

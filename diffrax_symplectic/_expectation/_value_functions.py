@@ -86,11 +86,12 @@ class ValueFunctions(AbstractSampling):
     def prepare(self, problem, key, devices):
         basis, (times, m) = _basis(problem, self.degree), problem.num_outputs
         functions, shape = _fits(problem, key, basis), (len(problem.weights), times, m)
-        never, narrow = np.full(shape, np.inf), np.zeros((), problem.dtype)
+        never = np.zeros(shape), np.full(shape, np.inf)
+        narrow = np.zeros((), problem.dtype)
 
-        def plan(best, used, n: int, beyond=never, wide=narrow):
-            arrays = used, beyond.astype(problem.dtype), wide
-            u = functions.chosen(best)
+        def plan(best, used, n: int, usual=never, wide=narrow):
+            usual = [x.astype(problem.dtype) for x in usual]
+            u, arrays = functions.chosen(best), (used, usual, wide)
             return Plan(
                 jtu.Partial(_controlled_paths, problem, u, *arrays), n, self.batch_size
             )
@@ -114,19 +115,18 @@ class ValueFunctions(AbstractSampling):
                 stacklevel=4,
             )
         # Paths with wider noise estimate the deviations beyond the largest in the trial.
-        largest = lambda e, kind: flat(
-            jtu.tree_map(lambda x: x[kind], total(e.moments).largest), shape[0]
-        )
-        with_fit = np.stack([largest(e, 0) for e in tried])
+        at = lambda tree, kind: flat(jtu.tree_map(lambda x: x[kind], tree), shape[0])
+        with_fit = np.stack([at(total(e.moments).largest, 0) for e in tried])
         with_fit = np.take_along_axis(with_fit, best[None, None], 0)[0]
-        beyond = np.where(used, with_fit, largest(tried[0], 1))
-        wide = trial(best, used, _WIDE * self.batch_size, beyond, narrow + 1)
+        without = total(tried[0].moments)
+        usual = at(without.mean, 1), np.where(used, with_fit, at(without.largest, 1))
+        wide = trial(best, used, _WIDE * self.batch_size, usual, narrow + 1)
         far = jtu.tree_map(lambda x: x[3], total(wide.moments).mean)
         names = np.array([0, *basis.candidates])
         chosen = ", ".join(map(str, np.unique(names[np.where(used, best + 1, 0)])))
         among = ", ".join(map(str, np.unique(names)))
         reason = f"{basis.kind}: {chosen}, chosen among {among}"
-        final = plan(best, used, self.num_paths, beyond)
+        final = plan(best, used, self.num_paths, usual)
         return final._replace(reason=reason, far=far)
 
 
@@ -195,12 +195,12 @@ def _basis(p: Problem, degree: int | None) -> AbstractBasis:
 
 
 def _controlled_paths(
-    p: Problem, functions: Functions, used, beyond, wide, keys: PRNGKeyArray
+    p: Problem, functions: Functions, used, usual, wide, keys: PRNGKeyArray
 ) -> Samples:
     """A sample is a path minus the control variate of `functions` (with a leading axis of
     levels) where they are `used`. With `wide=1` the noise is wider, to estimate deviations
-    `beyond` the usual ones."""
-    n = len(keys)
+    beyond the `usual` ones: the mean without control, and the largest deviation."""
+    n, (center, beyond) = len(keys), [x[:, :, None] for x in usual]
 
     def begin(level):
         noise, u = Noise.of(p, level), jtu.tree_map(lambda x: x[level.index], functions)
@@ -232,9 +232,9 @@ def _controlled_paths(
     promised = jnp.where(along(p.levels.saved_steps[0] == 0, saved[0]), saved, promised)
     each = saved - control, saved, control, promised
     left, plain, control, promised = map(p.combined, each)
-    off = jnp.abs(left - promised)
+    off = jnp.abs(left - jnp.where(used[:, None], promised, center))
     # Deviations must exceed rounding.
-    beyond = beyond[:, :, None] + ROUNDING * jnp.finfo(off.dtype).eps * jnp.abs(plain)
+    beyond = beyond + ROUNDING * jnp.finfo(off.dtype).eps * jnp.abs(plain)
     # Cap ratios at one: paths that are likelier without wider noise are seen without it.
     ratio = jnp.exp(-jnp.maximum(jnp.sum(log_ratio, axis=0), 0))[:, None]
     far, lost = jnp.where(off > beyond, ratio * off, 0), jnp.any(failed, axis=0)

@@ -139,12 +139,17 @@ def friction_modes(
             continue
         modes = _with_masses(matrix, _inverse_mass(velocity, p, i))
         known = not isinstance(modes.rates, jax.core.Tracer)
+        says = (
+            "`gamma` must be a symmetric positive semidefinite matrix for momenta of "
+            f"shape {jnp.shape(x)}, or become one with the masses of H0, but "
+            f"{fault.reason}."
+        )
         if not fault.masses or known and np.any(np.isnan(modes.rates)):
-            raise ValueError(
-                "`gamma` must be a symmetric positive semidefinite matrix for momenta of "
-                f"shape {jnp.shape(x)}, or become one with the masses of H0, but "
-                f"{fault.reason}."
-            )
+            raise ValueError(says)
+        if fault != UNKNOWN:
+            # Only the masses are traced.
+            bad = jnp.any(jnp.isnan(modes.rates))
+            modes = modes._replace(rates=eqx.error_if(modes.rates, bad, says))
         found.append(modes)
     return found
 

@@ -17,8 +17,8 @@ from .._terms import brownian_paths
 # units in the last place of `t1`.
 ROUNDINGS = 100
 _OUTSIDE = (
-    "A step goes beyond `path.t0` or `path.t1` of a Brownian path, where its noise is "
-    "undefined. Solve within these times, or pass a longer path."
+    "A step begins before `path.t0` or ends after `path.t1` of a Brownian path, which has "
+    "no noise there. Solve between these times, or pass a longer path."
 )
 
 

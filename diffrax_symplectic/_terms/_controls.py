@@ -21,6 +21,7 @@ from .._brownian import (
     GivenPath,
     Increment,
     increment_struct,
+    is_random,
     laws_of,
     LevyAreaBrownianPath,
     raveled,
@@ -123,15 +124,26 @@ def controls(
         if not held(name):
             variable = VARIABLES.get(name)
             advice = f"increments with the attribute `{name}`"
-            raise ValueError(
-                f"`{solver}` needs {variable.advice if variable else advice}."
-            )
+            needs = variable.advice if variable else advice
+            records = [x for x in brownian_paths(noise) if _is_record(x)]
+            if variable and records:
+                needs = (
+                    f"{variable.name}, but `{type(records[0]).__name__}` has no random key "
+                    "to draw them from. Use a solver that needs only increments, such as "
+                    "`StormerVerlet` for separable systems or `ImplicitMidpoint` for others"
+                )
+            raise ValueError(f"`{solver}` needs {needs}.")
     return {
         name: [
             _in_time(term, name, getattr(i, name)) for term, i in zip(noise, increments)
         ]
         for name in [*names, *filter(held, optional)]
     }
+
+
+def _is_record(path: diffrax.AbstractBrownianPath) -> bool:
+    """Whether a path of the user's holds given noise."""
+    return not is_random(path) and not isinstance(path, GivenPath)
 
 
 def _in_time(term: diffrax.AbstractTerm, name: str, x: PyTree[Array]) -> PyTree[Array]:

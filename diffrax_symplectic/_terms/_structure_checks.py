@@ -22,7 +22,7 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from ._dependence import Dependence
 from ._hamiltonian import asserted_structure, has_lifted, is_hamiltonian
-from ._vector_fields import apply, control_struct, split_terms
+from ._vector_fields import apply, check_increments, control_struct, split_terms
 
 
 class Fault(NamedTuple):
@@ -44,6 +44,7 @@ def check_structure(
     solver: str,
 ) -> None:
     """Raises a `ValueError` unless a system has the structure that a solver needs."""
+    check_increments(noise, t0, y0, args)
     if structure not in get_args(Structure):
         raise ValueError(
             f"`structure` of the tableau of `{solver}` must be one of "

@@ -10,6 +10,7 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
@@ -91,8 +92,37 @@ def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
         )
     if is_term(terms):
         parts = tuple(_flatten(terms))
+        check_increments(parts, t0, y0, args)
         controls = eqx.filter_eval_shape(lambda: [x.contr(t0, t0) for x in parts])
         eqx.filter_eval_shape(apply, parts, controls, args, t0, y0)
+
+
+def check_increments(terms: tuple, t0: RealScalarLike, y0: Y, args: Args) -> None:
+    """Raises a `ValueError` if a `ControlTerm` cannot multiply its vector field by the
+    increments of its path. (The errors of JAX and Lineax name neither.)"""
+
+    def product(term):
+        field, increments = term.vf(t0, y0, args), term.contr(t0, t0)
+        try:
+            return term.prod(field, increments)
+        except (TypeError, ValueError) as error:
+            is_operator = isinstance(field, lx.AbstractLinearOperator)
+            takes = field.in_structure() if is_operator else field
+            kind = "a Lineax operator on" if is_operator else "an array"
+            raise ValueError(
+                "A `ControlTerm` cannot multiply its vector field, "
+                f"{kind} {_brief(takes)}, by the increments of its path, "
+                f"{_brief(increments)}. Construct the path with the shape and dtype that "
+                "the vector field takes, for an array the shape of its last axes."
+            ) from error
+
+    for term in terms:
+        if isinstance(unwrapped(term), diffrax.ControlTerm):
+            eqx.filter_eval_shape(product, term)
+
+
+def _brief(tree: PyTree) -> str:
+    return eqx.tree_pformat(tree, struct_as_array=True)
 
 
 def control_struct(

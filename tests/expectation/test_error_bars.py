@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation._run import run
+from diffrax_symplectic._expectation._run import Meter, run
 from diffrax_symplectic._expectation._sampling import Plan, Samples
 from diffrax_symplectic._expectation._steps import Problem
 from examples.benchmarks.coverage import arguments, Cell, estimate, exact
@@ -86,8 +86,9 @@ def test_a_fit_that_overflows_leaves_plain_paths():
         lambda t, y, args: y[1][0], terms, ds.StormerVerlet(), 0.0, 6.0, 0.005, y0,
         key=jr.key(2), sampling=sampling,
     )  # fmt: skip
-    with pytest.warns(UserWarning, match="`degree=2` is no better|was dropped"):
+    with pytest.warns(UserWarning, match="`degree=2` is no better|was dropped") as told:
         got = run(ds.ValueFunctions(2, 512))
+    assert not any("smaller steps" in str(warning.message) for warning in told)
     plain = run(ds.IndependentPaths(2048))
     assert np.isfinite(got.mean) and got.std_error > plain.std_error
     assert abs(got.mean - plain.mean) <= 5 * np.hypot(got.std_error, plain.std_error)
@@ -143,8 +144,9 @@ def test_few_samples_that_make_up_for_the_spread_widen_it_and_are_told():
     np.testing.assert_allclose(light.std_error, np.sqrt(light.variance / 2000))
 
 
-def _with_control(shift: float, spread: float = 1.0):
-    """Standard normal numbers, less a control that has the mean `shift`."""
+def _with_control(shift: float, spread: float = 1.0, far: float = 0.0, meter=None):
+    """Standard normal numbers, less a control that has the mean `shift`, and `far` from it
+    in the tails, which are not among them."""
 
     def sampler(keys):
         x = jax.vmap(jr.normal)(keys)
@@ -152,9 +154,8 @@ def _with_control(shift: float, spread: float = 1.0):
         kinds = jnp.stack([x - control, x, control, jnp.zeros_like(x)])[:, None]
         return Samples(kinds, jnp.ones(len(keys), bool), jnp.zeros(len(keys), bool))
 
-    far = np.zeros(1)
-    plan = Plan(jax.tree_util.Partial(sampler), 1000, 250, far=far)
-    return run(plan, KEY, tuple(jax.devices()[:1]))
+    plan = Plan(jax.tree_util.Partial(sampler), 1000, 250, far=np.array([far]))
+    return run(plan, KEY, tuple(jax.devices()[:1]), meter=meter)
 
 
 def test_a_control_whose_mean_is_not_zero_is_dropped():
@@ -166,6 +167,13 @@ def test_a_control_whose_mean_is_not_zero_is_dropped():
     np.testing.assert_allclose(biased.mean, plain.mean, rtol=1e-12)
     np.testing.assert_allclose(biased.std_error, plain.std_error, rtol=1e-12)
     assert _with_control(np.nan).mean == biased.mean
+    with pytest.warns(UserWarning, match="A control variate was dropped"):
+        _with_control(0.5, 0.875, meter=Meter(diffrax.NoProgressMeter()))
+
+
+def test_tails_that_no_sample_shows_widen_the_standard_error():
+    fine, tails = _with_control(0.0, 0.875), _with_control(0.0, 0.875, far=0.5)
+    np.testing.assert_allclose(tails.std_error, np.hypot(fine.std_error, 0.5))
 
 
 def test_plain_terms_are_refused_where_a_solver_takes_them_for_ito():

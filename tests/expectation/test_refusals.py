@@ -64,6 +64,15 @@ def test_arguments_of_other_solves_lead_to_monte_carlo():
         _mean(path, y0=lambda key: Y0)
 
 
+def test_functions_that_close_over_traced_values_have_no_estimate():
+    mean = lambda size: ds.monte_carlo(
+        lambda key: size * jr.normal(key), key=jr.key(0), num_paths=2
+    )
+    for transform in (jax.grad, jax.jit):
+        with pytest.raises(ValueError, match="cannot run inside JAX.*`monte_carlo`"):
+            transform(lambda size: mean(size).mean)(1.0)
+
+
 def test_steps_that_single_precision_does_not_resolve_are_refused_at_once():
     single = jax.ShapeDtypeStruct((), jnp.float32)
     path = ds.WeakBrownianPath(single, jr.key(0))

@@ -196,6 +196,10 @@ def test_frictions_that_are_none_are_refused():
         for solver in (ds.BAOAB(wrong), ds.Damped(ds.StormerVerlet(), wrong)):
             with pytest.raises(ValueError, match=f"semidefinite matrix.*{match}"):
                 solver.init(terms, 0.0, 0.1, y0, None)
+    # The solve traces them, but they were passed as numbers.
+    with pytest.raises(ValueError, match="the negative eigenvalue -2") as info:
+        diffrax.diffeqsolve(terms, ds.BAOAB(wrong), 0.0, 1.0, 0.1, y0)
+    assert "Tracer" not in str(info.value)
     with pytest.raises(ValueError, match=r"as a matrix the shape \(2, 2\)"):
         ds.BAOAB(jnp.ones(3)).init(terms, 0.0, 0.1, y0, None)
 

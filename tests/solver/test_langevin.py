@@ -168,8 +168,12 @@ def test_rates_that_no_masses_make_symmetric_are_refused_and_traced_fail_alone()
     y0 = jnp.ones(3), jnp.ones(3)
     for make in (ds.BAOAB, lambda g: ds.Damped(ds.StormerVerlet(), g)):
         # Divided along the wrong axis.
+        solver = make(TENSOR / MASSES[:, None])
         with pytest.raises(ValueError, match="masses of H0, but it is not symmetric"):
-            make(TENSOR / MASSES[:, None]).init(terms, 0.0, 0.1, y0, None)
+            solver.init(terms, 0.0, 0.1, y0, None)
+    # In a solve the masses are traced, and the numbers of the friction are not.
+    with pytest.raises(RuntimeError, match="masses of H0, but it is not symmetric"):
+        jax.jit(lambda y0: solver.init(terms, 0.0, 0.1, y0, None))(y0)
 
     @eqx.filter_jit
     @jax.vmap

@@ -129,6 +129,21 @@ def test_beyond_the_end_of_recorded_noise_there_is_an_error(solver):
             jax.block_until_ready(sol.ys)
 
 
+@pytest.mark.parametrize(
+    "solver, missing", [(ds.PlateauVerlet(), "plateaus"), (ds.PlateauGauss(), "Lévy")]
+)
+def test_recorded_noise_leads_to_solvers_that_need_only_increments(solver, missing):
+    says = f"needs .*{missing}.*but `Recorded` has no random key.* `StormerVerlet`"
+    with pytest.raises(ValueError, match=says):
+        _solve(solver, RECORD, 0.0, 1.0, 0.1)
+    # Random noise is drawn with more instead.
+    random = ds.WeakBrownianPath((), jr.key(0))
+    with pytest.raises(ValueError, match=rf"needs .*{missing}.*`solver.path\(shape"):
+        _solve(solver, random, 0.0, 1.0, 0.1)
+    with pytest.raises(ValueError, match=r"by `solver.path\(shape"):
+        ds.second_moment_map(_oscillator(random), solver, 0.0, 0.1, (0.0, 1.0))
+
+
 def test_suggestions_keep_recorded_noise():
     y0 = jnp.zeros(()), jnp.ones(())
     for want in ("strong", "weak"):
@@ -177,22 +192,26 @@ def test_noises_that_do_not_fit_their_control_term_are_refused(solver, operator)
         kick = lambda w: 0.1 * w
         return lx.FunctionLinearOperator(kick, struct) if operator else 0.1 * jnp.eye(2)
 
-    def solve(shape, y0):
+    def terms(shape):
         path = ds.WeakBrownianPath(shape, jr.key(0), two_point=True)
         drift = diffrax.ODETerm(lambda t, y, args: -y)
-        terms = diffrax.MultiTerm(drift, diffrax.ControlTerm(field, path))
-        return diffrax.diffeqsolve(terms, solver, 0, 1, 0.5, y0, max_steps=2).ys
+        return diffrax.MultiTerm(drift, diffrax.ControlTerm(field, path))
 
-    # By Lineax, JAX, or what the terms return in place of the state.
-    for shape, y0 in (((3,), jnp.ones(2)), ((2,), jnp.ones(3))):
-        with pytest.raises((TypeError, ValueError), match="shape|structure|different"):
-            solve(shape, y0)
-    single = jax.ShapeDtypeStruct((2,), jnp.float32)
+    def solve(shape, y0):
+        return diffrax.diffeqsolve(terms(shape), solver, 0, 1, 0.5, y0, max_steps=2).ys
+
+    single, y0 = jax.ShapeDtypeStruct((2,), jnp.float32), jnp.ones(2)
+    takes = "operator on" if operator else "array"
+    says = rf"vector field, .*{takes} f64\[2.*increments of its path, f{{}}\. Construct"
+    with pytest.raises(ValueError, match=says.format(r"64\[3\]")):
+        solve((3,), y0)
+    with pytest.raises(ValueError, match=says.format(r"64\[3\]")):
+        ds.suggest_solver(terms((3,)), 0, y0, want="weak")
+    with pytest.raises(ValueError, match="state|The terms change an array"):
+        solve((2,), jnp.ones(3))
     if operator:
-        with pytest.raises(ValueError, match="structure|different"):
-            solve(single, jnp.ones(2))
+        with pytest.raises(ValueError, match=says.format(r"32\[2\]")):
+            solve(single, y0)
     else:
         # Diffrax multiplies arrays of different precision.
-        np.testing.assert_allclose(
-            solve(single, jnp.ones(2)), solve((2,), jnp.ones(2)), rtol=1e-6
-        )
+        np.testing.assert_allclose(solve(single, y0), solve((2,), y0), rtol=1e-6)

@@ -179,6 +179,27 @@ def test_plain_terms_of_a_separable_system_are_taken():
     np.testing.assert_allclose(got.ys, sol.ys, rtol=1e-14)
 
 
+@pytest.mark.parametrize(
+    "field, says",
+    [
+        (lambda p, q: (q, q), "a noise term changes q, the second half of the state"),
+        (lambda p, q: (p, jnp.zeros(2)), "changes p by an amount that depends on p"),
+    ],
+)
+def test_plain_noise_is_not_blamed_on_a_hamiltonian(field, says):
+    kick = diffrax.ControlTerm(
+        lambda t, y, args: lx.PyTreeLinearOperator(field(*y), _pair),
+        ds.WeakBrownianPath((), jr.key(0)),
+    )
+    drift = diffrax.ODETerm(lambda t, y, args: (-y[1], y[0]))
+    terms = diffrax.MultiTerm(drift, kick)
+    additive = "the noise b_k depends on the state"
+    for solver, match in ((ds.StormerVerlet(), says), (ds.SRKs4(), additive)):
+        with pytest.raises(ValueError, match=match) as info:
+            solver.init(terms, 0.0, 0.1, _positive_state, None)
+        assert "dH" not in str(info.value)
+
+
 def test_one_coupled_array_of_several_is_enough_to_refuse():
     H0 = lambda t, p, q, args: p["a"] ** 2 + q["a"] ** 2 + p["b"] * q["b"]
     noise = lambda t, p, q, args: q["a"]
