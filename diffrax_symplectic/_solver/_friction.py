@@ -138,9 +138,9 @@ def friction_modes(
             )
         matrix = _as_matrix(jax.lax.stop_gradient(g), x)
         if fault is None:
-            found.append(_modes(matrix))
-            continue
-        modes = _with_masses(matrix, _inverse_mass(velocity, p, i))
+            modes, fault = _modes(matrix), UNKNOWN
+        else:
+            modes = _with_masses(matrix, _inverse_mass(velocity, p, i))
         known = not isinstance(modes.rates, jax.core.Tracer)
         if not fault.masses or known and np.any(np.isnan(modes.rates)):
             raise ValueError(

@@ -155,10 +155,11 @@ def test_gradients_with_respect_to_a_matrix_with_equal_rates(wrap):
     terms = ds.hamiltonian_terms(_pendula, _bath(SIGMA), weak_path(2))
     y0 = jnp.ones(2), jnp.zeros(2)
 
-    def end(gamma, adjoint=diffrax.RecursiveCheckpointAdjoint()):
+    def end(gamma, adjoint=None):
         sol = diffrax.diffeqsolve(
-            terms, wrap(gamma), 0, 1, 0.25, y0, max_steps=4, adjoint=adjoint
-        )
+            terms, wrap(gamma), 0, 1, 0.25, y0, max_steps=4,
+            adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(),
+        )  # fmt: skip
         return jnp.sum(jnp.stack(sol.ys)[:, -1] * jnp.array([[1.0, 2.0], [-1.0, 0.5]]))
 
     change, k = jnp.array([[0.3, -0.2], [-0.2, 0.5]]), 1e-5
