@@ -2,6 +2,7 @@
 over a step."""
 
 import functools as ft
+import itertools as it
 from collections.abc import Callable
 from typing import Any, cast, NamedTuple
 
@@ -123,10 +124,9 @@ def friction_modes(
     """The modes of `gamma` for each array of `p`; `None` where it is not a matrix. They are
     constant during a solve. The masses come from `velocity(p)`. Raises a `ValueError` if
     `gamma` does not fit `p`."""
-    leaves = jtu.tree_leaves(p)
-    faults = faults if len(faults) == len(leaves) else faults * len(leaves)
     found = []
-    for i, (g, x, fault) in enumerate(zip(_for_each(gamma, p), leaves, faults)):
+    each = zip(_for_each(gamma, p), jtu.tree_leaves(p), it.cycle(faults))
+    for i, (g, x, fault) in enumerate(each):
         if jnp.shape(g) in ((), jnp.shape(x)):
             found.append(None)
             continue
@@ -177,11 +177,9 @@ def friction_result(
 ) -> diffrax.RESULTS:
     """`result`, or `RESULTS.nonfinite` if `gamma` turns out to be invalid (negative, not
     finite, or as a matrix not symmetric positive semidefinite)."""
-    leaves = jtu.tree_leaves(gamma)
-    leaves = leaves if len(leaves) == len(modes) else leaves * len(modes)
     bad = [
         _no_rate(g) if mode is None else jnp.any(jnp.isnan(mode.rates))
-        for g, mode in zip(leaves, modes)
+        for g, mode in zip(it.cycle(jtu.tree_leaves(gamma)), modes)
     ]
     R, bad = diffrax.RESULTS, ft.reduce(jnp.logical_or, bad)
     return R.where(bad, R.nonfinite, result)  # pyright: ignore
