@@ -7,11 +7,7 @@ from jaxtyping import Array, ArrayLike, Int, PyTree, Real, Shaped
 if TYPE_CHECKING:
     IntScalarLike: TypeAlias = int | Array | np.ndarray
     RealScalarLike: TypeAlias = int | float | Array | np.ndarray
-    # Which properties may override, unlike `equinox.AbstractVar`.
-    from typing import ClassVar as AbstractVar
 else:
-    from equinox import AbstractVar as AbstractVar
-
     IntScalarLike = Int[ArrayLike, ""]
     RealScalarLike = Real[ArrayLike, ""]
 

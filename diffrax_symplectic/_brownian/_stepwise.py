@@ -3,7 +3,7 @@
 import abc
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, cast, ClassVar, TypeAlias
+from typing import Any, cast, ClassVar, TYPE_CHECKING, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -14,8 +14,14 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree, UInt32
 
 from .._compat import nondifferentiable
-from .._custom_types import AbstractVar, RealScalarLike
+from .._custom_types import RealScalarLike
 from ._random import AbstractLaw, Gaussian, Place, place_of, random_words
+
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 # The value of a path over a step, with `use_levy=False` or with `use_levy=True`.

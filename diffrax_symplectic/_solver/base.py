@@ -6,7 +6,7 @@ import dataclasses
 import functools as ft
 import math
 from collections.abc import Callable
-from typing import Any, cast, ClassVar, Literal, NamedTuple, TypeAlias
+from typing import Any, cast, ClassVar, Literal, NamedTuple, TYPE_CHECKING, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -18,7 +18,7 @@ from .._arguments import check_state, whole_number
 from .._batch import batched_like
 from .._brownian import drives, path_of, VARIABLES
 from .._conditions import drift_order
-from .._custom_types import AbstractVar, Args, Y
+from .._custom_types import Args, Y
 from .._plan import make_plan
 from .._root_finder import PicardNewton
 from .._tableau import AbstractTableau, FlatTableau, Structure
@@ -31,6 +31,13 @@ from .._terms import (
 )
 from ._step import no_failure, result_of, Solved, Step, take_step
 from ._times import result_at
+
+
+if TYPE_CHECKING:
+    # In one module for all, Pyright would take the variables for arguments of `__init__`.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 Want: TypeAlias = Literal["weak", "strong"]

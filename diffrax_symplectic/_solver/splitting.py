@@ -12,7 +12,7 @@ from jaxtyping import ArrayLike, PyTree
 
 from .._arguments import check_pair, check_takes
 from .._compat import direction
-from .._custom_types import AbstractVar, Args, RealScalarLike, Y
+from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from .._terms import Dependence, has_lifted, is_hamiltonian, split_terms
 from ._friction import (
@@ -34,7 +34,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
     """Strang splitting: an exact flow over half a step, a step of `solver` for the rest of
     the system, and the flow over the other half."""
 
-    solver: AbstractVar[AbstractSymplecticSolver]
+    solver: eqx.AbstractVar[AbstractSymplecticSolver]
     # When to choose it, in a sentence.
     choose: ClassVar[str]
     # The highest orders of the splitting.
