@@ -136,13 +136,15 @@ def _check_supported(solver, controller, event, saveat) -> None:
             )
 
 
-def _undoes_its_steps(solver: diffrax.AbstractSolver) -> bool:
+def _undoes_its_steps(solver: Any) -> bool:
+    # `isinstance` would look through wrappers, such as `diffrax.HalfSolver`.
+    kind = type(solver)
     # With negated increments `NinomiyaVictoir` takes its flows in reverse order.
-    if isinstance(solver, NinomiyaVictoir | BAOAB):
+    if issubclass(kind, NinomiyaVictoir | BAOAB):
         return True
-    if isinstance(solver, AbstractSplitting):
+    if issubclass(kind, AbstractSplitting):
         return _undoes_its_steps(solver.solver)
-    if not isinstance(solver, AbstractSymplecticRungeKutta):
+    if not issubclass(kind, AbstractSymplecticRungeKutta):
         return False
     return is_own_inverse(make_plan(solver.tableau.flatten()).tableau)
 

@@ -1,6 +1,7 @@
 """The private parts of other packages that this one uses, and may change without notice.
 
-They are used nowhere else. `tests/test_private_parts.py` tests each of them.
+They are used nowhere else, except for the loop of a solve, its state and that of its step
+size controller in `_adjoint.py`. `tests/test_private_parts.py` tests each of them.
 """
 
 from collections.abc import Callable

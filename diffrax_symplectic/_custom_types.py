@@ -13,6 +13,4 @@ else:
 
 Args: TypeAlias = PyTree[Any]
 Y: TypeAlias = PyTree[Shaped[ArrayLike, "?*y"], "Y"]
-VF: TypeAlias = PyTree[Shaped[ArrayLike, "?*vf"], "VF"]
 BM: TypeAlias = PyTree[Shaped[ArrayLike, "?*bm"], "BM"]
-DenseInfo: TypeAlias = dict[str, PyTree[Array]]

@@ -58,6 +58,7 @@ def test_solvers_that_do_not_undo_their_steps_are_refused():
     refused = (
         *[ds.SRKw2(), ds.SRKs3(), ds.SRKs4(), ds.SRKw3(), ds.SRKw4(), ds.SRKw5()],
         *[ds.PlateauVerlet(), ds.AdditiveGauss(), diffrax.Heun()],
+        *[diffrax.HalfSolver(ds.StormerVerlet()), diffrax.HalfSolver(ds.BAOAB(1.0))],
     )
     assert not any(map(_undoes_its_steps, refused))
 

@@ -15,6 +15,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic import _compat
+from diffrax_symplectic._adjoint import _Steps
 
 
 def test_private_parts_of_others_are_used_in_one_module_only():
@@ -95,7 +96,7 @@ def test_equinox_refuses_derivatives_of_what_is_nondifferentiable():
 @pytest.mark.core
 def test_adjoints_of_diffrax_run_a_loop_with_the_arguments_and_the_state_known_here():
     # `ReversingAdjoint` calls the loop of a solve, and reads these parts of its state.
-    read = []
+    steps = []
 
     class Spy(diffrax.RecursiveCheckpointAdjoint):
         def loop(self, *, init_state, terms, passed_solver_state, **kwargs):
@@ -107,8 +108,7 @@ def test_adjoints_of_diffrax_run_a_loop_with_the_arguments_and_the_state_known_h
                 assert hasattr(init_state, part)
             for part in ("ys", "saveat_ts_index"):
                 assert hasattr(init_state.save_state, part)
-            # Of a constant step size: how many steps are made, the second of the state.
-            read.extend(init_state.controller_state[:2])
+            steps.append(_Steps(kwargs["stepsize_controller"], init_state))
             return super().loop(
                 init_state=init_state,
                 terms=terms,
@@ -117,11 +117,16 @@ def test_adjoints_of_diffrax_run_a_loop_with_the_arguments_and_the_state_known_h
             )
 
     term = diffrax.ODETerm(lambda t, y, args: -y)
+    saveat = diffrax.SaveAt(t0=True, steps=True)
     with jax.ensure_compile_time_eval(), jax.disable_jit():
-        diffrax.diffeqsolve(
-            term, diffrax.Euler(), 0.0, 1.0, 0.25, jnp.array(1.0), adjoint=Spy()
-        )
-    assert read[1] == 4
+        sol = diffrax.diffeqsolve(
+            term, diffrax.Euler(), 0.1, 1.13, 0.1, jnp.array(1.0), saveat=saveat,
+            adjoint=Spy(), max_steps=16,
+        )  # fmt: skip
+        # The state of a constant step size: how many steps are made, and in which times.
+        assert steps[0].between(1) == 11 == sol.stats["num_steps"]
+        times = [steps[0].time(i) for i in range(12)]
+    assert sol.ts[:12].tolist() == times and 0.2 in times and times[2] < 0.3
 
 
 def test_loops_of_equinox_take_buffers_and_gradients_can_be_refused():

@@ -20,8 +20,6 @@ SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
     *(SRKs4, SRKw5, AdditiveGauss),
 )
 
-# Solvers whose only arguments are for the root finder.
-for _solver in (ImplicitMidpoint, SRKw2, StrangGauss, NinomiyaVictoir, PlateauGauss):
-    _solver.__init__.__doc__ = ARGUMENTS
-for _solver in (LevyAreaMidpoint, SRKs2, SRKw5, AdditiveGauss):
-    _solver.__init__.__doc__ = ARGUMENTS
+for _solver in SOLVERS:
+    if issubclass(_solver, AbstractImplicitStages):
+        _solver.__init__.__doc__ = ARGUMENTS

@@ -2,8 +2,9 @@
 over a step."""
 
 import functools as ft
+import itertools as it
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, cast, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -38,7 +39,9 @@ class Fault(NamedTuple):
     masses: bool = False
 
 
-UNKNOWN = Fault("its values are traced", masses=True)
+# Of arrays that are traced or not a matrix. Their place may be taken by a matrix, as in
+# `eqx.tree_at`, or if they are a batch of matrices.
+UNKNOWN = Fault("it is not", masses=True)
 
 
 def checked(gamma: PyTree) -> PyTree:
@@ -57,12 +60,12 @@ def checked(gamma: PyTree) -> PyTree:
             raise ValueError(f"`gamma` must be finite; got {leaf!r}.")
         if np.all(values >= 0):
             continue
-        fault = _matrix_fault(values)
-        if fault == _NO_SQUARE:
+        if not is_square(values.shape):
             raise ValueError(
                 "`gamma` must not be negative: it is the rate at which momentum decays; "
                 f"got {leaf!r}."
             )
+        fault = _matrix_fault(values)
         if fault is not None and not fault.masses:
             raise ValueError(
                 "`gamma` has negative entries, which only a symmetric positive "
@@ -74,19 +77,20 @@ def checked(gamma: PyTree) -> PyTree:
 def matrix_faults(gamma: PyTree) -> tuple[Fault | None, ...]:
     """Why each array of `gamma` cannot serve as a matrix; `None` if it can. Whether it must
     is known only from the shape of the momenta."""
-    known = lambda x: not isinstance(x, jax.core.Tracer)
-    leaves = jtu.tree_leaves(gamma)
-    return tuple(_matrix_fault(np.asarray(x)) if known(x) else UNKNOWN for x in leaves)
+    return tuple(map(_matrix_fault, jtu.tree_leaves(gamma)))
 
 
-_NO_SQUARE = Fault("it is not a square matrix")
+def is_square(shape: tuple[int, ...]) -> bool:
+    """Whether this is the shape of some momenta twice."""
+    half = len(shape) // 2
+    return half > 0 and shape == shape[:half] * 2
 
 
-def _matrix_fault(values: np.ndarray) -> Fault | None:
-    half = values.shape[: values.ndim // 2]
-    if values.ndim == 0 or values.shape != half + half:
-        return _NO_SQUARE
-    matrix = values.reshape(int(np.prod(half)), -1)
+def _matrix_fault(g: ArrayLike) -> Fault | None:
+    if isinstance(g, jax.core.Tracer) or not is_square(jnp.shape(g)):
+        return UNKNOWN
+    n = round(jnp.size(g) ** 0.5)
+    matrix = np.reshape(np.asarray(g), (n, n))
     if not np.all(np.isfinite(matrix)):
         return Fault("it is not finite")
     eps = np.finfo(np.result_type(matrix, np.float32)).eps
@@ -120,10 +124,9 @@ def friction_modes(
     """The modes of `gamma` for each array of `p`; `None` where it is not a matrix. They are
     constant during a solve. The masses come from `velocity(p)`. Raises a `ValueError` if
     `gamma` does not fit `p`."""
-    leaves = jtu.tree_leaves(p)
-    faults = faults if len(faults) == len(leaves) else faults * len(leaves)
     found = []
-    for i, (g, x, fault) in enumerate(zip(_for_each(gamma, p), leaves, faults)):
+    each = zip(_for_each(gamma, p), jtu.tree_leaves(p), it.cycle(faults))
+    for i, (g, x, fault) in enumerate(each):
         if jnp.shape(g) in ((), jnp.shape(x)):
             found.append(None)
             continue
@@ -135,9 +138,9 @@ def friction_modes(
             )
         matrix = _as_matrix(jax.lax.stop_gradient(g), x)
         if fault is None:
-            found.append(_modes(matrix))
-            continue
-        modes = _with_masses(matrix, _inverse_mass(velocity, p, i))
+            modes, fault = _modes(matrix), UNKNOWN
+        else:
+            modes = _with_masses(matrix, _inverse_mass(velocity, p, i))
         known = not isinstance(modes.rates, jax.core.Tracer)
         says = (
             "`gamma` must be a symmetric positive semidefinite matrix for momenta of "
@@ -177,18 +180,12 @@ def _inverse_mass(velocity: Callable, p: PyTree[Array], number: int) -> Array:
 def friction_result(
     gamma: PyTree[ArrayLike], modes: list[Modes | None], result: diffrax.RESULTS
 ) -> diffrax.RESULTS:
-    """`result`, or `RESULTS.nonfinite` if traced values of `gamma` are invalid (negative,
-    not finite, or as a matrix not symmetric positive semidefinite)."""
-    leaves = jtu.tree_leaves(gamma)
-    leaves = leaves if len(leaves) == len(modes) else leaves * len(modes)
-    traced = lambda x: isinstance(x, jax.core.Tracer)
+    """`result`, or `RESULTS.nonfinite` if `gamma` turns out to be invalid (negative, not
+    finite, or as a matrix not symmetric positive semidefinite)."""
     bad = [
         _no_rate(g) if mode is None else jnp.any(jnp.isnan(mode.rates))
-        for g, mode in zip(leaves, modes)
-        if traced(g) or mode is not None and traced(mode.rates)
+        for g, mode in zip(it.cycle(jtu.tree_leaves(gamma)), modes)
     ]
-    if len(bad) == 0:
-        return result
     R, bad = diffrax.RESULTS, ft.reduce(jnp.logical_or, bad)
     return R.where(bad, R.nonfinite, result)  # pyright: ignore
 
@@ -314,15 +311,16 @@ def _of_matrix(fn, matrix, modes: Modes, time, x) -> Array:
 def _(fn, primals, tangents):
     matrix, modes, time, x = primals
     d_matrix, _, d_time, d_x = tangents
-    # The modes are treated as constants, so a second derivative would be wrong.
-    matrix = nondifferentiable(matrix, name="the matrix `gamma`, a second time")
-    del matrix
+    # The modes are treated as constants, so a second derivative would be wrong. With the
+    # modes behind the guard of the matrix, JAX cannot drop it as unused.
+    name = "the matrix `gamma`, a second time"
+    matrix, modes = cast(Any, nondifferentiable((matrix, modes), name=name))
     rates, left, right = modes
     along = lambda v: _dot(right, v)
     change = _dot(along(d_matrix), left) * time + jnp.diag(rates * d_time)
     quotients = _divided_differences(fn, rates * time)
     d_out = fn(rates * time) * along(d_x) + _dot(quotients * change, along(x))
-    return _of_matrix(fn, primals[0], modes, time, x), _dot(left, d_out)
+    return _of_matrix(fn, matrix, modes, time, x), _dot(left, d_out)
 
 
 def root_of_matrix(matrix: Array) -> Array:

@@ -12,8 +12,8 @@ from .base import (
     free_parameter,
     real_number,
     Record,
-    ROOT_FINDER,
 )
+from .general import GAUSS
 
 
 def _nonzero(value: Any) -> float:
@@ -53,9 +53,9 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
       \tfrac{I_{k0}}{h}\big) b_k(c^1_2) \Big).$$
 
     A step solves for two stage vectors, one after the other. If the noise is constant, only
-    the sign $s$ matters. The paper has $s = +1$. The default here is $s = -1$: in six
-    problems with two noises its strong error at $h = 1/16$ was half as large as for
-    $s = +1$, or 0.7 times as large with weak noise. The parameters $\beta_1$,
+    `sign`, the sign $s = \pm 1$, matters. The paper has $s = +1$. The default here is
+    $s = -1$: in six problems with two noises its strong error at $h = 1/16$ was half as
+    large as for $s = +1$, or 0.7 times as large with weak noise. The parameters $\beta_1$,
     $\beta_2 \neq 0$ and $b$ determine the times at which the noise is evaluated: with the
     defaults $\beta_1 = b = 0$, $\beta_2 = 1$, at both ends of the step.
 
@@ -93,16 +93,6 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         )
 
 
-SRKs4.__init__.__doc__ = f"""**Arguments:**
-
-- `beta1`, `beta2`, `b`: the free parameters, Python floats; `beta2` not 0.
-- `sign`: the sign $s$, 1 or -1.
-{ROOT_FINDER}
-**Raises:** a `ValueError` if a parameter is not a finite real number, if `beta2` is 0, or
-if `sign` is not 1 or -1.
-"""
-
-
 class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKw5 of Wang, Hong and Xu, of weak order 2 for any number of
     noises that depend neither on the state nor on time.
@@ -137,7 +127,6 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     )
 
 
-_r = np.sqrt(3.0)
 _s = np.sqrt(1 / 6)
 
 
@@ -176,9 +165,9 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
         alpha=[1 / 2, 1 / 2],
         beta={"W": [1]},
-        A=[[1 / 4, 1 / 4 - _r / 6], [1 / 4 + _r / 6, 1 / 4]],
+        A=GAUSS,
         B={
-            "W": [[1 / 2 - _r / 6], [1 / 2 + _r / 6]],
+            "W": GAUSS.sum(axis=1, keepdims=True),
             "second": [[_s], [0]],
             "third": [[0], [_s]],
         },

@@ -12,13 +12,13 @@ import diffrax
 import equinox as eqx
 import jax
 import optimistix as optx
-from jaxtyping import PRNGKeyArray, PyTree
+from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._arguments import check_state, whole_number
 from .._batch import batched_like
 from .._brownian import drives, path_of, VARIABLES
 from .._conditions import drift_order
-from .._custom_types import Args, DenseInfo, VF, Y
+from .._custom_types import Args, Y
 from .._plan import make_plan
 from .._root_finder import PicardNewton
 from .._tableau import AbstractTableau, FlatTableau, Structure
@@ -34,6 +34,7 @@ from ._times import result_at
 
 
 if TYPE_CHECKING:
+    # In one module for all, Pyright would take the variables for arguments of `__init__`.
     from typing import ClassVar as AbstractVar
 else:
     from equinox import AbstractVar
@@ -67,12 +68,9 @@ class Record(NamedTuple):
         return order[0 if commute else 1] if isinstance(order, tuple) else order
 
 
-# Whether all stage equations were solved so far: in a batch Diffrax continues to step
-# failed paths.
-SolverState: TypeAlias = Solved
-
-
-class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
+# The solver state is whether all stage equations were solved so far: in a batch Diffrax
+# continues to step failed paths.
+class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
     """The base class of all solvers of this package, and of your own solvers that are not
     Runge--Kutta methods.
 
@@ -80,7 +78,8 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
     Stratonovich terms. It defines `structure` (`"any"`, `"separable"`, `"additive"`,
     `"constant"` or `"separable and constant"`), `variables` (the names of the random
     variables of a step, such as `("W",)`), and `stage_vectors(num_noises)`, and overrides
-    `weak_order(terms)` and `strong_order(terms)`. Then [`diffrax_symplectic.Damped`][] and
+    `weak_order(terms)` and `strong_order(terms)`. A solver with friction of its own also
+    sets `includes_friction = True`. Then [`diffrax_symplectic.Damped`][] and
     [`diffrax_symplectic.LinearFlow`][] can wrap it, and `solver.path(shape, key)` makes the
     path that it needs.
     """
@@ -90,6 +89,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
         diffrax.LocalLinearInterpolation
     )
     record: ClassVar[Record | None] = None
+    includes_friction: ClassVar[bool] = False
     structure: AbstractVar[Structure]
     variables: AbstractVar[tuple[str, ...]]
 
@@ -161,7 +161,13 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[SolverState]):
                 given.append(f"{f.name}={text}")
         return f"{type(self).__name__}({', '.join(given)})"
 
-    def func(self, terms, t0, y0: Y, args: Args) -> VF:
+    def check(self, terms, t0, y0: Y, args: Args) -> None:
+        """Raises a `ValueError` unless the state and the terms suit the solver."""
+        name = type(self).__name__
+        check_state(y0, name)
+        check_structure(self.structure, *split_terms(terms), t0, y0, args, name)
+
+    def func(self, terms, t0, y0: Y, args: Args) -> PyTree[ArrayLike]:
         return terms.vf(t0, y0, args)
 
 
@@ -181,9 +187,10 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
     **State.** Any PyTree of real floating-point arrays.
 
     **Failures.** A step fails if a stage equation is not solved, if its end is not finite,
-    if it is shorter than a hundred times the rounding of the time, or if it leaves the time
-    interval of its path. Then `diffeqsolve` raises an error, or with `throw=False` reports
-    it in `sol.result`. The other paths of a batch continue.
+    or if it is shorter than a hundred times the rounding of the time. Then `diffeqsolve`
+    raises an error, or with `throw=False` reports it in `sol.result`. The other paths of a
+    batch continue. A step outside of the time interval of its path is an error when run,
+    whatever `throw` is.
     """
 
     tableau: AbstractVar[AbstractTableau]
@@ -207,16 +214,15 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         del terms
         return drift_order(self.tableau.flatten())
 
-    def init(self, terms, t0, t1, y0: Y, args: Args) -> SolverState:
+    def init(self, terms, t0, t1, y0: Y, args: Args) -> Solved:
         del t1
-        name = type(self).__name__
-        check_state(y0, name)
-        check_structure(self.structure, *split_terms(terms), t0, y0, args, name)
-        return first_state(self)
+        self.check(terms, t0, y0, args)
+        implicit = isinstance(self, diffrax.AbstractImplicitSolver)
+        return no_failure() if implicit else None
 
     def step(
-        self, terms, t0, t1, y0: Y, args: Args, solver_state: SolverState, made_jump
-    ) -> tuple[Y, None, DenseInfo, SolverState, diffrax.RESULTS]:
+        self, terms, t0, t1, y0: Y, args: Args, solver_state: Solved, made_jump
+    ) -> tuple[Y, None, dict[str, Y], Solved, diffrax.RESULTS]:
         del made_jump
         drift, noise = split_terms(terms)
         plan = make_plan(_drop_absent(self.tableau.flatten(), drift, noise))
@@ -230,11 +236,6 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         y1, solved = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
         result = result_at(terms, t0, t1, result_of(solved, y1))
         return y1, None, dict(y0=y0, y1=y1), solved, result
-
-
-def first_state(solver: AbstractSymplecticSolver) -> SolverState:
-    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    return no_failure() if implicit else None
 
 
 def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTableau:
@@ -286,24 +287,14 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
     )
 
 
-# The documentation of these fields in every implicit solver's `__init__`.
-ROOT_FINDER = """\
+# The documentation of `__init__` of every implicit solver.
+ARGUMENTS = """**Arguments:** the parameters above, if any (Python numbers or strings), and
+
 - `root_finder`: any Optimistix root finder for the stage equations.
 - `root_find_max_steps`: the most steps that the root finder may take. `PicardNewton` takes
     one step, and limits its iterations itself.
-"""
-ARGUMENTS = f"""**Arguments:**
 
-{ROOT_FINDER}"""
-
-
-def one_parameter(name: str) -> str:
-    """The documentation of `__init__` for a solver with one free parameter."""
-    return f"""**Arguments:**
-
-- `{name}`: the free parameter, a Python float.
-{ROOT_FINDER}
-**Raises:** a `ValueError` if `{name}` is not a finite real number.
+**Raises:** a `ValueError` for any other value.
 """
 
 

@@ -9,32 +9,27 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 
-from .._arguments import check_state
 from .._conditions import drift_order
 from .._plan import make_plan
 from .._tableau import FlatTableau, GeneralTableau, Stage, Structure
 from .._terms import (
     apply_one,
-    check_structure,
     controls,
     drift_driven,
     number_of_noises,
     split_terms,
 )
-from ._step import result_of, Step, take_step
+from ._step import no_failure, result_of, Step, take_step
 from ._times import result_at
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
     AbstractSymplecticSolver,
-    first_state,
     Record,
 )
-from .general import ImplicitMidpoint
+from .general import GAUSS, ImplicitMidpoint
 
 
-_r = np.sqrt(3.0)
-_gauss = np.array([[1 / 4, 1 / 4 - _r / 6], [1 / 4 + _r / 6, 1 / 4]])
 _half = np.array([1 / 2, 1 / 2])
 
 
@@ -73,15 +68,15 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         A0=[[1 / 4, 0], [1 / 2, 1 / 4]],
         B0=[[0, 0], [1 / 2, 1 / 2]],
         A1=[[1 / 2, 0], [1 / 2, 0]],
-        B1=_gauss,
+        B1=GAUSS,
     )
 
 
 # The flow of one vector field: two stages of the Gauss method, of order 4.
 _flow = make_plan(
     FlatTableau(
-        stages=tuple(Stage(("h",), 1 / 2 + s * _r / 6, "y", "y") for s in (-1, 1)),
-        matrix=_gauss,
+        stages=tuple(Stage(("h",), c, "y", "y") for c in GAUSS.sum(axis=1)),
+        matrix=GAUSS,
         weights=_half,
     )
 )
@@ -136,15 +131,13 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
 
     def init(self, terms, t0, t1, y0, args):
         del t1
-        name = type(self).__name__
-        check_state(y0, name)
-        check_structure(self.structure, *split_terms(terms), t0, y0, args, name)
-        return first_state(self)
+        self.check(terms, t0, y0, args)
+        return no_failure()
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del made_jump
         drift, noise = split_terms(terms)
-        solved = first_state(self) if solver_state is None else solver_state
+        solved = no_failure() if solver_state is None else solver_state
         middle = t0 + (t1 - t0) / 2
         numbers, increments = self._in_order(terms, t0, t1)
         still = [middle] * (numbers.size + 1)
@@ -284,6 +277,6 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         suggested=("strong",),
     )
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
-        GeneralTableau.strong(A=_gauss, B=_gauss, alpha=_half, beta=_half),
+        GeneralTableau.strong(A=GAUSS, B=GAUSS, alpha=_half, beta=_half),
         noise=("W", "L"),
     )

@@ -9,7 +9,6 @@ from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
     free_parameter,
-    one_parameter,
     Record,
 )
 
@@ -70,9 +69,6 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         return GeneralTableau.strong(A=A, B=A, alpha=alpha, beta=alpha)
 
 
-SRKs1.__init__.__doc__ = one_parameter("a")
-
-
 class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The one-stage symplectic methods SRKw1 of Wang, Hong and Xu, of weak order 1.
 
@@ -106,10 +102,9 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         )
 
 
-SRKw1.__init__.__doc__ = one_parameter("b")
-
-
 _r = np.sqrt(3)
+# Of the Gauss method with two stages, of order 4. Its times are the sums of the rows.
+GAUSS = np.array([[1 / 4, 1 / 4 - _r / 6], [1 / 4 + _r / 6, 1 / 4]])
 
 
 class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -161,5 +156,5 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
             [1 / 2, 1 / 2],
         ],
         A1=[[-1 / 6 + _r / 6, 1 / 3, 1 / 3 - _r / 6, 0], [1 / 2, 0, 0, 0]],
-        B1=[[1 / 4, 1 / 4 - _r / 6], [1 / 4 + _r / 6, 1 / 4]],
+        B1=GAUSS,
     )

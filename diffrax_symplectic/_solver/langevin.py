@@ -10,11 +10,10 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import ArrayLike, PyTree
 
-from .._arguments import check_state
 from .._compat import direction, unwrapped
 from .._custom_types import RealScalarLike
 from .._tableau import Structure
-from .._terms import apply, check_structure, controls, rate, split_terms
+from .._terms import apply, controls, rate, split_terms
 from ._friction import (
     apply_friction,
     checked,
@@ -39,6 +38,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
 
     structure: ClassVar[Structure] = "separable and constant"
     variables: ClassVar[tuple[str, ...]] = ("W",)
+    includes_friction: ClassVar[bool] = True
     symmetric: eqx.AbstractClassVar[bool]
     gamma: eqx.AbstractVar[PyTree[ArrayLike]]
     _faults: eqx.AbstractVar[tuple[Fault | None, ...]]
@@ -56,14 +56,12 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         """The forces, which a symmetric splitting hands on from the end of a step to the
         start of the next one, and the modes of the friction."""
         del t1
-        name = type(self).__name__
-        check_state(y0, name)
-        drift, noise = split_terms(terms)
-        check_structure(self.structure, drift, noise, t0, y0, args, name)
+        self.check(terms, t0, y0, args)
+        drift, _ = split_terms(terms)
         if not all(isinstance(unwrapped(x), diffrax.ODETerm) for x in drift):
             raise ValueError(
-                f"`{name}` needs a drift driven by time: pass `hamiltonian_terms(H0, "
-                "noise, path)`."
+                f"`{type(self).__name__}` needs a drift driven by time: pass "
+                "`hamiltonian_terms(H0, noise, path)`."
             )
         velocity = velocity_of(terms, t0, y0, args)
         modes = friction_modes(self.gamma, self._faults, y0[0], velocity)

@@ -9,9 +9,7 @@ from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
     free_parameter,
-    one_parameter,
     Record,
-    ROOT_FINDER,
 )
 
 
@@ -41,10 +39,10 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     | $A^1$ | 1/2 | 1 | 0 | 1/2 | 1 | 0 |
     | $B^0$ | 1/2 | 0 | 1 | -1/2 | 0 | -1 |
 
-    `"a"` is the midpoint rule; `"b"` is a midpoint step of the drift, then an explicit kick
-    by the noise; `"c"`, the default, is the kick, then the midpoint step. `"d"`, `"e"` and
-    `"f"` are the same with negated increments, which have the same law. Weak order 1 for
-    any number of noises.
+    The `variant` `"a"` is the midpoint rule; `"b"` is a midpoint step of the drift, then an
+    explicit kick by the noise; `"c"`, the default, is the kick, then the midpoint step.
+    `"d"`, `"e"` and `"f"` are the same with negated increments, which have the same law.
+    Weak order 1 for any number of noises.
 
     **Source:** [Wang, Hong and Xu (2017)](https://doi.org/10.4208/cicp.261014.230616a),
     section 3.1.
@@ -69,14 +67,6 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         return SeparableTableau([1], [beta], A0=[[1 / 2]], B0=[[B0]], A1=[[A1]])
 
 
-SRKw3.__init__.__doc__ = f"""**Arguments:**
-
-- `variant`: one of `"a"` to `"f"`.
-{ROOT_FINDER}
-**Raises:** a `ValueError` if `variant` is not one of these letters.
-"""
-
-
 class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic methods SRKw4 of Wang, Hong and Xu, of weak order 2, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
@@ -90,9 +80,9 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     A step depends only on these coefficients: the paper's third drift stage has weight 0,
     its second and third noise stages are evaluated at the same point, and its other
-    parameters only affect these stages. For $a_{21} = 0$ and $1/2$ the matrix $A^0$ is
-    triangular; for $\frac14 \pm \frac{\sqrt 3}{6}$ it is the Gauss method, of order 4
-    without noise.
+    parameters only affect these stages. For $a_{21} = 0$ and the default $1/2$ the matrix
+    $A^0$ is triangular; for $\frac14 \pm \frac{\sqrt 3}{6}$ it is the Gauss method, of
+    order 4 without noise.
 
     Weak order 2: by the paper for one noise, and measured for two and three noises.
 
@@ -117,9 +107,6 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
             B0=[[1, 0], [0, 0]],
             A1=[[-1 / 2, 1 / 2], [1 / 2, 1 / 2]],
         )
-
-
-SRKw4.__init__.__doc__ = one_parameter("a21")
 
 
 class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
@@ -179,9 +166,6 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         a = self.a
         A0, alpha = [[a, 0], [2 * a, 1 / 2 - a]], [2 * a, 1 - 2 * a]
         return SeparableTableau(alpha=alpha, beta=[1], A0=A0, B0=[[0], [0]], A1=[alpha])
-
-
-SRKs3.__init__.__doc__ = one_parameter("a")
 
 
 class StormerVerlet(AbstractSymplecticRungeKutta):

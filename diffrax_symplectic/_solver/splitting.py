@@ -34,6 +34,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
     """Strang splitting: an exact flow over half a step, a step of `solver` for the rest of
     the system, and the flow over the other half."""
 
+    solver: eqx.AbstractVar[AbstractSymplecticSolver]
     # When to choose it, in a sentence.
     choose: ClassVar[str]
     # The highest orders of the splitting.
@@ -55,7 +56,8 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
         """The `result` of a step of the solver, or the failure of the flow."""
 
     def __check_init__(self):
-        if not isinstance(self.solver, AbstractSymplecticSolver):
+        # `isinstance` would look through wrappers, such as `diffrax.HalfSolver`.
+        if not issubclass(type(self.solver), AbstractSymplecticSolver):
             name = type(self).__name__
             raise ValueError(
                 f"`{name}` wraps a solver of this package, such as `StormerVerlet()`; got "
@@ -64,27 +66,31 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
 
     @property
     def record(self) -> Record | None:  # pyright: ignore
-        record = self.solver.record  # pyright: ignore
+        record = self.solver.record
         return record and record._replace(
             weak=_at_most(record.weak, self.weak),
             strong=_at_most(record.strong, self.strong),
         )
 
     def weak_order(self, terms) -> int | None:
-        order = self.solver.weak_order(terms)  # pyright: ignore
+        order = self.solver.weak_order(terms)
         return None if order is None else min(order, self.weak)
 
     def strong_order(self, terms) -> int | float | None:
-        order: Any = self.solver.strong_order(terms)  # pyright: ignore
+        order: Any = self.solver.strong_order(terms)
         return None if order is None else min(order, self.strong)
 
     @property
+    def includes_friction(self) -> bool:  # pyright: ignore
+        return self.solver.includes_friction
+
+    @property
     def structure(self) -> Structure:
-        return self.solver.structure  # pyright: ignore
+        return self.solver.structure
 
     @property
     def variables(self) -> tuple[str, ...]:
-        return self.solver.variables  # pyright: ignore
+        return self.solver.variables
 
     @property
     def root_finder(self):
@@ -95,7 +101,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
         return self.solver.root_find_max_steps  # pyright: ignore
 
     def stage_vectors(self, num_noises):
-        return self.solver.stage_vectors(num_noises)  # pyright: ignore
+        return self.solver.stage_vectors(num_noises)
 
     def order(self, terms):
         order = self.solver.order(terms)
@@ -149,18 +155,19 @@ class Damped(AbstractSplitting):
     **Source:** the splitting of [Strang (1968)](https://doi.org/10.1137/0705041).
     """
 
-    solver: diffrax.AbstractSolver
+    solver: AbstractSymplecticSolver
     gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
     _faults: tuple[Fault | None, ...] = eqx.field(static=True, init=False, repr=False)
 
     def __post_init__(self):
         self._faults = matrix_faults(self.gamma)
-        if hasattr(self.solver, "gamma"):
+        if getattr(self.solver, "includes_friction", False):
             raise ValueError(
                 f"`{type(self.solver).__name__}` already includes friction. Pass all "
                 "friction to it, without `Damped`."
             )
 
+    includes_friction: ClassVar[bool] = True  # pyright: ignore
     choose: ClassVar[str] = "Friction: collisions, damping, thermostats."
     advice: ClassVar[str] = (
         "Other solvers take friction as a term: `diffrax.MultiTerm(terms, "
@@ -241,7 +248,7 @@ class LinearFlow(AbstractSplitting):
     (1991)](https://doi.org/10.1080/08927029108022142).
     """
 
-    solver: diffrax.AbstractSolver
+    solver: AbstractSymplecticSolver
     flow: Callable[[RealScalarLike, Y, Args], Y]
 
     choose: ClassVar[str] = (

@@ -7,7 +7,14 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from .._arguments import real_array
 from .._custom_types import Args, RealScalarLike
-from ._friction import checked, Fault, matrix_faults, root_of_matrix, UNKNOWN
+from ._friction import (
+    checked,
+    Fault,
+    is_square,
+    matrix_faults,
+    root_of_matrix,
+    UNKNOWN,
+)
 
 
 def thermal_noise(
@@ -73,10 +80,9 @@ class _Amplitudes(eqx.Module):
                 f"{jnp.shape(gamma)}, {jnp.shape(mass)} and {jnp.shape(T)}. A matrix "
                 "`gamma` has the shape of `q` twice: (n, d, n, d) for `q` of shape (n, d)."
             ) from None
+        variance = jnp.asarray(variance, jnp.result_type(variance, float))
         (fault,) = matrix_faults(variance)
-        half = variance.shape[: variance.ndim // 2]
-        possible = fault is None or fault == UNKNOWN
-        if variance.ndim == 0 or variance.shape != half + half or not possible:
+        if not is_square(variance.shape) or fault not in (None, UNKNOWN):
             return _Amplitudes(variance, None, fault)
         return _Amplitudes(variance, root_of_matrix(variance), fault)
 

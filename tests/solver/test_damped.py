@@ -81,8 +81,10 @@ def test_misfits_are_refused_with_advice():
     for gamma, match in ((jnp.ones(3), "shape of its momenta"), ([1.0], "structure")):
         with pytest.raises(ValueError, match=match):
             ds.Damped(ds.ImplicitMidpoint(), gamma).init(terms, 0.0, 0.1, y0, None)
-    with pytest.raises(ValueError, match="wraps a solver of this package"):
-        ds.Damped(diffrax.Heun(), 1.0)
+    # Diffrax's wrappers count as what they wrap, by `isinstance`.
+    for other in (diffrax.Heun(), diffrax.HalfSolver(ds.ImplicitMidpoint())):
+        with pytest.raises(ValueError, match="wraps a solver of this package"):
+            ds.Damped(other, 1.0)
     assert isinstance(
         ds.Damped(ds.ImplicitMidpoint(), 1.0), diffrax.AbstractImplicitSolver
     )
@@ -133,10 +135,19 @@ def test_a_traced_friction_that_is_negative_fails_its_path_alone():
         diffrax.diffeqsolve(terms, solver, 0.0, 0.5, 0.1, y0)
 
 
+class _OwnGamma(ds.AbstractSymplecticRungeKutta):
+    """A tableau with a parameter `gamma` that is no friction."""
+
+    gamma: float = 0.25
+    tableau = ds.StormerVerlet.tableau
+
+
 def test_there_is_one_friction_only():
-    for solver in (ds.BAOAB(1.0), ds.Damped(ds.StormerVerlet(), 1.0)):
+    split = ds.LinearFlow(ds.BAOAB(1.0), lambda time, y, args: y)
+    for solver in (ds.BAOAB(1.0), ds.Damped(ds.StormerVerlet(), 1.0), split):
         with pytest.raises(ValueError, match="already includes friction"):
             ds.Damped(solver, 1.0)
+    assert ds.Damped(_OwnGamma(), 1.0).solver == _OwnGamma()
 
 
 def test_orders_are_those_of_the_splitting_where_the_solver_has_higher_ones():

@@ -233,6 +233,9 @@ def test_thermal_noise_is_that_of_numbers_arrays_matrices_and_trees():
         sigma = _amplitudes(gamma, mass, T, q)
         variance = 2 * T * gamma * mass
         np.testing.assert_allclose(sigma @ sigma.T, variance, atol=1e-15)
+    integers = np.array([[2, 1], [1, 2]])
+    sigma = _amplitudes(integers, 1, 1, jnp.zeros(2))
+    np.testing.assert_allclose(sigma @ sigma.T, 2 * integers, rtol=1e-14)
     # Momenta of an array of two axes have rates of its shape, and matrices of twice it.
     flat = _amplitudes(TENSOR / MASSES, MASSES, T, q)
     matrix = (TENSOR / MASSES).reshape(3, 1, 3, 1)
