@@ -1,5 +1,6 @@
 """The loop over fixed steps that all samplings share."""
 
+import functools as ft
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -8,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
@@ -19,7 +19,7 @@ from .._brownian import is_random
 from .._custom_types import Args, RealScalarLike, Y
 from .._root_finder import all_finite
 from .._solver import AbstractSymplecticSolver, check_resolution
-from .._suggest import path_for, specified
+from .._suggest import own_path, specified
 from .._terms import (
     additive_fault,
     brownian_paths,
@@ -70,9 +70,8 @@ class Problem(eqx.Module):
             raise ValueError(
                 "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
             )
-        # The key is replaced for each sample.
-        make = lambda shape: path_for(solver, "weak", None, shape, jr.key(0))
-        terms = specified(terms, make)
+        # Each sample gets new keys, different for different ones.
+        terms = specified(terms, ft.partial(own_path, solver, "weak"))
         saved_steps, num_steps = _steps(t0, t1, dt0, ts)
         if callable(y0):
             raise ValueError(
