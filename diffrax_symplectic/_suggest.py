@@ -60,8 +60,8 @@ from ._terms import (
 # The most that a higher order may cost: with steps of a twentieth, a step of order 2 is
 # worth about twenty of order 1.
 _MOST_STAGE_VECTORS = 20
-# The first seed for paths made from shapes, if the terms hold other paths, too: no shape may
-# get the key of such a path.
+# The first seed for paths made from shapes, if the terms hold other paths, too, whose keys
+# must differ.
 _SEED = 0x5EED0000
 
 
@@ -330,8 +330,8 @@ def own_path(
 def common_path(
     solver: diffrax.AbstractSolver, cell: float | None, shape, key
 ) -> diffrax.AbstractBrownianPath:
-    """A Gaussian path with the Lévy areas that the solver needs. With `cell` all solvers get
-    the same Brownian motion."""
+    """A Gaussian path with the Lévy areas that the solver needs. With `cell` it is the same
+    Brownian motion for all solvers."""
     area = diffrax.SpaceTimeLevyArea
     path = FixedStepBrownianPath(shape, key, levy_area=area, cell=cell)
     needs = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)

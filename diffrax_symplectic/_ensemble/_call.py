@@ -146,7 +146,7 @@ def ensemble(
     saved = np.asarray(problem.levels.saved_steps[0])
     at = float(problem.t0) + saved * float(problem.levels.h[0])
     _warn_of(joined, engine)
-    return Ensemble(at, *joined, engine, terms, key)
+    return Ensemble(at, *joined, engine, problem.terms, key)
 
 
 def _default_size(engine: str, problem: Problem) -> int:

@@ -99,7 +99,8 @@ def by_drjit(
     return Batch(y, failed, len(which))
 
 
-@ft.lru_cache(maxsize=128)
+# A kernel keeps what the user's functions capture.
+@ft.lru_cache(maxsize=8)
 def _kernels(layout: Any) -> Kernels:
     return Kernels(layout)
 

@@ -177,7 +177,8 @@ class Expectation(eqx.Module):
         return dataclasses.replace(self, moments=joined(parts), tol_reached=None)
 
     def check_same(self, other: "Expectation", name: str) -> None:
-        """Raises a `ValueError` if the estimates have different keys or shapes."""
+        """Raises a `ValueError` if the estimates have different keys, shapes or numbers of
+        paths in a sample."""
         if not np.array_equal(self.key_data, other.key_data):
             raise ValueError(
                 f"{name} has another `key`. Pass the same `key` for all parts of an "
@@ -188,6 +189,13 @@ class Expectation(eqx.Module):
             raise ValueError(
                 f"{name} has another structure or other shapes. Pass one from the same "
                 "function, times and levels."
+            )
+        sizes = self.paths_per_sample, other.paths_per_sample
+        if sizes[0] != sizes[1]:
+            raise ValueError(
+                f"{name} was sampled otherwise: a sample is a mean over {sizes[0]:,} paths "
+                f"in one of the estimates, and over {sizes[1]:,} in the other. Pass the "
+                "same `sampling` for all parts of an estimate."
             )
 
     def save(self, file: str | Path | BinaryIO) -> None:

@@ -18,7 +18,8 @@ _SAMPLE = 256
 _BLOCK = 6
 
 
-@ft.lru_cache(maxsize=8)
+# A set may take a gigabyte.
+@ft.lru_cache(maxsize=1)
 def sobol_points(num_points: int, dimension: int) -> np.ndarray:
     r"""The first points of the Sobol' sequence, as 32-bit words. `num_points` is a power of
     two.

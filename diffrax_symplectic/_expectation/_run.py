@@ -18,7 +18,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._arguments import whole_number
-from .._brownian import check_key
+from .._brownian import check_key, typed_key
 from ._estimate import Expectation, ExpectationInterrupted
 from ._moments import joined, Moments, total
 from ._sampling import Plan
@@ -63,7 +63,6 @@ def checked_call(
         raise ValueError(
             f"`start` must be what `{user}` returned, or `None`; got {start!r}."
         )
-    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     devices = jax.devices() if devices is None else devices
     is_device = lambda x: isinstance(x, jax.Device)
     if not isinstance(devices, Sequence) or not all(map(is_device, devices)):
@@ -71,8 +70,7 @@ def checked_call(
             "`devices` must be a list of devices, such as `jax.devices()[:1]`, or `None`; "
             f"got {devices!r}."
         )
-    devices = tuple(devices)
-    return key if typed else jr.wrap_key_data(key), begin, devices
+    return typed_key(key), begin, tuple(devices)
 
 
 class Meter:

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
@@ -353,8 +354,10 @@ def test_results_within_phi_are_refused():
         )
         return sol.ys[0][-1], sol.ys[1][-1], sol.result
 
-    with pytest.raises(ValueError, match=r"Return a pair `\(phi, sol.result\)`"):
-        ds.monte_carlo(fn, key=jr.key(0), num_paths=10)
+    of_root = lambda key: (jr.normal(key), optx.RESULTS.successful)
+    for wrong in (fn, of_root):
+        with pytest.raises(ValueError, match=r"Return a pair `\(phi, sol.result\)`"):
+            ds.monte_carlo(wrong, key=jr.key(0), num_paths=10)
 
 
 def test_without_any_success_there_is_no_mean_and_it_can_go_on():

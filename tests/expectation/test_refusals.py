@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._brownian import is_random
+from diffrax_symplectic._expectation._monte_carlo import path_keys, with_keys
 
 from ..solver.test_times_and_paths import RECORD
 
@@ -54,6 +56,16 @@ def test_random_noise_of_a_path_of_ones_own_has_one():
     theirs = _mean(ds.FixedStepBrownianPath((), jr.key(0)), ds.IndependentPaths(4000))
     error = np.hypot(estimate.std_error, theirs.std_error)
     assert 0 < estimate.std_error and abs(estimate.mean - theirs.mean) <= 4 * error
+
+
+def test_only_the_key_of_a_path_is_replaced():
+    key, old, table = jr.key(0), jr.PRNGKey(0), jnp.arange(5, dtype=jnp.uint32)
+    path = Kicks((key, {"table": table, "old": old}))
+    assert not is_random(Kicks(table)) and is_random(Kicks(old))
+    new = with_keys(path, path_keys(path, jr.key(1))).key
+    assert new[1]["table"] is table
+    np.testing.assert_array_equal(jr.key_data(new[0]), new[1]["old"])
+    assert not np.array_equal(new[1]["old"], old)
 
 
 def test_arguments_of_other_solves_lead_to_monte_carlo():
