@@ -329,14 +329,14 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         return sharded(dynamic, lo_hi, left)
     except ValueError as error:
         # The loop of Diffrax's default adjoint rejects arrays that vary between devices.
-        if "Closure-converted function" not in str(error):
-            raise
-        raise ValueError(
-            "Reverse mode through `diffrax.RecursiveCheckpointAdjoint`, the default of "
-            "`diffeqsolve`, does not work on several devices. Pass `adjoint="
-            "diffrax_symplectic.ReversingAdjoint()` or `adjoint=diffrax.DirectAdjoint()` "
-            "to `diffeqsolve`, or `devices=jax.devices()[:1]` to `monte_carlo`."
-        ) from error
+        if "Closure-converted function" in str(error):
+            error.add_note(
+                "Reverse mode through `diffrax.RecursiveCheckpointAdjoint`, the default of "
+                "`diffeqsolve`, does not work on several devices. Pass `adjoint=diffrax_"
+                "symplectic.ReversingAdjoint()` or `adjoint=diffrax.DirectAdjoint()` to "
+                "`diffeqsolve`, or `devices=jax.devices()[:1]` to `monte_carlo`."
+            )
+        raise
 
 
 def _spread(x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]):

@@ -319,24 +319,18 @@ def _check_cells(terms, t0, h: float) -> None:
             )
 
 
-# Errors from a function of spins or amplitudes that gets a pair instead.
-_NOT_OF_A_PAIR = (TypeError, AttributeError, IndexError)
-
-
 def _shape_of(phi: Callable, terms, t0, y0: Y, args: Args) -> PyTree:
     """The shape of `phi`'s result. Errors explain which state `phi` gets."""
     once = lambda t, y, args: evaluated("phi", phi, t, y, args=args)
     try:
         return eqx.filter_eval_shape(once, t0, y0, args)
-    except _NOT_OF_A_PAIR as error:
-        if not has_lifted(terms):
-            raise
-        kind = next(kind for kind in _NOT_OF_A_PAIR if isinstance(error, kind))
-        raise kind(
-            "For spins and complex amplitudes `phi(t, y, args)` gets the pair `(p, q)`: "
-            "call `from_spinors(y)` or `from_pair(y)` in it. "
-            f"{error}"
-        ) from error
+    except (TypeError, AttributeError, IndexError) as error:
+        if has_lifted(terms):
+            error.add_note(
+                "For spins and complex amplitudes `phi(t, y, args)` gets the pair "
+                "`(p, q)`: call `from_spinors(y)` or `from_pair(y)` in it."
+            )
+        raise
 
 
 def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations levels"]:
