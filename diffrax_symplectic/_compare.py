@@ -17,7 +17,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree
 
-from ._arguments import check_solver, check_takes, shapes
+from ._arguments import check_real, check_solver, check_takes, shapes
 from ._custom_types import Args, RealScalarLike, Y
 from ._suggest import (
     common_path,
@@ -265,7 +265,9 @@ def _check_solvers(solvers, reference) -> None:
 def _check_scalar(phi, t: RealScalarLike, y0: Y, args: Args) -> None:
     check_takes("phi", phi, "t", "y", "args")
     out = eqx.filter_eval_shape(phi, jnp.asarray(t, float), y0, args)
-    if [jnp.shape(leaf) for leaf in jtu.tree_leaves(out)] != [()]:
+    leaves = jtu.tree_leaves(out)
+    check_real("phi", leaves)
+    if [*map(jnp.shape, leaves)] != [()]:
         raise ValueError(f"`phi` must return one number; got shape {shapes(out)}.")
 
 

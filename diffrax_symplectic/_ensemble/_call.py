@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, PRNGKeyArray, PyTree
 from .._arguments import whole_number
 from .._custom_types import Args, Y
 from .._expectation._monte_carlo import path_keys, with_keys
+from .._expectation._problem import Problem
 from .._expectation._run import checked_call
-from .._expectation._steps import Problem
 from ._engines import Batch, ENGINES, state_itself
 from ._layout import sample_key
 

@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt32
 
-from .._arguments import check_takes, whole_number
+from .._arguments import check_real, check_takes, whole_number
 from .._brownian import (
     AbstractStepwisePath,
     GivenPath,
@@ -26,16 +26,10 @@ from .._custom_types import Y
 from .._terms import brownian_paths, path_numbers, replace_paths
 from ._fits import Functions
 from ._points import hilbert_order, num_seeds, randomized, sobol_points
+from ._problem import numbers, Problem
 from ._run import run
 from ._sampling import AbstractSampling, Plan, ROUNDING, Samples
-from ._steps import (
-    along,
-    check_real,
-    independent_steps,
-    numbers,
-    Problem,
-    simulate,
-)
+from ._steps import along, independent_steps, simulate
 from ._value_functions import value_function
 
 

@@ -13,9 +13,9 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 from .._custom_types import Args, RealScalarLike, Y
 from ._choose import choose, MOST
 from ._estimate import Expectation, ExpectationInterrupted
+from ._problem import Problem
 from ._run import checked_call, Meter, NO_METER, run
 from ._sampling import AbstractSampling
-from ._steps import Problem
 
 
 # No sample's key is folded from this number.
@@ -153,7 +153,7 @@ def expectation(
             "function of a random key and average it with `monte_carlo`."
         )
     given = terms, t0, t1, dt0, y0, args, ts
-    key, begin, devices = checked_call(
+    key, first, devices = checked_call(
         "expectation", key, tol, start, first, devices, given
     )
     if engine not in (None, "jax", "drjit"):
@@ -185,7 +185,7 @@ def expectation(
             # Without `tol` the number of samples stays as it was.
             used = start.moments[-1].end - start.moments[0].begin
             plan = plan._replace(num_samples=used)
-        estimate = run(plan, key, devices, sampling, begin, tol, meter)
+        estimate = run(plan, key, devices, sampling, start, first, tol, meter)
     _warn_of_rounding(estimate, problem)
     return estimate
 

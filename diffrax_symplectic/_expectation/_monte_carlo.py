@@ -12,15 +12,17 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
-from .._arguments import check_takes, whole_number
+from .._arguments import check_real, check_takes, whole_number
 from .._brownian import is_key, typed_key
 from .._root_finder import all_finite
 from .._terms import brownian_paths, replace_paths
 from ._estimate import Expectation
+from ._moments import level_weights
 from ._polynomials import tensordot
+from ._problem import Problem
 from ._run import checked_call, Meter, NO_METER, run
 from ._sampling import AbstractSampling, Plan, real, Samples
-from ._steps import independent_steps, level_weights, Problem, simulate
+from ._steps import independent_steps, simulate
 
 
 class IndependentPaths(AbstractSampling):
@@ -163,7 +165,7 @@ def monte_carlo(
     without `order`, or if $\phi$ contains a `diffrax.RESULTS`. Warns if all samples are
     equal, as they are if `fn` does not use its key.
     """
-    key, begin, devices = checked_call("monte_carlo", key, tol, start, first, devices)
+    key, first, devices = checked_call("monte_carlo", key, tol, start, first, devices)
     levels = whole_number("levels", levels)
     if levels > 1 and order is None:
         raise ValueError(
@@ -176,7 +178,7 @@ def monte_carlo(
     sampler = jtu.Partial(_of_function, fn, level_weights(order, levels))
     plan = sampling.plan(sampler, devices)
     with Meter(progress_meter) as meter:
-        return run(plan, key, devices, sampling, begin, tol, meter)
+        return run(plan, key, devices, sampling, start, first, tol, meter)
 
 
 def _of_function(fn: Callable, weights: np.ndarray, keys: PRNGKeyArray) -> Samples:
@@ -204,12 +206,6 @@ def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
             "`fn` returns a result of a solve within phi, where it would be averaged. "
             "Return a pair `(phi, sol.result)`, so that failed paths are excluded."
         )
+    check_real("fn", jtu.tree_leaves(out))
     out = jtu.tree_map(lambda x: jnp.asarray(x, real(jnp.result_type(x))), out)
-    if len(jtu.tree_leaves(out)) == 0:
-        raise ValueError(f"`fn` must return arrays to average; got {out!r}.")
-    if any(map(jnp.iscomplexobj, jtu.tree_leaves(out))):
-        raise ValueError(
-            "`fn` must return real arrays; got complex arrays. Return their real and "
-            "imaginary parts."
-        )
     return out, success & all_finite(out)

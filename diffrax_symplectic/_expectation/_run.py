@@ -4,7 +4,7 @@ import collections
 import dataclasses
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -32,18 +32,11 @@ _HEAVY = 0.35
 NO_METER = diffrax.NoProgressMeter()
 
 
-class Begin(NamedTuple):
-    """An estimate to continue, or the number of the first sample."""
-
-    start: Expectation | None = None
-    first: int = 0
-
-
 def checked_call(
     user: str, key, tol, start, first, devices: Sequence[Any] | None, *others: Any
-) -> tuple[PRNGKeyArray, Begin, tuple]:
-    """The key as a typed key, where to begin, and the devices. Raises a `ValueError` for
-    invalid arguments, and if any array is traced."""
+) -> tuple[PRNGKeyArray, int, tuple]:
+    """The key as a typed key, the number of the first sample, and the devices. Raises a
+    `ValueError` for invalid arguments, and if any array is traced."""
     if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((key, others))):
         raise ValueError(
             f"`{user}` cannot run inside JAX transformations, because the number of "
@@ -55,7 +48,7 @@ def checked_call(
         raise ValueError(
             "Pass either `start`, which continues after its last sample, or `first`."
         )
-    begin = Begin(start, whole_number("first", first, 0))
+    first = whole_number("first", first, 0)
     is_number = isinstance(tol, int | float | np.number)
     if tol is not None and not (is_number and 0 < tol < np.inf):
         raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")
@@ -70,7 +63,7 @@ def checked_call(
             "`devices` must be a list of devices, such as `jax.devices()[:1]`, or `None`; "
             f"got {devices!r}."
         )
-    return typed_key(key), begin, tuple(devices)
+    return typed_key(key), first, tuple(devices)
 
 
 class Meter:
@@ -94,27 +87,29 @@ def run(
     key: PRNGKeyArray,
     devices: tuple,
     sampling: Any = None,
-    begin: Begin = Begin(),  # noqa: B008 (it does not change)
+    start: Expectation | None = None,
+    first: int = 0,
     tol: float | None = None,
     meter: Meter | None = None,
 ) -> Expectation:
-    """The estimate from the samples of a plan. Without a meter it is a trial, without
-    warnings. The result does not depend on the number of devices."""
-    first, at = begin.first, begin.first
-    if begin.start is not None:
-        first, at = begin.start.moments[0].begin, begin.start.moments[-1].end
+    """The estimate from the samples of a plan, which continues `start`, or begins with
+    sample number `first`. Without a meter it is a trial, without warnings. The result does
+    not depend on the number of devices."""
+    at = first
+    if start is not None:
+        first, at = start.moments[0].begin, start.moments[-1].end
     most, batches = first + plan.num_samples, _Batches(plan, key, devices)
     none = batches.nothing(at, most)
     about = plan.roundings, sampling, plan.reason, None, plan.far
     estimate = Expectation((none,), batches.key_data, plan.paths, *about)
-    if begin.start is not None:
-        begin.start.check_same(estimate, "`start`")
+    if start is not None:
+        start.check_same(estimate, "`start`")
         if at > most:
             raise ValueError(
                 "The number of paths (or replicates) includes `start`, which has "
                 f"{at - first} already; got {plan.num_samples}. Pass a larger number."
             )
-        estimate = dataclasses.replace(estimate, moments=begin.start.moments)
+        estimate = dataclasses.replace(estimate, moments=start.moments)
     reached = lambda: _reached(estimate, plan.least, tol)
     running, done = collections.deque(), at
     try:
@@ -307,7 +302,7 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         wanted = index < left
         good, failed = samples.good & wanted, jnp.where(wanted, samples.lost, 0)
         leaves, treedef = jtu.tree_flatten(samples.values)
-        each = [_spread(x, good) for x in leaves]
+        each = [_moments_of_batch(x, good) for x in leaves]
         return jnp.sum(good), jnp.sum(failed), *map(treedef.unflatten, zip(*each))
 
     if mesh.size == 1:
@@ -339,7 +334,9 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         raise
 
 
-def _spread(x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]):
+def _moments_of_batch(
+    x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]
+):
     """For the good samples: the mean, its rounding error, the root of the sum of squared
     deviations from the exact mean, the largest deviation, and the largest absolute value.
     """

@@ -239,7 +239,9 @@ def test_complex_values_are_refused():
 
 
 def test_functions_that_return_nothing_are_refused():
-    with pytest.raises(ValueError, match="`fn` must return arrays"):
+    with pytest.raises(
+        ValueError, match="`fn` must return real arrays; it returned none"
+    ):
         ds.monte_carlo(lambda key: None, key=jr.key(0), num_paths=10)
 
 

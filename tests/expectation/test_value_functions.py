@@ -19,7 +19,7 @@ from diffrax_symplectic._expectation._polynomials import (
     hermite,
     least_squares,
 )
-from diffrax_symplectic._expectation._steps import Problem
+from diffrax_symplectic._expectation._problem import Problem
 from diffrax_symplectic._expectation._value_functions import _basis
 from diffrax_symplectic._terms import outcomes, step_variables
 
