@@ -10,12 +10,13 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
-from .._custom_types import Args, RealScalarLike, Y
-from ._choose import choose, MOST
-from ._estimate import Expectation, ExpectationInterrupted
-from ._problem import Problem
-from ._run import checked_call, Meter, NO_METER, run
-from ._sampling import AbstractSampling
+from ._custom_types import Args, RealScalarLike, Y
+from ._ensemble import fused_plan
+from ._expectation import Expectation, ExpectationInterrupted
+from ._expectation._choose import choose, MOST
+from ._expectation._problem import Problem
+from ._expectation._run import checked_call, Meter, NO_METER, run
+from ._expectation._sampling import AbstractSampling
 
 
 # No sample's key is folded from this number.
@@ -168,10 +169,6 @@ def expectation(
     with Meter(progress_meter) as meter:
         try:
             if engine == "drjit":
-                from .._ensemble import (
-                    fused_plan,
-                )  # It imports from this folder.
-
                 plan = fused_plan(problem, key, sampling, devices)
             else:
                 plan = sampling.prepare(problem, jr.fold_in(key, _NO_SAMPLE), devices)
