@@ -183,7 +183,9 @@ def suggest_solver(
         solvers = [solver for solver in solvers if not areas(solver)]
     given = [path for path in paths if not is_random(path)]
     solvers = [s for s in solvers if all(_holds(path, s) for path in given)]
-    found = tuple(_suggestion(solver, want, terms, commute) for solver in solvers)
+    numbers = path_numbers(random_paths(terms))
+    with_new = lambda make: jtu.Partial(ft.partial(with_paths, make, numbers), terms)
+    found = tuple(_suggestion(s, want, terms, commute, with_new) for s in solvers)
     noises = "one noise"
     if m > 1:
         noises = f"{m} noises that {'commute' if commute else 'do not commute'}"
@@ -290,6 +292,7 @@ def _suggestion(
     want: Want,
     terms: diffrax.AbstractTerm,
     commute: bool,
+    with_new: Callable,
 ) -> Suggestion:
     record = _record(solver)
     random = random_paths(terms)
@@ -297,14 +300,13 @@ def _suggestion(
     if random:
         shape = _shape_code(increment_struct(random[0]))
         code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
-    make = ft.partial(solver.path, want=want)
     return Suggestion(
         solver=solver,
         weak_order=cast(int, record.order("weak", commute)),
         strong_order=record.order("strong", commute),
         path=code,
         reason=record.choose,
-        terms=jtu.Partial(ft.partial(with_paths, make, path_numbers(random)), terms),
+        terms=with_new(ft.partial(solver.path, want=want)),
     )
 
 

@@ -153,7 +153,7 @@ def _one_product(term, struct, number, increment, args: Args, t, y: Y) -> Y:
         matrix = term.vf(t, y, args)
         # A single array of noises, not a Lineax operator or another PyTree.
         one_array = eqx.is_array(matrix) and isinstance(struct, jax.ShapeDtypeStruct)
-        if one_array and () != matrix.shape[-1:] == struct.shape:
+        if one_array and matrix.ndim > 0 and matrix.shape[-1:] == struct.shape:
             return matrix[..., number] * increment.astype(matrix.dtype)
     flat, unravel = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, struct))
     only = flat.at[number].set(increment.astype(flat.dtype))
