@@ -96,9 +96,9 @@ def expectation(
     - `phi`: maps time, state and `args` to a PyTree of real arrays.
     - `terms`, `solver`, `t0`, `t1`, `dt0`, `y0`, `args`: as for `diffrax.diffeqsolve`,
         with `t1 - t0` a whole number of steps `dt0`. `terms` may have a shape in place of
-        a path; the solver then chooses the path. Paths determine the random variables, and
-        paths with equal keys are one Brownian motion. `solver` is any solver of this
-        package, or a Stratonovich solver of Diffrax with fixed steps.
+        a path; the solver then chooses the path. Paths determine the random variables.
+        Paths with equal keys are one Brownian motion; each shape is another. `solver` is
+        any solver of this package, or a Stratonovich solver of Diffrax with fixed steps.
     - `key`: a JAX random key.
     - `sampling`: an [`diffrax_symplectic.IndependentPaths`][],
         [`diffrax_symplectic.ArrayRQMC`][] or [`diffrax_symplectic.ValueFunctions`][].
