@@ -32,10 +32,10 @@ from ._conditions import (
     weak_order_residuals as weak_order_residuals,
 )
 from ._ensemble import Ensemble as Ensemble, ensemble as ensemble
+from ._expect import expectation as expectation
 from ._expectation import (
     ArrayRQMC as ArrayRQMC,
     Expectation as Expectation,
-    expectation as expectation,
     ExpectationInterrupted as ExpectationInterrupted,
     IndependentPaths as IndependentPaths,
     monte_carlo as monte_carlo,

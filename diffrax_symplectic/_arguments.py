@@ -66,6 +66,18 @@ def whole_number(name: str, value: Any, least: int = 1) -> int:
     return int(value)
 
 
+def check_real(name: str, leaves: list) -> None:
+    if len(leaves) == 0:
+        raise ValueError(f"`{name}` must return real arrays; it returned none.")
+    kinds = jnp.floating, jnp.integer, jnp.bool_
+    dtypes = [getattr(s, "dtype", type(s)) for s in leaves]
+    if not all(any(jnp.issubdtype(d, k) for k in kinds) for d in dtypes):
+        raise ValueError(
+            f"`{name}` must return real arrays; got dtypes {[str(d) for d in dtypes]}. "
+            "For complex numbers return their real and imaginary parts."
+        )
+
+
 def real_array(name: str, value: Any, *, positive: bool, kind: str) -> ArrayLike:
     """Raises a `ValueError` unless this is a real number or array that is finite and
     positive (or not negative), as far as its values are known while tracing."""

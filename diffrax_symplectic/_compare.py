@@ -17,10 +17,16 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree
 
-from ._arguments import check_solver, check_takes, shapes
+from ._arguments import check_real, check_solver, check_takes, shapes
 from ._custom_types import Args, RealScalarLike, Y
-from ._suggest import path_for, suggest_solver, with_paths
-from ._terms import check_stratonovich
+from ._suggest import (
+    common_path,
+    own_path,
+    random_paths,
+    suggest_solver,
+    with_paths,
+)
+from ._terms import check_stratonovich, path_numbers
 
 
 # The results of a batch of paths, and which paths succeeded.
@@ -165,15 +171,15 @@ def compare_solvers(
         _check_scalar(phi, t1, y0, args)
     problem = _Problem(terms, t0, t1, y0, args, phi)
     cell = min(dts) / _FINER
-    own_path = lambda solver: ft.partial(path_for, solver, want, None)
+    own_of = lambda solver: ft.partial(own_path, solver, want)
     # Strong errors need a common Brownian motion, which not all solvers can use.
-    common = lambda solver: ft.partial(path_for, solver, None, cell)
-    error_path = common if phi is None else own_path
+    common = lambda solver: ft.partial(common_path, solver, cell)
+    error_path = common if phi is None else own_of
     keys = lambda number: jr.split(jr.fold_in(key, number), num_paths)
     fine = problem.batch(reference, error_path(reference))(keys(0), jnp.asarray(cell))
     steps, refused = [], {}
     for solver in solvers:
-        name, own = repr(solver), problem.batch(solver, own_path(solver))
+        name, own = repr(solver), problem.batch(solver, own_of(solver))
         compared = problem.batch(solver, common(solver)) if phi is None else own
         try:
             eqx.filter_eval_shape(compared, keys(0), jnp.asarray(dts[0]))
@@ -204,11 +210,12 @@ class _Problem(NamedTuple):
     def batch(self, solver: diffrax.AbstractSolver, make_path: Callable) -> Callable:
         """The results of paths as a function of their keys and the step size."""
         terms, t0, t1, y0, args, phi = self
+        numbers = path_numbers(random_paths(terms))
 
         @eqx.filter_jit
         @ft.partial(jax.vmap, in_axes=(0, None))
         def results(key, dt):
-            own = with_paths(make_path, terms, key)
+            own = with_paths(make_path, numbers, terms, key)
             check_stratonovich(own, solver, t0, y0, args)
             sol = diffrax.diffeqsolve(
                 own, solver, t0, t1, dt, y0, args, max_steps=None,
@@ -258,7 +265,9 @@ def _check_solvers(solvers, reference) -> None:
 def _check_scalar(phi, t: RealScalarLike, y0: Y, args: Args) -> None:
     check_takes("phi", phi, "t", "y", "args")
     out = eqx.filter_eval_shape(phi, jnp.asarray(t, float), y0, args)
-    if [jnp.shape(leaf) for leaf in jtu.tree_leaves(out)] != [()]:
+    leaves = jtu.tree_leaves(out)
+    check_real("phi", leaves)
+    if [*map(jnp.shape, leaves)] != [()]:
         raise ValueError(f"`phi` must return one number; got shape {shapes(out)}.")
 
 

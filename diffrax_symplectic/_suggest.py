@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools as ft
+import itertools
 import textwrap
 from collections.abc import Callable, Collection, Sequence
 from typing import cast, get_args
@@ -48,6 +49,7 @@ from ._terms import (
     FRICTION,
     is_hamiltonian,
     number_of_noises,
+    path_numbers,
     replace_paths,
     separable_fault,
     split_terms,
@@ -58,6 +60,9 @@ from ._terms import (
 # The most that a higher order may cost: with steps of a twentieth, a step of order 2 is
 # worth about twenty of order 1.
 _MOST_STAGE_VECTORS = 20
+# The first seed for paths made from shapes, if the terms hold other paths, too, whose keys
+# must differ.
+_SEED = 0x5EED0000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +156,7 @@ def suggest_solver(
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
     # Any path serves to inspect the terms.
-    terms = specified(terms, lambda shape: WeakBrownianPath(shape, jr.key(0)))
+    terms = specified(terms, WeakBrownianPath)
     drift, noise = _parts(terms)
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
@@ -178,7 +183,9 @@ def suggest_solver(
         solvers = [solver for solver in solvers if not areas(solver)]
     given = [path for path in paths if not is_random(path)]
     solvers = [s for s in solvers if all(_holds(path, s) for path in given)]
-    found = tuple(_suggestion(solver, want, terms, commute) for solver in solvers)
+    numbers = path_numbers(random_paths(terms))
+    with_new = lambda make: jtu.Partial(ft.partial(with_paths, make, numbers), terms)
+    found = tuple(_suggestion(s, want, terms, commute, with_new) for s in solvers)
     noises = "one noise"
     if m > 1:
         noises = f"{m} noises that {'commute' if commute else 'do not commute'}"
@@ -285,9 +292,10 @@ def _suggestion(
     want: Want,
     terms: diffrax.AbstractTerm,
     commute: bool,
+    with_new: Callable,
 ) -> Suggestion:
     record = _record(solver)
-    random = [path for path in brownian_paths(terms) if is_random(path)]
+    random = random_paths(terms)
     code = "the path of the terms, which holds given noise"
     if random:
         shape = _shape_code(increment_struct(random[0]))
@@ -298,24 +306,34 @@ def _suggestion(
         strong_order=record.order("strong", commute),
         path=code,
         reason=record.choose,
-        terms=jtu.Partial(with_paths, ft.partial(solver.path, want=want), terms),
+        terms=with_new(ft.partial(solver.path, want=want)),
     )
 
 
 def specified(terms: PyTree, make: Callable) -> PyTree:
-    """The terms with `make(shape)` in place of the shape of a path."""
+    """The terms with `make(shape, key)` in place of each shape of a path. The keys differ:
+    each shape is a Brownian motion of its own."""
     is_shape = lambda path: isinstance(path, UnspecifiedPath)
-    return replace_paths(terms, lambda x: make(x.shape) if is_shape(x) else x)
+    seeds = itertools.count(0 if all(map(is_shape, brownian_paths(terms))) else _SEED)
+    made = lambda shape: make(shape, jr.key(next(seeds)))
+    return replace_paths(terms, lambda x: made(x.shape) if is_shape(x) else x)
 
 
-def path_for(
-    solver: diffrax.AbstractSolver, want: Want | None, cell: float | None, shape, key
+def own_path(
+    solver: diffrax.AbstractSolver, want: Want, shape, key
 ) -> diffrax.AbstractBrownianPath:
-    """The path of a solver of this package. For other solvers, or if `want` is `None`, a
-    Gaussian path with the Lévy areas that the solver needs. With `cell` all solvers get the
-    same Brownian motion."""
-    if want is not None and isinstance(solver, AbstractSymplecticSolver):
-        return solver.path(shape, key, want=want)
+    """The path of a solver of this package, or else a Gaussian path."""
+    # `isinstance` would look through a `diffrax.HalfSolver`.
+    if issubclass(type(solver), AbstractSymplecticSolver):
+        return cast(AbstractSymplecticSolver, solver).path(shape, key, want=want)
+    return common_path(solver, None, shape, key)
+
+
+def common_path(
+    solver: diffrax.AbstractSolver, cell: float | None, shape, key
+) -> diffrax.AbstractBrownianPath:
+    """A Gaussian path with the Lévy areas that the solver needs. With `cell` it is the same
+    Brownian motion for all solvers."""
     area = diffrax.SpaceTimeLevyArea
     path = FixedStepBrownianPath(shape, key, levy_area=area, cell=cell)
     needs = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
@@ -327,19 +345,23 @@ def path_for(
     return path
 
 
-def with_paths(make: Callable, terms: PyTree, key: PRNGKeyArray) -> PyTree:
-    """The terms with new paths. Terms that share a path share the new one. Paths of given
-    noise are not replaced."""
-    made = {}
+def random_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
+    return [path for path in brownian_paths(terms) if is_random(path)]
+
+
+def with_paths(
+    make: Callable, numbers: tuple[int, ...], terms: PyTree, key: PRNGKeyArray
+) -> PyTree:
+    """The terms with new paths, made from a shape and a key. `numbers` are the
+    `path_numbers` of their random paths; others are not replaced."""
+    left = iter(numbers)
 
     def new(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
         if not is_random(path):
             return path
-        if id(path) not in made:
-            number = len(made)
-            own = key if number == 0 else jr.fold_in(key, number + 1)
-            made[id(path)] = make(increment_struct(path), own)
-        return made[id(path)]
+        number = next(left)
+        own = key if number == 0 else jr.fold_in(key, number + 1)
+        return make(increment_struct(path), own)
 
     return replace_paths(terms, new)
 

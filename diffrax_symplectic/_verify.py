@@ -4,7 +4,6 @@ import functools as ft
 from collections.abc import Callable
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -21,10 +20,10 @@ from ._terms import (
     from_spinors,
     number_of_noises,
     outcomes,
+    rate,
     split_terms,
     step_variables,
     to_spinors,
-    tree_sum,
 )
 
 
@@ -224,10 +223,7 @@ def _average(outcome: Callable, terms, h, nodes: int) -> PyTree[Array]:
     laws, terms_with = step_variables(terms, h)
     variables, weights = outcomes(laws, nodes)
     values, result = jax.vmap(lambda x: outcome(terms_with(x)))(variables)
-    failed = jnp.any(result != diffrax.RESULTS.successful)
-    values = eqx.error_if(
-        values, failed, "A step failed: its stage equations could not be solved."
-    )
+    values = result.error_if(values, result != diffrax.RESULTS.successful)
     return jtu.tree_map(
         lambda v: jnp.tensordot(jnp.asarray(weights, v.dtype), v, axes=1), values
     )
@@ -267,9 +263,11 @@ def weak_order_defect(
     expected = step_expectation(terms, solver, t0, t1, y0, args, fn=fn, nodes=nodes)
     L = _generator(terms, args, ito=isinstance(solver, diffrax.AbstractItoSolver))
     phi = lambda t, y: fn(t, y, args)
+    # Vector fields must have the precision of the state.
+    t = jnp.asarray(t0, jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).dtype)
     factor, defect = 1.0, expected
     for j in range(order + 1):
-        exact = phi(jnp.asarray(t0, jnp.result_type(float)), y0)
+        exact = phi(t, y0)
         defect = (defect**ω - factor * exact**ω).ω
         phi, factor = L(phi), factor * (t1 - t0) / (j + 1)
     return defect
@@ -287,7 +285,7 @@ def _generator(terms, args, ito: bool) -> Callable:
     def L(phi):
         def L_phi(t, y):
             still = jtu.tree_map(jnp.zeros_like, y)
-            velocity = tree_sum([still, *(term.vf(t, y, args) for term in drift)])
+            velocity = rate(drift, t, y, args) if drift else still
             _, total = jax.jvp(phi, (t, y), (jnp.ones_like(t), velocity))
             for b in fields:
                 frozen = b(t, y)

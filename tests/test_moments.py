@@ -185,6 +185,36 @@ def test_quadrature_over_gaussian_increments_is_exact_for_polynomials():
     assert abs(squared(2) - exact) > 1e-4
 
 
+def test_the_local_error_counts_the_control_of_the_drift():
+    # Heun's method for dy = y d(2 t), without noise: (1 + 2 h + 2 h^2) y.
+    path = ds.WeakBrownianPath((), jr.key(0))
+    still = diffrax.ControlTerm(lambda t, y, args: 0 * y, path)
+    drift = diffrax.ControlTerm(lambda t, y, args: y, _Twice())
+    defect = ds.weak_order_defect(
+        diffrax.MultiTerm(drift, still), diffrax.Heun(), 0.0, 0.125, jnp.ones(()),
+        fn=lambda t, y, args: y, order=1,
+    )  # fmt: skip
+    np.testing.assert_allclose(defect, 2 * 0.125**2, rtol=1e-14)
+
+
+class _Twice(diffrax.AbstractPath):
+    t0, t1 = 0.0, jnp.inf
+
+    def evaluate(self, t0, t1=None, left=True):
+        return 2 * t0 if t1 is None else 2 * (t1 - t0)
+
+
+def test_a_failed_step_has_no_expectation_and_says_why():
+    path = ds.WeakBrownianPath((), jr.key(0))
+    H0 = lambda t, p, q, args: p**2 / 2 + args * q
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: q, path)
+    mean = lambda force: ds.step_expectation(
+        terms, ds.StormerVerlet(), 0.0, 0.1, Y0, force, fn=lambda t, y, args: y[0]
+    )
+    with pytest.raises(RuntimeError, match="Nonfinite"):
+        mean(jnp.nan)
+
+
 def test_moments_work_under_jit_and_vmap():
     path = ds.WeakBrownianPath((), jr.key(0))
     maps = lambda h: ds.second_moment_map(

@@ -1,6 +1,7 @@
 """Suggested solvers fit the system."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -9,9 +10,16 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._brownian import increment_struct
-from diffrax_symplectic._suggest import _shape_code, ranked, SOLVERS, with_paths
-from diffrax_symplectic._terms import brownian_paths
+from diffrax_symplectic._brownian import increment_struct, UnspecifiedPath
+from diffrax_symplectic._suggest import (
+    _shape_code,
+    own_path,
+    ranked,
+    SOLVERS,
+    specified,
+    with_paths,
+)
+from diffrax_symplectic._terms import brownian_paths, path_numbers
 
 
 # Pieces of Hamiltonians, by what they allow the whole to be.
@@ -248,22 +256,73 @@ def _same(a, b) -> bool:
     return bool(jnp.all(a == b))
 
 
-def test_terms_that_share_a_path_share_the_new_one():
-    path = ds.WeakBrownianPath((), jr.key(0))
-    other = ds.WeakBrownianPath((), jr.key(7))
-    noise = [diffrax.ControlTerm(lambda t, y, args: y, x) for x in (path, path, other)]
-    terms = diffrax.MultiTerm(diffrax.ODETerm(lambda t, y, args: -y), *noise)
-    for solver in (ds.ImplicitMidpoint(), ds.PlateauVerlet(), ds.LevyAreaMidpoint()):
-        made = with_paths(solver.path, terms, jr.key(1))
-        keys = [
-            {jr.key_data(x).tobytes() for x in jax.tree.leaves(path) if _is_key(x)}
-            for path in brownian_paths(made)
-        ]
-        assert keys[0] == keys[1] and keys[0].isdisjoint(keys[2])
+def _driven(*paths):
+    """Terms with one noise for each of these paths."""
+    noise = [diffrax.ControlTerm(lambda t, y, args: y, path) for path in paths]
+    return diffrax.MultiTerm(diffrax.ODETerm(lambda t, y, args: -y), *noise)
+
+
+def _keys(terms) -> list[set]:
+    """The keys of each path."""
+    keys = lambda path: filter(_is_key, jax.tree.leaves(path))
+    return [
+        {jr.key_data(x).tobytes() for x in keys(path)} for path in brownian_paths(terms)
+    ]
 
 
 def _is_key(x) -> bool:
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def test_terms_that_share_a_path_share_the_new_one():
+    path = ds.WeakBrownianPath((), jr.key(0))
+    equal = ds.WeakBrownianPath((), jr.key(0))
+    other = ds.WeakBrownianPath((), jr.key(7))
+    shared = path_numbers([path, path, equal, other, path])
+    assert shared == (0, 0, 0, 1, 0)
+    for solver in (ds.ImplicitMidpoint(), ds.PlateauVerlet(), ds.LevyAreaMidpoint()):
+        terms = _driven(path, path, equal, other)
+        keys = _keys(with_paths(solver.path, shared[:4], terms, jr.key(1)))
+        assert keys[0] == keys[1] == keys[2] and keys[0].isdisjoint(keys[3])
+
+
+def test_suggestions_share_paths_after_operations_on_their_terms():
+    path, other = (ds.WeakBrownianPath((), jr.key(i)) for i in (0, 7))
+    # No operation on PyTrees keeps the identity of a path.
+    copied = jax.tree.map(lambda x: x, _driven(path, other, path))
+    best = ds.suggest_solver(copied, 0.0, jnp.ones(()), want="weak")[0]
+    for make in (best.terms, lambda key: eqx.filter_jit(_call)(best.terms, key)):
+        first, second, third = _keys(make(jr.key(3)))
+        assert first == third and first.isdisjoint(second)
+
+
+def _call(fn, key):
+    return fn(key)
+
+
+def test_traced_paths_are_one_brownian_motion_if_they_hold_the_same_key():
+    def numbers(key, other):
+        paths = [ds.WeakBrownianPath((), x) for x in (key, other, key)]
+        traced.append(path_numbers(paths))
+        return key
+
+    traced = []
+    jax.eval_shape(numbers, jr.key(0), jr.key(0))
+    assert traced == [(0, 1, 0)]
+
+
+def test_each_shape_of_a_path_is_a_brownian_motion_of_its_own():
+    shape = UnspecifiedPath(shape=jax.ShapeDtypeStruct((), jnp.float64))
+    assert path_numbers([shape, shape]) == (0, 1)
+    for first in (shape, ds.WeakBrownianPath((), jr.key(0))):
+        keys = _keys(specified(_driven(first, shape, shape), ds.WeakBrownianPath))
+        assert len(set.union(*keys)) == 3
+
+
+def test_a_half_solver_gets_a_gaussian_path():
+    solver = diffrax.HalfSolver(ds.StormerVerlet())
+    path = own_path(solver, "weak", (), jr.key(0))
+    assert type(path) is ds.FixedStepBrownianPath
 
 
 def test_bad_input_gets_a_clear_error():

@@ -11,7 +11,8 @@ from ._stepwise import (
     UnspecifiedPath,
 )
 from ._paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
-from ._random import AbstractLaw, check_key, Discrete, random_words, THREE_POINT
+from ._random import AbstractLaw, check_key, Discrete, is_key, random_words
+from ._random import THREE_POINT, typed_key
 from ._levy_area import LevyAreaBrownianPath, LevyAreaIncrement
 from ._wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPath
 from ._variables import drives, path_of, VARIABLES

@@ -30,7 +30,12 @@ def random_words(
     """Random words for a step at `place`, in `sets` sets of `n` words each. More sets leave
     the first ones unchanged. Words for different values of `begin` are independent, so a
     path and a wrapper around it may share a key."""
-    key = _typed(key)
+    key = typed_key(key)
+    if key.ndim > 0:
+        raise ValueError(
+            "A Brownian path needs one random key; got an array of keys of shape "
+            f"{key.shape}. Use `jax.vmap` over it."
+        )
     count, exponent = place
     blocks = (sets * n + 1) // 2
     if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks <= _MOST:
@@ -69,24 +74,24 @@ def _threefry(key: UInt32[Array, "2"], a: Array, b: Array) -> tuple[Array, Array
 def check_key(key, user: str) -> None:
     """Raises a `ValueError` unless `key` is a random key (from `jax.random.key` or
     `jax.random.PRNGKey`) or an array of keys, to be used with `jax.vmap`."""
-    dtype = getattr(key, "dtype", None)
-    if dtype is None or not (
-        jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32
-    ):
+    if not is_key(key):
         raise ValueError(
             f"`{user}` needs a random key, such as `jax.random.key(0)`; got {key!r}."
         )
 
 
-def _typed(key) -> PRNGKeyArray:
-    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-    key = key if typed else jr.wrap_key_data(key)
-    if key.ndim > 0:
-        raise ValueError(
-            "A Brownian path needs one random key; got an array of keys of shape "
-            f"{key.shape}. Use `jax.vmap` over it."
-        )
-    return key
+def is_key(x) -> bool:
+    """Whether this is a random key, or an array of keys. The words of a key from
+    `jax.random.PRNGKey` are told from other integers by their number."""
+    dtype = getattr(x, "dtype", None)
+    if dtype == jnp.uint32:
+        return x.shape[-1:] == jax.eval_shape(jr.PRNGKey, 0).shape
+    return dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+
+
+def typed_key(key) -> PRNGKeyArray:
+    """The key as one from `jax.random.key`."""
+    return jr.wrap_key_data(key) if key.dtype == jnp.uint32 else key
 
 
 def place_of(t0, t1) -> Place:

@@ -16,7 +16,7 @@ from jaxtyping import Array, PRNGKeyArray, PyTree, UInt32
 
 from .._compat import nondifferentiable
 from .._custom_types import RealScalarLike
-from ._random import AbstractLaw, Gaussian, Place, place_of, random_words
+from ._random import AbstractLaw, Gaussian, is_key, Place, place_of, random_words
 
 
 if TYPE_CHECKING:
@@ -219,13 +219,6 @@ def laws_of(path: diffrax.AbstractBrownianPath) -> Mapping[str, AbstractLaw] | N
 def is_random(path: diffrax.AbstractBrownianPath) -> bool:
     """Whether a path draws its noise from a random key, instead of holding given noise such
     as a record."""
-
-    def is_key(x) -> bool:
-        if not eqx.is_array(x):
-            return False
-        typed = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-        return typed or x.dtype == jnp.uint32 and x.shape[-1:] in ((2,), (4,))
-
     return isinstance(path, UnspecifiedPath) or any(map(is_key, jtu.tree_leaves(path)))
 
 

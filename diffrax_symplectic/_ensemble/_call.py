@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, PRNGKeyArray, PyTree
 from .._arguments import whole_number
 from .._custom_types import Args, Y
 from .._expectation._monte_carlo import path_keys, with_keys
+from .._expectation._problem import Problem
 from .._expectation._run import checked_call
-from .._expectation._steps import Problem
 from ._engines import Batch, ENGINES, state_itself
 from ._layout import sample_key
 
@@ -146,7 +146,7 @@ def ensemble(
     saved = np.asarray(problem.levels.saved_steps[0])
     at = float(problem.t0) + saved * float(problem.levels.h[0])
     _warn_of(joined, engine)
-    return Ensemble(at, *joined, engine, terms, key)
+    return Ensemble(at, *joined, engine, problem.terms, key)
 
 
 def _default_size(engine: str, problem: Problem) -> int:

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Bool, PRNGKeyArray, PyTree
 
 from .._expectation._monte_carlo import path_keys, with_keys
-from .._expectation._steps import independent_steps, Problem, simulate
+from .._expectation._problem import Problem
+from .._expectation._steps import independent_steps, simulate
 from ._kernels import Kernels
 from ._layout import sample_key, split
 from ._operation import NotReplayed
@@ -99,7 +100,8 @@ def by_drjit(
     return Batch(y, failed, len(which))
 
 
-@ft.lru_cache(maxsize=128)
+# A kernel keeps what the user's functions capture.
+@ft.lru_cache(maxsize=8)
 def _kernels(layout: Any) -> Kernels:
     return Kernels(layout)
 

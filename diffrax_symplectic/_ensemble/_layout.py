@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from .._expectation._monte_carlo import path_keys, with_keys
-from .._expectation._steps import Level, Problem
+from .._expectation._problem import Level, Problem
 from ._sweeps import without_rescue
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .._expectation._monte_carlo import IndependentPaths
+from .._expectation._problem import Problem
 from .._expectation._sampling import Plan, Samples
-from .._expectation._steps import Problem
 from .._root_finder import all_finite
 from ._engines import by_drjit, state_itself
 

@@ -17,7 +17,6 @@ class Replay:
 
     def __init__(self, module: Any):
         self._module = module  # It owns the operations.
-        self._errors: list[Any] = []
         functions = [
             f for f in module.body.operations if f.operation.name == "func.func"
         ]
@@ -42,34 +41,38 @@ class Replay:
 
     def __call__(self, *args: Tensor) -> tuple[list[Tensor], list[Any]]:
         """The results, and masks of the lanes that raise an error."""
-        self._errors.clear()
-        return self._call("main", args), [*self._errors]
+        errors = []
+        return self._call("main", args, errors), errors
 
-    def _call(self, name: str, args) -> list[Tensor]:
-        return self._block(self._functions[name].regions[0].blocks[0], args, ChainMap())
+    def _call(self, name: str, args, errors: list[Any]) -> list[Tensor]:
+        block = self._functions[name].regions[0].blocks[0]
+        return self._block(block, args, ChainMap(), errors)
 
-    def _block(self, block: Any, args, outer: ChainMap) -> list[Tensor]:
+    def _block(
+        self, block: Any, args, outer: ChainMap, errors: list[Any]
+    ) -> list[Tensor]:
         values = outer.new_child(dict(zip(block.arguments, args)))
         for op in block.operations:
             op = op.operation
             operands = [values[x] for x in op.operands]
             if op.name in _RETURNS:
                 return operands
-            values.update(zip(op.results, self._results(op, operands, values)))
+            results = self._results(op, operands, values, errors)
+            values.update(zip(op.results, results))
         raise AssertionError("A block ends with what it returns.")
 
     def _results(
-        self, op: Any, operands: list[Tensor], values: ChainMap
+        self, op: Any, operands: list[Tensor], values: ChainMap, errors: list[Any]
     ) -> list[Tensor]:
         if op.name == "func.call":
             try:
-                return self._call(op.attributes["callee"].value, operands)
+                return self._call(op.attributes["callee"].value, operands, errors)
             except NotReplayed as error:
                 # The location of a called function does not name its caller.
                 error.location += str(op.location)
                 raise
-        run = lambda i, args: self._block(op.regions[i].blocks[0], args, values)
-        operation = Operation(op, run, self._errors)
+        run = lambda i, args: self._block(op.regions[i].blocks[0], args, values, errors)
+        operation = Operation(op, run, errors)
         rule = rule_of(operation.name)
         if rule is None:
             raise NotReplayed(op)

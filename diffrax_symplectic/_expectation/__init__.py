@@ -1,5 +1,4 @@
 from ._array_rqmc import ArrayRQMC as ArrayRQMC
-from ._call import expectation as expectation
 from ._estimate import (
     Expectation as Expectation,
     ExpectationInterrupted as ExpectationInterrupted,

@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt32
 
-from .._arguments import check_takes, whole_number
+from .._arguments import check_real, check_takes, whole_number
 from .._brownian import (
     AbstractStepwisePath,
     GivenPath,
@@ -23,19 +23,13 @@ from .._brownian import (
     THREE_POINT,
 )
 from .._custom_types import Y
-from .._terms import brownian_paths, replace_paths
+from .._terms import brownian_paths, path_numbers, replace_paths
 from ._fits import Functions
 from ._points import hilbert_order, num_seeds, randomized, sobol_points
+from ._problem import numbers, Problem
 from ._run import run
 from ._sampling import AbstractSampling, Plan, ROUNDING, Samples
-from ._steps import (
-    along,
-    check_real,
-    independent_steps,
-    numbers,
-    Problem,
-    simulate,
-)
+from ._steps import along, independent_steps, simulate
 from ._value_functions import value_function
 
 
@@ -211,10 +205,9 @@ def layout(terms: PyTree[diffrax.AbstractTerm]) -> Layout:
     words. Raises a `ValueError` for a path whose increments cannot be computed from words.
     """
     paths = [stepwise(path) for path in brownian_paths(terms)]
-    slices, end = [], 0
-    for i, path in enumerate(paths):
-        same = [j for j in range(i) if eqx.tree_equal(paths[j], path)]
-        start = slices[same[0]][0] if same else end
+    starts, slices, end = {}, [], 0
+    for number, path in zip(path_numbers(paths), paths):
+        start = starts.setdefault(number, end)
         slices.append((start, start + path.num_words(use_levy=True)))
         end = max(end, slices[-1][1])
     sixths = end == 1 and paths[0].laws == {"W": THREE_POINT}

@@ -6,8 +6,8 @@ import numpy as np
 from ._array_rqmc import ArrayRQMC, layout
 from ._monte_carlo import IndependentPaths
 from ._noise import num_outcomes
+from ._problem import Problem
 from ._sampling import AbstractSampling
-from ._steps import Problem
 from ._value_functions import ValueFunctions
 
 

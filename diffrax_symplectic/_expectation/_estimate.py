@@ -177,7 +177,8 @@ class Expectation(eqx.Module):
         return dataclasses.replace(self, moments=joined(parts), tol_reached=None)
 
     def check_same(self, other: "Expectation", name: str) -> None:
-        """Raises a `ValueError` if the estimates have different keys or shapes."""
+        """Raises a `ValueError` if the estimates have different keys, shapes or numbers of
+        paths in a sample."""
         if not np.array_equal(self.key_data, other.key_data):
             raise ValueError(
                 f"{name} has another `key`. Pass the same `key` for all parts of an "
@@ -188,6 +189,13 @@ class Expectation(eqx.Module):
             raise ValueError(
                 f"{name} has another structure or other shapes. Pass one from the same "
                 "function, times and levels."
+            )
+        sizes = self.paths_per_sample, other.paths_per_sample
+        if sizes[0] != sizes[1]:
+            raise ValueError(
+                f"{name} was sampled otherwise: a sample is a mean over {sizes[0]:,} paths "
+                f"in one of the estimates, and over {sizes[1]:,} in the other. Pass the "
+                "same `sampling` for all parts of an estimate."
             )
 
     def save(self, file: str | Path | BinaryIO) -> None:
@@ -211,34 +219,21 @@ class Expectation(eqx.Module):
             return rebuilt(Expectation, json.loads(str(arrays["header"])), arrays)
 
     def __str__(self) -> str:
-
-        def shown(mean, error) -> str:
-            """With two digits beyond the smallest error."""
-            least = np.clip(np.min(np.nan_to_num(error), initial=1), 1e-10, 1)
-            digits = 2 - math.floor(math.log10(least))
-            mode = "fixed" if digits < 12 else "maxprec"
-            mean = np.asarray(mean)
-            return np.array2string(mean, precision=digits, threshold=6, floatmode=mode)
-
-        short: Any = {"float_kind": "{:.1e}".format}
-        brief = lambda x: np.array2string(np.asarray(x), formatter=short, threshold=6)
-        named, error = (
-            jtu.tree_leaves_with_path(self.mean),
-            jtu.tree_leaves(self.std_error),
-        )
-        names = [jtu.keystr(path) for path, _ in named] if len(named) > 1 else [""]
-        mean = [x for _, x in named]
-        leaves = lambda x: [brief(y) for y in jtu.tree_leaves(x)[:6]]
-        lines = [f"{shown(m, e)} ± {brief(e)}" for m, e in zip(mean[:6], error)]
+        leaves = jtu.tree_leaves_with_path(self.mean)
+        trees = [self.mean, self.std_error, self.error]
         if self.bias is not None:
-            whole = zip(lines, leaves(self.error))
-            lines = [f"{x} (sampling), {e} (total)" for x, e in whole]
-        lines = [f"{name}: {x}" if name else x for name, x in zip(names, lines)]
-        lines += ["..."] * (len(mean) > 6)
-        if self.bias is not None:
-            pairs = zip(leaves(self.bias), leaves(self.bias_std_error))
-            biases = ", ".join(f"{bias} ± {error}" for bias, error in pairs)
-            lines.append(f"bias of the finest step (removed): {biases}")
+            trees += [self.bias, self.bias_std_error]
+        lines, biases = [], []
+        for (path, _), *row in zip(leaves[:6], *map(jtu.tree_leaves, trees)):
+            mean, error, whole, *bias = row
+            line = f"{_with_digits(mean, error)} ± {_brief(error)}"
+            if bias:
+                line += f" (sampling), {_brief(whole)} (total)"
+                biases.append(" ± ".join(map(_brief, bias)))
+            lines.append(f"{jtu.keystr(path)}: {line}" if len(leaves) > 1 else line)
+        lines += ["..."] * (len(leaves) > 6)
+        if biases:
+            lines.append(f"bias of the finest step (removed): {', '.join(biases)}")
         elif self.sampling is not None:
             lines.append("not included: the discretization error (see `levels`)")
         how = "" if self.sampling is None else f", {self.sampling}"
@@ -278,6 +273,20 @@ class Expectation(eqx.Module):
     def _largest(self, name: str) -> float:
         each = jtu.tree_leaves(self._each(name, 0))
         return max((float(np.max(x, initial=0.0)) for x in each), default=0.0)
+
+
+def _with_digits(mean, error) -> str:
+    """The mean, with two digits beyond the smallest error."""
+    least = np.clip(np.min(np.nan_to_num(error), initial=1), 1e-10, 1)
+    digits = 2 - math.floor(math.log10(least))
+    mode = "fixed" if digits < 12 else "maxprec"
+    mean = np.asarray(mean)
+    return np.array2string(mean, precision=digits, threshold=6, floatmode=mode)
+
+
+def _brief(x) -> str:
+    short: Any = {"float_kind": "{:.1e}".format}
+    return np.array2string(np.asarray(x), formatter=short, threshold=6)
 
 
 @np.errstate(all="ignore")

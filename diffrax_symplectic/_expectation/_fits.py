@@ -14,7 +14,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .._custom_types import Y
 from ._bases import AbstractBasis
-from ._steps import Ensemble, ravel
+from ._problem import ravel
+from ._steps import Paths
 
 
 # The number of states over which second derivatives along the noise are averaged.
@@ -112,12 +113,12 @@ def _pilot(noise: Any, keys: PRNGKeyArray, y0: Array):
             x, _ = noise.draw(key, i, jnp.ones(()))
             return noise.step(i, y, noise.fresh(i, y), x)
 
-        ensemble, states = carry
-        y, _, success = jax.vmap(one)(ensemble.y, keys)
-        ensemble = ensemble.moved(p, y, None, success)
-        return ensemble, states.at[i].set(jax.vmap(ravel)(ensemble.y))
+        paths, states = carry
+        y, _, success = jax.vmap(one)(paths.y, keys)
+        paths = paths.moved(p, y, None, success)
+        return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
     states = jnp.broadcast_to(y0, (last, n, y0.size))
-    carry = Ensemble.start(p, n, None), states
-    ensemble, states = lax.fori_loop(0, noise.level.num_steps, forward, carry)
-    return states, ~ensemble.failed
+    carry = Paths.start(p, n, None), states
+    paths, states = lax.fori_loop(0, noise.level.num_steps, forward, carry)
+    return states, ~paths.failed

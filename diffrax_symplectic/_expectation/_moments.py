@@ -1,11 +1,12 @@
-"""Means and variances of batches of samples, and their combination."""
+"""Means and variances of batches of samples, their combination, and their weights in
+extrapolation."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Float, PyTree
 
 
 class Moments(NamedTuple):
@@ -77,3 +78,27 @@ def _both(a: Moments, b: Moments) -> Moments:
         trees(np.maximum, a.size, b.size),
         b.dtypes,
     )  # fmt: skip
+
+
+def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations levels"]:
+    r"""The combinations of the means with steps $h, h/2, h/4, \ldots$ that an
+    [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$. For $L$
+    levels the first eliminates the error terms in $h^p, \ldots, h^{p + L - 2}$. With
+    $L > 1$ there are two more: the finest level's mean minus the first, and the change by
+    the last extrapolation.
+
+    [Talay and Tubaro (1990)](https://doi.org/10.1080/07362999008809220) show that the error
+    has an expansion in powers of $h$.
+    """
+    best = _extrapolated(order, levels)
+    if levels == 1:
+        return best[None]
+    # The finer levels alone, which eliminate one power of the step size less.
+    before = np.append(0.0, _extrapolated(order, levels - 1))
+    return np.stack([best, np.eye(levels)[-1] - best, best - before])
+
+
+def _extrapolated(order: int, levels: int) -> Float[np.ndarray, " levels"]:
+    powers = np.array([0, *range(order, order + levels - 1)])
+    system = 2.0 ** -np.outer(powers, np.arange(levels))
+    return np.linalg.solve(system, np.eye(levels)[0])

@@ -12,14 +12,17 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
-from .._arguments import check_takes, whole_number
+from .._arguments import check_real, check_takes, whole_number
+from .._brownian import is_key, typed_key
 from .._root_finder import all_finite
 from .._terms import brownian_paths, replace_paths
 from ._estimate import Expectation
+from ._moments import level_weights
 from ._polynomials import tensordot
+from ._problem import Problem
 from ._run import checked_call, Meter, NO_METER, run
 from ._sampling import AbstractSampling, Plan, real, Samples
-from ._steps import independent_steps, level_weights, Problem, simulate
+from ._steps import independent_steps, simulate
 
 
 class IndependentPaths(AbstractSampling):
@@ -69,13 +72,12 @@ def path_keys(terms: PyTree[diffrax.AbstractTerm], key: PRNGKeyArray) -> list[Ar
     get the same new one."""
     new = []
     for x in filter(is_key, jtu.tree_leaves(brownian_paths(terms))):
-        typed = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-        words = jr.key_data(x) if typed else x
-        own = key
+        typed, own = typed_key(x), key
+        words = jr.key_data(typed)
         for word in words.reshape(-1):
             own = jr.fold_in(own, word)
         data = jr.bits(own, words.shape, jnp.uint32)
-        new.append(jr.wrap_key_data(data, impl=jr.key_impl(x)) if typed else data)
+        new.append(jr.wrap_key_data(data, impl=jr.key_impl(x)) if x is typed else data)
     return new
 
 
@@ -84,14 +86,6 @@ def with_keys(terms: PyTree[diffrax.AbstractTerm], keys: list[Array]) -> PyTree:
     left = iter(keys)
     replaced = lambda x: next(left) if is_key(x) else x
     return replace_paths(terms, lambda path: jtu.tree_map(replaced, path))
-
-
-def is_key(x) -> bool:
-    """Whether an array of a Brownian path is its random key."""
-    dtype = getattr(x, "dtype", None)
-    return dtype is not None and (
-        jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32
-    )
 
 
 def monte_carlo(
@@ -171,7 +165,7 @@ def monte_carlo(
     without `order`, or if $\phi$ contains a `diffrax.RESULTS`. Warns if all samples are
     equal, as they are if `fn` does not use its key.
     """
-    key, begin, devices = checked_call("monte_carlo", key, tol, start, first, devices)
+    key, first, devices = checked_call("monte_carlo", key, tol, start, first, devices)
     levels = whole_number("levels", levels)
     if levels > 1 and order is None:
         raise ValueError(
@@ -184,7 +178,7 @@ def monte_carlo(
     sampler = jtu.Partial(_of_function, fn, level_weights(order, levels))
     plan = sampling.plan(sampler, devices)
     with Meter(progress_meter) as meter:
-        return run(plan, key, devices, sampling, begin, tol, meter)
+        return run(plan, key, devices, sampling, start, first, tol, meter)
 
 
 def _of_function(fn: Callable, weights: np.ndarray, keys: PRNGKeyArray) -> Samples:
@@ -201,24 +195,17 @@ def _of_function(fn: Callable, weights: np.ndarray, keys: PRNGKeyArray) -> Sampl
 def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
     """The $\\phi$ that `fn` returns, and whether the path succeeded."""
     out, success = fn(key), jnp.array(True)
-    if isinstance(out, tuple) and len(out) == 2 and _is_result(out[1]):
+    is_pair = isinstance(out, tuple) and len(out) == 2
+    if is_pair and isinstance(out[1], diffrax.RESULTS):
         out, result = out
         success = diffrax.is_okay(result)
-    if any(map(_is_result, jtu.tree_leaves(out, is_leaf=_is_result))):
+    # The type of the results of all packages.
+    is_result = lambda x: isinstance(x, type(diffrax.RESULTS.successful))
+    if any(map(is_result, jtu.tree_leaves(out, is_leaf=is_result))):
         raise ValueError(
-            "`fn` returns a `diffrax.RESULTS` within phi, where it would be averaged. "
+            "`fn` returns a result of a solve within phi, where it would be averaged. "
             "Return a pair `(phi, sol.result)`, so that failed paths are excluded."
         )
+    check_real("fn", jtu.tree_leaves(out))
     out = jtu.tree_map(lambda x: jnp.asarray(x, real(jnp.result_type(x))), out)
-    if len(jtu.tree_leaves(out)) == 0:
-        raise ValueError(f"`fn` must return arrays to average; got {out!r}.")
-    if any(map(jnp.iscomplexobj, jtu.tree_leaves(out))):
-        raise ValueError(
-            "`fn` must return real arrays; got complex arrays. Return their real and "
-            "imaginary parts."
-        )
     return out, success & all_finite(out)
-
-
-def _is_result(x) -> bool:
-    return isinstance(x, type(diffrax.RESULTS.successful))

@@ -15,7 +15,7 @@ from .._brownian import Discrete, random_words
 from .._custom_types import Y
 from .._terms import outcomes, step_variables
 from ._polynomials import tensordot
-from ._steps import Level, Problem
+from ._problem import Level, Problem
 
 
 # Up to this many outcomes, a step is taken for each of them.

@@ -18,7 +18,8 @@ _SAMPLE = 256
 _BLOCK = 6
 
 
-@ft.lru_cache(maxsize=8)
+# A set may take a gigabyte.
+@ft.lru_cache(maxsize=1)
 def sobol_points(num_points: int, dimension: int) -> np.ndarray:
     r"""The first points of the Sobol' sequence, as 32-bit words. `num_points` is a power of
     two.
@@ -110,11 +111,8 @@ def _scrambled(
     points: UInt32[Array, "n d"], number: UInt32[Array, " m"], seeds
 ) -> UInt32[Array, "m d"]:
     n, d = points.shape
-    bits = np.uint32(32 - (n.bit_length() - 1))
-    # (A shift by 32 bits is undefined.)
-    number = number << min(bits, np.uint32(31))
-    number = nested_scramble(number, seeds[0]) >> min(bits, np.uint32(31))
-    number = number if n > 1 else jnp.zeros_like(number)
+    bits = np.uint32(33 - n.bit_length())
+    number = nested_scramble(number << bits, seeds[0]) >> bits
     words = nested_scramble(points[number.astype(jnp.int32)], seeds[1 : 1 + d])
     # The hash of one seed is not quite uniform; a digital shift makes it so.
     return words ^ seeds[1 + d : 1 + 2 * d]
@@ -126,8 +124,8 @@ def hilbert_order(
     """The indices of the rows of `z` in order along Hilbert's curve, with the rows marked
     `last` at the end."""
     n, d = z.shape
-    index_bits = max(1, (n - 1).bit_length())
-    if jax.dtypes.canonicalize_dtype(np.uint64) == np.uint64 and index_bits <= 32:
+    index_bits = (n - 1).bit_length()
+    if jax.dtypes.canonicalize_dtype(np.uint64) == np.uint64:
         # On CPUs XLA sorts a single array of unsigned integers ten times as fast as
         # anything else, so the row's index is packed into the bits below its curve index.
         key = _curve(_on_grid(z, 63 - index_bits), 63 - index_bits, jnp.uint64)

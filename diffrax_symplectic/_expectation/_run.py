@@ -4,7 +4,7 @@ import collections
 import dataclasses
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -18,7 +18,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._arguments import whole_number
-from .._brownian import check_key
+from .._brownian import check_key, typed_key
 from ._estimate import Expectation, ExpectationInterrupted
 from ._moments import joined, Moments, total
 from ._sampling import Plan
@@ -32,25 +32,18 @@ _HEAVY = 0.35
 NO_METER = diffrax.NoProgressMeter()
 
 
-class Begin(NamedTuple):
-    """An estimate to continue, or the number of the first sample."""
-
-    start: Expectation | None = None
-    first: int = 0
-
-
 def checked_call(
     user: str, key, tol, start, first, devices: Sequence[Any] | None, *others: Any
-) -> tuple[PRNGKeyArray, Begin, tuple]:
-    """The key as a typed key, where to begin, and the devices. Raises a `ValueError` for
-    invalid arguments, and if any array is traced."""
+) -> tuple[PRNGKeyArray, int, tuple]:
+    """The key as a typed key, the number of the first sample, and the devices. Raises a
+    `ValueError` for invalid arguments, and if any array is traced."""
     _check_untraced((key, others))
     check_key(key, user)
     if start is not None and first != 0:
         raise ValueError(
             "Pass either `start`, which continues after its last sample, or `first`."
         )
-    begin = Begin(start, whole_number("first", first, 0))
+    first = whole_number("first", first, 0)
     is_number = isinstance(tol, int | float | np.number)
     if tol is not None and not (is_number and 0 < tol < np.inf):
         raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")
@@ -58,7 +51,6 @@ def checked_call(
         raise ValueError(
             f"`start` must be what `{user}` returned, or `None`; got {start!r}."
         )
-    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     devices = jax.devices() if devices is None else devices
     is_device = lambda x: isinstance(x, jax.Device)
     if not isinstance(devices, Sequence) or not all(map(is_device, devices)):
@@ -66,8 +58,7 @@ def checked_call(
             "`devices` must be a list of devices, such as `jax.devices()[:1]`, or `None`; "
             f"got {devices!r}."
         )
-    devices = tuple(devices)
-    return key if typed else jr.wrap_key_data(key), begin, devices
+    return typed_key(key), first, tuple(devices)
 
 
 def _check_untraced(tree: Any) -> None:
@@ -100,27 +91,29 @@ def run(
     key: PRNGKeyArray,
     devices: tuple,
     sampling: Any = None,
-    begin: Begin = Begin(),  # noqa: B008 (it does not change)
+    start: Expectation | None = None,
+    first: int = 0,
     tol: float | None = None,
     meter: Meter | None = None,
 ) -> Expectation:
-    """The estimate from the samples of a plan. Without a meter it is a trial, without
-    warnings. The result does not depend on the number of devices."""
-    first, at = begin.first, begin.first
-    if begin.start is not None:
-        first, at = begin.start.moments[0].begin, begin.start.moments[-1].end
+    """The estimate from the samples of a plan, which continues `start`, or begins with
+    sample number `first`. Without a meter it is a trial, without warnings. The result does
+    not depend on the number of devices."""
+    at = first
+    if start is not None:
+        first, at = start.moments[0].begin, start.moments[-1].end
     most, batches = first + plan.num_samples, _Batches(plan, key, devices)
     none = batches.nothing(at, most)
     about = plan.roundings, sampling, plan.reason, None, plan.far
     estimate = Expectation((none,), batches.key_data, plan.paths, *about)
-    if begin.start is not None:
-        begin.start.check_same(estimate, "`start`")
+    if start is not None:
+        start.check_same(estimate, "`start`")
         if at > most:
             raise ValueError(
                 "The number of paths (or replicates) includes `start`, which has "
                 f"{at - first} already; got {plan.num_samples}. Pass a larger number."
             )
-        estimate = dataclasses.replace(estimate, moments=begin.start.moments)
+        estimate = dataclasses.replace(estimate, moments=start.moments)
     reached = lambda: _reached(estimate, plan.least, tol)
     running, done = collections.deque(), at
     try:
@@ -315,7 +308,7 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         wanted = index < left
         good, failed = samples.good & wanted, jnp.where(wanted, samples.lost, 0)
         leaves, treedef = jtu.tree_flatten(samples.values)
-        each = [_spread(x, good) for x in leaves]
+        each = [_moments_of_batch(x, good) for x in leaves]
         return jnp.sum(good), jnp.sum(failed), *map(treedef.unflatten, zip(*each))
 
     if mesh.size == 1:
@@ -337,17 +330,19 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         return sharded(dynamic, lo_hi, left)
     except ValueError as error:
         # The loop of Diffrax's default adjoint rejects arrays that vary between devices.
-        if "Closure-converted function" not in str(error):
-            raise
-        raise ValueError(
-            "Reverse mode through `diffrax.RecursiveCheckpointAdjoint`, the default of "
-            "`diffeqsolve`, does not work on several devices. Pass `adjoint="
-            "diffrax_symplectic.ReversingAdjoint()` or `adjoint=diffrax.DirectAdjoint()` "
-            "to `diffeqsolve`, or `devices=jax.devices()[:1]` to `monte_carlo`."
-        ) from error
+        if "Closure-converted function" in str(error):
+            error.add_note(
+                "Reverse mode through `diffrax.RecursiveCheckpointAdjoint`, the default of "
+                "`diffeqsolve`, does not work on several devices. Pass `adjoint=diffrax_"
+                "symplectic.ReversingAdjoint()` or `adjoint=diffrax.DirectAdjoint()` to "
+                "`diffeqsolve`, or `devices=jax.devices()[:1]` to `monte_carlo`."
+            )
+        raise
 
 
-def _spread(x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]):
+def _moments_of_batch(
+    x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]
+):
     """For the good samples: the mean, its rounding error, the root of the sum of squared
     deviations from the exact mean, the largest deviation, and the largest absolute value.
     """

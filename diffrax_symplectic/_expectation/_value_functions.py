@@ -22,9 +22,10 @@ from ._fits import fit, Functions
 from ._moments import total
 from ._noise import Noise
 from ._polynomials import num_polynomials
+from ._problem import Level, Problem
 from ._run import run
 from ._sampling import AbstractSampling, Plan, ROUNDING, Samples
-from ._steps import along, Ensemble, Level, Problem, simulate
+from ._steps import along, Paths, simulate
 
 
 # The most polynomials in a fit by default.
@@ -225,7 +226,7 @@ def _controlled_paths(
         same = lambda x: jnp.broadcast_to(x, (n, *jnp.shape(x)))
         state = jtu.tree_map(same, noise.fresh(0, p.y0))
         zero = jnp.zeros((n, *p.num_outputs), dtype)
-        return step, Ensemble.start(p, n, state, (zero, zero, jnp.zeros(n, dtype)))
+        return step, Paths.start(p, n, state, (zero, zero, jnp.zeros(n, dtype)))
 
     saved, failed, (*known, log_ratio) = simulate(p, begin)
     control, promised = (jnp.swapaxes(x, 1, 2).astype(saved.dtype) for x in known)

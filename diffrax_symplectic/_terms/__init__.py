@@ -7,6 +7,6 @@ from ._structure_checks import additive_fault, check_stratonovich, check_structu
 from ._structure_checks import commuting, constant_fault, Fault, FRICTION
 from ._structure_checks import separable_fault, WRONG_WAY_ROUND
 from ._vector_fields import apply, apply_one, brownian_paths, check_fit
-from ._vector_fields import number_of_noises, rate, replace_paths, split_terms
-from ._vector_fields import tree_sum
+from ._vector_fields import number_of_noises, path_numbers, rate, replace_paths
+from ._vector_fields import split_terms, tree_sum
 from ._waves import from_pair, to_pair, wave_terms

@@ -300,9 +300,6 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         return jtu.tree_map(lambda h, s: jnp.reshape(h, s.shape), H, struct)
 
 
-_LEFT_OUT = "`args=None`. Was it left out?"
-
-
 def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Array]:
     """`H(*inputs, args)`, with advice on its errors."""
     # A copy, so that functions which modify `args` in place are the same in each trace.
@@ -316,11 +313,12 @@ def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Arr
             "instead of `if`, and `jnp` instead of `np`."
         ) from error
     except (TypeError, AttributeError) as error:
+        question = "was called with `args=None`. Was it left out?"
         # An `IndexedNoise` calls this function twice.
-        if args is not None or _LEFT_OUT in str(error) or "None" not in str(error):
-            raise
-        kind = TypeError if isinstance(error, TypeError) else AttributeError
-        raise kind(f"`{name}` was called with {_LEFT_OUT} {error}") from error
+        asked = any(question in note for note in getattr(error, "__notes__", ()))
+        if args is None and "None" in str(error) and not asked:
+            error.add_note(f"`{name}` {question}")
+        raise
 
 
 def symplectic_gradient(scalar: Callable, y: _State) -> _State:

@@ -157,23 +157,28 @@ def check_stratonovich(
     t0: RealScalarLike,
     y0: Y,
     args: Args,
+    *,
+    all_terms: bool = False,
 ) -> None:
-    """Raises a `ValueError` if an Ito solver gets terms from Hamiltonians, which are in the
-    sense of Stratonovich, unless both senses agree: for additive noise, and for noise that
-    changes only `p` and depends only on `q`."""
-    drift, noise = split_terms(terms)
-    # A drift beside `H0` may be the correction from one sense to the other.
-    corrected = not all(map(is_hamiltonian, drift))
-    if corrected or not isinstance(solver, diffrax.AbstractItoSolver):
+    """Raises a `ValueError` if an Ito solver gets terms in the sense of Stratonovich: those
+    from Hamiltonians, and in `expectation` `all_terms`. Both senses agree for additive
+    noise, and for noise that changes only `p` and depends only on `q`."""
+    if not isinstance(solver, diffrax.AbstractItoSolver):
         return
-    noise = tuple(filter(is_hamiltonian, noise))
+    drift, noise = split_terms(terms)
+    these, instead = "`expectation` takes all terms", ", or use `monte_carlo`"
+    if not all_terms:
+        # A drift beside `H0` may be the correction from one sense to the other.
+        if not all(map(is_hamiltonian, drift)):
+            return
+        noise = tuple(filter(is_hamiltonian, noise))
+        these, instead = "The terms of `hamiltonian_terms` are", ""
     if additive_fault(noise, t0, y0, args) and separable_fault((), noise, t0, y0, args):
         raise ValueError(
-            f"`{type(solver).__name__}` solves equations in the sense of Ito. The terms of "
-            "`hamiltonian_terms` are in the sense of Stratonovich, and here the two "
-            "differ. Use a solver of this package, or a Stratonovich solver of Diffrax "
-            "such as `diffrax.Heun`. If you mean the Ito equation, add its drift "
-            "correction."
+            f"`{type(solver).__name__}` solves equations in the sense of Ito. {these} in "
+            "the sense of Stratonovich, and here the two differ. Use a solver of this "
+            "package, or a Stratonovich solver of Diffrax such as `diffrax.Heun`. If you "
+            f"mean the Ito equation, add its drift correction{instead}."
         )
 
 

@@ -2,11 +2,13 @@
 Lie brackets of vector fields."""
 
 import functools as ft
-from collections.abc import Callable
+import operator
+from collections.abc import Callable, Sequence
 
 import diffrax
 import equinox as eqx
 import jax
+import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -14,7 +16,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._brownian import num_noises, raveled
+from .._brownian import num_noises, raveled, UnspecifiedPath
 from .._compat import is_adjoint_term, unwrapped, ω
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from ._hamiltonian import HamiltonianNoise, OneNoise
@@ -55,6 +57,30 @@ def _flatten(terms: diffrax.AbstractTerm) -> tuple:
 
 def brownian_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
     return [x for x in jtu.tree_leaves(terms, is_leaf=_is_path) if _is_path(x)]
+
+
+def path_numbers(paths: Sequence[diffrax.AbstractBrownianPath]) -> tuple[int, ...]:
+    """The number of the Brownian motion that each path samples, counted from 0. Equal paths
+    sample the same one; two shapes of paths never do."""
+    found: list[diffrax.AbstractBrownianPath] = []
+    numbers = []
+    for path in paths:
+        same = (k for k, other in enumerate(found) if _are_equal(path, other))
+        numbers.append(next(same, len(found)))
+        if numbers[-1] == len(found):
+            found.append(path)
+    return tuple(numbers)
+
+
+def _are_equal(a: diffrax.AbstractBrownianPath, b) -> bool:
+    """Traced paths are equal if they hold the same arrays."""
+    if isinstance(a, UnspecifiedPath):
+        return False
+    with jax.ensure_compile_time_eval():
+        equal = eqx.tree_equal(a, b)
+    if isinstance(equal, jax.core.Tracer):
+        return all(map(operator.is_, jtu.tree_leaves(a), jtu.tree_leaves(b)))
+    return bool(equal)
 
 
 def replace_paths(terms: PyTree, new: Callable) -> PyTree:
@@ -164,7 +190,7 @@ def _one_product(term, struct, number, increment, args: Args, t, y: Y) -> Y:
         matrix = term.vf(t, y, args)
         # A single array of noises, not a Lineax operator or another PyTree.
         one_array = eqx.is_array(matrix) and isinstance(struct, jax.ShapeDtypeStruct)
-        if one_array and matrix.shape[-1:] == struct.shape:
+        if one_array and matrix.ndim > 0 and matrix.shape[-1:] == struct.shape:
             return matrix[..., number] * increment.astype(matrix.dtype)
     flat, unravel = raveled(struct)
     only = flat.at[number].set(increment.astype(flat.dtype))

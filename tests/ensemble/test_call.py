@@ -61,6 +61,12 @@ def test_states_are_those_of_diffeqsolve_at_the_saved_times(engine):
         np.testing.assert_allclose(q[i], sol.ys[1], rtol=1e-14, atol=1e-15)
 
 
+def test_terms_of_a_path_are_complete_if_the_terms_had_a_shape():
+    paths = follow(ds.hamiltonian_terms(pendulum, push, ()))
+    sol = diffrax.diffeqsolve(paths.terms(7), ds.StormerVerlet(), 0.0, 1.0, 0.25, ONE)
+    np.testing.assert_allclose(paths.ys[1][7], sol.ys[1][-1], rtol=1e-14)
+
+
 @engines
 def test_without_times_the_ends_are_returned(engine):
     ends, saved = follow(engine=engine), follow(engine=engine, ts=[1.0])

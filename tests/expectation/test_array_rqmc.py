@@ -16,7 +16,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation._array_rqmc import layout
-from diffrax_symplectic._expectation._steps import level_weights
+from diffrax_symplectic._expectation._moments import level_weights
 
 from ..problems import kubo_terms, RecordingMeter
 

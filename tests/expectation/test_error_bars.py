@@ -10,9 +10,9 @@ import pytest
 from scipy import stats
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation._problem import Problem
 from diffrax_symplectic._expectation._run import Meter, run
 from diffrax_symplectic._expectation._sampling import Plan, Samples
-from diffrax_symplectic._expectation._steps import Problem
 from examples.benchmarks.coverage import arguments, Cell, estimate, exact
 
 from ..problems import kubo_terms

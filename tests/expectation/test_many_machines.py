@@ -1,5 +1,6 @@
 """An estimate in parts, made anywhere, is that of one run to the last bit."""
 
+import dataclasses
 import os
 import signal
 import subprocess
@@ -85,6 +86,12 @@ def test_parts_that_do_not_fit_are_refused(tmp_path):
         one.merge(other)
     with pytest.raises(ValueError, match="has another `key`"):
         other.merge(ds.monte_carlo(jr.normal, key=jr.key(4), num_paths=10))
+    replicates = _part("ArrayRQMC", 2)
+    smaller = dataclasses.replace(replicates, paths_per_sample=32)
+    with pytest.raises(ValueError, match="over 64 paths.*over 32"):
+        replicates.merge(smaller)
+    with pytest.raises(ValueError, match="over 32 paths.*over 64.*same `sampling`"):
+        _part("ArrayRQMC", 4, start=smaller)
     with pytest.raises(ValueError, match="were sampled by IndependentPaths"):
         one.merge(_part("ValueFunctions", 32, 32))
     with pytest.raises(ValueError, match="`merge` takes estimates; got 3"):

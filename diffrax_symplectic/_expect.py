@@ -10,12 +10,13 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
-from .._custom_types import Args, RealScalarLike, Y
-from ._choose import choose, MOST
-from ._estimate import Expectation, ExpectationInterrupted
-from ._run import checked_call, Meter, NO_METER, run
-from ._sampling import AbstractSampling
-from ._steps import Problem
+from ._custom_types import Args, RealScalarLike, Y
+from ._ensemble import fused_plan
+from ._expectation import Expectation, ExpectationInterrupted
+from ._expectation._choose import choose, MOST
+from ._expectation._problem import Problem
+from ._expectation._run import checked_call, Meter, NO_METER, run
+from ._expectation._sampling import AbstractSampling
 
 
 # No sample's key is folded from this number.
@@ -95,9 +96,9 @@ def expectation(
     - `phi`: maps time, state and `args` to a PyTree of real arrays.
     - `terms`, `solver`, `t0`, `t1`, `dt0`, `y0`, `args`: as for `diffrax.diffeqsolve`,
         with `t1 - t0` a whole number of steps `dt0`. `terms` may have a shape in place of
-        a path; the solver then chooses the path. Paths determine the random variables, and
-        paths with equal keys are one Brownian motion. `solver` is any solver of this
-        package, or a Stratonovich solver of Diffrax with fixed steps.
+        a path; the solver then chooses the path. Paths determine the random variables.
+        Paths with equal keys are one Brownian motion; each shape is another. `solver` is
+        any solver of this package, or a Stratonovich solver of Diffrax with fixed steps.
     - `key`: a JAX random key.
     - `sampling`: an [`diffrax_symplectic.IndependentPaths`][],
         [`diffrax_symplectic.ArrayRQMC`][] or [`diffrax_symplectic.ValueFunctions`][].
@@ -153,7 +154,7 @@ def expectation(
             "function of a random key and average it with `monte_carlo`."
         )
     given = terms, t0, t1, dt0, y0, args, ts
-    key, begin, devices = checked_call(
+    key, first, devices = checked_call(
         "expectation", key, tol, start, first, devices, given
     )
     if engine not in (None, "jax", "drjit"):
@@ -168,10 +169,6 @@ def expectation(
     with Meter(progress_meter) as meter:
         try:
             if engine == "drjit":
-                from .._ensemble import (
-                    fused_plan,
-                )  # It imports from this folder.
-
                 plan = fused_plan(problem, key, sampling, devices)
             else:
                 plan = sampling.prepare(problem, jr.fold_in(key, _NO_SAMPLE), devices)
@@ -185,7 +182,7 @@ def expectation(
             # Without `tol` the number of samples stays as it was.
             used = start.moments[-1].end - start.moments[0].begin
             plan = plan._replace(num_samples=used)
-        estimate = run(plan, key, devices, sampling, begin, tol, meter)
+        estimate = run(plan, key, devices, sampling, start, first, tol, meter)
     _warn_of_rounding(estimate, problem)
     return estimate
 

@@ -1,0 +1,242 @@
+"""An expectation to compute: the checked arguments, and single steps."""
+
+import functools as ft
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from .._arguments import check_real, check_solver, check_takes, whole_number
+from .._brownian import is_random
+from .._custom_types import Args, RealScalarLike, Y
+from .._root_finder import all_finite
+from .._solver import AbstractSymplecticSolver, check_resolution
+from .._suggest import own_path, specified
+from .._terms import (
+    brownian_paths,
+    check_fit,
+    check_stratonovich,
+    evaluated,
+    has_lifted,
+)
+from ._moments import level_weights
+from ._polynomials import tensordot
+from ._sampling import real
+
+
+class Level(eqx.Module):
+    """One step size: its index, counted from the coarsest, the number of steps, and the
+    steps after which to average."""
+
+    index: Int[Array, ""]
+    h: Float[Array, ""]
+    num_steps: Int[Array, ""]
+    saved_steps: Int[Array, " saves"]
+
+
+class Problem(eqx.Module):
+    """The arguments of `expectation`, by the same names, and the levels, along a leading
+    axis."""
+
+    phi: Callable[[RealScalarLike, Y, Args], PyTree]
+    terms: PyTree[diffrax.AbstractTerm]
+    solver: diffrax.AbstractSolver
+    t0: Float[Array, ""]
+    y0: Y
+    args: Args
+    levels: Level
+    # An array, so that other weights do not compile anew.
+    weights: Float[Array, "combinations levels"]
+    # Whether to average at `t1` only, without an axis of times.
+    at_end: bool = eqx.field(static=True)
+    # The number of steps on the finest level. (Shapes must be known when compiling.)
+    max_steps: int = eqx.field(static=True)
+
+    @staticmethod
+    def of(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels) -> "Problem":
+        """Raises a `ValueError` for bad arguments of `expectation`."""
+        levels = whole_number("levels", levels)
+        check_solver("solver", solver)
+        if isinstance(solver, diffrax.HalfSolver):
+            raise ValueError(
+                "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
+            )
+        # In each sample other keys take the place of these.
+        terms = specified(terms, ft.partial(own_path, solver, "weak"))
+        saved_steps, num_steps = _steps(t0, t1, dt0, ts)
+        if callable(y0):
+            raise ValueError(
+                "`y0` must be a state; got a function. For a random initial state, use "
+                "`monte_carlo` with a function of the key that draws the state and solves."
+            )
+        y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+        if not all_finite(y0):
+            raise ValueError(f"`y0` must hold finite numbers; got {y0}.")
+        start = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
+        check_fit(terms, start, y0, args)
+        _check_noise(terms)
+        smallest = float(dt0) / 2 ** (levels - 1)
+        if isinstance(solver, AbstractSymplecticSolver):
+            check_resolution(smallest, float(t0), float(t1), start.dtype)
+        check_stratonovich(terms, solver, start, y0, args, all_terms=True)
+        _check_cells(terms, t0, smallest)
+        check_takes("phi", phi, "t", "y", "args")
+        check_real("phi", jtu.tree_leaves(_shape_of(phi, terms, start, y0, args)))
+        if num_steps * 2.0 ** (levels - 1) >= 2**31:
+            raise ValueError(
+                f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "
+                "2^31 steps. Pass fewer levels: two to four are enough to extrapolate."
+            )
+        finer = 2 ** np.arange(levels, dtype=np.int32)
+        grid = Level(
+            jnp.arange(levels, dtype=jnp.int32),
+            jnp.asarray(float(dt0) / finer, start.dtype),
+            jnp.asarray(finer * num_steps),
+            jnp.asarray(finer[:, None] * saved_steps),
+        )
+        order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
+        weights = jnp.asarray(level_weights(order, levels), float)
+        at = grid, weights, ts is None, int(finer[-1] * num_steps)
+        return Problem(phi, terms, solver, start, y0, args, *at)
+
+    def level(self, index: int) -> Level:
+        return jtu.tree_map(lambda x: x[index], self.levels)
+
+    def init(self, terms, i, h: Float[Array, ""], y: Y) -> PyTree[Array]:
+        """The arrays of the solver's state before step `i`. The rest of the state does not
+        change."""
+        t = self.t0 + i * h
+        state = self.solver.init(terms, t, t + h, y, self.args)
+        return eqx.filter(state, eqx.is_array)
+
+    def step(self, terms, i, h, y: Y, state) -> tuple[Y, PyTree, Bool[Array, ""]]:
+        """One step of one path, and whether it succeeded."""
+        t, next_t = self.t0 + i * h, self.t0 + (i + 1) * h
+        fresh = eqx.filter_eval_shape(self.solver.init, terms, t, next_t, y, self.args)
+        is_struct = lambda x: isinstance(x, jax.ShapeDtypeStruct)
+        state = eqx.combine(state, eqx.filter(fresh, is_struct, inverse=True))
+        y, _, _, state, result = self.solver.step(
+            terms, t, next_t, y, self.args, state, made_jump=False
+        )
+        state = eqx.filter(state, eqx.is_array)
+        return y, state, diffrax.is_okay(result) & all_finite(y)
+
+    def values(self, t, y: Y) -> Float[Array, " m"]:
+        return numbers(self.phi(t, y, self.args))
+
+    def unravel(self, x: Float[Array, "*axes m"]) -> PyTree[Array]:
+        """Flat values of `phi` in its own structure."""
+        shape = jax.eval_shape(lambda: self.phi(self.t0, self.y0, self.args))
+        leaves, treedef = jtu.tree_flatten(shape)
+        parts = jnp.split(x, np.cumsum([s.size for s in leaves])[:-1], axis=-1)
+        pairs = zip(parts, leaves)
+        return treedef.unflatten([y.reshape(*x.shape[:-1], *s.shape) for y, s in pairs])
+
+    def combined(
+        self, x: Float[Array, "levels ..."]
+    ) -> Float[Array, "combinations ..."]:
+        return tensordot(self.weights.astype(x.dtype), x, 1)
+
+    def averaged(
+        self, kinds: list[Float[Array, "combinations S n m"]]
+    ) -> PyTree[Array]:
+        """The `values` of `Samples` from these kinds."""
+        x = jnp.stack(kinds)
+        return self.unravel(x[:, :, 0] if self.at_end else jnp.swapaxes(x, 2, 3))
+
+    @property
+    def dtype(self) -> Any:
+        return jnp.result_type(*jtu.tree_leaves(self.y0))
+
+    @property
+    def num_outputs(self) -> tuple[int, int]:
+        """The number of times at which to average, and of components of `phi`."""
+        m = jax.eval_shape(lambda: self.values(self.t0, self.y0)).size
+        return self.levels.saved_steps.shape[1], m
+
+
+def ravel(y: Y) -> Float[Array, " d"]:
+    return jfu.ravel_pytree(y)[0]
+
+
+def numbers(tree: PyTree) -> Float[Array, " m"]:
+    """The leaves as one vector of real numbers."""
+    x = ravel(tree)
+    return x.astype(real(x.dtype))
+
+
+def _steps(t0, t1, dt0, ts: Sequence | None) -> tuple[np.ndarray, np.integer]:
+    """The numbers of steps after which to average, and the number of all steps."""
+    if dt0 is None:
+        raise ValueError("`dt0` must be a number: steps are fixed; got None.")
+    given = f"got dt0={dt0!r}, t0={t0!r}, t1={t1!r}"
+    if not all(eqx.is_array_like(x) and np.ndim(x) == 0 for x in (t0, t1, dt0)):
+        raise ValueError(f"`t0`, `t1` and `dt0` must be numbers; {given}.")
+    t0, t1, dt0 = float(t0), float(t1), float(dt0)
+    if not (0 < dt0 < np.inf and t0 < t1 < np.inf):
+        raise ValueError(f"`dt0` must be positive, and `t1` after `t0`; {given}.")
+    times = np.array([t1] if ts is None else ts, float).reshape(-1)
+    counts = (np.append(times, t1) - t0) / dt0
+    whole = np.round(counts)
+    if not np.all(np.abs(counts - whole) <= 1e-6 * np.maximum(whole, 1)):
+        raise ValueError(
+            "`t1` and each of `ts` must be a whole number of steps after `t0`; got "
+            f"t0={t0}, dt0={dt0}, t1={t1} and ts={ts}. Choose a `dt0` that divides the "
+            "intervals between them."
+        )
+    if len(times) == 0 or np.any(whole < 0) or np.any(whole > whole[-1]):
+        raise ValueError(
+            f"`ts` must hold at least one time, all between `t0` and `t1`; got {ts}."
+        )
+    *saved, num_steps = whole.astype(np.int32)
+    return np.array(saved), num_steps
+
+
+def _check_noise(terms) -> None:
+    """Raises a `ValueError` if nothing in the terms is random."""
+    if len(brownian_paths(terms)) == 0:
+        raise ValueError(
+            "`terms` have no Brownian path, so nothing is random. Solve them once, with "
+            "`diffrax.diffeqsolve`."
+        )
+    if not any(map(is_random, brownian_paths(terms))):
+        raise ValueError(
+            "No Brownian path in `terms` has a random key, so all samples would have the "
+            "same noise. Solve once, with `diffrax.diffeqsolve`. If your path draws its "
+            "own noise, give it a field that holds a JAX random key. To average over many "
+            "records, pass `monte_carlo` a function that draws one of them."
+        )
+
+
+def _check_cells(terms, t0, h: float) -> None:
+    """Raises a `ValueError` for steps that are not made up of whole cells of a path."""
+    for path in brownian_paths(terms):
+        cell = getattr(path, "cell", None)
+        whole = lambda x: abs(x / cell - round(x / cell)) <= 1e-3
+        if cell is not None and not (whole(float(t0)) and whole(h)):
+            raise ValueError(
+                f"Steps of a `{type(path).__name__}` with `cell` must begin and end at "
+                f"multiples of `cell`; got cell={cell}, t0={t0} and the smallest step {h}. "
+                "Pass a `cell` that divides `t0` and the steps of all `levels`."
+            )
+
+
+def _shape_of(phi: Callable, terms, t0, y0: Y, args: Args) -> PyTree:
+    """The shape of `phi`'s result. Errors explain which state `phi` gets."""
+    once = lambda t, y, args: evaluated("phi", phi, t, y, args=args)
+    try:
+        return eqx.filter_eval_shape(once, t0, y0, args)
+    except (TypeError, AttributeError, IndexError) as error:
+        if has_lifted(terms):
+            error.add_note(
+                "For spins and complex amplitudes `phi(t, y, args)` gets the pair "
+                "`(p, q)`: call `from_spinors(y)` or `from_pair(y)` in it."
+            )
+        raise
