@@ -35,6 +35,7 @@ from .work_precision import two_noises
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
+from matplotlib.ticker import NullFormatter  # noqa: E402
 
 
 class Case(NamedTuple):
@@ -235,6 +236,7 @@ def draw(measured: dict[str, dict]) -> None:
             "s^o", ("IndependentPaths", "ArrayRQMC", "ValueFunctions")
         ):
             ax.loglog(*zip(*measured[name][sampling]), marker + "-", label=sampling)
+        ax.xaxis.set_minor_formatter(NullFormatter())
         ax.set_title(name)
         ax.set_xlabel("seconds")
         ax.grid(alpha=0.3)
@@ -253,8 +255,8 @@ def table(measured: dict[str, dict]) -> str:
     lines = []
     for name, m in measured.items():
         c = CASES[name]
-        best = str(c.degree or m["reason"].split(" was")[0].split(": ")[-1])
-        kind = f"grid, {best}" if best in ("32", "64") else f"degree {best}"
+        basis, best = m["reason"].split(",")[0].split(": ")
+        kind = f"grid, {best}" if basis.startswith("grid") else f"degree {best}"
         error = "" if np.isnan(m["exact"]) else f"{m['error']:.1e}"
         cells = (
             f"{name}, $t = {c.t1:g}$", kind, f"{m['std_error']:.1e}", error,
