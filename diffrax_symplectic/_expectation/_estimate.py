@@ -20,9 +20,6 @@ from ._saved import arrays_of, described, rebuilt
 # A control variate is dropped if its mean is this many standard errors from zero, unless
 # its own `r` exceeds this value.
 _SURE, _HEAVY_CONTROL = 5, 0.1
-# Tails that paths with wider noise show count if they exceed the tails seen in the samples
-# by this factor.
-_SEEN = 4
 # NumPy operations on zero-dimensional arrays return scalars.
 _Host = PyTree[np.ndarray | np.floating]
 
@@ -54,7 +51,7 @@ class Expectation(eqx.Module):
     reason: str = ""
     tol_reached: bool | None = None
     # For value functions: the mean absolute deviation from the fitted mean in the tails, as
-    # estimated by paths with wider noise.
+    # estimated by paths whose noise is wider or pushed to one side.
     far: PyTree[np.ndarray] | None = None
 
     @property
@@ -96,8 +93,8 @@ class Expectation(eqx.Module):
         $s \sqrt{4.5 \log n}$ only for heavy tails, and $r = 1$ if a single sample accounts
         for all of the variance. (For sorted paths, $r$ is also computed for the paths
         within a replicate, and the larger value is used.) For value functions, $b$ is the
-        part of the mean absolute deviation that only paths with wider noise show; otherwise
-        it is zero. The standard error is never less than the rounding of the mean."""
+        part of the mean absolute deviation that only paths show whose noise is wider or
+        pushed to one side; otherwise it is zero. The standard error is never less than the rounding of the mean."""
         return self._each("std_error", 0)
 
     @property
@@ -317,7 +314,7 @@ def _results(
         dropped |= ~np.all(fine & np.isfinite(mean[0]), axis=0)
         # Tails that the samples show are in their variance already. (NaN, from a trial
         # without a value, is ignored.)
-        unseen = np.where(far > _SEEN * mean[3], far - mean[3], 0)
+        unseen = np.where(far > mean[3], far - mean[3], 0)
         error[0] = np.hypot(error[0], unseen)
     best = lambda x: np.where(dropped, x[1], x[0]) if controlled else x[0]
     return {

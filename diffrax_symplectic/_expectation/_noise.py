@@ -1,5 +1,6 @@
 """The random variables of a step, and expectations over them."""
 
+import collections
 import math
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -22,6 +23,8 @@ from ._problem import Level, Problem
 _MOST_OUTCOMES = 100
 # The relative entropy of a whole path's wider noise with respect to its own law, in nats.
 _NATS = 8.0
+# With this tilt nearly all outcomes are the largest.
+_MOST_TILTED = 4.0
 
 # A function of the state.
 Function: TypeAlias = Callable[[Y], Array]
@@ -62,38 +65,56 @@ class Noise(eqx.Module):
         return Noise(problem, level, discrete, few)
 
     def draw(
-        self, key: PRNGKeyArray, number, share: Any = 0.0
+        self, key: PRNGKeyArray, number, share: Any = 0.0, tilt: Any = 0.0
     ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
         """The variables drawn from the key and this number, and their log likelihood ratio.
-        In a fraction `share` (from 0 to 1) of draws all outcomes are equally probable."""
+        In a fraction `share` (from 0 to 1) of draws all outcomes are equally probable.
+        Probabilities are multiplied by the exponential of `tilt`, a number or one for each
+        variable, times the outcome."""
         words = random_words(key, (number, self.level.index), 1, len(self.laws))[0]
         x = jnp.zeros(len(self.laws), self.problem.dtype)
-        log_ratio = jnp.zeros_like(x)
+        log_ratio, tilts = jnp.zeros_like(x), jnp.broadcast_to(tilt, x.shape)
+        own = (share == 0) & (tilts == 0)
         for law in dict.fromkeys(self.laws):
             mine = np.array([other == law for other in self.laws])
-            p = np.array(law.probabilities, x.dtype)
-            q = (1 - share) * p + share / len(p)
-            cuts = (jnp.cumsum(q)[:-1] * 2.0**32).astype(jnp.uint32)
-            cuts = jnp.where(share > 0, cuts, np.array(law.cuts, np.uint32))
+            p, q = np.array(law.probabilities, x.dtype), _widened(law, share)
+            q = jax.vmap(lambda tilt: _tilted(law, q, tilt))(tilts)
+            cuts = (jnp.cumsum(q, axis=1)[:, :-1] * 2.0**32).astype(jnp.uint32)
+            cuts = jnp.where(own[:, None], np.array(law.cuts, np.uint32), cuts)
             place = jnp.sum(words[:, None] >= cuts, axis=1)
             x = jnp.where(mine, jnp.asarray(law.values, x.dtype)[place], x)
-            log_ratio = jnp.where(mine, jnp.log(q / p)[place], log_ratio)
+            ratio = jnp.take_along_axis(jnp.log(q / p), place[:, None], axis=1)[:, 0]
+            log_ratio = jnp.where(mine, ratio, log_ratio)
         return x, jnp.sum(log_ratio)
 
     @property
     def share(self) -> Array:
-        """The `share` for `draw` that gives all variables of a path together a relative
-        entropy of 8 nats with respect to their own law."""
+        """The largest `share` for `draw` that `_strongest` allows."""
+        return self._strongest(_widened, 1.0)
+
+    @property
+    def tilt(self) -> Array:
+        """The largest `tilt` for `draw` that `_strongest` allows."""
+        own = lambda law: np.array(law.probabilities)
+        return self._strongest(lambda law, z: _tilted(law, own(law), z), _MOST_TILTED)
+
+    def _strongest(self, changed: Callable, most: float) -> Array:
+        """The largest `z`, up to `most`, for which the laws `changed(law, z)` give all
+        variables of a path together a relative entropy of at most 8 nats with respect to
+        their own laws."""
         levels = len(self.problem.levels.h)
-        coarser = 2 ** np.arange(levels)[::-1]
-        steps = self.problem.max_steps / coarser
-        low, high = np.zeros(levels), np.ones(levels)
+        steps = self.problem.max_steps / 2 ** np.arange(levels)[::-1]
+        counts = collections.Counter(self.laws).items()
+
+        def information(z: float) -> float:
+            each = [(n, changed(x, z), np.array(x.probabilities)) for x, n in counts]
+            return sum(n * np.sum(q * np.log(q / p)) for n, q, p in each)
+
+        low, high = np.zeros(levels), np.full(levels, most)
         for _ in range(30):
-            share = (low + high) / 2
-            enough = (
-                steps * sum(_information(x, share) for x in self.laws) > _NATS / levels
-            )
-            low, high = np.where(enough, low, share), np.where(enough, share, high)
+            z = (low + high) / 2
+            enough = steps * [*map(information, z)] > _NATS / levels
+            low, high = np.where(enough, low, z), np.where(enough, z, high)
         return jnp.asarray(low, self.problem.dtype)[self.level.index]
 
     def nodes(self, x: Array | None = None) -> tuple[Any, np.ndarray]:
@@ -163,11 +184,15 @@ class Noise(eqx.Module):
         )
 
 
-def _information(law: Discrete, share: np.ndarray) -> np.ndarray:
-    """The relative entropy of a draw with this share of equal probabilities."""
-    p = np.array(law.probabilities)
-    q = (1 - share[:, None]) * p + share[:, None] / len(p)
-    return np.sum(q * np.log(q / p), axis=1)
+def _widened(law: Discrete, share: Any) -> Any:
+    p = np.array(law.probabilities, jnp.result_type(share))
+    return (1 - share) * p + share / len(p)
+
+
+def _tilted(law: Discrete, q: Any, tilt: Any) -> Any:
+    numpy = jnp if isinstance(tilt, jax.Array) else np
+    weights = q * numpy.exp(tilt * np.array(law.values, jnp.result_type(tilt)))
+    return weights / numpy.sum(weights)
 
 
 def num_outcomes(problem: Problem) -> int | None:

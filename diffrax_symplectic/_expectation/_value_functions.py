@@ -5,6 +5,8 @@ step, $u_{n+1}$ minus its expectation over the step's random variables has mean 
 $u$. For the exact $u$ the sum of these differences is $\\phi(y_N)$ minus its mean.
 """
 
+import functools as ft
+import itertools
 import math
 import warnings
 
@@ -17,6 +19,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from .._arguments import whole_number
+from .._terms import number_of_noises
 from ._bases import AbstractBasis, Grid, Hermite, Quadratic
 from ._fits import fit, Functions
 from ._moments import total
@@ -39,6 +42,8 @@ _GRID, _GRID_SIZES, _MOST_ENDS, _MOST = 2, (64, 32), 50_000, 2**25
 _MOST_MEMORY, _OUT_OF_PROPORTION = 4 * 2**30, 2**31
 # The number folded into the key of trials, and the number of batches with wider noise.
 _TRIAL, _WIDE = 0xFFFFFFFE, 2
+# The most noises of which paths are pushed to all sides.
+_MOST_NOISES = 2
 
 
 class ValueFunctions(AbstractSampling):
@@ -88,11 +93,11 @@ class ValueFunctions(AbstractSampling):
         basis, (times, m) = _basis(problem, self.degree), problem.num_outputs
         functions, shape = _fits(problem, key, basis), (len(problem.weights), times, m)
         never = np.zeros(shape), np.full(shape, np.inf)
-        narrow = np.zeros((), problem.dtype)
+        narrow, *wider = _wider(problem)
 
-        def plan(best, used, n: int, usual=never, wide=narrow):
+        def plan(best, used, n: int, usual=never, law=narrow):
             usual = [x.astype(problem.dtype) for x in usual]
-            u, arrays = functions.chosen(best), (used, usual, wide)
+            u, arrays = functions.chosen(best), (used, usual, law)
             return Plan(
                 jtu.Partial(_controlled_paths, problem, u, *arrays), n, self.batch_size
             )
@@ -121,8 +126,10 @@ class ValueFunctions(AbstractSampling):
         with_fit = np.take_along_axis(with_fit, best[None, None], 0)[0]
         without = total(tried[0].moments)
         usual = at(without.mean, 1), np.where(used, with_fit, at(without.largest, 1))
-        wide = trial(best, used, _WIDE * self.batch_size, usual, narrow + 1)
-        far = jtu.tree_map(lambda x: x[3], total(wide.moments).mean)
+        n = _WIDE * self.batch_size
+        wide = [trial(best, used, n, usual, law).moments for law in wider]
+        largest = lambda *means: ft.reduce(np.fmax, [x[3] for x in means])
+        far = jtu.tree_map(largest, *[total(x).mean for x in wide])
         names = np.array([0, *basis.candidates])
         chosen = ", ".join(map(str, np.unique(names[np.where(used, best + 1, 0)])))
         among = ", ".join(map(str, np.unique(names)))
@@ -195,13 +202,24 @@ def _basis(p: Problem, degree: int | None) -> AbstractBasis:
     return basis
 
 
+def _wider(p: Problem) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Laws of the noise, as factors of `Noise.share` and of `Noise.tilt`: its own, a wider
+    one, and for one noise or two those in which each noise pushes to one side."""
+    m, n = number_of_noises(p.terms), len(Noise.of(p, p.level(0)).laws)
+    sides = [*itertools.product((-1, 1), repeat=m)] if m <= _MOST_NOISES else []
+    pushed = [(0, [*side, *[0] * (n - m)]) for side in sides]
+    laws = [(0, [0] * n), (1, [0] * n), *pushed]
+    return [(np.array(a, p.dtype), np.array(b, p.dtype)) for a, b in laws]
+
+
 def _controlled_paths(
-    p: Problem, functions: Functions, used, usual, wide, keys: PRNGKeyArray
+    p: Problem, functions: Functions, used, usual, law, keys: PRNGKeyArray
 ) -> Samples:
     """A sample is a path minus the control variate of `functions` (with a leading axis of
-    levels) where they are `used`. With `wide=1` the noise is wider, to estimate deviations
-    beyond the `usual` ones: the mean without control, and the largest deviation."""
+    levels) where they are `used`. With a wider `law` (see `_wider`) deviations beyond
+    the `usual` ones are estimated: the mean without control, and the largest deviation."""
     n, (center, beyond) = len(keys), [x[:, :, None] for x in usual]
+    share, side = law
 
     def begin(level):
         noise, u = Noise.of(p, level), jtu.tree_map(lambda x: x[level.index], functions)
@@ -210,7 +228,9 @@ def _controlled_paths(
             at, second = lambda y: u(i, y), jtu.tree_map(lambda x: x[i], u.second)
 
             def one(y, state, key):
-                x, log_ratio = noise.draw(key, i, wide * noise.share)
+                x, log_ratio = noise.draw(
+                    key, i, share * noise.share, side * noise.tilt
+                )
                 return *noise.advance(i, y, state, at, second, x), log_ratio
 
             out = jax.vmap(one)(paths.y, paths.solver_state, keys)

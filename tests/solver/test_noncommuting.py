@@ -232,9 +232,10 @@ def test_missing_variables_are_refused_with_advice():
     solve = lambda solver, path: diffrax.diffeqsolve(
         ds.hamiltonian_terms(H0, noise, path), solver, 0.0, 0.2, 0.1, y0, args
     )
-    with pytest.raises(ValueError, match="two_point=True"):
+    advice = r".* Make its path by `solver.path\(shape, key\)`"
+    with pytest.raises(ValueError, match="two-point variables" + advice):
         solve(ds.NinomiyaVictoir(), weak_path(2))
-    with pytest.raises(ValueError, match="LevyAreaBrownianPath"):
+    with pytest.raises(ValueError, match="Lévy areas" + advice):
         solve(ds.LevyAreaMidpoint(), weak_path(2))
     with pytest.raises(ValueError, match="needs a path with space-time"):
         ds.LevyAreaBrownianPath(weak_path(2), jr.key(0))
