@@ -94,7 +94,8 @@ class Expectation(eqx.Module):
         for all of the variance. (For sorted paths, $r$ is also computed for the paths
         within a replicate, and the larger value is used.) For value functions, $b$ is the
         part of the mean absolute deviation that only paths show whose noise is wider or
-        pushed to one side; otherwise it is zero. The standard error is never less than the rounding of the mean."""
+        pushed to one side; otherwise it is zero. The standard error is never less than the
+        rounding of the mean."""
         return self._each("std_error", 0)
 
     @property
