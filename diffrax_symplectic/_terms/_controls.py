@@ -23,9 +23,10 @@ from .._brownian import (
     increment_struct,
     is_random,
     laws_of,
-    LevyAreaBrownianPath,
+    PlateauBrownianPath,
     raveled,
     step_size,
+    TruncatedBrownianPath,
     VARIABLES,
     WeakBrownianPath,
 )
@@ -178,9 +179,9 @@ def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPa
 
 def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
     """Whether its random variables are cheaper to recompute than to store."""
-    cheap = WeakBrownianPath | FixedStepBrownianPath
-    areas = isinstance(path, LevyAreaBrownianPath)
-    return isinstance(_innermost(path), cheap) and not areas
+    while isinstance(path, TruncatedBrownianPath | PlateauBrownianPath):
+        path = path.path
+    return isinstance(path, WeakBrownianPath | FixedStepBrownianPath)
 
 
 def noise_driven(
