@@ -27,6 +27,11 @@ def unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
     return term.term if isinstance(term, WrapTerm) else term
 
 
+def replaced(term: diffrax.AbstractTerm, new: diffrax.AbstractTerm) -> Any:
+    """`new` in place of the user's term, in the same direction of time."""
+    return WrapTerm(new, term.direction) if isinstance(term, WrapTerm) else new
+
+
 def direction(terms: PyTree[diffrax.AbstractTerm]) -> Any:
     """The sign of the direction of time in the solve that the terms come from. Terms from
     outside a solve run forward."""
