@@ -17,7 +17,13 @@ from equinox.internal import (
     while_loop as while_loop,
     ω as ω,
 )
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import (
+    ClosedJaxpr,
+    Jaxpr as Jaxpr,
+    jaxpr_as_fun,
+    JaxprEqn as JaxprEqn,
+    Literal as Literal,
+)
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 from jaxtyping import PyTree
 

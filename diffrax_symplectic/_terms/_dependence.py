@@ -4,10 +4,9 @@ from collections.abc import Callable
 
 import jax
 import jax.tree_util as jtu
-from jax.extend.core import Jaxpr, JaxprEqn, Literal
 from jaxtyping import Array, PyTree
 
-from .._compat import dce_jaxpr
+from .._compat import dce_jaxpr, Jaxpr, JaxprEqn, Literal
 
 
 class Dependence:

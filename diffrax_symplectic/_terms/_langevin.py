@@ -252,9 +252,11 @@ class _Exchanged(diffrax.AbstractTerm):
 
 
 class _Square(eqx.Module):
-    """A constant array that may be a matrix, with its root, as computed once."""
+    """A constant array that may be a matrix; whether it is symmetric positive semidefinite,
+    and then its root, computed once."""
 
     value: Array
+    is_semidefinite: Bool[Array, ""]
     root: Array
 
 
@@ -274,12 +276,10 @@ def _product(friction: Any, t, q: _P, args: Args, velocity: _P) -> _P:
         value = g.value if isinstance(g, _Square) else g
         if not _is_matrix(value, v):
             return _not_negative(_like(value, v)) * v
-        axes = jnp.ndim(v)
+        force = jnp.tensordot(_like(value, v), v, jnp.ndim(v))
         if not isinstance(g, _Square):
-            return jnp.tensordot(_like(g, v), v, axes)
-        # NaN if the matrix is invalid.
-        root = _like(g.root, v)
-        return jnp.tensordot(root, jnp.tensordot(v, root, axes), axes)
+            return force
+        return jnp.where(g.is_semidefinite, force, jnp.nan)
 
     value = _for_each("friction", _value("friction", friction, t, q, args), q)
     return jtu.tree_map(product, value, velocity, is_leaf=_is_square)
@@ -428,11 +428,12 @@ def _checked_array(g: ArrayLike, x: Array | None) -> Array | _Square:
     kind = "a real number, an array or PyTree of them, or a function of `(t, q, args)`"
     if not may_be_matrix:
         return jnp.asarray(real_array("friction", g, positive=False, kind=kind))
-    square = _Square(jnp.asarray(g), _root(jnp.asarray(g, jnp.result_type(g, float))))
-    if isinstance(square.root, jax.core.Tracer):
+    root = _root(jnp.asarray(g, jnp.result_type(g, float)))
+    is_semidefinite = ~jnp.any(jnp.isnan(root))
+    square = _Square(jnp.asarray(g), is_semidefinite, root)
+    if isinstance(is_semidefinite, jax.core.Tracer):
         return square
-    invalid = bool(jnp.any(jnp.isnan(square.root)))
-    if invalid and (is_matrix or not np.all(np.asarray(g) >= 0)):
+    if not is_semidefinite and (is_matrix or not np.all(np.asarray(g) >= 0)):
         raise ValueError(
             "`friction` must be a symmetric positive semidefinite matrix, or an array of "
             f"numbers that are not negative, one for each momentum; got {g!r}."
