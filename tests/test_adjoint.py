@@ -11,8 +11,7 @@ from diffrax._term import WrapTerm
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._adjoint import _begin_anew, _undoes_its_steps
-from diffrax_symplectic._conditions import is_own_inverse
-from diffrax_symplectic._tableau import FlatTableau, Stage
+from diffrax_symplectic._tableau import FlatTableau, is_own_inverse, Stage
 
 from .problems import Given, H0, noise, random_problem, weak_path
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._plan import make_plan
+from diffrax_symplectic._tableau import make_plan
 
 from .families import slow_except
 from .problems import kubo_terms
