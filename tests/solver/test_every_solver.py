@@ -14,8 +14,8 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import VARIABLES
-from diffrax_symplectic._plan import make_plan
 from diffrax_symplectic._suggest import SOLVERS
+from diffrax_symplectic._tableau import make_plan
 
 from ..picard import by_picard
 from ..problems import (
@@ -80,8 +80,8 @@ def terms_for(solver, *args, **kwargs):
     terms = SYSTEMS[solver.structure].terms(*args, **kwargs)
     if not has_friction(solver):
         return terms
-    friction = ds.langevin_terms(lambda t, p, q, args: p @ p / 2, GAMMA).terms[1]
-    return diffrax.MultiTerm(*terms.terms, friction)
+    friction = ds.bath_terms(lambda t, p, q, args: p @ p / 2, GAMMA)
+    return diffrax.MultiTerm(*terms.terms, *friction.terms)
 
 
 def whole(terms, solver):
