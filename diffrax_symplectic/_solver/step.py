@@ -18,7 +18,7 @@ from .._batch import batched_like, materialize
 from .._compat import ω
 from .._custom_types import RealScalarLike, Y
 from .._root_finder import all_finite, differentiate, Halves
-from .._tableau import Block, FlatTableau, Plan, Stage
+from .._tableau import Block, FlatTableau, Stage, StepPlan
 from .._terms import tree_sum
 
 
@@ -43,7 +43,7 @@ class Step(NamedTuple):
 class Stages(eqx.Module):
     """The stages of one step, in the blocks of its plan. Unknown values count as zero."""
 
-    plan: Plan = eqx.field(static=True)
+    plan: StepPlan = eqx.field(static=True)
     step: Step
     y0: Y
 
@@ -206,7 +206,7 @@ Solved: TypeAlias = optx.RESULTS | None
 
 
 def take_step(
-    plan: Plan,
+    plan: StepPlan,
     step: Step,
     y0: Y,
     solver: diffrax.AbstractSolver,
@@ -245,7 +245,9 @@ def result_of(solved: Solved, y1: Y) -> diffrax.RESULTS:
 
 # Diffrax traces a step three times or more.
 @eqx.filter_jit
-def _traced_once(plan: Plan, step: Step, y0: Y, before, finder: Any, max_steps: int):
+def _traced_once(
+    plan: StepPlan, step: Step, y0: Y, before, finder: Any, max_steps: int
+):
     stages = Stages(plan, closed(step, y0), y0)
     y1, _, solved = _implicit_step(stages, before, finder=finder, max_steps=max_steps)
     return y1, solved
