@@ -10,6 +10,7 @@ from typing import Any
 import diffrax
 import jax
 import jax.tree_util as jtu
+import lineax as lx
 from diffrax._term import AdjointTerm, WrapTerm
 from equinox.internal import (
     nondifferentiable as nondifferentiable,
@@ -19,7 +20,21 @@ from equinox.internal import (
 )
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
+
+
+def computed_by(
+    solver: lx.AbstractLinearSolver[Any],
+    operator: lx.AbstractLinearOperator,
+    rhs: Array,
+) -> tuple[Array, lx.RESULTS]:
+    """The solution of a linear system by a solver of Lineax, and whether it was found.
+
+    `lineax.linear_solve` does the same, with derivatives that would not be used here, and
+    with a longer trace.
+    """
+    x, result, _ = solver.compute(solver.init(operator, {}), rhs, {})
+    return x, result
 
 
 def unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:

@@ -58,7 +58,7 @@ class Stages(eqx.Module):
 
         return [zero(group) for group in block.unknown]
 
-    def sweep(self, solve: Callable, guess: Unknown, pending):
+    def solve_blocks(self, solve: Callable, guess: Unknown, pending):
         """Sweeps for the stage equations, block by block, each with the values of earlier
         blocks."""
         values, y = {}, []
@@ -274,7 +274,7 @@ def _implicit_step(
         finder,
         guess,
         args=stages,
-        options=dict(scale=stages.scale, sweep=Stages.sweep),
+        options=dict(scale=stages.scale, solve_blocks=Stages.solve_blocks),
         max_steps=max_steps,
         throw=False,
     )
