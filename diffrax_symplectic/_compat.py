@@ -9,6 +9,8 @@ from typing import Any
 
 import diffrax
 import jax
+import jax.core
+import jax.random as jr
 import jax.tree_util as jtu
 import lineax as lx
 from diffrax._term import AdjointTerm, WrapTerm
@@ -20,7 +22,18 @@ from equinox.internal import (
 )
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, PRNGKeyArray, PyTree
+
+
+def is_threefry(key: PRNGKeyArray) -> bool:
+    """Whether the key belongs to JAX's default generator, by its name, which is all that
+    JAX tells of a generator."""
+    return str(jr.key_impl(key)) == "threefry2x32"
+
+
+def is_traced(x: Any) -> bool:
+    """Whether this value is known only when the program runs."""
+    return isinstance(x, jax.core.Tracer)
 
 
 def computed_by(

@@ -15,4 +15,4 @@ from .random import AbstractLaw, check_key, Discrete, is_key, random_words
 from .random import THREE_POINT, typed_key
 from .levy_area import LevyAreaBrownianPath, LevyAreaIncrement
 from .wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPath
-from .variables import drives, path_of, VARIABLES
+from .variables import drives, most_demanding, path_of, VARIABLES

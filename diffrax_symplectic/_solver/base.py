@@ -16,7 +16,7 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._arguments import check_state, whole_number
 from .._batch import batched_like
-from .._brownian import drives, path_of, VARIABLES
+from .._brownian import drives, most_demanding, path_of
 from .._custom_types import Args, Y
 from .._root_finder import PicardNewton
 from .._tableau import AbstractTableau, drift_order, FlatTableau, make_plan, Structure
@@ -99,10 +99,10 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
     @property
     def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
         """The least that the path's increments must contain."""
-        for name, variable in VARIABLES.items():
-            if name in self.variables:
-                return variable.increment
-        return diffrax.AbstractBrownianIncrement
+        variable = most_demanding(self.variables)
+        if variable is None:
+            return diffrax.AbstractBrownianIncrement
+        return variable.increment
 
     def strong_order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | float | None:
         """Strong order of convergence. `None` for a weak method, or if it is not stated."""
