@@ -15,7 +15,6 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic import _compat
-from diffrax_symplectic._adjoint import _Steps
 
 
 def test_private_parts_of_others_are_used_in_one_module_only():
@@ -108,7 +107,7 @@ def test_adjoints_of_diffrax_run_a_loop_with_the_arguments_and_the_state_known_h
                 assert hasattr(init_state, part)
             for part in ("ys", "saveat_ts_index"):
                 assert hasattr(init_state.save_state, part)
-            steps.append(_Steps(kwargs["stepsize_controller"], init_state))
+            steps.append(_compat.StepTimes(kwargs["stepsize_controller"], init_state))
             return super().loop(
                 init_state=init_state,
                 terms=terms,
@@ -124,7 +123,7 @@ def test_adjoints_of_diffrax_run_a_loop_with_the_arguments_and_the_state_known_h
             adjoint=Spy(), max_steps=16,
         )  # fmt: skip
         # The state of a constant step size: how many steps are made, and in which times.
-        assert steps[0].between(1) == 11 == sol.stats["num_steps"]
+        assert steps[0].number() == 11 == sol.stats["num_steps"]
         times = [steps[0].time(i) for i in range(12)]
     assert sol.ts[:12].tolist() == times and 0.2 in times and times[2] < 0.3
 

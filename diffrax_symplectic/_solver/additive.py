@@ -86,8 +86,8 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     def tableau(self) -> AdditiveTableau:
         beta1 = self.beta1
         beta2 = self.beta2
-        # I_k0 / h has the variance h / 3, but that of the path is h / 2 in the mean over the
-        # step. So the squares of the factors are 3 / 2 in the mean over both stages.
+        # I_k0 / h has the variance h / 3, while that of the path is h / 2 in the mean over
+        # the step. So the squares of the factors are 3 / 2 in the mean over both stages.
         first = 1 + self.sign / np.sqrt(2)
         second = 1 - self.sign / np.sqrt(2)
         B = np.array([[first, 0], [second - self.b, self.b]])

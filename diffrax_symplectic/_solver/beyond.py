@@ -170,8 +170,9 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         def drift_flow(flow: _Flow, y: Y, solved: Solved) -> tuple[Y, Solved]:
             if len(drift) == 0:
                 return y, solved
+            h = flow.t1 - flow.t0
             driven = drift_driven(drift, flow.t0, flow.t1, args)
-            step = Step(flow.t0, flow.t1 - flow.t0, {"h": driven})
+            step = Step(flow.t0, h, {"h": driven})
             return take_step(_FLOW, step, y, self, solved)
 
         def noise_flow(flow: _Flow, y: Y, solved: Solved) -> tuple[Y, Solved]:
