@@ -308,13 +308,20 @@ def _solve_bwd(
         t0 = times.time(i)
         t1 = times.time(i + 1)
         if back:
-            t0, t1 = -t1, -t0
+            begin = -t1
+            end = -t0
             terms = reversed_in_time(terms)
+        else:
+            begin = t0
+            end = t1
         # As after a jump, since the solver state belongs to another step.
         made_jump = True
         solver_state = times.solver_state()
-        y1, *_ = solver.step(terms, t0, t1, y, args, solver_state, made_jump)
+        y1, *_ = solver.step(terms, begin, end, y, args, solver_state, made_jump)
         return y1
+
+    def going(walk: _Walk) -> Bool[Array, ""]:
+        return walk.i > 0
 
     def body(walk: _Walk) -> _Walk:
         i = walk.i - 1
@@ -329,7 +336,8 @@ def _solve_bwd(
             t1 = times.time(i + 1)
             passed = _saved_between(t0, t1, saveat.ts, g, passed)
         # Forward again, from the state that was found: its transposed Jacobian is exact.
-        _, vjp = jax.vjp(lambda y, diff: step(y, diff, i, False), y, diff)
+        forward = ft.partial(step, i=i, back=False)
+        _, vjp = jax.vjp(forward, y, diff)
         through, a_parameters = vjp(passed.a_y1)
         return _Walk(
             i=i,
@@ -355,7 +363,7 @@ def _solve_bwd(
         size=optx.max_norm(y1),
         arrived=jnp.array(True),
     )
-    walk = lax.while_loop(lambda walk: walk.i > 0, body, walk)
+    walk = lax.while_loop(going, body, walk)
     a_y = walk.a_y
     if saveat.ts is not None:
         # States saved at the start itself.
