@@ -30,7 +30,7 @@ PRIVATE_ATTRIBUTE = re.compile(
 )
 # What uses such attributes still, and is to call `_compat.py` instead. Nothing is to be
 # added here.
-STILL_TO_DO = ("_ensemble/", "_expectation/", "_terms/", "_solver/_friction.py")
+STILL_TO_DO = ("_ensemble/", "_expectation/", "_terms/")
 
 
 def _private_imports(tree: ast.AST) -> set[str]:
