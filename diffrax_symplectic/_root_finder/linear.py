@@ -65,7 +65,7 @@ def correction(fn: _Map, x: _Vector, solver: LinearSolver) -> NewtonCorrection:
         return jax.jvp(fn, (x,), (unit,))
 
     value, matrix = jax.vmap(value_and_column, out_axes=(None, 1))(_units(x))
-    return NewtonCorrection(value, _eliminate(matrix, value), jnp.array(True))
+    return NewtonCorrection(value, eliminate(matrix, value), jnp.array(True))
 
 
 def solve(
@@ -76,7 +76,7 @@ def solve(
     failure."""
     if solver is None and rhs.size <= _MAX_DENSE:
         matrix = jax.vmap(apply, out_axes=1)(_units(rhs))
-        return LinearSolution(_eliminate(matrix, rhs), jnp.array(True))
+        return LinearSolution(eliminate(matrix, rhs), jnp.array(True))
     if solver is None:
         solver = lx.GMRES(reduction, reduction, restart=_DIRECTIONS)
     # Absolute tolerances assume a right-hand side of size one.
@@ -98,7 +98,7 @@ def _size_or_one(rhs: _Vector) -> Scalar:
     return jnp.where(size > 0, size, 1)
 
 
-def _eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
+def eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     """Solves a linear system by elimination with partial pivoting, in XLA operations:
     LAPACK needs a call for each matrix of a batch, and 0.1 s to load."""
     num_unknowns = len(rhs)
