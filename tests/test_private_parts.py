@@ -6,6 +6,7 @@ import inspect
 import re
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import diffrax
@@ -61,6 +62,9 @@ def _private_attributes(tree: ast.AST) -> set[str]:
             if first not in ("self", "cls") and PRIVATE_ATTRIBUTE.search(name):
                 found.add(name)
     return found
+
+
+from .ensemble.fused import needs_drjit
 
 
 def test_private_parts_of_others_are_used_in_one_module_only():
@@ -304,3 +308,47 @@ def test_traced_programs_tell_literals_and_what_they_call():
     assert product.primitive.name == "mul"
     literals = [isinstance(x, _compat.Literal) for x in product.invars]
     assert literals == [True, False]
+
+
+on_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="needs LLVM")
+
+
+def needs_llvm(test):
+    return needs_drjit(on_cpu(test))
+
+
+def _ends_with(code: str) -> subprocess.CompletedProcess:
+    """A program of Dr.Jit, which may abort, in a process of its own."""
+    start = "import drjit as dr\nfrom drjit.llvm import Float\nx = Float([1, -2, 3])\n"
+    command = [sys.executable, "-c", start + textwrap.dedent(code)]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+# Two faults of Dr.Jit 1.5. Once one of these tests fails, Dr.Jit has mended it. The
+# function that is named can go as soon as `pyproject.toml` asks for that version.
+
+
+@needs_llvm
+def test_drjit_writes_the_result_of_a_conditional_into_what_its_branch_returned():
+    # So `_ensemble._tensor.copied` copies what a branch returns.
+    done = _ends_with(
+        """
+        y = 3 * x
+        dr.if_stmt((), x > 0, lambda: x * x, lambda: y, mode="symbolic")
+        print(y)
+        """
+    )
+    assert done.stdout.split("\n")[0] == "[1, -6, 9]", done.stderr
+
+
+@needs_llvm
+def test_drjit_returns_the_constant_of_a_branch_from_a_conditional():
+    # So `_ensemble._tensor.made_here` makes constants anew.
+    done = _ends_with(
+        """
+        half = lambda sign: lambda: (Float(0.5), sign * x)
+        y, z = dr.if_stmt((), x > 0, half(1), half(-1), mode="symbolic")
+        print(z + dr.if_stmt((), x > 0, lambda: y, lambda: x, mode="symbolic"))
+        """
+    )
+    assert done.returncode < 0 and "does not dominate all uses" in done.stderr

@@ -94,8 +94,8 @@ CASES = {
     # JAX 0.12's own, in single precision and without optimizations, is off by 10.
     "asin": (unit(jnp.arcsin), [(F, ())], 12),
     "asinh": (domain(-1e9, 1e9)(jnp.arcsinh), [(F, ())], 4),
-    "atan": (jnp.arctan, [(F, ())], 16),
-    "atan2": (lambda y, x: jnp.arctan2(jnp.clip(y, -9, 9), jnp.clip(x, -9, 9)), [(F, ()), (F, ())], 16),
+    "atan": (jnp.arctan, [(F, ())], 4),
+    "atan2": (jnp.arctan2, [(F, ()), (F, ())], 4),
     # Of which JAX's own is off by up to 128.
     "atanh": (unit(jnp.arctanh), [(F, ())], 128),
     "bitcast_convert": (lambda x: lax.bitcast_convert_type(x, jnp.int32), [(U, ())], 0),
