@@ -82,6 +82,7 @@ from ._tableau import (
     SeparableTableau as SeparableTableau,
 )
 from ._terms import (
+    constrained_state as constrained_state,
     from_pair as from_pair,
     from_spinors as from_spinors,
     hamiltonian_terms as hamiltonian_terms,

@@ -24,6 +24,7 @@ from ._solver import (
     BAOAB,
     NinomiyaVictoir,
 )
+from ._terms import refuse_constraint
 
 
 class ReversingAdjoint(diffrax.AbstractAdjoint):
@@ -84,6 +85,7 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
             raise ValueError(
                 "`ReversingAdjoint` takes no `solver_state` and no `controller_state`."
             )
+        refuse_constraint(terms, "ReversingAdjoint")
         _check_supported(solver, stepsize_controller, event, saveat)
         y = init_state.y
         # Each step of the backward pass recomputes the solver state (see `made_jump`).

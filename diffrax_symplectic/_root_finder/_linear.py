@@ -60,6 +60,15 @@ def solve(
     return x * size, result == lx.RESULTS.successful
 
 
+def solve_matrix(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
+    """Solves `matrix @ x = rhs`, differentiably. Of a singular matrix `x` is not finite, or
+    large."""
+    # To rounding error, also by GMRES.
+    reduction = float(jnp.finfo(rhs.dtype).eps) ** 0.9
+    by = lambda apply, rhs: solve(apply, rhs, None, reduction)[0]
+    return lax.custom_linear_solve(lambda x: matrix @ x, rhs, by, by)
+
+
 def _units(x: _Vector) -> Any:
     # A NumPy constant, which XLA folds, unlike `jnp.eye`.
     return np.eye(x.size, dtype=x.dtype)

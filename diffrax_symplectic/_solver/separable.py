@@ -5,6 +5,10 @@ from typing import ClassVar, get_args, Literal, TypeAlias
 import equinox as eqx
 
 from .._tableau import PartitionedTableau, SeparableTableau
+from .._terms import constraint_of
+from ._constrained import init_constrained, verlet_step
+from ._step import result_of, Solved
+from ._times import result_at
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
@@ -204,6 +208,19 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
         B0=[[0], [1]],
         A1=[[1 / 2, 0]],
     )
+
+    def init(self, terms, t0, t1, y0, args) -> Solved:
+        if constraint_of(terms) is None:
+            return super().init(terms, t0, t1, y0, args)
+        return init_constrained(self, terms, t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        if constraint_of(terms) is None:
+            return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
+        at = terms, t0, t1, y0, args
+        y1, solved = verlet_step(*at, solver_state, type(self).__name__)
+        result = result_at(terms, t0, t1, result_of(solved, y1))
+        return y1, None, dict(y0=y0, y1=y1), solved, result
 
 
 _kicks = {"W": [1 / 2, 0, 1 / 2], "H": [1, 0, -1], "C": [-1, 2, -1]}

@@ -14,7 +14,13 @@ from .._arguments import check_pair, check_takes
 from .._compat import direction
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
-from .._terms import Dependence, has_lifted, is_hamiltonian, split_terms
+from .._terms import (
+    Dependence,
+    has_lifted,
+    is_hamiltonian,
+    refuse_constraint,
+    split_terms,
+)
 from ._friction import (
     apply_friction,
     checked,
@@ -108,6 +114,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
         return None if order is None else min(order, 2)
 
     def init(self, terms, t0, t1, y0, args) -> Any:
+        refuse_constraint(terms, type(self).__name__)
         check_pair(y0)
         prepared = self.prepare(terms, t0, direction(terms) * (t1 - t0) / 2, y0, args)
         return self.solver.init(terms, t0, t1, y0, args), prepared

@@ -1,0 +1,310 @@
+"""The states that a constraint allows: projections onto them, and free flight on them."""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.core
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Bool, Float, PyTree, Scalar
+
+from .._arguments import check_pair, check_state, shapes
+from .._batch import batched_like, error_if_alone
+from .._custom_types import Args, RealScalarLike
+from .._root_finder import correction, max_norm, ratio, solve_matrix
+from ._constraint import Constraint, constraint_of, without_constraint
+from ._dependence import Dependence
+from ._hamiltonian import evaluated
+from ._structure_checks import separable_fault
+from ._vector_fields import check_fit, rate, split_terms
+
+
+_Vector: TypeAlias = Float[Array, " n"]
+_Multipliers: TypeAlias = Float[Array, " c"]
+
+# Newton's method takes three or four steps, and up to twice as many from far away.
+_MOST_STEPS = 30
+# It has converged once the next correction would change no position by more than so many
+# units in the last place of the largest one.
+_UNITS = 1.0
+# Corrections below so many units that no longer shrink are rounding errors.
+_ROUNDING = 100.0
+_SHRINK = 0.25
+
+
+class Frame(NamedTuple):
+    """The directions normal to the surface at a position.
+
+    - `normals`: the gradients of the constraints, `J`.
+    - `along`: the changes of the velocity by impulses along them, `M^-1 J^T`.
+    - `gram`: `J M^-1 J^T`.
+    """
+
+    normals: Float[Array, "c n"]
+    along: Float[Array, "n c"]
+    gram: Float[Array, "c c"]
+
+
+class Surface(NamedTuple):
+    """The positions that a constraint allows and the momenta tangent to them, `J v = 0`.
+    Both are vectors.
+
+    - `residual`: the constraint, as a function of the position.
+    - `velocity`: `v = dH0/dp` as a function of the momentum, which is linear up to a
+        constant: its derivative is the inverse of the masses, `M^-1`.
+    """
+
+    residual: Callable[[_Vector], _Multipliers]
+    velocity: Callable[[_Vector], _Vector]
+
+    @staticmethod
+    def of(
+        terms: PyTree[diffrax.AbstractTerm], t: RealScalarLike, y: PyTree, args: Args
+    ) -> "Surface":
+        """That of constrained terms. Raises a `ValueError` if the constraint does not
+        return an array of shape `(c,)`."""
+        constraint = constraint_of(terms)
+        assert constraint is not None
+        drift, _ = split_terms(without_constraint(terms))
+        _, q = y
+        _, unravel = jfu.ravel_pytree(q)
+
+        def residual(x: _Vector) -> _Multipliers:
+            return _values(constraint, unravel(x), args)
+
+        def velocity(x: _Vector) -> _Vector:
+            return jfu.ravel_pytree(rate(drift, t, (unravel(x), q), args)[1])[0]
+
+        return Surface(residual, velocity)
+
+    def frame(self, q: _Vector) -> Frame:
+        normals = jax.jacrev(self.residual)(q)
+        still = jnp.zeros_like(q)
+        pushed = lambda x: jax.jvp(self.velocity, (still,), (x,))[1]
+        along = jax.vmap(pushed, out_axes=1)(normals)
+        return Frame(normals, along, normals @ along)
+
+    def tangent(self, p: _Vector, q: _Vector) -> _Vector:
+        """The momentum after the impulse of the constraint forces that makes it tangent."""
+        frame = self.frame(q)
+        impulse = solve_matrix(frame.gram, frame.normals @ self.velocity(p))
+        return p - impulse @ frame.normals
+
+    def fly(
+        self,
+        p: _Vector,
+        q: _Vector,
+        time: RealScalarLike,
+        pending: Bool[Array, ""] | bool = True,
+    ) -> tuple[_Vector, _Vector, Bool[Array, ""]]:
+        r"""Free flight on the surface over `time`, by a step of RATTLE,
+
+        $$q_1 = q + h\, v(p_1), \qquad p_1 = p - J(q)^\top \lambda, \qquad g(q_1) = 0,$$
+
+        and whether the multipliers were found. The momentum $p_1$ still has to be made
+        tangent at $q_1$. Nothing is solved for, nor found, if not `pending`.
+        """
+        frame = self.frame(q)
+        time = jnp.asarray(time, p.dtype)
+        free = q + time * self.velocity(p)
+        moved = lambda x: free - frame.along @ x
+        off = lambda x: self.residual(moved(x))
+
+        def solve(off: Callable, start: _Multipliers):
+            x, found = _newton(off, moved, start, jnp.asarray(pending))
+            # As a float: `custom_root` gives other types a tangent of a wrong type.
+            return x, found.astype(x.dtype)
+
+        start = jnp.zeros(len(frame.gram), p.dtype)
+        x, found = lax.custom_root(off, start, solve, _tangent_solve, has_aux=True)
+        return p - (x / time) @ frame.normals, moved(x), found > 0
+
+    def dependent(self, q: _Vector) -> Bool[Array, ""]:
+        """Whether the normals are linearly dependent, up to rounding errors."""
+        gram = self.frame(q).gram
+        # In a solve backward in time velocities change their sign.
+        gram = gram * jnp.sign(jnp.trace(gram))
+        size = jnp.sqrt(jnp.diag(gram))
+        # A pivot is the squared sine of the angle between a normal and the ones before it.
+        pivots = jnp.diag(jnp.linalg.cholesky(gram / size / size[:, None])) ** 2
+        rounding = 1000 * jnp.finfo(gram.dtype).eps
+        return ~jnp.all(pivots > rounding)
+
+    def off(self, p: _Vector, q: _Vector) -> Bool[Array, ""]:
+        """Whether a state is farther from the surface than rounding errors explain."""
+        frame = self.frame(q)
+        correction = frame.along @ solve_matrix(frame.gram, self.residual(q))
+        near = float(jnp.finfo(q.dtype).eps) ** (2 / 3)
+        on = max_norm(correction) <= near * max_norm(q)
+        return ~(on & (max_norm(p - self.tangent(p, q)) <= near * max_norm(p)))
+
+
+_DEPENDENT = (
+    "The gradients of `constraint` at `y0` are linearly dependent, or zero. Leave out "
+    "constraints that follow from the others, and write each so that its gradient does not "
+    "vanish where it is zero, such as `jnp.sum(q**2) - 1`."
+)
+_OFF = (
+    "`y0` is off the `constraint`, or its momenta are not tangent to it. Pass "
+    "`constrained_state(terms, y0, args)`."
+)
+
+
+def check_start(
+    terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether the constraints are dependent at `y0`, and whether it is off them. Raises a
+    `ValueError` if either is known while tracing, and for constraints that no solver takes.
+    Otherwise it is an error when run, but not in a batch."""
+    surface = Surface.of(terms, t0, y0, args)
+    (p, _), (q, _) = map(jfu.ravel_pytree, y0)
+    _check_masses(surface, p)
+    dependent = lax.stop_gradient(surface.dependent(q))
+    off = ~dependent & lax.stop_gradient(surface.off(p, q))
+    return _refused(dependent, _DEPENDENT), _refused(off, _OFF)
+
+
+def _refused(fault: Bool[Array, ""], advice: str) -> Bool[Array, ""]:
+    if isinstance(fault, jax.core.Tracer):
+        return error_if_alone(fault, advice)
+    if fault:
+        raise ValueError(advice)
+    return fault
+
+
+def _check_masses(surface: Surface, p: _Vector) -> None:
+    """Raises a `ValueError` unless velocities are linear in the momenta."""
+    pushed = lambda p, x: jax.jvp(surface.velocity, (p,), (x,))[1]
+    if not Dependence(pushed, p, p).independent(lambda p, x: p):
+        raise ValueError(
+            "Terms with a `constraint` need constant masses, H0 = p . M^-1 p / 2 + U(t, q), "
+            "but the second derivative of H0 by p depends on p. Write squares of momenta, "
+            "such as `jnp.sum(p**2 / mass) / 2`."
+        )
+
+
+def constrained_state(
+    terms: PyTree[diffrax.AbstractTerm], y0: PyTree, args: Args = None
+) -> PyTree:
+    r"""A state that a constraint allows, near a given one.
+
+    Positions are moved along $M^{-1} J^\top$, with the masses $M$ of $H_0$ and the
+    gradients $J$ of the constraints at the given positions, until `constraint(q, args)` is
+    zero. Momenta lose their part along $J^\top$ at the new positions, so that $J M^{-1} p =
+    0$: of all allowed momenta these are the nearest in kinetic energy.
+
+    !!! example
+
+        ```python
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+
+        H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + q[1]
+        rod = lambda q, args: jnp.stack([jnp.sum(q**2) - 1])
+        pendulum = ds.hamiltonian_terms(H0, constraint=rod)
+        p, q = ds.constrained_state(pendulum, (jnp.array([0.3, 0.1]), jnp.array([2.0, 0.0])))
+        print(p, q)  # [0 0.1] and [1 0]
+        ```
+
+    **Arguments:**
+
+    - `terms`: the terms, with a `constraint`.
+    - `y0`: the state `(p, q)`.
+    - `args`: as for `diffrax.diffeqsolve`.
+
+    **Returns:** the pair `(p, q)`. Differentiable.
+
+    **Raises:** a `ValueError` if the terms have no constraint, if no solver takes them, if
+    the constraints are dependent at `y0`, or if Newton's method finds no allowed positions.
+    If this is not known while tracing, the state is NaN, and a solve from there fails.
+    """
+    if constraint_of(terms) is None:
+        raise ValueError(
+            "`constrained_state` needs terms with a `constraint`, such as "
+            "`hamiltonian_terms(H0, constraint=constraint)`."
+        )
+    check_pair(y0)
+    check_state(y0, "constrained_state")
+    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
+    t = jnp.zeros((), q.dtype)
+    free = without_constraint(terms)
+    check_fit(free, t, y0, args)
+    if fault := separable_fault(*split_terms(free), t, y0, args):
+        raise ValueError(
+            "Terms with a `constraint` need H0 = V(p) + U(t, q) and noise Hamiltonians "
+            f"H_k = U_k(t, q), but {fault.reason}. {fault.advice}"
+        )
+    surface = Surface.of(terms, t, y0, args)
+    _check_masses(surface, p)
+    _, q1, found = surface.fly(jnp.zeros_like(p), q, 1.0)
+    p1 = surface.tangent(p, q1)
+    lost = surface.dependent(q1)
+    if not isinstance(lost, jax.core.Tracer):
+        if lost:
+            raise ValueError(_DEPENDENT)
+        if not found:
+            raise ValueError(
+                "`constrained_state` found no positions with `constraint(q, args) = 0` "
+                "from `y0`. Pass one that is closer to them."
+            )
+    okay = found & ~lost
+    p1, q1 = (jnp.where(okay, x, jnp.nan) for x in (p1, q1))
+    return unravel_p(p1), unravel_q(q1)
+
+
+def _values(constraint: Constraint, q: PyTree, args: Args) -> _Multipliers:
+    value = evaluated("constraint", constraint, q, args=args)
+    real = eqx.is_array_like(value) and not jnp.iscomplexobj(value)
+    if not real or jnp.ndim(value) != 1 or jnp.size(value) == 0:
+        raise ValueError(
+            "`constraint(q, args)` must return a real array of shape `(c,)`, one number "
+            f"for each constraint; got shape {shapes(value)}. For one constraint write "
+            "`jnp.stack([...])`."
+        )
+    return jnp.asarray(value, jnp.result_type(*jtu.tree_leaves(q)))
+
+
+class _Newton(NamedTuple):
+    """The multipliers, the size of the last correction in units of the tolerance, the
+    number of corrections, and whether the next one is within the tolerance."""
+
+    x: _Multipliers
+    size: Scalar
+    number: Array
+    solved: Bool[Array, ""]
+
+
+def _newton(
+    off: Callable, moved: Callable, start: _Multipliers, pending: Bool[Array, ""]
+) -> tuple[_Multipliers, Bool[Array, ""]]:
+    """The root of `off`, and whether it was found; otherwise zero. `moved` maps it to a
+    position."""
+    unit = float(jnp.finfo(start.dtype).eps) * _UNITS
+
+    def going(state: _Newton):
+        left = pending & (state.number < _MOST_STEPS)
+        return left & ~state.solved & ~jnp.isnan(state.size)
+
+    def step(state: _Newton) -> _Newton:
+        _, change, _ = correction(off, state.x, None)
+        x = state.x - change
+        after, before = moved(x), moved(state.x)
+        size = ratio(max_norm(after - before), unit * max_norm(after))
+        shrink = jnp.where(state.number > 0, ratio(size, state.size), 1)
+        rounded = (size <= _ROUNDING) & (shrink >= _SHRINK)
+        solved = (size * jnp.minimum(shrink, 1) <= 1) | rounded
+        return _Newton(x, size, state.number + 1, solved)
+
+    first = _Newton(start, jnp.zeros((), start.dtype), jnp.array(0), jnp.array(False))
+    last = lax.while_loop(going, step, batched_like(first, moved(start)))
+    return jnp.where(last.solved, last.x, 0), last.solved
+
+
+def _tangent_solve(apply: Callable, rhs: _Multipliers) -> _Multipliers:
+    matrix = jax.vmap(apply, out_axes=1)(jnp.eye(len(rhs), dtype=rhs.dtype))
+    return solve_matrix(matrix, rhs)
