@@ -59,7 +59,7 @@ def verlet_step(
     half = (t1 - t0) / 2
     pending = before == optx.RESULTS.successful
 
-    p, q, first = surface.fly(p, q, half, pending)
+    p, q, first = surface.fly(p, surface.frame(q), half, pending)
     y = unravel_p(p), unravel_q(q)
     force, _ = drift_driven(drift, t0, t1, args)(t0 + half, y)
     p = p + jfu.ravel_pytree(force)[0]
@@ -67,9 +67,8 @@ def verlet_step(
         drawn = controls(noise, ["W"], t0, t1, name)["W"]
         kick, _ = apply(noise, drawn, args, t0 + half, y)
         p = p + jfu.ravel_pytree(kick)[0]
-    p = surface.tangent(p, q)
-    p, q, second = surface.fly(p, q, half, pending)
-    y1 = unravel_p(surface.tangent(p, q)), unravel_q(q)
+    p, q, second = surface.fly(p, surface.frame(q), half, pending)
+    y1 = unravel_p(surface.tangent(p, surface.frame(q))), unravel_q(q)
     return ended(y1, first & second, before)
 
 

@@ -40,11 +40,13 @@ _SHRINK = 0.25
 class Frame(NamedTuple):
     """The directions normal to the surface at a position.
 
+    - `q`: the position.
     - `normals`: the gradients of the constraints, `J`.
     - `along`: the changes of the velocity by impulses along them, `M^-1 J^T`.
     - `gram`: `J M^-1 J^T`.
     """
 
+    q: _Vector
     normals: Float[Array, "c n"]
     along: Float[Array, "n c"]
     gram: Float[Array, "c c"]
@@ -84,21 +86,34 @@ class Surface(NamedTuple):
 
     def frame(self, q: _Vector) -> Frame:
         normals = jax.jacrev(self.residual)(q)
-        still = jnp.zeros_like(q)
-        pushed = lambda x: jax.jvp(self.velocity, (still,), (x,))[1]
-        along = jax.vmap(pushed, out_axes=1)(normals)
-        return Frame(normals, along, normals @ along)
+        along = self._pushed(normals.T)
+        return Frame(q, normals, along, normals @ along)
 
-    def tangent(self, p: _Vector, q: _Vector) -> _Vector:
-        """The momentum after the impulse of the constraint forces that makes it tangent."""
-        frame = self.frame(q)
-        impulse = solve_matrix(frame.gram, frame.normals @ self.velocity(p))
-        return p - impulse @ frame.normals
+    def _pushed(self, impulses: Float[Array, "n c"]) -> Float[Array, "n c"]:
+        """The change of the velocity by each of these changes of the momentum."""
+        still = jnp.zeros(len(impulses), impulses.dtype)
+        pushed = lambda x: jax.jvp(self.velocity, (still,), (x,))[1]
+        return jax.vmap(pushed, 1, 1)(impulses)
+
+    def tangent(
+        self,
+        p: _Vector,
+        at: Frame,
+        response: Callable[[_Vector], _Vector] | None = None,
+    ) -> _Vector:
+        """The momentum after the impulses of the constraint forces that make it tangent.
+        An impulse changes the momentum by itself, or by its `response`."""
+        if response is None:
+            gram, changes = at.gram, at.normals.T
+        else:
+            changes = jax.vmap(response, out_axes=1)(at.normals)
+            gram = at.normals @ self._pushed(changes)
+        return p - changes @ solve_matrix(gram, at.normals @ self.velocity(p))
 
     def fly(
         self,
         p: _Vector,
-        q: _Vector,
+        at: Frame,
         time: RealScalarLike,
         pending: Bool[Array, ""] | bool = True,
     ) -> tuple[_Vector, _Vector, Bool[Array, ""]]:
@@ -107,12 +122,12 @@ class Surface(NamedTuple):
         $$q_1 = q + h\, v(p_1), \qquad p_1 = p - J(q)^\top \lambda, \qquad g(q_1) = 0,$$
 
         and whether the multipliers were found. The momentum $p_1$ still has to be made
-        tangent at $q_1$. Nothing is solved for, nor found, if not `pending`.
+        tangent at $q_1$. The momentum $p$ need not be tangent: the multipliers make up for
+        the difference. Nothing is solved for, nor found, if not `pending`.
         """
-        frame = self.frame(q)
         time = jnp.asarray(time, p.dtype)
-        free = q + time * self.velocity(p)
-        moved = lambda x: free - frame.along @ x
+        free = at.q + time * self.velocity(p)
+        moved = lambda x: free - at.along @ x
         off = lambda x: self.residual(moved(x))
 
         def solve(off: Callable, start: _Multipliers):
@@ -120,28 +135,26 @@ class Surface(NamedTuple):
             # As a float: `custom_root` gives other types a tangent of a wrong type.
             return x, found.astype(x.dtype)
 
-        start = jnp.zeros(len(frame.gram), p.dtype)
+        start = jnp.zeros(len(at.gram), p.dtype)
         x, found = lax.custom_root(off, start, solve, _tangent_solve, has_aux=True)
-        return p - (x / time) @ frame.normals, moved(x), found > 0
+        return p - (x / time) @ at.normals, moved(x), found > 0
 
-    def dependent(self, q: _Vector) -> Bool[Array, ""]:
+    def dependent(self, at: Frame) -> Bool[Array, ""]:
         """Whether the normals are linearly dependent, up to rounding errors."""
-        gram = self.frame(q).gram
         # In a solve backward in time velocities change their sign.
-        gram = gram * jnp.sign(jnp.trace(gram))
+        gram = at.gram * jnp.sign(jnp.trace(at.gram))
         size = jnp.sqrt(jnp.diag(gram))
         # A pivot is the squared sine of the angle between a normal and the ones before it.
         pivots = jnp.diag(jnp.linalg.cholesky(gram / size / size[:, None])) ** 2
         rounding = 1000 * jnp.finfo(gram.dtype).eps
         return ~jnp.all(pivots > rounding)
 
-    def off(self, p: _Vector, q: _Vector) -> Bool[Array, ""]:
+    def off(self, p: _Vector, at: Frame) -> Bool[Array, ""]:
         """Whether a state is farther from the surface than rounding errors explain."""
-        frame = self.frame(q)
-        correction = frame.along @ solve_matrix(frame.gram, self.residual(q))
-        near = float(jnp.finfo(q.dtype).eps) ** (2 / 3)
-        on = max_norm(correction) <= near * max_norm(q)
-        return ~(on & (max_norm(p - self.tangent(p, q)) <= near * max_norm(p)))
+        correction = at.along @ solve_matrix(at.gram, self.residual(at.q))
+        near = float(jnp.finfo(p.dtype).eps) ** (2 / 3)
+        on = max_norm(correction) <= near * max_norm(at.q)
+        return ~(on & (max_norm(p - self.tangent(p, at)) <= near * max_norm(p)))
 
 
 _DEPENDENT = (
@@ -164,8 +177,9 @@ def check_start(
     surface = Surface.of(terms, t0, y0, args)
     (p, _), (q, _) = map(jfu.ravel_pytree, y0)
     _check_masses(surface, p)
-    dependent = lax.stop_gradient(surface.dependent(q))
-    off = ~dependent & lax.stop_gradient(surface.off(p, q))
+    at = surface.frame(q)
+    dependent = lax.stop_gradient(surface.dependent(at))
+    off = ~dependent & lax.stop_gradient(surface.off(p, at))
     return _refused(dependent, _DEPENDENT), _refused(off, _OFF)
 
 
@@ -182,9 +196,9 @@ def _check_masses(surface: Surface, p: _Vector) -> None:
     pushed = lambda p, x: jax.jvp(surface.velocity, (p,), (x,))[1]
     if not Dependence(pushed, p, p).independent(lambda p, x: p):
         raise ValueError(
-            "Terms with a `constraint` need constant masses, H0 = p . M^-1 p / 2 + U(t, q), "
-            "but the second derivative of H0 by p depends on p. Write squares of momenta, "
-            "such as `jnp.sum(p**2 / mass) / 2`."
+            "Terms with a `constraint` need constant masses, H0 = p . M^-1 p / 2 + "
+            "U(t, q), but the second derivative of H0 by p depends on p. Write squares of "
+            "momenta, such as `jnp.sum(p**2 / mass) / 2`."
         )
 
 
@@ -207,8 +221,9 @@ def constrained_state(
         H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + q[1]
         rod = lambda q, args: jnp.stack([jnp.sum(q**2) - 1])
         pendulum = ds.hamiltonian_terms(H0, constraint=rod)
-        p, q = ds.constrained_state(pendulum, (jnp.array([0.3, 0.1]), jnp.array([2.0, 0.0])))
-        print(p, q)  # [0 0.1] and [1 0]
+        y0 = (jnp.array([0.3, 0.1]), jnp.array([2.0, 0.0]))
+        p, q = ds.constrained_state(pendulum, y0)
+        print(p, q)  # [0, 0.1] and [1, 0]
         ```
 
     **Arguments:**
@@ -241,9 +256,10 @@ def constrained_state(
         )
     surface = Surface.of(terms, t, y0, args)
     _check_masses(surface, p)
-    _, q1, found = surface.fly(jnp.zeros_like(p), q, 1.0)
-    p1 = surface.tangent(p, q1)
-    lost = surface.dependent(q1)
+    _, q1, found = surface.fly(jnp.zeros_like(p), surface.frame(q), 1.0)
+    at = surface.frame(q1)
+    p1 = surface.tangent(p, at)
+    lost = surface.dependent(at)
     if not isinstance(lost, jax.core.Tracer):
         if lost:
             raise ValueError(_DEPENDENT)
