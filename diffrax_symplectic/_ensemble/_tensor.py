@@ -47,8 +47,8 @@ def known(x: Tensor) -> np.ndarray | None:
 
 
 def each(fn: Callable, *xs: Tensor) -> Tensor:
-    """Applies a function entry by entry. A single entry is repeated as needed."""
-    size = max(xs, key=lambda x: len(x.entries))
+    """Applies a function entry by entry. A scalar is repeated as needed."""
+    size = max(xs, key=lambda x: (len(x.entries), len(x.shape)))
     spread = [
         x.entries
         if len(x.entries) == len(size.entries)
