@@ -26,9 +26,9 @@ from ._friction import (
     spread,
     velocity_of,
 )
-from ._step import result_of
-from ._times import result_at
 from .base import AbstractSymplecticSolver, Record
+from .step import result_of
+from .times import result_at
 
 
 class AbstractLangevinSplitting(AbstractSymplecticSolver):

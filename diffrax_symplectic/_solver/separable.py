@@ -6,15 +6,15 @@ import equinox as eqx
 
 from .._tableau import PartitionedTableau, SeparableTableau
 from .._terms import constraint_of
-from ._constrained import init_constrained, verlet_step
-from ._step import result_of, Solved
-from ._times import result_at
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
     free_parameter,
     Record,
 )
+from .constrained import init_constrained, verlet_step
+from .step import result_of, Solved
+from .times import result_at
 
 
 Variant: TypeAlias = Literal["a", "b", "c", "d", "e", "f"]

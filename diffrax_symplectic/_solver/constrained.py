@@ -21,8 +21,8 @@ from .._terms import (
     Surface,
     without_constraint,
 )
-from ._step import no_failure
 from .base import AbstractSymplecticSolver
+from .step import no_failure
 
 
 def init_constrained(
