@@ -2,12 +2,12 @@
 
 The state is a pair `(p, q)`, momenta first.
 
-- Terms: `hamiltonian_terms`, `spin_terms`, `wave_terms`.
+- Terms: `hamiltonian_terms`, `langevin_terms`, `spin_terms`, `wave_terms`.
 - Choosing a solver: `suggest_solver`, `compare_solvers`; try `ImplicitMidpoint` first.
 - Its Brownian path: `solver.path(shape, key)`.
 - Solving: `diffrax.diffeqsolve(terms, solver, t0, t1, dt0, y0)`.
 - Means over many paths: `expectation`; the states of many paths: `ensemble`.
-- Friction: `BAOAB`, `LangevinMiddle`, `Damped`, `thermal_noise`.
+- Friction: `langevin_terms`, for `BAOAB`, `LangevinMiddle`, `Damped` and all others.
 - Stiff linear parts: `LinearFlow`.
 - Gradients of long solves: `ReversingAdjoint`.
 - Checks of one step: `symplecticity_defect`, `weak_order_defect`.
@@ -67,7 +67,6 @@ from ._solver import (
     SRKw5 as SRKw5,
     StormerVerlet as StormerVerlet,
     StrangGauss as StrangGauss,
-    thermal_noise as thermal_noise,
 )
 from ._suggest import (
     suggest_solver as suggest_solver,
@@ -83,10 +82,12 @@ from ._tableau import (
 )
 from ._terms import (
     constrained_state as constrained_state,
+    FrictionAlong as FrictionAlong,
     from_pair as from_pair,
     from_spinors as from_spinors,
     hamiltonian_terms as hamiltonian_terms,
     IndexedNoise as IndexedNoise,
+    langevin_terms as langevin_terms,
     spin_terms as spin_terms,
     to_pair as to_pair,
     to_spinors as to_spinors,

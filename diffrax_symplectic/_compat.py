@@ -17,7 +17,13 @@ from equinox.internal import (
     while_loop as while_loop,
     ω as ω,
 )
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import (
+    ClosedJaxpr,
+    Jaxpr as Jaxpr,
+    jaxpr_as_fun,
+    JaxprEqn as JaxprEqn,
+    Literal as Literal,
+)
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 from jaxtyping import PyTree
 
@@ -25,6 +31,11 @@ from jaxtyping import PyTree
 def unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
     """The user's term. In a solve Diffrax wraps it, to be able to run backward in time."""
     return term.term if isinstance(term, WrapTerm) else term
+
+
+def replaced(term: diffrax.AbstractTerm, new: diffrax.AbstractTerm) -> Any:
+    """`new` in place of the user's term, in the same direction of time."""
+    return WrapTerm(new, term.direction) if isinstance(term, WrapTerm) else new
 
 
 def direction(terms: PyTree[diffrax.AbstractTerm]) -> Any:

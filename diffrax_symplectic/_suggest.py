@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
+from jaxtyping import PRNGKeyArray, PyTree
 
 from ._arguments import check_state
 from ._brownian import (
@@ -31,8 +31,8 @@ from ._custom_types import Args, RealScalarLike, Y
 from ._solver import (
     AbstractLangevinSplitting,
     AbstractSymplecticSolver,
+    BAOAB,
     Damped,
-    ImplicitMidpoint,
     LANGEVIN,
     Record,
     SOLVERS,
@@ -47,7 +47,6 @@ from ._terms import (
     constant_fault,
     Fault,
     FRICTION,
-    is_hamiltonian,
     number_of_noises,
     path_numbers,
     replace_paths,
@@ -127,7 +126,6 @@ def suggest_solver(
     args: Args = None,
     *,
     want: Want,
-    gamma: PyTree[ArrayLike] | None = None,
 ) -> Suggestions:
     r"""Suggests solvers for a system by the structure of its terms, sorted by highest order
     and then by fewest stage vectors to solve for.
@@ -144,14 +142,11 @@ def suggest_solver(
     - `t0`, `y0`, `args`: the initial time and state, and `args`, as for
         `diffrax.diffeqsolve`.
     - `want`: `"weak"` for expectations, or `"strong"` for single paths.
-    - `gamma`: the rate of additional friction $-\gamma p\,\mathrm{d}t$, as for
-        [`diffrax_symplectic.Damped`][]. Then solvers with friction are suggested.
 
     **Returns:** a sequence of [`diffrax_symplectic.Suggestion`][]s.
 
     **Raises:** a `ValueError` if `want` is neither of the two, if `terms` has no Brownian
-    path, for terms and states that no solver accepts, and for a `gamma` that does not fit
-    the momenta.
+    path, or for terms and states that no solver accepts.
     """
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
@@ -168,14 +163,12 @@ def suggest_solver(
         if constant_fault(noise, t0, y0, args) is None:
             structures.append("constant")
     m = number_of_noises(terms)
-    commute = m == 1 or len(structures) > 0 or commuting(noise, t0, y0, args)
-    solvers = ranked(want, structures, commute, m, gamma)
-    if gamma is not None:
-        if not any(map(is_hamiltonian, drift)):
-            # `Damped` does not accept plain terms; the Langevin splittings do.
-            solvers = [s for s in solvers if isinstance(s, AbstractLangevinSplitting)]
-        probe = next(iter(solvers), Damped(ImplicitMidpoint(), gamma))
-        probe.init(terms, t0, t0 + 1, y0, args)  # raises if `gamma` does not fit
+    # Noise in the forces commutes, whatever the drift is.
+    in_forces = separable_fault((), noise, t0, y0, args) is None
+    commute = m == 1 or len(structures) > 0 or in_forces
+    commute = commute or commuting(noise, t0, y0, args)
+    with_friction = takes_friction_apart(terms, t0, y0, args)
+    solvers = ranked(want, structures, commute, m, with_friction)
     paths = brownian_paths(noise)
     if len(noise) > 1 or not jtu.all_leaves([increment_struct(paths[0])]):
         # Lévy areas are only sampled between the noises of one array.
@@ -189,9 +182,9 @@ def suggest_solver(
     noises = "one noise"
     if m > 1:
         noises = f"{m} noises that {'commute' if commute else 'do not commute'}"
-    if gamma is not None:
+    if with_friction:
         noises = f"friction and {noises}"
-    system = _system(structures, not_separable, noises)
+    system = _system(structures, not_separable, noises, with_friction)
     if any(isinstance(path, diffrax.UnsafeBrownianPath) for path in paths):
         system += (
             " Its `diffrax.UnsafeBrownianPath` rounds times to 32 bits and repeats its "
@@ -200,15 +193,17 @@ def suggest_solver(
     return Suggestions(f"For {want} approximation. {system}", found)
 
 
-def _system(structures: list[Structure], fault: Fault | None, noises: str) -> str:
+def _system(
+    structures: list[Structure], fault: Fault | None, noises: str, with_friction: bool
+) -> str:
     """The structure of the system, in a sentence. `fault` is why it is not separable."""
     kind = " and ".join(structures) or f"general ({fault.reason if fault else ''})"
     system = f"The system is {kind}, with {noises}."
     if fault is not None:
         if structures and WRONG_WAY_ROUND in fault.reason:
             system += f" It is not separable: {fault.reason}."
-        if fault.friction:
-            system += f" {FRICTION} Without it, ask with `gamma=`."
+        if fault.friction and not with_friction:
+            system += f" {FRICTION}"
     return system
 
 
@@ -236,15 +231,26 @@ def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     return drift, noise
 
 
+def takes_friction_apart(
+    terms: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
+) -> bool:
+    """Whether these are Langevin terms that `BAOAB` accepts."""
+    try:
+        BAOAB().check(terms, t0, y0, args)
+    except ValueError:
+        return False
+    return True
+
+
 def ranked(
     want: Want,
     structures: Collection[Structure],
     commute: bool,
     num_noises: int,
-    gamma: PyTree[ArrayLike] | None = None,
+    friction: bool = False,
 ) -> list[AbstractSymplecticSolver]:
     """The suggested solvers for these structures (`"any"` is implied) and noises, best
-    first."""
+    first; and with `friction`, for Langevin terms whose other terms are separable."""
     structures = {"any", *structures}
     if {"separable", "constant"} <= structures:
         structures.add("separable and constant")
@@ -264,13 +270,15 @@ def ranked(
 
     def fits(solver: AbstractSymplecticSolver) -> bool:
         record = _record(solver)
-        wanted = want in record.suggested and record.noises in noises
-        return wanted and solver.structure in structures
+        return want in record.suggested and record.noises in noises
 
-    solvers = [solver() for solver in SOLVERS]
-    if gamma is not None:
-        langevin = [solver(gamma) for solver in LANGEVIN]
-        solvers = [*langevin, *(Damped(solver, gamma) for solver in solvers)]
+    every = [solver() for solver in SOLVERS]
+    solvers = [solver for solver in every if solver.structure in structures]
+    if friction:
+        # Solvers for separable systems need a friction that is treated apart.
+        separable = [solver for solver in every if solver.structure == "separable"]
+        solvers += [solver() for solver in LANGEVIN]
+        solvers += [Damped(solver) for solver in separable]
     return sorted(filter(fits, solvers), key=rank)
 
 
@@ -280,10 +288,9 @@ def _record(solver: AbstractSymplecticSolver) -> Record:
 
 
 def _code(solver: AbstractSymplecticSolver, module: str = "") -> str:
-    """The code that constructs the solver, with friction called `gamma`."""
-    given = "gamma" if isinstance(solver, AbstractLangevinSplitting) else ""
-    if isinstance(solver, Damped):
-        given = f"{_code(solver.solver, module)}, gamma"  # pyright: ignore
+    """The code that constructs the solver."""
+    damped = isinstance(solver, Damped)
+    given = _code(solver.solver, module) if damped else ""  # pyright: ignore
     return f"{module}{type(solver).__name__}({given})"
 
 

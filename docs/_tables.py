@@ -40,9 +40,9 @@ _NOISES = {
 }
 # Examples of solvers without defaults. A splitting is shown around any solver.
 _SPLIT = (
-    ds.BAOAB(1.0),
-    ds.LangevinMiddle(1.0),
-    ds.Damped(ds.NinomiyaVictoir(), 1.0),
+    ds.BAOAB(),
+    ds.LangevinMiddle(),
+    ds.Damped(ds.NinomiyaVictoir()),
     ds.LinearFlow(ds.NinomiyaVictoir(), lambda time, y, args: y),
 )
 

@@ -282,6 +282,14 @@ def rigid_body_terms(path, mu=0.1, inertia=(0.8, 0.6, 0.2)):
     )
 
 
+def damped_terms(H0, friction, noise=None, path=None) -> diffrax.MultiTerm:
+    """The terms of a system with friction, and with other noise than that of a bath."""
+    terms = ds.langevin_terms(H0, friction).terms
+    if noise is not None:
+        terms = *terms, ds.hamiltonian_terms(H0, noise, path).terms[1]
+    return diffrax.MultiTerm(*terms)
+
+
 def slope(hs, errors):
     """The order that errors at several step sizes show, by least squares."""
     return np.polyfit(np.log(hs), np.log(np.abs(errors)), 1)[0]

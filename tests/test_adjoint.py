@@ -13,7 +13,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._adjoint import _begin_anew, _undoes_its_steps
 from diffrax_symplectic._tableau import FlatTableau, is_own_inverse, Stage
 
-from .problems import Given, H0, noise, random_problem, weak_path
+from .problems import damped_terms, Given, H0, noise, random_problem, weak_path
 
 
 def separable_H0(t, p, q, args):
@@ -57,7 +57,7 @@ def test_solvers_that_do_not_undo_their_steps_are_refused():
     refused = (
         *[ds.SRKw2(), ds.SRKs3(), ds.SRKs4(), ds.SRKw3(), ds.SRKw4(), ds.SRKw5()],
         *[ds.PlateauVerlet(), ds.AdditiveGauss(), diffrax.Heun()],
-        *[diffrax.HalfSolver(ds.StormerVerlet()), diffrax.HalfSolver(ds.BAOAB(1.0))],
+        *[diffrax.HalfSolver(ds.StormerVerlet()), diffrax.HalfSolver(ds.BAOAB())],
     )
     assert not any(map(_undoes_its_steps, refused))
 
@@ -319,13 +319,14 @@ def test_backsolve_is_refused_with_advice(solver):
 def test_friction_is_walked_back_too(inner, form):
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 - args * jnp.sum(jnp.cos(q + t))
     noise = lambda t, p, q, args: args * jnp.sum(jnp.sin(q))
-    terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
-    y0 = (jnp.array([0.3, 0.1]), jnp.array([0.5, -0.2]))
+    path = ds.WeakBrownianPath((), jr.key(0))
+    make = lambda friction: damped_terms(H0, friction, noise, path)
+    solver, y0 = ds.Damped(inner), (jnp.array([0.3, 0.1]), jnp.array([0.5, -0.2]))
 
     @jax.jit
     def gradients(gamma):
         def loss(y0, args, gamma, adjoint):
-            solver = ds.Damped(inner, gamma * form)
+            terms = make(gamma * form)
             sol = diffrax.diffeqsolve(
                 terms, solver, 0.0, 2.0, 0.1, y0, args, adjoint=adjoint
             )
@@ -343,6 +344,6 @@ def test_friction_is_walked_back_too(inner, form):
         assert ours[2] != 0
     with pytest.raises(ValueError, match="needs a reversible solver"):
         diffrax.diffeqsolve(
-            terms, ds.Damped(ds.SRKs3(), 0.1), 0.0, 1.0, 0.1, y0, 0.7,
+            make(0.1), ds.Damped(ds.SRKs3()), 0.0, 1.0, 0.1, y0, 0.7,
             adjoint=ds.ReversingAdjoint(),
         )  # fmt: skip

@@ -7,12 +7,11 @@ from .beyond import LevyAreaMidpoint, NinomiyaVictoir, PlateauGauss, StrangGauss
 from .langevin import AbstractLangevinSplitting, BAOAB, LangevinMiddle
 from .times import check_resolution
 from .splitting import AbstractSplitting, Damped, LinearFlow
-from .thermal import thermal_noise
 
 
-# Those of Langevin dynamics, which take the friction as their one argument.
+# Those that need friction, from `langevin_terms`.
 LANGEVIN: tuple[type[BAOAB] | type[LangevinMiddle], ...] = (BAOAB, LangevinMiddle)
-# All solvers without friction, in the order of the documentation.
+# All others, in the order of the documentation.
 SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
     *(ImplicitMidpoint, SRKs1, SRKw1, SRKw2),
     *(StrangGauss, NinomiyaVictoir, PlateauGauss, LevyAreaMidpoint),

@@ -76,8 +76,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
     Stratonovich terms. It defines `structure` (`"any"`, `"separable"`, `"additive"`,
     `"constant"` or `"separable and constant"`), `variables` (the names of the random
     variables of a step, such as `("W",)`), and `stage_vectors(num_noises)`, and overrides
-    `weak_order(terms)` and `strong_order(terms)`. A solver with friction of its own also
-    sets `includes_friction = True`. Then [`diffrax_symplectic.Damped`][] and
+    `weak_order(terms)` and `strong_order(terms)`. Then [`diffrax_symplectic.Damped`][] and
     [`diffrax_symplectic.LinearFlow`][] can wrap it, and `solver.path(shape, key)` makes the
     path that it needs.
     """
@@ -87,7 +86,6 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
         diffrax.LocalLinearInterpolation
     )
     record: ClassVar[Record | None] = None
-    includes_friction: ClassVar[bool] = False
     structure: AbstractVar[Structure]
     variables: AbstractVar[tuple[str, ...]]
 

@@ -1,50 +1,40 @@
-"""Langevin dynamics by splitting: kicks of the forces, drifts of the positions, and the
-exact Ornstein--Uhlenbeck process of friction and noise between them."""
+"""Langevin dynamics by splitting: kicks of the forces, drifts of the positions, and
+friction and noise between them."""
 
 from typing import Any, ClassVar
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import ArrayLike, PyTree
+from jaxtyping import PyTree
 
-from .._compat import direction, unwrapped
-from .._custom_types import RealScalarLike
+from .._arguments import check_state
+from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
-from .._terms import apply, controls, rate, split_terms
-from ._friction import (
-    apply_friction,
-    checked,
-    decay,
-    Fault,
-    friction_modes,
-    friction_result,
-    GAMMA,
-    matrix_faults,
-    spread,
-    velocity_of,
+from .._terms import (
+    apply,
+    check_structure,
+    constraint_of,
+    controls,
+    momentum_first,
+    rate,
 )
 from .base import AbstractSymplecticSolver, Record
+from .bath import after_friction, check_friction, split_friction
+from .constrained import baoab_step, force_at, init_constrained
 from .step import result_of
 from .times import result_at
 
 
 class AbstractLangevinSplitting(AbstractSymplecticSolver):
-    """A kick, half a drift, the Ornstein--Uhlenbeck process, half a drift. A symmetric
-    splitting makes one half of the kick at the start of the step and one at its end; any
-    other makes the whole kick at the start."""
+    """A kick, half a drift, friction and noise, half a drift. A symmetric splitting makes
+    one half of the kick at the start of the step and one at its end; any other makes the
+    whole kick at the start."""
 
-    structure: ClassVar[Structure] = "separable and constant"
+    structure: ClassVar[Structure] = "separable"
     variables: ClassVar[tuple[str, ...]] = ("W",)
-    includes_friction: ClassVar[bool] = True
     symmetric: eqx.AbstractClassVar[bool]
-    gamma: eqx.AbstractVar[PyTree[ArrayLike]]
-    _faults: eqx.AbstractVar[tuple[Fault | None, ...]]
-
-    def __post_init__(self):
-        self._faults = matrix_faults(self.gamma)
 
     def stage_vectors(self, num_noises):
         return ()
@@ -52,50 +42,50 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
     def order(self, terms):
         return 2 if self.symmetric else 1
 
+    def check(self, terms, t0, y0: Y, args: Args) -> None:
+        name = type(self).__name__
+        check_state(y0, name)
+        terms, y0 = momentum_first(terms, y0)
+        drift, friction, noise = split_friction(terms)
+        check_structure(self.structure, drift, noise, t0, y0, args, name)
+        check_friction(friction, t0, y0, args, name)
+
     def init(self, terms, t0, t1, y0, args) -> Any:
         """The forces, which a symmetric splitting hands on from the end of a step to the
-        start of the next one, and the modes of the friction."""
+        start of the next one."""
         del t1
         self.check(terms, t0, y0, args)
-        drift, _ = split_terms(terms)
-        if not all(isinstance(unwrapped(x), diffrax.ODETerm) for x in drift):
-            raise ValueError(
-                f"`{type(self).__name__}` needs a drift driven by time: pass "
-                "`hamiltonian_terms(H0, noise, path)`."
-            )
-        velocity = velocity_of(terms, t0, y0, args)
-        modes = friction_modes(self.gamma, self._faults, y0[0], velocity)
-        forces = rate(drift, t0, y0, args)[0] if self.symmetric else None
-        return forces, modes
+        terms, y0 = momentum_first(terms, y0)
+        drift, _, _ = split_friction(terms)
+        return rate(drift, t0, y0, args)[0] if self.symmetric else None
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
-        drift, noise = split_terms(terms)
-        forces, modes = solver_state
+        own_terms, own_y0 = terms, y0
+        terms, y0 = momentum_first(terms, y0)
+        drift, friction, noise = split_friction(terms)
+        forces = solver_state
         anew = lambda: rate(drift, t0, y0, args)[0]
         if not self.symmetric:
             forces = anew()
         elif made_jump is not False:
-            forces = lax.cond(made_jump, anew, lambda: solver_state[0])
+            forces = lax.cond(made_jump, anew, lambda: solver_state)
         half = (t1 - t0) / 2
         p = moved(y0[0], half if self.symmetric else t1 - t0, forces)
         q = moved(y0[1], half, rate(drift, t0, (p, y0[1]), args)[1])
-        # In a solve backward in time the momentum grows. Diffrax makes `t1 - t0` positive.
-        time = 2 * direction(terms) * half
-        parts = [(decay, p)]
+        kick = None
         if len(noise) > 0:
             drawn = controls(noise, ["W"], t0, t1, type(self).__name__)["W"]
             kick, _ = apply(noise, drawn, args, t0 + half, (p, q))
-            parts.append((spread, kick))
-        p = apply_friction(self.gamma, modes, time, *parts)
+        p = after_friction(friction, t0 + half, t1 - t0, (p, q), args, kick)
         q = moved(q, half, rate(drift, t1, (p, q), args)[1])
         if self.symmetric:
             forces, _ = rate(drift, t1, (p, q), args)
             p = moved(p, half, forces)
-        y1 = p, q
-        result = result_at(terms, t0, t1, result_of(None, y1))
-        result = friction_result(self.gamma, modes, result)
-        state = forces if self.symmetric else None, modes
-        return y1, None, dict(y0=y0, y1=y1), state, result
+        result = result_at(terms, t0, t1, result_of(None, (p, q)))
+        # Exchanged once more.
+        _, y1 = momentum_first(own_terms, (p, q))
+        state = forces if self.symmetric else None
+        return y1, None, dict(y0=own_y0, y1=y1), state, result
 
 
 class BAOAB(AbstractLangevinSplitting):
@@ -154,8 +144,24 @@ class BAOAB(AbstractLangevinSplitting):
         "Mobility and diffusion are too large by a factor of x coth x, x = gamma h / 2.",
         suggested=("weak", "strong"),
     )
-    gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
-    _faults: tuple[Fault | None, ...] = eqx.field(static=True, init=False, repr=False)
+
+    def init(self, terms, t0, t1, y0, args) -> Any:
+        if constraint_of(terms) is None:
+            return super().init(terms, t0, t1, y0, args)
+        solved = init_constrained(self, terms, t0, y0, args)
+        return force_at(terms, t0, y0, args), solved
+
+    def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
+        if constraint_of(terms) is None:
+            return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
+        force, solved = solver_state
+        if made_jump is not False:
+            anew = lambda: force_at(terms, t0, y0, args)
+            force = lax.cond(made_jump, anew, lambda: solver_state[0])
+        at = terms, t0, t1, y0, args
+        y1, force, solved = baoab_step(*at, force, solved, type(self).__name__)
+        result = result_at(terms, t0, t1, result_of(solved, y1))
+        return y1, None, dict(y0=y0, y1=y1), (force, solved), result
 
 
 class LangevinMiddle(AbstractLangevinSplitting):
@@ -199,22 +205,9 @@ class LangevinMiddle(AbstractLangevinSplitting):
         "`BAOAB`; momenta lag by half a step.",
         suggested=("weak", "strong"),
     )
-    gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
-    _faults: tuple[Fault | None, ...] = eqx.field(static=True, init=False, repr=False)
 
 
 def moved(x: PyTree, time: RealScalarLike, rate: PyTree) -> PyTree:
     """`x` after `time` at a constant rate."""
     along = lambda x, v: x + jnp.asarray(time, jnp.result_type(x)) * v
     return jtu.tree_map(along, x, rate)
-
-
-_INIT = f"""**Arguments:**
-
-- `gamma`: {GAMMA}
-
-**Raises:** a `ValueError` if `gamma` is known to be negative, not finite or not such a
-    matrix; and in the solve if it does not fit `p`, or if the terms are not separable with
-    constant noise.
-"""
-BAOAB.__init__.__doc__ = LangevinMiddle.__init__.__doc__ = _INIT

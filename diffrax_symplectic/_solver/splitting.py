@@ -1,4 +1,4 @@
-"""Exact flows around the step of another solver: friction, or a linear part."""
+"""Friction, or the exact flow of a linear part, around the step of another solver."""
 
 import abc
 from collections.abc import Callable
@@ -8,37 +8,21 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, PyTree
+from jaxtyping import PyTree
 
 from .._arguments import check_pair, check_takes
 from .._compat import direction
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
-from .._terms import (
-    Dependence,
-    has_lifted,
-    is_hamiltonian,
-    refuse_constraint,
-    split_terms,
-)
-from ._friction import (
-    apply_friction,
-    checked,
-    decay,
-    Fault,
-    friction_modes,
-    friction_result,
-    GAMMA,
-    matrix_faults,
-    Modes,
-    velocity_of,
-)
+from .._terms import Dependence, flattened, has_lifted, is_friction, refuse_constraint
 from .base import AbstractSymplecticSolver, Order, Record
+from .bath import after_friction, check_friction, split_friction
+from .langevin import AbstractLangevinSplitting, LangevinMiddle
 
 
 class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
-    """Strang splitting: an exact flow over half a step, a step of `solver` for the rest of
-    the system, and the flow over the other half."""
+    """Strang splitting: a flow over half a step, a step of `solver` for the rest of the
+    system, and the flow over the other half."""
 
     solver: eqx.AbstractVar[AbstractSymplecticSolver]
     # When to choose it, in a sentence.
@@ -50,16 +34,14 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
     advice: ClassVar[str] = ""
 
     @abc.abstractmethod
-    def prepare(self, terms, t0, time: RealScalarLike, y0: Y, args: Args) -> Any:
-        """What all flows over `time` of a solve from `t0` share, computed once."""
+    def half_step(self, terms, t, time: RealScalarLike, y: Y, args: Args) -> Y:
+        """The state after the flow over half of a step, `time`. `t` is the end of the step
+        that belongs to this half. Like these, `time` is positive even in a solve backward
+        in time."""
 
     @abc.abstractmethod
-    def exact_flow(self, prepared: Any, time: RealScalarLike, y: Y, args: Args) -> Y:
-        """The flow over `time`, which is negative in a solve backward in time."""
-
-    @abc.abstractmethod
-    def result_with(self, prepared: Any, result: diffrax.RESULTS) -> diffrax.RESULTS:
-        """The `result` of a step of the solver, or the failure of the flow."""
+    def rest(self, terms) -> PyTree[diffrax.AbstractTerm]:
+        """The terms for `solver`."""
 
     def __check_init__(self):
         # `isinstance` would look through wrappers, such as `diffrax.HalfSolver`.
@@ -87,10 +69,6 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
         return None if order is None else min(order, self.strong)
 
     @property
-    def includes_friction(self) -> bool:  # pyright: ignore
-        return self.solver.includes_friction
-
-    @property
     def structure(self) -> Structure:
         return self.solver.structure
 
@@ -115,23 +93,19 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
 
     def init(self, terms, t0, t1, y0, args) -> Any:
         refuse_constraint(terms, type(self).__name__)
-        check_pair(y0)
-        prepared = self.prepare(terms, t0, direction(terms) * (t1 - t0) / 2, y0, args)
-        return self.solver.init(terms, t0, t1, y0, args), prepared
+        self.check(terms, t0, y0, args)
+        return self.solver.init(self.rest(terms), t0, t1, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         del made_jump
-        inner, prepared = solver_state
-        # In Diffrax `t1 - t0` is positive even in a solve backward in time.
-        time = direction(terms) * (t1 - t0) / 2
-        y = self.exact_flow(prepared, time, y0, args)
+        half = (t1 - t0) / 2
+        y = self.half_step(terms, t0, half, y0, args)
         # The flow is a jump for a solver that remembers the end of its last step.
-        y, error, _, inner, result = self.solver.step(
-            terms, t0, t1, y, args, inner, True
+        y, error, _, state, result = self.solver.step(
+            self.rest(terms), t0, t1, y, args, solver_state, True
         )
-        y1 = self.exact_flow(prepared, time, y, args)
-        result = self.result_with(prepared, result)
-        return y1, error, dict(y0=y0, y1=y1), (inner, prepared), result
+        y1 = self.half_step(terms, t1, half, y, args)
+        return y1, error, dict(y0=y0, y1=y1), state, result
 
 
 def _at_most(order: Order | None, most: int) -> Order | None:
@@ -141,87 +115,74 @@ def _at_most(order: Order | None, most: int) -> Order | None:
 
 
 class Damped(AbstractSplitting):
-    r"""Any solver of this package with friction, $\mathrm{d}p = \ldots - \gamma p\,
-    \mathrm{d}t$.
+    r"""Any solver of this package for Langevin terms, with the friction around its step.
 
-    $$p \gets e^{-\gamma h / 2} p, \qquad (p, q) \gets \text{a step of the solver}, \qquad
-      p \gets e^{-\gamma h / 2} p$$
+    $$p \gets C_{h/2}\, p, \qquad (p, q) \gets \text{a step of the solver}, \qquad
+      p \gets C_{h/2}\, p$$
 
-    The terms do not include the friction, so they remain separable for separable solvers.
+    where $C$ is the implicit midpoint rule for the friction of
+    [`diffrax_symplectic.langevin_terms`][], $\mathrm{d}p = -G v\,\mathrm{d}t$, at fixed
+    $q$. The solver gets all other terms, with the noise of the bath and any other noise. If
+    these are separable it may be a separable solver, such as
+    [`diffrax_symplectic.StormerVerlet`][]; then the method is explicit. The velocity $v =
+    \partial H_0 / \partial p$ must be linear in $p$. Solvers for general systems take
+    Langevin terms as they are, without `Damped`.
 
-    For a single constant $\gamma$ a step is conformally symplectic: with its Jacobian $S'$,
-    $S'^\top J S' = e^{-\gamma h} J$. It is explicit if the solver is. The orders are the
-    solver's, but at most weak order 2, strong order 1, and order 2 without noise.
+    If $G = \gamma M$ with one constant number $\gamma$, a step is conformally symplectic:
+    with its Jacobian $S'$, $S'^\top J S' = c^2 J$ for $c = (1 - \gamma h / 4) / (1 + \gamma
+    h / 4)$. The orders are the solver's, but at most weak order 2, strong order 1, and
+    order 2 without noise.
 
-    The friction acts on the canonical momentum $p$. In a magnetic field, friction on the
-    kinetic momentum $p - A(q)$ needs its own term.
-
-    For Langevin dynamics with constant noise, [`diffrax_symplectic.BAOAB`][] and
+    For Langevin dynamics with separable $H_0$, [`diffrax_symplectic.BAOAB`][] and
     [`diffrax_symplectic.LangevinMiddle`][] have far less bias.
 
     **Source:** the splitting of [Strang (1968)](https://doi.org/10.1137/0705041).
     """
 
     solver: AbstractSymplecticSolver
-    gamma: PyTree[ArrayLike] = eqx.field(converter=checked)
-    _faults: tuple[Fault | None, ...] = eqx.field(static=True, init=False, repr=False)
 
-    def __post_init__(self):
-        self._faults = matrix_faults(self.gamma)
-        if getattr(self.solver, "includes_friction", False):
-            raise ValueError(
-                f"`{type(self.solver).__name__}` already includes friction. Pass all "
-                "friction to it, without `Damped`."
-            )
-
-    includes_friction: ClassVar[bool] = True  # pyright: ignore
     choose: ClassVar[str] = "Friction: collisions, damping, thermostats."
     advice: ClassVar[str] = (
-        "Other solvers take friction as a term: `diffrax.MultiTerm(terms, "
-        "diffrax.ODETerm(friction))`."
+        "Other solvers take the terms of `langevin_terms` as they are, without `Damped`."
     )
 
-    def prepare(self, terms, t0, time, y0, args) -> list[Modes | None]:
-        """The modes of the friction."""
-        del time
-        _check_has_momentum(terms)
-        velocity = velocity_of(terms, t0, y0, args)
-        return friction_modes(self.gamma, self._faults, y0[0], velocity)
+    def __check_init__(self):
+        inner = self.solver
+        while issubclass(type(inner), AbstractSplitting):
+            inner = inner.solver  # pyright: ignore
+        if issubclass(type(inner), AbstractLangevinSplitting):
+            raise ValueError(
+                f"`{type(inner).__name__}` takes the friction of the terms itself: use it "
+                "without `Damped`."
+            )
 
-    def exact_flow(self, prepared: list[Modes | None], time, y, args):
-        p, q = y
-        return apply_friction(self.gamma, prepared, time, (decay, p)), q
+    def check(self, terms, t0, y0, args):
+        if has_lifted(terms):
+            raise ValueError(
+                "`Damped` applies friction to a canonical momentum, which the state of "
+                "`spin_terms` or `wave_terms` does not have: spins would get shorter. For "
+                "damped spins pass `damping=` to `spin_terms`."
+            )
+        check_pair(y0)
+        _, friction, _ = split_friction(terms)
+        check_friction(friction, t0, y0, args, type(self).__name__)
 
-    def result_with(self, prepared, result):
-        return friction_result(self.gamma, prepared, result)
+    def half_step(self, terms, t, time, y, args):
+        _, friction, _ = split_friction(terms)
+        return after_friction(friction, t, time, y, args), y[1]
 
-
-def _check_has_momentum(terms: PyTree[diffrax.AbstractTerm]) -> None:
-    """Raises a `ValueError` unless the first half of the state is a canonical momentum."""
-    if has_lifted(terms):
-        raise ValueError(
-            "`Damped` applies friction to a canonical momentum, which the state of "
-            "`spin_terms` or `wave_terms` does not have: spins would get shorter. For "
-            "damped spins pass `damping=` to `spin_terms`."
-        )
-    if not any(map(is_hamiltonian, split_terms(terms)[0])):
-        raise ValueError(
-            "`Damped` applies friction to the momentum p of a state `(p, q)`. Plain terms "
-            "(`ODETerm`, `ControlTerm`) may have other states, such as (position, "
-            "velocity). Construct the terms with `hamiltonian_terms`; or use "
-            "`BAOAB(gamma)`, if the noise is constant and in the forces; or include the "
-            "friction in the drift, for solvers of general systems."
-        )
+    def rest(self, terms):
+        others = [term for term in flattened(terms) if not is_friction(term)]
+        return diffrax.MultiTerm(*others)
 
 
-Damped.__init__.__doc__ = f"""**Arguments:**
+Damped.__init__.__doc__ = """**Arguments:**
 
 - `solver`: a solver of this package.
-- `gamma`: {GAMMA}
 
-**Raises:** a `ValueError` if `gamma` is negative, not finite or an invalid matrix (unless
-    it is traced), if it does not fit `p` (in the solve), or for a solver of another package
-    or one that already includes friction.
+**Raises:** a `ValueError` for a solver of another package, or one that takes friction
+    itself; and in the solve if the terms have no friction, or one that is not linear in
+    `p`.
 """
 
 
@@ -237,8 +198,12 @@ class LinearFlow(AbstractSplitting):
     The error is proportional to commutators of $L$ with the rest.
 
     The terms contain $R$ and all noises, without $L$. If they depend on $q$ alone,
-    `LinearFlow(StormerVerlet(), flow)` is explicit. With friction and thermal noise use
-    `LinearFlow(BAOAB(gamma), flow)`, in which both are exact.
+    `LinearFlow(StormerVerlet(), flow)` is explicit.
+
+    **Friction.** With friction and noise of a temperature use `LinearFlow(BAOAB(), flow)`.
+    Friction acts on the velocities of the whole system, so it comes from terms of the whole
+    Hamiltonian: `MultiTerm(*hamiltonian_terms(R).terms, *langevin_terms(H0, friction,
+    temperature, path).terms[1:])`.
 
     The method is symplectic if the solver and `flow` are, which
     [`diffrax_symplectic.symplecticity_defect`][] tests. The orders are the solver's, but at
@@ -264,18 +229,27 @@ class LinearFlow(AbstractSplitting):
 
     def __check_init__(self):
         check_takes("flow", self.flow, "time", "y", "args")
+        if issubclass(type(self.solver), LangevinMiddle):
+            raise ValueError(
+                "The momenta of `LangevinMiddle` are late by half a step, which makes "
+                "positions wrong to first order if a flow moves them. Use "
+                "`LinearFlow(BAOAB(), flow)`."
+            )
 
-    def prepare(self, terms, t0, time, y0, args):
-        flow = lambda time, y: self.exact_flow(None, time, y, args)
-        if Dependence(flow, jnp.asarray(time), y0).independent(lambda time, y: time):
+    def check(self, terms, t0, y0, args):
+        check_pair(y0)
+        t0 = jnp.asarray(t0, jnp.result_type(t0, jnp.float32))
+        after = lambda time, y: self.half_step(terms, t0, time, y, args)
+        if Dependence(after, t0, y0).independent(lambda time, y: time):
             raise ValueError(
                 "`flow(time, y, args)` of `LinearFlow` does not depend on `time`, so it is "
                 "not a flow: for `time = 0` it must return `y`. It is called with half of "
                 "each step."
             )
 
-    def exact_flow(self, prepared, time, y, args):
-        y1 = self.flow(time, y, args)
+    def half_step(self, terms, t, time, y, args):
+        del t
+        y1 = self.flow(direction(terms) * time, y, args)
         shape = lambda x: jax.eval_shape(lambda: x)
         if not eqx.tree_equal(shape(y1), shape(y)):
             raise ValueError(
@@ -284,9 +258,8 @@ class LinearFlow(AbstractSplitting):
             )
         return y1
 
-    def result_with(self, prepared, result):
-        del prepared
-        return result
+    def rest(self, terms):
+        return terms
 
 
 LinearFlow.__init__.__doc__ = """**Arguments:**

@@ -226,7 +226,9 @@ def _advice(structure: str) -> str:
     )
 
 
-_GENERAL = "use a solver for general systems, for example `ImplicitMidpoint` or `SRKw1`"
+_GENERAL = (
+    "use a solver for general systems, for example `ImplicitMidpoint` or `StrangGauss`"
+)
 
 
 WRONG_WAY_ROUND = (
@@ -234,8 +236,8 @@ WRONG_WAY_ROUND = (
     "way round? It is `(p, q)`, momentum first, not (position, velocity)"
 )
 FRICTION = (
-    "Leave friction -gamma p out of the terms, and use `BAOAB(gamma)`, or for terms from "
-    "`hamiltonian_terms` use `Damped(solver, gamma)`."
+    "Take friction from `langevin_terms(H0, friction, temperature, path)`: `BAOAB()`, "
+    "`LangevinMiddle()` and `Damped(solver)` treat it by a step of its own."
 )
 
 

@@ -20,6 +20,7 @@ from .._root_finder import correction, max_norm, ratio, solve_matrix
 from ._constraint import Constraint, constraint_of, without_constraint
 from ._dependence import Dependence
 from ._hamiltonian import evaluated
+from ._langevin import is_friction
 from ._structure_checks import separable_fault
 from ._vector_fields import check_fit, rate, split_terms
 
@@ -249,7 +250,9 @@ def constrained_state(
     t = jnp.zeros((), q.dtype)
     free = without_constraint(terms)
     check_fit(free, t, y0, args)
-    if fault := separable_fault(*split_terms(free), t, y0, args):
+    drift, noise = split_terms(free)
+    drift = tuple(term for term in drift if not is_friction(term))
+    if fault := separable_fault(drift, noise, t, y0, args):
         raise ValueError(
             "Terms with a `constraint` need H0 = V(p) + U(t, q) and noise Hamiltonians "
             f"H_k = U_k(t, q), but {fault.reason}. {fault.advice}"

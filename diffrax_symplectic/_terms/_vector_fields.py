@@ -37,7 +37,7 @@ def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     neither the first term nor an `ODETerm`.
 
     Raises a `ValueError` for the terms of `diffrax.BacksolveAdjoint`."""
-    parts = _flatten(terms)
+    parts = flattened(terms)
     if any(map(is_adjoint_term, parts)):
         raise ValueError(_BACKSOLVE)
     ode = diffrax.ODETerm | ConstrainedDrift
@@ -50,10 +50,10 @@ def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     return drift, tuple(term for term, noise in zip(parts, is_noise) if noise)
 
 
-def _flatten(terms: diffrax.AbstractTerm) -> tuple:
+def flattened(terms: diffrax.AbstractTerm) -> tuple:
     """The terms of a `MultiTerm`, including nested ones."""
     if isinstance(terms, diffrax.MultiTerm):
-        return tuple(part for term in terms.terms for part in _flatten(term))
+        return tuple(part for term in terms.terms for part in flattened(term))
     return (terms,)
 
 
@@ -119,7 +119,7 @@ def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
             f"; got {type(terms).__name__}."
         )
     if is_term(terms):
-        parts = tuple(_flatten(without_constraint(terms)))
+        parts = tuple(flattened(without_constraint(terms)))
         check_increments(parts, t0, y0, args)
         controls = eqx.filter_eval_shape(lambda: [x.contr(t0, t0) for x in parts])
         eqx.filter_eval_shape(apply, parts, controls, args, t0, y0)

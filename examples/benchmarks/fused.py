@@ -100,13 +100,14 @@ class Case(NamedTuple):
 ONE, TWO = (0.0, 1.0), (jnp.array([0.2, 0.1]), jnp.array([0.0, -0.15]))
 line = lambda d: (jnp.linspace(-0.5, 0.5, d), jnp.linspace(0.3, 1.0, d))
 of = lambda H0, noise: lambda path: ds.hamiltonian_terms(H0, noise, path)
+warm = lambda H0: lambda path: ds.langevin_terms(H0, 0.5, 1.0, path)
 midpoint = lambda h: Case(of(kubo, kubo_noise), ds.ImplicitMidpoint(), ONE, h)
 coin = lambda shape, key: ds.WeakBrownianPath(shape, key, two_point=True)
 CASES = {
     "pendulum, `StormerVerlet`": Case(
         of(pendulum, push), ds.StormerVerlet(), ONE, 0.02
     ),
-    "pendulum, `BAOAB`": Case(of(pendulum, kicks), ds.BAOAB(0.5), ONE, 0.02),
+    "pendulum, `BAOAB`": Case(warm(pendulum), ds.BAOAB(), ONE, 0.02),
     **{f"Kubo, `ImplicitMidpoint`, h = {h}": midpoint(h) for h in (0.01, 0.2, 0.4)},
     "Kubo, `StrangGauss`, h = 0.1": Case(
         of(kubo, kubo_noise), ds.StrangGauss(), ONE, 0.1

@@ -26,18 +26,9 @@ Y0 = (jnp.array(0.0), jnp.array(1.0))
 GAMMA, T = 1.0, 0.5
 
 
-def langevin_terms(path, gamma=GAMMA, T=T):
-    """Those of a solver that is `Damped`."""
-    return ds.hamiltonian_terms(
-        lambda t, p, q, args: energy(p, q),
-        lambda t, p, q, args: -np.sqrt(2 * gamma * T) * q,
-        path,
-    )
-
-
-def terms_with_friction(path):
-    friction = diffrax.ODETerm(lambda t, y, args: (-GAMMA * y[0], jnp.zeros_like(y[1])))
-    return diffrax.MultiTerm(*langevin_terms(path).terms, friction)
+def langevin_terms(path, friction=GAMMA, T=T):
+    H0 = lambda t, p, q, args: energy(p, q)
+    return ds.langevin_terms(H0, friction, T, path)
 
 
 def diffrax_terms(path):
@@ -56,14 +47,14 @@ def with_third_areas(key):
 
 
 def damped(solver, make_path) -> Step:
-    return Step(langevin_terms, make_path, ds.Damped(solver, GAMMA))
+    return Step(langevin_terms, make_path, ds.Damped(solver))
 
 
 # Each with its evaluations of the force in a step.
 LANGEVIN = {
-    "BAOAB": (Step(langevin_terms, gaussian(), ds.BAOAB(GAMMA)), 1),
-    "BAOAB, three-point": (Step(langevin_terms, weak(), ds.BAOAB(GAMMA)), 1),
-    "LangevinMiddle": (Step(langevin_terms, gaussian(), ds.LangevinMiddle(GAMMA)), 1),
+    "BAOAB": (Step(langevin_terms, gaussian(), ds.BAOAB()), 1),
+    "BAOAB, three-point": (Step(langevin_terms, weak(), ds.BAOAB()), 1),
+    "LangevinMiddle": (Step(langevin_terms, gaussian(), ds.LangevinMiddle()), 1),
     "Damped(StormerVerlet)": (damped(ds.StormerVerlet(), gaussian()), 1),
     "Damped(PlateauVerlet)": (damped(ds.PlateauVerlet(), plateaus()), 2),
     "Damped(ImplicitMidpoint)": (damped(ds.ImplicitMidpoint(), gaussian()), None),
@@ -72,7 +63,7 @@ LANGEVIN = {
         Step(diffrax_terms, with_third_areas, diffrax.QUICSORT(), True, nodes=5),
         2,
     ),
-    "Heun": (Step(terms_with_friction, gaussian(), diffrax.Heun()), 2),
+    "Heun": (Step(langevin_terms, gaussian(), diffrax.Heun()), 2),
 }
 # The picture has all of them, the table these.
 SHOWN = (

@@ -102,15 +102,14 @@ def test_escape_from_a_double_well_costs_the_energy_that_noise_brings():
 def test_stationary_law_of_an_oscillator_is_that_of_its_matrices():
     gamma, T, h = 0.7, 0.5, 0.3
     H0 = lambda t, p, q, args: (p**2 + q**2) / 2
-    noise = lambda t, p, q, args: -np.sqrt(2 * gamma * T) * q
     step = Step(
-        lambda path: ds.hamiltonian_terms(H0, noise, path),
+        lambda path: ds.langevin_terms(H0, gamma, T, path),
         lambda key: diffrax.UnsafeBrownianPath((), key),
-        ds.Damped(ds.StormerVerlet(), gamma),
+        ds.Damped(ds.StormerVerlet()),
     )
     [bias] = stationary_bias(step, lambda q: q**2 / 2, T, [h], degrees=(2, 2))
     # For (q, p): friction, half a drift, kick, half a drift, friction.
-    friction = np.diag([1, np.exp(-gamma * h / 2)])
+    friction = np.diag([1, (1 - gamma * h / 4) / (1 + gamma * h / 4)])
     drift, kick = np.array([[1, h / 2], [0, 1]]), np.array([[1, 0], [-h, 1]])
     after = friction @ drift
     A, b = after @ kick @ drift @ friction, after @ [0, np.sqrt(2 * gamma * T * h)]

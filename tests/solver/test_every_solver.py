@@ -50,11 +50,12 @@ def oscillator(time, y, args):
     return c * p - 2 * s * q, s / 2 * p + c * q
 
 
-# Those whose terms leave a part of the drift out, which the solver adds.
+# Those that treat a part of the drift by itself: the friction of their terms, or a flow
+# that the terms leave out.
 SPLIT = [
-    ds.BAOAB(GAMMA),
-    ds.LangevinMiddle(GAMMA),
-    ds.Damped(ds.StrangGauss(), GAMMA),
+    ds.BAOAB(),
+    ds.LangevinMiddle(),
+    ds.Damped(ds.StrangGauss()),
     ds.LinearFlow(ds.StormerVerlet(), oscillator),
 ]
 TABLE = [*DEFAULTS, *SPLIT, *MEMBERS]
@@ -70,31 +71,36 @@ STEPS = [
 ]
 
 
-def left_out(solver):
-    """What the solver adds to the drift of its terms, for a reference."""
-    if isinstance(solver, ds.LinearFlow):
-        return lambda t, y, args: (-4 * y[1], y[0])
-    if hasattr(solver, "gamma"):
-        return lambda t, y, args: (-GAMMA * y[0], jnp.zeros_like(y[1]))
-    return None
+def has_friction(solver) -> bool:
+    return isinstance(solver, ds.BAOAB | ds.LangevinMiddle | ds.Damped)
+
+
+def terms_for(solver, *args, **kwargs):
+    """The terms of the solver's system, with a friction -GAMMA p if it needs one."""
+    terms = SYSTEMS[solver.structure].terms(*args, **kwargs)
+    if not has_friction(solver):
+        return terms
+    friction = ds.langevin_terms(lambda t, p, q, args: p @ p / 2, GAMMA).terms[1]
+    return diffrax.MultiTerm(*terms.terms, friction)
 
 
 def whole(terms, solver):
     """The terms of the system that the solver solves."""
-    if left_out(solver) is None:
+    if not isinstance(solver, ds.LinearFlow):
         return terms
-    return diffrax.MultiTerm(*terms.terms, diffrax.ODETerm(left_out(solver)))
+    left_out = diffrax.ODETerm(lambda t, y, args: (-4 * y[1], y[0]))
+    return diffrax.MultiTerm(*terms.terms, left_out)
 
 
 def kind_of(solver) -> tuple:
     """Solvers of one kind have one reference."""
-    return solver.structure, type(solver).__name__ if left_out(solver) else ""
+    return solver.structure, has_friction(solver), isinstance(solver, ds.LinearFlow)
 
 
 def take_step(solver, terms, t0, t1, y0, args):
     """One step from a state of the solver made anew, if it has one."""
     state = None
-    if left_out(solver) is not None:
+    if has_friction(solver) or isinstance(solver, ds.LinearFlow):
         state = solver.init(terms, t0, t1, y0, args)
     y1, _, _, _, result = solver.step(terms, t0, t1, y0, args, state, False)
     return y1, result
@@ -161,7 +167,6 @@ def batch(structure: str, dtype) -> Batch:
 def program(solver, dtype, derivatives: bool):
     """Ends of the steps, their derivatives by state and sizes, if asked for, and which
     succeeded."""
-    system = SYSTEMS[solver.structure]
     if dtype == jnp.float64 and repr(solver) not in (*CORE, "StrangGauss()"):
         # Their equations are of the kinds that those of the core are.
         solver = by_picard(solver)
@@ -173,7 +178,7 @@ def program(solver, dtype, derivatives: bool):
 
         def end(flat):
             y0, sizes = unravel(flat)
-            terms = system.terms(Given(**x.variables), sizes)
+            terms = terms_for(solver, Given(**x.variables), sizes)
             zero = jnp.zeros_like(x.h)
             y1, result = take_step(solver, terms, zero, x.h, y0, x.args)
             y1, _ = jfu.ravel_pytree(y1)
@@ -221,9 +226,10 @@ def _assert_symplectic(solver, dtype, bound):
     omega = np.block([[zero, one], [-one, zero]]).astype(dtype)
     # Friction shrinks areas.
     shrunk = 1.0
-    if hasattr(solver, "gamma"):
-        h = batch(solver.structure, dtype).h
-        shrunk = np.asarray(jnp.exp(-GAMMA * h))[:, None, None]
+    if has_friction(solver):
+        parts = 2 if isinstance(solver, ds.Damped) else 1
+        x = GAMMA * np.asarray(batch(solver.structure, dtype).h) / 2 / parts
+        shrunk = (((1 - x) / (1 + x)) ** parts)[:, None, None]
     defects = np.swapaxes(J, 1, 2) @ omega @ J - shrunk * omega
     assert np.max(np.abs(defects)) <= bound
 
@@ -277,12 +283,12 @@ def _flows(solver) -> jax.Array:
 
 
 def _make_flows(solver) -> jax.Array:
-    system, x = SYSTEMS[solver.structure], batch(solver.structure, jnp.float64)
+    x = batch(solver.structure, jnp.float64)
 
     @jax.jit
     @jax.vmap
     def flow(y0, args, h):
-        terms = whole(system.terms(Given(jnp.zeros(M)), jnp.ones(2)), solver)
+        terms = whole(terms_for(solver, Given(jnp.zeros(M)), jnp.ones(2)), solver)
         drift = diffrax.MultiTerm(
             *(terms.terms[i] for i in (0, *range(2, len(terms.terms))))
         )
@@ -349,7 +355,8 @@ def _make_weak_systems(solver):
     kinds = _kinds(solver.structure)
     drawn = [jax.vmap(ft.partial(draw, kind))(keys) for kind in kinds]
     y0, args = jax.tree.map(lambda *x: jnp.concatenate(x), *drawn)
-    terms = system.terms(ds.WeakBrownianPath((2,), jr.key(0)), commuting=True)
+    path = ds.WeakBrownianPath((2,), jr.key(0))
+    terms = terms_for(solver, path, commuting=True)
     terms = whole(terms, solver)
 
     def exact(h, y0, args):
@@ -365,7 +372,7 @@ def _make_weak_systems(solver):
 def local_weak_orders(solver) -> dict[str, float]:
     y0, args, exact = _weak_systems(solver)
     path = solver.path((2,), jr.key(0), want="weak")
-    terms = SYSTEMS[solver.structure].terms(path, commuting=True)
+    terms = terms_for(solver, path, commuting=True)
     solver = by_picard(solver)
 
     def mean(h, y0, args):
@@ -414,7 +421,7 @@ def strong_orders(solver) -> dict[str, tuple[float, float]]:
             path = ds.PlateauBrownianPath(path, k_more)
         if "A" in solver.variables:
             path = ds.LevyAreaBrownianPath(path, k_more, num_terms=0, cell=1 / fine)
-        terms, h = system.terms(path, commuting=True), 1 / steps
+        terms, h = terms_for(solver, path, commuting=True), 1 / steps
         step = lambda i, y: take_step(quick, terms, i * h, (i + 1) * h, y, args)[0]
         return jfu.ravel_pytree(jax.lax.fori_loop(0, steps, step, y0))[0]
 
@@ -481,7 +488,8 @@ def test_own_paths_hold_what_a_step_needs(solver):
     # The test of weak orders takes a step along the other path.
     path = solver.path((2,), jr.key(0), want="strong")
     quick = by_picard(solver)
-    step = lambda y0: take_step(quick, system.terms(path), 0.0, 0.1, y0, args)[0]
+    terms = terms_for(solver, path)
+    step = lambda y0: take_step(quick, terms, 0.0, 0.1, y0, args)[0]
     y1 = eqx.filter_eval_shape(step, y0)
     assert [x.shape for x in y1] == [(1,), (1,)]
     assert issubclass(path.levy_area, solver.minimal_levy_area) or (

@@ -182,7 +182,7 @@ def test_dampings_that_are_none_are_refused():
     each = ds.spin_terms(lambda t, s, args: s, noise, path, damping=1.0)
     with pytest.raises(ValueError, match="`H0` must return a scalar"):
         each.terms[0].vf(0.0, y0, args)
-    for solver in (ds.StormerVerlet(), ds.SRKw5(), ds.BAOAB(1.0)):
+    for solver in (ds.StormerVerlet(), ds.SRKw5(), ds.BAOAB()):
         damped = ds.spin_terms(H0, noise, path, damping=1.0)
         with pytest.raises(ValueError, match="use a solver for general systems"):
             solver.init(damped, 0.0, 0.1, y0, args)

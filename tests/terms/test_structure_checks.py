@@ -129,26 +129,24 @@ def _langevin(friction: float, momentum_first: bool) -> diffrax.MultiTerm:
     )
 
 
-def test_friction_in_the_drift_is_told_to_be_left_out():
+def test_friction_in_the_drift_is_told_of_langevin_terms():
     y0 = jnp.ones(2), jnp.zeros(2)
-    start = lambda terms: ds.BAOAB(0.5).init(terms, 0.0, 0.1, y0, None)
-    suggest = lambda terms, **options: ds.suggest_solver(
-        terms, 0.0, y0, want="weak", **options
-    )
+    start = lambda terms: ds.BAOAB().init(terms, 0.0, 0.1, y0, None)
     for first in (True, False):
         with pytest.raises(
-            ValueError, match=r"Leave friction .* `BAOAB\(gamma\)`"
+            ValueError, match=r"Take friction from `langevin_ter"
         ) as info:
             start(_langevin(0.5, first))
         assert ("wrong way round?" in str(info.value)) is not first
-        assert "ask with `gamma=`" in suggest(_langevin(0.5, first)).system
-    # Without it, and with the momentum first, plain terms are taken as they are.
-    terms = _langevin(0.0, True)
+        found = ds.suggest_solver(_langevin(0.5, first), 0.0, y0, want="weak")
+        assert "Take friction from `langevin_terms" in found.system
+    # Friction of its own and plain terms go together.
+    kinetic = lambda t, p, q, args: p @ p / 2
+    friction = ds.langevin_terms(kinetic, 0.5).terms[1]
+    terms = diffrax.MultiTerm(*_langevin(0.0, True).terms, friction)
     start(terms)
-    only, _ = suggest(terms, gamma=0.5)
-    assert isinstance(only.solver, ds.BAOAB)
-    with pytest.raises(ValueError, match="or use `BAOAB"):
-        suggest(_langevin(0.0, False), gamma=0.5)
+    found = ds.suggest_solver(terms, 0.0, y0, want="weak")
+    assert isinstance(found[0].solver, ds.BAOAB)
 
 
 def test_spins_are_not_told_to_write_sums():
@@ -258,7 +256,7 @@ def test_friction_in_a_second_term_is_not_blamed_on_the_hamiltonian():
         diffrax.MultiTerm(friction, terms),
         diffrax.MultiTerm(*terms.terms, friction),
     ):
-        with pytest.raises(ValueError, match="besides H0.*`Damped") as info:
+        with pytest.raises(ValueError, match="besides H0.*`langevin_terms") as info:
             ds.StormerVerlet().init(both, 0.0, 0.1, _positive_state, None)
         assert "dH0/dq" not in str(info.value)
     # A drift alone is that of H0, whatever it was made from.
