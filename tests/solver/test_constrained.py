@@ -4,13 +4,16 @@ import functools as ft
 
 import diffrax
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._solver.step import no_failure
 
+from ..ensemble.fused import needs_drjit
 from ..problems import Given
 
 
@@ -48,6 +51,23 @@ def take_step(terms, t0, t1, y0, args=None, solver=None):
     state = solver.init(terms, t0, t1, y0, args)
     y1, _, _, _, result = solver.step(terms, t0, t1, y0, args, state, False)
     return y1, result
+
+
+def take_steps(number, terms, h, y0, args=None, solver=None):
+    """The end of some steps. Compared with a solve they are quick to compile, and may be
+    differentiated in reverse mode."""
+    solver = ds.StormerVerlet() if solver is None else solver
+    state = solver.init(terms, 0.0, h, y0, args)
+
+    def body(carry, i):
+        y, state = carry
+        y, _, _, state, result = solver.step(
+            terms, i * h, (i + 1) * h, y, args, state, False
+        )
+        return (y, state), result == diffrax.RESULTS.successful
+
+    (y, _), okay = jax.lax.scan(body, (y0, state), jnp.arange(number))
+    return y, jnp.all(okay)
 
 
 @pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-14), (jnp.float32, 1e-5)])
@@ -143,47 +163,46 @@ def test_derivatives_are_those_of_the_solution():
 
     terms = ds.hamiltonian_terms(H0, constraint=ring)
 
-    def end(x, adjoint):
+    def end(x):
         args = {"mass": x[0], "length": x[1]}
         y0 = {"x": x[2:4]}, {"x": x[4:]}
         y0 = ds.constrained_state(terms, y0, args)
-        p, q = solved(terms, 0.3, 0.1, y0, args, adjoint=adjoint, max_steps=4)
+        (p, q), _ = take_steps(3, terms, 0.1, y0, args)
         return jnp.sum(p["x"] ** 3) + jnp.sum(q["x"] ** 3)
 
     x = jnp.array([1.3, 0.8, 0.3, 0.4, 0.6, 0.5])
-    forward = ft.partial(end, adjoint=diffrax.ForwardMode())
-    backward = ft.partial(end, adjoint=diffrax.RecursiveCheckpointAdjoint())
-    slopes = jax.jit(jax.jacfwd(forward))
-    moved = [x + s * 1e-5 * e for e in jnp.eye(6) for s in (1, -1)]
-    values = np.stack([jax.jit(forward)(x) for x in moved]).reshape(6, 2)
+    slopes = jax.jit(jax.jacfwd(end))
+    moved = jnp.stack([x + s * 1e-5 * e for e in jnp.eye(6) for s in (1, -1)])
+    values = jax.jit(jax.vmap(end))(moved).reshape(6, 2)
     exact = slopes(x)
     np.testing.assert_allclose((values[:, 0] - values[:, 1]) / 2e-5, exact, atol=1e-8)
-    np.testing.assert_allclose(jax.jit(jax.grad(backward))(x), exact, rtol=1e-11)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(x), exact, rtol=1e-11)
     # Once more, along one direction.
-    along = lambda s: forward(x + s * jnp.ones(6))
+    along = lambda s: end(x + s * jnp.ones(6))
     second = jax.jit(jax.jacfwd(jax.jacfwd(along)))(0.0)
     near = [slopes(x + s) @ jnp.ones(6) for s in (1e-5, -1e-5)]
     np.testing.assert_allclose((near[0] - near[1]) / 2e-5, second, rtol=1e-7)
 
 
 def test_a_step_that_is_too_long_fails_alone():
+    @jax.jit
+    @jax.vmap
     def end(speed):
         y0 = jnp.stack([0 * speed, speed]), LEVEL[1]
-        sol = diffrax.diffeqsolve(
-            PENDULUM, ds.StormerVerlet(), 0, 1, 0.5, y0, throw=False
-        )
-        return sol.ys[1][-1], sol.result == diffrax.RESULTS.successful
+        (_, q), okay = take_steps(2, PENDULUM, 0.5, y0)
+        return q, okay
 
     speeds = jnp.array([0.1, 40.0, 0.2, jnp.nan])
-    q, okay = jax.jit(jax.vmap(end))(speeds)
+    q, okay = end(speeds)
     np.testing.assert_array_equal(okay, [True, False, True, False])
+    alone, _ = end(speeds[jnp.array([0, 0, 2, 2])])
     for i in (0, 2):
-        np.testing.assert_allclose(q[i], end(speeds[i])[0], rtol=1e-14)
+        np.testing.assert_allclose(q[i], alone[i], rtol=1e-14)
     # Summed over a batch, too, a path without a solution has no derivative.
-    total = jax.grad(lambda x: jnp.sum(jax.vmap(end)(x)[0]))
-    slopes = total(speeds[:3])
-    np.testing.assert_allclose(slopes[1], 0)
-    np.testing.assert_allclose(slopes[0], total(speeds[:1])[0], rtol=1e-12)
+    slopes = jax.jit(jax.grad(lambda x: jnp.sum(end(x)[0])))
+    found, right = slopes(speeds.at[3].set(0.3)), slopes(speeds.at[1:].set(0.2))
+    assert found[1] == 0
+    np.testing.assert_allclose(found[:3:2], right[:3:2], rtol=1e-12)
 
 
 TWICE = ds.hamiltonian_terms(
@@ -326,3 +345,181 @@ def test_masses_that_are_not_constant_are_refused(H0, message):
         ds.StormerVerlet().init(terms, 0.0, 0.1, LEVEL, None)
     with pytest.raises(ValueError, match=message):
         ds.constrained_state(terms, LEVEL)
+
+
+# Friction between coordinates, masses that differ, and a plane that is oblique to both.
+INERTIA = jnp.array([1.0, 4.0, 0.5])
+TENSOR = jnp.array([[1.0, 0.3, 0.0], [0.3, 0.5, -0.2], [0.0, -0.2, 0.7]])
+NORMAL, TEMPERATURE = jnp.array([1.0, -2.0, 0.5]), 0.6
+STIFF = jnp.diag(jnp.array([2.0, 1.0, 1.5]))
+
+
+def in_a_plane(path, stiffness):
+    H0 = lambda t, p, q, args: jnp.sum(p**2 / INERTIA) / 2 + q @ stiffness @ q / 2
+    plane = lambda q, args: jnp.stack([NORMAL @ q])
+    return ds.langevin_terms(H0, TENSOR, TEMPERATURE, path, constraint=plane)
+
+
+def stationary(step, n, h):
+    """The covariance that a linear `step(y, W)` keeps, of the coordinates in the plane."""
+    A, B = (
+        np.asarray(x) for x in jax.jit(jax.jacfwd(step, (0, 1)))(*map(jnp.zeros, n))
+    )
+    # It maps the allowed states to themselves, and B leads to them.
+    U, S, _ = np.linalg.svd(np.concatenate([A @ A, B, A @ B], axis=1))
+    Z = U[:, S > 1e-10]
+    A, B = Z.T @ A @ Z, Z.T @ B
+    K = np.kron(A, A)
+    C = np.linalg.solve(np.eye(len(K)) - K, (h * B @ B.T).reshape(-1))
+    return Z @ C.reshape(A.shape) @ Z.T
+
+
+def test_friction_and_noise_keep_the_maxwell_distribution_of_a_plane_exactly():
+    h = 0.7
+
+    def step(p, W):
+        terms = in_a_plane(Given(W), jnp.zeros((3, 3)))
+        y0 = p, jnp.zeros(3)
+        force, solved = jnp.zeros(3), no_failure()
+        at = terms, 0.0, h, y0, None, (force, solved), False
+        return ds.BAOAB().step(*at)[0][0]
+
+    normals = NORMAL[None]
+    impulse = normals.T @ np.linalg.inv(normals / INERTIA @ normals.T) @ normals
+    exact = TEMPERATURE * (np.diag(INERTIA) - impulse)
+    np.testing.assert_allclose(stationary(step, (3, 3), h), exact, atol=1e-14)
+
+
+def test_positions_in_a_harmonic_well_and_a_plane_have_the_law_of_gibbs():
+    h = 0.5
+
+    def step(y, W):
+        terms = in_a_plane(Given(W), STIFF)
+        p, q = jnp.split(y, 2)
+        solver_state = -STIFF @ q, no_failure()
+        y1 = ds.BAOAB().step(terms, 0.0, h, (p, q), None, solver_state, False)[0]
+        return jnp.concatenate(y1)
+
+    _, _, V = np.linalg.svd(NORMAL[None])
+    Z = V[1:].T
+    exact = TEMPERATURE * Z @ np.linalg.inv(Z.T @ STIFF @ Z) @ Z.T
+    found = stationary(step, (6, 3), h)
+    np.testing.assert_allclose(found[3:, 3:], exact, atol=1e-13)
+    np.testing.assert_allclose(found[:3, 3:], 0, atol=1e-13)
+
+
+def test_steps_with_one_rate_of_friction_are_conformally_symplectic():
+    rate, h = 0.8, 0.1
+
+    def terms(W):
+        friction = rate * jnp.broadcast_to(MASSES, (3, 2))
+        at = chain_energy, friction, TEMPERATURE, Given(W)
+        return ds.langevin_terms(*at, constraint=rods)
+
+    @jax.jit
+    @jax.vmap
+    def two_forms(key):
+        (p, q), W = chain_state(key), 0.3 * jr.normal(key, (3, 2))
+        flat, unravel = jfu.ravel_pytree((p, q))
+        step = lambda x: take_step(terms(W), 0.0, h, unravel(x), 0.5, ds.BAOAB())[0]
+        jacobian = jax.jacfwd(lambda x: jfu.ravel_pytree(step(x))[0])(flat)
+        hidden = lambda y: jax.jvp(lambda q: rods(q, None), (y[1],), (y[0] / MASSES,))
+        normals = jax.jacfwd(lambda x: jnp.concatenate(hidden(unravel(x))))(flat)
+        Z = jnp.linalg.svd(normals)[2][6:].T
+        zero, one = jnp.zeros((6, 6)), jnp.eye(6)
+        omega = jnp.block([[zero, one], [-one, zero]])
+        moved = jacobian @ Z
+        return moved.T @ omega @ moved, Z.T @ omega @ Z
+
+    after, before = two_forms(jr.split(jr.key(6), 20))
+    c = (1 - rate * h / 2) / (1 + rate * h / 2)
+    np.testing.assert_allclose(after, c * before, atol=1e-14)
+
+
+FIELD = 1.2
+
+
+def dimer(path, friction=1.0):
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 - FIELD * (q[0, 0] - q[1, 0])
+    rod = lambda q, args: jnp.stack([jnp.sum((q[0] - q[1]) ** 2) - 1])
+    return ds.langevin_terms(H0, friction, TEMPERATURE, path, constraint=rod)
+
+
+DIMER = jnp.zeros((2, 3)), jnp.array([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]])
+
+
+def test_rigid_dimers_in_a_field_have_the_means_of_gibbs():
+    terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
+    paths = ds.ensemble(
+        terms, ds.BAOAB(), 0, 12, 0.12, DIMER, key=jr.key(1), num_paths=5000
+    )
+    p, q = paths.ys
+    energy = np.sum((p[:, 0] - p[:, 1]) ** 2, axis=1) / 4
+    seen = q[:, 0, 0] - q[:, 1, 0], energy, energy > TEMPERATURE
+    x = FIELD / TEMPERATURE
+    exact = 1 / np.tanh(x) - 1 / x, TEMPERATURE, np.exp(-1)
+    # The bias of this step is below a tenth of a standard error.
+    for values, mean in zip(seen, exact):
+        assert abs(np.mean(values) - mean) <= 3 * np.std(values) / len(values) ** 0.5
+    assert np.max(np.abs(np.sum((q[:, 0] - q[:, 1]) ** 2, axis=1) - 1)) <= 1e-14
+
+
+@needs_drjit
+@pytest.mark.parametrize("solver", [ds.StormerVerlet(), ds.BAOAB()], ids=repr)
+def test_the_fused_engine_takes_the_same_steps(solver):
+    terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
+    if isinstance(solver, ds.StormerVerlet):
+        # The noise without the friction.
+        terms = diffrax.MultiTerm(terms.terms[0], terms.terms[2])
+    at = terms, solver, 0, 2, 0.1, DIMER
+    fused, plain = (
+        ds.ensemble(*at, key=jr.key(2), num_paths=50, engine=engine)
+        for engine in ("drjit", "jax")
+    )
+    assert fused.num_stragglers == 0
+    for a, b in zip(fused.ys, plain.ys):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_expectations_refuse_starts_off_the_constraint():
+    terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
+    off = DIMER[0], 1.001 * DIMER[1]
+    phi = lambda t, y, args: y[1]
+    with pytest.raises(ValueError, match="constrained_state"):
+        ds.expectation(phi, terms, ds.BAOAB(), 0, 1, 0.1, off, key=jr.key(1))
+
+
+@pytest.mark.parametrize("solver", [ds.LangevinMiddle(), ds.Damped(ds.StormerVerlet())])
+def test_other_solvers_for_langevin_dynamics_refuse_constraints(solver):
+    terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
+    with pytest.raises(ValueError, match="`StormerVerlet.*BAOAB"):
+        solver.init(terms, 0.0, 0.1, DIMER, None)
+    with pytest.raises(ValueError, match="Take friction from|BAOAB"):
+        ds.StormerVerlet().init(terms, 0.0, 0.1, DIMER, None)
+
+
+def test_a_derivative_by_the_friction_along_a_path():
+    path = ds.FixedStepBrownianPath((2, 3), jr.key(0))
+
+    def end(friction):
+        at = 3, dimer(path, friction), 0.1, DIMER, None, ds.BAOAB()
+        return jnp.sum(take_steps(*at)[0][0] ** 3)
+
+    end = jax.jit(end)
+    exact = (end(1.0 + 1e-5) - end(1.0 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(1.0), exact, rtol=1e-8)
+
+
+def test_a_gradient_through_a_solve():
+    def end(length, adjoint):
+        terms = ds.hamiltonian_terms(
+            pendulum_energy, constraint=lambda q, args: rod(q / args, None)
+        )
+        p, q = LEVEL
+        at = terms, 0.2, 0.1, (p, length * q), length
+        return solved(*at, adjoint=adjoint, max_steps=4)[1][0]
+
+    backward = ft.partial(end, adjoint=diffrax.RecursiveCheckpointAdjoint())
+    forward = ft.partial(end, adjoint=diffrax.ForwardMode())
+    found, exact = jax.jit(jax.grad(backward)), jax.jit(jax.jacfwd(forward))
+    np.testing.assert_allclose(found(1.2), exact(1.2), rtol=1e-13)
