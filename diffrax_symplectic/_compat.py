@@ -21,7 +21,6 @@ from jax.extend.core import (
     ClosedJaxpr,
     Jaxpr as Jaxpr,
     jaxpr_as_fun,
-    JaxprEqn as JaxprEqn,
     Literal as Literal,
 )
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr

@@ -47,6 +47,7 @@ from ._terms import (
     constant_fault,
     Fault,
     FRICTION,
+    is_friction,
     number_of_noises,
     path_numbers,
     replace_paths,
@@ -169,6 +170,9 @@ def suggest_solver(
     commute = commute or commuting(noise, t0, y0, args)
     with_friction = takes_friction_apart(terms, t0, y0, args)
     solvers = ranked(want, structures, commute, m, with_friction)
+    if not any(map(is_friction, drift)):
+        # Diffrax's own terms, which only the Langevin splittings take apart.
+        solvers = [solver for solver in solvers if not isinstance(solver, Damped)]
     paths = brownian_paths(noise)
     if len(noise) > 1 or not jtu.all_leaves([increment_struct(paths[0])]):
         # Lévy areas are only sampled between the noises of one array.
@@ -199,10 +203,10 @@ def _system(
     """The structure of the system, in a sentence. `fault` is why it is not separable."""
     kind = " and ".join(structures) or f"general ({fault.reason if fault else ''})"
     system = f"The system is {kind}, with {noises}."
-    if fault is not None:
+    if fault is not None and not with_friction:
         if structures and WRONG_WAY_ROUND in fault.reason:
             system += f" It is not separable: {fault.reason}."
-        if fault.friction and not with_friction:
+        if fault.friction:
             system += f" {FRICTION}"
     return system
 

@@ -20,15 +20,18 @@ def split_friction(terms: PyTree[diffrax.AbstractTerm]) -> tuple[tuple, tuple, t
 
 
 def check_friction(
-    friction: tuple, t0: RealScalarLike, y0: Y, args: Args, solver: str
+    drift: tuple, friction: tuple, t0: RealScalarLike, y0: Y, args: Args, solver: str
 ) -> None:
-    """Raises a `ValueError` unless there is friction that is linear in the momenta."""
+    """Raises a `ValueError` unless there is friction that is linear in the momenta, and a
+    drift beside it."""
     if len(friction) == 0:
         raise ValueError(
             f"`{solver}` takes friction from the terms, and these have none. Construct "
             "them with `langevin_terms(H0, friction, temperature, path)`. (Without "
             "friction use `StormerVerlet` or `ImplicitMidpoint`.)"
         )
+    if len(drift) == 0:
+        raise ValueError(f"`{solver}` needs a drift besides friction, that of `H0`.")
     p, q = y0
     t0 = jnp.asarray(t0, jnp.result_type(t0, jnp.float32))
     force = lambda t, p, q: rate(friction, t, (p, q), args)[0]

@@ -48,7 +48,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         terms, y0 = momentum_first(terms, y0)
         drift, friction, noise = split_friction(terms)
         check_structure(self.structure, drift, noise, t0, y0, args, name)
-        check_friction(friction, t0, y0, args, name)
+        check_friction(drift, friction, t0, y0, args, name)
 
     def init(self, terms, t0, t1, y0, args) -> Any:
         """The forces, which a symmetric splitting hands on from the end of a step to the
@@ -89,59 +89,60 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
 
 
 class BAOAB(AbstractLangevinSplitting):
-    r"""Langevin dynamics, $\mathrm{d}p = -\nabla U(q)\,\mathrm{d}t - \gamma p\,\mathrm{d}t
-    + \sum_k \sigma_k\,\mathrm{d}w_k$, $\mathrm{d}q = \nabla V(p)\,\mathrm{d}t$, by a
-    splitting whose stationary positions are very accurate. Explicit, with one evaluation
-    of the forces in a step.
+    r"""Langevin dynamics, by a splitting whose stationary positions are very accurate, and
+    whose mobility and free diffusion are exact. Explicit, with one evaluation of the forces
+    in a step.
+
+    For the terms of [`diffrax_symplectic.langevin_terms`][] with $H_0 = V(p) + U(t, q)$,
+    the forces $f = -\partial U / \partial q$ and the velocities $g = \partial V / \partial
+    p$,
 
     $$\begin{aligned}
       \text{B:} &\quad p \gets p + \tfrac h2 f(t_n, q) \\
       \text{A:} &\quad q \gets q + \tfrac h2 g(p) \\
-      \text{O:} &\quad p \gets e^{-\gamma h} p
-        + \Bigl(\frac{1 - e^{-2 \gamma h}}{2 \gamma h}\Bigr)^{1/2} \sum_k \sigma_k I_k \\
+      \text{O:} &\quad \bar p = p - h G g(\tfrac12 (p + \bar p)) + B W, \quad
+        p \gets \bar p \\
       \text{A:} &\quad q \gets q + \tfrac h2 g(p) \\
       \text{B:} &\quad p \gets p + \tfrac h2 f(t_{n+1}, q)
     \end{aligned}$$
 
-    Pass the terms without friction, with $H_0 = V(p) + U(t, q)$ and $H_k = -\sigma_k
-    \cdot q$ for constant $\sigma_k$; other terms raise an error while tracing. Masses are
-    part of $V$. With $\sum_k \sigma_k \sigma_k^\top = 2 \gamma M T$, which
-    [`diffrax_symplectic.thermal_noise`][] gives, and $V(p) = p \cdot M^{-1} p / 2$ the
-    density $e^{-H_0 / T}$ is stationary.
+    with $G$ and $B$ at $t_n + \frac h2$ and the current $q$. O is the implicit midpoint
+    rule for friction and noise, one linear equation: $V$ must be quadratic. It keeps the
+    Maxwell distribution exactly for every friction and all masses. For numbers, $p \gets
+    ((1 - x) p + B W) / (1 + x)$ with $x = \gamma h / 2$, $\gamma = G / m$.
+
+    Other noise is added as further terms. It goes into O as well, and must be in the
+    forces, $H_k = U_k(t, q)$. A drift added as a further term must be separable.
 
     **Positions, momenta, transport.** In a harmonic well of frequency $\omega$ the law of
     $q$ is exact for every step with $\omega h < 2$. Momenta are too cold,
     $\langle p^2 \rangle = m T (1 - \omega^2 h^2 / 4)$: for functions of momenta, such as
-    kinetic temperatures, use [`diffrax_symplectic.LangevinMiddle`][], which
-    has the same positions. Mobility and free diffusion are too large in both by the factor
-    $x \coth x$, $x = \gamma h / 2$: 0.3% at $\gamma h = 0.2$, 8% at $\gamma h = 1$. They
-    are exact for the friction $\gamma' = \frac2h \operatorname{artanh} \frac{\gamma h}2$
-    in place of $\gamma$, in the solver and in the noise.
+    kinetic temperatures, use [`diffrax_symplectic.LangevinMiddle`][], which has the same
+    positions. The mobility $G^{-1}$ and the diffusion $T G^{-1}$ of a free particle are
+    exact for every step.
 
-    The friction acts on the canonical momentum $p$, which in a magnetic field differs from
-    the kinetic one. ($H_0$ is not separable there.)
-
-    O has the exact law of friction and noise together for thermal noise, and if the matrix
-    $\gamma$ commutes with $\sum_k \sigma_k \sigma_k^\top$: for one number $\gamma$, or
-    one number and one noise for each momentum. Otherwise its covariance has an error of
-    $\mathcal O(h^3)$.
-
-    Weak order 2, strong order 1, order 2 without noise. For one number $\gamma$ a step is
-    conformally symplectic: with its Jacobian $S'$, $S'^\top J S' = e^{-\gamma h} J$. As an
-    explicit method it is limited to $\omega h < 2$.
+    Weak order 2, strong order 1, order 2 without noise. If $G = \gamma M$ with one
+    constant number $\gamma$, a step is conformally symplectic: with its Jacobian $S'$,
+    $S'^\top J S' = \frac{1 - x}{1 + x} J$. As an explicit method it is limited to
+    $\omega h < 2$.
 
     Takes any Brownian path: a [`diffrax_symplectic.WeakBrownianPath`][] for
     expectations, a [`diffrax_symplectic.FixedStepBrownianPath`][] for paths.
 
-    **Source:** [Leimkuhler and Matthews (2013)](https://doi.org/10.1093/amrx/abs010).
+    **Diffrax's terms.** It also takes `diffrax.UnderdampedLangevinDriftTerm` and
+    `diffrax.UnderdampedLangevinDiffusionTerm`, with their state `(x, v)`.
+
+    **Source:** [Leimkuhler and Matthews (2013)](https://doi.org/10.1093/amrx/abs010) for
+    the splitting; [Grønbech-Jensen and Farago
+    (2013)](https://doi.org/10.1080/00268976.2012.760055) for the method with this O.
     """
 
     symmetric: ClassVar[bool] = True
     record: ClassVar[Record] = Record(
         weak=2,
         strong=1,
-        choose="Langevin dynamics: explicit, with very accurate stationary positions. "
-        "Mobility and diffusion are too large by a factor of x coth x, x = gamma h / 2.",
+        choose="Langevin dynamics: explicit, with very accurate stationary positions, and "
+        "exact mobility and diffusion of free particles.",
         suggested=("weak", "strong"),
     )
 
@@ -171,12 +172,12 @@ class LangevinMiddle(AbstractLangevinSplitting):
     $$\begin{aligned}
       \text{B:} &\quad p \gets p + h f(t_n, q) \\
       \text{A:} &\quad q \gets q + \tfrac h2 g(p) \\
-      \text{O:} &\quad p \gets e^{-\gamma h} p
-        + \Bigl(\frac{1 - e^{-2 \gamma h}}{2 \gamma h}\Bigr)^{1/2} \sum_k \sigma_k I_k \\
+      \text{O:} &\quad \bar p = p - h G g(\tfrac12 (p + \bar p)) + B W, \quad
+        p \gets \bar p \\
       \text{A:} &\quad q \gets q + \tfrac h2 g(p)
     \end{aligned}$$
 
-    Takes the same terms, friction, noise and paths as [`diffrax_symplectic.BAOAB`][].
+    Takes the same terms and paths as [`diffrax_symplectic.BAOAB`][].
 
     **Positions, momenta, transport.** In a harmonic well the laws of $q$ and of $p$ are
     exact, each by itself, for every step with $\omega h < 2$. The momenta belong to half a
@@ -184,17 +185,17 @@ class LangevinMiddle(AbstractLangevinSplitting):
     for functions of the momenta or of the positions, and [`diffrax_symplectic.BAOAB`][] for
     functions of both, such as a correlation $\langle p q \rangle$. Momenta come right after
     friction and noise: in a step, the bath gives a particle of mass $m$ the mean energy
-    $\frac12 (e^{2 \gamma h} - 1) \langle T - p^2 / m \rangle$. Mobility and free diffusion
-    are as in [`diffrax_symplectic.BAOAB`][], which says how to make them exact.
+    $\frac12 (c^{-2} - 1) \langle T - p^2 / m \rangle$, $c = (1 - x) / (1 + x)$. Mobility
+    and free diffusion are exact, as for [`diffrax_symplectic.BAOAB`][].
 
     The steps are those of [`diffrax_symplectic.BAOAB`][] in other variables: if this solver
     has $p$ and $q$, then BAOAB has $p + \frac h2 f(t, q)$ and $q$ along the same path. Weak
     order 1, strong order 1, and order 1 without noise, since momenta are late; order 2 for
-    stationary means of functions of $q$ alone or of $p$ alone. For one number $\gamma$ a
-    step is conformally symplectic.
+    stationary means of functions of $q$ alone or of $p$ alone. Conformally symplectic, like
+    BAOAB.
 
     **Source:** [Zhang, Liu, Yan, Tuckerman and Liu
-    (2019)](https://doi.org/10.1021/acs.jpca.9b02771).
+    (2019)](https://doi.org/10.1021/acs.jpca.9b02771) for the splitting.
     """
 
     symmetric: ClassVar[bool] = False

@@ -164,8 +164,8 @@ class Damped(AbstractSplitting):
                 "damped spins pass `damping=` to `spin_terms`."
             )
         check_pair(y0)
-        _, friction, _ = split_friction(terms)
-        check_friction(friction, t0, y0, args, type(self).__name__)
+        drift, friction, _ = split_friction(terms)
+        check_friction(drift, friction, t0, y0, args, type(self).__name__)
 
     def half_step(self, terms, t, time, y, args):
         _, friction, _ = split_friction(terms)

@@ -1,12 +1,13 @@
 """Detects which inputs the results of a function depend on."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from .._compat import dce_jaxpr, Jaxpr, JaxprEqn, Literal
+from .._compat import dce_jaxpr, Jaxpr, Literal
 
 
 class Dependence:
@@ -55,7 +56,7 @@ def acts_elementwise(fn: Callable, x: PyTree[Array]) -> bool:
     return sources is not None and all(map(fits, numbers, sources))
 
 
-def _sources(jaxpr: Jaxpr, numbers: list[int | None]) -> list[int | None] | None:
+def _sources(jaxpr: Jaxpr, numbers: Sequence[int | None]) -> list[int | None] | None:
     """For each result, the number of the input whose entries its entries depend on, or
     `None` if it depends on none; given the number of each input. `None` if some operation
     mixes the entries of an input, or two inputs."""
@@ -84,7 +85,7 @@ def _sources(jaxpr: Jaxpr, numbers: list[int | None]) -> list[int | None] | None
 _CALLS = frozenset({"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"})
 
 
-def _is_elementwise(eqn: JaxprEqn, source: Callable) -> bool:
+def _is_elementwise(eqn: Any, source: Callable) -> bool:
     """Whether an operation keeps the entries of the arguments that `source` tracks."""
     shape = eqn.outvars[0].aval.shape
     tracked = [x for x in eqn.invars if source(x) is not None]
