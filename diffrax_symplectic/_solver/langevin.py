@@ -138,6 +138,7 @@ class BAOAB(AbstractLangevinSplitting):
     """
 
     symmetric: ClassVar[bool] = True
+    keeps_constraints: ClassVar[bool] = True
     record: ClassVar[Record] = Record(
         weak=2,
         strong=1,

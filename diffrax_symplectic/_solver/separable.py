@@ -192,6 +192,7 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     order of symmetric splittings.
     """
 
+    keeps_constraints: ClassVar[bool] = True
     record: ClassVar[Record] = Record(
         weak=2,
         strong=1,
