@@ -2,4 +2,4 @@ from .derivative import differentiate as differentiate
 from .linear import correction as correction, solve_matrix as solve_matrix
 from .picard_newton import PicardNewton as PicardNewton
 from .sweeps import Halves as Halves
-from .tolerance import all_finite as all_finite, max_norm as max_norm, ratio as ratio
+from .tolerance import all_finite as all_finite, max_norm as max_norm

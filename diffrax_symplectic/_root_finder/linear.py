@@ -83,6 +83,8 @@ def _eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     """Solves a linear system by elimination with partial pivoting, in XLA operations:
     LAPACK needs a call for each matrix of a batch, and 0.1 s to load."""
     n = len(rhs)
+    if n == 1:
+        return rhs / matrix[0]
     if n > MAX_WRITTEN_OUT:
         rows = jnp.concatenate([matrix, rhs[:, None]], axis=1)
         return lax.fori_loop(0, n, _clear_column, rows)[:, n]

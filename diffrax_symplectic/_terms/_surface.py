@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, PyTree, Scalar
 from .._arguments import check_pair, check_state, shapes
 from .._batch import batched_like, error_if_alone
 from .._custom_types import Args, RealScalarLike
-from .._root_finder import correction, max_norm, ratio, solve_matrix
+from .._root_finder import correction, max_norm, solve_matrix
 from ._constraint import Constraint, constraint_of, without_constraint
 from ._dependence import Dependence
 from ._hamiltonian import evaluated
@@ -30,10 +30,8 @@ _Multipliers: TypeAlias = Float[Array, " c"]
 
 # Newton's method takes three or four steps, and up to twice as many from far away.
 _MOST_STEPS = 30
-# It has converged once the next correction would change no position by more than so many
-# units in the last place of the largest one.
-_UNITS = 1.0
-# Corrections below so many units that no longer shrink are rounding errors.
+# Changes of positions below so many units in the last place of the largest one, which no
+# longer shrink, are rounding errors.
 _ROUNDING = 100.0
 _SHRINK = 0.25
 
@@ -130,9 +128,10 @@ class Surface(NamedTuple):
         free = at.q + time * self.velocity(p)
         moved = lambda x: free - at.along @ x
         off = lambda x: self.residual(moved(x))
+        size = max_norm(free)
 
         def solve(off: Callable, start: _Multipliers):
-            x, found = _newton(off, moved, start, jnp.asarray(pending))
+            x, found = _newton(off, at.along, size, start, jnp.asarray(pending))
             # As a float: `custom_root` gives other types a tangent of a wrong type.
             return x, found.astype(x.dtype)
 
@@ -289,38 +288,44 @@ def _values(constraint: Constraint, q: PyTree, args: Args) -> _Multipliers:
 
 
 class _Newton(NamedTuple):
-    """The multipliers, the size of the last correction in units of the tolerance, the
+    """The multipliers, the largest change of a position by their last correction, the
     number of corrections, and whether the next one is within the tolerance."""
 
     x: _Multipliers
-    size: Scalar
+    change: Scalar
     number: Array
     solved: Bool[Array, ""]
 
 
 def _newton(
-    off: Callable, moved: Callable, start: _Multipliers, pending: Bool[Array, ""]
+    off: Callable,
+    along: Float[Array, "n c"],
+    size: Scalar,
+    start: _Multipliers,
+    pending: Bool[Array, ""],
 ) -> tuple[_Multipliers, Bool[Array, ""]]:
-    """The root of `off`, and whether it was found; otherwise zero. `moved` maps it to a
-    position."""
-    unit = float(jnp.finfo(start.dtype).eps) * _UNITS
+    """The root of `off`, and whether it was found; otherwise zero. The multipliers change
+    positions of this `size` by `along @ x`."""
+    tolerance = float(jnp.finfo(start.dtype).eps) * size
 
     def going(state: _Newton):
         left = pending & (state.number < _MOST_STEPS)
-        return left & ~state.solved & ~jnp.isnan(state.size)
+        return left & ~state.solved & ~jnp.isnan(state.change)
 
     def step(state: _Newton) -> _Newton:
-        _, change, _ = correction(off, state.x, None)
-        x = state.x - change
-        after, before = moved(x), moved(state.x)
-        size = ratio(max_norm(after - before), unit * max_norm(after))
-        shrink = jnp.where(state.number > 0, ratio(size, state.size), 1)
-        rounded = (size <= _ROUNDING) & (shrink >= _SHRINK)
-        solved = (size * jnp.minimum(shrink, 1) <= 1) | rounded
-        return _Newton(x, size, state.number + 1, solved)
+        _, diff, _ = correction(off, state.x, None)
+        change = max_norm(along @ diff)
+        before = jnp.where(state.number > 0, state.change, change)
+        # The next one is smaller at least by the same factor.
+        solved = change * jnp.minimum(change, before) <= tolerance * before
+        rounded = (change <= _ROUNDING * tolerance) & (change >= _SHRINK * before)
+        x = state.x - diff
+        return _Newton(x, change, state.number + 1, solved | rounded)
 
-    first = _Newton(start, jnp.zeros((), start.dtype), jnp.array(0), jnp.array(False))
-    last = lax.while_loop(going, step, batched_like(first, moved(start)))
+    zero, no = jnp.zeros((), start.dtype), jnp.array(False)
+    first = _Newton(start, zero, jnp.array(0), no)
+    first = batched_like(first, (off(start), along, size, pending))
+    last = lax.while_loop(going, step, first)
     return jnp.where(last.solved, last.x, 0), last.solved
 
 
