@@ -132,9 +132,16 @@ class BAOAB(AbstractLangevinSplitting):
     **Diffrax's terms.** It also takes `diffrax.UnderdampedLangevinDriftTerm` and
     `diffrax.UnderdampedLangevinDiffusionTerm`, with their state `(x, v)`.
 
+    **Constraints.** For terms with a `constraint` this is g-BAOAB: each A is a step of
+    RATTLE, as in [`diffrax_symplectic.StormerVerlet`][], B and O end with momenta that are
+    tangent, and O is the midpoint rule with multipliers of its own, so that it keeps the
+    Maxwell distribution of the tangent momenta exactly.
+
     **Source:** [Leimkuhler and Matthews (2013)](https://doi.org/10.1093/amrx/abs010) for
     the splitting; [Grønbech-Jensen and Farago
-    (2013)](https://doi.org/10.1080/00268976.2012.760055) for the method with this O.
+    (2013)](https://doi.org/10.1080/00268976.2012.760055) for the method with this O;
+    [Leimkuhler and Matthews (2016)](https://doi.org/10.1098/rspa.2016.0138) for
+    constraints.
     """
 
     symmetric: ClassVar[bool] = True

@@ -187,9 +187,17 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     one evaluation of the forces, and must resolve the fastest frequency $\omega$ of $H_0$:
     $\omega h < 2$.
 
+    **Constraints.** For terms with a `constraint` each drift over $h / 2$ is a step of
+    RATTLE, $q \gets q + \frac h2 M^{-1} p$ with $p \gets p - J(q)^\top \lambda$ and
+    multipliers $\lambda$ for which the new $q$ satisfies the constraint, and momenta are
+    made tangent, $J M^{-1} p = 0$. Multipliers are found by Newton's method to rounding; a
+    step fails if there are none, as happens if it is too long. It is symplectic on the
+    allowed states, and reversible.
+
     **Source:** [Strang (1968)](https://doi.org/10.1137/0705041) for the splitting;
     [Ninomiya and Victoir (2008)](https://doi.org/10.1080/13504860701413958) for the weak
-    order of symmetric splittings.
+    order of symmetric splittings; [Leimkuhler and Skeel
+    (1994)](https://doi.org/10.1006/jcph.1994.1085) for RATTLE.
     """
 
     keeps_constraints: ClassVar[bool] = True
