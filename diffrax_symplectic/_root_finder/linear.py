@@ -110,5 +110,7 @@ def _clear_column(k: IntScalarLike, rows: Float[Array, "n m"]) -> Float[Array, "
     place = jnp.arange(len(rows))
     i = jnp.argmax(jnp.where(place < k, -1, jnp.abs(rows[:, k])))
     pivot = rows[i] / rows[i, k]
-    rows = rows.at[i].set(rows[k])
-    return (rows - rows[:, k, None] * pivot).at[k].set(pivot)
+    # Selections, which the fused engine replays: unlike a scatter to a row that differs
+    # between paths.
+    rows = jnp.where((place == i)[:, None], rows[k], rows)
+    return jnp.where((place == k)[:, None], pivot, rows - rows[:, k, None] * pivot)

@@ -1,6 +1,6 @@
 """Solvers for H0 = V(p) + U(t, q) and noise Hamiltonians U_k(t, q)."""
 
-from typing import ClassVar, get_args, Literal, TypeAlias
+from typing import Any, ClassVar, get_args, Literal, TypeAlias
 
 import equinox as eqx
 
@@ -223,7 +223,7 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
             return super().init(terms, t0, t1, y0, args)
         return init_constrained(self, terms, t0, y0, args)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         if constraint_of(terms) is None:
             return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
         at = terms, t0, t1, y0, args
