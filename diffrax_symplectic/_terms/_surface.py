@@ -1,7 +1,7 @@
 """The states that a constraint allows: projections onto them, and free flight on them."""
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -174,13 +174,24 @@ def check_start(
     """Whether the constraints are dependent at `y0`, and whether it is off them. Raises a
     `ValueError` if either is known while tracing, and for constraints that no solver takes.
     Otherwise it is an error when run, but not in a batch."""
+    _check_masses(terms, t0, y0, args)
+    fixed = jtu.tree_map(_without_derivative, (y0, args))
+    dependent, off = _faults(terms, t0, *fixed)
+    return _refused(dependent, _DEPENDENT), _refused(off, _OFF)
+
+
+def _without_derivative(x: Any) -> Any:
+    return lax.stop_gradient(x) if eqx.is_inexact_array(x) else x
+
+
+# Outside of a program its operations would be compiled one by one.
+@eqx.filter_jit
+def _faults(terms, t0, y0, args) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     surface = Surface.of(terms, t0, y0, args)
     (p, _), (q, _) = map(jfu.ravel_pytree, y0)
-    _check_masses(surface, p)
     at = surface.frame(q)
-    dependent = lax.stop_gradient(surface.dependent(at))
-    off = ~dependent & lax.stop_gradient(surface.off(p, at))
-    return _refused(dependent, _DEPENDENT), _refused(off, _OFF)
+    dependent = surface.dependent(at)
+    return dependent, ~dependent & surface.off(p, at)
 
 
 def _refused(fault: Bool[Array, ""], advice: str) -> Bool[Array, ""]:
@@ -191,8 +202,10 @@ def _refused(fault: Bool[Array, ""], advice: str) -> Bool[Array, ""]:
     return fault
 
 
-def _check_masses(surface: Surface, p: _Vector) -> None:
+def _check_masses(terms, t0, y0, args) -> None:
     """Raises a `ValueError` unless velocities are linear in the momenta."""
+    surface = Surface.of(terms, t0, y0, args)
+    p, _ = jfu.ravel_pytree(y0[0])
     pushed = lambda p, x: jax.jvp(surface.velocity, (p,), (x,))[1]
     if not Dependence(pushed, p, p).independent(lambda p, x: p):
         raise ValueError(
@@ -245,34 +258,39 @@ def constrained_state(
         )
     check_pair(y0)
     check_state(y0, "constrained_state")
-    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
-    t = jnp.zeros((), q.dtype)
-    free = without_constraint(terms)
-    check_fit(free, t, y0, args)
-    drift, noise = split_terms(free)
-    drift = tuple(term for term in drift if not is_friction(term))
-    if fault := separable_fault(drift, noise, t, y0, args):
+    t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(y0)))
+    drift, _ = split_terms(without_constraint(terms))
+    check_fit(diffrax.MultiTerm(*drift), t, y0, args)
+    own = tuple(term for term in drift if not is_friction(term))
+    if fault := separable_fault(own, (), t, y0, args):
         raise ValueError(
-            "Terms with a `constraint` need H0 = V(p) + U(t, q) and noise Hamiltonians "
-            f"H_k = U_k(t, q), but {fault.reason}. {fault.advice}"
+            "Terms with a `constraint` need H0 = p . M^-1 p / 2 + U(t, q), but "
+            f"{fault.reason}. {fault.advice}"
         )
-    surface = Surface.of(terms, t, y0, args)
-    _check_masses(surface, p)
-    _, q1, found = surface.fly(jnp.zeros_like(p), surface.frame(q), 1.0)
-    at = surface.frame(q1)
-    p1 = surface.tangent(p, at)
-    lost = surface.dependent(at)
-    if not isinstance(lost, jax.core.Tracer):
-        if lost:
+    _check_masses(terms, t, y0, args)
+    y1, found, dependent = _projected(terms, t, y0, args)
+    if not isinstance(found, jax.core.Tracer):
+        if dependent:
             raise ValueError(_DEPENDENT)
         if not found:
             raise ValueError(
                 "`constrained_state` found no positions with `constraint(q, args) = 0` "
                 "from `y0`. Pass one that is closer to them."
             )
-    okay = found & ~lost
-    p1, q1 = (jnp.where(okay, x, jnp.nan) for x in (p1, q1))
-    return unravel_p(p1), unravel_q(q1)
+    okay = found & ~dependent
+    return jtu.tree_map(lambda x: jnp.where(okay, x, jnp.nan), y1)
+
+
+@eqx.filter_jit
+def _projected(terms, t, y0, args) -> tuple[PyTree, Bool[Array, ""], Bool[Array, ""]]:
+    """The nearest allowed state, whether Newton's method found it, and whether the
+    constraints are dependent there."""
+    surface = Surface.of(terms, t, y0, args)
+    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
+    _, q, found = surface.fly(jnp.zeros_like(p), surface.frame(q), 1.0)
+    at = surface.frame(q)
+    y1 = unravel_p(surface.tangent(p, at)), unravel_q(q)
+    return y1, found, surface.dependent(at)
 
 
 def _values(constraint: Constraint, q: PyTree, args: Args) -> _Multipliers:
