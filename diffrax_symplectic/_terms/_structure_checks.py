@@ -83,9 +83,10 @@ def separable_fault(
     ]
     still = ft.partial(_is_zero, t0, y0, args)
     of = flows(drift), flows(noise)
-    here, exchanged = (_faults(p, *of, still) for p in (0, 1))
+    here = _faults(0, *of, still)
     if not here:
         return None
+    exchanged = _faults(1, *of, still)
     only_friction = lambda faults: all(fault.friction for fault in faults)
     reason, advice, _ = here[0]
     friction = only_friction(here)
