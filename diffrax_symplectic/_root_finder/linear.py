@@ -65,8 +65,14 @@ def solve_matrix(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     large."""
     # To rounding error, also by GMRES.
     reduction = float(jnp.finfo(rhs.dtype).eps) ** 0.9
-    by = lambda apply, rhs: solve(apply, rhs, None, reduction)[0]
-    return lax.custom_linear_solve(lambda x: matrix @ x, rhs, by, by)
+
+    def by(matrix: Float[Array, "n n"]) -> Callable[[_Map, _Vector], _Vector]:
+        if len(matrix) <= _MAX_DENSE:
+            return lambda apply, rhs: eliminate(matrix, rhs)
+        return lambda apply, rhs: solve(apply, rhs, None, reduction)[0]
+
+    multiply = lambda x: matrix @ x
+    return lax.custom_linear_solve(multiply, rhs, by(matrix), by(matrix.T))
 
 
 def _units(x: _Vector) -> Any:
