@@ -279,9 +279,7 @@ def test_positions_that_cannot_be_projected_are_refused():
         ds.NinomiyaVictoir(),
         ds.LinearFlow(ds.StormerVerlet(), lambda time, y, args: (y[0] - time, y[1])),
         diffrax.Tsit5(),
-        diffrax.Heun(),
         diffrax.EulerHeun(),
-        diffrax.ReversibleHeun(),
         diffrax.Kvaerno5(),
     ],
     ids=lambda solver: type(solver).__name__,
@@ -465,6 +463,31 @@ def test_rigid_dimers_in_a_field_have_the_means_of_gibbs():
 
 
 @needs_drjit
+@pytest.mark.slow
+def test_the_fused_engine_solves_for_more_multipliers_than_are_written_out():
+    number = 7
+    line = jnp.stack([jnp.arange(number) % 2, jnp.arange(number) // 2], axis=1) * 1.0
+    bonds = lambda q, args: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1)
+    lengths = bonds(line, None)
+    free = lambda t, p, q, args: jnp.sum(p**2) / 2
+    terms = ds.langevin_terms(
+        free,
+        1.0,
+        TEMPERATURE,
+        ds.WeakBrownianPath((number, 2), jr.key(0)),
+        constraint=lambda q, args: bonds(q, args) - lengths,
+    )
+    at = terms, ds.BAOAB(), 0, 0.4, 0.1, (0 * line, line)
+    fused, plain = (
+        ds.ensemble(*at, key=jr.key(2), num_paths=20, engine=engine)
+        for engine in ("drjit", "jax")
+    )
+    assert fused.num_stragglers == 0
+    for a, b in zip(fused.ys, plain.ys):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+@needs_drjit
 @pytest.mark.parametrize("solver", [ds.StormerVerlet(), ds.BAOAB()], ids=repr)
 def test_the_fused_engine_takes_the_same_steps(solver):
     terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
@@ -510,6 +533,7 @@ def test_a_derivative_by_the_friction_along_a_path():
     np.testing.assert_allclose(jax.jit(jax.grad(end))(1.0), exact, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_gradient_through_a_solve():
     def end(length, adjoint):
         terms = ds.hamiltonian_terms(
