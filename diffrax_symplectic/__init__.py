@@ -82,6 +82,7 @@ from ._tableau import (
     SeparableTableau as SeparableTableau,
 )
 from ._terms import (
+    bath_terms as bath_terms,
     constrained_state as constrained_state,
     FrictionAlong as FrictionAlong,
     from_pair as from_pair,

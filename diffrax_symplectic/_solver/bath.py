@@ -1,6 +1,5 @@
 """The step of friction and noise at fixed positions, by the implicit midpoint rule."""
 
-import diffrax
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -9,15 +8,7 @@ from jaxtyping import Array, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
 from .._root_finder import eliminate, MAX_WRITTEN_OUT
-from .._terms import acts_elementwise, Dependence, is_friction, rate, split_terms
-
-
-def split_friction(terms: PyTree[diffrax.AbstractTerm]) -> tuple[tuple, tuple, tuple]:
-    """The drift without friction, the friction, and the noise."""
-    drift, noise = split_terms(terms)
-    friction = tuple(filter(is_friction, drift))
-    rest = tuple(term for term in drift if not is_friction(term))
-    return rest, friction, noise
+from .._terms import acts_elementwise, Dependence, rate
 
 
 def check_friction(
@@ -52,8 +43,8 @@ def check_friction(
             f"`{solver}` has no friction to apply: it acts on the velocities dH0/dp, which "
             "do not depend on p. If the kinetic energy is a part of the flow of a "
             "`LinearFlow`, take friction and noise from terms of the whole Hamiltonian: "
-            "`MultiTerm(*hamiltonian_terms(rest).terms, *langevin_terms(whole, friction, "
-            "temperature, path).terms[1:])`."
+            "`MultiTerm(*hamiltonian_terms(rest).terms, *bath_terms(whole, friction, "
+            "temperature, path).terms)`."
         )
 
 

@@ -19,12 +19,13 @@ from .._terms import (
     controls,
     drift_driven,
     rate,
+    split_friction,
     split_terms,
     Surface,
     without_constraint,
 )
 from .base import AbstractSymplecticSolver
-from .bath import after_friction, split_friction
+from .bath import after_friction
 from .step import no_failure
 
 

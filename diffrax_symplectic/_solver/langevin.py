@@ -19,9 +19,10 @@ from .._terms import (
     controls,
     momentum_first,
     rate,
+    split_friction,
 )
 from .base import AbstractSymplecticSolver, Record
-from .bath import after_friction, check_friction, split_friction
+from .bath import after_friction, check_friction
 from .constrained import baoab_step, force_at, init_constrained
 from .step import result_of
 from .times import result_at

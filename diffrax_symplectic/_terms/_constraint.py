@@ -49,6 +49,13 @@ class ConstrainedDrift(diffrax.AbstractTerm):
         )
 
 
+def constrained(
+    drift: diffrax.ODETerm, constraint: Constraint | None
+) -> diffrax.AbstractTerm:
+    """The drift with its constraint, if there is one."""
+    return drift if constraint is None else ConstrainedDrift(drift, constraint)
+
+
 def constraint_of(terms: PyTree[diffrax.AbstractTerm]) -> Constraint | None:
     """The constraint of these terms, if there is one. Raises a `ValueError` if there are
     several."""

@@ -14,7 +14,7 @@ from .._arguments import check_pair, check_takes, shapes, whole_number
 from .._brownian import checked_shape, increment_struct, UnspecifiedPath
 from .._compat import ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike
-from ._constraint import ConstrainedDrift, Constraint
+from ._constraint import constrained, Constraint
 from ._dependence import Dependence
 
 
@@ -85,9 +85,7 @@ def hamiltonian_terms(
             f"`structure` must be one of {get_args(_Structure)}, or `None` to detect it; "
             f"got {structure!r}."
         )
-    drift = diffrax.ODETerm(_Drift(H0, structure))
-    if constraint is not None:
-        drift = ConstrainedDrift(drift, constraint)
+    drift = constrained(diffrax.ODETerm(_Drift(H0, structure)), constraint)
     if noise is None and path is None:
         return diffrax.MultiTerm(drift)
     noise = cast(_Hamiltonian, noise)

@@ -22,9 +22,9 @@ from .._root_finder import correction, max_norm, solve_matrix
 from ._constraint import Constraint, constraint_of, without_constraint
 from ._dependence import Dependence
 from ._hamiltonian import evaluated
-from ._langevin import is_friction
+from ._langevin import split_friction
 from ._structure_checks import separable_fault
-from ._vector_fields import check_fit, rate, split_terms
+from ._vector_fields import check_fit, rate
 
 
 _Vector: TypeAlias = Float[Array, " n"]
@@ -73,7 +73,7 @@ class Surface(NamedTuple):
         return an array of shape `(c,)`."""
         constraint = constraint_of(terms)
         assert constraint is not None
-        drift, _ = split_terms(without_constraint(terms))
+        drift, _, _ = split_friction(without_constraint(terms))
         _, q = y
         _, unravel = jfu.ravel_pytree(q)
 
@@ -280,10 +280,9 @@ def constrained_state(
     check_pair(y0)
     check_state(y0, "constrained_state")
     t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(y0)))
-    drift, _ = split_terms(without_constraint(terms))
+    drift, _, _ = split_friction(without_constraint(terms))
     check_fit(diffrax.MultiTerm(*drift), t, y0, args)
-    own = tuple(term for term in drift if not is_friction(term))
-    if fault := separable_fault(own, (), t, y0, args):
+    if fault := separable_fault(drift, (), t, y0, args):
         raise ValueError(
             "Terms with a `constraint` need H0 = p . M^-1 p / 2 + U(t, q), but "
             f"{fault.reason}. {fault.advice}"

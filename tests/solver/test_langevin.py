@@ -176,7 +176,7 @@ def test_friction_and_noise_are_exact_beside_an_exact_flow(omega_h):
 
     nothing = lambda t, p, q, args: 0.0 * q
     whole = lambda t, p, q, args: (p**2 + omega_h**2 * q**2) / 2
-    bath = ds.langevin_terms(whole, 1.0, T, _path(())).terms[1:]
+    bath = ds.bath_terms(whole, 1.0, T, _path(())).terms
     terms = diffrax.MultiTerm(*ds.hamiltonian_terms(nothing).terms, *bath)
     exact = np.diag([T, T / omega_h**2])
     solver = ds.LinearFlow(ds.BAOAB(), flow)
