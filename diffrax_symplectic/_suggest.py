@@ -45,6 +45,7 @@ from ._terms import (
     check_fit,
     commuting,
     constant_fault,
+    constraint_of,
     Fault,
     FRICTION,
     friction_apart,
@@ -53,6 +54,7 @@ from ._terms import (
     replace_paths,
     separable_fault,
     split_terms,
+    without_constraint,
     WRONG_WAY_ROUND,
 )
 
@@ -153,6 +155,8 @@ def suggest_solver(
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
     # Any path serves to inspect the terms.
     terms = specified(terms, WeakBrownianPath)
+    constrained = constraint_of(terms) is not None
+    given_terms, terms = terms, without_constraint(terms)
     drift, noise = _parts(terms)
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
@@ -173,6 +177,14 @@ def suggest_solver(
     if len(friction_apart(drift)[1]) == 0:
         # Diffrax's own terms, which only the Langevin splittings take apart.
         solvers = [solver for solver in solvers if not isinstance(solver, Damped)]
+    if constrained:
+        solvers = [solver for solver in solvers if solver.keeps_constraints]
+        if not solvers:
+            raise ValueError(
+                "Solvers for terms with a `constraint` need H0 = p . M^-1 p / 2 + U(t, q), "
+                "noise Hamiltonians H_k = U_k(t, q), and friction only from "
+                "`langevin_terms`."
+            )
     paths = brownian_paths(noise)
     if len(noise) > 1 or not jtu.all_leaves([increment_struct(paths[0])]):
         # Lévy areas are only sampled between the noises of one array.
@@ -181,13 +193,17 @@ def suggest_solver(
     given = [path for path in paths if not is_random(path)]
     solvers = [s for s in solvers if all(_holds(path, s) for path in given)]
     numbers = path_numbers(random_paths(terms))
-    with_new = lambda make: jtu.Partial(ft.partial(with_paths, make, numbers), terms)
+    with_new = lambda make: jtu.Partial(
+        ft.partial(with_paths, make, numbers), given_terms
+    )
     found = tuple(_suggestion(s, want, terms, commute, with_new) for s in solvers)
     noises = "one noise"
     if m > 1:
         noises = f"{m} noises that {'commute' if commute else 'do not commute'}"
     if with_friction:
         noises = f"friction and {noises}"
+    if constrained:
+        noises = f"constraints, {noises}"
     system = _system(structures, not_separable, noises, with_friction)
     if any(isinstance(path, diffrax.UnsafeBrownianPath) for path in paths):
         system += (

@@ -19,6 +19,8 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic import _compat
 
+from .ensemble.fused import needs_drjit
+
 
 # Private modules, and public ones without a promise to be kept.
 PRIVATE_IMPORT = re.compile(r"\._(?!_)|\.internal|jax\.extend|jax\.interpreters")
@@ -62,9 +64,6 @@ def _private_attributes(tree: ast.AST) -> set[str]:
             if first not in ("self", "cls") and PRIVATE_ATTRIBUTE.search(name):
                 found.add(name)
     return found
-
-
-from .ensemble.fused import needs_drjit
 
 
 def test_private_parts_of_others_are_used_in_one_module_only():

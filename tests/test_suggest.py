@@ -361,3 +361,26 @@ def test_suggestions_say_what_the_other_order_of_the_state_would_allow():
     got = ds.suggest_solver(terms, 0, y0, want="strong")
     assert "is the state the wrong way round?" in got.system
     assert "StormerVerlet" not in str(got)
+
+
+def test_with_constraints_only_solvers_that_keep_them_are_suggested():
+    rod = lambda q, args: jnp.stack([jnp.sum(q**2) - 1])
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + q[0]
+    noise = lambda t, p, q, args: jnp.sin(q[0])
+    y0 = jnp.array([0.0, 0.1]), jnp.array([1.0, 0.0])
+    kicked = ds.hamiltonian_terms(H0, noise, (), constraint=rod)
+    bath = ds.langevin_terms(H0, 1.0, 0.5, (2,), constraint=rod)
+    for terms, name in ((kicked, "StormerVerlet"), (bath, "BAOAB")):
+        for want in ("weak", "strong"):
+            found = ds.suggest_solver(terms, 0.0, y0, want=want)
+            assert [type(s.solver).__name__ for s in found] == [name]
+            assert "constraints" in found.system
+        # With the path of the solver these are still terms with a constraint.
+        found[0].solver.init(found[0].terms(jr.key(0)), 0.0, 0.1, y0, None)
+        with pytest.raises(ValueError, match="have a `constraint`"):
+            at = found[0].terms(jr.key(0)), 0.0, 0.1, y0, None, None, False
+            ds.ImplicitMidpoint().step(*at)
+    mixed = lambda t, p, q, args: jnp.sum(p**2) * q[0]
+    terms = ds.hamiltonian_terms(mixed, noise, (), constraint=rod)
+    with pytest.raises(ValueError, match="Solvers for terms with a `constraint` need"):
+        ds.suggest_solver(terms, 0.0, y0, want="weak")

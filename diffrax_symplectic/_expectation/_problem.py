@@ -22,7 +22,9 @@ from .._suggest import own_path, specified
 from .._terms import (
     brownian_paths,
     check_fit,
+    check_start,
     check_stratonovich,
+    constraint_of,
     evaluated,
     has_lifted,
 )
@@ -81,6 +83,8 @@ class Problem(eqx.Module):
             raise ValueError(f"`y0` must hold finite numbers; got {y0}.")
         start = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
         check_fit(terms, start, y0, args)
+        if constraint_of(terms) is not None:
+            check_start(terms, start, y0, args)
         _check_noise(terms)
         smallest = float(dt0) / 2 ** (levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):

@@ -106,6 +106,8 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
         diffrax.LocalLinearInterpolation
     )
     record: ClassVar[Record | None] = None
+    # Whether it takes terms with a `constraint`.
+    keeps_constraints: ClassVar[bool] = False
     structure: AbstractVar[Structure]
     variables: AbstractVar[tuple[str, ...]]
 

@@ -222,3 +222,15 @@ def test_every_operation_of_the_table_is_tested():
     tested = {name.split()[0] for name in CASES}
     # These two have no value.
     assert names() == tested | {"custom_call", "sharding_constraint"}
+
+
+def test_a_selection_by_a_scalar_keeps_the_axis_of_a_single_entry():
+    yes, x = values(B, (), bool, 0), values(F, (1,), np.float64, 2)
+    x[~np.isfinite(x)] = 0.5
+
+    def fn(yes, x):
+        # The product needs an axis.
+        return jnp.where(yes, x, 0) @ jnp.ones((1, 2))
+
+    (actual,) = replayed(fn, yes, x)
+    np.testing.assert_array_equal(actual, np.where(yes, x[:, 0], 0)[:, None] * [1, 1])
