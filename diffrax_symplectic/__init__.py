@@ -26,7 +26,7 @@ from ._brownian import (
 )
 from ._citation import citation as citation
 from ._compare import compare_solvers as compare_solvers, Comparison as Comparison
-from ._conditions import (
+from ._tableau import (
     strong_order_residuals as strong_order_residuals,
     symplectic_residuals as symplectic_residuals,
     weak_order_residuals as weak_order_residuals,

@@ -15,15 +15,14 @@ from jaxtyping import Array, Bool, PyTree
 
 from ._arguments import whole_number
 from ._compat import nondifferentiable_backward, reversed_in_time, while_loop, ω
-from ._conditions import is_own_inverse
 from ._custom_types import IntScalarLike, RealScalarLike, Y
-from ._plan import make_plan
 from ._solver import (
     AbstractSplitting,
     AbstractSymplecticRungeKutta,
     BAOAB,
     NinomiyaVictoir,
 )
+from ._tableau import is_own_inverse, make_plan
 
 
 class ReversingAdjoint(diffrax.AbstractAdjoint):

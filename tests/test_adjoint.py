@@ -11,8 +11,7 @@ from diffrax._term import WrapTerm
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._adjoint import _begin_anew, _undoes_its_steps
-from diffrax_symplectic._conditions import is_own_inverse
-from diffrax_symplectic._tableau import FlatTableau, Stage
+from diffrax_symplectic._tableau import FlatTableau, is_own_inverse, Stage
 
 from .problems import damped_terms, Given, H0, noise, random_problem, weak_path
 
@@ -216,6 +215,7 @@ def test_a_way_back_that_is_lost_is_reported_for_that_path_alone():
 @pytest.mark.parametrize(
     "path", [weak_path(1), ds.FixedStepBrownianPath((1,), jr.key(3))]
 )
+@pytest.mark.slow
 def test_the_way_back_leads_to_rest(path):
     # Three-point increments are zero in two steps of three: several first steps may rest.
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + 1 - jnp.sum(jnp.cos(q))

@@ -16,6 +16,8 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._suggest import LANGEVIN, SOLVERS
 from examples.notebooks import read_cells, SCRIPTS
 
+from .families import slow_except
+
 
 ROOT = Path(__file__).parent.parent
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -37,12 +39,17 @@ DOCSTRINGS = {
 
 
 @pytest.mark.parametrize("name", DOCSTRINGS)
+@pytest.mark.slow
 def test_the_example_of_a_docstring_runs(name):
     for code in DOCSTRINGS[name]:
         exec(compile(textwrap.dedent(code), name, "exec"), {})
 
 
-@pytest.mark.parametrize("page", PAGES)
+# Those that a new user runs first.
+FIRST_PAGES = "README.md", "docs/index.md", "docs/concepts.md"
+
+
+@pytest.mark.parametrize("page", slow_except(FIRST_PAGES, PAGES))
 def test_code_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     # Pictures are drawn into files, outside the checkout.
     monkeypatch.setenv("MPLBACKEND", "Agg")

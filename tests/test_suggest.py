@@ -121,6 +121,7 @@ def check_systems(seeds) -> set:
     return {solver for solver, _ in traced}
 
 
+@pytest.mark.slow
 def test_no_suggestion_is_refused():
     # Noise of each kind, with p and q mixed by H0 and not, in both precisions.
     suggested = check_systems([0, 2, 3, 5, 6, 9, 12, 18])

@@ -1,5 +1,5 @@
-from ._stepwise import AbstractStepwisePath, AbstractWrappedPath, GivenPath, Increment
-from ._stepwise import (
+from .stepwise import AbstractStepwisePath, AbstractWrappedPath, GivenPath, Increment
+from .stepwise import (
     checked_shape,
     increment_struct,
     is_random,
@@ -10,9 +10,9 @@ from ._stepwise import (
     stepwise,
     UnspecifiedPath,
 )
-from ._paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
-from ._random import AbstractLaw, check_key, Discrete, is_key, random_words
-from ._random import THREE_POINT, typed_key
-from ._levy_area import LevyAreaBrownianPath, LevyAreaIncrement
-from ._wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPath
-from ._variables import drives, path_of, VARIABLES
+from .paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
+from .random import AbstractLaw, check_key, Discrete, is_key, random_words
+from .random import THREE_POINT, typed_key
+from .levy_area import LevyAreaBrownianPath, LevyAreaIncrement
+from .wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPath
+from .variables import drives, path_of, VARIABLES

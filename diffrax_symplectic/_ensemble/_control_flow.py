@@ -4,7 +4,7 @@ from typing import Any
 
 from ._backend import drjit
 from ._operation import NotReplayed, rule
-from ._tensor import flat, known, Tensor, unflat
+from ._tensor import copied, flat, known, Tensor, unflat
 
 
 @rule
@@ -40,9 +40,9 @@ def _case(o, index):
         """The first of the branches, or one of the others."""
         first, *others = left
         if not others:
-            return flat(o.run(first, []))
+            return copied(o.run(first, []))
         here = index.item() == first
-        run, rest = lambda: flat(o.run(first, [])), lambda: taken(others)
+        run, rest = lambda: copied(o.run(first, [])), lambda: taken(others)
         return o.recorded(drjit().if_stmt, (), here, run, rest)
 
     return unflat(taken(branches), o.shapes())
@@ -53,7 +53,7 @@ def _if(o, condition):
     value = known(condition)
     if value is not None:
         return o.run(0 if value else 1, [])
-    yes, no = (lambda i=i: flat(o.run(i, [])) for i in (0, 1))
+    yes, no = (lambda i=i: copied(o.run(i, [])) for i in (0, 1))
     out = o.recorded(drjit().if_stmt, (), condition.item(), yes, no)
     return unflat(out, o.shapes())
 
@@ -82,6 +82,6 @@ def _while(o, *xs):
         return [next(left) if m else x for x, m in zip(fixed, moves)]
 
     on = lambda *y: o.run(0, whole(y))[0].item()
-    once = lambda *y: flat(moving(o.run(1, whole(y))))
+    once = lambda *y: copied(moving(o.run(1, whole(y))))
     out = o.recorded(drjit().while_loop, flat(start), on, once, compress=False)
     return whole(out)

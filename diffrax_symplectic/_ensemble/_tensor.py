@@ -62,6 +62,13 @@ def flat(xs: Sequence[Tensor]) -> tuple:
     return tuple(entry for x in xs for entry in x.entries)
 
 
+def copied(xs: Sequence[Tensor]) -> tuple:
+    """The entries of these tensors as objects of their own, as a branch or the body of a
+    loop must return them: Dr.Jit writes the result of a conditional into the objects that
+    a branch returned, so a value from outside would change for all who hold it."""
+    return tuple(type(entry)(entry) for entry in flat(xs))
+
+
 def unflat(entries: Iterable[Any], shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
     left = iter(entries)
     return [Tensor([next(left) for _ in range(math.prod(s))], s) for s in shapes]

@@ -17,11 +17,9 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 from .._arguments import check_state, whole_number
 from .._batch import batched_like
 from .._brownian import drives, path_of, VARIABLES
-from .._conditions import drift_order
 from .._custom_types import Args, Y
-from .._plan import make_plan
 from .._root_finder import PicardNewton
-from .._tableau import AbstractTableau, FlatTableau, Structure
+from .._tableau import AbstractTableau, drift_order, FlatTableau, make_plan, Structure
 from .._terms import (
     check_structure,
     drift_driven,
@@ -29,8 +27,8 @@ from .._terms import (
     number_of_noises,
     split_terms,
 )
-from ._step import no_failure, result_of, Solved, Step, take_step
-from ._times import result_at
+from .step import no_failure, result_of, Solved, Step, take_step
+from .times import result_at
 
 
 if TYPE_CHECKING:

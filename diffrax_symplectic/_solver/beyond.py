@@ -9,9 +9,14 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 
-from .._conditions import drift_order
-from .._plan import make_plan
-from .._tableau import FlatTableau, GeneralTableau, Stage, Structure
+from .._tableau import (
+    drift_order,
+    FlatTableau,
+    GeneralTableau,
+    make_plan,
+    Stage,
+    Structure,
+)
 from .._terms import (
     apply_one,
     controls,
@@ -19,8 +24,6 @@ from .._terms import (
     number_of_noises,
     split_terms,
 )
-from ._step import no_failure, result_of, Step, take_step
-from ._times import result_at
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
@@ -28,6 +31,8 @@ from .base import (
     Record,
 )
 from .general import GAUSS, ImplicitMidpoint
+from .step import no_failure, result_of, Step, take_step
+from .times import result_at
 
 
 _half = np.array([1 / 2, 1 / 2])

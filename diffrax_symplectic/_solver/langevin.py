@@ -14,9 +14,9 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from .._terms import apply, check_structure, controls, momentum_first, rate
 from ._bath import after_friction, check_friction, split_friction
-from ._step import result_of
-from ._times import result_at
 from .base import AbstractSymplecticSolver, Record
+from .step import result_of
+from .times import result_at
 
 
 class AbstractLangevinSplitting(AbstractSymplecticSolver):

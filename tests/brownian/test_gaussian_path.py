@@ -9,8 +9,8 @@ import pytest
 from scipy import special
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._brownian import _random as words
-from diffrax_symplectic._brownian._random import normal_from_words
+from diffrax_symplectic._brownian import random as words
+from diffrax_symplectic._brownian.random import normal_from_words
 
 from ..problems import kubo_terms
 

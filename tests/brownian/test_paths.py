@@ -10,7 +10,7 @@ import pytest
 from jax.extend.random import threefry_2x32
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._brownian._random import (
+from diffrax_symplectic._brownian.random import (
     _threefry,
     AREA_WORDS,
     place_of,

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+import pytest
 
 import diffrax_symplectic as ds
 from examples.hard_cases import (
@@ -24,6 +25,9 @@ from examples.hard_cases._ensemble import ensemble, Mean, truncated
 from examples.hard_cases._stationary import stationary_bias, Step
 
 from ..problems import FineSample, slope
+
+
+pytestmark = pytest.mark.slow
 
 
 def test_two_bodies_keep_their_angular_momentum_and_gain_energy_as_they_should():

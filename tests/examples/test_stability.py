@@ -13,6 +13,9 @@ from examples.stability import _models, rounding, solvability, stiff
 from ..problems import Given, kubo_terms
 
 
+pytestmark = pytest.mark.slow
+
+
 HS, STRENGTHS = np.array([0.02, 0.2, 2.0]), np.array([0.05, 0.5, 2.0])
 
 

@@ -1,6 +1,7 @@
 """The chart of total errors against time: what it extrapolates and what it calls exact."""
 
 import numpy as np
+import pytest
 from scipy.linalg import expm
 
 import diffrax_symplectic as ds
@@ -9,6 +10,9 @@ from examples._gallery import weak
 from examples._transfer import transfer_expectations
 from examples.benchmarks import _exact, total_error
 from examples.hard_cases import chain
+
+
+pytestmark = pytest.mark.slow
 
 
 def test_independent_paths_take_the_step_that_is_cheapest_for_an_error():

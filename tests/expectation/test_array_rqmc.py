@@ -205,6 +205,7 @@ def _numbers() -> list[str]:
     return [float(x).hex() for e in each for x in (e.mean, e.bias, e.std_error)]
 
 
+@pytest.mark.slow
 def test_one_device_and_eight_give_the_same_numbers():
     root = str(Path(__file__).parents[2])
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}

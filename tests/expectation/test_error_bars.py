@@ -54,6 +54,7 @@ def _energy(s: float, h: float, steps: int) -> float:
     return end[4] + end[8]
 
 
+@pytest.mark.slow
 def test_means_do_not_depend_on_units():
     exact = _energy(0.1, 0.1, 20)
     units = [(1.0, 1.0), (2.0**-83, 2.0**-19), (1e-25, 2e-6)]
@@ -67,6 +68,7 @@ def test_means_do_not_depend_on_units():
 
 
 @pytest.mark.parametrize("sampling", [ds.ValueFunctions(), None])
+@pytest.mark.slow
 def test_rare_paths_that_carry_the_mean_are_not_lost(sampling):
     got = ds.expectation(
         ENERGY, PARAMETRIC, ds.StormerVerlet(), 0.0, 5.0, 0.05, Y0, key=jr.key(1),
@@ -200,6 +202,7 @@ _FEW = {
 # Additive and strong; multiplicative and strong, for heavy tails.
 @pytest.mark.parametrize("name", _FEW)
 @pytest.mark.parametrize("noise", ["additive", "multiplicative"])
+@pytest.mark.slow
 def test_intervals_cover_as_often_as_they_say(name, noise):
     cell, devices = Cell(noise, 1.0, 1.0, steps=10), tuple(jax.devices()[:1])
     problem = Problem.of(*arguments(cell), None, 1)

@@ -74,6 +74,7 @@ def _enumerated(terms, solver, y, phi, h: float, steps: int):
     return w @ jax.vmap(lambda y: phi(0.0, y, None))(ys)
 
 
+@pytest.mark.slow
 def test_rare_paths_that_leave_the_grid_do_not_move_the_mean():
     # Of probability 1e-6: they are not among the paths, and so not in the standard error.
     quartic = lambda t, p, q, args: (p**2 + q**2) / 2 + 0.1 * (p**4 + q**4)
@@ -155,6 +156,7 @@ def _harmonic(n: int, m: int):
 
 
 @pytest.mark.parametrize("n, m", [(1, 5), (8, 2), (8, 6)])
+@pytest.mark.slow
 def test_many_noises_and_many_dimensions_are_closed_where_they_can_be(n, m):
     # 243 and 729 outcomes: by derivatives. 16 dimensions: by mean derivatives.
     terms, y0 = _harmonic(n, m), (jnp.zeros(n), jnp.ones(n))
@@ -165,6 +167,7 @@ def test_many_noises_and_many_dimensions_are_closed_where_they_can_be(n, m):
     assert got.std_error < 1e-12
 
 
+@pytest.mark.slow
 def test_noise_that_enters_nonlinearly_leaves_the_mean_as_it_is():
     H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
     noise = lambda t, p, q, args: 0.5 * jnp.sin(q + jnp.arange(5.0))
@@ -257,6 +260,7 @@ def test_wider_noise_knows_its_likelihood_and_its_entropy():
         assert np.allclose(mean, 0) if share else mean[0] > 0.3 > -0.3 > mean[1]
 
 
+@pytest.mark.slow
 def test_levels_extrapolate_and_the_bias_is_known_as_well_as_the_mean():
     got = _estimate(ds.ValueFunctions(6), levels=3)
     fine, finer = (

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from diffrax_symplectic._root_finder import differentiate
-from diffrax_symplectic._root_finder._linear import solve
+from diffrax_symplectic._root_finder.linear import solve
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])

@@ -12,7 +12,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._batch import most_of_batch
-from diffrax_symplectic._root_finder._tolerance import converged, max_norm
+from diffrax_symplectic._root_finder.tolerance import converged, max_norm
 
 
 @pytest.mark.parametrize("frequency", [0.1, 1.0, 10.0, 1000.0])

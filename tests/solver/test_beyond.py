@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._plan import make_plan
+from diffrax_symplectic._tableau import make_plan
 
 from ..problems import (
     FineSample,

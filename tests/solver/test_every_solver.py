@@ -14,8 +14,8 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import VARIABLES
-from diffrax_symplectic._plan import make_plan
 from diffrax_symplectic._suggest import SOLVERS
+from diffrax_symplectic._tableau import make_plan
 
 from ..picard import by_picard
 from ..problems import (

@@ -25,6 +25,7 @@ from ..problems import (
 
 
 @pytest.mark.parametrize("m", [3])
+@pytest.mark.slow
 def test_ninomiya_victoir_is_weak_order_two(m):
     solver = ds.NinomiyaVictoir()
     terms = ds.hamiltonian_terms(H0, noise, weak_path(m, two_point=True))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._plan import Block, make_plan
+from diffrax_symplectic._tableau import Block, make_plan
 from examples._srkw2 import PaperSRKw2
 
 from .. import paper

@@ -51,6 +51,7 @@ def _drift_of_invariant(terms, solver, y0, invariant, h, steps):
 # What a solver keeps of one quadratic invariant it keeps of any, and every one has the test
 # below: here are a solver with one system of equations and one with several.
 @pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.SRKw2()], ids=repr)
+@pytest.mark.slow
 def test_kubo_energy_is_conserved_over_1e5_steps(solver):
     y0 = (jnp.array(0.0), jnp.array(1.0))
     terms = kubo_terms(ds.WeakBrownianPath((), jr.key(0)))
@@ -59,6 +60,7 @@ def test_kubo_energy_is_conserved_over_1e5_steps(solver):
 
 
 @all_solvers
+@pytest.mark.slow
 def test_rigid_body_stays_on_the_sphere_over_1e5_steps(solver):
     y0 = jnp.array([np.cos(1.1), 0.0, np.sin(1.1)])
     terms = rigid_body_terms(ds.WeakBrownianPath((), jr.key(0)))

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._plan import make_plan
+from diffrax_symplectic._tableau import make_plan
 
 from ..problems import Given
 

@@ -31,6 +31,7 @@ def test_defect_sees_a_method_that_is_not_symplectic(solver):
     [(name, jnp.float64) for name in GENERAL]
     + [(name, jnp.float32) for name in ("ImplicitMidpoint", "SRKw2")],
 )
+@pytest.mark.slow
 def test_stage_equations_are_solved_to_rounding_error(name, dtype):
     solver = GENERAL[name]
     # Derivatives are implicit, and those of steps would be symplectic at any approximate

@@ -66,10 +66,10 @@ def test_dampings_fit_lattices_of_spins_and_take_their_precision():
     "solver, dtype, bound",
     [
         (ds.ImplicitMidpoint(), jnp.float64, 1e-13),
-        (ds.ImplicitMidpoint(), jnp.float32, 1e-5),
+        pytest.param(ds.ImplicitMidpoint(), jnp.float32, 1e-5, marks=pytest.mark.slow),
         (ds.NinomiyaVictoir(), jnp.float64, 1e-13),
-        (ds.LevyAreaMidpoint(), jnp.float64, 1e-13),
-        (ds.PlateauGauss(), jnp.float64, 1e-13),
+        pytest.param(ds.LevyAreaMidpoint(), jnp.float64, 1e-13, marks=pytest.mark.slow),
+        pytest.param(ds.PlateauGauss(), jnp.float64, 1e-13, marks=pytest.mark.slow),
     ],
     ids=[
         "ImplicitMidpoint",
@@ -99,6 +99,7 @@ def test_length_is_kept_for_a_thousand_random_systems(solver, dtype, bound):
     assert jnp.max(changes) <= bound
 
 
+@pytest.mark.slow
 def test_ninomiya_victoir_keeps_weak_order_two_with_damping():
     path = weak_path(2, two_point=True)
     terms = ds.spin_terms(H0, noise, path, damping=0.6)
@@ -115,6 +116,7 @@ def test_ninomiya_victoir_keeps_weak_order_two_with_damping():
     np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_stationary_law_of_one_spin_is_that_of_gibbs_up_to_the_square_of_the_step():
     # In a field, with an easy axis beside it.
     H = lambda s: -0.5 * s[2] - 0.4 * s[0] ** 2

@@ -117,10 +117,10 @@ def _thousand_systems():
     "solver, dtype, bound",
     [
         (ds.ImplicitMidpoint(), jnp.float64, 1e-13),
-        (ds.ImplicitMidpoint(), jnp.float32, 5e-6),
-        (ds.SRKw1(b=0.2), jnp.float64, 1e-13),
+        pytest.param(ds.ImplicitMidpoint(), jnp.float32, 5e-6, marks=pytest.mark.slow),
+        pytest.param(ds.SRKw1(b=0.2), jnp.float64, 1e-13, marks=pytest.mark.slow),
         (ds.NinomiyaVictoir(), jnp.float64, 1e-13),
-        (ds.LevyAreaMidpoint(), jnp.float64, 1e-13),
+        pytest.param(ds.LevyAreaMidpoint(), jnp.float64, 1e-13, marks=pytest.mark.slow),
     ],
     ids=["ImplicitMidpoint", "float32", "SRKw1", "NinomiyaVictoir", "LevyAreaMidpoint"],
 )
@@ -163,6 +163,7 @@ def test_one_step_in_a_constant_field_is_the_rotation_of_the_cayley_map():
     np.testing.assert_allclose(ds.from_spinors(y1), expected, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_ninomiya_victoir_is_weak_order_two_for_noises_that_do_not_commute():
     terms = ds.spin_terms(H0, noise, weak_path(2, two_point=True))
     s0, args = jax.vmap(lambda key: _problem(key, 1, 2))(jr.split(jr.key(2), 2))
@@ -211,6 +212,7 @@ def _end(y0, args, solver=ds.ImplicitMidpoint()):  # noqa: B008
 
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.slow
 def test_a_batch_of_chains_keeps_lengths_and_does_not_see_the_phase(dtype):
     eps = jnp.finfo(dtype).eps
     s0 = jax.vmap(lambda key: _problem(key, 4, 1, dtype)[0])(jr.split(jr.key(0), 3))

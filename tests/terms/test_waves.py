@@ -91,6 +91,7 @@ def test_what_are_no_pairs_of_real_arrays_is_refused():
     [ds.ImplicitMidpoint(), ds.SRKw1(), ds.StrangGauss(), ds.NinomiyaVictoir()],
     ids=repr,
 )
+@pytest.mark.slow
 def test_norm_is_kept_over_ten_thousand_steps(solver):
     H0 = lambda t, psi, args: _mean(X, psi) + jnp.sum(jnp.abs(psi) ** 4)
     noise = lambda t, psi, args: 0.5 * _mean(Z, psi) + 0.2 * jnp.abs(psi[0]) ** 4
@@ -123,6 +124,7 @@ def test_noisy_qubit_has_the_density_matrix_of_lindblad_without_sampling(solver,
     assert errors[-1] <= (1e-2 if order == 1 else 1e-4)
 
 
+@pytest.mark.slow
 def test_noisy_qubit_sampled():
     times = np.array([1.0, 2.0])
     path = lambda key: qubit.sampled(key, times, 0.1)

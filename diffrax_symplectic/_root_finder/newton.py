@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._batch import batched_like
 from .._custom_types import IntScalarLike
-from ._linear import correction
-from ._tolerance import all_finite, converged, largest, log2, max_norm, ratio, Tolerance
+from .linear import correction
+from .tolerance import all_finite, converged, largest, log2, max_norm, ratio, Tolerance
 
 
 _Vector: TypeAlias = Float[Array, " n"]

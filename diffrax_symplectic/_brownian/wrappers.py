@@ -9,8 +9,8 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._arguments import whole_number
 from .._custom_types import BM
-from ._paths import WeakBrownianPath
-from ._random import (
+from .paths import WeakBrownianPath
+from .random import (
     AbstractLaw,
     check_key,
     place_of,
@@ -18,7 +18,7 @@ from ._random import (
     random_words,
     TWO_POINT,
 )
-from ._stepwise import (
+from .stepwise import (
     AbstractWrappedPath,
     draw_set,
     Increment,

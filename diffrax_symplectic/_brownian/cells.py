@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
 from .._custom_types import RealScalarLike
-from ._stepwise import Increment, raveled, step_size
+from .stepwise import Increment, raveled, step_size
 
 
 class Piece(eqx.Module):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._plan import Block, make_plan
+from diffrax_symplectic._tableau import Block, make_plan
 from examples._srkw2 import PaperSRKw2, srkw2_tableau
 
 
@@ -183,7 +183,7 @@ def test_noise_of_a_tableau_is_a_tuple_of_names():
 
 
 def test_tableaus_know_nothing_of_jax():
-    file = pathlib.Path(ds.__file__).parent / "_tableau.py"
+    file = pathlib.Path(ds.__file__).parent / "_tableau" / "tableau.py"
     imported = set()
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):

@@ -17,9 +17,8 @@ from jaxtyping import Array, Bool, PyTree
 from .._batch import batched_like, materialize
 from .._compat import ω
 from .._custom_types import RealScalarLike, Y
-from .._plan import Block, Plan
 from .._root_finder import all_finite, differentiate, Halves
-from .._tableau import FlatTableau, Stage
+from .._tableau import Block, FlatTableau, Plan, Stage
 from .._terms import tree_sum
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from .._batch import batched_like, materialize, most_of_batch
 from .._compat import ω
 from .._custom_types import IntScalarLike
-from ._tolerance import converged, Correction, log2, MARGIN, Tolerance
+from .tolerance import converged, Correction, log2, MARGIN, Tolerance
 
 
 Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]

@@ -9,9 +9,9 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from .._batch import where_pending
-from ._linear import MAX_WRITTEN_OUT, solve, Solver
-from ._sweeps import sweep
-from ._tolerance import Tolerance
+from .linear import MAX_WRITTEN_OUT, solve, Solver
+from .sweeps import sweep
+from .tolerance import Tolerance
 
 
 # Derivatives are solved to rounding error, as steps are by default.

@@ -7,9 +7,7 @@ import itertools
 import numpy as np
 
 import diffrax_symplectic as ds
-from diffrax_symplectic import _plan
-from diffrax_symplectic._plan import make_plan
-from diffrax_symplectic._tableau import FlatTableau, Stage
+from diffrax_symplectic._tableau import FlatTableau, make_plan, plan as plans, Stage
 
 
 BOTH = ("h", "W")
@@ -168,8 +166,8 @@ def test_the_search_for_few_unknowns_is_bounded(monkeypatch):
     matrix[np.ix_(more, ten)] = 0.1
     stages = tuple(Stage(("h",), c, "y", "y") for c in np.linspace(0, 1, 28))
     tableau, tried = FlatTableau(stages, matrix, np.ones(28)), []
-    rounds = _plan._rounds
-    monkeypatch.setattr(_plan, "_rounds", lambda *a: tried.append(a) or rounds(*a))
+    rounds = plans._rounds
+    monkeypatch.setattr(plans, "_rounds", lambda *a: tried.append(a) or rounds(*a))
     first, *rest = make_plan(tableau).blocks
     assert first.unknown == (tuple(six),) and first.explicit == (tuple(ten),)
     assert all(block.unknown == () for block in rest) and len(rest) == len(more)

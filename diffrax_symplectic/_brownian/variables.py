@@ -8,9 +8,9 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import diffrax
 from jaxtyping import PRNGKeyArray
 
-from ._levy_area import LevyAreaBrownianPath, LevyAreaIncrement
-from ._paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
-from ._wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPath
+from .levy_area import LevyAreaBrownianPath, LevyAreaIncrement
+from .paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
+from .wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPath
 
 
 # Makes a Brownian path of a shape from a key.

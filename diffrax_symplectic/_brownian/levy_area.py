@@ -12,10 +12,10 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 from .._arguments import whole_number
 from .._batch import materialize
 from .._custom_types import BM, RealScalarLike
-from ._cells import checked_cell, compose, or_one, Piece
-from ._random import AREA_WORDS, check_key, normal_from_words, place_of, random_words
-from ._stepwise import AbstractWrappedPath, Increment, increment_struct, num_noises
-from ._wrappers import require_space_time_area
+from .cells import checked_cell, compose, or_one, Piece
+from .random import AREA_WORDS, check_key, normal_from_words, place_of, random_words
+from .stepwise import AbstractWrappedPath, Increment, increment_struct, num_noises
+from .wrappers import require_space_time_area
 
 
 class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):

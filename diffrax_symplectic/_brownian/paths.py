@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM
-from ._cells import checked_cell, compose, Piece
-from ._random import (
+from .cells import checked_cell, compose, Piece
+from .random import (
     AbstractLaw,
     check_key,
     FOUR_POINT,
@@ -17,7 +17,7 @@ from ._random import (
     THREE_POINT,
     TWO_POINT,
 )
-from ._stepwise import AbstractPathWithLaws, checked_shape, GAUSSIAN_LAWS, Increment
+from .stepwise import AbstractPathWithLaws, checked_shape, GAUSSIAN_LAWS, Increment
 
 
 class WeakIncrement(diffrax.AbstractBrownianIncrement):

@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from ._tableau import FlatTableau, Stage
+from .tableau import FlatTableau, Stage
 
 
 # Coefficients are exact up to a few roundings of numbers of order one.

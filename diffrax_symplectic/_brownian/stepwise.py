@@ -16,7 +16,7 @@ from jaxtyping import Array, PRNGKeyArray, PyTree, UInt32
 
 from .._compat import nondifferentiable
 from .._custom_types import RealScalarLike
-from ._random import AbstractLaw, Gaussian, is_key, Place, place_of, random_words
+from .random import AbstractLaw, Gaussian, is_key, Place, place_of, random_words
 
 
 if TYPE_CHECKING:

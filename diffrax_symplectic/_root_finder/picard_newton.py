@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from .._arguments import whole_number
 from .._batch import batched_like, where_pending
 from .._compat import ω
-from ._newton import Newton
-from ._sweeps import sweep
-from ._tolerance import all_finite, Tolerance
+from .newton import Newton
+from .sweeps import sweep
+from .tolerance import all_finite, Tolerance
 
 
 _SUCCESSFUL = optx.RESULTS.successful

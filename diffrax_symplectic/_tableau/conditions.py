@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from ._brownian import drives, VARIABLES
-from ._tableau import (
+from .._brownian import drives, VARIABLES
+from .tableau import (
     AbstractTableau,
     AdditiveTableau,
     FlatTableau,
