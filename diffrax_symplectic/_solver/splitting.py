@@ -58,6 +58,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
         return record and record._replace(
             weak=_at_most(record.weak, self.weak),
             strong=_at_most(record.strong, self.strong),
+            stationary=(),
         )
 
     def weak_order(self, terms) -> int | None:
