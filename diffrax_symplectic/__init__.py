@@ -81,6 +81,7 @@ from ._tableau import (
     SeparableTableau as SeparableTableau,
 )
 from ._terms import (
+    bath_terms as bath_terms,
     FrictionAlong as FrictionAlong,
     from_pair as from_pair,
     from_spinors as from_spinors,

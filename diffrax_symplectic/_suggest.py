@@ -46,7 +46,7 @@ from ._terms import (
     constant_fault,
     Fault,
     FRICTION,
-    is_friction,
+    friction_apart,
     number_of_noises,
     path_numbers,
     replace_paths,
@@ -173,7 +173,7 @@ def suggest_solver(
     commute = commute or commuting(noise, t0, y0, args)
     with_friction = takes_friction_apart(terms, t0, y0, args)
     solvers = ranked(want, structures, commute, m, with_friction)
-    if not any(map(is_friction, drift)):
+    if len(friction_apart(drift)[1]) == 0:
         # Diffrax's own terms, which only the Langevin splittings take apart.
         solvers = [solver for solver in solvers if not isinstance(solver, Damped)]
     paths = brownian_paths(noise)

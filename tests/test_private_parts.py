@@ -56,6 +56,9 @@ def test_diffrax_wraps_the_terms_of_a_solve_with_its_direction(terms):
     with jax.disable_jit(), jax.ensure_compile_time_eval():
         solve()
     assert _compat.direction(seen[1]) == -1 and _compat.direction(drift) == 1
+    other = _compat.replaced(seen[1], drift)
+    assert _compat.direction(other) == -1 and _compat.unwrapped(other) is drift
+    assert _compat.replaced(drift, drift) is drift
     turned = _compat.reversed_in_time({"drift": seen[1]})
     assert _compat.direction(turned) == 1
     assert type(turned["drift"]) is type(seen[1])
@@ -153,3 +156,14 @@ def test_a_function_takes_other_arrays_in_place_of_the_captured_ones():
     assert len(arrays) == 1
     out = call({"x": jnp.zeros(3)}, [jnp.full(3, 2.0)])
     assert out["sum"].tolist() == [2.0] * 3 and out["x"].tolist() == [0.0] * 3
+
+
+def test_traced_programs_tell_literals_and_what_they_call():
+    jaxpr = jax.make_jaxpr(lambda x: jax.jit(lambda x: 2.0 * x)(x))(1.0).jaxpr
+    assert isinstance(jaxpr, _compat.Jaxpr)
+    (call,) = jaxpr.eqns
+    assert call.primitive.name in ("jit", "pjit")
+    (product,) = call.params["jaxpr"].jaxpr.eqns
+    assert product.primitive.name == "mul"
+    literals = [isinstance(x, _compat.Literal) for x in product.invars]
+    assert literals == [True, False]

@@ -39,7 +39,7 @@ def correction(
     # With `jvp` the compiled program contains `fn` only once.
     both = lambda v: jax.jvp(fn, (x,), (v,))
     value, matrix = jax.vmap(both, out_axes=(None, 1))(_units(x))
-    return value, _eliminate(matrix, value), jnp.array(True)
+    return value, eliminate(matrix, value), jnp.array(True)
 
 
 def solve(
@@ -50,7 +50,7 @@ def solve(
     of the residual. On failure `x` is inexact or not finite, and nothing is raised."""
     if solver is None and rhs.size <= _MAX_DENSE:
         matrix = jax.vmap(apply, out_axes=1)(_units(rhs))
-        return _eliminate(matrix, rhs), jnp.array(True)
+        return eliminate(matrix, rhs), jnp.array(True)
     if solver is None:
         solver = lx.GMRES(reduction, reduction, restart=_DIRECTIONS)
     # Absolute tolerances assume a right-hand side of size one.
@@ -70,7 +70,7 @@ def _size(rhs: _Vector) -> Scalar:
     return jnp.where(size > 0, size, 1)
 
 
-def _eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
+def eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     """Solves a linear system by elimination with partial pivoting, in XLA operations:
     LAPACK needs a call for each matrix of a batch, and 0.1 s to load."""
     n = len(rhs)

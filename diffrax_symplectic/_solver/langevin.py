@@ -12,9 +12,16 @@ from jaxtyping import PyTree
 from .._arguments import check_state
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
-from .._terms import apply, check_structure, controls, momentum_first, rate
-from ._bath import after_friction, check_friction, split_friction
+from .._terms import (
+    apply,
+    check_structure,
+    controls,
+    momentum_first,
+    rate,
+    split_friction,
+)
 from .base import AbstractSymplecticSolver, Record
+from .bath import after_friction, check_friction
 from .step import result_of
 from .times import result_at
 

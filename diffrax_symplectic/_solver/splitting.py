@@ -14,9 +14,9 @@ from .._arguments import check_pair, check_takes
 from .._compat import direction
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
-from .._terms import Dependence, flattened, has_lifted, is_friction
-from ._bath import after_friction, check_friction, split_friction
+from .._terms import Dependence, has_lifted, split_friction
 from .base import AbstractSymplecticSolver, Order, Record
+from .bath import after_friction, check_friction
 from .langevin import AbstractLangevinSplitting, LangevinMiddle
 
 
@@ -172,8 +172,8 @@ class Damped(AbstractSplitting):
         return after_friction(friction, t, time, y, args), y[1]
 
     def rest(self, terms):
-        others = [term for term in flattened(terms) if not is_friction(term)]
-        return diffrax.MultiTerm(*others)
+        drift, _, noise = split_friction(terms)
+        return diffrax.MultiTerm(*drift, *noise)
 
 
 Damped.__init__.__doc__ = """**Arguments:**
@@ -202,8 +202,8 @@ class LinearFlow(AbstractSplitting):
 
     **Friction.** With friction and noise of a temperature use `LinearFlow(BAOAB(), flow)`.
     Friction acts on the velocities of the whole system, so it comes from terms of the whole
-    Hamiltonian: `MultiTerm(*hamiltonian_terms(R).terms, *langevin_terms(H0, friction,
-    temperature, path).terms[1:])`.
+    Hamiltonian: `MultiTerm(*hamiltonian_terms(R).terms, *bath_terms(H0, friction,
+    temperature, path).terms)`.
 
     The method is symplectic if the solver and `flow` are, which
     [`diffrax_symplectic.symplecticity_defect`][] tests. The orders are the solver's, but at

@@ -2,7 +2,9 @@ from ._controls import controls, drift_driven, noise_driven, outcomes, step_vari
 from ._dependence import acts_elementwise, Dependence
 from ._hamiltonian import evaluated, hamiltonian_terms, has_lifted, IndexedNoise
 from ._hamiltonian import is_hamiltonian
-from ._langevin import FrictionAlong, is_friction, langevin_terms, momentum_first
+from ._diffrax_langevin import momentum_first
+from ._friction import FrictionAlong
+from ._langevin import bath_terms, friction_apart, langevin_terms, split_friction
 from ._spins import as_spins, from_spinors, spin_terms, to_spinors
 from ._structure_checks import additive_fault, check_stratonovich, check_structure
 from ._structure_checks import commuting, constant_fault, Fault, FRICTION
