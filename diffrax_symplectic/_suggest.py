@@ -270,7 +270,8 @@ def ranked(
         assert order is not None
         record = _record(solver)
         # In a heat bath most means are stationary ones, of positions.
-        inexact = friction and "qq" not in record.stationary
+        means = friction and want == "weak"
+        inexact = means and "qq" not in record.stationary
         too_many = cost > _MOST_STAGE_VECTORS
         wrong = record.heats is False
         return inexact, too_many, -order, wrong, cost, max(systems, default=0)

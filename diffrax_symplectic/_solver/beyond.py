@@ -285,6 +285,7 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose="For accurate paths: two stage vectors, and brackets of vector fields.",
         noises="commuting",
         suggested=("strong",),
+        stationary=("qq", "pq", "pp"),
         heats=False,
     )
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(

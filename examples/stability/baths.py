@@ -8,7 +8,6 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
-from ..advice import with_newton
 from ._page import fill, Page, table
 
 
@@ -43,7 +42,6 @@ def energies(solver, omega_h) -> np.ndarray:
     path = solver.path((), jr.key(0), want="weak")
     terms = ds.langevin_terms(H0, FRICTION, 1.0, path)
     y0 = (jnp.array(0.0), jnp.array(0.0))
-    solver = with_newton(solver)
     one = lambda h: ds.second_moment_map(terms, solver, 0.0, h, y0)
     maps = np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(omega_h) / OMEGA))
     second = [4, 5, 7, 8]  # pp, pq, qp, qq among the moments of (1, p, q)
