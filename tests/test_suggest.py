@@ -136,23 +136,26 @@ def test_with_friction_solvers_that_have_it_are_suggested(want):
     y0, friction = (jnp.ones(2), jnp.ones(2)), jnp.array([0.5, 0.2])
     path = ds.WeakBrownianPath((2,), jr.key(0))
     bath = lambda H0: ds.langevin_terms(H0, friction, 0.3, path)
-    for terms, first in (
-        (bath(H0), ds.BAOAB),
-        (damped_terms(H0, friction, other, path), ds.BAOAB),
+    general = ds.AdditiveGauss if want == "weak" else ds.SRKs4
+    other_general = ds.BAOAB if want == "weak" else ds.PlateauGauss
+    for terms, first, is_apart in (
+        # Stationary positions come first for means, and the order for paths.
+        (bath(H0), ds.BAOAB if want == "weak" else ds.SRKs4, True),
+        (damped_terms(H0, friction, other, path), other_general, True),
         # Constant noise, and a mass that depends on positions.
-        (bath(mixed), ds.AdditiveGauss if want == "weak" else ds.SRKs4),
+        (bath(mixed), general, False),
     ):
         found = ds.suggest_solver(terms, 0.0, y0, want=want)
         assert type(found[0].solver) is first
-        assert ("with friction" in found.system) is (first is ds.BAOAB)
+        assert ("with friction" in found.system) is is_apart
         damped = [s.solver.solver for s in found if isinstance(s.solver, ds.Damped)]
-        assert (ds.StormerVerlet() in damped) is (first is ds.BAOAB)
+        assert (ds.StormerVerlet() in damped) is is_apart
         for s in found:
             s.solver.init(s.terms(jr.key(1)), 0.0, 0.1, y0, None)
             assert "().path((2,), key" in s.path or ")).path((2,), key" in s.path
         # Which of the two is for momenta.
         reason = {type(s.solver): s.reason for s in found}
-        if first is ds.BAOAB:
+        if is_apart:
             assert "momenta" in reason[ds.LangevinMiddle]
 
 

@@ -19,7 +19,8 @@ _PATHS_OF_FUNCTIONS, _PATHS, _REPLICATE, _REPLICATES = 2**12, 2**17, 2**14, 16
 MOST = 10**9
 # Scrambling more random variables per step takes long.
 _MOST_WORDS = 2**8
-# Limit on the numbers in all steps of all paths (about ten seconds), and the fewest paths.
+# Limit on the numbers in all steps of all paths (from ten seconds to some
+# minutes), and the fewest paths.
 _NUMBERS, _FEWEST = 2**28, 2**8
 
 

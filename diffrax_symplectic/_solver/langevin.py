@@ -151,8 +151,10 @@ class BAOAB(AbstractLangevinSplitting):
         weak=2,
         strong=1,
         choose="Langevin dynamics: explicit, with very accurate stationary positions, and "
-        "exact mobility and diffusion of free particles.",
+        "exact mobility and diffusion of free particles. Not for momenta, for transients "
+        "to more than three digits, or for frequencies omega > 2 / h.",
         suggested=("weak", "strong"),
+        stationary=("qq", "pq"),
     )
 
     def init(self, terms, t0, t1, y0, args) -> Any:
@@ -214,6 +216,7 @@ class LangevinMiddle(AbstractLangevinSplitting):
         choose="Langevin dynamics, for functions of momenta. Same positions as "
         "`BAOAB`; momenta lag by half a step.",
         suggested=("weak", "strong"),
+        stationary=("qq", "pp"),
     )
 
 

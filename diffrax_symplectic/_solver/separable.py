@@ -112,6 +112,7 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=None,
         choose="Solves for half of the state. For stiff systems.",
         suggested=("weak",),
+        heats=False,
     )
     a21: float = free_parameter("a21", 0.5)
 
@@ -146,6 +147,7 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=1,
         choose="The midpoint rule on half of the state. For stiff systems.",
         suggested=("strong",),
+        heats=False,
     )
     tableau: ClassVar[SeparableTableau] = SeparableTableau(
         alpha=[1], beta=[1], A0=[[1 / 2]], B0=[[1 / 2]], A1=[[1 / 2]]
@@ -221,7 +223,7 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=1,
-        choose="Explicit, with the cheapest step. For frequencies omega < 2 / h.",
+        choose="Explicit, with the cheapest step. Not for frequencies omega > 2 / h.",
         suggested=("weak", "strong"),
     )
     tableau: ClassVar[PartitionedTableau] = PartitionedTableau(
@@ -299,7 +301,7 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=3 / 2,
-        choose="Explicit, with accurate paths. For frequencies omega < 4 / h.",
+        choose="Explicit, with accurate paths. Not for frequencies omega > 4 / h.",
         suggested=("strong",),
     )
     tableau: ClassVar[PartitionedTableau] = _plateau_verlet

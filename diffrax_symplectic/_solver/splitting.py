@@ -58,6 +58,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
         return record and record._replace(
             weak=_at_most(record.weak, self.weak),
             strong=_at_most(record.strong, self.strong),
+            stationary=(),
         )
 
     def weak_order(self, terms) -> int | None:
@@ -160,8 +161,8 @@ class Damped(AbstractSplitting):
         if has_lifted(terms):
             raise ValueError(
                 "`Damped` applies friction to a canonical momentum, which the state of "
-                "`spin_terms` or `wave_terms` does not have: spins would get shorter. For "
-                "damped spins pass `damping=` to `spin_terms`."
+                "`spin_terms` or `wave_terms` does not have: spins would get shorter. Pass "
+                "`damping=` to `spin_terms` or `wave_terms` instead."
             )
         check_pair(y0)
         drift, friction, _ = split_friction(terms)
