@@ -17,7 +17,7 @@ from .._arguments import check_real, check_solver, check_takes, whole_number
 from .._brownian import is_random
 from .._custom_types import Args, RealScalarLike, Y
 from .._root_finder import all_finite
-from .._solver import AbstractSymplecticSolver, check_resolution
+from .._solver import AbstractSymplecticSolver, check_resolution, Want
 from .._suggest import own_path, specified
 from .._terms import (
     brownian_paths,
@@ -60,8 +60,10 @@ class Problem(eqx.Module):
     max_steps: int = eqx.field(static=True)
 
     @staticmethod
-    def of(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels) -> "Problem":
-        """Raises a `ValueError` for bad arguments of `expectation`."""
+    def of(
+        phi, terms, solver, t0, t1, dt0, y0, args, ts, levels, want: Want = "weak"
+    ) -> "Problem":
+        """`want` is what the paths are for that take the place of shapes. Raises a `ValueError` for bad arguments of `expectation`."""
         levels = whole_number("levels", levels)
         check_solver("solver", solver)
         if isinstance(solver, diffrax.HalfSolver):
@@ -69,7 +71,7 @@ class Problem(eqx.Module):
                 "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
             )
         # In each sample other keys take the place of these.
-        terms = specified(terms, ft.partial(own_path, solver, "weak"))
+        terms = specified(terms, ft.partial(own_path, solver, want))
         saved_steps, num_steps = _steps(t0, t1, dt0, ts)
         if callable(y0):
             raise ValueError(
