@@ -95,8 +95,8 @@ def typed_key(key) -> PRNGKeyArray:
 
 
 def derived_key(key: PRNGKeyArray, old):
-    """A key derived from `key` to take the place of `old`, of the same kind and shape. Equal
-    old keys get the same new one."""
+    """A key derived from `key` to take the place of `old`, of the same kind and shape.
+    Equal old keys get the same new one."""
     typed, own = typed_key(old), key
     words = jr.key_data(typed)
     for word in words.reshape(-1):

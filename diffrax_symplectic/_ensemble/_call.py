@@ -44,7 +44,7 @@ class Ensemble(eqx.Module):
     failed: Bool[np.ndarray, " num_paths"]
     num_stragglers: int
     engine: str
-    _terms: Any
+    _problem: Problem
     _key: Any
 
     @property
@@ -55,9 +55,17 @@ class Ensemble(eqx.Module):
         """The terms of path number `number`, with its random keys. Passed to
         `diffrax.diffeqsolve` they give the same path, for example to save it at more
         times."""
+        terms = self._problem.terms
+        return with_keys(terms, path_keys(terms, self._key_of(number)))
+
+    def start(self, number: int) -> tuple[Y, Args]:
+        """The initial state and the `args` of path number `number`."""
+        y0, own = self._problem.drawn(self._key_of(number))
+        return y0, self._problem.with_args(own).args
+
+    def _key_of(self, number: int) -> PRNGKeyArray:
         high, low = (np.uint32(x) for x in divmod(int(number), 2**32))
-        key = sample_key(self._key, high, low)
-        return with_keys(self._terms, path_keys(self._terms, key))
+        return sample_key(self._key, high, low)
 
 
 def ensemble(
@@ -102,12 +110,12 @@ def ensemble(
     terms with these keys, for `diffrax.diffeqsolve`. Paths are simulated in batches, so
     that only the returned arrays grow with their number.
 
-    **Noise.** Where `terms` have the shape of a path, the solver makes one with the Gaussian
-    increments of a Brownian motion (bounded for implicit solvers), so that every function
-    of the states has the right law. The three-point increments of `want="weak"` give the
-    right means of smooth functions only: a momentum that starts at one value has three
-    values after a step, and Brownian motion from 0 leaves (-1, 1) after 1.07 in the mean,
-    not after 1. They take less time per step.
+    **Noise.** Where `terms` have the shape of a path, the solver makes one with the
+    Gaussian increments of a Brownian motion (bounded for implicit solvers), so that every
+    function of the states has the right law. The three-point increments of `want="weak"`
+    take less time, and give the right means of smooth functions only: a momentum that
+    starts at one value has three values after a step, and Brownian motion from 0 leaves
+    (-1, 1) after 1.07 in the mean, not after 1.
 
     **Engines.** `engine="jax"`, the default, moves all paths through each step together.
     `engine="drjit"` compiles all steps to one kernel with
@@ -130,8 +138,8 @@ def ensemble(
     **Returns:** an [`diffrax_symplectic.Ensemble`][].
 
     **Raises:** what [`diffrax_symplectic.expectation`][] raises, and a `ValueError` if
-    `engine` or `want` is unknown. With `engine="drjit"`: a `ValueError` if the system uses an
-    operation that cannot be replayed or its state has more than 256 entries, and an
+    `engine` or `want` is unknown. With `engine="drjit"`: a `ValueError` if the system uses
+    an operation that cannot be replayed or its state has more than 256 entries, and an
     `ImportError` if Dr.Jit or LLVM is missing. Warns if paths failed, and if many are
     stragglers.
     """
@@ -161,7 +169,7 @@ def ensemble(
     saved = np.asarray(problem.levels.saved_steps[0])
     at = float(problem.t0) + saved * float(problem.levels.h[0])
     _warn_of(joined, engine)
-    return Ensemble(at, *joined, engine, problem.terms, key)
+    return Ensemble(at, *joined, engine, problem, key)
 
 
 def _default_size(engine: str, problem: Problem) -> int:

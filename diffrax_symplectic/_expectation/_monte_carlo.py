@@ -57,9 +57,10 @@ class IndependentPaths(AbstractSampling):
 
 def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
     """A sample is a path, with the same random key on all levels."""
-    n, own = len(keys), jax.vmap(lambda key: path_keys(p.terms, key))(keys)
+    own = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
+    drawn = jax.vmap(p.drawn)(keys)
     terms_of = lambda keys: with_keys(p.terms, keys)
-    begin = lambda level: independent_steps(p, level, n, terms_of, lambda i: own)
+    begin = lambda level: independent_steps(p, level, drawn, terms_of, lambda i: own)
     saved, failed, _ = simulate(p, begin)
     # A path that fails on several levels counts once.
     lost = jnp.any(failed, axis=0)
