@@ -16,10 +16,13 @@ from jaxtyping import PRNGKeyArray, PyTree
 
 from ._arguments import check_state
 from ._brownian import (
+    derived_key,
     drives,
     FixedStepBrownianPath,
     increment_struct,
+    is_key,
     is_random,
+    laws_of,
     LevyAreaBrownianPath,
     LevyAreaIncrement,
     PlateauBrownianPath,
@@ -76,7 +79,8 @@ class Suggestion:
     - `path`: the Brownian path that it needs, as code.
     - `reason`: when to choose it, in a sentence.
     - `terms`: a function of a random key that returns the terms of the system with such
-        paths. Paths of given noise, such as a record, are not replaced.
+        paths. Paths of given noise, such as a record, are not replaced. A path of a class
+        of your own, such as one of random kicks, is kept, with another key.
     """
 
     solver: AbstractSymplecticSolver
@@ -193,7 +197,7 @@ def suggest_solver(
         # Lévy areas are only sampled between the noises of one array.
         areas = lambda solver: "noise brackets" in map(drives, solver.variables)
         solvers = [solver for solver in solvers if not areas(solver)]
-    given = [path for path in paths if not is_random(path)]
+    given = [path for path in paths if not is_random(path) or is_own(path)]
     solvers = [s for s in solvers if all(_holds(path, s) for path in given)]
     numbers = path_numbers(random_paths(terms))
     with_new = lambda make: jtu.Partial(
@@ -329,10 +333,14 @@ def _suggestion(
 ) -> Suggestion:
     record = _record(solver)
     random = random_paths(terms)
-    code = "the path of the terms, which holds given noise"
-    if random:
-        shape = _shape_code(increment_struct(random[0]))
+    replaced = [path for path in random if not is_own(path)]
+    if replaced:
+        shape = _shape_code(increment_struct(replaced[0]))
         code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
+    elif random:
+        code = f"the `{type(random[0]).__name__}` of the terms, with another key"
+    else:
+        code = "the path of the terms, which holds given noise"
     return Suggestion(
         solver=solver,
         weak_order=cast(int, record.order("weak", commute)),
@@ -382,11 +390,18 @@ def random_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
     return [path for path in brownian_paths(terms) if is_random(path)]
 
 
+def is_own(path: diffrax.AbstractBrownianPath) -> bool:
+    """Whether this is a path of the user's own class, which need not be a Brownian motion
+    (but the paths of this package and of Diffrax are)."""
+    return laws_of(path) is None
+
+
 def with_paths(
     make: Callable, numbers: tuple[int, ...], terms: PyTree, key: PRNGKeyArray
 ) -> PyTree:
     """The terms with new paths, made from a shape and a key. `numbers` are the
-    `path_numbers` of their random paths; others are not replaced."""
+    `path_numbers` of their random paths; others are not replaced. Paths of the user's own
+    classes only get other keys."""
     left = iter(numbers)
 
     def new(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
@@ -394,6 +409,9 @@ def with_paths(
             return path
         number = next(left)
         own = key if number == 0 else jr.fold_in(key, number + 1)
+        if is_own(path):
+            derived = lambda x: derived_key(own, x) if is_key(x) else x
+            return jtu.tree_map(derived, path)
         return make(increment_struct(path), own)
 
     return replace_paths(terms, new)
