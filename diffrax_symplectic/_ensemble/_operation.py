@@ -52,7 +52,7 @@ class Operation(NamedTuple):
         return [tuple(x.type.shape) for x in self.op.results]
 
     def recorded(self, fn: Callable, *args: Any, **kwargs: Any) -> tuple:
-        """The entries that a loop or conditional returns, which Dr.Jit records with `fn`."""
+        """The entries that a loop or conditional returns, recorded with `fn`."""
         number = len(self.errors)
         out = fn(*args, mode="symbolic", **kwargs)
         if len(self.errors) > number:
