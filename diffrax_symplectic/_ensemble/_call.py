@@ -119,8 +119,8 @@ def ensemble(
     **Raises:** what [`diffrax_symplectic.expectation`][] raises, and a `ValueError` if
     `engine` is unknown. With `engine="drjit"`: a `ValueError` if the system uses an
     operation that cannot be replayed, its state has more than 256 entries, or a
-    `PicardNewton` has a tolerance other than rounding error, and an `ImportError` if Dr.Jit or LLVM is missing. Warns if paths failed, and if many are
-    stragglers.
+    `PicardNewton` has another tolerance than rounding error, and an `ImportError` if Dr.Jit
+    or LLVM is missing. Warns if paths failed, and if many are stragglers.
     """
     given = terms, t0, t1, dt0, y0, args
     key, _, _ = checked_call("ensemble", key, None, None, 0, None, given)
