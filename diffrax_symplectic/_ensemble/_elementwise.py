@@ -35,7 +35,7 @@ def _divide(a, b):
         return a / b
     by, zero, _ = _divisor(a, b)
     # Dr.Jit's `//` of integers rounds to zero, as StableHLO does.
-    return drjit().select(zero, type(a)(-1), a // by)
+    return drjit().select(zero, ~type(a)(0), a // by)
 
 
 def _divisor(a, b):
