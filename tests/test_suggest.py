@@ -24,6 +24,18 @@ from diffrax_symplectic._terms import brownian_paths, path_numbers
 from .problems import damped_terms
 
 
+class Kicks(diffrax.AbstractBrownianPath):
+    """Kicks at random times, whose law is no Gaussian."""
+
+    key: jax.Array
+    t0 = 0.0
+    t1 = jnp.inf
+    levy_area = diffrax.BrownianIncrement
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        return 1.0 * jr.poisson(self.key, t1 - t0)
+
+
 # Pieces of Hamiltonians, by what they allow the whole to be.
 KINETIC = [
     lambda t, p, q: jnp.sum(p**2) / 2,
@@ -364,3 +376,43 @@ def test_suggestions_say_what_the_other_order_of_the_state_would_allow():
     got = ds.suggest_solver(terms, 0, y0, want="strong")
     assert "is the state the wrong way round?" in got.system
     assert "StormerVerlet" not in str(got)
+
+
+def test_with_constraints_only_solvers_that_keep_them_are_suggested():
+    rod = lambda q, args: jnp.stack([jnp.sum(q**2) - 1])
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + q[0]
+    noise = lambda t, p, q, args: jnp.sin(q[0])
+    y0 = jnp.array([0.0, 0.1]), jnp.array([1.0, 0.0])
+    kicked = ds.hamiltonian_terms(H0, noise, (), constraint=rod)
+    bath = ds.langevin_terms(H0, 1.0, 0.5, (2,), constraint=rod)
+    for terms, name in ((kicked, "StormerVerlet"), (bath, "BAOAB")):
+        for want in ("weak", "strong"):
+            found = ds.suggest_solver(terms, 0.0, y0, want=want)
+            assert [type(s.solver).__name__ for s in found] == [name]
+            assert "constraints" in found.system
+        # With the path of the solver these are still terms with a constraint.
+        found[0].solver.init(found[0].terms(jr.key(0)), 0.0, 0.1, y0, None)
+        with pytest.raises(ValueError, match="have a `constraint`"):
+            at = found[0].terms(jr.key(0)), 0.0, 0.1, y0, None, None, False
+            ds.ImplicitMidpoint().step(*at)
+    mixed = lambda t, p, q, args: jnp.sum(p**2) * q[0]
+    terms = ds.hamiltonian_terms(mixed, noise, (), constraint=rod)
+    with pytest.raises(ValueError, match="Solvers for terms with a `constraint` need"):
+        ds.suggest_solver(terms, 0.0, y0, want="weak")
+
+
+def test_a_keyed_path_of_ones_own_is_kept_with_another_key():
+    H = lambda t, p, q, args: (p**2 + q**2) / 2
+    terms = ds.hamiltonian_terms(H, lambda t, p, q, args: -q, Kicks(jr.key(0)))
+    y0 = jnp.array(0.0), jnp.array(1.0)
+    for want in ("strong", "weak"):
+        suggestions = ds.suggest_solver(terms, 0.0, y0, want=want)
+        for suggestion in suggestions:
+            (one,), (other,) = (
+                brownian_paths(suggestion.terms(jr.key(seed))) for seed in (1, 2)
+            )
+            assert type(one) is type(other) is Kicks
+            assert len({int(jr.key_data(x.key)[-1]) for x in (one, other)}) == 2
+            assert suggestion.path == "the `Kicks` of the terms, with another key"
+            # It has increments only.
+            assert suggestion.solver.variables == ("W",)

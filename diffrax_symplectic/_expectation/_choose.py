@@ -32,7 +32,9 @@ def choose(problem: Problem, tol: float | None) -> tuple[AbstractSampling, str]:
     why = f"{d} components of the state, {steps:,} steps"
     why += f" of {outcomes} outcomes each" if outcomes else ""
     paths = int(np.clip(_NUMBERS // (steps * d), _FEWEST, _PATHS))
-    if d <= _FUNCTIONS and outcomes and outcomes <= _FEW_OUTCOMES:
+    # Value functions leave the variance of the start, for which few paths are too few.
+    few_suffice = not problem.paths_differ
+    if few_suffice and d <= _FUNCTIONS and outcomes and outcomes <= _FEW_OUTCOMES:
         if steps * outcomes <= _OUTCOMES:
             sampling = ValueFunctions(None, MOST if tol else _PATHS_OF_FUNCTIONS)
             return sampling, f"value functions for {why}"

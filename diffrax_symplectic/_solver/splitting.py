@@ -14,7 +14,7 @@ from .._arguments import check_pair, check_takes
 from .._compat import direction
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
-from .._terms import Dependence, has_lifted, split_friction
+from .._terms import Dependence, has_lifted, refuse_constraint, split_friction
 from .base import AbstractSymplecticSolver, Order, Record
 from .bath import after_friction, check_friction
 from .langevin import AbstractLangevinSplitting, LangevinMiddle
@@ -93,6 +93,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
         return None if order is None else min(order, 2)
 
     def init(self, terms, t0, t1, y0, args) -> Any:
+        refuse_constraint(terms, type(self).__name__)
         self.check(terms, t0, y0, args)
         return self.solver.init(self.rest(terms), t0, t1, y0, args)
 

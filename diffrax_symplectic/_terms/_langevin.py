@@ -16,6 +16,7 @@ from .._arguments import check_pair, check_takes
 from .._brownian import increment_struct, raveled
 from .._compat import replaced, unwrapped, ω
 from .._custom_types import Args, BM, RealScalarLike
+from ._constraint import constrained, Constraint
 from ._friction import (
     checked_friction,
     checked_temperature,
@@ -40,6 +41,7 @@ def langevin_terms(
     path: diffrax.AbstractBrownianPath | PyTree | None = None,
     *,
     structure: Any = None,
+    constraint: Constraint | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of Langevin dynamics: a Hamiltonian system with friction, in a heat bath.
 
@@ -77,6 +79,9 @@ def langevin_terms(
         [`diffrax_symplectic.hamiltonian_terms`][]: the shape of `q`, or `(m,)` for the `m`
         directions of a `FrictionAlong`.
     - `structure`: as for [`diffrax_symplectic.hamiltonian_terms`][].
+    - `constraint`: as for [`diffrax_symplectic.hamiltonian_terms`][]. Then
+        [`diffrax_symplectic.BAOAB`][] is the solver. Friction and noise act within the
+        allowed momenta; the density is $e^{-H_0 / T}$ on the allowed states.
 
     **Returns:** `MultiTerm(drift, noise)`, or without `temperature` `MultiTerm(drift)`.
 
@@ -87,8 +92,9 @@ def langevin_terms(
     """
     hamiltonian = hamiltonian_terms(H0, structure=structure).terms[0].vector_field
     friction_term, *noise = bath_terms(H0, friction, temperature, path).terms
-    drift = DriftWithFriction(hamiltonian, friction_term.vector_field)
-    return diffrax.MultiTerm(diffrax.ODETerm(drift), *noise)
+    damped = DriftWithFriction(hamiltonian, friction_term.vector_field)
+    drift = constrained(diffrax.ODETerm(damped), constraint)
+    return diffrax.MultiTerm(drift, *noise)
 
 
 def bath_terms(

@@ -223,6 +223,7 @@ def test_traced_frictions_and_temperatures_that_are_none_fail_alone(solver):
     np.testing.assert_array_equal(run(rates, heats), [True] + [False] * 4)
 
 
+@pytest.mark.slow
 def test_every_other_solver_sees_friction_and_noise():
     # The end of a fine solution by Diffrax's solver, which all others approach.
     y0 = jnp.ones(3), jnp.array([0.3, -0.2, 0.5])
