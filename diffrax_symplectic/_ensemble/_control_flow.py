@@ -3,7 +3,7 @@
 from typing import Any
 
 from ._backend import drjit
-from ._operation import NotReplayed, rule
+from ._operation import rule
 from ._tensor import copied, flat, known, Tensor, unflat
 
 

@@ -51,7 +51,18 @@ def _packed(types: list[str], arrays: Iterable[Array]) -> dict[str, Any]:
     for t, x in zip(types, numbers, strict=True):
         of_type[t].append(x)
     # As lists, which are copied: memory of NumPy could be freed while Dr.Jit records.
-    return {t: array_types()[t]([v.item() for v in x]) for t, x in of_type.items()}
+    return {t: _array(t, np.array(x)) for t, x in of_type.items()}
+
+
+def _array(of: str, values: np.ndarray) -> Any:
+    kind = array_types()[of]
+    if np.iscomplexobj(values):
+        return kind(_array(_PART[of], values.real), _array(_PART[of], values.imag))
+    return kind(values.tolist())
+
+
+# The types of the real and the imaginary part.
+_PART = {"complex<f32>": "f32", "complex<f64>": "f64"}
 
 
 def _unpacked(types: list[str], packed: dict[str, Any]) -> list[Any]:

@@ -7,8 +7,6 @@ between loops of Dr.Jit values go through memory, which costs more than operatio
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
-import numpy as np
-
 from ._backend import array_types, drjit
 from ._operation import NotReplayed, Operation, rule
 from ._tensor import Tensor

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ._backend import array_types, drjit
+from ._complex import equal, is_complex, values
 from ._operation import NotReplayed, Operation, rule
 from ._tensor import constant, each, flat, known, Tensor
 
@@ -18,9 +19,10 @@ from ._tensor import constant, each, flat, known, Tensor
 
 @rule
 def _constant(o):
-    return [
-        constant(o.kind, np.broadcast_to(np.asarray(o.op.attributes["value"]), o.shape))
-    ]
+    if is_complex(o.kind):
+        return [constant(o.kind, values(o.op, o.shape))]
+    numbers = np.asarray(o.op.attributes["value"])
+    return [constant(o.kind, np.broadcast_to(numbers, o.shape))]
 
 
 @rule
@@ -256,6 +258,9 @@ def _compare(o, a, b):
     name = o.word("comparison_direction").lower()
     if "compare_type" in o.op.attributes and o.word("compare_type") == "TOTALORDER":
         a, b = each(_in_total_order, a), each(_in_total_order, b)
+    if is_complex(a.entries[0]):
+        same = each(equal, a, b)
+        return [same if name == "eq" else each(operator.invert, same)]
     if name == "ne":
         # NaN differs from everything, but not in Dr.Jit.
         return [each(lambda a, b: ~(a == b), a, b)]
@@ -274,6 +279,17 @@ def _in_total_order(a: Any) -> Any:
 # Combinations
 
 
+def _multiplied_and_added(a: Any, b: Any, c: Any) -> Any:
+    """`a b + c`, in one operation if it can be."""
+    real = drjit().is_float_v(c) and not is_complex(c)
+    return drjit().fma(a, b, c) if real else a * b + c
+
+
+@rule
+def _complex(o, real, imag):
+    return [each(o.kind, real, imag)]
+
+
 @rule
 def _dot_general(o, a, b):
     part = lambda side, kind: o.part(
@@ -290,8 +306,10 @@ def _dot_general(o, a, b):
     left, right = matrices(a, "lhs"), matrices(b, "rhs")
     out = []
     for k, i, j in np.ndindex(len(left), left.shape[1], right.shape[1]):
-        terms = [a.entries[m] * b.entries[n] for m, n in zip(left[k, i], right[k, j])]
-        out.append(sum(terms[1:], terms[0]) if terms else o.kind(0))
+        total = o.kind(0)
+        for m, n in zip(left[k, i], right[k, j]):
+            total = _multiplied_and_added(a.entries[m], b.entries[n], total)
+        out.append(total)
     return [Tensor(out, o.shape)]
 
 

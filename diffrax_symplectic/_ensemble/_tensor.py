@@ -40,10 +40,12 @@ def constant(kind: type, values: np.ndarray) -> Tensor:
 
 def known(x: Tensor) -> np.ndarray | None:
     """The values, if Dr.Jit knows them: constants, and what it folded from constants."""
-    literal = drjit().VarState.Literal
+    dr = drjit()
+    literal = dr.VarState.Literal
     if not all(e.state == literal for e in x.entries):
         return None
-    return np.array([e[0] for e in x.entries]).reshape(x.shape)
+    value = lambda e: complex(e.real[0], e.imag[0]) if dr.is_complex_v(e) else e[0]
+    return np.array([value(e) for e in x.entries]).reshape(x.shape)
 
 
 def each(fn: Callable, *xs: Tensor) -> Tensor:
