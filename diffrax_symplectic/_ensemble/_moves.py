@@ -10,8 +10,9 @@ import numpy as np
 
 from ._backend import array_types, drjit
 from ._complex import equal, is_complex, values
+from ._elementwise import elementwise
 from ._operation import NotReplayed, Operation, rule
-from ._tensor import constant, each, flat, known, Tensor
+from ._tensor import constant, each, flat, known, Table, Tensor
 
 
 # Moves
@@ -111,7 +112,10 @@ def _windows(
         first, last = [(0, s <= 0)], [(most, s >= most)]
         axes.append([*first, *[(k, s == k) for k in range(1, most)], *last])
     if (number := math.prod(map(len, axes))) > _MOST_PLACES:
-        what = f"`{o.op.name}` with an index per path, among {number} places"
+        what = (
+            f"`{o.op.name}` with an index per path, among {number} places (arrays that "
+            "are computed before the solve may be larger)"
+        )
         raise NotReplayed(o.op, what)
     for choice in itertools.product(*axes):
         here = True
@@ -127,11 +131,41 @@ def _in_lanes(here: Any, new: Tensor, old: Tensor | None) -> Tensor:
 
 
 def _window(o: Operation, x: Tensor, starts, sizes) -> Tensor:
+    if isinstance(x.entries, Table) and any(known(s) is None for s in starts):
+        return _from_table(o, x, x.entries, starts, sizes)
     out = None
     for window, here in _windows(o, x, starts, sizes):
         out = _in_lanes(here, x.take(x.places[window]), out)
     assert out is not None
     return out
+
+
+def _from_table(o: Operation, x: Tensor, table: Table, starts, sizes) -> Tensor:
+    """A window of an array in memory, at each path's own place."""
+    places = table.places.reshape(x.shape)
+    corner = places.flat[0]
+    steps = [
+        int(places.take(1, d).flat[0] - corner) if n > 1 else 0
+        for d, n in enumerate(x.shape)
+    ]
+    regular = corner + sum(
+        step * k for step, k in zip(steps, np.indices(x.shape, sparse=True))
+    )
+    if not np.array_equal(np.broadcast_to(regular, x.shape), places):
+        what = f"`{o.op.name}` with an index per path, from an array in another order"
+        raise NotReplayed(o.op, what)
+    number = array_types()["i32"]
+    begin = number(int(corner))
+    for start, step, n, size in zip(starts, steps, x.shape, sizes):
+        s = start.item()
+        most = type(s)(n - size)
+        begin = begin + number(elementwise()["clamp"](type(s)(0), s, most)) * step
+    inside = sum(step * k for step, k in zip(steps, np.indices(sizes, sparse=True)))
+    offsets = np.broadcast_to(inside, sizes)
+    index = array_types()["ui32"]
+    return Tensor(
+        [table.gathered(index(begin + int(k))) for k in offsets.flat], tuple(sizes)
+    )
 
 
 @rule
