@@ -1,7 +1,7 @@
 """Gradients by stepping back along the solution, for reversible solvers."""
 
-import dataclasses
 import functools as ft
+from collections.abc import Callable
 from typing import Any, cast, NamedTuple
 
 import diffrax
@@ -14,8 +14,19 @@ from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
 from ._arguments import whole_number
-from ._compat import nondifferentiable_backward, reversed_in_time, while_loop, ω
-from ._custom_types import IntScalarLike, RealScalarLike, Y
+from ._compat import (
+    reversed_in_time,
+    run_steps,
+    saves_states,
+    solve_state,
+    StepTimes,
+    while_loop,
+    with_only_ys_differentiable,
+    with_y,
+    without_derivatives,
+    ω,
+)
+from ._custom_types import IntScalarLike, Y
 from ._solver import (
     AbstractSplitting,
     AbstractSymplecticRungeKutta,
@@ -23,6 +34,7 @@ from ._solver import (
     NinomiyaVictoir,
 )
 from ._tableau import is_own_inverse, make_plan
+from ._terms import refuse_constraint
 
 
 class ReversingAdjoint(diffrax.AbstractAdjoint):
@@ -83,22 +95,21 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
             raise ValueError(
                 "`ReversingAdjoint` takes no `solver_state` and no `controller_state`."
             )
+        refuse_constraint(terms, "ReversingAdjoint")
         _check_supported(solver, stepsize_controller, event, saveat)
-        y = init_state.y
         # Each step of the backward pass recomputes the solver state (see `made_jump`).
-        stop = lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x
-        fixed = jtu.tree_map(stop, init_state.solver_state)
         kwargs |= dict(
             stepsize_controller=stepsize_controller,
             saveat=saveat,
-            init_state=dataclasses.replace(init_state, y=object(), solver_state=fixed),
+            init_state=without_derivatives(init_state, _without_gradient),
         )
-        final_state, aux_stats = _solve(
-            (y, args, terms, solver), adjoint=self, **kwargs
-        )
-        ys = final_state.save_state.ys
-        final_state = nondifferentiable_backward(final_state, symbolic=False)
-        return eqx.tree_at(lambda s: s.save_state.ys, final_state, ys), aux_stats
+        differentiated = (init_state.y, args, terms, solver)
+        final_state, aux_stats = _solve(differentiated, adjoint=self, **kwargs)
+        return with_only_ys_differentiable(final_state), aux_stats
+
+
+def _without_gradient(x: Any) -> Any:
+    return lax.stop_gradient(x) if eqx.is_array(x) else x
 
 
 ReversingAdjoint.__init__.__doc__ = """**Arguments:**
@@ -110,32 +121,49 @@ ReversingAdjoint.__init__.__doc__ = """**Arguments:**
 """
 
 
-def _check_supported(solver, controller, event, saveat) -> None:
+def _check_supported(
+    solver: Any, controller: Any, event: diffrax.Event | None, saveat: diffrax.SaveAt
+) -> None:
+    """Raises a `ValueError` for what the backward pass does not know how to undo."""
+    known_steps = diffrax.ConstantStepSize | diffrax.StepTo
+    if not _undoes_its_steps(solver):
+        fault = (
+            "needs a reversible solver, such as `ImplicitMidpoint`, `StormerVerlet` or "
+            f"`StrangGauss`; got `{type(solver).__name__}`"
+        )
+    elif not isinstance(controller, known_steps):
+        fault = (
+            "needs steps that are known in advance: `stepsize_controller=diffrax."
+            "ConstantStepSize()` or `diffrax.StepTo(ts)`; got "
+            f"`{type(controller).__name__}`"
+        )
+    elif event is not None:
+        fault = "does not support events"
+    elif not _saves_states_alone(saveat):
+        fault = (
+            "only saves states, by `SaveAt(t1=True)` or `SaveAt(ts=...)`. Instead of "
+            "`SaveAt(fn=...)` apply the function to `sol.ys`"
+        )
+    else:
+        return
+    raise ValueError(
+        f"`ReversingAdjoint` {fault}. Alternatively pass "
+        "`adjoint=diffrax.RecursiveCheckpointAdjoint()`."
+    )
+
+
+def _saves_states_alone(saveat: diffrax.SaveAt) -> bool:
+    """Whether states are saved at the end or at given times, and nothing else is."""
     sub = saveat.subs
-    one = isinstance(sub, diffrax.SubSaveAt) and not saveat.dense
-    more = not one or sub.steps or sub.t0 or (sub.t1 and sub.ts is not None)
-    known = diffrax.ConstantStepSize | diffrax.StepTo
-    faults = {
-        "needs a reversible solver, such as `ImplicitMidpoint`, "
-        f"`StormerVerlet` or `StrangGauss`; got `{type(solver).__name__}`":
-            not _undoes_its_steps(solver),
-        "needs steps that are known in advance: `stepsize_controller=diffrax."
-        "ConstantStepSize()` or `diffrax.StepTo(ts)`; got "
-        f"`{type(controller).__name__}`": not isinstance(controller, known),
-        "does not support events": event is not None,
-        "only saves states, by `SaveAt(t1=True)` or `SaveAt(ts=...)`. Instead of "
-        "`SaveAt(fn=...)` apply the function to `sol.ys`":
-            more or sub.fn is not diffrax.SubSaveAt(t1=True).fn,
-    }  # fmt: skip
-    for fault, found in faults.items():
-        if found:
-            raise ValueError(
-                f"`ReversingAdjoint` {fault}. Alternatively pass "
-                "`adjoint=diffrax.RecursiveCheckpointAdjoint()`."
-            )
+    # Several of them would be a PyTree.
+    if saveat.dense or not isinstance(sub, diffrax.SubSaveAt):
+        return False
+    at_end_and_times = sub.t1 and sub.ts is not None
+    return not (sub.steps or sub.t0 or at_end_and_times) and saves_states(sub)
 
 
 def _undoes_its_steps(solver: Any) -> bool:
+    """Whether a step with negated increments leads back to where a step began."""
     # `isinstance` would look through wrappers, such as `diffrax.HalfSolver`.
     kind = type(solver)
     # With negated increments `NinomiyaVictoir` takes its flows in reverse order.
@@ -148,161 +176,214 @@ def _undoes_its_steps(solver: Any) -> bool:
     return is_own_inverse(make_plan(solver.tableau.flatten()).tableau)
 
 
+# Equinox passes to the rules below what is passed here, in the same way: `inputs` are
+# differentiated, keyword arguments are not.
 @eqx.filter_custom_vjp
 def _solve(inputs, *, adjoint, throw, **kwargs):
     del throw
     return _run(adjoint, inputs, ft.partial(while_loop, kind="lax"), kwargs)
 
 
-def _run(adjoint, inputs, outer_while_loop, kwargs):
+def _run(adjoint: ReversingAdjoint, inputs: Any, outer_while_loop: Callable, kwargs):
+    """The final state of Diffrax's loop, and statistics."""
     y, args, terms, solver = inputs
-    init_state = eqx.tree_at(lambda s: s.y, kwargs["init_state"], y)
-    return adjoint._loop(
-        **kwargs | {"init_state": init_state},
-        args=args,
-        terms=terms,
-        solver=solver,
-        event=None,
-        inner_while_loop=ft.partial(while_loop, kind="lax"),
-        outer_while_loop=outer_while_loop,
+    begun = with_y(kwargs["init_state"], y)
+    others = kwargs | {"init_state": begun}
+    return run_steps(
+        adjoint, outer_while_loop, args=args, terms=terms, solver=solver, **others
     )
+
+
+class _Residuals(NamedTuple):
+    """What the forward pass leaves for the backward pass.
+
+    - `rows`: the checkpoints, evenly spaced over the steps.
+    - `y1`: the state at the end.
+    - `num_steps`: the number of steps made.
+    - `num_saved`: the number of saved times.
+    """
+
+    rows: PyTree[Array]
+    y1: Y
+    num_steps: IntScalarLike
+    num_saved: IntScalarLike
 
 
 @_solve.def_fwd
 def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
     del perturbed, throw
-    every = _Steps.of(kwargs).between(adjoint.checkpoints)
+    times = StepTimes(kwargs["stepsize_controller"], kwargs["init_state"])
+    every = _steps_between(times, adjoint.checkpoints)
     recorded = []
 
     def recording_while_loop(cond_fun, body_fun, init_val, *, buffers, **options):
-        rows = jtu.tree_map(
-            lambda x: jnp.zeros((adjoint.checkpoints, *jnp.shape(x)), x.dtype),
-            init_val.y,
-        )
+        """The loop over steps, which also carries the rows of saved states."""
+
+        def empty_rows(x: Array) -> Array:
+            return jnp.zeros((adjoint.checkpoints, *jnp.shape(x)), x.dtype)
+
+        def going(carry):
+            state, _ = carry
+            return cond_fun(state)
 
         def body(carry):
             state, rows = carry
-            row, rest = jnp.divmod(state.num_steps, every)
+            now = solve_state(state)
+            row, rest = jnp.divmod(now.num_steps, every)
             # Indices beyond the last row are dropped.
             row = jnp.where(rest == 0, row, adjoint.checkpoints)
-            save = lambda x, rows: rows.at[row].set(x, mode="drop")
-            return body_fun(state), jtu.tree_map(save, state.y, rows)
 
+            def save(x: Array, rows: Array) -> Array:
+                return rows.at[row].set(x, mode="drop")
+
+            return body_fun(state), jtu.tree_map(save, now.y, rows)
+
+        def buffers_of_state(carry):
+            state, _ = carry
+            return buffers(state)
+
+        rows = jtu.tree_map(empty_rows, solve_state(init_val).y)
         final, rows = while_loop(
-            lambda carry: cond_fun(carry[0]),
+            going,
             body,
             (init_val, rows),
-            buffers=lambda carry: buffers(carry[0]),
+            buffers=buffers_of_state,
             kind="lax",
             **options,
         )
+        # Diffrax passes on only its own state.
         recorded.append(rows)
         return final
 
     out = _run(adjoint, inputs, recording_while_loop, kwargs)
     final_state, _ = out
-    index = final_state.save_state.saveat_ts_index
-    return out, (recorded[0], final_state.y, final_state.num_steps, index)
+    final = solve_state(final_state)
+    [rows] = recorded
+    return out, _Residuals(rows, final.y, final.num_steps, final.num_saved)
 
 
-class _Steps(NamedTuple):
-    """The times of the steps of a solve, computed by its controller."""
-
-    controller: diffrax.AbstractStepSizeController
-    init_state: Any
-
-    @staticmethod
-    def of(kwargs: dict) -> "_Steps":
-        return _Steps(kwargs["stepsize_controller"], kwargs["init_state"])
-
-    def between(self, checkpoints: int) -> IntScalarLike:
-        """The number of steps between two saved states."""
-        if isinstance(self.controller, diffrax.StepTo):
-            number = len(self.controller.ts) - 1
-        else:
-            _, number, *_ = self.init_state.controller_state
-        return jnp.maximum(1, -(-jnp.asarray(number) // checkpoints))
-
-    def time(self, i: IntScalarLike) -> RealScalarLike:
-        """The time after `i` steps."""
-        if isinstance(self.controller, diffrax.StepTo):
-            return self.controller.ts[i]
-        _, *fixed = self.init_state.controller_state
-        first, second = self.init_state.tprev, self.init_state.tnext
-        # The controller computes times from the number of steps alone.
-        _, _, later, *_ = self.controller.adapt_step_size(
-            first, second, None, None, None, None, 1, (i - 1, *fixed)
-        )
-        return jnp.where(i == 1, second, later)
+def _steps_between(times: StepTimes, checkpoints: int) -> IntScalarLike:
+    """The number of steps between two saved states."""
+    # Rounded up, so that there are rows enough.
+    return jnp.maximum(1, -(-jnp.asarray(times.number()) // checkpoints))
 
 
 class _Walk(NamedTuple):
-    """The state of the backward pass."""
+    """The state of the backward pass.
 
-    # The number of steps from the start, and the state there.
+    - `i`: the number of steps from the start.
+    - `y`: the state there.
+    - `a_y`, `a_parameters`: the derivatives of the loss with respect to this state, and to
+        the parameters so far.
+    - `saved`: the number of saved times before this one.
+    - `size`: the size of nearby states.
+    - `arrived`: whether the pass met all checkpoints so far.
+    """
+
     i: Array
     y: Y
-    # The derivatives of the loss with respect to this state, and to the parameters so far.
     a_y: Y
     a_parameters: PyTree[Array]
-    # The number of saved times before this one.
     saved: Array
-    # The size of nearby states.
     size: Array
     arrived: Bool[Array, ""]
 
 
 @_solve.def_bwd
-def _solve_bwd(residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwargs):
-    rows, y1, num_steps, saved = residuals
-    sub = kwargs["saveat"].subs
-    init_state, steps = kwargs["init_state"], _Steps.of(kwargs)
-    every = steps.between(adjoint.checkpoints)
+def _solve_bwd(
+    residuals: _Residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwargs
+):
+    rows, y1, num_steps, num_saved = residuals
+    saveat = kwargs["saveat"].subs
+    times = StepTimes(kwargs["stepsize_controller"], kwargs["init_state"])
+    every = _steps_between(times, adjoint.checkpoints)
     _, *parameters = inputs
     _, *is_perturbed = perturbed
     diff, nondiff = eqx.partition(parameters, is_perturbed)
-    # Outputs that the loss does not depend on have no derivative.
-    number = 1 if sub.ts is None else len(sub.ts)
-    g = jtu.tree_map(
-        lambda x, g: jnp.zeros((number, *jnp.shape(x)), x.dtype) if g is None else g,
-        y1,
-        grad_out[0].save_state.ys,
-        is_leaf=lambda x: x is None,
-    )
+    final_grad, _ = grad_out
+    number = 1 if saveat.ts is None else len(saveat.ts)
+    g = _filled(solve_state(final_grad).ys, y1, number)
 
-    def step(y, diff, i, back: bool):
+    def step(y: Y, diff: PyTree[Array], i: IntScalarLike, back: bool) -> Y:
+        """One step between the times of steps `i` and `i + 1`, forward or back."""
         args, terms, solver = eqx.combine(diff, nondiff)
-        t0, t1 = steps.time(i), steps.time(i + 1)
+        t0 = times.time(i)
+        t1 = times.time(i + 1)
         if back:
-            t0, t1, terms = -t1, -t0, reversed_in_time(terms)
+            begin = -t1
+            end = -t0
+            terms = reversed_in_time(terms)
+        else:
+            begin = t0
+            end = t1
         # As after a jump, since the solver state belongs to another step.
-        return solver.step(terms, t0, t1, y, args, init_state.solver_state, True)[0]
+        made_jump = True
+        solver_state = times.solver_state()
+        y1, *_ = solver.step(terms, begin, end, y, args, solver_state, made_jump)
+        return y1
+
+    def going(walk: _Walk) -> Bool[Array, ""]:
+        return walk.i > 0
 
     def body(walk: _Walk) -> _Walk:
         i = walk.i - 1
         before = step(walk.y, diff, i, True)
         size = jnp.maximum(optx.max_norm(before), _PER_STEP * walk.size)
         y, arrived = _begin_anew(before, rows, i, every, walk.arrived, size)
-        a_y, a_y0, saved = walk.a_y, (0 * walk.a_y**ω).ω, walk.saved
-        if sub.ts is not None:
-            t0, t1 = steps.time(i), steps.time(i + 1)
-            a_y, a_y0, saved = _saved_between(t0, t1, sub.ts, g, a_y, a_y0, saved)
-        _, vjp = jax.vjp(lambda y, diff: step(y, diff, i, False), y, diff)
-        through, a_parameters = vjp(a_y)
-        total = (walk.a_parameters**ω + a_parameters**ω).ω
-        return _Walk(i, y, (a_y0**ω + through**ω).ω, total, saved, size, arrived)
+        # The state at the end of the step, and the part of that at its start which does not
+        # come through the step.
+        passed = _Passed(walk.a_y, (0 * walk.a_y**ω).ω, walk.saved)
+        if saveat.ts is not None:
+            t0 = times.time(i)
+            t1 = times.time(i + 1)
+            passed = _saved_between(t0, t1, saveat.ts, g, passed)
+        # Forward again, from the state that was found: its transposed Jacobian is exact.
+        forward = ft.partial(step, i=i, back=False)
+        _, vjp = jax.vjp(forward, y, diff)
+        through, a_parameters = vjp(passed.a_y1)
+        return _Walk(
+            i=i,
+            y=y,
+            a_parameters=(walk.a_parameters**ω + a_parameters**ω).ω,
+            a_y=(passed.a_y0**ω + through**ω).ω,
+            saved=passed.saved,
+            size=size,
+            arrived=arrived,
+        )
 
-    start = jtu.tree_map(lambda g: g[-1] if sub.ts is None else 0 * g[0], g)
-    zeros = jtu.tree_map(jnp.zeros_like, diff)
-    at, size, yes = jnp.asarray(num_steps), optx.max_norm(y1), jnp.array(True)
-    walk = _Walk(at, y1, start, zeros, jnp.asarray(saved), size, yes)
-    walk = lax.while_loop(lambda walk: walk.i > 0, body, walk)
+    if saveat.ts is None:
+        a_y1 = jtu.tree_map(lambda g: g[-1], g)
+    else:
+        # Saved states at the end itself are met in the last step.
+        a_y1 = jtu.tree_map(lambda g: 0 * g[0], g)
+    walk = _Walk(
+        i=jnp.asarray(num_steps),
+        y=y1,
+        a_y=a_y1,
+        a_parameters=jtu.tree_map(jnp.zeros_like, diff),
+        saved=jnp.asarray(num_saved),
+        size=optx.max_norm(y1),
+        arrived=jnp.array(True),
+    )
+    walk = lax.while_loop(going, body, walk)
     a_y = walk.a_y
-    if sub.ts is not None:
+    if saveat.ts is not None:
         # States saved at the start itself.
-        before = jnp.arange(len(sub.ts)) < walk.saved
+        before = jnp.arange(len(saveat.ts)) < walk.saved
         a_y = jtu.tree_map(lambda a, g: a + jnp.tensordot(before, g, 1), a_y, g)
     return _if_arrived(walk.arrived, throw, (a_y, *walk.a_parameters))
+
+
+def _filled(grad_ys: PyTree[Array | None], y1: Y, number: int) -> PyTree[Array]:
+    """The derivatives of the loss with respect to the saved states. Those that it does not
+    depend on have none, which is zero here."""
+
+    def filled(y1: Array, grad: Array | None) -> Array:
+        if grad is None:
+            return jnp.zeros((number, *jnp.shape(y1)), y1.dtype)
+        return grad
+
+    return jtu.tree_map(filled, y1, grad_ys, is_leaf=lambda x: x is None)
 
 
 # The fraction of its size that a state passes to the one before it. Thus a start at rest,
@@ -311,10 +392,16 @@ _PER_STEP = 0.9
 
 
 def _begin_anew(
-    y: Y, rows: PyTree[Array], i, every, arrived, size: Array
+    y: Y,
+    rows: PyTree[Array],
+    i: IntScalarLike,
+    every: IntScalarLike,
+    arrived: Bool[Array, ""],
+    size: Array,
 ) -> tuple[Y, Bool[Array, ""]]:
     """The state after `i` steps, replaced by the checkpoint if there is one, and whether
     both agree, for states of this `size`."""
+    # Between checkpoints this reads the one before, and does not use it.
     row, rest = jnp.divmod(i, every)
     exact = jtu.tree_map(lambda rows: rows[row], rows)
     error = optx.max_norm((y**ω - exact**ω).ω)
@@ -325,19 +412,38 @@ def _begin_anew(
     return y, arrived & (close | ~here)
 
 
-def _saved_between(t0, t1, ts, g, a_y, a_y0, saved):
+class _Passed(NamedTuple):
+    """Derivatives at a step, as saved times are passed on the way back.
+
+    - `a_y1`: with respect to the state at its end.
+    - `a_y0`: with respect to the state at its start, without what comes through the step.
+    - `saved`: the number of saved times before.
+    """
+
+    a_y1: Y
+    a_y0: Y
+    saved: Array
+
+
+def _saved_between(t0, t1, ts: Array, g: PyTree[Array], passed: _Passed) -> _Passed:
     """Adds the derivatives with respect to the states saved between `t0` and `t1`, which
     are interpolated linearly."""
 
-    def add(carry):
-        a_y, a_y0, saved = carry
-        share = (ts[saved - 1] - t0) / (t1 - t0)
-        of = lambda x, share: jtu.tree_map(lambda x, g: x + share * g[saved - 1], x, g)
-        return of(a_y, share), of(a_y0, 1 - share), saved - 1
+    def added(y: Y, share: Array, at: Array) -> Y:
+        return jtu.tree_map(lambda a, g: a + share * g[at], y, g)
 
-    # If no saved time is left, this reads the last one, but does not use it.
-    more = lambda carry: (carry[2] > 0) & (ts[carry[2] - 1] > t0)
-    return lax.while_loop(more, add, (a_y, a_y0, saved))
+    def add(passed: _Passed) -> _Passed:
+        last = passed.saved - 1
+        share = (ts[last] - t0) / (t1 - t0)
+        a_y1 = added(passed.a_y1, share, last)
+        a_y0 = added(passed.a_y0, 1 - share, last)
+        return _Passed(a_y1, a_y0, last)
+
+    def more(passed: _Passed) -> Bool[Array, ""]:
+        # If no saved time is left, this reads the last one, but does not use it.
+        return (passed.saved > 0) & (ts[passed.saved - 1] > t0)
+
+    return lax.while_loop(more, add, passed)
 
 
 def _if_arrived(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyTree:
@@ -350,5 +456,9 @@ def _if_arrived(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyT
             "too large between two checkpoints. Increase `checkpoints`, or pass "
             "`adjoint=diffrax.RecursiveCheckpointAdjoint()`.",
         )
-    nan = lambda x: jnp.where(arrived, x, cast(Array, jnp.nan))
-    return jtu.tree_map(nan, gradients)
+
+    # A gradient that is silently wrong would be worse.
+    def or_nan(x: Array) -> Array:
+        return jnp.where(arrived, x, cast(Array, jnp.nan))
+
+    return jtu.tree_map(or_nan, gradients)

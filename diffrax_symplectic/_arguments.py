@@ -6,13 +6,17 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
+from ._compat import is_traced
 from ._custom_types import Y
+
+
+# Names of positions and momenta (or velocities) in this order, where momenta come first.
+_POSITIONS_FIRST = (("x", "v"), ("x", "p"), ("q", "v"))
 
 
 def check_takes(name: str, fn: Any, *arguments: str) -> None:
@@ -23,7 +27,8 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
     try:
         signature = inspect.signature(fn)
     except ValueError:
-        return  # Some functions written in C have no signature.
+        # Some functions written in C have no signature.
+        return
     try:
         signature.bind(*arguments)
     except TypeError:
@@ -35,14 +40,31 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
         inspect.Parameter.POSITIONAL_ONLY,
         inspect.Parameter.POSITIONAL_OR_KEYWORD,
     )
-    names = [x.name for x in signature.parameters.values() if x.kind in by_position]
-    swapped = any(x in arguments and x != y for x, y in zip(names, arguments))
-    pair = arguments[1:3] == ("p", "q") and tuple(names[1:3])
-    if swapped or pair in (("x", "v"), ("x", "p"), ("q", "v")):
+    names = [
+        parameter.name
+        for parameter in signature.parameters.values()
+        if parameter.kind in by_position
+    ]
+    # Other names than ours are fine, but ours in another place is a mistake, which would
+    # show in no shape: momenta and positions are alike.
+    swapped = any(
+        name in arguments and name != ours for name, ours in zip(names, arguments)
+    )
+    takes_pair = arguments[1:3] == ("p", "q")
+    positions_first = takes_pair and tuple(names[1:3]) in _POSITIONS_FIRST
+    if swapped or positions_first:
         raise ValueError(
             f"`{name}` is called as {call}; got a function with its arguments in another "
             f"order, `{signature}`."
         )
+
+
+def parameters(fn: Any) -> list[str]:
+    """The names of the parameters of a function."""
+    try:
+        return [*inspect.signature(fn).parameters]
+    except ValueError:
+        return []  # As above.
 
 
 def check_solver(name: str, solver: Any) -> None:
@@ -50,6 +72,7 @@ def check_solver(name: str, solver: Any) -> None:
     if isinstance(solver, diffrax.AbstractSolver):
         return
     example = "ImplicitMidpoint"
+    # A class in place of its instance is what is most often passed by mistake.
     if isinstance(solver, type) and issubclass(solver, diffrax.AbstractSolver):
         example = solver.__name__
     raise ValueError(
@@ -59,6 +82,7 @@ def check_solver(name: str, solver: Any) -> None:
 
 def whole_number(name: str, value: Any, least: int = 1) -> int:
     """Raises a `ValueError` unless this is an integer, `least` or larger."""
+    # `True` is an integer to Python.
     integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not integer or value < least:
         kind = "a positive integer" if least == 1 else f"an integer, {least} or larger"
@@ -67,22 +91,28 @@ def whole_number(name: str, value: Any, least: int = 1) -> int:
 
 
 def check_real(name: str, leaves: list) -> None:
+    """Raises a `ValueError` unless the `leaves` that a function returned are real."""
     if len(leaves) == 0:
         raise ValueError(f"`{name}` must return real arrays; it returned none.")
-    kinds = jnp.floating, jnp.integer, jnp.bool_
-    dtypes = [getattr(s, "dtype", type(s)) for s in leaves]
-    if not all(any(jnp.issubdtype(d, k) for k in kinds) for d in dtypes):
+    dtypes = [getattr(leaf, "dtype", type(leaf)) for leaf in leaves]
+    if not all(_is_real(dtype) for dtype in dtypes):
         raise ValueError(
             f"`{name}` must return real arrays; got dtypes {[str(d) for d in dtypes]}. "
             "For complex numbers return their real and imaginary parts."
         )
 
 
+def _is_real(dtype: Any) -> bool:
+    # Booleans are the values of events, whose mean is a probability.
+    kinds = (jnp.floating, jnp.integer, jnp.bool_)
+    return any(jnp.issubdtype(dtype, kind) for kind in kinds)
+
+
 def real_array(name: str, value: Any, *, positive: bool, kind: str) -> ArrayLike:
     """Raises a `ValueError` unless this is a real number or array that is finite and
     positive (or not negative), as far as its values are known while tracing."""
     fits = eqx.is_array_like(value) and not isinstance(value, bool)
-    if fits and not isinstance(value, jax.core.Tracer):
+    if fits and not is_traced(value):
         values = np.asarray(value)
         fits = not np.iscomplexobj(values) and np.all(np.isfinite(values))
         fits = fits and np.all(values > 0 if positive else values >= 0)
@@ -102,6 +132,8 @@ def shapes(tree: PyTree) -> str:
 
 
 def check_state(y0: Y, solver: str) -> None:
+    """Raises a `ValueError` unless the state consists of real floating-point arrays, in
+    one precision of at least 32 bits."""
     leaves = jtu.tree_leaves(y0)
     if len(leaves) == 0:
         raise ValueError(f"`{solver}` needs a state with at least one array.")
@@ -121,6 +153,8 @@ def check_state(y0: Y, solver: str) -> None:
                 f"array of dtype {dtype}. Convert it with `.astype(float)`, to float32 or "
                 "float64."
             )
+    # A step would promote them, and Diffrax refuses a state whose dtype changes with a
+    # message that names neither.
     if len({jnp.result_type(leaf) for leaf in leaves}) > 1:
         raise ValueError(
             f"`{solver}` needs all arrays of `y0` to have one dtype; got "
@@ -142,16 +176,21 @@ def pair_fault(y: PyTree) -> str | None:
         "the same structure and shapes: pass `y0=(p0, q0)`, or for spins "
         "`y0=to_spinors(s0)`, or for complex amplitudes `y0=to_pair(psi0)`. "
     )
-    if any(map(jnp.iscomplexobj, jtu.tree_leaves(y))):
+    # First, since a complex array is the most common state that is no pair.
+    if any(jnp.iscomplexobj(leaf) for leaf in jtu.tree_leaves(y)):
         return (
             f"{advice}Both are real; got {eqx.tree_pformat(y)}. For complex amplitudes "
             "construct the terms with `wave_terms`."
         )
+    # A list, or a tuple with names, would come back from a step as a plain tuple.
     if type(y) is not tuple or len(y) != 2:
         return f"{advice}Got {eqx.tree_pformat(y)}."
     p, q = y
-    if jtu.tree_structure(p) != jtu.tree_structure(q) or [
-        jnp.shape(x) for x in jtu.tree_leaves(p)
-    ] != [jnp.shape(x) for x in jtu.tree_leaves(q)]:
+    same_structure = jtu.tree_structure(p) == jtu.tree_structure(q)
+    if not same_structure or _shapes_of(p) != _shapes_of(q):
         return f"{advice}Got p = {eqx.tree_pformat(p)} and q = {eqx.tree_pformat(q)}."
     return None
+
+
+def _shapes_of(tree: PyTree) -> list[tuple[int, ...]]:
+    return [jnp.shape(leaf) for leaf in jtu.tree_leaves(tree)]

@@ -3,7 +3,7 @@ values that are computed once."""
 
 import functools as ft
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -34,7 +34,9 @@ def most_of_batch(number: IntScalarLike) -> IntScalarLike:
 @most_of_batch.def_vmap
 def _(size, in_batched, number):
     del size
-    return most_of_batch(jnp.max(number, 0) if in_batched[0] else number), False
+    largest = jnp.max(number, 0) if in_batched[0] else number
+    # Called again, for an outer batch.
+    return most_of_batch(largest), False
 
 
 def batched_like(values: _T, others: PyTree) -> _T:
@@ -44,7 +46,7 @@ def batched_like(values: _T, others: PyTree) -> _T:
     nested loops again each time. Batching the initial values before the loop halves the
     time to trace `StrangGauss`.
     """
-    arrays = [x for x in jtu.tree_leaves(others) if eqx.is_array(x)]
+    arrays = [leaf for leaf in jtu.tree_leaves(others) if eqx.is_array(leaf)]
     # Copies, which are no operations of the program: `custom_jvp` does not convert arrays
     # of NumPy, over which a user may have batched.
     return _batched(*jtu.tree_map(jnp.array, (values, arrays)))
@@ -58,9 +60,22 @@ def _all_or_none(values: _T, others: list[Array]) -> _T:
 
 @_all_or_none.def_vmap
 def _(size, in_batched, values, others):
-    spread = lambda b, x: x if b else jnp.broadcast_to(x, (size, *jnp.shape(x)))
-    values = jtu.tree_map(spread, in_batched[0], values)
-    return _all_or_none(values, others), jtu.tree_map(lambda _: True, values)
+    # Called only if anything is batched. Then all values are, too.
+    spread = _spread(size, in_batched[0], values)
+    return _all_or_none(spread, others), _all_batched(values)
+
+
+def _spread(size: int, batched: PyTree[bool], values: _T) -> _T:
+    """`values`, with those that are not batched repeated for each path of the batch."""
+
+    def spread(is_batched: bool, x: Array) -> Array:
+        return x if is_batched else jnp.broadcast_to(x, (size, *jnp.shape(x)))
+
+    return jtu.tree_map(spread, batched, values)
+
+
+def _all_batched(values: PyTree) -> PyTree[bool]:
+    return jtu.tree_map(lambda _: True, values)
 
 
 # Custom batching rules cannot be differentiated in reverse mode.
@@ -72,6 +87,22 @@ def _(primals, tangents):
     return _batched(*primals), tangents[0]
 
 
+def error_if_alone(pred: Bool[Array, ""], message: str) -> Bool[Array, ""]:
+    """`pred`; if it is true, an error when run. In a batch there is no error: it would stop
+    the other paths."""
+
+    @jax.custom_batching.custom_vmap
+    def checked(pred):
+        return eqx.error_if(pred, pred, message)
+
+    @checked.def_vmap
+    def _(size, in_batched, pred):
+        del size
+        return pred, in_batched[0]
+
+    return checked(pred)
+
+
 def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -> _T:
     """`fn(value)` where `pending`, and `value` elsewhere. Not differentiable.
 
@@ -80,6 +111,7 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
     """
     # Trace `fn` once, here: under `vmap`, `jax.jit` would trace it again.
     call, arrays = captured_arrays(fn, value)
+    # The same program for each level of nested batches.
     by_parts = jax.jit(ft.partial(_by_parts, call))
 
     # Each path's `own` arrays have a leading axis; `common` arrays are shared.
@@ -89,36 +121,71 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
 
     @serve.def_vmap
     def _(size, in_batched, pending, value, own, common):
-        # Nested batches are joined into one.
-        n = pending.shape[1 if in_batched[0] else 0]
+        # Nested batches are joined into one: stragglers of all of them share the groups.
+        inner_size = pending.shape[1 if in_batched[0] else 0]
 
-        def joined(batched, x):
+        def join(batched: bool, x: Array) -> Array:
             x = x if batched else jnp.broadcast_to(x, (size, *x.shape))
-            return x.reshape(size * n, *x.shape[2:])
+            return x.reshape(size * inner_size, *x.shape[2:])
 
-        each = jtu.tree_map(joined, tuple(in_batched[:3]), (pending, value, own))
-        pending, value, own = each
-        repeat = lambda b, x: jnp.repeat(x, n, axis=0) if b else None
-        more = jtu.tree_map(repeat, in_batched[3], common)
-        rest = jtu.tree_map(lambda b, x: None if b else x, in_batched[3], common)
+        def repeat_if(batched: bool, x: Array) -> Array | None:
+            return jnp.repeat(x, inner_size, axis=0) if batched else None
+
+        def keep_unless(batched: bool, x: Array) -> Array | None:
+            return None if batched else x
+
+        def part_again(x: Array) -> Array:
+            return x.reshape(size, inner_size, *x.shape[1:])
+
+        batched_each = tuple(in_batched[:3])
+        batched_common = in_batched[3]
+        pending, value, own = jtu.tree_map(join, batched_each, (pending, value, own))
+        # Captured arrays that the outer batch has are the inner paths' own.
+        more = jtu.tree_map(repeat_if, batched_common, common)
+        rest = jtu.tree_map(keep_unless, batched_common, common)
         value = serve(pending, value, eqx.combine(own, more), rest)
-        apart = lambda x: x.reshape(size, n, *x.shape[1:])
-        return jtu.tree_map(apart, value), jtu.tree_map(lambda _: True, value)
+        return jtu.tree_map(part_again, value), _all_batched(value)
 
     # One path is a batch of one.
-    none = jtu.tree_map(lambda _: None, arrays)
-    value = serve(*jtu.tree_map(lambda x: x[None], (pending, value)), none, arrays)
-    return jtu.tree_map(lambda x: x[0], value)
+    own_arrays = jtu.tree_map(lambda _: None, arrays)
+    pending, value = _with_axis((pending, value))
+    return _first(serve(pending, value, own_arrays, arrays))
 
 
-def _by_parts(call, pending, value, own, common):
+def _with_axis(tree: _T) -> _T:
+    """The arrays as those of a batch of one."""
+    return jtu.tree_map(lambda x: x[None], tree)
+
+
+def _first(tree: _T) -> _T:
+    """The arrays of the first path of a batch."""
+    return jtu.tree_map(lambda x: x[0], tree)
+
+
+def _by_parts(
+    call: Callable,
+    pending: Bool[Array, " size"],
+    value: _T,
+    own: PyTree[Array | None],
+    common: PyTree[Array | None],
+) -> _T:
+    """`value` of a batch, with `call` applied for the paths that are `pending`. Of the
+    arrays that it captures, `own` have an axis for the paths."""
     size = len(pending)
+    # Rounded up, so that a small batch has groups of one.
     part = -(-size // _PARTS)
-    one = lambda value, own: call(value, eqx.combine(own, common))
+
+    def served(value: _T, own: PyTree) -> _T:
+        return call(value, eqx.combine(own, common))
+
+    def unchanged(value: _T, own: PyTree) -> _T:
+        del own
+        return value
+
     if size == 1:
-        alone = jtu.tree_map(lambda x: x[0], (value, own))
-        new = lax.cond(pending[0], one, lambda value, _: value, *alone)
-        return jtu.tree_map(lambda x: x[None], new)
+        # A conditional is cheaper than a loop, and stays one: there is no batch.
+        alone = _first((value, own))
+        return _with_axis(lax.cond(pending[0], served, unchanged, *alone))
 
     def serve_part(carry):
         pending, value = carry
@@ -127,12 +194,20 @@ def _by_parts(call, pending, value, own, common):
         # code for negative ones.
         flag, which = lax.top_k(pending.astype(jnp.float32), part)
         which = jnp.where(flag > 0, which, size).astype(jnp.uint32)
-        new = jax.vmap(one)(*jtu.tree_map(lambda x: x[which], (value, own)))
-        scatter = lambda x, y: x.at[which].set(y, mode="drop")
+        gathered = jtu.tree_map(lambda x: x[which], (value, own))
+        new = jax.vmap(served)(*gathered)
+
+        def scatter(x: Array, y: Any) -> Array:
+            return x.at[which].set(y, mode="drop")
+
         return scatter(pending, False), jtu.tree_map(scatter, value, new)
 
-    some_pending = lambda carry: jnp.any(carry[0])
-    return lax.while_loop(some_pending, serve_part, (pending, value))[1]
+    def some_pending(carry):
+        pending, _ = carry
+        return jnp.any(pending)
+
+    _, value = lax.while_loop(some_pending, serve_part, (pending, value))
+    return value
 
 
 def materialize(fn: Callable[[], _T]) -> _T:
@@ -143,11 +218,16 @@ def materialize(fn: Callable[[], _T]) -> _T:
     saves. XLA does not fuse across the boundary of a conditional, so `fn` is called in one
     branch of a conditional, and a barrier hides that the condition is always true.
     """
-    fn = jax.jit(fn)  # traced once
+    # Traced once, although it is called for its shapes, in a branch, and elsewhere than on
+    # CPUs.
+    fn = jax.jit(fn)
 
     def in_a_conditional() -> _T:
         shapes = jax.eval_shape(fn)
-        zeros = lambda: jtu.tree_map(lambda s: lax.full_like(s, 0), shapes)
+
+        def zeros() -> _T:
+            return jtu.tree_map(lambda leaf: lax.full_like(leaf, 0), shapes)
+
         return lax.cond(lax.optimization_barrier(True), fn, zeros)
 
     return lax.platform_dependent(cpu=in_a_conditional, default=fn)

@@ -9,7 +9,9 @@ import diffrax
 import jax.tree_util as jtu
 
 
+# A link in a docstring, and a field of an entry.
 _DOI = re.compile(r"https://doi\.org/([^\s)]+)")
+_DOI_FIELD = re.compile(r"doi = \{(.*?)\}")
 
 
 def citation(*args: Any, **kwargs: Any) -> None:
@@ -23,9 +25,11 @@ def citation(*args: Any, **kwargs: Any) -> None:
     **Arguments:** any arguments of `diffrax.diffeqsolve`.
     """
     diffrax.citation(*args, **kwargs)
+    # Like Diffrax, by what the arguments are, wherever they stand.
     bound = inspect.signature(diffrax.diffeqsolve).bind_partial(*args, **kwargs)
     entries = _entries()
     for cls in _classes(bound.arguments):
+        # The sources stand in the docstrings, once.
         dois = list(dict.fromkeys(_DOI.findall(cls.__doc__ or "")))
         if len(dois) > 0:
             print(
@@ -40,8 +44,11 @@ def citation(*args: Any, **kwargs: Any) -> None:
 
 def _classes(tree: Any) -> list[type]:
     """The classes of this package that occur in `tree`, in order."""
-    found = {}
+    # A dictionary in place of a set, to keep the order.
+    found: dict[type, None] = {}
 
+    # Called for each node on the way down, containers and modules among them, which are no
+    # leaves.
     def note(node: Any) -> bool:
         if type(node).__module__.split(".")[0] == "diffrax_symplectic":
             found[type(node)] = None
@@ -55,5 +62,10 @@ def _entries() -> dict[str, str]:
     """The entries of `references.bib`, by DOI."""
     bib = importlib.resources.files("diffrax_symplectic").joinpath("references.bib")
     entries = bib.read_text(encoding="utf-8").strip().split("\n\n")
-    doi = re.compile(r"doi = \{(.*?)\}")
-    return {match[1]: e for e in entries if (match := doi.search(e))}
+    by_doi = {}
+    for entry in entries:
+        match = _DOI_FIELD.search(entry)
+        # Books without one cannot be linked to, so no docstring asks for them.
+        if match is not None:
+            by_doi[match[1]] = entry
+    return by_doi

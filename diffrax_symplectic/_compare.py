@@ -6,7 +6,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -29,11 +29,28 @@ from ._suggest import (
 from ._terms import check_stratonovich, path_numbers
 
 
-# The results of a batch of paths, and which paths succeeded.
-_Batch: TypeAlias = tuple[PyTree[Array], Bool[Array, " num_paths"]]
-
-# The number of steps of the reference in the smallest compared step.
+# The number of steps of the reference in the smallest compared step. An error of order 1/2
+# is then a third of what is measured, and of any higher order less.
 _FINER = 8
+
+
+class Batch(NamedTuple):
+    """The results of a batch of paths.
+
+    - `results`: the states at the end, or what `phi` makes of them.
+    - `okay`: which paths succeeded.
+    """
+
+    results: PyTree[Array]
+    okay: Bool[Array, " num_paths"]
+
+
+class _Measured(NamedTuple):
+    """An error with its standard error, and the number of paths that it leaves out."""
+
+    error: float
+    std_error: float
+    num_failed: int
 
 
 class ComparedStep(NamedTuple):
@@ -71,10 +88,10 @@ class Comparison:
     def __str__(self) -> str:
         title = f"{self.kind} error"
         lines = [f"{'solver':20} {'dt':>9} {title:>22} {'seconds per path':>17}"]
-        for s in self.steps:
-            failed = f"  {s.num_failed} failed" if s.num_failed else ""
-            error = f"{s.error:.1e} +- {s.std_error:.0e}"
-            row = f"{s.solver:20} {s.dt:9.3g} {error:>22} {s.seconds:17.1e}"
+        for step in self.steps:
+            failed = f"  {step.num_failed} failed" if step.num_failed else ""
+            error = f"{step.error:.1e} +- {step.std_error:.0e}"
+            row = f"{step.solver:20} {step.dt:9.3g} {error:>22} {step.seconds:17.1e}"
             lines.append(row + failed)
         lines += [f"{name}: {why}" for name, why in self.refused.items()]
         return "\n".join(lines)
@@ -90,14 +107,21 @@ class Comparison:
 
         **Returns:** the axes.
         """
+        # Matplotlib is no dependency of the package, and takes long to import.
         import matplotlib.pyplot as plt
 
-        axes = plt.subplots(layout="constrained")[1] if axes is None else axes
-        for name in dict.fromkeys(s.solver for s in self.steps):
-            own = [s for s in self.steps if s.solver == name]
-            x, y = [s.seconds for s in own], [s.error for s in own]
-            bars = [3 * s.std_error for s in own]
-            axes.errorbar(x, y, bars, label=name, marker="o", capsize=2)
+        if axes is None:
+            _, axes = plt.subplots(layout="constrained")
+        for name in dict.fromkeys(step.solver for step in self.steps):
+            own = [step for step in self.steps if step.solver == name]
+            axes.errorbar(
+                x=[step.seconds for step in own],
+                y=[step.error for step in own],
+                yerr=[3 * step.std_error for step in own],
+                label=name,
+                marker="o",
+                capsize=2,
+            )
         axes.set(xscale="log", yscale="log")
         axes.set(xlabel="seconds per path", ylabel=f"{self.kind} error")
         axes.legend()
@@ -169,37 +193,66 @@ def compare_solvers(
     _check_solvers(solvers, reference)
     if phi is not None:
         _check_scalar(phi, t1, y0, args)
-    problem = _Problem(terms, t0, t1, y0, args, phi)
+    system = _ComparedSystem(terms, t0, t1, y0, args, phi)
     cell = min(dts) / _FINER
-    own_of = lambda solver: ft.partial(own_path, solver, want)
-    # Strong errors need a common Brownian motion, which not all solvers can use.
-    common = lambda solver: ft.partial(common_path, solver, cell)
-    error_path = common if phi is None else own_of
-    keys = lambda number: jr.split(jr.fold_in(key, number), num_paths)
-    fine = problem.batch(reference, error_path(reference))(keys(0), jnp.asarray(cell))
-    steps, refused = [], {}
+
+    def keys(number: int) -> PRNGKeyArray:
+        return jr.split(jr.fold_in(key, number), num_paths)
+
+    def own_runs(solver: diffrax.AbstractSolver) -> Callable:
+        """Runs along the path that the solver gets in a solve."""
+        return system.batch(solver, ft.partial(own_path, solver, want))
+
+    def compared_runs(solver: diffrax.AbstractSolver) -> Callable:
+        """Runs of which the error is measured."""
+        if want == "weak":
+            return own_runs(solver)
+        # Strong errors need a common Brownian motion, which not all solvers can use.
+        return system.batch(solver, ft.partial(common_path, solver, cell))
+
+    # Keys 0 are those of strong errors. Weak errors are from independent paths, so the keys
+    # of each step size are its own.
+    fine = compared_runs(reference)(keys(0), jnp.asarray(cell))
+    steps = []
+    refused = {}
     for solver in solvers:
-        name, own = repr(solver), problem.batch(solver, own_of(solver))
-        compared = problem.batch(solver, common(solver)) if phi is None else own
+        name = repr(solver)
+        timed = own_runs(solver)
+        compared = timed if want == "weak" else compared_runs(solver)
         try:
+            # Refusals are errors while tracing, so that nothing need be compiled for them.
             eqx.filter_eval_shape(compared, keys(0), jnp.asarray(dts[0]))
         except ValueError as error:
             refused[name] = str(error).splitlines()[0]
             continue
-        jax.block_until_ready(own(keys(1), jnp.asarray(dts[0])))  # compiles
-        for number, dt in enumerate(map(jnp.asarray, dts), start=1):
+        # The first call compiles, and is not timed.
+        jax.block_until_ready(timed(keys(1), jnp.asarray(dts[0])))
+        for number, dt in enumerate(dts, start=1):
+            # An array, since a number would be compiled for.
+            traced_dt = jnp.asarray(dt)
             begin = time.perf_counter()
-            out = jax.block_until_ready(own(keys(number), dt))
+            out = jax.block_until_ready(timed(keys(number), traced_dt))
             seconds = (time.perf_counter() - begin) / num_paths
-            if phi is None:
-                error, bar, failed = strong_error(compared(keys(0), dt), fine)
+            if want == "strong":
+                measured = strong_error(compared(keys(0), traced_dt), fine)
             else:
-                error, bar, failed = weak_error(out, fine)
-            steps.append(ComparedStep(name, float(dt), error, bar, seconds, failed))
+                measured = weak_error(out, fine)
+            steps.append(
+                ComparedStep(
+                    solver=name,
+                    dt=float(traced_dt),
+                    error=measured.error,
+                    std_error=measured.std_error,
+                    seconds=seconds,
+                    num_failed=measured.num_failed,
+                )
+            )
     return Comparison(want, tuple(steps), refused)
 
 
-class _Problem(NamedTuple):
+class _ComparedSystem(NamedTuple):
+    """What all compared solvers solve, with the names of `compare_solvers`."""
+
     terms: diffrax.AbstractTerm
     t0: float
     t1: float
@@ -210,11 +263,12 @@ class _Problem(NamedTuple):
     def batch(self, solver: diffrax.AbstractSolver, make_path: Callable) -> Callable:
         """The results of paths as a function of their keys and the step size."""
         terms, t0, t1, y0, args, phi = self
+        # Terms that share a path share it again.
         numbers = path_numbers(random_paths(terms))
 
         @eqx.filter_jit
         @ft.partial(jax.vmap, in_axes=(0, None))
-        def results(key, dt):
+        def results(key: PRNGKeyArray, dt: Array) -> Batch:
             own = with_paths(make_path, numbers, terms, key)
             check_stratonovich(own, solver, t0, y0, args)
             sol = diffrax.diffeqsolve(
@@ -223,38 +277,50 @@ class _Problem(NamedTuple):
             )  # fmt: skip
             y1 = jtu.tree_map(lambda y: y[-1], sol.ys)
             result = y1 if phi is None else phi(t1, y1, args)
-            return result, diffrax.is_okay(sol.result)
+            return Batch(result, diffrax.is_okay(sol.result))
 
         return results
 
 
-def strong_error(out: _Batch, fine: _Batch) -> tuple[float, float, int]:
-    """The root mean square of the difference over the paths that both solvers finish, its
-    standard error, and the number of paths that either does not finish."""
-    okay = np.asarray(out[1] & fine[1])
-    square = lambda a, b: np.asarray(a - b, np.float64).reshape(len(okay), -1) ** 2
-    squares = jtu.tree_leaves(jtu.tree_map(square, out[0], fine[0]))
-    mean, bar = _mean(np.concatenate(squares, axis=1).sum(axis=1), okay)
+def strong_error(out: Batch, fine: Batch) -> _Measured:
+    """The root mean square of the difference over the paths that both solvers finish, and
+    the number of paths that either does not finish."""
+    okay = np.asarray(out.okay & fine.okay)
+
+    def squared_difference(y: Array, exact: Array) -> np.ndarray:
+        return np.asarray(y - exact, np.float64).reshape(len(okay), -1) ** 2
+
+    each = jtu.tree_map(squared_difference, out.results, fine.results)
+    squares = np.concatenate(jtu.tree_leaves(each), axis=1).sum(axis=1)
+    mean, std_error = _mean(squares, okay)
+    # Without an error there is no relative one: 0 / 0 is NaN.
     with np.errstate(all="ignore"):
         rms = np.sqrt(mean)
-        return float(rms), float(bar / (2 * rms)), int(np.sum(~okay))
+        # By the derivative of the square root.
+        of_rms = std_error / (2 * rms)
+    return _Measured(float(rms), float(of_rms), int(np.sum(~okay)))
 
 
-def weak_error(out: _Batch, fine: _Batch) -> tuple[float, float, int]:
-    """The difference of the means, its standard error, and the number of failed paths."""
-    (mean, bar), (exact, other) = _mean(*out), _mean(*fine)
-    return abs(mean - exact), math.hypot(bar, other), int(np.sum(~np.asarray(out[1])))
+def weak_error(out: Batch, fine: Batch) -> _Measured:
+    """The difference of the means, and the number of failed paths of the first."""
+    mean, std_error = _mean(*out)
+    exact, other = _mean(*fine)
+    # Both are from independent paths, so that variances add up.
+    both = math.hypot(std_error, other)
+    return _Measured(abs(mean - exact), both, int(np.sum(~np.asarray(out.okay))))
 
 
-def _mean(x, okay) -> tuple[float, float]:
+def _mean(x: Any, okay: Any) -> tuple[float, float]:
     """The mean of the values that are `okay`, and its standard error."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # no path is left
+        # If no path is left, the mean is NaN, and the number of failures tells why.
+        warnings.simplefilter("ignore", RuntimeWarning)
         kept = np.asarray(x, np.float64)[np.asarray(okay)]
         return float(np.mean(kept)), float(np.std(kept) / np.sqrt(len(kept)))
 
 
-def _check_solvers(solvers, reference) -> None:
+def _check_solvers(solvers: Any, reference: Any) -> None:
+    """Raises a `ValueError` unless these are a list of solvers, and a solver."""
     if not isinstance(solvers, Sequence) or isinstance(solvers, str):
         raise ValueError(f"`solvers` must be a list of solvers; got {solvers!r}.")
     for solver in solvers:
@@ -262,26 +328,35 @@ def _check_solvers(solvers, reference) -> None:
     check_solver("reference", reference)
 
 
-def _check_scalar(phi, t: RealScalarLike, y0: Y, args: Args) -> None:
+def _check_scalar(phi: Any, t: RealScalarLike, y0: Y, args: Args) -> None:
+    """Raises a `ValueError` unless `phi` returns one real number."""
     check_takes("phi", phi, "t", "y", "args")
     out = eqx.filter_eval_shape(phi, jnp.asarray(t, float), y0, args)
     leaves = jtu.tree_leaves(out)
     check_real("phi", leaves)
-    if [*map(jnp.shape, leaves)] != [()]:
+    one_number = len(leaves) == 1 and jnp.shape(leaves[0]) == ()
+    if not one_number:
         raise ValueError(f"`phi` must return one number; got shape {shapes(out)}.")
 
 
-def _checked_steps(t0, t1, dts: Sequence[float]) -> list[float]:
+def _checked_steps(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
+    """Raises a `ValueError` unless each step divides the interval, and is a multiple of the
+    smallest, so that all follow one Brownian motion."""
     if not t1 > t0:
         raise ValueError(f"`t1` must be after `t0`; got t0={t0!r} and t1={t1!r}.")
     if np.ndim(dts) != 1 or len(dts) == 0:
         raise ValueError(f"`dt0` must be a list of step sizes; got {dts!r}.")
-    whole = lambda x: math.isfinite(x) and x > 0.5 and abs(x - round(x)) < 1e-6
     for dt in dts:
-        if not dt or not whole((t1 - t0) / dt) or not whole(dt / min(dts)):
+        # Of zero no quotient can be asked.
+        if not dt or not _is_whole((t1 - t0) / dt) or not _is_whole(dt / min(dts)):
             raise ValueError(
                 f"Every step in `dt0` must divide the interval from {t0} to {t1} and be a "
                 f"multiple of the smallest; got {dt}. Take for example "
                 "`[(t1 - t0) / 2**k for k in range(3, 8)]`."
             )
     return [float(dt) for dt in dts]
+
+
+def _is_whole(x: float) -> bool:
+    """Whether this is a positive whole number, up to the rounding of a quotient."""
+    return math.isfinite(x) and x > 0.5 and abs(x - round(x)) < 1e-6

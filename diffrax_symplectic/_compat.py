@@ -1,15 +1,23 @@
-"""The private parts of other packages that this one uses, and may change without notice.
+"""What this package uses of others that they do not promise to keep, by its use.
 
-They are used nowhere else, except for the loop of a solve, its state and that of its step
-size controller in `_adjoint.py`. `tests/test_private_parts.py` tests each of them.
+Some of it is private, some is public but undocumented, and some is how a class happens to
+store what it was given. It is used nowhere else, and `tests/test_private_parts.py` tests
+each part by itself: if one of these tests fails after an upgrade, change the function here.
 """
 
+import dataclasses
+import functools as ft
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
+import jax.core
+import jax.numpy as jnp
+import jax.random as jr
 import jax.tree_util as jtu
+import lineax as lx
 from diffrax._term import AdjointTerm, WrapTerm
 from equinox.internal import (
     nondifferentiable as nondifferentiable,
@@ -24,7 +32,32 @@ from jax.extend.core import (
     Literal as Literal,
 )
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
-from jaxtyping import PyTree
+from jaxtyping import Array, PRNGKeyArray, PyTree
+
+
+def is_threefry(key: PRNGKeyArray) -> bool:
+    """Whether the key belongs to JAX's default generator, by its name, which is all that
+    JAX tells of a generator."""
+    return str(jr.key_impl(key)) == "threefry2x32"
+
+
+def is_traced(x: Any) -> bool:
+    """Whether this value is known only when the program runs."""
+    return isinstance(x, jax.core.Tracer)
+
+
+def computed_by(
+    solver: lx.AbstractLinearSolver[Any],
+    operator: lx.AbstractLinearOperator,
+    rhs: Array,
+) -> tuple[Array, lx.RESULTS]:
+    """The solution of a linear system by a solver of Lineax, and whether it was found.
+
+    `lineax.linear_solve` does the same, with derivatives that would not be used here, and
+    with a longer trace.
+    """
+    x, result, _ = solver.compute(solver.init(operator, {}), rhs, {})
+    return x, result
 
 
 def unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
@@ -41,13 +74,17 @@ def direction(terms: PyTree[diffrax.AbstractTerm]) -> Any:
     """The sign of the direction of time in the solve that the terms come from. Terms from
     outside a solve run forward."""
     leaves = jtu.tree_leaves(terms, is_leaf=_is_wrapped)
-    return next((x.direction for x in leaves if _is_wrapped(x)), 1)
+    # The same for all terms of a solve.
+    return next((leaf.direction for leaf in leaves if _is_wrapped(leaf)), 1)
 
 
 def reversed_in_time(terms: PyTree[diffrax.AbstractTerm]) -> PyTree:
     """The terms of a solve with the direction of time reversed."""
-    turn = lambda x: WrapTerm(x.term, -x.direction) if _is_wrapped(x) else x
-    return jtu.tree_map(turn, terms, is_leaf=_is_wrapped)
+
+    def turned(term: Any) -> Any:
+        return WrapTerm(term.term, -term.direction) if _is_wrapped(term) else term
+
+    return jtu.tree_map(turned, terms, is_leaf=_is_wrapped)
 
 
 def _is_wrapped(x: Any) -> bool:
@@ -64,6 +101,116 @@ def captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[Any]]:
     (`eqx.filter_closure_convert` checks types that `shard_map` changes.)"""
     traced, struct = jax.make_jaxpr(fn, return_shape=True)(value)
     treedef = jtu.tree_structure(struct)
-    closed = lambda arrays: jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, arrays))
-    call = lambda x, arrays: treedef.unflatten(closed(arrays)(*jtu.tree_leaves(x)))
+
+    def call(value: PyTree, arrays: list[Any]) -> PyTree:
+        # A jaxpr is a function of its inputs and constants, both as flat lists.
+        run = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, arrays))
+        return treedef.unflatten(run(*jtu.tree_leaves(value)))
+
     return call, traced.consts
+
+
+class SolveState(NamedTuple):
+    """What is used here of the state of Diffrax's loop over steps.
+
+    - `y`: the state of the equation.
+    - `num_steps`: the number of steps so far.
+    - `num_saved`: the number of times of `SaveAt(ts=...)` so far.
+    - `ys`: the saved states.
+    """
+
+    y: PyTree[Array]
+    num_steps: Any
+    num_saved: Any
+    ys: PyTree[Array]
+
+
+def solve_state(loop_state: Any) -> SolveState:
+    """The parts of a state of Diffrax's loop."""
+    return SolveState(
+        y=loop_state.y,
+        num_steps=loop_state.num_steps,
+        num_saved=loop_state.save_state.saveat_ts_index,
+        ys=loop_state.save_state.ys,
+    )
+
+
+def without_derivatives(loop_state: Any, of_solver_state: Callable) -> Any:
+    """A state of Diffrax's loop without the state of the equation, and with
+    `of_solver_state(x)` in place of each leaf `x` of the solver's state."""
+    fixed = jtu.tree_map(of_solver_state, loop_state.solver_state)
+    # An object that is no array, so that using it by mistake is an error.
+    return dataclasses.replace(loop_state, y=object(), solver_state=fixed)
+
+
+def with_y(loop_state: Any, y: PyTree[Array]) -> Any:
+    """A state of Diffrax's loop with this state of the equation."""
+    return eqx.tree_at(lambda state: state.y, loop_state, y)
+
+
+def with_only_ys_differentiable(loop_state: Any) -> Any:
+    """A state of Diffrax's loop with an error for derivatives of anything but the saved
+    states."""
+    ys = loop_state.save_state.ys
+    refused = nondifferentiable_backward(loop_state, symbolic=False)
+    return eqx.tree_at(lambda state: state.save_state.ys, refused, ys)
+
+
+def run_steps(adjoint: Any, outer_while_loop: Callable, **kwargs: Any) -> Any:
+    """Runs Diffrax's loop over steps, for an adjoint, with `outer_while_loop` for it and
+    an ordinary loop for the times to save at. `kwargs` are those of `adjoint.loop`."""
+    return adjoint._loop(
+        **kwargs,
+        event=None,
+        inner_while_loop=ft.partial(while_loop, kind="lax"),
+        outer_while_loop=outer_while_loop,
+    )
+
+
+def saves_states(sub_saveat: diffrax.SubSaveAt) -> bool:
+    """Whether the states themselves are saved, not a function of them."""
+    # The default is a private function, the same object in each.
+    return sub_saveat.fn is diffrax.SubSaveAt(t1=True).fn
+
+
+class StepTimes(NamedTuple):
+    """The times of the steps of a solve, computed by its controller.
+
+    - `controller`: `diffrax.ConstantStepSize` or `diffrax.StepTo`.
+    - `init_state`: the state of Diffrax's loop before the first step.
+    """
+
+    controller: diffrax.AbstractStepSizeController
+    init_state: Any
+
+    def number(self) -> Any:
+        """The number of steps."""
+        if isinstance(self.controller, diffrax.StepTo):
+            return len(self.controller.ts) - 1
+        # The state of a constant step size: steps so far, number of steps, and more.
+        _, number, *_ = self.init_state.controller_state
+        return number
+
+    def time(self, i: Any) -> Any:
+        """The time after `i` steps."""
+        if isinstance(self.controller, diffrax.StepTo):
+            return self.controller.ts[i]
+        _, *fixed = self.init_state.controller_state
+        first = self.init_state.tprev
+        second = self.init_state.tnext
+        # The controller computes times from the number of steps alone.
+        _, _, later, *_ = self.controller.adapt_step_size(
+            t0=first,
+            t1=second,
+            y0=None,
+            y1_candidate=None,
+            args=None,
+            y_error=None,
+            error_order=1,
+            controller_state=(i - 1, *fixed),
+        )
+        return jnp.where(i == 1, second, later)
+
+    def solver_state(self) -> Any:
+        """The state of the solver before the first step."""
+        return self.init_state.solver_state

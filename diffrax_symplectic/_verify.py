@@ -17,17 +17,22 @@ from ._custom_types import Args, RealScalarLike, Y
 from ._terms import (
     apply_one,
     as_spins,
+    constraint_of,
     from_spinors,
     number_of_noises,
     outcomes,
     rate,
+    refuse_constraint,
     split_terms,
     step_variables,
+    Surface,
     to_spinors,
 )
 
 
 def _one_step(terms, solver, t0, t1, y0, args) -> tuple[Y, diffrax.RESULTS]:
+    """The end of one step, and whether it succeeded."""
+    # Not by `diffrax.diffeqsolve`, whose loop takes longer to trace than the step.
     solver_state = solver.init(terms, t0, t1, y0, args)
     y1, _, _, _, result = solver.step(
         terms, t0, t1, y0, args, solver_state, made_jump=False
@@ -50,6 +55,8 @@ def symplecticity_defect(
 
     Exact up to rounding: for a symplectic method this is a small multiple of the machine
     epsilon, for any Hamiltonians, step and increments; for other methods it is not small.
+    For terms with a `constraint` it is the largest entry between directions along which
+    allowed states can move.
     (The solvers of this package differentiate their stage equations implicitly, so it does
     not depend on the tolerance of the root finder.)
 
@@ -70,18 +77,41 @@ def symplecticity_defect(
     check_state(y0, "symplecticity_defect")
     flat, unravel = jfu.ravel_pytree(y0)
 
-    def step(x):
+    def step(x: Array) -> tuple[Array, diffrax.RESULTS]:
         y1, result = _one_step(terms, solver, t0, t1, unravel(x), args)
         return jfu.ravel_pytree(y1)[0], result
 
     jacobian, result = jax.jacrev(step, has_aux=True)(flat)
+    # A failed step has no Jacobian to be judged.
     jacobian = result.error_if(jacobian, result != diffrax.RESULTS.successful)
-    d = flat.size // 2
-    zero, one = np.zeros((d, d)), np.eye(d)
+    half = flat.size // 2
+    zero = np.zeros((half, half))
+    one = np.eye(half)
     omega = jnp.asarray(np.block([[zero, one], [-one, zero]]), flat.dtype)
-    return jnp.max(jnp.abs(_dot(jacobian.T, _dot(omega, jacobian)) - omega))
+    defect = _dot(jacobian.T, _dot(omega, jacobian)) - omega
+    if constraint_of(terms) is not None:
+        Z = _allowed_directions(terms, t0, y0, args)
+        defect = _dot(Z.T, _dot(defect, Z))
+    return jnp.max(jnp.abs(defect))
 
 
+def _allowed_directions(terms, t0, y0: Y, args: Args) -> Float[Array, "n k"]:
+    """An orthonormal basis of the directions along which a state can move that satisfies
+    constraint(q) = 0 and J v = 0."""
+    surface = Surface.of(terms, t0, y0, args)
+    flat, _ = jfu.ravel_pytree(y0)
+
+    def equations(x):
+        p, q = jnp.split(x, 2)
+        off, speed = jax.jvp(surface.residual, (q,), (surface.velocity(p),))
+        return jnp.concatenate([off, speed])
+
+    normals = jax.jacrev(equations)(flat)
+    _, _, V = jnp.linalg.svd(normals, full_matrices=True)
+    return V[len(normals) :].T
+
+
+# By default accelerators multiply in half precision, which would look like a defect.
 _dot = ft.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
 
 
@@ -113,10 +143,12 @@ def poisson_defect(
     **Raises:** a `ValueError` if `y0` is neither; an error when run if a spin of the pair
     `y0` has length zero, or if the solver reports a failed step.
     """
+    # Spins may be given as spinors, for terms of which the step is symplectic.
     lifted = isinstance(y0, tuple)
     s0 = from_spinors(y0) if lifted else as_spins(y0)
 
-    def step(s):
+    def step(s: Array) -> tuple[Array, tuple[Array, diffrax.RESULTS]]:
+        # Any spinors of a spin will do, since all of them move to those of the same spin.
         y0 = to_spinors(s) if lifted else s
         y1, result = _one_step(terms, solver, t0, t1, y0, args)
         s1 = from_spinors(y1) if lifted else y1
@@ -125,11 +157,17 @@ def poisson_defect(
     jacobian, (s1, result) = jax.jacrev(step, has_aux=True)(s0)
     jacobian = result.error_if(jacobian, result != diffrax.RESULTS.successful)
     # Row i of `gradients` is ds1_i / ds0, and row i of `units` the gradient of s_i itself.
-    rows = lambda x: x.reshape(s0.size, *s0.shape)
-    flat = lambda x: x.reshape(s0.size, s0.size)
-    gradients, units = rows(jacobian), rows(jnp.eye(s0.size, dtype=s0.dtype))
-    before = _dot(flat(gradients), flat(jnp.cross(s0, gradients)).T)
-    return jnp.max(jnp.abs(before - flat(jnp.cross(s1, units)).T))
+    num_components = s0.size
+    gradients = jacobian.reshape(num_components, *s0.shape)
+    identity = jnp.eye(num_components, dtype=s0.dtype)
+    units = identity.reshape(num_components, *s0.shape)
+
+    def matrix(rows: Array) -> Array:
+        return rows.reshape(num_components, num_components)
+
+    # P(s) multiplies each row by a cross product, so it is never formed.
+    before = _dot(matrix(gradients), matrix(jnp.cross(s0, gradients)).T)
+    return jnp.max(jnp.abs(before - matrix(jnp.cross(s1, units)).T))
 
 
 def step_expectation(
@@ -165,7 +203,7 @@ def step_expectation(
     an error when run if the solver reports a failed step.
     """
 
-    def outcome(terms):
+    def outcome(terms: PyTree) -> tuple[PyTree[Array], diffrax.RESULTS]:
         y1, result = _one_step(terms, solver, t0, t1, y0, args)
         return fn(t1, y1, args), result
 
@@ -197,21 +235,24 @@ def second_moment_map(
 
     **Returns:** the matrix $K$, of shape `((n + 1)**2, (n + 1)**2)`.
 
-    **Raises:** as [`diffrax_symplectic.step_expectation`][].
+    **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for terms
+    with a `constraint`.
     """
+    refuse_constraint(terms, "second_moment_map")
     flat, unravel = jfu.ravel_pytree(y0)
-    n = flat.size
+    size = flat.size
     # The step is affine, so its values at zero and at the unit vectors give its matrix.
     # Differentiating it would take far more tracing.
-    starts = jnp.eye(n + 1, n, k=-1, dtype=flat.dtype)
+    starts = jnp.eye(size + 1, size, k=-1, dtype=flat.dtype)
 
-    def outcome(terms):
-        def step(y):
+    def outcome(terms: PyTree) -> tuple[Array, diffrax.RESULTS]:
+        def step(y: Array) -> tuple[Array, diffrax.RESULTS]:
             y1, result = _one_step(terms, solver, t0, t1, unravel(y), args)
             return jfu.ravel_pytree(y1)[0], result
 
         ends, result = jax.vmap(step)(starts)
-        first = jnp.zeros_like(flat, shape=(1, n + 1)).at[0, 0].set(1)
+        # The constant 1 of z stays as it is.
+        first = jnp.zeros_like(flat, shape=(1, size + 1)).at[0, 0].set(1)
         Z = jnp.concatenate([first, ends.at[1:].add(-ends[0]).T])
         return jnp.kron(Z, Z), result
 
@@ -222,11 +263,18 @@ def _average(outcome: Callable, terms, h, nodes: int) -> PyTree[Array]:
     """The expectation of `outcome(terms) -> (value, result)`."""
     laws, terms_with = step_variables(terms, h)
     variables, weights = outcomes(laws, nodes)
-    values, result = jax.vmap(lambda x: outcome(terms_with(x)))(variables)
+
+    def of_variables(values: Array) -> tuple[PyTree[Array], diffrax.RESULTS]:
+        return outcome(terms_with(values))
+
+    # Traced once for all outcomes.
+    values, result = jax.vmap(of_variables)(variables)  # pyright: ignore
     values = result.error_if(values, result != diffrax.RESULTS.successful)
-    return jtu.tree_map(
-        lambda v: jnp.tensordot(jnp.asarray(weights, v.dtype), v, axes=1), values
-    )
+
+    def mean(value: Array) -> Array:
+        return jnp.tensordot(jnp.asarray(weights, value.dtype), value, axes=1)
+
+    return jtu.tree_map(mean, values)
 
 
 def weak_order_defect(
@@ -258,18 +306,29 @@ def weak_order_defect(
 
     **Returns:** the local error, in the structure of `fn`.
 
-    **Raises:** as [`diffrax_symplectic.step_expectation`][].
+    **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for terms
+    with a `constraint`.
     """
+    refuse_constraint(terms, "weak_order_defect")
     expected = step_expectation(terms, solver, t0, t1, y0, args, fn=fn, nodes=nodes)
-    L = _generator(terms, args, ito=isinstance(solver, diffrax.AbstractItoSolver))
-    phi = lambda t, y: fn(t, y, args)
+    generator = _generator(
+        terms, args, ito=isinstance(solver, diffrax.AbstractItoSolver)
+    )
+
+    def phi(t: RealScalarLike, y: Y) -> PyTree[Array]:
+        return fn(t, y, args)
+
     # Vector fields must have the precision of the state.
     t = jnp.asarray(t0, jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).dtype)
-    factor, defect = 1.0, expected
+    defect = expected
+    power = phi
+    factor = 1.0
+    # In round j, `power` is L^j phi and `factor` is h^j / j!.
     for j in range(order + 1):
-        exact = phi(t, y0)
+        exact = power(t, y0)
         defect = (defect**ω - factor * exact**ω).ω
-        phi, factor = L(phi), factor * (t1 - t0) / (j + 1)
+        power = generator(power)
+        factor = factor * (t1 - t0) / (j + 1)
     return defect
 
 
@@ -282,22 +341,32 @@ def _generator(terms, args, ito: bool) -> Callable:
         for k in range(number_of_noises(terms))
     ]
 
-    def L(phi):
-        def L_phi(t, y):
+    def generator(phi: Callable) -> Callable:
+        def applied(t: RealScalarLike, y: Y) -> PyTree[Array]:
             still = jtu.tree_map(jnp.zeros_like, y)
             velocity = rate(drift, t, y, args) if drift else still
             _, total = jax.jvp(phi, (t, y), (jnp.ones_like(t), velocity))
-            for b in fields:
-                frozen = b(t, y)
-                moving = (lambda t, y: frozen) if ito else b
-
-                def derivative(y):
-                    return jax.jvp(lambda y: phi(t, y), (y,), (moving(t, y),))[1]
-
-                _, second = jax.jvp(derivative, (y,), (frozen,))
+            for field in fields:
+                second = _second_derivative(phi, field, t, y, ito)
                 total = (total**ω + second**ω / 2).ω
             return total
 
-        return L_phi
+        return applied
 
-    return L
+    return generator
+
+
+def _second_derivative(
+    phi: Callable, field: Callable, t: RealScalarLike, y: Y, ito: bool
+) -> PyTree[Array]:
+    """The second derivative of `phi` along a vector field: along its flow, or for an Itô
+    equation along the straight line of its value at `y`."""
+    here = field(t, y)
+
+    def along_field(y: Y) -> PyTree[Array]:
+        direction = here if ito else field(t, y)
+        _, derivative = jax.jvp(lambda y: phi(t, y), (y,), (direction,))
+        return derivative
+
+    _, second = jax.jvp(along_field, (y,), (here,))
+    return second

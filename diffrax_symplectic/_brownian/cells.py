@@ -6,7 +6,6 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
-import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -14,6 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
+from .._compat import is_traced
 from .._custom_types import RealScalarLike
 from .stepwise import Increment, raveled, step_size
 
@@ -46,6 +46,7 @@ class Piece(eqx.Module):
     @property
     def H(self) -> Float[Array, " m"]:
         """The space-time Lévy area; zero for an empty segment."""
+        # Integrals compose by addition, areas do not, so a segment holds the integral.
         assert self.integral is not None
         return self.integral / or_one(self.h) - self.W / 2
 
@@ -53,6 +54,7 @@ class Piece(eqx.Module):
         """This segment followed by another, by Chen's rule."""
         integral = A = None
         if self.integral is not None and other.integral is not None:
+            # Over the other segment the path is above its start there by `self.W`.
             integral = self.integral + other.integral + self.W * other.h
         if self.A is not None and other.A is not None:
             outer = jnp.outer(self.W, other.W)
@@ -89,7 +91,8 @@ def checked_cell(cell: float | None) -> float | None:
     """Raises a `ValueError` unless this is a positive number or `None`."""
     if cell is None:
         return None
-    known = eqx.is_array_like(cell) and not isinstance(cell, jax.core.Tracer)
+    # It is a static field of a path, so it must be known while tracing.
+    known = eqx.is_array_like(cell) and not is_traced(cell)
     if not known or np.ndim(cell) != 0 or not 0 < float(cell) < np.inf:
         raise ValueError(
             f"`cell` must be a positive number that is not traced, or `None`; got {cell!r}."
@@ -106,8 +109,10 @@ def compose(
 ) -> Piece:
     """The segment from `t0` to `t1`, where `sample(i)` is the cell that starts at
     `i * cell`. An error when run if it does not consist of whole cells."""
-    first, last = (jnp.round(t / cell).astype(int) for t in (t0, t1))
+    first = jnp.round(t0 / cell).astype(int)
+    last = jnp.round(t1 / cell).astype(int)
     off = jnp.maximum(jnp.abs(first * cell - t0), jnp.abs(last * cell - t1))
+    # Times are sums of rounded steps, so they are met only nearly.
     last = eqx.error_if(
         last,
         (off > 1e-3 * cell) | (last < first),
@@ -115,5 +120,10 @@ def compose(
         "If they should, their times may have been rounded too much: enable 64 bits, or "
         "step with `diffrax.StepTo`.",
     )
-    empty = jtu.tree_map(lambda s: lax.full_like(s, 0), jax.eval_shape(sample, first))
-    return lax.fori_loop(first, last, lambda i, piece: piece.then(sample(i)), empty)
+    struct = jax.eval_shape(sample, first)
+    empty = jtu.tree_map(lambda leaf: lax.full_like(leaf, 0), struct)
+
+    def extended(i: Int[Array, ""], piece: Piece) -> Piece:
+        return piece.then(sample(i))
+
+    return lax.fori_loop(first, last, extended, empty)

@@ -66,6 +66,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     num_terms: int = eqx.field(static=True)
     cell: float | None = eqx.field(static=True)
     levy_area: ClassVar = LevyAreaIncrement  # pyright: ignore
+    # The law of the areas is known only given `W` and `H`.
     laws: ClassVar[None] = None  # pyright: ignore
 
     def __init__(
@@ -99,20 +100,27 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         cell = self.cell
         if cell is not None:
-            # Through rounding a cell may end just beyond the end of the path.
-            at = lambda i: jnp.clip(i * cell, self.path.t0, self.path.t1)
-            sample = lambda i: self._sample(at(i), at(i + 1))
+
+            def time(i: Array) -> Array:
+                # Through rounding a cell may end just beyond the end of the path.
+                return jnp.clip(i * cell, self.path.t0, self.path.t1)
+
+            def sample(i: Array) -> Piece:
+                return self._sample(time(i), time(i + 1))
+
             piece = compose(t0, t1, cell, sample, type(self).__name__)
         elif use_levy:
             piece = self._sample(t0, t1)
         else:
+            # The increment alone needs none of the words drawn here.
             return self.path.evaluate(t0, t1)
         return self._increment(piece, t1 - t0, use_levy)
 
     def num_own_words(self, use_levy: bool) -> int:
         if not use_levy:
             return 0
-        return sum(_sizes(num_noises(increment_struct(self.path)), self.num_terms))
+        m = num_noises(increment_struct(self.path))
+        return sum(_num_normals(m, self.num_terms))
 
     def changed(self, increment, own_words, h, use_levy) -> Increment:
         """Samples the step as a whole, regardless of `cell`."""
@@ -124,25 +132,35 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         shape = increment_struct(self.path)
         return piece.as_increment(LevyAreaIncrement, shape, h, use_levy)
 
-    def _sample(self, t0, t1) -> Piece:
+    def _sample(self, t0: Array, t1: Array) -> Piece:
+        """The path between these times, drawn as one piece."""
+        # The areas read each normal number several times.
         increment = materialize(lambda: self.path.evaluate(t0, t1, use_levy=True))
-        n = self.num_own_words(True)
-        words = random_words(self.key, place_of(t0, t1), 1, n, AREA_WORDS)
+        num_words = self.num_own_words(True)
+        words = random_words(self.key, place_of(t0, t1), 1, num_words, AREA_WORDS)
         return self._piece(increment, words[0], t1 - t0)
 
-    def _piece(self, increment, words: UInt32[Array, " normals"], h) -> Piece:
+    def _piece(
+        self, increment: Increment, words: UInt32[Array, " normals"], h: RealScalarLike
+    ) -> Piece:
+        """The path over a step of size `h` with this increment, with areas from `words`."""
         assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
         H, _ = jfu.ravel_pytree(increment.H)
         piece = Piece.of(increment, jnp.abs(h))
         normals = normal_from_words(words, H.dtype)
+        # A bridge over a step is one over unit time, scaled by the root of its size. Its
+        # areas are scaled by the size.
         scaled = H / jnp.sqrt(or_one(piece.h))
         bridge = piece.h * _bridge_area(scaled, normals, self.num_terms)
+        # The area between the line and the bridge, which only its integral enters.
         outer = jnp.outer(H, piece.W)
         return dataclasses.replace(piece, A=outer - outer.T + bridge)
 
 
-def _sizes(m: int, terms: int) -> tuple[int, ...]:
-    """The number of normal variables that each part of the area needs."""
+def _num_normals(m: int, terms: int) -> tuple[int, ...]:
+    """The numbers of normal variables that the areas of `m` noises need: for the cosine and
+    sine coefficients, for the sum of all other cosine coefficients, and for the two parts
+    of the remainder's area."""
     return m * terms, m * terms, m, m, m * (m - 1) // 2
 
 
@@ -157,17 +175,22 @@ def _bridge_area(
     area $\pi \sum_r r (a_{kr} b_{lr} - b_{kr} a_{lr})$.
     """
     m = H.size
-    r = np.arange(1, terms + 1)
-    s = 1 / (2 * np.pi**2 * r**2)
-    rest, rest_squared = 1 / 12 - np.sum(s), max(1 / 360 - np.sum(s**2), 0)
-    cast = lambda x: jnp.asarray(x, H.dtype)
-    ends = np.cumsum(_sizes(m, terms))
-    a, b, from_rest, by_mean, by_area = jnp.split(normals, ends[:-1])
-    a, b = (cast(np.sqrt(s)) * x.reshape(m, terms) for x in (a, b))
+    orders = np.arange(1, terms + 1)
+    variances = 1 / (2 * np.pi**2 * orders**2)
+    # Over all orders the variances add up to 1/12, and their squares to 1/360.
+    rest = 1 / 12 - np.sum(variances)
+    # With many terms, rounding could make it negative.
+    rest_squared = max(1 / 360 - np.sum(variances**2), 0)
+    # In NumPy until here, since constants of the program should not be computed by it.
+    deviations = jnp.asarray(np.sqrt(variances), H.dtype)
+    ends = np.cumsum(_num_normals(m, terms))
+    cosines, sines, from_rest, by_mean, by_area = jnp.split(normals, ends[:-1])
+    a = deviations * cosines.reshape(m, terms)
+    b = deviations * sines.reshape(m, terms)
     total = jnp.sum(a, axis=1) + np.sqrt(rest) * from_rest
     # Condition on the sum of all cosine coefficients, including the remainder: it is -H.
-    a = a - cast(12 * s) * (total + H)[:, None]
-    series = _weighted_product(a, b, np.pi * r)
+    a = a - jnp.asarray(12 * variances, H.dtype) * (total + H)[:, None]
+    series = _weighted_product(a, b, np.pi * orders)
     # Cosine coefficients of the remainder have mean -12 s_r H, which gives the first part
     # of its area, and variance s_r - 12 s_r^2, which gives the second.
     mean = jnp.outer(H, np.sqrt(72 * rest_squared) * by_mean)
@@ -182,16 +205,20 @@ def _weighted_product(
     """`a diag(weights) b^T`."""
     if len(weights) > _WRITTEN_OUT:
         a = a * jnp.asarray(weights, a.dtype)
+        # By default accelerators multiply in half precision.
         return jnp.matmul(a, b.T, precision=jax.lax.Precision.HIGHEST)
     # Batched products of small matrices cost more than their arithmetic.
-    outer = [float(w) * jnp.outer(a[:, i], b[:, i]) for i, w in enumerate(weights)]
-    return sum(outer, jnp.zeros((len(a), len(a)), a.dtype))
+    products = [
+        float(weight) * jnp.outer(a[:, i], b[:, i]) for i, weight in enumerate(weights)
+    ]
+    # Zeros to start from, since there may be no terms at all.
+    return sum(products, jnp.zeros((len(a), len(a)), a.dtype))
 
 
 def _strictly_upper(x: Float[Array, " n"], m: int) -> Float[Array, "m m"]:
     """The matrix with the entries `x` above its diagonal."""
     place = np.zeros((m, m), int)
     place[np.triu_indices(m, 1)] = np.arange(x.size)
-    # Gather, since scattering is slow.
+    # Gather, since scattering is slow. For one noise there is no entry to gather from.
     padded = jnp.append(x, 0) if x.size == 0 else x
     return jnp.triu(padded[place], 1)

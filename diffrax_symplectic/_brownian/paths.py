@@ -101,12 +101,15 @@ class WeakBrownianPath(AbstractPathWithLaws):
         check_key(key, type(self).__name__)
         self.shape = checked_shape(shape, type(self).__name__)
         self.key = key
+        # Methods of order 3 need three variables for each noise.
         self.second = second or order == 3
         self.two_point = two_point
         self.order = order
 
     @property
     def laws(self) -> dict[str, AbstractLaw]:
+        # Their order is that of the random words. `W` is first, so that it does not depend
+        # on the others.
         laws = {
             "W": THREE_POINT if self.order == 2 else FOUR_POINT,
             "second": THREE_POINT if self.second else None,
@@ -188,8 +191,11 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
         h = jnp.asarray(self.cell, t0.dtype)
 
         def sample(i) -> Piece:
+            # Cells are numbered, so their place needs no rounding. The number is exact, as
+            # the times of a cell are not.
+            place = (i.astype(jnp.int32), jnp.array(0))
             # Always draw the areas, so that increments do not depend on `use_levy`.
-            words = self.words((i.astype(jnp.int32), jnp.array(0)), True)
+            words = self.words(place, True)
             return Piece.of(self.increment(words, 0 * h, h, True), h)
 
         piece = compose(t0, t1, self.cell, sample, type(self).__name__)

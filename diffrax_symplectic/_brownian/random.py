@@ -3,8 +3,8 @@ laws of the scalar random variables computed from them."""
 
 import abc
 import dataclasses
-import functools as ft
-from typing import TypeAlias
+import math
+from typing import Any, cast, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -14,18 +14,23 @@ from jax import lax
 from jaxtyping import Array, Float, Integer, PRNGKeyArray, UInt32
 
 from .._batch import materialize
+from .._compat import is_threefry
 
 
 # The position of a step, in units of a power of two, and the exponent of that power.
 Place: TypeAlias = tuple[Integer[Array, ""], Integer[Array, ""]]
 
+# The number of pairs of words that a path, and each wrapper around it, may draw in a step.
+# Above it, three ranges of numbers would not fit below the exponent of the step's size,
+# which takes the upper 12 bits of a counter.
+_MOST_PAIRS = 2**18
 # Pairs of words of a step are numbered. The pairs of wrappers begin at these numbers.
-_MOST = 2**18
-PLATEAU_WORDS, AREA_WORDS = _MOST, 2 * _MOST
+PLATEAU_WORDS = _MOST_PAIRS
+AREA_WORDS = 2 * _MOST_PAIRS
 
 
 def random_words(
-    key, place: Place, sets: int, n: int, begin: int = 0
+    key: PRNGKeyArray, place: Place, sets: int, n: int, begin: int = 0
 ) -> UInt32[Array, "sets n"]:
     """Random words for a step at `place`, in `sets` sets of `n` words each. More sets leave
     the first ones unchanged. Words for different values of `begin` are independent, so a
@@ -37,41 +42,54 @@ def random_words(
             f"{key.shape}. Use `jax.vmap` over it."
         )
     count, exponent = place
-    blocks = (sets * n + 1) // 2
-    if str(jr.key_impl(key)) == "threefry2x32" and 0 < blocks <= _MOST:
+    num_words = sets * n
+    num_pairs = (num_words + 1) // 2
+    if is_threefry(key) and 0 < num_pairs <= _MOST_PAIRS:
         # With the place as counter, one hash yields two words. Folding and splitting keys
         # would take three hashes for the first word.
-        numbers = np.arange(begin, begin + blocks, dtype=np.uint32)
-        counter = (
-            count.astype(jnp.uint32),
-            (exponent.astype(jnp.uint32) << 20) + numbers,
-        )
-        hashed = lambda: _threefry(jr.key_data(key), *counter)
+        numbers = np.arange(begin, begin + num_pairs, dtype=np.uint32)
+        upper = count.astype(jnp.uint32)
+        lower = (exponent.astype(jnp.uint32) << 20) + numbers
+
+        def hashed() -> tuple[Array, ...]:
+            pair = _threefry(jr.key_data(key), upper, lower)
+            # A single word needs only the first of its pair.
+            return pair[:num_words]
+
         # XLA would compute each of the two words in a separate kernel.
-        words = jnp.stack(materialize(lambda: hashed()[: sets * n]), axis=1)
-        return words.reshape(-1)[: sets * n].reshape(sets, n)
+        words = jnp.stack(materialize(hashed), axis=1)
+        return words.reshape(-1)[:num_words].reshape(sets, n)
     at = jr.fold_in(jr.fold_in(key, count), exponent)
-    return jnp.stack(
-        [jr.bits(jr.fold_in(at, begin + i), (n,), jnp.uint32) for i in range(sets)]
-    )
+    # Each set from a key of its own, so that more sets leave the first ones unchanged.
+    each = [jr.bits(jr.fold_in(at, begin + i), (n,), jnp.uint32) for i in range(sets)]
+    return jnp.stack(each)
 
 
-def _threefry(key: UInt32[Array, "2"], a: Array, b: Array) -> tuple[Array, Array]:
+# Threefry-2x32 rotates by these numbers of bits, in turns, four times before it adds keys.
+_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+_PARITY = np.uint32(0x1BD11BDA)
+
+
+def _threefry(
+    key: UInt32[Array, "2"], upper: Array, lower: Array
+) -> tuple[Array, Array]:
     """Threefry-2x32 with 20 rounds, by Salmon et al. (SC'11, doi:10.1145/2063384.2063405):
-    the words of JAX's generator for this key and counters `(a, b)`. Unrolled, since JAX's
-    version is a loop of eighty kernels on CPUs: three words for each of 512 paths take 3 ns
-    per path instead of 16."""
-    keys = key[0], key[1], key[0] ^ key[1] ^ np.uint32(0x1BD11BDA)
-    a, b = a + keys[0], b + keys[1]
+    the words of JAX's generator for this key and counters `(upper, lower)`. Unrolled, since
+    JAX's version is a loop of eighty kernels on CPUs: three words for each of 512 paths
+    take 3 ns per path instead of 16."""
+    keys = [key[0], key[1], key[0] ^ key[1] ^ _PARITY]
+    first = upper + keys[0]
+    second = lower + keys[1]
     for i in range(5):
-        for bits in ((13, 15, 26, 6), (17, 29, 16, 24))[i % 2]:
-            a = a + b
-            b = a ^ ((b << bits) | (b >> (32 - bits)))
-        a, b = a + keys[(i + 1) % 3], b + keys[(i + 2) % 3] + np.uint32(i + 1)
-    return a, b
+        for bits in _ROTATIONS[i % 2]:
+            first = first + second
+            second = first ^ ((second << bits) | (second >> (32 - bits)))
+        first = first + keys[(i + 1) % 3]
+        second = second + keys[(i + 2) % 3] + np.uint32(i + 1)
+    return first, second
 
 
-def check_key(key, user: str) -> None:
+def check_key(key: Any, user: str) -> None:
     """Raises a `ValueError` unless `key` is a random key (from `jax.random.key` or
     `jax.random.PRNGKey`) or an array of keys, to be used with `jax.vmap`."""
     if not is_key(key):
@@ -80,7 +98,7 @@ def check_key(key, user: str) -> None:
         )
 
 
-def is_key(x) -> bool:
+def is_key(x: Any) -> bool:
     """Whether this is a random key, or an array of keys. The words of a key from
     `jax.random.PRNGKey` are told from other integers by their number."""
     dtype = getattr(x, "dtype", None)
@@ -89,12 +107,23 @@ def is_key(x) -> bool:
     return dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
 
 
-def typed_key(key) -> PRNGKeyArray:
+def typed_key(key: PRNGKeyArray | UInt32[Array, "..."]) -> PRNGKeyArray:
     """The key as one from `jax.random.key`."""
     return jr.wrap_key_data(key) if key.dtype == jnp.uint32 else key
 
 
-def place_of(t0, t1) -> Place:
+def derived_key(key: PRNGKeyArray, old):
+    """A key derived from `key` to take the place of `old`, of the same kind and shape.
+    Equal old keys get the same new one."""
+    typed, own = typed_key(old), key
+    words = jr.key_data(typed)
+    for word in words.reshape(-1):
+        own = jr.fold_in(own, word)
+    data = jr.bits(own, words.shape, jnp.uint32)
+    return jr.wrap_key_data(data, impl=jr.key_impl(old)) if old is typed else data
+
+
+def place_of(t0: Array, t1: Array) -> Place:
     """The position of a step as two integers, which do not change if times are rounded.
 
     The first counts the middle of the step in units of a power of two that is between a
@@ -105,7 +134,8 @@ def place_of(t0, t1) -> Place:
     per_unit, exponent = _inverse_power_of_two(jnp.abs(t1 - t0) * 1.37)
     # Late in a long float32 solve, two steps may round to the same middle. So the integer
     # part of the start, which is exact, is split off before adding half a step.
-    start, half = t0 * per_unit, (t1 - t0) / 2 * per_unit
+    start = t0 * per_unit
+    half = (t1 - t0) / 2 * per_unit
     whole = jnp.floor(start)
     rest = jnp.floor(start - whole + half + 0.29)
     # Wrap around after 2^31 counts, or fewer in half precision.
@@ -120,10 +150,13 @@ def _inverse_power_of_two(x: Array) -> tuple[Array, Integer[Array, ""]]:
     random word."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(x, f"int{info.bits}")
+    # The number is positive, so above its mantissa is only the exponent.
     biased = bits >> info.nmant
     bias = 2 ** (info.nexp - 1) - 1
+    # An exponent with an empty mantissa is a power of two.
     inverse = lax.bitcast_convert_type((2 * bias - biased) << info.nmant, x.dtype) * 2
     exponent = biased.astype(jnp.int32) - (bias + 1)
+    # For an empty step, in which a path has no noise, any unit will do.
     return jnp.where(biased > 0, inverse, 1), exponent
 
 
@@ -155,6 +188,8 @@ class Discrete(AbstractLaw):
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
         values = [np.asarray(value, dtype) for value in self.values]
         sample = jnp.full(words.shape, values[-1])
+        # From the last cut to the first, each of which decides for the words below it. A
+        # table of values would need a gather, which is slow on CPUs.
         for cut, value in reversed([*zip(self.cuts, values)]):
             sample = jnp.where(words < np.uint32(cut), value, sample)
         return sample
@@ -172,6 +207,7 @@ class Gaussian(AbstractLaw):
 
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
         sample = normal_from_words(words, dtype)
+        # A product with one would stay in the program.
         if self.variance == 1:
             return sample
         return sample * np.asarray(np.sqrt(self.variance), dtype)
@@ -195,34 +231,48 @@ _DENOMINATOR = (
 def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
     """The inverse of the normal distribution function, at the middle of each word's
     interval of length `2^-32`."""
-    constant = lambda x: np.asarray(x, dtype)
-    half, unit = constant(0.5), constant(2.0**-31)
+    half = np.asarray(0.5, dtype)
+    unit = np.asarray(2.0**-31, dtype)
     # Processors convert signed integers to floats faster.
     signed = lax.bitcast_convert_type(words ^ np.uint32(2**31), np.int32)
     # 2 q with its sign, and 2 p: each is accurate where the other is not.
     two_q = (signed.astype(dtype) + half) * unit
     tail = lax.bitcast_convert_type(jnp.minimum(words, ~words), np.int32)
     two_p = (tail.astype(dtype) + half) * unit
-    w = -jnp.log(two_p * (2 - two_p))
-    polynomial = lambda c: ft.reduce(lambda s, a: s * w + constant(a), reversed(c))
-    return two_q * half * polynomial(_NUMERATOR) / polynomial(_DENOMINATOR)
+    argument = -jnp.log(two_p * (2 - two_p))
+    product = two_q * half * _polynomial(_NUMERATOR, argument)
+    return product / _polynomial(_DENOMINATOR, argument)
 
 
+def _polynomial(coefficients: tuple[float, ...], x: Array) -> Array:
+    """A polynomial at `x`, by Horner's rule; the lowest degree comes first."""
+    highest, *others = reversed(coefficients)
+    value = highest
+    for coefficient in others:
+        value = value * x + np.asarray(coefficient, x.dtype)
+    return cast(Array, value)
+
+
+_ROOT3 = math.sqrt(3)
 _SIXTH = 2**32 // 6
-_SMALL, _LARGE = (float(np.sqrt(3 + s * np.sqrt(6))) for s in (-1, 1))
-_LESS, _MORE = (float((3 + s * np.sqrt(6)) / 12) for s in (-1, 1))
-_RARE = round(2**32 * _LESS)
+# The four-point law is the Gauss-Hermite rule with four nodes.
+_SMALL = float(np.sqrt(3 - np.sqrt(6)))
+_LARGE = float(np.sqrt(3 + np.sqrt(6)))
+_LIKELY = float((3 + np.sqrt(6)) / 12)
+_UNLIKELY = float((3 - np.sqrt(6)) / 12)
+_RARE = round(2**32 * _UNLIKELY)
 
-# Matches moments 1 to 5 of the normal distribution.
+# Matches moments 1 to 5 of the normal distribution. Odd moments vanish exactly, since as
+# many words give one sign as the other.
 THREE_POINT = Discrete(
-    values=(-float(np.sqrt(3.0)), 0.0, float(np.sqrt(3.0))),
+    values=(-_ROOT3, 0.0, _ROOT3),
     probabilities=(1 / 6, 2 / 3, 1 / 6),
     cuts=(_SIXTH, 2**32 - _SIXTH),
 )
 # Matches moments 1 to 7. Words below 2^31 give negative values.
 FOUR_POINT = Discrete(
     values=(-_LARGE, -_SMALL, _LARGE, _SMALL),
-    probabilities=(_LESS, _MORE, _LESS, _MORE),
+    probabilities=(_UNLIKELY, _LIKELY, _UNLIKELY, _LIKELY),
     cuts=(_RARE, 2**31, 2**31 + _RARE),
 )
 

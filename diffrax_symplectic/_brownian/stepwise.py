@@ -20,6 +20,7 @@ from .random import AbstractLaw, Gaussian, is_key, Place, place_of, random_words
 
 
 if TYPE_CHECKING:
+    # In one module for all, Pyright would take the variables for arguments of `__init__`.
     from typing import ClassVar as AbstractVar
 else:
     from equinox import AbstractVar
@@ -43,9 +44,13 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
     ) -> Increment:
         """The increment over the step from `t0` to `t1` (from `0` to `t0` without `t1`), or
         with `use_levy=True` an object of type `levy_area`."""
+        # A step is drawn as a whole, so there are no limits from either side.
         del left
-        start, end = (jnp.zeros_like(t0), t0) if t1 is None else (t0, t1)
-        ends = jnp.asarray(start), jnp.asarray(end)
+        if t1 is None:
+            ends = (jnp.asarray(jnp.zeros_like(t0)), jnp.asarray(t0))
+        else:
+            ends = (jnp.asarray(t0), jnp.asarray(t1))
+        # Words are an integer function of the times: a derivative would silently be zero.
         start, end = cast(tuple[Array, Array], nondifferentiable(ends, name="t"))
         return _drawn(self, start, end, use_levy)
 
@@ -99,21 +104,24 @@ class AbstractPathWithLaws(AbstractStepwisePath):
 
     def words(self, place: Place, use_levy: bool) -> UInt32[Array, " num_words"]:
         """The path's random words for a place on the time axis."""
-        sets, n = len(self.laws) if use_levy else 1, num_noises(self.shape)
-        return random_words(self.key, place, sets, n).reshape(-1)
+        sets = len(self.laws) if use_levy else 1
+        # In sets, so that the words of the first law do not depend on `use_levy`.
+        return random_words(self.key, place, sets, num_noises(self.shape)).reshape(-1)
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         words = self.words(place_of(t0, t1), use_levy)
         return self.increment(words, t0, t1, use_levy)
 
     def increment(self, words, t0, t1, use_levy: bool = False) -> Increment:
-        h, n = t1 - t0, num_noises(self.shape)
+        h = t1 - t0
+        n = num_noises(self.shape)
         if not use_levy:
             return draw_set(self.laws["W"], words[:n], h, self.shape)
-        drawn = {
-            name: draw_set(law, words[i * n : (i + 1) * n], h, self.shape)
-            for i, (name, law) in enumerate(self.laws.items())
-        }
+        drawn = {}
+        for i, (name, law) in enumerate(self.laws.items()):
+            own_words = words[i * n : (i + 1) * n]
+            drawn[name] = draw_set(law, own_words, h, self.shape)
+        # `levy_area` is any class of increments to a type checker.
         return cast(Any, self.levy_area)(dt=step_size(h, self.shape), **drawn)
 
 
@@ -148,6 +156,7 @@ class AbstractWrappedPath(AbstractStepwisePath):
         return stepwise(self.path).num_words(use_levy) + self.num_own_words(use_levy)
 
     def increment(self, words, t0, t1, use_levy: bool = False) -> Increment:
+        # The words of the wrapped path come first, as if it were alone.
         path = stepwise(self.path)
         increment = path.increment(words, t0, t1, use_levy)
         own_words = words[path.num_words(use_levy) :]
@@ -162,7 +171,7 @@ class GivenPath(diffrax.AbstractBrownianPath):
     t0: ClassVar[float] = -math.inf
     t1: ClassVar[float] = math.inf
 
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+    def evaluate(self, t0, t1=None, left=True, use_levy=False) -> Increment:
         del left
         return self.make(t0, t1, use_levy)
 
@@ -211,6 +220,7 @@ def laws_of(path: diffrax.AbstractBrownianPath) -> Mapping[str, AbstractLaw] | N
     """The laws of the random variables of a step, or `None` if they are unknown."""
     if isinstance(path, AbstractStepwisePath):
         return path.laws
+    # Those of Diffrax have no attribute for it. Other paths may have any law.
     if isinstance(path, diffrax.UnsafeBrownianPath | diffrax.VirtualBrownianTree):
         return GAUSSIAN_LAWS.get(path.levy_area)
     return None
@@ -219,7 +229,8 @@ def laws_of(path: diffrax.AbstractBrownianPath) -> Mapping[str, AbstractLaw] | N
 def is_random(path: diffrax.AbstractBrownianPath) -> bool:
     """Whether a path draws its noise from a random key, instead of holding given noise such
     as a record."""
-    return isinstance(path, UnspecifiedPath) or any(map(is_key, jtu.tree_leaves(path)))
+    holds_a_key = any(is_key(leaf) for leaf in jtu.tree_leaves(path))
+    return holds_a_key or isinstance(path, UnspecifiedPath)
 
 
 def increment_struct(
@@ -240,12 +251,14 @@ def num_noises(shape: PyTree[jax.ShapeDtypeStruct]) -> int:
 def raveled(like: PyTree) -> tuple[Array, Callable]:
     """Zeros in the structure, shapes and dtypes of `like` as one vector, and what restores
     the structure of such a vector."""
-    return jfu.ravel_pytree(jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like))
+    zeros = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
+    return jfu.ravel_pytree(zeros)
 
 
 def step_size(h: RealScalarLike, shape: PyTree[jax.ShapeDtypeStruct]) -> PyTree[Array]:
     """The field `dt` of an increment of this shape."""
-    return jtu.tree_map(lambda s: jnp.asarray(h, s.dtype), shape)
+    # Diffrax's increments have one for each leaf, each in the dtype of its leaf.
+    return jtu.tree_map(lambda leaf: jnp.asarray(h, leaf.dtype), shape)
 
 
 def draw_set(
@@ -258,11 +271,13 @@ def draw_set(
     and dtypes of `like`."""
     leaves, treedef = jtu.tree_flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
+    # Diffrax steps backward in time with negated times, and negates the increments.
     root = jnp.sqrt(jnp.abs(h))
-    out = [
-        law.from_words(piece.reshape(leaf.shape), leaf.dtype) * root.astype(leaf.dtype)
-        for piece, leaf in zip(jnp.split(words, ends[:-1]), leaves)
-    ]
+    out = []
+    for piece, leaf in zip(jnp.split(words, ends[:-1]), leaves):
+        sample = law.from_words(piece.reshape(leaf.shape), leaf.dtype)
+        # In the leaf's own precision, which that of the times may exceed.
+        out.append(sample * root.astype(leaf.dtype))
     return jtu.tree_unflatten(treedef, out)
 
 
@@ -271,7 +286,8 @@ def checked_shape(
 ) -> PyTree[jax.ShapeDtypeStruct]:
     """The shape of the increments of a path; a tuple of integers means a single array.
     Raises a `ValueError` for anything else, and for dtypes that are not real."""
-    if isinstance(shape, tuple) and all(isinstance(n, int) for n in shape):
+    if isinstance(shape, tuple) and all(isinstance(size, int) for size in shape):
+        # The default dtype now, not when a step is drawn: the two may differ.
         shape = jax.ShapeDtypeStruct(shape, jnp.result_type(float))
     for leaf in jtu.tree_leaves(shape):
         if not isinstance(leaf, jax.ShapeDtypeStruct) or min(leaf.shape, default=0) < 0:

@@ -16,20 +16,22 @@ from .wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPa
 # Makes a Brownian path of a shape from a key.
 _MakePath: TypeAlias = Callable[[Any, PRNGKeyArray], diffrax.AbstractBrownianPath]
 
-_AREA = ft.partial(FixedStepBrownianPath, levy_area=diffrax.SpaceTimeLevyArea)
+_with_space_time_area = ft.partial(
+    FixedStepBrownianPath, levy_area=diffrax.SpaceTimeLevyArea
+)
 
 
-def _truncated(shape, key) -> TruncatedBrownianPath:
+def _truncated(shape: Any, key: PRNGKeyArray) -> TruncatedBrownianPath:
     return TruncatedBrownianPath(FixedStepBrownianPath(shape, key))
 
 
 # Wrappers draw other random words from the same key.
-def _with_levy_areas(shape, key) -> LevyAreaBrownianPath:
-    return LevyAreaBrownianPath(_AREA(shape, key), key)
+def _with_levy_areas(shape: Any, key: PRNGKeyArray) -> LevyAreaBrownianPath:
+    return LevyAreaBrownianPath(_with_space_time_area(shape, key), key)
 
 
-def _with_plateaus(shape, key) -> PlateauBrownianPath:
-    return PlateauBrownianPath(_AREA(shape, key), key)
+def _with_plateaus(shape: Any, key: PRNGKeyArray) -> PlateauBrownianPath:
+    return PlateauBrownianPath(_with_space_time_area(shape, key), key)
 
 
 class RandomVariable(NamedTuple):
@@ -38,6 +40,8 @@ class RandomVariable(NamedTuple):
     - `increment`: the type of increments that contain it.
     - `name`: its name in messages.
     - `path`: makes a path that has it.
+    - `rank`: a path with a variable of higher rank also has those of lower rank that a
+        solver may need with it. So the highest rank decides which path a solver needs.
     - `variance`: in units of the step size, the same for all laws; `None` if it has no law
         of its own.
     - `even`: whether it is unchanged when time runs backward, although Diffrax negates all
@@ -51,6 +55,7 @@ class RandomVariable(NamedTuple):
     increment: type[diffrax.AbstractBrownianIncrement]
     name: str
     path: _MakePath
+    rank: int
     variance: float | None = 1.0
     even: bool = False
     drives: Literal["noise", "noise brackets", "drift brackets"] = "noise"
@@ -62,42 +67,68 @@ class RandomVariable(NamedTuple):
         return f"{self.name}. Make its path by `solver.path(shape, key)`"
 
 
+# Two variables of one increment each, which differ in their laws and uses.
 _area = ft.partial(
-    RandomVariable, diffrax.AbstractSpaceTimeLevyArea, "space-time Lévy area", _AREA
+    RandomVariable,
+    increment=diffrax.AbstractSpaceTimeLevyArea,
+    name="space-time Lévy area",
+    path=_with_space_time_area,
+    rank=4,
 )
-_plateau = ft.partial(RandomVariable, PlateauIncrement, "plateaus", _with_plateaus)
+_plateau = ft.partial(
+    RandomVariable,
+    increment=PlateauIncrement,
+    name="plateaus",
+    path=_with_plateaus,
+    rank=5,
+)
 
-# By the attribute of the increment. Variables whose increments contain the most come first:
-# messages name missing variables in this order.
+# By the attribute of the increment.
 VARIABLES = {
     "A": RandomVariable(
-        LevyAreaIncrement, "Lévy areas", _with_levy_areas, None, drives="noise brackets"
+        increment=LevyAreaIncrement,
+        name="Lévy areas",
+        path=_with_levy_areas,
+        rank=6,
+        # Their law is known only given the increments.
+        variance=None,
+        drives="noise brackets",
     ),
-    "C": _plateau(1 / 6),
+    "C": _plateau(variance=1 / 6),
     # The sign of `C`. Only the sign is drawn: the size is a function of `W` and `H`.
-    "sign": _plateau(1.0),
-    "L": _area(None, even=True, drives="drift brackets", held=(("W", "H"), ("K",))),
+    "sign": _plateau(variance=1.0),
+    "L": _area(
+        # A quadratic form in other variables.
+        variance=None,
+        even=True,
+        drives="drift brackets",
+        held=(("W", "H"), ("K",)),
+    ),
     # The time-reversed bridge has the same integral.
-    "H": _area(1 / 12, even=True),
+    "H": _area(variance=1 / 12, even=True),
     "third": RandomVariable(
-        WeakIncrement,
-        "four-point variables and two more sets",
-        ft.partial(WeakBrownianPath, order=3),
+        increment=WeakIncrement,
+        name="four-point variables and two more sets",
+        path=ft.partial(WeakBrownianPath, order=3),
+        rank=3,
     ),
     "second": RandomVariable(
-        WeakIncrement,
-        "a second set of three-point variables",
-        ft.partial(WeakBrownianPath, second=True),
+        increment=WeakIncrement,
+        name="a second set of three-point variables",
+        path=ft.partial(WeakBrownianPath, second=True),
+        rank=2,
     ),
     "two_point": RandomVariable(
-        WeakIncrement,
-        "two-point variables",
-        ft.partial(WeakBrownianPath, two_point=True),
+        increment=WeakIncrement,
+        name="two-point variables",
+        path=ft.partial(WeakBrownianPath, two_point=True),
+        rank=1,
     ),
     "W": RandomVariable(
-        diffrax.AbstractBrownianIncrement,
-        "the increment of a Brownian path",
-        WeakBrownianPath,
+        increment=diffrax.AbstractBrownianIncrement,
+        name="the increment of a Brownian path",
+        path=WeakBrownianPath,
+        rank=0,
     ),
 }
 
@@ -108,10 +139,19 @@ def drives(name: str) -> str:
     return VARIABLES[name].drives if name in VARIABLES else "noise"
 
 
+def most_demanding(names: Collection[str]) -> RandomVariable | None:
+    """The random variable of the highest rank among these, or `None` if all are unknown."""
+    # A solver of the user's own may have variables that are not known here.
+    known = [VARIABLES[name] for name in names if name in VARIABLES]
+    return max(known, key=lambda variable: variable.rank, default=None)
+
+
 def path_of(variables: Collection[str], *, gaussian: bool, bounded: bool) -> _MakePath:
     """Makes a path with these random variables. If only increments are needed, they may be
     `gaussian`, and then also `bounded`, for implicit methods."""
-    for name, variable in VARIABLES.items():
-        if name in variables and (name != "W" or not gaussian):
-            return variable.path
+    # The path of the increments alone is the discrete one.
+    decisive = set(variables) - {"W"} if gaussian else variables
+    variable = most_demanding(decisive)
+    if variable is not None:
+        return variable.path
     return _truncated if bounded else FixedStepBrownianPath

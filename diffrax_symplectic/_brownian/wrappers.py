@@ -30,6 +30,7 @@ from .stepwise import (
 
 def require_space_time_area(path: diffrax.AbstractBrownianPath, wrapper: str) -> None:
     """Raises a `ValueError` unless the increments of `path` have space-time Lévy area."""
+    # Anything that is no path fails the same test.
     area = getattr(path, "levy_area", type(None))
     if not issubclass(area, diffrax.AbstractSpaceTimeLevyArea):
         raise ValueError(
@@ -59,6 +60,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
     path: diffrax.AbstractBrownianPath
     k: int = eqx.field(static=True)
+    # A truncated law depends on the size of the step.
     laws: ClassVar[None] = None  # pyright: ignore
 
     def __init__(self, path: diffrax.AbstractBrownianPath, *, k: int = 2):
@@ -109,7 +111,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         log_h = jnp.log(jnp.where(h > 0, h, 1))
         bound = jnp.sqrt(2 * self.k * h * jnp.abs(log_h))
 
-        def clip(w):
+        def clip(w: Array) -> Array:
             return jnp.clip(w, -bound.astype(w.dtype), bound.astype(w.dtype))
 
         if isinstance(increment, diffrax.AbstractBrownianIncrement):
@@ -144,7 +146,8 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
         return jtu.tree_map(_offset, self.dt, self.W, self.H, self.sign)
 
 
-def _offset(h, W, H, sign):
+def _offset(h: Array, W: Array, H: Array, sign: Array) -> Array:
+    """The variables `C` of one array of noises."""
     # In a solve backward in time Diffrax negates everything, including the step size.
     h = jnp.abs(h).astype(W.dtype)
     size = jnp.sqrt(h / 15 + W**2 / 12 + H**2 / 5)
@@ -178,7 +181,8 @@ class PlateauBrownianPath(AbstractWrappedPath):
         laws = laws_of(self.path)
         if laws is None:
             return None
-        # These increments do not include space-time-time areas.
+        # These increments do not include space-time-time areas. The order is that of the
+        # random words, of which the wrapped path's come first.
         return {"W": laws["W"], "H": laws["H"], "sign": TWO_POINT}
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:

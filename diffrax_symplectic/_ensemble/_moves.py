@@ -377,3 +377,31 @@ def _changes_nothing(o, starts) -> bool:
         "and": True,
     }
     return len(starts) == 1 and value is not None and neutral.get(name) == value
+
+
+@rule
+def _reduce_window(o, *xs):
+    """Cumulative sums, and other reductions of windows."""
+    n = len(xs) // 2
+    if any(size > 1 for size in o.optional("base_dilations")):
+        raise NotReplayed(o.op, f"`{o.op.name}` of entries that are apart")
+    shape = xs[0].shape
+    rank = len(shape)
+    ones = [1] * rank
+    sizes = o.ints("window_dimensions")
+    strides = o.optional("window_strides") or ones
+    apart = o.optional("window_dilations") or ones
+    padding = o.op.attributes["padding"] if "padding" in o.op.attributes else [0] * rank
+    low = np.asarray(padding).reshape(rank, -1)[:, 0]
+    outs = [[] for _ in range(n)]
+    for place in np.ndindex(*o.shape):
+        total = [*xs[n:]]
+        for offset in np.ndindex(*sizes):
+            at = np.array(place) * strides + np.array(offset) * apart - low
+            if np.all((at >= 0) & (at < shape)):
+                i = xs[0].places[tuple(at)]
+                part = [Tensor([x.entries[i]], ()) for x in xs[:n]]
+                total = o.run(0, [*total, *part])
+        for out, t in zip(outs, total):
+            out.append(t.item())
+    return [Tensor(out, o.shape) for out in outs]

@@ -134,7 +134,7 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         del fn, f_struct, aux_struct, tags
         zeros = jtu.tree_map(jnp.zeros_like, y)
-        return options["sweep"](args, sweep, zeros, all_finite(y))
+        return options["solve_blocks"](args, sweep, zeros, all_finite(y))
 
     def step(self, fn, y, args, options, state, tags):
         del fn, args, options, tags

@@ -113,6 +113,15 @@ def copied(xs: Sequence[Tensor]) -> tuple:
     return tuple(type(entry)(entry) for entry in flat(xs))
 
 
+def made_here(entry: Any) -> Any:
+    """An entry that a conditional or loop returned, for use after it. If both branches
+    return the same constant, Dr.Jit returns the constant of the second branch, which is
+    defined within it only: LLVM aborts the process if an outer branch returns that."""
+    if entry.state != drjit().VarState.Literal:
+        return entry
+    return type(entry)(entry[0])
+
+
 def unflat(entries: Iterable[Any], shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
     left = iter(entries)
     return [Tensor([next(left) for _ in range(math.prod(s))], s) for s in shapes]

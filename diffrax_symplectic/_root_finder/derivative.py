@@ -1,5 +1,6 @@
 """Derivatives of a solution, by implicit differentiation."""
 
+import functools as ft
 from collections.abc import Callable
 
 import jax.flatten_util as jfu
@@ -9,18 +10,19 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from .._batch import where_pending
-from .linear import MAX_WRITTEN_OUT, solve, Solver
-from .sweeps import sweep
+from .linear import LinearSolver, MAX_WRITTEN_OUT, solve
+from .sweeps import solve_by_sweeps
 from .tolerance import Tolerance
 
 
 # Derivatives are solved to rounding error, as steps are by default.
-_TOLERANCE = Tolerance(None, 0.0, optx.max_norm)
+_TOLERANCE = Tolerance(rtol=None, atol=0.0, norm=optx.max_norm)
+# As many as `PicardNewton` takes by default, for systems with the same rate of convergence.
 _MOST_SWEEPS = 200
 
 
 def differentiate(
-    solver: Solver, linear: Callable[[PyTree], PyTree], rhs: PyTree[Array]
+    solver: LinearSolver, linear: Callable[[PyTree], PyTree], rhs: PyTree[Array]
 ) -> PyTree[Array]:
     r"""The tangent $x = L x + b$ of the solution of $k = \Phi(k)$, where $L$ is the
     derivative of $\Phi$ along $k$ and $b$ the derivative along everything else; and by
@@ -34,15 +36,44 @@ def differentiate(
     # depend on the differentiated inputs.
     flat, unravel = jfu.ravel_pytree(rhs)
 
-    def by(operator: Callable[[Array], Array], b: Float[Array, " n"]) -> Array:
-        if b.size <= MAX_WRITTEN_OUT or solver is not None:
-            return solve(operator, b, solver)[0]
-        image = lambda x: x + (b - operator(x))
-        zero, yes = jnp.zeros_like(b), jnp.array(True)
-        found, solved = sweep(_TOLERANCE, _MOST_SWEEPS, image, lambda x: x, zero, yes)
-        reduction = float(jnp.finfo(b.dtype).eps) ** 0.9
-        exactly = lambda _: solve(operator, b, None, reduction)[0]
-        return where_pending(exactly, ~solved, found)
+    def operator(x: Float[Array, " n"]) -> Float[Array, " n"]:
+        image, _ = jfu.ravel_pytree(linear(unravel(x)))
+        return x - image
 
-    operator = lambda x: x - jfu.ravel_pytree(linear(unravel(x)))[0]
-    return unravel(lax.custom_linear_solve(operator, flat, by, by))
+    # The same function solves the transposed system, which has the same eigenvalues, so
+    # that sweeps converge as fast.
+    either = ft.partial(_solve, solver)
+    return unravel(lax.custom_linear_solve(operator, flat, either, either))
+
+
+def _solve(
+    solver: LinearSolver,
+    operator: Callable[[Array], Array],
+    rhs: Float[Array, " n"],
+) -> Float[Array, " n"]:
+    """The solution of `operator(x) = rhs`, of a system that a step could solve."""
+    if rhs.size <= MAX_WRITTEN_OUT or solver is not None:
+        return solve(operator, rhs, solver).value
+
+    def image(x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return x + (rhs - operator(x))
+
+    def itself(x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return x
+
+    found, solved = solve_by_sweeps(
+        _TOLERANCE,
+        _MOST_SWEEPS,
+        image,
+        itself,
+        guess=jnp.zeros_like(rhs),
+        pending=jnp.array(True),
+    )
+    # No Newton correction makes up for the error of GMRES here, so it must be small, but it
+    # cannot be as small as the rounding errors of one product.
+    reduction = float(jnp.finfo(rhs.dtype).eps) ** 0.9
+
+    def exactly(_: Float[Array, " n"]) -> Float[Array, " n"]:
+        return solve(operator, rhs, None, reduction).value
+
+    return where_pending(exactly, ~solved, found)

@@ -1,7 +1,7 @@
 """Linear systems with the Jacobian of the stage equations."""
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +11,13 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, Float, Scalar
 
+from .._compat import computed_by
 from .._custom_types import IntScalarLike
 
 
 _Vector: TypeAlias = Float[Array, " n"]
 _Map: TypeAlias = Callable[[_Vector], _Vector]
-Solver: TypeAlias = lx.AbstractLinearSolver[Any] | None
+LinearSolver: TypeAlias = lx.AbstractLinearSolver[Any] | None
 
 # Up to this many unknowns, a matrix costs no more than matrix-vector products.
 _MAX_DENSE = 32
@@ -28,76 +29,134 @@ _DIRECTIONS = 20
 REDUCTION = 1e-3
 
 
-def correction(
-    fn: _Map, x: _Vector, solver: Solver
-) -> tuple[_Vector, _Vector, Bool[Array, ""]]:
-    """The value of `fn` at `x`, the Newton correction to subtract from `x`, and whether it
-    was found."""
+class LinearSolution(NamedTuple):
+    """The solution of a linear system.
+
+    - `value`: the unknowns. If they were not found they are inexact, or not finite.
+    - `found`: whether the solver succeeded. Elimination always does, with values that are
+        not finite if the matrix is singular.
+    """
+
+    value: _Vector
+    found: Bool[Array, ""]
+
+
+class NewtonCorrection(NamedTuple):
+    """One correction of Newton's method.
+
+    - `residual`: the value of the equations before it.
+    - `change`: what to subtract from the iterate.
+    - `found`: whether its linear system was solved.
+    """
+
+    residual: _Vector
+    change: _Vector
+    found: Bool[Array, ""]
+
+
+def correction(fn: _Map, x: _Vector, solver: LinearSolver) -> NewtonCorrection:
+    """The Newton correction for `fn(x) = 0` at `x`."""
     if solver is not None or x.size > _MAX_DENSE:
         value, derivative = jax.linearize(fn, x)
-        return value, *solve(derivative, value, solver)
+        return NewtonCorrection(value, *solve(derivative, value, solver))
+
     # With `jvp` the compiled program contains `fn` only once.
-    both = lambda v: jax.jvp(fn, (x,), (v,))
-    value, matrix = jax.vmap(both, out_axes=(None, 1))(_units(x))
-    return value, _eliminate(matrix, value), jnp.array(True)
+    def value_and_column(unit: _Vector) -> tuple[_Vector, _Vector]:
+        return jax.jvp(fn, (x,), (unit,))
+
+    value, matrix = jax.vmap(value_and_column, out_axes=(None, 1))(_units(x))
+    return NewtonCorrection(value, eliminate(matrix, value), jnp.array(True))
 
 
 def solve(
-    apply: _Map, rhs: _Vector, solver: Solver, reduction: float = REDUCTION
-) -> tuple[_Vector, Bool[Array, ""]]:
-    """Solves `apply(x) = rhs` for `x`, and returns whether that succeeded. `solver` is a
-    Lineax solver; `None` is elimination, or for many unknowns GMRES with this `reduction`
-    of the residual. On failure `x` is inexact or not finite, and nothing is raised."""
+    apply: _Map, rhs: _Vector, solver: LinearSolver, reduction: float = REDUCTION
+) -> LinearSolution:
+    """Solves `apply(x) = rhs` for `x`. `solver` is a Lineax solver; `None` is elimination,
+    or for many unknowns GMRES with this `reduction` of the residual. Nothing is raised on
+    failure."""
     if solver is None and rhs.size <= _MAX_DENSE:
         matrix = jax.vmap(apply, out_axes=1)(_units(rhs))
-        return _eliminate(matrix, rhs), jnp.array(True)
+        return LinearSolution(eliminate(matrix, rhs), jnp.array(True))
     if solver is None:
         solver = lx.GMRES(reduction, reduction, restart=_DIRECTIONS)
     # Absolute tolerances assume a right-hand side of size one.
-    size = _size(rhs)
+    size = _size_or_one(rhs)
     operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: rhs))
-    x, result, _ = solver.compute(solver.init(operator, {}), rhs / size, {})
-    return x * size, result == lx.RESULTS.successful
+    x, result = computed_by(solver, operator, rhs / size)
+    return LinearSolution(x * size, result == lx.RESULTS.successful)
+
+
+def solve_matrix(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
+    """Solves `matrix @ x = rhs`, differentiably. Of a singular matrix `x` is not finite, or
+    large."""
+    # To rounding error, also by GMRES.
+    reduction = float(jnp.finfo(rhs.dtype).eps) ** 0.9
+
+    def by(matrix: Float[Array, "n n"]) -> Callable[[_Map, _Vector], _Vector]:
+        if len(matrix) <= _MAX_DENSE:
+            return lambda apply, rhs: eliminate(matrix, rhs)
+        return lambda apply, rhs: solve(apply, rhs, None, reduction)[0]
+
+    multiply = lambda x: matrix @ x
+    return lax.custom_linear_solve(multiply, rhs, by(matrix), by(matrix.T))
 
 
 def _units(x: _Vector) -> Any:
+    """The unit vectors, as rows."""
     # A NumPy constant, which XLA folds, unlike `jnp.eye`.
     return np.eye(x.size, dtype=x.dtype)
 
 
-def _size(rhs: _Vector) -> Scalar:
+def _size_or_one(rhs: _Vector) -> Scalar:
+    """The largest entry, or 1 if all are zero, as a divisor."""
     size = optx.max_norm(rhs)
     return jnp.where(size > 0, size, 1)
 
 
-def _eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
+def eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     """Solves a linear system by elimination with partial pivoting, in XLA operations:
     LAPACK needs a call for each matrix of a batch, and 0.1 s to load."""
-    n = len(rhs)
-    if n > MAX_WRITTEN_OUT:
-        rows = jnp.concatenate([matrix, rhs[:, None]], axis=1)
-        return lax.fori_loop(0, n, _clear_column, rows)[:, n]
+    num_unknowns = len(rhs)
+    if num_unknowns == 1:
+        return rhs / matrix[0]
+    if num_unknowns > MAX_WRITTEN_OUT:
+        augmented = jnp.concatenate([matrix, rhs[:, None]], axis=1)
+        cleared = lax.fori_loop(0, num_unknowns, _clear_column, augmented)
+        return cleared[:, num_unknowns]
     # The division makes XLA store the right-hand side. Otherwise it would be recomputed in
     # each unrolled entry, which takes 0.1 s more to compile for four unknowns.
-    size = _size(rhs)
-    rows = [[*row, x] for row, x in zip(matrix, rhs / size)]
-    for k in range(n):
-        for i in range(k + 1, n):
-            # Pairwise swaps bring up the row with the largest pivot.
-            swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
-            upper = [jnp.where(swap, b, a) for a, b in zip(rows[k], rows[i])]
-            lower = [jnp.where(swap, a, b) for a, b in zip(rows[k], rows[i])]
-            rows[k], rows[i] = upper, lower
+    size = _size_or_one(rhs)
+    rows = [[*row, entry] for row, entry in zip(matrix, rhs / size)]
+    for k in range(num_unknowns):
+        _bring_up_pivot(rows, k)
+        # A single division: dividing every entry would take longer than multiplying.
         scale = 1 / rows[k][k]
-        rows[k] = [scale * x for x in rows[k]]
-        for i in {*range(n)} - {k}:
-            rows[i] = [x - rows[i][k] * y for x, y in zip(rows[i], rows[k])]
-    return size * jnp.stack([row[n] for row in rows])
+        rows[k] = [scale * entry for entry in rows[k]]
+        # Rows above are cleared, too (Gauss-Jordan), in place of a substitution backward.
+        for i in {*range(num_unknowns)} - {k}:
+            factor = rows[i][k]
+            rows[i] = [entry - factor * pivot for entry, pivot in zip(rows[i], rows[k])]
+    return size * jnp.stack([row[num_unknowns] for row in rows])
+
+
+def _bring_up_pivot(rows: list[list[Scalar]], k: int) -> None:
+    """Brings up the row with the largest entry of column `k`, from row `k` or below."""
+    # Pairwise swaps are selects, which a batch can do without gathering rows.
+    for i in range(k + 1, len(rows)):
+        swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
+        pairs = list(zip(rows[k], rows[i]))
+        rows[k] = [jnp.where(swap, lower, upper) for upper, lower in pairs]
+        rows[i] = [jnp.where(swap, upper, lower) for upper, lower in pairs]
 
 
 def _clear_column(k: IntScalarLike, rows: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """One step of elimination: scales the row with the largest pivot, moves it to row `k`,
+    and clears column `k` in all other rows."""
     place = jnp.arange(len(rows))
-    i = jnp.argmax(jnp.where(place < k, -1, jnp.abs(rows[:, k])))
-    pivot = rows[i] / rows[i, k]
-    rows = rows.at[i].set(rows[k])
-    return (rows - rows[:, k, None] * pivot).at[k].set(pivot)
+    # Rows above have had their turn. A negative number is never the largest.
+    largest = jnp.argmax(jnp.where(place < k, -1, jnp.abs(rows[:, k])))
+    pivot = rows[largest] / rows[largest, k]
+    # Selections, which the fused engine replays: unlike a scatter to a row that differs
+    # between paths.
+    rows = jnp.where((place == largest)[:, None], rows[k], rows)
+    return jnp.where((place == k)[:, None], pivot, rows - rows[:, k, None] * pivot)

@@ -31,7 +31,8 @@ _SHRINK = 0.5
 # only serves as the guess for the next part.
 _LOOSE = 0.1
 # The next part is twice as long after a success, and a quarter as long after a failure.
-_LONGER, _SHORTER = 2.0, 0.25
+_LONGER = 2.0
+_SHORTER = 0.25
 # When parts get this short, the branch of solutions from the start of the step has turned
 # back. From then on Newton's method searches for any solution.
 _SHORTEST = 1e-3
@@ -81,8 +82,17 @@ class Newton(eqx.Module):
         """The last iterate from a `guess`, after at most so many iterations, and whether it
         is a solution."""
         # In place of `optx.root_find`, which takes a seventh longer to trace a step.
-        zero, no = jnp.zeros((), self.start.dtype), jnp.array(False)
-        begun = Progress(self.start, zero, zero + 1, jnp.array(0), zero, no, no)
+        zero = jnp.zeros((), self.start.dtype)
+        no = jnp.array(False)
+        begun = Progress(
+            anchor=self.start,
+            reached=zero,
+            target=zero + 1,
+            tries=jnp.array(0),
+            size=zero,
+            searching=no,
+            solved=no,
+        )
         begun, number = batched_like((begun, jnp.array(0)), guess)
 
         def pending(carry):
@@ -99,28 +109,44 @@ class Newton(eqx.Module):
         return k, R.where(state.solved, R.successful, failure)
 
     def step(self, y: _Vector, state: Progress) -> tuple[_Vector, Progress]:
-        s, whole = state.target, state.target == 1
-        part = lambda k: (1 - s) * (k - self.start) + s * self.residual(k)
-        value, diff, found = correction(part, y, self.linear_solver)
-        moved, k = max_norm(y), y - diff
+        """One iteration for the current target: the corrected iterate, or the guess for the
+        next target."""
+        s = state.target
+        whole = state.target == 1
+
+        def equations(k: _Vector) -> _Vector:
+            return (1 - s) * (k - self.start) + s * self.residual(k)
+
+        residual, change, found = correction(equations, y, self.linear_solver)
+        moved = max_norm(y)
+        k = y - change
         states = self.scale(self.restore(k))
-        measured = self.tolerance.measure(self.restore(diff), states)
-        size, tries = measured.size, state.tries + 1
+        measured = self.tolerance.measure(self.restore(change), states)
+        size = measured.size
+        tries = state.tries + 1
+        # The first correction has none to be compared with.
         shrink = jnp.where(state.tries > 0, ratio(size, state.size), 1)
-        solved = converged(log2(size), log2(shrink), measured.rounded, shrink >= 0.25)
+        level = log2(size)
+        rate = log2(shrink)
+        # Newton's method converges quadratically near a solution. Corrections that shrink
+        # by less than four there have reached rounding errors.
+        at_rounding = shrink >= 0.25
+        solved = converged(level, rate, measured.rounded, at_rounding)
         # Far from any solution, rounding errors of a large Jacobian can hide the unknowns
         # with small coefficients. Corrections are then small, but residuals exceed the
         # state.
         whole_state = largest([max_norm(x) for x in jtu.tree_leaves(states)])
         state_size = jnp.maximum(whole_state, moved) + self.tolerance.atol
-        solved &= whole & found & (max_norm(value) <= state_size) & all_finite(k)
+        solved &= whole & found & (max_norm(residual) <= state_size) & all_finite(k)
 
         at_once = whole & (state.reached == 0) & ~state.searching
+        # The last part and the search begin near a solution, or fail soon: two corrections
+        # are the fewest that can be compared.
         patience = jnp.where(at_once, _PATIENCE, 2)
         # A zero correction away from a solution is no progress either.
         stalled = (tries >= patience) & ~((shrink < _SHRINK) & (size > 0))
         slow = ~whole & (tries >= _PATIENCE_IN_PART)
-        arrived = (max_norm(diff) < _LOOSE * moved) & ~whole
+        arrived = (max_norm(change) < _LOOSE * moved) & ~whole
         failed = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~solved
         state = state._replace(tries=tries, size=size, solved=solved)
         return _next_target(state, k, arrived, failed & ~state.searching)
@@ -130,15 +156,17 @@ def _next_target(
     progress: Progress, k: _Vector, arrived: Bool[Array, ""], failed: Bool[Array, ""]
 ) -> tuple[_Vector, Progress]:
     """Advances if the target was reached, and goes back if Newton's method `failed`."""
-    s, stride = progress.target, progress.target - progress.reached
+    target = progress.target
+    stride = progress.target - progress.reached
     turned = failed & (_SHORTER * stride < _SHORTEST)
-    longer = jnp.minimum(s + _LONGER * stride, 1)
+    longer = jnp.minimum(target + _LONGER * stride, 1)
+    # A search for any solution is one for the full equations.
     shorter = jnp.where(turned, 1, progress.reached + _SHORTER * stride)
     k = jnp.where(failed, progress.anchor, k)
     return k, progress._replace(
         anchor=jnp.where(arrived, k, progress.anchor),
-        reached=jnp.where(arrived, s, progress.reached),
-        target=jnp.where(arrived, longer, jnp.where(failed, shorter, s)),
+        reached=jnp.where(arrived, target, progress.reached),
+        target=jnp.where(arrived, longer, jnp.where(failed, shorter, target)),
         tries=jnp.where(arrived | failed, 0, progress.tries),
         searching=progress.searching | turned,
     )

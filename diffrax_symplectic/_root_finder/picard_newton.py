@@ -14,16 +14,20 @@ from .._arguments import whole_number
 from .._batch import batched_like, where_pending
 from .._compat import ω
 from .newton import Newton
-from .sweeps import sweep
+from .sweeps import solve_by_sweeps
 from .tolerance import all_finite, Tolerance
 
 
 _SUCCESSFUL = optx.RESULTS.successful
 
 
-class _State(NamedTuple):
-    """Whether the equations are solved, the reason if they cannot be, and the structure of
-    the auxiliary output."""
+class _FinderState(NamedTuple):
+    """The state of the root finder, between its only step and the end.
+
+    - `solved`: whether the equations are solved.
+    - `result`: the reason if they cannot be.
+    - `aux`: the structure of the auxiliary output.
+    """
 
     solved: Bool[Array, ""]
     result: optx.RESULTS
@@ -31,11 +35,14 @@ class _State(NamedTuple):
 
 
 def _number_of_steps(name: str, default: int) -> Any:
+    """A field for a number of iterations. It bounds loops, so it is known while tracing."""
     converter = ft.partial(whole_number, name, least=0)
     return eqx.field(default=default, converter=converter, static=True)
 
 
-class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _State]):
+class PicardNewton(
+    optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _FinderState]
+):
     r"""Solves stage equations $k = \Phi(k)$, given as $k - \Phi(k) = 0$, to rounding error:
     cheaply for small steps, and robustly for large ones.
 
@@ -73,9 +80,12 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
 
     In `optimistix.root_find`, `options` may hold two functions. `scale(k)`, in the
     structure of the unknowns `k`, is the size of the state that they change, and replaces
-    `k` in `rtol`. `sweep(args, solve, k, pending)` solves the equations block by block,
-    each with the values of earlier blocks, by `solve(image, scale, k, pending)`; both
-    return the unknowns and whether they are solved.
+    `k` in `rtol`. `solve_blocks(args, solve, k, pending)` solves the equations block by
+    block, each with the values of earlier blocks, by `solve(image, scale, k, pending)`;
+    both return the unknowns and whether they are solved.
+
+    In `optimistix.root_find`, all of this is one step: `max_steps` has no effect unless it
+    is zero.
 
     **Raises:** a `ValueError` for negative numbers.
     """
@@ -89,41 +99,61 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
 
     def __check_init__(self):
         for name in ("rtol", "atol"):
-            if isinstance(n := getattr(self, name), int | float) and not n >= 0:
-                raise ValueError(f"`{name}` of `PicardNewton` must be >= 0; got {n}.")
+            number = getattr(self, name)
+            # A traced tolerance cannot be checked, but has a meaning. NaN fails, too.
+            if isinstance(number, int | float) and not number >= 0:
+                raise ValueError(
+                    f"`{name}` of `PicardNewton` must be >= 0; got {number}."
+                )
 
     @property
     def _tolerance(self) -> Tolerance:
         return Tolerance(self.rtol, self.atol, self.norm)
 
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _FinderState:
         del fn, args, options, f_struct, tags
-        return _State(*batched_like((jnp.array(False), _SUCCESSFUL), y), aux_struct)
+        solved, result = batched_like((jnp.array(False), _SUCCESSFUL), y)
+        return _FinderState(solved, result, aux_struct)
 
     def step(self, fn, y, args, options, state, tags):
         del tags
-        scale = options.get("scale", lambda k: k)
+        scale = options.get("scale", _itself)
+        # A guess that is not finite stands for a path that failed before. It is left alone,
+        # so that the others of its batch need not wait for it.
         pending = all_finite(y)
-        solve = ft.partial(sweep, self._tolerance, self.picard_steps)
-        if "sweep" in options:
-            found, solved = options["sweep"](args, solve, y, pending)
+        solve = ft.partial(solve_by_sweeps, self._tolerance, self.picard_steps)
+        if "solve_blocks" in options:
+            found, solved = options["solve_blocks"](args, solve, y, pending)
         else:
-            image = lambda y: (y**ω - fn(y, args)[0] ** ω).ω
-            found, solved = solve(image, scale, y, pending)
+            found, solved = solve(_image(fn, args), scale, y, pending)
         # As one vector: a loop needs separate kernels to select, gather and scatter each
         # array of its state.
         k, restore = jfu.ravel_pytree(found)
-        residual = lambda k: jfu.ravel_pytree(fn(restore(k), args)[0])[0]
+
+        def residual(k: Array) -> Array:
+            return jfu.ravel_pytree(fn(restore(k), args)[0])[0]
+
+        # Continuation starts from the guess of the step, not from where the sweeps ended.
         start, _ = jfu.ravel_pytree(y)
         newton = Newton(
-            residual, start, restore, scale, self._tolerance, self.linear_solver
+            residual=residual,
+            start=start,
+            restore=restore,
+            scale=scale,
+            tolerance=self._tolerance,
+            linear_solver=self.linear_solver,
         )
-        rescue = lambda value: newton.solve(value[0], self.newton_steps)
+
+        def rescue(value: tuple[Array, optx.RESULTS]) -> tuple[Array, optx.RESULTS]:
+            k, _ = value
+            return newton.solve(k, self.newton_steps)
+
         k, result = where_pending(rescue, pending & ~solved, (k, _SUCCESSFUL))
-        y_new, solved = restore(k), result == _SUCCESSFUL
+        y_new = restore(k)
+        solved = result == _SUCCESSFUL
         # Evaluate the equations once more only if there is auxiliary output.
         aux = fn(y_new, args)[1] if jtu.tree_leaves(state.aux) else state.aux
-        return y_new, _State(solved, result, state.aux), aux
+        return y_new, _FinderState(solved, result, state.aux), aux
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
@@ -132,3 +162,17 @@ class PicardNewton(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, _S
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del fn, args, options, state, tags, result
         return y, aux, {}
+
+
+def _itself(k: PyTree[Array]) -> PyTree[Array]:
+    return k
+
+
+def _image(fn: Callable, args: Any) -> Callable[[PyTree[Array]], PyTree[Array]]:
+    r"""The map $\Phi$ of equations that are given as $k - \Phi(k) = 0$."""
+
+    def image(k: PyTree[Array]) -> PyTree[Array]:
+        # Optimistix asks for a residual, and sweeps for the image.
+        return (k**ω - fn(k, args)[0] ** ω).ω
+
+    return image

@@ -12,17 +12,22 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from .._batch import batched_like, materialize, most_of_batch
 from .._compat import ω
 from .._custom_types import IntScalarLike
-from .tolerance import converged, Correction, log2, MARGIN, Tolerance
+from .tolerance import converged, CorrectionSize, log2, MARGIN, Tolerance
 
 
 Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]
 
-# Sweeps before the first convergence check, in double and single precision, as needed for a
-# short step. For a doubled system (y = \Phi(y) as p = \Phi(q), q = \Phi(p)) a sweep
+# Sweeps before the first convergence check, as needed for a short step: with an error that
+# shrinks by a factor of about 60 in each, to the 16 digits of double precision, or to the 8
+# of single precision.
+_FIRST_IN_DOUBLE = 9
+_FIRST_IN_SINGLE = 6
+# The same for a doubled system (y = \Phi(y) as p = \Phi(q), q = \Phi(p)), where a sweep
 # evaluates everything twice, so fewer suffice.
-_FIRST, _FIRST_DOUBLED = (9, 6), (6, 5)
+_FIRST_DOUBLED_IN_DOUBLE = 6
+_FIRST_DOUBLED_IN_SINGLE = 5
 # The most sweeps between two convergence checks: rates near one are not known accurately.
-_MOST = 32
+_MOST_BETWEEN_CHECKS = 32
 # The same when corrections are as small as rounding errors.
 _MOST_ROUNDED = 3
 # Sweeps with a slower rate of convergence are under-relaxed. Faster ones would gain less
@@ -45,7 +50,7 @@ class Halves(NamedTuple):
     q: PyTree[Array]
 
 
-class _State(NamedTuple):
+class _SweepState(NamedTuple):
     """The state of the sweeps at a convergence check.
 
     - `y`: the iterate.
@@ -66,7 +71,29 @@ class _State(NamedTuple):
     ahead: IntScalarLike
 
 
-def sweep(
+class _Swept(NamedTuple):
+    """The result of the sweeps between two checks.
+
+    - `change`: the last correction.
+    - `y`: the iterate.
+    """
+
+    change: PyTree[Array]
+    y: Halves
+
+
+class _Checked(NamedTuple):
+    """The decision at a convergence check.
+
+    - `state`: the next state, except for the iterate.
+    - `back`: whether to go back to the guess.
+    """
+
+    state: _SweepState
+    back: Bool[Array, ""]
+
+
+def solve_by_sweeps(
     tolerance: Tolerance,
     most: int,
     image: Map,
@@ -93,12 +120,14 @@ def sweep(
     """
     in_halves = isinstance(guess, Halves)
     start = guess if in_halves else Halves(guess, guess)
-    value_of = lambda y: y if in_halves else y.q
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
-    first = (_FIRST if in_halves else _FIRST_DOUBLED)[jnp.finfo(dtype).bits < 64]
+    first = _first_sweeps(dtype, in_halves)
 
-    def step(state: _State) -> _State:
-        change, y = _iterate(image, state, in_halves)
+    def value_of(y: PyTree[Array]) -> PyTree[Array]:
+        return y if in_halves else y.q
+
+    def sweep_and_check(state: _SweepState) -> _SweepState:
+        change, y = _swept(image, state, in_halves)
         correction = tolerance.measure(change, scale(value_of(y)))
         # The first correction is bounded by the size of the state.
         earlier = jnp.minimum(state.level, log2(correction.bound))
@@ -108,77 +137,112 @@ def sweep(
         # small systems took 1.3 to 2.8 times as long. The logarithms are inside, so that
         # only one kernel reads them: otherwise ten arrays took 1.1 times as long.
         new, back = materialize(check)
+
         # All paths of a batch sweep together, but each keeps only its own sweeps.
-        restart = lambda y, start: jnp.where(back, start, y)
-        own = lambda y, start, old: jnp.where(state.pending, restart(y, start), old)
+        def own(y: Array, start: Array, old: Array) -> Array:
+            return jnp.where(state.pending, jnp.where(back, start, y), old)
+
         return new._replace(y=jtu.tree_map(own, y, start, state.y))
 
-    one, inf, no = jnp.ones((), dtype), jnp.full((), jnp.inf, dtype), jnp.array(False)
+    one = jnp.ones((), dtype)
+    inf = jnp.full((), jnp.inf, dtype)
+    no = jnp.array(False)
+    # The check batches these values in any case: without their batching here, JAX would
+    # trace the loop again to find that out.
     start, pending, one, inf, no = batched_like((start, pending, one, inf, no), guess)
-    state = _State(start, one, inf, no, pending, done=0, ahead=first)
-    state = lax.while_loop(lambda state: state.ahead > 0, step, state)
+    state = _SweepState(
+        y=start,
+        relaxation=one,
+        level=inf,
+        solved=no,
+        pending=pending,
+        # The counts are shared by the batch, so that the loops keep unbatched lengths.
+        done=0,
+        ahead=first,
+    )
+    state = lax.while_loop(lambda state: state.ahead > 0, sweep_and_check, state)
     return value_of(state.y), state.solved
 
 
-def _iterate(
-    image: Map, state: _State, in_halves: bool
-) -> tuple[PyTree[Array], Halves]:
-    """The last correction after all sweeps until the next check, and the iterate."""
-    p_of = lambda y: image(y).p if in_halves else image(y.q)
-    q_of = lambda y: image(y).q if in_halves else image(y.p)
+def _first_sweeps(dtype, in_halves: bool) -> int:
+    """The number of sweeps before the first convergence check."""
+    if jnp.finfo(dtype).bits < 64:
+        return _FIRST_IN_SINGLE if in_halves else _FIRST_DOUBLED_IN_SINGLE
+    return _FIRST_IN_DOUBLE if in_halves else _FIRST_DOUBLED_IN_DOUBLE
+
+
+def _swept(image: Map, state: _SweepState, in_halves: bool) -> _Swept:
+    """All sweeps until the next check."""
+
+    # Each half is taken from an evaluation of its own. XLA drops what an evaluation
+    # computes for the other half.
+    def new_p(y: Halves) -> PyTree[Array]:
+        return image(y).p if in_halves else image(y.q)
+
+    def new_q(y: Halves) -> PyTree[Array]:
+        return image(y).q if in_halves else image(y.p)
 
     def relaxed(new: PyTree[Array], old: PyTree[Array]) -> PyTree[Array]:
-        omega = lambda x: state.relaxation.astype(x.dtype)
-        return jtu.tree_map(lambda x, y: y + omega(x) * (x - y), new, old)
+        def between(new: Array, old: Array) -> Array:
+            return old + state.relaxation.astype(new.dtype) * (new - old)
+
+        return jtu.tree_map(between, new, old)
 
     def once(_, y: Halves) -> Halves:
-        y = Halves(relaxed(p_of(y), y.p), y.q)
-        return Halves(y.p, relaxed(q_of(y), y.q))
+        y = Halves(relaxed(new_p(y), y.p), y.q)
+        return Halves(y.p, relaxed(new_q(y), y.q))
 
     if not in_halves:
         y = lax.fori_loop(0, state.ahead, once, state.y)
         # The halves may converge to different solutions of y = \Phi(\Phi(y)); only their
         # difference shows that.
-        return (y.q**ω - y.p**ω).ω, y
+        return _Swept((y.q**ω - y.p**ω).ω, y)
     # A loop that also carried the previous iterate would copy it in each sweep: steps of 64
     # pairs took 1.1 to 1.4 times as long, although the program was a tenth shorter.
     before = lax.fori_loop(0, state.ahead - 1, once, state.y)
     y = once(None, before)
-    return (y**ω - before**ω).ω, y
+    return _Swept((y**ω - before**ω).ω, y)
 
 
 def _check(
-    state: _State,
+    state: _SweepState,
     level: Scalar,
     earlier: Scalar,
-    last: Correction,
+    last: CorrectionSize,
     first: int,
     most: int,
-) -> tuple[_State, Bool[Array, ""]]:
-    """The next state, except for the iterate, and whether to go back to the guess. The
-    base-2 logarithms of the last and an earlier correction are `level` and `earlier`."""
-    rate, done = (level - earlier) / state.ahead, state.done + state.ahead
+) -> _Checked:
+    """What to do next. The base-2 logarithms of the `last` and an earlier correction are
+    `level` and `earlier`; `first` and `most` are numbers of sweeps."""
+    # In base-2 logarithms, so that the number of further sweeps is a quotient.
+    rate = (level - earlier) / state.ahead
+    done = state.done + state.ahead
     stalled = rate >= _STALLED
     solved = converged(level, rate, last.rounded, stalled)
+    # Sweeps that diverged get one more try. If it stalls, Newton's method takes over.
     again = stalled & (state.relaxation > _STRONGEST)
-    a = jnp.exp2(rate)
-    tuned = (state.done == 0) & (a > _SLOW) & ~stalled
+    ratio = jnp.exp2(rate)
+    # Relaxed once, at the first check: later rates are those of relaxed sweeps, to which
+    # the formula does not apply.
+    tuned = (state.done == 0) & (ratio > _SLOW) & ~stalled
     further = (level + MARGIN) / jnp.where(tuned, -_RELAXED, -rate)
+    # Sweeps that would not end in time end now, before they cost anything.
     in_time = again | (~stalled & (done + further < most))
     pending = state.pending & ~solved & in_time & (done < most)
+    # Newton's method begins where the sweeps ended, unless that is far from a solution.
     near = ~stalled & (last.small | pending)
     count = jnp.where(again, first, further)
     # Corrections as small as rounding errors show no rate.
     count = jnp.where(last.rounded, jnp.minimum(count, _MOST_ROUNDED), count)
     count = jnp.ceil(jnp.where(pending, count, 0)).astype(int)
-    relaxation = jnp.where(tuned, 2 / (1 + jnp.sqrt(1 + a)), state.relaxation)
-    new = _State(
+    relaxation = jnp.where(tuned, 2 / (1 + jnp.sqrt(1 + ratio)), state.relaxation)
+    new = _SweepState(
         y=None,
         relaxation=jnp.where(again, _STRONGEST, relaxation),
         level=jnp.where(again, jnp.inf, level),
         solved=jnp.where(state.pending, solved, state.solved),
         pending=pending,
         done=done,
-        ahead=jnp.minimum(most_of_batch(count), _MOST),
+        ahead=jnp.minimum(most_of_batch(count), _MOST_BETWEEN_CHECKS),
     )
-    return new, ~(near | solved)
+    return _Checked(new, ~(near | solved))

@@ -21,14 +21,27 @@ _SHORT = 4
 _WIDE = 32
 
 
-class Correction(NamedTuple):
+# The base-2 logarithm of 64, the factor by which the next correction must be below the
+# tolerance. The remaining error has the same sign in every step and would add up to a
+# drift, while rounding errors cancel.
+MARGIN = 6
+# Corrections below this many roundings of the whole state may be rounding errors, of all
+# stages together. They count as such only if they no longer shrink.
+_ROUNDINGS = 100
+# A correction below this fraction of the state is small: the iterate is close enough for
+# Newton's method to begin with.
+_SMALL = 0.01
+
+
+class CorrectionSize(NamedTuple):
     """The size of a correction.
 
     - `size`: the largest over all leaves, in units of their tolerances: 1 is just accepted.
     - `bound`: the `size` of a correction as large as the whole state.
     - `rounded`: whether it is as small as rounding errors of the whole state, which can
         keep the corrections of a comparatively small leaf above its own tolerance forever.
-    - `small`: whether it is below a hundredth of the whole state.
+    - `small`: whether it is below a hundredth of the whole state, so that the iterate is
+        worth keeping.
     """
 
     size: Scalar
@@ -38,8 +51,12 @@ class Correction(NamedTuple):
 
 
 class Tolerance(NamedTuple):
-    """Measures corrections in units of `rtol * scale + atol`, leaf by leaf. An `rtol` of
-    `None` is two units in the last place."""
+    """Measures corrections in units of `rtol * scale + atol`, leaf by leaf.
+
+    - `rtol`, `atol`: as for root finders of Optimistix. An `rtol` of `None` is two units in
+        the last place.
+    - `norm`: the norm within a leaf.
+    """
 
     rtol: float | None
     atol: float
@@ -47,26 +64,37 @@ class Tolerance(NamedTuple):
 
     def sizes(self, y: PyTree[Array]) -> list[Scalar]:
         """The norm of each leaf."""
+        # The same number, from a program that is faster.
         norm = max_norm if self.norm is optx.max_norm else self.norm
-        return [norm(x) for x in jtu.tree_leaves(y)]
+        return [norm(leaf) for leaf in jtu.tree_leaves(y)]
 
-    def measure(self, change: PyTree[Array], scale: PyTree[Array]) -> Correction:
-        sizes, scales = self.sizes(change), self.sizes(scale)
+    def measure(self, change: PyTree[Array], scale: PyTree[Array]) -> CorrectionSize:
+        """The size of a correction to a state of size `scale`, in the same structure."""
+        sizes = self.sizes(change)
+        scales = self.sizes(scale)
         whole = largest(scales)
-        size, bound = self._in_units(sizes, scales), self._in_units([whole], [whole])
-        # Strictly below, so that an infinite correction to an infinite state is neither.
+        size = self._in_units(sizes, scales)
+        bound = self._in_units([whole], [whole])
         eps = float(jnp.finfo(size.dtype).eps)
-        below = lambda fraction: largest(sizes) < fraction * whole
-        return Correction(size, bound, below(100 * eps), below(0.01))
+        # Strictly below, so that an infinite correction to an infinite state is neither.
+        rounded = largest(sizes) < _ROUNDINGS * eps * whole
+        small = largest(sizes) < _SMALL * whole
+        return CorrectionSize(size, bound, rounded, small)
 
     def _in_units(self, sizes: list[Scalar], scales: list[Scalar]) -> Scalar:
+        """The largest of these sizes, each in units of its tolerance."""
         eps = jnp.finfo(jnp.result_type(*sizes)).eps
         rtol = 2 * eps if self.rtol is None else self.rtol
-        each = [ratio(a, rtol * b + self.atol) for a, b in zip(sizes, scales)]
+        # Leaf by leaf, so that one far from zero does not hide errors of one near zero.
+        each = [
+            ratio(size, rtol * scale + self.atol) for size, scale in zip(sizes, scales)
+        ]
         return largest(each)
 
 
 def max_norm(x: Array) -> Scalar:
+    """The largest entry of an array by size, in few kernels; NaN if any is, and zero if
+    there is none."""
     if x.size == 0:
         return jnp.zeros((), x.dtype)
     if x.size == 1:
@@ -76,16 +104,24 @@ def max_norm(x: Array) -> Scalar:
     # of 16 pairs took 1.1 times as long in single precision.
     kind = f"int{jnp.finfo(x.dtype).bits}"
     bits = lax.bitcast_convert_type(jnp.abs(x), kind).reshape(-1)
-    while (n := bits.size) > (1 if x.size <= _SHORT else _WIDE):
-        bits = jnp.maximum(bits[: (n + 1) // 2], bits[n // 2 :])
-    return lax.bitcast_convert_type(bits[0] if n == 1 else jnp.max(bits), x.dtype)
+    final_size = 1 if x.size <= _SHORT else _WIDE
+    while bits.size > final_size:
+        # Halves of equal size; of an odd number, both have the middle entry.
+        first = bits[: (bits.size + 1) // 2]
+        second = bits[bits.size // 2 :]
+        bits = jnp.maximum(first, second)
+    largest_bits = bits[0] if bits.size == 1 else jnp.max(bits)
+    return lax.bitcast_convert_type(largest_bits, x.dtype)
 
 
 def largest(norms: list[Scalar]) -> Scalar:
+    """The largest of a few numbers; NaN if any is."""
+    # Stacked for `jnp.max`, they would be a reduction, which XLA does not fuse.
     return ft.reduce(jnp.maximum, norms)
 
 
 def all_finite(y: PyTree[Array]) -> _Flag:
+    """Whether no entry of any array is infinite or NaN."""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(y)]))
 
 
@@ -98,19 +134,17 @@ def log2(x: Scalar) -> Scalar:
     """The base-2 logarithm of a positive number to within 0.09, with the mantissa as a
     linear interpolation. With the library function steps took 1.05 to 1.4 times as long.
     Zero is below all other numbers, and NaN above."""
+    # Read as an integer, the bits of a float are its exponent, followed by its mantissa.
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(jnp.abs(x), f"int{info.bits}").astype(x.dtype)
     return bits * 2.0**-info.nmant + float(info.minexp - 1)
-
-
-# The base-2 logarithm of 64, the factor by which the next correction must be below the
-# tolerance. The remaining error has the same sign in every step and would add up to a
-# drift, while rounding errors cancel.
-MARGIN = 6
 
 
 def converged(level: Scalar, rate: Scalar, rounded: _Flag, stalled: _Flag) -> _Flag:
     """Whether the next correction will be below the tolerance; or corrections have
     `stalled` at rounding errors. `level` and `rate` are the base-2 logarithms of the last
     correction, in units of the tolerance, and of its ratio to the previous one."""
-    return (level + jnp.minimum(rate, 0) <= -MARGIN) | (stalled & rounded)
+    # With linear convergence the next correction is smaller by the same ratio. A growing
+    # correction says nothing about the next, so that at least the last must be small.
+    next_level = level + jnp.minimum(rate, 0)
+    return (next_level <= -MARGIN) | (stalled & rounded)

@@ -1,5 +1,5 @@
 from .base import AbstractImplicitStages, AbstractSymplecticRungeKutta
-from .base import AbstractSymplecticSolver, ARGUMENTS, Record, Want
+from .base import AbstractSymplecticSolver, Record, Want
 from .general import ImplicitMidpoint, SRKs1, SRKw1, SRKw2
 from .separable import PlateauVerlet, SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet
 from .additive import AdditiveGauss, SRKs4, SRKw5
@@ -18,7 +18,3 @@ SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
     *(SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet, PlateauVerlet),
     *(SRKs4, SRKw5, AdditiveGauss),
 )
-
-for _solver in SOLVERS:
-    if issubclass(_solver, AbstractImplicitStages):
-        _solver.__init__.__doc__ = ARGUMENTS

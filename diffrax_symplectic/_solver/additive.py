@@ -9,6 +9,7 @@ from .._tableau import AdditiveTableau
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
+    documented,
     free_parameter,
     real_number,
     Record,
@@ -17,6 +18,7 @@ from .general import GAUSS
 
 
 def _nonzero(value: Any) -> float:
+    """Raises a `ValueError` unless `beta2` is a finite real number other than zero."""
     beta2 = real_number("beta2", value)
     if beta2 == 0:
         raise ValueError(
@@ -27,11 +29,14 @@ def _nonzero(value: Any) -> float:
 
 
 def _sign(value: Any) -> int:
+    """Raises a `ValueError` unless this is 1 or -1."""
+    # `True == 1`, but a boolean says nothing about a sign.
     if isinstance(value, bool) or value not in (-1, 1):
         raise ValueError(f"`sign` must be 1 or -1; got {value!r}.")
     return int(value)
 
 
+@documented
 class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic methods SRKs4 of Wang, Hong and Xu, of strong order 3/2 for any
     number of noises that do not depend on the state.
@@ -71,6 +76,7 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=3 / 2,
         choose="Two stage vectors, one after the other. The noise may depend on time.",
         suggested=("weak", "strong"),
+        heats=True,
     )
     beta1: float = free_parameter("beta1", 0.0)
     beta2: float = eqx.field(default=1.0, static=True, converter=_nonzero)
@@ -79,9 +85,13 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> AdditiveTableau:
-        beta1, beta2, b = self.beta1, self.beta2, self.b
-        rows = 1 + self.sign / np.sqrt(2), 1 - self.sign / np.sqrt(2)
-        B = np.array([[rows[0], 0], [rows[1] - b, b]])
+        beta1 = self.beta1
+        beta2 = self.beta2
+        # I_k0 / h has the variance h / 3, while that of the path is h / 2 in the mean over
+        # the step. So the squares of the factors are 3 / 2 in the mean over both stages.
+        first = 1 + self.sign / np.sqrt(2)
+        second = 1 - self.sign / np.sqrt(2)
+        B = np.array([[first, 0], [second - self.b, self.b]])
         weights = beta2 * np.array([1, -1])
         # I_k0 / h = W / 2 + H, in Diffrax's variables.
         return AdditiveTableau(
@@ -93,6 +103,7 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         )
 
 
+@documented
 class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKw5 of Wang, Hong and Xu, of weak order 2 for any number of
     noises that depend neither on the state nor on time.
@@ -116,6 +127,7 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=None,
         choose="As cheap as the midpoint rule, for low accuracy.",
         suggested=("weak",),
+        heats=True,
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
         alpha=[1],
@@ -127,9 +139,11 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     )
 
 
-_s = np.sqrt(1 / 6)
+# The coefficient of the variables eta below.
+_SPREAD = np.sqrt(1 / 6)
 
 
+@documented
 class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""A symplectic method of weak order 3 for any number of noises that depend neither on
     the state nor on time: the Gauss method of two stages, with three random variables for
@@ -159,8 +173,11 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=3,
         strong=None,
-        choose="Two stage vectors, and by far the smallest errors for constant noise.",
+        choose="Two stage vectors, and by far the smallest errors for constant noise. Not "
+        "for long steps, omega h > 1, or for stationary laws of linear systems, which the "
+        "midpoint rule has exactly.",
         suggested=("weak",),
+        heats=True,
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
         alpha=[1 / 2, 1 / 2],
@@ -168,8 +185,9 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         A=GAUSS,
         B={
             "W": GAUSS.sum(axis=1, keepdims=True),
-            "second": [[_s], [0]],
-            "third": [[0], [_s]],
+            # Each stage has a variable of its own, so that stages correlate through `W`.
+            "second": [[_SPREAD], [0]],
+            "third": [[0], [_SPREAD]],
         },
         c1=[0],
         constant=True,

@@ -6,7 +6,16 @@ import dataclasses
 import functools as ft
 import math
 from collections.abc import Callable
-from typing import Any, cast, ClassVar, Literal, NamedTuple, TYPE_CHECKING, TypeAlias
+from typing import (
+    Any,
+    cast,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    TYPE_CHECKING,
+    TypeAlias,
+    TypeVar,
+)
 
 import diffrax
 import equinox as eqx
@@ -16,10 +25,17 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._arguments import check_state, whole_number
 from .._batch import batched_like
-from .._brownian import drives, path_of, VARIABLES
+from .._brownian import drives, most_demanding, path_of
 from .._custom_types import Args, Y
 from .._root_finder import PicardNewton
-from .._tableau import AbstractTableau, drift_order, FlatTableau, make_plan, Structure
+from .._tableau import (
+    AbstractTableau,
+    drift_order,
+    FlatTableau,
+    make_plan,
+    Stage,
+    Structure,
+)
 from .._terms import (
     check_structure,
     drift_driven,
@@ -53,6 +69,12 @@ class Record(NamedTuple):
     - `choose`: when to choose it, in a sentence.
     - `noises`: the noises for which it is recommended. It accepts any.
     - `suggested`: the kinds of convergence for which `suggest_solver` returns it.
+    - `stationary`: the second moments, of `"qq"`, `"pq"` and `"pp"`, of a harmonic mode in
+        a heat bath whose stationary values are exact for every stable step.
+    - `heats`: whether noise gives a harmonic mode without friction the right energy for
+        steps that do not resolve it; `None` if such steps are unstable.
+
+    The last two are measured, in `tests/test_advice.py`.
     """
 
     weak: Order
@@ -60,10 +82,29 @@ class Record(NamedTuple):
     choose: str
     noises: Noises = "any"
     suggested: tuple[Want, ...] = ()
+    stationary: tuple[str, ...] = ()
+    heats: bool | None = None
+
+    @property
+    def reason(self) -> str:
+        """When to choose it, and what noise does to modes that a step does not resolve."""
+        if self.heats is None:
+            return self.choose
+        if self.heats:
+            stiff = "For stiff modes with friction wrap it in `Damped`."
+        elif "pp" in self.stationary:
+            stiff = "Right for noise on stiff modes only in a heat bath."
+        else:
+            stiff = "Not for noise on stiff modes."
+        return f"{self.choose} {stiff}"
 
     def order(self, want: Want, commute: bool) -> int | float | None:
+        """The order for noises that commute, or for others."""
         order = self.weak if want == "weak" else self.strong
-        return order[0 if commute else 1] if isinstance(order, tuple) else order
+        if not isinstance(order, tuple):
+            return order
+        commuting, others = order
+        return commuting if commute else others
 
 
 # The solver state is whether all stage equations were solved so far: in a batch Diffrax
@@ -86,6 +127,8 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
         diffrax.LocalLinearInterpolation
     )
     record: ClassVar[Record | None] = None
+    # Whether it takes terms with a `constraint`.
+    keeps_constraints: ClassVar[bool] = False
     structure: AbstractVar[Structure]
     variables: AbstractVar[tuple[str, ...]]
 
@@ -97,10 +140,10 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
     @property
     def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
         """The least that the path's increments must contain."""
-        for name, variable in VARIABLES.items():
-            if name in self.variables:
-                return variable.increment
-        return diffrax.AbstractBrownianIncrement
+        variable = most_demanding(self.variables)
+        if variable is None:
+            return diffrax.AbstractBrownianIncrement
+        return variable.increment
 
     def strong_order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | float | None:
         """Strong order of convergence. `None` for a weak method, or if it is not stated."""
@@ -114,8 +157,13 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
     def _order_for(self, want: Want, terms) -> int | float | None:
         if self.record is None:
             return None
-        alone, several = (self.record.order(want, x) for x in (True, False))
-        return alone if alone == several or number_of_noises(terms) <= 1 else several
+        commuting = self.record.order(want, commute=True)
+        others = self.record.order(want, commute=False)
+        # Terms are looked at only if it matters, so that orders of most solvers can be
+        # asked for without any. Whether several noises commute is not known here.
+        if commuting == others or number_of_noises(terms) <= 1:
+            return commuting
+        return others
 
     def path(
         self,
@@ -149,12 +197,15 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
     def __repr__(self) -> str:
         """The parameters that differ from the defaults, in one line."""
         given = []
-        for f in dataclasses.fields(self):
-            value = getattr(self, f.name)
-            if f.repr and eqx.tree_equal(value, f.default) is not True:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            # Of traced values it is not known whether they are equal.
+            is_default = eqx.tree_equal(value, field.default) is True
+            if field.repr and not is_default:
+                # A module may have a `__repr__` of its own, as this one does.
                 module = isinstance(value, eqx.Module)
                 text = repr(value) if module else eqx.tree_pformat(value)
-                given.append(f"{f.name}={text}")
+                given.append(f"{field.name}={text}")
         return f"{type(self).__name__}({', '.join(given)})"
 
     def check(self, terms, t0, y0: Y, args: Args) -> None:
@@ -212,6 +263,7 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
 
     def init(self, terms, t0, t1, y0: Y, args: Args) -> Solved:
         del t1
+        # Here, not in `step`, since a solve calls it only once.
         self.check(terms, t0, y0, args)
         implicit = isinstance(self, diffrax.AbstractImplicitSolver)
         return no_failure() if implicit else None
@@ -223,10 +275,15 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         drift, noise = split_terms(terms)
         plan = make_plan(_drop_absent(self.tableau.flatten(), drift, noise))
         variables = _variables(plan.tableau)
-        begun = t0, t1, y0, solver_state
+        # All of a step is batched if anything is, since values that become batched within
+        # its loops would be traced again.
+        begun = (t0, t1, y0, solver_state)
         begin, end, y0, solver_state = batched_like(begun, (begun, terms, args))
-        from_drift, h = drift_driven(drift, begin, end, args), end - begin
+        from_drift = drift_driven(drift, begin, end, args)
+        h = end - begin
         driven = {"h": from_drift} if drift else {}
+        # The path gets the times as they are: if they are the same for all paths of a
+        # batch, so is the place of the step.
         name = type(self).__name__
         driven |= noise_driven(from_drift, h, noise, variables, t0, t1, args, name)
         y1, solved = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
@@ -245,19 +302,25 @@ def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTablea
     tableau = tableau.take(keep)
     if len(drift) > 0:
         return tableau
-    stays = lambda c: drives(c) != "drift brackets"
-    without = lambda stage: tuple(filter(stays, stage.channels))
-    stages = tuple(stage._replace(channels=without(stage)) for stage in tableau.stages)
+    stages = tuple(_without_brackets(stage) for stage in tableau.stages)
     return dataclasses.replace(tableau, stages=stages)
+
+
+def _without_brackets(stage: Stage) -> Stage:
+    """The stage without channels that drive brackets with the drift."""
+    kept = [name for name in stage.channels if drives(name) != "drift brackets"]
+    return stage._replace(channels=tuple(kept))
 
 
 def _variables(tableau: FlatTableau) -> list[str]:
     """The random variables that drive the stages."""
-    channels = [c for stage in tableau.stages for c in stage.channels]
-    return [c for c in dict.fromkeys(channels) if c != "h"]
+    channels = [name for stage in tableau.stages for name in stage.channels]
+    # Each once, in an order that is the same in every run.
+    return [name for name in dict.fromkeys(channels) if name != "h"]
 
 
 def _checked_root_finder(value: Any) -> Any:
+    """Raises a `ValueError` unless this is a root finder, not its class or a SciPy name."""
     kinds = optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver
     if not isinstance(value, kinds):
         raise ValueError(
@@ -276,6 +339,9 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
     root_finder: optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver = eqx.field(
         default=PicardNewton(), kw_only=True, converter=_checked_root_finder
     )
+    # Diffrax requires this field. With the default root finder it has no effect (see
+    # `_ARGUMENTS`): that takes a single step of `optimistix.root_find`, with bounds of its
+    # own on sweeps and on iterations of Newton's method.
     root_find_max_steps: int = eqx.field(
         default=100,
         kw_only=True,
@@ -283,8 +349,9 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
     )
 
 
-# The documentation of `__init__` of every implicit solver.
-ARGUMENTS = """**Arguments:** the parameters above, if any (Python numbers or strings), and
+_Solver = TypeVar("_Solver", bound=type)
+
+_ARGUMENTS = """**Arguments:** the parameters above, if any (Python numbers or strings), and
 
 - `root_finder`: any Optimistix root finder for the stage equations.
 - `root_find_max_steps`: the most steps that the root finder may take. `PicardNewton` takes
@@ -292,6 +359,13 @@ ARGUMENTS = """**Arguments:** the parameters above, if any (Python numbers or st
 
 **Raises:** a `ValueError` for any other value.
 """
+
+
+def documented(solver: _Solver) -> _Solver:
+    """A decorator for solvers with implicit stages, which documents their arguments."""
+    # Equinox makes an `__init__` for each class, without a docstring.
+    solver.__init__.__doc__ = _ARGUMENTS
+    return solver
 
 
 def free_parameter(name: str, default: float) -> Any:
@@ -306,6 +380,7 @@ def real_number(name: str, value: Any) -> float:
     try:
         number = math.nan if isinstance(value, complex) else float(value)
     except (TypeError, ValueError):
+        # Errors of JAX about traced arrays are of these types, too.
         number = math.nan
     if not math.isfinite(number):
         raise ValueError(

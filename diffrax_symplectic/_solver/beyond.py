@@ -1,14 +1,16 @@
 """Solvers for any Hamiltonians that are not from Wang, Hong and Xu."""
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
+from jaxtyping import Array
 
+from .._custom_types import Y
 from .._tableau import (
     drift_order,
     FlatTableau,
@@ -28,16 +30,18 @@ from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
     AbstractSymplecticSolver,
+    documented,
     Record,
 )
 from .general import GAUSS, ImplicitMidpoint
-from .step import no_failure, result_of, Step, take_step
+from .step import no_failure, result_of, Solved, Step, take_step
 from .times import result_at
 
 
-_half = np.array([1 / 2, 1 / 2])
+_HALVES = np.array([1 / 2, 1 / 2])
 
 
+@documented
 class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""A symplectic method of weak order 2 for one noise or noises that commute: half a
     step of the drift by the midpoint rule, the noise by the Gauss method of order 4, and
@@ -63,13 +67,15 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=(2, 1),
         strong=None,
-        choose="For accurate expectations: four stage vectors in three small systems.",
+        choose="For accurate expectations: four stage vectors in three small systems. "
+        "Not for long steps, omega h > 1.",
         noises="commuting",
         suggested=("weak",),
+        heats=True,
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(
-        alpha=_half,
-        beta=_half,
+        alpha=_HALVES,
+        beta=_HALVES,
         A0=[[1 / 4, 0], [1 / 2, 1 / 4]],
         B0=[[0, 0], [1 / 2, 1 / 2]],
         A1=[[1 / 2, 0], [1 / 2, 0]],
@@ -77,16 +83,33 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     )
 
 
-# The flow of one vector field: two stages of the Gauss method, of order 4.
-_flow = make_plan(
+# The flow of one vector field: two stages of the Gauss method, of order 4. Its channel is
+# called "h" whatever drives it, the drift or one noise.
+_FLOW = make_plan(
     FlatTableau(
         stages=tuple(Stage(("h",), c, "y", "y") for c in GAUSS.sum(axis=1)),
         matrix=GAUSS,
-        weights=_half,
+        weights=_HALVES,
     )
 )
 
 
+class _Flow(NamedTuple):
+    """One flow of a splitting.
+
+    - `is_drift`: whether it is the flow of the drift, not of one noise.
+    - `t0`, `t1`: the times between which it moves; the same for noise.
+    - `number`, `increment`: which noise, and its increment; ignored for the drift.
+    """
+
+    is_drift: Any
+    t0: Array
+    t1: Array
+    number: Array
+    increment: Array
+
+
+@documented
 class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     r"""A symplectic method of weak order 2 for any Hamiltonians and any number of noises,
     whether they commute or not: splitting in random order.
@@ -122,6 +145,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         choose="For few noises: two stage vectors per noise, and four for the drift.",
         noises="not commuting",
         suggested=("weak",),
+        heats=True,
     )
     structure: ClassVar[Structure] = "any"
     variables: ClassVar[tuple[str, ...]] = ("W", "two_point")
@@ -132,7 +156,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     def order(self, terms):
         """The order without noise, which is the order of the flows."""
         del terms
-        return drift_order(_flow.tableau)
+        return drift_order(_FLOW.tableau)
 
     def init(self, terms, t0, t1, y0, args):
         del t1
@@ -142,44 +166,49 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del made_jump
         drift, noise = split_terms(terms)
+        # Of a step that is called by itself, or by `diffrax.HalfSolver`.
         solved = no_failure() if solver_state is None else solver_state
-        middle = t0 + (t1 - t0) / 2
-        numbers, increments = self._in_order(terms, t0, t1)
-        still = [middle] * (numbers.size + 1)
-        # The drift comes first and last, and ignores the number.
-        flows = (
-            np.pad(np.full(numbers.size, False), 1, constant_values=True),
-            jnp.stack([t0, *still]),
-            jnp.stack([*still, t1]),
-            jnp.pad(numbers, 1),
-            jnp.pad(increments, 1),
-        )
+        flows = self._flows(terms, t0, t1)
 
-        def drift_flow(t0, t1, number, increment, y, solved):
-            del number, increment
+        def drift_flow(flow: _Flow, y: Y, solved: Solved) -> tuple[Y, Solved]:
             if len(drift) == 0:
                 return y, solved
-            step = Step(t0, t1 - t0, {"h": drift_driven(drift, t0, t1, args)})
-            return take_step(_flow, step, y, self, solved)
+            h = flow.t1 - flow.t0
+            driven = drift_driven(drift, flow.t0, flow.t1, args)
+            step = Step(flow.t0, h, {"h": driven})
+            return take_step(_FLOW, step, y, self, solved)
 
-        def noise_flow(t0, t1, number, increment, y, solved):
-            del t1
+        def noise_flow(flow: _Flow, y: Y, solved: Solved) -> tuple[Y, Solved]:
             if len(noise) == 0:
                 return y, solved
-            driven = jtu.Partial(apply_one, noise, number, increment, args)
-            step = Step(t0, jnp.zeros_like(t0), {"h": driven})
-            return take_step(_flow, step, y, self, solved)
+            driven = jtu.Partial(apply_one, noise, flow.number, flow.increment, args)
+            # Time stands still, so all stages are at the middle of the step.
+            step = Step(flow.t0, jnp.zeros_like(flow.t0), {"h": driven})
+            return take_step(_FLOW, step, y, self, solved)
 
         # A loop compiles each kind of flow only once.
-        def one_flow(carry, flow):
-            is_drift, *which = flow
-            return lax.cond(is_drift, drift_flow, noise_flow, *which, *carry), None
+        def one_flow(carry, flow: _Flow):
+            return lax.cond(flow.is_drift, drift_flow, noise_flow, flow, *carry), None
 
         (y1, solved), _ = lax.scan(one_flow, (y0, solved), flows)
         result = result_at(terms, t0, t1, result_of(solved, y1))
         return y1, None, dict(y0=y0, y1=y1), solved, result
 
-    def _in_order(self, terms, t0, t1):
+    def _flows(self, terms, t0, t1) -> _Flow:
+        """All flows of a step, in order, stacked along a first axis."""
+        middle = t0 + (t1 - t0) / 2
+        numbers, increments = self._in_order(terms, t0, t1)
+        still = [middle] * (numbers.size + 1)
+        # The drift comes first and last, and ignores the number.
+        return _Flow(
+            is_drift=np.pad(np.full(numbers.size, False), 1, constant_values=True),
+            t0=jnp.stack([t0, *still]),
+            t1=jnp.stack([*still, t1]),
+            number=jnp.pad(numbers, 1),
+            increment=jnp.pad(increments, 1),
+        )
+
+    def _in_order(self, terms, t0, t1) -> tuple[Array, Array]:
         """The indices of the noises in the order of their flows, and their increments."""
         _, noise = split_terms(terms)
         if len(noise) == 0:
@@ -188,6 +217,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         # The order of several noises is chosen by a coin.
         names = ["W", "two_point"] if m > 1 else ["W"]
         drawn = controls(noise, names, t0, t1, type(self).__name__)
+        # One number for each noise, over all terms and leaves.
         increments, _ = jfu.ravel_pytree(drawn["W"])
         numbers = jnp.arange(m)
         if m > 1:
@@ -196,6 +226,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         return numbers, increments[numbers]
 
 
+@documented
 class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The implicit midpoint rule with Lévy areas: strong order 1 for any number of noises,
     whether they commute or not.
@@ -231,12 +262,15 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose="The midpoint rule with Lévy areas, for noises that do not commute.",
         noises="not commuting",
         suggested=("strong",),
+        stationary=("qq", "pq", "pp"),
+        heats=False,
     )
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
         ImplicitMidpoint.tableau, noise=("W", "A")
     )
 
 
+@documented
 class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""A symplectic method of strong order 3/2 for any Hamiltonians, with one noise or with
     noises that commute.
@@ -280,8 +314,10 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose="For accurate paths: two stage vectors, and brackets of vector fields.",
         noises="commuting",
         suggested=("strong",),
+        stationary=("qq", "pq", "pp"),
+        heats=False,
     )
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
-        GeneralTableau.strong(A=GAUSS, B=GAUSS, alpha=_half, beta=_half),
+        GeneralTableau.strong(A=GAUSS, B=GAUSS, alpha=_HALVES, beta=_HALVES),
         noise=("W", "L"),
     )

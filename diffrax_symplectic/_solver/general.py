@@ -8,11 +8,13 @@ from .._tableau import GeneralTableau
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
+    documented,
     free_parameter,
     Record,
 )
 
 
+@documented
 class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The implicit midpoint rule for Stratonovich systems.
 
@@ -31,12 +33,15 @@ class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=(1, 1 / 2),
         choose="A good first choice: one stage vector for any number of noises.",
         suggested=("strong",),
+        stationary=("qq", "pq", "pp"),
+        heats=False,
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau.strong(
         A=[[1 / 2]], B=[[1 / 2]], alpha=[1], beta=[1]
     )
 
 
+@documented
 class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The two-stage symplectic methods SRKs1 of Wang, Hong and Xu.
 
@@ -59,16 +64,20 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=1,
         strong=(1, 1 / 2),
         choose="Two midpoint substeps, for errors dominated by the drift.",
+        heats=False,
     )
     a: float = free_parameter("a", 0.25)
 
     @property
     def tableau(self) -> GeneralTableau:
-        a = self.a
-        A, alpha = [[a, 0], [2 * a, 1 / 2 - a]], [2 * a, 1 - 2 * a]
+        # Drift and noise have the same coefficients, so that each stage is one midpoint
+        # evaluation of both.
+        A = [[self.a, 0], [2 * self.a, 1 / 2 - self.a]]
+        alpha = [2 * self.a, 1 - 2 * self.a]
         return GeneralTableau.strong(A=A, B=A, alpha=alpha, beta=alpha)
 
 
+@documented
 class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The one-stage symplectic methods SRKw1 of Wang, Hong and Xu, of weak order 1.
 
@@ -91,22 +100,30 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=None,
         choose="The midpoint rule for expectations. Cheap, for low accuracy.",
         suggested=("weak",),
+        stationary=("qq", "pq", "pp"),
+        heats=False,
     )
     b: float = free_parameter("b", 0.5)
 
     @property
     def tableau(self) -> GeneralTableau:
-        b, half = self.b, [[1 / 2]]
+        # Symplectic for any b, since A1 + B0 is the product of the weights.
         return GeneralTableau(
-            alpha=[1], beta=[1], A0=half, B0=[[b]], A1=[[1 - b]], B1=half
+            alpha=[1],
+            beta=[1],
+            A0=[[1 / 2]],
+            B0=[[self.b]],
+            A1=[[1 - self.b]],
+            B1=[[1 / 2]],
         )
 
 
-_r = np.sqrt(3)
+_ROOT3 = np.sqrt(3)
 # Of the Gauss method with two stages, of order 4. Its times are the sums of the rows.
-GAUSS = np.array([[1 / 4, 1 / 4 - _r / 6], [1 / 4 + _r / 6, 1 / 4]])
+GAUSS = np.array([[1 / 4, 1 / 4 - _ROOT3 / 6], [1 / 4 + _ROOT3 / 6, 1 / 4]])
 
 
+@documented
 class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKw2 of Wang, Hong and Xu, of weak order 2 for one noise.
 
@@ -148,13 +165,14 @@ class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     tableau: ClassVar[GeneralTableau] = GeneralTableau(
         alpha=np.full(4, 1 / 4),
         beta=[1 / 2, 1 / 2],
+        # Four midpoint steps of a quarter each.
         A0=np.eye(4) / 8 + np.tril(np.full((4, 4), 1 / 4), -1),
         B0=[
-            [5 / 6 - _r / 3, -1 / 2],
+            [5 / 6 - _ROOT3 / 3, -1 / 2],
             [-1 / 6, 1 / 2],
-            [-1 / 6 + _r / 3, 1 / 2],
+            [-1 / 6 + _ROOT3 / 3, 1 / 2],
             [1 / 2, 1 / 2],
         ],
-        A1=[[-1 / 6 + _r / 6, 1 / 3, 1 / 3 - _r / 6, 0], [1 / 2, 0, 0, 0]],
+        A1=[[-1 / 6 + _ROOT3 / 6, 1 / 3, 1 / 3 - _ROOT3 / 6, 0], [1 / 2, 0, 0, 0]],
         B1=GAUSS,
     )

@@ -1,31 +1,45 @@
 """Solvers for H0 = V(p) + U(t, q) and noise Hamiltonians U_k(t, q)."""
 
-from typing import ClassVar, get_args, Literal, TypeAlias
+from typing import Any, ClassVar, get_args, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 
 from .._tableau import PartitionedTableau, SeparableTableau
+from .._terms import constraint_of
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
+    documented,
     free_parameter,
     Record,
 )
+from .constrained import init_constrained, verlet_step
+from .step import result_of, Solved
+from .times import result_at
 
 
 Variant: TypeAlias = Literal["a", "b", "c", "d", "e", "f"]
 
-# variant: (beta, A1, B0)
-_srkw3 = {
-    "a": (1, 1 / 2, 1 / 2),
-    "b": (1, 1, 0),
-    "c": (1, 0, 1),
-    "d": (-1, 1 / 2, -1 / 2),
-    "e": (-1, 1, 0),
-    "f": (-1, 0, -1),
+
+class _Coefficients(NamedTuple):
+    """The coefficients of a one-stage method, besides `alpha = 1` and `A0 = 1 / 2`."""
+
+    beta: float
+    A1: float
+    B0: float
+
+
+_SRKW3 = {
+    "a": _Coefficients(beta=1, A1=1 / 2, B0=1 / 2),
+    "b": _Coefficients(beta=1, A1=1, B0=0),
+    "c": _Coefficients(beta=1, A1=0, B0=1),
+    "d": _Coefficients(beta=-1, A1=1 / 2, B0=-1 / 2),
+    "e": _Coefficients(beta=-1, A1=1, B0=0),
+    "f": _Coefficients(beta=-1, A1=0, B0=-1),
 }
 
 
+@documented
 class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The one-stage symplectic methods SRKw3a to SRKw3f of Wang, Hong and Xu, of weak
     order 1, for $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
@@ -63,10 +77,13 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> SeparableTableau:
-        beta, A1, B0 = _srkw3[self.variant]
-        return SeparableTableau([1], [beta], A0=[[1 / 2]], B0=[[B0]], A1=[[A1]])
+        beta, A1, B0 = _SRKW3[self.variant]
+        return SeparableTableau(
+            alpha=[1], beta=[beta], A0=[[1 / 2]], B0=[[B0]], A1=[[A1]]
+        )
 
 
+@documented
 class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic methods SRKw4 of Wang, Hong and Xu, of weak order 2, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
@@ -95,6 +112,7 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=None,
         choose="Solves for half of the state. For stiff systems.",
         suggested=("weak",),
+        heats=False,
     )
     a21: float = free_parameter("a21", 0.5)
 
@@ -105,10 +123,12 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
             beta=[1 / 2, 1 / 2],
             A0=[[1 / 4, 1 / 2 - self.a21], [self.a21, 1 / 4]],
             B0=[[1, 0], [0, 0]],
+            # The second noise stage is at the end of the step, the first at its start.
             A1=[[-1 / 2, 1 / 2], [1 / 2, 1 / 2]],
         )
 
 
+@documented
 class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKs2 of Wang, Hong and Xu, of strong order 1, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
@@ -127,12 +147,14 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=1,
         choose="The midpoint rule on half of the state. For stiff systems.",
         suggested=("strong",),
+        heats=False,
     )
     tableau: ClassVar[SeparableTableau] = SeparableTableau(
         alpha=[1], beta=[1], A0=[[1 / 2]], B0=[[1 / 2]], A1=[[1 / 2]]
     )
 
 
+@documented
 class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic methods SRKs3 of Wang, Hong and Xu, of strong order 1 for any
     number of noises, for $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
@@ -163,8 +185,9 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> SeparableTableau:
-        a = self.a
-        A0, alpha = [[a, 0], [2 * a, 1 / 2 - a]], [2 * a, 1 - 2 * a]
+        A0 = [[self.a, 0], [2 * self.a, 1 / 2 - self.a]]
+        alpha = [2 * self.a, 1 - 2 * self.a]
+        # The positions at the noise are those at the end of the step: its row is `alpha`.
         return SeparableTableau(alpha=alpha, beta=[1], A0=A0, B0=[[0], [0]], A1=[alpha])
 
 
@@ -183,41 +206,68 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     one evaluation of the forces, and must resolve the fastest frequency $\omega$ of $H_0$:
     $\omega h < 2$.
 
+    **Constraints.** For terms with a `constraint` each drift over $h / 2$ is a step of
+    RATTLE, $q \gets q + \frac h2 M^{-1} p$ with $p \gets p - J(q)^\top \lambda$ and
+    multipliers $\lambda$ for which the new $q$ satisfies the constraint, and momenta are
+    made tangent, $J M^{-1} p = 0$. Multipliers are found by Newton's method to rounding; a
+    step fails if there are none, as happens if it is too long. It is symplectic on the
+    allowed states, and reversible.
+
     **Source:** [Strang (1968)](https://doi.org/10.1137/0705041) for the splitting;
     [Ninomiya and Victoir (2008)](https://doi.org/10.1080/13504860701413958) for the weak
-    order of symmetric splittings.
+    order of symmetric splittings; [Leimkuhler and Skeel
+    (1994)](https://doi.org/10.1006/jcph.1994.1085) for RATTLE.
     """
 
+    keeps_constraints: ClassVar[bool] = True
     record: ClassVar[Record] = Record(
         weak=2,
         strong=1,
-        choose="Explicit, with the cheapest step. For frequencies omega < 2 / h.",
+        choose="Explicit, with the cheapest step. Not for frequencies omega > 2 / h.",
         suggested=("weak", "strong"),
     )
     tableau: ClassVar[PartitionedTableau] = PartitionedTableau(
         alpha=[1],
         alpha_hat=[1 / 2, 1 / 2],
         beta=[1],
-        # The momenta before and after the kick.
+        # The momenta before and after the kick, which is a single force stage: the first
+        # velocity moves half a step, the second the other half.
         A=[[0], [1]],
         A_hat=[[1 / 2, 0]],
         B0=[[0], [1]],
         A1=[[1 / 2, 0]],
     )
 
+    def init(self, terms, t0, t1, y0, args) -> Solved:
+        if constraint_of(terms) is None:
+            return super().init(terms, t0, t1, y0, args)
+        return init_constrained(self, terms, t0, y0, args)
 
-_kicks = {"W": [1 / 2, 0, 1 / 2], "H": [1, 0, -1], "C": [-1, 2, -1]}
+    def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
+        if constraint_of(terms) is None:
+            return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
+        at = terms, t0, t1, y0, args
+        y1, solved = verlet_step(*at, solver_state, type(self).__name__)
+        result = result_at(terms, t0, t1, result_of(solved, y1))
+        return y1, None, dict(y0=y0, y1=y1), solved, result
+
+
+# The three kicks, as combinations of random variables: with M = W / 2 + H, these are M - C,
+# 2 C and W - M - C.
+_KICKS = {"W": [1 / 2, 0, 1 / 2], "H": [1, 0, -1], "C": [-1, 2, -1]}
 _plateau_verlet = PartitionedTableau(
     alpha=[1 / 2, 1 / 2],
     alpha_hat=[1 / 4, 1 / 4, 1 / 4, 1 / 4],
-    beta=_kicks,
+    beta=_KICKS,
     # The momenta after the first kick, the first force, the second kick, the second force.
     A=[[0, 0], [1 / 2, 0], [1 / 2, 0], [1 / 2, 1 / 2]],
     A_hat=[[1 / 4, 0, 0, 0], [1 / 4, 1 / 4, 1 / 4, 0]],
+    # Momenta contain the kicks that came before. The last kick is in none of them.
     B0={
-        name: [[a, 0, 0], [a, 0, 0], [a, b, 0], [a, b, 0]]
-        for name, (a, b, _) in _kicks.items()
+        name: [[first, 0, 0], [first, 0, 0], [first, second, 0], [first, second, 0]]
+        for name, (first, second, _) in _KICKS.items()
     },
+    # The positions of the three kicks: at the start, in the middle and at the end.
     A1=[[0, 0, 0, 0], [1 / 4, 1 / 4, 0, 0], [1 / 4, 1 / 4, 1 / 4, 1 / 4]],
 )
 
@@ -251,7 +301,7 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=3 / 2,
-        choose="Explicit, with accurate paths. For frequencies omega < 4 / h.",
+        choose="Explicit, with accurate paths. Not for frequencies omega > 4 / h.",
         suggested=("strong",),
     )
     tableau: ClassVar[PartitionedTableau] = _plateau_verlet

@@ -18,11 +18,12 @@ from .._batch import batched_like, materialize
 from .._compat import ω
 from .._custom_types import RealScalarLike, Y
 from .._root_finder import all_finite, differentiate, Halves
-from .._tableau import Block, FlatTableau, Plan, Stage
+from .._tableau import Block, FlatTableau, Group, Stage, StepPlan
 from .._terms import tree_sum
 
 
-# The value of a stage: the change of the part of the state that it writes.
+# The value of a stage: the change of the part of the state that it writes. Of several
+# stages evaluated together, their values are stacked along a first axis.
 _Value: TypeAlias = PyTree[Array]
 # The values of the stages known so far, by stage number.
 Values: TypeAlias = dict[int, _Value]
@@ -33,7 +34,11 @@ Driven: TypeAlias = Callable[[RealScalarLike, Y], Y]
 
 
 class Step(NamedTuple):
-    """One step from `t0` over `h`, with a function for each channel."""
+    """One step.
+
+    - `t0`, `h`: its start and size.
+    - `driven`: for each channel the vector field times its control.
+    """
 
     t0: RealScalarLike
     h: RealScalarLike
@@ -43,48 +48,80 @@ class Step(NamedTuple):
 class Stages(eqx.Module):
     """The stages of one step, in the blocks of its plan. Unknown values count as zero."""
 
-    plan: Plan = eqx.field(static=True)
+    plan: StepPlan = eqx.field(static=True)
     step: Step
     y0: Y
 
     def zero_of(self, block: Block) -> list[_Value]:
         """Zero for each unknown stage of a block."""
 
-        def zero(group: tuple[int, ...]) -> _Value:
+        def zero(group: Group) -> _Value:
             first = self.plan.tableau.stages[group[0]]
+            # One stage alone is not stacked.
             stacked = (len(group),) if len(group) > 1 else ()
-            zeros = lambda x: jnp.zeros((*stacked, *jnp.shape(x)), jnp.result_type(x))
+
+            def zeros(x: Array) -> Array:
+                return jnp.zeros((*stacked, *jnp.shape(x)), jnp.result_type(x))
+
             return jtu.tree_map(zeros, _part(self.y0, first.writes))
 
         return [zero(group) for group in block.unknown]
 
-    def sweep(self, solve: Callable, guess: Unknown, pending):
-        """Sweeps for the stage equations, block by block, each with the values of earlier
-        blocks."""
-        values, y = {}, []
+    def solve_blocks(
+        self, solve: Callable, guess: Unknown, pending: Bool[Array, ""]
+    ) -> tuple[Unknown, Bool[Array, ""]]:
+        """The unknown values of all blocks, one block after another, each with the values
+        of earlier blocks; and whether all blocks are solved. `solve` is called as
+        `solve(image, scale, guess, pending)` and returns these for one block."""
+        values: Values = {}
+        unknown = []
         solved = jnp.array(True)
         for block, k in zip(self.plan.blocks, guess):
             if block.unknown:
-                pairs = all(type(x) is tuple and len(x) == 2 for x in k)
-                pack = lambda k, pairs=pairs: Halves(*zip(*k)) if pairs else k
-                unpack = lambda k, pairs=pairs: [*zip(*k)] if pairs else k
-                image = lambda k: pack(self._image(block, values, unpack(k)))
-                scale = lambda k: pack(self._scale(block, unpack(k)))
-                k, is_solved = solve(image, scale, pack(k), pending)
-                k, solved = unpack(k), solved & is_solved
-            y.append(k)
+                k, block_solved = self._solve_block(block, values, solve, k, pending)
+                solved = solved & block_solved
+            unknown.append(k)
             values = self._with_block(block, values, k, keep=True)
-        return y, solved
+        return unknown, solved
+
+    def _solve_block(
+        self,
+        block: Block,
+        known: Values,
+        solve: Callable,
+        guess: list[_Value],
+        pending: Bool[Array, ""],
+    ) -> tuple[list[_Value], Bool[Array, ""]]:
+        """The unknown values of one block, and whether they solve its equations."""
+        # For values that are pairs (p, q), sweeps update all momenta, then all positions.
+        pairs = all(type(value) is tuple and len(value) == 2 for value in guess)
+
+        def pack(k: list[_Value]) -> Any:
+            return Halves(*zip(*k)) if pairs else k
+
+        def unpack(k: Any) -> list[_Value]:
+            return [*zip(*k)] if pairs else k
+
+        def image(k: Any) -> Any:
+            return pack(self._image(block, known, unpack(k)))
+
+        def scale(k: Any) -> Any:
+            return pack(self._scale(block, unpack(k)))
+
+        k, solved = solve(image, scale, pack(guess), pending)
+        return unpack(k), solved
 
     def image(self, unknown: Unknown) -> Unknown:
         r"""$\Phi$ for the whole step."""
-        values, image = {}, []
+        values: Values = {}
+        image = []
         for block, k in zip(self.plan.blocks, unknown):
             image.append(self._image(block, values, k))
             values = self._with_block(block, values, k)
         return image
 
     def _image(self, block: Block, known: Values, k: list[_Value]) -> list[_Value]:
+        r"""$\Phi$ for the unknown values `k` of one block."""
         values = self._with_block(block, known, k)
         return [self._evaluate_group(group, values) for group in block.unknown]
 
@@ -93,10 +130,13 @@ class Stages(eqx.Module):
     ) -> Values:
         """`values` with the stages of a block added. With `keep`, explicit stages that
         enter several positions are computed only once."""
+        # A new dictionary each time: the root finder traces an iteration more than once,
+        # from the same known values.
         for group, value in zip(block.unknown, unknown):
             values = values | _unstack(group, value)
         for group in block.explicit:
             evaluate = ft.partial(self._evaluate_group, group, values)
+            # Within an iteration, storing a value costs as much as computing it again.
             shared = keep and _uses(self.plan.tableau, group) > 1
             new = materialize(evaluate) if shared else evaluate()
             values = values | _unstack(group, new)
@@ -104,7 +144,8 @@ class Stages(eqx.Module):
 
     def end(self, unknown: Unknown) -> Y:
         """The end of the step."""
-        values, tableau = {}, self.plan.tableau
+        tableau = self.plan.tableau
+        values: Values = {}
         for block, k in zip(self.plan.blocks, unknown):
             values = self._with_block(block, values, k, keep=True)
         return _position(self.y0, tableau.stages, tableau.weights[None], values)
@@ -114,46 +155,59 @@ class Stages(eqx.Module):
         return [self._scale(block, k) for block, k in zip(self.plan.blocks, unknown)]
 
     def _scale(self, block: Block, unknown: list[_Value]) -> list[_Value]:
-        def scale(group: tuple[int, ...], value: _Value) -> _Value:
+        def size(y: Array, k: Array) -> Array:
+            # Never below the value itself, so that a step from rest has a scale.
+            return jnp.abs(y) + jnp.abs(k)
+
+        def scale(group: Group, value: _Value) -> _Value:
             changed = _part(self.y0, self.plan.tableau.stages[group[0]].writes)
-            return jtu.tree_map(lambda y, k: jnp.abs(y) + jnp.abs(k), changed, value)
+            return jtu.tree_map(size, changed, value)
 
         return [scale(group, k) for group, k in zip(block.unknown, unknown)]
 
-    def _evaluate_group(self, group: tuple[int, ...], values: Values) -> _Value:
+    def _evaluate_group(self, group: Group, values: Values) -> _Value:
         """The values of stages of one kind, stacked unless there is only one."""
-        stages, matrix = self.plan.tableau.stages, self.plan.tableau.matrix
-        position = _position(self.y0, stages, matrix[list(group)], values)
-        return _evaluate(self.step, [stages[i] for i in group], position)
+        tableau = self.plan.tableau
+        rows = tableau.matrix[list(group)]
+        position = _position(self.y0, tableau.stages, rows, values)
+        return _evaluate(self.step, [tableau.stages[i] for i in group], position)
 
 
 def closed(step: Step, y0: Y) -> Step:
     """The same step, with the arrays that its functions capture made explicit. Each
     function is traced once, here."""
+    # Converted functions accept only the types that they were traced for.
     dtype = jnp.result_type(step.t0, step.h, float)
-    t0, h = jnp.asarray(step.t0, dtype), jnp.asarray(step.h, dtype)
-    close = lambda fn: eqx.filter_closure_convert(fn, t0, y0)
-    return Step(t0, h, {name: close(fn) for name, fn in step.driven.items()})
+    t0 = jnp.asarray(step.t0, dtype)
+    h = jnp.asarray(step.h, dtype)
+    driven = {
+        name: eqx.filter_closure_convert(fn, t0, y0) for name, fn in step.driven.items()
+    }
+    return Step(t0, h, driven)
 
 
-def _uses(tableau: FlatTableau, group: tuple[int, ...]) -> int:
+def _uses(tableau: FlatTableau, group: Group) -> int:
     """The number of positions that the values of `group` enter, including the end of the
     step."""
     columns = np.vstack([tableau.matrix, tableau.weights])[:, list(group)]
     return int(np.count_nonzero(columns.any(axis=1)))
 
 
-def _unstack(group: tuple[int, ...], value: _Value) -> dict[int, _Value]:
+def _unstack(group: Group, value: _Value) -> Values:
+    """The values of a group, one by one."""
     if len(group) == 1:
         return {group[0]: value}
-    return {i: jtu.tree_map(lambda v: v[j], value) for j, i in enumerate(group)}
+    return {
+        i: jtu.tree_map(lambda stacked: stacked[place], value)
+        for place, i in enumerate(group)
+    }
 
 
 def _evaluate(step: Step, stages: list[Stage], y: Y) -> _Value:
     """The values of stages of one kind at their positions `y`."""
     first = stages[0]
 
-    def value(c, y):
+    def value(c: RealScalarLike, y: Y) -> _Value:
         t = step.t0 + c * step.h
         total = tree_sum([step.driven[name](t, y) for name in first.channels])
         return _part(total, first.writes)
@@ -161,18 +215,20 @@ def _evaluate(step: Step, stages: list[Stage], y: Y) -> _Value:
     if len(stages) == 1:
         return value(first.c, y)
     # `vmap` keeps the compiled code as small as for one evaluation.
-    c = [stage.c for stage in stages]
-    if len(set(c)) == 1:
-        return jax.vmap(value, in_axes=(None, 0))(c[0], y)
-    return jax.vmap(value)(jnp.asarray(c, jnp.result_type(step.h, float)), y)
+    times = [stage.c for stage in stages]
+    if len(set(times)) == 1:
+        # What depends on time alone is then computed once.
+        return jax.vmap(value, in_axes=(None, 0))(times[0], y)
+    return jax.vmap(value)(jnp.asarray(times, jnp.result_type(step.h, float)), y)
 
 
 def _part(y: PyTree, part: str) -> PyTree:
+    """The state `y`, or its half `"p"` or `"q"`."""
     return y if part == "y" else y["pq".index(part)]
 
 
 def _position(
-    y0: Y, stages: tuple[Stage, ...], rows: np.ndarray, values: dict[int, _Value]
+    y0: Y, stages: tuple[Stage, ...], rows: np.ndarray, values: Values
 ) -> PyTree[Array]:
     """`y0 + sum_i rows[:, i] values[i]` over the known values, stacked unless there is only
     one row."""
@@ -181,23 +237,32 @@ def _position(
         column = rows[:, i]
         if len(column) == 1:
             weight = float(column[0])
+            # A product with one would stay in the program.
             return values[i] if weight == 1 else (weight * values[i] ** ω).ω
-        return jtu.tree_map(
-            lambda v: column.astype(v.dtype).reshape(-1, *[1] * v.ndim) * v, values[i]
-        )
+
+        def products(value: Array) -> Any:
+            one_axis_each = (-1, *[1] * value.ndim)
+            return column.astype(value.dtype).reshape(one_axis_each) * value
+
+        return jtu.tree_map(products, values[i])
+
+    def stack(x: Array) -> Array:
+        return jnp.broadcast_to(x, (len(rows), *jnp.shape(x)))
 
     def add(part: str) -> PyTree[Array]:
         base = _part(y0, part)
         total = None
         for i in values:
+            # Zeros are left out here, since XLA may not drop products with zero, which are
+            # not zero for infinite values.
             if rows[:, i].any() and stages[i].writes == part:
                 total = scaled(i) if total is None else (total**ω + scaled(i) ** ω).ω
         if total is None:
-            stack = lambda x: jnp.broadcast_to(x, (len(rows), *jnp.shape(x)))
             return base if len(rows) == 1 else jtu.tree_map(stack, base)
         # Add the small terms first, for fewer roundings at the size of the state.
         return (base**ω + total**ω).ω
 
+    # A tableau writes whole states, or halves of states, but not both.
     return add("y") if stages[0].writes == "y" else (add("p"), add("q"))
 
 
@@ -206,7 +271,7 @@ Solved: TypeAlias = optx.RESULTS | None
 
 
 def take_step(
-    plan: Plan,
+    plan: StepPlan,
     step: Step,
     y0: Y,
     solver: diffrax.AbstractSolver,
@@ -215,18 +280,21 @@ def take_step(
     """The end of the step, and whether its stage equations were solved, by the root finder
     of `solver`. A path that failed `before` is skipped."""
     if plan.num_unknown == 0:
-        return Stages(plan, step, y0).end([[]] * len(plan.blocks)), before
+        nothing = [[]] * len(plan.blocks)
+        return Stages(plan, step, y0).end(nothing), before
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         raise ValueError(
             f"The tableau of `{type(solver).__name__}` has implicit stages. Let the class "
             "also inherit from `diffrax_symplectic.AbstractImplicitStages`."
         )
     before = no_failure() if before is None else before
-    finder, most = solver.root_finder, solver.root_find_max_steps
-    return _traced_once(plan, step, y0, before, finder, most)
+    return _traced_once(
+        plan, step, y0, before, solver.root_finder, solver.root_find_max_steps
+    )
 
 
 def no_failure() -> optx.RESULTS:
+    """The result before the first step, as arrays, since it is carried by a loop."""
     return jtu.tree_map(jnp.asarray, optx.RESULTS.successful)
 
 
@@ -237,6 +305,7 @@ def _failed(result: optx.RESULTS) -> Bool[Array, ""]:
 def result_of(solved: Solved, y1: Y) -> diffrax.RESULTS:
     """The result of a step."""
     R = diffrax.RESULTS
+    # Finite stages may still have an end that overflows.
     finite = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
     if solved is None:
         return finite
@@ -245,7 +314,9 @@ def result_of(solved: Solved, y1: Y) -> diffrax.RESULTS:
 
 # Diffrax traces a step three times or more.
 @eqx.filter_jit
-def _traced_once(plan: Plan, step: Step, y0: Y, before, finder: Any, max_steps: int):
+def _traced_once(
+    plan: StepPlan, step: Step, y0: Y, before, finder: Any, max_steps: int
+):
     stages = Stages(plan, closed(step, y0), y0)
     y1, _, solved = _implicit_step(stages, before, finder=finder, max_steps=max_steps)
     return y1, solved
@@ -272,7 +343,8 @@ def _implicit_step(
         finder,
         guess,
         args=stages,
-        options=dict(scale=stages.scale, sweep=Stages.sweep),
+        # Root finders of other packages ignore options that they do not know.
+        options=dict(scale=stages.scale, solve_blocks=Stages.solve_blocks),
         max_steps=max_steps,
         throw=False,
     )
@@ -282,7 +354,8 @@ def _implicit_step(
 
 @_implicit_step.def_jvp
 def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
-    (stages, before), (t_stages, _) = primals, tangents
+    stages, before = primals
+    t_stages, _ = tangents
     y1, unknown, result = _implicit_step(
         stages, before, finder=finder, max_steps=max_steps
     )
@@ -291,17 +364,26 @@ def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
     failed = _failed(result) | ~all_finite(y1)
     root = jtu.tree_map(lambda k: jnp.where(failed, 0, k), unknown)
 
-    is_none = lambda x: x is None
-    fixed = jtu.tree_map(is_none, t_stages, is_leaf=is_none)
-    still, moving = eqx.partition(stages, fixed, is_leaf=is_none)
-    along = lambda fn: jax.jvp(
-        lambda x: fn(eqx.combine(x, still), root), (moving,), (t_stages,)
-    )[1]
-    rhs = along(Stages.image)
+    # What is not differentiated has `None` for a tangent, which `jax.jvp` does not take.
+    fixed = jtu.tree_map(_is_none, t_stages, is_leaf=_is_none)
+    still, moving = eqx.partition(stages, fixed, is_leaf=_is_none)
+
+    def image(moving: Stages) -> Unknown:
+        return eqx.combine(moving, still).image(root)
+
+    def end(moving: Stages, unknown: Unknown) -> Y:
+        return eqx.combine(moving, still).end(unknown)
+
+    # With k = Phi(k, x): dk = (dPhi / dk) dk + (dPhi / dx) dx.
+    _, rhs = jax.jvp(image, (moving,), (t_stages,))
     _, linear = jax.linearize(stages.image, root)
+    # `PicardNewton` has such a solver; those of others are not asked for derivatives.
     t_unknown = differentiate(getattr(finder, "linear_solver", None), linear, rhs)
-    end = lambda x, k: eqx.combine(x, still).end(k)
     _, t_y1 = jax.jvp(end, (moving, root), (t_stages, t_unknown))
     t_y1, t_unknown = jtu.tree_map(lambda t: jnp.where(failed, 0, t), (t_y1, t_unknown))
     no_tangent = jtu.tree_map(lambda _: None, result)
     return (y1, unknown, result), (t_y1, t_unknown, no_tangent)
+
+
+def _is_none(x: Any) -> bool:
+    return x is None

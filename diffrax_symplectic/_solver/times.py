@@ -24,7 +24,8 @@ _OUTSIDE = (
 
 def check_resolution(h: float, t0: float, t1: float, dtype: Any) -> None:
     """Raises a `ValueError` if `result_at` would report steps of this size as failed."""
-    if h < ROUNDINGS * float(jnp.finfo(dtype).eps) * max(abs(t0), abs(t1)):
+    rounding = float(jnp.finfo(dtype).eps) * max(abs(t0), abs(t1))
+    if h < ROUNDINGS * rounding:
         raise ValueError(
             f"Steps of {h:g} are shorter than {ROUNDINGS} times the rounding of the time "
             f"in {dtype} at t0={t0} and t1={t1}. Call `jax.config.update("
@@ -41,18 +42,25 @@ def result_at(
     """`result` of the step from `t0` to `t1`, or `RESULTS.dt_min_reached` if it is too
     short for the rounding of times. An error when run if a path does not cover the step."""
     R: Any = diffrax.RESULTS
-    t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
-    h, eps = t1 - t0, float(jnp.finfo(jnp.result_type(t0, jnp.float32)).eps)
+    t0 = jnp.asarray(t0)
+    t1 = jnp.asarray(t1)
+    h = t1 - t0
+    # The times of a single step may be integers.
+    eps = float(jnp.finfo(jnp.result_type(t0, jnp.float32)).eps)
     short = h < ROUNDINGS * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     result = R.where(short, R.dt_min_reached, result)
     for path in brownian_paths(terms):
-        numbers = isinstance(path.t0, float) and isinstance(path.t1, float)
-        if numbers and (path.t0, path.t1) == (-np.inf, np.inf):
+        # Most paths have no ends, so that nothing needs to be checked when run. Ends that
+        # are traced arrays cannot be compared here.
+        known = isinstance(path.t0, float) and isinstance(path.t1, float)
+        if known and path.t0 == -np.inf and path.t1 == np.inf:
             continue
         # In a solve backward in time Diffrax changes the sign of all times.
         forward = direction(terms) > 0
-        begin, end = jnp.where(forward, t0, -t1), jnp.where(forward, t1, -t0)
-        slack = 0.01 * h  # for rounded times
+        begin = jnp.where(forward, t0, -t1)
+        end = jnp.where(forward, t1, -t0)
+        # Times are rounded, so that the last step may end just behind the path.
+        slack = 0.01 * h
         outside = (begin < path.t0 - slack) | (end > path.t1 + slack)
         result = eqx.error_if(result, outside, _OUTSIDE)
     return result

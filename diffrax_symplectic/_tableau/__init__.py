@@ -5,7 +5,12 @@ from .conditions import (
     symplectic_residuals as symplectic_residuals,
     weak_order_residuals as weak_order_residuals,
 )
-from .plan import Block as Block, make_plan as make_plan, Plan as Plan
+from .plan import (
+    Block as Block,
+    Group as Group,
+    make_plan as make_plan,
+    StepPlan as StepPlan,
+)
 from .tableau import (
     AbstractTableau as AbstractTableau,
     AdditiveTableau as AdditiveTableau,

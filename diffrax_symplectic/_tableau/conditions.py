@@ -4,6 +4,7 @@ import dataclasses
 import functools as ft
 import itertools
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +18,11 @@ from .tableau import (
     PartitionedTableau,
     SeparableTableau,
 )
+
+
+# Coefficients such as those of the Gauss methods are rounded, and sums of their products
+# more so; a wrong coefficient misses a condition by far more.
+_ROUNDING = 1e-12
 
 
 def symplectic_residuals(tableau: AbstractTableau) -> Float[np.ndarray, "s s"]:
@@ -38,6 +44,8 @@ def symplectic_residuals(tableau: AbstractTableau) -> Float[np.ndarray, "s s"]:
     """
     flat = tableau.flatten()
     weighted = flat.weights[:, None] * flat.matrix
+    # Quadratic invariants are conserved if these vanish. A pair of stages contributes only
+    # if each reads what the other writes: otherwise its term is no function of both.
     residuals = np.outer(flat.weights, flat.weights) - weighted - weighted.T
     return np.where(flat.reads & flat.reads.T, residuals, 0.0)
 
@@ -69,8 +77,8 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     """
     if order not in (1, 2):
         raise ValueError(f"`order` must be 1 or 2; got {order!r}.")
-    first, second = _weak(tableau)
-    conditions = first if order == 1 else first | second
+    weak = _weak(tableau)
+    conditions = weak.first if order == 1 else weak.first | weak.second
     return {name: float(value) for name, value in conditions.items()}
 
 
@@ -101,21 +109,26 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
 def drift_order(tableau: FlatTableau) -> int:
     """The order without noise, up to 4, by Butcher's conditions for each part of the state
     that the stages write."""
-    drift = [i for i, s in enumerate(tableau.stages) if s.channels == ("h",)]
+    drift = [i for i, stage in enumerate(tableau.stages) if stage.channels == ("h",)]
     flat = tableau.take(drift)
+    writes = np.array([stage.writes for stage in flat.stages])
+    # Coefficients of values that a stage does not read belong to no rooted tree.
     M = np.where(flat.reads, flat.matrix, 0.0)
-    e, writes = np.ones(len(drift)), np.array([s.writes for s in flat.stages])
+    e = np.ones(len(drift))
     c = M @ e
+    # For each order its rooted trees, and the exact value of their weighted sum.
     conditions = (
         [(e, 1)],
         [(c, 1 / 2)],
         [(c**2, 1 / 3), (M @ c, 1 / 6)],
         [(c**3, 1 / 4), (c * (M @ c), 1 / 8), (M @ c**2, 1 / 12), (M @ M @ c, 1 / 24)],
     )
-    for order, of_this_order in enumerate(conditions):
-        for (x, exact), part in itertools.product(of_this_order, set(writes)):
-            of = writes == part
-            if abs(flat.weights[of] @ x[of] - exact) > 1e-12:
+    for order, trees in enumerate(conditions):
+        for (tree, exact), part in itertools.product(trees, set(writes)):
+            # Momenta and positions have weights of their own, and each part its condition.
+            in_part = writes == part
+            value = flat.weights[in_part] @ tree[in_part]
+            if abs(value - exact) > _ROUNDING:
                 return order
     return len(conditions)
 
@@ -154,30 +167,51 @@ def _(tableau: PartitionedTableau) -> dict:
 
 @_strong.register
 def _(tableau: AdditiveTableau) -> dict:
-    first, second = _weak(tableau)
-    al, c1 = tableau.alpha, tableau.c1
-    B_H = tableau.B.get("H", np.zeros((len(al), len(c1))))
+    weak = _weak(tableau)
+    alpha = tableau.alpha
+    c1 = tableau.c1
+    # Without the space-time area its conditions fail, which is the right answer.
+    B_H = tableau.B.get("H", np.zeros((len(alpha), len(c1))))
     beta_H = tableau.beta.get("H", np.zeros(len(c1)))
+    # For additive noise the expansions agree up to the integrals of order 3/2.
     return {
-        **first,
-        **second,
-        "alpha.B[H]e - 1": al @ B_H.sum(axis=1) - 1,
+        **weak.first,
+        **weak.second,
+        "alpha.B[H]e - 1": alpha @ B_H.sum(axis=1) - 1,
         "beta[W].c1 - 1/2": tableau.beta["W"] @ c1 - 1 / 2,
         "beta[H].c1 + 1": beta_H @ c1 + 1,
     }
 
 
+class _Weak(NamedTuple):
+    """Conditions for a weak order, from their formulas to their residuals.
+
+    - `first`: those for order 1.
+    - `second`: the additional ones for order 2.
+    """
+
+    first: dict
+    second: dict
+
+
 @ft.singledispatch
-def _weak(tableau: AbstractTableau) -> tuple[dict, dict]:
-    """The conditions for weak order 1, and the additional conditions for order 2."""
+def _weak(tableau: AbstractTableau) -> _Weak:
+    """The conditions for the weak order of the tableau's family."""
     raise _unknown(tableau)
 
 
 @_weak.register
-def _(tableau: GeneralTableau) -> tuple[dict, dict]:
-    al, be = tableau.alpha, tableau.beta
-    A0, A1, B0, B1 = tableau.A0, tableau.A1, tableau.B0, tableau.B1
-    A0e, A1e, B0e, B1e = (x.sum(axis=1) for x in (A0, A1, B0, B1))
+def _(tableau: GeneralTableau) -> _Weak:
+    # Short names, for formulas that can be compared with their keys.
+    al = tableau.alpha
+    be = tableau.beta
+    A1 = tableau.A1
+    B0 = tableau.B0
+    B1 = tableau.B1
+    A0e = tableau.A0.sum(axis=1)
+    A1e = A1.sum(axis=1)
+    B0e = B0.sum(axis=1)
+    B1e = B1.sum(axis=1)
     # The expectation of the double brackets: E L_kl = h^2 delta_kl / 12 times
     # [b, [b, a]] = a''bb + a'b'b - b''ba - 2 b'a'b + b'b'a.
     brackets = "drift brackets" in map(drives, tableau.noise)
@@ -203,12 +237,13 @@ def _(tableau: GeneralTableau) -> tuple[dict, dict]:
         "beta.((A1e)(B1e)) - 1/4": be @ (A1e * B1e) - 1 / 4 - L,
         "beta.B1(A1e) - 1/4": be @ B1 @ A1e - 1 / 4 + L,
     }
-    return first, second
+    return _Weak(first, second)
 
 
 @_weak.register
-def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
-    be, A1 = tableau.beta["W"], tableau.A1
+def _(tableau: PartitionedTableau) -> _Weak:
+    be = tableau.beta["W"]
+    A1 = tableau.A1
     B0e = {name: B0.sum(axis=1) for name, B0 in tableau.B0.items()}
     first = {
         "alpha.e - 1": tableau.alpha.sum() - 1,
@@ -216,9 +251,17 @@ def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
         "(beta.e)^2 - 1": be.sum() ** 2 - 1,
         **_others_vanish(tableau.beta, e=np.ones(len(A1))),
     }
-    squares = sum(_variance(v) * (tableau.alpha_hat @ x**2) for v, x in B0e.items())
-    both = [v for v in B0e if v in tableau.beta]
-    products = sum(_variance(v) * (tableau.beta[v] @ A1 @ B0e[v]) for v in both)
+    # The random variables of a step are independent, so the mean of a product of two
+    # vanishes unless they are the same.
+    squares = sum(
+        _variance(name) * (tableau.alpha_hat @ row_sums**2)
+        for name, row_sums in B0e.items()
+    )
+    products = sum(
+        _variance(name) * (tableau.beta[name] @ A1 @ row_sums)
+        for name, row_sums in B0e.items()
+        if name in tableau.beta
+    )
     second = {
         "alpha.A_hat e - 1/2": tableau.alpha @ tableau.A_hat.sum(axis=1) - 1 / 2,
         "alpha_hat.Ae - 1/2": tableau.alpha_hat @ tableau.A.sum(axis=1) - 1 / 2,
@@ -228,40 +271,45 @@ def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
         "(beta.e)(beta.A1e) - 1/2": be.sum() * (be @ A1.sum(axis=1)) - 1 / 2,
         "sum over variables: variance beta.A1(B0e)": products,
     }
-    return first, second
+    return _Weak(first, second)
 
 
 @_weak.register
-def _(tableau: SeparableTableau) -> tuple[dict, dict]:
+def _(tableau: SeparableTableau) -> _Weak:
     """With conditions on the paper's other random variables, which depend on `W`."""
-    B0 = {"W": tableau.B0["W"]}
-    partitioned = dataclasses.replace(tableau.partitioned(), B0=B0)
-    first, second = _weak(partitioned)
+    # The sums over independent variables above hold for `W` alone. For the others the paper
+    # has conditions of its own.
+    only_W = {"W": tableau.B0["W"]}
+    weak = _weak(dataclasses.replace(tableau.partitioned(), B0=only_W))
     B0e = tableau.B0["W"].sum(axis=1)
-    return first, second | {
-        "beta.A1((B0e)^2)": tableau.beta["W"] @ tableau.A1 @ B0e**2,
-        **_others_vanish(
-            tableau.beta, A1e=tableau.A1.sum(axis=1), **{"A1(B0e)": tableau.A1 @ B0e}
-        ),
-    }
+    # Not an identifier, so no keyword.
+    moments = {"A1e": tableau.A1.sum(axis=1), "A1(B0e)": tableau.A1 @ B0e}
+    others = _others_vanish(tableau.beta, **moments)
+    third_moment = {"beta.A1((B0e)^2)": tableau.beta["W"] @ tableau.A1 @ B0e**2}
+    return _Weak(weak.first, weak.second | third_moment | others)
 
 
 @_weak.register
-def _(tableau: AdditiveTableau) -> tuple[dict, dict]:
-    al, B = tableau.alpha, {k: v.sum(axis=1) for k, v in tableau.B.items()}
-    first = {"alpha.e - 1": al.sum() - 1}
+def _(tableau: AdditiveTableau) -> _Weak:
+    alpha = tableau.alpha
+    Be = {name: B.sum(axis=1) for name, B in tableau.B.items()}
+    first = {"alpha.e - 1": alpha.sum() - 1}
     for name, weights in tableau.beta.items():
+        # Any variable but the increment itself must not enter constant noise at all.
         exact = 1 if name == "W" else 0
         first[f"beta[{name}].e - {exact}"] = weights.sum() - exact
-    squares = sum(_variance(name) * (al @ Be**2) for name, Be in B.items())
+    squares = sum(
+        _variance(name) * (alpha @ row_sums**2) for name, row_sums in Be.items()
+    )
     second = {
-        "alpha.Ae - 1/2": al @ tableau.A.sum(axis=1) - 1 / 2,
-        "alpha.B[W]e - 1/2": al @ B["W"] - 1 / 2,
+        "alpha.Ae - 1/2": alpha @ tableau.A.sum(axis=1) - 1 / 2,
+        "alpha.B[W]e - 1/2": alpha @ Be["W"] - 1 / 2,
         "sum over variables: variance alpha.(Be)^2 - 1/2": squares - 1 / 2,
     }
+    # The times at which constant noise is evaluated do not matter.
     if not tableau.constant:
         second["beta[W].c1 - 1/2"] = tableau.beta["W"] @ tableau.c1 - 1 / 2
-    return first, second
+    return _Weak(first, second)
 
 
 def _others_vanish(beta: Mapping[str, np.ndarray], **moments: np.ndarray) -> dict:
@@ -276,9 +324,14 @@ def _others_vanish(beta: Mapping[str, np.ndarray], **moments: np.ndarray) -> dic
 
 def _variance(name: str) -> float:
     """The variance of a random variable of a step, in units of the step's size."""
+    # A tableau may have variables that are not known here, for a path of the user's own.
     variable = VARIABLES.get(name)
     if variable is None or variable.variance is None:
-        known = [name for name, x in VARIABLES.items() if x.variance is not None]
+        known = [
+            other
+            for other, described in VARIABLES.items()
+            if described.variance is not None
+        ]
         raise ValueError(
             f"The conditions are known for the random variables {', '.join(known)}; got a "
             f"tableau with `{name}`. To measure the order of any solver use "
@@ -287,7 +340,7 @@ def _variance(name: str) -> float:
     return variable.variance
 
 
-def _unknown(tableau) -> ValueError:
+def _unknown(tableau: AbstractTableau) -> ValueError:
     return ValueError(
         "The conditions are known for `GeneralTableau`, `SeparableTableau`, "
         f"`PartitionedTableau` and `AdditiveTableau`; got `{type(tableau).__name__}`."
@@ -295,7 +348,10 @@ def _unknown(tableau) -> ValueError:
 
 
 # The controls that change sign when a step is reversed.
-_NEGATED = {"h", *(name for name, variable in VARIABLES.items() if not variable.even)}
+_NEGATED = {
+    "h",
+    *(name for name, variable in VARIABLES.items() if not variable.even),
+}
 
 
 def is_own_inverse(tableau: FlatTableau) -> bool:
@@ -305,27 +361,30 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
     $$a_{ij} + a_{\sigma(i)\sigma(j)} = b_j, \qquad b_{\sigma(j)} = b_j, \qquad
       c_i + c_{\sigma(i)} = 1.$$
     """
-    stages, b = tableau.stages, tableau.weights
-    if not {c for stage in stages for c in stage.channels} <= _NEGATED:
+    channels = {name for stage in tableau.stages for name in stage.channels}
+    # Even random variables keep their sign in a step back, so they are no negated controls.
+    if not channels <= _NEGATED:
         return False
-
-    def partners(i: int) -> list[int]:
-        this = stages[i]
-        return [
-            j
-            for j, that in enumerate(stages)
-            if (that.channels, that.reads, that.writes)
-            == (this.channels, this.reads, this.writes)
-            # In a separable system, functions of p do not depend on time.
-            and (this.reads == "p" or np.isclose(that.c, 1 - this.c))
-            and np.isclose(b[i], b[j])
-        ]
-
-    for sigma in itertools.product(*map(partners, range(len(stages)))):
+    # Few stages have more than one partner, so that few pairings are tried.
+    partners = [_partners(tableau, i) for i in range(len(tableau.stages))]
+    for sigma in itertools.product(*partners):
         paired = all(sigma[j] == i for i, j in enumerate(sigma))
         both = tableau.matrix + tableau.matrix[np.ix_(sigma, sigma)]
         # Ignore coefficients of values that a stage does not read.
-        wrong = np.where(tableau.reads, both - b, 0)
-        if paired and np.allclose(wrong, 0, atol=1e-12):
+        wrong = np.where(tableau.reads, both - tableau.weights, 0)
+        if paired and np.allclose(wrong, 0, atol=_ROUNDING):
             return True
     return False
+
+
+def _partners(tableau: FlatTableau, i: int) -> list[int]:
+    """The stages that may be paired with stage `i`, by their kinds, times and weights."""
+    this = tableau.stages[i]
+    partners = []
+    for j, other in enumerate(tableau.stages):
+        # In a separable system, functions of p do not depend on time.
+        mirrored = this.reads == "p" or np.isclose(other.c, 1 - this.c)
+        same_weight = np.isclose(tableau.weights[i], tableau.weights[j])
+        if other.kind == this.kind and mirrored and same_weight:
+            partners.append(j)
+    return partners

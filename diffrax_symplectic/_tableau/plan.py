@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from jaxtyping import Bool
 
 from .tableau import FlatTableau, Stage
 
@@ -16,12 +17,16 @@ from .tableau import FlatTableau, Stage
 # Coefficients are exact up to a few roundings of numbers of order one.
 _TOLERANCE = 1e-14
 # The smallest set of unknown stages of a block is found by trying all sets, up to a size
-# with more than this many choices.
+# with more than this many choices. Twelve stages are always searched exhaustively. No
+# tableau of this package has a block with more than six, so the bound serves only to keep
+# an unusual tableau from taking minutes.
 _MOST_CHOICES = 1000
 
 
-# Stages of one kind that can be evaluated together.
+# Stages of one kind that can be evaluated together, by their numbers.
 Group: TypeAlias = tuple[int, ...]
+# Entry `i, j` says whether stage `i` depends on the value of stage `j`.
+_Dependencies: TypeAlias = Bool[np.ndarray, "s s"]
 
 
 class Block(NamedTuple):
@@ -39,8 +44,9 @@ class Block(NamedTuple):
     explicit: tuple[Group, ...]
 
 
+# Compared by identity, which is fast and enough: `make_plan` makes equal plans only once.
 @dataclasses.dataclass(frozen=True, eq=False)
-class Plan:
+class StepPlan:
     """The distinct stages that a tableau uses, in blocks to be solved in order."""
 
     tableau: FlatTableau
@@ -52,41 +58,61 @@ class Plan:
         return sum(len(group) for block in self.blocks for group in block.unknown)
 
 
-def make_plan(tableau: FlatTableau) -> Plan:
+def make_plan(tableau: FlatTableau) -> StepPlan:
     """Drops unused stages, merges equal ones, and orders the rest. Equal tableaus share one
     plan, the same object in every trace."""
-    as_bytes = lambda x: np.asarray(x, np.float64).tobytes()
+    # A plan is static data of a traced step, so that a new object would be a new trace. As
+    # bytes, unlike as arrays, coefficients are hashable.
     return _make_plan(
-        tableau.stages, as_bytes(tableau.matrix), as_bytes(tableau.weights)
+        tableau.stages,
+        np.asarray(tableau.matrix, np.float64).tobytes(),
+        np.asarray(tableau.weights, np.float64).tobytes(),
     )
 
 
+# Solvers with free parameters have a tableau for each value of these, so that a search over
+# parameters would fill an unbounded cache.
 @ft.lru_cache(maxsize=1024)
-def _make_plan(stages: tuple[Stage, ...], matrix: bytes, weights: bytes) -> Plan:
-    read = lambda data: np.frombuffer(data, np.float64)
-    s = len(stages)
-    tableau = FlatTableau(stages, read(matrix).reshape(s, s), read(weights))
-    previous = None
-    # Ignore coefficients of values that a stage does not read.
+def _make_plan(stages: tuple[Stage, ...], matrix: bytes, weights: bytes) -> StepPlan:
+    num_stages = len(stages)
+    tableau = FlatTableau(
+        stages=stages,
+        matrix=np.frombuffer(matrix, np.float64).reshape(num_stages, num_stages),
+        weights=np.frombuffer(weights, np.float64),
+    )
+    # Coefficients of values that a stage does not read would count as dependencies.
     masked = np.where(tableau.reads, tableau.matrix, 0.0)
     tableau = dataclasses.replace(tableau, matrix=_snap(masked))
+    # Each of the three can make more work for the others: stages that become equal once
+    # others were dropped, or weights that cancel once stages were merged.
+    previous = None
     while previous is None or len(tableau.stages) < len(previous.stages):
         previous = tableau
         tableau = _merge(tableau, same_channels=True)
         tableau = _live(tableau)
+        # Last, since a stage whose weight cancels would keep others from being merged.
         tableau = _merge(tableau, same_channels=False)
-    return Plan(tableau, _blocks(tableau))
+    return StepPlan(tableau, _blocks(tableau))
 
 
 def _snap(x: np.ndarray | np.floating) -> np.ndarray:
+    """`x`, with numbers that are zero up to rounding set to zero: any other coefficient
+    counts as a dependency."""
     return np.where(np.abs(x) < _TOLERANCE, 0.0, x)
+
+
+def _equal(x: np.ndarray | float, y: np.ndarray | float) -> bool:
+    """Whether coefficients are equal up to rounding."""
+    return np.allclose(x, y, rtol=0, atol=_TOLERANCE)
 
 
 def _live(tableau: FlatTableau) -> FlatTableau:
     """Keeps the stages that the end of the step depends on."""
+    depends = tableau.matrix != 0
     live = tableau.weights != 0
+    # No chain of dependencies is longer than the number of stages.
     for _ in tableau.stages:
-        live = live | (live @ (tableau.matrix != 0))
+        live = live | (live @ depends)
     return tableau.take(np.flatnonzero(live).tolist())
 
 
@@ -96,61 +122,92 @@ def _merge(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
     With the same channels they have the same value, and their coefficients are added. With
     different channels they can be merged if they always enter together.
     """
-    stages, matrix, weights = tableau.stages, tableau.matrix, tableau.weights
-    for i, j in itertools.combinations(range(len(stages)), 2):
-        a, b = stages[i], stages[j]
-        same_point = (
-            (a.reads, a.writes) == (b.reads, b.writes)
-            and np.isclose(a.c, b.c, rtol=0, atol=_TOLERANCE)
-            and np.allclose(matrix[i], matrix[j], rtol=0, atol=_TOLERANCE)
-        )
-        if not same_point or (a.channels == b.channels) != same_channels:
+    for i, j in itertools.combinations(range(len(tableau.stages)), 2):
+        channels_agree = tableau.stages[i].channels == tableau.stages[j].channels
+        if channels_agree != same_channels or not _same_point(tableau, i, j):
             continue
         if same_channels:
-            matrix, weights = matrix.copy(), weights.copy()
-            matrix[:, i] = _snap(matrix[:, i] + matrix[:, j])
-            weights[i] = _snap(weights[i] + weights[j])
-            merged = a
+            merged = _added(tableau, i, j)
+        elif _same_use(tableau, i, j):
+            merged = _driven_by_both(tableau, i, j)
         else:
-            same_use = np.allclose(
-                np.append(matrix[:, i], weights[i]),
-                np.append(matrix[:, j], weights[j]),
-                rtol=0,
-                atol=_TOLERANCE,
-            )
-            if not same_use:
-                continue
-            merged = a._replace(channels=a.channels + b.channels)
-        stages = stages[:i] + (merged,) + stages[i + 1 :]
-        keep = [k for k in range(len(stages)) if k != j]
+            continue
         # Merge one pair at a time: the merged stage may equal another.
-        return _merge(FlatTableau(stages, matrix, weights).take(keep), same_channels)
+        return _merge(merged, same_channels)
     return tableau
+
+
+def _same_point(tableau: FlatTableau, i: int, j: int) -> bool:
+    """Whether two stages evaluate their vector fields at the same time and state, for the
+    same part of the state."""
+    first = tableau.stages[i]
+    second = tableau.stages[j]
+    return (
+        (first.reads, first.writes) == (second.reads, second.writes)
+        and _equal(first.c, second.c)
+        and _equal(tableau.matrix[i], tableau.matrix[j])
+    )
+
+
+def _same_use(tableau: FlatTableau, i: int, j: int) -> bool:
+    """Whether the values of two stages enter everything with the same coefficients."""
+    in_stages = _equal(tableau.matrix[:, i], tableau.matrix[:, j])
+    return in_stages and _equal(tableau.weights[i], tableau.weights[j])
+
+
+def _added(tableau: FlatTableau, i: int, j: int) -> FlatTableau:
+    """The tableau without stage `j`, whose coefficients are added to those of `i`."""
+    matrix = tableau.matrix.copy()
+    weights = tableau.weights.copy()
+    # A sum that should vanish may not in floating point: 0.1 + 0.2 - 0.3 is not 0.
+    matrix[:, i] = _snap(matrix[:, i] + matrix[:, j])
+    weights[i] = _snap(weights[i] + weights[j])
+    added = dataclasses.replace(tableau, matrix=matrix, weights=weights)
+    return _without(added, j)
+
+
+def _driven_by_both(tableau: FlatTableau, i: int, j: int) -> FlatTableau:
+    """The tableau without stage `j`, whose channels drive stage `i` as well."""
+    channels = tableau.stages[i].channels + tableau.stages[j].channels
+    stages = list(tableau.stages)
+    stages[i] = stages[i]._replace(channels=channels)
+    return _without(dataclasses.replace(tableau, stages=tuple(stages)), j)
+
+
+def _without(tableau: FlatTableau, j: int) -> FlatTableau:
+    return tableau.take([i for i in range(len(tableau.stages)) if i != j])
 
 
 def _blocks(tableau: FlatTableau) -> tuple[Block, ...]:
     """Strongly connected components of the dependencies, dependencies first."""
-    n = len(tableau.stages)
+    num_stages = len(tableau.stages)
     depends = tableau.matrix != 0
+    # The transitive closure by Warshall's algorithm: after round k, all chains through the
+    # first k stages are known.
     reach = depends
-    for k in range(n):
+    for k in range(num_stages):
         reach = reach | (reach[:, k, None] & reach[k])
-    closed = reach | np.eye(n, dtype=bool)
+    # Each stage reaches itself, so that an explicit stage is a component of its own.
+    closed = reach | np.eye(num_stages, dtype=bool)
     mutual = closed & closed.T
     components = {tuple(np.flatnonzero(row).tolist()) for row in mutual}
     # A block depends on fewer stages than any block that depends on it.
     ordered = sorted(components, key=lambda block: (closed[block[0]].sum(), block))
-    blocks = []
-    for component in ordered:
-        unknown, rounds = _cut(component, depends)
-        explicit = [group for ready in rounds for group in _groups(ready, tableau)]
-        groups = _groups(unknown, tableau)
-        if len(groups) > 1:
-            # Stages of other kinds would unstack the values again: without stacking, an
-            # iteration of five stages takes a third less time.
-            groups = tuple((i,) for group in groups for i in group)
-        blocks.append(Block(groups, tuple(explicit)))
-    return tuple(blocks)
+    return tuple(_as_block(component, depends, tableau) for component in ordered)
+
+
+def _as_block(
+    component: tuple[int, ...], depends: _Dependencies, tableau: FlatTableau
+) -> Block:
+    """The block of the stages `component`, which depend on each other."""
+    cut = _cut(component, depends)
+    unknown = _groups(cut.unknown, tableau)
+    if len(unknown) > 1:
+        # Stages of other kinds would unstack the values again: without stacking, an
+        # iteration of five stages takes a third less time.
+        unknown = tuple((i,) for group in unknown for i in group)
+    explicit = [group for ready in cut.rounds for group in _groups(ready, tableau)]
+    return Block(unknown, tuple(explicit))
 
 
 def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
@@ -158,32 +215,36 @@ def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
     groups: dict[tuple, list[int]] = {}
     for i in stages:
         groups.setdefault(tableau.stages[i].kind, []).append(i)
-    return tuple(map(tuple, groups.values()))
+    return tuple(tuple(group) for group in groups.values())
 
 
-def _cut(
-    block: tuple[int, ...], depends: np.ndarray
-) -> tuple[tuple[int, ...], list[list[int]]]:
-    """Stages whose removal breaks all dependency cycles, and the rounds in which the other
-    stages can then be evaluated. As few as possible, unless there are many choices."""
-    for size in range(len(block) + 1):
+class _Cut(NamedTuple):
+    """A block with its dependency cycles broken.
+
+    - `unknown`: the stages whose removal breaks all cycles.
+    - `rounds`: the rounds in which the other stages can then be evaluated.
+    """
+
+    unknown: tuple[int, ...]
+    rounds: list[list[int]]
+
+
+def _cut(block: tuple[int, ...], depends: _Dependencies) -> _Cut:
+    """The smallest cut of a block. If there are too many choices, all stages are unknown:
+    these equations have the same solution, but more of them are solved."""
+    for size in range(len(block)):
         if math.comb(len(block), size) > _MOST_CHOICES:
             break
         for unknown in itertools.combinations(block, size):
             rounds = _rounds([i for i in block if i not in unknown], depends)
             if rounds is not None:
-                return unknown, rounds
-    # Make stages explicit unless that closes a cycle, fewest neighbours first.
-    links = depends | depends.T
-    explicit, rounds = [], []
-    for i in sorted(block, key=lambda i: links[i, list(block)].sum()):
-        new = _rounds(sorted([*explicit, i]), depends)
-        if new is not None:
-            explicit, rounds = [*explicit, i], new
-    return tuple(i for i in block if i not in explicit), rounds
+                return _Cut(unknown, rounds)
+    return _Cut(block, [])
 
 
-def _rounds(stages: list[int], depends: np.ndarray) -> list[list[int]] | None:
+def _rounds(stages: Sequence[int], depends: _Dependencies) -> list[list[int]] | None:
+    """Stages in rounds, each of which depends on no stage of its own or a later round.
+    `None` if they depend on each other in a cycle."""
     rounds = []
     rest = list(stages)
     while rest:

@@ -14,9 +14,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 
-# The Hamiltonians that coefficients apply to: any; `H0 = V(p) + U(t, q)` and `H_k = U_k(t,
-# q)`; noise independent of the state; noise independent of state and time; the second and
-# fourth together.
+# The Hamiltonians that coefficients apply to:
+# - "any";
+# - "separable": `H0 = V(p) + U(t, q)` and `H_k = U_k(t, q)`;
+# - "additive": noise independent of the state;
+# - "constant": noise independent of state and time;
+# - "separable and constant".
 Structure: TypeAlias = Literal[
     "any", "separable", "additive", "constant", "separable and constant"
 ]
@@ -32,6 +35,8 @@ class Stage(NamedTuple):
     - `writes`: the part of the state it changes, `"y"`, `"p"` or `"q"`.
     """
 
+    # Channels are names, not vector fields, so that a tableau can be made, compared and
+    # tested before there are any terms.
     channels: tuple[str, ...]
     c: float
     reads: str
@@ -43,6 +48,7 @@ class Stage(NamedTuple):
         return self.channels, self.reads, self.writes
 
 
+# Compared by identity, here and in the classes below, since `==` of arrays is an array.
 @dataclasses.dataclass(frozen=True, eq=False)
 class FlatTableau:
     """Stage `i` is evaluated at `y0 + sum_j matrix[i, j] k_j`, with value `k_i`, and the
@@ -55,6 +61,9 @@ class FlatTableau:
     @property
     def reads(self) -> Bool[np.ndarray, "s s"]:
         """Whether stage `i` reads a part of the state that stage `j` changes."""
+        # A stage that writes "y" changes both parts, but then no stage of the same tableau
+        # reads only one: the families below mix "p" and "q", or use "y" alone. So a test
+        # for equal names (or none) suffices.
         reads = [b.writes in a.reads for a in self.stages for b in self.stages]
         return np.array(reads, bool).reshape(self.matrix.shape)
 
@@ -88,12 +97,20 @@ Coefficients: TypeAlias = Any
 CoefficientsByVariable: TypeAlias = Any
 
 
-def _coefficients(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
+def _coefficients(
+    name: str, value: Coefficients, shape: tuple[int, ...]
+) -> Float[np.ndarray, "..."]:
+    """`value` as a read-only array. Raises a `ValueError` unless it holds real, finite
+    numbers in this shape."""
     array = np.asarray(value)
+    # Strings and objects would fail later, with a message that does not name the
+    # coefficients; booleans are more likely a mistake than zeros and ones.
     if array.dtype.kind not in "iuf":
         raise ValueError(
             f"Coefficients `{name}` must be real numbers; got dtype {array.dtype}."
         )
+    # Always in double precision: a plan decides by comparing coefficients, and must not
+    # depend on the precision of a solve.
     array = array.astype(np.float64)
     if array.shape != shape:
         raise ValueError(
@@ -101,6 +118,7 @@ def _coefficients(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
         )
     if not np.isfinite(array).all():
         raise ValueError(f"Coefficients `{name}` must be finite; got {array}.")
+    # A tableau is usually a class variable, which all solves share.
     array.setflags(write=False)
     return array
 
@@ -110,30 +128,37 @@ def _check(
     by_variable: tuple[str, ...] = (),
     **shapes: tuple[int, ...],
 ) -> None:
-    """Replaces coefficients by checked arrays, or dictionaries of them."""
+    """Replaces coefficients by checked arrays; those `by_variable` by dictionaries from the
+    names of random variables to such arrays."""
     for name, shape in shapes.items():
         value = getattr(tableau, name)
         if name in by_variable:
             named = value if isinstance(value, Mapping) else {"W": value}
             checked = {
-                k: _coefficients(f"{name}[{k!r}]", x, shape) for k, x in named.items()
+                variable: _coefficients(f"{name}[{variable!r}]", array, shape)
+                for variable, array in named.items()
             }
         else:
             checked = _coefficients(name, value, shape)
+        # A frozen dataclass refuses `tableau.name = checked`, in `__post_init__` too.
         object.__setattr__(tableau, name, checked)
 
 
+def _variables(*parts: Mapping[str, np.ndarray]) -> list[str]:
+    """The names of all random variables in these coefficients, in order of first
+    appearance."""
+    # A dictionary keeps the order, which that of a set would change from run to run.
+    return list(dict.fromkeys(name for part in parts for name in part))
+
+
 def _side_by_side(
-    *parts: tuple[Mapping[str, np.ndarray], tuple[int, ...]],
-) -> tuple[list[str], list[np.ndarray]]:
-    """The names of all random variables, in order of first appearance, and for each part
-    its coefficients for all of them, concatenated. Parts are pairs of coefficients and
-    their shape."""
-    names = list(dict.fromkeys(name for part, _ in parts for name in part))
-    return names, [
-        np.concatenate([part.get(name, np.zeros(shape)) for name in names], axis=-1)
-        for part, shape in parts
-    ]
+    part: Mapping[str, np.ndarray], variables: list[str], shape: tuple[int, ...]
+) -> Float[np.ndarray, "..."]:
+    """The coefficients for each of these random variables, of this `shape` each,
+    concatenated. Variables without coefficients have zeros."""
+    zeros = np.zeros(shape)
+    each = [part.get(variable, zeros) for variable in variables]
+    return np.concatenate(each, axis=-1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -176,16 +201,26 @@ class GeneralTableau(AbstractTableau):
     noise: tuple[str, ...] = ("W",)
 
     def __post_init__(self):
-        if isinstance(self.noise, str) or not all(
-            isinstance(x, str) for x in self.noise
-        ):
+        # A string is a sequence of strings, too: `noise="W"` would pass the second test.
+        is_one_name = isinstance(self.noise, str)
+        if is_one_name or not all(isinstance(name, str) for name in self.noise):
             raise ValueError(
                 '`noise` must hold the names of random variables, as in `("W",)`; got '
                 f"{self.noise!r}."
             )
         object.__setattr__(self, "noise", tuple(self.noise))
-        s, r = np.size(self.alpha), np.size(self.beta)
-        _check(self, alpha=(s,), beta=(r,), A0=(s, s), B0=(s, r), A1=(r, s), B1=(r, r))
+        # The weights say how many stages there are, since each stage has one.
+        drift_stages = np.size(self.alpha)
+        noise_stages = np.size(self.beta)
+        _check(
+            self,
+            alpha=(drift_stages,),
+            beta=(noise_stages,),
+            A0=(drift_stages, drift_stages),
+            B0=(drift_stages, noise_stages),
+            A1=(noise_stages, drift_stages),
+            B1=(noise_stages, noise_stages),
+        )
 
     @classmethod
     def strong(cls, A, B, alpha, beta) -> "GeneralTableau":
@@ -199,10 +234,12 @@ class GeneralTableau(AbstractTableau):
         return cls(alpha=alpha, beta=beta, A0=A, B0=B, A1=A, B1=B)
 
     def flatten(self) -> FlatTableau:
-        stages = [Stage(("h",), float(c), "y", "y") for c in self.A0.sum(axis=1)]
-        stages += [Stage(self.noise, float(c), "y", "y") for c in self.A1.sum(axis=1)]
+        drift = [Stage(("h",), float(c0), "y", "y") for c0 in self.A0.sum(axis=1)]
+        # The two numbers of stages differ in general, so drift and noise are never one
+        # stage here. The plan of a step merges those that are evaluated at one point.
+        noise = [Stage(self.noise, float(c1), "y", "y") for c1 in self.A1.sum(axis=1)]
         return FlatTableau(
-            stages=tuple(stages),
+            stages=(*drift, *noise),
             matrix=np.block([[self.A0, self.B0], [self.A1, self.B1]]),
             weights=np.concatenate([self.alpha, self.beta]),
         )
@@ -244,14 +281,30 @@ class SeparableTableau(AbstractTableau):
     A1: Coefficients
 
     def __post_init__(self):
-        s, r = np.size(self.alpha), len(self.A1)
-        noise = dict(beta=(r,), B0=(s, r))
-        _check(self, ("beta", "B0"), alpha=(s,), A0=(s, s), A1=(r, s), **noise)
+        drift_stages = np.size(self.alpha)
+        # `beta` may be a dictionary, so the number of noise stages is taken from `A1`.
+        noise_stages = len(self.A1)
+        _check(
+            self,
+            by_variable=("beta", "B0"),
+            alpha=(drift_stages,),
+            beta=(noise_stages,),
+            A0=(drift_stages, drift_stages),
+            B0=(drift_stages, noise_stages),
+            A1=(noise_stages, drift_stages),
+        )
 
     def partitioned(self) -> "PartitionedTableau":
         """The same method, with explicit coefficients for the velocities."""
-        alpha, A = self.alpha, self.A0
-        return PartitionedTableau(alpha, alpha, self.beta, A, A, self.B0, self.A1)
+        return PartitionedTableau(
+            alpha=self.alpha,
+            alpha_hat=self.alpha,
+            beta=self.beta,
+            A=self.A0,
+            A_hat=self.A0,
+            B0=self.B0,
+            A1=self.A1,
+        )
 
     def flatten(self) -> FlatTableau:
         return self.partitioned().flatten()
@@ -288,33 +341,55 @@ class PartitionedTableau(AbstractTableau):
     A1: Coefficients
 
     def __post_init__(self):
-        s, v, r = np.size(self.alpha), np.size(self.alpha_hat), len(self.A1)
-        drift = dict(alpha=(s,), alpha_hat=(v,), A=(v, s), A_hat=(s, v))
-        _check(self, ("beta", "B0"), beta=(r,), B0=(v, r), A1=(r, v), **drift)
+        forces = np.size(self.alpha)
+        velocities = np.size(self.alpha_hat)
+        noise_stages = len(self.A1)
+        _check(
+            self,
+            by_variable=("beta", "B0"),
+            alpha=(forces,),
+            alpha_hat=(velocities,),
+            beta=(noise_stages,),
+            A=(velocities, forces),
+            A_hat=(forces, velocities),
+            B0=(velocities, noise_stages),
+            A1=(noise_stages, velocities),
+        )
 
     def flatten(self) -> FlatTableau:
-        s, v, r = len(self.alpha), len(self.alpha_hat), len(self.A1)
-        names, (B0, beta) = _side_by_side((self.B0, (v, r)), (self.beta, (r,)))
-        A1 = np.concatenate([self.A1] * len(names))
+        velocities = len(self.alpha_hat)
+        noise_stages = len(self.A1)
+        variables = _variables(self.B0, self.beta)
+        B0 = _side_by_side(self.B0, variables, (velocities, noise_stages))
+        beta = _side_by_side(self.beta, variables, (noise_stages,))
+        # Each random variable has noise stages of its own, all at the same points.
+        A1 = np.concatenate([self.A1] * len(variables))
+        noise_times = self.A1.sum(axis=1)
         # Forces come first, which makes them the unknowns, as they cost more to evaluate.
-        stages = [Stage(("h",), float(c), "q", "p") for c in self.A_hat.sum(axis=1)]
-        # Velocities do not depend on time.
-        stages += [Stage(("h",), 0.0, "p", "q") for _ in range(v)]
-        stages += [
-            Stage((name,), float(c), "q", "p")
-            for name in names
-            for c in self.A1.sum(axis=1)
+        force_stages = [
+            Stage(("h",), float(c_hat), "q", "p") for c_hat in self.A_hat.sum(axis=1)
         ]
-        zeros, n = np.zeros, len(A1)
+        # Velocities do not depend on time. With one and the same time, those at equal
+        # momenta can be merged.
+        velocity_stages = [Stage(("h",), 0.0, "p", "q") for _ in range(velocities)]
+        noise = [
+            Stage((variable,), float(c1), "q", "p")
+            for variable in variables
+            for c1 in noise_times
+        ]
+        stages = (*force_stages, *velocity_stages, *noise)
+        # Momenta depend on forces and noise at positions, positions on velocities.
+        matrix = np.zeros((len(stages), len(stages)))
+        at_forces = slice(0, len(force_stages))
+        at_velocities = slice(at_forces.stop, at_forces.stop + velocities)
+        at_noise = slice(at_velocities.stop, len(stages))
+        matrix[at_forces, at_velocities] = self.A_hat
+        matrix[at_velocities, at_forces] = self.A
+        matrix[at_velocities, at_noise] = B0
+        matrix[at_noise, at_velocities] = A1
         return FlatTableau(
-            stages=tuple(stages),
-            matrix=np.block(
-                [
-                    [zeros((s, s)), self.A_hat, zeros((s, n))],
-                    [self.A, zeros((v, v)), B0],
-                    [zeros((n, s)), A1, zeros((n, n))],
-                ]
-            ),
+            stages=stages,
+            matrix=matrix,
             weights=np.concatenate([self.alpha, self.alpha_hat, beta]),
         )
 
@@ -351,22 +426,39 @@ class AdditiveTableau(AbstractTableau):
     constant: bool = False
 
     def __post_init__(self):
-        s, r = np.size(self.alpha), np.size(self.c1)
-        noise = dict(beta=(r,), B=(s, r), c1=(r,))
-        _check(self, ("beta", "B"), alpha=(s,), A=(s, s), **noise)
+        drift_stages = np.size(self.alpha)
+        noise_stages = np.size(self.c1)
+        _check(
+            self,
+            by_variable=("beta", "B"),
+            alpha=(drift_stages,),
+            beta=(noise_stages,),
+            A=(drift_stages, drift_stages),
+            B=(drift_stages, noise_stages),
+            c1=(noise_stages,),
+        )
 
     @property
     def structure(self) -> Structure:
         return "constant" if self.constant else "additive"
 
     def flatten(self) -> FlatTableau:
-        s, r = len(self.alpha), len(self.c1)
-        names, (B, beta) = _side_by_side((self.B, (s, r)), (self.beta, (r,)))
-        stages = [Stage(("h",), float(c), "y", "y") for c in self.A.sum(axis=1)]
-        stages += [Stage((v,), float(c), "", "y") for v in names for c in self.c1]
-        n = len(beta)
+        drift_stages = len(self.alpha)
+        noise_stages = len(self.c1)
+        variables = _variables(self.B, self.beta)
+        B = _side_by_side(self.B, variables, (drift_stages, noise_stages))
+        beta = _side_by_side(self.beta, variables, (noise_stages,))
+        drift = [Stage(("h",), float(c0), "y", "y") for c0 in self.A.sum(axis=1)]
+        # These read no part of the state, so they are evaluated once in a step, not in
+        # every iteration of the root finder.
+        noise = [
+            Stage((variable,), float(c1), "", "y")
+            for variable in variables
+            for c1 in self.c1
+        ]
+        nothing = np.zeros((len(noise), drift_stages + len(noise)))
         return FlatTableau(
-            stages=tuple(stages),
-            matrix=np.block([[self.A, B], [np.zeros((n, s + n))]]),
+            stages=(*drift, *noise),
+            matrix=np.block([[self.A, B], [nothing]]),
             weights=np.concatenate([self.alpha, beta]),
         )

@@ -161,6 +161,9 @@ CASES = {
     "reduce": (lambda x: jnp.sum(x, axis=(0, 2)), [(F, (2, 3, 2))], None),
     "reduce to the largest": (lambda x: jnp.max(x, axis=1), [(F, (2, 3))], 0),
     "reduce to a place": (lambda x: jnp.argmax(x), [(F, (5,))], 0),
+    "reduce_window": (lambda x: jnp.cumsum(x, axis=1), [(F, (2, 5))], None),
+    "reduce_window to the largest": (lambda x: lax.reduce_window(x, -jnp.inf, lax.max, (2, 3), (1, 2), ((0, 1), (2, 0))), [(F, (3, 5))], 0),
+    "reduce_window from the end": (lambda x: lax.cumprod(x, reverse=True), [(I, (4,))], 0),
     "reduce of bool": (lambda x: jnp.stack([jnp.all(x), jnp.any(x)]), [(B, (3,))], 0),
     "remainder": (lambda a, b: lax.rem(jnp.clip(a, -999, 999), jnp.where(jnp.abs(b) < 0.1, 0.3, b)), [(F, ()), (F, ())], 0),
     "remainder of integers": (lax.rem, [(I, ()), (I, ())], 0),
@@ -241,3 +244,15 @@ def test_every_operation_of_the_table_is_tested():
     # Tested by `test_linear_algebra` and `test_complex`; the last has no value.
     elsewhere = {"custom_call", "complex", "imag", "real", "sharding_constraint"}
     assert names() == tested | elsewhere
+
+
+def test_a_selection_by_a_scalar_keeps_the_axis_of_a_single_entry():
+    yes, x = values(B, (), bool, 0), values(F, (1,), np.float64, 2)
+    x[~np.isfinite(x)] = 0.5
+
+    def fn(yes, x):
+        # The product needs an axis.
+        return jnp.where(yes, x, 0) @ jnp.ones((1, 2))
+
+    (actual,) = replayed(fn, yes, x)
+    np.testing.assert_array_equal(actual, np.where(yes, x[:, 0], 0)[:, None] * [1, 1])
