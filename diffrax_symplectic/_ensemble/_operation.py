@@ -41,6 +41,9 @@ class Operation(NamedTuple):
     def ints(self, name: str) -> list[int]:
         return [int(i) for i in self.op.attributes[name]]
 
+    def optional(self, name: str) -> list[int]:
+        return self.ints(name) if name in self.op.attributes else []
+
     def number(self, name: str) -> int:
         return self.op.attributes[name].value
 
