@@ -8,6 +8,7 @@ The state is a pair `(p, q)`, momenta first.
 - Solving: `diffrax.diffeqsolve(terms, solver, t0, t1, dt0, y0)`.
 - Means over many paths: `expectation`; the states of many paths: `ensemble`.
 - Friction: `langevin_terms`, for `BAOAB`, `LangevinMiddle`, `Damped` and all others.
+- Rods and rigid molecules: `constraint=` of the terms, `constrained_state`.
 - Stiff linear parts: `LinearFlow`.
 - Gradients of long solves: `ReversingAdjoint`.
 - Checks of one step: `symplecticity_defect`, `weak_order_defect`.
@@ -81,6 +82,8 @@ from ._tableau import (
     SeparableTableau as SeparableTableau,
 )
 from ._terms import (
+    bath_terms as bath_terms,
+    constrained_state as constrained_state,
     FrictionAlong as FrictionAlong,
     from_pair as from_pair,
     from_spinors as from_spinors,

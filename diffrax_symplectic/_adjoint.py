@@ -34,6 +34,7 @@ from ._solver import (
     NinomiyaVictoir,
 )
 from ._tableau import is_own_inverse, make_plan
+from ._terms import refuse_constraint
 
 
 class ReversingAdjoint(diffrax.AbstractAdjoint):
@@ -94,6 +95,7 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
             raise ValueError(
                 "`ReversingAdjoint` takes no `solver_state` and no `controller_state`."
             )
+        refuse_constraint(terms, "ReversingAdjoint")
         _check_supported(solver, stepsize_controller, event, saveat)
         # Each step of the backward pass recomputes the solver state (see `made_jump`).
         kwargs |= dict(

@@ -59,6 +59,14 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
         )
 
 
+def parameters(fn: Any) -> list[str]:
+    """The names of the parameters of a function."""
+    try:
+        return [*inspect.signature(fn).parameters]
+    except ValueError:
+        return []  # As above.
+
+
 def check_solver(name: str, solver: Any) -> None:
     """Raises a `ValueError` unless this is a solver."""
     if isinstance(solver, diffrax.AbstractSolver):

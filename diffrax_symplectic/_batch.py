@@ -87,6 +87,22 @@ def _(primals, tangents):
     return _batched(*primals), tangents[0]
 
 
+def error_if_alone(pred: Bool[Array, ""], message: str) -> Bool[Array, ""]:
+    """`pred`; if it is true, an error when run. In a batch there is no error: it would stop
+    the other paths."""
+
+    @jax.custom_batching.custom_vmap
+    def checked(pred):
+        return eqx.error_if(pred, pred, message)
+
+    @checked.def_vmap
+    def _(size, in_batched, pred):
+        del size
+        return pred, in_batched[0]
+
+    return checked(pred)
+
+
 def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -> _T:
     """`fn(value)` where `pending`, and `value` elsewhere. Not differentiable.
 

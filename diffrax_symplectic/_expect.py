@@ -108,7 +108,7 @@ def expectation(
         the increments can be computed from quasi-random points; and otherwise
         `IndependentPaths`. Without `tol` these draw 4,096 paths, 16 replicates of 16,384
         paths, and 131,072 paths, or fewer where all steps of all paths would exceed
-        $2^{28}$ numbers (about ten seconds).
+        $2^{28}$ numbers (from ten seconds to some minutes, by solver and system).
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
         default only `t1`.
     - `levels`: the number of step sizes, each half the previous one. With one level the

@@ -16,10 +16,13 @@ from jaxtyping import PRNGKeyArray, PyTree
 
 from ._arguments import check_state
 from ._brownian import (
+    derived_key,
     drives,
     FixedStepBrownianPath,
     increment_struct,
+    is_key,
     is_random,
+    laws_of,
     LevyAreaBrownianPath,
     LevyAreaIncrement,
     PlateauBrownianPath,
@@ -29,7 +32,6 @@ from ._brownian import (
 )
 from ._custom_types import Args, RealScalarLike, Y
 from ._solver import (
-    AbstractLangevinSplitting,
     AbstractSymplecticSolver,
     BAOAB,
     Damped,
@@ -45,14 +47,16 @@ from ._terms import (
     check_fit,
     commuting,
     constant_fault,
+    constraint_of,
     Fault,
     FRICTION,
-    is_friction,
+    friction_apart,
     number_of_noises,
     path_numbers,
     replace_paths,
     separable_fault,
     split_terms,
+    without_constraint,
     WRONG_WAY_ROUND,
 )
 
@@ -75,7 +79,8 @@ class Suggestion:
     - `path`: the Brownian path that it needs, as code.
     - `reason`: when to choose it, in a sentence.
     - `terms`: a function of a random key that returns the terms of the system with such
-        paths. Paths of given noise, such as a record, are not replaced.
+        paths. Paths of given noise, such as a record, are not replaced. A path of a class
+        of your own, such as one of random kicks, is kept, with another key.
     """
 
     solver: AbstractSymplecticSolver
@@ -128,8 +133,12 @@ def suggest_solver(
     *,
     want: Want,
 ) -> Suggestions:
-    r"""Suggests solvers for a system by the structure of its terms, sorted by highest order
-    and then by fewest stage vectors to solve for.
+    r"""Suggests solvers for a system by the structure of its terms.
+
+    In a heat bath, solvers with exact stationary positions of a harmonic mode come first.
+    Then they are sorted by highest order; by whether noise on stiff modes comes out right;
+    and by fewest stage vectors to solve for. [Measured errors](advice.md) at equal cost
+    support this order.
 
     Whether $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, and whether the noise is additive
     or constant, is determined by tracing, as in the solvers. Whether noises commute is
@@ -153,6 +162,8 @@ def suggest_solver(
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
     # Any path serves to inspect the terms.
     terms = specified(terms, WeakBrownianPath)
+    constrained = constraint_of(terms) is not None
+    given_terms, terms = terms, without_constraint(terms)
     drift, noise = _parts(terms)
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
@@ -170,24 +181,36 @@ def suggest_solver(
     commute = commute or commuting(noise, t0, y0, args)
     with_friction = takes_friction_apart(terms, t0, y0, args)
     solvers = ranked(want, structures, commute, m, with_friction)
-    if not any(map(is_friction, drift)):
+    if len(friction_apart(drift)[1]) == 0:
         # Diffrax's own terms, which only the Langevin splittings take apart.
         solvers = [solver for solver in solvers if not isinstance(solver, Damped)]
+    if constrained:
+        solvers = [solver for solver in solvers if solver.keeps_constraints]
+        if not solvers:
+            raise ValueError(
+                "Solvers for terms with a `constraint` need H0 = p . M^-1 p / 2 + U(t, q), "
+                "noise Hamiltonians H_k = U_k(t, q), and friction only from "
+                "`langevin_terms`."
+            )
     paths = brownian_paths(noise)
     if len(noise) > 1 or not jtu.all_leaves([increment_struct(paths[0])]):
         # Lévy areas are only sampled between the noises of one array.
         areas = lambda solver: "noise brackets" in map(drives, solver.variables)
         solvers = [solver for solver in solvers if not areas(solver)]
-    given = [path for path in paths if not is_random(path)]
+    given = [path for path in paths if not is_random(path) or is_own(path)]
     solvers = [s for s in solvers if all(_holds(path, s) for path in given)]
     numbers = path_numbers(random_paths(terms))
-    with_new = lambda make: jtu.Partial(ft.partial(with_paths, make, numbers), terms)
+    with_new = lambda make: jtu.Partial(
+        ft.partial(with_paths, make, numbers), given_terms
+    )
     found = tuple(_suggestion(s, want, terms, commute, with_new) for s in solvers)
     noises = "one noise"
     if m > 1:
         noises = f"{m} noises that {'commute' if commute else 'do not commute'}"
     if with_friction:
         noises = f"friction and {noises}"
+    if constrained:
+        noises = f"constraints, {noises}"
     system = _system(structures, not_separable, noises, with_friction)
     if any(isinstance(path, diffrax.UnsafeBrownianPath) for path in paths):
         system += (
@@ -265,10 +288,13 @@ def ranked(
         cost = sum(systems) / (2 if solver.structure == "separable" else 1)
         order = _record(solver).order(want, commute)
         assert order is not None
-        # Langevin splittings have the stationary means of a higher order.
-        other = not isinstance(solver, AbstractLangevinSplitting)
+        record = _record(solver)
+        # In a heat bath most means are stationary ones, of positions.
+        means = friction and want == "weak"
+        inexact = means and "qq" not in record.stationary
         too_many = cost > _MOST_STAGE_VECTORS
-        return other, too_many, -order, cost, max(systems, default=0)
+        wrong = record.heats is False
+        return inexact, too_many, -order, wrong, cost, max(systems, default=0)
 
     noises = ("any", "commuting" if commute else "not commuting")
 
@@ -307,16 +333,20 @@ def _suggestion(
 ) -> Suggestion:
     record = _record(solver)
     random = random_paths(terms)
-    code = "the path of the terms, which holds given noise"
-    if random:
-        shape = _shape_code(increment_struct(random[0]))
+    replaced = [path for path in random if not is_own(path)]
+    if replaced:
+        shape = _shape_code(increment_struct(replaced[0]))
         code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
+    elif random:
+        code = f"the `{type(random[0]).__name__}` of the terms, with another key"
+    else:
+        code = "the path of the terms, which holds given noise"
     return Suggestion(
         solver=solver,
         weak_order=cast(int, record.order("weak", commute)),
         strong_order=record.order("strong", commute),
         path=code,
-        reason=record.choose,
+        reason=record.reason,
         terms=with_new(ft.partial(solver.path, want=want)),
     )
 
@@ -360,11 +390,18 @@ def random_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
     return [path for path in brownian_paths(terms) if is_random(path)]
 
 
+def is_own(path: diffrax.AbstractBrownianPath) -> bool:
+    """Whether this is a path of the user's own class, which need not be a Brownian motion
+    (but the paths of this package and of Diffrax are)."""
+    return laws_of(path) is None
+
+
 def with_paths(
     make: Callable, numbers: tuple[int, ...], terms: PyTree, key: PRNGKeyArray
 ) -> PyTree:
     """The terms with new paths, made from a shape and a key. `numbers` are the
-    `path_numbers` of their random paths; others are not replaced."""
+    `path_numbers` of their random paths; others are not replaced. Paths of the user's own
+    classes only get other keys."""
     left = iter(numbers)
 
     def new(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
@@ -372,6 +409,9 @@ def with_paths(
             return path
         number = next(left)
         own = key if number == 0 else jr.fold_in(key, number + 1)
+        if is_own(path):
+            derived = lambda x: derived_key(own, x) if is_key(x) else x
+            return jtu.tree_map(derived, path)
         return make(increment_struct(path), own)
 
     return replace_paths(terms, new)

@@ -17,12 +17,15 @@ from ._custom_types import Args, RealScalarLike, Y
 from ._terms import (
     apply_one,
     as_spins,
+    constraint_of,
     from_spinors,
     number_of_noises,
     outcomes,
     rate,
+    refuse_constraint,
     split_terms,
     step_variables,
+    Surface,
     to_spinors,
 )
 
@@ -52,6 +55,8 @@ def symplecticity_defect(
 
     Exact up to rounding: for a symplectic method this is a small multiple of the machine
     epsilon, for any Hamiltonians, step and increments; for other methods it is not small.
+    For terms with a `constraint` it is the largest entry between directions along which
+    allowed states can move.
     (The solvers of this package differentiate their stage equations implicitly, so it does
     not depend on the tolerance of the root finder.)
 
@@ -83,7 +88,27 @@ def symplecticity_defect(
     zero = np.zeros((half, half))
     one = np.eye(half)
     omega = jnp.asarray(np.block([[zero, one], [-one, zero]]), flat.dtype)
-    return jnp.max(jnp.abs(_dot(jacobian.T, _dot(omega, jacobian)) - omega))
+    defect = _dot(jacobian.T, _dot(omega, jacobian)) - omega
+    if constraint_of(terms) is not None:
+        Z = _allowed_directions(terms, t0, y0, args)
+        defect = _dot(Z.T, _dot(defect, Z))
+    return jnp.max(jnp.abs(defect))
+
+
+def _allowed_directions(terms, t0, y0: Y, args: Args) -> Float[Array, "n k"]:
+    """An orthonormal basis of the directions along which a state can move that satisfies
+    constraint(q) = 0 and J v = 0."""
+    surface = Surface.of(terms, t0, y0, args)
+    flat, _ = jfu.ravel_pytree(y0)
+
+    def equations(x):
+        p, q = jnp.split(x, 2)
+        off, speed = jax.jvp(surface.residual, (q,), (surface.velocity(p),))
+        return jnp.concatenate([off, speed])
+
+    normals = jax.jacrev(equations)(flat)
+    _, _, V = jnp.linalg.svd(normals, full_matrices=True)
+    return V[len(normals) :].T
 
 
 # By default accelerators multiply in half precision, which would look like a defect.
@@ -210,8 +235,10 @@ def second_moment_map(
 
     **Returns:** the matrix $K$, of shape `((n + 1)**2, (n + 1)**2)`.
 
-    **Raises:** as [`diffrax_symplectic.step_expectation`][].
+    **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for terms
+    with a `constraint`.
     """
+    refuse_constraint(terms, "second_moment_map")
     flat, unravel = jfu.ravel_pytree(y0)
     size = flat.size
     # The step is affine, so its values at zero and at the unit vectors give its matrix.
@@ -279,8 +306,10 @@ def weak_order_defect(
 
     **Returns:** the local error, in the structure of `fn`.
 
-    **Raises:** as [`diffrax_symplectic.step_expectation`][].
+    **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for terms
+    with a `constraint`.
     """
+    refuse_constraint(terms, "weak_order_defect")
     expected = step_expectation(terms, solver, t0, t1, y0, args, fn=fn, nodes=nodes)
     generator = _generator(
         terms, args, ito=isinstance(solver, diffrax.AbstractItoSolver)

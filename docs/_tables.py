@@ -105,7 +105,7 @@ def _facts(solver: AbstractSymplecticSolver) -> dict[str, str]:
         "strong": _order(record.strong),
         "weak": _order(record.weak),
         "without noise": str(solver.order(None)),
-        "when to choose it": record.choose,
+        "when to choose it": record.reason,
     }
     if isinstance(solver, AbstractSplitting):
         facts |= {

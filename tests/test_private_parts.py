@@ -6,6 +6,7 @@ import inspect
 import re
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import diffrax
@@ -17,6 +18,8 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic import _compat
+
+from .ensemble.fused import needs_drjit
 
 
 # Private modules, and public ones without a promise to be kept.
@@ -30,7 +33,7 @@ PRIVATE_ATTRIBUTE = re.compile(
 )
 # What uses such attributes still, and is to call `_compat.py` instead. Nothing is to be
 # added here.
-STILL_TO_DO = ("_ensemble/", "_expectation/", "_terms/", "_solver/_friction.py")
+STILL_TO_DO = ("_ensemble/", "_expectation/", "_terms/")
 
 
 def _private_imports(tree: ast.AST) -> set[str]:
@@ -114,6 +117,9 @@ def test_diffrax_wraps_the_terms_of_a_solve_with_its_direction(terms):
     with jax.disable_jit(), jax.ensure_compile_time_eval():
         solve()
     assert _compat.direction(seen[1]) == -1 and _compat.direction(drift) == 1
+    other = _compat.replaced(seen[1], drift)
+    assert _compat.direction(other) == -1 and _compat.unwrapped(other) is drift
+    assert _compat.replaced(drift, drift) is drift
     turned = _compat.reversed_in_time({"drift": seen[1]})
     assert _compat.direction(turned) == 1
     assert type(turned["drift"]) is type(seen[1])
@@ -302,3 +308,58 @@ def test_a_program_may_have_compiler_options_unless_it_is_inside_of_another():
         return _compat.quickly_compiled(lambda y: x * y)(2.0)
 
     assert jax.grad(captured)(x) == 2
+
+
+def test_traced_programs_tell_literals_and_what_they_call():
+    jaxpr = jax.make_jaxpr(lambda x: jax.jit(lambda x: 2.0 * x)(x))(1.0).jaxpr
+    assert isinstance(jaxpr, _compat.Jaxpr)
+    (call,) = jaxpr.eqns
+    assert call.primitive.name in ("jit", "pjit")
+    (product,) = call.params["jaxpr"].jaxpr.eqns
+    assert product.primitive.name == "mul"
+    literals = [isinstance(x, _compat.Literal) for x in product.invars]
+    assert literals == [True, False]
+
+
+on_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="needs LLVM")
+
+
+def needs_llvm(test):
+    return needs_drjit(on_cpu(test))
+
+
+def _ends_with(code: str) -> subprocess.CompletedProcess:
+    """A program of Dr.Jit, which may abort, in a process of its own."""
+    start = "import drjit as dr\nfrom drjit.llvm import Float\nx = Float([1, -2, 3])\n"
+    command = [sys.executable, "-c", start + textwrap.dedent(code)]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+# Two faults of Dr.Jit 1.5. Once one of these tests fails, Dr.Jit has mended it. The
+# function that is named can go as soon as `pyproject.toml` asks for that version.
+
+
+@needs_llvm
+def test_drjit_writes_the_result_of_a_conditional_into_what_its_branch_returned():
+    # So `_ensemble._tensor.copied` copies what a branch returns.
+    done = _ends_with(
+        """
+        y = 3 * x
+        dr.if_stmt((), x > 0, lambda: x * x, lambda: y, mode="symbolic")
+        print(y)
+        """
+    )
+    assert done.stdout.split("\n")[0] == "[1, -6, 9]", done.stderr
+
+
+@needs_llvm
+def test_drjit_returns_the_constant_of_a_branch_from_a_conditional():
+    # So `_ensemble._tensor.made_here` makes constants anew.
+    done = _ends_with(
+        """
+        half = lambda sign: lambda: (Float(0.5), sign * x)
+        y, z = dr.if_stmt((), x > 0, half(1), half(-1), mode="symbolic")
+        print(z + dr.if_stmt((), x > 0, lambda: y, lambda: x, mode="symbolic"))
+        """
+    )
+    assert done.returncode < 0 and "does not dominate all uses" in done.stderr

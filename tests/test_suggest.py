@@ -24,6 +24,18 @@ from diffrax_symplectic._terms import brownian_paths, path_numbers
 from .problems import damped_terms
 
 
+class Kicks(diffrax.AbstractBrownianPath):
+    """Kicks at random times, whose law is no Gaussian."""
+
+    key: jax.Array
+    t0 = 0.0
+    t1 = jnp.inf
+    levy_area = diffrax.BrownianIncrement
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        return 1.0 * jr.poisson(self.key, t1 - t0)
+
+
 # Pieces of Hamiltonians, by what they allow the whole to be.
 KINETIC = [
     lambda t, p, q: jnp.sum(p**2) / 2,
@@ -136,23 +148,26 @@ def test_with_friction_solvers_that_have_it_are_suggested(want):
     y0, friction = (jnp.ones(2), jnp.ones(2)), jnp.array([0.5, 0.2])
     path = ds.WeakBrownianPath((2,), jr.key(0))
     bath = lambda H0: ds.langevin_terms(H0, friction, 0.3, path)
-    for terms, first in (
-        (bath(H0), ds.BAOAB),
-        (damped_terms(H0, friction, other, path), ds.BAOAB),
+    general = ds.AdditiveGauss if want == "weak" else ds.SRKs4
+    other_general = ds.BAOAB if want == "weak" else ds.PlateauGauss
+    for terms, first, is_apart in (
+        # Stationary positions come first for means, and the order for paths.
+        (bath(H0), ds.BAOAB if want == "weak" else ds.SRKs4, True),
+        (damped_terms(H0, friction, other, path), other_general, True),
         # Constant noise, and a mass that depends on positions.
-        (bath(mixed), ds.AdditiveGauss if want == "weak" else ds.SRKs4),
+        (bath(mixed), general, False),
     ):
         found = ds.suggest_solver(terms, 0.0, y0, want=want)
         assert type(found[0].solver) is first
-        assert ("with friction" in found.system) is (first is ds.BAOAB)
+        assert ("with friction" in found.system) is is_apart
         damped = [s.solver.solver for s in found if isinstance(s.solver, ds.Damped)]
-        assert (ds.StormerVerlet() in damped) is (first is ds.BAOAB)
+        assert (ds.StormerVerlet() in damped) is is_apart
         for s in found:
             s.solver.init(s.terms(jr.key(1)), 0.0, 0.1, y0, None)
             assert "().path((2,), key" in s.path or ")).path((2,), key" in s.path
         # Which of the two is for momenta.
         reason = {type(s.solver): s.reason for s in found}
-        if first is ds.BAOAB:
+        if is_apart:
             assert "momenta" in reason[ds.LangevinMiddle]
 
 
@@ -361,3 +376,43 @@ def test_suggestions_say_what_the_other_order_of_the_state_would_allow():
     got = ds.suggest_solver(terms, 0, y0, want="strong")
     assert "is the state the wrong way round?" in got.system
     assert "StormerVerlet" not in str(got)
+
+
+def test_with_constraints_only_solvers_that_keep_them_are_suggested():
+    rod = lambda q, args: jnp.stack([jnp.sum(q**2) - 1])
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + q[0]
+    noise = lambda t, p, q, args: jnp.sin(q[0])
+    y0 = jnp.array([0.0, 0.1]), jnp.array([1.0, 0.0])
+    kicked = ds.hamiltonian_terms(H0, noise, (), constraint=rod)
+    bath = ds.langevin_terms(H0, 1.0, 0.5, (2,), constraint=rod)
+    for terms, name in ((kicked, "StormerVerlet"), (bath, "BAOAB")):
+        for want in ("weak", "strong"):
+            found = ds.suggest_solver(terms, 0.0, y0, want=want)
+            assert [type(s.solver).__name__ for s in found] == [name]
+            assert "constraints" in found.system
+        # With the path of the solver these are still terms with a constraint.
+        found[0].solver.init(found[0].terms(jr.key(0)), 0.0, 0.1, y0, None)
+        with pytest.raises(ValueError, match="have a `constraint`"):
+            at = found[0].terms(jr.key(0)), 0.0, 0.1, y0, None, None, False
+            ds.ImplicitMidpoint().step(*at)
+    mixed = lambda t, p, q, args: jnp.sum(p**2) * q[0]
+    terms = ds.hamiltonian_terms(mixed, noise, (), constraint=rod)
+    with pytest.raises(ValueError, match="Solvers for terms with a `constraint` need"):
+        ds.suggest_solver(terms, 0.0, y0, want="weak")
+
+
+def test_a_keyed_path_of_ones_own_is_kept_with_another_key():
+    H = lambda t, p, q, args: (p**2 + q**2) / 2
+    terms = ds.hamiltonian_terms(H, lambda t, p, q, args: -q, Kicks(jr.key(0)))
+    y0 = jnp.array(0.0), jnp.array(1.0)
+    for want in ("strong", "weak"):
+        suggestions = ds.suggest_solver(terms, 0.0, y0, want=want)
+        for suggestion in suggestions:
+            (one,), (other,) = (
+                brownian_paths(suggestion.terms(jr.key(seed))) for seed in (1, 2)
+            )
+            assert type(one) is type(other) is Kicks
+            assert len({int(jr.key_data(x.key)[-1]) for x in (one, other)}) == 2
+            assert suggestion.path == "the `Kicks` of the terms, with another key"
+            # It has increments only.
+            assert suggestion.solver.variables == ("W",)

@@ -112,6 +112,17 @@ def typed_key(key: PRNGKeyArray | UInt32[Array, "..."]) -> PRNGKeyArray:
     return jr.wrap_key_data(key) if key.dtype == jnp.uint32 else key
 
 
+def derived_key(key: PRNGKeyArray, old):
+    """A key derived from `key` to take the place of `old`, of the same kind and shape.
+    Equal old keys get the same new one."""
+    typed, own = typed_key(old), key
+    words = jr.key_data(typed)
+    for word in words.reshape(-1):
+        own = jr.fold_in(own, word)
+    data = jr.bits(own, words.shape, jnp.uint32)
+    return jr.wrap_key_data(data, impl=jr.key_impl(old)) if old is typed else data
+
+
 def place_of(t0: Array, t1: Array) -> Place:
     """The position of a step as two integers, which do not change if times are rounded.
 

@@ -12,10 +12,10 @@ _HOW = (
     '; or pass `engine="jax"`, which needs nothing else.'
 )
 _LLVM = (
-    'On a CPU `engine="drjit"` needs a shared library of LLVM, and Dr.Jit found none. '
-    "Install one (Debian and Ubuntu: `apt-get install libllvm19`; conda-forge: `libllvm`; "
-    "Homebrew: `llvm`), and if it lies where Dr.Jit does not look, set the environment "
-    "variable `DRJIT_LIBLLVM_PATH` to the file before you start Python."
+    'On a CPU `engine="drjit"` needs a shared library of LLVM, of version 15 or newer, and '
+    "Dr.Jit found none. Install one (Debian and Ubuntu: `apt-get install libllvm19`; "
+    "conda-forge: `libllvm`; Homebrew: `llvm`), and if it lies where Dr.Jit does not look, "
+    "set the environment variable `DRJIT_LIBLLVM_PATH` to the file before you start Python."
 )
 _CUDA = (
     "JAX runs on a GPU, but Dr.Jit found no driver of CUDA. Start Python with "

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, get_args
 
 import diffrax
 import equinox as eqx
@@ -16,6 +16,7 @@ from .._custom_types import Args, Y
 from .._expectation._monte_carlo import path_keys, with_keys
 from .._expectation._problem import Problem
 from .._expectation._run import checked_call
+from .._solver import Want
 from ._engines import Batch, ENGINES, state_itself
 from ._layout import sample_key
 
@@ -43,7 +44,7 @@ class Ensemble(eqx.Module):
     failed: Bool[np.ndarray, " num_paths"]
     num_stragglers: int
     engine: str
-    _terms: Any
+    _problem: Problem
     _key: Any
 
     @property
@@ -54,9 +55,17 @@ class Ensemble(eqx.Module):
         """The terms of path number `number`, with its random keys. Passed to
         `diffrax.diffeqsolve` they give the same path, for example to save it at more
         times."""
+        terms = self._problem.terms
+        return with_keys(terms, path_keys(terms, self._key_of(number)))
+
+    def start(self, number: int) -> tuple[Y, Args]:
+        """The initial state and the `args` of path number `number`."""
+        y0, own = self._problem.drawn(self._key_of(number))
+        return y0, self._problem.with_args(own).args
+
+    def _key_of(self, number: int) -> PRNGKeyArray:
         high, low = (np.uint32(x) for x in divmod(int(number), 2**32))
-        key = sample_key(self._key, high, low)
-        return with_keys(self._terms, path_keys(self._terms, key))
+        return sample_key(self._key, high, low)
 
 
 def ensemble(
@@ -71,6 +80,7 @@ def ensemble(
     key: PRNGKeyArray,
     num_paths: int,
     ts: Sequence[float] | np.ndarray | None = None,
+    want: Want = "strong",
     engine: str | None = None,
     batch_size: int | None = None,
 ) -> Ensemble:
@@ -86,7 +96,7 @@ def ensemble(
 
         H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
         noise = lambda t, p, q, args: 0.2 * jnp.sin(q)
-        terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+        terms = ds.hamiltonian_terms(H0, noise, ())  # the shape of one noise
         y0 = (jnp.array(0.0), jnp.array(1.0))
         paths = ds.ensemble(
             terms, ds.StormerVerlet(), 0, 10, 0.1, y0, key=jr.key(1), num_paths=10_000
@@ -100,6 +110,13 @@ def ensemble(
     terms with these keys, for `diffrax.diffeqsolve`. Paths are simulated in batches, so
     that only the returned arrays grow with their number.
 
+    **Noise.** Where `terms` have the shape of a path, the solver makes one with the
+    Gaussian increments of a Brownian motion (bounded for implicit solvers), so that every
+    function of the states has the right law. The three-point increments of `want="weak"`
+    take less time, and give the right means of smooth functions only: a momentum that
+    starts at one value has three values after a step, and Brownian motion from 0 leaves
+    (-1, 1) after 1.07 in the mean, not after 1.
+
     **Engines.** `engine="jax"`, the default, moves all paths through each step together.
     `engine="drjit"` compiles all steps to one kernel with
     [Dr.Jit](https://drjit.readthedocs.io), which keeps each path in registers and is
@@ -112,6 +129,8 @@ def ensemble(
     - `terms`, `solver`, `t0`, `t1`, `dt0`, `y0`, `args`, `key`, `ts`: as for
         [`diffrax_symplectic.expectation`][].
     - `num_paths`: the number of paths.
+    - `want`: `"strong"` for Gaussian increments, or `"weak"` for discrete ones, where
+        `terms` have the shape of a path; a path itself is kept.
     - `engine`: `"jax"`, `"drjit"`, or `None`, which means `"jax"`.
     - `batch_size`: the number of paths to simulate at once. By default, the states of a
         batch have 131,072 entries, with Dr.Jit a million; on accelerators 16 times as many.
@@ -119,8 +138,8 @@ def ensemble(
     **Returns:** an [`diffrax_symplectic.Ensemble`][].
 
     **Raises:** what [`diffrax_symplectic.expectation`][] raises, and a `ValueError` if
-    `engine` is unknown. With `engine="drjit"`: a `ValueError` if the system uses an
-    operation that cannot be replayed or its state has more than 256 entries, and an
+    `engine` or `want` is unknown. With `engine="drjit"`: a `ValueError` if the system uses
+    an operation that cannot be replayed or its state has more than 256 entries, and an
     `ImportError` if Dr.Jit or LLVM is missing. Warns if paths failed, and if many are
     stragglers.
     """
@@ -131,7 +150,11 @@ def ensemble(
     if engine not in ENGINES:
         raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
     times = [t1] if ts is None else ts
-    problem = Problem.of(state_itself, terms, solver, t0, t1, dt0, y0, args, times, 1)
+    if want not in get_args(Want):
+        raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
+    problem = Problem.of(
+        state_itself, terms, solver, t0, t1, dt0, y0, args, times, 1, want
+    )
     if batch_size is None:
         batch_size = _default_size(engine, problem)
     size = whole_number("batch_size", batch_size)
@@ -146,7 +169,7 @@ def ensemble(
     saved = np.asarray(problem.levels.saved_steps[0])
     at = float(problem.t0) + saved * float(problem.levels.h[0])
     _warn_of(joined, engine)
-    return Ensemble(at, *joined, engine, problem.terms, key)
+    return Ensemble(at, *joined, engine, problem, key)
 
 
 def _default_size(engine: str, problem: Problem) -> int:

@@ -3,7 +3,7 @@
 from typing import Any
 
 from ._backend import drjit
-from ._operation import NotReplayed, rule
+from ._operation import rule
 from ._tensor import copied, flat, known, Tensor, unflat
 
 
@@ -15,11 +15,6 @@ def _optimization_barrier(o, *xs):
 @rule
 def _sharding_constraint(o, x):
     return [x]
-
-
-@rule
-def _custom_call(o, *xs):
-    raise NotReplayed(o.op, f"a call of `{o.op.attributes['call_target_name'].value}`")
 
 
 def _raises(region: Any) -> bool:
@@ -60,6 +55,9 @@ def _if(o, condition):
 
 # The most iterations to unroll, of a loop whose condition is known.
 _WRITTEN_OUT = 8
+# Of one that moves indices only, such as a bisection or the exchanges of rows of a matrix.
+# Written out, most of its operations are folded.
+_INDICES_WRITTEN_OUT = 32
 
 
 @rule
@@ -69,8 +67,10 @@ def _while(o, *xs):
     # Values that do not change stay out of the loop's state, so that constants stay known.
     moves = [a != b for a, b in zip(returned, body.arguments)]
     moving = lambda xs: [x for x, m in zip(xs, moves) if m]
+    floats = any(drjit().is_float_v(e) for e in flat(moving(xs)))
+    most = _WRITTEN_OUT if floats else _INDICES_WRITTEN_OUT
     xs, number = [*xs], 0
-    while (go := known(o.run(0, xs)[0])) is not None and number < _WRITTEN_OUT:
+    while (go := known(o.run(0, xs)[0])) is not None and number < most:
         if not go:
             return xs
         xs, number = o.run(1, xs), number + 1

@@ -35,7 +35,7 @@ def _divide(a, b):
         return a / b
     by, zero, _ = _divisor(a, b)
     # Dr.Jit's `//` of integers rounds to zero, as StableHLO does.
-    return drjit().select(zero, type(a)(-1), a // by)
+    return drjit().select(zero, ~type(a)(0), a // by)
 
 
 def _divisor(a, b):
@@ -116,15 +116,22 @@ def _tan(a):
 
 
 def _atan(a):
-    return drjit().select(_is_nan(a), a, drjit().atan(a))
+    return _atan2(a, type(a)(1))
 
 
 def _atan2(a, b):
+    """By the arcsine of an angle of at most 45 degrees. Dr.Jit's own takes a maximum that
+    LLVM 15 and 16 cannot compile: they abort the process."""
     dr, T = drjit(), type(a)
-    to_left = dr.copysign(T(1), b) < 0
-    angle = dr.select(
-        a == 0, dr.select(to_left, T(np.pi), T(0)), dr.atan2(dr.abs(a), b)
-    )
+    steep = dr.abs(a) > dr.abs(b)
+    small = dr.select(steep, dr.abs(b), dr.abs(a))
+    large = dr.select(steep, dr.abs(a), dr.abs(b))
+    # Two infinities count as equal.
+    slope = dr.select(small == large, T(1), small / large)
+    angle = dr.asin(slope / dr.sqrt(1 + slope * slope))
+    angle = dr.select(steep, np.pi / 2 - angle, angle)
+    angle = dr.select(a == 0, T(0), angle)
+    angle = dr.select(dr.copysign(T(1), b) < 0, np.pi - angle, angle)
     return dr.select(_is_nan(a) | _is_nan(b), a + b, dr.copysign(angle, a))
 
 

@@ -43,10 +43,20 @@ def state_itself(t, y, args):
 
 def by_jax(p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0) -> Batch:
     """With the loop of `expectation`."""
-    low = (numbers & np.uint64(0xFFFFFFFF)).astype(np.uint32)
-    high = (numbers >> np.uint64(32)).astype(np.uint32)
-    y, failed = jax.device_get(_paths(p, key, high, low))
+    y, failed = jax.device_get(_paths(p, key, *_halves(numbers)))
     return Batch(jtu.tree_map(lambda x: x[level], y), failed[level])
+
+
+def _halves(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The high and the low 32 bits."""
+    high = (numbers >> np.uint64(32)).astype(np.uint32)
+    return high, (numbers & np.uint64(0xFFFFFFFF)).astype(np.uint32)
+
+
+@eqx.filter_jit
+def _drawn(p: Problem, key: PRNGKeyArray, hi, lo) -> tuple[PyTree, PyTree]:
+    """`Problem.drawn` for the paths of a batch."""
+    return jax.vmap(p.drawn)(jax.vmap(ft.partial(sample_key, key))(hi, lo))
 
 
 @eqx.filter_jit
@@ -54,7 +64,8 @@ def _paths(p: Problem, key: PRNGKeyArray, hi, lo):
     keys = jax.vmap(ft.partial(sample_key, key))(hi, lo)
     own = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
     terms_of = lambda keys: with_keys(p.terms, keys)
-    begin = lambda level: independent_steps(p, level, len(lo), terms_of, lambda i: own)
+    drawn = jax.vmap(p.drawn)(keys)
+    begin = lambda level: independent_steps(p, level, drawn, terms_of, lambda i: own)
     states, failed, _ = simulate(p, begin)
     return p.unravel(jnp.swapaxes(states, 1, 2)), failed
 
@@ -70,7 +81,11 @@ def by_drjit(
     grid, n = p.level(level), len(numbers)
     try:
         kernels = _kernels(layout)
-        paths, parameters = kernels.begin(arrays, key, grid.h, int(numbers[0]), n)
+        drawn = p.y0, None
+        if p.paths_differ:
+            drawn = _drawn(p, key, *_halves(numbers))
+        first = int(numbers[0])
+        paths, parameters = kernels.begin(arrays, key, grid.h, first, n, *drawn)
         saves = np.asarray(grid.saved_steps)
         kept, done = {}, 0
         for step in np.unique(saves):

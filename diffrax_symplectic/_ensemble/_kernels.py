@@ -72,7 +72,7 @@ def _numbers(x: Array) -> np.ndarray:
 class Paths(NamedTuple):
     """The paths of a batch. Each Dr.Jit array has one lane for each path.
 
-    - `keys`: the words of the random keys.
+    - `keys`: the words of the random keys, and the entries of the paths' own `args`.
     - `y`: the entries of the states.
     - `memory`: the entries of the solver states.
     - `stopped`: whether a step of the path was not solved.
@@ -91,7 +91,9 @@ class Kernels:
         arrays, key = layout.arrays, layout.key
         word, number = (jax.ShapeDtypeStruct((), x) for x in ("uint32", "int32"))
         keys = jax.eval_shape(layout.path_keys, arrays, key, word, word)
-        y, memory = jax.eval_shape(layout.start, arrays, keys)
+        own = [*keys, *layout.own_args]
+        y = jtu.tree_leaves(jax.eval_shape(lambda: layout.problem(arrays).y0))
+        memory = jax.eval_shape(layout.start, arrays, own, y)
         size = sum(math.prod(x.shape) for x in y)
         if size > _MOST_NUMBERS:
             raise ValueError(
@@ -100,47 +102,69 @@ class Kernels:
             )
         h = jax.ShapeDtypeStruct((), jnp.result_type(*y))
 
+        def start_of_one(arrays, key, y, args):
+            of = lambda lo: layout.path_keys(arrays, key, jnp.zeros_like(lo), lo)
+            start = lambda keys: layout.start(arrays, [*keys, *args], y)
+            # No solver draws random numbers in `init`: it does not depend on the keys.
+            return jax.vmap(start, out_axes=None)(
+                jax.vmap(of)(jnp.zeros(1, word.dtype))
+            )
+
         @jax.jit
-        def start(arrays, key):
-            of = jax.vmap(
-                lambda lo: layout.path_keys(arrays, key, jnp.zeros_like(lo), lo)
-            )
-            # No solver draws random numbers in `init`: all paths start alike.
-            return jax.vmap(layout.start, (None, 0), None)(
-                arrays, of(jnp.zeros(1, word.dtype))
-            )
+        def start(arrays, key, y, args):
+            if layout.paths_differ:
+                return jax.vmap(start_of_one, (None, None, 0, 0))(arrays, key, y, args)
+            return start_of_one(arrays, key, y, args)
 
         self._start = start
         self._keys = Program(layout.path_keys, arrays, key, word, word)
-        self._step = Program(layout.step, arrays, keys, h, number, y, memory)
-        # Entries of the solver state that a step returns unchanged are parameters.
+        self._step = Program(layout.step, arrays, own, h, number, y, memory)
+        self._paths_differ = layout.paths_differ
+        # Entries of the solver state that a step returns unchanged are parameters, if all
+        # paths start alike.
         begin = sum(map(len, self._step.types[:-1]))
         handed_on = self._step.replay.handed_on[len(y) : -1]
-        self._moves = [i != begin + k for k, i in enumerate(handed_on)]
+        self._moves = [
+            layout.paths_differ or i != begin + k for k, i in enumerate(handed_on)
+        ]
         freeze = ft.partial(drjit().freeze, warn_after=_RECORDINGS)
         self._make_keys = freeze(self._record_keys)
         self._take_steps = freeze(self._record_steps)
 
     def begin(
-        self, arrays: list[Array], key: PRNGKeyArray, h: Array, first: int, n: int
+        self,
+        arrays: list[Array],
+        key: PRNGKeyArray,
+        h: Array,
+        first: int,
+        n: int,
+        y0: PyTree[Array],
+        args: PyTree[Array],
     ):
         """The paths of the samples `first` to `first + n - 1`, and the parameters of their
-        steps of size `h`."""
+        steps of size `h`. If paths differ, `y0` and their own `args` have a leading axis of
+        paths."""
         dr, kinds = drjit(), array_types()
-        own = self._keys.entries(0) + self._keys.entries(1)
+        types = self._keys.entries(0) + self._keys.entries(1)
         numbers = dr.arange(kinds["ui64"], n) + first
         hi, lo = kinds["ui32"](numbers >> 32), kinds["ui32"](numbers)
         dr.eval(hi, lo)
-        keys = self._make_keys(_packed(own, [*arrays, key]), hi, lo)
-        y, memory = self._start(arrays, key)
+        keys = self._make_keys(_packed(types, [*arrays, key]), hi, lo)
+        y, own = jtu.tree_leaves(y0), jtu.tree_leaves(args)
+        memory = self._start(arrays, key, y, own)
         fixed = [x for x, moves in zip(memory, self._moves) if not moves]
         parameters = _packed(self._uniform, [*arrays, h, *fixed])
 
         def for_all(types: list[str], leaves) -> list[Any]:
+            if self._paths_differ:
+                rows = [x for a in leaves for x in _numbers(a).reshape(n, -1).T]
+                # As lists, which are copied: see `_packed`.
+                return [kinds[t](x.tolist()) for t, x in zip(types, rows, strict=True)]
             values = [x for leaf in leaves for x in _numbers(leaf).flat]
             return [dr.opaque(kinds[t], x.item(), n) for t, x in zip(types, values)]
 
         moving = [x for x, moves in zip(memory, self._moves) if moves]
+        keys += for_all(self._step.entries(1)[len(keys) :], own)
         y, memory = for_all(self._step.entries(4), y), for_all(self._moving, moving)
         return Paths(keys, y, memory, dr.opaque(kinds["i1"], False, n)), parameters
 

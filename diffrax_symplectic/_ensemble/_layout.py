@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .._expectation._monte_carlo import path_keys, with_keys
 from .._expectation._problem import Level, Problem
@@ -25,6 +25,10 @@ class Layout(NamedTuple):
     static: tuple[Any, ...]
     structs: tuple[jax.ShapeDtypeStruct | None, ...]
     impl: str
+    # The shapes of the arrays of `args` that each path has of its own, and whether each has
+    # its own `y0`, too.
+    own_args: tuple[jax.ShapeDtypeStruct, ...]
+    paths_differ: bool
     settings: tuple[Any, ...]
 
     @property
@@ -46,16 +50,24 @@ class Layout(NamedTuple):
     def path_keys(self, arrays: list[Array], key, hi, lo) -> list[Array]:
         return path_keys(self.problem(arrays).terms, sample_key(key, hi, lo))
 
-    def start(self, arrays: list[Array], keys: list[Array]) -> tuple[list, list]:
-        """The leaves of the state, and of the state of the solver."""
+    def of_path(self, arrays: list[Array], own: list[Array]) -> tuple[Problem, PyTree]:
+        """The problem and the terms of a path, from its keys and its own `args`."""
         p = self.problem(arrays)
-        state = p.init(with_keys(p.terms, keys), 0, p.levels.h[0], p.y0)
-        return jtu.tree_leaves(p.y0), jtu.tree_leaves(state)
+        keys, args = own[: len(own) - len(self.own_args)], None
+        if self.own_args:
+            args = eqx.filter(p.args, eqx.is_array)
+            args = jtu.tree_unflatten(jtu.tree_structure(args), own[len(keys) :])
+        return p.with_args(args), with_keys(p.terms, keys)
 
-    def step(self, arrays, keys, h, i, y: list, state: list):
+    def start(self, arrays: list[Array], own: list[Array], y: list) -> list:
+        """The leaves of the state of the solver at the start."""
+        p, terms = self.of_path(arrays, own)
+        y = jtu.tree_unflatten(jtu.tree_structure(p.y0), y)
+        return jtu.tree_leaves(p.init(terms, 0, p.levels.h[0], y))
+
+    def step(self, arrays, own, h, i, y: list, state: list):
         """The leaves after step number `i` of size `h`, and whether it succeeded."""
-        p = self.problem(arrays)
-        terms = with_keys(p.terms, keys)
+        p, terms = self.of_path(arrays, own)
         likes = p.y0, eqx.filter_eval_shape(p.init, terms, 0, h, p.y0)
         y, state = (
             jtu.tree_unflatten(jtu.tree_structure(like), x)
@@ -77,6 +89,8 @@ def split(problem: Problem, key: PRNGKeyArray) -> tuple[Layout, list[Array]]:
     bare = dataclasses.replace(
         problem,
         solver=without_rescue(problem.solver),
+        y0_of=None,
+        args_of=None,
         levels=Level(none, jnp.ones_like(problem.levels.h[:1]), none, none[None]),
         weights=jnp.ones((1, 1)),
         at_end=True,
@@ -89,5 +103,14 @@ def split(problem: Problem, key: PRNGKeyArray) -> tuple[Layout, list[Array]]:
     struct = lambda x: None if x is None else jax.ShapeDtypeStruct(x.shape, x.dtype)
     settings = jax.default_backend(), jax.config.read("jax_enable_x64")
     impl = str(jr.key_impl(key))
-    layout = Layout(treedef, static, tuple(map(struct, arrays)), impl, settings)
+    own = None if problem.args_of is None else eqx.filter(problem.args, eqx.is_array)
+    layout = Layout(
+        treedef,
+        static,
+        tuple(map(struct, arrays)),
+        impl,
+        tuple(map(struct, jtu.tree_leaves(own))),
+        problem.paths_differ,
+        settings,
+    )
     return layout, [x for x in arrays if x is not None]

@@ -60,12 +60,13 @@ def _samples(
     paths: tuple[PyTree[Array], Bool[Array, "levels n"]],
     keys: PRNGKeyArray,
 ) -> Samples:
-    del keys
     y, failed = paths
+    _, args = jax.vmap(p.drawn)(keys)
 
     def values(level, y):
         times = p.t0 + level.saved_steps * level.h
-        return jax.vmap(jax.vmap(p.values), (None, 0))(times, y)
+        of_path = lambda y, args: jax.vmap(p.with_args(args).values)(times, y)
+        return jax.vmap(of_path)(y, args)
 
     phi = jax.vmap(values)(p.levels, y)
     lost = jnp.any(failed | ~jax.vmap(jax.vmap(all_finite))(phi), axis=0)

@@ -78,19 +78,34 @@ def _pad(o, x, value):
 
 # An index that differs between paths selects by comparison with each position.
 _MOST_PLACES = 64
+# Exchanges grow with the square of the number.
+_MOST_SORTED = 16
 
 
 def _windows(
-    o: Operation, x: Tensor, starts: Sequence[Tensor], sizes: Sequence[int]
+    o: Operation,
+    x: Tensor,
+    starts: Sequence[Tensor],
+    sizes: Sequence[int],
+    clip: bool = True,
 ) -> Iterator[tuple[tuple[slice, ...], Any]]:
-    """The possible positions of a window of these sizes in `x`, with masks of the lanes."""
+    """The possible positions of a window of these sizes in `x`, with masks of the lanes.
+    Windows that are not within `x` are moved into it, or else left out."""
     axes = []
     for start, n, size in zip(starts, x.shape, sizes):
         most, value = n - size, known(start)
-        if most == 0 or value is not None:
-            axes.append([(0 if value is None else int(np.clip(value, 0, most)), True)])
+        if value is not None and not clip and not 0 <= value <= most:
+            return
+        if value is not None:
+            axes.append([(int(np.clip(value, 0, most)), True)])
+            continue
+        if most == 0 and clip:
+            axes.append([(0, True)])
             continue
         s = start.item()
+        if not clip:
+            axes.append([(k, s == k) for k in range(most + 1)])
+            continue
         first, last = [(0, s <= 0)], [(most, s >= most)]
         axes.append([*first, *[(k, s == k) for k in range(1, most)], *last])
     if (number := math.prod(map(len, axes))) > _MOST_PLACES:
@@ -133,35 +148,50 @@ def _dynamic_update_slice(o, x, update, *starts):
     return [out]
 
 
-def _starts(o: Operation, name: str, x: Tensor, indices: Tensor, axes: list[int]):
-    """The start of the window in `x` for each of `indices`."""
-    if o.part(name, "operand_batching_dims") or o.part(name, "input_batching_dims"):
-        raise NotReplayed(o.op, f"`{o.op.name}` with a batch axis")
+def _starts(
+    o: Operation, name: str, x: Tensor, indices: Tensor, axes: list[int], batched: str
+):
+    """The start of the window in `x` for each of `indices`, and the axes of `x` along which
+    it follows the place among the indices."""
+    together = dict(
+        zip(
+            o.part(
+                name, f"{'input' if batched == 'scatter' else 'operand'}_batching_dims"
+            ),
+            o.part(name, f"{batched}_indices_batching_dims"),
+        )
+    )
     # The attribute is printed only if it is not zero.
     vector = sum(o.part(name, "index_vector_dim"))
     places = indices.places.reshape(
         *indices.shape, *[1] * (vector == len(indices.shape))
     )
     places = np.moveaxis(places, vector, -1)
-    zero = constant(type(indices.entries[0]), np.zeros(()))
-
-    def start(row: np.ndarray) -> list[Tensor]:
-        own = {axis: Tensor([indices.entries[i]], ()) for axis, i in zip(axes, row)}
-        return [own.get(d, zero) for d in range(len(x.shape))]
-
     batch = places.shape[:-1]
-    return batch, [start(row) for row in places.reshape(math.prod(batch), -1)]
+    number = lambda i: constant(type(indices.entries[0]), np.asarray(i))
+
+    def start(place: tuple[int, ...]) -> list[Tensor]:
+        own = {
+            axis: Tensor([indices.entries[i]], ())
+            for axis, i in zip(axes, places[place])
+        }
+        for axis, along in together.items():
+            own[axis] = number(place[along - (along > vector)])
+        return [own.get(d, number(0)) for d in range(len(x.shape))]
+
+    return batch, [start(place) for place in np.ndindex(*batch)], [*together]
 
 
 @rule
 def _gather(o, x, indices):
     name, sizes = "dimension_numbers", o.ints("slice_sizes")
-    batch, starts = _starts(o, name, x, indices, o.part(name, "start_index_map"))
+    axes = o.part(name, "start_index_map")
+    batch, starts, together = _starts(o, name, x, indices, axes, "start")
     windows = Tensor(
         [*flat([_window(o, x, s, sizes) for s in starts])], (*batch, *sizes)
     )
-    collapsed = tuple(len(batch) + d for d in o.part(name, "collapsed_slice_dims"))
-    places = windows.places.squeeze(collapsed)
+    collapsed = [*o.part(name, "collapsed_slice_dims"), *together]
+    places = windows.places.squeeze(tuple(len(batch) + d for d in collapsed))
     moved = range(len(batch), places.ndim)
     return [windows.take(np.moveaxis(places, moved, o.part(name, "offset_dims")))]
 
@@ -169,28 +199,41 @@ def _gather(o, x, indices):
 @rule
 def _scatter(o, x, indices, updates):
     name = "scatter_dimension_numbers"
-    inserted = o.part(name, "inserted_window_dims")
+    axes = o.part(name, "scatter_dims_to_operand_dims")
+    batch, starts, together = _starts(o, name, x, indices, axes, "scatter")
+    inserted = [*o.part(name, "inserted_window_dims"), *together]
     window = o.part(name, "update_window_dims")
     sizes, left = [], iter(window)
     for d in range(len(x.shape)):
         sizes.append(1 if d in inserted else updates.shape[next(left)])
-    axes = o.part(name, "scatter_dims_to_operand_dims")
-    batch, starts = _starts(o, name, x, indices, axes)
     source = np.moveaxis(updates.places, window, range(len(batch), updates.places.ndim))
     out = [*x.entries]
     for start, row in zip(starts, source.reshape(math.prod(batch), -1)):
-        values = [known(s) for s in start]
-        if any(v is None for v in values):
-            raise NotReplayed(o.op, f"`{o.op.name}` with an index per path")
-        begin = [int(v) for v in values if v is not None]
-        fits = [0 <= b <= n - size for b, n, size in zip(begin, x.shape, sizes)]
-        if not all(fits):
-            continue  # Updates out of bounds are dropped.
-        at = tuple(slice(b, b + size) for b, size in zip(begin, sizes))
-        for i, k in zip(x.places[at].flat, row):
-            one = [Tensor([e], ()) for e in (out[i], updates.entries[k])]
-            out[i] = o.run(0, one)[0].item()
+        for window, here in _windows(o, x, start, sizes, clip=False):
+            for i, k in zip(x.places[window].flat, row):
+                old = Tensor([out[i]], ())
+                new = o.run(0, [old, Tensor([updates.entries[k]], ())])[0]
+                out[i] = _in_lanes(here, new, old).item()
     return [Tensor(out, x.shape)]
+
+
+@rule
+def _sort(o, *xs):
+    """Exchanges of neighbours until all are in order, which keep the order of equals."""
+    axis, n = o.number("dimension"), xs[0].shape[o.number("dimension")]
+    if n > _MOST_SORTED:
+        raise NotReplayed(o.op, f"`{o.op.name}` of more than {_MOST_SORTED} numbers")
+    outs = [[*x.entries] for x in xs]
+    for row in np.moveaxis(xs[0].places, axis, -1).reshape(-1, n):
+        for end in range(n - 1, 0, -1):
+            for left, right in itertools.pairwise(row[: end + 1]):
+                pairs = [Tensor([x[i]], ()) for x in outs for i in (right, left)]
+                wrong = o.run(0, pairs)[0].item()
+                for x in outs:
+                    low = drjit().select(wrong, x[right], x[left])
+                    x[right] = drjit().select(wrong, x[left], x[right])
+                    x[left] = low
+    return [Tensor(out, x.shape) for out, x in zip(outs, xs)]
 
 
 # Conversions
@@ -211,10 +254,21 @@ def _bitcast_convert(o, x):
 @rule
 def _compare(o, a, b):
     name = o.word("comparison_direction").lower()
+    if "compare_type" in o.op.attributes and o.word("compare_type") == "TOTALORDER":
+        a, b = each(_in_total_order, a), each(_in_total_order, b)
     if name == "ne":
         # NaN differs from everything, but not in Dr.Jit.
         return [each(lambda a, b: ~(a == b), a, b)]
     return [each(getattr(operator, name), a, b)]
+
+
+def _in_total_order(a: Any) -> Any:
+    """An integer that orders floating-point numbers, with NaN above infinity."""
+    kinds = {4: "i32", 8: "i64"}
+    bits = 8 * drjit().itemsize_v(a)
+    number = drjit().reinterpret_array(array_types()[kinds[bits // 8]], a)
+    # Of negative numbers all bits but the sign are turned.
+    return number ^ ((number >> (bits - 1)) & (2 ** (bits - 1) - 1))
 
 
 # Combinations

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 from ._backend import array_types
-from ._tensor import Tensor
+from ._tensor import made_here, Tensor
 
 
 class Operation(NamedTuple):
@@ -51,15 +51,15 @@ class Operation(NamedTuple):
     def shapes(self) -> list[tuple[int, ...]]:
         return [tuple(x.type.shape) for x in self.op.results]
 
-    def recorded(self, fn: Callable, *args: Any, **kwargs: Any) -> list[Tensor]:
-        """The results of a loop or conditional that Dr.Jit records with `fn`."""
+    def recorded(self, fn: Callable, *args: Any, **kwargs: Any) -> tuple:
+        """What a loop or conditional returns, which Dr.Jit records with `fn`."""
         number = len(self.errors)
         out = fn(*args, mode="symbolic", **kwargs)
         if len(self.errors) > number:
             raise NotReplayed(
                 self.op, "an error that is raised within a loop or branch"
             )
-        return out
+        return tuple(map(made_here, out))
 
     def part(self, name: str, key: str) -> list[int]:
         """An entry of an attribute such as `#stablehlo.gather<offset_dims = [0], ...>`."""

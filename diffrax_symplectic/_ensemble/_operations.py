@@ -1,7 +1,7 @@
 """The table of operations that can be replayed. An elementwise operation is a line in
 `_elementwise`; any other is a function with the decorator `rule`."""
 
-from . import _control_flow, _moves  # noqa: F401 (they fill the table)
+from . import _control_flow, _linear_algebra, _moves  # noqa: F401 (they fill the table)
 from ._elementwise import elementwise
 from ._operation import Rule, RULES
 from ._tensor import each

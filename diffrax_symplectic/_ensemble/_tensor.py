@@ -47,8 +47,8 @@ def known(x: Tensor) -> np.ndarray | None:
 
 
 def each(fn: Callable, *xs: Tensor) -> Tensor:
-    """Applies a function entry by entry. A single entry is repeated as needed."""
-    size = max(xs, key=lambda x: len(x.entries))
+    """Applies a function entry by entry. A scalar is repeated as needed."""
+    size = max(xs, key=lambda x: (len(x.entries), len(x.shape)))
     spread = [
         x.entries
         if len(x.entries) == len(size.entries)
@@ -67,6 +67,15 @@ def copied(xs: Sequence[Tensor]) -> tuple:
     loop must return them: Dr.Jit writes the result of a conditional into the objects that
     a branch returned, so a value from outside would change for all who hold it."""
     return tuple(type(entry)(entry) for entry in flat(xs))
+
+
+def made_here(entry: Any) -> Any:
+    """An entry that a conditional or loop returned, for use after it. If both branches
+    return the same constant, Dr.Jit returns the constant of the second branch, which is
+    defined within it only: LLVM aborts the process if an outer branch returns that."""
+    if entry.state != drjit().VarState.Literal:
+        return entry
+    return type(entry)(entry[0])
 
 
 def unflat(entries: Iterable[Any], shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:

@@ -40,6 +40,9 @@ _BEFORE_STOPPING = 8
 # With fewer paths along each coordinate, neighbours are far apart. The number of replicates
 # by which two ways to sort are compared.
 _FEW, _TRIAL = 3, 4
+# Folded into the key of a replicate to draw the starts of its paths. (Numbers of levels are
+# smaller.)
+_STARTS = 0xFFFFFFFF
 
 
 class ArrayRQMC(AbstractSampling):
@@ -139,6 +142,9 @@ def _replicates(
     n, d = points.shape
     terms_of = lambda words: with_words(p.terms, layout, words)
     (replicate,) = keys
+    # Not from quasi-random points, since a function of a key takes any number of them.
+    each = jr.split(jr.fold_in(replicate, _STARTS), n)
+    drawn = jax.vmap(p.drawn)(each)
 
     def begin(level):
         key = jr.fold_in(replicate, level.index)
@@ -156,7 +162,7 @@ def _replicates(
             order = hilbert_order(z, paths.failed)
             return advance(i, jtu.tree_map(lambda x: x[order], paths))
 
-        advance, paths = independent_steps(p, level, n, terms_of, words)
+        advance, paths = independent_steps(p, level, drawn, terms_of, words)
         return step, paths
 
     saved, failed, _ = simulate(p, begin, _mean_of_good)

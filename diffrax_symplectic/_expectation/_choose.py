@@ -19,7 +19,8 @@ _PATHS_OF_FUNCTIONS, _PATHS, _REPLICATE, _REPLICATES = 2**12, 2**17, 2**14, 16
 MOST = 10**9
 # Scrambling more random variables per step takes long.
 _MOST_WORDS = 2**8
-# Limit on the numbers in all steps of all paths (about ten seconds), and the fewest paths.
+# Limit on the numbers in all steps of all paths (from ten seconds to some
+# minutes), and the fewest paths.
 _NUMBERS, _FEWEST = 2**28, 2**8
 
 
@@ -31,7 +32,9 @@ def choose(problem: Problem, tol: float | None) -> tuple[AbstractSampling, str]:
     why = f"{d} components of the state, {steps:,} steps"
     why += f" of {outcomes} outcomes each" if outcomes else ""
     paths = int(np.clip(_NUMBERS // (steps * d), _FEWEST, _PATHS))
-    if d <= _FUNCTIONS and outcomes and outcomes <= _FEW_OUTCOMES:
+    # Value functions leave the variance of the start, for which few paths are too few.
+    few_suffice = not problem.paths_differ
+    if few_suffice and d <= _FUNCTIONS and outcomes and outcomes <= _FEW_OUTCOMES:
         if steps * outcomes <= _OUTCOMES:
             sampling = ValueFunctions(None, MOST if tol else _PATHS_OF_FUNCTIONS)
             return sampling, f"value functions for {why}"

@@ -82,7 +82,9 @@ def fit(
     y0, unravel = jfu.ravel_pytree(p.y0)
     steps, last = level.num_steps, p.max_steps
     keys = jr.split(key, basis.pilots)
-    states, good = _pilot(noise, keys, y0)
+    starts, states, good = _pilot(noise, keys)
+    if p.y0_of is not None:
+        y0 = jnp.mean(starts, axis=0)
     # Coordinates are scaled by how far they move. (Dividing by the largest value first
     # avoids underflow of squares in single precision.)
     off = jnp.where(good[:, None], jnp.abs(states - y0), 0)
@@ -123,28 +125,32 @@ def fit(
         return noise.second(i, jax.vmap(unravel)(few), lambda y: u(i, y))
 
     # Some states before each step.
-    few = jnp.concatenate([states[:1] * 0 + y0, states[:-1]])[:, :_SECOND]
+    few = jnp.concatenate([starts[None], states[:-1]])[:, :_SECOND]
     second = lax.map(kept, (jnp.arange(last), few))
     return Functions(u.frames, u.coefficients, second, basis), jnp.sum(~good)
 
 
-def _pilot(noise: Any, keys: PRNGKeyArray, y0: Array):
-    """The states of the pilot's paths after each step, and which paths are good."""
-    p, n, last = noise.problem, len(keys), noise.problem.max_steps
+def _pilot(noise: Any, keys: PRNGKeyArray):
+    """The states of the pilot's paths at the start and after each step, and which paths are
+    good."""
+    p, last = noise.problem, noise.problem.max_steps
 
     def forward(i, carry):
-        def one(y, key):
+        def one(y, args, key):
             # With equal probabilities the pilot spreads further than the paths, so that
             # the fit also holds for outliers.
             x, _ = noise.draw(key, i, jnp.ones(()))
-            return noise.step(i, y, noise.fresh(i, y), x)
+            own = noise.with_args(args)
+            return own.step(i, y, own.fresh(i, y), x)
 
         paths, states = carry
-        y, _, success = jax.vmap(one)(paths.y, keys)
+        y, _, success = jax.vmap(one)(paths.y, paths.args, keys)
         paths = paths.moved(p, y, None, success)
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
-    states = jnp.broadcast_to(y0, (last, n, y0.size))
-    carry = Paths.start(p, n, None), states
+    paths = Paths.start(p, *jax.vmap(p.drawn)(keys), None)
+    starts = jax.vmap(ravel)(paths.y)
+    states = jnp.broadcast_to(starts, (last, *starts.shape))
+    carry = paths, states
     paths, states = lax.fori_loop(0, noise.level.num_steps, forward, carry)
-    return states, ~paths.failed
+    return starts, states, ~paths.failed

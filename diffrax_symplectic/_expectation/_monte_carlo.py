@@ -7,13 +7,12 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .._arguments import check_real, check_takes, whole_number
-from .._brownian import is_key, typed_key
+from .._brownian import derived_key, is_key
 from .._root_finder import all_finite
 from .._terms import brownian_paths, replace_paths
 from ._estimate import Expectation
@@ -58,9 +57,10 @@ class IndependentPaths(AbstractSampling):
 
 def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
     """A sample is a path, with the same random key on all levels."""
-    n, own = len(keys), jax.vmap(lambda key: path_keys(p.terms, key))(keys)
+    own = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
+    drawn = jax.vmap(p.drawn)(keys)
     terms_of = lambda keys: with_keys(p.terms, keys)
-    begin = lambda level: independent_steps(p, level, n, terms_of, lambda i: own)
+    begin = lambda level: independent_steps(p, level, drawn, terms_of, lambda i: own)
     saved, failed, _ = simulate(p, begin)
     # A path that fails on several levels counts once.
     lost = jnp.any(failed, axis=0)
@@ -70,15 +70,8 @@ def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
 def path_keys(terms: PyTree[diffrax.AbstractTerm], key: PRNGKeyArray) -> list[Array]:
     """New random keys for the paths in `terms`, derived from `key`. Paths that share a key
     get the same new one."""
-    new = []
-    for x in filter(is_key, jtu.tree_leaves(brownian_paths(terms))):
-        typed, own = typed_key(x), key
-        words = jr.key_data(typed)
-        for word in words.reshape(-1):
-            own = jr.fold_in(own, word)
-        data = jr.bits(own, words.shape, jnp.uint32)
-        new.append(jr.wrap_key_data(data, impl=jr.key_impl(x)) if x is typed else data)
-    return new
+    old = filter(is_key, jtu.tree_leaves(brownian_paths(terms)))
+    return [derived_key(key, x) for x in old]
 
 
 def with_keys(terms: PyTree[diffrax.AbstractTerm], keys: list[Array]) -> PyTree:

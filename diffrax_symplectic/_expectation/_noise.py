@@ -1,6 +1,7 @@
 """The random variables of a step, and expectations over them."""
 
 import collections
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -63,6 +64,10 @@ class Noise(eqx.Module):
         values, probabilities = outcomes(discrete, 1)
         few = values.astype(problem.dtype), probabilities
         return Noise(problem, level, discrete, few)
+
+    def with_args(self, own: PyTree[Array]) -> "Noise":
+        """The noise for a path with its own `args`."""
+        return dataclasses.replace(self, problem=self.problem.with_args(own))
 
     def draw(
         self, key: PRNGKeyArray, number, share: Any = 0.0, tilt: Any = 0.0

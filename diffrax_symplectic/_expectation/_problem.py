@@ -1,5 +1,6 @@
 """An expectation to compute: the checked arguments, and single steps."""
 
+import dataclasses
 import functools as ft
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,26 +10,40 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from .._arguments import check_real, check_solver, check_takes, whole_number
+from .._arguments import (
+    check_real,
+    check_solver,
+    check_takes,
+    parameters,
+    whole_number,
+)
 from .._brownian import is_random
 from .._custom_types import Args, RealScalarLike, Y
 from .._root_finder import all_finite
-from .._solver import AbstractSymplecticSolver, check_resolution
+from .._solver import AbstractSymplecticSolver, check_resolution, Want
 from .._suggest import own_path, specified
 from .._terms import (
     brownian_paths,
     check_fit,
+    check_start,
     check_stratonovich,
+    constraint_of,
     evaluated,
     has_lifted,
 )
 from ._moments import level_weights
 from ._polynomials import tensordot
 from ._sampling import real
+
+
+# Folded into the key of a sample to draw its `y0` and `args`. The keys of its paths are
+# folded from the words of the user's keys: a number that is unlikely to be one of them.
+_START = 0x517A87
 
 
 class Level(eqx.Module):
@@ -43,7 +58,8 @@ class Level(eqx.Module):
 
 class Problem(eqx.Module):
     """The arguments of `expectation`, by the same names, and the levels, along a leading
-    axis."""
+    axis. Where `y0` or `args` is a function of a random key, `y0` and `args` are an example
+    of its values."""
 
     phi: Callable[[RealScalarLike, Y, Args], PyTree]
     terms: PyTree[diffrax.AbstractTerm]
@@ -51,6 +67,9 @@ class Problem(eqx.Module):
     t0: Float[Array, ""]
     y0: Y
     args: Args
+    # The functions of a random key that draw `y0` and `args` for each path.
+    y0_of: Callable | None
+    args_of: Callable | None
     levels: Level
     # An array, so that other weights do not compile anew.
     weights: Float[Array, "combinations levels"]
@@ -60,8 +79,11 @@ class Problem(eqx.Module):
     max_steps: int = eqx.field(static=True)
 
     @staticmethod
-    def of(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels) -> "Problem":
-        """Raises a `ValueError` for bad arguments of `expectation`."""
+    def of(
+        phi, terms, solver, t0, t1, dt0, y0, args, ts, levels, want: Want = "weak"
+    ) -> "Problem":
+        """Raises a `ValueError` for bad arguments of `expectation`. `want` is the purpose
+        of the paths that take the place of shapes."""
         levels = whole_number("levels", levels)
         check_solver("solver", solver)
         if isinstance(solver, diffrax.HalfSolver):
@@ -69,18 +91,19 @@ class Problem(eqx.Module):
                 "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
             )
         # In each sample other keys take the place of these.
-        terms = specified(terms, ft.partial(own_path, solver, "weak"))
+        terms = specified(terms, ft.partial(own_path, solver, want))
         saved_steps, num_steps = _steps(t0, t1, dt0, ts)
-        if callable(y0):
-            raise ValueError(
-                "`y0` must be a state; got a function. For a random initial state, use "
-                "`monte_carlo` with a function of the key that draws the state and solves."
-            )
-        y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
-        if not all_finite(y0):
+        # Any draw has the right structure.
+        args_of = args if callable(args) else None
+        args = args if args_of is None else _drawn_args(args_of, jr.key(0))
+        y0_of = y0 if callable(y0) else None
+        y0 = _state(y0) if y0_of is None else _drawn_state(y0_of, jr.key(1), args)
+        if y0_of is None and not all_finite(y0):
             raise ValueError(f"`y0` must hold finite numbers; got {y0}.")
         start = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
         check_fit(terms, start, y0, args)
+        if constraint_of(terms) is not None:
+            check_start(terms, start, y0, args)
         _check_noise(terms)
         smallest = float(dt0) / 2 ** (levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):
@@ -104,10 +127,33 @@ class Problem(eqx.Module):
         order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
         weights = jnp.asarray(level_weights(order, levels), float)
         at = grid, weights, ts is None, int(finer[-1] * num_steps)
-        return Problem(phi, terms, solver, start, y0, args, *at)
+        return Problem(phi, terms, solver, start, y0, args, y0_of, args_of, *at)
 
     def level(self, index: int) -> Level:
         return jtu.tree_map(lambda x: x[index], self.levels)
+
+    @property
+    def paths_differ(self) -> bool:
+        """Whether not all paths have the same `y0` and `args`."""
+        return self.y0_of is not None or self.args_of is not None
+
+    def drawn(self, key: PRNGKeyArray) -> tuple[Y, PyTree[Array]]:
+        """The initial state of the sample with this key, and its own `args` as arrays for
+        `with_args`: nothing unless they are drawn."""
+        for_y0, for_args = jr.split(jr.fold_in(key, _START))
+        own = None
+        if self.args_of is not None:
+            own = eqx.filter(_drawn_args(self.args_of, for_args), eqx.is_array)
+        if self.y0_of is None:
+            return self.y0, own
+        return _drawn_state(self.y0_of, for_y0, self.with_args(own).args), own
+
+    def with_args(self, own: PyTree[Array]) -> "Problem":
+        """The problem of a path that was drawn."""
+        if self.args_of is None and own is None:
+            return self
+        rest = eqx.filter(self.args, eqx.is_array, inverse=True)
+        return dataclasses.replace(self, args=eqx.combine(own, rest))
 
     def init(self, terms, i, h: Float[Array, ""], y: Y) -> PyTree[Array]:
         """The arrays of the solver's state before step `i`. The rest of the state does not
@@ -172,6 +218,33 @@ class Problem(eqx.Module):
         """The number of times at which to average, and of components of `phi`."""
         m = jax.eval_shape(lambda: self.values(self.t0, self.y0)).size
         return self.levels.saved_steps.shape[1], m
+
+
+def _state(y0: Y) -> Y:
+    return jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+
+
+def _drawn_state(y0_of: Callable, key: PRNGKeyArray, args: Args) -> Y:
+    # By its name, since a function of the key may have other parameters with defaults.
+    if "args" in parameters(y0_of):
+        check_takes("y0", y0_of, "key", "args")
+        return _state(y0_of(key, args))
+    check_takes("y0", y0_of, "key")
+    return _state(y0_of(key))
+
+
+def _drawn_args(args_of: Callable, key: PRNGKeyArray) -> Args:
+    check_takes("args", args_of, "key")
+    try:
+        args = args_of(key)
+    except TypeError as error:
+        error.add_note(
+            "`args` is called with a random key, to draw the `args` of each path. If your "
+            "Hamiltonians take a function in `args`, pass it in a tuple or a dictionary."
+        )
+        raise
+    is_numpy = lambda x: isinstance(x, np.ndarray | np.generic)
+    return jtu.tree_map(lambda x: jnp.asarray(x) if is_numpy(x) else x, args)
 
 
 def ravel(y: Y) -> Float[Array, " d"]:

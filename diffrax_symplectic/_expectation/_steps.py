@@ -23,20 +23,27 @@ class Paths(eqx.Module):
     # A failed path stays failed, and continues from `y0`: otherwise stage equations without
     # a solution would hold up the other paths in every later step.
     failed: Bool[Array, " n"]
+    # The arrays of `args`, if each path has its own.
+    args: PyTree[Array]
     # The control variate, if any.
     control: Any
 
     @staticmethod
-    def start(p: Problem, n: int, state: PyTree[Array], control=None) -> "Paths":
-        y = jtu.tree_map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), p.y0)
-        return Paths(y, state, jnp.zeros(n, bool), control)
+    def start(
+        p: Problem, y: Y, args: PyTree, state: PyTree[Array], control=None
+    ) -> "Paths":
+        """Paths that start at `y` with these `args`, both from `Problem.drawn`."""
+        failed = ~jax.vmap(all_finite)(y)
+        keep = lambda new, old: jnp.where(along(failed, new), old, new)
+        return Paths(jtu.tree_map(keep, y, p.y0), state, failed, args, control)
 
     def moved(self, p: Problem, y, state, success, control=None) -> "Paths":
         """The paths after a step to `y`, with failed paths reset."""
         failed = self.failed | ~success
         keep = lambda new, old: jnp.where(along(failed, new), old, new)
         state = jtu.tree_map(keep, state, self.solver_state)
-        return Paths(jtu.tree_map(keep, y, p.y0), state, failed, control)
+        y = jtu.tree_map(keep, y, p.y0)
+        return Paths(y, state, failed, self.args, control)
 
 
 def simulate(
@@ -54,7 +61,8 @@ def simulate(
 
         def recorded(i, paths: Paths, saved):
             def record():
-                phi = jax.vmap(lambda y: p.values(p.t0 + i * level.h, y))(paths.y)
+                value = lambda y, args: p.with_args(args).values(p.t0 + i * level.h, y)
+                phi = jax.vmap(value)(paths.y, paths.args)
                 failed = paths.failed | ~jax.vmap(all_finite)(phi)
                 here = along(level.saved_steps == i, saved)
                 return failed, jnp.where(here, measure(phi, failed), saved)
@@ -83,19 +91,30 @@ def simulate(
 
 
 def independent_steps(
-    p: Problem, level: Level, n: int, terms_of: Callable, randomness: Callable
+    p: Problem,
+    level: Level,
+    drawn: tuple[Y, PyTree],
+    terms_of: Callable,
+    randomness: Callable,
 ) -> tuple[Callable[[Any, Paths], Paths], Paths]:
-    """The step of `n` independent paths, and these paths at the start. In step `i` each
-    path has the terms `terms_of(r)`, with `r` its own row of `randomness(i)`."""
+    """The step of independent paths, and these paths at the start, `drawn` by
+    `Problem.drawn`. In step `i` each path has the terms `terms_of(r)`, with `r` its own row
+    of `randomness(i)`."""
 
     def step(i, paths):
-        one = lambda random, y, state: p.step(terms_of(random), i, level.h, y, state)
-        return paths.moved(
-            p, *jax.vmap(one)(randomness(i), paths.y, paths.solver_state)
-        )
+        def one(random, y, state, args):
+            return p.with_args(args).step(terms_of(random), i, level.h, y, state)
 
-    start = lambda random: p.init(terms_of(random), 0, level.h, p.y0)
-    return step, Paths.start(p, n, jax.vmap(start)(randomness(0)))
+        random = randomness(i)
+        new = jax.vmap(one)(random, paths.y, paths.solver_state, paths.args)
+        return paths.moved(p, *new)
+
+    def start(random, y, args):
+        return p.with_args(args).init(terms_of(random), 0, level.h, y)
+
+    y, args = drawn
+    state = jax.vmap(start)(randomness(0), y, args)
+    return step, Paths.start(p, y, args, state)
 
 
 def along(mask: Bool[Array, " n"], x: Array) -> Array:

@@ -248,6 +248,7 @@ def _controlled_paths(
     functions = functions.chosen(best)
     n, (center, beyond) = len(keys), [x[:, :, None] for x in usual]
     share, side = law
+    drawn = jax.vmap(p.drawn)(keys)
 
     def begin(level):
         noise, u = Noise.of(p, level), jtu.tree_map(lambda x: x[level.index], functions)
@@ -255,13 +256,14 @@ def _controlled_paths(
         def step(i, paths):
             at, second = lambda y: u(i, y), jtu.tree_map(lambda x: x[i], u.second)
 
-            def one(y, state, key):
+            def one(y, state, args, key):
                 x, log_ratio = noise.draw(
                     key, i, share * noise.share, side * noise.tilt
                 )
-                return *noise.advance(i, y, state, at, second, x), log_ratio
+                own = noise.with_args(args)
+                return *own.advance(i, y, state, at, second, x), log_ratio
 
-            out = jax.vmap(one)(paths.y, paths.solver_state, keys)
+            out = jax.vmap(one)(paths.y, paths.solver_state, paths.args, keys)
             y, state, success, (value, change), log_ratio = out
             # A failed path has no value, but its control must be finite.
             change = jnp.where(along(success, change), change, 0)
@@ -271,10 +273,9 @@ def _controlled_paths(
             return paths.moved(p, y, state, success, control)
 
         dtype = jax.eval_shape(lambda: u(0, p.y0)).dtype
-        same = lambda x: jnp.broadcast_to(x, (n, *jnp.shape(x)))
-        state = jtu.tree_map(same, noise.fresh(0, p.y0))
+        state = jax.vmap(lambda y, args: noise.with_args(args).fresh(0, y))(*drawn)
         zero = jnp.zeros((n, *p.num_outputs), dtype)
-        return step, Paths.start(p, n, state, (zero, zero, jnp.zeros(n, dtype)))
+        return step, Paths.start(p, *drawn, state, (zero, zero, jnp.zeros(n, dtype)))
 
     saved, failed, (*known, log_ratio) = simulate(p, begin)
     control, promised = (jnp.swapaxes(x, 1, 2).astype(saved.dtype) for x in known)

@@ -65,7 +65,7 @@ def correction(fn: _Map, x: _Vector, solver: LinearSolver) -> NewtonCorrection:
         return jax.jvp(fn, (x,), (unit,))
 
     value, matrix = jax.vmap(value_and_column, out_axes=(None, 1))(_units(x))
-    return NewtonCorrection(value, _eliminate(matrix, value), jnp.array(True))
+    return NewtonCorrection(value, eliminate(matrix, value), jnp.array(True))
 
 
 def solve(
@@ -76,7 +76,7 @@ def solve(
     failure."""
     if solver is None and rhs.size <= _MAX_DENSE:
         matrix = jax.vmap(apply, out_axes=1)(_units(rhs))
-        return LinearSolution(_eliminate(matrix, rhs), jnp.array(True))
+        return LinearSolution(eliminate(matrix, rhs), jnp.array(True))
     if solver is None:
         solver = lx.GMRES(reduction, reduction, restart=_DIRECTIONS)
     # Absolute tolerances assume a right-hand side of size one.
@@ -84,6 +84,21 @@ def solve(
     operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: rhs))
     x, result = computed_by(solver, operator, rhs / size)
     return LinearSolution(x * size, result == lx.RESULTS.successful)
+
+
+def solve_matrix(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
+    """Solves `matrix @ x = rhs`, differentiably. Of a singular matrix `x` is not finite, or
+    large."""
+    # To rounding error, also by GMRES.
+    reduction = float(jnp.finfo(rhs.dtype).eps) ** 0.9
+
+    def by(matrix: Float[Array, "n n"]) -> Callable[[_Map, _Vector], _Vector]:
+        if len(matrix) <= _MAX_DENSE:
+            return lambda apply, rhs: eliminate(matrix, rhs)
+        return lambda apply, rhs: solve(apply, rhs, None, reduction)[0]
+
+    multiply = lambda x: matrix @ x
+    return lax.custom_linear_solve(multiply, rhs, by(matrix), by(matrix.T))
 
 
 def _units(x: _Vector) -> Any:
@@ -98,10 +113,12 @@ def _size_or_one(rhs: _Vector) -> Scalar:
     return jnp.where(size > 0, size, 1)
 
 
-def _eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
+def eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     """Solves a linear system by elimination with partial pivoting, in XLA operations:
     LAPACK needs a call for each matrix of a batch, and 0.1 s to load."""
     num_unknowns = len(rhs)
+    if num_unknowns == 1:
+        return rhs / matrix[0]
     if num_unknowns > MAX_WRITTEN_OUT:
         augmented = jnp.concatenate([matrix, rhs[:, None]], axis=1)
         cleared = lax.fori_loop(0, num_unknowns, _clear_column, augmented)
@@ -139,5 +156,7 @@ def _clear_column(k: IntScalarLike, rows: Float[Array, "n m"]) -> Float[Array, "
     # Rows above have had their turn. A negative number is never the largest.
     largest = jnp.argmax(jnp.where(place < k, -1, jnp.abs(rows[:, k])))
     pivot = rows[largest] / rows[largest, k]
-    rows = rows.at[largest].set(rows[k])
-    return (rows - rows[:, k, None] * pivot).at[k].set(pivot)
+    # Selections, which the fused engine replays: unlike a scatter to a row that differs
+    # between paths.
+    rows = jnp.where((place == largest)[:, None], rows[k], rows)
+    return jnp.where((place == k)[:, None], pivot, rows - rows[:, k, None] * pivot)

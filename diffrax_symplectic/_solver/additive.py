@@ -76,6 +76,7 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=3 / 2,
         choose="Two stage vectors, one after the other. The noise may depend on time.",
         suggested=("weak", "strong"),
+        heats=True,
     )
     beta1: float = free_parameter("beta1", 0.0)
     beta2: float = eqx.field(default=1.0, static=True, converter=_nonzero)
@@ -126,6 +127,7 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=None,
         choose="As cheap as the midpoint rule, for low accuracy.",
         suggested=("weak",),
+        heats=True,
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
         alpha=[1],
@@ -171,8 +173,11 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=3,
         strong=None,
-        choose="Two stage vectors, and by far the smallest errors for constant noise.",
+        choose="Two stage vectors, and by far the smallest errors for constant noise. Not "
+        "for long steps, omega h > 1, or for stationary laws of linear systems, which the "
+        "midpoint rule has exactly.",
         suggested=("weak",),
+        heats=True,
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
         alpha=[1 / 2, 1 / 2],

@@ -69,6 +69,12 @@ class Record(NamedTuple):
     - `choose`: when to choose it, in a sentence.
     - `noises`: the noises for which it is recommended. It accepts any.
     - `suggested`: the kinds of convergence for which `suggest_solver` returns it.
+    - `stationary`: the second moments, of `"qq"`, `"pq"` and `"pp"`, of a harmonic mode in
+        a heat bath whose stationary values are exact for every stable step.
+    - `heats`: whether noise gives a harmonic mode without friction the right energy for
+        steps that do not resolve it; `None` if such steps are unstable.
+
+    The last two are measured, in `tests/test_advice.py`.
     """
 
     weak: Order
@@ -76,6 +82,21 @@ class Record(NamedTuple):
     choose: str
     noises: Noises = "any"
     suggested: tuple[Want, ...] = ()
+    stationary: tuple[str, ...] = ()
+    heats: bool | None = None
+
+    @property
+    def reason(self) -> str:
+        """When to choose it, and what noise does to modes that a step does not resolve."""
+        if self.heats is None:
+            return self.choose
+        if self.heats:
+            stiff = "For stiff modes with friction wrap it in `Damped`."
+        elif "pp" in self.stationary:
+            stiff = "Right for noise on stiff modes only in a heat bath."
+        else:
+            stiff = "Not for noise on stiff modes."
+        return f"{self.choose} {stiff}"
 
     def order(self, want: Want, commute: bool) -> int | float | None:
         """The order for noises that commute, or for others."""
@@ -106,6 +127,8 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
         diffrax.LocalLinearInterpolation
     )
     record: ClassVar[Record | None] = None
+    # Whether it takes terms with a `constraint`.
+    keeps_constraints: ClassVar[bool] = False
     structure: AbstractVar[Structure]
     variables: AbstractVar[tuple[str, ...]]
 

@@ -67,9 +67,11 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=(2, 1),
         strong=None,
-        choose="For accurate expectations: four stage vectors in three small systems.",
+        choose="For accurate expectations: four stage vectors in three small systems. "
+        "Not for long steps, omega h > 1.",
         noises="commuting",
         suggested=("weak",),
+        heats=True,
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(
         alpha=_HALVES,
@@ -143,6 +145,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         choose="For few noises: two stage vectors per noise, and four for the drift.",
         noises="not commuting",
         suggested=("weak",),
+        heats=True,
     )
     structure: ClassVar[Structure] = "any"
     variables: ClassVar[tuple[str, ...]] = ("W", "two_point")
@@ -259,6 +262,8 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose="The midpoint rule with Lévy areas, for noises that do not commute.",
         noises="not commuting",
         suggested=("strong",),
+        stationary=("qq", "pq", "pp"),
+        heats=False,
     )
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
         ImplicitMidpoint.tableau, noise=("W", "A")
@@ -309,6 +314,8 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose="For accurate paths: two stage vectors, and brackets of vector fields.",
         noises="commuting",
         suggested=("strong",),
+        stationary=("qq", "pq", "pp"),
+        heats=False,
     )
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
         GeneralTableau.strong(A=GAUSS, B=GAUSS, alpha=_HALVES, beta=_HALVES),

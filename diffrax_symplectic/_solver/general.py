@@ -33,6 +33,8 @@ class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=(1, 1 / 2),
         choose="A good first choice: one stage vector for any number of noises.",
         suggested=("strong",),
+        stationary=("qq", "pq", "pp"),
+        heats=False,
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau.strong(
         A=[[1 / 2]], B=[[1 / 2]], alpha=[1], beta=[1]
@@ -62,6 +64,7 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=1,
         strong=(1, 1 / 2),
         choose="Two midpoint substeps, for errors dominated by the drift.",
+        heats=False,
     )
     a: float = free_parameter("a", 0.25)
 
@@ -97,6 +100,8 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=None,
         choose="The midpoint rule for expectations. Cheap, for low accuracy.",
         suggested=("weak",),
+        stationary=("qq", "pq", "pp"),
+        heats=False,
     )
     b: float = free_parameter("b", 0.5)
 

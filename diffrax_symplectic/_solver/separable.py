@@ -1,10 +1,11 @@
 """Solvers for H0 = V(p) + U(t, q) and noise Hamiltonians U_k(t, q)."""
 
-from typing import ClassVar, get_args, Literal, NamedTuple, TypeAlias
+from typing import Any, ClassVar, get_args, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 
 from .._tableau import PartitionedTableau, SeparableTableau
+from .._terms import constraint_of
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
@@ -12,6 +13,9 @@ from .base import (
     free_parameter,
     Record,
 )
+from .constrained import init_constrained, verlet_step
+from .step import result_of, Solved
+from .times import result_at
 
 
 Variant: TypeAlias = Literal["a", "b", "c", "d", "e", "f"]
@@ -108,6 +112,7 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=None,
         choose="Solves for half of the state. For stiff systems.",
         suggested=("weak",),
+        heats=False,
     )
     a21: float = free_parameter("a21", 0.5)
 
@@ -142,6 +147,7 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=1,
         choose="The midpoint rule on half of the state. For stiff systems.",
         suggested=("strong",),
+        heats=False,
     )
     tableau: ClassVar[SeparableTableau] = SeparableTableau(
         alpha=[1], beta=[1], A0=[[1 / 2]], B0=[[1 / 2]], A1=[[1 / 2]]
@@ -200,15 +206,24 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     one evaluation of the forces, and must resolve the fastest frequency $\omega$ of $H_0$:
     $\omega h < 2$.
 
+    **Constraints.** For terms with a `constraint` each drift over $h / 2$ is a step of
+    RATTLE, $q \gets q + \frac h2 M^{-1} p$ with $p \gets p - J(q)^\top \lambda$ and
+    multipliers $\lambda$ for which the new $q$ satisfies the constraint, and momenta are
+    made tangent, $J M^{-1} p = 0$. Multipliers are found by Newton's method to rounding; a
+    step fails if there are none, as happens if it is too long. It is symplectic on the
+    allowed states, and reversible.
+
     **Source:** [Strang (1968)](https://doi.org/10.1137/0705041) for the splitting;
     [Ninomiya and Victoir (2008)](https://doi.org/10.1080/13504860701413958) for the weak
-    order of symmetric splittings.
+    order of symmetric splittings; [Leimkuhler and Skeel
+    (1994)](https://doi.org/10.1006/jcph.1994.1085) for RATTLE.
     """
 
+    keeps_constraints: ClassVar[bool] = True
     record: ClassVar[Record] = Record(
         weak=2,
         strong=1,
-        choose="Explicit, with the cheapest step. For frequencies omega < 2 / h.",
+        choose="Explicit, with the cheapest step. Not for frequencies omega > 2 / h.",
         suggested=("weak", "strong"),
     )
     tableau: ClassVar[PartitionedTableau] = PartitionedTableau(
@@ -222,6 +237,19 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
         B0=[[0], [1]],
         A1=[[1 / 2, 0]],
     )
+
+    def init(self, terms, t0, t1, y0, args) -> Solved:
+        if constraint_of(terms) is None:
+            return super().init(terms, t0, t1, y0, args)
+        return init_constrained(self, terms, t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
+        if constraint_of(terms) is None:
+            return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
+        at = terms, t0, t1, y0, args
+        y1, solved = verlet_step(*at, solver_state, type(self).__name__)
+        result = result_at(terms, t0, t1, result_of(solved, y1))
+        return y1, None, dict(y0=y0, y1=y1), solved, result
 
 
 # The three kicks, as combinations of random variables: with M = W / 2 + H, these are M - C,
@@ -273,7 +301,7 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=3 / 2,
-        choose="Explicit, with accurate paths. For frequencies omega < 4 / h.",
+        choose="Explicit, with accurate paths. Not for frequencies omega > 4 / h.",
         suggested=("strong",),
     )
     tableau: ClassVar[PartitionedTableau] = _plateau_verlet

@@ -14,9 +14,9 @@ from .._arguments import check_pair, check_takes
 from .._compat import direction
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
-from .._terms import Dependence, flattened, has_lifted, is_friction
-from ._bath import after_friction, check_friction, split_friction
+from .._terms import Dependence, has_lifted, refuse_constraint, split_friction
 from .base import AbstractSymplecticSolver, Order, Record
+from .bath import after_friction, check_friction
 from .langevin import AbstractLangevinSplitting, LangevinMiddle
 
 
@@ -58,6 +58,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
         return record and record._replace(
             weak=_at_most(record.weak, self.weak),
             strong=_at_most(record.strong, self.strong),
+            stationary=(),
         )
 
     def weak_order(self, terms) -> int | None:
@@ -92,6 +93,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
         return None if order is None else min(order, 2)
 
     def init(self, terms, t0, t1, y0, args) -> Any:
+        refuse_constraint(terms, type(self).__name__)
         self.check(terms, t0, y0, args)
         return self.solver.init(self.rest(terms), t0, t1, y0, args)
 
@@ -159,8 +161,8 @@ class Damped(AbstractSplitting):
         if has_lifted(terms):
             raise ValueError(
                 "`Damped` applies friction to a canonical momentum, which the state of "
-                "`spin_terms` or `wave_terms` does not have: spins would get shorter. For "
-                "damped spins pass `damping=` to `spin_terms`."
+                "`spin_terms` or `wave_terms` does not have: spins would get shorter. Pass "
+                "`damping=` to `spin_terms` or `wave_terms` instead."
             )
         check_pair(y0)
         drift, friction, _ = split_friction(terms)
@@ -171,8 +173,8 @@ class Damped(AbstractSplitting):
         return after_friction(friction, t, time, y, args), y[1]
 
     def rest(self, terms):
-        others = [term for term in flattened(terms) if not is_friction(term)]
-        return diffrax.MultiTerm(*others)
+        drift, _, noise = split_friction(terms)
+        return diffrax.MultiTerm(*drift, *noise)
 
 
 Damped.__init__.__doc__ = """**Arguments:**
@@ -201,8 +203,8 @@ class LinearFlow(AbstractSplitting):
 
     **Friction.** With friction and noise of a temperature use `LinearFlow(BAOAB(), flow)`.
     Friction acts on the velocities of the whole system, so it comes from terms of the whole
-    Hamiltonian: `MultiTerm(*hamiltonian_terms(R).terms, *langevin_terms(H0, friction,
-    temperature, path).terms[1:])`.
+    Hamiltonian: `MultiTerm(*hamiltonian_terms(R).terms, *bath_terms(H0, friction,
+    temperature, path).terms)`.
 
     The method is symplectic if the solver and `flow` are, which
     [`diffrax_symplectic.symplecticity_defect`][] tests. The orders are the solver's, but at

@@ -38,12 +38,13 @@ def _marked(select: Callable, tree: PyTree) -> list[bool]:
     return [i in chosen for i in range(treedef.num_leaves)]
 
 
-# Primitives whose result has the shape of their arguments (or of those that are not
-# scalars), entry by entry. All others count as mixing entries.
+# Operations that may act on what is linear in an input, entry by entry. All others count
+# as mixing entries.
 _ELEMENTWISE = frozenset(
-    "abs add add_any convert_element_type copy copy_p cos div exp integer_pow log max min "
-    "mul neg pow rem select_n sign sin sqrt square stop_gradient sub tanh".split()
+    "add add_any convert_element_type copy div integer_pow mul neg select_n sub".split()
 )
+# Those whose parameters hold what they call.
+_CALLS = frozenset({"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"})
 
 
 def acts_elementwise(fn: Callable, x: PyTree[Array]) -> bool:
@@ -80,9 +81,6 @@ def _sources(jaxpr: Jaxpr, numbers: Sequence[int | None]) -> list[int | None] | 
         else:
             return None
     return [of(x) for x in jaxpr.outvars]
-
-
-_CALLS = frozenset({"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"})
 
 
 def _is_elementwise(eqn: Any, source: Callable) -> bool:

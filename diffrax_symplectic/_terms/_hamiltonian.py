@@ -14,6 +14,7 @@ from .._arguments import check_pair, check_takes, shapes, whole_number
 from .._brownian import checked_shape, increment_struct, UnspecifiedPath
 from .._compat import ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike
+from ._constraint import constrained, Constraint
 from ._dependence import Dependence
 
 
@@ -29,6 +30,7 @@ def hamiltonian_terms(
     path: diffrax.AbstractBrownianPath | PyTree | None = None,
     *,
     structure: _Structure | None = None,
+    constraint: Constraint | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of a stochastic Hamiltonian system, from its Hamiltonians.
 
@@ -60,6 +62,12 @@ def hamiltonian_terms(
         $H_k$ do not depend on the state. By default it is detected by tracing, which counts
         every variable that enters a derivative, even if it cancels or is multiplied by
         zero: write $H_0$ as a sum of terms that depend on $p$ or $q$ alone.
+    - `constraint`: `constraint(q, args)`, an array of shape `(c,)` that is zero on the
+        positions that the system can take, such as `jnp.stack([jnp.sum(q**2) - 1])` for a
+        rod. Its gradients must be linearly independent there. For
+        [`diffrax_symplectic.StormerVerlet`][] and [`diffrax_symplectic.BAOAB`][], with
+        $H_0 = p \cdot M^{-1} p / 2 + U(t, q)$ and $H_k = U_k(t, q)$; all other solvers
+        raise an error. Start from [`diffrax_symplectic.constrained_state`][].
 
     `p` and `q` are PyTrees of arrays of the same structure and shapes.
 
@@ -77,7 +85,7 @@ def hamiltonian_terms(
             f"`structure` must be one of {get_args(_Structure)}, or `None` to detect it; "
             f"got {structure!r}."
         )
-    drift = diffrax.ODETerm(_Drift(H0, structure))
+    drift = constrained(diffrax.ODETerm(_Drift(H0, structure)), constraint)
     if noise is None and path is None:
         return diffrax.MultiTerm(drift)
     noise = cast(_Hamiltonian, noise)

@@ -22,6 +22,7 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from ._dependence import Dependence
 from ._hamiltonian import asserted_structure, has_lifted, is_hamiltonian
+from ._langevin import friction_apart
 from ._vector_fields import apply, check_increments, control_struct, split_terms
 
 
@@ -82,10 +83,11 @@ def separable_fault(
         (term, _flow(term, t0, y0, args)) for term in _not_asserted(terms, "separable")
     ]
     still = ft.partial(_is_zero, t0, y0, args)
-    of = flows(drift), flows(noise)
-    here, exchanged = (_faults(p, *of, still) for p in (0, 1))
+    of = flows(sum(friction_apart(drift), ())), flows(noise)
+    here = _faults(0, *of, still)
     if not here:
         return None
+    exchanged = _faults(1, *of, still)
     only_friction = lambda faults: all(fault.friction for fault in faults)
     reason, advice, _ = here[0]
     friction = only_friction(here)

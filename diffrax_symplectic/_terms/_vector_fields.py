@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, PyTree
 from .._brownian import num_noises, raveled, UnspecifiedPath
 from .._compat import is_adjoint_term, unwrapped, ω
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
+from ._constraint import ConstrainedDrift, without_constraint
 from ._hamiltonian import HamiltonianNoise, OneNoise
 
 
@@ -39,7 +40,8 @@ def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     parts = flattened(terms)
     if any(map(is_adjoint_term, parts)):
         raise ValueError(_BACKSOLVE)
-    is_ode = lambda term: isinstance(unwrapped(term), diffrax.ODETerm)
+    ode = diffrax.ODETerm | ConstrainedDrift
+    is_ode = lambda term: isinstance(unwrapped(term), ode)
     is_noise = [
         len(brownian_paths(term)) > 0 or (i > 0 and not is_ode(term))
         for i, term in enumerate(parts)
@@ -117,7 +119,7 @@ def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
             f"; got {type(terms).__name__}."
         )
     if is_term(terms):
-        parts = tuple(flattened(terms))
+        parts = tuple(flattened(without_constraint(terms)))
         check_increments(parts, t0, y0, args)
         controls = eqx.filter_eval_shape(lambda: [x.contr(t0, t0) for x in parts])
         eqx.filter_eval_shape(apply, parts, controls, args, t0, y0)

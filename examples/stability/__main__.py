@@ -4,4 +4,4 @@ from ._page import run
 
 
 if __name__ == "__main__":
-    run("stability", __doc__, ("moments", "solvability", "stiff", "rounding"))
+    run("stability", __doc__, ("moments", "solvability", "stiff", "baths", "rounding"))

@@ -53,24 +53,32 @@ def _map(
     page: Page, name: str, title: str, caption: str, hs, strengths, values: dict
 ) -> str:
     """One picture over h and s for each solver."""
-    rows = -(-len(values) // 5)
+    # As wide as the page, so that labels are shown in their own size.
+    columns = 4
+    rows = -(-len(values) // columns)
     figure, axes = plt.subplots(
-        rows, 5, figsize=(15, 3 * rows), squeeze=False, sharex=True, sharey=True,
-        layout="constrained",
+        rows, columns, figsize=(8, 2.1 * rows + 0.9), squeeze=False, sharex=True,
+        sharey=True, layout="constrained",
     )  # fmt: skip
     norm, image = LogNorm(1e-16, 1e2), None
     for ax, (label, value) in zip(axes.flat, values.items()):
         shown = np.clip(np.abs(value), 1e-16, 1e2)
         image = ax.pcolormesh(strengths, hs, shown, norm=norm, cmap="magma")
-        ax.set(xscale="log", yscale="log", title=label)
-    for ax in axes[-1]:
-        ax.set_xlabel("s")
+        ax.set(xscale="log", yscale="log")
+        ax.set_title(label, fontsize=10)
+        ax.set_xticks([0.1, 1], ["0.1", "1"])
+        ax.set_yticks([0.01, 0.1, 1], ["0.01", "0.1", "1"])
+        ax.minorticks_off()
+    # The last picture of each column has the labels of its axis.
+    for number, ax in enumerate(axes.flat):
+        ax.set_visible(number < len(values))
+        if number + columns >= len(values):
+            ax.set_xlabel("s")
+            ax.tick_params(labelbottom=True)
     for ax in axes[:, 0]:
         ax.set_ylabel("h")
-    for ax in axes.flat[len(values) :]:
-        ax.set_visible(False)
     assert image is not None
-    figure.colorbar(image, ax=axes, label=title)
+    figure.colorbar(image, ax=axes, label=title, location="bottom", aspect=40)
     markdown = page.picture(figure, name, caption)
     plt.close(figure)
     return markdown

@@ -68,6 +68,21 @@ def test_terms_of_a_path_are_complete_if_the_terms_had_a_shape():
 
 
 @engines
+@pytest.mark.parametrize("solver", [ds.StormerVerlet(), ds.ImplicitMidpoint()])
+def test_a_shape_becomes_a_path_with_gaussian_increments_unless_a_weak_one_is_wanted(
+    engine, solver
+):
+    kick = ds.hamiltonian_terms(pendulum, lambda t, p, q, args: -q, ())
+    once = dict(terms=kick, solver=solver, t1=0.25, num_paths=200, engine=engine)
+    values = lambda paths: len(np.unique(np.round(paths.ys[0], 12)))
+    # (A few are cut off for the implicit solver.)
+    assert values(follow(**once)) >= 190
+    assert values(follow(**once, want="weak")) == 3
+    with pytest.raises(ValueError, match="`want` must be one of"):
+        follow(**once, want="sharp")
+
+
+@engines
 def test_without_times_the_ends_are_returned(engine):
     ends, saved = follow(engine=engine), follow(engine=engine, ts=[1.0])
     assert ends.ys[0].shape == (40,)

@@ -94,8 +94,8 @@ CASES = {
     # JAX 0.12's own, in single precision and without optimizations, is off by 10.
     "asin": (unit(jnp.arcsin), [(F, ())], 12),
     "asinh": (domain(-1e9, 1e9)(jnp.arcsinh), [(F, ())], 4),
-    "atan": (jnp.arctan, [(F, ())], 16),
-    "atan2": (lambda y, x: jnp.arctan2(jnp.clip(y, -9, 9), jnp.clip(x, -9, 9)), [(F, ()), (F, ())], 16),
+    "atan": (jnp.arctan, [(F, ())], 4),
+    "atan2": (jnp.arctan2, [(F, ()), (F, ())], 4),
     # Of which JAX's own is off by up to 128.
     "atanh": (unit(jnp.arctanh), [(F, ())], 128),
     "bitcast_convert": (lambda x: lax.bitcast_convert_type(x, jnp.int32), [(U, ())], 0),
@@ -115,6 +115,7 @@ CASES = {
     "cosine": (domain(-9, 9)(jnp.cos), [(F, ())], 4),
     "count_leading_zeros": (lax.clz, [(U, ())], 0),
     "divide": (jnp.divide, [(F, ()), (F, ())], 1),
+    "divide of numbers without sign": (lax.div, [(U, ()), (U, ())], 0),
     "divide of integers": (lax.div, [(I, ()), (I, ())], 0),
     "dot_general": (lambda a, b: jnp.einsum("kij,kjl->kil", a, b), [(F, (2, 2, 3)), (F, (2, 3, 2))], None),
     "dot_general of vectors": (jnp.dot, [(F, (4,)), (F, (4,))], None),
@@ -127,6 +128,7 @@ CASES = {
     "floor": (jnp.floor, [(F, ())], 0),
     "gather": (lambda x: x[np.array([[2, 0], [-1, 1]]), np.array([0, 1])], [(F, (3, 2))], 0),
     "gather of each path": (lambda x, i: x[i % 3, 1], [(F, (3, 2)), (U, ())], 0),
+    "gather with a batch axis": (lambda x, i: jnp.take_along_axis(x, i % 3, axis=0), [(F, (3, 2)), (U, (2, 2))], 0),
     "gather of rows": (lambda x: x[:, np.array([2, 0, 2])], [(F, (2, 3))], 0),
     "if": (lambda b, x: lax.cond(b, lambda x: jnp.floor(x), lambda x: x * 2, x), [(B, ()), (F, ())], 2),
     "iota": (lambda x: x + jnp.arange(3), [(F, (3,))], 0),
@@ -161,6 +163,9 @@ CASES = {
     "rsqrt": (lax.rsqrt, [(F, ())], 4),
     "scatter": (lambda x: x.at[np.array([2, 0])].set(x[:2] * 2), [(F, (3, 2))], 0),
     "scatter that adds": (lambda x: x.at[np.array([1, 1, 0])].add(x[:3]), [(F, (4,))], None),
+    "scatter of each path": (lambda x, y, i: x.at[i].set(y, mode="drop"), [(F, (4,)), (F, (2,)), (I, (2,))], 0),
+    "scatter of each path, which adds": (lambda x, y, i: x.at[1, i % 3].add(y), [(F, (2, 3)), (F, (2,)), (U, (2,))], None),
+    "scatter with a batch axis": (jax.vmap(lambda x, i: x.at[i % 3].set(7.0)), [(F, (2, 3)), (U, (2,))], 0),
     "select": (lambda b, x, y: jnp.where(b, x, y), [(B, ()), (F, ()), (F, ())], 0),
     "shift_left": (lax.shift_left, [(U, ()), (U, ())], 0),
     "shift_right_arithmetic": (lambda a, b: lax.shift_right_arithmetic(a, jnp.abs(b) % 40), [(I, ()), (I, ())], 0),
@@ -170,6 +175,11 @@ CASES = {
     "sine": (domain(-9, 9)(jnp.sin), [(F, ())], 4),
     "sinh": (domain(-9, 9)(jnp.sinh), [(F, ())], 16),
     "slice": (lambda x: x[1:4:2], [(F, (5, 2))], 0),
+    "sort": (lambda x: jnp.sort(x), [(F, (5,))], 0),
+    "sort with NaN": (lambda x: jnp.sort(jnp.where(jnp.abs(x) > 3, jnp.nan * x, x)), [(F, (5,))], 0),
+    "searchsorted": (lambda x: jnp.searchsorted(jnp.arange(20.0).astype(x.dtype), x), [(F, (3,))], 0),
+    "sort along an axis": (lambda x: jnp.sort(x, axis=0, descending=True), [(I, (3, 2))], 0),
+    "sort of pairs": (lambda i, x: jnp.argsort(i % 3), [(U, (6,)), (F, ())], 0),
     "sqrt": (jnp.sqrt, [(F, ())], 0),
     "square": (lax.square, [(F, ())], 0),
     "subtract": (jnp.subtract, [(F, ()), (F, ())], 0),
@@ -219,6 +229,18 @@ def test_the_inverse_error_function_is_one_to_rounding_in_its_tails():
 def test_every_operation_of_the_table_is_tested():
     from diffrax_symplectic._ensemble._operations import names
 
-    tested = {name.split()[0] for name in CASES}
-    # These two have no value.
+    tested = {name.split()[0] for name in CASES} - {"searchsorted"}
+    # The first is tested by `test_linear_algebra`, the second has no value.
     assert names() == tested | {"custom_call", "sharding_constraint"}
+
+
+def test_a_selection_by_a_scalar_keeps_the_axis_of_a_single_entry():
+    yes, x = values(B, (), bool, 0), values(F, (1,), np.float64, 2)
+    x[~np.isfinite(x)] = 0.5
+
+    def fn(yes, x):
+        # The product needs an axis.
+        return jnp.where(yes, x, 0) @ jnp.ones((1, 2))
+
+    (actual,) = replayed(fn, yes, x)
+    np.testing.assert_array_equal(actual, np.where(yes, x[:, 0], 0)[:, None] * [1, 1])

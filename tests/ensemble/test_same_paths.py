@@ -13,7 +13,7 @@ import diffrax_symplectic as ds
 
 from ..picard import by_picard
 from ..problems import SYSTEMS
-from ..solver.test_every_solver import CORE, DEFAULTS, each, STEPS
+from ..solver.test_every_solver import CORE, DEFAULTS, each, STEPS, terms_for
 from .fused import needs_drjit
 
 
@@ -105,7 +105,7 @@ def test_of_every_solver_in_single_precision(solver):
 def _assert_of_solver(solver, dtype):
     y0, args = problem(solver.structure, dtype)
     path = solver.path(jax.ShapeDtypeStruct((2,), dtype), jr.key(0))
-    terms = SYSTEMS[solver.structure].terms(path)
+    terms = terms_for(solver, path)
     reference = solver if repr(solver) in CORE else quick(solver, dtype)
     assert_same_paths(terms, solver, y0, args, dtype, reference)
 

@@ -72,8 +72,6 @@ def test_arguments_of_other_solves_lead_to_monte_carlo():
     path = ds.WeakBrownianPath((), jr.key(0))
     with pytest.raises(TypeError, match="takes no `event`.*`monte_carlo`"):
         _mean(path, event=diffrax.Event(lambda t, y, args, **kwargs: y[0] > 1))
-    with pytest.raises(ValueError, match="random initial state.*`monte_carlo`"):
-        _mean(path, y0=lambda key: Y0)
 
 
 def test_functions_that_close_over_traced_values_have_no_estimate():

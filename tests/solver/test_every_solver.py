@@ -80,8 +80,8 @@ def terms_for(solver, *args, **kwargs):
     terms = SYSTEMS[solver.structure].terms(*args, **kwargs)
     if not has_friction(solver):
         return terms
-    friction = ds.langevin_terms(lambda t, p, q, args: p @ p / 2, GAMMA).terms[1]
-    return diffrax.MultiTerm(*terms.terms, friction)
+    friction = ds.bath_terms(lambda t, p, q, args: p @ p / 2, GAMMA)
+    return diffrax.MultiTerm(*terms.terms, *friction.terms)
 
 
 def whole(terms, solver):

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from examples.hard_cases import double_well
+from examples.hard_cases._ensemble import gaussian
+from examples.hard_cases._stationary import stationary_bias, Step
 
-from ..problems import damped_terms, weak_path
+from ..problems import damped_terms, local_weak_orders, weak_path
 
 
 MASS, T, STIFFNESS = 2.0, 0.5, 1.6
@@ -176,7 +179,7 @@ def test_friction_and_noise_are_exact_beside_an_exact_flow(omega_h):
 
     nothing = lambda t, p, q, args: 0.0 * q
     whole = lambda t, p, q, args: (p**2 + omega_h**2 * q**2) / 2
-    bath = ds.langevin_terms(whole, 1.0, T, _path(())).terms[1:]
+    bath = ds.bath_terms(whole, 1.0, T, _path(())).terms
     terms = diffrax.MultiTerm(*ds.hamiltonian_terms(nothing).terms, *bath)
     exact = np.diag([T, T / omega_h**2])
     solver = ds.LinearFlow(ds.BAOAB(), flow)
@@ -188,3 +191,182 @@ def test_friction_and_noise_are_exact_beside_an_exact_flow(omega_h):
         solver.init(alone, 0.0, h, ORIGIN, None)
     with pytest.raises(ValueError, match=r"`LinearFlow\(BAOAB\(\), flow\)`"):
         ds.LinearFlow(ds.LangevinMiddle(), flow)
+
+
+def test_friction_that_depends_on_positions_leaves_a_bias_of_order_two():
+    # Without sampling, of the mean square of the position in a double well.
+    make = lambda path: double_well.langevin_terms(
+        path, friction=lambda t, q, args: 1 + jnp.tanh(q) / 2
+    )
+    V = lambda q: double_well.energy(0.0, q)
+    hs = [0.2, 0.1, 0.05]
+    step = Step(make, gaussian(), ds.BAOAB())
+    bias = stationary_bias(step, V, double_well.T, hs)[:, 0]
+    assert abs(bias[0]) <= 1.1e-3
+    np.testing.assert_allclose(bias[:-1] / bias[1:], 4.0, rtol=0.03)
+
+
+def _plane_well(q):
+    return (q[0] ** 2 - 1) ** 2 / 2 + q[1] ** 2 / 2 + q[0] * q[1] / 4
+
+
+@pytest.mark.parametrize("form", ["number", "tensor"])
+def test_a_double_well_in_the_plane_has_the_moments_of_gibbs(form):
+    # With friction that depends on positions, and time averages of many paths.
+    H0 = lambda t, p, q, args: (
+        jnp.sum(p**2 / jnp.array([1.0, 2.0])) / 2 + _plane_well(q)
+    )
+    friction = {
+        "number": lambda t, q, args: 0.5 + q[0] ** 2,
+        "tensor": lambda t, q, args: 0.5 * jnp.eye(2) + jnp.outer(q, q),
+    }[form]
+    x = np.linspace(-5, 5, 401)
+    grid = np.stack(np.meshgrid(x, x, indexing="ij"))
+    density = np.exp(-_plane_well(grid) / T)
+    exact = np.sum(grid**2 * density, axis=(1, 2)) / np.sum(density)
+    h, steps = 0.1, 1000
+    solver = ds.BAOAB()
+
+    @jax.jit
+    @jax.vmap
+    def run(key):
+        terms = ds.langevin_terms(H0, friction, T, ds.WeakBrownianPath((2,), key))
+        side = jnp.where(jr.bernoulli(key), 1.0, -1.0)
+        y0 = jnp.zeros(2), jnp.array([1.0, 0.0]) * side
+        state = solver.init(terms, 0.0, h, y0, None)
+
+        def step(carry, i):
+            y, state = carry
+            times = i * h, (i + 1) * h
+            y, _, _, state, _ = solver.step(terms, *times, y, None, state, False)
+            return (y, state), y[1] ** 2
+
+        _, squares = jax.lax.scan(step, (y0, state), jnp.arange(steps))
+        return jnp.mean(squares[200:], axis=0)
+
+    means = np.asarray(run(jr.split(jr.key(1), 1000)))
+    errors = np.std(means, axis=0) / np.sqrt(len(means))
+    assert np.all(errors <= 0.006)
+    np.testing.assert_array_less(np.abs(np.mean(means, axis=0) - exact), 3 * errors)
+
+
+def test_derivatives_of_stationary_means_by_friction_and_temperature():
+    # Exactly in a harmonic well: the mean of q^2 is T / k whatever the friction is.
+    H0 = lambda t, p, q, args: p**2 / (2 * MASS) + STIFFNESS * q**2 / 2
+
+    def mean_square(friction, T):
+        terms = ds.langevin_terms(H0, friction, T, _path(()))
+        K = ds.second_moment_map(terms, ds.BAOAB(), 0.0, 0.4, ORIGIN)
+        return jnp.linalg.solve(jnp.eye(8) - K[1:, 1:], K[1:, 0])[-1]
+
+    slopes = jax.jit(jax.jacfwd(mean_square, (0, 1)))(0.7, T)
+    np.testing.assert_allclose(slopes, [0, 1 / STIFFNESS], atol=1e-12)
+    # And along the paths in a well that is not.
+    well = lambda t, p, q, args: p**2 / 2 + q**2 / 2 + q**4 / 4
+
+    @jax.jit
+    @jax.vmap
+    def run(key):
+        def mean(friction, T):
+            terms = ds.langevin_terms(well, friction, T, ds.WeakBrownianPath((), key))
+            sol = diffrax.diffeqsolve(
+                terms, ds.BAOAB(), 0, 60, 0.1, ORIGIN, max_steps=600,
+                saveat=diffrax.SaveAt(ts=jnp.linspace(10, 60, 201)),
+                adjoint=diffrax.ForwardMode(),
+            )  # fmt: skip
+            return jnp.mean(sol.ys[1] ** 2)
+
+        return jnp.stack(jax.jacfwd(mean, (0, 1))(1.0, T))
+
+    slopes = np.asarray(run(jr.split(jr.key(0), 1000)))
+    x = np.linspace(-6, 6, 2001)
+    at = lambda T: np.average(x**2, weights=np.exp(-(x**2 / 2 + x**4 / 4) / T))
+    exact = [0, (at(T + 1e-4) - at(T - 1e-4)) / 2e-4]
+    errors = np.std(slopes, axis=0) / np.sqrt(len(slopes))
+    assert np.all(errors <= 0.02)
+    np.testing.assert_array_less(np.abs(np.mean(slopes, axis=0) - exact), 3 * errors)
+
+
+@pytest.mark.slow
+def test_constant_friction_leaves_weak_order_three():
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 4 - jnp.sum(jnp.cos(q))
+    terms = ds.langevin_terms(H0, 0.7, T, weak_path(1, order=3))
+    y0 = jnp.array([[0.3]]), jnp.array([[0.5]])
+    hs = jnp.array([0.02, 0.01])
+    slopes = local_weak_orders(terms, ds.AdditiveGauss(), y0, None, hs, order=3)
+    np.testing.assert_allclose(slopes, 4.0, atol=0.2)
+
+
+GAMMA, U = jnp.array([0.7, 0.2]), jnp.array([0.5, 2.0])
+
+
+def _diffrax_terms(path, gamma=GAMMA):
+    grad_f = lambda x, args: x**3 + args * jnp.sin(x)
+    return diffrax.MultiTerm(
+        diffrax.UnderdampedLangevinDriftTerm(gamma, U, grad_f),
+        diffrax.UnderdampedLangevinDiffusionTerm(gamma, U, path),
+    )
+
+
+@LANGEVIN
+def test_terms_of_diffrax_are_taken_as_they_are(solver):
+    path = weak_path(2)
+    H0 = lambda t, p, q, args: jnp.sum(U * p**2 / 2 + q**4 / 4 - args * jnp.cos(q))
+    ours = ds.langevin_terms(H0, GAMMA / U, 1.0, path)
+    x, v = jr.normal(jr.key(1), (2, 2))
+    for t1 in (1.0, -1.0):
+        solve = lambda terms, y0: (
+            diffrax.diffeqsolve(terms, solver, 0.0, t1, t1 / 8, y0, 0.3, max_steps=8).ys
+        )
+        theirs, expected = solve(_diffrax_terms(path), (x, v)), solve(ours, (v / U, x))
+        np.testing.assert_allclose(theirs[0], expected[1], atol=1e-14)
+        np.testing.assert_allclose(theirs[1], U * expected[0], atol=1e-14)
+    # More terms have the same state.
+    push = diffrax.ODETerm(lambda t, y, args: (jnp.zeros(2), U * jnp.cos(t)))
+    both = diffrax.MultiTerm(*_diffrax_terms(path).terms, push)
+    tilted = lambda t, p, q, args: H0(t, p, q, args) - jnp.cos(t) * jnp.sum(q)
+    ours = ds.langevin_terms(tilted, GAMMA / U, 1.0, path)
+    t1 = 1.0
+    theirs = solve(both, (x, v))
+    np.testing.assert_allclose(theirs[0], solve(ours, (v / U, x))[1], atol=1e-14)
+    # A rate that is traced and negative fails its path alone.
+    run = jax.vmap(
+        lambda gamma: (
+            diffrax.diffeqsolve(
+                _diffrax_terms(path, gamma),
+                solver,
+                0.0,
+                1.0,
+                0.25,
+                (x, v),
+                0.3,
+                throw=False,
+            ).result
+            == diffrax.RESULTS.successful
+        )
+    )
+    np.testing.assert_array_equal(run(jnp.array([0.5, -0.5])), [True, False])
+    found = ds.suggest_solver(_diffrax_terms(path), 0.0, (x, v), 0.3, want="weak")
+    assert isinstance(found[0].solver, ds.BAOAB)
+    assert not any(isinstance(s.solver, ds.Damped) for s in found)
+
+
+@pytest.mark.slow
+def test_along_a_path_of_diffrax_its_solver_is_approached():
+    path = diffrax.VirtualBrownianTree(
+        0.0, 1.0, 1e-4, (2,), jr.key(0), levy_area=diffrax.SpaceTimeLevyArea
+    )
+    terms, y0 = _diffrax_terms(path), (jnp.ones(2), jnp.zeros(2))
+
+    def ends(solver, *numbers):
+        end = lambda h: (
+            diffrax.diffeqsolve(
+                terms, solver, 0.0, 1.0, h, y0, 0.3, max_steps=max(numbers) + 1
+            ).ys
+        )
+        return np.stack(jax.jit(jax.vmap(end))(1 / jnp.array(numbers)))[:, :, 0]
+
+    exact = ends(diffrax.ALIGN(0.1), 256)
+    errors = np.max(np.abs(ends(ds.BAOAB(), 32, 128) - exact), axis=(0, 2))
+    # Half the step, half the error.
+    assert errors[1] <= 0.5 * errors[0] and errors[1] <= 0.02

@@ -101,7 +101,7 @@ def test_what_a_solver_remembers_is_not_taken_for_where_the_flow_leads():
     # BAOAB keeps the forces of the end of a step, and the flow goes on from there.
     flow = klein_gordon.waves(8, 0.5)
     whole = lambda t, p, q, args: jnp.sum(p**2) / 2 + _rest(t, p, q, args)
-    bath = ds.langevin_terms(whole, 0.4, 0.1, Given(0.1 * jnp.arange(8.0))).terms[1:]
+    bath = ds.bath_terms(whole, 0.4, 0.1, Given(0.1 * jnp.arange(8.0))).terms
     terms = diffrax.MultiTerm(*ds.hamiltonian_terms(_rest).terms, *bath)
     inner, y = ds.BAOAB(), tuple(jr.normal(jr.key(0), (2, 8)))
     solver = ds.LinearFlow(inner, flow)
@@ -121,7 +121,7 @@ def test_gradients_may_walk_back_along_the_solution():
     H0 = lambda t, p, q, args: args * _rest(t, p, q, None)
     kinetic = lambda t, p, q, args: jnp.sum(p**2) / 2
     rest = ds.hamiltonian_terms(H0, _kicks, weak_path(2)).terms
-    terms = diffrax.MultiTerm(*rest, ds.langevin_terms(kinetic, 0.5).terms[1])
+    terms = diffrax.MultiTerm(*rest, *ds.bath_terms(kinetic, 0.5).terms)
     y0 = tuple(0.3 * jr.normal(jr.key(0), (2, 8)))
 
     def end(y0, args, adjoint):

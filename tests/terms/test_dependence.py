@@ -7,6 +7,7 @@ import jax.random as jr
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._terms import acts_elementwise
 from diffrax_symplectic._terms._structure_checks import (
     additive_fault,
     constant_fault,
@@ -211,3 +212,45 @@ def test_dependence_through_programs(name):
     assert flow.independent(lambda x, y: x) == independent
     wrapped = Dependence(jax.jit(jax.vmap(fn)), jnp.ones(3), jnp.ones(3))
     assert wrapped.independent(lambda x, y: x) == independent
+
+
+_MASSES = jnp.array([1.0, 2.0, 4.0])
+
+
+@pytest.mark.parametrize(
+    "kinetic, diagonal",
+    [
+        (lambda p: jnp.sum(p**2) / 2, True),
+        (lambda p: p @ p / 2, True),
+        (lambda p: jnp.sum(p**2 / (2 * _MASSES)), True),
+        (lambda p: jnp.vdot(p, p / _MASSES) / 2, True),
+        (lambda p: jnp.sum(jax.jit(jnp.square)(p)) / 2, True),
+        (lambda p: jnp.sum(jnp.where(_MASSES > 1, p, 2 * p) ** 2), True),
+        # Some are so, but not known to be.
+        (lambda p: jnp.einsum("i,i,i", p, p, 1 / _MASSES) / 2, False),
+        (lambda p: sum(p[i] ** 2 for i in range(3)) / 2, False),
+        (lambda p: p @ (jnp.diag(_MASSES) + 0.1) @ p / 2, False),
+        (lambda p: jnp.sum(jnp.diff(p) ** 2), False),
+        (lambda p: jnp.sum(p) ** 2 / 2, False),
+        (lambda p: jnp.sum(p * p[::-1]), False),
+        (
+            lambda p: jnp.sum(p**2 * _MASSES[:, None]) + jnp.sum(jnp.cumsum(p) ** 2),
+            False,
+        ),
+    ],
+)
+def test_kinetic_energies_of_diagonal_masses_are_known(kinetic, diagonal):
+    velocity = jax.grad(kinetic)
+    assert acts_elementwise(velocity, jnp.ones(3)) is diagonal
+    mass = jax.jacobian(velocity)(jnp.ones(3))
+    is_diagonal = jnp.allclose(mass, jnp.diag(jnp.diag(mass)))
+    assert is_diagonal or not diagonal
+
+
+def test_arrays_of_a_tree_that_mix_do_not_act_entry_by_entry():
+    p = {"a": jnp.ones(3), "b": jnp.ones(3)}
+    apart = lambda p: {"a": 2 * p["a"], "b": p["b"] / _MASSES}
+    mixed = lambda p: {"a": p["a"] + p["b"], "b": p["b"]}
+    exchanged = lambda p: {"a": p["b"], "b": p["a"]}
+    found = [acts_elementwise(fn, p) for fn in (apart, mixed, exchanged)]
+    assert found == [True, False, False]

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._terms._friction import _root
+
+from ..problems import Given, weak_path
 
 
 TENSOR = jnp.array([[1.0, 0.3, 0.0], [0.3, 0.5, -0.2], [0.0, -0.2, 0.7]])
@@ -51,13 +54,16 @@ def test_drift_and_noise_are_those_of_the_equation(name):
     m = 2 if "along" in name else 3
     terms = ds.langevin_terms(_pendula, friction, T, (m,))
     p, q = jr.normal(jr.key(0), (2, 3))
-    drift, force, noise = terms.terms
-    dp, dq = force.vf(0.3, (p, q), None)
+    drift, noise = terms.terms
+    alone, of_bath = ds.bath_terms(_pendula, friction, T, (m,)).terms
+    dp, dq = alone.vf(0.3, (p, q), None)
     G = matrix(q)
     np.testing.assert_allclose(dp, -G @ (p / MASSES), rtol=1e-14)
     np.testing.assert_array_equal(dq, 0)
-    expected = ds.hamiltonian_terms(_pendula).terms[0].vf(0.3, (p, q), None)
-    np.testing.assert_array_equal(drift.vf(0.3, (p, q), None), expected)
+    forces, velocities = ds.hamiltonian_terms(_pendula).terms[0].vf(0.3, (p, q), None)
+    both = drift.vf(0.3, (p, q), None)
+    np.testing.assert_allclose(both, (forces + dp, velocities), rtol=1e-14)
+    assert type(noise) is type(of_bath)
     B, still = noise.vf(0.3, (p, q), None)
     np.testing.assert_allclose(B @ B.T, 2 * T * G, atol=1e-14)
     np.testing.assert_array_equal(still, 0)
@@ -76,7 +82,7 @@ def test_momenta_in_trees_have_frictions_and_temperatures_in_trees():
         (0.5, {"a": jnp.arange(3.0), "b": 0.0}, (-0.25 * p["a"], -1.0),
          (np.diag([0.0, 1.0, 2.0]), 0.0)),
     ):  # fmt: skip
-        _, force, noise = ds.langevin_terms(H0, friction, heat, shape).terms
+        force, noise = ds.bath_terms(H0, friction, heat, shape).terms
         dp, _ = force.vf(0.0, (p, p), None)
         np.testing.assert_allclose(dp["a"], forces[0])
         np.testing.assert_allclose(dp["b"], forces[1])
@@ -86,7 +92,7 @@ def test_momenta_in_trees_have_frictions_and_temperatures_in_trees():
     # Directions couple the arrays of a tree.
     along = {"a": jnp.ones((3, 1)), "b": -3 * jnp.ones(1)}
     friction = ds.FrictionAlong(along)
-    _, force, noise = ds.langevin_terms(H0, friction, T, (1,)).terms
+    force, noise = ds.bath_terms(H0, friction, T, (1,)).terms
     dp, _ = force.vf(0.0, (p, p), None)
     # The velocities 0, 0.5, 1 and 2.
     np.testing.assert_allclose([*dp["a"], dp["b"]], 4.5 * np.array([1, 1, 1, -3]))
@@ -114,3 +120,223 @@ def test_friction_between_particles_conserves_momentum(n):
         )  # fmt: skip
         np.testing.assert_allclose(jnp.sum(sol.ys[0]), (n - 1) / 2, atol=1e-13 * n)
         assert np.std(sol.ys[0]) > 0.1
+
+
+def test_pairs_of_particles_are_heated_and_keep_their_momentum():
+    # Friction along the line between each pair, which depends on their distance.
+    n, T = 5, 0.7
+    first, second = np.triu_indices(n, 1)
+    m = len(first)
+
+    def directions(t, q, args):
+        d = q[first] - q[second]
+        r = jnp.linalg.norm(d, axis=1, keepdims=True)
+        d = jnp.exp(-(r**2) / 2) * d / r
+        pairs = np.arange(m)
+        return (
+            jnp.zeros((n, 3, m)).at[first, :, pairs].add(d).at[second, :, pairs].add(-d)
+        )
+
+    def H0(t, p, q, args):
+        return jnp.sum(p**2) / 2 + 0.15 * jnp.sum((q[:, None] - q) ** 2)
+
+    friction = ds.FrictionAlong(directions)
+
+    @jax.jit
+    @jax.vmap
+    def run(key):
+        path = ds.WeakBrownianPath((m,), key)
+        terms = ds.langevin_terms(H0, friction, T, path)
+        # From the density of Gibbs, since the angular momentum is conserved, too.
+        start = T**0.5 * jr.normal(jr.fold_in(key, 1), (2, n, 3))
+        start = start.at[1].divide((0.6 * n) ** 0.5)
+        saveat = diffrax.SaveAt(ts=jnp.linspace(10.0, 60.0, 51))
+        sol = diffrax.diffeqsolve(
+            terms, ds.BAOAB(), 0, 60, 0.1, tuple(start), saveat=saveat,
+            max_steps=None, adjoint=diffrax.ForwardMode(),
+        )  # fmt: skip
+        p = sol.ys[0]
+        relative = p - jnp.mean(p, axis=1, keepdims=True)
+        energy = jnp.sum(relative**2, axis=(1, 2)) / 2
+        return jnp.mean(energy), jnp.sum(p[-1], axis=0) - jnp.sum(start[0], axis=0)
+
+    energies, change = run(jr.split(jr.key(0), 200))
+    np.testing.assert_allclose(change, 0, atol=1e-13)
+    # Their frequency is the root of 0.6 n: BAOAB is too cold by (omega h / 2)^2.
+    exact = T * 3 * (n - 1) / 2 * (1 - 0.6 * n * 0.1**2 / 4)
+    error = np.std(energies) / np.sqrt(len(energies))
+    assert abs(np.mean(energies) - exact) <= 3 * error
+    assert error <= 0.02 * exact
+
+
+# Lengths and ranks of the factors of semidefinite matrices.
+@pytest.mark.parametrize("n, rank", [(1, 1), (2, 1), (5, 3), (8, 8), (20, 7)])
+def test_roots_of_semidefinite_matrices_are_roots(n, rank):
+    # In single precision, too, and with entries of very different size.
+    X = jr.normal(jr.key(n), (n, rank)) * jnp.logspace(0, -6, n)[:, None]
+    for dtype in (jnp.float64, jnp.float32):
+        A = (X @ X.T).astype(dtype)
+        L = np.asarray(_root(A), np.float64)
+        sizes = np.sqrt(np.diag(A))
+        error = np.abs(L @ L.T - np.asarray(A, np.float64)) / np.outer(sizes, sizes)
+        # Without pivoting, a small pivot may count as zero.
+        most = 50 if rank == n else np.finfo(dtype).eps ** -0.5
+        assert np.max(error) <= most * n * np.finfo(dtype).eps
+        np.testing.assert_allclose(L, np.tril(L))
+
+
+def test_other_matrices_have_no_root():
+    for A in (
+        [[1.0, 0.5], [0.2, 1.0]],
+        [[1.0, 3.0], [3.0, 1.0]],
+        [[0.0, 1.0], [1.0, 0.0]],
+        [[1.0, 0.0], [0.0, -1e-9]],
+        [[1.0, 1.0], [1.0, 1.0 - 1e-9]],
+        [[np.nan, 0.0], [0.0, 1.0]],
+        [[np.inf, 0.0], [0.0, 1.0]],
+    ):
+        assert np.all(np.isnan(_root(jnp.array(A))))
+
+
+def _end(terms, solver, y0, t1=0.5):
+    sol = diffrax.diffeqsolve(terms, solver, 0.0, t1, t1 / 5, y0, throw=False)
+    return jnp.stack([x[-1] for x in sol.ys]), sol.result
+
+
+@pytest.mark.parametrize("solver", [ds.BAOAB(), ds.Damped(ds.StormerVerlet())])
+def test_traced_frictions_and_temperatures_that_are_none_fail_alone(solver):
+    y0, given = (jnp.ones(3), jnp.ones(3)), Given(jnp.array([0.3, 0.1, -0.2]))
+
+    @jax.jit
+    @jax.vmap
+    def run(friction, T):
+        terms = ds.langevin_terms(_pendula, friction, T, given)
+        return _end(terms, solver, y0)[1] == diffrax.RESULTS.successful
+
+    skew = TENSOR.at[0, 1].set(0.5)
+    one = jnp.eye(3)
+    matrices = jnp.stack([one, -one, TENSOR, skew, jnp.nan * one, 0 * one])
+    valid = [True, False, True, False, False, True]
+    np.testing.assert_array_equal(run(matrices, jnp.ones(6)), valid)
+    rates = jnp.array([0.5, -0.5, jnp.inf, 0.5, -0.5])
+    heats = jnp.array([1.0, 1.0, 1.0, -1.0, -1.0])
+    np.testing.assert_array_equal(run(rates, heats), [True] + [False] * 4)
+
+
+@pytest.mark.slow
+def test_every_other_solver_sees_friction_and_noise():
+    # The end of a fine solution by Diffrax's solver, which all others approach.
+    y0 = jnp.ones(3), jnp.array([0.3, -0.2, 0.5])
+    for friction in (TENSOR, lambda t, q, args: _at(q[0]) * TENSOR):
+        path = diffrax.VirtualBrownianTree(
+            0.0, 0.5, 1e-4, (3,), jr.key(2), levy_area=diffrax.SpaceTimeLevyArea
+        )
+        terms = ds.langevin_terms(_pendula, friction, T, path)
+        steps = lambda solver, n: (
+            diffrax.diffeqsolve(terms, solver, 0.0, 0.5, 0.5 / n, y0, max_steps=n).ys
+        )
+        exact = np.stack(steps(diffrax.Heun(), 1024))[:, -1]
+        solvers = [diffrax.EulerHeun(), ds.ImplicitMidpoint(), ds.SRKs1(), ds.BAOAB()]
+        solvers += [ds.LangevinMiddle(), ds.Damped(ds.StormerVerlet())]
+        if not callable(friction):
+            solvers += [ds.SRKs4(), diffrax.ShARK(), diffrax.Euler()]
+        for solver in solvers:
+            end = np.stack(steps(solver, 64))[:, -1]
+            # Momenta that are late by half a step.
+            late = 4 if isinstance(solver, ds.LangevinMiddle) else 1
+            np.testing.assert_allclose(end, exact, atol=0.03 * late)
+        for solver in (ds.StormerVerlet(), ds.SRKw4()):
+            with pytest.raises(
+                ValueError, match=r"`BAOAB\(\)`.* and `Damped\(solver\)"
+            ):
+                solver.init(terms, 0.0, 0.1, y0, None)
+
+
+def test_two_baths_have_the_mean_temperature_that_their_frictions_weigh():
+    H0 = lambda t, p, q, args: p**2 / 2 + q**2 / 2
+
+    def step(p, q, W):
+        second = ds.bath_terms(H0, 1.5, 1.0, Given(W[1])).terms
+        first = ds.langevin_terms(H0, 0.5, 2.0, Given(W[0])).terms
+        given = diffrax.MultiTerm(*first, *second)
+        return jnp.stack(ds.BAOAB().step(
+            given, 0.0, h, (p, q), None, ds.BAOAB().init(given, 0.0, h, (p, q), None),
+            False,
+        )[0])  # fmt: skip
+
+    h, zero = 0.3, jnp.zeros(())
+    A = np.stack(jax.jacobian(step, (0, 1))(zero, zero, jnp.zeros(2)), axis=1)
+    B = np.asarray(jax.jacobian(step, 2)(zero, zero, jnp.zeros(2))) * np.sqrt(h)
+    moments = np.linalg.solve(np.eye(4) - np.kron(A, A), (B @ B.T).ravel())
+    np.testing.assert_allclose(moments[-1], 1.25, rtol=1e-13)
+
+
+def test_a_new_friction_or_temperature_of_the_same_shape_compiles_nothing():
+    path = ds.FixedStepBrownianPath((3,), jr.key(0))
+    y0 = jnp.ones(3), jnp.ones(3)
+
+    def mean(friction, T):
+        terms = ds.langevin_terms(_pendula, friction, T, path)
+        _end(terms, ds.BAOAB(), y0)
+
+    pairs = (
+        (0.5, 0.3),
+        (jnp.array([0.5, 1.0, 0.2]), 0.3),
+        (np.eye(3), jnp.array(0.4)),
+    )
+    others = [(2 * friction, 3 * T) for friction, T in pairs]
+    for friction, T in pairs:
+        mean(friction, T)
+    compiled = []
+    listen = lambda name, *_, **__: compiled.append(name)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for friction, T in others:
+            mean(friction, T)
+    finally:
+        jax.monitoring.clear_event_listeners()
+    assert not [name for name in compiled if name.endswith("backend_compile_duration")]
+
+
+def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
+    make = lambda *args: ds.langevin_terms(_pendula, *args)
+    negative = jnp.array([[1.0, -3.0], [-3.0, 1.0]])
+    for arguments, match in (
+        ((-1.0, T, (3,)), "`friction` must be a real number.*not negative; got -1.0"),
+        ((np.nan, T, (3,)), "`friction` must be .*finite"),
+        ((1j, T, (3,)), "`friction` must be a real number"),
+        (("much", T, (3,)), "`friction` must be a real number"),
+        ((True, T, (3,)), "`friction` must be a real number"),
+        ((None, T, (3,)), "`friction` must be a number"),
+        (
+            (jnp.ones(2), T, (3,)),
+            r"`friction` must be a scalar.* as a matrix .*\(3, 3\)",
+        ),
+        ((negative,), "`friction` must be a symmetric positive semidefinite"),
+        ((negative, T, (2,)), "`friction` must be a symmetric positive semidefinite"),
+        ((jnp.abs(negative), T, (2,)), "`friction` must be a symmetric positive semi"),
+        (({"a": 1.0}, T, (3,)), "`friction` must be .* structure of the momenta"),
+        ((lambda q: 1.0, T, (3,)), r"`friction\(t, q, args\)`"),
+        ((1.0, -T, (3,)), "`temperature` must be a real number.*not negative"),
+        ((1.0, "hot", (3,)), "`temperature` must be"),
+        ((1.0, lambda t: 1.0, (3,)), r"`temperature\(t, q, args\)`"),
+        ((1.0, T), "both a `temperature` and a `path`"),
+        ((1.0, None, (3,)), "both a `temperature` and a `path`"),
+        ((1.0, T, 3), "`path` must be a Brownian path"),
+        ((ds.FrictionAlong(lambda q: q), T, (3,)), r"`directions\(t, q, args\)`"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            make(*arguments)
+    y0 = jnp.ones(3), jnp.ones(3)
+    along = ds.FrictionAlong(jnp.ones((3, 2)))
+    for arguments, match in (
+        ((1.0, T, weak_path(2)), r"must have the shape of `q`, \(3,\)"),
+        ((along, T, weak_path(3)), r"one noise for each direction.* shape \(2,\)"),
+        ((ds.FrictionAlong(jnp.ones(3)), T, weak_path(3)), "and one more axis"),
+        ((along, jnp.ones(2), weak_path(2)), "`temperature` must be one number"),
+        ((TENSOR, jnp.ones(3), weak_path(3)), "`temperature` must be one number"),
+        ((1.0, jnp.ones(2), weak_path(3)), "array of `temperature` must be a scalar"),
+        ((lambda t, q, args: q[:2], T, weak_path(3)), "array of `friction` must be"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            ds.BAOAB().init(make(*arguments), 0.0, 0.1, y0, None)

@@ -142,8 +142,8 @@ def test_friction_in_the_drift_is_told_of_langevin_terms():
         assert "Take friction from `langevin_terms" in found.system
     # Friction of its own and plain terms go together.
     kinetic = lambda t, p, q, args: p @ p / 2
-    friction = ds.langevin_terms(kinetic, 0.5).terms[1]
-    terms = diffrax.MultiTerm(*_langevin(0.0, True).terms, friction)
+    friction = ds.bath_terms(kinetic, 0.5).terms
+    terms = diffrax.MultiTerm(*_langevin(0.0, True).terms, *friction)
     start(terms)
     found = ds.suggest_solver(terms, 0.0, y0, want="weak")
     assert isinstance(found[0].solver, ds.BAOAB)

@@ -184,6 +184,7 @@ def test_without_noise_terms_are_the_drift():
         (ds.spin_terms, harmonic, spinors, None),
         (ft.partial(ds.spin_terms, damping=0.1), harmonic, spinors, None),
         (ds.wave_terms, amplitude, ds.to_pair(waves), None),
+        (ft.partial(ds.wave_terms, damping=0.1), amplitude, ds.to_pair(waves), None),
     ):
         both = make(energy), make(energy, energy, path)
         assert len(both[0].terms) == 1

@@ -1,6 +1,5 @@
 """The step of friction and noise at fixed positions, by the implicit midpoint rule."""
 
-import diffrax
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -8,15 +7,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
-from .._terms import acts_elementwise, Dependence, is_friction, rate, split_terms
-
-
-def split_friction(terms: PyTree[diffrax.AbstractTerm]) -> tuple[tuple, tuple, tuple]:
-    """The drift without friction, the friction, and the noise."""
-    drift, noise = split_terms(terms)
-    friction = tuple(filter(is_friction, drift))
-    rest = tuple(term for term in drift if not is_friction(term))
-    return rest, friction, noise
+from .._root_finder import eliminate, MAX_WRITTEN_OUT
+from .._terms import acts_elementwise, Dependence, rate
 
 
 def check_friction(
@@ -51,8 +43,8 @@ def check_friction(
             f"`{solver}` has no friction to apply: it acts on the velocities dH0/dp, which "
             "do not depend on p. If the kinetic energy is a part of the flow of a "
             "`LinearFlow`, take friction and noise from terms of the whole Hamiltonian: "
-            "`MultiTerm(*hamiltonian_terms(rest).terms, *langevin_terms(whole, friction, "
-            "temperature, path).terms[1:])`."
+            "`MultiTerm(*hamiltonian_terms(rest).terms, *bath_terms(whole, friction, "
+            "temperature, path).terms)`."
         )
 
 
@@ -89,4 +81,6 @@ def after_friction(
     right = step * flat_force(flat) + jfu.ravel_pytree(kick)[0]
     one = jnp.eye(flat.size, dtype=flat.dtype)
     matrix = one - step / 2 * jax.jacfwd(flat_force)(flat)
-    return unravel(flat + jnp.linalg.solve(matrix, right))
+    # Elimination in XLA operations takes a tenth of LAPACK's time for matrices this small.
+    solve = eliminate if flat.size <= MAX_WRITTEN_OUT else jnp.linalg.solve
+    return unravel(flat + solve(matrix, right))

@@ -1,0 +1,85 @@
+"""The drift of a system whose positions are constrained."""
+
+from collections.abc import Callable
+from typing import Any, NoReturn, TypeVar
+
+import diffrax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, PyTree
+
+from .._arguments import check_takes
+from .._custom_types import Args
+
+
+_T = TypeVar("_T")
+Constraint = Callable[[PyTree, Args], Float[Array, " c"]]
+
+KEEP = (
+    "Use `StormerVerlet()`, or for the terms of `langevin_terms` `BAOAB()`: they keep it "
+    "to rounding"
+)
+
+
+class ConstrainedDrift(diffrax.AbstractTerm):
+    """The drift of Hamiltonians for positions with `constraint(q, args) = 0`.
+
+    Its vector field depends on multipliers that a solver has to find. So the product with
+    the length of a step raises an error, which every solver meets that does not know of
+    constraints, also those of Diffrax. Others read the fields of the term.
+    """
+
+    drift: diffrax.ODETerm
+    constraint: Constraint
+
+    def __check_init__(self):
+        check_takes("constraint", self.constraint, "q", "args")
+
+    def vf(self, t, y, args) -> PyTree[Array]:
+        # Diffrax looks at its structure before a solve, with any solver.
+        return jtu.tree_map(lambda x: jnp.full_like(x, jnp.nan), y)
+
+    def contr(self, t0, t1, **kwargs) -> Any:
+        return self.drift.contr(t0, t1, **kwargs)
+
+    def prod(self, vf, control) -> NoReturn:
+        raise ValueError(
+            "These terms have a `constraint`, and cannot be solved without multipliers. "
+            f"{KEEP}."
+        )
+
+
+def constrained(
+    drift: diffrax.ODETerm, constraint: Constraint | None
+) -> diffrax.AbstractTerm:
+    """The drift with its constraint, if there is one."""
+    return drift if constraint is None else ConstrainedDrift(drift, constraint)
+
+
+def constraint_of(terms: PyTree[diffrax.AbstractTerm]) -> Constraint | None:
+    """The constraint of these terms, if there is one. Raises a `ValueError` if there are
+    several."""
+    leaves = jtu.tree_leaves(terms, is_leaf=_is_constrained)
+    found = [x.constraint for x in leaves if _is_constrained(x)]
+    if len(found) > 1:
+        raise ValueError(
+            f"Only one of the terms may have a `constraint`; got {len(found)}. Return all "
+            "constraints from one function, as one array of shape `(c,)`."
+        )
+    return found[0] if found else None
+
+
+def without_constraint(terms: _T) -> _T:
+    """The same terms, free to leave the constraint."""
+    free = lambda x: x.drift if _is_constrained(x) else x
+    return jtu.tree_map(free, terms, is_leaf=_is_constrained)
+
+
+def refuse_constraint(terms: PyTree[diffrax.AbstractTerm], name: str) -> None:
+    """Raises a `ValueError` if the terms have a constraint."""
+    if constraint_of(terms) is not None:
+        raise ValueError(f"`{name}` takes no terms with a `constraint`. {KEEP}.")
+
+
+def _is_constrained(x: Any) -> bool:
+    return isinstance(x, ConstrainedDrift)

@@ -1,0 +1,394 @@
+"""Solvers by problems, at equal cost: `python -m examples.advice`.
+
+The errors of second moments on linear systems, from `second_moment_map` and the exact
+equations of the moments, without sampling; and strong errors, by `compare_solvers`. Writes
+`docs/advice.md`, its picture, and `docs/advice.json`, by which `tests/test_advice.py`
+judges the order of the suggestions.
+"""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optimistix as optx
+from scipy.linalg import expm
+
+import diffrax_symplectic as ds
+
+
+DOCS = Path(__file__).parents[1] / "docs"
+# What a stage vector costs, in evaluations of the vector field: sweeps until the stage
+# equations are solved.
+SWEEPS = 5
+# Times for one evaluation, in units of one over the frequency of the system.
+BUDGETS = (0.01, 0.03, 0.1)
+
+
+class Problem(NamedTuple):
+    """A linear system, by its terms for a path."""
+
+    terms: Callable[[diffrax.AbstractBrownianPath], diffrax.MultiTerm]
+    y0: tuple
+    # The shape of the noise.
+    noises: tuple[int, ...] = ()
+    # When moments are compared; `None` for their stationary values.
+    time: float | None = 6.0
+    # The largest frequency, by which times are measured.
+    frequency: float = 1.0
+    budgets: tuple[float, ...] = BUDGETS
+
+
+ONE = (jnp.array(0.5), jnp.array(1.0))
+
+
+def hamiltonian(H0, noise):
+    energy = lambda t, p, q, args: H0(p, q)
+    return lambda path: ds.hamiltonian_terms(
+        energy, lambda t, p, q, args: noise(p, q), path
+    )
+
+
+def bath(H0, friction=0.5, noise=None):
+    """Langevin dynamics at temperature 1, or with another noise."""
+    energy = lambda t, p, q, args: H0(p, q)
+
+    def terms(path):
+        if noise is None:
+            return ds.langevin_terms(energy, friction, 1.0, path)
+        drift = ds.langevin_terms(energy, friction)
+        other = ds.hamiltonian_terms(
+            energy, lambda t, p, q, args: noise(p, q), path
+        ).terms[1]
+        return diffrax.MultiTerm(*drift.terms, other)
+
+    return terms
+
+
+def coloured(friction):
+    """An oscillator pushed by an Ornstein-Uhlenbeck process, the second momentum."""
+    energy = lambda t, p, q, args: (p[0] ** 2 + q[0] ** 2) / 2
+    rates = jnp.array([friction, 0.5])
+
+    def more(t, y, args):
+        p, q = y
+        return jnp.array([p[1], 0.0]) - rates * p, jnp.zeros(2)
+
+    def terms(path):
+        noise = lambda t, p, q, args: -q[1]
+        base = ds.hamiltonian_terms(energy, noise, path)
+        return diffrax.MultiTerm(*base.terms, diffrax.ODETerm(more))
+
+    return terms
+
+
+def free(p, q):
+    return p**2 / 2
+
+
+def well(p, q):
+    return (p**2 + q**2) / 2
+
+
+def push(p, q):
+    return -q
+
+
+def spring(p, q):
+    return 0.4 * q**2 / 2
+
+
+def kubo(p, q):
+    return 0.6 * (p**2 + q**2) / 2
+
+
+def turning(p, q):
+    return jnp.stack([0.4 * (p**2 - q**2) / 2, 0.4 * p * q])
+
+
+PAIR = (jnp.array([0.5, 0.0]), jnp.array([1.0, 0.0]))
+# Steps that do not resolve the mode.
+STIFF = (0.3, 1.0)
+PROBLEMS = {
+    "free particle": Problem(hamiltonian(free, push), ONE),
+    "oscillator": Problem(hamiltonian(well, push), ONE),
+    "stiff oscillator": Problem(hamiltonian(well, push), ONE, budgets=STIFF, time=40.0),
+    "free particle in a bath": Problem(bath(free), ONE),
+    "oscillator in a bath, transient": Problem(bath(well), ONE, time=3.0),
+    "oscillator in a bath, stationary": Problem(bath(well), ONE, time=None),
+    "stiff oscillator in a bath": Problem(bath(well), ONE, time=None, budgets=STIFF),
+    "noisy spring": Problem(hamiltonian(well, spring), ONE),
+    "noisy spring with friction": Problem(bath(well, 0.5, spring), ONE),
+    "Kubo oscillator": Problem(hamiltonian(well, kubo), ONE, time=3.0),
+    "two noises that do not commute": Problem(
+        hamiltonian(well, turning), ONE, (2,), time=3.0
+    ),
+    "coloured forcing": Problem(coloured(0.0), PAIR),
+    "coloured forcing with friction, late": Problem(coloured(0.3), PAIR, time=40.0),
+}
+
+
+def cost(solver, num_noises: int) -> float:
+    """Evaluations of the vector field in one step."""
+    vectors = sum(solver.stage_vectors(num_noises))
+    share = 2 if solver.structure == "separable" else 1
+    return 1 + SWEEPS * vectors / share
+
+
+def generator(problem: Problem) -> np.ndarray:
+    """Of the second moments of (1, y), in the order of `second_moment_map`."""
+    path = ds.WeakBrownianPath(problem.noises, jr.key(0))
+    terms = problem.terms(path)
+    flat, unravel = jfu.ravel_pytree(problem.y0)
+
+    def matrix(field):
+        affine = lambda y: jfu.ravel_pytree(field(unravel(y)))[0]
+        Z = np.zeros((flat.size + 1,) * 2)
+        Z[1:, 0] = affine(jnp.zeros_like(flat))
+        Z[1:, 1:] = jax.jacfwd(affine)(jnp.zeros_like(flat))
+        return Z
+
+    one = np.eye(flat.size + 1)
+    both = lambda Z: np.kron(Z, one) + np.kron(one, Z)
+    out = np.zeros((one.size,) * 2)
+    for term in terms.terms:
+        if isinstance(term, diffrax.ODETerm):
+            out += both(matrix(lambda y: term.vf(0.0, y, None)))
+            continue
+        for unit in np.eye(max(int(np.prod(problem.noises)), 1)):
+            W = jnp.asarray(unit.reshape(problem.noises))
+            B = both(matrix(lambda y: term.vf_prod(0.0, y, None, W)))
+            out += B @ B / 2
+    return out
+
+
+def stationary(matrix: np.ndarray, forever: float) -> np.ndarray:
+    """The moments that `matrix`, of a step, or a generator with `forever = 0`, keeps."""
+    left = np.eye(len(matrix)) * forever - matrix
+    moments = np.zeros(len(matrix))
+    moments[0] = 1
+    rest, *_ = np.linalg.lstsq(left[1:, 1:], -left[1:, 0], rcond=None)
+    moments[1:] = rest
+    return moments
+
+
+def with_newton(solver):
+    """The solver with a root finder that is exact for linear systems, and compiled sooner.
+    The results are the same."""
+    if isinstance(solver, ds.Damped):
+        return ds.Damped(with_newton(solver.solver))
+    if hasattr(solver, "root_finder"):
+        newton = optx.Newton(rtol=1e-12, atol=1e-12)
+        return dataclasses.replace(solver, root_finder=newton)
+    return solver
+
+
+def weak_errors(problem: Problem, exact: np.ndarray, solver) -> list[float]:
+    """For each budget the largest error of a second moment, relative to the largest of
+    them; infinite if moments grow that should not."""
+    noises = max(int(np.prod(problem.noises)), 1)
+    hs = np.array(problem.budgets) * cost(solver, noises) / problem.frequency
+    steps = np.zeros(len(hs), int)
+    if problem.time is not None:
+        steps = np.maximum(np.round(problem.time / hs), 1).astype(int)
+        hs = problem.time / steps
+    terms = problem.terms(solver.path(problem.noises, jr.key(0), want="weak"))
+    solver = with_newton(solver)
+    one = lambda h: ds.second_moment_map(terms, solver, 0.0, h, problem.y0)
+    # One program for all steps, which runs once.
+    options = {"xla_backend_optimization_level": 0}
+    maps = jax.jit(jax.vmap(one), compiler_options=options)(jnp.asarray(hs))
+    z = np.concatenate([[1.0], jfu.ravel_pytree(problem.y0)[0]])
+    start, size = np.kron(z, z), len(z)
+    second = [i for i in range(size**2) if i % size > 0 and i >= size]
+    if problem.time is None:
+        true = stationary(exact, 0.0)
+    else:
+        true = expm(exact * problem.time) @ start
+    errors = []
+    for K, n in zip(np.asarray(maps), steps):
+        if problem.time is not None:
+            found = np.linalg.matrix_power(K, n) @ start
+        elif np.max(np.abs(np.linalg.eigvals(K[1:, 1:]))) < 1 - 1e-12:
+            found = stationary(K, 1.0)
+        else:
+            found = np.full(len(K), np.inf)
+        error = np.max(np.abs(found - true)[second]) / np.max(np.abs(true)[second])
+        errors.append(float(error) if error < 10 else np.inf)
+    return errors
+
+
+def weak_table(name: str) -> dict[str, list[float]]:
+    """The errors of all solvers suggested for a problem, best first, and with friction of
+    those that take it apart, by budget."""
+    problem = PROBLEMS[name]
+    terms = problem.terms(problem.noises)
+    suggestions = ds.suggest_solver(terms, 0.0, problem.y0, want="weak")
+    found = [suggestion.solver for suggestion in suggestions]
+    if any(isinstance(solver, ds.BAOAB) for solver in found):
+        found += [
+            ds.Damped(x) for x in (ds.SRKw5(), ds.AdditiveGauss(), ds.StrangGauss())
+        ]
+    exact = generator(problem)
+    rows = {}
+    for solver in found:
+        try:
+            errors = weak_errors(problem, exact, solver)
+        except ValueError:
+            # Those in `Damped` that need additive noise.
+            continue
+        rows[solver_name(solver)] = errors
+        shown = "".join(f"{x:10.1e}" for x in errors)
+        print(f"{name:44s}{solver_name(solver):24s}{shown}", flush=True)
+    return rows
+
+
+def solver_name(solver) -> str:
+    """Its class, and that of the solver within."""
+    inner = solver_name(solver.solver) if isinstance(solver, ds.Damped) else ""
+    return f"{type(solver).__name__}({inner})"
+
+
+# Strong errors, along the same Brownian paths.
+STRONG = (
+    "oscillator",
+    "oscillator in a bath, transient",
+    "noisy spring",
+    "Kubo oscillator",
+    "two noises that do not commute",
+)
+STRONG_STEPS = (1 / 4, 1 / 8, 1 / 16, 1 / 32)
+
+
+def strong_table(name: str) -> dict[str, list[float]]:
+    """Root mean square errors at t = 2 by budget, interpolated between steps."""
+    problem = PROBLEMS[name]
+    noises = max(int(np.prod(problem.noises)), 1)
+    terms = problem.terms(problem.noises)
+    found = ds.suggest_solver(terms, 0.0, problem.y0, want="strong")
+    solvers = {repr(s.solver): s.solver for s in found}
+    compared = ds.compare_solvers(
+        terms, list(solvers.values()), 0.0, 2.0, STRONG_STEPS, problem.y0,
+        key=jr.key(0), num_paths=200,
+    )  # fmt: skip
+    rows = {}
+    for key, solver in solvers.items():
+        errors = [step.error for step in compared.steps if step.solver == key]
+        hs = np.log(np.array(BUDGETS[:2]) * cost(solver, noises))
+        # In a line beyond the steps that were measured.
+        slope, _ = np.polyfit(np.log(STRONG_STEPS), np.log(errors), 1)
+        known = np.log(STRONG_STEPS[::-1])
+        within = np.interp(hs, known, np.log(errors[::-1]))
+        beyond = hs - np.clip(hs, known[0], known[-1])
+        rows[solver_name(solver)] = [float(x) for x in np.exp(within + slope * beyond)]
+        print(
+            f"{name:44s}{solver_name(solver):24s}{rows[solver_name(solver)]}",
+            flush=True,
+        )
+    return rows
+
+
+KEPT = DOCS / "advice.json"
+
+
+def measure(names) -> None:
+    """Measures these problems anew, and keeps the others."""
+    kept = json.loads(KEPT.read_text()) if KEPT.exists() else {}
+    table = {"weak": {}, "strong": {}} | kept
+    for name in names:
+        table["weak"][name] = weak_table(name)
+        if name in STRONG:
+            table["strong"][name] = strong_table(name)
+        KEPT.write_text(json.dumps(table, indent=1) + "\n")
+
+
+def page(kept: dict) -> str:
+    """The page of these errors, with solvers in the order of the suggestions."""
+
+    def tables(want, names, number=None):
+        parts = []
+        for name in names:
+            problem = PROBLEMS[name]
+            rows = _in_order(problem, want, kept[want][name])
+            parts.append(_table(name, rows, problem.budgets[:number]))
+        return "\n\n".join(parts)
+
+    text = Path(__file__).with_suffix(".md").read_text()
+    return text.format(
+        weak=tables("weak", PROBLEMS), strong=tables("strong", STRONG, 2)
+    )
+
+
+def _in_order(problem: Problem, want, rows: dict) -> dict:
+    terms = problem.terms(problem.noises)
+    found = ds.suggest_solver(terms, 0.0, problem.y0, want=want)
+    names = [solver_name(suggestion.solver) for suggestion in found]
+    return {name: rows[name] for name in [*names, *(rows.keys() - {*names})]}
+
+
+def draw(kept: dict) -> None:
+    """The picture of the errors of means."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(5, 3, figsize=(8, 12), layout="constrained")
+    every = sorted({solver for rows in kept["weak"].values() for solver in rows})
+    styles = {
+        solver: dict(color=f"C{i % 10}", ls=("-", "--")[i // 10], marker=".")
+        for i, solver in enumerate(every)
+    }
+    for ax, name in zip(axes.flat, PROBLEMS):
+        budgets = PROBLEMS[name].budgets
+        for solver, errors in kept["weak"][name].items():
+            shown = np.where(np.isfinite(errors), np.maximum(errors, 1e-10), np.nan)
+            ax.loglog(budgets, shown, **styles[solver])
+        ax.set_title(name, fontsize=8)
+        ax.set_ylim(5e-11, 10)
+        ax.set_xticks(budgets, map(str, budgets))
+        ax.minorticks_off()
+    left = list(axes.flat[len(PROBLEMS) :])
+    for ax in left:
+        ax.axis("off")
+    for solver in every:
+        left[0].plot([], [], label=solver, **styles[solver])
+    left[0].legend(loc="upper left", fontsize=8, ncols=2, frameon=False)
+    figure.supxlabel("time for one evaluation", fontsize=9)
+    figure.supylabel("error", fontsize=9)
+    figure.savefig(DOCS / "img" / "advice.png", dpi=100)
+    plt.close(figure)
+
+
+def _table(name: str, rows: dict, budgets) -> str:
+    best = np.nanmin(np.array(list(rows.values())), axis=0)
+    lines = [f"| **{name}** | {' | '.join(map(str, budgets))} |"]
+    lines.append("|---" * (1 + len(budgets)) + "|")
+    for solver, errors in rows.items():
+        cells = []
+        for error, least in zip(errors, best):
+            cell = "grows" if not np.isfinite(error) else f"{error:.1e}"
+            good = error <= 2 * max(least, ROUNDING)
+            cells.append(f"**{cell}**" if good else cell)
+        lines.append(f"| `{solver}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+# Errors below this are as good as none.
+ROUNDING = 1e-12
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    measure(sys.argv[1:] or PROBLEMS)
+    measured = json.loads(KEPT.read_text())
+    draw(measured)
+    (DOCS / "advice.md").write_text(page(measured))

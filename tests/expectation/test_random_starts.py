@@ -1,0 +1,155 @@
+"""Paths that each start at a state of their own, and have `args` of their own."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from ..ensemble.fused import needs_drjit
+
+
+def oscillator(t, p, q, args):
+    return (p**2 + q**2) / 2
+
+
+def push(t, p, q, args):
+    # A force of this variance per unit of time.
+    return -jnp.sqrt(args["strength"]) * q
+
+
+TERMS = ds.hamiltonian_terms(oscillator, push, ())
+END, WIDTH = 1.0, 0.5
+ENGINES = ["jax", pytest.param("drjit", marks=needs_drjit)]
+
+
+def cloud(key):
+    """Positions around one, at rest."""
+    return jnp.zeros(()), 1 + WIDTH * jr.normal(key)
+
+
+def strengths(key):
+    return {"strength": jr.uniform(key, minval=1.0, maxval=3.0)}
+
+
+def square(t, y, args):
+    return y[1] ** 2, args["strength"]
+
+
+def exact(strength):
+    """The mean square of the position at the end."""
+    noise = strength * (END / 2 - np.sin(2 * END) / 4)
+    return (1 + WIDTH**2) * np.cos(END) ** 2 + noise
+
+
+def mean(sampling, y0=cloud, args=strengths, **kwargs):
+    kwargs = dict(key=jr.key(1), sampling=sampling) | kwargs
+    solver = ds.AdditiveGauss()
+    return ds.expectation(square, TERMS, solver, 0.0, END, 0.25, y0, args, **kwargs)
+
+
+SAMPLINGS = [
+    ds.IndependentPaths(4000),
+    ds.ArrayRQMC(2**9, 16),
+    ds.ValueFunctions(degree=2, num_paths=4000),
+]
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_means_over_drawn_starts_and_args_are_right(sampling):
+    estimate = mean(sampling)
+    np.testing.assert_array_less(
+        np.abs(np.subtract(estimate.mean, (exact(2.0), 2.0))),
+        4 * np.array(estimate.std_error),
+    )
+    assert estimate.num_failed == 0
+
+
+def test_value_functions_leave_the_variance_of_the_start():
+    fixed = {"strength": jnp.array(0.01)}
+    estimate = mean(ds.ValueFunctions(degree=2, num_paths=4000), args=fixed)
+    spread = np.sqrt(4 * WIDTH**2 + 2 * WIDTH**4) * np.cos(END) ** 2
+    assert 0.9 < estimate.std_error[0] * np.sqrt(4000) / spread < 1.1
+    assert abs(estimate.mean[0] - exact(0.01)) < 4 * estimate.std_error[0]
+
+
+@needs_drjit
+def test_the_fused_engine_draws_the_same_starts():
+    parts = [mean(SAMPLINGS[0], engine=engine) for engine in ("jax", "drjit")]
+    for own, other in zip(*[jax.tree.leaves(x.mean) for x in parts]):
+        np.testing.assert_allclose(own, other, rtol=1e-12)
+
+
+def test_parts_of_an_estimate_draw_the_samples_of_the_whole():
+    half = ds.IndependentPaths(100, batch_size=50)
+    first, second = mean(half), mean(half, first=100)
+    whole = mean(ds.IndependentPaths(200, batch_size=50))
+    assert first.merge(second).mean[0] == whole.mean[0]
+    assert first.merge(second).mean[1] == whole.mean[1]
+
+
+def test_the_default_does_not_rely_on_few_paths():
+    assert isinstance(mean(None, args={"strength": 1.0}, y0=ONE).sampling, FEW)
+    assert isinstance(mean(None, args={"strength": 1.0}).sampling, ds.ArrayRQMC)
+
+
+ONE, FEW = (jnp.zeros(()), jnp.ones(())), ds.ValueFunctions
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_paths_of_an_ensemble_start_where_they_say(engine):
+    # The start of a path may depend on its own `args`.
+    def start(key, args):
+        return jnp.zeros(()), jnp.sqrt(args["strength"]) * jr.normal(key)
+
+    solver = ds.ImplicitMidpoint()
+    given = TERMS, solver, 0.0, END, 0.25, start, strengths
+    how = dict(key=jr.key(1), num_paths=20, batch_size=8, engine=engine)
+    paths = ds.ensemble(*given, **how, ts=[0.0, END])
+    for i in (0, 13, 19):
+        y0, args = paths.start(i)
+        assert paths.ys[1][i, 0] == y0[1]
+        terms = paths.terms(i)
+        sol = diffrax.diffeqsolve(terms, solver, 0.0, END, 0.25, y0, args)
+        np.testing.assert_allclose(paths.ys[1][i, 1], sol.ys[1][0], rtol=1e-13)
+    ratios = paths.ys[1][:, 0] / np.sqrt(
+        [paths.start(i)[1]["strength"] for i in range(20)]
+    )
+    assert len(np.unique(ratios)) == 20
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_start_that_is_not_finite_is_a_failed_path(engine):
+    def start(key):
+        return jnp.zeros(()), jnp.log(jr.uniform(key, minval=-1.0))
+
+    args = {"strength": jnp.array(1.0)}
+    given = TERMS, ds.AdditiveGauss(), 0.0, END, 0.25, start, args
+    with pytest.warns(UserWarning, match="of 100 paths failed"):
+        paths = ds.ensemble(*given, key=jr.key(1), num_paths=100, engine=engine)
+    negative = [not np.isfinite(paths.start(i)[0][1]) for i in range(100)]
+    np.testing.assert_array_equal(paths.failed, negative)
+    assert np.all(np.isfinite(paths.ys[1][~paths.failed]))
+
+
+def test_a_function_in_args_is_told_from_a_function_of_the_key():
+    drive = lambda t: jnp.sin(t)
+    terms = ds.hamiltonian_terms(oscillator, lambda t, p, q, args: -args(t) * q, ())
+    with pytest.raises(TypeError) as info:
+        ds.ensemble(
+            terms,
+            ds.StormerVerlet(),
+            0.0,
+            1.0,
+            0.5,
+            ONE,
+            drive,
+            key=jr.key(1),
+            num_paths=2,
+        )
+    assert "pass it in a tuple" in str(info.value.__notes__)
+    with pytest.raises(ValueError, match=r"`y0` is called as `y0\(key\)`"):
+        mean(SAMPLINGS[0], y0=lambda key, width: ONE)

@@ -1,0 +1,557 @@
+"""Systems with constraints: the steps that keep them, and starts that satisfy them."""
+
+import functools as ft
+
+import diffrax
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._solver.step import no_failure
+
+from ..ensemble.fused import needs_drjit
+from ..problems import Given
+
+
+MASSES = jnp.array([1.0, 2.0, 0.5])[:, None]
+
+
+def chain_energy(t, p, q, args):
+    wind = args * jnp.sum(jnp.cos(q) * jnp.sin(q[::-1] + t**2))
+    return jnp.sum(p**2 / MASSES) / 2 + jnp.sum(MASSES[:, 0] * q[:, 1]) + wind
+
+
+def gusts(t, p, q, args):
+    return 0.3 * jnp.stack([jnp.sin(q[0, 0] + q[2, 1]), jnp.cos(q[1, 0]) * q[2, 1]])
+
+
+def rods(q, args):
+    """Three rods of length 1, in a chain that hangs from the origin."""
+    return jnp.sum(jnp.diff(q, axis=0, prepend=0) ** 2, axis=1) - 1
+
+
+def chain(path):
+    return ds.hamiltonian_terms(chain_energy, gusts, path, constraint=rods)
+
+
+def chain_state(key):
+    """Any allowed state."""
+    p, angles = jr.normal(key, (3, 2)), jr.uniform(key, (3,), maxval=2 * jnp.pi)
+    steps = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
+    terms = chain(ds.WeakBrownianPath((2,), jr.key(0)))
+    return ds.constrained_state(terms, (p, jnp.cumsum(steps, axis=0)), 0.5)
+
+
+def take_step(terms, t0, t1, y0, args=None, solver=None):
+    solver = ds.StormerVerlet() if solver is None else solver
+    state = solver.init(terms, t0, t1, y0, args)
+    y1, _, _, _, result = solver.step(terms, t0, t1, y0, args, state, False)
+    return y1, result
+
+
+def take_steps(number, terms, h, y0, args=None, solver=None):
+    """The end of some steps. Compared with a solve they are quick to compile, and may be
+    differentiated in reverse mode."""
+    solver = ds.StormerVerlet() if solver is None else solver
+    state = solver.init(terms, 0.0, h, y0, args)
+
+    def body(carry, i):
+        y, state = carry
+        y, _, _, state, result = solver.step(
+            terms, i * h, (i + 1) * h, y, args, state, False
+        )
+        return (y, state), result == diffrax.RESULTS.successful
+
+    (y, _), okay = jax.lax.scan(body, (y0, state), jnp.arange(number))
+    return y, jnp.all(okay)
+
+
+@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-14), (jnp.float32, 1e-5)])
+def test_steps_are_symplectic_on_the_constrained_phase_space(dtype, bound):
+    @jax.jit
+    @jax.vmap
+    def defect(key):
+        W = 0.3 * jr.normal(key, (2,))
+        y0, W = jax.tree.map(lambda x: x.astype(dtype), (chain_state(key), W))
+        terms = chain(Given(W))
+        at = terms, ds.StormerVerlet(), jnp.zeros((), dtype), jnp.full((), 0.1, dtype)
+        return ds.symplecticity_defect(*at, y0, jnp.full((), 0.5, dtype))
+
+    defects = defect(jr.split(jr.key(1), 50))
+    assert defects.dtype == dtype
+    assert np.max(defects) <= bound
+
+
+def test_the_way_back_is_the_way_there():
+    # With momenta reversed, and a wind that is even in time.
+    @jax.jit
+    @jax.vmap
+    def there_and_back(key):
+        terms, y0 = chain(Given(0.3 * jr.normal(key, (2,)))), chain_state(key)
+        (p, q), _ = take_step(terms, -0.05, 0.05, y0, 0.5)
+        (p, q), _ = take_step(terms, -0.05, 0.05, (-p, q), 0.5)
+        return y0, (-p, q)
+
+    begin, end = there_and_back(jr.split(jr.key(2), 20))
+    jax.tree.map(ft.partial(np.testing.assert_allclose, atol=1e-13), begin, end)
+
+
+def pendulum_energy(t, p, q, args):
+    return jnp.sum(p**2) / 2 + q[1]
+
+
+def rod(q, args):
+    return jnp.stack([jnp.sum(q**2) - 1])
+
+
+PENDULUM = ds.hamiltonian_terms(pendulum_energy, constraint=rod)
+# At the angle 0, of the speed 0.1.
+LEVEL = jnp.array([0.0, 0.1]), jnp.array([1.0, 0.0])
+
+
+def solved(terms, t1, dt0, y0, args=None, **kwargs):
+    kwargs = dict(max_steps=None, adjoint=diffrax.ForwardMode()) | kwargs
+    solver = ds.StormerVerlet()
+    sol = diffrax.diffeqsolve(terms, solver, 0.0, t1, dt0, y0, args, **kwargs)
+    return jax.tree.map(lambda x: x[-1], sol.ys)
+
+
+def test_a_hundred_thousand_steps_keep_constraints_and_energy():
+    p, q = solved(PENDULUM, 1e4, 0.1, LEVEL)
+    assert abs(rod(q, None)[0]) <= 1e-15
+    assert abs(p @ q) <= 1e-15
+    change = pendulum_energy(0, p, q, None) - pendulum_energy(0, *LEVEL, None)
+    assert abs(change) <= 3e-3
+
+
+def test_positions_and_momenta_are_those_of_the_angle_to_second_order():
+    in_angle = lambda t, p, q, args: p**2 / 2 + jnp.sin(q)
+    angle = ds.hamiltonian_terms(in_angle)
+    start = jnp.array(0.1), jnp.array(0.0)
+    # The step size is a number that the compiled programs read.
+    exact = jax.jit(lambda dt0: solved(angle, 2.0, dt0, start))
+    steps = jax.jit(lambda dt0: solved(PENDULUM, 2.0, dt0, LEVEL))
+    # Both have errors of even order.
+    fine, finer = (exact(2.0 / n) for n in (2000, 4000))
+    speed, theta = ((4 * b - a) / 3 for a, b in zip(fine, finer))
+    along = jnp.array([-jnp.sin(theta), jnp.cos(theta)])
+    right = speed * along, jnp.array([jnp.cos(theta), jnp.sin(theta)])
+    coarse, half = (
+        [np.linalg.norm(a - b) for a, b in zip(steps(2.0 / n), right)] for n in (40, 80)
+    )
+    np.testing.assert_allclose(np.log2(np.divide(coarse, half)), 2, atol=0.02)
+
+
+def test_a_solve_backward_in_time_returns_to_the_start():
+    y1 = solved(PENDULUM, 1.0, 0.1, LEVEL)
+    sol = diffrax.diffeqsolve(PENDULUM, ds.StormerVerlet(), 1.0, 0.0, -0.1, y1)
+    begin = [x[-1] for x in sol.ys]
+    np.testing.assert_allclose(np.stack(begin), np.stack(LEVEL), atol=1e-13)
+
+
+def test_derivatives_are_those_of_the_solution():
+    # With respect to masses, to the length of the rod, and to the start.
+    def H0(t, p, q, args):
+        return jnp.sum(p["x"] ** 2) / (2 * args["mass"]) + args["mass"] * q["x"][1]
+
+    def ring(q, args):
+        return jnp.stack([jnp.sum(q["x"] ** 2) - args["length"] ** 2])
+
+    terms = ds.hamiltonian_terms(H0, constraint=ring)
+
+    def end(x):
+        args = {"mass": x[0], "length": x[1]}
+        y0 = {"x": x[2:4]}, {"x": x[4:]}
+        y0 = ds.constrained_state(terms, y0, args)
+        (p, q), _ = take_steps(3, terms, 0.1, y0, args)
+        return jnp.sum(p["x"] ** 3) + jnp.sum(q["x"] ** 3)
+
+    x = jnp.array([1.3, 0.8, 0.3, 0.4, 0.6, 0.5])
+    slopes = jax.jit(jax.jacfwd(end))
+    moved = jnp.stack([x + s * 1e-5 * e for e in jnp.eye(6) for s in (1, -1)])
+    values = jax.jit(jax.vmap(end))(moved).reshape(6, 2)
+    exact = slopes(x)
+    np.testing.assert_allclose((values[:, 0] - values[:, 1]) / 2e-5, exact, atol=1e-8)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(x), exact, rtol=1e-11)
+    # Once more, along one direction.
+    along = lambda s: end(x + s * jnp.ones(6))
+    second = jax.jit(jax.jacfwd(jax.jacfwd(along)))(0.0)
+    near = [slopes(x + s) @ jnp.ones(6) for s in (1e-5, -1e-5)]
+    np.testing.assert_allclose((near[0] - near[1]) / 2e-5, second, rtol=1e-7)
+
+
+def test_a_step_that_is_too_long_fails_alone():
+    @jax.jit
+    @jax.vmap
+    def end(speed):
+        y0 = jnp.stack([0 * speed, speed]), LEVEL[1]
+        (_, q), okay = take_steps(2, PENDULUM, 0.5, y0)
+        return q, okay
+
+    speeds = jnp.array([0.1, 40.0, 0.2, jnp.nan])
+    q, okay = end(speeds)
+    np.testing.assert_array_equal(okay, [True, False, True, False])
+    alone, _ = end(speeds[jnp.array([0, 0, 2, 2])])
+    for i in (0, 2):
+        np.testing.assert_allclose(q[i], alone[i], rtol=1e-14)
+    # Summed over a batch, too, a path without a solution has no derivative.
+    slopes = jax.jit(jax.grad(lambda x: jnp.sum(end(x)[0])))
+    found, right = slopes(speeds.at[3].set(0.3)), slopes(speeds.at[1:].set(0.2))
+    assert found[1] == 0
+    np.testing.assert_allclose(found[:3:2], right[:3:2], rtol=1e-12)
+
+
+TWICE = ds.hamiltonian_terms(
+    pendulum_energy, constraint=lambda q, args: jnp.sum(q**2) - jnp.array([1.0, 1.0])
+)
+OFF = LEVEL[0], 1.01 * LEVEL[1]
+STARTS = pytest.mark.parametrize(
+    "terms, y0, advice",
+    [
+        (PENDULUM, OFF, "constrained_state"),
+        (PENDULUM, LEVEL[::-1], "constrained_state"),
+        (TWICE, LEVEL, "linearly dependent"),
+        (PENDULUM, (LEVEL[0], 0 * LEVEL[1]), "linearly dependent"),
+    ],
+)
+
+
+@STARTS
+def test_bad_starts_and_redundant_constraints_are_refused(terms, y0, advice):
+    with pytest.raises(ValueError, match=advice):
+        ds.StormerVerlet().init(terms, 0.0, 0.1, y0, None)
+    with pytest.raises(Exception, match=advice):
+        solved(terms, 1.0, 0.1, y0)
+
+
+@pytest.mark.parametrize("terms, bad", [(PENDULUM, OFF), (TWICE, LEVEL)])
+def test_bad_starts_fail_alone_in_a_batch(terms, bad):
+    solve = lambda y0: diffrax.diffeqsolve(
+        terms, ds.StormerVerlet(), 0, 1, 0.5, y0, throw=False
+    )
+    starts = jax.tree.map(lambda *x: jnp.stack(x), LEVEL, bad)
+    okay = jax.jit(jax.vmap(solve))(starts).result == diffrax.RESULTS.successful
+    np.testing.assert_array_equal(okay, [terms is PENDULUM, False])
+
+
+def test_a_state_is_projected_in_the_metric_of_the_masses():
+    terms = chain(ds.WeakBrownianPath((2,), jr.key(0)))
+    p, q = jr.normal(jr.key(3), (3, 2)), 0.9 * chain_state(jr.key(4))[1]
+    p1, q1 = ds.constrained_state(terms, (p, q), 0.5)
+    assert np.max(np.abs(rods(q1, None))) <= 1e-15
+    # Positions move along M^-1 J^T at the old ones, momenta along J^T at the new ones.
+    before, after = (jax.jacfwd(rods)(x, None).reshape(3, 6) for x in (q, q1))
+    moved = ((q1 - q) * MASSES).reshape(6)
+    change = (p1 - p).reshape(6)
+    for normals, x in ((before, moved), (after, change)):
+        rest = np.linalg.lstsq(normals.T, x)[1]
+        assert rest <= 1e-28
+    np.testing.assert_allclose(after @ (p1 / MASSES).reshape(6), 0, atol=1e-14)
+    again = ds.constrained_state(terms, (p1, q1), 0.5)
+    np.testing.assert_allclose(np.stack(again), np.stack((p1, q1)), atol=1e-15)
+    single = jax.tree.map(jnp.float32, (p, q))
+    below = ds.constrained_state(terms, single, jnp.float32(0.5))
+    assert below[0].dtype == jnp.float32
+    np.testing.assert_allclose(np.stack(below), np.stack((p1, q1)), atol=2e-6)
+
+
+def test_positions_that_cannot_be_projected_are_refused():
+    # No point of the parabola's tangent space reaches a negative number.
+    above = lambda q, args: jnp.stack([q[0] ** 2 + 1])
+    terms = ds.hamiltonian_terms(pendulum_energy, constraint=above)
+    with pytest.raises(ValueError, match="closer"):
+        ds.constrained_state(terms, LEVEL)
+    nowhere = jax.jit(lambda y0: ds.constrained_state(terms, y0))(LEVEL)
+    assert np.all(np.isnan(np.stack(nowhere)))
+    with pytest.raises(ValueError, match="needs terms with a `constraint`"):
+        ds.constrained_state(ds.hamiltonian_terms(pendulum_energy), LEVEL)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        ds.ImplicitMidpoint(),
+        ds.PlateauVerlet(),
+        ds.NinomiyaVictoir(),
+        ds.LinearFlow(ds.StormerVerlet(), lambda time, y, args: (y[0] - time, y[1])),
+        diffrax.Tsit5(),
+        diffrax.EulerHeun(),
+        diffrax.Kvaerno5(),
+    ],
+    ids=lambda solver: type(solver).__name__,
+)
+def test_other_solvers_refuse_constraints_and_name_those_that_keep_them(solver):
+    ours = isinstance(solver, ds.AbstractSymplecticSolver)
+    path = (solver if ours else ds.StormerVerlet()).path((2,), jr.key(0))
+    terms, controller = chain(path), diffrax.ConstantStepSize()
+    if isinstance(solver, diffrax.AbstractAdaptiveSolver | diffrax.Kvaerno5):
+        terms = ds.hamiltonian_terms(chain_energy, constraint=rods)
+        controller = diffrax.PIDController(1e-3, 1e-3)
+    y0 = chain_state(jr.key(5))
+    with pytest.raises(ValueError, match="`StormerVerlet.*BAOAB"):
+        diffrax.diffeqsolve(
+            terms, solver, 0.0, 1.0, 0.1, y0, 0.5, stepsize_controller=controller
+        )
+
+
+def test_what_makes_no_sense_with_constraints_refuses_them():
+    terms = chain(ds.WeakBrownianPath((2,), jr.key(0)))
+    y0 = chain_state(jr.key(5))
+    at = terms, ds.StormerVerlet(), 0.0, 0.1, y0, 0.5
+    with pytest.raises(ValueError, match="`second_moment_map` takes no terms"):
+        ds.second_moment_map(*at)
+    with pytest.raises(ValueError, match="`weak_order_defect` takes no terms"):
+        ds.weak_order_defect(*at, fn=lambda t, y, args: y[0], order=1)
+    with pytest.raises(ValueError, match="`ReversingAdjoint` takes no terms"):
+        solved(terms, 1.0, 0.1, y0, 0.5, adjoint=ds.ReversingAdjoint())
+    two = diffrax.MultiTerm(*terms.terms, *PENDULUM.terms)
+    with pytest.raises(ValueError, match="Only one of the terms"):
+        solved(two, 1.0, 0.1, y0, 0.5)
+
+
+@pytest.mark.parametrize(
+    "constraint, message",
+    [
+        (lambda q, args: jnp.sum(q**2) - 1, "real array of shape"),
+        (lambda q, args: (q[0],), "real array of shape"),
+        (lambda q, args: q[:, None], "real array of shape"),
+        (lambda q, args: 1j * q, "real array of shape"),
+        (lambda q: q, "is called as `constraint"),
+        (3.0, "must be a function"),
+    ],
+)
+def test_constraints_of_another_kind_are_refused(constraint, message):
+    with pytest.raises(ValueError, match=message):
+        terms = ds.hamiltonian_terms(pendulum_energy, constraint=constraint)
+        ds.StormerVerlet().init(terms, 0.0, 0.1, LEVEL, None)
+
+
+@pytest.mark.parametrize(
+    "H0, message",
+    [
+        (lambda t, p, q, args: jnp.sum(jnp.sqrt(1 + p**2)) + q[1], "constant masses"),
+        (lambda t, p, q, args: jnp.sum(p**2) * q[1], "dH0/dq depends on p"),
+    ],
+)
+def test_masses_that_are_not_constant_are_refused(H0, message):
+    terms = ds.hamiltonian_terms(H0, constraint=rod)
+    with pytest.raises(ValueError, match=message):
+        ds.StormerVerlet().init(terms, 0.0, 0.1, LEVEL, None)
+    with pytest.raises(ValueError, match=message):
+        ds.constrained_state(terms, LEVEL)
+
+
+# Friction between coordinates, masses that differ, and a plane that is oblique to both.
+INERTIA = jnp.array([1.0, 4.0, 0.5])
+TENSOR = jnp.array([[1.0, 0.3, 0.0], [0.3, 0.5, -0.2], [0.0, -0.2, 0.7]])
+NORMAL, TEMPERATURE = jnp.array([1.0, -2.0, 0.5]), 0.6
+STIFF = jnp.diag(jnp.array([2.0, 1.0, 1.5]))
+
+
+def in_a_plane(path, stiffness):
+    H0 = lambda t, p, q, args: jnp.sum(p**2 / INERTIA) / 2 + q @ stiffness @ q / 2
+    plane = lambda q, args: jnp.stack([NORMAL @ q])
+    return ds.langevin_terms(H0, TENSOR, TEMPERATURE, path, constraint=plane)
+
+
+def stationary(step, n, h):
+    """The covariance that a linear `step(y, W)` keeps, of the coordinates in the plane."""
+    A, B = (
+        np.asarray(x) for x in jax.jit(jax.jacfwd(step, (0, 1)))(*map(jnp.zeros, n))
+    )
+    # It maps the allowed states to themselves, and B leads to them.
+    U, S, _ = np.linalg.svd(np.concatenate([A @ A, B, A @ B], axis=1))
+    Z = U[:, S > 1e-10]
+    A, B = Z.T @ A @ Z, Z.T @ B
+    K = np.kron(A, A)
+    C = np.linalg.solve(np.eye(len(K)) - K, (h * B @ B.T).reshape(-1))
+    return Z @ C.reshape(A.shape) @ Z.T
+
+
+def test_friction_and_noise_keep_the_maxwell_distribution_of_a_plane_exactly():
+    h = 0.7
+
+    def step(p, W):
+        terms = in_a_plane(Given(W), jnp.zeros((3, 3)))
+        y0 = p, jnp.zeros(3)
+        force, solved = jnp.zeros(3), no_failure()
+        at = terms, 0.0, h, y0, None, (force, solved), False
+        return ds.BAOAB().step(*at)[0][0]
+
+    normals = NORMAL[None]
+    impulse = normals.T @ np.linalg.inv(normals / INERTIA @ normals.T) @ normals
+    exact = TEMPERATURE * (np.diag(INERTIA) - impulse)
+    np.testing.assert_allclose(stationary(step, (3, 3), h), exact, atol=1e-14)
+
+
+def test_positions_in_a_harmonic_well_and_a_plane_have_the_law_of_gibbs():
+    h = 0.5
+
+    def step(y, W):
+        terms = in_a_plane(Given(W), STIFF)
+        p, q = jnp.split(y, 2)
+        solver_state = -STIFF @ q, no_failure()
+        y1 = ds.BAOAB().step(terms, 0.0, h, (p, q), None, solver_state, False)[0]
+        return jnp.concatenate(y1)
+
+    _, _, V = np.linalg.svd(NORMAL[None])
+    Z = V[1:].T
+    exact = TEMPERATURE * Z @ np.linalg.inv(Z.T @ STIFF @ Z) @ Z.T
+    found = stationary(step, (6, 3), h)
+    np.testing.assert_allclose(found[3:, 3:], exact, atol=1e-13)
+    np.testing.assert_allclose(found[:3, 3:], 0, atol=1e-13)
+
+
+def test_steps_with_one_rate_of_friction_are_conformally_symplectic():
+    rate, h = 0.8, 0.1
+
+    def terms(W):
+        friction = rate * jnp.broadcast_to(MASSES, (3, 2))
+        at = chain_energy, friction, TEMPERATURE, Given(W)
+        return ds.langevin_terms(*at, constraint=rods)
+
+    @jax.jit
+    @jax.vmap
+    def two_forms(key):
+        (p, q), W = chain_state(key), 0.3 * jr.normal(key, (3, 2))
+        flat, unravel = jfu.ravel_pytree((p, q))
+        step = lambda x: take_step(terms(W), 0.0, h, unravel(x), 0.5, ds.BAOAB())[0]
+        jacobian = jax.jacfwd(lambda x: jfu.ravel_pytree(step(x))[0])(flat)
+        hidden = lambda y: jax.jvp(lambda q: rods(q, None), (y[1],), (y[0] / MASSES,))
+        normals = jax.jacfwd(lambda x: jnp.concatenate(hidden(unravel(x))))(flat)
+        Z = jnp.linalg.svd(normals)[2][6:].T
+        zero, one = jnp.zeros((6, 6)), jnp.eye(6)
+        omega = jnp.block([[zero, one], [-one, zero]])
+        moved = jacobian @ Z
+        return moved.T @ omega @ moved, Z.T @ omega @ Z
+
+    after, before = two_forms(jr.split(jr.key(6), 20))
+    c = (1 - rate * h / 2) / (1 + rate * h / 2)
+    np.testing.assert_allclose(after, c * before, atol=1e-14)
+
+
+FIELD = 1.2
+
+
+def dimer_energy(t, p, q, args):
+    return jnp.sum(p**2) / 2 - FIELD * (q[0, 0] - q[1, 0])
+
+
+def dimer_rod(q, args):
+    return jnp.stack([jnp.sum((q[0] - q[1]) ** 2) - 1])
+
+
+def dimer(path, friction=1.0):
+    at = dimer_energy, friction, TEMPERATURE, path
+    return ds.langevin_terms(*at, constraint=dimer_rod)
+
+
+DIMER = jnp.zeros((2, 3)), jnp.array([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]])
+
+
+def test_rigid_dimers_in_a_field_have_the_means_of_gibbs():
+    terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
+    paths = ds.ensemble(
+        terms, ds.BAOAB(), 0, 12, 0.12, DIMER, key=jr.key(1), num_paths=5000
+    )
+    p, q = paths.ys
+    energy = np.sum((p[:, 0] - p[:, 1]) ** 2, axis=1) / 4
+    seen = q[:, 0, 0] - q[:, 1, 0], energy, energy > TEMPERATURE
+    x = FIELD / TEMPERATURE
+    exact = 1 / np.tanh(x) - 1 / x, TEMPERATURE, np.exp(-1)
+    # The bias of this step is below a tenth of a standard error.
+    for values, mean in zip(seen, exact):
+        assert abs(np.mean(values) - mean) <= 3 * np.std(values) / len(values) ** 0.5
+    assert np.max(np.abs(np.sum((q[:, 0] - q[:, 1]) ** 2, axis=1) - 1)) <= 1e-14
+
+
+@needs_drjit
+@pytest.mark.slow
+def test_the_fused_engine_solves_for_more_multipliers_than_are_written_out():
+    number = 7
+    line = jnp.stack([jnp.arange(number) % 2, jnp.arange(number) // 2], axis=1) * 1.0
+    bonds = lambda q, args: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1)
+    lengths = bonds(line, None)
+    free = lambda t, p, q, args: jnp.sum(p**2) / 2
+    terms = ds.langevin_terms(
+        free,
+        1.0,
+        TEMPERATURE,
+        ds.WeakBrownianPath((number, 2), jr.key(0)),
+        constraint=lambda q, args: bonds(q, args) - lengths,
+    )
+    at = terms, ds.BAOAB(), 0, 0.4, 0.1, (0 * line, line)
+    fused, plain = (
+        ds.ensemble(*at, key=jr.key(2), num_paths=20, engine=engine)
+        for engine in ("drjit", "jax")
+    )
+    assert fused.num_stragglers == 0
+    for a, b in zip(fused.ys, plain.ys):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+@needs_drjit
+@pytest.mark.parametrize("solver", [ds.StormerVerlet(), ds.BAOAB()], ids=repr)
+def test_the_fused_engine_takes_the_same_steps(solver):
+    path = ds.WeakBrownianPath((2, 3), jr.key(0))
+    terms = dimer(path)
+    if isinstance(solver, ds.StormerVerlet):
+        kicks = lambda t, p, q, args: jnp.sin(q)
+        terms = ds.hamiltonian_terms(dimer_energy, kicks, path, constraint=dimer_rod)
+    at = terms, solver, 0, 2, 0.1, DIMER
+    fused, plain = (
+        ds.ensemble(*at, key=jr.key(2), num_paths=50, engine=engine)
+        for engine in ("drjit", "jax")
+    )
+    assert fused.num_stragglers == 0
+    for a, b in zip(fused.ys, plain.ys):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_expectations_refuse_starts_off_the_constraint():
+    terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
+    off = DIMER[0], 1.001 * DIMER[1]
+    phi = lambda t, y, args: y[1]
+    with pytest.raises(ValueError, match="constrained_state"):
+        ds.expectation(phi, terms, ds.BAOAB(), 0, 1, 0.1, off, key=jr.key(1))
+
+
+@pytest.mark.parametrize("solver", [ds.LangevinMiddle(), ds.Damped(ds.StormerVerlet())])
+def test_other_solvers_for_langevin_dynamics_refuse_constraints(solver):
+    terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
+    with pytest.raises(ValueError, match="`StormerVerlet.*BAOAB"):
+        solver.init(terms, 0.0, 0.1, DIMER, None)
+    with pytest.raises(ValueError, match="Take friction from|BAOAB"):
+        ds.StormerVerlet().init(terms, 0.0, 0.1, DIMER, None)
+
+
+def test_a_derivative_by_the_friction_along_a_path():
+    path = ds.FixedStepBrownianPath((2, 3), jr.key(0))
+
+    def end(friction):
+        at = 3, dimer(path, friction), 0.1, DIMER, None, ds.BAOAB()
+        return jnp.sum(take_steps(*at)[0][0] ** 3)
+
+    end = jax.jit(end)
+    exact = (end(1.0 + 1e-5) - end(1.0 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(1.0), exact, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_gradient_through_a_solve():
+    def end(length, adjoint):
+        terms = ds.hamiltonian_terms(
+            pendulum_energy, constraint=lambda q, args: rod(q / args, None)
+        )
+        p, q = LEVEL
+        at = terms, 0.2, 0.1, (p, length * q), length
+        return solved(*at, adjoint=adjoint, max_steps=4)[1][0]
+
+    backward = ft.partial(end, adjoint=diffrax.RecursiveCheckpointAdjoint())
+    forward = ft.partial(end, adjoint=diffrax.ForwardMode())
+    found, exact = jax.jit(jax.grad(backward)), jax.jit(jax.jacfwd(forward))
+    np.testing.assert_allclose(found(1.2), exact(1.2), rtol=1e-13)

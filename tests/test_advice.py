@@ -1,0 +1,104 @@
+"""Advice is measured: facts in the records, and the order of suggestions."""
+
+import json
+import re
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._suggest import LANGEVIN, SOLVERS
+from examples import advice
+
+
+# Of those that are explicit, or implicit.
+EXPLICIT = (ds.StormerVerlet, ds.PlateauVerlet, ds.BAOAB, ds.LangevinMiddle)
+RESOLVED, STIFF = jnp.array([0.5, 1.8]), jnp.array([1.0, 3.0, 5.0])
+SUGGESTED = [solver for solver in (*SOLVERS, *LANGEVIN) if solver.record.suggested]
+# Its random variables have no finite set of outcomes; without noise brackets it is the
+# midpoint rule.
+MEASURED = [solver for solver in SUGGESTED if solver is not ds.LevyAreaMidpoint]
+
+
+def _well(t, p, q, args):
+    return (p**2 + q**2) / 2
+
+
+def _maps(terms, solver, hs):
+    one = lambda h: ds.second_moment_map(terms, solver, 0.0, h, advice.ONE)
+    options = {"xla_backend_optimization_level": 0}
+    return np.asarray(jax.jit(jax.vmap(one), compiler_options=options)(hs))
+
+
+@pytest.mark.parametrize("kind", MEASURED, ids=lambda kind: kind.__name__)
+def test_facts_about_noise_on_harmonic_modes_are_measured(kind):
+    solver = advice.with_newton(kind())
+    path = kind().path((), jr.key(0), want="weak")
+    # The energy that noise gives in each unit of time to a mode without friction is 1/2.
+    heats = None
+    if kind not in EXPLICIT:
+        push = lambda t, p, q, args: -q
+        terms = ds.hamiltonian_terms(_well, push, path)
+        ends = np.linalg.matrix_power(_maps(terms, solver, STIFF), 200)[:, :, 0]
+        rates = (ends[:, 4] + ends[:, 8]) / (200 * STIFF)
+        heats = bool(np.all(np.abs(rates - 1) <= 0.05))
+    assert kind.record.heats is heats
+    # Those for separable systems do not take friction in the drift.
+    exact = []
+    if kind in LANGEVIN or kind().structure not in ("separable",):
+        hs = RESOLVED if kind in EXPLICIT else jnp.concatenate([RESOLVED, STIFF])
+        maps = _maps(ds.langevin_terms(_well, 0.5, 1.0, path), solver, hs)
+        found = np.array([advice.stationary(K, 1.0) for K in maps])
+        for name, number, value in (("qq", 8, 1.0), ("pq", 5, 0.0), ("pp", 4, 1.0)):
+            if np.max(np.abs(found[:, number] - value)) <= 1e-9:
+                exact.append(name)
+    assert kind.record.stationary == tuple(exact)
+
+
+# What the first suggestion says that it is not for, where it is not within twice the error
+# of the best.
+SAID = {
+    "stiff oscillator": "Not for long steps, omega h > 1",
+    "stiff oscillator in a bath": "Not for .* frequencies omega > 2 / h",
+    "free particle in a bath": "Not for .* transients to more than three digits",
+    "oscillator in a bath, transient": "Not for .* transients to more than three digits",
+    "oscillator in a bath, stationary": "Not for momenta",
+    "coloured forcing with friction, late": "Not for .* stationary laws of linear systems",
+    "Kubo oscillator": "Not for long steps, omega h > 1",
+}
+KEPT = json.loads(advice.KEPT.read_text())
+
+
+@pytest.mark.parametrize("want", ["weak", "strong"])
+def test_first_suggestion_is_nearly_the_best_or_says_for_what_it_is_not(want):
+    excused = set()
+    assert set(KEPT["weak"]) == set(advice.PROBLEMS)
+    for name, rows in KEPT[want].items():
+        problem = advice.PROBLEMS[name]
+        terms = problem.terms(problem.noises)
+        found = ds.suggest_solver(terms, 0.0, problem.y0, want=want)
+        # All of them have been measured.
+        assert {advice.solver_name(s.solver) for s in found} <= set(rows)
+        best = np.min(np.array(list(rows.values())), axis=0)
+        first = np.array(rows[advice.solver_name(found[0].solver)])
+        if np.all(first <= 2 * np.maximum(best, advice.ROUNDING)):
+            continue
+        excused.add(name)
+        assert re.search(SAID[name], found[0].reason), (name, found[0], first, best)
+    if want == "weak":
+        assert excused == set(SAID)
+
+
+def test_errors_of_the_page_are_those_measured_now():
+    name = "noisy spring"
+    problem = advice.PROBLEMS[name]
+    exact = advice.generator(problem)
+    for solver in (ds.StormerVerlet(), ds.SRKw4()):
+        errors = advice.weak_errors(problem, exact, solver)
+        kept = KEPT["weak"][name][advice.solver_name(solver)]
+        np.testing.assert_allclose(errors, kept, rtol=1e-6)
+    page = (advice.DOCS / "advice.md").read_text()
+    assert page == advice.page(KEPT), "run `python -m examples.advice`"
