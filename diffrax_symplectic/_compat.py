@@ -56,7 +56,9 @@ def quickly_compiled(fn: Callable) -> Callable:
 
     @ft.cache
     def compiled() -> Callable:
-        return eqx.filter_jit(fn, compiler_options=_quick_options())
+        # Equinox hands on all other options to `jax.jit`, which its types do not say.
+        jit: Any = eqx.filter_jit
+        return jit(fn, compiler_options=_quick_options())
 
     @ft.wraps(fn)
     def call(*args: Any) -> Any:
