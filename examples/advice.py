@@ -11,7 +11,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -34,9 +34,9 @@ BUDGETS = (0.01, 0.03, 0.1)
 
 
 class Problem(NamedTuple):
-    """A linear system, by its terms for a path."""
+    """A linear system, by its terms for a path or its shape."""
 
-    terms: Callable[[diffrax.AbstractBrownianPath], diffrax.MultiTerm]
+    terms: Callable[[Any], diffrax.MultiTerm]
     y0: tuple
     # The shape of the noise.
     noises: tuple[int, ...] = ()
@@ -57,18 +57,19 @@ def hamiltonian(H0, noise):
     )
 
 
-def bath(H0, friction=0.5, noise=None):
-    """Langevin dynamics at temperature 1, or with another noise."""
+def bath(H0, friction=0.5):
+    """Langevin dynamics at temperature 1."""
     energy = lambda t, p, q, args: H0(p, q)
+    return lambda path: ds.langevin_terms(energy, friction, 1.0, path)
+
+
+def rubbing(H0, noise, friction=0.5):
+    """Friction beside other noise."""
 
     def terms(path):
-        if noise is None:
-            return ds.langevin_terms(energy, friction, 1.0, path)
-        drift = ds.langevin_terms(energy, friction)
-        other = ds.hamiltonian_terms(
-            energy, lambda t, p, q, args: noise(p, q), path
-        ).terms[1]
-        return diffrax.MultiTerm(*drift.terms, other)
+        rest = hamiltonian(H0, noise)(path)
+        energy = lambda t, p, q, args: H0(p, q)
+        return diffrax.MultiTerm(*rest.terms, *ds.bath_terms(energy, friction).terms)
 
     return terms
 
@@ -126,7 +127,7 @@ PROBLEMS = {
     "oscillator in a bath, stationary": Problem(bath(well), ONE, time=None),
     "stiff oscillator in a bath": Problem(bath(well), ONE, time=None, budgets=STIFF),
     "noisy spring": Problem(hamiltonian(well, spring), ONE),
-    "noisy spring with friction": Problem(bath(well, 0.5, spring), ONE),
+    "noisy spring with friction": Problem(rubbing(well, spring), ONE),
     "Kubo oscillator": Problem(hamiltonian(well, kubo), ONE, time=3.0),
     "two noises that do not commute": Problem(
         hamiltonian(well, turning), ONE, (2,), time=3.0
@@ -341,10 +342,11 @@ def draw(kept: dict) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.lines import Line2D
 
     figure, axes = plt.subplots(5, 3, figsize=(8, 12), layout="constrained")
     every = sorted({solver for rows in kept["weak"].values() for solver in rows})
-    styles = {
+    styles: dict[str, Any] = {
         solver: dict(color=f"C{i % 10}", ls=("-", "--")[i // 10], marker=".")
         for i, solver in enumerate(every)
     }
@@ -359,7 +361,7 @@ def draw(kept: dict) -> None:
         ax.minorticks_off()
     for ax in axes.flat[len(PROBLEMS) :]:
         ax.axis("off")
-    lines = [plt.Line2D([], [], label=solver, **styles[solver]) for solver in every]
+    lines = [Line2D([], [], label=solver, **styles[solver]) for solver in every]
     figure.legend(handles=lines, loc="lower right", fontsize=8, ncols=2, frameon=False)
     figure.supxlabel("time for one evaluation", fontsize=9)
     figure.supylabel("error", fontsize=9)
