@@ -35,9 +35,8 @@ BUDGETS = (0.01, 0.03, 0.1)
 
 
 class Problem(NamedTuple):
-    """A linear system, by its terms for a path."""
+    """A linear system, by its terms for a path or its shape."""
 
-    # Of a Brownian path or its shape.
     terms: Callable[[Any], diffrax.MultiTerm]
     y0: tuple
     # The shape of the noise.
@@ -59,18 +58,19 @@ def hamiltonian(H0, noise):
     )
 
 
-def bath(H0, friction=0.5, noise=None):
-    """Langevin dynamics at temperature 1, or with another noise."""
+def bath(H0, friction=0.5):
+    """Langevin dynamics at temperature 1."""
     energy = lambda t, p, q, args: H0(p, q)
-    if noise is None:
-        return lambda path: ds.langevin_terms(energy, friction, 1.0, path)
+    return lambda path: ds.langevin_terms(energy, friction, 1.0, path)
+
+
+def rubbing(H0, noise, friction=0.5):
+    """Friction beside other noise."""
 
     def terms(path):
-        drift = ds.langevin_terms(energy, friction)
-        other = ds.hamiltonian_terms(
-            energy, lambda t, p, q, args: noise(p, q), path
-        ).terms[1]
-        return diffrax.MultiTerm(*drift.terms, other)
+        rest = hamiltonian(H0, noise)(path)
+        energy = lambda t, p, q, args: H0(p, q)
+        return diffrax.MultiTerm(*rest.terms, *ds.bath_terms(energy, friction).terms)
 
     return terms
 
@@ -128,7 +128,7 @@ PROBLEMS = {
     "oscillator in a bath, stationary": Problem(bath(well), ONE, time=None),
     "stiff oscillator in a bath": Problem(bath(well), ONE, time=None, budgets=STIFF),
     "noisy spring": Problem(hamiltonian(well, spring), ONE),
-    "noisy spring with friction": Problem(bath(well, 0.5, spring), ONE),
+    "noisy spring with friction": Problem(rubbing(well, spring), ONE),
     "Kubo oscillator": Problem(hamiltonian(well, kubo), ONE, time=3.0),
     "two noises that do not commute": Problem(
         hamiltonian(well, turning), ONE, (2,), time=3.0
@@ -346,7 +346,7 @@ def draw(kept: dict) -> None:
 
     figure, axes = plt.subplots(5, 3, figsize=(8, 12), layout="constrained")
     every = sorted({solver for rows in kept["weak"].values() for solver in rows})
-    styles: dict[str, dict[str, Any]] = {
+    styles: dict[str, Any] = {
         solver: dict(color=f"C{i % 10}", ls=("-", "--")[i // 10], marker=".")
         for i, solver in enumerate(every)
     }
