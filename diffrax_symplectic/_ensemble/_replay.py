@@ -91,7 +91,11 @@ class Replay:
         rule = rule_of(operation.name)
         if rule is None:
             raise NotReplayed(op)
-        return rule(operation, *operands)
+        try:
+            return rule(operation, *operands)
+        except TypeError as error:
+            # Dr.Jit's own, which names neither the operation nor its place.
+            raise NotReplayed(op, f"`{op.name}` of these types ({error})") from error
 
 
 def _large_constants(functions: list[Any]) -> dict[Any, np.ndarray]:
