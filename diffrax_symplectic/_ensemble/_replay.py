@@ -83,10 +83,10 @@ class Replay:
                 raise
         run = lambda i, args: self._block(op.regions[i].blocks[0], args, values, errors)
         if op.results and op.results[0] in self._memory:
-            values = self.constants[op.results[0]]
-            places = np.arange(values.size)
-            table = Table(self._memory[op.results[0]], places, values.ravel())
-            return [Tensor(table, values.shape)]
+            given = self.constants[op.results[0]]
+            places = np.arange(given.size)
+            table = Table(self._memory[op.results[0]], places, given.ravel())
+            return [Tensor(table, given.shape)]
         operation = Operation(op, run, errors)
         rule = rule_of(operation.name)
         if rule is None:
