@@ -83,15 +83,19 @@ class Replay:
                 raise
         run = lambda i, args: self._block(op.regions[i].blocks[0], args, values, errors)
         if op.results and op.results[0] in self._memory:
-            constant = self.constants[op.results[0]]
-            places = np.arange(constant.size)
-            table = Table(self._memory[op.results[0]], places, constant.ravel())
-            return [Tensor(table, constant.shape)]
+            given = self.constants[op.results[0]]
+            places = np.arange(given.size)
+            table = Table(self._memory[op.results[0]], places, given.ravel())
+            return [Tensor(table, given.shape)]
         operation = Operation(op, run, errors)
         rule = rule_of(operation.name)
         if rule is None:
             raise NotReplayed(op)
-        return rule(operation, *operands)
+        try:
+            return rule(operation, *operands)
+        except TypeError as error:
+            # Dr.Jit's own, which names neither the operation nor its place.
+            raise NotReplayed(op, f"`{op.name}` of these types ({error})") from error
 
 
 def _large_constants(functions: list[Any]) -> dict[Any, np.ndarray]:

@@ -9,6 +9,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from .fused import needs_drjit
+from .test_operations import replayed
 
 
 pytestmark = needs_drjit
@@ -72,7 +73,7 @@ def test_paths_are_the_same_as_in_jax(name, dtype):
             assert np.mean(close) > 0.98
 
 
-def test_a_table_of_the_paths_own_numbers_is_refused_with_operation_and_line():
+def test_a_table_of_the_paths_own_numbers_is_refused_by_name():
     def potential(t, q, args):
         table = jnp.cos(q + jnp.arange(100.0))
         return table[jnp.int32(10 * q)]
@@ -82,6 +83,18 @@ def test_a_table_of_the_paths_own_numbers_is_refused_with_operation_and_line():
     )
     given = terms, ds.StormerVerlet(), 0, 1, 0.1, (0.0, 1.0)
     with pytest.raises(
-        ValueError, match="index per path, among 100.*which `potential`"
+        ValueError, match="`stablehlo.*with an index per path, among 100"
     ):
         ds.ensemble(*given, key=jr.key(0), num_paths=10, engine="drjit")
+
+
+def test_an_error_of_dr_jit_is_reported_with_the_operation(monkeypatch):
+    from diffrax_symplectic._ensemble import _operation
+    from diffrax_symplectic._ensemble._operation import NotReplayed
+
+    def mistaken(o, *xs):
+        raise TypeError("UInt(-1)")
+
+    monkeypatch.setitem(_operation.RULES, "reverse", mistaken)
+    with pytest.raises(NotReplayed, match=r"`stablehlo.reverse`.*UInt\(-1\)"):
+        replayed(lambda x: x[::-1], np.ones((5, 3)))
