@@ -56,7 +56,8 @@ def quickly_compiled(fn: Callable) -> Callable:
 
     @ft.cache
     def compiled() -> Callable:
-        return eqx.filter_jit(fn, compiler_options=_quick_options())
+        options: Any = dict(compiler_options=_quick_options())
+        return eqx.filter_jit(fn, **options)
 
     @ft.wraps(fn)
     def call(*args: Any) -> Any:

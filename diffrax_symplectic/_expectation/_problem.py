@@ -129,7 +129,7 @@ class Problem(eqx.Module):
         at = grid, weights, ts is None, int(finer[-1] * num_steps)
         return Problem(phi, terms, solver, start, y0, args, y0_of, args_of, *at)
 
-    def level(self, index: int) -> Level:
+    def level(self, index: int | Int[Array, ""]) -> Level:
         return jtu.tree_map(lambda x: x[index], self.levels)
 
     @property
