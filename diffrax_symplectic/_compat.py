@@ -56,8 +56,9 @@ def quickly_compiled(fn: Callable) -> Callable:
 
     @ft.cache
     def compiled() -> Callable:
-        options: Any = dict(compiler_options=_quick_options())
-        return eqx.filter_jit(fn, **options)
+        # Equinox hands on all other options to `jax.jit`, which its types do not say.
+        jit: Any = eqx.filter_jit
+        return jit(fn, compiler_options=_quick_options())
 
     @ft.wraps(fn)
     def call(*args: Any) -> Any:

@@ -11,7 +11,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import optimistix as optx
+from matplotlib.lines import Line2D
 from scipy.linalg import expm
 
 import diffrax_symplectic as ds
@@ -34,9 +35,9 @@ BUDGETS = (0.01, 0.03, 0.1)
 
 
 class Problem(NamedTuple):
-    """A linear system, by its terms for a path."""
+    """A linear system, by its terms for a path or its shape."""
 
-    terms: Callable[[diffrax.AbstractBrownianPath], diffrax.MultiTerm]
+    terms: Callable[[Any], diffrax.MultiTerm]
     y0: tuple
     # The shape of the noise.
     noises: tuple[int, ...] = ()
@@ -57,18 +58,19 @@ def hamiltonian(H0, noise):
     )
 
 
-def bath(H0, friction=0.5, noise=None):
-    """Langevin dynamics at temperature 1, or with another noise."""
+def bath(H0, friction=0.5):
+    """Langevin dynamics at temperature 1."""
     energy = lambda t, p, q, args: H0(p, q)
+    return lambda path: ds.langevin_terms(energy, friction, 1.0, path)
+
+
+def rubbing(H0, noise, friction=0.5):
+    """Friction beside other noise."""
 
     def terms(path):
-        if noise is None:
-            return ds.langevin_terms(energy, friction, 1.0, path)
-        drift = ds.langevin_terms(energy, friction)
-        other = ds.hamiltonian_terms(
-            energy, lambda t, p, q, args: noise(p, q), path
-        ).terms[1]
-        return diffrax.MultiTerm(*drift.terms, other)
+        rest = hamiltonian(H0, noise)(path)
+        energy = lambda t, p, q, args: H0(p, q)
+        return diffrax.MultiTerm(*rest.terms, *ds.bath_terms(energy, friction).terms)
 
     return terms
 
@@ -126,7 +128,7 @@ PROBLEMS = {
     "oscillator in a bath, stationary": Problem(bath(well), ONE, time=None),
     "stiff oscillator in a bath": Problem(bath(well), ONE, time=None, budgets=STIFF),
     "noisy spring": Problem(hamiltonian(well, spring), ONE),
-    "noisy spring with friction": Problem(bath(well, 0.5, spring), ONE),
+    "noisy spring with friction": Problem(rubbing(well, spring), ONE),
     "Kubo oscillator": Problem(hamiltonian(well, kubo), ONE, time=3.0),
     "two noises that do not commute": Problem(
         hamiltonian(well, turning), ONE, (2,), time=3.0
@@ -323,7 +325,7 @@ def page(kept: dict) -> str:
 
     text = Path(__file__).with_suffix(".md").read_text()
     return text.format(
-        weak=tables("weak", PROBLEMS), strong=tables("strong", STRONG, 2)
+        weak=tables("weak", PROBLEMS), strong=tables("strong", kept["strong"], 2)
     )
 
 
@@ -331,7 +333,8 @@ def _in_order(problem: Problem, want, rows: dict) -> dict:
     terms = problem.terms(problem.noises)
     found = ds.suggest_solver(terms, 0.0, problem.y0, want=want)
     names = [solver_name(suggestion.solver) for suggestion in found]
-    return {name: rows[name] for name in [*names, *(rows.keys() - {*names})]}
+    others = [name for name in rows if name not in names]
+    return {name: rows[name] for name in [*names, *others]}
 
 
 def draw(kept: dict) -> None:
@@ -343,7 +346,7 @@ def draw(kept: dict) -> None:
 
     figure, axes = plt.subplots(5, 3, figsize=(8, 12), layout="constrained")
     every = sorted({solver for rows in kept["weak"].values() for solver in rows})
-    styles = {
+    styles: dict[str, Any] = {
         solver: dict(color=f"C{i % 10}", ls=("-", "--")[i // 10], marker=".")
         for i, solver in enumerate(every)
     }
@@ -356,12 +359,10 @@ def draw(kept: dict) -> None:
         ax.set_ylim(5e-11, 10)
         ax.set_xticks(budgets, map(str, budgets))
         ax.minorticks_off()
-    left = list(axes.flat[len(PROBLEMS) :])
-    for ax in left:
+    for ax in axes.flat[len(PROBLEMS) :]:
         ax.axis("off")
-    for solver in every:
-        left[0].plot([], [], label=solver, **styles[solver])
-    left[0].legend(loc="upper left", fontsize=8, ncols=2, frameon=False)
+    lines = [Line2D([], [], label=solver, **styles[solver]) for solver in every]
+    figure.legend(handles=lines, loc="lower right", fontsize=8, ncols=2, frameon=False)
     figure.supxlabel("time for one evaluation", fontsize=9)
     figure.supylabel("error", fontsize=9)
     figure.savefig(DOCS / "img" / "advice.png", dpi=100)

@@ -148,7 +148,8 @@ def _pilot(noise: Any, keys: PRNGKeyArray):
         paths = paths.moved(p, y, None, success)
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
-    paths = Paths.start(p, *jax.vmap(p.drawn)(keys), None)
+    y, args = jax.vmap(p.drawn)(keys)
+    paths = Paths.start(p, y, args, None)
     starts = jax.vmap(ravel)(paths.y)
     states = jnp.broadcast_to(starts, (last, *starts.shape))
     carry = paths, states

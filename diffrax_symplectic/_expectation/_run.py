@@ -15,14 +15,14 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .._arguments import whole_number
 from .._brownian import check_key, typed_key
 from .._compat import quickly_compiled
 from ._estimate import Expectation, ExpectationInterrupted
 from ._moments import joined, Moments, total
-from ._sampling import Plan
+from ._sampling import Plan, Samples
 
 
 # If a larger fraction of the paths fails, there is a warning.
@@ -169,7 +169,9 @@ class _Batches:
     def sampler_at(self, at: int) -> Callable:
         if self._paths_of is None:
             return self._sampler
-        return jtu.Partial(self._sampler, self._paths_of(at, self.size))
+        # Of a `Partial` of a `Partial` JAX would take the inner one for a function, arrays
+        # and all, and compile anew for each.
+        return jtu.Partial(_of_paths, self._sampler, self._paths_of(at, self.size))
 
     def started(self, at: int, most: int, sampler: Callable) -> tuple:
         """Starts one batch on each device, from sample `at` on and up to `most`."""
@@ -202,6 +204,10 @@ class _Batches:
         zeros = jtu.tree_map(lambda s: np.zeros(s.shape), shapes)
         dtypes = jtu.tree_map(lambda s: str(s.dtype), shapes)
         return Moments(at, at, 0, 0, zeros, zeros, zeros, zeros, dtypes)
+
+
+def _of_paths(sampler: Callable, paths: PyTree, keys: PRNGKeyArray) -> Samples:
+    return sampler(paths, keys)
 
 
 def _reached(estimate: Expectation, least: int, tol: float | None) -> bool:
