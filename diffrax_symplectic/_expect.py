@@ -13,10 +13,11 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 from ._custom_types import Args, RealScalarLike, Y
 from ._ensemble import fused_plan, FusedPaths, warn_of_stragglers
 from ._expectation import Expectation, ExpectationInterrupted
-from ._expectation._choose import choose, MOST
+from ._expectation._choose import choose, MOST, MUCH_LEFT, sorted_paths
 from ._expectation._problem import Problem
 from ._expectation._run import checked_call, Meter, NO_METER, run
 from ._expectation._sampling import AbstractSampling
+from ._expectation._value_functions import ValueFunctions
 
 
 # No sample's key is folded from this number.
@@ -104,10 +105,11 @@ def expectation(
         [`diffrax_symplectic.ArrayRQMC`][] or [`diffrax_symplectic.ValueFunctions`][].
         `None` chooses one, and the result's `reason` says why: `ValueFunctions` for a
         state of one or two components, if a step has at most 48 outcomes and all steps
-        together have at most 4,096; otherwise `ArrayRQMC` for up to four components, if
-        the increments can be computed from quasi-random points; and otherwise
-        `IndependentPaths`. Without `tol` these draw 4,096 paths, 16 replicates of 16,384
-        paths, and 131,072 paths, or fewer where all steps of all paths would exceed
+        together have at most 4,096, unless trials show that the fit leaves more than 1% of
+        the standard error, as for functions with kinks; otherwise `ArrayRQMC` for up to
+        four components, if the increments can be computed from quasi-random points; and
+        otherwise `IndependentPaths`. Without `tol` these draw 4,096 paths, 16 replicates of
+        16,384 paths, and 131,072 paths, or fewer where all steps of all paths would exceed
         $2^{28}$ numbers (from ten seconds to some minutes, by solver and system).
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
         default only `t1`.
@@ -161,17 +163,28 @@ def expectation(
         raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
     problem = Problem.of(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels)
     reason = ""
+    sorted_instead = None
     if sampling is None and start is not None:
         sampling = start.sampling
     elif sampling is None:
         sampling, reason = choose(problem, tol)
+        if isinstance(sampling, ValueFunctions):
+            sorted_instead = sorted_paths(problem, tol)
     sampling = _checked_sampling(sampling, start)
     with Meter(progress_meter) as meter:
         try:
             if engine == "drjit":
                 plan = fused_plan(problem, key, sampling, devices)
             else:
-                plan = sampling.prepare(problem, jr.fold_in(key, _NO_SAMPLE), devices)
+                own = jr.fold_in(key, _NO_SAMPLE)
+                plan = sampling.prepare(problem, own, devices)
+                if sorted_instead is not None and plan.left > MUCH_LEFT:
+                    reason = (
+                        "sorted paths, since fitted value functions leave "
+                        f"{plan.left:.1%} of the standard error"
+                    )
+                    sampling = sorted_instead
+                    plan = sampling.prepare(problem, own, devices)
         except ExpectationInterrupted:
             # Trial samples are not part of the estimate, and cannot be continued.
             raise KeyboardInterrupt from None

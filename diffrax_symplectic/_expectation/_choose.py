@@ -17,6 +17,10 @@ _FUNCTIONS, _OUTCOMES, _FEW_OUTCOMES, _SORTED = 2, 2**12, 48, 4
 # The number of samples without a tolerance, and the maximum with one.
 _PATHS_OF_FUNCTIONS, _PATHS, _REPLICATE, _REPLICATES = 2**12, 2**17, 2**14, 16
 MOST = 10**9
+# Where a fit leaves more than this of the standard error, paths are sorted instead. For an
+# indicator and a call option on the pendulum fits left 26% and 1.3%, and sorted paths had
+# error bars that were 23 and 8 times less.
+MUCH_LEFT = 0.01
 # Scrambling more random variables per step takes long.
 _MOST_WORDS = 2**8
 # Limit on the numbers in all steps of all paths (from ten seconds to some
@@ -38,11 +42,20 @@ def choose(problem: Problem, tol: float | None) -> tuple[AbstractSampling, str]:
         if steps * outcomes <= _OUTCOMES:
             sampling = ValueFunctions(None, MOST if tol else _PATHS_OF_FUNCTIONS)
             return sampling, f"value functions for {why}"
-    if d <= _SORTED and _can_be_sorted(problem):
-        fewer = max(_NUMBERS // (steps * d * _REPLICATES), _FEWEST)
-        size = min(2 ** (fewer.bit_length() - 1), _REPLICATE)
-        return ArrayRQMC(size, MOST if tol else _REPLICATES), f"sorted paths for {why}"
+    if (sampling := sorted_paths(problem, tol)) is not None:
+        return sampling, f"sorted paths for {why}"
     return IndependentPaths(MOST if tol else paths), f"independent paths for {why}"
+
+
+def sorted_paths(problem: Problem, tol: float | None) -> ArrayRQMC | None:
+    """Sorted paths, or `None` for many components and for paths that cannot be sorted."""
+    d = sum(x.size for x in jtu.tree_leaves(problem.y0))
+    steps = int(np.sum(problem.levels.num_steps))
+    if d > _SORTED or not _can_be_sorted(problem):
+        return None
+    fewer = max(_NUMBERS // (steps * d * _REPLICATES), _FEWEST)
+    size = min(2 ** (fewer.bit_length() - 1), _REPLICATE)
+    return ArrayRQMC(size, MOST if tol else _REPLICATES)
 
 
 def _can_be_sorted(problem: Problem) -> bool:

@@ -38,6 +38,8 @@ class Plan(NamedTuple):
     - `paths`: the number of paths in a sample, on each level.
     - `least`: the fewest samples whose variance is estimated well enough to stop.
     - `reason`: why this sampling was chosen, for the result.
+    - `left`: the largest fraction of a standard error that a control variate leaves of it,
+        by trials.
     - `shapes`: the shapes of the values of one sample, if they are known without a trace.
     - `quick`: whether the samples take less time than compiling their program, so that it
         is compiled for speed of compilation.
@@ -52,6 +54,7 @@ class Plan(NamedTuple):
     paths: int = 1
     least: int = 2
     reason: str = ""
+    left: float = 0.0
     shapes: PyTree | None = None
     quick: bool = False
     far: PyTree[np.ndarray] | None = None

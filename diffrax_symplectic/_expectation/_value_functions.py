@@ -140,7 +140,15 @@ class ValueFunctions(AbstractSampling):
         among = ", ".join(map(str, np.unique(names)))
         reason = f"{basis.kind}: {chosen}, chosen among {among}"
         final = plan(best, used, self.num_paths, usual)
-        return final._replace(reason=reason, far=far)
+        left = np.max(_ratios(np.min(errors, axis=0), plain), initial=0.0)
+        return final._replace(reason=reason, far=far, left=float(left))
+
+
+def _ratios(errors: np.ndarray, plain: np.ndarray) -> np.ndarray:
+    """Standard errors with control, as fractions of those without it, at most one."""
+    random = plain > 0
+    ratios = np.minimum(errors, plain) / np.where(random, plain, 1)
+    return np.where(random, ratios, 0)
 
 
 def value_function(problem: Problem, key: PRNGKeyArray) -> Functions | None:

@@ -441,3 +441,15 @@ def test_a_fit_whose_steps_are_too_long_for_sweeps_is_made_by_newtons_method():
     got = _estimate(ds.ValueFunctions(degree=2), KUBO, MIDPOINT, t1=16.0, dt0=8.0)
     assert got.num_failed == 0
     assert got.std_error <= 1e-12
+
+
+@pytest.mark.slow
+def test_the_default_sorts_paths_where_a_fit_leaves_much():
+    indicator = lambda t, y, args: jnp.where(y[1] > 0.6, 1.0, 0.0)
+    got = _estimate(None, phi=indicator)
+    fitted = _estimate(ds.ValueFunctions(), phi=indicator)
+    assert isinstance(got.sampling, ds.ArrayRQMC)
+    assert "leave" in got.reason
+    assert got.std_error < fitted.std_error / 5
+    # A smooth function keeps its fit.
+    assert isinstance(_estimate(None).sampling, ds.ValueFunctions)
