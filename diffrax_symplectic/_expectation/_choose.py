@@ -17,6 +17,8 @@ _FUNCTIONS, _OUTCOMES, _FEW_OUTCOMES, _SORTED = 2, 2**12, 48, 4
 # The number of samples without a tolerance, and the maximum with one.
 _PATHS_OF_FUNCTIONS, _PATHS, _REPLICATE, _REPLICATES = 2**12, 2**17, 2**14, 16
 MOST = 10**9
+# The sizes of a trial.
+_FEW_SORTED, _FEW_REPLICATES, _FEW_PATHS = 2**12, 8, 2**14
 # Scrambling more random variables per step takes long.
 _MOST_WORDS = 2**8
 # Limit on the numbers in all steps of all paths (from ten seconds to some
@@ -43,6 +45,14 @@ def choose(problem: Problem, tol: float | None) -> tuple[AbstractSampling, str]:
         size = min(2 ** (fewer.bit_length() - 1), _REPLICATE)
         return ArrayRQMC(size, MOST if tol else _REPLICATES), f"sorted paths for {why}"
     return IndependentPaths(MOST if tol else paths), f"independent paths for {why}"
+
+
+def few_paths(problem: Problem) -> AbstractSampling:
+    """The most accurate sampling of a few seconds that takes Gaussian increments, too."""
+    d = sum(x.size for x in jtu.tree_leaves(problem.y0))
+    if d <= _SORTED and _can_be_sorted(problem):
+        return ArrayRQMC(_FEW_SORTED, _FEW_REPLICATES)
+    return IndependentPaths(_FEW_PATHS)
 
 
 def _can_be_sorted(problem: Problem) -> bool:
