@@ -105,7 +105,7 @@ def ensemble(
         print(q.shape, q.std(), paths.num_failed)
         ```
 
-    Every path starts at `y0`. The random keys of path number $i$ depend on `key` and $i$
+    Every path starts at `y0`, or where `y0(key)` says. The random keys of path number $i$ depend on `key` and $i$
     only, not on `num_paths`, `batch_size` or `engine`. `ensemble(...).terms(i)` returns
     terms with these keys, for `diffrax.diffeqsolve`. Paths are simulated in batches, so
     that only the returned arrays grow with their number.
