@@ -14,7 +14,7 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from ._brownian import Discrete, laws_of, UnspecifiedPath
 from ._custom_types import Args, RealScalarLike, Y
-from ._ensemble import fused_plan
+from ._ensemble import fused_plan, FusedPaths, warn_of_stragglers
 from ._expectation import Expectation, ExpectationInterrupted
 from ._expectation._choose import choose, few_paths, MOST
 from ._expectation._problem import Problem
@@ -207,6 +207,8 @@ def expectation(
             used = start.moments[-1].end - start.moments[0].begin
             plan = plan._replace(num_samples=used)
         estimate = run(plan, key, devices, sampling, start, first, tol, meter)
+    if isinstance(paths := plan.paths_of, FusedPaths):
+        warn_of_stragglers(paths.stragglers, paths.lost, paths.count, stacklevel=2)
     _warn_of_rounding(estimate, problem)
     if start is None and first == 0 and problem.has_kinks:
         _warn_of_law(estimate, problem, jr.fold_in(key, _NO_SAMPLE), devices)

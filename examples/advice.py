@@ -323,7 +323,7 @@ def page(kept: dict) -> str:
 
     text = Path(__file__).with_suffix(".md").read_text()
     return text.format(
-        weak=tables("weak", PROBLEMS), strong=tables("strong", STRONG, 2)
+        weak=tables("weak", PROBLEMS), strong=tables("strong", kept["strong"], 2)
     )
 
 
@@ -331,7 +331,8 @@ def _in_order(problem: Problem, want, rows: dict) -> dict:
     terms = problem.terms(problem.noises)
     found = ds.suggest_solver(terms, 0.0, problem.y0, want=want)
     names = [solver_name(suggestion.solver) for suggestion in found]
-    return {name: rows[name] for name in [*names, *(rows.keys() - {*names})]}
+    others = [name for name in rows if name not in names]
+    return {name: rows[name] for name in [*names, *others]}
 
 
 def draw(kept: dict) -> None:
@@ -356,12 +357,10 @@ def draw(kept: dict) -> None:
         ax.set_ylim(5e-11, 10)
         ax.set_xticks(budgets, map(str, budgets))
         ax.minorticks_off()
-    left = list(axes.flat[len(PROBLEMS) :])
-    for ax in left:
+    for ax in axes.flat[len(PROBLEMS) :]:
         ax.axis("off")
-    for solver in every:
-        left[0].plot([], [], label=solver, **styles[solver])
-    left[0].legend(loc="upper left", fontsize=8, ncols=2, frameon=False)
+    lines = [plt.Line2D([], [], label=solver, **styles[solver]) for solver in every]
+    figure.legend(handles=lines, loc="lower right", fontsize=8, ncols=2, frameon=False)
     figure.supxlabel("time for one evaluation", fontsize=9)
     figure.supylabel("error", fontsize=9)
     figure.savefig(DOCS / "img" / "advice.png", dpi=100)

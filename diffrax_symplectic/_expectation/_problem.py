@@ -204,6 +204,18 @@ class Problem(eqx.Module):
         x = jnp.stack(kinds)
         return self.unravel(x[:, :, 0] if self.at_end else jnp.swapaxes(x, 2, 3))
 
+    def shapes_of_samples(self, kinds: int) -> PyTree[jax.ShapeDtypeStruct]:
+        """The shapes of the `values` of one sample, with this number of kinds."""
+        (times, m), dtype = self.num_outputs, self.dtype_of_values
+        zeros = np.zeros((len(self.weights), times, 1, m), dtype)
+        averaged = jax.eval_shape(lambda: self.averaged([zeros] * kinds))
+        one = lambda s: jax.ShapeDtypeStruct((*s.shape[:2], *s.shape[3:]), s.dtype)
+        return jtu.tree_map(one, averaged)
+
+    @property
+    def dtype_of_values(self) -> Any:
+        return jax.eval_shape(lambda: self.values(self.t0, self.y0)).dtype
+
     @property
     def dtype(self) -> Any:
         return jnp.result_type(*jtu.tree_leaves(self.y0))

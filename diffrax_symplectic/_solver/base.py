@@ -87,12 +87,10 @@ class Record(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """When to choose it, and what noise does to modes that a step does not resolve."""
-        if self.heats is None:
+        """When to choose it, and where noise gives stiff modes the wrong energy."""
+        if self.heats is not False:
             return self.choose
-        if self.heats:
-            stiff = "For stiff modes with friction wrap it in `Damped`."
-        elif "pp" in self.stationary:
+        if "pp" in self.stationary:
             stiff = "Right for noise on stiff modes only in a heat bath."
         else:
             stiff = "Not for noise on stiff modes."

@@ -63,14 +63,14 @@ def _cell(pair) -> str:
 
 def section(page: Page) -> str:
     cases = {name: CASES[name] for name in (QUICK if page.quick else CASES)}
-    fine = np.geomspace(0.1, 20, 12 if page.quick else 120)
-    figure, axes = plt.subplots(1, 2, figsize=(9, 4), sharey=True, layout="constrained")
+    fine = np.geomspace(0.1, 20, 12 if page.quick else 60)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 5), sharey=True, layout="constrained")
     rows = []
     print("\nNoise on stiff modes: <p^2> / T, omega^2 <q^2> / T")
     for number, (name, solver) in enumerate(cases.items()):
         found = energies(solver, np.concatenate([SHOWN, fine]))
         rows.append((f"`{name}`", *map(_cell, found[: len(SHOWN)])))
-        style = dict(color=f"C{number}", ls=("-", "--")[number % 2], lw=1.5)
+        style = dict(color=f"C{number % 10}", ls=("-", "--")[number // 10], lw=1.5)
         for ax, values in zip(axes, found[len(SHOWN) :].T):
             shown = np.where(np.isfinite(values), values, np.nan)
             ax.loglog(fine, shown, label=name, **style)
@@ -78,7 +78,8 @@ def section(page: Page) -> str:
     for ax, title in zip(axes, titles):
         ax.axhline(1, color="k", lw=0.5, ls=":")
         ax.set(xlabel=r"$h\omega$", title=title, ylim=(0.02, 10))
-    axes[0].legend(fontsize=8, loc="lower left")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=8, ncols=4, loc="outside lower center")
     heads = ["solver", *(f"$h \\omega = {x:g}$" for x in SHOWN)]
     energy_table = table(heads, rows)
     picture = page.picture(figure, "baths", "Energies of a mode in a heat bath")
