@@ -184,7 +184,8 @@ def expectation(
     has_shape = any(isinstance(x, UnspecifiedPath) for x in brownian_paths(terms))
     # Value functions need discrete increments.
     free = has_shape and not isinstance(sampling, ValueFunctions)
-    if free and problem.has_kinks:
+    has_kinks = problem.has_kinks
+    if free and has_kinks:
         problem = Problem.of(*given, want="strong")
         reason = "Gaussian increments, since phi may not be smooth"
     if sampling is None:
@@ -210,7 +211,7 @@ def expectation(
     if isinstance(paths := plan.paths_of, FusedPaths):
         warn_of_stragglers(paths.stragglers, paths.lost, paths.count, stacklevel=2)
     _warn_of_rounding(estimate, problem)
-    if start is None and first == 0 and problem.has_kinks:
+    if start is None and first == 0 and has_kinks:
         _warn_of_law(estimate, problem, jr.fold_in(key, _NO_SAMPLE), devices)
     return estimate
 

@@ -81,5 +81,7 @@ def test_a_table_of_the_paths_own_numbers_is_refused_with_operation_and_line():
         energy(potential), lambda t, p, q, args: q, ds.WeakBrownianPath((), jr.key(0))
     )
     given = terms, ds.StormerVerlet(), 0, 1, 0.1, (0.0, 1.0)
-    with pytest.raises(ValueError, match="index per path, among 100.*which `potential`"):
+    with pytest.raises(
+        ValueError, match="index per path, among 100.*which `potential`"
+    ):
         ds.ensemble(*given, key=jr.key(0), num_paths=10, engine="drjit")
