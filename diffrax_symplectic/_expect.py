@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from ._custom_types import Args, RealScalarLike, Y
-from ._ensemble import fused_plan
+from ._ensemble import fused_plan, FusedPaths, warn_of_stragglers
 from ._expectation import Expectation, ExpectationInterrupted
 from ._expectation._choose import choose, MOST
 from ._expectation._problem import Problem
@@ -183,6 +183,8 @@ def expectation(
             used = start.moments[-1].end - start.moments[0].begin
             plan = plan._replace(num_samples=used)
         estimate = run(plan, key, devices, sampling, start, first, tol, meter)
+    if isinstance(paths := plan.paths_of, FusedPaths):
+        warn_of_stragglers(paths.stragglers, paths.lost, paths.count, stacklevel=2)
     _warn_of_rounding(estimate, problem)
     return estimate
 

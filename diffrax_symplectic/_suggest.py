@@ -142,9 +142,10 @@ def suggest_solver(
 
     Whether $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, and whether the noise is additive
     or constant, is determined by tracing, as in the solvers. Whether noises commute is
-    tested at random states, which is not a proof. Nothing is solved. Stiffness cannot be
-    detected from the terms: if the first suggestion is explicit and needs too many steps,
-    use the next implicit one.
+    tested at random states, which is not a proof. For
+    [`diffrax_symplectic.langevin_terms`][] solvers with a step of their own for friction
+    come first. Nothing is solved. Stiffness cannot be detected from the terms: if the first
+    suggestion is explicit and needs too many steps, use the next implicit one.
 
     **Arguments:**
 

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import optimistix as optx
+from matplotlib.lines import Line2D
 from scipy.linalg import expm
 
 import diffrax_symplectic as ds

@@ -298,6 +298,18 @@ def test_solvers_of_lineax_compute_without_linear_solve():
         assert jnp.allclose(x, jnp.array([1.5, 1.0]), atol=1e-5)
 
 
+def test_a_program_may_have_compiler_options_unless_it_is_inside_of_another():
+    double = _compat.quickly_compiled(lambda x: 2 * x)
+    x = jnp.ones(())
+    assert double(x) == 2
+    assert jax.jit(double)(x) == 2
+
+    def captured(x):
+        return _compat.quickly_compiled(lambda y: x * y)(2.0)
+
+    assert jax.grad(captured)(x) == 2
+
+
 def test_traced_programs_tell_literals_and_what_they_call():
     jaxpr = jax.make_jaxpr(lambda x: jax.jit(lambda x: 2.0 * x)(x))(1.0).jaxpr
     assert isinstance(jaxpr, _compat.Jaxpr)

@@ -1,2 +1,3 @@
 from ._call import Ensemble, ensemble
-from ._means import fused_plan
+from ._engines import warn_of_stragglers
+from ._means import fused_plan, FusedPaths

@@ -43,6 +43,8 @@ def array_types() -> dict[str, Any]:
         raise ImportError(_LLVM if on_cpu else _CUDA)
     types = importlib.import_module("drjit.llvm" if on_cpu else "drjit.cuda")
     return {
+        "complex<f32>": types.Complex2f,
+        "complex<f64>": types.Complex2f64,
         "f32": types.Float,
         "f64": types.Float64,
         "i1": types.Bool,

@@ -17,7 +17,7 @@ from .._expectation._monte_carlo import path_keys, with_keys
 from .._expectation._problem import Problem
 from .._expectation._run import checked_call
 from .._solver import Want
-from ._engines import Batch, ENGINES, state_itself
+from ._engines import Batch, ENGINES, state_itself, warn_of_stragglers
 from ._layout import sample_key
 
 
@@ -25,8 +25,6 @@ from ._layout import sample_key
 _NUMBERS = {"jax": 2**17, "drjit": 2**20}
 # Accelerators need more.
 _MORE = 16
-# Beyond this share, stragglers take most of the time.
-_MANY = 0.05
 
 
 class Ensemble(eqx.Module):
@@ -139,9 +137,9 @@ def ensemble(
 
     **Raises:** what [`diffrax_symplectic.expectation`][] raises, and a `ValueError` if
     `engine` or `want` is unknown. With `engine="drjit"`: a `ValueError` if the system uses
-    an operation that cannot be replayed or its state has more than 256 entries, and an
-    `ImportError` if Dr.Jit or LLVM is missing. Warns if paths failed, and if many are
-    stragglers.
+    an operation that cannot be replayed, its state has more than 256 entries, or a
+    `PicardNewton` has another tolerance than rounding error, and an `ImportError` if Dr.Jit
+    or LLVM is missing. Warns if paths failed, and if many are stragglers.
     """
     given = terms, t0, t1, dt0, y0, args
     key, _, _ = checked_call("ensemble", key, None, None, 0, None, given)
@@ -168,7 +166,7 @@ def ensemble(
     joined = _joined(batches, num_paths, at_end=ts is None)
     saved = np.asarray(problem.levels.saved_steps[0])
     at = float(problem.t0) + saved * float(problem.levels.h[0])
-    _warn_of(joined, engine)
+    _warn_of(joined)
     return Ensemble(at, *joined, engine, problem, key)
 
 
@@ -190,7 +188,7 @@ def _joined(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
     return Batch(y, failed, sum(b.stragglers for b in batches))
 
 
-def _warn_of(joined: Batch, engine: str) -> None:
+def _warn_of(joined: Batch) -> None:
     count, lost = len(joined.failed), int(np.sum(joined.failed))
     if lost > 0:
         warnings.warn(
@@ -200,10 +198,4 @@ def _warn_of(joined: Batch, engine: str) -> None:
             "Hamiltonians.",
             stacklevel=3,
         )
-    if joined.stragglers - lost > _MANY * count:
-        warnings.warn(
-            f"{joined.stragglers:,} of {count:,} paths had steps that the fused kernel did "
-            "not solve, and were simulated again by JAX. Take smaller steps, or "
-            '`engine="jax"`.',
-            stacklevel=3,
-        )
+    warn_of_stragglers(joined.stragglers, lost, count, stacklevel=3)

@@ -3,6 +3,7 @@ that all samples share, and consecutive sample numbers."""
 
 import functools as ft
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,21 @@ from .._expectation._steps import independent_steps, simulate
 from ._kernels import Kernels
 from ._layout import sample_key, split
 from ._operation import NotReplayed
+
+
+# Beyond this share, stragglers take most of the time.
+_MANY = 0.05
+
+
+def warn_of_stragglers(stragglers: int, lost: int, count: int, stacklevel: int) -> None:
+    """Warns if JAX simulated many of `count` paths again, of which `lost` failed."""
+    if stragglers - lost > _MANY * count:
+        warnings.warn(
+            f"{stragglers:,} of {count:,} paths had steps that the fused kernel did not "
+            "solve, and were simulated again by JAX. Take smaller steps, or "
+            '`engine="jax"`.',
+            stacklevel=stacklevel + 1,
+        )
 
 
 class Batch(NamedTuple):

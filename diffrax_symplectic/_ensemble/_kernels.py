@@ -2,9 +2,10 @@
 layout, and reads step sizes, times, parameters and numbers of steps."""
 
 import functools as ft
+import itertools
 import math
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 from ._backend import array_types, drjit
 from ._layout import Layout
 from ._replay import Replay
-from ._tensor import flat, scalar, Tensor, unflat
+from ._tensor import flat, MOST_IN_REGISTERS, scalar, Table, Tensor, unflat
 
 
 # Kernels of larger systems take long to compile.
@@ -36,6 +37,12 @@ class Program:
         types = iter(self.replay.arguments)
         self.types = [[next(types) for _ in jtu.tree_leaves(x)] for x in args]
 
+    def constants(self) -> list[Any]:
+        """The large constants, in memory."""
+        pairs = self.replay.constants.items()
+        of = lambda x: str(x.type.element_type)
+        return [in_memory(of(x), values.ravel()) for x, values in pairs]
+
     def entries(self, argument: int) -> list[str]:
         """The types of all entries of an argument."""
         return [t for shape, t in self.types[argument] for _ in range(math.prod(shape))]
@@ -44,24 +51,36 @@ class Program:
         return unflat(entries, [shape for shape, _ in self.types[argument]])
 
 
-def _packed(types: list[str], arrays: Iterable[Array]) -> dict[str, Any]:
+# The shape of an array and the type of its entries.
+Struct: TypeAlias = tuple[tuple[int, ...], str]
+
+
+def _packed(structs: list[Struct], arrays: Iterable[Array]) -> dict[str, Any]:
     """All entries, in one array for each type."""
-    of_type: dict[str, list] = {t: [] for t in types}
-    numbers = [x for a in arrays for x in _numbers(a).flat]
-    for t, x in zip(types, numbers, strict=True):
-        of_type[t].append(x)
-    # As lists, which are copied: memory of NumPy could be freed while Dr.Jit records.
-    return {t: array_types()[t]([v.item() for v in x]) for t, x in of_type.items()}
+    of_type: dict[str, list[np.ndarray]] = {t: [] for _, t in structs}
+    for (_, t), x in zip(structs, arrays, strict=True):
+        of_type[t].append(_numbers(x).ravel())
+    return {t: in_memory(t, np.concatenate(xs)) for t, xs in of_type.items()}
 
 
-def _unpacked(types: list[str], packed: dict[str, Any]) -> list[Any]:
+def in_memory(of: str, values: np.ndarray) -> Any:
+    """An array of Dr.Jit with these values."""
+    kind = array_types()[of]
+    if np.iscomplexobj(values):
+        part = of.removeprefix("complex<").removesuffix(">")
+        return kind(in_memory(part, np.real(values)), in_memory(part, np.imag(values)))
+    # As a list, which is copied: memory of NumPy could be freed while Dr.Jit records.
+    return kind(values.tolist())
+
+
+def _unpacked(structs: list[Struct], packed: dict[str, Any]) -> Iterator[Tensor]:
     """The inverse of `_packed`, within a kernel."""
-    dr, count, out = drjit(), dict.fromkeys(packed, 0), []
-    for t in types:
-        place = array_types()["ui32"](count[t])
-        out.append(dr.gather(array_types()[t], packed[t], place))
-        count[t] += 1
-    return out
+    begin = dict.fromkeys(packed, 0)
+    for shape, t in structs:
+        size = math.prod(shape)
+        table = Table(packed[t], begin[t] + np.arange(size))
+        begin[t] += size
+        yield Tensor(table if size > MOST_IN_REGISTERS else [*table], shape)
 
 
 def _numbers(x: Array) -> np.ndarray:
@@ -127,6 +146,7 @@ class Kernels:
         self._moves = [
             layout.paths_differ or i != begin + k for k, i in enumerate(handed_on)
         ]
+        self._constants = self._step.constants()
         freeze = ft.partial(drjit().freeze, warn_after=_RECORDINGS)
         self._make_keys = freeze(self._record_keys)
         self._take_steps = freeze(self._record_steps)
@@ -145,7 +165,7 @@ class Kernels:
         steps of size `h`. If paths differ, `y0` and their own `args` have a leading axis of
         paths."""
         dr, kinds = drjit(), array_types()
-        types = self._keys.entries(0) + self._keys.entries(1)
+        types = [*self._keys.types[0], *self._keys.types[1]]
         numbers = dr.arange(kinds["ui64"], n) + first
         hi, lo = kinds["ui32"](numbers >> 32), kinds["ui32"](numbers)
         dr.eval(hi, lo)
@@ -158,15 +178,15 @@ class Kernels:
         def for_all(types: list[str], leaves) -> list[Any]:
             if self._paths_differ:
                 rows = [x for a in leaves for x in _numbers(a).reshape(n, -1).T]
-                # As lists, which are copied: see `_packed`.
-                return [kinds[t](x.tolist()) for t, x in zip(types, rows, strict=True)]
+                return [in_memory(t, x) for t, x in zip(types, rows, strict=True)]
             values = [x for leaf in leaves for x in _numbers(leaf).flat]
             return [dr.opaque(kinds[t], x.item(), n) for t, x in zip(types, values)]
 
         moving = [x for x, moves in zip(memory, self._moves) if moves]
         keys += for_all(self._step.entries(1)[len(keys) :], own)
         y, memory = for_all(self._step.entries(4), y), for_all(self._moving, moving)
-        return Paths(keys, y, memory, dr.opaque(kinds["i1"], False, n)), parameters
+        paths = Paths(keys, y, memory, dr.opaque(kinds["i1"], False, n))
+        return paths, (parameters, self._constants)
 
     def advance(self, paths: Paths, parameters, begin: int, end: int) -> Paths:
         """The paths after the steps `begin` to `end - 1`."""
@@ -177,42 +197,39 @@ class Kernels:
         return Paths(paths.keys, y, memory, stopped)
 
     @property
-    def _uniform(self) -> list[str]:
-        fixed = self._types_of_memory(False)
-        return [*self._step.entries(0), *self._step.entries(2), *fixed]
+    def _uniform(self) -> list[Struct]:
+        return [*self._step.types[0], *self._step.types[2], *self._memory(False)]
 
     @property
     def _moving(self) -> list[str]:
-        return self._types_of_memory(True)
+        return [t for s, t in self._memory(True) for _ in range(math.prod(s))]
 
-    def _types_of_memory(self, moves: bool) -> list[str]:
-        pairs = zip(self._step.types[5], self._moves)
-        return [t for (s, t), m in pairs if m == moves for _ in range(math.prod(s))]
+    def _memory(self, moves: bool) -> list[Struct]:
+        return [x for x, m in zip(self._step.types[5], self._moves) if m == moves]
 
     def _record_keys(self, packed, hi, lo) -> list[Any]:
         program = self._keys
-        types = program.entries(0) + program.entries(1)
-        entries = iter(_unpacked(types, packed))
-        args = [*program.tensors(0, entries), *program.tensors(1, entries)]
+        args = _unpacked([*program.types[0], *program.types[1]], packed)
         out, _ = program.replay(*args, scalar(hi), scalar(lo))
         return [*flat(out)]
 
-    def _record_steps(self, packed, begin, end, keys, y, memory, stopped):
+    def _record_steps(self, parameters, begin, end, keys, y, memory, stopped):
         dr, step = drjit(), self._step
-        entries = iter(_unpacked(self._uniform, packed))
-        arrays, h = step.tensors(0, entries), step.tensors(2, entries)
-        shapes = lambda moves: [
-            s for (s, _), m in zip(step.types[5], self._moves) if m == moves
-        ]
-        fixed = unflat(entries, shapes(False))
+        packed, constants = parameters
+        tensors = _unpacked(self._uniform, packed)
+        arrays = [*itertools.islice(tensors, len(step.types[0]))]
+        h = [next(tensors)]
+        fixed = [*tensors]
+        shapes = [shape for shape, _ in self._memory(True)]
         uniform = [*arrays, *step.tensors(1, iter(keys)), *h]
 
         def once(i, stopped, *numbers):
             left = iter(numbers)
-            y, moving = step.tensors(4, left), iter(unflat(left, shapes(True)))
+            y, moving = step.tensors(4, left), iter(unflat(left, shapes))
             still = iter(fixed)
             memory = [next(moving if m else still) for m in self._moves]
-            out, errors = step.replay(*uniform, scalar(i), *y, *memory)
+            args = [*uniform, scalar(i), *y, *memory]
+            out, errors = step.replay(*args, memory=constants)
             *out, success = out
             for lost in (~success.item(), *errors):
                 stopped = stopped | lost

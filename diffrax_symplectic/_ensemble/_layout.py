@@ -39,7 +39,7 @@ class Layout(NamedTuple):
     def key(self) -> Any:
         return jax.eval_shape(lambda: jr.key(0, impl=self.impl))
 
-    def problem(self, arrays: Sequence[Array]) -> Problem:
+    def problem(self, arrays: Sequence[Any]) -> Problem:
         left = iter(arrays)
         pairs = zip(self.static, self.structs)
         leaves = [x if s is None else next(left) for x, s in pairs]
@@ -100,14 +100,14 @@ def split(problem: Problem, key: PRNGKeyArray) -> tuple[Layout, list[Array]]:
     leaves, treedef = jtu.tree_flatten(bare)
     arrays = [jnp.asarray(x) if is_array(x) else None for x in leaves]
     static = tuple(None if is_array(x) else x for x in leaves)
-    struct = lambda x: None if x is None else jax.ShapeDtypeStruct(x.shape, x.dtype)
+    struct = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype)
     settings = jax.default_backend(), jax.config.read("jax_enable_x64")
     impl = str(jr.key_impl(key))
     own = None if problem.args_of is None else eqx.filter(problem.args, eqx.is_array)
     layout = Layout(
         treedef,
         static,
-        tuple(map(struct, arrays)),
+        tuple(None if x is None else struct(x) for x in arrays),
         impl,
         tuple(map(struct, jtu.tree_leaves(own))),
         problem.paths_differ,

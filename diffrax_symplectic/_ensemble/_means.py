@@ -1,7 +1,6 @@
 """Samples of `expectation` from a fused kernel."""
 
 import dataclasses
-import functools as ft
 from typing import Any
 
 import jax
@@ -36,23 +35,39 @@ def fused_plan(
             f'`engine="drjit"` uses all cores, or one GPU; got {len(devices)} devices. '
             "Pass `devices=jax.devices()[:1]`."
         )
-    states = dataclasses.replace(problem, phi=state_itself, at_end=False)
+    plan = sampling.plan(jtu.Partial(_samples, problem), devices)
+    if sampling.batch_size is None:
+        plan = plan._replace(batch_size=_BATCH)
+    return plan._replace(paths_of=FusedPaths(problem, key))
 
-    # `expectation` asks for the first batch twice.
-    @ft.lru_cache(maxsize=1)
-    def paths(first: int, n: int) -> tuple[PyTree[np.ndarray], np.ndarray]:
+
+class FusedPaths:
+    """The paths of a plan, from sample `first` on, and how many of all so far failed or
+    were handed back to JAX."""
+
+    def __init__(self, problem: Problem, key: PRNGKeyArray):
+        self._problem = dataclasses.replace(problem, phi=state_itself, at_end=False)
+        self._key = key
+        self._last = None
+        self.count = self.lost = self.stragglers = 0
+
+    def __call__(self, first: int, n: int) -> tuple[PyTree[np.ndarray], np.ndarray]:
+        # `expectation` asks for the first batch twice.
+        if self._last is None or self._last[0] != (first, n):
+            self._last = (first, n), self._batch(first, n)
+        return self._last[1]
+
+    def _batch(self, first: int, n: int) -> tuple[PyTree[np.ndarray], np.ndarray]:
         numbers = np.arange(first, first + n, dtype=np.uint64)
-        levels = range(len(problem.levels.h))
-        batches = [by_drjit(states, key, numbers, level) for level in levels]
+        levels = range(len(self._problem.levels.h))
+        batches = [by_drjit(self._problem, self._key, numbers, k) for k in levels]
+        self.count += n * len(batches)
+        self.lost += sum(int(np.sum(b.failed)) for b in batches)
+        self.stragglers += sum(b.stragglers for b in batches)
         stack = lambda *x: np.stack(x)
         return jtu.tree_map(stack, *[b.y for b in batches]), stack(
             *[b.failed for b in batches]
         )
-
-    plan = sampling.plan(jtu.Partial(_samples, problem), devices)
-    if sampling.batch_size is None:
-        plan = plan._replace(batch_size=_BATCH)
-    return plan._replace(paths_of=paths)
 
 
 def _samples(

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from ._backend import array_types, drjit
+from ._complex import equal, is_complex, values
+from ._elementwise import elementwise
 from ._operation import NotReplayed, Operation, rule
-from ._tensor import constant, each, flat, known, Tensor
+from ._tensor import constant, each, flat, known, Table, Tensor
 
 
 # Moves
@@ -18,9 +20,10 @@ from ._tensor import constant, each, flat, known, Tensor
 
 @rule
 def _constant(o):
-    return [
-        constant(o.kind, np.broadcast_to(np.asarray(o.op.attributes["value"]), o.shape))
-    ]
+    if is_complex(o.kind):
+        return [constant(o.kind, values(o.op, o.shape))]
+    numbers = np.asarray(o.op.attributes["value"])
+    return [constant(o.kind, np.broadcast_to(numbers, o.shape))]
 
 
 @rule
@@ -109,7 +112,10 @@ def _windows(
         first, last = [(0, s <= 0)], [(most, s >= most)]
         axes.append([*first, *[(k, s == k) for k in range(1, most)], *last])
     if (number := math.prod(map(len, axes))) > _MOST_PLACES:
-        what = f"`{o.op.name}` with an index per path, among {number} places"
+        what = (
+            f"`{o.op.name}` with an index per path, among {number} places (arrays that "
+            "are computed before the solve may be larger)"
+        )
         raise NotReplayed(o.op, what)
     for choice in itertools.product(*axes):
         here = True
@@ -125,11 +131,41 @@ def _in_lanes(here: Any, new: Tensor, old: Tensor | None) -> Tensor:
 
 
 def _window(o: Operation, x: Tensor, starts, sizes) -> Tensor:
+    if isinstance(x.entries, Table) and any(known(s) is None for s in starts):
+        return _from_table(o, x, x.entries, starts, sizes)
     out = None
     for window, here in _windows(o, x, starts, sizes):
         out = _in_lanes(here, x.take(x.places[window]), out)
     assert out is not None
     return out
+
+
+def _from_table(o: Operation, x: Tensor, table: Table, starts, sizes) -> Tensor:
+    """A window of an array in memory, at each path's own place."""
+    places = table.places.reshape(x.shape)
+    corner = places.flat[0]
+    steps = [
+        int(places.take(1, d).flat[0] - corner) if n > 1 else 0
+        for d, n in enumerate(x.shape)
+    ]
+    regular = corner + sum(
+        step * k for step, k in zip(steps, np.indices(x.shape, sparse=True))
+    )
+    if not np.array_equal(np.broadcast_to(regular, x.shape), places):
+        what = f"`{o.op.name}` with an index per path, from an array in another order"
+        raise NotReplayed(o.op, what)
+    number = array_types()["i32"]
+    begin = number(int(corner))
+    for start, step, n, size in zip(starts, steps, x.shape, sizes):
+        s = start.item()
+        most = type(s)(n - size)
+        begin = begin + number(elementwise()["clamp"](type(s)(0), s, most)) * step
+    inside = sum(step * k for step, k in zip(steps, np.indices(sizes, sparse=True)))
+    offsets = np.broadcast_to(inside, sizes)
+    index = array_types()["ui32"]
+    return Tensor(
+        [table.gathered(index(begin + int(k))) for k in offsets.flat], tuple(sizes)
+    )
 
 
 @rule
@@ -256,6 +292,9 @@ def _compare(o, a, b):
     name = o.word("comparison_direction").lower()
     if "compare_type" in o.op.attributes and o.word("compare_type") == "TOTALORDER":
         a, b = each(_in_total_order, a), each(_in_total_order, b)
+    if is_complex(a.entries[0]):
+        same = each(equal, a, b)
+        return [same if name == "eq" else each(operator.invert, same)]
     if name == "ne":
         # NaN differs from everything, but not in Dr.Jit.
         return [each(lambda a, b: ~(a == b), a, b)]
@@ -274,6 +313,17 @@ def _in_total_order(a: Any) -> Any:
 # Combinations
 
 
+def _multiplied_and_added(a: Any, b: Any, c: Any) -> Any:
+    """`a b + c`, in one operation if it can be."""
+    real = drjit().is_float_v(c) and not is_complex(c)
+    return drjit().fma(a, b, c) if real else a * b + c
+
+
+@rule
+def _complex(o, real, imag):
+    return [each(o.kind, real, imag)]
+
+
 @rule
 def _dot_general(o, a, b):
     part = lambda side, kind: o.part(
@@ -290,8 +340,10 @@ def _dot_general(o, a, b):
     left, right = matrices(a, "lhs"), matrices(b, "rhs")
     out = []
     for k, i, j in np.ndindex(len(left), left.shape[1], right.shape[1]):
-        terms = [a.entries[m] * b.entries[n] for m, n in zip(left[k, i], right[k, j])]
-        out.append(sum(terms[1:], terms[0]) if terms else o.kind(0))
+        total = o.kind(0)
+        for m, n in zip(left[k, i], right[k, j]):
+            total = _multiplied_and_added(a.entries[m], b.entries[n], total)
+        out.append(total)
     return [Tensor(out, o.shape)]
 
 
@@ -325,3 +377,31 @@ def _changes_nothing(o, starts) -> bool:
         "and": True,
     }
     return len(starts) == 1 and value is not None and neutral.get(name) == value
+
+
+@rule
+def _reduce_window(o, *xs):
+    """Cumulative sums, and other reductions of windows."""
+    n = len(xs) // 2
+    if any(size > 1 for size in o.optional("base_dilations")):
+        raise NotReplayed(o.op, f"`{o.op.name}` of entries that are apart")
+    shape = xs[0].shape
+    rank = len(shape)
+    ones = [1] * rank
+    sizes = o.ints("window_dimensions")
+    strides = o.optional("window_strides") or ones
+    apart = o.optional("window_dilations") or ones
+    padding = o.op.attributes["padding"] if "padding" in o.op.attributes else [0] * rank
+    low = np.asarray(padding).reshape(rank, -1)[:, 0]
+    outs = [[] for _ in range(n)]
+    for place in np.ndindex(*o.shape):
+        total = [*xs[n:]]
+        for offset in np.ndindex(*sizes):
+            at = np.array(place) * strides + np.array(offset) * apart - low
+            if np.all((at >= 0) & (at < shape)):
+                i = xs[0].places[tuple(at)]
+                part = [Tensor([x.entries[i]], ()) for x in xs[:n]]
+                total = o.run(0, [*total, *part])
+        for out, t in zip(outs, total):
+            out.append(t.item())
+    return [Tensor(out, o.shape) for out in outs]

@@ -41,6 +41,9 @@ class Operation(NamedTuple):
     def ints(self, name: str) -> list[int]:
         return [int(i) for i in self.op.attributes[name]]
 
+    def optional(self, name: str) -> list[int]:
+        return self.ints(name) if name in self.op.attributes else []
+
     def number(self, name: str) -> int:
         return self.op.attributes[name].value
 
@@ -52,7 +55,7 @@ class Operation(NamedTuple):
         return [tuple(x.type.shape) for x in self.op.results]
 
     def recorded(self, fn: Callable, *args: Any, **kwargs: Any) -> tuple:
-        """What a loop or conditional returns, which Dr.Jit records with `fn`."""
+        """The entries that a loop or conditional returns, recorded with `fn`."""
         number = len(self.errors)
         out = fn(*args, mode="symbolic", **kwargs)
         if len(self.errors) > number:

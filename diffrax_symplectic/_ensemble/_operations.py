@@ -2,18 +2,28 @@
 `_elementwise`; any other is a function with the decorator `rule`."""
 
 from . import _control_flow, _linear_algebra, _moves  # noqa: F401 (they fill the table)
+from ._complex import complex_functions, is_complex
 from ._elementwise import elementwise
-from ._operation import Rule, RULES
-from ._tensor import each
+from ._operation import NotReplayed, Operation, Rule, RULES
+from ._tensor import each, Tensor
 
 
 def rule_of(name: str) -> Rule | None:
     """The rule for an operation, by its name without the dialect."""
-    if fn := elementwise().get(name):
-        return lambda o, *xs: [each(fn, *xs)]
-    return RULES.get(name)
+    fn, of_complex = elementwise().get(name), complex_functions().get(name)
+    if fn is None and of_complex is None:
+        return RULES.get(name)
+
+    def entry_by_entry(o: Operation, *xs: Tensor) -> list[Tensor]:
+        pairs = any(is_complex(x.entries[0]) for x in xs if x.entries)
+        function = of_complex if pairs else fn
+        if function is None:
+            raise NotReplayed(o.op, f"`{o.op.name}` of complex numbers")
+        return [each(function, *xs)]
+
+    return entry_by_entry
 
 
 def names() -> set[str]:
     """All operations in the table."""
-    return {*elementwise(), *RULES}
+    return {*elementwise(), *complex_functions(), *RULES}

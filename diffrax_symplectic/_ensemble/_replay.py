@@ -1,11 +1,15 @@
 """Replays a program that JAX lowered for one path on arrays with many paths."""
 
+import math
 from collections import ChainMap
+from collections.abc import Iterator, Sequence
 from typing import Any
+
+import numpy as np
 
 from ._operation import NotReplayed, Operation
 from ._operations import rule_of
-from ._tensor import Tensor
+from ._tensor import MOST_IN_REGISTERS, Table, Tensor
 
 
 _RETURNS = ("func.return", "stablehlo.return")
@@ -21,6 +25,8 @@ class Replay:
             f for f in module.body.operations if f.operation.name == "func.func"
         ]
         self._functions = {f.attributes["sym_name"].value: f for f in functions}
+        # Large constants, by their variables. Callers keep them in memory.
+        self.constants = _large_constants(functions)
 
     @property
     def arguments(self) -> list[tuple[tuple[int, ...], str]]:
@@ -39,9 +45,13 @@ class Replay:
     def _main(self) -> Any:
         return self._functions["main"].regions[0].blocks[0]
 
-    def __call__(self, *args: Tensor) -> tuple[list[Tensor], list[Any]]:
-        """The results, and masks of the lanes that raise an error."""
+    def __call__(
+        self, *args: Tensor, memory: Sequence[Any] = ()
+    ) -> tuple[list[Tensor], list[Any]]:
+        """The results, and masks of the lanes that raise an error. `memory` has the arrays
+        of `constants`."""
         errors = []
+        self._memory = dict(zip(self.constants, memory))
         return self._call("main", args, errors), errors
 
     def _call(self, name: str, args, errors: list[Any]) -> list[Tensor]:
@@ -72,8 +82,39 @@ class Replay:
                 error.location += str(op.location)
                 raise
         run = lambda i, args: self._block(op.regions[i].blocks[0], args, values, errors)
+        if op.results and op.results[0] in self._memory:
+            constant = self.constants[op.results[0]]
+            places = np.arange(constant.size)
+            table = Table(self._memory[op.results[0]], places, constant.ravel())
+            return [Tensor(table, constant.shape)]
         operation = Operation(op, run, errors)
         rule = rule_of(operation.name)
         if rule is None:
             raise NotReplayed(op)
         return rule(operation, *operands)
+
+
+def _large_constants(functions: list[Any]) -> dict[Any, np.ndarray]:
+    """The real constants of more entries than stay in registers."""
+    out = {}
+    for op in _operations(functions):
+        if op.name != "stablehlo.constant":
+            continue
+        of = op.results[0].type
+        real = "complex" not in str(of.element_type)
+        if real and math.prod(of.shape) > MOST_IN_REGISTERS:
+            values = np.asarray(op.attributes["value"])
+            out[op.results[0]] = np.broadcast_to(values, of.shape)
+    return out
+
+
+def _operations(functions: list[Any]) -> Iterator[Any]:
+    """All operations, those of regions included."""
+    left = [f.operation for f in functions]
+    while left:
+        op = left.pop()
+        yield op
+        for region in op.regions:
+            left.extend(
+                x.operation for block in region.blocks for x in block.operations
+            )

@@ -156,7 +156,21 @@ def without_rescue(solver: Any) -> Any:
     def replace(x: Any) -> Any:
         if not (is_implicit(x) and isinstance(x.root_finder, PicardNewton)):
             return x
+        _check_tolerance(x.root_finder)
         fields = lambda s: (s.root_finder, s.root_find_max_steps)
         return eqx.tree_at(fields, x, (Sweeps(), 0))
 
     return jtu.tree_map(replace, solver, is_leaf=is_implicit)
+
+
+def _check_tolerance(finder: PicardNewton) -> None:
+    """Raises a `ValueError` for another tolerance than rounding error. (Numbers of steps
+    are those of JAX, which takes the paths that are not solved here.)"""
+    usual = PicardNewton()
+    for name in ("rtol", "atol", "norm"):
+        if getattr(finder, name) != getattr(usual, name):
+            raise ValueError(
+                '`engine="drjit"` solves each step to rounding error; got '
+                f"`PicardNewton({name}={getattr(finder, name)})`. Leave it out, or pass "
+                '`engine="jax"`.'
+            )

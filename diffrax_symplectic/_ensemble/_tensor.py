@@ -6,14 +6,54 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ._backend import drjit
+from ._backend import array_types, drjit
+
+
+# Larger arrays that all paths share stay in memory.
+MOST_IN_REGISTERS = 64
+
+
+class Table(Sequence):
+    """The entries of an array that all paths share: positions in an array of Dr.Jit in
+    memory. An entry is read where a rule asks for it; each path may ask for its own.
+
+    - `memory`: the array, in its own order.
+    - `places`: where in `memory` the entries are.
+    - `values`: the values in `memory` if these are constants of the program, so that
+        operations with them can be folded.
+    """
+
+    def __init__(
+        self, memory: Any, places: np.ndarray, values: np.ndarray | None = None
+    ):
+        self.memory = memory
+        self.places = places
+        self.values = values
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def __getitem__(self, i: Any) -> Any:
+        if isinstance(i, slice):
+            return self.at_places(np.arange(len(self))[i])
+        place = int(self.places[i])
+        if self.values is not None:
+            return type(self.memory)(self.values[place].item())
+        return self.gathered(array_types()["ui32"](place))
+
+    def at_places(self, places: np.ndarray) -> "Table":
+        return Table(self.memory, self.places[places], self.values)
+
+    def gathered(self, places: Any) -> Any:
+        """What is at these places of `memory`, one for each path."""
+        return drjit().gather(type(self.memory), self.memory, places)
 
 
 class Tensor(NamedTuple):
     """An array whose entries, in row-major order, are Dr.Jit arrays with one lane for each
     path."""
 
-    entries: list[Any]
+    entries: Sequence[Any]
     shape: tuple[int, ...]
 
     @property
@@ -23,6 +63,8 @@ class Tensor(NamedTuple):
 
     def take(self, places: np.ndarray) -> "Tensor":
         """The entries at these positions."""
+        if isinstance(self.entries, Table):
+            return Tensor(self.entries.at_places(places.ravel()), places.shape)
         return Tensor([self.entries[i] for i in places.flat], places.shape)
 
     def item(self) -> Any:
@@ -40,10 +82,12 @@ def constant(kind: type, values: np.ndarray) -> Tensor:
 
 def known(x: Tensor) -> np.ndarray | None:
     """The values, if Dr.Jit knows them: constants, and what it folded from constants."""
-    literal = drjit().VarState.Literal
+    dr = drjit()
+    literal = dr.VarState.Literal
     if not all(e.state == literal for e in x.entries):
         return None
-    return np.array([e[0] for e in x.entries]).reshape(x.shape)
+    value = lambda e: complex(e.real[0], e.imag[0]) if dr.is_complex_v(e) else e[0]
+    return np.array([value(e) for e in x.entries]).reshape(x.shape)
 
 
 def each(fn: Callable, *xs: Tensor) -> Tensor:
@@ -52,7 +96,7 @@ def each(fn: Callable, *xs: Tensor) -> Tensor:
     spread = [
         x.entries
         if len(x.entries) == len(size.entries)
-        else x.entries * len(size.entries)
+        else [*x.entries] * len(size.entries)
         for x in xs
     ]
     return Tensor([fn(*es) for es in zip(*spread)], size.shape)

@@ -1,5 +1,6 @@
 """Value functions, fitted backwards in time at the states of a pilot run."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +14,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .._custom_types import Y
+from .._root_finder import PicardNewton
+from .._solver import AbstractImplicitStages
 from ._bases import AbstractBasis
 from ._problem import ravel
 from ._steps import Paths
@@ -50,8 +53,31 @@ class Functions(eqx.Module):
         return Functions(self.frames, c, second, self.basis)
 
 
-def fit(noise: Any, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
-    """The functions of a level, for its noise: a pilot run forward, and fits backward."""
+def without_newton(solver: Any) -> Any:
+    """The solver, and all solvers in it, with a root finder that ends after its sweeps.
+
+    Newton's method is a quarter of the time to compile a fit, and few of its states need
+    it. A state at which the sweeps fail is left out of the fit.
+    """
+
+    def replaced(x: Any) -> Any:
+        if not (_is_implicit(x) and isinstance(x.root_finder, PicardNewton)):
+            return x
+        sweeps = dataclasses.replace(x.root_finder, newton_steps=0)
+        return eqx.tree_at(lambda solver: solver.root_finder, x, sweeps)
+
+    return jtu.tree_map(replaced, solver, is_leaf=_is_implicit)
+
+
+def _is_implicit(x: Any) -> bool:
+    return isinstance(x, AbstractImplicitStages)
+
+
+def fit(
+    noise: Any, key: PRNGKeyArray, basis: AbstractBasis
+) -> tuple[Functions, Int[Array, ""]]:
+    """The functions of a level, for its noise: a pilot run forward, and fits backward; and
+    how many of the pilot's paths failed."""
     p, level = noise.problem, noise.level
     y0, unravel = jfu.ravel_pytree(p.y0)
     steps, last = level.num_steps, p.max_steps
@@ -101,7 +127,7 @@ def fit(noise: Any, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
     # Some states before each step.
     few = jnp.concatenate([starts[None], states[:-1]])[:, :_SECOND]
     second = lax.map(kept, (jnp.arange(last), few))
-    return Functions(u.frames, u.coefficients, second, basis)
+    return Functions(u.frames, u.coefficients, second, basis), jnp.sum(~good)
 
 
 def _pilot(noise: Any, keys: PRNGKeyArray):
@@ -122,7 +148,8 @@ def _pilot(noise: Any, keys: PRNGKeyArray):
         paths = paths.moved(p, y, None, success)
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
-    paths = Paths.start(p, *jax.vmap(p.drawn)(keys), None)
+    y, args = jax.vmap(p.drawn)(keys)
+    paths = Paths.start(p, y, args, None)
     starts = jax.vmap(ravel)(paths.y)
     states = jnp.broadcast_to(starts, (last, *starts.shape))
     carry = paths, states

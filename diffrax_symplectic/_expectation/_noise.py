@@ -136,9 +136,15 @@ class Noise(eqx.Module):
         return points.astype(self.problem.dtype), weights
 
     def mean(self, i, y: Y, u: Function, x: Array | None = None) -> Array:
-        """The expectation of `u` after step `i` from `y`, over `nodes(x)`."""
+        """The expectation of `u` after step `i` from `y`, over `nodes(x)`; NaN if a step
+        fails."""
         (points, weights), state = self.nodes(x), self.fresh(i, y)
-        values = jax.vmap(lambda x: u(self.step(i, y, state, x)[0]))(points)
+
+        def value(x: Array) -> Array:
+            y1, _, success = self.step(i, y, state, x)
+            return jnp.where(success, u(y1), jnp.nan)
+
+        values = jax.vmap(value)(points)
         return tensordot(weights.astype(values.dtype), values, 1)
 
     def advance(

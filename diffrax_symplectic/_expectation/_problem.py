@@ -23,7 +23,7 @@ from .._arguments import (
     whole_number,
 )
 from .._brownian import is_random
-from .._custom_types import Args, RealScalarLike, Y
+from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from .._root_finder import all_finite
 from .._solver import AbstractSymplecticSolver, check_resolution, Want
 from .._suggest import own_path, specified
@@ -129,7 +129,7 @@ class Problem(eqx.Module):
         at = grid, weights, ts is None, int(finer[-1] * num_steps)
         return Problem(phi, terms, solver, start, y0, args, y0_of, args_of, *at)
 
-    def level(self, index: int) -> Level:
+    def level(self, index: IntScalarLike) -> Level:
         return jtu.tree_map(lambda x: x[index], self.levels)
 
     @property
@@ -191,11 +191,23 @@ class Problem(eqx.Module):
         return tensordot(self.weights.astype(x.dtype), x, 1)
 
     def averaged(
-        self, kinds: list[Float[Array, "combinations S n m"]]
+        self, kinds: Sequence[Float[Array | np.ndarray, "combinations S n m"]]
     ) -> PyTree[Array]:
         """The `values` of `Samples` from these kinds."""
         x = jnp.stack(kinds)
         return self.unravel(x[:, :, 0] if self.at_end else jnp.swapaxes(x, 2, 3))
+
+    def shapes_of_samples(self, kinds: int) -> PyTree[jax.ShapeDtypeStruct]:
+        """The shapes of the `values` of one sample, with this number of kinds."""
+        (times, m), dtype = self.num_outputs, self.dtype_of_values
+        zeros = np.zeros((len(self.weights), times, 1, m), dtype)
+        averaged = jax.eval_shape(lambda: self.averaged([zeros] * kinds))
+        one = lambda s: jax.ShapeDtypeStruct((*s.shape[:2], *s.shape[3:]), s.dtype)
+        return jtu.tree_map(one, averaged)
+
+    @property
+    def dtype_of_values(self) -> Any:
+        return jax.eval_shape(lambda: self.values(self.t0, self.y0)).dtype
 
     @property
     def dtype(self) -> Any:

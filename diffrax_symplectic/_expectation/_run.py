@@ -15,13 +15,14 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .._arguments import whole_number
 from .._brownian import check_key, typed_key
+from .._compat import quickly_compiled
 from ._estimate import Expectation, ExpectationInterrupted
 from ._moments import joined, Moments, total
-from ._sampling import Plan
+from ._sampling import Plan, Samples
 
 
 # If a larger fraction of the paths fails, there is a warning.
@@ -157,6 +158,8 @@ class _Batches:
             plan.paths_of,
             devices,
         )
+        self._shapes = plan.shapes
+        self._sums: Any = _quick_batch if plan.quick else _batch
         if jax.process_count() > 1:
             # All processes hold the same arrays. Captured by a function they become
             # constants; as arguments they would have to be placed on all devices.
@@ -166,7 +169,9 @@ class _Batches:
     def sampler_at(self, at: int) -> Callable:
         if self._paths_of is None:
             return self._sampler
-        return jtu.Partial(self._sampler, self._paths_of(at, self.size))
+        # Of a `Partial` of a `Partial` JAX would take the inner one for a function, arrays
+        # and all, and compile anew for each.
+        return jtu.Partial(_of_paths, self._sampler, self._paths_of(at, self.size))
 
     def started(self, at: int, most: int, sampler: Callable) -> tuple:
         """Starts one batch on each device, from sample `at` on and up to `most`."""
@@ -175,8 +180,7 @@ class _Batches:
         left = np.array(max(0, min(self.size * count, most - at)), np.int32)
         if count == 1:
             lo_hi, left = jax.device_put((lo_hi, left), self._devices[0])
-        one: Any = _batch
-        return one(
+        return self._sums(
             sampler, self.key_data, self._impl, lo_hi, left, self._mesh, self.size
         )
 
@@ -190,12 +194,20 @@ class _Batches:
 
     def nothing(self, at: int, most: int) -> Moments:
         """The moments of no samples."""
-        # JAX caches this trace and uses it for the first batch.
-        sampler = self.sampler_at(at)
-        shapes = eqx.filter_eval_shape(self.started, at, most, sampler)[2]
-        zeros = jtu.tree_map(lambda s: np.zeros(s.shape[1:]), shapes)
+        shapes = self._shapes
+        if shapes is None:
+            # JAX caches this trace and uses it for the first batch.
+            sampler = self.sampler_at(at)
+            batches = eqx.filter_eval_shape(self.started, at, most, sampler)[2]
+            without_devices = lambda s: jax.ShapeDtypeStruct(s.shape[1:], s.dtype)
+            shapes = jtu.tree_map(without_devices, batches)
+        zeros = jtu.tree_map(lambda s: np.zeros(s.shape), shapes)
         dtypes = jtu.tree_map(lambda s: str(s.dtype), shapes)
         return Moments(at, at, 0, 0, zeros, zeros, zeros, zeros, dtypes)
+
+
+def _of_paths(sampler: Callable, paths: PyTree, keys: PRNGKeyArray) -> Samples:
+    return sampler(paths, keys)
 
 
 def _reached(estimate: Expectation, least: int, tol: float | None) -> bool:
@@ -293,8 +305,7 @@ def _least(dtype: str) -> float:
     return float(jnp.finfo(dtype).tiny / jnp.finfo(dtype).eps)
 
 
-@eqx.filter_jit
-def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
+def _sums(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
     """The batches of all devices: the numbers of good samples and of failed paths, and the
     sums from which `_moments` computes the moments of the good samples."""
 
@@ -338,6 +349,10 @@ def _batch(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
                 "`diffeqsolve`, or `devices=jax.devices()[:1]` to `monte_carlo`."
             )
         raise
+
+
+_batch = eqx.filter_jit(_sums)
+_quick_batch = quickly_compiled(_sums)
 
 
 def _moments_of_batch(

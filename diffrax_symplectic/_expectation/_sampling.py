@@ -38,6 +38,9 @@ class Plan(NamedTuple):
     - `paths`: the number of paths in a sample, on each level.
     - `least`: the fewest samples whose variance is estimated well enough to stop.
     - `reason`: why this sampling was chosen, for the result.
+    - `shapes`: the shapes of the values of one sample, if they are known without a trace.
+    - `quick`: whether the samples take less time than compiling their program, so that it
+        is compiled for speed of compilation.
     - `far`, `roundings`: as in `Expectation`.
     - `paths_of`: for paths computed outside JAX, maps the number of the first sample and
         the number of samples to an argument that the sampler takes before the keys.
@@ -49,6 +52,8 @@ class Plan(NamedTuple):
     paths: int = 1
     least: int = 2
     reason: str = ""
+    shapes: PyTree | None = None
+    quick: bool = False
     far: PyTree[np.ndarray] | None = None
     roundings: int = 1
     paths_of: Callable[[int, int], Any] | None = None

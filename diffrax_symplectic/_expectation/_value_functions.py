@@ -5,6 +5,7 @@ step, $u_{n+1}$ minus its expectation over the step's random variables has mean 
 $u$. For the exact $u$ the sum of these differences is $\\phi(y_N)$ minus its mean.
 """
 
+import dataclasses
 import functools as ft
 import itertools
 import math
@@ -16,16 +17,17 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from .._arguments import whole_number
+from .._compat import quickly_compiled
 from .._terms import number_of_noises
 from ._bases import AbstractBasis, Grid, Hermite, Quadratic
-from ._fits import fit, Functions
+from ._fits import fit, Functions, without_newton
 from ._moments import total
 from ._noise import Noise
 from ._polynomials import num_polynomials
-from ._problem import Level, Problem
+from ._problem import Problem
 from ._run import run
 from ._sampling import AbstractSampling, Plan, ROUNDING, Samples
 from ._steps import along, Paths, simulate
@@ -42,6 +44,8 @@ _GRID, _GRID_SIZES, _MOST_ENDS, _MOST = 2, (64, 32), 50_000, 2**25
 _MOST_MEMORY, _OUT_OF_PROPORTION = 4 * 2**30, 2**31
 # The number folded into the key of trials, and the number of batches with wider noise.
 _TRIAL, _WIDE = 0xFFFFFFFE, 2
+# The kinds of values of a sample with a control variate.
+_KINDS = 4
 # The most noises of which paths are pushed to all sides.
 _MOST_NOISES = 2
 
@@ -92,15 +96,16 @@ class ValueFunctions(AbstractSampling):
     def prepare(self, problem, key, devices):
         basis, (times, m) = _basis(problem, self.degree), problem.num_outputs
         functions, shape = _fits(problem, key, basis), (len(problem.weights), times, m)
+        shapes = problem.shapes_of_samples(_KINDS)
         never = np.zeros(shape), np.full(shape, np.inf)
         narrow, *wider = _wider(problem)
 
         def plan(best, used, n: int, usual=never, law=narrow):
             usual = [x.astype(problem.dtype) for x in usual]
-            u, arrays = functions.chosen(best), (used, usual, law)
-            return Plan(
-                jtu.Partial(_controlled_paths, problem, u, *arrays), n, self.batch_size
+            sampler = jtu.Partial(
+                _controlled_paths, problem, functions, best, used, usual, law
             )
+            return Plan(sampler, n, self.batch_size, shapes=shapes, quick=True)
 
         # The trials' paths are not part of the estimate.
         trial = lambda *args: run(plan(*args), jr.fold_in(key, _TRIAL), devices)
@@ -150,16 +155,37 @@ def value_function(problem: Problem, key: PRNGKeyArray) -> Functions | None:
 
 def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
     """The fits of all levels."""
-    levels = range(len(problem.levels.h))
-    each = [
-        _fitted(problem, problem.level(k), jr.fold_in(key, k), basis) for k in levels
-    ]
-    return jtu.tree_map(lambda *xs: jnp.stack(xs), *each)
+    lean = dataclasses.replace(problem, solver=without_newton(problem.solver))
+    functions, lost = _fits_by(lean, key, basis)
+    if lost == 0 or eqx.tree_equal(lean.solver, problem.solver):
+        return functions
+    # Steps too long for sweeps: the fit is made again, with Newton's method.
+    functions, _ = _fits_by(problem, key, basis)
+    return functions
 
 
-@eqx.filter_jit
-def _fitted(problem: Problem, level: Level, key: PRNGKeyArray, basis: AbstractBasis):
-    return fit(Noise.of(problem, level), key, basis)
+def _fits_by(
+    problem: Problem, key: PRNGKeyArray, basis: AbstractBasis
+) -> tuple[Functions, int]:
+    """The fits of all levels, and how many of the pilot's paths failed."""
+    count = len(problem.levels.h)
+    each = [_fitted(problem, np.array([k]), key, basis) for k in range(count)]
+    lost = sum(int(number) for _, number in each)
+    functions = [own for own, _ in each]
+    if count == 1:
+        return functions[0], lost
+    return jtu.tree_map(lambda *xs: jnp.concatenate(xs), *functions), lost
+
+
+@quickly_compiled
+def _fitted(
+    problem: Problem, index: Int[Array, "1"], key: PRNGKeyArray, basis: AbstractBasis
+) -> tuple[Functions, Int[Array, ""]]:
+    """The fit of the level with this index, with a leading axis of levels, and how many of
+    the pilot's paths failed."""
+    level = problem.level(index[0])
+    own, lost = fit(Noise.of(problem, level), jr.fold_in(key, index[0]), basis)
+    return jtu.tree_map(lambda x: x[None], own), lost
 
 
 def _basis(p: Problem, degree: int | None) -> AbstractBasis:
@@ -213,11 +239,13 @@ def _wider(p: Problem) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _controlled_paths(
-    p: Problem, functions: Functions, used, usual, law, keys: PRNGKeyArray
+    p: Problem, functions: Functions, best, used, usual, law, keys: PRNGKeyArray
 ) -> Samples:
     """A sample is a path minus the control variate of `functions` (with a leading axis of
-    levels) where they are `used`. With a wider `law` (see `_wider`) deviations beyond
-    the `usual` ones are estimated: the mean without control, and the largest deviation."""
+    levels), by their `best` candidates, where they are `used`. With a wider
+    `law` (see `_wider`) deviations beyond the `usual` ones are estimated: the mean without
+    control, and the largest deviation."""
+    functions = functions.chosen(best)
     n, (center, beyond) = len(keys), [x[:, :, None] for x in usual]
     share, side = law
     drawn = jax.vmap(p.drawn)(keys)
@@ -260,4 +288,5 @@ def _controlled_paths(
     # Cap ratios at one: paths that are likelier without wider noise are seen without it.
     ratio = jnp.exp(-jnp.maximum(jnp.sum(log_ratio, axis=0), 0))[:, None]
     far, lost = jnp.where(off > beyond, ratio * off, 0), jnp.any(failed, axis=0)
-    return Samples(p.averaged([left, plain, control, far]), ~lost, lost)
+    kinds = [left, plain, control, far]
+    return Samples(p.averaged(kinds), ~lost, lost)

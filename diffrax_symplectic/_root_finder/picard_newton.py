@@ -19,6 +19,7 @@ from .tolerance import all_finite, Tolerance
 
 
 _SUCCESSFUL = optx.RESULTS.successful
+_UNSOLVED = optx.RESULTS.nonlinear_divergence
 
 
 class _FinderState(NamedTuple):
@@ -126,6 +127,29 @@ class PicardNewton(
             found, solved = options["solve_blocks"](args, solve, y, pending)
         else:
             found, solved = solve(_image(fn, args), scale, y, pending)
+        pending = pending & ~solved
+        if self.newton_steps == 0:
+            # A program without Newton's method compiles in half the time.
+            y_new = found
+            result = optx.RESULTS.where(pending, _UNSOLVED, _SUCCESSFUL)
+        else:
+            y_new, result = self._rescued(fn, scale, args, y, found, pending)
+        solved = result == _SUCCESSFUL
+        # Evaluate the equations once more only if there is auxiliary output.
+        aux = fn(y_new, args)[1] if jtu.tree_leaves(state.aux) else state.aux
+        return y_new, _FinderState(solved, result, state.aux), aux
+
+    def _rescued(
+        self,
+        fn: Callable,
+        scale: Callable,
+        args: Any,
+        guess: PyTree[Array],
+        found: PyTree[Array],
+        pending: Bool[Array, ""],
+    ) -> tuple[PyTree[Array], optx.RESULTS]:
+        """The solution by Newton's method where sweeps left the equations `pending`, and
+        what they `found` elsewhere."""
         # As one vector: a loop needs separate kernels to select, gather and scatter each
         # array of its state.
         k, restore = jfu.ravel_pytree(found)
@@ -134,7 +158,7 @@ class PicardNewton(
             return jfu.ravel_pytree(fn(restore(k), args)[0])[0]
 
         # Continuation starts from the guess of the step, not from where the sweeps ended.
-        start, _ = jfu.ravel_pytree(y)
+        start, _ = jfu.ravel_pytree(guess)
         newton = Newton(
             residual=residual,
             start=start,
@@ -148,12 +172,8 @@ class PicardNewton(
             k, _ = value
             return newton.solve(k, self.newton_steps)
 
-        k, result = where_pending(rescue, pending & ~solved, (k, _SUCCESSFUL))
-        y_new = restore(k)
-        solved = result == _SUCCESSFUL
-        # Evaluate the equations once more only if there is auxiliary output.
-        aux = fn(y_new, args)[1] if jtu.tree_leaves(state.aux) else state.aux
-        return y_new, _FinderState(solved, result, state.aux), aux
+        k, result = where_pending(rescue, pending, (k, _SUCCESSFUL))
+        return restore(k), result
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags

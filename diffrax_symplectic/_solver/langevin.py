@@ -3,6 +3,7 @@ friction and noise between them."""
 
 from typing import Any, ClassVar
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -10,6 +11,7 @@ from jax import lax
 from jaxtyping import PyTree
 
 from .._arguments import check_state
+from .._compat import unwrapped
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from .._terms import (
@@ -48,6 +50,11 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         check_state(y0, name)
         terms, y0 = momentum_first(terms, y0)
         drift, friction, noise = split_friction(terms)
+        if not all(isinstance(unwrapped(x), diffrax.ODETerm) for x in drift):
+            raise ValueError(
+                f"`{name}` needs a drift driven by time: pass `langevin_terms(H0, "
+                "friction, temperature, path)`."
+            )
         check_structure(self.structure, drift, noise, t0, y0, args, name)
         check_friction(drift, friction, t0, y0, args, name)
 

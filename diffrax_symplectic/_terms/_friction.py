@@ -22,6 +22,9 @@ _P = PyTree[Array]
 Value = PyTree[ArrayLike] | Callable[[RealScalarLike, _P, Args], PyTree[ArrayLike]]
 
 
+_KIND = "a real number, an array or PyTree of them, or a function of `(t, q, args)`"
+
+
 class FrictionAlong(eqx.Module):
     r"""Friction along given directions, for [`diffrax_symplectic.langevin_terms`][]:
     $G = \sum_k d_k d_k^\top$.
@@ -52,6 +55,7 @@ class _Square(eqx.Module):
 
 
 def value_at(name: str, value: Any, t, q: _P, args: Args) -> PyTree:
+    """A constant, or the value of a function."""
     return evaluated(name, value, t, q, args=args) if callable(value) else value
 
 
@@ -65,7 +69,7 @@ def product_with(friction: Any, t, q: _P, args: Args, velocity: _P) -> _P:
 
     def product(g, v):
         value = g.value if isinstance(g, _Square) else g
-        if not _is_matrix(value, v):
+        if not _is_matrix(value, jnp.shape(v)):
             return not_negative(like(value, v)) * v
         force = jnp.tensordot(like(value, v), v, jnp.ndim(v))
         if not isinstance(g, _Square):
@@ -79,46 +83,50 @@ def product_with(friction: Any, t, q: _P, args: Args, velocity: _P) -> _P:
 def root_product_with(
     friction: Any, T: PyTree, t, q: _P, args: Args, control: BM
 ) -> _P:
-    """`B W`."""
+    """`B W`, with `B B^T = 2 T G`."""
     if isinstance(friction, FrictionAlong):
         columns = _columns(friction, t, q, args)
-        flat, _ = jfu.ravel_pytree(control)
-        scale = _single_temperature(T)
-        first = jtu.tree_leaves(columns)[0]
-        if jnp.shape(first)[-1:] != flat.shape:
-            raise ValueError(
-                "The `path` of `langevin_terms` must have one noise for each direction of "
-                f"the friction, shape {jnp.shape(first)[-1:]}; got shape {shapes(control)}."
-            )
-        along = lambda d: d @ (jnp.sqrt(2 * like(scale, d)) * flat.astype(d.dtype))
-        return jtu.tree_map(along, columns)
-    if jtu.tree_structure(control) != jtu.tree_structure(q) or [
-        jnp.shape(x) for x in jtu.tree_leaves(control)
-    ] != [jnp.shape(x) for x in jtu.tree_leaves(q)]:
+        return _noise_along(columns, _single_temperature(T), control)
+    fits = lambda w, x: jnp.shape(w) == jnp.shape(x)
+    if jtu.tree_structure(control) != jtu.tree_structure(q) or not all(
+        map(fits, jtu.tree_leaves(control), jtu.tree_leaves(q))
+    ):
         raise ValueError(
             f"The `path` of `langevin_terms` must have the shape of `q`, {shapes(q)}; got "
             f"shape {shapes(control)}."
         )
-
-    def product(g, temperature, x, w):
-        w = like(w, x)
-        matrix = g.value if isinstance(g, _Square) else g
-        if not _is_matrix(matrix, x):
-            if jnp.shape(temperature) not in ((), jnp.shape(x)):
-                raise ValueError(
-                    "An array of `temperature` must be a scalar, or have the shape of its "
-                    f"momenta, {jnp.shape(x)}; got shape {jnp.shape(temperature)}."
-                )
-            # Where either is negative, NaN makes the path fail.
-            return jnp.sqrt(like(matrix, x)) * jnp.sqrt(2 * like(temperature, x)) * w
-        scale = jnp.sqrt(2 * like(_single_temperature(temperature), x))
-        root = like(g.root, x) if isinstance(g, _Square) else _root(like(g, x))
-        return scale * jnp.tensordot(root, w, jnp.ndim(w))
-
     value = _for_each("friction", value_at("friction", friction, t, q, args), q)
-    return jtu.tree_map(
-        product, value, _for_each("temperature", T, q), q, control, is_leaf=_is_square
-    )
+    heat = _for_each("temperature", T, q)
+    return jtu.tree_map(_noise_of, value, heat, control, q, is_leaf=_is_square)
+
+
+def _noise_of(g: Any, T: ArrayLike, w: Array, x: Array) -> Array:
+    """The noise `w` of the momenta of one array, in the shape of `x`."""
+    w = like(w, x)
+    matrix = g.value if isinstance(g, _Square) else g
+    if _is_matrix(matrix, jnp.shape(x)):
+        scale = jnp.sqrt(2 * like(_single_temperature(T), x))
+        root = g.root if isinstance(g, _Square) else _root(like(g, x))
+        return scale * jnp.tensordot(like(root, x), w, jnp.ndim(w))
+    if jnp.shape(T) not in ((), jnp.shape(x)):
+        raise ValueError(
+            "An array of `temperature` must be a scalar, or have the shape of its momenta, "
+            f"{jnp.shape(x)}; got shape {jnp.shape(T)}."
+        )
+    # Where either is negative, NaN makes the path fail.
+    return jnp.sqrt(like(matrix, x)) * jnp.sqrt(2 * like(T, x)) * w
+
+
+def _noise_along(columns: _P, T: ArrayLike, control: BM) -> _P:
+    flat, _ = jfu.ravel_pytree(control)
+    number = jnp.shape(jtu.tree_leaves(columns)[0])[-1:]
+    if number != flat.shape:
+        raise ValueError(
+            "The `path` of `langevin_terms` must have one noise for each direction of the "
+            f"friction, shape {number}; got shape {shapes(control)}."
+        )
+    along = lambda d: d @ (jnp.sqrt(2 * like(T, d)) * like(flat, d))
+    return jtu.tree_map(along, columns)
 
 
 def _columns(friction: FrictionAlong, t, q: _P, args: Args) -> _P:
@@ -127,9 +135,8 @@ def _columns(friction: FrictionAlong, t, q: _P, args: Args) -> _P:
     columns = _for_each("directions", columns, q)
     numbers = {jnp.shape(d)[-1:] for d in jtu.tree_leaves(columns)}
     fits = lambda d, x: jnp.ndim(d) > 0 and jnp.shape(d)[:-1] == jnp.shape(x)
-    if len(numbers) > 1 or not all(
-        jtu.tree_leaves(jtu.tree_map(fits, columns, q))
-    ):  # fmt: skip
+    all_fit = all(jtu.tree_leaves(jtu.tree_map(fits, columns, q)))
+    if len(numbers) > 1 or not all_fit:
         raise ValueError(
             "`directions` of `FrictionAlong` must have the shape of the momenta and one "
             f"more axis, for the noises; got shape {shapes(columns)} for momenta of shape "
@@ -138,16 +145,15 @@ def _columns(friction: FrictionAlong, t, q: _P, args: Args) -> _P:
     return jtu.tree_map(like, columns, q)
 
 
-def _is_matrix(g: ArrayLike, x: Array) -> bool:
-    """Whether this is a matrix for the momenta `x`, and not a number or an array of them.
-    Raises a `ValueError` if it is neither."""
-    if jnp.shape(g) in ((), jnp.shape(x)):
+def _is_matrix(g: ArrayLike, momenta: tuple[int, ...]) -> bool:
+    """Whether this is a matrix for momenta of this shape, and not a number or an array of
+    them. Raises a `ValueError` if it is neither."""
+    if jnp.shape(g) in ((), momenta):
         return False
-    if jnp.shape(g) != jnp.shape(x) * 2:
+    if jnp.shape(g) != momenta * 2:
         raise ValueError(
             "An array of `friction` must be a scalar, or have the shape of its momenta, "
-            f"{jnp.shape(x)}, or as a matrix the shape {jnp.shape(x) * 2}; got shape "
-            f"{jnp.shape(g)}."
+            f"{momenta}, or as a matrix the shape {momenta * 2}; got shape {jnp.shape(g)}."
         )
     return True
 
@@ -174,11 +180,13 @@ def _single_temperature(T: PyTree) -> ArrayLike:
 
 
 def not_negative(g: Array) -> Array:
+    """`g`, or NaN where it is negative."""
     # Traced values cannot raise an error; NaN makes their path fail.
     return jnp.where(g >= 0, g, jnp.nan)
 
 
 def like(x: ArrayLike, y: Array) -> Array:
+    """`x` in the precision of `y`."""
     return jnp.asarray(x, jnp.result_type(y))
 
 
@@ -201,26 +209,24 @@ def checked_friction(friction: Any, struct: PyTree | None) -> Any:
             "`friction` must be a number, an array, a PyTree of arrays, a `FrictionAlong`, "
             f"or a function `(t, q, args)`; got {friction!r}."
         )
-    if struct is None:
-        return jtu.tree_map(lambda g: _checked_array(g, None), friction)
+    known = {s.shape for s in jtu.tree_leaves(struct)}
+    if jtu.all_leaves([friction]) or struct is None:
+        # One for all momenta, whose shape is known if it is one.
+        shape = known.pop() if len(known) == 1 else None
+        return jtu.tree_map(lambda g: _checked_array(g, shape), friction)
     each = jtu.tree_map(lambda s: jnp.zeros(s.shape), struct)
-    one = jtu.all_leaves([friction])
-    if one and len({x.shape for x in jtu.tree_leaves(each)}) == 1:
-        return _checked_array(friction, jtu.tree_leaves(each)[0])
-    if one:
-        return _checked_array(friction, None)
-    return jtu.tree_map(_checked_array, _for_each("friction", friction, each), each)
+    checked = lambda g, x: _checked_array(g, jnp.shape(x))
+    return jtu.tree_map(checked, _for_each("friction", friction, each), each)
 
 
-def _checked_array(g: ArrayLike, x: Array | None) -> Array | _Square:
-    """Of the friction of the momenta `x`, if their shape is known."""
+def _checked_array(g: ArrayLike, momenta: tuple[int, ...] | None) -> Array | _Square:
+    """The friction of an array of momenta, of this shape if it is known."""
     shape = jnp.shape(g)
     half = len(shape) // 2
     may_be_matrix = half > 0 and shape == shape[:half] * 2
-    is_matrix = x is not None and _is_matrix(g, x)
-    kind = "a real number, an array or PyTree of them, or a function of `(t, q, args)`"
+    is_matrix = momenta is not None and _is_matrix(g, momenta)
     if not may_be_matrix:
-        return jnp.asarray(real_array("friction", g, positive=False, kind=kind))
+        return jnp.asarray(real_array("friction", g, positive=False, kind=_KIND))
     root = _root(jnp.asarray(g, jnp.result_type(g, float)))
     is_semidefinite = ~jnp.any(jnp.isnan(root))
     square = _Square(jnp.asarray(g), is_semidefinite, root)
@@ -238,11 +244,8 @@ def checked_temperature(temperature: Any) -> Any:
     if callable(temperature):
         check_takes("temperature", temperature, "t", "q", "args")
         return temperature
-    kind = "a real number, an array or PyTree of them, or a function of `(t, q, args)`"
-    checked = lambda T: jnp.asarray(
-        real_array("temperature", T, positive=False, kind=kind)
-    )
-    return jtu.tree_map(checked, temperature)
+    real = lambda T: real_array("temperature", T, positive=False, kind=_KIND)
+    return jtu.tree_map(lambda T: jnp.asarray(real(T)), temperature)
 
 
 # Traced and compiled once for each shape.

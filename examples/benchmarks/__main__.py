@@ -1,6 +1,7 @@
 """All benchmarks: `python -m examples.benchmarks`."""
 
 from . import (
+    calls,
     ensemble,
     growth,
     members,
@@ -14,6 +15,7 @@ from . import (
 
 def main() -> None:
     speed.main()
+    calls.main()
     ensemble.main()
     growth.main()
     step_sizes.main()

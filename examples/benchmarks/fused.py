@@ -149,7 +149,7 @@ def by_drjit(case: Case, n: int, steps: int, dtype) -> Callable:
     layout, arrays = split(problem, jr.key(1))
     kernels = Kernels(layout)
     h = problem.level(0).h
-    start, parameters = kernels.begin(arrays, jr.key(1), h, 0, n)
+    start, parameters = kernels.begin(arrays, jr.key(1), h, 0, n, problem.y0, None)
 
     def run():
         drjit.eval(kernels.advance(start, parameters, 0, steps))

@@ -17,6 +17,7 @@ import jax.random as jr
 
 import diffrax_symplectic as ds
 
+from . import calls
 from ._timing import DOCS, ensemble, keys, machine, race
 
 
@@ -213,7 +214,11 @@ def main() -> None:
             print(lines[-1], flush=True)
             title = ""  # only in the first row of a system
     DOCS.mkdir(parents=True, exist_ok=True)
-    (DOCS / "speed.md").write_text("\n".join(lines) + "\n")
+    page = DOCS / "speed.md"
+    # What follows is made by `calls.py`.
+    _, *rest = page.read_text().split(calls.HEADING) if page.exists() else [""]
+    lines += ["", calls.HEADING + rest[0].rstrip()] if rest else []
+    page.write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from .fused import needs_drjit
-from .test_call import ONE, TERMS
+from .test_call import follow, ONE, STIFF, TERMS
 
 
 def square(t, y, args):
@@ -58,3 +58,25 @@ def test_a_path_that_fails_has_no_part_in_a_mean():
     ]
     assert 0 < means[0].num_failed == means[1].num_failed < 200
     np.testing.assert_allclose(means[1].mean, means[0].mean, rtol=1e-9)
+
+
+@needs_drjit
+def test_many_stragglers_are_warned_of():
+    y0, sampling = (jnp.array(0.0), jnp.array(0.4)), ds.IndependentPaths(60)
+    given = square, STIFF, ds.ImplicitMidpoint(), 0.0, 4.0, 0.8, y0
+    with pytest.warns(UserWarning, match="of 60 paths had steps that the fused kernel"):
+        ds.expectation(*given, key=jr.key(1), sampling=sampling, engine="drjit")
+
+
+@needs_drjit
+@pytest.mark.parametrize("change", [dict(rtol=1e-4), dict(atol=1e-4)], ids=str)
+def test_another_tolerance_than_rounding_error_is_refused(change):
+    solver = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(**change))
+    (name,) = change
+    with pytest.raises(
+        ValueError, match=rf"rounding error; got `PicardNewton\({name}="
+    ):
+        follow(solver=solver, engine="drjit")
+    # JAX takes the paths that need Newton's method.
+    solver = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(newton_steps=50))
+    assert follow(solver=solver, engine="drjit").num_failed == 0

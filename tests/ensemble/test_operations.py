@@ -51,12 +51,20 @@ def replayed(fn, *args: np.ndarray) -> list[np.ndarray]:
     program = Program(fn, *structs)
     tensors = []
     for x, ((shape, kind),) in zip(args, program.types):
-        lanes = x.reshape(len(x), -1).T
-        tensors.append(Tensor([array_types()[kind](a.copy()) for a in lanes], shape))
+        of = array_types()[kind]
+        parts = (lambda a: (a.real, a.imag)) if np.iscomplexobj(x) else lambda a: (a,)
+        entries = [of(*(p.copy() for p in parts(a))) for a in x.reshape(len(x), -1).T]
+        tensors.append(Tensor(entries, shape))
     results, errors = program.replay(*tensors)
     assert not errors
     drjit().eval(*[r.entries for r in results])
-    stack = lambda r: [np.broadcast_to(np.asarray(e), len(args[0])) for e in r.entries]
+    lanes = lambda e: np.broadcast_to(np.asarray(e), len(args[0]))
+    value = lambda e: (
+        lanes(e.real) + np.array(1j, f"c{2 * drjit().itemsize_v(e)}") * lanes(e.imag)
+        if drjit().is_complex_v(e)
+        else lanes(e)
+    )
+    stack = lambda r: [value(e) for e in r.entries]
     return [np.stack(stack(r), -1).reshape(-1, *r.shape) for r in results]
 
 
@@ -153,6 +161,9 @@ CASES = {
     "reduce": (lambda x: jnp.sum(x, axis=(0, 2)), [(F, (2, 3, 2))], None),
     "reduce to the largest": (lambda x: jnp.max(x, axis=1), [(F, (2, 3))], 0),
     "reduce to a place": (lambda x: jnp.argmax(x), [(F, (5,))], 0),
+    "reduce_window": (lambda x: jnp.cumsum(x, axis=1), [(F, (2, 5))], None),
+    "reduce_window to the largest": (lambda x: lax.reduce_window(x, -jnp.inf, lax.max, (2, 3), (1, 2), ((0, 1), (2, 0))), [(F, (3, 5))], 0),
+    "reduce_window from the end": (lambda x: lax.cumprod(x, reverse=True), [(I, (4,))], 0),
     "reduce of bool": (lambda x: jnp.stack([jnp.all(x), jnp.any(x)]), [(B, (3,))], 0),
     "remainder": (lambda a, b: lax.rem(jnp.clip(a, -999, 999), jnp.where(jnp.abs(b) < 0.1, 0.3, b)), [(F, ()), (F, ())], 0),
     "remainder of integers": (lax.rem, [(I, ()), (I, ())], 0),
@@ -230,8 +241,9 @@ def test_every_operation_of_the_table_is_tested():
     from diffrax_symplectic._ensemble._operations import names
 
     tested = {name.split()[0] for name in CASES} - {"searchsorted"}
-    # The first is tested by `test_linear_algebra`, the second has no value.
-    assert names() == tested | {"custom_call", "sharding_constraint"}
+    # Tested by `test_linear_algebra` and `test_complex`; the last has no value.
+    elsewhere = {"custom_call", "complex", "imag", "real", "sharding_constraint"}
+    assert names() == tested | elsewhere
 
 
 def test_a_selection_by_a_scalar_keeps_the_axis_of_a_single_entry():

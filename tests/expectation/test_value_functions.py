@@ -435,3 +435,9 @@ def test_bad_input_is_told_what_to_pass():
         ds.ValueFunctions(2, 0)
     with pytest.raises(ValueError, match="`sampling` must be `IndependentPaths"):
         _estimate(1000)
+
+
+def test_a_fit_whose_steps_are_too_long_for_sweeps_is_made_by_newtons_method():
+    got = _estimate(ds.ValueFunctions(degree=2), KUBO, MIDPOINT, t1=16.0, dt0=8.0)
+    assert got.num_failed == 0
+    assert got.std_error <= 1e-12

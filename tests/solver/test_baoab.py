@@ -4,6 +4,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import lineax as lx
 import numpy as np
 import pytest
 
@@ -212,3 +213,16 @@ def test_backward_in_time_a_step_is_undone():
     ]
     there = solve(0.0, 1.0, y0)
     np.testing.assert_allclose(solve(1.0, 0.0, tuple(there)), y0, atol=1e-13)
+
+
+def test_a_drift_that_time_does_not_drive_is_refused():
+    control = diffrax.LinearInterpolation(jnp.array([0.0, 1.0]), jnp.array([0.0, 2.0]))
+    number = jax.ShapeDtypeStruct((), jnp.result_type(float))
+
+    def field(t, y, args):
+        return lx.FunctionLinearOperator(lambda w: (-y[1] * w, y[0] * w), number)
+
+    bath = ds.bath_terms(_pendula, 0.5, 1.0, weak_path(2)).terms
+    terms = diffrax.MultiTerm(diffrax.ControlTerm(field, control), *bath)
+    with pytest.raises(ValueError, match="`BAOAB` needs a drift driven by time"):
+        ds.BAOAB().init(terms, 0.0, 0.1, (jnp.ones(2), jnp.ones(2)), None)

@@ -1,0 +1,209 @@
+"""Processor seconds of first and repeated calls, next to Diffrax's `Heun`:
+
+    python -m examples.benchmarks.calls
+
+Each call is measured in a process of its own, since a process remembers what it has traced
+and compiled. Writes the second part of `docs/benchmarks/speed.md`.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+
+import diffrax_symplectic as ds
+
+from ._timing import DOCS, machine
+
+
+STEPS, H = 10, 0.1
+PATHS = 64
+REPEATS = 10
+Y0 = (jnp.array(0.0), jnp.array(1.0))
+HEADING = "## First and repeated calls"
+OLDER_CODE = {"XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false"}
+
+
+class Seconds(NamedTuple):
+    """Processor time of the first call, and of the best of the calls after it."""
+
+    first: float
+    repeated: float
+
+
+def pendulum(path_or_shape: Any) -> Any:
+    return ds.hamiltonian_terms(
+        lambda t, p, q, args: p**2 / 2 - jnp.cos(q),
+        lambda t, p, q, args: 0.2 * jnp.sin(q),
+        path_or_shape,
+    )
+
+
+def solve(solver: Any, make_path: Callable) -> Callable:
+    """A jitted solve by `diffrax.diffeqsolve`, as a function of a number."""
+
+    @jax.jit
+    def end(key):
+        terms = pendulum(make_path(key))
+        return diffrax.diffeqsolve(terms, solver, 0.0, STEPS * H, H, Y0).ys
+
+    return lambda i: jax.block_until_ready(end(jr.key(i)))
+
+
+def solved_by(solver: Any) -> Callable:
+    return solve(solver, lambda key: solver.path((), key))
+
+
+def heun() -> Callable:
+    return solve(diffrax.Heun(), lambda key: ds.FixedStepBrownianPath((), key))
+
+
+def square(t, y, args):
+    return y[1] ** 2
+
+
+def expectation(solver: Any, **arguments: Any) -> Callable:
+    """`expectation` as a function of a number."""
+    terms = pendulum(())
+    problem = (square, terms, solver, 0.0, STEPS * H, H, Y0)
+    return lambda i: ds.expectation(*problem, key=jr.key(i), **arguments)
+
+
+def ensemble(engine: str) -> Callable:
+    terms, solver = pendulum(()), ds.ImplicitMidpoint()
+    problem = (terms, solver, 0.0, STEPS * H, H, Y0)
+    return lambda i: ds.ensemble(
+        *problem, key=jr.key(i), num_paths=PATHS, engine=engine
+    )
+
+
+FEW = ds.IndependentPaths(PATHS)
+SOLVERS = (ds.StormerVerlet(), ds.ImplicitMidpoint(), ds.StrangGauss())
+DEFAULTS = {
+    f"`expectation` with the defaults, `{type(solver).__name__}`": (
+        lambda solver=solver: expectation(solver)
+    )
+    for solver in SOLVERS
+}
+SOLVES = {
+    f"jitted `diffeqsolve`, `{type(solver).__name__}`": (
+        lambda solver=solver: solved_by(solver)
+    )
+    for solver in (ds.ImplicitMidpoint(), ds.StrangGauss(), ds.SRKw2())
+}
+HEUN = "jitted `diffeqsolve`, `Heun`"
+CALLS: dict[str, Callable[[], Callable]] = {
+    HEUN: heun,
+    **SOLVES,
+    **DEFAULTS,
+    f"`expectation` of {PATHS} independent paths": (
+        lambda: expectation(ds.ImplicitMidpoint(), sampling=FEW)
+    ),
+    f'`expectation` of {PATHS} independent paths, `engine="drjit"`': (
+        lambda: expectation(ds.ImplicitMidpoint(), sampling=FEW, engine="drjit")
+    ),
+    f"`ensemble` of {PATHS} paths": lambda: ensemble("jax"),
+    f'`ensemble` of {PATHS} paths, `engine="drjit"`': lambda: ensemble("drjit"),
+}
+
+
+def measure(name: str) -> Seconds:
+    """In this process."""
+    call = CALLS[name]()
+    # Starting JAX is no part of a call.
+    jax.block_until_ready(jnp.zeros(3) + 1)
+
+    def seconds(i: int) -> float:
+        begin = time.process_time()
+        call(i)
+        return time.process_time() - begin
+
+    first = seconds(0)
+    return Seconds(first, min(seconds(i) for i in range(1, REPEATS + 1)))
+
+
+def in_a_process(name: str, settings: dict[str, str]) -> Seconds:
+    """In a process of its own, with these environment variables."""
+    command = [sys.executable, "-m", "examples.benchmarks.calls", name]
+    done = subprocess.run(
+        command,
+        env={**os.environ, **settings},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    *_, last = done.stdout.splitlines()
+    return Seconds(*json.loads(last))
+
+
+def in_a_second_process(name: str) -> Seconds:
+    """In a process that finds the programs of another one on disk."""
+    with tempfile.TemporaryDirectory() as folder:
+        settings = {
+            "JAX_COMPILATION_CACHE_DIR": folder,
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0",
+        }
+        in_a_process(name, settings)
+        return in_a_process(name, settings)
+
+
+def row(name: str, time: Seconds, unit: Seconds) -> str:
+    ratio = time.first / unit.first
+    cells = [name, f"{time.first:.2f}", f"{ratio:.1f}", f"{time.repeated * 1e3:.1f}"]
+    line = f"| {' | '.join(cells)} |"
+    print(line, flush=True)
+    return line
+
+
+def table() -> list[str]:
+    unit = in_a_process(HEUN, {})
+    lines = [
+        "| call | first, s | first, of Heun's | repeated, ms |",
+        "|---|---|---|---|",
+        row(HEUN, unit, unit),
+    ]
+    for name in CALLS:
+        if name != HEUN:
+            lines.append(row(name, in_a_process(name, {}), unit))
+    for name in (HEUN, *SOLVES):
+        label = f"{name}, older code generator"
+        lines.append(row(label, in_a_process(name, OLDER_CODE), unit))
+    for name in DEFAULTS:
+        label = f"{name}, second process"
+        lines.append(row(label, in_a_second_process(name), unit))
+    return lines
+
+
+def main() -> None:
+    head = [
+        HEADING,
+        "",
+        f"Processor time for the pendulum with one noise and {STEPS} steps. {machine()}. "
+        "float64. Each row is measured in a process of its own; repeated is the best of "
+        f"{REPEATS} calls with other random keys. The older code generator is XLA's, by "
+        f"`XLA_FLAGS={OLDER_CODE['XLA_FLAGS']}`. A second process finds the programs of a "
+        "first one in JAX's compilation cache. Made by `python -m "
+        "examples.benchmarks.calls`.",
+        "",
+    ]
+    page = DOCS / "speed.md"
+    before, *_ = page.read_text().split(HEADING)
+    section = "\n".join([*head, *table()])
+    page.write_text(f"{before.rstrip()}\n\n{section}\n")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        print(json.dumps(measure(sys.argv[1])))
+    else:
+        main()

@@ -1,0 +1,93 @@
+"""A second call with other numbers compiles nothing, by JAX's own count."""
+
+import jax.numpy as jnp
+import jax.random as jr
+import pytest
+from jax import monitoring
+
+import diffrax_symplectic as ds
+
+from ..ensemble.fused import needs_drjit
+
+
+COMPILED = "/jax/core/compile/backend_compile_duration"
+compiled = []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def listener():
+    def listen(event, duration, **kwargs):
+        if event == COMPILED:
+            compiled.append(kwargs.get("fun_name", ""))
+
+    monitoring.register_event_duration_secs_listener(listen)
+    yield
+    monitoring.unregister_event_duration_listener(listen)
+
+
+def H0(t, p, q, args):
+    return p**2 / 2 + args * q**2
+
+
+def phi(t, y, args):
+    return args * y[1] ** 2
+
+
+# What differs from the first call.
+CHANGES = {
+    "key": dict(key=jr.key(7)),
+    "args": dict(args=jnp.array(0.8)),
+    "y0": dict(y0=(jnp.array(0.2), jnp.array(0.7))),
+    "numbers of Python in y0": dict(y0=(0.2, 0.7)),
+    "t0 and t1": dict(t0=1.0, t1=1.5),
+    "dt0": dict(dt0=0.25, t1=1.0),
+    "friction": dict(friction=jnp.array(0.7)),
+    "temperature": dict(temperature=jnp.array(0.2)),
+    "everything": dict(
+        key=jr.key(8), args=jnp.array(0.3), y0=(jnp.array(0.1), jnp.array(0.2)),
+        t0=0.5, t1=1.5, dt0=0.25, friction=jnp.array(0.1), temperature=jnp.array(3.0),
+    ),
+}  # fmt: skip
+
+
+def call(run, sampling, *, friction=None, temperature=None, **others):
+    friction = jnp.array(0.3) if friction is None else friction
+    temperature = jnp.array(1.0) if temperature is None else temperature
+    terms = ds.langevin_terms(H0, friction, temperature, ())
+    given = dict(
+        t0=0.0, t1=0.5, dt0=0.125, key=jr.key(1), args=jnp.array(0.5),
+        y0=(jnp.array(0.0), jnp.array(1.0)),
+    ) | others  # fmt: skip
+    run(terms=terms, solver=ds.BAOAB(), **sampling, **given)
+
+
+def mean(**kwargs):
+    return ds.expectation(phi, **kwargs)
+
+
+fused = lambda *values: pytest.param(*values, "drjit", marks=needs_drjit)
+RUNS = {
+    "IndependentPaths": (mean, dict(sampling=ds.IndependentPaths(64)), None),
+    "IndependentPaths, fused": fused(mean, dict(sampling=ds.IndependentPaths(64))),
+    "ArrayRQMC": (mean, dict(sampling=ds.ArrayRQMC(64, 2)), None),
+    "ValueFunctions": (
+        mean,
+        dict(sampling=ds.ValueFunctions(degree=2, num_paths=64)),
+        None,
+    ),
+    "ensemble": (ds.ensemble, dict(num_paths=64), None),
+    "ensemble, fused": fused(ds.ensemble, dict(num_paths=64)),
+}
+
+
+@pytest.mark.parametrize("run, sampling, engine", RUNS.values(), ids=RUNS)
+def test_a_call_with_other_numbers_compiles_nothing(run, sampling, engine):
+    sampling = sampling | {"engine": engine}
+    call(run, sampling)
+    anew = {}
+    for name, change in CHANGES.items():
+        compiled.clear()
+        call(run, sampling, **change)
+        if compiled:
+            anew[name] = [*compiled]
+    assert anew == {}
