@@ -343,7 +343,6 @@ def draw(kept: dict) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
-    from matplotlib.lines import Line2D
 
     figure, axes = plt.subplots(5, 3, figsize=(8, 12), layout="constrained")
     every = sorted({solver for rows in kept["weak"].values() for solver in rows})
