@@ -263,8 +263,8 @@ def _warnings_of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]
     else:
         largest = max(float(np.max(x, initial=0.0)) for x in changes)
         rest = (
-            f"the mean is over the other {estimate.num_paths:,}. They could change it by "
-            f"more than its standard error, up to {largest:.1e}, which is part of `error`"
+            "they are left out of the mean, and could change it by more than its standard "
+            f"error, up to {largest:.1e}, which is part of `error`"
         )
     instead = "" if bounded else " or bounded increments, as from a `WeakBrownianPath`,"
     yield (

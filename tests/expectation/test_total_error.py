@@ -77,7 +77,7 @@ def _uniform_unless(lost: float):
 def test_few_failed_paths_are_told_if_they_could_change_more_than_the_standard_error():
     # Of one path in two hundred, 1 / 400 of the mean is missing.
     run = lambda n: ds.monte_carlo(_uniform_unless(0.005), key=KEY, num_paths=n)
-    with pytest.warns(UserWarning, match="paths failed: the mean is over the other"):
+    with pytest.warns(UserWarning, match="paths failed: they are left out"):
         many = run(100_000)
     assert many.std_error < abs(many.mean - 0.5) < many.failed_error < 0.003
     np.testing.assert_allclose(many.error, np.hypot(many.std_error, many.failed_error))
