@@ -80,10 +80,13 @@ def _both(a: Moments, b: Moments) -> Moments:
     )  # fmt: skip
 
 
-def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations levels"]:
+def level_weights(
+    order: float, levels: int
+) -> Float[np.ndarray, "combinations levels"]:
     r"""The combinations of the means with steps $h, h/2, h/4, \ldots$ that an
     [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$. For $L$
-    levels the first eliminates the error terms in $h^p, \ldots, h^{p + L - 2}$. With
+    levels the first eliminates the error terms in $h^p, \ldots, h^{p + L - 2}$, or for
+    $p = 1/2$ those in $h^{1/2}, \ldots, h^{(L - 1)/2}$. With
     $L > 1$ there are two more: the finest level's mean minus the first, and the change by
     the last extrapolation.
 
@@ -98,7 +101,7 @@ def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations le
     return np.stack([best, np.eye(levels)[-1] - best, best - before])
 
 
-def _extrapolated(order: int, levels: int) -> Float[np.ndarray, " levels"]:
-    powers = np.array([0, *range(order, order + levels - 1)])
+def _extrapolated(order: float, levels: int) -> Float[np.ndarray, " levels"]:
+    powers = np.append(0.0, order + min(order, 1) * np.arange(levels - 1))
     system = 2.0 ** -np.outer(powers, np.arange(levels))
     return np.linalg.solve(system, np.eye(levels)[0])
