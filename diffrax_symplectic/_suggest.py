@@ -396,7 +396,7 @@ def random_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
 def is_own(path: diffrax.AbstractBrownianPath) -> bool:
     """Whether this is a path of the user's own class, which need not be a Brownian motion
     (but the paths of this package and of Diffrax are)."""
-    return laws_of(path) is None
+    return laws_of(path) is None and not isinstance(path, UnspecifiedPath)
 
 
 def with_paths(
