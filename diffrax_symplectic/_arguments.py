@@ -120,8 +120,16 @@ def real_array(name: str, value: Any, *, positive: bool, kind: str) -> ArrayLike
         fits = not jnp.iscomplexobj(value)
     if not fits:
         least = "positive" if positive else "not negative"
-        raise ValueError(f"`{name}` must be {kind}, finite and {least}; got {value!r}.")
+        raise ValueError(
+            f"`{name}` must be {kind}, finite and {least}; got {brief(value)}."
+        )
     return value
+
+
+def brief(tree: PyTree) -> str:
+    """Values for messages. Of long arrays only the first and the last ones are shown."""
+    with np.printoptions(threshold=8, edgeitems=2):
+        return str(tree)
 
 
 def shapes(tree: PyTree) -> str:

@@ -26,7 +26,7 @@ from ._suggest import (
     suggest_solver,
     with_paths,
 )
-from ._terms import check_stratonovich, path_numbers
+from ._terms import check_stratonovich, path_numbers, shapes_as_paths
 
 
 # The number of steps of the reference in the smallest compared step. An error of order 1/2
@@ -186,6 +186,7 @@ def compare_solvers(
     """
     dts = _checked_steps(t0, t1, dt0)
     want = "strong" if phi is None else "weak"
+    terms = shapes_as_paths(terms)
     suggestions = suggest_solver(terms, t0, y0, args, want=want)
     reference = suggestions[0].solver if reference is None else reference
     if solvers is None:

@@ -109,6 +109,13 @@ def replaced(term: diffrax.AbstractTerm, new: diffrax.AbstractTerm) -> Any:
     return WrapTerm(new, term.direction) if isinstance(term, WrapTerm) else new
 
 
+def not_a_path(term: diffrax.ControlTerm) -> Any:
+    """What was passed to a `ControlTerm` in place of a path or a function, or `None`."""
+    # Diffrax takes anything that is no path for a function, and wraps it.
+    given = getattr(term.control, "fn", None)
+    return None if callable(given) else given
+
+
 def direction(terms: PyTree[diffrax.AbstractTerm]) -> Any:
     """The sign of the direction of time in the solve that the terms come from. Terms from
     outside a solve run forward."""

@@ -18,7 +18,7 @@ from ._ensemble import fused_plan, FusedPaths, warn_of_stragglers
 from ._expectation import Expectation, ExpectationInterrupted
 from ._expectation._choose import choose, few_paths, MOST, MUCH_LEFT, sorted_paths
 from ._expectation._problem import Problem
-from ._expectation._run import checked_call, Meter, NO_METER, run
+from ._expectation._run import checked_call, Meter, NO_METER, refuse_others, run
 from ._expectation._sampling import AbstractSampling
 from ._expectation._value_functions import ValueFunctions
 from ._suggest import own_path, random_paths, with_paths
@@ -168,12 +168,7 @@ def expectation(
     variances of batches; [Talay and Tubaro
     (1990)](https://doi.org/10.1080/07362999008809220) for extrapolation.
     """
-    if others:
-        raise TypeError(
-            f"`expectation` takes no {', '.join(f'`{name}`' for name in others)}. To use "
-            "events or other arguments of `diffrax.diffeqsolve`, write the solve as a "
-            "function of a random key and average it with `monte_carlo`."
-        )
+    refuse_others("expectation", others)
     given = terms, t0, t1, dt0, y0, args, ts
     key, first, devices = checked_call(
         "expectation", key, tol, start, first, devices, given

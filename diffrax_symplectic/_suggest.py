@@ -55,6 +55,7 @@ from ._terms import (
     path_numbers,
     replace_paths,
     separable_fault,
+    shapes_as_paths,
     split_terms,
     without_constraint,
     WRONG_WAY_ROUND,
@@ -355,6 +356,7 @@ def _suggestion(
 def specified(terms: PyTree, make: Callable) -> PyTree:
     """The terms with `make(shape, key)` in place of each shape of a path. The keys differ:
     each shape is a Brownian motion of its own."""
+    terms = shapes_as_paths(terms)
     is_shape = lambda path: isinstance(path, UnspecifiedPath)
     seeds = itertools.count(0 if all(map(is_shape, brownian_paths(terms))) else _SEED)
     made = lambda shape: make(shape, jr.key(next(seeds)))
@@ -394,7 +396,7 @@ def random_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
 def is_own(path: diffrax.AbstractBrownianPath) -> bool:
     """Whether this is a path of the user's own class, which need not be a Brownian motion
     (but the paths of this package and of Diffrax are)."""
-    return laws_of(path) is None
+    return laws_of(path) is None and not isinstance(path, UnspecifiedPath)
 
 
 def with_paths(

@@ -125,6 +125,14 @@ def test_diffrax_wraps_the_terms_of_a_solve_with_its_direction(terms):
     assert type(turned["drift"]) is type(seen[1])
 
 
+def test_a_control_term_keeps_what_it_was_given_in_place_of_a_path():
+    """If this fails: find where Diffrax keeps it, and adapt `not_a_path`."""
+    field = lambda t, y, args: jnp.ones(3)
+    assert _compat.not_a_path(diffrax.ControlTerm(field, (3,))) == (3,)
+    for path in (ds.WeakBrownianPath((3,), jax.random.key(0)), lambda t0, t1: t1 - t0):
+        assert _compat.not_a_path(diffrax.ControlTerm(field, path)) is None
+
+
 def test_the_terms_that_backsolve_adjoint_solves_are_known(terms):
     """If this fails: find the term of `BacksolveAdjoint`, and adapt `is_adjoint_term`."""
     y0 = jnp.array(0.3), jnp.array(0.7)

@@ -15,7 +15,7 @@ from .._arguments import whole_number
 from .._custom_types import Args, Y
 from .._expectation._monte_carlo import path_keys, with_keys
 from .._expectation._problem import Problem
-from .._expectation._run import checked_call
+from .._expectation._run import checked_call, refuse_others
 from .._solver import Want
 from ._engines import Batch, ENGINES, state_itself, warn_of_stragglers
 from ._layout import sample_key
@@ -81,6 +81,7 @@ def ensemble(
     want: Want = "strong",
     engine: str | None = None,
     batch_size: int | None = None,
+    **others: Any,
 ) -> Ensemble:
     r"""The states of many independent paths, for histograms, spectra, and clouds in phase
     space.
@@ -108,7 +109,8 @@ def ensemble(
     `num_paths`, `batch_size` or `engine`. `ensemble(...).terms(i)` returns terms with these
     keys, for `diffrax.diffeqsolve`, and `ensemble(...).start(i)` the initial state and the
     `args`. Paths are simulated in batches, so that only the returned arrays grow with their
-    number.
+    number. For events along a path, average a solve of your own with
+    [`diffrax_symplectic.monte_carlo`][].
 
     **Noise.** Where `terms` have the shape of a path, the solver makes one with the
     Gaussian increments of a Brownian motion (bounded for implicit solvers), so that every
@@ -143,6 +145,7 @@ def ensemble(
     `PicardNewton` has another tolerance than rounding error, and an `ImportError` if Dr.Jit
     or LLVM is missing. Warns if paths failed, and if many are stragglers.
     """
+    refuse_others("ensemble", others)
     given = terms, t0, t1, dt0, y0, args
     key, _, _ = checked_call("ensemble", key, None, None, 0, None, given)
     num_paths = whole_number("num_paths", num_paths)
@@ -153,7 +156,7 @@ def ensemble(
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
     problem = Problem.of(
-        state_itself, terms, solver, t0, t1, dt0, y0, args, times, 1, want
+        state_itself, terms, solver, t0, t1, dt0, y0, args, times, 1, want, "ensemble"
     )
     if batch_size is None:
         batch_size = _default_size(engine, problem)

@@ -97,11 +97,13 @@ class Combination(enum.IntEnum):
     MISS = 5
 
 
-def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations levels"]:
+def level_weights(
+    order: float, levels: int
+) -> Float[np.ndarray, "combinations levels"]:
     r"""The combinations of the means with steps $h, h/2, h/4, \ldots$ that an
     [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$: the rows of
     `Combination`, as far as $L$ levels have them. The first eliminates the error terms in
-    $h^p, \ldots, h^{p + L - 2}$.
+    $h^p, \ldots, h^{p + L - 2}$, or for $p = 1/2$ those in $h^{1/2}, \ldots, h^{(L - 1)/2}$.
 
     [Talay and Tubaro (1990)](https://doi.org/10.1080/07362999008809220) show that the error
     has an expansion in powers of $h$.
@@ -120,7 +122,7 @@ def level_weights(order: int, levels: int) -> Float[np.ndarray, "combinations le
     return np.stack(rows)
 
 
-def _extrapolated(order: int, levels: int) -> Float[np.ndarray, " levels"]:
-    powers = np.array([0, *range(order, order + levels - 1)])
+def _extrapolated(order: float, levels: int) -> Float[np.ndarray, " levels"]:
+    powers = np.append(0.0, order + min(order, 1) * np.arange(levels - 1))
     system = 2.0 ** -np.outer(powers, np.arange(levels))
     return np.linalg.solve(system, np.eye(levels)[0])

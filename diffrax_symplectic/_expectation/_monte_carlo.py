@@ -88,7 +88,7 @@ def monte_carlo(
     num_paths: int | np.integer,
     batch_size: int | np.integer | None = None,
     levels: int = 1,
-    order: int | None = None,
+    order: float | None = None,
     tol: float | None = None,
     start: Expectation | None = None,
     first: int = 0,
@@ -148,7 +148,7 @@ def monte_carlo(
     - `batch_size`: as for [`diffrax_symplectic.IndependentPaths`][].
     - `levels`: the number of step sizes.
     - `order`: with several levels, the weak order $p$ of the solver for these terms, as
-        returned by `solver.weak_order(terms)`.
+        returned by `solver.weak_order(terms)`; or 1/2 for first-passage times.
     - `key`, `tol`, `start`, `first`, `devices`, `progress_meter`: as for
         [`diffrax_symplectic.expectation`][].
 
@@ -166,9 +166,13 @@ def monte_carlo(
             f"levels={levels!r} and order=None."
         )
     check_takes("fn", fn, *(["key"] if levels == 1 else ["key", "level"]))
-    order = 1 if order is None else whole_number("order", order)
+    # Of events that are checked at the end of a step.
+    is_half = isinstance(order, float) and order == 0.5
+    is_whole = isinstance(order, int | np.integer) and order >= 1
+    if order is not None and not (is_half or is_whole):
+        raise ValueError(f"`order` must be a positive integer, or 1/2; got {order!r}.")
     sampling = IndependentPaths(num_paths, batch_size)
-    sampler = jtu.Partial(_of_function, fn, level_weights(order, levels))
+    sampler = jtu.Partial(_of_function, fn, level_weights(order or 1, levels))
     plan = sampling.plan(sampler, devices)
     with Meter(progress_meter) as meter:
         return run(plan, key, devices, sampling, start, first, tol, meter)

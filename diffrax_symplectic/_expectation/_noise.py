@@ -184,7 +184,16 @@ class Noise(eqx.Module):
         """The state of a solver that starts at step `i`. It is used in fits, which affect
         only the variance; paths carry their own solver state."""
         terms = self._terms(np.zeros(len(self.laws)))
-        return self.problem.init(terms, i, self.level.h, y)
+        state = self.problem.init(terms, i, self.level.h, y)
+
+        # XLA would evaluate what follows from a constant result for all states and outcomes
+        # while compiling: for 6,300 states and 27 outcomes for more than a second, with an
+        # alarm.
+        def hidden(x: Array) -> Array:
+            is_result = jnp.issubdtype(x.dtype, jnp.integer)
+            return jax.lax.optimization_barrier(x) if is_result else x
+
+        return jtu.tree_map(hidden, state)
 
     def _terms(self, x):
         return step_variables(self.problem.terms, self.level.h).terms_with(x)

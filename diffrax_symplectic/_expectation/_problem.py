@@ -16,8 +16,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from .._arguments import (
+    brief,
     check_real,
     check_solver,
+    check_state,
     check_takes,
     parameters,
     whole_number,
@@ -81,10 +83,21 @@ class Problem(eqx.Module):
 
     @staticmethod
     def of(
-        phi, terms, solver, t0, t1, dt0, y0, args, ts, levels, want: Want = "weak"
+        phi,
+        terms,
+        solver,
+        t0,
+        t1,
+        dt0,
+        y0,
+        args,
+        ts,
+        levels,
+        want: Want = "weak",
+        user: str = "expectation",
     ) -> "Problem":
-        """Raises a `ValueError` for bad arguments of `expectation`. `want` is the purpose
-        of the paths that take the place of shapes."""
+        """Raises a `ValueError` for bad arguments of `user`, the function called. `want` is
+        the purpose of the paths that take the place of shapes."""
         levels = whole_number("levels", levels)
         check_solver("solver", solver)
         if isinstance(solver, diffrax.HalfSolver):
@@ -99,8 +112,9 @@ class Problem(eqx.Module):
         args = args if args_of is None else _drawn_args(args_of, jr.key(0))
         y0_of = y0 if callable(y0) else None
         y0 = _state(y0) if y0_of is None else _drawn_state(y0_of, jr.key(1), args)
+        check_state(y0, user)
         if y0_of is None and not all_finite(y0):
-            raise ValueError(f"`y0` must hold finite numbers; got {y0}.")
+            raise ValueError(f"`y0` must hold finite numbers; got {brief(y0)}.")
         start = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
         check_fit(terms, start, y0, args)
         if constraint_of(terms) is not None:
@@ -284,13 +298,14 @@ def _steps(t0, t1, dt0, ts: Sequence | None) -> tuple[np.ndarray, np.integer]:
     whole = np.round(counts)
     if not np.all(np.abs(counts - whole) <= 1e-6 * np.maximum(whole, 1)):
         raise ValueError(
-            "`t1` and each of `ts` must be a whole number of steps after `t0`; got "
-            f"t0={t0}, dt0={dt0}, t1={t1} and ts={ts}. Choose a `dt0` that divides the "
-            "intervals between them."
+            "Choose a `dt0` that divides the intervals between `t0`, `t1` and `ts`: `t1` "
+            "and each of `ts` must be a whole number of steps after `t0`. Got "
+            f"dt0={dt0}, t0={t0}, t1={t1} and ts={brief(times)}."
         )
     if len(times) == 0 or np.any(whole < 0) or np.any(whole > whole[-1]):
         raise ValueError(
-            f"`ts` must hold at least one time, all between `t0` and `t1`; got {ts}."
+            "`ts` must hold at least one time, all between `t0` and `t1`; got "
+            f"{brief(times)}."
         )
     *saved, num_steps = whole.astype(np.int32)
     return np.array(saved), num_steps

@@ -36,7 +36,7 @@ def checked_call(
 ) -> tuple[PRNGKeyArray, int, tuple]:
     """The key as a typed key, the number of the first sample, and the devices. Raises a
     `ValueError` for invalid arguments, and if any array is traced."""
-    _check_untraced((key, others))
+    _check_untraced(f"`{user}`", (key, others))
     check_key(key, user)
     if start is not None and first != 0:
         raise ValueError(
@@ -60,12 +60,22 @@ def checked_call(
     return typed_key(key), first, tuple(devices)
 
 
-def _check_untraced(tree: Any) -> None:
+def _check_untraced(caller: str, tree: Any) -> None:
     if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(tree)):
         raise ValueError(
-            "`expectation` and `monte_carlo` cannot run inside JAX transformations: the "
-            "number of batches depends on values. Call them outside of `jit`, `vmap` and "
-            "`grad`. To differentiate a mean, average gradients with `monte_carlo`."
+            f"{caller} cannot run inside JAX transformations, since batches are collected "
+            "outside of JAX. Call it outside of `jit`, `vmap` and `grad`. To differentiate "
+            "a mean, average gradients with `monte_carlo`."
+        )
+
+
+def refuse_others(user: str, others: dict[str, Any]) -> None:
+    """Raises a `TypeError` for arguments that only a solve takes."""
+    if others:
+        raise TypeError(
+            f"`{user}` takes no {', '.join(f'`{name}`' for name in others)}. To use events "
+            "or other arguments of `diffrax.diffeqsolve`, write the solve as a function of "
+            "a random key and average it with `monte_carlo`."
         )
 
 
@@ -185,7 +195,7 @@ class _Batches:
     def parts(self, running: tuple) -> list[tuple]:
         """The results of each device."""
         # They are traced if a function closes over traced values.
-        _check_untraced(running)
+        _check_untraced("`expectation` or `monte_carlo`", running)
         arrays = jax.device_get(running)
         at = lambda k: jtu.tree_map(lambda x: x[k], arrays)
         return [at(k) for k in range(len(self._devices))]

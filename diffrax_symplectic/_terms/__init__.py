@@ -2,7 +2,7 @@ from ._constraint import constraint_of, refuse_constraint, without_constraint
 from ._controls import controls, drift_driven, noise_driven, outcomes, step_variables
 from ._dependence import acts_elementwise, Dependence
 from ._hamiltonian import evaluated, hamiltonian_terms, has_lifted, IndexedNoise
-from ._hamiltonian import is_hamiltonian
+from ._hamiltonian import is_hamiltonian, shapes_as_paths
 from ._diffrax_langevin import momentum_first
 from ._friction import FrictionAlong
 from ._langevin import bath_terms, friction_apart, langevin_terms, split_friction

@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree, Shaped
 
 from .._arguments import check_pair, check_takes, shapes, whole_number
 from .._brownian import checked_shape, increment_struct, UnspecifiedPath
-from .._compat import ω
+from .._compat import not_a_path, ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike
 from ._constraint import constrained, Constraint
 from ._dependence import Dependence
@@ -108,6 +108,19 @@ def as_path(path: Any) -> diffrax.AbstractBrownianPath:
         f"shape `(m,)`; got {got}. (For a system without noise pass neither `noise` nor "
         "`path`.)"
     )
+
+
+def shapes_as_paths(terms: PyTree) -> PyTree:
+    """The terms with an `UnspecifiedPath` in each `ControlTerm` that has a shape in place
+    of its path."""
+    is_control = lambda x: isinstance(x, diffrax.ControlTerm)
+
+    def with_path(x):
+        if not is_control(x) or (shape := not_a_path(x)) is None:
+            return x
+        return eqx.tree_at(lambda term: term.control, x, as_path(shape))
+
+    return jtu.tree_map(with_path, terms, is_leaf=is_control)
 
 
 class IndexedNoise(eqx.Module):

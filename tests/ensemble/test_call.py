@@ -268,6 +268,7 @@ BAD = [
     (dict(key=3), "needs a random key"),
     (dict(y0=(ONE[0], jnp.array(np.nan))), "`y0` must hold finite numbers"),
     (dict(solver=diffrax.EulerHeun), "`solver` must be a solver"),
+    (dict(y0=ONE[0] + 1j), "`ensemble` needs a state.*`wave_terms.*to_pair"),
 ]
 
 
@@ -278,5 +279,11 @@ def test_bad_arguments_are_refused(kwargs, message):
 
 
 def test_it_is_no_part_of_a_jax_program():
-    with pytest.raises(ValueError, match="cannot run inside JAX transformations"):
+    with pytest.raises(ValueError, match="^`ensemble` cannot run inside JAX"):
         eqx.filter_jit(lambda q: follow(y0=(ONE[0], q)).ys)(ONE[1])
+
+
+def test_events_lead_to_monte_carlo():
+    event = diffrax.Event(lambda t, y, args, **kwargs: y[0] > 1)
+    with pytest.raises(TypeError, match="`ensemble` takes no `event`.*`monte_carlo`"):
+        follow(event=event)

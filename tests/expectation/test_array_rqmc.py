@@ -259,6 +259,7 @@ def test_equal_paths_are_one_brownian_motion():
         ("must take fixed steps", dict(solver=diffrax.HalfSolver(diffrax.Heun()))),
         ("`dt0` must be a number", dict(dt0=None)),
         ("`y0` must hold finite", dict(y0=(jnp.array(jnp.nan), jnp.array(0.0)))),
+        ("`expectation` needs a state.*`wave_terms.*to_pair", dict(y0=jnp.array(1j))),
     ],
 )
 def test_bad_input_is_told_what_to_pass(message, kwargs):

@@ -1,11 +1,14 @@
 """A second call with other numbers compiles nothing, by JAX's own count."""
 
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import pytest
 from jax import monitoring
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation._noise import Noise
+from diffrax_symplectic._expectation._problem import Problem
 
 from ..ensemble.fused import needs_drjit
 
@@ -91,3 +94,26 @@ def test_a_call_with_other_numbers_compiles_nothing(run, sampling, engine):
         if compiled:
             anew[name] = [*compiled]
     assert anew == {}
+
+
+def test_xla_does_not_know_the_result_before_a_step_of_a_fit():
+    """It would evaluate what follows from it for all states while compiling, for more than
+    a second with an alarm from `slow_operation_alarm`, where there are many states."""
+    H = lambda t, p, q, args: (p**2 + q**2) / 2
+    terms = ds.hamiltonian_terms(H, H, ())
+    y0 = jnp.array(0.0), jnp.array(1.0)
+    problem = Problem.of(
+        lambda t, y, args: y[1],
+        terms,
+        ds.ImplicitMidpoint(),
+        0,
+        1,
+        0.5,
+        y0,
+        None,
+        None,
+        1,
+    )
+    noise = Noise.of(problem, problem.level(0))
+    program = jax.jit(lambda y: noise.fresh(0, y)).lower(y0).as_text()
+    assert "optimization_barrier" in program

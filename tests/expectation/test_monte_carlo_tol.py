@@ -138,6 +138,17 @@ def test_a_path_fails_if_it_does_on_one_of_the_levels():
     np.testing.assert_allclose(got.mean, np.mean(x[x >= 0.5]) * 7 / 3, rtol=1e-12)
 
 
+def test_an_order_of_one_half_removes_powers_of_the_root_of_the_step():
+    def phi(key, level):
+        h = 0.5**level
+        return jr.uniform(key) + 3 * jnp.sqrt(h) - 2 * h
+
+    got = ds.monte_carlo(phi, key=jr.key(1), num_paths=64, levels=3, order=0.5)
+    exact = ds.monte_carlo(jr.uniform, key=jr.key(1), num_paths=64)
+    np.testing.assert_allclose(got.mean, exact.mean, rtol=1e-12)
+    np.testing.assert_allclose(got.bias, 3 * 0.5 - 2 * 0.25, rtol=1e-12)
+
+
 def test_one_word_for_a_tolerance_that_was_not_reached():
     with pytest.warns(UserWarning, match="`tol=1e-06` was not reached: .* 100 paths"):
         got = ds.monte_carlo(jr.normal, key=jr.key(0), num_paths=100, tol=1e-6)
@@ -152,6 +163,7 @@ def test_one_word_for_a_tolerance_that_was_not_reached():
         (dict(levels=0), "`levels` must be a positive integer"),
         (dict(levels=2), "the weak order of the solver"),
         (dict(levels=2, order=0), "`order` must be a positive integer"),
+        (dict(levels=2, order=1.5), "`order` must be a positive integer, or 1/2"),
     ],
 )
 def test_bad_tolerances_and_levels_are_refused(kwargs, message):

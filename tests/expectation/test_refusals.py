@@ -74,6 +74,31 @@ def test_arguments_of_other_solves_lead_to_monte_carlo():
         _mean(path, event=diffrax.Event(lambda t, y, args, **kwargs: y[0] > 1))
 
 
+def test_times_between_steps_are_told_in_few_words_with_the_advice_first():
+    path = ds.WeakBrownianPath((), jr.key(0))
+    with pytest.raises(ValueError, match="^Choose a `dt0`") as info:
+        _mean(path, ts=np.linspace(0, 1, 1000))
+    assert len(str(info.value)) < 300
+    with pytest.raises(ValueError, match="all between `t0` and `t1`") as info:
+        _mean(path, ts=np.linspace(0, 2, 21))
+    assert len(str(info.value)) < 200
+
+
+def test_a_control_term_may_have_the_shape_of_its_path():
+    field = lambda t, y, args: jnp.array([[1.0, 2.0, 2.0]])
+    drift = diffrax.ODETerm(lambda t, y, args: -y)
+    terms_with = lambda path: diffrax.MultiTerm(drift, diffrax.ControlTerm(field, path))
+    mean = lambda path: ds.expectation(
+        lambda t, y, args: y[0] ** 2, terms_with(path), ds.SRKw5(), 0, 1, 0.5,
+        jnp.zeros(1), key=jr.key(0), sampling=ds.IndependentPaths(16),
+    )  # fmt: skip
+    assert mean((3,)).std_error > 0
+    suggestions = ds.suggest_solver(terms_with((3,)), 0.0, jnp.zeros(1), want="weak")
+    assert suggestions[0].solver == ds.AdditiveGauss()
+    with pytest.raises(ValueError, match="or its shape `.m,.`; got a list"):
+        mean([3])
+
+
 def test_functions_that_close_over_traced_values_have_no_estimate():
     mean = lambda size: ds.monte_carlo(
         lambda key: size * jr.normal(key), key=jr.key(0), num_paths=2
