@@ -131,7 +131,8 @@ def expectation(
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
         default only `t1`.
     - `levels`: the number of step sizes, each half the previous one. With one level the
-        discretization error is unknown, and not part of `std_error`.
+        discretization error is unknown, and not part of `std_error`. With three or more,
+        the result is checked against the solver's order: see `Expectation.error`.
     - `tol`: no further batch starts once every standard error is at most `tol`. The number
         of samples in `sampling` is then an upper limit.
     - `start`: an earlier estimate to continue. It must come from the same `key` and the
@@ -156,11 +157,11 @@ def expectation(
     other shapes or more paths, terms without noise, and for paths that `sampling` cannot
     use (the message names suitable ones); a
     [`diffrax_symplectic.ExpectationInterrupted`][] holding the estimate so far, on a
-    keyboard interrupt. Warns if `tol` was not reached, if more than one path in a hundred
-    failed, if a few samples account for most of the variance, if a fit was dropped or takes
-    long, if all samples are equal or underflow, if `phi` is not smooth and a trial with
-    Gaussian increments has another mean than discrete ones, and if rounding in single
-    precision may exceed the standard error.
+    keyboard interrupt. Warns if `tol` was not reached, if failed paths could change the
+    mean by more than the standard error, if a few samples account for most of the variance,
+    if a fit was dropped or takes long, if all samples are equal or underflow, if `phi` is
+    not smooth and a trial with Gaussian increments has another mean than discrete ones, and
+    if rounding in single precision may exceed the standard error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and
@@ -212,7 +213,9 @@ def expectation(
             raise KeyboardInterrupt from None
         reason = "; ".join(filter(None, (choice, reason, plan.reason)))
         reason = reason if start is None else start.reason
-        plan = plan._replace(reason=reason, roundings=problem.max_steps)
+        plan = plan._replace(
+            reason=reason, roundings=problem.max_steps, bounded=problem.bounded
+        )
         if start is not None and tol is None and plan.num_samples == MOST:
             # Without `tol` the number of samples stays as it was.
             used = start.moments[-1].end - start.moments[0].begin

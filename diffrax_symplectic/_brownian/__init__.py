@@ -14,5 +14,10 @@ from .paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
 from .random import AbstractLaw, check_key, derived_key, Discrete, is_key
 from .random import random_words, THREE_POINT, typed_key
 from .levy_area import LevyAreaBrownianPath, LevyAreaIncrement
-from .wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPath
+from .wrappers import (
+    has_bounded_increments,
+    PlateauBrownianPath,
+    PlateauIncrement,
+    TruncatedBrownianPath,
+)
 from .variables import drives, most_demanding, path_of, VARIABLES

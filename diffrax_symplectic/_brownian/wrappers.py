@@ -13,6 +13,7 @@ from .paths import WeakBrownianPath
 from .random import (
     AbstractLaw,
     check_key,
+    Discrete,
     place_of,
     PLATEAU_WORDS,
     random_words,
@@ -38,6 +39,14 @@ def require_space_time_area(path: diffrax.AbstractBrownianPath, wrapper: str) ->
             "`FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`; got "
             f"{type(path).__name__} with {area.__name__}."
         )
+
+
+def has_bounded_increments(path: diffrax.AbstractBrownianPath) -> bool:
+    """Whether the increments of a path are known to be bounded."""
+    if isinstance(path, TruncatedBrownianPath):
+        return True
+    laws = laws_of(path)
+    return laws is not None and all(isinstance(x, Discrete) for x in laws.values())
 
 
 class TruncatedBrownianPath(AbstractWrappedPath):

@@ -171,7 +171,7 @@ def ensemble(
     joined = _joined(batches, num_paths, at_end=ts is None)
     saved = np.asarray(problem.levels.saved_steps[0])
     at = float(problem.t0) + saved * float(problem.levels.h[0])
-    _warn_of(joined)
+    _warn_of(joined, problem.bounded)
     return Ensemble(at, *joined, engine, problem, key)
 
 
@@ -193,14 +193,14 @@ def _joined(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
     return Batch(y, failed, sum(b.stragglers for b in batches))
 
 
-def _warn_of(joined: Batch) -> None:
+def _warn_of(joined: Batch, bounded: bool) -> None:
     count, lost = len(joined.failed), int(np.sum(joined.failed))
     if lost > 0:
+        instead = "" if bounded else " or bounded increments (a `WeakBrownianPath`),"
         warnings.warn(
             f"{lost:,} of {count:,} paths failed. Their states are NaN: select the others "
-            "with `~failed`. Take smaller steps or bounded increments (a "
-            "`WeakBrownianPath` has them), and look for NaNs in `y0`, `args` and the "
-            "Hamiltonians.",
+            f"with `~failed`. Take smaller steps{instead} and look for NaNs in `y0`, "
+            "`args` and the Hamiltonians.",
             stacklevel=3,
         )
     warn_of_stragglers(joined.stragglers, lost, count, stacklevel=3)

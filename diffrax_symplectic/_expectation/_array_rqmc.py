@@ -26,6 +26,7 @@ from .._custom_types import Y
 from .._terms import brownian_paths, path_numbers, replace_paths
 from ._fits import Functions
 from ._points import hilbert_order, num_seeds, randomized, sobol_points
+from ._polynomials import tensordot
 from ._problem import numbers, Problem
 from ._run import run
 from ._sampling import AbstractSampling, Plan, ROUNDING, Samples
@@ -166,16 +167,19 @@ def _replicates(
         return step, paths
 
     saved, failed, _ = simulate(p, begin, _mean_of_good)
-    means, heavy = jnp.moveaxis(saved[:, :, :, None], 2, 0)
+    means, heavy, largest = jnp.moveaxis(saved[:, :, :, None], 2, 0)
     means = p.combined(means)
     # The largest over all levels.
     heavy = jnp.broadcast_to(jnp.max(heavy, axis=0), means.shape)
-    return Samples(p.averaged([means, heavy]), jnp.ones(1, bool), jnp.sum(failed)[None])
+    # A path may fail on any level.
+    largest = tensordot(jnp.abs(p.weights).astype(largest.dtype), largest, 1)
+    kinds = [means, heavy, largest]
+    return Samples(p.averaged(kinds), jnp.ones(1, bool), jnp.sum(failed)[None])
 
 
-def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "2 ..."]:
-    """The mean over the paths that have not failed, and the `r` of these paths as in
-    `Expectation.std_error`."""
+def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "3 ..."]:
+    """The mean over the paths that have not failed, the `r` of these paths as in
+    `Expectation.std_error`, and the largest deviation of one of them."""
     keep = along(~failed, x)
     count = jnp.sum(~failed).astype(x.dtype)
 
@@ -194,7 +198,7 @@ def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "2 ..."]:
     # Rounding errors can have heavy tails, too.
     some = most > ROUNDING * jnp.finfo(x.dtype).eps * jnp.abs(own)
     r = jnp.where(some, beyond / (s * jnp.sqrt(count)), 0)
-    return jnp.stack([own, r])
+    return jnp.stack([own, r, most])
 
 
 class Layout(NamedTuple):

@@ -12,14 +12,20 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from ._moments import joined, Moments, total
-from ._sampling import ROUNDING
+from ._moments import Combination, joined, Moments, total
+from ._sampling import KINDS_OF_REPLICATES, KINDS_WITH_CONTROL, ROUNDING
 from ._saved import arrays_of, described, rebuilt
 
 
 # A control variate is dropped if its mean is this many standard errors from zero, unless
 # its own `r` exceeds this value.
 _SURE, _HEAVY_CONTROL = 5, 0.1
+# The last change by a smaller step, over what the order foretells from the change before.
+# In between, the steps are taken to be in the asymptotic range. (Of half an order less it
+# would be 1.41, of two orders more 0.25.)
+_FASTEST, _SLOWEST = 0.25, 1.33
+# The standard errors by which it may be off.
+_BY_CHANCE = 2
 # NumPy operations on zero-dimensional arrays return scalars.
 _Host = PyTree[np.ndarray | np.floating]
 
@@ -79,7 +85,7 @@ class Expectation(eqx.Module):
         r"""The estimate, in the structure of $\phi$ and in float64: the mean over the
         samples, extrapolated to step size zero if there are several levels. With `ts` there
         is a leading axis of times. NaN without samples."""
-        return self._each("mean", 0)
+        return self._each("mean", Combination.BEST)
 
     @property
     def std_error(self) -> _Host:
@@ -96,42 +102,79 @@ class Expectation(eqx.Module):
         part of the mean absolute deviation that only paths show whose noise is wider or
         pushed to one side; otherwise it is zero. The standard error is never less than the
         rounding of the mean."""
-        return self._each("std_error", 0)
+        return self._each("std_error", Combination.BEST)
 
     @property
     def variance(self) -> _Host:
         """The variance of a sample."""
-        return self._each("variance", 0)
+        return self._each("variance", Combination.BEST)
 
     @property
     def bias(self) -> _Host | None:
         r"""The discretization error of the finest level, $\mathbb E[\phi_h] - \mathbb
         E[\phi]$, as estimated by extrapolation; `None` with a single level. It has already
         been removed from `mean`: `mean + bias` is the mean of the finest level."""
-        return self._each("mean", 1)
+        return self._each("mean", Combination.BIAS)
 
     @property
     def bias_std_error(self) -> _Host | None:
         """The standard error of `bias`."""
-        return self._each("std_error", 1)
+        return self._each("std_error", Combination.BIAS)
 
     @property
     def error(self) -> _Host:
-        """The total error of `mean`: the root of the sum of squares of `std_error` and,
-        with several levels, of the change by the last extrapolation. The remaining
-        discretization error is of higher order in the step size, and usually smaller. With
-        one level the discretization error is unknown, and this is `std_error`."""
-        change = self._each("mean", 2)
-        if change is None:
-            return self.std_error
-        return jtu.tree_map(np.hypot, self.std_error, change)
+        r"""The total error of `mean`: the root of the sum of squares of `std_error`,
+        `failed_error` and, with several levels, an estimate of the remaining discretization
+        error.
+
+        That is the change by the last extrapolation. With two levels it is unchecked, and
+        may be far too small where the steps are too long. With three or more, the changes
+        of the mean by the last two halvings of the step are compared: for a method of order
+        $p$ the last one should be $2^{-p}$ of the one before. If it is less than a quarter
+        of that, or more than four thirds, by more than two standard errors, then the larger
+        of these changes is taken instead, and the printed estimate says so.
+
+        With one level the discretization error is unknown, and not included."""
+        error = jtu.tree_map(np.hypot, self.std_error, self.failed_error)
+        remaining = self._each("mean", Combination.EXTRAPOLATION)
+        if remaining is None:
+            return error
+        if self.off_order is not None:
+            last = self._each("mean", Combination.LAST)
+            before = self._each("mean", Combination.BEFORE)
+            trees = self.off_order, remaining, last, before
+            remaining = jtu.tree_map(_remaining, *trees)
+        return jtu.tree_map(np.hypot, error, remaining)
+
+    @property
+    def failed_error(self) -> _Host:
+        """What failed paths could change in `mean`: their fraction of all paths, times the
+        largest deviation of another path's value from the mean. (For sorted paths, that is
+        the mean over the replicates.) It does not decrease with more paths."""
+        lost = self.num_failed
+        # Replicates count the paths that failed in them, too.
+        whole = self.num_paths + (lost if self.paths_per_sample == 1 else 0)
+        fraction = lost / max(whole, 1)
+        spread = self._each("spread", Combination.BEST)
+        return jtu.tree_map(lambda x: fraction * x, spread)
+
+    @property
+    def off_order(self) -> PyTree[np.ndarray] | None:
+        """Whether the changes of the mean from step to step do not fit the order, as in
+        `error`; `None` with fewer than three levels."""
+        last = self._each("mean", Combination.LAST)
+        if last is None:
+            return None
+        miss = self._each("mean", Combination.MISS)
+        miss_error = self._each("std_error", Combination.MISS)
+        return jtu.tree_map(_is_off_order, last, miss, miss_error)
 
     def interval(self, confidence: float = 0.95) -> tuple[_Host, _Host]:
         r"""The ends of a confidence interval for the mean of infinitely many samples:
         `mean` plus and minus `std_error` times the quantile of Student's $t$ with
         `num_samples - 1` degrees of freedom. (For 95% this is 2.13 standard errors with 16
         samples, and 1.96 with very many.) The remaining discretization error is not
-        included: see `error`."""
+        included, nor are failed paths: see `error`."""
         # Imported here: it would double the time to import this package.
         from scipy.special import stdtrit
 
@@ -218,29 +261,48 @@ class Expectation(eqx.Module):
 
     def __str__(self) -> str:
         leaves = jtu.tree_leaves_with_path(self.mean)
+        several = self.bias is not None
         trees = [self.mean, self.std_error, self.error]
-        if self.bias is not None:
+        if several:
             trees += [self.bias, self.bias_std_error]
         lines, biases = [], []
         for (path, _), *row in zip(leaves[:6], *map(jtu.tree_leaves, trees)):
             mean, error, whole, *bias = row
             line = f"{_with_digits(mean, error)} ± {_brief(error)}"
-            if bias:
+            if several or self.num_failed > 0:
                 line += f" (sampling), {_brief(whole)} (total)"
+            if several:
                 biases.append(" ± ".join(map(_brief, bias)))
             lines.append(f"{jtu.keystr(path)}: {line}" if len(leaves) > 1 else line)
         lines += ["..."] * (len(leaves) > 6)
         if biases:
             lines.append(f"bias of the finest step (removed): {', '.join(biases)}")
+            lines += self._said_of_levels()
         elif self.sampling is not None:
             lines.append("not included: the discretization error (see `levels`)")
         how = "" if self.sampling is None else f", {self.sampling}"
         lines.append(f"{self.num_paths:,} paths, {self.num_failed:,} failed{how}")
+        if self.num_failed > 0:
+            each = map(_brief, jtu.tree_leaves(self.failed_error)[:6])
+            lines.append(f"failed paths could change the mean by {', '.join(each)}")
         lines += [self.reason] if self.reason else []
         lines += ["`tol` was not reached"] if self.tol_reached is False else []
         return "\n".join(lines)
 
     __repr__ = __str__
+
+    def _said_of_levels(self) -> list[str]:
+        """What the printed estimate says of the discretization error that remains."""
+        if self.off_order is None:
+            return [
+                "unchecked: what remains of the discretization error (pass `levels=3`)"
+            ]
+        if any(np.any(x) for x in jtu.tree_leaves(self.off_order)):
+            return [
+                "the changes from step to step do not fit the order: the total error is "
+                "the larger one (take smaller steps)"
+            ]
+        return []
 
     def _each(self, name: str, combination: int) -> Any:
         """A result for each leaf, or `None` if there is no such combination of levels."""
@@ -256,7 +318,7 @@ class Expectation(eqx.Module):
     @property
     def plain_std_error(self) -> _Host:
         """The standard error without a control variate."""
-        return self._each("plain_std_error", 0)
+        return self._each("plain_std_error", Combination.BEST)
 
     @property
     def heaviest(self) -> float:
@@ -269,7 +331,7 @@ class Expectation(eqx.Module):
         return self._largest("dropped") > 0
 
     def _largest(self, name: str) -> float:
-        each = jtu.tree_leaves(self._each(name, 0))
+        each = jtu.tree_leaves(self._each(name, Combination.BEST))
         return max((float(np.max(x, initial=0.0)) for x in each), default=0.0)
 
 
@@ -287,6 +349,24 @@ def _brief(x) -> str:
     return np.array2string(np.asarray(x), formatter=short, threshold=6)
 
 
+@np.errstate(invalid="ignore")
+def _is_off_order(last, miss, miss_error) -> np.ndarray:
+    """Whether the last change is not what the order makes of the change before."""
+    foretold = last - miss
+    ends = np.stack([_FASTEST * foretold, _SLOWEST * foretold])
+    allowed = _BY_CHANCE * miss_error
+    low = np.min(ends, axis=0) - allowed
+    high = np.max(ends, axis=0) + allowed
+    return (last < low) | (last > high)
+
+
+def _remaining(off_order, extrapolation, last, before) -> np.ndarray:
+    """An estimate of the discretization error that remains."""
+    size = np.abs(extrapolation)
+    largest = np.maximum(np.abs(last), np.abs(before))
+    return np.where(off_order, np.maximum(size, largest), size)
+
+
 @np.errstate(all="ignore")
 def _results(
     n: int, roundings: int, mean, norm, largest, dtype: str, far
@@ -296,14 +376,17 @@ def _results(
     s = norm / np.sqrt(n - 1) if n > 1 else np.full_like(norm, np.nan)
     outlying = np.maximum(largest - s * np.sqrt(4.5 * np.log(max(n, 2))), 0)
     r = np.where(s > 0, outlying / (s * np.sqrt(n)), 0)
-    controlled = len(mean) > 2
+    controlled = len(mean) == KINDS_WITH_CONTROL
+    # The largest deviation of a path without control.
+    spread = largest[int(controlled)]
     # Combinations of levels are differences of values as large as the mean.
     size = np.fmax.reduce(np.abs(mean[: 1 + controlled, :1]))
     rounding = roundings * float(jnp.finfo(dtype).eps) * size
     # Rounding errors can have heavy tails, too.
     r = np.where(largest > ROUNDING * rounding, r, 0)
-    if len(mean) == 2:
+    if len(mean) == KINDS_OF_REPLICATES:
         r[0] = np.fmax(r[0], mean[1])
+        spread = mean[2]
     r = np.minimum(r, 1 - 1e-6)
     error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
     error = np.maximum(error, rounding)
@@ -325,6 +408,7 @@ def _results(
         "variance": best(s) ** 2,
         "weight": best(r),
         "dropped": dropped,
+        "spread": spread,
     }
 
 

@@ -1,6 +1,7 @@
 """Means and variances of batches of samples, their combination, and their weights in
 extrapolation."""
 
+import enum
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -80,15 +81,30 @@ def _both(a: Moments, b: Moments) -> Moments:
     )  # fmt: skip
 
 
+class Combination(enum.IntEnum):
+    """The rows of `level_weights`."""
+
+    # Extrapolated to step size zero.
+    BEST = 0
+    # With two levels or more: the finest level's mean minus the best, and the change by the
+    # last extrapolation.
+    BIAS = 1
+    EXTRAPOLATION = 2
+    # With three levels or more: the changes to the last level and to the one before, and
+    # the former minus what the order foretells from the latter.
+    LAST = 3
+    BEFORE = 4
+    MISS = 5
+
+
 def level_weights(
     order: float, levels: int
 ) -> Float[np.ndarray, "combinations levels"]:
     r"""The combinations of the means with steps $h, h/2, h/4, \ldots$ that an
-    [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$. For $L$
-    levels the first eliminates the error terms in $h^p, \ldots, h^{p + L - 2}$, or for
-    $p = 1/2$ those in $h^{1/2}, \ldots, h^{(L - 1)/2}$. With
-    $L > 1$ there are two more: the finest level's mean minus the first, and the change by
-    the last extrapolation.
+    [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$: the rows of
+    `Combination`, as far as $L$ levels have them. The first eliminates the error terms in
+    $h^p, \ldots, h^{p + L - 2}$, or for $p = 1/2$ the terms in
+    $h^{1/2}, \ldots, h^{(L - 1)/2}$.
 
     [Talay and Tubaro (1990)](https://doi.org/10.1080/07362999008809220) show that the error
     has an expansion in powers of $h$.
@@ -98,7 +114,13 @@ def level_weights(
         return best[None]
     # The finer levels alone, which eliminate one power of the step size less.
     before = np.append(0.0, _extrapolated(order, levels - 1))
-    return np.stack([best, np.eye(levels)[-1] - best, best - before])
+    own = np.eye(levels)
+    rows = [best, own[-1] - best, best - before]
+    if levels > 2:
+        last = own[-1] - own[-2]
+        change_before = own[-2] - own[-3]
+        rows += [last, change_before, last - 2.0**-order * change_before]
+    return np.stack(rows)
 
 
 def _extrapolated(order: float, levels: int) -> Float[np.ndarray, " levels"]:

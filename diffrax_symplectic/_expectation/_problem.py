@@ -24,7 +24,7 @@ from .._arguments import (
     parameters,
     whole_number,
 )
-from .._brownian import is_random
+from .._brownian import has_bounded_increments, is_random
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from .._root_finder import all_finite
 from .._solver import AbstractSymplecticSolver, check_resolution, Want
@@ -225,6 +225,11 @@ class Problem(eqx.Module):
         averaged = jax.eval_shape(lambda: self.averaged([zeros] * kinds))
         one = lambda s: jax.ShapeDtypeStruct((*s.shape[:2], *s.shape[3:]), s.dtype)
         return jtu.tree_map(one, averaged)
+
+    @property
+    def bounded(self) -> bool:
+        """Whether the increments of all paths are known to be bounded."""
+        return all(has_bounded_increments(path) for path in brownian_paths(self.terms))
 
     @property
     def dtype_of_values(self) -> Any:

@@ -22,11 +22,9 @@ from .._brownian import check_key, typed_key
 from .._compat import quickly_compiled
 from ._estimate import Expectation, ExpectationInterrupted
 from ._moments import joined, Moments, total
-from ._sampling import Plan, Samples
+from ._sampling import KINDS_WITH_CONTROL, Plan, Samples
 
 
-# If a larger fraction of the paths fails, there is a warning.
-_MANY = 0.01
 # With an `r` of `std_error` above this, means of exp(5 x) with normal x were off by forty
 # standard errors, and means of exp(3 x) by five.
 _HEAVY = 0.35
@@ -152,7 +150,7 @@ def run(
         raise ExpectationInterrupted(_finished(estimate, plan.least, tol)) from None
     estimate = _finished(estimate, plan.least, tol)
     if meter is not None:
-        for message in _warnings(estimate, tol):
+        for message in _warnings(estimate, tol, plan.bounded):
             warnings.warn(message, stacklevel=3)
     return estimate
 
@@ -249,16 +247,9 @@ def _moments(part, begin: int, end: int, dtypes) -> Moments:
     return Moments(*numbers, mean, norm, largest, size, dtypes)
 
 
-def _warnings(estimate: Expectation, tol: float | None) -> Iterator[str]:
-    done, lost = estimate.num_paths, estimate.num_failed
-    if lost > _MANY * (done + lost):
-        rest = f"the mean is over the other {done:,}, and biased"
-        rest = rest if done else "there is no mean"
-        yield (
-            f"{lost:,} paths failed: {rest}. Take smaller steps or bounded increments, as "
-            "from a `WeakBrownianPath`, and look for NaNs in `y0`, `args` and the "
-            "Hamiltonians."
-        )
+def _warnings(estimate: Expectation, tol: float | None, bounded: bool) -> Iterator[str]:
+    if estimate.num_failed > 0:
+        yield from _warnings_of_failures(estimate, bounded)
     if estimate.num_samples > 1:
         yield from _warnings_of_spread(estimate)
     if estimate.tol_reached is False:
@@ -269,6 +260,27 @@ def _warnings(estimate: Expectation, tol: float | None) -> Iterator[str]:
             f"after {estimate.num_paths:,} paths. Take more paths, continuing with "
             "`start=`, or another `sampling`."
         )
+
+
+def _warnings_of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
+    changes = jtu.tree_leaves(estimate.failed_error)
+    errors = jtu.tree_leaves(estimate.std_error)
+    # Without samples both are NaN.
+    if all(np.all(change <= error) for change, error in zip(changes, errors)):
+        return
+    if estimate.num_samples == 0:
+        rest = "there is no mean"
+    else:
+        largest = max(float(np.max(x, initial=0.0)) for x in changes)
+        rest = (
+            "they are left out of the mean, and could change it by more than its standard "
+            f"error, up to {largest:.1e}, which is part of `error`"
+        )
+    instead = "" if bounded else " or bounded increments, as from a `WeakBrownianPath`,"
+    yield (
+        f"{estimate.num_failed:,} paths failed: {rest}. Take smaller steps{instead} and "
+        "look for NaNs in `y0`, `args` and the Hamiltonians."
+    )
 
 
 def _warnings_of_spread(estimate: Expectation) -> Iterator[str]:
@@ -294,7 +306,8 @@ def _warnings_of_spread(estimate: Expectation) -> Iterator[str]:
     whole = total(estimate.moments)
     kinds = zip(jtu.tree_leaves(whole.size), jtu.tree_leaves(whole.dtypes))
     # The values without control.
-    low = [dtype for x, dtype in kinds if np.max(x[int(len(x) > 2), 0]) < _least(dtype)]
+    plain = lambda x: x[int(len(x) == KINDS_WITH_CONTROL), 0]
+    low = [dtype for x, dtype in kinds if np.max(plain(x)) < _least(dtype)]
     if low:
         yield (
             f"A component is zero, or underflows {low[0]}, on all paths. If it "

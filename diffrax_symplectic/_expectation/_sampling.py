@@ -12,16 +12,20 @@ from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
 
 # Deviations up to this many roundings of the mean count as rounding errors.
 ROUNDING = 1e3
+# The kinds of values of a sample that is a replicate of many paths, and of one with a
+# control variate.
+KINDS_OF_REPLICATES = 3
+KINDS_WITH_CONTROL = 4
 
 
 class Samples(eqx.Module):
     """The values to average, with leading axes for kinds, combinations of levels, and
     samples; which samples are good; and how many paths failed in each.
 
-    The first kind is the estimate. Replicates of many paths have a second one, which
-    measures how heavy their tails are: `r` of `Expectation.std_error`. With a control
-    variate there are four kinds: with the control, without it, the control itself, and the
-    deviations in the tails.
+    The first kind is the estimate. Replicates of many paths have two more: `r` of
+    `Expectation.std_error`, which measures how heavy their tails are, and the largest
+    deviation of a path. With a control variate there are four kinds: with the control,
+    without it, the control itself, and the deviations in the tails.
     """
 
     values: PyTree[Array]
@@ -43,6 +47,7 @@ class Plan(NamedTuple):
     - `shapes`: the shapes of the values of one sample, if they are known without a trace.
     - `quick`: whether the samples take less time than compiling their program, so that it
         is compiled for speed of compilation.
+    - `bounded`: whether the increments of all paths are known to be bounded.
     - `far`, `roundings`: as in `Expectation`.
     - `paths_of`: for paths computed outside JAX, maps the number of the first sample and
         the number of samples to an argument that the sampler takes before the keys.
@@ -57,6 +62,7 @@ class Plan(NamedTuple):
     left: float = 0.0
     shapes: PyTree | None = None
     quick: bool = False
+    bounded: bool = False
     far: PyTree[np.ndarray] | None = None
     roundings: int = 1
     paths_of: Callable[[int, int], Any] | None = None

@@ -29,7 +29,13 @@ from ._noise import Noise
 from ._polynomials import num_polynomials
 from ._problem import Problem
 from ._run import run
-from ._sampling import AbstractSampling, Plan, ROUNDING, Samples
+from ._sampling import (
+    AbstractSampling,
+    KINDS_WITH_CONTROL,
+    Plan,
+    ROUNDING,
+    Samples,
+)
 from ._steps import along, Paths, simulate
 
 
@@ -44,8 +50,6 @@ _GRID, _GRID_SIZES, _MOST_ENDS, _MOST = 2, (64, 32), 50_000, 2**25
 _MOST_MEMORY, _OUT_OF_PROPORTION = 4 * 2**30, 2**31
 # The number folded into the key of trials, and the number of batches with wider noise.
 _TRIAL, _WIDE = 0xFFFFFFFE, 2
-# The kinds of values of a sample with a control variate.
-_KINDS = 4
 # The most noises of which paths are pushed to all sides.
 _MOST_NOISES = 2
 
@@ -96,7 +100,7 @@ class ValueFunctions(AbstractSampling):
     def prepare(self, problem, key, devices):
         basis, (times, m) = _basis(problem, self.degree), problem.num_outputs
         functions, shape = _fits(problem, key, basis), (len(problem.weights), times, m)
-        shapes = problem.shapes_of_samples(_KINDS)
+        shapes = problem.shapes_of_samples(KINDS_WITH_CONTROL)
         never = np.zeros(shape), np.full(shape, np.inf)
         narrow, *wider = _wider(problem)
 

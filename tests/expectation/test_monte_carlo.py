@@ -97,7 +97,7 @@ def test_failed_paths_are_counted_and_left_out():
         value = jnp.where(x > 0.9, jnp.nan, x)
         return value, diffrax.RESULTS.where(x < 0.2, bad, ok)
 
-    with pytest.warns(UserWarning, match=r"paths failed: the mean is over the other"):
+    with pytest.warns(UserWarning, match=r"paths failed: they are left out"):
         got = ds.monte_carlo(phi, key=jr.key(0), num_paths=5000, batch_size=999)
     x = np.asarray(_by_hand(jr.uniform, jr.key(0), 5000))
     good = x[(x >= 0.2) & (x <= 0.9)]

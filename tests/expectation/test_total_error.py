@@ -1,0 +1,131 @@
+"""The total error of an estimate contains what remains of the discretization error, and
+what failed paths could change."""
+
+import warnings
+
+import diffrax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+
+KEY = jr.key(0)
+# <p q> of an oscillator with friction 0.01 at temperature 1, at t = 500 from (0, 2).
+FAR, EXACT = 500, -0.01106188
+
+
+def _from_means(means: np.ndarray, noise: float = 0.0, num_paths: int = 16):
+    """An estimate, for a method of order 2, whose levels have these means."""
+
+    def fn(key, level):
+        both = jnp.asarray(means)[level] + noise * jr.normal(key)
+        # Levels that are not coupled.
+        return both + noise * jr.normal(jr.fold_in(key, level))
+
+    return ds.monte_carlo(fn, key=KEY, num_paths=num_paths, levels=len(means), order=2)
+
+
+def _far_mean(h: float) -> float:
+    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    terms = ds.langevin_terms(H0, 0.01, 1.0, ds.WeakBrownianPath((), KEY))
+    y0 = jnp.array(0.0), jnp.array(2.0)
+    one = np.asarray(ds.second_moment_map(terms, ds.BAOAB(), 0.0, h, y0))
+    z = np.array([1.0, *y0])
+    end = np.linalg.matrix_power(one, round(FAR / h)) @ np.kron(z, z)
+    return end.reshape(3, 3)[1, 2]
+
+
+def test_three_levels_know_that_the_steps_are_too_long_and_two_promise_nothing():
+    means = np.array([_far_mean(0.2 / 2**k) for k in range(3)])
+    two, three = _from_means(means[:2], 1e-9), _from_means(means, 1e-9)
+    # The change by the extrapolation is half of what remains.
+    assert two.error < abs(two.mean - EXACT) / 1.9
+    assert two.off_order is None and "unchecked: what remains" in str(two)
+    assert three.off_order and "do not fit the order" in str(three)
+    np.testing.assert_allclose(three.error, np.max(np.abs(np.diff(means))), rtol=1e-5)
+
+
+@pytest.mark.parametrize("noise", [1e-9, 10.0])
+def test_changes_fit_the_order_unless_sampling_shows_that_they_do_not(noise):
+    h = 0.5 ** np.arange(3)
+    # Half an order less, the order, one with a term of higher order, two orders more, no
+    # change at all, one that comes late, and one that turns.
+    rows = [h**1.5, h**2, h**2 - 0.1 * h**3, h**4, 0 * h, [0, 0, 1], [0, 1, 0.75]]
+    got = _from_means(np.transpose(rows), noise, 256)
+    off = np.array([True, False, False, False, False, True, True])
+    np.testing.assert_array_equal(got.off_order, off & (noise < 1))
+    last, before = np.diff(rows)[:, 1], np.diff(rows)[:, 0]
+    if noise < 1:
+        whole = np.maximum(np.abs(last), np.abs(before))
+        np.testing.assert_allclose(got.error[off], whole[off], rtol=1e-6)
+        assert np.all(got.error[~off] < 0.05)
+
+
+def _uniform_unless(lost: float):
+    """Uniform numbers, of which those above `1 - lost` fail."""
+
+    def fn(key):
+        x = jr.uniform(key)
+        return jnp.where(x > 1 - lost, jnp.nan, x)
+
+    return fn
+
+
+def test_few_failed_paths_are_told_if_they_could_change_more_than_the_standard_error():
+    # Of one path in two hundred, 1 / 400 of the mean is missing.
+    run = lambda n: ds.monte_carlo(_uniform_unless(0.005), key=KEY, num_paths=n)
+    with pytest.warns(UserWarning, match="paths failed: they are left out"):
+        many = run(100_000)
+    assert many.std_error < abs(many.mean - 0.5) < many.failed_error < 0.003
+    np.testing.assert_allclose(many.error, np.hypot(many.std_error, many.failed_error))
+    # The largest deviation is a half.
+    share = many.num_failed / 100_000
+    np.testing.assert_allclose(many.failed_error, share / 2, rtol=0.02)
+    assert "failed paths could change the mean by" in str(many)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        few = run(400)
+    assert few.num_failed > 0 and few.failed_error < few.std_error
+
+
+def _added(path):
+    """The noise itself, of which what is above 1.5 fails in the next step."""
+    lost = lambda t, y, args: jnp.where(y > 1.5, jnp.nan, 0.0)
+    kick = diffrax.ControlTerm(lambda t, y, args: jnp.ones(()), path)
+    return diffrax.MultiTerm(diffrax.ODETerm(lost), kick)
+
+
+@pytest.mark.parametrize(
+    "sampling",
+    [ds.IndependentPaths(4000), ds.ArrayRQMC(256, 16), ds.ValueFunctions(1, 2000)],
+    ids=lambda sampling: type(sampling).__name__,
+)
+def test_failed_paths_count_by_the_spread_of_paths_in_every_sampling(sampling):
+    with pytest.warns(UserWarning, match="paths failed") as told:
+        got = ds.expectation(
+            lambda t, y, args: y, _added(ds.WeakBrownianPath((), KEY)),
+            diffrax.EulerHeun(), 0, 1, 0.25, jnp.zeros(()), key=KEY, sampling=sampling,
+        )  # fmt: skip
+    assert not any("WeakBrownianPath" in str(x.message) for x in told)
+    # Replicates count the paths that failed among theirs.
+    replicates = isinstance(sampling, ds.ArrayRQMC)
+    count = got.num_paths + (0 if replicates else got.num_failed)
+    # The lowest value is four kicks of sqrt(3 / 4).
+    assert 2.5 < got.failed_error * count / got.num_failed < 4
+    assert got.std_error < abs(got.mean) < got.error
+
+
+def test_bounded_increments_are_advised_where_they_are_not():
+    gaussian = ds.FixedStepBrownianPath((), KEY)
+    truncated = ds.TruncatedBrownianPath(gaussian)
+    for path in (gaussian, ds.WeakBrownianPath((), KEY), truncated):
+        with pytest.warns(UserWarning, match="paths failed") as told:
+            ds.ensemble(
+                _added(path), diffrax.EulerHeun(), 0, 2, 0.25, jnp.zeros(()), key=KEY,
+                num_paths=64,
+            )  # fmt: skip
+        said = any("bounded increments" in str(x.message) for x in told)
+        assert said == (path is gaussian)
