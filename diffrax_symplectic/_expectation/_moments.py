@@ -103,7 +103,8 @@ def level_weights(
     r"""The combinations of the means with steps $h, h/2, h/4, \ldots$ that an
     [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$: the rows of
     `Combination`, as far as $L$ levels have them. The first eliminates the error terms in
-    $h^p, \ldots, h^{p + L - 2}$, or for $p = 1/2$ those in $h^{1/2}, \ldots, h^{(L - 1)/2}$.
+    $h^p, \ldots, h^{p + L - 2}$, or for $p = 1/2$ the terms in
+    $h^{1/2}, \ldots, h^{(L - 1)/2}$.
 
     [Talay and Tubaro (1990)](https://doi.org/10.1080/07362999008809220) show that the error
     has an expansion in powers of $h$.

@@ -172,7 +172,7 @@ def monte_carlo(
     if order is not None and not (is_half or is_whole):
         raise ValueError(f"`order` must be a positive integer, or 1/2; got {order!r}.")
     sampling = IndependentPaths(num_paths, batch_size)
-    sampler = jtu.Partial(_of_function, fn, level_weights(order or 1, levels))
+    sampler = jtu.Partial(_of_function, fn, level_weights(float(order or 1), levels))
     plan = sampling.plan(sampler, devices)
     with Meter(progress_meter) as meter:
         return run(plan, key, devices, sampling, start, first, tol, meter)
