@@ -1,5 +1,7 @@
 """Expectations of functions of the state, with error bars."""
 
+import dataclasses
+import functools as ft
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,18 +12,23 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
+from ._brownian import Discrete, laws_of, UnspecifiedPath
 from ._custom_types import Args, RealScalarLike, Y
 from ._ensemble import fused_plan, FusedPaths, warn_of_stragglers
 from ._expectation import Expectation, ExpectationInterrupted
-from ._expectation._choose import choose, MOST, MUCH_LEFT, sorted_paths
+from ._expectation._choose import choose, few_paths, MOST, MUCH_LEFT, sorted_paths
 from ._expectation._problem import Problem
 from ._expectation._run import checked_call, Meter, NO_METER, run
 from ._expectation._sampling import AbstractSampling
 from ._expectation._value_functions import ValueFunctions
+from ._suggest import own_path, random_paths, with_paths
+from ._terms import brownian_paths, path_numbers
 
 
 # No sample's key is folded from this number.
 _NO_SAMPLE = 0xFFFFFFFF
+# Means differ if their difference is this many standard errors.
+_SURE = 4
 
 
 def expectation(
@@ -97,9 +104,17 @@ def expectation(
     - `phi`: maps time, state and `args` to a PyTree of real arrays.
     - `terms`, `solver`, `t0`, `t1`, `dt0`, `y0`, `args`: as for `diffrax.diffeqsolve`,
         with `t1 - t0` a whole number of steps `dt0`. `terms` may have a shape in place of
-        a path; the solver then chooses the path. Paths determine the random variables.
-        Paths with equal keys are one Brownian motion; each shape is another. `solver` is
-        any solver of this package, or a Stratonovich solver of Diffrax with fixed steps.
+        a path; the solver then chooses the path: with discrete increments, or Gaussian
+        ones where `phi` contains an operation that is not smooth (such as `abs` or a
+        comparison), since discrete ones have the right means of smooth functions only.
+        (For `ValueFunctions` they are discrete always.) Paths determine the random
+        variables. Paths with equal keys are one Brownian motion; each shape is another.
+        `solver` is any solver of this package, or a Stratonovich solver of Diffrax with
+        fixed steps.
+        `y0` may be a function that draws a state, `y0(key)` or `y0(key, args)`, and `args`
+        a function `args(key)`. Each path then has its own, drawn with independent keys
+        that depend on `key` and on the number of the path; `std_error` includes their
+        variance. (To pass a function in `args` as it is, put it in a tuple or dictionary.)
     - `key`: a JAX random key.
     - `sampling`: an [`diffrax_symplectic.IndependentPaths`][],
         [`diffrax_symplectic.ArrayRQMC`][] or [`diffrax_symplectic.ValueFunctions`][].
@@ -108,9 +123,11 @@ def expectation(
         together have at most 4,096, unless trials show that the fit leaves more than 1% of
         the standard error, as for functions with kinks; otherwise `ArrayRQMC` for up to
         four components, if the increments can be computed from quasi-random points; and
-        otherwise `IndependentPaths`. Without `tol` these draw 4,096 paths, 16 replicates of
-        16,384 paths, and 131,072 paths, or fewer where all steps of all paths would exceed
-        $2^{28}$ numbers (from ten seconds to some minutes, by solver and system).
+        otherwise `IndependentPaths`. Where `y0` or `args` is drawn, it is not
+        `ValueFunctions`, which leave the variance of the start. Without `tol` these draw
+        4,096 paths, 16 replicates of 16,384 paths, and 131,072 paths, or fewer where all
+        steps of all paths would exceed $2^{28}$ numbers (from ten seconds to some minutes,
+        by solver and system).
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
         default only `t1`.
     - `levels`: the number of step sizes, each half the previous one. With one level the
@@ -140,9 +157,10 @@ def expectation(
     other shapes or more paths, terms without noise, and for paths that `sampling` cannot
     use (the message names suitable ones); a
     [`diffrax_symplectic.ExpectationInterrupted`][] holding the estimate so far, on a
-    keyboard interrupt. Warns if `tol` was not reached, if failed paths could change
-    the mean by more than the standard error, if a few samples account for most of the
-    variance, if a fit was dropped or takes long, if all samples are equal or underflow, and
+    keyboard interrupt. Warns if `tol` was not reached, if failed paths could change the
+    mean by more than the standard error, if a few samples account for most of the variance,
+    if a fit was dropped or takes long, if all samples are equal or underflow, if `phi` is
+    not smooth and a trial with Gaussian increments has another mean than discrete ones, and
     if rounding in single precision may exceed the standard error.
 
     **Source:** [Chan, Golub and LeVeque
@@ -162,13 +180,22 @@ def expectation(
     )
     if engine not in (None, "jax", "drjit"):
         raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
-    problem = Problem.of(phi, terms, solver, t0, t1, dt0, y0, args, ts, levels)
-    reason = ""
-    sorted_instead = None
     if sampling is None and start is not None:
         sampling = start.sampling
-    elif sampling is None:
-        sampling, reason = choose(problem, tol)
+    given = phi, terms, solver, t0, t1, dt0, y0, args, ts, levels
+    problem = Problem.of(*given)
+    reason = ""
+    choice = ""
+    has_shape = any(isinstance(x, UnspecifiedPath) for x in brownian_paths(terms))
+    # Value functions need discrete increments.
+    free = has_shape and not isinstance(sampling, ValueFunctions)
+    has_kinks = problem.has_kinks
+    if free and has_kinks:
+        problem = Problem.of(*given, want="strong")
+        reason = "Gaussian increments, since phi may not be smooth"
+    sorted_instead = None
+    if sampling is None:
+        sampling, choice = choose(problem, tol)
         if isinstance(sampling, ValueFunctions):
             sorted_instead = sorted_paths(problem, tol)
     sampling = _checked_sampling(sampling, start)
@@ -180,7 +207,7 @@ def expectation(
                 own = jr.fold_in(key, _NO_SAMPLE)
                 plan = sampling.prepare(problem, own, devices)
                 if sorted_instead is not None and plan.left > MUCH_LEFT:
-                    reason = (
+                    choice = (
                         "sorted paths, since fitted value functions leave "
                         f"{plan.left:.1%} of the standard error"
                     )
@@ -189,7 +216,7 @@ def expectation(
         except ExpectationInterrupted:
             # Trial samples are not part of the estimate, and cannot be continued.
             raise KeyboardInterrupt from None
-        reason = "; ".join(filter(None, (reason, plan.reason)))
+        reason = "; ".join(filter(None, (choice, reason, plan.reason)))
         reason = reason if start is None else start.reason
         plan = plan._replace(
             reason=reason, roundings=problem.max_steps, bounded=problem.bounded
@@ -202,6 +229,8 @@ def expectation(
     if isinstance(paths := plan.paths_of, FusedPaths):
         warn_of_stragglers(paths.stragglers, paths.lost, paths.count, stacklevel=2)
     _warn_of_rounding(estimate, problem)
+    if start is None and first == 0 and has_kinks:
+        _warn_of_law(estimate, problem, jr.fold_in(key, _NO_SAMPLE), devices)
     return estimate
 
 
@@ -217,6 +246,36 @@ def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampl
             "same `sampling`."
         )
     return sampling
+
+
+def _warn_of_law(
+    estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: tuple
+) -> None:
+    """If phi is not smooth, discrete increments may change its mean."""
+    laws = [laws_of(path) or {} for path in random_paths(problem.terms)]
+    if not any(isinstance(law, Discrete) for each in laws for law in each.values()):
+        return
+    gaussian = ft.partial(own_path, problem.solver, "strong")
+    numbers = path_numbers(random_paths(problem.terms))
+    terms = with_paths(gaussian, numbers, problem.terms, key)
+    other = dataclasses.replace(problem, terms=terms)
+    plan = few_paths(other).prepare(other, key, devices)
+    trial = run(plan, key, devices)
+    pairs = zip(*map(jtu.tree_leaves, (estimate.mean, trial.mean)))
+    errors = zip(*map(jtu.tree_leaves, (estimate.std_error, trial.std_error)))
+    changes = [abs(one - two) for one, two in pairs]
+    beyond = [_SURE * np.hypot(one, two) for one, two in errors]
+    if any(np.any(x > y) for x, y in zip(changes, beyond)):
+        most = max(float(np.max(x, initial=0.0)) for x in changes)
+        warnings.warn(
+            "`phi` is not smooth, and its mean changes by up to "
+            f"{most:.1e} with Gaussian increments, which is more than the error of the "
+            "estimate: the discrete increments of a `WeakBrownianPath` (and of "
+            "`ValueFunctions`) are for smooth functions. Pass the shape in place of the "
+            "path in `terms`, or a `FixedStepBrownianPath`, and another `sampling` than "
+            "`ValueFunctions`.",
+            stacklevel=3,
+        )
 
 
 def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:

@@ -103,10 +103,12 @@ def ensemble(
         print(q.shape, q.std(), paths.num_failed)
         ```
 
-    Every path starts at `y0`. The random keys of path number $i$ depend on `key` and $i$
-    only, not on `num_paths`, `batch_size` or `engine`. `ensemble(...).terms(i)` returns
-    terms with these keys, for `diffrax.diffeqsolve`. Paths are simulated in batches, so
-    that only the returned arrays grow with their number.
+    Every path starts at `y0`, or if `y0` is a function of a random key, at a state of its
+    own. The random keys of path number $i$ depend on `key` and $i$ only, not on
+    `num_paths`, `batch_size` or `engine`. `ensemble(...).terms(i)` returns terms with these
+    keys, for `diffrax.diffeqsolve`, and `ensemble(...).start(i)` the initial state and the
+    `args`. Paths are simulated in batches, so that only the returned arrays grow with their
+    number.
 
     **Noise.** Where `terms` have the shape of a path, the solver makes one with the
     Gaussian increments of a Brownian motion (bounded for implicit solvers), so that every

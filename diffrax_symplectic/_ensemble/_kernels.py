@@ -111,7 +111,7 @@ class Kernels:
         word, number = (jax.ShapeDtypeStruct((), x) for x in ("uint32", "int32"))
         keys = jax.eval_shape(layout.path_keys, arrays, key, word, word)
         own = [*keys, *layout.own_args]
-        y = jtu.tree_leaves(jax.eval_shape(lambda: layout.problem(arrays).y0))
+        y = jtu.tree_leaves(jax.eval_shape(lambda x: layout.problem(x).y0, arrays))
         memory = jax.eval_shape(layout.start, arrays, own, y)
         size = sum(math.prod(x.shape) for x in y)
         if size > _MOST_NUMBERS:

@@ -109,7 +109,7 @@ def split(problem: Problem, key: PRNGKeyArray) -> tuple[Layout, list[Array]]:
         static,
         tuple(None if x is None else struct(x) for x in arrays),
         impl,
-        tuple(map(struct, jtu.tree_leaves(own))),
+        tuple(jtu.tree_leaves(jax.eval_shape(lambda: own))),
         problem.paths_differ,
         settings,
     )

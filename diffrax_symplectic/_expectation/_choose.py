@@ -21,6 +21,8 @@ MOST = 10**9
 # indicator and a call option on the pendulum fits left 26% and 1.3%, and sorted paths had
 # error bars that were 23 and 8 times less.
 MUCH_LEFT = 0.01
+# The sizes of a trial.
+_FEW_SORTED, _FEW_REPLICATES, _FEW_PATHS = 2**12, 8, 2**14
 # Scrambling more random variables per step takes long.
 _MOST_WORDS = 2**8
 # Limit on the numbers in all steps of all paths (from ten seconds to some
@@ -56,6 +58,14 @@ def sorted_paths(problem: Problem, tol: float | None) -> ArrayRQMC | None:
     fewer = max(_NUMBERS // (steps * d * _REPLICATES), _FEWEST)
     size = min(2 ** (fewer.bit_length() - 1), _REPLICATE)
     return ArrayRQMC(size, MOST if tol else _REPLICATES)
+
+
+def few_paths(problem: Problem) -> AbstractSampling:
+    """The most accurate sampling of a few seconds that takes Gaussian increments, too."""
+    d = sum(x.size for x in jtu.tree_leaves(problem.y0))
+    if d <= _SORTED and _can_be_sorted(problem):
+        return ArrayRQMC(_FEW_SORTED, _FEW_REPLICATES)
+    return IndependentPaths(_FEW_PATHS)
 
 
 def _can_be_sorted(problem: Problem) -> bool:

@@ -36,6 +36,7 @@ from .._terms import (
     evaluated,
     has_lifted,
 )
+from ._kinks import may_have_kinks
 from ._moments import level_weights
 from ._polynomials import tensordot
 from ._sampling import real
@@ -131,6 +132,12 @@ class Problem(eqx.Module):
 
     def level(self, index: IntScalarLike) -> Level:
         return jtu.tree_map(lambda x: x[index], self.levels)
+
+    @property
+    def has_kinks(self) -> bool:
+        """Whether `phi` may not be smooth."""
+        phi = lambda y: self.phi(self.t0, y, self.args)
+        return may_have_kinks(phi, self.y0)
 
     @property
     def paths_differ(self) -> bool:

@@ -144,13 +144,16 @@ class ValueFunctions(AbstractSampling):
         among = ", ".join(map(str, np.unique(names)))
         reason = f"{basis.kind}: {chosen}, chosen among {among}"
         final = plan(best, used, self.num_paths, usual)
-        left = np.max(_ratios(np.min(errors, axis=0), plain), initial=0.0)
+        rounding = ROUNDING * jnp.finfo(problem.dtype).eps * np.abs(flat(tried[0].mean))
+        ratios = _ratios(np.min(errors, axis=0), plain, rounding)
+        left = np.max(ratios, initial=0.0)
         return final._replace(reason=reason, far=far, left=float(left))
 
 
-def _ratios(errors: np.ndarray, plain: np.ndarray) -> np.ndarray:
-    """Standard errors with control, as fractions of those without it, at most one."""
-    random = plain > 0
+def _ratios(errors: np.ndarray, plain: np.ndarray, rounding: np.ndarray) -> np.ndarray:
+    """Standard errors with control, as fractions of those without it, at most one; zero
+    where those are `rounding` errors only, as of a constant."""
+    random = plain > rounding
     ratios = np.minimum(errors, plain) / np.where(random, plain, 1)
     return np.where(random, ratios, 0)
 

@@ -374,8 +374,7 @@ def apart(case: Case) -> float:
     path = path(jax.ShapeDtypeStruct((), case.dtype), jr.key(0))
     terms = ds.hamiltonian_terms(H0, H1, path)
     if isinstance(case.solver, ds.BAOAB | ds.Damped):
-        friction = ds.langevin_terms(H0, 0.3).terms[1]
-        terms = diffrax.MultiTerm(*terms.terms, friction)
+        terms = diffrax.MultiTerm(*terms.terms, *ds.bath_terms(H0, 0.3).terms)
     atol = 1e-15 if case.dtype == jnp.float64 else 1e-6
     y0 = jax.tree.map(jnp.zeros_like, y), y
     run = functools.partial(

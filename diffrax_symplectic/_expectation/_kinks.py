@@ -1,0 +1,46 @@
+"""Whether a function may have kinks or jumps, by the operations that it is made of."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.tree_util as jtu
+from jaxtyping import PyTree
+
+from .._compat import ClosedJaxpr, Jaxpr, Literal
+
+
+# All others are smooth, except perhaps at single points.
+_NOT_SMOOTH = frozenset(
+    "abs argmax argmin ceil clamp eq floor ge gt le lt max min ne reduce_max reduce_min "
+    "round sign sort top_k".split()
+)
+
+
+def may_have_kinks(fn: Callable, y: PyTree) -> bool:
+    """Whether `fn(y)` contains an operation that is not smooth in `y`, such as `abs`, a
+    maximum or a comparison. Some of these functions are smooth all the same."""
+    leaves, treedef = jtu.tree_flatten(y)
+    traced = jax.make_jaxpr(lambda *leaves: fn(treedef.unflatten(leaves)))(*leaves)
+    return _contains(traced.jaxpr)
+
+
+def _contains(jaxpr: Jaxpr) -> bool:
+    # What a function captures is constant in `y`.
+    depends = set(jaxpr.invars)
+    for eqn in jaxpr.eqns:
+        if not any(not isinstance(x, Literal) and x in depends for x in eqn.invars):
+            continue
+        depends.update(eqn.outvars)
+        if eqn.primitive.name in _NOT_SMOOTH or any(map(_contains, _inner(eqn))):
+            return True
+    return False
+
+
+def _inner(eqn: Any) -> Iterator[Jaxpr]:
+    """The programs that an operation runs, such as the branches of a conditional."""
+    for x in jtu.tree_leaves([*eqn.params.values()]):
+        if isinstance(x, ClosedJaxpr):
+            yield x.jaxpr
+        elif isinstance(x, Jaxpr):
+            yield x

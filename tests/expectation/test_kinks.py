@@ -1,0 +1,72 @@
+"""The law of the increments where phi is not smooth."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._expectation._kinks import may_have_kinks
+
+
+Y0 = jnp.array(0.0), jnp.array(0.0)
+STEPS = 4
+
+
+def walk(path):
+    """The momentum is a Brownian motion."""
+    free = lambda t, p, q, args: 0.0 * p
+    return ds.hamiltonian_terms(free, lambda t, p, q, args: -q, path)
+
+
+def beyond(t, y, args):
+    return jnp.where(y[0] > 0.5, 1.0, 0.0)
+
+
+def mean(phi, terms, **kwargs):
+    solver = ds.StormerVerlet()
+    return ds.expectation(
+        phi, terms, solver, 0, 1, 1 / STEPS, Y0, key=jr.key(1), **kwargs
+    )
+
+
+@pytest.mark.parametrize(
+    "phi, kinks",
+    [
+        (lambda y: y[0][1] * y[1][-1] ** 2, False),
+        (lambda y: jnp.exp(jnp.cos(y[0])) / (1 + y[1] ** 2), False),
+        (lambda y: jnp.abs(y[0]), True),
+        (lambda y: jax.jit(jnp.maximum)(y[0], 0), True),
+        (lambda y: jax.lax.cond(True, jnp.abs, jnp.sin, y[0]), True),
+        (lambda y: jnp.clip(jnp.arange(3.0), 0, 1) * y[0], False),
+    ],
+)
+def test_kinks_are_seen_in_the_operations(phi, kinks):
+    assert may_have_kinks(phi, (jnp.zeros(3), jnp.ones(3))) == kinks
+
+
+def test_a_shape_becomes_a_gaussian_path_where_phi_jumps():
+    estimate = mean(beyond, walk(()))
+    assert isinstance(estimate.sampling, ds.ArrayRQMC)
+    assert "Gaussian increments" in estimate.reason
+    assert abs(estimate.mean - ndtr(-0.5)) < 4 * estimate.std_error < 2e-3
+    smooth = mean(lambda t, y, args: y[0] ** 2, walk(()))
+    assert isinstance(smooth.sampling, ds.ValueFunctions)
+
+
+def test_a_law_that_changes_the_mean_is_told():
+    few = ds.IndependentPaths(20_000)
+    weak = walk(ds.WeakBrownianPath((), jr.key(0)))
+    with pytest.warns(UserWarning, match="changes by up to .* with Gaussian"):
+        estimate = mean(beyond, weak, sampling=few)
+    # Four steps of three values each.
+    assert abs(estimate.mean - ndtr(-0.5)) > 5 * estimate.std_error
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mean(lambda t, y, args: y[0] ** 2, weak, sampling=few)
+        gaussian = walk(ds.FixedStepBrownianPath((), jr.key(0)))
+        assert np.isfinite(mean(beyond, gaussian, sampling=few).mean)
