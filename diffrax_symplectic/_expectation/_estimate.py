@@ -128,11 +128,13 @@ class Expectation(eqx.Module):
         error.
 
         That is the change by the last extrapolation. With two levels it is unchecked, and
-        may be far too small where the steps are too long. With three or more, the changes
-        of the mean by the last two halvings of the step are compared: for a method of order
-        $p$ the last one should be $2^{-p}$ of the one before. If it is less than a quarter
-        of that, or more than four thirds, by more than two standard errors, then the larger
-        of these changes is taken instead, and the printed estimate says so.
+        may be far too small where the steps are too long. With three levels, the changes of
+        the mean by the two halvings of the step are compared: for a method of order $p$ the
+        last one should be $2^{-p}$ of the one before. If it is less than a quarter of that,
+        or more than four thirds, by more than two standard errors, then the larger of these
+        changes is taken instead, and the printed estimate says so. With $L > 3$ levels the
+        same holds for the extrapolations from $L - 2$ neighbouring levels, of order
+        $p + L - 3$.
 
         With one level the discretization error is unknown, and not included."""
         error = jtu.tree_map(np.hypot, self.std_error, self.failed_error)

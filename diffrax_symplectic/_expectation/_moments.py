@@ -90,8 +90,9 @@ class Combination(enum.IntEnum):
     # last extrapolation.
     BIAS = 1
     EXTRAPOLATION = 2
-    # With three levels or more: the changes to the last level and to the one before, and
-    # the former minus what the order foretells from the latter.
+    # With three levels or more, for the extrapolations from all but two neighbouring levels
+    # (from one level of three): the change to the last of these three and to the one
+    # before, and the former minus what the order foretells from the latter.
     LAST = 3
     BEFORE = 4
     MISS = 5
@@ -114,12 +115,15 @@ def level_weights(
         return best[None]
     # The finer levels alone, which eliminate one power of the step size less.
     before = np.append(0.0, _extrapolated(order, levels - 1))
-    own = np.eye(levels)
-    rows = [best, own[-1] - best, best - before]
+    rows = [best, np.eye(levels)[-1] - best, best - before]
     if levels > 2:
-        last = own[-1] - own[-2]
-        change_before = own[-2] - own[-3]
-        rows += [last, change_before, last - 2.0**-order * change_before]
+        of_some = _extrapolated(order, levels - 2)
+        coarse, middle, fine = (np.pad(of_some, (k, 2 - k)) for k in range(3))
+        last = fine - middle
+        change_before = middle - coarse
+        # The first power of the step size that is left in these.
+        power = order + levels - 3
+        rows += [last, change_before, last - 2.0**-power * change_before]
     return np.stack(rows)
 
 

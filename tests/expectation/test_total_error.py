@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation._moments import Combination, level_weights
 
 
 KEY = jr.key(0)
@@ -62,6 +63,18 @@ def test_changes_fit_the_order_unless_sampling_shows_that_they_do_not(noise):
         whole = np.maximum(np.abs(last), np.abs(before))
         np.testing.assert_allclose(got.error[off], whole[off], rtol=1e-6)
         assert np.all(got.error[~off] < 0.05)
+
+
+def test_changes_are_compared_after_all_but_one_power_is_eliminated():
+    for order, levels in ((1, 3), (2, 3), (1, 4), (2, 5)):
+        weights = level_weights(order, levels)
+        last, before, miss = weights[Combination.LAST :]
+        h = 0.5 ** np.arange(levels)
+        power = order + levels - 3
+        # Lower powers, with a sign that would turn the changes of the means.
+        means = 1 + h**power - 0.6 * (power > order) * h**order
+        assert last @ means == pytest.approx(2.0**-power * (before @ means), rel=1e-12)
+        assert abs(before @ means) > 1e-3 and abs(miss @ means) < 1e-14
 
 
 def _uniform_unless(lost: float):
