@@ -50,12 +50,12 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         check_state(y0, name)
         terms, y0 = momentum_first(terms, y0)
         drift, friction, noise = split_friction(terms)
+        check_structure(self.structure, drift, noise, t0, y0, args, name)
         if not all(isinstance(unwrapped(x), diffrax.ODETerm) for x in drift):
             raise ValueError(
                 f"`{name}` needs a drift driven by time: pass `langevin_terms(H0, "
                 "friction, temperature, path)`."
             )
-        check_structure(self.structure, drift, noise, t0, y0, args, name)
         check_friction(drift, friction, t0, y0, args, name)
 
     def init(self, terms, t0, t1, y0, args) -> Any:
