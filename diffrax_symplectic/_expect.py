@@ -21,8 +21,8 @@ from ._expectation._problem import Problem
 from ._expectation._run import checked_call, Meter, NO_METER, refuse_others, run
 from ._expectation._sampling import AbstractSampling
 from ._expectation._value_functions import ValueFunctions
-from ._suggest import own_path, random_paths, with_paths
-from ._terms import brownian_paths, path_numbers
+from ._solver import own_path
+from ._terms import brownian_paths, path_numbers, random_paths, with_paths
 
 
 # No sample's key is folded from this number.

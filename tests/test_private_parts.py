@@ -287,6 +287,20 @@ def test_values_are_told_from_traced_ones():
     assert not any(map(_compat.is_traced, (1.0, jnp.ones(2), "traced")))
 
 
+def test_operations_on_known_values_can_be_carried_out_while_tracing():
+    """If this fails: find the context's new name, or use NumPy for such operations."""
+    seen = []
+
+    def traced(x):
+        with _compat.at_trace_time():
+            seen.append(jnp.ones(2) + 1)
+        seen.append(jnp.ones(2) + 1)
+        return x
+
+    jax.jit(traced)(1.0)
+    assert [_compat.is_traced(x) for x in seen] == [False, True]
+
+
 def test_the_default_generator_is_known_by_its_name():
     """If this fails: words of a step are drawn by folding keys, which is slower and gives
     other numbers for the same key. Find the new name of Threefry."""
