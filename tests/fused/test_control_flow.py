@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from .fused import needs_drjit
+from ..drjit_here import needs_drjit
 from .fuzz import cases
 
 
@@ -25,7 +25,7 @@ def measured(numbers: list[int]) -> tuple[dict[int, float], str]:
     """How far the engines are apart, up to the first system that ends the process; and
     what the process wrote last."""
     done = subprocess.run(
-        [sys.executable, "-m", "tests.ensemble.fuzz", *map(str, numbers)],
+        [sys.executable, "-m", "tests.fused.fuzz", *map(str, numbers)],
         cwd=Path(__file__).parents[2],
         capture_output=True,
         text=True,

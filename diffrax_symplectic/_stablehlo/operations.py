@@ -1,11 +1,11 @@
 """The table of operations that can be replayed. An elementwise operation is a line in
-`_elementwise`; any other is a function with the decorator `rule`."""
+`elementwise`; any other is a function with the decorator `rule`."""
 
-from . import _control_flow, _linear_algebra, _moves  # noqa: F401 (they fill the table)
-from ._complex import complex_functions, is_complex
-from ._elementwise import elementwise
-from ._operation import NotReplayed, Operation, Rule, RULES
-from ._tensor import each, Tensor
+from . import control_flow, linear_algebra, moves  # noqa: F401 (they fill the table)
+from .complex import complex_functions, is_complex
+from .elementwise import elementwise
+from .operation import NotReplayed, Operation, Rule, RULES
+from .tensor import each, Tensor
 
 
 def rule_of(name: str) -> Rule | None:

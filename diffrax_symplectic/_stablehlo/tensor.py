@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ._backend import array_types, drjit
+from .backend import array_types, drjit
 
 
 # Larger arrays that all paths share stay in memory.

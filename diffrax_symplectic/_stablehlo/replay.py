@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ._operation import NotReplayed, Operation
-from ._operations import rule_of
-from ._tensor import MOST_IN_REGISTERS, Table, Tensor
+from .operation import NotReplayed, Operation
+from .operations import rule_of
+from .tensor import MOST_IN_REGISTERS, Table, Tensor
 
 
 _RETURNS = ("func.return", "stablehlo.return")

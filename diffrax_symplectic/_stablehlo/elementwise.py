@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ._backend import drjit
+from .backend import drjit
 
 
 def _maximum(a, b):

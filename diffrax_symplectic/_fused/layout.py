@@ -14,7 +14,7 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .._expectation._problem import Level, Problem
 from .._terms import path_keys, with_keys
-from ._sweeps import without_rescue
+from .sweeps import without_rescue
 
 
 class Layout(NamedTuple):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.scipy import linalg
 
-from .fused import needs_drjit
+from ..drjit_here import needs_drjit
 from .test_operations import LANES, replayed
 
 
@@ -104,7 +104,7 @@ def test_a_matrix_that_is_not_positive_definite_gives_nan_as_in_jax():
 
 
 def test_seventeen_unknowns_and_other_calls_are_refused_by_name():
-    from diffrax_symplectic._ensemble._operation import NotReplayed
+    from diffrax_symplectic._stablehlo.operation import NotReplayed
 
     a, b = problems(17, float)
     with pytest.raises(NotReplayed, match="`lapack_dgetrf_ffi` with more than 16"):

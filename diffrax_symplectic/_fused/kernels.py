@@ -14,10 +14,18 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
-from ._backend import array_types, drjit
-from ._layout import Layout
-from ._replay import Replay
-from ._tensor import flat, MOST_IN_REGISTERS, scalar, Table, Tensor, unflat
+from .._stablehlo import (
+    array_types,
+    drjit,
+    flat,
+    MOST_IN_REGISTERS,
+    Replay,
+    scalar,
+    Table,
+    Tensor,
+    unflat,
+)
+from .layout import Layout
 
 
 # Kernels of larger systems take long to compile.

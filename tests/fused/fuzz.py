@@ -1,6 +1,6 @@
 """Random systems with every kind of control flow, by both engines. As a program,
 
-    python -m tests.ensemble.fuzz NUMBER ...
+    python -m tests.fused.fuzz NUMBER ...
 
 it prints one line of JSON for each of these cases: its number and how far the engines are
 apart, in units in the last place of the largest number."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from .fused import needs_drjit
+from ..drjit_here import needs_drjit
 
 
 pytestmark = needs_drjit
@@ -43,9 +43,9 @@ def values(kind: str, shape, dtype, seed: int, spread: float = 3.0) -> np.ndarra
 
 def replayed(fn, *args: np.ndarray) -> list[np.ndarray]:
     """What Dr.Jit makes of the program of `fn` for each of the lanes."""
-    from diffrax_symplectic._ensemble._backend import array_types, drjit
-    from diffrax_symplectic._ensemble._kernels import Program
-    from diffrax_symplectic._ensemble._tensor import Tensor
+    from diffrax_symplectic._fused.kernels import Program
+    from diffrax_symplectic._stablehlo.backend import array_types, drjit
+    from diffrax_symplectic._stablehlo.tensor import Tensor
 
     structs = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in args]
     program = Program(fn, *structs)
@@ -238,7 +238,7 @@ def test_the_inverse_error_function_is_one_to_rounding_in_its_tails():
 
 
 def test_every_operation_of_the_table_is_tested():
-    from diffrax_symplectic._ensemble._operations import names
+    from diffrax_symplectic._stablehlo.operations import names
 
     tested = {name.split()[0] for name in CASES} - {"searchsorted"}
     # Tested by `test_linear_algebra` and `test_complex`; the last has no value.

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._ensemble import _backend, _engines
+from diffrax_symplectic._expectation import engines
+from diffrax_symplectic._stablehlo import backend
 
-from .fused import needs_drjit
+from ..drjit_here import needs_drjit
 
 
 ONE = jnp.array(0.0), jnp.array(1.0)
-engines = pytest.mark.parametrize(
+both_engines = pytest.mark.parametrize(
     "engine", ["jax", pytest.param("drjit", marks=needs_drjit)]
 )
 
@@ -44,7 +45,7 @@ def follow(terms=TERMS, solver=None, t1=1.0, dt0=0.25, y0=ONE, args=None, **kwar
     return ds.ensemble(terms, solver, 0.0, t1, dt0, y0, args, **kwargs)
 
 
-@engines
+@both_engines
 def test_states_are_those_of_diffeqsolve_at_the_saved_times(engine):
     times = [0.0, 0.5, 1.0]
     paths = follow(ts=times, engine=engine)
@@ -67,7 +68,7 @@ def test_terms_of_a_path_are_complete_if_the_terms_had_a_shape():
     np.testing.assert_allclose(paths.ys[1][7], sol.ys[1][-1], rtol=1e-14)
 
 
-@engines
+@both_engines
 @pytest.mark.parametrize("solver", [ds.StormerVerlet(), ds.ImplicitMidpoint()])
 def test_a_shape_becomes_a_path_with_gaussian_increments_unless_a_weak_one_is_wanted(
     engine, solver
@@ -82,7 +83,7 @@ def test_a_shape_becomes_a_path_with_gaussian_increments_unless_a_weak_one_is_wa
         follow(**once, want="sharp")
 
 
-@engines
+@both_engines
 def test_without_times_the_ends_are_returned(engine):
     ends, saved = follow(engine=engine), follow(engine=engine, ts=[1.0])
     assert ends.ys[0].shape == (40,)
@@ -93,7 +94,7 @@ def test_without_times_the_ends_are_returned(engine):
     np.testing.assert_array_equal(unsorted.ys[1][:, 0], ends.ys[1])
 
 
-@engines
+@both_engines
 @pytest.mark.parametrize("batch_size", [1, 7, 40])
 def test_a_path_does_not_depend_on_its_batch(engine, batch_size):
     whole = follow(engine=engine, num_paths=50, solver=ds.ImplicitMidpoint())
@@ -145,10 +146,8 @@ def test_another_step_number_of_steps_parameter_and_start_compile_nothing(monkey
 
     terms = ds.hamiltonian_terms(spring, push, ds.WeakBrownianPath((), jr.key(0)))
     made = []
-    make = _engines._kernels
-    monkeypatch.setattr(
-        _engines, "_kernels", lambda x: made.append(make(x)) or made[-1]
-    )
+    make = engines._kernels
+    monkeypatch.setattr(engines, "_kernels", lambda x: made.append(make(x)) or made[-1])
     kwargs = dict(terms=terms, engine="drjit", ts=[0.5, 1.0])
     first = follow(**kwargs, args=jnp.array(0.5))
     other = follow(**kwargs, args=jnp.array(0.7), y0=(ONE[1], ONE[0]), dt0=0.125)
@@ -234,7 +233,7 @@ def test_large_states_are_refused():
 @pytest.fixture
 def fresh():
     """What is known of Dr.Jit is asked for again, within the test and after it."""
-    caches = _backend.drjit, _backend.array_types
+    caches = backend.drjit, backend.array_types
     for fn in caches:
         fn.cache_clear()
     yield
@@ -254,7 +253,7 @@ def test_without_drjit_an_error_says_how_to_install_it(monkeypatch, fresh):
 @needs_drjit
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="a GPU needs no LLVM")
 def test_without_llvm_an_error_says_how_to_install_it(monkeypatch, fresh):
-    monkeypatch.setattr(_backend.drjit(), "has_backend", lambda backend: False)
+    monkeypatch.setattr(backend.drjit(), "has_backend", lambda backend: False)
     with pytest.raises(ImportError, match="libllvm19.*DRJIT_LIBLLVM_PATH"):
         follow(engine="drjit")
 

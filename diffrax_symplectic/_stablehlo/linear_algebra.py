@@ -7,9 +7,9 @@ between loops of Dr.Jit values go through memory, which costs more than operatio
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
-from ._backend import array_types, drjit
-from ._operation import NotReplayed, Operation, rule
-from ._tensor import Tensor
+from .backend import array_types, drjit
+from .operation import NotReplayed, Operation, rule
+from .tensor import Tensor
 
 
 # Larger matrices take long to compile.

@@ -13,12 +13,12 @@ from jaxtyping import Bool, Float, PRNGKeyArray, PyTree
 
 from .._arguments import whole_number
 from .._custom_types import Args, Y
-from .._expectation._problem import Problem
-from .._expectation._run import checked_call, refuse_others
+from .._fused import sample_key
 from .._solver import Want
 from .._terms import path_keys, with_keys
-from ._engines import Batch, ENGINES, state_itself, warn_of_stragglers
-from ._layout import sample_key
+from ._problem import Problem
+from ._run import checked_call, refuse_others
+from .engines import Batch, ENGINES, state_itself, warn_of_stragglers
 
 
 # Entries of all states in a batch: enough to keep every core busy, in tens of megabytes.

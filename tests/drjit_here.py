@@ -2,7 +2,7 @@
 
 import pytest
 
-from diffrax_symplectic._ensemble._backend import array_types
+from diffrax_symplectic._stablehlo.backend import array_types
 
 
 def _missing() -> str:

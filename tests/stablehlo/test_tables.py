@@ -8,7 +8,7 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from .fused import needs_drjit
+from ..drjit_here import needs_drjit
 from .test_operations import replayed
 
 
@@ -89,12 +89,12 @@ def test_a_table_of_the_paths_own_numbers_is_refused_by_name():
 
 
 def test_an_error_of_dr_jit_is_reported_with_the_operation(monkeypatch):
-    from diffrax_symplectic._ensemble import _operation
-    from diffrax_symplectic._ensemble._operation import NotReplayed
+    from diffrax_symplectic._stablehlo import operation
+    from diffrax_symplectic._stablehlo.operation import NotReplayed
 
     def mistaken(o, *xs):
         raise TypeError("UInt(-1)")
 
-    monkeypatch.setitem(_operation.RULES, "reverse", mistaken)
+    monkeypatch.setitem(operation.RULES, "reverse", mistaken)
     with pytest.raises(NotReplayed, match=r"`stablehlo.reverse`.*UInt\(-1\)"):
         replayed(lambda x: x[::-1], np.ones((5, 3)))

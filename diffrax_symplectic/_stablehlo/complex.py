@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ._backend import drjit
-from ._elementwise import elementwise
+from .backend import drjit
+from .elementwise import elementwise
 
 
 def is_complex(a: Any) -> bool:

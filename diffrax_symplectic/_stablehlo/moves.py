@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ._backend import array_types, drjit
-from ._complex import equal, is_complex, values
-from ._elementwise import elementwise
-from ._operation import NotReplayed, Operation, rule
-from ._tensor import constant, each, flat, known, Table, Tensor
+from .backend import array_types, drjit
+from .complex import equal, is_complex, values
+from .elementwise import elementwise
+from .operation import NotReplayed, Operation, rule
+from .tensor import constant, each, flat, known, Table, Tensor
 
 
 # Moves

@@ -11,10 +11,10 @@ import pytest
 
 import diffrax_symplectic as ds
 
+from ..drjit_here import needs_drjit
 from ..picard import by_picard
 from ..problems import SYSTEMS
 from ..solver.test_every_solver import CORE, DEFAULTS, each, STEPS, terms_for
-from .fused import needs_drjit
 
 
 pytestmark = needs_drjit

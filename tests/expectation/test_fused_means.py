@@ -8,8 +8,8 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from .fused import needs_drjit
-from .test_call import follow, ONE, STIFF, TERMS
+from ..drjit_here import needs_drjit
+from .test_ensemble import follow, ONE, STIFF, TERMS
 
 
 def square(t, y, args):

@@ -7,8 +7,8 @@ import re
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
-from ._backend import array_types
-from ._tensor import made_here, Tensor
+from .backend import array_types
+from .tensor import made_here, Tensor
 
 
 class Operation(NamedTuple):

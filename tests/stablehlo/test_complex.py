@@ -8,7 +8,7 @@ from jax import lax
 
 import diffrax_symplectic as ds
 
-from .fused import needs_drjit
+from ..drjit_here import needs_drjit
 from .test_operations import LANES, replayed
 
 
@@ -87,7 +87,7 @@ def test_quotients_of_large_and_small_numbers_neither_overflow_nor_vanish():
 
 
 def test_other_functions_of_complex_numbers_are_refused_by_name():
-    from diffrax_symplectic._ensemble._operation import NotReplayed
+    from diffrax_symplectic._stablehlo.operation import NotReplayed
 
     with pytest.raises(NotReplayed, match="`stablehlo.tan` of complex numbers"):
         replayed(lambda a: lax.tan(a), np.ones((3, 2), complex))

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from ._backend import drjit
-from ._operation import rule
-from ._tensor import copied, flat, known, Tensor, unflat
+from .backend import drjit
+from .operation import rule
+from .tensor import copied, flat, known, Tensor, unflat
 
 
 @rule

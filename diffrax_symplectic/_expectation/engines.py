@@ -15,12 +15,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Bool, PRNGKeyArray, PyTree
 
-from .._expectation._problem import Problem
-from .._expectation._steps import independent_steps, simulate
+from .._fused import Kernels, sample_key, split
+from .._stablehlo import NotReplayed
 from .._terms import path_keys, with_keys
-from ._kernels import Kernels
-from ._layout import sample_key, split
-from ._operation import NotReplayed
+from ._problem import Problem
+from ._steps import independent_steps, simulate
 
 
 # Beyond this share, stragglers take most of the time.
