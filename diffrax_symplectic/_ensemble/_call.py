@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float, PRNGKeyArray, PyTree
 
 from .._arguments import whole_number
 from .._custom_types import Args, Y
-from .._expectation._monte_carlo import path_keys, with_keys
 from .._expectation._problem import Problem
 from .._expectation._run import checked_call, refuse_others
+from .._expectation.monte_carlo import path_keys, with_keys
 from .._solver import Want
 from ._engines import Batch, ENGINES, state_itself, warn_of_stragglers
 from ._layout import sample_key

@@ -15,9 +15,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Bool, PRNGKeyArray, PyTree
 
-from .._expectation._monte_carlo import path_keys, with_keys
 from .._expectation._problem import Problem
 from .._expectation._steps import independent_steps, simulate
+from .._expectation.monte_carlo import path_keys, with_keys
 from ._kernels import Kernels
 from ._layout import sample_key, split
 from ._operation import NotReplayed

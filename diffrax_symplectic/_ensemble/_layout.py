@@ -12,8 +12,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
-from .._expectation._monte_carlo import path_keys, with_keys
 from .._expectation._problem import Level, Problem
+from .._expectation.monte_carlo import path_keys, with_keys
 from ._sweeps import without_rescue
 
 

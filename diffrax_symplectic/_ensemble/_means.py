@@ -9,9 +9,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
-from .._expectation._monte_carlo import IndependentPaths
 from .._expectation._problem import Problem
-from .._expectation._sampling import Plan, Samples
+from .._expectation.monte_carlo import IndependentPaths
+from .._expectation.sampling import Plan, Samples
 from .._root_finder import all_finite
 from ._engines import by_drjit, state_itself
 

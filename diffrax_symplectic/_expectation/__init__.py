@@ -1,9 +1,9 @@
-from ._array_rqmc import ArrayRQMC as ArrayRQMC
-from ._estimate import (
+from .array_rqmc import ArrayRQMC as ArrayRQMC
+from .estimate import (
     Expectation as Expectation,
     ExpectationInterrupted as ExpectationInterrupted,
 )
-from ._monte_carlo import (
+from .monte_carlo import (
     IndependentPaths as IndependentPaths,
     monte_carlo as monte_carlo,
 )
