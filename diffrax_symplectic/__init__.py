@@ -32,10 +32,11 @@ from ._tableau import (
     symplectic_residuals as symplectic_residuals,
     weak_order_residuals as weak_order_residuals,
 )
-from ._ensemble import Ensemble as Ensemble, ensemble as ensemble
 from ._expect import expectation as expectation
 from ._expectation import (
     ArrayRQMC as ArrayRQMC,
+    Ensemble as Ensemble,
+    ensemble as ensemble,
     Expectation as Expectation,
     ExpectationInterrupted as ExpectationInterrupted,
     IndependentPaths as IndependentPaths,

@@ -46,6 +46,12 @@ def is_traced(x: Any) -> bool:
     return isinstance(x, jax.core.Tracer)
 
 
+def at_trace_time() -> Any:
+    """A context in which operations on known values are carried out at once, so that their
+    results are known, too, inside of `jax.jit`."""
+    return jax.ensure_compile_time_eval()
+
+
 def quickly_compiled(fn: Callable) -> Callable:
     """`equinox.filter_jit(fn)`, compiled by XLA's older generator of code for CPUs where
     this version of XLA has it.

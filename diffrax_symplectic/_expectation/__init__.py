@@ -1,4 +1,5 @@
 from .array_rqmc import ArrayRQMC as ArrayRQMC
+from .ensemble import Ensemble as Ensemble, ensemble as ensemble
 from .estimate import (
     Expectation as Expectation,
     ExpectationInterrupted as ExpectationInterrupted,

@@ -27,8 +27,7 @@ from .._arguments import (
 from .._brownian import has_bounded_increments, is_random
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from .._root_finder import all_finite
-from .._solver import AbstractSymplecticSolver, check_resolution, Want
-from .._suggest import own_path, specified
+from .._solver import AbstractSymplecticSolver, check_resolution, own_path, Want
 from .._terms import (
     brownian_paths,
     check_fit,
@@ -37,6 +36,7 @@ from .._terms import (
     constraint_of,
     evaluated,
     has_lifted,
+    specified,
 )
 from .kinks import may_have_kinks
 from .moments import level_weights

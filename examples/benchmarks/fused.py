@@ -23,10 +23,9 @@ import jax.random as jr
 import matplotlib.pyplot as plt
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._ensemble._engines import state_itself
-from diffrax_symplectic._ensemble._kernels import Kernels
-from diffrax_symplectic._ensemble._layout import split
 from diffrax_symplectic._expectation._problem import Problem
+from diffrax_symplectic._expectation.engines import state_itself
+from diffrax_symplectic._fused import Kernels, split
 
 from .. import rigid_body
 from ._timing import ensemble, keys, machine, race

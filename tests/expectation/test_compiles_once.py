@@ -10,7 +10,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._expectation._problem import Problem
 from diffrax_symplectic._expectation.noise import Noise
 
-from ..ensemble.fused import needs_drjit
+from ..drjit_here import needs_drjit
 
 
 COMPILED = "/jax/core/compile/backend_compile_duration"

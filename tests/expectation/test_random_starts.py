@@ -9,7 +9,7 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from ..ensemble.fused import needs_drjit
+from ..drjit_here import needs_drjit
 
 
 def oscillator(t, p, q, args):

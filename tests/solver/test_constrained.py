@@ -13,7 +13,7 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._solver.step import no_failure
 
-from ..ensemble.fused import needs_drjit
+from ..drjit_here import needs_drjit
 from ..problems import Given
 
 

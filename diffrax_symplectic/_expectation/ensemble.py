@@ -1,0 +1,206 @@
+"""The states of many paths at given times."""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any, get_args
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Bool, Float, PRNGKeyArray, PyTree
+
+from .._arguments import whole_number
+from .._custom_types import Args, Y
+from .._fused import sample_key
+from .._solver import Want
+from .._terms import path_keys, with_keys
+from ._problem import Problem
+from ._run import checked_call, refuse_others
+from .engines import Batch, ENGINES, state_itself, warn_of_stragglers
+
+
+# Entries of all states in a batch: enough to keep every core busy, in tens of megabytes.
+_NUMBERS = {"jax": 2**17, "drjit": 2**20}
+# Accelerators need more.
+_MORE = 16
+
+
+class Ensemble(eqx.Module):
+    """The paths of [`diffrax_symplectic.ensemble`][].
+
+    - `ts`: the times.
+    - `ys`: the states at these times, as NumPy arrays. The first axis is the path; if `ts`
+        was passed, the second is the time. All states of a failed path are NaN.
+    - `failed`: which paths failed.
+    - `num_stragglers`: how many paths `engine="drjit"` handed back to JAX.
+    """
+
+    ts: Float[np.ndarray, " times"]
+    ys: PyTree[np.ndarray]
+    failed: Bool[np.ndarray, " num_paths"]
+    num_stragglers: int
+    engine: str
+    _problem: Problem
+    _key: Any
+
+    @property
+    def num_failed(self) -> int:
+        return int(np.sum(self.failed))
+
+    def terms(self, number: int) -> PyTree[diffrax.AbstractTerm]:
+        """The terms of path number `number`, with its random keys. Passed to
+        `diffrax.diffeqsolve` they give the same path, for example to save it at more
+        times."""
+        terms = self._problem.terms
+        return with_keys(terms, path_keys(terms, self._key_of(number)))
+
+    def start(self, number: int) -> tuple[Y, Args]:
+        """The initial state and the `args` of path number `number`."""
+        y0, own = self._problem.drawn(self._key_of(number))
+        return y0, self._problem.with_args(own).args
+
+    def _key_of(self, number: int) -> PRNGKeyArray:
+        high, low = (np.uint32(x) for x in divmod(int(number), 2**32))
+        return sample_key(self._key, high, low)
+
+
+def ensemble(
+    terms: PyTree[diffrax.AbstractTerm],
+    solver: diffrax.AbstractSolver,
+    t0: float,
+    t1: float,
+    dt0: float,
+    y0: Y,
+    args: Args = None,
+    *,
+    key: PRNGKeyArray,
+    num_paths: int,
+    ts: Sequence[float] | np.ndarray | None = None,
+    want: Want = "strong",
+    engine: str | None = None,
+    batch_size: int | None = None,
+    **others: Any,
+) -> Ensemble:
+    r"""The states of many independent paths, for histograms, spectra, and clouds in phase
+    space.
+
+    !!! example
+
+        ```python
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+        import jax.random as jr
+
+        H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
+        noise = lambda t, p, q, args: 0.2 * jnp.sin(q)
+        terms = ds.hamiltonian_terms(H0, noise, ())  # the shape of one noise
+        y0 = (jnp.array(0.0), jnp.array(1.0))
+        paths = ds.ensemble(
+            terms, ds.StormerVerlet(), 0, 10, 0.1, y0, key=jr.key(1), num_paths=10_000
+        )
+        p, q = paths.ys
+        print(q.shape, q.std(), paths.num_failed)
+        ```
+
+    Every path starts at `y0`, or if `y0` is a function of a random key, at a state of its
+    own. The random keys of path number $i$ depend on `key` and $i$ only, not on
+    `num_paths`, `batch_size` or `engine`. `ensemble(...).terms(i)` returns terms with these
+    keys, for `diffrax.diffeqsolve`, and `ensemble(...).start(i)` the initial state and the
+    `args`. Paths are simulated in batches, so that only the returned arrays grow with their
+    number. For events along a path, average a solve of your own with
+    [`diffrax_symplectic.monte_carlo`][].
+
+    **Noise.** Where `terms` have the shape of a path, the solver makes one with the
+    Gaussian increments of a Brownian motion (bounded for implicit solvers), so that every
+    function of the states has the right law. The three-point increments of `want="weak"`
+    take less time, and give the right means of smooth functions only: a momentum that
+    starts at one value has three values after a step, and Brownian motion from 0 leaves
+    (-1, 1) after 1.07 in the mean, not after 1.
+
+    **Engines.** `engine="jax"`, the default, moves all paths through each step together.
+    `engine="drjit"` compiles all steps to one kernel with
+    [Dr.Jit](https://drjit.readthedocs.io), which keeps each path in registers and is
+    several times as fast. The states agree up to rounding. The few paths with an implicit
+    step that simple sweeps do not solve ("stragglers") are simulated again by JAX, and
+    counted. See [Large ensembles][large-ensembles].
+
+    **Arguments:**
+
+    - `terms`, `solver`, `t0`, `t1`, `dt0`, `y0`, `args`, `key`, `ts`: as for
+        [`diffrax_symplectic.expectation`][].
+    - `num_paths`: the number of paths.
+    - `want`: `"strong"` for Gaussian increments, or `"weak"` for discrete ones, where
+        `terms` have the shape of a path; a path itself is kept.
+    - `engine`: `"jax"`, `"drjit"`, or `None`, which means `"jax"`.
+    - `batch_size`: the number of paths to simulate at once. By default, the states of a
+        batch have 131,072 entries, with Dr.Jit a million; on accelerators 16 times as many.
+
+    **Returns:** an [`diffrax_symplectic.Ensemble`][].
+
+    **Raises:** what [`diffrax_symplectic.expectation`][] raises, and a `ValueError` if
+    `engine` or `want` is unknown. With `engine="drjit"`: a `ValueError` if the system uses
+    an operation that cannot be replayed, its state has more than 256 entries, or a
+    `PicardNewton` has another tolerance than rounding error, and an `ImportError` if Dr.Jit
+    or LLVM is missing. Warns if paths failed, and if many are stragglers.
+    """
+    refuse_others("ensemble", others)
+    given = terms, t0, t1, dt0, y0, args
+    key, _, _ = checked_call("ensemble", key, None, None, 0, None, given)
+    num_paths = whole_number("num_paths", num_paths)
+    engine = "jax" if engine is None else engine
+    if engine not in ENGINES:
+        raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
+    times = [t1] if ts is None else ts
+    if want not in get_args(Want):
+        raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
+    problem = Problem.of(
+        state_itself, terms, solver, t0, t1, dt0, y0, args, times, 1, want, "ensemble"
+    )
+    if batch_size is None:
+        batch_size = _default_size(engine, problem)
+    size = whole_number("batch_size", batch_size)
+    batches = []
+    for begin in range(0, num_paths, size):
+        # JAX compiles for one batch size: the last batch is cut afterwards.
+        n = min(size, num_paths if engine == "jax" else num_paths - begin)
+        batches.append(
+            ENGINES[engine](problem, key, np.arange(begin, begin + n, dtype=np.uint64))
+        )
+    joined = _joined(batches, num_paths, at_end=ts is None)
+    saved = np.asarray(problem.levels.saved_steps[0])
+    at = float(problem.t0) + saved * float(problem.levels.h[0])
+    _warn_of(joined, problem.bounded)
+    return Ensemble(at, *joined, engine, problem, key)
+
+
+def _default_size(engine: str, problem: Problem) -> int:
+    numbers = sum(x.size for x in jtu.tree_leaves(problem.y0))
+    more = 1 if jax.default_backend() == "cpu" else _MORE
+    return max(256, more * _NUMBERS[engine] // numbers)
+
+
+def _joined(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
+    failed = np.concatenate([b.failed for b in batches])[:num_paths]
+
+    def join(*xs: np.ndarray) -> np.ndarray:
+        x = np.concatenate(xs)[:num_paths]
+        x[failed] = np.nan
+        return x[:, 0] if at_end else x
+
+    y = jtu.tree_map(join, *[b.y for b in batches])
+    return Batch(y, failed, sum(b.stragglers for b in batches))
+
+
+def _warn_of(joined: Batch, bounded: bool) -> None:
+    count, lost = len(joined.failed), int(np.sum(joined.failed))
+    if lost > 0:
+        instead = "" if bounded else " or bounded increments (a `WeakBrownianPath`),"
+        warnings.warn(
+            f"{lost:,} of {count:,} paths failed. Their states are NaN: select the others "
+            f"with `~failed`. Take smaller steps{instead} and look for NaNs in `y0`, "
+            "`args` and the Hamiltonians.",
+            stacklevel=3,
+        )
+    warn_of_stragglers(joined.stragglers, lost, count, stacklevel=3)

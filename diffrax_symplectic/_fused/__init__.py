@@ -1,0 +1,2 @@
+from .kernels import Kernels
+from .layout import sample_key, split

@@ -1,0 +1,29 @@
+"""The table of operations that can be replayed. An elementwise operation is a line in
+`elementwise`; any other is a function with the decorator `rule`."""
+
+from . import control_flow, linear_algebra, moves  # noqa: F401 (they fill the table)
+from .complex import complex_functions, is_complex
+from .elementwise import elementwise
+from .operation import NotReplayed, Operation, Rule, RULES
+from .tensor import each, Tensor
+
+
+def rule_of(name: str) -> Rule | None:
+    """The rule for an operation, by its name without the dialect."""
+    fn, of_complex = elementwise().get(name), complex_functions().get(name)
+    if fn is None and of_complex is None:
+        return RULES.get(name)
+
+    def entry_by_entry(o: Operation, *xs: Tensor) -> list[Tensor]:
+        pairs = any(is_complex(x.entries[0]) for x in xs if x.entries)
+        function = of_complex if pairs else fn
+        if function is None:
+            raise NotReplayed(o.op, f"`{o.op.name}` of complex numbers")
+        return [each(function, *xs)]
+
+    return entry_by_entry
+
+
+def names() -> set[str]:
+    """All operations in the table."""
+    return {*elementwise(), *complex_functions(), *RULES}

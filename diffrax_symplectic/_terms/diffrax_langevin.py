@@ -1,0 +1,103 @@
+"""Diffrax's own terms for Langevin dynamics, with the velocity in the place of the
+momentum."""
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, PyTree
+
+from .._arguments import check_pair
+from .._compat import replaced, unwrapped
+from .._custom_types import Args, RealScalarLike
+from .friction import like, not_negative
+from .langevin import AbstractFriction, DriftWithFriction
+from .vector_fields import flattened
+
+
+_P = PyTree[Array]
+
+
+def momentum_first(
+    terms: PyTree[diffrax.AbstractTerm], y: PyTree
+) -> tuple[PyTree[diffrax.AbstractTerm], PyTree]:
+    """Diffrax's Langevin terms as terms with the velocity in the place of the momentum, and
+    the halves of their state `(x, v)` exchanged. Other terms and their states are returned
+    as they are."""
+    parts = flattened(terms)
+    if not any(map(_is_drift, parts)):
+        return terms, y
+    check_pair(y)
+    exchanged = [replaced(term, _exchanged(unwrapped(term))) for term in parts]
+    return diffrax.MultiTerm(*exchanged), (y[1], y[0])
+
+
+def _is_drift(term: diffrax.AbstractTerm) -> bool:
+    return isinstance(unwrapped(term), diffrax.UnderdampedLangevinDriftTerm)
+
+
+def _exchanged(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
+    if isinstance(term, diffrax.UnderdampedLangevinDriftTerm):
+        friction = _PrefixFriction(term.gamma)
+        return diffrax.ODETerm(DriftWithFriction(_Frictionless(term), friction))
+    if isinstance(term, diffrax.ODETerm):
+        return diffrax.ODETerm(_ExchangedField(term))
+    return _Exchanged(term)
+
+
+class _Frictionless(eqx.Module):
+    """The drift of Diffrax's Langevin term without friction, for `(velocity, position)`."""
+
+    term: diffrax.UnderdampedLangevinDriftTerm
+
+    def __call__(self, t: RealScalarLike, y: tuple[_P, _P], args: Args):
+        v, x = y
+        still = jtu.tree_map(jnp.zeros_like, v)
+        _, dv = self.term.vf(t, (x, still), args)
+        return dv, v
+
+
+class _PrefixFriction(AbstractFriction):
+    """The friction of Diffrax's Langevin term. Its `gamma` may be a prefix of the
+    velocity."""
+
+    gamma: PyTree[ArrayLike]
+
+    def force(self, t, q, args, velocity):
+        del t, q, args
+
+        def forces(gamma, v):
+            of = lambda v: -not_negative(like(gamma, v)) * v
+            return jtu.tree_map(of, v)
+
+        return jtu.tree_map(forces, self.gamma, velocity)
+
+    def __call__(self, t, y, args):
+        v, x = y
+        return self.force(t, x, args, v), jtu.tree_map(jnp.zeros_like, x)
+
+
+class _ExchangedField(eqx.Module):
+    """The vector field of a drift term with the halves of its state exchanged."""
+
+    term: diffrax.ODETerm
+
+    def __call__(self, t: RealScalarLike, y: tuple[_P, _P], args: Args):
+        dx, dv = self.term.vf(t, (y[1], y[0]), args)
+        return dv, dx
+
+
+class _Exchanged(diffrax.AbstractTerm):
+    """A noise term with the halves of its state exchanged."""
+
+    term: diffrax.AbstractTerm
+
+    def vf(self, t, y, args):
+        return self.term.vf(t, (y[1], y[0]), args)
+
+    def contr(self, t0, t1, **kwargs):
+        return self.term.contr(t0, t1, **kwargs)
+
+    def prod(self, vf, control):
+        dx, dv = self.term.prod(vf, control)
+        return dv, dx

@@ -1,0 +1,288 @@
+"""The forms of friction, a number, an array, a matrix or directions, and its root in the
+noise of a temperature."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+
+from .._arguments import check_takes, real_array, shapes
+from .._custom_types import Args, BM, RealScalarLike
+from .hamiltonian import evaluated
+
+
+_P = PyTree[Array]
+Value = PyTree[ArrayLike] | Callable[[RealScalarLike, _P, Args], PyTree[ArrayLike]]
+
+
+_KIND = "a real number, an array or PyTree of them, or a function of `(t, q, args)`"
+
+
+class FrictionAlong(eqx.Module):
+    r"""Friction along given directions, for [`diffrax_symplectic.langevin_terms`][]:
+    $G = \sum_k d_k d_k^\top$.
+
+    For friction between pairs of particles, each pair has a direction, which is opposite
+    for the two of them. The noise is $\sqrt{2 T} \sum_k d_k\,\mathrm{d}w_k$, so that no
+    root of a matrix is taken, and both conserve the total momentum.
+    """
+
+    directions: Value
+
+
+FrictionAlong.__init__.__doc__ = """**Arguments:**
+
+- `directions`: an array of shape `(*p.shape, m)` for `m` noises, or for momenta in a PyTree
+    a PyTree of such arrays; or a function `(t, q, args)` of these. In units of the root of
+    a friction, (force / velocity)^(1/2).
+"""
+
+
+class _Square(eqx.Module):
+    """A constant array that may be a matrix; whether it is symmetric positive semidefinite,
+    and then its root, computed once."""
+
+    value: Array
+    is_semidefinite: Bool[Array, ""]
+    root: Array
+
+
+def value_at(name: str, value: Any, t, q: _P, args: Args) -> PyTree:
+    """A constant, or the value of a function."""
+    return evaluated(name, value, t, q, args=args) if callable(value) else value
+
+
+def product_with(friction: Any, t, q: _P, args: Args, velocity: _P) -> _P:
+    """`G v`."""
+    if isinstance(friction, FrictionAlong):
+        columns = _columns(friction, t, q, args)
+        along = lambda d, v: jnp.tensordot(v, d, jnp.ndim(v))
+        parts = jtu.tree_leaves(jtu.tree_map(along, columns, velocity))
+        return jtu.tree_map(lambda d: d @ sum(parts), columns)
+
+    def product(g, v):
+        value = g.value if isinstance(g, _Square) else g
+        if not _is_matrix(value, jnp.shape(v)):
+            return not_negative(like(value, v)) * v
+        force = jnp.tensordot(like(value, v), v, jnp.ndim(v))
+        if not isinstance(g, _Square):
+            return force
+        return jnp.where(g.is_semidefinite, force, jnp.nan)
+
+    value = _for_each("friction", value_at("friction", friction, t, q, args), q)
+    return jtu.tree_map(product, value, velocity, is_leaf=_is_square)
+
+
+def root_product_with(
+    friction: Any, T: PyTree, t, q: _P, args: Args, control: BM
+) -> _P:
+    """`B W`, with `B B^T = 2 T G`."""
+    if isinstance(friction, FrictionAlong):
+        columns = _columns(friction, t, q, args)
+        return _noise_along(columns, _single_temperature(T), control)
+    fits = lambda w, x: jnp.shape(w) == jnp.shape(x)
+    if jtu.tree_structure(control) != jtu.tree_structure(q) or not all(
+        map(fits, jtu.tree_leaves(control), jtu.tree_leaves(q))
+    ):
+        raise ValueError(
+            f"The `path` of `langevin_terms` must have the shape of `q`, {shapes(q)}; got "
+            f"shape {shapes(control)}."
+        )
+    value = _for_each("friction", value_at("friction", friction, t, q, args), q)
+    heat = _for_each("temperature", T, q)
+    return jtu.tree_map(_noise_of, value, heat, control, q, is_leaf=_is_square)
+
+
+def _noise_of(g: Any, T: ArrayLike, w: Array, x: Array) -> Array:
+    """The noise `w` of the momenta of one array, in the shape of `x`."""
+    w = like(w, x)
+    matrix = g.value if isinstance(g, _Square) else g
+    if _is_matrix(matrix, jnp.shape(x)):
+        scale = jnp.sqrt(2 * like(_single_temperature(T), x))
+        root = g.root if isinstance(g, _Square) else _root(like(g, x))
+        return scale * jnp.tensordot(like(root, x), w, jnp.ndim(w))
+    if jnp.shape(T) not in ((), jnp.shape(x)):
+        raise ValueError(
+            "An array of `temperature` must be a scalar, or have the shape of its momenta, "
+            f"{jnp.shape(x)}; got shape {jnp.shape(T)}."
+        )
+    # Where either is negative, NaN makes the path fail.
+    return jnp.sqrt(like(matrix, x)) * jnp.sqrt(2 * like(T, x)) * w
+
+
+def _noise_along(columns: _P, T: ArrayLike, control: BM) -> _P:
+    flat, _ = jfu.ravel_pytree(control)
+    number = jnp.shape(jtu.tree_leaves(columns)[0])[-1:]
+    if number != flat.shape:
+        raise ValueError(
+            "The `path` of `langevin_terms` must have one noise for each direction of the "
+            f"friction, shape {number}; got shape {shapes(control)}."
+        )
+    along = lambda d: d @ (jnp.sqrt(2 * like(T, d)) * like(flat, d))
+    return jtu.tree_map(along, columns)
+
+
+def _columns(friction: FrictionAlong, t, q: _P, args: Args) -> _P:
+    """The directions for each array of the momenta, with a trailing axis of noises."""
+    columns = value_at("directions", friction.directions, t, q, args)
+    columns = _for_each("directions", columns, q)
+    numbers = {jnp.shape(d)[-1:] for d in jtu.tree_leaves(columns)}
+    fits = lambda d, x: jnp.ndim(d) > 0 and jnp.shape(d)[:-1] == jnp.shape(x)
+    all_fit = all(jtu.tree_leaves(jtu.tree_map(fits, columns, q)))
+    if len(numbers) > 1 or not all_fit:
+        raise ValueError(
+            "`directions` of `FrictionAlong` must have the shape of the momenta and one "
+            f"more axis, for the noises; got shape {shapes(columns)} for momenta of shape "
+            f"{shapes(q)}."
+        )
+    return jtu.tree_map(like, columns, q)
+
+
+def _is_matrix(g: ArrayLike, momenta: tuple[int, ...]) -> bool:
+    """Whether this is a matrix for momenta of this shape, and not a number or an array of
+    them. Raises a `ValueError` if it is neither."""
+    if jnp.shape(g) in ((), momenta):
+        return False
+    if jnp.shape(g) != momenta * 2:
+        raise ValueError(
+            "An array of `friction` must be a scalar, or have the shape of its momenta, "
+            f"{momenta}, or as a matrix the shape {momenta * 2}; got shape {jnp.shape(g)}."
+        )
+    return True
+
+
+def _for_each(name: str, value: PyTree, p: _P) -> PyTree:
+    """`value` in the structure of the momenta."""
+    if jtu.all_leaves([value], is_leaf=_is_square):
+        return jtu.tree_map(lambda _: value, p)
+    if jtu.tree_structure(value, is_leaf=_is_square) != jtu.tree_structure(p):
+        raise ValueError(
+            f"`{name}` must be one number or array, or have the structure of the momenta "
+            f"{eqx.tree_pformat(p)}; got {eqx.tree_pformat(value)}."
+        )
+    return value
+
+
+def _single_temperature(T: PyTree) -> ArrayLike:
+    if not jtu.all_leaves([T]) or jnp.shape(T) != ():
+        raise ValueError(
+            "`temperature` must be one number for friction by a matrix or along "
+            f"directions; got shape {shapes(T)}."
+        )
+    return T
+
+
+def not_negative(g: Array) -> Array:
+    """`g`, or NaN where it is negative."""
+    # Traced values cannot raise an error; NaN makes their path fail.
+    return jnp.where(g >= 0, g, jnp.nan)
+
+
+def like(x: ArrayLike, y: Array) -> Array:
+    """`x` in the precision of `y`."""
+    return jnp.asarray(x, jnp.result_type(y))
+
+
+def _is_square(x: Any) -> bool:
+    return isinstance(x, _Square)
+
+
+def checked_friction(friction: Any, struct: PyTree | None) -> Any:
+    """The friction with the roots of constant matrices, for a path of this shape, if there
+    is one. Raises a `ValueError` if it is known to be invalid."""
+    if isinstance(friction, FrictionAlong):
+        if callable(friction.directions):
+            check_takes("directions", friction.directions, "t", "q", "args")
+        return jtu.tree_map(lambda x: x if callable(x) else jnp.asarray(x), friction)
+    if callable(friction):
+        check_takes("friction", friction, "t", "q", "args")
+        return friction
+    if len(jtu.tree_leaves(friction)) == 0:
+        raise ValueError(
+            "`friction` must be a number, an array, a PyTree of arrays, a `FrictionAlong`, "
+            f"or a function `(t, q, args)`; got {friction!r}."
+        )
+    known = {s.shape for s in jtu.tree_leaves(struct)}
+    if jtu.all_leaves([friction]) or struct is None:
+        # One for all momenta, whose shape is known if it is one.
+        shape = known.pop() if len(known) == 1 else None
+        return jtu.tree_map(lambda g: _checked_array(g, shape), friction)
+    each = jtu.tree_map(lambda s: jnp.zeros(s.shape), struct)
+    checked = lambda g, x: _checked_array(g, jnp.shape(x))
+    return jtu.tree_map(checked, _for_each("friction", friction, each), each)
+
+
+def _checked_array(g: ArrayLike, momenta: tuple[int, ...] | None) -> Array | _Square:
+    """The friction of an array of momenta, of this shape if it is known."""
+    shape = jnp.shape(g)
+    half = len(shape) // 2
+    may_be_matrix = half > 0 and shape == shape[:half] * 2
+    is_matrix = momenta is not None and _is_matrix(g, momenta)
+    if not may_be_matrix:
+        return jnp.asarray(real_array("friction", g, positive=False, kind=_KIND))
+    root = _root(jnp.asarray(g, jnp.result_type(g, float)))
+    is_semidefinite = ~jnp.any(jnp.isnan(root))
+    square = _Square(jnp.asarray(g), is_semidefinite, root)
+    if isinstance(is_semidefinite, jax.core.Tracer):
+        return square
+    if not is_semidefinite and (is_matrix or not np.all(np.asarray(g) >= 0)):
+        raise ValueError(
+            "`friction` must be a symmetric positive semidefinite matrix, or an array of "
+            f"numbers that are not negative, one for each momentum; got {g!r}."
+        )
+    return square
+
+
+def checked_temperature(temperature: Any) -> Any:
+    if callable(temperature):
+        check_takes("temperature", temperature, "t", "q", "args")
+        return temperature
+    real = lambda T: real_array("temperature", T, positive=False, kind=_KIND)
+    return jtu.tree_map(lambda T: jnp.asarray(real(T)), temperature)
+
+
+# Traced and compiled once for each shape.
+@jax.jit
+def _root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
+    r"""$L$ with $L L^\top$ equal to a symmetric positive semidefinite matrix: its Cholesky
+    factor, with zero columns where the matrix is singular. NaN if it is no such matrix.
+
+    A column is zero if its pivot is a rounding error, whose root would be far larger than
+    one: a friction between particles would then change their total momentum.
+    """
+    n = round(matrix.size**0.5)
+    A = matrix.reshape(n, n)
+    eps = jnp.finfo(A.dtype).eps
+    diagonal = jnp.diag(A)
+    # Of a pivot, which is a difference of numbers up to the entry of the diagonal.
+    rounding = 10 * n * eps * diagonal
+    # No entry of what is left of a semidefinite matrix without its tiny pivots is larger.
+    size = jnp.sqrt(jnp.maximum(diagonal, 0))
+    most = 10 * (n * eps) ** 0.5 * size[:, None] * size
+
+    def column(j, carry):
+        left, root, is_valid = carry
+        pivot = left[j, j]
+        used = pivot > rounding[j]
+        below = left[:, j] / jnp.sqrt(jnp.where(used, pivot, 1))
+        below = jnp.where(used & (jnp.arange(n) >= j), below, 0)
+        left = left - below[:, None] * below
+        is_valid = is_valid & (pivot >= -rounding[j])
+        return left, root.at[:, j].set(below), is_valid
+
+    begin = A, jnp.zeros_like(A), _is_symmetric(A) & jnp.all(jnp.isfinite(A))
+    left, root, is_valid = jax.lax.fori_loop(0, n, column, begin, unroll=n <= 16)
+    is_valid = is_valid & jnp.all(jnp.abs(left) <= most)
+    return jnp.where(is_valid, root, jnp.nan).reshape(matrix.shape)
+
+
+def _is_symmetric(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
+    size = 100 * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
+    return jnp.max(jnp.abs(matrix - matrix.T)) <= size

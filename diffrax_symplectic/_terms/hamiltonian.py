@@ -1,0 +1,336 @@
+import functools as ft
+from collections.abc import Callable
+from typing import cast, get_args, Literal
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree, Shaped
+
+from .._arguments import check_pair, check_takes, shapes, whole_number
+from .._brownian import increment_struct
+from .._compat import ω
+from .._custom_types import Args, BM, IntScalarLike, RealScalarLike
+from .constraint import constrained, Constraint
+from .dependence import Dependence
+from .paths import as_path
+
+
+_P = PyTree[Shaped[Array, "?*p"], "P"]
+_State = tuple[_P, _P]
+_Hamiltonian = Callable[[RealScalarLike, _P, _P, Args], PyTree[Array]]
+_Structure = Literal["separable", "additive"]
+
+
+def hamiltonian_terms(
+    H0: _Hamiltonian,
+    noise: _Hamiltonian | None = None,
+    path: diffrax.AbstractBrownianPath | PyTree | None = None,
+    *,
+    structure: _Structure | None = None,
+    constraint: Constraint | None = None,
+) -> diffrax.MultiTerm:
+    r"""The terms of a stochastic Hamiltonian system, from its Hamiltonians.
+
+    For the state $y = (p, q)$, in the sense of Stratonovich,
+
+    $$\mathrm{d}p = -\frac{\partial H_0}{\partial q}\,\mathrm{d}t
+        - \sum_{k=1}^m \frac{\partial H_k}{\partial q} \circ \mathrm{d}w_k, \qquad
+      \mathrm{d}q = \frac{\partial H_0}{\partial p}\,\mathrm{d}t
+        + \sum_{k=1}^m \frac{\partial H_k}{\partial p} \circ \mathrm{d}w_k.$$
+
+    Any Stratonovich solver, from this package or from Diffrax, accepts these terms. The
+    noise of a step is the gradient of one scalar, $\sum_k I_k H_k$, and costs one reverse
+    pass for any number of noises.
+
+    **Arguments:**
+
+    - `H0`: `H0(t, p, q, args)`, a scalar. A function, or a Module with parameters;
+        differentiable with respect to these and to `args`.
+    - `noise`: `noise(t, p, q, args)`, the noise Hamiltonians $H_1, \ldots, H_m$ as an
+        array of shape `(m,)`, or in the structure and shapes of `path`; a scalar if `m =
+        1`. Or an [`diffrax_symplectic.IndexedNoise`][]. For a system without noise omit
+        `noise` and `path`.
+    - `path`: a Brownian path of shape `(m,)`. If the solver is not known yet, pass its
+        shape, `(m,)` or a PyTree of `jax.ShapeDtypeStruct`s:
+        [`diffrax_symplectic.suggest_solver`][], [`diffrax_symplectic.compare_solvers`][]
+        and [`diffrax_symplectic.expectation`][] then make the path that the solver needs.
+    - `structure`: asserts a structure that some solvers need: `"separable"` for
+        $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, `"additive"` if the gradients of the
+        $H_k$ do not depend on the state. By default it is detected by tracing, which counts
+        every variable that enters a derivative, even if it cancels or is multiplied by
+        zero: write $H_0$ as a sum of terms that depend on $p$ or $q$ alone.
+    - `constraint`: `constraint(q, args)`, an array of shape `(c,)` that is zero on the
+        positions that the system can take, such as `jnp.stack([jnp.sum(q**2) - 1])` for a
+        rod. Its gradients must be linearly independent there. For
+        [`diffrax_symplectic.StormerVerlet`][] and [`diffrax_symplectic.BAOAB`][], with
+        $H_0 = p \cdot M^{-1} p / 2 + U(t, q)$ and $H_k = U_k(t, q)$; all other solvers
+        raise an error. Start from [`diffrax_symplectic.constrained_state`][].
+
+    `p` and `q` are PyTrees of arrays of the same structure and shapes.
+
+    **Returns:** `MultiTerm(drift, diffusion)`, or without noise `MultiTerm(drift)`.
+
+    **Raises:** a `ValueError` if `path` is neither a Brownian path nor a shape, or if
+    `structure` is unknown; and, while the solve is traced, if the state is not a pair
+    `(p, q)` of the same structure and shapes, if `H0` does not return a scalar, if `noise`
+    does not match the path or does not depend on the state, or if either needs concrete
+    values or does not return real numbers.
+    """
+    check_takes("H0", H0, "t", "p", "q", "args")
+    if structure not in (None, *get_args(_Structure)):
+        raise ValueError(
+            f"`structure` must be one of {get_args(_Structure)}, or `None` to detect it; "
+            f"got {structure!r}."
+        )
+    drift = constrained(diffrax.ODETerm(_Drift(H0, structure)), constraint)
+    if noise is None and path is None:
+        return diffrax.MultiTerm(drift)
+    noise = cast(_Hamiltonian, noise)
+    check_takes("noise", noise, "t", "p", "q", "args")
+    return diffrax.MultiTerm(drift, HamiltonianNoise(noise, as_path(path), structure))
+
+
+class IndexedNoise(eqx.Module):
+    r"""Noise Hamiltonians that can be evaluated one at a time, for
+    [`diffrax_symplectic.hamiltonian_terms`][].
+
+    $H_1, \ldots, H_m$ are given as one function of the index, so that
+    [`diffrax_symplectic.NinomiyaVictoir`][], which follows the flow of one noise after
+    another, evaluates only one of them at a time. Other solvers call `noise(t, p, q,
+    args)`, which returns all of them, by `jax.vmap` over the index.
+    """
+
+    H: Callable[[IntScalarLike, RealScalarLike, PyTree, PyTree, Args], Array]
+    m: int = eqx.field(static=True, converter=ft.partial(whole_number, "m"))
+
+    def __check_init__(self):
+        if not callable(self.H):
+            raise ValueError(
+                f"`H` must be a function `H(k, t, p, q, args)`; got {self.H!r}."
+            )
+
+    def one(
+        self, k: IntScalarLike, t: RealScalarLike, p: PyTree, q: PyTree, args: Args
+    ) -> Array:
+        """`H_k`, for `k` from 0 to `m - 1`. Raises a `ValueError` if it is not a scalar."""
+        return scalar_energy(evaluated("H", self.H, k, t, p, q, args=args), "H")
+
+    def __call__(self, t: RealScalarLike, p: PyTree, q: PyTree, args: Args) -> Array:
+        return jax.vmap(lambda k: self.one(k, t, p, q, args))(jnp.arange(self.m))
+
+
+IndexedNoise.__init__.__doc__ = """**Arguments:**
+
+- `H`: `H(k, t, p, q, args)`, the Hamiltonian of noise `k`, a scalar. A function, or a
+    Module with parameters. `k` is a traced integer from `0` to `m - 1`.
+- `m`: the number of noises.
+
+**Raises:** a `ValueError` if `H` is not callable or `m` is not a positive integer; and,
+while the solve is traced, if `H` does not return a scalar.
+"""
+
+
+class OneNoise(eqx.Module):
+    """A control with a single nonzero noise, at index `number` of the flattened path."""
+
+    number: IntScalarLike
+    increment: RealScalarLike
+
+
+class Lifted(eqx.Module):
+    """A Hamiltonian in another variable, `H(t, chart(p, q), args)`."""
+
+    H: Callable
+    chart: Callable[[_State], PyTree]
+
+    def __call__(self, *inputs) -> PyTree[Array]:
+        # An `IndexedNoise` passes the index before the time.
+        *before, p, q, args = inputs
+        return self.H(*before, self.chart((p, q)), args)
+
+
+def has_lifted(terms: PyTree) -> bool:
+    """Whether these terms have Hamiltonians in another variable."""
+    is_lifted = lambda x: isinstance(x, Lifted)
+    return any(map(is_lifted, jtu.tree_leaves(terms, is_leaf=is_lifted)))
+
+
+def lifted_terms(
+    H0: Callable,
+    noise: Callable | None,
+    path: diffrax.AbstractBrownianPath | PyTree | None,
+    chart: Callable[[_State], PyTree],
+    name: str,
+) -> diffrax.MultiTerm:
+    """The terms of Hamiltonians in `chart((p, q))`, a variable called `name`."""
+    check_takes("H0", H0, "t", name, "args")
+    if isinstance(noise, IndexedNoise):
+        lifted = IndexedNoise(Lifted(noise.H, chart), noise.m)
+    elif noise is None:
+        lifted = None
+    else:
+        check_takes("noise", noise, "t", name, "args")
+        lifted = Lifted(noise, chart)
+    return hamiltonian_terms(Lifted(H0, chart), lifted, path)
+
+
+class _Drift(eqx.Module):
+    """The vector field `(-dH0/dq, dH0/dp)`."""
+
+    H0: _Hamiltonian
+    structure: _Structure | None = eqx.field(static=True, default=None)
+
+    def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
+        check_pair(y)
+
+        def scalar(p, q):
+            return scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
+
+        return symplectic_gradient(scalar, y)
+
+
+def scalar_energy(out: PyTree, name: str = "H0") -> Array:
+    """The output of a Hamiltonian. Raises a `ValueError` if it is not a real scalar."""
+    if not jtu.all_leaves([out]) or jnp.shape(out) != ():
+        raise ValueError(
+            f"`{name}` must return a scalar; got shape {shapes(out)}. Sum over the degrees "
+            "of freedom. (For a batch of paths write it for one path, and `jax.vmap` the "
+            "solve.)"
+        )
+    _check_real(name, out)
+    return jnp.asarray(out, jnp.result_type(out, float))
+
+
+def _check_real(name: str, out: PyTree[Array]) -> None:
+    is_real = lambda x: eqx.is_array_like(x) and not jnp.iscomplexobj(x)
+    if not all(map(is_real, jtu.tree_leaves(out))):
+        raise ValueError(
+            f"`{name}` must return real numbers; got {eqx.tree_pformat(out)}. Take "
+            "`jnp.real` of numbers that are mathematically real, such as <psi| A |psi>."
+        )
+
+
+class HamiltonianNoise(diffrax.AbstractTerm):
+    """The noise term. Its product with the control `I` is the symplectic gradient of
+    `I . H`."""
+
+    noise: _Hamiltonian
+    path: diffrax.AbstractBrownianPath
+    structure: _Structure | None = eqx.field(static=True, default=None)
+
+    def contr(self, t0: RealScalarLike, t1: RealScalarLike, **kwargs) -> BM:
+        return self.path.evaluate(t0, t1, **kwargs)
+
+    def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
+        # For each array of the state, with a trailing axis of noises.
+        hamiltonians = self._checked(t, y, args)
+        flat = lambda y: jfu.ravel_pytree(hamiltonians(y))[0]
+        last = lambda x: jnp.moveaxis(x, 0, -1)
+        dp, dq = jtu.tree_map(last, jax.jacrev(flat)(y))
+        return (-(dq**ω)).ω, dp
+
+    def prod(self, vf: PyTree[Array], control: BM) -> _State:
+        flat, _ = jfu.ravel_pytree(control)
+        return jtu.tree_map(lambda v: jnp.tensordot(v, flat.astype(v.dtype), 1), vf)
+
+    def vf_prod(
+        self, t: RealScalarLike, y: _State, args: Args, control: BM | OneNoise
+    ) -> _State:
+        hamiltonians = self._checked(t, y, args)
+
+        def scalar(p, q):
+            if isinstance(control, OneNoise):
+                if isinstance(self.noise, IndexedNoise):
+                    H = self.noise.one(control.number, t, p, q, args)
+                else:
+                    H = jfu.ravel_pytree(hamiltonians((p, q)))[0][control.number]
+                return H * jnp.asarray(control.increment, H.dtype)
+            dot = lambda h, c: jnp.sum(h * c.astype(h.dtype))
+            dots = jtu.tree_map(dot, hamiltonians((p, q)), control)
+            return sum(jtu.tree_leaves(dots))
+
+        return symplectic_gradient(scalar, y)
+
+    def is_vf_expensive(self, t0, t1, y, args) -> bool:
+        # `vf` takes one reverse pass per noise, `vf_prod` a single one.
+        struct = increment_struct(self.path)
+        return sum(s.size for s in jtu.tree_leaves(struct)) > 2
+
+    def _checked(self, t, y: _State, args) -> Callable:
+        """The noise Hamiltonians as a function of the state. Raises a `ValueError` if they
+        do not depend on it."""
+        check_pair(y)
+        struct = increment_struct(self.path)
+        hamiltonians = lambda y: self._hamiltonians(t, y[0], y[1], args, struct)
+        if Dependence(hamiltonians, y).independent(lambda y: y):
+            raise ValueError(
+                "`noise` does not depend on the state, so there is no noise. Return "
+                "Hamiltonians, not amplitudes: for kicks of constant strength to each "
+                "momentum, dp_k = sigma_k dw_k, pass `noise = lambda t, p, q, args: -sigma "
+                "* q`. Without noise, solve the drift alone, `terms.terms[0]`."
+            )
+        return hamiltonians
+
+    def _hamiltonians(self, t, p, q, args, struct) -> PyTree[Array]:
+        """The noise Hamiltonians, in the structure and shapes of the path."""
+        H = evaluated("noise", self.noise, t, p, q, args=args)
+        # A single noise may be a scalar.
+        fits = lambda h, s: jnp.shape(h) == s.shape or jnp.size(h) == s.size == 1
+        if jtu.tree_structure(H) != jtu.tree_structure(struct) or not all(
+            map(fits, jtu.tree_leaves(H), jtu.tree_leaves(struct))
+        ):
+            raise ValueError(
+                "`noise` must return one Hamiltonian for each noise of the path, which has "
+                f"shape {shapes(struct)}; got shape {shapes(H)}. Return an array of shape "
+                "`(m,)` and construct the path with `shape=(m,)`."
+            )
+        _check_real("noise", H)
+        return jtu.tree_map(lambda h, s: jnp.reshape(h, s.shape), H, struct)
+
+
+def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Array]:
+    """`H(*inputs, args)`, with advice on its errors."""
+    # A copy, so that functions which modify `args` in place are the same in each trace.
+    copy = jtu.tree_map(lambda x: x, args)
+    try:
+        return H(*inputs, copy)
+    except jax.errors.JAXTypeError as error:
+        raise ValueError(
+            f"`{name}` needs concrete values while JAX traces it, in an `if`, `while`, "
+            "`float`, or a NumPy function. Write `jnp.where(a, b, c)` or `jax.lax.cond` "
+            "instead of `if`, and `jnp` instead of `np`."
+        ) from error
+    except (TypeError, AttributeError) as error:
+        question = "was called with `args=None`. Was it left out?"
+        # An `IndexedNoise` calls this function twice.
+        asked = any(question in note for note in getattr(error, "__notes__", ()))
+        if args is None and "None" in str(error) and not asked:
+            error.add_note(f"`{name}` {question}")
+        raise
+
+
+def symplectic_gradient(scalar: Callable, y: _State) -> _State:
+    """`(-dH/dq, dH/dp)` for `H = scalar(p, q)`."""
+    p, q = y
+    dp, dq = jax.grad(scalar, argnums=(0, 1))(p, q)
+    return (-(dq**ω)).ω, dp
+
+
+def is_hamiltonian(term: diffrax.AbstractTerm) -> bool:
+    """Whether a term comes from Hamiltonians."""
+    return len(_parts(term)) > 0
+
+
+def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
+    """The `structure` that the user asserted for a term."""
+    asserted = {part.structure for part in _parts(term)}
+    return asserted.pop() if len(asserted) == 1 else None
+
+
+def _parts(term: diffrax.AbstractTerm) -> list[_Drift | HamiltonianNoise]:
+    ours = lambda x: isinstance(x, _Drift | HamiltonianNoise)
+    return [x for x in jtu.tree_leaves(term, is_leaf=ours) if ours(x)]

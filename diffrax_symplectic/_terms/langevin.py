@@ -1,0 +1,228 @@
+"""Langevin dynamics: friction on velocities, and the noise of a temperature."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree
+
+from .._arguments import check_pair, check_takes
+from .._brownian import increment_struct, raveled
+from .._compat import replaced, unwrapped, ω
+from .._custom_types import Args, BM, RealScalarLike
+from .constraint import constrained, Constraint
+from .friction import (
+    checked_friction,
+    checked_temperature,
+    FrictionAlong,
+    product_with,
+    root_product_with,
+    Value,
+    value_at,
+)
+from .hamiltonian import evaluated, hamiltonian_terms, scalar_energy
+from .paths import as_path
+from .vector_fields import split_terms
+
+
+_P = PyTree[Array]
+_Hamiltonian = Callable[[RealScalarLike, _P, _P, Args], PyTree[Array]]
+
+
+def langevin_terms(
+    H0: _Hamiltonian,
+    friction: Value | FrictionAlong,
+    temperature: Value | None = None,
+    path: diffrax.AbstractBrownianPath | PyTree | None = None,
+    *,
+    structure: Any = None,
+    constraint: Constraint | None = None,
+) -> diffrax.MultiTerm:
+    r"""The terms of Langevin dynamics: a Hamiltonian system with friction, in a heat bath.
+
+    For the state $y = (p, q)$,
+
+    $$\mathrm{d}p = -\frac{\partial H_0}{\partial q}\,\mathrm{d}t
+        - G \frac{\partial H_0}{\partial p}\,\mathrm{d}t + B\,\mathrm{d}w, \qquad
+      \mathrm{d}q = \frac{\partial H_0}{\partial p}\,\mathrm{d}t, \qquad
+      B B^\top = 2 T G.$$
+
+    The friction $G(t, q)$ acts on velocities, so it is symmetric positive semidefinite
+    whatever the masses are. (For a rate $\gamma$, $\mathrm{d}p = \ldots - \gamma
+    p\,\mathrm{d}t$, pass $G = \gamma m$.) If $H_0$ and $T$ are constant, the density
+    $e^{-H_0 / T}$ is stationary. The noise is the same in the sense of Ito and of
+    Stratonovich.
+
+    [`diffrax_symplectic.BAOAB`][], [`diffrax_symplectic.LangevinMiddle`][] and
+    [`diffrax_symplectic.Damped`][] treat friction by a step of its own. Every other solver,
+    from this package or from Diffrax, takes it as a part of the drift. More terms are added
+    by `diffrax.MultiTerm(*terms.terms, ...)`: other noise, or a second bath from
+    [`diffrax_symplectic.bath_terms`][].
+
+    **Arguments:**
+
+    - `H0`: `H0(t, p, q, args)`, as for [`diffrax_symplectic.hamiltonian_terms`][].
+    - `friction`: the friction $G$, in units of force over velocity: a number; an array with
+        one number for each momentum, of the shape of `p`; or a symmetric positive
+        semidefinite matrix, with the shape of `p` twice, `(n, n)` for `n` momenta. For
+        momenta in a PyTree a number, or a PyTree of these. Or a function `(t, q, args)`
+        that returns one of these. Or a [`diffrax_symplectic.FrictionAlong`][].
+    - `temperature`: the temperature $T$, in units of energy: a number; for friction by
+        numbers also one for each momentum, as an array or PyTree like `p`; or a function
+        `(t, q, args)` of these. `None` for friction without noise.
+    - `path`: the Brownian path or its shape, as for
+        [`diffrax_symplectic.hamiltonian_terms`][]: the shape of `q`, or `(m,)` for the `m`
+        directions of a `FrictionAlong`.
+    - `structure`: as for [`diffrax_symplectic.hamiltonian_terms`][].
+    - `constraint`: as for [`diffrax_symplectic.hamiltonian_terms`][]. Then
+        [`diffrax_symplectic.BAOAB`][] is the solver. Friction and noise act within the
+        allowed momenta; the density is $e^{-H_0 / T}$ on the allowed states.
+
+    **Returns:** `MultiTerm(drift, noise)`, or without `temperature` `MultiTerm(drift)`.
+
+    **Raises:** as [`diffrax_symplectic.hamiltonian_terms`][]; a `ValueError` if numbers are
+    known to be negative or not finite, or a matrix not to be symmetric positive
+    semidefinite; and, while the solve is traced, if their shapes do not fit. Paths fail
+    where this is not known before.
+    """
+    hamiltonian = hamiltonian_terms(H0, structure=structure).terms[0].vector_field
+    friction_term, *noise = bath_terms(H0, friction, temperature, path).terms
+    damped = DriftWithFriction(hamiltonian, friction_term.vector_field)
+    drift = constrained(diffrax.ODETerm(damped), constraint)
+    return diffrax.MultiTerm(drift, *noise)
+
+
+def bath_terms(
+    H0: _Hamiltonian,
+    friction: Value | FrictionAlong,
+    temperature: Value | None = None,
+    path: diffrax.AbstractBrownianPath | PyTree | None = None,
+) -> diffrax.MultiTerm:
+    r"""The friction and the noise of [`diffrax_symplectic.langevin_terms`][] alone:
+    $\mathrm{d}p = -G\, \partial H_0 / \partial p\,\mathrm{d}t + B\,\mathrm{d}w$.
+
+    Add them to other terms, `diffrax.MultiTerm(*terms.terms, *bath.terms)`: a second bath,
+    friction beside noise of another kind, or for
+    [`diffrax_symplectic.LinearFlow`][], whose drift is not that of `H0`.
+
+    **Arguments** and errors are those of [`diffrax_symplectic.langevin_terms`][].
+
+    **Returns:** `MultiTerm(friction, noise)`, or without `temperature`
+    `MultiTerm(friction)`.
+    """
+    check_takes("H0", H0, "t", "p", "q", "args")
+    if (temperature is None) != (path is None):
+        raise ValueError(
+            "Pass both a `temperature` and a `path` with the shape of `q`, or for friction "
+            "without noise neither of them."
+        )
+    driven = None if path is None else as_path(path)
+    struct = None if driven is None else increment_struct(driven)
+    friction = checked_friction(friction, struct)
+    term = diffrax.ODETerm(Friction(H0, friction))
+    if driven is None:
+        return diffrax.MultiTerm(term)
+    noise = BathNoise(friction, checked_temperature(temperature), driven)
+    return diffrax.MultiTerm(term, noise)
+
+
+def split_friction(terms: PyTree[diffrax.AbstractTerm]) -> tuple[tuple, tuple, tuple]:
+    """The drift without friction, the friction, and the noise."""
+    drift, noise = split_terms(terms)
+    return *friction_apart(drift), noise
+
+
+def friction_apart(drift: tuple) -> tuple[tuple, tuple]:
+    """The drift without friction, and the friction."""
+    rest, friction = [], []
+    for term in drift:
+        own = unwrapped(term)
+        field = own.vector_field if isinstance(own, diffrax.ODETerm) else None
+        if isinstance(field, DriftWithFriction):
+            rest.append(replaced(term, diffrax.ODETerm(field.drift)))
+            friction.append(replaced(term, diffrax.ODETerm(field.friction)))
+        elif isinstance(field, AbstractFriction):
+            friction.append(term)
+        else:
+            rest.append(term)
+    return tuple(rest), tuple(friction)
+
+
+class AbstractFriction(eqx.Module):
+    """A vector field `(-G v, 0)` with the velocities `v`."""
+
+    @abc.abstractmethod
+    def force(self, t: RealScalarLike, q: _P, args: Args, velocity: _P) -> _P:
+        """`-G v`."""
+
+    @abc.abstractmethod
+    def __call__(self, t: RealScalarLike, y: tuple[_P, _P], args: Args) -> Any:
+        """`(-G v, 0)`."""
+
+
+class Friction(AbstractFriction):
+    """The vector field `(-G dH0/dp, 0)`."""
+
+    H0: _Hamiltonian
+    friction: Any
+
+    def force(self, t, q, args, velocity):
+        return (-(product_with(self.friction, t, q, args, velocity) ** ω)).ω
+
+    def __call__(self, t, y, args):
+        check_pair(y)
+        p, q = y
+
+        def scalar(p):
+            return scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
+
+        force = self.force(t, q, args, jax.grad(scalar)(p))
+        return force, jtu.tree_map(jnp.zeros_like, q)
+
+
+class DriftWithFriction(eqx.Module):
+    """A vector field with friction on its velocities `dq`."""
+
+    drift: Callable
+    friction: AbstractFriction
+
+    def __call__(self, t: RealScalarLike, y: tuple[_P, _P], args: Args):
+        dp, dq = self.drift(t, y, args)
+        force = self.friction.force(t, y[1], args, dq)
+        return (dp**ω + force**ω).ω, dq
+
+
+class BathNoise(diffrax.AbstractTerm):
+    """The noise `(B dw, 0)` with `B B^T = 2 T G`."""
+
+    friction: Any
+    temperature: Value
+    path: diffrax.AbstractBrownianPath
+
+    def contr(self, t0: RealScalarLike, t1: RealScalarLike, **kwargs) -> BM:
+        return self.path.evaluate(t0, t1, **kwargs)
+
+    def vf(self, t: RealScalarLike, y: tuple[_P, _P], args: Args) -> PyTree[Array]:
+        # For each array of the state, with a trailing axis of noises.
+        flat, unravel = raveled(increment_struct(self.path))
+        product = lambda unit: self.vf_prod(t, y, args, unravel(unit))
+        return jax.vmap(product, out_axes=-1)(jnp.eye(flat.size, dtype=flat.dtype))
+
+    def prod(self, vf: PyTree[Array], control: BM) -> tuple[_P, _P]:
+        flat, _ = jfu.ravel_pytree(control)
+        return jtu.tree_map(lambda v: jnp.tensordot(v, flat.astype(v.dtype), 1), vf)
+
+    def vf_prod(
+        self, t: RealScalarLike, y: tuple[_P, _P], args: Args, control: BM
+    ) -> tuple[_P, _P]:
+        check_pair(y)
+        q = y[1]
+        T = value_at("temperature", self.temperature, t, q, args)
+        kick = root_product_with(self.friction, T, t, q, args, control)
+        return kick, jtu.tree_map(jnp.zeros_like, q)

@@ -1,0 +1,372 @@
+"""The states that a constraint allows: projections onto them, and free flight on them."""
+
+import functools as ft
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.core
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Bool, Float, PyTree, Scalar
+
+from .._arguments import check_pair, check_state, shapes
+from .._batch import batched_like, error_if_alone
+from .._custom_types import Args, RealScalarLike
+from .._root_finder import correction, max_norm, solve_matrix
+from .constraint import Constraint, constraint_of, without_constraint
+from .dependence import Dependence
+from .hamiltonian import evaluated
+from .langevin import split_friction
+from .structure import separable_fault
+from .vector_fields import check_fit, rate
+
+
+_Vector: TypeAlias = Float[Array, " n"]
+_Multipliers: TypeAlias = Float[Array, " c"]
+
+# Newton's method takes three or four steps, and up to twice as many from far away.
+_MOST_STEPS = 30
+# Changes of positions below so many units in the last place of the largest one, which no
+# longer shrink, are rounding errors.
+_ROUNDING = 100.0
+_SHRINK = 0.25
+
+
+class Frame(NamedTuple):
+    """The directions normal to the surface at a position.
+
+    - `q`: the position.
+    - `normals`: the gradients of the constraints, `J`.
+    - `along`: the changes of the velocity by impulses along them, `J M^-1`.
+    - `gram`: `J M^-1 J^T`.
+    """
+
+    q: _Vector
+    normals: Float[Array, "c n"]
+    along: Float[Array, "c n"]
+    gram: Float[Array, "c c"]
+
+
+class Surface(NamedTuple):
+    """The positions that a constraint allows and the momenta tangent to them, `J v = 0`.
+    Both are vectors.
+
+    - `residual`: the constraint, as a function of the position.
+    - `velocity`: `v = dH0/dp` as a function of the momentum, which is linear up to a
+        constant: its derivative is the inverse of the masses, `M^-1`.
+    """
+
+    residual: Callable[[_Vector], _Multipliers]
+    velocity: Callable[[_Vector], _Vector]
+
+    @staticmethod
+    def of(
+        terms: PyTree[diffrax.AbstractTerm], t: RealScalarLike, y: PyTree, args: Args
+    ) -> "Surface":
+        """That of constrained terms. Raises a `ValueError` if the constraint does not
+        return an array of shape `(c,)`."""
+        constraint = constraint_of(terms)
+        assert constraint is not None
+        drift, _, _ = split_friction(without_constraint(terms))
+        _, q = y
+        _, unravel = jfu.ravel_pytree(q)
+
+        def residual(x: _Vector) -> _Multipliers:
+            return _values(constraint, unravel(x), args)
+
+        def velocity(x: _Vector) -> _Vector:
+            return jfu.ravel_pytree(rate(drift, t, (unravel(x), q), args)[1])[0]
+
+        return Surface(residual, velocity)
+
+    def frame(self, q: _Vector) -> Frame:
+        normals = jax.jacrev(self.residual)(q)
+        along = self._pushed(normals)
+        return Frame(q, normals, along, _products(normals, along))
+
+    def _pushed(self, impulses: Float[Array, "c n"]) -> Float[Array, "c n"]:
+        """The change of the velocity by each of these changes of the momentum."""
+        still = jnp.zeros_like(impulses[0])
+        return jax.vmap(lambda x: jax.jvp(self.velocity, (still,), (x,))[1])(impulses)
+
+    def tangent(
+        self,
+        p: _Vector,
+        at: Frame,
+        response: Callable[[_Vector], _Vector] | None = None,
+    ) -> _Vector:
+        """The momentum after the impulses of the constraint forces that make it tangent.
+        An impulse changes the momentum by itself, or by its `response`."""
+        if response is None:
+            gram, changes = at.gram, at.normals
+        else:
+            changes = jax.vmap(response)(at.normals)
+            gram = _products(at.normals, self._pushed(changes))
+        speeds = _products(at.normals, self.velocity(p)[None])[:, 0]
+        return p - _combined(solve_matrix(gram, speeds), changes)
+
+    def fly(
+        self,
+        p: _Vector,
+        at: Frame,
+        time: RealScalarLike,
+        pending: Bool[Array, ""] | bool = True,
+    ) -> tuple[_Vector, _Vector, Bool[Array, ""]]:
+        r"""Free flight on the surface over `time`, by a step of RATTLE,
+
+        $$q_1 = q + h\, v(p_1), \qquad p_1 = p - J(q)^\top \lambda, \qquad g(q_1) = 0,$$
+
+        and whether the multipliers were found. The momentum $p_1$ still has to be made
+        tangent at $q_1$. The momentum $p$ need not be tangent: the multipliers make up for
+        the difference. Nothing is solved for, nor found, if not `pending`.
+        """
+        time = jnp.asarray(time, p.dtype)
+        free = at.q + time * self.velocity(p)
+        moved = lambda x: free - _combined(x, at.along)
+        off = lambda x: self.residual(moved(x))
+        size = max_norm(free)
+
+        def solve(off: Callable, start: _Multipliers):
+            x, found = _newton(off, at.along, size, start, jnp.asarray(pending))
+            # As a float: `custom_root` gives other types a tangent of a wrong type.
+            return x, found.astype(x.dtype)
+
+        start = jnp.zeros(len(at.gram), p.dtype)
+        x, found = lax.custom_root(off, start, solve, _tangent_solve, has_aux=True)
+        return p - _combined(x / time, at.normals), moved(x), found > 0
+
+    def dependent(self, at: Frame) -> Bool[Array, ""]:
+        """Whether the normals are linearly dependent, up to rounding errors."""
+        # In a solve backward in time velocities change their sign.
+        gram = at.gram * jnp.sign(jnp.trace(at.gram))
+        size = jnp.sqrt(jnp.diag(gram))
+        # A pivot is the squared sine of the angle between a normal and the ones before it.
+        pivots = jnp.diag(jnp.linalg.cholesky(gram / size / size[:, None])) ** 2
+        rounding = 1000 * jnp.finfo(gram.dtype).eps
+        return ~jnp.all(pivots > rounding)
+
+    def off(self, p: _Vector, at: Frame) -> Bool[Array, ""]:
+        """Whether a state is farther from the surface than rounding errors explain."""
+        correction = _combined(solve_matrix(at.gram, self.residual(at.q)), at.along)
+        near = float(jnp.finfo(p.dtype).eps) ** (2 / 3)
+        on = max_norm(correction) <= near * max_norm(at.q)
+        return ~(on & (max_norm(p - self.tangent(p, at)) <= near * max_norm(p)))
+
+
+def _products(a: Float[Array, "c n"], b: Float[Array, "d n"]) -> Float[Array, "c d"]:
+    """The scalar products of all pairs."""
+    return _total(a.T[:, :, None] * b.T[:, None, :])
+
+
+def _combined(x: _Multipliers, vectors: Float[Array, "c n"]) -> _Vector:
+    return _total(x[:, None] * vectors)
+
+
+# Sums over axes up to this length are unrolled, so that XLA fuses them. On CPUs it calls a
+# library for each other sum or product of matrices: steps of rigid dimers took three times
+# as long.
+_SHORT = 32
+
+
+def _total(x: Float[Array, "n ..."]) -> Float[Array, "..."]:
+    return ft.reduce(operator.add, x) if len(x) <= _SHORT else jnp.sum(x, axis=0)
+
+
+_DEPENDENT = (
+    "The gradients of `constraint` at `y0` are linearly dependent, or zero. Leave out "
+    "constraints that follow from the others, and write each so that its gradient does not "
+    "vanish where it is zero, such as `jnp.sum(q**2) - 1`."
+)
+_OFF = (
+    "`y0` is off the `constraint`, or its momenta are not tangent to it. Pass "
+    "`constrained_state(terms, y0, args)`."
+)
+
+
+def check_start(
+    terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether the constraints are dependent at `y0`, and whether it is off them. Raises a
+    `ValueError` if either is known while tracing, and for constraints that no solver takes.
+    Otherwise it is an error when run, but not in a batch."""
+    _check_masses(terms, t0, y0, args)
+    fixed = jtu.tree_map(_without_derivative, (y0, args))
+    dependent, off = _faults(terms, t0, *fixed)
+    return _refused(dependent, _DEPENDENT), _refused(off, _OFF)
+
+
+def _without_derivative(x: Any) -> Any:
+    return lax.stop_gradient(x) if eqx.is_inexact_array(x) else x
+
+
+# Outside of a program its operations would be compiled one by one.
+@eqx.filter_jit
+def _faults(terms, t0, y0, args) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    surface = Surface.of(terms, t0, y0, args)
+    (p, _), (q, _) = map(jfu.ravel_pytree, y0)
+    at = surface.frame(q)
+    dependent = surface.dependent(at)
+    return dependent, ~dependent & surface.off(p, at)
+
+
+def _refused(fault: Bool[Array, ""], advice: str) -> Bool[Array, ""]:
+    if isinstance(fault, jax.core.Tracer):
+        return error_if_alone(fault, advice)
+    if fault:
+        raise ValueError(advice)
+    return fault
+
+
+def _check_masses(terms, t0, y0, args) -> None:
+    """Raises a `ValueError` unless velocities are linear in the momenta."""
+    surface = Surface.of(terms, t0, y0, args)
+    p, _ = jfu.ravel_pytree(y0[0])
+    pushed = lambda p, x: jax.jvp(surface.velocity, (p,), (x,))[1]
+    if not Dependence(pushed, p, p).independent(lambda p, x: p):
+        raise ValueError(
+            "Terms with a `constraint` need constant masses, H0 = p . M^-1 p / 2 + "
+            "U(t, q), but the second derivative of H0 by p depends on p. Write squares of "
+            "momenta, such as `jnp.sum(p**2 / mass) / 2`."
+        )
+
+
+def constrained_state(
+    terms: PyTree[diffrax.AbstractTerm], y0: PyTree, args: Args = None
+) -> PyTree:
+    r"""A state that a constraint allows, near a given one.
+
+    Positions are moved along $M^{-1} J^\top$, with the masses $M$ of $H_0$ and the
+    gradients $J$ of the constraints at the given positions, until `constraint(q, args)` is
+    zero. Momenta lose their part along $J^\top$ at the new positions, so that $J M^{-1} p =
+    0$: of all allowed momenta these are the nearest in kinetic energy.
+
+    !!! example
+
+        ```python
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+
+        H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + q[1]
+        rod = lambda q, args: jnp.stack([jnp.sum(q**2) - 1])
+        pendulum = ds.hamiltonian_terms(H0, constraint=rod)
+        y0 = (jnp.array([0.3, 0.1]), jnp.array([2.0, 0.0]))
+        p, q = ds.constrained_state(pendulum, y0)
+        print(p, q)  # [0, 0.1] and [1, 0]
+        ```
+
+    **Arguments:**
+
+    - `terms`: the terms, with a `constraint`.
+    - `y0`: the state `(p, q)`.
+    - `args`: as for `diffrax.diffeqsolve`.
+
+    **Returns:** the pair `(p, q)`. Differentiable.
+
+    **Raises:** a `ValueError` if the terms have no constraint, if no solver takes them, if
+    the constraints are dependent at `y0`, or if Newton's method finds no allowed positions.
+    If this is not known while tracing, the state is NaN, and a solve from there fails.
+    """
+    if constraint_of(terms) is None:
+        raise ValueError(
+            "`constrained_state` needs terms with a `constraint`, such as "
+            "`hamiltonian_terms(H0, constraint=constraint)`."
+        )
+    check_pair(y0)
+    check_state(y0, "constrained_state")
+    t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(y0)))
+    drift, _, _ = split_friction(without_constraint(terms))
+    check_fit(diffrax.MultiTerm(*drift), t, y0, args)
+    if fault := separable_fault(drift, (), t, y0, args):
+        raise ValueError(
+            "Terms with a `constraint` need H0 = p . M^-1 p / 2 + U(t, q), but "
+            f"{fault.reason}. {fault.advice}"
+        )
+    _check_masses(terms, t, y0, args)
+    y1, found, dependent = _projected(terms, t, y0, args)
+    if not isinstance(found, jax.core.Tracer):
+        if dependent:
+            raise ValueError(_DEPENDENT)
+        if not found:
+            raise ValueError(
+                "`constrained_state` found no positions with `constraint(q, args) = 0` "
+                "from `y0`. Pass one that is closer to them."
+            )
+    okay = found & ~dependent
+    return jtu.tree_map(lambda x: jnp.where(okay, x, jnp.nan), y1)
+
+
+@eqx.filter_jit
+def _projected(terms, t, y0, args) -> tuple[PyTree, Bool[Array, ""], Bool[Array, ""]]:
+    """The nearest allowed state, whether Newton's method found it, and whether the
+    constraints are dependent there."""
+    surface = Surface.of(terms, t, y0, args)
+    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
+    _, q, found = surface.fly(jnp.zeros_like(p), surface.frame(q), 1.0)
+    at = surface.frame(q)
+    y1 = unravel_p(surface.tangent(p, at)), unravel_q(q)
+    return y1, found, surface.dependent(at)
+
+
+def _values(constraint: Constraint, q: PyTree, args: Args) -> _Multipliers:
+    value = evaluated("constraint", constraint, q, args=args)
+    real = eqx.is_array_like(value) and not jnp.iscomplexobj(value)
+    if not real or jnp.ndim(value) != 1 or jnp.size(value) == 0:
+        raise ValueError(
+            "`constraint(q, args)` must return a real array of shape `(c,)`, one number "
+            f"for each constraint; got shape {shapes(value)}. For one constraint write "
+            "`jnp.stack([...])`."
+        )
+    return jnp.asarray(value, jnp.result_type(*jtu.tree_leaves(q)))
+
+
+class _Newton(NamedTuple):
+    """The multipliers, the largest change of a position by their last correction, the
+    number of corrections, and whether the next one is within the tolerance."""
+
+    x: _Multipliers
+    change: Scalar
+    number: Array
+    solved: Bool[Array, ""]
+
+
+def _newton(
+    off: Callable,
+    along: Float[Array, "c n"],
+    size: Scalar,
+    start: _Multipliers,
+    pending: Bool[Array, ""],
+) -> tuple[_Multipliers, Bool[Array, ""]]:
+    """The root of `off`, and whether it was found; otherwise zero. The multipliers change
+    positions of this `size` by `x @ along`."""
+    tolerance = float(jnp.finfo(start.dtype).eps) * size
+
+    def going(state: _Newton):
+        left = pending & (state.number < _MOST_STEPS)
+        return left & ~state.solved & ~jnp.isnan(state.change)
+
+    def step(state: _Newton) -> _Newton:
+        _, diff, _ = correction(off, state.x, None)
+        change = max_norm(_combined(diff, along))
+        before = jnp.where(state.number > 0, state.change, change)
+        # The next one is smaller at least by the same factor.
+        solved = change * jnp.minimum(change, before) <= tolerance * before
+        rounded = (change <= _ROUNDING * tolerance) & (change >= _SHRINK * before)
+        x = state.x - diff
+        return _Newton(x, change, state.number + 1, solved | rounded)
+
+    zero, no = jnp.zeros((), start.dtype), jnp.array(False)
+    first = _Newton(start, zero, jnp.array(0), no)
+    first = batched_like(first, (off(start), along, size, pending))
+    last = lax.while_loop(going, step, first)
+    return jnp.where(last.solved, last.x, 0), last.solved
+
+
+def _tangent_solve(apply: Callable, rhs: _Multipliers) -> _Multipliers:
+    matrix = jax.vmap(apply, out_axes=1)(jnp.eye(len(rhs), dtype=rhs.dtype))
+    return solve_matrix(matrix, rhs)

@@ -1,0 +1,288 @@
+"""What `ensemble` returns and refuses."""
+
+import importlib
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._expectation import engines
+from diffrax_symplectic._stablehlo import backend
+
+from ..drjit_here import needs_drjit
+
+
+ONE = jnp.array(0.0), jnp.array(1.0)
+both_engines = pytest.mark.parametrize(
+    "engine", ["jax", pytest.param("drjit", marks=needs_drjit)]
+)
+
+
+def pendulum(t, p, q, args):
+    return p**2 / 2 - jnp.cos(q)
+
+
+def push(t, p, q, args):
+    return 0.2 * jnp.sin(q)
+
+
+def stiff(t, p, q, args):
+    return p**2 / 2 + 20 * q**4
+
+
+TERMS = ds.hamiltonian_terms(pendulum, push, ds.WeakBrownianPath((), jr.key(0)))
+STIFF = ds.hamiltonian_terms(stiff, push, ds.WeakBrownianPath((), jr.key(0)))
+
+
+def follow(terms=TERMS, solver=None, t1=1.0, dt0=0.25, y0=ONE, args=None, **kwargs):
+    kwargs = dict(key=jr.key(1), num_paths=40) | kwargs
+    solver = ds.StormerVerlet() if solver is None else solver
+    return ds.ensemble(terms, solver, 0.0, t1, dt0, y0, args, **kwargs)
+
+
+@both_engines
+def test_states_are_those_of_diffeqsolve_at_the_saved_times(engine):
+    times = [0.0, 0.5, 1.0]
+    paths = follow(ts=times, engine=engine)
+    np.testing.assert_allclose(paths.ts, times, rtol=1e-15)
+    p, q = paths.ys
+    assert type(q) is np.ndarray and q.shape == (40, 3)
+    assert paths.num_failed == paths.num_stragglers == 0
+    for i in (0, 7, 39):
+        saveat = diffrax.SaveAt(ts=jnp.array(times))
+        sol = diffrax.diffeqsolve(
+            paths.terms(i), ds.StormerVerlet(), 0.0, 1.0, 0.25, ONE, saveat=saveat
+        )
+        np.testing.assert_allclose(p[i], sol.ys[0], rtol=1e-14, atol=1e-15)
+        np.testing.assert_allclose(q[i], sol.ys[1], rtol=1e-14, atol=1e-15)
+
+
+def test_terms_of_a_path_are_complete_if_the_terms_had_a_shape():
+    paths = follow(ds.hamiltonian_terms(pendulum, push, ()))
+    sol = diffrax.diffeqsolve(paths.terms(7), ds.StormerVerlet(), 0.0, 1.0, 0.25, ONE)
+    np.testing.assert_allclose(paths.ys[1][7], sol.ys[1][-1], rtol=1e-14)
+
+
+@both_engines
+@pytest.mark.parametrize("solver", [ds.StormerVerlet(), ds.ImplicitMidpoint()])
+def test_a_shape_becomes_a_path_with_gaussian_increments_unless_a_weak_one_is_wanted(
+    engine, solver
+):
+    kick = ds.hamiltonian_terms(pendulum, lambda t, p, q, args: -q, ())
+    once = dict(terms=kick, solver=solver, t1=0.25, num_paths=200, engine=engine)
+    values = lambda paths: len(np.unique(np.round(paths.ys[0], 12)))
+    # (A few are cut off for the implicit solver.)
+    assert values(follow(**once)) >= 190
+    assert values(follow(**once, want="weak")) == 3
+    with pytest.raises(ValueError, match="`want` must be one of"):
+        follow(**once, want="sharp")
+
+
+@both_engines
+def test_without_times_the_ends_are_returned(engine):
+    ends, saved = follow(engine=engine), follow(engine=engine, ts=[1.0])
+    assert ends.ys[0].shape == (40,)
+    assert list(ends.ts) == [1.0]
+    np.testing.assert_array_equal(ends.ys[1], saved.ys[1][:, 0])
+    unsorted = follow(engine=engine, ts=[1.0, 0.25, 1.0])
+    np.testing.assert_array_equal(unsorted.ys[1][:, 0], unsorted.ys[1][:, 2])
+    np.testing.assert_array_equal(unsorted.ys[1][:, 0], ends.ys[1])
+
+
+@both_engines
+@pytest.mark.parametrize("batch_size", [1, 7, 40])
+def test_a_path_does_not_depend_on_its_batch(engine, batch_size):
+    whole = follow(engine=engine, num_paths=50, solver=ds.ImplicitMidpoint())
+    parts = follow(engine=engine, batch_size=batch_size, solver=ds.ImplicitMidpoint())
+    tolerance = 0.0 if engine == "drjit" else 1e-15
+    np.testing.assert_allclose(parts.ys[1], whole.ys[1][:40], rtol=tolerance, atol=0)
+
+
+@needs_drjit
+def test_paths_that_sweeps_do_not_solve_are_taken_by_jax():
+    kwargs = dict(terms=STIFF, solver=ds.ImplicitMidpoint(), t1=4.0, num_paths=60)
+    y0 = jnp.array(0.0), jnp.array(0.4)
+    with pytest.warns(UserWarning, match="did not solve"):
+        fused = follow(**kwargs, y0=y0, dt0=0.8, engine="drjit")
+    assert 0 < fused.num_stragglers <= 60
+    assert fused.num_failed == 0
+    exact = follow(**kwargs, y0=y0, dt0=0.8)
+    np.testing.assert_allclose(fused.ys[1], exact.ys[1], rtol=0, atol=1e-10)
+
+
+def singular(t, p, q, args):
+    return p**2 / 2 + jnp.sqrt(q)
+
+
+@needs_drjit
+def test_the_same_paths_fail_and_leave_others_as_they_are():
+    path = ds.FixedStepBrownianPath((), jr.key(0))
+    terms = ds.hamiltonian_terms(singular, lambda t, p, q, args: 2 * q**2, path)
+    several = dict(terms=terms, t1=4.0, num_paths=200, ts=[0.25, 4.0])
+    paths = {}
+    for engine in ("jax", "drjit"):
+        with pytest.warns(
+            UserWarning, match="of 200 paths failed. Their states are NaN"
+        ):
+            paths[engine] = follow(**several, engine=engine)
+    failed = paths["jax"].failed
+    assert 0 < np.sum(failed) < 200
+    np.testing.assert_array_equal(paths["drjit"].failed, failed)
+    assert paths["drjit"].num_stragglers == np.sum(failed)
+    for engine in paths:
+        q = paths[engine].ys[1]
+        assert np.all(np.isnan(q[failed])) and np.all(np.isfinite(q[~failed]))
+
+
+@needs_drjit
+def test_another_step_number_of_steps_parameter_and_start_compile_nothing(monkeypatch):
+    def spring(t, p, q, args):
+        return p**2 / 2 + args * q**2
+
+    terms = ds.hamiltonian_terms(spring, push, ds.WeakBrownianPath((), jr.key(0)))
+    made = []
+    make = engines._kernels
+    monkeypatch.setattr(engines, "_kernels", lambda x: made.append(make(x)) or made[-1])
+    kwargs = dict(terms=terms, engine="drjit", ts=[0.5, 1.0])
+    first = follow(**kwargs, args=jnp.array(0.5))
+    other = follow(**kwargs, args=jnp.array(0.7), y0=(ONE[1], ONE[0]), dt0=0.125)
+    follow(**kwargs, args=jnp.array(0.7), t1=3.0, num_paths=41, key=jr.key(4))
+    assert made[0] is made[1] is made[2]
+    assert made[0]._take_steps.n_recordings == made[0]._make_keys.n_recordings == 1
+    assert not np.allclose(first.ys[1], other.ys[1])
+    kwargs["engine"] = "jax"
+    exact = follow(**kwargs, args=jnp.array(0.7), y0=(ONE[1], ONE[0]), dt0=0.125)
+    np.testing.assert_allclose(other.ys[1], exact.ys[1], rtol=1e-13)
+
+
+@needs_drjit
+def test_an_error_within_a_step_is_raised():
+    path = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((), jr.key(0)))
+    terms = ds.hamiltonian_terms(pendulum, push, path)
+    assert follow(terms, engine="drjit").num_stragglers == 0
+    with pytest.raises(Exception, match="shorter than one unit of time"):
+        follow(terms, dt0=2.0, t1=4.0, engine="drjit")
+
+
+def waves(t, p, q, args):
+    return jnp.sum(p**2) / 2 + jnp.sum(jnp.abs(jnp.fft.fft(q)) ** 2)
+
+
+def ordered(t, p, q, args):
+    return jnp.sum(p**2) / 2 + jnp.sort(jnp.tile(q, 6))[0] ** 2
+
+
+def table(t, p, q, args):
+    place = jnp.clip(jnp.floor(q[0]), 0, 99).astype(int)
+    return jnp.sum(p**2) / 2 + jnp.cos(q[0] * args)[place]
+
+
+def solved(t, p, q, args):
+    return jnp.sum(p**2) / 2 + jnp.linalg.eigvalsh(jnp.eye(3) + jnp.outer(q, q))[0]
+
+
+REFUSED = [
+    (waves, "`stablehlo.fft`"),
+    (ordered, "`stablehlo.sort` of more than 16 numbers"),
+    (
+        table,
+        "`stablehlo.dynamic_slice` with an index per path, among 100 places",
+    ),
+    (solved, "a call of `lapack_dsyevd"),
+]
+
+
+@needs_drjit
+@pytest.mark.parametrize("H0, what", REFUSED, ids=[fn.__name__ for fn, _ in REFUSED])
+def test_what_cannot_be_replayed_is_named_with_the_function_that_needs_it(H0, what):
+    path = ds.WeakBrownianPath((), jr.key(0))
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: q[0], path)
+    y0, args = (jnp.zeros(3), jnp.arange(3.0)), jnp.ones(100)
+    limit = jax.config.jax_traceback_in_locations_limit  # pyright: ignore
+    jax.config.update("jax_traceback_in_locations_limit", 10)
+    try:
+        with pytest.raises(ValueError, match="cannot replay") as info:
+            follow(terms, ds.ImplicitMidpoint(), y0=y0, args=args, engine="drjit")
+    finally:
+        jax.config.update("jax_traceback_in_locations_limit", limit)
+    assert what in str(info.value)
+    assert f"which `{H0.__name__}` needs" in str(info.value)
+    assert __file__ in str(info.value)
+    assert 'Pass `engine="jax"`' in str(info.value)
+    # And what comes after that is as before.
+    assert follow(engine="drjit").num_failed == 0
+
+
+@needs_drjit
+def test_large_states_are_refused():
+    y0 = jnp.zeros(200), jnp.ones(200)
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2,
+        lambda t, p, q, args: q[0],
+        ds.WeakBrownianPath((), jr.key(0)),
+    )
+    with pytest.raises(ValueError, match="up to 256 numbers; got 400"):
+        follow(terms, y0=y0, engine="drjit")
+
+
+@pytest.fixture
+def fresh():
+    """What is known of Dr.Jit is asked for again, within the test and after it."""
+    caches = backend.drjit, backend.array_types
+    for fn in caches:
+        fn.cache_clear()
+    yield
+    for fn in caches:
+        fn.cache_clear()
+
+
+def test_without_drjit_an_error_says_how_to_install_it(monkeypatch, fresh):
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    with pytest.raises(ImportError, match=r"needs Dr.Jit.*pip install '.\[fused\]'"):
+        follow(engine="drjit")
+
+
+@needs_drjit
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="a GPU needs no LLVM")
+def test_without_llvm_an_error_says_how_to_install_it(monkeypatch, fresh):
+    monkeypatch.setattr(backend.drjit(), "has_backend", lambda backend: False)
+    with pytest.raises(ImportError, match="libllvm19.*DRJIT_LIBLLVM_PATH"):
+        follow(engine="drjit")
+
+
+BAD = [
+    (dict(engine="cuda"), '`engine` must be "jax", "drjit" or `None`; got \'cuda\''),
+    (dict(num_paths=0), "`num_paths` must be a positive integer"),
+    (dict(batch_size=0), "`batch_size` must be a positive integer"),
+    (dict(dt0=0.3), "whole number of steps"),
+    (dict(ts=[0.3]), "whole number of steps"),
+    (dict(key=3), "needs a random key"),
+    (dict(y0=(ONE[0], jnp.array(np.nan))), "`y0` must hold finite numbers"),
+    (dict(solver=diffrax.EulerHeun), "`solver` must be a solver"),
+    (dict(y0=ONE[0] + 1j), "`ensemble` needs a state.*`wave_terms.*to_pair"),
+]
+
+
+@pytest.mark.parametrize("kwargs, message", BAD, ids=[m[:30] for _, m in BAD])
+def test_bad_arguments_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        follow(**kwargs)
+
+
+def test_it_is_no_part_of_a_jax_program():
+    with pytest.raises(ValueError, match="^`ensemble` cannot run inside JAX"):
+        eqx.filter_jit(lambda q: follow(y0=(ONE[0], q)).ys)(ONE[1])
+
+
+def test_events_lead_to_monte_carlo():
+    event = diffrax.Event(lambda t, y, args, **kwargs: y[0] > 1)
+    with pytest.raises(TypeError, match="`ensemble` takes no `event`.*`monte_carlo`"):
+        follow(event=event)

@@ -1,0 +1,82 @@
+"""`expectation` by fused kernels."""
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from ..drjit_here import needs_drjit
+from .test_ensemble import follow, ONE, STIFF, TERMS
+
+
+def square(t, y, args):
+    return {"q2": y[1] ** 2, "t": t * y[0]}
+
+
+def mean(**kwargs):
+    kwargs = dict(key=jr.key(1), sampling=ds.IndependentPaths(300, 128)) | kwargs
+    solver = ds.StormerVerlet()
+    return ds.expectation(square, TERMS, solver, 0.0, 1.0, 0.25, ONE, **kwargs)
+
+
+@needs_drjit
+@pytest.mark.parametrize(
+    "kwargs", [{}, dict(ts=[0.5, 1.0]), dict(levels=2)], ids=["end", "times", "levels"]
+)
+def test_means_are_those_of_the_same_paths(kwargs):
+    fused, exact = mean(engine="drjit", **kwargs), mean(**kwargs)
+    assert fused.num_paths == exact.num_paths == 300
+    assert jax.tree.structure(fused.mean) == jax.tree.structure(exact.mean)
+    for a, b in ((fused.mean, exact.mean), (fused.std_error, exact.std_error)):
+        for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b)):
+            np.testing.assert_allclose(x, y, rtol=1e-11, atol=1e-13)
+
+
+@needs_drjit
+def test_other_samplings_and_engines_are_refused():
+    with pytest.raises(ValueError, match="takes independent paths"):
+        mean(engine="drjit", sampling=ds.ArrayRQMC(64, 4))
+    with pytest.raises(ValueError, match="`engine` must be"):
+        mean(engine="numba")
+
+
+@needs_drjit
+def test_a_path_that_fails_has_no_part_in_a_mean():
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: p**2 / 2 + jnp.sqrt(q),
+        lambda t, p, q, args: 2 * q**2,
+        ds.FixedStepBrownianPath((), jr.key(0)),
+    )
+    several = dict(key=jr.key(1), sampling=ds.IndependentPaths(200))
+    solver, phi = ds.StormerVerlet(), lambda t, y, args: jnp.tanh(y[1])
+    means = [
+        ds.expectation(phi, terms, solver, 0.0, 4.0, 0.25, ONE, engine=e, **several)
+        for e in (None, "drjit")
+    ]
+    assert 0 < means[0].num_failed == means[1].num_failed < 200
+    np.testing.assert_allclose(means[1].mean, means[0].mean, rtol=1e-9)
+
+
+@needs_drjit
+def test_many_stragglers_are_warned_of():
+    y0, sampling = (jnp.array(0.0), jnp.array(0.4)), ds.IndependentPaths(60)
+    given = square, STIFF, ds.ImplicitMidpoint(), 0.0, 4.0, 0.8, y0
+    with pytest.warns(UserWarning, match="of 60 paths had steps that the fused kernel"):
+        ds.expectation(*given, key=jr.key(1), sampling=sampling, engine="drjit")
+
+
+@needs_drjit
+@pytest.mark.parametrize("change", [dict(rtol=1e-4), dict(atol=1e-4)], ids=str)
+def test_another_tolerance_than_rounding_error_is_refused(change):
+    solver = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(**change))
+    (name,) = change
+    with pytest.raises(
+        ValueError, match=rf"rounding error; got `PicardNewton\({name}="
+    ):
+        follow(solver=solver, engine="drjit")
+    # JAX takes the paths that need Newton's method.
+    solver = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(newton_steps=50))
+    assert follow(solver=solver, engine="drjit").num_failed == 0

@@ -1,0 +1,100 @@
+"""Arrays that all paths share stay in memory, and each path reads its own place."""
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from ..drjit_here import needs_drjit
+from .test_operations import replayed
+
+
+pytestmark = needs_drjit
+
+GRID = np.linspace(-4, 4, 300)
+MEASURED = -np.cos(GRID)
+FORCES = np.sin(np.arange(100_000) / 10)
+MAP = np.outer(MEASURED, np.sin(GRID))
+
+
+def energy(potential):
+    return lambda t, p, q, args: p**2 / 2 + potential(t, q, args)
+
+
+def recorded(t, q, args):
+    return q**2 / 2 - q * args[jnp.int32(1000 * t)]
+
+
+def field(t, q, args):
+    place = (q + 4) * 299 / 8
+    i = jnp.clip(jnp.int32(place), 0, 298)
+    rest = place - i
+    return (1 - rest) * args[i, 200 - i // 2] + rest * args[i + 1, 200 - i // 2]
+
+
+POTENTIALS = {
+    "constants": (lambda t, q, args: jnp.interp(q, GRID, MEASURED), None),
+    "args": (lambda t, q, args: jnp.interp(q, *args), (GRID, MEASURED)),
+    "every second entry": (
+        lambda t, q, args: jnp.interp(q, args[0][5:290:2], args[1][5:290:2]),
+        (GRID, MEASURED),
+    ),
+    "recorded in time": (recorded, FORCES),
+    "field map": (field, MAP),
+}
+
+
+def paths(name: str, engine: str, num_paths: int, dtype) -> ds.Ensemble:
+    potential, args = POTENTIALS[name]
+    args = jax.tree.map(lambda x: jnp.asarray(x, dtype), args)
+    noise = lambda t, p, q, args: 0.3 * q
+    path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((), dtype), jr.key(0))
+    terms = ds.hamiltonian_terms(energy(potential), noise, path)
+    y0 = (jnp.asarray(0.5, dtype), jnp.asarray(0.7, dtype))
+    # A step of a power of two: all times are exact.
+    given = terms, ds.StormerVerlet(), 0, 1, 0.125, y0, args
+    return ds.ensemble(*given, key=jr.key(1), num_paths=num_paths, engine=engine)
+
+
+# As many paths as entries, fewer, and more.
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=["f32", "f64"])
+@pytest.mark.parametrize("name", POTENTIALS)
+def test_paths_are_the_same_as_in_jax(name, dtype):
+    for number in (300, 40, 700):
+        fused = paths(name, "drjit", number, dtype)
+        plain = paths(name, "jax", number, dtype)
+        assert fused.num_failed == 0 and fused.num_stragglers == 0
+        for x, y in zip(fused.ys, plain.ys):
+            # A path that rounding errors move across a node of the grid differs there.
+            close = np.abs(x - y) <= 200 * np.finfo(dtype).eps
+            assert np.mean(close) > 0.98
+
+
+def test_a_table_of_the_paths_own_numbers_is_refused_by_name():
+    def potential(t, q, args):
+        table = jnp.cos(q + jnp.arange(100.0))
+        return table[jnp.int32(10 * q)]
+
+    terms = ds.hamiltonian_terms(
+        energy(potential), lambda t, p, q, args: q, ds.WeakBrownianPath((), jr.key(0))
+    )
+    given = terms, ds.StormerVerlet(), 0, 1, 0.1, (0.0, 1.0)
+    with pytest.raises(
+        ValueError, match="`stablehlo.*with an index per path, among 100"
+    ):
+        ds.ensemble(*given, key=jr.key(0), num_paths=10, engine="drjit")
+
+
+def test_an_error_of_dr_jit_is_reported_with_the_operation(monkeypatch):
+    from diffrax_symplectic._stablehlo import operation
+    from diffrax_symplectic._stablehlo.operation import NotReplayed
+
+    def mistaken(o, *xs):
+        raise TypeError("UInt(-1)")
+
+    monkeypatch.setitem(operation.RULES, "reverse", mistaken)
+    with pytest.raises(NotReplayed, match=r"`stablehlo.reverse`.*UInt\(-1\)"):
+        replayed(lambda x: x[::-1], np.ones((5, 3)))

@@ -1,0 +1,276 @@
+"""Systems are refused for their structure, not for the way in which they are written."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import lineax as lx
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._terms.structure import commuting
+
+
+def _solve(H0, noise, solver=None, args=None):
+    path = ds.WeakBrownianPath((), jr.key(0))
+    terms = ds.hamiltonian_terms(H0, noise, path)
+    y0 = (jnp.array([0.3, 0.1]), jnp.array([0.5, -0.2]))
+    solver = ds.SRKw3() if solver is None else solver
+    return diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0, args)
+
+
+_good_H0 = lambda t, p, q, args: jnp.sum(p**2 + q**4)
+
+
+_good_noise = lambda t, p, q, args: jnp.sum(jnp.sin(q))
+
+
+@pytest.mark.parametrize(
+    "solver", [ds.SRKw3("c"), ds.SRKw4(), ds.SRKs2(), ds.SRKs3(), ds.StormerVerlet()]
+)
+@pytest.mark.parametrize(
+    "H0, noise, derivative",
+    [
+        (lambda t, p, q, args: jnp.sum(p * q), _good_noise, "dH0/dq depends on p"),
+        (
+            lambda t, p, q, args: jnp.sum(p**2) * (1 + t),
+            _good_noise,
+            "dH0/dp depends on t",
+        ),
+        (_good_H0, lambda t, p, q, args: jnp.sum(p), "dH_k/dp is not zero"),
+        (_good_H0, lambda t, p, q, args: jnp.sum(p * q), "dH_k/dp is not zero"),
+    ],
+    ids=["coupled", "time", "momentum", "both"],
+)
+def test_wrong_structure_is_refused_by_the_derivative(solver, H0, noise, derivative):
+    with pytest.raises(ValueError, match=derivative):
+        _solve(H0, noise, solver)
+
+
+def test_general_solvers_take_any_structure():
+    _solve(lambda t, p, q, args: jnp.sum(p * q), _good_noise, ds.ImplicitMidpoint())
+
+
+@pytest.mark.parametrize(
+    "H0, args",
+    [
+        (
+            lambda t, p, q, args: (
+                jnp.sum(p**2 + q**2) / 2 + (1 - args) * jnp.sum(p * q)
+            ),
+            jnp.array(0),
+        ),
+        (
+            lambda t, p, q, args: (
+                jnp.sum(p**2 + q**2) / 2 + jnp.where(args, 0.0, 1.0) * jnp.sum(p * q)
+            ),
+            jnp.array(False),
+        ),
+    ],
+    ids=["integer", "Boolean"],
+)
+def test_integers_and_booleans_in_args_stand_for_any_value(H0, args):
+    # With these values, p and q couple. With others they do not.
+    with pytest.raises(ValueError, match="dH0/dq depends on p.*structure="):
+        _solve(H0, _good_noise, ds.StormerVerlet(), args)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_the_smallest_coupling_is_refused_in_both_precisions(dtype):
+    path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((), dtype), jr.key(0))
+    terms = ds.hamiltonian_terms(
+        _good_H0, lambda t, p, q, args: 1e-20 * jnp.sum(p * q), path
+    )
+    y0 = (jnp.array([0.3, 0.1], dtype), jnp.array([0.5, -0.2], dtype))
+    t0, t1, h = jnp.array([0.0, 0.2, 0.1], dtype)
+    with pytest.raises(ValueError, match="dH_k/dp is not zero"):
+        diffrax.diffeqsolve(terms, ds.SRKw3(), t0, t1, h, y0)
+
+
+_pair = (jax.ShapeDtypeStruct((2,), jnp.float64),) * 2
+
+
+def test_position_before_momentum_is_asked_about():
+    H0 = lambda t, a, b, args: jnp.sum(b**2) / 2 + jnp.sum(a**4)
+    kick = lambda t, a, b, args: -jnp.sum(a)
+    for solver in (ds.StormerVerlet(), ds.SRKs2()):
+        with pytest.raises(ValueError, match="the wrong way round"):
+            _solve(H0, kick, solver)
+    # As plain terms, too.
+    kick = diffrax.ControlTerm(
+        lambda t, y, args: lx.PyTreeLinearOperator((jnp.zeros(2), jnp.ones(2)), _pair),
+        ds.WeakBrownianPath((), jr.key(0)),
+    )
+    drift = diffrax.ODETerm(lambda t, y, args: (y[1], -(y[0] ** 3)))
+    terms = diffrax.MultiTerm(drift, kick)
+    with pytest.raises(ValueError, match="the wrong way round"):
+        ds.StormerVerlet().init(terms, 0.0, 0.1, _positive_state, None)
+    with pytest.raises(ValueError) as info:
+        _solve(H0, lambda t, p, q, args: jnp.sum(p * q), ds.StormerVerlet())
+    assert "wrong way" not in str(info.value)
+
+
+def _langevin(friction: float, momentum_first: bool) -> diffrax.MultiTerm:
+    """Plain terms with the friction in the drift."""
+    order = (lambda x, v: (v, x)) if momentum_first else (lambda x, v: (x, v))
+    noises = jax.ShapeDtypeStruct((2,), jnp.float64)
+
+    def drift(t, y, args):
+        x, v = order(*y)
+        return order(v, -(x**3) - friction * v if friction else -(x**3))
+
+    kick = lambda w: order(jnp.zeros(2), 0.3 * w)
+    operator = lambda t, y, args: lx.FunctionLinearOperator(kick, noises)
+    path = ds.WeakBrownianPath((2,), jr.key(0))
+    return diffrax.MultiTerm(
+        diffrax.ODETerm(drift), diffrax.ControlTerm(operator, path)
+    )
+
+
+def test_friction_in_the_drift_is_told_of_langevin_terms():
+    y0 = jnp.ones(2), jnp.zeros(2)
+    start = lambda terms: ds.BAOAB().init(terms, 0.0, 0.1, y0, None)
+    for first in (True, False):
+        with pytest.raises(
+            ValueError, match=r"Take friction from `langevin_ter"
+        ) as info:
+            start(_langevin(0.5, first))
+        assert ("wrong way round?" in str(info.value)) is not first
+        found = ds.suggest_solver(_langevin(0.5, first), 0.0, y0, want="weak")
+        assert "Take friction from `langevin_terms" in found.system
+    # Friction of its own and plain terms go together.
+    kinetic = lambda t, p, q, args: p @ p / 2
+    friction = ds.bath_terms(kinetic, 0.5).terms
+    terms = diffrax.MultiTerm(*_langevin(0.0, True).terms, *friction)
+    start(terms)
+    found = ds.suggest_solver(terms, 0.0, y0, want="weak")
+    assert isinstance(found[0].solver, ds.BAOAB)
+
+
+def test_spins_are_not_told_to_write_sums():
+    terms = ds.spin_terms(
+        lambda t, s, args: s[2],
+        lambda t, s, args: s,
+        ds.WeakBrownianPath((3,), jr.key(0)),
+    )
+    y0 = ds.to_spinors(jnp.array([1.0, 0.0, 0.0]))
+    with pytest.raises(ValueError, match="For spins and complex .* `ImplicitMidpoint`"):
+        ds.StormerVerlet().init(terms, 0.0, 0.1, y0, None)
+
+
+def test_plain_terms_of_a_separable_system_are_taken():
+    # The noise is written out, with a block of zeros.
+    kick = diffrax.ControlTerm(
+        lambda t, y, args: lx.PyTreeLinearOperator(
+            (jnp.cos(y[1]), jnp.zeros_like(y[1])), _pair
+        ),
+        ds.WeakBrownianPath((), jr.key(0)),
+    )
+    drift = diffrax.ODETerm(lambda t, y, args: (-4 * y[1] ** 3, 2 * y[0]))
+    terms = diffrax.MultiTerm(drift, kick)
+    got = diffrax.diffeqsolve(terms, ds.StormerVerlet(), 0.0, 0.2, 0.1, _positive_state)
+    noise = lambda t, p, q, args: -jnp.sum(jnp.sin(q))
+    same = ds.hamiltonian_terms(_good_H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+    sol = diffrax.diffeqsolve(same, ds.StormerVerlet(), 0.0, 0.2, 0.1, _positive_state)
+    np.testing.assert_allclose(got.ys, sol.ys, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "field, says",
+    [
+        (lambda p, q: (q, q), "a noise term changes q, the second half of the state"),
+        (lambda p, q: (p, jnp.zeros(2)), "changes p by an amount that depends on p"),
+    ],
+)
+def test_plain_noise_is_not_blamed_on_a_hamiltonian(field, says):
+    kick = diffrax.ControlTerm(
+        lambda t, y, args: lx.PyTreeLinearOperator(field(*y), _pair),
+        ds.WeakBrownianPath((), jr.key(0)),
+    )
+    drift = diffrax.ODETerm(lambda t, y, args: (-y[1], y[0]))
+    terms = diffrax.MultiTerm(drift, kick)
+    additive = "the noise b_k depends on the state"
+    for solver, match in ((ds.StormerVerlet(), says), (ds.SRKs4(), additive)):
+        with pytest.raises(ValueError, match=match) as info:
+            solver.init(terms, 0.0, 0.1, _positive_state, None)
+        assert "dH" not in str(info.value)
+
+
+def test_one_coupled_array_of_several_is_enough_to_refuse():
+    H0 = lambda t, p, q, args: p["a"] ** 2 + q["a"] ** 2 + p["b"] * q["b"]
+    noise = lambda t, p, q, args: q["a"]
+    terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
+    one = {"a": jnp.ones(()), "b": jnp.ones(())}
+    with pytest.raises(ValueError, match="depends on"):
+        ds.StormerVerlet().init(terms, 0.0, 0.1, (one, one), None)
+
+
+def test_noises_commute_only_if_that_could_be_tested():
+    path = ds.WeakBrownianPath((2,), jr.key(0))
+    for second, expected in (
+        (lambda p, q: jnp.sum(p * q) ** 2, True),
+        (lambda p, q: jnp.sum(p), False),
+        (lambda p, q: jnp.sum(jnp.sqrt(-1 - (p * q) ** 2)), False),
+    ):
+        noise = lambda t, p, q, args: jnp.stack([jnp.sum(p * q), second(p, q)])
+        term = ds.hamiltonian_terms(_good_H0, noise, path).terms[1]
+        assert commuting((term,), 0.0, _positive_state, None) == expected
+
+
+_positive_state = jnp.array([0.3, 0.1]), jnp.array([0.5, 0.2])
+
+
+def test_an_asserted_structure_is_relied_on():
+    # Whether this is separable depends on a value that is not known while tracing.
+    H0 = lambda t, p, q, args: jnp.sum(p**2 + q**4) + args * jnp.sum(p * q)
+    path, coupling = ds.WeakBrownianPath((), jr.key(0)), jnp.array(0.0)
+
+    def solve(**kwargs):
+        terms = ds.hamiltonian_terms(H0, _good_noise, path, **kwargs)
+        return diffrax.diffeqsolve(
+            terms, ds.StormerVerlet(), 0.0, 0.2, 0.1, _positive_state, coupling
+        ).ys
+
+    with pytest.raises(ValueError, match="depends on p.*pass `structure="):
+        solve()
+    with pytest.raises(ValueError, match="depends on"):
+        solve(structure="additive")
+    expected = _solve_from(_good_H0, _positive_state)
+    np.testing.assert_allclose(solve(structure="separable"), expected, rtol=1e-14)
+    with pytest.raises(ValueError, match="`structure` must be one of"):
+        solve(structure="seperable")
+
+
+def _solve_from(H0, y0):
+    terms = ds.hamiltonian_terms(H0, _good_noise, ds.WeakBrownianPath((), jr.key(0)))
+    return diffrax.diffeqsolve(terms, ds.StormerVerlet(), 0.0, 0.2, 0.1, y0).ys
+
+
+def test_friction_in_a_second_term_is_not_blamed_on_the_hamiltonian():
+    friction = diffrax.ODETerm(lambda t, y, args: (-0.1 * y[0], jnp.zeros(2)))
+    path = ds.WeakBrownianPath((), jr.key(0))
+    terms = ds.hamiltonian_terms(_good_H0, _good_noise, path)
+    for both in (
+        diffrax.MultiTerm(friction, terms),
+        diffrax.MultiTerm(*terms.terms, friction),
+    ):
+        with pytest.raises(ValueError, match="besides H0.*`langevin_terms") as info:
+            ds.StormerVerlet().init(both, 0.0, 0.1, _positive_state, None)
+        assert "dH0/dq" not in str(info.value)
+    # A drift alone is that of H0, whatever it was made from.
+    alone = diffrax.MultiTerm(friction, terms.terms[1])
+    with pytest.raises(ValueError, match="a drift term makes dp/dt depend on p"):
+        ds.StormerVerlet().init(alone, 0.0, 0.1, _positive_state, None)
+
+
+def test_a_check_of_the_users_does_not_stop_the_advice():
+    def noise(t, p, q, args):
+        q = eqx.error_if(q, jnp.any(q < 0.15), "coordinates must be positive")
+        return jnp.stack([jnp.sum(p * q), jnp.sum(p * q) ** 2])
+
+    path = ds.WeakBrownianPath((2,), jr.key(0))
+    terms = ds.hamiltonian_terms(lambda t, p, q, args: jnp.sum(p * q), noise, path)
+    assert not commuting((terms.terms[1],), 0.0, _positive_state, None)
+    assert len(ds.suggest_solver(terms, 0.0, _positive_state, want="strong")) > 0
