@@ -40,10 +40,10 @@ from .._terms import (
     has_lifted,
     specified,
 )
-from ._kinks import may_have_kinks
-from ._moments import level_weights
-from ._polynomials import tensordot
-from ._sampling import real
+from .kinks import may_have_kinks
+from .moments import level_weights
+from .polynomials import tensordot
+from .sampling import real
 
 
 # Folded into the key of a sample to draw its `y0` and `args`. The keys of its paths are

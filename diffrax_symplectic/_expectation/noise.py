@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from .._brownian import Discrete, random_words
 from .._custom_types import Y
 from .._terms import outcomes, step_variables
-from ._polynomials import tensordot
 from ._problem import Level, Problem
+from .polynomials import tensordot
 
 
 # Up to this many outcomes, a step is taken for each of them.
