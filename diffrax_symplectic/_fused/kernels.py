@@ -93,7 +93,7 @@ def _unpacked(structs: list[Struct], packed: dict[str, Any]) -> Iterator[Tensor]
         yield Tensor(table if size > MOST_IN_REGISTERS else [*table], shape)
 
 
-def _numbers(x: Array) -> np.ndarray:
+def _numbers(x: Array | np.ndarray) -> np.ndarray:
     typed = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     return np.asarray(jr.key_data(x) if typed else x)
 
