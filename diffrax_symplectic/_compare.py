@@ -19,14 +19,15 @@ from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree
 
 from ._arguments import check_real, check_solver, check_takes, shapes
 from ._custom_types import Args, RealScalarLike, Y
-from ._suggest import (
-    common_path,
-    own_path,
+from ._solver import common_path, own_path
+from ._suggest import suggest_solver
+from ._terms import (
+    check_stratonovich,
+    path_numbers,
     random_paths,
-    suggest_solver,
+    shapes_as_paths,
     with_paths,
 )
-from ._terms import check_stratonovich, path_numbers, shapes_as_paths
 
 
 # The number of steps of the reference in the smallest compared step. An error of order 1/2

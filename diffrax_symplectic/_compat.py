@@ -5,6 +5,7 @@ store what it was given. It is used nowhere else, and `tests/test_private_parts.
 each part by itself: if one of these tests fails after an upgrade, change the function here.
 """
 
+import contextlib
 import dataclasses
 import functools as ft
 import importlib
@@ -51,6 +52,12 @@ def is_traced(x: Any) -> bool:
     return isinstance(x, jax.core.Tracer)
 
 
+def at_trace_time() -> Any:
+    """A context in which operations on known values are carried out at once, so that their
+    results are known, too, inside of `jax.jit`."""
+    return jax.ensure_compile_time_eval()
+
+
 def quickly_compiled(fn: Callable) -> Callable:
     """`equinox.filter_jit(fn)`, compiled by XLA's older generator of code for CPUs where
     this version of XLA has it.
@@ -67,13 +74,10 @@ def quickly_compiled(fn: Callable) -> Callable:
 
     @ft.wraps(fn)
     def call(*args: Any) -> Any:
-        try:
-            return compiled()(*args)
-        except ValueError as error:
-            if "compiler_options" not in str(error):
-                raise
         # JAX refuses options for a program inside of another, or one that captures values
-        # of another.
+        # of another. An error of `fn` itself is raised again.
+        with contextlib.suppress(ValueError):
+            return compiled()(*args)
         return eqx.filter_jit(fn)(*args)
 
     return call
@@ -251,7 +255,8 @@ def constant_values(op: Any) -> np.ndarray:
         parts = np.frombuffer(bytes.fromhex(found[1]), f"<f{size}")
     else:
         pairs = re.findall(r"\(([^(),]+),([^(),]+)\)", text.split(" : ")[0])
-        parts = np.array([_printed_number(x, size) for pair in pairs for x in pair])
+        numbers = [_printed_number(x, size) for pair in pairs for x in pair]
+        parts = np.array(numbers, f"<f{size}")
     # Not `real + 1j * imag`, which turns an infinite part into a NaN of the other.
     values = parts[::2] + 0j
     values.imag = parts[1::2]

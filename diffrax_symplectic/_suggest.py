@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools as ft
-import itertools
 import textwrap
 from collections.abc import Callable, Collection, Sequence
 from typing import cast, get_args
@@ -10,24 +9,14 @@ from typing import cast, get_args
 import diffrax
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import PRNGKeyArray, PyTree
 
 from ._arguments import check_state
 from ._brownian import (
-    derived_key,
     drives,
-    FixedStepBrownianPath,
     increment_struct,
-    is_key,
     is_random,
-    laws_of,
-    LevyAreaBrownianPath,
-    LevyAreaIncrement,
-    PlateauBrownianPath,
-    PlateauIncrement,
-    UnspecifiedPath,
     WeakBrownianPath,
 )
 from ._custom_types import Args, RealScalarLike, Y
@@ -51,12 +40,14 @@ from ._terms import (
     Fault,
     FRICTION,
     friction_apart,
+    is_own,
     number_of_noises,
     path_numbers,
-    replace_paths,
+    random_paths,
     separable_fault,
-    shapes_as_paths,
+    specified,
     split_terms,
+    with_paths,
     without_constraint,
     WRONG_WAY_ROUND,
 )
@@ -65,9 +56,6 @@ from ._terms import (
 # The most that a higher order may cost: with steps of a twentieth, a step of order 2 is
 # worth about twenty of order 1.
 _MOST_STAGE_VECTORS = 20
-# The first seed for paths made from shapes, if the terms hold other paths, too, whose keys
-# must differ.
-_SEED = 0x5EED0000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -351,73 +339,6 @@ def _suggestion(
         reason=record.reason,
         terms=with_new(ft.partial(solver.path, want=want)),
     )
-
-
-def specified(terms: PyTree, make: Callable) -> PyTree:
-    """The terms with `make(shape, key)` in place of each shape of a path. The keys differ:
-    each shape is a Brownian motion of its own."""
-    terms = shapes_as_paths(terms)
-    is_shape = lambda path: isinstance(path, UnspecifiedPath)
-    seeds = itertools.count(0 if all(map(is_shape, brownian_paths(terms))) else _SEED)
-    made = lambda shape: make(shape, jr.key(next(seeds)))
-    return replace_paths(terms, lambda x: made(x.shape) if is_shape(x) else x)
-
-
-def own_path(
-    solver: diffrax.AbstractSolver, want: Want, shape, key
-) -> diffrax.AbstractBrownianPath:
-    """The path of a solver of this package, or else a Gaussian path."""
-    # `isinstance` would look through a `diffrax.HalfSolver`.
-    if issubclass(type(solver), AbstractSymplecticSolver):
-        return cast(AbstractSymplecticSolver, solver).path(shape, key, want=want)
-    return common_path(solver, None, shape, key)
-
-
-def common_path(
-    solver: diffrax.AbstractSolver, cell: float | None, shape, key
-) -> diffrax.AbstractBrownianPath:
-    """A Gaussian path with the Lévy areas that the solver needs. With `cell` it is the same
-    Brownian motion for all solvers."""
-    area = diffrax.SpaceTimeLevyArea
-    path = FixedStepBrownianPath(shape, key, levy_area=area, cell=cell)
-    needs = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
-    if needs is PlateauIncrement:
-        return PlateauBrownianPath(path, key)
-    if needs is LevyAreaIncrement:
-        num_terms = 0 if cell else 2
-        return LevyAreaBrownianPath(path, key, num_terms=num_terms, cell=cell)
-    return path
-
-
-def random_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
-    return [path for path in brownian_paths(terms) if is_random(path)]
-
-
-def is_own(path: diffrax.AbstractBrownianPath) -> bool:
-    """Whether this is a path of the user's own class, which need not be a Brownian motion
-    (but the paths of this package and of Diffrax are)."""
-    return laws_of(path) is None and not isinstance(path, UnspecifiedPath)
-
-
-def with_paths(
-    make: Callable, numbers: tuple[int, ...], terms: PyTree, key: PRNGKeyArray
-) -> PyTree:
-    """The terms with new paths, made from a shape and a key. `numbers` are the
-    `path_numbers` of their random paths; others are not replaced. Paths of the user's own
-    classes only get other keys."""
-    left = iter(numbers)
-
-    def new(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
-        if not is_random(path):
-            return path
-        number = next(left)
-        own = key if number == 0 else jr.fold_in(key, number + 1)
-        if is_own(path):
-            derived = lambda x: derived_key(own, x) if is_key(x) else x
-            return jtu.tree_map(derived, path)
-        return make(increment_struct(path), own)
-
-    return replace_paths(terms, new)
 
 
 def _shape_code(shape: PyTree[jax.ShapeDtypeStruct]) -> str:

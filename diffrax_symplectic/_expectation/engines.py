@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 from .._compat import source_lines
 from .._fused import Kernels, PathFunctions, sample_key, split, without_rescue
 from .._stablehlo import NotReplayed
-from ._monte_carlo import path_keys, with_keys
+from .._terms import path_keys, with_keys
 from ._problem import Level, Problem
 from ._steps import independent_steps, simulate
 

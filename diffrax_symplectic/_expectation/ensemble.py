@@ -15,7 +15,7 @@ from .._arguments import whole_number
 from .._custom_types import Args, Y
 from .._fused import sample_key
 from .._solver import Want
-from ._monte_carlo import path_keys, with_keys
+from .._terms import path_keys, with_keys
 from ._problem import Problem
 from ._run import checked_call, refuse_others
 from .engines import Batch, ENGINES, state_itself, warn_of_stragglers

@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .._compat import frozen
+from .._custom_types import RealScalarLike
 from .._stablehlo import (
     array_types,
     ArrayType,
@@ -125,7 +127,7 @@ class Kernels:
         self,
         arrays: list[Array],
         key: PRNGKeyArray,
-        h: Array,
+        h: RealScalarLike,
         first: int,
         number: int,
         y0: PyTree[Array],
@@ -146,7 +148,7 @@ class Kernels:
         y = jtu.tree_leaves(y0)
         own_args = jtu.tree_leaves(args)
         memory = self._start(arrays, key, y, own_args)
-        shared = [*arrays, h, *chosen(memory, self._stays)]
+        shared = [*arrays, np.asarray(h), *chosen(memory, self._stays)]
         lanes = Lanes(
             own=[*keys, *self._for_all(self._types_of_own_args, own_args, number)],
             y=self._for_all(self._step.types["y"], y, number),

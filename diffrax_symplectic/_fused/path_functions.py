@@ -1,7 +1,7 @@
 """The functions of one path that kernels are made of, apart from the values they read."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .._custom_types import Args, Y
-from .._expectation._monte_carlo import path_keys, with_keys
+from .._terms import path_keys, with_keys
 
 
+@runtime_checkable
 class SteppedSystem(Protocol):
     """What a kernel needs of a system: a PyTree whose leaves are all that it reads.
 

@@ -42,7 +42,9 @@ def shapes(types: Iterable[ArrayType]) -> list[tuple[int, ...]]:
     return [of.shape for of in types]
 
 
-def packed(types: Sequence[ArrayType], arrays: Iterable[Array]) -> dict[str, Any]:
+def packed(
+    types: Sequence[ArrayType], arrays: Iterable[Array | np.ndarray]
+) -> dict[str, Any]:
     """The entries of all these arrays, which all paths share, in one array of Dr.Jit for
     each kind: a kernel takes few arguments."""
     of_kind: dict[str, list[np.ndarray]] = {of.kind: [] for of in types}
@@ -65,7 +67,7 @@ def unpacked(types: Sequence[ArrayType], memory: dict[str, Any]) -> list[Tensor]
     return tensors
 
 
-def as_numbers(x: Array) -> np.ndarray:
+def as_numbers(x: Array | np.ndarray) -> np.ndarray:
     """The array, or the words of random keys."""
     is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     return np.asarray(jr.key_data(x) if is_key else x)

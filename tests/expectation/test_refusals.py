@@ -9,7 +9,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import is_random
-from diffrax_symplectic._expectation._monte_carlo import path_keys, with_keys
+from diffrax_symplectic._terms import path_keys, with_keys
 
 from ..solver.test_times_and_paths import RECORD
 

@@ -8,7 +8,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._terms import acts_elementwise
-from diffrax_symplectic._terms._structure_checks import (
+from diffrax_symplectic._terms.structure import (
     additive_fault,
     constant_fault,
     Dependence,

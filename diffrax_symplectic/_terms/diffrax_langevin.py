@@ -10,9 +10,9 @@ from jaxtyping import Array, ArrayLike, PyTree
 from .._arguments import check_pair
 from .._compat import replaced, unwrapped
 from .._custom_types import Args, RealScalarLike
-from ._friction import like, not_negative
-from ._langevin import AbstractFriction, DriftWithFriction
-from ._vector_fields import flattened
+from .friction import like, not_negative
+from .langevin import AbstractFriction, DriftWithFriction
+from .vector_fields import flattened
 
 
 _P = PyTree[Array]

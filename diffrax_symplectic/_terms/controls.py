@@ -32,14 +32,8 @@ from .._brownian import (
 )
 from .._compat import direction, ω
 from .._custom_types import Args, RealScalarLike
-from ._vector_fields import (
-    apply,
-    apply_brackets,
-    apply_bridge,
-    bridge,
-    brownian_paths,
-    replace_paths,
-)
+from .paths import brownian_paths, replace_paths
+from .vector_fields import apply, apply_brackets, apply_bridge, bridge
 
 
 class StepVariables(NamedTuple):

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from .._arguments import check_takes, real_array, shapes
 from .._custom_types import Args, BM, RealScalarLike
-from ._hamiltonian import evaluated
+from .hamiltonian import evaluated
 
 
 _P = PyTree[Array]

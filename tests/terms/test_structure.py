@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._terms._structure_checks import commuting
+from diffrax_symplectic._terms.structure import commuting
 
 
 def _solve(H0, noise, solver=None, args=None):

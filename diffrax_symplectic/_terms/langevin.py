@@ -16,8 +16,8 @@ from .._arguments import check_pair, check_takes
 from .._brownian import increment_struct, raveled
 from .._compat import replaced, unwrapped, ω
 from .._custom_types import Args, BM, RealScalarLike
-from ._constraint import constrained, Constraint
-from ._friction import (
+from .constraint import constrained, Constraint
+from .friction import (
     checked_friction,
     checked_temperature,
     FrictionAlong,
@@ -26,8 +26,9 @@ from ._friction import (
     Value,
     value_at,
 )
-from ._hamiltonian import as_path, evaluated, hamiltonian_terms, scalar_energy
-from ._vector_fields import split_terms
+from .hamiltonian import evaluated, hamiltonian_terms, scalar_energy
+from .paths import as_path
+from .vector_fields import split_terms
 
 
 _P = PyTree[Array]

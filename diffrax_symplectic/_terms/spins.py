@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._arguments import check_pair, real_array
 from .._custom_types import Args, RealScalarLike
-from ._hamiltonian import evaluated, lifted_terms, scalar_energy
+from .hamiltonian import evaluated, lifted_terms, scalar_energy
 
 
 _Spins = Float[Array, "*spins 3"]

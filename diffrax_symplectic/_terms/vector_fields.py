@@ -2,8 +2,6 @@
 Lie brackets of vector fields."""
 
 import functools as ft
-import operator
-from collections.abc import Callable, Sequence
 
 import diffrax
 import equinox as eqx
@@ -16,11 +14,12 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._brownian import num_noises, raveled, UnspecifiedPath
+from .._brownian import num_noises, raveled
 from .._compat import is_adjoint_term, unwrapped, ω
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
-from ._constraint import ConstrainedDrift, without_constraint
-from ._hamiltonian import HamiltonianNoise, OneNoise
+from .constraint import ConstrainedDrift, without_constraint
+from .hamiltonian import HamiltonianNoise, OneNoise
+from .paths import brownian_paths
 
 
 _BACKSOLVE = (
@@ -55,43 +54,6 @@ def flattened(terms: diffrax.AbstractTerm) -> tuple:
     if isinstance(terms, diffrax.MultiTerm):
         return tuple(part for term in terms.terms for part in flattened(term))
     return (terms,)
-
-
-def brownian_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
-    return [x for x in jtu.tree_leaves(terms, is_leaf=_is_path) if _is_path(x)]
-
-
-def path_numbers(paths: Sequence[diffrax.AbstractBrownianPath]) -> tuple[int, ...]:
-    """The number of the Brownian motion that each path samples, counted from 0. Equal paths
-    sample the same one; two shapes of paths never do."""
-    found: list[diffrax.AbstractBrownianPath] = []
-    numbers = []
-    for path in paths:
-        same = (k for k, other in enumerate(found) if _are_equal(path, other))
-        numbers.append(next(same, len(found)))
-        if numbers[-1] == len(found):
-            found.append(path)
-    return tuple(numbers)
-
-
-def _are_equal(a: diffrax.AbstractBrownianPath, b) -> bool:
-    """Traced paths are equal if they hold the same arrays."""
-    if isinstance(a, UnspecifiedPath):
-        return False
-    with jax.ensure_compile_time_eval():
-        equal = eqx.tree_equal(a, b)
-    if isinstance(equal, jax.core.Tracer):
-        return all(map(operator.is_, jtu.tree_leaves(a), jtu.tree_leaves(b)))
-    return bool(equal)
-
-
-def replace_paths(terms: PyTree, new: Callable) -> PyTree:
-    """The terms with `new(path)` in place of each Brownian path."""
-    return jtu.tree_map(lambda x: new(x) if _is_path(x) else x, terms, is_leaf=_is_path)
-
-
-def _is_path(x) -> bool:
-    return isinstance(x, diffrax.AbstractBrownianPath)
 
 
 # With `jit` this is traced and lowered once for several stages.

@@ -12,16 +12,15 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .._arguments import check_real, check_takes, whole_number
-from .._brownian import derived_key, is_key
 from .._root_finder import all_finite
-from .._terms import brownian_paths, replace_paths
-from ._estimate import Expectation
-from ._moments import level_weights
-from ._polynomials import tensordot
+from .._terms import path_keys, with_keys
 from ._problem import Problem
 from ._run import checked_call, Meter, NO_METER, run
-from ._sampling import AbstractSampling, Plan, real, Samples
 from ._steps import independent_steps, simulate
+from .estimate import Expectation
+from .moments import level_weights
+from .polynomials import tensordot
+from .sampling import AbstractSampling, Plan, real, Samples
 
 
 class IndependentPaths(AbstractSampling):
@@ -65,20 +64,6 @@ def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
     # A path that fails on several levels counts once.
     lost = jnp.any(failed, axis=0)
     return Samples(p.averaged([p.combined(saved)]), ~lost, lost)
-
-
-def path_keys(terms: PyTree[diffrax.AbstractTerm], key: PRNGKeyArray) -> list[Array]:
-    """New random keys for the paths in `terms`, derived from `key`. Paths that share a key
-    get the same new one."""
-    old = filter(is_key, jtu.tree_leaves(brownian_paths(terms)))
-    return [derived_key(key, x) for x in old]
-
-
-def with_keys(terms: PyTree[diffrax.AbstractTerm], keys: list[Array]) -> PyTree:
-    """The terms, with these keys in their paths."""
-    left = iter(keys)
-    replaced = lambda x: next(left) if is_key(x) else x
-    return replace_paths(terms, lambda path: jtu.tree_map(replaced, path))
 
 
 def monte_carlo(

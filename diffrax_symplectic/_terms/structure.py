@@ -20,10 +20,10 @@ from .._brownian import raveled
 from .._compat import unwrapped, ω
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
-from ._dependence import Dependence
-from ._hamiltonian import asserted_structure, has_lifted, is_hamiltonian
-from ._langevin import friction_apart
-from ._vector_fields import apply, check_increments, control_struct, split_terms
+from .dependence import Dependence
+from .hamiltonian import asserted_structure, has_lifted, is_hamiltonian
+from .langevin import friction_apart
+from .vector_fields import apply, check_increments, control_struct, split_terms
 
 
 class Fault(NamedTuple):

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
 from .._arguments import check_pair, real_array, shapes
 from .._custom_types import Args, RealScalarLike
-from ._hamiltonian import evaluated, lifted_terms, scalar_energy
+from .hamiltonian import evaluated, lifted_terms, scalar_energy
 
 
 _Waves = PyTree[Complex[Array, "..."]]

@@ -1,6 +1,6 @@
 import functools as ft
 from collections.abc import Callable
-from typing import Any, cast, get_args, Literal
+from typing import cast, get_args, Literal
 
 import diffrax
 import equinox as eqx
@@ -11,11 +11,12 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Shaped
 
 from .._arguments import check_pair, check_takes, shapes, whole_number
-from .._brownian import checked_shape, increment_struct, UnspecifiedPath
-from .._compat import not_a_path, ω
+from .._brownian import increment_struct
+from .._compat import ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike
-from ._constraint import constrained, Constraint
-from ._dependence import Dependence
+from .constraint import constrained, Constraint
+from .dependence import Dependence
+from .paths import as_path
 
 
 _P = PyTree[Shaped[Array, "?*p"], "P"]
@@ -91,36 +92,6 @@ def hamiltonian_terms(
     noise = cast(_Hamiltonian, noise)
     check_takes("noise", noise, "t", "p", "q", "args")
     return diffrax.MultiTerm(drift, HamiltonianNoise(noise, as_path(path), structure))
-
-
-def as_path(path: Any) -> diffrax.AbstractBrownianPath:
-    """`path`, or an `UnspecifiedPath` for a shape. Otherwise raises a `ValueError`."""
-    if isinstance(path, diffrax.AbstractBrownianPath):
-        return path
-    is_struct = lambda x: isinstance(x, jax.ShapeDtypeStruct)
-    is_tuple = isinstance(path, tuple) and all(isinstance(n, int) for n in path)
-    if is_tuple or (leaves := jtu.tree_leaves(path)) and all(map(is_struct, leaves)):
-        return UnspecifiedPath(shape=checked_shape(path, "path"))
-    is_class = isinstance(path, type)
-    got = f"the class {path.__name__}" if is_class else f"a {type(path).__name__}"
-    raise ValueError(
-        "`path` must be a Brownian path, for example `solver.path((m,), key)`, or its "
-        f"shape `(m,)`; got {got}. (For a system without noise pass neither `noise` nor "
-        "`path`.)"
-    )
-
-
-def shapes_as_paths(terms: PyTree) -> PyTree:
-    """The terms with an `UnspecifiedPath` in each `ControlTerm` that has a shape in place
-    of its path."""
-    is_control = lambda x: isinstance(x, diffrax.ControlTerm)
-
-    def with_path(x):
-        if not is_control(x) or (shape := not_a_path(x)) is None:
-            return x
-        return eqx.tree_at(lambda term: term.control, x, as_path(shape))
-
-    return jtu.tree_map(with_path, terms, is_leaf=is_control)
 
 
 class IndexedNoise(eqx.Module):

@@ -19,12 +19,12 @@ from .._arguments import check_pair, check_state, shapes
 from .._batch import batched_like, error_if_alone
 from .._custom_types import Args, RealScalarLike
 from .._root_finder import correction, max_norm, solve_matrix
-from ._constraint import Constraint, constraint_of, without_constraint
-from ._dependence import Dependence
-from ._hamiltonian import evaluated
-from ._langevin import split_friction
-from ._structure_checks import separable_fault
-from ._vector_fields import check_fit, rate
+from .constraint import Constraint, constraint_of, without_constraint
+from .dependence import Dependence
+from .hamiltonian import evaluated
+from .langevin import split_friction
+from .structure import separable_fault
+from .vector_fields import check_fit, rate
 
 
 _Vector: TypeAlias = Float[Array, " n"]
