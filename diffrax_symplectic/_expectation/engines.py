@@ -73,7 +73,8 @@ def _halves(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return high, (numbers & np.uint64(0xFFFFFFFF)).astype(np.uint32)
 
 
-def _sample_keys(key: PRNGKeyArray, high: _Words, low: _Words) -> PRNGKeyArray:
+def _sample_keys(key: PRNGKeyArray, high: _Words, low: _Words) -> Array:
+    """The keys of the samples with these numbers."""
     return jax.vmap(ft.partial(sample_key, key))(high, low)
 
 

@@ -74,7 +74,7 @@ def _reduce(o, *xs):
     return _joined(columns, tuple(sizes), number)
 
 
-def _entries_at(arrays: Sequence[Tensor], place: int) -> list[Tensor]:
+def _entries_at(arrays: Sequence[Tensor], place: Any) -> list[Tensor]:
     """The entries of all these arrays at a place, each as an array without axes."""
     return [Tensor([x.entries[place]], ()) for x in arrays]
 
@@ -104,7 +104,7 @@ def _changes_nothing(o: Operation, starts: Sequence[Tensor]) -> bool:
     if len(starts) > 1:
         return False
     value = known(starts[0])
-    return value is not None and _NEUTRAL.get(o.reduces_by) == value
+    return value is not None and bool(value == _NEUTRAL.get(o.reduces_by))
 
 
 @rule
