@@ -276,10 +276,11 @@ def _controlled_paths(
                     key, i, share * noise.share, side * noise.tilt
                 )
                 own = noise.with_args(args)
-                return *own.advance(i, y, state, at, second, x), log_ratio
+                return own.advance(i, y, state, at, second, x), log_ratio
 
-            out = jax.vmap(one)(paths.y, paths.solver_state, paths.args, keys)
-            y, state, success, (value, change), log_ratio = out
+            given = paths.y, paths.solver_state, paths.args, keys
+            after, log_ratio = jax.vmap(one)(*given)
+            y, state, success, value, change = after
             # A failed path has no value, but its control must be finite.
             change = jnp.where(along(success, change), change, 0)
             control, promised, ratios = paths.control
