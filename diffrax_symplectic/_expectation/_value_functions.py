@@ -26,7 +26,8 @@ from ._fits import fit, Functions, without_newton
 from ._problem import Problem
 from ._run import run
 from ._steps import along, Paths, simulate
-from .bases import AbstractBasis, Grid, Hermite, Quadratic
+from .bases import AbstractBasis, Hermite, Quadratic
+from .grid import Grid
 from .moments import total
 from .noise import Noise
 from .polynomials import num_polynomials
