@@ -52,6 +52,12 @@ def at_trace_time() -> Any:
     return jax.ensure_compile_time_eval()
 
 
+def is_result(x: Any) -> bool:
+    """Whether this says how a solve ended, such as a `diffrax.RESULTS`. The results of
+    Diffrax, Optimistix and Lineax have one class in common, which none of them names."""
+    return isinstance(x, type(diffrax.RESULTS.successful))
+
+
 def quickly_compiled(fn: Callable) -> Callable:
     """`equinox.filter_jit(fn)`, compiled by XLA's older generator of code for CPUs where
     this version of XLA has it.

@@ -18,7 +18,13 @@ from ._expectation import Expectation, ExpectationInterrupted
 from ._expectation._problem import Problem
 from ._expectation._run import checked_call, Meter, NO_METER, refuse_others, run
 from ._expectation._value_functions import ValueFunctions
-from ._expectation.choose import choose, few_paths, MOST, MUCH_LEFT, sorted_paths
+from ._expectation.choose import (
+    choose,
+    few_paths,
+    MOST_SAMPLES,
+    MUCH_LEFT,
+    sorted_paths,
+)
 from ._expectation.engines import warn_of_stragglers
 from ._expectation.fused_paths import fused_plan, FusedPaths
 from ._expectation.sampling import AbstractSampling
@@ -217,7 +223,7 @@ def expectation(
         plan = plan._replace(
             reason=reason, roundings=problem.max_steps, bounded=problem.bounded
         )
-        if start is not None and tol is None and plan.num_samples == MOST:
+        if start is not None and tol is None and plan.num_samples == MOST_SAMPLES:
             # Without `tol` the number of samples stays as it was.
             used = start.moments[-1].end - start.moments[0].begin
             plan = plan._replace(num_samples=used)

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
@@ -318,6 +319,13 @@ def test_solvers_of_lineax_compute_without_linear_solve():
         x, result = _compat.computed_by(solver, operator, jnp.array([4.0, 4.0]))
         assert result == lx.RESULTS.successful
         assert jnp.allclose(x, jnp.array([1.5, 1.0]), atol=1e-5)
+
+
+def test_results_of_all_solves_are_told_from_other_values():
+    """If this fails: find the class of the results of Equinox's enumerations."""
+    for results in (diffrax.RESULTS, optx.RESULTS, lx.RESULTS):
+        assert _compat.is_result(results.successful)
+    assert not any(map(_compat.is_result, (1, jnp.ones(2), "successful")))
 
 
 def test_a_program_may_have_compiler_options_unless_it_is_inside_of_another():

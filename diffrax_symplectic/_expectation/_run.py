@@ -22,7 +22,7 @@ from .._brownian import check_key, typed_key
 from .._compat import quickly_compiled
 from .estimate import Expectation, ExpectationInterrupted
 from .moments import joined, Moments, total
-from .sampling import KINDS_WITH_CONTROL, Plan, Samples
+from .sampling import KINDS_WITH_CONTROL, Samples, SamplingPlan
 
 
 # With an `r` of `std_error` above this, means of exp(5 x) with normal x were off by forty
@@ -96,7 +96,7 @@ class Meter:
 
 
 def run(
-    plan: Plan,
+    plan: SamplingPlan,
     key: PRNGKeyArray,
     devices: tuple,
     sampling: Any = None,
@@ -158,7 +158,7 @@ def run(
 class _Batches:
     """The batches of a plan: each device takes `size` samples at once."""
 
-    def __init__(self, plan: Plan, key: PRNGKeyArray, devices: tuple):
+    def __init__(self, plan: SamplingPlan, key: PRNGKeyArray, devices: tuple):
         self.size = min(plan.batch_size, plan.num_samples)
         self.key_data, self._impl = np.asarray(jr.key_data(key)), jr.key_impl(key)
         self._sampler, self._paths_of, self._devices = (

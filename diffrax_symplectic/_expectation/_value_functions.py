@@ -34,9 +34,9 @@ from .polynomials import num_polynomials
 from .sampling import (
     AbstractSampling,
     KINDS_WITH_CONTROL,
-    Plan,
     ROUNDING,
     Samples,
+    SamplingPlan,
 )
 
 
@@ -110,7 +110,7 @@ class ValueFunctions(AbstractSampling):
             sampler = jtu.Partial(
                 _controlled_paths, problem, functions, best, used, usual, law
             )
-            return Plan(sampler, n, self.batch_size, shapes=shapes, quick=True)
+            return SamplingPlan(sampler, n, self.batch_size, shapes=shapes, quick=True)
 
         # The trials' paths are not part of the estimate.
         trial = lambda *args: run(plan(*args), jr.fold_in(key, _TRIAL), devices)

@@ -17,9 +17,8 @@ from jaxtyping import Bool, PRNGKeyArray, PyTree
 
 from .._fused import Kernels, sample_key, split
 from .._stablehlo import NotReplayed
-from .._terms import path_keys, with_keys
 from ._problem import Problem
-from ._steps import independent_steps, simulate
+from .independent import solved
 
 
 # Beyond this share, stragglers take most of the time.
@@ -77,11 +76,7 @@ def _drawn(p: Problem, key: PRNGKeyArray, hi, lo) -> tuple[PyTree, PyTree]:
 @eqx.filter_jit
 def _paths(p: Problem, key: PRNGKeyArray, hi, lo):
     keys = jax.vmap(ft.partial(sample_key, key))(hi, lo)
-    own = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
-    terms_of = lambda keys: with_keys(p.terms, keys)
-    drawn = jax.vmap(p.drawn)(keys)
-    begin = lambda level: independent_steps(p, level, drawn, terms_of, lambda i: own)
-    states, failed, _ = simulate(p, begin)
+    states, failed = solved(p, keys)
     return p.unravel(jnp.swapaxes(states, 1, 2)), failed
 
 

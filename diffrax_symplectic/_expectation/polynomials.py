@@ -16,9 +16,9 @@ _EXACT = jax.lax.Precision.HIGHEST
 dot = ft.partial(jnp.matmul, precision=_EXACT)
 tensordot = ft.partial(jnp.tensordot, precision=_EXACT)
 # The normal equations have the squared condition number of a fit. This many roundings are
-# added to their diagonal, so that they have a Cholesky factor. Along an axis with eigenvalue
-# s of the normal equations, each refinement multiplies the change of the solution by
-# r / (s + r), with r what was added.
+# added to their diagonal, so that they have a Cholesky factor. Along an axis with the
+# eigenvalue s, each refinement multiplies what this changes in the solution by r / (s + r),
+# with r what was added.
 _RIDGE = 1e4
 _REFINEMENTS = 3
 

@@ -33,7 +33,7 @@ class Samples(eqx.Module):
     lost: Int[Array, " n"] | Bool[Array, " n"]
 
 
-class Plan(NamedTuple):
+class SamplingPlan(NamedTuple):
     """How samples are taken.
 
     - `sampler`: a callable PyTree that makes one sample for each of several random keys.
@@ -72,7 +72,7 @@ class AbstractSampling(eqx.Module):
     """How the samples of an expectation are taken: the public classes."""
 
     @abc.abstractmethod
-    def prepare(self, problem: Any, key: PRNGKeyArray, devices: tuple) -> Plan:
+    def prepare(self, problem: Any, key: PRNGKeyArray, devices: tuple) -> SamplingPlan:
         """Raises a `ValueError` for a problem that it cannot sample."""
 
 

@@ -12,7 +12,7 @@ from scipy import stats
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation._problem import Problem
 from diffrax_symplectic._expectation._run import Meter, run
-from diffrax_symplectic._expectation.sampling import Plan, Samples
+from diffrax_symplectic._expectation.sampling import Samples, SamplingPlan
 from examples.benchmarks.coverage import arguments, Cell, estimate, exact
 
 from ..problems import kubo_terms
@@ -156,7 +156,7 @@ def _with_control(shift: float, spread: float = 1.0, far: float = 0.0, meter=Non
         kinds = jnp.stack([x - control, x, control, jnp.zeros_like(x)])[:, None]
         return Samples(kinds, jnp.ones(len(keys), bool), jnp.zeros(len(keys), bool))
 
-    plan = Plan(jax.tree_util.Partial(sampler), 1000, 250, far=np.array([far]))
+    plan = SamplingPlan(jax.tree_util.Partial(sampler), 1000, 250, far=np.array([far]))
     return run(plan, KEY, tuple(jax.devices()[:1]), meter=meter)
 
 
