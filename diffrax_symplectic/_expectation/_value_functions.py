@@ -27,16 +27,18 @@ from ._problem import Problem
 from ._run import run
 from ._steps import along, Paths, simulate
 from .bases import AbstractBasis, Hermite, Quadratic
+from .estimate import best_results
 from .grid import Grid
 from .moments import total
 from .noise import Noise
 from .polynomials import num_polynomials
 from .sampling import (
     AbstractSampling,
-    KINDS_WITH_CONTROL,
+    KindsWithControl,
     ROUNDING,
     Samples,
     SamplingPlan,
+    saved_by_name,
 )
 
 
@@ -55,6 +57,7 @@ _TRIAL, _WIDE = 0xFFFFFFFE, 2
 _MOST_NOISES = 2
 
 
+@saved_by_name
 class ValueFunctions(AbstractSampling):
     r"""Independent paths with a control variate that removes most of their variance.
 
@@ -101,7 +104,7 @@ class ValueFunctions(AbstractSampling):
     def prepare(self, problem, key, devices):
         basis, (times, m) = _basis(problem, self.degree), problem.num_outputs
         functions, shape = _fits(problem, key, basis), (len(problem.weights), times, m)
-        shapes = problem.shapes_of_samples(KINDS_WITH_CONTROL)
+        shapes = problem.shapes_of_samples(len(KindsWithControl))
         never = np.zeros(shape), np.full(shape, np.inf)
         narrow, *wider = _wider(problem)
 
@@ -122,7 +125,8 @@ class ValueFunctions(AbstractSampling):
         tried = [trial(all_of(k), used, self.batch_size) for k in range(count)]
         errors = np.stack([flat(e.std_error) for e in tried])
         errors = np.nan_to_num(errors, nan=np.inf)
-        best, plain = np.argmin(errors, axis=0), flat(tried[0].plain_std_error)
+        best = np.argmin(errors, axis=0)
+        plain = flat(best_results(tried[0]).plain_std_error)
         used = ~(np.min(errors, axis=0) >= plain)
         if self.degree and not np.any(used):
             warnings.warn(

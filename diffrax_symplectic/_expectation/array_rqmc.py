@@ -32,7 +32,7 @@ from ._value_functions import value_function
 from .hilbert import hilbert_order
 from .points import num_seeds, randomized, sobol_points
 from .polynomials import tensordot
-from .sampling import AbstractSampling, ROUNDING, Samples, SamplingPlan
+from .sampling import AbstractSampling, ROUNDING, Samples, SamplingPlan, saved_by_name
 
 
 # SciPy has direction numbers for this many coordinates of Sobol' points.
@@ -50,6 +50,7 @@ _TRIAL_KEY = 4
 _STARTS_KEY = 0xFFFFFFFF
 
 
+@saved_by_name
 class ArrayRQMC(AbstractSampling):
     r"""Array-RQMC: randomized quasi-Monte Carlo across all paths of a replicate.
 

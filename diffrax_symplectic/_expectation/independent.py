@@ -14,7 +14,7 @@ from .._arguments import whole_number
 from .._terms import path_keys, with_keys
 from ._problem import Level, Problem
 from ._steps import independent_steps, Paths, simulate
-from .sampling import AbstractSampling, Samples, SamplingPlan
+from .sampling import AbstractSampling, Samples, SamplingPlan, saved_by_name
 
 
 # The default sizes of a batch. On CPUs it keeps all cores busy and fits their caches.
@@ -22,6 +22,7 @@ _BATCH_ON_CPU = 2**15
 _BATCH = 2**18
 
 
+@saved_by_name
 class IndependentPaths(AbstractSampling):
     """Independent paths (crude Monte Carlo). For any system the error is proportional to
     one over the square root of their number.
