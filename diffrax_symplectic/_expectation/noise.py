@@ -105,7 +105,8 @@ class Noise(eqx.Module):
         In a fraction `share` (from 0 to 1) of draws all outcomes are equally probable.
         Probabilities are multiplied by the exponential of `tilt`, a number or one for each
         variable, times the outcome."""
-        words = random_words(key, (number, self.level.index), 1, len(self.laws))[0]
+        place = number, jnp.asarray(self.level.index)
+        words = random_words(key, place, 1, len(self.laws))[0]
         x = jnp.zeros(len(self.laws), self.problem.dtype)
         log_ratio = jnp.zeros_like(x)
         tilts = jnp.broadcast_to(tilt, x.shape)
