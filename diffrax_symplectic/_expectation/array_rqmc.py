@@ -24,15 +24,15 @@ from .._brownian import (
 )
 from .._custom_types import Y
 from .._terms import brownian_paths, path_numbers, replace_paths
-from ._fits import Functions
-from ._problem import Level, numbers, Problem
-from ._run import run
-from ._steps import along, independent_steps, Paths, simulate
-from ._value_functions import value_function
+from .fits import Functions
 from .hilbert import hilbert_order
 from .points import num_seeds, randomized, sobol_points
 from .polynomials import tensordot
+from .problem import Level, numbers, Problem
+from .run import run
 from .sampling import AbstractSampling, ROUNDING, Samples, SamplingPlan, saved_by_name
+from .simulation import along, independent_steps, Paths, simulate
+from .value_functions import value_function
 
 
 # SciPy has direction numbers for this many coordinates of Sobol' points.

@@ -3,12 +3,12 @@
 import jax.tree_util as jtu
 import numpy as np
 
-from ._problem import Problem
-from ._value_functions import ValueFunctions
 from .array_rqmc import ArrayRQMC, step_words
 from .independent import IndependentPaths
 from .noise import num_outcomes
+from .problem import Problem
 from .sampling import AbstractSampling
+from .value_functions import ValueFunctions
 
 
 # Value functions are chosen up to this dimension, in which they are fitted on a grid, and

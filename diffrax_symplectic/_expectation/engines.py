@@ -17,8 +17,8 @@ from jaxtyping import Bool, PRNGKeyArray, PyTree
 
 from .._fused import Kernels, sample_key, split
 from .._stablehlo import NotReplayed
-from ._problem import Problem
 from .independent import solved
+from .problem import Problem
 
 
 # Beyond this share, stragglers take most of the time.

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .._root_finder import all_finite
-from ._problem import Problem
 from .engines import by_drjit, state_itself
 from .independent import IndependentPaths
+from .problem import Problem
 from .sampling import Samples, SamplingPlan
 
 

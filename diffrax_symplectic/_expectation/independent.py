@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._arguments import whole_number
 from .._terms import path_keys, with_keys
-from ._problem import Level, Problem
-from ._steps import independent_steps, Paths, simulate
+from .problem import Level, Problem
 from .sampling import AbstractSampling, Samples, SamplingPlan, saved_by_name
+from .simulation import independent_steps, Paths, simulate
 
 
 # The default sizes of a batch. On CPUs it keeps all cores busy and fits their caches.

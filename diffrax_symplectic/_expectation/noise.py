@@ -16,8 +16,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt3
 from .._brownian import Discrete, random_words
 from .._custom_types import Y
 from .._terms import outcomes, step_variables
-from ._problem import Level, Problem
 from .polynomials import tensordot
+from .problem import Level, Problem
 
 
 # Up to this many outcomes, a step is taken for each of them. Four noises of three values

@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
-from .._expectation._problem import Level, Problem
+from .._expectation.problem import Level, Problem
 from .._terms import path_keys, with_keys
 from .sweeps import without_rescue
 

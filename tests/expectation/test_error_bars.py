@@ -10,9 +10,9 @@ import pytest
 from scipy import stats
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation._problem import Problem
-from diffrax_symplectic._expectation._run import Meter, run
 from diffrax_symplectic._expectation.estimate import best_results
+from diffrax_symplectic._expectation.problem import Problem
+from diffrax_symplectic._expectation.run import Meter, run
 from diffrax_symplectic._expectation.sampling import Samples, SamplingPlan
 from examples.benchmarks.coverage import arguments, Cell, estimate, exact
 

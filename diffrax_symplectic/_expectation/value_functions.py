@@ -22,16 +22,15 @@ from jaxtyping import Array, Int, PRNGKeyArray
 from .._arguments import whole_number
 from .._compat import quickly_compiled
 from .._terms import number_of_noises
-from ._fits import fit, Functions, without_newton
-from ._problem import Problem
-from ._run import run
-from ._steps import along, Paths, simulate
 from .bases import AbstractBasis, Hermite, Quadratic
 from .estimate import best_results
+from .fits import fit, Functions, without_newton
 from .grid import Grid
 from .moments import total
 from .noise import Noise
 from .polynomials import num_polynomials
+from .problem import Problem
+from .run import run
 from .sampling import (
     AbstractSampling,
     KindsWithControl,
@@ -40,6 +39,7 @@ from .sampling import (
     SamplingPlan,
     saved_by_name,
 )
+from .simulation import along, Paths, simulate
 
 
 # The most polynomials in a fit by default.
