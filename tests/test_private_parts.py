@@ -133,6 +133,12 @@ def test_a_control_term_keeps_what_it_was_given_in_place_of_a_path():
         assert _compat.not_a_path(diffrax.ControlTerm(field, path)) is None
 
 
+def test_the_resolution_of_a_tree_is_the_tolerance_that_it_was_given():
+    """If this fails: find how Diffrax stores `tol`, and adapt `resolution`."""
+    tree = diffrax.VirtualBrownianTree(1.0, 5.0, 1e-3, (), jax.random.key(0))
+    assert jnp.allclose(_compat.resolution(tree), 1e-3)
+
+
 def test_the_terms_that_backsolve_adjoint_solves_are_known(terms):
     """If this fails: find the term of `BacksolveAdjoint`, and adapt `is_adjoint_term`."""
     y0 = jnp.array(0.3), jnp.array(0.7)

@@ -1,5 +1,6 @@
 from .constraint import constraint_of, refuse_constraint, without_constraint
-from .controls import controls, drift_driven, noise_driven, outcomes, step_variables
+from .controls import drawn_variables, drift_driven, noise_driven, outcomes
+from .controls import step_variables
 from .dependence import acts_elementwise, Dependence
 from .hamiltonian import evaluated, hamiltonian_terms, has_lifted, IndexedNoise
 from .hamiltonian import is_hamiltonian
