@@ -33,7 +33,7 @@ PRIVATE_ATTRIBUTE = re.compile(
 )
 # What uses such attributes still, and is to call `_compat.py` instead. Nothing is to be
 # added here.
-STILL_TO_DO = ("_stablehlo/", "_fused/", "_expectation/", "_terms/")
+STILL_TO_DO = ("_stablehlo/", "_fused/", "_expectation/")
 
 
 def _private_imports(tree: ast.AST) -> set[str]:
