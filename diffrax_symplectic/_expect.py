@@ -15,13 +15,13 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 from ._brownian import Discrete, laws_of, UnspecifiedPath
 from ._custom_types import Args, RealScalarLike, Y
 from ._expectation import Expectation, ExpectationInterrupted
-from ._expectation._choose import choose, few_paths, MOST, MUCH_LEFT, sorted_paths
 from ._expectation._problem import Problem
 from ._expectation._run import checked_call, Meter, NO_METER, refuse_others, run
-from ._expectation._sampling import AbstractSampling
 from ._expectation._value_functions import ValueFunctions
+from ._expectation.choose import choose, few_paths, MOST, MUCH_LEFT, sorted_paths
 from ._expectation.engines import warn_of_stragglers
 from ._expectation.fused_paths import fused_plan, FusedPaths
+from ._expectation.sampling import AbstractSampling
 from ._solver import own_path
 from ._terms import brownian_paths, path_numbers, random_paths, with_paths
 

@@ -1,10 +1,10 @@
-from ._array_rqmc import ArrayRQMC as ArrayRQMC
+from .array_rqmc import ArrayRQMC as ArrayRQMC
 from .ensemble import Ensemble as Ensemble, ensemble as ensemble
-from ._estimate import (
+from .estimate import (
     Expectation as Expectation,
     ExpectationInterrupted as ExpectationInterrupted,
 )
-from ._monte_carlo import (
+from .monte_carlo import (
     IndependentPaths as IndependentPaths,
     monte_carlo as monte_carlo,
 )

@@ -25,8 +25,10 @@ from .._arguments import (
     whole_number,
 )
 from .._brownian import has_bounded_increments, is_random
+from .._compat import is_traced
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from .._root_finder import all_finite
+from .._signature import once_for_each_signature
 from .._solver import AbstractSymplecticSolver, check_resolution, own_path, Want
 from .._terms import (
     brownian_paths,
@@ -38,10 +40,10 @@ from .._terms import (
     has_lifted,
     specified,
 )
-from ._kinks import may_have_kinks
-from ._moments import level_weights
-from ._polynomials import tensordot
-from ._sampling import real
+from .kinks import may_have_kinks
+from .moments import level_weights
+from .polynomials import tensordot
+from .sampling import real
 
 
 # Folded into the key of a sample to draw its `y0` and `args`. The keys of its paths are
@@ -53,21 +55,22 @@ class Level(eqx.Module):
     """One step size: its index, counted from the coarsest, the number of steps, and the
     steps after which to average."""
 
-    index: Int[Array, ""]
-    h: Float[Array, ""]
-    num_steps: Int[Array, ""]
-    saved_steps: Int[Array, " saves"]
+    index: Int[Array | np.ndarray, ""]
+    h: Float[Array | np.ndarray, ""]
+    num_steps: Int[Array | np.ndarray, ""]
+    saved_steps: Int[Array | np.ndarray, " saves"]
 
 
 class Problem(eqx.Module):
     """The arguments of `expectation`, by the same names, and the levels, along a leading
     axis. Where `y0` or `args` is a function of a random key, `y0` and `args` are an example
-    of its values."""
+    of its values. Outside of programs times, levels and weights are NumPy arrays: there
+    each operation of JAX is a program of its own, which takes some 20 ms to compile."""
 
     phi: Callable[[RealScalarLike, Y, Args], PyTree]
     terms: PyTree[diffrax.AbstractTerm]
     solver: diffrax.AbstractSolver
-    t0: Float[Array, ""]
+    t0: Float[Array | np.ndarray, ""]
     y0: Y
     args: Args
     # The functions of a random key that draw `y0` and `args` for each path.
@@ -75,7 +78,7 @@ class Problem(eqx.Module):
     args_of: Callable | None
     levels: Level
     # An array, so that other weights do not compile anew.
-    weights: Float[Array, "combinations levels"]
+    weights: Float[Array | np.ndarray, "combinations levels"]
     # Whether to average at `t1` only, without an axis of times.
     at_end: bool = eqx.field(static=True)
     # The number of steps on the finest level. (Shapes must be known when compiling.)
@@ -113,10 +116,10 @@ class Problem(eqx.Module):
         y0_of = y0 if callable(y0) else None
         y0 = _state(y0) if y0_of is None else _drawn_state(y0_of, jr.key(1), args)
         check_state(y0, user)
-        if y0_of is None and not all_finite(y0):
+        if y0_of is None and not _is_finite(y0):
             raise ValueError(f"`y0` must hold finite numbers; got {brief(y0)}.")
-        start = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
-        check_fit(terms, start, y0, args)
+        start = np.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
+        _check_shapes(phi, terms, start, y0, args)
         if constraint_of(terms) is not None:
             check_start(terms, start, y0, args)
         _check_noise(terms)
@@ -125,8 +128,6 @@ class Problem(eqx.Module):
             check_resolution(smallest, float(t0), float(t1), start.dtype)
         check_stratonovich(terms, solver, start, y0, args, all_terms=True)
         _check_cells(terms, t0, smallest)
-        check_takes("phi", phi, "t", "y", "args")
-        check_real("phi", jtu.tree_leaves(_shape_of(phi, terms, start, y0, args)))
         if num_steps * 2.0 ** (levels - 1) >= 2**31:
             raise ValueError(
                 f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "
@@ -134,17 +135,19 @@ class Problem(eqx.Module):
             )
         finer = 2 ** np.arange(levels, dtype=np.int32)
         grid = Level(
-            jnp.arange(levels, dtype=jnp.int32),
-            jnp.asarray(float(dt0) / finer, start.dtype),
-            jnp.asarray(finer * num_steps),
-            jnp.asarray(finer[:, None] * saved_steps),
+            np.arange(levels, dtype=np.int32),
+            np.asarray(float(dt0) / finer, start.dtype),
+            finer * num_steps,
+            finer[:, None] * saved_steps,
         )
         order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
-        weights = jnp.asarray(level_weights(order, levels), float)
+        weights = np.asarray(level_weights(order, levels), jnp.result_type(float))
         at = grid, weights, ts is None, int(finer[-1] * num_steps)
         return Problem(phi, terms, solver, start, y0, args, y0_of, args_of, *at)
 
     def level(self, index: IntScalarLike) -> Level:
+        if is_traced(index):
+            return jtu.tree_map(lambda x: jnp.asarray(x)[index], self.levels)
         return jtu.tree_map(lambda x: x[index], self.levels)
 
     @property
@@ -176,7 +179,7 @@ class Problem(eqx.Module):
         rest = eqx.filter(self.args, eqx.is_array, inverse=True)
         return dataclasses.replace(self, args=eqx.combine(own, rest))
 
-    def init(self, terms, i, h: Float[Array, ""], y: Y) -> PyTree[Array]:
+    def init(self, terms, i, h: Float[Array | np.ndarray, ""], y: Y) -> PyTree[Array]:
         """The arrays of the solver's state before step `i`. The rest of the state does not
         change."""
         t = self.t0 + i * h
@@ -248,6 +251,10 @@ class Problem(eqx.Module):
 
 def _state(y0: Y) -> Y:
     return jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+
+
+def _is_finite(y0: Y) -> bool:
+    return all(np.all(np.isfinite(x)) for x in jtu.tree_leaves(y0))
 
 
 def _drawn_state(y0_of: Callable, key: PRNGKeyArray, args: Args) -> Y:
@@ -338,6 +345,14 @@ def _check_cells(terms, t0, h: float) -> None:
                 f"multiples of `cell`; got cell={cell}, t0={t0} and the smallest step {h}. "
                 "Pass a `cell` that divides `t0` and the steps of all `levels`."
             )
+
+
+@once_for_each_signature
+def _check_shapes(phi: Callable, terms, start, y0: Y, args: Args) -> None:
+    """Raises an error unless terms and `phi` fit the state, and the latter is real."""
+    check_fit(terms, start, y0, args)
+    check_takes("phi", phi, "t", "y", "args")
+    check_real("phi", jtu.tree_leaves(_shape_of(phi, terms, start, y0, args)))
 
 
 def _shape_of(phi: Callable, terms, t0, y0: Y, args: Args) -> PyTree:

@@ -20,9 +20,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from .._arguments import whole_number
 from .._brownian import check_key, typed_key
 from .._compat import quickly_compiled
-from ._estimate import Expectation, ExpectationInterrupted
-from ._moments import joined, Moments, total
-from ._sampling import KINDS_WITH_CONTROL, Plan, Samples
+from .estimate import Expectation, ExpectationInterrupted
+from .moments import joined, Moments, total
+from .sampling import KINDS_WITH_CONTROL, Plan, Samples
 
 
 # With an `r` of `std_error` above this, means of exp(5 x) with normal x were off by forty

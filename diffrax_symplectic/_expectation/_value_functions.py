@@ -22,21 +22,21 @@ from jaxtyping import Array, Int, PRNGKeyArray
 from .._arguments import whole_number
 from .._compat import quickly_compiled
 from .._terms import number_of_noises
-from ._bases import AbstractBasis, Grid, Hermite, Quadratic
 from ._fits import fit, Functions, without_newton
-from ._moments import total
-from ._noise import Noise
-from ._polynomials import num_polynomials
 from ._problem import Problem
 from ._run import run
-from ._sampling import (
+from ._steps import along, Paths, simulate
+from .bases import AbstractBasis, Grid, Hermite, Quadratic
+from .moments import total
+from .noise import Noise
+from .polynomials import num_polynomials
+from .sampling import (
     AbstractSampling,
     KINDS_WITH_CONTROL,
     Plan,
     ROUNDING,
     Samples,
 )
-from ._steps import along, Paths, simulate
 
 
 # The most polynomials in a fit by default.

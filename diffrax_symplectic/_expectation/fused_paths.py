@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .._root_finder import all_finite
-from ._monte_carlo import IndependentPaths
 from ._problem import Problem
-from ._sampling import Plan, Samples
 from .engines import by_drjit, state_itself
+from .monte_carlo import IndependentPaths
+from .sampling import Plan, Samples
 
 
 # Default number of paths in a batch: large, to amortize the call of the kernel.

@@ -63,7 +63,9 @@ class Program:
 Struct: TypeAlias = tuple[tuple[int, ...], str]
 
 
-def _packed(structs: list[Struct], arrays: Iterable[Array]) -> dict[str, Any]:
+def _packed(
+    structs: list[Struct], arrays: Iterable[Array | np.ndarray]
+) -> dict[str, Any]:
     """All entries, in one array for each type."""
     of_type: dict[str, list[np.ndarray]] = {t: [] for _, t in structs}
     for (_, t), x in zip(structs, arrays, strict=True):
@@ -91,7 +93,7 @@ def _unpacked(structs: list[Struct], packed: dict[str, Any]) -> Iterator[Tensor]
         yield Tensor(table if size > MOST_IN_REGISTERS else [*table], shape)
 
 
-def _numbers(x: Array) -> np.ndarray:
+def _numbers(x: Array | np.ndarray) -> np.ndarray:
     typed = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     return np.asarray(jr.key_data(x) if typed else x)
 
@@ -163,7 +165,7 @@ class Kernels:
         self,
         arrays: list[Array],
         key: PRNGKeyArray,
-        h: Array,
+        h: Array | np.ndarray,
         first: int,
         n: int,
         y0: PyTree[Array],

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation._array_rqmc import layout
-from diffrax_symplectic._expectation._moments import level_weights
+from diffrax_symplectic._expectation.array_rqmc import layout
+from diffrax_symplectic._expectation.moments import level_weights
 
 from ..problems import kubo_terms, RecordingMeter
 

@@ -6,8 +6,8 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from diffrax_symplectic._expectation._bases import Frame, Grid, Hermite
-from diffrax_symplectic._expectation._polynomials import (
+from diffrax_symplectic._expectation.bases import Frame, Grid, Hermite
+from diffrax_symplectic._expectation.polynomials import (
     exponents,
     hermite,
     least_squares,

@@ -12,7 +12,7 @@ from scipy import stats
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation._problem import Problem
 from diffrax_symplectic._expectation._run import Meter, run
-from diffrax_symplectic._expectation._sampling import Plan, Samples
+from diffrax_symplectic._expectation.sampling import Plan, Samples
 from examples.benchmarks.coverage import arguments, Cell, estimate, exact
 
 from ..problems import kubo_terms

@@ -10,7 +10,7 @@ import pytest
 from scipy.special import ndtr
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation._kinks import may_have_kinks
+from diffrax_symplectic._expectation.kinks import may_have_kinks
 
 
 Y0 = jnp.array(0.0), jnp.array(0.0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation._moments import Combination, level_weights
+from diffrax_symplectic._expectation.moments import Combination, level_weights
 
 
 KEY = jr.key(0)

@@ -13,10 +13,10 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation import _value_functions
-from diffrax_symplectic._expectation._choose import choose
-from diffrax_symplectic._expectation._noise import Noise
 from diffrax_symplectic._expectation._problem import Problem
 from diffrax_symplectic._expectation._value_functions import _basis
+from diffrax_symplectic._expectation.choose import choose
+from diffrax_symplectic._expectation.noise import Noise
 from diffrax_symplectic._terms import outcomes, step_variables
 
 from ..problems import kubo_terms, RecordingMeter

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from ._polynomials import dot, hermite, least_squares, num_polynomials, tensordot
+from .polynomials import dot, hermite, least_squares, num_polynomials, tensordot
 
 
 _PILOTS_PER_POLYNOMIAL, _FEWEST_PILOTS = 30, 256

@@ -12,9 +12,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from ._moments import Combination, joined, Moments, total
-from ._sampling import KINDS_OF_REPLICATES, KINDS_WITH_CONTROL, ROUNDING
-from ._saved import arrays_of, described, rebuilt
+from .moments import Combination, joined, Moments, total
+from .sampling import KINDS_OF_REPLICATES, KINDS_WITH_CONTROL, ROUNDING
+from .saved import arrays_of, described, rebuilt
 
 
 # A control variate is dropped if its mean is this many standard errors from zero, unless

@@ -3,12 +3,12 @@
 import jax.tree_util as jtu
 import numpy as np
 
-from ._array_rqmc import ArrayRQMC, layout
-from ._monte_carlo import IndependentPaths
-from ._noise import num_outcomes
 from ._problem import Problem
-from ._sampling import AbstractSampling
 from ._value_functions import ValueFunctions
+from .array_rqmc import ArrayRQMC, layout
+from .monte_carlo import IndependentPaths
+from .noise import num_outcomes
+from .sampling import AbstractSampling
 
 
 # Limits for value functions: the dimension, and the outcomes of all steps and of one step.

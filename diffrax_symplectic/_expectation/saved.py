@@ -6,8 +6,8 @@ from typing import Any
 import jax.tree_util as jtu
 import numpy as np
 
-from ._moments import Moments
-from ._sampling import AbstractSampling
+from .moments import Moments
+from .sampling import AbstractSampling
 
 
 _TREES = "mean", "norm", "largest", "size"

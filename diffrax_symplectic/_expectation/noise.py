@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from .._brownian import Discrete, random_words
 from .._custom_types import Y
 from .._terms import outcomes, step_variables
-from ._polynomials import tensordot
 from ._problem import Level, Problem
+from .polynomials import tensordot
 
 
 # Up to this many outcomes, a step is taken for each of them.
@@ -76,7 +76,8 @@ class Noise(eqx.Module):
         In a fraction `share` (from 0 to 1) of draws all outcomes are equally probable.
         Probabilities are multiplied by the exponential of `tilt`, a number or one for each
         variable, times the outcome."""
-        words = random_words(key, (number, self.level.index), 1, len(self.laws))[0]
+        place = number, jnp.asarray(self.level.index)
+        words = random_words(key, place, 1, len(self.laws))[0]
         x = jnp.zeros(len(self.laws), self.problem.dtype)
         log_ratio, tilts = jnp.zeros_like(x), jnp.broadcast_to(tilt, x.shape)
         own = (share == 0) & (tilts == 0)

@@ -14,13 +14,13 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 from .._arguments import check_real, check_takes, whole_number
 from .._root_finder import all_finite
 from .._terms import path_keys, with_keys
-from ._estimate import Expectation
-from ._moments import level_weights
-from ._polynomials import tensordot
 from ._problem import Problem
 from ._run import checked_call, Meter, NO_METER, run
-from ._sampling import AbstractSampling, Plan, real, Samples
 from ._steps import independent_steps, simulate
+from .estimate import Expectation
+from .moments import level_weights
+from .polynomials import tensordot
+from .sampling import AbstractSampling, Plan, real, Samples
 
 
 class IndependentPaths(AbstractSampling):

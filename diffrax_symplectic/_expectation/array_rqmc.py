@@ -25,13 +25,13 @@ from .._brownian import (
 from .._custom_types import Y
 from .._terms import brownian_paths, path_numbers, replace_paths
 from ._fits import Functions
-from ._points import hilbert_order, num_seeds, randomized, sobol_points
-from ._polynomials import tensordot
 from ._problem import numbers, Problem
 from ._run import run
-from ._sampling import AbstractSampling, Plan, ROUNDING, Samples
 from ._steps import along, independent_steps, simulate
 from ._value_functions import value_function
+from .points import hilbert_order, num_seeds, randomized, sobol_points
+from .polynomials import tensordot
+from .sampling import AbstractSampling, Plan, ROUNDING, Samples
 
 
 # SciPy has direction numbers for this many coordinates of Sobol' points.

@@ -1,0 +1,66 @@
+"""What a program is traced for: a PyTree without the values of its arrays."""
+
+import collections
+import functools as ft
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+
+# The number of signatures that a check remembers. Each holds the user's functions.
+_REMEMBERED = 128
+
+
+class Signature(NamedTuple):
+    """The structure of a PyTree, the shapes and dtypes of its arrays, its other leaves, and
+    settings of JAX on which a trace depends. Hashable if these leaves are.
+
+    - `leaves`: for each leaf, its shape and dtype if it is an array, and otherwise its type
+        and the leaf itself: `1`, `1.0` and `True` are equal, but not the same input.
+    """
+
+    treedef: Any
+    leaves: tuple[Any, ...]
+    settings: tuple[Any, ...]
+
+
+def signature(tree: Any) -> Signature:
+    leaves, treedef = jtu.tree_flatten(tree)
+    settings = (jax.default_backend(), jnp.result_type(float))
+    return Signature(treedef, tuple(map(_leaf_signature, leaves)), settings)
+
+
+def _leaf_signature(leaf: Any) -> tuple[Any, ...]:
+    if eqx.is_array(leaf):
+        # Traces tell JAX's arrays of weak types from others.
+        return leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)
+    return type(leaf), leaf
+
+
+def once_for_each_signature(check: Callable[..., None]) -> Callable[..., None]:
+    """A check that depends on the signature of its arguments only, and is skipped if it was
+    passed with the same one. It is traced by JAX, which takes longer than a short ensemble:
+    5 of 11 ms for 64 paths."""
+    passed: collections.OrderedDict[Signature, None] = collections.OrderedDict()
+
+    @ft.wraps(check)
+    def checked(*args: Any) -> None:
+        own = signature(args)
+        try:
+            known = own in passed
+        except TypeError:
+            # A leaf that cannot be hashed.
+            check(*args)
+            return
+        if not known:
+            check(*args)
+        passed[own] = None
+        passed.move_to_end(own)
+        if len(passed) > _REMEMBERED:
+            passed.popitem(last=False)
+
+    return checked
