@@ -126,6 +126,12 @@ def not_a_path(term: diffrax.ControlTerm) -> Any:
     return None if callable(given) else given
 
 
+def resolution(tree: diffrax.VirtualBrownianTree) -> Any:
+    """The length of time below which a tree only interpolates, its `tol`."""
+    # It is stored in units of the length of the tree.
+    return tree.tol * (tree.t1 - tree.t0)
+
+
 def direction(terms: PyTree[diffrax.AbstractTerm]) -> Any:
     """The sign of the direction of time in the solve that the terms come from. Terms from
     outside a solve run forward."""

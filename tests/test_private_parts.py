@@ -34,7 +34,7 @@ PRIVATE_ATTRIBUTE = re.compile(
 )
 # What uses such attributes still, and is to call `_compat.py` instead. Nothing is to be
 # added here.
-STILL_TO_DO = ("_stablehlo/", "_fused/", "_expectation/", "_terms/")
+STILL_TO_DO = ("_stablehlo/", "_fused/", "_expectation/")
 
 
 def _private_imports(tree: ast.AST) -> set[str]:
@@ -132,6 +132,12 @@ def test_a_control_term_keeps_what_it_was_given_in_place_of_a_path():
     assert _compat.not_a_path(diffrax.ControlTerm(field, (3,))) == (3,)
     for path in (ds.WeakBrownianPath((3,), jax.random.key(0)), lambda t0, t1: t1 - t0):
         assert _compat.not_a_path(diffrax.ControlTerm(field, path)) is None
+
+
+def test_the_resolution_of_a_tree_is_the_tolerance_that_it_was_given():
+    """If this fails: find how Diffrax stores `tol`, and adapt `resolution`."""
+    tree = diffrax.VirtualBrownianTree(1.0, 5.0, 1e-3, (), jax.random.key(0))
+    assert jnp.allclose(_compat.resolution(tree), 1e-3)
 
 
 def test_the_terms_that_backsolve_adjoint_solves_are_known(terms):
