@@ -58,6 +58,12 @@ def at_trace_time() -> Any:
     return jax.ensure_compile_time_eval()
 
 
+def is_result(x: Any) -> bool:
+    """Whether this says how a solve ended, such as a `diffrax.RESULTS`. The results of
+    Diffrax, Optimistix and Lineax have one class in common, which none of them names."""
+    return isinstance(x, type(diffrax.RESULTS.successful))
+
+
 def quickly_compiled(fn: Callable) -> Callable:
     """`equinox.filter_jit(fn)`, compiled by XLA's older generator of code for CPUs where
     this version of XLA has it.
@@ -123,6 +129,12 @@ def not_a_path(term: diffrax.ControlTerm) -> Any:
     # Diffrax takes anything that is no path for a function, and wraps it.
     given = getattr(term.control, "fn", None)
     return None if callable(given) else given
+
+
+def resolution(tree: diffrax.VirtualBrownianTree) -> Any:
+    """The length of time below which a tree only interpolates, its `tol`."""
+    # It is stored in units of the length of the tree.
+    return tree.tol * (tree.t1 - tree.t0)
 
 
 def direction(terms: PyTree[diffrax.AbstractTerm]) -> Any:

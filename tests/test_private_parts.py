@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
@@ -35,7 +36,7 @@ PRIVATE_ATTRIBUTE = re.compile(
 )
 # What uses such attributes still, and is to call `_compat.py` instead. Nothing is to be
 # added here.
-STILL_TO_DO = ("_expectation/", "_terms/")
+STILL_TO_DO = ("_expectation/",)
 
 
 def _private_imports(tree: ast.AST) -> set[str]:
@@ -133,6 +134,12 @@ def test_a_control_term_keeps_what_it_was_given_in_place_of_a_path():
     assert _compat.not_a_path(diffrax.ControlTerm(field, (3,))) == (3,)
     for path in (ds.WeakBrownianPath((3,), jax.random.key(0)), lambda t0, t1: t1 - t0):
         assert _compat.not_a_path(diffrax.ControlTerm(field, path)) is None
+
+
+def test_the_resolution_of_a_tree_is_the_tolerance_that_it_was_given():
+    """If this fails: find how Diffrax stores `tol`, and adapt `resolution`."""
+    tree = diffrax.VirtualBrownianTree(1.0, 5.0, 1e-3, (), jax.random.key(0))
+    assert jnp.allclose(_compat.resolution(tree), 1e-3)
 
 
 def test_the_terms_that_backsolve_adjoint_solves_are_known(terms):
@@ -320,6 +327,13 @@ def test_solvers_of_lineax_compute_without_linear_solve():
         x, result = _compat.computed_by(solver, operator, jnp.array([4.0, 4.0]))
         assert result == lx.RESULTS.successful
         assert jnp.allclose(x, jnp.array([1.5, 1.0]), atol=1e-5)
+
+
+def test_results_of_all_solves_are_told_from_other_values():
+    """If this fails: find the class of the results of Equinox's enumerations."""
+    for results in (diffrax.RESULTS, optx.RESULTS, lx.RESULTS):
+        assert _compat.is_result(results.successful)
+    assert not any(map(_compat.is_result, (1, jnp.ones(2), "successful")))
 
 
 def test_a_program_may_have_compiler_options_unless_it_is_inside_of_another():

@@ -18,9 +18,8 @@ from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 from .._compat import source_lines
 from .._fused import Kernels, PathFunctions, sample_key, split, without_rescue
 from .._stablehlo import NotReplayed
-from .._terms import path_keys, with_keys
-from ._problem import Level, Problem
-from ._steps import independent_steps, simulate
+from .independent import solved
+from .problem import Level, Problem
 
 
 # Beyond this share, stragglers take most of the time.
@@ -92,17 +91,7 @@ def _paths(
 ) -> tuple[PyTree[Array], Bool[Array, "levels n"]]:
     """The saved states of the paths of a batch, along axes of levels, paths and times, and
     which paths failed."""
-    keys = _sample_keys(key, high, low)
-    keys_of_paths = jax.vmap(ft.partial(path_keys, p.terms))(keys)
-    drawn = jax.vmap(p.drawn)(keys)
-
-    def terms_of(keys: list[Array]) -> PyTree:
-        return with_keys(p.terms, keys)
-
-    def begin(level: Level):
-        return independent_steps(p, level, drawn, terms_of, lambda i: keys_of_paths)
-
-    states, failed, _ = simulate(p, begin)
+    states, failed = solved(p, _sample_keys(key, high, low))
     return p.unravel(jnp.swapaxes(states, 1, 2)), failed
 
 

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Key, PRNGKeyArray, PyTree
 
 from .._root_finder import all_finite
-from ._problem import Level, Problem
 from .engines import by_drjit, state_itself
-from .monte_carlo import IndependentPaths
-from .sampling import Plan, Samples
+from .independent import IndependentPaths
+from .problem import Level, Problem
+from .sampling import Samples, SamplingPlan
 
 
 # Default number of paths in a batch: large, to amortize the call of the kernel.
@@ -22,7 +22,7 @@ _BATCH = 2**19
 
 def fused_plan(
     problem: Problem, key: PRNGKeyArray, sampling: Any, devices: tuple
-) -> Plan:
+) -> SamplingPlan:
     r"""A plan in which a kernel simulates independent paths, and JAX evaluates $\phi$.
     Raises a `ValueError` for another `sampling`, or several devices."""
     if not isinstance(sampling, IndependentPaths):
