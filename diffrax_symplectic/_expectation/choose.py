@@ -6,6 +6,7 @@ import numpy as np
 from ._problem import Problem
 from ._value_functions import ValueFunctions
 from .array_rqmc import ArrayRQMC, layout
+from .cost import NUMBERS_PER_SECOND, numbers_per_step
 from .monte_carlo import IndependentPaths
 from .noise import num_outcomes
 from .sampling import AbstractSampling
@@ -25,9 +26,13 @@ MUCH_LEFT = 0.01
 _FEW_SORTED, _FEW_REPLICATES, _FEW_PATHS = 2**12, 8, 2**14
 # Scrambling more random variables per step takes long.
 _MOST_WORDS = 2**8
-# Limit on the numbers in all steps of all paths (from ten seconds to some
-# minutes), and the fewest paths.
-_NUMBERS, _FEWEST = 2**28, 2**8
+# Without a tolerance, samples are to take no more than about this many seconds.
+_SECONDS = 10
+# A replicate draws and sorts its paths before each step, which takes as long as computing
+# this many numbers for each path.
+_SORTING = 1500
+# The fewest paths.
+_FEWEST = 2**8
 
 
 def choose(problem: Problem, tol: float | None) -> tuple[AbstractSampling, str]:
@@ -37,7 +42,6 @@ def choose(problem: Problem, tol: float | None) -> tuple[AbstractSampling, str]:
     outcomes = num_outcomes(problem)
     why = f"{d} components of the state, {steps:,} steps"
     why += f" of {outcomes} outcomes each" if outcomes else ""
-    paths = int(np.clip(_NUMBERS // (steps * d), _FEWEST, _PATHS))
     # Value functions leave the variance of the start, for which few paths are too few.
     few_suffice = not problem.paths_differ
     if few_suffice and d <= _FUNCTIONS and outcomes and outcomes <= _FEW_OUTCOMES:
@@ -46,7 +50,11 @@ def choose(problem: Problem, tol: float | None) -> tuple[AbstractSampling, str]:
             return sampling, f"value functions for {why}"
     if (sampling := sorted_paths(problem, tol)) is not None:
         return sampling, f"sorted paths for {why}"
-    return IndependentPaths(MOST if tol else paths), f"independent paths for {why}"
+    if tol:
+        return IndependentPaths(MOST), f"independent paths for {why}"
+    steps_of_all = _SECONDS * NUMBERS_PER_SECOND / numbers_per_step(problem)
+    paths = int(np.clip(steps_of_all / steps, _FEWEST, _PATHS))
+    return IndependentPaths(paths), f"independent paths for {why}"
 
 
 def sorted_paths(problem: Problem, tol: float | None) -> ArrayRQMC | None:
@@ -55,7 +63,9 @@ def sorted_paths(problem: Problem, tol: float | None) -> ArrayRQMC | None:
     steps = int(np.sum(problem.levels.num_steps))
     if d > _SORTED or not _can_be_sorted(problem):
         return None
-    fewer = max(_NUMBERS // (steps * d * _REPLICATES), _FEWEST)
+    numbers = numbers_per_step(problem) + _SORTING
+    steps_of_all = _SECONDS * NUMBERS_PER_SECOND / numbers
+    fewer = max(int(steps_of_all / steps / _REPLICATES), _FEWEST)
     size = min(2 ** (fewer.bit_length() - 1), _REPLICATE)
     return ArrayRQMC(size, MOST if tol else _REPLICATES)
 
