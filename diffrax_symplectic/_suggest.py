@@ -49,7 +49,6 @@ from ._terms import (
     split_terms,
     with_paths,
     without_constraint,
-    WRONG_WAY_ROUND,
 )
 
 
@@ -217,7 +216,7 @@ def _system(
     kind = " and ".join(structures) or f"general ({fault.reason if fault else ''})"
     system = f"The system is {kind}, with {noises}."
     if fault is not None and not with_friction:
-        if structures and WRONG_WAY_ROUND in fault.reason:
+        if structures and fault.wrong_way_round:
             system += f" It is not separable: {fault.reason}."
         if fault.friction:
             system += f" {FRICTION}"

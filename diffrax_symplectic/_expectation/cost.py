@@ -2,17 +2,18 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._compat import Jaxpr
 from .._custom_types import Y
-from ._fits import without_newton
-from ._problem import Problem
+from .._signature import once_for_each_signature
+from .fits import without_newton
 from .kinks import programs_in
+from .problem import Problem
 
 
 # The numbers that two cores compute in a second in large batches of paths. The constants
@@ -33,6 +34,7 @@ _OF_LAPACK = 3_000
 _LAPACK = frozenset("cholesky eigh lu qr svd triangular_solve".split())
 
 
+@once_for_each_signature
 def numbers_per_step(problem: Problem) -> int:
     """How many numbers a step of one path computes, as a measure of its cost."""
     # A rescue by Newton's method is rare.
@@ -53,7 +55,7 @@ def _numbers(jaxpr: Jaxpr, in_loop: bool) -> int:
     count = 0
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
-        size = sum(math.prod(out.aval.shape) for out in eqn.outvars)
+        size = sum(map(_size, eqn.outvars))
         inner = list(programs_in(eqn))
         if name == "while" and not in_loop:
             count += _SWEEPS * sum(_numbers(program, True) for program in inner)
@@ -69,8 +71,13 @@ def _numbers(jaxpr: Jaxpr, in_loop: bool) -> int:
             count += _OF_TRANSCENDENTAL * size
         elif name == "dot_general":
             (contracted, _), _ = eqn.params["dimension_numbers"]
-            shape = eqn.invars[0].aval.shape
+            left, _ = eqn.invars
+            shape = left.aval.shape  # pyright: ignore (of arrays)
             count += size * math.prod(shape[axis] for axis in contracted)
         else:
             count += size
     return count
+
+
+def _size(variable: Any) -> int:
+    return math.prod(variable.aval.shape)

@@ -16,7 +16,7 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._terms import (
     apply,
     check_start,
-    controls,
+    drawn_variables,
     drift_driven,
     rate,
     split_friction,
@@ -122,7 +122,7 @@ def force_at(terms, t: RealScalarLike, y: Y, args: Args) -> Array:
 
 def _kick(noise: tuple, t0, t1, y: Y, args: Args, name: str) -> Array:
     """The change of the momenta by the noise, as a vector."""
-    drawn = controls(noise, ["W"], t0, t1, name)["W"]
+    drawn = drawn_variables(noise, ["W"], t0, t1, name)["W"]
     return jfu.ravel_pytree(apply(noise, drawn, args, t0 + (t1 - t0) / 2, y)[0])[0]
 
 

@@ -18,7 +18,7 @@ from .._terms import (
     apply,
     check_structure,
     constraint_of,
-    controls,
+    drawn_variables,
     momentum_first,
     rate,
     split_friction,
@@ -82,7 +82,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         q = moved(y0[1], half, rate(drift, t0, (p, y0[1]), args)[1])
         kick = None
         if len(noise) > 0:
-            drawn = controls(noise, ["W"], t0, t1, type(self).__name__)["W"]
+            drawn = drawn_variables(noise, ["W"], t0, t1, type(self).__name__)["W"]
             kick, _ = apply(noise, drawn, args, t0 + half, (p, q))
         p = after_friction(friction, t0 + half, t1 - t0, (p, q), args, kick)
         q = moved(q, half, rate(drift, t1, (p, q), args)[1])
