@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, PRNGKeyArray, PyTree
 
 from .._fused import Kernels, sample_key, split
+from .._lapack import lapack_in_turn
 from .._stablehlo import NotReplayed
 from .._terms import path_keys, with_keys
 from ._problem import Problem
@@ -75,6 +76,7 @@ def _drawn(p: Problem, key: PRNGKeyArray, hi, lo) -> tuple[PyTree, PyTree]:
 
 
 @eqx.filter_jit
+@lapack_in_turn
 def _paths(p: Problem, key: PRNGKeyArray, hi, lo):
     keys = jax.vmap(ft.partial(sample_key, key))(hi, lo)
     own = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
