@@ -111,20 +111,97 @@ def after_friction(
     step = jnp.asarray(h, flat.dtype)
     slope = jax.jacfwd(flat_force)(flat)
     right = step * flat_force(flat) + jfu.ravel_pytree(kick)[0]
-    modes = None
-    if flat.size > _MAX_SOLVED:
-        modes = _modes_if_constant(friction, t, y, args)
-    if modes is not None:
-        return unravel(flat + _solved_by(modes, step, slope, right))
     matrix = jnp.eye(flat.size, dtype=flat.dtype) - step / 2 * slope
+    constant = None
+    if flat.size > _MAX_SOLVED:
+        constant = _matrices_if_constant(friction, t, y, args)
+    if constant is not None:
+        return unravel(flat + _solved_with(constant, step, matrix, right))
     # Elimination in XLA operations takes a tenth of LAPACK's time for matrices this small.
     solve = eliminate if flat.size <= MAX_WRITTEN_OUT else jnp.linalg.solve
     return unravel(flat + solve(matrix, right))
 
 
+class _Matrices(NamedTuple):
+    """What the step of friction is made of, for momenta as a vector.
+
+    - `friction`: the friction on velocities, G.
+    - `inverse_masses`: the derivative of the velocities by the momenta, M^-1. In a solve
+        backward in time it has the other sign, as friction has.
+    """
+
+    friction: Float[Array, "n n"]
+    inverse_masses: Float[Array, "n n"]
+
+
+def _matrices_if_constant(
+    friction: tuple, t: RealScalarLike, y: Y, args: Args
+) -> _Matrices | None:
+    """The matrices of friction that is known to be the same at all times and positions."""
+    if len(friction) != 1:
+        return None
+    term = unwrapped(friction[0])
+    field = term.vector_field if isinstance(term, diffrax.ODETerm) else None
+    if not isinstance(field, AbstractFriction):
+        return None
+    p, q = y
+    flat, unravel = jfu.ravel_pytree(p)
+
+    def matrices(t: Any, p: Array, q: PyTree[Array]) -> _Matrices:
+        def force(velocity: Array) -> Array:
+            return jfu.ravel_pytree(field.force(t, q, args, unravel(velocity)))[0]
+
+        def velocity(p: Array) -> Array:
+            return jfu.ravel_pytree(field.velocity(t, (unravel(p), q), args))[0]
+
+        return _Matrices(-jax.jacfwd(force)(p), jax.jacfwd(velocity)(p))
+
+    t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
+    if not Dependence(matrices, t, flat, q).independent(lambda t, p, q: (t, p, q)):
+        return None
+    G, inverse_masses = matrices(t, flat, q)
+    return _Matrices(G, direction(friction) * inverse_masses)
+
+
+def _solved_with(
+    constant: _Matrices,
+    step: Float[Array, ""],
+    matrix: Float[Array, "n n"],
+    right: Float[Array, " n"],
+) -> Float[Array, " n"]:
+    """Solves `matrix @ x = right` for `matrix = 1 + step / 2 * G M^-1`, by the modes of
+    the `constant` matrices G and M^-1.
+
+    The modes are those of steps of all sizes, which differ by rounding errors. They are
+    computed here, in the step, since a batch would copy them into the state of each path.
+    Nothing in them changes from step to step, so XLA moves them out of the loop, but only
+    on CPUs: eigenvectors in each step would take forty times as long as a solve.
+    """
+
+    def multiply(x: Array) -> Array:
+        return matrix @ x
+
+    def solve(_: Any, rhs: Array) -> Array:
+        return lax.platform_dependent(
+            rhs,
+            cpu=lambda rhs: _Modes.of(constant).solve(step, rhs),
+            default=lambda rhs: jnp.linalg.solve(matrix, rhs),
+        )
+
+    def solve_transposed(_: Any, rhs: Array) -> Array:
+        return lax.platform_dependent(
+            rhs,
+            cpu=lambda rhs: _Modes.of(constant).transposed().solve(step, rhs),
+            default=lambda rhs: jnp.linalg.solve(matrix.T, rhs),
+        )
+
+    # Its derivatives are those of the equation. Those of eigenvectors may be infinite.
+    return lax.custom_linear_solve(multiply, right, solve, solve_transposed)
+
+
 class _Modes(NamedTuple):
-    r"""The modes of a friction matrix $G$ for momenta with the masses $M$: with
-    $G = B B^\top$, those of the symmetric matrix $B^\top M^{-1} B$.
+    r"""The modes of a friction matrix $G = B B^\top$ for momenta with the masses $M$: those
+    of the symmetric matrix $B^\top M^{-1} B$.
 
     - `left`: $B U$, with the eigenvectors $U$ as columns.
     - `right`: $U^\top B^\top M^{-1}$, so that $G M^{-1}$ is `left @ right`.
@@ -135,74 +212,18 @@ class _Modes(NamedTuple):
     right: Float[Array, "n n"]
     rates: Float[Array, " n"]
 
+    @staticmethod
+    def of(matrices: _Matrices) -> "_Modes":
+        root = semidefinite_root(matrices.friction)
+        rates, vectors = jnp.linalg.eigh(root.T @ matrices.inverse_masses @ root)
+        left = root @ vectors
+        return _Modes(left, left.T @ matrices.inverse_masses, rates)
+
+    def transposed(self) -> "_Modes":
+        return _Modes(self.right.T, self.left.T, self.rates)
+
     def solve(self, step: Float[Array, ""], rhs: Float[Array, " n"]) -> Array:
         r"""$(1 + \frac h2 G M^{-1})^{-1}$ times a vector. It moves along the columns of
         `left` only, so what the friction conserves is conserved."""
         along = (self.right @ rhs) / (1 + step / 2 * self.rates)
         return rhs - step / 2 * (self.left @ along)
-
-    def transposed(self) -> "_Modes":
-        return _Modes(self.right.T, self.left.T, self.rates)
-
-
-def _modes_if_constant(
-    friction: tuple, t: RealScalarLike, y: Y, args: Args
-) -> _Modes | None:
-    """The modes of friction that is known to be the same at all times and positions.
-
-    They belong to the step of whatever size. Nothing in them changes from step to step, so
-    XLA computes them once, before the loop over steps.
-    """
-    if len(friction) != 1:
-        return None
-    term = unwrapped(friction[0])
-    field = term.vector_field if isinstance(term, diffrax.ODETerm) else None
-    if not isinstance(field, AbstractFriction):
-        return None
-    p, q = y
-    flat, unravel = jfu.ravel_pytree(p)
-
-    def matrices(t: Any, p: Array, q: PyTree[Array]) -> tuple[Array, Array]:
-        """The friction and the inverse of the masses."""
-
-        def force(velocity: Array) -> Array:
-            return jfu.ravel_pytree(field.force(t, q, args, unravel(velocity)))[0]
-
-        def velocity(p: Array) -> Array:
-            return jfu.ravel_pytree(field.velocity(t, (unravel(p), q), args))[0]
-
-        return -jax.jacfwd(force)(p), jax.jacfwd(velocity)(p)
-
-    t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
-    if not Dependence(matrices, t, flat, q).independent(lambda t, p, q: (t, p, q)):
-        # Eigenvectors in each step would take forty times as long as a solve.
-        return None
-    # The solution has derivatives of its own; those of eigenvectors may be infinite.
-    G, inverse_masses = lax.stop_gradient(matrices(t, flat, q))
-    # Backward in time friction has the other sign.
-    inverse_masses = direction(friction) * inverse_masses
-    root = semidefinite_root(G)
-    rates, vectors = jnp.linalg.eigh(root.T @ inverse_masses @ root)
-    left = root @ vectors
-    return _Modes(left, left.T @ inverse_masses, rates)
-
-
-def _solved_by(
-    modes: _Modes,
-    step: Float[Array, ""],
-    slope: Float[Array, "n n"],
-    right: Float[Array, " n"],
-) -> Float[Array, " n"]:
-    """Solves `(1 - step / 2 * slope) x = right` by the modes of `slope`. Derivatives come
-    from the equation."""
-
-    def multiply(x: Array) -> Array:
-        return x - step / 2 * (slope @ x)
-
-    def solve(_: Any, rhs: Array) -> Array:
-        return modes.solve(step, rhs)
-
-    def solve_transposed(_: Any, rhs: Array) -> Array:
-        return modes.transposed().solve(step, rhs)
-
-    return lax.custom_linear_solve(multiply, right, solve, solve_transposed)

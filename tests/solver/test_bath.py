@@ -66,7 +66,7 @@ def _exact(friction, sign=1, h=0.1):
 def test_friction_by_its_modes_solves_the_equation_of_the_step(friction, backward):
     (term,) = _friction_term(friction)
     wrapped = _seen_by_a_solver(term, backward)
-    assert bath._modes_if_constant((wrapped,), 0.0, (P, Q), None) is not None
+    assert bath._matrices_if_constant((wrapped,), 0.0, (P, Q), None) is not None
     got = _after(friction, (wrapped,))
     sign = -1 if backward else 1
     np.testing.assert_allclose(got, _exact(friction, sign), rtol=0, atol=1e-13)
@@ -80,16 +80,16 @@ def test_friction_between_particles_by_its_modes_conserves_their_momentum():
 def test_modes_serve_what_is_the_same_at_all_times_and_positions_and_nothing_else():
     def modes(friction, args=None):
         terms = _friction_term(friction)
-        return bath._modes_if_constant(terms, 0.0, (P, Q), args)
+        return bath._matrices_if_constant(terms, 0.0, (P, Q), args)
 
     assert modes(lambda t, q, args: args * FULL, jnp.array(2.0)) is not None
     assert modes(lambda t, q, args: (1 + t) * FULL) is None
     assert modes(lambda t, q, args: (1 + q[0] ** 2) * FULL) is None
     heavier = lambda t, p, q, args: (1 + q[0] ** 2) * jnp.sum(p**2)
     terms = ds.bath_terms(heavier, FULL).terms
-    assert bath._modes_if_constant(terms, 0.0, (P, Q), None) is None
+    assert bath._matrices_if_constant(terms, 0.0, (P, Q), None) is None
     two = (*_friction_term(FULL), *_friction_term(PAIRS))
-    assert bath._modes_if_constant(two, 0.0, (P, Q), None) is None
+    assert bath._matrices_if_constant(two, 0.0, (P, Q), None) is None
     got = bath.after_friction(two, 0.0, 0.1, (P, Q), None, KICK)
     np.testing.assert_allclose(got, _exact(FULL + PAIRS), rtol=0, atol=1e-13)
 
