@@ -23,8 +23,8 @@ import jax.random as jr
 import matplotlib.pyplot as plt
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation._problem import Problem
 from diffrax_symplectic._expectation.engines import state_itself
+from diffrax_symplectic._expectation.problem import Problem
 from diffrax_symplectic._fused import Kernels, split
 
 from .. import rigid_body

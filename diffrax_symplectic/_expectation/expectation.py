@@ -12,18 +12,24 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
-from ._brownian import Discrete, laws_of, UnspecifiedPath
-from ._custom_types import Args, RealScalarLike, Y
-from ._expectation import Expectation, ExpectationInterrupted
-from ._expectation._problem import Problem
-from ._expectation._run import checked_call, Meter, NO_METER, refuse_others, run
-from ._expectation._value_functions import ValueFunctions
-from ._expectation.choose import choose, few_paths, MOST, MUCH_LEFT, sorted_paths
-from ._expectation.engines import warn_of_stragglers
-from ._expectation.fused_paths import fused_plan, FusedPaths
-from ._expectation.sampling import AbstractSampling
-from ._solver import own_path
-from ._terms import brownian_paths, path_numbers, random_paths, with_paths
+from .._brownian import Discrete, laws_of, UnspecifiedPath
+from .._custom_types import Args, RealScalarLike, Y
+from .._solver import own_path
+from .._terms import brownian_paths, path_numbers, random_paths, with_paths
+from .choose import (
+    choose,
+    few_paths,
+    MOST_SAMPLES,
+    MUCH_LEFT,
+    sorted_paths,
+)
+from .engines import warn_of_stragglers
+from .estimate import Expectation, ExpectationInterrupted
+from .fused_paths import fused_plan, FusedPaths
+from .problem import Problem
+from .run import checked_call, Meter, NO_METER, refuse_others, run
+from .sampling import AbstractSampling
+from .value_functions import ValueFunctions
 
 
 # No sample's key is folded from this number.
@@ -217,7 +223,7 @@ def expectation(
         plan = plan._replace(
             reason=reason, roundings=problem.max_steps, bounded=problem.bounded
         )
-        if start is not None and tol is None and plan.num_samples == MOST:
+        if start is not None and tol is None and plan.num_samples == MOST_SAMPLES:
             # Without `tol` the number of samples stays as it was.
             used = start.moments[-1].end - start.moments[0].begin
             plan = plan._replace(num_samples=used)
