@@ -132,9 +132,9 @@ def expectation(
         four components, if the increments can be computed from quasi-random points; and
         otherwise `IndependentPaths`. Where `y0` or `args` is drawn, it is not
         `ValueFunctions`, which leave the variance of the start. Without `tol` these draw
-        4,096 paths, 16 replicates of 16,384 paths, and 131,072 paths, or fewer where all
-        steps of all paths would exceed $2^{28}$ numbers (from ten seconds to some minutes,
-        by solver and system).
+        4,096 paths, 16 replicates of 16,384 paths, and 131,072 paths, or fewer where these
+        would take more than about ten seconds on two cores, as far as the operations of a
+        step tell (compilation comes on top).
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
         default only `t1`.
     - `levels`: the number of step sizes, each half the previous one. With one level the
@@ -195,11 +195,9 @@ def expectation(
     if free and has_kinks:
         problem = Problem.of(*given, want="strong")
         reason = "Gaussian increments, since phi may not be smooth"
-    sorted_instead = None
-    if sampling is None:
+    is_chosen = sampling is None
+    if is_chosen:
         sampling, choice = choose(problem, tol)
-        if isinstance(sampling, ValueFunctions):
-            sorted_instead = sorted_paths(problem, tol)
     sampling = _checked_sampling(sampling, start)
     with Meter(progress_meter) as meter:
         try:
@@ -208,13 +206,16 @@ def expectation(
             else:
                 own = jr.fold_in(key, _NO_SAMPLE)
                 plan = sampling.prepare(problem, own, devices)
-                if sorted_instead is not None and plan.left > MUCH_LEFT:
-                    choice = (
-                        "sorted paths, since fitted value functions leave "
-                        f"{plan.left:.1%} of the standard error"
-                    )
-                    sampling = sorted_instead
-                    plan = sampling.prepare(problem, own, devices)
+                # Only fits leave something.
+                if is_chosen and plan.left > MUCH_LEFT:
+                    sorted_instead = sorted_paths(problem, tol)
+                    if sorted_instead is not None:
+                        choice = (
+                            "sorted paths, since fitted value functions leave "
+                            f"{plan.left:.1%} of the standard error"
+                        )
+                        sampling = sorted_instead
+                        plan = sampling.prepare(problem, own, devices)
         except ExpectationInterrupted:
             # Trial samples are not part of the estimate, and cannot be continued.
             raise KeyboardInterrupt from None
