@@ -16,7 +16,15 @@ import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .._compat import source_lines
-from .._fused import Kernels, PathFunctions, sample_key, split, without_rescue
+from .._fused import (
+    Kernels,
+    Lanes,
+    PathFunctions,
+    sample_key,
+    Shared,
+    split,
+    without_rescue,
+)
 from .._stablehlo import NotReplayed
 from .independent import solved
 from .problem import Level, Problem
@@ -124,17 +132,8 @@ def _fused_batch(
     p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int
 ) -> Batch:
     """The paths from the kernel alone: those that it did not finish count as failed."""
-    own_args = None if p.args_of is None else eqx.filter(p.args, eqx.is_array)
-    functions, arrays = split(_bare(p), key, own_args, p.paths_differ)
-    kernels = _kernels(functions)
-    start = (p.y0, None)
-    if p.paths_differ:
-        start = _drawn(p, key, *_halves(numbers))
-    grid = p.level(level)
-    lanes, shared = kernels.begin(
-        arrays, key, grid.h, int(numbers[0]), len(numbers), *start
-    )
-    saved_steps = np.asarray(grid.saved_steps)
+    kernels, lanes, shared = fused_start(p, key, numbers, level)
+    saved_steps = np.asarray(p.level(level).saved_steps)
     # From the number of a step to the entries of all states after it. The kernel is called
     # for the steps between two times.
     after: dict[int, list[np.ndarray]] = {}
@@ -150,6 +149,32 @@ def _fused_batch(
     ]
     stopped = np.asarray(lanes.stopped)
     return Batch(_unraveled(p.y0, entries), stopped, int(np.sum(stopped)))
+
+
+class FusedStart(NamedTuple):
+    """The paths of a batch before their first step, and the kernels that take their steps:
+    `kernels.advance(lanes, shared, begin, end)`.
+    """
+
+    kernels: Kernels
+    lanes: Lanes
+    shared: Shared
+
+
+def fused_start(
+    p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0
+) -> FusedStart:
+    """Compiles the kernels of a problem, unless they are known, and starts these paths."""
+    own_args = None if p.args_of is None else eqx.filter(p.args, eqx.is_array)
+    functions, arrays = split(_bare(p), key, own_args, p.paths_differ)
+    kernels = _kernels(functions)
+    y0, args = p.y0, None
+    if p.paths_differ:
+        y0, args = _drawn(p, key, *_halves(numbers))
+    h = p.level(level).h
+    first = int(numbers[0])
+    lanes, shared = kernels.begin(arrays, key, h, first, len(numbers), y0, args)
+    return FusedStart(kernels, lanes, shared)
 
 
 def _bare(p: Problem) -> Problem:
