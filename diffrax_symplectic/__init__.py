@@ -32,12 +32,12 @@ from ._tableau import (
     symplectic_residuals as symplectic_residuals,
     weak_order_residuals as weak_order_residuals,
 )
-from ._expect import expectation as expectation
 from ._expectation import (
     ArrayRQMC as ArrayRQMC,
     Ensemble as Ensemble,
     ensemble as ensemble,
     Expectation as Expectation,
+    expectation as expectation,
     ExpectationInterrupted as ExpectationInterrupted,
     IndependentPaths as IndependentPaths,
     monte_carlo as monte_carlo,

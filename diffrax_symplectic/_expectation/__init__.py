@@ -4,8 +4,7 @@ from .estimate import (
     Expectation as Expectation,
     ExpectationInterrupted as ExpectationInterrupted,
 )
-from .monte_carlo import (
-    IndependentPaths as IndependentPaths,
-    monte_carlo as monte_carlo,
-)
-from ._value_functions import ValueFunctions as ValueFunctions
+from .expectation import expectation as expectation
+from .independent import IndependentPaths as IndependentPaths
+from .monte_carlo import monte_carlo as monte_carlo
+from .value_functions import ValueFunctions as ValueFunctions

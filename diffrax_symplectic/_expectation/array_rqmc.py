@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -24,28 +24,33 @@ from .._brownian import (
 )
 from .._custom_types import Y
 from .._terms import brownian_paths, path_numbers, replace_paths
-from ._fits import Functions
-from ._problem import numbers, Problem
-from ._run import run
-from ._steps import along, independent_steps, simulate
-from ._value_functions import value_function
-from .points import hilbert_order, num_seeds, randomized, sobol_points
+from .fits import Functions
+from .hilbert import hilbert_order
+from .points import num_seeds, randomized, sobol_points
 from .polynomials import tensordot
-from .sampling import AbstractSampling, Plan, ROUNDING, Samples
+from .problem import Level, numbers, Problem
+from .run import run
+from .sampling import AbstractSampling, ROUNDING, Samples, SamplingPlan, saved_by_name
+from .simulation import along, independent_steps, Paths, simulate
+from .value_functions import value_function
 
 
 # SciPy has direction numbers for this many coordinates of Sobol' points.
 _MAX_DIMENSION = 21201
 # Fewer replicates do not estimate their variance well enough to stop.
 _BEFORE_STOPPING = 8
-# With fewer paths along each coordinate, neighbours are far apart. The number of replicates
-# by which two ways to sort are compared.
-_FEW, _TRIAL = 3, 4
+# With fewer paths along each coordinate, neighbours are far apart.
+_FEWEST_ALONG_COORDINATE = 3
+# The number of replicates by which two ways to sort are compared.
+_TRIAL_REPLICATES = 4
+# Folded into the key of a call to draw these.
+_TRIAL_KEY = 4
 # Folded into the key of a replicate to draw the starts of its paths. (Numbers of levels are
 # smaller.)
-_STARTS = 0xFFFFFFFF
+_STARTS_KEY = 0xFFFFFFFF
 
 
+@saved_by_name
 class ArrayRQMC(AbstractSampling):
     r"""Array-RQMC: randomized quasi-Monte Carlo across all paths of a replicate.
 
@@ -85,54 +90,77 @@ class ArrayRQMC(AbstractSampling):
     sort_by: Callable[[Y], PyTree[ArrayLike]] | None = None
 
     def prepare(self, problem, key, devices):
-        words = layout(problem.terms)
-        if not 0 < words.num_words <= _MAX_DIMENSION:
+        words = step_words(problem.terms)
+        if not 0 < words.number <= _MAX_DIMENSION:
             raise ValueError(
-                f"`terms` need {words.num_words:,} random variables in each step; "
+                f"`terms` need {words.number:,} random variables in each step; "
                 f"`ArrayRQMC` takes 1 to {_MAX_DIMENSION:,}, the dimensions of Sobol' "
                 "points. Pass `sampling=IndependentPaths(num_paths)`."
             )
-        points = jnp.asarray(sobol_points(self.num_paths, words.num_words))
-        sort_by, y0 = _state if self.sort_by is None else self.sort_by, problem.y0
+        sort_by = _state if self.sort_by is None else self.sort_by
         check_takes("sort_by", sort_by, "y")
-        check_real("sort_by", jtu.tree_leaves(eqx.filter_eval_shape(sort_by, y0)))
-        sampler = lambda by: jtu.Partial(_replicates, problem, by, points, words)
-        plan = Plan(
-            sampler(sort_by), self.replicates, 1, self.num_paths, _BEFORE_STOPPING
-        )
-        dimension = jax.eval_shape(lambda: numbers(sort_by(y0))).size
-        # The number of sorted paths along each coordinate.
-        each = self.num_paths ** (1 / dimension)
-        if each >= _FEW:
-            return plan
-        one_number = self.sort_by is None and problem.num_outputs == (1, 1)
-        u = value_function(problem, key) if one_number else None
+        sorted_by = eqx.filter_eval_shape(sort_by, problem.y0)
+        check_real("sort_by", jtu.tree_leaves(sorted_by))
+        dimension = jax.eval_shape(lambda: numbers(sort_by(problem.y0))).size
+        points = jnp.asarray(sobol_points(self.num_paths, words.number))
+
+        def plan_for(sort_by: Callable) -> SamplingPlan:
+            return SamplingPlan(
+                jtu.Partial(_replicates, problem, sort_by, points, words),
+                num_samples=self.replicates,
+                # All paths of a replicate are solved at once, which is a batch already.
+                batch_size=1,
+                paths=self.num_paths,
+                least=_BEFORE_STOPPING,
+            )
+
+        by_state = plan_for(sort_by)
+        along_coordinate = self.num_paths ** (1 / dimension)
+        if along_coordinate >= _FEWEST_ALONG_COORDINATE:
+            return by_state
+        # Each number that is averaged has value functions of its own, and paths are sorted
+        # by one.
+        is_one_number = problem.num_outputs == (1, 1)
+        u = None
+        if self.sort_by is None and is_one_number:
+            u = value_function(problem, key)
         if u is not None:
-            other, own = plan._replace(sampler=sampler(u)), jr.fold_in(key, _TRIAL)
-            few = lambda plan: run(plan._replace(num_samples=_TRIAL), own, devices)
-            spread = lambda plan: float(np.sum(jtu.tree_leaves(few(plan).variance)))
-            ratio = spread(plan) / spread(other)
-            if ratio > 1:
-                return other._replace(
+            by_value = plan_for(u)
+            gain = _gain(by_state, by_value, key, devices)
+            if gain > 1:
+                return by_value._replace(
                     reason="sorted by a fitted value function, which divides the variance "
-                    f"of sorting by the state by {ratio:.1f}"
+                    f"of sorting by the state by {gain:.1f}"
                 )
         warnings.warn(
             f"{self.num_paths:,} paths are sorted by {dimension} coordinates, which leaves "
-            f"{each:.1f} along each: neighbours are far apart, and `ArrayRQMC` gains "
-            "little over `IndependentPaths`. Pass a `sort_by` that returns the few "
+            f"{along_coordinate:.1f} along each: neighbours are far apart, and `ArrayRQMC` "
+            "gains little over `IndependentPaths`. Pass a `sort_by` that returns the few "
             "coordinates that matter most, at most "
-            f"{int(math.log(self.num_paths, _FEW))}.",
+            f"{int(math.log(self.num_paths, _FEWEST_ALONG_COORDINATE))}.",
             stacklevel=4,
         )
-        return plan
+        return by_state
+
+
+def _gain(
+    plan: SamplingPlan, other: SamplingPlan, key: PRNGKeyArray, devices: tuple
+) -> float:
+    """How many times the variance of a plan is that of the other, in a short trial."""
+
+    def variance(plan: SamplingPlan) -> float:
+        short = plan._replace(num_samples=_TRIAL_REPLICATES)
+        trial = run(short, jr.fold_in(key, _TRIAL_KEY), devices)
+        return float(np.sum(jtu.tree_leaves(trial.variance)))
+
+    return variance(plan) / variance(other)
 
 
 def _replicates(
     p: Problem,
     sort_by: Callable[[Y], PyTree[Array]] | Functions,
     points: UInt32[Array, "n d"],
-    layout: "Layout",
+    words: "StepWords",
     keys: PRNGKeyArray,
 ) -> Samples:
     """A sample is the mean over all paths of a replicate. Algorithm 1 of
@@ -140,33 +168,28 @@ def _replicates(
 
     `points` come from `sobol_points`, with a coordinate for each random variable of a step.
     """
-    n, d = points.shape
-    terms_of = lambda words: with_words(p.terms, layout, words)
+    n, _ = points.shape
     (replicate,) = keys
     # Not from quasi-random points, since a function of a key takes any number of them.
-    each = jr.split(jr.fold_in(replicate, _STARTS), n)
-    drawn = jax.vmap(p.drawn)(each)
+    start_keys = jr.split(jr.fold_in(replicate, _STARTS_KEY), n)
+    drawn = jax.vmap(p.drawn)(start_keys)
 
-    def begin(level):
-        key = jr.fold_in(replicate, level.index)
-
-        def words(i):
-            seeds = jr.bits(jr.fold_in(key, i), (num_seeds(d),), jnp.uint32)
-            return randomized(points, seeds, layout.sixths)
+    def begin(level: Level) -> tuple[Callable[[Any, Paths], Paths], Paths]:
+        advance, paths = independent_steps(
+            p,
+            level,
+            drawn,
+            lambda own_words: with_words(p.terms, words, own_words),
+            lambda i: _words_of_step(replicate, level, i, points, words.sixths),
+        )
 
         def step(i, paths):
-            by = sort_by
-            if isinstance(by, Functions):
-                u = jtu.tree_map(lambda x: x[level.index], by)
-                by = lambda y: u(i - 1, y)
-            z = jax.vmap(lambda y: numbers(by(y)))(paths.y)
-            order = hilbert_order(z, paths.failed)
-            return advance(i, jtu.tree_map(lambda x: x[order], paths))
+            return advance(i, _in_order(sort_by, level, i, paths))
 
-        advance, paths = independent_steps(p, level, drawn, terms_of, words)
         return step, paths
 
     saved, failed, _ = simulate(p, begin, _mean_of_good)
+    # An axis for the samples, of which there is one.
     means, heavy, largest = jnp.moveaxis(saved[:, :, :, None], 2, 0)
     means = p.combined(means)
     # The largest over all levels.
@@ -177,60 +200,99 @@ def _replicates(
     return Samples(p.averaged(kinds), jnp.ones(1, bool), jnp.sum(failed)[None])
 
 
+def _words_of_step(
+    replicate: PRNGKeyArray,
+    level: Level,
+    i: Any,
+    points: UInt32[Array, "n d"],
+    sixths: bool,
+) -> UInt32[Array, "n d"]:
+    """The random words of all paths in step `i`: the points, scrambled anew."""
+    key = jr.fold_in(jr.fold_in(replicate, level.index), i)
+    _, d = points.shape
+    return randomized(points, jr.bits(key, (num_seeds(d),), jnp.uint32), sixths)
+
+
+def _in_order(
+    sort_by: Callable[[Y], PyTree[Array]] | Functions,
+    level: Level,
+    i: Any,
+    paths: Paths,
+) -> Paths:
+    """The paths before step `i`, sorted, with those that failed at the end."""
+
+    def sorted_by(y: Y) -> Float[Array, " m"]:
+        if isinstance(sort_by, Functions):
+            u = jtu.tree_map(lambda x: x[level.index], sort_by)
+            # Functions are those after each step. Before step 0 this is the last one, since
+            # there is none, and any order is right.
+            return numbers(u(i - 1, y))
+        return numbers(sort_by(y))
+
+    order = hilbert_order(jax.vmap(sorted_by)(paths.y), paths.failed)
+    return jtu.tree_map(lambda x: x[order], paths)
+
+
 def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "3 ..."]:
     """The mean over the paths that have not failed, the `r` of these paths as in
     `Expectation.std_error`, and the largest deviation of one of them."""
     keep = along(~failed, x)
     count = jnp.sum(~failed).astype(x.dtype)
 
-    def mean(x):
+    def mean(x: Array) -> Array:
         # In two stages, so that rounding errors in single precision do not add up.
-        x, rows = jnp.where(keep, x, 0), 1 << ((len(x).bit_length() - 1) // 2)
+        rows = 1 << ((len(x).bit_length() - 1) // 2)
+        x = jnp.where(keep, x, 0)
         total = jnp.sum(jnp.sum(x.reshape(rows, -1, *x.shape[1:]), axis=0), axis=0)
         return total / count
 
-    own = mean(x)
-    off = jnp.where(keep, jnp.abs(x - own), 0)
-    most = jnp.max(off, axis=0)
-    # In units of the largest deviation.
-    s = jnp.sqrt(mean((off / jnp.where(most > 0, most, 1)) ** 2))
+    center = mean(x)
+    off = jnp.where(keep, jnp.abs(x - center), 0)
+    largest = jnp.max(off, axis=0)
+    # In units of the largest deviation, so that squares neither overflow nor underflow.
+    s = jnp.sqrt(mean((off / jnp.where(largest > 0, largest, 1)) ** 2))
     beyond = jnp.maximum(1 - s * jnp.sqrt(4.5 * jnp.log(jnp.maximum(count, 2))), 0)
     # Rounding errors can have heavy tails, too.
-    some = most > ROUNDING * jnp.finfo(x.dtype).eps * jnp.abs(own)
-    r = jnp.where(some, beyond / (s * jnp.sqrt(count)), 0)
-    return jnp.stack([own, r, most])
+    is_random = largest > ROUNDING * jnp.finfo(x.dtype).eps * jnp.abs(center)
+    r = jnp.where(is_random, beyond / (s * jnp.sqrt(count)), 0)
+    return jnp.stack([center, r, largest])
 
 
-class Layout(NamedTuple):
-    """Which words of a step each path in `terms` takes, the number of words, and whether
-    there is only a single three-point variable."""
+class StepWords(NamedTuple):
+    """Which random words of a step each path in `terms` takes.
+
+    - `slices`: the first word of each path, and one past the last.
+    - `number`: the number of all words.
+    - `sixths`: whether there is only a single three-point variable, as in `randomized`.
+    """
 
     slices: tuple[tuple[int, int], ...]
-    num_words: int
+    number: int
     sixths: bool
 
 
-def layout(terms: PyTree[diffrax.AbstractTerm]) -> Layout:
-    """The layout of the words. Equal paths are one Brownian motion, and take the same
-    words. Raises a `ValueError` for a path whose increments cannot be computed from words.
-    """
+def step_words(terms: PyTree[diffrax.AbstractTerm]) -> StepWords:
+    """The words of a step. Equal paths are one Brownian motion, and take the same words.
+    Raises a `ValueError` for a path whose increments cannot be computed from words."""
     paths = [stepwise(path) for path in brownian_paths(terms)]
-    starts, slices, end = {}, [], 0
+    starts: dict[int, int] = {}
+    slices: list[tuple[int, int]] = []
+    end = 0
     for number, path in zip(path_numbers(paths), paths):
         start = starts.setdefault(number, end)
         slices.append((start, start + path.num_words(use_levy=True)))
         end = max(end, slices[-1][1])
     sixths = end == 1 and paths[0].laws == {"W": THREE_POINT}
-    return Layout(tuple(slices), end, sixths)
+    return StepWords(tuple(slices), end, sixths)
 
 
 def with_words(
     terms: PyTree[diffrax.AbstractTerm],
-    layout: Layout,
-    words: UInt32[Array, " num_words"],
+    step: StepWords,
+    words: UInt32[Array, " number"],
 ) -> PyTree[diffrax.AbstractTerm]:
     """The terms, with paths whose increments are computed from these words."""
-    slices = iter(layout.slices)
+    slices = iter(step.slices)
 
     def given(path: diffrax.AbstractBrownianPath) -> GivenPath:
         start, end = next(slices)
@@ -240,16 +302,23 @@ def with_words(
     return replace_paths(terms, given)
 
 
-def _from_words(path: AbstractStepwisePath, words, t0, t1, use_levy: bool) -> Increment:
+def _from_words(
+    path: AbstractStepwisePath,
+    words: UInt32[Array, " number"],
+    t0: Any,
+    t1: Any,
+    use_levy: bool,
+) -> Increment:
     """The increment of the path, computed from the first of these words."""
     return path.increment(words[: path.num_words(use_levy)], t0, t1, use_levy)
 
 
 def _state(y: Y) -> Y:
+    """The default of `sort_by`."""
     return y
 
 
-def _power_of_two(value) -> int:
+def _power_of_two(value: Any) -> int:
     whole = whole_number("num_paths", value, 2)
     if whole & (whole - 1):
         raise ValueError(

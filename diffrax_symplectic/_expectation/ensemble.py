@@ -16,9 +16,9 @@ from .._custom_types import Args, Y
 from .._fused import sample_key
 from .._solver import Want
 from .._terms import path_keys, with_keys
-from ._problem import Problem
-from ._run import checked_call, refuse_others
 from .engines import Batch, ENGINES, state_itself, warn_of_stragglers
+from .problem import Problem
+from .run import checked_call, refuse_others
 
 
 # Entries of all states in a batch: enough to keep every core busy, in tens of megabytes.

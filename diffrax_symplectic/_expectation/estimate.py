@@ -7,25 +7,23 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import equinox as eqx
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
+from .error_bars import (
+    has_combination,
+    is_off_order,
+    remaining_error,
+    Results,
+    results_of,
+)
 from .moments import Combination, joined, Moments, total
-from .sampling import KINDS_OF_REPLICATES, KINDS_WITH_CONTROL, ROUNDING
-from .saved import arrays_of, described, rebuilt
+from .saved import arrays_of, fields_from, header_of
 
 
-# A control variate is dropped if its mean is this many standard errors from zero, unless
-# its own `r` exceeds this value.
-_SURE, _HEAVY_CONTROL = 5, 0.1
-# The last change by a smaller step, over what the order foretells from the change before.
-# In between, the steps are taken to be in the asymptotic range. (Of half an order less it
-# would be 1.41, of two orders more 0.25.)
-_FASTEST, _SLOWEST = 0.25, 1.33
-# The standard errors by which it may be off.
-_BY_CHANCE = 2
+# The components that the printed estimate shows, and the samples of an array.
+_SHOWN = 6
 # NumPy operations on zero-dimensional arrays return scalars.
 _Host = PyTree[np.ndarray | np.floating]
 
@@ -45,6 +43,9 @@ class Expectation(eqx.Module):
     - `reason`: why this sampling was chosen, or empty if there was no choice.
     - `tol_reached`: whether all standard errors are at most `tol`; `None` without `tol`.
     - `key_data`: the data of the random key.
+
+    The other fields are what `save` stores beside these, and may change: `moments`,
+    `paths_per_sample`, `roundings` and `far`.
     """
 
     # The moments of batches, with neighbours combined.
@@ -75,9 +76,11 @@ class Expectation(eqx.Module):
     @property
     def samples(self) -> list[tuple[int, int]]:
         ranges: list[tuple[int, int]] = []
-        for x in self.moments:
-            begin = ranges.pop()[0] if ranges and ranges[-1][1] == x.begin else x.begin
-            ranges.append((begin, x.end))
+        for part in self.moments:
+            begin = part.begin
+            if ranges and ranges[-1][1] == begin:
+                begin, _ = ranges.pop()
+            ranges.append((begin, part.end))
         return ranges
 
     @property
@@ -85,7 +88,7 @@ class Expectation(eqx.Module):
         r"""The estimate, in the structure of $\phi$ and in float64: the mean over the
         samples, extrapolated to step size zero if there are several levels. With `ts` there
         is a leading axis of times. NaN without samples."""
-        return self._each("mean", Combination.BEST)
+        return self._results(Combination.BEST).mean
 
     @property
     def std_error(self) -> _Host:
@@ -102,24 +105,28 @@ class Expectation(eqx.Module):
         part of the mean absolute deviation that only paths show whose noise is wider or
         pushed to one side; otherwise it is zero. The standard error is never less than the
         rounding of the mean."""
-        return self._each("std_error", Combination.BEST)
+        return self._results(Combination.BEST).std_error
 
     @property
     def variance(self) -> _Host:
         """The variance of a sample."""
-        return self._each("variance", Combination.BEST)
+        return self._results(Combination.BEST).variance
 
     @property
     def bias(self) -> _Host | None:
         r"""The discretization error of the finest level, $\mathbb E[\phi_h] - \mathbb
         E[\phi]$, as estimated by extrapolation; `None` with a single level. It has already
         been removed from `mean`: `mean + bias` is the mean of the finest level."""
-        return self._each("mean", Combination.BIAS)
+        if not self._has(Combination.BIAS):
+            return None
+        return self._results(Combination.BIAS).mean
 
     @property
     def bias_std_error(self) -> _Host | None:
         """The standard error of `bias`."""
-        return self._each("std_error", Combination.BIAS)
+        if not self._has(Combination.BIAS):
+            return None
+        return self._results(Combination.BIAS).std_error
 
     @property
     def error(self) -> _Host:
@@ -138,14 +145,15 @@ class Expectation(eqx.Module):
 
         With one level the discretization error is unknown, and not included."""
         error = jtu.tree_map(np.hypot, self.std_error, self.failed_error)
-        remaining = self._each("mean", Combination.EXTRAPOLATION)
-        if remaining is None:
+        if not self._has(Combination.EXTRAPOLATION):
             return error
-        if self.off_order is not None:
-            last = self._each("mean", Combination.LAST)
-            before = self._each("mean", Combination.BEFORE)
-            trees = self.off_order, remaining, last, before
-            remaining = jtu.tree_map(_remaining, *trees)
+        remaining = self._results(Combination.EXTRAPOLATION).mean
+        off_order = self.off_order
+        if off_order is not None:
+            last = self._results(Combination.LAST).mean
+            before = self._results(Combination.BEFORE).mean
+            changes = remaining, last, before
+            remaining = jtu.tree_map(remaining_error, off_order, *changes)
         return jtu.tree_map(np.hypot, error, remaining)
 
     @property
@@ -157,19 +165,18 @@ class Expectation(eqx.Module):
         # Replicates count the paths that failed in them, too.
         whole = self.num_paths + (lost if self.paths_per_sample == 1 else 0)
         fraction = lost / max(whole, 1)
-        spread = self._each("spread", Combination.BEST)
-        return jtu.tree_map(lambda x: fraction * x, spread)
+        spread = self._results(Combination.BEST).spread
+        return jtu.tree_map(lambda most: fraction * most, spread)
 
     @property
     def off_order(self) -> PyTree[np.ndarray] | None:
         """Whether the changes of the mean from step to step do not fit the order, as in
         `error`; `None` with fewer than three levels."""
-        last = self._each("mean", Combination.LAST)
-        if last is None:
+        if not self._has(Combination.LAST):
             return None
-        miss = self._each("mean", Combination.MISS)
-        miss_error = self._each("std_error", Combination.MISS)
-        return jtu.tree_map(_is_off_order, last, miss, miss_error)
+        last = self._results(Combination.LAST)
+        miss = self._results(Combination.MISS)
+        return jtu.tree_map(is_off_order, last.mean, miss.mean, miss.std_error)
 
     def interval(self, confidence: float = 0.95) -> tuple[_Host, _Host]:
         r"""The ends of a confidence interval for the mean of infinitely many samples:
@@ -181,10 +188,11 @@ class Expectation(eqx.Module):
         from scipy.special import stdtrit
 
         factor = stdtrit(max(self.num_samples - 1, 1), (1 + confidence) / 2)
-        side = lambda sign: jtu.tree_map(
-            lambda m, s: m + sign * factor * s, self.mean, self.std_error
-        )
-        return side(-1), side(1)
+        mean = self.mean
+        reach = jtu.tree_map(lambda error: factor * error, self.std_error)
+        lower = jtu.tree_map(lambda center, side: center - side, mean, reach)
+        upper = jtu.tree_map(lambda center, side: center + side, mean, reach)
+        return lower, upper
 
     def merge(self, *others: "Expectation") -> "Expectation":
         """Combines this estimate with others from the same `key` and arguments, but with
@@ -207,10 +215,9 @@ class Expectation(eqx.Module):
                     f"Estimates to merge were sampled by {self.sampling} and by "
                     f"{other.sampling}."
                 )
-            self.check_same(other, "An estimate to merge")
-        parts = sorted(
-            (x for e in (self, *others) for x in e.moments), key=lambda x: x.begin
-        )
+            check_same(self, other, "An estimate to merge")
+        parts = [part for estimate in (self, *others) for part in estimate.moments]
+        parts.sort(key=lambda part: part.begin)
         for one, after in zip(parts, parts[1:]):
             if after.begin < one.end:
                 raise ValueError(
@@ -219,34 +226,12 @@ class Expectation(eqx.Module):
                 )
         return dataclasses.replace(self, moments=joined(parts), tol_reached=None)
 
-    def check_same(self, other: "Expectation", name: str) -> None:
-        """Raises a `ValueError` if the estimates have different keys, shapes or numbers of
-        paths in a sample."""
-        if not np.array_equal(self.key_data, other.key_data):
-            raise ValueError(
-                f"{name} has another `key`. Pass the same `key` for all parts of an "
-                "estimate."
-            )
-        shapes = lambda e: jtu.tree_map(np.shape, e.moments[0].mean)
-        if not eqx.tree_equal(shapes(self), shapes(other)):
-            raise ValueError(
-                f"{name} has another structure or other shapes. Pass one from the same "
-                "function, times and levels."
-            )
-        sizes = self.paths_per_sample, other.paths_per_sample
-        if sizes[0] != sizes[1]:
-            raise ValueError(
-                f"{name} was sampled otherwise: a sample is a mean over {sizes[0]:,} paths "
-                f"in one of the estimates, and over {sizes[1]:,} in the other. Pass the "
-                "same `sampling` for all parts of an estimate."
-            )
-
     def save(self, file: str | Path | BinaryIO) -> None:
         """Writes the estimate to a NumPy `.npz` file, which `Expectation.load` reads.
         $\\phi$ must be made of dictionaries, lists, tuples and arrays. Functions in
         `sampling`, such as `sort_by`, are not saved."""
-        header, arrays = described(self), arrays_of(self)
-        arrays["header"] = np.array(json.dumps(header))
+        arrays = arrays_of(self)
+        arrays["header"] = np.array(json.dumps(header_of(self)))
         if isinstance(file, str | Path):
             with open(file, "wb") as opened:
                 np.savez(opened, **arrays)  # pyright: ignore
@@ -255,163 +240,128 @@ class Expectation(eqx.Module):
 
     @staticmethod
     def load(file: str | Path | BinaryIO) -> "Expectation":
-        """Reads an estimate written by `save`. No code from the file is executed."""
+        """Reads an estimate written by `save`. No code from the file is executed.
+
+        **Raises:** a `ValueError` for another file, and for a sampling that this version
+        does not have.
+        """
         with np.load(file, allow_pickle=False) as arrays:
             if "header" not in arrays:
                 raise ValueError(f"{file} was not written by `Expectation.save`.")
-            return rebuilt(Expectation, json.loads(str(arrays["header"])), arrays)
+            header = json.loads(str(arrays["header"]))
+            return Expectation(**fields_from(header, arrays))
 
     def __str__(self) -> str:
-        leaves = jtu.tree_leaves_with_path(self.mean)
-        several = self.bias is not None
-        trees = [self.mean, self.std_error, self.error]
-        if several:
-            trees += [self.bias, self.bias_std_error]
-        lines, biases = [], []
-        for (path, _), *row in zip(leaves[:6], *map(jtu.tree_leaves, trees)):
-            mean, error, whole, *bias = row
-            line = f"{_with_digits(mean, error)} ± {_brief(error)}"
-            if several or self.num_failed > 0:
-                line += f" (sampling), {_brief(whole)} (total)"
-            if several:
-                biases.append(" ± ".join(map(_brief, bias)))
-            lines.append(f"{jtu.keystr(path)}: {line}" if len(leaves) > 1 else line)
-        lines += ["..."] * (len(leaves) > 6)
-        if biases:
-            lines.append(f"bias of the finest step (removed): {', '.join(biases)}")
-            lines += self._said_of_levels()
+        lines = self._lines_of_means()
+        if self.bias is not None:
+            lines += self._lines_of_levels()
         elif self.sampling is not None:
             lines.append("not included: the discretization error (see `levels`)")
         how = "" if self.sampling is None else f", {self.sampling}"
         lines.append(f"{self.num_paths:,} paths, {self.num_failed:,} failed{how}")
         if self.num_failed > 0:
-            each = map(_brief, jtu.tree_leaves(self.failed_error)[:6])
-            lines.append(f"failed paths could change the mean by {', '.join(each)}")
-        lines += [self.reason] if self.reason else []
-        lines += ["`tol` was not reached"] if self.tol_reached is False else []
+            changes = _listed(self.failed_error)
+            lines.append(f"failed paths could change the mean by {', '.join(changes)}")
+        if self.reason:
+            lines.append(self.reason)
+        if self.tol_reached is False:
+            lines.append("`tol` was not reached")
         return "\n".join(lines)
 
     __repr__ = __str__
 
-    def _said_of_levels(self) -> list[str]:
-        """What the printed estimate says of the discretization error that remains."""
+    def _lines_of_means(self) -> list[str]:
+        """What the printed estimate says of each component of the mean."""
+        leaves = jtu.tree_leaves_with_path(self.mean)
+        sampling_errors = _listed(self.std_error)
+        total_errors = _listed(self.error)
+        # Otherwise both are the same.
+        has_total = self.bias is not None or self.num_failed > 0
+        lines = []
+        for k, (path, mean) in enumerate(leaves[:_SHOWN]):
+            error = jtu.tree_leaves(self.std_error)[k]
+            line = f"{_with_digits(mean, error)} ± {sampling_errors[k]}"
+            if has_total:
+                line += f" (sampling), {total_errors[k]} (total)"
+            if len(leaves) > 1:
+                line = f"{jtu.keystr(path)}: {line}"
+            lines.append(line)
+        if len(leaves) > _SHOWN:
+            lines.append("...")
+        return lines
+
+    def _lines_of_levels(self) -> list[str]:
+        """What the printed estimate says of the discretization error."""
+        pairs = zip(_listed(self.bias), _listed(self.bias_std_error))
+        biases = [f"{bias} ± {error}" for bias, error in pairs]
+        lines = [f"bias of the finest step (removed): {', '.join(biases)}"]
         if self.off_order is None:
-            return [
+            lines.append(
                 "unchecked: what remains of the discretization error (pass `levels=3`)"
-            ]
-        if any(np.any(x) for x in jtu.tree_leaves(self.off_order)):
-            return [
+            )
+        elif any(np.any(leaf) for leaf in jtu.tree_leaves(self.off_order)):
+            lines.append(
                 "the changes from step to step do not fit the order: the total error is "
                 "the larger one (take smaller steps)"
-            ]
-        return []
+            )
+        return lines
 
-    def _each(self, name: str, combination: int) -> Any:
-        """A result for each leaf, or `None` if there is no such combination of levels."""
-        whole, far = total(self.moments), self.far
-        if any(x.shape[1] <= combination for x in jtu.tree_leaves(whole.mean)):
-            return None
-        if far is None:
-            far = jtu.tree_map(lambda x: np.zeros(x.shape[1:]), whole.mean)
-        one = lambda *leaves: _results(whole.good, self.roundings, *leaves)[name]
-        trees = whole.mean, whole.norm, whole.largest, whole.dtypes, far
-        return jtu.tree_map(lambda *leaves: one(*leaves)[combination], *trees)
+    def _has(self, combination: Combination) -> bool:
+        """Whether there are enough levels for this combination."""
+        return has_combination(self.moments[0], combination)
 
-    @property
-    def plain_std_error(self) -> _Host:
-        """The standard error without a control variate."""
-        return self._each("plain_std_error", Combination.BEST)
-
-    @property
-    def heaviest(self) -> float:
-        """The largest `r` of `std_error`."""
-        return self._largest("weight")
-
-    @property
-    def dropped(self) -> bool:
-        """Whether a control variate was dropped because its mean is not zero."""
-        return self._largest("dropped") > 0
-
-    def _largest(self, name: str) -> float:
-        each = jtu.tree_leaves(self._each(name, Combination.BEST))
-        return max((float(np.max(x, initial=0.0)) for x in each), default=0.0)
+    def _results(self, combination: Combination) -> Results:
+        """What follows from the moments for one combination of levels."""
+        whole = total(self.moments)
+        return results_of(whole, self.roundings, self.far, combination)
 
 
-def _with_digits(mean, error) -> str:
+def best_results(estimate: Expectation) -> Results:
+    """All results of the extrapolation to step size zero. Users see some of them."""
+    return estimate._results(Combination.BEST)
+
+
+def check_same(one: Expectation, other: Expectation, name: str) -> None:
+    """Raises a `ValueError` if the estimates have different keys, shapes or numbers of
+    paths in a sample."""
+    if not np.array_equal(one.key_data, other.key_data):
+        raise ValueError(
+            f"{name} has another `key`. Pass the same `key` for all parts of an "
+            "estimate."
+        )
+    shapes = jtu.tree_map(np.shape, one.moments[0].mean)
+    other_shapes = jtu.tree_map(np.shape, other.moments[0].mean)
+    if not eqx.tree_equal(shapes, other_shapes):
+        raise ValueError(
+            f"{name} has another structure or other shapes. Pass one from the same "
+            "function, times and levels."
+        )
+    if one.paths_per_sample != other.paths_per_sample:
+        raise ValueError(
+            f"{name} was sampled otherwise: a sample is a mean over "
+            f"{one.paths_per_sample:,} paths in one of the estimates, and over "
+            f"{other.paths_per_sample:,} in the other. Pass the same `sampling` for all "
+            "parts of an estimate."
+        )
+
+
+def _with_digits(mean: Any, error: Any) -> str:
     """The mean, with two digits beyond the smallest error."""
     least = np.clip(np.min(np.nan_to_num(error), initial=1), 1e-10, 1)
     digits = 2 - math.floor(math.log10(least))
+    # With more, the mean's own digits end first.
     mode = "fixed" if digits < 12 else "maxprec"
     mean = np.asarray(mean)
-    return np.array2string(mean, precision=digits, threshold=6, floatmode=mode)
+    return np.array2string(mean, precision=digits, threshold=_SHOWN, floatmode=mode)
 
 
-def _brief(x) -> str:
-    short: Any = {"float_kind": "{:.1e}".format}
-    return np.array2string(np.asarray(x), formatter=short, threshold=6)
-
-
-@np.errstate(invalid="ignore")
-def _is_off_order(last, miss, miss_error) -> np.ndarray:
-    """Whether the last change is not what the order makes of the change before."""
-    foretold = last - miss
-    ends = np.stack([_FASTEST * foretold, _SLOWEST * foretold])
-    allowed = _BY_CHANCE * miss_error
-    low = np.min(ends, axis=0) - allowed
-    high = np.max(ends, axis=0) + allowed
-    return (last < low) | (last > high)
-
-
-def _remaining(off_order, extrapolation, last, before) -> np.ndarray:
-    """An estimate of the discretization error that remains."""
-    size = np.abs(extrapolation)
-    largest = np.maximum(np.abs(last), np.abs(before))
-    return np.where(off_order, np.maximum(size, largest), size)
-
-
-@np.errstate(all="ignore")
-def _results(
-    n: int, roundings: int, mean, norm, largest, dtype: str, far
-) -> dict[str, np.ndarray]:
-    """The results for an array, for each combination of levels, from its moments. Their
-    first axis is for the kinds of `Samples`."""
-    s = norm / np.sqrt(n - 1) if n > 1 else np.full_like(norm, np.nan)
-    outlying = np.maximum(largest - s * np.sqrt(4.5 * np.log(max(n, 2))), 0)
-    r = np.where(s > 0, outlying / (s * np.sqrt(n)), 0)
-    controlled = len(mean) == KINDS_WITH_CONTROL
-    # The largest deviation of a path without control.
-    spread = largest[int(controlled)]
-    # Combinations of levels are differences of values as large as the mean.
-    size = np.fmax.reduce(np.abs(mean[: 1 + controlled, :1]))
-    rounding = roundings * float(jnp.finfo(dtype).eps) * size
-    # Rounding errors can have heavy tails, too.
-    r = np.where(largest > ROUNDING * rounding, r, 0)
-    if len(mean) == KINDS_OF_REPLICATES:
-        r[0] = np.fmax(r[0], mean[1])
-        spread = mean[2]
-    r = np.minimum(r, 1 - 1e-6)
-    error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
-    error = np.maximum(error, rounding)
-    dropped = np.zeros(mean.shape[1:], bool)
-    if controlled:
-        # For a control with heavy tails its standard error is not reliable.
-        fine = np.abs(mean[2]) <= np.fmax(_SURE * error[2], ROUNDING * rounding)
-        fine |= r[2] > _HEAVY_CONTROL
-        dropped |= ~np.all(fine & np.isfinite(mean[0]), axis=0)
-        # Tails that the samples show are in their variance already. (NaN, from a trial
-        # without a value, is ignored.)
-        unseen = np.where(far > mean[3], far - mean[3], 0)
-        error[0] = np.hypot(error[0], unseen)
-    best = lambda x: np.where(dropped, x[1], x[0]) if controlled else x[0]
-    return {
-        "mean": best(mean) if n > 0 else np.full_like(mean[0], np.nan),
-        "std_error": best(error),
-        "plain_std_error": error[int(controlled)],
-        "variance": best(s) ** 2,
-        "weight": best(r),
-        "dropped": dropped,
-        "spread": spread,
-    }
+def _listed(tree: PyTree) -> list[str]:
+    """The first arrays of a PyTree, with two digits."""
+    formats: Any = {"float_kind": "{:.1e}".format}
+    return [
+        np.array2string(np.asarray(leaf), formatter=formats, threshold=_SHOWN)
+        for leaf in jtu.tree_leaves(tree)[:_SHOWN]
+    ]
 
 
 class ExpectationInterrupted(KeyboardInterrupt):

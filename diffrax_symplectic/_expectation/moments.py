@@ -13,7 +13,8 @@ from jaxtyping import Float, PyTree
 class Moments(NamedTuple):
     """Statistics of samples `begin` to `end - 1`, on the host and in float64.
 
-    - `good`: the number of good samples; `failed`: the number of failed paths.
+    - `good`: the number of good samples.
+    - `failed`: the number of failed paths.
     - `mean`: the mean of the good samples, with two leading axes for kinds and for
         combinations of levels.
     - `norm`: the root of the sum of squared deviations from the mean. (The sum itself would
@@ -56,29 +57,43 @@ def total(parts: tuple[Moments, ...]) -> Moments:
 
 
 def _are_halves(a: Moments, b: Moments) -> bool:
+    """Whether `a` and `b` are neighbours of one length, with `a` at an even place among all
+    ranges of this length. (Without samples `a` joins any neighbour.)"""
     length = a.end - a.begin
-    if a.end != b.begin or length == 0:
-        return a.end == b.begin
+    if a.end != b.begin:
+        return False
+    if length == 0:
+        return True
     return b.end - b.begin == length and (a.begin // length) % 2 == 0
 
 
 @np.errstate(over="ignore", invalid="ignore", under="ignore")
 def _both(a: Moments, b: Moments) -> Moments:
-    """The pairwise formula of Chan, Golub and LeVeque."""
-    n, trees = max(a.good + b.good, 1), jtu.tree_map
-    share, part = np.sqrt(a.good / n * b.good), b.good / n
-    delta = trees(lambda x, y: y - x, a.mean, b.mean)
-    norm = lambda x, y, d: np.hypot(np.hypot(x, y), share * d)
-    # Without samples `a` has no mean.
-    mean = lambda x, y, d: y if a.good == 0 else x + d * part
+    """The moments of both, by the pairwise formula of Chan, Golub and LeVeque."""
+    n = max(a.good + b.good, 1)
+    share_of_b = b.good / n
+    # Times the difference of the means, squared, this adds to the squared deviations.
+    weight = np.sqrt(a.good / n * b.good)
+    change = jtu.tree_map(np.subtract, b.mean, a.mean)
+
+    def mean(of_a, of_b, change):
+        # Without samples `a` has no mean.
+        return of_b if a.good == 0 else of_a + change * share_of_b
+
+    def norm(of_a, of_b, change):
+        return np.hypot(np.hypot(of_a, of_b), weight * change)
+
     return Moments(
-        a.begin, b.end, a.good + b.good, a.failed + b.failed,
-        trees(mean, a.mean, b.mean, delta),
-        trees(norm, a.norm, b.norm, delta),
-        trees(np.maximum, a.largest, b.largest),
-        trees(np.maximum, a.size, b.size),
-        b.dtypes,
-    )  # fmt: skip
+        begin=a.begin,
+        end=b.end,
+        good=a.good + b.good,
+        failed=a.failed + b.failed,
+        mean=jtu.tree_map(mean, a.mean, b.mean, change),
+        norm=jtu.tree_map(norm, a.norm, b.norm, change),
+        largest=jtu.tree_map(np.maximum, a.largest, b.largest),
+        size=jtu.tree_map(np.maximum, a.size, b.size),
+        dtypes=b.dtypes,
+    )
 
 
 class Combination(enum.IntEnum):
@@ -128,6 +143,7 @@ def level_weights(
 
 
 def _extrapolated(order: float, levels: int) -> Float[np.ndarray, " levels"]:
+    """The weights of the means that add up to one, and cancel all error terms."""
     powers = np.append(0.0, order + min(order, 1) * np.arange(levels - 1))
     system = 2.0 ** -np.outer(powers, np.arange(levels))
     return np.linalg.solve(system, np.eye(levels)[0])

@@ -1,69 +1,24 @@
-"""Crude Monte Carlo: averages over independent paths, or of a function of a random key."""
+"""Averages of any function of a random key."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .._arguments import check_real, check_takes, whole_number
+from .._compat import is_result
 from .._root_finder import all_finite
-from .._terms import path_keys, with_keys
-from ._problem import Problem
-from ._run import checked_call, Meter, NO_METER, run
-from ._steps import independent_steps, simulate
 from .estimate import Expectation
+from .independent import IndependentPaths
 from .moments import level_weights
 from .polynomials import tensordot
-from .sampling import AbstractSampling, Plan, real, Samples
-
-
-class IndependentPaths(AbstractSampling):
-    """Independent paths (crude Monte Carlo). For any system the error is proportional to
-    one over the square root of their number.
-
-    With several levels, each path uses the same Brownian motion on all of them if `terms`
-    have a [`diffrax_symplectic.FixedStepBrownianPath`][] with `cell=`. Then the `bias` is
-    estimated much more accurately than the mean.
-
-    **Arguments:**
-
-    - `num_paths`: the number of paths, at least two; with `tol` an upper limit.
-    - `batch_size`: the number of paths that each device solves at once. By default 32,768
-        on CPUs (for a state of a few components this keeps all cores busy and fits their
-        caches) and 262,144 elsewhere. Choose less for large states, or to share few paths
-        among several devices: the size of a batch does not depend on their number.
-    """
-
-    num_paths: int = eqx.field(converter=lambda x: whole_number("num_paths", x, 2))
-    batch_size: int | np.integer | None = None
-
-    def prepare(self, problem, key, devices):
-        return self.plan(jtu.Partial(_paths, problem), devices)
-
-    def plan(self, sampler: Callable, devices: tuple) -> Plan:
-        if self.batch_size is None:
-            size = 32768 if devices[0].platform == "cpu" else 262144
-        else:
-            size = whole_number("batch_size", self.batch_size)
-        return Plan(sampler, self.num_paths, size)
-
-
-def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
-    """A sample is a path, with the same random key on all levels."""
-    own = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
-    drawn = jax.vmap(p.drawn)(keys)
-    terms_of = lambda keys: with_keys(p.terms, keys)
-    begin = lambda level: independent_steps(p, level, drawn, terms_of, lambda i: own)
-    saved, failed, _ = simulate(p, begin)
-    # A path that fails on several levels counts once.
-    lost = jnp.any(failed, axis=0)
-    return Samples(p.averaged([p.combined(saved)]), ~lost, lost)
+from .run import checked_call, Meter, NO_METER, run
+from .sampling import real, Samples
 
 
 def monte_carlo(
@@ -150,39 +105,53 @@ def monte_carlo(
             "Several `levels` need `order=`, the weak order of the solver; got "
             f"levels={levels!r} and order=None."
         )
-    check_takes("fn", fn, *(["key"] if levels == 1 else ["key", "level"]))
-    # Of events that are checked at the end of a step.
+    arguments = ["key"] if levels == 1 else ["key", "level"]
+    check_takes("fn", fn, *arguments)
+    # An event that is checked at the end of each step has the order 1/2.
     is_half = isinstance(order, float) and order == 0.5
     is_whole = isinstance(order, int | np.integer) and order >= 1
     if order is not None and not (is_half or is_whole):
         raise ValueError(f"`order` must be a positive integer, or 1/2; got {order!r}.")
     sampling = IndependentPaths(num_paths, batch_size)
-    sampler = jtu.Partial(_of_function, fn, level_weights(float(order or 1), levels))
-    plan = sampling.plan(sampler, devices)
+    weights = level_weights(float(order or 1), levels)
+    plan = sampling.plan(jtu.Partial(_of_function, fn, weights), devices)
     with Meter(progress_meter) as meter:
         return run(plan, key, devices, sampling, start, first, tol, meter)
 
 
-def _of_function(fn: Callable, weights: np.ndarray, keys: PRNGKeyArray) -> Samples:
-    at = lambda level: lambda key: fn(key, level)
+def _of_function(
+    fn: Callable, weights: Float[np.ndarray, "combinations levels"], keys: PRNGKeyArray
+) -> Samples:
+    """A sample is a value of the function, with the same random key on all levels."""
     levels = weights.shape[1]
-    fns = [fn] if levels == 1 else [at(level) for level in range(levels)]
-    each = [jax.vmap(lambda key: _evaluate(fn, key))(keys) for fn in fns]
+
+    def on_level(level: int) -> tuple[PyTree[Array], Bool[Array, " n"]]:
+        call = fn if levels == 1 else lambda key: fn(key, level)
+        return jax.vmap(lambda key: _evaluate(call, key))(keys)
+
+    # A level is a Python integer, by which a function may choose its step, so each level is
+    # a call of its own.
+    each = [on_level(level) for level in range(levels)]
     values, good = jtu.tree_map(lambda *xs: jnp.stack(xs), *each)
-    combined = lambda x: tensordot(weights.astype(x.dtype), x, 1)[None]
+
+    def combined(
+        x: Float[Array, "levels n ..."],
+    ) -> Float[Array, "1 combinations n ..."]:
+        return tensordot(weights.astype(x.dtype), x, 1)[None]
+
+    # A path that fails on several levels counts once.
     lost = ~jnp.all(good, axis=0)
     return Samples(jtu.tree_map(combined, values), ~lost, lost)
 
 
-def _evaluate(fn: Callable, key) -> tuple[PyTree[Array], Array]:
+def _evaluate(fn: Callable, key: PRNGKeyArray) -> tuple[PyTree[Array], Bool[Array, ""]]:
     """The $\\phi$ that `fn` returns, and whether the path succeeded."""
-    out, success = fn(key), jnp.array(True)
+    out = fn(key)
+    success = jnp.array(True)
     is_pair = isinstance(out, tuple) and len(out) == 2
     if is_pair and isinstance(out[1], diffrax.RESULTS):
         out, result = out
         success = diffrax.is_okay(result)
-    # The type of the results of all packages.
-    is_result = lambda x: isinstance(x, type(diffrax.RESULTS.successful))
     if any(map(is_result, jtu.tree_leaves(out, is_leaf=is_result))):
         raise ValueError(
             "`fn` returns a result of a solve within phi, where it would be averaged. "

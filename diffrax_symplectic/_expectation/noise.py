@@ -4,31 +4,56 @@ import collections
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt32
 
 from .._brownian import Discrete, random_words
 from .._custom_types import Y
 from .._terms import outcomes, step_variables
-from ._problem import Level, Problem
 from .polynomials import tensordot
+from .problem import Level, Problem
 
 
-# Up to this many outcomes, a step is taken for each of them.
+# Up to this many outcomes, a step is taken for each of them. Four noises of three values
+# each have 81 outcomes, five have 243.
 _MOST_OUTCOMES = 100
 # The relative entropy of a whole path's wider noise with respect to its own law, in nats.
+# Typical paths of the wider noise are then e^8 = 3,000 times less likely by their own law:
+# rare enough to show the tails, and not so rare that no weight is left.
 _NATS = 8.0
-# With this tilt nearly all outcomes are the largest.
+# With this tilt the largest of three outcomes, sqrt(3) times as large as the standard
+# deviation, is e^7 = 1,000 times as likely next to the middle one as before: nearly all
+# outcomes are the largest.
 _MOST_TILTED = 4.0
+# Halvings of an interval until only rounding errors in single precision remain.
+_HALVINGS = 30
 
 # A function of the state.
 Function: TypeAlias = Callable[[Y], Array]
+# The probabilities that a law has after a change by a number.
+ChangedLaw: TypeAlias = Callable[[Discrete, float], np.ndarray]
+
+
+class StepOfPath(NamedTuple):
+    """A path after a step, from `Noise.advance`.
+
+    - `y`, `solver_state`: the states of the path and of the solver.
+    - `success`: whether the step succeeded.
+    - `value`: the value of the function at the end.
+    - `control`: its control variate, whose mean over the step's random variables is zero.
+    """
+
+    y: Y
+    solver_state: PyTree[Array]
+    success: Bool[Array, ""]
+    value: Array
+    control: Array
 
 
 class Noise(eqx.Module):
@@ -70,7 +95,11 @@ class Noise(eqx.Module):
         return dataclasses.replace(self, problem=self.problem.with_args(own))
 
     def draw(
-        self, key: PRNGKeyArray, number, share: Any = 0.0, tilt: Any = 0.0
+        self,
+        key: PRNGKeyArray,
+        number: Any,
+        share: ArrayLike = 0.0,
+        tilt: ArrayLike = 0.0,
     ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
         """The variables drawn from the key and this number, and their log likelihood ratio.
         In a fraction `share` (from 0 to 1) of draws all outcomes are equally probable.
@@ -79,18 +108,15 @@ class Noise(eqx.Module):
         place = number, jnp.asarray(self.level.index)
         words = random_words(key, place, 1, len(self.laws))[0]
         x = jnp.zeros(len(self.laws), self.problem.dtype)
-        log_ratio, tilts = jnp.zeros_like(x), jnp.broadcast_to(tilt, x.shape)
-        own = (share == 0) & (tilts == 0)
+        log_ratio = jnp.zeros_like(x)
+        tilts = jnp.broadcast_to(tilt, x.shape)
+        # Once for each different law, rather than for each variable: hundreds of variables
+        # have one law or two.
         for law in dict.fromkeys(self.laws):
-            mine = np.array([other == law for other in self.laws])
-            p, q = np.array(law.probabilities, x.dtype), _widened(law, share)
-            q = jax.vmap(lambda tilt: _tilted(law, q, tilt))(tilts)
-            cuts = (jnp.cumsum(q, axis=1)[:, :-1] * 2.0**32).astype(jnp.uint32)
-            cuts = jnp.where(own[:, None], np.array(law.cuts, np.uint32), cuts)
-            place = jnp.sum(words[:, None] >= cuts, axis=1)
-            x = jnp.where(mine, jnp.asarray(law.values, x.dtype)[place], x)
-            ratio = jnp.take_along_axis(jnp.log(q / p), place[:, None], axis=1)[:, 0]
-            log_ratio = jnp.where(mine, ratio, log_ratio)
+            has_law = np.array([other == law for other in self.laws])
+            outcome, log_ratio_of_law = _drawn(law, words, share, tilts, x.dtype)
+            x = jnp.where(has_law, outcome, x)
+            log_ratio = jnp.where(has_law, log_ratio_of_law, log_ratio)
         return x, jnp.sum(log_ratio)
 
     @property
@@ -101,26 +127,29 @@ class Noise(eqx.Module):
     @property
     def tilt(self) -> Array:
         """The largest `tilt` for `draw` that `_strongest` allows."""
-        own = lambda law: np.array(law.probabilities)
-        return self._strongest(lambda law, z: _tilted(law, own(law), z), _MOST_TILTED)
 
-    def _strongest(self, changed: Callable, most: float) -> Array:
+        def tilted(law: Discrete, tilt: float) -> np.ndarray:
+            return _tilted(law, np.array(law.probabilities), tilt)
+
+        return self._strongest(tilted, _MOST_TILTED)
+
+    def _strongest(self, changed: ChangedLaw, most: float) -> Array:
         """The largest `z`, up to `most`, for which the laws `changed(law, z)` give all
         variables of a path together a relative entropy of at most 8 nats with respect to
         their own laws."""
-        levels = len(self.problem.levels.h)
-        steps = self.problem.max_steps / 2 ** np.arange(levels)[::-1]
-        counts = collections.Counter(self.laws).items()
-
-        def information(z: float) -> float:
-            each = [(n, changed(x, z), np.array(x.probabilities)) for x, n in counts]
-            return sum(n * np.sum(q * np.log(q / p)) for n, q, p in each)
-
-        low, high = np.zeros(levels), np.full(levels, most)
-        for _ in range(30):
-            z = (low + high) / 2
-            enough = steps * [*map(information, z)] > _NATS / levels
-            low, high = np.where(enough, low, z), np.where(enough, z, high)
+        num_levels = len(self.problem.levels.h)
+        # Each level has twice as many steps as the one before.
+        steps = self.problem.max_steps / 2 ** np.arange(num_levels)[::-1]
+        counts = collections.Counter(self.laws)
+        # By bisection, for all levels at once, since `z` depends on the number of steps.
+        low = np.zeros(num_levels)
+        high = np.full(num_levels, most)
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2
+            of_step = np.array([_relative_entropy(counts, changed, z) for z in middle])
+            is_too_much = steps * of_step > _NATS / num_levels
+            low = np.where(is_too_much, low, middle)
+            high = np.where(is_too_much, middle, high)
         return jnp.asarray(low, self.problem.dtype)[self.level.index]
 
     def nodes(self, x: Array | None = None) -> tuple[Any, np.ndarray]:
@@ -129,59 +158,95 @@ class Noise(eqx.Module):
         if self.outcomes is not None:
             return self.outcomes
         if x is not None:
+            # The mean over a draw and its opposite is right for all odd functions.
             return jnp.stack([x, -x]), np.full(2, 0.5)
         # Exact for polynomials of degree 3, or 5 in one variable.
-        m, arms = len(self.laws), np.diag(np.sqrt(3 * self._variances()))
-        points = np.concatenate([arms, -arms, np.zeros((1, m))])
-        weights = np.append(np.full(2 * m, 1 / 6), 1 - m / 3)
+        n = len(self.laws)
+        arms = np.diag(np.sqrt(3 * self._variances()))
+        points = np.concatenate([arms, -arms, np.zeros((1, n))])
+        weights = np.append(np.full(2 * n, 1 / 6), 1 - n / 3)
         return points.astype(self.problem.dtype), weights
 
-    def mean(self, i, y: Y, u: Function, x: Array | None = None) -> Array:
+    def mean(self, i: Any, y: Y, u: Function, x: Array | None = None) -> Array:
         """The expectation of `u` after step `i` from `y`, over `nodes(x)`; NaN if a step
         fails."""
-        (points, weights), state = self.nodes(x), self.fresh(i, y)
+        points, weights = self.nodes(x)
+        solver_state = self.fresh(i, y)
 
         def value(x: Array) -> Array:
-            y1, _, success = self.step(i, y, state, x)
+            y1, _, success = self.step(i, y, solver_state, x)
             return jnp.where(success, u(y1), jnp.nan)
 
         values = jax.vmap(value)(points)
         return tensordot(weights.astype(values.dtype), values, 1)
 
     def advance(
-        self, i, y: Y, state: PyTree, u: Function, second: Array | None, x: Array
-    ) -> tuple[Y, PyTree, Bool[Array, ""], tuple[Array, Array]]:
-        """The states of the path and the solver after step `i` with variables `x`; whether
-        the step succeeded; and a pair of `u` at the end and its control variate. `second`
-        comes from the method of the same name."""
+        self,
+        i: Any,
+        y: Y,
+        solver_state: PyTree[Array],
+        u: Function,
+        second: Array | None,
+        x: Array,
+    ) -> StepOfPath:
+        """Step `i` of a path with variables `x`, and the control variate of `u` in it.
+        `second` comes from the method of the same name."""
         if self.outcomes is None:
             assert second is not None
-            y1, new, success = self.step(i, y, state, x)
-            first = jax.jacrev(lambda x: u(self.step(i, y, state, x)[0]))(0 * x)
-            square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
-            control = tensordot(first, x, 1) + tensordot(square, second, 2) / 2
-            return y1, new, success, (u(y1), control)
+            return self._advance_by_derivatives(i, y, solver_state, u, second, x)
         points, weights = self.outcomes
-        ends, states, success = jax.vmap(lambda x: self.step(i, y, state, x))(points)
-        values, own = jax.vmap(u)(ends), jnp.argmax(jnp.all(points == x, axis=1))
+        ends, states, success = jax.vmap(lambda x: self.step(i, y, solver_state, x))(
+            points
+        )
+        values = jax.vmap(u)(ends)
+        drawn = jnp.argmax(jnp.all(points == x, axis=1))
         mean = tensordot(weights.astype(values.dtype), values, 1)
-        y1, new, value = jtu.tree_map(lambda x: x[own], (ends, states, values))
-        return y1, new, jnp.all(success), (value, value - mean)
+        y1, new_state, value = jtu.tree_map(lambda x: x[drawn], (ends, states, values))
+        # One failed outcome makes the mean wrong, and with it the control variate.
+        return StepOfPath(y1, new_state, jnp.all(success), value, value - mean)
 
-    def second(self, i, ys: Y, u: Function) -> Array | None:
+    def _advance_by_derivatives(
+        self,
+        i: Any,
+        y: Y,
+        solver_state: PyTree[Array],
+        u: Function,
+        second: Array,
+        x: Array,
+    ) -> StepOfPath:
+        """`advance` for many outcomes, by the formula of this class."""
+        y1, new_state, success = self.step(i, y, solver_state, x)
+
+        def after(x: Array) -> Array:
+            return u(self.step(i, y, solver_state, x)[0])
+
+        first = jax.jacrev(after)(0 * x)
+        square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
+        control = tensordot(first, x, 1) + tensordot(square, second, 2) / 2
+        return StepOfPath(y1, new_state, success, u(y1), control)
+
+    def second(self, i: Any, ys: Y, u: Function) -> Array | None:
         """The mean of the second derivatives over `ys`, if there are many outcomes."""
         if self.outcomes is not None:
             return None
         zero = jnp.zeros(len(self.laws), self.problem.dtype)
-        after = lambda y, x: u(self.step(i, y, self.fresh(i, y), x)[0])
-        at = lambda y: jax.hessian(lambda x: after(y, x))(zero)
-        mean = jnp.mean(jax.lax.map(at, ys), axis=0)
+
+        def hessian(y: Y) -> Array:
+            after = lambda x: u(self.step(i, y, self.fresh(i, y), x)[0])
+            return jax.hessian(after)(zero)
+
+        # One state after another, since a Hessian of many variables takes much memory.
+        mean = jnp.mean(jax.lax.map(hessian, ys), axis=0)
         return jnp.moveaxis(mean, (-2, -1), (0, 1))
 
-    def step(self, i, y: Y, state: PyTree, x: Array):
-        return self.problem.step(self._terms(x), i, self.level.h, y, state)
+    def step(
+        self, i: Any, y: Y, solver_state: PyTree[Array], x: Array
+    ) -> tuple[Y, PyTree[Array], Bool[Array, ""]]:
+        """`Problem.step` with these variables."""
+        terms = self._terms(x)
+        return self.problem.step(terms, i, self.level.h, y, solver_state)
 
-    def fresh(self, i, y: Y) -> PyTree[Array]:
+    def fresh(self, i: Any, y: Y) -> PyTree[Array]:
         """The state of a solver that starts at step `i`. It is used in fits, which affect
         only the variance; paths carry their own solver state."""
         terms = self._terms(np.zeros(len(self.laws)))
@@ -196,24 +261,65 @@ class Noise(eqx.Module):
 
         return jtu.tree_map(hidden, state)
 
-    def _terms(self, x):
+    def _terms(self, x: Any) -> PyTree:
+        """The terms with paths that give these variables in every step."""
         return step_variables(self.problem.terms, self.level.h).terms_with(x)
 
     def _variances(self) -> np.ndarray:
         return np.array(
-            [np.dot(x.probabilities, np.square(x.values)) for x in self.laws]
+            [np.dot(law.probabilities, np.square(law.values)) for law in self.laws]
         )
 
 
+def _drawn(
+    law: Discrete,
+    words: UInt32[Array, " n"],
+    share: ArrayLike,
+    tilts: Float[Array, " n"],
+    dtype: Any,
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Outcomes by one law, widened and tilted, and their log likelihood ratios, from one
+    random word each."""
+    p = np.array(law.probabilities, dtype)
+    q = _widened(law, share)
+    q = jax.vmap(lambda tilt: _tilted(law, q, tilt))(tilts)
+    # The law as it is has cuts in integers, by which a `WeakBrownianPath` draws, too. With
+    # other cuts, by rounded probabilities, few draws would differ, but the law would not be
+    # exact.
+    is_unchanged = (share == 0) & (tilts == 0)
+    cuts = (jnp.cumsum(q, axis=1)[:, :-1] * 2.0**32).astype(jnp.uint32)
+    cuts = jnp.where(is_unchanged[:, None], np.array(law.cuts, np.uint32), cuts)
+    place = jnp.sum(words[:, None] >= cuts, axis=1)
+    outcome = jnp.asarray(law.values, dtype)[place]
+    log_ratios = jnp.take_along_axis(jnp.log(q / p), place[:, None], axis=1)
+    return outcome, log_ratios[:, 0]
+
+
 def _widened(law: Discrete, share: Any) -> Any:
+    """Probabilities between those of the law (for a `share` of zero) and equal ones."""
     p = np.array(law.probabilities, jnp.result_type(share))
     return (1 - share) * p + share / len(p)
 
 
 def _tilted(law: Discrete, q: Any, tilt: Any) -> Any:
+    """Probabilities `q` times the exponential of `tilt` times the outcome, normalized."""
+    # Numbers stay on the host: `_strongest` calls this hundreds of times.
     numpy = jnp if isinstance(tilt, jax.Array) else np
     weights = q * numpy.exp(tilt * np.array(law.values, jnp.result_type(tilt)))
     return weights / numpy.sum(weights)
+
+
+def _relative_entropy(
+    counts: collections.Counter[Discrete], changed: ChangedLaw, z: float
+) -> float:
+    """How far the variables of a step, so many of each law, are from their own laws if
+    these are changed: the sum of `q log(q / p)`, in nats."""
+    nats = 0.0
+    for law, count in counts.items():
+        p = np.array(law.probabilities)
+        q = changed(law, z)
+        nats += count * np.sum(q * np.log(q / p))
+    return nats
 
 
 def num_outcomes(problem: Problem) -> int | None:
@@ -222,4 +328,7 @@ def num_outcomes(problem: Problem) -> int | None:
         outcomes = Noise.of(problem, problem.level(0)).outcomes
     except ValueError:
         return None
-    return None if outcomes is None else len(outcomes[1])
+    if outcomes is None:
+        return None
+    _, probabilities = outcomes
+    return len(probabilities)

@@ -1,8 +1,9 @@
 """The interface between samplings and the loop over batches."""
 
 import abc
+import enum
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,20 +13,38 @@ from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
 
 # Deviations up to this many roundings of the mean count as rounding errors.
 ROUNDING = 1e3
-# The kinds of values of a sample that is a replicate of many paths, and of one with a
-# control variate.
-KINDS_OF_REPLICATES = 3
-KINDS_WITH_CONTROL = 4
+
+
+class KindsOfReplicates(enum.IntEnum):
+    """The kinds of values of a sample that is a replicate of many paths."""
+
+    MEAN = 0
+    # `r` of `Expectation.std_error` for the paths within the replicate, which measures how
+    # heavy their tails are.
+    HEAVINESS = 1
+    # The largest deviation of a path from the mean.
+    LARGEST = 2
+
+
+class KindsWithControl(enum.IntEnum):
+    """The kinds of values of a sample that has a control variate."""
+
+    CONTROLLED = 0
+    # Without the control, and the control itself.
+    PLAIN = 1
+    CONTROL = 2
+    # The deviations in the tails.
+    TAILS = 3
 
 
 class Samples(eqx.Module):
-    """The values to average, with leading axes for kinds, combinations of levels, and
-    samples; which samples are good; and how many paths failed in each.
+    """Samples to average.
 
-    The first kind is the estimate. Replicates of many paths have two more: `r` of
-    `Expectation.std_error`, which measures how heavy their tails are, and the largest
-    deviation of a path. With a control variate there are four kinds: with the control,
-    without it, the control itself, and the deviations in the tails.
+    - `values`: with leading axes for kinds, combinations of levels, and samples. The first
+        kind is the estimate. Most samples have only this one; others have all of
+        `KindsOfReplicates` or `KindsWithControl`.
+    - `good`: which samples are good.
+    - `lost`: how many paths failed in each.
     """
 
     values: PyTree[Array]
@@ -33,7 +52,7 @@ class Samples(eqx.Module):
     lost: Int[Array, " n"] | Bool[Array, " n"]
 
 
-class Plan(NamedTuple):
+class SamplingPlan(NamedTuple):
     """How samples are taken.
 
     - `sampler`: a callable PyTree that makes one sample for each of several random keys.
@@ -72,10 +91,24 @@ class AbstractSampling(eqx.Module):
     """How the samples of an expectation are taken: the public classes."""
 
     @abc.abstractmethod
-    def prepare(self, problem: Any, key: PRNGKeyArray, devices: tuple) -> Plan:
-        """Raises a `ValueError` for a problem that it cannot sample."""
+    def prepare(self, problem: Any, key: PRNGKeyArray, devices: tuple) -> SamplingPlan:
+        """The plan for a problem, made with trials that draw from `key`. Raises a
+        `ValueError` for a problem that it cannot sample."""
 
 
-def real(dtype) -> Any:
+# The samplings whose estimates can be read from files, by the names of their classes.
+SAVED_SAMPLINGS: dict[str, type[AbstractSampling]] = {}
+
+_Sampling = TypeVar("_Sampling", bound=type[AbstractSampling])
+
+
+def saved_by_name(sampling: _Sampling) -> _Sampling:
+    """Decorates a sampling whose estimates can be read from files, where it is known by the
+    name of its class."""
+    SAVED_SAMPLINGS[sampling.__name__] = sampling
+    return sampling
+
+
+def real(dtype: Any) -> Any:
     """The floating-point type in which values of `dtype` are averaged."""
     return jnp.result_type(dtype, float)

@@ -1,80 +1,109 @@
 """Estimates in files: arrays, and their structure as JSON."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import PyTree
 
 from .moments import Moments
-from .sampling import AbstractSampling
+from .sampling import SAVED_SAMPLINGS
 
 
-_TREES = "mean", "norm", "largest", "size"
+# The fields of `Moments` that have the structure of `phi`, and those that are numbers.
+_TREES = ("mean", "norm", "largest", "size")
+_NUMBERS = ("begin", "end", "good", "failed")
+# The fields of an estimate that JSON takes as they are.
+_PLAIN_FIELDS = ("paths_per_sample", "roundings", "reason", "tol_reached")
 
 
-def described(estimate: Any) -> dict[str, Any]:
-    """Raises a `ValueError` for PyTree nodes that JSON cannot express."""
-    sampling, one = estimate.sampling, estimate.moments[0]
+def header_of(estimate: Any) -> dict[str, Any]:
+    """All of an `Expectation` but its arrays, for JSON. Raises a `ValueError` for PyTree
+    nodes that JSON cannot express."""
+    sampling = estimate.sampling
+    one, *_ = estimate.moments
     fields = {} if sampling is None else vars(sampling)
-    plain = lambda x: x is None or isinstance(x, int | float | str | np.integer)
-    kept = {k: int(x) if isinstance(x, np.integer) else x for k, x in fields.items()}
-    return {
-        "ranges": [(x.begin, x.end, x.good, x.failed) for x in estimate.moments],
+    header = {
+        "ranges": [[getattr(x, name) for name in _NUMBERS] for x in estimate.moments],
         "structure": _structure(one.mean),
         "dtypes": jtu.tree_leaves(one.dtypes),
-        "paths_per_sample": estimate.paths_per_sample,
-        "roundings": estimate.roundings,
         "sampling": None if sampling is None else type(sampling).__name__,
-        "fields": {k: x for k, x in kept.items() if plain(x)},
-        "reason": estimate.reason,
-        "tol_reached": estimate.tol_reached,
+        # A function, such as `sort_by`, is left out.
+        "fields": {name: _plain(x) for name, x in fields.items() if _is_plain(x)},
         "far": estimate.far is not None,
     }
+    return header | {name: getattr(estimate, name) for name in _PLAIN_FIELDS}
 
 
 def arrays_of(estimate: Any) -> dict[str, np.ndarray]:
-    out = {"key_data": estimate.key_data}
-    trees = [
-        (f"{name}_{i}", getattr(x, name))
-        for i, x in enumerate(estimate.moments)
-        for name in _TREES
-    ]
-    for name, tree in [*trees, ("far", estimate.far)]:
-        leaves = jtu.tree_leaves(tree)
-        out |= {f"{name}_{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
-    return out
+    """The arrays of an `Expectation`, by names that are made of a field and positions."""
+    trees = {"far": estimate.far}
+    for i, moments in enumerate(estimate.moments):
+        for name in _TREES:
+            trees[f"{name}_{i}"] = getattr(moments, name)
+    arrays = {"key_data": estimate.key_data}
+    for name, tree in trees.items():
+        for k, leaf in enumerate(jtu.tree_leaves(tree)):
+            arrays[f"{name}_{k}"] = np.asarray(leaf)
+    return arrays
 
 
-def rebuilt(
-    kind: type, header: dict[str, Any], arrays: Mapping[str, np.ndarray]
-) -> Any:
+def fields_from(
+    header: dict[str, Any], arrays: Mapping[str, np.ndarray]
+) -> dict[str, Any]:
+    """The fields of the `Expectation` from which `header_of` and `arrays_of` made these.
+    Raises a `ValueError` for an unknown sampling."""
     structure = header["structure"]
+    count = len(header["dtypes"])
 
-    def tree(name: str) -> Any:
-        count = len(header["dtypes"])
-        return _filled(structure, iter([arrays[f"{name}_{k}"] for k in range(count)]))
+    def tree(name: str) -> PyTree[np.ndarray]:
+        leaves = [arrays[f"{name}_{k}"] for k in range(count)]
+        return _filled(structure, iter(leaves))
 
-    dtypes = _filled(structure, iter(header["dtypes"]))
-    moments = tuple(
-        Moments(*numbers, dtypes=dtypes, **{k: tree(f"{k}_{i}") for k in _TREES})
-        for i, numbers in enumerate(header["ranges"])
-    )
-    kinds = {x.__name__: x for x in AbstractSampling.__subclasses__()}
-    name, fields = header["sampling"], header["fields"]
-    sampling = None if name is None else kinds[name](**fields)
-    far = tree("far") if header["far"] else None
-    names = "paths_per_sample", "roundings", "reason", "tol_reached"
-    about = {name: header[name] for name in names}
-    return kind(moments, arrays["key_data"], sampling=sampling, far=far, **about)
+    def moments(i: int, numbers: list[int]) -> Moments:
+        trees = {name: tree(f"{name}_{i}") for name in _TREES}
+        dtypes = _filled(structure, iter(header["dtypes"]))
+        return Moments(**dict(zip(_NUMBERS, numbers)), **trees, dtypes=dtypes)
+
+    fields = {name: header[name] for name in _PLAIN_FIELDS}
+    return fields | {
+        "moments": tuple(moments(i, x) for i, x in enumerate(header["ranges"])),
+        "key_data": arrays["key_data"],
+        "sampling": _sampling_from(header),
+        "far": tree("far") if header["far"] else None,
+    }
+
+
+def _sampling_from(header: dict[str, Any]) -> Any:
+    name = header["sampling"]
+    if name is None:
+        return None
+    if name not in SAVED_SAMPLINGS:
+        raise ValueError(
+            f"The estimate was sampled by `{name}`, which this version does not have. Read "
+            "it with the version that wrote it."
+        )
+    return SAVED_SAMPLINGS[name](**header["fields"])
+
+
+def _is_plain(x: Any) -> bool:
+    return x is None or isinstance(x, int | float | str | np.integer)
+
+
+def _plain(x: Any) -> Any:
+    """JSON takes integers of Python only."""
+    return int(x) if isinstance(x, np.integer) else x
 
 
 def _structure(tree: Any) -> Any:
-    if type(tree) is dict and all(type(k) is str for k in tree):
+    """A PyTree of arrays as nested dictionaries of one entry each: the kind of a node, and
+    what it holds."""
+    if type(tree) is dict and all(type(name) is str for name in tree):
         # JAX sorts keys.
-        return {"dict": {k: _structure(tree[k]) for k in sorted(tree)}}
+        return {"dict": {name: _structure(tree[name]) for name in sorted(tree)}}
     if type(tree) in (list, tuple):
-        return {type(tree).__name__: [_structure(x) for x in tree]}
+        return {type(tree).__name__: [_structure(inner) for inner in tree]}
     if tree is None:
         return {"none": 0}
     if isinstance(tree, np.ndarray | np.generic):
@@ -85,12 +114,14 @@ def _structure(tree: Any) -> Any:
     )
 
 
-def _filled(structure: Any, leaves: Any) -> Any:
+def _filled(structure: Any, leaves: Iterator[Any]) -> Any:
+    """The PyTree with this structure and these leaves."""
     ((kind, inner),) = structure.items()
     if kind == "dict":
-        return {k: _filled(x, leaves) for k, x in inner.items()}
+        return {name: _filled(node, leaves) for name, node in inner.items()}
     if kind == "none":
         return None
     if kind == "array":
         return next(leaves)
-    return (list if kind == "list" else tuple)(_filled(x, leaves) for x in inner)
+    nodes = [_filled(node, leaves) for node in inner]
+    return nodes if kind == "list" else tuple(nodes)

@@ -21,7 +21,7 @@ from .._tableau import (
 )
 from .._terms import (
     apply_one,
-    controls,
+    drawn_variables,
     drift_driven,
     number_of_noises,
     split_terms,
@@ -216,7 +216,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         m = number_of_noises(terms)
         # The order of several noises is chosen by a coin.
         names = ["W", "two_point"] if m > 1 else ["W"]
-        drawn = controls(noise, names, t0, t1, type(self).__name__)
+        drawn = drawn_variables(noise, names, t0, t1, type(self).__name__)
         # One number for each noise, over all terms and leaves.
         increments, _ = jfu.ravel_pytree(drawn["W"])
         numbers = jnp.arange(m)

@@ -1,15 +1,22 @@
 from .constraint import constraint_of, refuse_constraint, without_constraint
-from .controls import controls, drift_driven, noise_driven, outcomes, step_variables
+from .controls import drawn_variables, drift_driven, noise_driven, outcomes
+from .controls import step_variables
 from .dependence import acts_elementwise, Dependence
 from .hamiltonian import evaluated, hamiltonian_terms, has_lifted, IndexedNoise
 from .hamiltonian import is_hamiltonian
 from .diffrax_langevin import momentum_first
-from .friction import FrictionAlong
-from .langevin import bath_terms, friction_apart, langevin_terms, split_friction
+from .friction import FrictionAlong, semidefinite_root
+from .langevin import (
+    AbstractFriction,
+    bath_terms,
+    friction_apart,
+    langevin_terms,
+    split_friction,
+)
 from .spins import as_spins, from_spinors, spin_terms, to_spinors
 from .structure import additive_fault, check_stratonovich, check_structure
 from .structure import commuting, constant_fault, Fault, FRICTION
-from .structure import separable_fault, WRONG_WAY_ROUND
+from .structure import separable_fault
 from .surface import check_start, constrained_state, Surface
 from .paths import brownian_paths, is_own, path_keys, path_numbers, random_paths
 from .paths import replace_paths, shapes_as_paths, specified, with_keys, with_paths

@@ -15,6 +15,7 @@ from .._custom_types import Args
 _T = TypeVar("_T")
 Constraint = Callable[[PyTree, Args], Float[Array, " c"]]
 
+# What every refusal advises. These two solvers find the multipliers of a constraint.
 KEEP = (
     "Use `StormerVerlet()`, or for the terms of `langevin_terms` `BAOAB()`: they keep it "
     "to rounding"
@@ -26,7 +27,7 @@ class ConstrainedDrift(diffrax.AbstractTerm):
 
     Its vector field depends on multipliers that a solver has to find. So the product with
     the length of a step raises an error, which every solver meets that does not know of
-    constraints, also those of Diffrax. Others read the fields of the term.
+    constraints, also those of Diffrax. The solvers that do read the fields of the term.
     """
 
     drift: diffrax.ODETerm
@@ -36,8 +37,9 @@ class ConstrainedDrift(diffrax.AbstractTerm):
         check_takes("constraint", self.constraint, "q", "args")
 
     def vf(self, t, y, args) -> PyTree[Array]:
-        # Diffrax looks at its structure before a solve, with any solver.
-        return jtu.tree_map(lambda x: jnp.full_like(x, jnp.nan), y)
+        # Diffrax looks at the structure of this before a solve, with any solver, so it
+        # cannot be the error. Nobody may use the values.
+        return jtu.tree_map(_nan_like, y)
 
     def contr(self, t0, t1, **kwargs) -> Any:
         return self.drift.contr(t0, t1, **kwargs)
@@ -59,8 +61,10 @@ def constrained(
 def constraint_of(terms: PyTree[diffrax.AbstractTerm]) -> Constraint | None:
     """The constraint of these terms, if there is one. Raises a `ValueError` if there are
     several."""
+    # Also within a `MultiTerm`, and within Diffrax's wrapper for the direction of time.
     leaves = jtu.tree_leaves(terms, is_leaf=_is_constrained)
-    found = [x.constraint for x in leaves if _is_constrained(x)]
+    found = [leaf.constraint for leaf in leaves if _is_constrained(leaf)]
+    # One at a time would leave the other: their multipliers belong to one equation.
     if len(found) > 1:
         raise ValueError(
             f"Only one of the terms may have a `constraint`; got {len(found)}. Return all "
@@ -71,14 +75,21 @@ def constraint_of(terms: PyTree[diffrax.AbstractTerm]) -> Constraint | None:
 
 def without_constraint(terms: _T) -> _T:
     """The same terms, free to leave the constraint."""
-    free = lambda x: x.drift if _is_constrained(x) else x
-    return jtu.tree_map(free, terms, is_leaf=_is_constrained)
+
+    def freed(x: Any) -> Any:
+        return x.drift if _is_constrained(x) else x
+
+    return jtu.tree_map(freed, terms, is_leaf=_is_constrained)
 
 
 def refuse_constraint(terms: PyTree[diffrax.AbstractTerm], name: str) -> None:
     """Raises a `ValueError` if the terms have a constraint."""
     if constraint_of(terms) is not None:
         raise ValueError(f"`{name}` takes no terms with a `constraint`. {KEEP}.")
+
+
+def _nan_like(x: Array) -> Array:
+    return jnp.full_like(x, jnp.nan)
 
 
 def _is_constrained(x: Any) -> bool:

@@ -3,7 +3,7 @@ quadrature."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, cast, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -30,7 +30,7 @@ from .._brownian import (
     VARIABLES,
     WeakBrownianPath,
 )
-from .._compat import direction, ω
+from .._compat import direction, resolution, ω
 from .._custom_types import Args, RealScalarLike
 from .paths import brownian_paths, replace_paths
 from .vector_fields import apply, apply_brackets, apply_bridge, bridge
@@ -53,11 +53,14 @@ def step_variables(terms: PyTree[diffrax.AbstractTerm], h) -> StepVariables:
     path, laws = _the_path(terms)
     shape = increment_struct(path)
     flat, unravel = raveled(shape)
+    make_increment: Any = path.levy_area
 
-    def terms_with(values):
+    def terms_with(values: Float[Array, " n"]) -> PyTree[diffrax.AbstractTerm]:
         scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(flat.dtype)
-        sets = dict(zip(laws, map(unravel, scaled.reshape(-1, flat.size))))
-        increment = cast(Any, path.levy_area)(dt=step_size(h, shape), **sets)
+        # One row for each attribute of the increment, in the order of the laws.
+        rows = scaled.reshape(-1, flat.size)
+        attributes = {name: unravel(row) for name, row in zip(laws, rows)}
+        increment = make_increment(dt=step_size(h, shape), **attributes)
         make = jtu.Partial(_constant, increment)
         given = GivenPath(make=make, levy_area=type(increment))
         return replace_paths(terms, lambda _: given)
@@ -71,9 +74,15 @@ def outcomes(
 ) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, " K"]]:
     """All values of variables with these laws, and their probabilities or quadrature
     weights."""
-    scalars = [law.outcomes(nodes) for law in laws]
-    values = np.array([*itertools.product(*[values for values, _ in scalars])])
-    weights = np.array([*itertools.product(*[weights for _, weights in scalars])])
+    values_of_each = []
+    weights_of_each = []
+    for law in laws:
+        values, weights = law.outcomes(nodes)
+        values_of_each.append(values)
+        weights_of_each.append(weights)
+    # They are independent: all combinations, whose weights are products.
+    values = np.array([*itertools.product(*values_of_each)])
+    weights = np.array([*itertools.product(*weights_of_each)])
     return values, np.prod(weights, axis=1)
 
 
@@ -83,7 +92,11 @@ def _constant(increment, t0, t1, use_levy: bool) -> Increment:
     return increment if use_levy else increment.W
 
 
-def _the_path(terms) -> tuple[diffrax.AbstractBrownianPath, Mapping[str, AbstractLaw]]:
+def _the_path(
+    terms: PyTree[diffrax.AbstractTerm],
+) -> tuple[diffrax.AbstractBrownianPath, Mapping[str, AbstractLaw]]:
+    """The Brownian path of the terms, and the laws of the attributes of its increments.
+    Raises a `ValueError` if there are several, or if its laws are not known."""
     paths = brownian_paths(terms)
     laws = laws_of(paths[0]) if len(paths) == 1 else None
     if laws is None:
@@ -101,39 +114,65 @@ def _named(path: diffrax.AbstractBrownianPath) -> str:
     return f"{type(path).__name__} with {getattr(path.levy_area, '__name__', '?')}"
 
 
-def controls(
-    noise: tuple, names: list[str], t0, t1, solver: str, optional: tuple[str, ...] = ()
+def drawn_variables(
+    noise: tuple,
+    names: list[str],
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    solver: str,
+    optional: tuple[str, ...] = (),
 ) -> dict[str, list]:
-    """The random variables of the step from `t0` to `t1` for each noise term, and the
-    `optional` ones if all increments have them."""
+    """The random variables of the step from `t0` to `t1`: for each name, one value for
+    each noise term. The `optional` ones are left out unless all increments have them.
+
+    Raises a `ValueError`, in the name of `solver`, if a path does not have one of `names`.
+    """
     t1 = _within_resolution(noise, t0, t1)
-    options = {} if names == ["W"] else {"use_levy": True}
-    drawn = lambda: [term.contr(t0, t1, **options) for term in noise]
+    # Without Lévy areas an increment is `W` itself.
+    only_increments = names == ["W"]
+    options = {} if only_increments else {"use_levy": True}
+
+    def draw() -> list[Increment]:
+        return [term.contr(t0, t1, **options) for term in noise]
+
     cheap = all(map(_is_cheap, brownian_paths(noise)))
-    increments = drawn() if cheap else materialize(drawn)
-    if names == ["W"]:
+    increments = draw() if cheap else materialize(draw)
+    if only_increments:
         return {"W": increments}
-    # Check the variable first whose paths hold most: its advice fits the others, too.
-    held = lambda name: all(getattr(i, name, None) is not None for i in increments)
-    for name in sorted(names, key=lambda x: [*VARIABLES, x].index(x)):
-        if not held(name):
-            variable = VARIABLES.get(name)
-            advice = f"increments with the attribute `{name}`"
-            needs = variable.advice if variable else advice
-            records = [x for x in brownian_paths(noise) if _is_record(x)]
-            if variable and records:
-                needs = (
-                    f"{variable.name}, but `{type(records[0]).__name__}` has no random key "
-                    "to draw them from. Use a solver that needs only increments, such as "
-                    "`StormerVerlet` for separable systems or `ImplicitMidpoint` for others"
-                )
-            raise ValueError(f"`{solver}` needs {needs}.")
-    return {
-        name: [
-            _in_time(term, name, getattr(i, name)) for term, i in zip(noise, increments)
-        ]
-        for name in [*names, *filter(held, optional)]
-    }
+
+    def all_have(name: str) -> bool:
+        return all(getattr(x, name, None) is not None for x in increments)
+
+    # The variable first whose paths hold most: its advice fits the others, too.
+    for name in sorted(names, key=_rank, reverse=True):
+        if not all_have(name):
+            raise ValueError(f"`{solver}` needs {_how_to_get(name, noise)}.")
+    variables = {}
+    for name in [*names, *filter(all_have, optional)]:
+        pairs = zip(noise, increments)
+        variables[name] = [_in_time(term, name, getattr(x, name)) for term, x in pairs]
+    return variables
+
+
+def _rank(name: str) -> int:
+    """The rank of a random variable. Those of the user's own solvers come last."""
+    return VARIABLES[name].rank if name in VARIABLES else -1
+
+
+def _how_to_get(name: str, noise: tuple) -> str:
+    """What a path needs to have this random variable, for messages."""
+    variable = VARIABLES.get(name)
+    if variable is None:
+        return f"increments with the attribute `{name}`"
+    records = [path for path in brownian_paths(noise) if _is_record(path)]
+    if not records:
+        return variable.advice
+    # Another path would be other noise, so that only another solver helps.
+    return (
+        f"{variable.name}, but `{type(records[0]).__name__}` has no random key to draw "
+        "them from. Use a solver that needs only increments, such as `StormerVerlet` for "
+        "separable systems or `ImplicitMidpoint` for others"
+    )
 
 
 def _is_record(path: diffrax.AbstractBrownianPath) -> bool:
@@ -141,20 +180,25 @@ def _is_record(path: diffrax.AbstractBrownianPath) -> bool:
     return not is_random(path) and not isinstance(path, GivenPath)
 
 
-def _in_time(term: diffrax.AbstractTerm, name: str, x: PyTree[Array]) -> PyTree[Array]:
+def _in_time(
+    term: diffrax.AbstractTerm, name: str, value: PyTree[Array]
+) -> PyTree[Array]:
     """Restores the sign of even random variables, since backward in time Diffrax negates
     all of them."""
-    even = name in VARIABLES and VARIABLES[name].even
-    return (direction(term) * x**ω).ω if even else x
+    is_even = name in VARIABLES and VARIABLES[name].even
+    return (direction(term) * value**ω).ω if is_even else value
 
 
-def _within_resolution(noise: tuple, t0, t1) -> RealScalarLike:
+def _within_resolution(
+    noise: tuple, t0: RealScalarLike, t1: RealScalarLike
+) -> RealScalarLike:
     """`t1`, with an error when run if a `VirtualBrownianTree` does not resolve the step."""
     h = jnp.abs(t1 - t0)
     for path in map(_innermost, brownian_paths(noise)):
         if isinstance(path, diffrax.VirtualBrownianTree):
-            tol = path.tol * (path.t1 - path.t0)  # stored in units of its length
-            # Ignore steps of a rounding error, which Diffrax may take at the end.
+            tol = resolution(path)
+            # Steps of a rounding error, which Diffrax may take at the end, have next to no
+            # noise. A step of just `tol` may be rounded to less.
             t1 = eqx.error_if(
                 jnp.asarray(t1),
                 (h < 0.999 * tol) & (h > 1e-6 * tol),
@@ -173,6 +217,7 @@ def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPa
 
 def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
     """Whether its random variables are cheaper to recompute than to store."""
+    # Of the wrappers, Lévy areas are not: they sum a series.
     while isinstance(path, TruncatedBrownianPath | PlateauBrownianPath):
         path = path.path
     return isinstance(path, WeakBrownianPath | FixedStepBrownianPath)
@@ -180,41 +225,56 @@ def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
 
 def noise_driven(
     drift: jtu.Partial,
-    h,
+    h: RealScalarLike,
     noise: tuple,
     names: list[str],
-    t0,
-    t1,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
     args: Args,
     solver: str,
 ) -> dict[str, jtu.Partial]:
-    """For each random variable, the function that drives noise stages over the step of size
-    `h`; `drift` drives drift stages."""
-    own = [VARIABLES[name].held if name in VARIABLES else None for name in names]
-    needed = [
-        x for name, held in zip(names, own) for x in (held[0] if held else [name])
-    ]
-    optional = tuple(x for held in own if held for x in held[1])
-    drawn = controls(noise, [*dict.fromkeys(needed)], t0, t1, solver, optional)
-    driven = {}
+    """What drives the noise stages of the step of size `h` from `t0` to `t1`: for the name
+    of each random variable, a function `(t, y)` that returns the change of the state by
+    the vector fields that it multiplies. `drift` is that of the drift stages."""
+    # Most variables are attributes of an increment. The others are computed from several
+    # of its attributes, some of which are used only if they are there.
+    attributes = []
+    if_there = []
+    for name in names:
+        held = VARIABLES[name].held if name in VARIABLES else None
+        if held is None:
+            attributes.append(name)
+        else:
+            attributes += held[0]
+            if_there += held[1]
+    # Each is drawn once, although several variables may be computed from it.
+    attributes = list(dict.fromkeys(attributes))
+    values = drawn_variables(noise, attributes, t0, t1, solver, tuple(if_there))
+    functions = {}
     for name in names:
         match drives(name):
             case "noise":
-                driven[name] = jtu.Partial(apply, noise, drawn[name], args)
+                functions[name] = jtu.Partial(apply, noise, values[name], args)
             case "drift brackets":
-                bridges = bridge(h, drawn["W"], drawn["H"], drawn.get("K"))
-                driven[name] = jtu.Partial(apply_bridge, drift, noise, bridges, h, args)
+                areas = bridge(h, values["W"], values["H"], values.get("K"))
+                functions[name] = jtu.Partial(
+                    apply_bridge, drift, noise, areas, h, args
+                )
             case "noise brackets" if len(noise) == 1:
-                A = drawn[name][0]
-                driven[name] = jtu.Partial(apply_brackets, noise[0], A, args)
+                (areas,) = values[name]
+                functions[name] = jtu.Partial(apply_brackets, noise[0], areas, args)
             case _:
                 raise ValueError(
                     f"`{solver}` needs all noises in one term, whose path samples the Lévy "
                     f"areas between them; got {len(noise)} noise terms. Combine them."
                 )
-    return driven
+    return functions
 
 
-def drift_driven(drift: tuple, t0, t1, args: Args) -> jtu.Partial:
-    """The function that drives drift stages over the step."""
-    return jtu.Partial(apply, drift, [x.contr(t0, t1) for x in drift], args)
+def drift_driven(
+    drift: tuple, t0: RealScalarLike, t1: RealScalarLike, args: Args
+) -> jtu.Partial:
+    """What drives the drift stages of the step: a function `(t, y)` that returns the
+    change of the state by the drift over the whole step."""
+    sizes = [term.contr(t0, t1) for term in drift]
+    return jtu.Partial(apply, drift, sizes, args)

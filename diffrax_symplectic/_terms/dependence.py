@@ -1,7 +1,7 @@
 """Detects which inputs the results of a function depend on."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.tree_util as jtu
@@ -21,30 +21,38 @@ class Dependence:
 
     def __init__(self, fn: Callable, *inputs: PyTree):
         closed, self._out = jax.make_jaxpr(fn, return_shape=True)(*inputs)
-        self._jaxpr, self._inputs = closed.jaxpr, inputs
+        self._jaxpr = closed.jaxpr
+        self._inputs = inputs
 
     def independent(self, of: Callable, part: Callable = lambda out: out) -> bool:
         """Whether `part(result)` is independent of `of(*inputs)`, PyTrees of arrays."""
-        _, read = dce_jaxpr(self._jaxpr, _marked(part, self._out))
+        used_results = _marked(part, self._out)
+        # A program for these results alone reads fewer inputs.
+        _, read = dce_jaxpr(self._jaxpr, used_results)
         marked = _marked(lambda inputs: of(*inputs), self._inputs)
-        return not any(a and b for a, b in zip(read, marked))
+        return not any(is_read and asked for is_read, asked in zip(read, marked))
 
 
 def _marked(select: Callable, tree: PyTree) -> list[bool]:
     """Which leaves of `tree` are leaves of `select(tree)`."""
+    # Leaves may be equal, or have no values, so they are told apart by their numbers.
     treedef = jtu.tree_structure(tree)
     numbers = treedef.unflatten(range(treedef.num_leaves))
     chosen = set(jtu.tree_leaves(select(numbers)))
-    return [i in chosen for i in range(treedef.num_leaves)]
+    return [number in chosen for number in range(treedef.num_leaves)]
 
 
 # Operations that may act on what is linear in an input, entry by entry. All others count
-# as mixing entries.
+# as mixing entries: a list of those that mix would grow with each release of JAX.
 _ELEMENTWISE = frozenset(
     "add add_any convert_element_type copy div integer_pow mul neg select_n sub".split()
 )
 # Those whose parameters hold what they call.
 _CALLS = frozenset({"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"})
+
+# The number of the input whose entries the entries of an array depend on, each on the same
+# entry; `None` if it depends on no input.
+_Source: TypeAlias = int | None
 
 
 def acts_elementwise(fn: Callable, x: PyTree[Array]) -> bool:
@@ -53,45 +61,62 @@ def acts_elementwise(fn: Callable, x: PyTree[Array]) -> bool:
     closed = jax.make_jaxpr(fn)(x)
     numbers = list(range(len(closed.jaxpr.invars)))
     sources = _sources(closed.jaxpr, numbers)
-    fits = lambda number, source: source is None or source == number
-    return sources is not None and all(map(fits, numbers, sources))
+    if sources is None:
+        return False
+    return all(
+        source is None or source == number for number, source in zip(numbers, sources)
+    )
 
 
-def _sources(jaxpr: Jaxpr, numbers: Sequence[int | None]) -> list[int | None] | None:
-    """For each result, the number of the input whose entries its entries depend on, or
-    `None` if it depends on none; given the number of each input. `None` if some operation
-    mixes the entries of an input, or two inputs."""
+def _sources(jaxpr: Jaxpr, numbers: Sequence[_Source]) -> list[_Source] | None:
+    """The source of each result, given those of the inputs. `None` if some operation mixes
+    the entries of an input, or two inputs."""
+    # What no result needs may mix entries: the derivative of a product of all of them
+    # also computes the product.
     jaxpr, read = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
     read_numbers = [number for number, is_read in zip(numbers, read) if is_read]
-    source = dict(zip(jaxpr.invars, read_numbers))
-    of = lambda x: None if isinstance(x, Literal) else source.get(x)
+    known = dict(zip(jaxpr.invars, read_numbers))
+
+    def source_of(x: Any) -> _Source:
+        return None if isinstance(x, Literal) else known.get(x)
+
     for eqn in jaxpr.eqns:
-        found = {number for x in eqn.invars if (number := of(x)) is not None}
+        sources = [source_of(x) for x in eqn.invars]
+        found = {number for number in sources if number is not None}
         if len(found) == 0:
             continue
-        inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
-        if inner is not None and eqn.primitive.name in _CALLS:
-            inner = getattr(inner, "jaxpr", inner)
-            outs = _sources(inner, [of(x) for x in eqn.invars])
-            if outs is None:
+        inner = _called_by(eqn)
+        if inner is not None:
+            results = _sources(inner, sources)
+            if results is None:
                 return None
-            source.update(zip(eqn.outvars, outs))
-        elif len(found) == 1 and _is_elementwise(eqn, of):
-            source.update(dict.fromkeys(eqn.outvars, found.pop()))
+            known.update(zip(eqn.outvars, results))
+        elif len(found) == 1 and _is_elementwise(eqn, sources):
+            known.update(dict.fromkeys(eqn.outvars, found.pop()))
         else:
             return None
-    return [of(x) for x in jaxpr.outvars]
+    return [source_of(x) for x in jaxpr.outvars]
 
 
-def _is_elementwise(eqn: Any, source: Callable) -> bool:
-    """Whether an operation keeps the entries of the arguments that `source` tracks."""
+def _called_by(eqn: Any) -> Jaxpr | None:
+    """The program that an operation calls with its own arguments, if it is such a call."""
+    if eqn.primitive.name not in _CALLS:
+        return None
+    inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
+    # With its constants, or without them.
+    return getattr(inner, "jaxpr", inner)
+
+
+def _is_elementwise(eqn: Any, sources: Sequence[_Source]) -> bool:
+    """Whether an operation keeps the entries of those arguments that have a source."""
     shape = eqn.outvars[0].aval.shape
-    tracked = [x for x in eqn.invars if source(x) is not None]
+    tracked = [x for x, source in zip(eqn.invars, sources) if source is not None]
     if any(x.aval.shape != shape for x in tracked):
         return False
     if eqn.primitive.name == "dot_general":
         # The derivative of `p @ p` multiplies by a scalar in this way.
         return len(tracked) == 1 and any(x.aval.size == 1 for x in eqn.invars)
+    # These keep entries where they keep the shape.
     if eqn.primitive.name in ("reshape", "broadcast_in_dim"):
         return True
     return eqn.primitive.name in _ELEMENTWISE

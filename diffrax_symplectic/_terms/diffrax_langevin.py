@@ -28,8 +28,9 @@ def momentum_first(
     if not any(map(_is_drift, parts)):
         return terms, y
     check_pair(y)
+    x, v = y
     exchanged = [replaced(term, _exchanged(unwrapped(term))) for term in parts]
-    return diffrax.MultiTerm(*exchanged), (y[1], y[0])
+    return diffrax.MultiTerm(*exchanged), (v, x)
 
 
 def _is_drift(term: diffrax.AbstractTerm) -> bool:
@@ -37,7 +38,10 @@ def _is_drift(term: diffrax.AbstractTerm) -> bool:
 
 
 def _exchanged(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
+    """The term with the halves of its state exchanged, and with friction apart if it is
+    Diffrax's Langevin term."""
     if isinstance(term, diffrax.UnderdampedLangevinDriftTerm):
+        # Its `gamma` acts on velocities of mass one, as the friction here does.
         friction = _PrefixFriction(term.gamma)
         return diffrax.ODETerm(DriftWithFriction(_Frictionless(term), friction))
     if isinstance(term, diffrax.ODETerm):
@@ -52,6 +56,7 @@ class _Frictionless(eqx.Module):
 
     def __call__(self, t: RealScalarLike, y: tuple[_P, _P], args: Args):
         v, x = y
+        # Without velocity there is no friction, so that the forces are left.
         still = jtu.tree_map(jnp.zeros_like, v)
         _, dv = self.term.vf(t, (x, still), args)
         return dv, v
@@ -63,18 +68,21 @@ class _PrefixFriction(AbstractFriction):
 
     gamma: PyTree[ArrayLike]
 
+    def velocity(self, t, y, args):
+        del t, args
+        v, _ = y
+        return v
+
     def force(self, t, q, args, velocity):
         del t, q, args
 
-        def forces(gamma, v):
-            of = lambda v: -not_negative(like(gamma, v)) * v
-            return jtu.tree_map(of, v)
+        def force_on(v: Array, gamma: ArrayLike) -> Array:
+            return -not_negative(like(gamma, v)) * v
 
-        return jtu.tree_map(forces, self.gamma, velocity)
+        def forces_on(gamma: ArrayLike, v: _P) -> _P:
+            return jtu.tree_map(lambda leaf: force_on(leaf, gamma), v)
 
-    def __call__(self, t, y, args):
-        v, x = y
-        return self.force(t, x, args, v), jtu.tree_map(jnp.zeros_like, x)
+        return jtu.tree_map(forces_on, self.gamma, velocity)
 
 
 class _ExchangedField(eqx.Module):
@@ -83,7 +91,8 @@ class _ExchangedField(eqx.Module):
     term: diffrax.ODETerm
 
     def __call__(self, t: RealScalarLike, y: tuple[_P, _P], args: Args):
-        dx, dv = self.term.vf(t, (y[1], y[0]), args)
+        v, x = y
+        dx, dv = self.term.vf(t, (x, v), args)
         return dv, dx
 
 
@@ -93,7 +102,8 @@ class _Exchanged(diffrax.AbstractTerm):
     term: diffrax.AbstractTerm
 
     def vf(self, t, y, args):
-        return self.term.vf(t, (y[1], y[0]), args)
+        v, x = y
+        return self.term.vf(t, (x, v), args)
 
     def contr(self, t0, t1, **kwargs):
         return self.term.contr(t0, t1, **kwargs)

@@ -6,7 +6,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -14,13 +13,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from .._arguments import check_takes, real_array, shapes
+from .._compat import is_traced
 from .._custom_types import Args, BM, RealScalarLike
 from .hamiltonian import evaluated
 
 
 _P = PyTree[Array]
+# A friction or a temperature, constant or a function.
 Value = PyTree[ArrayLike] | Callable[[RealScalarLike, _P, Args], PyTree[ArrayLike]]
-
 
 _KIND = "a real number, an array or PyTree of them, or a function of `(t, q, args)`"
 
@@ -46,8 +46,13 @@ FrictionAlong.__init__.__doc__ = """**Arguments:**
 
 
 class _Square(eqx.Module):
-    """A constant array that may be a matrix; whether it is symmetric positive semidefinite,
-    and then its root, computed once."""
+    """A constant array that may be a matrix: whether it is one depends on the shape of its
+    momenta, which may be known only in the solve.
+
+    - `value`: the array.
+    - `is_semidefinite`: whether it is symmetric positive semidefinite, as a matrix.
+    - `root`: its root as a matrix, computed once and not in every step.
+    """
 
     value: Array
     is_semidefinite: Bool[Array, ""]
@@ -62,22 +67,29 @@ def value_at(name: str, value: Any, t, q: _P, args: Args) -> PyTree:
 def product_with(friction: Any, t, q: _P, args: Args, velocity: _P) -> _P:
     """`G v`."""
     if isinstance(friction, FrictionAlong):
+        # The speed along each direction first: a matrix would cost more.
         columns = _columns(friction, t, q, args)
-        along = lambda d, v: jnp.tensordot(v, d, jnp.ndim(v))
-        parts = jtu.tree_leaves(jtu.tree_map(along, columns, velocity))
-        return jtu.tree_map(lambda d: d @ sum(parts), columns)
-
-    def product(g, v):
-        value = g.value if isinstance(g, _Square) else g
-        if not _is_matrix(value, jnp.shape(v)):
-            return not_negative(like(value, v)) * v
-        force = jnp.tensordot(like(value, v), v, jnp.ndim(v))
-        if not isinstance(g, _Square):
-            return force
-        return jnp.where(g.is_semidefinite, force, jnp.nan)
-
+        speeds = jtu.tree_leaves(jtu.tree_map(_speeds_along, columns, velocity))
+        return jtu.tree_map(lambda d: d @ sum(speeds), columns)
     value = _for_each("friction", value_at("friction", friction, t, q, args), q)
-    return jtu.tree_map(product, value, velocity, is_leaf=_is_square)
+    return jtu.tree_map(_product, value, velocity, is_leaf=_is_square)
+
+
+def _speeds_along(directions: Array, v: Array) -> Array:
+    """The scalar product of each direction, along the last axis, with the velocity."""
+    return jnp.tensordot(v, directions, jnp.ndim(v))
+
+
+def _product(g: Any, v: Array) -> Array:
+    """`G v` for the velocities of one array."""
+    value = g.value if isinstance(g, _Square) else g
+    if not _is_matrix(value, jnp.shape(v)):
+        return not_negative(like(value, v)) * v
+    force = jnp.tensordot(like(value, v), v, jnp.ndim(v))
+    if not isinstance(g, _Square):
+        # Whether the value of a function is semidefinite is seen when its root is taken.
+        return force
+    return jnp.where(g.is_semidefinite, force, jnp.nan)
 
 
 def root_product_with(
@@ -87,10 +99,8 @@ def root_product_with(
     if isinstance(friction, FrictionAlong):
         columns = _columns(friction, t, q, args)
         return _noise_along(columns, _single_temperature(T), control)
-    fits = lambda w, x: jnp.shape(w) == jnp.shape(x)
-    if jtu.tree_structure(control) != jtu.tree_structure(q) or not all(
-        map(fits, jtu.tree_leaves(control), jtu.tree_leaves(q))
-    ):
+    same_structure = jtu.tree_structure(control) == jtu.tree_structure(q)
+    if not same_structure or _shapes_of(control) != _shapes_of(q):
         raise ValueError(
             f"The `path` of `langevin_terms` must have the shape of `q`, {shapes(q)}; got "
             f"shape {shapes(control)}."
@@ -100,13 +110,17 @@ def root_product_with(
     return jtu.tree_map(_noise_of, value, heat, control, q, is_leaf=_is_square)
 
 
+def _shapes_of(tree: PyTree) -> list[tuple[int, ...]]:
+    return [jnp.shape(leaf) for leaf in jtu.tree_leaves(tree)]
+
+
 def _noise_of(g: Any, T: ArrayLike, w: Array, x: Array) -> Array:
     """The noise `w` of the momenta of one array, in the shape of `x`."""
     w = like(w, x)
     matrix = g.value if isinstance(g, _Square) else g
     if _is_matrix(matrix, jnp.shape(x)):
         scale = jnp.sqrt(2 * like(_single_temperature(T), x))
-        root = g.root if isinstance(g, _Square) else _root(like(g, x))
+        root = g.root if isinstance(g, _Square) else semidefinite_root(like(g, x))
         return scale * jnp.tensordot(like(root, x), w, jnp.ndim(w))
     if jnp.shape(T) not in ((), jnp.shape(x)):
         raise ValueError(
@@ -118,6 +132,7 @@ def _noise_of(g: Any, T: ArrayLike, w: Array, x: Array) -> Array:
 
 
 def _noise_along(columns: _P, T: ArrayLike, control: BM) -> _P:
+    """The noise with one increment for each direction: no root is taken."""
     flat, _ = jfu.ravel_pytree(control)
     number = jnp.shape(jtu.tree_leaves(columns)[0])[-1:]
     if number != flat.shape:
@@ -125,18 +140,26 @@ def _noise_along(columns: _P, T: ArrayLike, control: BM) -> _P:
             "The `path` of `langevin_terms` must have one noise for each direction of the "
             f"friction, shape {number}; got shape {shapes(control)}."
         )
-    along = lambda d: d @ (jnp.sqrt(2 * like(T, d)) * like(flat, d))
-    return jtu.tree_map(along, columns)
+
+    def kick(directions: Array) -> Array:
+        scale = jnp.sqrt(2 * like(T, directions))
+        return directions @ (scale * like(flat, directions))
+
+    return jtu.tree_map(kick, columns)
 
 
 def _columns(friction: FrictionAlong, t, q: _P, args: Args) -> _P:
     """The directions for each array of the momenta, with a trailing axis of noises."""
     columns = value_at("directions", friction.directions, t, q, args)
     columns = _for_each("directions", columns, q)
-    numbers = {jnp.shape(d)[-1:] for d in jtu.tree_leaves(columns)}
-    fits = lambda d, x: jnp.ndim(d) > 0 and jnp.shape(d)[:-1] == jnp.shape(x)
-    all_fit = all(jtu.tree_leaves(jtu.tree_map(fits, columns, q)))
-    if len(numbers) > 1 or not all_fit:
+    given = _shapes_of(columns)
+    # All arrays have the same directions, so their last axes agree.
+    one_number = len({shape[-1:] for shape in given}) == 1
+    fit = [
+        len(shape) > 0 and shape[:-1] == momenta
+        for shape, momenta in zip(given, _shapes_of(q))
+    ]
+    if not one_number or not all(fit):
         raise ValueError(
             "`directions` of `FrictionAlong` must have the shape of the momenta and one "
             f"more axis, for the noises; got shape {shapes(columns)} for momenta of shape "
@@ -159,7 +182,7 @@ def _is_matrix(g: ArrayLike, momenta: tuple[int, ...]) -> bool:
 
 
 def _for_each(name: str, value: PyTree, p: _P) -> PyTree:
-    """`value` in the structure of the momenta."""
+    """`value` in the structure of the momenta: one that is given once is that of each."""
     if jtu.all_leaves([value], is_leaf=_is_square):
         return jtu.tree_map(lambda _: value, p)
     if jtu.tree_structure(value, is_leaf=_is_square) != jtu.tree_structure(p):
@@ -171,6 +194,8 @@ def _for_each(name: str, value: PyTree, p: _P) -> PyTree:
 
 
 def _single_temperature(T: PyTree) -> ArrayLike:
+    """Raises a `ValueError` unless this is one number. (With several, friction that mixes
+    momenta has no stationary density that is known.)"""
     if not jtu.all_leaves([T]) or jnp.shape(T) != ():
         raise ValueError(
             "`temperature` must be one number for friction by a matrix or along "
@@ -200,7 +225,7 @@ def checked_friction(friction: Any, struct: PyTree | None) -> Any:
     if isinstance(friction, FrictionAlong):
         if callable(friction.directions):
             check_takes("directions", friction.directions, "t", "q", "args")
-        return jtu.tree_map(lambda x: x if callable(x) else jnp.asarray(x), friction)
+        return jtu.tree_map(_as_array_or_function, friction)
     if callable(friction):
         check_takes("friction", friction, "t", "q", "args")
         return friction
@@ -209,29 +234,36 @@ def checked_friction(friction: Any, struct: PyTree | None) -> Any:
             "`friction` must be a number, an array, a PyTree of arrays, a `FrictionAlong`, "
             f"or a function `(t, q, args)`; got {friction!r}."
         )
-    known = {s.shape for s in jtu.tree_leaves(struct)}
     if jtu.all_leaves([friction]) or struct is None:
-        # One for all momenta, whose shape is known if it is one.
+        # One for all momenta, whose shape is known if all have the same.
+        known = {leaf.shape for leaf in jtu.tree_leaves(struct)}
         shape = known.pop() if len(known) == 1 else None
         return jtu.tree_map(lambda g: _checked_array(g, shape), friction)
-    each = jtu.tree_map(lambda s: jnp.zeros(s.shape), struct)
-    checked = lambda g, x: _checked_array(g, jnp.shape(x))
-    return jtu.tree_map(checked, _for_each("friction", friction, each), each)
+    momenta = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape), struct)
+    each = _for_each("friction", friction, momenta)
+    return jtu.tree_map(lambda g, p: _checked_array(g, jnp.shape(p)), each, momenta)
+
+
+def _as_array_or_function(x: Any) -> Any:
+    return x if callable(x) else jnp.asarray(x)
 
 
 def _checked_array(g: ArrayLike, momenta: tuple[int, ...] | None) -> Array | _Square:
-    """The friction of an array of momenta, of this shape if it is known."""
+    """The friction of an array of momenta, of this shape if it is known. Raises a
+    `ValueError` if it is known to be invalid."""
     shape = jnp.shape(g)
+    # A matrix has the shape of its momenta twice.
     half = len(shape) // 2
     may_be_matrix = half > 0 and shape == shape[:half] * 2
     is_matrix = momenta is not None and _is_matrix(g, momenta)
     if not may_be_matrix:
         return jnp.asarray(real_array("friction", g, positive=False, kind=_KIND))
-    root = _root(jnp.asarray(g, jnp.result_type(g, float)))
+    root = semidefinite_root(jnp.asarray(g, jnp.result_type(g, float)))
     is_semidefinite = ~jnp.any(jnp.isnan(root))
     square = _Square(jnp.asarray(g), is_semidefinite, root)
-    if isinstance(is_semidefinite, jax.core.Tracer):
+    if is_traced(is_semidefinite):
         return square
+    # Without the shape of the momenta it may be numbers that are valid as they are.
     if not is_semidefinite and (is_matrix or not np.all(np.asarray(g) >= 0)):
         raise ValueError(
             "`friction` must be a symmetric positive semidefinite matrix, or an array of "
@@ -241,16 +273,20 @@ def _checked_array(g: ArrayLike, momenta: tuple[int, ...] | None) -> Array | _Sq
 
 
 def checked_temperature(temperature: Any) -> Any:
+    """The temperature, in arrays. Raises a `ValueError` if it is known to be invalid."""
     if callable(temperature):
         check_takes("temperature", temperature, "t", "q", "args")
         return temperature
-    real = lambda T: real_array("temperature", T, positive=False, kind=_KIND)
-    return jtu.tree_map(lambda T: jnp.asarray(real(T)), temperature)
+
+    def checked(T: ArrayLike) -> Array:
+        return jnp.asarray(real_array("temperature", T, positive=False, kind=_KIND))
+
+    return jtu.tree_map(checked, temperature)
 
 
 # Traced and compiled once for each shape.
 @jax.jit
-def _root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
+def semidefinite_root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
     r"""$L$ with $L L^\top$ equal to a symmetric positive semidefinite matrix: its Cholesky
     factor, with zero columns where the matrix is singular. NaN if it is no such matrix.
 
@@ -258,16 +294,17 @@ def _root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
     one: a friction between particles would then change their total momentum.
     """
     n = round(matrix.size**0.5)
-    A = matrix.reshape(n, n)
-    eps = jnp.finfo(A.dtype).eps
-    diagonal = jnp.diag(A)
+    square = matrix.reshape(n, n)
+    eps = jnp.finfo(square.dtype).eps
+    diagonal = jnp.diag(square)
     # Of a pivot, which is a difference of numbers up to the entry of the diagonal.
     rounding = 10 * n * eps * diagonal
     # No entry of what is left of a semidefinite matrix without its tiny pivots is larger.
     size = jnp.sqrt(jnp.maximum(diagonal, 0))
     most = 10 * (n * eps) ** 0.5 * size[:, None] * size
 
-    def column(j, carry):
+    def column(j: Any, carry: tuple) -> tuple:
+        """The next column of the root; what is left of the matrix without it."""
         left, root, is_valid = carry
         pivot = left[j, j]
         used = pivot > rounding[j]
@@ -277,7 +314,10 @@ def _root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
         is_valid = is_valid & (pivot >= -rounding[j])
         return left, root.at[:, j].set(below), is_valid
 
-    begin = A, jnp.zeros_like(A), _is_symmetric(A) & jnp.all(jnp.isfinite(A))
+    is_valid = _is_symmetric(square) & jnp.all(jnp.isfinite(square))
+    begin = (square, jnp.zeros_like(square), is_valid)
+    # Unrolled for all matrices that the fused engine solves with: it takes no column whose
+    # number is known only when it runs.
     left, root, is_valid = jax.lax.fori_loop(0, n, column, begin, unroll=n <= 16)
     is_valid = is_valid & jnp.all(jnp.abs(left) <= most)
     return jnp.where(is_valid, root, jnp.nan).reshape(matrix.shape)

@@ -1,6 +1,8 @@
+"""The terms of a Hamiltonian system: vector fields from its Hamiltonians, by `jax.grad`."""
+
 import functools as ft
 from collections.abc import Callable
-from typing import cast, get_args, Literal
+from typing import Any, cast, get_args, Literal
 
 import diffrax
 import equinox as eqx
@@ -19,6 +21,7 @@ from .dependence import Dependence
 from .paths import as_path
 
 
+# Momenta or positions: of one structure and one shape each, which are those of the other.
 _P = PyTree[Shaped[Array, "?*p"], "P"]
 _State = tuple[_P, _P]
 _Hamiltonian = Callable[[RealScalarLike, _P, _P, Args], PyTree[Array]]
@@ -89,6 +92,7 @@ def hamiltonian_terms(
     drift = constrained(diffrax.ODETerm(_Drift(H0, structure)), constraint)
     if noise is None and path is None:
         return diffrax.MultiTerm(drift)
+    # If only one of the two was left out, its own check says so.
     noise = cast(_Hamiltonian, noise)
     check_takes("noise", noise, "t", "p", "q", "args")
     return diffrax.MultiTerm(drift, HamiltonianNoise(noise, as_path(path), structure))
@@ -120,7 +124,8 @@ class IndexedNoise(eqx.Module):
         return scalar_energy(evaluated("H", self.H, k, t, p, q, args=args), "H")
 
     def __call__(self, t: RealScalarLike, p: PyTree, q: PyTree, args: Args) -> Array:
-        return jax.vmap(lambda k: self.one(k, t, p, q, args))(jnp.arange(self.m))
+        numbers = jnp.arange(self.m)
+        return jax.vmap(lambda k: self.one(k, t, p, q, args))(numbers)
 
 
 IndexedNoise.__init__.__doc__ = """**Arguments:**
@@ -135,14 +140,22 @@ while the solve is traced, if `H` does not return a scalar.
 
 
 class OneNoise(eqx.Module):
-    """A control with a single nonzero noise, at index `number` of the flattened path."""
+    """A control with a single nonzero noise.
+
+    - `number`: its index in the flattened path.
+    - `increment`: its value.
+    """
 
     number: IntScalarLike
     increment: RealScalarLike
 
 
 class Lifted(eqx.Module):
-    """A Hamiltonian in another variable, `H(t, chart(p, q), args)`."""
+    """A Hamiltonian in another variable, `H(t, chart(p, q), args)`.
+
+    A Module and not a closure, so that parameters within `H` stay leaves of the terms, and
+    that `has_lifted` finds it.
+    """
 
     H: Callable
     chart: Callable[[_State], PyTree]
@@ -155,8 +168,11 @@ class Lifted(eqx.Module):
 
 def has_lifted(terms: PyTree) -> bool:
     """Whether these terms have Hamiltonians in another variable."""
-    is_lifted = lambda x: isinstance(x, Lifted)
-    return any(map(is_lifted, jtu.tree_leaves(terms, is_leaf=is_lifted)))
+    return any(map(_is_lifted, jtu.tree_leaves(terms, is_leaf=_is_lifted)))
+
+
+def _is_lifted(x: Any) -> bool:
+    return isinstance(x, Lifted)
 
 
 def lifted_terms(
@@ -168,10 +184,11 @@ def lifted_terms(
 ) -> diffrax.MultiTerm:
     """The terms of Hamiltonians in `chart((p, q))`, a variable called `name`."""
     check_takes("H0", H0, "t", name, "args")
-    if isinstance(noise, IndexedNoise):
-        lifted = IndexedNoise(Lifted(noise.H, chart), noise.m)
-    elif noise is None:
+    if noise is None:
         lifted = None
+    elif isinstance(noise, IndexedNoise):
+        # Still one noise at a time, for the solvers that follow one after another.
+        lifted = IndexedNoise(Lifted(noise.H, chart), noise.m)
     else:
         check_takes("noise", noise, "t", name, "args")
         lifted = Lifted(noise, chart)
@@ -187,7 +204,7 @@ class _Drift(eqx.Module):
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
         check_pair(y)
 
-        def scalar(p, q):
+        def scalar(p: _P, q: _P) -> Array:
             return scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
 
         return symplectic_gradient(scalar, y)
@@ -202,16 +219,20 @@ def scalar_energy(out: PyTree, name: str = "H0") -> Array:
             "solve.)"
         )
     _check_real(name, out)
+    # `jax.grad` refuses integers, such as the `0` of a particle without energy.
     return jnp.asarray(out, jnp.result_type(out, float))
 
 
 def _check_real(name: str, out: PyTree[Array]) -> None:
-    is_real = lambda x: eqx.is_array_like(x) and not jnp.iscomplexobj(x)
-    if not all(map(is_real, jtu.tree_leaves(out))):
+    if not all(map(_is_real, jtu.tree_leaves(out))):
         raise ValueError(
             f"`{name}` must return real numbers; got {eqx.tree_pformat(out)}. Take "
             "`jnp.real` of numbers that are mathematically real, such as <psi| A |psi>."
         )
+
+
+def _is_real(x: Any) -> bool:
+    return eqx.is_array_like(x) and not jnp.iscomplexobj(x)
 
 
 class HamiltonianNoise(diffrax.AbstractTerm):
@@ -226,11 +247,17 @@ class HamiltonianNoise(diffrax.AbstractTerm):
         return self.path.evaluate(t0, t1, **kwargs)
 
     def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
-        # For each array of the state, with a trailing axis of noises.
+        # For each array of the state, with a trailing axis of noises: what Diffrax's own
+        # solvers ask for, if they take several stages with one field.
         hamiltonians = self._checked(t, y, args)
-        flat = lambda y: jfu.ravel_pytree(hamiltonians(y))[0]
-        last = lambda x: jnp.moveaxis(x, 0, -1)
-        dp, dq = jtu.tree_map(last, jax.jacrev(flat)(y))
+
+        def flat(y: _State) -> Array:
+            return jfu.ravel_pytree(hamiltonians(y))[0]
+
+        def noises_last(x: Array) -> Array:
+            return jnp.moveaxis(x, 0, -1)
+
+        dp, dq = jtu.tree_map(noises_last, jax.jacrev(flat)(y))
         return (-(dq**ω)).ω, dp
 
     def prod(self, vf: PyTree[Array], control: BM) -> _State:
@@ -240,16 +267,22 @@ class HamiltonianNoise(diffrax.AbstractTerm):
     def vf_prod(
         self, t: RealScalarLike, y: _State, args: Args, control: BM | OneNoise
     ) -> _State:
+        # The noise of a step is the gradient of one scalar, for any number of noises.
         hamiltonians = self._checked(t, y, args)
 
-        def scalar(p, q):
+        def one_of_them(p: _P, q: _P, one: OneNoise) -> Array:
+            if isinstance(self.noise, IndexedNoise):
+                H = self.noise.one(one.number, t, p, q, args)
+            else:
+                H = jfu.ravel_pytree(hamiltonians((p, q)))[0][one.number]
+            return H * jnp.asarray(one.increment, H.dtype)
+
+        def dot(H: Array, increment: Array) -> Array:
+            return jnp.sum(H * increment.astype(H.dtype))
+
+        def scalar(p: _P, q: _P) -> Any:
             if isinstance(control, OneNoise):
-                if isinstance(self.noise, IndexedNoise):
-                    H = self.noise.one(control.number, t, p, q, args)
-                else:
-                    H = jfu.ravel_pytree(hamiltonians((p, q)))[0][control.number]
-                return H * jnp.asarray(control.increment, H.dtype)
-            dot = lambda h, c: jnp.sum(h * c.astype(h.dtype))
+                return one_of_them(p, q, control)
             dots = jtu.tree_map(dot, hamiltonians((p, q)), control)
             return sum(jtu.tree_leaves(dots))
 
@@ -258,14 +291,19 @@ class HamiltonianNoise(diffrax.AbstractTerm):
     def is_vf_expensive(self, t0, t1, y, args) -> bool:
         # `vf` takes one reverse pass per noise, `vf_prod` a single one.
         struct = increment_struct(self.path)
-        return sum(s.size for s in jtu.tree_leaves(struct)) > 2
+        return sum(leaf.size for leaf in jtu.tree_leaves(struct)) > 2
 
-    def _checked(self, t, y: _State, args) -> Callable:
+    def _checked(self, t: RealScalarLike, y: _State, args: Args) -> Callable:
         """The noise Hamiltonians as a function of the state. Raises a `ValueError` if they
         do not depend on it."""
         check_pair(y)
         struct = increment_struct(self.path)
-        hamiltonians = lambda y: self._hamiltonians(t, y[0], y[1], args, struct)
+
+        def hamiltonians(y: _State) -> PyTree[Array]:
+            p, q = y
+            return self._hamiltonians(t, p, q, args, struct)
+
+        # Their gradient would be zero, and the noise missing without a word.
         if Dependence(hamiltonians, y).independent(lambda y: y):
             raise ValueError(
                 "`noise` does not depend on the state, so there is no noise. Return "
@@ -275,27 +313,45 @@ class HamiltonianNoise(diffrax.AbstractTerm):
             )
         return hamiltonians
 
-    def _hamiltonians(self, t, p, q, args, struct) -> PyTree[Array]:
+    def _hamiltonians(
+        self,
+        t: RealScalarLike,
+        p: _P,
+        q: _P,
+        args: Args,
+        struct: PyTree[jax.ShapeDtypeStruct],
+    ) -> PyTree[Array]:
         """The noise Hamiltonians, in the structure and shapes of the path."""
-        H = evaluated("noise", self.noise, t, p, q, args=args)
-        # A single noise may be a scalar.
-        fits = lambda h, s: jnp.shape(h) == s.shape or jnp.size(h) == s.size == 1
-        if jtu.tree_structure(H) != jtu.tree_structure(struct) or not all(
-            map(fits, jtu.tree_leaves(H), jtu.tree_leaves(struct))
-        ):
+        if isinstance(self.noise, IndexedNoise):
+            # It gives advice on the errors of its function by itself.
+            H = self.noise(t, p, q, args)
+        else:
+            H = evaluated("noise", self.noise, t, p, q, args=args)
+        if not _fit(H, struct):
             raise ValueError(
                 "`noise` must return one Hamiltonian for each noise of the path, which has "
                 f"shape {shapes(struct)}; got shape {shapes(H)}. Return an array of shape "
                 "`(m,)` and construct the path with `shape=(m,)`."
             )
         _check_real("noise", H)
-        return jtu.tree_map(lambda h, s: jnp.reshape(h, s.shape), H, struct)
+        return jtu.tree_map(lambda leaf, s: jnp.reshape(leaf, s.shape), H, struct)
+
+
+def _fit(H: PyTree[Array], struct: PyTree[jax.ShapeDtypeStruct]) -> bool:
+    """Whether there is one Hamiltonian for each noise of a path."""
+    if jtu.tree_structure(H) != jtu.tree_structure(struct):
+        return False
+    pairs = zip(jtu.tree_leaves(H), jtu.tree_leaves(struct))
+    # A single noise may be a scalar.
+    return all(
+        jnp.shape(leaf) == s.shape or jnp.size(leaf) == s.size == 1 for leaf, s in pairs
+    )
 
 
 def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Array]:
     """`H(*inputs, args)`, with advice on its errors."""
     # A copy, so that functions which modify `args` in place are the same in each trace.
-    copy = jtu.tree_map(lambda x: x, args)
+    copy = jtu.tree_map(lambda leaf: leaf, args)
     try:
         return H(*inputs, copy)
     except jax.errors.JAXTypeError as error:
@@ -305,12 +361,45 @@ def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Arr
             "instead of `if`, and `jnp` instead of `np`."
         ) from error
     except (TypeError, AttributeError) as error:
-        question = "was called with `args=None`. Was it left out?"
-        # An `IndexedNoise` calls this function twice.
-        asked = any(question in note for note in getattr(error, "__notes__", ()))
-        if args is None and "None" in str(error) and not asked:
-            error.add_note(f"`{name}` {question}")
+        if args is None and _uses_args(H, inputs):
+            error.add_note(f"`{name}` was called with `args=None`. Was it left out?")
         raise
+
+
+def _uses_args(H: Callable, inputs: tuple) -> bool:
+    """Whether a function that fails without `args` does anything with them before."""
+    try:
+        H(*inputs, _NoArgs())
+    except _Used:
+        return True
+    except Exception:
+        return False
+    return False
+
+
+class _Used(Exception):
+    """Raised by `_NoArgs`."""
+
+
+class _NoArgs:
+    """In the place of `args`: raises an exception of its own at every use, which tells the
+    error of an absent `args` from others."""
+
+
+def _raise_used(*operands: Any) -> Any:
+    del operands
+    raise _Used
+
+
+# Python looks operators up in the class, and all else, as JAX does, by `__getattr__`.
+_OPERATORS = "add sub mul truediv pow matmul".split()
+_USES = [
+    *"getattr getitem iter len call bool float neg lt le gt ge".split(),
+    *_OPERATORS,
+    *(f"r{operator}" for operator in _OPERATORS),
+]
+for _use in _USES:
+    setattr(_NoArgs, f"__{_use}__", _raise_used)
 
 
 def symplectic_gradient(scalar: Callable, y: _State) -> _State:
@@ -326,11 +415,15 @@ def is_hamiltonian(term: diffrax.AbstractTerm) -> bool:
 
 
 def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
-    """The `structure` that the user asserted for a term."""
+    """The `structure` that the user asserted for a term, and for all parts of it."""
     asserted = {part.structure for part in _parts(term)}
     return asserted.pop() if len(asserted) == 1 else None
 
 
 def _parts(term: diffrax.AbstractTerm) -> list[_Drift | HamiltonianNoise]:
-    ours = lambda x: isinstance(x, _Drift | HamiltonianNoise)
-    return [x for x in jtu.tree_leaves(term, is_leaf=ours) if ours(x)]
+    """What comes from Hamiltonians in a term, which may be wrapped or have friction."""
+    return [x for x in jtu.tree_leaves(term, is_leaf=_is_part) if _is_part(x)]
+
+
+def _is_part(x: Any) -> bool:
+    return isinstance(x, _Drift | HamiltonianNoise)

@@ -122,28 +122,32 @@ def bath_terms(
             "Pass both a `temperature` and a `path` with the shape of `q`, or for friction "
             "without noise neither of them."
         )
-    driven = None if path is None else as_path(path)
-    struct = None if driven is None else increment_struct(driven)
-    friction = checked_friction(friction, struct)
-    term = diffrax.ODETerm(Friction(H0, friction))
-    if driven is None:
-        return diffrax.MultiTerm(term)
-    noise = BathNoise(friction, checked_temperature(temperature), driven)
-    return diffrax.MultiTerm(term, noise)
+    if path is None:
+        # The shape of the momenta is known in the solve only.
+        field = Friction(H0, checked_friction(friction, None))
+        return diffrax.MultiTerm(diffrax.ODETerm(field))
+    path = as_path(path)
+    field = Friction(H0, checked_friction(friction, increment_struct(path)))
+    # The same friction in both, so that they cannot get out of balance.
+    noise = BathNoise(field.friction, checked_temperature(temperature), path)
+    return diffrax.MultiTerm(diffrax.ODETerm(field), noise)
 
 
 def split_friction(terms: PyTree[diffrax.AbstractTerm]) -> tuple[tuple, tuple, tuple]:
     """The drift without friction, the friction, and the noise."""
     drift, noise = split_terms(terms)
-    return *friction_apart(drift), noise
+    rest, friction = friction_apart(drift)
+    return rest, friction, noise
 
 
 def friction_apart(drift: tuple) -> tuple[tuple, tuple]:
     """The drift without friction, and the friction."""
-    rest, friction = [], []
+    rest = []
+    friction = []
     for term in drift:
         own = unwrapped(term)
         field = own.vector_field if isinstance(own, diffrax.ODETerm) else None
+        # `replaced` keeps the direction of time, which Diffrax wraps around each term.
         if isinstance(field, DriftWithFriction):
             rest.append(replaced(term, diffrax.ODETerm(field.drift)))
             friction.append(replaced(term, diffrax.ODETerm(field.friction)))
@@ -158,12 +162,21 @@ class AbstractFriction(eqx.Module):
     """A vector field `(-G v, 0)` with the velocities `v`."""
 
     @abc.abstractmethod
+    def velocity(self, t: RealScalarLike, y: tuple[_P, _P], args: Args) -> _P:
+        """The velocities `v`."""
+
+    @abc.abstractmethod
     def force(self, t: RealScalarLike, q: _P, args: Args, velocity: _P) -> _P:
         """`-G v`."""
 
-    @abc.abstractmethod
-    def __call__(self, t: RealScalarLike, y: tuple[_P, _P], args: Args) -> Any:
+    def __call__(
+        self, t: RealScalarLike, y: tuple[_P, _P], args: Args
+    ) -> tuple[_P, _P]:
         """`(-G v, 0)`."""
+        check_pair(y)
+        _, q = y
+        force = self.force(t, q, args, self.velocity(t, y, args))
+        return force, jtu.tree_map(jnp.zeros_like, q)
 
 
 class Friction(AbstractFriction):
@@ -172,22 +185,21 @@ class Friction(AbstractFriction):
     H0: _Hamiltonian
     friction: Any
 
+    def velocity(self, t, y, args):
+        p, q = y
+
+        def energy(p: _P) -> Array:
+            return scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
+
+        return jax.grad(energy)(p)
+
     def force(self, t, q, args, velocity):
         return (-(product_with(self.friction, t, q, args, velocity) ** ω)).ω
 
-    def __call__(self, t, y, args):
-        check_pair(y)
-        p, q = y
-
-        def scalar(p):
-            return scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
-
-        force = self.force(t, q, args, jax.grad(scalar)(p))
-        return force, jtu.tree_map(jnp.zeros_like, q)
-
 
 class DriftWithFriction(eqx.Module):
-    """A vector field with friction on its velocities `dq`."""
+    """A vector field with friction on its velocities `dq`, in one term: the solvers of
+    Diffrax for stochastic equations take one drift and one noise."""
 
     drift: Callable
     friction: AbstractFriction
@@ -211,7 +223,10 @@ class BathNoise(diffrax.AbstractTerm):
     def vf(self, t: RealScalarLike, y: tuple[_P, _P], args: Args) -> PyTree[Array]:
         # For each array of the state, with a trailing axis of noises.
         flat, unravel = raveled(increment_struct(self.path))
-        product = lambda unit: self.vf_prod(t, y, args, unravel(unit))
+
+        def product(unit: Array) -> tuple[_P, _P]:
+            return self.vf_prod(t, y, args, unravel(unit))
+
         return jax.vmap(product, out_axes=-1)(jnp.eye(flat.size, dtype=flat.dtype))
 
     def prod(self, vf: PyTree[Array], control: BM) -> tuple[_P, _P]:

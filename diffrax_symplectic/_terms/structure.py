@@ -3,21 +3,21 @@ the vector fields depend on, or by the user's assertion."""
 
 import functools as ft
 from collections.abc import Callable
-from typing import get_args, NamedTuple
+from typing import Any, get_args, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
-import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array, Float, PyTree
 
 from .._arguments import check_pair, pair_fault
 from .._brownian import raveled
-from .._compat import unwrapped, ω
+from .._compat import at_trace_time, is_traced, unwrapped, ω
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
 from .dependence import Dependence
@@ -27,12 +27,31 @@ from .vector_fields import apply, check_increments, control_struct, split_terms
 
 
 class Fault(NamedTuple):
-    """Why a system does not have a structure, advice, and whether the fault is a force of
-    plain terms that depends on the momentum, such as friction."""
+    """Why a system does not have a structure.
 
-    reason: str
+    - `cause`: what is wrong, as a part of a sentence.
+    - `advice`: what to do, in sentences.
+    - `friction`: whether all that is wrong is a force of plain terms that depends on the
+        momentum, such as friction.
+    - `wrong_way_round`: whether nothing else would be wrong with the halves of the state
+        exchanged.
+    """
+
+    cause: str
     advice: str
     friction: bool = False
+    wrong_way_round: bool = False
+
+    @property
+    def reason(self) -> str:
+        """The cause, and whether the state may be the wrong way round."""
+        if not self.wrong_way_round:
+            return self.cause
+        return (
+            f"{self.cause}. With the halves of the state exchanged it would be separable: "
+            "is the state the wrong way round? It is `(p, q)`, momentum first, not "
+            "(position, velocity)"
+        )
 
 
 def check_structure(
@@ -57,6 +76,8 @@ def check_structure(
             return
         advice = fault.advice
         if has_lifted((drift, noise)):
+            # Their Hamiltonians are functions of both halves of the state, however they
+            # are written.
             advice = f"For spins and complex amplitudes {_GENERAL}."
         raise ValueError(f"`{solver}` needs {needs}, but {fault.reason}. {advice}")
 
@@ -77,68 +98,114 @@ def separable_fault(
 ) -> Fault | None:
     """Why the system is not of the form `H0 = V(p) + U(t, q)`, `H_k = U_k(t, q)`; `None` if
     it is."""
-    if fault := pair_fault(y0):
-        return Fault("the state is not a pair (p, q)", fault)
-    flows = lambda terms: [
-        (term, _flow(term, t0, y0, args)) for term in _not_asserted(terms, "separable")
-    ]
+    if advice := pair_fault(y0):
+        return Fault("the state is not a pair (p, q)", advice)
+
+    def traced(terms: tuple) -> list["_Traced"]:
+        left = _not_asserted(terms, "separable")
+        return [_Traced(term, _flow(term, t0, y0, args)) for term in left]
+
+    # Apart from its friction, a drift is still one of a Hamiltonian, whose faults are named
+    # by its derivatives.
+    rest, friction = friction_apart(drift)
+    drift_flows = traced((*rest, *friction))
+    noise_flows = traced(noise)
     still = ft.partial(_is_zero, t0, y0, args)
-    of = flows(sum(friction_apart(drift), ())), flows(noise)
-    here = _faults(0, *of, still)
+    here = _faults(0, drift_flows, noise_flows, still)
     if not here:
         return None
-    exchanged = _faults(1, *of, still)
-    only_friction = lambda faults: all(fault.friction for fault in faults)
-    reason, advice, _ = here[0]
-    friction = only_friction(here)
-    if not friction and only_friction(exchanged):
-        reason, friction = f"{reason}. {WRONG_WAY_ROUND}", len(exchanged) > 0
-    return Fault(reason, f"{FRICTION} {advice}" if friction else advice, friction)
+    # As it would be for (position, velocity), the order of many other packages.
+    exchanged = _faults(1, drift_flows, noise_flows, still)
+    first = here[0]
+    only_friction = all(fault.friction for fault in here)
+    wrong_way_round = not only_friction and all(fault.friction for fault in exchanged)
+    if wrong_way_round:
+        only_friction = len(exchanged) > 0
+    advice = f"{FRICTION} {first.advice}" if only_friction else first.advice
+    return Fault(first.cause, advice, only_friction, wrong_way_round)
+
+
+class _Traced(NamedTuple):
+    """A term, and what the change of the state by it depends on."""
+
+    term: diffrax.AbstractTerm
+    flow: Dependence
+
+
+class _Forbidden(NamedTuple):
+    """A dependence that no drift of a separable system has.
+
+    - `part`: selects a half of the change of the state.
+    - `of`: selects, of the inputs `(t, y, control)`, what it must not depend on.
+    - `derivative`: says so of a Hamiltonian.
+    - `rate`: says so of a plain term.
+    - `by_friction`: whether friction in a plain term does this.
+    """
+
+    part: Callable
+    of: Callable
+    derivative: str
+    rate: str
+    by_friction: bool = False
 
 
 def _faults(
     p: int,
-    drift: list[tuple[diffrax.AbstractTerm, Dependence]],
-    noise: list[tuple[diffrax.AbstractTerm, Dependence]],
+    drift: list[_Traced],
+    noise: list[_Traced],
     still: Callable[[diffrax.AbstractTerm, int], bool],
 ) -> list[Fault]:
-    """The faults, if momenta are the first half of the state, `p = 0`, or the second,
+    """All faults, if momenta are the first half of the state, `p = 0`, or the second,
     `p = 1`. `still` says whether a noise term leaves a half of the state unchanged."""
-    q, faults, advice = 1 - p, [], _advice("separable")
-    dp, dq = (lambda out: out[p]), (lambda out: out[q])
-    of_p, of_q = (lambda t, y, control: y[p]), (lambda t, y, control: y[q])
+    q = 1 - p
+    advice = _advice("separable")
+
+    def momenta(t: Any, y: Y, control: Any) -> PyTree:
+        return y[p]
+
+    def positions(t: Any, y: Y, control: Any) -> PyTree:
+        return y[q]
+
+    def of_momenta(change: Y) -> PyTree:
+        return change[p]
+
+    def of_positions(change: Y) -> PyTree:
+        return change[q]
+
+    forbidden = (
+        _Forbidden(
+            of_momenta, momenta, "dH0/dq depends on p", "dp/dt depend on p", True
+        ),
+        _Forbidden(of_positions, positions, "dH0/dp depends on q", "dq/dt depend on q"),
+        _Forbidden(of_positions, _times, "dH0/dp depends on t", "dq/dt depend on t"),
+    )
+    faults = []
     beside = " besides H0" if len(drift) > 1 else ""
     for term, flow in drift:
-        for part, of, derivative, rate in (
-            (dp, of_p, "dH0/dq depends on p", "dp/dt depend on p"),
-            (dq, of_q, "dH0/dp depends on q", "dq/dt depend on q"),
-            (dq, _of_t, "dH0/dp depends on t", "dq/dt depend on t"),
-        ):
-            if not flow.independent(of, part):
-                plain = not is_hamiltonian(term)
-                reason = f"a drift term{beside} makes {rate}" if plain else derivative
-                faults.append(Fault(reason, advice, friction=plain and part is dp))
+        plain = not is_hamiltonian(term)
+        for rule in forbidden:
+            if not flow.independent(rule.of, rule.part):
+                of_plain = f"a drift term{beside} makes {rule.rate}"
+                cause = of_plain if plain else rule.derivative
+                faults.append(Fault(cause, advice, plain and rule.by_friction))
     for term, flow in noise:
-        hamiltonian = is_hamiltonian(term)
+        plain = not is_hamiltonian(term)
         # The change of q is linear in the increment, so it is zero if it does not depend
         # on the increment.
-        if not flow.independent(lambda t, y, control: control, dq) and not still(
-            term, q
-        ):
-            plain = "a noise term changes q, the second half of the state"
-            reason = "dH_k/dp is not zero" if hamiltonian else plain
-            faults.append(Fault(reason, advice))
-        elif not flow.independent(of_p, dp):
-            plain = "a noise term changes p by an amount that depends on p"
-            reason = "dH_k/dq depends on p" if hamiltonian else plain
-            faults.append(Fault(reason, advice))
+        moves_q = not flow.independent(_increments, of_positions) and not still(term, q)
+        if moves_q:
+            of_plain = "a noise term changes q, the second half of the state"
+            faults.append(Fault(of_plain if plain else "dH_k/dp is not zero", advice))
+        elif not flow.independent(momenta, of_momenta):
+            of_plain = "a noise term changes p by an amount that depends on p"
+            faults.append(Fault(of_plain if plain else "dH_k/dq depends on p", advice))
     return faults
 
 
 def additive_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
     """Why the noise is not additive; `None` if it does not depend on the state."""
     for term in _not_asserted(noise, "additive"):
-        if not _flow(term, t0, y0, args).independent(lambda t, y, control: y):
+        if not _flow(term, t0, y0, args).independent(_states):
             of = " = (-dH_k/dq, dH_k/dp)" if is_hamiltonian(term) else ""
             reason = f"the noise b_k{of} depends on the state"
             return Fault(reason, _advice("additive"))
@@ -148,7 +215,7 @@ def additive_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault
 def constant_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
     """Why additive noise is not constant; `None` if it does not depend on time."""
     for term in noise:
-        if not _flow(term, t0, y0, args).independent(_of_t):
+        if not _flow(term, t0, y0, args).independent(_times):
             return Fault("it depends on time", "Use `SRKs4`, which accepts such noise.")
     return None
 
@@ -168,13 +235,16 @@ def check_stratonovich(
     if not isinstance(solver, diffrax.AbstractItoSolver):
         return
     drift, noise = split_terms(terms)
-    these, instead = "`expectation` takes all terms", ", or use `monte_carlo`"
-    if not all_terms:
+    if all_terms:
+        these = "`expectation` takes all terms"
+        instead = ", or use `monte_carlo`"
+    else:
         # A drift beside `H0` may be the correction from one sense to the other.
         if not all(map(is_hamiltonian, drift)):
             return
         noise = tuple(filter(is_hamiltonian, noise))
-        these, instead = "The terms of `hamiltonian_terms` are", ""
+        these = "The terms of `hamiltonian_terms` are"
+        instead = ""
     if additive_fault(noise, t0, y0, args) and separable_fault((), noise, t0, y0, args):
         raise ValueError(
             f"`{type(solver).__name__}` solves equations in the sense of Ito. {these} in "
@@ -187,32 +257,46 @@ def check_stratonovich(
 def _flow(term: diffrax.AbstractTerm, t0, y0: Y, args: Args) -> Dependence:
     """The dependencies of the change by a term on time, state and control."""
     t0 = jnp.asarray(t0, jnp.result_type(float))
-    control = control_struct(term, t0)
-    change = lambda t, y, control: term.vf_prod(t, y, args, control)
-    return Dependence(change, t0, y0, control)
+
+    def change(t: RealScalarLike, y: Y, control: Any) -> Y:
+        return term.vf_prod(t, y, args, control)
+
+    return Dependence(change, t0, y0, control_struct(term, t0))
 
 
-def _is_zero(t0, y0: Y, args: Args, term: diffrax.AbstractTerm, half: int) -> bool:
+def _is_zero(
+    t0: RealScalarLike, y0: Y, args: Args, term: diffrax.AbstractTerm, half: int
+) -> bool:
     """Whether a plain noise term leaves one half of the state unchanged because its matrix
     has a block of zeros that is known while tracing."""
     if is_hamiltonian(term):
         return False
     struct = control_struct(term, t0)
-    with jax.ensure_compile_time_eval():
+    with at_trace_time():
         flat, unravel = raveled(struct)
         changes = [
             unwrapped(term).vf_prod(t0, y0, args, unravel(unit))[half]
             for unit in jnp.eye(flat.size, dtype=flat.dtype)
         ]
-    known = lambda x: not isinstance(x, jax.core.Tracer)
-    return all(known(x) and not np.asarray(x).any() for x in jtu.tree_leaves(changes))
+    leaves = jtu.tree_leaves(changes)
+    return not any(is_traced(leaf) or np.asarray(leaf).any() for leaf in leaves)
 
 
-def _of_t(t, y, control):
+# Parts of the inputs of `_flow`.
+def _times(t: Any, y: Y, control: Any) -> Any:
     return t
 
 
-def _not_asserted(terms: tuple, structure: str) -> list:
+def _states(t: Any, y: Y, control: Any) -> Y:
+    return y
+
+
+def _increments(t: Any, y: Y, control: Any) -> Any:
+    return control
+
+
+def _not_asserted(terms: tuple, structure: str) -> list[diffrax.AbstractTerm]:
+    """The terms of which the user has not asserted the structure."""
     return [term for term in terms if asserted_structure(term) != structure]
 
 
@@ -233,10 +317,6 @@ _GENERAL = (
 )
 
 
-WRONG_WAY_ROUND = (
-    "With the halves of the state exchanged it would be separable: is the state the wrong "
-    "way round? It is `(p, q)`, momentum first, not (position, velocity)"
-)
 FRICTION = (
     "Take friction from `langevin_terms(H0, friction, temperature, path)`: `BAOAB()`, "
     "`LangevinMiddle()` and `Damped(solver)` treat it by a step of its own."
@@ -252,29 +332,42 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     t0 = jnp.asarray(t0, jnp.result_type(float))
     struct = [control_struct(term, t0) for term in noise]
     flat, unravel = raveled((jtu.tree_map(jnp.asarray, y0), struct, struct))
-    largest = lambda y: jnp.max(jnp.abs(jfu.ravel_pytree(y)[0]))
 
     @eqx.filter_jit
     @jax.vmap
-    def sizes(point):
+    def sizes(point: Float[Array, " n"]) -> tuple[Array, Array]:
+        """The sizes of `Db_x b_z` and of the bracket, at a state and two combinations."""
         y, x, z = unravel(point)
-        b = lambda control: lambda y: apply(noise, control, args, t0, y)
-        first = jax.jvp(b(z), (y,), (b(x)(y),))[1]
-        second = jax.jvp(b(x), (y,), (b(z)(y),))[1]
-        bracket = (first**ω - second**ω).ω
-        return largest(first), largest(bracket)
+        along_x = ft.partial(apply, noise, x, args, t0)
+        along_z = ft.partial(apply, noise, z, args, t0)
+        _, first = jax.jvp(along_z, (y,), (along_x(y),))
+        _, second = jax.jvp(along_x, (y,), (along_z(y),))
+        return _largest(first), _largest((first**ω - second**ω).ω)
 
     try:
         with jax.disable_jit(False):
-            # Most functions are defined between 0 and 1.
-            draw = lambda law: law(jr.key(0), (4, *flat.shape), flat.dtype)
-            points = jnp.concatenate([draw(jr.normal), draw(jr.uniform)])
-            size, bracket = sizes(points)
+            size, bracket = sizes(_random_points(flat))
             finite = jnp.isfinite(size) & jnp.isfinite(bracket)
+            # What is left of brackets that cancel are rounding errors of their summands.
             small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
             found = jax.block_until_ready(jnp.any(finite) & jnp.all(small | ~finite))
     except RuntimeError:
         # From a user's `equinox.error_if`, at states that the user did not choose.
         return False
     # Inside `jax.jit` the result is not known.
-    return not isinstance(found, jax.core.Tracer) and bool(found)
+    return not is_traced(found) and bool(found)
+
+
+def _random_points(flat: Float[Array, " n"]) -> Float[Array, "8 n"]:
+    """Four points of either sign, and four between 0 and 1, where most functions are
+    defined."""
+    shape = (4, *flat.shape)
+    anywhere = jr.normal(jr.key(0), shape, flat.dtype)
+    positive = jr.uniform(jr.key(0), shape, flat.dtype)
+    return jnp.concatenate([anywhere, positive])
+
+
+def _largest(y: Y) -> Array:
+    """The largest entry of a state, without its sign."""
+    flat, _ = jfu.ravel_pytree(y)
+    return jnp.max(jnp.abs(flat))

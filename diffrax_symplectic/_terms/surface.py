@@ -8,7 +8,6 @@ from typing import Any, NamedTuple, TypeAlias
 import diffrax
 import equinox as eqx
 import jax
-import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -17,6 +16,7 @@ from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._arguments import check_pair, check_state, shapes
 from .._batch import batched_like, error_if_alone
+from .._compat import is_traced
 from .._custom_types import Args, RealScalarLike
 from .._root_finder import correction, max_norm, solve_matrix
 from .constraint import Constraint, constraint_of, without_constraint
@@ -32,14 +32,17 @@ _Multipliers: TypeAlias = Float[Array, " c"]
 
 # Newton's method takes three or four steps, and up to twice as many from far away.
 _MOST_STEPS = 30
-# Changes of positions below so many units in the last place of the largest one, which no
-# longer shrink, are rounding errors.
+# Corrections that move positions by at most this many units in the last place of the
+# largest one, and that do not shrink below this fraction of the one before, are rounding
+# errors: far from rounding errors each is a small fraction of the one before.
 _ROUNDING = 100.0
 _SHRINK = 0.25
 
 
 class Frame(NamedTuple):
     """The directions normal to the surface at a position.
+
+    A step uses those at its ends and at its middle several times, so they are kept.
 
     - `q`: the position.
     - `normals`: the gradients of the constraints, `J`.
@@ -74,26 +77,34 @@ class Surface(NamedTuple):
         constraint = constraint_of(terms)
         assert constraint is not None
         drift, _, _ = split_friction(without_constraint(terms))
-        _, q = y
-        _, unravel = jfu.ravel_pytree(q)
+        _, q0 = y
+        _, unravel = jfu.ravel_pytree(q0)
 
-        def residual(x: _Vector) -> _Multipliers:
-            return _values(constraint, unravel(x), args)
+        def residual(q: _Vector) -> _Multipliers:
+            return _values(constraint, unravel(q), args)
 
-        def velocity(x: _Vector) -> _Vector:
-            return jfu.ravel_pytree(rate(drift, t, (unravel(x), q), args)[1])[0]
+        def velocity(p: _Vector) -> _Vector:
+            # For separable H0, at any position.
+            _, dq = rate(drift, t, (unravel(p), q0), args)
+            return jfu.ravel_pytree(dq)[0]
 
         return Surface(residual, velocity)
 
     def frame(self, q: _Vector) -> Frame:
+        """The directions normal to the surface at this position."""
         normals = jax.jacrev(self.residual)(q)
         along = self._pushed(normals)
         return Frame(q, normals, along, _products(normals, along))
 
     def _pushed(self, impulses: Float[Array, "c n"]) -> Float[Array, "c n"]:
         """The change of the velocity by each of these changes of the momentum."""
+        # The velocity is linear, so its derivative is the same at every momentum.
         still = jnp.zeros_like(impulses[0])
-        return jax.vmap(lambda x: jax.jvp(self.velocity, (still,), (x,))[1])(impulses)
+
+        def change(impulse: _Vector) -> _Vector:
+            return jax.jvp(self.velocity, (still,), (impulse,))[1]
+
+        return jax.vmap(change)(impulses)
 
     def tangent(
         self,
@@ -104,10 +115,12 @@ class Surface(NamedTuple):
         """The momentum after the impulses of the constraint forces that make it tangent.
         An impulse changes the momentum by itself, or by its `response`."""
         if response is None:
-            gram, changes = at.gram, at.normals
+            gram = at.gram
+            changes = at.normals
         else:
             changes = jax.vmap(response)(at.normals)
             gram = _products(at.normals, self._pushed(changes))
+        # How fast the momentum would leave the surface.
         speeds = _products(at.normals, self.velocity(p)[None])[:, 0]
         return p - _combined(solve_matrix(gram, speeds), changes)
 
@@ -128,15 +141,21 @@ class Surface(NamedTuple):
         """
         time = jnp.asarray(time, p.dtype)
         free = at.q + time * self.velocity(p)
-        moved = lambda x: free - _combined(x, at.along)
-        off = lambda x: self.residual(moved(x))
         size = max_norm(free)
 
-        def solve(off: Callable, start: _Multipliers):
+        # The unknowns are `time * lambda`, so that `time` may be small.
+        def moved(multipliers: _Multipliers) -> _Vector:
+            return free - _combined(multipliers, at.along)
+
+        def off(multipliers: _Multipliers) -> _Multipliers:
+            return self.residual(moved(multipliers))
+
+        def solve(off: Callable, start: _Multipliers) -> tuple[_Multipliers, Array]:
             x, found = _newton(off, at.along, size, start, jnp.asarray(pending))
             # As a float: `custom_root` gives other types a tangent of a wrong type.
             return x, found.astype(x.dtype)
 
+        # Derivatives come from the equations, and not through the loop that solves them.
         start = jnp.zeros(len(at.gram), p.dtype)
         x, found = lax.custom_root(off, start, solve, _tangent_solve, has_aux=True)
         return p - _combined(x / time, at.normals), moved(x), found > 0
@@ -153,10 +172,14 @@ class Surface(NamedTuple):
 
     def off(self, p: _Vector, at: Frame) -> Bool[Array, ""]:
         """Whether a state is farther from the surface than rounding errors explain."""
-        correction = _combined(solve_matrix(at.gram, self.residual(at.q)), at.along)
+        # To first order, how far away the surface is.
+        way = _combined(solve_matrix(at.gram, self.residual(at.q)), at.along)
+        # Between rounding errors, also of long sums, and any mistake of the user's.
         near = float(jnp.finfo(p.dtype).eps) ** (2 / 3)
-        on = max_norm(correction) <= near * max_norm(at.q)
-        return ~(on & (max_norm(p - self.tangent(p, at)) <= near * max_norm(p)))
+        position_is_on = max_norm(way) <= near * max_norm(at.q)
+        normal_part = p - self.tangent(p, at)
+        momentum_is_tangent = max_norm(normal_part) <= near * max_norm(p)
+        return ~(position_is_on & momentum_is_tangent)
 
 
 def _products(a: Float[Array, "c n"], b: Float[Array, "d n"]) -> Float[Array, "c d"]:
@@ -165,6 +188,7 @@ def _products(a: Float[Array, "c n"], b: Float[Array, "d n"]) -> Float[Array, "c
 
 
 def _combined(x: _Multipliers, vectors: Float[Array, "c n"]) -> _Vector:
+    """The sum of the vectors times these numbers."""
     return _total(x[:, None] * vectors)
 
 
@@ -175,6 +199,7 @@ _SHORT = 32
 
 
 def _total(x: Float[Array, "n ..."]) -> Float[Array, "..."]:
+    """The sum over the first axis."""
     return ft.reduce(operator.add, x) if len(x) <= _SHORT else jnp.sum(x, axis=0)
 
 
@@ -196,6 +221,7 @@ def check_start(
     `ValueError` if either is known while tracing, and for constraints that no solver takes.
     Otherwise it is an error when run, but not in a batch."""
     _check_masses(terms, t0, y0, args)
+    # A check has no derivative. Taking one would trace it again.
     fixed = jtu.tree_map(_without_derivative, (y0, args))
     dependent, off = _faults(terms, t0, *fixed)
     return _refused(dependent, _DEPENDENT), _refused(off, _OFF)
@@ -207,7 +233,11 @@ def _without_derivative(x: Any) -> Any:
 
 # Outside of a program its operations would be compiled one by one.
 @eqx.filter_jit
-def _faults(terms, t0, y0, args) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+def _faults(
+    terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether the constraints are dependent at `y0`, and, unless they are, whether it is
+    off them."""
     surface = Surface.of(terms, t0, y0, args)
     (p, _), (q, _) = map(jfu.ravel_pytree, y0)
     at = surface.frame(q)
@@ -216,19 +246,25 @@ def _faults(terms, t0, y0, args) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
 
 
 def _refused(fault: Bool[Array, ""], advice: str) -> Bool[Array, ""]:
-    if isinstance(fault, jax.core.Tracer):
+    """The fault, with a `ValueError` where it is known."""
+    if is_traced(fault):
         return error_if_alone(fault, advice)
     if fault:
         raise ValueError(advice)
     return fault
 
 
-def _check_masses(terms, t0, y0, args) -> None:
+def _check_masses(
+    terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
+) -> None:
     """Raises a `ValueError` unless velocities are linear in the momenta."""
     surface = Surface.of(terms, t0, y0, args)
-    p, _ = jfu.ravel_pytree(y0[0])
-    pushed = lambda p, x: jax.jvp(surface.velocity, (p,), (x,))[1]
-    if not Dependence(pushed, p, p).independent(lambda p, x: p):
+    p0, _ = jfu.ravel_pytree(y0[0])
+
+    def pushed(p: _Vector, impulse: _Vector) -> _Vector:
+        return jax.jvp(surface.velocity, (p,), (impulse,))[1]
+
+    if not Dependence(pushed, p0, p0).independent(lambda p, impulse: p):
         raise ValueError(
             "Terms with a `constraint` need constant masses, H0 = p . M^-1 p / 2 + "
             "U(t, q), but the second derivative of H0 by p depends on p. Write squares of "
@@ -289,7 +325,7 @@ def constrained_state(
         )
     _check_masses(terms, t, y0, args)
     y1, found, dependent = _projected(terms, t, y0, args)
-    if not isinstance(found, jax.core.Tracer):
+    if not is_traced(found):
         if dependent:
             raise ValueError(_DEPENDENT)
         if not found:
@@ -302,18 +338,23 @@ def constrained_state(
 
 
 @eqx.filter_jit
-def _projected(terms, t, y0, args) -> tuple[PyTree, Bool[Array, ""], Bool[Array, ""]]:
+def _projected(
+    terms: PyTree[diffrax.AbstractTerm], t: RealScalarLike, y0: PyTree, args: Args
+) -> tuple[PyTree, Bool[Array, ""], Bool[Array, ""]]:
     """The nearest allowed state, whether Newton's method found it, and whether the
     constraints are dependent there."""
     surface = Surface.of(terms, t, y0, args)
     (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
+    # Without a momentum, all of the way is that of the multipliers.
     _, q, found = surface.fly(jnp.zeros_like(p), surface.frame(q), 1.0)
     at = surface.frame(q)
-    y1 = unravel_p(surface.tangent(p, at)), unravel_q(q)
+    y1 = (unravel_p(surface.tangent(p, at)), unravel_q(q))
     return y1, found, surface.dependent(at)
 
 
 def _values(constraint: Constraint, q: PyTree, args: Args) -> _Multipliers:
+    """The constraints. Raises a `ValueError` unless they are a real array of shape
+    `(c,)`."""
     value = evaluated("constraint", constraint, q, args=args)
     real = eqx.is_array_like(value) and not jnp.iscomplexobj(value)
     if not real or jnp.ndim(value) != 1 or jnp.size(value) == 0:
@@ -326,8 +367,13 @@ def _values(constraint: Constraint, q: PyTree, args: Args) -> _Multipliers:
 
 
 class _Newton(NamedTuple):
-    """The multipliers, the largest change of a position by their last correction, the
-    number of corrections, and whether the next one is within the tolerance."""
+    """The state of Newton's method.
+
+    - `x`: the multipliers.
+    - `change`: the largest change of a position by their last correction.
+    - `number`: the number of corrections.
+    - `solved`: whether the next one would be within the tolerance.
+    """
 
     x: _Multipliers
     change: Scalar
@@ -346,27 +392,33 @@ def _newton(
     positions of this `size` by `x @ along`."""
     tolerance = float(jnp.finfo(start.dtype).eps) * size
 
-    def going(state: _Newton):
+    def going(state: _Newton) -> Bool[Array, ""]:
         left = pending & (state.number < _MOST_STEPS)
         return left & ~state.solved & ~jnp.isnan(state.change)
 
     def step(state: _Newton) -> _Newton:
-        _, diff, _ = correction(off, state.x, None)
-        change = max_norm(_combined(diff, along))
+        newton = correction(off, state.x, None)
+        change = max_norm(_combined(newton.change, along))
         before = jnp.where(state.number > 0, state.change, change)
-        # The next one is smaller at least by the same factor.
+        # The next one is smaller at least by the same factor. Without a division, since
+        # both may be zero.
         solved = change * jnp.minimum(change, before) <= tolerance * before
         rounded = (change <= _ROUNDING * tolerance) & (change >= _SHRINK * before)
-        x = state.x - diff
+        x = state.x - newton.change
         return _Newton(x, change, state.number + 1, solved | rounded)
 
-    zero, no = jnp.zeros((), start.dtype), jnp.array(False)
-    first = _Newton(start, zero, jnp.array(0), no)
+    first = _Newton(
+        x=start,
+        change=jnp.zeros((), start.dtype),
+        number=jnp.array(0),
+        solved=jnp.array(False),
+    )
     first = batched_like(first, (off(start), along, size, pending))
     last = lax.while_loop(going, step, first)
     return jnp.where(last.solved, last.x, 0), last.solved
 
 
 def _tangent_solve(apply: Callable, rhs: _Multipliers) -> _Multipliers:
+    """Solves the linear equations for the derivative of the multipliers."""
     matrix = jax.vmap(apply, out_axes=1)(jnp.eye(len(rhs), dtype=rhs.dtype))
     return solve_matrix(matrix, rhs)

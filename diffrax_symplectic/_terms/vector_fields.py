@@ -2,11 +2,12 @@
 Lie brackets of vector fields."""
 
 import functools as ft
+from collections.abc import Callable
+from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
-import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -39,14 +40,21 @@ def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
     parts = flattened(terms)
     if any(map(is_adjoint_term, parts)):
         raise ValueError(_BACKSOLVE)
-    ode = diffrax.ODETerm | ConstrainedDrift
-    is_ode = lambda term: isinstance(unwrapped(term), ode)
-    is_noise = [
-        len(brownian_paths(term)) > 0 or (i > 0 and not is_ode(term))
-        for i, term in enumerate(parts)
-    ]
-    drift = tuple(term for term, noise in zip(parts, is_noise) if not noise)
-    return drift, tuple(term for term, noise in zip(parts, is_noise) if noise)
+    drift = []
+    noise = []
+    for place, term in enumerate(parts):
+        # A term of another kind after the first may be driven by a path that Diffrax knows
+        # nothing of. It must not pass for a drift: most solvers treat noise differently.
+        other_kind = place > 0 and not _is_ode(term)
+        if len(brownian_paths(term)) > 0 or other_kind:
+            noise.append(term)
+        else:
+            drift.append(term)
+    return tuple(drift), tuple(noise)
+
+
+def _is_ode(term: diffrax.AbstractTerm) -> bool:
+    return isinstance(unwrapped(term), diffrax.ODETerm | ConstrainedDrift)
 
 
 def flattened(terms: diffrax.AbstractTerm) -> tuple:
@@ -60,39 +68,52 @@ def flattened(terms: diffrax.AbstractTerm) -> tuple:
 @eqx.filter_jit
 def apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> Y:
     """The sum over terms of vector field times control."""
-    parts = [term.vf_prod(t, y, args, c) for term, c in zip(terms, controls)]
+    pairs = zip(terms, controls)
+    parts = [term.vf_prod(t, y, args, control) for term, control in pairs]
     return _checked_sum(parts, y)
 
 
 def rate(drift: tuple, t: RealScalarLike, y: Y, args: Args) -> Y:
     """The rate of change of the state by the drift."""
     t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
+    # Over a step of size one, whose place does not matter to a drift driven by time.
     zero = jnp.zeros_like(t)
-    return apply(drift, [x.contr(zero, zero + 1) for x in drift], args, t, y)
+    controls = [term.contr(zero, zero + 1) for term in drift]
+    return apply(drift, controls, args, t, y)
 
 
 def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
     """Raises a `ValueError` unless these are terms that fit the state `y0`. (A PyTree of
     terms, as some Diffrax solvers take, is not checked further.)"""
-    is_term = lambda x: isinstance(x, diffrax.AbstractTerm)
-    if not any(map(is_term, jtu.tree_leaves(terms, is_leaf=is_term))):
+    if not any(map(_is_term, jtu.tree_leaves(terms, is_leaf=_is_term))):
         raise ValueError(
             "`terms` must be Diffrax terms, such as `hamiltonian_terms(H0, noise, path)`"
             f"; got {type(terms).__name__}."
         )
-    if is_term(terms):
-        parts = tuple(flattened(without_constraint(terms)))
-        check_increments(parts, t0, y0, args)
-        controls = eqx.filter_eval_shape(lambda: [x.contr(t0, t0) for x in parts])
-        eqx.filter_eval_shape(apply, parts, controls, args, t0, y0)
+    if not _is_term(terms):
+        return
+    parts = tuple(flattened(without_constraint(terms)))
+    # First, since its message names the term and its path.
+    check_increments(parts, t0, y0, args)
+
+    def changed(t: RealScalarLike) -> Y:
+        controls = [term.contr(t, t) for term in parts]
+        return apply(parts, controls, args, t0, y0)
+
+    eqx.filter_eval_shape(changed, t0)
+
+
+def _is_term(x: Any) -> bool:
+    return isinstance(x, diffrax.AbstractTerm)
 
 
 def check_increments(terms: tuple, t0: RealScalarLike, y0: Y, args: Args) -> None:
     """Raises a `ValueError` if a `ControlTerm` cannot multiply its vector field by the
     increments of its path. (The errors of JAX and Lineax name neither.)"""
 
-    def product(term):
-        field, increments = term.vf(t0, y0, args), term.contr(t0, t0)
+    def product(term: diffrax.AbstractTerm) -> Y:
+        field = term.vf(t0, y0, args)
+        increments = term.contr(t0, t0)
         try:
             return term.prod(field, increments)
         except (TypeError, ValueError) as error:
@@ -112,6 +133,7 @@ def check_increments(terms: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Non
 
 
 def _brief(tree: PyTree) -> str:
+    """The shapes and dtypes of arrays, for messages."""
     return eqx.tree_pformat(tree, struct_as_array=True)
 
 
@@ -133,7 +155,9 @@ def apply_one(
 ) -> Y:
     """The vector field of one noise times its increment. `number` is its index among the
     noises of all terms, in the order of their flattened controls."""
-    parts, before = [], 0
+    parts = []
+    # The number of noises of the terms before this one.
+    before = 0
     for term in terms:
         struct = control_struct(term)
         m = num_noises(struct)
@@ -146,8 +170,17 @@ def apply_one(
     return _checked_sum(parts, y)
 
 
-def _one_product(term, struct, number, increment, args: Args, t, y: Y) -> Y:
-    """The vector field of one noise of this term times its increment."""
+def _one_product(
+    term: diffrax.AbstractTerm,
+    struct: PyTree[jax.ShapeDtypeStruct],
+    number: IntScalarLike,
+    increment: Float[Array, ""],
+    args: Args,
+    t: RealScalarLike,
+    y: Y,
+) -> Y:
+    """The vector field of one noise of this term times its increment. `struct` are the
+    shapes of all increments. Where possible no other noise is evaluated or multiplied."""
     if isinstance(unwrapped(term), HamiltonianNoise):
         return term.vf_prod(t, y, args, OneNoise(number, increment))
     if isinstance(unwrapped(term), diffrax.ControlTerm):
@@ -156,6 +189,7 @@ def _one_product(term, struct, number, increment, args: Args, t, y: Y) -> Y:
         one_array = eqx.is_array(matrix) and isinstance(struct, jax.ShapeDtypeStruct)
         if one_array and matrix.ndim > 0 and matrix.shape[-1:] == struct.shape:
             return matrix[..., number] * increment.astype(matrix.dtype)
+    # Of a term of any other kind, the sum over all noises, of which one is not zero.
     flat, unravel = raveled(struct)
     only = flat.at[number].set(increment.astype(flat.dtype))
     return term.vf_prod(t, y, args, unravel(only))
@@ -175,12 +209,17 @@ def apply_brackets(
     For antisymmetric `A` this is `sum_l Db_l (sum_k A_kl b_k)`, with `m` derivatives.
     """
     _, unravel = raveled(control_struct(term))
-    field = lambda y, x: term.vf_prod(t, y, args, unravel(x))
 
-    def summand(column, unit):
-        return jax.jvp(lambda y: field(y, unit), (y,), (field(y, column),))[1]
+    def field(increments: Float[Array, " m"], y: Y) -> Y:
+        return term.vf_prod(t, y, args, unravel(increments))
 
-    return _total(jax.vmap(summand)(A.T, np.eye(len(A), dtype=A.dtype)), len(A))
+    def summand(column: Float[Array, " m"], unit: Float[Array, " m"]) -> Y:
+        b_l = ft.partial(field, unit)
+        return jax.jvp(b_l, (y,), (field(column, y),))[1]
+
+    # NumPy's, a constant that XLA folds, unlike `jnp.eye`.
+    units: Any = np.eye(len(A), dtype=A.dtype)
+    return _total(jax.vmap(summand)(A.T, units), len(A))
 
 
 def _total(summands: Y, m: int) -> Y:
@@ -190,7 +229,11 @@ def _total(summands: Y, m: int) -> Y:
 
 
 def tree_sum(values: list[Y]) -> Y:
-    return ft.reduce(lambda a, b: (a**ω + b**ω).ω, values)
+    """The sum of PyTrees of the same structure, at least one."""
+    total, *others = values
+    for value in others:
+        total = (total**ω + value**ω).ω
+    return total
 
 
 def bridge(
@@ -203,15 +246,20 @@ def bridge(
     plus an independent remainder. The time average of its mean square is $h / 15$ without
     the second summand, and $3 h / 70$ with it.
     """
-    w, first = jfu.ravel_pytree(W)[0], jfu.ravel_pytree(H)[0]
-    one = jnp.eye(first.size, dtype=first.dtype) * jnp.abs(h).astype(first.dtype)
-    second = 3 / 5 * jnp.outer(first, first)
+    increments, _ = jfu.ravel_pytree(W)
+    areas, _ = jfu.ravel_pytree(H)
+    # In a solve backward in time steps are negative, and the mean square is not.
+    size = jnp.abs(h).astype(areas.dtype)
+    one = jnp.eye(areas.size, dtype=areas.dtype) * size
+    # Each of these is half of the time average of a square.
+    second = 3 / 5 * jnp.outer(areas, areas)
     if K is None:
-        return first, second + one / 30
-    k = jfu.ravel_pytree(K)[0]
-    mixed = jnp.outer(w, k)
-    second = second + 60 / 7 * jnp.outer(k, k) - (mixed + mixed.T) / 2
-    return first, second + 3 / 140 * one
+        return areas, second + one / 30
+    more_areas, _ = jfu.ravel_pytree(K)
+    mixed = jnp.outer(increments, more_areas)
+    squares = 60 / 7 * jnp.outer(more_areas, more_areas)
+    second = second + squares - (mixed + mixed.T) / 2
+    return areas, second + 3 / 140 * one
 
 
 @eqx.filter_jit
@@ -230,39 +278,52 @@ def apply_bridge(
     """
     _, unravel = raveled([control_struct(term) for term in noise])
     t = jnp.asarray(t, jnp.result_type(h))
+    areas, _ = bridge
 
-    def b(x, t, y):
-        """The noise with increments `x`."""
-        controls = zip(noise, unravel(x))
-        return tree_sum([term.vf_prod(t, y, args, c) for term, c in controls])
+    def b(increments: Float[Array, " m"], t: Array, y: Y) -> Y:
+        """The noise with these increments."""
+        pairs = zip(noise, unravel(increments))
+        return tree_sum([term.vf_prod(t, y, args, control) for term, control in pairs])
 
-    def bracket(x, field, t, y, speed):
-        """`[b(x), field]`, where `field` advances time by `speed`; and `field` itself."""
-        value, change = jax.jvp(lambda y: field(t, y), (y,), (b(x, t, y),))
-        _, carried = jax.jvp(lambda t, y: b(x, t, y), (t, y), (speed, value))
+    def bracket(
+        increments: Float[Array, " m"], field: Callable, t: Array, y: Y, speed: Array
+    ) -> tuple[Y, Y]:
+        """`[b, field]`, where `field` advances time by `speed`; and `field` itself."""
+        along = b(increments, t, y)
+        value, change = jax.jvp(lambda y: field(t, y), (y,), (along,))
+        noise_of = ft.partial(b, increments)
+        _, carried = jax.jvp(noise_of, (t, y), (speed, value))
         return (change**ω - carried**ω).ω, value
 
-    def summand(unit, first, column):
-        inner = lambda t, y: bracket(unit, drift, t, y, jnp.asarray(h, t.dtype))[0]
-        double, single = bracket(column, inner, t, y, jnp.zeros_like(t))
-        return (double**ω + first * single**ω).ω
+    def with_drift(unit: Float[Array, " m"], t: Array, y: Y) -> Y:
+        """`[b_k, A]` for the noise `k` of this unit vector."""
+        return bracket(unit, drift, t, y, jnp.asarray(h, t.dtype))[0]
 
-    units = np.eye(bridge[0].size, dtype=bridge[0].dtype)
+    def summand(unit: Float[Array, " m"], area: Array, column: Float[Array, " m"]) -> Y:
+        """`[L_k . b, [b_k, A]] + H_k [b_k, A]`: the outer brackets of all noises with the
+        inner one of `k` are one bracket, with their sum."""
+        inner = ft.partial(with_drift, unit)
+        # This bracket has no drift, so that it leaves the time.
+        double, single = bracket(column, inner, t, y, jnp.zeros_like(t))
+        return (double**ω + area * single**ω).ω
+
+    units: Any = np.eye(areas.size, dtype=areas.dtype)
     return _total(jax.vmap(summand)(units, *bridge), len(units))
 
 
 def _checked_sum(parts: list[Y], y: Y) -> Y:
     """The sum. Raises a `ValueError` unless all have the dtypes and shapes of the state."""
 
-    def check(v, x):
+    def check(change: Any, x: Any) -> None:
         # An array made before 64 bits were enabled may have a dtype unlike its result type.
-        v, x = jnp.asarray(v), jnp.asarray(x)
-        if (v.dtype, v.shape) != (x.dtype, x.shape):
+        change = jnp.asarray(change)
+        x = jnp.asarray(x)
+        if (change.dtype, change.shape) != (x.dtype, x.shape):
             raise ValueError(
                 f"The terms change an array of dtype and shape {x.dtype}{x.shape} by one "
-                f"of {v.dtype}{v.shape}. Give the state, the vector fields and the path "
-                "(as `shape=jax.ShapeDtypeStruct(shape, dtype)`) the same dtype, and times "
-                "a dtype that is not wider."
+                f"of {change.dtype}{change.shape}. Give the state, the vector fields and "
+                "the path (as `shape=jax.ShapeDtypeStruct(shape, dtype)`) the same dtype, "
+                "and times a dtype that is not wider."
             )
 
     for part in parts:

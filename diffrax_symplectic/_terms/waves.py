@@ -117,7 +117,7 @@ class _DampedWaves(eqx.Module):
                 f"{shapes(q)}. Join them, for example by `jnp.concatenate`."
             )
 
-        def energy(p, q):
+        def energy(p: Array, q: Array) -> Array:
             H = evaluated("H0", self.H0, t, from_pair((p, q)), args=args)
             return scalar_energy(H)
 
@@ -130,15 +130,20 @@ class _DampedWaves(eqx.Module):
             )
         # Traced values cannot raise an error; NaN makes their path fail.
         alpha = jnp.where(jnp.isfinite(alpha) & (alpha >= 0), alpha, jnp.nan)
-        # In real numbers: g = (by_q + i by_p) / sqrt(2), psi = (q + i p) / sqrt(2).
+        # In real numbers, as the state: g = (by_q + i by_p) / sqrt(2), psi = (q + i p) /
+        # sqrt(2). The first two are the parts of 2 g^+ psi, the third is 2 psi^+ psi.
         half = alpha[..., None] / 2
-        dot = lambda a, b: jnp.sum(a * b, axis=-1, keepdims=True)
-        real = dot(by_q, q) + dot(by_p, p)
-        imaginary = dot(by_q, p) - dot(by_p, q)
-        squares = dot(p, p) + dot(q, q)
+        real = _dot(by_q, q) + _dot(by_p, p)
+        imaginary = _dot(by_q, p) - _dot(by_p, q)
+        squares = _dot(p, p) + _dot(q, q)
         dp = -by_q + half * (real * p + imaginary * q - squares * by_p)
         dq = by_p + half * (real * q - imaginary * p - squares * by_q)
         return dp, dq
+
+
+def _dot(a: Float[Array, "*vectors n"], b: Float[Array, "*vectors n"]) -> Array:
+    """The scalar products of vectors, with an axis of length one for their components."""
+    return jnp.sum(a * b, axis=-1, keepdims=True)
 
 
 def to_pair(psi: _Waves) -> _Pair:
@@ -151,8 +156,14 @@ def to_pair(psi: _Waves) -> _Pair:
 
     **Returns:** the pair `(p, q)` of real arrays, in the precision of `psi`.
     """
-    part = lambda of: jtu.tree_map(lambda x: math.sqrt(2) * of(jnp.asarray(x)), psi)
-    return part(jnp.imag), part(jnp.real)
+
+    def momentum(psi: ArrayLike) -> Array:
+        return math.sqrt(2) * jnp.imag(jnp.asarray(psi))
+
+    def position(psi: ArrayLike) -> Array:
+        return math.sqrt(2) * jnp.real(jnp.asarray(psi))
+
+    return jtu.tree_map(momentum, psi), jtu.tree_map(position, psi)
 
 
 def from_pair(y: _Pair) -> _Waves:

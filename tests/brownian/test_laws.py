@@ -9,7 +9,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import Discrete, laws_of, VARIABLES
-from diffrax_symplectic._terms import controls, outcomes, step_variables
+from diffrax_symplectic._terms import drawn_variables, outcomes, step_variables
 
 from ..problems import weak_path
 
@@ -118,6 +118,6 @@ def test_areas_keep_their_sign_backward_in_time_and_nobody_else_scales_them():
         (Directed(noise), 0.5, 0.75, 1),
         (back, -0.75, -0.5, -1),
     ):
-        got = controls((term,), ["W", "H"], t0, t1, "")
+        got = drawn_variables((term,), ["W", "H"], t0, t1, "")
         np.testing.assert_array_equal(got["W"][0], sign * inc.W)
         np.testing.assert_array_equal(got["H"][0], inc.H)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.array_rqmc import layout
+from diffrax_symplectic._expectation.array_rqmc import step_words
 from diffrax_symplectic._expectation.moments import level_weights
 
 from ..problems import kubo_terms, RecordingMeter
@@ -221,7 +221,7 @@ def test_equal_paths_are_one_brownian_motion():
     other = ds.WeakBrownianPath((2,), jr.key(1), two_point=True)
     term = lambda path: diffrax.ControlTerm(lambda t, y, args: y, path)
     terms = diffrax.MultiTerm(term(path), term(other), term(path))
-    assert layout(terms) == (((0, 4), (4, 8), (0, 4)), 8, False)
+    assert step_words(terms) == (((0, 4), (4, 8), (0, 4)), 8, False)
 
 
 @pytest.mark.parametrize(

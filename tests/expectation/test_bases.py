@@ -6,7 +6,8 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from diffrax_symplectic._expectation.bases import Frame, Grid, Hermite
+from diffrax_symplectic._expectation.bases import Frame, Hermite
+from diffrax_symplectic._expectation.grid import Grid
 from diffrax_symplectic._expectation.polynomials import (
     exponents,
     hermite,

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation.sampling import AbstractSampling
 
 from ..problems import kubo_terms
 
@@ -103,6 +104,18 @@ def test_parts_that_do_not_fit_are_refused(tmp_path):
     np.savez(tmp_path / "other.npz", x=1)
     with pytest.raises(ValueError, match="was not written by"):
         ds.Expectation.load(tmp_path / "other.npz")
+
+
+def test_an_estimate_by_an_unknown_sampling_is_refused_by_name(tmp_path):
+    class Own(AbstractSampling):
+        def prepare(self, problem, key, devices): ...
+
+    estimate = ds.monte_carlo(jr.normal, key=KEY, num_paths=8)
+    dataclasses.replace(estimate, sampling=Own()).save(tmp_path / "own.npz")
+    with pytest.raises(
+        ValueError, match="sampled by `Own`, which this version does not"
+    ):
+        ds.Expectation.load(tmp_path / "own.npz")
 
 
 PROGRAM = """

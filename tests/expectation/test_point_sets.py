@@ -9,9 +9,8 @@ import jax.random as jr
 import numpy as np
 import pytest
 
+from diffrax_symplectic._expectation.hilbert import _curve, hilbert_order
 from diffrax_symplectic._expectation.points import (
-    _curve,
-    hilbert_order,
     nested_scramble,
     num_seeds,
     randomized,
@@ -69,7 +68,9 @@ def test_scrambling_is_a_bijection_that_respects_intervals():
 def test_the_curve_meets_each_cell_once_and_goes_on_to_its_neighbour(
     d, bits, monkeypatch
 ):
-    monkeypatch.setattr("diffrax_symplectic._expectation.points._COORDINATE_BITS", bits)
+    monkeypatch.setattr(
+        "diffrax_symplectic._expectation.hilbert._COORDINATE_BITS", bits
+    )
     axes = np.meshgrid(*[np.arange(2**bits)] * d, indexing="ij")
     cells = np.stack(axes, -1).reshape(-1, d).astype(np.uint32)
     place = np.asarray(_curve([*jnp.asarray(cells).T], 48, jnp.uint64))

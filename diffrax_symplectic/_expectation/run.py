@@ -21,9 +21,14 @@ from .._arguments import whole_number
 from .._brownian import check_key, typed_key
 from .._compat import quickly_compiled
 from .._lapack import lapack_in_turn
-from .estimate import Expectation, ExpectationInterrupted
+from .estimate import (
+    best_results,
+    check_same,
+    Expectation,
+    ExpectationInterrupted,
+)
 from .moments import joined, Moments, total
-from .sampling import KINDS_WITH_CONTROL, Plan, Samples
+from .sampling import KindsWithControl, Samples, SamplingPlan
 
 
 # With an `r` of `std_error` above this, means of exp(5 x) with normal x were off by forty
@@ -97,7 +102,7 @@ class Meter:
 
 
 def run(
-    plan: Plan,
+    plan: SamplingPlan,
     key: PRNGKeyArray,
     devices: tuple,
     sampling: Any = None,
@@ -117,7 +122,7 @@ def run(
     about = plan.roundings, sampling, plan.reason, None, plan.far
     estimate = Expectation((none,), batches.key_data, plan.paths, *about)
     if start is not None:
-        start.check_same(estimate, "`start`")
+        check_same(start, estimate, "`start`")
         if at > most:
             raise ValueError(
                 "The number of paths (or replicates) includes `start`, which has "
@@ -159,7 +164,7 @@ def run(
 class _Batches:
     """The batches of a plan: each device takes `size` samples at once."""
 
-    def __init__(self, plan: Plan, key: PRNGKeyArray, devices: tuple):
+    def __init__(self, plan: SamplingPlan, key: PRNGKeyArray, devices: tuple):
         self.size = min(plan.batch_size, plan.num_samples)
         self.key_data, self._impl = np.asarray(jr.key_data(key)), jr.key_impl(key)
         self._sampler, self._paths_of, self._devices = (
@@ -292,13 +297,14 @@ def _warnings_of_spread(estimate: Expectation) -> Iterator[str]:
             "Take smaller steps or a more stable solver, and check whether single paths "
             "stay bounded."
         )
-    if estimate.dropped:
+    best = best_results(estimate)
+    if any(np.any(x) for x in jtu.tree_leaves(best.dropped)):
         yield (
             "A control variate was dropped: its mean over these paths is more than five "
             "standard errors from zero, or not finite. The estimate is crude Monte Carlo. "
             "Pass a smaller `degree`, or another `sampling`."
         )
-    if estimate.heaviest > _HEAVY:
+    if any(np.any(x > _HEAVY) for x in jtu.tree_leaves(best.heaviness)):
         yield (
             f"A few of the {estimate.num_paths:,} paths account for most of the variance: "
             "still rarer paths may contribute much to the mean, and the standard error may "
@@ -307,7 +313,7 @@ def _warnings_of_spread(estimate: Expectation) -> Iterator[str]:
     whole = total(estimate.moments)
     kinds = zip(jtu.tree_leaves(whole.size), jtu.tree_leaves(whole.dtypes))
     # The values without control.
-    plain = lambda x: x[int(len(x) == KINDS_WITH_CONTROL), 0]
+    plain = lambda x: x[int(len(x) == len(KindsWithControl)), 0]
     low = [dtype for x, dtype in kinds if np.max(plain(x)) < _least(dtype)]
     if low:
         yield (

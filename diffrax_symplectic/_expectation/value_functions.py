@@ -23,21 +23,24 @@ from .._arguments import whole_number
 from .._compat import quickly_compiled
 from .._lapack import lapack_in_turn
 from .._terms import number_of_noises
-from ._fits import fit, Functions, without_newton
-from ._problem import Problem
-from ._run import run
-from ._steps import along, Paths, simulate
-from .bases import AbstractBasis, Grid, Hermite, Quadratic
+from .bases import AbstractBasis, Hermite, Quadratic
+from .estimate import best_results
+from .fits import fit, Functions, without_newton
+from .grid import Grid
 from .moments import total
 from .noise import Noise
 from .polynomials import num_polynomials
+from .problem import Problem
+from .run import run
 from .sampling import (
     AbstractSampling,
-    KINDS_WITH_CONTROL,
-    Plan,
+    KindsWithControl,
     ROUNDING,
     Samples,
+    SamplingPlan,
+    saved_by_name,
 )
+from .simulation import along, Paths, simulate
 
 
 # The most polynomials in a fit by default.
@@ -55,6 +58,7 @@ _TRIAL, _WIDE = 0xFFFFFFFE, 2
 _MOST_NOISES = 2
 
 
+@saved_by_name
 class ValueFunctions(AbstractSampling):
     r"""Independent paths with a control variate that removes most of their variance.
 
@@ -101,7 +105,7 @@ class ValueFunctions(AbstractSampling):
     def prepare(self, problem, key, devices):
         basis, (times, m) = _basis(problem, self.degree), problem.num_outputs
         functions, shape = _fits(problem, key, basis), (len(problem.weights), times, m)
-        shapes = problem.shapes_of_samples(KINDS_WITH_CONTROL)
+        shapes = problem.shapes_of_samples(len(KindsWithControl))
         never = np.zeros(shape), np.full(shape, np.inf)
         narrow, *wider = _wider(problem)
 
@@ -110,7 +114,7 @@ class ValueFunctions(AbstractSampling):
             sampler = jtu.Partial(
                 _controlled_paths, problem, functions, best, used, usual, law
             )
-            return Plan(sampler, n, self.batch_size, shapes=shapes, quick=True)
+            return SamplingPlan(sampler, n, self.batch_size, shapes=shapes, quick=True)
 
         # The trials' paths are not part of the estimate.
         trial = lambda *args: run(plan(*args), jr.fold_in(key, _TRIAL), devices)
@@ -122,7 +126,8 @@ class ValueFunctions(AbstractSampling):
         tried = [trial(all_of(k), used, self.batch_size) for k in range(count)]
         errors = np.stack([flat(e.std_error) for e in tried])
         errors = np.nan_to_num(errors, nan=np.inf)
-        best, plain = np.argmin(errors, axis=0), flat(tried[0].plain_std_error)
+        best = np.argmin(errors, axis=0)
+        plain = flat(best_results(tried[0]).plain_std_error)
         used = ~(np.min(errors, axis=0) >= plain)
         if self.degree and not np.any(used):
             warnings.warn(
@@ -278,10 +283,11 @@ def _controlled_paths(
                     key, i, share * noise.share, side * noise.tilt
                 )
                 own = noise.with_args(args)
-                return *own.advance(i, y, state, at, second, x), log_ratio
+                return own.advance(i, y, state, at, second, x), log_ratio
 
-            out = jax.vmap(one)(paths.y, paths.solver_state, paths.args, keys)
-            y, state, success, (value, change), log_ratio = out
+            given = paths.y, paths.solver_state, paths.args, keys
+            after, log_ratio = jax.vmap(one)(*given)
+            y, state, success, value, change = after
             # A failed path has no value, but its control must be finite.
             change = jnp.where(along(success, change), change, 0)
             control, promised, ratios = paths.control

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._custom_types import Y
 from .._root_finder import all_finite
-from ._problem import Level, Problem
+from .problem import Level, Problem
 
 
 class Paths(eqx.Module):

@@ -16,9 +16,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from .._custom_types import Y
 from .._root_finder import PicardNewton
 from .._solver import AbstractImplicitStages
-from ._problem import ravel
-from ._steps import Paths
 from .bases import AbstractBasis
+from .problem import ravel
+from .simulation import Paths
 
 
 # The number of states over which second derivatives along the noise are averaged.

@@ -12,18 +12,24 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
-from ._brownian import Discrete, laws_of, UnspecifiedPath
-from ._custom_types import Args, RealScalarLike, Y
-from ._expectation import Expectation, ExpectationInterrupted
-from ._expectation._problem import Problem
-from ._expectation._run import checked_call, Meter, NO_METER, refuse_others, run
-from ._expectation._value_functions import ValueFunctions
-from ._expectation.choose import choose, few_paths, MOST, MUCH_LEFT, sorted_paths
-from ._expectation.engines import warn_of_stragglers
-from ._expectation.fused_paths import fused_plan, FusedPaths
-from ._expectation.sampling import AbstractSampling
-from ._solver import own_path
-from ._terms import brownian_paths, path_numbers, random_paths, with_paths
+from .._brownian import Discrete, laws_of, UnspecifiedPath
+from .._custom_types import Args, RealScalarLike, Y
+from .._solver import own_path
+from .._terms import brownian_paths, path_numbers, random_paths, with_paths
+from .choose import (
+    choose,
+    few_paths,
+    MOST_SAMPLES,
+    MUCH_LEFT,
+    sorted_paths,
+)
+from .engines import warn_of_stragglers
+from .estimate import Expectation, ExpectationInterrupted
+from .fused_paths import fused_plan, FusedPaths
+from .problem import Problem
+from .run import checked_call, Meter, NO_METER, refuse_others, run
+from .sampling import AbstractSampling
+from .value_functions import ValueFunctions
 
 
 # No sample's key is folded from this number.
@@ -126,9 +132,9 @@ def expectation(
         four components, if the increments can be computed from quasi-random points; and
         otherwise `IndependentPaths`. Where `y0` or `args` is drawn, it is not
         `ValueFunctions`, which leave the variance of the start. Without `tol` these draw
-        4,096 paths, 16 replicates of 16,384 paths, and 131,072 paths, or fewer where all
-        steps of all paths would exceed $2^{28}$ numbers (from ten seconds to some minutes,
-        by solver and system).
+        4,096 paths, 16 replicates of 16,384 paths, and 131,072 paths, or fewer where these
+        would take more than about ten seconds on two cores, as far as the operations of a
+        step tell (compilation comes on top).
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
         default only `t1`.
     - `levels`: the number of step sizes, each half the previous one. With one level the
@@ -189,11 +195,9 @@ def expectation(
     if free and has_kinks:
         problem = Problem.of(*given, want="strong")
         reason = "Gaussian increments, since phi may not be smooth"
-    sorted_instead = None
-    if sampling is None:
+    is_chosen = sampling is None
+    if is_chosen:
         sampling, choice = choose(problem, tol)
-        if isinstance(sampling, ValueFunctions):
-            sorted_instead = sorted_paths(problem, tol)
     sampling = _checked_sampling(sampling, start)
     with Meter(progress_meter) as meter:
         try:
@@ -202,13 +206,16 @@ def expectation(
             else:
                 own = jr.fold_in(key, _NO_SAMPLE)
                 plan = sampling.prepare(problem, own, devices)
-                if sorted_instead is not None and plan.left > MUCH_LEFT:
-                    choice = (
-                        "sorted paths, since fitted value functions leave "
-                        f"{plan.left:.1%} of the standard error"
-                    )
-                    sampling = sorted_instead
-                    plan = sampling.prepare(problem, own, devices)
+                # Only fits leave something.
+                if is_chosen and plan.left > MUCH_LEFT:
+                    sorted_instead = sorted_paths(problem, tol)
+                    if sorted_instead is not None:
+                        choice = (
+                            "sorted paths, since fitted value functions leave "
+                            f"{plan.left:.1%} of the standard error"
+                        )
+                        sampling = sorted_instead
+                        plan = sampling.prepare(problem, own, devices)
         except ExpectationInterrupted:
             # Trial samples are not part of the estimate, and cannot be continued.
             raise KeyboardInterrupt from None
@@ -217,7 +224,7 @@ def expectation(
         plan = plan._replace(
             reason=reason, roundings=problem.max_steps, bounded=problem.bounded
         )
-        if start is not None and tol is None and plan.num_samples == MOST:
+        if start is not None and tol is None and plan.num_samples == MOST_SAMPLES:
             # Without `tol` the number of samples stays as it was.
             used = start.moments[-1].end - start.moments[0].begin
             plan = plan._replace(num_samples=used)

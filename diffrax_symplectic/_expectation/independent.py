@@ -1,0 +1,85 @@
+"""Independent paths: crude Monte Carlo."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from .._arguments import whole_number
+from .._terms import path_keys, with_keys
+from .problem import Level, Problem
+from .sampling import AbstractSampling, Samples, SamplingPlan, saved_by_name
+from .simulation import independent_steps, Paths, simulate
+
+
+# The default sizes of a batch. On CPUs it keeps all cores busy and fits their caches.
+_BATCH_ON_CPU = 2**15
+_BATCH = 2**18
+
+
+@saved_by_name
+class IndependentPaths(AbstractSampling):
+    """Independent paths (crude Monte Carlo). For any system the error is proportional to
+    one over the square root of their number.
+
+    With several levels, each path uses the same Brownian motion on all of them if `terms`
+    have a [`diffrax_symplectic.FixedStepBrownianPath`][] with `cell=`. Then the `bias` is
+    estimated much more accurately than the mean.
+
+    **Arguments:**
+
+    - `num_paths`: the number of paths, at least two; with `tol` an upper limit.
+    - `batch_size`: the number of paths that each device solves at once. By default 32,768
+        on CPUs (for a state of a few components this keeps all cores busy and fits their
+        caches) and 262,144 elsewhere. Choose less for large states, or to share few paths
+        among several devices: the size of a batch does not depend on their number.
+    """
+
+    num_paths: int = eqx.field(converter=lambda x: whole_number("num_paths", x, 2))
+    batch_size: int | np.integer | None = None
+
+    def prepare(self, problem, key, devices):
+        return self.plan(jtu.Partial(_paths, problem), devices)
+
+    def plan(self, sampler: Callable[..., Samples], devices: tuple) -> SamplingPlan:
+        """The plan for samples that are made one for each key, by any function."""
+        if self.batch_size is None:
+            size = _BATCH_ON_CPU if devices[0].platform == "cpu" else _BATCH
+        else:
+            size = whole_number("batch_size", self.batch_size)
+        return SamplingPlan(sampler, self.num_paths, size)
+
+
+def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
+    """A sample is a path, with the same random key on all levels."""
+    saved, failed = solved(p, keys)
+    # A path that fails on several levels counts once.
+    lost = jnp.any(failed, axis=0)
+    return Samples(p.averaged([p.combined(saved)]), ~lost, lost)
+
+
+def solved(
+    p: Problem, keys: PRNGKeyArray
+) -> tuple[Float[Array, "levels S n m"], Bool[Array, "levels n"]]:
+    """The values of `phi` for one path for each of several keys, at the times at which to
+    average and on all levels, and which paths failed."""
+    own_keys = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
+    drawn = jax.vmap(p.drawn)(keys)
+
+    def begin(level: Level) -> tuple[Callable[[Any, Paths], Paths], Paths]:
+        return independent_steps(
+            p,
+            level,
+            drawn,
+            terms_of=lambda own: with_keys(p.terms, own),
+            # A path draws the increments of all steps from its keys.
+            randomness=lambda i: own_keys,
+        )
+
+    saved, failed, _ = simulate(p, begin)
+    return saved, failed
