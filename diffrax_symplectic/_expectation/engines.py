@@ -25,6 +25,7 @@ from .._fused import (
     split,
     without_rescue,
 )
+from .._lapack import lapack_in_turn
 from .._stablehlo import NotReplayed
 from .independent import solved
 from .problem import Level, Problem
@@ -94,6 +95,7 @@ def _drawn(
 
 
 @eqx.filter_jit
+@lapack_in_turn
 def _paths(
     p: Problem, key: PRNGKeyArray, high: _Words, low: _Words
 ) -> tuple[PyTree[Array], Bool[Array, "levels n"]]:
