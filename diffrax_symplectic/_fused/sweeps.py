@@ -129,8 +129,8 @@ def solve_one_path(
     """
     equations = _Equations(image, isinstance(guess, Halves))
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
-    # Three sweeps before the loop: two rates of convergence are the least to know whether
-    # they have converged, and short steps need no more than that.
+    # Three sweeps before the loop: they make two corrections, whose ratio is the rate of
+    # convergence.
     first = equations.swept(equations.start(guess))
     criterion = _criterion(scale(equations.value(first)), dtype)
     second = equations.swept(first)
