@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from .._arguments import whole_number
 from .._brownian import check_key, typed_key
 from .._compat import quickly_compiled
+from .._lapack import lapack_in_turn
 from .estimate import (
     best_results,
     check_same,
@@ -344,7 +345,7 @@ def _sums(sampler, key_data, impl, lo_hi, left, mesh: Mesh, n: int):
         hi = lo_hi[1] + (lo < lo_hi[0]).astype(jnp.uint32)
         key = jr.wrap_key_data(jnp.asarray(key_data), impl=impl)
         fold = lambda hi, lo: jr.fold_in(jr.fold_in(key, hi), lo)
-        samples = sampler(jax.vmap(fold)(hi, lo))
+        samples = lapack_in_turn(sampler)(jax.vmap(fold)(hi, lo))
         wanted = index < left
         good, failed = samples.good & wanted, jnp.where(wanted, samples.lost, 0)
         leaves, treedef = jtu.tree_flatten(samples.values)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 
 from .._arguments import whole_number
 from .._compat import quickly_compiled
+from .._lapack import lapack_in_turn
 from .._terms import number_of_noises
 from .bases import AbstractBasis, Hermite, Quadratic
 from .estimate import best_results
@@ -198,6 +199,7 @@ def _fits_by(
 
 
 @quickly_compiled
+@lapack_in_turn
 def _fitted(
     problem: Problem, index: Int[Array, "1"], key: PRNGKeyArray, basis: AbstractBasis
 ) -> tuple[Functions, Int[Array, ""]]:
