@@ -66,8 +66,8 @@ class Replay:
 
     def constants(self) -> list[Any]:
         """The large constants of the program, as arrays of Dr.Jit in memory."""
-        # Made once by the caller, since a frozen function of Dr.Jit takes arrays in memory as
-        # arguments only.
+        # Made once by the caller, since a frozen function of Dr.Jit takes arrays in memory
+        # as arguments only.
         return [
             in_memory(_type_of(variable).kind, values.ravel())
             for variable, values in self._constants.items()
