@@ -174,9 +174,11 @@ def fused_start(
     own_args = None if p.args_of is None else eqx.filter(p.args, eqx.is_array)
     functions, arrays = split(_bare(p), key, own_args, p.paths_differ)
     kernels = _kernels(functions)
-    y0, args = p.y0, None
     if p.paths_differ:
         y0, args = _drawn(p, key, *_halves(numbers))
+    else:
+        y0 = p.y0
+        args = None
     h = p.level(level).h
     first = int(numbers[0])
     lanes, shared = kernels.begin(arrays, key, h, first, len(numbers), y0, args)
@@ -210,6 +212,8 @@ def _with_stragglers(
     p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int, fused: Batch
 ) -> Batch:
     """The paths of a batch, with those that the kernel did not finish simulated by JAX."""
+    # What the kernel returned for these is where it stopped. From there JAX would need the
+    # solver's state, too: it begins anew, which also gives the same path as without kernel.
     (which,) = np.nonzero(fused.failed)
     # Rounded up to a power of four, so that JAX compiles few programs.
     power = int(np.ceil(np.log(len(which)) / np.log(4)))

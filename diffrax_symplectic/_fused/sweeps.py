@@ -129,8 +129,8 @@ def solve_one_path(
     """
     equations = _Equations(image, isinstance(guess, Halves))
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
-    # Three sweeps before the loop: two rates of convergence are the least to know whether
-    # they have converged, and short steps need no more than that.
+    # Three sweeps before the loop: they make two corrections, whose ratio is the rate of
+    # convergence.
     first = equations.swept(equations.start(guess))
     criterion = _criterion(scale(equations.value(first)), dtype)
     second = equations.swept(first)
@@ -189,9 +189,13 @@ def _sizes(y: PyTree[Array]) -> list[Scalar]:
 
 
 def _largest(numbers: list[Scalar]) -> Scalar:
+    return ft.reduce(_larger, numbers)
+
+
+def _larger(a: Scalar, b: Scalar) -> Scalar:
     # `jnp.maximum` propagates NaN at the price of three operations. The check at the end of
     # the step finds NaN in any case.
-    return ft.reduce(lambda a, b: jnp.where(a > b, a, b), numbers)
+    return jnp.where(a > b, a, b)
 
 
 class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
