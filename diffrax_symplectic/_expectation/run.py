@@ -9,7 +9,6 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
@@ -17,7 +16,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from .._arguments import whole_number
+from .._arguments import check_untraced, whole_number
 from .._brownian import check_key, typed_key
 from .._compat import quickly_compiled
 from .._lapack import lapack_in_turn
@@ -42,7 +41,10 @@ def checked_call(
 ) -> tuple[PRNGKeyArray, int, tuple]:
     """The key as a typed key, the number of the first sample, and the devices. Raises a
     `ValueError` for invalid arguments, and if any array is traced."""
-    _check_untraced(f"`{user}`", (key, others))
+    # Inside `jit` a new array is traced, too. Functions that close over traced values of
+    # other transformations are found once something that depends on these is needed.
+    new = jnp.zeros(())
+    check_untraced(f"`{user}`", (key, others, new))
     check_key(key, user)
     if start is not None and first != 0:
         raise ValueError(
@@ -64,15 +66,6 @@ def checked_call(
             f"got {devices!r}."
         )
     return typed_key(key), first, tuple(devices)
-
-
-def _check_untraced(caller: str, tree: Any) -> None:
-    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(tree)):
-        raise ValueError(
-            f"{caller} cannot run inside JAX transformations, since batches are collected "
-            "outside of JAX. Call it outside of `jit`, `vmap` and `grad`. To differentiate "
-            "a mean, average gradients with `monte_carlo`."
-        )
 
 
 def refuse_others(user: str, others: dict[str, Any]) -> None:
@@ -201,7 +194,7 @@ class _Batches:
     def parts(self, running: tuple) -> list[tuple]:
         """The results of each device."""
         # They are traced if a function closes over traced values.
-        _check_untraced("`expectation` or `monte_carlo`", running)
+        check_untraced("`expectation` or `monte_carlo`", running)
         arrays = jax.device_get(running)
         at = lambda k: jtu.tree_map(lambda x: x[k], arrays)
         return [at(k) for k in range(len(self._devices))]
