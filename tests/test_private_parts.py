@@ -334,6 +334,15 @@ def test_results_of_all_solves_are_told_from_other_values():
     assert not any(map(_compat.is_result, (1, jnp.ones(2), "successful")))
 
 
+def test_equinox_names_the_closure_that_it_refuses_to_call():
+    """If this fails: find what Equinox says now. Only the advice in a note is lost."""
+    double = eqx.filter_closure_convert(lambda x: 2 * x, jnp.ones(2))
+    with pytest.raises(ValueError) as info:
+        double(jnp.ones(3))
+    assert _compat.is_closure_mismatch(info.value)
+    assert not _compat.is_closure_mismatch(ValueError("other"))
+
+
 def test_a_program_may_have_compiler_options_unless_it_is_inside_of_another():
     double = _compat.quickly_compiled(lambda x: 2 * x)
     x = jnp.ones(())

@@ -16,9 +16,9 @@ from .._custom_types import Args, Y
 from .._fused import sample_key
 from .._solver import Want
 from .._terms import path_keys, with_keys
+from .call import checked_call
 from .engines import Batch, ENGINES, state_itself, warn_of_stragglers
 from .problem import Problem
-from .run import checked_call, refuse_others
 
 
 # Entries of all states in a batch: enough to keep every core busy, in tens of megabytes.
@@ -81,7 +81,6 @@ def ensemble(
     want: Want = "strong",
     engine: str | None = None,
     batch_size: int | None = None,
-    **others: Any,
 ) -> Ensemble:
     r"""The states of many independent paths, for histograms, spectra, and clouds in phase
     space.
@@ -145,7 +144,6 @@ def ensemble(
     `PicardNewton` has another tolerance than rounding error, and an `ImportError` if Dr.Jit
     or LLVM is missing. Warns if paths failed, and if many are stragglers.
     """
-    refuse_others("ensemble", others)
     given = terms, t0, t1, dt0, y0, args
     key, _, _ = checked_call("ensemble", key, None, None, 0, None, given)
     num_paths = whole_number("num_paths", num_paths)

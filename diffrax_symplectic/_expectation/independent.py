@@ -1,7 +1,6 @@
 """Independent paths: crude Monte Carlo."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,7 +13,7 @@ from .._arguments import whole_number
 from .._terms import path_keys, with_keys
 from .problem import Level, Problem
 from .sampling import AbstractSampling, Samples, SamplingPlan, saved_by_name
-from .simulation import independent_steps, Paths, simulate
+from .simulation import independent_steps, Motion, simulate
 
 
 # The default sizes of a batch. On CPUs it keeps all cores busy and fits their caches.
@@ -71,7 +70,7 @@ def solved(
     own_keys = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
     drawn = jax.vmap(p.drawn)(keys)
 
-    def begin(level: Level) -> tuple[Callable[[Any, Paths], Paths], Paths]:
+    def begin(level: Level) -> Motion:
         return independent_steps(
             p,
             level,
@@ -81,5 +80,5 @@ def solved(
             randomness=lambda i: own_keys,
         )
 
-    saved, failed, _ = simulate(p, begin)
-    return saved, failed
+    done = simulate(p, begin)
+    return done.saved, done.failed

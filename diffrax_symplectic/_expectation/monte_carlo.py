@@ -13,11 +13,12 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from .._arguments import check_real, check_takes, whole_number
 from .._compat import is_result
 from .._root_finder import all_finite
+from .call import checked_call, Meter, NO_METER
 from .estimate import Expectation
 from .independent import IndependentPaths
 from .moments import level_weights
 from .polynomials import tensordot
-from .run import checked_call, Meter, NO_METER, run
+from .run import run
 from .sampling import real, Samples
 
 

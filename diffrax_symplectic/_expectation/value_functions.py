@@ -7,54 +7,47 @@ $u$. For the exact $u$ the sum of these differences is $\\phi(y_N)$ minus its me
 
 import dataclasses
 import functools as ft
-import itertools
-import math
 import warnings
+from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
 from .._arguments import whole_number
 from .._compat import quickly_compiled
-from .._terms import number_of_noises
-from .bases import AbstractBasis, Hermite, Quadratic
-from .estimate import best_results
-from .fits import fit, Functions, without_newton
-from .grid import Grid
+from .bases import AbstractBasis
+from .basis_choice import chosen_basis, warn_of_long_fit
+from .controlled_paths import (
+    Choice,
+    controlled_paths,
+    laws_of_trials,
+    TrialLaw,
+    Usual,
+)
+from .estimate import best_results, Expectation
+from .fits import fit, FittedFunctions, without_newton
 from .moments import total
 from .noise import Noise
-from .polynomials import num_polynomials
 from .problem import Problem
 from .run import run
 from .sampling import (
     AbstractSampling,
     KindsWithControl,
     ROUNDING,
-    Samples,
     SamplingPlan,
     saved_by_name,
 )
-from .simulation import along, Paths, simulate
 
 
-# The most polynomials in a fit by default.
-_MOST_POLYNOMIALS = 130
-# By default a grid is used in up to this many dimensions, with the largest of these sizes
-# that memory and time allow: the most evaluations (points times outcomes) for one step of a
-# path, and for all steps.
-_GRID, _GRID_SIZES, _MOST_ENDS, _MOST = 2, (64, 32), 50_000, 2**25
-# Bytes that a fit may take, and the numbers it may compute before a warning that it will
-# take long (about a minute).
-_MOST_MEMORY, _OUT_OF_PROPORTION = 4 * 2**30, 2**31
-# The number folded into the key of trials, and the number of batches with wider noise.
-_TRIAL, _WIDE = 0xFFFFFFFE, 2
-# The most noises of which paths are pushed to all sides.
-_MOST_NOISES = 2
+# Folded into the key of a call to draw trials. (Numbers of levels, by which fits are drawn,
+# are smaller.)
+_TRIAL_KEY = 0xFFFFFFFE
+# A trial with wider noise has this many batches.
+_BATCHES_OF_WIDE_TRIAL = 2
 
 
 @saved_by_name
@@ -102,78 +95,162 @@ class ValueFunctions(AbstractSampling):
     )
 
     def prepare(self, problem, key, devices):
-        basis, (times, m) = _basis(problem, self.degree), problem.num_outputs
-        functions, shape = _fits(problem, key, basis), (len(problem.weights), times, m)
-        shapes = problem.shapes_of_samples(len(KindsWithControl))
-        never = np.zeros(shape), np.full(shape, np.inf)
-        narrow, *wider = _wider(problem)
+        basis = chosen_basis(problem, self.degree)
+        warn_of_long_fit(problem, basis, stacklevel=4)
+        functions = _fits(problem, key, basis)
+        trials = _Trials(problem, functions, key, devices, self.batch_size)
+        narrow, *wider = laws_of_trials(problem)
 
-        def plan(best, used, n: int, usual=never, law=narrow):
-            usual = [x.astype(problem.dtype) for x in usual]
-            sampler = jtu.Partial(
-                _controlled_paths, problem, functions, best, used, usual, law
-            )
-            return SamplingPlan(sampler, n, self.batch_size, shapes=shapes, quick=True)
-
-        # The trials' paths are not part of the estimate.
-        trial = lambda *args: run(plan(*args), jr.fold_in(key, _TRIAL), devices)
-        flat = lambda tree, *axes: np.concatenate(
-            [np.reshape(x, (*axes, times, -1)) for x in jtu.tree_leaves(tree)], axis=-1
-        )
-        all_of, used = (lambda k: np.full((times, m), k)), np.ones((times, m), bool)
-        count = len(basis.candidates)
-        tried = [trial(all_of(k), used, self.batch_size) for k in range(count)]
-        errors = np.stack([flat(e.std_error) for e in tried])
+        # One trial for each candidate, on the same paths.
+        tried = [
+            trials.run(_all_of(k, problem), _nothing_unusual(problem), narrow)
+            for k in range(len(basis.candidates))
+        ]
+        errors = np.stack([_flat(e.std_error, problem) for e in tried])
         errors = np.nan_to_num(errors, nan=np.inf)
-        best = np.argmin(errors, axis=0)
-        plain = flat(best_results(tried[0]).plain_std_error)
-        used = ~(np.min(errors, axis=0) >= plain)
-        if self.degree and not np.any(used):
+        smallest = np.min(errors, axis=0)
+        plain = _flat(best_results(tried[0]).plain_std_error, problem)
+        choice = Choice(np.argmin(errors, axis=0), ~(smallest >= plain))
+        if self.degree and not np.any(choice.used):
             warnings.warn(
                 f"`degree={self.degree}` is no better than no control variate, so none is "
                 "used. Pass another `degree`, or another `sampling`.",
                 stacklevel=4,
             )
+
         # Paths with wider noise estimate the deviations beyond the largest in the trial.
-        at = lambda tree, kind: flat(jtu.tree_map(lambda x: x[kind], tree), shape[0])
-        with_fit = np.stack([at(total(e.moments).largest, 0) for e in tried])
-        with_fit = np.take_along_axis(with_fit, best[None, None], 0)[0]
-        without = total(tried[0].moments)
-        usual = at(without.mean, 1), np.where(used, with_fit, at(without.largest, 1))
-        n = _WIDE * self.batch_size
-        wide = [trial(best, used, n, usual, law).moments for law in wider]
-        largest = lambda *means: ft.reduce(np.fmax, [x[3] for x in means])
-        far = jtu.tree_map(largest, *[total(x).mean for x in wide])
-        names = np.array([0, *basis.candidates])
-        chosen = ", ".join(map(str, np.unique(names[np.where(used, best + 1, 0)])))
-        among = ", ".join(map(str, np.unique(names)))
-        reason = f"{basis.kind}: {chosen}, chosen among {among}"
-        final = plan(best, used, self.num_paths, usual)
-        rounding = ROUNDING * jnp.finfo(problem.dtype).eps * np.abs(flat(tried[0].mean))
-        ratios = _ratios(np.min(errors, axis=0), plain, rounding)
-        left = np.max(ratios, initial=0.0)
-        return final._replace(reason=reason, far=far, left=float(left))
+        usual = _usual(tried, choice, problem)
+        size = _BATCHES_OF_WIDE_TRIAL * self.batch_size
+        wide = [trials.run(choice, usual, law, size) for law in wider]
+        rounding = ROUNDING * jnp.finfo(problem.dtype).eps
+        noise_floor = rounding * np.abs(_flat(tried[0].mean, problem))
+        ratios = _ratios(smallest, plain, noise_floor)
+        return trials.plan(choice, usual, narrow, self.num_paths)._replace(
+            reason=_reason(basis, choice),
+            far=_largest_tails(wide),
+            left=float(np.max(ratios, initial=0.0)),
+        )
+
+
+class _Trials(NamedTuple):
+    """What all trials of a problem share, and the estimate itself."""
+
+    problem: Problem
+    functions: FittedFunctions
+    key: PRNGKeyArray
+    devices: tuple
+    batch_size: int
+
+    def plan(
+        self, choice: Choice, usual: Usual, law: TrialLaw, num_samples: int
+    ) -> SamplingPlan:
+        """The plan for paths whose noise has this law."""
+        return SamplingPlan(
+            jtu.Partial(
+                controlled_paths, self.problem, self.functions, choice, usual, law
+            ),
+            num_samples,
+            self.batch_size,
+            shapes=self.problem.shapes_of_samples(len(KindsWithControl)),
+            quick=True,
+        )
+
+    def run(
+        self,
+        choice: Choice,
+        usual: Usual,
+        law: TrialLaw,
+        num_samples: int | None = None,
+    ) -> Expectation:
+        """The estimate from a batch of paths, or this number, which are not part of the
+        final estimate."""
+        size = self.batch_size if num_samples is None else num_samples
+        plan = self.plan(choice, usual, law, size)
+        return run(plan, jr.fold_in(self.key, _TRIAL_KEY), self.devices)
+
+
+def _all_of(candidate: int, problem: Problem) -> Choice:
+    """The same candidate for all components."""
+    shape = problem.num_outputs
+    return Choice(np.full(shape, candidate), np.ones(shape, bool))
+
+
+def _nothing_unusual(problem: Problem) -> Usual:
+    """No deviation is beyond these."""
+    shape = len(problem.weights), *problem.num_outputs
+    return Usual(
+        np.zeros(shape, problem.dtype),
+        np.full(shape, np.inf, problem.dtype),
+    )
+
+
+def _flat(tree: PyTree[np.ndarray], problem: Problem, *axes: int) -> np.ndarray:
+    """The arrays of a PyTree in the structure of `phi` as one array, with axes for times
+    and for components, behind these other axes."""
+    times, _ = problem.num_outputs
+    leaves = [np.reshape(x, (*axes, times, -1)) for x in jtu.tree_leaves(tree)]
+    return np.concatenate(leaves, axis=-1)
+
+
+def _usual(tried: list[Expectation], choice: Choice, problem: Problem) -> Usual:
+    """The mean without control, and the largest deviation in the trials of what each
+    component uses."""
+    combinations = len(problem.weights)
+
+    def of_kind(tree: PyTree[np.ndarray], kind: KindsWithControl) -> np.ndarray:
+        return _flat(jtu.tree_map(lambda x: x[kind], tree), problem, combinations)
+
+    trials = [total(estimate.moments) for estimate in tried]
+    # Without control all trials are the same.
+    plain = trials[0]
+    center = of_kind(plain.mean, KindsWithControl.PLAIN)
+    without = of_kind(plain.largest, KindsWithControl.PLAIN)
+    each = [of_kind(trial.largest, KindsWithControl.CONTROLLED) for trial in trials]
+    with_fit = np.take_along_axis(np.stack(each), choice.best[None, None], 0)[0]
+    largest = np.where(choice.used, with_fit, without)
+    return Usual(center.astype(problem.dtype), largest.astype(problem.dtype))
+
+
+def _largest_tails(wide: list[Expectation]) -> PyTree[np.ndarray]:
+    """The largest deviations in the tails, over trials by several laws."""
+
+    def largest(*means: np.ndarray) -> np.ndarray:
+        # A trial without a value is ignored.
+        return ft.reduce(np.fmax, [mean[KindsWithControl.TAILS] for mean in means])
+
+    return jtu.tree_map(largest, *[total(estimate.moments).mean for estimate in wide])
+
+
+def _reason(basis: AbstractBasis, choice: Choice) -> str:
+    """Which candidates were chosen, with zero for none."""
+    names = np.array([0, *basis.candidates])
+    chosen = np.unique(names[np.where(choice.used, choice.best + 1, 0)])
+    return (
+        f"{basis.kind}: {', '.join(map(str, chosen))}, chosen among "
+        f"{', '.join(map(str, np.unique(names)))}"
+    )
 
 
 def _ratios(errors: np.ndarray, plain: np.ndarray, rounding: np.ndarray) -> np.ndarray:
     """Standard errors with control, as fractions of those without it, at most one; zero
     where those are `rounding` errors only, as of a constant."""
-    random = plain > rounding
-    ratios = np.minimum(errors, plain) / np.where(random, plain, 1)
-    return np.where(random, ratios, 0)
+    is_random = plain > rounding
+    ratios = np.minimum(errors, plain) / np.where(is_random, plain, 1)
+    return np.where(is_random, ratios, 0)
 
 
-def value_function(problem: Problem, key: PRNGKeyArray) -> Functions | None:
+def value_function(problem: Problem, key: PRNGKeyArray) -> FittedFunctions | None:
     """A quadratic value function for each level, or `None` if the random variables do not
     have finitely many outcomes."""
     try:
-        basis = _basis(problem, 2)
+        basis = chosen_basis(problem, 2)
     except ValueError:
         return None
+    warn_of_long_fit(problem, basis, stacklevel=5)
     return _fits(problem, key, basis).chosen(np.zeros(problem.num_outputs, int))
 
 
-def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
+def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> FittedFunctions:
     """The fits of all levels."""
     lean = dataclasses.replace(problem, solver=without_newton(problem.solver))
     functions, lost = _fits_by(lean, key, basis)
@@ -186,7 +263,7 @@ def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> Function
 
 def _fits_by(
     problem: Problem, key: PRNGKeyArray, basis: AbstractBasis
-) -> tuple[Functions, int]:
+) -> tuple[FittedFunctions, int]:
     """The fits of all levels, and how many of the pilot's paths failed."""
     count = len(problem.levels.h)
     each = [_fitted(problem, np.array([k]), key, basis) for k in range(count)]
@@ -200,114 +277,9 @@ def _fits_by(
 @quickly_compiled
 def _fitted(
     problem: Problem, index: Int[Array, "1"], key: PRNGKeyArray, basis: AbstractBasis
-) -> tuple[Functions, Int[Array, ""]]:
+) -> tuple[FittedFunctions, Int[Array, ""]]:
     """The fit of the level with this index, with a leading axis of levels, and how many of
     the pilot's paths failed."""
     level = problem.level(index[0])
     own, lost = fit(Noise.of(problem, level), jr.fold_in(key, index[0]), basis)
     return jtu.tree_map(lambda x: x[None], own), lost
-
-
-def _basis(p: Problem, degree: int | None) -> AbstractBasis:
-    """Raises a `ValueError` if the fit needs too much memory, or for random variables
-    without finitely many outcomes."""
-    points = len(Noise.of(p, p.level(0)).nodes()[1])
-    d, levels = sum(x.size for x in jtu.tree_leaves(p.y0)), len(p.levels.h)
-    outputs, item = levels * p.max_steps * math.prod(p.num_outputs), p.dtype.itemsize
-    many = num_polynomials(d, 2) > _MOST_POLYNOMIALS
-    steps = int(np.sum(p.levels.num_steps))
-    if degree is None:
-        for size in _GRID_SIZES if d <= _GRID else ():
-            grid = Grid(d, (size,))
-            memory, ends = 2 * item * grid.size * outputs, size**d * points
-            if memory <= _MOST_MEMORY and ends <= _MOST_ENDS and ends * steps <= _MOST:
-                return grid
-        few = [k for k in range(1, 9) if num_polynomials(d, k) <= _MOST_POLYNOMIALS]
-        # Drop degrees whose fit would take too long.
-        cheap = lambda k: Hermite(d, (k,)).sites * points * steps <= _MOST
-        few = [k for k in few if k <= 2 or cheap(k)]
-        degrees = (1, 2) if many else (*(k for k in few[:-1] if k % 2 == 0), few[-1])
-    else:
-        degrees = (whole_number("degree", degree, 0),)
-    basis = Quadratic(d, degrees) if many and degrees[-1] <= 2 else Hermite(d, degrees)
-    if isinstance(basis, Hermite):
-        need = item * basis.size * (basis.pilots + len(degrees) * outputs)
-        if need > _MOST_MEMORY:
-            raise ValueError(
-                f"`degree={degree}` has {basis.size:,} polynomials in {d} dimensions, and "
-                f"its fit needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`."
-            )
-    numbers = basis.sites * points * steps * d
-    if numbers > _OUT_OF_PROPORTION:
-        warnings.warn(
-            f"The fit of `ValueFunctions` takes as long as {basis.sites * points:,} "
-            "independent paths. If fewer paths are accurate enough, pass "
-            "`sampling=IndependentPaths(num_paths)`.",
-            stacklevel=5,
-        )
-    return basis
-
-
-def _wider(p: Problem) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Laws of the noise, as factors of `Noise.share` and of `Noise.tilt`: its own, a wider
-    one, and for one noise or two those in which each noise pushes to one side."""
-    m, n = number_of_noises(p.terms), len(Noise.of(p, p.level(0)).laws)
-    sides = [*itertools.product((-1, 1), repeat=m)] if m <= _MOST_NOISES else []
-    pushed = [(0, [*side, *[0] * (n - m)]) for side in sides]
-    laws = [(0, [0] * n), (1, [0] * n), *pushed]
-    return [(np.array(a, p.dtype), np.array(b, p.dtype)) for a, b in laws]
-
-
-def _controlled_paths(
-    p: Problem, functions: Functions, best, used, usual, law, keys: PRNGKeyArray
-) -> Samples:
-    """A sample is a path minus the control variate of `functions` (with a leading axis of
-    levels), by their `best` candidates, where they are `used`. With a wider
-    `law` (see `_wider`) deviations beyond the `usual` ones are estimated: the mean without
-    control, and the largest deviation."""
-    functions = functions.chosen(best)
-    n, (center, beyond) = len(keys), [x[:, :, None] for x in usual]
-    share, side = law
-    drawn = jax.vmap(p.drawn)(keys)
-
-    def begin(level):
-        noise, u = Noise.of(p, level), jtu.tree_map(lambda x: x[level.index], functions)
-
-        def step(i, paths):
-            at, second = lambda y: u(i, y), jtu.tree_map(lambda x: x[i], u.second)
-
-            def one(y, state, args, key):
-                x, log_ratio = noise.draw(
-                    key, i, share * noise.share, side * noise.tilt
-                )
-                own = noise.with_args(args)
-                return own.advance(i, y, state, at, second, x), log_ratio
-
-            given = paths.y, paths.solver_state, paths.args, keys
-            after, log_ratio = jax.vmap(one)(*given)
-            y, state, success, value, change = after
-            # A failed path has no value, but its control must be finite.
-            change = jnp.where(along(success, change), change, 0)
-            control, promised, ratios = paths.control
-            promised = jnp.where(i == 0, value - change, promised)
-            control = control + jnp.where(used, change, 0), promised, ratios + log_ratio
-            return paths.moved(p, y, state, success, control)
-
-        dtype = jax.eval_shape(lambda: u(0, p.y0)).dtype
-        state = jax.vmap(lambda y, args: noise.with_args(args).fresh(0, y))(*drawn)
-        zero = jnp.zeros((n, *p.num_outputs), dtype)
-        return step, Paths.start(p, *drawn, state, (zero, zero, jnp.zeros(n, dtype)))
-
-    saved, failed, (*known, log_ratio) = simulate(p, begin)
-    control, promised = (jnp.swapaxes(x, 1, 2).astype(saved.dtype) for x in known)
-    promised = jnp.where(along(p.levels.saved_steps[0] == 0, saved[0]), saved, promised)
-    each = saved - control, saved, control, promised
-    left, plain, control, promised = map(p.combined, each)
-    off = jnp.abs(left - jnp.where(used[:, None], promised, center))
-    # Deviations must exceed rounding.
-    beyond = beyond + ROUNDING * jnp.finfo(off.dtype).eps * jnp.abs(plain)
-    # Cap ratios at one: paths that are likelier without wider noise are seen without it.
-    ratio = jnp.exp(-jnp.maximum(jnp.sum(log_ratio, axis=0), 0))[:, None]
-    far, lost = jnp.where(off > beyond, ratio * off, 0), jnp.any(failed, axis=0)
-    kinds = [left, plain, control, far]
-    return Samples(p.averaged(kinds), ~lost, lost)
