@@ -1,24 +1,25 @@
 """Simulates the paths of a batch with either engine. Both take a problem, the random key
 that all samples share, and consecutive sample numbers."""
 
+import dataclasses
 import functools as ft
-import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Bool, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
-from .._fused import Kernels, sample_key, split
+from .._compat import source_lines
+from .._fused import Kernels, PathFunctions, sample_key, split, without_rescue
 from .._stablehlo import NotReplayed
 from .independent import solved
-from .problem import Problem
+from .problem import Level, Problem
 
 
 # Beyond this share, stragglers take most of the time.
@@ -34,6 +35,10 @@ def warn_of_stragglers(stragglers: int, lost: int, count: int, stacklevel: int) 
             '`engine="jax"`.',
             stacklevel=stacklevel + 1,
         )
+
+
+# The high or the low 32 bits of the numbers of samples.
+_Words: TypeAlias = Array | np.ndarray
 
 
 class Batch(NamedTuple):
@@ -67,16 +72,26 @@ def _halves(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return high, (numbers & np.uint64(0xFFFFFFFF)).astype(np.uint32)
 
 
+def _sample_keys(key: PRNGKeyArray, high: _Words, low: _Words) -> Array:
+    """The keys of the samples with these numbers."""
+    return jax.vmap(ft.partial(sample_key, key))(high, low)
+
+
 @eqx.filter_jit
-def _drawn(p: Problem, key: PRNGKeyArray, hi, lo) -> tuple[PyTree, PyTree]:
+def _drawn(
+    p: Problem, key: PRNGKeyArray, high: _Words, low: _Words
+) -> tuple[PyTree, PyTree]:
     """`Problem.drawn` for the paths of a batch."""
-    return jax.vmap(p.drawn)(jax.vmap(ft.partial(sample_key, key))(hi, lo))
+    return jax.vmap(p.drawn)(_sample_keys(key, high, low))
 
 
 @eqx.filter_jit
-def _paths(p: Problem, key: PRNGKeyArray, hi, lo):
-    keys = jax.vmap(ft.partial(sample_key, key))(hi, lo)
-    states, failed = solved(p, keys)
+def _paths(
+    p: Problem, key: PRNGKeyArray, high: _Words, low: _Words
+) -> tuple[PyTree[Array], Bool[Array, "levels n"]]:
+    """The saved states of the paths of a batch, along axes of levels, paths and times, and
+    which paths failed."""
+    states, failed = solved(p, _sample_keys(key, high, low))
     return p.unravel(jnp.swapaxes(states, 1, 2)), failed
 
 
@@ -87,58 +102,107 @@ def by_drjit(
 
     Raises an `ImportError` without Dr.Jit, and a `ValueError` if the system cannot be
     replayed."""
-    layout, arrays = split(p, key)
-    grid, n = p.level(level), len(numbers)
     try:
-        kernels = _kernels(layout)
-        drawn = p.y0, None
-        if p.paths_differ:
-            drawn = _drawn(p, key, *_halves(numbers))
-        first = int(numbers[0])
-        paths, parameters = kernels.begin(arrays, key, grid.h, first, n, *drawn)
-        saves = np.asarray(grid.saved_steps)
-        kept, done = {}, 0
-        for step in np.unique(saves):
-            if step > done:
-                paths = kernels.advance(paths, parameters, done, int(step))
-            kept[step], done = [*map(np.asarray, paths.y)], step
-        stopped = np.asarray(paths.stopped)
+        fused = _fused_batch(p, key, numbers, level)
+    except ImportError as error:
+        raise ImportError(
+            f'`engine="drjit"` needs Dr.Jit. {error}; or pass `engine="jax"`, which needs '
+            "nothing else."
+        ) from error
     except (NotReplayed, RuntimeError) as error:
-        if (refused := _refused(error)) is not None:
-            raise refused from None
-        raise
-    at_times = [
-        np.stack([kept[s][k] for s in saves], axis=1) for k in range(len(paths.y))
+        refused = _refused(error)
+        if refused is None:
+            raise
+        # The errors behind it are about recordings, and pages long.
+        raise refused from None
+    if fused.stragglers == 0:
+        return fused
+    return _with_stragglers(p, key, numbers, level, fused)
+
+
+def _fused_batch(
+    p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int
+) -> Batch:
+    """The paths from the kernel alone: those that it did not finish count as failed."""
+    own_args = None if p.args_of is None else eqx.filter(p.args, eqx.is_array)
+    functions, arrays = split(_bare(p), key, own_args, p.paths_differ)
+    kernels = _kernels(functions)
+    start = (p.y0, None)
+    if p.paths_differ:
+        start = _drawn(p, key, *_halves(numbers))
+    grid = p.level(level)
+    lanes, shared = kernels.begin(
+        arrays, key, grid.h, int(numbers[0]), len(numbers), *start
+    )
+    saved_steps = np.asarray(grid.saved_steps)
+    # From the number of a step to the entries of all states after it. The kernel is called
+    # for the steps between two times.
+    after: dict[int, list[np.ndarray]] = {}
+    done = 0
+    for step in np.unique(saved_steps).tolist():
+        if step > done:
+            lanes = kernels.advance(lanes, shared, done, step)
+        done = step
+        after[step] = [np.asarray(entry) for entry in lanes.y]
+    entries = [
+        np.stack([after[step][k] for step in saved_steps.tolist()], axis=1)
+        for k in range(len(lanes.y))
     ]
-    y = _unraveled(p.y0, at_times)
-    (which,) = np.nonzero(stopped)
-    if len(which) == 0:
-        return Batch(y, stopped)
-    # Rounded up to a power of four, so that JAX compiles few programs.
-    size = min(n, 4 ** int(np.ceil(np.log(len(which)) / np.log(4))))
-    rest = by_jax(p, key, numbers[np.resize(which, size)], level)
-    y = jtu.tree_map(np.array, y)
-    for x, own in zip(jtu.tree_leaves(y), jtu.tree_leaves(rest.y)):
-        x[which] = own[: len(which)]
-    failed = np.zeros(n, bool)
-    failed[which] = rest.failed[: len(which)]
-    return Batch(y, failed, len(which))
+    stopped = np.asarray(lanes.stopped)
+    return Batch(_unraveled(p.y0, entries), stopped, int(np.sum(stopped)))
 
 
-# A kernel keeps what the user's functions capture.
+def _bare(p: Problem) -> Problem:
+    """The problem as a kernel is compiled for it: with plain sweeps for root finders, and
+    without step sizes, times and numbers of steps, which are inputs of the kernel."""
+    none = jnp.zeros(1, jnp.int32)
+    level = Level(none, jnp.ones_like(p.levels.h[:1]), none, none[None])
+    return dataclasses.replace(
+        p,
+        solver=without_rescue(p.solver),
+        y0_of=None,
+        args_of=None,
+        levels=level,
+        weights=jnp.ones((1, 1)),
+        at_end=True,
+        max_steps=1,
+    )
+
+
+# A kernel keeps what the user's functions capture, so only a few are kept.
 @ft.lru_cache(maxsize=8)
-def _kernels(layout: Any) -> Kernels:
-    return Kernels(layout)
+def _kernels(functions: PathFunctions) -> Kernels:
+    return Kernels(functions)
 
 
-def _unraveled(y0: PyTree, numbers: list[np.ndarray]) -> PyTree[np.ndarray]:
+def _with_stragglers(
+    p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int, fused: Batch
+) -> Batch:
+    """The paths of a batch, with those that the kernel did not finish simulated by JAX."""
+    (which,) = np.nonzero(fused.failed)
+    # Rounded up to a power of four, so that JAX compiles few programs.
+    power = int(np.ceil(np.log(len(which)) / np.log(4)))
+    size = min(len(numbers), 4**power)
+    rest = by_jax(p, key, numbers[np.resize(which, size)], level)
+
+    def replaced(fused: np.ndarray, by_jax: np.ndarray) -> np.ndarray:
+        y = np.array(fused)
+        y[which] = by_jax[: len(which)]
+        return y
+
+    failed = np.zeros(len(numbers), bool)
+    failed[which] = rest.failed[: len(which)]
+    return Batch(jtu.tree_map(replaced, fused.y, rest.y), failed, len(which))
+
+
+def _unraveled(y0: PyTree, entries: list[np.ndarray]) -> PyTree[np.ndarray]:
     """The state, from its entries, each with axes for paths and times."""
     leaves, treedef = jtu.tree_flatten(y0)
-    ends = np.cumsum([0, *[x.size for x in leaves]])
-    stack = lambda x, i: np.stack(numbers[i : i + x.size], axis=-1)
-    each = [
-        stack(x, i).reshape(*numbers[0].shape, *x.shape) for x, i in zip(leaves, ends)
-    ]
+    left = iter(entries)
+    each = []
+    for leaf in leaves:
+        own = np.stack([next(left) for _ in range(leaf.size)], axis=-1)
+        each.append(own.reshape(*own.shape[:-1], *leaf.shape))
     return treedef.unflatten(each)
 
 
@@ -158,14 +222,15 @@ def _refused(error: BaseException | None) -> ValueError | None:
 def _origin(location: str) -> str:
     """The function of the user's code that an operation comes from, if JAX recorded it: the
     first one outside of installed packages."""
-    frames = re.findall(r'"([^"]*)"\("([^"]+)":(\d+)', location)
     own = str(Path(__file__).parents[1])
-    for name, file, line in frames:
-        if "site-packages" not in file and not file.startswith(own):
-            return f", which `{name.split('.')[-1]}` needs ({file}, line {line})"
+    for source in source_lines(location):
+        if "site-packages" not in source.file and not source.file.startswith(own):
+            where = f"({source.file}, line {source.line})"
+            return f", which `{source.function}` needs {where}"
     return ""
 
 
+# From the name of an engine to the function that simulates a batch.
 ENGINES: dict[str, Callable[..., Batch]] = {
     "jax": by_jax,
     "drjit": by_drjit,

@@ -1,18 +1,18 @@
 """Samples of `expectation` from a fused kernel."""
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Key, PRNGKeyArray, PyTree
 
 from .._root_finder import all_finite
 from .engines import by_drjit, state_itself
 from .independent import IndependentPaths
-from .problem import Problem
+from .problem import Level, Problem
 from .sampling import Samples, SamplingPlan
 
 
@@ -23,7 +23,7 @@ _BATCH = 2**19
 def fused_plan(
     problem: Problem, key: PRNGKeyArray, sampling: Any, devices: tuple
 ) -> SamplingPlan:
-    """A plan in which a kernel simulates independent paths, and JAX evaluates $\\phi$.
+    r"""A plan in which a kernel simulates independent paths, and JAX evaluates $\phi$.
     Raises a `ValueError` for another `sampling`, or several devices."""
     if not isinstance(sampling, IndependentPaths):
         raise ValueError(
@@ -42,48 +42,81 @@ def fused_plan(
 
 
 class FusedPaths:
-    """The paths of a plan, from sample `first` on, and how many of all so far failed or
-    were handed back to JAX."""
+    """The paths of a plan, by their numbers.
+
+    - `count`: the number of paths so far, on all levels.
+    - `lost`: how many of these failed.
+    - `stragglers`: how many were handed back to JAX.
+    """
 
     def __init__(self, problem: Problem, key: PRNGKeyArray):
+        # A kernel returns states, and is the same for every $\phi$.
         self._problem = dataclasses.replace(problem, phi=state_itself, at_end=False)
         self._key = key
-        self._last = None
-        self.count = self.lost = self.stragglers = 0
+        self._last: _NumberedPaths | None = None
+        self.count = 0
+        self.lost = 0
+        self.stragglers = 0
 
-    def __call__(self, first: int, n: int) -> tuple[PyTree[np.ndarray], np.ndarray]:
-        # `expectation` asks for the first batch twice.
-        if self._last is None or self._last[0] != (first, n):
-            self._last = (first, n), self._batch(first, n)
-        return self._last[1]
+    def __call__(self, first: int, number: int) -> "_Paths":
+        """The paths of this number of samples, from sample `first` on."""
+        # `expectation` asks for the first batch twice: to know the shapes of samples, and
+        # for the samples.
+        if self._last is None or self._last.which != (first, number):
+            self._last = _NumberedPaths((first, number), self._batch(first, number))
+        return self._last.paths
 
-    def _batch(self, first: int, n: int) -> tuple[PyTree[np.ndarray], np.ndarray]:
-        numbers = np.arange(first, first + n, dtype=np.uint64)
-        levels = range(len(self._problem.levels.h))
-        batches = [by_drjit(self._problem, self._key, numbers, k) for k in levels]
-        self.count += n * len(batches)
-        self.lost += sum(int(np.sum(b.failed)) for b in batches)
-        self.stragglers += sum(b.stragglers for b in batches)
-        stack = lambda *x: np.stack(x)
-        return jtu.tree_map(stack, *[b.y for b in batches]), stack(
-            *[b.failed for b in batches]
+    def _batch(self, first: int, number: int) -> "_Paths":
+        samples = np.arange(first, first + number, dtype=np.uint64)
+        batches = [
+            by_drjit(self._problem, self._key, samples, level)
+            for level in range(len(self._problem.levels.h))
+        ]
+        self.count += number * len(batches)
+        self.lost += sum(int(np.sum(batch.failed)) for batch in batches)
+        self.stragglers += sum(batch.stragglers for batch in batches)
+        return _Paths(
+            y=jtu.tree_map(_stacked, *[batch.y for batch in batches]),
+            failed=_stacked(*[batch.failed for batch in batches]),
         )
 
 
-def _samples(
-    p: Problem,
-    paths: tuple[PyTree[Array], Bool[Array, "levels n"]],
-    keys: PRNGKeyArray,
-) -> Samples:
-    y, failed = paths
-    _, args = jax.vmap(p.drawn)(keys)
+def _stacked(*levels: np.ndarray) -> np.ndarray:
+    return np.stack(levels)
 
-    def values(level, y):
+
+class _Paths(NamedTuple):
+    """Paths, along the second axis of each array. The first axis is the level.
+
+    - `y`: the states at the saved times, along the third axis.
+    - `failed`: which paths failed.
+    """
+
+    y: PyTree[Array | np.ndarray]
+    failed: Bool[Array | np.ndarray, "levels n"]
+
+
+class _NumberedPaths(NamedTuple):
+    """Paths, and `which` they are: the number of the first sample, and of samples."""
+
+    which: tuple[int, int]
+    paths: _Paths
+
+
+def _samples(p: Problem, paths: _Paths, keys: Key[Array, " n"]) -> Samples:
+    """The samples with these random keys, whose paths are known."""
+    _, own_args = jax.vmap(p.drawn)(keys)
+
+    def values_of_path(times: Any, y: PyTree[Array], own: PyTree[Array]) -> Array:
+        return jax.vmap(p.with_args(own).values)(times, y)
+
+    def values_on_level(level: Level, y: PyTree[Array]) -> Array:
         times = p.t0 + level.saved_steps * level.h
-        of_path = lambda y, args: jax.vmap(p.with_args(args).values)(times, y)
-        return jax.vmap(of_path)(y, args)
+        return jax.vmap(values_of_path, (None, 0, 0))(times, y, own_args)
 
-    phi = jax.vmap(values)(p.levels, y)
-    lost = jnp.any(failed | ~jax.vmap(jax.vmap(all_finite))(phi), axis=0)
+    phi = jax.vmap(values_on_level)(p.levels, paths.y)
+    finite = jax.vmap(jax.vmap(all_finite))(phi)
+    # A path that fails on several levels counts once.
+    lost = jnp.any(paths.failed | ~finite, axis=0)
     combined = p.combined(jnp.swapaxes(phi, 1, 2))
     return Samples(p.averaged([combined]), ~lost, lost)

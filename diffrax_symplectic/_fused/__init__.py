@@ -1,2 +1,3 @@
-from .kernels import Kernels
-from .layout import sample_key, split
+from .kernels import Kernels, Lanes
+from .path_functions import PathFunctions, sample_key, split
+from .sweeps import without_rescue

@@ -1,4 +1,39 @@
+"""Programs in StableHLO, as functions of arrays of [Dr.Jit](https://drjit.readthedocs.io).
+
+StableHLO is the form in which JAX hands a program to its compilers: operations on arrays of
+known shapes. `Replay` takes such a program, as text or as JAX's own object, and is a
+function of `Tensor`s. A `Tensor` is an array whose every entry is an array of Dr.Jit, with
+one lane for each path (or whatever else there are many of): a program for one path runs for
+all of them.
+
+    lowered = jax.jit(fn).lower(jax.ShapeDtypeStruct((3,), "float32"))
+    replay = Replay(lowered.as_text())
+    results, errors = replay(Tensor([x, y, z], (3,)))
+
+Dr.Jit records the operations and compiles them when values are asked for. So a replay may
+stand within a loop of Dr.Jit, and becomes part of one kernel with it.
+
+What an operation does is its *rule*. A function of single entries is a line in the table
+of `elementwise.py`, or of `complex.py`; any other rule is a function with the decorator
+`rule`:
+`moves.py` (entries go to known places), `windows.py` (an index that differs between paths),
+`reductions.py` (sums, products, sorting), `control_flow.py` (loops and branches) and
+`linear_algebra.py` (what JAX calls LAPACK for). Without a rule, `Replay` raises
+`NotReplayed`, with the name of the operation and where it comes from.
+
+This folder knows nothing of differential equations.
+"""
+
 from .backend import array_types, drjit
 from .operation import NotReplayed
 from .replay import Replay
-from .tensor import flat, MOST_IN_REGISTERS, scalar, Table, Tensor, unflat
+from .tensor import (
+    ArrayType,
+    chosen,
+    flat,
+    in_memory,
+    merged,
+    MOST_IN_REGISTERS,
+    scalar,
+)
+from .tensor import Table, Tensor, unflat

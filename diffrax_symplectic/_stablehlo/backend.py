@@ -7,19 +7,19 @@ from typing import Any
 import jax
 
 
-_HOW = (
-    "Install it with `pip install '.[fused]'` in a checkout (or `pip install 'drjit>=1.5'`)"
-    '; or pass `engine="jax"`, which needs nothing else.'
+_NO_DRJIT = (
+    "Dr.Jit cannot be imported. Install it with `pip install '.[fused]'` in a checkout (or "
+    "`pip install 'drjit>=1.5'`)"
 )
-_LLVM = (
-    'On a CPU `engine="drjit"` needs a shared library of LLVM, of version 15 or newer, and '
-    "Dr.Jit found none. Install one (Debian and Ubuntu: `apt-get install libllvm19`; "
-    "conda-forge: `libllvm`; Homebrew: `llvm`), and if it lies where Dr.Jit does not look, "
-    "set the environment variable `DRJIT_LIBLLVM_PATH` to the file before you start Python."
+_NO_LLVM = (
+    "On a CPU Dr.Jit needs a shared library of LLVM, of version 15 or newer, and found "
+    "none. Install one (Debian and Ubuntu: `apt-get install libllvm19`; conda-forge: "
+    "`libllvm`; Homebrew: `llvm`), and if it lies where Dr.Jit does not look, set the "
+    "environment variable `DRJIT_LIBLLVM_PATH` to the file before you start Python"
 )
-_CUDA = (
+_NO_CUDA = (
     "JAX runs on a GPU, but Dr.Jit found no driver of CUDA. Start Python with "
-    '`JAX_PLATFORMS=cpu` to use the CPU, or pass `engine="jax"`.'
+    "`JAX_PLATFORMS=cpu` to use the CPU"
 )
 
 
@@ -29,18 +29,19 @@ def drjit() -> Any:
     try:
         return importlib.import_module("drjit")
     except ImportError as error:
-        message = f'`engine="drjit"` needs Dr.Jit, which cannot be imported. {_HOW}'
-        raise ImportError(message) from error
+        raise ImportError(_NO_DRJIT) from error
 
 
 @ft.cache
 def array_types() -> dict[str, Any]:
     """The types of arrays for JAX's default device, by StableHLO's names of the types of
     their entries. Raises an `ImportError` if Dr.Jit cannot compile for it."""
-    dr, on_cpu = drjit(), jax.default_backend() == "cpu"
+    dr = drjit()
+    on_cpu = jax.default_backend() == "cpu"
+    # Importing `drjit.llvm` succeeds without LLVM, and the first kernel then fails.
     needed = dr.JitBackend.LLVM if on_cpu else dr.JitBackend.CUDA
     if not dr.has_backend(needed):
-        raise ImportError(_LLVM if on_cpu else _CUDA)
+        raise ImportError(_NO_LLVM if on_cpu else _NO_CUDA)
     types = importlib.import_module("drjit.llvm" if on_cpu else "drjit.cuda")
     return {
         "complex<f32>": types.Complex2f,

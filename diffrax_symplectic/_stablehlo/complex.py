@@ -1,16 +1,15 @@
 """Complex numbers, as pairs of Dr.Jit arrays: their functions, where these are not those of
-real numbers, and their constants.
+real numbers.
 
 Dr.Jit folds operations with constant zeros, so that a real number that JAX converts to a
 complex one costs as little as before.
 """
 
-import re
+import operator
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
+from .._compat import is_literal
 from .backend import drjit
 from .elementwise import elementwise
 
@@ -21,17 +20,20 @@ def is_complex(a: Any) -> bool:
 
 def _is_zero(a: Any) -> bool:
     """Whether it is zero for all paths, known while the kernel is recorded."""
-    return a.state == drjit().VarState.Literal and a[0] == 0
+    return is_literal(a) and a[0] == 0
 
 
 def _divide(a, b):
     if _is_zero(b.imag):
+        # By a real number, as in many Hamiltonians.
         inverse = 1 / b.real
         return type(a)(a.real * inverse, a.imag * inverse)
     dr = drjit()
     # Scaled, so that no square overflows.
-    real, imag = dr.abs(b.real), dr.abs(b.imag)
+    real = dr.abs(b.real)
+    imag = dr.abs(b.imag)
     size = dr.select(real > imag, real, imag)
+    # Zero and infinity cannot be scaled.
     unit = dr.select((size > 0) & dr.isfinite(size), 1 / size, 1)
     scaled = type(a)(b.real * unit, b.imag * unit)
     inverse = unit / dr.squared_norm(scaled)
@@ -43,10 +45,12 @@ def _absolute(a):
     dr = drjit()
     if _is_zero(a.imag):
         return dr.abs(a.real)
+    # Not scaled: the square of an amplitude beyond 1e154 overflows.
     return dr.sqrt(dr.fma(a.real, a.real, a.imag * a.imag))
 
 
 def _sign(a):
+    """The number divided by its absolute value."""
     dr = drjit()
     size = _absolute(a)
     inverse = dr.select(size == 0, 0, 1 / size)
@@ -56,6 +60,7 @@ def _sign(a):
 def _square_root(a):
     """The root with a real part that is not negative, without cancellation."""
     dr = drjit()
+    # The larger part of the root is a sum, and the other follows from their product.
     size = dr.sqrt((_absolute(a) + dr.abs(a.real)) / 2)
     other = dr.select(size == 0, 0, a.imag / (2 * size))
     right = a.real >= 0
@@ -78,72 +83,59 @@ def _exp(a):
 
 def _power(a, b):
     dr = drjit()
+    # The logarithm of zero is infinite, and its product with the exponent NaN.
     zero = (a.real == 0) & (a.imag == 0)
-    one = (b.real == 0) & (b.imag == 0)
-    at_zero = dr.select(one, type(a)(1), type(a)(0))
-    return dr.select(zero, at_zero, _exp(b * _log(a)))
+    to_the_zeroth = (b.real == 0) & (b.imag == 0)
+    of_zero = dr.select(to_the_zeroth, type(a)(1), type(a)(0))
+    return dr.select(zero, of_zero, _exp(b * _log(a)))
 
 
 def _sine(a):
-    real = elementwise()
     sine, cosine = drjit().sincos(a.real)
-    return type(a)(sine * real["cosh"](a.imag), cosine * real["sinh"](a.imag))
+    cosh = elementwise()["cosh"](a.imag)
+    sinh = elementwise()["sinh"](a.imag)
+    return type(a)(sine * cosh, cosine * sinh)
 
 
 def _cosine(a):
-    real = elementwise()
     sine, cosine = drjit().sincos(a.real)
-    return type(a)(cosine * real["cosh"](a.imag), -sine * real["sinh"](a.imag))
+    cosh = elementwise()["cosh"](a.imag)
+    sinh = elementwise()["sinh"](a.imag)
+    return type(a)(cosine * cosh, -sine * sinh)
+
+
+def _is_finite(a):
+    return drjit().isfinite(a.real) & drjit().isfinite(a.imag)
+
+
+def _square(a):
+    return a * a
 
 
 def equal(a, b):
+    """Whether both parts are equal."""
     return (a.real == b.real) & (a.imag == b.imag)
 
 
 def complex_functions() -> dict[str, Callable[..., Any]]:
     """The elementwise functions of complex numbers, by their names in StableHLO."""
-    dr = drjit()
     return {
         "abs": _absolute,
-        "add": lambda a, b: a + b,
+        "add": operator.add,
         "cosine": _cosine,
         "divide": _divide,
         "exponential": _exp,
-        "imag": lambda a: a.imag,
-        "is_finite": lambda a: dr.isfinite(a.real) & dr.isfinite(a.imag),
+        "imag": operator.attrgetter("imag"),
+        "is_finite": _is_finite,
         "log": _log,
-        "multiply": lambda a, b: a * b,
-        "negate": lambda a: -a,
+        "multiply": operator.mul,
+        "negate": operator.neg,
         "power": _power,
-        "real": lambda a: a.real,
-        "select": dr.select,
+        "real": operator.attrgetter("real"),
+        "select": drjit().select,
         "sign": _sign,
         "sine": _sine,
         "sqrt": _square_root,
-        "square": lambda a: a * a,
-        "subtract": lambda a, b: a - b,
+        "square": _square,
+        "subtract": operator.sub,
     }
-
-
-def values(op: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """The values of a complex constant. JAX's interface to the program gives those of real
-    constants only, so that these are read from its text."""
-    text = str(op)
-    size = 8 if "complex<f64>" in text else 4
-    if found := re.search(r'dense<"0x([0-9A-F]+)">', text):
-        numbers = np.frombuffer(bytes.fromhex(found[1]), f"<f{size}")
-    else:
-        parts = re.findall(r"\(([^(),]+),([^(),]+)\)", text.split(" : ")[0])
-        numbers = np.array([_number(x, size) for pair in parts for x in pair])
-    pairs = numbers.reshape(-1, 2)
-    whole = pairs[:, 0] + 0j
-    whole.imag = pairs[:, 1]
-    return np.resize(whole, shape)
-
-
-def _number(text: str, size: int) -> float:
-    """A number as MLIR prints it: as hexadecimal bits if it is not finite."""
-    text = text.strip()
-    if not text.startswith("0x"):
-        return float(text)
-    return float(np.array(int(text, 16), f"<u{size}").view(f"<f{size}"))

@@ -4,20 +4,42 @@ Functions are defined here where Dr.Jit differs from StableHLO (NaN, infinities,
 or is less accurate.
 """
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from .._compat import is_literal
 from .backend import drjit
 
 
+# Powers with whole exponents up to this size are products, of at most twelve factors, which
+# have no logarithm of a negative number. Larger ones are computed by logarithms.
+_MOST_MULTIPLIED = 64
+
+
+# Of truth values StableHLO has sums, products and extremes. Dr.Jit has `|` and `&` only.
+
+
+def _add(a, b):
+    return a | b if drjit().is_mask_v(a) else a + b
+
+
+def _multiply(a, b):
+    return a & b if drjit().is_mask_v(a) else a * b
+
+
 def _maximum(a, b):
+    if drjit().is_mask_v(a):
+        return a | b
     # NaN propagates, as in JAX.
     return drjit().select((a > b) | _is_nan(a), a, b)
 
 
 def _minimum(a, b):
+    if drjit().is_mask_v(a):
+        return a & b
     return drjit().select((a < b) | _is_nan(a), a, b)
 
 
@@ -33,9 +55,9 @@ def _clamp(low, a, high):
 def _divide(a, b):
     if drjit().is_float_v(a):
         return a / b
-    by, zero, _ = _divisor(a, b)
+    safe, zero, _ = _divisor(a, b)
     # Dr.Jit's `//` of integers rounds to zero, as StableHLO does.
-    return drjit().select(zero, ~type(a)(0), a // by)
+    return drjit().select(zero, ~type(a)(0), a // safe)
 
 
 def _divisor(a, b):
@@ -43,12 +65,14 @@ def _divisor(a, b):
     division by zero, and of the smallest integer by -1."""
     dr = drjit()
     zero = b == 0
-    minus = (b == -1) if dr.is_signed_v(b) else ~zero & zero
-    overflow = minus & (a == _least(a))
-    return dr.select(zero | overflow, type(b)(1), b), zero, minus
+    # A number without sign is never -1.
+    minus_one = (b == -1) if dr.is_signed_v(b) else ~zero & zero
+    overflow = minus_one & (a == _least(a))
+    return dr.select(zero | overflow, type(b)(1), b), zero, minus_one
 
 
 def _least(a):
+    """The smallest integer of its type."""
     bits = 8 * drjit().itemsize_v(a)
     return type(a)(-(2 ** (bits - 1)) if drjit().is_signed_v(a) else 0)
 
@@ -56,12 +80,14 @@ def _least(a):
 def _remainder(a, b):
     dr = drjit()
     if not dr.is_float_v(a):
-        by, zero, minus = _divisor(a, b)
-        return dr.select(zero, a, dr.select(minus, type(a)(0), a - (a // by) * by))
-    size, by = dr.abs(a), dr.abs(b)
-    rest = dr.fma(-dr.trunc(size / by), by, size)
+        safe, zero, minus_one = _divisor(a, b)
+        rest = a - (a // safe) * safe
+        return dr.select(zero, a, dr.select(minus_one, type(a)(0), rest))
+    size = dr.abs(a)
+    step = dr.abs(b)
+    rest = dr.fma(-dr.trunc(size / step), step, size)
     # Where the quotient was rounded to the next whole number.
-    rest = dr.select(rest < 0, rest + by, dr.select(rest >= by, rest - by, rest))
+    rest = dr.select(rest < 0, rest + step, dr.select(rest >= step, rest - step, rest))
     rest = dr.select(dr.isinf(b) & dr.isfinite(a), size, rest)
     return dr.select(dr.isfinite(a) & ~(b == 0), dr.copysign(rest, a), type(a)(np.nan))
 
@@ -69,45 +95,56 @@ def _remainder(a, b):
 def _sign(a):
     dr = drjit()
     if dr.is_float_v(a):
+        # Zero keeps its sign, and NaN is itself.
         return dr.select((a == 0) | _is_nan(a), a, dr.copysign(type(a)(1), a))
     return dr.select(a == 0, 0, dr.select(a > 0, type(a)(1), type(a)(-1)))
 
 
 def _power(a, b):
     """Uses logarithms, or multiplication for small integer exponents."""
-    dr, T = drjit(), type(a)
-    if b.state == dr.VarState.Literal and float(b[0]).is_integer() and abs(b[0]) <= 64:
+    if is_literal(b) and float(b[0]).is_integer() and abs(b[0]) <= _MOST_MULTIPLIED:
         return _integer_power(a, int(b[0]))
+    dr = drjit()
+    number = type(a)
     size = dr.exp(dr.log(dr.abs(a)) * b)
-    whole, odd = dr.floor(b) == b, dr.floor(b / 2) * 2 != b
-    other = dr.select(dr.isinf(a), size, T(np.nan))
+    # Of a negative number only whole powers are real: odd ones are negative.
+    whole = dr.floor(b) == b
+    odd = dr.floor(b / 2) * 2 != b
+    other = dr.select(dr.isinf(a), size, number(np.nan))
     negative = dr.select(whole, dr.select(odd, -size, size), other)
-    size = dr.select(a < 0, negative, size)
-    size = dr.select((a == 0) & (b > 0), T(0), size)
-    return dr.select((b == 0) | (a == 1), T(1), size)
+    power = dr.select(a < 0, negative, size)
+    # Where a logarithm of zero would meet an exponent of zero, and of one an infinite one.
+    power = dr.select((a == 0) & (b > 0), number(0), power)
+    return dr.select((b == 0) | (a == 1), number(1), power)
 
 
-def _integer_power(a, n: int):
-    out, square, left = type(a)(1), a, abs(n)
+def _integer_power(a, exponent: int):
+    """By repeated squares."""
+    power = type(a)(1)
+    square = a
+    left = abs(exponent)
     while left:
-        out = out * square if left & 1 else out
-        square, left = square * square, left >> 1
-    return 1 / out if n < 0 else out
+        power = power * square if left & 1 else power
+        square = square * square
+        left = left >> 1
+    return 1 / power if exponent < 0 else power
 
 
 def _expm1(a):
     """Kahan's formula, in which the rounding error of the exponential cancels."""
     dr = drjit()
-    u = dr.exp(a)
-    near = (u - 1) * a / dr.log(u)
-    return dr.select(u == 1, a, dr.select(dr.abs(a) > 1, u - 1, near))
+    exp = dr.exp(a)
+    near_zero = (exp - 1) * a / dr.log(exp)
+    return dr.select(exp == 1, a, dr.select(dr.abs(a) > 1, exp - 1, near_zero))
 
 
 def _log1p(a):
+    """Kahan's formula, in which the rounding error of the sum cancels."""
     dr = drjit()
-    u = 1 + a
-    near = dr.log(u) * a / (u - 1)
-    return dr.select(u == 1, a, dr.select(dr.isfinite(u), near, dr.log(u)))
+    moved = 1 + a
+    log = dr.log(moved)
+    near_zero = log * a / (moved - 1)
+    return dr.select(moved == 1, a, dr.select(dr.isfinite(moved), near_zero, log))
 
 
 def _tan(a):
@@ -122,16 +159,19 @@ def _atan(a):
 def _atan2(a, b):
     """By the arcsine of an angle of at most 45 degrees. Dr.Jit's own takes a maximum that
     LLVM 15 and 16 cannot compile: they abort the process."""
-    dr, T = drjit(), type(a)
+    dr = drjit()
+    number = type(a)
     steep = dr.abs(a) > dr.abs(b)
     small = dr.select(steep, dr.abs(b), dr.abs(a))
     large = dr.select(steep, dr.abs(a), dr.abs(b))
     # Two infinities count as equal.
-    slope = dr.select(small == large, T(1), small / large)
+    slope = dr.select(small == large, number(1), small / large)
     angle = dr.asin(slope / dr.sqrt(1 + slope * slope))
+    # From one eighth of the circle to all of it.
     angle = dr.select(steep, np.pi / 2 - angle, angle)
-    angle = dr.select(a == 0, T(0), angle)
-    angle = dr.select(dr.copysign(T(1), b) < 0, np.pi - angle, angle)
+    angle = dr.select(a == 0, number(0), angle)
+    # The sign of `b` counts, also where it is zero: the angle of (0, -0) is pi.
+    angle = dr.select(dr.copysign(number(1), b) < 0, np.pi - angle, angle)
     return dr.select(_is_nan(a) | _is_nan(b), a + b, dr.copysign(angle, a))
 
 
@@ -140,6 +180,7 @@ def _erf(a):
 
 
 def _rsqrt(a):
+    # Dr.Jit's own is an approximation in single precision.
     return 1 / drjit().sqrt(a)
 
 
@@ -147,20 +188,22 @@ def _rsqrt(a):
 
 
 def _sinh(a):
-    u = _expm1(drjit().abs(a))
-    return drjit().copysign(
-        drjit().select(drjit().isinf(u), u, (u + u / (u + 1)) / 2), a
-    )
+    dr = drjit()
+    grown = _expm1(dr.abs(a))
+    # Where the exponential overflows, the quotient is NaN.
+    size = dr.select(dr.isinf(grown), grown, (grown + grown / (grown + 1)) / 2)
+    return dr.copysign(size, a)
 
 
 def _cosh(a):
-    u = drjit().exp(drjit().abs(a))
-    return u / 2 + 0.5 / u
+    exp = drjit().exp(drjit().abs(a))
+    return exp / 2 + 0.5 / exp
 
 
 def _tanh(a):
-    u = _expm1(-2 * drjit().abs(a))
-    return drjit().copysign(-u / (u + 2), a)
+    # Of a negative number the exponential does not overflow.
+    shrunk = _expm1(-2 * drjit().abs(a))
+    return drjit().copysign(-shrunk / (shrunk + 2), a)
 
 
 def _atanh(a):
@@ -175,17 +218,19 @@ def _erf_inv(a):
     """In double precision Dr.Jit's version has at most the digits of single precision. Each
     step of Halley's method triples their number."""
     dr = drjit()
-    start = y = dr.erfinv(a)
+    start = dr.erfinv(a)
     if dr.itemsize_v(a) < 8:
-        return y
+        return start
+    y = start
     for _ in range(2):
         newton = (dr.erf(y) - a) * (np.sqrt(np.pi) / 2) * dr.exp(y * y)
         y = y - newton / (1 + y * newton)
+    # At the ends, and beyond them, it is infinite or NaN, and has no digits to gain.
     return dr.select(dr.abs(a) < 1, y, start)
 
 
 def _shifted(shift: Callable) -> Callable:
-    """A shift by all bits or more gives zero."""
+    """A shift by all bits or more gives zero, which LLVM leaves undefined."""
 
     def fn(a, b):
         return drjit().select(b < 8 * drjit().itemsize_v(a), shift(a, b), 0)
@@ -193,13 +238,18 @@ def _shifted(shift: Callable) -> Callable:
     return fn
 
 
-def _arithmetic(a, b):
+def _arithmetic_shift(a, b):
+    # A shift by all bits or more leaves the sign.
     bits = 8 * drjit().itemsize_v(a)
     return a >> drjit().minimum(b, bits - 1)
 
 
-def _not(a):
-    return ~a
+def _round_half_away(a):
+    return drjit().trunc(a + drjit().copysign(type(a)(0.5), a))
+
+
+def _square(a):
+    return a * a
 
 
 def elementwise() -> dict[str, Callable[..., Any]]:
@@ -209,8 +259,8 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "abs": dr.abs,
         "acos": dr.acos,
         "acosh": dr.acosh,
-        "add": lambda a, b: a | b if dr.is_mask_v(a) else a + b,
-        "and": lambda a, b: a & b,
+        "add": _add,
+        "and": operator.and_,
         "asin": dr.asin,
         "asinh": dr.asinh,
         "atan": _atan,
@@ -232,29 +282,29 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "log": dr.log,
         "log_plus_one": _log1p,
         "logistic": _logistic,
-        "maximum": lambda a, b: a | b if dr.is_mask_v(a) else _maximum(a, b),
-        "minimum": lambda a, b: a & b if dr.is_mask_v(a) else _minimum(a, b),
-        "multiply": lambda a, b: a & b if dr.is_mask_v(a) else a * b,
-        "negate": lambda a: -a,
-        "not": _not,
-        "or": lambda a, b: a | b,
+        "maximum": _maximum,
+        "minimum": _minimum,
+        "multiply": _multiply,
+        "negate": operator.neg,
+        "not": operator.invert,
+        "or": operator.or_,
         "popcnt": dr.popcnt,
         "power": _power,
         "remainder": _remainder,
-        "round_nearest_afz": lambda a: dr.trunc(a + dr.copysign(type(a)(0.5), a)),
+        "round_nearest_afz": _round_half_away,
         "round_nearest_even": dr.round,
         "rsqrt": _rsqrt,
         "select": dr.select,
-        "shift_left": _shifted(lambda a, b: a << b),
-        "shift_right_arithmetic": _arithmetic,
-        "shift_right_logical": _shifted(lambda a, b: a >> b),
+        "shift_left": _shifted(operator.lshift),
+        "shift_right_arithmetic": _arithmetic_shift,
+        "shift_right_logical": _shifted(operator.rshift),
         "sign": _sign,
         "sine": dr.sin,
         "sinh": _sinh,
         "sqrt": dr.sqrt,
-        "square": lambda a: a * a,
-        "subtract": lambda a, b: a - b,
+        "square": _square,
+        "subtract": operator.sub,
         "tan": _tan,
         "tanh": _tanh,
-        "xor": lambda a, b: a ^ b,
+        "xor": operator.xor,
     }

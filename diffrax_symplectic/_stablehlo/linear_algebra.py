@@ -7,6 +7,7 @@ between loops of Dr.Jit values go through memory, which costs more than operatio
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
+from .._compat import call_target
 from .backend import array_types, drjit
 from .operation import NotReplayed, Operation, rule
 from .tensor import Tensor
@@ -25,31 +26,43 @@ def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
     index = array_types()["i32"]
     rows = [[*row] for row in a]
     pivots = []
-    for k in range(min(len(rows), len(rows[0]))):
-        largest = dr.abs(rows[k][k])
-        pivot = index(k)
-        for i in range(k + 1, len(rows)):
-            size = dr.abs(rows[i][k])
+    for step in range(min(len(rows), len(rows[0]))):
+        # The largest entry of what is left of the column. Each path has its own.
+        largest = dr.abs(rows[step][step])
+        pivot = index(step)
+        for below in range(step + 1, len(rows)):
+            size = dr.abs(rows[below][step])
             larger = size > largest
             largest = dr.select(larger, size, largest)
-            pivot = dr.select(larger, index(i), pivot)
-        top = rows[k]
-        for i in range(k + 1, len(rows)):
-            here = pivot == i
-            row = rows[i]
-            rows[i] = [dr.select(here, old, x) for old, x in zip(rows[k], row)]
-            top = [dr.select(here, x, y) for x, y in zip(row, top)]
-        rows[k] = top
+            pivot = dr.select(larger, index(below), pivot)
+        # Rows have no address within a kernel: every row below may be the one to exchange.
+        first = rows[step]
+        top = first
+        for below in range(step + 1, len(rows)):
+            here = pivot == below
+            row = rows[below]
+            rows[below] = _where(here, first, row)
+            top = _where(here, row, top)
+        rows[step] = top
         # Below a pivot of zero are zeros.
-        inverse = dr.select(top[k] == 0, 0, 1 / top[k])
-        for i in range(k + 1, len(rows)):
-            factor = rows[i][k] * inverse
-            rest = [
-                dr.fma(-factor, y, x) for x, y in zip(rows[i][k + 1 :], top[k + 1 :])
-            ]
-            rows[i] = [*rows[i][:k], factor, *rest]
+        inverse = dr.select(top[step] == 0, 0, 1 / top[step])
+        for below in range(step + 1, len(rows)):
+            row = rows[below]
+            factor = row[step] * inverse
+            rest = _minus_multiple(row[step + 1 :], factor, top[step + 1 :])
+            rows[below] = [*row[:step], factor, *rest]
         pivots.append(pivot + 1)
     return rows, pivots
+
+
+def _where(mask: Any, row: list[Any], other: list[Any]) -> list[Any]:
+    """One row where a mask is true, and another elsewhere."""
+    return [drjit().select(mask, entry, old) for entry, old in zip(row, other)]
+
+
+def _minus_multiple(row: list[Any], factor: Any, other: list[Any]) -> list[Any]:
+    """A row less a multiple of another."""
+    return [drjit().fma(-factor, entry, old) for old, entry in zip(row, other)]
 
 
 def _cholesky(a: Matrix) -> tuple[Matrix, Any]:
@@ -58,34 +71,36 @@ def _cholesky(a: Matrix) -> tuple[Matrix, Any]:
     dr = drjit()
     rows = [[*row] for row in a]
     failed = array_types()["i1"](False)
-    for j, row in enumerate(rows):
-        square = row[j]
-        for k in range(j):
+    for column, row in enumerate(rows):
+        square = row[column]
+        for k in range(column):
             square = dr.fma(-row[k], row[k], square)
         # Also if it is NaN.
         failed = failed | ~(square > 0)
-        row[j] = dr.sqrt(square)
-        inverse = 1 / row[j]
-        for below in rows[j + 1 :]:
-            entry = below[j]
-            for k in range(j):
+        row[column] = dr.sqrt(square)
+        # One division for the whole column.
+        inverse = 1 / row[column]
+        for below in rows[column + 1 :]:
+            entry = below[column]
+            for k in range(column):
                 entry = dr.fma(-below[k], row[k], entry)
-            below[j] = entry * inverse
+            below[column] = entry * inverse
     return rows, failed
 
 
 def _solve_triangular(a: Matrix, b: Matrix, lower: bool, unit: bool) -> Matrix:
-    """The solution of `A X = B`."""
-    dr = drjit()
+    """The solution of `A X = B`. Reads one triangle of `A`, and with `unit` takes its
+    diagonal for ones."""
     n = len(a)
     solved: dict[int, list[Any]] = {}
+    # From the row with a single unknown on, each row has one more.
     for i in range(n) if lower else reversed(range(n)):
         row = b[i]
         for j, known in solved.items():
-            row = [dr.fma(-a[i][j], y, x) for x, y in zip(row, known)]
+            row = _minus_multiple(row, a[i][j], known)
         if not unit:
             inverse = 1 / a[i][i]
-            row = [x * inverse for x in row]
+            row = [entry * inverse for entry in row]
         solved[i] = row
     return [solved[i] for i in range(n)]
 
@@ -99,23 +114,15 @@ def _matrices(o: Operation, x: Tensor) -> list[Matrix]:
     rows, columns = x.shape[-2:]
     # `inv` has as many right-hand sides as unknowns.
     if max(rows, columns) > _MOST_UNKNOWNS:
-        what = f"`{_target(o)}` with more than {_MOST_UNKNOWNS} unknowns"
+        what = f"`{call_target(o.op)}` with more than {_MOST_UNKNOWNS} unknowns"
         raise NotReplayed(o.op, what)
     places = x.places.reshape(-1, rows, columns)
     return [[[x.entries[i] for i in row] for row in matrix] for matrix in places]
 
 
 def _tensor(matrices: list[Matrix], shape: tuple[int, ...]) -> Tensor:
-    return Tensor([x for a in matrices for row in a for x in row], shape)
-
-
-def _target(o: Operation) -> str:
-    return o.op.attributes["call_target_name"].value
-
-
-def _letter(o: Operation, name: str) -> str:
-    """An argument of LAPACK, such as `U` for an upper triangle."""
-    return chr(o.op.attributes["mhlo.backend_config"][name].value)
+    """The inverse of `_matrices`."""
+    return Tensor([entry for a in matrices for row in a for entry in row], shape)
 
 
 def _getrf(o: Operation, x: Tensor) -> list[Tensor]:
@@ -125,27 +132,28 @@ def _getrf(o: Operation, x: Tensor) -> list[Tensor]:
     fine = array_types()["i32"](0)
     return [
         _tensor([factors for factors, _ in done], x.shape),
-        Tensor([p for _, own in done for p in own], pivots),
+        Tensor([pivot for _, own in done for pivot in own], pivots),
         Tensor([fine] * len(done), info),
     ]
 
 
 def _potrf(o: Operation, x: Tensor) -> list[Tensor]:
-    upper = _letter(o, "uplo") == "U"
-    turned = _transposed if upper else lambda a: a
-    done = [_cholesky(turned(a)) for a in _matrices(o, x)]
-    factors = [turned(factor) for factor, _ in done]
+    upper = o.letter("uplo") == "U"
+    matrices = _matrices(o, x)
+    # `A = U^T U` with the transpose of the lower factor.
+    done = [_cholesky(_transposed(a) if upper else a) for a in matrices]
+    factors = [_transposed(factor) if upper else factor for factor, _ in done]
     # JAX asks whether `info` is zero.
     info = [drjit().select(lost, array_types()["i32"](1), 0) for _, lost in done]
     return [_tensor(factors, x.shape), Tensor(info, o.shapes()[1])]
 
 
 def _trsm(o: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
-    lower = _letter(o, "uplo") == "L"
-    unit = _letter(o, "diag") == "U"
-    right = _letter(o, "side") == "R"
+    lower = o.letter("uplo") == "L"
+    unit = o.letter("diag") == "U"
+    right = o.letter("side") == "R"
     # X A = B is A^T X^T = B^T.
-    turns = (_letter(o, "trans_x") != "N") != right
+    turns = (o.letter("trans_x") != "N") != right
     out = []
     for matrix, rhs in zip(_matrices(o, a), _matrices(o, b), strict=True):
         rhs = _transposed(rhs) if right else rhs
@@ -165,7 +173,7 @@ _CALLS: dict[str, Callable[..., list[Tensor]]] = {
 
 @rule
 def _custom_call(o, *xs):
-    name = _target(o)
+    name = call_target(o.op)
     for letter in ("s", "d"):
         for call, fn in _CALLS.items():
             if name == f"lapack_{letter}{call}_ffi":

@@ -3,76 +3,119 @@
 Their semantics: https://openxla.org/stablehlo/spec.
 """
 
-import re
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
+import numpy as np
+
+from .._compat import (
+    attribute_entry,
+    attribute_enum,
+    attribute_integers,
+    attribute_part,
+    attribute_rows,
+    attribute_value,
+    constant_values,
+    has_attribute,
+    operations_in,
+)
 from .backend import array_types
 from .tensor import made_here, Tensor
 
 
 class Operation(NamedTuple):
-    """An operation of a program. `run(i, arguments)` runs its region `i`."""
+    """An operation of a program.
+
+    - `op`: the object of MLIR.
+    - `run`: `run(i, arguments)` runs the region number `i`, such as the body of a loop.
+    - `errors`: masks of the lanes that raise an error, to which rules append. The caller
+        of the program sees to these lanes.
+    """
 
     op: Any
     run: Callable[..., list[Tensor]]
-    # Masks of the lanes that raise an error. JAX simulates these paths, and raises it.
     errors: list[Any]
 
     @property
     def name(self) -> str:
+        """The name without the dialect, such as `add`."""
         return self.op.name.split(".")[-1]
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """The shape of the first result."""
         return tuple(self.op.results[0].type.shape)
 
     @property
     def kind(self) -> Any:
-        return self.kind_of(self.op.results[0])
-
-    def kind_of(self, value: Any) -> Any:
-        """The type of Dr.Jit arrays for a value of the program."""
-        name = str(getattr(value.type, "element_type", value.type))
+        """The type of Dr.Jit arrays for the first result."""
+        type_of_result = self.op.results[0].type
+        name = str(getattr(type_of_result, "element_type", type_of_result))
         if name not in array_types():
             raise NotReplayed(self.op, f"numbers of type `{name}`")
         return array_types()[name]
 
+    @property
+    def value(self) -> np.ndarray:
+        """The values of a constant."""
+        return constant_values(self.op)
+
+    @property
+    def reduces_by(self) -> str:
+        """The name of the first operation of the region, which of a simple reduction is
+        its only one."""
+        first, *_ = operations_in(self.op.regions[0])
+        return first.name.split(".")[-1]
+
+    def has(self, name: str) -> bool:
+        return has_attribute(self.op, name)
+
     def ints(self, name: str) -> list[int]:
-        return [int(i) for i in self.op.attributes[name]]
+        return attribute_integers(self.op, name)
 
     def optional(self, name: str) -> list[int]:
-        return self.ints(name) if name in self.op.attributes else []
+        """As `ints`, or nothing if there is no such attribute."""
+        return self.ints(name) if self.has(name) else []
 
     def number(self, name: str) -> int:
-        return self.op.attributes[name].value
+        return attribute_value(self.op, name)
+
+    def rows(self, name: str) -> np.ndarray:
+        return attribute_rows(self.op, name)
+
+    def letter(self, name: str) -> str:
+        """An argument of LAPACK, such as `U` for an upper triangle."""
+        return chr(attribute_entry(self.op, "mhlo.backend_config", name))
 
     def word(self, name: str) -> str:
-        """The value of an enumeration, such as `#stablehlo<comparison_direction LT>`."""
-        return re.findall(r"\w+", str(self.op.attributes[name]))[-1]
+        """The value of an enumeration, such as `LT`."""
+        return attribute_enum(self.op, name)
+
+    def part(self, name: str, key: str) -> list[int]:
+        """An entry of an attribute with several, such as `offset_dims` of a `gather`."""
+        return attribute_part(self.op, name, key)
 
     def shapes(self) -> list[tuple[int, ...]]:
-        return [tuple(x.type.shape) for x in self.op.results]
+        """The shapes of all results."""
+        return [tuple(result.type.shape) for result in self.op.results]
 
     def recorded(self, fn: Callable, *args: Any, **kwargs: Any) -> tuple:
-        """The entries that a loop or conditional returns, recorded with `fn`."""
+        """The entries that a loop or conditional of Dr.Jit returns, recorded with `fn`."""
         number = len(self.errors)
         out = fn(*args, mode="symbolic", **kwargs)
         if len(self.errors) > number:
+            # The mask belongs to the inside of the loop or branch, and has no value here.
             raise NotReplayed(
                 self.op, "an error that is raised within a loop or branch"
             )
         return tuple(map(made_here, out))
 
-    def part(self, name: str, key: str) -> list[int]:
-        """An entry of an attribute such as `#stablehlo.gather<offset_dims = [0], ...>`."""
-        text = str(self.op.attributes[name])
-        found = re.search(rf"\b{key} = (\[[^\]]*\]|\d+)", text)
-        return [int(i) for i in re.findall(r"\d+", found[1])] if found else []
-
 
 class NotReplayed(Exception):
-    """An operation that cannot be replayed, and which part of it."""
+    """An operation that cannot be replayed, and which part of it.
+
+    - `location`: where it comes from, as JAX recorded it.
+    """
 
     def __init__(self, op: Any, what: str | None = None):
         super().__init__(what or f"`{op.name}`")
@@ -86,5 +129,6 @@ RULES: dict[str, Rule] = {}
 
 def rule(fn: Rule) -> Rule:
     """Registers a function as the rule for the operation of the same name."""
+    # With an underscore, since Python has words such as `while` of its own.
     RULES[fn.__name__.strip("_")] = fn
     return fn

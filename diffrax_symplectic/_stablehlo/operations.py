@@ -1,7 +1,13 @@
 """The table of operations that can be replayed. An elementwise operation is a line in
-`elementwise`; any other is a function with the decorator `rule`."""
+`elementwise` or `complex`; any other is a function with the decorator `rule`."""
 
-from . import control_flow, linear_algebra, moves  # noqa: F401 (they fill the table)
+from . import (  # noqa: F401 (they fill the table)
+    control_flow,
+    linear_algebra,
+    moves,
+    reductions,
+    windows,
+)
 from .complex import complex_functions, is_complex
 from .elementwise import elementwise
 from .operation import NotReplayed, Operation, Rule, RULES
@@ -10,13 +16,16 @@ from .tensor import each, Tensor
 
 def rule_of(name: str) -> Rule | None:
     """The rule for an operation, by its name without the dialect."""
-    fn, of_complex = elementwise().get(name), complex_functions().get(name)
-    if fn is None and of_complex is None:
+    of_real = elementwise().get(name)
+    of_complex = complex_functions().get(name)
+    if of_real is None and of_complex is None:
         return RULES.get(name)
 
     def entry_by_entry(o: Operation, *xs: Tensor) -> list[Tensor]:
+        # Of a selection the first operand is not complex, and empty arrays have no entry
+        # to ask.
         pairs = any(is_complex(x.entries[0]) for x in xs if x.entries)
-        function = of_complex if pairs else fn
+        function = of_complex if pairs else of_real
         if function is None:
             raise NotReplayed(o.op, f"`{o.op.name}` of complex numbers")
         return [each(function, *xs)]

@@ -1,70 +1,105 @@
 """Replays a program that JAX lowered for one path on arrays with many paths."""
 
+import itertools
 import math
 from collections import ChainMap
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
+from .._compat import (
+    block_of,
+    callee_of,
+    constant_values,
+    functions_of,
+    operations_in,
+    stablehlo_module,
+)
 from .operation import NotReplayed, Operation
 from .operations import rule_of
-from .tensor import MOST_IN_REGISTERS, Table, Tensor
+from .tensor import ArrayType, in_memory, MOST_IN_REGISTERS, Table, Tensor
 
 
 _RETURNS = ("func.return", "stablehlo.return")
 
+# From a variable of the program to its tensor. Regions see the variables of the block that
+# they stand in, but not the other way round.
+Values: TypeAlias = ChainMap[Any, Tensor]
+
 
 class Replay:
-    """A module of StableHLO as a function of tensors. Dr.Jit records the operations as part
-    of the kernel of the caller."""
+    """A program in StableHLO as a function of tensors, within a kernel of Dr.Jit that the
+    caller records.
 
-    def __init__(self, module: Any):
-        self._module = module  # It owns the operations.
-        functions = [
-            f for f in module.body.operations if f.operation.name == "func.func"
-        ]
-        self._functions = {f.attributes["sym_name"].value: f for f in functions}
-        # Large constants, by their variables. Callers keep them in memory.
-        self.constants = _large_constants(functions)
+    **Arguments:**
+
+    - `program`: the text of the program, or the object that
+        `jax.jit(fn).lower(...).compiler_ir("stablehlo")` returns. Its `main` is run.
+    """
+
+    def __init__(self, program: Any):
+        # It owns the operations, so that it must be kept.
+        self._module = stablehlo_module(program)
+        self._functions = functions_of(self._module)
+        self._constants = _large_constants([*self._functions.values()])
+        self._memory: dict[Any, Any] = {}
 
     @property
-    def arguments(self) -> list[tuple[tuple[int, ...], str]]:
-        """The shape and type of each argument."""
-        types = [x.type for x in self._main.arguments]
-        return [(tuple(t.shape), str(t.element_type)) for t in types]
+    def arguments(self) -> list[ArrayType]:
+        """The type of each argument."""
+        return [_type_of(argument) for argument in self._main.arguments]
 
     @property
     def handed_on(self) -> list[int | None]:
         """For each result, the number of the argument that it equals, or `None`."""
-        (*_, last), arguments = self._main.operations, [*self._main.arguments]
-        where = lambda x: next((i for i, a in enumerate(arguments) if a == x), None)
-        return [where(x) for x in last.operands]
+        arguments = [*self._main.arguments]
+        *_, last = self._main.operations
+        return [
+            arguments.index(result) if result in arguments else None
+            for result in last.operands
+        ]
 
     @property
     def _main(self) -> Any:
-        return self._functions["main"].regions[0].blocks[0]
+        return block_of(self._functions["main"])
+
+    def constants(self) -> list[Any]:
+        """The large constants of the program, as arrays of Dr.Jit in memory."""
+        # A frozen function of Dr.Jit must get these as arguments: what it captures becomes
+        # part of the kernel's code, number by number.
+        return [
+            in_memory(_type_of(variable).kind, values.ravel())
+            for variable, values in self._constants.items()
+        ]
 
     def __call__(
-        self, *args: Tensor, memory: Sequence[Any] = ()
+        self, *args: Tensor, constants: Sequence[Any] = ()
     ) -> tuple[list[Tensor], list[Any]]:
-        """The results, and masks of the lanes that raise an error. `memory` has the arrays
-        of `constants`."""
-        errors = []
-        self._memory = dict(zip(self.constants, memory))
+        """The results, and masks of the lanes that raise an error.
+
+        `constants` are what `self.constants()` returned. Without it, large constants are
+        written into the kernel.
+        """
+        errors: list[Any] = []
+        self._memory = dict(zip(self._constants, constants))
         return self._call("main", args, errors), errors
 
-    def _call(self, name: str, args, errors: list[Any]) -> list[Tensor]:
-        block = self._functions[name].regions[0].blocks[0]
-        return self._block(block, args, ChainMap(), errors)
+    def _call(
+        self, name: str, args: Sequence[Tensor], errors: list[Any]
+    ) -> list[Tensor]:
+        """The results of a function of the program, which sees its arguments only."""
+        return self._block(block_of(self._functions[name]), args, ChainMap(), errors)
 
     def _block(
-        self, block: Any, args, outer: ChainMap, errors: list[Any]
+        self, block: Any, args: Sequence[Tensor], outer: Values, errors: list[Any]
     ) -> list[Tensor]:
+        """What the operations of a block return, one after another."""
         values = outer.new_child(dict(zip(block.arguments, args)))
-        for op in block.operations:
-            op = op.operation
-            operands = [values[x] for x in op.operands]
+        for view in block.operations:
+            # Of an operation that MLIR has a class for, this is the general form.
+            op = view.operation
+            operands = [values[operand] for operand in op.operands]
             if op.name in _RETURNS:
                 return operands
             results = self._results(op, operands, values, errors)
@@ -72,21 +107,22 @@ class Replay:
         raise AssertionError("A block ends with what it returns.")
 
     def _results(
-        self, op: Any, operands: list[Tensor], values: ChainMap, errors: list[Any]
+        self, op: Any, operands: list[Tensor], values: Values, errors: list[Any]
     ) -> list[Tensor]:
+        """The results of one operation."""
         if op.name == "func.call":
             try:
-                return self._call(op.attributes["callee"].value, operands, errors)
+                return self._call(callee_of(op), operands, errors)
             except NotReplayed as error:
                 # The location of a called function does not name its caller.
                 error.location += str(op.location)
                 raise
-        run = lambda i, args: self._block(op.regions[i].blocks[0], args, values, errors)
         if op.results and op.results[0] in self._memory:
-            given = self.constants[op.results[0]]
-            places = np.arange(given.size)
-            table = Table(self._memory[op.results[0]], places, given.ravel())
-            return [Tensor(table, given.shape)]
+            return [self._table(op.results[0])]
+
+        def run(i: int, args: Sequence[Tensor]) -> list[Tensor]:
+            return self._block(block_of(op, i), args, values, errors)
+
         operation = Operation(op, run, errors)
         rule = rule_of(operation.name)
         if rule is None:
@@ -97,28 +133,38 @@ class Replay:
             # Dr.Jit's own, which names neither the operation nor its place.
             raise NotReplayed(op, f"`{op.name}` of these types ({error})") from error
 
+    def _table(self, variable: Any) -> Tensor:
+        """A large constant, which stays in memory."""
+        values = self._constants[variable]
+        places = np.arange(values.size)
+        table = Table(self._memory[variable], places, values.ravel())
+        return Tensor(table, values.shape)
+
+
+def _type_of(variable: Any) -> ArrayType:
+    return ArrayType(tuple(variable.type.shape), str(variable.type.element_type))
+
 
 def _large_constants(functions: list[Any]) -> dict[Any, np.ndarray]:
-    """The real constants of more entries than stay in registers."""
-    out = {}
+    """The real constants of more entries than stay in registers, by their variables."""
+    found = {}
     for op in _operations(functions):
         if op.name != "stablehlo.constant":
             continue
-        of = op.results[0].type
-        real = "complex" not in str(of.element_type)
-        if real and math.prod(of.shape) > MOST_IN_REGISTERS:
-            values = np.asarray(op.attributes["value"])
-            out[op.results[0]] = np.broadcast_to(values, of.shape)
-    return out
+        (variable,) = op.results
+        shape, kind = _type_of(variable)
+        # Complex ones are written into the kernel, whatever their number.
+        is_real = "complex" not in kind
+        if is_real and math.prod(shape) > MOST_IN_REGISTERS:
+            found[variable] = constant_values(op)
+    return found
 
 
 def _operations(functions: list[Any]) -> Iterator[Any]:
     """All operations, those of regions included."""
-    left = [f.operation for f in functions]
+    left = [function.operation for function in functions]
     while left:
         op = left.pop()
         yield op
-        for region in op.regions:
-            left.extend(
-                x.operation for block in region.blocks for x in block.operations
-            )
+        inner = map(operations_in, op.regions)
+        left.extend(itertools.chain.from_iterable(inner))

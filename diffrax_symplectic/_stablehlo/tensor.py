@@ -6,11 +6,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .._compat import is_literal
 from .backend import array_types, drjit
 
 
 # Larger arrays that all paths share stay in memory.
 MOST_IN_REGISTERS = 64
+
+
+class ArrayType(NamedTuple):
+    """The shape of an array, and StableHLO's name of the type of its entries (`f64`)."""
+
+    shape: tuple[int, ...]
+    kind: str
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
 
 
 class Table(Sequence):
@@ -58,52 +70,77 @@ class Tensor(NamedTuple):
 
     @property
     def places(self) -> np.ndarray:
-        """The positions of the entries. Rules that move entries act on these."""
+        """The positions of the entries. Rules that move entries act on these: NumPy does
+        to the array of positions what the operation does to the array."""
         return np.arange(len(self.entries)).reshape(self.shape)
 
     def take(self, places: np.ndarray) -> "Tensor":
         """The entries at these positions."""
         if isinstance(self.entries, Table):
             return Tensor(self.entries.at_places(places.ravel()), places.shape)
-        return Tensor([self.entries[i] for i in places.flat], places.shape)
+        return Tensor([self.entries[place] for place in places.flat], places.shape)
 
     def item(self) -> Any:
+        """The entry of an array with a single one."""
         (entry,) = self.entries
         return entry
 
 
 def scalar(entry: Any) -> Tensor:
+    """An array without axes."""
     return Tensor([entry], ())
 
 
 def constant(kind: type, values: np.ndarray) -> Tensor:
-    return Tensor([kind(x.item()) for x in values.flat], values.shape)
+    """An array of values that are part of the program. `kind` is a type of Dr.Jit."""
+    return Tensor([kind(value.item()) for value in values.flat], values.shape)
+
+
+def in_memory(kind: str, values: np.ndarray) -> Any:
+    """A Dr.Jit array with these values as its lanes."""
+    array_type = array_types()[kind]
+    if np.iscomplexobj(values):
+        part = kind.removeprefix("complex<").removesuffix(">")
+        real = in_memory(part, np.real(values))
+        imag = in_memory(part, np.imag(values))
+        return array_type(real, imag)
+    # As a list, which is copied: memory of NumPy could be freed while Dr.Jit records.
+    return array_type(values.tolist())
 
 
 def known(x: Tensor) -> np.ndarray | None:
     """The values, if Dr.Jit knows them: constants, and what it folded from constants."""
-    dr = drjit()
-    literal = dr.VarState.Literal
-    if not all(e.state == literal for e in x.entries):
+    if not all(map(is_literal, x.entries)):
         return None
-    value = lambda e: complex(e.real[0], e.imag[0]) if dr.is_complex_v(e) else e[0]
-    return np.array([value(e) for e in x.entries]).reshape(x.shape)
+    return np.array([_value(entry) for entry in x.entries]).reshape(x.shape)
+
+
+def _value(literal: Any) -> Any:
+    if drjit().is_complex_v(literal):
+        return complex(literal.real[0], literal.imag[0])
+    return literal[0]
 
 
 def each(fn: Callable, *xs: Tensor) -> Tensor:
     """Applies a function entry by entry. A scalar is repeated as needed."""
-    size = max(xs, key=lambda x: (len(x.entries), len(x.shape)))
-    spread = [
-        x.entries
-        if len(x.entries) == len(size.entries)
-        else [*x.entries] * len(size.entries)
-        for x in xs
-    ]
-    return Tensor([fn(*es) for es in zip(*spread)], size.shape)
+    # Of a scalar and an array with one entry, the array has the shape of the result.
+    largest = max(xs, key=lambda x: (len(x.entries), len(x.shape)))
+    size = len(largest.entries)
+    columns = [x.entries if len(x.entries) == size else [*x.entries] * size for x in xs]
+    return Tensor([fn(*row) for row in zip(*columns)], largest.shape)
 
 
 def flat(xs: Sequence[Tensor]) -> tuple:
+    """The entries of all these tensors."""
     return tuple(entry for x in xs for entry in x.entries)
+
+
+def unflat(entries: Iterable[Any], shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
+    """Tensors of these shapes from the first of these entries: the inverse of `flat`."""
+    left = iter(entries)
+    return [
+        Tensor([next(left) for _ in range(math.prod(shape))], shape) for shape in shapes
+    ]
 
 
 def copied(xs: Sequence[Tensor]) -> tuple:
@@ -117,11 +154,18 @@ def made_here(entry: Any) -> Any:
     """An entry that a conditional or loop returned, for use after it. If both branches
     return the same constant, Dr.Jit returns the constant of the second branch, which is
     defined within it only: LLVM aborts the process if an outer branch returns that."""
-    if entry.state != drjit().VarState.Literal:
-        return entry
-    return type(entry)(entry[0])
+    return type(entry)(entry[0]) if is_literal(entry) else entry
 
 
-def unflat(entries: Iterable[Any], shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
-    left = iter(entries)
-    return [Tensor([next(left) for _ in range(math.prod(s))], s) for s in shapes]
+def chosen(xs: Sequence[Any], mask: Sequence[bool]) -> list[Any]:
+    """Those of `xs` where the mask is true."""
+    return [x for x, yes in zip(xs, mask, strict=True) if yes]
+
+
+def merged(
+    mask: Sequence[bool], where_true: Iterable[Any], where_false: Iterable[Any]
+) -> list[Any]:
+    """One list of two, in the order of a mask: the inverse of `chosen`."""
+    yes = iter(where_true)
+    no = iter(where_false)
+    return [next(yes) if here else next(no) for here in mask]

@@ -9,7 +9,8 @@ from jax import lax
 import diffrax_symplectic as ds
 
 from ..drjit_here import needs_drjit
-from .test_operations import LANES, replayed
+from .replayed import replayed
+from .test_operations import LANES
 
 
 pytestmark = needs_drjit

@@ -7,7 +7,8 @@ import pytest
 from jax.scipy import linalg
 
 from ..drjit_here import needs_drjit
-from .test_operations import LANES, replayed
+from .replayed import replayed
+from .test_operations import LANES
 
 
 pytestmark = needs_drjit

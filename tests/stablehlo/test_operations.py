@@ -7,6 +7,7 @@ import pytest
 from jax import lax
 
 from ..drjit_here import needs_drjit
+from .replayed import replayed
 
 
 pytestmark = needs_drjit
@@ -39,33 +40,6 @@ def values(kind: str, shape, dtype, seed: int, spread: float = 3.0) -> np.ndarra
     order = np.arange(pairs) // len(special) if seed % 2 else np.arange(pairs)
     flat[:pairs] = special[order % len(special)][:, None]
     return x
-
-
-def replayed(fn, *args: np.ndarray) -> list[np.ndarray]:
-    """What Dr.Jit makes of the program of `fn` for each of the lanes."""
-    from diffrax_symplectic._fused.kernels import Program
-    from diffrax_symplectic._stablehlo.backend import array_types, drjit
-    from diffrax_symplectic._stablehlo.tensor import Tensor
-
-    structs = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in args]
-    program = Program(fn, *structs)
-    tensors = []
-    for x, ((shape, kind),) in zip(args, program.types):
-        of = array_types()[kind]
-        parts = (lambda a: (a.real, a.imag)) if np.iscomplexobj(x) else lambda a: (a,)
-        entries = [of(*(p.copy() for p in parts(a))) for a in x.reshape(len(x), -1).T]
-        tensors.append(Tensor(entries, shape))
-    results, errors = program.replay(*tensors)
-    assert not errors
-    drjit().eval(*[r.entries for r in results])
-    lanes = lambda e: np.broadcast_to(np.asarray(e), len(args[0]))
-    value = lambda e: (
-        lanes(e.real) + np.array(1j, f"c{2 * drjit().itemsize_v(e)}") * lanes(e.imag)
-        if drjit().is_complex_v(e)
-        else lanes(e)
-    )
-    stack = lambda r: [value(e) for e in r.entries]
-    return [np.stack(stack(r), -1).reshape(-1, *r.shape) for r in results]
 
 
 def assert_close(actual, exact, ulps: float) -> None:

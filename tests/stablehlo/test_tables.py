@@ -9,7 +9,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..drjit_here import needs_drjit
-from .test_operations import replayed
+from .replayed import replayed
 
 
 pytestmark = needs_drjit

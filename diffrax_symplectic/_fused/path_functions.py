@@ -1,0 +1,175 @@
+"""The functions of one path that kernels are made of, apart from the values they read."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
+
+from .._custom_types import Args, Y
+from .._terms import path_keys, with_keys
+
+
+@runtime_checkable
+class SteppedSystem(Protocol):
+    """What a kernel needs of a system: a PyTree whose leaves are all that it reads.
+
+    - `terms`: with random keys, in place of which each path has its own.
+    - `y0`, `args`: of all paths, or examples of those that paths have of their own.
+    """
+
+    terms: PyTree
+    y0: Y
+    args: Args
+
+    def with_args(self, own: PyTree[Array]) -> "SteppedSystem":
+        """The system with these arrays in its `args`."""
+        ...
+
+    def init(self, terms: PyTree, i: Any, h: Any, y: Y) -> PyTree[Array]:
+        """The state of the solver before step `i` of size `h`."""
+        ...
+
+    def step(
+        self, terms: PyTree, i: Any, h: Any, y: Y, state: PyTree[Array]
+    ) -> tuple[Y, PyTree[Array], Bool[Array, ""]]:
+        """The states of the path and of the solver after step `i`, and whether it
+        succeeded."""
+        ...
+
+
+class Stepped(NamedTuple):
+    """A path after a step.
+
+    - `y`: the leaves of its state.
+    - `memory`: the leaves of the state of its solver.
+    - `success`: whether the step succeeded.
+    """
+
+    y: list[Array]
+    memory: list[Array]
+    success: Bool[Array, ""]
+
+
+class PathFunctions(NamedTuple):
+    """A system without the values of its arrays, as functions of these values. Hashable: it
+    is what a kernel is compiled for.
+
+    In these functions `arrays` are the arrays of the system, and `own` is what each path
+    has of its own: the words of its random keys, and arrays of its `args` if these are
+    drawn.
+
+    - `treedef`, `static`, `structs`: the system. Where it has an array, `static` is `None`
+        and `structs` has its shape and type.
+    - `impl`: the implementation of random keys.
+    - `own_args`: the shapes of the arrays of `args` that each path has of its own.
+    - `paths_differ`: whether each path has its own initial state and `args`.
+    - `settings`: settings of JAX that programs depend on.
+    """
+
+    treedef: Any
+    static: tuple[Any, ...]
+    structs: tuple[jax.ShapeDtypeStruct | None, ...]
+    impl: str
+    own_args: tuple[jax.ShapeDtypeStruct, ...]
+    paths_differ: bool
+    settings: tuple[Any, ...]
+
+    @property
+    def arrays(self) -> list[jax.ShapeDtypeStruct]:
+        """The shapes and types of the arrays of the system."""
+        return [struct for struct in self.structs if struct is not None]
+
+    @property
+    def key(self) -> Any:
+        """The shape and type of a random key."""
+        return jax.eval_shape(lambda: jr.key(0, impl=self.impl))
+
+    def system(self, arrays: Sequence[Any]) -> SteppedSystem:
+        """The system with these arrays."""
+        left = iter(arrays)
+        leaves = [
+            value if struct is None else next(left)
+            for value, struct in zip(self.static, self.structs)
+        ]
+        return self.treedef.unflatten(leaves)
+
+    def y0(self, arrays: list[Array]) -> list[Array]:
+        """The leaves of the initial state of all paths."""
+        return jtu.tree_leaves(self.system(arrays).y0)
+
+    def path_keys(self, arrays: list[Array], key, high, low) -> list[Array]:
+        """The random keys in the terms of path number `high * 2^32 + low`."""
+        return path_keys(self.system(arrays).terms, sample_key(key, high, low))
+
+    def start(self, arrays: list[Array], own: list[Array], y: list[Array]) -> list:
+        """The leaves of the state of the solver before the first step from `y`."""
+        system, terms = self._of_path(arrays, own)
+        y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
+        # No solver's initial state depends on the size of a step.
+        h = jnp.ones((), jnp.result_type(*jtu.tree_leaves(y)))
+        return jtu.tree_leaves(system.init(terms, 0, h, y))
+
+    def step(self, arrays, own, h, i, y: list[Array], memory: list[Array]) -> Stepped:
+        """Step number `i` of size `h`."""
+        system, terms = self._of_path(arrays, own)
+        structure = eqx.filter_eval_shape(system.init, terms, 0, h, system.y0)
+        y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
+        memory = jtu.tree_unflatten(jtu.tree_structure(structure), memory)
+        y, memory, success = system.step(terms, i, h, y, memory)
+        return Stepped(jtu.tree_leaves(y), jtu.tree_leaves(memory), success)
+
+    def _of_path(self, arrays: list[Array], own: list[Array]):
+        """The system and the terms of a path."""
+        system = self.system(arrays)
+        number = len(own) - len(self.own_args)
+        keys = own[:number]
+        args = None
+        if self.own_args:
+            structure = jtu.tree_structure(eqx.filter(system.args, eqx.is_array))
+            args = jtu.tree_unflatten(structure, own[number:])
+        return system.with_args(args), with_keys(system.terms, keys)
+
+
+def sample_key(key: PRNGKeyArray, high, low) -> PRNGKeyArray:
+    """The key of sample number `high * 2^32 + low`."""
+    return jr.fold_in(jr.fold_in(key, high), low)
+
+
+def split(
+    system: SteppedSystem,
+    key: PRNGKeyArray,
+    own_args: PyTree[Array],
+    paths_differ: bool,
+) -> tuple[PathFunctions, list[Array]]:
+    """What a kernel is compiled for, and the arrays that it reads.
+
+    `own_args` is an example of the arrays in `args` that each path has of its own, and
+    `paths_differ` says whether each has its own initial state and `args`.
+    """
+    leaves, treedef = jtu.tree_flatten(system)
+    arrays = [jnp.asarray(x) if _is_array(x) else None for x in leaves]
+    functions = PathFunctions(
+        treedef=treedef,
+        static=tuple(None if _is_array(x) else x for x in leaves),
+        structs=tuple(None if x is None else _struct(x) for x in arrays),
+        impl=str(jr.key_impl(key)),
+        own_args=tuple(map(_struct, jtu.tree_leaves(own_args))),
+        paths_differ=paths_differ,
+        # The type of Python's floats says whether JAX has 64 bits.
+        settings=(jax.default_backend(), jnp.result_type(float)),
+    )
+    return functions, [x for x in arrays if x is not None]
+
+
+def _is_array(x: Any) -> bool:
+    return isinstance(x, jax.Array | np.ndarray)
+
+
+def _struct(x: Array) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(x.shape, x.dtype)

@@ -1,0 +1,160 @@
+"""Operations that combine entries of an array: products of matrices, sums, sorting."""
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .backend import drjit
+from .complex import is_complex
+from .operation import NotReplayed, Operation, rule
+from .tensor import known, Tensor
+
+
+# Exchanges grow with the square of the number.
+_MOST_SORTED = 16
+
+
+def _multiplied_and_added(a: Any, b: Any, c: Any) -> Any:
+    """`a b + c`, in one operation if it can be."""
+    real = drjit().is_float_v(c) and not is_complex(c)
+    return drjit().fma(a, b, c) if real else a * b + c
+
+
+@rule
+def _dot_general(o, a, b):
+    left = _matrices(o, a, "lhs")
+    right = _matrices(o, b, "rhs")
+    _, rows, _ = left.shape
+    batch, columns, _ = right.shape
+    out = []
+    for k, row, column in np.ndindex(batch, rows, columns):
+        total = o.kind(0)
+        for i, j in zip(left[k, row], right[k, column]):
+            total = _multiplied_and_added(a.entries[i], b.entries[j], total)
+        out.append(total)
+    return [Tensor(out, o.shape)]
+
+
+def _matrices(o: Operation, x: Tensor, side: str) -> np.ndarray:
+    """The places of a factor of `dot_general`: with an axis for the products, one for what
+    stays, and one to sum over."""
+    name = "dot_dimension_numbers"
+    batch = o.part(name, f"{side}_batching_dimensions")
+    summed = o.part(name, f"{side}_contracting_dimensions")
+    kept = [axis for axis in range(len(x.shape)) if axis not in (*batch, *summed)]
+    groups = (batch, kept, summed)
+    sizes = [math.prod(x.shape[axis] for axis in axes) for axes in groups]
+    return x.places.transpose(*batch, *kept, *summed).reshape(sizes)
+
+
+@rule
+def _reduce(o, *xs):
+    # Several arrays may be reduced together, such as values and places for `argmax`.
+    # First come the arrays, then where each reduction starts.
+    number = len(xs) // 2
+    arrays = xs[:number]
+    starts = xs[number:]
+    shape = arrays[0].shape
+    axes = o.ints("dimensions")
+    kept = [axis for axis in range(len(shape)) if axis not in axes]
+    sizes = [shape[axis] for axis in kept]
+    rows = arrays[0].places.transpose(*kept, *axes).reshape(math.prod(sizes), -1)
+    neutral = _changes_nothing(o, starts)
+    columns = []
+    for row in rows:
+        parts = [_entries_at(arrays, place) for place in row]
+        # Most reductions start from a neutral element, such as zero in a sum.
+        total = parts.pop(0) if parts and neutral else [*starts]
+        for part in parts:
+            total = o.run(0, [*total, *part])
+        columns.append(total)
+    return _joined(columns, tuple(sizes), number)
+
+
+def _entries_at(arrays: Sequence[Tensor], place: Any) -> list[Tensor]:
+    """The entries of all these arrays at a place, each as an array without axes."""
+    return [Tensor([x.entries[place]], ()) for x in arrays]
+
+
+def _joined(
+    columns: list[list[Tensor]], shape: tuple[int, ...], number: int
+) -> list[Tensor]:
+    """Arrays of this shape. Each of `columns` has an entry of each of them."""
+    return [
+        Tensor([column[k].item() for column in columns], shape) for k in range(number)
+    ]
+
+
+# Neutral elements, by the operation that is repeated.
+_NEUTRAL = {
+    "add": 0,
+    "multiply": 1,
+    "maximum": -np.inf,
+    "minimum": np.inf,
+    "or": False,
+    "and": True,
+}
+
+
+def _changes_nothing(o: Operation, starts: Sequence[Tensor]) -> bool:
+    """Whether a reduction starts from the neutral element of its operation."""
+    if len(starts) > 1:
+        return False
+    value = known(starts[0])
+    return value is not None and bool(value == _NEUTRAL.get(o.reduces_by))
+
+
+@rule
+def _reduce_window(o, *xs):
+    """Cumulative sums, and other reductions of windows."""
+    number = len(xs) // 2
+    arrays = xs[:number]
+    starts = xs[number:]
+    if any(size > 1 for size in o.optional("base_dilations")):
+        raise NotReplayed(o.op, f"`{o.op.name}` of entries that are apart")
+    shape = arrays[0].shape
+    ones = [1] * len(shape)
+    sizes = o.ints("window_dimensions")
+    strides = o.optional("window_strides") or ones
+    gaps = o.optional("window_dilations") or ones
+    # Pairs of the padding before and after. What lies outside is left out.
+    padding = o.rows("padding") if o.has("padding") else np.zeros((len(shape), 2), int)
+    before = padding.reshape(len(shape), 2)[:, 0]
+    columns = []
+    for window in np.ndindex(*o.shape):
+        total = [*starts]
+        for offset in np.ndindex(*sizes):
+            at = np.array(window) * strides + np.array(offset) * gaps - before
+            if np.all((at >= 0) & (at < shape)):
+                place = arrays[0].places[tuple(at)]
+                total = o.run(0, [*total, *_entries_at(arrays, place)])
+        columns.append(total)
+    return _joined(columns, o.shape, number)
+
+
+@rule
+def _sort(o, *xs):
+    """Exchanges of neighbours until all are in order, which keep the order of equals."""
+    axis = o.number("dimension")
+    length = xs[0].shape[axis]
+    if length > _MOST_SORTED:
+        raise NotReplayed(o.op, f"`{o.op.name}` of more than {_MOST_SORTED} numbers")
+    select = drjit().select
+    # Arrays that are sorted together: the first ones may be keys of the others.
+    outs = [[*x.entries] for x in xs]
+    for row in np.moveaxis(xs[0].places, axis, -1).reshape(-1, length):
+        # After each round the largest of those left is at their end.
+        for end in range(length, 1, -1):
+            for left, right in itertools.pairwise(row[:end]):
+                # The region compares two of each array, the first of which should stand
+                # first. It is asked about the right one, so that equals stay.
+                pairs = [Tensor([x[i]], ()) for x in outs for i in (right, left)]
+                wrong = o.run(0, pairs)[0].item()
+                for x in outs:
+                    low = select(wrong, x[right], x[left])
+                    x[right] = select(wrong, x[left], x[right])
+                    x[left] = low
+    return [Tensor(out, x.shape) for out, x in zip(outs, xs)]

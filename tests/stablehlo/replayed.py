@@ -1,0 +1,49 @@
+"""Programs of JAX, replayed for many lanes by the entrance of `_stablehlo`."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffrax_symplectic._stablehlo import drjit, in_memory, Replay, Tensor
+
+
+def text_of(fn: Callable, *structs: jax.ShapeDtypeStruct) -> str:
+    """The program of a function in StableHLO, with the lines that it comes from."""
+    # For CPUs on every device: for others JAX emits calls of libraries.
+    with jax.default_device(jax.devices("cpu")[0]):
+        lowered = jax.jit(fn, keep_unused=True).lower(*structs)
+    return lowered.as_text(debug_info=True)
+
+
+def replayed(fn: Callable, *args: np.ndarray) -> list[np.ndarray]:
+    """What Dr.Jit makes of the program of `fn` for each of the lanes, along the first axis
+    of each argument."""
+    structs = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in args]
+    return replayed_text(text_of(fn, *structs), *args)
+
+
+def replayed_text(program: str, *args: np.ndarray) -> list[np.ndarray]:
+    replay = Replay(program)
+    tensors = [tensor(x, of.kind) for x, of in zip(args, replay.arguments)]
+    results, errors = replay(*tensors)
+    assert not errors
+    drjit().eval(*[result.entries for result in results])
+    number = len(args[0])
+    stacked = lambda x: np.stack([lanes(entry, number) for entry in x.entries], -1)
+    return [stacked(x).reshape(number, *x.shape) for x in results]
+
+
+def tensor(x: np.ndarray, kind: str) -> Tensor:
+    """An array with an axis of lanes as a tensor."""
+    columns = x.reshape(len(x), -1).T
+    return Tensor([in_memory(kind, column) for column in columns], x.shape[1:])
+
+
+def lanes(entry: Any, number: int) -> np.ndarray:
+    """The values of an entry in each lane."""
+    if not drjit().is_complex_v(entry):
+        return np.broadcast_to(np.asarray(entry), number)
+    unit = np.array(1j, f"c{2 * drjit().itemsize_v(entry)}")
+    return lanes(entry.real, number) + unit * lanes(entry.imag, number)

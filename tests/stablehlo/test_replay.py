@@ -1,0 +1,111 @@
+"""The entrance of `_stablehlo`: a program's text and arrays in, arrays out."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from diffrax_symplectic._stablehlo import (
+    array_types,
+    drjit,
+    in_memory,
+    NotReplayed,
+    Replay,
+    scalar,
+)
+
+from ..drjit_here import needs_drjit
+from .replayed import replayed_text, text_of
+
+
+pytestmark = needs_drjit
+
+# Written by hand: for each path x, the sum of x and 2 x and the larger of them.
+BY_HAND = """
+module {
+  func.func private @double(%x: tensor<f64>) -> tensor<f64> {
+    %two = stablehlo.constant dense<2.0> : tensor<f64>
+    %y = stablehlo.multiply %x, %two : tensor<f64>
+    return %y : tensor<f64>
+  }
+  func.func public @main(%x: tensor<f64>) -> (tensor<f64>, tensor<f64>) {
+    %y = call @double(%x) : (tensor<f64>) -> tensor<f64>
+    %sum = stablehlo.add %x, %y : tensor<f64>
+    %larger = stablehlo.maximum %x, %y : tensor<f64>
+    return %sum, %larger : tensor<f64>, tensor<f64>
+  }
+}
+"""
+X = np.array([-1.0, 0.5, 3.0])
+
+
+def test_a_program_that_is_no_product_of_jax_is_run_for_each_lane():
+    total, larger = replayed_text(BY_HAND, X)
+    np.testing.assert_array_equal(total, 3 * X)
+    np.testing.assert_array_equal(larger, np.maximum(X, 2 * X))
+
+
+def test_the_types_of_arguments_are_known():
+    fn = lambda x, i, z: (x[i], z)
+    structs = [((3, 2), "float32"), ((), "int32"), ((4,), "complex128")]
+    program = text_of(fn, *[jax.ShapeDtypeStruct(*struct) for struct in structs])
+    types = Replay(program).arguments
+    assert types == [((3, 2), "f32"), ((), "i32"), ((4,), "complex<f64>")]
+    assert [of.size for of in types] == [6, 1, 4]
+
+
+def test_results_that_are_arguments_are_known():
+    program = text_of(lambda x, y: (y, x + y, x, 1.0), *[jnp.zeros(())] * 2)
+    assert Replay(program).handed_on == [1, None, 0, None]
+
+
+def test_a_replay_is_part_of_the_loop_that_it_stands_in():
+    double = Replay(text_of(lambda x: 2 * x, jnp.zeros(())))
+
+    def once(i, x):
+        ((result,), _) = double(scalar(x))
+        return i + 1, result.item()
+
+    count = array_types()["i32"](0)
+    start = in_memory("f64", X)
+    _, end = drjit().while_loop((count, start), lambda i, _: i < 5, once)
+    np.testing.assert_array_equal(end, 32 * X)
+
+
+def test_large_constants_are_read_from_memory():
+    table = np.sin(np.arange(1000.0))
+    replay = Replay(text_of(lambda i: jnp.asarray(table)[i], jnp.zeros((), "int32")))
+    places = np.array([3, 999, 0], np.int32)
+    (in_this_array,) = replay.constants()
+    np.testing.assert_array_equal(in_this_array, table)
+    other = in_memory("f64", -table)
+    index = scalar(in_memory("i32", places))
+    for memory, exact in ((in_this_array, table), (other, -table)):
+        ((found,), _) = replay(index, constants=[memory])
+        np.testing.assert_array_equal(found.item(), exact[places])
+
+
+def test_errors_name_the_lanes_that_raise_them():
+    import equinox as eqx
+
+    def fn(x):
+        return eqx.error_if(2 * x, x > 1, "too large")
+
+    replay = Replay(text_of(fn, jnp.zeros(())))
+    ((result,), errors) = replay(scalar(in_memory("f64", X)))
+    (lost,) = errors
+    np.testing.assert_array_equal(lost, X > 1)
+    kept = ~np.asarray(lost)
+    np.testing.assert_array_equal(np.asarray(result.item())[kept], 2 * X[kept])
+
+
+def test_what_has_no_rule_is_named_with_where_it_comes_from():
+    limit = jax.config.jax_traceback_in_locations_limit  # pyright: ignore
+    jax.config.update("jax_traceback_in_locations_limit", 10)
+    try:
+        program = text_of(lambda x: jnp.abs(jnp.fft.fft(x)), jnp.zeros(4))
+    finally:
+        jax.config.update("jax_traceback_in_locations_limit", limit)
+    with pytest.raises(NotReplayed, match="`stablehlo.fft`") as info:
+        replayed_text(program, np.ones((3, 4)))
+    assert __file__ in info.value.location
