@@ -34,9 +34,6 @@ PRIVATE_ATTRIBUTE = re.compile(
     r"saveat_ts_index|controller_state|tol|canonicalize_dtype|ensure_compile_time_eval|"
     r"compute|__notes__)$"
 )
-# What uses such attributes still, and is to call `_compat.py` instead. Nothing is to be
-# added here.
-STILL_TO_DO = ("_expectation/",)
 
 
 def _private_imports(tree: ast.AST) -> set[str]:
@@ -78,8 +75,7 @@ def test_private_parts_of_others_are_used_in_one_module_only():
         if name == "_compat.py":
             continue
         assert not _private_imports(tree), file
-        if not name.startswith(STILL_TO_DO):
-            assert not _private_attributes(tree), file
+        assert not _private_attributes(tree), file
 
 
 def test_the_guard_sees_imports_and_attributes():
