@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from typing import NamedTuple
 
 import jax.tree_util as jtu
 import numpy as np
@@ -34,13 +35,44 @@ _MOST_MEMORY = 4 * 2**30
 _OUT_OF_PROPORTION = 2**31
 
 
-def chosen_basis(p: Problem, degree: int | None) -> AbstractBasis:
+class ChosenBasis(NamedTuple):
+    """A basis, and what a fit to it costs.
+
+    - `states`: the number of states that are computed in each step.
+    - `numbers`: all numbers that are computed.
+    """
+
+    basis: AbstractBasis
+    states: int
+    numbers: int
+
+
+def chosen_basis(p: Problem, degree: int | None) -> ChosenBasis:
     """The basis for polynomials of this degree, or the best one. Raises a `ValueError` if
     the fit needs too much memory, or for random variables without finitely many outcomes.
     """
+    _, weights = Noise.of(p, p.level(0)).nodes()
+    outcomes = len(weights)
+    steps = int(np.sum(p.levels.num_steps))
+    basis = _basis(p, degree, outcomes, steps)
+    states = basis.sites * outcomes
+    return ChosenBasis(basis, states, states * steps * basis.d)
+
+
+def warn_of_long_fit(chosen: ChosenBasis, stacklevel: int) -> None:
+    """Warns if a fit takes long next to independent paths."""
+    if chosen.numbers > _OUT_OF_PROPORTION:
+        warnings.warn(
+            f"The fit of `ValueFunctions` takes as long as {chosen.states:,} independent "
+            "paths. If fewer paths are accurate enough, pass "
+            "`sampling=IndependentPaths(num_paths)`.",
+            stacklevel=stacklevel + 1,
+        )
+
+
+def _basis(p: Problem, degree: int | None, outcomes: int, steps: int) -> AbstractBasis:
+    """The basis for a step with so many outcomes, and so many steps on all levels."""
     d = sum(leaf.size for leaf in jtu.tree_leaves(p.y0))
-    outcomes = _num_outcomes(p)
-    steps = _num_steps(p)
     if degree is None:
         grid = _grid(p, d, outcomes, steps)
         if grid is not None:
@@ -50,34 +82,10 @@ def chosen_basis(p: Problem, degree: int | None) -> AbstractBasis:
         degrees = (whole_number("degree", degree, 0),)
     # Averaged derivatives cost less than a fit to many polynomials.
     if _has_many_of_degree_two(d) and max(degrees) <= 2:
-        basis = Quadratic(d, degrees)
-    else:
-        basis = Hermite(d, degrees)
-        _check_memory(p, basis)
+        return Quadratic(d, degrees)
+    basis = Hermite(d, degrees)
+    _check_memory(p, basis)
     return basis
-
-
-def warn_of_long_fit(p: Problem, basis: AbstractBasis, stacklevel: int) -> None:
-    """Warns if a fit takes long next to independent paths."""
-    paths = basis.sites * _num_outcomes(p)
-    if paths * _num_steps(p) * basis.d > _OUT_OF_PROPORTION:
-        warnings.warn(
-            f"The fit of `ValueFunctions` takes as long as {paths:,} independent paths. If "
-            "fewer paths are accurate enough, pass "
-            "`sampling=IndependentPaths(num_paths)`.",
-            stacklevel=stacklevel + 1,
-        )
-
-
-def _num_outcomes(p: Problem) -> int:
-    """The number of states after a step over which a fit averages."""
-    _, weights = Noise.of(p, p.level(0)).nodes()
-    return len(weights)
-
-
-def _num_steps(p: Problem) -> int:
-    """The steps of a path on all levels."""
-    return int(np.sum(p.levels.num_steps))
 
 
 def _grid(p: Problem, d: int, outcomes: int, steps: int) -> Grid | None:

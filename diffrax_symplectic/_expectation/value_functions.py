@@ -8,9 +8,10 @@ $u$. For the exact $u$ the sum of these differences is $\\phi(y_N)$ minus its me
 import dataclasses
 import functools as ft
 import warnings
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
@@ -95,48 +96,53 @@ class ValueFunctions(AbstractSampling):
     )
 
     def prepare(self, problem, key, devices):
-        basis = chosen_basis(problem, self.degree)
-        warn_of_long_fit(problem, basis, stacklevel=4)
-        functions = _fits(problem, key, basis)
-        trials = _Trials(problem, functions, key, devices, self.batch_size)
-        narrow, *wider = laws_of_trials(problem)
-
+        chosen = chosen_basis(problem, self.degree)
+        warn_of_long_fit(chosen, stacklevel=4)
+        basis = chosen.basis
+        trials = _Trials(
+            problem,
+            _fits(problem, key, basis),
+            outputs=problem.num_outputs,
+            shapes=problem.shapes_of_samples(len(KindsWithControl)),
+            key=jr.fold_in(key, _TRIAL_KEY),
+            devices=devices,
+            batch_size=self.batch_size,
+        )
+        own_law, *wider_laws = laws_of_trials(problem)
         # One trial for each candidate, on the same paths.
-        tried = [
-            trials.run(_all_of(k, problem), _nothing_unusual(problem), narrow)
-            for k in range(len(basis.candidates))
-        ]
-        errors = np.stack([_flat(e.std_error, problem) for e in tried])
-        errors = np.nan_to_num(errors, nan=np.inf)
-        smallest = np.min(errors, axis=0)
-        plain = _flat(best_results(tried[0]).plain_std_error, problem)
-        choice = Choice(np.argmin(errors, axis=0), ~(smallest >= plain))
+        candidates = range(len(basis.candidates))
+        tried = [trials.of_candidate(k, own_law) for k in candidates]
+        compared = _compared(tried, trials.outputs)
+        choice = compared.choice
         if self.degree and not np.any(choice.used):
             warnings.warn(
                 f"`degree={self.degree}` is no better than no control variate, so none is "
                 "used. Pass another `degree`, or another `sampling`.",
                 stacklevel=4,
             )
-
         # Paths with wider noise estimate the deviations beyond the largest in the trial.
-        usual = _usual(tried, choice, problem)
+        usual = _usual(tried, choice, trials.outputs, problem.dtype)
         size = _BATCHES_OF_WIDE_TRIAL * self.batch_size
-        wide = [trials.run(choice, usual, law, size) for law in wider]
-        rounding = ROUNDING * jnp.finfo(problem.dtype).eps
-        noise_floor = rounding * np.abs(_flat(tried[0].mean, problem))
-        ratios = _ratios(smallest, plain, noise_floor)
-        return trials.plan(choice, usual, narrow, self.num_paths)._replace(
+        wide = [trials.run(choice, usual, law, size) for law in wider_laws]
+        return trials.plan(choice, usual, own_law, self.num_paths)._replace(
             reason=_reason(basis, choice),
             far=_largest_tails(wide),
-            left=float(np.max(ratios, initial=0.0)),
+            left=compared.left(problem.dtype),
         )
 
 
 class _Trials(NamedTuple):
-    """What all trials of a problem share, and the estimate itself."""
+    """What all trials of a problem share, and the estimate itself.
+
+    - `outputs`: the numbers of times at which to average and of components of `phi`.
+    - `shapes`: as in `SamplingPlan`.
+    - `key`: the random key of all trials, whose paths are not part of the estimate.
+    """
 
     problem: Problem
     functions: FittedFunctions
+    outputs: tuple[int, int]
+    shapes: PyTree[jax.ShapeDtypeStruct]
     key: PRNGKeyArray
     devices: tuple
     batch_size: int
@@ -145,70 +151,95 @@ class _Trials(NamedTuple):
         self, choice: Choice, usual: Usual, law: TrialLaw, num_samples: int
     ) -> SamplingPlan:
         """The plan for paths whose noise has this law."""
+        fixed = self.problem, self.functions, choice, usual, law
         return SamplingPlan(
-            jtu.Partial(
-                controlled_paths, self.problem, self.functions, choice, usual, law
-            ),
+            jtu.Partial(controlled_paths, *fixed),
             num_samples,
             self.batch_size,
-            shapes=self.problem.shapes_of_samples(len(KindsWithControl)),
+            shapes=self.shapes,
             quick=True,
         )
 
     def run(
-        self,
-        choice: Choice,
-        usual: Usual,
-        law: TrialLaw,
-        num_samples: int | None = None,
+        self, choice: Choice, usual: Usual, law: TrialLaw, num_samples: int
     ) -> Expectation:
-        """The estimate from a batch of paths, or this number, which are not part of the
-        final estimate."""
-        size = self.batch_size if num_samples is None else num_samples
-        plan = self.plan(choice, usual, law, size)
-        return run(plan, jr.fold_in(self.key, _TRIAL_KEY), self.devices)
+        """An estimate from this number of paths."""
+        plan = self.plan(choice, usual, law, num_samples)
+        return run(plan, self.key, self.devices)
+
+    def of_candidate(self, k: int, law: TrialLaw) -> Expectation:
+        """An estimate from one batch, with the same candidate for all components."""
+        choice = Choice(np.full(self.outputs, k), np.ones(self.outputs, bool))
+        # The same program estimates tails, but nothing is beyond these deviations.
+        shape = len(self.problem.weights), *self.outputs
+        dtype = self.problem.dtype
+        unlimited = Usual(np.zeros(shape, dtype), np.full(shape, np.inf, dtype))
+        return self.run(choice, unlimited, law, self.batch_size)
 
 
-def _all_of(candidate: int, problem: Problem) -> Choice:
-    """The same candidate for all components."""
-    shape = problem.num_outputs
-    return Choice(np.full(shape, candidate), np.ones(shape, bool))
-
-
-def _nothing_unusual(problem: Problem) -> Usual:
-    """No deviation is beyond these."""
-    shape = len(problem.weights), *problem.num_outputs
-    return Usual(
-        np.zeros(shape, problem.dtype),
-        np.full(shape, np.inf, problem.dtype),
-    )
-
-
-def _flat(tree: PyTree[np.ndarray], problem: Problem, *axes: int) -> np.ndarray:
+def _flat(tree: PyTree[np.ndarray], outputs: tuple[int, int], *axes: int) -> np.ndarray:
     """The arrays of a PyTree in the structure of `phi` as one array, with axes for times
     and for components, behind these other axes."""
-    times, _ = problem.num_outputs
-    leaves = [np.reshape(x, (*axes, times, -1)) for x in jtu.tree_leaves(tree)]
+    times, _ = outputs
+    leaves = [np.reshape(leaf, (*axes, times, -1)) for leaf in jtu.tree_leaves(tree)]
     return np.concatenate(leaves, axis=-1)
 
 
-def _usual(tried: list[Expectation], choice: Choice, problem: Problem) -> Usual:
+class _Compared(NamedTuple):
+    """The candidates, compared by their trials, with axes for times and components.
+
+    - `choice`: the best candidates, and where they are better than none.
+    - `errors`: the standard errors with them.
+    - `plain`: the standard errors without a control variate.
+    - `mean`: the mean.
+    """
+
+    choice: Choice
+    errors: np.ndarray
+    plain: np.ndarray
+    mean: np.ndarray
+
+    def left(self, dtype: Any) -> float:
+        """The largest fraction of a standard error that is left with control."""
+        # Where nothing is random, as of a constant, both errors are rounding errors.
+        is_random = self.plain > ROUNDING * jnp.finfo(dtype).eps * np.abs(self.mean)
+        errors = np.minimum(self.errors, self.plain)
+        fractions = errors / np.where(is_random, self.plain, 1)
+        return float(np.max(np.where(is_random, fractions, 0), initial=0.0))
+
+
+def _compared(tried: list[Expectation], outputs: tuple[int, int]) -> _Compared:
+    """Compares the candidates, each of which was tried alone."""
+    each = np.stack([_flat(estimate.std_error, outputs) for estimate in tried])
+    # A candidate without an error has failed.
+    each = np.nan_to_num(each, nan=np.inf)
+    errors = np.min(each, axis=0)
+    # Without control all trials are the same.
+    plain = _flat(best_results(tried[0]).plain_std_error, outputs)
+    # A fit is used where the error without it is NaN, too.
+    is_worse = errors >= plain
+    choice = Choice(np.argmin(each, axis=0), ~is_worse)
+    return _Compared(choice, errors, plain, _flat(tried[0].mean, outputs))
+
+
+def _usual(
+    tried: list[Expectation], choice: Choice, outputs: tuple[int, int], dtype: Any
+) -> Usual:
     """The mean without control, and the largest deviation in the trials of what each
     component uses."""
-    combinations = len(problem.weights)
+    trials = [total(estimate.moments) for estimate in tried]
+    combinations = jtu.tree_leaves(trials[0].mean)[0].shape[1]
 
     def of_kind(tree: PyTree[np.ndarray], kind: KindsWithControl) -> np.ndarray:
-        return _flat(jtu.tree_map(lambda x: x[kind], tree), problem, combinations)
+        return _flat(jtu.tree_map(lambda x: x[kind], tree), outputs, combinations)
 
-    trials = [total(estimate.moments) for estimate in tried]
     # Without control all trials are the same.
-    plain = trials[0]
-    center = of_kind(plain.mean, KindsWithControl.PLAIN)
-    without = of_kind(plain.largest, KindsWithControl.PLAIN)
+    center = of_kind(trials[0].mean, KindsWithControl.PLAIN)
+    without = of_kind(trials[0].largest, KindsWithControl.PLAIN)
     each = [of_kind(trial.largest, KindsWithControl.CONTROLLED) for trial in trials]
     with_fit = np.take_along_axis(np.stack(each), choice.best[None, None], 0)[0]
     largest = np.where(choice.used, with_fit, without)
-    return Usual(center.astype(problem.dtype), largest.astype(problem.dtype))
+    return Usual(center.astype(dtype), largest.astype(dtype))
 
 
 def _largest_tails(wide: list[Expectation]) -> PyTree[np.ndarray]:
@@ -231,23 +262,16 @@ def _reason(basis: AbstractBasis, choice: Choice) -> str:
     )
 
 
-def _ratios(errors: np.ndarray, plain: np.ndarray, rounding: np.ndarray) -> np.ndarray:
-    """Standard errors with control, as fractions of those without it, at most one; zero
-    where those are `rounding` errors only, as of a constant."""
-    is_random = plain > rounding
-    ratios = np.minimum(errors, plain) / np.where(is_random, plain, 1)
-    return np.where(is_random, ratios, 0)
-
-
 def value_function(problem: Problem, key: PRNGKeyArray) -> FittedFunctions | None:
     """A quadratic value function for each level, or `None` if the random variables do not
     have finitely many outcomes."""
     try:
-        basis = chosen_basis(problem, 2)
+        chosen = chosen_basis(problem, 2)
     except ValueError:
         return None
-    warn_of_long_fit(problem, basis, stacklevel=5)
-    return _fits(problem, key, basis).chosen(np.zeros(problem.num_outputs, int))
+    warn_of_long_fit(chosen, stacklevel=5)
+    functions = _fits(problem, key, chosen.basis)
+    return functions.chosen(np.zeros(problem.num_outputs, int))
 
 
 def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> FittedFunctions:
