@@ -26,12 +26,12 @@ _ROUNDED_CELL = 1e-3
 class StepNumbers(NamedTuple):
     """The numbers of steps with step size `dt0`: after which to average, and all."""
 
-    saved: Int[np.ndarray, " saves"]
+    saved: Int[np.ndarray, "..."]
     total: np.integer
 
 
 def step_numbers(
-    t0: Any, t1: Any, dt0: Any, ts: Sequence[float] | np.ndarray | None
+    t0: Any, t1: Any, dt0: Any, ts: Sequence[Any] | np.ndarray | None
 ) -> StepNumbers:
     """Raises a `ValueError` for times that are no numbers, or between steps."""
     if dt0 is None:

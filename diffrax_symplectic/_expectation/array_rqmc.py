@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray, PyTree, UInt32
 
 from .._arguments import check_real, check_takes, whole_number
 from .._brownian import (
@@ -163,7 +163,7 @@ def _replicates(
     sort_by: Callable[[Y], PyTree[Array]] | FittedFunctions,
     points: UInt32[Array, "n d"],
     words: "StepWords",
-    keys: PRNGKeyArray,
+    keys: Key[Array, "1"],
 ) -> Samples:
     """A sample is the mean over all paths of a replicate. Algorithm 1 of
     [L'Ecuyer, Lécot and Tuffin (2008)](https://doi.org/10.1287/opre.1080.0556).

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from .polynomials import dot, hermite, least_squares, num_polynomials, tensordot
 
@@ -134,7 +134,7 @@ class AbstractBasis(eqx.Module):
         frame: Any,
         states: Float[Array, "n d"],
         good: Bool[Array, " n"],
-        keys: PRNGKeyArray,
+        keys: Key[Array, " n"],
     ) -> Float[Array, "size C S m"]:
         """The coefficients. `keys` are the keys of the pilot's paths, for estimates."""
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from .._terms import number_of_noises
 from .fits import FittedFunctions
@@ -28,8 +28,8 @@ class Choice(NamedTuple):
     - `used`: whether its control variate is used, or none.
     """
 
-    best: Int[np.ndarray, "S m"]
-    used: Bool[np.ndarray, "S m"]
+    best: Int[Array | np.ndarray, "S m"]
+    used: Bool[Array | np.ndarray, "S m"]
 
 
 class Usual(NamedTuple):
@@ -39,8 +39,8 @@ class Usual(NamedTuple):
     - `largest`: the largest deviation from it, or with control from the promised mean.
     """
 
-    center: Float[np.ndarray, "combinations S m"]
-    largest: Float[np.ndarray, "combinations S m"]
+    center: Float[Array | np.ndarray, "combinations S m"]
+    largest: Float[Array | np.ndarray, "combinations S m"]
 
 
 class TrialLaw(NamedTuple):
@@ -50,8 +50,8 @@ class TrialLaw(NamedTuple):
     - `side`: as a factor of `Noise.tilt`, for each random variable of a step.
     """
 
-    share: Float[np.ndarray, ""]
-    side: Float[np.ndarray, " n"]
+    share: Float[Array | np.ndarray, ""]
+    side: Float[Array | np.ndarray, " n"]
 
 
 def laws_of_trials(p: Problem) -> list[TrialLaw]:
@@ -90,7 +90,7 @@ def controlled_paths(
     choice: Choice,
     usual: Usual,
     law: TrialLaw,
-    keys: PRNGKeyArray,
+    keys: Key[Array, " n"],
 ) -> Samples:
     """A sample is a path minus the control variate of `functions` (with a leading axis of
     levels). With a wider `law` deviations beyond the `usual` ones are estimated."""

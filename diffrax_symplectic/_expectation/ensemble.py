@@ -1,7 +1,7 @@
 """The states of many paths at given times."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, get_args
 
 import diffrax
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray, PyTree
 
 from .._arguments import whole_number
-from .._custom_types import Args, Y
+from .._custom_types import Args, RealScalarLike, Y
 from .._fused import sample_key
 from .._solver import Want
 from .._terms import path_keys, with_keys
@@ -72,15 +72,15 @@ class Ensemble(eqx.Module):
 def ensemble(
     terms: PyTree[diffrax.AbstractTerm],
     solver: diffrax.AbstractSolver,
-    t0: float,
-    t1: float,
-    dt0: float,
-    y0: Y,
-    args: Args = None,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    dt0: RealScalarLike,
+    y0: Y | Callable[..., Y],
+    args: Args | Callable[[PRNGKeyArray], Args] = None,
     *,
     key: PRNGKeyArray,
     num_paths: int,
-    ts: Sequence[float] | np.ndarray | None = None,
+    ts: Sequence[RealScalarLike] | np.ndarray | None = None,
     want: Want = "strong",
     engine: str | None = None,
     batch_size: int | None = None,

@@ -43,15 +43,15 @@ def expectation(
     phi: Callable[[RealScalarLike, Y, Args], PyTree[ArrayLike]],
     terms: PyTree[diffrax.AbstractTerm],
     solver: diffrax.AbstractSolver,
-    t0: float,
-    t1: float,
-    dt0: float,
-    y0: Y,
-    args: Args = None,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    dt0: RealScalarLike,
+    y0: Y | Callable[..., Y],
+    args: Args | Callable[[PRNGKeyArray], Args] = None,
     *,
     key: PRNGKeyArray,
     sampling: AbstractSampling | None = None,
-    ts: Sequence[float] | np.ndarray | None = None,
+    ts: Sequence[RealScalarLike] | np.ndarray | None = None,
     levels: int = 1,
     tol: float | None = None,
     start: Expectation | None = None,
@@ -302,7 +302,7 @@ def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
     # Step sizes are rounded along with times, so errors of the same sign add up.
     fraction = float(numbers.eps) * problem.max_steps
 
-    def is_near_rounding(mean: np.ndarray, error: np.ndarray) -> np.bool_:
+    def is_near_rounding(mean: Any, error: Any) -> np.bool_:
         return np.any(error <= 2 * (fraction * np.abs(mean)))
 
     near = jtu.tree_map(is_near_rounding, estimate.mean, estimate.std_error)

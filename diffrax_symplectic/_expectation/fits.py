@@ -11,7 +11,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from .._custom_types import Y
 from .._root_finder import PicardNewton
@@ -46,7 +46,7 @@ class FittedFunctions(eqx.Module):
         frame = jtu.tree_map(lambda x: x[i], self.frames)
         return self.basis.combined(frame, ravel(y), self.coefficients[i])
 
-    def chosen(self, best: Int[np.ndarray, "S m"]) -> "FittedFunctions":
+    def chosen(self, best: Int[Array | np.ndarray, "S m"]) -> "FittedFunctions":
         """The functions with one candidate for each component."""
 
         def take(x: Float[Array, "... C S m"]) -> Float[Array, "... S m"]:
@@ -162,13 +162,13 @@ class _Pilot(NamedTuple):
     - `good`: which of them did not fail.
     """
 
-    keys: PRNGKeyArray
+    keys: Key[Array, " n"]
     starts: Float[Array, "paths d"]
     states: Float[Array, "steps paths d"]
     good: Bool[Array, " paths"]
 
 
-def _pilot(noise: Noise, keys: PRNGKeyArray) -> _Pilot:
+def _pilot(noise: Noise, keys: Key[Array, " n"]) -> _Pilot:
     """The paths with these keys."""
     p = noise.problem
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Key
 
 from .._arguments import whole_number
 from .._terms import path_keys, with_keys
@@ -54,7 +54,7 @@ class IndependentPaths(AbstractSampling):
         return SamplingPlan(sampler, self.num_paths, size)
 
 
-def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
+def _paths(p: Problem, keys: Key[Array, " n"]) -> Samples:
     """A sample is a path, with the same random key on all levels."""
     saved, failed = solved(p, keys)
     # A path that fails on several levels counts once.
@@ -63,7 +63,7 @@ def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
 
 
 def solved(
-    p: Problem, keys: PRNGKeyArray
+    p: Problem, keys: Key[Array, " n"]
 ) -> tuple[Float[Array, "levels S n m"], Bool[Array, "levels n"]]:
     """The values of `phi` for one path for each of several keys, at the times at which to
     average and on all levels, and which paths failed."""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
 from .._arguments import check_real, check_takes, whole_number
 from .._compat import is_result
@@ -121,7 +121,9 @@ def monte_carlo(
 
 
 def _of_function(
-    fn: Callable, weights: Float[np.ndarray, "combinations levels"], keys: PRNGKeyArray
+    fn: Callable,
+    weights: Float[Array | np.ndarray, "combinations levels"],
+    keys: Key[Array, " n"],
 ) -> Samples:
     """A sample is a value of the function, with the same random key on all levels."""
     levels = weights.shape[1]

@@ -53,7 +53,7 @@ _MOST_STEPS = 2**31
 
 
 class Level(eqx.Module):
-    """One step size.
+    """One step size, or several, along a leading axis.
 
     - `index`: its number, counted from the coarsest.
     - `h`: the step size.
@@ -61,10 +61,10 @@ class Level(eqx.Module):
     - `saved_steps`: the numbers of steps after which to average.
     """
 
-    index: Int[Array | np.ndarray, ""]
-    h: Float[Array | np.ndarray, ""]
-    num_steps: Int[Array | np.ndarray, ""]
-    saved_steps: Int[Array | np.ndarray, " saves"]
+    index: Int[Array | np.ndarray, "*levels"]
+    h: Float[Array | np.ndarray, "*levels"]
+    num_steps: Int[Array | np.ndarray, "*levels"]
+    saved_steps: Int[Array | np.ndarray, "*levels saves"]
 
 
 class Drawn(NamedTuple):
@@ -112,7 +112,7 @@ class Problem(eqx.Module):
         dt0: Any,
         y0: Y | Callable,
         args: Args | Callable,
-        ts: Sequence[float] | np.ndarray | None,
+        ts: Sequence[Any] | np.ndarray | None,
         levels: int,
         want: Want = "weak",
         user: str = "expectation",

@@ -12,7 +12,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import PRNGKeyArray, PyTree
+from jaxtyping import Array, Key, PRNGKeyArray, PyTree
 
 from .batch import batch_sums, BatchSums, quick_batch_sums
 from .call import check_untraced, Meter
@@ -165,7 +165,7 @@ class _Batches:
         )
 
 
-def _of_paths(sampler: Callable, paths: PyTree, keys: PRNGKeyArray) -> Samples:
+def _of_paths(sampler: Callable, paths: PyTree, keys: Key[Array, " n"]) -> Samples:
     """The samples from paths that were computed outside of JAX."""
     return sampler(paths, keys)
 

@@ -237,7 +237,8 @@ def _usual(
     center = of_kind(trials[0].mean, KindsWithControl.PLAIN)
     without = of_kind(trials[0].largest, KindsWithControl.PLAIN)
     each = [of_kind(trial.largest, KindsWithControl.CONTROLLED) for trial in trials]
-    with_fit = np.take_along_axis(np.stack(each), choice.best[None, None], 0)[0]
+    best = np.asarray(choice.best)[None, None]
+    with_fit = np.take_along_axis(np.stack(each), best, 0)[0]
     largest = np.where(choice.used, with_fit, without)
     return Usual(center.astype(dtype), largest.astype(dtype))
 
