@@ -19,6 +19,7 @@ from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree
 
 from ._arguments import check_real, check_solver, check_takes, shapes
 from ._custom_types import Args, RealScalarLike, Y
+from ._lapack import lapack_in_turn
 from ._solver import common_path, own_path
 from ._suggest import suggest_solver
 from ._terms import (
@@ -269,6 +270,7 @@ class _ComparedSystem(NamedTuple):
         numbers = path_numbers(random_paths(terms))
 
         @eqx.filter_jit
+        @lapack_in_turn
         @ft.partial(jax.vmap, in_axes=(0, None))
         def results(key: PRNGKeyArray, dt: Array) -> Batch:
             own = with_paths(make_path, numbers, terms, key)

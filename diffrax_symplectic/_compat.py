@@ -10,7 +10,7 @@ import dataclasses
 import functools as ft
 import importlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -30,9 +30,10 @@ from equinox.internal import (
     ω as ω,
 )
 from jax.extend.core import (
-    ClosedJaxpr,
+    ClosedJaxpr as ClosedJaxpr,
     Jaxpr as Jaxpr,
     jaxpr_as_fun,
+    JaxprEqn,
     Literal as Literal,
 )
 from jax.interpreters.mlir import make_ir_context
@@ -181,6 +182,23 @@ def captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[Any]]:
         return treedef.unflatten(run(*jtu.tree_leaves(value)))
 
     return call, traced.consts
+
+
+def bound(eqn: JaxprEqn, args: Sequence[Any], params: Any) -> list[Any]:
+    """The results of one operation of a jaxpr, with these parameters."""
+    params = eqn.primitive.get_bind_params(params)
+    # Other versions of JAX return functions apart from what they are passed with.
+    functions, params = params if isinstance(params, tuple) else ((), params)
+    with eqn.ctx.manager:
+        outs = eqn.primitive.bind(*functions, *args, **params)
+    return outs if eqn.primitive.multiple_results else [outs]
+
+
+def has_blocking_lapack() -> bool:
+    """Whether calls of LAPACK that run at the same time can block each other, as on CPUs by
+    the versions of JAX that share out a batch in the pool from which they are called."""
+    among_them = (0, 10, 0) <= jax.__version_info__ < (0, 11, 2)
+    return among_them and jax.default_backend() == "cpu"
 
 
 def stablehlo_module(program: Any) -> Any:

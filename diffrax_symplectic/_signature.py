@@ -3,7 +3,7 @@
 import collections
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 
-# The number of signatures that a check remembers. Each holds the user's functions.
+# The number of signatures that a function remembers. Each holds the user's functions.
 _REMEMBERED = 128
+Result = TypeVar("Result")
 
 
 class Signature(NamedTuple):
@@ -41,26 +42,26 @@ def _leaf_signature(leaf: Any) -> tuple[Any, ...]:
     return type(leaf), leaf
 
 
-def once_for_each_signature(check: Callable[..., None]) -> Callable[..., None]:
-    """A check that depends on the signature of its arguments only, and is skipped if it was
-    passed with the same one. It is traced by JAX, which takes longer than a short ensemble:
-    5 of 11 ms for 64 paths."""
-    passed: collections.OrderedDict[Signature, None] = collections.OrderedDict()
+def once_for_each_signature(fn: Callable[..., Result]) -> Callable[..., Result]:
+    """A function that depends on the signature of its arguments only, and is called once
+    for each. Tracing anew takes longer than a short ensemble: the checks of shapes took 5
+    of 11 ms for 64 paths."""
+    results: collections.OrderedDict[Signature, Result] = collections.OrderedDict()
 
-    @ft.wraps(check)
-    def checked(*args: Any) -> None:
+    @ft.wraps(fn)
+    def remembered(*args: Any) -> Result:
         own = signature(args)
         try:
-            known = own in passed
+            known = own in results
         except TypeError:
             # A leaf that cannot be hashed.
-            check(*args)
-            return
+            return fn(*args)
         if not known:
-            check(*args)
-        passed[own] = None
-        passed.move_to_end(own)
-        if len(passed) > _REMEMBERED:
-            passed.popitem(last=False)
+            # Errors are not remembered.
+            results[own] = fn(*args)
+        results.move_to_end(own)
+        if len(results) > _REMEMBERED:
+            results.popitem(last=False)
+        return results[own]
 
-    return checked
+    return remembered

@@ -4,13 +4,13 @@ import dataclasses
 import functools as ft
 import textwrap
 from collections.abc import Callable, Collection, Sequence
-from typing import cast, get_args
+from typing import cast, get_args, NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import PRNGKeyArray, PyTree
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from ._arguments import check_state
 from ._brownian import (
@@ -150,30 +150,129 @@ def suggest_solver(
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
     # Any path serves to inspect the terms.
-    terms = specified(terms, WeakBrownianPath)
-    constrained = constraint_of(terms) is not None
-    given_terms, terms = terms, without_constraint(terms)
+    given_terms = specified(terms, WeakBrownianPath)
+    terms = without_constraint(given_terms)
     drift, noise = _parts(terms)
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
     check_fit(terms, t0, y0, args)
-    not_separable = separable_fault(drift, noise, t0, y0, args)
-    structures: list[Structure] = [] if not_separable else ["separable"]
+    constrained = constraint_of(given_terms) is not None
+    system = _inspected(drift, noise, t0, y0, args, constrained)
+    paths = brownian_paths(noise)
+    solvers = _suitable(system, want, paths, one_term=len(noise) == 1)
+
+    numbers = path_numbers(random_paths(terms))
+
+    def terms_with(make: Callable) -> jtu.Partial:
+        """A function of a key: the terms with paths made by `make`."""
+        return jtu.Partial(ft.partial(with_paths, make, numbers), given_terms)
+
+    found = tuple(
+        _suggestion(solver, want, terms, system.commute, terms_with)
+        for solver in solvers
+    )
+    description = f"For {want} approximation. {system.in_a_sentence()}"
+    if any(isinstance(path, diffrax.UnsafeBrownianPath) for path in paths):
+        description += (
+            " Its `diffrax.UnsafeBrownianPath` rounds times to 32 bits and repeats its "
+            "noise late in a run (Diffrax issue 733): use one of the paths below."
+        )
+    return Suggestions(description, found)
+
+
+class _System(NamedTuple):
+    """What decides which solvers suit a system.
+
+    - `structures`: those that it has.
+    - `fault`: why it is not separable; `None` if it is.
+    - `num_noises`: the number of its scalar Brownian motions.
+    - `commute`: whether they commute, as far as is known.
+    - `friction`: whether it has friction that `BAOAB` treats by a step of its own.
+    - `our_friction`: whether that is friction of `langevin_terms` or `bath_terms`. It may
+        come from Diffrax's own terms instead.
+    - `constrained`: whether its positions are.
+    """
+
+    structures: list[Structure]
+    fault: Fault | None
+    num_noises: int
+    commute: bool
+    friction: bool
+    our_friction: bool
+    constrained: bool
+
+    def in_a_sentence(self) -> str:
+        """The structure of the system, for users."""
+        noises = "one noise"
+        if self.num_noises > 1:
+            how = "commute" if self.commute else "do not commute"
+            noises = f"{self.num_noises} noises that {how}"
+        if self.friction:
+            noises = f"friction and {noises}"
+        if self.constrained:
+            noises = f"constraints, {noises}"
+        fault = self.fault
+        reason = "" if fault is None else fault.reason
+        kind = " and ".join(self.structures) or f"general ({reason})"
+        sentence = f"The system is {kind}, with {noises}."
+        if fault is None or self.friction:
+            return sentence
+        # A user who reads this may want one of the solvers that are not suggested.
+        if self.structures and fault.wrong_way_round:
+            sentence += f" It is not separable: {reason}."
+        if fault.friction:
+            sentence += f" {FRICTION}"
+        return sentence
+
+
+def _inspected(
+    drift: tuple, noise: tuple, t0: Array, y0: Y, args: Args, constrained: bool
+) -> _System:
+    """The system, by tracing its terms."""
+    fault = separable_fault(drift, noise, t0, y0, args)
+    structures: list[Structure] = [] if fault else ["separable"]
     if additive_fault(noise, t0, y0, args) is None:
         structures.append("additive")
         if constant_fault(noise, t0, y0, args) is None:
             structures.append("constant")
-    m = number_of_noises(terms)
+    terms = diffrax.MultiTerm(*drift, *noise)
+    num_noises = number_of_noises(terms)
     # Noise in the forces commutes, whatever the drift is.
     in_forces = separable_fault((), noise, t0, y0, args) is None
-    commute = m == 1 or len(structures) > 0 or in_forces
-    commute = commute or commuting(noise, t0, y0, args)
-    with_friction = takes_friction_apart(terms, t0, y0, args)
-    solvers = ranked(want, structures, commute, m, with_friction)
-    if len(friction_apart(drift)[1]) == 0:
+    # At random states only if nothing else decides, since that compiles a program.
+    commute = (
+        num_noises == 1
+        or len(structures) > 0
+        or in_forces
+        or commuting(noise, t0, y0, args)
+    )
+    _, our_friction = friction_apart(drift)
+    return _System(
+        structures=structures,
+        fault=fault,
+        num_noises=num_noises,
+        commute=commute,
+        friction=takes_friction_apart(terms, t0, y0, args),
+        our_friction=len(our_friction) > 0,
+        constrained=constrained,
+    )
+
+
+def _suitable(
+    system: _System,
+    want: Want,
+    paths: list[diffrax.AbstractBrownianPath],
+    one_term: bool,
+) -> list[AbstractSymplecticSolver]:
+    """The solvers for a system, best first. `paths` are those of its noises, and
+    `one_term` says whether one term holds all of these."""
+    solvers = ranked(
+        want, system.structures, system.commute, system.num_noises, system.friction
+    )
+    if not system.our_friction:
         # Diffrax's own terms, which only the Langevin splittings take apart.
         solvers = [solver for solver in solvers if not isinstance(solver, Damped)]
-    if constrained:
+    if system.constrained:
         solvers = [solver for solver in solvers if solver.keeps_constraints]
         if not solvers:
             raise ValueError(
@@ -181,46 +280,17 @@ def suggest_solver(
                 "noise Hamiltonians H_k = U_k(t, q), and friction only from "
                 "`langevin_terms`."
             )
-    paths = brownian_paths(noise)
-    if len(noise) > 1 or not jtu.all_leaves([increment_struct(paths[0])]):
+    if not one_term or not jtu.all_leaves([increment_struct(paths[0])]):
         # Lévy areas are only sampled between the noises of one array.
-        areas = lambda solver: "noise brackets" in map(drives, solver.variables)
-        solvers = [solver for solver in solvers if not areas(solver)]
+        solvers = [solver for solver in solvers if not _needs_areas(solver)]
+    # No other path can take the place of these.
     given = [path for path in paths if not is_random(path) or is_own(path)]
-    solvers = [s for s in solvers if all(_holds(path, s) for path in given)]
-    numbers = path_numbers(random_paths(terms))
-    with_new = lambda make: jtu.Partial(
-        ft.partial(with_paths, make, numbers), given_terms
-    )
-    found = tuple(_suggestion(s, want, terms, commute, with_new) for s in solvers)
-    noises = "one noise"
-    if m > 1:
-        noises = f"{m} noises that {'commute' if commute else 'do not commute'}"
-    if with_friction:
-        noises = f"friction and {noises}"
-    if constrained:
-        noises = f"constraints, {noises}"
-    system = _system(structures, not_separable, noises, with_friction)
-    if any(isinstance(path, diffrax.UnsafeBrownianPath) for path in paths):
-        system += (
-            " Its `diffrax.UnsafeBrownianPath` rounds times to 32 bits and repeats its "
-            "noise late in a run (Diffrax issue 733): use one of the paths below."
-        )
-    return Suggestions(f"For {want} approximation. {system}", found)
+    return [solver for solver in solvers if all(_holds(path, solver) for path in given)]
 
 
-def _system(
-    structures: list[Structure], fault: Fault | None, noises: str, with_friction: bool
-) -> str:
-    """The structure of the system, in a sentence. `fault` is why it is not separable."""
-    kind = " and ".join(structures) or f"general ({fault.reason if fault else ''})"
-    system = f"The system is {kind}, with {noises}."
-    if fault is not None and not with_friction:
-        if structures and fault.wrong_way_round:
-            system += f" It is not separable: {fault.reason}."
-        if fault.friction:
-            system += f" {FRICTION}"
-    return system
+def _needs_areas(solver: AbstractSymplecticSolver) -> bool:
+    """Whether the solver needs the Lévy areas between noises."""
+    return "noise brackets" in map(drives, solver.variables)
 
 
 def _holds(
@@ -232,6 +302,7 @@ def _holds(
 
 
 def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
+    """Drift and noise terms. Raises a `ValueError` if a noise has no Brownian path."""
     advice = (
         "Pass the terms of a Stratonovich system, `hamiltonian_terms(H0, noise, path)` or "
         "`MultiTerm(ODETerm(f), ControlTerm(g, path))`, with a Brownian path"
@@ -272,18 +343,20 @@ def ranked(
         structures.add("separable and constant")
 
     def rank(solver: AbstractSymplecticSolver) -> tuple:
-        systems = solver.stage_vectors(num_noises)
-        # In a separable system only half of the state is solved for.
-        cost = sum(systems) / (2 if solver.structure == "separable" else 1)
-        order = _record(solver).order(want, commute)
-        assert order is not None
+        """What to sort by: the smallest tuple is the best solver."""
         record = _record(solver)
+        order = record.order(want, commute)
+        assert order is not None
         # In a heat bath most means are stationary ones, of positions.
         means = friction and want == "weak"
         inexact = means and "qq" not in record.stationary
+        systems = solver.stage_vectors(num_noises)
+        # In a separable system only half of the state is solved for.
+        cost = sum(systems) / (2 if solver.structure == "separable" else 1)
         too_many = cost > _MOST_STAGE_VECTORS
-        wrong = record.heats is False
-        return inexact, too_many, -order, wrong, cost, max(systems, default=0)
+        wrong_on_stiff_modes = record.heats is False
+        largest = max(systems, default=0)
+        return inexact, too_many, -order, wrong_on_stiff_modes, cost, largest
 
     noises = ("any", "commuting" if commute else "not commuting")
 
@@ -308,8 +381,7 @@ def _record(solver: AbstractSymplecticSolver) -> Record:
 
 def _code(solver: AbstractSymplecticSolver, module: str = "") -> str:
     """The code that constructs the solver."""
-    damped = isinstance(solver, Damped)
-    given = _code(solver.solver, module) if damped else ""  # pyright: ignore
+    given = _code(solver.solver, module) if isinstance(solver, Damped) else ""
     return f"{module}{type(solver).__name__}({given})"
 
 
@@ -318,8 +390,10 @@ def _suggestion(
     want: Want,
     terms: diffrax.AbstractTerm,
     commute: bool,
-    with_new: Callable,
+    terms_with: Callable,
 ) -> Suggestion:
+    """The suggestion of this solver. `terms_with(make)` returns, as a function of a key,
+    the terms with paths that are made by `make`."""
     record = _record(solver)
     random = random_paths(terms)
     replaced = [path for path in random if not is_own(path)]
@@ -336,11 +410,12 @@ def _suggestion(
         strong_order=record.order("strong", commute),
         path=code,
         reason=record.reason,
-        terms=with_new(ft.partial(solver.path, want=want)),
+        terms=terms_with(ft.partial(solver.path, want=want)),
     )
 
 
 def _shape_code(shape: PyTree[jax.ShapeDtypeStruct]) -> str:
+    """The code for the shape of a path."""
     if not isinstance(shape, jax.ShapeDtypeStruct):
         return "shape"
     if shape.dtype == jnp.result_type(float):

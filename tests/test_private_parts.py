@@ -550,3 +550,29 @@ def test_drjit_returns_the_constant_of_a_branch_from_a_conditional():
         """
     )
     assert done.returncode < 0 and "does not dominate all uses" in done.stderr
+
+
+def test_operations_of_a_jaxpr_are_evaluated_one_by_one():
+    """If this fails: look up how `jax.core.eval_jaxpr` binds an operation, and adapt
+    `bound`."""
+
+    @jax.custom_jvp
+    def sine(x):
+        return jnp.sin(x)
+
+    sine.defjvp(lambda primals, tangents: (sine(*primals), tangents[0]))
+    program = jax.make_jaxpr(lambda x: jax.lax.sort((sine(x), x)))(jnp.arange(3.0))
+    call, sort = program.jaxpr.eqns
+    (y,) = _compat.bound(call, [jnp.arange(3.0)], call.params)
+    assert jnp.allclose(y, jnp.sin(jnp.arange(3.0)))
+    keys, values = _compat.bound(sort, [-y, y], sort.params)
+    assert jnp.array_equal(keys, jnp.sort(-y)) and jnp.array_equal(values, -keys)
+
+
+def test_the_versions_with_calls_of_lapack_that_block_each_other(monkeypatch):
+    """If this fails: adapt `has_blocking_lapack` to how JAX writes its version."""
+    known = {(0, 9, 2): False, (0, 10, 0): True, (0, 10, 2): True, (0, 11, 2): False}
+    for version, blocking in known.items():
+        monkeypatch.setattr(jax, "__version_info__", version)
+        on_cpu = jax.default_backend() == "cpu"
+        assert _compat.has_blocking_lapack() == (blocking and on_cpu)

@@ -13,7 +13,7 @@ ROOT = Path(ds.__file__).parent
 # From the bottom up. Those in a row do not import each other.
 FLOORS = [
     ("_citation", "_compat", "_custom_types", "_signature"),
-    ("_arguments", "_batch", "_stablehlo"),
+    ("_arguments", "_batch", "_lapack", "_stablehlo"),
     ("_brownian", "_root_finder"),
     ("_tableau",),
     ("_terms",),

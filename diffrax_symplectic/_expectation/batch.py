@@ -12,6 +12,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt32
 
 from .._compat import is_closure_mismatch, quickly_compiled
+from .._lapack import lapack_in_turn
 from .sampling import Samples
 
 
@@ -107,7 +108,7 @@ def _of_device(
     def sample_key(high: Array, low: Array) -> PRNGKeyArray:
         return jr.fold_in(jr.fold_in(key, high), low)
 
-    samples = sampler(jax.vmap(sample_key)(high, low))
+    samples = lapack_in_turn(sampler)(jax.vmap(sample_key)(high, low))
     # The last batch is cut here: another size would be another program.
     is_wanted = index < left
     good = samples.good & is_wanted

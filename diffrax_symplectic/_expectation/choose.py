@@ -4,6 +4,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .array_rqmc import ArrayRQMC, step_words
+from .cost import NUMBERS_PER_SECOND, numbers_per_step
 from .independent import IndependentPaths
 from .noise import num_outcomes
 from .problem import Problem
@@ -29,8 +30,11 @@ _PATHS_OF_REPLICATE = 2**14
 _REPLICATES = 16
 # With a tolerance, which ends the estimate, the number of samples is without limit.
 MOST_SAMPLES = 10**9
-# Limit on the numbers in all steps of all paths (from ten seconds to some minutes).
-_MOST_NUMBERS = 2**28
+# Without a tolerance, paths take no more than about this many seconds.
+_SECONDS = 10
+# Sorted paths are drawn and sorted before each step, which takes as long as computing this
+# many numbers for each path.
+_NUMBERS_OF_SORTING = 1500
 # The fewest paths, however long they take.
 _FEWEST_PATHS = 2**8
 # The sizes of a trial.
@@ -55,10 +59,11 @@ def choose(problem: Problem, tol: float | None) -> tuple[AbstractSampling, str]:
     sampling = sorted_paths(problem, tol)
     if sampling is not None:
         return sampling, f"sorted paths for {why}"
-    affordable = _MOST_NUMBERS // (steps * components)
-    num_paths = int(np.clip(affordable, _FEWEST_PATHS, _PATHS))
     if tol:
         num_paths = MOST_SAMPLES
+    else:
+        affordable = _SECONDS * NUMBERS_PER_SECOND / (steps * numbers_per_step(problem))
+        num_paths = int(np.clip(affordable, _FEWEST_PATHS, _PATHS))
     return IndependentPaths(num_paths), f"independent paths for {why}"
 
 
@@ -66,8 +71,9 @@ def sorted_paths(problem: Problem, tol: float | None) -> ArrayRQMC | None:
     """Sorted paths, or `None` for many components and for paths that cannot be sorted."""
     if not _can_be_sorted(problem):
         return None
-    numbers = _num_steps(problem) * _num_components(problem) * _REPLICATES
-    affordable = max(_MOST_NUMBERS // numbers, _FEWEST_PATHS)
+    numbers = numbers_per_step(problem) + _NUMBERS_OF_SORTING
+    numbers_of_all = _num_steps(problem) * numbers * _REPLICATES
+    affordable = max(int(_SECONDS * NUMBERS_PER_SECOND / numbers_of_all), _FEWEST_PATHS)
     # Rounded down to a power of two, as Sobol' points need.
     size = min(2 ** (affordable.bit_length() - 1), _PATHS_OF_REPLICATE)
     return ArrayRQMC(size, MOST_SAMPLES if tol else _REPLICATES)

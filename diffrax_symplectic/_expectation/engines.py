@@ -16,7 +16,16 @@ import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .._compat import source_lines
-from .._fused import Kernels, PathFunctions, sample_key, split, without_rescue
+from .._fused import (
+    Kernels,
+    Lanes,
+    PathFunctions,
+    sample_key,
+    Shared,
+    split,
+    without_rescue,
+)
+from .._lapack import lapack_in_turn
 from .._stablehlo import NotReplayed
 from .independent import solved
 from .problem import Level, Problem
@@ -86,6 +95,7 @@ def _drawn(
 
 
 @eqx.filter_jit
+@lapack_in_turn
 def _paths(
     p: Problem, key: PRNGKeyArray, high: _Words, low: _Words
 ) -> tuple[PyTree[Array], Bool[Array, "levels n"]]:
@@ -124,17 +134,8 @@ def _fused_batch(
     p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int
 ) -> Batch:
     """The paths from the kernel alone: those that it did not finish count as failed."""
-    own_args = None if p.args_of is None else eqx.filter(p.args, eqx.is_array)
-    functions, arrays = split(_bare(p), key, own_args, p.paths_differ)
-    kernels = _kernels(functions)
-    start = (p.y0, None)
-    if p.paths_differ:
-        start = _drawn(p, key, *_halves(numbers))
-    grid = p.level(level)
-    lanes, shared = kernels.begin(
-        arrays, key, grid.h, int(numbers[0]), len(numbers), *start
-    )
-    saved_steps = np.asarray(grid.saved_steps)
+    kernels, lanes, shared = fused_start(p, key, numbers, level)
+    saved_steps = np.asarray(p.level(level).saved_steps)
     # From the number of a step to the entries of all states after it. The kernel is called
     # for the steps between two times.
     after: dict[int, list[np.ndarray]] = {}
@@ -150,6 +151,34 @@ def _fused_batch(
     ]
     stopped = np.asarray(lanes.stopped)
     return Batch(_unraveled(p.y0, entries), stopped, int(np.sum(stopped)))
+
+
+class FusedStart(NamedTuple):
+    """The paths of a batch before their first step, and the kernels that take their steps:
+    `kernels.advance(lanes, shared, begin, end)`.
+    """
+
+    kernels: Kernels
+    lanes: Lanes
+    shared: Shared
+
+
+def fused_start(
+    p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0
+) -> FusedStart:
+    """Compiles the kernels of a problem, unless they are known, and starts these paths."""
+    own_args = None if p.args_of is None else eqx.filter(p.args, eqx.is_array)
+    functions, arrays = split(_bare(p), key, own_args, p.paths_differ)
+    kernels = _kernels(functions)
+    if p.paths_differ:
+        y0, args = _drawn(p, key, *_halves(numbers))
+    else:
+        y0 = p.y0
+        args = None
+    h = p.level(level).h
+    first = int(numbers[0])
+    lanes, shared = kernels.begin(arrays, key, h, first, len(numbers), y0, args)
+    return FusedStart(kernels, lanes, shared)
 
 
 def _bare(p: Problem) -> Problem:
@@ -179,6 +208,8 @@ def _with_stragglers(
     p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int, fused: Batch
 ) -> Batch:
     """The paths of a batch, with those that the kernel did not finish simulated by JAX."""
+    # What the kernel returned for these is where it stopped. From there JAX would need the
+    # solver's state, too: it begins anew, which also gives the same path as without kernel.
     (which,) = np.nonzero(fused.failed)
     # Rounded up to a power of four, so that JAX compiles few programs.
     power = int(np.ceil(np.log(len(which)) / np.log(4)))

@@ -135,9 +135,9 @@ def expectation(
         four components, if the increments can be computed from quasi-random points; and
         otherwise `IndependentPaths`. Where `y0` or `args` is drawn, it is not
         `ValueFunctions`, which leave the variance of the start. Without `tol` these draw
-        4,096 paths, 16 replicates of 16,384 paths, and 131,072 paths, or fewer where all
-        steps of all paths would exceed $2^{28}$ numbers (from ten seconds to some minutes,
-        by solver and system).
+        4,096 paths, 16 replicates of 16,384 paths, and 131,072 paths, or fewer where these
+        would take more than about ten seconds on two cores, as far as the operations of a
+        step tell (compilation comes on top).
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
         default only `t1`.
     - `levels`: the number of step sizes, each half the previous one. With one level the
@@ -197,12 +197,9 @@ def expectation(
         why_law = "Gaussian increments, since phi may not be smooth"
 
     why_sampling = ""
-    # What takes the place of a fit that leaves much.
-    instead = None
-    if sampling is None:
+    is_chosen = sampling is None
+    if is_chosen:
         sampling, why_sampling = choose(problem, tol)
-        if isinstance(sampling, ValueFunctions):
-            instead = sorted_paths(problem, tol)
     sampling = _checked_sampling(sampling, start)
 
     trial_key = jr.fold_in(key, _NO_SAMPLE)
@@ -212,7 +209,11 @@ def expectation(
                 plan = fused_plan(problem, key, sampling, devices)
             else:
                 plan = sampling.prepare(problem, trial_key, devices)
-                if instead is not None and plan.left > MUCH_LEFT:
+                # Only fits leave something.
+                instead = None
+                if is_chosen and plan.left > MUCH_LEFT:
+                    instead = sorted_paths(problem, tol)
+                if instead is not None:
                     why_sampling = (
                         "sorted paths, since fitted value functions leave "
                         f"{plan.left:.1%} of the standard error"

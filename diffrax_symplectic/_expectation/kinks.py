@@ -34,12 +34,12 @@ def _contains(jaxpr: Jaxpr) -> bool:
         if not any(x in dependent for x in variables):
             continue
         dependent.update(eqn.outvars)
-        if eqn.primitive.name in _NOT_SMOOTH or any(map(_contains, _inner(eqn))):
+        if eqn.primitive.name in _NOT_SMOOTH or any(map(_contains, programs_in(eqn))):
             return True
     return False
 
 
-def _inner(eqn: Any) -> Iterator[Jaxpr]:
+def programs_in(eqn: Any) -> Iterator[Jaxpr]:
     """The programs that an operation runs, such as the branches of a conditional."""
     for x in jtu.tree_leaves([*eqn.params.values()]):
         if isinstance(x, ClosedJaxpr):

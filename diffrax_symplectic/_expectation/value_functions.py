@@ -20,6 +20,7 @@ from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
 from .._arguments import whole_number
 from .._compat import quickly_compiled
+from .._lapack import lapack_in_turn
 from .bases import AbstractBasis
 from .basis_choice import chosen_basis, warn_of_long_fit
 from .controlled_paths import (
@@ -300,6 +301,7 @@ def _fits_by(
 
 
 @quickly_compiled
+@lapack_in_turn
 def _fitted(
     problem: Problem, index: Int[Array, "1"], key: PRNGKeyArray, basis: AbstractBasis
 ) -> tuple[FittedFunctions, Int[Array, ""]]:

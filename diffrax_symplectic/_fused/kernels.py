@@ -96,8 +96,9 @@ class Kernels:
     def _which_memory_moves(self) -> list[bool]:
         """Which arrays of the solver state are the paths' own. Those that a step returns
         unchanged are shared, if all paths start alike: then they need no registers."""
-        *inputs, memory = self._step.types.values()
-        first = sum(map(len, inputs))
+        memory = self._step.types["memory"]
+        # It is the last argument of a step.
+        first = len(self._step.replay.arguments) - len(memory)
         # The results of a step: the state, the solver state, and whether it succeeded.
         begin = len(self._step.types["y"])
         returned = self._step.replay.handed_on[begin : begin + len(memory)]
@@ -138,11 +139,11 @@ class Kernels:
         paths."""
         dr = drjit()
         kinds = array_types()
-        samples = dr.arange(kinds["ui64"], number) + first
+        # Opaque: a number would be a constant of the kernel, so that every batch compiled a
+        # kernel of its own, in 20 to 40 ms.
+        samples = dr.arange(kinds["ui64"], number) + dr.opaque(kinds["ui64"], first)
         high = kinds["ui32"](samples >> 32)
         low = kinds["ui32"](samples)
-        # Otherwise `first` would be a constant of the kernel, which another batch would
-        # have to compile anew.
         dr.eval(high, low)
         keys = self._make_keys(packed(self._types_for_keys, [*arrays, key]), high, low)
         y = jtu.tree_leaves(y0)

@@ -80,6 +80,9 @@ class PathFunctions(NamedTuple):
     paths_differ: bool
     settings: tuple[Any, ...]
 
+    # The programs of a kernel are traced from these methods, so that all that they read is
+    # a field above, or an argument.
+
     @property
     def arrays(self) -> list[jax.ShapeDtypeStruct]:
         """The shapes and types of the arrays of the system."""
@@ -93,6 +96,7 @@ class PathFunctions(NamedTuple):
     def system(self, arrays: Sequence[Any]) -> SteppedSystem:
         """The system with these arrays."""
         left = iter(arrays)
+        # What is no array, such as the user's functions, is part of what is compiled.
         leaves = [
             value if struct is None else next(left)
             for value, struct in zip(self.static, self.structs)
@@ -118,6 +122,7 @@ class PathFunctions(NamedTuple):
     def step(self, arrays, own, h, i, y: list[Array], memory: list[Array]) -> Stepped:
         """Step number `i` of size `h`."""
         system, terms = self._of_path(arrays, own)
+        # Shapes alone tell how the leaves belong together; `init` is not run.
         structure = eqx.filter_eval_shape(system.init, terms, 0, h, system.y0)
         y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
         memory = jtu.tree_unflatten(jtu.tree_structure(structure), memory)
@@ -127,6 +132,7 @@ class PathFunctions(NamedTuple):
     def _of_path(self, arrays: list[Array], own: list[Array]):
         """The system and the terms of a path."""
         system = self.system(arrays)
+        # The keys come first, and then the arrays of `args`.
         number = len(own) - len(self.own_args)
         keys = own[:number]
         args = None
@@ -153,6 +159,7 @@ def split(
     `paths_differ` says whether each has its own initial state and `args`.
     """
     leaves, treedef = jtu.tree_flatten(system)
+    # Arrays of NumPy, too: another parameter must not need another kernel.
     arrays = [jnp.asarray(x) if _is_array(x) else None for x in leaves]
     functions = PathFunctions(
         treedef=treedef,

@@ -22,9 +22,11 @@ class Program:
 
     def __init__(self, fn: Callable, arguments: dict[str, PyTree]):
         """`arguments` are names, in the order of `fn`, with structures of shapes."""
-        # Lowered for CPUs on every device: for others JAX emits calls of libraries.
+        # Lowered for CPUs on every device: for others JAX emits calls of libraries. With
+        # unused arguments, so that arguments and types are in step.
         with jax.default_device(jax.devices("cpu")[0]):
             lowered = jax.jit(fn, keep_unused=True).lower(*arguments.values())
+        # The module itself: to write it as text and to read that takes longer.
         self.replay = Replay(lowered.compiler_ir("stablehlo"))
         left = iter(self.replay.arguments)
         self.types: dict[str, list[ArrayType]] = {
@@ -69,5 +71,6 @@ def unpacked(types: Sequence[ArrayType], memory: dict[str, Any]) -> list[Tensor]
 
 def as_numbers(x: Array | np.ndarray) -> np.ndarray:
     """The array, or the words of random keys."""
+    # Dr.Jit knows no random keys. In a lowered program these are their words, too.
     is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     return np.asarray(jr.key_data(x) if is_key else x)

@@ -1,4 +1,10 @@
-"""The root finder of a fused step: sweeps for one path, without a fallback."""
+"""The root finder of a fused step: sweeps for one path, without a fallback.
+
+When corrections are small enough, and when sweeps are relaxed, is decided as in
+`_root_finder/sweeps.py`. The loop is another: there all paths of a batch sweep together,
+and checks are rare since they cost much. In a kernel each path ends by itself, and checks
+after every sweep.
+"""
 
 import functools as ft
 from collections.abc import Callable
@@ -12,26 +18,100 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from .._root_finder import all_finite, Halves, PicardNewton
+from .._compat import ω
+from .._root_finder import (
+    all_finite,
+    best_relaxation,
+    Halves,
+    MARGIN,
+    PicardNewton,
+    ROUNDINGS,
+    SLOW,
+    STALLED,
+)
 from .._solver import AbstractImplicitStages
 
 
 # A path with a step that needs more sweeps is handed back to JAX.
 _MOST_SWEEPS = 48
-# Sweeps that converge at a slower rate are under-relaxed.
-_SLOW = 0.3
-# Sweeps end when the expected next correction is below two units in the last place by this
-# factor: the remaining error has the same sign in every step, and accumulates.
-_MARGIN = 64.0
-# Corrections below this many units of the largest value that no longer shrink are rounding.
-_ROUNDING = 50.0
-# Corrections beyond this many units: the sweeps diverge.
+# Beyond a correction of so many tolerances sweeps diverge. (It is finite in single
+# precision, too.)
 _HUGE = 1e30
+# Sweeps that diverge are relaxed as for this rate at most: their own may be infinite.
+_FASTEST_GROWTH = 4
+
+
+class _Equations(NamedTuple):
+    r"""The equations $y = \Phi(y)$ of a step, in two halves.
+
+    - `image`: the map $\Phi$.
+    - `in_halves`: whether unknowns are `Halves`. Otherwise these are the doubled system
+        $y = \Phi(z)$, $z = \Phi(y)$. It is solved when $y = z$: a cycle of period two
+        solves it, too, with $y \neq z$.
+    """
+
+    image: Callable[[PyTree[Array]], PyTree[Array]]
+    in_halves: bool
+
+    def start(self, guess: PyTree[Array]) -> Halves:
+        return guess if self.in_halves else Halves(guess, guess)
+
+    def swept(self, y: Halves, relaxation: Scalar | None = None) -> Halves:
+        """The iterate after a sweep, in which $q$ reads the new $p$. `None` is no
+        relaxation, and no operation."""
+        new_p = self.image(y).p if self.in_halves else self.image(y.q)
+        y = Halves(_relaxed(new_p, y.p, relaxation), y.q)
+        new_q = self.image(y).q if self.in_halves else self.image(y.p)
+        return Halves(y.p, _relaxed(new_q, y.q, relaxation))
+
+    def value(self, y: Halves) -> PyTree[Array]:
+        """An iterate in the structure of the unknowns."""
+        return y if self.in_halves else y.q
+
+    def correction(self, old: Halves, new: Halves) -> PyTree[Array]:
+        """How far an iterate is from a solution, by the last sweep."""
+        return (new**ω - old**ω).ω if self.in_halves else (new.q**ω - new.p**ω).ω
+
+
+def _relaxed(new: PyTree, old: PyTree, relaxation: Scalar | None) -> PyTree[Array]:
+    if relaxation is None:
+        return new
+    return (old**ω + relaxation * (new**ω - old**ω)).ω
+
+
+class _Criterion(NamedTuple):
+    """When a correction is small enough.
+
+    - `weights`: for each leaf, the inverse of its tolerance.
+    - `rounding`: the largest correction that may be a rounding error.
+    """
+
+    weights: list[Scalar]
+    rounding: Scalar
+
+    def measured(
+        self, correction: PyTree[Array], before: Scalar
+    ) -> tuple[Scalar, Bool[Array, ""]]:
+        """The size of a correction that follows one of size `before`, in units of the
+        tolerance, and whether sweeps have converged."""
+        sizes = _sizes(correction)
+        size = _largest([x * weight for x, weight in zip(sizes, self.weights)])
+        # The next correction is smaller by the same ratio, `size / before`: without the
+        # division. A growing correction says nothing about the next.
+        smaller = jnp.where(size < before, size, before)
+        below = 2.0**MARGIN * size * smaller <= before
+        stalled = size >= 2.0**STALLED * before
+        return size, below | (stalled & (_largest(sizes) <= self.rounding))
 
 
 class _State(NamedTuple):
-    """The iterate, the size of its last correction in units of the tolerance, whether the
-    equations are solved, and the number of sweeps."""
+    """The state of the loop over sweeps.
+
+    - `y`: the iterate.
+    - `size`: the size of its last correction, in units of the tolerance.
+    - `solved`: whether the equations are solved.
+    - `done`: the number of sweeps.
+    """
 
     y: Halves
     size: Scalar
@@ -39,69 +119,56 @@ class _State(NamedTuple):
     done: Array
 
 
-def sweep(image: Callable, scale: Callable, guess: PyTree, pending: Bool[Array, ""]):
-    r"""Solves $y = \Phi(y)$ from a `guess`. Returns the last iterate, and whether it is a
-    solution.
+def solve_one_path(
+    image: Callable, scale: Callable, guess: PyTree[Array], pending: Bool[Array, ""]
+) -> tuple[PyTree[Array], Bool[Array, ""]]:
+    r"""Solves $y = \Phi(y)$ from a `guess`, if it is `pending`. Returns the last iterate,
+    and whether it is a solution.
 
-    The sweeps are those of [`diffrax_symplectic.PicardNewton`][]. In a fused kernel each
-    path ends by itself, so that a convergence check after each sweep costs little.
+    The arguments are those that [`diffrax_symplectic.PicardNewton`][] is called with.
     """
-    paired = isinstance(guess, Halves)
-    # Without halves: Gauss-Seidel on the doubled system y = \Phi(z), z = \Phi(y). It is
-    # solved when y = z: a cycle of period two solves it, too, with y != z.
-    start = guess if paired else Halves(guess, guess)
-    p = lambda y: image(y).p if paired else image(y.q)
-    q = lambda y: image(y).q if paired else image(y.p)
-    value = lambda y: y if paired else y.q
-    minus = lambda y, z: jtu.tree_map(lambda a, b: a - b, y, z)
-    correction = lambda old, new: minus(new, old) if paired else minus(new.q, new.p)
-    one = jnp.ones((), jnp.result_type(*jtu.tree_leaves(guess)))
-    unit = 2 * jnp.finfo(one.dtype).eps
+    equations = _Equations(image, isinstance(guess, Halves))
+    dtype = jnp.result_type(*jtu.tree_leaves(guess))
+    # Three sweeps before the loop: they make two corrections, whose ratio is the rate of
+    # convergence.
+    first = equations.swept(equations.start(guess))
+    criterion = _criterion(scale(equations.value(first)), dtype)
+    second = equations.swept(first)
+    third = equations.swept(second)
+    one = jnp.ones((), dtype)
+    before, _ = criterion.measured(equations.correction(first, second), one)
+    size, solved = criterion.measured(equations.correction(second, third), before)
 
-    def once(y: Halves, omega: Scalar) -> Halves:
-        behind = lambda x, old: jtu.tree_map(lambda a, b: b + omega * (a - b), x, old)
-        relaxed = (lambda x, _: x) if omega is one else behind
-        y = Halves(relaxed(p(y), y.p), y.q)
-        return Halves(y.p, relaxed(q(y), y.q))
+    # Relaxed once: later rates are those of relaxed sweeps, to which the formula does not
+    # apply. A branch, since few paths take it, and a division takes as long as a sweep.
+    relaxation = lax.cond(
+        size > SLOW * before,
+        lambda: best_relaxation(jnp.minimum(size / before, _FASTEST_GROWTH)),
+        lambda: one,
+    )
 
-    first = once(start, one)
-    # The tolerance is taken at the first sweep, which is needed in any case.
-    scales = _sizes(scale(value(first)))
-    weights = [_inverse(unit * x) for x in scales]
-    rounding = _ROUNDING * unit * _largest(scales)
-
-    def check(
-        old: Halves, new: Halves, before: Scalar
-    ) -> tuple[Scalar, Bool[Array, ""]]:
-        """The size of a correction that follows one of size `before`, and whether the
-        sweeps have converged."""
-        gaps = _sizes(correction(old, new))
-        size = _largest([x * weight for x, weight in zip(gaps, weights)])
-        below = _MARGIN * size * jnp.where(size < before, size, before) <= before
-        return size, below | ((size >= 0.9 * before) & (_largest(gaps) <= rounding))
-
-    second = once(first, one)
-    third = once(second, one)
-    before, _ = check(first, second, one)
-    size, solved = check(second, third, before)
-
-    def best() -> Scalar:
-        """The relaxation factor for the observed rate of convergence."""
-        return 2 / (1 + jnp.sqrt(1 + jnp.minimum(size / before, 4)))
-
-    omega = lax.cond(size > _SLOW * before, best, lambda: one)
-
-    def step(last: _State) -> _State:
-        y = once(last.y, omega)
-        size, solved = check(last.y, y, last.size)
+    def once(last: _State) -> _State:
+        y = equations.swept(last.y, relaxation)
+        correction = equations.correction(last.y, y)
+        size, solved = criterion.measured(correction, last.size)
         return _State(y, size, solved, last.done + 1)
 
-    def going(last: _State) -> Bool[Array, ""]:
+    def goes_on(last: _State) -> Bool[Array, ""]:
         return ~last.solved & (last.done < _MOST_SWEEPS) & (last.size < _HUGE)
 
     state = _State(third, size, ~pending | solved, jnp.full((), 3, jnp.int32))
-    last = lax.while_loop(going, step, state)
-    return value(last.y), last.solved
+    last = lax.while_loop(goes_on, once, state)
+    return equations.value(last.y), last.solved
+
+
+def _criterion(scale: PyTree[Array], dtype: Any) -> _Criterion:
+    """The criterion for a state of size `scale`: corrections below two units in the last
+    place, leaf by leaf."""
+    # The tolerance is taken once, at the first sweep.
+    eps = jnp.finfo(dtype).eps
+    scales = _sizes(scale)
+    weights = [_inverse(2 * eps * x) for x in scales]
+    return _Criterion(weights, ROUNDINGS * eps * _largest(scales))
 
 
 def _inverse(x: Scalar) -> Scalar:
@@ -109,19 +176,22 @@ def _inverse(x: Scalar) -> Scalar:
     takes as long as a sweep. The inverse of zero is large, not infinite."""
     info = jnp.finfo(x.dtype)
     kind = jnp.dtype(f"int{info.bits}")
+    # Read as an integer, the bits of a float are its exponent, followed by its mantissa,
+    # which is cut off. The difference of two such integers subtracts exponents.
     one = int(np.asarray(1, x.dtype).view(kind))
     exponent = lax.bitcast_convert_type(x, kind) >> info.nmant << info.nmant
     return lax.bitcast_convert_type(jnp.asarray(2 * one, kind) - exponent, x.dtype)
 
 
 def _sizes(y: PyTree[Array]) -> list[Scalar]:
+    """The largest entry of each leaf, by size."""
     return [_largest([*jnp.abs(x).reshape(-1)]) for x in jtu.tree_leaves(y)]
 
 
-def _largest(x: list[Scalar]) -> Scalar:
+def _largest(numbers: list[Scalar]) -> Scalar:
     # `jnp.maximum` propagates NaN at the price of three operations. The check at the end of
     # the step finds NaN in any case.
-    return ft.reduce(lambda a, b: jnp.where(a > b, a, b), x)
+    return ft.reduce(lambda a, b: jnp.where(a > b, a, b), numbers)
 
 
 class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
@@ -134,7 +204,7 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         del fn, f_struct, aux_struct, tags
         zeros = jtu.tree_map(jnp.zeros_like, y)
-        return options["solve_blocks"](args, sweep, zeros, all_finite(y))
+        return options["solve_blocks"](args, solve_one_path, zeros, all_finite(y))
 
     def step(self, fn, y, args, options, state, tags):
         del fn, args, options, tags
@@ -151,16 +221,20 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
 
 def without_rescue(solver: Any) -> Any:
     """The solver, and all solvers in it, with `Sweeps` in place of `PicardNewton`."""
-    is_implicit = lambda x: isinstance(x, AbstractImplicitStages)
 
-    def replace(x: Any) -> Any:
-        if not (is_implicit(x) and isinstance(x.root_finder, PicardNewton)):
+    def replaced(x: Any) -> Any:
+        if not (_is_implicit(x) and isinstance(x.root_finder, PicardNewton)):
             return x
         _check_tolerance(x.root_finder)
-        fields = lambda s: (s.root_finder, s.root_find_max_steps)
+        # No iterations of Optimistix: `Sweeps` solves the equations before the first.
+        fields = lambda stages: (stages.root_finder, stages.root_find_max_steps)
         return eqx.tree_at(fields, x, (Sweeps(), 0))
 
-    return jtu.tree_map(replace, solver, is_leaf=is_implicit)
+    return jtu.tree_map(replaced, solver, is_leaf=_is_implicit)
+
+
+def _is_implicit(x: Any) -> bool:
+    return isinstance(x, AbstractImplicitStages)
 
 
 def _check_tolerance(finder: PicardNewton) -> None:

@@ -1,5 +1,6 @@
 """Linear systems with the Jacobian of the stage equations."""
 
+import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
@@ -92,13 +93,19 @@ def solve_matrix(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     # To rounding error, also by GMRES.
     reduction = float(jnp.finfo(rhs.dtype).eps) ** 0.9
 
-    def by(matrix: Float[Array, "n n"]) -> Callable[[_Map, _Vector], _Vector]:
-        if len(matrix) <= _MAX_DENSE:
-            return lambda apply, rhs: eliminate(matrix, rhs)
-        return lambda apply, rhs: solve(apply, rhs, None, reduction)[0]
+    def multiply(x: _Vector) -> _Vector:
+        return matrix @ x
 
-    multiply = lambda x: matrix @ x
-    return lax.custom_linear_solve(multiply, rhs, by(matrix), by(matrix.T))
+    def solve_by(matrix: Float[Array, "n n"], apply: _Map, rhs: _Vector) -> _Vector:
+        if len(matrix) <= _MAX_DENSE:
+            return eliminate(matrix, rhs)
+        return solve(apply, rhs, None, reduction).value
+
+    # Derivatives come from the equation: they are solves with the matrix, or in reverse
+    # mode with its transpose.
+    return lax.custom_linear_solve(
+        multiply, rhs, ft.partial(solve_by, matrix), ft.partial(solve_by, matrix.T)
+    )
 
 
 def _units(x: _Vector) -> Any:

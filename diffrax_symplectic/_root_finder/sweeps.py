@@ -32,14 +32,14 @@ _MOST_BETWEEN_CHECKS = 32
 _MOST_ROUNDED = 3
 # Sweeps with a slower rate of convergence are under-relaxed. Faster ones would gain less
 # than one sweep.
-_SLOW = 0.3
+SLOW = 0.3
 # The relaxation factor after divergence, which is optimal for a rate of 8.
 _STRONGEST = 0.5
 # The base-2 logarithm of the rate expected of relaxed sweeps. By the formula the rate is
 # 0.17 or better for rates up to one, but only after the first few sweeps.
 _RELAXED = -2.0
 # The base-2 logarithm of 0.87, the rate above which sweeps count as not converging.
-_STALLED = -0.2
+STALLED = -0.2
 
 
 class Halves(NamedTuple):
@@ -217,14 +217,14 @@ def _check(
     # In base-2 logarithms, so that the number of further sweeps is a quotient.
     rate = (level - earlier) / state.ahead
     done = state.done + state.ahead
-    stalled = rate >= _STALLED
+    stalled = rate >= STALLED
     solved = converged(level, rate, last.rounded, stalled)
     # Sweeps that diverged get one more try. If it stalls, Newton's method takes over.
     again = stalled & (state.relaxation > _STRONGEST)
     ratio = jnp.exp2(rate)
     # Relaxed once, at the first check: later rates are those of relaxed sweeps, to which
     # the formula does not apply.
-    tuned = (state.done == 0) & (ratio > _SLOW) & ~stalled
+    tuned = (state.done == 0) & (ratio > SLOW) & ~stalled
     further = (level + MARGIN) / jnp.where(tuned, -_RELAXED, -rate)
     # Sweeps that would not end in time end now, before they cost anything.
     in_time = again | (~stalled & (done + further < most))
@@ -235,7 +235,7 @@ def _check(
     # Corrections as small as rounding errors show no rate.
     count = jnp.where(last.rounded, jnp.minimum(count, _MOST_ROUNDED), count)
     count = jnp.ceil(jnp.where(pending, count, 0)).astype(int)
-    relaxation = jnp.where(tuned, 2 / (1 + jnp.sqrt(1 + ratio)), state.relaxation)
+    relaxation = jnp.where(tuned, best_relaxation(ratio), state.relaxation)
     new = _SweepState(
         y=None,
         relaxation=jnp.where(again, _STRONGEST, relaxation),
@@ -246,3 +246,8 @@ def _check(
         ahead=jnp.minimum(most_of_batch(count), _MOST_BETWEEN_CHECKS),
     )
     return _Checked(new, ~(near | solved))
+
+
+def best_relaxation(rate: Scalar) -> Scalar:
+    """The relaxation factor for an oscillation whose sweeps converge at this rate."""
+    return 2 / (1 + jnp.sqrt(1 + rate))

@@ -27,7 +27,7 @@ _WIDE = 32
 MARGIN = 6
 # Corrections below this many roundings of the whole state may be rounding errors, of all
 # stages together. They count as such only if they no longer shrink.
-_ROUNDINGS = 100
+ROUNDINGS = 100
 # A correction below this fraction of the state is small: the iterate is close enough for
 # Newton's method to begin with.
 _SMALL = 0.01
@@ -77,7 +77,7 @@ class Tolerance(NamedTuple):
         bound = self._in_units([whole], [whole])
         eps = float(jnp.finfo(size.dtype).eps)
         # Strictly below, so that an infinite correction to an infinite state is neither.
-        rounded = largest(sizes) < _ROUNDINGS * eps * whole
+        rounded = largest(sizes) < ROUNDINGS * eps * whole
         small = largest(sizes) < _SMALL * whole
         return CorrectionSize(size, bound, rounded, small)
 

@@ -337,9 +337,7 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
     root_finder: optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver = eqx.field(
         default=PicardNewton(), kw_only=True, converter=_checked_root_finder
     )
-    # Diffrax requires this field. With the default root finder it has no effect (see
-    # `_ARGUMENTS`): that takes a single step of `optimistix.root_find`, with bounds of its
-    # own on sweeps and on iterations of Newton's method.
+    # Diffrax requires this field. See `_ARGUMENTS` for what it bounds.
     root_find_max_steps: int = eqx.field(
         default=100,
         kw_only=True,
@@ -352,8 +350,10 @@ _Solver = TypeVar("_Solver", bound=type)
 _ARGUMENTS = """**Arguments:** the parameters above, if any (Python numbers or strings), and
 
 - `root_finder`: any Optimistix root finder for the stage equations.
-- `root_find_max_steps`: the most steps that the root finder may take. `PicardNewton` takes
-    one step, and limits its iterations itself.
+- `root_find_max_steps`: the most steps that a root finder of another package may take in
+    a step of the solver. `PicardNewton`, the default, takes a single step of
+    `optimistix.root_find` and has bounds of its own, `picard_steps` and `newton_steps`, so
+    that this has no effect on it (unless it is zero).
 
 **Raises:** a `ValueError` for any other value.
 """

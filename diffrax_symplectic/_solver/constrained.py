@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, PyTree
 
 from .._arguments import check_pair
 from .._custom_types import Args, RealScalarLike, Y
@@ -41,9 +41,10 @@ def init_constrained(
     check_pair(y0)
     solver.check(without_constraint(terms), t0, y0, args)
     dependent, off = check_start(terms, t0, y0, args)
-    R: Any = optx.RESULTS
-    fault = R.where(off, R.nonlinear_divergence, no_failure())
-    return R.where(dependent, R.singular, fault)
+    results: Any = optx.RESULTS
+    # With dependent constraints it is not known where the surface is.
+    fault = results.where(off, results.nonlinear_divergence, no_failure())
+    return results.where(dependent, results.singular, fault)
 
 
 def verlet_step(
@@ -59,19 +60,24 @@ def verlet_step(
     solver `name` after it."""
     surface = Surface.of(terms, t0, y0, args)
     drift, noise = split_terms(without_constraint(terms))
-    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
+    p, unravel_p = jfu.ravel_pytree(y0[0])
+    q, unravel_q = jfu.ravel_pytree(y0[1])
     half = (t1 - t0) / 2
+    # A path that failed before needs no multipliers: others would wait for them.
     pending = before == optx.RESULTS.successful
 
     p, q, first = surface.fly(p, surface.frame(q), half, pending)
-    y = unravel_p(p), unravel_q(q)
+    # The momentum is not tangent here. It need not be: forces do not depend on it, and the
+    # multipliers of the next flight make up for it.
+    y = (unravel_p(p), unravel_q(q))
     force, _ = drift_driven(drift, t0, t1, args)(t0 + half, y)
     p = p + jfu.ravel_pytree(force)[0]
     if len(noise) > 0:
         p = p + _kick(noise, t0, t1, y, args, name)
     p, q, second = surface.fly(p, surface.frame(q), half, pending)
-    y1 = unravel_p(surface.tangent(p, surface.frame(q))), unravel_q(q)
-    return ended(y1, first & second, before)
+    p = surface.tangent(p, surface.frame(q))
+    y1 = (unravel_p(p), unravel_q(q))
+    return _ended(y1, first & second, before)
 
 
 def baoab_step(
@@ -88,15 +94,18 @@ def baoab_step(
     start; the force at its end, and the state of the solver `name` after it."""
     surface = Surface.of(terms, t0, y0, args)
     _, friction, noise = split_friction(without_constraint(terms))
-    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
+    p, unravel_p = jfu.ravel_pytree(y0[0])
+    q, unravel_q = jfu.ravel_pytree(y0[1])
     half = jnp.asarray((t1 - t0) / 2, p.dtype)
     middle = t0 + (t1 - t0) / 2
     pending = before == optx.RESULTS.successful
 
+    # B and A
     p, q, first = surface.fly(p + half * force, surface.frame(q), half, pending)
     at = surface.frame(q)
     p = surface.tangent(p, at)
-    y = unravel_p(p), unravel_q(q)
+    y = (unravel_p(p), unravel_q(q))
+    # O
     kick = _kick(noise, t0, t1, y, args, name) if noise else jnp.zeros_like(p)
 
     # Friction acts on the impulses of the constraint forces, too: then friction and noise
@@ -105,35 +114,49 @@ def baoab_step(
         moved = after_friction(friction, middle, t1 - t0, y, args, unravel_p(impulse))
         return jfu.ravel_pytree(moved)[0]
 
-    response = lambda impulse: jax.jvp(after, (kick,), (impulse,))[1]
+    def response(impulse: Array) -> Array:
+        return jax.jvp(after, (kick,), (impulse,))[1]
+
     p = surface.tangent(after(kick), at, response)
+    # A and B
     p, q, second = surface.fly(p, at, half, pending)
     force = force_at(terms, t1, (unravel_p(p), unravel_q(q)), args)
     p = surface.tangent(p + half * force, surface.frame(q))
-    y1, solved = ended((unravel_p(p), unravel_q(q)), first & second, before)
+    y1 = (unravel_p(p), unravel_q(q))
+    y1, solved = _ended(y1, first & second, before)
     return y1, force, solved
 
 
-def force_at(terms, t: RealScalarLike, y: Y, args: Args) -> Array:
+def force_at(
+    terms: PyTree[diffrax.AbstractTerm], t: RealScalarLike, y: Y, args: Args
+) -> Array:
     """The force without friction, as a vector."""
     drift, _, _ = split_friction(without_constraint(terms))
-    return jfu.ravel_pytree(rate(drift, t, y, args)[0])[0]
+    force, _ = rate(drift, t, y, args)
+    return jfu.ravel_pytree(force)[0]
 
 
-def _kick(noise: tuple, t0, t1, y: Y, args: Args, name: str) -> Array:
+def _kick(
+    noise: tuple, t0: RealScalarLike, t1: RealScalarLike, y: Y, args: Args, name: str
+) -> Array:
     """The change of the momenta by the noise, as a vector."""
-    drawn = drawn_variables(noise, ["W"], t0, t1, name)["W"]
-    return jfu.ravel_pytree(apply(noise, drawn, args, t0 + (t1 - t0) / 2, y)[0])[0]
+    drawn = drawn_variables(noise, ["W"], t0, t1, name)
+    kick, _ = apply(noise, drawn["W"], args, t0 + (t1 - t0) / 2, y)
+    return jfu.ravel_pytree(kick)[0]
 
 
-def ended(
+def _ended(
     y1: Y, found: Bool[Array, ""], before: optx.RESULTS
 ) -> tuple[Y, optx.RESULTS]:
     """The end of a step, and the state of the solver after it."""
-    R: Any = optx.RESULTS
-    now = R.where(found, R.successful, R.nonlinear_max_steps_reached)
-    result = R.where(before == R.successful, now, before)
+    results: Any = optx.RESULTS
+    now = results.where(found, results.successful, results.nonlinear_max_steps_reached)
+    # The first failure is the one that is reported.
+    result = results.where(before == results.successful, now, before)
+
     # Without a solution there is no derivative. It is set to zero, so that a failed path
     # does not spoil gradients that are summed over a batch.
-    fixed = lambda x: jnp.where(result == R.successful, x, lax.stop_gradient(x))
-    return jtu.tree_map(fixed, y1), result
+    def fixed_if_failed(x: Array) -> Array:
+        return jnp.where(result == results.successful, x, lax.stop_gradient(x))
+
+    return jtu.tree_map(fixed_if_failed, y1), result

@@ -1,14 +1,16 @@
 """Langevin dynamics by splitting: kicks of the forces, drifts of the positions, and
 friction and noise between them."""
 
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import optimistix as optx
 from jax import lax
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .._arguments import check_state
 from .._compat import unwrapped
@@ -63,37 +65,73 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         start of the next one."""
         del t1
         self.check(terms, t0, y0, args)
+        if not self.symmetric:
+            return None
         terms, y0 = momentum_first(terms, y0)
         drift, _, _ = split_friction(terms)
-        return rate(drift, t0, y0, args)[0] if self.symmetric else None
+        forces, _ = rate(drift, t0, y0, args)
+        return forces
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
-        own_terms, own_y0 = terms, y0
-        terms, y0 = momentum_first(terms, y0)
+        own_terms = terms
+        own_y0 = y0
+        terms, y0 = momentum_first(own_terms, own_y0)
         drift, friction, noise = split_friction(terms)
-        forces = solver_state
-        anew = lambda: rate(drift, t0, y0, args)[0]
-        if not self.symmetric:
-            forces = anew()
-        elif made_jump is not False:
-            forces = lax.cond(made_jump, anew, lambda: solver_state)
-        half = (t1 - t0) / 2
-        p = moved(y0[0], half if self.symmetric else t1 - t0, forces)
-        q = moved(y0[1], half, rate(drift, t0, (p, y0[1]), args)[1])
+        p, q = y0
+        h = t1 - t0
+        half = h / 2
+
+        def forces_at_start() -> PyTree[Array]:
+            return rate(drift, t0, y0, args)[0]
+
+        # B
+        if self.symmetric:
+            forces = _handed_on(solver_state, made_jump, forces_at_start)
+            p = moved(p, half, forces)
+        else:
+            p = moved(p, h, forces_at_start())
+        # A. Of the rates at (p, q), XLA drops the half that is not used.
+        _, velocities = rate(drift, t0, (p, q), args)
+        q = moved(q, half, velocities)
+        # O
         kick = None
         if len(noise) > 0:
-            drawn = drawn_variables(noise, ["W"], t0, t1, type(self).__name__)["W"]
-            kick, _ = apply(noise, drawn, args, t0 + half, (p, q))
-        p = after_friction(friction, t0 + half, t1 - t0, (p, q), args, kick)
-        q = moved(q, half, rate(drift, t1, (p, q), args)[1])
+            drawn = drawn_variables(noise, ["W"], t0, t1, type(self).__name__)
+            kick, _ = apply(noise, drawn["W"], args, t0 + half, (p, q))
+        p = after_friction(friction, t0 + half, h, (p, q), args, kick)
+        # A
+        _, velocities = rate(drift, t1, (p, q), args)
+        q = moved(q, half, velocities)
+        # B
+        state = None
         if self.symmetric:
-            forces, _ = rate(drift, t1, (p, q), args)
-            p = moved(p, half, forces)
+            state, _ = rate(drift, t1, (p, q), args)
+            p = moved(p, half, state)
         result = result_at(terms, t0, t1, result_of(None, (p, q)))
-        # Exchanged once more.
+        # Exchanged once more, if the state is Diffrax's (x, v).
         _, y1 = momentum_first(own_terms, (p, q))
-        state = forces if self.symmetric else None
         return y1, None, dict(y0=own_y0, y1=y1), state, result
+
+
+def _handed_on(
+    forces: PyTree[Array], made_jump: Any, anew: Callable[[], PyTree[Array]]
+) -> PyTree[Array]:
+    """The forces from the end of the last step, or after a jump, which moved the state,
+    those that are computed `anew`."""
+    if made_jump is False:
+        return forces
+    return lax.cond(made_jump, anew, lambda: forces)
+
+
+class _Constrained(NamedTuple):
+    """The state of `BAOAB` for terms with a constraint.
+
+    - `force`: the force at the start of the step, as a vector.
+    - `solved`: whether the multipliers were found in all steps so far.
+    """
+
+    force: Array
+    solved: optx.RESULTS
 
 
 class BAOAB(AbstractLangevinSplitting):
@@ -168,19 +206,20 @@ class BAOAB(AbstractLangevinSplitting):
         if constraint_of(terms) is None:
             return super().init(terms, t0, t1, y0, args)
         solved = init_constrained(self, terms, t0, y0, args)
-        return force_at(terms, t0, y0, args), solved
+        return _Constrained(force_at(terms, t0, y0, args), solved)
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         if constraint_of(terms) is None:
             return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
-        force, solved = solver_state
-        if made_jump is not False:
-            anew = lambda: force_at(terms, t0, y0, args)
-            force = lax.cond(made_jump, anew, lambda: solver_state[0])
-        at = terms, t0, t1, y0, args
-        y1, force, solved = baoab_step(*at, force, solved, type(self).__name__)
+        force = _handed_on(
+            solver_state.force, made_jump, lambda: force_at(terms, t0, y0, args)
+        )
+        y1, force, solved = baoab_step(
+            terms, t0, t1, y0, args, force, solver_state.solved, type(self).__name__
+        )
         result = result_at(terms, t0, t1, result_of(solved, y1))
-        return y1, None, dict(y0=y0, y1=y1), (force, solved), result
+        state = _Constrained(force, solved)
+        return y1, None, dict(y0=y0, y1=y1), state, result
 
 
 class LangevinMiddle(AbstractLangevinSplitting):
@@ -229,5 +268,9 @@ class LangevinMiddle(AbstractLangevinSplitting):
 
 def moved(x: PyTree, time: RealScalarLike, rate: PyTree) -> PyTree:
     """`x` after `time` at a constant rate."""
-    along = lambda x, v: x + jnp.asarray(time, jnp.result_type(x)) * v
-    return jtu.tree_map(along, x, rate)
+
+    def leaf_moved(x: Array, v: Array) -> Array:
+        # In the precision of the state, which times need not have.
+        return x + jnp.asarray(time, jnp.result_type(x)) * v
+
+    return jtu.tree_map(leaf_moved, x, rate)

@@ -55,7 +55,10 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
     @property
     def record(self) -> Record | None:  # pyright: ignore
         record = self.solver.record
-        return record and record._replace(
+        if record is None:
+            return None
+        # What the solver alone keeps exactly, it need not keep with a flow around it.
+        return record._replace(
             weak=_at_most(record.weak, self.weak),
             strong=_at_most(record.strong, self.strong),
             stationary=(),
@@ -90,6 +93,7 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
 
     def order(self, terms):
         order = self.solver.order(terms)
+        # Strang's splitting has order 2.
         return None if order is None else min(order, 2)
 
     def init(self, terms, t0, t1, y0, args) -> Any:
@@ -110,8 +114,10 @@ class AbstractSplitting(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[
 
 
 def _at_most(order: Order | None, most: int) -> Order | None:
+    """The order of a splitting that has at most this order itself."""
     if isinstance(order, tuple):
-        return min(order[0], most), min(order[1], most)
+        commuting, others = order
+        return min(commuting, most), min(others, most)
     return None if order is None else min(order, most)
 
 
@@ -149,6 +155,7 @@ class Damped(AbstractSplitting):
 
     def __check_init__(self):
         inner = self.solver
+        # Below any `LinearFlow`.
         while issubclass(type(inner), AbstractSplitting):
             inner = inner.solver  # pyright: ignore
         if issubclass(type(inner), AbstractLangevinSplitting):
@@ -240,7 +247,11 @@ class LinearFlow(AbstractSplitting):
     def check(self, terms, t0, y0, args):
         check_pair(y0)
         t0 = jnp.asarray(t0, jnp.result_type(t0, jnp.float32))
-        after = lambda time, y: self.half_step(terms, t0, time, y, args)
+
+        def after(time: RealScalarLike, y: Y) -> Y:
+            return self.half_step(terms, t0, time, y, args)
+
+        # Any number in the place of the time serves to trace the flow.
         if Dependence(after, t0, y0).independent(lambda time, y: time):
             raise ValueError(
                 "`flow(time, y, args)` of `LinearFlow` does not depend on `time`, so it is "
@@ -250,9 +261,9 @@ class LinearFlow(AbstractSplitting):
 
     def half_step(self, terms, t, time, y, args):
         del t
+        # Steps are positive even in a solve backward in time, where the flow runs back.
         y1 = self.flow(direction(terms) * time, y, args)
-        shape = lambda x: jax.eval_shape(lambda: x)
-        if not eqx.tree_equal(shape(y1), shape(y)):
+        if not eqx.tree_equal(_shapes_of(y1), _shapes_of(y)):
             raise ValueError(
                 "`flow(time, y, args)` must return a pair like the state, "
                 f"{eqx.tree_pformat(y)}; got {eqx.tree_pformat(y1)}."
@@ -261,6 +272,10 @@ class LinearFlow(AbstractSplitting):
 
     def rest(self, terms):
         return terms
+
+
+def _shapes_of(y: Y) -> PyTree[jax.ShapeDtypeStruct]:
+    return jax.eval_shape(lambda: y)
 
 
 LinearFlow.__init__.__doc__ = """**Arguments:**

@@ -23,6 +23,9 @@ _NO_CUDA = (
 )
 
 
+# Both are asked for at every operation that is recorded.
+
+
 @ft.cache
 def drjit() -> Any:
     """The module. Raises an `ImportError` that says how to install it."""

@@ -50,6 +50,7 @@ class Operation(NamedTuple):
     def kind(self) -> Any:
         """The type of Dr.Jit arrays for the first result."""
         type_of_result = self.op.results[0].type
+        # A token, which orders side effects, has no type of entries.
         name = str(getattr(type_of_result, "element_type", type_of_result))
         if name not in array_types():
             raise NotReplayed(self.op, f"numbers of type `{name}`")
@@ -101,6 +102,7 @@ class Operation(NamedTuple):
 
     def recorded(self, fn: Callable, *args: Any, **kwargs: Any) -> tuple:
         """The entries that a loop or conditional of Dr.Jit returns, recorded with `fn`."""
+        # Symbolic: as part of the kernel. Otherwise Dr.Jit may run a loop step by step.
         number = len(self.errors)
         out = fn(*args, mode="symbolic", **kwargs)
         if len(self.errors) > number:

@@ -10,7 +10,8 @@ from .._compat import is_literal
 from .backend import array_types, drjit
 
 
-# Larger arrays that all paths share stay in memory.
+# Larger arrays that all paths share stay in memory: each entry in registers is a variable
+# of the kernel, which takes time to record and to compile.
 MOST_IN_REGISTERS = 64
 
 
@@ -50,6 +51,7 @@ class Table(Sequence):
             return self.at_places(np.arange(len(self))[i])
         place = int(self.places[i])
         if self.values is not None:
+            # A constant of the kernel, which costs no read of memory.
             return type(self.memory)(self.values[place].item())
         return self.gathered(array_types()["ui32"](place))
 
@@ -76,6 +78,7 @@ class Tensor(NamedTuple):
 
     def take(self, places: np.ndarray) -> "Tensor":
         """The entries at these positions."""
+        # Of a table, positions are moved, and nothing is read.
         if isinstance(self.entries, Table):
             return Tensor(self.entries.at_places(places.ravel()), places.shape)
         return Tensor([self.entries[place] for place in places.flat], places.shape)
@@ -110,6 +113,7 @@ def in_memory(kind: str, values: np.ndarray) -> Any:
 
 def known(x: Tensor) -> np.ndarray | None:
     """The values, if Dr.Jit knows them: constants, and what it folded from constants."""
+    # Of an index that is known, loops are unrolled and entries selected while recording.
     if not all(map(is_literal, x.entries)):
         return None
     return np.array([_value(entry) for entry in x.entries]).reshape(x.shape)

@@ -5,8 +5,14 @@ from .dependence import acts_elementwise, Dependence
 from .hamiltonian import evaluated, hamiltonian_terms, has_lifted, IndexedNoise
 from .hamiltonian import is_hamiltonian
 from .diffrax_langevin import momentum_first
-from .friction import FrictionAlong
-from .langevin import bath_terms, friction_apart, langevin_terms, split_friction
+from .friction import FrictionAlong, semidefinite_root
+from .langevin import (
+    AbstractFriction,
+    bath_terms,
+    friction_apart,
+    langevin_terms,
+    split_friction,
+)
 from .spins import as_spins, from_spinors, spin_terms, to_spinors
 from .structure import additive_fault, check_stratonovich, check_structure
 from .structure import commuting, constant_fault, Fault, FRICTION

@@ -120,7 +120,7 @@ def _noise_of(g: Any, T: ArrayLike, w: Array, x: Array) -> Array:
     matrix = g.value if isinstance(g, _Square) else g
     if _is_matrix(matrix, jnp.shape(x)):
         scale = jnp.sqrt(2 * like(_single_temperature(T), x))
-        root = g.root if isinstance(g, _Square) else _root(like(g, x))
+        root = g.root if isinstance(g, _Square) else semidefinite_root(like(g, x))
         return scale * jnp.tensordot(like(root, x), w, jnp.ndim(w))
     if jnp.shape(T) not in ((), jnp.shape(x)):
         raise ValueError(
@@ -258,7 +258,7 @@ def _checked_array(g: ArrayLike, momenta: tuple[int, ...] | None) -> Array | _Sq
     is_matrix = momenta is not None and _is_matrix(g, momenta)
     if not may_be_matrix:
         return jnp.asarray(real_array("friction", g, positive=False, kind=_KIND))
-    root = _root(jnp.asarray(g, jnp.result_type(g, float)))
+    root = semidefinite_root(jnp.asarray(g, jnp.result_type(g, float)))
     is_semidefinite = ~jnp.any(jnp.isnan(root))
     square = _Square(jnp.asarray(g), is_semidefinite, root)
     if is_traced(is_semidefinite):
@@ -286,7 +286,7 @@ def checked_temperature(temperature: Any) -> Any:
 
 # Traced and compiled once for each shape.
 @jax.jit
-def _root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
+def semidefinite_root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
     r"""$L$ with $L L^\top$ equal to a symmetric positive semidefinite matrix: its Cholesky
     factor, with zero columns where the matrix is singular. NaN if it is no such matrix.
 

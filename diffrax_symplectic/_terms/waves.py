@@ -62,7 +62,9 @@ def wave_terms(
 
     - `H0`: `H0(t, psi, args)`, a real scalar, where `psi` is a PyTree of complex arrays. A
         function, or a Module with parameters; differentiable with respect to these and to
-        `args`. Use `jnp.abs(psi) ** 2`, since `jnp.abs(psi)` has no derivative at zero.
+        `args`. Write $|\psi|^2$ as `jnp.real(psi * jnp.conj(psi))`: `jnp.abs(psi)` has no
+        derivative at zero, and that of `jnp.abs(psi) ** 2` takes a root and a division,
+        with which steps take two to three times as long.
     - `noise`: `noise(t, psi, args)`, the noise Hamiltonians $H_1, \ldots, H_m$, real, as an
         array of shape `(m,)`, or in the structure and shapes of `path`. Or an
         [`diffrax_symplectic.IndexedNoise`][] of `H(k, t, psi, args)`.

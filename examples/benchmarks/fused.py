@@ -21,11 +21,11 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import matplotlib.pyplot as plt
+import numpy as np
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.engines import state_itself
+from diffrax_symplectic._expectation.engines import fused_start, state_itself
 from diffrax_symplectic._expectation.problem import Problem
-from diffrax_symplectic._fused import Kernels, split
 
 from .. import rigid_body
 from ._timing import ensemble, keys, machine, race
@@ -145,13 +145,11 @@ def by_drjit(case: Case, n: int, steps: int, dtype) -> Callable:
     y0, terms = case.start(dtype), case.terms(jr.key(0), dtype)
     given = terms, case.solver, 0.0, steps * case.h, case.h, y0, None, None, 1
     problem = Problem.of(state_itself, *given)
-    layout, arrays = split(problem, jr.key(1))
-    kernels = Kernels(layout)
-    h = problem.level(0).h
-    start, parameters = kernels.begin(arrays, jr.key(1), h, 0, n, problem.y0, None)
+    numbers = np.arange(n, dtype=np.uint64)
+    kernels, lanes, shared = fused_start(problem, jr.key(1), numbers)
 
     def run():
-        drjit.eval(kernels.advance(start, parameters, 0, steps))
+        drjit.eval(kernels.advance(lanes, shared, 0, steps))
         drjit.sync_thread()
 
     return run

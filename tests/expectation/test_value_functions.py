@@ -363,18 +363,6 @@ def test_the_sampling_follows_from_dimension_outcomes_and_steps(
     assert type(choose(problem, None)[0]) is ds.IndependentPaths
 
 
-@pytest.mark.parametrize("state, steps", [(2, 2**15), (4, 2**13), (6, 2**14)])
-def test_the_default_takes_fewer_paths_of_more_steps(state, steps):
-    H0 = lambda t, p, q, args: (p @ p + q @ q) / 2
-    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: jnp.sum(q), WEAK)
-    y0 = (jnp.zeros(state // 2), jnp.ones(state // 2))
-    problem = Problem.of(SQUARE, terms, VERLET, 0, 1, 1 / steps, y0, None, None, 1)
-    sampling, _ = choose(problem, None)
-    paths = sampling.num_paths * getattr(sampling, "replicates", 1)
-    # About ten seconds.
-    assert 2**27 <= paths * steps * state <= 2**28
-
-
 def test_the_default_is_the_same_each_time_and_goes_on_with_itself():
     got = _estimate(None, tol=1e-6)
     assert isinstance(got.sampling, ds.ValueFunctions) and got.tol_reached

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._terms.friction import _root
+from diffrax_symplectic._terms.friction import semidefinite_root
 
 from ..problems import Given, weak_path
 
@@ -176,7 +176,7 @@ def test_roots_of_semidefinite_matrices_are_roots(n, rank):
     X = jr.normal(jr.key(n), (n, rank)) * jnp.logspace(0, -6, n)[:, None]
     for dtype in (jnp.float64, jnp.float32):
         A = (X @ X.T).astype(dtype)
-        L = np.asarray(_root(A), np.float64)
+        L = np.asarray(semidefinite_root(A), np.float64)
         sizes = np.sqrt(np.diag(A))
         error = np.abs(L @ L.T - np.asarray(A, np.float64)) / np.outer(sizes, sizes)
         # Without pivoting, a small pivot may count as zero.
@@ -195,7 +195,7 @@ def test_other_matrices_have_no_root():
         [[np.nan, 0.0], [0.0, 1.0]],
         [[np.inf, 0.0], [0.0, 1.0]],
     ):
-        assert np.all(np.isnan(_root(jnp.array(A))))
+        assert np.all(np.isnan(semidefinite_root(jnp.array(A))))
 
 
 def _end(terms, solver, y0, t1=0.5):

@@ -1,0 +1,83 @@
+"""What a step costs, by the operations that it is made of."""
+
+import dataclasses
+import math
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._compat import Jaxpr
+from .._custom_types import Y
+from .._signature import once_for_each_signature
+from .fits import without_newton
+from .kinks import programs_in
+from .problem import Problem
+
+
+# The numbers that two cores compute in a second in large batches of paths. The constants
+# here are a fit to 24 systems and solvers, from the pendulum to a chain of 64 oscillators:
+# seconds predicted are 0.5 to 2.3 times those measured for 22 of them (0.3 for a spin with
+# slow sweeps, 3.5 for two noises whose linear flows need one sweep).
+NUMBERS_PER_SECOND = 3e10
+# The passes through a loop. All loops of a step are sweeps over its equations.
+_SWEEPS = 4
+# A sine in a loop takes as long as so many sums.
+_OF_TRANSCENDENTAL = 8
+_TRANSCENDENTAL = frozenset(
+    "acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1 "
+    "lgamma log log1p logistic pow sin sinh tan tanh".split()
+)
+# Operations on matrices are calls of LAPACK, which take some 100 ns each.
+_OF_LAPACK = 3_000
+_LAPACK = frozenset("cholesky eigh lu qr svd triangular_solve".split())
+
+
+@once_for_each_signature
+def numbers_per_step(problem: Problem) -> int:
+    """How many numbers a step of one path computes, as a measure of its cost."""
+    # A rescue by Newton's method is rare.
+    lean = dataclasses.replace(problem, solver=without_newton(problem.solver))
+    traced, _, _ = eqx.filter_make_jaxpr(_step)(lean, problem.y0)
+    return max(1, _numbers(traced.jaxpr, in_loop=False))
+
+
+def _step(problem: Problem, y: Y) -> tuple[Y, Float[Array, ""]]:
+    i = jnp.zeros((), jnp.int32)
+    h = problem.level(i).h
+    state = problem.init(problem.terms, i, h, y)
+    y, _, success = problem.step(problem.terms, i, h, y, state)
+    return y, success
+
+
+def _numbers(jaxpr: Jaxpr, in_loop: bool) -> int:
+    count = 0
+    for eqn in jaxpr.eqns:
+        name = eqn.primitive.name
+        size = sum(map(_size, eqn.outvars))
+        inner = list(programs_in(eqn))
+        if name == "while" and not in_loop:
+            count += _SWEEPS * sum(_numbers(program, True) for program in inner)
+        elif name == "scan":
+            passes = eqn.params["length"]
+            count += passes * sum(_numbers(program, in_loop) for program in inner)
+        elif inner:
+            # In a batch all branches of a conditional are evaluated.
+            count += sum(_numbers(program, in_loop) for program in inner)
+        elif name in _LAPACK:
+            count += _OF_LAPACK
+        elif name in _TRANSCENDENTAL and in_loop:
+            count += _OF_TRANSCENDENTAL * size
+        elif name == "dot_general":
+            (contracted, _), _ = eqn.params["dimension_numbers"]
+            left, _ = eqn.invars
+            shape = left.aval.shape  # pyright: ignore (of arrays)
+            count += size * math.prod(shape[axis] for axis in contracted)
+        else:
+            count += size
+    return count
+
+
+def _size(variable: Any) -> int:
+    return math.prod(variable.aval.shape)

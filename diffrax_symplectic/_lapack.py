@@ -1,0 +1,156 @@
+"""Calls of LAPACK one after another, where JAX lets them block each other.
+
+On CPUs, JAX 0.10 shares out the matrices of a batch between the threads of XLA's pool, and
+the thread that calls LAPACK waits for the others. XLA runs operations that do not depend on
+each other at the same time, in the same pool. Once every thread of it waits in a call of
+LAPACK nobody is left to do the work, and the program never returns. On two cores two calls
+suffice. JAX 0.11.2 computes a batch in the thread that calls.
+
+Options of XLA make such a meeting rarer only. So here each call is made to depend on the
+results of the one before, and no two of them ever run at the same time.
+"""
+
+import functools as ft
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Bool
+
+from ._compat import bound, ClosedJaxpr, has_blocking_lapack, Jaxpr, Literal
+
+
+# The operations that JAX leaves to LAPACK on CPUs.
+_LAPACK = frozenset(
+    "cholesky eig eigh geqp3 geqrf hessenberg householder_product lu schur svd "
+    "symmetric_product triangular_solve tridiagonal tridiagonal_solve".split()
+)
+_CONTROL_FLOW = frozenset({"cond", "scan", "while"})
+# Operations that only call a function, and the parameter that holds it.
+_CALLS = {
+    "checkpoint": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "custom_vmap_call": "call",
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+}
+
+
+def lapack_in_turn(fn: Callable) -> Callable:
+    """`fn`, with its calls of LAPACK one after another where JAX needs that. The result is
+    the same. For functions that are compiled and not transformed any further."""
+
+    @ft.wraps(fn)
+    def call(*args: Any) -> Any:
+        if not has_blocking_lapack():
+            return fn(*args)
+        traced, dynamic, static = eqx.filter_make_jaxpr(fn)(*args)
+        arrays = jtu.tree_leaves(eqx.filter(args, eqx.is_array))
+        outs = _Turns().run(traced, arrays)
+        treedef = jtu.tree_structure(dynamic)
+        return eqx.combine(treedef.unflatten(outs), static)
+
+    return call
+
+
+class _Turns:
+    """Evaluates a program in which each call of LAPACK waits for the one before."""
+
+    def __init__(self):
+        # The results of the last call.
+        self._before: Sequence[Any] = ()
+
+    def run(self, program: Jaxpr | ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
+        """The results of a program."""
+        jaxpr = getattr(program, "jaxpr", program)
+        consts = getattr(program, "consts", [])
+        values = dict(zip(jaxpr.constvars, consts)) | dict(zip(jaxpr.invars, args))
+
+        def read(x: Any) -> Any:
+            return x.val if isinstance(x, Literal) else values[x]
+
+        for eqn in jaxpr.eqns:
+            outs = self._results(eqn, [read(x) for x in eqn.invars])
+            values.update(zip(eqn.outvars, outs))
+        return [read(x) for x in jaxpr.outvars]
+
+    def _results(self, eqn: Any, args: list[Any]) -> Sequence[Any]:
+        """The results of one operation."""
+        name = eqn.primitive.name
+        if not _calls_lapack(eqn):
+            return bound(eqn, args, eqn.params)
+        if name in _CALLS:
+            return self.run(eqn.params[_CALLS[name]], args)
+        if name == "custom_linear_solve":
+            return self.run(*_solve_of(eqn, args))
+        # A loop waits as a whole, and so does what comes after it.
+        args = _after(self._before, args)
+        params = eqn.params
+        if name in _CONTROL_FLOW:
+            params = _with_turns_inside(params)
+        self._before = bound(eqn, args, params)
+        return self._before
+
+
+def _calls_lapack(eqn: Any) -> bool:
+    """Whether an operation is one of LAPACK's or contains one."""
+    if eqn.primitive.name in _LAPACK:
+        return True
+    inner = jtu.tree_leaves(eqn.params, is_leaf=_is_program)
+    programs = [getattr(x, "jaxpr", x) for x in inner if _is_program(x)]
+    return any(_calls_lapack(own) for jaxpr in programs for own in jaxpr.eqns)
+
+
+def _is_program(x: Any) -> bool:
+    return isinstance(x, Jaxpr | ClosedJaxpr)
+
+
+def _after(before: Sequence[Any], args: list[Any]) -> list[Any]:
+    """`args`, which XLA cannot know before all of `before`."""
+    if len(before) == 0:
+        return args
+    # Always false, which XLA does not see. A barrier alone does not suffice: XLA removes it
+    # before it looks which operations can run side by side.
+    wait = lax.optimization_barrier(jnp.array(False))
+    for x in before:
+        if _is_plain(x):
+            wait = wait & (jnp.ravel(x)[0] != 0)
+    return [_where(wait, x) if _is_plain(x) else x for x in args]
+
+
+def _is_plain(x: Any) -> bool:
+    """Whether this is an array of numbers with an entry, and not of random keys."""
+    return jnp.size(x) > 0 and not jnp.issubdtype(
+        jnp.result_type(x), jax.dtypes.extended
+    )
+
+
+def _where(wait: Bool[Array, ""], x: Any) -> Array:
+    return jnp.where(wait, jnp.zeros_like(x), x)
+
+
+def _solve_of(eqn: Any, args: list[Any]) -> tuple[ClosedJaxpr, list[Any]]:
+    """The program that `lax.custom_linear_solve` calls, and its arguments."""
+    lengths = eqn.params["const_lengths"]
+    # The constants of four functions, `solve` the third of them, and the right-hand side.
+    first = lengths.matvec + lengths.vecmat
+    rhs = args[sum(lengths) :]
+    return eqn.params["jaxprs"].solve, [*args[first : first + lengths.solve], *rhs]
+
+
+def _with_turns_inside(params: dict[str, Any]) -> dict[str, Any]:
+    """The parameters of an operation, with calls in turn in all programs among them."""
+
+    def in_turn(x: Any) -> Any:
+        if not isinstance(x, ClosedJaxpr):
+            return x
+        shapes = [own.aval for own in x.jaxpr.invars]
+        return jax.make_jaxpr(lambda *args: _Turns().run(x, args))(*shapes)
+
+    return jtu.tree_map(in_turn, params, is_leaf=_is_program)

@@ -1,0 +1,47 @@
+"""What a fused kernel is compiled for."""
+
+import jax.numpy as jnp
+import jax.random as jr
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._stablehlo import drjit
+
+from ..drjit_here import needs_drjit
+
+
+ONE = jnp.array(0.0), jnp.array(1.0)
+
+
+def spring(t, p, q, args):
+    return p**2 / 2 + args * q**2
+
+
+def push(t, p, q, args):
+    return 0.2 * jnp.sin(q)
+
+
+TERMS = ds.hamiltonian_terms(spring, push, ds.WeakBrownianPath((), jr.key(0)))
+
+
+@needs_drjit
+def test_batches_share_their_kernels():
+    dr = drjit()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        ds.ensemble(
+            TERMS,
+            ds.StormerVerlet(),
+            0.0,
+            1.0,
+            0.25,
+            ONE,
+            jnp.array(0.5),
+            key=jr.key(1),
+            num_paths=60,
+            batch_size=20,
+            engine="drjit",
+        )
+        history = dr.kernel_history([dr.KernelType.JIT])
+    # By their hashes: a kernel may also come from the cache on disk.
+    hashes = [str(kernel["hash"]) for kernel in history]
+    assert len(hashes) == 3 * len({*hashes})

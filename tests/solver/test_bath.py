@@ -1,0 +1,145 @@
+"""The step of friction and noise for more momenta than are solved for in each step."""
+
+import os
+import subprocess
+import sys
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._compat import reversed_in_time
+from diffrax_symplectic._solver import bath
+
+
+N = 20
+_ROOT = jr.normal(jr.key(0), (N, N)) / N**0.5
+FULL = _ROOT @ _ROOT.T + 0.1 * jnp.eye(N)
+# Friction between neighbours, which conserves the total momentum.
+_NEIGHBOURS = jnp.eye(N) - jnp.roll(jnp.eye(N), 1, axis=0)
+PAIRS = _NEIGHBOURS @ _NEIGHBOURS.T
+INVERSE_MASSES = jnp.diag(jnp.linspace(0.5, 3.0, N)) + 0.1
+P = jr.normal(jr.key(1), (N,))
+Q = jr.normal(jr.key(2), (N,))
+KICK = jr.normal(jr.key(3), (N,))
+
+
+def H0(t, p, q, args):
+    return p @ INVERSE_MASSES @ p / 2 + jnp.sum(q**4)
+
+
+def _friction_term(friction):
+    return ds.bath_terms(H0, friction).terms
+
+
+def _seen_by_a_solver(terms, backward: bool):
+    """The terms as Diffrax passes them to a solver."""
+    seen = []
+
+    class Spy(diffrax.Euler):
+        def init(self, terms, t0, t1, y0, args):
+            seen.append(terms)
+
+    solve = lambda: diffrax.diffeqsolve(terms, Spy(), 0.0, 1.0, 0.5, (P, Q)).ys
+    with jax.disable_jit(), jax.ensure_compile_time_eval():
+        solve()
+    return reversed_in_time(seen[0]) if backward else seen[0]
+
+
+def _after(friction, terms=None, args=None, h=0.1):
+    terms = _friction_term(friction) if terms is None else terms
+    return bath.after_friction(terms, 0.0, h, (P, Q), args, KICK)
+
+
+def _exact(friction, sign=1, h=0.1):
+    A = sign * np.asarray(friction @ INVERSE_MASSES)
+    right = -h * A @ P + KICK
+    return P + np.linalg.solve(np.eye(N) + h / 2 * A, right)
+
+
+@pytest.mark.parametrize("friction", [FULL, PAIRS], ids=["full", "pairs"])
+@pytest.mark.parametrize("backward", [False, True])
+def test_friction_by_its_modes_solves_the_equation_of_the_step(friction, backward):
+    (term,) = _friction_term(friction)
+    wrapped = _seen_by_a_solver(term, backward)
+    assert bath._matrices_if_constant((wrapped,), 0.0, (P, Q), None) is not None
+    got = _after(friction, (wrapped,))
+    sign = -1 if backward else 1
+    np.testing.assert_allclose(got, _exact(friction, sign), rtol=0, atol=1e-13)
+
+
+def test_friction_between_particles_by_its_modes_conserves_their_momentum():
+    after = _after(PAIRS)
+    assert abs(jnp.sum(after) - jnp.sum(P) - jnp.sum(KICK)) < 1e-13
+
+
+def test_modes_serve_what_is_the_same_at_all_times_and_positions_and_nothing_else():
+    def modes(friction, args=None):
+        terms = _friction_term(friction)
+        return bath._matrices_if_constant(terms, 0.0, (P, Q), args)
+
+    assert modes(lambda t, q, args: args * FULL, jnp.array(2.0)) is not None
+    assert modes(lambda t, q, args: (1 + t) * FULL) is None
+    assert modes(lambda t, q, args: (1 + q[0] ** 2) * FULL) is None
+    heavier = lambda t, p, q, args: (1 + q[0] ** 2) * jnp.sum(p**2)
+    terms = ds.bath_terms(heavier, FULL).terms
+    assert bath._matrices_if_constant(terms, 0.0, (P, Q), None) is None
+    two = (*_friction_term(FULL), *_friction_term(PAIRS))
+    assert bath._matrices_if_constant(two, 0.0, (P, Q), None) is None
+    got = bath.after_friction(two, 0.0, 0.1, (P, Q), None, KICK)
+    np.testing.assert_allclose(got, _exact(FULL + PAIRS), rtol=0, atol=1e-13)
+
+
+def test_a_matrix_of_a_function_that_is_not_semidefinite_fails():
+    assert np.all(np.isnan(_after(lambda t, q, args: -FULL)))
+
+
+@pytest.mark.parametrize("friction", [FULL, PAIRS, jnp.eye(N)])
+def test_derivatives_are_those_of_the_equation_also_for_equal_rates(friction):
+    # Derivatives of eigenvectors of equal eigenvalues are infinite.
+    weights = jr.normal(jr.key(4), (N,))
+
+    def by_modes(scale):
+        after = _after(lambda t, q, args: args * friction, args=scale)
+        return weights @ after
+
+    def by_solve(scale):
+        A = scale * friction @ INVERSE_MASSES
+        right = -0.1 * A @ P + KICK
+        return weights @ (P + jnp.linalg.solve(jnp.eye(N) + 0.05 * A, right))
+
+    for derivative in (jax.grad, jax.jacfwd):
+        got = derivative(by_modes)(1.2)
+        np.testing.assert_allclose(got, derivative(by_solve)(1.2), rtol=1e-12)
+
+
+_PROGRAM = """
+import jax, jax.numpy as jnp, jax.random as jr, diffrax, diffrax_symplectic as ds
+jax.config.update("jax_enable_x64", True)
+n = 20
+H0 = lambda t, p, q, args: p @ p / 2 + jnp.sum(q**4)
+solver = ds.BAOAB()
+terms = ds.langevin_terms(
+    H0, lambda t, q, args: args, 1.0, solver.path((n,), jr.key(0))
+)
+def solve(y0, friction):
+    return diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0, friction).ys
+y0 = jnp.ones(n), jnp.ones(n)
+program = jax.jit(solve).lower(y0, jnp.eye(n) + 0.1).compile().as_text()
+before, entry = program.split("ENTRY")
+print("lapack" in entry, "lapack" in before)
+"""
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="LAPACK serves CPUs")
+def test_a_constant_matrix_is_diagonalized_once_before_the_loop_over_steps():
+    # As users compile it: the suite leaves this optimization out.
+    left_out = ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS")
+    env = {name: value for name, value in os.environ.items() if name not in left_out}
+    command = [sys.executable, "-c", _PROGRAM]
+    done = subprocess.run(command, capture_output=True, text=True, env=env)
+    assert done.stdout.split() == ["True", "False"], done.stderr

@@ -1,0 +1,167 @@
+"""Calls of LAPACK that could run side by side wait for each other, and change nothing."""
+
+import os
+import subprocess
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from diffrax_symplectic import _lapack
+from diffrax_symplectic._compat import has_blocking_lapack, Literal
+from diffrax_symplectic._lapack import lapack_in_turn
+
+
+blocking = pytest.mark.skipif(
+    not has_blocking_lapack(), reason="This version of JAX has no such calls."
+)
+
+
+def solution(x, shift):
+    matrix = 2 * jnp.eye(3) + 0.1 * jnp.cos(x[:, None] - x + shift)
+    return jnp.linalg.solve(matrix, x)
+
+
+def root(x, shift):
+    return jnp.linalg.cholesky(jnp.diag(1 + x**2 + shift)) @ x
+
+
+@jax.custom_jvp
+def spectrum(x):
+    return jnp.linalg.eigvalsh(x[:, None] * x)
+
+
+@spectrum.defjvp
+def _(primals, tangents):
+    return spectrum(*primals), tangents[0]
+
+
+def side_by_side(x):
+    return solution(x, 0) + solution(x, 1) + spectrum(x) + jax.jit(root)(x, 1)
+
+
+def one_after_another_already(x):
+    return solution(solution(x, 0), 1)
+
+
+def in_loops(x):
+    def body(carry):
+        n, y, key = carry
+        key, new = jr.split(key)
+        y = solution(y, n) + root(y, 1) + 0.1 * jr.normal(new)
+        return n + 1, y / 2, key
+
+    # In a batch, the paths do not agree on when this ends.
+    enough = lambda carry: (jnp.sum(carry[1]) > 1) & (carry[0] < 5)
+    first, *_ = carry = jax.lax.while_loop(enough, body, (0, x, jr.key(1)))
+    over = lambda y, shift: (solution(y, shift) - root(y, shift), jnp.sum(y))
+    y, sums = jax.lax.scan(over, carry[1], jnp.arange(3.0))
+    z = jax.lax.cond(jnp.max(x) > 1, root, solution, x, 0.5)
+    return first, y, sums, z + solution(x, 2), jax.grad(lambda x: root(x, 1)[0])(x)
+
+
+def side_by_side_calls(jaxpr):
+    """How many calls of LAPACK, in a program and all programs in it, do not depend on the
+    call before."""
+    count = 0
+    # The number of the last call that each value depends on.
+    last = {}
+    calls = 0
+    for eqn in jaxpr.eqns:
+        inputs = [x for x in eqn.invars if not isinstance(x, Literal)]
+        known = max([last.get(x, 0) for x in inputs], default=0)
+        if _lapack._calls_lapack(eqn):
+            count += known < calls
+            calls += 1
+            known = calls
+            leaves = jax.tree.leaves(eqn.params, is_leaf=_lapack._is_program)
+            inner = [x for x in leaves if _lapack._is_program(x)]
+            count += sum(side_by_side_calls(getattr(x, "jaxpr", x)) for x in inner)
+        last.update(dict.fromkeys(eqn.outvars, known))
+    return count
+
+
+@pytest.mark.parametrize("fn", (side_by_side, one_after_another_already, in_loops))
+def test_the_results_are_the_same_and_each_call_waits(fn, monkeypatch):
+    monkeypatch.setattr(_lapack, "has_blocking_lapack", lambda: True)
+    x = jr.normal(jr.key(0), (4, 3))
+    batch = jax.vmap(fn)
+    for expected, found in zip(
+        jax.tree.leaves(jax.jit(batch)(x)),
+        jax.tree.leaves(jax.jit(lapack_in_turn(batch))(x)),
+    ):
+        np.testing.assert_array_equal(found, expected)
+    as_it_is = jax.make_jaxpr(batch)(x).jaxpr
+    in_turn = jax.make_jaxpr(lapack_in_turn(batch))(x).jaxpr
+    assert side_by_side_calls(in_turn) == 0
+    if fn is not one_after_another_already:
+        assert side_by_side_calls(as_it_is) > 0
+
+
+def test_a_function_without_lapack_stays_as_it_is(monkeypatch):
+    monkeypatch.setattr(_lapack, "has_blocking_lapack", lambda: True)
+    fn = jax.vmap(lambda x: jax.lax.fori_loop(0, 3, lambda i, x: jnp.sin(x) + i, x))
+    x = jnp.linspace(0, 1, 4)
+    plain, in_turn = (jax.jit(f).lower(x).as_text() for f in (fn, lapack_in_turn(fn)))
+    assert in_turn == plain
+
+
+PROGRAM = """
+    import os, sys
+    # Two threads in XLA's pool: two calls that wait suffice.
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, [*os.sched_getaffinity(0)][:2])
+    import jax
+    import jax.numpy as jnp
+    import jax.random as jr
+    import diffrax_symplectic as ds
+
+    n, kind, call = int(sys.argv[1]), sys.argv[2], sys.argv[3]
+    jax.config.update("jax_enable_x64", True)
+
+    def potential(q, shift):
+        matrix = 2 * jnp.eye(n) + 0.1 * jnp.cos(q[:, None] - q + shift)
+        matrix = (matrix + matrix.T) / 2
+        if kind == "solve":
+            return q @ jnp.linalg.solve(matrix, q)
+        return jnp.sum(jnp.linalg.cholesky(matrix))
+
+    def H0(t, p, q, args):
+        return p @ p / 2 + sum(potential(q, k) for k in range(8))
+
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: -q, (n,))
+    y0 = jnp.zeros(n), jnp.ones(n)
+    given = terms, ds.StormerVerlet(), 0, 2, 0.1, y0
+    size = 2**16 if n == 2 else 2**13
+    if call == "ensemble":
+        out = ds.ensemble(*given, key=jr.key(1), num_paths=size).ys
+    else:
+        sampling = ds.IndependentPaths(size, batch_size=size)
+        phi = lambda t, y, args: y[1]
+        out = ds.expectation(phi, *given, key=jr.key(1), sampling=sampling).mean
+    assert all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(out))
+"""
+slow = pytest.mark.slow
+
+
+@blocking
+@pytest.mark.parametrize(
+    "n, kind, call",
+    [
+        (5, "solve", "expectation"),
+        pytest.param(5, "cholesky", "ensemble", marks=slow),
+        pytest.param(2, "solve", "ensemble", marks=slow),
+        pytest.param(2, "cholesky", "expectation", marks=slow),
+    ],
+)
+def test_many_calls_of_lapack_return(n, kind, call):
+    """Without turns this program never ends."""
+    # As users run it: with little optimization fewer calls meet.
+    env = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    env["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "0"
+    program = [sys.executable, "-c", textwrap.dedent(PROGRAM), str(n), kind, call]
+    subprocess.run(program, env=env, check=True, timeout=300)
