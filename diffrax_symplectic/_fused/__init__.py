@@ -1,3 +1,20 @@
+"""The steps of many paths as one kernel, which keeps the state of each path in registers.
+
+JAX lowers a step of one path to StableHLO (`path_functions.py`, `program.py`), and
+`_stablehlo` replays it within a loop of Dr.Jit, with a lane for each path (`kernels.py`).
+The stage equations of implicit solvers are solved by a loop of each path's own
+(`sweeps.py`). A path with a step that it does not solve stops, and the caller simulates it
+by other means.
+
+    functions, arrays = split(system, key, None, False)
+    kernels = Kernels(functions)
+    lanes, shared = kernels.begin(arrays, key, h, 0, 1000, y0, None)
+    lanes = kernels.advance(lanes, shared, 0, 100)
+
+Kernels depend on `functions` alone, so that the same serve for all values of `arrays`, step
+sizes, and numbers of steps and paths.
+"""
+
 from .kernels import Kernels, Lanes, Shared
 from .path_functions import PathFunctions, sample_key, split
 from .sweeps import without_rescue

@@ -189,9 +189,13 @@ def _sizes(y: PyTree[Array]) -> list[Scalar]:
 
 
 def _largest(numbers: list[Scalar]) -> Scalar:
+    return ft.reduce(_larger, numbers)
+
+
+def _larger(a: Scalar, b: Scalar) -> Scalar:
     # `jnp.maximum` propagates NaN at the price of three operations. The check at the end of
     # the step finds NaN in any case.
-    return ft.reduce(lambda a, b: jnp.where(a > b, a, b), numbers)
+    return jnp.where(a > b, a, b)
 
 
 class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):

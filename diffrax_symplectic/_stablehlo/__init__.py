@@ -21,6 +21,11 @@ of `elementwise.py`, or of `complex.py`; any other rule is a function with the d
 `linear_algebra.py` (what JAX calls LAPACK for). Without a rule, `Replay` raises
 `NotReplayed`, with the name of the operation and where it comes from.
 
+To add an operation, write its rule, and a line in the table of
+`tests/stablehlo/test_operations.py`, which compares it with JAX: a test sees that each
+operation has one. The [specification](https://openxla.org/stablehlo/spec) says what it does
+with NaN, infinities and integers, where Dr.Jit is often different.
+
 This folder knows nothing of differential equations.
 """
 

@@ -66,8 +66,8 @@ class Replay:
 
     def constants(self) -> list[Any]:
         """The large constants of the program, as arrays of Dr.Jit in memory."""
-        # A frozen function of Dr.Jit must get these as arguments: what it captures becomes
-        # part of the kernel's code, number by number.
+        # Made once by the caller, since a frozen function of Dr.Jit takes arrays in memory
+        # as arguments only.
         return [
             in_memory(_type_of(variable).kind, values.ravel())
             for variable, values in self._constants.items()

@@ -1,0 +1,140 @@
+"""Whether many paths cost more, each, than few: processor time per path and step of
+`ensemble`, by both engines, and of `ArrayRQMC`.
+
+    python -m examples.benchmarks.many_paths
+
+Writes `docs/benchmarks/many_paths.md` and the chart beside it. Processor time counts all
+cores, and does not count other programs that take turns on them.
+"""
+
+import functools as ft
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import matplotlib.pyplot as plt
+
+import diffrax_symplectic as ds
+
+from ._timing import DOCS, machine
+from .fused import Case, CASES
+
+
+NUMBERS = [2**k for k in range(6, 21, 2)]
+# Path-steps of a call, within bounds: the start of a path, which draws its random keys,
+# should not count for much, and no path should leave its valley.
+WORK = 2**22
+LEAST_STEPS = 16
+MOST_STEPS = 128
+# A call that takes longer is not repeated.
+PATIENCE = 5.0
+ROUNDS = 5
+SYSTEMS = [
+    "pendulum, `StormerVerlet`",
+    "Kubo, `ImplicitMidpoint`, h = 0.2",
+    "Kubo, `StrangGauss`, h = 0.1",
+    "Henon-Heiles, `ImplicitMidpoint`, h = 0.1",
+    "spin, `ImplicitMidpoint`, h = 0.1",
+    "chain of 4, `StormerVerlet`",
+]
+# The number of replicates, so that the variance can be estimated at all.
+REPLICATES = 2
+
+
+def by_ensemble(case: Case, number: int, steps: int, engine: str) -> Callable:
+    given = arguments(case, steps)
+
+    def call() -> None:
+        ds.ensemble(*given, key=jr.key(1), num_paths=number, engine=engine)
+
+    return call
+
+
+def by_array_rqmc(case: Case, number: int, steps: int) -> Callable:
+    given = arguments(case, steps)
+    sampling = ds.ArrayRQMC(num_paths=number // REPLICATES, replicates=REPLICATES)
+
+    def call() -> None:
+        ds.expectation(first_number, *given, key=jr.key(1), sampling=sampling)
+
+    return call
+
+
+def arguments(case: Case, steps: int) -> tuple[Any, ...]:
+    """From terms to the initial state."""
+    terms = case.terms(jr.key(0), jnp.float64)
+    y0 = case.start(jnp.float64)
+    return terms, case.solver, 0.0, steps * case.h, case.h, y0
+
+
+def first_number(t, y, args):
+    return jnp.ravel(jax.tree.leaves(y)[0])[0]
+
+
+def nanoseconds(call: Callable, number: int, steps: int) -> float:
+    """A path and step takes, at best."""
+    call()  # compiles
+    best = float("inf")
+    for _ in range(ROUNDS):
+        begin = time.process_time()
+        call()
+        seconds = time.process_time() - begin
+        best = min(best, seconds)
+        if seconds > PATIENCE:
+            break
+    return best * 1e9 / (number * steps)
+
+
+WAYS: dict[str, Callable[[Case, int, int], Callable]] = {
+    "fused": ft.partial(by_ensemble, engine="drjit"),
+    "JAX": ft.partial(by_ensemble, engine="jax"),
+    "`ArrayRQMC`": by_array_rqmc,
+}
+
+
+def measured(name: str, way: str) -> list[float]:
+    """For each of `NUMBERS`; nothing if the sampling does not take the system."""
+    found = []
+    for number in NUMBERS:
+        steps = min(max(LEAST_STEPS, WORK // number), MOST_STEPS)
+        try:
+            call = WAYS[way](CASES[name], number, steps)
+            found.append(nanoseconds(call, number, steps))
+        except ValueError:
+            return []
+        print(name, way, number, f"{found[-1]:.1f}", flush=True)
+    return found
+
+
+def main() -> None:
+    heads = " | ".join(f"{number:,}" for number in NUMBERS)
+    rows = [
+        f"# Many paths\n\nProcessor nanoseconds per path and step, by the number of paths, "
+        f"with the call around them. {machine()}. float64, best of {ROUNDS} calls. "
+        "`ArrayRQMC` has these paths in two replicates; it takes no chain without "
+        "`sort_by`. Made by `python -m examples.benchmarks.many_paths`.\n",
+        f"| system | | {heads} |",
+        "|---" * (2 + len(NUMBERS)) + "|",
+    ]
+    fig, axes = plt.subplots(2, 3, figsize=(9, 5), sharex=True, layout="constrained")
+    for name, ax in zip(SYSTEMS, axes.flat):
+        for way in WAYS:
+            if ns := measured(name, way):
+                shown = " | ".join(f"{x:.1f}" for x in ns)
+                rows.append(f"| {name} | {way} | {shown} |")
+                ax.loglog(NUMBERS, ns, "o-", markersize=3, label=way.strip("`"))
+        ax.set_title(name.replace("`", ""), fontsize=8)
+        ax.set_ylim(1, None)
+    axes[0, 0].legend(frameon=False, fontsize=7)
+    fig.supxlabel("paths", fontsize=8)
+    fig.supylabel("processor ns per path and step", fontsize=8)
+    fig.savefig(DOCS / "many_paths.png", dpi=150)
+    image = "![Processor time per path and step](many_paths.png)"
+    (DOCS / "many_paths.md").write_text("\n".join([*rows, "", image, ""]))
+
+
+if __name__ == "__main__":
+    main()
