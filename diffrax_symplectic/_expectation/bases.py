@@ -29,7 +29,8 @@ _MOVE = 0.2
 # the largest. Along shorter axes the points do not determine a fit. Of both systems 0.001
 # to 0.3 left the same standard errors.
 _FLOOR = 0.1
-# QUADRATIC
+# The pilot's states over which derivatives are averaged; fewer in many dimensions, down to
+# the fewest, since a Hessian needs as many gradients.
 _QUADRATIC_PILOTS = 128
 _FEWEST_QUADRATIC_PILOTS = 16
 _QUADRATIC_NUMBERS = 2**13

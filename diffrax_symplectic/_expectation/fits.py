@@ -22,23 +22,25 @@ from .problem import Problem, ravel
 from .simulation import PathStates
 
 
-# SECOND
+# The states over which second derivatives along the noise are averaged.
 _STATES_FOR_SECOND = 32
 
 
 class FittedFunctions(eqx.Module):
     """The value functions of a level, one after each step, for each time at which to
     average (`S`) and each component of `phi` (`m`); and for each candidate (`C`), until one
-    is chosen.
+    is chosen. For several levels there is another leading axis.
 
     - `frames`: the coordinates of the basis, with a leading axis of steps.
-    - `coefficients`: of the functions of the basis, which are `size` many.
-    - `second`: second derivatives along the noise, from `Noise.second`.
+    - `coefficients`: of the functions of the basis, which are `size` many, with axes for
+        steps, `size`, `C`, `S` and `m`.
+    - `second`: second derivatives along the noise, from `Noise.second`, with axes for
+        steps, twice the random variables, `C`, `S` and `m`.
     """
 
     frames: PyTree[Array]
-    coefficients: Float[Array, "steps size *C S m"]
-    second: Float[Array, "steps n n *C S m"] | None
+    coefficients: Float[Array, "..."]
+    second: Float[Array, "..."] | None
     basis: AbstractBasis = eqx.field(static=True)
 
     def __call__(self, i: Any, y: Y) -> Float[Array, "*C S m"]:

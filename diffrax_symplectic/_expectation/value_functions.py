@@ -178,7 +178,9 @@ class _Trials(NamedTuple):
         return self.run(choice, unlimited, law, self.batch_size)
 
 
-def _flat(tree: PyTree[np.ndarray], outputs: tuple[int, int], *axes: int) -> np.ndarray:
+def _flat(
+    tree: PyTree[np.ndarray | np.floating], outputs: tuple[int, int], *axes: int
+) -> np.ndarray:
     """The arrays of a PyTree in the structure of `phi` as one array, with axes for times
     and for components, behind these other axes."""
     times, _ = outputs
