@@ -126,6 +126,21 @@ def real_array(name: str, value: Any, *, positive: bool, kind: str) -> ArrayLike
     return value
 
 
+def check_untraced(caller: str, tree: Any) -> None:
+    """Raises a `ValueError` if any array is known only when a program runs."""
+    if any(is_traced(x) for x in jtu.tree_leaves(tree)):
+        raise inside_jax(caller)
+
+
+def inside_jax(caller: str) -> ValueError:
+    """The error for a call inside a JAX transformation."""
+    return ValueError(
+        f"{caller} cannot run inside JAX transformations, since batches are collected "
+        "outside of JAX. Call it outside of `jit`, `vmap` and `grad`. To differentiate a "
+        "mean, average gradients with `monte_carlo`."
+    )
+
+
 def brief(tree: PyTree) -> str:
     """Values for messages. Of long arrays only the first and the last ones are shown."""
     with np.printoptions(threshold=8, edgeitems=2):

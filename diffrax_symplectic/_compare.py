@@ -17,7 +17,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree
 
-from ._arguments import check_real, check_solver, check_takes, shapes
+from ._arguments import check_real, check_solver, check_takes, check_untraced, shapes
 from ._custom_types import Args, RealScalarLike, Y
 from ._lapack import lapack_in_turn
 from ._solver import common_path, own_path
@@ -216,6 +216,8 @@ def compare_solvers(
     # Keys 0 are those of strong errors. Weak errors are from independent paths, so the keys
     # of each step size are its own.
     fine = compared_runs(reference)(keys(0), jnp.asarray(cell))
+    # They are traced if a function closes over traced values.
+    check_untraced("`compare_solvers`", fine)
     steps = []
     refused = {}
     for solver in solvers:

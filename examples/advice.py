@@ -270,8 +270,19 @@ STRONG = (
 STRONG_STEPS = (1 / 4, 1 / 8, 1 / 16, 1 / 32)
 
 
-def strong_table(name: str) -> dict[str, list[float]]:
-    """Root mean square errors at t = 2 by budget, interpolated between steps."""
+class StrongErrors(NamedTuple):
+    """Strong errors of all solvers suggested for a problem.
+
+    - `rows`: root mean square errors at t = 2 by budget, interpolated between steps.
+    - `std_error`: the largest standard error of those at the steps, as a fraction.
+    """
+
+    rows: dict[str, list[float]]
+    std_error: float
+
+
+def strong_table(name: str) -> StrongErrors:
+    """Strong errors along common Brownian paths."""
     problem = PROBLEMS[name]
     noises = max(int(np.prod(problem.noises)), 1)
     terms = problem.terms(problem.noises)
@@ -295,6 +306,62 @@ def strong_table(name: str) -> dict[str, list[float]]:
             f"{name:44s}{solver_name(solver):24s}{rows[solver_name(solver)]}",
             flush=True,
         )
+    fractions = [step.std_error / step.error for step in compared.steps]
+    return StrongErrors(rows, max(fractions))
+
+
+class NonlinearProblem(NamedTuple):
+    """A system whose exact mean at a late time is known.
+
+    - `terms`: a function of the shape of the noise.
+    - `phi`, `mean`: a function of the state, and its stationary mean.
+    - `time`: when it is averaged. The rest of the transient is below the errors.
+    """
+
+    terms: Callable[[Any], diffrax.MultiTerm]
+    y0: tuple
+    phi: Callable
+    mean: float
+    time: float
+
+
+def van_der_pol(path):
+    """dx = v dt, dv = (2 (1 - x^2) v - x) dt + sqrt(2) dW."""
+    energy = lambda t, p, q, args: (p**2 + q**2) / 2
+    noise = lambda t, p, q, args: -np.sqrt(2) * q
+    swing = lambda t, y, args: (2 * (1 - y[1] ** 2) * y[0], jnp.zeros_like(y[1]))
+    base = ds.hamiltonian_terms(energy, noise, path)
+    return diffrax.MultiTerm(*base.terms, diffrax.ODETerm(swing))
+
+
+NONLINEAR = {
+    # In the stationary state the energy is constant: 2 <(1 - x^2) v^2> + 1 = 0.
+    "Van der Pol with noise": NonlinearProblem(
+        van_der_pol, ONE, lambda t, y, args: (y[1] ** 2 - 1) * y[0] ** 2, 0.5, 15.0
+    ),
+}
+NONLINEAR_BUDGET = 0.01
+
+
+def nonlinear_table(name: str) -> dict[str, list[float]]:
+    """By solver, the error of the mean at equal cost, and the standard error of 1,024 paths
+    with value functions."""
+    problem = NONLINEAR[name]
+    terms = problem.terms(())
+    rows = {}
+    for suggestion in ds.suggest_solver(terms, 0.0, problem.y0, want="weak"):
+        solver = suggestion.solver
+        steps = round(problem.time / (NONLINEAR_BUDGET * cost(solver, 1)))
+        if "H" in solver.variables:
+            # Of these there are no value functions.
+            continue
+        found = ds.expectation(
+            problem.phi, terms, solver, 0.0, problem.time, problem.time / steps,
+            problem.y0, key=jr.key(1), sampling=ds.ValueFunctions(num_paths=1024),
+        )  # fmt: skip
+        off = abs(float(found.mean) - problem.mean)
+        rows[solver_name(solver)] = [off, float(found.std_error)]
+        print(f"{name:44s}{solver_name(solver):24s}{off:.4f} {found}", flush=True)
     return rows
 
 
@@ -304,11 +371,17 @@ KEPT = DOCS / "advice.json"
 def measure(names) -> None:
     """Measures these problems anew, and keeps the others."""
     kept = json.loads(KEPT.read_text()) if KEPT.exists() else {}
-    table = {"weak": {}, "strong": {}} | kept
+    table = {"weak": {}, "strong": {}, "strong_std_error": {}, "nonlinear": {}} | kept
     for name in names:
+        if name in NONLINEAR:
+            table["nonlinear"][name] = nonlinear_table(name)
+            KEPT.write_text(json.dumps(table, indent=1) + "\n")
+            continue
         table["weak"][name] = weak_table(name)
         if name in STRONG:
-            table["strong"][name] = strong_table(name)
+            strong = strong_table(name)
+            table["strong"][name] = strong.rows
+            table["strong_std_error"][name] = strong.std_error
         KEPT.write_text(json.dumps(table, indent=1) + "\n")
 
 
@@ -325,8 +398,19 @@ def page(kept: dict) -> str:
 
     text = Path(__file__).with_suffix(".md").read_text()
     return text.format(
-        weak=tables("weak", PROBLEMS), strong=tables("strong", kept["strong"], 2)
+        weak=tables("weak", PROBLEMS),
+        strong=tables("strong", kept["strong"], 2),
+        strong_std_error=max(kept["strong_std_error"].values()),
+        nonlinear="\n\n".join(map(_nonlinear_table, *zip(*kept["nonlinear"].items()))),
+        nonlinear_budget=NONLINEAR_BUDGET,
     )
+
+
+def _nonlinear_table(name: str, rows: dict[str, list[float]]) -> str:
+    lines = [f"| **{name}** | error | standard error |", "|---|---|---|"]
+    for solver, (error, std_error) in rows.items():
+        lines.append(f"| `{solver}` | {error:.1e} | {std_error:.1e} |")
+    return "\n".join(lines)
 
 
 def _in_order(problem: Problem, want, rows: dict) -> dict:
@@ -389,7 +473,7 @@ ROUNDING = 1e-12
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    measure(sys.argv[1:] or PROBLEMS)
+    measure(sys.argv[1:] or [*PROBLEMS, *NONLINEAR])
     measured = json.loads(KEPT.read_text())
     draw(measured)
     (DOCS / "advice.md").write_text(page(measured))

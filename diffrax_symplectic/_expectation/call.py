@@ -5,13 +5,12 @@ from typing import Any, NamedTuple
 
 import diffrax
 import jax
-import jax.tree_util as jtu
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from .._arguments import whole_number
+from .._arguments import check_untraced, whole_number
 from .._brownian import check_key, typed_key
-from .._compat import is_traced
 from .estimate import Expectation
 
 
@@ -42,7 +41,10 @@ def checked_call(
 ) -> CheckedCall:
     """Raises a `ValueError` for invalid arguments of `user`, the function called, and if an
     array is traced, also in the `others`."""
-    check_untraced(f"`{user}`", (key, others))
+    # Inside `jit` a new array is traced, too. Functions that close over traced values of
+    # other transformations are found once something that depends on these is needed.
+    new = jnp.zeros(())
+    check_untraced(f"`{user}`", (key, others, new))
     check_key(key, user)
     if start is not None and first != 0:
         raise ValueError(
@@ -64,16 +66,6 @@ def checked_call(
             f"got {devices!r}."
         )
     return CheckedCall(typed_key(key), first, tuple(devices))
-
-
-def check_untraced(caller: str, tree: Any) -> None:
-    """Raises a `ValueError` if any array is traced."""
-    if any(is_traced(leaf) for leaf in jtu.tree_leaves(tree)):
-        raise ValueError(
-            f"{caller} cannot run inside JAX transformations, since batches are collected "
-            "outside of JAX. Call it outside of `jit`, `vmap` and `grad`. To differentiate "
-            "a mean, average gradients with `monte_carlo`."
-        )
 
 
 class Meter:

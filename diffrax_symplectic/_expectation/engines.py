@@ -15,6 +15,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
+from .._arguments import check_untraced
 from .._compat import source_lines
 from .._fused import (
     Kernels,
@@ -71,7 +72,10 @@ def state_itself(t, y, args):
 
 def by_jax(p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0) -> Batch:
     """With the loop of `expectation`."""
-    y, failed = jax.device_get(_paths(p, key, *_halves(numbers)))
+    paths = _paths(p, key, *_halves(numbers))
+    # They are traced if a function closes over traced values.
+    check_untraced("`ensemble`", paths)
+    y, failed = jax.device_get(paths)
     return Batch(jtu.tree_map(lambda x: x[level], y), failed[level])
 
 

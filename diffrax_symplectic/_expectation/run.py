@@ -14,8 +14,9 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Key, PRNGKeyArray, PyTree
 
+from .._arguments import check_untraced
 from .batch import batch_sums, BatchSums, quick_batch_sums
-from .call import check_untraced, Meter
+from .call import Meter
 from .cautions import cautions
 from .estimate import check_same, Expectation, ExpectationInterrupted
 from .moments import joined, Moments

@@ -18,7 +18,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
-from .._arguments import whole_number
+from .._arguments import check_untraced, whole_number
 from .._compat import quickly_compiled
 from .._lapack import lapack_in_turn
 from .bases import AbstractBasis
@@ -295,6 +295,7 @@ def _fits_by(
     """The fits of all levels, and how many of the pilot's paths failed."""
     count = len(problem.levels.h)
     each = [_fitted(problem, np.array([k]), key, basis) for k in range(count)]
+    check_untraced("`expectation`", [number for _, number in each])
     lost = sum(int(number) for _, number in each)
     functions = [own for own, _ in each]
     if count == 1:

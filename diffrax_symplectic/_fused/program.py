@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .._arguments import inside_jax
 from .._stablehlo import ArrayType, in_memory, MOST_IN_REGISTERS, Replay, Table, Tensor
 
 
@@ -29,6 +30,9 @@ class Program:
         # The module itself: to write it as text and to read that takes longer.
         self.replay = Replay(lowered.compiler_ir("stablehlo"))
         left = iter(self.replay.arguments)
+        if len(self.replay.arguments) > len(jtu.tree_leaves(arguments)):
+            # Traced values that a function closes over are arguments of the program, too.
+            raise inside_jax('`engine="drjit"`')
         self.types: dict[str, list[ArrayType]] = {
             name: [next(left) for _ in jtu.tree_leaves(argument)]
             for name, argument in arguments.items()

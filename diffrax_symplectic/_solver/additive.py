@@ -174,8 +174,9 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=3,
         strong=None,
         choose="Two stage vectors, and by far the smallest errors for constant noise. Not "
-        "for long steps, omega h > 1, or for stationary laws of linear systems, which the "
-        "midpoint rule has exactly.",
+        "for long steps, omega h > 1, for `ValueFunctions` in strongly nonlinear systems "
+        "(36 outcomes of a step make the fit coarser), or for stationary laws of linear "
+        "systems, which the midpoint rule has exactly.",
         suggested=("weak",),
         heats=True,
     )

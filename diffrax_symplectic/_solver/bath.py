@@ -1,5 +1,6 @@
 """The step of friction and noise at fixed positions, by the implicit midpoint rule."""
 
+import functools as ft
 from typing import Any, NamedTuple
 
 import diffrax
@@ -181,19 +182,19 @@ def _solved_with(
     def multiply(x: Array) -> Array:
         return matrix @ x
 
+    def by_modes(rhs: Array) -> Array:
+        return _Modes.of(constant).solve(step, rhs)
+
+    def by_modes_transposed(rhs: Array) -> Array:
+        return _Modes.of(constant).transposed().solve(step, rhs)
+
     def solve(_: Any, rhs: Array) -> Array:
-        return lax.platform_dependent(
-            rhs,
-            cpu=lambda rhs: _Modes.of(constant).solve(step, rhs),
-            default=lambda rhs: jnp.linalg.solve(matrix, rhs),
-        )
+        elsewhere = ft.partial(jnp.linalg.solve, matrix)
+        return lax.platform_dependent(rhs, cpu=by_modes, default=elsewhere)
 
     def solve_transposed(_: Any, rhs: Array) -> Array:
-        return lax.platform_dependent(
-            rhs,
-            cpu=lambda rhs: _Modes.of(constant).transposed().solve(step, rhs),
-            default=lambda rhs: jnp.linalg.solve(matrix.T, rhs),
-        )
+        elsewhere = ft.partial(jnp.linalg.solve, matrix.T)
+        return lax.platform_dependent(rhs, cpu=by_modes_transposed, default=elsewhere)
 
     # Its derivatives are those of the equation. Those of eigenvectors may be infinite.
     return lax.custom_linear_solve(multiply, right, solve, solve_transposed)

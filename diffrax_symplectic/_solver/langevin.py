@@ -123,7 +123,7 @@ def _handed_on(
     return lax.cond(made_jump, anew, lambda: forces)
 
 
-class _Constrained(NamedTuple):
+class ConstrainedState(NamedTuple):
     """The state of `BAOAB` for terms with a constraint.
 
     - `force`: the force at the start of the step, as a vector.
@@ -206,7 +206,7 @@ class BAOAB(AbstractLangevinSplitting):
         if constraint_of(terms) is None:
             return super().init(terms, t0, t1, y0, args)
         solved = init_constrained(self, terms, t0, y0, args)
-        return _Constrained(force_at(terms, t0, y0, args), solved)
+        return ConstrainedState(force_at(terms, t0, y0, args), solved)
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         if constraint_of(terms) is None:
@@ -218,7 +218,7 @@ class BAOAB(AbstractLangevinSplitting):
             terms, t0, t1, y0, args, force, solver_state.solved, type(self).__name__
         )
         result = result_at(terms, t0, t1, result_of(solved, y1))
-        state = _Constrained(force, solved)
+        state = ConstrainedState(force, solved)
         return y1, None, dict(y0=y0, y1=y1), state, result
 
 

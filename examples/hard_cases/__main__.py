@@ -10,6 +10,7 @@ if __name__ == "__main__":
         (
             "two_body",
             "double_well",
+            "rods",
             "chain",
             "henon_heiles",
             "spins",

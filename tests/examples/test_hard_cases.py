@@ -18,6 +18,7 @@ from examples.hard_cases import (
     learning,
     magnet,
     nls,
+    rods,
     spins,
     two_body,
 )
@@ -226,6 +227,36 @@ def test_schroedinger_lattice_keeps_its_norm_and_gains_the_energy_of_the_noise()
     assert abs(ours.balance.sigmas) <= 4
     # Heun multiplies the highest modes, of frequency 32, in each step.
     assert heun.norm_error > 1e-3
+
+
+def test_the_law_of_rods_is_the_volume_of_the_momenta_that_they_allow():
+    # The root of det(J J^T), with the gradients J of the constraints, by definition.
+    for key in jr.split(jr.key(0), 5):
+        directions = jr.normal(key, (rods.RODS, 3))
+        directions /= jnp.linalg.norm(directions, axis=1, keepdims=True)
+        q = jnp.cumsum(jnp.concatenate([jnp.zeros((1, 3)), directions]), axis=0)
+        J = jax.jacobian(lambda q: jnp.sum(rods.bonds(q) ** 2, axis=1) / 2)(q)
+        J = J.reshape(rods.RODS, -1)
+        volume = jnp.sqrt(jnp.linalg.det(J @ J.T))
+        np.testing.assert_allclose(rods.weight(rods.cosines(q)), volume, rtol=1e-12)
+    np.testing.assert_allclose(rods.exact_square(8), rods.exact_square(16), rtol=1e-7)
+    c, w = np.polynomial.legendre.leggauss(8)
+    np.testing.assert_allclose(w @ rods.density_of_one(c, 8), 1, rtol=1e-12)
+
+
+def test_rods_have_their_angles_and_momenta_and_springs_have_others():
+    t1, paths = 5.0, 4_000
+    rigid = rods.angles(rods.rigid, ds.BAOAB(), 0.1, t1, paths)
+    soft = rods.angles(rods.springs, ds.BAOAB(), 0.02, t1, paths)
+    assert rigid.stretched <= 1e-13
+    for mean, exact in (
+        (rigid.square, rods.exact_square(12)),
+        (rigid.kinetic, 11 * rods.T / 2),
+        (soft.square, 1 / 3),
+    ):
+        assert abs(mean.value - exact) <= 4 * mean.std_error
+    # By a factor that is known for one spring, 1 - (omega h)^2 / 4.
+    assert soft.kinetic.value < 15 * rods.T / 2 - 4 * soft.kinetic.std_error
 
 
 class Known(eqx.Module):

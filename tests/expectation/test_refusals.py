@@ -1,5 +1,6 @@
 """What `expectation` cannot do is refused with advice that fits."""
 
+import functools as ft
 import inspect
 
 import diffrax
@@ -13,6 +14,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import is_random
 from diffrax_symplectic._terms import path_keys, with_keys
 
+from ..drjit_here import needs_drjit
 from ..solver.test_times_and_paths import RECORD
 
 
@@ -110,13 +112,53 @@ def test_a_control_term_may_have_the_shape_of_its_path():
         mean([3])
 
 
-def test_functions_that_close_over_traced_values_have_no_estimate():
-    mean = lambda size: ds.monte_carlo(
-        lambda key: size * jr.normal(key), key=jr.key(0), num_paths=2
+def _spring(size):
+    """Terms that close over `size`."""
+    energy = lambda t, p, q, args: p**2 / 2 + size * q**2
+    return ds.hamiltonian_terms(energy, lambda t, p, q, args: -q, ())
+
+
+def _of_system(call, **others):
+    y0 = jnp.array(0.0), jnp.array(1.0)
+    fixed = dict(key=jr.key(0), **others)
+    return lambda size: call(
+        _spring(size), ds.StormerVerlet(), 0, 0.2, 0.1, y0, **fixed
     )
-    for transform in (jax.grad, jax.jit):
+
+
+def _compared(terms, solver, t0, t1, dt0, y0, **others):
+    found = ds.compare_solvers(terms, [solver], t0, t1, [dt0], y0, **others)
+    return found.steps[0].error
+
+
+_mean_of_q = ft.partial(ds.expectation, lambda t, y, args: y[1])
+_fits = ds.ValueFunctions(degree=2, num_paths=8)
+CLOSURES = {
+    "monte_carlo": lambda size: (
+        ds.monte_carlo(
+            lambda key: size * jr.normal(key), key=jr.key(0), num_paths=2
+        ).mean
+    ),
+    "IndependentPaths": _of_system(_mean_of_q, sampling=ds.IndependentPaths(8)),
+    "ValueFunctions": pytest.param(
+        _of_system(_mean_of_q, sampling=_fits), marks=pytest.mark.slow
+    ),
+    "ensemble": _of_system(ds.ensemble, num_paths=8),
+    "ensemble, fused": pytest.param(
+        _of_system(ds.ensemble, num_paths=8, engine="drjit"), marks=needs_drjit
+    ),
+    "compare_solvers": pytest.param(
+        _of_system(_compared, num_paths=8), marks=pytest.mark.slow
+    ),
+}
+
+
+@pytest.mark.parametrize("call", CLOSURES.values(), ids=CLOSURES)
+def test_functions_that_close_over_traced_values_have_no_estimate(call):
+    on_batch = lambda call: lambda size: jax.vmap(call)(jnp.full(2, size))
+    for transform in (jax.grad, jax.jit, on_batch):
         with pytest.raises(ValueError, match="cannot run inside JAX.*`monte_carlo`"):
-            transform(lambda size: mean(size).mean)(1.0)
+            transform(call)(1.0)
 
 
 def test_steps_that_single_precision_does_not_resolve_are_refused_at_once():

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._solver.langevin import ConstrainedState
 from diffrax_symplectic._solver.step import no_failure
 
 from ..drjit_here import needs_drjit
@@ -378,8 +379,8 @@ def test_friction_and_noise_keep_the_maxwell_distribution_of_a_plane_exactly():
     def step(p, W):
         terms = in_a_plane(Given(W), jnp.zeros((3, 3)))
         y0 = p, jnp.zeros(3)
-        force, solved = jnp.zeros(3), no_failure()
-        at = terms, 0.0, h, y0, None, (force, solved), False
+        begun = ConstrainedState(jnp.zeros(3), no_failure())
+        at = terms, 0.0, h, y0, None, begun, False
         return ds.BAOAB().step(*at)[0][0]
 
     normals = NORMAL[None]
@@ -394,7 +395,7 @@ def test_positions_in_a_harmonic_well_and_a_plane_have_the_law_of_gibbs():
     def step(y, W):
         terms = in_a_plane(Given(W), STIFF)
         p, q = jnp.split(y, 2)
-        solver_state = -STIFF @ q, no_failure()
+        solver_state = ConstrainedState(-STIFF @ q, no_failure())
         y1 = ds.BAOAB().step(terms, 0.0, h, (p, q), None, solver_state, False)[0]
         return jnp.concatenate(y1)
 
