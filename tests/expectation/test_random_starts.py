@@ -45,7 +45,10 @@ def exact(strength):
     return (1 + WIDTH**2) * np.cos(END) ** 2 + noise
 
 
-def mean(sampling, y0=cloud, args=strengths, solver=ds.AdditiveGauss(), **kwargs):
+ACCURATE = ds.AdditiveGauss()
+
+
+def mean(sampling, y0=cloud, args=strengths, solver=ACCURATE, **kwargs):
     kwargs = dict(key=jr.key(1), sampling=sampling) | kwargs
     return ds.expectation(square, TERMS, solver, 0.0, END, 0.25, y0, args, **kwargs)
 
