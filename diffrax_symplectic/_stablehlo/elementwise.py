@@ -263,7 +263,7 @@ def _arithmetic_shift(a, b):
 
 def _round_half_away(a):
     dr = drjit()
-    # The sum of `a` and one half is rounded itself, so the fraction is compared: it is exact.
+    # The sum of `a` and one half is rounded itself. The fraction that is compared is exact.
     whole = dr.trunc(a)
     away = whole + dr.copysign(type(a)(1), a)
     return dr.select(dr.abs(a - whole) >= 0.5, away, whole)
