@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray, PyTree
 
-from .._arguments import brief, check_real, check_takes, parameters
+from .._arguments import brief, check_real, check_takes, takes_args
 from .._brownian import is_random
 from .._custom_types import Args, Y
 from .._signature import once_for_each_signature
@@ -71,8 +71,7 @@ def given_state(y0: Y) -> Y:
 def drawn_state(y0_of: Callable, key: PRNGKeyArray, args: Args) -> Y:
     """The initial state that the user's function draws. Raises a `ValueError` for a
     function with other arguments."""
-    # By its name, since a function of the key may have other parameters with defaults.
-    if "args" in parameters(y0_of):
+    if takes_args(y0_of):
         check_takes("y0", y0_of, "key", "args")
         return given_state(y0_of(key, args))
     check_takes("y0", y0_of, "key")

@@ -83,7 +83,9 @@ def _of_spread(estimate: Expectation) -> Iterator[str]:
             f"A component is zero, or underflows {dtype}, on all paths. If it "
             'underflows, use other units, or call `jax.config.update("jax_enable'
             '_x64", True)` first. If it is the indicator of a rare event, the event did '
-            "not occur, and the standard error is meaningless."
+            "not occur, and the standard error is meaningless. The gradient of an "
+            "indicator, or of another step function, is zero wherever it exists: average a "
+            "smooth function instead, or difference two estimates."
         )
     elif not any(np.any(x > 0) for x in jtu.tree_leaves(estimate.variance)):
         yield (

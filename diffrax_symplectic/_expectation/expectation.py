@@ -104,7 +104,8 @@ def expectation(
     [`diffrax_symplectic.monte_carlo`][].
 
     Each new `phi`, `sort_by` or function in `terms` is compiled anew. For many values of a
-    parameter, pass the same functions and the parameter as an array in `args`.
+    parameter, make one call for each, with the same functions and the parameter as an array
+    in `args`. (All paths have the same `args`, unless these are drawn.)
 
     Events, and all else that only `diffrax.diffeqsolve` takes, belong into a solve of your
     own, as a function of a random key, which [`diffrax_symplectic.monte_carlo`][] averages.

@@ -155,5 +155,22 @@ def test_a_function_in_args_is_told_from_a_function_of_the_key():
             num_paths=2,
         )
     assert "pass it in a tuple" in str(info.value.__notes__)
+    with pytest.raises(ValueError, match=r"`y0` is called as `y0\(key, args\)`"):
+        mean(SAMPLINGS[0], y0=lambda key, args, width: ONE)
     with pytest.raises(ValueError, match=r"`y0` is called as `y0\(key\)`"):
-        mean(SAMPLINGS[0], y0=lambda key, width: ONE)
+        mean(SAMPLINGS[0], y0=lambda: ONE)
+
+
+def test_starts_take_args_by_any_name_and_options_by_their_defaults():
+    def of_key(key, width=WIDTH):
+        return jnp.zeros(()), width * jr.normal(key)
+
+    def of_both(key, k):
+        return jnp.zeros(()), WIDTH * jnp.sqrt(k["strength"]) * jr.normal(key)
+
+    few = dict(key=jr.key(1), num_paths=8)
+    args = {"strength": jnp.array(4.0)}
+    start = lambda y0: ds.ensemble(
+        TERMS, ds.AdditiveGauss(), 0.0, END, 0.5, y0, args, ts=[0.0], **few
+    ).ys[1]
+    np.testing.assert_allclose(start(of_both), 2 * start(of_key), rtol=1e-12)
