@@ -57,7 +57,9 @@ def step_variables(terms: PyTree[diffrax.AbstractTerm], h) -> StepVariables:
     flat, unravel = raveled(shape)
     make_increment: Any = path.levy_area
 
-    def terms_with(values: Float[Array, " n"]) -> PyTree[diffrax.AbstractTerm]:
+    def terms_with(
+        values: Float[Array | np.ndarray, " n"],
+    ) -> PyTree[diffrax.AbstractTerm]:
         scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(flat.dtype)
         # One row for each attribute of the increment, in the order of the laws.
         rows = scaled.reshape(-1, flat.size)
