@@ -433,7 +433,7 @@ def test_regions_of_operations_are_read():
     assert _compat.sole_operation(reduction.regions[0]) == "stablehlo.add"
 
     def sole(fn):
-        reduced = _lowered(lambda x: jax.lax.reduce(x, 0.0, fn, (0,)), (3,))
+        reduced = _lowered(lambda x: jax.lax.reduce(x, jnp.float32(0), fn, (0,)), (3,))
         return _compat.sole_operation(
             _operation(reduced, "stablehlo.reduce").regions[0]
         )

@@ -18,10 +18,10 @@ from .backend import drjit
 # Powers with whole exponents up to this size are products, of at most twelve factors, which
 # have no logarithm of a negative number. Larger ones are computed by logarithms.
 _MOST_MULTIPLIED = 64
-# For the complementary error function: the place, from zero to infinity, that the series has
-# in its middle, and the degree of the series for each size of numbers in bytes. The first
-# coefficients left out are 2e-9 and 7e-17. With a middle of 4 they are as small, with 2
-# larger.
+# For the complementary error function: the place, from zero to infinity, that its series
+# has in the middle, and the degree of the series for each size of numbers in bytes. The
+# first coefficients left out are 2e-9 and 7e-17. With a middle of 4 they are as small, with
+# 2 larger.
 _ERFC_MIDDLE = 3.0
 _ERFC_DEGREES = {4: 11, 8: 23}
 # Both precisions have zero from here on.
