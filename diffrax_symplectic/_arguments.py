@@ -59,12 +59,22 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
         )
 
 
-def parameters(fn: Any) -> list[str]:
-    """The names of the parameters of a function."""
+def takes_args(fn: Any) -> bool:
+    """Whether a function is called as `fn(key, args)`, not as `fn(key)`: with a parameter
+    of this name, or with a second one that has no default."""
     try:
-        return [*inspect.signature(fn).parameters]
+        parameters = inspect.signature(fn).parameters
     except ValueError:
-        return []  # As above.
+        # As above.
+        return False
+    needed = [
+        parameter
+        for parameter in parameters.values()
+        if parameter.default is inspect.Parameter.empty
+        and parameter.kind is not inspect.Parameter.VAR_POSITIONAL
+        and parameter.kind is not inspect.Parameter.VAR_KEYWORD
+    ]
+    return "args" in parameters or len(needed) > 1
 
 
 def check_solver(name: str, solver: Any) -> None:

@@ -65,6 +65,12 @@ def is_result(x: Any) -> bool:
     return isinstance(x, type(diffrax.RESULTS.successful))
 
 
+def is_closure_mismatch(error: ValueError) -> bool:
+    """Whether Equinox refused to call what it converted from a closure with arrays of
+    another type, as it does on several devices. It has no class of errors for this."""
+    return "Closure-converted function" in str(error)
+
+
 def quickly_compiled(fn: Callable) -> Callable:
     """`equinox.filter_jit(fn)`, compiled by XLA's older generator of code for CPUs where
     this version of XLA has it.

@@ -108,7 +108,7 @@ VARIABLES = {
     "H": _area(variance=1 / 12, even=True),
     "third": RandomVariable(
         increment=WeakIncrement,
-        name="four-point variables and two more sets",
+        name="four-point variables and two sets of three-point ones beside them",
         path=ft.partial(WeakBrownianPath, order=3),
         rank=3,
     ),

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray, PyTree, UInt32
 
 from .._arguments import check_real, check_takes, whole_number
 from .._brownian import (
@@ -24,14 +24,14 @@ from .._brownian import (
 )
 from .._custom_types import Y
 from .._terms import brownian_paths, path_numbers, replace_paths
-from .fits import Functions
+from .fits import FittedFunctions
 from .hilbert import hilbert_order
 from .points import num_seeds, randomized, sobol_points
 from .polynomials import tensordot
 from .problem import Level, numbers, Problem
 from .run import run
 from .sampling import AbstractSampling, ROUNDING, Samples, SamplingPlan, saved_by_name
-from .simulation import along, independent_steps, Paths, simulate
+from .simulation import along, independent_steps, Motion, PathStates, simulate
 from .value_functions import value_function
 
 
@@ -146,22 +146,24 @@ class ArrayRQMC(AbstractSampling):
 def _gain(
     plan: SamplingPlan, other: SamplingPlan, key: PRNGKeyArray, devices: tuple
 ) -> float:
-    """How many times the variance of a plan is that of the other, in a short trial."""
+    """How many times the variance of a plan is that of the other, in a short trial; one if
+    nothing is random."""
 
     def variance(plan: SamplingPlan) -> float:
         short = plan._replace(num_samples=_TRIAL_REPLICATES)
         trial = run(short, jr.fold_in(key, _TRIAL_KEY), devices)
         return float(np.sum(jtu.tree_leaves(trial.variance)))
 
-    return variance(plan) / variance(other)
+    own = variance(plan)
+    return own / variance(other) if own > 0 else 1.0
 
 
 def _replicates(
     p: Problem,
-    sort_by: Callable[[Y], PyTree[Array]] | Functions,
+    sort_by: Callable[[Y], PyTree[Array]] | FittedFunctions,
     points: UInt32[Array, "n d"],
     words: "StepWords",
-    keys: PRNGKeyArray,
+    keys: Key[Array, "1"],
 ) -> Samples:
     """A sample is the mean over all paths of a replicate. Algorithm 1 of
     [L'Ecuyer, Lécot and Tuffin (2008)](https://doi.org/10.1287/opre.1080.0556).
@@ -174,8 +176,8 @@ def _replicates(
     start_keys = jr.split(jr.fold_in(replicate, _STARTS_KEY), n)
     drawn = jax.vmap(p.drawn)(start_keys)
 
-    def begin(level: Level) -> tuple[Callable[[Any, Paths], Paths], Paths]:
-        advance, paths = independent_steps(
+    def begin(level: Level) -> Motion:
+        motion = independent_steps(
             p,
             level,
             drawn,
@@ -184,20 +186,20 @@ def _replicates(
         )
 
         def step(i, paths):
-            return advance(i, _in_order(sort_by, level, i, paths))
+            return motion.step(i, _in_order(sort_by, level, i, paths))
 
-        return step, paths
+        return Motion(step, motion.start)
 
-    saved, failed, _ = simulate(p, begin, _mean_of_good)
+    done = simulate(p, begin, _mean_of_good)
     # An axis for the samples, of which there is one.
-    means, heavy, largest = jnp.moveaxis(saved[:, :, :, None], 2, 0)
+    means, heavy, largest = jnp.moveaxis(done.saved[:, :, :, None], 2, 0)
     means = p.combined(means)
     # The largest over all levels.
     heavy = jnp.broadcast_to(jnp.max(heavy, axis=0), means.shape)
     # A path may fail on any level.
     largest = tensordot(jnp.abs(p.weights).astype(largest.dtype), largest, 1)
     kinds = [means, heavy, largest]
-    return Samples(p.averaged(kinds), jnp.ones(1, bool), jnp.sum(failed)[None])
+    return Samples(p.averaged(kinds), jnp.ones(1, bool), jnp.sum(done.failed)[None])
 
 
 def _words_of_step(
@@ -214,15 +216,15 @@ def _words_of_step(
 
 
 def _in_order(
-    sort_by: Callable[[Y], PyTree[Array]] | Functions,
+    sort_by: Callable[[Y], PyTree[Array]] | FittedFunctions,
     level: Level,
     i: Any,
-    paths: Paths,
-) -> Paths:
+    paths: PathStates,
+) -> PathStates:
     """The paths before step `i`, sorted, with those that failed at the end."""
 
     def sorted_by(y: Y) -> Float[Array, " m"]:
-        if isinstance(sort_by, Functions):
+        if isinstance(sort_by, FittedFunctions):
             u = jtu.tree_map(lambda x: x[level.index], sort_by)
             # Functions are those after each step. Before step 0 this is the last one, since
             # there is none, and any order is right.

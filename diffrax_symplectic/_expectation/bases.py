@@ -11,21 +11,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from .polynomials import dot, hermite, least_squares, num_polynomials, tensordot
 
 
-# PILOTS
+# The pilot's paths for each polynomial, and the fewest. The fit hardly depends on them: of
+# the Hénon-Heiles system, by degree 6, 5 to 90 for each polynomial left standard errors of
+# 0.6e-7 to 1.8e-7, for 1e-3 without a fit.
 _PILOTS_PER_POLYNOMIAL = 30
 _FEWEST_PILOTS = 256
 # The pilot's states are perturbed by this fraction of their standard deviations: after the
-# first steps the paths are in only a few different states.
+# first steps the paths are in only a few different states. Four times as much made the
+# standard errors of that system, and of a pendulum by degree 4, 2 to 5 times larger.
 _MOVE = 0.2
 # Lower bound of the standard deviations along the axes of the covariance, as a fraction of
-# the largest. Along shorter axes the points do not determine a fit.
+# the largest. Along shorter axes the points do not determine a fit. Of both systems 0.001
+# to 0.3 left the same standard errors.
 _FLOOR = 0.1
-# QUADRATIC
+# The pilot's states over which derivatives are averaged; fewer in many dimensions, down to
+# the fewest, since a Hessian needs as many gradients.
 _QUADRATIC_PILOTS = 128
 _FEWEST_QUADRATIC_PILOTS = 16
 _QUADRATIC_NUMBERS = 2**13
@@ -130,7 +135,7 @@ class AbstractBasis(eqx.Module):
         frame: Any,
         states: Float[Array, "n d"],
         good: Bool[Array, " n"],
-        keys: PRNGKeyArray,
+        keys: Key[Array, " n"],
     ) -> Float[Array, "size C S m"]:
         """The coefficients. `keys` are the keys of the pilot's paths, for estimates."""
 

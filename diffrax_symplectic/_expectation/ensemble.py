@@ -1,30 +1,34 @@
 """The states of many paths at given times."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, get_args
 
 import diffrax
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import ArrayLike, Bool, Float, PRNGKeyArray, PyTree
 
-from .._arguments import whole_number
-from .._custom_types import Args, Y
+from .._arguments import brief, whole_number
+from .._compat import is_traced
+from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from .._fused import sample_key
 from .._solver import Want
 from .._terms import path_keys, with_keys
+from .call import checked_call
 from .engines import Batch, ENGINES, state_itself, warn_of_stragglers
 from .problem import Problem
-from .run import checked_call, refuse_others
 
 
 # Entries of all states in a batch: enough to keep every core busy, in tens of megabytes.
-_NUMBERS = {"jax": 2**17, "drjit": 2**20}
-# Accelerators need more.
-_MORE = 16
+_ENTRIES = {"jax": 2**17, "drjit": 2**20}
+# Accelerators need this many times as many.
+_MORE_ON_ACCELERATORS = 16
+# The fewest paths in a batch, however large their states.
+_FEWEST_PATHS = 256
 
 
 class Ensemble(eqx.Module):
@@ -35,6 +39,7 @@ class Ensemble(eqx.Module):
         was passed, the second is the time. All states of a failed path are NaN.
     - `failed`: which paths failed.
     - `num_stragglers`: how many paths `engine="drjit"` handed back to JAX.
+    - `engine`: the engine that simulated them.
     """
 
     ts: Float[np.ndarray, " times"]
@@ -49,39 +54,54 @@ class Ensemble(eqx.Module):
     def num_failed(self) -> int:
         return int(np.sum(self.failed))
 
-    def terms(self, number: int) -> PyTree[diffrax.AbstractTerm]:
+    def terms(self, number: IntScalarLike) -> PyTree[diffrax.AbstractTerm]:
         """The terms of path number `number`, with its random keys. Passed to
         `diffrax.diffeqsolve` they give the same path, for example to save it at more
-        times."""
+        times. `number` may be traced, to solve several paths by `jax.vmap`."""
         terms = self._problem.terms
         return with_keys(terms, path_keys(terms, self._key_of(number)))
 
-    def start(self, number: int) -> tuple[Y, Args]:
-        """The initial state and the `args` of path number `number`."""
+    def start(self, number: IntScalarLike) -> tuple[Y, Args]:
+        """The initial state and the `args` of path number `number`, which may be traced."""
         y0, own = self._problem.drawn(self._key_of(number))
         return y0, self._problem.with_args(own).args
 
-    def _key_of(self, number: int) -> PRNGKeyArray:
-        high, low = (np.uint32(x) for x in divmod(int(number), 2**32))
-        return sample_key(self._key, high, low)
+    def _key_of(self, number: IntScalarLike) -> PRNGKeyArray:
+        return sample_key(self._key, *_words(number))
+
+
+def _words(number: IntScalarLike) -> tuple[ArrayLike, ArrayLike]:
+    """The upper and the lower 32 bits of the number of a path. Raises a `ValueError`
+    unless it is an integer that is not negative, as far as that is known."""
+    is_one = eqx.is_array_like(number) and jnp.shape(number) == ()
+    if not is_one or not jnp.issubdtype(jnp.result_type(number), jnp.integer):
+        raise ValueError(
+            f"`number` must be one integer, 0 or larger; got {brief(number)}. For several "
+            "paths, batch over their numbers: `jax.vmap(paths.start)(numbers)`."
+        )
+    if not is_traced(number):
+        high, low = divmod(whole_number("number", int(number), least=0), 2**32)
+        return np.uint32(high), np.uint32(low)
+    traced = jnp.asarray(number)
+    # Of a number with fewer bits the upper ones are zero.
+    return (traced >> 32).astype(jnp.uint32), traced.astype(jnp.uint32)
 
 
 def ensemble(
     terms: PyTree[diffrax.AbstractTerm],
     solver: diffrax.AbstractSolver,
-    t0: float,
-    t1: float,
-    dt0: float,
-    y0: Y,
-    args: Args = None,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    dt0: RealScalarLike,
+    y0: Y | Callable[..., Y],
+    args: Args | Callable[[PRNGKeyArray], Args] = None,
     *,
     key: PRNGKeyArray,
     num_paths: int,
-    ts: Sequence[float] | np.ndarray | None = None,
+    ts: Sequence[RealScalarLike] | np.ndarray | None = None,
     want: Want = "strong",
     engine: str | None = None,
     batch_size: int | None = None,
-    **others: Any,
 ) -> Ensemble:
     r"""The states of many independent paths, for histograms, spectra, and clouds in phase
     space.
@@ -145,56 +165,81 @@ def ensemble(
     `PicardNewton` has another tolerance than rounding error, and an `ImportError` if Dr.Jit
     or LLVM is missing. Warns if paths failed, and if many are stragglers.
     """
-    refuse_others("ensemble", others)
-    given = terms, t0, t1, dt0, y0, args
-    key, _, _ = checked_call("ensemble", key, None, None, 0, None, given)
+    arguments = terms, t0, t1, dt0, y0, args
+    key, _, _ = checked_call("ensemble", key, others=arguments)
     num_paths = whole_number("num_paths", num_paths)
     engine = "jax" if engine is None else engine
     if engine not in ENGINES:
         raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
-    times = [t1] if ts is None else ts
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
     problem = Problem.of(
-        state_itself, terms, solver, t0, t1, dt0, y0, args, times, 1, want, "ensemble"
+        state_itself,
+        terms,
+        solver,
+        t0,
+        t1,
+        dt0,
+        y0,
+        args,
+        ts=[t1] if ts is None else ts,
+        levels=1,
+        want=want,
+        user="ensemble",
     )
     if batch_size is None:
         batch_size = _default_size(engine, problem)
     size = whole_number("batch_size", batch_size)
+
+    paths_by = ENGINES[engine]
     batches = []
     for begin in range(0, num_paths, size):
         # JAX compiles for one batch size: the last batch is cut afterwards.
-        n = min(size, num_paths if engine == "jax" else num_paths - begin)
-        batches.append(
-            ENGINES[engine](problem, key, np.arange(begin, begin + n, dtype=np.uint64))
-        )
+        left = num_paths if engine == "jax" else num_paths - begin
+        n = min(size, left)
+        numbers = np.arange(begin, begin + n, dtype=np.uint64)
+        batches.append(paths_by(problem, key, numbers))
     joined = _joined(batches, num_paths, at_end=ts is None)
-    saved = np.asarray(problem.levels.saved_steps[0])
-    at = float(problem.t0) + saved * float(problem.levels.h[0])
     _warn_of(joined, problem.bounded)
-    return Ensemble(at, *joined, engine, problem, key)
+    saved_steps = np.asarray(problem.levels.saved_steps[0])
+    return Ensemble(
+        ts=float(problem.t0) + saved_steps * float(problem.levels.h[0]),
+        ys=joined.y,
+        failed=joined.failed,
+        num_stragglers=joined.stragglers,
+        engine=engine,
+        _problem=problem,
+        _key=key,
+    )
 
 
 def _default_size(engine: str, problem: Problem) -> int:
-    numbers = sum(x.size for x in jtu.tree_leaves(problem.y0))
-    more = 1 if jax.default_backend() == "cpu" else _MORE
-    return max(256, more * _NUMBERS[engine] // numbers)
+    """The number of paths in a batch."""
+    entries = _ENTRIES[engine]
+    if jax.default_backend() != "cpu":
+        entries *= _MORE_ON_ACCELERATORS
+    of_path = sum(leaf.size for leaf in jtu.tree_leaves(problem.y0))
+    return max(_FEWEST_PATHS, entries // of_path)
 
 
 def _joined(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
-    failed = np.concatenate([b.failed for b in batches])[:num_paths]
+    """All batches as one, cut to this number of paths, with NaN as states of failed ones.
+    Without the axis of times if the states were wanted `at_end` only."""
+    failed = np.concatenate([batch.failed for batch in batches])[:num_paths]
 
-    def join(*xs: np.ndarray) -> np.ndarray:
-        x = np.concatenate(xs)[:num_paths]
-        x[failed] = np.nan
-        return x[:, 0] if at_end else x
+    def join(*parts: np.ndarray) -> np.ndarray:
+        states = np.concatenate(parts)[:num_paths]
+        states[failed] = np.nan
+        return states[:, 0] if at_end else states
 
-    y = jtu.tree_map(join, *[b.y for b in batches])
-    return Batch(y, failed, sum(b.stragglers for b in batches))
+    y = jtu.tree_map(join, *[batch.y for batch in batches])
+    return Batch(y, failed, sum(batch.stragglers for batch in batches))
 
 
 def _warn_of(joined: Batch, bounded: bool) -> None:
-    count, lost = len(joined.failed), int(np.sum(joined.failed))
+    """Warns of failed paths and of many stragglers."""
+    count = len(joined.failed)
+    lost = int(np.sum(joined.failed))
     if lost > 0:
         instead = "" if bounded else " or bounded increments (a `WeakBrownianPath`),"
         warnings.warn(

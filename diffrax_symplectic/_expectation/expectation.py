@@ -16,6 +16,7 @@ from .._brownian import Discrete, laws_of, UnspecifiedPath
 from .._custom_types import Args, RealScalarLike, Y
 from .._solver import own_path
 from .._terms import brownian_paths, path_numbers, random_paths, with_paths
+from .call import checked_call, Meter, NO_METER
 from .choose import (
     choose,
     few_paths,
@@ -27,7 +28,7 @@ from .engines import warn_of_stragglers
 from .estimate import Expectation, ExpectationInterrupted
 from .fused_paths import fused_plan, FusedPaths
 from .problem import Problem
-from .run import checked_call, Meter, NO_METER, refuse_others, run
+from .run import run
 from .sampling import AbstractSampling
 from .value_functions import ValueFunctions
 
@@ -42,15 +43,15 @@ def expectation(
     phi: Callable[[RealScalarLike, Y, Args], PyTree[ArrayLike]],
     terms: PyTree[diffrax.AbstractTerm],
     solver: diffrax.AbstractSolver,
-    t0: float,
-    t1: float,
-    dt0: float,
-    y0: Y,
-    args: Args = None,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    dt0: RealScalarLike,
+    y0: Y | Callable[..., Y],
+    args: Args | Callable[[PRNGKeyArray], Args] = None,
     *,
     key: PRNGKeyArray,
     sampling: AbstractSampling | None = None,
-    ts: Sequence[float] | np.ndarray | None = None,
+    ts: Sequence[RealScalarLike] | np.ndarray | None = None,
     levels: int = 1,
     tol: float | None = None,
     start: Expectation | None = None,
@@ -58,7 +59,6 @@ def expectation(
     engine: str | None = None,
     devices: Sequence[Any] | None = None,
     progress_meter: diffrax.AbstractProgressMeter = NO_METER,
-    **others: Any,
 ) -> Expectation:
     r"""Estimates $\mathbb E[\phi(t, y_t)]$, with its standard error and the discretization
     error.
@@ -104,7 +104,11 @@ def expectation(
     [`diffrax_symplectic.monte_carlo`][].
 
     Each new `phi`, `sort_by` or function in `terms` is compiled anew. For many values of a
-    parameter, pass the same functions and the parameter as an array in `args`.
+    parameter, make one call for each, with the same functions and the parameter as an array
+    in `args`. (All paths have the same `args`, unless these are drawn.)
+
+    Events, and all else that only `diffrax.diffeqsolve` takes, belong into a solve of your
+    own, as a function of a random key, which [`diffrax_symplectic.monte_carlo`][] averages.
 
     **Arguments:**
 
@@ -175,54 +179,56 @@ def expectation(
     variances of batches; [Talay and Tubaro
     (1990)](https://doi.org/10.1080/07362999008809220) for extrapolation.
     """
-    refuse_others("expectation", others)
-    given = terms, t0, t1, dt0, y0, args, ts
+    arguments = terms, t0, t1, dt0, y0, args, ts
     key, first, devices = checked_call(
-        "expectation", key, tol, start, first, devices, given
+        "expectation", key, tol, start, first, devices, arguments
     )
     if engine not in (None, "jax", "drjit"):
         raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
     if sampling is None and start is not None:
         sampling = start.sampling
-    given = phi, terms, solver, t0, t1, dt0, y0, args, ts, levels
-    problem = Problem.of(*given)
-    reason = ""
-    choice = ""
-    has_shape = any(isinstance(x, UnspecifiedPath) for x in brownian_paths(terms))
-    # Value functions need discrete increments.
-    free = has_shape and not isinstance(sampling, ValueFunctions)
+
+    # Discrete increments, unless `phi` is not smooth.
+    arguments = phi, terms, solver, t0, t1, dt0, y0, args, ts, levels
+    problem = Problem.of(*arguments, want="weak")
     has_kinks = problem.has_kinks
-    if free and has_kinks:
-        problem = Problem.of(*given, want="strong")
-        reason = "Gaussian increments, since phi may not be smooth"
+    why_law = ""
+    if has_kinks and _may_choose_law(terms, sampling):
+        problem = Problem.of(*arguments, want="strong")
+        why_law = "Gaussian increments, since phi may not be smooth"
+
+    why_sampling = ""
     is_chosen = sampling is None
     if is_chosen:
-        sampling, choice = choose(problem, tol)
+        sampling, why_sampling = choose(problem, tol)
     sampling = _checked_sampling(sampling, start)
+
+    trial_key = jr.fold_in(key, _NO_SAMPLE)
     with Meter(progress_meter) as meter:
         try:
             if engine == "drjit":
                 plan = fused_plan(problem, key, sampling, devices)
             else:
-                own = jr.fold_in(key, _NO_SAMPLE)
-                plan = sampling.prepare(problem, own, devices)
+                plan = sampling.prepare(problem, trial_key, devices)
                 # Only fits leave something.
+                instead = None
                 if is_chosen and plan.left > MUCH_LEFT:
-                    sorted_instead = sorted_paths(problem, tol)
-                    if sorted_instead is not None:
-                        choice = (
-                            "sorted paths, since fitted value functions leave "
-                            f"{plan.left:.1%} of the standard error"
-                        )
-                        sampling = sorted_instead
-                        plan = sampling.prepare(problem, own, devices)
+                    instead = sorted_paths(problem, tol)
+                if instead is not None:
+                    why_sampling = (
+                        "sorted paths, since fitted value functions leave "
+                        f"{plan.left:.1%} of the standard error"
+                    )
+                    sampling = instead
+                    plan = sampling.prepare(problem, trial_key, devices)
         except ExpectationInterrupted:
             # Trial samples are not part of the estimate, and cannot be continued.
             raise KeyboardInterrupt from None
-        reason = "; ".join(filter(None, (choice, reason, plan.reason)))
-        reason = reason if start is None else start.reason
+        why = [why_sampling, why_law, plan.reason]
         plan = plan._replace(
-            reason=reason, roundings=problem.max_steps, bounded=problem.bounded
+            reason="; ".join(filter(None, why)) if start is None else start.reason,
+            roundings=problem.max_steps,
+            bounded=problem.bounded,
         )
         if start is not None and tol is None and plan.num_samples == MOST_SAMPLES:
             # Without `tol` the number of samples stays as it was.
@@ -232,12 +238,22 @@ def expectation(
     if isinstance(paths := plan.paths_of, FusedPaths):
         warn_of_stragglers(paths.stragglers, paths.lost, paths.count, stacklevel=2)
     _warn_of_rounding(estimate, problem)
+    # A part of an estimate is not warned of again.
     if start is None and first == 0 and has_kinks:
-        _warn_of_law(estimate, problem, jr.fold_in(key, _NO_SAMPLE), devices)
+        _warn_of_law(estimate, problem, trial_key, devices)
     return estimate
 
 
+def _may_choose_law(terms: PyTree, sampling: AbstractSampling | None) -> bool:
+    """Whether the user left the law of the increments open."""
+    # Value functions need discrete increments.
+    if isinstance(sampling, ValueFunctions):
+        return False
+    return any(isinstance(path, UnspecifiedPath) for path in brownian_paths(terms))
+
+
 def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampling:
+    """Raises a `ValueError` for what is no sampling, or for another than in `start`."""
     if not isinstance(sampling, AbstractSampling):
         raise ValueError(
             "`sampling` must be `IndependentPaths(num_paths)`, `ArrayRQMC()`, "
@@ -255,21 +271,20 @@ def _warn_of_law(
     estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: tuple
 ) -> None:
     """If phi is not smooth, discrete increments may change its mean."""
-    laws = [laws_of(path) or {} for path in random_paths(problem.terms)]
-    if not any(isinstance(law, Discrete) for each in laws for law in each.values()):
+    paths = random_paths(problem.terms)
+    laws = [law for path in paths for law in (laws_of(path) or {}).values()]
+    if not any(isinstance(law, Discrete) for law in laws):
         return
-    gaussian = ft.partial(own_path, problem.solver, "strong")
-    numbers = path_numbers(random_paths(problem.terms))
-    terms = with_paths(gaussian, numbers, problem.terms, key)
-    other = dataclasses.replace(problem, terms=terms)
-    plan = few_paths(other).prepare(other, key, devices)
+    gaussian_path = ft.partial(own_path, problem.solver, "strong")
+    terms = with_paths(gaussian_path, path_numbers(paths), problem.terms, key)
+    gaussian = dataclasses.replace(problem, terms=terms)
+    plan = few_paths(gaussian).prepare(gaussian, key, devices)
     trial = run(plan, key, devices)
-    pairs = zip(*map(jtu.tree_leaves, (estimate.mean, trial.mean)))
-    errors = zip(*map(jtu.tree_leaves, (estimate.std_error, trial.std_error)))
-    changes = [abs(one - two) for one, two in pairs]
-    beyond = [_SURE * np.hypot(one, two) for one, two in errors]
-    if any(np.any(x > y) for x, y in zip(changes, beyond)):
-        most = max(float(np.max(x, initial=0.0)) for x in changes)
+    change = jtu.tree_map(lambda x, y: np.abs(x - y), estimate.mean, trial.mean)
+    error = jtu.tree_map(np.hypot, estimate.std_error, trial.std_error)
+    is_beyond = jtu.tree_map(lambda x, y: np.any(x > _SURE * y), change, error)
+    if any(jtu.tree_leaves(is_beyond)):
+        most = max(float(np.max(x, initial=0.0)) for x in jtu.tree_leaves(change))
         warnings.warn(
             "`phi` is not smooth, and its mean changes by up to "
             f"{most:.1e} with Gaussian increments, which is more than the error of the "
@@ -288,9 +303,12 @@ def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
         return
     # Step sizes are rounded along with times, so errors of the same sign add up.
     fraction = float(numbers.eps) * problem.max_steps
-    rounding = lambda mean: fraction * np.abs(mean)
-    pairs = zip(jtu.tree_leaves(estimate.mean), jtu.tree_leaves(estimate.std_error))
-    if any(np.any(error <= 2 * rounding(mean)) for mean, error in pairs):
+
+    def is_near_rounding(mean: Any, error: Any) -> np.bool_:
+        return np.any(error <= 2 * (fraction * np.abs(mean)))
+
+    near = jtu.tree_map(is_near_rounding, estimate.mean, estimate.std_error)
+    if any(jtu.tree_leaves(near)):
         warnings.warn(
             "Rounding errors may be larger than the sampling error: over "
             f"{problem.max_steps:,} steps in {numbers.dtype} they are about {fraction:.0e} "

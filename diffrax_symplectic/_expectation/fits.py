@@ -1,7 +1,7 @@
 """Value functions, fitted backwards in time at the states of a pilot run."""
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,46 +11,53 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from .._custom_types import Y
 from .._root_finder import PicardNewton
 from .._solver import AbstractImplicitStages
-from .bases import AbstractBasis
-from .problem import ravel
-from .simulation import Paths
+from .bases import AbstractBasis, equal_weights, Value
+from .noise import Noise
+from .problem import Problem, ravel
+from .simulation import PathStates
 
 
-# The number of states over which second derivatives along the noise are averaged.
-_SECOND = 32
+# The states over which second derivatives along the noise are averaged.
+_STATES_FOR_SECOND = 32
 
 
-class Functions(eqx.Module):
+class FittedFunctions(eqx.Module):
     """The value functions of a level, one after each step, for each time at which to
     average (`S`) and each component of `phi` (`m`); and for each candidate (`C`), until one
-    is chosen."""
+    is chosen. For several levels there is another leading axis.
 
-    # With a leading axis of steps.
+    - `frames`: the coordinates of the basis, with a leading axis of steps.
+    - `coefficients`: of the functions of the basis, which are `size` many, with axes for
+        steps, `size`, `C`, `S` and `m`.
+    - `second`: second derivatives along the noise, from `Noise.second`, with axes for
+        steps, twice the random variables, `C`, `S` and `m`.
+    """
+
     frames: PyTree[Array]
-    coefficients: Float[Array, "steps P *C S m"]
-    # Second derivatives along the noise, from `Noise.second`.
-    second: Float[Array, "steps n n *C S m"] | None
+    coefficients: Float[Array, "..."]
+    second: Float[Array, "..."] | None
     basis: AbstractBasis = eqx.field(static=True)
 
-    def __call__(self, i, y: Y) -> Float[Array, "*C S m"]:
+    def __call__(self, i: Any, y: Y) -> Float[Array, "*C S m"]:
         """Their values at a state after step `i`."""
         frame = jtu.tree_map(lambda x: x[i], self.frames)
         return self.basis.combined(frame, ravel(y), self.coefficients[i])
 
-    def chosen(self, best: Int[np.ndarray, "S m"]) -> "Functions":
+    def chosen(self, best: Int[Array | np.ndarray, "S m"]) -> "FittedFunctions":
         """The functions with one candidate for each component."""
 
-        def take(c):
-            index = best.reshape(*[1] * (c.ndim - 2), *best.shape)
-            return jnp.take_along_axis(c, index, -3).squeeze(-3)
+        def take(x: Float[Array, "... C S m"]) -> Float[Array, "... S m"]:
+            index = best.reshape(*[1] * (x.ndim - 2), *best.shape)
+            return jnp.take_along_axis(x, index, -3).squeeze(-3)
 
-        c, second = jtu.tree_map(take, (self.coefficients, self.second))
-        return Functions(self.frames, c, second, self.basis)
+        coefficients = take(self.coefficients)
+        second = None if self.second is None else take(self.second)
+        return FittedFunctions(self.frames, coefficients, second, self.basis)
 
 
 def without_newton(solver: Any) -> Any:
@@ -74,84 +81,132 @@ def _is_implicit(x: Any) -> bool:
 
 
 def fit(
-    noise: Any, key: PRNGKeyArray, basis: AbstractBasis
-) -> tuple[Functions, Int[Array, ""]]:
+    noise: Noise, key: PRNGKeyArray, basis: AbstractBasis
+) -> tuple[FittedFunctions, Int[Array, ""]]:
     """The functions of a level, for its noise: a pilot run forward, and fits backward; and
     how many of the pilot's paths failed."""
-    p, level = noise.problem, noise.level
-    y0, unravel = jfu.ravel_pytree(p.y0)
-    steps, last = level.num_steps, p.max_steps
-    keys = jr.split(key, basis.pilots)
-    starts, states, good = _pilot(noise, keys)
-    if p.y0_of is not None:
-        y0 = jnp.mean(starts, axis=0)
-    # Coordinates are scaled by how far they move. (Dividing by the largest value first
-    # avoids underflow of squares in single precision.)
-    off = jnp.where(good[:, None], jnp.abs(states - y0), 0)
-    most = jnp.max(off, axis=(0, 1))
-    share = good.astype(y0.dtype) / jnp.maximum(jnp.sum(good), 1)
-    off = off / jnp.where(most > 0, most, 1)
-    unit = most * jnp.sqrt(jnp.einsum("n,ind->d", share, off**2) / steps)
-    frame = lambda i: basis.frame(states[i], good, unit)
+    p = noise.problem
+    num_steps = noise.level.num_steps
+    pilot = _pilot(noise, jr.split(key, basis.pilots))
+    unit = _unit(p, pilot, num_steps)
 
-    def fitted(i, u):
-        after = jnp.minimum(i + 1, steps - 1)
+    def frame(i: Any) -> PyTree[Array]:
+        return basis.frame(pilot.states[i], pilot.good, unit)
 
-        def value(x, key=None):
-            y = unravel(x)
-            draw = None if key is None else noise.draw(key, last + i)[0]
-            later = noise.mean(after, y, lambda y: u(after, y), draw)
-            phi = p.values(p.t0 + (i + 1) * level.h, y).astype(later.dtype)
-            here, before = level.saved_steps == i + 1, level.saved_steps > i + 1
-            return jnp.where(here[:, None], phi, jnp.where(before[:, None], later, 0))
-
+    def backward(j: Any, u: FittedFunctions) -> FittedFunctions:
+        i = num_steps - 1 - j
         own = frame(i)
-        return own, basis.fitted(value, own, states[i], good, keys)
+        target = _target(noise, u, i)
+        c = basis.fitted(target, own, pilot.states[i], pilot.good, pilot.keys)
+        put = lambda of_steps, of_step: of_steps.at[i].set(of_step)
+        frames = jtu.tree_map(put, u.frames, own)
+        return FittedFunctions(frames, put(u.coefficients, c), None, basis)
 
-    def backward(j, u):
-        i = steps - 1 - j
-        put = lambda all, one: all.at[i].set(one)
-        both = jtu.tree_map(put, (u.frames, u.coefficients), fitted(i, u))
-        return Functions(both[0], both[1], None, basis)
-
-    zeros = lambda s: jnp.zeros((last, *s.shape), s.dtype)
+    # Arrays have room for the most steps of a level, so that levels share one program.
+    zeros = lambda struct: jnp.zeros((p.max_steps, *struct.shape), struct.dtype)
     frames = jtu.tree_map(zeros, jax.eval_shape(lambda: frame(0)))
-    shape = last, basis.size, len(basis.candidates), *p.num_outputs
-    u = Functions(frames, jnp.zeros(shape, p.dtype), None, basis)
-    u = lax.fori_loop(0, steps, backward, u)
-
-    def kept(args):
-        i, few = args
-        return noise.second(i, jax.vmap(unravel)(few), lambda y: u(i, y))
-
-    # Some states before each step.
-    few = jnp.concatenate([starts[None], states[:-1]])[:, :_SECOND]
-    second = lax.map(kept, (jnp.arange(last), few))
-    return Functions(u.frames, u.coefficients, second, basis), jnp.sum(~good)
+    shape = p.max_steps, basis.size, len(basis.candidates), *p.num_outputs
+    u = FittedFunctions(frames, jnp.zeros(shape, p.dtype), None, basis)
+    u = lax.fori_loop(0, num_steps, backward, u)
+    second = _second(noise, pilot, u)
+    fitted = FittedFunctions(u.frames, u.coefficients, second, basis)
+    return fitted, jnp.sum(~pilot.good)
 
 
-def _pilot(noise: Any, keys: PRNGKeyArray):
-    """The states of the pilot's paths at the start and after each step, and which paths are
-    good."""
-    p, last = noise.problem, noise.problem.max_steps
+def _target(noise: Noise, u: FittedFunctions, i: Any) -> Value:
+    """What the functions after step `i` are fitted to, as a function of a flat state:
+    `phi` itself for the time at the end of this step, and for later times the mean over the
+    next step of the functions after it, which are known. For earlier times it is zero."""
+    p = noise.problem
+    level = noise.level
+    _, unravel = jfu.ravel_pytree(p.y0)
+    # After the last step there is no next one, whose mean is not used.
+    next_step = jnp.minimum(i + 1, level.num_steps - 1)
 
-    def forward(i, carry):
-        def one(y, args, key):
-            # With equal probabilities the pilot spreads further than the paths, so that
-            # the fit also holds for outliers.
-            x, _ = noise.draw(key, i, jnp.ones(()))
-            own = noise.with_args(args)
-            return own.step(i, y, own.fresh(i, y), x)
+    def value(x: Float[Array, " d"], key: PRNGKeyArray | None = None) -> Array:
+        y = unravel(x)
+        draw = None
+        if key is not None:
+            # Other numbers than those of the pilot's own steps.
+            draw, _ = noise.draw(key, p.max_steps + i)
+        later = noise.mean(next_step, y, lambda y1: u(next_step, y1), draw)
+        phi = p.values(p.t0 + (i + 1) * level.h, y).astype(later.dtype)
+        is_now = level.saved_steps == i + 1
+        is_later = level.saved_steps > i + 1
+        of_later = jnp.where(is_later[:, None], later, 0)
+        return jnp.where(is_now[:, None], phi, of_later)
 
+    return value
+
+
+def _second(
+    noise: Noise, pilot: "_Pilot", u: FittedFunctions
+) -> Float[Array, "steps n n C S m"] | None:
+    """Second derivatives of the functions along the noise, at some states before each
+    step."""
+    _, unravel = jfu.ravel_pytree(noise.problem.y0)
+
+    def of_step(step_and_states):
+        i, states = step_and_states
+        return noise.second(i, jax.vmap(unravel)(states), lambda y: u(i, y))
+
+    before = jnp.concatenate([pilot.starts[None], pilot.states[:-1]])
+    few = before[:, :_STATES_FOR_SECOND]
+    return lax.map(of_step, (jnp.arange(noise.problem.max_steps), few))
+
+
+class _Pilot(NamedTuple):
+    """Paths at whose states functions are fitted.
+
+    - `keys`: their random keys.
+    - `starts`: their states at the start.
+    - `states`: their states after each step.
+    - `good`: which of them did not fail.
+    """
+
+    keys: Key[Array, " n"]
+    starts: Float[Array, "paths d"]
+    states: Float[Array, "steps paths d"]
+    good: Bool[Array, " paths"]
+
+
+def _pilot(noise: Noise, keys: Key[Array, " n"]) -> _Pilot:
+    """The paths with these keys."""
+    p = noise.problem
+
+    def step(i: Any, y: Y, args: PyTree[Array], key: PRNGKeyArray):
+        # With equal probabilities the pilot spreads further than the paths, so that the fit
+        # also holds for outliers.
+        x, _ = noise.draw(key, i, jnp.ones(()))
+        own = noise.with_args(args)
+        y, _, success = own.step(i, y, own.fresh(i, y), x)
+        return y, success
+
+    def forward(i: Any, carry: tuple[PathStates, Array]) -> tuple[PathStates, Array]:
         paths, states = carry
-        y, _, success = jax.vmap(one)(paths.y, paths.args, keys)
+        each = jax.vmap(lambda *of_path: step(i, *of_path))
+        y, success = each(paths.y, paths.args, keys)
         paths = paths.moved(p, y, None, success)
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
-    y, args = jax.vmap(p.drawn)(keys)
-    paths = Paths.start(p, y, args, None)
+    # For a fit it is good enough that solvers start anew in each step.
+    paths = PathStates.start(p, jax.vmap(p.drawn)(keys), solver_state=None)
     starts = jax.vmap(ravel)(paths.y)
-    states = jnp.broadcast_to(starts, (last, *starts.shape))
+    states = jnp.broadcast_to(starts, (p.max_steps, *starts.shape))
     carry = paths, states
     paths, states = lax.fori_loop(0, noise.level.num_steps, forward, carry)
-    return starts, states, ~paths.failed
+    return _Pilot(keys, starts, states, ~paths.failed)
+
+
+def _unit(p: Problem, pilot: _Pilot, num_steps: Any) -> Float[Array, " d"]:
+    """How far each component moves: the root of the mean squared distance from the start
+    over all steps of good paths. Zero for components that do not move."""
+    start, _ = jfu.ravel_pytree(p.y0)
+    if p.y0_of is not None:
+        start = jnp.mean(pilot.starts, axis=0)
+    off = jnp.where(pilot.good[:, None], jnp.abs(pilot.states - start), 0)
+    # Dividing by the largest value first avoids underflow of squares in single precision.
+    most = jnp.max(off, axis=(0, 1))
+    off = off / jnp.where(most > 0, most, 1)
+    weights = equal_weights(pilot.good, start.dtype)
+    return most * jnp.sqrt(jnp.einsum("n,ind->d", weights, off**2) / num_steps)

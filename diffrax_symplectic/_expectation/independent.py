@@ -1,20 +1,19 @@
 """Independent paths: crude Monte Carlo."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Key
 
 from .._arguments import whole_number
 from .._terms import path_keys, with_keys
 from .problem import Level, Problem
 from .sampling import AbstractSampling, Samples, SamplingPlan, saved_by_name
-from .simulation import independent_steps, Paths, simulate
+from .simulation import independent_steps, Motion, simulate
 
 
 # The default sizes of a batch. On CPUs it keeps all cores busy and fits their caches.
@@ -55,7 +54,7 @@ class IndependentPaths(AbstractSampling):
         return SamplingPlan(sampler, self.num_paths, size)
 
 
-def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
+def _paths(p: Problem, keys: Key[Array, " n"]) -> Samples:
     """A sample is a path, with the same random key on all levels."""
     saved, failed = solved(p, keys)
     # A path that fails on several levels counts once.
@@ -64,14 +63,14 @@ def _paths(p: Problem, keys: PRNGKeyArray) -> Samples:
 
 
 def solved(
-    p: Problem, keys: PRNGKeyArray
+    p: Problem, keys: Key[Array, " n"]
 ) -> tuple[Float[Array, "levels S n m"], Bool[Array, "levels n"]]:
     """The values of `phi` for one path for each of several keys, at the times at which to
     average and on all levels, and which paths failed."""
     own_keys = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
     drawn = jax.vmap(p.drawn)(keys)
 
-    def begin(level: Level) -> tuple[Callable[[Any, Paths], Paths], Paths]:
+    def begin(level: Level) -> Motion:
         return independent_steps(
             p,
             level,
@@ -81,5 +80,5 @@ def solved(
             randomness=lambda i: own_keys,
         )
 
-    saved, failed, _ = simulate(p, begin)
-    return saved, failed
+    done = simulate(p, begin)
+    return done.saved, done.failed

@@ -26,12 +26,14 @@ def may_have_kinks(fn: Callable, y: PyTree) -> bool:
 
 
 def _contains(jaxpr: Jaxpr) -> bool:
+    """Whether a program contains such an operation on what depends on its inputs."""
     # What a function captures is constant in `y`.
-    depends = set(jaxpr.invars)
+    dependent = set(jaxpr.invars)
     for eqn in jaxpr.eqns:
-        if not any(not isinstance(x, Literal) and x in depends for x in eqn.invars):
+        variables = [x for x in eqn.invars if not isinstance(x, Literal)]
+        if not any(x in dependent for x in variables):
             continue
-        depends.update(eqn.outvars)
+        dependent.update(eqn.outvars)
         if eqn.primitive.name in _NOT_SMOOTH or any(map(_contains, programs_in(eqn))):
             return True
     return False

@@ -114,7 +114,7 @@ class Combination(enum.IntEnum):
 
 
 def level_weights(
-    order: float, levels: int
+    order: int | float, levels: int
 ) -> Float[np.ndarray, "combinations levels"]:
     r"""The combinations of the means with steps $h, h/2, h/4, \ldots$ that an
     [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$: the rows of
@@ -142,7 +142,7 @@ def level_weights(
     return np.stack(rows)
 
 
-def _extrapolated(order: float, levels: int) -> Float[np.ndarray, " levels"]:
+def _extrapolated(order: int | float, levels: int) -> Float[np.ndarray, " levels"]:
     """The weights of the means that add up to one, and cancel all error terms."""
     powers = np.append(0.0, order + min(order, 1) * np.arange(levels - 1))
     system = 2.0 ** -np.outer(powers, np.arange(levels))

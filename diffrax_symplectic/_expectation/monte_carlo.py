@@ -8,16 +8,17 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
 from .._arguments import check_real, check_takes, whole_number
 from .._compat import is_result
 from .._root_finder import all_finite
+from .call import checked_call, Meter, NO_METER
 from .estimate import Expectation
 from .independent import IndependentPaths
 from .moments import level_weights
 from .polynomials import tensordot
-from .run import checked_call, Meter, NO_METER, run
+from .run import run
 from .sampling import real, Samples
 
 
@@ -120,7 +121,9 @@ def monte_carlo(
 
 
 def _of_function(
-    fn: Callable, weights: Float[np.ndarray, "combinations levels"], keys: PRNGKeyArray
+    fn: Callable,
+    weights: Float[Array | np.ndarray, "combinations levels"],
+    keys: Key[Array, " n"],
 ) -> Samples:
     """A sample is a value of the function, with the same random key on all levels."""
     levels = weights.shape[1]

@@ -1,7 +1,8 @@
 """The loop over fixed steps that all samplings share."""
 
+import functools as ft
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,109 +13,173 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._custom_types import Y
 from .._root_finder import all_finite
-from .problem import Level, Problem
+from .problem import Drawn, Level, Problem
 
 
-class Paths(eqx.Module):
-    """Paths, along the first axis of each array."""
+class PathStates(eqx.Module):
+    """The states of many paths at one time, along the first axis of each array.
+
+    - `y`: the state of the equation.
+    - `solver_state`: the arrays of the solver's state.
+    - `failed`: which paths have failed. A failed path stays failed, and continues from
+        `y0`: otherwise stage equations without a solution would hold up the other paths in
+        every later step.
+    - `args`: the arrays of `args`, if each path has its own.
+    - `control`: the control variate, if any.
+    """
 
     y: Y
     solver_state: PyTree[Array]
-    # A failed path stays failed, and continues from `y0`: otherwise stage equations without
-    # a solution would hold up the other paths in every later step.
     failed: Bool[Array, " n"]
-    # The arrays of `args`, if each path has its own.
     args: PyTree[Array]
-    # The control variate, if any.
     control: Any
 
     @staticmethod
     def start(
-        p: Problem, y: Y, args: PyTree, state: PyTree[Array], control=None
-    ) -> "Paths":
-        """Paths that start at `y` with these `args`, both from `Problem.drawn`."""
-        failed = ~jax.vmap(all_finite)(y)
-        keep = lambda new, old: jnp.where(along(failed, new), old, new)
-        return Paths(jtu.tree_map(keep, y, p.y0), state, failed, args, control)
+        p: Problem, drawn: Drawn, solver_state: PyTree[Array], control: Any = None
+    ) -> "PathStates":
+        """Paths at the start."""
+        failed = ~jax.vmap(all_finite)(drawn.y0)
+        y = _kept_where(failed, p.y0, drawn.y0)
+        return PathStates(y, solver_state, failed, drawn.args, control)
 
-    def moved(self, p: Problem, y, state, success, control=None) -> "Paths":
+    def moved(
+        self,
+        p: Problem,
+        y: Y,
+        solver_state: PyTree[Array],
+        success: Bool[Array, " n"],
+        control: Any = None,
+    ) -> "PathStates":
         """The paths after a step to `y`, with failed paths reset."""
         failed = self.failed | ~success
-        keep = lambda new, old: jnp.where(along(failed, new), old, new)
-        state = jtu.tree_map(keep, state, self.solver_state)
-        y = jtu.tree_map(keep, y, p.y0)
-        return Paths(y, state, failed, self.args, control)
+        solver_state = _kept_where(failed, self.solver_state, solver_state)
+        y = _kept_where(failed, p.y0, y)
+        return PathStates(y, solver_state, failed, self.args, control)
+
+
+def _kept_where(failed: Bool[Array, " n"], old: PyTree, new: PyTree) -> PyTree:
+    """The new values, and the old ones for failed paths."""
+    keep = lambda new, old: jnp.where(along(failed, new), old, new)
+    return jtu.tree_map(keep, new, old)
+
+
+class Motion(NamedTuple):
+    """How the paths of a level move.
+
+    - `step`: maps the number of a step and the paths before it to those after it.
+    - `start`: the paths before step 0.
+    """
+
+    step: Callable[[Any, PathStates], PathStates]
+    start: PathStates
+
+
+class Simulated(NamedTuple):
+    """The paths of all levels.
+
+    - `saved`: what was measured after each saved step.
+    - `failed`: which paths have failed at the end.
+    - `control`: the control variates at the end.
+    """
+
+    saved: Float[Array, "levels S ..."]
+    failed: Bool[Array, "levels n"]
+    control: Any
+
+
+def _phi_itself(phi: Array, failed: Bool[Array, " n"]) -> Array:
+    del failed
+    return phi
 
 
 def simulate(
     p: Problem,
-    begin: Callable[[Level], tuple[Callable, Paths]],
-    measure: Callable[[Array, Bool[Array, " n"]], Array] = lambda phi, failed: phi,
-) -> tuple[Float[Array, "levels S ..."], Bool[Array, "levels n"], Any]:
-    """Solves all levels. For each level `begin` returns `step(i, paths)` and the initial
-    paths. Returns `measure(phi, failed)` after each saved step, which paths have failed at
-    the end, and their control variates."""
-
-    def on_level(level):
-        step, paths = begin(level)
-        n, (saves, m) = len(paths.failed), p.num_outputs
-
-        def recorded(i, paths: Paths, saved):
-            def record():
-                value = lambda y, args: p.with_args(args).values(p.t0 + i * level.h, y)
-                phi = jax.vmap(value)(paths.y, paths.args)
-                failed = paths.failed | ~jax.vmap(all_finite)(phi)
-                here = along(level.saved_steps == i, saved)
-                return failed, jnp.where(here, measure(phi, failed), saved)
-
-            # One predicate for all paths, so that `phi` is evaluated only after saved
-            # steps.
-            here = jnp.any(level.saved_steps == i)
-            failed, saved = lax.cond(here, record, lambda: (paths.failed, saved))
-            return eqx.tree_at(lambda e: e.failed, paths, failed), saved
-
-        def body(i, carry):
-            paths, saved = carry
-            return recorded(i + 1, step(i, paths), saved)
-
-        dtype = jax.eval_shape(lambda: p.values(p.t0, p.y0)).dtype
-        phi = jax.ShapeDtypeStruct((n, m), dtype)
-        shape = jax.eval_shape(measure, phi, paths.failed).shape
-        carry = recorded(0, paths, jnp.zeros((saves, *shape), dtype))
-        paths, saved = lax.fori_loop(0, level.num_steps, body, carry)
-        return saved, paths.failed, paths.control
-
+    begin: Callable[[Level], Motion],
+    measure: Callable[[Array, Bool[Array, " n"]], Array] = _phi_itself,
+) -> Simulated:
+    """Solves all levels. `measure(phi, failed)` is saved after each saved step."""
+    on_level = ft.partial(_on_level, p, begin, measure)
     if len(p.levels.h) == 1:
         return jtu.tree_map(lambda x: x[None], on_level(p.level(0)))
     # All levels share one compiled program.
     return lax.map(on_level, p.levels)
 
 
+def _on_level(
+    p: Problem, begin: Callable[[Level], Motion], measure: Callable, level: Level
+) -> Simulated:
+    """Solves one level."""
+    motion = begin(level)
+
+    def body(i, carry):
+        paths, saved = carry
+        return _recorded(p, level, measure, i + 1, motion.step(i, paths), saved)
+
+    saves, m = p.num_outputs
+    dtype = p.dtype_of_values
+    phi = jax.ShapeDtypeStruct((len(motion.start.failed), m), dtype)
+    measured = jax.eval_shape(measure, phi, motion.start.failed)
+    saved = jnp.zeros((saves, *measured.shape), dtype)
+    carry = _recorded(p, level, measure, 0, motion.start, saved)
+    paths, saved = lax.fori_loop(0, level.num_steps, body, carry)
+    return Simulated(saved, paths.failed, paths.control)
+
+
+def _recorded(
+    p: Problem,
+    level: Level,
+    measure: Callable,
+    i: Any,
+    paths: PathStates,
+    saved: Float[Array, "S ..."],
+) -> tuple[PathStates, Float[Array, "S ..."]]:
+    """Measures the paths after `i` steps, if this is a saved step. A path whose `phi` is
+    not finite has failed."""
+
+    def record():
+        def phi_of(y, args):
+            return p.with_args(args).values(p.t0 + i * level.h, y)
+
+        phi = jax.vmap(phi_of)(paths.y, paths.args)
+        failed = paths.failed | ~jax.vmap(all_finite)(phi)
+        # The same step may be saved twice.
+        here = along(level.saved_steps == i, saved)
+        return failed, jnp.where(here, measure(phi, failed), saved)
+
+    def pass_by():
+        return paths.failed, saved
+
+    # One predicate for all paths, so that `phi` is evaluated only after saved steps.
+    is_saved = jnp.any(level.saved_steps == i)
+    failed, saved = lax.cond(is_saved, record, pass_by)
+    return eqx.tree_at(lambda states: states.failed, paths, failed), saved
+
+
 def independent_steps(
     p: Problem,
     level: Level,
-    drawn: tuple[Y, PyTree],
-    terms_of: Callable,
-    randomness: Callable,
-) -> tuple[Callable[[Any, Paths], Paths], Paths]:
-    """The step of independent paths, and these paths at the start, `drawn` by
-    `Problem.drawn`. In step `i` each path has the terms `terms_of(r)`, with `r` its own row
-    of `randomness(i)`."""
+    drawn: Drawn,
+    terms_of: Callable[[Any], PyTree],
+    randomness: Callable[[Any], PyTree[Array]],
+) -> Motion:
+    """The motion of independent paths, whose starts were `drawn`. In step `i` each path has
+    the terms `terms_of(r)`, with `r` its own row of `randomness(i)`."""
 
     def step(i, paths):
-        def one(random, y, state, args):
-            return p.with_args(args).step(terms_of(random), i, level.h, y, state)
+        def one(random, y, solver_state, args):
+            own = p.with_args(args)
+            return own.step(terms_of(random), i, level.h, y, solver_state)
 
-        random = randomness(i)
-        new = jax.vmap(one)(random, paths.y, paths.solver_state, paths.args)
-        return paths.moved(p, *new)
+        states = paths.y, paths.solver_state, paths.args
+        y, solver_state, success = jax.vmap(one)(randomness(i), *states)
+        return paths.moved(p, y, solver_state, success)
 
     def start(random, y, args):
         return p.with_args(args).init(terms_of(random), 0, level.h, y)
 
-    y, args = drawn
-    state = jax.vmap(start)(randomness(0), y, args)
-    return step, Paths.start(p, y, args, state)
+    solver_state = jax.vmap(start)(randomness(0), drawn.y0, drawn.args)
+    return Motion(step, PathStates.start(p, drawn, solver_state))
 
 
 def along(mask: Bool[Array, " n"], x: Array) -> Array:

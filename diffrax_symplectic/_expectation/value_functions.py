@@ -7,9 +7,8 @@ $u$. For the exact $u$ the sum of these differences is $\\phi(y_N)$ minus its me
 
 import dataclasses
 import functools as ft
-import itertools
-import math
 import warnings
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,45 +16,40 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
 from .._arguments import check_untraced, whole_number
 from .._compat import quickly_compiled
 from .._lapack import lapack_in_turn
-from .._terms import number_of_noises
-from .bases import AbstractBasis, Hermite, Quadratic
-from .estimate import best_results
-from .fits import fit, Functions, without_newton
-from .grid import Grid
+from .bases import AbstractBasis
+from .basis_choice import chosen_basis, warn_of_long_fit
+from .controlled_paths import (
+    Choice,
+    controlled_paths,
+    laws_of_trials,
+    TrialLaw,
+    Usual,
+)
+from .estimate import best_results, Expectation
+from .fits import fit, FittedFunctions, without_newton
 from .moments import total
 from .noise import Noise
-from .polynomials import num_polynomials
 from .problem import Problem
 from .run import run
 from .sampling import (
     AbstractSampling,
     KindsWithControl,
     ROUNDING,
-    Samples,
     SamplingPlan,
     saved_by_name,
 )
-from .simulation import along, Paths, simulate
 
 
-# The most polynomials in a fit by default.
-_MOST_POLYNOMIALS = 130
-# By default a grid is used in up to this many dimensions, with the largest of these sizes
-# that memory and time allow: the most evaluations (points times outcomes) for one step of a
-# path, and for all steps.
-_GRID, _GRID_SIZES, _MOST_ENDS, _MOST = 2, (64, 32), 50_000, 2**25
-# Bytes that a fit may take, and the numbers it may compute before a warning that it will
-# take long (about a minute).
-_MOST_MEMORY, _OUT_OF_PROPORTION = 4 * 2**30, 2**31
-# The number folded into the key of trials, and the number of batches with wider noise.
-_TRIAL, _WIDE = 0xFFFFFFFE, 2
-# The most noises of which paths are pushed to all sides.
-_MOST_NOISES = 2
+# Folded into the key of a call to draw trials. (Numbers of levels, by which fits are drawn,
+# are smaller.)
+_TRIAL_KEY = 0xFFFFFFFE
+# A trial with wider noise has this many batches.
+_BATCHES_OF_WIDE_TRIAL = 2
 
 
 @saved_by_name
@@ -103,78 +97,188 @@ class ValueFunctions(AbstractSampling):
     )
 
     def prepare(self, problem, key, devices):
-        basis, (times, m) = _basis(problem, self.degree), problem.num_outputs
-        functions, shape = _fits(problem, key, basis), (len(problem.weights), times, m)
-        shapes = problem.shapes_of_samples(len(KindsWithControl))
-        never = np.zeros(shape), np.full(shape, np.inf)
-        narrow, *wider = _wider(problem)
-
-        def plan(best, used, n: int, usual=never, law=narrow):
-            usual = [x.astype(problem.dtype) for x in usual]
-            sampler = jtu.Partial(
-                _controlled_paths, problem, functions, best, used, usual, law
-            )
-            return SamplingPlan(sampler, n, self.batch_size, shapes=shapes, quick=True)
-
-        # The trials' paths are not part of the estimate.
-        trial = lambda *args: run(plan(*args), jr.fold_in(key, _TRIAL), devices)
-        flat = lambda tree, *axes: np.concatenate(
-            [np.reshape(x, (*axes, times, -1)) for x in jtu.tree_leaves(tree)], axis=-1
+        chosen = chosen_basis(problem, self.degree)
+        warn_of_long_fit(chosen, stacklevel=4)
+        basis = chosen.basis
+        trials = _Trials(
+            problem,
+            _fits(problem, key, basis),
+            outputs=problem.num_outputs,
+            shapes=problem.shapes_of_samples(len(KindsWithControl)),
+            key=jr.fold_in(key, _TRIAL_KEY),
+            devices=devices,
+            batch_size=self.batch_size,
         )
-        all_of, used = (lambda k: np.full((times, m), k)), np.ones((times, m), bool)
-        count = len(basis.candidates)
-        tried = [trial(all_of(k), used, self.batch_size) for k in range(count)]
-        errors = np.stack([flat(e.std_error) for e in tried])
-        errors = np.nan_to_num(errors, nan=np.inf)
-        best = np.argmin(errors, axis=0)
-        plain = flat(best_results(tried[0]).plain_std_error)
-        used = ~(np.min(errors, axis=0) >= plain)
-        if self.degree and not np.any(used):
+        own_law, *wider_laws = laws_of_trials(problem)
+        # One trial for each candidate, on the same paths.
+        candidates = range(len(basis.candidates))
+        tried = [trials.of_candidate(k, own_law) for k in candidates]
+        compared = _compared(tried, trials.outputs)
+        choice = compared.choice
+        if self.degree and not np.any(choice.used):
             warnings.warn(
                 f"`degree={self.degree}` is no better than no control variate, so none is "
                 "used. Pass another `degree`, or another `sampling`.",
                 stacklevel=4,
             )
         # Paths with wider noise estimate the deviations beyond the largest in the trial.
-        at = lambda tree, kind: flat(jtu.tree_map(lambda x: x[kind], tree), shape[0])
-        with_fit = np.stack([at(total(e.moments).largest, 0) for e in tried])
-        with_fit = np.take_along_axis(with_fit, best[None, None], 0)[0]
-        without = total(tried[0].moments)
-        usual = at(without.mean, 1), np.where(used, with_fit, at(without.largest, 1))
-        n = _WIDE * self.batch_size
-        wide = [trial(best, used, n, usual, law).moments for law in wider]
-        largest = lambda *means: ft.reduce(np.fmax, [x[3] for x in means])
-        far = jtu.tree_map(largest, *[total(x).mean for x in wide])
-        names = np.array([0, *basis.candidates])
-        chosen = ", ".join(map(str, np.unique(names[np.where(used, best + 1, 0)])))
-        among = ", ".join(map(str, np.unique(names)))
-        reason = f"{basis.kind}: {chosen}, chosen among {among}"
-        final = plan(best, used, self.num_paths, usual)
-        rounding = ROUNDING * jnp.finfo(problem.dtype).eps * np.abs(flat(tried[0].mean))
-        ratios = _ratios(np.min(errors, axis=0), plain, rounding)
-        left = np.max(ratios, initial=0.0)
-        return final._replace(reason=reason, far=far, left=float(left))
+        usual = _usual(tried, choice, trials.outputs, problem.dtype)
+        size = _BATCHES_OF_WIDE_TRIAL * self.batch_size
+        wide = [trials.run(choice, usual, law, size) for law in wider_laws]
+        return trials.plan(choice, usual, own_law, self.num_paths)._replace(
+            reason=_reason(basis, choice),
+            far=_largest_tails(wide),
+            left=compared.left(problem.dtype),
+        )
 
 
-def _ratios(errors: np.ndarray, plain: np.ndarray, rounding: np.ndarray) -> np.ndarray:
-    """Standard errors with control, as fractions of those without it, at most one; zero
-    where those are `rounding` errors only, as of a constant."""
-    random = plain > rounding
-    ratios = np.minimum(errors, plain) / np.where(random, plain, 1)
-    return np.where(random, ratios, 0)
+class _Trials(NamedTuple):
+    """What all trials of a problem share, and the estimate itself.
+
+    - `outputs`: the numbers of times at which to average and of components of `phi`.
+    - `shapes`: as in `SamplingPlan`.
+    - `key`: the random key of all trials, whose paths are not part of the estimate.
+    """
+
+    problem: Problem
+    functions: FittedFunctions
+    outputs: tuple[int, int]
+    shapes: PyTree[jax.ShapeDtypeStruct]
+    key: PRNGKeyArray
+    devices: tuple
+    batch_size: int
+
+    def plan(
+        self, choice: Choice, usual: Usual, law: TrialLaw, num_samples: int
+    ) -> SamplingPlan:
+        """The plan for paths whose noise has this law."""
+        fixed = self.problem, self.functions, choice, usual, law
+        return SamplingPlan(
+            jtu.Partial(controlled_paths, *fixed),
+            num_samples,
+            self.batch_size,
+            shapes=self.shapes,
+            quick=True,
+        )
+
+    def run(
+        self, choice: Choice, usual: Usual, law: TrialLaw, num_samples: int
+    ) -> Expectation:
+        """An estimate from this number of paths."""
+        plan = self.plan(choice, usual, law, num_samples)
+        return run(plan, self.key, self.devices)
+
+    def of_candidate(self, k: int, law: TrialLaw) -> Expectation:
+        """An estimate from one batch, with the same candidate for all components."""
+        choice = Choice(np.full(self.outputs, k), np.ones(self.outputs, bool))
+        # The same program estimates tails, but nothing is beyond these deviations.
+        shape = len(self.problem.weights), *self.outputs
+        dtype = self.problem.dtype
+        unlimited = Usual(np.zeros(shape, dtype), np.full(shape, np.inf, dtype))
+        return self.run(choice, unlimited, law, self.batch_size)
 
 
-def value_function(problem: Problem, key: PRNGKeyArray) -> Functions | None:
+def _flat(
+    tree: PyTree[np.ndarray | np.floating], outputs: tuple[int, int], *axes: int
+) -> np.ndarray:
+    """The arrays of a PyTree in the structure of `phi` as one array, with axes for times
+    and for components, behind these other axes."""
+    times, _ = outputs
+    leaves = [np.reshape(leaf, (*axes, times, -1)) for leaf in jtu.tree_leaves(tree)]
+    return np.concatenate(leaves, axis=-1)
+
+
+class _Compared(NamedTuple):
+    """The candidates, compared by their trials, with axes for times and components.
+
+    - `choice`: the best candidates, and where they are better than none.
+    - `errors`: the standard errors with them.
+    - `plain`: the standard errors without a control variate.
+    - `mean`: the mean.
+    """
+
+    choice: Choice
+    errors: np.ndarray
+    plain: np.ndarray
+    mean: np.ndarray
+
+    def left(self, dtype: Any) -> float:
+        """The largest fraction of a standard error that is left with control."""
+        # Where nothing is random, as of a constant, both errors are rounding errors.
+        is_random = self.plain > ROUNDING * jnp.finfo(dtype).eps * np.abs(self.mean)
+        errors = np.minimum(self.errors, self.plain)
+        fractions = errors / np.where(is_random, self.plain, 1)
+        return float(np.max(np.where(is_random, fractions, 0), initial=0.0))
+
+
+def _compared(tried: list[Expectation], outputs: tuple[int, int]) -> _Compared:
+    """Compares the candidates, each of which was tried alone."""
+    each = np.stack([_flat(estimate.std_error, outputs) for estimate in tried])
+    # A candidate without an error has failed.
+    each = np.nan_to_num(each, nan=np.inf)
+    errors = np.min(each, axis=0)
+    # Without control all trials are the same.
+    plain = _flat(best_results(tried[0]).plain_std_error, outputs)
+    # A fit is used where the error without it is NaN, too.
+    is_worse = errors >= plain
+    choice = Choice(np.argmin(each, axis=0), ~is_worse)
+    return _Compared(choice, errors, plain, _flat(tried[0].mean, outputs))
+
+
+def _usual(
+    tried: list[Expectation], choice: Choice, outputs: tuple[int, int], dtype: Any
+) -> Usual:
+    """The mean without control, and the largest deviation in the trials of what each
+    component uses."""
+    trials = [total(estimate.moments) for estimate in tried]
+    combinations = jtu.tree_leaves(trials[0].mean)[0].shape[1]
+
+    def of_kind(tree: PyTree[np.ndarray], kind: KindsWithControl) -> np.ndarray:
+        return _flat(jtu.tree_map(lambda x: x[kind], tree), outputs, combinations)
+
+    # Without control all trials are the same.
+    center = of_kind(trials[0].mean, KindsWithControl.PLAIN)
+    without = of_kind(trials[0].largest, KindsWithControl.PLAIN)
+    each = [of_kind(trial.largest, KindsWithControl.CONTROLLED) for trial in trials]
+    best = np.asarray(choice.best)[None, None]
+    with_fit = np.take_along_axis(np.stack(each), best, 0)[0]
+    largest = np.where(choice.used, with_fit, without)
+    return Usual(center.astype(dtype), largest.astype(dtype))
+
+
+def _largest_tails(wide: list[Expectation]) -> PyTree[np.ndarray]:
+    """The largest deviations in the tails, over trials by several laws."""
+
+    def largest(*means: np.ndarray) -> np.ndarray:
+        # A trial without a value is ignored.
+        return ft.reduce(np.fmax, [mean[KindsWithControl.TAILS] for mean in means])
+
+    return jtu.tree_map(largest, *[total(estimate.moments).mean for estimate in wide])
+
+
+def _reason(basis: AbstractBasis, choice: Choice) -> str:
+    """Which candidates were chosen, with zero for none."""
+    names = np.array([0, *basis.candidates])
+    chosen = np.unique(names[np.where(choice.used, choice.best + 1, 0)])
+    return (
+        f"{basis.kind}: {', '.join(map(str, chosen))}, chosen among "
+        f"{', '.join(map(str, np.unique(names)))}"
+    )
+
+
+def value_function(problem: Problem, key: PRNGKeyArray) -> FittedFunctions | None:
     """A quadratic value function for each level, or `None` if the random variables do not
     have finitely many outcomes."""
     try:
-        basis = _basis(problem, 2)
+        chosen = chosen_basis(problem, 2)
     except ValueError:
         return None
-    return _fits(problem, key, basis).chosen(np.zeros(problem.num_outputs, int))
+    warn_of_long_fit(chosen, stacklevel=5)
+    functions = _fits(problem, key, chosen.basis)
+    return functions.chosen(np.zeros(problem.num_outputs, int))
 
 
-def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> Functions:
+def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> FittedFunctions:
     """The fits of all levels."""
     lean = dataclasses.replace(problem, solver=without_newton(problem.solver))
     functions, lost = _fits_by(lean, key, basis)
@@ -187,7 +291,7 @@ def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> Function
 
 def _fits_by(
     problem: Problem, key: PRNGKeyArray, basis: AbstractBasis
-) -> tuple[Functions, int]:
+) -> tuple[FittedFunctions, int]:
     """The fits of all levels, and how many of the pilot's paths failed."""
     count = len(problem.levels.h)
     each = [_fitted(problem, np.array([k]), key, basis) for k in range(count)]
@@ -203,114 +307,9 @@ def _fits_by(
 @lapack_in_turn
 def _fitted(
     problem: Problem, index: Int[Array, "1"], key: PRNGKeyArray, basis: AbstractBasis
-) -> tuple[Functions, Int[Array, ""]]:
+) -> tuple[FittedFunctions, Int[Array, ""]]:
     """The fit of the level with this index, with a leading axis of levels, and how many of
     the pilot's paths failed."""
     level = problem.level(index[0])
     own, lost = fit(Noise.of(problem, level), jr.fold_in(key, index[0]), basis)
     return jtu.tree_map(lambda x: x[None], own), lost
-
-
-def _basis(p: Problem, degree: int | None) -> AbstractBasis:
-    """Raises a `ValueError` if the fit needs too much memory, or for random variables
-    without finitely many outcomes."""
-    points = len(Noise.of(p, p.level(0)).nodes()[1])
-    d, levels = sum(x.size for x in jtu.tree_leaves(p.y0)), len(p.levels.h)
-    outputs, item = levels * p.max_steps * math.prod(p.num_outputs), p.dtype.itemsize
-    many = num_polynomials(d, 2) > _MOST_POLYNOMIALS
-    steps = int(np.sum(p.levels.num_steps))
-    if degree is None:
-        for size in _GRID_SIZES if d <= _GRID else ():
-            grid = Grid(d, (size,))
-            memory, ends = 2 * item * grid.size * outputs, size**d * points
-            if memory <= _MOST_MEMORY and ends <= _MOST_ENDS and ends * steps <= _MOST:
-                return grid
-        few = [k for k in range(1, 9) if num_polynomials(d, k) <= _MOST_POLYNOMIALS]
-        # Drop degrees whose fit would take too long.
-        cheap = lambda k: Hermite(d, (k,)).sites * points * steps <= _MOST
-        few = [k for k in few if k <= 2 or cheap(k)]
-        degrees = (1, 2) if many else (*(k for k in few[:-1] if k % 2 == 0), few[-1])
-    else:
-        degrees = (whole_number("degree", degree, 0),)
-    basis = Quadratic(d, degrees) if many and degrees[-1] <= 2 else Hermite(d, degrees)
-    if isinstance(basis, Hermite):
-        need = item * basis.size * (basis.pilots + len(degrees) * outputs)
-        if need > _MOST_MEMORY:
-            raise ValueError(
-                f"`degree={degree}` has {basis.size:,} polynomials in {d} dimensions, and "
-                f"its fit needs {need / 2**30:,.0f} GiB. Pass a smaller `degree`."
-            )
-    numbers = basis.sites * points * steps * d
-    if numbers > _OUT_OF_PROPORTION:
-        warnings.warn(
-            f"The fit of `ValueFunctions` takes as long as {basis.sites * points:,} "
-            "independent paths. If fewer paths are accurate enough, pass "
-            "`sampling=IndependentPaths(num_paths)`.",
-            stacklevel=5,
-        )
-    return basis
-
-
-def _wider(p: Problem) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Laws of the noise, as factors of `Noise.share` and of `Noise.tilt`: its own, a wider
-    one, and for one noise or two those in which each noise pushes to one side."""
-    m, n = number_of_noises(p.terms), len(Noise.of(p, p.level(0)).laws)
-    sides = [*itertools.product((-1, 1), repeat=m)] if m <= _MOST_NOISES else []
-    pushed = [(0, [*side, *[0] * (n - m)]) for side in sides]
-    laws = [(0, [0] * n), (1, [0] * n), *pushed]
-    return [(np.array(a, p.dtype), np.array(b, p.dtype)) for a, b in laws]
-
-
-def _controlled_paths(
-    p: Problem, functions: Functions, best, used, usual, law, keys: PRNGKeyArray
-) -> Samples:
-    """A sample is a path minus the control variate of `functions` (with a leading axis of
-    levels), by their `best` candidates, where they are `used`. With a wider
-    `law` (see `_wider`) deviations beyond the `usual` ones are estimated: the mean without
-    control, and the largest deviation."""
-    functions = functions.chosen(best)
-    n, (center, beyond) = len(keys), [x[:, :, None] for x in usual]
-    share, side = law
-    drawn = jax.vmap(p.drawn)(keys)
-
-    def begin(level):
-        noise, u = Noise.of(p, level), jtu.tree_map(lambda x: x[level.index], functions)
-
-        def step(i, paths):
-            at, second = lambda y: u(i, y), jtu.tree_map(lambda x: x[i], u.second)
-
-            def one(y, state, args, key):
-                x, log_ratio = noise.draw(
-                    key, i, share * noise.share, side * noise.tilt
-                )
-                own = noise.with_args(args)
-                return own.advance(i, y, state, at, second, x), log_ratio
-
-            given = paths.y, paths.solver_state, paths.args, keys
-            after, log_ratio = jax.vmap(one)(*given)
-            y, state, success, value, change = after
-            # A failed path has no value, but its control must be finite.
-            change = jnp.where(along(success, change), change, 0)
-            control, promised, ratios = paths.control
-            promised = jnp.where(i == 0, value - change, promised)
-            control = control + jnp.where(used, change, 0), promised, ratios + log_ratio
-            return paths.moved(p, y, state, success, control)
-
-        dtype = jax.eval_shape(lambda: u(0, p.y0)).dtype
-        state = jax.vmap(lambda y, args: noise.with_args(args).fresh(0, y))(*drawn)
-        zero = jnp.zeros((n, *p.num_outputs), dtype)
-        return step, Paths.start(p, *drawn, state, (zero, zero, jnp.zeros(n, dtype)))
-
-    saved, failed, (*known, log_ratio) = simulate(p, begin)
-    control, promised = (jnp.swapaxes(x, 1, 2).astype(saved.dtype) for x in known)
-    promised = jnp.where(along(p.levels.saved_steps[0] == 0, saved[0]), saved, promised)
-    each = saved - control, saved, control, promised
-    left, plain, control, promised = map(p.combined, each)
-    off = jnp.abs(left - jnp.where(used[:, None], promised, center))
-    # Deviations must exceed rounding.
-    beyond = beyond + ROUNDING * jnp.finfo(off.dtype).eps * jnp.abs(plain)
-    # Cap ratios at one: paths that are likelier without wider noise are seen without it.
-    ratio = jnp.exp(-jnp.maximum(jnp.sum(log_ratio, axis=0), 0))[:, None]
-    far, lost = jnp.where(off > beyond, ratio * off, 0), jnp.any(failed, axis=0)
-    kinds = [left, plain, control, far]
-    return Samples(p.averaged(kinds), ~lost, lost)

@@ -148,6 +148,8 @@ def _log1p(a):
 
 
 def _tan(a):
+    # Dr.Jit's own in double precision is off by up to 5e-9 of the value, for angles between
+    # 4e-8 and 1e-4. The quotient is right to three units in the last place.
     sine, cosine = drjit().sincos(a)
     return sine / cosine
 
@@ -184,29 +186,44 @@ def _rsqrt(a):
     return 1 / drjit().sqrt(a)
 
 
-# Dr.Jit's own versions of these three have single precision on GPUs.
+# Dr.Jit's own versions of `sinh`, `cosh` and `tanh` have single precision on GPUs.
+
+
+def _half_exp(a):
+    """Half of the exponential, which is finite also where the exponential overflows."""
+    # Its error is that of the root twice, so it serves only there.
+    root = drjit().exp(a / 2)
+    return root / 2 * root
 
 
 def _sinh(a):
     dr = drjit()
-    grown = _expm1(dr.abs(a))
+    size = dr.abs(a)
+    grown = _expm1(size)
     # Where the exponential overflows, the quotient is NaN.
-    size = dr.select(dr.isinf(grown), grown, (grown + grown / (grown + 1)) / 2)
-    return dr.copysign(size, a)
+    value = dr.select(
+        dr.isinf(grown), _half_exp(size), (grown + grown / (grown + 1)) / 2
+    )
+    return dr.copysign(value, a)
 
 
 def _cosh(a):
-    exp = drjit().exp(drjit().abs(a))
-    return exp / 2 + 0.5 / exp
+    dr = drjit()
+    size = dr.abs(a)
+    exp = dr.exp(size)
+    return dr.select(dr.isinf(exp), _half_exp(size), exp / 2 + 0.5 / exp)
 
 
 def _tanh(a):
-    # Of a negative number the exponential does not overflow.
+    # On CPUs Dr.Jit's own is as accurate, but gives 0 for -0, and in single precision -1
+    # and 1 have different values. Of a negative number the exponential does not overflow.
     shrunk = _expm1(-2 * drjit().abs(a))
     return drjit().copysign(-shrunk / (shrunk + 2), a)
 
 
 def _atanh(a):
+    # On CPUs Dr.Jit's own is right to 1.2 units in the last place, and this to 2. On GPUs
+    # Dr.Jit's has not been measured, and this passes the tests.
     return (_log1p(a) - _log1p(-a)) / 2
 
 
@@ -245,7 +262,11 @@ def _arithmetic_shift(a, b):
 
 
 def _round_half_away(a):
-    return drjit().trunc(a + drjit().copysign(type(a)(0.5), a))
+    dr = drjit()
+    # The sum of `a` and one half is rounded itself. The fraction that is compared is exact.
+    whole = dr.trunc(a)
+    away = whole + dr.copysign(type(a)(1), a)
+    return dr.select(dr.abs(a - whole) >= 0.5, away, whole)
 
 
 def _square(a):

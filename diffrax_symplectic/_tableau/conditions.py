@@ -69,8 +69,9 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     **Returns:** a dictionary from the formula of each condition to its residual. Order 2
     includes the conditions for order 1.
 
-    **Raises:** a `ValueError` for any other order, for other tableaus, or for random
-    variables of unknown variance.
+    **Raises:** a `ValueError` for any other order, for other tableaus, for random variables
+    of unknown variance, or for a `GeneralTableau` whose `noise` is not `"W"`, alone or with
+    `"A"` or `"L"`.
 
     **Source:** [Rößler (2007)](https://doi.org/10.1007/s10543-007-0130-3) for Stratonovich
     equations, [Rößler (2009)](https://doi.org/10.1137/060673308) for Itô equations.
@@ -98,7 +99,8 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
 
     **Returns:** a dictionary from the formula of each condition to its residual.
 
-    **Raises:** a `ValueError` for other tableaus, or random variables of unknown variance.
+    **Raises:** a `ValueError` for other tableaus, for random variables of unknown variance,
+    or for a `GeneralTableau` whose `noise` is not `"W"`, alone or with `"A"` or `"L"`.
 
     **Source:** [Burrage and Burrage (2000)](https://doi.org/10.1137/S0036142999363206) for
     general tableaus; [Rößler (2010)](https://doi.org/10.1137/09076636X) for the others.
@@ -141,6 +143,7 @@ def _strong(tableau: AbstractTableau) -> dict:
 
 @_strong.register
 def _(tableau: GeneralTableau) -> dict:
+    _check_noise(tableau)
     return {
         "alpha.e - 1": tableau.alpha.sum() - 1,
         "beta.e - 1": tableau.beta.sum() - 1,
@@ -202,6 +205,7 @@ def _weak(tableau: AbstractTableau) -> _Weak:
 
 @_weak.register
 def _(tableau: GeneralTableau) -> _Weak:
+    _check_noise(tableau)
     # Short names, for formulas that can be compared with their keys.
     al = tableau.alpha
     be = tableau.beta
@@ -310,6 +314,20 @@ def _(tableau: AdditiveTableau) -> _Weak:
     if not tableau.constant:
         second["beta[W].c1 - 1/2"] = tableau.beta["W"] @ tableau.c1 - 1 / 2
     return _Weak(first, second)
+
+
+def _check_noise(tableau: GeneralTableau) -> None:
+    """Raises a `ValueError` unless the increment drives the noise of a general tableau."""
+    # All variables share the weights. So another one that multiplies the noise itself would
+    # add to the increment, and change all moments that the conditions are made of. Those
+    # that multiply brackets are of higher order, and are counted where they matter.
+    noise_itself = [name for name in tableau.noise if drives(name) == "noise"]
+    if noise_itself != ["W"]:
+        raise ValueError(
+            "The conditions are known for general tableaus whose noise has the random "
+            f'variable "W", alone or with "A" or "L"; got `noise={tableau.noise}`. To '
+            "measure the order of any solver use `weak_order_defect`."
+        )
 
 
 def _others_vanish(beta: Mapping[str, np.ndarray], **moments: np.ndarray) -> dict:

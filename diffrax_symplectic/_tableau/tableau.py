@@ -24,6 +24,11 @@ Structure: TypeAlias = Literal[
     "any", "separable", "additive", "constant", "separable and constant"
 ]
 
+# The names of the random variables of a step. Their records, `VARIABLES` of `_brownian`,
+# hold Brownian paths, and thus JAX, of which this module knows nothing. A test compares the
+# names.
+NOISE_VARIABLES = ("W", "H", "C", "sign", "A", "L", "second", "third", "two_point")
+
 
 class Stage(NamedTuple):
     """One evaluation, `y -> sum over channels of (vector field times control)`.
@@ -186,9 +191,13 @@ class GeneralTableau(AbstractTableau):
     `(s, s)`, `B0` of shape `(s, r)`, `A1` of shape `(r, s)`, `B1` of shape `(r, r)`;
     `noise`, the random variables that drive the noise stages: `("W",)` for $I_k$,
     `("W", "A")` for the vector field of [`diffrax_symplectic.LevyAreaMidpoint`][], or
-    `("W", "L")` for the vector field of [`diffrax_symplectic.PlateauGauss`][].
+    `("W", "L")` for the vector field of [`diffrax_symplectic.PlateauGauss`][]. All names
+    share one set of noise stages and weights: a stage evaluates the sum, over the names, of
+    the vector fields that each multiplies. The conditions on orders are known with `"W"`
+    alone, or `"W"` with variables that multiply brackets, `"A"` or `"L"`.
 
-    **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
+    **Raises:** a `ValueError` for other shapes, numbers that are not real and finite, or
+    random variables that are not known.
     """
 
     structure: ClassVar[Structure] = "any"
@@ -207,6 +216,12 @@ class GeneralTableau(AbstractTableau):
             raise ValueError(
                 '`noise` must hold the names of random variables, as in `("W",)`; got '
                 f"{self.noise!r}."
+            )
+        unknown = [name for name in self.noise if name not in NOISE_VARIABLES]
+        if unknown:
+            raise ValueError(
+                f"`noise` must hold names among {', '.join(map(repr, NOISE_VARIABLES))}; "
+                f"got {', '.join(map(repr, unknown))}."
             )
         object.__setattr__(self, "noise", tuple(self.noise))
         # The weights say how many stages there are, since each stage has one.

@@ -185,6 +185,11 @@ def lifted_terms(
     """The terms of Hamiltonians in `chart((p, q))`, a variable called `name`."""
     check_takes("H0", H0, "t", name, "args")
     if noise is None:
+        if path is not None:
+            raise ValueError(
+                f"`noise` must be a function, called as `noise(t, {name}, args)`; got "
+                "None. Without noise, leave out `path`, too."
+            )
         lifted = None
     elif isinstance(noise, IndexedNoise):
         # Still one noise at a time, for the solvers that follow one after another.

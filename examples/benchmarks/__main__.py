@@ -4,6 +4,7 @@ from . import (
     calls,
     ensemble,
     growth,
+    many_paths,
     members,
     speed,
     step_sizes,
@@ -18,6 +19,7 @@ def main() -> None:
     calls.main()
     ensemble.main()
     growth.main()
+    many_paths.main()
     step_sizes.main()
     tolerance.main()
     members.main()

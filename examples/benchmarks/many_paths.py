@@ -10,7 +10,7 @@ cores, and does not count other programs that take turns on them.
 import functools as ft
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -109,23 +109,32 @@ def measured(name: str, way: str) -> list[float]:
     return found
 
 
+# From the name of a system and the way to the nanoseconds for each of `NUMBERS`.
+Table: TypeAlias = dict[tuple[str, str], list[float]]
+
+
 def main() -> None:
+    write({(name, way): measured(name, way) for name in SYSTEMS for way in WAYS})
+
+
+def write(table: Table) -> None:
     heads = " | ".join(f"{number:,}" for number in NUMBERS)
     rows = [
-        f"# Many paths\n\nProcessor nanoseconds per path and step, by the number of paths, "
-        f"with the call around them. {machine()}. float64, best of {ROUNDS} calls. "
-        "`ArrayRQMC` has these paths in two replicates; it takes no chain without "
-        "`sort_by`. Made by `python -m examples.benchmarks.many_paths`.\n",
+        "# Many paths\n\nProcessor nanoseconds per path and step, by the number of paths. "
+        f"{machine()}. float64, best of {ROUNDS} calls, each of {LEAST_STEPS} to "
+        f"{MOST_STEPS} steps, with the time of the call around them, which counts where "
+        f"paths are few. `ArrayRQMC` takes these paths in {REPLICATES} replicates. Made by "
+        "`python -m examples.benchmarks.many_paths`.\n",
         f"| system | | {heads} |",
         "|---" * (2 + len(NUMBERS)) + "|",
     ]
     fig, axes = plt.subplots(2, 3, figsize=(9, 5), sharex=True, layout="constrained")
     for name, ax in zip(SYSTEMS, axes.flat):
         for way in WAYS:
-            if ns := measured(name, way):
-                shown = " | ".join(f"{x:.1f}" for x in ns)
+            if nanoseconds := table.get((name, way)):
+                shown = " | ".join(f"{x:.1f}" for x in nanoseconds)
                 rows.append(f"| {name} | {way} | {shown} |")
-                ax.loglog(NUMBERS, ns, "o-", markersize=3, label=way.strip("`"))
+                ax.loglog(NUMBERS, nanoseconds, "o-", ms=3, label=way.strip("`"))
         ax.set_title(name.replace("`", ""), fontsize=8)
         ax.set_ylim(1, None)
     axes[0, 0].legend(frameon=False, fontsize=7)

@@ -307,6 +307,12 @@ def test_many_coordinates_are_sorted_by_a_fitted_function():
     phi = lambda t, y, args: jnp.sum(y[-2:])
     got = _estimate(diffrax.Heun(), terms, phi, y0=jnp.ones(12), dt0=0.25)
     assert "sorted by a fitted value function" in got.reason
+    # Neither way to sort has a variance.
+    with pytest.warns(UserWarning, match="by 12 coordinates|samples are equal"):
+        constant = _estimate(
+            diffrax.Heun(), terms, lambda t, y, args: t, y0=jnp.ones(12), dt0=0.25
+        )
+    assert constant.mean == 1 and constant.reason == ""
     plain = np.sqrt(2 * np.exp(0.6) / 1024)
     assert got.std_error < plain / 4
 

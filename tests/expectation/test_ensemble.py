@@ -280,9 +280,3 @@ def test_bad_arguments_are_refused(kwargs, message):
 def test_it_is_no_part_of_a_jax_program():
     with pytest.raises(ValueError, match="^`ensemble` cannot run inside JAX"):
         eqx.filter_jit(lambda q: follow(y0=(ONE[0], q)).ys)(ONE[1])
-
-
-def test_events_lead_to_monte_carlo():
-    event = diffrax.Event(lambda t, y, args, **kwargs: y[0] > 1)
-    with pytest.raises(TypeError, match="`ensemble` takes no `event`.*`monte_carlo`"):
-        follow(event=event)

@@ -1,6 +1,7 @@
 """What `expectation` cannot do is refused with advice that fits."""
 
 import functools as ft
+import inspect
 
 import diffrax
 import jax
@@ -71,10 +72,19 @@ def test_only_the_key_of_a_path_is_replaced():
     assert not np.array_equal(new[1]["old"], old)
 
 
-def test_arguments_of_other_solves_lead_to_monte_carlo():
-    path = ds.WeakBrownianPath((), jr.key(0))
-    with pytest.raises(TypeError, match="takes no `event`.*`monte_carlo`"):
-        _mean(path, event=diffrax.Event(lambda t, y, args, **kwargs: y[0] > 1))
+@pytest.mark.parametrize("function", [ds.expectation, ds.ensemble, ds.monte_carlo])
+def test_type_checkers_see_arguments_that_do_not_exist(function):
+    kinds = [x.kind for x in inspect.signature(function).parameters.values()]
+    assert not {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL} & {
+        *kinds
+    }
+
+
+@pytest.mark.parametrize("function", [ds.expectation, ds.ensemble])
+def test_whoever_looks_for_events_finds_monte_carlo(function):
+    paragraphs = function.__doc__.split("\n\n")
+    (events,) = [text for text in paragraphs if "vents" in text]
+    assert "diffrax_symplectic.monte_carlo" in events
 
 
 def test_times_between_steps_are_told_in_few_words_with_the_advice_first():

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation import value_functions
+from diffrax_symplectic._expectation import basis_choice, value_functions
+from diffrax_symplectic._expectation.basis_choice import chosen_basis
 from diffrax_symplectic._expectation.choose import choose
 from diffrax_symplectic._expectation.estimate import best_results
 from diffrax_symplectic._expectation.noise import Noise
 from diffrax_symplectic._expectation.problem import Problem
-from diffrax_symplectic._expectation.value_functions import _basis
 from diffrax_symplectic._terms import outcomes, step_variables
 
 from ..problems import kubo_terms, RecordingMeter
@@ -387,13 +387,13 @@ def test_from_an_interrupted_trial_nobody_is_told_to_go_on(monkeypatch):
 
 
 def test_a_fit_that_would_take_long_is_coarser_or_told(monkeypatch):
-    at = lambda steps: _basis(
+    at = lambda steps: chosen_basis(
         Problem.of(SQUARE, PENDULUM, VERLET, 0, 1, 1 / steps, Y0, None, None, 1), None
     )
-    sites = [at(steps).sites for steps in (100, 10_000, 100_000)]
+    sites = [at(steps).basis.sites for steps in (100, 10_000, 100_000)]
     assert sites == sorted(sites, reverse=True) and len(set(sites)) == 3
     assert 100_000 * 3 * sites[-1] < 2**27
-    monkeypatch.setattr(value_functions, "_OUT_OF_PROPORTION", 1000)
+    monkeypatch.setattr(basis_choice, "_OUT_OF_PROPORTION", 1000)
     with pytest.warns(UserWarning, match="takes as long as .* independent paths"):
         _estimate(ds.ValueFunctions(2, 64))
 

@@ -204,6 +204,34 @@ def test_a_replayed_operation_gives_what_jax_gives(name, dtype):
         assert_close(actual, exact, ulps)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["f32", "f64"])
+def test_rounding_away_from_zero_is_exact_where_half_cannot_be_added(dtype):
+    info = np.finfo(dtype)
+    # The spacing of numbers is one, and half a number more would be rounded itself.
+    ones = 2.0**info.nmant + np.array([1, 3])
+    below_half = np.nextafter(dtype(0.5), dtype(0))
+    x = np.array([*ones, below_half, 0.5, 1.5, np.inf], dtype)
+    exact = np.array([*ones, 0, 1, 2, np.inf], dtype)
+    fn = lambda x: lax.round(x, lax.RoundingMethod.AWAY_FROM_ZERO)
+    (rounded,) = replayed(fn, np.concatenate([x, -x]))
+    np.testing.assert_array_equal(rounded, np.concatenate([exact, -exact]))
+
+
+@pytest.mark.parametrize(
+    "dtype, x", [(np.float32, 89.0), (np.float64, 710.2)], ids=["f32", "f64"]
+)
+def test_hyperbolic_functions_are_finite_where_the_exponential_is_not(dtype, x):
+    x = np.array([x, -x], dtype)
+    size = np.exp(np.abs(x).astype(np.longdouble)) / 2
+    info = np.finfo(dtype)
+    assert np.all(info.max / 2 < size) and np.all(size < info.max)
+    hardware = dtype == np.float32 and jax.default_backend() != "cpu"
+    rtol = 2e-5 if hardware else 8 * info.eps
+    for fn, exact in ((jnp.cosh, size), (jnp.sinh, np.sign(x) * size)):
+        (actual,) = replayed(fn, x)
+        np.testing.assert_allclose(actual, exact.astype(dtype), rtol=rtol)
+
+
 def test_the_inverse_error_function_is_one_to_rounding_in_its_tails():
     x = np.concatenate([s * (1 - 10.0 ** -np.linspace(1, 15, LANES)) for s in (-1, 1)])
     (y,) = replayed(lax.erf_inv, x)

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._brownian import VARIABLES
 from diffrax_symplectic._tableau import Block, make_plan
+from diffrax_symplectic._tableau.tableau import NOISE_VARIABLES
 from examples._srkw2 import PaperSRKw2, srkw2_tableau
 
 
@@ -180,6 +182,24 @@ def test_noise_of_a_tableau_is_a_tuple_of_names():
     for wrong in ("W", [0]):
         with pytest.raises(ValueError, match="`noise` must hold the names"):
             ds.GeneralTableau(**one, noise=wrong)
+    with pytest.raises(ValueError, match="names among 'W', .*; got 'bogus'."):
+        ds.GeneralTableau(**one, noise=("W", "bogus"))
+    # Tableaus know no JAX, so they have a list of their own.
+    assert set(NOISE_VARIABLES) == set(VARIABLES)
+
+
+@pytest.mark.parametrize(
+    "noise", [("W", "H"), ("H",), ("A",), ("W", "W"), ("two_point",)], ids=repr
+)
+def test_general_conditions_are_refused_unless_the_increment_drives_the_noise(noise):
+    tableau = dataclasses.replace(ds.SRKw2().tableau, noise=noise)
+    for residuals in (
+        ds.strong_order_residuals,
+        lambda x: ds.weak_order_residuals(x, 1),
+        lambda x: ds.weak_order_residuals(x, 2),
+    ):
+        with pytest.raises(ValueError, match=r'variable "W", .*weak_order_defect'):
+            residuals(tableau)
 
 
 def test_tableaus_know_nothing_of_jax():

@@ -206,6 +206,10 @@ def test_hamiltonians_that_return_complex_numbers_are_refused():
         ds.wave_terms(lambda t, p, q, args: 0.0, each, path)
     with pytest.raises(ValueError, match=r"called as `noise\(t, psi, args\)`"):
         ds.wave_terms(wrong, lambda t, p, q, args: 0.0, path)
+    with pytest.raises(
+        ValueError, match=r"called as `noise\(t, psi, args\)`; got None"
+    ):
+        ds.wave_terms(wrong, None, path)
     with pytest.raises(ValueError, match="use a solver for general systems"):
         terms = ds.wave_terms(_lattice, _site_noise, path)
         ds.StormerVerlet().init(terms, 0.0, 0.1, y0, 1.0)

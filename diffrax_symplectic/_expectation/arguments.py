@@ -1,0 +1,166 @@
+"""Checks of the arguments of `expectation` and `ensemble`, before anything is solved."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray, PyTree
+
+from .._arguments import brief, check_real, check_takes, takes_args
+from .._brownian import is_random
+from .._custom_types import Args, Y
+from .._signature import once_for_each_signature
+from .._terms import brownian_paths, check_fit, evaluated, has_lifted
+
+
+# Times are given in decimals, so a number of steps is whole up to this fraction of it.
+_ROUNDED = 1e-6
+# Cells are given in decimals, too. Beyond this fraction of a cell, a step would take the
+# increment of another.
+_ROUNDED_CELL = 1e-3
+
+
+class StepNumbers(NamedTuple):
+    """The numbers of steps with step size `dt0`: after which to average, and all."""
+
+    saved: Int[np.ndarray, "..."]
+    total: np.integer
+
+
+def step_numbers(
+    t0: Any, t1: Any, dt0: Any, ts: Sequence[Any] | np.ndarray | None
+) -> StepNumbers:
+    """Raises a `ValueError` for times that are no numbers, or between steps."""
+    if dt0 is None:
+        raise ValueError("`dt0` must be a number: steps are fixed; got None.")
+    given = f"got dt0={dt0!r}, t0={t0!r}, t1={t1!r}"
+    if not all(eqx.is_array_like(x) and np.ndim(x) == 0 for x in (t0, t1, dt0)):
+        raise ValueError(f"`t0`, `t1` and `dt0` must be numbers; {given}.")
+    begin = float(t0)
+    end = float(t1)
+    step = float(dt0)
+    if not (0 < step < np.inf and begin < end < np.inf):
+        raise ValueError(f"`dt0` must be positive, and `t1` after `t0`; {given}.")
+    times = np.array([end] if ts is None else ts, float).reshape(-1)
+    # Of all steps last.
+    counts = (np.append(times, end) - begin) / step
+    whole = np.round(counts)
+    if not np.all(np.abs(counts - whole) <= _ROUNDED * np.maximum(whole, 1)):
+        raise ValueError(
+            "Choose a `dt0` that divides the intervals between `t0`, `t1` and `ts`: `t1` "
+            "and each of `ts` must be a whole number of steps after `t0`. Got "
+            f"dt0={step}, t0={begin}, t1={end} and ts={brief(times)}."
+        )
+    if len(times) == 0 or np.any(whole < 0) or np.any(whole > whole[-1]):
+        raise ValueError(
+            "`ts` must hold at least one time, all between `t0` and `t1`; got "
+            f"{brief(times)}."
+        )
+    *saved, total = whole.astype(np.int32)
+    return StepNumbers(np.array(saved), total)
+
+
+def given_state(y0: Y) -> Y:
+    """The initial state in floating-point numbers."""
+    return jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+
+
+def drawn_state(y0_of: Callable, key: PRNGKeyArray, args: Args) -> Y:
+    """The initial state that the user's function draws. Raises a `ValueError` for a
+    function with other arguments."""
+    if takes_args(y0_of):
+        check_takes("y0", y0_of, "key", "args")
+        return given_state(y0_of(key, args))
+    check_takes("y0", y0_of, "key")
+    return given_state(y0_of(key))
+
+
+def drawn_args(args_of: Callable, key: PRNGKeyArray) -> Args:
+    """The `args` that the user's function draws. Raises a `ValueError` for a function with
+    other arguments."""
+    check_takes("args", args_of, "key")
+    try:
+        args = args_of(key)
+    except TypeError as error:
+        error.add_note(
+            "`args` is called with a random key, to draw the `args` of each path. If your "
+            "Hamiltonians take a function in `args`, pass it in a tuple or a dictionary."
+        )
+        raise
+    # Each path has its own arrays. (What is neither kind of array is the same for all.)
+    is_numpy = lambda x: isinstance(x, np.ndarray | np.generic)
+    return jtu.tree_map(lambda x: jnp.asarray(x) if is_numpy(x) else x, args)
+
+
+def check_finite(y0: Y) -> None:
+    """Raises a `ValueError` unless the initial state is finite."""
+    if not all(np.all(np.isfinite(leaf)) for leaf in jtu.tree_leaves(y0)):
+        raise ValueError(f"`y0` must hold finite numbers; got {brief(y0)}.")
+
+
+def check_noise(terms: PyTree) -> None:
+    """Raises a `ValueError` if nothing in the terms is random."""
+    paths = brownian_paths(terms)
+    if len(paths) == 0:
+        raise ValueError(
+            "`terms` have no Brownian path, so nothing is random. Solve them once, with "
+            "`diffrax.diffeqsolve`."
+        )
+    if not any(map(is_random, paths)):
+        raise ValueError(
+            "No Brownian path in `terms` has a random key, so all samples would have the "
+            "same noise. Solve once, with `diffrax.diffeqsolve`. If your path draws its "
+            "own noise, give it a field that holds a JAX random key. To average over many "
+            "records, pass `monte_carlo` a function that draws one of them."
+        )
+
+
+def check_cells(terms: PyTree, t0: float, h: float) -> None:
+    """Raises a `ValueError` for steps that are not made up of whole cells of a path."""
+    for path in brownian_paths(terms):
+        cell = getattr(path, "cell", None)
+        if cell is None:
+            continue
+        if not (_is_multiple(t0, cell) and _is_multiple(h, cell)):
+            raise ValueError(
+                f"Steps of a `{type(path).__name__}` with `cell` must begin and end at "
+                f"multiples of `cell`; got cell={cell}, t0={t0} and the smallest step {h}. "
+                "Pass a `cell` that divides `t0` and the steps of all `levels`."
+            )
+
+
+def _is_multiple(x: float, cell: float) -> bool:
+    return abs(x / cell - round(x / cell)) <= _ROUNDED_CELL
+
+
+@once_for_each_signature
+def check_shapes(
+    phi: Callable,
+    terms: PyTree,
+    t0: Float[np.ndarray, ""],
+    y0: Y,
+    args: Args,
+) -> None:
+    """Raises an error unless terms and `phi` fit the state, and the latter is real."""
+    check_fit(terms, t0, y0, args)
+    check_takes("phi", phi, "t", "y", "args")
+    check_real("phi", jtu.tree_leaves(_shape_of(phi, terms, t0, y0, args)))
+
+
+def _shape_of(
+    phi: Callable, terms: PyTree, t0: Float[np.ndarray, ""], y0: Y, args: Args
+) -> PyTree:
+    """The shape of `phi`'s result. Errors explain which state `phi` gets."""
+    once = lambda t, y, args: evaluated("phi", phi, t, y, args=args)
+    try:
+        return eqx.filter_eval_shape(once, t0, y0, args)
+    except (TypeError, AttributeError, IndexError) as error:
+        if has_lifted(terms):
+            error.add_note(
+                "For spins and complex amplitudes `phi(t, y, args)` gets the pair "
+                "`(p, q)`: call `from_spinors(y)` or `from_pair(y)` in it."
+            )
+        raise

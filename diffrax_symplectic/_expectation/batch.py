@@ -1,0 +1,153 @@
+"""The program that computes one batch on each device."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt32
+
+from .._compat import is_closure_mismatch, quickly_compiled
+from .._lapack import lapack_in_turn
+from .sampling import Samples
+
+
+# Powers of two up to this one below the largest that the dtype holds: sums of 2^24 numbers
+# of this size stay in range.
+_ROOM = 24
+
+
+class BatchSums(NamedTuple):
+    """What is known of the samples of a batch. All but the numbers have the structure of
+    `phi`, and leading axes for kinds and combinations of levels.
+
+    - `good`, `failed`: the numbers of good samples and of failed paths.
+    - `mean`: the mean of the good samples.
+    - `rest`: the rounding error of this mean, which is added to it in float64.
+    - `norm`: the root of the sum of squared deviations from the exact mean.
+    - `largest`: the largest deviation.
+    - `size`: the largest absolute value.
+    """
+
+    good: Int[Array, "*devices"]
+    failed: Int[Array, "*devices"]
+    mean: PyTree[Array]
+    rest: PyTree[Array]
+    norm: PyTree[Array]
+    largest: PyTree[Array]
+    size: PyTree[Array]
+
+
+def _sums(
+    sampler: Callable[..., Samples],
+    key_data: UInt32[Array, "..."],
+    impl: Any,
+    first: UInt32[Array, "2"],
+    left: Int[Array, ""],
+    mesh: Mesh,
+    n: int,
+) -> BatchSums:
+    """The sums of all devices, along a leading axis. Each takes `n` samples, the first one
+    from sample number `first` on, in two halves of 32 bits, of which `left` are wanted."""
+    if mesh.size == 1:
+        sums = _of_device(sampler, key_data, impl, first, left, n, 0)
+        return jtu.tree_map(lambda x: x[None], sums)
+    dynamic, static = eqx.partition(sampler, eqx.is_array)
+
+    # The devices do not communicate until the end, so each one's result does not depend on
+    # how many there are.
+    def shard(dynamic, first, left):
+        sampler = eqx.combine(dynamic, static)
+        device = jax.lax.axis_index("samples")
+        sums = _of_device(sampler, key_data, impl, first, left, n, device)
+        return jtu.tree_map(lambda x: jax.lax.all_gather(x, "samples"), sums)
+
+    none = PartitionSpec()
+    sharded = jax.shard_map(
+        shard, mesh=mesh, in_specs=none, out_specs=none, check_vma=False
+    )
+    try:
+        return sharded(dynamic, first, left)
+    except ValueError as error:
+        # The loop of Diffrax's default adjoint rejects arrays that vary between devices.
+        if is_closure_mismatch(error):
+            error.add_note(
+                "Reverse mode through `diffrax.RecursiveCheckpointAdjoint`, the default of "
+                "`diffeqsolve`, does not work on several devices. Pass `adjoint=diffrax_"
+                "symplectic.ReversingAdjoint()` or `adjoint=diffrax.DirectAdjoint()` to "
+                "`diffeqsolve`, or `devices=jax.devices()[:1]` to `monte_carlo`."
+            )
+        raise
+
+
+batch_sums = eqx.filter_jit(_sums)
+# For samples that take less time than compiling their program.
+quick_batch_sums = quickly_compiled(_sums)
+
+
+def _of_device(
+    sampler: Callable[..., Samples],
+    key_data: UInt32[Array, "..."],
+    impl: Any,
+    first: UInt32[Array, "2"],
+    left: Int[Array, ""],
+    n: int,
+    device: Any,
+) -> BatchSums:
+    """The sums of one device, by its number."""
+    index = device * n + jnp.arange(n)
+    # The sum of `first` and `index` in two halves, since there may be no 64-bit integers.
+    low = first[0] + index.astype(jnp.uint32)
+    high = first[1] + (low < first[0]).astype(jnp.uint32)
+    key = jr.wrap_key_data(jnp.asarray(key_data), impl=impl)
+
+    def sample_key(high: Array, low: Array) -> PRNGKeyArray:
+        return jr.fold_in(jr.fold_in(key, high), low)
+
+    samples = lapack_in_turn(sampler)(jax.vmap(sample_key)(high, low))
+    # The last batch is cut here: another size would be another program.
+    is_wanted = index < left
+    good = samples.good & is_wanted
+    failed = jnp.where(is_wanted, samples.lost, 0)
+    leaves, treedef = jtu.tree_flatten(samples.values)
+    each = [_sums_of_array(leaf, good) for leaf in leaves]
+    sums = map(treedef.unflatten, zip(*each))
+    return BatchSums(jnp.sum(good), jnp.sum(failed), *sums)
+
+
+def _sums_of_array(
+    x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]
+) -> tuple[Array, Array, Array, Array, Array]:
+    """`mean`, `rest`, `norm`, `largest` and `size` of `BatchSums` for one array."""
+    keep = good.reshape(-1, *[1] * (x.ndim - 3))
+    n = jnp.maximum(jnp.sum(good), 1)
+
+    def largest_of(x: Array) -> Array:
+        return jnp.max(jnp.abs(x), axis=2)
+
+    x = jnp.where(keep, x, 0)
+    size = largest_of(x)
+    to_unit, from_unit = _powers(size)
+    mean = from_unit * (jnp.sum(x * to_unit[:, :, None], axis=2) / n)
+    # Two passes avoid cancellation. The second also finds the rounding error of the mean.
+    off = jnp.where(keep, x - mean[:, :, None], 0)
+    largest = largest_of(off)
+    to_unit, from_unit = _powers(largest)
+    z = off * to_unit[:, :, None]
+    rest = jnp.sum(z, axis=2) / n
+    squares = jnp.maximum(jnp.sum(z**2, axis=2) - n * rest**2, 0)
+    return mean, from_unit * rest, from_unit * jnp.sqrt(squares), largest, size
+
+
+def _powers(size: Array) -> tuple[Array, Array]:
+    """A power of two that scales numbers of this size to about one, so that sums of them
+    and of their squares stay in range; and its inverse. (XLA divides by multiplying with
+    the inverse, which may underflow.)"""
+    most = jnp.finfo(size.dtype).maxexp - _ROOM
+    exponent = jnp.clip(jnp.frexp(size)[1], -most, most)
+    one = jnp.ones_like(size)
+    return jnp.ldexp(one, -exponent), jnp.ldexp(one, exponent)

@@ -1,0 +1,116 @@
+"""What users are warned of in an estimate."""
+
+from collections.abc import Iterator
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import PyTree
+
+from .estimate import best_results, Expectation
+from .moments import Combination, total
+from .sampling import KindsWithControl
+
+
+# With an `r` of `std_error` above this, means of exp(5 x) with normal x were off by forty
+# standard errors, and means of exp(3 x) by five.
+_HEAVY = 0.35
+
+
+def cautions(estimate: Expectation, tol: float | None, bounded: bool) -> Iterator[str]:
+    """What the user is warned of. `bounded` is whether the increments of all paths are
+    known to be bounded."""
+    if estimate.num_failed > 0:
+        yield from _of_failures(estimate, bounded)
+    if estimate.num_samples > 1:
+        yield from _of_spread(estimate)
+    if estimate.tol_reached is False:
+        largest = _largest(estimate.std_error)
+        yield (
+            f"`tol={tol}` was not reached: the largest standard error is {largest:.1e} "
+            f"after {estimate.num_paths:,} paths. Take more paths, continuing with "
+            "`start=`, or another `sampling`."
+        )
+
+
+def _of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
+    """Of failed paths, if they could change the mean by more than its error."""
+    changes = jtu.tree_leaves(estimate.failed_error)
+    errors = jtu.tree_leaves(estimate.std_error)
+    # Without samples both are NaN.
+    if all(np.all(change <= error) for change, error in zip(changes, errors)):
+        return
+    if estimate.num_samples == 0:
+        rest = "there is no mean"
+    else:
+        largest = _largest(estimate.failed_error)
+        rest = (
+            "they are left out of the mean, and could change it by more than its standard "
+            f"error, up to {largest:.1e}, which is part of `error`"
+        )
+    instead = "" if bounded else " or bounded increments, as from a `WeakBrownianPath`,"
+    yield (
+        f"{estimate.num_failed:,} paths failed: {rest}. Take smaller steps{instead} and "
+        "look for NaNs in `y0`, `args` and the Hamiltonians."
+    )
+
+
+def _of_spread(estimate: Expectation) -> Iterator[str]:
+    """Of values whose mean or standard error cannot be trusted."""
+    results = jtu.tree_leaves((estimate.mean, estimate.std_error))
+    if not all(np.all(np.isfinite(x)) for x in results):
+        yield (
+            "The mean or its standard error is not finite: the averaged values overflow. "
+            "Take smaller steps or a more stable solver, and check whether single paths "
+            "stay bounded."
+        )
+    best = best_results(estimate)
+    if any(np.any(x) for x in jtu.tree_leaves(best.dropped)):
+        yield (
+            "A control variate was dropped: its mean over these paths is more than five "
+            "standard errors from zero, or not finite. The estimate is crude Monte Carlo. "
+            "Pass a smaller `degree`, or another `sampling`."
+        )
+    if any(np.any(x > _HEAVY) for x in jtu.tree_leaves(best.heaviness)):
+        yield (
+            f"A few of the {estimate.num_paths:,} paths account for most of the variance: "
+            "still rarer paths may contribute much to the mean, and the standard error may "
+            "be too small. Take many more paths, or a function that grows more slowly."
+        )
+    dtype = _underflowing(estimate)
+    if dtype is not None:
+        yield (
+            f"A component is zero, or underflows {dtype}, on all paths. If it "
+            'underflows, use other units, or call `jax.config.update("jax_enable'
+            '_x64", True)` first. If it is the indicator of a rare event, the event did '
+            "not occur, and the standard error is meaningless. The gradient of an "
+            "indicator, or of another step function, is zero wherever it exists: average a "
+            "smooth function instead, or difference two estimates."
+        )
+    elif not any(np.any(x > 0) for x in jtu.tree_leaves(estimate.variance)):
+        yield (
+            f"All {estimate.num_samples:,} samples are equal, so the error is unknown. "
+            "Check that phi depends on the noise, and a function for `monte_carlo` on its "
+            "key."
+        )
+
+
+def _largest(errors: PyTree[np.ndarray]) -> float:
+    leaves = jtu.tree_leaves(errors)
+    return max(float(np.max(leaf, initial=0.0)) for leaf in leaves)
+
+
+def _underflowing(estimate: Expectation) -> str | None:
+    """The dtype of a component that is zero or underflows on all paths, if there is one."""
+    whole = total(estimate.moments)
+    for sizes, dtype in zip(*map(jtu.tree_leaves, (whole.size, whole.dtypes))):
+        has_control = len(sizes) == len(KindsWithControl)
+        without_control = sizes[KindsWithControl.PLAIN if has_control else 0]
+        if np.max(without_control[Combination.BEST]) < _least(dtype):
+            return dtype
+    return None
+
+
+def _least(dtype: str) -> float:
+    """The smallest number whose rounding errors do not underflow."""
+    return float(jnp.finfo(dtype).tiny / jnp.finfo(dtype).eps)
