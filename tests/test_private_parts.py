@@ -553,7 +553,7 @@ def test_drjit_writes_the_result_of_a_conditional_into_what_its_branch_returned(
 
 @needs_llvm
 def test_drjit_returns_the_constant_of_a_branch_from_a_conditional():
-    # So `_stablehlo.tensor.made_here` makes constants anew.
+    # So `_stablehlo.tensor.as_own_literal` makes constants anew.
     done = _ends_with(
         """
         half = lambda sign: lambda: (Float(0.5), sign * x)

@@ -52,6 +52,7 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
             ends = (jnp.asarray(t0), jnp.asarray(t1))
         # Words are an integer function of the times: a derivative would silently be zero.
         start, end = cast(tuple[Array, Array], nondifferentiable(ends, name="t"))
+        # As a program of its own, which is traced once for all steps of a solve.
         return _drawn(self, start, end, use_levy)
 
     @abc.abstractmethod

@@ -107,7 +107,8 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> GeneralTableau:
-        # Symplectic for any b, since A1 + B0 is the product of the weights.
+        # Symplectic for any b: A0 and B1 are half the product of the weights, which is 1,
+        # and A1 + B0 are all of it.
         return GeneralTableau(
             alpha=[1],
             beta=[1],

@@ -24,7 +24,11 @@ of `elementwise.py`, or of `complex.py`; any other rule is a function with the d
 To add an operation, write its rule, and a line in the table of
 `tests/stablehlo/test_operations.py`, which compares it with JAX: a test sees that each
 operation has one. The [specification](https://openxla.org/stablehlo/spec) says what it does
-with NaN, infinities and integers, where Dr.Jit is often different.
+with NaN, infinities and integers, where Dr.Jit is often different. Where JAX itself is
+inexact, as for `erfc` in its tail, compare with `math` in a test beside the table. If in
+single precision Dr.Jit takes the function from a GPU's hardware, whose error is absolute,
+add its name to `HARDWARE` there. What has no rule is listed in `docs/ensembles.md`: take it
+off the list.
 
 This folder knows nothing of differential equations.
 """

@@ -20,7 +20,7 @@ from .._compat import (
     sole_operation,
 )
 from .backend import array_types
-from .tensor import made_here, Tensor
+from .tensor import as_own_literal, Tensor
 
 
 class Operation(NamedTuple):
@@ -102,15 +102,16 @@ class Operation(NamedTuple):
 
     def recorded(self, fn: Callable, *args: Any, **kwargs: Any) -> tuple:
         """The entries that a loop or conditional of Dr.Jit returns, recorded with `fn`."""
+        before = len(self.errors)
         # Symbolic: as part of the kernel. Otherwise Dr.Jit may run a loop step by step.
-        number = len(self.errors)
         out = fn(*args, mode="symbolic", **kwargs)
-        if len(self.errors) > number:
+        if len(self.errors) > before:
             # The mask belongs to the inside of the loop or branch, and has no value here.
             raise NotReplayed(
                 self.op, "an error that is raised within a loop or branch"
             )
-        return tuple(map(made_here, out))
+        # A constant of the inside would abort the process if it were used outside.
+        return tuple(map(as_own_literal, out))
 
 
 class NotReplayed(Exception):

@@ -117,7 +117,7 @@ def _reduce_window(o, *xs):
     """Cumulative sums, and other reductions of windows."""
     number = len(xs) // 2
     arrays = xs[:number]
-    starts = xs[number:]
+    initial = xs[number:]
     if any(size > 1 for size in o.optional("base_dilations")):
         raise NotReplayed(o.op, f"`{o.op.name}` of entries that are apart")
     shape = arrays[0].shape
@@ -125,12 +125,13 @@ def _reduce_window(o, *xs):
     sizes = o.ints("window_dimensions")
     strides = o.optional("window_strides") or ones
     gaps = o.optional("window_dilations") or ones
-    # Pairs of the padding before and after. What lies outside is left out.
+    # Pairs of the padding before and after. What lies outside is left out, as XLA does. The
+    # specification has the initial value there, which is the same if it is neutral.
     padding = o.rows("padding") if o.has("padding") else np.zeros((len(shape), 2), int)
     before = padding.reshape(len(shape), 2)[:, 0]
     columns = []
     for window in np.ndindex(*o.shape):
-        total = [*starts]
+        total = [*initial]
         for offset in np.ndindex(*sizes):
             at = np.array(window) * strides + np.array(offset) * gaps - before
             if np.all((at >= 0) & (at < shape)):

@@ -154,7 +154,7 @@ def copied(xs: Sequence[Tensor]) -> tuple:
     return tuple(type(entry)(entry) for entry in flat(xs))
 
 
-def made_here(entry: Any) -> Any:
+def as_own_literal(entry: Any) -> Any:
     """An entry that a conditional or loop returned, for use after it. If both branches
     return the same constant, Dr.Jit returns the constant of the second branch, which is
     defined within it only: LLVM aborts the process if an outer branch returns that."""

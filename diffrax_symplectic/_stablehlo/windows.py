@@ -113,6 +113,7 @@ def _from_table(
     sizes: Sequence[int],
 ) -> Tensor:
     """A window of an array in memory, at each path's own place."""
+    # Where in memory each entry of `x` is: `x` may be a part of the table, or a transpose.
     places = table.places.reshape(x.shape)
     corner = int(places.flat[0])
     # The distance in memory between neighbours along each axis.
@@ -130,6 +131,7 @@ def _from_table(
     for start, stride, length, size in zip(starts, strides, x.shape, sizes):
         index = start.item()
         kind = type(index)
+        # Moved into `x` in the index's own type: made signed, a large one is negative.
         inside = elementwise()["clamp"](kind(0), index, kind(length - size))
         begin = begin + signed(inside) * stride
     offsets = np.broadcast_to(_offsets(strides, sizes), sizes)
@@ -139,7 +141,9 @@ def _from_table(
 
 
 def _offsets(strides: Sequence[int], shape: Sequence[int]) -> np.ndarray | int:
-    """How far in memory each entry is from the first, up to broadcasting."""
+    """How far in memory each entry is from the first, up to broadcasting: the number zero
+    for an array without axes, which has one entry."""
+    # An axis of indices for each axis of the array, so that their sum is the whole array.
     indices = np.indices(shape, sparse=True)
     return sum(stride * index for stride, index in zip(strides, indices))
 
@@ -154,6 +158,7 @@ def _dynamic_update_slice(o, x, update, *starts):
     # The entries of the update stand behind those of `x`.
     both = Tensor([*flat([x, update])], ())
     out = None
+    # The first place is for all lanes; the others replace it in theirs.
     for slices, here in _windows(o, x, starts, update.shape):
         places = x.places.copy()
         places[slices] = len(x.entries) + update.places

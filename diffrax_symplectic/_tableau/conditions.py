@@ -69,9 +69,10 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     **Returns:** a dictionary from the formula of each condition to its residual. Order 2
     includes the conditions for order 1.
 
-    **Raises:** a `ValueError` for any other order, for other tableaus, for random variables
-    of unknown variance, or for a `GeneralTableau` whose `noise` is not `"W"`, alone or with
-    `"A"` or `"L"`.
+    **Raises:** a `ValueError` for any other order, for other tableaus, for a
+    `GeneralTableau` whose `noise` is not `"W"`, alone or with `"A"` or `"L"`, or for other
+    tableaus with random variables of unknown variance: `"A"`, `"L"`, and names that no path
+    of this package has.
 
     **Source:** [Rößler (2007)](https://doi.org/10.1007/s10543-007-0130-3) for Stratonovich
     equations, [Rößler (2009)](https://doi.org/10.1137/060673308) for Itô equations.
@@ -86,21 +87,24 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
 def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
     r"""Residuals of the conditions for a strong order, with Gaussian increments:
 
-    - 1/2 for a [`diffrax_symplectic.GeneralTableau`][], and 1 if the noises commute,
-        since every noise has the same coefficients;
+    - 1/2 for a [`diffrax_symplectic.GeneralTableau`][]: all noises have the same
+        coefficients, so the iterated integrals of two of them are missing. 1 if they
+        commute, when these are not needed;
     - 1 for a [`diffrax_symplectic.SeparableTableau`][] or
         [`diffrax_symplectic.PartitionedTableau`][];
     - 3/2 for an [`diffrax_symplectic.AdditiveTableau`][], in the variables $I_k = W_k$
-        and $I_{k0} / h = W_k / 2 + H_k$.
+        and $I_{k0} / h = W_k / 2 + H_k$. Those on the times `c1` are there for a `constant`
+        tableau, too, though noise that does not depend on time does not need them.
 
     **Arguments:**
 
-    - `tableau`: any tableau of this package.
+    - `tableau`: one of these tableaus.
 
     **Returns:** a dictionary from the formula of each condition to its residual.
 
-    **Raises:** a `ValueError` for other tableaus, for random variables of unknown variance,
-    or for a `GeneralTableau` whose `noise` is not `"W"`, alone or with `"A"` or `"L"`.
+    **Raises:** a `ValueError` for other tableaus, for a `GeneralTableau` whose `noise` is
+    not `"W"`, alone or with `"A"` or `"L"`, or for an `AdditiveTableau` with random
+    variables of unknown variance: `"A"`, `"L"`, and names that no path of this package has.
 
     **Source:** [Burrage and Burrage (2000)](https://doi.org/10.1137/S0036142999363206) for
     general tableaus; [Rößler (2010)](https://doi.org/10.1137/09076636X) for the others.
@@ -170,13 +174,14 @@ def _(tableau: PartitionedTableau) -> dict:
 
 @_strong.register
 def _(tableau: AdditiveTableau) -> dict:
+    # The weak and the strong expansion have the same terms, but for the integrals with the
+    # space-time area: those of order 3/2 below.
     weak = _weak(tableau)
     alpha = tableau.alpha
     c1 = tableau.c1
     # Without the space-time area its conditions fail, which is the right answer.
     B_H = tableau.B.get("H", np.zeros((len(alpha), len(c1))))
     beta_H = tableau.beta.get("H", np.zeros(len(c1)))
-    # For additive noise the expansions agree up to the integrals of order 3/2.
     return {
         **weak.first,
         **weak.second,

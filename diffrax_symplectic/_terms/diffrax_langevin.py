@@ -38,7 +38,7 @@ def _is_drift(term: diffrax.AbstractTerm) -> bool:
 
 
 def _exchanged(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
-    """The term with the halves of its state exchanged, and with friction apart if it is
+    """A term of the state `(x, v)` as one of `(v, x)`, and with friction apart if it is
     Diffrax's Langevin term."""
     if isinstance(term, diffrax.UnderdampedLangevinDriftTerm):
         # Its `gamma` acts on velocities of mass one, as the friction here does.
@@ -46,6 +46,7 @@ def _exchanged(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
         return diffrax.ODETerm(DriftWithFriction(_Frictionless(term), friction))
     if isinstance(term, diffrax.ODETerm):
         return diffrax.ODETerm(_ExchangedField(term))
+    # A noise term.
     return _Exchanged(term)
 
 
@@ -86,7 +87,7 @@ class _PrefixFriction(AbstractFriction):
 
 
 class _ExchangedField(eqx.Module):
-    """The vector field of a drift term with the halves of its state exchanged."""
+    """The vector field of a drift term of `(x, v)`, as one of `(v, x)`."""
 
     term: diffrax.ODETerm
 
@@ -97,7 +98,7 @@ class _ExchangedField(eqx.Module):
 
 
 class _Exchanged(diffrax.AbstractTerm):
-    """A noise term with the halves of its state exchanged."""
+    """A noise term of the state `(x, v)`, as one of `(v, x)`."""
 
     term: diffrax.AbstractTerm
 

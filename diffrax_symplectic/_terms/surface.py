@@ -263,9 +263,12 @@ def _check_masses(
     surface = Surface.of(terms, t0, y0, args)
     p0, _ = jfu.ravel_pytree(y0[0])
 
+    # The change of the velocity by an impulse: the second derivative of H0 by p, times it.
     def pushed(p: _Vector, impulse: _Vector) -> _Vector:
         return jax.jvp(surface.velocity, (p,), (impulse,))[1]
 
+    # It may depend on the impulse, but not on the momentum: then the masses are constant.
+    # Only the shape of the second argument matters.
     if not Dependence(pushed, p0, p0).independent(lambda p, impulse: p):
         raise ValueError(
             "Terms with a `constraint` need constant masses, H0 = p . M^-1 p / 2 + "
