@@ -206,7 +206,9 @@ def _total(x: Float[Array, "n ..."]) -> Float[Array, "..."]:
 _DEPENDENT = (
     "The gradients of `constraint` at `y0` are linearly dependent, or zero. Leave out "
     "constraints that follow from the others, and write each so that its gradient does not "
-    "vanish where it is zero, such as `jnp.sum(q**2) - 1`."
+    "vanish where it is zero, such as `jnp.sum(q**2) - 1`. For atoms on a line no distance "
+    "follows from the others: fix one, and put each atom between its ends on the line, "
+    "for a middle one by `q[1] - (q[0] + q[2]) / 2` in place of its distances."
 )
 _OFF = (
     "`y0` is off the `constraint`, or its momenta are not tangent to it. Pass "
