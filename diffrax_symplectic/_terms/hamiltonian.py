@@ -205,6 +205,8 @@ class _Drift(eqx.Module):
 
     H0: _Hamiltonian
     structure: _Structure | None = eqx.field(static=True, default=None)
+    # The user's function call that took `structure`, for messages.
+    made_by: str = eqx.field(static=True, default="hamiltonian_terms")
 
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
         check_pair(y)
@@ -423,6 +425,15 @@ def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
     """The `structure` that the user asserted for a term, and for all parts of it."""
     asserted = {part.structure for part in _parts(term)}
     return asserted.pop() if len(asserted) == 1 else None
+
+
+def takes_structure(term: diffrax.AbstractTerm) -> str | None:
+    """The function that made a term from Hamiltonians, and that takes the `structure` of
+    these; `None` for other terms."""
+    drifts = [part for part in _parts(term) if isinstance(part, _Drift)]
+    if len(drifts) > 0:
+        return drifts[0].made_by
+    return "hamiltonian_terms" if is_hamiltonian(term) else None
 
 
 def _parts(term: diffrax.AbstractTerm) -> list[_Drift | HamiltonianNoise]:
