@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree
 
 from .._brownian import raveled
-from .._compat import at_trace_time, is_traced
+from .._compat import is_traced
 from .._custom_types import Args, RealScalarLike, Y
 from .vector_fields import control_struct
 
@@ -40,12 +40,10 @@ def contradicted(
         return False
     t0 = jnp.asarray(t0, jnp.result_type(float))
     y0 = jtu.tree_map(jnp.asarray, y0)
-    try:
-        with at_trace_time(), jax.disable_jit(False):
-            return bool(_contradicts(structure, is_noise, term, t0, y0, args))
-    except RuntimeError:
-        # From a user's `equinox.error_if`. The solve will tell.
-        return False
+    with jax.disable_jit(False):
+        found = _contradicts(structure, is_noise, term, t0, y0, args)
+    # Inside a program of the user's, of which these values are constants.
+    return not is_traced(found) and bool(found)
 
 
 @eqx.filter_jit

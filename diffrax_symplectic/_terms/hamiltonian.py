@@ -65,7 +65,9 @@ def hamiltonian_terms(
         $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, `"additive"` if the gradients of the
         $H_k$ do not depend on the state. By default it is detected by tracing, which counts
         every variable that enters a derivative, even if it cancels or is multiplied by
-        zero: write $H_0$ as a sum of terms that depend on $p$ or $q$ alone.
+        zero: write $H_0$ as a sum of terms that depend on $p$ or $q$ alone. An assertion
+        is relied on; `expectation`, `ensemble` and `suggest_solver` compare it with
+        derivatives at `y0`.
     - `constraint`: `constraint(q, args)`, an array of shape `(c,)` that is zero on the
         positions that the system can take, such as `jnp.stack([jnp.sum(q**2) - 1])` for a
         rod. Its gradients must be linearly independent there. For

@@ -330,7 +330,9 @@ def test_each_part_of_an_assertion_is_compared(structure, H0, noise, says):
 
 def test_plain_terms_are_not_told_to_assert_a_structure():
     drift = diffrax.ODETerm(lambda t, y, args: (-y[0] * y[1], y[0]))
-    terms = diffrax.MultiTerm(drift, _kicked(_good_H0, None).terms[1])
+    path = ds.WeakBrownianPath((), jr.key(0))
+    noise = ds.hamiltonian_terms(_good_H0, _good_noise, path).terms[1]
+    terms = diffrax.MultiTerm(drift, noise)
     with pytest.raises(ValueError, match="depend on p") as info:
         ds.StormerVerlet().init(terms, 0.0, 0.1, _positive_state, None)
     assert "structure=" not in str(info.value)
