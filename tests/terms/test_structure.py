@@ -322,6 +322,8 @@ def test_each_part_of_an_assertion_is_compared(structure, H0, noise, says):
     with pytest.raises(ValueError, match=f"is wrong: at `y0`.*{says}"):
         ds.ensemble(*given, key=jr.key(0), num_paths=2)
     found = ds.suggest_solver(terms, 0.0, _positive_state, want="weak")
+    if structure == "separable":
+        assert "at `y0`" in found.system
     right = ds.suggest_solver(
         _kicked(H0, None, noise), 0.0, _positive_state, want="weak"
     )
