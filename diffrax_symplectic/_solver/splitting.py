@@ -263,8 +263,9 @@ class LinearFlow(AbstractSplitting):
         def after(time: RealScalarLike, y: Y) -> Y:
             return self.half_step(terms, t0, time, y, args)
 
-        # Any number in the place of the time serves to trace the flow.
-        if Dependence(after, t0, y0).independent(lambda time, y: time):
+        # `t0` serves as any duration: what depends on what is decided without values.
+        dependence = Dependence(after, t0, y0)
+        if dependence.independent(lambda time, y: time):
             raise ValueError(
                 "`flow(time, y, args)` of `LinearFlow` does not depend on `time`, so it is "
                 "not a flow: for `time = 0` it must return `y`. It is called with half of "

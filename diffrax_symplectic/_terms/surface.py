@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
-from .._arguments import check_pair, check_state, shapes
+from .._arguments import check_pair, check_state, is_real_number
 from .._batch import batched_like, error_if_alone
 from .._compat import is_traced
 from .._custom_types import Args, RealScalarLike
@@ -354,15 +354,16 @@ def _projected(
     return y1, found, surface.dependent(at)
 
 
-def _values(constraint: Constraint, q: PyTree, args: Args) -> _Multipliers:
-    """The constraints. Raises a `ValueError` unless they are a real array of shape
-    `(c,)`."""
+def _values(constraint: Constraint, q: PyTree, args: Args) -> Float[Array, " c"]:
+    """The values of the constraints. Raises a `ValueError` unless they are a real array of
+    shape `(c,)`."""
     value = evaluated("constraint", constraint, q, args=args)
-    real = eqx.is_array_like(value) and not jnp.iscomplexobj(value)
-    if not real or jnp.ndim(value) != 1 or jnp.size(value) == 0:
+    if not is_real_number(value) or jnp.ndim(value) != 1 or jnp.size(value) == 0:
+        # With the dtype, such as `f32[2]`: that alone may be what is wrong.
+        got = eqx.tree_pformat(value, struct_as_array=True)
         raise ValueError(
             "`constraint(q, args)` must return a real array of shape `(c,)`, one number "
-            f"for each constraint; got shape {shapes(value)}. For one constraint write "
+            f"for each constraint; got {got}. For one constraint write "
             "`jnp.stack([...])`."
         )
     return jnp.asarray(value, jnp.result_type(*jtu.tree_leaves(q)))
