@@ -230,11 +230,12 @@ def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
             state, rows = carry
             now = solve_state(state)
             row, rest = jnp.divmod(now.num_steps, every)
-            # Indices beyond the last row are dropped.
+            # States between checkpoints go to the row after the last one, which `save`
+            # drops.
             row = jnp.where(rest == 0, row, adjoint.checkpoints)
 
-            def save(x: Array, rows: Array) -> Array:
-                return rows.at[row].set(x, mode="drop")
+            def save(x: Array, saved: Array) -> Array:
+                return saved.at[row].set(x, mode="drop")
 
             return body_fun(state), jtu.tree_map(save, now.y, rows)
 

@@ -121,19 +121,26 @@ def _is_real(dtype: Any) -> bool:
 def real_array(name: str, value: Any, *, positive: bool, kind: str) -> ArrayLike:
     """Raises a `ValueError` unless this is a real number or array that is finite and
     positive (or not negative), as far as its values are known while tracing."""
-    fits = eqx.is_array_like(value) and not isinstance(value, bool)
+    fits = is_real_number(value)
     if fits and not is_traced(value):
         values = np.asarray(value)
-        fits = not np.iscomplexobj(values) and np.all(np.isfinite(values))
-        fits = fits and np.all(values > 0 if positive else values >= 0)
-    elif fits:
-        fits = not jnp.iscomplexobj(value)
+        in_range = values > 0 if positive else values >= 0
+        fits = np.all(np.isfinite(values) & in_range)
     if not fits:
         least = "positive" if positive else "not negative"
         raise ValueError(
             f"`{name}` must be {kind}, finite and {least}; got {brief(value)}."
         )
     return value
+
+
+def is_real_number(value: Any) -> bool:
+    """Whether this is a real number, or an array of them. Truth values are none: a mask in
+    place of a number is a mistake."""
+    dtype = getattr(value, "dtype", type(value))
+    kinds = (jnp.floating, jnp.integer)
+    has_kind = any(jnp.issubdtype(dtype, kind) for kind in kinds)
+    return eqx.is_array_like(value) and has_kind
 
 
 def check_untraced(caller: str, tree: Any) -> None:

@@ -239,6 +239,18 @@ def operations_in(region: Any) -> list[Any]:
     return [op.operation for block in region.blocks for op in block.operations]
 
 
+def sole_operation(region: Any) -> str | None:
+    """The name of the operation that is all that a region of MLIR does, on its arguments in
+    their order; `None` for other regions."""
+    operations = operations_in(region)
+    # The last one returns.
+    if len(operations) != 2:
+        return None
+    op, _ = operations
+    (block,) = region.blocks
+    return op.name if [*op.operands] == [*block.arguments] else None
+
+
 def has_attribute(op: Any, name: str) -> bool:
     """Whether an operation of MLIR has an attribute of this name."""
     return name in op.attributes

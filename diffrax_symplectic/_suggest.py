@@ -40,7 +40,7 @@ from ._terms import (
     Fault,
     FRICTION,
     friction_apart,
-    is_own,
+    has_unknown_law,
     number_of_noises,
     path_numbers,
     random_paths,
@@ -284,7 +284,7 @@ def _suitable(
         # Lévy areas are only sampled between the noises of one array.
         solvers = [solver for solver in solvers if not _needs_areas(solver)]
     # No other path can take the place of these.
-    given = [path for path in paths if not is_random(path) or is_own(path)]
+    given = [path for path in paths if not is_random(path) or has_unknown_law(path)]
     return [solver for solver in solvers if all(_holds(path, solver) for path in given)]
 
 
@@ -396,7 +396,7 @@ def _suggestion(
     the terms with paths that are made by `make`."""
     record = _record(solver)
     random = random_paths(terms)
-    replaced = [path for path in random if not is_own(path)]
+    replaced = [path for path in random if not has_unknown_law(path)]
     if replaced:
         shape = _shape_code(increment_struct(replaced[0]))
         code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'

@@ -12,6 +12,7 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._suggest import LANGEVIN, SOLVERS
 from examples import advice
+from examples.stability import friction
 
 
 # Of those that are explicit, or implicit.
@@ -58,6 +59,57 @@ def test_facts_about_noise_on_harmonic_modes_are_measured(kind):
     assert kind.record.stationary == tuple(exact)
 
 
+def _names(found) -> set[str]:
+    return {advice.solver_name(suggestion.solver) for suggestion in found}
+
+
+def test_friction_is_measured_for_all_solvers_suggested_for_it():
+    terms = ds.langevin_terms(_well, 0.5, 1.0, ())
+    measured = {advice.solver_name(solver) for solver in friction.CASES.values()}
+    for want in ("weak", "strong"):
+        assert _names(ds.suggest_solver(terms, 0.0, advice.ONE, want=want)) <= measured
+
+
+@pytest.mark.parametrize("name", friction.CASES)
+def test_reasons_name_the_friction_that_exact_second_moments_allow(name):
+    solver = friction.CASES[name]
+    limit = friction.limit(friction.energies(solver))
+    assert solver.record.most_friction == limit
+    reason = solver.record.reason
+    if limit is None:
+        assert "gamma h" not in reason
+    else:
+        assert f"not for friction gamma h > {limit:g}." in reason
+
+
+def test_reasons_say_which_solver_is_for_functions_of_momenta_and_positions():
+    kappa, h = 1.0, 0.2
+
+    def pair(t, p, q, args):
+        return jnp.sum(p**2 + q**2) / 2 + kappa * (q[0] - q[1]) ** 2 / 2
+
+    exact = 1 / 6  # of the heat current, as in docs/solvers/langevin.md
+    zero = (jnp.zeros(2), jnp.zeros(2))
+    currents = {}
+    for kind in (ds.BAOAB, ds.LangevinMiddle):
+        path = kind().path((2,), jr.key(0), want="weak")
+        terms = ds.langevin_terms(pair, 0.5, jnp.array([1.5, 0.5]), path)
+        K = np.asarray(ds.second_moment_map(terms, kind(), 0.0, h, zero))
+        # Of (1, p, p', q, q').
+        moments = advice.stationary(K, 1.0).reshape(5, 5)
+        p, q = moments[1:3], moments[3:]
+        currents[kind] = kappa * np.sum(p[:, 3] - p[:, 4]) / 2
+        # Its momenta are h / 2 late, times the forces of the wells.
+        late = h * kappa / 4 * (q[0, 3] - q[1, 4])
+    baoab, middle = currents[ds.BAOAB], currents[ds.LangevinMiddle]
+    np.testing.assert_allclose(middle - baoab, late, rtol=1e-9)
+    assert abs(baoab / exact - 1) < 0.004
+    assert middle / exact - 1 > 0.04
+    both = "functions of p and q together, such as a heat current"
+    assert f"For {both}, too." in ds.BAOAB.record.reason
+    assert f"not for {both}." in ds.LangevinMiddle.record.reason
+
+
 # What the first suggestion says that it is not for, where it is not within twice the error
 # of the best.
 SAID = {
@@ -65,7 +117,7 @@ SAID = {
     "stiff oscillator in a bath": "Not for .* frequencies omega > 2 / h",
     "free particle in a bath": "Not for .* transients to more than three digits",
     "oscillator in a bath, transient": "Not for .* transients to more than three digits",
-    "oscillator in a bath, stationary": "Not for momenta",
+    "oscillator in a bath, stationary": "Not for functions of p alone",
     "coloured forcing with friction, late": "Not for .* stationary laws of linear systems",
     "Kubo oscillator": "Not for long steps, omega h > 1",
 }

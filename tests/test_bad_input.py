@@ -165,13 +165,33 @@ def test_noise_that_does_not_depend_on_the_state_is_refused(solver, m):
         jax.eval_shape(solve)
 
 
-@pytest.mark.parametrize("name", ["H0", "noise"])
-def test_a_hamiltonian_that_asks_for_values_is_named(name):
-    def branches(t, p, q, args):
-        return jnp.sum(p**2) if p[0] > 0 else jnp.sum(q**2)
+def _branches(t, p, q, args):
+    return jnp.sum(p**2) if p[0] > 0 else jnp.sum(q**2)
 
+
+def _selects(t, p, q, args):
+    return jnp.sum(q[p > 0])
+
+
+def _takes_numpy(t, p, q, args):
+    return np.sum(np.sin(q))
+
+
+def _takes_float(t, p, q, args):
+    return float(q[0])
+
+
+def _counts(t, p, q, args):
+    return jnp.sum(jnp.ones(int(q[0])) * q)
+
+
+@pytest.mark.parametrize("name", ["H0", "noise"])
+@pytest.mark.parametrize(
+    "asks", [_branches, _selects, _takes_numpy, _takes_float, _counts]
+)
+def test_a_hamiltonian_that_asks_for_values_is_named(name, asks):
     square = lambda t, p, q, args: jnp.sum(p**2)
-    H0, noise = (branches, square) if name == "H0" else (square, branches)
+    H0, noise = (asks, square) if name == "H0" else (square, asks)
     terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
     with pytest.raises(ValueError, match=f"`{name}` needs concrete.*jnp.where"):
         _solve(terms, (jnp.ones(2), jnp.ones(2)))

@@ -419,7 +419,8 @@ def test_attributes_of_operations_are_read():
 
 
 def test_regions_of_operations_are_read():
-    """If this fails: print the operation, and adapt `attribute_rows` or `operations_in`."""
+    """If this fails: print the operation, and adapt `attribute_rows`, `operations_in` or
+    `sole_operation`."""
 
     def windows(x):
         padding = ((1, 0), (0, 2))
@@ -429,6 +430,17 @@ def test_regions_of_operations_are_read():
     assert _compat.attribute_rows(reduction, "padding").tolist() == [[1, 0], [0, 2]]
     inside = _compat.operations_in(reduction.regions[0])
     assert [op.name for op in inside] == ["stablehlo.add", "stablehlo.return"]
+    assert _compat.sole_operation(reduction.regions[0]) == "stablehlo.add"
+
+    def sole(fn):
+        reduced = _lowered(lambda x: jax.lax.reduce(x, jnp.float32(0), fn, (0,)), (3,))
+        return _compat.sole_operation(
+            _operation(reduced, "stablehlo.reduce").regions[0]
+        )
+
+    assert sole(lambda a, b: a * b) == "stablehlo.multiply"
+    assert sole(lambda a, b: (a + b) * 0.5) is None
+    assert sole(lambda a, b: a + a) is None
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="LAPACK is for CPUs")

@@ -5,6 +5,7 @@ from .stepwise import (
     is_random,
     laws_of,
     num_noises,
+    ONLY_A_SHAPE,
     raveled,
     step_size,
     stepwise,

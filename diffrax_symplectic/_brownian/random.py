@@ -123,21 +123,26 @@ def derived_key(key: PRNGKeyArray, old):
     return jr.wrap_key_data(data, impl=jr.key_impl(old)) if old is typed else data
 
 
+# Odd constants, which keep steps of round numbers away from where `place_of` rounds: their
+# sizes from powers of two, and their middles in units from integers.
+_OFF_POWERS = 1.37
+_OFF_INTEGERS = 0.29
+
+
 def place_of(t0: Array, t1: Array) -> Place:
     """The position of a step as two integers, which do not change if times are rounded.
 
     The first counts the middle of the step in units of a power of two that is between a
-    third and 0.7 of the step; the second is the exponent. So two steps have the same
-    integers only if they overlap. The two odd constants keep round numbers away from the
-    boundaries of rounding.
+    third and 0.7 of the step (1.37 times a quarter and a half); the second is the exponent.
+    So two steps have the same integers only if they overlap.
     """
-    per_unit, exponent = _inverse_power_of_two(jnp.abs(t1 - t0) * 1.37)
+    per_unit, exponent = _inverse_power_of_two(jnp.abs(t1 - t0) * _OFF_POWERS)
     # Late in a long float32 solve, two steps may round to the same middle. So the integer
     # part of the start, which is exact, is split off before adding half a step.
     start = t0 * per_unit
     half = (t1 - t0) / 2 * per_unit
     whole = jnp.floor(start)
-    rest = jnp.floor(start - whole + half + 0.29)
+    rest = jnp.floor(start - whole + half + _OFF_INTEGERS)
     # Wrap around after 2^31 counts, or fewer in half precision.
     period = 2.0 ** min(31, jnp.finfo(whole.dtype).maxexp - 1)
     whole = whole - period * jnp.trunc(whole / period)

@@ -176,6 +176,12 @@ class GivenPath(diffrax.AbstractBrownianPath):
         return self.make(t0, t1, use_levy)
 
 
+ONLY_A_SHAPE = (
+    "These terms have the shape of a Brownian path instead of the path itself, which "
+    "suffices for `suggest_solver`, `compare_solvers`, `expectation` and `ensemble`."
+)
+
+
 class UnspecifiedPath(diffrax.AbstractBrownianPath):
     """The shape of a Brownian path to be chosen later, once the solver is known."""
 
@@ -186,10 +192,8 @@ class UnspecifiedPath(diffrax.AbstractBrownianPath):
 
     def evaluate(self, t0, t1=None, left=True, use_levy=False):
         raise ValueError(
-            "These terms have the shape of a Brownian path instead of the path itself, "
-            "which suffices for `suggest_solver`, `compare_solvers` and `expectation`. To "
-            "solve them, pass `path=solver.path(shape, key)` to the function that makes "
-            "the terms."
+            f"{ONLY_A_SHAPE} To solve them, pass `path=solver.path(shape, key)` to the "
+            "function that makes the terms."
         )
 
 

@@ -7,12 +7,14 @@ from typing import Any, get_args
 import diffrax
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import ArrayLike, Bool, Float, PRNGKeyArray, PyTree
 
-from .._arguments import whole_number
-from .._custom_types import Args, RealScalarLike, Y
+from .._arguments import brief, whole_number
+from .._compat import is_traced
+from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from .._fused import sample_key
 from .._solver import Want
 from .._terms import path_keys, with_keys
@@ -52,21 +54,37 @@ class Ensemble(eqx.Module):
     def num_failed(self) -> int:
         return int(np.sum(self.failed))
 
-    def terms(self, number: int) -> PyTree[diffrax.AbstractTerm]:
+    def terms(self, number: IntScalarLike) -> PyTree[diffrax.AbstractTerm]:
         """The terms of path number `number`, with its random keys. Passed to
         `diffrax.diffeqsolve` they give the same path, for example to save it at more
-        times."""
+        times. `number` may be traced, to solve several paths by `jax.vmap`."""
         terms = self._problem.terms
         return with_keys(terms, path_keys(terms, self._key_of(number)))
 
-    def start(self, number: int) -> tuple[Y, Args]:
-        """The initial state and the `args` of path number `number`."""
+    def start(self, number: IntScalarLike) -> tuple[Y, Args]:
+        """The initial state and the `args` of path number `number`, which may be traced."""
         y0, own = self._problem.drawn(self._key_of(number))
         return y0, self._problem.with_args(own).args
 
-    def _key_of(self, number: int) -> PRNGKeyArray:
-        high, low = (np.uint32(x) for x in divmod(int(number), 2**32))
-        return sample_key(self._key, high, low)
+    def _key_of(self, number: IntScalarLike) -> PRNGKeyArray:
+        return sample_key(self._key, *_words(number))
+
+
+def _words(number: IntScalarLike) -> tuple[ArrayLike, ArrayLike]:
+    """The upper and the lower 32 bits of the number of a path. Raises a `ValueError`
+    unless it is an integer that is not negative, as far as that is known."""
+    is_one = eqx.is_array_like(number) and jnp.shape(number) == ()
+    if not is_one or not jnp.issubdtype(jnp.result_type(number), jnp.integer):
+        raise ValueError(
+            f"`number` must be one integer, 0 or larger; got {brief(number)}. For several "
+            "paths, batch over their numbers: `jax.vmap(paths.start)(numbers)`."
+        )
+    if not is_traced(number):
+        high, low = divmod(whole_number("number", int(number), least=0), 2**32)
+        return np.uint32(high), np.uint32(low)
+    traced = jnp.asarray(number)
+    # Of a number with fewer bits the upper ones are zero.
+    return (traced >> 32).astype(jnp.uint32), traced.astype(jnp.uint32)
 
 
 def ensemble(

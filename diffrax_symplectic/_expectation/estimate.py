@@ -161,10 +161,12 @@ class Expectation(eqx.Module):
         """What failed paths could change in `mean`: their fraction of all paths, times the
         largest deviation of another path's value from the mean. (For sorted paths, that is
         the mean over the replicates.) It does not decrease with more paths."""
-        lost = self.num_failed
-        # Replicates count the paths that failed in them, too.
-        whole = self.num_paths + (lost if self.paths_per_sample == 1 else 0)
-        fraction = lost / max(whole, 1)
+        drawn = sum(own.end - own.begin for own in self.moments)
+        # Samples that are left out, as single paths are, or as many samples as the paths
+        # that failed in others would be, as in replicates.
+        left_out = drawn - self.num_samples
+        lost = max(left_out, self.num_failed / self.paths_per_sample)
+        fraction = lost / max(drawn, 1)
         spread = self._results(Combination.BEST).spread
         return jtu.tree_map(lambda most: fraction * most, spread)
 

@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, Int32, UInt, UInt32
 # The most bits of a coordinate that sorting uses: 65,536 cells along each axis, four times
 # the default number of paths. Each bit costs some operations on all paths.
 _COORDINATE_BITS = 16
-# The number of states from which the range of a coordinate is estimated, and the share of
-# them that is left out at either end.
+# About how many states the range of a coordinate is estimated from, and the share of them
+# that is left out at either end.
 _SAMPLE = 256
 _OUTLIERS = 1 / 50
 # The bits of an unsigned integer, less one that marks the rows at the end.
@@ -65,6 +65,7 @@ def _on_grid(z: Float[Array, "n d"], total: int) -> list[UInt32[Array, " n"]]:
     high = sample[-1 - outliers]
     width = jnp.where(high > low, high - low, 1)
     x = ((z - low) / width + 1) * np.asarray(2.0**bits / 3, z.dtype)
+    # At most 16 bits each, which are exact in single precision.
     x = jnp.clip(x, 0, 2.0**bits - 1).astype(jnp.uint32)
     return [x[:, i] for i in range(d)]
 

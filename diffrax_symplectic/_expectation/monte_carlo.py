@@ -140,6 +140,7 @@ def _of_function(
     def combined(
         x: Float[Array, "levels n ..."],
     ) -> Float[Array, "1 combinations n ..."]:
+        # With the first axis of `Samples.values`, for the one kind.
         return tensordot(weights.astype(x.dtype), x, 1)[None]
 
     # A path that fails on several levels counts once.

@@ -173,6 +173,7 @@ def _of_paths(sampler: Callable, paths: PyTree, keys: Key[Array, " n"]) -> Sampl
 
 def _moments(sums: BatchSums, begin: int, end: int, dtypes: PyTree[str]) -> Moments:
     """The moments of samples `begin` to `end - 1`, in float64."""
+    # Single precision could not hold the sum of a mean and its rounding error.
     wide = jtu.tree_map(lambda x: x.astype(float), sums)
     return Moments(
         begin=begin,

@@ -41,8 +41,9 @@ class Samples(eqx.Module):
     """Samples to average.
 
     - `values`: with leading axes for kinds, combinations of levels, and samples. The first
-        kind is the estimate. Most samples have only this one; others have all of
-        `KindsOfReplicates` or `KindsWithControl`.
+        kind is the estimate. Most samples have only this one, a path each; others have all
+        of `KindsOfReplicates` or `KindsWithControl`. Where a sample is a mean of paths, the
+        spread of single ones, on which `failed_error` and warnings rest, comes from these.
     - `good`: which samples are good.
     - `lost`: how many paths failed in each.
     """

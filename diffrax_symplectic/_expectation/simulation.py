@@ -143,7 +143,7 @@ def _recorded(
 
         phi = jax.vmap(phi_of)(paths.y, paths.args)
         failed = paths.failed | ~jax.vmap(all_finite)(phi)
-        # The same step may be saved twice.
+        # `ts` may repeat a time, so one step may have several places.
         here = along(level.saved_steps == i, saved)
         return failed, jnp.where(here, measure(phi, failed), saved)
 

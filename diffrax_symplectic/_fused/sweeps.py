@@ -172,15 +172,16 @@ def _criterion(scale: PyTree[Array], dtype: Any) -> _Criterion:
 
 
 def _inverse(x: Scalar) -> Scalar:
-    """The inverse of a positive number up to a factor of two, from its exponent: a division
-    takes as long as a sweep. The inverse of zero is large, not infinite."""
+    """The inverse of a positive finite number up to a factor of two, from its exponent: a
+    division takes as long as a sweep. The inverse of zero is large, not infinite. Others
+    give minus infinity, which the check at the end finds."""
     info = jnp.finfo(x.dtype)
     kind = jnp.dtype(f"int{info.bits}")
     # Read as an integer, the bits of a float are its exponent, followed by its mantissa,
     # which is cut off. The difference of two such integers subtracts exponents.
     one = int(np.asarray(1, x.dtype).view(kind))
-    exponent = lax.bitcast_convert_type(x, kind) >> info.nmant << info.nmant
-    return lax.bitcast_convert_type(jnp.asarray(2 * one, kind) - exponent, x.dtype)
+    power = lax.bitcast_convert_type(x, kind) >> info.nmant << info.nmant
+    return lax.bitcast_convert_type(jnp.asarray(2 * one, kind) - power, x.dtype)
 
 
 def _sizes(y: PyTree[Array]) -> list[Scalar]:

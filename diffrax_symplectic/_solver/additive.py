@@ -77,6 +77,7 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose="Two stage vectors, one after the other. The noise may depend on time.",
         suggested=("weak", "strong"),
         heats=True,
+        most_friction=1.0,
     )
     beta1: float = free_parameter("beta1", 0.0)
     beta2: float = eqx.field(default=1.0, static=True, converter=_nonzero)
@@ -128,6 +129,7 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose="As cheap as the midpoint rule, for low accuracy.",
         suggested=("weak",),
         heats=True,
+        most_friction=0.5,
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
         alpha=[1],
@@ -179,6 +181,7 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         "systems, which the midpoint rule has exactly.",
         suggested=("weak",),
         heats=True,
+        most_friction=2.0,
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
         alpha=[1 / 2, 1 / 2],

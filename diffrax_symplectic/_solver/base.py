@@ -73,8 +73,12 @@ class Record(NamedTuple):
         a heat bath whose stationary values are exact for every stable step.
     - `heats`: whether noise gives a harmonic mode without friction the right energy for
         steps that do not resolve it; `None` if such steps are unstable.
+    - `most_friction`: the greatest friction, as a rate times the step, up to which the
+        stationary energies of a resolved harmonic mode in a heat bath are within a tenth,
+        of those in `examples/stability/friction.py`; `None` if there is no limit. Given
+        for suggested solvers.
 
-    The last two are measured, in `tests/test_advice.py`, for the solvers that are
+    The last three are measured, in `tests/test_advice.py`, for the solvers that are
     `suggested`. Leave them out for others: the page then promises and warns of nothing.
     The random variables of `LevyAreaMidpoint` have no finite set of outcomes, so it states
     those of the midpoint rule, which a test compares its steps with.
@@ -87,17 +91,21 @@ class Record(NamedTuple):
     suggested: tuple[Want, ...] = ()
     stationary: tuple[str, ...] = ()
     heats: bool | None = None
+    most_friction: float | None = None
 
     @property
     def reason(self) -> str:
-        """When to choose it, and where noise gives stiff modes the wrong energy."""
-        if self.heats is not False:
-            return self.choose
-        if "pp" in self.stationary:
-            stiff = "Right for noise on stiff modes only in a heat bath."
-        else:
-            stiff = "Not for noise on stiff modes."
-        return f"{self.choose} {stiff}"
+        """When to choose it, where noise gives stiff modes the wrong energy, and for which
+        friction the temperature is wrong."""
+        sentences = [self.choose]
+        if self.heats is False and "pp" in self.stationary:
+            sentences.append("Right for noise on stiff modes only in a heat bath.")
+        elif self.heats is False:
+            sentences.append("Not for noise on stiff modes.")
+        if self.most_friction is not None:
+            limit = f"{self.most_friction:g}"
+            sentences.append(f"In a heat bath not for friction gamma h > {limit}.")
+        return " ".join(sentences)
 
     def order(self, want: Want, commute: bool) -> int | float | None:
         """The order for noises that commute, or for others."""

@@ -72,6 +72,7 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         noises="commuting",
         suggested=("weak",),
         heats=True,
+        most_friction=0.5,
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(
         alpha=_HALVES,
@@ -146,6 +147,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         noises="not commuting",
         suggested=("weak",),
         heats=True,
+        most_friction=0.5,
     )
     structure: ClassVar[Structure] = "any"
     variables: ClassVar[tuple[str, ...]] = ("W", "two_point")

@@ -162,10 +162,11 @@ class BAOAB(AbstractLangevinSplitting):
 
     **Positions, momenta, transport.** In a harmonic well of frequency $\omega$ the law of
     $q$ is exact for every step with $\omega h < 2$. Momenta are too cold,
-    $\langle p^2 \rangle = m T (1 - \omega^2 h^2 / 4)$: for functions of momenta, such as
+    $\langle p^2 \rangle = m T (1 - \omega^2 h^2 / 4)$: for functions of p alone, such as
     kinetic temperatures, use [`diffrax_symplectic.LangevinMiddle`][], which has the same
-    positions. The mobility $G^{-1}$ and the diffusion $T G^{-1}$ of a free particle are
-    exact for every step.
+    positions. Functions of p and q together, such as heat currents, are for this solver,
+    since its momenta and positions belong to the same time. The mobility $G^{-1}$ and the
+    diffusion $T G^{-1}$ of a free particle are exact for every step.
 
     Weak order 2, strong order 1, order 2 without noise. If $G = \gamma M$ with one
     constant number $\gamma$, a step is conformally symplectic: with its Jacobian $S'$,
@@ -196,8 +197,10 @@ class BAOAB(AbstractLangevinSplitting):
         weak=2,
         strong=1,
         choose="Langevin dynamics: explicit, with very accurate stationary positions, and "
-        "exact mobility and diffusion of free particles. Not for momenta, for transients "
-        "to more than three digits, or for frequencies omega > 2 / h.",
+        "exact mobility and diffusion of free particles. For functions of p and q "
+        "together, such as a heat current, too. Not for functions of p alone, such as a "
+        "kinetic temperature, for transients to more than three digits, or for "
+        "frequencies omega > 2 / h.",
         suggested=("weak", "strong"),
         stationary=("qq", "pq"),
     )
@@ -239,8 +242,8 @@ class LangevinMiddle(AbstractLangevinSplitting):
     **Positions, momenta, transport.** In a harmonic well the laws of $q$ and of $p$ are
     exact, each by itself, for every step with $\omega h < 2$. The momenta belong to half a
     step before the positions, so that $\langle p q \rangle = h T / 2$ and not zero. Use it
-    for functions of the momenta or of the positions, and [`diffrax_symplectic.BAOAB`][] for
-    functions of both, such as a correlation $\langle p q \rangle$. Momenta come right after
+    for functions of p alone or of q alone, not for functions of p and q together, such as a
+    heat current: these are for [`diffrax_symplectic.BAOAB`][]. Momenta come right after
     friction and noise: in a step, the bath gives a particle of mass $m$ the mean energy
     $\frac12 (c^{-2} - 1) \langle T - p^2 / m \rangle$, $c = (1 - x) / (1 + x)$. Mobility
     and free diffusion are exact, as for [`diffrax_symplectic.BAOAB`][].
@@ -259,8 +262,9 @@ class LangevinMiddle(AbstractLangevinSplitting):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose="Langevin dynamics, for functions of momenta. Same positions as "
-        "`BAOAB`; momenta lag by half a step.",
+        choose="Langevin dynamics, for functions of p alone. Same positions as `BAOAB`, "
+        "but momenta lag by half a step: not for functions of p and q together, such as a "
+        "heat current.",
         suggested=("weak", "strong"),
         stationary=("qq", "pp"),
     )

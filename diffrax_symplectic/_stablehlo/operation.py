@@ -17,7 +17,7 @@ from .._compat import (
     attribute_value,
     constant_values,
     has_attribute,
-    operations_in,
+    sole_operation,
 )
 from .backend import array_types
 from .tensor import made_here, Tensor
@@ -62,11 +62,11 @@ class Operation(NamedTuple):
         return constant_values(self.op)
 
     @property
-    def reduces_by(self) -> str:
-        """The name of the first operation of the region, which of a simple reduction is
-        its only one."""
-        first, *_ = operations_in(self.op.regions[0])
-        return first.name.split(".")[-1]
+    def reduces_by(self) -> str | None:
+        """The name of the operation that a reduction repeats, such as `add`; `None` if its
+        region does more than one."""
+        name = sole_operation(self.op.regions[0])
+        return None if name is None else name.split(".")[-1]
 
     def has(self, name: str) -> bool:
         return has_attribute(self.op, name)

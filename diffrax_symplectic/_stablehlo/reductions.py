@@ -95,7 +95,6 @@ _NEUTRAL = {
     "maximum": -np.inf,
     "minimum": np.inf,
     "or": False,
-    "and": True,
 }
 
 
@@ -104,7 +103,13 @@ def _changes_nothing(o: Operation, starts: Sequence[Tensor]) -> bool:
     if len(starts) > 1:
         return False
     value = known(starts[0])
-    return value is not None and bool(value == _NEUTRAL.get(o.reduces_by))
+    repeated = o.reduces_by
+    if value is None or repeated is None:
+        return False
+    if repeated == "and":
+        # All bits. Of integers, one has a single bit.
+        return bool(~value == 0)
+    return bool(value == _NEUTRAL.get(repeated))
 
 
 @rule

@@ -18,7 +18,13 @@ from .structure import additive_fault, check_stratonovich, check_structure
 from .structure import commuting, constant_fault, Fault, FRICTION
 from .structure import separable_fault
 from .surface import check_start, constrained_state, Surface
-from .paths import brownian_paths, is_own, path_keys, path_numbers, random_paths
+from .paths import (
+    brownian_paths,
+    has_unknown_law,
+    path_keys,
+    path_numbers,
+    random_paths,
+)
 from .paths import replace_paths, shapes_as_paths, specified, with_keys, with_paths
 from .vector_fields import apply, apply_one, check_fit, flattened
 from .vector_fields import number_of_noises, rate

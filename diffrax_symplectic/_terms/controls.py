@@ -23,16 +23,18 @@ from .._brownian import (
     increment_struct,
     is_random,
     laws_of,
+    ONLY_A_SHAPE,
     PlateauBrownianPath,
     raveled,
     step_size,
     TruncatedBrownianPath,
+    UnspecifiedPath,
     VARIABLES,
     WeakBrownianPath,
 )
 from .._compat import direction, resolution, ω
 from .._custom_types import Args, RealScalarLike
-from .paths import brownian_paths, replace_paths
+from .paths import brownian_paths, replace_paths, shapes_as_paths
 from .vector_fields import apply, apply_brackets, apply_bridge, bridge
 
 
@@ -99,7 +101,12 @@ def _the_path(
 ) -> tuple[diffrax.AbstractBrownianPath, Mapping[str, AbstractLaw]]:
     """The Brownian path of the terms, and the laws of the attributes of its increments.
     Raises a `ValueError` if there are several, or if its laws are not known."""
-    paths = brownian_paths(terms)
+    paths = brownian_paths(shapes_as_paths(terms))
+    if any(isinstance(path, UnspecifiedPath) for path in paths):
+        raise ValueError(
+            f"{ONLY_A_SHAPE} For the random variables of a step, pass "
+            "`path=solver.path(shape, key)` to the function that makes the terms."
+        )
     laws = laws_of(paths[0]) if len(paths) == 1 else None
     if laws is None:
         raise ValueError(

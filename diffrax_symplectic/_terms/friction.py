@@ -126,6 +126,7 @@ def _noise_of(g: Any, T: ArrayLike, w: Array, x: Array) -> Array:
         raise ValueError(
             "An array of `temperature` must be a scalar, or have the shape of its momenta, "
             f"{jnp.shape(x)}; got shape {jnp.shape(T)}."
+            f"{_broadcast_advice('temperature', jnp.shape(T), jnp.shape(x))}"
         )
     # Where either is negative, NaN makes the path fail.
     return jnp.sqrt(like(matrix, x)) * jnp.sqrt(2 * like(T, x)) * w
@@ -177,8 +178,45 @@ def _is_matrix(g: ArrayLike, momenta: tuple[int, ...]) -> bool:
         raise ValueError(
             "An array of `friction` must be a scalar, or have the shape of its momenta, "
             f"{momenta}, or as a matrix the shape {momenta * 2}; got shape {jnp.shape(g)}."
+            f"{_broadcast_advice('friction', jnp.shape(g), momenta)}"
         )
     return True
+
+
+def _broadcast_advice(
+    name: str, shape: tuple[int, ...], momenta: tuple[int, ...]
+) -> str:
+    """What to pass instead of an array of this shape if NumPy would broadcast it, which is
+    not done here: the shape of a matrix and that of momenta could not be told apart."""
+    if not _broadcasts(shape, momenta):
+        return ""
+    return f" To repeat it along an axis, pass `{name} * jnp.ones({momenta})`."
+
+
+def _broadcasts(shape: tuple[int, ...], momenta: tuple[int, ...]) -> bool:
+    """Whether NumPy would repeat an array of this shape to that of the momenta."""
+    try:
+        return np.broadcast_shapes(shape, momenta) == momenta
+    except ValueError:
+        return False
+
+
+def _check_fits_path(g: ArrayLike, path: tuple[int, ...]) -> None:
+    """Raises a `ValueError` if an array of friction and a path of this shape belong to
+    momenta of different shapes. Before the solve it is not known which of them is wrong."""
+    shape = jnp.shape(g)
+    # Where broadcasting was meant, the path is right.
+    if shape in ((), path, path * 2) or _broadcasts(shape, path):
+        return
+    half = len(shape) // 2
+    momenta = shape[:half] if shape == shape[:half] * 2 else shape
+    raise ValueError(
+        "`friction` and the `path` of `langevin_terms` must be those of the same momenta; "
+        f"got friction of shape {shape} and a path of shape {path}. For momenta of shape "
+        f"{momenta} pass a path of shape {momenta}, one noise for each momentum. For "
+        f"momenta of shape {path} pass friction of that shape, or a matrix of shape "
+        f"{path * 2}."
+    )
 
 
 def _for_each(name: str, value: PyTree, p: _P) -> PyTree:
@@ -186,9 +224,13 @@ def _for_each(name: str, value: PyTree, p: _P) -> PyTree:
     if jtu.all_leaves([value], is_leaf=_is_square):
         return jtu.tree_map(lambda _: value, p)
     if jtu.tree_structure(value, is_leaf=_is_square) != jtu.tree_structure(p):
+        is_list = isinstance(value, list | tuple)
+        instead = (
+            f" For an array pass `jnp.array({name})`, not a list." if is_list else ""
+        )
         raise ValueError(
             f"`{name}` must be one number or array, or have the structure of the momenta "
-            f"{eqx.tree_pformat(p)}; got {eqx.tree_pformat(value)}."
+            f"{eqx.tree_pformat(p)}; got {eqx.tree_pformat(value)}.{instead}"
         )
     return value
 
@@ -249,12 +291,14 @@ def _as_array_or_function(x: Any) -> Any:
 
 
 def _checked_array(g: ArrayLike, momenta: tuple[int, ...] | None) -> Array | _Square:
-    """The friction of an array of momenta, of this shape if it is known. Raises a
-    `ValueError` if it is known to be invalid."""
+    """The friction of an array of momenta, of this shape if it is known, from that of the
+    path. Raises a `ValueError` if it is known to be invalid."""
     shape = jnp.shape(g)
     # A matrix has the shape of its momenta twice.
     half = len(shape) // 2
     may_be_matrix = half > 0 and shape == shape[:half] * 2
+    if momenta is not None:
+        _check_fits_path(g, momenta)
     is_matrix = momenta is not None and _is_matrix(g, momenta)
     if not may_be_matrix:
         return jnp.asarray(real_array("friction", g, positive=False, kind=_KIND))

@@ -359,11 +359,11 @@ def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Arr
     copy = jtu.tree_map(lambda leaf: leaf, args)
     try:
         return H(*inputs, copy)
-    except jax.errors.JAXTypeError as error:
+    except _NEED_VALUES as error:
         raise ValueError(
             f"`{name}` needs concrete values while JAX traces it, in an `if`, `while`, "
-            "`float`, or a NumPy function. Write `jnp.where(a, b, c)` or `jax.lax.cond` "
-            "instead of `if`, and `jnp` instead of `np`."
+            "`float`, an index `x[x > 0]`, or a NumPy function. Write `jnp.where(a, b, c)` "
+            "or `jax.lax.cond` instead of `if`, and `jnp` instead of `np`."
         ) from error
     except (TypeError, AttributeError) as error:
         if args is None and _uses_args(H, inputs):
@@ -371,8 +371,18 @@ def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Arr
         raise
 
 
+# Errors of a function that needs the values of its arguments while JAX traces it.
+_NEED_VALUES = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.NonConcreteBooleanIndexError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+
 def _uses_args(H: Callable, inputs: tuple) -> bool:
-    """Whether a function that fails without `args` does anything with them before."""
+    """Whether a function that fails without `args` does anything with them before: it is
+    called once more, with an object whose every use is an error of its own."""
     try:
         H(*inputs, _NoArgs())
     except _Used:

@@ -77,9 +77,9 @@ def random_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
     return [path for path in brownian_paths(terms) if is_random(path)]
 
 
-def is_own(path: diffrax.AbstractBrownianPath) -> bool:
-    """Whether this is a path of the user's own class, which need not be a Brownian motion
-    (but the paths of this package and of Diffrax are)."""
+def has_unknown_law(path: diffrax.AbstractBrownianPath) -> bool:
+    """Whether the law of this path is not known here, as for the user's own classes, which
+    need not be Brownian motions."""
     return laws_of(path) is None and not _is_unspecified(path)
 
 
@@ -149,7 +149,7 @@ def with_paths(
         # With one Brownian motion, which is the usual case, the user's key is its key: the
         # same path can then be made by hand.
         own = key if number == 0 else jr.fold_in(key, number + 1)
-        if not is_own(path):
+        if not has_unknown_law(path):
             return make(increment_struct(path), own)
         derived = lambda x: derived_key(own, x) if is_key(x) else x
         return jtu.tree_map(derived, path)

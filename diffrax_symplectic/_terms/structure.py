@@ -85,6 +85,7 @@ def check_structure(
         check_pair(y0)
         needs = "H0 = V(p) + U(t, q) and noise Hamiltonians H_k = U_k(t, q)"
         refuse(needs, separable_fault(drift, noise, t0, y0, args))
+    # "constant" is additive, and constant in time.
     if structure in ("additive", "constant", "separable and constant"):
         needs = "additive noise, H_k = -sigma_k(t).q + gamma_k(t).p"
         refuse(needs, additive_fault(noise, t0, y0, args))

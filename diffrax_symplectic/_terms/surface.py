@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
-from .._arguments import check_pair, check_state, shapes
+from .._arguments import check_pair, check_state, is_real_number
 from .._batch import batched_like, error_if_alone
 from .._compat import is_traced
 from .._custom_types import Args, RealScalarLike
@@ -206,7 +206,9 @@ def _total(x: Float[Array, "n ..."]) -> Float[Array, "..."]:
 _DEPENDENT = (
     "The gradients of `constraint` at `y0` are linearly dependent, or zero. Leave out "
     "constraints that follow from the others, and write each so that its gradient does not "
-    "vanish where it is zero, such as `jnp.sum(q**2) - 1`."
+    "vanish where it is zero, such as `jnp.sum(q**2) - 1`. For atoms on a line no distance "
+    "follows from the others: fix one, and put each atom between its ends on the line, "
+    "for a middle one by `q[1] - (q[0] + q[2]) / 2` in place of its distances."
 )
 _OFF = (
     "`y0` is off the `constraint`, or its momenta are not tangent to it. Pass "
@@ -352,15 +354,16 @@ def _projected(
     return y1, found, surface.dependent(at)
 
 
-def _values(constraint: Constraint, q: PyTree, args: Args) -> _Multipliers:
-    """The constraints. Raises a `ValueError` unless they are a real array of shape
-    `(c,)`."""
+def _values(constraint: Constraint, q: PyTree, args: Args) -> Float[Array, " c"]:
+    """The values of the constraints. Raises a `ValueError` unless they are a real array of
+    shape `(c,)`."""
     value = evaluated("constraint", constraint, q, args=args)
-    real = eqx.is_array_like(value) and not jnp.iscomplexobj(value)
-    if not real or jnp.ndim(value) != 1 or jnp.size(value) == 0:
+    if not is_real_number(value) or jnp.ndim(value) != 1 or jnp.size(value) == 0:
+        # With the dtype, such as `f32[2]`: that alone may be what is wrong.
+        got = eqx.tree_pformat(value, struct_as_array=True)
         raise ValueError(
             "`constraint(q, args)` must return a real array of shape `(c,)`, one number "
-            f"for each constraint; got shape {shapes(value)}. For one constraint write "
+            f"for each constraint; got {got}. For one constraint write "
             "`jnp.stack([...])`."
         )
     return jnp.asarray(value, jnp.result_type(*jtu.tree_leaves(q)))

@@ -4,4 +4,5 @@ from ._page import run
 
 
 if __name__ == "__main__":
-    run("stability", __doc__, ("moments", "solvability", "stiff", "baths", "rounding"))
+    modules = ("moments", "solvability", "stiff", "baths", "friction", "rounding")
+    run("stability", __doc__, modules)

@@ -125,6 +125,35 @@ def test_paths_of_an_ensemble_start_where_they_say(engine):
     assert len(np.unique(ratios)) == 20
 
 
+def test_paths_of_an_ensemble_may_be_solved_again_in_a_batch():
+    def start(key, args):
+        return jnp.zeros(()), jnp.sqrt(args["strength"]) * jr.normal(key)
+
+    solver = ds.AdditiveGauss()
+    given = TERMS, solver, 0.0, END, 0.25, start, strengths
+    paths = ds.ensemble(*given, key=jr.key(1), num_paths=20)
+
+    def again(number):
+        y0, args = paths.start(number)
+        terms = paths.terms(number)
+        return diffrax.diffeqsolve(terms, solver, 0.0, END, 0.25, y0, args).ys[1][0]
+
+    numbers = jnp.array([0, 13, 19])
+    ends = jax.jit(jax.vmap(again))(numbers)
+    np.testing.assert_allclose(ends, paths.ys[1][numbers], rtol=1e-13)
+    # Beyond 32 bits, and in the types of 32 bits and fewer.
+    far = 2**40 + 5
+    for numbers in (jnp.array([5, far]), np.arange(5, 6, dtype=np.uint8)):
+        q = jax.vmap(lambda i: paths.start(i)[0][1])(numbers)
+        one_by_one = [paths.start(int(i))[0][1] for i in numbers]
+        np.testing.assert_array_equal(q, one_by_one)
+    for bad in (1.5, -1, numbers, "one", True):
+        with pytest.raises(ValueError, match="`number` must be .*integer, 0 or larger"):
+            paths.start(bad)
+    with pytest.raises(ValueError, match="`number` must be one integer"):
+        jax.vmap(paths.terms)(jnp.array([0.5]))
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_start_that_is_not_finite_is_a_failed_path(engine):
     def start(key):

@@ -210,6 +210,18 @@ TWICE = ds.hamiltonian_terms(
     pendulum_energy, constraint=lambda q, args: jnp.sum(q**2) - jnp.array([1.0, 1.0])
 )
 OFF = LEVEL[0], 1.01 * LEVEL[1]
+
+
+def _free(t, p, q, args):
+    return jnp.sum(p**2) / 2
+
+
+def _distances(q, args):
+    sides = q - jnp.roll(q, 1, axis=0)
+    return jnp.sum(sides**2, axis=1) - jnp.array([4.0, 1.0, 1.0])
+
+
+LINE = jnp.zeros((3, 2)), jnp.array([[-0.6, -0.8], [0.0, 0.0], [0.6, 0.8]])
 STARTS = pytest.mark.parametrize(
     "terms, y0, advice",
     [
@@ -217,6 +229,11 @@ STARTS = pytest.mark.parametrize(
         (PENDULUM, LEVEL[::-1], "constrained_state"),
         (TWICE, LEVEL, "linearly dependent"),
         (PENDULUM, (LEVEL[0], 0 * LEVEL[1]), "linearly dependent"),
+        (
+            ds.hamiltonian_terms(_free, constraint=_distances),
+            LINE,
+            r"atoms on a line.*q\[1\] - \(q\[0\] \+ q\[2\]\) / 2",
+        ),
     ],
 )
 
@@ -237,6 +254,27 @@ def test_bad_starts_fail_alone_in_a_batch(terms, bad):
     starts = jax.tree.map(lambda *x: jnp.stack(x), LEVEL, bad)
     okay = jax.jit(jax.vmap(solve))(starts).result == diffrax.RESULTS.successful
     np.testing.assert_array_equal(okay, [terms is PENDULUM, False])
+
+
+def test_atoms_on_a_line_stay_there_and_turn_as_one():
+    def straight(q, args):
+        length = jnp.sum((q[2] - q[0]) ** 2)[None] - 4
+        return jnp.concatenate([length, q[1] - (q[0] + q[2]) / 2])
+
+    terms = ds.hamiltonian_terms(_free, constraint=straight)
+    # Both ends are 1 from the middle, and have the speed 1.
+    p = jnp.array([[0.8, -0.6], [0.0, 0.0], [-0.8, 0.6]])
+    ends = []
+    for h in (0.02, 0.01):
+        number = round(1.5 / h)
+        (_, q), okay = take_steps(number, terms, h, (p, LINE[1]))
+        assert bool(okay)
+        np.testing.assert_allclose(q[1], (q[0] + q[2]) / 2, atol=1e-14)
+        ends.append(q[2])
+    exact = np.cos(1.5) * LINE[1][2] + np.sin(1.5) * p[2]
+    coarse, fine = (np.linalg.norm(end - exact) for end in ends)
+    # The step is of second order.
+    assert fine < 1e-4 and 3.9 < coarse / fine < 4.1
 
 
 def test_a_state_is_projected_in_the_metric_of_the_masses():
@@ -320,7 +358,8 @@ def test_what_makes_no_sense_with_constraints_refuses_them():
         (lambda q, args: jnp.sum(q**2) - 1, "real array of shape"),
         (lambda q, args: (q[0],), "real array of shape"),
         (lambda q, args: q[:, None], "real array of shape"),
-        (lambda q, args: 1j * q, "real array of shape"),
+        (lambda q, args: 1j * q, r"real array of shape .*got c\d+\["),
+        (lambda q, args: q > 0, r"real array of shape .*got bool\["),
         (lambda q: q, "is called as `constraint"),
         (3.0, "must be a function"),
     ],

@@ -100,6 +100,19 @@ def test_kubo_moments_match_the_matrix_recursion():
     np.testing.assert_allclose(got, expected, atol=1e-15)
 
 
+@pytest.mark.parametrize("name", ["step_expectation", "second_moment_map"])
+def test_shapes_of_paths_are_told_to_be_shapes(name):
+    field = lambda t, y, args: jax.tree.map(lambda x: x[..., None], y)
+    control = diffrax.ControlTerm(field, (1,))  # pyright: ignore
+    drift, noise = kubo_terms(()).terms
+    y0 = (jnp.array(0.0), jnp.array(1.0))
+    more = {"fn": lambda t, y, a: y[0]} if name == "step_expectation" else {}
+    for term in (noise, control):
+        terms = diffrax.MultiTerm(drift, term)
+        with pytest.raises(ValueError, match=r"pass `path=solver.path\(shape, key\)`"):
+            getattr(ds, name)(terms, ds.ImplicitMidpoint(), 0.0, 0.1, y0, **more)
+
+
 def test_expectation_needs_one_path_of_a_known_law():
     y0 = (jnp.array(0.0), jnp.array(1.0))
     area = diffrax.SpaceTimeLevyArea

@@ -170,7 +170,8 @@ def test_gradients_with_respect_to_damping_and_parameters():
 
 def test_dampings_that_are_none_are_refused():
     path = weak_path(3)
-    for wrong in (-0.1, jnp.nan, jnp.inf, 1j, "much", jnp.array([0.1, -0.1])):
+    array = jnp.array([0.1, -0.1])
+    for wrong in (-0.1, jnp.nan, jnp.inf, 1j, "much", array, array > -1, 1j * array):
         with pytest.raises(ValueError, match="`damping` must be a number"):
             ds.spin_terms(H0, noise, path, damping=wrong)  # pyright: ignore
     y0 = ds.to_spinors(jnp.ones((2, 3)))

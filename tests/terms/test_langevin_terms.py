@@ -310,8 +310,15 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
         ((None, T, (3,)), "`friction` must be a number"),
         (
             (jnp.ones(2), T, (3,)),
-            r"`friction` must be a scalar.* as a matrix .*\(3, 3\)",
+            r"friction of shape \(2,\) and a path of shape \(3,\)\. For momenta of shape "
+            r"\(2,\) pass a path of shape \(2,\).* matrix of shape \(3, 3\)",
         ),
+        (
+            (jnp.eye(4), T, (2,)),
+            r"For momenta of shape \(4,\) pass a path of shape \(4,\)",
+        ),
+        (([1.0, 0, 1.0], T, (3,)), r"got \[1.0, 0, 1.0\]. .*`jnp.array\(friction\)`"),
+        ((jnp.ones((3, 1)), T, (3, 3)), r"pass `friction \* jnp.ones\(\(3, 3\)\)`"),
         ((negative,), "`friction` must be a symmetric positive semidefinite"),
         ((negative, T, (2,)), "`friction` must be a symmetric positive semidefinite"),
         ((jnp.abs(negative), T, (2,)), "`friction` must be a symmetric positive semi"),
@@ -337,6 +344,12 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
         ((TENSOR, jnp.ones(3), weak_path(3)), "`temperature` must be one number"),
         ((1.0, jnp.ones(2), weak_path(3)), "array of `temperature` must be a scalar"),
         ((lambda t, q, args: q[:2], T, weak_path(3)), "array of `friction` must be"),
+        (([1.0, 0, 1.0],), r"`jnp.array\(friction\)`"),
+        ((1.0, [T] * 3, weak_path(3)), r"`jnp.array\(temperature\)`"),
+        (
+            (1.0, jnp.ones(1), weak_path(3)),
+            r"pass `temperature \* jnp.ones\(\(3,\)\)`",
+        ),
     ):
         with pytest.raises(ValueError, match=match):
             ds.BAOAB().init(make(*arguments), 0.0, 0.1, y0, None)
