@@ -33,6 +33,7 @@ from ._tableau import Structure
 from ._terms import (
     additive_fault,
     brownian_paths,
+    check_assertions,
     check_fit,
     commuting,
     constant_fault,
@@ -145,7 +146,8 @@ def suggest_solver(
     **Returns:** a sequence of [`diffrax_symplectic.Suggestion`][]s.
 
     **Raises:** a `ValueError` if `want` is neither of the two, if `terms` has no Brownian
-    path, or for terms and states that no solver accepts.
+    path, if derivatives at `y0` contradict the `structure` of the terms, or for terms and
+    states that no solver accepts.
     """
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
@@ -156,6 +158,7 @@ def suggest_solver(
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
     check_fit(terms, t0, y0, args)
+    check_assertions(terms, t0, y0, args)
     constrained = constraint_of(given_terms) is not None
     system = _inspected(drift, noise, t0, y0, args, constrained)
     paths = brownian_paths(noise)

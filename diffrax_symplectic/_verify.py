@@ -226,14 +226,15 @@ def second_moment_map(
     For such a system a step is $z_1 = Z z_0$ with a random matrix $Z$, where $z = (1, y)$
     and $y$ is the state as a vector of length $n$. So $\mathrm{vec}\, \mathbb E[z_1
     z_1^\top] = K\, \mathrm{vec}\, \mathbb E[z_0 z_0^\top]$ with $K = \mathbb E[Z \otimes
-    Z]$, and $K^N$ gives the moments after $N$ steps. The spectral radius of $K$ is the
+    Z]$, and $K^s$ gives the moments after $s$ steps. The spectral radius of $K$ is the
     growth factor of the mean square per step.
 
     **Arguments:** as for [`diffrax_symplectic.step_expectation`][]; only the structure,
     shapes and dtype of `y0` matter. The system must be linear and autonomous, which is not
     checked.
 
-    **Returns:** the matrix $K$, of shape `((n + 1)**2, (n + 1)**2)`.
+    **Returns:** the matrix $K$, of shape `(N, N)` with `N = (n + 1)**2`. Rows and columns
+    belong to pairs $(i, j)$ of entries of $z$, with number $(n + 1) i + j$.
 
     **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for terms
     with a `constraint`.
@@ -242,7 +243,7 @@ def second_moment_map(
     flat, unravel = jfu.ravel_pytree(y0)
     size = flat.size
     # The step is affine, so its values at zero and at the unit vectors give its matrix.
-    # Differentiating it would take far more tracing.
+    # Differentiating it would take far more tracing. Row 0 is the zero vector.
     starts = jnp.eye(size + 1, size, k=-1, dtype=flat.dtype)
 
     def outcome(terms: PyTree) -> tuple[Array, diffrax.RESULTS]:
@@ -251,7 +252,8 @@ def second_moment_map(
             return jfu.ravel_pytree(y1)[0], result
 
         ends, result = jax.vmap(step)(starts)
-        # The constant 1 of z stays as it is.
+        # The end from zero is the column of the constant 1 of z, which stays as it is: the
+        # first row. What the others add to it are the columns of the entries of y.
         first = jnp.zeros_like(flat, shape=(1, size + 1)).at[0, 0].set(1)
         Z = jnp.concatenate([first, ends.at[1:].add(-ends[0]).T])
         return jnp.kron(Z, Z), result
@@ -333,7 +335,15 @@ def weak_order_defect(
 
 
 def _generator(terms, args, ito: bool) -> Callable:
-    """The generator of the equation, acting on functions of time and state."""
+    r"""The generator $L$ of the equation, as a map from functions $\phi(t, y)$ to functions
+    $L \phi (t, y)$, whose values are PyTrees like those of $\phi$:
+
+    $$L \phi = \partial_t \phi + a \cdot \nabla \phi
+      + \tfrac12 \sum_k (b_k \cdot \nabla)^2 \phi,$$
+
+    where for an Itô equation (`ito`) the derivatives of $b_k$ are left out. The mean of
+    $\phi$ changes at the rate $\mathbb E\, L \phi$.
+    """
     drift, noise = split_terms(terms)
     # Each `b_k(t, y)` is the response to a unit increment of one noise.
     fields = [
@@ -345,6 +355,7 @@ def _generator(terms, args, ito: bool) -> Callable:
         def applied(t: RealScalarLike, y: Y) -> PyTree[Array]:
             still = jtu.tree_map(jnp.zeros_like, y)
             velocity = rate(drift, t, y, args) if drift else still
+            # The derivatives by time and along the drift in one: along (1, a).
             _, total = jax.jvp(phi, (t, y), (jnp.ones_like(t), velocity))
             for field in fields:
                 second = _second_derivative(phi, field, t, y, ito)

@@ -59,15 +59,24 @@ def has_combination(moments: Moments, combination: Combination) -> bool:
 
 
 def results_of(
-    moments: Moments, roundings: int, far: PyTree[np.ndarray] | None, at: Combination
+    moments: Moments,
+    roundings: int,
+    far: PyTree[np.ndarray] | None,
+    combination: Combination,
 ) -> Results:
-    """The results for a combination of levels. `roundings` and `far` are those of
-    `Expectation`."""
+    """The results for one combination of levels.
+
+    Each array of `moments.mean` has the shape `(kinds, combinations, ...)`, where the dots
+    are the axes of one component of the mean. `roundings` and `far` are those of
+    `Expectation`; an array of `far` has the shape `(combinations, ...)`.
+    """
     means, treedef = jtu.tree_flatten(moments.mean)
+    # Only fits of value functions estimate tails by paths of their own. Deviations of zero
+    # there add nothing to the standard errors.
     if far is None:
-        beyond = [np.zeros(mean.shape[1:]) for mean in means]
+        tails = [np.zeros(mean.shape[1:]) for mean in means]
     else:
-        beyond = jtu.tree_leaves(far)
+        tails = jtu.tree_leaves(far)
     each = [
         _results_of_array(moments.good, roundings, *parts)
         for parts in zip(
@@ -75,11 +84,12 @@ def results_of(
             jtu.tree_leaves(moments.norm),
             jtu.tree_leaves(moments.largest),
             jtu.tree_leaves(moments.dtypes),
-            beyond,
+            tails,
         )
     ]
-    # One field of all arrays after another.
-    fields = [[array[at] for array in arrays] for arrays in zip(*each)]
+    # `each` has all fields of one array after another, each with an axis of combinations.
+    # PyTrees need all arrays of one field after another, at this combination.
+    fields = [[array[combination] for array in arrays] for arrays in zip(*each)]
     return Results(*map(treedef.unflatten, fields))
 
 
@@ -91,10 +101,11 @@ def _results_of_array(
     norm: Float[np.ndarray, "kinds combinations ..."],
     largest: Float[np.ndarray, "kinds combinations ..."],
     dtype: str,
-    far: Float[np.ndarray, "combinations ..."],
+    tails: Float[np.ndarray, "combinations ..."],
 ) -> Results:
     """The results for an array and each combination of levels, from its moments over `n`
-    samples. The kinds are those of `Samples`."""
+    samples. The kinds are those of `Samples`. `tails` is the mean absolute deviation in the
+    tails, as paths with wider noise estimate it."""
     has_control = len(mean) == len(KindsWithControl)
     is_replicate = len(mean) == len(KindsOfReplicates)
     # Where the values without control are.
@@ -129,7 +140,7 @@ def _results_of_array(
         # Tails that the samples show are in their variance already. (NaN, from a trial
         # without a value, is ignored.)
         shown = mean[KindsWithControl.TAILS]
-        unseen = np.where(far > shown, far - shown, 0)
+        unseen = np.where(tails > shown, tails - shown, 0)
         error[0] = np.hypot(error[0], unseen)
 
     def best(x: np.ndarray) -> np.ndarray:

@@ -273,16 +273,20 @@ class Expectation(eqx.Module):
     __repr__ = __str__
 
     def _lines_of_means(self) -> list[str]:
-        """What the printed estimate says of each component of the mean."""
+        """What the printed estimate says of each component of the mean: a line for each
+        array of the PyTree, with its path in it if there are several, and at most the first
+        `_SHOWN`."""
         leaves = jtu.tree_leaves_with_path(self.mean)
         sampling_errors = _listed(self.std_error)
         total_errors = _listed(self.error)
-        # Otherwise both are the same.
+        # The total error adds to that of sampling the discretization error, known from
+        # several levels, and what failed paths could change. Without either they are equal.
         has_total = self.bias is not None or self.num_failed > 0
         lines = []
         for k, (path, mean) in enumerate(leaves[:_SHOWN]):
-            error = jtu.tree_leaves(self.std_error)[k]
-            line = f"{_with_digits(mean, error)} ± {sampling_errors[k]}"
+            # The sampling error decides how many digits of the mean are shown.
+            std_error = jtu.tree_leaves(self.std_error)[k]
+            line = f"{_with_digits(mean, std_error)} ± {sampling_errors[k]}"
             if has_total:
                 line += f" (sampling), {total_errors[k]} (total)"
             if len(leaves) > 1:

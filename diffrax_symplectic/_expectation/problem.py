@@ -23,6 +23,7 @@ from .._root_finder import all_finite
 from .._solver import AbstractSymplecticSolver, check_resolution, own_path, Want
 from .._terms import (
     brownian_paths,
+    check_assertions,
     check_start,
     check_stratonovich,
     constraint_of,
@@ -144,6 +145,8 @@ class Problem(eqx.Module):
 
         start = np.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
         check_shapes(phi, terms, start, y0, args)
+        # Here, where the values of `y0` are known. In the program of a solve they are not.
+        check_assertions(terms, start, y0, args)
         if constraint_of(terms) is not None:
             check_start(terms, start, y0, args)
         check_noise(terms)

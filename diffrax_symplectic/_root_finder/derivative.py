@@ -28,9 +28,10 @@ def differentiate(
     derivative of $\Phi$ along $k$ and $b$ the derivative along everything else; and by
     transposition its adjoint.
 
-    Up to four unknowns are solved for by elimination, and more by `solver` if there is one.
-    Otherwise the sweeps that solved the step are used: they converge if those did.
-    Stragglers are gathered from the batch, and their systems are solved one by one.
+    If there is a `solver`, such as that of `optx.Newton`, it solves for any number of
+    unknowns. Without, up to four unknowns are solved for by elimination, and more by the
+    sweeps that solved the step: they converge if those did. Stragglers are gathered from
+    the batch, and their systems are solved one by one, by elimination or GMRES.
     """
     # As one vector: JAX cannot transpose a solve if only some arrays of the right-hand side
     # depend on the differentiated inputs.

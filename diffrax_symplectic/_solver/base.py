@@ -78,7 +78,10 @@ class Record(NamedTuple):
         of those in `examples/stability/friction.py`; `None` if there is no limit. Given
         for suggested solvers.
 
-    The last three are measured, in `tests/test_advice.py`.
+    The last three are measured, in `tests/test_advice.py`, for the solvers that are
+    `suggested`. Leave them out for others: the page then promises and warns of nothing.
+    The random variables of `LevyAreaMidpoint` have no finite set of outcomes, so it states
+    those of the midpoint rule, which a test compares its steps with.
     """
 
     weak: Order
@@ -160,13 +163,21 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
         `None` if it is not stated."""
         return cast(int | None, self._order_for("weak", terms))
 
-    def _order_for(self, want: Want, terms) -> int | float | None:
+    def _order_for(
+        self, want: Want, terms: PyTree[diffrax.AbstractTerm]
+    ) -> int | float | None:
+        """The order on record, for strong or weak approximation: for several noises the one
+        without assuming that they commute. `None` if there is no record, or in it no such
+        order."""
+        # Solvers of the user's own need no record.
         if self.record is None:
             return None
         commuting = self.record.order(want, commute=True)
         others = self.record.order(want, commute=False)
-        # Terms are looked at only if it matters, so that orders of most solvers can be
-        # asked for without any. Whether several noises commute is not known here.
+        # One noise commutes with itself, and without noise there is nothing to commute. Of
+        # several it is not known here, since it depends on values, so the lower order is
+        # returned. Terms are looked at only if it matters: for most solvers they may be
+        # `None`.
         if commuting == others or number_of_noises(terms) <= 1:
             return commuting
         return others

@@ -34,7 +34,8 @@ def check_friction(
     drift: tuple, friction: tuple, t0: RealScalarLike, y0: Y, args: Args, solver: str
 ) -> None:
     """Raises a `ValueError` unless there is friction that is linear in the momenta, and a
-    drift beside it."""
+    drift beside it. `drift` and `friction` are the terms of each, and `solver` is the name
+    for messages. Shapes and dependence decide it, not values, so it works under `jit`."""
     if len(friction) == 0:
         raise ValueError(
             f"`{solver}` takes friction from the terms, and these have none. Construct "
@@ -54,7 +55,8 @@ def check_friction(
 
         return jax.jvp(force, (p,), (along,))[1]
 
-    # A function is linear if its derivative is the same everywhere.
+    # A function is linear, up to a constant, if its derivative is the same everywhere. The
+    # friction is G(t, q) times the velocities dH0/dp, so only these can be nonlinear in p.
     traced = Dependence(slope, p, p)
     if not traced.independent(lambda p, along: p):
         raise ValueError(
@@ -62,6 +64,7 @@ def check_friction(
             "kinetic energy with `p**2` or products such as `p @ p`. For another kinetic "
             "energy use `ImplicitMidpoint` or `StrangGauss`, which take these terms."
         )
+    # The derivative is zero along every change, so the force is constant in p.
     if traced.independent(lambda p, along: along):
         raise ValueError(
             f"`{solver}` has no friction to apply: it acts on the velocities dH0/dp, which "

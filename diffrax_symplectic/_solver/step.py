@@ -377,7 +377,8 @@ def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
     # With k = Phi(k, x): dk = (dPhi / dk) dk + (dPhi / dx) dx.
     _, rhs = jax.jvp(image, (moving,), (t_stages,))
     _, linear = jax.linearize(stages.image, root)
-    # `PicardNewton` has such a solver; those of others are not asked for derivatives.
+    # The linear solver of a root finder, as in `PicardNewton` and `optx.Newton`, serves for
+    # derivatives, too. Others (`optx.FixedPointIteration`, `optx.Dogleg`) have none.
     t_unknown = differentiate(getattr(finder, "linear_solver", None), linear, rhs)
     _, t_y1 = jax.jvp(end, (moving, root), (t_stages, t_unknown))
     t_y1, t_unknown = jtu.tree_map(lambda t: jnp.where(failed, 0, t), (t_y1, t_unknown))

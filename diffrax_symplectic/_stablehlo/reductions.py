@@ -155,8 +155,9 @@ def _sort(o, *xs):
         # After each round the largest of those left is at their end.
         for end in range(length, 1, -1):
             for left, right in itertools.pairwise(row[:end]):
-                # The region compares two of each array, the first of which should stand
-                # first. It is asked about the right one, so that equals stay.
+                # The region says whether the first of two must stand before the second, and
+                # takes both of each array in turn. The right one is asked about first: they
+                # are exchanged only if the right one must stand first, so equals stay.
                 pairs = [Tensor([x[i]], ()) for x in outs for i in (right, left)]
                 wrong = o.run(0, pairs)[0].item()
                 for x in outs:

@@ -14,7 +14,8 @@ from .langevin import (
     split_friction,
 )
 from .spins import as_spins, from_spinors, spin_terms, to_spinors
-from .structure import additive_fault, check_stratonovich, check_structure
+from .structure import additive_fault, check_assertions, check_stratonovich
+from .structure import check_structure
 from .structure import commuting, constant_fault, Fault, FRICTION
 from .structure import separable_fault
 from .surface import check_start, constrained_state, Surface

@@ -65,7 +65,9 @@ def hamiltonian_terms(
         $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, `"additive"` if the gradients of the
         $H_k$ do not depend on the state. By default it is detected by tracing, which counts
         every variable that enters a derivative, even if it cancels or is multiplied by
-        zero: write $H_0$ as a sum of terms that depend on $p$ or $q$ alone.
+        zero: write $H_0$ as a sum of terms that depend on $p$ or $q$ alone. An assertion
+        is relied on; `expectation`, `ensemble` and `suggest_solver` compare it with
+        derivatives at `y0`.
     - `constraint`: `constraint(q, args)`, an array of shape `(c,)` that is zero on the
         positions that the system can take, such as `jnp.stack([jnp.sum(q**2) - 1])` for a
         rod. Its gradients must be linearly independent there. For
@@ -205,6 +207,8 @@ class _Drift(eqx.Module):
 
     H0: _Hamiltonian
     structure: _Structure | None = eqx.field(static=True, default=None)
+    # The user's function call that took `structure`, for messages.
+    made_by: str = eqx.field(static=True, default="hamiltonian_terms")
 
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
         check_pair(y)
@@ -433,6 +437,15 @@ def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
     """The `structure` that the user asserted for a term, and for all parts of it."""
     asserted = {part.structure for part in _parts(term)}
     return asserted.pop() if len(asserted) == 1 else None
+
+
+def takes_structure(term: diffrax.AbstractTerm) -> str | None:
+    """The function that made a term from Hamiltonians, and that takes the `structure` of
+    these; `None` for other terms."""
+    drifts = [part for part in _parts(term) if isinstance(part, _Drift)]
+    if len(drifts) > 0:
+        return drifts[0].made_by
+    return "hamiltonian_terms" if is_hamiltonian(term) else None
 
 
 def _parts(term: diffrax.AbstractTerm) -> list[_Drift | HamiltonianNoise]:

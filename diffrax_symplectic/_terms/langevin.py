@@ -1,6 +1,7 @@
 """Langevin dynamics: friction on velocities, and the noise of a temperature."""
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -92,6 +93,7 @@ def langevin_terms(
     where this is not known before.
     """
     hamiltonian = hamiltonian_terms(H0, structure=structure).terms[0].vector_field
+    hamiltonian = dataclasses.replace(hamiltonian, made_by="langevin_terms")
     friction_term, *noise = bath_terms(H0, friction, temperature, path).terms
     damped = DriftWithFriction(hamiltonian, friction_term.vector_field)
     drift = constrained(diffrax.ODETerm(damped), constraint)

@@ -154,6 +154,7 @@ def from_spinors(y: _Spinors) -> _Spins:
     """
     check_pair(y)
     p, q = y
+    # So `q` has the structure and the shape of `p`.
     if not eqx.is_array_like(p) or jnp.shape(p)[-1:] != (2,):
         raise ValueError(
             "The state of spins is a pair `(p, q)` of arrays of shape `(..., 2)`: pass "
@@ -161,6 +162,7 @@ def from_spinors(y: _Spinors) -> _Spins:
         )
     p1, p2 = _components(p)
     q1, q2 = _components(q)
+    # a b* = (q1 q2 + p1 p2) + i (p1 q2 - q1 p2), and twice a quarter is a half.
     s1 = (q1 * q2 + p1 * p2) / 2
     s2 = (p1 * q2 - q1 * p2) / 2
     s3 = (q1**2 + p1**2 - q2**2 - p2**2) / 4

@@ -20,9 +20,16 @@ from .._brownian import raveled
 from .._compat import at_trace_time, is_traced, unwrapped, ω
 from .._custom_types import Args, RealScalarLike, Y
 from .._tableau import Structure
+from .assertion import contradicted
+from .constraint import without_constraint
 from .dependence import Dependence
-from .hamiltonian import asserted_structure, has_lifted, is_hamiltonian
-from .langevin import friction_apart
+from .hamiltonian import (
+    asserted_structure,
+    has_lifted,
+    is_hamiltonian,
+    takes_structure,
+)
+from .langevin import friction_apart, split_friction
 from .vector_fields import apply, check_increments, control_struct, split_terms
 
 
@@ -109,6 +116,8 @@ def separable_fault(
     # Apart from its friction, a drift is still one of a Hamiltonian, whose faults are named
     # by its derivatives.
     rest, friction = friction_apart(drift)
+    if fault := _wrong_assertion("separable", rest, noise, t0, y0, args):
+        return fault
     drift_flows = traced((*rest, *friction))
     noise_flows = traced(noise)
     still = ft.partial(_is_zero, t0, y0, args)
@@ -159,7 +168,6 @@ def _faults(
     """All faults, if momenta are the first half of the state, `p = 0`, or the second,
     `p = 1`. `still` says whether a noise term leaves a half of the state unchanged."""
     q = 1 - p
-    advice = _advice("separable")
 
     def momenta(t: Any, y: Y, control: Any) -> PyTree:
         return y[p]
@@ -184,6 +192,7 @@ def _faults(
     beside = " besides H0" if len(drift) > 1 else ""
     for term, flow in drift:
         plain = not is_hamiltonian(term)
+        advice = _advice("separable", term)
         for rule in forbidden:
             if not flow.independent(rule.of, rule.part):
                 of_plain = f"a drift term{beside} makes {rule.rate}"
@@ -191,6 +200,7 @@ def _faults(
                 faults.append(Fault(cause, advice, plain and rule.by_friction))
     for term, flow in noise:
         plain = not is_hamiltonian(term)
+        advice = _advice("separable", term)
         # The change of q is linear in the increment, so it is zero if it does not depend
         # on the increment.
         moves_q = not flow.independent(_increments, of_positions) and not still(term, q)
@@ -205,11 +215,13 @@ def _faults(
 
 def additive_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
     """Why the noise is not additive; `None` if it does not depend on the state."""
+    if fault := _wrong_assertion("additive", (), noise, t0, y0, args):
+        return fault
     for term in _not_asserted(noise, "additive"):
         if not _flow(term, t0, y0, args).independent(_states):
             of = " = (-dH_k/dq, dH_k/dp)" if is_hamiltonian(term) else ""
             reason = f"the noise b_k{of} depends on the state"
-            return Fault(reason, _advice("additive"))
+            return Fault(reason, _advice("additive", term))
     return None
 
 
@@ -219,6 +231,19 @@ def constant_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault
         if not _flow(term, t0, y0, args).independent(_times):
             return Fault("it depends on time", "Use `SRKs4`, which accepts such noise.")
     return None
+
+
+def check_assertions(
+    terms: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
+) -> None:
+    """Raises a `ValueError` if the values at `y0` contradict a `structure` that the user
+    asserted. Programs of a solve, in which values are traced, cannot tell."""
+    drift, _, noise = split_friction(without_constraint(terms))
+    for structure, checked in (("separable", drift), ("additive", ())):
+        if fault := _wrong_assertion(structure, checked, noise, t0, y0, args):
+            raise ValueError(
+                f'`structure="{structure}"` is wrong: {fault.cause}. {fault.advice}'
+            )
 
 
 def check_stratonovich(
@@ -301,15 +326,50 @@ def _not_asserted(terms: tuple, structure: str) -> list[diffrax.AbstractTerm]:
     return [term for term in terms if asserted_structure(term) != structure]
 
 
-def _advice(structure: str) -> str:
+def _wrong_assertion(
+    structure: str,
+    drift: tuple,
+    noise: tuple,
+    t0: RealScalarLike,
+    y0: Y,
+    args: Args,
+) -> Fault | None:
+    """The fault of a term of which the user asserted this structure, but does not have it
+    at `y0`; `None` if there is none, or if the values are not known."""
+    mixed = {
+        "separable": "at `y0` H0 mixes p and q, or dH0/dp depends on t",
+        "additive": "at `y0` the noise depends on the state",
+    }[structure]
+    in_noise = {"separable": "at `y0` a noise Hamiltonian depends on p"}
+    for is_noise, terms in ((False, drift), (True, noise)):
+        for term in terms:
+            asserted = asserted_structure(term) == structure
+            given = structure, is_noise, term, t0, y0, args
+            if asserted and contradicted(*given):
+                cause = in_noise.get(structure, mixed) if is_noise else mixed
+                advice = (
+                    f'Leave `structure="{structure}"`, which is wrong here, out of '
+                    f"`{takes_structure(term)}`, and {_GENERAL}."
+                )
+                return Fault(cause, advice)
+    return None
+
+
+def _advice(structure: str, term: diffrax.AbstractTerm) -> str:
+    """How to write a term with this structure so that tracing shows it."""
     how = {
         "separable": "H0 as a sum `V(p) + U(t, q)`, each summand of p or q alone",
         "additive": "each H_k as a function linear in p and q, such as `-sigma * q`",
     }[structure]
+    maker = takes_structure(term)
+    # The structure of plain terms, and of the noise of a bath, cannot be asserted.
+    instead = (
+        "" if maker is None else f', or pass `structure="{structure}"` to `{maker}`'
+    )
     return (
         "Variables also count if they cancel, are multiplied by zero, are printed, or "
-        f"share an array with others: in that case write {how}, or pass "
-        f'`structure="{structure}"` to `hamiltonian_terms`. Otherwise {_GENERAL}.'
+        f"share an array with others: in that case write {how}{instead}. Otherwise "
+        f"{_GENERAL}."
     )
 
 

@@ -394,8 +394,15 @@ def _newton(
     start: _Multipliers,
     pending: Bool[Array, ""],
 ) -> tuple[_Multipliers, Bool[Array, ""]]:
-    """The root of `off`, and whether it was found; otherwise zero. The multipliers change
-    positions of this `size` by `x @ along`."""
+    """The root of `off`, from `start`, and whether it was found; otherwise zero.
+
+    - `off`: the constraints as a function of the multipliers `x`: their values after the
+        positions have moved by `-x @ along`.
+    - `size`: the largest of the positions, to which the tolerance is relative.
+    - `pending`: if false, no step is taken and nothing is found, so that in a batch a path
+        that failed before does not keep the others waiting.
+    """
+    # One unit in the last place of the largest position.
     tolerance = float(jnp.finfo(start.dtype).eps) * size
 
     def going(state: _Newton) -> Bool[Array, ""]:

@@ -401,7 +401,8 @@ def test_local_weak_order(solver):
 
 
 _STRONG_STEPS = np.array([16, 32, 64])
-_STRONG_PATHS = 60
+# So many that the standard errors of slopes are at most 0.08, for every solver.
+_STRONG_PATHS = 240
 
 
 def strong_orders(solver) -> dict[str, tuple[float, float]]:
@@ -453,14 +454,27 @@ STRONG = [
 ]
 
 
-@each(STRONG)
+def _quick(solver) -> bool:
+    # By its brackets of vector fields, a third of the time of this test for all solvers.
+    return "L" not in solver.variables
+
+
+# How far slopes of steps that are not yet small lie above the claim, where terms of higher
+# order are still seen. For noises of order 1/2 it tells this order from 1. Of
+# `SRKs4(0.3, -0.7)`, of order 3/2, 2.0 is measured down to steps of 1 / 128.
+_ABOVE = {1 / 2: 0.2, 1: 0.3, 3 / 2: 0.5}
+
+
+@each([pytest.param(s, marks=() if _quick(s) else pytest.mark.slow) for s in STRONG])
 def test_strong_order(solver):
     for kind, (order, bar) in strong_orders(solver).items():
         claim = solver.record.order("strong", KINDS[kind])
-        # Terms of higher order are still seen. Where noises that do not commute have a
-        # lower order, it is told from that of the others.
-        most = 0.2 if claim < 1 else 0.3
-        assert claim - 0.1 - 3 * bar <= order <= claim + most + 3 * bar, (kind, order)
+        # With wider bars a slope of 1/2 would pass for the claim 1, of which 0.9 - 3 * 0.1
+        # is the least that passes.
+        assert bar <= 0.1, (kind, bar)
+        low = claim - 0.1 - 3 * bar
+        high = claim + _ABOVE[claim] + 3 * bar
+        assert low <= order <= high, (kind, order)
 
 
 @each(TABLE)

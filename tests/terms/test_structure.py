@@ -243,6 +243,98 @@ def test_an_asserted_structure_is_relied_on():
         solve(structure="seperable")
 
 
+def _in_a_field(t, p, q, args):
+    """A charge in a magnetic field, which mixes momenta and positions."""
+    return jnp.sum((p - args * jnp.array([-q[1], q[0]])) ** 2) / 2 + jnp.sum(q**2) / 2
+
+
+def _kicked(H0, structure, noise=_good_noise):
+    return ds.hamiltonian_terms(H0, noise, (), structure=structure)
+
+
+def _heated(H0, structure, noise=None):
+    return ds.langevin_terms(H0, 1.0, 1.5, (2,), structure=structure)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize(
+    "make, solver, name",
+    [
+        (_kicked, ds.StormerVerlet(), "hamiltonian_terms"),
+        (_heated, ds.BAOAB(), "langevin_terms"),
+        (_heated, ds.Damped(ds.StormerVerlet()), "langevin_terms"),
+    ],
+)
+def test_a_wrong_assertion_is_refused_where_values_are_known(make, solver, name, dtype):
+    y0 = jax.tree.map(lambda x: x.astype(dtype), _positive_state)
+    path = jax.ShapeDtypeStruct(() if make is _kicked else (2,), dtype)
+    t0 = jnp.zeros((), dtype)
+    phi = lambda t, y, args: jnp.sum(y[0] ** 2)
+
+    def called(terms, args):
+        how = dict(key=jr.key(0), sampling=ds.IndependentPaths(4))
+        own = solver.path(path, jr.key(0))
+        terms = diffrax.MultiTerm(
+            terms.terms[0], eqx.tree_at(lambda x: x.path, terms.terms[1], own)
+        )
+        return (
+            lambda: ds.expectation(phi, terms, solver, 0, 0.2, 0.1, y0, args, **how),
+            lambda: ds.ensemble(
+                terms, solver, 0, 0.2, 0.1, y0, args, key=jr.key(0), num_paths=4
+            ),
+            lambda: solver.init(terms, t0, t0 + 0.1, y0, args),
+        )
+
+    field = jnp.array(0.5, dtype)
+    says = rf'at `y0` H0 mixes p and q.*Leave `structure="separable"`.*`{name}`'
+    for call in called(make(_in_a_field, "separable"), field):
+        with pytest.raises(ValueError, match=says):
+            call()
+    # Without a field it is right, in spite of rounding errors.
+    cancelling = lambda t, p, q, args: (
+        jnp.sum(p**2 + q**2) / 2
+        + args * jnp.sum(p * (jnp.sin(q) + jnp.exp(q)))
+        - args * (p @ jnp.sin(q) + p @ jnp.exp(q))
+    )
+    for call in called(make(cancelling, "separable"), 10 * field):
+        call()
+    # The advice that offers an assertion names the same function.
+    with pytest.raises(ValueError, match=f'`structure="separable"` to `{name}`'):
+        called(make(_in_a_field, None), field)[2]()
+
+
+@pytest.mark.parametrize(
+    "structure, H0, noise, says",
+    [
+        ("separable", _good_H0, lambda t, p, q, args: jnp.sum(p), "noise Hamiltonian"),
+        ("additive", _good_H0, _good_noise, "the noise depends on the state"),
+        (
+            "separable",
+            lambda t, p, q, args: (1 + t) * jnp.sum(p**2),
+            _good_noise,
+            "dH0/dp depends on t",
+        ),
+    ],
+)
+def test_each_part_of_an_assertion_is_compared(structure, H0, noise, says):
+    terms = _kicked(H0, structure, noise)
+    given = terms, ds.ImplicitMidpoint(), 0.0, 0.2, 0.1, _positive_state
+    with pytest.raises(ValueError, match=f"is wrong: at `y0`.*{says}"):
+        ds.ensemble(*given, key=jr.key(0), num_paths=2)
+    with pytest.raises(ValueError, match=f"is wrong: at `y0`.*{says}"):
+        ds.suggest_solver(terms, 0.0, _positive_state, want="weak")
+
+
+def test_plain_terms_are_not_told_to_assert_a_structure():
+    drift = diffrax.ODETerm(lambda t, y, args: (-y[0] * y[1], y[0]))
+    path = ds.WeakBrownianPath((), jr.key(0))
+    noise = ds.hamiltonian_terms(_good_H0, _good_noise, path).terms[1]
+    terms = diffrax.MultiTerm(drift, noise)
+    with pytest.raises(ValueError, match="depend on p") as info:
+        ds.StormerVerlet().init(terms, 0.0, 0.1, _positive_state, None)
+    assert "structure=" not in str(info.value)
+
+
 def _solve_from(H0, y0):
     terms = ds.hamiltonian_terms(H0, _good_noise, ds.WeakBrownianPath((), jr.key(0)))
     return diffrax.diffeqsolve(terms, ds.StormerVerlet(), 0.0, 0.2, 0.1, y0).ys
