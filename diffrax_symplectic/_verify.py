@@ -55,8 +55,9 @@ def symplecticity_defect(
 
     Exact up to rounding: for a symplectic method this is a small multiple of the machine
     epsilon, for any Hamiltonians, step and increments; for other methods it is not small.
-    For terms with a `constraint` it is the largest entry between directions along which
-    allowed states can move.
+    For terms with a `constraint` it is the largest entry of
+    $Z^\top (J^\top \Omega J - \Omega) Z$, where the columns of $Z$ are an orthonormal basis
+    of the directions along which allowed states can move.
     (The solvers of this package differentiate their stage equations implicitly, so it does
     not depend on the tolerance of the root finder.)
 
@@ -90,6 +91,7 @@ def symplecticity_defect(
     omega = jnp.asarray(np.block([[zero, one], [-one, zero]]), flat.dtype)
     defect = _dot(jacobian.T, _dot(omega, jacobian)) - omega
     if constraint_of(terms) is not None:
+        # Columns: an orthonormal basis.
         Z = _allowed_directions(terms, t0, y0, args)
         defect = _dot(Z.T, _dot(defect, Z))
     return jnp.max(jnp.abs(defect))

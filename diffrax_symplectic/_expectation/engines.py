@@ -124,7 +124,7 @@ def by_drjit(
             "nothing else."
         ) from error
     except (NotReplayed, RuntimeError) as error:
-        refused = _refused(error)
+        refused = _refusal(error)
         if refused is None:
             raise
         # The errors behind it are about recordings, and pages long.
@@ -241,9 +241,10 @@ def _unraveled(y0: PyTree, entries: list[np.ndarray]) -> PyTree[np.ndarray]:
     return treedef.unflatten(each)
 
 
-def _refused(error: BaseException | None) -> ValueError | None:
-    """The error for the user if an operation cannot be replayed. Dr.Jit wraps errors of the
-    functions with which it records a loop."""
+def _refusal(error: BaseException | None) -> ValueError | None:
+    """The error for the user if an operation cannot be replayed; `None` if the error is
+    another one, to be raised as it is. Dr.Jit wraps errors of the functions with which it
+    records a loop."""
     while error is not None and not isinstance(error, NotReplayed):
         error = error.__cause__ or error.__context__
     if error is None:

@@ -228,10 +228,11 @@ class Problem(eqx.Module):
     ) -> tuple[Y, PyTree[Array], Bool[Array, ""]]:
         """One step of one path: its state and the arrays of the solver's state after the
         step, and whether it succeeded."""
+        # Both from the number of the step: `next_t` is exactly the `t` of the next step.
         t = self.t0 + i * h
-        # From the number of the step, so that times do not drift.
         next_t = self.t0 + (i + 1) * h
-        # What is no array in the solver's state does not change: it is that of a new one.
+        # Only arrays are carried from step to step. The rest of the solver's state does not
+        # change: it is that of `init`, traced for its structure only.
         fresh = eqx.filter_eval_shape(self.solver.init, terms, t, next_t, y, self.args)
         is_struct = lambda x: isinstance(x, jax.ShapeDtypeStruct)
         rest = eqx.filter(fresh, is_struct, inverse=True)

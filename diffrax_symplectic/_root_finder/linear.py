@@ -77,12 +77,14 @@ def solve(
     failure."""
     if solver is None and rhs.size <= _MAX_DENSE:
         matrix = jax.vmap(apply, out_axes=1)(_units(rhs))
+        # A singular matrix shows as entries that are not finite.
         return LinearSolution(eliminate(matrix, rhs), jnp.array(True))
     if solver is None:
         solver = lx.GMRES(reduction, reduction, restart=_DIRECTIONS)
     # Absolute tolerances assume a right-hand side of size one.
-    size = _size_or_one(rhs)
+    size = _largest_or_one(rhs)
     operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: rhs))
+    # `lx.linear_solve`, without its derivatives.
     x, result = computed_by(solver, operator, rhs / size)
     return LinearSolution(x * size, result == lx.RESULTS.successful)
 
@@ -114,7 +116,7 @@ def _units(x: _Vector) -> Any:
     return np.eye(x.size, dtype=x.dtype)
 
 
-def _size_or_one(rhs: _Vector) -> Scalar:
+def _largest_or_one(rhs: _Vector) -> Scalar:
     """The largest entry, or 1 if all are zero, as a divisor."""
     size = optx.max_norm(rhs)
     return jnp.where(size > 0, size, 1)
@@ -132,7 +134,7 @@ def eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
         return cleared[:, num_unknowns]
     # The division makes XLA store the right-hand side. Otherwise it would be recomputed in
     # each unrolled entry, which takes 0.1 s more to compile for four unknowns.
-    size = _size_or_one(rhs)
+    size = _largest_or_one(rhs)
     rows = [[*row, entry] for row, entry in zip(matrix, rhs / size)]
     for k in range(num_unknowns):
         _bring_up_pivot(rows, k)

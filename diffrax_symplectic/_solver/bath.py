@@ -176,10 +176,11 @@ def _solved_with(
     """Solves `matrix @ x = right` for `matrix = 1 + step / 2 * G M^-1`, by the modes of
     the `constant` matrices G and M^-1.
 
-    The modes are those of steps of all sizes, which differ by rounding errors. They are
-    computed here, in the step, since a batch would copy them into the state of each path.
-    Nothing in them changes from step to step, so XLA moves them out of the loop, but only
-    on CPUs: eigenvectors in each step would take forty times as long as a solve.
+    The modes do not depend on the step. (Sizes of steps differ by rounding errors, so that
+    `matrix` itself is not the same in all; it carries the derivatives.) They are computed
+    here, in the step, since a batch would copy them into the state of each path. On CPUs
+    XLA moves them out of the loop. Elsewhere it leaves them there, forty times as long as a
+    solve.
     """
 
     def multiply(x: Array) -> Array:

@@ -56,22 +56,24 @@ def verlet_step(
     before: optx.RESULTS,
     name: str,
 ) -> tuple[Y, optx.RESULTS]:
-    """A step of [`diffrax_symplectic.StormerVerlet`][] on the surface, and the state of the
-    solver `name` after it."""
+    """A step of [`diffrax_symplectic.StormerVerlet`][] on the surface, and its result,
+    which is the state of the solver. `before` is the state before the step, and `name` that
+    of the solver, for errors about its path."""
     surface = Surface.of(terms, t0, y0, args)
     drift, noise = split_terms(without_constraint(terms))
     p, unravel_p = jfu.ravel_pytree(y0[0])
     q, unravel_q = jfu.ravel_pytree(y0[1])
     half = (t1 - t0) / 2
-    # A path that failed before needs no multipliers: others would wait for them.
+    # A path that failed before needs no multipliers: in a batch, others would wait for it.
     pending = before == optx.RESULTS.successful
 
     p, q, first = surface.fly(p, surface.frame(q), half, pending)
     # The momentum is not tangent here. It need not be: forces do not depend on it, and the
     # multipliers of the next flight make up for it.
     y = (unravel_p(p), unravel_q(q))
-    force, _ = drift_driven(drift, t0, t1, args)(t0 + half, y)
-    p = p + jfu.ravel_pytree(force)[0]
+    # The force times the step.
+    impulse, _ = drift_driven(drift, t0, t1, args)(t0 + half, y)
+    p = p + jfu.ravel_pytree(impulse)[0]
     if len(noise) > 0:
         p = p + _kick(noise, t0, t1, y, args, name)
     p, q, second = surface.fly(p, surface.frame(q), half, pending)

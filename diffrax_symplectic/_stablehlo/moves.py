@@ -111,12 +111,13 @@ def _compare(o, a, b):
     if o.has("compare_type") and o.word("compare_type") == "TOTALORDER":
         a = each(_in_total_order, a)
         b = each(_in_total_order, b)
+    # All entries are of one type.
     if is_complex(a.entries[0]):
         # Complex numbers have no order: the direction is `eq` or `ne`.
         same = each(equal, a, b)
         return [same if direction == "eq" else each(operator.invert, same)]
     if direction == "ne":
-        # NaN differs from everything, but not in Dr.Jit.
+        # NaN differs from everything. In Dr.Jit NaN != NaN is false, unless it is folded.
         return [each(operator.invert, each(operator.eq, a, b))]
     return [each(getattr(operator, direction), a, b)]
 

@@ -44,7 +44,8 @@ class Block(NamedTuple):
     explicit: tuple[Group, ...]
 
 
-# Compared by identity, which is fast and enough: `make_plan` makes equal plans only once.
+# Compared by identity, which is fast and enough: `make_plan` makes equal plans only once,
+# unless more than its cache holds were made in between.
 @dataclasses.dataclass(frozen=True, eq=False)
 class StepPlan:
     """The distinct stages that a tableau uses, in blocks to be solved in order."""
@@ -117,14 +118,16 @@ def _live(tableau: FlatTableau) -> FlatTableau:
 
 
 def _merge(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
-    """Merges pairs of stages that are evaluated at the same point.
+    """Merges pairs of stages whose vector fields are evaluated at the same time and state,
+    reading and changing the same part of the state.
 
-    With the same channels they have the same value, and their coefficients are added. With
-    different channels they can be merged if they always enter together.
+    With the same channels (the controls that drive them) they have the same value, and
+    their coefficients are added. With different channels they can be merged if they enter
+    everything with the same coefficients.
     """
     for i, j in itertools.combinations(range(len(tableau.stages)), 2):
         channels_agree = tableau.stages[i].channels == tableau.stages[j].channels
-        if channels_agree != same_channels or not _same_point(tableau, i, j):
+        if channels_agree != same_channels or not _same_evaluation(tableau, i, j):
             continue
         if same_channels:
             merged = _added(tableau, i, j)
@@ -137,7 +140,7 @@ def _merge(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
     return tableau
 
 
-def _same_point(tableau: FlatTableau, i: int, j: int) -> bool:
+def _same_evaluation(tableau: FlatTableau, i: int, j: int) -> bool:
     """Whether two stages evaluate their vector fields at the same time and state, for the
     same part of the state."""
     first = tableau.stages[i]

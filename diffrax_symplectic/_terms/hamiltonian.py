@@ -439,7 +439,7 @@ def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
     return asserted.pop() if len(asserted) == 1 else None
 
 
-def takes_structure(term: diffrax.AbstractTerm) -> str | None:
+def structure_asserted_in(term: diffrax.AbstractTerm) -> str | None:
     """The function that made a term from Hamiltonians, and that takes the `structure` of
     these; `None` for other terms."""
     drifts = [part for part in _parts(term) if isinstance(part, _Drift)]

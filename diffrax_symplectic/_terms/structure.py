@@ -27,7 +27,7 @@ from .hamiltonian import (
     asserted_structure,
     has_lifted,
     is_hamiltonian,
-    takes_structure,
+    structure_asserted_in,
 )
 from .langevin import friction_apart, split_friction
 from .vector_fields import apply, check_increments, control_struct, split_terms
@@ -334,24 +334,24 @@ def _wrong_assertion(
     y0: Y,
     args: Args,
 ) -> Fault | None:
-    """The fault of a term of which the user asserted this structure, but does not have it
-    at `y0`; `None` if there is none, or if the values are not known."""
-    mixed = {
-        "separable": "at `y0` H0 mixes p and q, or dH0/dp depends on t",
-        "additive": "at `y0` the noise depends on the state",
-    }[structure]
-    in_noise = {"separable": "at `y0` a noise Hamiltonian depends on p"}
+    """The fault of the first term that the user asserted to have this structure, and that
+    does not have it at `y0`; `None` if there is none, or if values are traced. For
+    "additive" pass no drift: only noise can break it."""
+    causes = {
+        ("separable", False): "at `y0` H0 mixes p and q, or dH0/dp depends on t",
+        ("separable", True): "at `y0` a noise Hamiltonian depends on p",
+        ("additive", True): "at `y0` the noise depends on the state",
+    }
     for is_noise, terms in ((False, drift), (True, noise)):
         for term in terms:
-            asserted = asserted_structure(term) == structure
-            given = structure, is_noise, term, t0, y0, args
-            if asserted and contradicted(*given):
-                cause = in_noise.get(structure, mixed) if is_noise else mixed
+            if asserted_structure(term) != structure:
+                continue
+            if contradicted(structure, is_noise, term, t0, y0, args):
                 advice = (
                     f'Leave `structure="{structure}"`, which is wrong here, out of '
-                    f"`{takes_structure(term)}`, and {_GENERAL}."
+                    f"`{structure_asserted_in(term)}`, and {_GENERAL}."
                 )
-                return Fault(cause, advice)
+                return Fault(causes[structure, is_noise], advice)
     return None
 
 
@@ -361,7 +361,7 @@ def _advice(structure: str, term: diffrax.AbstractTerm) -> str:
         "separable": "H0 as a sum `V(p) + U(t, q)`, each summand of p or q alone",
         "additive": "each H_k as a function linear in p and q, such as `-sigma * q`",
     }[structure]
-    maker = takes_structure(term)
+    maker = structure_asserted_in(term)
     # The structure of plain terms, and of the noise of a bath, cannot be asserted.
     instead = (
         "" if maker is None else f', or pass `structure="{structure}"` to `{maker}`'

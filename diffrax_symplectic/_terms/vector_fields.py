@@ -315,7 +315,9 @@ def _checked_sum(parts: list[Y], y: Y) -> Y:
     """The sum. Raises a `ValueError` unless all have the dtypes and shapes of the state."""
 
     def check(change: Any, x: Any) -> None:
-        # An array made before 64 bits were enabled may have a dtype unlike its result type.
+        # Either may be a number of Python or NumPy. (Not `jnp.result_type`: a weakly typed
+        # scalar that was made before 64 bits were enabled is float32, with result type
+        # float64.)
         change = jnp.asarray(change)
         x = jnp.asarray(x)
         if (change.dtype, change.shape) != (x.dtype, x.shape):
