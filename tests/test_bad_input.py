@@ -357,3 +357,12 @@ def test_implicit_tableaus_need_an_implicit_solver():
         match="also inherit from `diffrax_symplectic.AbstractImplicitStages`",
     ):
         diffrax.diffeqsolve(terms, Mine(), 0.0, 0.2, 0.1, y0, args)
+
+
+def test_matrices_for_a_state_of_several_arrays_become_an_operator():
+    matrices = lambda t, y, args: (jnp.ones((3, 2)), jnp.zeros((3, 2)))
+    drift = diffrax.ODETerm(lambda t, y, args: y)
+    noise = diffrax.ControlTerm(matrices, weak_path(2))
+    y0 = (jnp.zeros(3), jnp.ones(3))
+    with pytest.raises(ValueError, match="must be a Lineax operator"):
+        _solve(diffrax.MultiTerm(drift, noise), y0)

@@ -120,11 +120,20 @@ def check_increments(terms: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Non
             is_operator = isinstance(field, lx.AbstractLinearOperator)
             takes = field.in_structure() if is_operator else field
             kind = "a Lineax operator on" if is_operator else "an array"
+            instead = "Construct the path with the shape and dtype that the vector field takes"
+            if len(jtu.tree_leaves(y0)) > 1 and not is_operator:
+                kind = "arrays"
+                instead = (
+                    "Of a state of several arrays the vector field must be a Lineax "
+                    "operator, such as a `lineax.FunctionLinearOperator` that maps the "
+                    "increments to a change of the state"
+                )
+            elif not is_operator:
+                instead += ", for an array the shape of its last axes"
             raise ValueError(
                 "A `ControlTerm` cannot multiply its vector field, "
                 f"{kind} {_brief(takes)}, by the increments of its path, "
-                f"{_brief(increments)}. Construct the path with the shape and dtype that "
-                "the vector field takes, for an array the shape of its last axes."
+                f"{_brief(increments)}. {instead}."
             ) from error
 
     for term in terms:
