@@ -120,7 +120,7 @@ def check_increments(terms: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Non
             is_operator = isinstance(field, lx.AbstractLinearOperator)
             takes = field.in_structure() if is_operator else field
             kind = "a Lineax operator on" if is_operator else "an array"
-            instead = "Construct the path with the shape and dtype that the vector field takes"
+            instead = "Construct the path with the shape and dtype that the field takes"
             if len(jtu.tree_leaves(y0)) > 1 and not is_operator:
                 kind = "arrays"
                 instead = (
