@@ -118,18 +118,16 @@ def _is_real(dtype: Any) -> bool:
     return any(jnp.issubdtype(dtype, kind) for kind in kinds)
 
 
-def real_array(name: str, value: Any, *, positive: bool, kind: str) -> ArrayLike:
+def real_array(name: str, value: Any, *, kind: str) -> ArrayLike:
     """Raises a `ValueError` unless this is a real number or array that is finite and
-    positive (or not negative), as far as its values are known while tracing."""
+    not negative, as far as its values are known while tracing."""
     fits = is_real_number(value)
     if fits and not is_traced(value):
         values = np.asarray(value)
-        in_range = values > 0 if positive else values >= 0
-        fits = np.all(np.isfinite(values) & in_range)
+        fits = np.all(np.isfinite(values) & (values >= 0))
     if not fits:
-        least = "positive" if positive else "not negative"
         raise ValueError(
-            f"`{name}` must be {kind}, finite and {least}; got {brief(value)}."
+            f"`{name}` must be {kind}, finite and not negative; got {brief(value)}."
         )
     return value
 

@@ -184,6 +184,17 @@ def captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[Any]]:
     return call, traced.consts
 
 
+def is_program(x: Any) -> bool:
+    """Whether this is a jaxpr, among the parameters of an operation."""
+    return isinstance(x, Jaxpr | ClosedJaxpr)
+
+
+def programs_in(eqn: JaxprEqn) -> list[Jaxpr]:
+    """The programs that an operation runs, such as the branches of a conditional."""
+    leaves = jtu.tree_leaves(eqn.params, is_leaf=is_program)
+    return [getattr(x, "jaxpr", x) for x in leaves if is_program(x)]
+
+
 def bound(eqn: JaxprEqn, args: Sequence[Any], params: Any) -> list[Any]:
     """The results of one operation of a jaxpr, with these parameters."""
     params = eqn.primitive.get_bind_params(params)

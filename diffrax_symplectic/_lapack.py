@@ -21,11 +21,19 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool
 
-from ._compat import bound, ClosedJaxpr, has_blocking_lapack, Jaxpr, Literal
+from ._compat import (
+    bound,
+    ClosedJaxpr,
+    has_blocking_lapack,
+    is_program,
+    Jaxpr,
+    Literal,
+    programs_in,
+)
 
 
 # The operations that JAX leaves to LAPACK on CPUs.
-_LAPACK = frozenset(
+LAPACK = frozenset(
     "cholesky eig eigh geqp3 geqrf hessenberg householder_product lu schur svd "
     "symmetric_product triangular_solve tridiagonal tridiagonal_solve".split()
 )
@@ -100,15 +108,9 @@ class _Turns:
 
 def _calls_lapack(eqn: Any) -> bool:
     """Whether an operation is one of LAPACK's or contains one."""
-    if eqn.primitive.name in _LAPACK:
+    if eqn.primitive.name in LAPACK:
         return True
-    inner = jtu.tree_leaves(eqn.params, is_leaf=_is_program)
-    programs = [getattr(x, "jaxpr", x) for x in inner if _is_program(x)]
-    return any(_calls_lapack(own) for jaxpr in programs for own in jaxpr.eqns)
-
-
-def _is_program(x: Any) -> bool:
-    return isinstance(x, Jaxpr | ClosedJaxpr)
+    return any(_calls_lapack(own) for jaxpr in programs_in(eqn) for own in jaxpr.eqns)
 
 
 def _after(before: Sequence[Any], args: list[Any]) -> list[Any]:
@@ -153,4 +155,4 @@ def _with_turns_inside(params: dict[str, Any]) -> dict[str, Any]:
         shapes = [own.aval for own in x.jaxpr.invars]
         return jax.make_jaxpr(lambda *args: _Turns().run(x, args))(*shapes)
 
-    return jtu.tree_map(in_turn, params, is_leaf=_is_program)
+    return jtu.tree_map(in_turn, params, is_leaf=is_program)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from diffrax_symplectic import _lapack
-from diffrax_symplectic._compat import has_blocking_lapack, Literal
+from diffrax_symplectic._compat import has_blocking_lapack, Literal, programs_in
 from diffrax_symplectic._lapack import lapack_in_turn
 
 
@@ -78,9 +78,7 @@ def side_by_side_calls(jaxpr):
             count += known < calls
             calls += 1
             known = calls
-            leaves = jax.tree.leaves(eqn.params, is_leaf=_lapack._is_program)
-            inner = [x for x in leaves if _lapack._is_program(x)]
-            count += sum(side_by_side_calls(getattr(x, "jaxpr", x)) for x in inner)
+            count += sum(map(side_by_side_calls, programs_in(eqn)))
         last.update(dict.fromkeys(eqn.outvars, known))
     return count
 

@@ -8,11 +8,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._compat import Jaxpr
+from .._compat import Jaxpr, programs_in
 from .._custom_types import Y
+from .._lapack import LAPACK
 from .._signature import once_for_each_signature
 from .fits import without_newton
-from .kinks import programs_in
 from .problem import Problem
 
 
@@ -31,7 +31,6 @@ _TRANSCENDENTAL = frozenset(
 )
 # Operations on matrices are calls of LAPACK, which take some 100 ns each.
 _OF_LAPACK = 3_000
-_LAPACK = frozenset("cholesky eigh lu qr svd triangular_solve".split())
 
 
 @once_for_each_signature
@@ -56,7 +55,7 @@ def _numbers(jaxpr: Jaxpr, in_loop: bool) -> int:
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         size = sum(map(_size, eqn.outvars))
-        inner = list(programs_in(eqn))
+        inner = programs_in(eqn)
         if name == "while" and not in_loop:
             count += _SWEEPS * sum(_numbers(program, True) for program in inner)
         elif name == "scan":
@@ -65,7 +64,7 @@ def _numbers(jaxpr: Jaxpr, in_loop: bool) -> int:
         elif inner:
             # In a batch all branches of a conditional are evaluated.
             count += sum(_numbers(program, in_loop) for program in inner)
-        elif name in _LAPACK:
+        elif name in LAPACK:
             count += _OF_LAPACK
         elif name in _TRANSCENDENTAL and in_loop:
             count += _OF_TRANSCENDENTAL * size

@@ -1,13 +1,12 @@
 """Whether a function may have kinks or jumps, by the operations that it is made of."""
 
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
-from .._compat import ClosedJaxpr, Jaxpr, Literal
+from .._compat import Jaxpr, Literal, programs_in
 
 
 # All others are smooth, except perhaps at single points.
@@ -37,12 +36,3 @@ def _contains(jaxpr: Jaxpr) -> bool:
         if eqn.primitive.name in _NOT_SMOOTH or any(map(_contains, programs_in(eqn))):
             return True
     return False
-
-
-def programs_in(eqn: Any) -> Iterator[Jaxpr]:
-    """The programs that an operation runs, such as the branches of a conditional."""
-    for x in jtu.tree_leaves([*eqn.params.values()]):
-        if isinstance(x, ClosedJaxpr):
-            yield x.jaxpr
-        elif isinstance(x, Jaxpr):
-            yield x

@@ -40,6 +40,7 @@ def contradicted(
         return False
     t0 = jnp.asarray(t0, jnp.result_type(float))
     y0 = jtu.tree_map(jnp.asarray, y0)
+    # Not eagerly, operation by operation, where the user debugs under `jax.disable_jit()`.
     with jax.disable_jit(False):
         found = _contradicts(structure, is_noise, term, t0, y0, args)
     # Inside a program of the user's, of which these values are constants.

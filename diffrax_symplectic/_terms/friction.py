@@ -301,7 +301,7 @@ def _checked_array(g: ArrayLike, momenta: tuple[int, ...] | None) -> Array | _Sq
         _check_fits_path(g, momenta)
     is_matrix = momenta is not None and _is_matrix(g, momenta)
     if not may_be_matrix:
-        return jnp.asarray(real_array("friction", g, positive=False, kind=_KIND))
+        return jnp.asarray(real_array("friction", g, kind=_KIND))
     root = semidefinite_root(jnp.asarray(g, jnp.result_type(g, float)))
     is_semidefinite = ~jnp.any(jnp.isnan(root))
     square = _Square(jnp.asarray(g), is_semidefinite, root)
@@ -323,7 +323,7 @@ def checked_temperature(temperature: Any) -> Any:
         return temperature
 
     def checked(T: ArrayLike) -> Array:
-        return jnp.asarray(real_array("temperature", T, positive=False, kind=_KIND))
+        return jnp.asarray(real_array("temperature", T, kind=_KIND))
 
     return jtu.tree_map(checked, temperature)
 

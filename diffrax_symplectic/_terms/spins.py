@@ -84,7 +84,7 @@ def spin_terms(
 
 def _checked_damping(alpha: ArrayLike) -> ArrayLike:
     kind = "a number, or an array with one for each spin"
-    return real_array("damping", alpha, positive=False, kind=kind)
+    return real_array("damping", alpha, kind=kind)
 
 
 class _DampedPrecession(eqx.Module):

@@ -100,7 +100,7 @@ def wave_terms(
 
 def _checked_damping(alpha: ArrayLike) -> ArrayLike:
     kind = "a number, or an array with one for each vector of amplitudes"
-    return real_array("damping", alpha, positive=False, kind=kind)
+    return real_array("damping", alpha, kind=kind)
 
 
 class _DampedWaves(eqx.Module):
