@@ -39,6 +39,10 @@ def _multiply(a, b):
     return a & b if drjit().is_mask_v(a) else a * b
 
 
+# Dr.Jit's own maximum and minimum of floats abort the process with LLVM 15 and 16, which
+# cannot compile them, and lose NaN.
+
+
 def _maximum(a, b):
     if drjit().is_mask_v(a):
         return a | b
@@ -196,7 +200,7 @@ def _erfc(a):
     dr = drjit()
     number = type(a)
     # Not infinite, of which the next quotient would be NaN.
-    size = dr.minimum(dr.abs(a), _ERFC_END)
+    size = _minimum(dr.abs(a), number(_ERFC_END))
     s = (size - _ERFC_MIDDLE) / (size + _ERFC_MIDDLE)
     first, *others = _erfc_series(_ERFC_DEGREES[dr.itemsize_v(a)])
     # The sum of the Chebyshev series, by Clenshaw's recurrence.
