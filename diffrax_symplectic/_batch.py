@@ -218,16 +218,20 @@ def materialize(fn: Callable[[], _T]) -> _T:
     saves. XLA does not fuse across the boundary of a conditional, so `fn` is called in one
     branch of a conditional, and a barrier hides that the condition is always true.
     """
+
     # Traced once, although it is called for its shapes, in a branch, and elsewhere than on
-    # CPUs.
-    fn = jax.jit(fn)
+    # CPUs. (JAX names what it traces. It prints a bound method with all that it is bound
+    # to, for 50 ms each time, but not a function.)
+    @jax.jit
+    def once() -> _T:
+        return fn()
 
     def in_a_conditional() -> _T:
-        shapes = jax.eval_shape(fn)
+        shapes = jax.eval_shape(once)
 
         def zeros() -> _T:
             return jtu.tree_map(lambda leaf: lax.full_like(leaf, 0), shapes)
 
-        return lax.cond(lax.optimization_barrier(True), fn, zeros)
+        return lax.cond(lax.optimization_barrier(True), once, zeros)
 
-    return lax.platform_dependent(cpu=in_a_conditional, default=fn)
+    return lax.platform_dependent(cpu=in_a_conditional, default=once)
