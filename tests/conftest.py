@@ -10,6 +10,9 @@ import os
 
 # Inherited by the processes that some tests start, too.
 OPTIMIZED = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1") == "0"
+# Nobody looks up which lines an operation of a compiled program comes from, and to write
+# them down takes a tenth of the time.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
 import jax  # noqa: E402
 import jaxlib  # noqa: E402
@@ -33,9 +36,6 @@ if jaxlib.__version__.startswith("0.10.") and not OPTIMIZED:
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_disable_most_optimizations", not OPTIMIZED)
-# Nobody looks up which lines an operation of a compiled program comes from, and to write
-# them down takes a tenth of the time.
-jax.config.update("jax_traceback_in_locations_limit", 0)
 
 # Tracing makes millions of objects that live on: to look through them every few hundred
 # takes a third of its time.

@@ -9,14 +9,15 @@ from pathlib import Path
 import pytest
 
 from ..drjit_here import needs_drjit
+from ..families import slow_except
 from .fuzz import cases
 
 
 pytestmark = needs_drjit
 
 # A process takes seconds to start, so several systems share one.
-SIZE = 9
-GROUPS = [range(i, min(i + SIZE, len(cases()))) for i in range(0, len(cases()), SIZE)]
+ENDS = [*range(3, len(cases()), 12), len(cases())]
+QUICK, *LONG = map(range, [0, *ENDS[:-1]], ENDS)
 # Four steps; units in the last place of the largest number.
 ULPS = 32
 
@@ -36,7 +37,7 @@ def measured(numbers: list[int]) -> tuple[dict[int, float], str]:
 
 @pytest.mark.parametrize(
     "group",
-    [GROUPS[0], *(pytest.param(group, marks=pytest.mark.slow) for group in GROUPS[1:])],
+    slow_except([QUICK], [QUICK, *LONG]),
     ids=lambda group: f"{group.start}-{group.stop - 1}",
 )
 def test_control_flow_gives_the_same_paths(group):
