@@ -106,6 +106,11 @@ def take_step(solver, terms, t0, t1, y0, args):
     return y1, result
 
 
+# Other members of a family, and a solver within another one, are slow.
+QUICK_STEPS = [
+    repr(solver) for solver in (*DEFAULTS, *SPLIT) if not isinstance(solver, ds.Damped)
+]
+
 # By the scope all tests of one solver follow each other, in the process that has compiled
 # its program.
 each = lambda solvers: pytest.mark.parametrize(
@@ -116,10 +121,16 @@ each = lambda solvers: pytest.mark.parametrize(
 CORE = "ImplicitMidpoint()", "SRKw2()", "StormerVerlet()", "NinomiyaVictoir()"
 
 
-def core(solvers, names=CORE):
-    """Of these, those with one of the names with the mark `core`."""
-    marks = {True: pytest.mark.core, False: ()}
-    return [pytest.param(s, marks=marks[repr(s) in names]) for s in solvers]
+def marked(solvers, quick, core=()):
+    """Of these, those whose name is in `quick` or `core` without the mark `slow`, and the
+    latter with the mark `core`."""
+
+    def marks(solver):
+        if repr(solver) in core:
+            return pytest.mark.core
+        return () if repr(solver) in quick else pytest.mark.slow
+
+    return [pytest.param(solver, marks=marks(solver)) for solver in solvers]
 
 
 N, D, M = 1000, 2, 2
@@ -193,17 +204,17 @@ def program(solver, dtype, derivatives: bool):
     return step
 
 
-@each(core(STEPS))
+@each(marked(STEPS, QUICK_STEPS, CORE))
 def test_steps_of_a_thousand_random_systems_are_symplectic(solver):
     _assert_symplectic(solver, jnp.float64, 1e-13)
 
 
-@each(core([s for s in DEFAULTS if repr(s) in CORE[:3]], CORE[:1]))
+@each(marked([s for s in DEFAULTS if repr(s) in CORE[:3]], CORE[2:3], CORE[:1]))
 def test_steps_in_single_precision_are_symplectic(solver):
     _assert_symplectic(solver, jnp.float32, 5e-6)
 
 
-@each([*DEFAULTS, *SPLIT])
+@each(marked([*DEFAULTS, *SPLIT], (CORE[0], CORE[2], "BAOAB()")))
 def test_steps_in_single_precision_are_those_in_double_precision(solver):
     # Which are symplectic. Their derivatives are more than half of a program.
     x = batch(solver.structure, jnp.float32)
@@ -239,7 +250,7 @@ def _some(x: Batch, number: int) -> Batch:
     return jax.tree.map(lambda leaf: leaf[jnp.arange(N) % number], x)
 
 
-@each(STEPS)
+@each(marked(STEPS, QUICK_STEPS))
 def test_derivatives_equal_central_differences(solver):
     # Each system is moved along each of its unknowns and sizes, forward and back.
     n = 2 * D + 2
@@ -258,7 +269,7 @@ def test_derivatives_equal_central_differences(solver):
     np.testing.assert_allclose(np.moveaxis(differences, 0, 2), exact, atol=1e-8)
 
 
-@each(STEPS)
+@each(marked(STEPS, QUICK_STEPS))
 def test_failures_are_reported_and_leave_others_as_they_are(solver):
     x = batch(solver.structure, jnp.float64)
     sizes = np.ones((N, 2))
@@ -313,7 +324,7 @@ def _make_flows(solver) -> jax.Array:
     return jnp.stack([flow(*some, jnp.full(50, h)) for h in (0.1, 0.05)])
 
 
-@each(STEPS)
+@each(marked(STEPS, QUICK_STEPS))
 def test_the_order_without_noise_is_that_of_the_coefficients(solver):
     x = _some(batch(solver.structure, jnp.float64), 50)
     sizes = jnp.ones((N, 2)).at[:, 1].set(0)
@@ -388,7 +399,7 @@ def local_weak_orders(solver) -> dict[str, float]:
 
 
 # The outcomes of Lévy areas cannot be enumerated.
-@each([solver for solver in TABLE if "A" not in solver.variables])
+@each(marked([s for s in TABLE if "A" not in s.variables], CORE))
 def test_local_weak_order(solver):
     for kind, order in local_weak_orders(solver).items():
         claim = solver.record.order("weak", KINDS[kind])
@@ -454,9 +465,8 @@ STRONG = [
 ]
 
 
-def _quick(solver) -> bool:
-    # By its brackets of vector fields, a third of the time of this test for all solvers.
-    return "L" not in solver.variables
+# Of the orders 1/2 and 1, 1, and 3/2.
+QUICK_STRONG = "ImplicitMidpoint()", "StormerVerlet()", "SRKs4()"
 
 
 # How far slopes of steps that are not yet small lie above the claim, where terms of higher
@@ -465,7 +475,7 @@ def _quick(solver) -> bool:
 _ABOVE = {1 / 2: 0.2, 1: 0.3, 3 / 2: 0.5}
 
 
-@each([pytest.param(s, marks=() if _quick(s) else pytest.mark.slow) for s in STRONG])
+@each(marked(STRONG, QUICK_STRONG))
 def test_strong_order(solver):
     for kind, (order, bar) in strong_orders(solver).items():
         claim = solver.record.order("strong", KINDS[kind])
