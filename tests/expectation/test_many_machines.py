@@ -15,13 +15,9 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation.sampling import AbstractSampling
 
-from ..problems import kubo_terms
-
 
 KEY = jr.key(3)
 Y0 = (jnp.array(0.0), jnp.array(1.0))
-KUBO = kubo_terms(ds.WeakBrownianPath((), jr.key(0)))
-MIDPOINT = ds.ImplicitMidpoint()
 SAMPLINGS = {
     "IndependentPaths": lambda n: ds.IndependentPaths(n, 16),
     "ValueFunctions": lambda n: ds.ValueFunctions(1, n, 16),
@@ -29,14 +25,26 @@ SAMPLINGS = {
 }
 
 
-# Made once, so that JAX compiles programs of it once.
+def _energy(t, p, q, args):
+    return (p**2 + q**2) / 2
+
+
+def _force(t, p, q, args):
+    return jnp.cos(q)
+
+
+# Made once, so that JAX compiles programs of them once.
+TERMS = ds.hamiltonian_terms(_energy, _force, ds.WeakBrownianPath((), jr.key(0)))
+SOLVER = ds.StormerVerlet()
+
+
 def _phi(t, y, args):
     return {"q2": y[1] ** 2, "both": (y[0], jnp.stack(y))}
 
 
 def _part(name: str, n: int, first: int = 0, **kwargs) -> ds.Expectation:
     return ds.expectation(
-        _phi, KUBO, MIDPOINT, 0.0, 1.0, 0.25, Y0, key=KEY, levels=2,
+        _phi, TERMS, SOLVER, 0.0, 1.0, 0.25, Y0, key=KEY, levels=2,
         sampling=SAMPLINGS[name](n), first=first, **kwargs,
     )  # fmt: skip
 
@@ -137,6 +145,7 @@ e.save(sys.argv[2])
 """
 
 
+@pytest.mark.slow
 def test_two_processes_are_one_and_a_part_that_was_killed_is_done_again(tmp_path):
     root = str(Path(__file__).parents[2])
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}

@@ -335,6 +335,7 @@ def _of_three_devices() -> list[float]:
     return _read(_start(PROGRAM, 3))
 
 
+@pytest.mark.slow
 def test_the_paths_are_the_same_on_any_devices_and_hosts():
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
@@ -409,12 +410,19 @@ def _gradient(adjoint=None):
     return jax.tree_util.Partial(jax.grad(observable), jnp.array(0.5))
 
 
+@functools.cache
+def _mean_gradient() -> float:
+    by_hand = jax.jit(lambda key: _by_hand(_gradient(), key, 100))
+    return np.mean(by_hand(jr.key(0)))
+
+
 def test_gradients_are_taken_within():
     one = jax.devices()[:1]
     got = ds.monte_carlo(_gradient(), key=jr.key(0), num_paths=100, devices=one)
-    by_hand = jax.jit(lambda key: _by_hand(_gradient(), key, 100))
-    expected = np.mean(by_hand(jr.key(0)))
-    np.testing.assert_allclose(got.mean, expected, rtol=1e-12)
-    # On several devices the default adjoint is refused from JAX 0.10 on, and that of the
-    # advice works.
-    np.testing.assert_allclose(_of_three_devices()[3], expected, rtol=1e-12)
+    np.testing.assert_allclose(got.mean, _mean_gradient(), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_gradients_are_taken_within_on_several_devices():
+    # The default adjoint is refused from JAX 0.10 on, and that of the advice works.
+    np.testing.assert_allclose(_of_three_devices()[3], _mean_gradient(), rtol=1e-12)
