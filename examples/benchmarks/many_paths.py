@@ -24,8 +24,8 @@ from .fused import Case, CASES
 
 
 NUMBERS = [2**k for k in range(6, 21, 2)]
-# The start of a path, which draws its random keys, costs as much as ten steps. It should
-# not count for much, and for as much everywhere.
+# The start of a path, which draws its random keys, costs as much as ten steps of
+# `StormerVerlet`. It should not count for much, and for as much everywhere.
 STEPS = 64
 # A call that takes longer is not repeated.
 PATIENCE = 5.0
@@ -119,7 +119,8 @@ def write(table: Table) -> None:
     rows = [
         "# Many paths\n\nProcessor nanoseconds per path and step, by the number of paths. "
         f"{machine()}. float64, best of {ROUNDS} calls of {STEPS} steps, with the "
-        "time of the call around them, which counts where paths are few. `ArrayRQMC` takes these paths in {REPLICATES} replicates. Made by "
+        "time of the call around them, which counts where paths are few. `ArrayRQMC` "
+        f"takes these paths in {REPLICATES} replicates. Made by "
         "`python -m examples.benchmarks.many_paths`.\n",
         f"| system | | {heads} |",
         "|---" * (2 + len(NUMBERS)) + "|",
