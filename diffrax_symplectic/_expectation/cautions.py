@@ -95,7 +95,7 @@ def _of_spread(estimate: Expectation) -> Iterator[str]:
         )
 
 
-def _largest(errors: PyTree[np.ndarray]) -> float:
+def _largest(errors: PyTree[np.ndarray | np.floating]) -> float:
     leaves = jtu.tree_leaves(errors)
     return max(float(np.max(leaf, initial=0.0)) for leaf in leaves)
 

@@ -160,15 +160,18 @@ class Expectation(eqx.Module):
     def failed_error(self) -> _Host:
         """What failed paths could change in `mean`: their fraction of all paths, times the
         largest deviation of another path's value from the mean. (For sorted paths, that is
-        the mean over the replicates.) It does not decrease with more paths."""
+        the mean over the replicates.) It does not decrease with more paths, and is NaN if
+        there is no other path."""
         drawn = sum(own.end - own.begin for own in self.moments)
         # Samples that are left out, as single paths are, or as many samples as the paths
         # that failed in others would be, as in replicates.
         left_out = drawn - self.num_samples
         lost = max(left_out, self.num_failed / self.paths_per_sample)
         fraction = lost / max(drawn, 1)
+        # Of no samples the largest deviation is zero.
+        known = 1.0 if self.num_samples > 0 else np.nan
         spread = self._results(Combination.BEST).spread
-        return jtu.tree_map(lambda most: fraction * most, spread)
+        return jtu.tree_map(lambda most: known * fraction * most, spread)
 
     @property
     def off_order(self) -> PyTree[np.ndarray] | None:
@@ -261,7 +264,7 @@ class Expectation(eqx.Module):
             lines.append("not included: the discretization error (see `levels`)")
         how = "" if self.sampling is None else f", {self.sampling}"
         lines.append(f"{self.num_paths:,} paths, {self.num_failed:,} failed{how}")
-        if self.num_failed > 0:
+        if self.num_failed > 0 and self.num_samples > 0:
             changes = _listed(self.failed_error)
             lines.append(f"failed paths could change the mean by {', '.join(changes)}")
         if self.reason:

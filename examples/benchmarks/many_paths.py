@@ -24,11 +24,9 @@ from .fused import Case, CASES
 
 
 NUMBERS = [2**k for k in range(6, 21, 2)]
-# Path-steps of a call, within bounds: the start of a path, which draws its random keys,
-# should not count for much, and no path should leave its valley.
-WORK = 2**22
-LEAST_STEPS = 16
-MOST_STEPS = 128
+# The start of a path, which draws its random keys, costs as much as ten steps of
+# `StormerVerlet`. It should not count for much, and for as much everywhere.
+STEPS = 64
 # A call that takes longer is not repeated.
 PATIENCE = 5.0
 ROUNDS = 5
@@ -44,8 +42,8 @@ SYSTEMS = [
 REPLICATES = 2
 
 
-def by_ensemble(case: Case, number: int, steps: int, engine: str) -> Callable:
-    given = arguments(case, steps)
+def by_ensemble(case: Case, number: int, engine: str) -> Callable:
+    given = arguments(case)
 
     def call() -> None:
         ds.ensemble(*given, key=jr.key(1), num_paths=number, engine=engine)
@@ -53,8 +51,8 @@ def by_ensemble(case: Case, number: int, steps: int, engine: str) -> Callable:
     return call
 
 
-def by_array_rqmc(case: Case, number: int, steps: int) -> Callable:
-    given = arguments(case, steps)
+def by_array_rqmc(case: Case, number: int) -> Callable:
+    given = arguments(case)
     sampling = ds.ArrayRQMC(num_paths=number // REPLICATES, replicates=REPLICATES)
 
     def call() -> None:
@@ -63,18 +61,18 @@ def by_array_rqmc(case: Case, number: int, steps: int) -> Callable:
     return call
 
 
-def arguments(case: Case, steps: int) -> tuple[Any, ...]:
+def arguments(case: Case) -> tuple[Any, ...]:
     """From terms to the initial state."""
     terms = case.terms(jr.key(0), jnp.float64)
     y0 = case.start(jnp.float64)
-    return terms, case.solver, 0.0, steps * case.h, case.h, y0
+    return terms, case.solver, 0.0, STEPS * case.h, case.h, y0
 
 
 def first_number(t, y, args):
     return jnp.ravel(jax.tree.leaves(y)[0])[0]
 
 
-def nanoseconds(call: Callable, number: int, steps: int) -> float:
+def nanoseconds(call: Callable, number: int) -> float:
     """A path and step takes, at best."""
     call()  # compiles
     best = float("inf")
@@ -85,10 +83,10 @@ def nanoseconds(call: Callable, number: int, steps: int) -> float:
         best = min(best, seconds)
         if seconds > PATIENCE:
             break
-    return best * 1e9 / (number * steps)
+    return best * 1e9 / (number * STEPS)
 
 
-WAYS: dict[str, Callable[[Case, int, int], Callable]] = {
+WAYS: dict[str, Callable[[Case, int], Callable]] = {
     "fused": ft.partial(by_ensemble, engine="drjit"),
     "JAX": ft.partial(by_ensemble, engine="jax"),
     "`ArrayRQMC`": by_array_rqmc,
@@ -99,10 +97,9 @@ def measured(name: str, way: str) -> list[float]:
     """For each of `NUMBERS`; nothing if the sampling does not take the system."""
     found = []
     for number in NUMBERS:
-        steps = min(max(LEAST_STEPS, WORK // number), MOST_STEPS)
         try:
-            call = WAYS[way](CASES[name], number, steps)
-            found.append(nanoseconds(call, number, steps))
+            call = WAYS[way](CASES[name], number)
+            found.append(nanoseconds(call, number))
         except ValueError:
             return []
         print(name, way, number, f"{found[-1]:.1f}", flush=True)
@@ -121,9 +118,9 @@ def write(table: Table) -> None:
     heads = " | ".join(f"{number:,}" for number in NUMBERS)
     rows = [
         "# Many paths\n\nProcessor nanoseconds per path and step, by the number of paths. "
-        f"{machine()}. float64, best of {ROUNDS} calls, each of {LEAST_STEPS} to "
-        f"{MOST_STEPS} steps, with the time of the call around them, which counts where "
-        f"paths are few. `ArrayRQMC` takes these paths in {REPLICATES} replicates. Made by "
+        f"{machine()}. float64, best of {ROUNDS} calls of {STEPS} steps, with the "
+        "time of the call around them, which counts where paths are few. `ArrayRQMC` "
+        f"takes these paths in {REPLICATES} replicates. Made by "
         "`python -m examples.benchmarks.many_paths`.\n",
         f"| system | | {heads} |",
         "|---" * (2 + len(NUMBERS)) + "|",

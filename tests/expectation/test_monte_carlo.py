@@ -108,7 +108,8 @@ def test_failed_paths_are_counted_and_left_out():
             lambda key: jnp.nan * jr.normal(key), key=jr.key(0), num_paths=10
         )
     assert (nothing.num_paths, nothing.num_failed) == (0, 10)
-    assert np.isnan(nothing.std_error)
+    assert np.isnan(nothing.std_error) and np.isnan(nothing.failed_error)
+    assert "could change" not in str(nothing)
 
 
 def test_failures_are_counted_if_they_are_reported_and_raised_if_they_are_thrown():
