@@ -312,7 +312,7 @@ def test_backsolve_is_refused_with_advice(solver):
     "inner, form",
     [
         (ds.StormerVerlet(), jnp.array([[1.0, 0.4], [0.4, 0.7]])),
-        (ds.ImplicitMidpoint(), jnp.array(1.0)),
+        pytest.param(ds.ImplicitMidpoint(), jnp.array(1.0), marks=pytest.mark.slow),
     ],
     ids=["matrix", "number"],
 )

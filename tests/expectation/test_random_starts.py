@@ -10,6 +10,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..drjit_here import needs_drjit
+from ..picard import by_picard
 
 
 def oscillator(t, p, q, args):
@@ -45,7 +46,7 @@ def exact(strength):
     return (1 + WIDTH**2) * np.cos(END) ** 2 + noise
 
 
-ACCURATE = ds.AdditiveGauss()
+ACCURATE = by_picard(ds.AdditiveGauss())
 
 
 def mean(sampling, y0=cloud, args=strengths, solver=ACCURATE, **kwargs):
@@ -109,7 +110,7 @@ def test_paths_of_an_ensemble_start_where_they_say(engine):
     def start(key, args):
         return jnp.zeros(()), jnp.sqrt(args["strength"]) * jr.normal(key)
 
-    solver = ds.ImplicitMidpoint()
+    solver = ds.StormerVerlet()
     given = TERMS, solver, 0.0, END, 0.25, start, strengths
     how = dict(key=jr.key(1), num_paths=20, batch_size=8, engine=engine)
     paths = ds.ensemble(*given, **how, ts=[0.0, END])
@@ -129,7 +130,7 @@ def test_paths_of_an_ensemble_may_be_solved_again_in_a_batch():
     def start(key, args):
         return jnp.zeros(()), jnp.sqrt(args["strength"]) * jr.normal(key)
 
-    solver = ds.AdditiveGauss()
+    solver = ds.StormerVerlet()
     given = TERMS, solver, 0.0, END, 0.25, start, strengths
     paths = ds.ensemble(*given, key=jr.key(1), num_paths=20)
 
@@ -200,6 +201,6 @@ def test_starts_take_args_by_any_name_and_options_by_their_defaults():
     few = dict(key=jr.key(1), num_paths=8)
     args = {"strength": jnp.array(4.0)}
     start = lambda y0: ds.ensemble(
-        TERMS, ds.AdditiveGauss(), 0.0, END, 0.5, y0, args, ts=[0.0], **few
+        TERMS, ds.StormerVerlet(), 0.0, END, 0.5, y0, args, ts=[0.0], **few
     ).ys[1]
     np.testing.assert_allclose(start(of_both), 2 * start(of_key), rtol=1e-12)

@@ -20,6 +20,7 @@ from diffrax_symplectic._expectation.noise import Noise
 from diffrax_symplectic._expectation.problem import Problem
 from diffrax_symplectic._terms import outcomes, step_variables
 
+from ..families import slow_except
 from ..problems import kubo_terms, RecordingMeter
 
 
@@ -89,7 +90,7 @@ def test_rare_paths_that_leave_the_grid_do_not_move_the_mean():
     assert abs(got.mean - exact) <= 4.5 * got.std_error
 
 
-@pytest.mark.parametrize("degree", [1, 6, None])
+@pytest.mark.parametrize("degree", slow_except([6], [1, 6, None]))
 def test_the_mean_is_that_over_all_outcomes_however_the_fit_is(degree):
     # The quartic is not a polynomial of these degrees after three steps.
     phi = lambda t, y, args: y[1] ** 4 + y[0]
@@ -108,7 +109,9 @@ def _turned(power: int) -> complex:
     return (np.exp(1j * power * turn) @ np.array([1, 4, 1]) / 6) ** 10
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize(
+    "dtype", slow_except([jnp.float64], [jnp.float32, jnp.float64])
+)
 def test_linear_systems_and_quadratic_functions_are_closed(dtype):
     shape = jax.ShapeDtypeStruct((), dtype)
     terms = kubo_terms(ds.WeakBrownianPath(shape, KEY))

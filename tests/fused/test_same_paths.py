@@ -12,9 +12,10 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..drjit_here import needs_drjit
+from ..families import slow_except
 from ..picard import by_picard
 from ..problems import SYSTEMS
-from ..solver.test_every_solver import CORE, DEFAULTS, each, STEPS, terms_for
+from ..solver.test_every_solver import CORE, DEFAULTS, each, marked, STEPS, terms_for
 
 
 pytestmark = needs_drjit
@@ -92,12 +93,16 @@ def problem(structure: str, dtype, m: int = 2):
     return SYSTEMS[structure].draw(jr.key(3), 2, m, dtype)
 
 
-@each(STEPS)
+# Of the steps by one system of equations, by several, none, with flows, and with friction.
+QUICK = *CORE, "BAOAB()"
+
+
+@each(marked(STEPS, QUICK))
 def test_of_every_solver(solver):
     _assert_of_solver(solver, jnp.float64)
 
 
-@each(DEFAULTS)
+@each(marked(DEFAULTS, (CORE[0], CORE[2])))
 def test_of_every_solver_in_single_precision(solver):
     _assert_of_solver(solver, jnp.float32)
 
@@ -129,7 +134,9 @@ PATHS = {
 }
 
 
-@pytest.mark.parametrize("name", PATHS)
+@pytest.mark.parametrize(
+    "name", slow_except(["weak", "Gaussian of cells", "truncated", "tree"], PATHS)
+)
 def test_of_every_brownian_path(name):
     y0, args = problem("any", jnp.float64)
     terms = SYSTEMS["any"].terms(PATHS[name](jr.key(0)))
@@ -137,7 +144,7 @@ def test_of_every_brownian_path(name):
     assert_same_paths(terms, solver, y0, args, jnp.float64, quick(solver))
 
 
-@pytest.mark.parametrize("cell", [None, H / 2])
+@pytest.mark.parametrize("cell", slow_except([None], [None, H / 2]))
 @pytest.mark.parametrize("solver", [ds.LevyAreaMidpoint(), diffrax.SlowRK()], ids=repr)
 def test_of_paths_with_areas(solver, cell):
     gaussian = lambda cell: ds.FixedStepBrownianPath(

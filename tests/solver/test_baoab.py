@@ -14,6 +14,7 @@ from examples.hard_cases import double_well
 from examples.hard_cases._ensemble import gaussian, weak
 from examples.hard_cases._stationary import stationary_bias, Step
 
+from ..families import slow_except
 from ..problems import damped_terms, Given, local_weak_orders, weak_path
 
 
@@ -58,7 +59,9 @@ def test_stationary_bias_of_the_double_well(make_path, expected):
 
 
 @pytest.mark.parametrize("solver", [ds.BAOAB(), ds.Damped(ds.StormerVerlet())])
-@pytest.mark.parametrize("friction", ["each", "matrix", "positions"])
+@pytest.mark.parametrize(
+    "friction", slow_except(["matrix"], ["each", "matrix", "positions"])
+)
 def test_local_weak_order_is_two(friction, solver):
     # The friction does not commute with the covariance of the noise, and may be one that
     # depends on positions and time.
@@ -101,7 +104,13 @@ def test_a_matrix_of_friction_is_that_of_its_own_axes():
     np.testing.assert_allclose(p1["x"][:, 0], expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("solver", [ds.BAOAB(), ds.Damped(ds.StormerVerlet())])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        ds.BAOAB(),
+        pytest.param(ds.Damped(ds.StormerVerlet()), marks=pytest.mark.slow),
+    ],
+)
 def test_first_and_second_derivatives_by_a_matrix_with_equal_rates(solver):
     y0 = jnp.ones(2), jnp.zeros(2)
 

@@ -71,7 +71,13 @@ def take_steps(number, terms, h, y0, args=None, solver=None):
     return y, jnp.all(okay)
 
 
-@pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-14), (jnp.float32, 1e-5)])
+@pytest.mark.parametrize(
+    "dtype, bound",
+    [
+        (jnp.float64, 1e-14),
+        pytest.param(jnp.float32, 1e-5, marks=pytest.mark.slow),
+    ],
+)
 def test_steps_are_symplectic_on_the_constrained_phase_space(dtype, bound):
     @jax.jit
     @jax.vmap
@@ -121,6 +127,7 @@ def solved(terms, t1, dt0, y0, args=None, **kwargs):
     return jax.tree.map(lambda x: x[-1], sol.ys)
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_steps_keep_constraints_and_energy():
     p, q = solved(PENDULUM, 1e4, 0.1, LEVEL)
     assert abs(rod(q, None)[0]) <= 1e-15

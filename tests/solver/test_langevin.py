@@ -12,6 +12,7 @@ from examples.hard_cases import double_well
 from examples.hard_cases._ensemble import gaussian
 from examples.hard_cases._stationary import stationary_bias, Step
 
+from ..families import slow_except
 from ..problems import damped_terms, local_weak_orders, weak_path
 
 
@@ -79,12 +80,17 @@ def test_momenta_of_baoab_are_too_cold_by_a_known_factor(h):
 LANGEVIN = pytest.mark.parametrize("solver", [ds.BAOAB(), ds.LangevinMiddle()])
 
 
+BOTH = [(friction, masses) for friction in FRICTIONS for masses in KINETIC]
+
+
 @LANGEVIN
-@pytest.mark.parametrize("masses", KINETIC)
-@pytest.mark.parametrize("friction", FRICTIONS)
-def test_springs_of_any_friction_and_masses_keep_the_temperature(
-    friction, masses, solver
-):
+@pytest.mark.parametrize(
+    "kinds",
+    slow_except([("number", "each"), ("matrix", "matrix")], BOTH),
+    ids="-".join,
+)
+def test_springs_of_any_friction_and_masses_keep_the_temperature(kinds, solver):
+    friction, masses = kinds
     springs = jnp.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.0], [0.1, 0.0, 1.5]])
     kinetic, h = KINETIC[masses], 0.4
     H0 = lambda t, p, q, args: kinetic(p) + q @ springs @ q / 2
@@ -99,7 +105,7 @@ def test_springs_of_any_friction_and_masses_keep_the_temperature(
 
 
 @LANGEVIN
-@pytest.mark.parametrize("friction", FRICTIONS)
+@pytest.mark.parametrize("friction", slow_except(["matrix"], FRICTIONS))
 def test_free_particles_diffuse_as_einstein_says_for_any_step(friction, solver):
     G = FRICTIONS[friction]
     H0 = lambda t, p, q, args: KINETIC["each"](p)

@@ -18,6 +18,7 @@ import pytest
 
 import diffrax_symplectic as ds
 
+from ..families import slow_except
 from ..problems import (
     GENERAL,
     H0,
@@ -73,7 +74,10 @@ _CUT = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((2,), jr.key(3)), k=1)
 
 @pytest.mark.parametrize(
     "solver, path",
-    [(ds.ImplicitMidpoint(), weak_path(2)), (ds.SRKs1(), _CUT)],
+    [
+        (ds.ImplicitMidpoint(), weak_path(2)),
+        pytest.param(ds.SRKs1(), _CUT, marks=pytest.mark.slow),
+    ],
     ids=["ImplicitMidpoint", "SRKs1-cut"],
 )
 def test_gradients_equal_central_differences(solver, path):
@@ -143,17 +147,22 @@ def test_adjoints_agree():
     np.testing.assert_allclose(got, expected, rtol=1e-10)
 
 
+OTHER_FINDERS = [
+    optx.Newton(rtol=1e-12, atol=1e-14),
+    optx.Chord(rtol=1e-12, atol=1e-14),
+    optx.Dogleg(rtol=1e-12, atol=1e-14),
+    optx.LevenbergMarquardt(rtol=1e-12, atol=1e-14),
+]
+OWN_FINDERS = [
+    ds.PicardNewton(linear_solver=lx.QR()),
+    ds.PicardNewton(),
+    ds.PicardNewton(picard_steps=0),
+]
+
+
 @pytest.mark.parametrize(
     "root_finder",
-    [
-        optx.Newton(rtol=1e-12, atol=1e-14),
-        optx.Chord(rtol=1e-12, atol=1e-14),
-        optx.Dogleg(rtol=1e-12, atol=1e-14),
-        optx.LevenbergMarquardt(rtol=1e-12, atol=1e-14),
-        ds.PicardNewton(linear_solver=lx.QR()),
-        ds.PicardNewton(),
-        ds.PicardNewton(picard_steps=0),
-    ],
+    slow_except([OTHER_FINDERS[0], *OWN_FINDERS], [*OTHER_FINDERS, *OWN_FINDERS]),
     ids=lambda r: type(r).__name__,
 )
 def test_any_root_finder_gives_the_same_solution(root_finder):
@@ -204,7 +213,9 @@ def test_unsolvable_stages_are_reported():
     assert solve(throw=False).result != diffrax.RESULTS.successful
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize(
+    "dtype", slow_except([jnp.float64], [jnp.float32, jnp.float64])
+)
 def test_failed_paths_do_not_spoil_their_neighbours(dtype):
     def solve(q, key):
         path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((), dtype), key)
@@ -254,23 +265,29 @@ def test_non_finite_hamiltonians_are_reported():
         jax.block_until_ready(solve(args[1], throw=True))
 
 
-def test_everything_works_in_single_precision_mode():
+@pytest.mark.parametrize(
+    "solver, path",
+    [
+        ("ds.ImplicitMidpoint()", "cut"),
+        pytest.param("ds.SRKw2()", "weak", marks=pytest.mark.slow),
+    ],
+)
+def test_everything_works_in_single_precision_mode(solver, path):
     # In a process of its own: the tests run with 64-bit floats enabled.
-    program = """
+    program = f"""
 import diffrax, diffrax_symplectic as ds, jax, jax.numpy as jnp, jax.random as jr
 H = lambda t, p, q, args: (p**2 + q**2) / 2
 y0 = (jnp.array(0.0), jnp.array(1.0))
 fixed = ds.FixedStepBrownianPath((), jr.key(0))
 weak, cut = ds.WeakBrownianPath((), jr.key(0)), ds.TruncatedBrownianPath(fixed)
-for solver, path in ((ds.ImplicitMidpoint(), cut), (ds.SRKw2(), weak)):
-    terms = ds.hamiltonian_terms(H, H, path)
-    def momentum(y0):
-        ys = diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.01, y0).ys
-        return jnp.sum(ys[0]), ys
-    grad, (p, q) = jax.jit(jax.grad(momentum, has_aux=True))(y0)
-    assert p.dtype == grad[0].dtype == jnp.float32
-    assert abs(p**2 + q**2 - 1) < 1e-5, (solver, p, q)
-    assert all(jnp.isfinite(g) for g in grad)
+terms = ds.hamiltonian_terms(H, H, {path})
+def momentum(y0):
+    ys = diffrax.diffeqsolve(terms, {solver}, 0.0, 1.0, 0.01, y0).ys
+    return jnp.sum(ys[0]), ys
+grad, (p, q) = jax.jit(jax.grad(momentum, has_aux=True))(y0)
+assert p.dtype == grad[0].dtype == jnp.float32
+assert abs(p**2 + q**2 - 1) < 1e-5, (p, q)
+assert all(jnp.isfinite(g) for g in grad)
 """
     # The examples, which other tests import, ask for double precision.
     single = os.environ | {"JAX_ENABLE_X64": "0"}

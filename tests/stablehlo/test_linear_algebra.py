@@ -7,6 +7,7 @@ import pytest
 from jax.scipy import linalg
 
 from ..drjit_here import needs_drjit
+from ..families import slow_except
 from .replayed import replayed
 from .test_operations import LANES
 
@@ -54,7 +55,9 @@ def problems(n: int, dtype, seed: int = 0, batch: tuple[int, ...] = ()):
     return a, rng.normal(size=(LANES, n)).astype(dtype)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["f32", "f64"])
+@pytest.mark.parametrize(
+    "dtype", slow_except([np.float64], [np.float32, np.float64]), ids=["f32", "f64"]
+)
 @pytest.mark.parametrize("name", CASES)
 def test_it_gives_what_jax_gives_up_to_rounding(name, dtype):
     batch = (2,) if "batch" in name else ()

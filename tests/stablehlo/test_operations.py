@@ -9,6 +9,7 @@ import pytest
 from jax import lax
 
 from ..drjit_here import needs_drjit
+from ..families import slow_except
 from .replayed import replayed
 
 
@@ -193,7 +194,9 @@ HARDWARE = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["f32", "f64"])
+@pytest.mark.parametrize(
+    "dtype", slow_except([np.float64], [np.float32, np.float64]), ids=["f32", "f64"]
+)
 @pytest.mark.parametrize("name", CASES)
 def test_a_replayed_operation_gives_what_jax_gives(name, dtype):
     fn, kinds, ulps = CASES[name]

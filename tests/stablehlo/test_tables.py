@@ -9,6 +9,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..drjit_here import needs_drjit
+from ..families import slow_except
 from .replayed import replayed
 
 
@@ -60,8 +61,10 @@ def paths(name: str, engine: str, num_paths: int, dtype) -> ds.Ensemble:
 
 
 # As many paths as entries, fewer, and more.
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=["f32", "f64"])
-@pytest.mark.parametrize("name", POTENTIALS)
+@pytest.mark.parametrize(
+    "dtype", slow_except([jnp.float64], [jnp.float32, jnp.float64]), ids=["f32", "f64"]
+)
+@pytest.mark.parametrize("name", slow_except(["args", "field map"], POTENTIALS))
 def test_paths_are_the_same_as_in_jax(name, dtype):
     for number in (300, 40, 700):
         fused = paths(name, "drjit", number, dtype)

@@ -119,8 +119,8 @@ def test_density_of_gibbs_solves_the_equation_of_fokker_and_planck(energy):
     "solver, dtype, bound",
     [
         (ds.ImplicitMidpoint(), jnp.float64, 1e-13),
-        (ds.ImplicitMidpoint(), jnp.float32, 1e-5),
-        (ds.NinomiyaVictoir(), jnp.float64, 1e-13),
+        pytest.param(ds.ImplicitMidpoint(), jnp.float32, 1e-5, marks=pytest.mark.slow),
+        pytest.param(ds.NinomiyaVictoir(), jnp.float64, 1e-13, marks=pytest.mark.slow),
     ],
     ids=["ImplicitMidpoint", "float32", "NinomiyaVictoir"],
 )

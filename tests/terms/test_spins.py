@@ -119,7 +119,7 @@ def _thousand_systems():
         (ds.ImplicitMidpoint(), jnp.float64, 1e-13),
         pytest.param(ds.ImplicitMidpoint(), jnp.float32, 5e-6, marks=pytest.mark.slow),
         pytest.param(ds.SRKw1(b=0.2), jnp.float64, 1e-13, marks=pytest.mark.slow),
-        (ds.NinomiyaVictoir(), jnp.float64, 1e-13),
+        pytest.param(ds.NinomiyaVictoir(), jnp.float64, 1e-13, marks=pytest.mark.slow),
         pytest.param(ds.LevyAreaMidpoint(), jnp.float64, 1e-13, marks=pytest.mark.slow),
     ],
     ids=["ImplicitMidpoint", "float32", "SRKw1", "NinomiyaVictoir", "LevyAreaMidpoint"],
