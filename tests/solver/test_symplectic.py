@@ -37,7 +37,7 @@ def test_stage_equations_are_solved_to_rounding_error(name, dtype):
     # Derivatives are implicit, and those of steps would be symplectic at any approximate
     # solution. So the end of the step is compared to a solve that goes on and on.
     stubborn = Picard(atol=-1.0)
-    exact = dataclasses.replace(solver, root_finder=stubborn, root_find_max_steps=500)
+    exact = dataclasses.replace(solver, root_finder=stubborn, root_find_max_steps=250)
 
     ravel = jnp.concatenate
 

@@ -12,6 +12,8 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._terms.structure import commuting
 
+from ..families import slow_except
+
 
 def _solve(H0, noise, solver=None, args=None):
     path = ds.WeakBrownianPath((), jr.key(0))
@@ -256,7 +258,9 @@ def _heated(H0, structure, noise=None):
     return ds.langevin_terms(H0, 1.0, 1.5, (2,), structure=structure)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize(
+    "dtype", slow_except([jnp.float64], [jnp.float32, jnp.float64])
+)
 @pytest.mark.parametrize(
     "make, solver, name",
     [

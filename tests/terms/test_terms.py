@@ -12,6 +12,7 @@ import pytest
 
 import diffrax_symplectic as ds
 
+from ..families import slow_except
 from ..problems import (
     H0,
     local_weak_orders,
@@ -103,7 +104,7 @@ def test_one_noise_may_be_a_scalar(shape):
     solve(diffrax.StratonovichMilstein())
 
 
-@pytest.mark.parametrize("m", [1, 3])
+@pytest.mark.parametrize("m", slow_except([3], [1, 3]))
 def test_terms_work_with_diffrax_solvers(m):
     y0, args = random_problem(jr.key(0), 2, m)
     # Steps of the same size see the same increments.
