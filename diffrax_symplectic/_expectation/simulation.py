@@ -16,6 +16,12 @@ from .._root_finder import all_finite
 from .problem import Drawn, Level, Problem
 
 
+# On CPUs so many paths are stepped at once. The arrays of more overflow the cache in every
+# sweep over their stage equations: for a million paths of `ArrayRQMC` by the midpoint rule
+# this saves 33 to 42% of the processor time. Smaller blocks leave cores idle.
+_BLOCK = 2**17
+
+
 class PathStates(eqx.Module):
     """The states of many paths at one time, along the first axis of each array.
 
@@ -172,7 +178,7 @@ def independent_steps(
             return own.step(terms_of(random), i, level.h, y, solver_state)
 
         states = paths.y, paths.solver_state, paths.args
-        y, solver_state, success = jax.vmap(one)(randomness(i), *states)
+        y, solver_state, success = _in_blocks(one, randomness(i), *states)
         return paths.moved(p, y, solver_state, success)
 
     def start(random, y, args):
@@ -180,6 +186,14 @@ def independent_steps(
 
     solver_state = jax.vmap(start)(randomness(0), drawn.y0, drawn.args)
     return Motion(step, PathStates.start(p, drawn, solver_state))
+
+
+def _in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
+    """`jax.vmap(fn)(*args)`, on CPUs one block of paths after another."""
+    count = len(jtu.tree_leaves(args)[0])
+    if count <= _BLOCK or jax.default_backend() != "cpu":
+        return jax.vmap(fn)(*args)
+    return lax.map(lambda own: fn(*own), args, batch_size=_BLOCK)
 
 
 def along(mask: Bool[Array, " n"], x: Array) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation import simulation
 from diffrax_symplectic._expectation.array_rqmc import step_words
 from diffrax_symplectic._expectation.moments import level_weights
 
@@ -61,6 +62,18 @@ def test_the_estimate_is_exact_up_to_the_spread_that_it_reports():
     assert got.bias is None and got.tol_reached is None
     low, high = got.interval(0.95)
     np.testing.assert_allclose(high - low, 2 * 2.13145 * got.std_error, rtol=1e-5)
+
+
+@pytest.mark.parametrize("block", [64, 48])
+def test_paths_in_blocks_are_those_of_one_batch(block, monkeypatch):
+    phi = lambda t, y, args: (
+        y[1] ** 2
+    )  # Its own, so that its programs are compiled anew.
+    whole = _estimate(phi=SQUARE, levels=2)
+    monkeypatch.setattr(simulation, "_BLOCK", block)
+    got = _estimate(phi=phi, levels=2)
+    np.testing.assert_allclose(got.mean, whole.mean, rtol=1e-13)
+    np.testing.assert_allclose(got.std_error, whole.std_error, rtol=1e-9)
 
 
 def test_ito_solvers_are_refused_for_terms_of_stratonovich():
