@@ -118,8 +118,9 @@ def write(table: Table) -> None:
     heads = " | ".join(f"{number:,}" for number in NUMBERS)
     rows = [
         "# Many paths\n\nProcessor nanoseconds per path and step, by the number of paths. "
-        f"{machine()}. float64, best of {ROUNDS} calls of {STEPS} steps, with the "
-        "time of the call around them, which counts where paths are few. `ArrayRQMC` "
+        f"{machine()}. float64, best of {ROUNDS} calls of {STEPS} steps, fewer where a "
+        f"call takes more than {PATIENCE:.0f} s, with the time of the call around them, "
+        "which counts where paths are few. `ArrayRQMC` "
         f"takes these paths in {REPLICATES} replicates. Made by "
         "`python -m examples.benchmarks.many_paths`.\n",
         f"| system | | {heads} |",

@@ -64,13 +64,11 @@ def test_the_estimate_is_exact_up_to_the_spread_that_it_reports():
     np.testing.assert_allclose(high - low, 2 * 2.13145 * got.std_error, rtol=1e-5)
 
 
-@pytest.mark.parametrize("block", [64, 48])
-def test_paths_in_blocks_are_those_of_one_batch(block, monkeypatch):
-    phi = lambda t, y, args: (
-        y[1] ** 2
-    )  # Its own, so that its programs are compiled anew.
+def test_paths_in_blocks_are_those_of_one_batch(monkeypatch):
     whole = _estimate(phi=SQUARE, levels=2)
-    monkeypatch.setattr(simulation, "_BLOCK", block)
+    # Another function, so that programs are compiled anew.
+    phi = lambda t, y, args: y[1] ** 2
+    monkeypatch.setattr(simulation, "_BLOCK", 64)
     got = _estimate(phi=phi, levels=2)
     np.testing.assert_allclose(got.mean, whole.mean, rtol=1e-13)
     np.testing.assert_allclose(got.std_error, whole.std_error, rtol=1e-9)
