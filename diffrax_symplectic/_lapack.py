@@ -34,7 +34,7 @@ from ._compat import (
 
 # The operations that JAX leaves to LAPACK on CPUs.
 LAPACK = frozenset(
-    "cholesky eig eigh geqp3 geqrf hessenberg householder_product lu schur svd "
+    "cholesky eig eigh geqp3 geqrf hessenberg householder_product lu qr schur svd "
     "symmetric_product triangular_solve tridiagonal tridiagonal_solve".split()
 )
 _CONTROL_FLOW = frozenset({"cond", "scan", "while"})

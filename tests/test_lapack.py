@@ -163,3 +163,9 @@ def test_many_calls_of_lapack_return(n, kind, call):
     env["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "0"
     program = [sys.executable, "-c", textwrap.dedent(PROGRAM), str(n), kind, call]
     subprocess.run(program, env=env, check=True, timeout=300)
+
+
+@pytest.mark.parametrize("name", ["cholesky", "eigh", "eigvals", "inv", "qr", "svd"])
+def test_functions_of_matrices_are_known_to_call_lapack(name):
+    jaxpr = jax.make_jaxpr(getattr(jnp.linalg, name))(jnp.eye(2))
+    assert any(map(_lapack._calls_lapack, jaxpr.eqns))
