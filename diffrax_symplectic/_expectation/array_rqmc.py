@@ -111,6 +111,7 @@ class ArrayRQMC(AbstractSampling):
                 # All paths of a replicate are solved at once, which is a batch already.
                 batch_size=1,
                 paths=self.num_paths,
+                levels=len(problem.levels.h),
                 least=_BEFORE_STOPPING,
             )
 
@@ -138,7 +139,7 @@ class ArrayRQMC(AbstractSampling):
             "gains little over `IndependentPaths`. Pass a `sort_by` that returns the few "
             "coordinates that matter most, at most "
             f"{int(math.log(self.num_paths, _FEWEST_ALONG_COORDINATE))}.",
-            stacklevel=4,
+            stacklevel=5,
         )
         return by_state
 
@@ -199,7 +200,8 @@ def _replicates(
     # A path may fail on any level.
     largest = tensordot(jnp.abs(p.weights).astype(largest.dtype), largest, 1)
     kinds = [means, heavy, largest]
-    return Samples(p.averaged(kinds), jnp.ones(1, bool), jnp.sum(done.failed)[None])
+    lost = jnp.sum(done.failed, axis=1, keepdims=True)
+    return Samples(p.averaged(kinds), jnp.ones(1, bool), lost)
 
 
 def _words_of_step(

@@ -25,7 +25,9 @@ class BatchSums(NamedTuple):
     """What is known of the samples of a batch. All but the numbers have the structure of
     `phi`, and leading axes for kinds and combinations of levels.
 
-    - `good`, `failed`: the numbers of good samples and of failed paths.
+    - `good`: the number of good samples.
+    - `failed`: the number of failed paths. A path that fails on several levels counts once.
+    - `failed_on`: the number of paths that failed on each level.
     - `mean`: the mean of the good samples.
     - `rest`: the rounding error of this mean, which is added to it in float64.
     - `norm`: the root of the sum of squared deviations from the exact mean.
@@ -35,6 +37,7 @@ class BatchSums(NamedTuple):
 
     good: Int[Array, "*devices"]
     failed: Int[Array, "*devices"]
+    failed_on: Int[Array, "*devices levels"]
     mean: PyTree[Array]
     rest: PyTree[Array]
     norm: PyTree[Array]
@@ -112,11 +115,12 @@ def _of_device(
     # The last batch is cut here: another size would be another program.
     is_wanted = index < left
     good = samples.good & is_wanted
-    failed = jnp.where(is_wanted, samples.lost, 0)
+    lost = jnp.where(is_wanted, samples.lost, 0)
+    failed = jnp.sum(jnp.max(lost, axis=0))
     leaves, treedef = jtu.tree_flatten(samples.values)
     each = [_sums_of_array(leaf, good) for leaf in leaves]
     sums = map(treedef.unflatten, zip(*each))
-    return BatchSums(jnp.sum(good), jnp.sum(failed), *sums)
+    return BatchSums(jnp.sum(good), failed, jnp.sum(lost, axis=1), *sums)
 
 
 def _sums_of_array(

@@ -1,20 +1,29 @@
 """What users are warned of in an estimate."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PyTree
 
-from .estimate import best_results, Expectation
+from .estimate import combined_results, Expectation
 from .moments import Combination, total
-from .sampling import KindsWithControl
+from .sampling import KindsWithControl, ROUNDING
+from .tolerance import largest_of, shortfall
 
 
 # With an `r` of `std_error` above this, means of exp(5 x) with normal x were off by forty
 # standard errors, and means of exp(3 x) by five.
 _HEAVY = 0.35
+# Two steps do not agree if the extrapolation from them changes the mean by more than this
+# share of it. Of a method of order 2, the bias of the longer step is then more than twice
+# the mean.
+_MUCH = 0.5
+# Unless that change may be the noise of the samples, so many standard errors.
+_SURE = 4
+# Many more paths fail with the longer step if they are so many times those with half of it.
+_MANY_MORE = 10
 
 
 def cautions(estimate: Expectation, tol: float | None, bounded: bool) -> Iterator[str]:
@@ -24,13 +33,9 @@ def cautions(estimate: Expectation, tol: float | None, bounded: bool) -> Iterato
         yield from _of_failures(estimate, bounded)
     if estimate.num_samples > 1:
         yield from _of_spread(estimate)
-    if estimate.tol_reached is False:
-        largest = _largest(estimate.std_error)
-        yield (
-            f"`tol={tol}` was not reached: the largest standard error is {largest:.1e} "
-            f"after {estimate.num_paths:,} paths. Take more paths, continuing with "
-            "`start=`, or another `sampling`."
-        )
+        yield from _of_first_steps(estimate)
+    if tol is not None and not estimate.tol_reached:
+        yield f"`tol={tol}` was not reached: {shortfall(estimate, tol)}."
 
 
 def _of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
@@ -43,11 +48,18 @@ def _of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
     if estimate.num_samples == 0:
         rest = "there is no mean"
     else:
-        largest = _largest(estimate.failed_error)
+        largest = largest_of(estimate.failed_error)
         rest = (
             "they are left out of the mean, and could change it by more than its standard "
             f"error, up to {largest:.1e}, which is part of `error`"
         )
+    if estimate.levels > 1:
+        longest, next_one, *_ = estimate.failed_on
+        if longest > _MANY_MORE * next_one:
+            rest += (
+                f"; the first two steps do not agree, since {longest:,} paths fail with "
+                f"steps of `dt0` and {next_one:,} with half of it"
+            )
     instead = "" if bounded else " or bounded increments, as from a `WeakBrownianPath`,"
     yield (
         f"{estimate.num_failed:,} paths failed: {rest}. Take smaller steps{instead} and "
@@ -64,7 +76,7 @@ def _of_spread(estimate: Expectation) -> Iterator[str]:
             "Take smaller steps or a more stable solver, and check whether single paths "
             "stay bounded."
         )
-    best = best_results(estimate)
+    best = combined_results(estimate, Combination.BEST)
     if any(np.any(x) for x in jtu.tree_leaves(best.dropped)):
         yield (
             "A control variate was dropped: its mean over these paths is more than five "
@@ -95,9 +107,27 @@ def _of_spread(estimate: Expectation) -> Iterator[str]:
         )
 
 
-def _largest(errors: PyTree[np.ndarray | np.floating]) -> float:
-    leaves = jtu.tree_leaves(errors)
-    return max(float(np.max(leaf, initial=0.0)) for leaf in leaves)
+def _of_first_steps(estimate: Expectation) -> Iterator[str]:
+    """Of two steps whose means have little in common. (Three are checked for the order.)"""
+    if estimate.levels != 2:
+        return
+    change = combined_results(estimate, Combination.EXTRAPOLATION)
+    whole = total(estimate.moments)
+
+    def disagree(change: Any, noise: Any, finest: Any, sizes: Any, dtype: str) -> Any:
+        size = np.max(sizes, axis=0)[Combination.BEST]
+        rounding = ROUNDING * float(jnp.finfo(dtype).eps) * size
+        is_large = np.abs(change) > np.maximum(_SURE * noise, rounding)
+        return np.any(is_large & (np.abs(change) > _MUCH * np.abs(finest)))
+
+    finest = jtu.tree_map(np.add, estimate.mean, estimate.bias)
+    arguments = change.mean, change.std_error, finest, whole.size, whole.dtypes
+    if any(jtu.tree_leaves(jtu.tree_map(disagree, *arguments))):
+        yield (
+            "The first two steps do not agree: extrapolation from steps of `dt0` and half "
+            "of it changes the mean by more than half of it. Pass a smaller `dt0`, or "
+            "`levels=3`, which checks the order."
+        )
 
 
 def _underflowing(estimate: Expectation) -> str | None:

@@ -1,17 +1,27 @@
-"""The default choice of `sampling` in `expectation`."""
+"""What `expectation` chooses: the law of the increments, the sampling, and its plan."""
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import PRNGKeyArray
 
+from .._solver import Want
 from .array_rqmc import ArrayRQMC, step_words
 from .cost import NUMBERS_PER_SECOND, numbers_per_step
+from .estimate import Expectation
+from .fused_paths import fused_plan
 from .independent import IndependentPaths
 from .noise import num_outcomes
 from .problem import Problem
-from .sampling import AbstractSampling
+from .sampling import AbstractSampling, SamplingPlan
 from .value_functions import ValueFunctions
 
 
+# No sample's key is folded from this number.
+_NO_SAMPLE = 0xFFFFFFFF
 # Value functions are chosen up to this dimension, in which they are fitted on a grid, and
 # up to this many outcomes of one step and of all steps, which a fit visits at each point.
 _MOST_COMPONENTS_OF_FITS = 2
@@ -22,14 +32,14 @@ _MOST_COMPONENTS_SORTED = 4
 # Where a fit leaves more than this of the standard error, paths are sorted instead. For an
 # indicator and a call option on the pendulum fits left 26% and 1.3%, and sorted paths had
 # error bars that were 23 and 8 times less.
-MUCH_LEFT = 0.01
+_MUCH_LEFT = 0.01
 # The numbers of paths and replicates without a tolerance.
 _PATHS_OF_FITS = 2**12
 _PATHS = 2**17
 _PATHS_OF_REPLICATE = 2**14
 _REPLICATES = 16
 # With a tolerance, which ends the estimate, the number of samples is without limit.
-MOST_SAMPLES = 10**9
+_MOST_SAMPLES = 10**9
 # Without a tolerance, paths take no more than about this many seconds.
 _SECONDS = 10
 # Sorted paths are drawn and sorted before each step, which takes as long as computing this
@@ -45,8 +55,109 @@ _PATHS_OF_TRIAL = 2**14
 _MOST_WORDS = 2**8
 
 
-def choose(problem: Problem, tol: float | None) -> tuple[AbstractSampling, str]:
-    """The sampling, and the reason. The docstring of `expectation` documents the rule."""
+class Wanted(NamedTuple):
+    """How the user of `expectation` wants it to be computed.
+
+    - `has_path`: whether the `terms` hold paths, rather than their shapes.
+    - The others are the arguments of the same names.
+    """
+
+    has_path: bool
+    key: PRNGKeyArray
+    sampling: AbstractSampling | None
+    tol: float | None
+    start: Expectation | None
+    engine: str | None
+    devices: tuple
+
+
+class Chosen(NamedTuple):
+    """What is computed, and how. The plan holds the reason."""
+
+    problem: Problem
+    sampling: AbstractSampling
+    plan: SamplingPlan
+
+
+def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
+    """Chooses the law of the increments and the sampling, as far as the user did not. The
+    docstring of `expectation` documents the rules. `problem_for` maps the purpose of paths
+    that are not known yet to the problem."""
+    has_path, key, sampling, tol, start, engine, devices = wanted
+    if engine not in (None, "jax", "drjit"):
+        raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
+    if sampling is None and start is not None:
+        sampling = start.sampling
+
+    # Discrete increments, unless `phi` is not smooth.
+    problem = problem_for("weak")
+    why_law = ""
+    # Value functions need discrete increments.
+    may_choose_law = not has_path and not isinstance(sampling, ValueFunctions)
+    if problem.has_kinks and may_choose_law:
+        problem = problem_for("strong")
+        why_law = "Gaussian increments, since phi may not be smooth"
+
+    why_sampling = ""
+    is_chosen = sampling is None
+    if is_chosen:
+        sampling, why_sampling = _chosen_sampling(problem, tol, engine)
+    sampling = _checked_sampling(sampling, start)
+
+    if engine == "drjit":
+        plan = fused_plan(problem, key, sampling, devices)
+    else:
+        plan = sampling.prepare(problem, trial_key(key), devices)
+        # Only fits leave something.
+        instead = None
+        if is_chosen and plan.left > _MUCH_LEFT:
+            instead = sorted_paths(problem, tol)
+        if instead is not None:
+            why_sampling = (
+                "sorted paths, since fitted value functions leave "
+                f"{plan.left:.1%} of the standard error"
+            )
+            sampling = instead
+            plan = sampling.prepare(problem, trial_key(key), devices)
+
+    reason = "; ".join(filter(None, [why_sampling, why_law, plan.reason]))
+    if start is not None:
+        reason = start.reason
+    plan = plan._replace(reason=reason, roundings=problem.max_steps)
+    if start is not None and tol is None and plan.num_samples == _MOST_SAMPLES:
+        # Without `tol` the number of samples stays as it was.
+        used = start.moments[-1].end - start.moments[0].begin
+        plan = plan._replace(num_samples=used)
+    return Chosen(problem, sampling, plan)
+
+
+def trial_key(key: PRNGKeyArray) -> PRNGKeyArray:
+    """The key of trials, which are not part of the estimate."""
+    return jr.fold_in(key, _NO_SAMPLE)
+
+
+def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampling:
+    """Raises a `ValueError` for what is no sampling, or for another than in `start`."""
+    if not isinstance(sampling, AbstractSampling):
+        raise ValueError(
+            "`sampling` must be `IndependentPaths(num_paths)`, `ArrayRQMC()`, "
+            f"`ValueFunctions()` or `None`; got {sampling!r}."
+        )
+    if start is not None and type(start.sampling) is not type(sampling):
+        raise ValueError(
+            f"`start` was sampled by {start.sampling}; got sampling={sampling}. Pass the "
+            "same `sampling`."
+        )
+    return sampling
+
+
+def _chosen_sampling(
+    problem: Problem, tol: float | None, engine: str | None
+) -> tuple[AbstractSampling, str]:
+    """The sampling, and the reason."""
+    if engine == "drjit":
+        # The engine has no other.
+        return _independent_paths(problem, tol), ""
     components = _num_components(problem)
     steps = _num_steps(problem)
     outcomes = num_outcomes(problem)
@@ -54,17 +165,21 @@ def choose(problem: Problem, tol: float | None) -> tuple[AbstractSampling, str]:
     if outcomes:
         why += f" of {outcomes} outcomes each"
     if _can_be_fitted(problem, outcomes):
-        num_paths = MOST_SAMPLES if tol else _PATHS_OF_FITS
+        num_paths = _MOST_SAMPLES if tol else _PATHS_OF_FITS
         return ValueFunctions(None, num_paths), f"value functions for {why}"
     sampling = sorted_paths(problem, tol)
     if sampling is not None:
         return sampling, f"sorted paths for {why}"
+    return _independent_paths(problem, tol), f"independent paths for {why}"
+
+
+def _independent_paths(problem: Problem, tol: float | None) -> IndependentPaths:
+    """As many independent paths as are affordable."""
     if tol:
-        num_paths = MOST_SAMPLES
-    else:
-        affordable = _SECONDS * NUMBERS_PER_SECOND / (steps * numbers_per_step(problem))
-        num_paths = int(np.clip(affordable, _FEWEST_PATHS, _PATHS))
-    return IndependentPaths(num_paths), f"independent paths for {why}"
+        return IndependentPaths(_MOST_SAMPLES)
+    numbers = _num_steps(problem) * numbers_per_step(problem)
+    affordable = _SECONDS * NUMBERS_PER_SECOND / numbers
+    return IndependentPaths(int(np.clip(affordable, _FEWEST_PATHS, _PATHS)))
 
 
 def sorted_paths(problem: Problem, tol: float | None) -> ArrayRQMC | None:
@@ -76,7 +191,7 @@ def sorted_paths(problem: Problem, tol: float | None) -> ArrayRQMC | None:
     affordable = max(int(_SECONDS * NUMBERS_PER_SECOND / numbers_of_all), _FEWEST_PATHS)
     # Rounded down to a power of two, as Sobol' points need.
     size = min(2 ** (affordable.bit_length() - 1), _PATHS_OF_REPLICATE)
-    return ArrayRQMC(size, MOST_SAMPLES if tol else _REPLICATES)
+    return ArrayRQMC(size, _MOST_SAMPLES if tol else _REPLICATES)
 
 
 def few_paths(problem: Problem) -> AbstractSampling:

@@ -153,6 +153,5 @@ def controlled_paths(
     log_ratio = jnp.sum(done.control.log_ratio, axis=0)
     ratio = jnp.exp(-jnp.maximum(log_ratio, 0))[:, None]
     tails = jnp.where(off > beyond, ratio * off, 0)
-    # A path that fails on several levels counts once.
-    lost = jnp.any(done.failed, axis=0)
-    return Samples(p.averaged([left, plain, control, tails]), ~lost, lost)
+    good = ~jnp.any(done.failed, axis=0)
+    return Samples(p.averaged([left, plain, control, tails]), good, done.failed)

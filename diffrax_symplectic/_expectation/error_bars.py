@@ -52,12 +52,6 @@ class Results(NamedTuple):
     spread: PyTree[np.ndarray]
 
 
-def has_combination(moments: Moments, combination: Combination) -> bool:
-    """Whether there are enough levels for this combination."""
-    leaves = jtu.tree_leaves(moments.mean)
-    return all(leaf.shape[1] > combination for leaf in leaves)
-
-
 def results_of(
     moments: Moments,
     roundings: int,

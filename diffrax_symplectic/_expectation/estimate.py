@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .error_bars import (
-    has_combination,
     is_off_order,
     remaining_error,
     Results,
@@ -22,8 +21,6 @@ from .moments import Combination, joined, Moments, total
 from .saved import arrays_of, fields_from, header_of
 
 
-# The components that the printed estimate shows, and the samples of an array.
-_SHOWN = 6
 # NumPy operations on zero-dimensional arrays return scalars.
 _Host = PyTree[np.ndarray | np.floating]
 
@@ -33,15 +30,18 @@ class Expectation(eqx.Module):
     [`diffrax_symplectic.expectation`][] and [`diffrax_symplectic.monte_carlo`][]. Printed,
     it is a short summary.
 
+    - `levels`: the number of step sizes, each half the one before.
     - `num_paths`: the number of paths in the estimate, on each level.
-    - `num_failed`: the number of failed paths, which are excluded from the estimate.
+    - `num_failed`: the number of failed paths, which are excluded from the estimate. A path
+        that fails on several levels counts once.
     - `num_samples`: the number of independent samples: paths, or replicates of
         [`diffrax_symplectic.ArrayRQMC`][].
     - `samples`: the ranges of sample numbers, as pairs of the first number and one past the
         last: a single pair, unless merged parts leave gaps.
     - `sampling`: the sampling.
     - `reason`: why this sampling was chosen, or empty if there was no choice.
-    - `tol_reached`: whether all standard errors are at most `tol`; `None` without `tol`.
+    - `tol_reached`: whether the `error` of every mean is at most `tol` and the changes from
+        step to step fit the order; `None` without `tol`.
     - `key_data`: the data of the random key.
 
     The other fields are what `save` stores beside these, and may change: `moments`,
@@ -62,6 +62,10 @@ class Expectation(eqx.Module):
     far: PyTree[np.ndarray] | None = None
 
     @property
+    def levels(self) -> int:
+        return len(self.moments[0].failed_on)
+
+    @property
     def num_samples(self) -> int:
         return sum(x.good for x in self.moments)
 
@@ -72,6 +76,11 @@ class Expectation(eqx.Module):
     @property
     def num_failed(self) -> int:
         return sum(x.failed for x in self.moments)
+
+    @property
+    def failed_on(self) -> tuple[int, ...]:
+        """The number of paths that failed on each level."""
+        return total(self.moments).failed_on
 
     @property
     def samples(self) -> list[tuple[int, int]]:
@@ -117,44 +126,50 @@ class Expectation(eqx.Module):
         r"""The discretization error of the finest level, $\mathbb E[\phi_h] - \mathbb
         E[\phi]$, as estimated by extrapolation; `None` with a single level. It has already
         been removed from `mean`: `mean + bias` is the mean of the finest level."""
-        if not self._has(Combination.BIAS):
+        if self.levels == 1:
             return None
         return self._results(Combination.BIAS).mean
 
     @property
     def bias_std_error(self) -> _Host | None:
         """The standard error of `bias`."""
-        if not self._has(Combination.BIAS):
+        if self.levels == 1:
             return None
         return self._results(Combination.BIAS).std_error
 
     @property
     def error(self) -> _Host:
-        r"""The total error of `mean`: the root of the sum of squares of `std_error`,
-        `failed_error` and, with several levels, an estimate of the remaining discretization
-        error.
-
-        That is the change by the last extrapolation. With two levels it is unchecked, and
-        may be far too small where the steps are too long. With three levels, the changes of
-        the mean by the two halvings of the step are compared: for a method of order $p$ the
-        last one should be $2^{-p}$ of the one before. If it is less than a quarter of that,
-        or more than four thirds, by more than two standard errors, then the larger of these
-        changes is taken instead, and the printed estimate says so. With $L > 3$ levels the
-        same holds for the extrapolations from $L - 2$ neighbouring levels, of order
-        $p + L - 3$.
-
-        With one level the discretization error is unknown, and not included."""
+        """The error of `mean`, which is printed after it: the root of the sum of squares of
+        `std_error`, `failed_error` and `discretization_error`. (With one level this last
+        one is unknown, and not included.)"""
         error = jtu.tree_map(np.hypot, self.std_error, self.failed_error)
-        if not self._has(Combination.EXTRAPOLATION):
+        if self.levels == 1:
             return error
+        return jtu.tree_map(np.hypot, error, self.discretization_error)
+
+    @property
+    def discretization_error(self) -> _Host | None:
+        r"""What remains of the discretization error in `mean`: the change by the last
+        extrapolation; `None` with one level.
+
+        With two levels this is the bias that the extrapolation removed from the finer one,
+        which is more than what remains wherever the order of the solver shows. It does not
+        show where steps are too long, and two levels cannot tell. With three levels, the
+        changes of the mean by the two halvings of the step are compared: for a method of
+        order $p$ the last one should be $2^{-p}$ of the one before. If it is less than a
+        quarter of that, or more than four thirds, by more than two standard errors, then
+        the larger of these changes is taken instead, and the printed estimate says so. With
+        $L > 3$ levels the same holds for the extrapolations from $L - 2$ neighbouring
+        levels, of order $p + L - 3$."""
+        if self.levels == 1:
+            return None
         remaining = self._results(Combination.EXTRAPOLATION).mean
         off_order = self.off_order
-        if off_order is not None:
-            last = self._results(Combination.LAST).mean
-            before = self._results(Combination.BEFORE).mean
-            changes = remaining, last, before
-            remaining = jtu.tree_map(remaining_error, off_order, *changes)
-        return jtu.tree_map(np.hypot, error, remaining)
+        if off_order is None:
+            return jtu.tree_map(np.abs, remaining)
+        last = self._results(Combination.LAST).mean
+        before = self._results(Combination.BEFORE).mean
+        return jtu.tree_map(remaining_error, off_order, remaining, last, before)
 
     @property
     def failed_error(self) -> _Host:
@@ -176,25 +191,24 @@ class Expectation(eqx.Module):
     @property
     def off_order(self) -> PyTree[np.ndarray] | None:
         """Whether the changes of the mean from step to step do not fit the order, as in
-        `error`; `None` with fewer than three levels."""
-        if not self._has(Combination.LAST):
+        `discretization_error`; `None` with fewer than three levels."""
+        if self.levels < 3:
             return None
         last = self._results(Combination.LAST)
         miss = self._results(Combination.MISS)
         return jtu.tree_map(is_off_order, last.mean, miss.mean, miss.std_error)
 
     def interval(self, confidence: float = 0.95) -> tuple[_Host, _Host]:
-        r"""The ends of a confidence interval for the mean of infinitely many samples:
-        `mean` plus and minus `std_error` times the quantile of Student's $t$ with
-        `num_samples - 1` degrees of freedom. (For 95% this is 2.13 standard errors with 16
-        samples, and 1.96 with very many.) The remaining discretization error is not
-        included, nor are failed paths: see `error`."""
+        """The ends of a confidence interval: `mean` plus and minus `error` times the
+        quantile of Student's $t$ with `num_samples - 1` degrees of freedom. (For 95% this
+        is 2.13 with 16 samples, and 1.96 with very many.) Where sampling is a small part of
+        `error` the interval holds the mean more often than that."""
         # Imported here: it would double the time to import this package.
         from scipy.special import stdtrit
 
         factor = stdtrit(max(self.num_samples - 1, 1), (1 + confidence) / 2)
         mean = self.mean
-        reach = jtu.tree_map(lambda error: factor * error, self.std_error)
+        reach = jtu.tree_map(lambda error: factor * error, self.error)
         lower = jtu.tree_map(lambda center, side: center - side, mean, reach)
         upper = jtu.tree_map(lambda center, side: center + side, mean, reach)
         return lower, upper
@@ -258,15 +272,20 @@ class Expectation(eqx.Module):
 
     def __str__(self) -> str:
         lines = self._lines_of_means()
-        if self.bias is not None:
-            lines += self._lines_of_levels()
-        elif self.sampling is not None:
+        if self.levels == 1 and self.sampling is not None:
             lines.append("not included: the discretization error (see `levels`)")
+        if self.levels == 2:
+            lines.append("the order of the solver is unchecked (see `levels`)")
+        if any(np.any(leaf) for leaf in jtu.tree_leaves(self.off_order)):
+            lines.append(
+                "the changes from step to step do not fit the order: the largest of them "
+                "is taken for the error (take smaller steps)"
+            )
         how = "" if self.sampling is None else f", {self.sampling}"
-        lines.append(f"{self.num_paths:,} paths, {self.num_failed:,} failed{how}")
-        if self.num_failed > 0 and self.num_samples > 0:
-            changes = _listed(self.failed_error)
-            lines.append(f"failed paths could change the mean by {', '.join(changes)}")
+        levels = "1 level" if self.levels == 1 else f"{self.levels} levels"
+        lines.append(
+            f"{self.num_paths:,} paths on {levels}, {self.num_failed:,} failed{how}"
+        )
         if self.reason:
             lines.append(self.reason)
         if self.tol_reached is False:
@@ -276,48 +295,27 @@ class Expectation(eqx.Module):
     __repr__ = __str__
 
     def _lines_of_means(self) -> list[str]:
-        """What the printed estimate says of each component of the mean: a line for each
-        array of the PyTree, with its path in it if there are several, and at most the first
-        `_SHOWN`."""
-        leaves = jtu.tree_leaves_with_path(self.mean)
-        sampling_errors = _listed(self.std_error)
-        total_errors = _listed(self.error)
-        # The total error adds to that of sampling the discretization error, known from
-        # several levels, and what failed paths could change. Without either they are equal.
-        has_total = self.bias is not None or self.num_failed > 0
+        """A line for each number of the mean: the number, its error, and the parts of it
+        that are not zero. Where there are several numbers, the line begins with the place
+        of the number in the PyTree."""
+        parts = {
+            "sampling": self.std_error,
+            "discretization": self.discretization_error,
+            "failed paths": self.failed_error,
+        }
+        parts = {name: _flat(part) for name, part in parts.items() if part is not None}
+        if self.num_failed == 0:
+            del parts["failed paths"]
+        means = _flat(self.mean)
+        errors = _flat(self.error)
         lines = []
-        for k, (path, mean) in enumerate(leaves[:_SHOWN]):
-            # The sampling error decides how many digits of the mean are shown.
-            std_error = jtu.tree_leaves(self.std_error)[k]
-            line = f"{_with_digits(mean, std_error)} ± {sampling_errors[k]}"
-            if has_total:
-                line += f" (sampling), {total_errors[k]} (total)"
-            if len(leaves) > 1:
-                line = f"{jtu.keystr(path)}: {line}"
-            lines.append(line)
-        if len(leaves) > _SHOWN:
-            lines.append("...")
+        for k, place in enumerate(_places(self.mean)):
+            line = f"{_with_digits(means[k], errors[k])} ± {errors[k]:.1e}"
+            if len(parts) > 1:
+                each = [f"{name} {part[k]:.1e}" for name, part in parts.items()]
+                line += f" ({', '.join(each)})"
+            lines.append(f"{place}: {line}" if place else line)
         return lines
-
-    def _lines_of_levels(self) -> list[str]:
-        """What the printed estimate says of the discretization error."""
-        pairs = zip(_listed(self.bias), _listed(self.bias_std_error))
-        biases = [f"{bias} ± {error}" for bias, error in pairs]
-        lines = [f"bias of the finest step (removed): {', '.join(biases)}"]
-        if self.off_order is None:
-            lines.append(
-                "unchecked: what remains of the discretization error (pass `levels=3`)"
-            )
-        elif any(np.any(leaf) for leaf in jtu.tree_leaves(self.off_order)):
-            lines.append(
-                "the changes from step to step do not fit the order: the total error is "
-                "the larger one (take smaller steps)"
-            )
-        return lines
-
-    def _has(self, combination: Combination) -> bool:
-        """Whether there are enough levels for this combination."""
-        return has_combination(self.moments[0], combination)
 
     def _results(self, combination: Combination) -> Results:
         """What follows from the moments for one combination of levels."""
@@ -325,9 +323,9 @@ class Expectation(eqx.Module):
         return results_of(whole, self.roundings, self.far, combination)
 
 
-def best_results(estimate: Expectation) -> Results:
-    """All results of the extrapolation to step size zero. Users see some of them."""
-    return estimate._results(Combination.BEST)
+def combined_results(estimate: Expectation, combination: Combination) -> Results:
+    """All results for a combination of levels. Users see some of them."""
+    return estimate._results(combination)
 
 
 def check_same(one: Expectation, other: Expectation, name: str) -> None:
@@ -354,23 +352,29 @@ def check_same(one: Expectation, other: Expectation, name: str) -> None:
         )
 
 
-def _with_digits(mean: Any, error: Any) -> str:
-    """The mean, with two digits beyond the smallest error."""
-    least = np.clip(np.min(np.nan_to_num(error), initial=1), 1e-10, 1)
-    digits = 2 - math.floor(math.log10(least))
+def _flat(tree: PyTree[np.ndarray | np.floating]) -> list[float]:
+    """All numbers."""
+    return [float(x) for leaf in jtu.tree_leaves(tree) for x in np.ravel(leaf)]
+
+
+def _places(tree: PyTree[np.ndarray | np.floating]) -> list[str]:
+    """For each number its place, such as `['energy'][0, 2]`; nothing for a single array
+    without axes."""
+    places = []
+    for path, leaf in jtu.tree_leaves_with_path(tree):
+        for index in np.ndindex(np.shape(leaf)):
+            axes = f"[{', '.join(map(str, index))}]" if index else ""
+            places.append(jtu.keystr(path) + axes)
+    return places
+
+
+def _with_digits(mean: float, error: float) -> str:
+    """The mean, with two digits of its error."""
+    least = np.clip(np.nan_to_num(error), 1e-15, 1)
+    digits = 1 - math.floor(math.log10(least))
     # With more, the mean's own digits end first.
-    mode = "fixed" if digits < 12 else "maxprec"
-    mean = np.asarray(mean)
-    return np.array2string(mean, precision=digits, threshold=_SHOWN, floatmode=mode)
-
-
-def _listed(tree: PyTree) -> list[str]:
-    """The first arrays of a PyTree, with two digits."""
-    formats: Any = {"float_kind": "{:.1e}".format}
-    return [
-        np.array2string(np.asarray(leaf), formatter=formats, threshold=_SHOWN)
-        for leaf in jtu.tree_leaves(tree)[:_SHOWN]
-    ]
+    mode = "fixed" if digits < 14 else "maxprec"
+    return np.array2string(np.asarray(mean), precision=digits, floatmode=mode)
 
 
 class ExpectationInterrupted(KeyboardInterrupt):

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import diffrax
-import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
@@ -17,24 +16,21 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._solver import own_path
 from .._terms import brownian_paths, path_numbers, random_paths, with_paths
 from .call import checked_call, Meter, NO_METER
-from .choose import (
-    choose,
-    few_paths,
-    MOST_SAMPLES,
-    MUCH_LEFT,
-    sorted_paths,
-)
+from .cautions import cautions
+from .choose import choose, few_paths, trial_key, Wanted
 from .engines import warn_of_stragglers
 from .estimate import Expectation, ExpectationInterrupted
-from .fused_paths import fused_plan, FusedPaths
+from .fused_paths import FusedPaths
 from .problem import Problem
 from .run import run
 from .sampling import AbstractSampling
-from .value_functions import ValueFunctions
+from .tolerance import needs_level
 
 
-# No sample's key is folded from this number.
-_NO_SAMPLE = 0xFFFFFFFF
+# The levels, unless the user chooses them: the fewest that tell the discretization error,
+# and with `tol` at most so many.
+_FEWEST_LEVELS = 2
+_MOST_LEVELS = 6
 # Means differ if their difference is this many standard errors.
 _SURE = 4
 
@@ -52,7 +48,7 @@ def expectation(
     key: PRNGKeyArray,
     sampling: AbstractSampling | None = None,
     ts: Sequence[RealScalarLike] | np.ndarray | None = None,
-    levels: int = 1,
+    levels: int | None = None,
     tol: float | None = None,
     start: Expectation | None = None,
     first: int = 0,
@@ -183,88 +179,39 @@ def expectation(
     key, first, devices = checked_call(
         "expectation", key, tol, start, first, devices, arguments
     )
-    if engine not in (None, "jax", "drjit"):
-        raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
-    if sampling is None and start is not None:
-        sampling = start.sampling
+    may_add_levels = False
+    if levels is None:
+        levels = _FEWEST_LEVELS if start is None else start.levels
+        # Other levels are another estimate.
+        may_add_levels = start is None
 
-    # Discrete increments, unless `phi` is not smooth.
-    arguments = phi, terms, solver, t0, t1, dt0, y0, args, ts, levels
-    problem = Problem.of(*arguments, want="weak")
-    has_kinks = problem.has_kinks
-    why_law = ""
-    if has_kinks and _may_choose_law(terms, sampling):
-        problem = Problem.of(*arguments, want="strong")
-        why_law = "Gaussian increments, since phi may not be smooth"
-
-    why_sampling = ""
-    is_chosen = sampling is None
-    if is_chosen:
-        sampling, why_sampling = choose(problem, tol)
-    sampling = _checked_sampling(sampling, start)
-
-    trial_key = jr.fold_in(key, _NO_SAMPLE)
+    is_open = any(isinstance(path, UnspecifiedPath) for path in brownian_paths(terms))
+    wanted = Wanted(not is_open, key, sampling, tol, start, engine, devices)
+    problem_of = ft.partial(Problem.of, phi, terms, solver, t0, t1, dt0, y0, args, ts)
     with Meter(progress_meter) as meter:
-        try:
-            if engine == "drjit":
-                plan = fused_plan(problem, key, sampling, devices)
-            else:
-                plan = sampling.prepare(problem, trial_key, devices)
-                # Only fits leave something.
-                instead = None
-                if is_chosen and plan.left > MUCH_LEFT:
-                    instead = sorted_paths(problem, tol)
-                if instead is not None:
-                    why_sampling = (
-                        "sorted paths, since fitted value functions leave "
-                        f"{plan.left:.1%} of the standard error"
-                    )
-                    sampling = instead
-                    plan = sampling.prepare(problem, trial_key, devices)
-        except ExpectationInterrupted:
-            # Trial samples are not part of the estimate, and cannot be continued.
-            raise KeyboardInterrupt from None
-        why = [why_sampling, why_law, plan.reason]
-        plan = plan._replace(
-            reason="; ".join(filter(None, why)) if start is None else start.reason,
-            roundings=problem.max_steps,
-            bounded=problem.bounded,
-        )
-        if start is not None and tol is None and plan.num_samples == MOST_SAMPLES:
-            # Without `tol` the number of samples stays as it was.
-            used = start.moments[-1].end - start.moments[0].begin
-            plan = plan._replace(num_samples=used)
-        estimate = run(plan, key, devices, sampling, start, first, tol, meter)
+        while True:
+            try:
+                chosen = choose(ft.partial(problem_of, levels), wanted)
+            except ExpectationInterrupted:
+                # Trial samples are not part of the estimate, and cannot be continued.
+                raise KeyboardInterrupt from None
+            problem, sampling, plan = chosen
+            estimate = run(plan, key, devices, sampling, start, first, tol, meter)
+            if tol is None or not may_add_levels or levels == _MOST_LEVELS:
+                break
+            if not needs_level(estimate, tol):
+                break
+            levels += 1
+
+    for message in cautions(estimate, tol, problem.bounded):
+        warnings.warn(message, stacklevel=2)
     if isinstance(paths := plan.paths_of, FusedPaths):
         warn_of_stragglers(paths.stragglers, paths.lost, paths.count, stacklevel=2)
     _warn_of_rounding(estimate, problem)
     # A part of an estimate is not warned of again.
-    if start is None and first == 0 and has_kinks:
-        _warn_of_law(estimate, problem, trial_key, devices)
+    if start is None and first == 0 and problem.has_kinks:
+        _warn_of_law(estimate, problem, key, devices)
     return estimate
-
-
-def _may_choose_law(terms: PyTree, sampling: AbstractSampling | None) -> bool:
-    """Whether the user left the law of the increments open."""
-    # Value functions need discrete increments.
-    if isinstance(sampling, ValueFunctions):
-        return False
-    return any(isinstance(path, UnspecifiedPath) for path in brownian_paths(terms))
-
-
-def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampling:
-    """Raises a `ValueError` for what is no sampling, or for another than in `start`."""
-    if not isinstance(sampling, AbstractSampling):
-        raise ValueError(
-            "`sampling` must be `IndependentPaths(num_paths)`, `ArrayRQMC()`, "
-            f"`ValueFunctions()` or `None`; got {sampling!r}."
-        )
-    if start is not None and type(start.sampling) is not type(sampling):
-        raise ValueError(
-            f"`start` was sampled by {start.sampling}; got sampling={sampling}. Pass the "
-            "same `sampling`."
-        )
-    return sampling
 
 
 def _warn_of_law(
@@ -278,6 +225,7 @@ def _warn_of_law(
     gaussian_path = ft.partial(own_path, problem.solver, "strong")
     terms = with_paths(gaussian_path, path_numbers(paths), problem.terms, key)
     gaussian = dataclasses.replace(problem, terms=terms)
+    key = trial_key(key)
     plan = few_paths(gaussian).prepare(gaussian, key, devices)
     trial = run(plan, key, devices)
     change = jtu.tree_map(lambda x, y: np.abs(x - y), estimate.mean, trial.mean)

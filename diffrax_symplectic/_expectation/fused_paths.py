@@ -35,7 +35,8 @@ def fused_plan(
             f'`engine="drjit"` uses all cores, or one GPU; got {len(devices)} devices. '
             "Pass `devices=jax.devices()[:1]`."
         )
-    plan = sampling.plan(jtu.Partial(_samples, problem), devices)
+    levels = len(problem.levels.h)
+    plan = sampling.plan(jtu.Partial(_samples, problem), levels, devices)
     if sampling.batch_size is None:
         plan = plan._replace(batch_size=_BATCH)
     return plan._replace(paths_of=FusedPaths(problem, key))
@@ -116,7 +117,6 @@ def _samples(p: Problem, paths: _Paths, keys: Key[Array, " n"]) -> Samples:
 
     phi = jax.vmap(values_on_level)(p.levels, paths.y)
     finite = jax.vmap(jax.vmap(all_finite))(phi)
-    # A path that fails on several levels counts once.
-    lost = jnp.any(paths.failed | ~finite, axis=0)
+    lost = jnp.asarray(paths.failed) | ~finite
     combined = p.combined(jnp.swapaxes(phi, 1, 2))
-    return Samples(p.averaged([combined]), ~lost, lost)
+    return Samples(p.averaged([combined]), ~jnp.any(lost, axis=0), lost)

@@ -43,23 +43,25 @@ class IndependentPaths(AbstractSampling):
     batch_size: int | np.integer | None = None
 
     def prepare(self, problem, key, devices):
-        return self.plan(jtu.Partial(_paths, problem), devices)
+        levels = len(problem.levels.h)
+        return self.plan(jtu.Partial(_paths, problem), levels, devices)
 
-    def plan(self, sampler: Callable[..., Samples], devices: tuple) -> SamplingPlan:
+    def plan(
+        self, sampler: Callable[..., Samples], levels: int, devices: tuple
+    ) -> SamplingPlan:
         """The plan for samples that are made one for each key, by any function."""
         if self.batch_size is None:
             size = _BATCH_ON_CPU if devices[0].platform == "cpu" else _BATCH
         else:
             size = whole_number("batch_size", self.batch_size)
-        return SamplingPlan(sampler, self.num_paths, size)
+        return SamplingPlan(sampler, self.num_paths, size, levels=levels)
 
 
 def _paths(p: Problem, keys: Key[Array, " n"]) -> Samples:
     """A sample is a path, with the same random key on all levels."""
     saved, failed = solved(p, keys)
-    # A path that fails on several levels counts once.
-    lost = jnp.any(failed, axis=0)
-    return Samples(p.averaged([p.combined(saved)]), ~lost, lost)
+    good = ~jnp.any(failed, axis=0)
+    return Samples(p.averaged([p.combined(saved)]), good, failed)
 
 
 def solved(

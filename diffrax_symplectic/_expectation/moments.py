@@ -14,7 +14,8 @@ class Moments(NamedTuple):
     """Statistics of samples `begin` to `end - 1`, on the host and in float64.
 
     - `good`: the number of good samples.
-    - `failed`: the number of failed paths.
+    - `failed`: the number of failed paths, each counted once.
+    - `failed_on`: the number of paths that failed on each level.
     - `mean`: the mean of the good samples, with two leading axes for kinds and for
         combinations of levels.
     - `norm`: the root of the sum of squared deviations from the mean. (The sum itself would
@@ -28,6 +29,7 @@ class Moments(NamedTuple):
     end: int
     good: int
     failed: int
+    failed_on: tuple[int, ...]
     mean: PyTree[np.ndarray]
     norm: PyTree[np.ndarray]
     largest: PyTree[np.ndarray]
@@ -88,6 +90,7 @@ def _both(a: Moments, b: Moments) -> Moments:
         end=b.end,
         good=a.good + b.good,
         failed=a.failed + b.failed,
+        failed_on=tuple(map(sum, zip(a.failed_on, b.failed_on))),
         mean=jtu.tree_map(mean, a.mean, b.mean, change),
         norm=jtu.tree_map(norm, a.norm, b.norm, change),
         largest=jtu.tree_map(np.maximum, a.largest, b.largest),

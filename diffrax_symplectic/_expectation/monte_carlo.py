@@ -1,5 +1,6 @@
 """Averages of any function of a random key."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ from .._arguments import check_real, check_takes, whole_number
 from .._compat import is_result
 from .._root_finder import all_finite
 from .call import checked_call, Meter, NO_METER
+from .cautions import cautions
 from .estimate import Expectation
 from .independent import IndependentPaths
 from .moments import level_weights
@@ -115,9 +117,12 @@ def monte_carlo(
         raise ValueError(f"`order` must be a positive integer, or 1/2; got {order!r}.")
     sampling = IndependentPaths(num_paths, batch_size)
     weights = level_weights(float(order or 1), levels)
-    plan = sampling.plan(jtu.Partial(_of_function, fn, weights), devices)
+    plan = sampling.plan(jtu.Partial(_of_function, fn, weights), levels, devices)
     with Meter(progress_meter) as meter:
-        return run(plan, key, devices, sampling, start, first, tol, meter)
+        estimate = run(plan, key, devices, sampling, start, first, tol, meter)
+    for message in cautions(estimate, tol, bounded=False):
+        warnings.warn(message, stacklevel=2)
+    return estimate
 
 
 def _of_function(
@@ -143,9 +148,7 @@ def _of_function(
         # With the first axis of `Samples.values`, for the one kind.
         return tensordot(weights.astype(x.dtype), x, 1)[None]
 
-    # A path that fails on several levels counts once.
-    lost = ~jnp.all(good, axis=0)
-    return Samples(jtu.tree_map(combined, values), ~lost, lost)
+    return Samples(jtu.tree_map(combined, values), jnp.all(good, axis=0), ~good)
 
 
 def _evaluate(fn: Callable, key: PRNGKeyArray) -> tuple[PyTree[Array], Bool[Array, ""]]:

@@ -2,7 +2,6 @@
 
 import collections
 import dataclasses
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -17,10 +16,10 @@ from jaxtyping import Array, Key, PRNGKeyArray, PyTree
 from .._arguments import check_untraced
 from .batch import batch_sums, BatchSums, quick_batch_sums
 from .call import Meter
-from .cautions import cautions
 from .estimate import check_same, Expectation, ExpectationInterrupted
 from .moments import joined, Moments
 from .sampling import Samples, SamplingPlan
+from .tolerance import is_reached, is_stuck, share_of
 
 
 def run(
@@ -34,8 +33,7 @@ def run(
     meter: Meter | None = None,
 ) -> Expectation:
     """The estimate from the samples of a plan, which continues `start`, or begins with
-    sample number `first`. Without a meter it is a trial, without warnings. The result does
-    not depend on the number of devices."""
+    sample number `first`. The result does not depend on the number of devices."""
     # One past the last sample that is part of the estimate.
     done = first
     if start is not None:
@@ -67,7 +65,7 @@ def run(
     begun = done
     try:
         while True:
-            is_more = begun < end and not _reached(estimate, plan.least, tol)
+            is_more = begun < end and not _stops(estimate, plan.least, tol)
             if is_more:
                 running.append(batches.started(begun, end, batches.sampler_at(begun)))
                 begun += batches.size * len(devices)
@@ -76,7 +74,7 @@ def run(
             if has_previous:
                 for sums in batches.of_devices(running.popleft()):
                     # Where to stop does not depend on how many devices there are.
-                    if done < end and not _reached(estimate, plan.least, tol):
+                    if done < end and not _stops(estimate, plan.least, tol):
                         after = min(done + batches.size, end)
                         new = _moments(sums, done, after, none.dtypes)
                         moments = joined((*estimate.moments, new))
@@ -84,16 +82,12 @@ def run(
                         done = after
                 if meter is not None:
                     share = (done - first) / plan.num_samples
-                    meter.step(max(share, _share_of_tolerance(estimate, tol)))
+                    meter.step(max(share, share_of(estimate, tol)))
             elif not is_more:
                 break
     except KeyboardInterrupt:
         raise ExpectationInterrupted(_finished(estimate, plan.least, tol)) from None
-    estimate = _finished(estimate, plan.least, tol)
-    if meter is not None:
-        for message in cautions(estimate, tol, plan.bounded):
-            warnings.warn(message, stacklevel=3)
-    return estimate
+    return _finished(estimate, plan.least, tol)
 
 
 class _Batches:
@@ -107,6 +101,7 @@ class _Batches:
         self._paths_of = plan.paths_of
         self._devices = devices
         self._shapes = plan.shapes
+        self._levels = plan.levels
         self._sums: Any = quick_batch_sums if plan.quick else batch_sums
         if jax.process_count() > 1:
             # All processes hold the same arrays. Captured by a function they become
@@ -158,6 +153,7 @@ class _Batches:
             end=at,
             good=0,
             failed=0,
+            failed_on=(0,) * self._levels,
             mean=zeros,
             norm=zeros,
             largest=zeros,
@@ -180,6 +176,7 @@ def _moments(sums: BatchSums, begin: int, end: int, dtypes: PyTree[str]) -> Mome
         end=end,
         good=int(sums.good),
         failed=int(sums.failed),
+        failed_on=tuple(map(int, sums.failed_on)),
         mean=jtu.tree_map(np.add, wide.mean, wide.rest),
         norm=wide.norm,
         largest=wide.largest,
@@ -188,24 +185,16 @@ def _moments(sums: BatchSums, begin: int, end: int, dtypes: PyTree[str]) -> Mome
     )
 
 
-def _reached(estimate: Expectation, least: int, tol: float | None) -> bool:
-    """Whether there are enough samples, and all standard errors are small enough."""
+def _stops(estimate: Expectation, least: int, tol: float | None) -> bool:
+    """Whether there are enough samples for the tolerance, or more would not help."""
     if tol is None or estimate.num_samples < least:
         return False
-    errors = jtu.tree_leaves(estimate.std_error)
-    return all(bool(np.all(error <= tol)) for error in errors)
+    return is_reached(estimate, tol) or is_stuck(estimate, tol)
 
 
 def _finished(estimate: Expectation, least: int, tol: float | None) -> Expectation:
     """The estimate, which now says whether it reached the tolerance."""
-    reached = None if tol is None else _reached(estimate, least, tol)
+    reached = None
+    if tol is not None:
+        reached = estimate.num_samples >= least and is_reached(estimate, tol)
     return dataclasses.replace(estimate, tol_reached=reached)
-
-
-def _share_of_tolerance(estimate: Expectation, tol: float | None) -> float:
-    """The estimated share of the samples needed that has been taken."""
-    if tol is None or estimate.num_samples < 2:
-        return 0.0
-    errors = jtu.tree_leaves(estimate.std_error)
-    largest = max(float(np.max(error, initial=tol)) for error in errors)
-    return (tol / largest) ** 2 if np.isfinite(largest) else 0.0

@@ -45,12 +45,12 @@ class Samples(eqx.Module):
         of `KindsOfReplicates` or `KindsWithControl`. Where a sample is a mean of paths, the
         spread of single ones, on which `failed_error` and warnings rest, comes from these.
     - `good`: which samples are good.
-    - `lost`: how many paths failed in each.
+    - `lost`: how many paths failed in each, on each level.
     """
 
     values: PyTree[Array]
     good: Bool[Array, " n"]
-    lost: Int[Array, " n"] | Bool[Array, " n"]
+    lost: Int[Array, "levels n"] | Bool[Array, "levels n"]
 
 
 class SamplingPlan(NamedTuple):
@@ -60,6 +60,7 @@ class SamplingPlan(NamedTuple):
     - `num_samples`: the most samples, including the samples of an estimate to continue.
     - `batch_size`: the number of samples that each device takes at once.
     - `paths`: the number of paths in a sample, on each level.
+    - `levels`: the number of levels.
     - `least`: the fewest samples whose variance is estimated well enough to stop.
     - `reason`: why this sampling was chosen, for the result.
     - `left`: the largest fraction of a standard error that a control variate leaves of it,
@@ -67,7 +68,6 @@ class SamplingPlan(NamedTuple):
     - `shapes`: the shapes of the values of one sample, if they are known without a trace.
     - `quick`: whether the samples take less time than compiling their program, so that it
         is compiled for speed of compilation.
-    - `bounded`: whether the increments of all paths are known to be bounded.
     - `far`, `roundings`: as in `Expectation`.
     - `paths_of`: for paths computed outside JAX, maps the number of the first sample and
         the number of samples to an argument that the sampler takes before the keys.
@@ -77,12 +77,12 @@ class SamplingPlan(NamedTuple):
     num_samples: int
     batch_size: int
     paths: int = 1
+    levels: int = 1
     least: int = 2
     reason: str = ""
     left: float = 0.0
     shapes: PyTree | None = None
     quick: bool = False
-    bounded: bool = False
     far: PyTree[np.ndarray] | None = None
     roundings: int = 1
     paths_of: Callable[[int, int], Any] | None = None

@@ -13,7 +13,7 @@ from .sampling import SAVED_SAMPLINGS
 
 # The fields of `Moments` that have the structure of `phi`, and those that are numbers.
 _TREES = ("mean", "norm", "largest", "size")
-_NUMBERS = ("begin", "end", "good", "failed")
+_NUMBERS = ("begin", "end", "good", "failed", "failed_on")
 # The fields of an estimate that JSON takes as they are.
 _PLAIN_FIELDS = ("paths_per_sample", "roundings", "reason", "tol_reached")
 
@@ -61,10 +61,13 @@ def fields_from(
         leaves = [arrays[f"{name}_{k}"] for k in range(count)]
         return _filled(structure, iter(leaves))
 
-    def moments(i: int, numbers: list[int]) -> Moments:
+    def moments(i: int, numbers: list[Any]) -> Moments:
         trees = {name: tree(f"{name}_{i}") for name in _TREES}
         dtypes = _filled(structure, iter(header["dtypes"]))
-        return Moments(**dict(zip(_NUMBERS, numbers)), **trees, dtypes=dtypes)
+        begin, end, good, failed, failed_on = numbers
+        return Moments(
+            begin, end, good, failed, tuple(failed_on), **trees, dtypes=dtypes
+        )
 
     fields = {name: header[name] for name in _PLAIN_FIELDS}
     return fields | {

@@ -30,9 +30,9 @@ from .controlled_paths import (
     TrialLaw,
     Usual,
 )
-from .estimate import best_results, Expectation
+from .estimate import combined_results, Expectation
 from .fits import fit, FittedFunctions, without_newton
-from .moments import total
+from .moments import Combination, total
 from .noise import Noise
 from .problem import Problem
 from .run import run
@@ -98,7 +98,7 @@ class ValueFunctions(AbstractSampling):
 
     def prepare(self, problem, key, devices):
         chosen = chosen_basis(problem, self.degree)
-        warn_of_long_fit(chosen, stacklevel=4)
+        warn_of_long_fit(chosen, stacklevel=6)
         basis = chosen.basis
         trials = _Trials(
             problem,
@@ -119,7 +119,7 @@ class ValueFunctions(AbstractSampling):
             warnings.warn(
                 f"`degree={self.degree}` is no better than no control variate, so none is "
                 "used. Pass another `degree`, or another `sampling`.",
-                stacklevel=4,
+                stacklevel=5,
             )
         # Paths with wider noise estimate the deviations beyond the largest in the trial.
         usual = _usual(tried, choice, trials.outputs, problem.dtype)
@@ -157,6 +157,7 @@ class _Trials(NamedTuple):
             jtu.Partial(controlled_paths, *fixed),
             num_samples,
             self.batch_size,
+            levels=len(self.problem.levels.h),
             shapes=self.shapes,
             quick=True,
         )
@@ -218,7 +219,8 @@ def _compared(tried: list[Expectation], outputs: tuple[int, int]) -> _Compared:
     each = np.nan_to_num(each, nan=np.inf)
     errors = np.min(each, axis=0)
     # Without control all trials are the same.
-    plain = _flat(best_results(tried[0]).plain_std_error, outputs)
+    best = combined_results(tried[0], Combination.BEST)
+    plain = _flat(best.plain_std_error, outputs)
     # A fit is used where the error without it is NaN, too.
     is_worse = errors >= plain
     choice = Choice(np.argmin(each, axis=0), ~is_worse)
@@ -273,7 +275,7 @@ def value_function(problem: Problem, key: PRNGKeyArray) -> FittedFunctions | Non
         chosen = chosen_basis(problem, 2)
     except ValueError:
         return None
-    warn_of_long_fit(chosen, stacklevel=5)
+    warn_of_long_fit(chosen, stacklevel=6)
     functions = _fits(problem, key, chosen.basis)
     return functions.chosen(np.zeros(problem.num_outputs, int))
 

@@ -1,0 +1,99 @@
+"""When an estimate is as accurate as asked, and what it would take where it is not."""
+
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import PyTree
+
+from .estimate import combined_results, Expectation
+from .moments import Combination
+
+
+# More samples are of no use once their own part of the error is this share of the
+# tolerance: without it the error would be less by an eighth at most.
+_SHARE = 0.5
+# What remains of the discretization error is noisy. By chance it exceeds the tolerance by
+# this many of its standard errors once in fifty times.
+_BY_CHANCE = 2
+
+
+def is_reached(estimate: Expectation, tol: float) -> bool:
+    """Whether the whole error of each mean is small enough, and can be trusted."""
+    return _all_within(estimate.error, tol) and not is_any(estimate.off_order)
+
+
+def is_stuck(estimate: Expectation, tol: float) -> bool:
+    """Whether more samples would not reach the tolerance."""
+    if is_any(estimate.off_order) or _is_step_beyond(estimate, tol):
+        return True
+    # What is left comes from the step, or from failed paths.
+    is_sampled = _all_within(estimate.std_error, _SHARE * tol)
+    return is_sampled and not _all_within(estimate.error, tol)
+
+
+def needs_level(estimate: Expectation, tol: float) -> bool:
+    """Whether another level, of half the step, may reach the tolerance."""
+    if is_reached(estimate, tol) or not is_stuck(estimate, tol):
+        return False
+    return _all_within(estimate.failed_error, tol)
+
+
+def share_of(estimate: Expectation, tol: float | None) -> float:
+    """The estimated share of the samples needed that has been taken."""
+    if tol is None or estimate.num_samples < 2:
+        return 0.0
+    largest = max(largest_of(estimate.std_error), tol)
+    return (tol / largest) ** 2 if np.isfinite(largest) else 0.0
+
+
+def shortfall(estimate: Expectation, tol: float) -> str:
+    """Which part of the error exceeds the tolerance, and what it would take."""
+    if is_any(estimate.off_order):
+        return (
+            "the changes from step to step do not fit the order of the solver, so the "
+            "error is not known. Pass a smaller `dt0`"
+        )
+    step = largest_of(estimate.discretization_error)
+    sampling = largest_of(estimate.std_error)
+    failed = largest_of(estimate.failed_error)
+    if failed > max(step, sampling):
+        return (
+            f"failed paths could change the mean by {failed:.1e}. Take smaller steps, or a "
+            "more stable solver"
+        )
+    if step > sampling:
+        return (
+            f"{step:.1e} remains of the discretization error with {estimate.levels} "
+            f"levels. Pass a smaller `dt0`, or more `levels`"
+        )
+    needed = estimate.num_paths * (sampling / tol) ** 2
+    return (
+        f"the sampling error is {sampling:.1e} after {estimate.num_paths:,} paths. It "
+        f"takes about {needed:.1e}: continue with `start=`, or pass another `sampling`"
+    )
+
+
+def is_any(tree: PyTree[np.ndarray] | None) -> bool:
+    return any(bool(np.any(leaf)) for leaf in jtu.tree_leaves(tree))
+
+
+def largest_of(errors: PyTree[np.ndarray | np.floating] | None) -> float:
+    """The largest of all numbers, and zero without any."""
+    leaves = jtu.tree_leaves(errors)
+    return max((float(np.max(leaf, initial=0.0)) for leaf in leaves), default=0.0)
+
+
+def _all_within(errors: PyTree[np.ndarray | np.floating], tol: float) -> bool:
+    return all(bool(np.all(error <= tol)) for error in jtu.tree_leaves(errors))
+
+
+def _is_step_beyond(estimate: Expectation, tol: float) -> bool:
+    """Whether the discretization error alone exceeds the tolerance, beyond its noise."""
+    if estimate.levels == 1:
+        return False
+
+    def is_beyond(error: np.ndarray, noise: np.ndarray) -> np.bool_:
+        return np.any(error - _BY_CHANCE * noise > tol)
+
+    noise = combined_results(estimate, Combination.EXTRAPOLATION).std_error
+    beyond = jtu.tree_map(is_beyond, estimate.discretization_error, noise)
+    return any(jtu.tree_leaves(beyond))
