@@ -101,7 +101,7 @@ def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
     why_sampling = ""
     is_chosen = sampling is None
     if is_chosen:
-        sampling, why_sampling = _chosen_sampling(problem, tol, engine)
+        sampling, why_sampling = sampling_for(problem, tol, engine)
     sampling = _checked_sampling(sampling, start)
 
     if engine == "drjit":
@@ -151,8 +151,8 @@ def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampl
     return sampling
 
 
-def _chosen_sampling(
-    problem: Problem, tol: float | None, engine: str | None
+def sampling_for(
+    problem: Problem, tol: float | None, engine: str | None = None
 ) -> tuple[AbstractSampling, str]:
     """The sampling, and the reason."""
     if engine == "drjit":

@@ -42,7 +42,7 @@ KUBO = kubo_terms(ds.WeakBrownianPath((), jr.key(0)))
 def _estimate(solver=MIDPOINT, terms=None, phi=SQUARE, **kwargs):
     terms = KUBO if terms is None else terms
     kwargs = dict(t1=1.0, dt0=0.1, y0=Y0, key=jr.key(7)) | kwargs
-    kwargs = dict(num_paths=256, replicates=4, sort_by=None) | kwargs
+    kwargs = dict(num_paths=256, replicates=4, sort_by=None, levels=1) | kwargs
     t1, dt0, y0 = (kwargs.pop(name) for name in ("t1", "dt0", "y0"))
     own = [kwargs.pop(name) for name in ("num_paths", "replicates", "sort_by")]
     sampling = kwargs.pop("sampling", None) or ds.ArrayRQMC(*own)

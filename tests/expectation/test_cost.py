@@ -8,7 +8,7 @@ import pytest
 from jax import lax
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.choose import choose
+from diffrax_symplectic._expectation.choose import sampling_for
 from diffrax_symplectic._expectation.cost import (
     _numbers,
     NUMBERS_PER_SECOND,
@@ -94,7 +94,7 @@ def test_implicit_steps_large_systems_and_more_stages_cost_more():
 @pytest.mark.parametrize("steps, levels", [(20_000, 1), (5_000, 3)])
 def test_the_default_takes_as_many_paths_as_ten_seconds_allow(solver, steps, levels):
     problem = problem_of(solver, steps=steps, levels=levels)
-    sampling, _ = choose(problem, None)
+    sampling, _ = sampling_for(problem, None)
     assert isinstance(sampling, ds.IndependentPaths)
     of_levels = steps * (2**levels - 1)
     numbers = sampling.num_paths * of_levels * numbers_per_step(problem)
@@ -103,7 +103,7 @@ def test_the_default_takes_as_many_paths_as_ten_seconds_allow(solver, steps, lev
 
 def test_the_cost_of_sorted_paths_includes_sorting():
     problem = problem_of(ds.StormerVerlet(), n=1, steps=20_000)
-    sampling, _ = choose(problem, None)
+    sampling, _ = sampling_for(problem, None)
     assert isinstance(sampling, ds.ArrayRQMC)
     numbers = sampling.num_paths * sampling.replicates * 20_000
     numbers *= numbers_per_step(problem) + 1500

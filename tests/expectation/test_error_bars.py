@@ -10,9 +10,11 @@ import pytest
 from scipy import stats
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.estimate import best_results
+from diffrax_symplectic._expectation.cautions import cautions
+from diffrax_symplectic._expectation.estimate import combined_results
+from diffrax_symplectic._expectation.moments import Combination
 from diffrax_symplectic._expectation.problem import Problem
-from diffrax_symplectic._expectation.run import Meter, run
+from diffrax_symplectic._expectation.run import run
 from diffrax_symplectic._expectation.sampling import Samples, SamplingPlan
 from examples.benchmarks.coverage import arguments, Cell, estimate, exact
 
@@ -147,7 +149,7 @@ def test_few_samples_that_make_up_for_the_spread_widen_it_and_are_told():
     np.testing.assert_allclose(light.std_error, np.sqrt(light.variance / 2000))
 
 
-def _with_control(shift: float, spread: float = 1.0, far: float = 0.0, meter=None):
+def _with_control(shift: float, spread: float = 1.0, far: float = 0.0):
     """Standard normal numbers, less a control that has the mean `shift`, and `far` from it
     in the tails, which are not among them."""
 
@@ -155,23 +157,24 @@ def _with_control(shift: float, spread: float = 1.0, far: float = 0.0, meter=Non
         x = jax.vmap(jr.normal)(keys)
         control = spread * x + shift
         kinds = jnp.stack([x - control, x, control, jnp.zeros_like(x)])[:, None]
-        return Samples(kinds, jnp.ones(len(keys), bool), jnp.zeros(len(keys), bool))
+        return Samples(kinds, jnp.ones(len(keys), bool), jnp.zeros((1, len(keys))))
 
     plan = SamplingPlan(jax.tree_util.Partial(sampler), 1000, 250, far=np.array([far]))
-    return run(plan, KEY, tuple(jax.devices()[:1]), meter=meter)
+    return run(plan, KEY, tuple(jax.devices()[:1]))
 
 
 def test_a_control_whose_mean_is_not_zero_is_dropped():
     # What is left is an eighth of the noise, and the whole mean of the control.
     fine, biased = _with_control(0.0, 0.875), _with_control(0.5, 0.875)
     plain = ds.monte_carlo(jr.normal, key=KEY, num_paths=1000)
-    assert not best_results(fine).dropped and best_results(biased).dropped
+    assert not combined_results(fine, Combination.BEST).dropped
+    assert combined_results(biased, Combination.BEST).dropped
     np.testing.assert_allclose(fine.std_error, plain.std_error / 8, rtol=1e-12)
     np.testing.assert_allclose(biased.mean, plain.mean, rtol=1e-12)
     np.testing.assert_allclose(biased.std_error, plain.std_error, rtol=1e-12)
     assert _with_control(np.nan).mean == biased.mean
-    with pytest.warns(UserWarning, match="A control variate was dropped"):
-        _with_control(0.5, 0.875, meter=Meter(diffrax.NoProgressMeter()))
+    assert "A control variate was dropped" in " ".join(cautions(biased, None, True))
+    assert not list(cautions(fine, None, True))
 
 
 def test_tails_that_no_sample_shows_widen_the_standard_error():

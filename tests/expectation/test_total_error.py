@@ -12,6 +12,8 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation.moments import Combination, level_weights
 
+from ..drjit_here import needs_drjit
+
 
 KEY = jr.key(0)
 # <p q> of an oscillator with friction 0.01 at temperature 1, at t = 500 from (0, 2).
@@ -44,7 +46,7 @@ def test_three_levels_know_that_the_steps_are_too_long_and_two_promise_nothing()
     two, three = _from_means(means[:2], 1e-9), _from_means(means, 1e-9)
     # The change by the extrapolation is half of what remains.
     assert two.error < abs(two.mean - EXACT) / 1.9
-    assert two.off_order is None and "unchecked: what remains" in str(two)
+    assert two.off_order is None and "the order of the solver is unchecked" in str(two)
     assert three.off_order and "do not fit the order" in str(three)
     np.testing.assert_allclose(three.error, np.max(np.abs(np.diff(means))), rtol=1e-5)
 
@@ -63,6 +65,107 @@ def test_changes_fit_the_order_unless_sampling_shows_that_they_do_not(noise):
         whole = np.maximum(np.abs(last), np.abs(before))
         np.testing.assert_allclose(got.error[off], whole[off], rtol=1e-6)
         assert np.all(got.error[~off] < 0.05)
+
+
+PENDULUM = ds.hamiltonian_terms(
+    lambda t, p, q, args: p**2 / 2 - jnp.cos(q),
+    lambda t, p, q, args: 0.2 * jnp.sin(q),
+    (),
+)
+START = jnp.array(0.0), jnp.array(1.0)
+
+
+def _of_pendulum(**kwargs):
+    kwargs = dict(key=KEY, dt0=0.125) | kwargs
+    phi = lambda t, y, args: y[1] ** 2
+    return ds.expectation(phi, PENDULUM, ds.StormerVerlet(), 0, 1, y0=START, **kwargs)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {},
+        dict(sampling=ds.ArrayRQMC(256, 8)),
+        dict(sampling=ds.IndependentPaths(4096)),
+        pytest.param(dict(engine="drjit"), marks=needs_drjit),
+    ],
+    ids=str,
+)
+def test_what_is_printed_after_the_mean_holds_the_error_of_the_step(how):
+    # By four levels with steps half as long, 0.3640833476.
+    exact = 0.3640833476
+    got = _of_pendulum(**how)
+    assert got.levels == 2 and abs(got.mean - exact) < 3 * got.error
+    assert f"± {got.error:.1e} (sampling {got.std_error:.1e}, " in str(got)
+    np.testing.assert_allclose(
+        got.error, np.hypot(got.std_error, got.discretization_error)
+    )
+    low, high = got.interval(0.5)
+    assert high - low > got.error
+    if not how:
+        # A step of 1/8 alone is off by 3e-4, and rounding is all that its samples show.
+        one = _of_pendulum(levels=1)
+        assert one.std_error < 1e-14 < 3e-4 < abs(one.mean - exact)
+        assert abs(got.mean - exact) < got.error < 1e-4
+
+
+def test_levels_are_added_until_the_tolerance_holds_for_the_whole_error():
+    levels = []
+    for tol in (1e-3, 1e-6, 1e-9):
+        got = _of_pendulum(tol=tol)
+        assert got.tol_reached and got.error <= tol
+        assert abs(got.mean - 0.3640833476) <= tol + 1e-10
+        levels.append(got.levels)
+    assert levels == [2, 3, 4]
+    # The number of levels is the user's, if it is given, and that of `start`.
+    with pytest.warns(
+        UserWarning, match="not reached: .* remains of the discretization"
+    ):
+        two = _of_pendulum(tol=1e-6, levels=2)
+    assert two.levels == 2 and two.tol_reached is False
+    with pytest.warns(UserWarning, match="not reached"):
+        assert _of_pendulum(tol=1e-6, start=two).levels == 2
+
+
+def test_samples_end_where_more_of_them_do_not_reach_the_tolerance():
+    def with_levels(*means, noise=1e-6, **kwargs):
+        def fn(key, level):
+            return jnp.asarray(means)[level] + noise * jr.normal(key)
+
+        kwargs = dict(key=KEY, num_paths=10**6, batch_size=64, order=2) | kwargs
+        return ds.monte_carlo(fn, levels=len(means), **kwargs)
+
+    with pytest.warns(UserWarning, match="1.0e-01 remains of the discretization error"):
+        got = with_levels(0.0, 0.3, tol=1e-3)
+    assert got.tol_reached is False and got.num_paths <= 256
+    # The changes do not fit the order, however small the tolerance makes them.
+    with pytest.warns(UserWarning, match="do not fit the order of the solver, so"):
+        got = with_levels(0.0, 0.3, 0.0, tol=0.5)
+    assert got.tol_reached is False and got.num_paths <= 256
+    with pytest.warns(UserWarning, match="sampling error is .* takes about"):
+        got = with_levels(0.0, 0.0, noise=1.0, tol=0.01, num_paths=256)
+    assert got.tol_reached is False and got.num_paths == 256
+
+
+def test_steps_that_do_not_agree_are_told():
+    # The steps of 1/8 are beyond the limit of stability, those of half of it are not.
+    H0 = lambda t, p, q, args: (p**2 + 18**2 * q**2) / 2
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: 0.1 * q, ())
+    phi = lambda t, y, args: y[1] ** 2
+    arguments = phi, terms, ds.StormerVerlet(), 0, 2, 0.125, START
+    sampling = ds.IndependentPaths(64)
+    with pytest.warns(UserWarning, match="The first two steps do not agree"):
+        got = ds.expectation(*arguments, key=KEY, sampling=sampling)
+    assert got.error > abs(got.mean - 0.5)
+
+    def lost(t, y, args):
+        return jnp.where(jnp.abs(y[1]) > 10, jnp.nan, y[1])
+
+    with pytest.warns(
+        UserWarning, match="do not agree, since 64 paths fail.* and 0 with"
+    ):
+        none = ds.expectation(lost, *arguments[1:], key=KEY, sampling=sampling)
+    assert none.failed_on == (64, 0) and none.num_failed == 64
 
 
 def test_changes_are_compared_after_all_but_one_power_is_eliminated():
@@ -97,7 +200,7 @@ def test_few_failed_paths_are_told_if_they_could_change_more_than_the_standard_e
     # The largest deviation is a half.
     share = many.num_failed / 100_000
     np.testing.assert_allclose(many.failed_error, share / 2, rtol=0.02)
-    assert "failed paths could change the mean by" in str(many)
+    assert f"failed paths {many.failed_error:.1e})" in str(many)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         few = run(400)
@@ -121,6 +224,7 @@ def test_failed_paths_count_by_the_spread_of_paths_in_every_sampling(sampling):
         got = ds.expectation(
             lambda t, y, args: y, _added(ds.WeakBrownianPath((), KEY)),
             diffrax.EulerHeun(), 0, 1, 0.25, jnp.zeros(()), key=KEY, sampling=sampling,
+            levels=1,
         )  # fmt: skip
     assert not any("WeakBrownianPath" in str(x.message) for x in told)
     # Replicates count the paths that failed among theirs.

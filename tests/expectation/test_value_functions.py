@@ -14,8 +14,9 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation import basis_choice, value_functions
 from diffrax_symplectic._expectation.basis_choice import chosen_basis
-from diffrax_symplectic._expectation.choose import choose
-from diffrax_symplectic._expectation.estimate import best_results
+from diffrax_symplectic._expectation.choose import sampling_for
+from diffrax_symplectic._expectation.estimate import combined_results
+from diffrax_symplectic._expectation.moments import Combination
 from diffrax_symplectic._expectation.noise import Noise
 from diffrax_symplectic._expectation.problem import Problem
 from diffrax_symplectic._terms import outcomes, step_variables
@@ -45,7 +46,7 @@ PENDULUM = _pendulum(WEAK)
 
 
 def _estimate(sampling, terms=PENDULUM, solver=VERLET, phi=SQUARE, **kwargs):
-    kwargs = dict(t1=1.0, dt0=0.25, y0=Y0, key=jr.key(7)) | kwargs
+    kwargs = dict(t1=1.0, dt0=0.25, y0=Y0, key=jr.key(7), levels=1) | kwargs
     t1, dt0, y0 = (kwargs.pop(name) for name in ("t1", "dt0", "y0"))
     return ds.expectation(
         phi, terms, solver, 0.0, t1, dt0, y0, sampling=sampling, **kwargs
@@ -219,7 +220,7 @@ def test_a_fit_that_is_worse_than_none_is_not_used(factor, monkeypatch):
         got = _estimate(ds.ValueFunctions(3, 128, 64))
     assert got.reason == "degree: 0, chosen among 0, 3"
     # What paths with wider noise show beyond these is little.
-    best = best_results(got)
+    best = combined_results(got, Combination.BEST)
     assert best.plain_std_error <= got.std_error <= 1.01 * best.plain_std_error
     assert not best.dropped
 
@@ -357,22 +358,24 @@ def test_the_sampling_follows_from_dimension_outcomes_and_steps(
     y0 = (jnp.zeros(state // 2), jnp.ones(state // 2))
     problem = Problem.of(SQUARE, terms, VERLET, 0, 1, 1 / steps, y0, None, None, 1)
     for tol in (None, 1e-3):
-        sampling, reason = choose(problem, tol)
+        sampling, reason = sampling_for(problem, tol)
         assert type(sampling) is kind
         assert f"{state} components of the state, {steps:,} steps" in reason
     # Paths that cannot be made of given words.
     other = ds.hamiltonian_terms(H0, noise, diffrax.UnsafeBrownianPath((noises,), KEY))
     problem = Problem.of(SQUARE, other, VERLET, 0, 1, 1 / steps, y0, None, None, 1)
-    assert type(choose(problem, None)[0]) is ds.IndependentPaths
+    assert type(sampling_for(problem, None)[0]) is ds.IndependentPaths
 
 
 def test_the_default_is_the_same_each_time_and_goes_on_with_itself():
-    got = _estimate(None, tol=1e-6)
+    estimate = lambda **kwargs: _estimate(None, levels=None, **kwargs)
+    got = estimate(tol=1e-6)
     assert isinstance(got.sampling, ds.ValueFunctions) and got.tol_reached
+    # Three levels: two leave more of the discretization error.
     assert got.reason.startswith(
-        "value functions for 2 components of the state, 4 steps of 3"
+        "value functions for 2 components of the state, 28 steps of 3"
     )
-    again, more = _estimate(None, tol=1e-6), _estimate(None, start=got)
+    again, more = estimate(tol=1e-6), estimate(start=got)
     assert (again.mean, again.std_error) == (got.mean, got.std_error)
     assert more.reason == got.reason and more.num_paths == got.num_paths
 
