@@ -142,7 +142,7 @@ def quasi_weak_error(
     for h in hs:
         estimate = ds.expectation(
             of_state, terms, solver, 0.0, t1, h, y0,
-            key=jr.key(round(t1 / h)), sampling=ds.ArrayRQMC(paths, 32),
+            key=jr.key(round(t1 / h)), sampling=ds.ArrayRQMC(paths, 32), levels=1,
         )  # fmt: skip
         assert estimate.num_failed == 0
         signed.append(float(estimate.mean) - exact)

@@ -150,7 +150,7 @@ def plain(model: Model):
     phi = lambda t, y, args: model.phi(y)
     return lambda paths, seed: ds.expectation(
         phi, terms, model.solver, 0.0, model.t1, model.t1 / model.steps, model.y0,
-        key=jr.key(seed), sampling=ds.IndependentPaths(paths),
+        key=jr.key(seed), sampling=ds.IndependentPaths(paths), levels=1,
     )  # fmt: skip
 
 

@@ -34,7 +34,7 @@ def gains(
         warnings.simplefilter("ignore")
         estimate = ds.expectation(
             moments, terms, ds.StormerVerlet(), 0.0, ts[-1], h, y0, ts=ts,
-            key=jr.key(0), sampling=ds.ArrayRQMC(paths, replicates, sort_by),
+            key=jr.key(0), sampling=ds.ArrayRQMC(paths, replicates, sort_by), levels=1,
         )  # fmt: skip
     assert estimate.num_failed == 0
     mean, square = np.moveaxis(estimate.mean, 1, 0)

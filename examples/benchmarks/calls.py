@@ -106,10 +106,12 @@ CALLS: dict[str, Callable[[], Callable]] = {
     **SOLVES,
     **DEFAULTS,
     f"`expectation` of {PATHS} independent paths": (
-        lambda: expectation(ds.ImplicitMidpoint(), sampling=FEW)
+        lambda: expectation(ds.ImplicitMidpoint(), sampling=FEW, levels=1)
     ),
     f'`expectation` of {PATHS} independent paths, `engine="drjit"`': (
-        lambda: expectation(ds.ImplicitMidpoint(), sampling=FEW, engine="drjit")
+        lambda: expectation(
+            ds.ImplicitMidpoint(), sampling=FEW, levels=1, engine="drjit"
+        )
     ),
     f"`ensemble` of {PATHS} paths": lambda: ensemble("jax"),
     f'`ensemble` of {PATHS} paths, `engine="drjit"`': lambda: ensemble("drjit"),

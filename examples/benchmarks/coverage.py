@@ -133,13 +133,15 @@ def arguments(cell: Cell) -> tuple:
 
 
 def estimate(cell: Cell, sampling: Any, seed: int) -> ds.Expectation:
-    return ds.expectation(*arguments(cell), key=jr.key(seed), sampling=sampling)
+    return ds.expectation(
+        *arguments(cell), key=jr.key(seed), sampling=sampling, levels=1
+    )
 
 
 def kubo(cell: Cell, sampling: Any, seed: int) -> ds.Expectation:
     """Of `exp(q)` by itself, for multiplicative noise."""
     own = _exponential, _KUBO, ds.ImplicitMidpoint(), *arguments(cell)[3:]
-    return ds.expectation(*own, key=jr.key(seed), sampling=sampling)
+    return ds.expectation(*own, key=jr.key(seed), sampling=sampling, levels=1)
 
 
 def covered(cell: Cell, sampling: Any, repetitions: int) -> np.ndarray:

@@ -251,6 +251,7 @@ def mean_of(n: int) -> float:
             case.start(jnp.float64),
             key=jr.key(1),
             sampling=ds.IndependentPaths(number),
+            levels=1,
             engine="drjit",
         )
     return time.perf_counter() - begin

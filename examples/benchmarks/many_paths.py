@@ -56,7 +56,7 @@ def by_array_rqmc(case: Case, number: int) -> Callable:
     sampling = ds.ArrayRQMC(num_paths=number // REPLICATES, replicates=REPLICATES)
 
     def call() -> None:
-        ds.expectation(first_number, *given, key=jr.key(1), sampling=sampling)
+        ds.expectation(first_number, *given, key=jr.key(1), sampling=sampling, levels=1)
 
     return call
 

@@ -118,7 +118,6 @@ estimate = ds.expectation(
     key=jr.key(3),
     ts=[1.0, 2.0, 3.0, 4.0],
     sampling=ds.ArrayRQMC(1024),
-    levels=2,
 )
 times = np.array([1.0, 2.0, 3.0, 4.0])
 exact = np.exp(-(sigma**2) * times / 2) * np.cos(times)
