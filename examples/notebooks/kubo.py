@@ -88,8 +88,8 @@ plt.show()
 # $$1 + (h^4 + 6 h^3 \sigma^2 + 3 h^2 \sigma^4) / 4.$$
 #
 # The term in $h^2$ comes from the noise. So the growth per unit of time falls only like
-# $h$: half the step at best halves the drift, and no affordable step makes a long run
-# safe.
+# $h$: half the step at best halves the drift, so a run that is twice as long needs half
+# the step.
 
 # %%
 weak_terms = ds.hamiltonian_terms(H0, H1, ds.WeakBrownianPath((), jr.key(0)))

@@ -3,8 +3,8 @@
 # %% [markdown]
 # # A rigid body with noise
 #
-# A free rigid body with the moments of inertia $I_1, I_2, I_3$ is kicked at random about
-# each of its axes. In the frame of the body, its angular momentum $X \in \mathbb R^3$
+# A free rigid body with the moments of inertia $I_1, I_2, I_3$ is turned at random about
+# each of its axes. (A random torque would change $|X|$.) In the frame of the body, its angular momentum $X \in \mathbb R^3$
 # follows
 #
 # $$\mathrm{d}X = X \times \nabla H_0(X)\,\mathrm{d}t + \mu \sum_k X \times e_k \circ
@@ -15,8 +15,8 @@
 # $\{X_1, X_2\} = -X_3$, as the flow of a canonical pair $(p, q)$ preserves area.
 #
 # In the fourth test model of [Wang, Hong and Xu
-# (2017)](https://doi.org/10.4208/cicp.261014.230616a) the kicks are about the first axis
-# only.
+# (2017)](https://doi.org/10.4208/cicp.261014.230616a) the random turns are about the
+# first axis only.
 
 # %%
 import diffrax
