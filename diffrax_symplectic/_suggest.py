@@ -34,6 +34,8 @@ from ._terms import (
     additive_fault,
     brownian_paths,
     check_assertions,
+    check_baths_have_own_noise,
+    check_drifts_differ,
     check_fit,
     commuting,
     constant_fault,
@@ -158,6 +160,8 @@ def suggest_solver(
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
     check_fit(terms, t0, y0, args)
+    check_drifts_differ(terms)
+    check_baths_have_own_noise(terms)
     check_assertions(terms, t0, y0, args)
     constrained = constraint_of(given_terms) is not None
     system = _inspected(drift, noise, t0, y0, args, constrained)

@@ -13,7 +13,14 @@ from .._arguments import brief, check_real, check_takes, takes_args
 from .._brownian import is_random
 from .._custom_types import Args, Y
 from .._signature import once_for_each_signature
-from .._terms import brownian_paths, check_fit, evaluated, has_lifted
+from .._terms import (
+    brownian_paths,
+    check_baths_have_own_noise,
+    check_drifts_differ,
+    check_fit,
+    evaluated,
+    has_lifted,
+)
 
 
 # Times are given in decimals, so a number of steps is whole up to this fraction of it.
@@ -102,7 +109,10 @@ def check_finite(y0: Y) -> None:
 
 
 def check_noise(terms: PyTree) -> None:
-    """Raises a `ValueError` if nothing in the terms is random."""
+    """Raises a `ValueError` if nothing in the terms is random, or if something in them
+    would count twice."""
+    check_drifts_differ(terms)
+    check_baths_have_own_noise(terms)
     paths = brownian_paths(terms)
     if len(paths) == 0:
         raise ValueError(

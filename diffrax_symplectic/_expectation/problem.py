@@ -27,7 +27,10 @@ from .._terms import (
     check_start,
     check_stratonovich,
     constraint_of,
+    path_numbers,
     specified,
+    step_variables,
+    StepVariables,
 )
 from .arguments import (
     check_cells,
@@ -100,6 +103,9 @@ class Problem(eqx.Module):
     weights: Float[Array | np.ndarray, "combinations levels"]
     # Whether to average at `t1` only, without an axis of times.
     at_end: bool = eqx.field(static=True)
+    # Which paths of the terms are one Brownian motion. Programs, whose keys are traced,
+    # cannot tell.
+    path_numbers: tuple[int, ...] = eqx.field(static=True)
     # The number of steps on the finest level. (Shapes must be known when compiling.)
     max_steps: int = eqx.field(static=True)
 
@@ -171,6 +177,7 @@ class Problem(eqx.Module):
             levels=grid,
             weights=weights,
             at_end=ts is None,
+            path_numbers=path_numbers(brownian_paths(terms)),
             max_steps=int(grid.num_steps[-1]),
         )
 
@@ -242,6 +249,10 @@ class Problem(eqx.Module):
         )
         success = diffrax.is_okay(result) & all_finite(y)
         return y, eqx.filter(solver_state, eqx.is_array), success
+
+    def variables(self, h: Float[Array | np.ndarray, ""]) -> StepVariables:
+        """The random variables of a step of this size."""
+        return step_variables(self.terms, h, self.path_numbers)
 
     def values(self, t: Any, y: Y) -> Float[Array, " m"]:
         """All numbers of `phi` as one vector."""

@@ -1,9 +1,9 @@
 from .constraint import constraint_of, refuse_constraint, without_constraint
 from .controls import drawn_variables, drift_driven, noise_driven, outcomes
-from .controls import step_variables
+from .controls import step_variables, StepVariables
 from .dependence import acts_elementwise, Dependence
 from .hamiltonian import evaluated, hamiltonian_terms, has_lifted, IndexedNoise
-from .hamiltonian import is_hamiltonian
+from .hamiltonian import is_hamiltonian, noise_terms
 from .diffrax_langevin import momentum_first
 from .friction import FrictionAlong, semidefinite_root
 from .langevin import (
@@ -13,6 +13,7 @@ from .langevin import (
     langevin_terms,
     split_friction,
 )
+from .said_twice import check_baths_have_own_noise, check_drifts_differ
 from .spins import as_spins, from_spinors, spin_terms, to_spinors
 from .structure import additive_fault, check_assertions, check_stratonovich
 from .structure import check_structure

@@ -63,8 +63,10 @@ def langevin_terms(
     [`diffrax_symplectic.BAOAB`][], [`diffrax_symplectic.LangevinMiddle`][] and
     [`diffrax_symplectic.Damped`][] treat friction by a step of its own. Every other solver,
     from this package or from Diffrax, takes it as a part of the drift. More terms are added
-    by `diffrax.MultiTerm(*terms.terms, ...)`: other noise, or a second bath from
-    [`diffrax_symplectic.bath_terms`][].
+    by `diffrax.MultiTerm(*terms.terms, ...)`: other noise from
+    [`diffrax_symplectic.noise_terms`][], or a second bath from
+    [`diffrax_symplectic.bath_terms`][]. A bath shares its random key with no other term:
+    both would be one Brownian motion.
 
     **Arguments:**
 
