@@ -1,18 +1,22 @@
 """Checks of the arguments of `expectation` and `ensemble`, before anything is solved."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray, PyTree
 
 from .._arguments import brief, check_real, check_takes, takes_args
-from .._brownian import is_random
+from .._brownian import Discrete, is_random, laws_of, lost_variance, TOO_STRONG
 from .._custom_types import Args, Y
 from .._signature import once_for_each_signature
+from .._solver import own_path
 from .._terms import (
     brownian_paths,
     check_baths_have_own_noise,
@@ -28,6 +32,9 @@ _ROUNDED = 1e-6
 # Cells are given in decimals, too. Beyond this fraction of a cell, a step would take the
 # increment of another.
 _ROUNDED_CELL = 1e-3
+# What is lost of the variance of the noise beyond this is said. It is the size of the noise
+# in a bath, its temperature.
+_MUCH_LOST = 1e-3
 
 
 class StepNumbers(NamedTuple):
@@ -125,6 +132,44 @@ def check_noise(terms: PyTree) -> None:
             "same noise. Solve once, with `diffrax.diffeqsolve`. If your path draws its "
             "own noise, give it a field that holds a JAX random key. To average over many "
             "records, pass `monte_carlo` a function that draws one of them."
+        )
+
+
+def check_truncation(terms: PyTree, h: float) -> None:
+    """Raises a `ValueError` if steps of size `h` leave nothing of truncated increments."""
+    if any(lost_variance(path, h) == 1 for path in brownian_paths(terms)):
+        raise ValueError(f"{TOO_STRONG} Got dt0={h}.")
+
+
+def warn_of_truncation(terms: PyTree, h: float, stacklevel: int) -> None:
+    """Warns if truncated increments lose much of their variance in steps of size `h`."""
+    lost = max(lost_variance(path, h) for path in brownian_paths(terms))
+    if lost > _MUCH_LOST:
+        warnings.warn(
+            f"Gaussian increments lose {lost:.1%} of their variance in steps of {h:g}, "
+            "since those of implicit solvers are bounded where the noise depends on the "
+            "state. Take smaller steps (0.1% is lost at h = 1/20); or for means of smooth "
+            "functions discrete increments, by a `WeakBrownianPath`; or a "
+            "`FixedStepBrownianPath`, whose paths fail where a step has no solution; or an "
+            "explicit solver.",
+            stacklevel=stacklevel + 1,
+        )
+
+
+def has_discrete_increments(solver: diffrax.AbstractSolver) -> bool:
+    """Whether a solver exists in the weak sense only: no path for it is Gaussian."""
+    path = own_path(solver, "strong", (), jr.key(0))
+    return isinstance((laws_of(path) or {}).get("W"), Discrete)
+
+
+def check_gaussian(solver: diffrax.AbstractSolver) -> None:
+    """Raises a `ValueError` unless a solver takes Gaussian increments."""
+    if has_discrete_increments(solver):
+        raise ValueError(
+            f"`{type(solver).__name__}` is a weak method, whose increments take a few "
+            "values, so that paths do not have the law of the solution. Pass "
+            '`want="weak"` for the right means of smooth functions, or a solver of '
+            '`suggest_solver(terms, t0, y0, args, want="strong")`.'
         )
 
 

@@ -15,7 +15,14 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 from .._brownian import Discrete, laws_of, UnspecifiedPath
 from .._custom_types import Args, RealScalarLike, Y
 from .._solver import own_path
-from .._terms import brownian_paths, path_numbers, random_paths, with_paths
+from .._terms import (
+    brownian_paths,
+    path_numbers,
+    random_paths,
+    with_paths,
+    without_truncation,
+)
+from .arguments import has_discrete_increments, warn_of_truncation
 from .call import checked_call, Meter, NO_METER
 from .choose import (
     choose,
@@ -193,7 +200,7 @@ def expectation(
     problem = Problem.of(*arguments, want="weak")
     has_kinks = problem.has_kinks
     why_law = ""
-    if has_kinks and _may_choose_law(terms, sampling):
+    if has_kinks and _may_choose_law(terms, solver, sampling):
         problem = Problem.of(*arguments, want="strong")
         why_law = "Gaussian increments, since phi may not be smooth"
 
@@ -239,15 +246,19 @@ def expectation(
         warn_of_stragglers(paths.stragglers, paths.lost, paths.count, stacklevel=2)
     _warn_of_rounding(estimate, problem)
     # A part of an estimate is not warned of again.
-    if start is None and first == 0 and has_kinks:
-        _warn_of_law(estimate, problem, trial_key, devices)
+    if start is None and first == 0:
+        warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
+        if has_kinks:
+            _warn_of_law(estimate, problem, trial_key, devices)
     return estimate
 
 
-def _may_choose_law(terms: PyTree, sampling: AbstractSampling | None) -> bool:
+def _may_choose_law(
+    terms: PyTree, solver: diffrax.AbstractSolver, sampling: AbstractSampling | None
+) -> bool:
     """Whether the user left the law of the increments open."""
-    # Value functions need discrete increments.
-    if isinstance(sampling, ValueFunctions):
+    # Value functions need discrete increments, as do solvers of the weak sense.
+    if isinstance(sampling, ValueFunctions) or has_discrete_increments(solver):
         return False
     return any(isinstance(path, UnspecifiedPath) for path in brownian_paths(terms))
 
@@ -277,6 +288,7 @@ def _warn_of_law(
         return
     gaussian_path = ft.partial(own_path, problem.solver, "strong")
     terms = with_paths(gaussian_path, path_numbers(paths), problem.terms, key)
+    terms = without_truncation(terms)
     gaussian = dataclasses.replace(problem, terms=terms)
     plan = few_paths(gaussian).prepare(gaussian, key, devices)
     trial = run(plan, key, devices)

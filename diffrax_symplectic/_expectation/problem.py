@@ -27,16 +27,20 @@ from .._terms import (
     check_start,
     check_stratonovich,
     constraint_of,
+    has_shapes,
+    needs_truncation,
     path_numbers,
     specified,
     step_variables,
     StepVariables,
+    without_truncation,
 )
 from .arguments import (
     check_cells,
     check_finite,
     check_noise,
     check_shapes,
+    check_truncation,
     drawn_args,
     drawn_state,
     given_state,
@@ -133,6 +137,7 @@ class Problem(eqx.Module):
                 "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
             )
         # In each sample other keys take the place of these.
+        shapes = has_shapes(terms)
         terms = specified(terms, ft.partial(own_path, solver, want))
         counts = step_numbers(t0, t1, dt0, ts)
 
@@ -156,6 +161,12 @@ class Problem(eqx.Module):
         if constraint_of(terms) is not None:
             check_start(terms, start, y0, args)
         check_noise(terms)
+        # Solvers make paths without knowing what they drive. Those of the user are kept.
+        if any(shapes):
+            needed = needs_truncation(terms, start, y0, args)
+            needless = [own and not need for own, need in zip(shapes, needed)]
+            terms = without_truncation(terms, needless)
+        check_truncation(terms, float(dt0))
         smallest = float(dt0) / 2 ** (levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):
             check_resolution(smallest, float(t0), float(t1), start.dtype)

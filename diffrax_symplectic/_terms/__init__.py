@@ -22,12 +22,14 @@ from .structure import separable_fault
 from .surface import check_start, constrained_state, Surface
 from .paths import (
     brownian_paths,
+    has_shapes,
     has_unknown_law,
     path_keys,
     path_numbers,
     random_paths,
 )
 from .paths import replace_paths, shapes_as_paths, specified, with_keys, with_paths
+from .truncation import needs_truncation, without_truncation
 from .vector_fields import apply, apply_one, check_fit, flattened
 from .vector_fields import number_of_noises, rate
 from .vector_fields import split_terms, tree_sum
