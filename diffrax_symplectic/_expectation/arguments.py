@@ -146,9 +146,9 @@ def warn_of_truncation(terms: PyTree, h: float, stacklevel: int) -> None:
     lost = max(lost_variance(path, h) for path in brownian_paths(terms))
     if lost > _MUCH_LOST:
         warnings.warn(
-            f"Gaussian increments lose {lost:.1%} of their variance in steps of {h:g}, "
-            "since those of implicit solvers are bounded where the noise depends on the "
-            "state. Take smaller steps (0.1% is lost at h = 1/20); or for means of smooth "
+            "The increments of a `TruncatedBrownianPath`, which implicit solvers get where "
+            f"the noise depends on the state, lose {lost:.1%} of their variance in steps of "
+            f"{h:g}. Take smaller steps (0.1% is lost at h = 1/20); or for means of smooth "
             "functions discrete increments, by a `WeakBrownianPath`; or a "
             "`FixedStepBrownianPath`, whose paths fail where a step has no solution; or an "
             "explicit solver.",
