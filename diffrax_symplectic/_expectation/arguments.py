@@ -147,9 +147,9 @@ def warn_of_truncation(terms: PyTree, h: float, stacklevel: int) -> None:
     if lost > _MUCH_LOST:
         warnings.warn(
             "The increments of a `TruncatedBrownianPath`, which implicit solvers get where "
-            f"the noise depends on the state, lose {lost:.1%} of their variance in steps of "
-            f"{h:g}. Take smaller steps (0.1% is lost at h = 1/20); or for means of smooth "
-            "functions discrete increments, by a `WeakBrownianPath`; or a "
+            f"the noise depends on the state, lose {lost:.1%} of their variance in steps "
+            f"of {h:g}. Take smaller steps (0.1% is lost at h = 1/20); or for means of "
+            "smooth functions discrete increments, by a `WeakBrownianPath`; or a "
             "`FixedStepBrownianPath`, whose paths fail where a step has no solution; or an "
             "explicit solver.",
             stacklevel=stacklevel + 1,

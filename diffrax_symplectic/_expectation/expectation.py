@@ -286,6 +286,14 @@ def _warn_of_law(
     laws = [law for path in paths for law in (laws_of(path) or {}).values()]
     if not any(isinstance(law, Discrete) for law in laws):
         return
+    if has_discrete_increments(problem.solver):
+        warnings.warn(
+            f"`phi` may not be smooth, and `{type(problem.solver).__name__}` has discrete "
+            "increments alone, which have the right means of smooth functions only. Pass "
+            'a solver of `suggest_solver(terms, t0, y0, args, want="strong")`.',
+            stacklevel=3,
+        )
+        return
     gaussian_path = ft.partial(own_path, problem.solver, "strong")
     terms = with_paths(gaussian_path, path_numbers(paths), problem.terms, key)
     terms = without_truncation(terms)

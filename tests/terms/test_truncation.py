@@ -105,7 +105,9 @@ def assert_moments(y, exact):
     for i in range(2):
         for j in range(2):
             x = y[i] * y[j]
-            assert abs(x.mean() - exact[i, j]) < 5 * x.std() / len(x) ** 0.5
+            bound = 5 * x.std() / len(x) ** 0.5
+            # Some moments have no spread.
+            assert abs(x.mean() - exact[i, j]) < bound + 1e-12
 
 
 STEPS = (0.05, 0.25, 0.5, 0.9, 1.0, 2.0)
@@ -126,10 +128,11 @@ MATRIX = [
 def test_the_law_with_additive_noise_is_exact_at_every_step(solver, h):
     # A linear system: the law is Gaussian, with these moments.
     solver = solver()
-    for shaped in (
-        ds.langevin_terms(WELL, 0.5, 1.0, ()),
-        ds.hamiltonian_terms(WELL, KICK, ()),
-    ):
+    systems = [ds.hamiltonian_terms(WELL, KICK, ())]
+    if not str(solver.structure).startswith("separable"):
+        # Friction in the drift is not separable.
+        systems.append(ds.langevin_terms(WELL, 0.5, 1.0, ()))
+    for shaped in systems:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
