@@ -91,6 +91,7 @@ from ._terms import (
     hamiltonian_terms as hamiltonian_terms,
     IndexedNoise as IndexedNoise,
     langevin_terms as langevin_terms,
+    noise_terms as noise_terms,
     spin_terms as spin_terms,
     to_pair as to_pair,
     to_spinors as to_spinors,

@@ -9,6 +9,7 @@ from typing import cast, get_args, NamedTuple
 import diffrax
 import jax
 import jax.numpy as jnp
+import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
@@ -17,6 +18,7 @@ from ._brownian import (
     drives,
     increment_struct,
     is_random,
+    TruncatedBrownianPath,
     WeakBrownianPath,
 )
 from ._custom_types import Args, RealScalarLike, Y
@@ -34,6 +36,8 @@ from ._terms import (
     additive_fault,
     brownian_paths,
     check_assertions,
+    check_baths_have_own_noise,
+    check_drifts_differ,
     check_fit,
     commuting,
     constant_fault,
@@ -42,6 +46,7 @@ from ._terms import (
     FRICTION,
     friction_apart,
     has_unknown_law,
+    needs_truncation,
     number_of_noises,
     path_numbers,
     random_paths,
@@ -50,6 +55,7 @@ from ._terms import (
     split_terms,
     with_paths,
     without_constraint,
+    without_truncation,
 )
 
 
@@ -158,6 +164,8 @@ def suggest_solver(
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
     check_fit(terms, t0, y0, args)
+    check_drifts_differ(terms)
+    check_baths_have_own_noise(terms)
     check_assertions(terms, t0, y0, args)
     constrained = constraint_of(given_terms) is not None
     system = _inspected(drift, noise, t0, y0, args, constrained)
@@ -166,12 +174,16 @@ def suggest_solver(
 
     numbers = path_numbers(random_paths(terms))
 
+    # Solvers make paths without knowing what they drive.
+    needed = needs_truncation(terms, t0, y0, args)
+
     def terms_with(make: Callable) -> jtu.Partial:
         """A function of a key: the terms with paths made by `make`."""
-        return jtu.Partial(ft.partial(with_paths, make, numbers), given_terms)
+        with_own = ft.partial(_terms_with, make, numbers, needed)
+        return jtu.Partial(with_own, given_terms)
 
     found = tuple(
-        _suggestion(solver, want, terms, system.commute, terms_with)
+        _suggestion(solver, want, terms, system.commute, any(needed), terms_with)
         for solver in solvers
     )
     description = f"For {want} approximation. {system.in_a_sentence()}"
@@ -181,6 +193,18 @@ def suggest_solver(
             "noise late in a run (Diffrax issue 733): use one of the paths below."
         )
     return Suggestions(description, found)
+
+
+def _terms_with(
+    make: Callable,
+    numbers: tuple[int, ...],
+    needed: tuple[bool, ...],
+    terms: diffrax.AbstractTerm,
+    key: PRNGKeyArray,
+) -> diffrax.AbstractTerm:
+    """`with_paths`, truncated only where it is `needed`."""
+    needless = [not need for need in needed]
+    return without_truncation(with_paths(make, numbers, terms, key), needless)
 
 
 class _System(NamedTuple):
@@ -393,16 +417,22 @@ def _suggestion(
     want: Want,
     terms: diffrax.AbstractTerm,
     commute: bool,
+    bounded: bool,
     terms_with: Callable,
 ) -> Suggestion:
-    """The suggestion of this solver. `terms_with(make)` returns, as a function of a key,
-    the terms with paths that are made by `make`."""
+    """The suggestion of this solver. `bounded` is whether implicit steps need bounded
+    increments. `terms_with(make)` returns, as a function of a key, the terms with paths
+    that are made by `make`."""
     record = _record(solver)
     random = random_paths(terms)
     replaced = [path for path in random if not has_unknown_law(path)]
     if replaced:
-        shape = _shape_code(increment_struct(replaced[0]))
+        struct = increment_struct(replaced[0])
+        shape = _shape_code(struct)
         code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
+        own = solver.path(struct, jr.key(0), want=want)
+        if isinstance(own, TruncatedBrownianPath) and not bounded:
+            code = f"ds.FixedStepBrownianPath({shape}, key)"
     elif random:
         code = f"the `{type(random[0]).__name__}` of the terms, with another key"
     else:

@@ -17,6 +17,7 @@ from ._custom_types import Args, RealScalarLike, Y
 from ._terms import (
     apply_one,
     as_spins,
+    check_baths_have_own_noise,
     constraint_of,
     from_spinors,
     number_of_noises,
@@ -193,16 +194,16 @@ def step_expectation(
 
     **Arguments:**
 
-    - `terms`, `solver`, `y0`, `args`: as for `diffrax.diffeqsolve`; `terms` with one
-        Brownian path.
+    - `terms`, `solver`, `y0`, `args`: as for `diffrax.diffeqsolve`; `terms` with any
+        number of Brownian paths. Equal paths are one Brownian motion.
     - `t0`, `t1`: start and end of the step.
     - `fn`: the function $\phi$, `fn(t, y, args)`, which returns a PyTree of arrays.
     - `nodes`: the number of quadrature points in each Gaussian variable.
 
     **Returns:** the average of `fn`, in its structure.
 
-    **Raises:** a `ValueError` if `terms` does not contain exactly one path of a known law;
-    an error when run if the solver reports a failed step.
+    **Raises:** a `ValueError` if `terms` contain no path, or one whose law is not known; an
+    error when run if the solver reports a failed step.
     """
 
     def outcome(terms: PyTree) -> tuple[PyTree[Array], diffrax.RESULTS]:
@@ -265,6 +266,7 @@ def second_moment_map(
 
 def _average(outcome: Callable, terms, h, nodes: int) -> PyTree[Array]:
     """The expectation of `outcome(terms) -> (value, result)`."""
+    check_baths_have_own_noise(terms)
     laws, terms_with = step_variables(terms, h)
     variables, weights = outcomes(laws, nodes)
 

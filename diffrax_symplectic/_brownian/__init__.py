@@ -17,8 +17,10 @@ from .random import random_words, THREE_POINT, typed_key
 from .levy_area import LevyAreaBrownianPath, LevyAreaIncrement
 from .wrappers import (
     has_bounded_increments,
+    lost_variance,
     PlateauBrownianPath,
     PlateauIncrement,
+    TOO_STRONG,
     TruncatedBrownianPath,
 )
 from .variables import drives, most_demanding, path_of, VARIABLES

@@ -1,19 +1,30 @@
 """Checks of the arguments of `expectation` and `ensemble`, before anything is solved."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray, PyTree
 
 from .._arguments import brief, check_real, check_takes, takes_args
-from .._brownian import is_random
+from .._brownian import Discrete, is_random, laws_of, lost_variance, TOO_STRONG
 from .._custom_types import Args, Y
 from .._signature import once_for_each_signature
-from .._terms import brownian_paths, check_fit, evaluated, has_lifted
+from .._solver import own_path
+from .._terms import (
+    brownian_paths,
+    check_baths_have_own_noise,
+    check_drifts_differ,
+    check_fit,
+    evaluated,
+    has_lifted,
+)
 
 
 # Times are given in decimals, so a number of steps is whole up to this fraction of it.
@@ -21,6 +32,9 @@ _ROUNDED = 1e-6
 # Cells are given in decimals, too. Beyond this fraction of a cell, a step would take the
 # increment of another.
 _ROUNDED_CELL = 1e-3
+# What is lost of the variance of the noise beyond this is said. It is the size of the noise
+# in a bath, its temperature.
+_MUCH_LOST = 1e-3
 
 
 class StepNumbers(NamedTuple):
@@ -102,7 +116,10 @@ def check_finite(y0: Y) -> None:
 
 
 def check_noise(terms: PyTree) -> None:
-    """Raises a `ValueError` if nothing in the terms is random."""
+    """Raises a `ValueError` if nothing in the terms is random, or if something in them
+    would count twice."""
+    check_drifts_differ(terms)
+    check_baths_have_own_noise(terms)
     paths = brownian_paths(terms)
     if len(paths) == 0:
         raise ValueError(
@@ -115,6 +132,44 @@ def check_noise(terms: PyTree) -> None:
             "same noise. Solve once, with `diffrax.diffeqsolve`. If your path draws its "
             "own noise, give it a field that holds a JAX random key. To average over many "
             "records, pass `monte_carlo` a function that draws one of them."
+        )
+
+
+def check_truncation(terms: PyTree, h: float) -> None:
+    """Raises a `ValueError` if steps of size `h` leave nothing of truncated increments."""
+    if any(lost_variance(path, h) == 1 for path in brownian_paths(terms)):
+        raise ValueError(f"{TOO_STRONG} Got dt0={h}.")
+
+
+def warn_of_truncation(terms: PyTree, h: float, stacklevel: int) -> None:
+    """Warns if truncated increments lose much of their variance in steps of size `h`."""
+    lost = max(lost_variance(path, h) for path in brownian_paths(terms))
+    if lost > _MUCH_LOST:
+        warnings.warn(
+            "The increments of a `TruncatedBrownianPath`, which implicit solvers get where "
+            f"the noise depends on the state, lose {lost:.1%} of their variance in steps "
+            f"of {h:g}. Take smaller steps (0.1% is lost at h = 1/20); or for means of "
+            "smooth functions discrete increments, by a `WeakBrownianPath`; or a "
+            "`FixedStepBrownianPath`, whose paths fail where a step has no solution; or an "
+            "explicit solver.",
+            stacklevel=stacklevel + 1,
+        )
+
+
+def has_discrete_increments(solver: diffrax.AbstractSolver) -> bool:
+    """Whether a solver exists in the weak sense only: no path for it is Gaussian."""
+    path = own_path(solver, "strong", (), jr.key(0))
+    return isinstance((laws_of(path) or {}).get("W"), Discrete)
+
+
+def check_gaussian(solver: diffrax.AbstractSolver) -> None:
+    """Raises a `ValueError` unless a solver takes Gaussian increments."""
+    if has_discrete_increments(solver):
+        raise ValueError(
+            f"`{type(solver).__name__}` is a weak method, whose increments take a few "
+            "values, so that paths do not have the law of the solution. Pass "
+            '`want="weak"` for the right means of smooth functions, or a solver of '
+            '`suggest_solver(terms, t0, y0, args, want="strong")`.'
         )
 
 

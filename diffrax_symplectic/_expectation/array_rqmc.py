@@ -148,7 +148,7 @@ def _gain(
     plan: SamplingPlan, other: SamplingPlan, key: PRNGKeyArray, devices: tuple
 ) -> float:
     """How many times the variance of a plan is that of the other, in a short trial; one if
-    nothing is random."""
+    either is zero, of which nothing can be said."""
 
     def variance(plan: SamplingPlan) -> float:
         short = plan._replace(num_samples=_TRIAL_REPLICATES)
@@ -156,7 +156,8 @@ def _gain(
         return float(np.sum(jtu.tree_leaves(trial.variance)))
 
     own = variance(plan)
-    return own / variance(other) if own > 0 else 1.0
+    others = variance(other)
+    return own / others if own > 0 and others > 0 else 1.0
 
 
 def _replicates(

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from .._solver import Want
+from .arguments import has_discrete_increments
 from .array_rqmc import ArrayRQMC, step_words
 from .cost import NUMBERS_PER_SECOND, numbers_per_step
 from .estimate import Expectation
@@ -92,9 +93,10 @@ def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
     # Discrete increments, unless `phi` is not smooth.
     problem = problem_for("weak")
     why_law = ""
-    # Value functions need discrete increments.
-    may_choose_law = not has_path and not isinstance(sampling, ValueFunctions)
-    if problem.has_kinks and may_choose_law:
+    # Value functions need discrete increments, as do solvers of the weak sense.
+    needs_discrete = isinstance(sampling, ValueFunctions)
+    needs_discrete |= has_discrete_increments(problem.solver)
+    if problem.has_kinks and not has_path and not needs_discrete:
         problem = problem_for("strong")
         why_law = "Gaussian increments, since phi may not be smooth"
 

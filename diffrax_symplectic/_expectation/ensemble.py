@@ -17,7 +17,8 @@ from .._compat import is_traced
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from .._fused import sample_key
 from .._solver import Want
-from .._terms import path_keys, with_keys
+from .._terms import has_shapes, path_keys, with_keys
+from .arguments import check_gaussian, warn_of_truncation
 from .call import checked_call
 from .engines import Batch, ENGINES, state_itself, warn_of_stragglers
 from .problem import Problem
@@ -133,11 +134,14 @@ def ensemble(
     [`diffrax_symplectic.monte_carlo`][].
 
     **Noise.** Where `terms` have the shape of a path, the solver makes one with the
-    Gaussian increments of a Brownian motion (bounded for implicit solvers), so that every
-    function of the states has the right law. The three-point increments of `want="weak"`
-    take less time, and give the right means of smooth functions only: a momentum that
-    starts at one value has three values after a step, and Brownian motion from 0 leaves
-    (-1, 1) after 1.07 in the mean, not after 1.
+    Gaussian increments of a Brownian motion, so that every function of the states has the
+    right law. They are bounded for implicit solvers where the noise depends on the state
+    (see [`diffrax_symplectic.TruncatedBrownianPath`][]); what that takes from their
+    variance is told above 0.1%. The discrete increments of `want="weak"` take less time,
+    and give the right means of smooth functions only: a momentum that starts at one value
+    has three values after a step, and Brownian motion from 0 leaves (-1, 1) after 1.07 in
+    the mean, not after 1. Solvers that have no other ones, such as
+    [`diffrax_symplectic.AdditiveGauss`][], are refused without it.
 
     **Engines.** `engine="jax"`, the default, moves all paths through each step together.
     `engine="drjit"` compiles all steps to one kernel with
@@ -160,10 +164,12 @@ def ensemble(
     **Returns:** an [`diffrax_symplectic.Ensemble`][].
 
     **Raises:** what [`diffrax_symplectic.expectation`][] raises, and a `ValueError` if
-    `engine` or `want` is unknown. With `engine="drjit"`: a `ValueError` if the system uses
-    an operation that cannot be replayed, its state has more than 256 entries, or a
-    `PicardNewton` has another tolerance than rounding error, and an `ImportError` if Dr.Jit
-    or LLVM is missing. Warns if paths failed, and if many are stragglers.
+    `engine` or `want` is unknown, or if a solver with discrete increments alone would have
+    to make a path and `want` is not `"weak"`. With `engine="drjit"`: a `ValueError` if the
+    system uses an operation that cannot be replayed, its state has more than 256 entries,
+    or a `PicardNewton` has another tolerance than rounding error, and an `ImportError` if
+    Dr.Jit or LLVM is missing. Warns if paths failed, if many are stragglers, and
+    if truncation takes more than 0.1% of the variance of increments.
     """
     arguments = terms, t0, t1, dt0, y0, args
     key, _, _ = checked_call("ensemble", key, others=arguments)
@@ -187,6 +193,9 @@ def ensemble(
         want=want,
         user="ensemble",
     )
+    if want == "strong" and any(has_shapes(terms)):
+        check_gaussian(solver)
+    warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
     if batch_size is None:
         batch_size = _default_size(engine, problem)
     size = whole_number("batch_size", batch_size)

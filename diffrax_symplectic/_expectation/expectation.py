@@ -14,7 +14,14 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 from .._brownian import Discrete, laws_of, UnspecifiedPath
 from .._custom_types import Args, RealScalarLike, Y
 from .._solver import own_path
-from .._terms import brownian_paths, path_numbers, random_paths, with_paths
+from .._terms import (
+    brownian_paths,
+    path_numbers,
+    random_paths,
+    with_paths,
+    without_truncation,
+)
+from .arguments import has_discrete_increments, warn_of_truncation
 from .call import checked_call, Meter, NO_METER
 from .cautions import cautions
 from .choose import choose, few_paths, trial_key, Wanted
@@ -211,8 +218,10 @@ def expectation(
         warn_of_stragglers(paths.stragglers, paths.lost, paths.count, stacklevel=2)
     _warn_of_rounding(estimate, problem)
     # A part of an estimate is not warned of again.
-    if start is None and first == 0 and problem.has_kinks:
-        _warn_of_law(estimate, problem, key, devices)
+    if start is None and first == 0:
+        warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
+        if problem.has_kinks:
+            _warn_of_law(estimate, problem, key, devices)
     return estimate
 
 
@@ -224,8 +233,17 @@ def _warn_of_law(
     laws = [law for path in paths for law in (laws_of(path) or {}).values()]
     if not any(isinstance(law, Discrete) for law in laws):
         return
+    if has_discrete_increments(problem.solver):
+        warnings.warn(
+            f"`phi` may not be smooth, and `{type(problem.solver).__name__}` has discrete "
+            "increments alone, which have the right means of smooth functions only. Pass "
+            'a solver of `suggest_solver(terms, t0, y0, args, want="strong")`.',
+            stacklevel=3,
+        )
+        return
     gaussian_path = ft.partial(own_path, problem.solver, "strong")
     terms = with_paths(gaussian_path, path_numbers(paths), problem.terms, key)
+    terms = without_truncation(terms)
     gaussian = dataclasses.replace(problem, terms=terms)
     key = trial_key(key)
     plan = few_paths(gaussian).prepare(gaussian, key, devices)

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt3
 
 from .._brownian import Discrete, random_words
 from .._custom_types import Y
-from .._terms import outcomes, step_variables
+from .._terms import outcomes
 from .polynomials import tensordot
 from .problem import Level, Problem
 
@@ -76,7 +76,7 @@ class Noise(eqx.Module):
     @staticmethod
     def of(problem: Problem, level: Level) -> "Noise":
         """Raises a `ValueError` for random variables without finitely many outcomes."""
-        laws = step_variables(problem.terms, level.h).laws
+        laws = problem.variables(level.h).laws
         discrete = tuple(law for law in laws if isinstance(law, Discrete))
         if len(discrete) < len(laws):
             raise ValueError(
@@ -263,7 +263,7 @@ class Noise(eqx.Module):
 
     def _terms(self, x: Any) -> PyTree:
         """The terms with paths that give these variables in every step."""
-        return step_variables(self.problem.terms, self.level.h).terms_with(x)
+        return self.problem.variables(self.level.h).terms_with(x)
 
     def _variances(self) -> np.ndarray:
         return np.array(

@@ -27,13 +27,20 @@ from .._terms import (
     check_start,
     check_stratonovich,
     constraint_of,
+    has_shapes,
+    needs_truncation,
+    path_numbers,
     specified,
+    step_variables,
+    StepVariables,
+    without_truncation,
 )
 from .arguments import (
     check_cells,
     check_finite,
     check_noise,
     check_shapes,
+    check_truncation,
     drawn_args,
     drawn_state,
     given_state,
@@ -100,6 +107,9 @@ class Problem(eqx.Module):
     weights: Float[Array | np.ndarray, "combinations levels"]
     # Whether to average at `t1` only, without an axis of times.
     at_end: bool = eqx.field(static=True)
+    # Which paths of the terms are one Brownian motion. Programs, whose keys are traced,
+    # cannot tell.
+    path_numbers: tuple[int, ...] = eqx.field(static=True)
     # The number of steps on the finest level. (Shapes must be known when compiling.)
     max_steps: int = eqx.field(static=True)
 
@@ -127,6 +137,7 @@ class Problem(eqx.Module):
                 "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
             )
         # In each sample other keys take the place of these.
+        shapes = has_shapes(terms)
         terms = specified(terms, ft.partial(own_path, solver, want))
         counts = step_numbers(t0, t1, dt0, ts)
 
@@ -150,6 +161,12 @@ class Problem(eqx.Module):
         if constraint_of(terms) is not None:
             check_start(terms, start, y0, args)
         check_noise(terms)
+        # Solvers make paths without knowing what they drive. Those of the user are kept.
+        if any(shapes):
+            needed = needs_truncation(terms, start, y0, args)
+            needless = [own and not need for own, need in zip(shapes, needed)]
+            terms = without_truncation(terms, needless)
+        check_truncation(terms, float(dt0))
         smallest = float(dt0) / 2 ** (levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):
             check_resolution(smallest, float(t0), float(t1), start.dtype)
@@ -171,6 +188,7 @@ class Problem(eqx.Module):
             levels=grid,
             weights=weights,
             at_end=ts is None,
+            path_numbers=path_numbers(brownian_paths(terms)),
             max_steps=int(grid.num_steps[-1]),
         )
 
@@ -242,6 +260,10 @@ class Problem(eqx.Module):
         )
         success = diffrax.is_okay(result) & all_finite(y)
         return y, eqx.filter(solver_state, eqx.is_array), success
+
+    def variables(self, h: Float[Array | np.ndarray, ""]) -> StepVariables:
+        """The random variables of a step of this size."""
+        return step_variables(self.terms, h, self.path_numbers)
 
     def values(self, t: Any, y: Y) -> Float[Array, " m"]:
         """All numbers of `phi` as one vector."""

@@ -191,6 +191,16 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
     ) -> diffrax.AbstractBrownianPath:
         """A Brownian path for fixed steps, with the random variables that the solver needs.
 
+        The path does not know the terms. So where an implicit solver needs increments alone
+        and these are Gaussian, it is a [`diffrax_symplectic.TruncatedBrownianPath`][]: with
+        noise that depends on the state, steps with unbounded increments may have no
+        solution. It loses variance in long steps, 0.1% at h = 1/20 and 16% at h = 1/2. For
+        additive noise, which needs none of this, pass a
+        [`diffrax_symplectic.FixedStepBrownianPath`][], or where a shape suffices, the
+        shape: [`diffrax_symplectic.expectation`][], [`diffrax_symplectic.ensemble`][] and
+        [`diffrax_symplectic.suggest_solver`][] see what the noise depends on.
+        [`diffrax_symplectic.langevin_terms`][] truncate nothing.
+
         **Arguments:**
 
         - `shape`: the shape of the increments, `(m,)` for `m` noises; or a PyTree of

@@ -86,18 +86,51 @@ def hamiltonian_terms(
     values or does not return real numbers.
     """
     check_takes("H0", H0, "t", "p", "q", "args")
-    if structure not in (None, *get_args(_Structure)):
-        raise ValueError(
-            f"`structure` must be one of {get_args(_Structure)}, or `None` to detect it; "
-            f"got {structure!r}."
-        )
+    _check_structure_name(structure)
     drift = constrained(diffrax.ODETerm(_Drift(H0, structure)), constraint)
     if noise is None and path is None:
         return diffrax.MultiTerm(drift)
     # If only one of the two was left out, its own check says so.
     noise = cast(_Hamiltonian, noise)
+    return diffrax.MultiTerm(
+        drift, *noise_terms(noise, path, structure=structure).terms
+    )
+
+
+def noise_terms(
+    noise: _Hamiltonian,
+    path: diffrax.AbstractBrownianPath | PyTree,
+    *,
+    structure: _Structure | None = None,
+) -> diffrax.MultiTerm:
+    r"""The noise of [`diffrax_symplectic.hamiltonian_terms`][] alone, without a drift:
+
+    $$\mathrm{d}p = -\sum_{k=1}^m \frac{\partial H_k}{\partial q} \circ \mathrm{d}w_k,
+      \qquad
+      \mathrm{d}q = \sum_{k=1}^m \frac{\partial H_k}{\partial p} \circ \mathrm{d}w_k.$$
+
+    Add it to other terms, `diffrax.MultiTerm(*terms.terms, *noise_terms(noise,
+    path).terms)`: noisy forces beside a bath of [`diffrax_symplectic.langevin_terms`][], or
+    a second noise with a path of its own.
+
+    **Arguments:** `noise`, `path` and `structure` are those of
+    [`diffrax_symplectic.hamiltonian_terms`][].
+
+    **Returns:** `MultiTerm(diffusion)`.
+
+    **Raises:** what [`diffrax_symplectic.hamiltonian_terms`][] raises for these arguments.
+    """
     check_takes("noise", noise, "t", "p", "q", "args")
-    return diffrax.MultiTerm(drift, HamiltonianNoise(noise, as_path(path), structure))
+    _check_structure_name(structure)
+    return diffrax.MultiTerm(HamiltonianNoise(noise, as_path(path), structure))
+
+
+def _check_structure_name(structure: Any) -> None:
+    if structure not in (None, *get_args(_Structure)):
+        raise ValueError(
+            f"`structure` must be one of {get_args(_Structure)}, or `None` to detect it; "
+            f"got {structure!r}."
+        )
 
 
 class IndexedNoise(eqx.Module):
@@ -433,6 +466,11 @@ def is_hamiltonian(term: diffrax.AbstractTerm) -> bool:
     return len(_parts(term)) > 0
 
 
+def drift_hamiltonians(terms: PyTree[diffrax.AbstractTerm]) -> list[_Hamiltonian]:
+    """The Hamiltonians of all drifts."""
+    return [part.H0 for part in _parts(terms) if isinstance(part, _Drift)]
+
+
 def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
     """The `structure` that the user asserted for a term, and for all parts of it."""
     asserted = {part.structure for part in _parts(term)}
@@ -448,7 +486,7 @@ def structure_asserted_in(term: diffrax.AbstractTerm) -> str | None:
     return "hamiltonian_terms" if is_hamiltonian(term) else None
 
 
-def _parts(term: diffrax.AbstractTerm) -> list[_Drift | HamiltonianNoise]:
+def _parts(term: PyTree[diffrax.AbstractTerm]) -> list[_Drift | HamiltonianNoise]:
     """What comes from Hamiltonians in a term, which may be wrapped or have friction."""
     return [x for x in jtu.tree_leaves(term, is_leaf=_is_part) if _is_part(x)]
 

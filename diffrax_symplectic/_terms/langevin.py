@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from .._arguments import check_pair, check_takes
-from .._brownian import increment_struct, raveled
+from .._brownian import increment_struct, raveled, TruncatedBrownianPath
 from .._compat import replaced, unwrapped, ω
 from .._custom_types import Args, BM, RealScalarLike
 from .constraint import constrained, Constraint
@@ -63,8 +63,10 @@ def langevin_terms(
     [`diffrax_symplectic.BAOAB`][], [`diffrax_symplectic.LangevinMiddle`][] and
     [`diffrax_symplectic.Damped`][] treat friction by a step of its own. Every other solver,
     from this package or from Diffrax, takes it as a part of the drift. More terms are added
-    by `diffrax.MultiTerm(*terms.terms, ...)`: other noise, or a second bath from
-    [`diffrax_symplectic.bath_terms`][].
+    by `diffrax.MultiTerm(*terms.terms, ...)`: other noise from
+    [`diffrax_symplectic.noise_terms`][], or a second bath from
+    [`diffrax_symplectic.bath_terms`][]. A bath shares its random key with no other term:
+    both would be one Brownian motion.
 
     **Arguments:**
 
@@ -79,7 +81,9 @@ def langevin_terms(
         `(t, q, args)` of these. `None` for friction without noise.
     - `path`: the Brownian path or its shape, as for
         [`diffrax_symplectic.hamiltonian_terms`][]: the shape of `q`, or `(m,)` for the `m`
-        directions of a `FrictionAlong`.
+        directions of a `FrictionAlong`. Of a
+        [`diffrax_symplectic.TruncatedBrownianPath`][], which would cool the bath, the path
+        within is taken.
     - `structure`: as for [`diffrax_symplectic.hamiltonian_terms`][].
     - `constraint`: as for [`diffrax_symplectic.hamiltonian_terms`][]. Then
         [`diffrax_symplectic.BAOAB`][] is the solver. Friction and noise act within the
@@ -129,6 +133,9 @@ def bath_terms(
         field = Friction(H0, checked_friction(friction, None))
         return diffrax.MultiTerm(diffrax.ODETerm(field))
     path = as_path(path)
+    if isinstance(path, TruncatedBrownianPath):
+        # As `solver.path` makes it, which does not know the terms. It would cool the bath.
+        path = path.path
     field = Friction(H0, checked_friction(friction, increment_struct(path)))
     # The same friction in both, so that they cannot get out of balance.
     noise = BathNoise(field.friction, checked_temperature(temperature), path)

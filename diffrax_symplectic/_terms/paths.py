@@ -67,6 +67,12 @@ def shapes_as_paths(terms: PyTree) -> PyTree:
     return jtu.tree_map(with_path, terms, is_leaf=_is_control)
 
 
+def has_shapes(terms: PyTree) -> list[bool]:
+    """For each Brownian path of the terms, in order, whether its shape stands in its
+    place."""
+    return [_is_unspecified(path) for path in brownian_paths(shapes_as_paths(terms))]
+
+
 def brownian_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
     """All Brownian paths of the terms, one for each place."""
     return [x for x in jtu.tree_leaves(terms, is_leaf=_is_path) if _is_path(x)]

@@ -30,6 +30,7 @@ from .hamiltonian import (
     structure_asserted_in,
 )
 from .langevin import friction_apart, split_friction
+from .said_twice import check_drifts_differ
 from .vector_fields import apply, check_increments, control_struct, split_terms
 
 
@@ -72,6 +73,7 @@ def check_structure(
 ) -> None:
     """Raises a `ValueError` unless a system has the structure that a solver needs."""
     check_increments(noise, t0, y0, args)
+    check_drifts_differ(drift)
     if structure not in get_args(Structure):
         raise ValueError(
             f"`structure` of the tableau of `{solver}` must be one of "

@@ -4,6 +4,7 @@ is estimated is exact up to the spread that is reported."""
 import os
 import subprocess
 import sys
+import types
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,9 +16,10 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation import simulation
+from diffrax_symplectic._expectation import array_rqmc, simulation
 from diffrax_symplectic._expectation.array_rqmc import step_words
 from diffrax_symplectic._expectation.moments import level_weights
+from diffrax_symplectic._expectation.sampling import SamplingPlan
 
 from ..families import slow_except
 from ..problems import kubo_terms, RecordingMeter
@@ -189,6 +191,7 @@ def test_solvers_of_diffrax_work_in_both_precisions(dtype):
 
 PROGRAM = """
 import sys
+import types
 import jax
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
@@ -434,3 +437,12 @@ def test_a_shape_stands_for_the_path_that_the_solver_needs(solver):
         for x in ((), path)
     )
     assert got.mean == expected.mean
+
+
+@pytest.mark.parametrize("variances", [(1.0, 0.0), (0.0, 1.0), (0.0, 0.0)])
+def test_a_variance_of_zero_is_no_gain(variances, monkeypatch):
+    left = iter(variances)
+    trial = lambda *given: types.SimpleNamespace(variance=next(left))
+    monkeypatch.setattr(array_rqmc, "run", trial)
+    plan = SamplingPlan(lambda keys: None, num_samples=16, batch_size=1)
+    assert array_rqmc._gain(plan, plan, jr.key(0), ()) == 1

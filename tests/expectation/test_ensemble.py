@@ -68,6 +68,23 @@ def test_terms_of_a_path_are_complete_if_the_terms_had_a_shape():
     np.testing.assert_allclose(paths.ys[1][7], sol.ys[1][-1], rtol=1e-14)
 
 
+@pytest.mark.parametrize(
+    "solver", [ds.AdditiveGauss(), ds.SRKw5(), ds.NinomiyaVictoir()]
+)
+def test_weak_methods_have_no_paths_with_the_law_of_the_solution(solver):
+    kick = ds.hamiltonian_terms(pendulum, lambda t, p, q, args: -q, ())
+    name = type(solver).__name__
+    with pytest.raises(ValueError, match=f'`{name}` is a weak method.*`want="weak"`'):
+        follow(kick, solver)
+    values = lambda paths: len(np.unique(np.round(paths.ys[0], 12)))
+    weak = follow(kick, solver, t1=0.25, num_paths=200, want="weak")
+    assert values(weak) < 40
+    # A path of the user's is taken as it is.
+    own = solver.path((), jr.key(0))
+    same = follow(ds.hamiltonian_terms(pendulum, kick.terms[1].noise, own), solver)
+    assert same.num_failed == 0
+
+
 @both_engines
 @pytest.mark.parametrize("solver", [ds.StormerVerlet(), ds.ImplicitMidpoint()])
 def test_a_shape_becomes_a_path_with_gaussian_increments_unless_a_weak_one_is_wanted(
@@ -76,8 +93,7 @@ def test_a_shape_becomes_a_path_with_gaussian_increments_unless_a_weak_one_is_wa
     kick = ds.hamiltonian_terms(pendulum, lambda t, p, q, args: -q, ())
     once = dict(terms=kick, solver=solver, t1=0.25, num_paths=200, engine=engine)
     values = lambda paths: len(np.unique(np.round(paths.ys[0], 12)))
-    # (A few are cut off for the implicit solver.)
-    assert values(follow(**once)) >= 190
+    assert values(follow(**once)) == 200
     assert values(follow(**once, want="weak")) == 3
     with pytest.raises(ValueError, match="`want` must be one of"):
         follow(**once, want="sharp")
@@ -162,11 +178,15 @@ def test_another_step_number_of_steps_parameter_and_start_compile_nothing(monkey
 
 @needs_drjit
 def test_an_error_within_a_step_is_raised():
-    path = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((), jr.key(0)))
-    terms = ds.hamiltonian_terms(pendulum, push, path)
-    assert follow(terms, engine="drjit").num_stragglers == 0
-    with pytest.raises(Exception, match="shorter than one unit of time"):
-        follow(terms, dt0=2.0, t1=4.0, engine="drjit")
+    def checked(t, p, q, args):
+        return pendulum(t, p, eqx.error_if(q, t > args, "too late"), args)
+
+    path = ds.FixedStepBrownianPath((), jr.key(0))
+    terms = ds.hamiltonian_terms(checked, push, path)
+    paths = follow(terms, args=jnp.array(9.0), engine="drjit")
+    assert paths.num_stragglers == 0
+    with pytest.raises(Exception, match="too late"):
+        follow(terms, args=jnp.array(0.5), engine="drjit")
 
 
 def waves(t, p, q, args):

@@ -58,6 +58,27 @@ def test_a_shape_becomes_a_gaussian_path_where_phi_jumps():
     assert isinstance(smooth.sampling, ds.ValueFunctions)
 
 
+def test_a_weak_method_has_no_gaussian_path():
+    options = dict(key=jr.key(1), sampling=ds.IndependentPaths(10))
+    solver = ds.SRKw5()
+    with pytest.warns(UserWarning, match="`SRKw5` has discrete increments alone"):
+        estimate = ds.expectation(beyond, walk(()), solver, 0, 1, 0.5, Y0, **options)
+    assert "Gaussian" not in estimate.reason
+
+
+def test_a_trial_with_gaussian_increments_is_made_at_long_steps_too():
+    # Truncated increments of which nothing is left would not do.
+    spring = lambda t, p, q, args: 0.1 * q**2 / 2
+    well = lambda t, p, q, args: (p**2 + q**2) / 2
+    terms = ds.hamiltonian_terms(well, spring, ds.WeakBrownianPath((), jr.key(0)))
+    y0 = jnp.array(0.0), jnp.array(1.0)
+    options = dict(key=jr.key(1), sampling=ds.IndependentPaths(1000))
+    solver = ds.ImplicitMidpoint()
+    kinked = lambda t, y, args: jnp.abs(y[1])
+    estimate = ds.expectation(kinked, terms, solver, 0, 2, 1.0, y0, **options)
+    assert np.isfinite(estimate.mean)
+
+
 def test_a_law_that_changes_the_mean_is_told():
     few = ds.IndependentPaths(20_000)
     weak = walk(ds.WeakBrownianPath((), jr.key(0)))

@@ -1,0 +1,62 @@
+"""Terms that say something twice: one drift that counts double, one noise in two places."""
+
+import diffrax
+import equinox as eqx
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import PyTree
+
+from .._brownian import is_key, typed_key
+from .._compat import is_traced, unwrapped
+from .hamiltonian import drift_hamiltonians
+from .langevin import BathNoise
+from .paths import brownian_paths
+from .vector_fields import flattened
+
+
+def check_drifts_differ(terms: PyTree[diffrax.AbstractTerm]) -> None:
+    """Raises a `ValueError` if two drifts have the same Hamiltonian, which would count
+    twice."""
+    found = []
+    for H0 in drift_hamiltonians(terms):
+        # Of Modules with traced parameters it is not known whether they are equal.
+        if any(eqx.tree_equal(H0, other) is True for other in found):
+            raise ValueError(
+                f"`H0` stands in two drift terms ({_name(H0)}), so it would count twice. "
+                "Make one drift of it, by `hamiltonian_terms` or `langevin_terms`, and add "
+                "noise alone by `noise_terms(noise, path)`, or a second bath by "
+                "`bath_terms(H0, friction, temperature, path)`: "
+                "`diffrax.MultiTerm(*terms.terms, *noise_terms(noise, path).terms)`."
+            )
+        found.append(H0)
+
+
+def _name(H0) -> str:
+    return getattr(H0, "__name__", type(H0).__name__)
+
+
+def check_baths_have_own_noise(terms: PyTree[diffrax.AbstractTerm]) -> None:
+    """Raises a `ValueError` if a bath shares a random key with another term: with one
+    Brownian motion for both, the temperature would be wrong. Traced keys may be equal
+    without being known to be."""
+    parts = [term for term in flattened(terms) if len(brownian_paths(term)) > 0]
+    keys = [_known_keys(term) for term in parts]
+    for place, term in enumerate(parts):
+        if not isinstance(unwrapped(term), BathNoise):
+            continue
+        others = set().union(*keys[:place], *keys[place + 1 :])
+        if keys[place] & others:
+            raise ValueError(
+                "The path of a bath has the same random key as the path of another term, "
+                "so both would be one Brownian motion, and the temperature would be wrong. "
+                "Give each a key of its own, by `key1, key2 = jax.random.split(key)`; or "
+                "where shapes are taken, pass the shape of each path."
+            )
+
+
+def _known_keys(term: diffrax.AbstractTerm) -> set[bytes]:
+    """The words of the random keys of the paths of a term."""
+    keys = filter(is_key, jtu.tree_leaves(brownian_paths(term)))
+    data = [jr.key_data(typed_key(key)) for key in keys]
+    return {np.asarray(words).tobytes() for words in data if not is_traced(words)}

@@ -1,0 +1,134 @@
+"""Every warning names the user's line, not one of the package."""
+
+import warnings
+from collections.abc import Callable
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._expectation import basis_choice, value_functions
+
+from ..drjit_here import needs_drjit
+
+
+def here(call: Callable, message: str) -> None:
+    """Asserts that `call` warns with this message, once, and in its own lines."""
+    with pytest.warns(UserWarning, match=message) as told:
+        call()
+    (found,) = [w for w in told if message in str(w.message)]
+    lines = {line for _, _, line in call.__code__.co_lines()}
+    assert found.filename == __file__ and found.lineno in lines
+
+
+ONE = jnp.array(0.0), jnp.array(1.0)
+KEY = jr.key(1)
+
+
+def walk(noise, path) -> diffrax.AbstractTerm:
+    """Terms without drift: these compile fastest."""
+    return diffrax.ControlTerm(noise, path)
+
+
+WEAK = walk(lambda t, y, args: y, ds.WeakBrownianPath((), jr.key(0)))
+GAUSSIAN = walk(lambda t, y, args: y, ds.FixedStepBrownianPath((), jr.key(0)))
+FEW = ds.IndependentPaths(100)
+
+
+def mean(phi, terms=WEAK, y0=None, sampling=FEW, **options) -> Callable:
+    """A call of the user's, in a line of this file."""
+    y0 = jnp.ones(1) if y0 is None else y0
+    given = phi, terms, diffrax.Heun(), 0, 1, 0.5, y0
+    return lambda: ds.expectation(*given, key=KEY, sampling=sampling, **options)
+
+
+def first(t, y, args):
+    return y[0]
+
+
+def test_of_the_loop_over_batches():
+    here(mean(first, tol=1e-9), "was not reached")
+    same = lambda key: jnp.ones(())
+    here(lambda: ds.monte_carlo(same, key=KEY, num_paths=10), "samples are equal")
+
+
+def test_of_rounding():
+    y0 = jnp.ones(1, jnp.float32)
+    path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((), jnp.float32), jr.key(0))
+    terms = walk(lambda t, y, args: 1e-6 * y, path)
+    here(mean(first, terms, y0), "Rounding errors may be larger")
+
+
+def test_of_the_law_where_phi_jumps():
+    weak = walk(lambda t, y, args: jnp.ones(1), ds.WeakBrownianPath((), jr.key(0)))
+    beyond = lambda t, y, args: (y[0] > 1.1).astype(float)
+    sampling = ds.IndependentPaths(20_000)
+    here(mean(beyond, weak, jnp.zeros(1), sampling), "changes by up to")
+
+
+def test_of_coordinates_to_sort_by():
+    sampling = ds.ArrayRQMC(256, 2)
+    here(mean(first, GAUSSIAN, jnp.ones(8), sampling), "sorted by 8 coordinates")
+
+
+@pytest.mark.parametrize("sampling", [ds.ValueFunctions(2, 64), ds.ArrayRQMC(256, 2)])
+def test_of_a_fit_that_takes_long(sampling, monkeypatch):
+    monkeypatch.setattr(basis_choice, "_OUT_OF_PROPORTION", 1)
+    # In eight dimensions sorted paths are sorted by a fit.
+    y0 = jnp.ones(2 if isinstance(sampling, ds.ValueFunctions) else 8)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*sorted by")
+        here(mean(first, WEAK, y0, sampling), "The fit of `ValueFunctions`")
+
+
+def test_of_a_fit_that_is_no_better(monkeypatch):
+    compared = value_functions._compared
+
+    def none_is_better(*given):
+        found = compared(*given)
+        unused = np.zeros_like(found.choice.used)
+        return found._replace(choice=found.choice._replace(used=unused))
+
+    monkeypatch.setattr(value_functions, "_compared", none_is_better)
+    here(mean(first, sampling=ds.ValueFunctions(2, 64)), "is no better than")
+
+
+def follow(terms, solver, t1, dt0, **options) -> Callable:
+    return lambda: ds.ensemble(
+        terms, solver, 0, t1, dt0, ONE, key=KEY, num_paths=60, **options
+    )
+
+
+def test_of_failed_paths():
+    singular = lambda t, p, q, args: p**2 / 2 + jnp.sqrt(q)
+    path = ds.FixedStepBrownianPath((), jr.key(0))
+    terms = ds.hamiltonian_terms(singular, lambda t, p, q, args: 2 * q**2, path)
+    here(follow(terms, ds.StormerVerlet(), 4, 0.25), "of 60 paths failed")
+
+
+@needs_drjit
+def test_of_stragglers():
+    stiff = lambda t, p, q, args: p**2 / 2 + 20 * q**4
+    path = ds.WeakBrownianPath((), jr.key(0))
+    terms = ds.hamiltonian_terms(stiff, lambda t, p, q, args: 0.2 * q, path)
+    solver = ds.ImplicitMidpoint()
+    here(follow(terms, solver, 4, 0.8, engine="drjit"), "were simulated again")
+    square = lambda t, y, args: y[1] ** 2
+    given = square, terms, solver, 0, 4, 0.8, ONE
+    options = dict(key=KEY, sampling=ds.IndependentPaths(60), engine="drjit")
+    here(lambda: ds.expectation(*given, **options), "were simulated again")
+
+
+def test_of_truncated_increments():
+    spring = lambda t, p, q, args: 0.5 * q**2 / 2
+    well = lambda t, p, q, args: (p**2 + q**2) / 2
+    terms = ds.hamiltonian_terms(well, spring, ())
+    solver = ds.ImplicitMidpoint()
+    here(follow(terms, solver, 0.5, 0.5), "lose 16.2% of their variance")
+    kinked = lambda t, y, args: jnp.abs(y[1])
+    given = kinked, terms, solver, 0, 1, 0.5, ONE
+    here(lambda: ds.expectation(*given, key=KEY, sampling=FEW), "lose 16.2% of their")

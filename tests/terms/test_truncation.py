@@ -1,0 +1,226 @@
+"""Gaussian increments are truncated only where an implicit step needs it: the laws are the
+exact ones, and what is lost otherwise is said."""
+
+import re
+import warnings
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._brownian import laws_of, lost_variance
+from diffrax_symplectic._solver import SOLVERS
+from diffrax_symplectic._terms import brownian_paths, step_variables
+
+
+ONE = jnp.array(0.0), jnp.array(1.0)
+MIDPOINT = ds.ImplicitMidpoint()
+WELL = lambda t, p, q, args: (p**2 + q**2) / 2
+KICK = lambda t, p, q, args: -0.5 * q
+SPRING = lambda t, p, q, args: 0.5 * q**2 / 2
+IMPLICIT = [s for s in SOLVERS if issubclass(s, diffrax.AbstractImplicitSolver)]
+
+
+def follow(terms, solver, h, steps, **options):
+    options = dict(key=jr.key(1), num_paths=20_000) | options
+    return ds.ensemble(terms, solver, 0, h * steps, h, ONE, **options)
+
+
+def kinds(terms):
+    """Which noises of these terms get truncated paths from the midpoint rule."""
+    given = 0, 0.01, 0.01, ONE
+    made = [ds.ensemble(terms, MIDPOINT, *given, key=jr.key(0), num_paths=1).terms(0)]
+    # In a bath the midpoint rule is not suggested first, and for noise in the forces later.
+    suggested = ds.suggest_solver(terms, 0.0, ONE, want="strong")
+    own = [s for s in suggested if type(s.solver) is ds.ImplicitMidpoint]
+    made += [s.terms(jr.key(0)) for s in own]
+    found = {
+        tuple(isinstance(path, ds.TruncatedBrownianPath) for path in brownian_paths(x))
+        for x in made
+    }
+    (same,) = found
+    return same
+
+
+def test_only_noise_that_depends_on_the_state_is_truncated():
+    shape = ()
+    additive = ds.hamiltonian_terms(WELL, KICK, shape)
+    multiplicative = ds.hamiltonian_terms(WELL, SPRING, shape)
+    assert kinds(additive) == (False,)
+    assert kinds(multiplicative) == (True,)
+    for friction in (0.5, lambda t, q, args: 0.5 + q**2):
+        bath = ds.langevin_terms(WELL, friction, 1.0, shape)
+        assert kinds(bath) == (False,)
+        for noise, cut in ((KICK, False), (SPRING, True)):
+            more = ds.noise_terms(noise, shape)
+            both = diffrax.MultiTerm(*bath.terms, *more.terms)
+            assert kinds(both) == (False, cut)
+
+
+def test_paths_of_the_user_are_kept_but_not_in_a_bath():
+    cut = MIDPOINT.path((), jr.key(0))
+    assert isinstance(cut, ds.TruncatedBrownianPath)
+    given = ds.hamiltonian_terms(WELL, KICK, cut)
+    kept = ds.ensemble(given, MIDPOINT, 0, 0.01, 0.01, ONE, key=jr.key(0), num_paths=1)
+    (path,) = brownian_paths(kept.terms(0))
+    assert isinstance(path, ds.TruncatedBrownianPath)
+    for make in (ds.langevin_terms, ds.bath_terms):
+        (path,) = brownian_paths(make(WELL, 0.5, 1.0, cut))
+        assert isinstance(path, ds.FixedStepBrownianPath)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+@pytest.mark.parametrize("h", [0.9, 0.5, 0.25, 0.05, 0.01])
+def test_lost_variance_is_that_of_the_law(h, k):
+    path = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((), jr.key(0)), k=k)
+    x = np.linspace(-12, 12, 400_001)
+    cut = np.minimum(np.abs(x), np.sqrt(2 * k * abs(np.log(h))))
+    density = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
+    lost = 1 - np.trapezoid(cut**2 * density, x)
+    assert abs(lost_variance(path, h) - lost) < 1e-9
+    wrapped = ds.TruncatedBrownianPath(path.path, k=9)
+    assert lost_variance(ds.TruncatedBrownianPath(wrapped, k=k), h) >= lost - 1e-9
+    assert lost_variance(path.path, h) == 0
+
+
+def test_numbers_of_the_docstring():
+    path = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((), jr.key(0)))
+    lost = [round(lost_variance(path, h), 3) for h in (1 / 20, 1 / 4, 1 / 2, 0.9, 1)]
+    assert lost == [0.001, 0.033, 0.162, 0.718, 1.0]
+
+
+def exact_moments(terms, solver, h, steps):
+    """The second moments of `(p, q)`, by a linear map."""
+    z = np.array([1.0, *map(float, ONE)])
+    K = np.asarray(ds.second_moment_map(terms, solver, 0.0, h, ONE))
+    return (np.linalg.matrix_power(K, steps) @ np.kron(z, z)).reshape(3, 3)[1:, 1:]
+
+
+def assert_moments(y, exact):
+    """Second moments of paths, within five standard errors."""
+    for i in range(2):
+        for j in range(2):
+            x = y[i] * y[j]
+            bound = 5 * x.std() / len(x) ** 0.5
+            # Some moments have no spread.
+            assert abs(x.mean() - exact[i, j]) < bound + 1e-12
+
+
+STEPS = (0.05, 0.25, 0.5, 0.9, 1.0, 2.0)
+QUICK = [(ds.ImplicitMidpoint, 0.5), (ds.ImplicitMidpoint, 2.0)]
+
+
+def matrix(solvers):
+    """Every solver with every step."""
+    cases = [
+        pytest.param(
+            solver,
+            h,
+            marks=() if (solver, h) in QUICK else pytest.mark.slow,
+            id=f"{solver.__name__} {h}",
+        )
+        for solver in solvers
+        for h in STEPS
+    ]
+    return pytest.mark.parametrize("solver, h", cases)
+
+
+def truncates(solver):
+    """Whether a solver takes noise that depends on the state, and truncates its path."""
+    path = solver().path((), jr.key(0), want="strong")
+    is_cut = isinstance(path, ds.TruncatedBrownianPath)
+    return is_cut and solver().structure in ("any", "separable")
+
+
+@matrix(IMPLICIT)
+def test_the_law_with_additive_noise_is_exact_at_every_step(solver, h):
+    # A linear system: the law is Gaussian, with these moments.
+    solver = solver()
+    systems = [ds.hamiltonian_terms(WELL, KICK, ())]
+    if not str(solver.structure).startswith("separable"):
+        # Friction in the drift is not separable.
+        systems.append(ds.langevin_terms(WELL, 0.5, 1.0, ()))
+    for shaped in systems:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                paths = follow(shaped, solver, h, 10)
+        except ValueError as error:
+            assert "is a weak method" in str(error)
+            continue
+        terms = paths.terms(0)
+        if any(laws_of(path) is None for path in brownian_paths(terms)):
+            assert solver.variables != ("W",)
+            continue
+        assert paths.num_failed == 0
+        assert_moments(paths.ys, exact_moments(terms, solver, h, 10))
+        if solver.variables == ("W",):
+            # All of a Gaussian law, by its tails.
+            x = paths.ys[1]
+            x = (x - x.mean()) / x.std()
+            assert abs((x**4).mean() - 3) < 5 * (96 / len(x)) ** 0.5
+
+
+def truncated_moments(solver, h):
+    """Second moments after one step with truncated increments, by quadrature: an integral
+    between the bounds, and what lies beyond at these."""
+    path = ds.FixedStepBrownianPath((), jr.key(0))
+    terms = ds.hamiltonian_terms(WELL, SPRING, path)
+    bound = np.sqrt(4 * abs(np.log(h)))
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    x = np.append(bound * nodes, [-bound, bound])
+    inner = bound * weights * np.exp(-((bound * nodes) ** 2) / 2) / np.sqrt(2 * np.pi)
+    beyond = (1 - inner.sum()) / 2
+    weights = np.append(inner, [beyond, beyond])
+
+    @jax.vmap
+    def end(value):
+        own = step_variables(terms, h).terms_with(value[None])
+        state = solver.init(own, 0.0, h, ONE, None)
+        return solver.step(own, 0.0, h, ONE, None, state, made_jump=False)[0]
+
+    y = np.stack(jax.jit(end)(x))
+    return np.einsum("k, ik, jk -> ij", weights, y, y)
+
+
+@matrix(filter(truncates, IMPLICIT))
+def test_with_multiplicative_noise_what_is_lost_is_said(solver, h):
+    solver = solver()
+    terms = ds.hamiltonian_terms(WELL, SPRING, ())
+    path = solver.path((), jr.key(0), want="strong")
+    if h >= 1:
+        with pytest.raises(ValueError, match="noise is too strong for the step"):
+            follow(terms, solver, h, 1)
+        return
+    with pytest.warns(UserWarning, match="of their variance in steps") as told:
+        paths = follow(terms, solver, h, 1)
+    percent = re.findall(r"lose ([\d.]+)%", str(told[0].message))
+    assert len(told) == 1 and percent == [f"{100 * lost_variance(path, h):.1f}"]
+    assert_moments(paths.ys, truncated_moments(solver, h))
+
+
+def test_little_loss_is_not_said():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        follow(ds.hamiltonian_terms(WELL, SPRING, ()), MIDPOINT, 0.04, 1, num_paths=10)
+
+
+def test_a_bath_is_as_hot_where_phi_has_kinks():
+    terms = ds.langevin_terms(WELL, 0.5, 1.0, ())
+    estimate = ds.expectation(
+        lambda t, y, args: jnp.abs(y[1]), terms, MIDPOINT, 0, 40, 0.8, ONE,
+        key=jr.key(0), sampling=ds.IndependentPaths(20_000), levels=1,
+    )  # fmt: skip
+    assert abs(estimate.mean - np.sqrt(2 / np.pi)) < 4 * estimate.std_error
+
+
+def test_long_steps_are_compared_too():
+    terms = ds.langevin_terms(WELL, 0.5, 1.0, ())
+    got = ds.compare_solvers(
+        terms, [MIDPOINT], 0.0, 2.0, [1.0], ONE, key=jr.key(0), num_paths=10
+    )
+    assert np.isfinite(got.steps[0].error) and got.steps[0].num_failed == 0
