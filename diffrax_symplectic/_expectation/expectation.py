@@ -173,11 +173,12 @@ def expectation(
     other shapes or more paths, terms without noise, and for paths that `sampling` cannot
     use (the message names suitable ones); a
     [`diffrax_symplectic.ExpectationInterrupted`][] holding the estimate so far, on a
-    keyboard interrupt. Warns if `tol` was not reached, if two levels do not agree, if failed
-    paths could change the mean by more than the standard error, if a few samples account for most of the variance,
-    if a fit was dropped or takes long, if all samples are equal or underflow, if `phi` is
-    not smooth and a trial with Gaussian increments has another mean than discrete ones, and
-    if rounding in single precision may exceed the standard error.
+    keyboard interrupt. Warns if `tol` was not reached, if two levels do not agree, if
+    failed paths could change the mean by more than the standard error, if a few samples
+    account for most of the variance, if a fit was dropped or takes long, if all samples
+    are equal or underflow, if `phi` is not smooth and a trial with Gaussian increments
+    has another mean than discrete ones, and if rounding in single precision may exceed
+    the standard error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and

@@ -98,7 +98,7 @@ class ValueFunctions(AbstractSampling):
 
     def prepare(self, problem, key, devices):
         chosen = chosen_basis(problem, self.degree)
-        warn_of_long_fit(chosen, stacklevel=6)
+        warn_of_long_fit(chosen, stacklevel=5)
         basis = chosen.basis
         trials = _Trials(
             problem,
