@@ -4,8 +4,8 @@
 # # A rigid body with noise
 #
 # A free rigid body with the moments of inertia $I_1, I_2, I_3$ is turned at random about
-# each of its axes. (A random torque would change $|X|$.) In the frame of the body, its angular momentum $X \in \mathbb R^3$
-# follows
+# each of its axes. (A random torque would change $|X|$.) In the frame of the body, its
+# angular momentum $X \in \mathbb R^3$ follows
 #
 # $$\mathrm{d}X = X \times \nabla H_0(X)\,\mathrm{d}t + \mu \sum_k X \times e_k \circ
 #   \mathrm{d}w_k, \qquad H_0 = \sum_i \frac{X_i^2}{2 I_i}.$$
