@@ -254,7 +254,8 @@ class Kernels:
                 *arrays, *of_path, h, scalar(i), *states, *memory, constants=constants
             )
             *results, success = results
-            # In this order: in another, a step in single precision takes 1.2 times as long.
+            # LLVM schedules by the order: with the success first, a step of `StormerVerlet`
+            # in single precision takes 1.13 times as long, and of Heun's method 0.85.
             for lost in (*errors, ~success.item()):
                 stopped = stopped | lost
             moved = chosen(results[len(states) :], self._moves)
