@@ -345,15 +345,29 @@ def source_lines(location: str) -> list[SourceLine]:
     """The lines that an operation of MLIR comes from, innermost first, out of its printed
     location. JAX records several if `jax_traceback_in_locations_limit` says so."""
     found = re.findall(r'"([^"]*)"\("([^"]+)":(\d+)', location)
-    return [
-        SourceLine(name.split(".")[-1], file, int(line)) for name, file, line in found
-    ]
+    return [SourceLine(_named(name), file, int(line)) for name, file, line in found]
+
+
+# What Python calls parts of a function: `fn.<locals>.<genexpr>` is a line of `fn`.
+_UNNAMED = ("<locals>", "<genexpr>", "<listcomp>", "<dictcomp>", "<setcomp>")
+
+
+def _named(qualified: str) -> str:
+    """The name of the function that code of this qualified name stands in."""
+    names = [part for part in qualified.split(".") if part not in _UNNAMED]
+    return names[-1] if names else qualified
 
 
 def is_literal(x: Any) -> bool:
     """Whether the value of an array of Dr.Jit is known while a kernel is recorded: it is a
     constant, or was computed from constants."""
     return x.state.name == "Literal"
+
+
+def variable_number(x: Any) -> int:
+    """The number that Dr.Jit has given to an array: the smallest that no other has. Each
+    operation that is recorded makes an array."""
+    return x.index
 
 
 def frozen(fn: Callable, most_recordings: int) -> Any:

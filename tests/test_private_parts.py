@@ -497,6 +497,23 @@ def test_the_lines_that_an_operation_comes_from_are_known():
     assert own.line == one.__code__.co_firstlineno + 1
 
 
+def test_a_line_of_a_generator_is_one_of_its_function():
+    """If this fails: print the location, and adapt `_named`."""
+
+    def one(x):
+        return sum(jnp.sin(i * x) for i in range(1, 2))
+
+    limit = jax.config.jax_traceback_in_locations_limit  # pyright: ignore
+    jax.config.update("jax_traceback_in_locations_limit", 10)
+    try:
+        sine = _operation(_lowered(one, ()), "stablehlo.sine")
+    finally:
+        jax.config.update("jax_traceback_in_locations_limit", limit)
+    own = [x for x in _compat.source_lines(str(sine.location)) if x.file == __file__]
+    assert own[0].function == "one"
+    assert own[0].line == one.__code__.co_firstlineno + 1
+
+
 @needs_drjit
 def test_drjit_knows_the_values_of_constants_and_of_what_follows_from_them():
     """If this fails: find how an array of Dr.Jit tells its state, and adapt `is_literal`.
@@ -507,6 +524,21 @@ def test_drjit_knows_the_values_of_constants_and_of_what_follows_from_them():
     pair = array_types()["complex<f64>"]
     assert _compat.is_literal(pair(1, 2))
     assert not _compat.is_literal(pair(1, number([1, 2])))
+
+
+@needs_drjit
+def test_drjit_numbers_the_variables_that_exist():
+    """If this fails: find how Dr.Jit tells how many operations were recorded, and adapt
+    `variable_number`. Without it nothing warns of kernels that compile for minutes."""
+    start = array_types()["f64"]([1, 2])
+    for number in (1000, 10):
+        first = _compat.variable_number(start + 1)
+        x = start
+        for _ in range(number):
+            x = x * x + start
+        # Two operations in each turn.
+        assert number < _compat.variable_number(x) - first < 3 * number
+        del x
 
 
 @needs_drjit

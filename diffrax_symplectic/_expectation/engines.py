@@ -41,7 +41,8 @@ def warn_of_stragglers(stragglers: int, lost: int, count: int, stacklevel: int) 
     if stragglers - lost > _MANY * count:
         warnings.warn(
             f"{stragglers:,} of {count:,} paths had steps that the fused kernel did not "
-            "solve, and were simulated again by JAX. Take smaller steps, or "
+            "solve, or the sine or cosine of an angle beyond 2^31 (in single precision "
+            "2^13), and were simulated again by JAX. Take smaller steps or angles, or "
             '`engine="jax"`.',
             stacklevel=stacklevel + 1,
         )
@@ -234,10 +235,13 @@ def _unraveled(y0: PyTree, entries: list[np.ndarray]) -> PyTree[np.ndarray]:
     """The state, from its entries, each with axes for paths and times."""
     leaves, treedef = jtu.tree_flatten(y0)
     left = iter(entries)
+    axes = entries[0].shape
     each = []
     for leaf in leaves:
-        own = np.stack([next(left) for _ in range(leaf.size)], axis=-1)
-        each.append(own.reshape(*own.shape[:-1], *leaf.shape))
+        own = [next(left) for _ in range(leaf.size)]
+        # An empty array has no entries to stack.
+        stacked = np.stack(own, axis=-1) if own else np.zeros((*axes, 0), leaf.dtype)
+        each.append(stacked.reshape(*axes, *leaf.shape))
     return treedef.unflatten(each)
 
 

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
+from .._compat import is_threefry
 from .._custom_types import Args, Y
 from .._terms import path_keys, with_keys
 
@@ -159,6 +160,7 @@ def split(
     `paths_differ` says whether each has its own initial state and `args`.
     """
     leaves, treedef = jtu.tree_flatten(system)
+    _check_keys([key, *leaves])
     # Arrays of NumPy, too: another parameter must not need another kernel.
     arrays = [jnp.asarray(x) if _is_array(x) else None for x in leaves]
     functions = PathFunctions(
@@ -172,6 +174,18 @@ def split(
         settings=(jax.default_backend(), jnp.result_type(float)),
     )
     return functions, [x for x in arrays if x is not None]
+
+
+def _check_keys(leaves: Sequence[Any]) -> None:
+    """Raises a `ValueError` for random keys of a generator that kernels do not have."""
+    for x in leaves:
+        if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            if not is_threefry(x):
+                raise ValueError(
+                    '`engine="drjit"` has JAX\'s default generator of random numbers, '
+                    f"threefry2x32; got a key of `{jr.key_impl(x)}`. Pass "
+                    '`jax.random.key(seed)`, or `engine="jax"`.'
+                )
 
 
 def _is_array(x: Any) -> bool:

@@ -11,7 +11,15 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._arguments import inside_jax
-from .._stablehlo import ArrayType, in_memory, MOST_IN_REGISTERS, Replay, Table, Tensor
+from .._stablehlo import (
+    array_types,
+    ArrayType,
+    in_memory,
+    MOST_IN_REGISTERS,
+    Replay,
+    Table,
+    Tensor,
+)
 
 
 class Program:
@@ -37,6 +45,17 @@ class Program:
             name: [next(left) for _ in jtu.tree_leaves(argument)]
             for name, argument in arguments.items()
         }
+        for leaf, of in zip(jtu.tree_leaves(arguments), self.replay.arguments):
+            _check_kind(leaf, of)
+
+
+def _check_kind(leaf: Any, of: ArrayType) -> None:
+    if of.kind not in array_types():
+        raise ValueError(
+            f'`engine="drjit"` has no numbers of type {leaf.dtype}, which an array in '
+            "`args` or `terms` has. Convert it, with `.astype(float)` or `.astype(int)`, "
+            'or pass `engine="jax"`.'
+        )
 
 
 def entry_kinds(types: Iterable[ArrayType]) -> list[str]:

@@ -27,8 +27,9 @@ operation has one. The [specification](https://openxla.org/stablehlo/spec) says 
 with NaN, infinities and integers, where Dr.Jit is often different. Where JAX itself is
 inexact, as for `erfc` in its tail, compare with `math` in a test beside the table. If in
 single precision Dr.Jit takes the function from a GPU's hardware, whose error is absolute,
-add its name to `HARDWARE` there. What has no rule is listed in `docs/ensembles.md`: take it
-off the list.
+add its name to `HARDWARE` there. Where Dr.Jit has no right answer for some numbers, mark
+their lanes by `Operation.fail`: JAX gets these paths. What has no rule is listed in
+`docs/ensembles.md`: take it off the list.
 
 This folder knows nothing of differential equations.
 """

@@ -9,22 +9,16 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
-from .._compat import is_literal
 from .backend import drjit
-from .elementwise import elementwise
+from .elementwise import elementwise, is_zero
 
 
 def is_complex(a: Any) -> bool:
     return drjit().is_complex_v(a)
 
 
-def _is_zero(a: Any) -> bool:
-    """Whether it is zero for all paths, known while the kernel is recorded."""
-    return is_literal(a) and a[0] == 0
-
-
 def _divide(a, b):
-    if _is_zero(b.imag):
+    if is_zero(b.imag):
         # By a real number, as in many Hamiltonians.
         inverse = 1 / b.real
         return type(a)(a.real * inverse, a.imag * inverse)
@@ -43,7 +37,7 @@ def _divide(a, b):
 
 def _absolute(a):
     dr = drjit()
-    if _is_zero(a.imag):
+    if is_zero(a.imag):
         return dr.abs(a.real)
     # Not scaled: the square of an amplitude beyond 1e154 overflows.
     return dr.sqrt(dr.fma(a.real, a.real, a.imag * a.imag))
@@ -81,13 +75,18 @@ def _exp(a):
     return type(a)(size * cosine, size * sine)
 
 
+def exponent(a, b):
+    """The logarithm of the power."""
+    return b * _log(a)
+
+
 def _power(a, b):
     dr = drjit()
     # The logarithm of zero is infinite, and its product with the exponent NaN.
     zero = (a.real == 0) & (a.imag == 0)
     to_the_zeroth = (b.real == 0) & (b.imag == 0)
     of_zero = dr.select(to_the_zeroth, type(a)(1), type(a)(0))
-    return dr.select(zero, of_zero, _exp(b * _log(a)))
+    return dr.select(zero, of_zero, _exp(exponent(a, b)))
 
 
 def _sine(a):

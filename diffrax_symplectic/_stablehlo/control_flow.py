@@ -1,12 +1,12 @@
 """Operations with regions: conditionals and loops."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from .._compat import block_of, call_target, operations_in
-from .backend import drjit
+from .backend import array_types, drjit
 from .operation import Operation, rule
-from .tensor import chosen, copied, flat, known, merged, Tensor, unflat
+from .tensor import as_own_literal, chosen, copied, flat, known, merged, Tensor, unflat
 
 
 @rule
@@ -34,7 +34,8 @@ def _case(o, index):
         return o.run(int(value) if 0 <= value < number else number - 1, [])
     raising = [i for i in range(number) if _raises(o.op.regions[i])]
     # A kernel cannot raise an error. Lanes that would are marked, and take another branch.
-    o.errors.extend(index.item() == i for i in raising)
+    for i in raising:
+        o.fail(index.item() == i)
     branches = [i for i in range(number) if i not in raising]
     return unflat(_taken(o, index.item(), branches), o.shapes())
 
@@ -52,7 +53,34 @@ def _taken(o: Operation, index: Any, branches: Sequence[int]) -> tuple:
 
     if not others:
         return run_first()
-    return o.recorded(drjit().if_stmt, (), index == first, run_first, run_others)
+    return _conditional(o, index == first, run_first, run_others)
+
+
+def _conditional(
+    o: Operation, condition: Any, if_true: Callable, if_false: Callable
+) -> tuple:
+    """The entries that one of two functions returns: where the condition holds, those of
+    the first."""
+
+    def with_failures(branch: Callable[[], tuple]) -> Callable[[], tuple]:
+        def run() -> tuple:
+            entries, failed = o.failing(branch)
+            return *entries, failed
+
+        return run
+
+    # Symbolic: as part of the kernel. Otherwise Dr.Jit may run a branch at once.
+    out = drjit().if_stmt(
+        (),
+        condition,
+        with_failures(if_true),
+        with_failures(if_false),
+        mode="symbolic",
+    )
+    # A constant of the inside would abort the process if it were used outside.
+    *entries, failed = map(as_own_literal, out)
+    o.fail(failed)
+    return tuple(entries)
 
 
 @rule
@@ -69,7 +97,7 @@ def _if(o, condition):
 
     # With `select` in its place both branches run: the midpoint rule, whose sweeps have
     # such branches, took 21 ns a step in place of 13.
-    out = o.recorded(drjit().if_stmt, (), condition.item(), if_true, if_false)
+    out = _conditional(o, condition.item(), if_true, if_false)
     return unflat(out, o.shapes())
 
 
@@ -114,11 +142,21 @@ def _loop(o: Operation, state: list[Tensor], moves: Sequence[bool]) -> list[Tens
     def whole(entries: Iterable[Any]) -> list[Tensor]:
         return merged(moves, unflat(entries, shapes), still)
 
-    def goes_on(*entries: Any) -> Any:
-        return o.run(0, whole(entries))[0].item()
+    def goes_on(failed: Any, *entries: Any) -> Any:
+        (going,), new = o.failing(lambda: o.run(0, whole(entries)))
+        # A lane that failed could go on for ever.
+        return going.item() & ~(failed | new)
 
-    def once(*entries: Any) -> tuple:
-        return copied(chosen(o.run(1, whole(entries)), moves))
+    def once(failed: Any, *entries: Any) -> tuple:
+        state, new = o.failing(lambda: o.run(1, whole(entries)))
+        return failed | new, *copied(chosen(state, moves))
 
-    out = o.recorded(drjit().while_loop, flat(start), goes_on, once)
-    return whole(out)
+    # Where no lane can fail, Dr.Jit leaves the mask out.
+    none = array_types()["i1"](False)
+    out = drjit().while_loop((none, *flat(start)), goes_on, once, mode="symbolic")
+    failed, *entries = map(as_own_literal, out)
+    o.fail(failed)
+    end = whole(entries)
+    # A loop returns no mask of its condition, but such lanes have stopped there.
+    o.run(0, end)
+    return end

@@ -13,6 +13,7 @@ import numpy as np
 
 from .._compat import is_literal
 from .backend import drjit
+from .integers import arithmetic_shift, logical_shift, safe_divisor, shift_left
 
 
 # Powers with whole exponents up to this size are products, of at most twelve factors, which
@@ -35,8 +36,28 @@ def _add(a, b):
     return a | b if drjit().is_mask_v(a) else a + b
 
 
+def is_zero(a: Any) -> bool:
+    """Whether it is zero for all paths, known while the kernel is recorded."""
+    return is_literal(a) and a[0] == 0
+
+
 def _multiply(a, b):
-    return a & b if drjit().is_mask_v(a) else a * b
+    dr = drjit()
+    if dr.is_mask_v(a):
+        return a & b
+    if dr.is_float_v(a):
+        # Dr.Jit folds each product with zero, though that with infinity is NaN.
+        if is_zero(a) and not is_literal(b):
+            return _times_zero(b, a)
+        if is_zero(b) and not is_literal(a):
+            return _times_zero(a, b)
+    return a * b
+
+
+def _times_zero(a, zero):
+    # The difference is zero, but not a constant, and NaN of an infinite number.
+    same = a - a
+    return a * (-same if np.signbit(zero[0]) else same)
 
 
 # Dr.Jit's own maximum and minimum of floats abort the process with LLVM 15 and 16, which
@@ -68,32 +89,15 @@ def _clamp(low, a, high):
 def _divide(a, b):
     if drjit().is_float_v(a):
         return a / b
-    safe, zero, _ = _divisor(a, b)
+    safe, zero, _ = safe_divisor(a, b)
     # Dr.Jit's `//` of integers rounds to zero, as StableHLO does.
     return drjit().select(zero, ~type(a)(0), a // safe)
-
-
-def _divisor(a, b):
-    """A safe divisor for integers, and where the given one is 0 and -1: processors trap on
-    division by zero, and of the smallest integer by -1."""
-    dr = drjit()
-    zero = b == 0
-    # A number without sign is never -1.
-    minus_one = (b == -1) if dr.is_signed_v(b) else ~zero & zero
-    overflow = minus_one & (a == _least(a))
-    return dr.select(zero | overflow, type(b)(1), b), zero, minus_one
-
-
-def _least(a):
-    """The smallest integer of its type."""
-    bits = 8 * drjit().itemsize_v(a)
-    return type(a)(-(2 ** (bits - 1)) if drjit().is_signed_v(a) else 0)
 
 
 def _remainder(a, b):
     dr = drjit()
     if not dr.is_float_v(a):
-        safe, zero, minus_one = _divisor(a, b)
+        safe, zero, minus_one = safe_divisor(a, b)
         rest = a - (a // safe) * safe
         return dr.select(zero, a, dr.select(minus_one, type(a)(0), rest))
     size = dr.abs(a)
@@ -306,21 +310,6 @@ def _erf_inv(a):
     return dr.select(dr.abs(a) < 1, y, start)
 
 
-def _shifted(shift: Callable) -> Callable:
-    """A shift by all bits or more gives zero, which LLVM leaves undefined."""
-
-    def fn(a, b):
-        return drjit().select(b < 8 * drjit().itemsize_v(a), shift(a, b), 0)
-
-    return fn
-
-
-def _arithmetic_shift(a, b):
-    # A shift by all bits or more leaves the sign.
-    bits = 8 * drjit().itemsize_v(a)
-    return a >> drjit().minimum(b, bits - 1)
-
-
 def _round_half_away(a):
     dr = drjit()
     # The sum of `a` and one half is rounded itself. The fraction that is compared is exact.
@@ -377,9 +366,9 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "round_nearest_even": dr.round,
         "rsqrt": _rsqrt,
         "select": dr.select,
-        "shift_left": _shifted(operator.lshift),
-        "shift_right_arithmetic": _arithmetic_shift,
-        "shift_right_logical": _shifted(operator.rshift),
+        "shift_left": shift_left,
+        "shift_right_arithmetic": arithmetic_shift,
+        "shift_right_logical": logical_shift,
         "sign": _sign,
         "sine": dr.sin,
         "sinh": _sinh,

@@ -4,6 +4,7 @@ Matrices are lists of rows, with an entry for all paths each. Everything is writ
 between loops of Dr.Jit values go through memory, which costs more than operations.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
@@ -26,7 +27,7 @@ def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
     index = array_types()["i32"]
     rows = [[*row] for row in a]
     pivots = []
-    for step in range(min(len(rows), len(rows[0]))):
+    for step in range(min(len(rows), len(rows[0]) if rows else 0)):
         # The largest entry of what is left of the column. Each path has its own.
         largest = dr.abs(rows[step][step])
         pivot = index(step)
@@ -116,7 +117,7 @@ def _matrices(o: Operation, x: Tensor) -> list[Matrix]:
     if max(rows, columns) > _MOST_UNKNOWNS:
         what = f"`{call_target(o.op)}` with more than {_MOST_UNKNOWNS} unknowns"
         raise NotReplayed(o.op, what)
-    places = x.places.reshape(-1, rows, columns)
+    places = x.places.reshape(math.prod(x.shape[:-2]), rows, columns)
     return [[[x.entries[i] for i in row] for row in matrix] for matrix in places]
 
 

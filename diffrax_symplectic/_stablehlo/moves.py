@@ -1,6 +1,7 @@
 """Operations that make, move or convert entries, one by one: the program knows where each
 goes."""
 
+import functools as ft
 import operator
 from typing import Any
 
@@ -8,7 +9,8 @@ import numpy as np
 
 from .backend import array_types, drjit
 from .complex import equal, is_complex
-from .operation import rule
+from .integers import to_integer
+from .operation import NotReplayed, rule
 from .tensor import constant, each, flat, Tensor
 
 
@@ -83,17 +85,25 @@ def _pad(o, x, value):
 
 @rule
 def _convert(o, x):
-    if o.kind is not array_types()["i1"]:
-        return [each(o.kind, x)]
+    return [each(ft.partial(_converted, o.kind), x)]
 
-    def is_true(entry: Any) -> Any:
-        return entry if type(entry) is o.kind else ~(entry == 0)
 
-    return [each(is_true, x)]
+def _converted(kind: type, entry: Any) -> Any:
+    dr = drjit()
+    if type(entry) is kind:
+        return entry
+    if dr.is_mask_v(kind):
+        return ~(entry == 0)
+    if dr.is_float_v(entry) and dr.is_integral_v(kind):
+        return to_integer(kind, entry)
+    return kind(entry)
 
 
 @rule
 def _bitcast_convert(o, x):
+    if o.shape != x.shape:
+        raise NotReplayed(o.op, f"`{o.op.name}` between numbers of different sizes")
+
     def reinterpreted(entry: Any) -> Any:
         return drjit().reinterpret_array(o.kind, entry)
 

@@ -3,6 +3,8 @@
 Their semantics: https://openxla.org/stablehlo/spec.
 """
 
+import functools as ft
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
@@ -17,10 +19,11 @@ from .._compat import (
     attribute_value,
     constant_values,
     has_attribute,
+    is_literal,
     sole_operation,
 )
 from .backend import array_types
-from .tensor import as_own_literal, Tensor
+from .tensor import Tensor
 
 
 class Operation(NamedTuple):
@@ -100,18 +103,22 @@ class Operation(NamedTuple):
         """The shapes of all results."""
         return [tuple(result.type.shape) for result in self.op.results]
 
-    def recorded(self, fn: Callable, *args: Any, **kwargs: Any) -> tuple:
-        """The entries that a loop or conditional of Dr.Jit returns, recorded with `fn`."""
+    def fail(self, mask: Any) -> None:
+        """Marks the lanes of this mask as failed."""
+        # That no lane fails is often known while the kernel is recorded.
+        if not (is_literal(mask) and not mask[0]):
+            self.errors.append(mask)
+
+    def failing(self, fn: Callable[[], Any]) -> tuple[Any, Any]:
+        """What `fn` returns, and the mask of the lanes that fail in it: within a loop or
+        branch a mask belongs to its inside, which has to return it."""
         before = len(self.errors)
-        # Symbolic: as part of the kernel. Otherwise Dr.Jit may run a loop step by step.
-        out = fn(*args, mode="symbolic", **kwargs)
-        if len(self.errors) > before:
-            # The mask belongs to the inside of the loop or branch, and has no value here.
-            raise NotReplayed(
-                self.op, "an error that is raised within a loop or branch"
-            )
-        # A constant of the inside would abort the process if it were used outside.
-        return tuple(map(as_own_literal, out))
+        out = fn()
+        failed = ft.reduce(
+            operator.or_, self.errors[before:], array_types()["i1"](False)
+        )
+        del self.errors[before:]
+        return out, failed
 
 
 class NotReplayed(Exception):

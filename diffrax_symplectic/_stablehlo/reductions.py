@@ -1,14 +1,18 @@
 """Operations that combine entries of an array: products of matrices, sums, sorting."""
 
+import functools as ft
 import itertools
 import math
+import operator
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from .._compat import is_literal
 from .backend import drjit
 from .complex import is_complex
+from .elementwise import is_zero
 from .operation import NotReplayed, Operation, rule
 from .tensor import known, Tensor
 
@@ -29,13 +33,31 @@ def _dot_general(o, a, b):
     right = _matrices(o, b, "rhs")
     _, rows, _ = left.shape
     batch, columns, _ = right.shape
+    # Of numbers of another type than the result: products and sums have its type.
+    a_entries = [x if type(x) is o.kind else o.kind(x) for x in a.entries]
+    b_entries = [x if type(x) is o.kind else o.kind(x) for x in b.entries]
     out = []
     for k, row, column in np.ndindex(batch, rows, columns):
+        ours = [a_entries[i] for i in left[k, row]]
+        theirs = [b_entries[j] for j in right[k, column]]
         total = o.kind(0)
-        for i, j in zip(left[k, row], right[k, column]):
-            total = _multiplied_and_added(a.entries[i], b.entries[j], total)
+        if drjit().is_float_v(total) and not is_complex(total):
+            total = total + _left_out(ours, theirs) + _left_out(theirs, ours)
+        for x, y in zip(ours, theirs):
+            total = _multiplied_and_added(x, y, total)
         out.append(total)
     return [Tensor(out, o.shape)]
+
+
+def _left_out(factors: Sequence[Any], others: Sequence[Any]) -> Any:
+    """The sum of the products that Dr.Jit leaves out, those with a zero that is known while
+    the kernel is recorded: zero, or NaN if the other factor may be infinite."""
+    unknown = [x for x in others if not is_literal(x)]
+    if not unknown or not any(map(is_zero, factors)):
+        return 0
+    # The same for all rows of a sparse matrix, so that they stay cheap.
+    total = ft.reduce(operator.add, unknown)
+    return total - total
 
 
 def _matrices(o: Operation, x: Tensor, side: str) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Replays a program that JAX lowered for one path on arrays with many paths."""
 
 import itertools
-import math
 from collections import ChainMap
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeAlias
@@ -49,6 +48,12 @@ class Replay:
     def arguments(self) -> list[ArrayType]:
         """The type of each argument."""
         return [_type_of(argument) for argument in self._main.arguments]
+
+    @property
+    def results(self) -> list[ArrayType]:
+        """The type of each result."""
+        *_, last = self._main.operations
+        return [_type_of(result) for result in last.operands]
 
     @property
     def handed_on(self) -> list[int | None]:
@@ -120,6 +125,9 @@ class Replay:
         if op.results and op.results[0] in self._memory:
             return [self._table(op.results[0])]
 
+        if op.results and all(map(_is_empty, op.results)):
+            return [Tensor([], tuple(result.type.shape)) for result in op.results]
+
         def run(i: int, args: Sequence[Tensor]) -> list[Tensor]:
             return self._block(block_of(op, i), args, values, errors)
 
@@ -129,7 +137,9 @@ class Replay:
             raise NotReplayed(op)
         try:
             return rule(operation, *operands)
-        except TypeError as error:
+        except (TypeError, RuntimeError) as error:
+            if _is_named(error):
+                raise
             # Dr.Jit's own, which names neither the operation nor its place.
             raise NotReplayed(op, f"`{op.name}` of these types ({error})") from error
 
@@ -145,17 +155,26 @@ def _type_of(variable: Any) -> ArrayType:
     return ArrayType(tuple(variable.type.shape), str(variable.type.element_type))
 
 
+def _is_named(error: BaseException | None) -> bool:
+    """Whether it follows from an operation in a branch or loop, which is named already."""
+    while error is not None and not isinstance(error, NotReplayed):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _is_empty(variable: Any) -> bool:
+    # A token, which orders side effects, has no shape.
+    return 0 in getattr(variable.type, "shape", ())
+
+
 def _large_constants(functions: list[Any]) -> dict[Any, np.ndarray]:
-    """The real constants of more entries than stay in registers, by their variables."""
+    """The constants of more entries than stay in registers, by their variables."""
     found = {}
     for op in _operations(functions):
         if op.name != "stablehlo.constant":
             continue
         (variable,) = op.results
-        shape, kind = _type_of(variable)
-        # Complex ones are written into the kernel, whatever their number.
-        is_real = "complex" not in kind
-        if is_real and math.prod(shape) > MOST_IN_REGISTERS:
+        if _type_of(variable).size > MOST_IN_REGISTERS:
             found[variable] = constant_values(op)
     return found
 

@@ -89,6 +89,15 @@ class Tensor(NamedTuple):
         return entry
 
 
+def same_table(a: Tensor, b: Tensor) -> bool:
+    """Whether both are the same part of the same array in memory."""
+    one = a.entries
+    other = b.entries
+    if not (isinstance(one, Table) and isinstance(other, Table)):
+        return False
+    return one.memory is other.memory and np.array_equal(one.places, other.places)
+
+
 def scalar(entry: Any) -> Tensor:
     """An array without axes."""
     return Tensor([entry], ())
@@ -158,6 +167,9 @@ def as_own_literal(entry: Any) -> Any:
     """An entry that a conditional or loop returned, for use after it. If both branches
     return the same constant, Dr.Jit returns the constant of the second branch, which is
     defined within it only: LLVM aborts the process if an outer branch returns that."""
+    if drjit().is_complex_v(entry):
+        # One part of a complex number may be a constant, and the other not.
+        return type(entry)(as_own_literal(entry.real), as_own_literal(entry.imag))
     return type(entry)(entry[0]) if is_literal(entry) else entry
 
 

@@ -51,8 +51,9 @@ def _windows(
     number = math.prod(map(len, axes))
     if number > _MOST_PLACES:
         what = (
-            f"`{o.op.name}` with an index per path, among {number} places (an array that "
-            "is computed beforehand may be larger)"
+            f"`{o.op.name}` with an index per path, among {number} places (the most are "
+            f"{_MOST_PLACES}, but for an array in `args` or from outside of the function "
+            "that is not drawn for each path, computed, or returned by a branch or loop)"
         )
         raise NotReplayed(o.op, what)
     for choice in itertools.product(*axes):
@@ -148,9 +149,19 @@ def _offsets(strides: Sequence[int], shape: Sequence[int]) -> np.ndarray | int:
     return sum(stride * index for stride, index in zip(strides, indices))
 
 
+def _wide(index: Tensor) -> Tensor:
+    """An index of a type that counts all places of an array: eight bits may be too few."""
+
+    def wide(entry: Any) -> Any:
+        few = drjit().itemsize_v(entry) < 4
+        return array_types()["i32"](entry) if few else entry
+
+    return each(wide, index)
+
+
 @rule
 def _dynamic_slice(o, x, *starts):
-    return [_window(o, x, starts, o.shape)]
+    return [_window(o, x, [*map(_wide, starts)], o.shape)]
 
 
 @rule
@@ -159,7 +170,7 @@ def _dynamic_update_slice(o, x, update, *starts):
     both = Tensor([*flat([x, update])], ())
     out = None
     # The first place is for all lanes; the others replace it in theirs.
-    for slices, here in _windows(o, x, starts, update.shape):
+    for slices, here in _windows(o, x, [*map(_wide, starts)], update.shape):
         places = x.places.copy()
         places[slices] = len(x.entries) + update.places
         out = _in_lanes(here, both.take(places), out)
@@ -196,12 +207,12 @@ def _starts(
     # If the axis is one more than there are, each vector is a single number.
     missing = vector_axis == len(indices.shape)
     shape = (*indices.shape, 1) if missing else indices.shape
+    indices = _wide(indices)
     places = np.moveaxis(indices.places.reshape(shape), vector_axis, -1)
     batch = places.shape[:-1]
-    kind = type(indices.entries[0])
 
     def number(i: Any) -> Tensor:
-        return constant(kind, np.asarray(i))
+        return constant(array_types()["i32"], np.asarray(i))
 
     def start(place: tuple[int, ...]) -> list[Tensor]:
         along = [number(0)] * len(x.shape)

@@ -12,6 +12,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation import engines
+from diffrax_symplectic._fused import kernels
 from diffrax_symplectic._stablehlo import backend
 
 from ..drjit_here import needs_drjit
@@ -206,7 +207,31 @@ def solved(t, p, q, args):
     return jnp.sum(p**2) / 2 + jnp.linalg.eigvalsh(jnp.eye(3) + jnp.outer(q, q))[0]
 
 
+def several(t, p, q, args):
+    return jnp.sum(p**2) / 2 + sum(jnp.abs(jnp.fft.fft(i * q))[0] for i in range(2))
+
+
+def in_bits(t, p, q, args):
+    high, _ = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(q[0]), jnp.int32)
+    return jnp.sum(p**2) / 2 + q[0] * high
+
+
+def short(t, p, q, args):
+    return jnp.sum(p**2) / 2 + jnp.sum(q.astype(jnp.float16))
+
+
+def deep(t, p, q, args):
+    def once(i, x):
+        return jax.lax.cond(x > 0, lambda: x * jnp.exp(jax.lax.lgamma(x)), lambda: x)
+
+    outer = lambda i, x: jax.lax.fori_loop(0, 12, once, x)
+    return jnp.sum(p**2) / 2 + jax.lax.fori_loop(0, 12, outer, q[0])
+
+
 REFUSED = [
+    (several, "`stablehlo.fft`"),
+    (in_bits, "`stablehlo.bitcast_convert` between numbers of different sizes"),
+    (short, "numbers of type `f16`"),
     (waves, "`stablehlo.fft`"),
     (ordered, "`stablehlo.sort` of more than 16 numbers"),
     (
@@ -236,6 +261,76 @@ def test_what_cannot_be_replayed_is_named_with_the_function_that_needs_it(H0, wh
     assert 'Pass `engine="jax"`' in str(info.value)
     # And what comes after that is as before.
     assert follow(engine="drjit").num_failed == 0
+
+
+@needs_drjit
+def test_of_branches_in_loops_in_loops_the_operation_is_named():
+    path = ds.WeakBrownianPath((), jr.key(0))
+    terms = ds.hamiltonian_terms(deep, lambda t, p, q, args: q[0], path)
+    with pytest.raises(ValueError, match="cannot replay `chlo.(lgamma|digamma)`"):
+        follow(terms, y0=(jnp.zeros(3), jnp.arange(3.0)), engine="drjit")
+
+
+@needs_drjit
+@pytest.mark.parametrize("kind", [jnp.int16, jnp.float16, jnp.bfloat16])
+def test_arrays_of_short_numbers_are_refused(kind):
+    given = dict(args={"a": jnp.ones(2), "b": jnp.ones(2, kind)}, engine="drjit")
+    with pytest.raises(ValueError, match=rf"type {jnp.dtype(kind)}, .*\.astype\(float"):
+        follow(**given)
+
+
+@needs_drjit
+def test_keys_of_another_generator_are_refused():
+    key = jr.key(1, impl="rbg")
+    terms = ds.hamiltonian_terms(pendulum, push, ds.WeakBrownianPath((), key))
+    for given in (dict(key=key), dict(terms=terms)):
+        with pytest.raises(ValueError, match="threefry2x32; got a key of `rbg`"):
+            follow(**given, engine="drjit")
+
+
+@needs_drjit
+def test_arrays_of_the_state_may_be_empty():
+    def energy(t, p, q, args):
+        return p["a"] ** 2 / 2 - jnp.cos(q["a"]) + jnp.sum(q["b"] * args)
+
+    terms = ds.hamiltonian_terms(
+        energy, lambda t, p, q, args: q["a"], ds.WeakBrownianPath((), jr.key(0))
+    )
+    one = lambda x: {"a": jnp.array(x), "b": jnp.zeros((0, 2))}
+    given = dict(terms=terms, y0=(one(0.0), one(1.0)), args=jnp.zeros((0, 2)))
+    fused = follow(**given, engine="drjit")
+    plain = follow(**given)
+    assert fused.ys[1]["b"].shape == (40, 0, 2)
+    np.testing.assert_allclose(fused.ys[1]["a"], plain.ys[1]["a"], rtol=1e-13)
+
+
+@needs_drjit
+def test_paths_whose_angles_are_too_large_for_the_kernel_are_taken_by_jax():
+    def driven(t, p, q, args):
+        return p**2 / 2 + q * jnp.sin(jnp.where(q < 0.65, 3e9, 1.0))
+
+    terms = ds.hamiltonian_terms(driven, push, ds.WeakBrownianPath((), jr.key(0)))
+    with pytest.warns(UserWarning, match="sine or cosine"):
+        fused = follow(terms, engine="drjit")
+    plain = follow(terms)
+    assert 0 < fused.num_stragglers < 40
+    np.testing.assert_allclose(fused.ys[1], plain.ys[1], rtol=1e-13)
+
+
+@needs_drjit
+def test_of_kernels_that_compile_for_longer_than_jax_a_warning_comes_first(monkeypatch):
+    # One of 200,000 operations would compile for minutes.
+    monkeypatch.setattr(kernels, "_MOST_OPERATIONS", 1_000)
+    follow(engine="drjit")
+
+    def median(t, p, q, args):
+        return p**2 / 2 + jnp.median(jnp.sin(q * jnp.arange(9.0)))
+
+    terms = ds.hamiltonian_terms(median, push, ds.WeakBrownianPath((), jr.key(0)))
+    with pytest.warns(
+        UserWarning, match=r"about 1,[5-9]\d\d operations.*`engine=\"jax\"`"
+    ):
+        follow(terms, engine="drjit")
 
 
 @needs_drjit

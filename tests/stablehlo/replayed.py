@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffrax_symplectic._stablehlo import drjit, in_memory, Replay, Tensor
+from diffrax_symplectic._stablehlo import array_types, drjit, in_memory, Replay, Tensor
 
 
 def text_of(fn: Callable, *structs: jax.ShapeDtypeStruct) -> str:
@@ -24,15 +24,42 @@ def replayed(fn: Callable, *args: np.ndarray) -> list[np.ndarray]:
     return replayed_text(text_of(fn, *structs), *args)
 
 
+def replayed_lanes(
+    fn: Callable, *args: np.ndarray
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """As `replayed`, and which lanes fail."""
+    structs = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in args]
+    return _replayed_lanes(text_of(fn, *structs), *args)
+
+
 def replayed_text(program: str, *args: np.ndarray) -> list[np.ndarray]:
+    """As `replayed`, of the text of a program."""
+    results, lost = _replayed_lanes(program, *args)
+    assert not np.any(lost)
+    return results
+
+
+def _replayed_lanes(
+    program: str, *args: np.ndarray
+) -> tuple[list[np.ndarray], np.ndarray]:
     replay = Replay(program)
     tensors = [tensor(x, of.kind) for x, of in zip(args, replay.arguments)]
     results, errors = replay(*tensors)
-    assert not errors
-    drjit().eval(*[result.entries for result in results])
+    drjit().eval(errors, *[result.entries for result in results])
     number = len(args[0])
-    stacked = lambda x: np.stack([lanes(entry, number) for entry in x.entries], -1)
-    return [stacked(x).reshape(number, *x.shape) for x in results]
+    arrays = [
+        stacked(x, of.kind, number).reshape(number, *x.shape)
+        for x, of in zip(results, replay.results, strict=True)
+    ]
+    lost = [lanes(error, number) for error in errors]
+    return arrays, np.any([np.zeros(number, bool), *lost], axis=0)
+
+
+def stacked(x: Tensor, kind: str, number: int) -> np.ndarray:
+    """The values of all entries in each lane, along the last axis."""
+    if not x.entries:
+        return np.zeros((number, 0), lanes(array_types()[kind](0), 1).dtype)
+    return np.stack([lanes(entry, number) for entry in x.entries], -1)
 
 
 def tensor(x: np.ndarray, kind: str) -> Tensor:

@@ -24,6 +24,10 @@ def energy(z):
     return polar + jnp.sum(jnp.abs(z) ** 4) + jnp.sin(jnp.abs(z[0]))
 
 
+def constant(a):
+    return lambda: jnp.asarray(2 + 1j, a.dtype)
+
+
 # Functions of two vectors of three complex numbers.
 CASES = {
     "add": lambda a, b: a + b,
@@ -55,6 +59,23 @@ CASES = {
     "gather": lambda a, b: a[np.array([2, 0])],
     "if": lambda a, b: lax.cond(jnp.real(a[0]) > 0, jnp.sin, lambda a: 2 * a, a),
     "while": lambda a, b: lax.fori_loop(0, 20, lambda i, x: x * b / jnp.abs(b), a),
+    "constants of branches": lambda a, b: (
+        lax.cond(jnp.real(a[0]) > 0, lambda: a * (2 + 1j), lambda: a * 0 + (2 + 1j))
+        * lax.cond(jnp.real(a[0]) > 0, constant(a), constant(a))
+    ),
+    "one constant part": lambda a, b: (
+        lax.cond(
+            jnp.real(a[0]) > 0,
+            lambda: lax.complex(jnp.real(a), jnp.full_like(jnp.real(a), 0.5)),
+            lambda: lax.complex(jnp.real(b), jnp.full_like(jnp.real(a), 0.5)),
+        )
+        ** 2
+    ),
+    "constants of loops": lambda a, b: lax.while_loop(
+        lambda state: state[0] < 9 + jnp.real(a[0]),
+        lambda state: (state[0] + 1, constant(a)()),
+        (jnp.zeros_like(jnp.real(a[0])), constant(a)() * 2),
+    )[1],
     "constants that are not finite": lambda a, b: (
         a * 0 + np.array([np.inf, 1j, 1 + 2j], a.dtype)[1:].sum()
     ),

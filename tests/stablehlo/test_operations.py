@@ -10,7 +10,7 @@ from jax import lax
 
 from ..drjit_here import needs_drjit
 from ..families import slow_except
-from .replayed import replayed
+from .replayed import replayed, replayed_lanes
 
 
 pytestmark = needs_drjit
@@ -66,6 +66,7 @@ def domain(low, high):
 
 
 unit = domain(-0.99, 0.99)
+INTEGERS = "int8", "uint8", "int32", "uint32", "int64", "uint64"
 
 # ruff: noqa: E501 (a table)
 # name: function, kinds and shapes of arguments, units in the last place.
@@ -95,6 +96,8 @@ CASES = {
     "constant": (lambda x: x + np.arange(6.0).reshape(2, 3).astype(x.dtype), [(F, (2, 3))], 0),
     "convert to numbers": (lambda x: x.astype(float), [(I, ())], 0),
     "convert to bool": (lambda x: x.astype(bool), [(F, ())], 0),
+    "convert out of range": (lambda x: jnp.stack([(x * s).astype(k).astype("int64") for k in INTEGERS for s in (1, 1e9, 1e19)]), [(F, ())], 0),
+    "convert between integers": (lambda x: jnp.stack([x.astype(k).astype("int64") for k in INTEGERS]), [(I, ())], 0),
     "convert to integers": (domain(-9, 9)(lambda x: jnp.where(x == x, x, 0).astype(jnp.int32)), [(F, ())], 0),
     "cosh": (domain(-9, 9)(jnp.cosh), [(F, ())], 16),
     "cosine": (domain(-9, 9)(jnp.cos), [(F, ())], 4),
@@ -103,6 +106,8 @@ CASES = {
     "divide of numbers without sign": (lax.div, [(U, ()), (U, ())], 0),
     "divide of integers": (lax.div, [(I, ()), (I, ())], 0),
     "dot_general": (lambda a, b: jnp.einsum("kij,kjl->kil", a, b), [(F, (2, 2, 3)), (F, (2, 3, 2))], None),
+    "dot_general of another type": (lambda a, b: jnp.dot(a.astype("int8"), b.astype("int8"), preferred_element_type="int32"), [(I, (4,)), (I, (4,))], 0),
+    "dot_general with zeros": (lambda a: jnp.array([[0, 1], [0.5, 2]], a.dtype) @ jnp.stack([a, 0.5 + 0 * jnp.sign(a)]), [(F, ())], 1),
     "dot_general of vectors": (jnp.dot, [(F, (4,)), (F, (4,))], None),
     "dynamic_slice": (lambda x, i: lax.dynamic_slice(x, (i, 0 * i), (2, 2)), [(F, (4, 2)), (I, ())], 0),
     "dynamic_update_slice": (lambda x, y, i: lax.dynamic_update_slice(x, y, (i,)), [(F, (4,)), (F, (2,)), (I, ())], 0),
@@ -127,6 +132,7 @@ CASES = {
     "maximum of integers": (jnp.maximum, [(U, ()), (U, ())], 0),
     "minimum": (jnp.minimum, [(F, ()), (F, ())], 0),
     "multiply": (jnp.multiply, [(F, ()), (F, ())], 0),
+    "multiply by zero": (lambda x: jnp.stack([0 * x, x * -0.0]), [(F, ())], 0),
     "multiply of integers": (jnp.multiply, [(U, ()), (U, ())], 0),
     "negate": (jnp.negative, [(F, ())], 0),
     "not": (jnp.bitwise_not, [(U, ())], 0),
@@ -162,8 +168,12 @@ CASES = {
     "scatter with a batch axis": (jax.vmap(lambda x, i: x.at[i % 3].set(7.0)), [(F, (2, 3)), (U, (2,))], 0),
     "select": (lambda b, x, y: jnp.where(b, x, y), [(B, ()), (F, ()), (F, ())], 0),
     "shift_left": (lax.shift_left, [(U, ()), (U, ())], 0),
-    "shift_right_arithmetic": (lambda a, b: lax.shift_right_arithmetic(a, jnp.abs(b) % 40), [(I, ()), (I, ())], 0),
+    "shift_left of signed numbers": (lax.shift_left, [(I, ()), (I, ())], 0),
+    "shift_right_arithmetic": (lax.shift_right_arithmetic, [(I, ()), (I, ())], 0),
+    "shift_right_arithmetic without sign": (lax.shift_right_arithmetic, [(U, ()), (U, ())], 0),
+    "shift_right_arithmetic of bytes": (lambda a, b: lax.shift_right_arithmetic(a.astype("uint8"), b.astype("uint8")), [(U, ()), (U, ())], 0),
     "shift_right_logical": (lax.shift_right_logical, [(U, ()), (U, ())], 0),
+    "shift_right_logical of signed numbers": (lax.shift_right_logical, [(I, ()), (I, ())], 0),
     "sign": (jnp.sign, [(F, ())], 0),
     "sign of integers": (jnp.sign, [(I, ())], 0),
     "sine": (domain(-9, 9)(jnp.sin), [(F, ())], 4),
@@ -180,7 +190,7 @@ CASES = {
     "tan": (domain(-1.5, 1.5)(jnp.tan), [(F, ())], 16),
     "tanh": (jnp.tanh, [(F, ())], 16),
     "transpose": (lambda x: jnp.transpose(x, (2, 0, 1)) * 1, [(F, (2, 3, 1))], 0),
-    "while": (lambda x, n: lax.while_loop(lambda c: c[1] < n % 50, lambda c: (jnp.cos(c[0]), c[1] + 1), (x, n * 0))[0], [(F, ()), (U, ())], None),
+    "while": (domain(-9, 9)(lambda x, n: lax.while_loop(lambda c: c[1] < n % 50, lambda c: (jnp.cos(c[0]), c[1] + 1), (x, n * 0))[0]), [(F, ()), (U, ())], None),
     "while of known length": (lambda x: lax.scan(lambda y, a: (y * 0.5 + a, y), x[0], x)[1], [(F, (4,))], 2),
     "while of known and long length": (lambda x: lax.fori_loop(0, 30, lambda i, y: y * 0.5 + x[i % 4], x[0]), [(F, (4,))], None),
     "xor": (jnp.bitwise_xor, [(U, ()), (U, ())], 0),
@@ -261,6 +271,61 @@ def test_the_complementary_error_function_has_all_digits_in_its_tails(dtype):
         np.testing.assert_allclose(actual, exact, rtol=0, atol=2e-6)
     else:
         assert_close(actual, exact, 16)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["f32", "f64"])
+def test_lanes_fail_whose_angles_are_too_large_for_sine_and_cosine(dtype):
+    largest = dtype({np.float32: 2**13, np.float64: 2**31}[dtype])
+    beyond = np.nextafter(largest, dtype(np.inf))
+    sizes = [largest, beyond, 3 * largest, 1e30, 1e6, 3000]
+    x = np.array([*sizes, *np.negative(sizes)], dtype)
+    waves = {
+        "itself": lambda x: jnp.stack([jnp.sin(x), jnp.cos(x)]),
+        "in a branch": lambda x: lax.cond(x > 0, jnp.sin, jnp.cos, x),
+        "in a loop": lambda x: lax.while_loop(
+            lambda y: y != jnp.cos(x), lambda y: jnp.cos(x), jnp.zeros_like(x)
+        ),
+        "of a loop that goes on": lambda x: lax.while_loop(
+            lambda y: jnp.sin(x * y) != 0, lambda y: y - 1, jnp.ones_like(x)
+        ),
+        "of complex numbers": lambda x: jnp.real(jnp.exp(lax.complex(x * 0, x))),
+    }
+    for name, fn in waves.items():
+        (actual,), lost = replayed_lanes(fn, x)
+        np.testing.assert_array_equal(lost, np.abs(x) > largest, name)
+        exact = np.asarray(jax.jit(jax.vmap(fn))(x))
+        np.testing.assert_allclose(
+            actual[~lost], exact[~lost], rtol=0, atol=4 * np.finfo(dtype).eps
+        )
+
+
+NONE = jnp.zeros(0)
+EMPTY = {
+    "itself": lambda x: jnp.stack([x])[:0],
+    "compare": lambda x: jnp.stack([x])[:0] > 1,
+    "convert": lambda x: jnp.stack([x])[:0].astype("int32"),
+    "complex": lambda x: jnp.real(lax.complex(NONE + x, NONE) * 1j),
+    "sort": lambda x: jnp.argsort(NONE + x),
+    "sum": lambda x: x + jnp.sum(jnp.zeros((0, 3)) + x, axis=0),
+    "concatenate": lambda x: jnp.concatenate([NONE, jnp.stack([x, x])]),
+    "gather": lambda x: jnp.stack([x, x])[NONE.astype("int32")],
+    "scatter": lambda x: jnp.stack([x, x]).at[NONE.astype("int32")].add(1.0),
+    "dot_general": lambda x: (jnp.zeros((2, 0)) + x) @ jnp.zeros((0, 3)),
+    "if": lambda x: lax.cond(x > 0, lambda: NONE + x, lambda: NONE),
+    "while": lambda x: lax.scan(lambda y, a: (y + x, y * a), NONE, jnp.ones(12)),
+    "solve": lambda x: jnp.linalg.solve(jnp.zeros((0, 0)) + x, NONE),
+    "det": lambda x: jnp.linalg.det(jnp.zeros((0, 0)) + x),
+}
+
+
+@pytest.mark.parametrize("name", EMPTY)
+def test_arrays_may_be_empty(name):
+    x = np.array([-1.0, 0.5, 3.0])
+    actual = replayed(EMPTY[name], x)
+    exact = jax.tree.leaves(jax.jit(jax.vmap(EMPTY[name]))(x))
+    for a, b in zip(actual, exact, strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
 
 
 def test_every_operation_of_the_table_is_tested():

@@ -99,6 +99,26 @@ def test_errors_name_the_lanes_that_raise_them():
     np.testing.assert_array_equal(np.asarray(result.item())[kept], 2 * X[kept])
 
 
+def test_errors_in_branches_and_loops_name_their_lanes():
+    import equinox as eqx
+
+    def in_a_branch(x):
+        raising = lambda x: eqx.error_if(2 * x, x > 1, "too large")
+        return jax.lax.cond(x > 0, raising, lambda x: x, x)
+
+    def in_a_loop(x):
+        def once(i, y):
+            return eqx.error_if(y + x, y > 2, "too large")
+
+        return jax.lax.fori_loop(0, 12, once, x)
+
+    for fn, exact in ((in_a_branch, [-1.0, 1.0]), (in_a_loop, [-13.0])):
+        replay = Replay(text_of(fn, jnp.zeros(())))
+        ((result,), errors) = replay(scalar(in_memory("f64", X)))
+        lost = np.any([np.asarray(error) for error in errors], axis=0)
+        np.testing.assert_array_equal(np.asarray(result.item())[~lost], exact)
+
+
 def test_what_has_no_rule_is_named_with_where_it_comes_from():
     limit = jax.config.jax_traceback_in_locations_limit  # pyright: ignore
     jax.config.update("jax_traceback_in_locations_limit", 10)

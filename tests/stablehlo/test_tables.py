@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from jax import lax
 
 import diffrax_symplectic as ds
 
@@ -18,6 +19,7 @@ pytestmark = needs_drjit
 GRID = np.linspace(-4, 4, 300)
 MEASURED = -np.cos(GRID)
 FORCES = np.sin(np.arange(100_000) / 10)
+PHASES = np.exp(1j * GRID)
 MAP = np.outer(MEASURED, np.sin(GRID))
 
 
@@ -36,7 +38,31 @@ def field(t, q, args):
     return (1 - rest) * args[i, 200 - i // 2] + rest * args[i + 1, 200 - i // 2]
 
 
+def branched(t, q, args):
+    read = lambda q: q * args[jnp.int32(30 * jnp.abs(q)) % 300]
+    return lax.cond(q > 0, read, lambda q: q * args[3], q)
+
+
+def mapped(t, q, args):
+    return jnp.sum(jax.vmap(lambda q: branched(t, q, args))(jnp.stack([q, -q / 2])))
+
+
+def by_bytes(t, q, args):
+    place = jnp.floor(40 * jnp.abs(lax.stop_gradient(q)))
+    one = args[place.astype(jnp.int8)]
+    return q * one + q * args[299 - place.astype(jnp.uint8)] / 3
+
+
+def rotated(t, q, args):
+    phases = jnp.asarray(PHASES, jnp.result_type(q, jnp.complex64))
+    return jnp.real(lax.complex(q, q**2) * phases[jnp.int32(40 * jnp.abs(q)) % 300])
+
+
 POTENTIALS = {
+    "in a branch": (branched, MEASURED),
+    "in branches of several": (mapped, MEASURED),
+    "at small indices": (by_bytes, MEASURED),
+    "of complex numbers": (rotated, None),
     "constants": (lambda t, q, args: jnp.interp(q, GRID, MEASURED), None),
     "args": (lambda t, q, args: jnp.interp(q, *args), (GRID, MEASURED)),
     "every second entry": (
@@ -64,7 +90,9 @@ def paths(name: str, engine: str, num_paths: int, dtype) -> ds.Ensemble:
 @pytest.mark.parametrize(
     "dtype", slow_except([jnp.float64], [jnp.float32, jnp.float64]), ids=["f32", "f64"]
 )
-@pytest.mark.parametrize("name", slow_except(["args", "field map"], POTENTIALS))
+@pytest.mark.parametrize(
+    "name", slow_except(["args", "in branches of several"], POTENTIALS)
+)
 def test_paths_are_the_same_as_in_jax(name, dtype):
     for number in (300, 40, 700):
         fused = paths(name, "drjit", number, dtype)

@@ -1,0 +1,63 @@
+"""Both engines take the same paths whatever a Hamiltonian is made of. Where a program of
+Dr.Jit is wrong, LLVM may abort the process: the systems run in processes of their own."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ..drjit_here import needs_drjit
+from ..families import slow_except
+from .fuzz import cases, IN_COMPANY_QUICK, of_control_flow
+
+
+pytestmark = needs_drjit
+
+# A process takes seconds to start, so several systems share one.
+FIRST = len(of_control_flow())
+COMPANY = FIRST + IN_COMPANY_QUICK
+QUICK = [range(0, 3), range(FIRST, FIRST + 25), range(FIRST + 25, COMPANY)]
+LONG = [
+    range(begin, min(begin + 12, end))
+    for start, end in ((3, FIRST), (COMPANY, len(cases())))
+    for begin in range(start, end, 12)
+]
+# A table is returned by a branch, for a checkpoint in the other one.
+REFUSED = {93}
+# Four steps; units in the last place of the largest number.
+ULPS = 32
+
+
+def measured(numbers: list[int]) -> tuple[dict[int, float | str], str]:
+    """How far the engines are apart, up to the first system that ends the process; and
+    what the process wrote last."""
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.fused.fuzz", *map(str, numbers)],
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    return dict(map(json.loads, done.stdout.splitlines())), done.stderr[-300:]
+
+
+@pytest.mark.parametrize(
+    "group",
+    slow_except(QUICK, [*QUICK, *LONG]),
+    ids=lambda group: f"{group.start}-{group.stop - 1}",
+)
+def test_systems_of_all_parts_have_the_same_paths(group):
+    apart, ended, left = {}, {}, [*group]
+    while left:
+        done, message = measured(left)
+        apart |= done
+        left = left[len(done) :]
+        if left:
+            ended[left.pop(0)] = message
+    assert not ended
+    refused = {number for number, ulps in apart.items() if ulps == "refused"}
+    assert refused == REFUSED & {*group}
+    solved = {number: ulps for number, ulps in apart.items() if number not in refused}
+    assert {number: ulps for number, ulps in solved.items() if ulps > ULPS} == {}
