@@ -60,7 +60,9 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     possibly your own; [`diffrax_symplectic.NinomiyaVictoir`][] and
     [`diffrax_symplectic.BAOAB`][]; and [`diffrax_symplectic.Damped`][] or
     [`diffrax_symplectic.LinearFlow`][] around one of these. With friction, rounding errors
-    grow by $e^{\gamma t}$ on the way back: use more checkpoints.
+    grow on the way back, about by $e^{\gamma t}$, and with
+    [`diffrax_symplectic.BAOAB`][] by $|(1 + x) / (1 - x)|$ in each step, $x = \gamma h /
+    2$: use more checkpoints. At $x = 1$ a step has no inverse.
 
     **Steps:** `diffrax.ConstantStepSize` or `diffrax.StepTo`. **Saving:** `SaveAt(t1=True)`
     or `SaveAt(ts=...)`. Events, forward mode and derivatives with respect to times are not
@@ -454,8 +456,9 @@ def _if_arrived(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyT
             gradients,
             ~arrived,
             "`ReversingAdjoint` could not reconstruct the solution: rounding errors grew "
-            "too large between two checkpoints. Increase `checkpoints`, or pass "
-            "`adjoint=diffrax.RecursiveCheckpointAdjoint()`.",
+            "too large between two checkpoints, or a step has no inverse, as one of "
+            "`BAOAB` with rate of friction times step equal to 2. Increase `checkpoints`, "
+            "change the step, or pass `adjoint=diffrax.RecursiveCheckpointAdjoint()`.",
         )
 
     # A gradient that is silently wrong would be worse.

@@ -63,7 +63,8 @@ def _of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
     instead = "" if bounded else " or bounded increments, as from a `WeakBrownianPath`,"
     yield (
         f"{estimate.num_failed:,} paths failed: {rest}. Take smaller steps{instead} and "
-        "look for NaNs in `y0`, `args` and the Hamiltonians."
+        "look for NaNs in `y0`, `args` and the Hamiltonians, and for a `temperature` or "
+        "`friction` that is negative or, as a matrix, not symmetric positive semidefinite."
     )
 
 

@@ -254,7 +254,8 @@ def _warn_of(joined: Batch, bounded: bool) -> None:
         warnings.warn(
             f"{lost:,} of {count:,} paths failed. Their states are NaN: select the others "
             f"with `~failed`. Take smaller steps{instead} and look for NaNs in `y0`, "
-            "`args` and the Hamiltonians.",
+            "`args` and the Hamiltonians, and for a `temperature` or `friction` that is "
+            "negative or, as a matrix, not symmetric positive semidefinite.",
             stacklevel=3,
         )
     warn_of_stragglers(joined.stragglers, lost, count, stacklevel=3)

@@ -1,6 +1,7 @@
 """Linear systems with the Jacobian of the stage equations."""
 
 import functools as ft
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
@@ -48,25 +49,32 @@ class NewtonCorrection(NamedTuple):
     - `residual`: the value of the equations before it.
     - `change`: what to subtract from the iterate.
     - `found`: whether its linear system was solved.
+    - `derivative`: the derivative of the equations before it, along a vector.
     """
 
     residual: _Vector
     change: _Vector
     found: Bool[Array, ""]
+    derivative: _Map
 
 
 def correction(fn: _Map, x: _Vector, solver: LinearSolver) -> NewtonCorrection:
     """The Newton correction for `fn(x) = 0` at `x`."""
     if solver is not None or x.size > _MAX_DENSE:
         value, derivative = jax.linearize(fn, x)
-        return NewtonCorrection(value, *solve(derivative, value, solver))
+        return NewtonCorrection(value, *solve(derivative, value, solver), derivative)
 
     # With `jvp` the compiled program contains `fn` only once.
     def value_and_column(unit: _Vector) -> tuple[_Vector, _Vector]:
         return jax.jvp(fn, (x,), (unit,))
 
     value, matrix = jax.vmap(value_and_column, out_axes=(None, 1))(_units(x))
-    return NewtonCorrection(value, eliminate(matrix, value), jnp.array(True))
+
+    def product(vector: _Vector) -> _Vector:
+        # Unrolled, so that XLA fuses it: it reduces short axes slowly on CPUs.
+        return ft.reduce(operator.add, vector[:, None] * matrix.T)
+
+    return NewtonCorrection(value, eliminate(matrix, value), jnp.array(True), product)
 
 
 def solve(

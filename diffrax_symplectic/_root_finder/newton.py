@@ -117,7 +117,7 @@ class Newton(eqx.Module):
         def equations(k: _Vector) -> _Vector:
             return (1 - s) * (k - self.start) + s * self.residual(k)
 
-        residual, change, found = correction(equations, y, self.linear_solver)
+        residual, change, found, _ = correction(equations, y, self.linear_solver)
         moved = max_norm(y)
         k = y - change
         states = self.scale(self.restore(k))

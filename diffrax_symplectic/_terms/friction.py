@@ -119,7 +119,7 @@ def _noise_of(g: Any, T: ArrayLike, w: Array, x: Array) -> Array:
     w = like(w, x)
     matrix = g.value if isinstance(g, _Square) else g
     if _is_matrix(matrix, jnp.shape(x)):
-        scale = jnp.sqrt(2 * like(_single_temperature(T), x))
+        scale = _root(2 * like(_single_temperature(T), x))
         root = g.root if isinstance(g, _Square) else semidefinite_root(like(g, x))
         return scale * jnp.tensordot(like(root, x), w, jnp.ndim(w))
     if jnp.shape(T) not in ((), jnp.shape(x)):
@@ -129,7 +129,7 @@ def _noise_of(g: Any, T: ArrayLike, w: Array, x: Array) -> Array:
             f"{_broadcast_advice('temperature', jnp.shape(T), jnp.shape(x))}"
         )
     # Where either is negative, NaN makes the path fail.
-    return jnp.sqrt(like(matrix, x)) * jnp.sqrt(2 * like(T, x)) * w
+    return _root(like(matrix, x)) * _root(2 * like(T, x)) * w
 
 
 def _noise_along(columns: _P, T: ArrayLike, control: BM) -> _P:
@@ -143,7 +143,7 @@ def _noise_along(columns: _P, T: ArrayLike, control: BM) -> _P:
         )
 
     def kick(directions: Array) -> Array:
-        scale = jnp.sqrt(2 * like(T, directions))
+        scale = _root(2 * like(T, directions))
         return directions @ (scale * like(flat, directions))
 
     return jtu.tree_map(kick, columns)
@@ -250,6 +250,19 @@ def not_negative(g: Array) -> Array:
     """`g`, or NaN where it is negative."""
     # Traced values cannot raise an error; NaN makes their path fail.
     return jnp.where(g >= 0, g, jnp.nan)
+
+
+def _root(x: Array) -> Array:
+    """The square root, with the derivative zero at zero, and NaN of negative numbers.
+
+    A friction or temperature that is zero in a part of space, or for some momenta, stays
+    zero along most directions. The infinite derivative of `jnp.sqrt`, times zero, would
+    make the derivatives along these NaN.
+    """
+    positive = x > 0
+    root = jnp.sqrt(jnp.where(positive, x, 1))
+    # Zero itself, and not a part of `x`, which would hand its derivative on.
+    return jnp.where(positive, root, jnp.where(x == 0, 0.0, jnp.nan).astype(x.dtype))
 
 
 def like(x: ArrayLike, y: Array) -> Array:

@@ -58,7 +58,8 @@ def langevin_terms(
     whatever the masses are. (For a rate $\gamma$, $\mathrm{d}p = \ldots - \gamma
     p\,\mathrm{d}t$, pass $G = \gamma m$.) If $H_0$ and $T$ are constant, the density
     $e^{-H_0 / T}$ is stationary. The noise is the same in the sense of Ito and of
-    Stratonovich.
+    Stratonovich. $B$ holds the roots of $G$ and $T$. Where one of these is zero, the
+    derivative of its root, which is infinite, counts as zero in gradients.
 
     [`diffrax_symplectic.BAOAB`][], [`diffrax_symplectic.LangevinMiddle`][] and
     [`diffrax_symplectic.Damped`][] treat friction by a step of its own. Every other solver,

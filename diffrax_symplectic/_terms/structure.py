@@ -382,7 +382,8 @@ _GENERAL = (
 
 FRICTION = (
     "Take friction from `langevin_terms(H0, friction, temperature, path)`: `BAOAB()`, "
-    "`LangevinMiddle()` and `Damped(solver)` treat it by a step of its own."
+    "`LangevinMiddle()` and `Damped(solver)` treat it by a step of its own. (`BAOAB` and "
+    "`LangevinMiddle` need a kinetic energy that is quadratic in p.)"
 )
 
 

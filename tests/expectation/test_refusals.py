@@ -192,3 +192,13 @@ def test_a_function_of_spins_is_told_that_it_gets_a_pair():
     # What was left out is still told.
     with pytest.raises(TypeError, match="Was it left out"):
         mean(lambda t, y, args: args["size"] * ds.from_spinors(y)[2])
+
+
+def test_a_warning_of_failed_paths_names_temperature_and_friction():
+    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    terms = ds.langevin_terms(H0, 1.0, lambda t, q, args: -0.1 + 0 * q, ())
+    at = terms, ds.BAOAB(), 0, 0.2, 0.1, (jnp.array(0.0), jnp.array(1.0))
+    with pytest.warns(
+        UserWarning, match="`temperature` or `friction` that is negative"
+    ):
+        ds.ensemble(*at, key=jr.key(0), num_paths=4)

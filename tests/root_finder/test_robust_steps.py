@@ -371,3 +371,18 @@ def test_linear_solvers_of_the_user_replace_elimination():
 
 def _program(fn, *args) -> str:
     return str(jax.make_jaxpr(fn)(*args))
+
+
+def test_stiff_steps_beside_a_wall_without_friction_are_solved():
+    # Newton's method differentiates the root of the friction, which is zero here.
+    H0 = lambda t, p, q, args: p**2 / 2 + 1e4 * q**2 / 2
+    wall = lambda t, q, args: jnp.maximum(q - 1, 0)
+    y0 = jnp.array(0.0), jnp.array(0.5)
+    ends = []
+    for friction in (wall, 0.0):
+        path = ds.WeakBrownianPath((), jr.key(0))
+        terms = ds.langevin_terms(H0, friction, 1.0, path)
+        sol = diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), 0, 2, 0.25, y0)
+        ends.append(sol.ys)
+    # It never reaches the wall.
+    np.testing.assert_allclose(*ends, atol=1e-11)

@@ -602,3 +602,66 @@ def test_a_gradient_through_a_solve():
     forward = ft.partial(end, adjoint=diffrax.ForwardMode())
     found, exact = jax.jit(jax.grad(backward)), jax.jit(jax.jacfwd(forward))
     np.testing.assert_allclose(found(1.2), exact(1.2), rtol=1e-13)
+
+
+def circle(centre, radius):
+    """A pendulum whose pivot is at the centre, with the height and the length in units."""
+    kinetic = lambda t, p, q, args: jnp.sum(p**2) / 2 + radius * q[1]
+    on = lambda q, args: jnp.sum((q - centre) ** 2)[None] - radius**2
+    return kinetic, on
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize("pivot", [(0.0, 0.0), (0.0, 1.0), (0.6, 0.8), (0.0, 1000.0)])
+def test_no_step_depends_on_the_origin_or_the_unit_of_length(pivot, dtype):
+    # With a bath, so that many come close to the origin at a low temperature. The radius
+    # is a unit of length.
+    for radius in (1.0, 1000.0, 1e-3):
+        centre = radius * jnp.array(pivot, dtype)
+        H0, on = circle(centre, jnp.array(radius, dtype))
+        y0 = jnp.array([0.1 * radius, 0.0], dtype), centre.at[1].add(-radius)
+        path = jax.ShapeDtypeStruct((2,), dtype)
+        terms = ds.langevin_terms(H0, 1.0, 0.01 * radius**2, path, constraint=on)
+        times = np.array([0, 2, 0.1], np.dtype(dtype))
+        paths = ds.ensemble(terms, ds.BAOAB(), *times, y0, key=jr.key(0), num_paths=500)
+        assert paths.num_failed == 0
+        far = radius * (1 + np.hypot(*pivot))
+        error = np.abs(
+            np.linalg.norm(paths.ys[1] - np.asarray(centre), axis=1) - radius
+        )
+        assert np.max(error) <= 10 * np.finfo(dtype).eps * far
+
+
+def test_steps_that_are_too_long_are_never_taken_for_solved():
+    H0, on = circle(jnp.array([0.0, 1.0]), 1.0)
+    terms = ds.hamiltonian_terms(H0, constraint=on)
+
+    @jax.jit
+    @jax.vmap
+    def end(speed):
+        y0 = jnp.stack([speed, 0 * speed]), jnp.zeros(2, speed.dtype)
+        solver = ds.StormerVerlet()
+        h = jnp.array(0.3, speed.dtype)
+        y1, *_, result = solver.step(terms, 0 * h, h, y0, None, no_failure(), False)
+        return on(y1[1], None)[0], result == diffrax.RESULTS.successful
+
+    for dtype in (jnp.float64, jnp.float32):
+        off, okay = end(jnp.geomspace(1e-3, 100.0, 20_000, dtype=dtype))
+        # Some do not reach the circle.
+        assert 0.5 < np.mean(okay) < 0.95
+        assert np.max(np.abs(off[okay])) <= 10 * np.finfo(dtype).eps
+
+
+def test_momenta_that_were_normal_are_a_valid_start():
+    p, q = jnp.array([0.3, 0.7]), jnp.array([0.3, 0.7])
+    y0 = ds.constrained_state(PENDULUM, (p, q))
+    ds.StormerVerlet().init(PENDULUM, 0.0, 0.1, y0, None)
+
+
+def test_a_start_in_single_precision_is_told_of_the_times():
+    single = jax.tree.map(jnp.float32, (jnp.array([0.2, 1.0]), jnp.array([0.3, 0.5])))
+    y0 = ds.constrained_state(PENDULUM, single)
+    with pytest.raises(Exception, match="dtype of the times"):
+        diffrax.diffeqsolve(PENDULUM, ds.StormerVerlet(), 0.0, 1.0, 0.5, y0)
+    times = jnp.array([0.0, 1.0, 0.5], jnp.float32)
+    diffrax.diffeqsolve(PENDULUM, ds.StormerVerlet(), *times, y0)

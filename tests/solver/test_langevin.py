@@ -110,8 +110,11 @@ def test_free_particles_diffuse_as_einstein_says_for_any_step(friction, solver):
     G = FRICTIONS[friction]
     H0 = lambda t, p, q, args: KINETIC["each"](p)
     terms = ds.langevin_terms(H0, G, T, _path((3,)))
-    slowest = min(np.linalg.eigvals(_matrix(G) / np.asarray(MASSES)))
-    fastest = max(np.linalg.eigvals(_matrix(G) / np.asarray(MASSES)))
+    # The rates of friction, which are those of a symmetric matrix.
+    root_masses = np.sqrt(np.asarray(MASSES))
+    rates = np.linalg.eigvalsh(_matrix(G) / np.outer(root_masses, root_masses))
+    slowest = rates[0]
+    fastest = rates[-1]
     for rate_h in (0.2, 1.0, 4.0):
         h = rate_h / fastest
         K = _moment_map(terms, solver, h, (jnp.zeros(3),) * 2)
