@@ -54,6 +54,7 @@ from ._solver import (
     LangevinMiddle as LangevinMiddle,
     LevyAreaMidpoint as LevyAreaMidpoint,
     LinearFlow as LinearFlow,
+    linear_flow as linear_flow,
     ImplicitMidpoint as ImplicitMidpoint,
     NinomiyaVictoir as NinomiyaVictoir,
     PlateauGauss as PlateauGauss,

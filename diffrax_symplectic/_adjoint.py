@@ -31,6 +31,7 @@ from ._solver import (
     AbstractSplitting,
     AbstractSymplecticRungeKutta,
     BAOAB,
+    is_solver,
     NinomiyaVictoir,
 )
 from ._tableau import is_own_inverse, make_plan
@@ -169,7 +170,10 @@ def _undoes_its_steps(solver: Any) -> bool:
     # `isinstance` would look through wrappers, such as `diffrax.HalfSolver`.
     kind = type(solver)
     # With negated increments `NinomiyaVictoir` takes its flows in reverse order.
-    if issubclass(kind, NinomiyaVictoir | BAOAB):
+    if issubclass(kind, BAOAB):
+        flow = solver.flow
+        return not is_solver(flow) or _undoes_its_steps(flow)
+    if issubclass(kind, NinomiyaVictoir):
         return True
     if issubclass(kind, AbstractSplitting):
         return _undoes_its_steps(solver.solver)

@@ -5,6 +5,8 @@ from .separable import PlateauVerlet, SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet
 from .additive import AdditiveGauss, SRKs4, SRKw5
 from .beyond import LevyAreaMidpoint, NinomiyaVictoir, PlateauGauss, StrangGauss
 from .langevin import AbstractLangevinSplitting, BAOAB, LangevinMiddle
+from .flow import is_solver
+from .linear_flow import linear_flow
 from .paths import common_path, own_path
 from .times import check_resolution
 from .splitting import AbstractSplitting, Damped, LinearFlow

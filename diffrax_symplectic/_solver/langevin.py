@@ -1,20 +1,19 @@
 """Langevin dynamics by splitting: kicks of the forces, drifts of the positions, and
 friction and noise between them."""
 
+import functools as ft
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
 import diffrax
 import equinox as eqx
-import jax.numpy as jnp
-import jax.tree_util as jtu
 import optimistix as optx
 from jax import lax
 from jaxtyping import Array, PyTree
 
-from .._arguments import check_state
+from .._arguments import check_state, whole_number
 from .._compat import unwrapped
-from .._custom_types import Args, RealScalarLike, Y
+from .._custom_types import Args, Y
 from .._tableau import Structure
 from .._terms import (
     apply,
@@ -28,21 +27,52 @@ from .._terms import (
 from .base import AbstractSymplecticSolver, Record
 from .bath import after_friction, check_friction
 from .constrained import baoab_step, force_at, init_constrained
+from .flow import (
+    begun,
+    check_flow,
+    check_follows,
+    Flow,
+    is_solver,
+    kicks_and_rest,
+    moved,
+    moved_by,
+)
 from .step import result_of
 from .times import result_at
 
 
-class AbstractLangevinSplitting(AbstractSymplecticSolver):
-    """A kick, half a drift, friction and noise, half a drift. A symmetric splitting makes
-    one half of the kick at the start of the step and one at its end; any other makes the
-    whole kick at the start."""
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
-    structure: ClassVar[Structure] = "separable"
+
+class SplittingState(NamedTuple):
+    """What a splitting hands on from the end of a step to the start of the next one.
+
+    - `forces`: those of the kicks, if a step begins and ends with half a kick.
+    - `flow`: the state of the solver that is the flow, if there is one.
+    """
+
+    forces: PyTree[Array]
+    flow: PyTree[Array]
+
+
+class AbstractLangevinSplitting(AbstractSymplecticSolver):
+    """A kick, half a flow, friction and noise, half a flow. A symmetric splitting makes one
+    half of the kick at the start of the step and one at its end; any other makes the whole
+    kick at the start."""
+
     variables: ClassVar[tuple[str, ...]] = ("W",)
     symmetric: eqx.AbstractClassVar[bool]
+    flow: AbstractVar[Flow]
+    # The steps of a solver over half a flow.
+    steps: AbstractVar[int]
 
     def stage_vectors(self, num_noises):
-        return ()
+        if not is_solver(self.flow):
+            return ()
+        return 2 * self.steps * self.flow.stage_vectors(num_noises)  # pyright: ignore
 
     def order(self, terms):
         return 2 if self.symmetric else 1
@@ -52,64 +82,71 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         check_state(y0, name)
         terms, y0 = momentum_first(terms, y0)
         drift, friction, noise = split_friction(terms)
-        check_structure(self.structure, drift, noise, t0, y0, args, name)
+        kicks, rest = kicks_and_rest(self.flow, drift)
+        check_structure("separable", kicks, noise, t0, y0, args, name)
         if not all(isinstance(unwrapped(x), diffrax.ODETerm) for x in drift):
             raise ValueError(
                 f"`{name}` needs a drift driven by time: pass `langevin_terms(H0, "
                 "friction, temperature, path)`."
             )
         check_friction(drift, friction, t0, y0, args, name)
+        check_follows(self.flow, rest, t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args) -> Any:
-        """The forces, which a symmetric splitting hands on from the end of a step to the
-        start of the next one."""
-        del t1
         self.check(terms, t0, y0, args)
-        if not self.symmetric:
-            return None
         terms, y0 = momentum_first(terms, y0)
         drift, _, _ = split_friction(terms)
-        forces, _ = rate(drift, t0, y0, args)
-        return forces
+        kicks, rest = kicks_and_rest(self.flow, drift)
+        forces = None
+        if self.symmetric and kicks:
+            forces, _ = rate(kicks, t0, y0, args)
+        return SplittingState(forces, begun(self.flow, rest, t0, t1, y0, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         own_terms = terms
         own_y0 = y0
         terms, y0 = momentum_first(own_terms, own_y0)
         drift, friction, noise = split_friction(terms)
+        kicks, rest = kicks_and_rest(self.flow, drift)
+        forces, flow_state = solver_state
         p, q = y0
         h = t1 - t0
         half = h / 2
+        middle = t0 + half
 
         def forces_at_start() -> PyTree[Array]:
-            return rate(drift, t0, y0, args)[0]
+            return rate(kicks, t0, y0, args)[0]
 
-        # B
-        if self.symmetric:
-            forces = _handed_on(solver_state, made_jump, forces_at_start)
+        # Kick
+        if self.symmetric and kicks:
+            forces = _handed_on(forces, made_jump, forces_at_start)
             p = moved(p, half, forces)
-        else:
+        elif kicks:
             p = moved(p, h, forces_at_start())
-        # A. Of the rates at (p, q), XLA drops the half that is not used.
-        _, velocities = rate(drift, t0, (p, q), args)
-        q = moved(q, half, velocities)
-        # O
+        # Flow. Of the rates at (p, q), XLA drops the half that is not used.
+        follow = ft.partial(moved_by, self.flow, self.steps, rest)
+        (p, q), flow_state, _ = follow(t0, middle, half, (p, q), args, flow_state)
+        # Friction and noise
         kick = None
         if len(noise) > 0:
             drawn = drawn_variables(noise, ["W"], t0, t1, type(self).__name__)
-            kick, _ = apply(noise, drawn["W"], args, t0 + half, (p, q))
-        p = after_friction(friction, t0 + half, h, (p, q), args, kick)
-        # A
-        _, velocities = rate(drift, t1, (p, q), args)
-        q = moved(q, half, velocities)
-        # B
-        state = None
-        if self.symmetric:
-            state, _ = rate(drift, t1, (p, q), args)
-            p = moved(p, half, state)
-        result = result_at(terms, t0, t1, result_of(None, (p, q)))
+            kick, _ = apply(noise, drawn["W"], args, middle, (p, q))
+        p = after_friction(friction, middle, h, (p, q), args, kick)
+        # Flow
+        begin = t1 if self.flow is None else middle
+        (p, q), flow_state, flowed = follow(begin, t1, half, (p, q), args, flow_state)
+        # Kick
+        if self.symmetric and kicks:
+            forces, _ = rate(kicks, t1, (p, q), args)
+            p = moved(p, half, forces)
+        R: Any = diffrax.RESULTS
+        result = result_of(None, (p, q))
+        if self.flow is not None:
+            result = R.where(flowed == R.successful, result, flowed)
+        result = result_at(terms, t0, t1, result)
         # Exchanged once more, if the state is Diffrax's (x, v).
         _, y1 = momentum_first(own_terms, (p, q))
+        state = SplittingState(forces, flow_state)
         return y1, None, dict(y0=own_y0, y1=y1), state, result
 
 
@@ -191,6 +228,11 @@ class BAOAB(AbstractLangevinSplitting):
     constraints.
     """
 
+    flow: Flow = None
+    steps: int = eqx.field(
+        default=1, static=True, converter=ft.partial(whole_number, "steps")
+    )
+
     symmetric: ClassVar[bool] = True
     keeps_constraints: ClassVar[bool] = True
     record: ClassVar[Record] = Record(
@@ -205,9 +247,25 @@ class BAOAB(AbstractLangevinSplitting):
         stationary=("qq", "pq"),
     )
 
+    def __check_init__(self):
+        check_flow(self.flow, self.steps, type(self).__name__)
+        if issubclass(type(self.flow), AbstractLangevinSplitting):
+            raise ValueError(
+                f"`{type(self.flow).__name__}` has a bath of its own. Pass a solver for "
+                "systems without noise as `flow`, such as `StormerVerlet()`."
+            )
+
+    @property
+    def structure(self) -> Structure:
+        return self.flow.structure if is_solver(self.flow) else "separable"  # pyright: ignore
+
     def init(self, terms, t0, t1, y0, args) -> Any:
         if constraint_of(terms) is None:
             return super().init(terms, t0, t1, y0, args)
+        if self.flow is not None:
+            raise ValueError(
+                "`BAOAB` with a `flow` takes no terms with a `constraint`. Use `BAOAB()`."
+            )
         solved = init_constrained(self, terms, t0, y0, args)
         return ConstrainedState(force_at(terms, t0, y0, args), solved)
 
@@ -259,6 +317,9 @@ class LangevinMiddle(AbstractLangevinSplitting):
     """
 
     symmetric: ClassVar[bool] = False
+    structure: ClassVar[Structure] = "separable"
+    flow: ClassVar[None] = None
+    steps: ClassVar[int] = 1
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
@@ -268,13 +329,3 @@ class LangevinMiddle(AbstractLangevinSplitting):
         suggested=("weak", "strong"),
         stationary=("qq", "pp"),
     )
-
-
-def moved(x: PyTree, time: RealScalarLike, rate: PyTree) -> PyTree:
-    """`x` after `time` at a constant rate."""
-
-    def leaf_moved(x: Array, v: Array) -> Array:
-        # In the precision of the state, which times need not have.
-        return x + jnp.asarray(time, jnp.result_type(x)) * v
-
-    return jtu.tree_map(leaf_moved, x, rate)

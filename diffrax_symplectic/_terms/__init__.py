@@ -3,7 +3,7 @@ from .controls import drawn_variables, drift_driven, noise_driven, outcomes
 from .controls import step_variables, StepVariables
 from .dependence import acts_elementwise, Dependence
 from .hamiltonian import evaluated, hamiltonian_terms, has_lifted, IndexedNoise
-from .hamiltonian import is_hamiltonian, noise_terms
+from .hamiltonian import is_hamiltonian, noise_terms, slow_apart
 from .diffrax_langevin import momentum_first
 from .friction import FrictionAlong, semidefinite_root
 from .langevin import (

@@ -1,5 +1,6 @@
 """The terms of a Hamiltonian system: vector fields from its Hamiltonians, by `jax.grad`."""
 
+import dataclasses
 import functools as ft
 from collections.abc import Callable
 from typing import Any, cast, get_args, Literal
@@ -14,7 +15,7 @@ from jaxtyping import Array, PyTree, Shaped
 
 from .._arguments import check_pair, check_takes, shapes, whole_number
 from .._brownian import increment_struct
-from .._compat import ω
+from .._compat import replaced, unwrapped, ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike
 from .constraint import constrained, Constraint
 from .dependence import Dependence
@@ -35,6 +36,7 @@ def hamiltonian_terms(
     *,
     structure: _Structure | None = None,
     constraint: Constraint | None = None,
+    slow: Callable[[RealScalarLike, _P, Args], Array] | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of a stochastic Hamiltonian system, from its Hamiltonians.
 
@@ -74,6 +76,9 @@ def hamiltonian_terms(
         [`diffrax_symplectic.StormerVerlet`][] and [`diffrax_symplectic.BAOAB`][], with
         $H_0 = p \cdot M^{-1} p / 2 + U(t, q)$ and $H_k = U_k(t, q)$; all other solvers
         raise an error. Start from [`diffrax_symplectic.constrained_state`][].
+    - `slow`: `slow(t, q, args)`, a potential that is added to `H0`, and whose force is soft
+        or expensive. [`diffrax_symplectic.BAOAB`][] with a `flow` evaluates it once in a
+        step, and leaves `H0` to the flow. For all other solvers it is a part of the drift.
 
     `p` and `q` are PyTrees of arrays of the same structure and shapes.
 
@@ -87,7 +92,10 @@ def hamiltonian_terms(
     """
     check_takes("H0", H0, "t", "p", "q", "args")
     _check_structure_name(structure)
-    drift = constrained(diffrax.ODETerm(_Drift(H0, structure)), constraint)
+    if slow is not None:
+        check_takes("slow", slow, "t", "q", "args")
+    drift = diffrax.ODETerm(Drift(H0, structure, slow=slow))
+    drift = constrained(drift, constraint)
     if noise is None and path is None:
         return diffrax.MultiTerm(drift)
     # If only one of the two was left out, its own check says so.
@@ -235,21 +243,61 @@ def lifted_terms(
     return hamiltonian_terms(Lifted(H0, chart), lifted, path)
 
 
-class _Drift(eqx.Module):
-    """The vector field `(-dH0/dq, dH0/dp)`."""
+class Drift(eqx.Module):
+    """The vector field `(-dH0/dq, dH0/dp)`, where `slow` is a part of `H0`."""
 
     H0: _Hamiltonian
     structure: _Structure | None = eqx.field(static=True, default=None)
     # The user's function call that took `structure`, for messages.
     made_by: str = eqx.field(static=True, default="hamiltonian_terms")
+    slow: Callable | None = None
 
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
         check_pair(y)
 
         def scalar(p: _P, q: _P) -> Array:
-            return scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
+            energy = scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
+            if self.slow is None:
+                return energy
+            return energy + _slow_energy(self.slow, t, q, args)
 
         return symplectic_gradient(scalar, y)
+
+
+class SlowForce(eqx.Module):
+    """The vector field `(-dU/dq, 0)` of a potential `slow(t, q, args)`."""
+
+    slow: Callable
+
+    def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
+        check_pair(y)
+        p, q = y
+
+        def energy(q: _P) -> Array:
+            return _slow_energy(self.slow, t, q, args)
+
+        return (-(jax.grad(energy)(q) ** ω)).ω, jtu.tree_map(jnp.zeros_like, p)
+
+
+def _slow_energy(slow: Callable, t: RealScalarLike, q: _P, args: Args) -> Array:
+    return scalar_energy(evaluated("slow", slow, t, q, args=args), "slow")
+
+
+def slow_apart(drift: tuple) -> tuple[tuple, tuple]:
+    """The terms of the drift without their slow potentials, and terms of these alone."""
+    rest = []
+    slow = []
+    for term in drift:
+        own = unwrapped(term)
+        field = own.vector_field if isinstance(own, diffrax.ODETerm) else None
+        if isinstance(field, Drift) and field.slow is not None:
+            alone = dataclasses.replace(field, slow=None)
+            # `replaced` keeps the direction of time, which Diffrax wraps around each term.
+            rest.append(replaced(term, diffrax.ODETerm(alone)))
+            slow.append(replaced(term, diffrax.ODETerm(SlowForce(field.slow))))
+        else:
+            rest.append(term)
+    return tuple(rest), tuple(slow)
 
 
 def scalar_energy(out: PyTree, name: str = "H0") -> Array:
@@ -468,7 +516,7 @@ def is_hamiltonian(term: diffrax.AbstractTerm) -> bool:
 
 def drift_hamiltonians(terms: PyTree[diffrax.AbstractTerm]) -> list[_Hamiltonian]:
     """The Hamiltonians of all drifts."""
-    return [part.H0 for part in _parts(terms) if isinstance(part, _Drift)]
+    return [part.H0 for part in _parts(terms) if isinstance(part, Drift)]
 
 
 def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
@@ -480,16 +528,16 @@ def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
 def structure_asserted_in(term: diffrax.AbstractTerm) -> str | None:
     """The function that made a term from Hamiltonians, and that takes the `structure` of
     these; `None` for other terms."""
-    drifts = [part for part in _parts(term) if isinstance(part, _Drift)]
+    drifts = [part for part in _parts(term) if isinstance(part, Drift)]
     if len(drifts) > 0:
         return drifts[0].made_by
     return "hamiltonian_terms" if is_hamiltonian(term) else None
 
 
-def _parts(term: PyTree[diffrax.AbstractTerm]) -> list[_Drift | HamiltonianNoise]:
+def _parts(term: PyTree[diffrax.AbstractTerm]) -> list[Drift | HamiltonianNoise]:
     """What comes from Hamiltonians in a term, which may be wrapped or have friction."""
     return [x for x in jtu.tree_leaves(term, is_leaf=_is_part) if _is_part(x)]
 
 
 def _is_part(x: Any) -> bool:
-    return isinstance(x, _Drift | HamiltonianNoise)
+    return isinstance(x, Drift | HamiltonianNoise)

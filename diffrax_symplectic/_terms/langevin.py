@@ -44,6 +44,7 @@ def langevin_terms(
     *,
     structure: Any = None,
     constraint: Constraint | None = None,
+    slow: Callable[[RealScalarLike, _P, Args], Array] | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of Langevin dynamics: a Hamiltonian system with friction, in a heat bath.
 
@@ -89,6 +90,8 @@ def langevin_terms(
     - `constraint`: as for [`diffrax_symplectic.hamiltonian_terms`][]. Then
         [`diffrax_symplectic.BAOAB`][] is the solver. Friction and noise act within the
         allowed momenta; the density is $e^{-H_0 / T}$ on the allowed states.
+    - `slow`: as for [`diffrax_symplectic.hamiltonian_terms`][]: a potential that is a part
+        of the energy, so that the density is $e^{-(H_0 + U) / T}$.
 
     **Returns:** `MultiTerm(drift, noise)`, or without `temperature` `MultiTerm(drift)`.
 
@@ -97,7 +100,8 @@ def langevin_terms(
     semidefinite; and, while the solve is traced, if their shapes do not fit. Paths fail
     where this is not known before.
     """
-    hamiltonian = hamiltonian_terms(H0, structure=structure).terms[0].vector_field
+    alone = hamiltonian_terms(H0, structure=structure, slow=slow)
+    hamiltonian = alone.terms[0].vector_field
     hamiltonian = dataclasses.replace(hamiltonian, made_by="langevin_terms")
     friction_term, *noise = bath_terms(H0, friction, temperature, path).terms
     damped = DriftWithFriction(hamiltonian, friction_term.vector_field)

@@ -1,0 +1,175 @@
+"""The flow of a linear system, by Cayley's angles."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .._arguments import check_pair
+from .._compat import is_traced
+from .._custom_types import Args, RealScalarLike
+
+
+# Stiffnesses that differ from their transpose by more of the largest entry are taken for a
+# mistake, and eigenvalues below that are zero: rounding leaves 1e-15 times their number.
+_SYMMETRIC = 1e-8
+
+
+def linear_flow(
+    stiffness: ArrayLike | None = None,
+    *,
+    masses: ArrayLike = 1.0,
+    rest: ArrayLike = 0.0,
+    frequencies: ArrayLike | None = None,
+    to_modes: Callable[[Array], Array] | None = None,
+    from_modes: Callable[[Array], Array] | None = None,
+) -> "CayleyFlow":
+    r"""The flow of $H_0 = \frac12 p \cdot M^{-1} p + \frac12 (q - q_0) \cdot K (q - q_0)$
+    over half a step, for [`diffrax_symplectic.BAOAB`][] and
+    [`diffrax_symplectic.LinearFlow`][].
+
+    A mode of frequency $\omega$ turns by the angle $\arctan(\omega h / 2)$ in half a step,
+    and not by $\omega h / 2$. The rotation conserves the same energy, and a whole step
+    never turns a mode by $\pi$, where the exact flow resonates with the kicks between. So
+    the step is limited by the kicks alone. Modes of frequency zero drift.
+
+    !!! example
+
+        A ring of beads with springs, whose modes are Fourier's:
+
+        ```python
+        P = 16
+        ring = ds.linear_flow(
+            frequencies=2 * k * jnp.sin(jnp.pi * jnp.arange(P // 2 + 1) / P),
+            to_modes=jnp.fft.rfft,
+            from_modes=lambda x: jnp.fft.irfft(x, P),
+        )
+        terms = ds.langevin_terms(springs, gamma, T, (P,), slow=potential)
+        solver = ds.BAOAB(ring)
+        ```
+
+    **Arguments:**
+
+    - `stiffness`: the symmetric matrix $K$ without negative eigenvalues, with the shape of
+        `q` twice.
+    - `masses`: a number, or an array with one for each position, of the shape of `q`. With
+        modes that are given, a number.
+    - `rest`: the positions $q_0$ at rest, a number or an array of the shape of `q`.
+    - `frequencies`, `to_modes`, `from_modes`: in place of `stiffness`, the frequencies
+        $\omega$ and the linear maps between positions and modes, which are inverse to each
+        other. `to_modes(q)` has the shape of `frequencies`.
+
+    `q` is one array.
+
+    **Returns:** a function `flow(time, y, args)` of half the step.
+
+    **Raises:** a `ValueError` for a stiffness that is not symmetric or has negative
+    eigenvalues (where traced, paths fail), masses that are not positive, and unless either
+    the stiffness or the modes are given.
+
+    **Source:** [Korol, Rosa-Raíces, Bou-Rabee and Miller
+    (2020)](https://doi.org/10.1063/1.5134810), for ring polymers.
+    """
+    modes = frequencies, to_modes, from_modes
+    given = [x is not None for x in modes]
+    if (stiffness is None) != all(given) or any(given) != all(given):
+        raise ValueError(
+            "Pass either `stiffness`, or `frequencies`, `to_modes` and `from_modes`."
+        )
+    if not is_traced(masses) and not np.all(np.asarray(masses) > 0):
+        raise ValueError(f"`masses` must be positive; got {masses!r}.")
+    roots = jnp.sqrt(jnp.asarray(masses, float))
+    if stiffness is not None:
+        omega, vectors = _modes_of(stiffness, roots)
+        to_modes = jtu.Partial(_project, vectors)
+        from_modes = jtu.Partial(_combine, vectors)
+    else:
+        if jnp.ndim(roots) > 0:
+            raise ValueError("With modes that are given, `masses` must be one number.")
+        omega = jnp.asarray(frequencies, float)
+    assert to_modes is not None and from_modes is not None
+    return CayleyFlow(omega, to_modes, from_modes, roots, jnp.asarray(rest, float))
+
+
+def _modes_of(
+    stiffness: ArrayLike, roots: Float[Array, "..."]
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """The frequencies, and the modes in positions times roots of masses as columns."""
+    K: Any = stiffness if is_traced(stiffness) else np.asarray(stiffness, float)
+    n = int(round(np.size(K) ** 0.5))
+    half = np.ndim(K) // 2
+    shape = np.shape(K)
+    if np.ndim(K) % 2 or shape[:half] != shape[half:]:
+        raise ValueError(
+            f"`stiffness` must have the shape of `q` twice, `(n, n)`; got {shape}."
+        )
+    K = K.reshape(n, n)
+    known = not is_traced(K) and not is_traced(roots)
+    xp: Any = np if known else jnp
+    if known and np.max(abs(K - K.T), initial=0) > _SYMMETRIC * np.max(
+        abs(K), initial=0
+    ):
+        raise ValueError("`stiffness` must be symmetric: it is a second derivative.")
+    each = xp.broadcast_to(xp.asarray(roots), shape[:half]).reshape(-1)
+    squares, vectors = xp.linalg.eigh(K / each[:, None] / each)
+    allowed = _SYMMETRIC * xp.max(abs(squares), initial=0)
+    if known and np.min(squares, initial=0) < -allowed:
+        raise ValueError(
+            f"`stiffness` has the negative eigenvalue {np.min(squares):.2g} (over masses): "
+            "the rest is no minimum. Leave this part to `slow=`."
+        )
+    # Where that is not known, the root of a negative number makes paths fail.
+    squares = xp.where(abs(squares) < allowed, 0.0, squares)
+    return jnp.asarray(xp.sqrt(squares)), jnp.asarray(vectors)
+
+
+def _project(
+    vectors: Float[Array, "n n"], x: Float[Array, "..."]
+) -> Float[Array, " n"]:
+    return vectors.T.astype(x.dtype) @ x.reshape(-1)
+
+
+def _combine(vectors: Float[Array, "n n"], modes: Float[Array, " n"]) -> Array:
+    return vectors.astype(modes.dtype) @ modes
+
+
+class CayleyFlow(eqx.Module):
+    """The flow that `linear_flow` returns.
+
+    - `frequencies`: of the modes.
+    - `to_modes`, `from_modes`: the maps between positions times the roots of masses and
+        modes.
+    - `roots`: the roots of the masses.
+    - `rest`: the positions at rest.
+    """
+
+    frequencies: Float[Array, "..."]
+    to_modes: Callable[[Array], Array]
+    from_modes: Callable[[Array], Array]
+    roots: Float[Array, "..."]
+    rest: Float[Array, "..."]
+
+    def __call__(
+        self, time: RealScalarLike, y: tuple[Array, Array], args: Args
+    ) -> tuple[Array, Array]:
+        """The state after `time`, half of a step."""
+        del args
+        check_pair(y)
+        p, q = y
+        dtype = jnp.result_type(q)
+        roots = self.roots.astype(dtype)
+        rest = self.rest.astype(dtype)
+        omega = self.frequencies.astype(dtype)
+        time = jnp.asarray(time, dtype)
+        # Cosine and sine of the angle, the sine over the frequency.
+        cosine = 1 / jnp.sqrt(1 + (omega * time) ** 2)
+        sine = time * cosine
+        P = self.to_modes(p / roots)
+        Q = self.to_modes((q - rest) * roots)
+        p = self.from_modes(cosine * P - omega**2 * sine * Q).reshape(jnp.shape(q))
+        q = self.from_modes(cosine * Q + sine * P).reshape(jnp.shape(q))
+        return p * roots, rest + q / roots
