@@ -1,0 +1,383 @@
+"""`BAOAB` with a flow between its kicks and its bath: another solver, or a linear flow."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+from ..drjit_here import needs_drjit
+
+
+KEY = jr.key(0)
+N, GAMMA, T = 4, 0.6, 1.3
+REST = jnp.arange(float(N))
+MASSES = jnp.array([1.0, 2.0, 0.5, 1.0])
+# A chain with free ends, of which one mode is at rest.
+SPRINGS = 40 * (2 * np.eye(N) - np.eye(N, k=1) - np.eye(N, k=-1))
+SPRINGS[0, 0] = SPRINGS[-1, -1] = 40
+CHAIN = ds.linear_flow(SPRINGS, masses=MASSES, rest=REST)
+
+
+def _stiff(t, p, q, args):
+    return (
+        jnp.sum(p**2 / MASSES) / 2 + (q - REST) @ jnp.asarray(SPRINGS) @ (q - REST) / 2
+    )
+
+
+def _soft(t, q, args):
+    return jnp.sum(q**2) / 2 + jnp.sum(jnp.cos(q[1:] - q[:-1])) / 4
+
+
+def _chain(slow=_soft, friction=GAMMA, temperature=T, path=None, **kwargs):
+    path = ds.WeakBrownianPath((N,), KEY) if path is None else path
+    if temperature is None:
+        path = None
+    return ds.langevin_terms(_stiff, friction, temperature, path, slow=slow, **kwargs)
+
+
+FLOWS = {
+    "midpoint": ds.BAOAB(ds.ImplicitMidpoint()),
+    "Verlet": ds.BAOAB(ds.StormerVerlet(), steps=3),
+    "Cayley": ds.BAOAB(CHAIN),
+}
+START = jnp.array([0.3, -0.4, 0.1, 0.5]), REST + jnp.array([0.1, -0.2, 0.3, 0.2])
+each_flow = pytest.mark.parametrize("name", FLOWS)
+
+
+def _one_step(solver, terms, h, y0, t0=0.1):
+    state = solver.init(terms, t0, t0 + h, y0, None)
+    return solver.step(terms, t0, t0 + h, y0, None, state, False)[0]
+
+
+def _stationary(solver, terms, h, n):
+    """The second moments that a step keeps."""
+    y0 = jnp.zeros(n), jnp.zeros(n)
+    K = np.asarray(ds.second_moment_map(terms, solver, 0.0, h, y0))
+    size = 2 * n + 1
+    moments = np.eye(size)[0][:, None] * np.eye(size)[0]
+    # Of a contraction, up to the constant one.
+    A = K - np.eye(size**2)
+    A[0] = 0
+    A[0, 0] = 1
+    right = np.zeros(size**2)
+    right[0] = 1
+    moments = np.linalg.lstsq(A, right, rcond=None)[0].reshape(size, size)
+    return moments[1 : n + 1, 1 : n + 1], moments[n + 1 :, n + 1 :]
+
+
+def _harmonic(slow):
+    K = jnp.asarray([[90.0, -30.0], [-30.0, 50.0]])
+    masses = jnp.array([1.0, 3.0])
+    H0 = lambda t, p, q, args: jnp.sum(p**2 / masses) / 2 + q @ K @ q / 2
+    friction = jnp.array([[0.9, 0.3], [0.3, 0.5]])
+    path = ds.WeakBrownianPath((2,), KEY)
+    terms = ds.langevin_terms(H0, friction, T, path, slow=slow)
+    return terms, K, masses, ds.linear_flow(K, masses=masses)
+
+
+@pytest.mark.parametrize("h", [0.1, 1.0, 7.0])
+def test_the_flow_of_the_whole_energy_keeps_the_law_of_a_harmonic_system_exactly(h):
+    # omega h up to 70, friction gamma h up to 6.
+    terms, K, masses, flow = _harmonic(None)
+    for solver in (ds.BAOAB(ds.ImplicitMidpoint()), ds.BAOAB(flow)):
+        pp, qq = _stationary(solver, terms, h, 2)
+        np.testing.assert_allclose(pp, T * np.diag(masses), atol=2e-8)
+        np.testing.assert_allclose(qq, T * np.linalg.inv(K), atol=2e-8)
+
+
+def test_a_harmonic_slow_force_leaves_an_error_of_order_two_or_by_cayleys_angles_none():
+    # Of positions. The angle of two half steps is that of the midpoint rule, with which
+    # kicks of a linear force keep the law of positions.
+    slow = lambda t, q, args: 2 * (q[0] - 0.5 * q[1]) ** 2
+    terms, K, _, flow = _harmonic(slow)
+    exact = T * np.linalg.inv(K + 4 * np.array([[1, -0.5], [-0.5, 0.25]]))
+
+    def error(solver, h):
+        return np.max(abs(_stationary(solver, terms, h, 2)[1] - exact))
+
+    errors = [error(ds.BAOAB(ds.ImplicitMidpoint()), h) for h in (0.1, 0.05)]
+    assert 1.95 < np.log2(errors[0] / errors[1]) < 2.05
+    assert max(error(ds.BAOAB(flow), h) for h in (0.05, 0.4, 0.8)) < 1e-12
+
+
+@each_flow
+def test_steps_are_symplectic_without_friction(name):
+    terms = _chain(friction=0.0, temperature=None)
+    defect = ds.symplecticity_defect(terms, FLOWS[name], 0.0, 0.3, START)
+    assert defect < 1e-13
+
+
+@each_flow
+def test_a_step_leads_back_and_has_order_two(name):
+    terms = _chain(friction=0.0, temperature=None)
+    solver = FLOWS[name]
+    there = jax.jit(lambda h, y: _one_step(solver, terms, h, y, 0.0))
+    back = there(-0.05, there(0.05, START))
+    for x, y in zip(back, START):
+        np.testing.assert_allclose(x, y, atol=1e-13)
+    # One step against two of half the size: the difference is of the third order.
+    gaps = []
+    for h in (0.02, 0.01):
+        two = there(h / 2, there(h / 2, START))
+        gaps.append(max(np.max(abs(x - y)) for x, y in zip(there(h, START), two)))
+    assert 2.7 < np.log2(gaps[0] / gaps[1]) < 3.3
+
+
+@pytest.mark.parametrize("name", ["midpoint", "Verlet"])
+def test_friction_between_particles_and_inner_forces_keep_the_total_momentum(name):
+    along = ds.FrictionAlong(lambda t, q, args: (jnp.eye(N)[1:] - jnp.eye(N)[:-1]).T)
+    path = ds.FixedStepBrownianPath((N - 1,), KEY)
+    inner = lambda t, q, args: jnp.sum(jnp.cos(q[1:] - q[:-1]))
+    terms = ds.langevin_terms(_stiff, along, T, path, slow=inner)
+    sol = diffrax.diffeqsolve(terms, FLOWS[name], 0, 20, 0.1, START)
+    assert abs(jnp.sum(sol.ys[0][-1]) - jnp.sum(START[0])) < 2e-13
+
+
+@each_flow
+def test_the_slow_force_is_evaluated_once_in_a_step(name):
+    calls = []
+
+    def counted(t, q, args):
+        jax.debug.callback(lambda: calls.append(1))
+        return _soft(t, q, args)
+
+    terms = _chain(counted)
+    solve = jax.jit(
+        lambda: diffrax.diffeqsolve(terms, FLOWS[name], 0, 10, 0.1, START).ys
+    )
+    jax.block_until_ready(solve())
+    jax.effects_barrier()
+    assert len(calls) == 101
+
+
+def test_a_jump_computes_the_force_anew():
+    solver, terms = FLOWS["Cayley"], _chain()
+    elsewhere = START[0], START[1] + 1
+    state = solver.init(terms, 0.1, 0.2, elsewhere, None)
+    moved = solver.step(terms, 0.1, 0.2, START, None, state, True)[0]
+    for x, y in zip(moved, _one_step(solver, terms, 0.1, START)):
+        np.testing.assert_allclose(x, y, rtol=1e-14)
+
+
+def test_other_solvers_take_the_slow_potential_as_a_part_of_the_energy():
+    whole = lambda t, p, q, args: _stiff(t, p, q, args) + _soft(t, q, args)
+    path = ds.WeakBrownianPath((N,), KEY)
+    terms, together = _chain(), ds.langevin_terms(whole, GAMMA, T, path)
+    for solver in (ds.BAOAB(), ds.ImplicitMidpoint(), diffrax.Heun()):
+        got, expected = (_one_step(solver, x, 0.05, START) for x in (terms, together))
+        for x, y in zip(got, expected):
+            np.testing.assert_allclose(x, y, rtol=1e-12)
+    conservative = ds.hamiltonian_terms(_stiff, slow=_soft)
+    got = _one_step(ds.StormerVerlet(), conservative, 0.05, START)
+    expected = _one_step(ds.StormerVerlet(), ds.hamiltonian_terms(whole), 0.05, START)
+    np.testing.assert_allclose(got[0], expected[0], rtol=1e-12)
+
+
+@needs_drjit
+@each_flow
+def test_a_fused_kernel_takes_the_same_paths(name):
+    solver = FLOWS[name]
+    if name == "Cayley":
+        # Its matrices are products of numbers.
+        solver = ds.BAOAB(ds.linear_flow(SPRINGS, masses=MASSES, rest=REST))
+    run = lambda engine: (
+        ds.ensemble(
+            _chain(path=(N,)),
+            solver,
+            0,
+            1,
+            0.1,
+            START,
+            key=KEY,
+            num_paths=16,
+            engine=engine,
+        ).ys
+    )
+    for x, y in zip(run("drjit"), run("jax")):
+        np.testing.assert_allclose(x, y, rtol=1e-11, atol=1e-12)
+
+
+@each_flow
+def test_gradients_are_those_of_differences_and_of_the_way_back(name):
+    path = ds.FixedStepBrownianPath((N,), KEY)
+
+    def end(parameters, adjoint):
+        friction, temperature = parameters
+        terms = _chain(friction=friction, temperature=temperature, path=path)
+        sol = diffrax.diffeqsolve(terms, FLOWS[name], 0, 1, 0.1, START, adjoint=adjoint)
+        return jnp.sum(sol.ys[1][-1] ** 2)
+
+    at = jnp.array([GAMMA, T])
+    checkpoints = diffrax.RecursiveCheckpointAdjoint()
+    got = jax.jit(jax.grad(lambda x: end(x, checkpoints)))(at)
+    reversing = jax.jit(jax.grad(lambda x: end(x, ds.ReversingAdjoint())))(at)
+    np.testing.assert_allclose(reversing, got, rtol=1e-7)
+    value = jax.jit(lambda x: end(x, checkpoints))
+    for k in range(2):
+        e = 1e-5 * jnp.eye(2)[k]
+        np.testing.assert_allclose(
+            (value(at + e) - value(at - e)) / 2e-5, got[k], rtol=1e-5
+        )
+
+
+@each_flow
+def test_single_precision_stays_single(name):
+    y0 = tuple(x.astype(jnp.float32) for x in START)
+    struct = jax.ShapeDtypeStruct((N,), jnp.float32)
+    terms = _chain(path=ds.FixedStepBrownianPath(struct, KEY))
+    y1 = _one_step(FLOWS[name], terms, jnp.float32(0.1), y0)
+    assert {x.dtype for x in y1} == {jnp.dtype(jnp.float32)}
+
+
+def _mean_in_time(terms, solver, y0, phi, h, t1, args=None, num_paths=2000):
+    """Over the second half of the time, with the standard error over paths."""
+    ts = h * np.arange(round(t1 / h / 2), round(t1 / h) + 1, 4)
+    t1 = h * round(t1 / h)
+    paths = ds.ensemble(
+        terms, solver, 0, t1, h, y0, args, key=jr.key(1), num_paths=num_paths, ts=ts
+    )
+    assert paths.num_failed == 0
+    values = np.asarray(jax.vmap(jax.vmap(phi))(*paths.ys)).mean(axis=1)
+    return values.mean(axis=0), values.std(axis=0) / num_paths**0.5
+
+
+@pytest.mark.parametrize("gamma", [1.0, 5.0, 50.0])
+def test_masses_that_depend_on_positions_keep_their_law_at_every_friction(gamma):
+    # With the mass exp(2 q1): <q1> = 1 and <p0^2 exp(-2 q1)> = 1. (The midpoint rule on
+    # the whole of the equation has <q1> = 0.88, 0.66 and 0.17.)
+    def H0(t, p, q, args):
+        return (p[0] ** 2 * jnp.exp(-2 * q[1]) + p[1] ** 2 + q[1] ** 2) / 2
+
+    def friction(t, q, gamma):
+        return jnp.stack([gamma * jnp.exp(2 * q[1]), 1.0])
+
+    terms = ds.langevin_terms(H0, friction, 1.0, (2,))
+    phi = lambda p, q: jnp.stack([q[1], p[0] ** 2 * jnp.exp(-2 * q[1])])
+    y0 = jnp.zeros(2), jnp.zeros(2)
+    solver = ds.BAOAB(ds.ImplicitMidpoint())
+    mean, error = _mean_in_time(terms, solver, y0, phi, 0.2, 40, jnp.array(gamma), 4000)
+    # Of order h^2 an error is left: 0.8% at h = 0.4.
+    assert np.all(abs(mean - 1) < 4 * error + 2e-3)
+    assert np.all(error < 1e-2)
+
+
+@pytest.mark.parametrize("h", [0.39, 0.5])
+def test_a_ring_of_beads_takes_long_steps_by_cayleys_angles(h):
+    # Where the exact flow turns the fastest mode by pi in a step (h = 0.39), it resonates.
+    P, hot = 16, 4.0
+    omega = 2 * hot * np.sin(np.pi * np.arange(P // 2 + 1) / P)
+    ring = ds.linear_flow(
+        frequencies=omega,
+        to_modes=jnp.fft.rfft,
+        from_modes=lambda x: jnp.fft.irfft(x, P),
+    )
+
+    def springs(t, p, q, args):
+        return jnp.sum(p**2 + hot**2 * (q - jnp.roll(q, 1)) ** 2) / 2
+
+    well = lambda t, q, args: jnp.sum(q**2 / 2 + q**4 / 4)
+    terms = ds.langevin_terms(springs, 1.0, hot, (P,), slow=well)
+    phi = lambda p, q: jnp.mean(q**2)
+    y0 = jnp.zeros(P), jnp.zeros(P)
+    mean, error = _mean_in_time(terms, ds.BAOAB(ring), y0, phi, h, 60)
+    assert error < 2e-3 and abs(mean - 0.3532) < 4 * error
+
+
+@pytest.mark.slow
+def test_stiff_springs_and_a_soft_force_take_one_soft_force_in_half_a_unit_of_time():
+    # By importance sampling the mean soft energy is 56.967 +- 0.002.
+    n, k = 16, 400.0
+    i, j = np.triu_indices(n, 1)
+    stiff = lambda q: k / 2 * jnp.sum((jnp.diff(q) - 1) ** 2)
+    soft = lambda t, q, args: jnp.sum(jnp.exp(-((q[i] - q[j] - (i - j)) ** 2))) / 2
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + stiff(q)
+    start = jnp.arange(float(n))
+    flow = ds.linear_flow(jax.hessian(stiff)(start), rest=start)
+    terms = ds.langevin_terms(H0, 0.5, 1.0, (n,), slow=soft)
+    phi = lambda p, q: soft(0.0, q, None)
+    y0 = jnp.zeros(n), start
+    mean, error = _mean_in_time(terms, ds.BAOAB(flow), y0, phi, 0.5, 60)
+    # A thousandth of it is 0.057.
+    assert error < 0.025 and abs(mean - 56.967) < 0.057 + 3 * error
+
+
+@pytest.mark.parametrize("h", [0.02, 1.0])
+def test_two_half_flows_are_a_step_of_the_midpoint_rule(h):
+    # Whose step is Cayley's transform, of which these are the square root.
+    terms = ds.hamiltonian_terms(_stiff)
+    expected = _one_step(ds.ImplicitMidpoint(), terms, h, START)
+    got = CHAIN(h / 2, CHAIN(h / 2, START, None), None)
+    for x, y in zip(got, expected):
+        np.testing.assert_allclose(x, y, atol=1e-11)
+    energies = [_stiff(0.0, *y, None) for y in (START, CHAIN(h / 2, START, None))]
+    np.testing.assert_allclose(energies[1], energies[0], rtol=1e-13)
+
+
+def test_modes_at_rest_drift_and_modes_that_are_given_are_those_of_the_matrix():
+    still = jnp.zeros(N), REST + 3.0
+    p = MASSES * 0.7
+    moved = CHAIN(0.5, (p, still[1]), None)
+    np.testing.assert_allclose(moved[0], p, atol=1e-13)
+    np.testing.assert_allclose(moved[1], still[1] + 0.35, atol=1e-13)
+    P, k = 6, 5.0
+    K = k * (2 * np.eye(P) - np.roll(np.eye(P), 1, 0) - np.roll(np.eye(P), -1, 0))
+    fourier = ds.linear_flow(
+        frequencies=2 * k**0.5 * np.sin(np.pi * np.arange(P // 2 + 1) / P),
+        to_modes=jnp.fft.rfft,
+        from_modes=lambda x: jnp.fft.irfft(x, P),
+    )
+    y = jnp.arange(6.0), jnp.cos(jnp.arange(6.0))
+    for x, z in zip(fourier(0.3, y, None), ds.linear_flow(K)(0.3, y, None)):
+        np.testing.assert_allclose(x, z, atol=1e-13)
+
+
+def _call(solver, terms=None, y0=START):
+    terms = _chain() if terms is None else terms
+    return lambda: solver.init(terms, 0.0, 0.1, y0, None)
+
+
+QUARTIC = ds.langevin_terms(
+    lambda t, p, q, args: jnp.sum(p**4), GAMMA, T, ds.WeakBrownianPath((N,), KEY)
+)
+ROD = ds.langevin_terms(
+    _stiff, GAMMA, T, ds.WeakBrownianPath((N,), KEY),
+    constraint=lambda q, args: jnp.stack([jnp.sum(q**2) - 14.0]),
+)  # fmt: skip
+OF_P = diffrax.MultiTerm(
+    *_chain().terms,
+    *ds.noise_terms(
+        lambda t, p, q, args: jnp.sum(p * q), ds.WeakBrownianPath((), jr.key(1))
+    ).terms,
+)
+
+
+@pytest.mark.parametrize(
+    "call, said",
+    [
+        (lambda: ds.BAOAB(diffrax.Heun()), "solver of this package.* got `Heun`"),
+        (lambda: ds.BAOAB(ds.BAOAB()), "`BAOAB` has a bath of its own"),
+        (lambda: ds.BAOAB(3.0), "flow"),
+        (lambda: ds.BAOAB(steps=0), "`steps`"),
+        (lambda: ds.BAOAB(steps=2), "those of a solver: pass one as `flow`"),
+        (lambda: ds.BAOAB(CHAIN, steps=2), "those of a solver"),
+        (_call(ds.BAOAB(lambda time, y, args: y[0])), "must return a pair like the state"),
+        (_call(FLOWS["midpoint"], ds.hamiltonian_terms(_stiff)), "takes friction from"),
+        (_call(FLOWS["midpoint"], QUARTIC), "friction that is linear in p"),
+        (_call(FLOWS["midpoint"], OF_P), "needs H0 = V.* noise Hamiltonians"),
+        (_call(FLOWS["midpoint"], ROD), "with a `flow` takes no terms with a `constraint`"),
+        (lambda: _chain(slow=lambda t, p, q, args: 0.0), "`slow`"),
+        (lambda: ds.linear_flow(np.array([[1.0, 2.0], [0.0, 1.0]])), "symmetric"),
+        (lambda: ds.linear_flow(-np.eye(2)), "negative eigenvalue -1"),
+        (lambda: ds.linear_flow(np.ones((2, 3))), r"shape of `q` twice.* got \(2, 3\)"),
+        (lambda: ds.linear_flow(np.eye(2), masses=[1.0, 0.0]), "`masses` must be positive"),
+        (lambda: ds.linear_flow(), "Pass either `stiffness`, or `frequencies`"),
+        (lambda: ds.linear_flow(np.eye(2), frequencies=[1.0]), "Pass either"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_told(call, said):
+    with pytest.raises(ValueError, match=said):
+        call()
