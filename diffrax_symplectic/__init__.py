@@ -99,6 +99,7 @@ from ._terms import (
     wave_terms as wave_terms,
 )
 from ._verify import (
+    equipartition as equipartition,
     poisson_defect as poisson_defect,
     second_moment_map as second_moment_map,
     step_expectation as step_expectation,

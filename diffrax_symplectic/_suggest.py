@@ -26,6 +26,8 @@ from ._solver import (
     AbstractSymplecticSolver,
     BAOAB,
     Damped,
+    ImplicitMidpoint,
+    is_solver,
     LANGEVIN,
     Record,
     SOLVERS,
@@ -62,6 +64,8 @@ from ._terms import (
 # The most that a higher order may cost: with steps of a twentieth, a step of order 2 is
 # worth about twenty of order 1.
 _MOST_STAGE_VECTORS = 20
+# For baths whose Hamiltonian is quadratic in the momenta, and otherwise any.
+_BATH_OF_ANY_ENERGY = BAOAB(ImplicitMidpoint())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,6 +219,8 @@ class _System(NamedTuple):
     - `num_noises`: the number of its scalar Brownian motions.
     - `commute`: whether they commute, as far as is known.
     - `friction`: whether it has friction that `BAOAB` treats by a step of its own.
+    - `general_bath`: whether only `BAOAB` with the midpoint rule for its flow does, as for
+        masses that depend on positions.
     - `our_friction`: whether that is friction of `langevin_terms` or `bath_terms`. It may
         come from Diffrax's own terms instead.
     - `constrained`: whether its positions are.
@@ -225,6 +231,7 @@ class _System(NamedTuple):
     num_noises: int
     commute: bool
     friction: bool
+    general_bath: bool
     our_friction: bool
     constrained: bool
 
@@ -234,7 +241,7 @@ class _System(NamedTuple):
         if self.num_noises > 1:
             how = "commute" if self.commute else "do not commute"
             noises = f"{self.num_noises} noises that {how}"
-        if self.friction:
+        if self.friction or self.general_bath:
             noises = f"friction and {noises}"
         if self.constrained:
             noises = f"constraints, {noises}"
@@ -274,12 +281,20 @@ def _inspected(
         or commuting(noise, t0, y0, args)
     )
     _, our_friction = friction_apart(drift)
+    friction = takes_friction_apart(terms, t0, y0, args, BAOAB())
+    general_bath = (
+        not friction
+        and len(our_friction) > 0
+        and not constrained
+        and takes_friction_apart(terms, t0, y0, args, _BATH_OF_ANY_ENERGY)
+    )
     return _System(
         structures=structures,
         fault=fault,
         num_noises=num_noises,
         commute=commute,
-        friction=takes_friction_apart(terms, t0, y0, args),
+        friction=friction,
+        general_bath=general_bath,
         our_friction=len(our_friction) > 0,
         constrained=constrained,
     )
@@ -294,7 +309,12 @@ def _suitable(
     """The solvers for a system, best first. `paths` are those of its noises, and
     `one_term` says whether one term holds all of these."""
     solvers = ranked(
-        want, system.structures, system.commute, system.num_noises, system.friction
+        want,
+        system.structures,
+        system.commute,
+        system.num_noises,
+        system.friction,
+        system.general_bath,
     )
     if not system.our_friction:
         # Diffrax's own terms, which only the Langevin splittings take apart.
@@ -346,11 +366,15 @@ def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
 
 
 def takes_friction_apart(
-    terms: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
+    terms: diffrax.AbstractTerm,
+    t0: RealScalarLike,
+    y0: Y,
+    args: Args,
+    solver: BAOAB,
 ) -> bool:
-    """Whether these are Langevin terms that `BAOAB` accepts."""
+    """Whether these are Langevin terms that a `BAOAB` accepts."""
     try:
-        BAOAB().check(terms, t0, y0, args)
+        solver.check(terms, t0, y0, args)
     except ValueError:
         return False
     return True
@@ -362,9 +386,11 @@ def ranked(
     commute: bool,
     num_noises: int,
     friction: bool = False,
+    general_bath: bool = False,
 ) -> list[AbstractSymplecticSolver]:
     """The suggested solvers for these structures (`"any"` is implied) and noises, best
-    first; and with `friction`, for Langevin terms whose other terms are separable."""
+    first; and with `friction`, for Langevin terms whose other terms are separable; with
+    `general_bath`, for those whose other terms are not."""
     structures = {"any", *structures}
     if {"separable", "constant"} <= structures:
         structures.add("separable and constant")
@@ -398,7 +424,8 @@ def ranked(
         separable = [solver for solver in every if solver.structure == "separable"]
         solvers += [solver() for solver in LANGEVIN]
         solvers += [Damped(solver) for solver in separable]
-    return sorted(filter(fits, solvers), key=rank)
+    best = sorted(filter(fits, solvers), key=rank)
+    return [_BATH_OF_ANY_ENERGY, *best] if general_bath else best
 
 
 def _record(solver: AbstractSymplecticSolver) -> Record:
@@ -408,7 +435,11 @@ def _record(solver: AbstractSymplecticSolver) -> Record:
 
 def _code(solver: AbstractSymplecticSolver, module: str = "") -> str:
     """The code that constructs the solver."""
-    given = _code(solver.solver, module) if isinstance(solver, Damped) else ""
+    given = ""
+    if isinstance(solver, Damped):
+        given = _code(solver.solver, module)
+    elif isinstance(solver, BAOAB) and is_solver(solver.flow):
+        given = _code(solver.flow, module)  # pyright: ignore
     return f"{module}{type(solver).__name__}({given})"
 
 

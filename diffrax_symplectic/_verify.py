@@ -2,6 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable
+from typing import Any
 
 import diffrax
 import jax
@@ -24,6 +25,7 @@ from ._terms import (
     outcomes,
     rate,
     refuse_constraint,
+    split_friction,
     split_terms,
     step_variables,
     Surface,
@@ -171,6 +173,58 @@ def poisson_defect(
     # P(s) multiplies each row by a cross product, so it is never formed.
     before = _dot(matrix(gradients), matrix(jnp.cross(s0, gradients)).T)
     return jnp.max(jnp.abs(before - matrix(jnp.cross(s1, units)).T))
+
+
+def equipartition(
+    terms: PyTree[diffrax.AbstractTerm],
+) -> Callable[[RealScalarLike, Y, Args], dict[str, Array]]:
+    r"""Two thermometers, whose means the equipartition theorem gives without knowing the
+    answer to anything else: in the stationary state at the temperature $T$ of the terms of
+    [`diffrax_symplectic.langevin_terms`][] with a constant $H_0$,
+
+    $$\Bigl\langle p \cdot \frac{\partial H_0}{\partial p} \Bigr\rangle = n T, \qquad
+      \Bigl\langle q \cdot \frac{\partial H_0}{\partial q} \Bigr\rangle = n T$$
+
+    for $n$ degrees of freedom, if $e^{-H_0 / T}$ vanishes at the ends of all coordinates.
+    (It does not for angles.) Where they disagree with $T$ the step is too long, the start
+    is not forgotten, or the terms say something else than what you mean.
+
+    !!! example
+
+        ```python
+        thermometers = ds.equipartition(terms)
+        print(ds.expectation(thermometers, terms, solver, t0, t1, dt0, y0, key=key))
+        ```
+
+    **Arguments:**
+
+    - `terms`: terms with the state `(p, q)`, without a `constraint`.
+
+    **Returns:** a function `phi(t, y, args)`, which returns a dictionary of the two numbers
+    over $n$: `"kinetic"` and `"configurational"`, in units of energy.
+
+    **Raises:** a `ValueError` for terms with a `constraint`.
+    """
+    refuse_constraint(terms, "equipartition")
+    drift, _, _ = split_friction(terms)
+
+    def phi(t: RealScalarLike, y: Y, args: Args) -> dict[str, Array]:
+        check_pair(y)
+        p, q = y
+        # (-dH0/dq, dH0/dp)
+        force, velocity = rate(drift, t, y, args)
+        n = sum(leaf.size for leaf in jtu.tree_leaves(q))
+        return {
+            "kinetic": _inner(p, velocity) / n,
+            "configurational": -_inner(q, force) / n,
+        }
+
+    return phi
+
+
+def _inner(a: PyTree[Array], b: PyTree[Array]) -> Any:
+    products = jtu.tree_map(lambda x, y: jnp.sum(x * y), a, b)
+    return sum(jtu.tree_leaves(products))
 
 
 def step_expectation(

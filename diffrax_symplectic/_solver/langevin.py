@@ -171,10 +171,29 @@ class ConstrainedState(NamedTuple):
     solved: optx.RESULTS
 
 
+_FREE_FLIGHT = Record(
+    weak=2,
+    strong=1,
+    choose="Langevin dynamics: explicit, with very accurate stationary positions (not "
+    "under constraints), and exact mobility and diffusion of free particles. For functions "
+    "of p and q together, such as a heat current, too. Not for functions of p alone in "
+    "equilibrium, such as a kinetic temperature, for transients to more than three digits, "
+    "or for frequencies omega > 2 / h.",
+    suggested=("weak", "strong"),
+    stationary=("qq", "pq"),
+)
+_CHOOSE_A_FLOW = (
+    "A heat bath for any energy that is quadratic in p, such as masses that depend on "
+    "positions: friction and noise by a step of their own, which keeps Maxwell's law at "
+    "every friction."
+)
+
+
 class BAOAB(AbstractLangevinSplitting):
-    r"""Langevin dynamics, by a splitting whose stationary positions are very accurate, and
-    whose mobility and free diffusion are exact. Explicit, with one evaluation of the forces
-    in a step.
+    r"""Langevin dynamics, by a symmetric splitting: kick, flow, friction and noise, flow,
+    kick. By default the flow is free flight, which is explicit, with one evaluation of the
+    forces in a step, very accurate stationary positions, and exact mobility and diffusion
+    of free particles.
 
     For the terms of [`diffrax_symplectic.langevin_terms`][] with $H_0 = V(p) + U(t, q)$,
     the forces $f = -\partial U / \partial q$ and the velocities $g = \partial V / \partial
@@ -191,7 +210,8 @@ class BAOAB(AbstractLangevinSplitting):
 
     with $G$ and $B$ at $t_n + \frac h2$ and the current $q$. O is the implicit midpoint
     rule for friction and noise, one linear equation: $V$ must be quadratic. It keeps the
-    Maxwell distribution exactly for every friction and all masses. For numbers, $p \gets
+    Maxwell distribution exactly for every friction and all masses (with the three-point
+    increments of a `WeakBrownianPath` its second moments). For numbers, $p \gets
     ((1 - x) p + B W) / (1 + x)$ with $x = \gamma h / 2$, $\gamma = G / m$.
 
     Other noise is added as further terms. It goes into O as well, and must be in the
@@ -211,7 +231,24 @@ class BAOAB(AbstractLangevinSplitting):
     $\omega h < 2$.
 
     Takes any Brownian path: a [`diffrax_symplectic.WeakBrownianPath`][] for
-    expectations, a [`diffrax_symplectic.FixedStepBrownianPath`][] for paths.
+    expectations, a [`diffrax_symplectic.FixedStepBrownianPath`][] for paths and for chains
+    with a Metropolis step, which need the whole law.
+
+    **Flows.** With a `flow`, A is half a step of that flow, and B kicks with the force of
+    the `slow` potential of the terms alone, if they have one:
+
+    - a solver of this package, in `steps` steps each half: `BAOAB(ImplicitMidpoint())` for
+        any $H_0$ that is quadratic in $p$, with masses that depend on positions, say;
+        `BAOAB(StormerVerlet(), steps=4)` for multiple time steps;
+    - a [`diffrax_symplectic.linear_flow`][], for stiff springs, rings of beads and waves,
+        whose frequencies then do not limit the step;
+    - a function `flow(time, y, args)`, called with half of each step. An exact flow
+        resonates with the kicks where a step turns a mode by $\pi$.
+
+    The last two stand for the whole of $H_0$: only the friction is taken from it. The slow
+    force is evaluated once in a step. Symmetric, of weak and stationary order 2; without
+    friction a step is symplectic, and without `slow` it conserves what the flow does. Terms
+    with a `constraint` are for `BAOAB()`.
 
     **Diffrax's terms.** It also takes `diffrax.UnderdampedLangevinDriftTerm` and
     `diffrax.UnderdampedLangevinDiffusionTerm`, with their state `(x, v)`.
@@ -225,7 +262,8 @@ class BAOAB(AbstractLangevinSplitting):
     the splitting; [Grønbech-Jensen and Farago
     (2013)](https://doi.org/10.1080/00268976.2012.760055) for the method with this O;
     [Leimkuhler and Matthews (2016)](https://doi.org/10.1098/rspa.2016.0138) for
-    constraints.
+    constraints; [Tuckerman, Berne and Martyna (1992)](https://doi.org/10.1063/1.463137) for
+    multiple time steps.
     """
 
     flow: Flow = None
@@ -235,17 +273,6 @@ class BAOAB(AbstractLangevinSplitting):
 
     symmetric: ClassVar[bool] = True
     keeps_constraints: ClassVar[bool] = True
-    record: ClassVar[Record] = Record(
-        weak=2,
-        strong=1,
-        choose="Langevin dynamics: explicit, with very accurate stationary positions, and "
-        "exact mobility and diffusion of free particles. For functions of p and q "
-        "together, such as a heat current, too. Not for functions of p alone, such as a "
-        "kinetic temperature, for transients to more than three digits, or for "
-        "frequencies omega > 2 / h.",
-        suggested=("weak", "strong"),
-        stationary=("qq", "pq"),
-    )
 
     def __check_init__(self):
         check_flow(self.flow, self.steps, type(self).__name__)
@@ -254,6 +281,13 @@ class BAOAB(AbstractLangevinSplitting):
                 f"`{type(self.flow).__name__}` has a bath of its own. Pass a solver for "
                 "systems without noise as `flow`, such as `StormerVerlet()`."
             )
+
+    @property
+    def record(self) -> Record:  # pyright: ignore
+        if self.flow is None:
+            return _FREE_FLIGHT
+        # What is exact depends on the flow.
+        return _FREE_FLIGHT._replace(choose=_CHOOSE_A_FLOW, stationary=())
 
     @property
     def structure(self) -> Structure:
@@ -285,7 +319,7 @@ class BAOAB(AbstractLangevinSplitting):
 
 class LangevinMiddle(AbstractLangevinSplitting):
     r"""Langevin dynamics, by a splitting whose stationary momenta are as accurate as its
-    positions. Explicit, with one evaluation of the forces in a step.
+    positions, in equilibrium. Explicit, with one evaluation of the forces in a step.
 
     $$\begin{aligned}
       \text{B:} &\quad p \gets p + h f(t_n, q) \\
@@ -303,8 +337,12 @@ class LangevinMiddle(AbstractLangevinSplitting):
     for functions of p alone or of q alone, not for functions of p and q together, such as a
     heat current: these are for [`diffrax_symplectic.BAOAB`][]. Momenta come right after
     friction and noise: in a step, the bath gives a particle of mass $m$ the mean energy
-    $\frac12 (c^{-2} - 1) \langle T - p^2 / m \rangle$, $c = (1 - x) / (1 + x)$. Mobility
-    and free diffusion are exact, as for [`diffrax_symplectic.BAOAB`][].
+    $\frac12 (c^{-2} - 1) \langle T - p^2 / m \rangle$, $c = (1 - x) / (1 + x)$. Free
+    diffusion is exact, as for [`diffrax_symplectic.BAOAB`][].
+
+    **In equilibrium only.** Under a current momenta are wrong to first order: a constant
+    force $F$ and the friction $G$ give the mean velocity $F / G$ but the mean momentum $m F
+    / G - h F / 2$; two baths at the ends of a bond do the same to temperatures.
 
     The steps are those of [`diffrax_symplectic.BAOAB`][] in other variables: if this solver
     has $p$ and $q$, then BAOAB has $p + \frac h2 f(t, q)$ and $q$ along the same path. Weak
@@ -323,9 +361,9 @@ class LangevinMiddle(AbstractLangevinSplitting):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose="Langevin dynamics, for functions of p alone. Same positions as `BAOAB`, "
-        "but momenta lag by half a step: not for functions of p and q together, such as a "
-        "heat current.",
+        choose="Langevin dynamics in equilibrium, for functions of p alone. Same positions "
+        "as `BAOAB`, but momenta lag by half a step, and are wrong where a force drives a "
+        "current: not for functions of p and q together, such as a heat current.",
         suggested=("weak", "strong"),
         stationary=("qq", "pp"),
     )

@@ -64,7 +64,8 @@ def langevin_terms(
 
     [`diffrax_symplectic.BAOAB`][], [`diffrax_symplectic.LangevinMiddle`][] and
     [`diffrax_symplectic.Damped`][] treat friction by a step of its own. Every other solver,
-    from this package or from Diffrax, takes it as a part of the drift. More terms are added
+    from this package or from Diffrax, takes it as a part of the drift, which makes
+    positions wrong to first order where masses depend on them. More terms are added
     by `diffrax.MultiTerm(*terms.terms, ...)`: other noise from
     [`diffrax_symplectic.noise_terms`][], or a second bath from
     [`diffrax_symplectic.bath_terms`][]. A bath shares its random key with no other term:

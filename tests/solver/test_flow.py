@@ -335,6 +335,59 @@ def test_modes_at_rest_drift_and_modes_that_are_given_are_those_of_the_matrix():
         np.testing.assert_allclose(x, z, atol=1e-13)
 
 
+def test_thermometers_show_what_a_step_leaves_of_the_temperature():
+    # Of positions and of momenta, by second moments, without sampling.
+    terms, K, masses, _ = _harmonic(None)
+    phi = ds.equipartition(terms)
+    for solver, h, kinetic, configurational in (
+        (ds.BAOAB(ds.ImplicitMidpoint()), 0.5, T, T),
+        (ds.BAOAB(), 0.05, None, T),
+    ):
+        pp, qq = _stationary(solver, terms, h, 2)
+        roots = np.linalg.cholesky(pp), np.linalg.cholesky(qq)
+        # Of a quadratic form the mean is that over these columns.
+        each = [
+            phi(0.0, (jnp.asarray(p), jnp.asarray(q)), None)
+            for p, q in zip(*(root.T * 2**0.5 for root in roots))
+        ]
+        means = {name: sum(float(x[name]) for x in each) / 2 for name in each[0]}
+        np.testing.assert_allclose(means["configurational"], configurational, rtol=1e-9)
+        if kinetic is not None:
+            np.testing.assert_allclose(means["kinetic"], kinetic, rtol=1e-9)
+        else:
+            assert means["kinetic"] < 0.99 * T
+    with pytest.raises(ValueError, match="takes no terms with a `constraint`"):
+        ds.equipartition(ROD)
+
+
+def test_a_suggestion_for_masses_that_depend_on_positions():
+    def H0(t, p, q, args):
+        return (p[0] ** 2 * jnp.exp(-2 * q[1]) + p[1] ** 2 + q[1] ** 2) / 2
+
+    y0 = jnp.zeros(2), jnp.zeros(2)
+    terms = ds.langevin_terms(H0, 1.0, 1.0, (2,))
+    for want in ("weak", "strong"):
+        found = ds.suggest_solver(terms, 0.0, y0, want=want)
+        assert "1. BAOAB(ImplicitMidpoint())" in str(found)
+        solver = found[0].solver
+        path = found[0].terms(KEY)
+        assert np.all(np.isfinite(_one_step(solver, path, 0.1, y0)[1]))
+
+
+def test_momenta_of_langevin_middle_are_wrong_under_a_current():
+    # A constant force 1 on a free particle with friction 1: <p> = 1, without sampling.
+    terms = ds.langevin_terms(
+        lambda t, p, q, args: p**2 / 2 - q, 1.0, 0.4, ds.WeakBrownianPath((), KEY)
+    )
+    y0 = jnp.zeros(()), jnp.zeros(())
+    h = 0.2
+    for solver, mean in ((ds.BAOAB(), 1.0), (ds.LangevinMiddle(), 1 - h / 2)):
+        K = np.asarray(ds.second_moment_map(terms, solver, 0.0, h, y0))
+        z = np.kron([1.0, 0, 0], [1.0, 0, 0])
+        end = np.linalg.matrix_power(K, 400) @ z
+        np.testing.assert_allclose(end[1], mean, rtol=1e-9)
+
+
 def _call(solver, terms=None, y0=START):
     terms = _chain() if terms is None else terms
     return lambda: solver.init(terms, 0.0, 0.1, y0, None)
