@@ -192,8 +192,20 @@ def equipartition(
     !!! example
 
         ```python
+        import jax.numpy as jnp
+        import jax.random as jr
+        import diffrax_symplectic as ds
+
+
+        def well(t, p, q, args):
+            return p**2 / 2 + q**4 / 4
+
+
+        terms = ds.langevin_terms(well, 1.0, 0.5, ())
+        y0 = (jnp.array(0.0), jnp.array(0.0))
         thermometers = ds.equipartition(terms)
-        print(ds.expectation(thermometers, terms, solver, t0, t1, dt0, y0, key=key))
+        print(ds.expectation(thermometers, terms, ds.BAOAB(), 0, 20, 0.1, y0, key=jr.key(0)))
+        # both 0.5
         ```
 
     **Arguments:**

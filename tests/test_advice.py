@@ -18,7 +18,7 @@ from examples.stability import friction
 # Of those that are explicit, or implicit.
 EXPLICIT = (ds.StormerVerlet, ds.PlateauVerlet, ds.BAOAB, ds.LangevinMiddle)
 RESOLVED, STIFF = jnp.array([0.5, 1.8]), jnp.array([1.0, 3.0, 5.0])
-SUGGESTED = [solver for solver in (*SOLVERS, *LANGEVIN) if solver.record.suggested]
+SUGGESTED = [kind for kind in (*SOLVERS, *LANGEVIN) if kind().record.suggested]
 # Its random variables have no finite set of outcomes; without noise brackets it is the
 # midpoint rule.
 MEASURED = [solver for solver in SUGGESTED if solver is not ds.LevyAreaMidpoint]

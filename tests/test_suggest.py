@@ -136,7 +136,7 @@ def check_systems(seeds) -> set:
 def test_no_suggestion_is_refused():
     # Noise of each kind, with p and q mixed by H0 and not, in both precisions.
     suggested = check_systems([0, 2, 3, 5, 6, 9, 12, 18])
-    assert suggested == {s for s in SOLVERS if s.record.suggested}
+    assert suggested == {kind for kind in SOLVERS if kind().record.suggested}
 
 
 @pytest.mark.parametrize("want", ["weak", "strong"])

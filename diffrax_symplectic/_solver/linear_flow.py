@@ -42,14 +42,36 @@ def linear_flow(
         A ring of beads with springs, whose modes are Fourier's:
 
         ```python
-        P = 16
+        import jax.numpy as jnp
+        import jax.random as jr
+        import diffrax_symplectic as ds
+
+        P, gamma, T = 16, 1.0, 1.0
+
+
+        def springs(t, p, q, args):
+            return jnp.sum(p**2 + P**2 * (q - jnp.roll(q, 1)) ** 2) / 2
+
+
+        def potential(t, q, args):
+            return jnp.sum(q**4) / 4
+
+
         ring = ds.linear_flow(
-            frequencies=2 * k * jnp.sin(jnp.pi * jnp.arange(P // 2 + 1) / P),
+            frequencies=2 * P * jnp.sin(jnp.pi * jnp.arange(P // 2 + 1) / P),
             to_modes=jnp.fft.rfft,
             from_modes=lambda x: jnp.fft.irfft(x, P),
         )
-        terms = ds.langevin_terms(springs, gamma, T, (P,), slow=potential)
-        solver = ds.BAOAB(ring)
+        paths = ds.ensemble(
+            ds.langevin_terms(springs, gamma, T, (P,), slow=potential),
+            ds.BAOAB(ring),
+            t0=0,
+            t1=10,
+            dt0=0.25,
+            y0=(jnp.zeros(P), jnp.zeros(P)),
+            key=jr.key(0),
+            num_paths=100,
+        )
         ```
 
     **Arguments:**

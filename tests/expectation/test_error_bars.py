@@ -43,7 +43,7 @@ def _in_units(mass: float, length: float, sampling):
     phi = lambda t, y, a: H0(t, *y, None) / (mass * length**2 / 2)
     y0 = (jnp.zeros(2), jnp.array([length, 0.0]))
     return ds.expectation(
-        phi, terms, ds.StormerVerlet(), 0.0, 2.0, 0.1, y0, key=jr.key(2),
+        phi, terms, ds.StormerVerlet(), 0.0, 2.0, 0.1, y0, key=jr.key(2), levels=1,
         sampling=sampling,
     )  # fmt: skip
 
@@ -75,7 +75,7 @@ def test_means_do_not_depend_on_units():
 def test_rare_paths_that_carry_the_mean_are_not_lost(sampling):
     got = ds.expectation(
         ENERGY, PARAMETRIC, ds.StormerVerlet(), 0.0, 5.0, 0.05, Y0, key=jr.key(1),
-        sampling=sampling,
+        levels=1, sampling=sampling,
     )  # fmt: skip
     exact = _energy(1.0, 0.05, 100)
     assert abs(exact - 10.689544) < 1e-6

@@ -161,7 +161,7 @@ def test_a_start_that_is_not_finite_is_a_failed_path(engine):
         return jnp.zeros(()), jnp.log(jr.uniform(key, minval=-1.0))
 
     args = {"strength": jnp.array(1.0)}
-    given = TERMS, ds.AdditiveGauss(), 0.0, END, 0.25, start, args
+    given = TERMS, ds.SRKw1(), 0.0, END, 0.25, start, args
     with pytest.warns(UserWarning, match="of 100 paths failed"):
         paths = ds.ensemble(*given, key=jr.key(1), num_paths=100, engine=engine)
     negative = [not np.isfinite(paths.start(i)[0][1]) for i in range(100)]
