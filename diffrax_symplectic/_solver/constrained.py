@@ -1,6 +1,6 @@
 """Steps of constrained systems."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -12,12 +12,16 @@ from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
 from .._arguments import check_pair
+from .._compat import replaced, unwrapped
 from .._custom_types import Args, RealScalarLike, Y
 from .._terms import (
     apply,
     check_start,
+    constrained,
+    constraint_of,
     drawn_variables,
     drift_driven,
+    Frame,
     rate,
     split_friction,
     split_terms,
@@ -26,6 +30,7 @@ from .._terms import (
 )
 from .base import AbstractSymplecticSolver
 from .bath import after_friction
+from .flow import begun, Flow, handed_on, kicks_and_rest, moved_by
 from .step import no_failure
 
 
@@ -82,28 +87,84 @@ def verlet_step(
     return _ended(y1, first & second, before)
 
 
-def baoab_step(
+class ConstrainedState(NamedTuple):
+    """What [`diffrax_symplectic.BAOAB`][] hands on from step to step on the surface.
+
+    - `force`: that of the kicks, as a vector, if there are kicks.
+    - `flow`: the state of the solver that is the flow, if there is one.
+    - `solved`: whether the multipliers were found in all steps so far.
+    """
+
+    force: Array | None
+    flow: PyTree[Array]
+    solved: optx.RESULTS
+
+
+def begin_baoab(
+    solver: AbstractSymplecticSolver,
+    flow: Flow,
     terms: diffrax.AbstractTerm,
     t0: RealScalarLike,
     t1: RealScalarLike,
     y0: Y,
     args: Args,
-    force: Array,
-    before: optx.RESULTS,
+) -> ConstrainedState:
+    """The state of a solver with this flow at the start. Raises a `ValueError` for a flow
+    that leaves the surface, and like `init_constrained`."""
+    keeps = getattr(flow, "keeps_constraints", flow is None)
+    if not keeps:
+        raise ValueError(
+            f"The flow {flow!r} does not keep the `constraint` of the terms. Use "
+            "`BAOAB()` or `BAOAB(StormerVerlet())`."
+        )
+    solved = init_constrained(solver, terms, t0, y0, args)
+    kicks, rest = _kicks_and_rest(flow, terms)
+    force = _force(kicks, t0, y0, args) if kicks else None
+    return ConstrainedState(force, begun(flow, rest, t0, t1, y0, args), solved)
+
+
+def baoab_step(
+    flow: Flow,
+    steps: int,
+    terms: diffrax.AbstractTerm,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    y0: Y,
+    args: Args,
+    before: ConstrainedState,
+    made_jump: Any,
     name: str,
-) -> tuple[Y, Array, optx.RESULTS]:
-    """A step of [`diffrax_symplectic.BAOAB`][] on the surface, from the `force` at its
-    start; the force at its end, and the state of the solver `name` after it."""
+) -> tuple[Y, ConstrainedState]:
+    """A step of the solver called `name`, [`diffrax_symplectic.BAOAB`][], on the surface,
+    and its state."""
     surface = Surface.of(terms, t0, y0, args)
+    kicks, rest = _kicks_and_rest(flow, terms)
     _, friction, noise = split_friction(without_constraint(terms))
     p, unravel_p = jfu.ravel_pytree(y0[0])
     q, unravel_q = jfu.ravel_pytree(y0[1])
     half = jnp.asarray((t1 - t0) / 2, p.dtype)
     middle = t0 + (t1 - t0) / 2
-    pending = before == optx.RESULTS.successful
+    pending = before.solved == optx.RESULTS.successful
 
-    # B and A
-    p, q, first = surface.fly(p + half * force, surface.frame(q), half, pending)
+    def follow(
+        p: Array, at: Frame, begin: RealScalarLike, end: RealScalarLike, state: PyTree
+    ) -> tuple[Array, Array, PyTree, Bool[Array, ""]]:
+        if flow is None:
+            p, q, found = surface.fly(p, at, half, pending)
+            return p, q, state, found
+        y = (unravel_p(p), unravel_q(at.q))
+        y, state, result = moved_by(flow, steps, rest, begin, end, half, y, args, state)
+        p, _ = jfu.ravel_pytree(y[0])
+        q, _ = jfu.ravel_pytree(y[1])
+        return p, q, state, result == diffrax.RESULTS.successful
+
+    # B and A. Between them the momentum need not be tangent: the multipliers of the flight
+    # make up for it.
+    force = None
+    if kicks:
+        force = handed_on(before.force, made_jump, lambda: _force(kicks, t0, y0, args))
+        p = p + half * force
+    p, q, flow_state, first = follow(p, surface.frame(q), t0, middle, before.flow)
     at = surface.frame(q)
     p = surface.tangent(p, at)
     y = (unravel_p(p), unravel_q(q))
@@ -121,20 +182,29 @@ def baoab_step(
 
     p = surface.tangent(after(kick), at, response)
     # A and B
-    p, q, second = surface.fly(p, at, half, pending)
-    force = force_at(terms, t1, (unravel_p(p), unravel_q(q)), args)
-    p = surface.tangent(p + half * force, surface.frame(q))
+    p, q, flow_state, second = follow(p, at, middle, t1, flow_state)
+    if kicks:
+        force = _force(kicks, t1, (unravel_p(p), unravel_q(q)), args)
+        p = p + half * force
+    p = surface.tangent(p, surface.frame(q))
     y1 = (unravel_p(p), unravel_q(q))
-    y1, solved = _ended(y1, first & second, before)
-    return y1, force, solved
+    y1, solved = _ended(y1, first & second, before.solved)
+    return y1, ConstrainedState(force, flow_state, solved)
 
 
-def force_at(
-    terms: PyTree[diffrax.AbstractTerm], t: RealScalarLike, y: Y, args: Args
-) -> Array:
-    """The force without friction, as a vector."""
+def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
+    """The terms whose forces are the kicks, and those that the flow follows on the
+    surface."""
     drift, _, _ = split_friction(without_constraint(terms))
-    force, _ = rate(drift, t, y, args)
+    kicks, rest = kicks_and_rest(flow, drift)
+    first, *others = rest
+    first = replaced(first, constrained(unwrapped(first), constraint_of(terms)))
+    return kicks, (first, *others)
+
+
+def _force(kicks: tuple, t: RealScalarLike, y: Y, args: Args) -> Array:
+    """The force of the kicks, as a vector."""
+    force, _ = rate(kicks, t, y, args)
     return jfu.ravel_pytree(force)[0]
 
 

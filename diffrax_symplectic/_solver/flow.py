@@ -141,3 +141,13 @@ def moved(x: PyTree, time: RealScalarLike, rate: PyTree) -> PyTree:
         return x + jnp.asarray(time, jnp.result_type(x)) * v
 
     return jtu.tree_map(leaf_moved, x, rate)
+
+
+def handed_on(
+    forces: PyTree[Array], made_jump: Any, anew: Callable[[], PyTree[Array]]
+) -> PyTree[Array]:
+    """The forces from the end of the last step, or after a jump, which moved the state,
+    those that are computed `anew`."""
+    if made_jump is False:
+        return forces
+    return lax.cond(made_jump, anew, lambda: forces)

@@ -2,13 +2,10 @@
 friction and noise between them."""
 
 import functools as ft
-from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
 import diffrax
 import equinox as eqx
-import optimistix as optx
-from jax import lax
 from jaxtyping import Array, PyTree
 
 from .._arguments import check_state, whole_number
@@ -26,12 +23,13 @@ from .._terms import (
 )
 from .base import AbstractSymplecticSolver, Record
 from .bath import after_friction, check_friction
-from .constrained import baoab_step, force_at, init_constrained
+from .constrained import baoab_step, begin_baoab
 from .flow import (
     begun,
     check_flow,
     check_follows,
     Flow,
+    handed_on,
     is_solver,
     kicks_and_rest,
     moved,
@@ -119,7 +117,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
 
         # Kick
         if self.symmetric and kicks:
-            forces = _handed_on(forces, made_jump, forces_at_start)
+            forces = handed_on(forces, made_jump, forces_at_start)
             p = moved(p, half, forces)
         elif kicks:
             p = moved(p, h, forces_at_start())
@@ -148,27 +146,6 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         _, y1 = momentum_first(own_terms, (p, q))
         state = SplittingState(forces, flow_state)
         return y1, None, dict(y0=own_y0, y1=y1), state, result
-
-
-def _handed_on(
-    forces: PyTree[Array], made_jump: Any, anew: Callable[[], PyTree[Array]]
-) -> PyTree[Array]:
-    """The forces from the end of the last step, or after a jump, which moved the state,
-    those that are computed `anew`."""
-    if made_jump is False:
-        return forces
-    return lax.cond(made_jump, anew, lambda: forces)
-
-
-class ConstrainedState(NamedTuple):
-    """The state of `BAOAB` for terms with a constraint.
-
-    - `force`: the force at the start of the step, as a vector.
-    - `solved`: whether the multipliers were found in all steps so far.
-    """
-
-    force: Array
-    solved: optx.RESULTS
 
 
 _FREE_FLIGHT = Record(
@@ -247,8 +224,7 @@ class BAOAB(AbstractLangevinSplitting):
 
     The last two stand for the whole of $H_0$: only the friction is taken from it. The slow
     force is evaluated once in a step. Symmetric, of weak and stationary order 2; without
-    friction a step is symplectic, and without `slow` it conserves what the flow does. Terms
-    with a `constraint` are for `BAOAB()`.
+    friction a step is symplectic, and without `slow` it conserves what the flow does.
 
     **Diffrax's terms.** It also takes `diffrax.UnderdampedLangevinDriftTerm` and
     `diffrax.UnderdampedLangevinDiffusionTerm`, with their state `(x, v)`.
@@ -256,7 +232,10 @@ class BAOAB(AbstractLangevinSplitting):
     **Constraints.** For terms with a `constraint` this is g-BAOAB: each A is a step of
     RATTLE, as in [`diffrax_symplectic.StormerVerlet`][], B and O end with momenta that are
     tangent, and O is the midpoint rule with multipliers of its own, so that it keeps the
-    Maxwell distribution of the tangent momenta exactly.
+    Maxwell distribution of the tangent momenta exactly. Positions and kinetic energies at
+    the ends of long steps are better with the flow `StormerVerlet()`, whose steps of RATTLE
+    contain the force: rigid water in a field with $h = 0.4$ has its kinetic energy within
+    0.1% in place of 1%, and its mean direction within 0.4% in place of 1.7%.
 
     **Source:** [Leimkuhler and Matthews (2013)](https://doi.org/10.1093/amrx/abs010) for
     the splitting; [Grønbech-Jensen and Farago
@@ -296,24 +275,24 @@ class BAOAB(AbstractLangevinSplitting):
     def init(self, terms, t0, t1, y0, args) -> Any:
         if constraint_of(terms) is None:
             return super().init(terms, t0, t1, y0, args)
-        if self.flow is not None:
-            raise ValueError(
-                "`BAOAB` with a `flow` takes no terms with a `constraint`. Use `BAOAB()`."
-            )
-        solved = init_constrained(self, terms, t0, y0, args)
-        return ConstrainedState(force_at(terms, t0, y0, args), solved)
+        return begin_baoab(self, self.flow, terms, t0, t1, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         if constraint_of(terms) is None:
             return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
-        force = _handed_on(
-            solver_state.force, made_jump, lambda: force_at(terms, t0, y0, args)
+        y1, state = baoab_step(
+            self.flow,
+            self.steps,
+            terms,
+            t0,
+            t1,
+            y0,
+            args,
+            solver_state,
+            made_jump,
+            type(self).__name__,
         )
-        y1, force, solved = baoab_step(
-            terms, t0, t1, y0, args, force, solver_state.solved, type(self).__name__
-        )
-        result = result_at(terms, t0, t1, result_of(solved, y1))
-        state = ConstrainedState(force, solved)
+        result = result_at(terms, t0, t1, result_of(state.solved, y1))
         return y1, None, dict(y0=y0, y1=y1), state, result
 
 

@@ -1,4 +1,9 @@
-from .constraint import constraint_of, refuse_constraint, without_constraint
+from .constraint import (
+    constrained,
+    constraint_of,
+    refuse_constraint,
+    without_constraint,
+)
 from .controls import drawn_variables, drift_driven, noise_driven, outcomes
 from .controls import step_variables, StepVariables
 from .dependence import acts_elementwise, Dependence
@@ -19,7 +24,7 @@ from .structure import additive_fault, check_assertions, check_stratonovich
 from .structure import check_structure
 from .structure import commuting, constant_fault, Fault, FRICTION
 from .structure import separable_fault
-from .surface import check_start, constrained_state, Surface
+from .surface import check_start, constrained_state, Frame, Surface
 from .paths import (
     brownian_paths,
     has_shapes,

@@ -30,7 +30,7 @@ class ConstrainedDrift(diffrax.AbstractTerm):
     constraints, also those of Diffrax. The solvers that do read the fields of the term.
     """
 
-    drift: diffrax.ODETerm
+    drift: diffrax.AbstractTerm
     constraint: Constraint
 
     def __check_init__(self):
@@ -52,7 +52,7 @@ class ConstrainedDrift(diffrax.AbstractTerm):
 
 
 def constrained(
-    drift: diffrax.ODETerm, constraint: Constraint | None
+    drift: diffrax.AbstractTerm, constraint: Constraint | None
 ) -> diffrax.AbstractTerm:
     """The drift with its constraint, if there is one."""
     return drift if constraint is None else ConstrainedDrift(drift, constraint)
