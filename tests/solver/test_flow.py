@@ -421,7 +421,6 @@ OF_P = diffrax.MultiTerm(
         (_call(FLOWS["midpoint"], ds.hamiltonian_terms(_stiff)), "takes friction from"),
         (_call(FLOWS["midpoint"], QUARTIC), "friction that is linear in p"),
         (_call(FLOWS["midpoint"], OF_P), "needs H0 = V.* noise Hamiltonians"),
-        (_call(FLOWS["midpoint"], ROD), "with a `flow` takes no terms with a `constraint`"),
         (lambda: _chain(slow=lambda t, p, q, args: 0.0), "`slow`"),
         (lambda: ds.linear_flow(np.array([[1.0, 2.0], [0.0, 1.0]])), "symmetric"),
         (lambda: ds.linear_flow(-np.eye(2)), "negative eigenvalue -1"),
