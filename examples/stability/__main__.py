@@ -4,5 +4,13 @@ from ._page import run
 
 
 if __name__ == "__main__":
-    modules = ("moments", "solvability", "stiff", "baths", "friction", "rounding")
+    modules = (
+        "moments",
+        "solvability",
+        "stiff",
+        "baths",
+        "chain",
+        "friction",
+        "rounding",
+    )
     run("stability", __doc__, modules)
