@@ -93,6 +93,7 @@ def path_means(solver, h: float, length: float) -> Callable:
             adjoint=diffrax.ForwardMode(),
             throw=False,
         ).ys
+        assert energies is not None
         return jnp.mean(energies[steps // 2 : steps])
 
     return mean
