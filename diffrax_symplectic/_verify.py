@@ -204,8 +204,8 @@ def equipartition(
         terms = ds.langevin_terms(well, 1.0, 0.5, ())
         y0 = (jnp.array(0.0), jnp.array(0.0))
         thermometers = ds.equipartition(terms)
-        print(ds.expectation(thermometers, terms, ds.BAOAB(), 0, 20, 0.1, y0, key=jr.key(0)))
-        # both 0.5
+        call = thermometers, terms, ds.BAOAB(), 0, 20, 0.1, y0
+        print(ds.expectation(*call, key=jr.key(0)))  # both 0.5
         ```
 
     **Arguments:**

@@ -567,11 +567,10 @@ def test_expectations_refuse_starts_off_the_constraint():
         ds.expectation(phi, terms, ds.BAOAB(), 0, 1, 0.1, off, key=jr.key(1))
 
 
-@pytest.mark.parametrize("solver", [ds.LangevinMiddle(), ds.Damped(ds.StormerVerlet())])
-def test_other_solvers_for_langevin_dynamics_refuse_constraints(solver):
+def test_other_solvers_for_langevin_dynamics_refuse_constraints():
     terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
     with pytest.raises(ValueError, match="`StormerVerlet.*BAOAB"):
-        solver.init(terms, 0.0, 0.1, DIMER, None)
+        ds.LangevinMiddle().init(terms, 0.0, 0.1, DIMER, None)
     with pytest.raises(ValueError, match="Take friction from|BAOAB"):
         ds.StormerVerlet().init(terms, 0.0, 0.1, DIMER, None)
 
