@@ -7,9 +7,9 @@ The state is a pair `(p, q)`, momenta first.
 - Its Brownian path: `solver.path(shape, key)`.
 - Solving: `diffrax.diffeqsolve(terms, solver, t0, t1, dt0, y0)`.
 - Means over many paths: `expectation`; the states of many paths: `ensemble`.
-- Friction: `langevin_terms`, for `BAOAB`, `LangevinMiddle`, `Damped` and all others.
+- Friction: `langevin_terms`, for `BAOAB`, `LangevinMiddle` and all others.
 - Rods and rigid molecules: `constraint=` of the terms, `constrained_state`.
-- Stiff linear parts: `LinearFlow`.
+- Stiff linear parts: `BAOAB(linear_flow(...))`, or without a bath `LinearFlow`.
 - Gradients of long solves: `ReversingAdjoint`.
 - Checks of one step: `symplecticity_defect`, `weak_order_defect`.
 """
@@ -50,7 +50,6 @@ from ._solver import (
     AbstractSymplecticSolver as AbstractSymplecticSolver,
     AdditiveGauss as AdditiveGauss,
     BAOAB as BAOAB,
-    Damped as Damped,
     LangevinMiddle as LangevinMiddle,
     LevyAreaMidpoint as LevyAreaMidpoint,
     LinearFlow as LinearFlow,

@@ -28,10 +28,10 @@ from ._compat import (
 )
 from ._custom_types import IntScalarLike, Y
 from ._solver import (
-    AbstractSplitting,
     AbstractSymplecticRungeKutta,
     BAOAB,
     is_solver,
+    LinearFlow,
     NinomiyaVictoir,
 )
 from ._tableau import is_own_inverse, make_plan
@@ -59,9 +59,9 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     [`diffrax_symplectic.ImplicitMidpoint`][], [`diffrax_symplectic.StormerVerlet`][],
     [`diffrax_symplectic.StrangGauss`][], [`diffrax_symplectic.LevyAreaMidpoint`][], and
     possibly your own; [`diffrax_symplectic.NinomiyaVictoir`][] and
-    [`diffrax_symplectic.BAOAB`][]; and [`diffrax_symplectic.Damped`][] or
-    [`diffrax_symplectic.LinearFlow`][] around one of these. With friction, rounding errors
-    grow on the way back, about by $e^{\gamma t}$, and with
+    [`diffrax_symplectic.BAOAB`][], with a flow that is reversible; and
+    [`diffrax_symplectic.LinearFlow`][] around a reversible solver. With friction, rounding
+    errors grow on the way back, about by $e^{\gamma t}$, and with
     [`diffrax_symplectic.BAOAB`][] by $|(1 + x) / (1 - x)|$ in each step, $x = \gamma h /
     2$: use more checkpoints. At $x = 1$ a step has no inverse.
 
@@ -175,7 +175,7 @@ def _undoes_its_steps(solver: Any) -> bool:
         return not is_solver(flow) or _undoes_its_steps(flow)
     if issubclass(kind, NinomiyaVictoir):
         return True
-    if issubclass(kind, AbstractSplitting):
+    if issubclass(kind, LinearFlow):
         return _undoes_its_steps(solver.solver)
     if not issubclass(kind, AbstractSymplecticRungeKutta):
         return False

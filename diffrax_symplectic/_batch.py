@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
-from ._compat import captured_arrays
+from ._compat import captured_arrays, is_traced
 from ._custom_types import IntScalarLike
 
 
@@ -101,6 +101,16 @@ def error_if_alone(pred: Bool[Array, ""], message: str) -> Bool[Array, ""]:
         return pred, in_batched[0]
 
     return checked(pred)
+
+
+def refused_where(fault: Bool[Array, ""], advice: str) -> Bool[Array, ""]:
+    """The fault, with a `ValueError` where it is known, and otherwise an error when run,
+    but not in a batch."""
+    if is_traced(fault):
+        return error_if_alone(fault, advice)
+    if fault:
+        raise ValueError(advice)
+    return fault
 
 
 def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -> _T:

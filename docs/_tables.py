@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._solver import AbstractSplitting, AbstractSymplecticSolver, Want
+from diffrax_symplectic._solver import AbstractSymplecticSolver, Want
 from diffrax_symplectic._suggest import ranked, SOLVERS
 
 
@@ -38,11 +38,10 @@ _NOISES = {
     "commuting": "commuting noises",
     "not commuting": "noises that do not commute",
 }
-# Examples of solvers without defaults. A splitting is shown around any solver.
+# Langevin splittings, and `LinearFlow`, which is shown around any solver.
 _SPLIT = (
     ds.BAOAB(),
     ds.LangevinMiddle(),
-    ds.Damped(ds.NinomiyaVictoir()),
     ds.LinearFlow(ds.NinomiyaVictoir(), lambda time, y, args: y),
 )
 
@@ -107,7 +106,7 @@ def _facts(solver: AbstractSymplecticSolver) -> dict[str, str]:
         "without noise": str(solver.order(None)),
         "when to choose it": record.reason,
     }
-    if isinstance(solver, AbstractSplitting):
+    if isinstance(solver, ds.LinearFlow):
         facts |= {
             "structure": "as `solver`",
             "strong": f"at most {solver.strong}",

@@ -316,12 +316,12 @@ def test_backsolve_is_refused_with_advice(solver):
     ],
     ids=["matrix", "number"],
 )
-def test_friction_is_walked_back_too(inner, form):
+def test_friction_beside_a_flow_is_walked_back_too(inner, form):
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 - args * jnp.sum(jnp.cos(q + t))
     noise = lambda t, p, q, args: args * jnp.sum(jnp.sin(q))
     path = ds.WeakBrownianPath((), jr.key(0))
     make = lambda friction: damped_terms(H0, friction, noise, path)
-    solver, y0 = ds.Damped(inner), (jnp.array([0.3, 0.1]), jnp.array([0.5, -0.2]))
+    solver, y0 = ds.BAOAB(inner), (jnp.array([0.3, 0.1]), jnp.array([0.5, -0.2]))
 
     @jax.jit
     def gradients(gamma):
@@ -344,6 +344,6 @@ def test_friction_is_walked_back_too(inner, form):
         assert ours[2] != 0
     with pytest.raises(ValueError, match="needs a reversible solver"):
         diffrax.diffeqsolve(
-            make(0.1), ds.Damped(ds.SRKs3()), 0.0, 1.0, 0.1, y0, 0.7,
+            make(0.1), ds.BAOAB(ds.SRKs3()), 0.0, 1.0, 0.1, y0, 0.7,
             adjoint=ds.ReversingAdjoint(),
         )  # fmt: skip

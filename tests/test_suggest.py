@@ -147,32 +147,42 @@ def test_with_friction_solvers_that_have_it_are_suggested(want):
     y0, friction = (jnp.ones(2), jnp.ones(2)), jnp.array([0.5, 0.2])
     path = ds.WeakBrownianPath((2,), jr.key(0))
     bath = lambda H0: ds.langevin_terms(H0, friction, 0.3, path)
-    general = ds.AdditiveGauss if want == "weak" else ds.SRKs4
-    other_general = ds.BAOAB if want == "weak" else ds.PlateauGauss
-    for terms, first, is_apart in (
+    of_order = ds.SRKs4() if want == "strong" else ds.BAOAB()
+    other_general = ds.PlateauGauss() if want == "strong" else ds.BAOAB()
+    any_energy = ds.BAOAB(ds.ImplicitMidpoint())
+    for terms, first, apart in (
         # Stationary positions come first for means, and the order for paths.
-        (bath(H0), ds.BAOAB if want == "weak" else ds.SRKs4, True),
-        (damped_terms(H0, friction, other, path), other_general, True),
+        (bath(H0), of_order, [ds.BAOAB(), ds.LangevinMiddle()]),
+        (
+            damped_terms(H0, friction, other, path),
+            other_general,
+            [ds.BAOAB(), ds.LangevinMiddle()],
+        ),
         # Constant noise, and a mass that depends on positions.
-        (bath(mixed), general, False),
+        (bath(mixed), any_energy, [any_energy]),
     ):
         found = ds.suggest_solver(terms, 0.0, y0, want=want)
-        assert type(found[0].solver) is first
-        assert ("with friction" in found.system) is is_apart
-        damped = [s.solver.solver for s in found if isinstance(s.solver, ds.Damped)]
-        assert (ds.StormerVerlet() in damped) is is_apart
+        assert found[0].solver == first
+        assert "with friction" in found.system
+        langevin = [
+            s.solver
+            for s in found
+            if isinstance(s.solver, ds.BAOAB | ds.LangevinMiddle)
+        ]
+        assert langevin == apart
         for s in found:
             s.solver.init(s.terms(jr.key(1)), 0.0, 0.1, y0, None)
             assert "Path((2,), key" in s.path or ").path((2,), key" in s.path
         # Which of the two is for momenta.
         reason = {type(s.solver): s.reason for s in found}
-        if is_apart:
+        if ds.LangevinMiddle() in apart:
             assert "momenta" in reason[ds.LangevinMiddle]
 
 
 def test_many_noises_that_do_not_commute_do_not_ask_for_a_flow_of_each():
     first = lambda m: type(ranked("weak", ["any"], False, m)[0])
-    assert first(2) is ds.NinomiyaVictoir and first(300) is ds.SRKw1
+    assert first(2) is first(4) is ds.NinomiyaVictoir
+    assert first(6) is first(300) is ds.SRKw1
 
 
 CASES = {
@@ -204,7 +214,7 @@ def test_first_suggestion_solves_as_it_stands(case):
         assert jnp.all(jnp.isfinite(sol.ys[0]))
 
 
-def test_friction_as_a_term_gets_a_solver_and_is_told_of_damped():
+def test_friction_as_a_term_gets_a_solver_and_is_told_of_langevin_terms():
     mixed, noises, *_ = CASES["separable"]
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + mixed(t, p, q)
     noise = lambda t, p, q, args: noises[0](t, p, q)
@@ -241,7 +251,7 @@ def test_noises_that_do_not_commute_may_be_terms_or_arrays_of_their_own():
         # Lévy areas are those of one array of noises.
         assert [type(s.solver) for s in found] == [ds.ImplicitMidpoint]
         assert found[0].strong_order == 0.5
-        assert "do not commute" in found.system and "Damped" not in found.system
+        assert "do not commute" in found.system and "friction" not in found.system
 
 
 def test_code_of_a_path_makes_the_path():

@@ -9,7 +9,7 @@ from .flow import is_solver
 from .linear_flow import linear_flow
 from .paths import common_path, own_path
 from .times import check_resolution
-from .splitting import AbstractSplitting, Damped, LinearFlow
+from .splitting import LinearFlow
 
 
 # Those that need friction, from `langevin_terms`.

@@ -126,9 +126,9 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
     Stratonovich terms. It defines `structure` (`"any"`, `"separable"`, `"additive"`,
     `"constant"` or `"separable and constant"`), `variables` (the names of the random
     variables of a step, such as `("W",)`), and `stage_vectors(num_noises)`, and overrides
-    `weak_order(terms)` and `strong_order(terms)`. Then [`diffrax_symplectic.Damped`][] and
-    [`diffrax_symplectic.LinearFlow`][] can wrap it, and `solver.path(shape, key)` makes the
-    path that it needs.
+    `weak_order(terms)` and `strong_order(terms)`. Then [`diffrax_symplectic.LinearFlow`][]
+    can wrap it, [`diffrax_symplectic.BAOAB`][] can take it as its flow, and
+    `solver.path(shape, key)` makes the path that it needs.
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm

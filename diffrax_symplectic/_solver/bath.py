@@ -18,6 +18,7 @@ from .._terms import (
     AbstractFriction,
     acts_elementwise,
     Dependence,
+    has_lifted,
     rate,
     semidefinite_root,
 )
@@ -36,6 +37,12 @@ def check_friction(
     """Raises a `ValueError` unless there is friction that is linear in the momenta, and a
     drift beside it. `drift` and `friction` are the terms of each, and `solver` is the name
     for messages. Shapes and dependence decide it, not values, so it works under `jit`."""
+    if has_lifted(drift):
+        raise ValueError(
+            f"`{solver}` applies friction to a canonical momentum, which the state of "
+            "`spin_terms` or `wave_terms` does not have: spins would get shorter. Pass "
+            "`damping=` to `spin_terms` or `wave_terms`, and use `ImplicitMidpoint`."
+        )
     if len(friction) == 0:
         raise ValueError(
             f"`{solver}` takes friction from the terms, and these have none. Construct "
@@ -68,10 +75,9 @@ def check_friction(
     if traced.independent(lambda p, along: along):
         raise ValueError(
             f"`{solver}` has no friction to apply: it acts on the velocities dH0/dp, which "
-            "do not depend on p. If the kinetic energy is a part of the flow of a "
-            "`LinearFlow`, take friction and noise from terms of the whole Hamiltonian: "
-            "`MultiTerm(*hamiltonian_terms(rest).terms, *bath_terms(whole, friction, "
-            "temperature, path).terms)`."
+            "do not depend on p. Pass the whole Hamiltonian, with its kinetic energy, also "
+            "if a flow solves a part of it: `langevin_terms(H0, friction, temperature, "
+            "path, slow=rest)`."
         )
 
 

@@ -9,18 +9,22 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from .._arguments import check_takes
+from .._batch import refused_where
 from .._compat import direction
 from .._custom_types import Args, RealScalarLike, Y
+from .._root_finder import all_finite
 from .._terms import rate, slow_apart
 from .base import AbstractSymplecticSolver
 from .step import result_of
 
 
-# Free flight, a solver for systems without noise, or `flow(time, y, args)`.
-Flow: TypeAlias = AbstractSymplecticSolver | Callable[..., Y] | None
+# `flow(time, y, args)`.
+FlowFunction: TypeAlias = Callable[[RealScalarLike, Y, Args], Y]
+# Free flight, a solver for systems without noise, or a function.
+Flow: TypeAlias = AbstractSymplecticSolver | FlowFunction | None
 
 
 def is_solver(flow: Any) -> bool:
@@ -70,24 +74,51 @@ def check_follows(
 
 
 def check_returns_pair(
-    flow: Callable[..., Y], t0: RealScalarLike, y0: Y, args: Args
+    flow: FlowFunction, t0: RealScalarLike, y0: Y, args: Args
 ) -> None:
     """Raises a `ValueError` if a flow returns another state than it gets."""
     time = jnp.asarray(t0, jnp.result_type(t0, jnp.float32))
     y1 = eqx.filter_eval_shape(flow, time, y0, args)
-    if not eqx.tree_equal(y1, eqx.filter_eval_shape(lambda: y0)):
+    if _shapes_and_types(y1) != _shapes_and_types(y0):
         raise ValueError(
             "`flow(time, y, args)` must return a pair like the state, "
             f"{eqx.tree_pformat(y0)}; got {eqx.tree_pformat(y1)}."
         )
 
 
+def _shapes_and_types(y: Y) -> PyTree:
+    leaves, structure = jtu.tree_flatten(y)
+    return structure, [(jnp.shape(x), jnp.result_type(x)) for x in leaves]
+
+
+def returns_nan(
+    flow: FlowFunction, time: RealScalarLike, y0: Y, args: Args
+) -> Bool[Array, ""]:
+    """Whether a flow returns NaN at the start of a solve, for half of its first step.
+    Raises an error that names the flow; in a batch the path fails alone."""
+    # The check has no derivative.
+    y1 = jtu.tree_map(lax.stop_gradient, flow(time, y0, args))
+    is_nan = jnp.stack([jnp.any(jnp.isnan(x)) for x in jtu.tree_leaves(y1)])
+    # A path that has failed already is not the fault of the flow.
+    return refused_where(all_finite(y0) & jnp.any(is_nan), _NAN)
+
+
+_NAN = (
+    "`flow(time, y, args)` returned NaN at `y0`, for half of the first step. (A mode with "
+    "`omega = 0` has no `sin(omega * time) / omega`: write `time * jnp.sinc(omega * time / "
+    "jnp.pi)`.)"
+)
+
+
 def begun(
     flow: Flow, drift: tuple, t0: RealScalarLike, t1: Any, y0: Y, args: Args
 ) -> PyTree[Array]:
-    """The state of the solver that is the flow, if it is one."""
-    if not is_solver(flow):
+    """The state of the solver that is the flow, or whether a function returns NaN."""
+    if flow is None:
         return None
+    if not is_solver(flow):
+        half = direction(drift) * (t1 - t0) / 2
+        return returns_nan(flow, half, y0, args)  # pyright: ignore
     return flow.init(diffrax.MultiTerm(*drift), t0, t1, y0, args)  # pyright: ignore
 
 
@@ -103,7 +134,7 @@ def moved_by(
     state: PyTree[Array],
 ) -> tuple[Y, PyTree[Array], diffrax.RESULTS]:
     """The state after the flow from `t0` to `t1`, half a step of length `time`; the state
-    of the solver that is the flow, and its result."""
+    of the flow, and its result."""
     if flow is None:
         p, q = y
         _, velocities = rate(drift, t0, y, args)
@@ -111,7 +142,10 @@ def moved_by(
     if not is_solver(flow):
         # Steps are positive even in a solve backward in time, where the flow runs back.
         y1 = flow(direction(drift) * time, y, args)  # pyright: ignore
-        return y1, None, result_of(None, y1)
+        R: Any = diffrax.RESULTS
+        # `state` says whether the flow was broken at the start.
+        result = R.where(state, R.nonfinite, result_of(None, y1))
+        return y1, state, result
     terms = diffrax.MultiTerm(*drift)
     h = (t1 - t0) / steps
 

@@ -49,7 +49,8 @@ class SplittingState(NamedTuple):
     """What a splitting hands on from the end of a step to the start of the next one.
 
     - `forces`: those of the kicks, if a step begins and ends with half a kick.
-    - `flow`: the state of the solver that is the flow, if there is one.
+    - `flow`: the state of the solver that is the flow; of a function, whether it returned
+        NaN at the start.
     """
 
     forces: PyTree[Array]

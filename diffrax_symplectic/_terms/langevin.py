@@ -62,11 +62,11 @@ def langevin_terms(
     Stratonovich. $B$ holds the roots of $G$ and $T$. Where one of these is zero, the
     derivative of its root, which is infinite, counts as zero in gradients.
 
-    [`diffrax_symplectic.BAOAB`][], [`diffrax_symplectic.LangevinMiddle`][] and
-    [`diffrax_symplectic.Damped`][] treat friction by a step of its own. Every other solver,
-    from this package or from Diffrax, takes it as a part of the drift, which makes
-    positions wrong to first order where masses depend on them. More terms are added
-    by `diffrax.MultiTerm(*terms.terms, ...)`: other noise from
+    [`diffrax_symplectic.BAOAB`][] and [`diffrax_symplectic.LangevinMiddle`][] treat
+    friction by a step of its own. Every other solver, from this package or from Diffrax,
+    takes it as a part of the drift, which makes positions wrong to first order where masses
+    depend on them; only [`diffrax_symplectic.LinearFlow`][] refuses it. More terms are
+    added by `diffrax.MultiTerm(*terms.terms, ...)`: other noise from
     [`diffrax_symplectic.noise_terms`][], or a second bath from
     [`diffrax_symplectic.bath_terms`][]. A bath shares its random key with no other term:
     both would be one Brownian motion.
@@ -120,8 +120,7 @@ def bath_terms(
     $\mathrm{d}p = -G\, \partial H_0 / \partial p\,\mathrm{d}t + B\,\mathrm{d}w$.
 
     Add them to other terms, `diffrax.MultiTerm(*terms.terms, *bath.terms)`: a second bath,
-    friction beside noise of another kind, or for
-    [`diffrax_symplectic.LinearFlow`][], whose drift is not that of `H0`.
+    or friction beside noise of another kind.
 
     **Arguments** and errors are those of [`diffrax_symplectic.langevin_terms`][].
 

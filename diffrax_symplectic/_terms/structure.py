@@ -381,9 +381,10 @@ _GENERAL = (
 
 
 FRICTION = (
-    "Take friction from `langevin_terms(H0, friction, temperature, path)`: `BAOAB()`, "
-    "`LangevinMiddle()` and `Damped(solver)` treat it by a step of its own. (`BAOAB` and "
-    "`LangevinMiddle` need a kinetic energy that is quadratic in p.)"
+    "Take friction from `langevin_terms(H0, friction, temperature, path)`: `BAOAB()` "
+    "and `LangevinMiddle()`, or for masses that depend on positions "
+    "`BAOAB(ImplicitMidpoint())`, treat it by a step of its own. (All need a kinetic "
+    "energy that is quadratic in p.)"
 )
 
 

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._arguments import check_pair, check_state, is_real_number
-from .._batch import batched_like, error_if_alone
+from .._batch import batched_like, refused_where
 from .._compat import is_traced
 from .._custom_types import Args, RealScalarLike
 from .._root_finder import correction, max_norm, solve_matrix
@@ -240,7 +240,7 @@ def check_start(
     # A check has no derivative. Taking one would trace it again.
     fixed = jtu.tree_map(_without_derivative, (y0, args))
     dependent, off = _faults(terms, t0, *fixed)
-    return _refused(dependent, _DEPENDENT), _refused(off, _OFF)
+    return refused_where(dependent, _DEPENDENT), refused_where(off, _OFF)
 
 
 def _without_derivative(x: Any) -> Any:
@@ -259,15 +259,6 @@ def _faults(
     at = surface.frame(q)
     dependent = surface.dependent(at)
     return dependent, ~dependent & surface.off(p, at)
-
-
-def _refused(fault: Bool[Array, ""], advice: str) -> Bool[Array, ""]:
-    """The fault, with a `ValueError` where it is known."""
-    if is_traced(fault):
-        return error_if_alone(fault, advice)
-    if fault:
-        raise ValueError(advice)
-    return fault
 
 
 def _check_masses(

@@ -21,6 +21,7 @@ TOLERANCE = 0.1
 CASES = {
     "BAOAB": ds.BAOAB(),
     "LangevinMiddle": ds.LangevinMiddle(),
+    "BAOAB(ImplicitMidpoint)": ds.BAOAB(ds.ImplicitMidpoint()),
     "ImplicitMidpoint": ds.ImplicitMidpoint(),
     "SRKw1": ds.SRKw1(),
     "PlateauGauss": ds.PlateauGauss(),
@@ -29,12 +30,8 @@ CASES = {
     "SRKw5": ds.SRKw5(),
     "StrangGauss": ds.StrangGauss(),
     "NinomiyaVictoir": ds.NinomiyaVictoir(),
-    "Damped(StormerVerlet)": ds.Damped(ds.StormerVerlet()),
-    "Damped(PlateauVerlet)": ds.Damped(ds.PlateauVerlet()),
-    "Damped(SRKw4)": ds.Damped(ds.SRKw4()),
-    "Damped(SRKs2)": ds.Damped(ds.SRKs2()),
 }
-QUICK = ("BAOAB", "ImplicitMidpoint", "Damped(StormerVerlet)")
+QUICK = ("BAOAB", "ImplicitMidpoint", "SRKw5")
 
 
 def energies(solver, frictions=FRICTIONS) -> np.ndarray:

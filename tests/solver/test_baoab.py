@@ -58,7 +58,7 @@ def test_stationary_bias_of_the_double_well(make_path, expected):
     np.testing.assert_allclose(bias[:, 0], expected, rtol=1e-2)
 
 
-@pytest.mark.parametrize("solver", [ds.BAOAB(), ds.Damped(ds.StormerVerlet())])
+@pytest.mark.parametrize("solver", [ds.BAOAB(), ds.BAOAB(ds.StormerVerlet())])
 @pytest.mark.parametrize(
     "friction", slow_except(["matrix"], ["each", "matrix", "positions"])
 )
@@ -108,7 +108,7 @@ def test_a_matrix_of_friction_is_that_of_its_own_axes():
     "solver",
     [
         ds.BAOAB(),
-        pytest.param(ds.Damped(ds.StormerVerlet()), marks=pytest.mark.slow),
+        pytest.param(ds.BAOAB(ds.StormerVerlet()), marks=pytest.mark.slow),
     ],
 )
 def test_first_and_second_derivatives_by_a_matrix_with_equal_rates(solver):
@@ -131,6 +131,71 @@ def test_first_and_second_derivatives_by_a_matrix_with_equal_rates(solver):
         np.testing.assert_allclose(slope, (above - below) / (2 * k), rtol=1e-8)
         differences = (upper - lower) / (2 * k)
         np.testing.assert_allclose(second(friction), differences, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("friction", [0.5, jnp.array([0.5, 0.0]), MATRIX])
+def test_momenta_fall_by_the_midpoint_rule_and_rise_again_backward(friction):
+    # Of free particles with masses 1 and 4.
+    H0 = lambda t, p, q, args: jnp.sum(p**2 / jnp.array([1.0, 4.0])) / 2
+    terms = ds.langevin_terms(H0, friction)
+    y0 = jnp.array([1.0, 2.0]), jnp.zeros(2)
+    rates = np.eye(2) * friction if jnp.ndim(friction) < 2 else np.asarray(friction)
+    x = rates / np.array([1.0, 4.0]) * 0.25 / 2
+    once = np.linalg.solve(np.eye(2) + x, np.eye(2) - x)
+    solver = ds.BAOAB()
+    end = diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.25, y0, max_steps=4).ys
+    expected = np.linalg.matrix_power(once, 4) @ y0[0]
+    np.testing.assert_allclose(end[0][-1], expected, rtol=1e-13)
+    back = tuple(x[-1] for x in end)
+    back = diffrax.diffeqsolve(terms, solver, 1.0, 0.0, -0.25, back, max_steps=4).ys
+    np.testing.assert_allclose([x[-1] for x in back], y0, atol=1e-14)
+
+
+@pytest.mark.parametrize("solver", [ds.BAOAB(), ds.BAOAB(ds.StormerVerlet())])
+def test_one_number_serves_all_momenta_in_their_precision(solver):
+    # Without noise, too.
+    kinetic = lambda p: jnp.sum(p["a"] ** 2) / 2 + jnp.sum(p["b"] ** 2) / 4
+    terms = ds.langevin_terms(lambda t, p, q, args: kinetic(p), np.float64(0.8))
+    p = {"a": jnp.ones(2, jnp.float32), "b": jnp.full((3, 1), 2, jnp.float32)}
+    t0, t1 = jnp.float32(0), jnp.float32(0.5)
+    state = solver.init(terms, t0, t1, (p, p), None)
+    p1, _ = solver.step(terms, t0, t1, (p, p), None, state, False)[0]
+    # The velocities of the second are half as large.
+    for name, mass in (("a", 1), ("b", 2)):
+        assert p1[name].dtype == jnp.float32
+        expected = p[name] * np.exp(-0.4 / mass)
+        np.testing.assert_allclose(p1[name], expected, rtol=6e-3)
+
+
+def test_what_has_no_friction_is_refused():
+    y0 = (jnp.ones(1), jnp.ones(1))
+    noise = lambda t, p, q, args: jnp.stack([jnp.sum(jnp.sin(q))])
+    terms = ds.hamiltonian_terms(_pendula, noise, weak_path(1))
+    # A state (x, v), of which the first half is no momentum.
+    drift = diffrax.ODETerm(lambda t, y, args: (y[1], -y[0]))
+    for without in (terms, drift):
+        with pytest.raises(ValueError, match="these have none.*`langevin_terms"):
+            diffrax.diffeqsolve(without, ds.BAOAB(), 0.0, 1.0, 0.1, y0)
+
+
+def test_friction_on_spins_is_refused_in_favour_of_their_damping():
+    spins = ds.spin_terms(lambda t, s, args: s[2])
+    bath = ds.bath_terms(lambda t, p, q, args: jnp.sum(p**2) / 2, 0.3)
+    terms = diffrax.MultiTerm(*spins.terms, *bath.terms)
+    y0 = ds.to_spinors(jnp.array([0.6, 0.0, 0.8]))
+    solver = ds.BAOAB(ds.ImplicitMidpoint())
+    with pytest.raises(ValueError, match="friction to a canonical.*Pass `damping=`"):
+        diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0)
+
+
+def test_between_steps_a_solution_is_interpolated_between_their_ends():
+    push = lambda t, p, q, args: jnp.stack([jnp.sum(q)])
+    terms = damped_terms(_pendula, 1.0, push, Given(jnp.array([0.3])))
+    solver, y0 = ds.BAOAB(), (jnp.ones(2), jnp.ones(2))
+    state = solver.init(terms, 0.0, 0.1, y0, None)
+    y1, _, dense, *_ = solver.step(terms, 0.0, 0.1, y0, None, state, False)
+    np.testing.assert_array_equal(dense["y0"], y0)
+    np.testing.assert_array_equal(dense["y1"], y1)
 
 
 def test_systems_without_the_structure_are_refused():
@@ -191,8 +256,8 @@ def test_after_a_jump_the_forces_are_new():
 def test_gradients_may_walk_back_along_the_solution():
     solver = ds.BAOAB()
     assert _undoes_its_steps(solver)
-    assert _undoes_its_steps(ds.Damped(ds.StormerVerlet()))
-    assert not _undoes_its_steps(ds.Damped(ds.SRKw4()))
+    assert _undoes_its_steps(ds.BAOAB(ds.StormerVerlet()))
+    assert not _undoes_its_steps(ds.BAOAB(ds.SRKw4()))
     H0 = lambda t, p, q, args: _pendula(t, args * p, args * q, None)
     terms = ds.langevin_terms(H0, MATRIX, 0.8, weak_path(2))
 

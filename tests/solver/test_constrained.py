@@ -646,11 +646,10 @@ def test_water_in_a_field_is_better_with_a_flow_of_its_own():
     assert np.all(abs(flow - [0.0018, -0.0005]) < 4 * error)
 
 
-@pytest.mark.parametrize("solver", [ds.LangevinMiddle(), ds.Damped(ds.StormerVerlet())])
-def test_other_solvers_for_langevin_dynamics_refuse_constraints(solver):
+def test_other_solvers_for_langevin_dynamics_refuse_constraints():
     terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
     with pytest.raises(ValueError, match="`StormerVerlet.*BAOAB"):
-        solver.init(terms, 0.0, 0.1, DIMER, None)
+        ds.LangevinMiddle().init(terms, 0.0, 0.1, DIMER, None)
     with pytest.raises(ValueError, match="Take friction from|BAOAB"):
         ds.StormerVerlet().init(terms, 0.0, 0.1, DIMER, None)
 

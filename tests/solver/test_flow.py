@@ -388,6 +388,18 @@ def test_momenta_of_langevin_middle_are_wrong_under_a_current():
         np.testing.assert_allclose(end[1], mean, rtol=1e-9)
 
 
+def test_a_flow_that_returns_nan_is_named():
+    # A mode of frequency zero, without a case for it.
+    def flow(time, y, args):
+        p, q = y
+        return p, q + jnp.sin(0.0 * time) / jnp.zeros(N) * p
+
+    with pytest.raises(ValueError, match="returned NaN"):
+        ds.BAOAB(flow).init(_chain(), 0.0, 0.1, START, None)
+    with pytest.raises(Exception, match="returned NaN"):
+        diffrax.diffeqsolve(_chain(), ds.BAOAB(flow), 0.0, 1.0, 0.1, START)
+
+
 def _call(solver, terms=None, y0=START):
     terms = _chain() if terms is None else terms
     return lambda: solver.init(terms, 0.0, 0.1, y0, None)

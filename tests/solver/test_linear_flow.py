@@ -67,6 +67,36 @@ def test_orders_are_those_of_the_splitting_where_the_solver_has_higher_ones():
     assert orders(ds.AdditiveGauss())[1] == 2
     assert orders(ds.PlateauVerlet())[2] == 1.0
     assert orders(ds.SRKs1()) == [2, 1, 1.0]
+    flow = klein_gordon.waves(8, 0.1)
+    assert ds.LinearFlow(ds.PlateauGauss(), flow).record.strong == (1, 0.5)
+
+
+class _Own(ds.AbstractSymplecticSolver):
+    """A solver that states its orders by methods, and moves by what it remembers of the
+    end of its last step, if nothing jumped."""
+
+    structure = "any"
+    variables = ("W",)
+    order = lambda self, terms: 3
+    weak_order = lambda self, terms: 1
+    strong_order = lambda self, terms: 0.5
+    stage_vectors = lambda self, num_noises: ()
+    init = lambda self, terms, t0, t1, y0, args: y0
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        p, q = y0 if made_jump else solver_state
+        y1 = (y0[0] - (t1 - t0) * q, y0[1])
+        return y1, None, dict(y0=y0, y1=y1), y1, diffrax.RESULTS.successful
+
+
+def test_the_orders_of_the_wrapped_solver_bound_those_of_the_splitting():
+    terms = ds.hamiltonian_terms(_rest, lambda *a: _kicks(*a)[:1], weak_path(1))
+    wrap = lambda solver: ds.LinearFlow(solver, klein_gordon.waves(8, 0.1))
+    own = wrap(_Own())
+    assert (own.weak_order(terms), own.strong_order(terms)) == (1, 0.5)
+    assert own.order(terms) == 2
+    weak_only = wrap(ds.SRKw2())
+    assert (weak_only.weak_order(terms), weak_only.strong_order(terms)) == (2, None)
 
 
 def test_noises_that_do_not_commute_leave_the_splitting_at_weak_order_two():
@@ -98,12 +128,10 @@ def test_linear_systems_without_a_rest_are_solved_exactly():
 
 
 def test_what_a_solver_remembers_is_not_taken_for_where_the_flow_leads():
-    # BAOAB keeps the forces of the end of a step, and the flow goes on from there.
+    # The solver keeps the end of its step, and the flow goes on from there.
     flow = klein_gordon.waves(8, 0.5)
-    whole = lambda t, p, q, args: jnp.sum(p**2) / 2 + _rest(t, p, q, args)
-    bath = ds.bath_terms(whole, 0.4, 0.1, Given(0.1 * jnp.arange(8.0))).terms
-    terms = diffrax.MultiTerm(*ds.hamiltonian_terms(_rest).terms, *bath)
-    inner, y = ds.BAOAB(), tuple(jr.normal(jr.key(0), (2, 8)))
+    terms = ds.hamiltonian_terms(_rest)
+    inner, y = _Own(), tuple(jr.normal(jr.key(0), (2, 8)))
     solver = ds.LinearFlow(inner, flow)
     sol = diffrax.diffeqsolve(terms, solver, 0, 0.6, 0.2, y, max_steps=4)
     for i in range(3):
@@ -115,18 +143,15 @@ def test_what_a_solver_remembers_is_not_taken_for_where_the_flow_leads():
 
 def test_gradients_may_walk_back_along_the_solution():
     solver = ds.LinearFlow(ds.StormerVerlet(), klein_gordon.waves(8, 0.1))
-    damped = ds.LinearFlow(ds.Damped(ds.StormerVerlet()), klein_gordon.waves(8, 0.1))
-    assert _undoes_its_steps(solver) and _undoes_its_steps(damped)
+    assert _undoes_its_steps(solver)
     assert not _undoes_its_steps(ds.LinearFlow(ds.SRKw4(), klein_gordon.waves(8, 0.1)))
     H0 = lambda t, p, q, args: args * _rest(t, p, q, None)
-    kinetic = lambda t, p, q, args: jnp.sum(p**2) / 2
-    rest = ds.hamiltonian_terms(H0, _kicks, weak_path(2)).terms
-    terms = diffrax.MultiTerm(*rest, *ds.bath_terms(kinetic, 0.5).terms)
+    terms = ds.hamiltonian_terms(H0, _kicks, weak_path(2))
     y0 = tuple(0.3 * jr.normal(jr.key(0), (2, 8)))
 
     def end(y0, args, adjoint):
         sol = diffrax.diffeqsolve(
-            terms, damped, 0, 2, 0.1, y0, args, adjoint=adjoint, max_steps=32
+            terms, solver, 0, 2, 0.1, y0, args, adjoint=adjoint, max_steps=32
         )
         return jnp.sum(sol.ys[0][-1] ** 2) + sol.ys[1][-1, 0]
 
@@ -166,8 +191,10 @@ def test_flows_that_are_none_are_refused():
     inner, flow = ds.StormerVerlet(), klein_gordon.waves(8, 0.1)
     with pytest.raises(ValueError, match=r"called as `flow\(time, y, args\)`"):
         ds.LinearFlow(inner, lambda y: y)  # pyright: ignore
-    with pytest.raises(ValueError, match="wraps a solver of this package"):
-        ds.LinearFlow(diffrax.Heun(), flow)
+    # Diffrax's wrappers count as what they wrap, by `isinstance`.
+    for other in (diffrax.Heun(), diffrax.HalfSolver(ds.ImplicitMidpoint())):
+        with pytest.raises(ValueError, match="wraps a solver of this package"):
+            ds.LinearFlow(other, flow)
     init = lambda flow, y0=y0: ds.LinearFlow(inner, flow).init(
         terms, 0.0, 0.1, y0, None
     )
@@ -178,3 +205,86 @@ def test_flows_that_are_none_are_refused():
     # One propagator for all steps.
     with pytest.raises(ValueError, match="does not depend on `time`"):
         init(lambda time, y, args: flow(0.05, y, args))
+
+
+def test_it_is_implicit_if_its_solver_is():
+    flow = klein_gordon.waves(8, 0.1)
+    implicit = ds.LinearFlow(ds.ImplicitMidpoint(), flow)
+    explicit = ds.LinearFlow(ds.StormerVerlet(), flow)
+    assert isinstance(implicit, diffrax.AbstractImplicitSolver)
+    assert not isinstance(explicit, diffrax.AbstractImplicitSolver)
+
+
+BATH = r"`BAOAB\(linear_flow\(\.\.\.\)\)`.*`langevin_terms\(.*slow="
+
+
+def test_heat_baths_are_refused_in_favour_of_baoab():
+    flow, y0 = klein_gordon.waves(8, 0.1), (jnp.ones(8), jnp.ones(8))
+    for langevin in (ds.BAOAB(), ds.LangevinMiddle(), ds.BAOAB(ds.StormerVerlet())):
+        with pytest.raises(ValueError, match=BATH):
+            ds.LinearFlow(langevin, flow)
+    kinetic = lambda t, p, q, args: jnp.sum(p**2) / 2
+    path = ds.WeakBrownianPath((8,), jr.key(0))
+    bath = ds.bath_terms(kinetic, 0.5, 1.0, path).terms
+    rate, one = 0.5, jnp.ones(8)
+    for terms in (
+        ds.langevin_terms(_rest, 0.5, 1.0, path),
+        ds.langevin_terms(_rest, 0.5),
+        diffrax.MultiTerm(*ds.hamiltonian_terms(_rest).terms, *bath),
+        diffrax.MultiTerm(
+            diffrax.UnderdampedLangevinDriftTerm(rate, one, lambda x, args: x**3),
+            diffrax.UnderdampedLangevinDiffusionTerm(rate, one, path),
+        ),
+    ):
+        for inner in (ds.StormerVerlet(), ds.ImplicitMidpoint()):
+            solver = ds.LinearFlow(inner, flow)
+            with pytest.raises(ValueError, match=f"no terms with friction.*{BATH}"):
+                diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0)
+
+
+def test_terms_of_the_whole_energy_with_a_slow_part_are_refused():
+    # The flow would follow what the solver follows, too.
+    whole = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2
+    slow = lambda t, q, args: _rest(t, q, q, args)
+    solver = ds.LinearFlow(ds.StormerVerlet(), klein_gordon.waves(8, 0.1))
+    terms = ds.hamiltonian_terms(whole, slow=slow)
+    with pytest.raises(ValueError, match="contain the rest alone"):
+        solver.init(terms, 0.0, 0.1, (jnp.ones(8), jnp.ones(8)), None)
+
+
+def _drifting(omega):
+    """The flow of a mode, without a case for frequency zero."""
+
+    def flow(time, y, args):
+        p, q = y
+        c, s = jnp.cos(omega * time), jnp.sin(omega * time)
+        return c * p - omega * s * q, c * q + s / omega * p
+
+    return flow
+
+
+@pytest.mark.parametrize("inner", [ds.StormerVerlet(), ds.ImplicitMidpoint()])
+def test_a_flow_that_returns_nan_is_named(inner):
+    y0 = jnp.ones(2), jnp.ones(2)
+    terms = ds.hamiltonian_terms(_rest)
+    named = r"`flow\(time, y, args\)` returned NaN.*jnp.sinc"
+    solver = ds.LinearFlow(inner, _drifting(jnp.array([1.0, 0.0])))
+    with pytest.raises(Exception, match=named):
+        diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0)
+    with pytest.raises(ValueError, match=named):
+        solver.init(terms, 0.0, 0.1, y0, None)
+
+
+def test_in_a_batch_a_flow_that_returns_nan_fails_its_path_alone():
+    terms, y0 = ds.hamiltonian_terms(_rest), (jnp.ones(()), jnp.ones(()))
+
+    @jax.jit
+    @jax.vmap
+    def run(omega):
+        solver = ds.LinearFlow(ds.ImplicitMidpoint(), _drifting(omega))
+        sol = diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0, throw=False)
+        return sol.result == diffrax.RESULTS.nonfinite, sol.ys[1][-1]
+
+    broken, ends = run(jnp.array([1.0, 0.0, 2.0]))
+    np.testing.assert_array_equal(broken, [False, True, False])
+    np.testing.assert_array_equal(np.isfinite(ends), [True, False, True])

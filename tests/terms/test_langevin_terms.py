@@ -203,7 +203,7 @@ def _end(terms, solver, y0, t1=0.5):
     return jnp.stack([x[-1] for x in sol.ys]), sol.result
 
 
-@pytest.mark.parametrize("solver", [ds.BAOAB(), ds.Damped(ds.StormerVerlet())])
+@pytest.mark.parametrize("solver", [ds.BAOAB(), ds.BAOAB(ds.StormerVerlet())])
 def test_traced_frictions_and_temperatures_that_are_none_fail_alone(solver):
     y0, given = (jnp.ones(3), jnp.ones(3)), Given(jnp.array([0.3, 0.1, -0.2]))
 
@@ -237,7 +237,7 @@ def test_every_other_solver_sees_friction_and_noise():
         )
         exact = np.stack(steps(diffrax.Heun(), 1024))[:, -1]
         solvers = [diffrax.EulerHeun(), ds.ImplicitMidpoint(), ds.SRKs1(), ds.BAOAB()]
-        solvers += [ds.LangevinMiddle(), ds.Damped(ds.StormerVerlet())]
+        solvers += [ds.LangevinMiddle(), ds.BAOAB(ds.StormerVerlet())]
         if not callable(friction):
             solvers += [ds.SRKs4(), diffrax.ShARK(), diffrax.Euler()]
         for solver in solvers:
@@ -247,7 +247,7 @@ def test_every_other_solver_sees_friction_and_noise():
             np.testing.assert_allclose(end, exact, atol=0.03 * late)
         for solver in (ds.StormerVerlet(), ds.SRKw4()):
             with pytest.raises(
-                ValueError, match=r"`BAOAB\(\)`.* and `Damped\(solver\)"
+                ValueError, match=r"`BAOAB\(\)` and `LangevinMiddle\(\)`"
             ):
                 solver.init(terms, 0.0, 0.1, y0, None)
 

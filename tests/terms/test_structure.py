@@ -266,7 +266,7 @@ def _heated(H0, structure, noise=None):
     [
         (_kicked, ds.StormerVerlet(), "hamiltonian_terms"),
         (_heated, ds.BAOAB(), "langevin_terms"),
-        (_heated, ds.Damped(ds.StormerVerlet()), "langevin_terms"),
+        (_heated, ds.BAOAB(ds.StormerVerlet()), "langevin_terms"),
     ],
 )
 def test_a_wrong_assertion_is_refused_where_values_are_known(make, solver, name, dtype):
