@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, PyTree
 from ._arguments import check_pair, check_state
 from ._compat import ω
 from ._custom_types import Args, RealScalarLike, Y
+from ._products import dot
 from ._terms import (
     apply_one,
     as_spins,
@@ -92,11 +93,11 @@ def symplecticity_defect(
     zero = np.zeros((half, half))
     one = np.eye(half)
     omega = jnp.asarray(np.block([[zero, one], [-one, zero]]), flat.dtype)
-    defect = _dot(jacobian.T, _dot(omega, jacobian)) - omega
+    defect = dot(jacobian.T, dot(omega, jacobian)) - omega
     if constraint_of(terms) is not None:
         # Columns: an orthonormal basis.
         Z = _allowed_directions(terms, t0, y0, args)
-        defect = _dot(Z.T, _dot(defect, Z))
+        defect = dot(Z.T, dot(defect, Z))
     return jnp.max(jnp.abs(defect))
 
 
@@ -114,10 +115,6 @@ def _allowed_directions(terms, t0, y0: Y, args: Args) -> Float[Array, "n k"]:
     normals = jax.jacrev(equations)(flat)
     _, _, V = jnp.linalg.svd(normals, full_matrices=True)
     return V[len(normals) :].T
-
-
-# By default accelerators multiply in half precision, which would look like a defect.
-_dot = ft.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
 
 
 def poisson_defect(
@@ -171,7 +168,7 @@ def poisson_defect(
         return rows.reshape(num_components, num_components)
 
     # P(s) multiplies each row by a cross product, so it is never formed.
-    before = _dot(matrix(gradients), matrix(jnp.cross(s0, gradients)).T)
+    before = dot(matrix(gradients), matrix(jnp.cross(s0, gradients)).T)
     return jnp.max(jnp.abs(before - matrix(jnp.cross(s1, units)).T))
 
 
@@ -204,7 +201,8 @@ def equipartition(
         terms = ds.langevin_terms(well, 1.0, 0.5, ())
         y0 = (jnp.array(0.0), jnp.array(0.0))
         thermometers = ds.equipartition(terms)
-        print(ds.expectation(thermometers, terms, ds.BAOAB(), 0, 20, 0.1, y0, key=jr.key(0)))
+        solver = ds.BAOAB()
+        print(ds.expectation(thermometers, terms, solver, 0, 20, 0.1, y0, key=jr.key(0)))
         # both 0.5
         ```
 

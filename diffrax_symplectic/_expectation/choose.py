@@ -8,17 +8,16 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from .._simulation import has_discrete_increments, Problem
 from .._solver import Want
-from .arguments import has_discrete_increments
-from .array_rqmc import ArrayRQMC, step_words
 from .cost import NUMBERS_PER_SECOND, numbers_per_step
 from .estimate import Expectation
+from .fitted import num_outcomes, ValueFunctions
 from .fused_paths import fused_plan
 from .independent import IndependentPaths
-from .noise import num_outcomes
-from .problem import Problem
+from .kinks import has_kinks
 from .sampling import AbstractSampling, SamplingPlan
-from .value_functions import ValueFunctions
+from .sorted import ArrayRQMC, step_words
 
 
 # No sample's key is folded from this number.
@@ -96,7 +95,7 @@ def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
     # Value functions need discrete increments, as do solvers of the weak sense.
     needs_discrete = isinstance(sampling, ValueFunctions)
     needs_discrete |= has_discrete_increments(problem.solver)
-    if problem.has_kinks and not has_path and not needs_discrete:
+    if has_kinks(problem) and not has_path and not needs_discrete:
         problem = problem_for("strong")
         why_law = "Gaussian increments, since phi may not be smooth"
 

@@ -12,8 +12,8 @@ from .._compat import Jaxpr, programs_in
 from .._custom_types import Y
 from .._lapack import LAPACK
 from .._signature import once_for_each_signature
-from .fits import without_newton
-from .problem import Problem
+from .._simulation import Problem
+from .._solver import without_newton
 
 
 # The numbers that two cores compute in a second in large batches of paths. The constants

@@ -13,6 +13,12 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._brownian import Discrete, laws_of, UnspecifiedPath
 from .._custom_types import Args, RealScalarLike, Y
+from .._simulation import (
+    has_discrete_increments,
+    Problem,
+    warn_of_stragglers,
+    warn_of_truncation,
+)
 from .._solver import own_path
 from .._terms import (
     brownian_paths,
@@ -21,17 +27,13 @@ from .._terms import (
     with_paths,
     without_truncation,
 )
-from .arguments import has_discrete_increments, warn_of_truncation
-from .call import checked_call, Meter, NO_METER
-from .cautions import cautions
+from .call import checked_call
 from .choose import choose, few_paths, trial_key, Wanted
-from .engines import warn_of_stragglers
-from .estimate import Expectation, ExpectationInterrupted
+from .estimate import cautions, Expectation, ExpectationInterrupted, needs_level
 from .fused_paths import FusedPaths
-from .problem import Problem
-from .run import run
+from .kinks import has_kinks
+from .run import Meter, NO_METER, run
 from .sampling import AbstractSampling
-from .tolerance import needs_level
 
 
 # The levels, unless the user chooses them: the fewest that tell the discretization error,
@@ -221,7 +223,7 @@ def expectation(
     # A part of an estimate is not warned of again.
     if start is None and first == 0:
         warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
-        if problem.has_kinks:
+        if has_kinks(problem):
             _warn_of_law(estimate, problem, key, devices)
     return estimate
 

@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Key, PRNGKeyArray, PyTree
 
 from .._root_finder import all_finite
-from .engines import by_drjit, state_itself
+from .._simulation import by_drjit, Level, Problem, state_itself
 from .independent import IndependentPaths
-from .problem import Level, Problem
 from .sampling import Samples, SamplingPlan
 
 

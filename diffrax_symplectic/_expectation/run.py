@@ -5,6 +5,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.random as jr
@@ -15,11 +16,38 @@ from jaxtyping import Array, Key, PRNGKeyArray, PyTree
 
 from .._arguments import check_untraced
 from .batch import batch_sums, BatchSums, quick_batch_sums
-from .call import Meter
-from .estimate import check_same, Expectation, ExpectationInterrupted
-from .moments import joined, Moments
+from .estimate import (
+    check_same,
+    Expectation,
+    ExpectationInterrupted,
+    is_reached,
+    is_stuck,
+    joined,
+    Moments,
+    share_of,
+)
 from .sampling import Samples, SamplingPlan
-from .tolerance import is_reached, is_stuck, share_of
+
+
+NO_METER = diffrax.NoProgressMeter()
+
+
+class Meter:
+    """A progress meter of Diffrax, as a context manager."""
+
+    def __init__(self, meter: diffrax.AbstractProgressMeter):
+        self._meter = meter
+        self._state = meter.init()
+
+    def step(self, progress: float) -> None:
+        """Shows the progress, from 0 to 1."""
+        self._state = self._meter.step(self._state, np.asarray(progress))
+
+    def __enter__(self) -> "Meter":
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._meter.close(self._state)
 
 
 def run(

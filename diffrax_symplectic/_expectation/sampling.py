@@ -6,9 +6,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
+
+from .._simulation import Problem
 
 
 # Deviations up to this many roundings of the mean count as rounding errors.
@@ -92,7 +93,9 @@ class AbstractSampling(eqx.Module):
     """How the samples of an expectation are taken: the public classes."""
 
     @abc.abstractmethod
-    def prepare(self, problem: Any, key: PRNGKeyArray, devices: tuple) -> SamplingPlan:
+    def prepare(
+        self, problem: Problem, key: PRNGKeyArray, devices: tuple
+    ) -> SamplingPlan:
         """The plan for a problem, made with trials that draw from `key`. Raises a
         `ValueError` for a problem that it cannot sample."""
 
@@ -108,8 +111,3 @@ def saved_by_name(sampling: _Sampling) -> _Sampling:
     name of its class."""
     SAVED_SAMPLINGS[sampling.__name__] = sampling
     return sampling
-
-
-def real(dtype: Any) -> Any:
-    """The floating-point type in which values of `dtype` are averaged."""
-    return jnp.result_type(dtype, float)

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation import array_rqmc, simulation
-from diffrax_symplectic._expectation.array_rqmc import step_words
-from diffrax_symplectic._expectation.moments import level_weights
 from diffrax_symplectic._expectation.sampling import SamplingPlan
+from diffrax_symplectic._expectation.sorted import array_rqmc
+from diffrax_symplectic._expectation.sorted.array_rqmc import step_words
+from diffrax_symplectic._simulation import loop
+from diffrax_symplectic._simulation.levels import level_weights
 
 from ..families import slow_except
 from ..problems import kubo_terms, RecordingMeter
@@ -70,7 +71,7 @@ def test_paths_in_blocks_are_those_of_one_batch(monkeypatch):
     whole = _estimate(phi=SQUARE, levels=2)
     # Another function, so that programs are compiled anew.
     phi = lambda t, y, args: y[1] ** 2
-    monkeypatch.setattr(simulation, "_BLOCK", 64)
+    monkeypatch.setattr(loop, "_BLOCK", 64)
     got = _estimate(phi=phi, levels=2)
     np.testing.assert_allclose(got.mean, whole.mean, rtol=1e-13)
     np.testing.assert_allclose(got.std_error, whole.std_error, rtol=1e-9)

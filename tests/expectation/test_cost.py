@@ -14,7 +14,7 @@ from diffrax_symplectic._expectation.cost import (
     NUMBERS_PER_SECOND,
     numbers_per_step,
 )
-from diffrax_symplectic._expectation.problem import Problem
+from diffrax_symplectic._simulation.problem import Problem
 
 
 MATRIX = np.ones((3, 5))

@@ -10,12 +10,12 @@ import pytest
 from scipy import stats
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.cautions import cautions
-from diffrax_symplectic._expectation.estimate import combined_results
-from diffrax_symplectic._expectation.moments import Combination
-from diffrax_symplectic._expectation.problem import Problem
+from diffrax_symplectic._expectation.estimate.cautions import cautions
+from diffrax_symplectic._expectation.estimate.estimate import combined_results
 from diffrax_symplectic._expectation.run import run
 from diffrax_symplectic._expectation.sampling import Samples, SamplingPlan
+from diffrax_symplectic._simulation.levels import Combination
+from diffrax_symplectic._simulation.problem import Problem
 from examples.benchmarks.coverage import arguments, Cell, estimate, exact
 
 from ..problems import kubo_terms

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation import basis_choice, value_functions
-from diffrax_symplectic._expectation.basis_choice import chosen_basis
 from diffrax_symplectic._expectation.choose import sampling_for
-from diffrax_symplectic._expectation.estimate import combined_results
-from diffrax_symplectic._expectation.moments import Combination
-from diffrax_symplectic._expectation.noise import Noise
-from diffrax_symplectic._expectation.problem import Problem
+from diffrax_symplectic._expectation.estimate.estimate import combined_results
+from diffrax_symplectic._expectation.fitted import basis_choice, value_functions
+from diffrax_symplectic._expectation.fitted.basis_choice import chosen_basis
+from diffrax_symplectic._expectation.fitted.noise import Noise
+from diffrax_symplectic._simulation.levels import Combination
+from diffrax_symplectic._simulation.problem import Problem
 from diffrax_symplectic._terms import outcomes, step_variables
 
 from ..families import slow_except

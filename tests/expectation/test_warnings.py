@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation import basis_choice, value_functions
+from diffrax_symplectic._expectation.fitted import basis_choice, value_functions
 
 from ..drjit_here import needs_drjit
 

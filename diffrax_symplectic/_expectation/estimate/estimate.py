@@ -11,13 +11,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from .error_bars import (
-    is_off_order,
-    remaining_error,
-    Results,
-    results_of,
-)
-from .moments import Combination, joined, Moments, total
+from ..._simulation import Combination
+from .error_bars import is_off_order, remaining_error, Results, results_of
+from .moments import joined, Moments, total
 from .saved import arrays_of, fields_from, header_of
 
 

@@ -14,25 +14,32 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray, PyTree, UInt32
 
-from .._arguments import check_real, check_takes, whole_number
-from .._brownian import (
+from ..._arguments import check_real, check_takes, whole_number
+from ..._brownian import (
     AbstractStepwisePath,
     GivenPath,
     Increment,
     stepwise,
     THREE_POINT,
 )
-from .._custom_types import Y
-from .._terms import brownian_paths, path_numbers, replace_paths
-from .fits import FittedFunctions
+from ..._custom_types import Y
+from ..._simulation import (
+    along,
+    combined,
+    independent_steps,
+    Level,
+    Motion,
+    numbers,
+    PathStates,
+    Problem,
+    simulate,
+)
+from ..._terms import brownian_paths, path_numbers, replace_paths
+from ..fitted import FittedFunctions, value_function
+from ..run import run
+from ..sampling import AbstractSampling, ROUNDING, Samples, SamplingPlan, saved_by_name
 from .hilbert import hilbert_order
 from .points import num_seeds, randomized, sobol_points
-from .polynomials import tensordot
-from .problem import Level, numbers, Problem
-from .run import run
-from .sampling import AbstractSampling, ROUNDING, Samples, SamplingPlan, saved_by_name
-from .simulation import along, independent_steps, Motion, PathStates, simulate
-from .value_functions import value_function
 
 
 # SciPy has direction numbers for this many coordinates of Sobol' points.
@@ -199,7 +206,7 @@ def _replicates(
     # The largest over all levels.
     heavy = jnp.broadcast_to(jnp.max(heavy, axis=0), means.shape)
     # A path may fail on any level.
-    largest = tensordot(jnp.abs(p.weights).astype(largest.dtype), largest, 1)
+    largest = combined(abs(p.weights), largest)
     kinds = [means, heavy, largest]
     lost = jnp.sum(done.failed, axis=1, keepdims=True)
     return Samples(p.averaged(kinds), jnp.ones(1, bool), lost)

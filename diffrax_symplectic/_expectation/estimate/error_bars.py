@@ -7,8 +7,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from .moments import Combination, Moments
-from .sampling import KindsOfReplicates, KindsWithControl, ROUNDING
+from ..._simulation import Combination
+from ..sampling import KindsOfReplicates, KindsWithControl, ROUNDING
+from .moments import Moments
 
 
 # A control variate is dropped if its mean is this many standard errors from zero: by chance

@@ -9,12 +9,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from .._terms import number_of_noises
+from ..._simulation import along, Level, Motion, PathStates, Problem, simulate
+from ..._terms import number_of_noises
+from ..sampling import ROUNDING, Samples
 from .fits import FittedFunctions
 from .noise import Noise
-from .problem import Level, Problem
-from .sampling import ROUNDING, Samples
-from .simulation import along, Motion, PathStates, simulate
 
 
 # The most noises of which paths are pushed to all sides: each more doubles the trials.

@@ -7,12 +7,12 @@ from typing import NamedTuple
 import jax.tree_util as jtu
 import numpy as np
 
-from .._arguments import whole_number
+from ..._arguments import whole_number
+from ..._simulation import Problem
 from .bases import AbstractBasis, Hermite, Quadratic
 from .grid import Grid
 from .noise import Noise
 from .polynomials import num_polynomials
-from .problem import Problem
 
 
 # By default a grid is used in up to this many dimensions: in three, 32 points along each

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from ..._simulation import Combination
+from ..sampling import KindsWithControl, ROUNDING
 from .estimate import combined_results, Expectation
-from .moments import Combination, total
-from .sampling import KindsWithControl, ROUNDING
+from .moments import total
 from .tolerance import largest_of, shortfall
 
 

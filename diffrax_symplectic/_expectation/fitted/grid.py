@@ -12,8 +12,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..._products import tensordot
 from .bases import AbstractBasis, Frame, Hermite
-from .polynomials import tensordot
 
 
 # The width of a grid relative to the pilot's range. For the mean of q^2 of a pendulum, the

@@ -1,6 +1,5 @@
 """Hermite polynomials of several variables, and least-squares fits."""
 
-import functools as ft
 import itertools
 import math
 from collections.abc import Sequence
@@ -10,11 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._products import dot
 
-# By default accelerators round the factors of a product to half the digits, or fewer.
-_EXACT = jax.lax.Precision.HIGHEST
-dot = ft.partial(jnp.matmul, precision=_EXACT)
-tensordot = ft.partial(jnp.tensordot, precision=_EXACT)
+
 # The normal equations have the squared condition number of a fit. This many roundings are
 # added to their diagonal, so that they have a Cholesky factor. Along an axis with the
 # eigenvalue s, each refinement multiplies what this changes in the solution by r / (s + r),

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .._arguments import check_solver, check_state, whole_number
 from .._brownian import has_bounded_increments
@@ -45,34 +45,13 @@ from .arguments import (
     drawn_state,
     given_state,
     step_numbers,
-    StepNumbers,
 )
-from .kinks import may_have_kinks
-from .moments import level_weights
-from .polynomials import tensordot
-from .sampling import real
+from .levels import combined, Level, level_weights, levels_of
 
 
 # Folded into the key of a sample to draw its `y0` and `args`. The keys of its paths are
 # folded from the words of the user's keys: a number that is unlikely to be one of them.
 _START_KEY = 0x517A87
-# Numbers of steps are 32-bit integers.
-_MOST_STEPS = 2**31
-
-
-class Level(eqx.Module):
-    """One step size, or several, along a leading axis.
-
-    - `index`: its number, counted from the coarsest.
-    - `h`: the step size.
-    - `num_steps`: the number of steps.
-    - `saved_steps`: the numbers of steps after which to average.
-    """
-
-    index: Int[Array | np.ndarray, "*levels"]
-    h: Float[Array | np.ndarray, "*levels"]
-    num_steps: Int[Array | np.ndarray, "*levels"]
-    saved_steps: Int[Array | np.ndarray, "*levels saves"]
 
 
 class Drawn(NamedTuple):
@@ -173,7 +152,7 @@ class Problem(eqx.Module):
         check_stratonovich(terms, solver, start, y0, args, all_terms=True)
         check_cells(terms, float(t0), smallest)
 
-        grid = _levels(float(dt0), counts, levels, start.dtype)
+        grid = levels_of(float(dt0), counts, levels, start.dtype)
         order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
         weights = np.asarray(level_weights(order, levels), jnp.result_type(float))
         return Problem(
@@ -197,12 +176,6 @@ class Problem(eqx.Module):
         if is_traced(index):
             return jtu.tree_map(lambda x: jnp.asarray(x)[index], self.levels)
         return jtu.tree_map(lambda x: x[index], self.levels)
-
-    @property
-    def has_kinks(self) -> bool:
-        """Whether `phi` may not be smooth."""
-        phi = lambda y: self.phi(self.t0, y, self.args)
-        return may_have_kinks(phi, self.y0)
 
     @property
     def paths_differ(self) -> bool:
@@ -283,7 +256,7 @@ class Problem(eqx.Module):
         self, x: Float[Array, "levels ..."]
     ) -> Float[Array, "combinations ..."]:
         """The combinations of values on all levels."""
-        return tensordot(self.weights.astype(x.dtype), x, 1)
+        return combined(self.weights, x)
 
     def averaged(
         self, kinds: Sequence[Float[Array | np.ndarray, "combinations S n m"]]
@@ -329,23 +302,6 @@ class Problem(eqx.Module):
         return self.levels.saved_steps.shape[1], m
 
 
-def _levels(dt0: float, counts: StepNumbers, levels: int, dtype: Any) -> Level:
-    """All levels, along a leading axis: each has half the step of the one before. Raises a
-    `ValueError` for too many steps."""
-    if counts.total * 2.0 ** (levels - 1) >= _MOST_STEPS:
-        raise ValueError(
-            f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "
-            "2^31 steps. Pass fewer levels: two to four are enough to extrapolate."
-        )
-    finer = 2 ** np.arange(levels, dtype=np.int32)
-    return Level(
-        index=np.arange(levels, dtype=np.int32),
-        h=np.asarray(dt0 / finer, dtype),
-        num_steps=finer * counts.total,
-        saved_steps=finer[:, None] * counts.saved,
-    )
-
-
 def ravel(y: Y) -> Float[Array, " d"]:
     """The leaves as one vector."""
     return jfu.ravel_pytree(y)[0]
@@ -354,4 +310,4 @@ def ravel(y: Y) -> Float[Array, " d"]:
 def numbers(tree: PyTree) -> Float[Array, " m"]:
     """The leaves as one vector of real numbers."""
     x = ravel(tree)
-    return x.astype(real(x.dtype))
+    return x.astype(jnp.result_type(x, float))

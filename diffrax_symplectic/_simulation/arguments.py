@@ -12,8 +12,16 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray, PyTree
 
-from .._arguments import brief, check_real, check_takes, takes_args
-from .._brownian import Discrete, is_random, laws_of, lost_variance, TOO_STRONG
+from .._arguments import brief, check_real, check_takes, check_untraced, takes_args
+from .._brownian import (
+    check_key,
+    Discrete,
+    is_random,
+    laws_of,
+    lost_variance,
+    TOO_STRONG,
+    typed_key,
+)
 from .._custom_types import Args, Y
 from .._signature import once_for_each_signature
 from .._solver import own_path
@@ -42,6 +50,17 @@ class StepNumbers(NamedTuple):
 
     saved: Int[np.ndarray, "..."]
     total: np.integer
+
+
+def checked_key(user: str, key: Any, others: Any) -> PRNGKeyArray:
+    """The key of a call of `user`, as a typed key. Raises a `ValueError` unless it is one,
+    and for traced arrays in it or in the `others`."""
+    # Inside `jit` a new array is traced, too. Functions that close over traced values of
+    # other transformations are found once something that depends on these is needed.
+    new = jnp.zeros(())
+    check_untraced(f"`{user}`", (key, others, new))
+    check_key(key, user)
+    return typed_key(key)
 
 
 def step_numbers(

@@ -18,31 +18,25 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
-from .._arguments import check_untraced, whole_number
-from .._compat import quickly_compiled
-from .._lapack import lapack_in_turn
-from .bases import AbstractBasis
-from .basis_choice import chosen_basis, warn_of_long_fit
-from .controlled_paths import (
-    Choice,
-    controlled_paths,
-    laws_of_trials,
-    TrialLaw,
-    Usual,
-)
-from .estimate import combined_results, Expectation
-from .fits import fit, FittedFunctions, without_newton
-from .moments import Combination, total
-from .noise import Noise
-from .problem import Problem
-from .run import run
-from .sampling import (
+from ..._arguments import check_untraced, whole_number
+from ..._compat import quickly_compiled
+from ..._lapack import lapack_in_turn
+from ..._simulation import Combination, Problem
+from ..._solver import without_newton
+from ..estimate import combined_results, Expectation, total
+from ..run import run
+from ..sampling import (
     AbstractSampling,
     KindsWithControl,
     ROUNDING,
     SamplingPlan,
     saved_by_name,
 )
+from .bases import AbstractBasis
+from .basis_choice import chosen_basis, warn_of_long_fit
+from .controlled_paths import Choice, controlled_paths, laws_of_trials, TrialLaw, Usual
+from .fits import fit, FittedFunctions
+from .noise import Noise
 
 
 # Folded into the key of a call to draw trials. (Numbers of levels, by which fits are drawn,
@@ -282,6 +276,8 @@ def value_function(problem: Problem, key: PRNGKeyArray) -> FittedFunctions | Non
 
 def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> FittedFunctions:
     """The fits of all levels."""
+    # Newton's method is a quarter of the time to compile a fit, and few of its states need
+    # it. A state at which the sweeps fail is left out of the fit.
     lean = dataclasses.replace(problem, solver=without_newton(problem.solver))
     functions, lost = _fits_by(lean, key, basis)
     if lost == 0 or eqx.tree_equal(lean.solver, problem.solver):

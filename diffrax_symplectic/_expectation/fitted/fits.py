@@ -1,6 +1,5 @@
 """Value functions, fitted backwards in time at the states of a pilot run."""
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,13 +12,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
-from .._custom_types import Y
-from .._root_finder import PicardNewton
-from .._solver import AbstractImplicitStages
+from ..._custom_types import Y
+from ..._simulation import PathStates, Problem, ravel
 from .bases import AbstractBasis, equal_weights, Value
 from .noise import Noise
-from .problem import Problem, ravel
-from .simulation import PathStates
 
 
 # The states over which second derivatives along the noise are averaged.
@@ -58,26 +54,6 @@ class FittedFunctions(eqx.Module):
         coefficients = take(self.coefficients)
         second = None if self.second is None else take(self.second)
         return FittedFunctions(self.frames, coefficients, second, self.basis)
-
-
-def without_newton(solver: Any) -> Any:
-    """The solver, and all solvers in it, with a root finder that ends after its sweeps.
-
-    Newton's method is a quarter of the time to compile a fit, and few of its states need
-    it. A state at which the sweeps fail is left out of the fit.
-    """
-
-    def replaced(x: Any) -> Any:
-        if not (_is_implicit(x) and isinstance(x.root_finder, PicardNewton)):
-            return x
-        sweeps = dataclasses.replace(x.root_finder, newton_steps=0)
-        return eqx.tree_at(lambda solver: solver.root_finder, x, sweeps)
-
-    return jtu.tree_map(replaced, solver, is_leaf=_is_implicit)
-
-
-def _is_implicit(x: Any) -> bool:
-    return isinstance(x, AbstractImplicitStages)
 
 
 def fit(

@@ -28,8 +28,9 @@ from .._fused import (
 )
 from .._lapack import lapack_in_turn
 from .._stablehlo import NotReplayed
-from .independent import solved
-from .problem import Level, Problem
+from .levels import Level
+from .loop import values_of_paths
+from .problem import Problem
 
 
 # Beyond this share, stragglers take most of the time.
@@ -106,7 +107,7 @@ def _paths(
 ) -> tuple[PyTree[Array], Bool[Array, "levels n"]]:
     """The saved states of the paths of a batch, along axes of levels, paths and times, and
     which paths failed."""
-    states, failed = solved(p, _sample_keys(key, high, low))
+    states, failed = values_of_paths(p, _sample_keys(key, high, low))
     return p.unravel(jnp.swapaxes(states, 1, 2)), failed
 
 

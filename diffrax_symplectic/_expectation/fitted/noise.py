@@ -13,11 +13,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt32
 
-from .._brownian import Discrete, random_words
-from .._custom_types import Y
-from .._terms import outcomes
-from .polynomials import tensordot
-from .problem import Level, Problem
+from ..._brownian import Discrete, random_words
+from ..._custom_types import Y
+from ..._products import tensordot
+from ..._simulation import Level, Problem
+from ..._terms import outcomes
 
 
 # Up to this many outcomes, a step is taken for each of them. Four noises of three values

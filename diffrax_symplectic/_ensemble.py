@@ -12,16 +12,22 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, PRNGKeyArray, PyTree
 
-from .._arguments import brief, whole_number
-from .._compat import is_traced
-from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
-from .._fused import sample_key
-from .._solver import Want
-from .._terms import has_shapes, path_keys, with_keys
-from .arguments import check_gaussian, warn_of_truncation
-from .call import checked_call
-from .engines import Batch, ENGINES, state_itself, warn_of_stragglers
-from .problem import Problem
+from ._arguments import brief, whole_number
+from ._compat import is_traced
+from ._custom_types import Args, IntScalarLike, RealScalarLike, Y
+from ._fused import sample_key
+from ._simulation import (
+    Batch,
+    check_gaussian,
+    checked_key,
+    ENGINES,
+    Problem,
+    state_itself,
+    warn_of_stragglers,
+    warn_of_truncation,
+)
+from ._solver import Want
+from ._terms import has_shapes, path_keys, with_keys
 
 
 # Entries of all states in a batch: enough to keep every core busy, in tens of megabytes.
@@ -172,7 +178,7 @@ def ensemble(
     if truncation takes more than 0.1% of the variance of increments.
     """
     arguments = terms, t0, t1, dt0, y0, args
-    key, _, _ = checked_call("ensemble", key, others=arguments)
+    key = checked_key("ensemble", key, arguments)
     num_paths = whole_number("num_paths", num_paths)
     engine = "jax" if engine is None else engine
     if engine not in ENGINES:

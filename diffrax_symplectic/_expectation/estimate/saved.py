@@ -7,8 +7,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
+from ..sampling import SAVED_SAMPLINGS
 from .moments import Moments
-from .sampling import SAVED_SAMPLINGS
 
 
 # The fields of `Moments` that have the structure of `phi`, and those that are numbers.

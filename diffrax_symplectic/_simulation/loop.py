@@ -9,11 +9,13 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from .._custom_types import Y
 from .._root_finder import all_finite
-from .problem import Drawn, Level, Problem
+from .._terms import path_keys, with_keys
+from .levels import Level
+from .problem import Drawn, Problem
 
 
 # On CPUs so many paths are stepped at once. The arrays of more overflow the cache in every
@@ -187,6 +189,28 @@ def independent_steps(
 
     solver_state = jax.vmap(start)(randomness(0), drawn.y0, drawn.args)
     return Motion(step, PathStates.start(p, drawn, solver_state))
+
+
+def values_of_paths(
+    p: Problem, keys: Key[Array, " n"]
+) -> tuple[Float[Array, "levels S n m"], Bool[Array, "levels n"]]:
+    """The values of `phi` for independent paths, one for each key, on all levels and at the
+    times at which to average, and which paths failed."""
+    own_keys = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
+    drawn = jax.vmap(p.drawn)(keys)
+
+    def begin(level: Level) -> Motion:
+        return independent_steps(
+            p,
+            level,
+            drawn,
+            terms_of=lambda own: with_keys(p.terms, own),
+            # A path draws the increments of all steps from its keys.
+            randomness=lambda i: own_keys,
+        )
+
+    done = simulate(p, begin)
+    return done.saved, done.failed
 
 
 def _in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:

@@ -13,7 +13,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from .polynomials import dot, hermite, least_squares, num_polynomials, tensordot
+from ..._products import dot, tensordot
+from .polynomials import hermite, least_squares, num_polynomials
 
 
 # The pilot's paths for each polynomial, and the fewest. The fit hardly depends on them: of

@@ -1,0 +1,13 @@
+"""Paths with control variates from fitted value functions.
+
+- `value_functions`: the sampling. Its trials decide which fits are used.
+- `noise`: the random variables of a step, and expectations over them.
+- `bases`, `grid`: the functions that are fitted; `polynomials`: what both are made of;
+  `basis_choice`: which of them.
+- `fits`: value functions, from a pilot run and a loop backward in time.
+- `controlled_paths`: paths, and their control variates.
+"""
+
+from .fits import FittedFunctions
+from .noise import num_outcomes
+from .value_functions import value_function, ValueFunctions
