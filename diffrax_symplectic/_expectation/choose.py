@@ -10,21 +10,20 @@ from jaxtyping import PRNGKeyArray
 
 from .._simulation import has_discrete_increments, Problem
 from .._solver import Want
-from .cost import NUMBERS_PER_SECOND, numbers_per_step
+from .cost import OPERATIONS_PER_SECOND, operations_per_step
 from .estimate import Expectation
-from .fitted import num_outcomes, ValueFunctions
+from .fitted import MOST_DIMENSIONS_OF_GRID, num_outcomes, ValueFunctions
 from .fused_paths import fused_plan
 from .independent import IndependentPaths
 from .kinks import has_kinks
-from .sampling import AbstractSampling, SamplingPlan
+from .sampling import AbstractSampling, SamplingPlan, SAVED_SAMPLINGS
 from .sorted import ArrayRQMC, step_words
 
 
 # No sample's key is folded from this number.
 _NO_SAMPLE = 0xFFFFFFFF
-# Value functions are chosen up to this dimension, in which they are fitted on a grid, and
-# up to this many outcomes of one step and of all steps, which a fit visits at each point.
-_MOST_COMPONENTS_OF_FITS = 2
+# Value functions are chosen where they are fitted on a grid, up to this many outcomes of
+# one step and of all steps, which a fit visits at each point.
 _MOST_OUTCOMES_OF_STEP = 48
 _MOST_OUTCOMES_OF_STEPS = 2**12
 # Paths are sorted up to this dimension.
@@ -33,18 +32,15 @@ _MOST_COMPONENTS_SORTED = 4
 # indicator and a call option on the pendulum fits left 26% and 1.3%, and sorted paths had
 # error bars that were 23 and 8 times less.
 _MUCH_LEFT = 0.01
-# The numbers of paths and replicates without a tolerance.
-_PATHS_OF_FITS = 2**12
+# The number of independent paths without a tolerance. (The other samplings have defaults.)
 _PATHS = 2**17
-_PATHS_OF_REPLICATE = 2**14
-_REPLICATES = 16
 # With a tolerance, which ends the estimate, the number of samples is without limit.
 _MOST_SAMPLES = 10**9
 # Without a tolerance, paths take no more than about this many seconds.
 _SECONDS = 10
-# Sorted paths are drawn and sorted before each step, which takes as long as computing this
-# many numbers for each path.
-_NUMBERS_OF_SORTING = 1500
+# Sorted paths are drawn and sorted before each step, which takes as long as this many
+# operations for each path.
+_OPERATIONS_OF_SORTING = 1500
 # The fewest paths, however long they take.
 _FEWEST_PATHS = 2**8
 # The sizes of a trial.
@@ -81,7 +77,7 @@ class Chosen(NamedTuple):
 
 def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
     """Chooses the law of the increments and the sampling, as far as the user did not. The
-    docstring of `expectation` documents the rules. `problem_for` maps the purpose of paths
+    docstring of `expectation` states the rules. `problem_for` maps the purpose of paths
     that are not known yet to the problem."""
     has_path, key, sampling, tol, start, engine, devices = wanted
     if engine not in (None, "jax", "drjit"):
@@ -138,11 +134,12 @@ def trial_key(key: PRNGKeyArray) -> PRNGKeyArray:
 
 
 def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampling:
-    """Raises a `ValueError` for what is no sampling, or for another than in `start`."""
+    """Raises a `ValueError` unless this is a sampling, of the class that `start` had."""
     if not isinstance(sampling, AbstractSampling):
+        names = ", ".join(f"`{name}`" for name in SAVED_SAMPLINGS)
         raise ValueError(
-            "`sampling` must be `IndependentPaths(num_paths)`, `ArrayRQMC()`, "
-            f"`ValueFunctions()` or `None`; got {sampling!r}."
+            f"`sampling` must be an instance of one of {names}, or `None`; got "
+            f"{sampling!r}."
         )
     if start is not None and type(start.sampling) is not type(sampling):
         raise ValueError(
@@ -166,8 +163,8 @@ def sampling_for(
     if outcomes:
         why += f" of {outcomes} outcomes each"
     if _can_be_fitted(problem, outcomes):
-        num_paths = _MOST_SAMPLES if tol else _PATHS_OF_FITS
-        return ValueFunctions(None, num_paths), f"value functions for {why}"
+        fitted = ValueFunctions(num_paths=_MOST_SAMPLES) if tol else ValueFunctions()
+        return fitted, f"value functions for {why}"
     sampling = sorted_paths(problem, tol)
     if sampling is not None:
         return sampling, f"sorted paths for {why}"
@@ -178,8 +175,7 @@ def _independent_paths(problem: Problem, tol: float | None) -> IndependentPaths:
     """As many independent paths as are affordable."""
     if tol:
         return IndependentPaths(_MOST_SAMPLES)
-    numbers = _num_steps(problem) * numbers_per_step(problem)
-    affordable = _SECONDS * NUMBERS_PER_SECOND / numbers
+    affordable = _affordable_operations(problem) / operations_per_step(problem)
     return IndependentPaths(int(np.clip(affordable, _FEWEST_PATHS, _PATHS)))
 
 
@@ -187,12 +183,19 @@ def sorted_paths(problem: Problem, tol: float | None) -> ArrayRQMC | None:
     """Sorted paths, or `None` for many components and for paths that cannot be sorted."""
     if not _can_be_sorted(problem):
         return None
-    numbers = numbers_per_step(problem) + _NUMBERS_OF_SORTING
-    numbers_of_all = _num_steps(problem) * numbers * _REPLICATES
-    affordable = max(int(_SECONDS * NUMBERS_PER_SECOND / numbers_of_all), _FEWEST_PATHS)
+    usual = ArrayRQMC()
+    operations = usual.replicates * (
+        operations_per_step(problem) + _OPERATIONS_OF_SORTING
+    )
+    affordable = max(int(_affordable_operations(problem) / operations), _FEWEST_PATHS)
     # Rounded down to a power of two, as Sobol' points need.
-    size = min(2 ** (affordable.bit_length() - 1), _PATHS_OF_REPLICATE)
-    return ArrayRQMC(size, _MOST_SAMPLES if tol else _REPLICATES)
+    size = min(2 ** (affordable.bit_length() - 1), usual.num_paths)
+    return ArrayRQMC(size, _MOST_SAMPLES if tol else usual.replicates)
+
+
+def _affordable_operations(problem: Problem) -> float:
+    """The operations of each step for which there is time, for all paths together."""
+    return _SECONDS * OPERATIONS_PER_SECOND / _num_steps(problem)
 
 
 def few_paths(problem: Problem) -> AbstractSampling:
@@ -217,7 +220,7 @@ def _can_be_fitted(problem: Problem, outcomes: int | None) -> bool:
     if problem.paths_differ or not outcomes:
         return False
     return (
-        _num_components(problem) <= _MOST_COMPONENTS_OF_FITS
+        _num_components(problem) <= MOST_DIMENSIONS_OF_GRID
         and outcomes <= _MOST_OUTCOMES_OF_STEP
         and _num_steps(problem) * outcomes <= _MOST_OUTCOMES_OF_STEPS
     )

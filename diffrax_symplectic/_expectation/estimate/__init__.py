@@ -7,6 +7,7 @@
 """
 
 from .cautions import cautions
+from .error_bars import heaviness
 from .estimate import (
     check_same,
     combined_results,

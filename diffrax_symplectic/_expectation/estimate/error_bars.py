@@ -32,6 +32,13 @@ _SLOWEST = 1.33
 _BY_CHANCE = 2
 
 
+def heaviness(largest: Any, s: Any, n: Any, numpy: Any = np) -> Any:
+    """The `r` of `Expectation.std_error`, from the largest deviation and the standard
+    deviation `s` of `n` values, by NumPy or `jax.numpy`. (Not finite if `s` is zero.)"""
+    usual = s * numpy.sqrt(_OUTLYING * numpy.log(numpy.maximum(n, 2)))
+    return numpy.maximum(largest - usual, 0) / (s * numpy.sqrt(n))
+
+
 class Results(NamedTuple):
     """What follows from the moments of samples, for one combination of levels. Each field
     has the structure of `phi`, with a leading axis of times, if any.
@@ -112,8 +119,7 @@ def _results_of_array(
     rounding = roundings * float(jnp.finfo(dtype).eps) * size
 
     s = norm / np.sqrt(n - 1) if n > 1 else np.full_like(norm, np.nan)
-    outlying = np.maximum(largest - s * np.sqrt(_OUTLYING * np.log(max(n, 2))), 0)
-    r = np.where(s > 0, outlying / (s * np.sqrt(n)), 0)
+    r = np.where(s > 0, heaviness(largest, s, n), 0)
     # Rounding errors can have heavy tails, too.
     r = np.where(largest > ROUNDING * rounding, r, 0)
     if is_replicate:

@@ -8,6 +8,7 @@
 - `controlled_paths`: paths, and their control variates.
 """
 
+from .basis_choice import MOST_DIMENSIONS_OF_GRID
 from .fits import FittedFunctions
 from .noise import num_outcomes
 from .value_functions import value_function, ValueFunctions

@@ -17,7 +17,7 @@ from .polynomials import num_polynomials
 
 # By default a grid is used in up to this many dimensions: in three, 32 points along each
 # axis are 32,768 together, each with all outcomes of a step.
-_MOST_DIMENSIONS_OF_GRID = 2
+MOST_DIMENSIONS_OF_GRID = 2
 # The points along an axis, of which the most are taken that memory and time allow.
 _SIZES_OF_GRID = (64, 32)
 # The most evaluations (points times outcomes) for one step of a path, and for all steps.
@@ -31,7 +31,8 @@ _HIGHEST_DEGREE = 8
 _ALWAYS_CHEAP = 2
 # Bytes that a fit may take.
 _MOST_MEMORY = 4 * 2**30
-# Numbers that a fit may compute before a warning that it will take long (about a minute).
+# Entries of states that a fit may compute before a warning that it will take long (about
+# a minute).
 _OUT_OF_PROPORTION = 2**31
 
 
@@ -39,12 +40,12 @@ class ChosenBasis(NamedTuple):
     """A basis, and what a fit to it costs.
 
     - `states`: the number of states that are computed in each step.
-    - `numbers`: all numbers that are computed.
+    - `entries`: the entries of all states of all steps.
     """
 
     basis: AbstractBasis
     states: int
-    numbers: int
+    entries: int
 
 
 def chosen_basis(p: Problem, degree: int | None) -> ChosenBasis:
@@ -61,7 +62,7 @@ def chosen_basis(p: Problem, degree: int | None) -> ChosenBasis:
 
 def warn_of_long_fit(chosen: ChosenBasis, stacklevel: int) -> None:
     """Warns if a fit takes long next to independent paths."""
-    if chosen.numbers > _OUT_OF_PROPORTION:
+    if chosen.entries > _OUT_OF_PROPORTION:
         warnings.warn(
             f"The fit of `ValueFunctions` takes as long as {chosen.states:,} independent "
             "paths. If fewer paths are accurate enough, pass "
@@ -90,7 +91,7 @@ def _basis(p: Problem, degree: int | None, outcomes: int, steps: int) -> Abstrac
 
 def _grid(p: Problem, d: int, outcomes: int, steps: int) -> Grid | None:
     """The finest grid that memory and time allow, in few dimensions."""
-    if d > _MOST_DIMENSIONS_OF_GRID:
+    if d > MOST_DIMENSIONS_OF_GRID:
         return None
     for size in _SIZES_OF_GRID:
         grid = Grid(d, (size,))

@@ -35,6 +35,7 @@ from ..._simulation import (
     simulate,
 )
 from ..._terms import brownian_paths, path_numbers, replace_paths
+from ..estimate import heaviness
 from ..fitted import FittedFunctions, value_function
 from ..run import run
 from ..sampling import AbstractSampling, ROUNDING, Samples, SamplingPlan, saved_by_name
@@ -263,10 +264,9 @@ def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "3 ..."]:
     largest = jnp.max(off, axis=0)
     # In units of the largest deviation, so that squares neither overflow nor underflow.
     s = jnp.sqrt(mean((off / jnp.where(largest > 0, largest, 1)) ** 2))
-    beyond = jnp.maximum(1 - s * jnp.sqrt(4.5 * jnp.log(jnp.maximum(count, 2))), 0)
     # Rounding errors can have heavy tails, too.
     is_random = largest > ROUNDING * jnp.finfo(x.dtype).eps * jnp.abs(center)
-    r = jnp.where(is_random, beyond / (s * jnp.sqrt(count)), 0)
+    r = jnp.where(is_random, heaviness(1, s, count, jnp), 0)
     return jnp.stack([center, r, largest])
 
 
