@@ -9,6 +9,5 @@
 """
 
 from .basis_choice import MOST_DIMENSIONS_OF_GRID
-from .fits import FittedFunctions
 from .noise import num_outcomes
-from .value_functions import value_function, ValueFunctions
+from .value_functions import ValueFunctions

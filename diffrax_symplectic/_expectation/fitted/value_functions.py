@@ -262,18 +262,6 @@ def _reason(basis: AbstractBasis, choice: Choice) -> str:
     )
 
 
-def value_function(problem: Problem, key: PRNGKeyArray) -> FittedFunctions | None:
-    """A quadratic value function for each level, or `None` if the random variables do not
-    have finitely many outcomes."""
-    try:
-        chosen = chosen_basis(problem, 2)
-    except ValueError:
-        return None
-    warn_of_long_fit(chosen, stacklevel=6)
-    functions = _fits(problem, key, chosen.basis)
-    return functions.chosen(np.zeros(problem.num_outputs, int))
-
-
 def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> FittedFunctions:
     """The fits of all levels."""
     # Newton's method is a quarter of the time to compile a fit, and few of its states need

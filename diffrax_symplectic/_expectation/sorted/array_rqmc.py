@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray, PyTree, UInt32
 
 from ..._arguments import check_real, check_takes, whole_number
@@ -36,8 +35,6 @@ from ..._simulation import (
 )
 from ..._terms import brownian_paths, path_numbers, replace_paths
 from ..estimate import heaviness
-from ..fitted import FittedFunctions, value_function
-from ..run import run
 from ..sampling import AbstractSampling, ROUNDING, Samples, SamplingPlan, saved_by_name
 from .hilbert import hilbert_order
 from .points import num_seeds, randomized, sobol_points
@@ -49,10 +46,6 @@ _MAX_DIMENSION = 21201
 _BEFORE_STOPPING = 8
 # With fewer paths along each coordinate, neighbours are far apart.
 _FEWEST_ALONG_COORDINATE = 3
-# The number of replicates by which two ways to sort are compared.
-_TRIAL_REPLICATES = 4
-# Folded into the key of a call to draw these.
-_TRIAL_KEY = 4
 # Folded into the key of a replicate to draw the starts of its paths. (Numbers of levels are
 # smaller.)
 _STARTS_KEY = 0xFFFFFFFF
@@ -82,10 +75,8 @@ class ArrayRQMC(AbstractSampling):
         which at least 8 are drawn. Each device solves one at a time, so memory does not
         grow with their number.
     - `sort_by`: maps the state to a PyTree of real numbers to sort the paths by: the fewest
-        that distinguish the states that matter. By default the state itself, unless it has
-        so many components that neighbours would be far apart. Then, if $\phi$ is a scalar
-        and the random variables are discrete, a value function fitted to
-        $\mathbb E[\phi \mid y_n = y]$ is used if it does better in a short trial.
+        that distinguish the states that matter. By default the state itself. Warns if
+        there are so many numbers that neighbours would be far apart.
 
     **Source:** [L'Ecuyer, Lécot and Tuffin
     (2008)](https://doi.org/10.1287/opre.1080.0556).
@@ -112,65 +103,30 @@ class ArrayRQMC(AbstractSampling):
         dimension = jax.eval_shape(lambda: numbers(sort_by(problem.y0))).size
         points = jnp.asarray(sobol_points(self.num_paths, words.number))
 
-        def plan_for(sort_by: Callable) -> SamplingPlan:
-            return SamplingPlan(
-                jtu.Partial(_replicates, problem, sort_by, points, words),
-                num_samples=self.replicates,
-                # All paths of a replicate are solved at once, which is a batch already.
-                batch_size=1,
-                paths=self.num_paths,
-                levels=len(problem.levels.h),
-                least=_BEFORE_STOPPING,
-            )
-
-        by_state = plan_for(sort_by)
         along_coordinate = self.num_paths ** (1 / dimension)
-        if along_coordinate >= _FEWEST_ALONG_COORDINATE:
-            return by_state
-        # Each number that is averaged has value functions of its own, and paths are sorted
-        # by one.
-        is_one_number = problem.num_outputs == (1, 1)
-        u = None
-        if self.sort_by is None and is_one_number:
-            u = value_function(problem, key)
-        if u is not None:
-            by_value = plan_for(u)
-            gain = _gain(by_state, by_value, key, devices)
-            if gain > 1:
-                return by_value._replace(
-                    reason="sorted by a fitted value function, which divides the variance "
-                    f"of sorting by the state by {gain:.1f}"
-                )
-        warnings.warn(
-            f"{self.num_paths:,} paths are sorted by {dimension} coordinates, which leaves "
-            f"{along_coordinate:.1f} along each: neighbours are far apart, and `ArrayRQMC` "
-            "gains little over `IndependentPaths`. Pass a `sort_by` that returns the few "
-            "coordinates that matter most, at most "
-            f"{int(math.log(self.num_paths, _FEWEST_ALONG_COORDINATE))}.",
-            stacklevel=5,
+        if along_coordinate < _FEWEST_ALONG_COORDINATE:
+            warnings.warn(
+                f"{self.num_paths:,} paths are sorted by {dimension} coordinates, which "
+                f"leaves {along_coordinate:.1f} along each: neighbours are far apart, and "
+                "`ArrayRQMC` gains little over `IndependentPaths`. Pass a `sort_by` that "
+                "returns the few coordinates that matter most, at most "
+                f"{int(math.log(self.num_paths, _FEWEST_ALONG_COORDINATE))}.",
+                stacklevel=5,
+            )
+        return SamplingPlan(
+            jtu.Partial(_replicates, problem, sort_by, points, words),
+            num_samples=self.replicates,
+            # All paths of a replicate are solved at once, which is a batch already.
+            batch_size=1,
+            paths=self.num_paths,
+            levels=len(problem.levels.h),
+            least=_BEFORE_STOPPING,
         )
-        return by_state
-
-
-def _gain(
-    plan: SamplingPlan, other: SamplingPlan, key: PRNGKeyArray, devices: tuple
-) -> float:
-    """How many times the variance of a plan is that of the other, in a short trial; one if
-    either is zero, of which nothing can be said."""
-
-    def variance(plan: SamplingPlan) -> float:
-        short = plan._replace(num_samples=_TRIAL_REPLICATES)
-        trial = run(short, jr.fold_in(key, _TRIAL_KEY), devices)
-        return float(np.sum(jtu.tree_leaves(trial.variance)))
-
-    own = variance(plan)
-    others = variance(other)
-    return own / others if own > 0 and others > 0 else 1.0
 
 
 def _replicates(
     p: Problem,
-    sort_by: Callable[[Y], PyTree[Array]] | FittedFunctions,
+    sort_by: Callable[[Y], PyTree[Array]],
     points: UInt32[Array, "n d"],
     words: "StepWords",
     keys: Key[Array, "1"],
@@ -196,7 +152,7 @@ def _replicates(
         )
 
         def step(i, paths):
-            return motion.step(i, _in_order(sort_by, level, i, paths))
+            return motion.step(i, _in_order(sort_by, paths))
 
         return Motion(step, motion.start)
 
@@ -226,23 +182,10 @@ def _words_of_step(
     return randomized(points, jr.bits(key, (num_seeds(d),), jnp.uint32), sixths)
 
 
-def _in_order(
-    sort_by: Callable[[Y], PyTree[Array]] | FittedFunctions,
-    level: Level,
-    i: Any,
-    paths: PathStates,
-) -> PathStates:
-    """The paths before step `i`, sorted, with those that failed at the end."""
-
-    def sorted_by(y: Y) -> Float[Array, " m"]:
-        if isinstance(sort_by, FittedFunctions):
-            u = jtu.tree_map(lambda x: x[level.index], sort_by)
-            # Functions are those after each step. Before step 0 this is the last one, since
-            # there is none, and any order is right.
-            return numbers(u(i - 1, y))
-        return numbers(sort_by(y))
-
-    order = hilbert_order(jax.vmap(sorted_by)(paths.y), paths.failed)
+def _in_order(sort_by: Callable[[Y], PyTree[Array]], paths: PathStates) -> PathStates:
+    """The paths, sorted, with those that failed at the end."""
+    coordinates = jax.vmap(lambda y: numbers(sort_by(y)))(paths.y)
+    order = hilbert_order(coordinates, paths.failed)
     return jtu.tree_map(lambda x: x[order], paths)
 
 
