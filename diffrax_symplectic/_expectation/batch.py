@@ -1,5 +1,6 @@
 """The program that computes one batch on each device."""
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,11 +10,11 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from .._compat import is_closure_mismatch, quickly_compiled
 from .._lapack import lapack_in_turn
-from .sampling import Samples
+from .sampling import Averaged, Samples
 
 
 # Powers of two up to this one below the largest that the dtype holds: sums of 2^24 numbers
@@ -22,8 +23,8 @@ _ROOM = 24
 
 
 class BatchSums(NamedTuple):
-    """What is known of the samples of a batch. All but the numbers have the structure of
-    `phi`, and leading axes for kinds and combinations of levels.
+    """What is known of the samples of a batch. Arrays in an `Averaged` have leading axes
+    for devices and combinations of levels.
 
     - `good`: the number of good samples.
     - `failed`: the number of failed paths. A path that fails on several levels counts once.
@@ -38,11 +39,11 @@ class BatchSums(NamedTuple):
     good: Int[Array, "*devices"]
     failed: Int[Array, "*devices"]
     failed_on: Int[Array, "*devices levels"]
-    mean: PyTree[Array]
-    rest: PyTree[Array]
-    norm: PyTree[Array]
-    largest: PyTree[Array]
-    size: PyTree[Array]
+    mean: Averaged
+    rest: Averaged
+    norm: Averaged
+    largest: Averaged
+    size: Averaged
 
 
 def _sums(
@@ -117,14 +118,23 @@ def _of_device(
     good = samples.good & is_wanted
     lost = jnp.where(is_wanted, samples.lost, 0)
     failed = jnp.sum(jnp.max(lost, axis=0))
-    leaves, treedef = jtu.tree_flatten(samples.values)
+    fields = samples.averaged.fields
+    # All fields of one shape are summed at once, since fewer operations compile sooner.
+    stacked = jtu.tree_map(lambda *of_fields: jnp.stack(of_fields), *fields.values())
+    leaves, treedef = jtu.tree_flatten(stacked)
     each = [_sums_of_array(leaf, good) for leaf in leaves]
-    sums = map(treedef.unflatten, zip(*each))
+
+    def by_field(*of_leaves: Array) -> Averaged:
+        tree = treedef.unflatten(of_leaves)
+        parts = [jtu.tree_map(lambda x, k=k: x[k], tree) for k in range(len(fields))]
+        return Averaged(**dict(zip(fields, parts)))
+
+    sums = itertools.starmap(by_field, zip(*each))
     return BatchSums(jnp.sum(good), failed, jnp.sum(lost, axis=1), *sums)
 
 
 def _sums_of_array(
-    x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]
+    x: Float[Array, "fields combinations n ..."], good: Bool[Array, " n"]
 ) -> tuple[Array, Array, Array, Array, Array]:
     """`mean`, `rest`, `norm`, `largest` and `size` of `BatchSums` for one array."""
     keep = good.reshape(-1, *[1] * (x.ndim - 3))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Key, PRNGKeyArray, PyTree
 from .._root_finder import all_finite
 from .._simulation import by_drjit, Level, Problem, state_itself
 from .independent import IndependentPaths
-from .sampling import Samples, SamplingPlan
+from .sampling import Averaged, Samples, SamplingPlan
 
 
 # Default number of paths in a batch: large, to amortize the call of the kernel.
@@ -117,5 +117,5 @@ def _samples(p: Problem, paths: _Paths, keys: Key[Array, " n"]) -> Samples:
     phi = jax.vmap(values_on_level)(p.levels, paths.y)
     finite = jax.vmap(jax.vmap(all_finite))(phi)
     lost = jnp.asarray(paths.failed) | ~finite
-    combined = p.combined(jnp.swapaxes(phi, 1, 2))
-    return Samples(p.averaged([combined]), ~jnp.any(lost, axis=0), lost)
+    values = p.shaped(p.combined(jnp.swapaxes(phi, 1, 2)))
+    return Samples(Averaged(values), ~jnp.any(lost, axis=0), lost)

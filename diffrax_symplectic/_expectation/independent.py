@@ -10,7 +10,7 @@ from jaxtyping import Array, Key
 
 from .._arguments import whole_number
 from .._simulation import Problem, values_of_paths
-from .sampling import AbstractSampling, Samples, SamplingPlan, saved_by_name
+from .sampling import AbstractSampling, Averaged, Samples, SamplingPlan, saved_by_name
 
 
 # The default sizes of a batch. On CPUs it keeps all cores busy and fits their caches.
@@ -58,4 +58,4 @@ def _paths(p: Problem, keys: Key[Array, " n"]) -> Samples:
     """A sample is a path, with the same random key on all levels."""
     saved, failed = values_of_paths(p, keys)
     good = ~jnp.any(failed, axis=0)
-    return Samples(p.averaged([p.combined(saved)]), good, failed)
+    return Samples(Averaged(p.shaped(p.combined(saved))), good, failed)

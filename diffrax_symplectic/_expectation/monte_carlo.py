@@ -19,7 +19,7 @@ from .call import checked_call
 from .estimate import cautions, Expectation
 from .independent import IndependentPaths
 from .run import Meter, NO_METER, run
-from .sampling import Samples
+from .sampling import Averaged, Samples
 
 
 def monte_carlo(
@@ -140,13 +140,8 @@ def _of_function(
     each = [on_level(level) for level in range(levels)]
     values, good = jtu.tree_map(lambda *xs: jnp.stack(xs), *each)
 
-    def of_one_kind(
-        x: Float[Array, "levels n ..."],
-    ) -> Float[Array, "1 combinations n ..."]:
-        # With the first axis of `Samples.values`, for the one kind.
-        return combined(weights, x)[None]
-
-    return Samples(jtu.tree_map(of_one_kind, values), jnp.all(good, axis=0), ~good)
+    values = jtu.tree_map(lambda x: combined(weights, x), values)
+    return Samples(Averaged(values), jnp.all(good, axis=0), ~good)
 
 
 def _evaluate(fn: Callable, key: PRNGKeyArray) -> tuple[PyTree[Array], Bool[Array, ""]]:

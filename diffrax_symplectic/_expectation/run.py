@@ -186,7 +186,7 @@ class _Batches:
             norm=zeros,
             largest=zeros,
             size=zeros,
-            dtypes=jtu.tree_map(lambda s: str(s.dtype), shapes),
+            dtypes=jtu.tree_map(lambda s: str(s.dtype), shapes.value),
         )
 
 

@@ -242,7 +242,7 @@ class Problem(eqx.Module):
         """All numbers of `phi` as one vector."""
         return numbers(self.phi(t, y, self.args))
 
-    def unravel(self, x: Float[Array, "*axes m"]) -> PyTree[Array]:
+    def unravel(self, x: Float[Array | np.ndarray, "*axes m"]) -> PyTree[Array]:
         """Flat values of `phi` in its own structure."""
         shape = jax.eval_shape(lambda: self.phi(self.t0, self.y0, self.args))
         leaves, treedef = jtu.tree_flatten(shape)
@@ -258,27 +258,26 @@ class Problem(eqx.Module):
         """The combinations of values on all levels."""
         return combined(self.weights, x)
 
-    def averaged(
-        self, kinds: Sequence[Float[Array | np.ndarray, "combinations S n m"]]
+    def shaped(
+        self, x: Float[Array | np.ndarray, "combinations S n m"]
     ) -> PyTree[Array]:
-        """The `values` of `Samples` from these kinds."""
-        x = jnp.stack(kinds)
+        """Values of samples in the structure of `phi`, with the axis of samples before that
+        of times, if there is one."""
         if self.at_end:
-            return self.unravel(x[:, :, 0])
-        # The axis of samples comes before that of times.
-        return self.unravel(jnp.swapaxes(x, 2, 3))
+            return self.unravel(x[:, 0])
+        return self.unravel(jnp.swapaxes(x, 1, 2))
 
-    def shapes_of_samples(self, kinds: int) -> PyTree[jax.ShapeDtypeStruct]:
-        """The shapes of the `values` of one sample, with this number of kinds."""
+    @property
+    def shape_of_sample(self) -> PyTree[jax.ShapeDtypeStruct]:
+        """The shapes of the values of one sample, for all combinations of levels."""
         times, m = self.num_outputs
-        one = np.zeros((len(self.weights), times, 1, m), self.dtype_of_values)
-        averaged = jax.eval_shape(lambda: self.averaged([one] * kinds))
+        x = np.zeros((len(self.weights), times, 1, m), self.dtype_of_values)
 
         def without_samples(struct: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-            num_kinds, combinations, _, *rest = struct.shape
-            return jax.ShapeDtypeStruct((num_kinds, combinations, *rest), struct.dtype)
+            combinations, _, *rest = struct.shape
+            return jax.ShapeDtypeStruct((combinations, *rest), struct.dtype)
 
-        return jtu.tree_map(without_samples, averaged)
+        return jtu.tree_map(without_samples, jax.eval_shape(lambda: self.shaped(x)))
 
     @property
     def bounded(self) -> bool:

@@ -13,7 +13,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._expectation.estimate.cautions import cautions
 from diffrax_symplectic._expectation.estimate.estimate import combined_results
 from diffrax_symplectic._expectation.run import run
-from diffrax_symplectic._expectation.sampling import Samples, SamplingPlan
+from diffrax_symplectic._expectation.sampling import Averaged, Samples, SamplingPlan
 from diffrax_symplectic._simulation.levels import Combination
 from diffrax_symplectic._simulation.problem import Problem
 from examples.benchmarks.coverage import arguments, Cell, estimate, exact
@@ -156,8 +156,11 @@ def _with_control(shift: float, spread: float = 1.0, far: float = 0.0):
     def sampler(keys):
         x = jax.vmap(jr.normal)(keys)
         control = spread * x + shift
-        kinds = jnp.stack([x - control, x, control, jnp.zeros_like(x)])[:, None]
-        return Samples(kinds, jnp.ones(len(keys), bool), jnp.zeros((1, len(keys))))
+        own, plain, control, none = (
+            value[None] for value in (x - control, x, control, jnp.zeros_like(x))
+        )
+        averaged = Averaged(own, plain=plain, control=control, tails=none)
+        return Samples(averaged, jnp.ones(len(keys), bool), jnp.zeros((1, len(keys))))
 
     plan = SamplingPlan(jax.tree_util.Partial(sampler), 1000, 250, far=np.array([far]))
     return run(plan, KEY, tuple(jax.devices()[:1]))

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ..._simulation import Combination
-from ..sampling import KindsWithControl, ROUNDING
+from ..sampling import ROUNDING
 from .estimate import combined_results, Expectation
 from .moments import total
 from .tolerance import largest_of, shortfall
@@ -116,14 +116,14 @@ def _of_first_steps(estimate: Expectation) -> Iterator[str]:
     change = combined_results(estimate, Combination.EXTRAPOLATION)
     whole = total(estimate.moments)
 
-    def disagree(change: Any, noise: Any, finest: Any, sizes: Any, dtype: str) -> Any:
-        size = np.max(sizes, axis=0)[Combination.BEST]
-        rounding = ROUNDING * float(jnp.finfo(dtype).eps) * size
+    def disagree(change: Any, noise: Any, finest: Any, size: Any, dtype: str) -> Any:
+        rounding = ROUNDING * float(jnp.finfo(dtype).eps) * size[Combination.BEST]
         is_large = np.abs(change) > np.maximum(_SURE * noise, rounding)
         return np.any(is_large & (np.abs(change) > _MUCH * np.abs(finest)))
 
     finest = jtu.tree_map(np.add, estimate.mean, estimate.bias)
-    arguments = change.mean, change.std_error, finest, whole.size, whole.dtypes
+    size = jtu.tree_map(np.fmax, whole.size.value, whole.size.without_control)
+    arguments = change.mean, change.std_error, finest, size, whole.dtypes
     if any(jtu.tree_leaves(jtu.tree_map(disagree, *arguments))):
         yield (
             "The first two steps do not agree: extrapolation from steps of `dt0` and half "
@@ -135,10 +135,9 @@ def _of_first_steps(estimate: Expectation) -> Iterator[str]:
 def _underflowing(estimate: Expectation) -> str | None:
     """The dtype of a component that is zero or underflows on all paths, if there is one."""
     whole = total(estimate.moments)
-    for sizes, dtype in zip(*map(jtu.tree_leaves, (whole.size, whole.dtypes))):
-        has_control = len(sizes) == len(KindsWithControl)
-        without_control = sizes[KindsWithControl.PLAIN if has_control else 0]
-        if np.max(without_control[Combination.BEST]) < _least(dtype):
+    both = whole.size.without_control, whole.dtypes
+    for size, dtype in zip(*map(jtu.tree_leaves, both)):
+        if np.max(size[Combination.BEST]) < _least(dtype):
             return dtype
     return None
 

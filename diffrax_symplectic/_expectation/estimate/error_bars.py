@@ -1,5 +1,6 @@
 """Means, standard errors and what else follows from the moments of samples."""
 
+import functools as ft
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from ..._simulation import Combination
-from ..sampling import KindsOfReplicates, KindsWithControl, ROUNDING
+from ..sampling import Averaged, ROUNDING
 from .moments import Moments
 
 
@@ -68,23 +69,23 @@ def results_of(
 ) -> Results:
     """The results for one combination of levels.
 
-    Each array of `moments.mean` has the shape `(kinds, combinations, ...)`, where the dots
-    are the axes of one component of the mean. `roundings` and `far` are those of
-    `Expectation`; an array of `far` has the shape `(combinations, ...)`.
+    Each array of `moments.mean` has the shape `(combinations, ...)`, where the dots are the
+    axes of one component of the mean; so has each array of `far`. `roundings` and `far` are
+    those of `Expectation`.
     """
-    means, treedef = jtu.tree_flatten(moments.mean)
+    arrays, treedef = jtu.tree_flatten(moments.mean.value)
     # Only fits of value functions estimate tails by paths of their own. Deviations of zero
     # there add nothing to the standard errors.
     if far is None:
-        tails = [np.zeros(mean.shape[1:]) for mean in means]
+        tails = [np.zeros(array.shape) for array in arrays]
     else:
         tails = jtu.tree_leaves(far)
     each = [
         _results_of_array(moments.good, roundings, *parts)
         for parts in zip(
-            means,
-            jtu.tree_leaves(moments.norm),
-            jtu.tree_leaves(moments.largest),
+            _by_array(moments.mean),
+            _by_array(moments.norm),
+            _by_array(moments.largest),
             jtu.tree_leaves(moments.dtypes),
             tails,
         )
@@ -95,67 +96,94 @@ def results_of(
     return Results(*map(treedef.unflatten, fields))
 
 
+def _by_array(averaged: Averaged) -> list[Averaged]:
+    """For each array of `phi` what is averaged of it."""
+    fields = averaged.fields
+    by_field = zip(*map(jtu.tree_leaves, fields.values()))
+    return [Averaged(**dict(zip(fields, parts))) for parts in by_field]
+
+
 @np.errstate(all="ignore")
 def _results_of_array(
     n: int,
     roundings: int,
-    mean: Float[np.ndarray, "kinds combinations ..."],
-    norm: Float[np.ndarray, "kinds combinations ..."],
-    largest: Float[np.ndarray, "kinds combinations ..."],
+    mean: Averaged,
+    norm: Averaged,
+    largest: Averaged,
     dtype: str,
     tails: Float[np.ndarray, "combinations ..."],
 ) -> Results:
-    """The results for an array and each combination of levels, from its moments over `n`
-    samples. The kinds are those of `Samples`. `tails` is the mean absolute deviation in the
-    tails, as paths with wider noise estimate it."""
-    has_control = len(mean) == len(KindsWithControl)
-    is_replicate = len(mean) == len(KindsOfReplicates)
-    # Where the values without control are.
-    plain = KindsWithControl.PLAIN if has_control else 0
-    spread = mean[KindsOfReplicates.LARGEST] if is_replicate else largest[plain]
-
+    """The results for an array of `phi` and each combination of levels, from its moments
+    over `n` samples. `tails` is the mean absolute deviation in the tails, as paths with
+    wider noise estimate it."""
+    plain_mean = mean.without_control
     # Combinations of levels are differences of values as large as the mean.
-    size = np.fmax.reduce(np.abs(mean[: plain + 1, :1]))
+    size = np.fmax(np.abs(mean.value[:1]), np.abs(plain_mean[:1]))
     rounding = roundings * float(jnp.finfo(dtype).eps) * size
+    spread_of = ft.partial(_spread_of, n, rounding)
 
+    own = spread_of(norm.value, largest.value, mean.heaviness)
+    results = Results(
+        mean=mean.value,
+        std_error=own.error,
+        plain_std_error=own.error,
+        variance=own.s**2,
+        heaviness=own.r,
+        dropped=np.zeros(plain_mean.shape, bool),
+        spread=largest.without_control if mean.largest is None else mean.largest,
+    )
+    if mean.control is not None:
+        control = spread_of(norm.control, largest.control)
+        allowed = np.fmax(_SURE * control.error, ROUNDING * rounding)
+        is_fine = np.abs(mean.control) <= allowed
+        is_fine |= control.r > _HEAVY_CONTROL
+        is_fine &= np.isfinite(mean.value)
+        # Combinations of levels belong together: for all or for none.
+        dropped = np.broadcast_to(~np.all(is_fine, axis=0), plain_mean.shape)
+        # Tails that the samples show are in their variance already. (NaN, from a trial
+        # without a value, is ignored.)
+        unseen = np.where(tails > mean.tails, tails - mean.tails, 0)
+        plain = spread_of(norm.plain, largest.plain)
+        results = results._replace(
+            mean=np.where(dropped, plain_mean, mean.value),
+            std_error=np.where(dropped, plain.error, np.hypot(own.error, unseen)),
+            plain_std_error=plain.error,
+            variance=np.where(dropped, plain.s, own.s) ** 2,
+            heaviness=np.where(dropped, plain.r, own.r),
+            dropped=dropped,
+        )
+    if n == 0:
+        return results._replace(mean=np.full_like(plain_mean, np.nan))
+    return results
+
+
+class _Spread(NamedTuple):
+    """How values spread: their standard deviation, their `heaviness`, and the standard
+    error of their mean."""
+
+    s: np.ndarray
+    r: np.ndarray
+    error: np.ndarray
+
+
+def _spread_of(
+    n: int,
+    rounding: np.ndarray,
+    norm: np.ndarray,
+    largest: np.ndarray,
+    within: np.ndarray | None = None,
+) -> _Spread:
+    """The spread of `n` values, from their moments. `within` is the `heaviness` of the
+    paths that each value is a mean of, which hides their tails."""
     s = norm / np.sqrt(n - 1) if n > 1 else np.full_like(norm, np.nan)
     r = np.where(s > 0, heaviness(largest, s, n), 0)
     # Rounding errors can have heavy tails, too.
     r = np.where(largest > ROUNDING * rounding, r, 0)
-    if is_replicate:
-        # The mean over many paths hides their tails.
-        r[0] = np.fmax(r[0], mean[KindsOfReplicates.HEAVINESS])
+    if within is not None:
+        r = np.fmax(r, within)
     r = np.minimum(r, _MOST_HEAVY)
     error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
-    error = np.maximum(error, rounding)
-
-    dropped = np.zeros(mean.shape[1:], bool)
-    if has_control:
-        control = KindsWithControl.CONTROL
-        allowed = np.fmax(_SURE * error[control], ROUNDING * rounding)
-        is_fine = np.abs(mean[control]) <= allowed
-        is_fine |= r[control] > _HEAVY_CONTROL
-        is_fine &= np.isfinite(mean[KindsWithControl.CONTROLLED])
-        # Combinations of levels belong together: for all or for none.
-        dropped |= ~np.all(is_fine, axis=0)
-        # Tails that the samples show are in their variance already. (NaN, from a trial
-        # without a value, is ignored.)
-        shown = mean[KindsWithControl.TAILS]
-        unseen = np.where(tails > shown, tails - shown, 0)
-        error[0] = np.hypot(error[0], unseen)
-
-    def best(x: np.ndarray) -> np.ndarray:
-        return np.where(dropped, x[plain], x[0]) if has_control else x[0]
-
-    return Results(
-        mean=best(mean) if n > 0 else np.full_like(mean[0], np.nan),
-        std_error=best(error),
-        plain_std_error=error[plain],
-        variance=best(s) ** 2,
-        heaviness=best(r),
-        dropped=dropped,
-        spread=spread,
-    )
+    return _Spread(s, r, np.maximum(error, rounding))
 
 
 @np.errstate(invalid="ignore")

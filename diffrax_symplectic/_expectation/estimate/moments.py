@@ -7,6 +7,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
+from ..sampling import Averaged
+
 
 class Moments(NamedTuple):
     """Statistics of samples `begin` to `end - 1`, on the host and in float64.
@@ -14,13 +16,13 @@ class Moments(NamedTuple):
     - `good`: the number of good samples.
     - `failed`: the number of failed paths, each counted once.
     - `failed_on`: the number of paths that failed on each level.
-    - `mean`: the mean of the good samples, with two leading axes for kinds and for
-        combinations of levels.
+    - `mean`: the mean of the good samples. Arrays have a leading axis for combinations of
+        levels.
     - `norm`: the root of the sum of squared deviations from the mean. (The sum itself would
         overflow or underflow sooner.)
     - `largest`: the largest deviation within a batch.
     - `size`: the largest absolute value.
-    - `dtypes`: the dtype in which each array was computed.
+    - `dtypes`: the dtype in which each array of `phi` was computed.
     """
 
     begin: int
@@ -28,10 +30,10 @@ class Moments(NamedTuple):
     good: int
     failed: int
     failed_on: tuple[int, ...]
-    mean: PyTree[np.ndarray]
-    norm: PyTree[np.ndarray]
-    largest: PyTree[np.ndarray]
-    size: PyTree[np.ndarray]
+    mean: Averaged
+    norm: Averaged
+    largest: Averaged
+    size: Averaged
     dtypes: PyTree[str]
 
 

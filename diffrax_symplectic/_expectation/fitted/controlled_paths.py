@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..._simulation import along, Level, Motion, PathStates, Problem, simulate
 from ..._terms import number_of_noises
-from ..sampling import ROUNDING, Samples
+from ..sampling import Averaged, ROUNDING, Samples
 from .fits import FittedFunctions
 from .noise import Noise
 
@@ -153,4 +153,10 @@ def controlled_paths(
     ratio = jnp.exp(-jnp.maximum(log_ratio, 0))[:, None]
     tails = jnp.where(off > beyond, ratio * off, 0)
     good = ~jnp.any(done.failed, axis=0)
-    return Samples(p.averaged([left, plain, control, tails]), good, done.failed)
+    averaged = Averaged(
+        p.shaped(left),
+        plain=p.shaped(plain),
+        control=p.shaped(control),
+        tails=p.shaped(tails),
+    )
+    return Samples(averaged, good, done.failed)

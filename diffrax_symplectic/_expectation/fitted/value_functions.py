@@ -11,7 +11,6 @@ import warnings
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
@@ -27,7 +26,7 @@ from ..estimate import combined_results, Expectation, total
 from ..run import run
 from ..sampling import (
     AbstractSampling,
-    KindsWithControl,
+    Averaged,
     ROUNDING,
     SamplingPlan,
     saved_by_name,
@@ -94,11 +93,12 @@ class ValueFunctions(AbstractSampling):
         chosen = chosen_basis(problem, self.degree)
         warn_of_long_fit(chosen, stacklevel=5)
         basis = chosen.basis
+        shape = problem.shape_of_sample
         trials = _Trials(
             problem,
             _fits(problem, key, basis),
             outputs=problem.num_outputs,
-            shapes=problem.shapes_of_samples(len(KindsWithControl)),
+            shapes=Averaged(shape, plain=shape, control=shape, tails=shape),
             key=jr.fold_in(key, _TRIAL_KEY),
             devices=devices,
             batch_size=self.batch_size,
@@ -137,7 +137,7 @@ class _Trials(NamedTuple):
     problem: Problem
     functions: FittedFunctions
     outputs: tuple[int, int]
-    shapes: PyTree[jax.ShapeDtypeStruct]
+    shapes: Averaged
     key: PRNGKeyArray
     devices: tuple
     batch_size: int
@@ -227,15 +227,15 @@ def _usual(
     """The mean without control, and the largest deviation in the trials of what each
     component uses."""
     trials = [total(estimate.moments) for estimate in tried]
-    combinations = jtu.tree_leaves(trials[0].mean)[0].shape[1]
+    combinations, *_ = jtu.tree_leaves(trials[0].mean.value)[0].shape
 
-    def of_kind(tree: PyTree[np.ndarray], kind: KindsWithControl) -> np.ndarray:
-        return _flat(jtu.tree_map(lambda x: x[kind], tree), outputs, combinations)
+    def flat(tree: PyTree[np.ndarray]) -> np.ndarray:
+        return _flat(tree, outputs, combinations)
 
     # Without control all trials are the same.
-    center = of_kind(trials[0].mean, KindsWithControl.PLAIN)
-    without = of_kind(trials[0].largest, KindsWithControl.PLAIN)
-    each = [of_kind(trial.largest, KindsWithControl.CONTROLLED) for trial in trials]
+    center = flat(trials[0].mean.plain)
+    without = flat(trials[0].largest.plain)
+    each = [flat(trial.largest.value) for trial in trials]
     best = np.asarray(choice.best)[None, None]
     with_fit = np.take_along_axis(np.stack(each), best, 0)[0]
     largest = np.where(choice.used, with_fit, without)
@@ -245,11 +245,12 @@ def _usual(
 def _largest_tails(wide: list[Expectation]) -> PyTree[np.ndarray]:
     """The largest deviations in the tails, over trials by several laws."""
 
-    def largest(*means: np.ndarray) -> np.ndarray:
+    def largest(*tails: np.ndarray) -> np.ndarray:
         # A trial without a value is ignored.
-        return ft.reduce(np.fmax, [mean[KindsWithControl.TAILS] for mean in means])
+        return ft.reduce(np.fmax, tails)
 
-    return jtu.tree_map(largest, *[total(estimate.moments).mean for estimate in wide])
+    each = [total(estimate.moments).mean.tails for estimate in wide]
+    return jtu.tree_map(largest, *each)
 
 
 def _reason(basis: AbstractBasis, choice: Choice) -> str:

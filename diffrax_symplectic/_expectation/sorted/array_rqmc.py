@@ -35,7 +35,14 @@ from ..._simulation import (
 )
 from ..._terms import brownian_paths, path_numbers, replace_paths
 from ..estimate import heaviness
-from ..sampling import AbstractSampling, ROUNDING, Samples, SamplingPlan, saved_by_name
+from ..sampling import (
+    AbstractSampling,
+    Averaged,
+    ROUNDING,
+    Samples,
+    SamplingPlan,
+    saved_by_name,
+)
 from .hilbert import hilbert_order
 from .points import num_seeds, randomized, sobol_points
 
@@ -164,9 +171,11 @@ def _replicates(
     heavy = jnp.broadcast_to(jnp.max(heavy, axis=0), means.shape)
     # A path may fail on any level.
     largest = combined(abs(p.weights), largest)
-    kinds = [means, heavy, largest]
+    averaged = Averaged(
+        p.shaped(means), heaviness=p.shaped(heavy), largest=p.shaped(largest)
+    )
     lost = jnp.sum(done.failed, axis=1, keepdims=True)
-    return Samples(p.averaged(kinds), jnp.ones(1, bool), lost)
+    return Samples(averaged, jnp.ones(1, bool), lost)
 
 
 def _words_of_step(
