@@ -77,7 +77,7 @@ def run(
         roundings=plan.roundings,
         sampling=sampling,
         reason=plan.reason,
-        far=plan.far,
+        tails=plan.tails,
     )
     if start is not None:
         check_same(start, estimate, "`start`")

@@ -77,7 +77,7 @@ class SamplingPlan(NamedTuple):
         trace.
     - `quick`: whether the samples take less time than compiling their program, so that it
         is compiled for speed of compilation.
-    - `far`, `roundings`: as in `Expectation`.
+    - `tails`, `roundings`: as in `Expectation`.
     - `paths_of`: for paths computed outside JAX, maps the number of the first sample and
         the number of samples to an argument that the sampler takes before the keys.
     """
@@ -92,7 +92,7 @@ class SamplingPlan(NamedTuple):
     left: float = 0.0
     shapes: Averaged | None = None
     quick: bool = False
-    far: PyTree[np.ndarray] | None = None
+    tails: PyTree[np.ndarray] | None = None
     roundings: int = 1
     paths_of: Callable[[int, int], Any] | None = None
 

@@ -64,22 +64,20 @@ class Results(NamedTuple):
 def results_of(
     moments: Moments,
     roundings: int,
-    far: PyTree[np.ndarray] | None,
+    tails: PyTree[np.ndarray] | None,
     combination: Combination,
 ) -> Results:
     """The results for one combination of levels.
 
     Each array of `moments.mean` has the shape `(combinations, ...)`, where the dots are the
-    axes of one component of the mean; so has each array of `far`. `roundings` and `far` are
-    those of `Expectation`.
+    axes of one component of the mean; so has each array of `tails`. `roundings` and `tails`
+    are those of `Expectation`.
     """
-    arrays, treedef = jtu.tree_flatten(moments.mean.value)
+    treedef = jtu.tree_structure(moments.mean.value)
     # Only fits of value functions estimate tails by paths of their own. Deviations of zero
     # there add nothing to the standard errors.
-    if far is None:
-        tails = [np.zeros(array.shape) for array in arrays]
-    else:
-        tails = jtu.tree_leaves(far)
+    if tails is None:
+        tails = jtu.tree_map(np.zeros_like, moments.mean.value)
     each = [
         _results_of_array(moments.good, roundings, *parts)
         for parts in zip(
@@ -87,7 +85,7 @@ def results_of(
             _by_array(moments.norm),
             _by_array(moments.largest),
             jtu.tree_leaves(moments.dtypes),
-            tails,
+            jtu.tree_leaves(tails),
         )
     ]
     # `each` has all fields of one array after another, each with an axis of combinations.

@@ -41,7 +41,7 @@ class Expectation(eqx.Module):
     - `key_data`: the data of the random key.
 
     The other fields are what `save` stores beside these, and may change: `moments`,
-    `paths_per_sample`, `roundings` and `far`.
+    `paths_per_sample`, `roundings` and `tails`.
     """
 
     # The moments of batches, with neighbours combined.
@@ -55,7 +55,7 @@ class Expectation(eqx.Module):
     tol_reached: bool | None = None
     # For value functions: the mean absolute deviation from the fitted mean in the tails, as
     # estimated by paths whose noise is wider or pushed to one side.
-    far: PyTree[np.ndarray] | None = None
+    tails: PyTree[np.ndarray] | None = None
 
     @property
     def levels(self) -> int:
@@ -316,7 +316,7 @@ class Expectation(eqx.Module):
     def _results(self, combination: Combination) -> Results:
         """What follows from the moments for one combination of levels."""
         whole = total(self.moments)
-        return results_of(whole, self.roundings, self.far, combination)
+        return results_of(whole, self.roundings, self.tails, combination)
 
 
 def combined_results(estimate: Expectation, combination: Combination) -> Results:

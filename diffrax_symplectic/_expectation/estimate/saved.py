@@ -32,14 +32,14 @@ def header_of(estimate: Any) -> dict[str, Any]:
         "sampling": None if sampling is None else type(sampling).__name__,
         # A function, such as `sort_by`, is left out.
         "fields": {name: _plain(x) for name, x in fields.items() if _is_plain(x)},
-        "far": estimate.far is not None,
+        "tails": estimate.tails is not None,
     }
     return header | {name: getattr(estimate, name) for name in _PLAIN_FIELDS}
 
 
 def arrays_of(estimate: Any) -> dict[str, np.ndarray]:
     """The arrays of an `Expectation`, by names that are made of a field and positions."""
-    trees = {"far": estimate.far}
+    trees = {"tails": estimate.tails}
     for i, moments in enumerate(estimate.moments):
         for name in _AVERAGED:
             for field, tree in getattr(moments, name).fields.items():
@@ -80,7 +80,7 @@ def fields_from(
         "moments": tuple(moments(i, x) for i, x in enumerate(header["ranges"])),
         "key_data": arrays["key_data"],
         "sampling": _sampling_from(header),
-        "far": tree("far") if header["far"] else None,
+        "tails": tree("tails") if header["tails"] else None,
     }
 
 

@@ -6,6 +6,7 @@
   `basis_choice`: which of them.
 - `fits`: value functions, from a pilot run and a loop backward in time.
 - `controlled_paths`: paths, and their control variates.
+- `tails`: trials of what paths too rare to be drawn would add to the error.
 """
 
 from .basis_choice import MOST_DIMENSIONS_OF_GRID

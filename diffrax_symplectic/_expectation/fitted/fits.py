@@ -22,6 +22,17 @@ from .noise import Noise
 _STATES_FOR_SECOND = 32
 
 
+class Choice(NamedTuple):
+    """What is used for each time at which to average and each component of `phi`.
+
+    - `best`: the number of the candidate.
+    - `used`: whether its control variate is used, or none.
+    """
+
+    best: Int[Array | np.ndarray, "S m"]
+    used: Bool[Array | np.ndarray, "S m"]
+
+
 class FittedFunctions(eqx.Module):
     """The value functions of a level, one after each step, for each time at which to
     average (`S`) and each component of `phi` (`m`); and for each candidate (`C`), until one

@@ -6,7 +6,6 @@ $u$. For the exact $u$ the sum of these differences is $\\phi(y_N)$ minus its me
 """
 
 import dataclasses
-import functools as ft
 import warnings
 from typing import Any, NamedTuple
 
@@ -33,9 +32,10 @@ from ..sampling import (
 )
 from .bases import AbstractBasis
 from .basis_choice import chosen_basis, warn_of_long_fit
-from .controlled_paths import Choice, controlled_paths, laws_of_trials, TrialLaw, Usual
-from .fits import fit, FittedFunctions
+from .controlled_paths import controlled_paths
+from .fits import Choice, fit, FittedFunctions
 from .noise import Noise
+from .tails import largest_tails, laws_of_trials, TrialLaw, Usual
 
 
 # Folded into the key of a call to draw trials. (Numbers of levels, by which fits are drawn,
@@ -121,7 +121,7 @@ class ValueFunctions(AbstractSampling):
         wide = [trials.run(choice, usual, law, size) for law in wider_laws]
         return trials.plan(choice, usual, own_law, self.num_paths)._replace(
             reason=_reason(basis, choice),
-            far=_largest_tails(wide),
+            tails=largest_tails(wide),
             left=compared.left(problem.dtype),
         )
 
@@ -240,17 +240,6 @@ def _usual(
     with_fit = np.take_along_axis(np.stack(each), best, 0)[0]
     largest = np.where(choice.used, with_fit, without)
     return Usual(center.astype(dtype), largest.astype(dtype))
-
-
-def _largest_tails(wide: list[Expectation]) -> PyTree[np.ndarray]:
-    """The largest deviations in the tails, over trials by several laws."""
-
-    def largest(*tails: np.ndarray) -> np.ndarray:
-        # A trial without a value is ignored.
-        return ft.reduce(np.fmax, tails)
-
-    each = [total(estimate.moments).mean.tails for estimate in wide]
-    return jtu.tree_map(largest, *each)
 
 
 def _reason(basis: AbstractBasis, choice: Choice) -> str:
