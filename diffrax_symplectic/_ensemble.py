@@ -34,7 +34,7 @@ from ._terms import has_shapes, path_keys, with_keys
 _ENTRIES = {"jax": 2**17, "drjit": 2**20}
 # Accelerators need this many times as many.
 _MORE_ON_ACCELERATORS = 16
-# The fewest paths in a batch, however large their states.
+# The fewest paths in a batch, however large their states, so that batches are few.
 _FEWEST_PATHS = 256
 
 
@@ -210,10 +210,10 @@ def ensemble(
     batches = []
     for begin in range(0, num_paths, size):
         # JAX compiles for one batch size: the last batch is cut afterwards.
-        left = num_paths if engine == "jax" else num_paths - begin
-        n = min(size, left)
-        numbers = np.arange(begin, begin + n, dtype=np.uint64)
-        batches.append(paths_by(problem, key, numbers))
+        remaining = num_paths if engine == "jax" else num_paths - begin
+        n = min(size, remaining)
+        sample_numbers = np.arange(begin, begin + n, dtype=np.uint64)
+        batches.append(paths_by(problem, key, sample_numbers))
     joined = _joined(batches, num_paths, at_end=ts is None)
     _warn_of(joined, problem.bounded)
     saved_steps = np.asarray(problem.levels.saved_steps[0])

@@ -51,23 +51,23 @@ def _sums(
     key_data: UInt32[Array, "..."],
     impl: Any,
     first: UInt32[Array, "2"],
-    left: Int[Array, ""],
+    wanted: Int[Array, ""],
     mesh: Mesh,
     n: int,
 ) -> BatchSums:
     """The sums of all devices, along a leading axis. Each takes `n` samples, the first one
-    from sample number `first` on, in two halves of 32 bits, of which `left` are wanted."""
+    from sample number `first` on, in two halves of 32 bits. The first `wanted` count."""
     if mesh.size == 1:
-        sums = _of_device(sampler, key_data, impl, first, left, n, 0)
+        sums = _of_device(sampler, key_data, impl, first, wanted, n, 0)
         return jtu.tree_map(lambda x: x[None], sums)
     dynamic, static = eqx.partition(sampler, eqx.is_array)
 
     # The devices do not communicate until the end, so each one's result does not depend on
     # how many there are.
-    def shard(dynamic, first, left):
+    def shard(dynamic, first, wanted):
         sampler = eqx.combine(dynamic, static)
         device = jax.lax.axis_index("samples")
-        sums = _of_device(sampler, key_data, impl, first, left, n, device)
+        sums = _of_device(sampler, key_data, impl, first, wanted, n, device)
         return jtu.tree_map(lambda x: jax.lax.all_gather(x, "samples"), sums)
 
     none = PartitionSpec()
@@ -75,7 +75,7 @@ def _sums(
         shard, mesh=mesh, in_specs=none, out_specs=none, check_vma=False
     )
     try:
-        return sharded(dynamic, first, left)
+        return sharded(dynamic, first, wanted)
     except ValueError as error:
         # The loop of Diffrax's default adjoint rejects arrays that vary between devices.
         if is_closure_mismatch(error):
@@ -98,7 +98,7 @@ def _of_device(
     key_data: UInt32[Array, "..."],
     impl: Any,
     first: UInt32[Array, "2"],
-    left: Int[Array, ""],
+    wanted: Int[Array, ""],
     n: int,
     device: Any,
 ) -> BatchSums:
@@ -114,7 +114,7 @@ def _of_device(
 
     samples = lapack_in_turn(sampler)(jax.vmap(sample_key)(high, low))
     # The last batch is cut here: another size would be another program.
-    is_wanted = index < left
+    is_wanted = index < wanted
     good = samples.good & is_wanted
     lost = jnp.where(is_wanted, samples.lost, 0)
     failed = jnp.sum(jnp.max(lost, axis=0))
@@ -137,21 +137,21 @@ def _sums_of_array(
     x: Float[Array, "fields combinations n ..."], good: Bool[Array, " n"]
 ) -> tuple[Array, Array, Array, Array, Array]:
     """`mean`, `rest`, `norm`, `largest` and `size` of `BatchSums` for one array."""
-    keep = good.reshape(-1, *[1] * (x.ndim - 3))
+    mask = good.reshape(-1, *[1] * (x.ndim - 3))
     n = jnp.maximum(jnp.sum(good), 1)
 
     def largest_of(x: Array) -> Array:
         return jnp.max(jnp.abs(x), axis=2)
 
-    x = jnp.where(keep, x, 0)
+    x = jnp.where(mask, x, 0)
     size = largest_of(x)
     to_unit, from_unit = _powers(size)
     mean = from_unit * (jnp.sum(x * to_unit[:, :, None], axis=2) / n)
     # Two passes avoid cancellation. The second also finds the rounding error of the mean.
-    off = jnp.where(keep, x - mean[:, :, None], 0)
-    largest = largest_of(off)
+    deviations = jnp.where(mask, x - mean[:, :, None], 0)
+    largest = largest_of(deviations)
     to_unit, from_unit = _powers(largest)
-    z = off * to_unit[:, :, None]
+    z = deviations * to_unit[:, :, None]
     rest = jnp.sum(z, axis=2) / n
     squares = jnp.maximum(jnp.sum(z**2, axis=2) - n * rest**2, 0)
     return mean, from_unit * rest, from_unit * jnp.sqrt(squares), largest, size

@@ -12,7 +12,7 @@ from .._simulation import has_discrete_increments, Problem
 from .._solver import Want
 from .cost import OPERATIONS_PER_SECOND, operations_per_step
 from .estimate import Expectation
-from .fitted import MOST_DIMENSIONS_OF_GRID, num_outcomes, ValueFunctions
+from .fitted import count_outcomes, MOST_DIMENSIONS_OF_GRID, ValueFunctions
 from .fused_paths import fused_plan
 from .independent import IndependentPaths
 from .kinks import has_kinks
@@ -23,27 +23,31 @@ from .sorted import ArrayRQMC, step_words
 # No sample's key is folded from this number.
 _NO_SAMPLE = 0xFFFFFFFF
 # Value functions are chosen where they are fitted on a grid, up to this many outcomes of
-# one step and of all steps, which a fit visits at each point.
+# one step and of all steps, which a fit visits at each point. With these, 32 points along
+# each of two axes are less than `basis_choice` allows (32^2 * 48 = 49,152 for one step).
 _MOST_OUTCOMES_OF_STEP = 48
 _MOST_OUTCOMES_OF_STEPS = 2**12
-# Paths are sorted up to this dimension.
+# Paths are sorted up to this dimension: the default of 2^14 paths are eleven along each of
+# four coordinates.
 _MOST_COMPONENTS_SORTED = 4
 # Where a fit leaves more than this of the standard error, paths are sorted instead. For an
 # indicator and a call option on the pendulum fits left 26% and 1.3%, and sorted paths had
 # error bars that were 23 and 8 times less.
-_MUCH_LEFT = 0.01
+_MOST_REMAINDER = 0.01
 # The number of independent paths without a tolerance. (The other samplings have defaults.)
 _PATHS = 2**17
 # With a tolerance, which ends the estimate, the number of samples is without limit.
 _MOST_SAMPLES = 10**9
-# Without a tolerance, paths take no more than about this many seconds.
+# Without a tolerance, paths take no more than about this many seconds, so that a first call
+# ends while its user waits.
 _SECONDS = 10
 # Sorted paths are drawn and sorted before each step, which takes as long as this many
 # operations for each path.
 _OPERATIONS_OF_SORTING = 1500
-# The fewest paths, however long they take.
+# The fewest paths, however long they take: fewer do not know their own spread.
 _FEWEST_PATHS = 2**8
-# The sizes of a trial.
+# The sizes of a trial, a part of those of an estimate: it looks for changes that are
+# several times the error of both.
 _REPLICATES_OF_TRIAL = 8
 _PATHS_OF_SORTED_TRIAL = 2**12
 _PATHS_OF_TRIAL = 2**14
@@ -107,12 +111,12 @@ def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
         plan = sampling.prepare(problem, trial_key(key), devices)
         # Only fits leave something.
         instead = None
-        if is_chosen and plan.left > _MUCH_LEFT:
+        if is_chosen and plan.remainder > _MOST_REMAINDER:
             instead = sorted_paths(problem, tol)
         if instead is not None:
             why_sampling = (
                 "sorted paths, since fitted value functions leave "
-                f"{plan.left:.1%} of the standard error"
+                f"{plan.remainder:.1%} of the standard error"
             )
             sampling = instead
             plan = sampling.prepare(problem, trial_key(key), devices)
@@ -120,7 +124,7 @@ def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
     reason = "; ".join(filter(None, [why_sampling, why_law, plan.reason]))
     if start is not None:
         reason = start.reason
-    plan = plan._replace(reason=reason, roundings=problem.max_steps)
+    plan = plan._replace(reason=reason, rounding_floor=problem.finest_steps)
     if start is not None and tol is None and plan.num_samples == _MOST_SAMPLES:
         # Without `tol` the number of samples stays as it was.
         used = start.moments[-1].end - start.moments[0].begin
@@ -158,11 +162,11 @@ def sampling_for(
         return _independent_paths(problem, tol), ""
     components = _num_components(problem)
     steps = _num_steps(problem)
-    outcomes = num_outcomes(problem)
+    num_outcomes = count_outcomes(problem)
     why = f"{components} components of the state, {steps:,} steps"
-    if outcomes:
-        why += f" of {outcomes} outcomes each"
-    if _can_be_fitted(problem, outcomes):
+    if num_outcomes:
+        why += f" of {num_outcomes} outcomes each"
+    if _can_be_fitted(problem, num_outcomes):
         fitted = ValueFunctions(num_paths=_MOST_SAMPLES) if tol else ValueFunctions()
         return fitted, f"value functions for {why}"
     sampling = sorted_paths(problem, tol)
@@ -214,15 +218,15 @@ def _num_steps(problem: Problem) -> int:
     return int(np.sum(problem.levels.num_steps))
 
 
-def _can_be_fitted(problem: Problem, outcomes: int | None) -> bool:
+def _can_be_fitted(problem: Problem, num_outcomes: int | None) -> bool:
     """Whether value functions are the best choice, as far as it is known without a fit."""
     # They leave the variance of the start, for which few paths are too few.
-    if problem.paths_differ or not outcomes:
+    if problem.paths_differ or not num_outcomes:
         return False
     return (
         _num_components(problem) <= MOST_DIMENSIONS_OF_GRID
-        and outcomes <= _MOST_OUTCOMES_OF_STEP
-        and _num_steps(problem) * outcomes <= _MOST_OUTCOMES_OF_STEPS
+        and num_outcomes <= _MOST_OUTCOMES_OF_STEP
+        and _num_steps(problem) * num_outcomes <= _MOST_OUTCOMES_OF_STEPS
     )
 
 

@@ -72,8 +72,8 @@ def _operations(jaxpr: Jaxpr, in_loop: bool) -> int:
             count += _OF_TRANSCENDENTAL * size
         elif name == "dot_general":
             (contracted, _), _ = eqn.params["dimension_numbers"]
-            left, _ = eqn.invars
-            shape = left.aval.shape  # pyright: ignore (of arrays)
+            factor, _ = eqn.invars
+            shape = factor.aval.shape  # pyright: ignore (of arrays)
             count += size * math.prod(shape[axis] for axis in contracted)
         else:
             count += size

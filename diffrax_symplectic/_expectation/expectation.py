@@ -37,11 +37,12 @@ from .sampling import AbstractSampling
 
 
 # The levels, unless the user chooses them: the fewest that tell the discretization error,
-# and with `tol` at most so many.
+# and with `tol` at most so many, the last of which has steps of `dt0 / 32`.
 _FEWEST_LEVELS = 2
 _MOST_LEVELS = 6
-# Means differ if their difference is this many standard errors.
-_SURE = 4
+# Means differ if their difference is this many standard errors: by chance that happens
+# once in sixteen thousand times.
+_SURE_OF_LAW = 4
 
 
 def expectation(
@@ -253,7 +254,7 @@ def _warn_of_law(
     trial = run(plan, key, devices)
     change = jtu.tree_map(lambda x, y: np.abs(x - y), estimate.mean, trial.mean)
     error = jtu.tree_map(np.hypot, estimate.std_error, trial.std_error)
-    is_beyond = jtu.tree_map(lambda x, y: np.any(x > _SURE * y), change, error)
+    is_beyond = jtu.tree_map(lambda x, y: np.any(x > _SURE_OF_LAW * y), change, error)
     if any(jtu.tree_leaves(is_beyond)):
         most = max(float(np.max(x, initial=0.0)) for x in jtu.tree_leaves(change))
         warnings.warn(
@@ -269,11 +270,11 @@ def _warn_of_law(
 
 def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
     """In single precision, rounding can exceed a small sampling error."""
-    numbers = np.finfo(problem.dtype)
-    if numbers.bits >= 64:
+    precision = np.finfo(problem.dtype)
+    if precision.bits >= 64:
         return
     # Step sizes are rounded along with times, so errors of the same sign add up.
-    fraction = float(numbers.eps) * problem.max_steps
+    fraction = float(precision.eps) * problem.finest_steps
 
     def is_near_rounding(mean: Any, error: Any) -> np.bool_:
         return np.any(error <= 2 * (fraction * np.abs(mean)))
@@ -282,8 +283,8 @@ def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
     if any(jtu.tree_leaves(near)):
         warnings.warn(
             "Rounding errors may be larger than the sampling error: over "
-            f"{problem.max_steps:,} steps in {numbers.dtype} they are about {fraction:.0e} "
-            "of the mean, which is the smallest `std_error` reported. For more digits call "
-            '`jax.config.update("jax_enable_x64", True)` first.',
+            f"{problem.finest_steps:,} steps in {precision.dtype} they are about "
+            f"{fraction:.0e} of the mean, which is the smallest `std_error` reported. For "
+            'more digits call `jax.config.update("jax_enable_x64", True)` first.',
             stacklevel=3,
         )

@@ -15,8 +15,9 @@ from .independent import IndependentPaths
 from .sampling import Averaged, Samples, SamplingPlan
 
 
-# Default number of paths in a batch: large, to amortize the call of the kernel.
-_BATCH = 2**19
+# The default number of paths in a batch: many, since each call of the kernel takes a while
+# before its first path.
+_FUSED_BATCH = 2**19
 
 
 def fused_plan(
@@ -37,7 +38,7 @@ def fused_plan(
     levels = len(problem.levels.h)
     plan = sampling.plan(jtu.Partial(_samples, problem), levels, devices)
     if sampling.batch_size is None:
-        plan = plan._replace(batch_size=_BATCH)
+        plan = plan._replace(batch_size=_FUSED_BATCH)
     return plan._replace(paths_of=FusedPaths(problem, key))
 
 

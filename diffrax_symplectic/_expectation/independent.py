@@ -13,9 +13,10 @@ from .._simulation import Problem, values_of_paths
 from .sampling import AbstractSampling, Averaged, Samples, SamplingPlan, saved_by_name
 
 
-# The default sizes of a batch. On CPUs it keeps all cores busy and fits their caches.
+# The default sizes of a batch. On CPUs it keeps all cores busy and fits their caches;
+# elsewhere more paths at once are needed to be busy.
 _BATCH_ON_CPU = 2**15
-_BATCH = 2**18
+_BATCH_ELSEWHERE = 2**18
 
 
 @saved_by_name
@@ -48,7 +49,7 @@ class IndependentPaths(AbstractSampling):
     ) -> SamplingPlan:
         """The plan for samples that are made one for each key, by any function."""
         if self.batch_size is None:
-            size = _BATCH_ON_CPU if devices[0].platform == "cpu" else _BATCH
+            size = _BATCH_ON_CPU if devices[0].platform == "cpu" else _BATCH_ELSEWHERE
         else:
             size = whole_number("batch_size", self.batch_size)
         return SamplingPlan(sampler, self.num_paths, size, levels=levels)

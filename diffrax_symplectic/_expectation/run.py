@@ -74,7 +74,7 @@ def run(
         moments=(none,),
         key_data=batches.key_data,
         paths_per_sample=plan.paths,
-        roundings=plan.roundings,
+        rounding_floor=plan.rounding_floor,
         sampling=sampling,
         reason=plan.reason,
         tails=plan.tails,
@@ -149,11 +149,11 @@ class _Batches:
         """Starts one batch on each device, from sample `at` on and up to `end`."""
         count = len(self._devices)
         low_high = np.array([at & 0xFFFFFFFF, at >> 32], np.uint32)
-        left = np.array(max(0, min(self.size * count, end - at)), np.int32)
+        wanted = np.array(max(0, min(self.size * count, end - at)), np.int32)
         if count == 1:
-            low_high, left = jax.device_put((low_high, left), self._devices[0])
+            low_high, wanted = jax.device_put((low_high, wanted), self._devices[0])
         return self._sums(
-            sampler, self.key_data, self._impl, low_high, left, self._mesh, self.size
+            sampler, self.key_data, self._impl, low_high, wanted, self._mesh, self.size
         )
 
     def of_devices(self, running: BatchSums) -> list[BatchSums]:

@@ -30,4 +30,4 @@ from .loop import (
     simulate,
     values_of_paths,
 )
-from .problem import Drawn, numbers, Problem, ravel
+from .problem import Drawn, Problem, ravel, real_vector

@@ -22,7 +22,7 @@ from .problem import Drawn, Problem
 # sweep over their stage equations: for a million paths of `ArrayRQMC` by the midpoint rule
 # this saves a quarter to a half of the processor time. In smaller blocks the batches of
 # `ensemble` take up to a fifth longer.
-_BLOCK = 2**16
+_PATHS_AT_ONCE = 2**16
 
 
 class PathStates(eqx.Module):
@@ -69,8 +69,8 @@ class PathStates(eqx.Module):
 
 def _kept_where(failed: Bool[Array, " n"], old: PyTree, new: PyTree) -> PyTree:
     """The new values, and the old ones for failed paths."""
-    keep = lambda new, old: jnp.where(along(failed, new), old, new)
-    return jtu.tree_map(keep, new, old)
+    pick = lambda new, old: jnp.where(along(failed, new), old, new)
+    return jtu.tree_map(pick, new, old)
 
 
 class Motion(NamedTuple):
@@ -217,10 +217,10 @@ def _in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
     """`jax.vmap(fn)(*args)`, on CPUs one block of paths after another."""
     count = len(jtu.tree_leaves(args)[0])
     # A block of another size would be compiled for itself.
-    is_whole = count > _BLOCK and count % _BLOCK == 0
+    is_whole = count > _PATHS_AT_ONCE and count % _PATHS_AT_ONCE == 0
     if not is_whole or jax.default_backend() != "cpu":
         return jax.vmap(fn)(*args)
-    return lax.map(lambda own: fn(*own), args, batch_size=_BLOCK)
+    return lax.map(lambda own: fn(*own), args, batch_size=_PATHS_AT_ONCE)
 
 
 def along(mask: Bool[Array, " n"], x: Array) -> Array:

@@ -1,4 +1,8 @@
-"""An expectation to compute: the checked arguments, and single steps."""
+"""An expectation to compute: the checked arguments, and single steps.
+
+Axes of arrays, here and in what simulates a problem: `n` paths, `d` entries of the state,
+`S` times at which to average (saves), `m` numbers in `phi`.
+"""
 
 import dataclasses
 import functools as ft
@@ -90,7 +94,7 @@ class Problem(eqx.Module):
     # cannot tell.
     path_numbers: tuple[int, ...] = eqx.field(static=True)
     # The number of steps on the finest level. (Shapes must be known when compiling.)
-    max_steps: int = eqx.field(static=True)
+    finest_steps: int = eqx.field(static=True)
 
     @staticmethod
     def of(
@@ -168,7 +172,7 @@ class Problem(eqx.Module):
             weights=weights,
             at_end=ts is None,
             path_numbers=path_numbers(brownian_paths(terms)),
-            max_steps=int(grid.num_steps[-1]),
+            finest_steps=int(grid.num_steps[-1]),
         )
 
     def level(self, index: IntScalarLike) -> Level:
@@ -240,7 +244,7 @@ class Problem(eqx.Module):
 
     def values(self, t: Any, y: Y) -> Float[Array, " m"]:
         """All numbers of `phi` as one vector."""
-        return numbers(self.phi(t, y, self.args))
+        return real_vector(self.phi(t, y, self.args))
 
     def unravel(self, x: Float[Array | np.ndarray, "*axes m"]) -> PyTree[Array]:
         """Flat values of `phi` in its own structure."""
@@ -306,7 +310,7 @@ def ravel(y: Y) -> Float[Array, " d"]:
     return jfu.ravel_pytree(y)[0]
 
 
-def numbers(tree: PyTree) -> Float[Array, " m"]:
+def real_vector(tree: PyTree) -> Float[Array, " m"]:
     """The leaves as one vector of real numbers."""
     x = ravel(tree)
     return x.astype(jnp.result_type(x, float))

@@ -68,7 +68,7 @@ def test_paths_in_blocks_are_those_of_one_batch(monkeypatch):
     whole = _estimate(phi=SQUARE, levels=2)
     # Another function, so that programs are compiled anew.
     phi = lambda t, y, args: y[1] ** 2
-    monkeypatch.setattr(loop, "_BLOCK", 64)
+    monkeypatch.setattr(loop, "_PATHS_AT_ONCE", 64)
     got = _estimate(phi=phi, levels=2)
     np.testing.assert_allclose(got.mean, whole.mean, rtol=1e-13)
     np.testing.assert_allclose(got.std_error, whole.std_error, rtol=1e-9)

@@ -123,7 +123,7 @@ def test_the_docstring_of_expectation_states_the_rule_of_the_default():
         "for a state of one or two components, if a step has at most "
         f"{choose._MOST_OUTCOMES_OF_STEP} outcomes and all steps together have at most "
         f"{choose._MOST_OUTCOMES_OF_STEPS:,}",
-        f"the fit leaves more than {choose._MUCH_LEFT:.0%} of the standard error",
+        f"the fit leaves more than {choose._MOST_REMAINDER:.0%} of the standard error",
         "`ArrayRQMC` for up to four components",
         f"draw {ds.ValueFunctions().num_paths:,} paths, {sorted_paths.replicates} "
         f"replicates of {sorted_paths.num_paths:,} paths, and {choose._PATHS:,} paths",

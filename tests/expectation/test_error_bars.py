@@ -216,7 +216,7 @@ def test_intervals_cover_as_often_as_they_say(name, noise):
     cell, devices = Cell(noise, 1.0, 1.0, steps=10), tuple(jax.devices()[:1])
     problem = Problem.of(*arguments(cell), None, 1)
     # One fit: its paths have nothing to do with those that are averaged.
-    plan = _FEW[name].prepare(problem, jr.key(1), devices)._replace(roundings=10)
+    plan = _FEW[name].prepare(problem, jr.key(1), devices)._replace(rounding_floor=10)
     ends = [run(plan, jr.key(seed), devices).interval() for seed in range(40)]
     low, high = np.array(ends).swapaxes(0, 1)
     means, errors = exact(cell, 2**12)

@@ -263,7 +263,7 @@ def test_wider_noise_knows_its_likelihood_and_its_entropy():
         likely = np.array([own(a).prod() * np.exp(b) for a, b in pairs.items()])
         assert abs(likely.sum() - 1) <= 1e-12
         entropy = likely @ np.array([*pairs.values()])
-        assert abs(problem.max_steps * entropy - 8) <= 1e-6
+        assert abs(problem.finest_steps * entropy - 8) <= 1e-6
         # Four standard errors.
         mean = likely @ np.array([*pairs])
         assert np.all(np.abs(np.sign(x).mean(0) - mean) <= 4 / np.sqrt(len(x)))

@@ -21,9 +21,11 @@ _HEAVY = 0.35
 # share of it. Of a method of order 2, the bias of the longer step is then more than twice
 # the mean.
 _MUCH = 0.5
-# Unless that change may be the noise of the samples, so many standard errors.
-_SURE = 4
-# Many more paths fail with the longer step if they are so many times those with half of it.
+# Unless that change may be the noise of the samples, so many standard errors: by chance it
+# is more once in sixteen thousand times.
+_SURE_OF_CHANGE = 4
+# Many more paths fail with the longer step if they are so many times those with half of it:
+# then the longer one is too long for the method, rather than paths bad by themselves.
 _MANY_MORE = 10
 
 
@@ -40,7 +42,7 @@ def cautions(estimate: Expectation, tol: float | None, bounded: bool) -> Iterato
 
 
 def _of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
-    """Of failed paths, if they could change the mean by more than its error."""
+    """A warning of failed paths, if they could change the mean by more than its error."""
     changes = jtu.tree_leaves(estimate.failed_error)
     errors = jtu.tree_leaves(estimate.std_error)
     # Without samples both are NaN.
@@ -70,7 +72,7 @@ def _of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
 
 
 def _of_spread(estimate: Expectation) -> Iterator[str]:
-    """Of values whose mean or standard error cannot be trusted."""
+    """Warnings of values whose mean or standard error cannot be trusted."""
     results = jtu.tree_leaves((estimate.mean, estimate.std_error))
     if not all(np.all(np.isfinite(x)) for x in results):
         yield (
@@ -110,7 +112,7 @@ def _of_spread(estimate: Expectation) -> Iterator[str]:
 
 
 def _of_first_steps(estimate: Expectation) -> Iterator[str]:
-    """Of two steps whose means have little in common. (Three are checked for the order.)"""
+    """A warning of two steps whose means differ much. (Three are checked for the order.)"""
     if estimate.levels != 2:
         return
     change = combined_results(estimate, Combination.EXTRAPOLATION)
@@ -118,7 +120,7 @@ def _of_first_steps(estimate: Expectation) -> Iterator[str]:
 
     def disagree(change: Any, noise: Any, finest: Any, size: Any, dtype: str) -> Any:
         rounding = ROUNDING * float(jnp.finfo(dtype).eps) * size[Combination.BEST]
-        is_large = np.abs(change) > np.maximum(_SURE * noise, rounding)
+        is_large = np.abs(change) > np.maximum(_SURE_OF_CHANGE * noise, rounding)
         return np.any(is_large & (np.abs(change) > _MUCH * np.abs(finest)))
 
     finest = jtu.tree_map(np.add, estimate.mean, estimate.bias)

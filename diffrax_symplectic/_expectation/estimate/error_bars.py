@@ -15,8 +15,9 @@ from .moments import Moments
 
 # A control variate is dropped if its mean is this many standard errors from zero: by chance
 # that happens less than once in a million times.
-_SURE = 5
-# Unless its own `r` exceeds this value: its standard error is then not reliable.
+_SURE_OF_CONTROL = 5
+# Unless its own `r` exceeds this value: its tails are then so heavy that its standard error
+# is not reliable.
 _HEAVY_CONTROL = 0.1
 # The largest deviation of n normal samples exceeds the root of this number times log(n), in
 # standard deviations, with a probability of less than n^(-5/4).
@@ -29,7 +30,7 @@ _MOST_HEAVY = 1 - 1e-6
 # would be 1.41, of two orders more 0.25.)
 _FASTEST = 0.25
 _SLOWEST = 1.33
-# The standard errors by which it may be off.
+# The standard errors by which it may miss them.
 _BY_CHANCE = 2
 
 
@@ -63,15 +64,15 @@ class Results(NamedTuple):
 
 def results_of(
     moments: Moments,
-    roundings: int,
+    rounding_floor: int,
     tails: PyTree[np.ndarray] | None,
     combination: Combination,
 ) -> Results:
     """The results for one combination of levels.
 
     Each array of `moments.mean` has the shape `(combinations, ...)`, where the dots are the
-    axes of one component of the mean; so has each array of `tails`. `roundings` and `tails`
-    are those of `Expectation`.
+    axes of one component of the mean; so has each array of `tails`. `rounding_floor`
+    and `tails` are those of `Expectation`.
     """
     treedef = jtu.tree_structure(moments.mean.value)
     # Only fits of value functions estimate tails by paths of their own. Deviations of zero
@@ -79,7 +80,7 @@ def results_of(
     if tails is None:
         tails = jtu.tree_map(np.zeros_like, moments.mean.value)
     each = [
-        _results_of_array(moments.good, roundings, *parts)
+        _results_of_array(moments.good, rounding_floor, *parts)
         for parts in zip(
             _by_array(moments.mean),
             _by_array(moments.norm),
@@ -104,7 +105,7 @@ def _by_array(averaged: Averaged) -> list[Averaged]:
 @np.errstate(all="ignore")
 def _results_of_array(
     n: int,
-    roundings: int,
+    rounding_floor: int,
     mean: Averaged,
     norm: Averaged,
     largest: Averaged,
@@ -117,7 +118,7 @@ def _results_of_array(
     plain_mean = mean.without_control
     # Combinations of levels are differences of values as large as the mean.
     size = np.fmax(np.abs(mean.value[:1]), np.abs(plain_mean[:1]))
-    rounding = roundings * float(jnp.finfo(dtype).eps) * size
+    rounding = rounding_floor * float(jnp.finfo(dtype).eps) * size
     spread_of = ft.partial(_spread_of, n, rounding)
 
     own = spread_of(norm.value, largest.value, mean.heaviness)
@@ -132,7 +133,7 @@ def _results_of_array(
     )
     if mean.control is not None:
         control = spread_of(norm.control, largest.control)
-        allowed = np.fmax(_SURE * control.error, ROUNDING * rounding)
+        allowed = np.fmax(_SURE_OF_CONTROL * control.error, ROUNDING * rounding)
         is_fine = np.abs(mean.control) <= allowed
         is_fine |= control.r > _HEAVY_CONTROL
         is_fine &= np.isfinite(mean.value)

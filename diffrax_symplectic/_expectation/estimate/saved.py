@@ -11,11 +11,11 @@ from ..sampling import Averaged, SAVED_SAMPLINGS
 from .moments import Moments
 
 
-# The fields of `Moments` that are an `Averaged`, and those that are numbers.
+# The fields of `Moments` that are an `Averaged`, and those that are integers.
 _AVERAGED = ("mean", "norm", "largest", "size")
-_NUMBERS = ("begin", "end", "good", "failed", "failed_on")
+_COUNTS = ("begin", "end", "good", "failed", "failed_on")
 # The fields of an estimate that JSON takes as they are.
-_PLAIN_FIELDS = ("paths_per_sample", "roundings", "reason", "tol_reached")
+_PLAIN_FIELDS = ("paths_per_sample", "rounding_floor", "reason", "tol_reached")
 
 
 def header_of(estimate: Any) -> dict[str, Any]:
@@ -25,7 +25,7 @@ def header_of(estimate: Any) -> dict[str, Any]:
     one, *_ = estimate.moments
     fields = {} if sampling is None else vars(sampling)
     header = {
-        "ranges": [[getattr(x, name) for name in _NUMBERS] for x in estimate.moments],
+        "ranges": [[getattr(x, name) for name in _COUNTS] for x in estimate.moments],
         "structure": _structure(one.mean.value),
         "averaged": list(one.mean.fields),
         "dtypes": jtu.tree_leaves(one.dtypes),
@@ -67,10 +67,10 @@ def fields_from(
         fields = header["averaged"]
         return Averaged(**{field: tree(f"{name}_{field}_{i}") for field in fields})
 
-    def moments(i: int, numbers: list[Any]) -> Moments:
+    def moments(i: int, counts: list[Any]) -> Moments:
         trees = {name: averaged(name, i) for name in _AVERAGED}
         dtypes = _filled(structure, iter(header["dtypes"]))
-        begin, end, good, failed, failed_on = numbers
+        begin, end, good, failed, failed_on = counts
         return Moments(
             begin, end, good, failed, tuple(failed_on), **trees, dtypes=dtypes
         )

@@ -18,12 +18,12 @@ class _Control(NamedTuple):
     """The control variate of a path so far.
 
     - `value`: the control variate.
-    - `promised`: the mean of `phi` that the functions promise at the start.
+    - `fitted_mean`: the mean of `phi` by the fitted functions, at the start.
     - `log_ratio`: the log likelihood ratio of the path.
     """
 
     value: Float[Array, "S m"]
-    promised: Float[Array, "S m"]
+    fitted_mean: Float[Array, "S m"]
     log_ratio: Float[Array, ""]
 
 
@@ -61,10 +61,10 @@ def controlled_paths(
             change = jnp.where(along(after.success, after.control), after.control, 0)
             before = paths.control
             # The mean over the first step.
-            promised = jnp.where(i == 0, after.value - change, before.promised)
+            fitted_mean = jnp.where(i == 0, after.value - change, before.fitted_mean)
             control = _Control(
                 before.value + jnp.where(choice.used, change, 0),
-                promised,
+                fitted_mean,
                 before.log_ratio + log_ratio,
             )
             return paths.moved(p, after.y, after.solver_state, after.success, control)
@@ -81,20 +81,20 @@ def controlled_paths(
     done = simulate(p, begin)
     plain = done.saved
     control = jnp.swapaxes(done.control.value, 1, 2).astype(plain.dtype)
-    promised = jnp.swapaxes(done.control.promised, 1, 2).astype(plain.dtype)
+    fitted_mean = jnp.swapaxes(done.control.fitted_mean, 1, 2).astype(plain.dtype)
     # At the start itself nothing is random.
     is_at_start = along(p.levels.saved_steps[0] == 0, plain[0])
-    promised = jnp.where(is_at_start, plain, promised)
-    by_kind = plain - control, plain, control, promised
-    left, plain, control, promised = map(p.combined, by_kind)
+    fitted_mean = jnp.where(is_at_start, plain, fitted_mean)
+    on_levels = plain - control, plain, control, fitted_mean
+    value, plain, control, fitted_mean = map(p.combined, on_levels)
 
     center = usual.center[:, :, None]
-    off = jnp.abs(left - jnp.where(choice.used[:, None], promised, center))
+    deviations = jnp.abs(value - jnp.where(choice.used[:, None], fitted_mean, center))
     log_ratio = jnp.sum(done.control.log_ratio, axis=0)
-    tails = usual.tails(off, plain, log_ratio)
+    tails = usual.tails(deviations, plain, log_ratio)
     good = ~jnp.any(done.failed, axis=0)
     averaged = Averaged(
-        p.shaped(left),
+        p.shaped(value),
         plain=p.shaped(plain),
         control=p.shaped(control),
         tails=p.shaped(tails),

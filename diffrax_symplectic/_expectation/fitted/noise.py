@@ -243,9 +243,9 @@ def _drawn(
     is_unchanged = (share == 0) & (tilts == 0)
     cuts = (jnp.cumsum(q, axis=1)[:, :-1] * 2.0**32).astype(jnp.uint32)
     cuts = jnp.where(is_unchanged[:, None], np.array(law.cuts, np.uint32), cuts)
-    place = jnp.sum(words[:, None] >= cuts, axis=1)
-    outcome = jnp.asarray(law.values, dtype)[place]
-    log_ratios = jnp.take_along_axis(jnp.log(q / p), place[:, None], axis=1)
+    index = jnp.sum(words[:, None] >= cuts, axis=1)
+    outcome = jnp.asarray(law.values, dtype)[index]
+    log_ratios = jnp.take_along_axis(jnp.log(q / p), index[:, None], axis=1)
     return outcome, log_ratios[:, 0]
 
 
@@ -263,13 +263,13 @@ def tilted(law: Discrete, q: Any, tilt: Any) -> Any:
     return weights / numpy.sum(weights)
 
 
-def num_outcomes(problem: Problem) -> int | None:
+def count_outcomes(problem: Problem) -> int | None:
     """The number of outcomes of a step, or `None` if there are many."""
     try:
-        outcomes = Noise.of(problem, problem.level(0)).outcomes
+        few = Noise.of(problem, problem.level(0)).outcomes
     except ValueError:
         return None
-    if outcomes is None:
+    if few is None:
         return None
-    _, probabilities = outcomes
+    _, probabilities = few
     return len(probabilities)

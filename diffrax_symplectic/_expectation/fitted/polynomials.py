@@ -82,13 +82,15 @@ def least_squares(
     in_block = is_used[:, :, None] & is_used[:, None]
     factors = jnp.where(in_block, L, jnp.eye(n, dtype=L.dtype))
 
-    def solved(L: Float[Array, "P P"], rhs: Float[Array, "P m"]) -> Float[Array, "P m"]:
+    def solution(
+        L: Float[Array, "P P"], rhs: Float[Array, "P m"]
+    ) -> Float[Array, "P m"]:
         return jax.scipy.linalg.cho_solve((L, True), rhs)
 
     def refined(_, c: Float[Array, "C P m"]) -> Float[Array, "C P m"]:
-        left = jnp.moveaxis(values, 1, 0) - dot(B, c)
-        rhs = jnp.where(is_used[:, :, None], dot(B.T, left), 0)
-        return c + jax.vmap(solved)(factors, rhs)
+        residual = jnp.moveaxis(values, 1, 0) - dot(B, c)
+        rhs = jnp.where(is_used[:, :, None], dot(B.T, residual), 0)
+        return c + jax.vmap(solution)(factors, rhs)
 
     c = jnp.zeros((len(sizes), n, values.shape[2]), values.dtype)
     # From zero: the first time is the solution itself.

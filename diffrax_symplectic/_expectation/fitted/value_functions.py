@@ -41,7 +41,8 @@ from .tails import largest_tails, laws_of_trials, TrialLaw, Usual
 # Folded into the key of a call to draw trials. (Numbers of levels, by which fits are drawn,
 # are smaller.)
 _TRIAL_KEY = 0xFFFFFFFE
-# A trial with wider noise has this many batches.
+# A trial with wider noise has this many batches, more than the trial of one batch beyond
+# whose deviations it looks.
 _BATCHES_OF_WIDE_TRIAL = 2
 
 
@@ -122,7 +123,7 @@ class ValueFunctions(AbstractSampling):
         return trials.plan(choice, usual, own_law, self.num_paths)._replace(
             reason=_reason(basis, choice),
             tails=largest_tails(wide),
-            left=compared.left(problem.dtype),
+            remainder=compared.remainder(problem.dtype),
         )
 
 
@@ -197,7 +198,7 @@ class _Compared(NamedTuple):
     plain: np.ndarray
     mean: np.ndarray
 
-    def left(self, dtype: Any) -> float:
+    def remainder(self, dtype: Any) -> float:
         """The largest fraction of a standard error that is left with control."""
         # Where nothing is random, as of a constant, both errors are rounding errors.
         is_random = self.plain > ROUNDING * jnp.finfo(dtype).eps * np.abs(self.mean)

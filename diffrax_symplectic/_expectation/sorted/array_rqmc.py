@@ -28,9 +28,9 @@ from ..._simulation import (
     independent_steps,
     Level,
     Motion,
-    numbers,
     PathStates,
     Problem,
+    real_vector,
     simulate,
 )
 from ..._terms import brownian_paths, path_numbers, replace_paths
@@ -49,13 +49,15 @@ from .points import num_seeds, randomized, sobol_points
 
 # SciPy has direction numbers for this many coordinates of Sobol' points.
 _MAX_DIMENSION = 21201
-# Fewer replicates do not estimate their variance well enough to stop.
+# Fewer replicates do not estimate their variance well enough to stop: the error bar of
+# eight is uncertain by a quarter.
 _BEFORE_STOPPING = 8
-# With fewer paths along each coordinate, neighbours are far apart.
+# With fewer paths along each coordinate, neighbours are far apart: nearly all paths are at
+# an edge of the cloud.
 _FEWEST_ALONG_COORDINATE = 3
 # Folded into the key of a replicate to draw the starts of its paths. (Numbers of levels are
 # smaller.)
-_STARTS_KEY = 0xFFFFFFFF
+_KEY_OF_STARTS = 0xFFFFFFFF
 
 
 @saved_by_name
@@ -107,7 +109,7 @@ class ArrayRQMC(AbstractSampling):
         check_takes("sort_by", sort_by, "y")
         sorted_by = eqx.filter_eval_shape(sort_by, problem.y0)
         check_real("sort_by", jtu.tree_leaves(sorted_by))
-        dimension = jax.eval_shape(lambda: numbers(sort_by(problem.y0))).size
+        dimension = jax.eval_shape(lambda: real_vector(sort_by(problem.y0))).size
         points = jnp.asarray(sobol_points(self.num_paths, words.number))
 
         along_coordinate = self.num_paths ** (1 / dimension)
@@ -146,7 +148,7 @@ def _replicates(
     n, _ = points.shape
     (replicate,) = keys
     # Not from quasi-random points, since a function of a key takes any number of them.
-    start_keys = jr.split(jr.fold_in(replicate, _STARTS_KEY), n)
+    start_keys = jr.split(jr.fold_in(replicate, _KEY_OF_STARTS), n)
     drawn = jax.vmap(p.drawn)(start_keys)
 
     def begin(level: Level) -> Motion:
@@ -193,7 +195,7 @@ def _words_of_step(
 
 def _in_order(sort_by: Callable[[Y], PyTree[Array]], paths: PathStates) -> PathStates:
     """The paths, sorted, with those that failed at the end."""
-    coordinates = jax.vmap(lambda y: numbers(sort_by(y)))(paths.y)
+    coordinates = jax.vmap(lambda y: real_vector(sort_by(y)))(paths.y)
     order = hilbert_order(coordinates, paths.failed)
     return jtu.tree_map(lambda x: x[order], paths)
 
@@ -201,21 +203,21 @@ def _in_order(sort_by: Callable[[Y], PyTree[Array]], paths: PathStates) -> PathS
 def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "3 ..."]:
     """The mean over the paths that have not failed, the `r` of these paths as in
     `Expectation.std_error`, and the largest deviation of one of them."""
-    keep = along(~failed, x)
+    mask = along(~failed, x)
     count = jnp.sum(~failed).astype(x.dtype)
 
     def mean(x: Array) -> Array:
         # In two stages, so that rounding errors in single precision do not add up.
         rows = 1 << ((len(x).bit_length() - 1) // 2)
-        x = jnp.where(keep, x, 0)
+        x = jnp.where(mask, x, 0)
         total = jnp.sum(jnp.sum(x.reshape(rows, -1, *x.shape[1:]), axis=0), axis=0)
         return total / count
 
     center = mean(x)
-    off = jnp.where(keep, jnp.abs(x - center), 0)
-    largest = jnp.max(off, axis=0)
+    deviations = jnp.where(mask, jnp.abs(x - center), 0)
+    largest = jnp.max(deviations, axis=0)
     # In units of the largest deviation, so that squares neither overflow nor underflow.
-    s = jnp.sqrt(mean((off / jnp.where(largest > 0, largest, 1)) ** 2))
+    s = jnp.sqrt(mean((deviations / jnp.where(largest > 0, largest, 1)) ** 2))
     # Rounding errors can have heavy tails, too.
     is_random = largest > ROUNDING * jnp.finfo(x.dtype).eps * jnp.abs(center)
     r = jnp.where(is_random, heaviness(1, s, count, jnp), 0)
