@@ -66,7 +66,7 @@ def checked_key(user: str, key: Any, others: Any) -> PRNGKeyArray:
 def step_numbers(
     t0: Any, t1: Any, dt0: Any, ts: Sequence[Any] | np.ndarray | None
 ) -> StepNumbers:
-    """Raises a `ValueError` for times that are no numbers, or between steps."""
+    """Raises a `ValueError` unless all times are numbers, a whole number of steps apart."""
     if dt0 is None:
         raise ValueError("`dt0` must be a number: steps are fixed; got None.")
     given = f"got dt0={dt0!r}, t0={t0!r}, t1={t1!r}"
