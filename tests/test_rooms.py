@@ -41,6 +41,7 @@ ROOMS = [
     (house, room) for house, rows in HOUSES.items() for row in rows for room in row
 ]
 FILES = sorted(ROOT.rglob("*.py"))
+NAME = lambda x: x.name if isinstance(x, Path) else x
 
 
 def floor_of(house: Path, room: str) -> int:
@@ -67,13 +68,13 @@ def imported(file: Path, house: Path = ROOT) -> list[tuple[str, ...]]:
     return found
 
 
-@pytest.mark.parametrize("house", HOUSES)
+@pytest.mark.parametrize("house", HOUSES, ids=NAME)
 def test_every_room_has_a_floor(house):
     rooms = {room_of(file, house) for file in house.rglob("*.py")}
     assert rooms == {room for row in HOUSES[house] for room in row}
 
 
-@pytest.mark.parametrize("house, room", ROOMS)
+@pytest.mark.parametrize("house, room", ROOMS, ids=NAME)
 def test_no_import_runs_upwards(house, room):
     own = floor_of(house, room)
     for file in house.rglob("*.py"):
@@ -92,7 +93,7 @@ def test_the_folder_of_stablehlo_needs_nothing_of_the_rest():
     assert used == {"_compat"}
 
 
-@pytest.mark.parametrize("house", HOUSES)
+@pytest.mark.parametrize("house", HOUSES, ids=NAME)
 def test_nothing_reaches_past_the_entrance_of_a_folder(house):
     for file in house.rglob("*.py"):
         for module in imported(file, house):
