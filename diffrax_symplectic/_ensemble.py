@@ -17,6 +17,7 @@ from ._compat import is_traced
 from ._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from ._fused import sample_key
 from ._simulation import (
+    advice_on_failures,
     Batch,
     check_gaussian,
     checked_key,
@@ -256,12 +257,9 @@ def _warn_of(joined: Batch, bounded: bool) -> None:
     count = len(joined.failed)
     lost = int(np.sum(joined.failed))
     if lost > 0:
-        instead = "" if bounded else " or bounded increments (a `WeakBrownianPath`),"
         warnings.warn(
             f"{lost:,} of {count:,} paths failed. Their states are NaN: select the others "
-            f"with `~failed`. Take smaller steps{instead} and look for NaNs in `y0`, "
-            "`args` and the Hamiltonians, and for a `temperature` or `friction` that is "
-            "negative or, as a matrix, not symmetric positive semidefinite.",
+            f"with `~failed`. {advice_on_failures(bounded)}",
             stacklevel=3,
         )
     warn_of_stragglers(joined.stragglers, lost, count, stacklevel=3)

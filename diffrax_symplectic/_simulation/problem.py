@@ -305,6 +305,17 @@ class Problem(eqx.Module):
         return self.levels.saved_steps.shape[1], m
 
 
+def advice_on_failures(bounded: bool) -> str:
+    """What to do about failed paths. `bounded` is whether the increments of all paths are
+    known to be bounded."""
+    instead = "" if bounded else " or bounded increments, as from a `WeakBrownianPath`,"
+    return (
+        f"Take smaller steps{instead} and look for NaNs in `y0`, `args` and the "
+        "Hamiltonians, and for a `temperature` or `friction` that is negative or, as a "
+        "matrix, not symmetric positive semidefinite."
+    )
+
+
 def ravel(y: Y) -> Float[Array, " d"]:
     """The leaves as one vector."""
     return jfu.ravel_pytree(y)[0]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from ..._simulation import Combination
+from ..._simulation import advice_on_failures, Combination
 from ..sampling import ROUNDING
 from .estimate import combined_results, Expectation
 from .moments import total
@@ -63,12 +63,7 @@ def _of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
                 f"; the first two steps do not agree, since {longest:,} paths fail with "
                 f"steps of `dt0` and {next_one:,} with half of it"
             )
-    instead = "" if bounded else " or bounded increments, as from a `WeakBrownianPath`,"
-    yield (
-        f"{estimate.num_failed:,} paths failed: {rest}. Take smaller steps{instead} and "
-        "look for NaNs in `y0`, `args` and the Hamiltonians, and for a `temperature` or "
-        "`friction` that is negative or, as a matrix, not symmetric positive semidefinite."
-    )
+    yield f"{estimate.num_failed:,} paths failed: {rest}. {advice_on_failures(bounded)}"
 
 
 def _of_spread(estimate: Expectation) -> Iterator[str]:
