@@ -32,10 +32,9 @@ from ._tableau import (
     symplectic_residuals as symplectic_residuals,
     weak_order_residuals as weak_order_residuals,
 )
+from ._ensemble import Ensemble as Ensemble, ensemble as ensemble
 from ._expectation import (
     ArrayRQMC as ArrayRQMC,
-    Ensemble as Ensemble,
-    ensemble as ensemble,
     Expectation as Expectation,
     expectation as expectation,
     ExpectationInterrupted as ExpectationInterrupted,

@@ -12,33 +12,55 @@ import diffrax_symplectic as ds
 ROOT = Path(ds.__file__).parent
 # From the bottom up. Those in a row do not import each other.
 FLOORS = [
-    ("_citation", "_compat", "_custom_types", "_signature"),
+    ("_citation", "_compat", "_custom_types", "_products", "_signature"),
     ("_arguments", "_batch", "_lapack", "_stablehlo"),
     ("_brownian", "_root_finder"),
     ("_tableau",),
     ("_terms",),
     ("_solver",),
     ("_fused",),
-    ("_expectation",),
+    ("_simulation",),
+    ("_ensemble", "_expectation"),
     ("_adjoint", "_suggest", "_verify"),
     ("_compare",),
     ("__init__",),
 ]
-FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
+# Of the folders and modules in `_expectation`.
+FLOORS_OF_EXPECTATION = [
+    ("sampling",),
+    ("estimate", "batch", "cost", "kinks"),
+    ("run", "call"),
+    ("independent", "fitted", "sorted"),
+    ("fused_paths",),
+    ("choose",),
+    ("expectation", "monte_carlo"),
+    ("__init__",),
+]
+HOUSES = {ROOT: FLOORS, ROOT / "_expectation": FLOORS_OF_EXPECTATION}
+ROOMS = [
+    (house, room) for house, rows in HOUSES.items() for row in rows for room in row
+]
 FILES = sorted(ROOT.rglob("*.py"))
+NAME = lambda x: x.name if isinstance(x, Path) else x
 
 
-def room_of(file: Path) -> str:
+def floor_of(house: Path, room: str) -> int:
+    """The number of the row in which a room is."""
+    (number,) = [k for k, row in enumerate(HOUSES[house]) if room in row]
+    return number
+
+
+def room_of(file: Path, house: Path = ROOT) -> str:
     """The folder of a module, or the module itself if it stands in none."""
-    return file.relative_to(ROOT).parts[0].removesuffix(".py")
+    return file.relative_to(house).parts[0].removesuffix(".py")
 
 
-def imported(file: Path) -> list[tuple[str, ...]]:
+def imported(file: Path, house: Path = ROOT) -> list[tuple[str, ...]]:
     """The modules of other rooms that a file imports, as parts of their names."""
-    depth = len(file.relative_to(ROOT).parts)
+    depth = len(file.relative_to(house).parts)
     found = []
     for node in ast.walk(ast.parse(file.read_text())):
-        # As many dots as folders, the package included: from another room.
+        # As many dots as folders, the house included: from another room.
         if isinstance(node, ast.ImportFrom) and node.level == depth:
             names = [alias.name for alias in node.names]
             modules = [node.module] if node.module else names
@@ -46,16 +68,19 @@ def imported(file: Path) -> list[tuple[str, ...]]:
     return found
 
 
-def test_every_room_has_a_floor():
-    assert {room_of(file) for file in FILES} == FLOOR_OF.keys()
+@pytest.mark.parametrize("house", HOUSES, ids=NAME)
+def test_every_room_has_a_floor(house):
+    rooms = {room_of(file, house) for file in house.rglob("*.py")}
+    assert rooms == {room for row in HOUSES[house] for room in row}
 
 
-@pytest.mark.parametrize("room", FLOOR_OF)
-def test_no_import_runs_upwards(room):
-    for file in FILES:
-        if room_of(file) == room:
-            for other, *_ in imported(file):
-                assert FLOOR_OF[other] < FLOOR_OF[room], f"{file} imports {other}"
+@pytest.mark.parametrize("house, room", ROOMS, ids=NAME)
+def test_no_import_runs_upwards(house, room):
+    own = floor_of(house, room)
+    for file in house.rglob("*.py"):
+        if room_of(file, house) == room:
+            for other, *_ in imported(file, house):
+                assert floor_of(house, other) < own, f"{file} imports {other}"
 
 
 def test_the_folder_of_stablehlo_needs_nothing_of_the_rest():
@@ -68,7 +93,8 @@ def test_the_folder_of_stablehlo_needs_nothing_of_the_rest():
     assert used == {"_compat"}
 
 
-def test_nothing_reaches_past_the_entrance_of_a_folder():
-    for file in FILES:
-        for module in imported(file):
+@pytest.mark.parametrize("house", HOUSES, ids=NAME)
+def test_nothing_reaches_past_the_entrance_of_a_folder(house):
+    for file in house.rglob("*.py"):
+        for module in imported(file, house):
             assert len(module) == 1, f"{file} imports {'.'.join(module)}"

@@ -3,7 +3,6 @@ from typing import ClassVar
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree, UInt32
 from .._arguments import whole_number
 from .._batch import materialize
 from .._custom_types import BM, RealScalarLike
+from .._products import dot
 from .cells import checked_cell, compose, or_one, Piece
 from .random import AREA_WORDS, check_key, normal_from_words, place_of, random_words
 from .stepwise import AbstractWrappedPath, Increment, increment_struct, num_noises
@@ -205,8 +205,7 @@ def _weighted_product(
     """`a diag(weights) b^T`."""
     if len(weights) > _WRITTEN_OUT:
         a = a * jnp.asarray(weights, a.dtype)
-        # By default accelerators multiply in half precision.
-        return jnp.matmul(a, b.T, precision=jax.lax.Precision.HIGHEST)
+        return dot(a, b.T)
     # Batched products of small matrices cost more than their arithmetic.
     products = [
         float(weight) * jnp.outer(a[:, i], b[:, i]) for i, weight in enumerate(weights)

@@ -1,5 +1,6 @@
 """The program that computes one batch on each device."""
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,11 +10,11 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from .._compat import is_closure_mismatch, quickly_compiled
 from .._lapack import lapack_in_turn
-from .sampling import Samples
+from .sampling import Averaged, Samples
 
 
 # Powers of two up to this one below the largest that the dtype holds: sums of 2^24 numbers
@@ -22,8 +23,8 @@ _ROOM = 24
 
 
 class BatchSums(NamedTuple):
-    """What is known of the samples of a batch. All but the numbers have the structure of
-    `phi`, and leading axes for kinds and combinations of levels.
+    """What is known of the samples of a batch. Arrays in an `Averaged` have leading axes
+    for devices and combinations of levels.
 
     - `good`: the number of good samples.
     - `failed`: the number of failed paths. A path that fails on several levels counts once.
@@ -38,11 +39,11 @@ class BatchSums(NamedTuple):
     good: Int[Array, "*devices"]
     failed: Int[Array, "*devices"]
     failed_on: Int[Array, "*devices levels"]
-    mean: PyTree[Array]
-    rest: PyTree[Array]
-    norm: PyTree[Array]
-    largest: PyTree[Array]
-    size: PyTree[Array]
+    mean: Averaged
+    rest: Averaged
+    norm: Averaged
+    largest: Averaged
+    size: Averaged
 
 
 def _sums(
@@ -50,23 +51,23 @@ def _sums(
     key_data: UInt32[Array, "..."],
     impl: Any,
     first: UInt32[Array, "2"],
-    left: Int[Array, ""],
+    wanted: Int[Array, ""],
     mesh: Mesh,
     n: int,
 ) -> BatchSums:
     """The sums of all devices, along a leading axis. Each takes `n` samples, the first one
-    from sample number `first` on, in two halves of 32 bits, of which `left` are wanted."""
+    from sample number `first` on, in two halves of 32 bits. The first `wanted` count."""
     if mesh.size == 1:
-        sums = _of_device(sampler, key_data, impl, first, left, n, 0)
+        sums = _of_device(sampler, key_data, impl, first, wanted, n, 0)
         return jtu.tree_map(lambda x: x[None], sums)
     dynamic, static = eqx.partition(sampler, eqx.is_array)
 
     # The devices do not communicate until the end, so each one's result does not depend on
     # how many there are.
-    def shard(dynamic, first, left):
+    def shard(dynamic, first, wanted):
         sampler = eqx.combine(dynamic, static)
         device = jax.lax.axis_index("samples")
-        sums = _of_device(sampler, key_data, impl, first, left, n, device)
+        sums = _of_device(sampler, key_data, impl, first, wanted, n, device)
         return jtu.tree_map(lambda x: jax.lax.all_gather(x, "samples"), sums)
 
     none = PartitionSpec()
@@ -74,7 +75,7 @@ def _sums(
         shard, mesh=mesh, in_specs=none, out_specs=none, check_vma=False
     )
     try:
-        return sharded(dynamic, first, left)
+        return sharded(dynamic, first, wanted)
     except ValueError as error:
         # The loop of Diffrax's default adjoint rejects arrays that vary between devices.
         if is_closure_mismatch(error):
@@ -97,7 +98,7 @@ def _of_device(
     key_data: UInt32[Array, "..."],
     impl: Any,
     first: UInt32[Array, "2"],
-    left: Int[Array, ""],
+    wanted: Int[Array, ""],
     n: int,
     device: Any,
 ) -> BatchSums:
@@ -113,35 +114,44 @@ def _of_device(
 
     samples = lapack_in_turn(sampler)(jax.vmap(sample_key)(high, low))
     # The last batch is cut here: another size would be another program.
-    is_wanted = index < left
+    is_wanted = index < wanted
     good = samples.good & is_wanted
     lost = jnp.where(is_wanted, samples.lost, 0)
     failed = jnp.sum(jnp.max(lost, axis=0))
-    leaves, treedef = jtu.tree_flatten(samples.values)
+    fields = samples.averaged.fields
+    # All fields of one shape are summed at once, since fewer operations compile sooner.
+    stacked = jtu.tree_map(lambda *of_fields: jnp.stack(of_fields), *fields.values())
+    leaves, treedef = jtu.tree_flatten(stacked)
     each = [_sums_of_array(leaf, good) for leaf in leaves]
-    sums = map(treedef.unflatten, zip(*each))
+
+    def by_field(*of_leaves: Array) -> Averaged:
+        tree = treedef.unflatten(of_leaves)
+        parts = [jtu.tree_map(lambda x, k=k: x[k], tree) for k in range(len(fields))]
+        return Averaged(**dict(zip(fields, parts)))
+
+    sums = itertools.starmap(by_field, zip(*each))
     return BatchSums(jnp.sum(good), failed, jnp.sum(lost, axis=1), *sums)
 
 
 def _sums_of_array(
-    x: Float[Array, "kinds combinations n ..."], good: Bool[Array, " n"]
+    x: Float[Array, "fields combinations n ..."], good: Bool[Array, " n"]
 ) -> tuple[Array, Array, Array, Array, Array]:
     """`mean`, `rest`, `norm`, `largest` and `size` of `BatchSums` for one array."""
-    keep = good.reshape(-1, *[1] * (x.ndim - 3))
+    mask = good.reshape(-1, *[1] * (x.ndim - 3))
     n = jnp.maximum(jnp.sum(good), 1)
 
     def largest_of(x: Array) -> Array:
         return jnp.max(jnp.abs(x), axis=2)
 
-    x = jnp.where(keep, x, 0)
+    x = jnp.where(mask, x, 0)
     size = largest_of(x)
     to_unit, from_unit = _powers(size)
     mean = from_unit * (jnp.sum(x * to_unit[:, :, None], axis=2) / n)
     # Two passes avoid cancellation. The second also finds the rounding error of the mean.
-    off = jnp.where(keep, x - mean[:, :, None], 0)
-    largest = largest_of(off)
+    deviations = jnp.where(mask, x - mean[:, :, None], 0)
+    largest = largest_of(deviations)
     to_unit, from_unit = _powers(largest)
-    z = off * to_unit[:, :, None]
+    z = deviations * to_unit[:, :, None]
     rest = jnp.sum(z, axis=2) / n
     squares = jnp.maximum(jnp.sum(z**2, axis=2) - n * rest**2, 0)
     return mean, from_unit * rest, from_unit * jnp.sqrt(squares), largest, size

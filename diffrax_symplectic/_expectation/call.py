@@ -1,20 +1,15 @@
-"""Arguments that `expectation`, `ensemble` and `monte_carlo` have in common."""
+"""Arguments that `expectation` and `monte_carlo` have in common."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from .._arguments import check_untraced, whole_number
-from .._brownian import check_key, typed_key
+from .._arguments import whole_number
+from .._simulation import checked_key
 from .estimate import Expectation
-
-
-NO_METER = diffrax.NoProgressMeter()
 
 
 class CheckedCall(NamedTuple):
@@ -39,13 +34,9 @@ def checked_call(
     devices: Sequence[Any] | None = None,
     others: Any = (),
 ) -> CheckedCall:
-    """Raises a `ValueError` for invalid arguments of `user`, the function called, and if an
-    array is traced, also in the `others`."""
-    # Inside `jit` a new array is traced, too. Functions that close over traced values of
-    # other transformations are found once something that depends on these is needed.
-    new = jnp.zeros(())
-    check_untraced(f"`{user}`", (key, others, new))
-    check_key(key, user)
+    """Raises a `ValueError` for invalid arguments of `user`, the function called, and for
+    traced arrays in `key` and in the `others`."""
+    key = checked_key(user, key, others)
     if start is not None and first != 0:
         raise ValueError(
             "Pass either `start`, which continues after its last sample, or `first`."
@@ -65,22 +56,4 @@ def checked_call(
             "`devices` must be a list of devices, such as `jax.devices()[:1]`, or `None`; "
             f"got {devices!r}."
         )
-    return CheckedCall(typed_key(key), first, tuple(devices))
-
-
-class Meter:
-    """A progress meter of Diffrax, as a context manager."""
-
-    def __init__(self, meter: diffrax.AbstractProgressMeter):
-        self._meter = meter
-        self._state = meter.init()
-
-    def step(self, progress: float) -> None:
-        """Shows the progress, from 0 to 1."""
-        self._state = self._meter.step(self._state, np.asarray(progress))
-
-    def __enter__(self) -> "Meter":
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._meter.close(self._state)
+    return CheckedCall(key, first, tuple(devices))

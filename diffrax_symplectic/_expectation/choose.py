@@ -8,47 +8,46 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from .._simulation import has_discrete_increments, Problem
 from .._solver import Want
-from .arguments import has_discrete_increments
-from .array_rqmc import ArrayRQMC, step_words
-from .cost import NUMBERS_PER_SECOND, numbers_per_step
+from .cost import OPERATIONS_PER_SECOND, operations_per_step
 from .estimate import Expectation
+from .fitted import count_outcomes, MOST_DIMENSIONS_OF_GRID, ValueFunctions
 from .fused_paths import fused_plan
 from .independent import IndependentPaths
-from .noise import num_outcomes
-from .problem import Problem
-from .sampling import AbstractSampling, SamplingPlan
-from .value_functions import ValueFunctions
+from .kinks import has_kinks
+from .sampling import AbstractSampling, SamplingPlan, SAVED_SAMPLINGS
+from .sorted import ArrayRQMC, step_words
 
 
 # No sample's key is folded from this number.
 _NO_SAMPLE = 0xFFFFFFFF
-# Value functions are chosen up to this dimension, in which they are fitted on a grid, and
-# up to this many outcomes of one step and of all steps, which a fit visits at each point.
-_MOST_COMPONENTS_OF_FITS = 2
+# Value functions are chosen where they are fitted on a grid, up to this many outcomes of
+# one step and of all steps, which a fit visits at each point. With these, 32 points along
+# each of two axes are less than `basis_choice` allows (32^2 * 48 = 49,152 for one step).
 _MOST_OUTCOMES_OF_STEP = 48
 _MOST_OUTCOMES_OF_STEPS = 2**12
-# Paths are sorted up to this dimension.
+# Paths are sorted up to this dimension: the default of 2^14 paths are eleven along each of
+# four coordinates.
 _MOST_COMPONENTS_SORTED = 4
 # Where a fit leaves more than this of the standard error, paths are sorted instead. For an
 # indicator and a call option on the pendulum fits left 26% and 1.3%, and sorted paths had
 # error bars that were 23 and 8 times less.
-_MUCH_LEFT = 0.01
-# The numbers of paths and replicates without a tolerance.
-_PATHS_OF_FITS = 2**12
+_MOST_REMAINDER = 0.01
+# The number of independent paths without a tolerance. (The other samplings have defaults.)
 _PATHS = 2**17
-_PATHS_OF_REPLICATE = 2**14
-_REPLICATES = 16
 # With a tolerance, which ends the estimate, the number of samples is without limit.
 _MOST_SAMPLES = 10**9
-# Without a tolerance, paths take no more than about this many seconds.
+# Without a tolerance, paths take no more than about this many seconds, so that a first call
+# ends while its user waits.
 _SECONDS = 10
-# Sorted paths are drawn and sorted before each step, which takes as long as computing this
-# many numbers for each path.
-_NUMBERS_OF_SORTING = 1500
-# The fewest paths, however long they take.
+# Sorted paths are drawn and sorted before each step, which takes as long as this many
+# operations for each path.
+_OPERATIONS_OF_SORTING = 1500
+# The fewest paths, however long they take: fewer do not know their own spread.
 _FEWEST_PATHS = 2**8
-# The sizes of a trial.
+# The sizes of a trial, a part of those of an estimate: it looks for changes that are
+# several times the error of both.
 _REPLICATES_OF_TRIAL = 8
 _PATHS_OF_SORTED_TRIAL = 2**12
 _PATHS_OF_TRIAL = 2**14
@@ -82,7 +81,7 @@ class Chosen(NamedTuple):
 
 def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
     """Chooses the law of the increments and the sampling, as far as the user did not. The
-    docstring of `expectation` documents the rules. `problem_for` maps the purpose of paths
+    docstring of `expectation` states the rules. `problem_for` maps the purpose of paths
     that are not known yet to the problem."""
     has_path, key, sampling, tol, start, engine, devices = wanted
     if engine not in (None, "jax", "drjit"):
@@ -96,7 +95,7 @@ def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
     # Value functions need discrete increments, as do solvers of the weak sense.
     needs_discrete = isinstance(sampling, ValueFunctions)
     needs_discrete |= has_discrete_increments(problem.solver)
-    if problem.has_kinks and not has_path and not needs_discrete:
+    if has_kinks(problem) and not has_path and not needs_discrete:
         problem = problem_for("strong")
         why_law = "Gaussian increments, since phi may not be smooth"
 
@@ -112,12 +111,12 @@ def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
         plan = sampling.prepare(problem, trial_key(key), devices)
         # Only fits leave something.
         instead = None
-        if is_chosen and plan.left > _MUCH_LEFT:
+        if is_chosen and plan.remainder > _MOST_REMAINDER:
             instead = sorted_paths(problem, tol)
         if instead is not None:
             why_sampling = (
                 "sorted paths, since fitted value functions leave "
-                f"{plan.left:.1%} of the standard error"
+                f"{plan.remainder:.1%} of the standard error"
             )
             sampling = instead
             plan = sampling.prepare(problem, trial_key(key), devices)
@@ -125,7 +124,7 @@ def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
     reason = "; ".join(filter(None, [why_sampling, why_law, plan.reason]))
     if start is not None:
         reason = start.reason
-    plan = plan._replace(reason=reason, roundings=problem.max_steps)
+    plan = plan._replace(reason=reason, rounding_floor=problem.finest_steps)
     if start is not None and tol is None and plan.num_samples == _MOST_SAMPLES:
         # Without `tol` the number of samples stays as it was.
         used = start.moments[-1].end - start.moments[0].begin
@@ -139,11 +138,12 @@ def trial_key(key: PRNGKeyArray) -> PRNGKeyArray:
 
 
 def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampling:
-    """Raises a `ValueError` for what is no sampling, or for another than in `start`."""
+    """Raises a `ValueError` unless this is a sampling, of the class that `start` had."""
     if not isinstance(sampling, AbstractSampling):
+        names = ", ".join(f"`{name}`" for name in SAVED_SAMPLINGS)
         raise ValueError(
-            "`sampling` must be `IndependentPaths(num_paths)`, `ArrayRQMC()`, "
-            f"`ValueFunctions()` or `None`; got {sampling!r}."
+            f"`sampling` must be an instance of one of {names}, or `None`; got "
+            f"{sampling!r}."
         )
     if start is not None and type(start.sampling) is not type(sampling):
         raise ValueError(
@@ -162,13 +162,13 @@ def sampling_for(
         return _independent_paths(problem, tol), ""
     components = _num_components(problem)
     steps = _num_steps(problem)
-    outcomes = num_outcomes(problem)
+    num_outcomes = count_outcomes(problem)
     why = f"{components} components of the state, {steps:,} steps"
-    if outcomes:
-        why += f" of {outcomes} outcomes each"
-    if _can_be_fitted(problem, outcomes):
-        num_paths = _MOST_SAMPLES if tol else _PATHS_OF_FITS
-        return ValueFunctions(None, num_paths), f"value functions for {why}"
+    if num_outcomes:
+        why += f" of {num_outcomes} outcomes each"
+    if _can_be_fitted(problem, num_outcomes):
+        fitted = ValueFunctions(num_paths=_MOST_SAMPLES) if tol else ValueFunctions()
+        return fitted, f"value functions for {why}"
     sampling = sorted_paths(problem, tol)
     if sampling is not None:
         return sampling, f"sorted paths for {why}"
@@ -179,8 +179,7 @@ def _independent_paths(problem: Problem, tol: float | None) -> IndependentPaths:
     """As many independent paths as are affordable."""
     if tol:
         return IndependentPaths(_MOST_SAMPLES)
-    numbers = _num_steps(problem) * numbers_per_step(problem)
-    affordable = _SECONDS * NUMBERS_PER_SECOND / numbers
+    affordable = _affordable_operations(problem) / operations_per_step(problem)
     return IndependentPaths(int(np.clip(affordable, _FEWEST_PATHS, _PATHS)))
 
 
@@ -188,12 +187,19 @@ def sorted_paths(problem: Problem, tol: float | None) -> ArrayRQMC | None:
     """Sorted paths, or `None` for many components and for paths that cannot be sorted."""
     if not _can_be_sorted(problem):
         return None
-    numbers = numbers_per_step(problem) + _NUMBERS_OF_SORTING
-    numbers_of_all = _num_steps(problem) * numbers * _REPLICATES
-    affordable = max(int(_SECONDS * NUMBERS_PER_SECOND / numbers_of_all), _FEWEST_PATHS)
+    usual = ArrayRQMC()
+    operations = usual.replicates * (
+        operations_per_step(problem) + _OPERATIONS_OF_SORTING
+    )
+    affordable = max(int(_affordable_operations(problem) / operations), _FEWEST_PATHS)
     # Rounded down to a power of two, as Sobol' points need.
-    size = min(2 ** (affordable.bit_length() - 1), _PATHS_OF_REPLICATE)
-    return ArrayRQMC(size, _MOST_SAMPLES if tol else _REPLICATES)
+    size = min(2 ** (affordable.bit_length() - 1), usual.num_paths)
+    return ArrayRQMC(size, _MOST_SAMPLES if tol else usual.replicates)
+
+
+def _affordable_operations(problem: Problem) -> float:
+    """The operations of each step for which there is time, for all paths together."""
+    return _SECONDS * OPERATIONS_PER_SECOND / _num_steps(problem)
 
 
 def few_paths(problem: Problem) -> AbstractSampling:
@@ -212,15 +218,15 @@ def _num_steps(problem: Problem) -> int:
     return int(np.sum(problem.levels.num_steps))
 
 
-def _can_be_fitted(problem: Problem, outcomes: int | None) -> bool:
+def _can_be_fitted(problem: Problem, num_outcomes: int | None) -> bool:
     """Whether value functions are the best choice, as far as it is known without a fit."""
     # They leave the variance of the start, for which few paths are too few.
-    if problem.paths_differ or not outcomes:
+    if problem.paths_differ or not num_outcomes:
         return False
     return (
-        _num_components(problem) <= _MOST_COMPONENTS_OF_FITS
-        and outcomes <= _MOST_OUTCOMES_OF_STEP
-        and _num_steps(problem) * outcomes <= _MOST_OUTCOMES_OF_STEPS
+        _num_components(problem) <= MOST_DIMENSIONS_OF_GRID
+        and num_outcomes <= _MOST_OUTCOMES_OF_STEP
+        and _num_steps(problem) * num_outcomes <= _MOST_OUTCOMES_OF_STEPS
     )
 
 

@@ -12,15 +12,15 @@ from .._compat import Jaxpr, programs_in
 from .._custom_types import Y
 from .._lapack import LAPACK
 from .._signature import once_for_each_signature
-from .fits import without_newton
-from .problem import Problem
+from .._simulation import Problem
+from .._solver import without_newton
 
 
-# The numbers that two cores compute in a second in large batches of paths. The constants
+# The operations of two cores in a second in large batches of paths. The constants
 # here are a fit to 24 systems and solvers, from the pendulum to a chain of 64 oscillators:
 # seconds predicted are 0.5 to 2.3 times those measured for 22 of them (0.3 for a spin with
 # slow sweeps, 3.5 for two noises whose linear flows need one sweep).
-NUMBERS_PER_SECOND = 3e10
+OPERATIONS_PER_SECOND = 3e10
 # The passes through a loop. All loops of a step are sweeps over its equations.
 _SWEEPS = 4
 # A sine in a loop takes as long as so many sums.
@@ -29,17 +29,19 @@ _TRANSCENDENTAL = frozenset(
     "acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1 "
     "lgamma log log1p logistic pow sin sinh tan tanh".split()
 )
-# Operations on matrices are calls of LAPACK, which take some 100 ns each.
+# Operations on matrices are calls of LAPACK, which take some 100 ns each: as long as so
+# many sums.
 _OF_LAPACK = 3_000
 
 
 @once_for_each_signature
-def numbers_per_step(problem: Problem) -> int:
-    """How many numbers a step of one path computes, as a measure of its cost."""
+def operations_per_step(problem: Problem) -> int:
+    """How many operations on single numbers a step of one path takes, as a measure of its
+    cost. Those that take longer than a sum count as several."""
     # A rescue by Newton's method is rare.
     lean = dataclasses.replace(problem, solver=without_newton(problem.solver))
     traced, _, _ = eqx.filter_make_jaxpr(_step)(lean, problem.y0)
-    return max(1, _numbers(traced.jaxpr, in_loop=False))
+    return max(1, _operations(traced.jaxpr, in_loop=False))
 
 
 def _step(problem: Problem, y: Y) -> tuple[Y, Float[Array, ""]]:
@@ -50,28 +52,28 @@ def _step(problem: Problem, y: Y) -> tuple[Y, Float[Array, ""]]:
     return y, success
 
 
-def _numbers(jaxpr: Jaxpr, in_loop: bool) -> int:
+def _operations(jaxpr: Jaxpr, in_loop: bool) -> int:
     count = 0
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         size = sum(map(_size, eqn.outvars))
         inner = programs_in(eqn)
         if name == "while" and not in_loop:
-            count += _SWEEPS * sum(_numbers(program, True) for program in inner)
+            count += _SWEEPS * sum(_operations(program, True) for program in inner)
         elif name == "scan":
             passes = eqn.params["length"]
-            count += passes * sum(_numbers(program, in_loop) for program in inner)
+            count += passes * sum(_operations(program, in_loop) for program in inner)
         elif inner:
             # In a batch all branches of a conditional are evaluated.
-            count += sum(_numbers(program, in_loop) for program in inner)
+            count += sum(_operations(program, in_loop) for program in inner)
         elif name in LAPACK:
             count += _OF_LAPACK
         elif name in _TRANSCENDENTAL and in_loop:
             count += _OF_TRANSCENDENTAL * size
         elif name == "dot_general":
             (contracted, _), _ = eqn.params["dimension_numbers"]
-            left, _ = eqn.invars
-            shape = left.aval.shape  # pyright: ignore (of arrays)
+            factor, _ = eqn.invars
+            shape = factor.aval.shape  # pyright: ignore (of arrays)
             count += size * math.prod(shape[axis] for axis in contracted)
         else:
             count += size

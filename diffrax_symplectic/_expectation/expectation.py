@@ -13,6 +13,12 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._brownian import Discrete, laws_of, UnspecifiedPath
 from .._custom_types import Args, RealScalarLike, Y
+from .._simulation import (
+    has_discrete_increments,
+    Problem,
+    warn_of_stragglers,
+    warn_of_truncation,
+)
 from .._solver import own_path
 from .._terms import (
     brownian_paths,
@@ -21,25 +27,22 @@ from .._terms import (
     with_paths,
     without_truncation,
 )
-from .arguments import has_discrete_increments, warn_of_truncation
-from .call import checked_call, Meter, NO_METER
-from .cautions import cautions
+from .call import checked_call
 from .choose import choose, few_paths, trial_key, Wanted
-from .engines import warn_of_stragglers
-from .estimate import Expectation, ExpectationInterrupted
+from .estimate import cautions, Expectation, ExpectationInterrupted, needs_level
 from .fused_paths import FusedPaths
-from .problem import Problem
-from .run import run
+from .kinks import has_kinks
+from .run import Meter, NO_METER, run
 from .sampling import AbstractSampling
-from .tolerance import needs_level
 
 
 # The levels, unless the user chooses them: the fewest that tell the discretization error,
-# and with `tol` at most so many.
+# and with `tol` at most so many, the last of which has steps of `dt0 / 32`.
 _FEWEST_LEVELS = 2
 _MOST_LEVELS = 6
-# Means differ if their difference is this many standard errors.
-_SURE = 4
+# Means differ if their difference is this many standard errors: by chance that happens
+# once in sixteen thousand times.
+_SURE_OF_LAW = 4
 
 
 def expectation(
@@ -221,7 +224,7 @@ def expectation(
     # A part of an estimate is not warned of again.
     if start is None and first == 0:
         warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
-        if problem.has_kinks:
+        if has_kinks(problem):
             _warn_of_law(estimate, problem, key, devices)
     return estimate
 
@@ -251,7 +254,7 @@ def _warn_of_law(
     trial = run(plan, key, devices)
     change = jtu.tree_map(lambda x, y: np.abs(x - y), estimate.mean, trial.mean)
     error = jtu.tree_map(np.hypot, estimate.std_error, trial.std_error)
-    is_beyond = jtu.tree_map(lambda x, y: np.any(x > _SURE * y), change, error)
+    is_beyond = jtu.tree_map(lambda x, y: np.any(x > _SURE_OF_LAW * y), change, error)
     if any(jtu.tree_leaves(is_beyond)):
         most = max(float(np.max(x, initial=0.0)) for x in jtu.tree_leaves(change))
         warnings.warn(
@@ -267,11 +270,11 @@ def _warn_of_law(
 
 def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
     """In single precision, rounding can exceed a small sampling error."""
-    numbers = np.finfo(problem.dtype)
-    if numbers.bits >= 64:
+    precision = np.finfo(problem.dtype)
+    if precision.bits >= 64:
         return
     # Step sizes are rounded along with times, so errors of the same sign add up.
-    fraction = float(numbers.eps) * problem.max_steps
+    fraction = float(precision.eps) * problem.finest_steps
 
     def is_near_rounding(mean: Any, error: Any) -> np.bool_:
         return np.any(error <= 2 * (fraction * np.abs(mean)))
@@ -280,8 +283,8 @@ def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
     if any(jtu.tree_leaves(near)):
         warnings.warn(
             "Rounding errors may be larger than the sampling error: over "
-            f"{problem.max_steps:,} steps in {numbers.dtype} they are about {fraction:.0e} "
-            "of the mean, which is the smallest `std_error` reported. For more digits call "
-            '`jax.config.update("jax_enable_x64", True)` first.',
+            f"{problem.finest_steps:,} steps in {precision.dtype} they are about "
+            f"{fraction:.0e} of the mean, which is the smallest `std_error` reported. For "
+            'more digits call `jax.config.update("jax_enable_x64", True)` first.',
             stacklevel=3,
         )

@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Key, PRNGKeyArray, PyTree
 
 from .._root_finder import all_finite
-from .engines import by_drjit, state_itself
+from .._simulation import by_drjit, Level, Problem, state_itself
 from .independent import IndependentPaths
-from .problem import Level, Problem
-from .sampling import Samples, SamplingPlan
+from .sampling import Averaged, Samples, SamplingPlan
 
 
-# Default number of paths in a batch: large, to amortize the call of the kernel.
-_BATCH = 2**19
+# The default number of paths in a batch: many, since each call of the kernel takes a while
+# before its first path.
+_FUSED_BATCH = 2**19
 
 
 def fused_plan(
@@ -38,7 +38,7 @@ def fused_plan(
     levels = len(problem.levels.h)
     plan = sampling.plan(jtu.Partial(_samples, problem), levels, devices)
     if sampling.batch_size is None:
-        plan = plan._replace(batch_size=_BATCH)
+        plan = plan._replace(batch_size=_FUSED_BATCH)
     return plan._replace(paths_of=FusedPaths(problem, key))
 
 
@@ -118,5 +118,5 @@ def _samples(p: Problem, paths: _Paths, keys: Key[Array, " n"]) -> Samples:
     phi = jax.vmap(values_on_level)(p.levels, paths.y)
     finite = jax.vmap(jax.vmap(all_finite))(phi)
     lost = jnp.asarray(paths.failed) | ~finite
-    combined = p.combined(jnp.swapaxes(phi, 1, 2))
-    return Samples(p.averaged([combined]), ~jnp.any(lost, axis=0), lost)
+    values = p.shaped(p.combined(jnp.swapaxes(phi, 1, 2)))
+    return Samples(Averaged(values), ~jnp.any(lost, axis=0), lost)

@@ -3,22 +3,20 @@
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Key
 
 from .._arguments import whole_number
-from .._terms import path_keys, with_keys
-from .problem import Level, Problem
-from .sampling import AbstractSampling, Samples, SamplingPlan, saved_by_name
-from .simulation import independent_steps, Motion, simulate
+from .._simulation import Problem, values_of_paths
+from .sampling import AbstractSampling, Averaged, Samples, SamplingPlan, saved_by_name
 
 
-# The default sizes of a batch. On CPUs it keeps all cores busy and fits their caches.
+# The default sizes of a batch. On CPUs it keeps all cores busy and fits their caches;
+# elsewhere more paths at once are needed to be busy.
 _BATCH_ON_CPU = 2**15
-_BATCH = 2**18
+_BATCH_ELSEWHERE = 2**18
 
 
 @saved_by_name
@@ -51,7 +49,7 @@ class IndependentPaths(AbstractSampling):
     ) -> SamplingPlan:
         """The plan for samples that are made one for each key, by any function."""
         if self.batch_size is None:
-            size = _BATCH_ON_CPU if devices[0].platform == "cpu" else _BATCH
+            size = _BATCH_ON_CPU if devices[0].platform == "cpu" else _BATCH_ELSEWHERE
         else:
             size = whole_number("batch_size", self.batch_size)
         return SamplingPlan(sampler, self.num_paths, size, levels=levels)
@@ -59,28 +57,6 @@ class IndependentPaths(AbstractSampling):
 
 def _paths(p: Problem, keys: Key[Array, " n"]) -> Samples:
     """A sample is a path, with the same random key on all levels."""
-    saved, failed = solved(p, keys)
+    saved, failed = values_of_paths(p, keys)
     good = ~jnp.any(failed, axis=0)
-    return Samples(p.averaged([p.combined(saved)]), good, failed)
-
-
-def solved(
-    p: Problem, keys: Key[Array, " n"]
-) -> tuple[Float[Array, "levels S n m"], Bool[Array, "levels n"]]:
-    """The values of `phi` for one path for each of several keys, at the times at which to
-    average and on all levels, and which paths failed."""
-    own_keys = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
-    drawn = jax.vmap(p.drawn)(keys)
-
-    def begin(level: Level) -> Motion:
-        return independent_steps(
-            p,
-            level,
-            drawn,
-            terms_of=lambda own: with_keys(p.terms, own),
-            # A path draws the increments of all steps from its keys.
-            randomness=lambda i: own_keys,
-        )
-
-    done = simulate(p, begin)
-    return done.saved, done.failed
+    return Samples(Averaged(p.shaped(p.combined(saved))), good, failed)

@@ -1,4 +1,4 @@
-"""Whether a function may have kinks or jumps, by the operations that it is made of."""
+"""Whether `phi` may have kinks or jumps, by the operations that it is made of."""
 
 from collections.abc import Callable
 
@@ -7,6 +7,7 @@ import jax.tree_util as jtu
 from jaxtyping import PyTree
 
 from .._compat import Jaxpr, Literal, programs_in
+from .._simulation import Problem
 
 
 # All others are smooth, except perhaps at single points.
@@ -14,6 +15,12 @@ _NOT_SMOOTH = frozenset(
     "abs argmax argmin ceil clamp eq floor ge gt le lt max min ne reduce_max reduce_min "
     "round sign sort top_k".split()
 )
+
+
+def has_kinks(problem: Problem) -> bool:
+    """Whether the problem's `phi` may not be smooth."""
+    phi = lambda y: problem.phi(problem.t0, y, problem.args)
+    return may_have_kinks(phi, problem.y0)
 
 
 def may_have_kinks(fn: Callable, y: PyTree) -> bool:

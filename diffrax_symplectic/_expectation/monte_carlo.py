@@ -14,14 +14,12 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 from .._arguments import check_real, check_takes, whole_number
 from .._compat import is_result
 from .._root_finder import all_finite
-from .call import checked_call, Meter, NO_METER
-from .cautions import cautions
-from .estimate import Expectation
+from .._simulation import combined, level_weights
+from .call import checked_call
+from .estimate import cautions, Expectation
 from .independent import IndependentPaths
-from .moments import level_weights
-from .polynomials import tensordot
-from .run import run
-from .sampling import real, Samples
+from .run import Meter, NO_METER, run
+from .sampling import Averaged, Samples
 
 
 def monte_carlo(
@@ -142,13 +140,8 @@ def _of_function(
     each = [on_level(level) for level in range(levels)]
     values, good = jtu.tree_map(lambda *xs: jnp.stack(xs), *each)
 
-    def combined(
-        x: Float[Array, "levels n ..."],
-    ) -> Float[Array, "1 combinations n ..."]:
-        # With the first axis of `Samples.values`, for the one kind.
-        return tensordot(weights.astype(x.dtype), x, 1)[None]
-
-    return Samples(jtu.tree_map(combined, values), jnp.all(good, axis=0), ~good)
+    values = jtu.tree_map(lambda x: combined(weights, x), values)
+    return Samples(Averaged(values), jnp.all(good, axis=0), ~good)
 
 
 def _evaluate(fn: Callable, key: PRNGKeyArray) -> tuple[PyTree[Array], Bool[Array, ""]]:
@@ -165,5 +158,5 @@ def _evaluate(fn: Callable, key: PRNGKeyArray) -> tuple[PyTree[Array], Bool[Arra
             "Return a pair `(phi, sol.result)`, so that failed paths are excluded."
         )
     check_real("fn", jtu.tree_leaves(out))
-    out = jtu.tree_map(lambda x: jnp.asarray(x, real(jnp.result_type(x))), out)
+    out = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), out)
     return out, success & all_finite(out)

@@ -5,6 +5,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.random as jr
@@ -15,11 +16,38 @@ from jaxtyping import Array, Key, PRNGKeyArray, PyTree
 
 from .._arguments import check_untraced
 from .batch import batch_sums, BatchSums, quick_batch_sums
-from .call import Meter
-from .estimate import check_same, Expectation, ExpectationInterrupted
-from .moments import joined, Moments
+from .estimate import (
+    check_same,
+    Expectation,
+    ExpectationInterrupted,
+    is_reached,
+    is_stuck,
+    joined,
+    Moments,
+    share_of,
+)
 from .sampling import Samples, SamplingPlan
-from .tolerance import is_reached, is_stuck, share_of
+
+
+NO_METER = diffrax.NoProgressMeter()
+
+
+class Meter:
+    """A progress meter of Diffrax, as a context manager."""
+
+    def __init__(self, meter: diffrax.AbstractProgressMeter):
+        self._meter = meter
+        self._state = meter.init()
+
+    def step(self, progress: float) -> None:
+        """Shows the progress, from 0 to 1."""
+        self._state = self._meter.step(self._state, np.asarray(progress))
+
+    def __enter__(self) -> "Meter":
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._meter.close(self._state)
 
 
 def run(
@@ -46,10 +74,10 @@ def run(
         moments=(none,),
         key_data=batches.key_data,
         paths_per_sample=plan.paths,
-        roundings=plan.roundings,
+        rounding_floor=plan.rounding_floor,
         sampling=sampling,
         reason=plan.reason,
-        far=plan.far,
+        tails=plan.tails,
     )
     if start is not None:
         check_same(start, estimate, "`start`")
@@ -121,11 +149,11 @@ class _Batches:
         """Starts one batch on each device, from sample `at` on and up to `end`."""
         count = len(self._devices)
         low_high = np.array([at & 0xFFFFFFFF, at >> 32], np.uint32)
-        left = np.array(max(0, min(self.size * count, end - at)), np.int32)
+        wanted = np.array(max(0, min(self.size * count, end - at)), np.int32)
         if count == 1:
-            low_high, left = jax.device_put((low_high, left), self._devices[0])
+            low_high, wanted = jax.device_put((low_high, wanted), self._devices[0])
         return self._sums(
-            sampler, self.key_data, self._impl, low_high, left, self._mesh, self.size
+            sampler, self.key_data, self._impl, low_high, wanted, self._mesh, self.size
         )
 
     def of_devices(self, running: BatchSums) -> list[BatchSums]:
@@ -158,7 +186,7 @@ class _Batches:
             norm=zeros,
             largest=zeros,
             size=zeros,
-            dtypes=jtu.tree_map(lambda s: str(s.dtype), shapes),
+            dtypes=jtu.tree_map(lambda s: str(s.dtype), shapes.value),
         )
 
 

@@ -29,7 +29,7 @@ from .._root_finder import (
     SLOW,
     STALLED,
 )
-from .._solver import AbstractImplicitStages
+from .._solver import with_changed_stages
 
 
 # A path with a step that needs more sweeps is handed back to JAX.
@@ -227,19 +227,13 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
 def without_rescue(solver: Any) -> Any:
     """The solver, and all solvers in it, with `Sweeps` in place of `PicardNewton`."""
 
-    def replaced(x: Any) -> Any:
-        if not (_is_implicit(x) and isinstance(x.root_finder, PicardNewton)):
-            return x
+    def swept(x: Any) -> Any:
         _check_tolerance(x.root_finder)
         # No iterations of Optimistix: `Sweeps` solves the equations before the first.
         fields = lambda stages: (stages.root_finder, stages.root_find_max_steps)
         return eqx.tree_at(fields, x, (Sweeps(), 0))
 
-    return jtu.tree_map(replaced, solver, is_leaf=_is_implicit)
-
-
-def _is_implicit(x: Any) -> bool:
-    return isinstance(x, AbstractImplicitStages)
+    return with_changed_stages(solver, swept)
 
 
 def _check_tolerance(finder: PicardNewton) -> None:

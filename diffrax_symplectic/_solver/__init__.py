@@ -8,6 +8,7 @@ from .langevin import AbstractLangevinSplitting, BAOAB, LangevinMiddle
 from .flow import is_solver
 from .linear_flow import linear_flow
 from .paths import common_path, own_path
+from .root_finders import with_changed_stages, without_newton
 from .times import check_resolution
 from .splitting import LinearFlow
 

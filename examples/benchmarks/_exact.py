@@ -13,7 +13,7 @@ from scipy.sparse.linalg import expm_multiply
 from scipy.special import gammaln, lpmv
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.moments import level_weights
+from diffrax_symplectic._simulation.levels import level_weights
 
 from .._gallery import weak
 from .._transfer import transfer_expectations

@@ -24,8 +24,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.engines import fused_start, state_itself
-from diffrax_symplectic._expectation.problem import Problem
+from diffrax_symplectic._simulation.engines import fused_start, state_itself
+from diffrax_symplectic._simulation.problem import Problem
 
 from .. import rigid_body
 from ._timing import ensemble, keys, machine, race

@@ -23,7 +23,7 @@ import jax
 import matplotlib
 import numpy as np
 
-from diffrax_symplectic._expectation.moments import level_weights
+from diffrax_symplectic._simulation.levels import level_weights
 
 from .._orders import exact_moment_map, exact_weak_error
 from ._ensembles import Model, MODELS, other, plain, quasi

@@ -4,7 +4,6 @@ is estimated is exact up to the spread that is reported."""
 import os
 import subprocess
 import sys
-import types
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,10 +15,9 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation import array_rqmc, simulation
-from diffrax_symplectic._expectation.array_rqmc import step_words
-from diffrax_symplectic._expectation.moments import level_weights
-from diffrax_symplectic._expectation.sampling import SamplingPlan
+from diffrax_symplectic._expectation.sorted.array_rqmc import step_words
+from diffrax_symplectic._simulation import loop
+from diffrax_symplectic._simulation.levels import level_weights
 
 from ..families import slow_except
 from ..problems import kubo_terms, RecordingMeter
@@ -70,7 +68,7 @@ def test_paths_in_blocks_are_those_of_one_batch(monkeypatch):
     whole = _estimate(phi=SQUARE, levels=2)
     # Another function, so that programs are compiled anew.
     phi = lambda t, y, args: y[1] ** 2
-    monkeypatch.setattr(simulation, "_BLOCK", 64)
+    monkeypatch.setattr(loop, "_PATHS_AT_ONCE", 64)
     got = _estimate(phi=phi, levels=2)
     np.testing.assert_allclose(got.mean, whole.mean, rtol=1e-13)
     np.testing.assert_allclose(got.std_error, whole.std_error, rtol=1e-9)
@@ -315,23 +313,6 @@ def test_too_many_coordinates_to_sort_by_are_warned_of():
         _estimate(diffrax.Heun(), terms, phi, y0=jnp.ones(8), dt0=1.0)
 
 
-def test_many_coordinates_are_sorted_by_a_fitted_function():
-    # Only the last coordinates matter, which are lost among the bits of all.
-    noise = lambda t, y, args: jnp.eye(8)[:, -2:] * jnp.exp(y[-1] / 4)
-    terms = diffrax.ControlTerm(noise, ds.WeakBrownianPath((2,), jr.key(0)))
-    phi = lambda t, y, args: jnp.sum(y[-2:])
-    got = _estimate(diffrax.Heun(), terms, phi, y0=jnp.ones(8), dt0=0.25)
-    assert "sorted by a fitted value function" in got.reason
-    # Neither way to sort has a variance.
-    with pytest.warns(UserWarning, match="by 8 coordinates|samples are equal"):
-        constant = _estimate(
-            diffrax.Heun(), terms, lambda t, y, args: t, y0=jnp.ones(8), dt0=0.25
-        )
-    assert constant.mean == 1 and constant.reason == ""
-    plain = np.sqrt(2 * np.exp(0.6) / 1024)
-    assert got.std_error < plain / 4
-
-
 def test_progress_is_shown_after_each_replicate_and_closed_in_any_case(capfd):
     # One device: several would make several replicates at once.
     run = lambda meter, **kwargs: _estimate(
@@ -437,12 +418,3 @@ def test_a_shape_stands_for_the_path_that_the_solver_needs(solver):
         for x in ((), path)
     )
     assert got.mean == expected.mean
-
-
-@pytest.mark.parametrize("variances", [(1.0, 0.0), (0.0, 1.0), (0.0, 0.0)])
-def test_a_variance_of_zero_is_no_gain(variances, monkeypatch):
-    left = iter(variances)
-    trial = lambda *given: types.SimpleNamespace(variance=next(left))
-    monkeypatch.setattr(array_rqmc, "run", trial)
-    plan = SamplingPlan(lambda keys: None, num_samples=16, batch_size=1)
-    assert array_rqmc._gain(plan, plan, jr.key(0), ()) == 1

@@ -6,9 +6,9 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from diffrax_symplectic._expectation.bases import Frame, Hermite
-from diffrax_symplectic._expectation.grid import Grid
-from diffrax_symplectic._expectation.polynomials import (
+from diffrax_symplectic._expectation.fitted.bases import Frame, Hermite
+from diffrax_symplectic._expectation.fitted.grid import Grid
+from diffrax_symplectic._expectation.fitted.polynomials import (
     exponents,
     hermite,
     least_squares,

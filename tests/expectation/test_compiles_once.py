@@ -7,8 +7,8 @@ import pytest
 from jax import monitoring
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.noise import Noise
-from diffrax_symplectic._expectation.problem import Problem
+from diffrax_symplectic._expectation.fitted.noise import Noise
+from diffrax_symplectic._simulation.problem import Problem
 
 from ..drjit_here import needs_drjit
 

@@ -1,4 +1,4 @@
-"""What a step costs, as a count of numbers, and how many paths that allows by default."""
+"""What a step costs, as a count of operations, and how many paths that allows."""
 
 import diffrax
 import jax
@@ -8,13 +8,15 @@ import pytest
 from jax import lax
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation import choose
 from diffrax_symplectic._expectation.choose import sampling_for
 from diffrax_symplectic._expectation.cost import (
-    _numbers,
-    NUMBERS_PER_SECOND,
-    numbers_per_step,
+    _operations,
+    OPERATIONS_PER_SECOND,
+    operations_per_step,
 )
-from diffrax_symplectic._expectation.problem import Problem
+from diffrax_symplectic._expectation.fitted import MOST_DIMENSIONS_OF_GRID
+from diffrax_symplectic._simulation.problem import Problem
 
 
 MATRIX = np.ones((3, 5))
@@ -61,15 +63,15 @@ def sine_in_a_loop_in_a_loop(x):
         (sine_in_a_loop_in_a_loop, 4 * 8 * 5),
     ],
 )
-def test_the_numbers_that_a_program_computes_are_counted(fn, count):
+def test_the_operations_of_a_program_are_counted(fn, count):
     program = jax.make_jaxpr(fn)(jnp.ones(5)).jaxpr
-    assert _numbers(program, in_loop=False) == count
+    assert _operations(program, in_loop=False) == count
 
 
-def test_a_call_of_lapack_counts_as_thousands_of_numbers():
+def test_a_call_of_lapack_counts_as_thousands_of_operations():
     program = jax.make_jaxpr(triangular_solve)(jnp.ones(5)).jaxpr
     # What surrounds it makes the identity and some copies.
-    assert 3_000 <= _numbers(program, in_loop=False) <= 3_300
+    assert 3_000 <= _operations(program, in_loop=False) <= 3_300
 
 
 def problem_of(solver, n=3, steps=100, levels=1):
@@ -81,10 +83,10 @@ def problem_of(solver, n=3, steps=100, levels=1):
 
 
 def test_implicit_steps_large_systems_and_more_stages_cost_more():
-    leapfrog = numbers_per_step(problem_of(ds.StormerVerlet()))
-    midpoint = numbers_per_step(problem_of(ds.ImplicitMidpoint()))
-    gauss = numbers_per_step(problem_of(ds.StrangGauss()))
-    large = numbers_per_step(problem_of(ds.ImplicitMidpoint(), n=64))
+    leapfrog = operations_per_step(problem_of(ds.StormerVerlet()))
+    midpoint = operations_per_step(problem_of(ds.ImplicitMidpoint()))
+    gauss = operations_per_step(problem_of(ds.StrangGauss()))
+    large = operations_per_step(problem_of(ds.ImplicitMidpoint(), n=64))
     assert 2 * leapfrog < midpoint
     assert 1.5 * midpoint < gauss
     assert 5 * midpoint < large
@@ -97,19 +99,40 @@ def test_the_default_takes_as_many_paths_as_ten_seconds_allow(solver, steps, lev
     sampling, _ = sampling_for(problem, None)
     assert isinstance(sampling, ds.IndependentPaths)
     of_levels = steps * (2**levels - 1)
-    numbers = sampling.num_paths * of_levels * numbers_per_step(problem)
-    assert numbers == pytest.approx(10 * NUMBERS_PER_SECOND, rel=0.01)
+    operations = sampling.num_paths * of_levels * operations_per_step(problem)
+    assert operations == pytest.approx(10 * OPERATIONS_PER_SECOND, rel=0.01)
 
 
 def test_the_cost_of_sorted_paths_includes_sorting():
     problem = problem_of(ds.StormerVerlet(), n=1, steps=20_000)
     sampling, _ = sampling_for(problem, None)
     assert isinstance(sampling, ds.ArrayRQMC)
-    numbers = sampling.num_paths * sampling.replicates * 20_000
-    numbers *= numbers_per_step(problem) + 1500
+    operations = sampling.num_paths * sampling.replicates * 20_000
+    operations *= operations_per_step(problem) + 1500
     # Rounded down to a power of two.
-    assert 5 * NUMBERS_PER_SECOND < numbers <= 10 * NUMBERS_PER_SECOND
+    assert 5 * OPERATIONS_PER_SECOND < operations <= 10 * OPERATIONS_PER_SECOND
 
 
 def test_solvers_of_diffrax_are_counted():
-    assert numbers_per_step(problem_of(diffrax.Heun())) > 0
+    assert operations_per_step(problem_of(diffrax.Heun())) > 0
+
+
+def test_the_docstring_of_expectation_states_the_rule_of_the_default():
+    sorted_paths = ds.ArrayRQMC()
+    rule = (
+        "for a state of one or two components, if a step has at most "
+        f"{choose._MOST_OUTCOMES_OF_STEP} outcomes and all steps together have at most "
+        f"{choose._MOST_OUTCOMES_OF_STEPS:,}",
+        f"the fit leaves more than {choose._MOST_REMAINDER:.0%} of the standard error",
+        "`ArrayRQMC` for up to four components",
+        f"draw {ds.ValueFunctions().num_paths:,} paths, {sorted_paths.replicates} "
+        f"replicates of {sorted_paths.num_paths:,} paths, and {choose._PATHS:,} paths",
+        "more than about ten seconds",
+    )
+    words = " ".join(ds.expectation.__doc__.split())
+    for part in rule:
+        assert part in words, part
+    # Those that are spelled out there.
+    assert MOST_DIMENSIONS_OF_GRID == 2
+    assert choose._MOST_COMPONENTS_SORTED == 4
+    assert choose._SECONDS == 10

@@ -10,12 +10,12 @@ import pytest
 from scipy import stats
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.cautions import cautions
-from diffrax_symplectic._expectation.estimate import combined_results
-from diffrax_symplectic._expectation.moments import Combination
-from diffrax_symplectic._expectation.problem import Problem
+from diffrax_symplectic._expectation.estimate.cautions import cautions
+from diffrax_symplectic._expectation.estimate.estimate import combined_results
 from diffrax_symplectic._expectation.run import run
-from diffrax_symplectic._expectation.sampling import Samples, SamplingPlan
+from diffrax_symplectic._expectation.sampling import Averaged, Samples, SamplingPlan
+from diffrax_symplectic._simulation.levels import Combination
+from diffrax_symplectic._simulation.problem import Problem
 from examples.benchmarks.coverage import arguments, Cell, estimate, exact
 
 from ..problems import kubo_terms
@@ -149,17 +149,22 @@ def test_few_samples_that_make_up_for_the_spread_widen_it_and_are_told():
     np.testing.assert_allclose(light.std_error, np.sqrt(light.variance / 2000))
 
 
-def _with_control(shift: float, spread: float = 1.0, far: float = 0.0):
-    """Standard normal numbers, less a control that has the mean `shift`, and `far` from it
-    in the tails, which are not among them."""
+def _with_control(shift: float, spread: float = 1.0, tails: float = 0.0):
+    """Standard normal numbers, less a control that has the mean `shift`, and `tails` from
+    it in the tails, which are not among them."""
 
     def sampler(keys):
         x = jax.vmap(jr.normal)(keys)
         control = spread * x + shift
-        kinds = jnp.stack([x - control, x, control, jnp.zeros_like(x)])[:, None]
-        return Samples(kinds, jnp.ones(len(keys), bool), jnp.zeros((1, len(keys))))
+        own, plain, control, none = (
+            value[None] for value in (x - control, x, control, jnp.zeros_like(x))
+        )
+        averaged = Averaged(own, plain=plain, control=control, tails=none)
+        return Samples(averaged, jnp.ones(len(keys), bool), jnp.zeros((1, len(keys))))
 
-    plan = SamplingPlan(jax.tree_util.Partial(sampler), 1000, 250, far=np.array([far]))
+    plan = SamplingPlan(
+        jax.tree_util.Partial(sampler), 1000, 250, tails=np.array([tails])
+    )
     return run(plan, KEY, tuple(jax.devices()[:1]))
 
 
@@ -178,7 +183,7 @@ def test_a_control_whose_mean_is_not_zero_is_dropped():
 
 
 def test_tails_that_no_sample_shows_widen_the_standard_error():
-    fine, tails = _with_control(0.0, 0.875), _with_control(0.0, 0.875, far=0.5)
+    fine, tails = _with_control(0.0, 0.875), _with_control(0.0, 0.875, tails=0.5)
     np.testing.assert_allclose(tails.std_error, np.hypot(fine.std_error, 0.5))
 
 
@@ -211,7 +216,7 @@ def test_intervals_cover_as_often_as_they_say(name, noise):
     cell, devices = Cell(noise, 1.0, 1.0, steps=10), tuple(jax.devices()[:1])
     problem = Problem.of(*arguments(cell), None, 1)
     # One fit: its paths have nothing to do with those that are averaged.
-    plan = _FEW[name].prepare(problem, jr.key(1), devices)._replace(roundings=10)
+    plan = _FEW[name].prepare(problem, jr.key(1), devices)._replace(rounding_floor=10)
     ends = [run(plan, jr.key(seed), devices).interval() for seed in range(40)]
     low, high = np.array(ends).swapaxes(0, 1)
     means, errors = exact(cell, 2**12)

@@ -9,7 +9,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..drjit_here import needs_drjit
-from .test_ensemble import follow, ONE, STIFF, TERMS
+from ..test_ensemble import follow, ONE, STIFF, TERMS
 
 
 def square(t, y, args):

@@ -9,8 +9,8 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from diffrax_symplectic._expectation.hilbert import _curve, hilbert_order
-from diffrax_symplectic._expectation.points import (
+from diffrax_symplectic._expectation.sorted.hilbert import _curve, hilbert_order
+from diffrax_symplectic._expectation.sorted.points import (
     nested_scramble,
     num_seeds,
     randomized,
@@ -69,7 +69,7 @@ def test_the_curve_meets_each_cell_once_and_goes_on_to_its_neighbour(
     d, bits, monkeypatch
 ):
     monkeypatch.setattr(
-        "diffrax_symplectic._expectation.hilbert._COORDINATE_BITS", bits
+        "diffrax_symplectic._expectation.sorted.hilbert._COORDINATE_BITS", bits
     )
     axes = np.meshgrid(*[np.arange(2**bits)] * d, indexing="ij")
     cells = np.stack(axes, -1).reshape(-1, d).astype(np.uint32)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.moments import Combination, level_weights
+from diffrax_symplectic._simulation.levels import Combination, level_weights
 
 from ..drjit_here import needs_drjit
 

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation import basis_choice, value_functions
-from diffrax_symplectic._expectation.basis_choice import chosen_basis
 from diffrax_symplectic._expectation.choose import sampling_for
-from diffrax_symplectic._expectation.estimate import combined_results
-from diffrax_symplectic._expectation.moments import Combination
-from diffrax_symplectic._expectation.noise import Noise
-from diffrax_symplectic._expectation.problem import Problem
+from diffrax_symplectic._expectation.estimate.estimate import combined_results
+from diffrax_symplectic._expectation.fitted import basis_choice, value_functions
+from diffrax_symplectic._expectation.fitted.basis_choice import chosen_basis
+from diffrax_symplectic._expectation.fitted.noise import Noise
+from diffrax_symplectic._expectation.fitted.tails import laws_of_trials
+from diffrax_symplectic._simulation.levels import Combination
+from diffrax_symplectic._simulation.problem import Problem
 from diffrax_symplectic._terms import outcomes, step_variables
 
 from ..families import slow_except
@@ -250,8 +251,11 @@ def test_wider_noise_knows_its_likelihood_and_its_entropy():
     noise = Noise.of(problem, problem.level(0))
     p = {-1: 1 / 6, 0: 2 / 3, 1: 1 / 6}
     own = lambda x: np.array([p[k] for k in np.sign(x)])
-    laws = (noise.share, 0.0), (0.0, jnp.array([1.0, -1.0]) * noise.tilt)
-    for share, tilt in laws:
+    _, wide, *pushed = laws_of_trials(problem)
+    # Up by the first noise, and down by the second.
+    for law in (wide, pushed[2]):
+        share = law.share[0]
+        tilt = law.tilts[0]
         draw = jax.vmap(lambda key: noise.draw(key, jnp.array(0), share, tilt))
         x, log_ratio = map(np.asarray, draw(jr.split(jr.key(1), 4000)))
         pairs = {tuple(np.sign(a)): b for a, b in zip(x, log_ratio)}
@@ -259,7 +263,7 @@ def test_wider_noise_knows_its_likelihood_and_its_entropy():
         likely = np.array([own(a).prod() * np.exp(b) for a, b in pairs.items()])
         assert abs(likely.sum() - 1) <= 1e-12
         entropy = likely @ np.array([*pairs.values()])
-        assert abs(problem.max_steps * entropy - 8) <= 1e-6
+        assert abs(problem.finest_steps * entropy - 8) <= 1e-6
         # Four standard errors.
         mean = likely @ np.array([*pairs])
         assert np.all(np.abs(np.sign(x).mean(0) - mean) <= 4 / np.sqrt(len(x)))
@@ -429,7 +433,7 @@ def test_bad_input_is_told_what_to_pass():
         _estimate(ds.ValueFunctions(-1))
     with pytest.raises(ValueError, match="`num_paths` must be an integer, 2 or larger"):
         ds.ValueFunctions(2, 0)
-    with pytest.raises(ValueError, match="`sampling` must be `IndependentPaths"):
+    with pytest.raises(ValueError, match="`sampling` must be an instance of"):
         _estimate(1000)
 
 

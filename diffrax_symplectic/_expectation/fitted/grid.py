@@ -12,8 +12,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..._products import tensordot
 from .bases import AbstractBasis, Frame, Hermite
-from .polynomials import tensordot
 
 
 # The width of a grid relative to the pilot's range. For the mean of q^2 of a pendulum, the
@@ -58,8 +58,8 @@ class Stretched(eqx.Module):
 
     def states(self, x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The states with these coordinates."""
-        far = _straight(_straight(self.edge * x))
-        return self.inner.states(self.middle + far / self.factor)
+        unscaled = _straight(_straight(self.edge * x))
+        return self.inner.states(self.middle + unscaled / self.factor)
 
 
 def _bent(x: Array) -> Array:
@@ -117,7 +117,7 @@ class Grid(AbstractBasis):
         bend = jnp.sqrt(jnp.maximum((half / even) ** (8 / 3) - 1, _LEAST_BENT))
         return Stretched(inner, middle, bend / half, _bent(_bent(bend)))
 
-    def fitted(self, value, frame, states, good, keys):
+    def fitted(self, target, frame, states, good, keys):
         base = self._base
         n = base.pilots
         axes = [np.linspace(-1, 1, self.candidates[0])] * self.d
@@ -125,23 +125,23 @@ class Grid(AbstractBasis):
         nodes = frame.states(jnp.asarray(x, states.dtype))
         # In one call, so that the target is compiled once.
         points = jnp.concatenate([frame.inner.moved(states[:n]), nodes])
-        values = jax.vmap(value)(points)
+        values = jax.vmap(target)(points)
         # One copy for each degree.
         at_pilots = jnp.repeat(values[:n], len(_DEGREES), axis=1)
         c = base.fitted_to(at_pilots, frame.inner, points[:n], good[:n])
-        left = values[n:] - tensordot(base.at(frame.inner, nodes), c, 1)
+        residual = values[n:] - tensordot(base.at(frame.inner, nodes), c, 1)
         # The target may overflow where it grows fast.
-        left = jnp.where(jnp.isfinite(left), left, 0)
+        residual = jnp.where(jnp.isfinite(residual), residual, 0)
         # The degree that leaves the least near the edge, for each component.
         distance = np.max(np.abs(x), axis=1)
         is_near_edge = (distance > _FALLS * _NEAR_EDGE) & (distance < _FALLS)
-        most = jnp.max(jnp.abs(left[is_near_edge]), axis=0)
+        most = jnp.max(jnp.abs(residual[is_near_edge]), axis=0)
         best = jnp.argmin(most, axis=0)[None, None]
-        left = jnp.take_along_axis(left, best, 1)
+        residual = jnp.take_along_axis(residual, best, 1)
         c = jnp.take_along_axis(c, best, 1)
         falling = np.prod(_falling((np.abs(x) - _FALLS) / (1 - _FALLS)), axis=1)
-        falling = jnp.asarray(falling, left.dtype)[:, None, None, None]
-        return jnp.concatenate([c, left * falling])
+        falling = jnp.asarray(falling, residual.dtype)[:, None, None, None]
+        return jnp.concatenate([c, residual * falling])
 
     def combined(self, frame, y, c):
         size = self._base.size
@@ -171,13 +171,13 @@ class Grid(AbstractBasis):
         return jnp.where(inside, block, 0)
 
 
-def _lagrange(off: list[Float[Array, " d"]]) -> list[Float[Array, " d"]]:
+def _lagrange(distances: list[Float[Array, " d"]]) -> list[Float[Array, " d"]]:
     """The Lagrange polynomials of the points `0, 1, ..., k - 1`, from the distances to each
     of them."""
-    k = len(off)
+    k = len(distances)
     # Each is a product over the points to the left, times one over the points to the right.
-    left = [*itertools.accumulate(off[:-1], jnp.multiply, initial=1.0)]
-    right = [*itertools.accumulate(off[:0:-1], jnp.multiply, initial=1.0)][::-1]
+    left = [*itertools.accumulate(distances[:-1], jnp.multiply, initial=1.0)]
+    right = [*itertools.accumulate(distances[:0:-1], jnp.multiply, initial=1.0)][::-1]
     weights = []
     for j in range(k):
         # The same product at point `j`.

@@ -1,6 +1,5 @@
 """The random variables of a step, and expectations over them."""
 
-import collections
 import dataclasses
 import math
 from collections.abc import Callable
@@ -13,31 +12,19 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt32
 
-from .._brownian import Discrete, random_words
-from .._custom_types import Y
-from .._terms import outcomes
-from .polynomials import tensordot
-from .problem import Level, Problem
+from ..._brownian import Discrete, random_words
+from ..._custom_types import Y
+from ..._products import tensordot
+from ..._simulation import Level, Problem
+from ..._terms import outcomes
 
 
 # Up to this many outcomes, a step is taken for each of them. Four noises of three values
 # each have 81 outcomes, five have 243.
 _MOST_OUTCOMES = 100
-# The relative entropy of a whole path's wider noise with respect to its own law, in nats.
-# Typical paths of the wider noise are then e^8 = 3,000 times less likely by their own law:
-# rare enough to show the tails, and not so rare that no weight is left.
-_NATS = 8.0
-# With this tilt the largest of three outcomes, sqrt(3) times as large as the standard
-# deviation, is e^7 = 1,000 times as likely next to the middle one as before: nearly all
-# outcomes are the largest.
-_MOST_TILTED = 4.0
-# Halvings of an interval until only rounding errors in single precision remain.
-_HALVINGS = 30
 
 # A function of the state.
 Function: TypeAlias = Callable[[Y], Array]
-# The probabilities that a law has after a change by a number.
-ChangedLaw: TypeAlias = Callable[[Discrete, float], np.ndarray]
 
 
 class StepOfPath(NamedTuple):
@@ -118,39 +105,6 @@ class Noise(eqx.Module):
             x = jnp.where(has_law, outcome, x)
             log_ratio = jnp.where(has_law, log_ratio_of_law, log_ratio)
         return x, jnp.sum(log_ratio)
-
-    @property
-    def share(self) -> Array:
-        """The largest `share` for `draw` that `_strongest` allows."""
-        return self._strongest(_widened, 1.0)
-
-    @property
-    def tilt(self) -> Array:
-        """The largest `tilt` for `draw` that `_strongest` allows."""
-
-        def tilted(law: Discrete, tilt: float) -> np.ndarray:
-            return _tilted(law, np.array(law.probabilities), tilt)
-
-        return self._strongest(tilted, _MOST_TILTED)
-
-    def _strongest(self, changed: ChangedLaw, most: float) -> Array:
-        """The largest `z`, up to `most`, for which the laws `changed(law, z)` give all
-        variables of a path together a relative entropy of at most 8 nats with respect to
-        their own laws."""
-        num_levels = len(self.problem.levels.h)
-        # Each level has twice as many steps as the one before.
-        steps = self.problem.max_steps / 2 ** np.arange(num_levels)[::-1]
-        counts = collections.Counter(self.laws)
-        # By bisection, for all levels at once, since `z` depends on the number of steps.
-        low = np.zeros(num_levels)
-        high = np.full(num_levels, most)
-        for _ in range(_HALVINGS):
-            middle = (low + high) / 2
-            of_step = np.array([_relative_entropy(counts, changed, z) for z in middle])
-            is_too_much = steps * of_step > _NATS / num_levels
-            low = np.where(is_too_much, low, middle)
-            high = np.where(is_too_much, middle, high)
-        return jnp.asarray(low, self.problem.dtype)[self.level.index]
 
     def nodes(self, x: Array | None = None) -> tuple[Any, np.ndarray]:
         """Nodes and weights of the expectation over the variables. Given a draw `x`, unless
@@ -281,54 +235,41 @@ def _drawn(
     """Outcomes by one law, widened and tilted, and their log likelihood ratios, from one
     random word each."""
     p = np.array(law.probabilities, dtype)
-    q = _widened(law, share)
-    q = jax.vmap(lambda tilt: _tilted(law, q, tilt))(tilts)
+    q = widened(law, share)
+    q = jax.vmap(lambda tilt: tilted(law, q, tilt))(tilts)
     # The law as it is has cuts in integers, by which a `WeakBrownianPath` draws, too. With
     # other cuts, by rounded probabilities, few draws would differ, but the law would not be
     # exact.
     is_unchanged = (share == 0) & (tilts == 0)
     cuts = (jnp.cumsum(q, axis=1)[:, :-1] * 2.0**32).astype(jnp.uint32)
     cuts = jnp.where(is_unchanged[:, None], np.array(law.cuts, np.uint32), cuts)
-    place = jnp.sum(words[:, None] >= cuts, axis=1)
-    outcome = jnp.asarray(law.values, dtype)[place]
-    log_ratios = jnp.take_along_axis(jnp.log(q / p), place[:, None], axis=1)
+    index = jnp.sum(words[:, None] >= cuts, axis=1)
+    outcome = jnp.asarray(law.values, dtype)[index]
+    log_ratios = jnp.take_along_axis(jnp.log(q / p), index[:, None], axis=1)
     return outcome, log_ratios[:, 0]
 
 
-def _widened(law: Discrete, share: Any) -> Any:
+def widened(law: Discrete, share: Any) -> Any:
     """Probabilities between those of the law (for a `share` of zero) and equal ones."""
     p = np.array(law.probabilities, jnp.result_type(share))
     return (1 - share) * p + share / len(p)
 
 
-def _tilted(law: Discrete, q: Any, tilt: Any) -> Any:
+def tilted(law: Discrete, q: Any, tilt: Any) -> Any:
     """Probabilities `q` times the exponential of `tilt` times the outcome, normalized."""
-    # Numbers stay on the host: `_strongest` calls this hundreds of times.
+    # Numbers stay on the host: trials of tails call this hundreds of times.
     numpy = jnp if isinstance(tilt, jax.Array) else np
     weights = q * numpy.exp(tilt * np.array(law.values, jnp.result_type(tilt)))
     return weights / numpy.sum(weights)
 
 
-def _relative_entropy(
-    counts: collections.Counter[Discrete], changed: ChangedLaw, z: float
-) -> float:
-    """How far the variables of a step, so many of each law, are from their own laws if
-    these are changed: the sum of `q log(q / p)`, in nats."""
-    nats = 0.0
-    for law, count in counts.items():
-        p = np.array(law.probabilities)
-        q = changed(law, z)
-        nats += count * np.sum(q * np.log(q / p))
-    return nats
-
-
-def num_outcomes(problem: Problem) -> int | None:
+def count_outcomes(problem: Problem) -> int | None:
     """The number of outcomes of a step, or `None` if there are many."""
     try:
-        outcomes = Noise.of(problem, problem.level(0)).outcomes
+        few = Noise.of(problem, problem.level(0)).outcomes
     except ValueError:
         return None
-    if outcomes is None:
+    if few is None:
         return None
-    _, probabilities = outcomes
+    _, probabilities = few
     return len(probabilities)

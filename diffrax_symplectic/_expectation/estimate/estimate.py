@@ -11,13 +11,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from .error_bars import (
-    is_off_order,
-    remaining_error,
-    Results,
-    results_of,
-)
-from .moments import Combination, joined, Moments, total
+from ..._simulation import Combination
+from .error_bars import is_off_order, remaining_error, Results, results_of
+from .moments import joined, Moments, total
 from .saved import arrays_of, fields_from, header_of
 
 
@@ -45,21 +41,21 @@ class Expectation(eqx.Module):
     - `key_data`: the data of the random key.
 
     The other fields are what `save` stores beside these, and may change: `moments`,
-    `paths_per_sample`, `roundings` and `far`.
+    `paths_per_sample`, `rounding_floor` and `tails`.
     """
 
     # The moments of batches, with neighbours combined.
     moments: tuple[Moments, ...]
     key_data: np.ndarray
     paths_per_sample: int = 1
-    # The smallest standard error, in roundings of the mean.
-    roundings: int = 1
+    # The smallest standard error, in units of the rounding of the mean.
+    rounding_floor: int = 1
     sampling: Any = None
     reason: str = ""
     tol_reached: bool | None = None
     # For value functions: the mean absolute deviation from the fitted mean in the tails, as
     # estimated by paths whose noise is wider or pushed to one side.
-    far: PyTree[np.ndarray] | None = None
+    tails: PyTree[np.ndarray] | None = None
 
     @property
     def levels(self) -> int:
@@ -309,18 +305,18 @@ class Expectation(eqx.Module):
         means = _flat(self.mean)
         errors = _flat(self.error)
         lines = []
-        for k, place in enumerate(_places(self.mean)):
+        for k, label in enumerate(_labels(self.mean)):
             line = f"{_with_digits(means[k], errors[k])} ± {errors[k]:.1e}"
             if len(parts) > 1:
                 each = [f"{name} {part[k]:.1e}" for name, part in parts.items()]
                 line += f" ({', '.join(each)})"
-            lines.append(f"{place}: {line}" if place else line)
+            lines.append(f"{label}: {line}" if label else line)
         return lines
 
     def _results(self, combination: Combination) -> Results:
         """What follows from the moments for one combination of levels."""
         whole = total(self.moments)
-        return results_of(whole, self.roundings, self.far, combination)
+        return results_of(whole, self.rounding_floor, self.tails, combination)
 
 
 def combined_results(estimate: Expectation, combination: Combination) -> Results:
@@ -357,15 +353,15 @@ def _flat(tree: PyTree[np.ndarray | np.floating]) -> list[float]:
     return [float(x) for leaf in jtu.tree_leaves(tree) for x in np.ravel(leaf)]
 
 
-def _places(tree: PyTree[np.ndarray | np.floating]) -> list[str]:
+def _labels(tree: PyTree[np.ndarray | np.floating]) -> list[str]:
     """For each number its place, such as `['energy'][0, 2]`; nothing for a single array
     without axes."""
-    places = []
+    labels = []
     for path, leaf in jtu.tree_leaves_with_path(tree):
         for index in np.ndindex(np.shape(leaf)):
             axes = f"[{', '.join(map(str, index))}]" if index else ""
-            places.append(jtu.keystr(path) + axes)
-    return places
+            labels.append(jtu.keystr(path) + axes)
+    return labels
 
 
 def _with_digits(mean: float, error: float) -> str:

@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float, Int32, UInt, UInt32
 # the default number of paths. Each bit costs some operations on all paths.
 _COORDINATE_BITS = 16
 # About how many states the range of a coordinate is estimated from, and the share of them
-# that is left out at either end.
+# that is left out at either end. The range need not be accurate: the grid is three times as
+# wide.
 _SAMPLE = 256
 _OUTLIERS = 1 / 50
 # The bits of an unsigned integer, less one that marks the rows at the end.

@@ -7,15 +7,15 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
+from ..sampling import Averaged, SAVED_SAMPLINGS
 from .moments import Moments
-from .sampling import SAVED_SAMPLINGS
 
 
-# The fields of `Moments` that have the structure of `phi`, and those that are numbers.
-_TREES = ("mean", "norm", "largest", "size")
-_NUMBERS = ("begin", "end", "good", "failed", "failed_on")
+# The fields of `Moments` that are an `Averaged`, and those that are integers.
+_AVERAGED = ("mean", "norm", "largest", "size")
+_COUNTS = ("begin", "end", "good", "failed", "failed_on")
 # The fields of an estimate that JSON takes as they are.
-_PLAIN_FIELDS = ("paths_per_sample", "roundings", "reason", "tol_reached")
+_PLAIN_FIELDS = ("paths_per_sample", "rounding_floor", "reason", "tol_reached")
 
 
 def header_of(estimate: Any) -> dict[str, Any]:
@@ -25,23 +25,25 @@ def header_of(estimate: Any) -> dict[str, Any]:
     one, *_ = estimate.moments
     fields = {} if sampling is None else vars(sampling)
     header = {
-        "ranges": [[getattr(x, name) for name in _NUMBERS] for x in estimate.moments],
-        "structure": _structure(one.mean),
+        "ranges": [[getattr(x, name) for name in _COUNTS] for x in estimate.moments],
+        "structure": _structure(one.mean.value),
+        "averaged": list(one.mean.fields),
         "dtypes": jtu.tree_leaves(one.dtypes),
         "sampling": None if sampling is None else type(sampling).__name__,
         # A function, such as `sort_by`, is left out.
         "fields": {name: _plain(x) for name, x in fields.items() if _is_plain(x)},
-        "far": estimate.far is not None,
+        "tails": estimate.tails is not None,
     }
     return header | {name: getattr(estimate, name) for name in _PLAIN_FIELDS}
 
 
 def arrays_of(estimate: Any) -> dict[str, np.ndarray]:
     """The arrays of an `Expectation`, by names that are made of a field and positions."""
-    trees = {"far": estimate.far}
+    trees = {"tails": estimate.tails}
     for i, moments in enumerate(estimate.moments):
-        for name in _TREES:
-            trees[f"{name}_{i}"] = getattr(moments, name)
+        for name in _AVERAGED:
+            for field, tree in getattr(moments, name).fields.items():
+                trees[f"{name}_{field}_{i}"] = tree
     arrays = {"key_data": estimate.key_data}
     for name, tree in trees.items():
         for k, leaf in enumerate(jtu.tree_leaves(tree)):
@@ -61,10 +63,14 @@ def fields_from(
         leaves = [arrays[f"{name}_{k}"] for k in range(count)]
         return _filled(structure, iter(leaves))
 
-    def moments(i: int, numbers: list[Any]) -> Moments:
-        trees = {name: tree(f"{name}_{i}") for name in _TREES}
+    def averaged(name: str, i: int) -> Averaged:
+        fields = header["averaged"]
+        return Averaged(**{field: tree(f"{name}_{field}_{i}") for field in fields})
+
+    def moments(i: int, counts: list[Any]) -> Moments:
+        trees = {name: averaged(name, i) for name in _AVERAGED}
         dtypes = _filled(structure, iter(header["dtypes"]))
-        begin, end, good, failed, failed_on = numbers
+        begin, end, good, failed, failed_on = counts
         return Moments(
             begin, end, good, failed, tuple(failed_on), **trees, dtypes=dtypes
         )
@@ -74,7 +80,7 @@ def fields_from(
         "moments": tuple(moments(i, x) for i, x in enumerate(header["ranges"])),
         "key_data": arrays["key_data"],
         "sampling": _sampling_from(header),
-        "far": tree("far") if header["far"] else None,
+        "tails": tree("tails") if header["tails"] else None,
     }
 
 

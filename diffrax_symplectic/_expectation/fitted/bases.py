@@ -13,7 +13,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from .polynomials import dot, hermite, least_squares, num_polynomials, tensordot
+from ..._products import dot, tensordot
+from .polynomials import hermite, least_squares, num_polynomials
 
 
 # The pilot's paths for each polynomial, and the fewest. The fit hardly depends on them: of
@@ -36,7 +37,7 @@ _FEWEST_QUADRATIC_PILOTS = 16
 _QUADRATIC_NUMBERS = 2**13
 
 # The target value of a function at a state; with a random key, an estimate of it.
-Value: TypeAlias = Callable[..., Float[Array, "C S m"]]
+Target: TypeAlias = Callable[..., Float[Array, "C S m"]]
 
 
 class Frame(eqx.Module):
@@ -65,9 +66,9 @@ class Frame(eqx.Module):
         weights = equal_weights(good, points.dtype)
         mean = weights @ points
         inverse = inverse_or_zero(unit)
-        off = (points - mean) * inverse
+        scaled = (points - mean) * inverse
         # In ascending order.
-        variances, axes = jnp.linalg.eigh((off.T * weights) @ off)
+        variances, axes = jnp.linalg.eigh((scaled.T * weights) @ scaled)
         # Keeps the matrices finite where nothing moves at all.
         tiny = jnp.finfo(points.dtype).eps ** 2
         size = jnp.sqrt(jnp.maximum(variances, _FLOOR**2 * variances[-1]) + tiny)
@@ -131,7 +132,7 @@ class AbstractBasis(eqx.Module):
     @abc.abstractmethod
     def fitted(
         self,
-        value: Value,
+        target: Target,
         frame: Any,
         states: Float[Array, "n d"],
         good: Bool[Array, " n"],
@@ -168,9 +169,9 @@ class Hermite(AbstractBasis):
     def frame(self, states, good, unit):
         return Frame.of(states, good, unit)
 
-    def fitted(self, value, frame, states, good, keys):
+    def fitted(self, target, frame, states, good, keys):
         points = frame.moved(states)
-        return self.fitted_to(jax.vmap(value)(points), frame, points, good)
+        return self.fitted_to(jax.vmap(target)(points), frame, points, good)
 
     def fitted_to(
         self,
@@ -239,10 +240,10 @@ class Quadratic(AbstractBasis):
     def frame(self, states, good, unit):
         return CentredFrame(equal_weights(good, states.dtype) @ states, unit)
 
-    def fitted(self, value, frame, states, good, keys):
+    def fitted(self, target, frame, states, good, keys):
         def derivatives(args):
             key, y = args
-            shifted = lambda z: value(y + frame.unit * z, key)
+            shifted = lambda z: target(y + frame.unit * z, key)
 
             def slope(z):
                 first = jax.jacrev(shifted)(z)

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation import engines
 from diffrax_symplectic._fused import kernels
+from diffrax_symplectic._simulation import engines
 from diffrax_symplectic._stablehlo import backend
 
-from ..drjit_here import needs_drjit
+from .drjit_here import needs_drjit
 
 
 ONE = jnp.array(0.0), jnp.array(1.0)

@@ -10,7 +10,7 @@ from jaxtyping import Array, UInt32
 
 # The number of consecutive points among which a single three-point variable is balanced:
 # its outer values have probability one sixth.
-_BLOCK = 6
+_SIX = 6
 
 
 # A set may take a gigabyte.
@@ -88,17 +88,17 @@ def randomized(
     last, and the others the middle.
     """
     n, d = points.shape
-    if not sixths or n < _BLOCK:
+    if not sixths or n < _SIX:
         return _scrambled(points, jnp.arange(n, dtype=jnp.uint32), seeds)
     # Blocks of six and points both start at random, so each point has the same law, and is
     # the smallest of its block with probability 1/6.
     start = seeds[-2]
-    offset = seeds[-1] % np.uint32(_BLOCK)
+    offset = seeds[-1] % np.uint32(_SIX)
     # Enough for any offset.
-    blocks = n // _BLOCK + 2
-    number = jnp.arange(_BLOCK * blocks, dtype=jnp.uint32) + start
+    blocks = n // _SIX + 2
+    number = jnp.arange(_SIX * blocks, dtype=jnp.uint32) + start
     words = _scrambled(points, number & np.uint32(n - 1), seeds)
-    words = words.reshape(blocks, _BLOCK)
+    words = words.reshape(blocks, _SIX)
     smallest = words == jnp.min(words, axis=1, keepdims=True)
     largest = words == jnp.max(words, axis=1, keepdims=True)
     words = jnp.where(largest, np.uint32(2**32 - 1), np.uint32(2**31))

@@ -12,8 +12,16 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray, PyTree
 
-from .._arguments import brief, check_real, check_takes, takes_args
-from .._brownian import Discrete, is_random, laws_of, lost_variance, TOO_STRONG
+from .._arguments import brief, check_real, check_takes, check_untraced, takes_args
+from .._brownian import (
+    check_key,
+    Discrete,
+    is_random,
+    laws_of,
+    lost_variance,
+    TOO_STRONG,
+    typed_key,
+)
 from .._custom_types import Args, Y
 from .._signature import once_for_each_signature
 from .._solver import own_path
@@ -44,10 +52,21 @@ class StepNumbers(NamedTuple):
     total: np.integer
 
 
+def checked_key(user: str, key: Any, others: Any) -> PRNGKeyArray:
+    """The key of a call of `user`, as a typed key. Raises a `ValueError` unless it is one,
+    and for traced arrays in it or in the `others`."""
+    # Inside `jit` a new array is traced, too. Functions that close over traced values of
+    # other transformations are found once something that depends on these is needed.
+    new = jnp.zeros(())
+    check_untraced(f"`{user}`", (key, others, new))
+    check_key(key, user)
+    return typed_key(key)
+
+
 def step_numbers(
     t0: Any, t1: Any, dt0: Any, ts: Sequence[Any] | np.ndarray | None
 ) -> StepNumbers:
-    """Raises a `ValueError` for times that are no numbers, or between steps."""
+    """Raises a `ValueError` unless all times are numbers, a whole number of steps apart."""
     if dt0 is None:
         raise ValueError("`dt0` must be a number: steps are fixed; got None.")
     given = f"got dt0={dt0!r}, t0={t0!r}, t1={t1!r}"

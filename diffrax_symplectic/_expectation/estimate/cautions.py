@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from ..._simulation import advice_on_failures, Combination
+from ..sampling import ROUNDING
 from .estimate import combined_results, Expectation
-from .moments import Combination, total
-from .sampling import KindsWithControl, ROUNDING
+from .moments import total
 from .tolerance import largest_of, shortfall
 
 
@@ -20,9 +21,11 @@ _HEAVY = 0.35
 # share of it. Of a method of order 2, the bias of the longer step is then more than twice
 # the mean.
 _MUCH = 0.5
-# Unless that change may be the noise of the samples, so many standard errors.
-_SURE = 4
-# Many more paths fail with the longer step if they are so many times those with half of it.
+# Unless that change may be the noise of the samples, so many standard errors: by chance it
+# is more once in sixteen thousand times.
+_SURE_OF_CHANGE = 4
+# Many more paths fail with the longer step if they are so many times those with half of it:
+# then the longer one is too long for the method, rather than paths bad by themselves.
 _MANY_MORE = 10
 
 
@@ -39,7 +42,7 @@ def cautions(estimate: Expectation, tol: float | None, bounded: bool) -> Iterato
 
 
 def _of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
-    """Of failed paths, if they could change the mean by more than its error."""
+    """A warning of failed paths, if they could change the mean by more than its error."""
     changes = jtu.tree_leaves(estimate.failed_error)
     errors = jtu.tree_leaves(estimate.std_error)
     # Without samples both are NaN.
@@ -60,16 +63,11 @@ def _of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
                 f"; the first two steps do not agree, since {longest:,} paths fail with "
                 f"steps of `dt0` and {next_one:,} with half of it"
             )
-    instead = "" if bounded else " or bounded increments, as from a `WeakBrownianPath`,"
-    yield (
-        f"{estimate.num_failed:,} paths failed: {rest}. Take smaller steps{instead} and "
-        "look for NaNs in `y0`, `args` and the Hamiltonians, and for a `temperature` or "
-        "`friction` that is negative or, as a matrix, not symmetric positive semidefinite."
-    )
+    yield f"{estimate.num_failed:,} paths failed: {rest}. {advice_on_failures(bounded)}"
 
 
 def _of_spread(estimate: Expectation) -> Iterator[str]:
-    """Of values whose mean or standard error cannot be trusted."""
+    """Warnings of values whose mean or standard error cannot be trusted."""
     results = jtu.tree_leaves((estimate.mean, estimate.std_error))
     if not all(np.all(np.isfinite(x)) for x in results):
         yield (
@@ -109,20 +107,20 @@ def _of_spread(estimate: Expectation) -> Iterator[str]:
 
 
 def _of_first_steps(estimate: Expectation) -> Iterator[str]:
-    """Of two steps whose means have little in common. (Three are checked for the order.)"""
+    """A warning of two steps whose means differ much. (Three are checked for the order.)"""
     if estimate.levels != 2:
         return
     change = combined_results(estimate, Combination.EXTRAPOLATION)
     whole = total(estimate.moments)
 
-    def disagree(change: Any, noise: Any, finest: Any, sizes: Any, dtype: str) -> Any:
-        size = np.max(sizes, axis=0)[Combination.BEST]
-        rounding = ROUNDING * float(jnp.finfo(dtype).eps) * size
-        is_large = np.abs(change) > np.maximum(_SURE * noise, rounding)
+    def disagree(change: Any, noise: Any, finest: Any, size: Any, dtype: str) -> Any:
+        rounding = ROUNDING * float(jnp.finfo(dtype).eps) * size[Combination.BEST]
+        is_large = np.abs(change) > np.maximum(_SURE_OF_CHANGE * noise, rounding)
         return np.any(is_large & (np.abs(change) > _MUCH * np.abs(finest)))
 
     finest = jtu.tree_map(np.add, estimate.mean, estimate.bias)
-    arguments = change.mean, change.std_error, finest, whole.size, whole.dtypes
+    size = jtu.tree_map(np.fmax, whole.size.value, whole.size.without_control)
+    arguments = change.mean, change.std_error, finest, size, whole.dtypes
     if any(jtu.tree_leaves(jtu.tree_map(disagree, *arguments))):
         yield (
             "The first two steps do not agree: extrapolation from steps of `dt0` and half "
@@ -134,10 +132,9 @@ def _of_first_steps(estimate: Expectation) -> Iterator[str]:
 def _underflowing(estimate: Expectation) -> str | None:
     """The dtype of a component that is zero or underflows on all paths, if there is one."""
     whole = total(estimate.moments)
-    for sizes, dtype in zip(*map(jtu.tree_leaves, (whole.size, whole.dtypes))):
-        has_control = len(sizes) == len(KindsWithControl)
-        without_control = sizes[KindsWithControl.PLAIN if has_control else 0]
-        if np.max(without_control[Combination.BEST]) < _least(dtype):
+    both = whole.size.without_control, whole.dtypes
+    for size, dtype in zip(*map(jtu.tree_leaves, both)):
+        if np.max(size[Combination.BEST]) < _least(dtype):
             return dtype
     return None
 

@@ -1,6 +1,5 @@
-"""Value functions, fitted backwards in time at the states of a pilot run."""
+"""Target functions, fitted backwards in time at the states of a pilot run."""
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,17 +12,26 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
-from .._custom_types import Y
-from .._root_finder import PicardNewton
-from .._solver import AbstractImplicitStages
-from .bases import AbstractBasis, equal_weights, Value
+from ..._custom_types import Y
+from ..._simulation import PathStates, Problem, ravel
+from .bases import AbstractBasis, equal_weights, Target
 from .noise import Noise
-from .problem import Problem, ravel
-from .simulation import PathStates
 
 
-# The states over which second derivatives along the noise are averaged.
+# The states over which second derivatives along the noise are averaged. A rough mean will
+# do: with any number in place of it, the control variate has mean zero.
 _STATES_FOR_SECOND = 32
+
+
+class Choice(NamedTuple):
+    """What is used for each time at which to average and each component of `phi`.
+
+    - `best`: the number of the candidate.
+    - `used`: whether its control variate is used, or none.
+    """
+
+    best: Int[Array | np.ndarray, "S m"]
+    used: Bool[Array | np.ndarray, "S m"]
 
 
 class FittedFunctions(eqx.Module):
@@ -60,26 +68,6 @@ class FittedFunctions(eqx.Module):
         return FittedFunctions(self.frames, coefficients, second, self.basis)
 
 
-def without_newton(solver: Any) -> Any:
-    """The solver, and all solvers in it, with a root finder that ends after its sweeps.
-
-    Newton's method is a quarter of the time to compile a fit, and few of its states need
-    it. A state at which the sweeps fail is left out of the fit.
-    """
-
-    def replaced(x: Any) -> Any:
-        if not (_is_implicit(x) and isinstance(x.root_finder, PicardNewton)):
-            return x
-        sweeps = dataclasses.replace(x.root_finder, newton_steps=0)
-        return eqx.tree_at(lambda solver: solver.root_finder, x, sweeps)
-
-    return jtu.tree_map(replaced, solver, is_leaf=_is_implicit)
-
-
-def _is_implicit(x: Any) -> bool:
-    return isinstance(x, AbstractImplicitStages)
-
-
 def fit(
     noise: Noise, key: PRNGKeyArray, basis: AbstractBasis
 ) -> tuple[FittedFunctions, Int[Array, ""]]:
@@ -103,9 +91,9 @@ def fit(
         return FittedFunctions(frames, put(u.coefficients, c), None, basis)
 
     # Arrays have room for the most steps of a level, so that levels share one program.
-    zeros = lambda struct: jnp.zeros((p.max_steps, *struct.shape), struct.dtype)
+    zeros = lambda struct: jnp.zeros((p.finest_steps, *struct.shape), struct.dtype)
     frames = jtu.tree_map(zeros, jax.eval_shape(lambda: frame(0)))
-    shape = p.max_steps, basis.size, len(basis.candidates), *p.num_outputs
+    shape = p.finest_steps, basis.size, len(basis.candidates), *p.num_outputs
     u = FittedFunctions(frames, jnp.zeros(shape, p.dtype), None, basis)
     u = lax.fori_loop(0, num_steps, backward, u)
     second = _second(noise, pilot, u)
@@ -113,7 +101,7 @@ def fit(
     return fitted, jnp.sum(~pilot.good)
 
 
-def _target(noise: Noise, u: FittedFunctions, i: Any) -> Value:
+def _target(noise: Noise, u: FittedFunctions, i: Any) -> Target:
     """What the functions after step `i` are fitted to, as a function of a flat state:
     `phi` itself for the time at the end of this step, and for later times the mean over the
     next step of the functions after it, which are known. For earlier times it is zero."""
@@ -128,7 +116,7 @@ def _target(noise: Noise, u: FittedFunctions, i: Any) -> Value:
         draw = None
         if key is not None:
             # Other numbers than those of the pilot's own steps.
-            draw, _ = noise.draw(key, p.max_steps + i)
+            draw, _ = noise.draw(key, p.finest_steps + i)
         later = noise.mean(next_step, y, lambda y1: u(next_step, y1), draw)
         phi = p.values(p.t0 + (i + 1) * level.h, y).astype(later.dtype)
         is_now = level.saved_steps == i + 1
@@ -152,7 +140,7 @@ def _second(
 
     before = jnp.concatenate([pilot.starts[None], pilot.states[:-1]])
     few = before[:, :_STATES_FOR_SECOND]
-    return lax.map(of_step, (jnp.arange(noise.problem.max_steps), few))
+    return lax.map(of_step, (jnp.arange(noise.problem.finest_steps), few))
 
 
 class _Pilot(NamedTuple):
@@ -192,7 +180,7 @@ def _pilot(noise: Noise, keys: Key[Array, " n"]) -> _Pilot:
     # For a fit it is good enough that solvers start anew in each step.
     paths = PathStates.start(p, jax.vmap(p.drawn)(keys), solver_state=None)
     starts = jax.vmap(ravel)(paths.y)
-    states = jnp.broadcast_to(starts, (p.max_steps, *starts.shape))
+    states = jnp.broadcast_to(starts, (p.finest_steps, *starts.shape))
     carry = paths, states
     paths, states = lax.fori_loop(0, noise.level.num_steps, forward, carry)
     return _Pilot(keys, starts, states, ~paths.failed)
@@ -204,9 +192,9 @@ def _unit(p: Problem, pilot: _Pilot, num_steps: Any) -> Float[Array, " d"]:
     start, _ = jfu.ravel_pytree(p.y0)
     if p.y0_of is not None:
         start = jnp.mean(pilot.starts, axis=0)
-    off = jnp.where(pilot.good[:, None], jnp.abs(pilot.states - start), 0)
+    distances = jnp.where(pilot.good[:, None], jnp.abs(pilot.states - start), 0)
     # Dividing by the largest value first avoids underflow of squares in single precision.
-    most = jnp.max(off, axis=(0, 1))
-    off = off / jnp.where(most > 0, most, 1)
+    most = jnp.max(distances, axis=(0, 1))
+    distances = distances / jnp.where(most > 0, most, 1)
     weights = equal_weights(pilot.good, start.dtype)
-    return most * jnp.sqrt(jnp.einsum("n,ind->d", weights, off**2) / num_steps)
+    return most * jnp.sqrt(jnp.einsum("n,ind->d", weights, distances**2) / num_steps)

@@ -9,18 +9,20 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from .._custom_types import Y
 from .._root_finder import all_finite
-from .problem import Drawn, Level, Problem
+from .._terms import path_keys, with_keys
+from .levels import Level
+from .problem import Drawn, Problem
 
 
 # On CPUs so many paths are stepped at once. The arrays of more overflow the cache in every
 # sweep over their stage equations: for a million paths of `ArrayRQMC` by the midpoint rule
 # this saves a quarter to a half of the processor time. In smaller blocks the batches of
 # `ensemble` take up to a fifth longer.
-_BLOCK = 2**16
+_PATHS_AT_ONCE = 2**16
 
 
 class PathStates(eqx.Module):
@@ -67,8 +69,8 @@ class PathStates(eqx.Module):
 
 def _kept_where(failed: Bool[Array, " n"], old: PyTree, new: PyTree) -> PyTree:
     """The new values, and the old ones for failed paths."""
-    keep = lambda new, old: jnp.where(along(failed, new), old, new)
-    return jtu.tree_map(keep, new, old)
+    pick = lambda new, old: jnp.where(along(failed, new), old, new)
+    return jtu.tree_map(pick, new, old)
 
 
 class Motion(NamedTuple):
@@ -189,14 +191,36 @@ def independent_steps(
     return Motion(step, PathStates.start(p, drawn, solver_state))
 
 
+def values_of_paths(
+    p: Problem, keys: Key[Array, " n"]
+) -> tuple[Float[Array, "levels S n m"], Bool[Array, "levels n"]]:
+    """The values of `phi` for independent paths, one for each key, on all levels and at the
+    times at which to average, and which paths failed."""
+    own_keys = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
+    drawn = jax.vmap(p.drawn)(keys)
+
+    def begin(level: Level) -> Motion:
+        return independent_steps(
+            p,
+            level,
+            drawn,
+            terms_of=lambda own: with_keys(p.terms, own),
+            # A path draws the increments of all steps from its keys.
+            randomness=lambda i: own_keys,
+        )
+
+    done = simulate(p, begin)
+    return done.saved, done.failed
+
+
 def _in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
     """`jax.vmap(fn)(*args)`, on CPUs one block of paths after another."""
     count = len(jtu.tree_leaves(args)[0])
     # A block of another size would be compiled for itself.
-    is_whole = count > _BLOCK and count % _BLOCK == 0
+    is_whole = count > _PATHS_AT_ONCE and count % _PATHS_AT_ONCE == 0
     if not is_whole or jax.default_backend() != "cpu":
         return jax.vmap(fn)(*args)
-    return lax.map(lambda own: fn(*own), args, batch_size=_BLOCK)
+    return lax.map(lambda own: fn(*own), args, batch_size=_PATHS_AT_ONCE)
 
 
 def along(mask: Bool[Array, " n"], x: Array) -> Array:

@@ -1,6 +1,5 @@
 """Hermite polynomials of several variables, and least-squares fits."""
 
-import functools as ft
 import itertools
 import math
 from collections.abc import Sequence
@@ -10,11 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._products import dot
 
-# By default accelerators round the factors of a product to half the digits, or fewer.
-_EXACT = jax.lax.Precision.HIGHEST
-dot = ft.partial(jnp.matmul, precision=_EXACT)
-tensordot = ft.partial(jnp.tensordot, precision=_EXACT)
+
 # The normal equations have the squared condition number of a fit. This many roundings are
 # added to their diagonal, so that they have a Cholesky factor. Along an axis with the
 # eigenvalue s, each refinement multiplies what this changes in the solution by r / (s + r),
@@ -85,13 +82,15 @@ def least_squares(
     in_block = is_used[:, :, None] & is_used[:, None]
     factors = jnp.where(in_block, L, jnp.eye(n, dtype=L.dtype))
 
-    def solved(L: Float[Array, "P P"], rhs: Float[Array, "P m"]) -> Float[Array, "P m"]:
+    def solution(
+        L: Float[Array, "P P"], rhs: Float[Array, "P m"]
+    ) -> Float[Array, "P m"]:
         return jax.scipy.linalg.cho_solve((L, True), rhs)
 
     def refined(_, c: Float[Array, "C P m"]) -> Float[Array, "C P m"]:
-        left = jnp.moveaxis(values, 1, 0) - dot(B, c)
-        rhs = jnp.where(is_used[:, :, None], dot(B.T, left), 0)
-        return c + jax.vmap(solved)(factors, rhs)
+        residual = jnp.moveaxis(values, 1, 0) - dot(B, c)
+        rhs = jnp.where(is_used[:, :, None], dot(B.T, residual), 0)
+        return c + jax.vmap(solution)(factors, rhs)
 
     c = jnp.zeros((len(sizes), n, values.shape[2]), values.dtype)
     # From zero: the first time is the solution itself.

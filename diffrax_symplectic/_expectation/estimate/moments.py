@@ -1,13 +1,13 @@
-"""Means and variances of batches of samples, their combination, and their weights in
-extrapolation."""
+"""Means and variances of batches of samples, and how they are combined."""
 
-import enum
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Float, PyTree
+from jaxtyping import PyTree
+
+from ..sampling import Averaged
 
 
 class Moments(NamedTuple):
@@ -16,13 +16,13 @@ class Moments(NamedTuple):
     - `good`: the number of good samples.
     - `failed`: the number of failed paths, each counted once.
     - `failed_on`: the number of paths that failed on each level.
-    - `mean`: the mean of the good samples, with two leading axes for kinds and for
-        combinations of levels.
+    - `mean`: the mean of the good samples. Arrays have a leading axis for combinations of
+        levels.
     - `norm`: the root of the sum of squared deviations from the mean. (The sum itself would
         overflow or underflow sooner.)
     - `largest`: the largest deviation within a batch.
     - `size`: the largest absolute value.
-    - `dtypes`: the dtype in which each array was computed.
+    - `dtypes`: the dtype in which each array of `phi` was computed.
     """
 
     begin: int
@@ -30,10 +30,10 @@ class Moments(NamedTuple):
     good: int
     failed: int
     failed_on: tuple[int, ...]
-    mean: PyTree[np.ndarray]
-    norm: PyTree[np.ndarray]
-    largest: PyTree[np.ndarray]
-    size: PyTree[np.ndarray]
+    mean: Averaged
+    norm: Averaged
+    largest: Averaged
+    size: Averaged
     dtypes: PyTree[str]
 
 
@@ -97,56 +97,3 @@ def _both(a: Moments, b: Moments) -> Moments:
         size=jtu.tree_map(np.maximum, a.size, b.size),
         dtypes=b.dtypes,
     )
-
-
-class Combination(enum.IntEnum):
-    """The rows of `level_weights`."""
-
-    # Extrapolated to step size zero.
-    BEST = 0
-    # With two levels or more: the finest level's mean minus the best, and the change by the
-    # last extrapolation.
-    BIAS = 1
-    EXTRAPOLATION = 2
-    # With three levels or more, for the extrapolations from all but two neighbouring levels
-    # (from one level of three): the change to the last of these three and to the one
-    # before, and the former minus what the order foretells from the latter.
-    LAST = 3
-    BEFORE = 4
-    MISS = 5
-
-
-def level_weights(
-    order: int | float, levels: int
-) -> Float[np.ndarray, "combinations levels"]:
-    r"""The combinations of the means with steps $h, h/2, h/4, \ldots$ that an
-    [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$: the rows of
-    `Combination`, as far as $L$ levels have them. The first eliminates the error terms in
-    $h^p, \ldots, h^{p + L - 2}$, or for $p = 1/2$ the terms in
-    $h^{1/2}, \ldots, h^{(L - 1)/2}$.
-
-    [Talay and Tubaro (1990)](https://doi.org/10.1080/07362999008809220) show that the error
-    has an expansion in powers of $h$.
-    """
-    best = _extrapolated(order, levels)
-    if levels == 1:
-        return best[None]
-    # The finer levels alone, which eliminate one power of the step size less.
-    before = np.append(0.0, _extrapolated(order, levels - 1))
-    rows = [best, np.eye(levels)[-1] - best, best - before]
-    if levels > 2:
-        of_some = _extrapolated(order, levels - 2)
-        coarse, middle, fine = (np.pad(of_some, (k, 2 - k)) for k in range(3))
-        last = fine - middle
-        change_before = middle - coarse
-        # The first power of the step size that is left in these.
-        power = order + levels - 3
-        rows += [last, change_before, last - 2.0**-power * change_before]
-    return np.stack(rows)
-
-
-def _extrapolated(order: int | float, levels: int) -> Float[np.ndarray, " levels"]:
-    """The weights of the means that add up to one, and cancel all error terms."""
-    powers = np.append(0.0, order + min(order, 1) * np.arange(levels - 1))
-    system = 2.0 ** -np.outer(powers, np.arange(levels))
-    return np.linalg.solve(system, np.eye(levels)[0])

@@ -11,43 +11,53 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray, PyTree, UInt32
 
-from .._arguments import check_real, check_takes, whole_number
-from .._brownian import (
+from ..._arguments import check_real, check_takes, whole_number
+from ..._brownian import (
     AbstractStepwisePath,
     GivenPath,
     Increment,
     stepwise,
     THREE_POINT,
 )
-from .._custom_types import Y
-from .._terms import brownian_paths, path_numbers, replace_paths
-from .fits import FittedFunctions
+from ..._custom_types import Y
+from ..._simulation import (
+    along,
+    combined,
+    independent_steps,
+    Level,
+    Motion,
+    PathStates,
+    Problem,
+    real_vector,
+    simulate,
+)
+from ..._terms import brownian_paths, path_numbers, replace_paths
+from ..estimate import heaviness
+from ..sampling import (
+    AbstractSampling,
+    Averaged,
+    ROUNDING,
+    Samples,
+    SamplingPlan,
+    saved_by_name,
+)
 from .hilbert import hilbert_order
 from .points import num_seeds, randomized, sobol_points
-from .polynomials import tensordot
-from .problem import Level, numbers, Problem
-from .run import run
-from .sampling import AbstractSampling, ROUNDING, Samples, SamplingPlan, saved_by_name
-from .simulation import along, independent_steps, Motion, PathStates, simulate
-from .value_functions import value_function
 
 
 # SciPy has direction numbers for this many coordinates of Sobol' points.
 _MAX_DIMENSION = 21201
-# Fewer replicates do not estimate their variance well enough to stop.
+# Fewer replicates do not estimate their variance well enough to stop: the error bar of
+# eight is uncertain by a quarter.
 _BEFORE_STOPPING = 8
-# With fewer paths along each coordinate, neighbours are far apart.
+# With fewer paths along each coordinate, neighbours are far apart: nearly all paths are at
+# an edge of the cloud.
 _FEWEST_ALONG_COORDINATE = 3
-# The number of replicates by which two ways to sort are compared.
-_TRIAL_REPLICATES = 4
-# Folded into the key of a call to draw these.
-_TRIAL_KEY = 4
 # Folded into the key of a replicate to draw the starts of its paths. (Numbers of levels are
 # smaller.)
-_STARTS_KEY = 0xFFFFFFFF
+_KEY_OF_STARTS = 0xFFFFFFFF
 
 
 @saved_by_name
@@ -74,10 +84,8 @@ class ArrayRQMC(AbstractSampling):
         which at least 8 are drawn. Each device solves one at a time, so memory does not
         grow with their number.
     - `sort_by`: maps the state to a PyTree of real numbers to sort the paths by: the fewest
-        that distinguish the states that matter. By default the state itself, unless it has
-        so many components that neighbours would be far apart. Then, if $\phi$ is a scalar
-        and the random variables are discrete, a value function fitted to
-        $\mathbb E[\phi \mid y_n = y]$ is used if it does better in a short trial.
+        that distinguish the states that matter. By default the state itself. Warns if
+        there are so many numbers that neighbours would be far apart.
 
     **Source:** [L'Ecuyer, Lécot and Tuffin
     (2008)](https://doi.org/10.1287/opre.1080.0556).
@@ -101,68 +109,33 @@ class ArrayRQMC(AbstractSampling):
         check_takes("sort_by", sort_by, "y")
         sorted_by = eqx.filter_eval_shape(sort_by, problem.y0)
         check_real("sort_by", jtu.tree_leaves(sorted_by))
-        dimension = jax.eval_shape(lambda: numbers(sort_by(problem.y0))).size
+        dimension = jax.eval_shape(lambda: real_vector(sort_by(problem.y0))).size
         points = jnp.asarray(sobol_points(self.num_paths, words.number))
 
-        def plan_for(sort_by: Callable) -> SamplingPlan:
-            return SamplingPlan(
-                jtu.Partial(_replicates, problem, sort_by, points, words),
-                num_samples=self.replicates,
-                # All paths of a replicate are solved at once, which is a batch already.
-                batch_size=1,
-                paths=self.num_paths,
-                levels=len(problem.levels.h),
-                least=_BEFORE_STOPPING,
-            )
-
-        by_state = plan_for(sort_by)
         along_coordinate = self.num_paths ** (1 / dimension)
-        if along_coordinate >= _FEWEST_ALONG_COORDINATE:
-            return by_state
-        # Each number that is averaged has value functions of its own, and paths are sorted
-        # by one.
-        is_one_number = problem.num_outputs == (1, 1)
-        u = None
-        if self.sort_by is None and is_one_number:
-            u = value_function(problem, key)
-        if u is not None:
-            by_value = plan_for(u)
-            gain = _gain(by_state, by_value, key, devices)
-            if gain > 1:
-                return by_value._replace(
-                    reason="sorted by a fitted value function, which divides the variance "
-                    f"of sorting by the state by {gain:.1f}"
-                )
-        warnings.warn(
-            f"{self.num_paths:,} paths are sorted by {dimension} coordinates, which leaves "
-            f"{along_coordinate:.1f} along each: neighbours are far apart, and `ArrayRQMC` "
-            "gains little over `IndependentPaths`. Pass a `sort_by` that returns the few "
-            "coordinates that matter most, at most "
-            f"{int(math.log(self.num_paths, _FEWEST_ALONG_COORDINATE))}.",
-            stacklevel=5,
+        if along_coordinate < _FEWEST_ALONG_COORDINATE:
+            warnings.warn(
+                f"{self.num_paths:,} paths are sorted by {dimension} coordinates, which "
+                f"leaves {along_coordinate:.1f} along each: neighbours are far apart, and "
+                "`ArrayRQMC` gains little over `IndependentPaths`. Pass a `sort_by` that "
+                "returns the few coordinates that matter most, at most "
+                f"{int(math.log(self.num_paths, _FEWEST_ALONG_COORDINATE))}.",
+                stacklevel=5,
+            )
+        return SamplingPlan(
+            jtu.Partial(_replicates, problem, sort_by, points, words),
+            num_samples=self.replicates,
+            # All paths of a replicate are solved at once, which is a batch already.
+            batch_size=1,
+            paths=self.num_paths,
+            levels=len(problem.levels.h),
+            least=_BEFORE_STOPPING,
         )
-        return by_state
-
-
-def _gain(
-    plan: SamplingPlan, other: SamplingPlan, key: PRNGKeyArray, devices: tuple
-) -> float:
-    """How many times the variance of a plan is that of the other, in a short trial; one if
-    either is zero, of which nothing can be said."""
-
-    def variance(plan: SamplingPlan) -> float:
-        short = plan._replace(num_samples=_TRIAL_REPLICATES)
-        trial = run(short, jr.fold_in(key, _TRIAL_KEY), devices)
-        return float(np.sum(jtu.tree_leaves(trial.variance)))
-
-    own = variance(plan)
-    others = variance(other)
-    return own / others if own > 0 and others > 0 else 1.0
 
 
 def _replicates(
     p: Problem,
-    sort_by: Callable[[Y], PyTree[Array]] | FittedFunctions,
+    sort_by: Callable[[Y], PyTree[Array]],
     points: UInt32[Array, "n d"],
     words: "StepWords",
     keys: Key[Array, "1"],
@@ -175,7 +148,7 @@ def _replicates(
     n, _ = points.shape
     (replicate,) = keys
     # Not from quasi-random points, since a function of a key takes any number of them.
-    start_keys = jr.split(jr.fold_in(replicate, _STARTS_KEY), n)
+    start_keys = jr.split(jr.fold_in(replicate, _KEY_OF_STARTS), n)
     drawn = jax.vmap(p.drawn)(start_keys)
 
     def begin(level: Level) -> Motion:
@@ -188,7 +161,7 @@ def _replicates(
         )
 
         def step(i, paths):
-            return motion.step(i, _in_order(sort_by, level, i, paths))
+            return motion.step(i, _in_order(sort_by, paths))
 
         return Motion(step, motion.start)
 
@@ -199,10 +172,12 @@ def _replicates(
     # The largest over all levels.
     heavy = jnp.broadcast_to(jnp.max(heavy, axis=0), means.shape)
     # A path may fail on any level.
-    largest = tensordot(jnp.abs(p.weights).astype(largest.dtype), largest, 1)
-    kinds = [means, heavy, largest]
+    largest = combined(abs(p.weights), largest)
+    averaged = Averaged(
+        p.shaped(means), heaviness=p.shaped(heavy), largest=p.shaped(largest)
+    )
     lost = jnp.sum(done.failed, axis=1, keepdims=True)
-    return Samples(p.averaged(kinds), jnp.ones(1, bool), lost)
+    return Samples(averaged, jnp.ones(1, bool), lost)
 
 
 def _words_of_step(
@@ -218,48 +193,34 @@ def _words_of_step(
     return randomized(points, jr.bits(key, (num_seeds(d),), jnp.uint32), sixths)
 
 
-def _in_order(
-    sort_by: Callable[[Y], PyTree[Array]] | FittedFunctions,
-    level: Level,
-    i: Any,
-    paths: PathStates,
-) -> PathStates:
-    """The paths before step `i`, sorted, with those that failed at the end."""
-
-    def sorted_by(y: Y) -> Float[Array, " m"]:
-        if isinstance(sort_by, FittedFunctions):
-            u = jtu.tree_map(lambda x: x[level.index], sort_by)
-            # Functions are those after each step. Before step 0 this is the last one, since
-            # there is none, and any order is right.
-            return numbers(u(i - 1, y))
-        return numbers(sort_by(y))
-
-    order = hilbert_order(jax.vmap(sorted_by)(paths.y), paths.failed)
+def _in_order(sort_by: Callable[[Y], PyTree[Array]], paths: PathStates) -> PathStates:
+    """The paths, sorted, with those that failed at the end."""
+    coordinates = jax.vmap(lambda y: real_vector(sort_by(y)))(paths.y)
+    order = hilbert_order(coordinates, paths.failed)
     return jtu.tree_map(lambda x: x[order], paths)
 
 
 def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "3 ..."]:
     """The mean over the paths that have not failed, the `r` of these paths as in
     `Expectation.std_error`, and the largest deviation of one of them."""
-    keep = along(~failed, x)
+    mask = along(~failed, x)
     count = jnp.sum(~failed).astype(x.dtype)
 
     def mean(x: Array) -> Array:
         # In two stages, so that rounding errors in single precision do not add up.
         rows = 1 << ((len(x).bit_length() - 1) // 2)
-        x = jnp.where(keep, x, 0)
+        x = jnp.where(mask, x, 0)
         total = jnp.sum(jnp.sum(x.reshape(rows, -1, *x.shape[1:]), axis=0), axis=0)
         return total / count
 
     center = mean(x)
-    off = jnp.where(keep, jnp.abs(x - center), 0)
-    largest = jnp.max(off, axis=0)
+    deviations = jnp.where(mask, jnp.abs(x - center), 0)
+    largest = jnp.max(deviations, axis=0)
     # In units of the largest deviation, so that squares neither overflow nor underflow.
-    s = jnp.sqrt(mean((off / jnp.where(largest > 0, largest, 1)) ** 2))
-    beyond = jnp.maximum(1 - s * jnp.sqrt(4.5 * jnp.log(jnp.maximum(count, 2))), 0)
+    s = jnp.sqrt(mean((deviations / jnp.where(largest > 0, largest, 1)) ** 2))
     # Rounding errors can have heavy tails, too.
     is_random = largest > ROUNDING * jnp.finfo(x.dtype).eps * jnp.abs(center)
-    r = jnp.where(is_random, beyond / (s * jnp.sqrt(count)), 0)
+    r = jnp.where(is_random, heaviness(1, s, count, jnp), 0)
     return jnp.stack([center, r, largest])
 
 

@@ -28,8 +28,9 @@ from .._fused import (
 )
 from .._lapack import lapack_in_turn
 from .._stablehlo import NotReplayed
-from .independent import solved
-from .problem import Level, Problem
+from .levels import Level
+from .loop import values_of_paths
+from .problem import Problem
 
 
 # Beyond this share, stragglers take most of the time.
@@ -71,19 +72,21 @@ def state_itself(t, y, args):
     return y
 
 
-def by_jax(p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0) -> Batch:
+def by_jax(
+    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
+) -> Batch:
     """With the loop of `expectation`."""
-    paths = _paths(p, key, *_halves(numbers))
+    paths = _paths(p, key, *_halves(sample_numbers))
     # They are traced if a function closes over traced values.
     check_untraced("`ensemble`", paths)
     y, failed = jax.device_get(paths)
     return Batch(jtu.tree_map(lambda x: x[level], y), failed[level])
 
 
-def _halves(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _halves(sample_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The high and the low 32 bits."""
-    high = (numbers >> np.uint64(32)).astype(np.uint32)
-    return high, (numbers & np.uint64(0xFFFFFFFF)).astype(np.uint32)
+    high = (sample_numbers >> np.uint64(32)).astype(np.uint32)
+    return high, (sample_numbers & np.uint64(0xFFFFFFFF)).astype(np.uint32)
 
 
 def _sample_keys(key: PRNGKeyArray, high: _Words, low: _Words) -> Array:
@@ -106,19 +109,19 @@ def _paths(
 ) -> tuple[PyTree[Array], Bool[Array, "levels n"]]:
     """The saved states of the paths of a batch, along axes of levels, paths and times, and
     which paths failed."""
-    states, failed = solved(p, _sample_keys(key, high, low))
+    states, failed = values_of_paths(p, _sample_keys(key, high, low))
     return p.unravel(jnp.swapaxes(states, 1, 2)), failed
 
 
 def by_drjit(
-    p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0
+    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:
     """With a fused kernel. JAX simulates again the paths that the kernel could not finish.
 
     Raises an `ImportError` without Dr.Jit, and a `ValueError` if the system cannot be
     replayed."""
     try:
-        fused = _fused_batch(p, key, numbers, level)
+        fused = _fused_batch(p, key, sample_numbers, level)
     except ImportError as error:
         raise ImportError(
             f'`engine="drjit"` needs Dr.Jit. {error}; or pass `engine="jax"`, which needs '
@@ -132,14 +135,14 @@ def by_drjit(
         raise refused from None
     if fused.stragglers == 0:
         return fused
-    return _with_stragglers(p, key, numbers, level, fused)
+    return _with_stragglers(p, key, sample_numbers, level, fused)
 
 
 def _fused_batch(
-    p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int
+    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int
 ) -> Batch:
     """The paths from the kernel alone: those that it did not finish count as failed."""
-    kernels, lanes, shared = fused_start(p, key, numbers, level)
+    kernels, lanes, shared = fused_start(p, key, sample_numbers, level)
     saved_steps = np.asarray(p.level(level).saved_steps)
     # From the number of a step to the entries of all states after it. The kernel is called
     # for the steps between two times.
@@ -169,20 +172,20 @@ class FusedStart(NamedTuple):
 
 
 def fused_start(
-    p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int = 0
+    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> FusedStart:
     """Compiles the kernels of a problem, unless they are known, and starts these paths."""
     own_args = None if p.args_of is None else eqx.filter(p.args, eqx.is_array)
     functions, arrays = split(_bare(p), key, own_args, p.paths_differ)
     kernels = _kernels(functions)
     if p.paths_differ:
-        y0, args = _drawn(p, key, *_halves(numbers))
+        y0, args = _drawn(p, key, *_halves(sample_numbers))
     else:
         y0 = p.y0
         args = None
     h = p.level(level).h
-    first = int(numbers[0])
-    lanes, shared = kernels.begin(arrays, key, h, first, len(numbers), y0, args)
+    first = int(sample_numbers[0])
+    lanes, shared = kernels.begin(arrays, key, h, first, len(sample_numbers), y0, args)
     return FusedStart(kernels, lanes, shared)
 
 
@@ -199,7 +202,7 @@ def _bare(p: Problem) -> Problem:
         levels=level,
         weights=jnp.ones((1, 1)),
         at_end=True,
-        max_steps=1,
+        finest_steps=1,
     )
 
 
@@ -210,7 +213,7 @@ def _kernels(functions: PathFunctions) -> Kernels:
 
 
 def _with_stragglers(
-    p: Problem, key: PRNGKeyArray, numbers: np.ndarray, level: int, fused: Batch
+    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int, fused: Batch
 ) -> Batch:
     """The paths of a batch, with those that the kernel did not finish simulated by JAX."""
     # What the kernel returned for these is where it stopped. From there JAX would need the
@@ -218,15 +221,15 @@ def _with_stragglers(
     (which,) = np.nonzero(fused.failed)
     # Rounded up to a power of four, so that JAX compiles few programs.
     power = int(np.ceil(np.log(len(which)) / np.log(4)))
-    size = min(len(numbers), 4**power)
-    rest = by_jax(p, key, numbers[np.resize(which, size)], level)
+    size = min(len(sample_numbers), 4**power)
+    rest = by_jax(p, key, sample_numbers[np.resize(which, size)], level)
 
     def replaced(fused: np.ndarray, by_jax: np.ndarray) -> np.ndarray:
         y = np.array(fused)
         y[which] = by_jax[: len(which)]
         return y
 
-    failed = np.zeros(len(numbers), bool)
+    failed = np.zeros(len(sample_numbers), bool)
     failed[which] = rest.failed[: len(which)]
     return Batch(jtu.tree_map(replaced, fused.y, rest.y), failed, len(which))
 
@@ -234,11 +237,11 @@ def _with_stragglers(
 def _unraveled(y0: PyTree, entries: list[np.ndarray]) -> PyTree[np.ndarray]:
     """The state, from its entries, each with axes for paths and times."""
     leaves, treedef = jtu.tree_flatten(y0)
-    left = iter(entries)
+    rest = iter(entries)
     axes = entries[0].shape
     each = []
     for leaf in leaves:
-        own = [next(left) for _ in range(leaf.size)]
+        own = [next(rest) for _ in range(leaf.size)]
         # An empty array has no entries to stack.
         stacked = np.stack(own, axis=-1) if own else np.zeros((*axes, 0), leaf.dtype)
         each.append(stacked.reshape(*axes, *leaf.shape))

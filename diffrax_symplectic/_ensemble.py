@@ -12,23 +12,30 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, PRNGKeyArray, PyTree
 
-from .._arguments import brief, whole_number
-from .._compat import is_traced
-from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
-from .._fused import sample_key
-from .._solver import Want
-from .._terms import has_shapes, path_keys, with_keys
-from .arguments import check_gaussian, warn_of_truncation
-from .call import checked_call
-from .engines import Batch, ENGINES, state_itself, warn_of_stragglers
-from .problem import Problem
+from ._arguments import brief, whole_number
+from ._compat import is_traced
+from ._custom_types import Args, IntScalarLike, RealScalarLike, Y
+from ._fused import sample_key
+from ._simulation import (
+    advice_on_failures,
+    Batch,
+    check_gaussian,
+    checked_key,
+    ENGINES,
+    Problem,
+    state_itself,
+    warn_of_stragglers,
+    warn_of_truncation,
+)
+from ._solver import Want
+from ._terms import has_shapes, path_keys, with_keys
 
 
 # Entries of all states in a batch: enough to keep every core busy, in tens of megabytes.
 _ENTRIES = {"jax": 2**17, "drjit": 2**20}
 # Accelerators need this many times as many.
 _MORE_ON_ACCELERATORS = 16
-# The fewest paths in a batch, however large their states.
+# The fewest paths in a batch, however large their states, so that batches are few.
 _FEWEST_PATHS = 256
 
 
@@ -172,7 +179,7 @@ def ensemble(
     if truncation takes more than 0.1% of the variance of increments.
     """
     arguments = terms, t0, t1, dt0, y0, args
-    key, _, _ = checked_call("ensemble", key, others=arguments)
+    key = checked_key("ensemble", key, arguments)
     num_paths = whole_number("num_paths", num_paths)
     engine = "jax" if engine is None else engine
     if engine not in ENGINES:
@@ -204,10 +211,10 @@ def ensemble(
     batches = []
     for begin in range(0, num_paths, size):
         # JAX compiles for one batch size: the last batch is cut afterwards.
-        left = num_paths if engine == "jax" else num_paths - begin
-        n = min(size, left)
-        numbers = np.arange(begin, begin + n, dtype=np.uint64)
-        batches.append(paths_by(problem, key, numbers))
+        remaining = num_paths if engine == "jax" else num_paths - begin
+        n = min(size, remaining)
+        sample_numbers = np.arange(begin, begin + n, dtype=np.uint64)
+        batches.append(paths_by(problem, key, sample_numbers))
     joined = _joined(batches, num_paths, at_end=ts is None)
     _warn_of(joined, problem.bounded)
     saved_steps = np.asarray(problem.levels.saved_steps[0])
@@ -250,12 +257,9 @@ def _warn_of(joined: Batch, bounded: bool) -> None:
     count = len(joined.failed)
     lost = int(np.sum(joined.failed))
     if lost > 0:
-        instead = "" if bounded else " or bounded increments (a `WeakBrownianPath`),"
         warnings.warn(
             f"{lost:,} of {count:,} paths failed. Their states are NaN: select the others "
-            f"with `~failed`. Take smaller steps{instead} and look for NaNs in `y0`, "
-            "`args` and the Hamiltonians, and for a `temperature` or `friction` that is "
-            "negative or, as a matrix, not symmetric positive semidefinite.",
+            f"with `~failed`. {advice_on_failures(bounded)}",
             stacklevel=3,
         )
     warn_of_stragglers(joined.stragglers, lost, count, stacklevel=3)

@@ -4,8 +4,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
+from ..._simulation import Combination
 from .estimate import combined_results, Expectation
-from .moments import Combination
 
 
 # More samples are of no use once their own part of the error is this share of the

@@ -1,4 +1,8 @@
-"""An expectation to compute: the checked arguments, and single steps."""
+"""An expectation to compute: the checked arguments, and single steps.
+
+Axes of arrays, here and in what simulates a problem: `n` paths, `d` entries of the state,
+`S` times at which to average (saves), `m` numbers in `phi`.
+"""
 
 import dataclasses
 import functools as ft
@@ -13,7 +17,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .._arguments import check_solver, check_state, whole_number
 from .._brownian import has_bounded_increments
@@ -45,34 +49,13 @@ from .arguments import (
     drawn_state,
     given_state,
     step_numbers,
-    StepNumbers,
 )
-from .kinks import may_have_kinks
-from .moments import level_weights
-from .polynomials import tensordot
-from .sampling import real
+from .levels import combined, Level, level_weights, levels_of
 
 
 # Folded into the key of a sample to draw its `y0` and `args`. The keys of its paths are
 # folded from the words of the user's keys: a number that is unlikely to be one of them.
 _START_KEY = 0x517A87
-# Numbers of steps are 32-bit integers.
-_MOST_STEPS = 2**31
-
-
-class Level(eqx.Module):
-    """One step size, or several, along a leading axis.
-
-    - `index`: its number, counted from the coarsest.
-    - `h`: the step size.
-    - `num_steps`: the number of steps.
-    - `saved_steps`: the numbers of steps after which to average.
-    """
-
-    index: Int[Array | np.ndarray, "*levels"]
-    h: Float[Array | np.ndarray, "*levels"]
-    num_steps: Int[Array | np.ndarray, "*levels"]
-    saved_steps: Int[Array | np.ndarray, "*levels saves"]
 
 
 class Drawn(NamedTuple):
@@ -111,7 +94,7 @@ class Problem(eqx.Module):
     # cannot tell.
     path_numbers: tuple[int, ...] = eqx.field(static=True)
     # The number of steps on the finest level. (Shapes must be known when compiling.)
-    max_steps: int = eqx.field(static=True)
+    finest_steps: int = eqx.field(static=True)
 
     @staticmethod
     def of(
@@ -173,7 +156,7 @@ class Problem(eqx.Module):
         check_stratonovich(terms, solver, start, y0, args, all_terms=True)
         check_cells(terms, float(t0), smallest)
 
-        grid = _levels(float(dt0), counts, levels, start.dtype)
+        grid = levels_of(float(dt0), counts, levels, start.dtype)
         order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
         weights = np.asarray(level_weights(order, levels), jnp.result_type(float))
         return Problem(
@@ -189,7 +172,7 @@ class Problem(eqx.Module):
             weights=weights,
             at_end=ts is None,
             path_numbers=path_numbers(brownian_paths(terms)),
-            max_steps=int(grid.num_steps[-1]),
+            finest_steps=int(grid.num_steps[-1]),
         )
 
     def level(self, index: IntScalarLike) -> Level:
@@ -197,12 +180,6 @@ class Problem(eqx.Module):
         if is_traced(index):
             return jtu.tree_map(lambda x: jnp.asarray(x)[index], self.levels)
         return jtu.tree_map(lambda x: x[index], self.levels)
-
-    @property
-    def has_kinks(self) -> bool:
-        """Whether `phi` may not be smooth."""
-        phi = lambda y: self.phi(self.t0, y, self.args)
-        return may_have_kinks(phi, self.y0)
 
     @property
     def paths_differ(self) -> bool:
@@ -267,9 +244,9 @@ class Problem(eqx.Module):
 
     def values(self, t: Any, y: Y) -> Float[Array, " m"]:
         """All numbers of `phi` as one vector."""
-        return numbers(self.phi(t, y, self.args))
+        return real_vector(self.phi(t, y, self.args))
 
-    def unravel(self, x: Float[Array, "*axes m"]) -> PyTree[Array]:
+    def unravel(self, x: Float[Array | np.ndarray, "*axes m"]) -> PyTree[Array]:
         """Flat values of `phi` in its own structure."""
         shape = jax.eval_shape(lambda: self.phi(self.t0, self.y0, self.args))
         leaves, treedef = jtu.tree_flatten(shape)
@@ -283,29 +260,28 @@ class Problem(eqx.Module):
         self, x: Float[Array, "levels ..."]
     ) -> Float[Array, "combinations ..."]:
         """The combinations of values on all levels."""
-        return tensordot(self.weights.astype(x.dtype), x, 1)
+        return combined(self.weights, x)
 
-    def averaged(
-        self, kinds: Sequence[Float[Array | np.ndarray, "combinations S n m"]]
+    def shaped(
+        self, x: Float[Array | np.ndarray, "combinations S n m"]
     ) -> PyTree[Array]:
-        """The `values` of `Samples` from these kinds."""
-        x = jnp.stack(kinds)
+        """Values of samples in the structure of `phi`, with the axis of samples before that
+        of times, if there is one."""
         if self.at_end:
-            return self.unravel(x[:, :, 0])
-        # The axis of samples comes before that of times.
-        return self.unravel(jnp.swapaxes(x, 2, 3))
+            return self.unravel(x[:, 0])
+        return self.unravel(jnp.swapaxes(x, 1, 2))
 
-    def shapes_of_samples(self, kinds: int) -> PyTree[jax.ShapeDtypeStruct]:
-        """The shapes of the `values` of one sample, with this number of kinds."""
+    @property
+    def shape_of_sample(self) -> PyTree[jax.ShapeDtypeStruct]:
+        """The shapes of the values of one sample, for all combinations of levels."""
         times, m = self.num_outputs
-        one = np.zeros((len(self.weights), times, 1, m), self.dtype_of_values)
-        averaged = jax.eval_shape(lambda: self.averaged([one] * kinds))
+        x = np.zeros((len(self.weights), times, 1, m), self.dtype_of_values)
 
         def without_samples(struct: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-            num_kinds, combinations, _, *rest = struct.shape
-            return jax.ShapeDtypeStruct((num_kinds, combinations, *rest), struct.dtype)
+            combinations, _, *rest = struct.shape
+            return jax.ShapeDtypeStruct((combinations, *rest), struct.dtype)
 
-        return jtu.tree_map(without_samples, averaged)
+        return jtu.tree_map(without_samples, jax.eval_shape(lambda: self.shaped(x)))
 
     @property
     def bounded(self) -> bool:
@@ -329,20 +305,14 @@ class Problem(eqx.Module):
         return self.levels.saved_steps.shape[1], m
 
 
-def _levels(dt0: float, counts: StepNumbers, levels: int, dtype: Any) -> Level:
-    """All levels, along a leading axis: each has half the step of the one before. Raises a
-    `ValueError` for too many steps."""
-    if counts.total * 2.0 ** (levels - 1) >= _MOST_STEPS:
-        raise ValueError(
-            f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "
-            "2^31 steps. Pass fewer levels: two to four are enough to extrapolate."
-        )
-    finer = 2 ** np.arange(levels, dtype=np.int32)
-    return Level(
-        index=np.arange(levels, dtype=np.int32),
-        h=np.asarray(dt0 / finer, dtype),
-        num_steps=finer * counts.total,
-        saved_steps=finer[:, None] * counts.saved,
+def advice_on_failures(bounded: bool) -> str:
+    """What to do about failed paths. `bounded` is whether the increments of all paths are
+    known to be bounded."""
+    instead = "" if bounded else " or bounded increments, as from a `WeakBrownianPath`,"
+    return (
+        f"Take smaller steps{instead} and look for NaNs in `y0`, `args` and the "
+        "Hamiltonians, and for a `temperature` or `friction` that is negative or, as a "
+        "matrix, not symmetric positive semidefinite."
     )
 
 
@@ -351,7 +321,7 @@ def ravel(y: Y) -> Float[Array, " d"]:
     return jfu.ravel_pytree(y)[0]
 
 
-def numbers(tree: PyTree) -> Float[Array, " m"]:
+def real_vector(tree: PyTree) -> Float[Array, " m"]:
     """The leaves as one vector of real numbers."""
     x = ravel(tree)
-    return x.astype(real(x.dtype))
+    return x.astype(jnp.result_type(x, float))

@@ -6,49 +6,43 @@ $u$. For the exact $u$ the sum of these differences is $\\phi(y_N)$ minus its me
 """
 
 import dataclasses
-import functools as ft
 import warnings
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
-from .._arguments import check_untraced, whole_number
-from .._compat import quickly_compiled
-from .._lapack import lapack_in_turn
-from .bases import AbstractBasis
-from .basis_choice import chosen_basis, warn_of_long_fit
-from .controlled_paths import (
-    Choice,
-    controlled_paths,
-    laws_of_trials,
-    TrialLaw,
-    Usual,
-)
-from .estimate import combined_results, Expectation
-from .fits import fit, FittedFunctions, without_newton
-from .moments import Combination, total
-from .noise import Noise
-from .problem import Problem
-from .run import run
-from .sampling import (
+from ..._arguments import check_untraced, whole_number
+from ..._compat import quickly_compiled
+from ..._lapack import lapack_in_turn
+from ..._simulation import Combination, Problem
+from ..._solver import without_newton
+from ..estimate import combined_results, Expectation, total
+from ..run import run
+from ..sampling import (
     AbstractSampling,
-    KindsWithControl,
+    Averaged,
     ROUNDING,
     SamplingPlan,
     saved_by_name,
 )
+from .bases import AbstractBasis
+from .basis_choice import chosen_basis, warn_of_long_fit
+from .controlled_paths import controlled_paths
+from .fits import Choice, fit, FittedFunctions
+from .noise import Noise
+from .tails import largest_tails, laws_of_trials, TrialLaw, Usual
 
 
 # Folded into the key of a call to draw trials. (Numbers of levels, by which fits are drawn,
 # are smaller.)
 _TRIAL_KEY = 0xFFFFFFFE
-# A trial with wider noise has this many batches.
+# A trial with wider noise has this many batches, more than the trial of one batch beyond
+# whose deviations it looks.
 _BATCHES_OF_WIDE_TRIAL = 2
 
 
@@ -100,11 +94,12 @@ class ValueFunctions(AbstractSampling):
         chosen = chosen_basis(problem, self.degree)
         warn_of_long_fit(chosen, stacklevel=5)
         basis = chosen.basis
+        shape = problem.shape_of_sample
         trials = _Trials(
             problem,
             _fits(problem, key, basis),
             outputs=problem.num_outputs,
-            shapes=problem.shapes_of_samples(len(KindsWithControl)),
+            shapes=Averaged(shape, plain=shape, control=shape, tails=shape),
             key=jr.fold_in(key, _TRIAL_KEY),
             devices=devices,
             batch_size=self.batch_size,
@@ -127,8 +122,8 @@ class ValueFunctions(AbstractSampling):
         wide = [trials.run(choice, usual, law, size) for law in wider_laws]
         return trials.plan(choice, usual, own_law, self.num_paths)._replace(
             reason=_reason(basis, choice),
-            far=_largest_tails(wide),
-            left=compared.left(problem.dtype),
+            tails=largest_tails(wide),
+            remainder=compared.remainder(problem.dtype),
         )
 
 
@@ -143,7 +138,7 @@ class _Trials(NamedTuple):
     problem: Problem
     functions: FittedFunctions
     outputs: tuple[int, int]
-    shapes: PyTree[jax.ShapeDtypeStruct]
+    shapes: Averaged
     key: PRNGKeyArray
     devices: tuple
     batch_size: int
@@ -203,7 +198,7 @@ class _Compared(NamedTuple):
     plain: np.ndarray
     mean: np.ndarray
 
-    def left(self, dtype: Any) -> float:
+    def remainder(self, dtype: Any) -> float:
         """The largest fraction of a standard error that is left with control."""
         # Where nothing is random, as of a constant, both errors are rounding errors.
         is_random = self.plain > ROUNDING * jnp.finfo(dtype).eps * np.abs(self.mean)
@@ -233,29 +228,19 @@ def _usual(
     """The mean without control, and the largest deviation in the trials of what each
     component uses."""
     trials = [total(estimate.moments) for estimate in tried]
-    combinations = jtu.tree_leaves(trials[0].mean)[0].shape[1]
+    combinations, *_ = jtu.tree_leaves(trials[0].mean.value)[0].shape
 
-    def of_kind(tree: PyTree[np.ndarray], kind: KindsWithControl) -> np.ndarray:
-        return _flat(jtu.tree_map(lambda x: x[kind], tree), outputs, combinations)
+    def flat(tree: PyTree[np.ndarray]) -> np.ndarray:
+        return _flat(tree, outputs, combinations)
 
     # Without control all trials are the same.
-    center = of_kind(trials[0].mean, KindsWithControl.PLAIN)
-    without = of_kind(trials[0].largest, KindsWithControl.PLAIN)
-    each = [of_kind(trial.largest, KindsWithControl.CONTROLLED) for trial in trials]
+    center = flat(trials[0].mean.plain)
+    without = flat(trials[0].largest.plain)
+    each = [flat(trial.largest.value) for trial in trials]
     best = np.asarray(choice.best)[None, None]
     with_fit = np.take_along_axis(np.stack(each), best, 0)[0]
     largest = np.where(choice.used, with_fit, without)
     return Usual(center.astype(dtype), largest.astype(dtype))
-
-
-def _largest_tails(wide: list[Expectation]) -> PyTree[np.ndarray]:
-    """The largest deviations in the tails, over trials by several laws."""
-
-    def largest(*means: np.ndarray) -> np.ndarray:
-        # A trial without a value is ignored.
-        return ft.reduce(np.fmax, [mean[KindsWithControl.TAILS] for mean in means])
-
-    return jtu.tree_map(largest, *[total(estimate.moments).mean for estimate in wide])
 
 
 def _reason(basis: AbstractBasis, choice: Choice) -> str:
@@ -268,20 +253,10 @@ def _reason(basis: AbstractBasis, choice: Choice) -> str:
     )
 
 
-def value_function(problem: Problem, key: PRNGKeyArray) -> FittedFunctions | None:
-    """A quadratic value function for each level, or `None` if the random variables do not
-    have finitely many outcomes."""
-    try:
-        chosen = chosen_basis(problem, 2)
-    except ValueError:
-        return None
-    warn_of_long_fit(chosen, stacklevel=6)
-    functions = _fits(problem, key, chosen.basis)
-    return functions.chosen(np.zeros(problem.num_outputs, int))
-
-
 def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> FittedFunctions:
     """The fits of all levels."""
+    # Newton's method is a quarter of the time to compile a fit, and few of its states need
+    # it. A state at which the sweeps fail is left out of the fit.
     lean = dataclasses.replace(problem, solver=without_newton(problem.solver))
     functions, lost = _fits_by(lean, key, basis)
     if lost == 0 or eqx.tree_equal(lean.solver, problem.solver):

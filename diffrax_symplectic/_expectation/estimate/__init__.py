@@ -1,0 +1,18 @@
+"""From sums over samples to the result that users see.
+
+- `moments`: means and variances of batches, and how they are combined.
+- `error_bars`: means and standard errors, from moments.
+- `estimate`: the result, `Expectation`; `saved`: results in files.
+- `tolerance`: whether a result is accurate enough; `cautions`: what users are warned of.
+"""
+
+from .cautions import cautions
+from .error_bars import heaviness
+from .estimate import (
+    check_same,
+    combined_results,
+    Expectation,
+    ExpectationInterrupted,
+)
+from .moments import joined, Moments, total
+from .tolerance import is_reached, is_stuck, needs_level, share_of

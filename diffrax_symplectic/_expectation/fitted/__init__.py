@@ -1,0 +1,17 @@
+"""Paths with control variates from fitted value functions.
+
+- `value_functions`: the sampling. Its trials decide which fits are used.
+- `noise`: the random variables of a step, and expectations over them.
+- `bases`, `grid`: the functions that are fitted; `polynomials`: what both are made of;
+  `basis_choice`: which of them.
+- `fits`: value functions, from a pilot run and a loop backward in time.
+- `controlled_paths`: paths, and their control variates.
+- `tails`: trials of what paths too rare to be drawn would add to the error.
+
+Axes of arrays, beside those of `_simulation/problem.py`: `C` candidates, among which trials
+choose, `P` polynomials, `K` outcomes of a step. Of random variables there are `n` as well.
+"""
+
+from .basis_choice import MOST_DIMENSIONS_OF_GRID
+from .noise import count_outcomes
+from .value_functions import ValueFunctions

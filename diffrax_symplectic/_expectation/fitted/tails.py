@@ -1,0 +1,142 @@
+"""Heavy tails: paths too rare to be in a sample, which matter all the same.
+
+A trial draws the noise by another law, by which extreme paths are common, and weighs each
+path by its likelihood ratio. What deviates in it by more than ordinary paths do adds to the
+standard error.
+"""
+
+import collections
+import functools as ft
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from ..._brownian import Discrete
+from ..._simulation import Problem
+from ..._terms import number_of_noises
+from ..estimate import Expectation, total
+from ..sampling import ROUNDING
+from .noise import Noise, tilted, widened
+
+
+# The relative entropy of a whole path's wider noise with respect to its own law, in nats.
+# Typical paths of the wider noise are then e^8 = 3,000 times less likely by their own law:
+# rare enough to show the tails, and not so rare that no weight is left.
+_NATS = 8.0
+# With this tilt the largest of three outcomes, sqrt(3) times as large as the standard
+# deviation, is e^7 = 1,000 times as likely next to the middle one as before: nearly all
+# outcomes are the largest.
+_MOST_TILTED = 4.0
+# Halvings of an interval until only rounding errors in single precision remain.
+_HALVINGS = 30
+# The most noises of which paths are pushed to all sides: each more doubles the trials.
+_MOST_NOISES = 2
+
+# The probabilities that a law has after a change by a number.
+_Change: TypeAlias = Callable[[Discrete, float], np.ndarray]
+
+
+class TrialLaw(NamedTuple):
+    """A law of the noise: what `Noise.draw` takes, on each level."""
+
+    share: Float[Array | np.ndarray, "*levels"]
+    tilts: Float[Array | np.ndarray, "*levels n"]
+
+
+def laws_of_trials(p: Problem) -> list[TrialLaw]:
+    """The noise's own law, a wider one, and for one noise or two those in which each noise
+    pushes to one side."""
+    laws = Noise.of(p, p.level(0)).laws
+    no_share = np.zeros(len(p.levels.h), p.dtype)
+    no_tilts = np.zeros((len(no_share), len(laws)), p.dtype)
+    share = _strongest(p, laws, widened, 1.0)
+    of_trials = [TrialLaw(no_share, no_tilts), TrialLaw(share, no_tilts)]
+    m = number_of_noises(p.terms)
+    if m <= _MOST_NOISES:
+        tilt = _strongest(p, laws, _tilted_from_own, _MOST_TILTED)
+        for sides in itertools.product((-1, 1), repeat=m):
+            tilts = no_tilts.copy()
+            # The increments come first, and then variables that are only in products.
+            tilts[:, :m] = np.outer(tilt, sides)
+            of_trials.append(TrialLaw(no_share, tilts))
+    return of_trials
+
+
+def _tilted_from_own(law: Discrete, tilt: float) -> np.ndarray:
+    return tilted(law, np.array(law.probabilities), tilt)
+
+
+def _strongest(
+    p: Problem, laws: tuple[Discrete, ...], changed: _Change, most: float
+) -> Float[np.ndarray, " levels"]:
+    """For each level the largest `z`, up to `most`, for which the laws `changed(law, z)`
+    give all variables of a path, on all levels together, a relative entropy of at most 8
+    nats with respect to their own laws."""
+    steps = p.levels.num_steps
+    counts = collections.Counter(laws)
+    # By bisection, for all levels at once, since `z` depends on the number of steps.
+    low = np.zeros(len(steps))
+    high = np.full(len(steps), most)
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        of_step = np.array([_relative_entropy(counts, changed, z) for z in middle])
+        is_too_much = steps * of_step > _NATS / len(steps)
+        low = np.where(is_too_much, low, middle)
+        high = np.where(is_too_much, middle, high)
+    return low.astype(p.dtype)
+
+
+def _relative_entropy(
+    counts: collections.Counter[Discrete], changed: _Change, z: float
+) -> float:
+    """How far the variables of a step, so many of each law, are from their own laws if
+    these are changed: the sum of `q log(q / p)`, in nats."""
+    nats = 0.0
+    for law, count in counts.items():
+        p = np.array(law.probabilities)
+        q = changed(law, z)
+        nats += count * np.sum(q * np.log(q / p))
+    return nats
+
+
+class Usual(NamedTuple):
+    """What ordinary paths show, beyond which deviations are in the tails.
+
+    - `center`: the mean without control.
+    - `largest`: the largest deviation from it, or with control from the fitted mean.
+    """
+
+    center: Float[Array | np.ndarray, "combinations S m"]
+    largest: Float[Array | np.ndarray, "combinations S m"]
+
+    def tails(
+        self,
+        deviations: Float[Array, "combinations S n m"],
+        plain: Float[Array, "combinations S n m"],
+        log_ratio: Float[Array, " n"],
+    ) -> Float[Array, "combinations S n m"]:
+        """The deviations of paths that are in the tails, times the likelihood ratios of
+        these paths, and zero for others. `plain` are the values without control."""
+        # Deviations must exceed rounding.
+        rounding = ROUNDING * jnp.finfo(deviations.dtype).eps * jnp.abs(plain)
+        is_beyond = deviations > self.largest[:, :, None] + rounding
+        # Cap ratios at one: paths that are likelier without wider noise are seen without
+        # it.
+        ratio = jnp.exp(-jnp.maximum(log_ratio, 0))[:, None]
+        return jnp.where(is_beyond, ratio * deviations, 0)
+
+
+def largest_tails(trials: list[Expectation]) -> PyTree[np.ndarray]:
+    """The largest of the mean deviations in the tails, over trials by several laws."""
+
+    def largest(*tails: np.ndarray) -> np.ndarray:
+        # A trial without a value is ignored.
+        return ft.reduce(np.fmax, tails)
+
+    each = [total(estimate.moments).mean.tails for estimate in trials]
+    return jtu.tree_map(largest, *each)

@@ -1,0 +1,33 @@
+"""Many paths of one equation: what `expectation` and `ensemble` have in common.
+
+- `arguments`: checks of what users pass.
+- `levels`: step sizes, each half the one before, and extrapolation from them.
+- `problem`: the equation, the function to average and the levels, from the arguments; and
+  single steps.
+- `loop`: the loop over steps, for paths that move in any way, and for independent ones.
+- `engines`: batches of independent paths, by JAX or by a fused kernel.
+"""
+
+from .arguments import (
+    check_gaussian,
+    checked_key,
+    has_discrete_increments,
+    warn_of_truncation,
+)
+from .engines import (
+    Batch,
+    by_drjit,
+    ENGINES,
+    state_itself,
+    warn_of_stragglers,
+)
+from .levels import combined, Combination, Level, level_weights
+from .loop import (
+    along,
+    independent_steps,
+    Motion,
+    PathStates,
+    simulate,
+    values_of_paths,
+)
+from .problem import advice_on_failures, Drawn, Problem, ravel, real_vector

@@ -1,0 +1,109 @@
+"""Levels, each with half the step of the one before, and the extrapolation from them to
+step size zero."""
+
+import enum
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .._products import tensordot
+from .arguments import StepNumbers
+
+
+# Numbers of steps are 32-bit integers.
+_MOST_STEPS = 2**31
+
+
+class Level(eqx.Module):
+    """One step size, or several, along a leading axis.
+
+    - `index`: its number, counted from the coarsest.
+    - `h`: the step size.
+    - `num_steps`: the number of steps.
+    - `saved_steps`: the numbers of steps after which to average.
+    """
+
+    index: Int[Array | np.ndarray, "*levels"]
+    h: Float[Array | np.ndarray, "*levels"]
+    num_steps: Int[Array | np.ndarray, "*levels"]
+    saved_steps: Int[Array | np.ndarray, "*levels saves"]
+
+
+def levels_of(dt0: float, counts: StepNumbers, levels: int, dtype: Any) -> Level:
+    """All levels, along a leading axis: each has half the step of the one before. Raises a
+    `ValueError` for too many steps."""
+    if counts.total * 2.0 ** (levels - 1) >= _MOST_STEPS:
+        raise ValueError(
+            f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "
+            "2^31 steps. Pass fewer levels: two to four are enough to extrapolate."
+        )
+    finer = 2 ** np.arange(levels, dtype=np.int32)
+    return Level(
+        index=np.arange(levels, dtype=np.int32),
+        h=np.asarray(dt0 / finer, dtype),
+        num_steps=finer * counts.total,
+        saved_steps=finer[:, None] * counts.saved,
+    )
+
+
+class Combination(enum.IntEnum):
+    """The rows of `level_weights`."""
+
+    # Extrapolated to step size zero.
+    BEST = 0
+    # With two levels or more: the finest level's mean minus the best, and the change by the
+    # last extrapolation.
+    BIAS = 1
+    EXTRAPOLATION = 2
+    # With three levels or more, for the extrapolations from all but two neighbouring levels
+    # (from one level of three): the change to the last of these three and to the one
+    # before, and the former minus what the order foretells from the latter.
+    LAST = 3
+    BEFORE = 4
+    MISS = 5
+
+
+def level_weights(
+    order: int | float, levels: int
+) -> Float[np.ndarray, "combinations levels"]:
+    r"""The combinations of the means with steps $h, h/2, h/4, \ldots$ that an
+    [`diffrax_symplectic.Expectation`][] holds, for a method of weak order $p$: the rows of
+    `Combination`, as far as $L$ levels have them. The first eliminates the error terms in
+    $h^p, \ldots, h^{p + L - 2}$, or for $p = 1/2$ the terms in
+    $h^{1/2}, \ldots, h^{(L - 1)/2}$.
+
+    [Talay and Tubaro (1990)](https://doi.org/10.1080/07362999008809220) show that the error
+    has an expansion in powers of $h$.
+    """
+    best = _extrapolated(order, levels)
+    if levels == 1:
+        return best[None]
+    # The finer levels alone, which eliminate one power of the step size less.
+    before = np.append(0.0, _extrapolated(order, levels - 1))
+    rows = [best, np.eye(levels)[-1] - best, best - before]
+    if levels > 2:
+        of_some = _extrapolated(order, levels - 2)
+        coarse, middle, fine = (np.pad(of_some, (k, 2 - k)) for k in range(3))
+        last = fine - middle
+        change_before = middle - coarse
+        # The first power of the step size that is left in these.
+        power = order + levels - 3
+        rows += [last, change_before, last - 2.0**-power * change_before]
+    return np.stack(rows)
+
+
+def _extrapolated(order: int | float, levels: int) -> Float[np.ndarray, " levels"]:
+    """The weights of the means that add up to one, and cancel all error terms."""
+    powers = np.append(0.0, order + min(order, 1) * np.arange(levels - 1))
+    system = 2.0 ** -np.outer(powers, np.arange(levels))
+    return np.linalg.solve(system, np.eye(levels)[0])
+
+
+def combined(
+    weights: Float[Array | np.ndarray, "combinations levels"],
+    x: Float[Array, "levels ..."],
+) -> Float[Array, "combinations ..."]:
+    """The combinations, with these weights, of values on all levels."""
+    return tensordot(weights.astype(x.dtype), x, 1)
