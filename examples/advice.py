@@ -49,6 +49,7 @@ class Problem(NamedTuple):
 
 
 ONE = (jnp.array(0.5), jnp.array(1.0))
+ZERO = (jnp.array(0.0), jnp.array(0.0))
 
 
 def hamiltonian(H0, noise):
@@ -73,6 +74,15 @@ def rubbing(H0, noise, friction=0.5):
         return diffrax.MultiTerm(*rest.terms, *ds.bath_terms(energy, friction).terms)
 
     return terms
+
+
+def two_baths(path):
+    """Two oscillators with a bond, and a bath of its own for each."""
+
+    def energy(t, p, q, args):
+        return jnp.sum(p**2 + q**2) / 2 + (q[0] - q[1]) ** 2 / 2
+
+    return ds.langevin_terms(energy, 0.5, jnp.array([1.5, 0.5]), path)
 
 
 def coloured(friction):
@@ -127,6 +137,8 @@ PROBLEMS = {
     "oscillator in a bath, transient": Problem(bath(well), ONE, time=3.0),
     "oscillator in a bath, stationary": Problem(bath(well), ONE, time=None),
     "stiff oscillator in a bath": Problem(bath(well), ONE, time=None, budgets=STIFF),
+    "strong friction": Problem(bath(well, 20.0), ONE, time=None),
+    "two baths": Problem(two_baths, PAIR, (2,), time=None),
     "noisy spring": Problem(hamiltonian(well, spring), ONE),
     "noisy spring with friction": Problem(rubbing(well, spring), ONE),
     "Kubo oscillator": Problem(hamiltonian(well, kubo), ONE, time=3.0),
@@ -142,7 +154,9 @@ def cost(solver, num_noises: int) -> float:
     """Evaluations of the vector field in one step."""
     vectors = sum(solver.stage_vectors(num_noises))
     share = 2 if solver.structure == "separable" else 1
-    return 1 + SWEEPS * vectors / share
+    # An explicit method evaluates the force at each of its positions.
+    explicit = len(solver.tableau.alpha) if isinstance(solver, ds.PlateauVerlet) else 1
+    return explicit + SWEEPS * vectors / share
 
 
 def generator(problem: Problem) -> np.ndarray:
@@ -312,6 +326,8 @@ class NonlinearProblem(NamedTuple):
     - `terms`: a function of the shape of the noise.
     - `phi`, `mean`: a function of the state, and its stationary mean.
     - `time`: when it is averaged. The rest of the transient is below the errors.
+    - `noises`: the shape of the noise.
+    - `sampling`: of `expectation`.
     """
 
     terms: Callable[[Any], diffrax.MultiTerm]
@@ -319,6 +335,13 @@ class NonlinearProblem(NamedTuple):
     phi: Callable
     mean: float
     time: float
+    noises: tuple[int, ...] = ()
+    sampling: Any = ds.ValueFunctions(num_paths=1024)
+
+
+# For more than two components of the state.
+SAMPLED = ds.IndependentPaths(40_000)
+REST = (jnp.zeros(2), jnp.zeros(2))
 
 
 def van_der_pol(path):
@@ -330,7 +353,50 @@ def van_der_pol(path):
     return diffrax.MultiTerm(*base.terms, diffrax.ODETerm(swing))
 
 
+def changing_mass(rate: float) -> Callable:
+    """Two coordinates, of which the second sets the mass of the first, exp(2 q'), with this
+    rate of friction, at temperature 1. The law of q' is normal, with mean 1."""
+
+    def energy(t, p, q, args):
+        return (p[0] ** 2 * jnp.exp(-2 * q[1]) + p[1] ** 2 + q[1] ** 2) / 2
+
+    def friction(t, q, args):
+        return rate * jnp.stack([jnp.exp(2 * q[1]), 1.0])
+
+    return lambda path: ds.langevin_terms(energy, friction, 1.0, path)
+
+
+def pushed(p, q):
+    return p**2 / 2 - q
+
+
+def double_well(p, q):
+    return p**2 / 2 + q**4 / 4 - q**2 / 2
+
+
+def _square_in_double_well() -> float:
+    q = np.linspace(-6, 6, 4001)
+    weight = np.exp(q**2 / 2 - q**4 / 4)
+    return float(np.sum(q**2 * weight) / np.sum(weight))
+
+
 NONLINEAR = {
+    "masses that depend on positions": NonlinearProblem(
+        changing_mass(1.0), REST, lambda t, y, args: y[1][1], 1.0, 15.0, (2,), SAMPLED
+    ),
+    "masses that depend on positions, strong friction": NonlinearProblem(
+        changing_mass(10.0), REST, lambda t, y, args: y[1][1], 1.0, 60.0, (2,), SAMPLED
+    ),
+    "a double well at a temperature": NonlinearProblem(
+        bath(double_well),
+        ONE,
+        lambda t, y, args: y[1] ** 2,
+        _square_in_double_well(),
+        20.0,
+    ),
+    "a current": NonlinearProblem(
+        bath(pushed), ZERO, lambda t, y, args: y[0], 2.0, 20.0
+    ),
     # In the stationary state the energy is constant: 2 <(1 - x^2) v^2> + 1 = 0.
     "Van der Pol with noise": NonlinearProblem(
         van_der_pol, ONE, lambda t, y, args: (y[1] ** 2 - 1) * y[0] ** 2, 0.5, 15.0
@@ -340,21 +406,21 @@ NONLINEAR_BUDGET = 0.01
 
 
 def nonlinear_table(name: str) -> dict[str, list[float]]:
-    """By solver, the error of the mean at equal cost, and the standard error of 1,024 paths
-    with value functions."""
+    """By solver, the error of the mean at equal cost, and the standard error."""
     problem = NONLINEAR[name]
-    terms = problem.terms(())
+    terms = problem.terms(problem.noises)
+    noises = max(int(np.prod(problem.noises)), 1)
     rows = {}
     for suggestion in ds.suggest_solver(terms, 0.0, problem.y0, want="weak"):
         solver = suggestion.solver
-        steps = round(problem.time / (NONLINEAR_BUDGET * cost(solver, 1)))
-        if "H" in solver.variables:
+        steps = round(problem.time / (NONLINEAR_BUDGET * cost(solver, noises)))
+        of_values = isinstance(problem.sampling, ds.ValueFunctions)
+        if of_values and "H" in solver.variables:
             # Of these there are no value functions.
             continue
         found = ds.expectation(
             problem.phi, terms, solver, 0.0, problem.time, problem.time / steps,
-            problem.y0, key=jr.key(1), sampling=ds.ValueFunctions(num_paths=1024),
-            levels=1,
+            problem.y0, key=jr.key(1), sampling=problem.sampling, levels=1,
         )  # fmt: skip
         off = abs(float(found.mean) - problem.mean)
         rows[solver_name(solver)] = [off, float(found.std_error)]
@@ -428,8 +494,8 @@ def draw(kept: dict) -> None:
     figure, axes = plt.subplots(5, 3, figsize=(8, 12), layout="constrained")
     every = sorted({solver for rows in kept["weak"].values() for solver in rows})
     styles: dict[str, Any] = {
-        solver: dict(color=f"C{i % 10}", ls=("-", "--")[i // 10], marker=".")
-        for i, solver in enumerate(every)
+        solver: dict(color=colour, marker=".")
+        for solver, colour in zip(every, [*map("C{}".format, range(10)), "k", "0.6"])
     }
     for ax, name in zip(axes.flat, PROBLEMS):
         budgets = PROBLEMS[name].budgets
@@ -443,7 +509,9 @@ def draw(kept: dict) -> None:
     for ax in axes.flat[len(PROBLEMS) :]:
         ax.axis("off")
     lines = [Line2D([], [], label=solver, **styles[solver]) for solver in every]
-    figure.legend(handles=lines, loc="lower right", fontsize=8, ncols=2, frameon=False)
+    figure.legend(
+        handles=lines, loc="outside lower center", fontsize=8, ncols=4, frameon=False
+    )
     figure.supxlabel("time for one evaluation", fontsize=9)
     figure.supylabel("error", fontsize=9)
     figure.savefig(DOCS / "img" / "advice.png", dpi=100)

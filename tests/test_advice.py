@@ -118,6 +118,8 @@ SAID = {
     "free particle in a bath": "Not for .* transients to more than three digits",
     "oscillator in a bath, transient": "Not for .* transients to more than three digits",
     "oscillator in a bath, stationary": "Not for functions of p alone",
+    "strong friction": "Not for functions of p alone",
+    "two baths": "Not for functions of p alone",
     "coloured forcing with friction, late": "Not for .* stationary laws of linear systems",
     "Kubo oscillator": "Not for long steps, omega h > 1",
 }
@@ -153,13 +155,17 @@ def test_first_suggestion_is_nearly_the_best_or_says_for_what_it_is_not(want):
 def test_in_a_nonlinear_system_the_first_suggestion_says_for_what_it_is_not():
     for name, problem in advice.NONLINEAR.items():
         rows = KEPT["nonlinear"][name]
-        first = ds.suggest_solver(problem.terms(()), 0.0, problem.y0, want="weak")[0]
+        first = ds.suggest_solver(
+            problem.terms(problem.noises), 0.0, problem.y0, want="weak"
+        )[0]
         # What is left of the error, whatever it consists of.
         whole = {solver: max(errors) for solver, errors in rows.items()}
         std_error = {solver: errors[1] for solver, errors in rows.items()}
         own = advice.solver_name(first.solver)
         good = whole[own] <= 2 * min(whole.values())
-        good &= std_error[own] <= 2 * min(std_error.values())
+        # Unless it is the best, a coarse fit has to be said.
+        if whole[own] > min(whole.values()):
+            good &= std_error[own] <= 2 * min(std_error.values())
         assert good or re.search(NONLINEAR, first.reason), (name, rows)
 
 

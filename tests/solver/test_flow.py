@@ -265,6 +265,32 @@ def test_masses_that_depend_on_positions_keep_their_law_at_every_friction(gamma)
     assert np.all(error < 1e-2)
 
 
+@pytest.mark.slow
+def test_stationary_means_have_order_two_where_masses_depend_on_positions():
+    # On a grid, without sampling.
+    mass = lambda q: 1 + jnp.tanh(q) ** 2 + jnp.tanh(q) / 2
+    H0 = lambda t, p, q, args: (p**2 / mass(q) + q**2) / 2
+    terms = ds.langevin_terms(H0, lambda t, q, args: mass(q), 1.0, ())
+    q = np.linspace(-9, 9, 20_001)
+    weight = np.exp(-(q**2) / 2) * np.sqrt(mass(q))
+    exact = np.array([np.sum(q * weight), np.sum(q**2 * weight)]) / np.sum(weight)
+
+    def error(h):
+        got = ds.expectation(
+            lambda t, y, args: jnp.stack([y[1], y[1] ** 2]),
+            terms, ds.BAOAB(ds.ImplicitMidpoint()), 0, 24, h, (0.0, 0.0), key=KEY,
+            sampling=ds.ValueFunctions(num_paths=1024), levels=1,
+        )  # fmt: skip
+        off = got.mean - exact
+        assert np.all(got.std_error < [2e-5, 4e-5])
+        return off
+
+    long = error(0.4)
+    short = error(0.2)
+    assert np.all(abs(short) < [1.2e-4, 1e-3])
+    assert np.all(abs(long / short - 4) < 0.6)
+
+
 @pytest.mark.parametrize("h", [0.39, 0.5])
 def test_a_ring_of_beads_takes_long_steps_by_cayleys_angles(h):
     # Where the exact flow turns the fastest mode by pi in a step (h = 0.39), it resonates.
