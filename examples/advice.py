@@ -512,8 +512,10 @@ def draw(kept: dict) -> None:
     figure.legend(
         handles=lines, loc="outside lower center", fontsize=8, ncols=4, frameon=False
     )
-    figure.supxlabel("time for one evaluation", fontsize=9)
-    figure.supylabel("error", fontsize=9)
+    for ax in axes[-1]:
+        ax.set_xlabel("time for one evaluation", fontsize=8)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("error", fontsize=8)
     figure.savefig(DOCS / "img" / "advice.png", dpi=100)
     plt.close(figure)
 
