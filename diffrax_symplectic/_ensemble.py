@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import ArrayLike, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree
 
 from ._arguments import brief, whole_number
 from ._compat import is_traced
@@ -106,7 +106,7 @@ def ensemble(
     *,
     key: PRNGKeyArray,
     num_paths: int,
-    ts: Sequence[RealScalarLike] | np.ndarray | None = None,
+    ts: Sequence[RealScalarLike] | np.ndarray | Array | None = None,
     want: Want = "strong",
     engine: str | None = None,
     batch_size: int | None = None,

@@ -9,7 +9,7 @@ from typing import Any
 import diffrax
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, PRNGKeyArray, PyTree
 
 from .._brownian import Discrete, laws_of, UnspecifiedPath
 from .._custom_types import Args, RealScalarLike, Y
@@ -57,7 +57,7 @@ def expectation(
     *,
     key: PRNGKeyArray,
     sampling: AbstractSampling | None = None,
-    ts: Sequence[RealScalarLike] | np.ndarray | None = None,
+    ts: Sequence[RealScalarLike] | np.ndarray | Array | None = None,
     levels: int | None = None,
     tol: float | None = None,
     start: Expectation | None = None,

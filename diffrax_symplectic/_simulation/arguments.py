@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .._arguments import brief, check_real, check_takes, check_untraced, takes_args
 from .._brownian import (
@@ -64,7 +64,7 @@ def checked_key(user: str, key: Any, others: Any) -> PRNGKeyArray:
 
 
 def step_numbers(
-    t0: Any, t1: Any, dt0: Any, ts: Sequence[Any] | np.ndarray | None
+    t0: Any, t1: Any, dt0: Any, ts: Sequence[Any] | np.ndarray | Array | None
 ) -> StepNumbers:
     """Raises a `ValueError` unless all times are numbers, a whole number of steps apart."""
     if dt0 is None:

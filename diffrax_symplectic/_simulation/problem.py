@@ -106,7 +106,7 @@ class Problem(eqx.Module):
         dt0: Any,
         y0: Y | Callable,
         args: Args | Callable,
-        ts: Sequence[Any] | np.ndarray | None,
+        ts: Sequence[Any] | np.ndarray | Array | None,
         levels: int,
         want: Want = "weak",
         user: str = "expectation",
