@@ -41,7 +41,7 @@ def random_fields(t, s, T):
 path = ds.WeakBrownianPath((spins, 3), jr.key(0))
 terms = ds.spin_terms(exchange, random_fields, path, damping=alpha)
 up = jnp.zeros((spins, 3)).at[:, 2].set(1.0)
-ts = jnp.linspace(0, 30, 301)
+ts = jnp.linspace(0, 30, 121)
 sol = diffrax.diffeqsolve(
     terms,
     ds.ImplicitMidpoint(),
@@ -56,8 +56,9 @@ s = jax.vmap(ds.from_spinors)(sol.ys)
 print(f"lengths: off by at most {np.max(abs(np.linalg.norm(s, axis=2) - 1)):.0e}")
 
 # %% The vertical component of each spin
-fig, ax = plt.subplots(figsize=(7, 3))
-picture = ax.imshow(s[:, :, 2].T, aspect="auto", extent=(0, 30, 0, spins), cmap="RdBu")
+fig, ax = plt.subplots(figsize=(5, 2.5))
+where = dict(aspect="auto", extent=(0, 30, 0, spins), cmap="RdBu")
+picture = ax.imshow(s[:, :, 2].T, interpolation="nearest", **where)
 ax.set(xlabel="t", ylabel="spin")
 fig.colorbar(picture)
 plt.show()
