@@ -58,10 +58,9 @@ p, phi = paths.ys  # of shape (paths, times, sites)
 print(f"temperature of the momenta: {np.mean(p[:, 20:] ** 2):.4f} for {T}")
 
 # %% The field of one path
-fig, ax = plt.subplots(figsize=(7, 3))
-picture = ax.imshow(
-    phi[0].T, aspect="auto", extent=(0, 120, x[0], x[-1]), origin="lower"
-)
+fig, ax = plt.subplots(figsize=(5, 2.5))
+where = dict(aspect="auto", extent=(0, 120, x[0], x[-1]), origin="lower")
+picture = ax.imshow(phi[0].T, interpolation="nearest", **where)
 ax.set(xlabel="t", ylabel="site")
 fig.colorbar(picture)
 plt.show()
