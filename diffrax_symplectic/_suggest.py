@@ -60,9 +60,10 @@ from ._terms import (
 )
 
 
-# The most that a higher order may cost. At the cost of a hundred steps of the midpoint rule,
-# `NinomiyaVictoir` had 0.1, 0.16, 0.14 and 1.2 times its error for 2, 3, 4 and 6 noises of
-# linear systems with as many degrees of freedom, at most three; 12 is its cost for four.
+# The most that a higher order may cost. At the cost of a hundred steps of the midpoint
+# rule, `NinomiyaVictoir` had 0.1, 0.16, 0.14 and 1.2 times its error for 2, 3, 4 and 6
+# noises of linear systems with as many degrees of freedom, at most three; 12 is its cost
+# for four.
 _MOST_STAGE_VECTORS = 12
 # For baths whose Hamiltonian is quadratic in the momenta, and otherwise any.
 _BATH_OF_ANY_ENERGY = BAOAB(ImplicitMidpoint())

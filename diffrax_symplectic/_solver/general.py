@@ -10,8 +10,8 @@ from .base import (
     AbstractSymplecticRungeKutta,
     documented,
     free_parameter,
-    Record,
 )
+from .record import Record
 
 
 @documented
