@@ -171,7 +171,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         given = []
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            # Of traced values it is not known whether they are equal.
+            # Whether traced values are equal is not known.
             is_default = eqx.tree_equal(value, field.default) is True
             if field.repr and not is_default:
                 # A module may have a `__repr__` of its own, as this one does.

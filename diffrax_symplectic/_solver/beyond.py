@@ -168,7 +168,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del made_jump
         drift, noise = split_terms(terms)
-        # Of a step that is called by itself, or by `diffrax.HalfSolver`.
+        # A step has no state if it is called by itself, or by `diffrax.HalfSolver`.
         outcome = no_failure() if solver_state is None else solver_state
         flows = self._flows(terms, t0, t1)
 

@@ -186,7 +186,7 @@ def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPa
 
 def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
     """Whether its random variables are cheaper to recompute than to store."""
-    # Of the wrappers, Lévy areas are not: they sum a series.
+    # A wrapper for Lévy areas is not: it sums a series.
     while isinstance(path, TruncatedBrownianPath | PlateauBrownianPath):
         path = path.path
     return isinstance(path, WeakBrownianPath | FixedStepBrownianPath)

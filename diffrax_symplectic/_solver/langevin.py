@@ -129,7 +129,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
             p = moved(p, half, forces)
         elif kicks:
             p = moved(p, h, forces_at_start())
-        # Flow. Of the rates at (p, q), XLA drops the half that is not used.
+        # Flow. XLA drops the half of the rates at (p, q) that is not used.
         follow = ft.partial(moved_by, self.flow, self.steps, rest)
         (p, q), flow_state, _ = follow(t0, middle, half, (p, q), args, flow_state)
         # Friction and noise

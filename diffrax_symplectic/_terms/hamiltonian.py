@@ -332,7 +332,7 @@ class HamiltonianNoise(AbstractNoise):
             p, q = y
             return self._hamiltonians(t, p, q, args, struct)
 
-        # Their gradient would be zero, and the noise missing without a word.
+        # Their gradient would be zero, and noise would be missing without an error.
         if Dependence(hamiltonians, y).independent(lambda y: y):
             raise ValueError(
                 "`noise` does not depend on the state, so there is no noise. Return "

@@ -72,7 +72,7 @@ def _one_product(
         one_array = eqx.is_array(matrix) and isinstance(struct, jax.ShapeDtypeStruct)
         if one_array and matrix.ndim > 0 and matrix.shape[-1:] == struct.shape:
             return matrix[..., number] * increment.astype(matrix.dtype)
-    # Of a term of any other kind, the sum over all noises, of which one is not zero.
+    # Other terms add up all noises, so all increments but this one are zero.
     flat, unravel = raveled(struct)
     only = flat.at[number].set(increment.astype(flat.dtype))
     return term.vf_prod(t, y, args, unravel(only))

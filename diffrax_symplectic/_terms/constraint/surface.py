@@ -63,8 +63,8 @@ class Surface(NamedTuple):
     def of(
         terms: PyTree[diffrax.AbstractTerm], t: RealScalarLike, y: PyTree, args: Args
     ) -> "Surface":
-        """That of constrained terms. Raises a `ValueError` if the constraint does not
-        return an array of shape `(c,)`."""
+        """The surface of constrained terms. Raises a `ValueError` if the constraint does
+        not return an array of shape `(c,)`."""
         constraint = constraint_of(terms)
         assert constraint is not None
         drift, _, _ = split_friction(without_constraint(terms))

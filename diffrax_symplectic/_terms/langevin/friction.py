@@ -362,7 +362,7 @@ def semidefinite_root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
     square = matrix.reshape(n, n)
     eps = jnp.finfo(square.dtype).eps
     diagonal = jnp.diag(square)
-    # Of a pivot, which is a difference of numbers up to the entry of the diagonal.
+    # The error of a pivot, a difference of numbers up to the entry of the diagonal.
     rounding = 10 * n * eps * diagonal
     # No entry of what is left of a semidefinite matrix without its tiny pivots is larger.
     size = jnp.sqrt(jnp.maximum(diagonal, 0))

@@ -43,7 +43,7 @@ def contradicted(
     # Not eagerly, operation by operation, where the user debugs under `jax.disable_jit()`.
     with jax.disable_jit(False):
         found = _contradicts(structure, is_noise, term, t0, y0, args)
-    # Inside a program of the user's, of which these values are constants.
+    # Traced, if these values are constants of a program of the user's.
     return not is_traced(found) and bool(found)
 
 
