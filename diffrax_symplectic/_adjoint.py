@@ -27,14 +27,7 @@ from ._compat import (
     ω,
 )
 from ._custom_types import IntScalarLike, Y
-from ._solver import (
-    AbstractSymplecticRungeKutta,
-    BAOAB,
-    is_solver,
-    LinearFlow,
-    NinomiyaVictoir,
-)
-from ._tableau import is_own_inverse, make_plan
+from ._solver import is_solver
 from ._terms import refuse_constraint
 
 
@@ -166,20 +159,9 @@ def _saves_states_alone(saveat: diffrax.SaveAt) -> bool:
 
 
 def _undoes_its_steps(solver: Any) -> bool:
-    """Whether a step with negated increments leads back to where a step began."""
-    # `isinstance` would look through wrappers, such as `diffrax.HalfSolver`.
-    kind = type(solver)
-    # With negated increments `NinomiyaVictoir` takes its flows in reverse order.
-    if issubclass(kind, BAOAB):
-        flow = solver.flow
-        return not is_solver(flow) or _undoes_its_steps(flow)
-    if issubclass(kind, NinomiyaVictoir):
-        return True
-    if issubclass(kind, LinearFlow):
-        return _undoes_its_steps(solver.solver)
-    if not issubclass(kind, AbstractSymplecticRungeKutta):
-        return False
-    return is_own_inverse(make_plan(solver.tableau.flatten()).tableau)
+    """Whether a step with negated increments leads back to where a step began. This is
+    known of solvers of this package only."""
+    return is_solver(solver) and solver.undoes_its_steps
 
 
 # Equinox passes to the rules below what is passed here, in the same way: `inputs` are

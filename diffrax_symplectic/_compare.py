@@ -355,7 +355,7 @@ def _checked_steps(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
     if np.ndim(dts) != 1 or len(dts) == 0:
         raise ValueError(f"`dt0` must be a list of step sizes; got {dts!r}.")
     for dt in dts:
-        # Of zero no quotient can be asked.
+        # First, since nothing can be divided by zero.
         if not dt or not _is_whole((t1 - t0) / dt) or not _is_whole(dt / min(dts)):
             raise ValueError(
                 f"Every step in `dt0` must divide the interval from {t0} to {t1} and be a "

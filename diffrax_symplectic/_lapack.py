@@ -3,11 +3,14 @@
 On CPUs, JAX 0.10 shares out the matrices of a batch between the threads of XLA's pool, and
 the thread that calls LAPACK waits for the others. XLA runs operations that do not depend on
 each other at the same time, in the same pool. Once every thread of it waits in a call of
-LAPACK nobody is left to do the work, and the program never returns. On two cores two calls
-suffice. JAX 0.11.2 computes a batch in the thread that calls.
+LAPACK, no thread is left to do the work, and the program never returns. On two cores, two
+calls suffice. JAX 0.11.2 computes a batch in the thread that calls.
 
-Options of XLA make such a meeting rarer only. So here each call is made to depend on the
-results of the one before, and no two of them ever run at the same time.
+Options of XLA only make this rarer. So here each call is made to depend on the results of
+the one before, and no two of them ever run at the same time.
+
+This module, `has_blocking_lapack` and the uses of `lapack_in_turn` can go as soon as
+`pyproject.toml` asks for JAX 0.11.2 or later.
 """
 
 import functools as ft

@@ -59,7 +59,7 @@ def once_for_each_signature(fn: Callable[..., Result]) -> Callable[..., Result]:
         if not known:
             # Errors are not remembered.
             results[own] = fn(*args)
-        # What was not asked for the longest time is dropped first.
+        # The least recently used result is dropped first.
         results.move_to_end(own)
         if len(results) > _REMEMBERED:
             results.popitem(last=False)

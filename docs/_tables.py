@@ -10,22 +10,13 @@ import re
 from pathlib import Path
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._solver import AbstractSymplecticSolver, Want
-from diffrax_symplectic._suggest import ranked, SOLVERS
+from diffrax_symplectic._solver import AbstractSymplecticSolver, LANGEVIN, SOLVERS, Want
+from diffrax_symplectic._suggest import ranked
 
 
 _TABLE = re.compile(r"<!-- solvers: (.*?) -->.*?<!-- end -->", re.DOTALL)
 _DOCS = Path(__file__).parent
 _OBJECT = re.compile(r"^::: diffrax_symplectic\.(\w+)$", re.MULTILINE)
-# The page of a solver, by the module that it stands in.
-_PAGES = {
-    "general": "general",
-    "separable": "separable",
-    "additive": "additive",
-    "beyond": "beyond",
-    "langevin": "langevin",
-    "splitting": "langevin",
-}
 _STRUCTURES = {
     "any": "any",
     "separable": "separable",
@@ -38,12 +29,8 @@ _NOISES = {
     "commuting": "commuting noises",
     "not commuting": "noises that do not commute",
 }
-# Langevin splittings, and `LinearFlow`, which is shown around any solver.
-_SPLIT = (
-    ds.BAOAB(),
-    ds.LangevinMiddle(),
-    ds.LinearFlow(ds.NinomiyaVictoir(), lambda time, y, args: y),
-)
+# Shown around any solver.
+_LINEAR_FLOW = ds.LinearFlow(ds.NinomiyaVictoir(), lambda time, y, args: y)
 
 
 def with_tables(markdown: str) -> str:
@@ -61,7 +48,7 @@ def with_tables(markdown: str) -> str:
 def table(name: str) -> str:
     """The table of all solvers, or of those suggested for `weak` or `strong` approximation;
     the names of the solvers for any system; or all public names."""
-    solvers = [*(solver() for solver in SOLVERS), *_SPLIT]
+    solvers = [*(solver() for solver in (*SOLVERS, *LANGEVIN)), _LINEAR_FLOW]
     if name in ("weak", "strong"):
         return _suggested(name)
     if name == "names any":
@@ -78,7 +65,14 @@ def table(name: str) -> str:
 
 
 def _page(solver: AbstractSymplecticSolver) -> str:
-    return _PAGES[type(solver).__module__.split(".")[-1]]
+    """The page that describes a solver."""
+    name = type(solver).__name__
+    (page,) = [
+        page
+        for page in (_DOCS / "solvers").glob("*.md")
+        if name in _OBJECT.findall(page.read_text())
+    ]
+    return page.stem
 
 
 def _names() -> str:

@@ -10,18 +10,21 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._suggest import LANGEVIN, SOLVERS
+from diffrax_symplectic._brownian import drives
+from diffrax_symplectic._solver import LANGEVIN, SOLVERS
 from examples import advice
 from examples.stability import friction
 
 
-# Of those that are explicit, or implicit.
-EXPLICIT = (ds.StormerVerlet, ds.PlateauVerlet, ds.BAOAB, ds.LangevinMiddle)
+# Steps of explicit solvers, and others for implicit ones.
 RESOLVED, STIFF = jnp.array([0.5, 1.8]), jnp.array([1.0, 3.0, 5.0])
+EXPLICIT = [kind for kind in (*SOLVERS, *LANGEVIN) if kind().stage_vectors(1) == ()]
 SUGGESTED = [kind for kind in (*SOLVERS, *LANGEVIN) if kind().record.suggested]
-# Its random variables have no finite set of outcomes; without noise brackets it is the
-# midpoint rule.
-MEASURED = [solver for solver in SUGGESTED if solver is not ds.LevyAreaMidpoint]
+# The Lévy areas of `LevyAreaMidpoint` have no finite set of outcomes; without noise
+# brackets it is the midpoint rule.
+MEASURED = [
+    kind for kind in SUGGESTED if "noise brackets" not in map(drives, kind().variables)
+]
 
 
 def _well(t, p, q, args):

@@ -4,6 +4,7 @@ import csv
 import importlib
 import inspect
 import json
+import pkgutil
 import re
 import textwrap
 from pathlib import Path
@@ -13,7 +14,10 @@ import jax.random as jr
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._suggest import LANGEVIN, SOLVERS
+from diffrax_symplectic import _solver
+from diffrax_symplectic._solver import LANGEVIN, SOLVERS
+from diffrax_symplectic._terms import FRICTION
+from diffrax_symplectic._terms.constrained_drift import KEEP
 from examples.notebooks import read_cells, SCRIPTS
 
 from .families import slow_except
@@ -115,6 +119,24 @@ def test_docs_list_every_solver():
             if not name.startswith("Abstract"):
                 assert f"| [`{name}`](" in page, name
                 assert f"::: diffrax_symplectic.{name}\n" in families
+
+
+def test_every_class_of_solvers_is_public_and_in_the_tables():
+    known = {*SOLVERS, *LANGEVIN, ds.LinearFlow}
+    for info in pkgutil.iter_modules(_solver.__path__):
+        module = importlib.import_module(f"{_solver.__name__}.{info.name}")
+        for name, kind in vars(module).items():
+            if isinstance(kind, type) and issubclass(kind, ds.AbstractSymplecticSolver):
+                if kind.record is not None:
+                    assert getattr(ds, name, None) is kind and kind in known, name
+
+
+def test_messages_name_the_solvers_that_keep_a_constraint_or_treat_friction():
+    kinds = (*SOLVERS, *LANGEVIN)
+    names = {kind.__name__ for kind in kinds}
+    named = lambda message: {*re.findall(r"`(\w+)\(", message)} & names
+    assert named(KEEP) == {kind.__name__ for kind in kinds if kind.keeps_constraints}
+    assert named(FRICTION) == {kind.__name__ for kind in LANGEVIN}
 
 
 def test_records_say_what_the_docstrings_say():

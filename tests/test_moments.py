@@ -1,6 +1,8 @@
 """Second moments on linear models, exactly: one step, and whole solves."""
 
 import functools
+from collections.abc import Callable
+from typing import ClassVar
 
 import diffrax
 import jax
@@ -227,3 +229,54 @@ def test_moments_work_under_jit_and_vmap():
     hs = jnp.array([0.1, 0.2])
     together = jax.jit(jax.vmap(maps))(hs)
     np.testing.assert_allclose(together[1], maps(hs[1]), atol=1e-13)
+
+
+class _NoiseInTwoPlaces(ds.AbstractSymplecticSolver):
+    """Only noise, as the sum of two parts of it."""
+
+    parts: Callable
+    structure: ClassVar[str] = "separable"
+    variables: ClassVar[tuple[str, ...]] = ("W", "H")
+
+    def stage_vectors(self, num_noises):
+        return ()
+
+    def order(self, terms):
+        return 1
+
+    def init(self, terms, t0, t1, y0, args):
+        return None
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y1 = self.parts(terms.terms[1], t0, t1)
+        return y1, None, dict(y0=y0, y1=y1), None, diffrax.RESULTS.successful
+
+
+def test_noise_in_two_places_of_a_step_comes_from_one_draw():
+    # As `AbstractSymplecticSolver` says.
+    def drawn_twice(noise, t0, t1):
+        middle = t0 + (t1 - t0) / 2
+        return noise.contr(t0, middle), noise.contr(middle, t1)
+
+    def drawn_once(noise, t0, t1):
+        drawn = noise.contr(t0, t1, use_levy=True)
+        difference = jnp.sqrt(3) * drawn.H
+        return drawn.W / 2 + difference, drawn.W / 2 - difference
+
+    h = 0.25
+    area = diffrax.SpaceTimeLevyArea
+    path = ds.FixedStepBrownianPath((), jr.key(0), levy_area=area)
+    terms = ds.hamiltonian_terms(lambda t, p, q, args: p**2 / 2, _push, path)
+
+    def squares(parts):
+        products = lambda t, y, args: jnp.stack([y[0] ** 2, y[0] * y[1], y[1] ** 2])
+        solver = _NoiseInTwoPlaces(parts)
+        return ds.step_expectation(terms, solver, 0.0, h, Y0, fn=products)
+
+    np.testing.assert_allclose(squares(drawn_once), [h / 2, 0, h / 2], atol=1e-14)
+    # The same increment, that of the whole step, in both places.
+    np.testing.assert_allclose(squares(drawn_twice), [h, h, h], atol=1e-14)
+
+
+def _push(t, p, q, args):
+    return -q

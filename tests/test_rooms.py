@@ -2,6 +2,7 @@
 runs upwards, and none reaches past the `__init__.py` of a folder."""
 
 import ast
+import graphlib
 from pathlib import Path
 
 import pytest
@@ -98,3 +99,31 @@ def test_nothing_reaches_past_the_entrance_of_a_folder(house):
     for file in house.rglob("*.py"):
         for module in imported(file, house):
             assert len(module) == 1, f"{file} imports {'.'.join(module)}"
+
+
+def in_room(room: str) -> list[Path]:
+    """The files of a room but for its entrance, which imports from all of it."""
+    files = (ROOT / room).rglob("*.py")
+    return sorted(file for file in files if file != ROOT / room / "__init__.py")
+
+
+FOLDERS = [x for row in FLOORS for x in row if (ROOT / x).is_dir()]
+
+
+@pytest.mark.parametrize("room", FOLDERS)
+def test_the_modules_of_a_room_import_each_other_one_way_only(room):
+    needs: dict[str, set[str]] = {}
+    for file in in_room(room):
+        # An inner folder counts as one module.
+        own = file.relative_to(ROOT / room).parts[0].removesuffix(".py")
+        used = {other for other, *_ in imported(file, ROOT / room)}
+        needs.setdefault(own, set()).update(used - {own})
+    # Raises a `CycleError` that names the modules of a cycle.
+    graphlib.TopologicalSorter(needs).prepare()
+
+
+def test_nothing_reaches_past_the_entrance_of_an_inner_folder():
+    for room in FOLDERS:
+        for file in in_room(room):
+            for module in imported(file, ROOT / room):
+                assert len(module) == 1, f"{file} imports {'.'.join(module)}"

@@ -11,8 +11,8 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import increment_struct, UnspecifiedPath
-from diffrax_symplectic._solver import own_path
-from diffrax_symplectic._suggest import _shape_code, ranked, SOLVERS
+from diffrax_symplectic._solver import own_path, SOLVERS
+from diffrax_symplectic._suggest import _shape_code, ranked
 from diffrax_symplectic._terms import (
     brownian_paths,
     path_numbers,

@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .._arguments import check_untraced
-from .._compat import source_lines
 from .._fused import (
     Kernels,
     Lanes,
@@ -27,7 +26,7 @@ from .._fused import (
     without_rescue,
 )
 from .._lapack import lapack_in_turn
-from .._stablehlo import NotReplayed
+from .._stablehlo import NotReplayed, source_lines
 from .levels import Level
 from .loop import values_of_paths
 from .problem import Problem

@@ -1,24 +1,54 @@
+"""One step of each method, and the Brownian path that it needs.
+
+Solvers, each with its `record`:
+
+- `general`, `separable`, `additive`: those by Wang, Hong and Xu and others, as tableaus.
+- `beyond`: for noises that do not commute, or more accurate paths.
+- `langevin`: splittings for heat baths; `splitting`: `LinearFlow`, for systems without one.
+
+What they are made of:
+
+- `base`: the base classes, and the step of a tableau; `record`: facts about a solver.
+- `driven`, `brackets`: what drives the stages of a step.
+- `step`: a step by the plan of a tableau, and its stage equations.
+- `flow`, `linear_flow`: flows within a splitting; `bath`: friction and noise there.
+- `constrained`: steps of systems with a constraint.
+- `paths`: the path that a solver needs; `times`: whether times resolve a step.
+"""
+
+import diffrax
+
 from .base import AbstractImplicitStages, AbstractSymplecticRungeKutta
-from .base import AbstractSymplecticSolver, Record, Want
+from .base import AbstractSymplecticSolver
+from .record import Record, Want
 from .general import ImplicitMidpoint, SRKs1, SRKw1, SRKw2
-from .separable import PlateauVerlet, SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet
-from .additive import AdditiveGauss, SRKs4, SRKw5
-from .beyond import LevyAreaMidpoint, NinomiyaVictoir, PlateauGauss, StrangGauss
+from .beyond import StrangGauss, NinomiyaVictoir, PlateauGauss, LevyAreaMidpoint
+from .separable import SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet, PlateauVerlet
+from .additive import SRKs4, SRKw5, AdditiveGauss
 from .langevin import AbstractLangevinSplitting, BAOAB, LangevinMiddle
+from .splitting import LinearFlow
 from .flow import is_solver
 from .linear_flow import linear_flow
 from .paths import common_path, own_path
 from .root_finders import with_changed_stages, without_newton
 from .times import check_resolution
-from .splitting import LinearFlow
 
 
+# All solvers, in the order of the imports above, which is that of the documentation.
+# Abstract classes have no record.
+_ALL = [
+    kind
+    for kind in tuple(globals().values())
+    if isinstance(kind, type) and issubclass(kind, AbstractSymplecticSolver)
+    if kind.record is not None
+]
 # Those that need friction, from `langevin_terms`.
-LANGEVIN: tuple[type[BAOAB] | type[LangevinMiddle], ...] = (BAOAB, LangevinMiddle)
-# All others, in the order of the documentation.
-SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
-    *(ImplicitMidpoint, SRKs1, SRKw1, SRKw2),
-    *(StrangGauss, NinomiyaVictoir, PlateauGauss, LevyAreaMidpoint),
-    *(SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet, PlateauVerlet),
-    *(SRKs4, SRKw5, AdditiveGauss),
+LANGEVIN: tuple[type[AbstractSymplecticSolver], ...] = tuple(
+    kind for kind in _ALL if issubclass(kind, AbstractLangevinSplitting)
+)
+# All others that do not wrap another solver.
+SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = tuple(
+    kind
+    for kind in _ALL
+    if not issubclass(kind, AbstractLangevinSplitting | diffrax.AbstractWrappedSolver)
 )

@@ -12,9 +12,9 @@ from .base import (
     documented,
     free_parameter,
     real_number,
-    Record,
 )
 from .general import GAUSS
+from .record import Record
 
 
 def _nonzero(value: Any) -> float:

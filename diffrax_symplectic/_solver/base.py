@@ -1,5 +1,4 @@
-"""The base classes of all solvers, the record of facts about a solver, and the step of a
-tableau."""
+"""The base classes of all solvers, and the step of a tableau."""
 
 import abc
 import dataclasses
@@ -10,10 +9,7 @@ from typing import (
     Any,
     cast,
     ClassVar,
-    Literal,
-    NamedTuple,
     TYPE_CHECKING,
-    TypeAlias,
     TypeVar,
 )
 
@@ -32,18 +28,15 @@ from .._tableau import (
     AbstractTableau,
     drift_order,
     FlatTableau,
+    is_own_inverse,
     make_plan,
     Stage,
     Structure,
 )
-from .._terms import (
-    check_structure,
-    drift_driven,
-    noise_driven,
-    number_of_noises,
-    split_terms,
-)
-from .step import no_failure, result_of, Solved, Step, take_step
+from .._terms import check_structure, number_of_noises, split_terms
+from .driven import drift_driven, noise_driven
+from .record import Record, Want
+from .step import no_failure, Outcome, result_of, Step, take_step
 from .times import result_at
 
 
@@ -54,72 +47,10 @@ else:
     from equinox import AbstractVar
 
 
-Want: TypeAlias = Literal["weak", "strong"]
-Noises: TypeAlias = Literal["any", "commuting", "not commuting"]
-# One order for all noises; or the orders for noises that commute and for others.
-Order: TypeAlias = int | float | tuple[int | float, int | float]
-
-
-class Record(NamedTuple):
-    """Facts about a solver that do not follow from its coefficients. Orders, suggestions,
-    the tables of the documentation and the tests of all solvers are made from it.
-
-    - `weak`: its weak order.
-    - `strong`: its strong order, or `None` for a weak method.
-    - `choose`: when to choose it, in a sentence.
-    - `noises`: the noises for which it is recommended. It accepts any.
-    - `suggested`: the kinds of convergence for which `suggest_solver` returns it.
-    - `stationary`: the second moments, of `"qq"`, `"pq"` and `"pp"`, of a harmonic mode in
-        a heat bath whose stationary values are exact for every stable step.
-    - `heats`: whether noise gives a harmonic mode without friction the right energy for
-        steps that do not resolve it; `None` if such steps are unstable.
-    - `most_friction`: the greatest friction, as a rate times the step, up to which the
-        stationary energies of a resolved harmonic mode in a heat bath are within a tenth,
-        of those in `examples/stability/friction.py`; `None` if there is no limit. Given
-        for suggested solvers.
-
-    The last three are measured, in `tests/test_advice.py`, for the solvers that are
-    `suggested`. Leave them out for others: the page then promises and warns of nothing.
-    The random variables of `LevyAreaMidpoint` have no finite set of outcomes, so it states
-    those of the midpoint rule, which a test compares its steps with.
-    """
-
-    weak: Order
-    strong: Order | None
-    choose: str
-    noises: Noises = "any"
-    suggested: tuple[Want, ...] = ()
-    stationary: tuple[str, ...] = ()
-    heats: bool | None = None
-    most_friction: float | None = None
-
-    @property
-    def reason(self) -> str:
-        """When to choose it, where noise gives stiff modes the wrong energy, and for which
-        friction the temperature is wrong."""
-        sentences = [self.choose]
-        if self.heats is False and "pp" in self.stationary:
-            sentences.append("Right for noise on stiff modes only in a heat bath.")
-        elif self.heats is False:
-            sentences.append("Not for noise on stiff modes.")
-        if self.most_friction is not None:
-            limit = f"{self.most_friction:g}"
-            sentences.append(f"In a heat bath not for friction gamma h > {limit}.")
-        return " ".join(sentences)
-
-    def order(self, want: Want, commute: bool) -> int | float | None:
-        """The order for noises that commute, or for others."""
-        order = self.weak if want == "weak" else self.strong
-        if not isinstance(order, tuple):
-            return order
-        commuting, others = order
-        return commuting if commute else others
-
-
 # The solver state is whether all stage equations were solved so far: in a batch Diffrax
 # continues to step failed paths.
-class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
-    """The base class of all solvers of this package, and of your own solvers that are not
+class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
+    r"""The base class of all solvers of this package, and of your own solvers that are not
     Runge--Kutta methods.
 
     A subclass is a Diffrax solver, with `order`, `init` and `step`, which accept any
@@ -129,6 +60,14 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
     `weak_order(terms)` and `strong_order(terms)`. Then [`diffrax_symplectic.LinearFlow`][]
     can wrap it, [`diffrax_symplectic.BAOAB`][] can take it as its flow, and
     `solver.path(shape, key)` makes the path that it needs.
+
+    **One draw in a step.** A `step` from `t0` to `t1` calls `contr(t0, t1)` of each noise
+    term, with these times, and uses what it returns wherever it needs noise.
+    [`diffrax_symplectic.expectation`][] and the tests of one step put a path in the place
+    of the user's that returns given variables of one step, whatever the times. A step that
+    asks for its two halves gets the same noise twice there, without an error. Two
+    independent halves of the increment, each of variance $h / 2$, are $\frac12 W \pm
+    \sqrt 3 H$ with `variables = ("W", "H")`.
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
@@ -145,6 +84,12 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
     def stage_vectors(self, num_noises: int) -> tuple[int, ...]:
         """The number of unknown stage vectors in each system of equations of a step, in the
         order in which the systems are solved."""
+
+    @property
+    def undoes_its_steps(self) -> bool:
+        """Whether a step with negated increments leads back to where a step began, which
+        [`diffrax_symplectic.ReversingAdjoint`][] needs."""
+        return False
 
     @property
     def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
@@ -226,7 +171,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Solved]):
         given = []
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            # Of traced values it is not known whether they are equal.
+            # Whether traced values are equal is not known.
             is_default = eqx.tree_equal(value, field.default) is True
             if field.repr and not is_default:
                 # A module may have a `__repr__` of its own, as this one does.
@@ -283,12 +228,16 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         sizes = [sum(map(len, block.unknown)) for block in blocks]
         return tuple(size for size in sizes if size > 0)
 
+    @property
+    def undoes_its_steps(self) -> bool:
+        return is_own_inverse(make_plan(self.tableau.flatten()).tableau)
+
     def order(self, terms: PyTree[diffrax.AbstractTerm]) -> int:
         """Order of convergence without noise, computed from the coefficients."""
         del terms
         return drift_order(self.tableau.flatten())
 
-    def init(self, terms, t0, t1, y0: Y, args: Args) -> Solved:
+    def init(self, terms, t0, t1, y0: Y, args: Args) -> Outcome:
         del t1
         # Here, not in `step`, since a solve calls it only once.
         self.check(terms, t0, y0, args)
@@ -296,8 +245,8 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         return no_failure() if implicit else None
 
     def step(
-        self, terms, t0, t1, y0: Y, args: Args, solver_state: Solved, made_jump
-    ) -> tuple[Y, None, dict[str, Y], Solved, diffrax.RESULTS]:
+        self, terms, t0, t1, y0: Y, args: Args, solver_state: Outcome, made_jump
+    ) -> tuple[Y, None, dict[str, Y], Outcome, diffrax.RESULTS]:
         del made_jump
         drift, noise = split_terms(terms)
         plan = make_plan(_drop_absent(self.tableau.flatten(), drift, noise))
@@ -313,9 +262,9 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         # batch, so is the place of the step.
         name = type(self).__name__
         driven |= noise_driven(from_drift, h, noise, variables, t0, t1, args, name)
-        y1, solved = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
-        result = result_at(terms, t0, t1, result_of(solved, y1))
-        return y1, None, dict(y0=y0, y1=y1), solved, result
+        y1, outcome = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
+        result = result_at(terms, t0, t1, result_of(outcome, y1))
+        return y1, None, dict(y0=y0, y1=y1), outcome, result
 
 
 def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTableau:

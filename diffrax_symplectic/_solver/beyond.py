@@ -19,22 +19,17 @@ from .._tableau import (
     Stage,
     Structure,
 )
-from .._terms import (
-    apply_one,
-    drawn_variables,
-    drift_driven,
-    number_of_noises,
-    split_terms,
-)
+from .._terms import apply_one, number_of_noises, split_terms
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
     AbstractSymplecticSolver,
     documented,
-    Record,
 )
+from .driven import drawn_variables, drift_driven
 from .general import GAUSS, ImplicitMidpoint
-from .step import no_failure, result_of, Solved, Step, take_step
+from .record import Record
+from .step import no_failure, Outcome, result_of, Step, take_step
 from .times import result_at
 
 
@@ -155,6 +150,11 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     def stage_vectors(self, num_noises):
         return (2,) * (num_noises + 2)
 
+    @property
+    def undoes_its_steps(self):
+        # With negated increments it takes its flows in reverse order.
+        return True
+
     def order(self, terms):
         """The order without noise, which is the order of the flows."""
         del terms
@@ -168,44 +168,44 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del made_jump
         drift, noise = split_terms(terms)
-        # Of a step that is called by itself, or by `diffrax.HalfSolver`.
-        solved = no_failure() if solver_state is None else solver_state
+        # A step has no state if it is called by itself, or by `diffrax.HalfSolver`.
+        outcome = no_failure() if solver_state is None else solver_state
         flows = self._flows(terms, t0, t1)
 
-        def drift_flow(flow: _Flow, y: Y, solved: Solved) -> tuple[Y, Solved]:
+        def drift_flow(flow: _Flow, y: Y, outcome: Outcome) -> tuple[Y, Outcome]:
             if len(drift) == 0:
-                return y, solved
+                return y, outcome
             h = flow.t1 - flow.t0
             driven = drift_driven(drift, flow.t0, flow.t1, args)
             step = Step(flow.t0, h, {"h": driven})
-            return take_step(_FLOW, step, y, self, solved)
+            return take_step(_FLOW, step, y, self, outcome)
 
-        def noise_flow(flow: _Flow, y: Y, solved: Solved) -> tuple[Y, Solved]:
+        def noise_flow(flow: _Flow, y: Y, outcome: Outcome) -> tuple[Y, Outcome]:
             if len(noise) == 0:
-                return y, solved
+                return y, outcome
             driven = jtu.Partial(apply_one, noise, flow.number, flow.increment, args)
             # Time stands still, so all stages are at the middle of the step.
             step = Step(flow.t0, jnp.zeros_like(flow.t0), {"h": driven})
-            return take_step(_FLOW, step, y, self, solved)
+            return take_step(_FLOW, step, y, self, outcome)
 
         # A loop compiles each kind of flow only once.
         def one_flow(carry, flow: _Flow):
             return lax.cond(flow.is_drift, drift_flow, noise_flow, flow, *carry), None
 
-        (y1, solved), _ = lax.scan(one_flow, (y0, solved), flows)
-        result = result_at(terms, t0, t1, result_of(solved, y1))
-        return y1, None, dict(y0=y0, y1=y1), solved, result
+        (y1, outcome), _ = lax.scan(one_flow, (y0, outcome), flows)
+        result = result_at(terms, t0, t1, result_of(outcome, y1))
+        return y1, None, dict(y0=y0, y1=y1), outcome, result
 
     def _flows(self, terms, t0, t1) -> _Flow:
         """All flows of a step, in order, stacked along a first axis."""
         middle = t0 + (t1 - t0) / 2
         numbers, increments = self._in_order(terms, t0, t1)
-        still = [middle] * (numbers.size + 1)
+        at_middle = [middle] * (numbers.size + 1)
         # The drift comes first and last, and ignores the number.
         return _Flow(
             is_drift=np.pad(np.full(numbers.size, False), 1, constant_values=True),
-            t0=jnp.stack([t0, *still]),
-            t1=jnp.stack([*still, t1]),
+            t0=jnp.stack([t0, *at_middle]),
+            t1=jnp.stack([*at_middle, t1]),
             number=jnp.pad(numbers, 1),
             increment=jnp.pad(increments, 1),
         )

@@ -19,9 +19,7 @@ from .._terms import (
     check_start,
     constrained,
     constraint_of,
-    drawn_variables,
-    drift_driven,
-    Frame,
+    NormalSpace,
     rate,
     split_friction,
     split_terms,
@@ -30,6 +28,7 @@ from .._terms import (
 )
 from .base import AbstractSymplecticSolver
 from .bath import after_friction
+from .driven import drawn_variables, drift_driven
 from .flow import begun, Flow, handed_on, kicks_and_rest, moved_by
 from .step import no_failure
 
@@ -45,11 +44,11 @@ def init_constrained(
     not take, and for starts off the constraint; a path fails if that is not known."""
     check_pair(y0)
     solver.check(without_constraint(terms), t0, y0, args)
-    dependent, off = check_start(terms, t0, y0, args)
+    is_dependent, is_off = check_start(terms, t0, y0, args)
     results: Any = optx.RESULTS
     # With dependent constraints it is not known where the surface is.
-    fault = results.where(off, results.nonlinear_divergence, no_failure())
-    return results.where(dependent, results.singular, fault)
+    fault = results.where(is_off, results.nonlinear_divergence, no_failure())
+    return results.where(is_dependent, results.singular, fault)
 
 
 def verlet_step(
@@ -72,7 +71,7 @@ def verlet_step(
     # A path that failed before needs no multipliers: in a batch, others would wait for it.
     pending = before == optx.RESULTS.successful
 
-    p, q, first = surface.fly(p, surface.frame(q), half, pending)
+    p, q, first = surface.free_flight(p, surface.normal_space(q), half, pending)
     # The momentum is not tangent here. It need not be: forces do not depend on it, and the
     # multipliers of the next flight make up for it.
     y = (unravel_p(p), unravel_q(q))
@@ -81,8 +80,8 @@ def verlet_step(
     p = p + jfu.ravel_pytree(impulse)[0]
     if len(noise) > 0:
         p = p + _kick(noise, t0, t1, y, args, name)
-    p, q, second = surface.fly(p, surface.frame(q), half, pending)
-    p = surface.tangent(p, surface.frame(q))
+    p, q, second = surface.free_flight(p, surface.normal_space(q), half, pending)
+    p = surface.tangent(p, surface.normal_space(q))
     y1 = (unravel_p(p), unravel_q(q))
     return _ended(y1, first & second, before)
 
@@ -92,12 +91,12 @@ class ConstrainedState(NamedTuple):
 
     - `force`: that of the kicks, as a vector, if there are kicks.
     - `flow`: the state of the solver that is the flow, if there is one.
-    - `solved`: whether the multipliers were found in all steps so far.
+    - `outcome`: whether the multipliers were found in all steps so far.
     """
 
     force: Array | None
     flow: PyTree[Array]
-    solved: optx.RESULTS
+    outcome: optx.RESULTS
 
 
 def begin_baoab(
@@ -117,10 +116,10 @@ def begin_baoab(
             f"The flow {flow!r} does not keep the `constraint` of the terms. Use "
             "`BAOAB()` or `BAOAB(StormerVerlet())`."
         )
-    solved = init_constrained(solver, terms, t0, y0, args)
+    outcome = init_constrained(solver, terms, t0, y0, args)
     kicks, rest = _kicks_and_rest(flow, terms)
     force = _force(kicks, t0, y0, args) if kicks else None
-    return ConstrainedState(force, begun(flow, rest, t0, t1, y0, args), solved)
+    return ConstrainedState(force, begun(flow, rest, t0, t1, y0, args), outcome)
 
 
 def baoab_step(
@@ -144,13 +143,17 @@ def baoab_step(
     q, unravel_q = jfu.ravel_pytree(y0[1])
     half = jnp.asarray((t1 - t0) / 2, p.dtype)
     middle = t0 + (t1 - t0) / 2
-    pending = before.solved == optx.RESULTS.successful
+    pending = before.outcome == optx.RESULTS.successful
 
     def follow(
-        p: Array, at: Frame, begin: RealScalarLike, end: RealScalarLike, state: PyTree
+        p: Array,
+        at: NormalSpace,
+        begin: RealScalarLike,
+        end: RealScalarLike,
+        state: PyTree,
     ) -> tuple[Array, Array, PyTree, Bool[Array, ""]]:
         if flow is None:
-            p, q, found = surface.fly(p, at, half, pending)
+            p, q, found = surface.free_flight(p, at, half, pending)
             return p, q, state, found
         y = (unravel_p(p), unravel_q(at.q))
         y, state, result = moved_by(flow, steps, rest, begin, end, half, y, args, state)
@@ -164,8 +167,10 @@ def baoab_step(
     if kicks:
         force = handed_on(before.force, made_jump, lambda: _force(kicks, t0, y0, args))
         p = p + half * force
-    p, q, flow_state, first = follow(p, surface.frame(q), t0, middle, before.flow)
-    at = surface.frame(q)
+    p, q, flow_state, first = follow(
+        p, surface.normal_space(q), t0, middle, before.flow
+    )
+    at = surface.normal_space(q)
     p = surface.tangent(p, at)
     y = (unravel_p(p), unravel_q(q))
     # O
@@ -186,10 +191,10 @@ def baoab_step(
     if kicks:
         force = _force(kicks, t1, (unravel_p(p), unravel_q(q)), args)
         p = p + half * force
-    p = surface.tangent(p, surface.frame(q))
+    p = surface.tangent(p, surface.normal_space(q))
     y1 = (unravel_p(p), unravel_q(q))
-    y1, solved = _ended(y1, first & second, before.solved)
-    return y1, ConstrainedState(force, flow_state, solved)
+    y1, outcome = _ended(y1, first & second, before.outcome)
+    return y1, ConstrainedState(force, flow_state, outcome)
 
 
 def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:

@@ -10,8 +10,8 @@ from .base import (
     AbstractSymplecticRungeKutta,
     documented,
     free_parameter,
-    Record,
 )
+from .record import Record
 
 
 @documented
@@ -120,7 +120,7 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
 
 _ROOT3 = np.sqrt(3)
-# Of the Gauss method with two stages, of order 4. Its times are the sums of the rows.
+# The Gauss method with two stages, of order 4. Its times are the sums of the rows.
 GAUSS = np.array([[1 / 4, 1 / 4 - _ROOT3 / 6], [1 / 4 + _ROOT3 / 6, 1 / 4]])
 
 

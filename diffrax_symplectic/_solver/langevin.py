@@ -16,14 +16,14 @@ from .._terms import (
     apply,
     check_structure,
     constraint_of,
-    drawn_variables,
     momentum_first,
     rate,
     split_friction,
 )
-from .base import AbstractSymplecticSolver, Record
+from .base import AbstractSymplecticSolver
 from .bath import after_friction, check_friction
 from .constrained import baoab_step, begin_baoab
+from .driven import drawn_variables
 from .flow import (
     begun,
     check_flow,
@@ -35,6 +35,7 @@ from .flow import (
     moved,
     moved_by,
 )
+from .record import Record
 from .step import result_of
 from .times import result_at
 
@@ -72,6 +73,12 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         if not is_solver(self.flow):
             return ()
         return 2 * self.steps * self.flow.stage_vectors(num_noises)  # pyright: ignore
+
+    @property
+    def undoes_its_steps(self) -> bool:
+        if not self.symmetric:
+            return False
+        return not is_solver(self.flow) or self.flow.undoes_its_steps  # pyright: ignore
 
     def order(self, terms):
         return 2 if self.symmetric else 1
@@ -122,7 +129,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
             p = moved(p, half, forces)
         elif kicks:
             p = moved(p, h, forces_at_start())
-        # Flow. Of the rates at (p, q), XLA drops the half that is not used.
+        # Flow. XLA drops the half of the rates at (p, q) that is not used.
         follow = ft.partial(moved_by, self.flow, self.steps, rest)
         (p, q), flow_state, _ = follow(t0, middle, half, (p, q), args, flow_state)
         # Friction and noise
@@ -293,7 +300,7 @@ class BAOAB(AbstractLangevinSplitting):
             made_jump,
             type(self).__name__,
         )
-        result = result_at(terms, t0, t1, result_of(state.solved, y1))
+        result = result_at(terms, t0, t1, result_of(state.outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), state, result
 
 

@@ -12,7 +12,8 @@ from .._brownian import (
     PlateauBrownianPath,
     PlateauIncrement,
 )
-from .base import AbstractSymplecticSolver, Want
+from .base import AbstractSymplecticSolver
+from .record import Want
 
 
 def own_path(

@@ -11,10 +11,10 @@ from .base import (
     AbstractSymplecticRungeKutta,
     documented,
     free_parameter,
-    Record,
 )
 from .constrained import init_constrained, verlet_step
-from .step import result_of, Solved
+from .record import Record
+from .step import Outcome, result_of
 from .times import result_at
 
 
@@ -238,7 +238,7 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
         A1=[[1 / 2, 0]],
     )
 
-    def init(self, terms, t0, t1, y0, args) -> Solved:
+    def init(self, terms, t0, t1, y0, args) -> Outcome:
         if constraint_of(terms) is None:
             return super().init(terms, t0, t1, y0, args)
         return init_constrained(self, terms, t0, y0, args)
@@ -247,9 +247,9 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
         if constraint_of(terms) is None:
             return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
         at = terms, t0, t1, y0, args
-        y1, solved = verlet_step(*at, solver_state, type(self).__name__)
-        result = result_at(terms, t0, t1, result_of(solved, y1))
-        return y1, None, dict(y0=y0, y1=y1), solved, result
+        y1, outcome = verlet_step(*at, solver_state, type(self).__name__)
+        result = result_at(terms, t0, t1, result_of(outcome, y1))
+        return y1, None, dict(y0=y0, y1=y1), outcome, result
 
 
 # The three kicks, as combinations of random variables: with M = W / 2 + H, these are M - C,

@@ -17,9 +17,10 @@ from .._terms import (
     slow_apart,
     split_friction,
 )
-from .base import AbstractSymplecticSolver, Order, Record
+from .base import AbstractSymplecticSolver
 from .flow import check_returns_pair, FlowFunction, returns_nan
 from .langevin import AbstractLangevinSplitting
+from .record import Order, Record
 
 
 class LinearFlowState(NamedTuple):
@@ -135,6 +136,10 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
     @property
     def root_find_max_steps(self) -> int:
         return self.solver.root_find_max_steps  # pyright: ignore
+
+    @property
+    def undoes_its_steps(self) -> bool:
+        return self.solver.undoes_its_steps
 
     def stage_vectors(self, num_noises):
         return self.solver.stage_vectors(num_noises)

@@ -75,14 +75,14 @@ class Stages(eqx.Module):
         `solve(image, scale, guess, pending)` and returns these for one block."""
         values: Values = {}
         unknown = []
-        solved = jnp.array(True)
+        all_solved = jnp.array(True)
         for block, k in zip(self.plan.blocks, guess):
             if block.unknown:
                 k, block_solved = self._solve_block(block, values, solve, k, pending)
-                solved = solved & block_solved
+                all_solved = all_solved & block_solved
             unknown.append(k)
             values = self._with_block(block, values, k, keep=True)
-        return unknown, solved
+        return unknown, all_solved
 
     def _solve_block(
         self,
@@ -108,8 +108,8 @@ class Stages(eqx.Module):
         def scale(k: Any) -> Any:
             return pack(self._scale(block, unpack(k)))
 
-        k, solved = solve(image, scale, pack(guess), pending)
-        return unpack(k), solved
+        k, is_solved = solve(image, scale, pack(guess), pending)
+        return unpack(k), is_solved
 
     def image(self, unknown: Unknown) -> Unknown:
         r"""$\Phi$ for the whole step."""
@@ -266,8 +266,9 @@ def _position(
     return add("y") if stages[0].writes == "y" else (add("p"), add("q"))
 
 
-# The result of the stage equations, or of an earlier failed step; `None` if there are none.
-Solved: TypeAlias = optx.RESULTS | None
+# The outcome of the stage equations, or of an earlier failed step; `None` if there are
+# none.
+Outcome: TypeAlias = optx.RESULTS | None
 
 
 def take_step(
@@ -275,8 +276,8 @@ def take_step(
     step: Step,
     y0: Y,
     solver: diffrax.AbstractSolver,
-    before: Solved = None,
-) -> tuple[Y, Solved]:
+    before: Outcome = None,
+) -> tuple[Y, Outcome]:
     """The end of the step, and whether its stage equations were solved, by the root finder
     of `solver`. A path that failed `before` is skipped."""
     if plan.num_unknown == 0:
@@ -302,14 +303,14 @@ def _failed(result: optx.RESULTS) -> Bool[Array, ""]:
     return result != optx.RESULTS.successful
 
 
-def result_of(solved: Solved, y1: Y) -> diffrax.RESULTS:
+def result_of(outcome: Outcome, y1: Y) -> diffrax.RESULTS:
     """The result of a step."""
     R = diffrax.RESULTS
     # Finite stages may still have an end that overflows.
     finite = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
-    if solved is None:
+    if outcome is None:
         return finite
-    return R.where(_failed(solved), R.promote(solved), finite)
+    return R.where(_failed(outcome), R.promote(outcome), finite)
 
 
 # Diffrax traces a step three times or more.
@@ -318,8 +319,8 @@ def _traced_once(
     plan: StepPlan, step: Step, y0: Y, before, finder: Any, max_steps: int
 ):
     stages = Stages(plan, closed(step, y0), y0)
-    y1, _, solved = _implicit_step(stages, before, finder=finder, max_steps=max_steps)
-    return y1, solved
+    y1, _, outcome = _implicit_step(stages, before, finder=finder, max_steps=max_steps)
+    return y1, outcome
 
 
 @eqx.filter_custom_jvp
@@ -366,13 +367,13 @@ def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
 
     # What is not differentiated has `None` for a tangent, which `jax.jvp` does not take.
     fixed = jtu.tree_map(_is_none, t_stages, is_leaf=_is_none)
-    still, moving = eqx.partition(stages, fixed, is_leaf=_is_none)
+    fixed_part, moving = eqx.partition(stages, fixed, is_leaf=_is_none)
 
     def image(moving: Stages) -> Unknown:
-        return eqx.combine(moving, still).image(root)
+        return eqx.combine(moving, fixed_part).image(root)
 
     def end(moving: Stages, unknown: Unknown) -> Y:
-        return eqx.combine(moving, still).end(unknown)
+        return eqx.combine(moving, fixed_part).end(unknown)
 
     # With k = Phi(k, x): dk = (dPhi / dk) dk + (dPhi / dx) dx.
     _, rhs = jax.jvp(image, (moving,), (t_stages,))

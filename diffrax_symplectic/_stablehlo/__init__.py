@@ -18,7 +18,8 @@ of `elementwise.py`, or of `complex.py`; any other rule is a function with the d
 `rule`:
 `moves.py` (entries go to known places), `windows.py` (an index that differs between paths),
 `reductions.py` (sums, products, sorting), `control_flow.py` (loops and branches) and
-`linear_algebra.py` (what JAX calls LAPACK for). Without a rule, `Replay` raises
+`linear_algebra.py` (what JAX calls LAPACK for). Rules read their operation through
+`operation.py`, and that through `mlir.py`. Without a rule, `Replay` raises
 `NotReplayed`, with the name of the operation and where it comes from.
 
 To add an operation, write its rule, and a line in the table of
@@ -35,6 +36,7 @@ This folder knows nothing of differential equations.
 """
 
 from .backend import array_types, drjit
+from .mlir import source_lines
 from .operation import NotReplayed
 from .replay import Replay
 from .tensor import (

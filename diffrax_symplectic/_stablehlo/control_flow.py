@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from .._compat import block_of, call_target, operations_in
 from .backend import array_types, drjit
+from .mlir import block_of, call_target, operations_in
 from .operation import Operation, rule
 from .tensor import as_own_literal, chosen, copied, flat, known, merged, Tensor, unflat
 

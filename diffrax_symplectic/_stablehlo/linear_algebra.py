@@ -8,8 +8,8 @@ import math
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
-from .._compat import call_target
 from .backend import array_types, drjit
+from .mlir import call_target
 from .operation import NotReplayed, Operation, rule
 from .tensor import Tensor
 

@@ -10,7 +10,9 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from .._compat import (
+from .._compat import is_literal
+from .backend import array_types
+from .mlir import (
     attribute_entry,
     attribute_enum,
     attribute_integers,
@@ -19,10 +21,8 @@ from .._compat import (
     attribute_value,
     constant_values,
     has_attribute,
-    is_literal,
     sole_operation,
 )
-from .backend import array_types
 from .tensor import Tensor
 
 

@@ -7,14 +7,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from .._compat import (
-    block_of,
-    callee_of,
-    constant_values,
-    functions_of,
-    operations_in,
-    stablehlo_module,
-)
+from .._compat import stablehlo_module
+from .mlir import block_of, callee_of, constant_values, functions_of, operations_in
 from .operation import NotReplayed, Operation
 from .operations import rule_of
 from .tensor import ArrayType, in_memory, MOST_IN_REGISTERS, Table, Tensor

@@ -1,41 +1,45 @@
-from .constraint import (
-    constrained,
-    constraint_of,
-    refuse_constraint,
-    without_constraint,
-)
-from .controls import drawn_variables, drift_driven, noise_driven, outcomes
-from .controls import step_variables, StepVariables
+"""What the equation is: vector fields from Hamiltonians, their structure, and the Brownian
+paths that they hold.
+
+What users call:
+
+- `hamiltonian`: `hamiltonian_terms` and `noise_terms`, the symplectic gradients.
+- `langevin`: `langevin_terms` and `bath_terms`; a folder.
+- `spins`, `waves`: `spin_terms` and `wave_terms`, Hamiltonians of another variable, which
+  `lifted` makes of `(p, q)`.
+- `constraint`: `constrained_state`, and the surface that a constraint leaves; a folder.
+
+What solvers and expectations ask of terms, from the bottom up:
+
+- `paths`: the Brownian paths that terms hold.
+- `dependence`: which inputs the results of a function depend on.
+- `evaluation`: calls of the user's functions, with advice on their errors.
+- `constrained_drift`: the drift of a system with a constraint.
+- `drift_and_noise`: which terms are drifts, and which are noises.
+- `vector_fields`: vector fields times controls.
+- `step_variables`: the random variables of a step and their laws.
+- `structure`: whether a system has the structure that a solver needs, and what is wrong
+  with it; a folder.
+"""
+
+from .constrained_drift import constrained, constraint_of
+from .constrained_drift import refuse_constraint, without_constraint
+from .constraint import check_start, constrained_state, NormalSpace, Surface
 from .dependence import acts_elementwise, Dependence
-from .hamiltonian import evaluated, hamiltonian_terms, has_lifted, IndexedNoise
-from .hamiltonian import is_hamiltonian, noise_terms, slow_apart
-from .diffrax_langevin import momentum_first
-from .friction import FrictionAlong, semidefinite_root
-from .langevin import (
-    AbstractFriction,
-    bath_terms,
-    friction_apart,
-    langevin_terms,
-    split_friction,
-)
-from .said_twice import check_baths_have_own_noise, check_drifts_differ
+from .drift_and_noise import control_struct, number_of_noises, split_terms
+from .evaluation import evaluated
+from .hamiltonian import hamiltonian_terms, IndexedNoise, noise_terms, slow_apart
+from .langevin import AbstractFriction, bath_terms, friction_apart, FrictionAlong
+from .langevin import langevin_terms, momentum_first, semidefinite_root, split_friction
+from .lifted import has_lifted
+from .paths import brownian_paths, has_shapes, has_unknown_law, path_keys, path_numbers
+from .paths import random_paths, replace_paths, shapes_as_paths, specified
+from .paths import with_keys, with_paths
 from .spins import as_spins, from_spinors, spin_terms, to_spinors
-from .structure import additive_fault, check_assertions, check_stratonovich
-from .structure import check_structure
+from .step_variables import outcomes, step_variables, StepVariables
+from .structure import additive_fault, check_assertions, check_baths_have_own_noise
+from .structure import check_drifts_differ, check_stratonovich, check_structure
 from .structure import commuting, constant_fault, Fault, FRICTION
-from .structure import separable_fault
-from .surface import check_start, constrained_state, Frame, Surface
-from .paths import (
-    brownian_paths,
-    has_shapes,
-    has_unknown_law,
-    path_keys,
-    path_numbers,
-    random_paths,
-)
-from .paths import replace_paths, shapes_as_paths, specified, with_keys, with_paths
-from .truncation import needs_truncation, without_truncation
-from .vector_fields import apply, apply_one, check_fit, flattened
-from .vector_fields import number_of_noises, rate
-from .vector_fields import split_terms, tree_sum
+from .structure import needs_truncation, separable_fault, without_truncation
+from .vector_fields import apply, apply_one, check_fit, rate, tree_sum
 from .waves import from_pair, to_pair, wave_terms

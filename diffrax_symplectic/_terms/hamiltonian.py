@@ -3,7 +3,7 @@
 import dataclasses
 import functools as ft
 from collections.abc import Callable
-from typing import Any, cast, get_args, Literal
+from typing import Any, cast, get_args, Literal, TYPE_CHECKING
 
 import diffrax
 import equinox as eqx
@@ -17,9 +17,16 @@ from .._arguments import check_pair, check_takes, shapes, whole_number
 from .._brownian import increment_struct
 from .._compat import replaced, unwrapped, ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike
-from .constraint import constrained, Constraint
+from .constrained_drift import constrained, Constraint
 from .dependence import Dependence
+from .evaluation import check_real, evaluated, scalar_energy
 from .paths import as_path
+
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 # Momenta or positions: of one structure and one shape each, which are those of the other.
@@ -193,56 +200,6 @@ class OneNoise(eqx.Module):
     increment: RealScalarLike
 
 
-class Lifted(eqx.Module):
-    """A Hamiltonian in another variable, `H(t, chart(p, q), args)`.
-
-    A Module and not a closure, so that parameters within `H` stay leaves of the terms, and
-    that `has_lifted` finds it.
-    """
-
-    H: Callable
-    chart: Callable[[_State], PyTree]
-
-    def __call__(self, *inputs) -> PyTree[Array]:
-        # An `IndexedNoise` passes the index before the time.
-        *before, p, q, args = inputs
-        return self.H(*before, self.chart((p, q)), args)
-
-
-def has_lifted(terms: PyTree) -> bool:
-    """Whether these terms have Hamiltonians in another variable."""
-    return any(map(_is_lifted, jtu.tree_leaves(terms, is_leaf=_is_lifted)))
-
-
-def _is_lifted(x: Any) -> bool:
-    return isinstance(x, Lifted)
-
-
-def lifted_terms(
-    H0: Callable,
-    noise: Callable | None,
-    path: diffrax.AbstractBrownianPath | PyTree | None,
-    chart: Callable[[_State], PyTree],
-    name: str,
-) -> diffrax.MultiTerm:
-    """The terms of Hamiltonians in `chart((p, q))`, a variable called `name`."""
-    check_takes("H0", H0, "t", name, "args")
-    if noise is None:
-        if path is not None:
-            raise ValueError(
-                f"`noise` must be a function, called as `noise(t, {name}, args)`; got "
-                "None. Without noise, leave out `path`, too."
-            )
-        lifted = None
-    elif isinstance(noise, IndexedNoise):
-        # Still one noise at a time, for the solvers that follow one after another.
-        lifted = IndexedNoise(Lifted(noise.H, chart), noise.m)
-    else:
-        check_takes("noise", noise, "t", name, "args")
-        lifted = Lifted(noise, chart)
-    return hamiltonian_terms(Lifted(H0, chart), lifted, path)
-
-
 class Drift(eqx.Module):
     """The vector field `(-dH0/dq, dH0/dp)`, where `slow` is a part of `H0`."""
 
@@ -300,41 +257,27 @@ def slow_apart(drift: tuple) -> tuple[tuple, tuple]:
     return tuple(rest), tuple(slow)
 
 
-def scalar_energy(out: PyTree, name: str = "H0") -> Array:
-    """The output of a Hamiltonian. Raises a `ValueError` if it is not a real scalar."""
-    if not jtu.all_leaves([out]) or jnp.shape(out) != ():
-        raise ValueError(
-            f"`{name}` must return a scalar; got shape {shapes(out)}. Sum over the degrees "
-            "of freedom. (For a batch of paths write it for one path, and `jax.vmap` the "
-            "solve.)"
-        )
-    _check_real(name, out)
-    # `jax.grad` refuses integers, such as the `0` of a particle without energy.
-    return jnp.asarray(out, jnp.result_type(out, float))
+class AbstractNoise(diffrax.AbstractTerm):
+    """Noise with a Brownian path. Subclasses define `vf`, for each array of the state with
+    a trailing axis of noises, and `vf_prod`, which costs less."""
+
+    path: AbstractVar[diffrax.AbstractBrownianPath]
+
+    def contr(self, t0: RealScalarLike, t1: RealScalarLike, **kwargs) -> BM:
+        return self.path.evaluate(t0, t1, **kwargs)
+
+    def prod(self, vf: PyTree[Array], control: BM) -> PyTree[Array]:
+        flat, _ = jfu.ravel_pytree(control)
+        return jtu.tree_map(lambda v: jnp.tensordot(v, flat.astype(v.dtype), 1), vf)
 
 
-def _check_real(name: str, out: PyTree[Array]) -> None:
-    if not all(map(_is_real, jtu.tree_leaves(out))):
-        raise ValueError(
-            f"`{name}` must return real numbers; got {eqx.tree_pformat(out)}. Take "
-            "`jnp.real` of numbers that are mathematically real, such as <psi| A |psi>."
-        )
-
-
-def _is_real(x: Any) -> bool:
-    return eqx.is_array_like(x) and not jnp.iscomplexobj(x)
-
-
-class HamiltonianNoise(diffrax.AbstractTerm):
-    """The noise term. Its product with the control `I` is the symplectic gradient of
-    `I . H`."""
+class HamiltonianNoise(AbstractNoise):
+    """The noise of Hamiltonians. Its product with the control `I` is the symplectic
+    gradient of `I . H`."""
 
     noise: _Hamiltonian
     path: diffrax.AbstractBrownianPath
     structure: _Structure | None = eqx.field(static=True, default=None)
-
-    def contr(self, t0: RealScalarLike, t1: RealScalarLike, **kwargs) -> BM:
-        return self.path.evaluate(t0, t1, **kwargs)
 
     def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
         # For each array of the state, with a trailing axis of noises: what Diffrax's own
@@ -349,10 +292,6 @@ class HamiltonianNoise(diffrax.AbstractTerm):
 
         dp, dq = jtu.tree_map(noises_last, jax.jacrev(flat)(y))
         return (-(dq**ω)).ω, dp
-
-    def prod(self, vf: PyTree[Array], control: BM) -> _State:
-        flat, _ = jfu.ravel_pytree(control)
-        return jtu.tree_map(lambda v: jnp.tensordot(v, flat.astype(v.dtype), 1), vf)
 
     def vf_prod(
         self, t: RealScalarLike, y: _State, args: Args, control: BM | OneNoise
@@ -393,7 +332,7 @@ class HamiltonianNoise(diffrax.AbstractTerm):
             p, q = y
             return self._hamiltonians(t, p, q, args, struct)
 
-        # Their gradient would be zero, and the noise missing without a word.
+        # Their gradient would be zero, and noise would be missing without an error.
         if Dependence(hamiltonians, y).independent(lambda y: y):
             raise ValueError(
                 "`noise` does not depend on the state, so there is no noise. Return "
@@ -423,7 +362,7 @@ class HamiltonianNoise(diffrax.AbstractTerm):
                 f"shape {shapes(struct)}; got shape {shapes(H)}. Return an array of shape "
                 "`(m,)` and construct the path with `shape=(m,)`."
             )
-        _check_real("noise", H)
+        check_real("noise", H)
         return jtu.tree_map(lambda leaf, s: jnp.reshape(leaf, s.shape), H, struct)
 
 
@@ -436,70 +375,6 @@ def _fit(H: PyTree[Array], struct: PyTree[jax.ShapeDtypeStruct]) -> bool:
     return all(
         jnp.shape(leaf) == s.shape or jnp.size(leaf) == s.size == 1 for leaf, s in pairs
     )
-
-
-def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Array]:
-    """`H(*inputs, args)`, with advice on its errors."""
-    # A copy, so that functions which modify `args` in place are the same in each trace.
-    copy = jtu.tree_map(lambda leaf: leaf, args)
-    try:
-        return H(*inputs, copy)
-    except _NEED_VALUES as error:
-        raise ValueError(
-            f"`{name}` needs concrete values while JAX traces it, in an `if`, `while`, "
-            "`float`, an index `x[x > 0]`, or a NumPy function. Write `jnp.where(a, b, c)` "
-            "or `jax.lax.cond` instead of `if`, and `jnp` instead of `np`."
-        ) from error
-    except (TypeError, AttributeError) as error:
-        if args is None and _uses_args(H, inputs):
-            error.add_note(f"`{name}` was called with `args=None`. Was it left out?")
-        raise
-
-
-# Errors of a function that needs the values of its arguments while JAX traces it.
-_NEED_VALUES = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.NonConcreteBooleanIndexError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-)
-
-
-def _uses_args(H: Callable, inputs: tuple) -> bool:
-    """Whether a function that fails without `args` does anything with them before: it is
-    called once more, with an object whose every use is an error of its own."""
-    try:
-        H(*inputs, _NoArgs())
-    except _Used:
-        return True
-    except Exception:
-        return False
-    return False
-
-
-class _Used(Exception):
-    """Raised by `_NoArgs`."""
-
-
-class _NoArgs:
-    """In the place of `args`: raises an exception of its own at every use, which tells the
-    error of an absent `args` from others."""
-
-
-def _raise_used(*operands: Any) -> Any:
-    del operands
-    raise _Used
-
-
-# Python looks operators up in the class, and all else, as JAX does, by `__getattr__`.
-_OPERATORS = "add sub mul truediv pow matmul".split()
-_USES = [
-    *"getattr getitem iter len call bool float neg lt le gt ge".split(),
-    *_OPERATORS,
-    *(f"r{operator}" for operator in _OPERATORS),
-]
-for _use in _USES:
-    setattr(_NoArgs, f"__{_use}__", _raise_used)
 
 
 def symplectic_gradient(scalar: Callable, y: _State) -> _State:

@@ -1,5 +1,6 @@
 """Spins and rigid bodies: vectors `s` in R^3, as canonical pairs `(p, q)`."""
 
+import functools as ft
 from collections.abc import Callable, Sequence
 
 import diffrax
@@ -8,9 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .._arguments import check_pair, real_array
+from .._arguments import check_pair
 from .._custom_types import Args, RealScalarLike
-from .hamiltonian import evaluated, lifted_terms, scalar_energy
+from .evaluation import evaluated, scalar_energy
+from .lifted import checked_damping, damping_for, lifted_terms
 
 
 _Spins = Float[Array, "*spins 3"]
@@ -82,9 +84,7 @@ def spin_terms(
     return diffrax.MultiTerm(drift, *terms.terms[1:])
 
 
-def _checked_damping(alpha: ArrayLike) -> ArrayLike:
-    kind = "a number, or an array with one for each spin"
-    return real_array("damping", alpha, kind=kind)
+_EACH = "each spin"
 
 
 class _DampedPrecession(eqx.Module):
@@ -92,7 +92,7 @@ class _DampedPrecession(eqx.Module):
     H0`."""
 
     H0: _SpinHamiltonian
-    alpha: ArrayLike = eqx.field(converter=_checked_damping)
+    alpha: ArrayLike = eqx.field(converter=ft.partial(checked_damping, _EACH))
 
     def __call__(self, t: RealScalarLike, y: _Spinors, args: Args) -> _Spinors:
         s = from_spinors(y)
@@ -101,14 +101,7 @@ class _DampedPrecession(eqx.Module):
             return scalar_energy(evaluated("H0", self.H0, t, s, args=args))
 
         gradient = jax.grad(energy)(s)
-        alpha = jnp.asarray(self.alpha, s.dtype)
-        if alpha.shape not in ((), s.shape[:-1]):
-            raise ValueError(
-                "`damping` must be a number, or have one for each spin, of shape "
-                f"{s.shape[:-1]}; got shape {alpha.shape}."
-            )
-        # Traced values cannot raise an error; NaN makes their path fail.
-        alpha = jnp.where(jnp.isfinite(alpha) & (alpha >= 0), alpha, jnp.nan)
+        alpha = damping_for(_EACH, self.alpha, s.shape[:-1], s.dtype)
         # Without damping `omega` is the gradient. The cross product turns it, so that the
         # spin spirals to lower energy.
         s1, s2, s3 = _components(s)

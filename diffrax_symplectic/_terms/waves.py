@@ -1,5 +1,6 @@
 """Complex amplitudes, as canonical pairs `(p, q)`."""
 
+import functools as ft
 import math
 from collections.abc import Callable
 
@@ -10,9 +11,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
-from .._arguments import check_pair, real_array, shapes
+from .._arguments import check_pair, shapes
 from .._custom_types import Args, RealScalarLike
-from .hamiltonian import evaluated, lifted_terms, scalar_energy
+from .evaluation import evaluated, scalar_energy
+from .lifted import checked_damping, damping_for, lifted_terms
 
 
 _Waves = PyTree[Complex[Array, "..."]]
@@ -98,16 +100,14 @@ def wave_terms(
     return diffrax.MultiTerm(drift, *terms.terms[1:])
 
 
-def _checked_damping(alpha: ArrayLike) -> ArrayLike:
-    kind = "a number, or an array with one for each vector of amplitudes"
-    return real_array("damping", alpha, kind=kind)
+_EACH = "each vector of amplitudes"
 
 
 class _DampedWaves(eqx.Module):
     """The velocity of the pair for `dpsi/dt = -i g + alpha (psi g^+ psi - g psi^+ psi)`."""
 
     H0: _WaveHamiltonian
-    alpha: ArrayLike = eqx.field(converter=_checked_damping)
+    alpha: ArrayLike = eqx.field(converter=ft.partial(checked_damping, _EACH))
 
     def __call__(self, t: RealScalarLike, y: _Pair, args: Args) -> _Pair:
         check_pair(y)
@@ -124,14 +124,8 @@ class _DampedWaves(eqx.Module):
             return scalar_energy(H)
 
         by_p, by_q = jax.grad(energy, argnums=(0, 1))(p, q)
-        alpha = jnp.asarray(self.alpha, jnp.result_type(q))
-        if alpha.shape not in ((), jnp.shape(q)[:-1]):
-            raise ValueError(
-                "`damping` must be a number, or have one for each vector of amplitudes, of "
-                f"shape {jnp.shape(q)[:-1]}; got shape {alpha.shape}."
-            )
-        # Traced values cannot raise an error; NaN makes their path fail.
-        alpha = jnp.where(jnp.isfinite(alpha) & (alpha >= 0), alpha, jnp.nan)
+        vectors = jnp.shape(q)[:-1]
+        alpha = damping_for(_EACH, self.alpha, vectors, jnp.result_type(q))
         # In real numbers, as the state: g = (by_q + i by_p) / sqrt(2), psi = (q + i p) /
         # sqrt(2). The first two are the parts of 2 g^+ psi, the third is 2 psi^+ psi.
         half = alpha[..., None] / 2

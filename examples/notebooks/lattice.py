@@ -59,8 +59,8 @@ print(f"temperature of the momenta: {np.mean(p[:, 20:] ** 2):.4f} for {T}")
 
 # %% The field of one path
 fig, ax = plt.subplots(figsize=(5, 2.5))
-where = dict(aspect="auto", extent=(0, 120, x[0], x[-1]), origin="lower")
-picture = ax.imshow(phi[0].T, interpolation="nearest", **where)
+picture = ax.imshow(phi[0].T, aspect="auto", origin="lower", interpolation="nearest")
+ax.set_xticks(range(0, 61, 10), [f"{ts[i]:g}" for i in range(0, 61, 10)])
 ax.set(xlabel="t", ylabel="site")
 fig.colorbar(picture)
 plt.show()

@@ -57,8 +57,8 @@ print(f"lengths: off by at most {np.max(abs(np.linalg.norm(s, axis=2) - 1)):.0e}
 
 # %% The vertical component of each spin
 fig, ax = plt.subplots(figsize=(5, 2.5))
-where = dict(aspect="auto", extent=(0, 30, 0, spins), cmap="RdBu")
-picture = ax.imshow(s[:, :, 2].T, interpolation="nearest", **where)
+picture = ax.imshow(s[:, :, 2].T, aspect="auto", cmap="RdBu", interpolation="nearest")
+ax.set_xticks(range(0, 121, 20), [f"{ts[i]:g}" for i in range(0, 121, 20)])
 ax.set(xlabel="t", ylabel="spin")
 fig.colorbar(picture)
 plt.show()

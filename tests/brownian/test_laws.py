@@ -9,7 +9,8 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import Discrete, laws_of, VARIABLES
-from diffrax_symplectic._terms import drawn_variables, outcomes, step_variables
+from diffrax_symplectic._solver.driven import drawn_variables
+from diffrax_symplectic._terms import outcomes, step_variables
 
 from ..problems import weak_path
 

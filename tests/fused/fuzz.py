@@ -41,6 +41,8 @@ STATES = [
     {"a": numbers(), "b": numbers(1), "c": numbers(2)},
     (numbers(2), numbers(1, 1)),
 ]
+# Solvers whose steps are different programs, not all solvers: which case gets which one
+# depends on their number.
 SEPARABLE = (
     ds.StormerVerlet(),
     ds.SRKs2(),

@@ -7,8 +7,8 @@ import jax.random as jr
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._terms import acts_elementwise
-from diffrax_symplectic._terms.structure import (
+from diffrax_symplectic._terms import (
+    acts_elementwise,
     additive_fault,
     constant_fault,
     Dependence,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._terms.friction import semidefinite_root
+from diffrax_symplectic._terms import semidefinite_root
 
 from ..problems import Given, weak_path
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._terms.structure import commuting
+from diffrax_symplectic._terms import commuting
 
 from ..families import slow_except
 

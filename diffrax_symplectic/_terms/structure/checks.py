@@ -6,32 +6,29 @@ from collections.abc import Callable
 from typing import Any, get_args, NamedTuple
 
 import diffrax
-import equinox as eqx
-import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import PyTree
 
-from .._arguments import check_pair, pair_fault
-from .._brownian import raveled
-from .._compat import at_trace_time, is_traced, unwrapped, ω
-from .._custom_types import Args, RealScalarLike, Y
-from .._tableau import Structure
-from .assertion import contradicted
-from .constraint import without_constraint
-from .dependence import Dependence
-from .hamiltonian import (
+from ..._arguments import check_pair, pair_fault
+from ..._brownian import raveled
+from ..._compat import at_trace_time, is_traced, unwrapped
+from ..._custom_types import Args, RealScalarLike, Y
+from ..._tableau import Structure
+from ..constrained_drift import without_constraint
+from ..dependence import Dependence
+from ..drift_and_noise import control_struct, split_terms
+from ..hamiltonian import (
     asserted_structure,
-    has_lifted,
     is_hamiltonian,
     structure_asserted_in,
 )
-from .langevin import friction_apart, split_friction
+from ..langevin import friction_apart, split_friction
+from ..lifted import has_lifted
+from ..vector_fields import check_increments
+from .assertion import contradicted
 from .said_twice import check_drifts_differ
-from .vector_fields import apply, check_increments, control_struct, split_terms
 
 
 class Fault(NamedTuple):
@@ -122,12 +119,12 @@ def separable_fault(
         return fault
     drift_flows = traced((*rest, *friction))
     noise_flows = traced(noise)
-    still = ft.partial(_is_zero, t0, y0, args)
-    here = _faults(0, drift_flows, noise_flows, still)
+    unmoved = ft.partial(_is_zero, t0, y0, args)
+    here = _faults(0, drift_flows, noise_flows, unmoved)
     if not here:
         return None
     # As it would be for (position, velocity), the order of many other packages.
-    exchanged = _faults(1, drift_flows, noise_flows, still)
+    exchanged = _faults(1, drift_flows, noise_flows, unmoved)
     first = here[0]
     only_friction = all(fault.friction for fault in here)
     wrong_way_round = not only_friction and all(fault.friction for fault in exchanged)
@@ -165,10 +162,10 @@ def _faults(
     p: int,
     drift: list[_Traced],
     noise: list[_Traced],
-    still: Callable[[diffrax.AbstractTerm, int], bool],
+    unmoved: Callable[[diffrax.AbstractTerm, int], bool],
 ) -> list[Fault]:
     """All faults, if momenta are the first half of the state, `p = 0`, or the second,
-    `p = 1`. `still` says whether a noise term leaves a half of the state unchanged."""
+    `p = 1`. `unmoved` says whether a noise term leaves a half of the state unchanged."""
     q = 1 - p
 
     def momenta(t: Any, y: Y, control: Any) -> PyTree:
@@ -205,7 +202,9 @@ def _faults(
         advice = _advice("separable", term)
         # The change of q is linear in the increment, so it is zero if it does not depend
         # on the increment.
-        moves_q = not flow.independent(_increments, of_positions) and not still(term, q)
+        moves_q = not flow.independent(_increments, of_positions) and not unmoved(
+            term, q
+        )
         if moves_q:
             of_plain = "a noise term changes q, the second half of the state"
             faults.append(Fault(of_plain if plain else "dH_k/dp is not zero", advice))
@@ -386,53 +385,3 @@ FRICTION = (
     "`BAOAB(ImplicitMidpoint())`, treat it by a step of its own. (All need a kinetic "
     "energy that is quadratic in p.)"
 )
-
-
-def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
-    """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish at random states, for
-    these `t0` and `args`; false if this cannot be tested. This is not a proof.
-
-    The bracket is bilinear, so it is tested for two random combinations of the noises.
-    """
-    t0 = jnp.asarray(t0, jnp.result_type(float))
-    struct = [control_struct(term, t0) for term in noise]
-    flat, unravel = raveled((jtu.tree_map(jnp.asarray, y0), struct, struct))
-
-    @eqx.filter_jit
-    @jax.vmap
-    def sizes(point: Float[Array, " n"]) -> tuple[Array, Array]:
-        """The sizes of `Db_x b_z` and of the bracket, at a state and two combinations."""
-        y, x, z = unravel(point)
-        along_x = ft.partial(apply, noise, x, args, t0)
-        along_z = ft.partial(apply, noise, z, args, t0)
-        _, first = jax.jvp(along_z, (y,), (along_x(y),))
-        _, second = jax.jvp(along_x, (y,), (along_z(y),))
-        return _largest(first), _largest((first**ω - second**ω).ω)
-
-    try:
-        with jax.disable_jit(False):
-            size, bracket = sizes(_random_points(flat))
-            finite = jnp.isfinite(size) & jnp.isfinite(bracket)
-            # What is left of brackets that cancel are rounding errors of their summands.
-            small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
-            found = jax.block_until_ready(jnp.any(finite) & jnp.all(small | ~finite))
-    except RuntimeError:
-        # From a user's `equinox.error_if`, at states that the user did not choose.
-        return False
-    # Inside `jax.jit` the result is not known.
-    return not is_traced(found) and bool(found)
-
-
-def _random_points(flat: Float[Array, " n"]) -> Float[Array, "8 n"]:
-    """Four points of either sign, and four between 0 and 1, where most functions are
-    defined."""
-    shape = (4, *flat.shape)
-    anywhere = jr.normal(jr.key(0), shape, flat.dtype)
-    positive = jr.uniform(jr.key(0), shape, flat.dtype)
-    return jnp.concatenate([anywhere, positive])
-
-
-def _largest(y: Y) -> Array:
-    """The largest entry of a state, without its sign."""
-    flat, _ = jfu.ravel_pytree(y)
-    return jnp.max(jnp.abs(flat))

@@ -7,12 +7,12 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from .._brownian import is_key, typed_key
-from .._compat import is_traced, unwrapped
-from .hamiltonian import drift_hamiltonians
-from .langevin import BathNoise
-from .paths import brownian_paths
-from .vector_fields import flattened
+from ..._brownian import is_key, typed_key
+from ..._compat import is_traced, unwrapped
+from ..drift_and_noise import flattened
+from ..hamiltonian import drift_hamiltonians
+from ..langevin import BathNoise
+from ..paths import brownian_paths
 
 
 def check_drifts_differ(terms: PyTree[diffrax.AbstractTerm]) -> None:

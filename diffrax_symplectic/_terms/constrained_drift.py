@@ -38,7 +38,7 @@ class ConstrainedDrift(diffrax.AbstractTerm):
 
     def vf(self, t, y, args) -> PyTree[Array]:
         # Diffrax looks at the structure of this before a solve, with any solver, so it
-        # cannot be the error. Nobody may use the values.
+        # cannot be the error. Its values must not be used.
         return jtu.tree_map(_nan_like, y)
 
     def contr(self, t0, t1, **kwargs) -> Any:

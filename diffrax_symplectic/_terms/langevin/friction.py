@@ -12,10 +12,10 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from .._arguments import check_takes, real_array, shapes
-from .._compat import is_traced
-from .._custom_types import Args, BM, RealScalarLike
-from .hamiltonian import evaluated
+from ..._arguments import check_takes, real_array, shapes
+from ..._compat import is_traced
+from ..._custom_types import Args, BM, RealScalarLike
+from ..evaluation import evaluated
 
 
 _P = PyTree[Array]
@@ -45,7 +45,7 @@ FrictionAlong.__init__.__doc__ = """**Arguments:**
 """
 
 
-class _Square(eqx.Module):
+class _MatrixOrNumbers(eqx.Module):
     """A constant array that may be a matrix: whether it is one depends on the shape of its
     momenta, which may be known only in the solve.
 
@@ -72,7 +72,7 @@ def product_with(friction: Any, t, q: _P, args: Args, velocity: _P) -> _P:
         speeds = jtu.tree_leaves(jtu.tree_map(_speeds_along, columns, velocity))
         return jtu.tree_map(lambda d: d @ sum(speeds), columns)
     value = _for_each("friction", value_at("friction", friction, t, q, args), q)
-    return jtu.tree_map(_product, value, velocity, is_leaf=_is_square)
+    return jtu.tree_map(_product, value, velocity, is_leaf=_is_matrix_or_numbers)
 
 
 def _speeds_along(directions: Array, v: Array) -> Array:
@@ -82,11 +82,11 @@ def _speeds_along(directions: Array, v: Array) -> Array:
 
 def _product(g: Any, v: Array) -> Array:
     """`G v` for the velocities of one array."""
-    value = g.value if isinstance(g, _Square) else g
+    value = g.value if isinstance(g, _MatrixOrNumbers) else g
     if not _is_matrix(value, jnp.shape(v)):
         return not_negative(like(value, v)) * v
     force = jnp.tensordot(like(value, v), v, jnp.ndim(v))
-    if not isinstance(g, _Square):
+    if not isinstance(g, _MatrixOrNumbers):
         # Whether the value of a function is semidefinite is seen when its root is taken.
         return force
     return jnp.where(g.is_semidefinite, force, jnp.nan)
@@ -107,7 +107,9 @@ def root_product_with(
         )
     value = _for_each("friction", value_at("friction", friction, t, q, args), q)
     heat = _for_each("temperature", T, q)
-    return jtu.tree_map(_noise_of, value, heat, control, q, is_leaf=_is_square)
+    return jtu.tree_map(
+        _noise_of, value, heat, control, q, is_leaf=_is_matrix_or_numbers
+    )
 
 
 def _shapes_of(tree: PyTree) -> list[tuple[int, ...]]:
@@ -117,10 +119,12 @@ def _shapes_of(tree: PyTree) -> list[tuple[int, ...]]:
 def _noise_of(g: Any, T: ArrayLike, w: Array, x: Array) -> Array:
     """The noise `w` of the momenta of one array, in the shape of `x`."""
     w = like(w, x)
-    matrix = g.value if isinstance(g, _Square) else g
+    matrix = g.value if isinstance(g, _MatrixOrNumbers) else g
     if _is_matrix(matrix, jnp.shape(x)):
         scale = _root(2 * like(_single_temperature(T), x))
-        root = g.root if isinstance(g, _Square) else semidefinite_root(like(g, x))
+        root = (
+            g.root if isinstance(g, _MatrixOrNumbers) else semidefinite_root(like(g, x))
+        )
         return scale * jnp.tensordot(like(root, x), w, jnp.ndim(w))
     if jnp.shape(T) not in ((), jnp.shape(x)):
         raise ValueError(
@@ -221,9 +225,11 @@ def _check_fits_path(g: ArrayLike, path: tuple[int, ...]) -> None:
 
 def _for_each(name: str, value: PyTree, p: _P) -> PyTree:
     """`value` in the structure of the momenta: one that is given once is that of each."""
-    if jtu.all_leaves([value], is_leaf=_is_square):
+    if jtu.all_leaves([value], is_leaf=_is_matrix_or_numbers):
         return jtu.tree_map(lambda _: value, p)
-    if jtu.tree_structure(value, is_leaf=_is_square) != jtu.tree_structure(p):
+    if jtu.tree_structure(value, is_leaf=_is_matrix_or_numbers) != jtu.tree_structure(
+        p
+    ):
         is_list = isinstance(value, list | tuple)
         instead = (
             f" For an array pass `jnp.array({name})`, not a list." if is_list else ""
@@ -270,8 +276,8 @@ def like(x: ArrayLike, y: Array) -> Array:
     return jnp.asarray(x, jnp.result_type(y))
 
 
-def _is_square(x: Any) -> bool:
-    return isinstance(x, _Square)
+def _is_matrix_or_numbers(x: Any) -> bool:
+    return isinstance(x, _MatrixOrNumbers)
 
 
 def checked_friction(friction: Any, struct: PyTree | None) -> Any:
@@ -303,7 +309,9 @@ def _as_array_or_function(x: Any) -> Any:
     return x if callable(x) else jnp.asarray(x)
 
 
-def _checked_array(g: ArrayLike, momenta: tuple[int, ...] | None) -> Array | _Square:
+def _checked_array(
+    g: ArrayLike, momenta: tuple[int, ...] | None
+) -> Array | _MatrixOrNumbers:
     """The friction of an array of momenta, of this shape if it is known, from that of the
     path. Raises a `ValueError` if it is known to be invalid."""
     shape = jnp.shape(g)
@@ -317,16 +325,16 @@ def _checked_array(g: ArrayLike, momenta: tuple[int, ...] | None) -> Array | _Sq
         return jnp.asarray(real_array("friction", g, kind=_KIND))
     root = semidefinite_root(jnp.asarray(g, jnp.result_type(g, float)))
     is_semidefinite = ~jnp.any(jnp.isnan(root))
-    square = _Square(jnp.asarray(g), is_semidefinite, root)
+    either = _MatrixOrNumbers(jnp.asarray(g), is_semidefinite, root)
     if is_traced(is_semidefinite):
-        return square
+        return either
     # Without the shape of the momenta it may be numbers that are valid as they are.
     if not is_semidefinite and (is_matrix or not np.all(np.asarray(g) >= 0)):
         raise ValueError(
             "`friction` must be a symmetric positive semidefinite matrix, or an array of "
             f"numbers that are not negative, one for each momentum; got {g!r}."
         )
-    return square
+    return either
 
 
 def checked_temperature(temperature: Any) -> Any:
@@ -354,7 +362,7 @@ def semidefinite_root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
     square = matrix.reshape(n, n)
     eps = jnp.finfo(square.dtype).eps
     diagonal = jnp.diag(square)
-    # Of a pivot, which is a difference of numbers up to the entry of the diagonal.
+    # The error of a pivot, a difference of numbers up to the entry of the diagonal.
     rounding = 10 * n * eps * diagonal
     # No entry of what is left of a semidefinite matrix without its tiny pivots is larger.
     size = jnp.sqrt(jnp.maximum(diagonal, 0))

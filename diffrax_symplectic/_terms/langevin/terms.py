@@ -8,16 +8,19 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from .._arguments import check_pair, check_takes
-from .._brownian import increment_struct, raveled, TruncatedBrownianPath
-from .._compat import replaced, unwrapped, ω
-from .._custom_types import Args, BM, RealScalarLike
-from .constraint import constrained, Constraint
+from ..._arguments import check_pair, check_takes
+from ..._brownian import increment_struct, raveled, TruncatedBrownianPath
+from ..._compat import replaced, unwrapped, ω
+from ..._custom_types import Args, BM, RealScalarLike
+from ..constrained_drift import constrained, Constraint
+from ..drift_and_noise import split_terms
+from ..evaluation import evaluated, scalar_energy
+from ..hamiltonian import AbstractNoise, hamiltonian_terms
+from ..paths import as_path
 from .friction import (
     checked_friction,
     checked_temperature,
@@ -27,9 +30,6 @@ from .friction import (
     Value,
     value_at,
 )
-from .hamiltonian import evaluated, hamiltonian_terms, scalar_energy
-from .paths import as_path
-from .vector_fields import split_terms
 
 
 _P = PyTree[Array]
@@ -224,15 +224,12 @@ class DriftWithFriction(eqx.Module):
         return (dp**ω + force**ω).ω, dq
 
 
-class BathNoise(diffrax.AbstractTerm):
+class BathNoise(AbstractNoise):
     """The noise `(B dw, 0)` with `B B^T = 2 T G`."""
 
     friction: Any
     temperature: Value
     path: diffrax.AbstractBrownianPath
-
-    def contr(self, t0: RealScalarLike, t1: RealScalarLike, **kwargs) -> BM:
-        return self.path.evaluate(t0, t1, **kwargs)
 
     def vf(self, t: RealScalarLike, y: tuple[_P, _P], args: Args) -> PyTree[Array]:
         # For each array of the state, with a trailing axis of noises.
@@ -242,10 +239,6 @@ class BathNoise(diffrax.AbstractTerm):
             return self.vf_prod(t, y, args, unravel(unit))
 
         return jax.vmap(product, out_axes=-1)(jnp.eye(flat.size, dtype=flat.dtype))
-
-    def prod(self, vf: PyTree[Array], control: BM) -> tuple[_P, _P]:
-        flat, _ = jfu.ravel_pytree(control)
-        return jtu.tree_map(lambda v: jnp.tensordot(v, flat.astype(v.dtype), 1), vf)
 
     def vf_prod(
         self, t: RealScalarLike, y: tuple[_P, _P], args: Args, control: BM

@@ -11,10 +11,10 @@ import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree
 
-from .._brownian import raveled
-from .._compat import is_traced
-from .._custom_types import Args, RealScalarLike, Y
-from .vector_fields import control_struct
+from ..._brownian import raveled
+from ..._compat import is_traced
+from ..._custom_types import Args, RealScalarLike, Y
+from ..drift_and_noise import control_struct
 
 
 # Random directions of the state and of the control. A derivative that is not zero vanishes
@@ -43,7 +43,7 @@ def contradicted(
     # Not eagerly, operation by operation, where the user debugs under `jax.disable_jit()`.
     with jax.disable_jit(False):
         found = _contradicts(structure, is_noise, term, t0, y0, args)
-    # Inside a program of the user's, of which these values are constants.
+    # Traced, if these values are constants of a program of the user's.
     return not is_traced(found) and bool(found)
 
 
@@ -89,12 +89,13 @@ def _contradicts(
             forbidden = by_p[0], by_q[1], by_t[1]
         everything = value, by_p, by_q, by_t
         # Values that are not finite compare as false: they tell nothing.
-        return _largest(forbidden) > rounding * _largest(everything)
+        return largest(forbidden) > rounding * largest(everything)
 
     directions = jr.normal(jr.key(0), (_DIRECTIONS, flat.size), flat.dtype)
     return jnp.any(jax.vmap(along)(directions))
 
 
-def _largest(tree: PyTree[Array]) -> Array:
-    """The largest entry, without its sign."""
-    return jnp.max(jnp.abs(jfu.ravel_pytree(tree)[0]))
+def largest(tree: PyTree[Array]) -> Array:
+    """The largest entry of all arrays, without its sign."""
+    flat, _ = jfu.ravel_pytree(tree)
+    return jnp.max(jnp.abs(flat))

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import diffrax
 from jaxtyping import PyTree
 
-from .._brownian import TruncatedBrownianPath
-from .._compat import unwrapped
-from .._custom_types import Args, RealScalarLike, Y
-from .langevin import BathNoise
-from .paths import brownian_paths, path_numbers, replace_paths
-from .structure import additive_fault
-from .vector_fields import flattened
+from ..._brownian import TruncatedBrownianPath
+from ..._compat import unwrapped
+from ..._custom_types import Args, RealScalarLike, Y
+from ..drift_and_noise import flattened
+from ..langevin import BathNoise
+from ..paths import brownian_paths, path_numbers, replace_paths
+from .checks import additive_fault
 
 
 def needs_truncation(

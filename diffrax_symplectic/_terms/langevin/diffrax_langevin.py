@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
-from .._arguments import check_pair
-from .._compat import replaced, unwrapped
-from .._custom_types import Args, RealScalarLike
+from ..._arguments import check_pair
+from ..._compat import replaced, unwrapped
+from ..._custom_types import Args, RealScalarLike
+from ..drift_and_noise import flattened
 from .friction import like, not_negative
-from .langevin import AbstractFriction, DriftWithFriction
-from .vector_fields import flattened
+from .terms import AbstractFriction, DriftWithFriction
 
 
 _P = PyTree[Array]
@@ -58,8 +58,8 @@ class _Frictionless(eqx.Module):
     def __call__(self, t: RealScalarLike, y: tuple[_P, _P], args: Args):
         v, x = y
         # Without velocity there is no friction, so that the forces are left.
-        still = jtu.tree_map(jnp.zeros_like, v)
-        _, dv = self.term.vf(t, (x, still), args)
+        no_velocity = jtu.tree_map(jnp.zeros_like, v)
+        _, dv = self.term.vf(t, (x, no_velocity), args)
         return dv, v
 
 

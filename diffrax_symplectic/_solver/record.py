@@ -1,0 +1,65 @@
+"""The record of facts about a solver."""
+
+from typing import Literal, NamedTuple, TypeAlias
+
+
+Want: TypeAlias = Literal["weak", "strong"]
+Noises: TypeAlias = Literal["any", "commuting", "not commuting"]
+# One order for all noises; or the orders for noises that commute and for others.
+Order: TypeAlias = int | float | tuple[int | float, int | float]
+
+
+class Record(NamedTuple):
+    """Facts about a solver that do not follow from its coefficients. Orders, suggestions,
+    the tables of the documentation and the tests of all solvers are made from it.
+
+    - `weak`: its weak order.
+    - `strong`: its strong order, or `None` for a weak method.
+    - `choose`: when to choose it, in a sentence.
+    - `noises`: the noises for which it is recommended. It accepts any.
+    - `suggested`: the kinds of convergence for which `suggest_solver` returns it.
+    - `stationary`: the second moments, of `"qq"`, `"pq"` and `"pp"`, of a harmonic mode in
+        a heat bath whose stationary values are exact for every stable step.
+    - `heats`: whether noise gives a harmonic mode without friction the right energy for
+        steps that do not resolve it; `None` if such steps are unstable.
+    - `most_friction`: the greatest friction, as a rate times the step, up to which the
+        stationary energies of a resolved harmonic mode in a heat bath are within a tenth,
+        of those in `examples/stability/friction.py`; `None` if there is no limit. Given
+        for suggested solvers.
+
+    The last three are measured, in `tests/test_advice.py`, for the solvers that are
+    `suggested`. Leave them out for others: the page then promises and warns of nothing.
+    The random variables of `LevyAreaMidpoint` have no finite set of outcomes, so it states
+    those of the midpoint rule, which a test compares its steps with.
+    """
+
+    weak: Order
+    strong: Order | None
+    choose: str
+    noises: Noises = "any"
+    suggested: tuple[Want, ...] = ()
+    stationary: tuple[str, ...] = ()
+    heats: bool | None = None
+    most_friction: float | None = None
+
+    @property
+    def reason(self) -> str:
+        """When to choose it, where noise gives stiff modes the wrong energy, and for which
+        friction the temperature is wrong."""
+        sentences = [self.choose]
+        if self.heats is False and "pp" in self.stationary:
+            sentences.append("Right for noise on stiff modes only in a heat bath.")
+        elif self.heats is False:
+            sentences.append("Not for noise on stiff modes.")
+        if self.most_friction is not None:
+            limit = f"{self.most_friction:g}"
+            sentences.append(f"In a heat bath not for friction gamma h > {limit}.")
+        return " ".join(sentences)
+
+    def order(self, want: Want, commute: bool) -> int | float | None:
+        """The order for noises that commute, or for others."""
+        order = self.weak if want == "weak" else self.strong
+        if not isinstance(order, tuple):
+            return order
+        commuting, others = order
+        return commuting if commute else others

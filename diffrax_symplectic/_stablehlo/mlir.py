@@ -1,0 +1,149 @@
+"""How operations of MLIR tell what they are: names, regions, attributes, constants, and the
+lines that they come from.
+
+MLIR's objects for Python promise little of this, and print some of it only. So it is used
+nowhere else, and `tests/stablehlo/test_mlir.py` tests each part by itself: if one of these
+tests fails after an upgrade of JAX, change the function here.
+"""
+
+import re
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+def functions_of(module: Any) -> dict[str, Any]:
+    """The functions of a module of MLIR, by their names."""
+    return {
+        op.attributes["sym_name"].value: op
+        for op in module.body.operations
+        if op.operation.name == "func.func"
+    }
+
+
+def callee_of(op: Any) -> str:
+    """The name of the function that an operation of MLIR calls."""
+    return op.attributes["callee"].value
+
+
+def call_target(op: Any) -> str:
+    """The name of what a custom call of StableHLO calls."""
+    return op.attributes["call_target_name"].value
+
+
+def block_of(op: Any, region: int = 0) -> Any:
+    """The block of a region of an operation of MLIR: regions of StableHLO have one."""
+    return op.regions[region].blocks[0]
+
+
+def operations_in(region: Any) -> list[Any]:
+    """The operations of a region of MLIR, in their general form."""
+    return [op.operation for block in region.blocks for op in block.operations]
+
+
+def sole_operation(region: Any) -> str | None:
+    """The name of the operation that is all that a region of MLIR does, on its arguments in
+    their order; `None` for other regions."""
+    operations = operations_in(region)
+    # The last one returns.
+    if len(operations) != 2:
+        return None
+    op, _ = operations
+    (block,) = region.blocks
+    return op.name if [*op.operands] == [*block.arguments] else None
+
+
+def has_attribute(op: Any, name: str) -> bool:
+    """Whether an operation of MLIR has an attribute of this name."""
+    return name in op.attributes
+
+
+def attribute_integers(op: Any, name: str) -> list[int]:
+    """An attribute of MLIR that is a list of integers."""
+    return [int(i) for i in op.attributes[name]]
+
+
+def attribute_rows(op: Any, name: str) -> np.ndarray:
+    """An attribute of MLIR that is a matrix of integers."""
+    return np.asarray(op.attributes[name])
+
+
+def attribute_value(op: Any, name: str) -> Any:
+    """An attribute of MLIR that is a number or a string."""
+    return op.attributes[name].value
+
+
+def attribute_entry(op: Any, name: str, key: str) -> Any:
+    """An entry of an attribute of MLIR that is a dictionary of numbers or strings."""
+    return op.attributes[name][key].value
+
+
+def attribute_enum(op: Any, name: str) -> str:
+    """The value of an enumeration, which MLIR only prints: of `LT` as
+    `#stablehlo<comparison_direction LT>`."""
+    return re.findall(r"\w+", str(op.attributes[name]))[-1]
+
+
+def attribute_part(op: Any, name: str, key: str) -> list[int]:
+    """An entry of an attribute with several, which MLIR only prints: as
+    `#stablehlo.gather<offset_dims = [0], index_vector_dim = 1>`. Entries that are zero or
+    empty are not printed."""
+    found = re.search(rf"\b{key} = (\[[^\]]*\]|\d+)", str(op.attributes[name]))
+    return [int(i) for i in re.findall(r"\d+", found[1])] if found else []
+
+
+def constant_values(op: Any) -> np.ndarray:
+    """The values of a constant of StableHLO, in its own shape."""
+    kind = op.results[0].type
+    shape = tuple(kind.shape)
+    if not str(kind.element_type).startswith("complex"):
+        return np.broadcast_to(np.asarray(op.attributes["value"]), shape)
+    # MLIR gives the values of real constants only: complex ones are read from its text.
+    text = str(op)
+    size = 8 if "complex<f64>" in text else 4
+    if found := re.search(r'dense<"0x([0-9A-F]+)">', text):
+        parts = np.frombuffer(bytes.fromhex(found[1]), f"<f{size}")
+    else:
+        pairs = re.findall(r"\(([^(),]+),([^(),]+)\)", text.split(" : ")[0])
+        numbers = [_printed_number(x, size) for pair in pairs for x in pair]
+        parts = np.array(numbers, f"<f{size}")
+    # Not `real + 1j * imag`, which turns an infinite part into a NaN of the other.
+    values = parts[::2] + 0j
+    values.imag = parts[1::2]
+    return np.resize(values, shape)
+
+
+def _printed_number(text: str, size: int) -> float:
+    """A number as MLIR prints it: as hexadecimal bits if it is not finite."""
+    text = text.strip()
+    if not text.startswith("0x"):
+        return float(text)
+    return float(np.array(int(text, 16), f"<u{size}").view(f"<f{size}"))
+
+
+class SourceLine(NamedTuple):
+    """A line of a user's program.
+
+    - `function`, `file`, `line`: where it stands.
+    """
+
+    function: str
+    file: str
+    line: int
+
+
+def source_lines(location: str) -> list[SourceLine]:
+    """The lines that an operation of MLIR comes from, innermost first, out of its printed
+    location. JAX records several if `jax_traceback_in_locations_limit` says so."""
+    found = re.findall(r'"([^"]*)"\("([^"]+)":(\d+)', location)
+    return [SourceLine(_named(name), file, int(line)) for name, file, line in found]
+
+
+# What Python calls parts of a function: `fn.<locals>.<genexpr>` is a line of `fn`.
+_UNNAMED = ("<locals>", "<genexpr>", "<listcomp>", "<dictcomp>", "<setcomp>")
+
+
+def _named(qualified: str) -> str:
+    """The name of the function that code of this qualified name stands in."""
+    names = [part for part in qualified.split(".") if part not in _UNNAMED]
+    return names[-1] if names else qualified

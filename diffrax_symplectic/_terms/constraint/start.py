@@ -1,0 +1,176 @@
+"""States that a constraint allows: found near others, and checked at the start of a
+solve."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Bool, PyTree
+
+from ..._arguments import check_pair, check_state
+from ..._batch import refused_where
+from ..._compat import is_traced
+from ..._custom_types import Args, RealScalarLike
+from ..constrained_drift import constraint_of, without_constraint
+from ..dependence import Dependence
+from ..langevin import split_friction
+from ..structure import separable_fault
+from ..vector_fields import check_fit
+from .multipliers import Vector
+from .surface import Surface
+
+
+_DEPENDENT = (
+    "The gradients of `constraint` at `y0` are linearly dependent, or zero. Leave out "
+    "constraints that follow from the others, and write each so that its gradient does not "
+    "vanish where it is zero, such as `jnp.sum(q**2) - 1`. For atoms on a line no distance "
+    "follows from the others: fix one, and put each atom between its ends on the line, "
+    "for a middle one by `q[1] - (q[0] + q[2]) / 2` in place of its distances."
+)
+
+
+_OFF = (
+    "`y0` is off the `constraint`, or its momenta are not tangent to it. Pass "
+    "`constrained_state(terms, y0, args)`. (Diffrax converts a float32 state to the dtype "
+    "of the times. If they are float64, pass them as `jnp.float32(t)`, too, or `y0` in "
+    "float64: a state on the constraint to single precision is off it in double.)"
+)
+
+
+def check_start(
+    terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether the constraints are dependent at `y0`, and whether it is off them. Raises a
+    `ValueError` if either is known while tracing, and for constraints that no solver takes.
+    Otherwise it is an error when run, but not in a batch."""
+    _check_masses(terms, t0, y0, args)
+    # A check has no derivative. Taking one would trace it again.
+    fixed = jtu.tree_map(_without_derivative, (y0, args))
+    is_dependent, is_off = _faults(terms, t0, *fixed)
+    return refused_where(is_dependent, _DEPENDENT), refused_where(is_off, _OFF)
+
+
+def _without_derivative(x: Any) -> Any:
+    return lax.stop_gradient(x) if eqx.is_inexact_array(x) else x
+
+
+# Outside of a program its operations would be compiled one by one.
+@eqx.filter_jit
+def _faults(
+    terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether the constraints are dependent at `y0`, and, unless they are, whether it is
+    off them."""
+    surface = Surface.of(terms, t0, y0, args)
+    (p, _), (q, _) = map(jfu.ravel_pytree, y0)
+    at = surface.normal_space(q)
+    is_dependent = surface.is_dependent(at)
+    return is_dependent, ~is_dependent & surface.is_off(p, at)
+
+
+def _check_masses(
+    terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
+) -> None:
+    """Raises a `ValueError` unless velocities are linear in the momenta."""
+    surface = Surface.of(terms, t0, y0, args)
+    p0, _ = jfu.ravel_pytree(y0[0])
+
+    # The change of the velocity by an impulse: the second derivative of H0 by p, times it.
+    def pushed(p: Vector, impulse: Vector) -> Vector:
+        return jax.jvp(surface.velocity, (p,), (impulse,))[1]
+
+    # It may depend on the impulse, but not on the momentum: then the masses are constant.
+    # Only the shape of the second argument matters.
+    if not Dependence(pushed, p0, p0).independent(lambda p, impulse: p):
+        raise ValueError(
+            "Terms with a `constraint` need constant masses, H0 = p . M^-1 p / 2 + "
+            "U(t, q), but the second derivative of H0 by p depends on p. Write squares of "
+            "momenta, such as `jnp.sum(p**2 / mass) / 2`."
+        )
+
+
+def constrained_state(
+    terms: PyTree[diffrax.AbstractTerm], y0: PyTree, args: Args = None
+) -> PyTree:
+    r"""A state that a constraint allows, near a given one.
+
+    Positions are moved along $M^{-1} J^\top$, with the masses $M$ of $H_0$ and the
+    gradients $J$ of the constraints at the given positions, until `constraint(q, args)` is
+    zero. Momenta lose their part along $J^\top$ at the new positions, so that $J M^{-1} p =
+    0$: of all allowed momenta these are the nearest in kinetic energy.
+
+    !!! example
+
+        ```python
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+
+        H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + q[1]
+        rod = lambda q, args: jnp.stack([jnp.sum(q**2) - 1])
+        pendulum = ds.hamiltonian_terms(H0, constraint=rod)
+        y0 = (jnp.array([0.3, 0.1]), jnp.array([2.0, 0.0]))
+        p, q = ds.constrained_state(pendulum, y0)
+        print(p, q)  # [0, 0.1] and [1, 0]
+        ```
+
+    **Arguments:**
+
+    - `terms`: the terms, with a `constraint`.
+    - `y0`: the state `(p, q)`.
+    - `args`: as for `diffrax.diffeqsolve`.
+
+    **Returns:** the pair `(p, q)`. Differentiable.
+
+    **Raises:** a `ValueError` if the terms have no constraint, if no solver takes them, if
+    the constraints are dependent at `y0`, or if Newton's method finds no allowed positions.
+    If this is not known while tracing, the state is NaN, and a solve from there fails.
+    """
+    if constraint_of(terms) is None:
+        raise ValueError(
+            "`constrained_state` needs terms with a `constraint`, such as "
+            "`hamiltonian_terms(H0, constraint=constraint)`."
+        )
+    check_pair(y0)
+    check_state(y0, "constrained_state")
+    t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(y0)))
+    drift, _, _ = split_friction(without_constraint(terms))
+    check_fit(diffrax.MultiTerm(*drift), t, y0, args)
+    if fault := separable_fault(drift, (), t, y0, args):
+        raise ValueError(
+            "Terms with a `constraint` need H0 = p . M^-1 p / 2 + U(t, q), but "
+            f"{fault.reason}. {fault.advice}"
+        )
+    _check_masses(terms, t, y0, args)
+    y1, found, is_dependent = _projected(terms, t, y0, args)
+    if not is_traced(found):
+        if is_dependent:
+            raise ValueError(_DEPENDENT)
+        if not found:
+            raise ValueError(
+                "`constrained_state` found no positions with `constraint(q, args) = 0` "
+                "from `y0`. Pass one that is closer to them."
+            )
+    okay = found & ~is_dependent
+    return jtu.tree_map(lambda x: jnp.where(okay, x, jnp.nan), y1)
+
+
+@eqx.filter_jit
+def _projected(
+    terms: PyTree[diffrax.AbstractTerm], t: RealScalarLike, y0: PyTree, args: Args
+) -> tuple[PyTree, Bool[Array, ""], Bool[Array, ""]]:
+    """The nearest allowed state, whether Newton's method found it, and whether the
+    constraints are dependent there."""
+    surface = Surface.of(terms, t, y0, args)
+    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
+    # Without a momentum, all of the way is that of the multipliers.
+    _, q, found = surface.free_flight(jnp.zeros_like(p), surface.normal_space(q), 1.0)
+    at = surface.normal_space(q)
+    # Twice, so that the rest of a momentum that was normal is tangent, too.
+    p = surface.tangent(surface.tangent(p, at), at)
+    y1 = (unravel_p(p), unravel_q(q))
+    return y1, found, surface.is_dependent(at)

@@ -1,0 +1,205 @@
+"""The positions that a constraint allows and the momenta tangent to them: projections, and
+free flight."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Bool, Float, PyTree
+
+from ..._arguments import is_real_number
+from ..._custom_types import Args, RealScalarLike
+from ..._root_finder import max_norm, solve_matrix
+from ..constrained_drift import Constraint, constraint_of, without_constraint
+from ..evaluation import evaluated
+from ..langevin import split_friction
+from ..vector_fields import rate
+from .multipliers import (
+    combined,
+    find_multipliers,
+    Multipliers,
+    products,
+    solve_tangent,
+    Vector,
+)
+
+
+class NormalSpace(NamedTuple):
+    """The directions normal to the surface at a position.
+
+    A step uses those at its ends and at its middle several times, so they are kept.
+
+    - `q`: the position.
+    - `normals`: the gradients of the constraints, `J`.
+    - `along`: the changes of the velocity by impulses along them, `J M^-1`.
+    - `gram`: `J M^-1 J^T`.
+    """
+
+    q: Vector
+    normals: Float[Array, "c n"]
+    along: Float[Array, "c n"]
+    gram: Float[Array, "c c"]
+
+
+class Surface(NamedTuple):
+    """The positions that a constraint allows and the momenta tangent to them, `J v = 0`.
+    Both are vectors.
+
+    - `residual`: the constraint, as a function of the position.
+    - `velocity`: `v = dH0/dp` as a function of the momentum, which is linear up to a
+        constant: its derivative is the inverse of the masses, `M^-1`.
+    """
+
+    residual: Callable[[Vector], Multipliers]
+    velocity: Callable[[Vector], Vector]
+
+    @staticmethod
+    def of(
+        terms: PyTree[diffrax.AbstractTerm], t: RealScalarLike, y: PyTree, args: Args
+    ) -> "Surface":
+        """The surface of constrained terms. Raises a `ValueError` if the constraint does
+        not return an array of shape `(c,)`."""
+        constraint = constraint_of(terms)
+        assert constraint is not None
+        drift, _, _ = split_friction(without_constraint(terms))
+        _, q0 = y
+        _, unravel = jfu.ravel_pytree(q0)
+
+        def residual(q: Vector) -> Multipliers:
+            return _values(constraint, unravel(q), args)
+
+        def velocity(p: Vector) -> Vector:
+            # For separable H0, at any position.
+            _, dq = rate(drift, t, (unravel(p), q0), args)
+            return jfu.ravel_pytree(dq)[0]
+
+        return Surface(residual, velocity)
+
+    def normal_space(self, q: Vector) -> NormalSpace:
+        """The directions normal to the surface at this position."""
+        normals = jax.jacrev(self.residual)(q)
+        along = self._pushed(normals)
+        return NormalSpace(q, normals, along, products(normals, along))
+
+    def _pushed(self, impulses: Float[Array, "c n"]) -> Float[Array, "c n"]:
+        """The change of the velocity by each of these changes of the momentum."""
+        # The velocity is linear, so its derivative is the same at every momentum.
+        zero = jnp.zeros_like(impulses[0])
+
+        def change(impulse: Vector) -> Vector:
+            return jax.jvp(self.velocity, (zero,), (impulse,))[1]
+
+        return jax.vmap(change)(impulses)
+
+    def tangent(
+        self,
+        p: Vector,
+        at: NormalSpace,
+        response: Callable[[Vector], Vector] | None = None,
+    ) -> Vector:
+        """The momentum after the impulses of the constraint forces that make it tangent.
+        An impulse changes the momentum by itself, or by its `response`."""
+        if response is None:
+            gram = at.gram
+            changes = at.normals
+        else:
+            changes = jax.vmap(response)(at.normals)
+            gram = products(at.normals, self._pushed(changes))
+        # How fast the momentum would leave the surface.
+        speeds = products(at.normals, self.velocity(p)[None])[:, 0]
+        return p - combined(solve_matrix(gram, speeds), changes)
+
+    def free_flight(
+        self,
+        p: Vector,
+        at: NormalSpace,
+        time: RealScalarLike,
+        pending: Bool[Array, ""] | bool = True,
+    ) -> tuple[Vector, Vector, Bool[Array, ""]]:
+        r"""Free flight on the surface over `time`, by a step of RATTLE,
+
+        $$q_1 = q + h\, v(p_1), \qquad p_1 = p - J(q)^\top \lambda, \qquad g(q_1) = 0,$$
+
+        and whether the multipliers were found. The momentum $p_1$ still has to be made
+        tangent at $q_1$. The momentum $p$ need not be tangent: the multipliers make up for
+        the difference. Nothing is solved for, nor found, if not `pending`.
+        """
+        time = jnp.asarray(time, p.dtype)
+        free = at.q + time * self.velocity(p)
+        rounding = _rounding(at, free)
+
+        # The unknowns are `time * lambda`, so that `time` may be small.
+        def moved(x: Multipliers) -> Vector:
+            return free - combined(x, at.along)
+
+        def residual(x: Multipliers) -> Multipliers:
+            return self.residual(moved(x))
+
+        def solve(residual: Callable, start: Multipliers) -> tuple[Multipliers, Array]:
+            x, found = find_multipliers(
+                residual, at.gram, rounding, start, jnp.asarray(pending)
+            )
+            # As a float: `custom_root` gives other types a tangent of a wrong type.
+            return x, found.astype(x.dtype)
+
+        # Derivatives come from the equations, and not through the loop that solves them.
+        start = jnp.zeros(len(at.gram), p.dtype)
+        x, found = lax.custom_root(residual, start, solve, solve_tangent, has_aux=True)
+        return p - combined(x / time, at.normals), moved(x), found > 0
+
+    def is_dependent(self, at: NormalSpace) -> Bool[Array, ""]:
+        """Whether the normals are linearly dependent, up to rounding errors."""
+        # In a solve backward in time velocities change their sign.
+        gram = at.gram * jnp.sign(jnp.trace(at.gram))
+        size = jnp.sqrt(jnp.diag(gram))
+        # A pivot is the squared sine of the angle between a normal and the ones before it.
+        pivots = jnp.diag(jnp.linalg.cholesky(gram / size / size[:, None])) ** 2
+        rounding = 1000 * jnp.finfo(gram.dtype).eps
+        return ~jnp.all(pivots > rounding)
+
+    def is_off(self, p: Vector, at: NormalSpace) -> Bool[Array, ""]:
+        """Whether a state is farther from the surface than rounding errors explain."""
+        # Between rounding errors, also of long sums, and any mistake of the user's.
+        eps = float(jnp.finfo(p.dtype).eps)
+        near = eps ** (2 / 3)
+        # A constraint rounds as its positions do, or, where these are near the origin, as
+        # numbers of the size of its radius of curvature do: to show that radius, gradients
+        # are differentiated along a direction that no symmetry singles out.
+        along = jnp.cos(1.0 + jnp.arange(len(at.q), dtype=p.dtype))
+        _, turned = jax.jvp(jax.jacrev(self.residual), (at.q,), (along,))
+        bend = jnp.sum(jnp.abs(turned), axis=1)
+        curved = jnp.sum(at.normals**2, axis=1) / jnp.where(bend > 0, bend, jnp.inf)
+        size = jnp.maximum(_rounding(at, at.q) / eps, curved)
+        position_is_on = jnp.all(jnp.abs(self.residual(at.q)) <= near * size)
+        normal_part = p - self.tangent(p, at)
+        momentum_is_tangent = max_norm(normal_part) <= near * max_norm(p)
+        return ~(position_is_on & momentum_is_tangent)
+
+
+def _rounding(at: NormalSpace, q: Vector) -> Multipliers:
+    """By how much one unit in the last place of each position changes the constraints."""
+    info = jnp.finfo(q.dtype)
+    ulps = float(info.eps) * jnp.abs(q)
+    # Never zero, since it is a divisor.
+    return products(jnp.abs(at.normals), ulps[None])[:, 0] + float(info.tiny)
+
+
+def _values(constraint: Constraint, q: PyTree, args: Args) -> Float[Array, " c"]:
+    """The values of the constraints. Raises a `ValueError` unless they are a real array of
+    shape `(c,)`."""
+    value = evaluated("constraint", constraint, q, args=args)
+    if not is_real_number(value) or jnp.ndim(value) != 1 or jnp.size(value) == 0:
+        # With the dtype, such as `f32[2]`: that alone may be what is wrong.
+        got = eqx.tree_pformat(value, struct_as_array=True)
+        raise ValueError(
+            "`constraint(q, args)` must return a real array of shape `(c,)`, one number "
+            f"for each constraint; got {got}. For one constraint write "
+            "`jnp.stack([...])`."
+        )
+    return jnp.asarray(value, jnp.result_type(*jtu.tree_leaves(q)))

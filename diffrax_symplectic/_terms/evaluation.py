@@ -1,0 +1,65 @@
+"""Calls of the user's functions, with advice on their errors."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree
+
+from .._arguments import shapes
+from .._custom_types import Args
+
+
+def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Array]:
+    """`H(*inputs, args)`, with advice on its errors."""
+    # A copy, so that functions which modify `args` in place are the same in each trace.
+    copy = jtu.tree_map(lambda leaf: leaf, args)
+    try:
+        return H(*inputs, copy)
+    except _NEED_VALUES as error:
+        raise ValueError(
+            f"`{name}` needs concrete values while JAX traces it, in an `if`, `while`, "
+            "`float`, an index `x[x > 0]`, or a NumPy function. Write `jnp.where(a, b, c)` "
+            "or `jax.lax.cond` instead of `if`, and `jnp` instead of `np`."
+        ) from error
+    except (TypeError, AttributeError) as error:
+        if args is None:
+            error.add_note(f"`{name}` was called with `args=None`. Was it left out?")
+        raise
+
+
+# Errors of a function that needs the values of its arguments while JAX traces it.
+_NEED_VALUES = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.NonConcreteBooleanIndexError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+
+def scalar_energy(out: PyTree, name: str = "H0") -> Array:
+    """The output of a Hamiltonian. Raises a `ValueError` if it is not a real scalar."""
+    if not jtu.all_leaves([out]) or jnp.shape(out) != ():
+        raise ValueError(
+            f"`{name}` must return a scalar; got shape {shapes(out)}. Sum over the degrees "
+            "of freedom. (For a batch of paths write it for one path, and `jax.vmap` the "
+            "solve.)"
+        )
+    check_real(name, out)
+    # `jax.grad` refuses integers, such as the `0` of a particle without energy.
+    return jnp.asarray(out, jnp.result_type(out, float))
+
+
+def check_real(name: str, out: PyTree[Array]) -> None:
+    if not all(map(_is_real, jtu.tree_leaves(out))):
+        raise ValueError(
+            f"`{name}` must return real numbers; got {eqx.tree_pformat(out)}. Take "
+            "`jnp.real` of numbers that are mathematically real, such as <psi| A |psi>."
+        )
+
+
+def _is_real(x: Any) -> bool:
+    return eqx.is_array_like(x) and not jnp.iscomplexobj(x)

@@ -1,0 +1,87 @@
+"""Hamiltonians of another variable than `(p, q)`, such as spins or complex amplitudes, and
+the damping that keeps the lengths of these."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, PyTree
+
+from .._arguments import check_takes, real_array
+from .hamiltonian import hamiltonian_terms, IndexedNoise
+
+
+class Lifted(eqx.Module):
+    """A Hamiltonian in another variable, `H(t, chart(p, q), args)`.
+
+    A Module and not a closure, so that parameters within `H` stay leaves of the terms, and
+    that `has_lifted` finds it.
+    """
+
+    H: Callable
+    chart: Callable[[tuple[PyTree, PyTree]], PyTree]
+
+    def __call__(self, *inputs) -> PyTree[Array]:
+        # An `IndexedNoise` passes the index before the time.
+        *before, p, q, args = inputs
+        return self.H(*before, self.chart((p, q)), args)
+
+
+def has_lifted(terms: PyTree) -> bool:
+    """Whether these terms have Hamiltonians in another variable."""
+    return any(map(_is_lifted, jtu.tree_leaves(terms, is_leaf=_is_lifted)))
+
+
+def _is_lifted(x: Any) -> bool:
+    return isinstance(x, Lifted)
+
+
+def lifted_terms(
+    H0: Callable,
+    noise: Callable | None,
+    path: diffrax.AbstractBrownianPath | PyTree | None,
+    chart: Callable[[tuple[PyTree, PyTree]], PyTree],
+    name: str,
+) -> diffrax.MultiTerm:
+    """The terms of Hamiltonians in `chart((p, q))`, a variable called `name`."""
+    check_takes("H0", H0, "t", name, "args")
+    if noise is None:
+        if path is not None:
+            raise ValueError(
+                f"`noise` must be a function, called as `noise(t, {name}, args)`; got "
+                "None. Without noise, leave out `path`, too."
+            )
+        lifted = None
+    elif isinstance(noise, IndexedNoise):
+        # Still one noise at a time, for the solvers that follow one after another.
+        lifted = IndexedNoise(Lifted(noise.H, chart), noise.m)
+    else:
+        check_takes("noise", noise, "t", name, "args")
+        lifted = Lifted(noise, chart)
+    return hamiltonian_terms(Lifted(H0, chart), lifted, path)
+
+
+def checked_damping(each: str, alpha: ArrayLike) -> ArrayLike:
+    """A damping in arrays, a number or one for `each` of what is damped. Raises a
+    `ValueError` if it is known to be negative or not finite."""
+    return real_array(
+        "damping", alpha, kind=f"a number, or an array with one for {each}"
+    )
+
+
+def damping_for(
+    each: str, alpha: ArrayLike, shape: tuple[int, ...], dtype: Any
+) -> Array:
+    """The damping of vectors of this shape, NaN where it is negative or not finite. Raises
+    a `ValueError` if its shape is another."""
+    alpha = jnp.asarray(alpha, dtype)
+    if alpha.shape not in ((), shape):
+        raise ValueError(
+            f"`damping` must be a number, or have one for {each}, of shape {shape}; got "
+            f"shape {alpha.shape}."
+        )
+    # Traced values cannot raise an error; NaN makes their path fail.
+    return jnp.where(jnp.isfinite(alpha) & (alpha >= 0), alpha, jnp.nan)

@@ -1,0 +1,168 @@
+"""The random variables of a step as numbers with known laws, for means over all of their
+values. (`_solver/driven.py` draws them for a step.)"""
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import diffrax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._brownian import (
+    AbstractLaw,
+    GivenPath,
+    Increment,
+    increment_struct,
+    laws_of,
+    num_noises,
+    ONLY_A_SHAPE,
+    raveled,
+    step_size,
+    UnspecifiedPath,
+)
+from .._compat import is_traced
+from .paths import brownian_paths, path_numbers, replace_paths, shapes_as_paths
+
+
+class StepVariables(NamedTuple):
+    """The independent random variables of a step, those of one path after another.
+
+    - `laws`: the law of each, for a step of size 1.
+    - `terms_with`: maps their values, in units of the square root of the step size, to
+        terms whose paths have these increments.
+    """
+
+    laws: tuple[AbstractLaw, ...]
+    terms_with: Callable[[Float[Array, " n"]], PyTree[diffrax.AbstractTerm]]
+
+
+def step_variables(
+    terms: PyTree[diffrax.AbstractTerm], h, numbers: tuple[int, ...] | None = None
+) -> StepVariables:
+    """The variables of a step of size `h`. `numbers` are the `path_numbers` of the paths of
+    the terms, which programs, whose keys are traced, have to be told."""
+    paths = _paths_of_known_laws(terms)
+    numbers = _known_numbers(paths) if numbers is None else numbers
+    # Equal paths are one Brownian motion, whose variables are drawn once.
+    motions = [_Motion.of(paths[numbers.index(k)]) for k in range(max(numbers) + 1)]
+    ends = np.cumsum([motion.size for motion in motions])
+
+    def terms_with(
+        values: Float[Array | np.ndarray, " n"],
+    ) -> PyTree[diffrax.AbstractTerm]:
+        each = jnp.split(values, ends[:-1])
+        given = [motion.given(x, h) for motion, x in zip(motions, each)]
+        left = iter(numbers)
+        return replace_paths(terms, lambda _: given[next(left)])
+
+    laws = tuple(law for motion in motions for law in motion.each_law)
+    return StepVariables(laws, terms_with)
+
+
+class _Motion(NamedTuple):
+    """One of the Brownian motions of a step.
+
+    - `path`: a path that samples it.
+    - `laws`: the laws of the attributes of its increments, in their order.
+    - `shape`: the shape of an increment.
+    - `noises`: the number of noises, each with all of these laws.
+    """
+
+    path: diffrax.AbstractBrownianPath
+    laws: Mapping[str, AbstractLaw]
+    shape: PyTree
+    noises: int
+
+    @staticmethod
+    def of(path: diffrax.AbstractBrownianPath) -> "_Motion":
+        laws = laws_of(path)
+        assert laws is not None
+        shape = increment_struct(path)
+        return _Motion(path, laws, shape, num_noises(shape))
+
+    @property
+    def size(self) -> int:
+        """The number of its random variables in a step."""
+        return len(self.laws) * self.noises
+
+    @property
+    def each_law(self) -> list[AbstractLaw]:
+        """The law of each of its random variables."""
+        return [law for law in self.laws.values() for _ in range(self.noises)]
+
+    def given(self, values: Float[Array, " size"], h) -> GivenPath:
+        """A path with these variables in every step, in units of the root of `h`."""
+        flat, unravel = raveled(self.shape)
+        scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(flat.dtype)
+        # One row for each attribute of the increment, in the order of the laws.
+        rows = scaled.reshape(-1, self.noises)
+        attributes = {name: unravel(row) for name, row in zip(self.laws, rows)}
+        make_increment: Any = self.path.levy_area
+        increment = make_increment(dt=step_size(h, self.shape), **attributes)
+        make = jtu.Partial(_constant, increment)
+        return GivenPath(make=make, levy_area=type(increment))
+
+
+def outcomes(
+    laws: Sequence[AbstractLaw], nodes: int
+) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, " K"]]:
+    """All values of variables with these laws, and their probabilities or quadrature
+    weights."""
+    values_of_each = []
+    weights_of_each = []
+    for law in laws:
+        values, weights = law.outcomes(nodes)
+        values_of_each.append(values)
+        weights_of_each.append(weights)
+    # They are independent: all combinations, whose weights are products.
+    values = np.array([*itertools.product(*values_of_each)])
+    weights = np.array([*itertools.product(*weights_of_each)])
+    return values, np.prod(weights, axis=1)
+
+
+def _constant(increment, t0, t1, use_levy: bool) -> Increment:
+    """The same increment over every step."""
+    del t0, t1
+    return increment if use_levy else increment.W
+
+
+def _paths_of_known_laws(
+    terms: PyTree[diffrax.AbstractTerm],
+) -> list[diffrax.AbstractBrownianPath]:
+    """The Brownian paths of the terms. Raises a `ValueError` if there are none, or if the
+    law of one is not known."""
+    paths = brownian_paths(shapes_as_paths(terms))
+    if any(isinstance(path, UnspecifiedPath) for path in paths):
+        raise ValueError(
+            f"{ONLY_A_SHAPE} For the random variables of a step, pass "
+            "`path=solver.path(shape, key)` to the function that makes the terms."
+        )
+    unknown = [path for path in paths if laws_of(path) is None]
+    if len(paths) == 0 or len(unknown) > 0:
+        raise ValueError(
+            "`terms` must hold Brownian paths whose laws are known, a `WeakBrownianPath` "
+            "or a Gaussian path with `levy_area=BrownianIncrement`, `SpaceTimeLevyArea` or "
+            "`SpaceTimeTimeLevyArea`, also within a `PlateauBrownianPath`; got "
+            f"{[_named(path) for path in unknown]}. (For a system without noise, pass a "
+            "noise that is zero, such as `0 * q`.)"
+        )
+    return paths
+
+
+def _known_numbers(paths: list[diffrax.AbstractBrownianPath]) -> tuple[int, ...]:
+    """The `path_numbers` of paths. Raises a `ValueError` for several of which it is not
+    known, inside a program, whether they are the same."""
+    if len(paths) > 1 and any(map(is_traced, jtu.tree_leaves(paths))):
+        raise ValueError(
+            "`terms` hold several Brownian paths with traced keys, of which it is not "
+            "known whether they are the same. Construct the terms outside of `jax.jit`, "
+            "and let the function close over them."
+        )
+    return path_numbers(paths)
+
+
+def _named(path: diffrax.AbstractBrownianPath) -> str:
+    return f"{type(path).__name__} with {getattr(path.levy_area, '__name__', '?')}"

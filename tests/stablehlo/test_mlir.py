@@ -1,0 +1,158 @@
+"""What the replay of programs reads of the operations of MLIR. If one of these tests fails
+after an upgrade of JAX, its name says what broke; other failures follow from it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from diffrax_symplectic._compat import stablehlo_module
+from diffrax_symplectic._stablehlo import mlir
+
+
+# A module of MLIR owns its operations, and frees them.
+_MODULES = []
+
+
+def _lowered(fn, *shapes):
+    structs = [jax.ShapeDtypeStruct(shape, "float32") for shape in shapes]
+    return jax.jit(fn).lower(*structs)
+
+
+def _operation(lowered, name: str):
+    """The first operation with this name in the main function of a program."""
+    _MODULES.append(lowered.compiler_ir("stablehlo"))
+    main = mlir.functions_of(_MODULES[-1])["main"]
+    operations = mlir.operations_in(main.operation.regions[0])
+    return next(op for op in operations if op.name == name)
+
+
+def test_a_program_in_stablehlo_is_the_same_as_text_and_as_a_module():
+    """If this fails: find how JAX parses MLIR now, and adapt `stablehlo_module`."""
+    square = jax.jit(lambda x: x @ x)
+    lowered = _lowered(lambda x: square(square(x)), (2, 2))
+    module = lowered.compiler_ir("stablehlo")
+    assert stablehlo_module(module) is module
+    parsed = stablehlo_module(lowered.as_text())
+    functions = mlir.functions_of(parsed)
+    assert functions.keys() == mlir.functions_of(module).keys() > {"main"}
+    inside = mlir.operations_in(functions["main"].operation.regions[0])
+    called = {mlir.callee_of(op) for op in inside if op.name == "func.call"}
+    assert len(called) == 1 and called < {*functions}
+    (argument,) = mlir.block_of(functions["main"]).arguments
+    assert list(argument.type.shape) == [2, 2]
+    assert str(argument.type.element_type) == "f32"
+
+
+def test_attributes_of_operations_are_read():
+    """If this fails: print the operation and its attributes, and adapt the function of
+    `_stablehlo/mlir.py` for this kind of attribute."""
+    slice_of = _operation(_lowered(lambda x: x[1:4:2], (5,)), "stablehlo.slice")
+    assert mlir.attribute_integers(slice_of, "strides") == [2]
+    assert mlir.has_attribute(slice_of, "strides")
+    assert not mlir.has_attribute(slice_of, "dimension")
+    joined = _lowered(lambda x: jnp.concatenate([x, x], axis=1), (2, 3))
+    joined = _operation(joined, "stablehlo.concatenate")
+    assert mlir.attribute_value(joined, "dimension") == 1
+    less = _operation(_lowered(lambda x: x < 1, ()), "stablehlo.compare")
+    assert mlir.attribute_enum(less, "comparison_direction") == "LT"
+    product = _lowered(lambda a, b: jnp.einsum("kij,klj->kil", a, b), *[(2, 3, 3)] * 2)
+    product = _operation(product, "stablehlo.dot_general")
+    part = lambda key: mlir.attribute_part(product, "dot_dimension_numbers", key)
+    assert part("lhs_batching_dimensions") == [0]
+    assert part("rhs_contracting_dimensions") == [2]
+    assert part("no_such_dimensions") == []
+
+
+def test_regions_of_operations_are_read():
+    """If this fails: print the operation, and adapt `attribute_rows`, `operations_in` or
+    `sole_operation`."""
+
+    def windows(x):
+        padding = ((1, 0), (0, 2))
+        return jax.lax.reduce_window(x, 0.0, jax.lax.add, (2, 1), (1, 1), padding)
+
+    reduction = _operation(_lowered(windows, (4, 3)), "stablehlo.reduce_window")
+    assert mlir.attribute_rows(reduction, "padding").tolist() == [[1, 0], [0, 2]]
+    inside = mlir.operations_in(reduction.regions[0])
+    assert [op.name for op in inside] == ["stablehlo.add", "stablehlo.return"]
+    assert mlir.sole_operation(reduction.regions[0]) == "stablehlo.add"
+
+    def sole(fn):
+        reduced = _lowered(lambda x: jax.lax.reduce(x, jnp.float32(0), fn, (0,)), (3,))
+        return mlir.sole_operation(_operation(reduced, "stablehlo.reduce").regions[0])
+
+    assert sole(lambda a, b: a * b) == "stablehlo.multiply"
+    assert sole(lambda a, b: (a + b) * 0.5) is None
+    assert sole(lambda a, b: a + a) is None
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="LAPACK is for CPUs")
+def test_calls_of_lapack_are_known_by_name_with_their_arguments():
+    """If this fails: print the operation, and adapt `call_target`, `attribute_entry`, or
+    the table of calls in `_stablehlo/linear_algebra.py`."""
+    factor = _operation(
+        _lowered(jax.lax.linalg.cholesky, (2, 2)), "stablehlo.custom_call"
+    )
+    assert mlir.call_target(factor) == "lapack_spotrf_ffi"
+    uplo = mlir.attribute_entry(factor, "mhlo.backend_config", "uplo")
+    assert chr(uplo) == "L"
+
+
+CONSTANTS = [
+    np.array([[1.5, np.inf], [-0.0, np.nan]], np.float32),
+    np.array([True, False]),
+    np.zeros((2, 3)),
+    np.array(2 - 1j, np.complex64),
+    np.full((2, 2), 0.1 + 3j),
+    np.array([1e300 - 1j, complex(np.inf, -0.0), complex(0, np.nan)]),
+    np.arange(100) * (1 + 2j),
+]
+
+
+@pytest.mark.parametrize("values", CONSTANTS, ids=lambda x: f"{x.dtype}{[*x.shape]}")
+def test_values_of_constants_are_read(values):
+    """If this fails: print the constant, and adapt `constant_values`."""
+    constant = _operation(_lowered(lambda: jnp.asarray(values)), "stablehlo.constant")
+    found = mlir.constant_values(constant)
+    assert found.dtype == values.dtype and found.shape == values.shape
+    for part in (np.real, np.imag):
+        np.testing.assert_array_equal(part(found), part(values))
+        if values.dtype != bool:
+            signs = np.signbit(part(found)), np.signbit(part(values))
+            np.testing.assert_array_equal(*signs)
+
+
+def test_the_lines_that_an_operation_comes_from_are_known():
+    """If this fails: print the location, and adapt `source_lines`."""
+
+    def one(x):
+        return jnp.sin(x)
+
+    limit = jax.config.jax_traceback_in_locations_limit  # pyright: ignore
+    jax.config.update("jax_traceback_in_locations_limit", 10)
+    try:
+        sine = _operation(_lowered(one, ()), "stablehlo.sine")
+    finally:
+        jax.config.update("jax_traceback_in_locations_limit", limit)
+    lines = mlir.source_lines(str(sine.location))
+    (own,) = [line for line in lines if line.function == "one"]
+    assert own.file == __file__
+    assert own.line == one.__code__.co_firstlineno + 1
+
+
+def test_a_line_of_a_generator_is_one_of_its_function():
+    """If this fails: print the location, and adapt `_named`."""
+
+    def one(x):
+        return sum(jnp.sin(i * x) for i in range(1, 2))
+
+    limit = jax.config.jax_traceback_in_locations_limit  # pyright: ignore
+    jax.config.update("jax_traceback_in_locations_limit", 10)
+    try:
+        sine = _operation(_lowered(one, ()), "stablehlo.sine")
+    finally:
+        jax.config.update("jax_traceback_in_locations_limit", limit)
+    own = [x for x in mlir.source_lines(str(sine.location)) if x.file == __file__]
+    assert own[0].function == "one"
+    assert own[0].line == one.__code__.co_firstlineno + 1
