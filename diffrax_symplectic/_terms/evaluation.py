@@ -26,7 +26,8 @@ def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Arr
             "or `jax.lax.cond` instead of `if`, and `jnp` instead of `np`."
         ) from error
     except (TypeError, AttributeError) as error:
-        if args is None:
+        # Errors of Python and JAX about `None` name its type.
+        if args is None and "NoneType" in str(error):
             error.add_note(f"`{name}` was called with `args=None`. Was it left out?")
         raise
 
