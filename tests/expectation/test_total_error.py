@@ -51,6 +51,19 @@ def test_three_levels_know_that_the_steps_are_too_long_and_two_promise_nothing()
     np.testing.assert_allclose(three.error, np.max(np.abs(np.diff(means))), rtol=1e-5)
 
 
+@pytest.mark.parametrize("size", [1e-12, 1e-4])
+def test_heavy_tails_are_told_only_where_they_matter_beside_the_whole_error(size):
+    def fn(key, level):
+        # The mean of each level, and a variable whose mean is made by rare samples.
+        return jnp.array([1.3, 1.0])[level] + size * jnp.exp(5 * jr.normal(key))
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        ds.monte_carlo(fn, key=KEY, num_paths=400, levels=2, order=2)
+    heavy = [x for x in told if "account for most" in str(x.message)]
+    assert len(heavy) == (size > 1e-6)
+
+
 @pytest.mark.parametrize("noise", [1e-9, 10.0])
 def test_changes_fit_the_order_unless_sampling_shows_that_they_do_not(noise):
     h = 0.5 ** np.arange(3)

@@ -17,6 +17,9 @@ from .tolerance import largest_of, shortfall
 # With an `r` of `std_error` above this, means of exp(5 x) with normal x were off by forty
 # standard errors, and means of exp(3 x) by five.
 _HEAVY = 0.35
+# Which does not matter where so many standard errors are less than the whole error, as for
+# value functions that leave 1e-16 beside a discretization error of 1e-7.
+_WORST = 100
 # Two steps do not agree if the extrapolation from them changes the mean by more than this
 # share of it. Of a method of order 2, the bias of the longer step is then more than twice
 # the mean.
@@ -82,7 +85,12 @@ def _of_spread(estimate: Expectation) -> Iterator[str]:
             "standard errors from zero, or not finite. The estimate is crude Monte Carlo. "
             "Pass a smaller `degree`, or another `sampling`."
         )
-    if any(np.any(x > _HEAVY) for x in jtu.tree_leaves(best.heaviness)):
+
+    def may_be_off(heaviness: Any, std_error: Any, error: Any) -> Any:
+        return np.any((heaviness > _HEAVY) & (_WORST * std_error >= error))
+
+    of_tails = best.heaviness, estimate.std_error, estimate.error
+    if any(jtu.tree_leaves(jtu.tree_map(may_be_off, *of_tails))):
         yield (
             f"A few of the {estimate.num_paths:,} paths account for most of the variance: "
             "still rarer paths may contribute much to the mean, and the standard error may "
