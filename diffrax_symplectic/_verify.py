@@ -217,7 +217,12 @@ def equipartition(
 
     **Raises:** a `ValueError` for terms with a `constraint`.
     """
-    refuse_constraint(terms, "equipartition")
+    if constraint_of(terms) is not None:
+        raise ValueError(
+            "`equipartition` takes no terms with a `constraint`, since its two means then "
+            "contain the forces of the constraint. Look at the kinetic energy alone: with "
+            "`c` constraints its mean is `(n - c) T / 2`."
+        )
     drift, _, _ = split_friction(terms)
 
     def phi(t: RealScalarLike, y: Y, args: Args) -> dict[str, Array]:

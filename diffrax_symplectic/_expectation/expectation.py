@@ -32,6 +32,7 @@ from .choose import choose, few_paths, trial_key, Wanted
 from .estimate import cautions, Expectation, ExpectationInterrupted, needs_level
 from .fused_paths import FusedPaths
 from .kinks import has_kinks
+from .long_steps import is_unstable_at_start
 from .run import Meter, NO_METER, run
 from .sampling import AbstractSampling
 
@@ -223,6 +224,14 @@ def expectation(
     _warn_of_rounding(estimate, problem)
     # A part of an estimate is not warned of again.
     if start is None and first == 0:
+        if is_unstable_at_start(problem):
+            warnings.warn(
+                f"Steps of `dt0={float(dt0):g}` are too long for `{type(solver).__name__}` "
+                "where paths start: a small change of the state grows in each step, with "
+                "alternating signs. Where forces are bounded, such steps leave random "
+                "states, and two levels may agree on a wrong mean. Pass a smaller `dt0`.",
+                stacklevel=2,
+            )
         warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
         if has_kinks(problem):
             _warn_of_law(estimate, problem, key, devices)

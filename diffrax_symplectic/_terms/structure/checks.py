@@ -367,15 +367,20 @@ def _advice(structure: str, term: diffrax.AbstractTerm) -> str:
     instead = (
         "" if maker is None else f', or pass `structure="{structure}"` to `{maker}`'
     )
+    general = _GENERAL_BATH if maker == "langevin_terms" else _GENERAL
     return (
         "Variables also count if they cancel, are multiplied by zero, are printed, or "
         f"share an array with others: in that case write {how}{instead}. Otherwise "
-        f"{_GENERAL}."
+        f"{general}."
     )
 
 
 _GENERAL = (
     "use a solver for general systems, for example `ImplicitMidpoint` or `StrangGauss`"
+)
+_GENERAL_BATH = (
+    "use `BAOAB(ImplicitMidpoint())`, for any H0 that is quadratic in p, or a solver for "
+    "general systems, such as `ImplicitMidpoint`"
 )
 
 

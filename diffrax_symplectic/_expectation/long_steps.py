@@ -1,0 +1,82 @@
+"""Whether steps are too long for an explicit solver, where paths start."""
+
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from .._compat import quickly_compiled
+from .._simulation import Problem
+from .._solver import AbstractSymplecticSolver
+from .._terms import constraint_of, split_terms
+
+
+# A step that enlarges a small change of the state by more than this, and turns it around,
+# is unstable. Exact flows turn changes around, too, but over a step that resolves them they
+# do not enlarge them at the same time. `StormerVerlet` has it for omega h = 2.003.
+_UNSTABLE = 1.1
+# So many steps of the tangent flow leave the most unstable direction of a random one. As
+# many more show its growth.
+_ITERATIONS = 50
+
+
+class _Growth(NamedTuple):
+    """Of a change of the state in steps that are all taken from the same state.
+
+    - `change`: of length one.
+    - `log`: the logarithm of its growth so far.
+    - `turned`: its product with itself before the last step.
+    """
+
+    change: Float[Array, " n"]
+    log: Float[Array, ""]
+    turned: Float[Array, ""]
+
+
+def is_unstable_at_start(problem: Problem) -> bool:
+    """Whether an explicit solver of this package is unstable at the start of a path, with
+    steps of `dt0` and without noise. Two levels need not show it: where forces are bounded,
+    steps of `dt0` and half of it may both leave a random state."""
+    solver = problem.solver
+    if not isinstance(solver, AbstractSymplecticSolver) or solver.stage_vectors(1):
+        return False
+    if constraint_of(problem.terms) is not None:
+        return False
+    growth = _quick_growth(problem, solver)
+    return bool(growth.log > _ITERATIONS * np.log(_UNSTABLE) and growth.turned < 0)
+
+
+def _growth(problem: Problem, solver: AbstractSymplecticSolver) -> _Growth:
+    """Of the change that a step enlarges most."""
+    drift, _ = split_terms(problem.terms)
+    terms = diffrax.MultiTerm(*drift)
+    t0 = jnp.asarray(problem.t0)
+    t1 = t0 + problem.level(0).h
+    flat, unravel = jfu.ravel_pytree(problem.y0)
+
+    def step(x: Array) -> Array:
+        y = unravel(x)
+        state = solver.init(terms, t0, t1, y, problem.args)
+        y1, *_ = solver.step(terms, t0, t1, y, problem.args, state, False)
+        return jfu.ravel_pytree(y1)[0]
+
+    def moved(number: Array, before: _Growth) -> _Growth:
+        _, after = jax.jvp(step, (flat,), (before.change,))
+        length = jnp.linalg.norm(after)
+        counted = jnp.where(number < _ITERATIONS, 0.0, jnp.log(length))
+        turned = before.change @ after
+        return _Growth(after / length, before.log + counted, turned)
+
+    # No symmetry singles it out.
+    change = jnp.cos(1.0 + jnp.arange(flat.size, dtype=flat.dtype))
+    zero = jnp.zeros((), flat.dtype)
+    start = _Growth(change / jnp.linalg.norm(change), zero, zero)
+    return lax.fori_loop(0, 2 * _ITERATIONS, moved, start)
+
+
+_quick_growth = quickly_compiled(_growth)

@@ -1,0 +1,78 @@
+"""Explicit steps beyond their limit are told where two levels agree on a wrong mean."""
+
+import warnings
+
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+
+Y0 = jnp.array(0.0), jnp.array(1.0)
+FEW = ds.IndependentPaths(2000)
+
+
+def _pendulum(t, p, q, args):
+    return p**2 / 2 - jnp.cos(q)
+
+
+def _cosine(t, y, args):
+    return jnp.cos(y[1])
+
+
+def _told(terms, solver, h, y0=Y0, phi=_cosine, **options):
+    """The estimate, and whether it says that steps are too long."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        got = ds.expectation(
+            phi, terms, solver, 0, 15 * h, h, y0, key=jr.key(1), sampling=FEW, **options
+        )
+    return got, any("too long for" in str(x.message) for x in told)
+
+
+def test_bounded_forces_hide_steps_that_are_too_long_from_two_levels():
+    terms = ds.langevin_terms(_pendulum, 0.5, 1.0, ())
+    got, told = _told(terms, ds.BAOAB(), 8.0)
+    # By Bessel functions.
+    assert abs(got.mean - 0.44639) > 10 * got.error
+    assert told
+
+
+OSCILLATOR = ds.hamiltonian_terms(
+    lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2,
+    lambda t, p, q, args: jnp.sin(q[0]) / 5,
+    (),
+)
+
+
+@pytest.mark.parametrize("h, too_long", [(0.1, False), (1.99, False), (2.02, True)])
+@pytest.mark.parametrize("size", [1, 100])
+def test_the_limit_of_stability_is_told(h, too_long, size):
+    y0 = jnp.zeros(size), jnp.ones(size)
+    phi = lambda t, y, args: jnp.cos(y[1][0])
+    _, told = _told(OSCILLATOR, ds.StormerVerlet(), h, y0, phi, levels=1)
+    assert told is too_long
+
+
+def test_steps_that_resolve_a_barrier_or_are_implicit_are_not_told():
+    barrier = ds.langevin_terms(
+        lambda t, p, q, args: p**2 / 2 + (q**2 - 1) ** 2 / 4, 5.0, 1.0, ()
+    )
+    top = jnp.array(0.0), jnp.array(0.0)
+    assert not _told(barrier, ds.BAOAB(), 1.0, top)[1]
+    terms = ds.hamiltonian_terms(_pendulum, lambda t, p, q, args: jnp.sin(q) / 5, ())
+    assert not _told(terms, ds.ImplicitMidpoint(), 4.0)[1]
+    # Strong friction turns momenta around, and does not enlarge them.
+    rough = ds.langevin_terms(_pendulum, 50.0, 1.0, ())
+    assert not _told(rough, ds.BAOAB(), 1.0)[1]
+
+
+def test_the_warning_names_the_line_of_the_user():
+    terms = ds.langevin_terms(_pendulum, 0.5, 1.0, ())
+    given = _cosine, terms, ds.BAOAB(), 0, 32, 8.0, Y0
+    with pytest.warns(UserWarning, match="too long for `BAOAB`") as told:
+        got = ds.expectation(*given, key=jr.key(1), sampling=FEW)
+    assert np.isfinite(got.mean)
+    assert {x.filename for x in told if "too long" in str(x.message)} == {__file__}
