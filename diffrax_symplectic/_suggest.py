@@ -30,6 +30,7 @@ from ._solver import (
     LANGEVIN,
     Record,
     SOLVERS,
+    StormerVerlet,
     Want,
 )
 from ._tableau import Structure
@@ -314,6 +315,8 @@ def _suitable(
     )
     if system.constrained:
         solvers = [solver for solver in solvers if solver.keeps_constraints]
+        if system.friction:
+            solvers.append(BAOAB(StormerVerlet()))
         if not solvers:
             raise ValueError(
                 "Solvers for terms with a `constraint` need H0 = p . M^-1 p / 2 + U(t, q), "

@@ -172,6 +172,10 @@ _CHOOSE_A_FLOW = (
     "positions: friction and noise by a step of their own, which keeps Maxwell's law at "
     "every friction."
 )
+_CHOOSE_FOR_CONSTRAINTS = (
+    "A heat bath under constraints: kinetic energies at the ends of long steps, and "
+    "positions, are better than with free flight, for twice the evaluations of forces."
+)
 
 
 class BAOAB(AbstractLangevinSplitting):
@@ -273,8 +277,10 @@ class BAOAB(AbstractLangevinSplitting):
     def record(self) -> Record:  # pyright: ignore
         if self.flow is None:
             return _FREE_FLIGHT
+        keeps_constraints = getattr(self.flow, "keeps_constraints", False)
+        choose = _CHOOSE_FOR_CONSTRAINTS if keeps_constraints else _CHOOSE_A_FLOW
         # What is exact depends on the flow.
-        return _FREE_FLIGHT._replace(choose=_CHOOSE_A_FLOW, stationary=())
+        return _FREE_FLIGHT._replace(choose=choose, stationary=())
 
     @property
     def structure(self) -> Structure:
