@@ -398,8 +398,9 @@ def test_drjit_numbers_the_variables_that_exist():
         x = start
         for _ in range(number):
             x = x * x + start
-        # Two operations in each turn.
-        assert number < _compat.variable_number(x) - first < 3 * number
+        # Two operations in each turn. Arrays of other tests that still exist have numbers
+        # in between.
+        assert number < _compat.variable_number(x) - first < 3 * number + 1000
         del x
 
 
