@@ -24,8 +24,9 @@ LONG = [
     for start, end in ((3, FIRST), (COMPANY, len(cases())))
     for begin in range(start, end, 12)
 ]
-# A table is returned by a branch, for a checkpoint in the other one.
-REFUSED = {93}
+# A table is returned by a branch, for a checkpoint in the other one. JAX 0.12 makes another
+# program of it, which is replayed.
+MAY_BE_REFUSED = {93}
 # Four steps; units in the last place of the largest number.
 ULPS = 32
 
@@ -58,6 +59,6 @@ def test_systems_of_all_parts_have_the_same_paths(group):
             ended[left.pop(0)] = message
     assert not ended
     refused = {number for number, ulps in apart.items() if ulps == "refused"}
-    assert refused == REFUSED & {*group}
+    assert refused <= MAY_BE_REFUSED
     solved = {number: ulps for number, ulps in apart.items() if number not in refused}
     assert {number: ulps for number, ulps in solved.items() if ulps > ULPS} == {}

@@ -205,8 +205,8 @@ def test_systems_without_the_structure_are_refused():
     fast = lambda t, p, q, args: jnp.sum(jnp.sqrt(1 + p**2))
     of_momenta = lambda t, p, q, args: jnp.sin(p)
     for H0, noise, match in (
-        (mixed, _bath(SIGMA), "needs H0 = V.*`ImplicitMidpoint` or `StrangGauss`"),
-        (mass, _bath(SIGMA), "needs H0 = V.*`ImplicitMidpoint` or `StrangGauss`"),
+        (mixed, _bath(SIGMA), r"needs H0 = V.*`BAOAB\(ImplicitMidpoint\(\)\)`"),
+        (mass, _bath(SIGMA), r"needs H0 = V.*`BAOAB\(ImplicitMidpoint\(\)\)`"),
         (_pendula, of_momenta, "needs H0 = V"),
         (fast, _bath(SIGMA), "linear in p.*`ImplicitMidpoint` or `StrangGauss`"),
     ):
