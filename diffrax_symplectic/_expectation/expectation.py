@@ -177,12 +177,12 @@ def expectation(
     other shapes or more paths, terms without noise, and for paths that `sampling` cannot
     use (the message names suitable ones); a
     [`diffrax_symplectic.ExpectationInterrupted`][] holding the estimate so far, on a
-    keyboard interrupt. Warns if `tol` was not reached, if two levels do not agree, if
-    failed paths could change the mean by more than the standard error, if a few samples
-    account for most of the variance, if a fit was dropped or takes long, if all samples
-    are equal or underflow, if `phi` is not smooth and a trial with Gaussian increments
-    has another mean than discrete ones, and if rounding in single precision may exceed
-    the standard error.
+    keyboard interrupt. Warns if `tol` was not reached, if two levels do not agree, or have
+    steps that are too long for an explicit solver at `y0`, if failed paths could change the
+    mean by more than the standard error, if a few samples account for most of the variance,
+    if a fit was dropped or takes long, if all samples are equal or underflow, if `phi` is
+    not smooth and a trial with Gaussian increments has another mean than discrete ones, and
+    if rounding in single precision may exceed the standard error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and
@@ -224,7 +224,8 @@ def expectation(
     _warn_of_rounding(estimate, problem)
     # A part of an estimate is not warned of again.
     if start is None and first == 0:
-        if is_unstable_at_start(problem):
+        # Three levels are checked for the order, and one promises nothing of the step.
+        if estimate.levels == 2 and is_unstable_at_start(problem):
             warnings.warn(
                 f"Steps of `dt0={float(dt0):g}` are too long for `{type(solver).__name__}` "
                 "where paths start: a small change of the state grows in each step, with "

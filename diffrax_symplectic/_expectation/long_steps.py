@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import diffrax
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ from jaxtyping import Array, Float
 from .._compat import quickly_compiled
 from .._simulation import Problem
 from .._solver import AbstractSymplecticSolver
-from .._terms import constraint_of, split_terms
+from .._terms import brownian_paths, constraint_of, has_unknown_law
 
 
 # A step that enlarges a small change of the state by more than this, and turns it around,
@@ -39,30 +38,30 @@ class _Growth(NamedTuple):
 
 
 def is_unstable_at_start(problem: Problem) -> bool:
-    """Whether an explicit solver of this package is unstable at the start of a path, with
-    steps of `dt0` and without noise. Two levels need not show it: where forces are bounded,
-    steps of `dt0` and half of it may both leave a random state."""
+    """Whether an explicit solver of this package's kind is unstable at the start of a path,
+    with steps of `dt0` and increments of zero. Two levels need not show it: where forces
+    are bounded, steps of `dt0` and half of it may both leave a random state."""
     solver = problem.solver
     if not isinstance(solver, AbstractSymplecticSolver) or solver.stage_vectors(1):
         return False
     if constraint_of(problem.terms) is not None:
         return False
-    growth = _quick_growth(problem, solver)
+    if any(map(has_unknown_law, brownian_paths(problem.terms))):
+        return False
+    growth = _quick_growth(problem)
     return bool(growth.log > _ITERATIONS * np.log(_UNSTABLE) and growth.turned < 0)
 
 
-def _growth(problem: Problem, solver: AbstractSymplecticSolver) -> _Growth:
+def _growth(problem: Problem) -> _Growth:
     """Of the change that a step enlarges most."""
-    drift, _ = split_terms(problem.terms)
-    terms = diffrax.MultiTerm(*drift)
-    t0 = jnp.asarray(problem.t0)
-    t1 = t0 + problem.level(0).h
+    h = problem.level(0).h
+    variables = problem.variables(h)
+    terms = variables.terms_with(jnp.zeros(len(variables.laws)))
     flat, unravel = jfu.ravel_pytree(problem.y0)
 
     def step(x: Array) -> Array:
         y = unravel(x)
-        state = solver.init(terms, t0, t1, y, problem.args)
-        y1, *_ = solver.step(terms, t0, t1, y, problem.args, state, False)
+        y1, *_ = problem.step(terms, 0, h, y, problem.init(terms, 0, h, y))
         return jfu.ravel_pytree(y1)[0]
 
     def moved(number: Array, before: _Growth) -> _Growth:

@@ -149,22 +149,22 @@ def moved_by(
     terms = diffrax.MultiTerm(*drift)
     h = (t1 - t0) / steps
 
-    def step(carry: tuple, k: Any) -> tuple:
+    def step(carry: tuple, k: Any) -> tuple[tuple, None]:
         y, state, _ = carry
         begin = t0 + k * h
         # What the bath did is a jump for a solver that remembers the end of its last step.
         y, _, _, state, result = flow.step(  # pyright: ignore
             terms, begin, begin + h, y, args, state, True
         )
-        return y, state, result
+        return (y, state, result), None
 
     carry = y, state, diffrax.RESULTS.successful
     if steps == 1:
-        return step(carry, 0)
-    # A failure stays in the state of the solver, or in a state that is not finite.
-    return lax.scan(lambda carry, k: (step(carry, k), None), carry, jnp.arange(steps))[
-        0
-    ]
+        carry, _ = step(carry, 0)
+    else:
+        # A failure stays in the state of the solver, or in a state that is not finite.
+        carry, _ = lax.scan(step, carry, jnp.arange(steps))
+    return carry
 
 
 def moved(x: PyTree, time: RealScalarLike, rate: PyTree) -> PyTree:

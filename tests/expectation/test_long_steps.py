@@ -2,6 +2,7 @@
 
 import warnings
 
+import diffrax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -45,6 +46,7 @@ OSCILLATOR = ds.hamiltonian_terms(
     lambda t, p, q, args: jnp.sin(q[0]) / 5,
     (),
 )
+Y1 = jnp.zeros(1), jnp.ones(1)
 
 
 @pytest.mark.parametrize("h, too_long", [(0.1, False), (1.99, False), (2.02, True)])
@@ -52,8 +54,44 @@ OSCILLATOR = ds.hamiltonian_terms(
 def test_the_limit_of_stability_is_told(h, too_long, size):
     y0 = jnp.zeros(size), jnp.ones(size)
     phi = lambda t, y, args: jnp.cos(y[1][0])
-    _, told = _told(OSCILLATOR, ds.StormerVerlet(), h, y0, phi, levels=1)
-    assert told is too_long
+    assert _told(OSCILLATOR, ds.StormerVerlet(), h, y0, phi)[1] is too_long
+
+
+def test_one_level_promises_nothing_of_the_step_as_for_a_map():
+    phi = lambda t, y, args: jnp.cos(y[1][0])
+    assert not _told(OSCILLATOR, ds.StormerVerlet(), 2.02, Y1, phi, levels=1)[1]
+
+
+class _Kicks(ds.AbstractSymplecticSolver):
+    """A kick and a drift, by a user who knows that there are a drift and a noise."""
+
+    structure = "separable"
+    variables = ("W",)
+    interpolation_cls = diffrax.LocalLinearInterpolation
+
+    def stage_vectors(self, num_noises):
+        return ()
+
+    def order(self, terms):
+        return 1
+
+    def init(self, terms, t0, t1, y0, args):
+        return None
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        drift, noise = terms.terms
+        p, q = y0
+        force, _ = drift.vf(t0, y0, args)
+        kick, _ = noise.vf_prod(t0, y0, args, noise.contr(t0, t1))
+        p = p + (t1 - t0) * force + kick
+        y1 = p, q + (t1 - t0) * p
+        return y1, None, dict(y0=y0, y1=y1), None, diffrax.RESULTS.successful
+
+
+@pytest.mark.parametrize("h, too_long", [(1.9, False), (2.1, True)])
+def test_a_solver_of_ones_own_keeps_its_noise(h, too_long):
+    phi = lambda t, y, args: jnp.cos(y[1][0])
+    assert _told(OSCILLATOR, _Kicks(), h, Y1, phi)[1] is too_long
 
 
 def test_steps_that_resolve_a_barrier_or_are_implicit_are_not_told():

@@ -123,19 +123,24 @@ def test_values_of_constants_are_read(values):
             np.testing.assert_array_equal(*signs)
 
 
+def _lines_of_the_sine(fn):
+    """The lines that the sine in a function comes from."""
+    limit = jax.config.jax_traceback_in_locations_limit  # pyright: ignore
+    jax.config.update("jax_traceback_in_locations_limit", 10)
+    try:
+        sine = _operation(_lowered(fn, ()), "stablehlo.sine")
+    finally:
+        jax.config.update("jax_traceback_in_locations_limit", limit)
+    return mlir.source_lines(str(sine.location))
+
+
 def test_the_lines_that_an_operation_comes_from_are_known():
     """If this fails: print the location, and adapt `source_lines`."""
 
     def one(x):
         return jnp.sin(x)
 
-    limit = jax.config.jax_traceback_in_locations_limit  # pyright: ignore
-    jax.config.update("jax_traceback_in_locations_limit", 10)
-    try:
-        sine = _operation(_lowered(one, ()), "stablehlo.sine")
-    finally:
-        jax.config.update("jax_traceback_in_locations_limit", limit)
-    lines = mlir.source_lines(str(sine.location))
+    lines = _lines_of_the_sine(one)
     (own,) = [line for line in lines if line.function == "one"]
     assert own.file == __file__
     assert own.line == one.__code__.co_firstlineno + 1
@@ -147,12 +152,6 @@ def test_a_line_of_a_generator_is_one_of_its_function():
     def one(x):
         return sum(jnp.sin(i * x) for i in range(1, 2))
 
-    limit = jax.config.jax_traceback_in_locations_limit  # pyright: ignore
-    jax.config.update("jax_traceback_in_locations_limit", 10)
-    try:
-        sine = _operation(_lowered(one, ()), "stablehlo.sine")
-    finally:
-        jax.config.update("jax_traceback_in_locations_limit", limit)
-    own = [x for x in mlir.source_lines(str(sine.location)) if x.file == __file__]
+    own = [line for line in _lines_of_the_sine(one) if line.file == __file__]
     assert own[0].function == "one"
     assert own[0].line == one.__code__.co_firstlineno + 1
