@@ -130,7 +130,7 @@ def write(table: Table) -> None:
     for name, ax in zip(SYSTEMS, axes.flat):
         for way in WAYS:
             if nanoseconds := table.get((name, way)):
-                shown = " | ".join(f"{x:.1f}" for x in nanoseconds)
+                shown = " | ".join(f"{float(f'{x:.3g}'):,.10g}" for x in nanoseconds)
                 rows.append(f"| {name} | {way} | {shown} |")
                 ax.loglog(NUMBERS, nanoseconds, "o-", ms=3, label=way.strip("`"))
         ax.set_title(name.replace("`", ""), fontsize=8)

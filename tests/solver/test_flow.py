@@ -1,5 +1,8 @@
 """`BAOAB` with a flow between its kicks and its bath: another solver, or a linear flow."""
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -10,6 +13,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..drjit_here import needs_drjit
+from ..problems import Given
 
 
 KEY = jr.key(0)
@@ -289,6 +293,71 @@ def test_stationary_means_have_order_two_where_masses_depend_on_positions():
     short = error(0.2)
     assert np.all(abs(short) < [1.2e-4, 1e-3])
     assert np.all(abs(long / short - 4) < 0.6)
+
+
+class _Masses(NamedTuple):
+    """Masses that depend on the last position alone, whose range is a part of a line."""
+
+    of: Callable
+    potential: Callable
+    range: tuple[float, float]
+
+
+# An atom under a heavy piston, and the angle between two rods of three equal masses.
+PISTON = _Masses(
+    lambda length: jnp.stack([length**2, 3.0 * jnp.ones_like(length)]),
+    lambda length: 2 * length + 3 / length,
+    (0.05, 10.05),
+)
+RODS = _Masses(
+    lambda angle: jnp.stack([(4 - jnp.cos(angle) ** 2) / 3]),
+    lambda angle: 3 * (1 - jnp.cos(angle + 1)),
+    (-np.pi, np.pi),
+)
+
+
+@pytest.mark.parametrize("masses", [PISTON, RODS], ids=["piston", "rods"])
+def test_one_step_keeps_the_law_of_gibbs_to_second_order(masses):
+    # By quadrature over the law of Gibbs and the noise, without sampling. The change of a
+    # mean in a step, over h, has the order of the law that the step keeps.
+    T = 0.8
+    of, potential, (low, high) = masses
+    n = len(of(jnp.array(1.0)))
+
+    def H0(t, p, q, args):
+        return jnp.sum(p**2 / of(q[-1])) / 2 + potential(q[-1])
+
+    terms = lambda path: ds.langevin_terms(H0, lambda t, q, args: of(q[-1]), T, path)
+    x, normal = np.polynomial.hermite_e.hermegauss(10)
+    normal = normal / normal.sum()
+    last, weight = np.polynomial.legendre.leggauss(60)
+    last = low + (last + 1) / 2 * (high - low)
+    weight = weight * np.prod(of(last), axis=0) ** 0.5 * np.exp(-potential(last) / T)
+    weight = weight / weight.sum()
+    for _ in range(2 * n):
+        weight = np.multiply.outer(weight, normal)
+    axes = np.meshgrid(last, *[x] * (2 * n), indexing="ij")
+    last, *numbers = [jnp.asarray(axis.ravel()) for axis in axes]
+    momenta = jnp.stack(numbers[:n], 1) * (T * of(last).T) ** 0.5
+    positions = jnp.zeros_like(momenta).at[:, -1].set(last)
+    noise = jnp.stack(numbers[n:], 1)
+
+    def observed(y):
+        p, q = y
+        return p[-1] * jnp.stack([jnp.sin(q[-1]), jnp.cos(q[-1])])
+
+    def changes(solver, h):
+        def change(y0, w):
+            y1 = _one_step(solver, terms(Given(w * h**0.5)), h, y0)
+            return observed(y1) - observed(y0)
+
+        changed = jax.jit(jax.vmap(change))((momenta, positions), noise)
+        return weight.ravel() @ np.asarray(changed) / h
+
+    solver = ds.BAOAB(ds.ImplicitMidpoint())
+    short = changes(solver, 0.05)
+    assert np.all(abs(changes(solver, 0.1) / short - 4) < 0.25)
+    assert np.max(abs(changes(ds.ImplicitMidpoint(), 0.05))) > 3 * np.max(abs(short))
 
 
 @pytest.mark.parametrize("h", [0.39, 0.5])
