@@ -2,7 +2,7 @@
 
     pip install '.[fused,examples]' && python -m examples.benchmarks.fused
 
-Prints the tables of `docs/ensembles.md` and draws its picture. Only steps are timed, and
+Prints the table of `docs/ensembles.md`. Only steps are timed, and
 first calls: each later call of `ensemble` takes 10 to 30 milliseconds more to check its
 arguments. The engines take turns, in many short runs, and the best run of each counts, so
 that other load on the machine matters less.
@@ -20,7 +20,6 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrax_symplectic as ds
@@ -31,7 +30,6 @@ from .. import rigid_body
 from ._timing import ensemble, keys, machine, race
 
 
-IMAGE = Path(__file__).parents[2] / "docs" / "img" / "ensembles.png"
 FEW, ROUNDS = 1024, 60
 
 
@@ -231,7 +229,6 @@ def main() -> None:
             f"{first[0]:.1f} s | {first[1]:.1f} s |",
             flush=True,
         )
-    draw(c)
     print(f"Mean over 10^7 paths of 100 steps: {mean_of(10**7):.1f} s")
 
 
@@ -255,22 +252,6 @@ def mean_of(n: int) -> float:
             engine="drjit",
         )
     return time.perf_counter() - begin
-
-
-def draw(c: Callable) -> None:
-    numbers = [2**k for k in (6, 10, 14)]
-    steps = [max(10, 2**16 // n) for n in numbers]
-    rows = [nanoseconds(midpoint(0.01), n, k, False) for n, k in zip(numbers, steps)]
-    in_c = [c(n)[0.01] for n in numbers]
-    fig, ax = plt.subplots(figsize=(5, 3.2), layout="constrained")
-    ax.loglog(numbers, [b for _, b in rows], "o-", label="vmap(diffeqsolve)")
-    ax.loglog(numbers, [a for a, _ in rows], "s-", label="fused")
-    ax.loglog(numbers, in_c, "^--", label="in C")
-    ax.set(xlabel="paths", ylabel="nanoseconds a path and step", ylim=(1, None))
-    ax.legend(frameon=False, fontsize=8)
-    fig.savefig(IMAGE, dpi=150)
-    for n, (a, b), own in zip(numbers, rows, in_c):
-        print(f"{n} paths: fused {a:.1f}, vmap {b:.1f}, C {own:.1f}", flush=True)
 
 
 if __name__ == "__main__":
