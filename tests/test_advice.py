@@ -82,7 +82,7 @@ def test_reasons_name_the_friction_that_exact_second_moments_allow(name):
     if limit is None:
         assert "gamma h" not in reason
     else:
-        assert f"not for friction gamma h > {limit:g}." in reason
+        assert f"only up to gamma h = {limit:g}." in reason
 
 
 def test_reasons_say_which_solver_is_for_functions_of_momenta_and_positions():

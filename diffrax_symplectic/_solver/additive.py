@@ -74,7 +74,8 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=2,
         strong=3 / 2,
-        choose="Two stage vectors, one after the other. The noise may depend on time.",
+        choose="Accurate paths; the noise may depend on time. Two stage vectors, one after "
+        "the other.",
         suggested=("weak", "strong"),
         heats=True,
         most_friction=1.0,
@@ -175,10 +176,10 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=3,
         strong=None,
-        choose="Two stage vectors, and by far the smallest errors for constant noise. Not "
-        "for long steps, omega h > 1, for `ValueFunctions` in strongly nonlinear systems "
-        "(36 outcomes of a step make the fit coarser), or for stationary laws of linear "
-        "systems, which the midpoint rule has exactly.",
+        choose="The smallest errors by far for constant noise; two stage vectors. Not for "
+        "long steps, omega h > 1, for stationary laws of linear systems (the midpoint rule "
+        "has them exactly), or for `ValueFunctions` in strongly nonlinear systems (36 "
+        "outcomes per step).",
         suggested=("weak",),
         heats=True,
         most_friction=2.0,

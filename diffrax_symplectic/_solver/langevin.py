@@ -159,9 +159,9 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
 _FREE_FLIGHT = Record(
     weak=2,
     strong=1,
-    choose="Langevin dynamics: explicit, with very accurate stationary positions (not "
-    "under constraints), and exact mobility and diffusion of free particles. For functions "
-    "of p and q together, such as a heat current, too. Not for functions of p alone in "
+    choose="Langevin dynamics, explicit: very accurate stationary positions (not under "
+    "constraints), and exact mobility and diffusion of free particles. For functions of p "
+    "and q together, such as a heat current, too. Not for functions of p alone in "
     "equilibrium, such as a kinetic temperature, for transients to more than three digits, "
     "or for frequencies omega > 2 / h.",
     suggested=("weak", "strong"),
@@ -357,9 +357,9 @@ class LangevinMiddle(AbstractLangevinSplitting):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose="Langevin dynamics in equilibrium, for functions of p alone. Same positions "
-        "as `BAOAB`, but momenta lag by half a step, and are wrong where a force drives a "
-        "current: not for functions of p and q together, such as a heat current.",
+        choose="Langevin dynamics in equilibrium, for functions of p alone. Momenta lag by "
+        "half a step and are wrong where a force drives a current: not for functions of p "
+        "and q together, such as a heat current.",
         suggested=("weak", "strong"),
         stationary=("qq", "pp"),
     )

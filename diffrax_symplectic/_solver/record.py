@@ -48,12 +48,12 @@ class Record(NamedTuple):
         friction the temperature is wrong."""
         sentences = [self.choose]
         if self.heats is False and "pp" in self.stationary:
-            sentences.append("Right for noise on stiff modes only in a heat bath.")
+            sentences.append("If noise drives stiff modes, only in a heat bath.")
         elif self.heats is False:
-            sentences.append("Not for noise on stiff modes.")
+            sentences.append("Not if noise drives stiff modes.")
         if self.most_friction is not None:
             limit = f"{self.most_friction:g}"
-            sentences.append(f"In a heat bath not for friction gamma h > {limit}.")
+            sentences.append(f"In a heat bath, only up to gamma h = {limit}.")
         return " ".join(sentences)
 
     def order(self, want: Want, commute: bool) -> int | float | None:

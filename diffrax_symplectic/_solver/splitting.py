@@ -53,8 +53,8 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
     on a lattice or the bonds of a molecule. Their frequencies then do not limit the step.
     The error is proportional to commutators of $L$ with the rest.
 
-    The terms contain $R$ and all noises, without $L$: a kinetic energy that stands in both
-    counts twice. If they depend on $q$ alone, `LinearFlow(StormerVerlet(), flow)` is
+    The terms contain $R$ and all noises, without $L$: energy must not be
+    in both. If they depend on $q$ alone, `LinearFlow(StormerVerlet(), flow)` is
     explicit. If $R$ depends on $p$ and $q$ together, as for complex amplitudes, take a
     solver for general systems.
 
