@@ -1,5 +1,6 @@
 """How long solves take."""
 
+import datetime
 import os
 import platform
 import time
@@ -86,6 +87,7 @@ def keys(n: int):
 
 
 def machine() -> str:
+    """The machine, the day and the versions with which a page is measured."""
     name = platform.processor() or platform.machine()
     try:
         with open("/proc/cpuinfo") as file:
@@ -93,9 +95,10 @@ def machine() -> str:
         name = lines[0].split(":")[1].strip()
     except (OSError, IndexError):
         pass
-    devices = ", ".join(sorted({d.device_kind for d in jax.devices()}))
+    kinds = sorted({d.device_kind for d in jax.devices()})
+    devices = ", ".join("CPU" if kind == "cpu" else kind for kind in kinds)
     return (
-        f"{name}, {os.cpu_count()} cores; device: {devices}; Python "
+        f"{name}, {os.cpu_count()} cores, {devices}; {datetime.date.today()}; Python "
         f"{platform.python_version()}, JAX {jax.__version__}, Diffrax "
         f"{diffrax.__version__}"
     )

@@ -72,7 +72,11 @@ def run(name: str, description: str | None, modules: Sequence[str]) -> None:
         compile_quickly()
         hasten()
     start = time.perf_counter()
-    sections = [(ROOT / "examples" / name / "page.md").read_text()]
+    # It imports JAX.
+    from ..benchmarks._timing import machine
+
+    head = (ROOT / "examples" / name / "page.md").read_text()
+    sections = [head.format(machine=machine())]
     for module in modules:
         begin = time.perf_counter()
         source = importlib.import_module(f"examples.{name}.{module}")
