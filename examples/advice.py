@@ -7,6 +7,7 @@ judges the order of the suggestions.
 """
 
 import dataclasses
+import datetime
 import json
 import sys
 from collections.abc import Callable
@@ -435,6 +436,7 @@ def measure(names) -> None:
     """Measures these problems anew, and keeps the others."""
     kept = json.loads(KEPT.read_text()) if KEPT.exists() else {}
     table = {"weak": {}, "strong": {}, "strong_std_error": {}, "nonlinear": {}} | kept
+    table["day"] = str(datetime.date.today())
     for name in names:
         if name in NONLINEAR:
             table["nonlinear"][name] = nonlinear_table(name)
@@ -464,7 +466,10 @@ def page(kept: dict) -> str:
         weak=tables("weak", PROBLEMS),
         strong=tables("strong", kept["strong"], 2),
         strong_std_error=max(kept["strong_std_error"].values()),
-        nonlinear="\n\n".join(map(_nonlinear_table, *zip(*kept["nonlinear"].items()))),
+        nonlinear="\n\n".join(
+            _nonlinear_table(name, kept["nonlinear"][name]) for name in NONLINEAR
+        ),
+        day=kept["day"],
         nonlinear_budget=NONLINEAR_BUDGET,
     )
 

@@ -167,8 +167,19 @@ def row(name: str, time: Seconds, unit: Seconds) -> str:
     return line
 
 
-def table() -> list[str]:
-    unit = in_a_process(HEUN, {})
+def conclusion(measured: dict[str, Seconds]) -> str:
+    of_defaults = [measured[name] for name in DEFAULTS]
+    firsts = [time.first / measured[HEUN].first for time in of_defaults]
+    later = [time.repeated for time in of_defaults]
+    return (
+        f"A first `expectation` takes {min(firsts):.0f} to {max(firsts):.0f} times as long "
+        "as the first jitted `Heun`; later calls take "
+        f"{min(later):.2f} to {max(later):.2f} s."
+    )
+
+
+def table(measured: dict[str, Seconds]) -> list[str]:
+    unit = measured[HEUN]
     lines = [
         "| call | first, s | first, of Heun's | repeated, ms |",
         "|---|---|---|---|",
@@ -176,7 +187,7 @@ def table() -> list[str]:
     ]
     for name in CALLS:
         if name != HEUN:
-            lines.append(row(name, in_a_process(name, {}), unit))
+            lines.append(row(name, measured[name], unit))
     for name in (HEUN, *SOLVES):
         label = f"{name}, older code generator"
         lines.append(row(label, in_a_process(name, OLDER_CODE), unit))
@@ -187,20 +198,22 @@ def table() -> list[str]:
 
 
 def main() -> None:
+    measured = {name: in_a_process(name, {}) for name in CALLS}
     head = [
         HEADING,
         "",
-        f"Processor time for the pendulum with one noise and {STEPS} steps. {machine()}. "
-        "float64. Each row is measured in a process of its own; repeated is the best of "
-        f"{REPEATS} calls with other random keys. The older code generator is XLA's, by "
-        f"`XLA_FLAGS={OLDER_CODE['XLA_FLAGS']}`. A second process finds the programs of a "
-        "first one in JAX's compilation cache. Made by `python -m "
+        conclusion(measured),
+        "",
+        f"Processor time of a pendulum with one noise and {STEPS} steps, float64; each row "
+        f'in its own process, repeated calls with other keys (best of {REPEATS}). "Older '
+        f'code generator": `XLA_FLAGS={OLDER_CODE["XLA_FLAGS"]}`. "Second process": '
+        f"programs found in JAX's cache. {machine()}. Made by `python -m "
         "examples.benchmarks.calls`.",
         "",
     ]
     page = DOCS / "speed.md"
     before, *_ = page.read_text().split(HEADING)
-    section = "\n".join([*head, *table()])
+    section = "\n".join([*head, *table(measured)])
     page.write_text(f"{before.rstrip()}\n\n{section}\n")
 
 

@@ -27,6 +27,8 @@ NUMBERS = [2**k for k in range(6, 21, 2)]
 # The start of a path, which draws its random keys, costs as much as ten steps of
 # `StormerVerlet`. It should not count for much, and for as much everywhere.
 STEPS = 64
+# So many that the time of a call no longer counts.
+MANY = 2**16
 # A call that takes longer is not repeated.
 PATIENCE = 5.0
 ROUNDS = 5
@@ -114,14 +116,27 @@ def main() -> None:
     write({(name, way): measured(name, way) for name in SYSTEMS for way in WAYS})
 
 
+def rise(table: Table, *ways: str) -> float:
+    """By how much the cost per path grows at most, as a fraction, from `MANY` paths on."""
+    found = 0.0
+    for (_, way), nanoseconds in table.items():
+        if way in ways and nanoseconds:
+            many = nanoseconds[NUMBERS.index(MANY) :]
+            found = max(found, max(many) / many[0] - 1)
+    return found
+
+
 def write(table: Table) -> None:
     heads = " | ".join(f"{number:,}" for number in NUMBERS)
     rows = [
-        "# Many paths\n\nProcessor nanoseconds per path and step, by the number of paths. "
-        f"{machine()}. float64, best of {ROUNDS} calls of {STEPS} steps, fewer where a "
-        f"call takes more than {PATIENCE:.0f} s, with the time of the call around them, "
-        "which counts where paths are few. `ArrayRQMC` "
-        f"takes these paths in {REPLICATES} replicates. Made by "
+        "# Many paths\n\n"
+        f"From {MANY:,} paths to {NUMBERS[-1]:,} the cost per path rises by at most "
+        f"{rise(table, 'fused', 'JAX'):.0%} in [ensembles](../ensembles.md), and by "
+        f"{rise(table, '`ArrayRQMC`'):.0%} in `ArrayRQMC`, which sorts them.\n\n"
+        "Processor nanoseconds per path and step, best of "
+        f"{ROUNDS} calls of {STEPS} steps (fewer where a call exceeds {PATIENCE:.0f} s), "
+        "float64. Times include the call itself, which dominates for few paths. "
+        f"`ArrayRQMC` splits the paths into {REPLICATES} replicates. {machine()}. Made by "
         "`python -m examples.benchmarks.many_paths`.\n",
         f"| system | | {heads} |",
         "|---" * (2 + len(NUMBERS)) + "|",

@@ -291,10 +291,10 @@ def draw(axes, title: str, results: dict[str, tuple[float, Errors]]) -> list[str
 
 
 EXPLAINED = {
-    "weak": f"At $h = 1/{1 / HS[SHOWN]:g}$; exact for linear models, with "
-    "`ArrayRQMC` for the others.",
-    "strong": f"At $h = 1/{1 / HS[1 + SHOWN]:g}$; root mean squares over 500 Brownian "
-    "paths (`compare_solvers`).",
+    "weak": f"Errors at $h = 1/{1 / HS[SHOWN]:g}$, exact for linear models, else from "
+    "`ArrayRQMC`.",
+    "strong": f"Root mean squares over 500 Brownian paths at $h = 1/{1 / HS[1 + SHOWN]:g}$ "
+    "(`compare_solvers`).",
 }
 HEAD = "| system | solver | error | µs |", "|---" * 4 + "|"
 
@@ -303,10 +303,11 @@ def main() -> None:
     lines = [
         "# Speed against accuracy",
         "",
-        f"{machine()}. Made by `python -m examples.benchmarks.work_precision`.",
+        Path(__file__).with_suffix(".md").read_text().strip(),
         "",
-        "Bars are three standard errors; points that are not clear of zero are not drawn.",
-        "Times are CPU times per path, for one core and batches of 10,000 paths.",
+        "Bars: three standard errors; points not clear of zero are omitted. CPU time per "
+        f"path, one core, batches of 10,000. {machine()}. Made by `python -m "
+        "examples.benchmarks.work_precision`.",
         "",
         "![Errors against CPU seconds per path](work_precision.png)",
     ]
