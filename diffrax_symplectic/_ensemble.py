@@ -111,8 +111,8 @@ def ensemble(
     engine: str | None = None,
     batch_size: int | None = None,
 ) -> Ensemble:
-    r"""The states of many independent paths, for histograms, spectra, and clouds in phase
-    space.
+    r"""Solves for many independent paths and returns their states, for histograms, spectra,
+    and clouds in phase space.
 
     !!! example
 
@@ -132,30 +132,20 @@ def ensemble(
         print(q.shape, q.std(), paths.num_failed)
         ```
 
-    Every path starts at `y0`, or if `y0` is a function of a random key, at a state of its
-    own. The random keys of path number $i$ depend on `key` and $i$ only, not on
-    `num_paths`, `batch_size` or `engine`. `ensemble(...).terms(i)` returns terms with these
-    keys, for `diffrax.diffeqsolve`, and `ensemble(...).start(i)` the initial state and the
-    `args`. Paths are simulated in batches, so that only the returned arrays grow with their
-    number. For events along a path, average a solve of your own with
+    Path $i$ depends on `key` and $i$ only. `terms(i)` and `start(i)` of the result
+    reproduce it with `diffrax.diffeqsolve`. `y0` may draw a start for each path. Only the
+    returned arrays grow with the number of paths. For events along a path use
     [`diffrax_symplectic.monte_carlo`][].
 
-    **Noise.** Where `terms` have the shape of a path, the solver makes one with the
-    Gaussian increments of a Brownian motion, so that every function of the states has the
-    right law. They are bounded for implicit solvers where the noise depends on the state
-    (see [`diffrax_symplectic.TruncatedBrownianPath`][]); what that takes from their
-    variance is told above 0.1%. The discrete increments of `want="weak"` take less time,
-    and give the right means of smooth functions only: a momentum that starts at one value
-    has three values after a step, and Brownian motion from 0 leaves (-1, 1) after 1.07 in
-    the mean, not after 1. Solvers that have no other ones, such as
-    [`diffrax_symplectic.AdditiveGauss`][], are refused without it.
+    **Noise.** If `terms` hold a shape, the solver makes a path with Gaussian increments.
+    They are bounded for implicit solvers where the noise depends on the state (see
+    [`diffrax_symplectic.TruncatedBrownianPath`][]); a warning says if that takes more than
+    0.1% of their variance. The discrete increments of `want="weak"` take less time, and
+    give the right means of smooth functions only. Solvers with discrete increments only,
+    such as [`diffrax_symplectic.AdditiveGauss`][], need `want="weak"`.
 
-    **Engines.** `engine="jax"`, the default, moves all paths through each step together.
-    `engine="drjit"` compiles all steps to one kernel with
-    [Dr.Jit](https://drjit.readthedocs.io), which keeps each path in registers and is
-    several times as fast. The states agree up to rounding. The few paths with an implicit
-    step that simple sweeps do not solve ("stragglers") are simulated again by JAX, and
-    counted. See [Large ensembles][large-ensembles].
+    **Engines.** `engine="drjit"` fuses all steps into one kernel, several times as fast;
+    see [Large ensembles][large-ensembles]. `"jax"` is the default.
 
     **Arguments:**
 

@@ -133,19 +133,29 @@ def suggest_solver(
     *,
     want: Want,
 ) -> Suggestions:
-    r"""Suggests solvers for a system by the structure of its terms.
+    r"""Lists the solvers that suit your terms, best first, with orders, paths and reasons.
 
-    In a heat bath, solvers with exact stationary positions of a harmonic mode come first.
-    Then they are sorted by highest order; by whether noise on stiff modes comes out right;
-    and by fewest stage vectors to solve for. [Measured errors](advice.md) at equal cost
-    support this order.
+    !!! example
 
-    Whether $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, and whether the noise is additive
-    or constant, is determined by tracing, as in the solvers. Whether noises commute is
-    tested at random states, which is not a proof. For
-    [`diffrax_symplectic.langevin_terms`][] solvers with a step of their own for friction
-    come first. Nothing is solved. Stiffness cannot be detected from the terms: if the first
-    suggestion is explicit and needs too many steps, use the next implicit one.
+        ```python
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+
+        H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
+        noise = lambda t, p, q, args: 0.1 * jnp.sin(q)
+        terms = ds.hamiltonian_terms(H0, noise, ())  # the shape of one noise
+        y0 = (jnp.array(0.0), jnp.array(1.0))
+        print(ds.suggest_solver(terms, 0.0, y0, want="weak"))
+        ```
+
+    The structure is traced, nothing is solved. Stiffness cannot be seen: if the first is
+    explicit and needs too many steps, take the next implicit one. Whether noises commute is
+    tested at random states, which is no proof.
+
+    They are ranked by: in a heat bath, exact stationary positions (for means); a cost of at
+    most twelve stage vectors; order; right energies for noise on stiff modes; fewest stage
+    vectors. If masses depend on positions, `BAOAB(ImplicitMidpoint())` comes first.
+    [Measured errors](advice.md) support this.
 
     **Arguments:**
 

@@ -178,8 +178,7 @@ def poisson_defect(
 def equipartition(
     terms: PyTree[diffrax.AbstractTerm],
 ) -> Callable[[RealScalarLike, Y, Args], dict[str, Array]]:
-    r"""Two thermometers, whose means the equipartition theorem gives without knowing the
-    answer to anything else: in the stationary state at the temperature $T$ of the terms of
+    r"""Two thermometers. In the stationary state at the temperature $T$ of the terms of
     [`diffrax_symplectic.langevin_terms`][] with a constant $H_0$,
 
     $$\Bigl\langle p \cdot \frac{\partial H_0}{\partial p} \Bigr\rangle = n T, \qquad

@@ -67,8 +67,8 @@ def expectation(
     devices: Sequence[Any] | None = None,
     progress_meter: diffrax.AbstractProgressMeter = NO_METER,
 ) -> Expectation:
-    r"""Estimates $\mathbb E[\phi(t, y_t)]$, with an error bar that holds the error of
-    sampling and that of the step.
+    r"""Estimates the mean $\mathbb E[\phi(t, y_t)]$, with an error bar for sampling and
+    step size.
 
     !!! example
 
@@ -95,56 +95,32 @@ def expectation(
         print(estimate)  # 0.364083 ± 8.6e-05, and the parts of this error
         ```
 
-    **Samples** are single paths or replicates of many paths, depending on `sampling`. They
-    are drawn in batches, so memory does not grow with their number. Sample $i$ gets the key
-    `fold_in(fold_in(key, i >> 32), i & 0xFFFFFFFF)`, for any batch size and devices.
+    **Samples** are paths, or replicates of many paths, drawn in batches, so memory does not
+    grow with their number.
 
-    **Levels.** By default each sample is solved with two steps, `dt0` and half of it.
-    `mean` is extrapolated to step size zero, by the solver's `weak_order(terms)`, or order
-    1 for solvers without one, such as Diffrax's. `error` holds what the extrapolation
-    changed. Where steps are too long for that, the change may be too small: three levels
-    check the order.
+    **Levels.** Each sample is solved with `dt0` and `dt0 / 2`, and `mean` is extrapolated
+    by the solver's weak order (1 if it states none). Three levels also check that order.
 
     This function runs outside JAX transformations: it cannot be differentiated, `jit`ted or
-    `vmap`ped. To differentiate an expectation, average gradients with
-    [`diffrax_symplectic.monte_carlo`][].
-
-    Each new `phi`, `sort_by` or function in `terms` is compiled anew. For many values of a
-    parameter, make one call for each, with the same functions and the parameter as an array
-    in `args`. (All paths have the same `args`, unless these are drawn.)
-
-    Events, and all else that only `diffrax.diffeqsolve` takes, belong into a solve of your
-    own, as a function of a random key, which [`diffrax_symplectic.monte_carlo`][] averages.
+    `vmap`ped. A new function `phi` or in `terms` compiles anew; for many parameters pass
+    them as arrays in `args`. For gradients, events and other options of `diffeqsolve`,
+    write a function of a key for [`diffrax_symplectic.monte_carlo`][].
 
     **Arguments:**
 
     - `phi`: maps time, state and `args` to a PyTree of real arrays.
     - `terms`, `solver`, `t0`, `t1`, `dt0`, `y0`, `args`: as for `diffrax.diffeqsolve`,
-        with `t1 - t0` a whole number of steps `dt0`. `terms` may have a shape in place of
-        a path; the solver then chooses the path: with discrete increments, or Gaussian
-        ones where `phi` contains an operation that is not smooth (such as `abs` or a
-        comparison), since discrete ones have the right means of smooth functions only.
-        (For `ValueFunctions` they are discrete always.) Paths determine the random
-        variables. Paths with equal keys are one Brownian motion; each shape is another.
-        `solver` is any solver of this package, or a Stratonovich solver of Diffrax with
-        fixed steps.
-        `y0` may be a function that draws a state, `y0(key)` or `y0(key, args)`, and `args`
-        a function `args(key)`. Each path then has its own, drawn with independent keys
-        that depend on `key` and on the number of the path; `std_error` includes their
-        variance. (To pass a function in `args` as it is, put it in a tuple or dictionary.)
+        with `t1 - t0` a whole number of steps, and any solver of this package or
+        Stratonovich solver of Diffrax with fixed steps. Give `terms` a shape in place of a
+        path, and the solver chooses one. Paths with equal keys are one Brownian motion;
+        each shape is another. `y0(key)` or `y0(key, args)`, and `args(key)`, may draw a
+        value for each path; `std_error` then includes their variance. (To pass a function
+        in `args` as it is, put it in a tuple or dictionary.)
     - `key`: a JAX random key.
     - `sampling`: an [`diffrax_symplectic.IndependentPaths`][],
         [`diffrax_symplectic.ArrayRQMC`][] or [`diffrax_symplectic.ValueFunctions`][].
-        `None` chooses one, and the result's `reason` says why: `ValueFunctions` for a
-        state of one or two components, if a step has at most 48 outcomes and all steps
-        together have at most 4,096, unless trials show that the fit leaves more than 1% of
-        the standard error, as for functions with kinks; otherwise `ArrayRQMC` for up to
-        four components, if the increments can be computed from quasi-random points; and
-        otherwise `IndependentPaths`. Where `y0` or `args` is drawn, it is not
-        `ValueFunctions`, which leave the variance of the start. Without `tol` these draw
-        4,096 paths, 16 replicates of 16,384 paths, and 131,072 paths, or fewer where these
-        would take more than about ten seconds on two cores, as far as the operations of a
-        step tell (compilation comes on top).
+        `None` chooses one (`reason` says why); see [How a sampling is
+        chosen](expectation.md#how-a-sampling-is-chosen).
     - `ts`: the times at which to average, each a whole number of steps after `t0`; by
         default only `t1`.
     - `levels`: the number of step sizes, each half the previous one. With one level the
@@ -177,12 +153,14 @@ def expectation(
     other shapes or more paths, terms without noise, and for paths that `sampling` cannot
     use (the message names suitable ones); a
     [`diffrax_symplectic.ExpectationInterrupted`][] holding the estimate so far, on a
-    keyboard interrupt. Warns if `tol` was not reached, if two levels do not agree, or have
-    steps that are too long for an explicit solver at `y0`, if failed paths could change the
-    mean by more than the standard error, if a few samples account for most of the variance,
-    if a fit was dropped or takes long, if all samples are equal or underflow, if `phi` is
-    not smooth and a trial with Gaussian increments has another mean than discrete ones, and
-    if rounding in single precision may exceed the standard error.
+    keyboard interrupt.
+
+    Warns of the error bar: if `tol` was not reached, if failed paths could change the mean
+    by more than the standard error, if a few samples account for most of the variance, if
+    all samples are equal or underflow, if a fit was dropped or takes long, and if `phi` is
+    not smooth and a trial with Gaussian increments has another mean than discrete ones. Of
+    the steps: if two levels do not agree, if steps are too long for an explicit solver at
+    `y0`, and if rounding in single precision may exceed the standard error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and

@@ -36,7 +36,7 @@ def monte_carlo(
     devices: Sequence[Any] | None = None,
     progress_meter: diffrax.AbstractProgressMeter = NO_METER,
 ) -> Expectation:
-    r"""Averages any function of a random key, typically one that solves for a path.
+    r"""Averages any function of a random key, typically of one path, with an error bar.
 
     For functions of the state at given times, [`diffrax_symplectic.expectation`][] is
     simpler and needs far fewer paths. Use `monte_carlo` for everything else: events,
@@ -65,18 +65,15 @@ def monte_carlo(
         print(estimate.mean, estimate.std_error, estimate.num_failed)
         ```
 
-    Each new `fn` is compiled anew. For many values of a parameter, pass one function with
-    the parameter as an array: `jax.tree_util.Partial(fn, parameter)`. To differentiate an
-    expectation, call `jax.grad` inside `fn`: the mean of the gradients is the gradient of
-    the mean. On several devices the solve then needs the adjoint `diffrax.DirectAdjoint()`
-    or `diffrax_symplectic.ReversingAdjoint()`. `monte_carlo` itself runs outside JAX
+    A new `fn` compiles anew; `jax.tree_util.Partial(fn, parameter)` does not. To
+    differentiate, call `jax.grad` inside `fn` (on several devices with [these
+    adjoints](adjoints.md#several-devices)). `monte_carlo` itself runs outside JAX
     transformations: it cannot be differentiated, `jit`ted or `vmap`ped.
 
-    **Levels.** With `levels=2` (3, ...) and `order=p` the function is `fn(key, level)`,
-    which solves with step $h$ on level 0, $h/2$ on level 1, and so on. `mean` is
-    extrapolated to step size zero. If all levels use the same Brownian motion, by `cell=`
-    of [`diffrax_symplectic.FixedStepBrownianPath`][], then `bias` (the discretization error
-    of the finest level) is estimated much more accurately than the mean.
+    **Levels.** With `levels=2` and `order=p`, `fn(key, level)` solves with step
+    $h / 2^{\mathrm{level}}$, and the mean is extrapolated. Use one Brownian motion for all
+    levels (`cell=` of [`diffrax_symplectic.FixedStepBrownianPath`][]): then `bias`, the
+    discretization error of the finest level, is far more accurate than the mean.
 
     **Arguments:**
 

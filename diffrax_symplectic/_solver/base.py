@@ -61,13 +61,8 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
     can wrap it, [`diffrax_symplectic.BAOAB`][] can take it as its flow, and
     `solver.path(shape, key)` makes the path that it needs.
 
-    **One draw in a step.** A `step` from `t0` to `t1` calls `contr(t0, t1)` of each noise
-    term, with these times, and uses what it returns wherever it needs noise.
-    [`diffrax_symplectic.expectation`][] and the tests of one step put a path in the place
-    of the user's that returns given variables of one step, whatever the times. A step that
-    asks for its two halves gets the same noise twice there, without an error. Two
-    independent halves of the increment, each of variance $h / 2$, are $\frac12 W \pm
-    \sqrt 3 H$ with `variables = ("W", "H")`.
+    **Draw noise once per step**, by `contr(t0, t1)` of each noise term with the times of
+    the step: see [a solver of your own](own_tableau.md#beyond-a-tableau).
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
@@ -139,8 +134,8 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         The path does not know the terms. So where an implicit solver needs increments alone
         and these are Gaussian, it is a [`diffrax_symplectic.TruncatedBrownianPath`][]: with
         noise that depends on the state, steps with unbounded increments may have no
-        solution. It loses variance in long steps, 0.1% at h = 1/20 and 16% at h = 1/2. For
-        additive noise, which needs none of this, pass a
+        solution. It loses variance in long steps. For additive noise, which needs none of
+        this, pass a
         [`diffrax_symplectic.FixedStepBrownianPath`][], or where a shape suffices, the
         shape: [`diffrax_symplectic.expectation`][], [`diffrax_symplectic.ensemble`][] and
         [`diffrax_symplectic.suggest_solver`][] see what the noise depends on.

@@ -180,14 +180,13 @@ _CHOOSE_FOR_CONSTRAINTS = (
 
 
 class BAOAB(AbstractLangevinSplitting):
-    r"""Langevin dynamics, by a symmetric splitting: kick, flow, friction and noise, flow,
-    kick. By default the flow is free flight, which is explicit, with one evaluation of the
-    forces in a step, very accurate stationary positions, and exact mobility and diffusion
-    of free particles.
+    r"""Langevin dynamics, explicit: one force evaluation per step, very accurate stationary
+    positions, exact mobility and diffusion of free particles.
 
-    For the terms of [`diffrax_symplectic.langevin_terms`][] with $H_0 = V(p) + U(t, q)$,
-    the forces $f = -\partial U / \partial q$ and the velocities $g = \partial V / \partial
-    p$,
+    For [`diffrax_symplectic.langevin_terms`][] with $H_0 = V(p) + U(t, q)$ and quadratic
+    $V$; weak order 2, strong order 1, order 2 without noise. A step is kick, flow, friction
+    and noise, flow, kick. By default the flow is free flight: with the forces $f =
+    -\partial U / \partial q$ and the velocities $g = \partial V / \partial p$,
 
     $$\begin{aligned}
       \text{B:} &\quad p \gets p + \tfrac h2 f(t_n, q) \\
@@ -199,58 +198,26 @@ class BAOAB(AbstractLangevinSplitting):
     \end{aligned}$$
 
     with $G$ and $B$ at $t_n + \frac h2$ and the current $q$. O is the implicit midpoint
-    rule for friction and noise, one linear equation: $V$ must be quadratic. It keeps the
-    Maxwell distribution exactly for every friction and all masses (with the three-point
-    increments of a `WeakBrownianPath` its second moments). For numbers, $p \gets
-    ((1 - x) p + B W) / (1 + x)$ with $x = \gamma h / 2$, $\gamma = G / m$.
+    rule for friction and noise, one linear equation. It keeps the Maxwell distribution
+    exactly, for every friction and all masses (its second moments, with three-point
+    increments). For numbers, $p \gets ((1 - x) p + B W) / (1 + x)$ with $x = \gamma h / 2$,
+    $\gamma = G / m$.
 
     Other noise is added as further terms. It goes into O as well, and must be in the
     forces, $H_k = U_k(t, q)$. A drift added as a further term must be separable.
 
-    **Positions, momenta, transport.** In a harmonic well of frequency $\omega$ the law of
-    $q$ is exact for every step with $\omega h < 2$. Momenta are too cold,
-    $\langle p^2 \rangle = m T (1 - \omega^2 h^2 / 4)$: for functions of p alone, such as
-    kinetic temperatures, use [`diffrax_symplectic.LangevinMiddle`][], which has the same
-    positions. Functions of p and q together, such as heat currents, are for this solver,
-    since its momenta and positions belong to the same time. The mobility $G^{-1}$ and the
-    diffusion $T G^{-1}$ of a free particle are exact for every step.
+    **Positions, momenta, transport.** In a harmonic well ($\omega h < 2$) the law of $q$ is
+    exact; momenta are too cold, $\langle p^2 \rangle = m T (1 - \omega^2 h^2 / 4)$. For
+    functions of p alone, such as a kinetic temperature, use
+    [`diffrax_symplectic.LangevinMiddle`][]. Functions of p and q together are for this
+    solver. The mobility $G^{-1}$ and the diffusion $T G^{-1}$ of a free particle are exact
+    for every step.
 
-    Weak order 2, strong order 1, order 2 without noise. If $G = \gamma M$ with one
-    constant number $\gamma$, a step is conformally symplectic: with its Jacobian $S'$,
-    $S'^\top J S' = \frac{1 - x}{1 + x} J$. As an explicit method it is limited to
-    $\omega h < 2$.
+    If $G = \gamma M$ with one constant number $\gamma$, a step is conformally symplectic:
+    with its Jacobian $S'$, $S'^\top J S' = \frac{1 - x}{1 + x} J$.
 
-    Takes any Brownian path: a [`diffrax_symplectic.WeakBrownianPath`][] for
-    expectations, a [`diffrax_symplectic.FixedStepBrownianPath`][] for paths and for chains
-    with a Metropolis step, which need the whole law.
-
-    **Flows.** With a `flow`, A is half a step of that flow, and B kicks with the force of
-    the `slow` potential of the terms alone, if they have one:
-
-    - a solver of this package, in `steps` steps each half: `BAOAB(ImplicitMidpoint())` for
-        any $H_0$ that is quadratic in $p$, with masses that depend on positions, say;
-        `BAOAB(StormerVerlet(), steps=4)` for multiple time steps;
-    - a [`diffrax_symplectic.linear_flow`][], for stiff springs, rings of beads and waves,
-        whose frequencies then do not limit the step;
-    - a function `flow(time, y, args)`, called with half of each step. An exact flow
-        resonates with the kicks where a step turns a mode by $\pi$.
-
-    The last two stand for the whole of $H_0$: only the friction is taken from it. The slow
-    force is evaluated once in a step. Symmetric, of weak and stationary order 2; without
-    friction a step is symplectic, and without `slow` it conserves what the flow does.
-
-    **Diffrax's terms.** It also takes `diffrax.UnderdampedLangevinDriftTerm` and
-    `diffrax.UnderdampedLangevinDiffusionTerm`, with their state `(x, v)`.
-
-    **Constraints.** For terms with a `constraint` this is g-BAOAB: each A is a step of
-    RATTLE, as in [`diffrax_symplectic.StormerVerlet`][], B and O end with momenta that are
-    tangent, and O is the midpoint rule with multipliers of its own, so that it keeps the
-    Maxwell distribution of the tangent momenta exactly. With the flow `StormerVerlet()`,
-    whose steps of RATTLE contain the force, kinetic energies at the ends of long steps are
-    better: those of rigid water in a field with $h = 0.4$ are right within 0.1% and not 1%,
-    and exact for harmonic motion in a plane. Mean directions of this water are within 0.4%
-    and not 1.7%, but positions of the harmonic motion have an error of order 2, where those
-    of free flight are exact.
+    Takes any Brownian path; use [`diffrax_symplectic.FixedStepBrownianPath`][] for paths
+    and for Metropolis chains.
 
     **Source:** [Leimkuhler and Matthews (2013)](https://doi.org/10.1093/amrx/abs010) for
     the splitting; [Grønbech-Jensen and Farago
@@ -258,6 +225,30 @@ class BAOAB(AbstractLangevinSplitting):
     [Leimkuhler and Matthews (2016)](https://doi.org/10.1098/rspa.2016.0138) for
     constraints; [Tuckerman, Berne and Martyna (1992)](https://doi.org/10.1063/1.463137) for
     multiple time steps.
+
+    **Flows.** With a `flow`, A is half a step of that flow, and B kicks with the force of
+    the `slow` potential of the terms alone, if they have one. It is evaluated once in a
+    step:
+
+    - a solver of this package, in `steps` steps each half: `BAOAB(ImplicitMidpoint())` for
+        any $H_0$ that is quadratic in $p$; `BAOAB(StormerVerlet(), steps=4)` for multiple
+        time steps;
+    - a [`diffrax_symplectic.linear_flow`][], for stiff springs, rings of beads and waves,
+        whose frequencies then do not limit the step;
+    - a function `flow(time, y, args)`, called with half of each step. An exact flow
+        resonates with the kicks where a step turns a mode by $\pi$.
+
+    The last two stand for the whole of $H_0$: only the friction is taken from it. Weak and
+    stationary order 2; without friction a step is symplectic, and without `slow` it
+    conserves what the flow does.
+
+    **Diffrax's terms.** It also takes `diffrax.UnderdampedLangevinDriftTerm` and
+    `diffrax.UnderdampedLangevinDiffusionTerm`, with their state `(x, v)`.
+
+    **Constraints.** For terms with a `constraint` this is g-BAOAB: A is a step of RATTLE,
+    as in [`diffrax_symplectic.StormerVerlet`][], and B and O keep momenta tangent, with
+    their exact Maxwell distribution. With the flow `StormerVerlet()`, kinetic energies at
+    the ends of long steps are better.
     """
 
     flow: Flow = None
@@ -357,9 +348,9 @@ class LangevinMiddle(AbstractLangevinSplitting):
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,
-        choose="Langevin dynamics in equilibrium, for functions of p alone. Momenta lag by "
-        "half a step and are wrong where a force drives a current: not for functions of p "
-        "and q together, such as a heat current.",
+        choose="Langevin dynamics in equilibrium, for functions of p alone. Its momenta "
+        "lag by half a step and are wrong where a force drives a current: not for functions "
+        "of p and q together, such as a heat current.",
         suggested=("weak", "strong"),
         stationary=("qq", "pp"),
     )

@@ -47,6 +47,17 @@ def hamiltonian_terms(
 ) -> diffrax.MultiTerm:
     r"""The terms of a stochastic Hamiltonian system, from its Hamiltonians.
 
+    !!! example
+
+        ```python
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+
+        H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
+        noise = lambda t, p, q, args: 0.2 * jnp.sin(q)
+        terms = ds.hamiltonian_terms(H0, noise, ())  # the shape of one noise
+        ```
+
     For the state $y = (p, q)$, in the sense of Stratonovich,
 
     $$\mathrm{d}p = -\frac{\partial H_0}{\partial q}\,\mathrm{d}t
@@ -54,9 +65,8 @@ def hamiltonian_terms(
       \mathrm{d}q = \frac{\partial H_0}{\partial p}\,\mathrm{d}t
         + \sum_{k=1}^m \frac{\partial H_k}{\partial p} \circ \mathrm{d}w_k.$$
 
-    Any Stratonovich solver, from this package or from Diffrax, accepts these terms. The
-    noise of a step is the gradient of one scalar, $\sum_k I_k H_k$, and costs one reverse
-    pass for any number of noises.
+    Any Stratonovich solver accepts them, also Diffrax's. One reverse pass gives the noise
+    of a step, for any number of noises.
 
     **Arguments:**
 
@@ -70,13 +80,9 @@ def hamiltonian_terms(
         shape, `(m,)` or a PyTree of `jax.ShapeDtypeStruct`s:
         [`diffrax_symplectic.suggest_solver`][], [`diffrax_symplectic.compare_solvers`][]
         and [`diffrax_symplectic.expectation`][] then make the path that the solver needs.
-    - `structure`: asserts a structure that some solvers need: `"separable"` for
-        $H_0 = V(p) + U(t, q)$ and $H_k = U_k(t, q)$, `"additive"` if the gradients of the
-        $H_k$ do not depend on the state. By default it is detected by tracing, which counts
-        every variable that enters a derivative, even if it cancels or is multiplied by
-        zero: write $H_0$ as a sum of terms that depend on $p$ or $q$ alone. An assertion
-        is relied on; `expectation`, `ensemble` and `suggest_solver` compare it with
-        derivatives at `y0`.
+    - `structure`: `"separable"` ($H_0 = V(p) + U(t, q)$, $H_k = U_k(t, q)$) or `"additive"`
+        (the gradients of the $H_k$ do not depend on the state), asserted instead of
+        detected; see [FAQ](faq.md). It is relied on.
     - `constraint`: `constraint(q, args)`, an array of shape `(c,)` that is zero on the
         positions that the system can take, such as `jnp.stack([jnp.sum(q**2) - 1])` for a
         rod. Its gradients must be linearly independent there. For

@@ -63,10 +63,9 @@ class ValueFunctions(AbstractSampling):
     averaged derivatives. If a step has more than 100 outcomes (five noises or more), the
     control variate is built from first and second derivatives along the noise.
 
-    In a few dimensions, standard errors are $10^{-4}$ to $10^{-8}$ times the standard error
-    of as many independent paths. In more than two dimensions the gain is small for chaotic
-    systems, for times after which the noise has spread the paths over the whole phase
-    space, and for functions with kinks.
+    In a few dimensions, standard errors are $10^{-4}$ to $10^{-8}$ times those of as many
+    independent paths, if $\phi$ is smooth and times are [not too
+    long](expectation.md#where-valuefunctions-gains).
 
     **Arguments:**
 

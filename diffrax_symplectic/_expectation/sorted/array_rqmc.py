@@ -72,10 +72,9 @@ class ArrayRQMC(AbstractSampling):
     the estimate is the solver's.
 
     The error decreases faster than one over the square root of the number of paths, much
-    faster in few dimensions: for up to four components of the state (or of `sort_by`) and
-    smooth $\phi$, a replicate is as accurate as hundreds to thousands of times as many
-    independent paths. For large systems with strong noise the factor is in the tens; in
-    chaos after long times it falls to one, and the time spent on sorting is wasted.
+    faster for [few coordinates and smooth
+    $\phi$](benchmarks/sampling.md#gains-of-arrayrqmc); in chaos after long times it does
+    not.
 
     **Arguments:**
 

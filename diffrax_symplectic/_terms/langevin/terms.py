@@ -46,7 +46,24 @@ def langevin_terms(
     constraint: Constraint | None = None,
     slow: Callable[[RealScalarLike, _P, Args], Array] | None = None,
 ) -> diffrax.MultiTerm:
-    r"""The terms of Langevin dynamics: a Hamiltonian system with friction, in a heat bath.
+    r"""The terms of Langevin dynamics: a Hamiltonian system in a heat bath. Solve with
+    [`diffrax_symplectic.BAOAB`][] unless masses depend on positions, then with
+    `BAOAB(ImplicitMidpoint())`.
+
+    !!! example
+
+        ```python
+        import diffrax_symplectic as ds
+        import jax.numpy as jnp
+        import jax.random as jr
+
+        H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+        terms = ds.langevin_terms(H0, 1.0, 0.5, ())  # friction, temperature, one noise
+        y0 = (jnp.array(0.0), jnp.array(0.0))
+        square = lambda t, y, args: y[1] ** 2
+        call = square, terms, ds.BAOAB(), 0, 20, 0.2, y0
+        print(ds.expectation(*call, key=jr.key(0)))  # exactly 0.5
+        ```
 
     For the state $y = (p, q)$,
 
@@ -55,21 +72,18 @@ def langevin_terms(
       \mathrm{d}q = \frac{\partial H_0}{\partial p}\,\mathrm{d}t, \qquad
       B B^\top = 2 T G.$$
 
-    The friction $G(t, q)$ acts on velocities, so it is symmetric positive semidefinite
-    whatever the masses are. (For a rate $\gamma$, $\mathrm{d}p = \ldots - \gamma
-    p\,\mathrm{d}t$, pass $G = \gamma m$.) If $H_0$ and $T$ are constant, the density
-    $e^{-H_0 / T}$ is stationary. The noise is the same in the sense of Ito and of
-    Stratonovich. $B$ holds the roots of $G$ and $T$. Where one of these is zero, the
-    derivative of its root, which is infinite, counts as zero in gradients.
+    The friction $G$ is a force over a velocity, symmetric positive semidefinite; for a rate
+    $\gamma$, pass $G = \gamma m$. If $H_0$ and $T$ are constant, $e^{-H_0 / T}$ is
+    stationary. Itô and Stratonovich agree.
 
-    [`diffrax_symplectic.BAOAB`][] and [`diffrax_symplectic.LangevinMiddle`][] treat
-    friction by a step of its own. Every other solver, from this package or from Diffrax,
-    takes it as a part of the drift, which makes positions wrong to first order where masses
-    depend on them; only [`diffrax_symplectic.LinearFlow`][] refuses it. More terms are
-    added by `diffrax.MultiTerm(*terms.terms, ...)`: other noise from
-    [`diffrax_symplectic.noise_terms`][], or a second bath from
-    [`diffrax_symplectic.bath_terms`][]. A bath shares its random key with no other term:
-    both would be one Brownian motion.
+    `BAOAB` and [`diffrax_symplectic.LangevinMiddle`][] treat friction in a step of their
+    own; other solvers put it in the drift, with positions wrong to first order if masses
+    depend on them; [`diffrax_symplectic.LinearFlow`][] refuses it. Add noise by
+    [`diffrax_symplectic.noise_terms`][], a second bath by
+    [`diffrax_symplectic.bath_terms`][], each with its own key.
+
+    $B$ holds the roots of $G$ and $T$. Where one of these is zero, the derivative of its
+    root, which is infinite, counts as zero in gradients.
 
     **Arguments:**
 
