@@ -349,8 +349,8 @@ class LangevinMiddle(AbstractLangevinSplitting):
         weak=1,
         strong=1,
         choose="Langevin dynamics in equilibrium, for functions of p alone. Its momenta "
-        "lag by half a step and are wrong where a force drives a current: not for functions "
-        "of p and q together, such as a heat current.",
+        "lag by half a step and are wrong where a force drives a current: not for "
+        "functions of p and q together, such as a heat current.",
         suggested=("weak", "strong"),
         stationary=("qq", "pp"),
     )

@@ -1,5 +1,7 @@
 """What a step costs, as a count of operations, and how many paths that allows."""
 
+from pathlib import Path
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -117,19 +119,21 @@ def test_solvers_of_diffrax_are_counted():
     assert operations_per_step(problem_of(diffrax.Heun())) > 0
 
 
-def test_the_docstring_of_expectation_states_the_rule_of_the_default():
+def test_the_page_of_expectation_states_the_rule_of_the_default():
     sorted_paths = ds.ArrayRQMC()
     rule = (
-        "for a state of one or two components, if a step has at most "
-        f"{choose._MOST_OUTCOMES_OF_STEP} outcomes and all steps together have at most "
-        f"{choose._MOST_OUTCOMES_OF_STEPS:,}",
-        f"the fit leaves more than {choose._MOST_REMAINDER:.0%} of the standard error",
-        "`ArrayRQMC` for up to four components",
-        f"draw {ds.ValueFunctions().num_paths:,} paths, {sorted_paths.replicates} "
-        f"replicates of {sorted_paths.num_paths:,} paths, and {choose._PATHS:,} paths",
+        "| one or two components; `y0` and `args` not drawn | at most "
+        f"{choose._MOST_OUTCOMES_OF_STEP} outcomes each and "
+        f"{choose._MOST_OUTCOMES_OF_STEPS:,} for all; in trials, the fit leaves at most "
+        f"{choose._MOST_REMAINDER:.0%} of the standard error | `ValueFunctions` | "
+        f"{ds.ValueFunctions().num_paths:,} paths |",
+        "| at most four components |",
+        f"| `ArrayRQMC` | {sorted_paths.replicates} × {sorted_paths.num_paths:,} paths |",
+        f"| `IndependentPaths` | {choose._PATHS:,} paths |",
         "more than about ten seconds",
     )
-    words = " ".join(ds.expectation.__doc__.split())
+    page = Path(__file__).parents[2] / "docs" / "expectation.md"
+    words = " ".join(page.read_text().split())
     for part in rule:
         assert part in words, part
     # Those that are spelled out there.
