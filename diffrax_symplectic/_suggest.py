@@ -21,7 +21,7 @@ from ._brownian import (
     TruncatedBrownianPath,
     WeakBrownianPath,
 )
-from ._custom_types import Args, RealScalarLike, Y
+from ._custom_types import Args, RealScalarLike, Terms, Y
 from ._solver import (
     AbstractSymplecticSolver,
     BAOAB,
@@ -258,7 +258,7 @@ class _System(NamedTuple):
 
 
 def _inspected(
-    drift: tuple, noise: tuple, t0: Array, y0: Y, args: Args, constrained: bool
+    drift: Terms, noise: Terms, t0: Array, y0: Y, args: Args, constrained: bool
 ) -> _System:
     """The system, by tracing its terms."""
     fault = separable_fault(drift, noise, t0, y0, args)
@@ -344,7 +344,7 @@ def _holds(
     return solver.variables == ("W",) or issubclass(area, solver.minimal_levy_area)
 
 
-def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
+def _parts(terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
     """Drift and noise terms. Raises a `ValueError` if a noise has no Brownian path."""
     advice = (
         "Pass the terms of a Stratonovich system, `hamiltonian_terms(H0, noise, path)` or "

@@ -9,6 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Key, PRNGKeyArray, PyTree
 
+from .._custom_types import Devices
 from .._root_finder import all_finite
 from .._simulation import by_drjit, Level, Problem, state_itself
 from .independent import IndependentPaths
@@ -21,7 +22,7 @@ _FUSED_BATCH = 2**19
 
 
 def fused_plan(
-    problem: Problem, key: PRNGKeyArray, sampling: Any, devices: tuple
+    problem: Problem, key: PRNGKeyArray, sampling: Any, devices: Devices
 ) -> SamplingPlan:
     r"""A plan in which a kernel simulates independent paths, and JAX evaluates $\phi$.
     Raises a `ValueError` for another `sampling`, or several devices."""

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from .._arguments import whole_number
+from .._custom_types import Devices
 from .._simulation import Problem, values_of_paths
 from .sampling import AbstractSampling, Averaged, Samples, SamplingPlan, saved_by_name
 
@@ -45,7 +46,7 @@ class IndependentPaths(AbstractSampling):
         return self.plan(jtu.Partial(_paths, problem), levels, devices)
 
     def plan(
-        self, sampler: Callable[..., Samples], levels: int, devices: tuple
+        self, sampler: Callable[..., Samples], levels: int, devices: Devices
     ) -> SamplingPlan:
         """The plan for samples that are made one for each key, by any function."""
         if self.batch_size is None:

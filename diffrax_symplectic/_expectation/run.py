@@ -15,6 +15,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Key, PRNGKeyArray, PyTree
 
 from .._arguments import check_untraced
+from .._custom_types import Devices
 from .batch import batch_sums, BatchSums, quick_batch_sums
 from .estimate import (
     check_same,
@@ -53,7 +54,7 @@ class Meter:
 def run(
     plan: SamplingPlan,
     key: PRNGKeyArray,
-    devices: tuple,
+    devices: Devices,
     sampling: Any = None,
     start: Expectation | None = None,
     first: int = 0,
@@ -121,7 +122,7 @@ def run(
 class _Batches:
     """The batches of a plan: each device takes `size` samples at once."""
 
-    def __init__(self, plan: SamplingPlan, key: PRNGKeyArray, devices: tuple):
+    def __init__(self, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices):
         self.size = min(plan.batch_size, plan.num_samples)
         self.key_data = np.asarray(jr.key_data(key))
         self._impl = jr.key_impl(key)

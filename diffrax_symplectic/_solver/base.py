@@ -22,7 +22,7 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 from .._arguments import check_state, whole_number
 from .._batch import batched_like
 from .._brownian import drives, most_demanding, path_of
-from .._custom_types import Args, Y
+from .._custom_types import Args, Terms, Y
 from .._root_finder import PicardNewton
 from .._tableau import (
     AbstractTableau,
@@ -267,7 +267,7 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         return y1, None, dict(y0=y0, y1=y1), outcome, result
 
 
-def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTableau:
+def _drop_absent(tableau: FlatTableau, drift: Terms, noise: Terms) -> FlatTableau:
     """Drops stages that no term drives (an ODE has no noise), and without drift the
     brackets of drift and noise."""
     keep = [

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from .._arguments import check_pair
 from .._compat import replaced, unwrapped
-from .._custom_types import Args, RealScalarLike, Y
+from .._custom_types import Args, RealScalarLike, Terms, Y
 from .._terms import (
     apply,
     check_start,
@@ -197,7 +197,7 @@ def baoab_step(
     return y1, ConstrainedState(force, flow_state, outcome)
 
 
-def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
+def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
     """The terms whose forces are the kicks, and those that the flow follows on the
     surface."""
     drift, _, _ = split_friction(without_constraint(terms))
@@ -207,14 +207,14 @@ def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[tuple, tup
     return kicks, (first, *others)
 
 
-def _force(kicks: tuple, t: RealScalarLike, y: Y, args: Args) -> Array:
+def _force(kicks: Terms, t: RealScalarLike, y: Y, args: Args) -> Array:
     """The force of the kicks, as a vector."""
     force, _ = rate(kicks, t, y, args)
     return jfu.ravel_pytree(force)[0]
 
 
 def _kick(
-    noise: tuple, t0: RealScalarLike, t1: RealScalarLike, y: Y, args: Args, name: str
+    noise: Terms, t0: RealScalarLike, t1: RealScalarLike, y: Y, args: Args, name: str
 ) -> Array:
     """The change of the momenta by the noise, as a vector."""
     drawn = drawn_variables(noise, ["W"], t0, t1, name)

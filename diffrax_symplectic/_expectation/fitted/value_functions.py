@@ -18,6 +18,7 @@ from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
 from ..._arguments import check_untraced, whole_number
 from ..._compat import quickly_compiled
+from ..._custom_types import Devices
 from ..._lapack import lapack_in_turn
 from ..._simulation import Combination, Problem
 from ..._solver import without_newton
@@ -140,7 +141,7 @@ class _Trials(NamedTuple):
     outputs: tuple[int, int]
     shapes: Averaged
     key: PRNGKeyArray
-    devices: tuple
+    devices: Devices
     batch_size: int
 
     def plan(
