@@ -37,7 +37,7 @@ from ._terms import (
 _FINER = 8
 
 
-class Batch(NamedTuple):
+class PathResults(NamedTuple):
     """The results of a batch of paths.
 
     - `results`: the states at the end, or what `phi` makes of them.
@@ -275,7 +275,7 @@ class _ComparedSystem(NamedTuple):
         @eqx.filter_jit
         @lapack_in_turn
         @ft.partial(jax.vmap, in_axes=(0, None))
-        def results(key: PRNGKeyArray, dt: Array) -> Batch:
+        def results(key: PRNGKeyArray, dt: Array) -> PathResults:
             # Paths fail where a step has no solution, and are counted.
             own = without_truncation(with_paths(make_path, numbers, terms, key))
             check_stratonovich(own, solver, t0, y0, args)
@@ -285,12 +285,12 @@ class _ComparedSystem(NamedTuple):
             )  # fmt: skip
             y1 = jtu.tree_map(lambda y: y[-1], sol.ys)
             result = y1 if phi is None else phi(t1, y1, args)
-            return Batch(result, diffrax.is_okay(sol.result))
+            return PathResults(result, diffrax.is_okay(sol.result))
 
         return results
 
 
-def strong_error(out: Batch, fine: Batch) -> _Measured:
+def strong_error(out: PathResults, fine: PathResults) -> _Measured:
     """The root mean square of the difference over the paths that both solvers finish, and
     the number of paths that either does not finish."""
     okay = np.asarray(out.okay & fine.okay)
@@ -309,7 +309,7 @@ def strong_error(out: Batch, fine: Batch) -> _Measured:
     return _Measured(float(rms), float(of_rms), int(np.sum(~okay)))
 
 
-def weak_error(out: Batch, fine: Batch) -> _Measured:
+def weak_error(out: PathResults, fine: PathResults) -> _Measured:
     """The difference of the means, and the number of failed paths of the first."""
     mean, std_error = _mean(*out)
     exact, other = _mean(*fine)

@@ -277,8 +277,8 @@ def step_expectation(
     error when run if the solver reports a failed step.
     """
 
-    def outcome(terms: PyTree) -> tuple[PyTree[Array], diffrax.RESULTS]:
-        y1, result = _one_step(terms, solver, t0, t1, y0, args)
+    def outcome(terms_of_step: PyTree) -> tuple[PyTree[Array], diffrax.RESULTS]:
+        y1, result = _one_step(terms_of_step, solver, t0, t1, y0, args)
         return fn(t1, y1, args), result
 
     return _average(outcome, terms, t1 - t0, nodes)
@@ -320,16 +320,18 @@ def second_moment_map(
     # Differentiating it would take far more tracing. Row 0 is the zero vector.
     starts = jnp.eye(size + 1, size, k=-1, dtype=flat.dtype)
 
-    def outcome(terms: PyTree) -> tuple[Array, diffrax.RESULTS]:
+    def outcome(terms_of_step: PyTree) -> tuple[Array, diffrax.RESULTS]:
         def step(y: Array) -> tuple[Array, diffrax.RESULTS]:
-            y1, result = _one_step(terms, solver, t0, t1, unravel(y), args)
-            return jfu.ravel_pytree(y1)[0], result
+            y1, result = _one_step(terms_of_step, solver, t0, t1, unravel(y), args)
+            end, _ = jfu.ravel_pytree(y1)
+            return end, result
 
         ends, result = jax.vmap(step)(starts)
-        # The end from zero is the column of the constant 1 of z, which stays as it is: the
-        # first row. What the others add to it are the columns of the entries of y.
-        first = jnp.zeros_like(flat, shape=(1, size + 1)).at[0, 0].set(1)
-        Z = jnp.concatenate([first, ends.at[1:].add(-ends[0]).T])
+        # Row 0 of Z keeps the constant 1 of z. Column 0 is the end from zero; each other
+        # column is what a unit vector adds to that end.
+        row_of_one = jnp.zeros_like(flat, shape=(1, size + 1)).at[0, 0].set(1)
+        columns = ends.at[1:].add(-ends[0])
+        Z = jnp.concatenate([row_of_one, columns.T])
         return jnp.kron(Z, Z), result
 
     return _average(outcome, terms, t1 - t0, nodes)

@@ -119,5 +119,5 @@ def _samples(p: Problem, paths: _Paths, keys: Key[Array, " n"]) -> Samples:
     phi = jax.vmap(values_on_level)(p.levels, paths.y)
     finite = jax.vmap(jax.vmap(all_finite))(phi)
     lost = jnp.asarray(paths.failed) | ~finite
-    values = p.shaped(p.combined(jnp.swapaxes(phi, 1, 2)))
+    values = p.shaped(p.combinations(jnp.swapaxes(phi, 1, 2)))
     return Samples(Averaged(values), ~jnp.any(lost, axis=0), lost)

@@ -60,4 +60,4 @@ def _paths(p: Problem, keys: Key[Array, " n"]) -> Samples:
     """A sample is a path, with the same random key on all levels."""
     saved, failed = values_of_paths(p, keys)
     good = ~jnp.any(failed, axis=0)
-    return Samples(Averaged(p.shaped(p.combined(saved))), good, failed)
+    return Samples(Averaged(p.shaped(p.combinations(saved))), good, failed)

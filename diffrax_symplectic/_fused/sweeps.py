@@ -109,13 +109,13 @@ class _State(NamedTuple):
 
     - `y`: the iterate.
     - `size`: the size of its last correction, in units of the tolerance.
-    - `solved`: whether the equations are solved.
+    - `is_solved`: whether the equations are solved.
     - `done`: the number of sweeps.
     """
 
     y: Halves
     size: Scalar
-    solved: Bool[Array, ""]
+    is_solved: Bool[Array, ""]
     done: Array
 
 
@@ -137,7 +137,7 @@ def solve_one_path(
     third = equations.swept(second)
     one = jnp.ones((), dtype)
     before, _ = criterion.measured(equations.correction(first, second), one)
-    size, solved = criterion.measured(equations.correction(second, third), before)
+    size, is_solved = criterion.measured(equations.correction(second, third), before)
 
     # Relaxed once: later rates are those of relaxed sweeps, to which the formula does not
     # apply. A branch, since few paths take it, and a division takes as long as a sweep.
@@ -150,15 +150,15 @@ def solve_one_path(
     def once(last: _State) -> _State:
         y = equations.swept(last.y, relaxation)
         correction = equations.correction(last.y, y)
-        size, solved = criterion.measured(correction, last.size)
-        return _State(y, size, solved, last.done + 1)
+        size, is_solved = criterion.measured(correction, last.size)
+        return _State(y, size, is_solved, last.done + 1)
 
     def goes_on(last: _State) -> Bool[Array, ""]:
-        return ~last.solved & (last.done < _MOST_SWEEPS) & (last.size < _HUGE)
+        return ~last.is_solved & (last.done < _MOST_SWEEPS) & (last.size < _HUGE)
 
-    state = _State(third, size, ~pending | solved, jnp.full((), 3, jnp.int32))
+    state = _State(third, size, ~pending | is_solved, jnp.full((), 3, jnp.int32))
     last = lax.while_loop(goes_on, once, state)
-    return equations.value(last.y), last.solved
+    return equations.value(last.y), last.is_solved
 
 
 def _criterion(scale: PyTree[Array], dtype: Any) -> _Criterion:

@@ -21,7 +21,7 @@ from .engines import (
     state_itself,
     warn_of_stragglers,
 )
-from .levels import combined, Combination, Level, level_weights
+from .levels import combinations, Combination, Level, level_weights
 from .loop import (
     along,
     independent_steps,

@@ -17,12 +17,12 @@ from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .._arguments import check_untraced
 from .._fused import (
+    functions_and_arrays,
     Kernels,
     Lanes,
     PathFunctions,
     sample_key,
     Shared,
-    split,
     without_rescue,
 )
 from .._lapack import lapack_in_turn
@@ -175,7 +175,7 @@ def fused_start(
 ) -> FusedStart:
     """Compiles the kernels of a problem, unless they are known, and starts these paths."""
     own_args = None if p.args_of is None else eqx.filter(p.args, eqx.is_array)
-    functions, arrays = split(_bare(p), key, own_args, p.paths_differ)
+    functions, arrays = functions_and_arrays(_bare(p), key, own_args, p.paths_differ)
     kernels = _kernels(functions)
     if p.paths_differ:
         y0, args = _drawn(p, key, *_halves(sample_numbers))

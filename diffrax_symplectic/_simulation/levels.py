@@ -101,7 +101,7 @@ def _extrapolated(order: int | float, levels: int) -> Float[np.ndarray, " levels
     return np.linalg.solve(system, np.eye(levels)[0])
 
 
-def combined(
+def combinations(
     weights: Float[Array | np.ndarray, "combinations levels"],
     x: Float[Array, "levels ..."],
 ) -> Float[Array, "combinations ..."]:

@@ -177,8 +177,9 @@ def independent_steps(
 
     def step(i, paths):
         def one(random, y, solver_state, args):
-            own = p.with_args(args)
-            return own.step(terms_of(random), i, level.h, y, solver_state)
+            problem_of_path = p.with_args(args)
+            terms = terms_of(random)
+            return problem_of_path.step(terms, i, level.h, y, solver_state)
 
         states = paths.y, paths.solver_state, paths.args
         y, solver_state, success = _in_blocks(one, randomness(i), *states)
@@ -196,7 +197,7 @@ def values_of_paths(
 ) -> tuple[Float[Array, "levels S n m"], Bool[Array, "levels n"]]:
     """The values of `phi` for independent paths, one for each key, on all levels and at the
     times at which to average, and which paths failed."""
-    own_keys = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
+    keys_of_paths = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
     drawn = jax.vmap(p.drawn)(keys)
 
     def begin(level: Level) -> Motion:
@@ -204,9 +205,9 @@ def values_of_paths(
             p,
             level,
             drawn,
-            terms_of=lambda own: with_keys(p.terms, own),
+            terms_of=lambda keys_of_path: with_keys(p.terms, keys_of_path),
             # A path draws the increments of all steps from its keys.
-            randomness=lambda i: own_keys,
+            randomness=lambda i: keys_of_paths,
         )
 
     done = simulate(p, begin)
@@ -220,7 +221,7 @@ def _in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
     is_whole = count > _PATHS_AT_ONCE and count % _PATHS_AT_ONCE == 0
     if not is_whole or jax.default_backend() != "cpu":
         return jax.vmap(fn)(*args)
-    return lax.map(lambda own: fn(*own), args, batch_size=_PATHS_AT_ONCE)
+    return lax.map(lambda args: fn(*args), args, batch_size=_PATHS_AT_ONCE)
 
 
 def along(mask: Bool[Array, " n"], x: Array) -> Array:

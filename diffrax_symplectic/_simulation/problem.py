@@ -50,7 +50,7 @@ from .arguments import (
     given_state,
     step_numbers,
 )
-from .levels import combined, Level, level_weights, levels_of
+from .levels import combinations, Level, level_weights, levels_of
 
 
 # Folded into the key of a sample to draw its `y0` and `args`. The keys of its paths are
@@ -256,11 +256,11 @@ class Problem(eqx.Module):
         shaped = [part.reshape(*axes, *leaf.shape) for part, leaf in zip(parts, leaves)]
         return treedef.unflatten(shaped)
 
-    def combined(
+    def combinations(
         self, x: Float[Array, "levels ..."]
     ) -> Float[Array, "combinations ..."]:
         """The combinations of values on all levels."""
-        return combined(self.weights, x)
+        return combinations(self.weights, x)
 
     def shaped(
         self, x: Float[Array | np.ndarray, "combinations S n m"]

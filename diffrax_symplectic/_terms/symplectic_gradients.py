@@ -20,7 +20,7 @@ from .._compat import replaced, ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike, Terms
 from .dependence import Dependence
 from .drift_and_noise import field_of
-from .evaluation import check_real, evaluated, scalar_energy
+from .evaluation import check_real_energies, evaluated, scalar_energy
 
 
 if TYPE_CHECKING:
@@ -252,7 +252,7 @@ class HamiltonianNoise(AbstractNoise):
                 f"shape {shapes(struct)}; got shape {shapes(H)}. Return an array of shape "
                 "`(m,)` and construct the path with `shape=(m,)`."
             )
-        check_real("noise", H)
+        check_real_energies("noise", H)
         return jtu.tree_map(lambda leaf, s: jnp.reshape(leaf, s.shape), H, struct)
 
 

@@ -24,7 +24,7 @@ def apply(terms: Terms, controls: list, args: Args, t: RealScalarLike, y: Y) -> 
     """The sum over terms of vector field times control."""
     pairs = zip(terms, controls)
     parts = [term.vf_prod(t, y, args, control) for term, control in pairs]
-    return _checked_sum(parts, y)
+    return _sum_like(parts, y)
 
 
 @eqx.filter_jit
@@ -50,7 +50,7 @@ def apply_one(
         only = jnp.where(here, increment, 0)
         parts.append(_product_of_one_noise(term, struct, local, only, args, t, y))
         before += m
-    return _checked_sum(parts, y)
+    return _sum_like(parts, y)
 
 
 def _product_of_one_noise(
@@ -105,11 +105,11 @@ def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
     # First, since its message names the term and its path.
     check_increments(parts, t0, y0, args)
 
-    def changed(t: RealScalarLike) -> Y:
+    def total_change(t: RealScalarLike) -> Y:
         controls = [term.contr(t, t) for term in parts]
         return apply(parts, controls, args, t0, y0)
 
-    eqx.filter_eval_shape(changed, t0)
+    eqx.filter_eval_shape(total_change, t0)
 
 
 def _is_term(x: Any) -> bool:
@@ -163,7 +163,7 @@ def tree_sum(values: list[Y]) -> Y:
     return total
 
 
-def _checked_sum(parts: list[Y], y: Y) -> Y:
+def _sum_like(parts: list[Y], y: Y) -> Y:
     """The sum. Raises a `ValueError` unless all have the dtypes and shapes of the state."""
 
     def check(change: Any, x: Any) -> None:
