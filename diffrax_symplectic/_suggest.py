@@ -173,7 +173,7 @@ def suggest_solver(
     check_baths_have_own_noise(terms)
     check_assertions(terms, t0, y0, args)
     constrained = constraint_of(given_terms) is not None
-    system = _inspected(drift, noise, t0, y0, args, constrained)
+    system = _inspect(drift, noise, t0, y0, args, constrained)
     paths = brownian_paths(noise)
     solvers = _suitable(system, want, paths, one_term=len(noise) == 1)
 
@@ -257,7 +257,7 @@ class _System(NamedTuple):
         return sentence
 
 
-def _inspected(
+def _inspect(
     drift: Terms, noise: Terms, t0: Array, y0: Y, args: Args, constrained: bool
 ) -> _System:
     """The system, by tracing its terms."""

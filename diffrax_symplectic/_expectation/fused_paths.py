@@ -78,12 +78,12 @@ class FusedPaths:
         self.lost += sum(int(np.sum(batch.failed)) for batch in batches)
         self.stragglers += sum(batch.stragglers for batch in batches)
         return _Paths(
-            y=jtu.tree_map(_stacked, *[batch.y for batch in batches]),
-            failed=_stacked(*[batch.failed for batch in batches]),
+            y=jtu.tree_map(_stack_levels, *[batch.y for batch in batches]),
+            failed=_stack_levels(*[batch.failed for batch in batches]),
         )
 
 
-def _stacked(*levels: np.ndarray) -> np.ndarray:
+def _stack_levels(*levels: np.ndarray) -> np.ndarray:
     return np.stack(levels)
 
 
@@ -107,7 +107,7 @@ class _NumberedPaths(NamedTuple):
 
 def _samples(p: Problem, paths: _Paths, keys: Key[Array, " n"]) -> Samples:
     """The samples with these random keys, whose paths are known."""
-    _, own_args = jax.vmap(p.drawn)(keys)
+    _, own_args = jax.vmap(p.draw_start)(keys)
 
     def values_of_path(times: Any, y: PyTree[Array], own: PyTree[Array]) -> Array:
         return jax.vmap(p.with_args(own).values)(times, y)

@@ -89,7 +89,7 @@ class _Criterion(NamedTuple):
     weights: list[Scalar]
     rounding: Scalar
 
-    def measured(
+    def measure(
         self, correction: PyTree[Array], before: Scalar
     ) -> tuple[Scalar, Bool[Array, ""]]:
         """The size of a correction that follows one of size `before`, in units of the
@@ -136,8 +136,8 @@ def solve_one_path(
     second = equations.swept(first)
     third = equations.swept(second)
     one = jnp.ones((), dtype)
-    before, _ = criterion.measured(equations.correction(first, second), one)
-    size, is_solved = criterion.measured(equations.correction(second, third), before)
+    before, _ = criterion.measure(equations.correction(first, second), one)
+    size, is_solved = criterion.measure(equations.correction(second, third), before)
 
     # Relaxed once: later rates are those of relaxed sweeps, to which the formula does not
     # apply. A branch, since few paths take it, and a division takes as long as a sweep.
@@ -150,7 +150,7 @@ def solve_one_path(
     def once(last: _State) -> _State:
         y = equations.swept(last.y, relaxation)
         correction = equations.correction(last.y, y)
-        size, is_solved = criterion.measured(correction, last.size)
+        size, is_solved = criterion.measure(correction, last.size)
         return _State(y, size, is_solved, last.done + 1)
 
     def goes_on(last: _State) -> Bool[Array, ""]:

@@ -30,4 +30,4 @@ from .loop import (
     simulate,
     values_of_paths,
 )
-from .problem import advice_on_failures, Drawn, Problem, ravel, real_vector
+from .problem import advice_on_failures, DrawnStart, Problem, ravel, real_vector

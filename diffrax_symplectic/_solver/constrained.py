@@ -29,7 +29,7 @@ from .._terms import (
 from .base import AbstractSymplecticSolver
 from .bath import after_friction
 from .driven import drawn_variables, drift_driven
-from .flow import begun, Flow, handed_on, kicks_and_rest, moved_by
+from .flow import begin_flow, Flow, handed_on, kicks_and_rest, moved_by
 from .step import no_failure
 
 
@@ -83,7 +83,7 @@ def verlet_step(
     p, q, second = surface.free_flight(p, surface.normal_space(q), half, pending)
     p = surface.tangent(p, surface.normal_space(q))
     y1 = (unravel_p(p), unravel_q(q))
-    return _ended(y1, first & second, before)
+    return _end_of_step(y1, first & second, before)
 
 
 class ConstrainedState(NamedTuple):
@@ -119,7 +119,7 @@ def begin_baoab(
     outcome = init_constrained(solver, terms, t0, y0, args)
     kicks, rest = _kicks_and_rest(flow, terms)
     force = _force(kicks, t0, y0, args) if kicks else None
-    return ConstrainedState(force, begun(flow, rest, t0, t1, y0, args), outcome)
+    return ConstrainedState(force, begin_flow(flow, rest, t0, t1, y0, args), outcome)
 
 
 def baoab_step(
@@ -193,7 +193,7 @@ def baoab_step(
         p = p + half * force
     p = surface.tangent(p, surface.normal_space(q))
     y1 = (unravel_p(p), unravel_q(q))
-    y1, outcome = _ended(y1, first & second, before.outcome)
+    y1, outcome = _end_of_step(y1, first & second, before.outcome)
     return y1, ConstrainedState(force, flow_state, outcome)
 
 
@@ -222,7 +222,7 @@ def _kick(
     return jfu.ravel_pytree(kick)[0]
 
 
-def _ended(
+def _end_of_step(
     y1: Y, found: Bool[Array, ""], before: optx.RESULTS
 ) -> tuple[Y, optx.RESULTS]:
     """The end of a step, and the state of the solver after it."""

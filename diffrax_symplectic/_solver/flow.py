@@ -110,7 +110,7 @@ _NAN = (
 )
 
 
-def begun(
+def begin_flow(
     flow: Flow, drift: Terms, t0: RealScalarLike, t1: Any, y0: Y, args: Args
 ) -> PyTree[Array]:
     """The state of the solver that is the flow, or whether a function returns NaN."""

@@ -25,7 +25,7 @@ from .bath import after_friction, check_friction
 from .constrained import baoab_step, begin_baoab
 from .driven import drawn_variables
 from .flow import (
-    begun,
+    begin_flow,
     check_flow,
     check_follows,
     Flow,
@@ -106,7 +106,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         forces = None
         if self.symmetric and kicks:
             forces, _ = rate(kicks, t0, y0, args)
-        return SplittingState(forces, begun(self.flow, rest, t0, t1, y0, args))
+        return SplittingState(forces, begin_flow(self.flow, rest, t0, t1, y0, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         own_terms = terms

@@ -173,7 +173,7 @@ class Stages(eqx.Module):
         return _evaluate(self.step, [tableau.stages[i] for i in group], position)
 
 
-def closed(step: Step, y0: Y) -> Step:
+def with_explicit_arrays(step: Step, y0: Y) -> Step:
     """The same step, with the arrays that its functions capture made explicit. Each
     function is traced once, here."""
     # Converted functions accept only the types that they were traced for.
@@ -322,7 +322,7 @@ def result_of(outcome: Outcome, y1: Y) -> diffrax.RESULTS:
 def _traced_once(
     plan: StepPlan, step: Step, y0: Y, before, finder: Any, max_steps: int
 ):
-    stages = Stages(plan, closed(step, y0), y0)
+    stages = Stages(plan, with_explicit_arrays(step, y0), y0)
     y1, _, outcome = _implicit_step(stages, before, finder=finder, max_steps=max_steps)
     return y1, outcome
 

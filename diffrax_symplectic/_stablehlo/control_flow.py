@@ -37,10 +37,10 @@ def _case(o, index):
     for i in raising:
         o.fail(index.item() == i)
     branches = [i for i in range(number) if i not in raising]
-    return unflat(_taken(o, index.item(), branches), o.shapes())
+    return unflat(_result_of_branch(o, index.item(), branches), o.shapes())
 
 
-def _taken(o: Operation, index: Any, branches: Sequence[int]) -> tuple:
+def _result_of_branch(o: Operation, index: Any, branches: Sequence[int]) -> tuple:
     """The entries that the branch with this index returns. If there is none in `branches`,
     it is the last of them."""
     first, *others = branches
@@ -49,7 +49,7 @@ def _taken(o: Operation, index: Any, branches: Sequence[int]) -> tuple:
         return copied(o.run(first, []))
 
     def run_others() -> tuple:
-        return _taken(o, index, others)
+        return _result_of_branch(o, index, others)
 
     if not others:
         return run_first()

@@ -93,7 +93,7 @@ def _reduce(o, *xs):
         for part in parts:
             total = o.run(0, [*total, *part])
         columns.append(total)
-    return _joined(columns, tuple(sizes), number)
+    return _join_columns(columns, tuple(sizes), number)
 
 
 def _entries_at(arrays: Sequence[Tensor], place: Any) -> list[Tensor]:
@@ -101,7 +101,7 @@ def _entries_at(arrays: Sequence[Tensor], place: Any) -> list[Tensor]:
     return [Tensor([x.entries[place]], ()) for x in arrays]
 
 
-def _joined(
+def _join_columns(
     columns: list[list[Tensor]], shape: tuple[int, ...], number: int
 ) -> list[Tensor]:
     """Arrays of this shape. Each of `columns` has an entry of each of them."""
@@ -160,7 +160,7 @@ def _reduce_window(o, *xs):
                 place = arrays[0].places[tuple(at)]
                 total = o.run(0, [*total, *_entries_at(arrays, place)])
         columns.append(total)
-    return _joined(columns, o.shape, number)
+    return _join_columns(columns, o.shape, number)
 
 
 @rule

@@ -39,7 +39,7 @@ def controlled_paths(
     levels). With a wider `law` of the noise deviations beyond the `usual` ones are
     estimated."""
     functions = functions.chosen(choice.best)
-    drawn = jax.vmap(p.drawn)(keys)
+    drawn = jax.vmap(p.draw_start)(keys)
 
     def begin(level: Level) -> Motion:
         noise = Noise.of(p, level)

@@ -179,7 +179,7 @@ def _pilot(noise: Noise, keys: Key[Array, " n"]) -> _Pilot:
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
     # For a fit it is good enough that solvers start anew in each step.
-    paths = PathStates.start(p, jax.vmap(p.drawn)(keys), solver_state=None)
+    paths = PathStates.start(p, jax.vmap(p.draw_start)(keys), solver_state=None)
     starts = jax.vmap(ravel)(paths.y)
     states = jnp.broadcast_to(starts, (p.finest_steps, *starts.shape))
     carry = paths, states

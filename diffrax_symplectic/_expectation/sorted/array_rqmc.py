@@ -149,7 +149,7 @@ def _replicates(
     (replicate,) = keys
     # Not from quasi-random points, since a function of a key takes any number of them.
     start_keys = jr.split(jr.fold_in(replicate, _KEY_OF_STARTS), n)
-    drawn = jax.vmap(p.drawn)(start_keys)
+    drawn = jax.vmap(p.draw_start)(start_keys)
 
     def begin(level: Level) -> Motion:
         motion = independent_steps(

@@ -146,7 +146,7 @@ def constrained_state(
             f"{fault.reason}. {fault.advice}"
         )
     _check_masses(terms, t, y0, args)
-    y1, found, is_dependent = _projected(terms, t, y0, args)
+    y1, found, is_dependent = _projection(terms, t, y0, args)
     if not is_traced(found):
         if is_dependent:
             raise ValueError(_DEPENDENT)
@@ -160,7 +160,7 @@ def constrained_state(
 
 
 @eqx.filter_jit
-def _projected(
+def _projection(
     terms: PyTree[diffrax.AbstractTerm], t: RealScalarLike, y0: PyTree, args: Args
 ) -> tuple[PyTree, Bool[Array, ""], Bool[Array, ""]]:
     """The nearest allowed state, whether Newton's method found it, and whether the

@@ -20,7 +20,7 @@ from ..drift_and_noise import control_struct
 _DIRECTIONS = 4
 
 
-def contradicted(
+def is_contradicted(
     structure: str,
     is_noise: bool,
     term: diffrax.AbstractTerm,

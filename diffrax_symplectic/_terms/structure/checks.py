@@ -27,7 +27,7 @@ from ..symplectic_gradients import (
     structure_asserted_in,
 )
 from ..vector_fields import check_increments
-from .assertion import contradicted
+from .assertion import is_contradicted
 from .said_twice import check_drifts_differ
 
 
@@ -347,7 +347,7 @@ def _wrong_assertion(
         for term in terms:
             if asserted_structure(term) != structure:
                 continue
-            if contradicted(structure, is_noise, term, t0, y0, args):
+            if is_contradicted(structure, is_noise, term, t0, y0, args):
                 advice = (
                     f'Leave `structure="{structure}"`, which is wrong here, out of '
                     f"`{structure_asserted_in(term)}`, and {_GENERAL}."
