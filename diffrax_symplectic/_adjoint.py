@@ -27,7 +27,7 @@ from ._compat import (
     ω,
 )
 from ._custom_types import IntScalarLike, Y
-from ._solver import is_solver
+from ._solver import is_solver, LANGEVIN
 from ._terms import refuse_constraint
 
 
@@ -435,6 +435,16 @@ def _saved_between(t0, t1, ts: Array, g: PyTree[Array], passed: _Passed) -> _Pas
     return lax.while_loop(more, add, passed)
 
 
+def _steps_without_inverse() -> str:
+    """Steps of solvers for heat baths that shrink areas to zero, for messages."""
+    return " or of ".join(
+        f"`{kind.__name__}` with rate of friction times step equal to "
+        f"{2 * kind.friction_parts}"
+        for kind in LANGEVIN
+        if kind().undoes_its_steps
+    )
+
+
 def _if_arrived(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyTree:
     """The gradients; or if the backward pass failed, an error when run, or NaN."""
     if throw:
@@ -443,8 +453,8 @@ def _if_arrived(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyT
             ~arrived,
             "`ReversingAdjoint` could not reconstruct the solution: rounding errors grew "
             "too large between two checkpoints, or a step has no inverse, as one of "
-            "`BAOAB` with rate of friction times step equal to 2. Increase `checkpoints`, "
-            "change the step, or pass `adjoint=diffrax.RecursiveCheckpointAdjoint()`.",
+            f"{_steps_without_inverse()}. Increase `checkpoints`, change the step, or pass "
+            "`adjoint=diffrax.RecursiveCheckpointAdjoint()`.",
         )
 
     # A gradient that is silently wrong would be worse.

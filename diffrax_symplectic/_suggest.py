@@ -219,7 +219,8 @@ class _System(NamedTuple):
     - `fault`: why it is not separable; `None` if it is.
     - `num_noises`: the number of its scalar Brownian motions.
     - `commute`: whether they commute, as far as is known.
-    - `friction`: whether it has friction that `BAOAB` treats by a step of its own.
+    - `friction`: whether it has friction that solvers for heat baths, such as `BAOAB()`,
+        treat by a step of its own.
     - `general_bath`: whether only `BAOAB` with the midpoint rule for its flow does, as for
         masses that depend on positions.
     - `constrained`: whether its positions are.

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
 import diffrax
 import equinox as eqx
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from .._arguments import check_state, whole_number
 from .._compat import unwrapped
@@ -41,9 +41,9 @@ from .times import result_at
 
 
 if TYPE_CHECKING:
-    from typing import ClassVar as AbstractVar
+    from typing import ClassVar as AbstractClassVar, ClassVar as AbstractVar
 else:
-    from equinox import AbstractVar
+    from equinox import AbstractClassVar, AbstractVar
 
 
 class SplittingState(NamedTuple):
@@ -64,10 +64,19 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
     kick at the start."""
 
     variables: ClassVar[tuple[str, ...]] = ("W",)
-    symmetric: eqx.AbstractClassVar[bool]
+    symmetric: AbstractClassVar[bool]
+    # How many parts of a step are friction and noise, each over an equal share of it.
+    friction_parts: ClassVar[int] = 1
     flow: AbstractVar[Flow]
     # The steps of a solver over half a flow.
     steps: AbstractVar[int]
+
+    @classmethod
+    def area_factor(cls, rate_times_step: ArrayLike) -> Any:
+        """The factor by which a step shrinks areas, where friction is one rate for all
+        momenta. At zero a step has no inverse."""
+        x = rate_times_step / (2 * cls.friction_parts)
+        return ((1 - x) / (1 + x)) ** cls.friction_parts
 
     def stage_vectors(self, num_noises):
         if not is_solver(self.flow):

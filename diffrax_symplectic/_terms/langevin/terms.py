@@ -63,9 +63,9 @@ def langevin_terms(
     Stratonovich. $B$ holds the roots of $G$ and $T$. Where one of these is zero, the
     derivative of its root, which is infinite, counts as zero in gradients.
 
-    [`diffrax_symplectic.BAOAB`][] and [`diffrax_symplectic.LangevinMiddle`][] treat
-    friction by a step of its own. Every other solver, from this package or from Diffrax,
-    takes it as a part of the drift, which makes positions wrong to first order where masses
+    Solvers for heat baths, such as [`diffrax_symplectic.BAOAB`][], treat friction by a step
+    of its own. Every other solver, from this package or from Diffrax, takes it as a part of
+    the drift, which makes positions wrong to first order where masses
     depend on them; only [`diffrax_symplectic.LinearFlow`][] refuses it. More terms are
     added by `diffrax.MultiTerm(*terms.terms, ...)`: other noise from
     [`diffrax_symplectic.noise_terms`][], or a second bath from

@@ -385,8 +385,8 @@ _GENERAL_BATH = (
 
 
 FRICTION = (
-    "Take friction from `langevin_terms(H0, friction, temperature, path)`: `BAOAB()` "
-    "and `LangevinMiddle()`, or for masses that depend on positions "
-    "`BAOAB(ImplicitMidpoint())`, treat it by a step of its own. (All need a kinetic "
-    "energy that is quadratic in p.)"
+    "Take friction from `langevin_terms(H0, friction, temperature, path)`: solvers for "
+    "heat baths, such as `BAOAB()`, or `BAOAB(ImplicitMidpoint())` for masses that depend "
+    "on positions, treat it by a step of its own. (All need a kinetic energy that is "
+    "quadratic in p.)"
 )
