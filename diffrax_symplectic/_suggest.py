@@ -320,7 +320,7 @@ def _suitable(
             solvers.append(BAOAB(StormerVerlet()))
         if not solvers:
             raise ValueError(
-                "Solvers for terms with a `constraint` need H0 = p . M^-1 p / 2 + U(t, q), "
+                "Solvers for constrained terms need H0 = p . M^-1 p / 2 + U(t, q), "
                 "noise Hamiltonians H_k = U_k(t, q), and friction only from "
                 "`langevin_terms`."
             )

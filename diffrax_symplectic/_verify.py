@@ -58,7 +58,7 @@ def symplecticity_defect(
 
     Exact up to rounding: for a symplectic method this is a small multiple of the machine
     epsilon, for any Hamiltonians, step and increments; for other methods it is not small.
-    For terms with a `constraint` it is the largest entry of
+    For constrained terms it is the largest entry of
     $Z^\top (J^\top \Omega J - \Omega) Z$, where the columns of $Z$ are an orthonormal basis
     of the directions along which allowed states can move.
     (The solvers of this package differentiate their stage equations implicitly, so it does
@@ -210,16 +210,16 @@ def equipartition(
 
     **Arguments:**
 
-    - `terms`: terms with the state `(p, q)`, without a `constraint`.
+    - `terms`: terms with the state `(p, q)`, not constrained.
 
     **Returns:** a function `phi(t, y, args)`, which returns a dictionary of the two numbers
     over $n$: `"kinetic"` and `"configurational"`, in units of energy.
 
-    **Raises:** a `ValueError` for terms with a `constraint`.
+    **Raises:** a `ValueError` for constrained terms.
     """
     if constraint_of(terms) is not None:
         raise ValueError(
-            "`equipartition` takes no terms with a `constraint`, since its two means then "
+            "`equipartition` takes no constrained terms, since its two means then "
             "contain the forces of the constraint. Look at the kinetic energy alone: with "
             "`c` constraints its mean is `(n - c) T / 2`."
         )
@@ -310,8 +310,8 @@ def second_moment_map(
     **Returns:** the matrix $K$, of shape `(N, N)` with `N = (n + 1)**2`. Rows and columns
     belong to pairs $(i, j)$ of entries of $z$, with number $(n + 1) i + j$.
 
-    **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for terms
-    with a `constraint`.
+    **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for
+    constrained terms.
     """
     refuse_constraint(terms, "second_moment_map")
     flat, unravel = jfu.ravel_pytree(y0)
@@ -385,8 +385,8 @@ def weak_order_defect(
 
     **Returns:** the local error, in the structure of `fn`.
 
-    **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for terms
-    with a `constraint`.
+    **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for
+    constrained terms.
     """
     refuse_constraint(terms, "weak_order_defect")
     expected = step_expectation(terms, solver, t0, t1, y0, args, fn=fn, nodes=nodes)

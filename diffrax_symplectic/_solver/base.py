@@ -75,7 +75,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         diffrax.LocalLinearInterpolation
     )
     record: ClassVar[Record | None] = None
-    # Whether it takes terms with a `constraint`.
+    # Whether it takes constrained terms.
     keeps_constraints: ClassVar[bool] = False
     structure: AbstractVar[Structure]
     variables: AbstractVar[tuple[str, ...]]

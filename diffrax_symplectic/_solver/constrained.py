@@ -65,8 +65,7 @@ def verlet_step(
     of the solver, for errors about its path."""
     surface = Surface.of(terms, t0, y0, args)
     drift, noise = split_terms(without_constraint(terms))
-    p, unravel_p = jfu.ravel_pytree(y0[0])
-    q, unravel_q = jfu.ravel_pytree(y0[1])
+    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
     half = (t1 - t0) / 2
     # A path that failed before needs no multipliers: in a batch, others would wait for it.
     pending = before == optx.RESULTS.successful
@@ -113,7 +112,7 @@ def begin_baoab(
     keeps = getattr(flow, "keeps_constraints", flow is None)
     if not keeps:
         raise ValueError(
-            f"The flow {flow!r} does not keep the `constraint` of the terms. Use "
+            f"The flow {flow!r} does not keep the constraint of the terms. Use "
             "`BAOAB()` or `BAOAB(StormerVerlet())`."
         )
     outcome = init_constrained(solver, terms, t0, y0, args)
@@ -139,8 +138,7 @@ def baoab_step(
     surface = Surface.of(terms, t0, y0, args)
     kicks, rest = _kicks_and_rest(flow, terms)
     _, friction, noise = split_friction(without_constraint(terms))
-    p, unravel_p = jfu.ravel_pytree(y0[0])
-    q, unravel_q = jfu.ravel_pytree(y0[1])
+    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
     half = jnp.asarray((t1 - t0) / 2, p.dtype)
     middle = t0 + (t1 - t0) / 2
     pending = before.outcome == optx.RESULTS.successful
@@ -157,8 +155,7 @@ def baoab_step(
             return p, q, state, found
         y = (unravel_p(p), unravel_q(at.q))
         y, state, result = moved_by(flow, steps, rest, begin, end, half, y, args, state)
-        p, _ = jfu.ravel_pytree(y[0])
-        q, _ = jfu.ravel_pytree(y[1])
+        (p, _), (q, _) = map(jfu.ravel_pytree, y)
         return p, q, state, result == diffrax.RESULTS.successful
 
     # B and A. Between them the momentum need not be tangent: the multipliers of the flight

@@ -251,7 +251,7 @@ class BAOAB(AbstractLangevinSplitting):
     **Diffrax's terms.** It also takes `diffrax.UnderdampedLangevinDriftTerm` and
     `diffrax.UnderdampedLangevinDiffusionTerm`, with their state `(x, v)`.
 
-    **Constraints.** For terms with a `constraint` this is g-BAOAB: each A is a step of
+    **Constraints.** For constrained terms this is g-BAOAB: each A is a step of
     RATTLE, as in [`diffrax_symplectic.StormerVerlet`][], B and O end with momenta that are
     tangent, and O is the midpoint rule with multipliers of its own, so that it keeps the
     Maxwell distribution of the tangent momenta exactly. With the flow `StormerVerlet()`,

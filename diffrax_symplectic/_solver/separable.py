@@ -206,7 +206,7 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     one evaluation of the forces, and must resolve the fastest frequency $\omega$ of $H_0$:
     $\omega h < 2$.
 
-    **Constraints.** For terms with a `constraint` each drift over $h / 2$ is a step of
+    **Constraints.** For constrained terms each drift over $h / 2$ is a step of
     RATTLE, $q \gets q + \frac h2 M^{-1} p$ with $p \gets p - J(q)^\top \lambda$ and
     multipliers $\lambda$ for which the new $q$ satisfies the constraint, and momenta are
     made tangent, $J M^{-1} p = 0$. Multipliers are found by Newton's method to rounding; a
