@@ -48,11 +48,11 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     an error is raised, or with `throw=False` the gradient is NaN. Near rest the error is
     compared with the size of later states, reduced by a tenth for each step.
 
-    **Solvers:** tableaus that are reversible, as determined from their coefficients:
-    [`diffrax_symplectic.ImplicitMidpoint`][], [`diffrax_symplectic.StormerVerlet`][],
+    **Solvers:** tableaus that are reversible, as determined from their coefficients, such
+    as [`diffrax_symplectic.ImplicitMidpoint`][], [`diffrax_symplectic.StormerVerlet`][],
     [`diffrax_symplectic.StrangGauss`][], [`diffrax_symplectic.LevyAreaMidpoint`][], and
-    possibly your own; [`diffrax_symplectic.NinomiyaVictoir`][] and
-    [`diffrax_symplectic.BAOAB`][], with a flow that is reversible; and
+    possibly your own; [`diffrax_symplectic.NinomiyaVictoir`][]; symmetric splittings for
+    heat baths, such as [`diffrax_symplectic.BAOAB`][], with a flow that is reversible; and
     [`diffrax_symplectic.LinearFlow`][] around a reversible solver. With friction, rounding
     errors grow on the way back, about by $e^{\gamma t}$, and with
     [`diffrax_symplectic.BAOAB`][] by $|(1 + x) / (1 - x)|$ in each step, $x = \gamma h /
@@ -316,11 +316,11 @@ def _solve_bwd(
 
     def body(walk: _Walk) -> _Walk:
         i = walk.i - 1
-        before = step(walk.y, diff, i, True)
-        size = jnp.maximum(optx.max_norm(before), _PER_STEP * walk.size)
-        y, arrived = _begin_anew(before, rows, i, every, walk.arrived, size)
-        # The state at the end of the step, and the part of that at its start which does not
-        # come through the step.
+        y_found = step(walk.y, diff, i, back=True)
+        size = jnp.maximum(optx.max_norm(y_found), _PER_STEP * walk.size)
+        y, arrived = _begin_anew(y_found, rows, i, every, walk.arrived, size)
+        # Derivatives with respect to the state at the end of the step; and to that at its
+        # start, without what comes through the step.
         passed = _Passed(walk.a_y, (0 * walk.a_y**ω).ω, walk.saved)
         if saveat.ts is not None:
             t0 = times.time(i)

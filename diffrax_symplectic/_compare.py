@@ -187,7 +187,7 @@ def compare_solvers(
     multiple of the smallest, if `phi` does not return one number, or if a solver is not a
     Diffrax solver.
     """
-    dts = _checked_steps(t0, t1, dt0)
+    dts = _steps_as_floats(t0, t1, dt0)
     want = "strong" if phi is None else "weak"
     terms = shapes_as_paths(terms)
     suggestions = suggest_solver(terms, t0, y0, args, want=want)
@@ -347,9 +347,9 @@ def _check_scalar(phi: Any, t: RealScalarLike, y0: Y, args: Args) -> None:
         raise ValueError(f"`phi` must return one number; got shape {shapes(out)}.")
 
 
-def _checked_steps(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
-    """Raises a `ValueError` unless each step divides the interval, and is a multiple of the
-    smallest, so that all follow one Brownian motion."""
+def _steps_as_floats(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
+    """The step sizes, as numbers of Python. Raises a `ValueError` unless each divides the
+    interval, and is a multiple of the smallest, so that all follow one Brownian motion."""
     if not t1 > t0:
         raise ValueError(f"`t1` must be after `t0`; got t0={t0!r} and t1={t1!r}.")
     if np.ndim(dts) != 1 or len(dts) == 0:

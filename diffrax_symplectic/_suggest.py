@@ -385,21 +385,21 @@ def ranked(
     friction: bool = False,
     general_bath: bool = False,
 ) -> list[AbstractSymplecticSolver]:
-    """The suggested solvers for these structures (`"any"` is implied) and noises, best
-    first; and with `friction`, for Langevin terms whose other terms are separable; with
-    `general_bath`, for those whose other terms are not."""
+    """The suggested solvers for systems of these structures (`"any"` is implied) and with
+    such noises, best first. `friction` says that the terms are Langevin terms, whose other
+    terms are separable, and `general_bath` that they are others of this kind."""
     structures = {"any", *structures}
     if {"separable", "constant"} <= structures:
         structures.add("separable and constant")
 
-    def rank(solver: AbstractSymplecticSolver) -> tuple:
+    def rank(solver: AbstractSymplecticSolver) -> tuple[float, ...]:
         """What to sort by: the smallest tuple is the best solver."""
         record = _record(solver)
         order = record.order(want, commute)
         assert order is not None
         # In a heat bath most means are stationary ones, of positions.
-        means = friction and want == "weak"
-        inexact = means and "qq" not in record.stationary
+        wants_stationary = friction and want == "weak"
+        inexact = wants_stationary and "qq" not in record.stationary
         systems = solver.stage_vectors(num_noises)
         # In a separable system only half of the state is solved for.
         cost = sum(systems) / (2 if solver.structure == "separable" else 1)
@@ -414,10 +414,10 @@ def ranked(
         record = _record(solver)
         return want in record.suggested and record.noises in noises
 
-    every = [solver() for solver in SOLVERS]
-    solvers = [solver for solver in every if solver.structure in structures]
+    all_solvers = [kind() for kind in SOLVERS]
+    solvers = [solver for solver in all_solvers if solver.structure in structures]
     if friction:
-        solvers += [solver() for solver in LANGEVIN]
+        solvers += [kind() for kind in LANGEVIN]
     best = sorted(filter(fits, solvers), key=rank)
     return [_BATH_OF_ANY_ENERGY, *best] if general_bath else best
 

@@ -139,7 +139,8 @@ def trial_key(key: PRNGKeyArray) -> PRNGKeyArray:
 
 
 def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampling:
-    """Raises a `ValueError` unless this is a sampling, of the class that `start` had."""
+    """The sampling. Raises a `ValueError` unless it is one, of the class that `start` was
+    sampled by, if there is a `start`."""
     if not isinstance(sampling, AbstractSampling):
         names = ", ".join(f"`{name}`" for name in SAVED_SAMPLINGS)
         raise ValueError(

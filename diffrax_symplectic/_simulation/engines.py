@@ -234,13 +234,14 @@ def _with_stragglers(
 
 
 def _states_of_entries(y0: PyTree, entries: list[np.ndarray]) -> PyTree[np.ndarray]:
-    """The state, from its entries, each with axes for paths and times."""
+    """States in the structure of `y0`, with leading axes for paths and times, from their
+    entries, each an array with these axes."""
     leaves, treedef = jtu.tree_flatten(y0)
-    rest = iter(entries)
+    left = iter(entries)
     axes = entries[0].shape
     each = []
     for leaf in leaves:
-        of_leaf = [next(rest) for _ in range(leaf.size)]
+        of_leaf = [next(left) for _ in range(leaf.size)]
         if of_leaf:
             stacked = np.stack(of_leaf, axis=-1)
         else:

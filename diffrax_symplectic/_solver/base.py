@@ -37,7 +37,7 @@ from .._terms import check_structure, number_of_noises, split_terms
 from .driven import drift_driven, noise_driven
 from .record import Record, Want
 from .step import no_failure, Outcome, result_of, Step, take_step
-from .times import result_at
+from .times import result_with_times_checked
 
 
 if TYPE_CHECKING:
@@ -263,7 +263,7 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         name = type(self).__name__
         driven |= noise_driven(from_drift, h, noise, variables, t0, t1, args, name)
         y1, outcome = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
-        result = result_at(terms, t0, t1, result_of(outcome, y1))
+        result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), outcome, result
 
 

@@ -23,7 +23,7 @@ from .._brownian import (
 from .._compat import direction, resolution, ω
 from .._custom_types import Args, RealScalarLike, Terms
 from .._terms import apply, brownian_paths
-from .brackets import apply_brackets, apply_bridge, bridge
+from .brackets import apply_brackets, apply_bridge, bridge_coefficients
 
 
 def drift_driven(
@@ -68,7 +68,9 @@ def noise_driven(
             case "noise":
                 functions[name] = jtu.Partial(apply, noise, values[name], args)
             case "drift brackets":
-                areas = bridge(h, values["W"], values["H"], values.get("K"))
+                areas = bridge_coefficients(
+                    h, values["W"], values["H"], values.get("K")
+                )
                 functions[name] = jtu.Partial(
                     apply_bridge, drift, noise, areas, h, args
                 )

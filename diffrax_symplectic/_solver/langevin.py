@@ -37,7 +37,7 @@ from .flow import (
 )
 from .record import Record
 from .step import result_of
-from .times import result_at
+from .times import result_with_times_checked
 
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         result = result_of(None, (p, q))
         if self.flow is not None:
             result = R.where(flowed == R.successful, result, flowed)
-        result = result_at(terms, t0, t1, result)
+        result = result_with_times_checked(terms, t0, t1, result)
         # Exchanged once more, if the state is Diffrax's (x, v).
         _, y1 = momentum_first(own_terms, (p, q))
         state = SplittingState(forces, flow_state)
@@ -318,7 +318,7 @@ class BAOAB(AbstractLangevinSplitting):
             made_jump,
             type(self).__name__,
         )
-        result = result_at(terms, t0, t1, result_of(state.outcome, y1))
+        result = result_with_times_checked(terms, t0, t1, result_of(state.outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), state, result
 
 

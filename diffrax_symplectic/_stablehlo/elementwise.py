@@ -117,28 +117,32 @@ def _sign(a):
     return dr.select(a == 0, 0, dr.select(a > 0, type(a)(1), type(a)(-1)))
 
 
-def _power(a, b):
-    """Uses logarithms, or multiplication for small integer exponents."""
-    if is_literal(b) and float(b[0]).is_integer() and abs(b[0]) <= _MOST_MULTIPLIED:
-        return _integer_power(a, int(b[0]))
+def _power(base, exponent):
+    """By logarithms, or by multiplication for small integer exponents."""
+    if is_literal(exponent):
+        known = exponent[0]
+        if float(known).is_integer() and abs(known) <= _MOST_MULTIPLIED:
+            return _integer_power(base, int(known))
     dr = drjit()
-    dtype = type(a)
-    size = dr.exp(dr.log(dr.abs(a)) * b)
+    dtype = type(base)
+    size = dr.exp(dr.log(dr.abs(base)) * exponent)
     # Of a negative number only whole powers are real: odd ones are negative.
-    whole = dr.floor(b) == b
-    odd = dr.floor(b / 2) * 2 != b
-    other = dr.select(dr.isinf(a), size, dtype(np.nan))
-    negative = dr.select(whole, dr.select(odd, -size, size), other)
-    power = dr.select(a < 0, negative, size)
-    # Where a logarithm of zero would meet an exponent of zero, and of one an infinite one.
-    power = dr.select((a == 0) & (b > 0), dtype(0), power)
-    return dr.select((b == 0) | (a == 1), dtype(1), power)
+    is_whole = dr.floor(exponent) == exponent
+    is_odd = dr.floor(exponent / 2) * 2 != exponent
+    whole_power = dr.select(is_odd, -size, size)
+    other_power = dr.select(dr.isinf(base), size, dtype(np.nan))
+    of_negative = dr.select(is_whole, whole_power, other_power)
+    power = dr.select(base < 0, of_negative, size)
+    # Where the product of logarithm and exponent is infinity times zero, or may be: a power
+    # of zero, the power zero, and a power of one.
+    power = dr.select((base == 0) & (exponent > 0), dtype(0), power)
+    return dr.select((exponent == 0) | (base == 1), dtype(1), power)
 
 
-def _integer_power(a, exponent: int):
+def _integer_power(base, exponent: int):
     """By repeated squares."""
-    power = type(a)(1)
-    square = a
+    power = type(base)(1)
+    square = base
     left = abs(exponent)
     while left:
         power = power * square if left & 1 else power
