@@ -291,7 +291,7 @@ def _solve_bwd(
     diff, nondiff = eqx.partition(parameters, is_perturbed)
     final_grad, _ = grad_out
     number = 1 if saveat.ts is None else len(saveat.ts)
-    g = _filled(solve_state(final_grad).ys, y1, number)
+    g = _with_zeros(solve_state(final_grad).ys, y1, number)
 
     def step(y: Y, diff: PyTree[Array], i: IntScalarLike, back: bool) -> Y:
         """One step between the times of steps `i` and `i + 1`, forward or back."""
@@ -363,16 +363,16 @@ def _solve_bwd(
     return _if_arrived(walk.arrived, throw, (a_y, *walk.a_parameters))
 
 
-def _filled(grad_ys: PyTree[Array | None], y1: Y, number: int) -> PyTree[Array]:
+def _with_zeros(grad_ys: PyTree[Array | None], y1: Y, number: int) -> PyTree[Array]:
     """The derivatives of the loss with respect to the saved states. Those that it does not
     depend on have none, which is zero here."""
 
-    def filled(y1: Array, grad: Array | None) -> Array:
+    def or_zeros(y1: Array, grad: Array | None) -> Array:
         if grad is None:
             return jnp.zeros((number, *jnp.shape(y1)), y1.dtype)
         return grad
 
-    return jtu.tree_map(filled, y1, grad_ys, is_leaf=lambda x: x is None)
+    return jtu.tree_map(or_zeros, y1, grad_ys, is_leaf=lambda x: x is None)
 
 
 # The fraction of its size that a state passes to the one before it. Thus a start at rest,

@@ -71,8 +71,8 @@ class Ensemble(eqx.Module):
 
     def start(self, number: IntScalarLike) -> tuple[Y, Args]:
         """The initial state and the `args` of path number `number`, which may be traced."""
-        y0, own = self._problem.draw_start(self._key_of(number))
-        return y0, self._problem.with_args(own).args
+        y0, own_args = self._problem.draw_start(self._key_of(number))
+        return y0, self._problem.with_args(own_args).args
 
     def _key_of(self, number: IntScalarLike) -> PRNGKeyArray:
         return sample_key(self._key, *_words(number))

@@ -453,8 +453,8 @@ def _suggestion(
         struct = increment_struct(replaced[0])
         shape = _shape_code(struct)
         code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
-        own = solver.path(struct, jr.key(0), want=want)
-        if isinstance(own, TruncatedBrownianPath) and not bounded:
+        made = solver.path(struct, jr.key(0), want=want)
+        if isinstance(made, TruncatedBrownianPath) and not bounded:
             code = f"ds.FixedStepBrownianPath({shape}, key)"
     elif random:
         code = f"the `{type(random[0]).__name__}` of the terms, with another key"

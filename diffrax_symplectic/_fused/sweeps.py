@@ -56,7 +56,7 @@ class _Equations(NamedTuple):
     def start(self, guess: PyTree[Array]) -> Halves:
         return guess if self.in_halves else Halves(guess, guess)
 
-    def swept(self, y: Halves, relaxation: Scalar | None = None) -> Halves:
+    def sweep(self, y: Halves, relaxation: Scalar | None = None) -> Halves:
         """The iterate after a sweep, in which $q$ reads the new $p$. `None` is no
         relaxation, and no operation."""
         new_p = self.image(y).p if self.in_halves else self.image(y.q)
@@ -131,10 +131,10 @@ def solve_one_path(
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
     # Three sweeps before the loop: they make two corrections, whose ratio is the rate of
     # convergence.
-    first = equations.swept(equations.start(guess))
+    first = equations.sweep(equations.start(guess))
     criterion = _criterion(scale(equations.value(first)), dtype)
-    second = equations.swept(first)
-    third = equations.swept(second)
+    second = equations.sweep(first)
+    third = equations.sweep(second)
     one = jnp.ones((), dtype)
     before, _ = criterion.measure(equations.correction(first, second), one)
     size, is_solved = criterion.measure(equations.correction(second, third), before)
@@ -147,8 +147,8 @@ def solve_one_path(
         lambda: one,
     )
 
-    def once(last: _State) -> _State:
-        y = equations.swept(last.y, relaxation)
+    def sweep_again(last: _State) -> _State:
+        y = equations.sweep(last.y, relaxation)
         correction = equations.correction(last.y, y)
         size, is_solved = criterion.measure(correction, last.size)
         return _State(y, size, is_solved, last.done + 1)
@@ -157,7 +157,7 @@ def solve_one_path(
         return ~last.is_solved & (last.done < _MOST_SWEEPS) & (last.size < _HUGE)
 
     state = _State(third, size, ~pending | is_solved, jnp.full((), 3, jnp.int32))
-    last = lax.while_loop(goes_on, once, state)
+    last = lax.while_loop(goes_on, sweep_again, state)
     return equations.value(last.y), last.is_solved
 
 
@@ -227,13 +227,13 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
 def without_rescue(solver: Any) -> Any:
     """The solver, and all solvers in it, with `Sweeps` in place of `PicardNewton`."""
 
-    def swept(x: Any) -> Any:
+    def with_sweeps(x: Any) -> Any:
         _check_tolerance(x.root_finder)
         # No iterations of Optimistix: `Sweeps` solves the equations before the first.
         fields = lambda stages: (stages.root_finder, stages.root_find_max_steps)
         return eqx.tree_at(fields, x, (Sweeps(), 0))
 
-    return with_changed_stages(solver, swept)
+    return with_changed_stages(solver, with_sweeps)
 
 
 def _check_tolerance(finder: PicardNewton) -> None:

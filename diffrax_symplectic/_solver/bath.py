@@ -126,7 +126,7 @@ def after_friction(
     if flat.size > _MAX_SOLVED:
         constant = _matrices_if_constant(friction, t, y, args)
     if constant is not None:
-        return unravel(flat + _solved_with(constant, step, matrix, right))
+        return unravel(flat + _solve_by_modes(constant, step, matrix, right))
     # Elimination in XLA operations takes a tenth of LAPACK's time for matrices this small.
     solve = eliminate if flat.size <= MAX_WRITTEN_OUT else jnp.linalg.solve
     return unravel(flat + solve(matrix, right))
@@ -172,13 +172,13 @@ def _matrices_if_constant(
     return _Matrices(G, direction(friction) * inverse_masses)
 
 
-def _solved_with(
+def _solve_by_modes(
     constant: _Matrices,
     step: Float[Array, ""],
     matrix: Float[Array, "n n"],
     right: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """Solves `matrix @ x = right` for `matrix = 1 + step / 2 * G M^-1`, by the modes of
+    """The solution of `matrix @ x = right` for `matrix = 1 + step / 2 * G M^-1`, by the modes of
     the `constant` matrices G and M^-1.
 
     The modes do not depend on the step. (Sizes of steps differ by rounding errors, so that

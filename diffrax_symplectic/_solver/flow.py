@@ -149,7 +149,7 @@ def moved_by(
     terms = diffrax.MultiTerm(*drift)
     h = (t1 - t0) / steps
 
-    def step(carry: tuple, k: Any) -> tuple[tuple, None]:
+    def step(carry: tuple[Any, ...], k: Any) -> tuple[tuple[Any, ...], None]:
         y, state, _ = carry
         begin = t0 + k * h
         # What the bath did is a jump for a solver that remembers the end of its last step.

@@ -6,7 +6,7 @@ import functools as ft
 import itertools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool
@@ -215,7 +215,7 @@ def _as_block(
 
 def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
     """Groups stages that evaluate the same vector field."""
-    groups: dict[tuple, list[int]] = {}
+    groups: dict[tuple[Any, ...], list[int]] = {}
     for i in stages:
         groups.setdefault(tableau.stages[i].kind, []).append(i)
     return tuple(tuple(group) for group in groups.values())
