@@ -178,8 +178,8 @@ def _solve_by_modes(
     matrix: Float[Array, "n n"],
     right: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """The solution of `matrix @ x = right` for `matrix = 1 + step / 2 * G M^-1`, by the modes of
-    the `constant` matrices G and M^-1.
+    """The solution of `matrix @ x = right` for `matrix = 1 + step / 2 * G M^-1`, by the
+    modes of the `constant` matrices G and M^-1.
 
     The modes do not depend on the step. (Sizes of steps differ by rounding errors, so that
     `matrix` itself is not the same in all; it carries the derivatives.) They are computed
