@@ -392,7 +392,7 @@ def ranked(
     if {"separable", "constant"} <= structures:
         structures.add("separable and constant")
 
-    def rank(solver: AbstractSymplecticSolver) -> tuple[float, ...]:
+    def rank(solver: AbstractSymplecticSolver) -> tuple[Any, ...]:
         """What to sort by: the smallest tuple is the best solver."""
         record = _record(solver)
         order = record.order(want, commute)
