@@ -4,7 +4,7 @@ import dataclasses
 import functools as ft
 import textwrap
 from collections.abc import Callable, Collection, Sequence
-from typing import cast, get_args, NamedTuple
+from typing import Any, cast, get_args, NamedTuple
 
 import diffrax
 import jax
