@@ -7,7 +7,7 @@ The state is a pair `(p, q)`, momenta first.
 - Its Brownian path: `solver.path(shape, key)`.
 - Solving: `diffrax.diffeqsolve(terms, solver, t0, t1, dt0, y0)`.
 - Means over many paths: `expectation`; the states of many paths: `ensemble`.
-- Friction: `langevin_terms`, for `BAOAB`, `LangevinMiddle` and all others.
+- Friction: `langevin_terms`, for `BAOAB` and all other solvers.
 - Rods and rigid molecules: `constraint=` of the terms, `constrained_state`.
 - Stiff linear parts: `BAOAB(linear_flow(...))`, or without a bath `LinearFlow`.
 - Gradients of long solves: `ReversingAdjoint`.

@@ -27,7 +27,7 @@ from ._compat import (
     ω,
 )
 from ._custom_types import IntScalarLike, Y
-from ._solver import is_solver
+from ._solver import is_solver, LANGEVIN
 from ._terms import refuse_constraint
 
 
@@ -48,11 +48,11 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
     an error is raised, or with `throw=False` the gradient is NaN. Near rest the error is
     compared with the size of later states, reduced by a tenth for each step.
 
-    **Solvers:** tableaus that are reversible, as determined from their coefficients:
-    [`diffrax_symplectic.ImplicitMidpoint`][], [`diffrax_symplectic.StormerVerlet`][],
+    **Solvers:** tableaus that are reversible, as determined from their coefficients, such
+    as [`diffrax_symplectic.ImplicitMidpoint`][], [`diffrax_symplectic.StormerVerlet`][],
     [`diffrax_symplectic.StrangGauss`][], [`diffrax_symplectic.LevyAreaMidpoint`][], and
-    possibly your own; [`diffrax_symplectic.NinomiyaVictoir`][] and
-    [`diffrax_symplectic.BAOAB`][], with a flow that is reversible; and
+    possibly your own; [`diffrax_symplectic.NinomiyaVictoir`][]; symmetric splittings for
+    heat baths, such as [`diffrax_symplectic.BAOAB`][], with a flow that is reversible; and
     [`diffrax_symplectic.LinearFlow`][] around a reversible solver. With friction, rounding
     errors grow on the way back, about by $e^{\gamma t}$, and with
     [`diffrax_symplectic.BAOAB`][] by $|(1 + x) / (1 - x)|$ in each step, $x = \gamma h /
@@ -291,7 +291,7 @@ def _solve_bwd(
     diff, nondiff = eqx.partition(parameters, is_perturbed)
     final_grad, _ = grad_out
     number = 1 if saveat.ts is None else len(saveat.ts)
-    g = _filled(solve_state(final_grad).ys, y1, number)
+    g = _with_zeros(solve_state(final_grad).ys, y1, number)
 
     def step(y: Y, diff: PyTree[Array], i: IntScalarLike, back: bool) -> Y:
         """One step between the times of steps `i` and `i + 1`, forward or back."""
@@ -316,11 +316,11 @@ def _solve_bwd(
 
     def body(walk: _Walk) -> _Walk:
         i = walk.i - 1
-        before = step(walk.y, diff, i, True)
-        size = jnp.maximum(optx.max_norm(before), _PER_STEP * walk.size)
-        y, arrived = _begin_anew(before, rows, i, every, walk.arrived, size)
-        # The state at the end of the step, and the part of that at its start which does not
-        # come through the step.
+        y_found = step(walk.y, diff, i, back=True)
+        size = jnp.maximum(optx.max_norm(y_found), _PER_STEP * walk.size)
+        y, arrived = _begin_anew(y_found, rows, i, every, walk.arrived, size)
+        # Derivatives with respect to the state at the end of the step; and to that at its
+        # start, without what comes through the step.
         passed = _Passed(walk.a_y, (0 * walk.a_y**ω).ω, walk.saved)
         if saveat.ts is not None:
             t0 = times.time(i)
@@ -363,16 +363,16 @@ def _solve_bwd(
     return _if_arrived(walk.arrived, throw, (a_y, *walk.a_parameters))
 
 
-def _filled(grad_ys: PyTree[Array | None], y1: Y, number: int) -> PyTree[Array]:
+def _with_zeros(grad_ys: PyTree[Array | None], y1: Y, number: int) -> PyTree[Array]:
     """The derivatives of the loss with respect to the saved states. Those that it does not
     depend on have none, which is zero here."""
 
-    def filled(y1: Array, grad: Array | None) -> Array:
+    def or_zeros(y1: Array, grad: Array | None) -> Array:
         if grad is None:
             return jnp.zeros((number, *jnp.shape(y1)), y1.dtype)
         return grad
 
-    return jtu.tree_map(filled, y1, grad_ys, is_leaf=lambda x: x is None)
+    return jtu.tree_map(or_zeros, y1, grad_ys, is_leaf=lambda x: x is None)
 
 
 # The fraction of its size that a state passes to the one before it. Thus a start at rest,
@@ -435,6 +435,16 @@ def _saved_between(t0, t1, ts: Array, g: PyTree[Array], passed: _Passed) -> _Pas
     return lax.while_loop(more, add, passed)
 
 
+def _steps_without_inverse() -> str:
+    """Steps of solvers for heat baths that shrink areas to zero, for messages."""
+    return " or of ".join(
+        f"`{kind.__name__}` with rate of friction times step equal to "
+        f"{2 * kind.friction_parts}"
+        for kind in LANGEVIN
+        if kind().undoes_its_steps
+    )
+
+
 def _if_arrived(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyTree:
     """The gradients; or if the backward pass failed, an error when run, or NaN."""
     if throw:
@@ -443,8 +453,8 @@ def _if_arrived(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyT
             ~arrived,
             "`ReversingAdjoint` could not reconstruct the solution: rounding errors grew "
             "too large between two checkpoints, or a step has no inverse, as one of "
-            "`BAOAB` with rate of friction times step equal to 2. Increase `checkpoints`, "
-            "change the step, or pass `adjoint=diffrax.RecursiveCheckpointAdjoint()`.",
+            f"{_steps_without_inverse()}. Increase `checkpoints`, change the step, or pass "
+            "`adjoint=diffrax.RecursiveCheckpointAdjoint()`.",
         )
 
     # A gradient that is silently wrong would be worse.

@@ -185,7 +185,7 @@ def _by_parts(
     # Rounded up, so that a small batch has groups of one.
     part = -(-size // _PARTS)
 
-    def served(value: _T, own: PyTree) -> _T:
+    def by_call(value: _T, own: PyTree) -> _T:
         return call(value, eqx.combine(own, common))
 
     def unchanged(value: _T, own: PyTree) -> _T:
@@ -195,9 +195,10 @@ def _by_parts(
     if size == 1:
         # A conditional is cheaper than a loop, and stays one: there is no batch.
         alone = _first((value, own))
-        return _with_axis(lax.cond(pending[0], served, unchanged, *alone))
+        return _with_axis(lax.cond(pending[0], by_call, unchanged, *alone))
 
     def serve_part(carry):
+        """Applies `call` for the next `part` of the paths that are pending."""
         pending, value = carry
         # Like `jnp.nonzero`, which compiles to a dozen kernels. If fewer paths are pending,
         # the surplus indices lie beyond the batch and are dropped. Unsigned indices need no
@@ -205,7 +206,7 @@ def _by_parts(
         flag, which = lax.top_k(pending.astype(jnp.float32), part)
         which = jnp.where(flag > 0, which, size).astype(jnp.uint32)
         gathered = jtu.tree_map(lambda x: x[which], (value, own))
-        new = jax.vmap(served)(*gathered)
+        new = jax.vmap(by_call)(*gathered)
 
         def scatter(x: Array, y: Any) -> Array:
             return x.at[which].set(y, mode="drop")

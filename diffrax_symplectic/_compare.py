@@ -37,7 +37,7 @@ from ._terms import (
 _FINER = 8
 
 
-class Batch(NamedTuple):
+class PathResults(NamedTuple):
     """The results of a batch of paths.
 
     - `results`: the states at the end, or what `phi` makes of them.
@@ -187,7 +187,7 @@ def compare_solvers(
     multiple of the smallest, if `phi` does not return one number, or if a solver is not a
     Diffrax solver.
     """
-    dts = _checked_steps(t0, t1, dt0)
+    dts = _steps_as_floats(t0, t1, dt0)
     want = "strong" if phi is None else "weak"
     terms = shapes_as_paths(terms)
     suggestions = suggest_solver(terms, t0, y0, args, want=want)
@@ -275,7 +275,7 @@ class _ComparedSystem(NamedTuple):
         @eqx.filter_jit
         @lapack_in_turn
         @ft.partial(jax.vmap, in_axes=(0, None))
-        def results(key: PRNGKeyArray, dt: Array) -> Batch:
+        def results(key: PRNGKeyArray, dt: Array) -> PathResults:
             # Paths fail where a step has no solution, and are counted.
             own = without_truncation(with_paths(make_path, numbers, terms, key))
             check_stratonovich(own, solver, t0, y0, args)
@@ -285,12 +285,12 @@ class _ComparedSystem(NamedTuple):
             )  # fmt: skip
             y1 = jtu.tree_map(lambda y: y[-1], sol.ys)
             result = y1 if phi is None else phi(t1, y1, args)
-            return Batch(result, diffrax.is_okay(sol.result))
+            return PathResults(result, diffrax.is_okay(sol.result))
 
         return results
 
 
-def strong_error(out: Batch, fine: Batch) -> _Measured:
+def strong_error(out: PathResults, fine: PathResults) -> _Measured:
     """The root mean square of the difference over the paths that both solvers finish, and
     the number of paths that either does not finish."""
     okay = np.asarray(out.okay & fine.okay)
@@ -309,7 +309,7 @@ def strong_error(out: Batch, fine: Batch) -> _Measured:
     return _Measured(float(rms), float(of_rms), int(np.sum(~okay)))
 
 
-def weak_error(out: Batch, fine: Batch) -> _Measured:
+def weak_error(out: PathResults, fine: PathResults) -> _Measured:
     """The difference of the means, and the number of failed paths of the first."""
     mean, std_error = _mean(*out)
     exact, other = _mean(*fine)
@@ -347,9 +347,9 @@ def _check_scalar(phi: Any, t: RealScalarLike, y0: Y, args: Args) -> None:
         raise ValueError(f"`phi` must return one number; got shape {shapes(out)}.")
 
 
-def _checked_steps(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
-    """Raises a `ValueError` unless each step divides the interval, and is a multiple of the
-    smallest, so that all follow one Brownian motion."""
+def _steps_as_floats(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
+    """The step sizes, as numbers of Python. Raises a `ValueError` unless each divides the
+    interval, and is a multiple of the smallest, so that all follow one Brownian motion."""
     if not t1 > t0:
         raise ValueError(f"`t1` must be after `t0`; got t0={t0!r} and t1={t1!r}.")
     if np.ndim(dts) != 1 or len(dts) == 0:

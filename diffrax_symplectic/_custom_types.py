@@ -1,5 +1,6 @@
 from typing import Any, TYPE_CHECKING, TypeAlias
 
+import diffrax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Int, PyTree, Real, Shaped
 
@@ -14,3 +15,7 @@ else:
 Args: TypeAlias = PyTree[Any]
 Y: TypeAlias = PyTree[Shaped[ArrayLike, "?*y"], "Y"]
 BM: TypeAlias = PyTree[Shaped[ArrayLike, "?*bm"], "BM"]
+# Terms one by one, such as those of the drift.
+Terms: TypeAlias = tuple[diffrax.AbstractTerm, ...]
+# Instances of `jax.Device`, which is no name of a type for type checkers.
+Devices: TypeAlias = tuple[Any, ...]

@@ -71,8 +71,8 @@ class Ensemble(eqx.Module):
 
     def start(self, number: IntScalarLike) -> tuple[Y, Args]:
         """The initial state and the `args` of path number `number`, which may be traced."""
-        y0, own = self._problem.drawn(self._key_of(number))
-        return y0, self._problem.with_args(own).args
+        y0, own_args = self._problem.draw_start(self._key_of(number))
+        return y0, self._problem.with_args(own_args).args
 
     def _key_of(self, number: IntScalarLike) -> PRNGKeyArray:
         return sample_key(self._key, *_words(number))
@@ -205,7 +205,7 @@ def ensemble(
         n = min(size, remaining)
         sample_numbers = np.arange(begin, begin + n, dtype=np.uint64)
         batches.append(paths_by(problem, key, sample_numbers))
-    joined = _joined(batches, num_paths, at_end=ts is None)
+    joined = _join(batches, num_paths, at_end=ts is None)
     _warn_of(joined, problem.bounded)
     saved_steps = np.asarray(problem.levels.saved_steps[0])
     return Ensemble(
@@ -228,7 +228,7 @@ def _default_size(engine: str, problem: Problem) -> int:
     return max(_FEWEST_PATHS, entries // of_path)
 
 
-def _joined(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
+def _join(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
     """All batches as one, cut to this number of paths, with NaN as states of failed ones.
     Without the axis of times if the states were wanted `at_end` only."""
     failed = np.concatenate([batch.failed for batch in batches])[:num_paths]

@@ -92,7 +92,8 @@ class _Turns:
         return [read(x) for x in jaxpr.outvars]
 
     def _results(self, eqn: Any, args: list[Any]) -> Sequence[Any]:
-        """The results of one operation."""
+        """The results of one operation. If LAPACK has a part in it, it waits for the last
+        one that LAPACK had a part in."""
         name = eqn.primitive.name
         if not _calls_lapack(eqn):
             return bound(eqn, args, eqn.params)
@@ -113,7 +114,8 @@ def _calls_lapack(eqn: Any) -> bool:
     """Whether an operation is one of LAPACK's or contains one."""
     if eqn.primitive.name in LAPACK:
         return True
-    return any(_calls_lapack(own) for jaxpr in programs_in(eqn) for own in jaxpr.eqns)
+    inner_eqns = [inner for jaxpr in programs_in(eqn) for inner in jaxpr.eqns]
+    return any(map(_calls_lapack, inner_eqns))
 
 
 def _after(before: Sequence[Any], args: list[Any]) -> list[Any]:
@@ -155,7 +157,7 @@ def _with_turns_inside(params: dict[str, Any]) -> dict[str, Any]:
     def in_turn(x: Any) -> Any:
         if not isinstance(x, ClosedJaxpr):
             return x
-        shapes = [own.aval for own in x.jaxpr.invars]
+        shapes = [variable.aval for variable in x.jaxpr.invars]
         return jax.make_jaxpr(lambda *args: _Turns().run(x, args))(*shapes)
 
     return jtu.tree_map(in_turn, params, is_leaf=is_program)

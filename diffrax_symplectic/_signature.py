@@ -49,20 +49,20 @@ def once_for_each_signature(fn: Callable[..., Result]) -> Callable[..., Result]:
     results: collections.OrderedDict[Signature, Result] = collections.OrderedDict()
 
     @ft.wraps(fn)
-    def remembered(*args: Any) -> Result:
-        own = signature(args)
+    def call_once(*args: Any) -> Result:
+        key = signature(args)
         try:
-            known = own in results
+            is_known = key in results
         except TypeError:
             # A leaf that cannot be hashed.
             return fn(*args)
-        if not known:
+        if not is_known:
             # Errors are not remembered.
-            results[own] = fn(*args)
+            results[key] = fn(*args)
         # The least recently used result is dropped first.
-        results.move_to_end(own)
+        results.move_to_end(key)
         if len(results) > _REMEMBERED:
             results.popitem(last=False)
-        return results[own]
+        return results[key]
 
-    return remembered
+    return call_once

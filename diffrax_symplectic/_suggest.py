@@ -4,7 +4,7 @@ import dataclasses
 import functools as ft
 import textwrap
 from collections.abc import Callable, Collection, Sequence
-from typing import cast, get_args, NamedTuple
+from typing import Any, cast, get_args, NamedTuple
 
 import diffrax
 import jax
@@ -21,7 +21,7 @@ from ._brownian import (
     TruncatedBrownianPath,
     WeakBrownianPath,
 )
-from ._custom_types import Args, RealScalarLike, Y
+from ._custom_types import Args, RealScalarLike, Terms, Y
 from ._solver import (
     AbstractSymplecticSolver,
     BAOAB,
@@ -183,7 +183,7 @@ def suggest_solver(
     check_baths_have_own_noise(terms)
     check_assertions(terms, t0, y0, args)
     constrained = constraint_of(given_terms) is not None
-    system = _inspected(drift, noise, t0, y0, args, constrained)
+    system = _inspect(drift, noise, t0, y0, args, constrained)
     paths = brownian_paths(noise)
     solvers = _suitable(system, want, paths, one_term=len(noise) == 1)
 
@@ -229,7 +229,8 @@ class _System(NamedTuple):
     - `fault`: why it is not separable; `None` if it is.
     - `num_noises`: the number of its scalar Brownian motions.
     - `commute`: whether they commute, as far as is known.
-    - `friction`: whether it has friction that `BAOAB` treats by a step of its own.
+    - `friction`: whether it has friction that solvers for heat baths, such as `BAOAB()`,
+        treat by a step of its own.
     - `general_bath`: whether only `BAOAB` with the midpoint rule for its flow does, as for
         masses that depend on positions.
     - `constrained`: whether its positions are.
@@ -267,8 +268,8 @@ class _System(NamedTuple):
         return sentence
 
 
-def _inspected(
-    drift: tuple, noise: tuple, t0: Array, y0: Y, args: Args, constrained: bool
+def _inspect(
+    drift: Terms, noise: Terms, t0: Array, y0: Y, args: Args, constrained: bool
 ) -> _System:
     """The system, by tracing its terms."""
     fault = separable_fault(drift, noise, t0, y0, args)
@@ -329,7 +330,7 @@ def _suitable(
             solvers.append(BAOAB(StormerVerlet()))
         if not solvers:
             raise ValueError(
-                "Solvers for terms with a `constraint` need H0 = p . M^-1 p / 2 + U(t, q), "
+                "Solvers for constrained terms need H0 = p . M^-1 p / 2 + U(t, q), "
                 "noise Hamiltonians H_k = U_k(t, q), and friction only from "
                 "`langevin_terms`."
             )
@@ -354,7 +355,7 @@ def _holds(
     return solver.variables == ("W",) or issubclass(area, solver.minimal_levy_area)
 
 
-def _parts(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
+def _parts(terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
     """Drift and noise terms. Raises a `ValueError` if a noise has no Brownian path."""
     advice = (
         "Pass the terms of a Stratonovich system, `hamiltonian_terms(H0, noise, path)` or "
@@ -394,21 +395,21 @@ def ranked(
     friction: bool = False,
     general_bath: bool = False,
 ) -> list[AbstractSymplecticSolver]:
-    """The suggested solvers for these structures (`"any"` is implied) and noises, best
-    first; and with `friction`, for Langevin terms whose other terms are separable; with
-    `general_bath`, for those whose other terms are not."""
+    """The suggested solvers for systems of these structures (`"any"` is implied) and with
+    such noises, best first. `friction` says that the terms are Langevin terms, whose other
+    terms are separable, and `general_bath` that they are others of this kind."""
     structures = {"any", *structures}
     if {"separable", "constant"} <= structures:
         structures.add("separable and constant")
 
-    def rank(solver: AbstractSymplecticSolver) -> tuple:
+    def rank(solver: AbstractSymplecticSolver) -> tuple[Any, ...]:
         """What to sort by: the smallest tuple is the best solver."""
         record = _record(solver)
         order = record.order(want, commute)
         assert order is not None
         # In a heat bath most means are stationary ones, of positions.
-        means = friction and want == "weak"
-        inexact = means and "qq" not in record.stationary
+        wants_stationary = friction and want == "weak"
+        inexact = wants_stationary and "qq" not in record.stationary
         systems = solver.stage_vectors(num_noises)
         # In a separable system only half of the state is solved for.
         cost = sum(systems) / (2 if solver.structure == "separable" else 1)
@@ -423,10 +424,10 @@ def ranked(
         record = _record(solver)
         return want in record.suggested and record.noises in noises
 
-    every = [solver() for solver in SOLVERS]
-    solvers = [solver for solver in every if solver.structure in structures]
+    all_solvers = [kind() for kind in SOLVERS]
+    solvers = [solver for solver in all_solvers if solver.structure in structures]
     if friction:
-        solvers += [solver() for solver in LANGEVIN]
+        solvers += [kind() for kind in LANGEVIN]
     best = sorted(filter(fits, solvers), key=rank)
     return [_BATH_OF_ANY_ENERGY, *best] if general_bath else best
 
@@ -462,8 +463,8 @@ def _suggestion(
         struct = increment_struct(replaced[0])
         shape = _shape_code(struct)
         code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
-        own = solver.path(struct, jr.key(0), want=want)
-        if isinstance(own, TruncatedBrownianPath) and not bounded:
+        made = solver.path(struct, jr.key(0), want=want)
+        if isinstance(made, TruncatedBrownianPath) and not bounded:
             code = f"ds.FixedStepBrownianPath({shape}, key)"
     elif random:
         code = f"the `{type(random[0]).__name__}` of the terms, with another key"

@@ -58,7 +58,7 @@ def symplecticity_defect(
 
     Exact up to rounding: for a symplectic method this is a small multiple of the machine
     epsilon, for any Hamiltonians, step and increments; for other methods it is not small.
-    For terms with a `constraint` it is the largest entry of
+    For constrained terms it is the largest entry of
     $Z^\top (J^\top \Omega J - \Omega) Z$, where the columns of $Z$ are an orthonormal basis
     of the directions along which allowed states can move.
     (The solvers of this package differentiate their stage equations implicitly, so it does
@@ -209,16 +209,16 @@ def equipartition(
 
     **Arguments:**
 
-    - `terms`: terms with the state `(p, q)`, without a `constraint`.
+    - `terms`: terms with the state `(p, q)`, not constrained.
 
     **Returns:** a function `phi(t, y, args)`, which returns a dictionary of the two numbers
     over $n$: `"kinetic"` and `"configurational"`, in units of energy.
 
-    **Raises:** a `ValueError` for terms with a `constraint`.
+    **Raises:** a `ValueError` for constrained terms.
     """
     if constraint_of(terms) is not None:
         raise ValueError(
-            "`equipartition` takes no terms with a `constraint`, since its two means then "
+            "`equipartition` takes no constrained terms, since its two means then "
             "contain the forces of the constraint. Look at the kinetic energy alone: with "
             "`c` constraints its mean is `(n - c) T / 2`."
         )
@@ -276,8 +276,8 @@ def step_expectation(
     error when run if the solver reports a failed step.
     """
 
-    def outcome(terms: PyTree) -> tuple[PyTree[Array], diffrax.RESULTS]:
-        y1, result = _one_step(terms, solver, t0, t1, y0, args)
+    def outcome(terms_of_step: PyTree) -> tuple[PyTree[Array], diffrax.RESULTS]:
+        y1, result = _one_step(terms_of_step, solver, t0, t1, y0, args)
         return fn(t1, y1, args), result
 
     return _average(outcome, terms, t1 - t0, nodes)
@@ -309,8 +309,8 @@ def second_moment_map(
     **Returns:** the matrix $K$, of shape `(N, N)` with `N = (n + 1)**2`. Rows and columns
     belong to pairs $(i, j)$ of entries of $z$, with number $(n + 1) i + j$.
 
-    **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for terms
-    with a `constraint`.
+    **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for
+    constrained terms.
     """
     refuse_constraint(terms, "second_moment_map")
     flat, unravel = jfu.ravel_pytree(y0)
@@ -319,16 +319,18 @@ def second_moment_map(
     # Differentiating it would take far more tracing. Row 0 is the zero vector.
     starts = jnp.eye(size + 1, size, k=-1, dtype=flat.dtype)
 
-    def outcome(terms: PyTree) -> tuple[Array, diffrax.RESULTS]:
+    def outcome(terms_of_step: PyTree) -> tuple[Array, diffrax.RESULTS]:
         def step(y: Array) -> tuple[Array, diffrax.RESULTS]:
-            y1, result = _one_step(terms, solver, t0, t1, unravel(y), args)
-            return jfu.ravel_pytree(y1)[0], result
+            y1, result = _one_step(terms_of_step, solver, t0, t1, unravel(y), args)
+            end, _ = jfu.ravel_pytree(y1)
+            return end, result
 
         ends, result = jax.vmap(step)(starts)
-        # The end from zero is the column of the constant 1 of z, which stays as it is: the
-        # first row. What the others add to it are the columns of the entries of y.
-        first = jnp.zeros_like(flat, shape=(1, size + 1)).at[0, 0].set(1)
-        Z = jnp.concatenate([first, ends.at[1:].add(-ends[0]).T])
+        # Row 0 of Z keeps the constant 1 of z. Column 0 is the end from zero; each other
+        # column is what a unit vector adds to that end.
+        row_of_one = jnp.zeros_like(flat, shape=(1, size + 1)).at[0, 0].set(1)
+        columns = ends.at[1:].add(-ends[0])
+        Z = jnp.concatenate([row_of_one, columns.T])
         return jnp.kron(Z, Z), result
 
     return _average(outcome, terms, t1 - t0, nodes)
@@ -382,8 +384,8 @@ def weak_order_defect(
 
     **Returns:** the local error, in the structure of `fn`.
 
-    **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for terms
-    with a `constraint`.
+    **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for
+    constrained terms.
     """
     refuse_constraint(terms, "weak_order_defect")
     expected = step_expectation(terms, solver, t0, t1, y0, args, fn=fn, nodes=nodes)

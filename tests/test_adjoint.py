@@ -1,5 +1,7 @@
 """Gradients by walking back along the solution, and adjoints that are refused."""
 
+import re
+
 import diffrax
 import equinox as eqx
 import jax
@@ -10,8 +12,12 @@ import pytest
 from diffrax._term import WrapTerm
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._adjoint import _begin_anew, _undoes_its_steps
-from diffrax_symplectic._solver import SOLVERS
+from diffrax_symplectic._adjoint import (
+    _begin_anew,
+    _steps_without_inverse,
+    _undoes_its_steps,
+)
+from diffrax_symplectic._solver import LANGEVIN, SOLVERS
 from diffrax_symplectic._tableau import FlatTableau, is_own_inverse, Stage
 
 from .problems import damped_terms, Given, H0, noise, random_problem, weak_path
@@ -25,31 +31,70 @@ def separable_noise(t, p, q, args):
     return jnp.stack([jnp.sum(jnp.sin(q)), jnp.sum(jnp.cos(2 * q) * (1 + t))])
 
 
-REVERSIBLE = [kind() for kind in SOLVERS if kind().undoes_its_steps]
+REVERSIBLE = [kind() for kind in (*SOLVERS, *LANGEVIN) if kind().undoes_its_steps]
+# The functions of each system, and the solvers that take it.
+SYSTEMS = {
+    "any": (H0, noise),
+    "separable": (separable_H0, separable_noise),
+    "with friction": (separable_H0, separable_noise),
+}
 
 
-@pytest.mark.parametrize("structure", ["any", "separable"])
-def test_solvers_taken_for_their_own_inverse_undo_their_steps(structure):
+def _system_of(solver) -> str:
+    return "with friction" if isinstance(solver, LANGEVIN) else solver.structure
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_solvers_taken_for_their_own_inverse_undo_their_steps(system):
     y0, args = random_problem(jr.key(0), 2, 2)
     W, A = jnp.array([0.3, -0.2]), jnp.array([[0, 0.05], [-0.05, 0]])
-    given = Given(W, second=W[::-1], two_point=0.1 * jnp.sign(W), A=A)
-    separable = structure == "separable"
-    functions = (separable_H0, separable_noise) if separable else (H0, noise)
-    terms = ds.hamiltonian_terms(*functions, given).terms
-    solvers = [solver for solver in REVERSIBLE if solver.structure == structure]
-    assert len(solvers) > 1
+    # Of these `H` does not change its sign backward in time.
+    given = Given(W, second=W[::-1], two_point=0.1 * jnp.sign(W), H=W[::-1] / 3, A=A)
+    terms = ds.hamiltonian_terms(*SYSTEMS[system], given).terms
+    if system == "with friction":
+        terms = *terms, *ds.bath_terms(separable_H0, jnp.array([0.5, 2.0])).terms
+    solvers = [solver for solver in REVERSIBLE if _system_of(solver) == system]
+    assert len(solvers) > 0
     for solver in solvers:
         assert _undoes_its_steps(solver)
 
         @jax.jit
         def step(t0, t1, direction, y, solver=solver):
             wrapped = diffrax.MultiTerm(*[WrapTerm(x, direction) for x in terms])
-            return solver.step(wrapped, t0, t1, y, args, None, False)[0]
+            state = None
+            if isinstance(solver, LANGEVIN):
+                state = solver.init(wrapped, t0, t1, y, args)
+            return solver.step(wrapped, t0, t1, y, args, state, False)[0]
 
         there = step(0.4, 0.5, 1, y0)
         back = step(-0.5, -0.4, -1, there)
         assert np.abs(np.subtract(there, y0)).max() > 1e-2
         np.testing.assert_allclose(back, y0, atol=1e-14)
+
+
+def test_solvers_that_the_docstring_names_undo_their_steps():
+    text = " ".join((ds.ReversingAdjoint.__doc__ or "").split())
+    found = set(re.findall(r"diffrax_symplectic\.(\w+)", text))
+    named = {kind.__name__ for kind in (*SOLVERS, *LANGEVIN)} & found
+    assert len(named) > 5
+    assert named <= {type(solver).__name__ for solver in REVERSIBLE}
+    x = 0.3
+    assert ds.BAOAB.area_factor(2 * x) == (1 - x) / (1 + x)
+    assert (
+        "BAOAB`][] by $|(1 + x) / (1 - x)|$ in each step, $x = \\gamma h / 2$" in text
+    )
+
+
+def test_the_message_names_the_steps_that_shrink_areas_to_zero():
+    for solver in REVERSIBLE:
+        if isinstance(solver, LANGEVIN):
+            rate_times_step = 2 * solver.friction_parts
+            assert solver.area_factor(rate_times_step) == 0
+            name = type(solver).__name__
+            said = (
+                f"`{name}` with rate of friction times step equal to {rate_times_step}"
+            )
+            assert said in _steps_without_inverse()
 
 
 def test_solvers_that_do_not_undo_their_steps_are_refused():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._compare import Batch, strong_error, weak_error
+from diffrax_symplectic._compare import PathResults, strong_error, weak_error
 
 
 Y0 = (jnp.array(0.0), jnp.array(1.0))
@@ -54,7 +54,9 @@ def test_strong_errors_are_root_mean_squares_over_the_paths_that_both_finish():
     solved = jnp.array([True, True, False, True, True])
     p, q = jnp.array([3.0, 0.0, 7.0, jnp.nan, 1.0]), jnp.zeros((5, 2))
     exact = jnp.zeros(5), jnp.array([[4.0, 0], [0, 0], [0, 0], [0, 0], [0, 2.0]])
-    error, bar, failed = strong_error(Batch((p, q), okay), Batch(exact, solved))
+    error, bar, failed = strong_error(
+        PathResults((p, q), okay), PathResults(exact, solved)
+    )
     squares = np.array([25.0, 0.0, 5.0])
     assert error == pytest.approx(np.sqrt(10)) and failed == 2
     assert bar == pytest.approx(np.std(squares) / np.sqrt(3) / (2 * np.sqrt(10)))
@@ -63,7 +65,9 @@ def test_strong_errors_are_root_mean_squares_over_the_paths_that_both_finish():
 def test_weak_errors_have_the_standard_errors_of_both_means():
     okay = jnp.array([True, True, True, False])
     out, fine = jnp.array([1.0, 2.0, 3.0, jnp.nan]), jnp.array([5.0, 6.0, 5.0, 6.0])
-    error, bar, failed = weak_error(Batch(out, okay), Batch(fine, jnp.ones(4, bool)))
+    error, bar, failed = weak_error(
+        PathResults(out, okay), PathResults(fine, jnp.ones(4, bool))
+    )
     assert error == pytest.approx(3.5) and failed == 1
     assert bar == pytest.approx(np.hypot(np.std([1, 2, 3]) / np.sqrt(3), 0.5 / 2))
 

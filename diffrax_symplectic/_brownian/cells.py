@@ -88,7 +88,8 @@ def or_one(h: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def checked_cell(cell: float | None) -> float | None:
-    """Raises a `ValueError` unless this is a positive number or `None`."""
+    """The length of a cell as a number of Python, or `None`. Raises a `ValueError` for
+    anything else."""
     if cell is None:
         return None
     # It is a static field of a path, so it must be known while tracing.

@@ -115,11 +115,11 @@ def typed_key(key: PRNGKeyArray | UInt32[Array, "..."]) -> PRNGKeyArray:
 def derived_key(key: PRNGKeyArray, old):
     """A key derived from `key` to take the place of `old`, of the same kind and shape.
     Equal old keys get the same new one."""
-    typed, own = typed_key(old), key
+    typed = typed_key(old)
     words = jr.key_data(typed)
     for word in words.reshape(-1):
-        own = jr.fold_in(own, word)
-    data = jr.bits(own, words.shape, jnp.uint32)
+        key = jr.fold_in(key, word)
+    data = jr.bits(key, words.shape, jnp.uint32)
     return jr.wrap_key_data(data, impl=jr.key_impl(old)) if old is typed else data
 
 

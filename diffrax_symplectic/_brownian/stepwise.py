@@ -53,7 +53,7 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         # Words are an integer function of the times: a derivative would silently be zero.
         start, end = cast(tuple[Array, Array], nondifferentiable(ends, name="t"))
         # As a program of its own, which is traced once for all steps of a solve.
-        return _drawn(self, start, end, use_levy)
+        return _draw_increment(self, start, end, use_levy)
 
     @abc.abstractmethod
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
@@ -83,7 +83,7 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
 
 # Diffrax traces a step three times, and `jax.vmap` traces the body of a loop more often.
 @eqx.filter_jit
-def _drawn(path: AbstractStepwisePath, t0: Array, t1: Array, use_levy: bool):
+def _draw_increment(path: AbstractStepwisePath, t0: Array, t1: Array, use_levy: bool):
     return path.draw(t0, t1, use_levy)
 
 

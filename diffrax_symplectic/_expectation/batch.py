@@ -22,7 +22,7 @@ from .sampling import Averaged, Samples
 _ROOM = 24
 
 
-class BatchSums(NamedTuple):
+class BatchMoments(NamedTuple):
     """What is known of the samples of a batch. Arrays in an `Averaged` have leading axes
     for devices and combinations of levels.
 
@@ -46,7 +46,7 @@ class BatchSums(NamedTuple):
     size: Averaged
 
 
-def _sums(
+def _moments_on_devices(
     sampler: Callable[..., Samples],
     key_data: UInt32[Array, "..."],
     impl: Any,
@@ -54,12 +54,13 @@ def _sums(
     wanted: Int[Array, ""],
     mesh: Mesh,
     n: int,
-) -> BatchSums:
-    """The sums of all devices, along a leading axis. Each takes `n` samples, the first one
-    from sample number `first` on, in two halves of 32 bits. The first `wanted` count."""
+) -> BatchMoments:
+    """The moments on all devices, along a leading axis. Each takes `n` samples, the first
+    one from sample number `first` on, in two halves of 32 bits. The first `wanted`
+    count."""
     if mesh.size == 1:
-        sums = _of_device(sampler, key_data, impl, first, wanted, n, 0)
-        return jtu.tree_map(lambda x: x[None], sums)
+        moments = _of_device(sampler, key_data, impl, first, wanted, n, 0)
+        return jtu.tree_map(lambda x: x[None], moments)
     dynamic, static = eqx.partition(sampler, eqx.is_array)
 
     # The devices do not communicate until the end, so each one's result does not depend on
@@ -67,8 +68,8 @@ def _sums(
     def shard(dynamic, first, wanted):
         sampler = eqx.combine(dynamic, static)
         device = jax.lax.axis_index("samples")
-        sums = _of_device(sampler, key_data, impl, first, wanted, n, device)
-        return jtu.tree_map(lambda x: jax.lax.all_gather(x, "samples"), sums)
+        moments = _of_device(sampler, key_data, impl, first, wanted, n, device)
+        return jtu.tree_map(lambda x: jax.lax.all_gather(x, "samples"), moments)
 
     none = PartitionSpec()
     sharded = jax.shard_map(
@@ -88,9 +89,9 @@ def _sums(
         raise
 
 
-batch_sums = eqx.filter_jit(_sums)
+batch_moments = eqx.filter_jit(_moments_on_devices)
 # For samples that take less time than compiling their program.
-quick_batch_sums = quickly_compiled(_sums)
+quick_batch_moments = quickly_compiled(_moments_on_devices)
 
 
 def _of_device(
@@ -101,8 +102,8 @@ def _of_device(
     wanted: Int[Array, ""],
     n: int,
     device: Any,
-) -> BatchSums:
-    """The sums of one device, by its number."""
+) -> BatchMoments:
+    """The moments on one device, by its number."""
     index = device * n + jnp.arange(n)
     # The sum of `first` and `index` in two halves, since there may be no 64-bit integers.
     low = first[0] + index.astype(jnp.uint32)
@@ -122,21 +123,21 @@ def _of_device(
     # All fields of one shape are summed at once, since fewer operations compile sooner.
     stacked = jtu.tree_map(lambda *of_fields: jnp.stack(of_fields), *fields.values())
     leaves, treedef = jtu.tree_flatten(stacked)
-    each = [_sums_of_array(leaf, good) for leaf in leaves]
+    each = [_moments_of_array(leaf, good) for leaf in leaves]
 
     def by_field(*of_leaves: Array) -> Averaged:
         tree = treedef.unflatten(of_leaves)
         parts = [jtu.tree_map(lambda x, k=k: x[k], tree) for k in range(len(fields))]
         return Averaged(**dict(zip(fields, parts)))
 
-    sums = itertools.starmap(by_field, zip(*each))
-    return BatchSums(jnp.sum(good), failed, jnp.sum(lost, axis=1), *sums)
+    moments = itertools.starmap(by_field, zip(*each))
+    return BatchMoments(jnp.sum(good), failed, jnp.sum(lost, axis=1), *moments)
 
 
-def _sums_of_array(
+def _moments_of_array(
     x: Float[Array, "fields combinations n ..."], good: Bool[Array, " n"]
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """`mean`, `rest`, `norm`, `largest` and `size` of `BatchSums` for one array."""
+    """`mean`, `rest`, `norm`, `largest` and `size` of `BatchMoments` for one array."""
     mask = good.reshape(-1, *[1] * (x.ndim - 3))
     n = jnp.maximum(jnp.sum(good), 1)
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from .._arguments import whole_number
+from .._custom_types import Devices
 from .._simulation import checked_key
 from .estimate import Expectation
 
@@ -22,7 +23,7 @@ class CheckedCall(NamedTuple):
 
     key: PRNGKeyArray
     first: int
-    devices: tuple[Any, ...]
+    devices: Devices
 
 
 def checked_call(

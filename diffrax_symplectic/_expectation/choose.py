@@ -8,6 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from .._custom_types import Devices
 from .._simulation import has_discrete_increments, Problem
 from .._solver import Want
 from .cost import OPERATIONS_PER_SECOND, operations_per_step
@@ -68,7 +69,7 @@ class Wanted(NamedTuple):
     tol: float | None
     start: Expectation | None
     engine: str | None
-    devices: tuple
+    devices: Devices
 
 
 class Chosen(NamedTuple):
@@ -138,7 +139,8 @@ def trial_key(key: PRNGKeyArray) -> PRNGKeyArray:
 
 
 def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampling:
-    """Raises a `ValueError` unless this is a sampling, of the class that `start` had."""
+    """The sampling. Raises a `ValueError` unless it is one, of the class that `start` was
+    sampled by, if there is a `start`."""
     if not isinstance(sampling, AbstractSampling):
         names = ", ".join(f"`{name}`" for name in SAVED_SAMPLINGS)
         raise ValueError(

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, PRNGKeyArray, PyTree
 
 from .._brownian import Discrete, laws_of, UnspecifiedPath
-from .._custom_types import Args, RealScalarLike, Y
+from .._custom_types import Args, Devices, RealScalarLike, Y
 from .._simulation import (
     has_discrete_increments,
     Problem,
@@ -218,7 +218,7 @@ def expectation(
 
 
 def _warn_of_law(
-    estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: tuple
+    estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
 ) -> None:
     """If phi is not smooth, discrete increments may change its mean."""
     paths = random_paths(problem.terms)

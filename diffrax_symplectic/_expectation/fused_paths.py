@@ -9,6 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Key, PRNGKeyArray, PyTree
 
+from .._custom_types import Devices
 from .._root_finder import all_finite
 from .._simulation import by_drjit, Level, Problem, state_itself
 from .independent import IndependentPaths
@@ -21,7 +22,7 @@ _FUSED_BATCH = 2**19
 
 
 def fused_plan(
-    problem: Problem, key: PRNGKeyArray, sampling: Any, devices: tuple
+    problem: Problem, key: PRNGKeyArray, sampling: Any, devices: Devices
 ) -> SamplingPlan:
     r"""A plan in which a kernel simulates independent paths, and JAX evaluates $\phi$.
     Raises a `ValueError` for another `sampling`, or several devices."""
@@ -77,12 +78,12 @@ class FusedPaths:
         self.lost += sum(int(np.sum(batch.failed)) for batch in batches)
         self.stragglers += sum(batch.stragglers for batch in batches)
         return _Paths(
-            y=jtu.tree_map(_stacked, *[batch.y for batch in batches]),
-            failed=_stacked(*[batch.failed for batch in batches]),
+            y=jtu.tree_map(_stack_levels, *[batch.y for batch in batches]),
+            failed=_stack_levels(*[batch.failed for batch in batches]),
         )
 
 
-def _stacked(*levels: np.ndarray) -> np.ndarray:
+def _stack_levels(*levels: np.ndarray) -> np.ndarray:
     return np.stack(levels)
 
 
@@ -106,7 +107,7 @@ class _NumberedPaths(NamedTuple):
 
 def _samples(p: Problem, paths: _Paths, keys: Key[Array, " n"]) -> Samples:
     """The samples with these random keys, whose paths are known."""
-    _, own_args = jax.vmap(p.drawn)(keys)
+    _, own_args = jax.vmap(p.draw_start)(keys)
 
     def values_of_path(times: Any, y: PyTree[Array], own: PyTree[Array]) -> Array:
         return jax.vmap(p.with_args(own).values)(times, y)
@@ -118,5 +119,5 @@ def _samples(p: Problem, paths: _Paths, keys: Key[Array, " n"]) -> Samples:
     phi = jax.vmap(values_on_level)(p.levels, paths.y)
     finite = jax.vmap(jax.vmap(all_finite))(phi)
     lost = jnp.asarray(paths.failed) | ~finite
-    values = p.shaped(p.combined(jnp.swapaxes(phi, 1, 2)))
+    values = p.shaped(p.combinations(jnp.swapaxes(phi, 1, 2)))
     return Samples(Averaged(values), ~jnp.any(lost, axis=0), lost)

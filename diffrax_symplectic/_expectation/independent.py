@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from .._arguments import whole_number
+from .._custom_types import Devices
 from .._simulation import Problem, values_of_paths
 from .sampling import AbstractSampling, Averaged, Samples, SamplingPlan, saved_by_name
 
@@ -45,7 +46,7 @@ class IndependentPaths(AbstractSampling):
         return self.plan(jtu.Partial(_paths, problem), levels, devices)
 
     def plan(
-        self, sampler: Callable[..., Samples], levels: int, devices: tuple
+        self, sampler: Callable[..., Samples], levels: int, devices: Devices
     ) -> SamplingPlan:
         """The plan for samples that are made one for each key, by any function."""
         if self.batch_size is None:
@@ -59,4 +60,4 @@ def _paths(p: Problem, keys: Key[Array, " n"]) -> Samples:
     """A sample is a path, with the same random key on all levels."""
     saved, failed = values_of_paths(p, keys)
     good = ~jnp.any(failed, axis=0)
-    return Samples(Averaged(p.shaped(p.combined(saved))), good, failed)
+    return Samples(Averaged(p.shaped(p.combinations(saved))), good, failed)

@@ -28,11 +28,12 @@ def may_have_kinks(fn: Callable, y: PyTree) -> bool:
     maximum or a comparison. Some of these functions are smooth all the same."""
     leaves, treedef = jtu.tree_flatten(y)
     traced = jax.make_jaxpr(lambda *leaves: fn(treedef.unflatten(leaves)))(*leaves)
-    return _contains(traced.jaxpr)
+    return _is_rough(traced.jaxpr)
 
 
-def _contains(jaxpr: Jaxpr) -> bool:
-    """Whether a program contains such an operation on what depends on its inputs."""
+def _is_rough(jaxpr: Jaxpr) -> bool:
+    """Whether a program contains an operation that is not smooth, on what depends on its
+    inputs."""
     # What a function captures is constant in `y`.
     dependent = set(jaxpr.invars)
     for eqn in jaxpr.eqns:
@@ -40,6 +41,6 @@ def _contains(jaxpr: Jaxpr) -> bool:
         if not any(x in dependent for x in variables):
             continue
         dependent.update(eqn.outvars)
-        if eqn.primitive.name in _NOT_SMOOTH or any(map(_contains, programs_in(eqn))):
+        if eqn.primitive.name in _NOT_SMOOTH or any(map(_is_rough, programs_in(eqn))):
             return True
     return False

@@ -25,16 +25,17 @@ _ITERATIONS = 50
 
 
 class _Growth(NamedTuple):
-    """Of a change of the state in steps that are all taken from the same state.
+    """How a small change of the state grows in steps that are all taken from one state.
 
-    - `change`: of length one.
+    - `change`: the change, scaled to length one.
     - `log`: the logarithm of its growth so far.
-    - `turned`: its product with itself before the last step.
+    - `along_itself`: the scalar product of the change after the last step with the one
+        before it. It is negative if the step turned the change around.
     """
 
     change: Float[Array, " n"]
     log: Float[Array, ""]
-    turned: Float[Array, ""]
+    along_itself: Float[Array, ""]
 
 
 def is_unstable_at_start(problem: Problem) -> bool:
@@ -49,11 +50,13 @@ def is_unstable_at_start(problem: Problem) -> bool:
     if any(map(has_unknown_law, brownian_paths(problem.terms))):
         return False
     growth = _quick_growth(problem)
-    return bool(growth.log > _ITERATIONS * np.log(_UNSTABLE) and growth.turned < 0)
+    return bool(
+        growth.log > _ITERATIONS * np.log(_UNSTABLE) and growth.along_itself < 0
+    )
 
 
 def _growth(problem: Problem) -> _Growth:
-    """Of the change that a step enlarges most."""
+    """The growth of the change that a step enlarges most."""
     h = problem.level(0).h
     variables = problem.variables(h)
     terms = variables.terms_with(jnp.zeros(len(variables.laws)))
@@ -64,18 +67,18 @@ def _growth(problem: Problem) -> _Growth:
         y1, *_ = problem.step(terms, 0, h, y, problem.init(terms, 0, h, y))
         return jfu.ravel_pytree(y1)[0]
 
-    def moved(number: Array, before: _Growth) -> _Growth:
+    def after_step(number: Array, before: _Growth) -> _Growth:
         _, after = jax.jvp(step, (flat,), (before.change,))
         length = jnp.linalg.norm(after)
         counted = jnp.where(number < _ITERATIONS, 0.0, jnp.log(length))
-        turned = before.change @ after
-        return _Growth(after / length, before.log + counted, turned)
+        along_itself = before.change @ after
+        return _Growth(after / length, before.log + counted, along_itself)
 
     # No symmetry singles it out.
     change = jnp.cos(1.0 + jnp.arange(flat.size, dtype=flat.dtype))
     zero = jnp.zeros((), flat.dtype)
     start = _Growth(change / jnp.linalg.norm(change), zero, zero)
-    return lax.fori_loop(0, 2 * _ITERATIONS, moved, start)
+    return lax.fori_loop(0, 2 * _ITERATIONS, after_step, start)
 
 
 _quick_growth = quickly_compiled(_growth)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 from .._arguments import check_real, check_takes, whole_number
 from .._compat import is_result
 from .._root_finder import all_finite
-from .._simulation import combined, level_weights
+from .._simulation import combinations, level_weights
 from .call import checked_call
 from .estimate import cautions, Expectation
 from .independent import IndependentPaths
@@ -137,7 +137,7 @@ def _of_function(
     each = [on_level(level) for level in range(levels)]
     values, good = jtu.tree_map(lambda *xs: jnp.stack(xs), *each)
 
-    values = jtu.tree_map(lambda x: combined(weights, x), values)
+    values = jtu.tree_map(lambda x: combinations(weights, x), values)
     return Samples(Averaged(values), jnp.all(good, axis=0), ~good)
 
 

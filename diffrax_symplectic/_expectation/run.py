@@ -15,7 +15,8 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Key, PRNGKeyArray, PyTree
 
 from .._arguments import check_untraced
-from .batch import batch_sums, BatchSums, quick_batch_sums
+from .._custom_types import Devices
+from .batch import batch_moments, BatchMoments, quick_batch_moments
 from .estimate import (
     check_same,
     Expectation,
@@ -53,7 +54,7 @@ class Meter:
 def run(
     plan: SamplingPlan,
     key: PRNGKeyArray,
-    devices: tuple,
+    devices: Devices,
     sampling: Any = None,
     start: Expectation | None = None,
     first: int = 0,
@@ -88,23 +89,23 @@ def run(
             )
         estimate = dataclasses.replace(estimate, moments=start.moments)
 
-    running: collections.deque[BatchSums] = collections.deque()
+    running: collections.deque[BatchMoments] = collections.deque()
     # One past the last sample of the batches that were started.
     begun = done
     try:
         while True:
             is_more = begun < end and not _stops(estimate, plan.least, tol)
             if is_more:
-                running.append(batches.started(begun, end, batches.sampler_at(begun)))
+                running.append(batches.start(begun, end, batches.sampler_at(begun)))
                 begun += batches.size * len(devices)
             # While one batch is being computed, the previous one is added up.
             has_previous = len(running) > (1 if is_more else 0)
             if has_previous:
-                for sums in batches.of_devices(running.popleft()):
+                for of_device in batches.of_devices(running.popleft()):
                     # Where to stop does not depend on how many devices there are.
                     if done < end and not _stops(estimate, plan.least, tol):
                         after = min(done + batches.size, end)
-                        new = _moments(sums, done, after, none.dtypes)
+                        new = _in_float64(of_device, done, after, none.dtypes)
                         moments = joined((*estimate.moments, new))
                         estimate = dataclasses.replace(estimate, moments=moments)
                         done = after
@@ -114,14 +115,16 @@ def run(
             elif not is_more:
                 break
     except KeyboardInterrupt:
-        raise ExpectationInterrupted(_finished(estimate, plan.least, tol)) from None
-    return _finished(estimate, plan.least, tol)
+        raise ExpectationInterrupted(
+            _with_tol_reached(estimate, plan.least, tol)
+        ) from None
+    return _with_tol_reached(estimate, plan.least, tol)
 
 
 class _Batches:
     """The batches of a plan: each device takes `size` samples at once."""
 
-    def __init__(self, plan: SamplingPlan, key: PRNGKeyArray, devices: tuple):
+    def __init__(self, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices):
         self.size = min(plan.batch_size, plan.num_samples)
         self.key_data = np.asarray(jr.key_data(key))
         self._impl = jr.key_impl(key)
@@ -130,7 +133,7 @@ class _Batches:
         self._devices = devices
         self._shapes = plan.shapes
         self._levels = plan.levels
-        self._sums: Any = quick_batch_sums if plan.quick else batch_sums
+        self._batch_moments: Any = quick_batch_moments if plan.quick else batch_moments
         if jax.process_count() > 1:
             # All processes hold the same arrays. Captured by a function they become
             # constants; as arguments they would have to be placed on all devices.
@@ -145,19 +148,19 @@ class _Batches:
         # and all, and compile anew for each.
         return jtu.Partial(_of_paths, self._sampler, self._paths_of(at, self.size))
 
-    def started(self, at: int, end: int, sampler: Callable[..., Samples]) -> BatchSums:
+    def start(self, at: int, end: int, sampler: Callable[..., Samples]) -> BatchMoments:
         """Starts one batch on each device, from sample `at` on and up to `end`."""
         count = len(self._devices)
         low_high = np.array([at & 0xFFFFFFFF, at >> 32], np.uint32)
         wanted = np.array(max(0, min(self.size * count, end - at)), np.int32)
         if count == 1:
             low_high, wanted = jax.device_put((low_high, wanted), self._devices[0])
-        return self._sums(
+        return self._batch_moments(
             sampler, self.key_data, self._impl, low_high, wanted, self._mesh, self.size
         )
 
-    def of_devices(self, running: BatchSums) -> list[BatchSums]:
-        """The sums of each device, on the host. Waits for them."""
+    def of_devices(self, running: BatchMoments) -> list[BatchMoments]:
+        """The moments on each device, on the host. Waits for them."""
         # They are traced if a function closes over traced values.
         check_untraced("`expectation` or `monte_carlo`", running)
         arrays = jax.device_get(running)
@@ -170,10 +173,10 @@ class _Batches:
         if shapes is None:
             # JAX caches this trace and uses it for the first batch.
             sampler = self.sampler_at(at)
-            sums = eqx.filter_eval_shape(self.started, at, end, sampler)
+            struct = eqx.filter_eval_shape(self.start, at, end, sampler)
             # Without the axis of devices.
             shapes = jtu.tree_map(
-                lambda s: jax.ShapeDtypeStruct(s.shape[1:], s.dtype), sums.mean
+                lambda s: jax.ShapeDtypeStruct(s.shape[1:], s.dtype), struct.mean
             )
         zeros = jtu.tree_map(lambda s: np.zeros(s.shape), shapes)
         return Moments(
@@ -195,16 +198,18 @@ def _of_paths(sampler: Callable, paths: PyTree, keys: Key[Array, " n"]) -> Sampl
     return sampler(paths, keys)
 
 
-def _moments(sums: BatchSums, begin: int, end: int, dtypes: PyTree[str]) -> Moments:
+def _in_float64(
+    of_device: BatchMoments, begin: int, end: int, dtypes: PyTree[str]
+) -> Moments:
     """The moments of samples `begin` to `end - 1`, in float64."""
     # Single precision could not hold the sum of a mean and its rounding error.
-    wide = jtu.tree_map(lambda x: x.astype(float), sums)
+    wide = jtu.tree_map(lambda x: x.astype(float), of_device)
     return Moments(
         begin=begin,
         end=end,
-        good=int(sums.good),
-        failed=int(sums.failed),
-        failed_on=tuple(map(int, sums.failed_on)),
+        good=int(of_device.good),
+        failed=int(of_device.failed),
+        failed_on=tuple(map(int, of_device.failed_on)),
         mean=jtu.tree_map(np.add, wide.mean, wide.rest),
         norm=wide.norm,
         largest=wide.largest,
@@ -220,7 +225,9 @@ def _stops(estimate: Expectation, least: int, tol: float | None) -> bool:
     return is_reached(estimate, tol) or is_stuck(estimate, tol)
 
 
-def _finished(estimate: Expectation, least: int, tol: float | None) -> Expectation:
+def _with_tol_reached(
+    estimate: Expectation, least: int, tol: float | None
+) -> Expectation:
     """The estimate, which now says whether it reached the tolerance."""
     reached = None
     if tol is not None:

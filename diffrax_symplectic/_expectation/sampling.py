@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
 
+from .._custom_types import Devices
 from .._simulation import Problem
 
 
@@ -103,7 +104,7 @@ class AbstractSampling(eqx.Module):
 
     @abc.abstractmethod
     def prepare(
-        self, problem: Problem, key: PRNGKeyArray, devices: tuple
+        self, problem: Problem, key: PRNGKeyArray, devices: Devices
     ) -> SamplingPlan:
         """The plan for a problem, made with trials that draw from `key`. Raises a
         `ValueError` for a problem that it cannot sample."""

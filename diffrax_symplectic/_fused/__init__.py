@@ -6,7 +6,7 @@ The stage equations of implicit solvers are solved by a loop of each path's own
 (`sweeps.py`). A path with a step that it does not solve stops, and the caller simulates it
 by other means.
 
-    functions, arrays = split(system, key, None, False)
+    functions, arrays = functions_and_arrays(system, key, None, False)
     kernels = Kernels(functions)
     lanes, shared = kernels.begin(arrays, key, h, 0, 1000, y0, None)
     lanes = kernels.advance(lanes, shared, 0, 100)
@@ -16,5 +16,5 @@ sizes, and numbers of steps and paths.
 """
 
 from .kernels import Kernels, Lanes, Shared
-from .path_functions import PathFunctions, sample_key, split
+from .path_functions import PathFunctions, sample_key, functions_and_arrays
 from .sweeps import without_rescue

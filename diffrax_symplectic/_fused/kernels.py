@@ -25,7 +25,7 @@ from .._stablehlo import (
     unflat,
 )
 from .path_functions import PathFunctions
-from .program import as_numbers, entry_kinds, packed, Program, shapes, unpacked
+from .program import as_numbers, entry_kinds, pack, Program, shapes, unpack
 
 
 # Kernels of larger systems take long to compile.
@@ -43,25 +43,25 @@ class Lanes(NamedTuple):
 
     - `own`: the words of the random keys, and the entries of the paths' own `args`.
     - `y`: the entries of the states.
-    - `memory`: the entries of the solver states that steps change.
+    - `solver_state`: the entries of the solver states that steps change.
     - `stopped`: whether a step of the path was not solved.
     """
 
     own: list[Any]
     y: list[Any]
-    memory: list[Any]
+    solver_state: list[Any]
     stopped: Any
 
 
 class Shared(NamedTuple):
     """What all paths of a batch read.
 
-    - `memory`: the arrays of the system, the step size, and the parts of the solver state
-        that steps do not change, packed.
+    - `packed`: the arrays of the system, the step size, and the parts of the solver state
+        that steps do not change.
     - `constants`: the large constants of the program of a step.
     """
 
-    memory: dict[str, Any]
+    packed: dict[str, Any]
     constants: list[Any]
 
 
@@ -89,30 +89,32 @@ class Kernels:
                 h=jax.ShapeDtypeStruct((), jnp.result_type(*y)),
                 number=jax.ShapeDtypeStruct((), "int32"),
                 y=y,
-                memory=jax.eval_shape(functions.start, arrays, own, y),
+                solver_state=jax.eval_shape(functions.start, arrays, own, y),
             ),
         )
-        self._moves = self._which_memory_moves()
+        self._moves = self._which_arrays_move()
         self._constants = self._step.replay.constants()
-        self._start = jax.jit(self._memory_at_start)
+        self._start = jax.jit(self._solver_state_at_start)
         self._make_keys = frozen(self._record_keys, _MOST_RECORDINGS)
         self._take_steps = frozen(self._record_steps, _MOST_RECORDINGS)
 
-    def _which_memory_moves(self) -> list[bool]:
+    def _which_arrays_move(self) -> list[bool]:
         """Which arrays of the solver state are the paths' own. Those that a step returns
         unchanged are shared, if all paths start alike: then they need no registers."""
-        memory = self._step.types["memory"]
+        types = self._step.types["solver_state"]
         # It is the last argument of a step.
-        first = len(self._step.replay.arguments) - len(memory)
+        first = len(self._step.replay.arguments) - len(types)
         # The results of a step: the state, the solver state, and whether it succeeded.
         begin = len(self._step.types["y"])
-        returned = self._step.replay.handed_on[begin : begin + len(memory)]
+        returned = self._step.replay.handed_on[begin : begin + len(types)]
         return [
             self._functions.paths_differ or source != first + k
             for k, source in enumerate(returned)
         ]
 
-    def _memory_at_start(self, arrays, key, y: list[Array], args: list[Array]) -> list:
+    def _solver_state_at_start(
+        self, arrays, key, y: list[Array], args: list[Array]
+    ) -> list:
         """The solver state at the start of all paths, or of each if they differ."""
 
         def of_one(y: list[Array], args: list[Array]) -> list[Array]:
@@ -150,29 +152,29 @@ class Kernels:
         high = kinds["ui32"](samples >> 32)
         low = kinds["ui32"](samples)
         dr.eval(high, low)
-        keys = self._make_keys(packed(self._types_for_keys, [*arrays, key]), high, low)
+        keys = self._make_keys(pack(self._types_for_keys, [*arrays, key]), high, low)
         y = jtu.tree_leaves(y0)
         own_args = jtu.tree_leaves(args)
-        memory = self._start(arrays, key, y, own_args)
-        shared = [*arrays, np.asarray(h), *chosen(memory, self._stays)]
+        solver_state = self._start(arrays, key, y, own_args)
+        shared = [*arrays, np.asarray(h), *chosen(solver_state, self._stays)]
         lanes = Lanes(
             own=[*keys, *self._for_all(self._types_of_own_args, own_args, number)],
             y=self._for_all(self._step.types["y"], y, number),
-            memory=self._for_all(
-                self._types_of_moving, chosen(memory, self._moves), number
+            solver_state=self._for_all(
+                self._types_of_moving, chosen(solver_state, self._moves), number
             ),
             stopped=dr.opaque(kinds["i1"], False, number),
         )
-        return lanes, Shared(packed(self._types_of_shared, shared), self._constants)
+        return lanes, Shared(pack(self._types_of_shared, shared), self._constants)
 
     def advance(self, lanes: Lanes, shared: Shared, begin: int, end: int) -> Lanes:
         """The paths after the steps `begin` to `end - 1`."""
         # Opaque, so that other numbers need no other kernel.
         opaque = ft.partial(drjit().opaque, array_types()["i32"])
-        y, memory, stopped = self._take_steps(
+        y, solver_state, stopped = self._take_steps(
             *shared, opaque(begin), opaque(end), *lanes
         )
-        return Lanes(lanes.own, y, memory, stopped)
+        return Lanes(lanes.own, y, solver_state, stopped)
 
     def _for_all(
         self, types: list[ArrayType], arrays: list[Array], number: int
@@ -201,32 +203,32 @@ class Kernels:
     @property
     def _types_of_shared(self) -> list[ArrayType]:
         types = self._step.types
-        still = chosen(types["memory"], self._stays)
+        still = chosen(types["solver_state"], self._stays)
         return [*types["arrays"], *types["h"], *still]
 
     @property
     def _types_of_moving(self) -> list[ArrayType]:
-        return chosen(self._step.types["memory"], self._moves)
+        return chosen(self._step.types["solver_state"], self._moves)
 
     @property
     def _stays(self) -> list[bool]:
         return [not moves for moves in self._moves]
 
-    def _record_keys(self, memory: dict[str, Any], high: Any, low: Any) -> list[Any]:
+    def _record_keys(self, packed: dict[str, Any], high: Any, low: Any) -> list[Any]:
         """The words of the paths' own random keys, as Dr.Jit records their computation."""
-        args = unpacked(self._types_for_keys, memory)
+        args = unpack(self._types_for_keys, packed)
         keys, _ = self._keys.replay(*args, scalar(high), scalar(low))
         return [*flat(keys)]
 
     def _record_steps(
         self,
-        memory_of_shared: dict[str, Any],
+        packed_of_shared: dict[str, Any],
         constants: list[Any],
         begin: Any,
         end: Any,
         own: list[Any],
         y: list[Any],
-        memory: list[Any],
+        solver_state: list[Any],
         stopped: Any,
     ) -> tuple[list[Any], list[Any], Any]:
         """The loop over steps, as Dr.Jit records it: the state, the solver state and which
@@ -235,7 +237,7 @@ class Kernels:
         first = variable_number(begin + 1)
         step = self._step
         number_of_arrays = len(step.types["arrays"])
-        shared = unpacked(self._types_of_shared, memory_of_shared)
+        shared = unpack(self._types_of_shared, packed_of_shared)
         arrays = shared[:number_of_arrays]
         h, *still = shared[number_of_arrays:]
         of_path = unflat(own, shapes(step.types["own"]))
@@ -245,13 +247,19 @@ class Kernels:
         def goes_on(i: Any, *_: Any) -> Any:
             return i < end
 
-        def once(i: Any, stopped: Any, *numbers: Any) -> tuple:
+        def one_step(i: Any, stopped: Any, *numbers: Any) -> tuple[Any, ...]:
             left = iter(numbers)
             states = unflat(left, shapes_of_y)
             moving = unflat(left, shapes_of_moving)
-            memory = merged(self._moves, moving, still)
+            whole_state = merged(self._moves, moving, still)
             results, errors = step.replay(
-                *arrays, *of_path, h, scalar(i), *states, *memory, constants=constants
+                *arrays,
+                *of_path,
+                h,
+                scalar(i),
+                *states,
+                *whole_state,
+                constants=constants,
             )
             *results, success = results
             # LLVM schedules by the order: with the success first, a step of `StormerVerlet`
@@ -265,8 +273,10 @@ class Kernels:
             kept = [select(stopped, old, entry) for old, entry in zip(numbers, new)]
             return i + 1, stopped, *kept
 
-        state = (begin, stopped, *y, *memory)
-        _, stopped, *numbers = drjit().while_loop(state, goes_on, once, mode="symbolic")
+        state = (begin, stopped, *y, *solver_state)
+        _, stopped, *numbers = drjit().while_loop(
+            state, goes_on, one_step, mode="symbolic"
+        )
         last = max(map(variable_number, [stopped, *numbers]))
         _warn_of_operations(last - first)
         return numbers[: len(y)], numbers[len(y) :], stopped

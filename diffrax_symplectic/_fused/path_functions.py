@@ -48,12 +48,12 @@ class Stepped(NamedTuple):
     """A path after a step.
 
     - `y`: the leaves of its state.
-    - `memory`: the leaves of the state of its solver.
+    - `solver_state`: the leaves of the state of its solver.
     - `success`: whether the step succeeded.
     """
 
     y: list[Array]
-    memory: list[Array]
+    solver_state: list[Array]
     success: Bool[Array, ""]
 
 
@@ -120,15 +120,17 @@ class PathFunctions(NamedTuple):
         h = jnp.ones((), jnp.result_type(*jtu.tree_leaves(y)))
         return jtu.tree_leaves(system.init(terms, 0, h, y))
 
-    def step(self, arrays, own, h, i, y: list[Array], memory: list[Array]) -> Stepped:
+    def step(
+        self, arrays, own, h, i, y: list[Array], solver_state: list[Array]
+    ) -> Stepped:
         """Step number `i` of size `h`."""
         system, terms = self._of_path(arrays, own)
         # Shapes alone tell how the leaves belong together; `init` is not run.
         structure = eqx.filter_eval_shape(system.init, terms, 0, h, system.y0)
         y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
-        memory = jtu.tree_unflatten(jtu.tree_structure(structure), memory)
-        y, memory, success = system.step(terms, i, h, y, memory)
-        return Stepped(jtu.tree_leaves(y), jtu.tree_leaves(memory), success)
+        solver_state = jtu.tree_unflatten(jtu.tree_structure(structure), solver_state)
+        y, solver_state, success = system.step(terms, i, h, y, solver_state)
+        return Stepped(jtu.tree_leaves(y), jtu.tree_leaves(solver_state), success)
 
     def _of_path(self, arrays: list[Array], own: list[Array]):
         """The system and the terms of a path."""
@@ -148,7 +150,7 @@ def sample_key(key: PRNGKeyArray, high, low) -> PRNGKeyArray:
     return jr.fold_in(jr.fold_in(key, high), low)
 
 
-def split(
+def functions_and_arrays(
     system: SteppedSystem,
     key: PRNGKeyArray,
     own_args: PyTree[Array],

@@ -67,7 +67,7 @@ def shapes(types: Iterable[ArrayType]) -> list[tuple[int, ...]]:
     return [of.shape for of in types]
 
 
-def packed(
+def pack(
     types: Sequence[ArrayType], arrays: Iterable[Array | np.ndarray]
 ) -> dict[str, Any]:
     """The entries of all these arrays, which all paths share, in one array of Dr.Jit for
@@ -78,14 +78,14 @@ def packed(
     return {kind: in_memory(kind, np.concatenate(xs)) for kind, xs in of_kind.items()}
 
 
-def unpacked(types: Sequence[ArrayType], memory: dict[str, Any]) -> list[Tensor]:
-    """The inverse of `packed`, within a kernel."""
-    begin = dict.fromkeys(memory, 0)
+def unpack(types: Sequence[ArrayType], packed: dict[str, Any]) -> list[Tensor]:
+    """The inverse of `pack`, within a kernel."""
+    begin = dict.fromkeys(packed, 0)
     tensors = []
     for of in types:
         places = begin[of.kind] + np.arange(of.size)
         begin[of.kind] += of.size
-        table = Table(memory[of.kind], places)
+        table = Table(packed[of.kind], places)
         # Small arrays are read once, before the loop over steps.
         entries = table if of.size > MOST_IN_REGISTERS else [*table]
         tensors.append(Tensor(entries, of.shape))

@@ -56,7 +56,7 @@ class _Equations(NamedTuple):
     def start(self, guess: PyTree[Array]) -> Halves:
         return guess if self.in_halves else Halves(guess, guess)
 
-    def swept(self, y: Halves, relaxation: Scalar | None = None) -> Halves:
+    def sweep(self, y: Halves, relaxation: Scalar | None = None) -> Halves:
         """The iterate after a sweep, in which $q$ reads the new $p$. `None` is no
         relaxation, and no operation."""
         new_p = self.image(y).p if self.in_halves else self.image(y.q)
@@ -89,7 +89,7 @@ class _Criterion(NamedTuple):
     weights: list[Scalar]
     rounding: Scalar
 
-    def measured(
+    def measure(
         self, correction: PyTree[Array], before: Scalar
     ) -> tuple[Scalar, Bool[Array, ""]]:
         """The size of a correction that follows one of size `before`, in units of the
@@ -109,13 +109,13 @@ class _State(NamedTuple):
 
     - `y`: the iterate.
     - `size`: the size of its last correction, in units of the tolerance.
-    - `solved`: whether the equations are solved.
+    - `is_solved`: whether the equations are solved.
     - `done`: the number of sweeps.
     """
 
     y: Halves
     size: Scalar
-    solved: Bool[Array, ""]
+    is_solved: Bool[Array, ""]
     done: Array
 
 
@@ -131,13 +131,13 @@ def solve_one_path(
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
     # Three sweeps before the loop: they make two corrections, whose ratio is the rate of
     # convergence.
-    first = equations.swept(equations.start(guess))
+    first = equations.sweep(equations.start(guess))
     criterion = _criterion(scale(equations.value(first)), dtype)
-    second = equations.swept(first)
-    third = equations.swept(second)
+    second = equations.sweep(first)
+    third = equations.sweep(second)
     one = jnp.ones((), dtype)
-    before, _ = criterion.measured(equations.correction(first, second), one)
-    size, solved = criterion.measured(equations.correction(second, third), before)
+    before, _ = criterion.measure(equations.correction(first, second), one)
+    size, is_solved = criterion.measure(equations.correction(second, third), before)
 
     # Relaxed once: later rates are those of relaxed sweeps, to which the formula does not
     # apply. A branch, since few paths take it, and a division takes as long as a sweep.
@@ -147,18 +147,18 @@ def solve_one_path(
         lambda: one,
     )
 
-    def once(last: _State) -> _State:
-        y = equations.swept(last.y, relaxation)
+    def sweep_again(last: _State) -> _State:
+        y = equations.sweep(last.y, relaxation)
         correction = equations.correction(last.y, y)
-        size, solved = criterion.measured(correction, last.size)
-        return _State(y, size, solved, last.done + 1)
+        size, is_solved = criterion.measure(correction, last.size)
+        return _State(y, size, is_solved, last.done + 1)
 
     def goes_on(last: _State) -> Bool[Array, ""]:
-        return ~last.solved & (last.done < _MOST_SWEEPS) & (last.size < _HUGE)
+        return ~last.is_solved & (last.done < _MOST_SWEEPS) & (last.size < _HUGE)
 
-    state = _State(third, size, ~pending | solved, jnp.full((), 3, jnp.int32))
-    last = lax.while_loop(goes_on, once, state)
-    return equations.value(last.y), last.solved
+    state = _State(third, size, ~pending | is_solved, jnp.full((), 3, jnp.int32))
+    last = lax.while_loop(goes_on, sweep_again, state)
+    return equations.value(last.y), last.is_solved
 
 
 def _criterion(scale: PyTree[Array], dtype: Any) -> _Criterion:
@@ -227,13 +227,13 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
 def without_rescue(solver: Any) -> Any:
     """The solver, and all solvers in it, with `Sweeps` in place of `PicardNewton`."""
 
-    def swept(x: Any) -> Any:
+    def with_sweeps(x: Any) -> Any:
         _check_tolerance(x.root_finder)
         # No iterations of Optimistix: `Sweeps` solves the equations before the first.
         fields = lambda stages: (stages.root_finder, stages.root_find_max_steps)
         return eqx.tree_at(fields, x, (Sweeps(), 0))
 
-    return with_changed_stages(solver, swept)
+    return with_changed_stages(solver, with_sweeps)
 
 
 def _check_tolerance(finder: PicardNewton) -> None:

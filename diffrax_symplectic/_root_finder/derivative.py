@@ -62,7 +62,7 @@ def _solve(
     def itself(x: Float[Array, " n"]) -> Float[Array, " n"]:
         return x
 
-    found, solved = solve_by_sweeps(
+    found, is_solved = solve_by_sweeps(
         _TOLERANCE,
         _MOST_SWEEPS,
         image,
@@ -77,4 +77,4 @@ def _solve(
     def exactly(_: Float[Array, " n"]) -> Float[Array, " n"]:
         return solve(operator, rhs, None, reduction).value
 
-    return where_pending(exactly, ~solved, found)
+    return where_pending(exactly, ~is_solved, found)

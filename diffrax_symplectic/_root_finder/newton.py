@@ -49,7 +49,7 @@ class Progress(NamedTuple):
     - `size`: the last correction, in units of the tolerance.
     - `searching`: whether the branch of solutions from $s = 0$ was given up, so that any
         solution of the full equations is accepted.
-    - `solved`: whether the full equations are solved.
+    - `is_solved`: whether the full equations are solved.
     """
 
     anchor: _Vector
@@ -58,7 +58,7 @@ class Progress(NamedTuple):
     tries: IntScalarLike
     size: Scalar
     searching: Bool[Array, ""]
-    solved: Bool[Array, ""]
+    is_solved: Bool[Array, ""]
 
     @property
     def hopeless(self) -> Bool[Array, ""]:
@@ -91,13 +91,13 @@ class Newton(eqx.Module):
             tries=jnp.array(0),
             size=zero,
             searching=no,
-            solved=no,
+            is_solved=no,
         )
         begun, number = batched_like((begun, jnp.array(0)), guess)
 
         def pending(carry):
             number, _, state = carry
-            return (number < most) & ~state.solved & ~state.hopeless
+            return (number < most) & ~state.is_solved & ~state.hopeless
 
         def body(carry):
             number, k, state = carry
@@ -106,7 +106,7 @@ class Newton(eqx.Module):
         _, k, state = lax.while_loop(pending, body, (number, guess, begun))
         R: Any = optx.RESULTS
         failure = R.where(state.hopeless, R.nonfinite, R.nonlinear_max_steps_reached)
-        return k, R.where(state.solved, R.successful, failure)
+        return k, R.where(state.is_solved, R.successful, failure)
 
     def step(self, y: _Vector, state: Progress) -> tuple[_Vector, Progress]:
         """One iteration for the current target: the corrected iterate, or the guess for the
@@ -131,13 +131,13 @@ class Newton(eqx.Module):
         # Newton's method converges quadratically near a solution. Corrections that shrink
         # by less than four there have reached rounding errors.
         at_rounding = shrink >= 0.25
-        solved = converged(level, rate, measured.rounded, at_rounding)
+        is_solved = converged(level, rate, measured.rounded, at_rounding)
         # Far from any solution, rounding errors of a large Jacobian can hide the unknowns
         # with small coefficients. Corrections are then small, but residuals exceed the
         # state.
         whole_state = largest([max_norm(x) for x in jtu.tree_leaves(states)])
         state_size = jnp.maximum(whole_state, moved) + self.tolerance.atol
-        solved &= whole & found & (max_norm(residual) <= state_size) & all_finite(k)
+        is_solved &= whole & found & (max_norm(residual) <= state_size) & all_finite(k)
 
         at_once = whole & (state.reached == 0) & ~state.searching
         # The last part and the search begin near a solution, or fail soon: two corrections
@@ -147,8 +147,8 @@ class Newton(eqx.Module):
         stalled = (tries >= patience) & ~((shrink < _SHRINK) & (size > 0))
         slow = ~whole & (tries >= _PATIENCE_IN_PART)
         arrived = (max_norm(change) < _LOOSE * moved) & ~whole
-        failed = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~solved
-        state = state._replace(tries=tries, size=size, solved=solved)
+        failed = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~is_solved
+        state = state._replace(tries=tries, size=size, is_solved=is_solved)
         return _next_target(state, k, arrived, failed & ~state.searching)
 
 

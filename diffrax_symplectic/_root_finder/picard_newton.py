@@ -25,12 +25,12 @@ _UNSOLVED = optx.RESULTS.nonlinear_divergence
 class _FinderState(NamedTuple):
     """The state of the root finder, between its only step and the end.
 
-    - `solved`: whether the equations are solved.
+    - `is_solved`: whether the equations are solved.
     - `result`: the reason if they cannot be.
     - `aux`: the structure of the auxiliary output.
     """
 
-    solved: Bool[Array, ""]
+    is_solved: Bool[Array, ""]
     result: optx.RESULTS
     aux: Any
 
@@ -113,8 +113,8 @@ class PicardNewton(
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _FinderState:
         del fn, args, options, f_struct, tags
-        solved, result = batched_like((jnp.array(False), _SUCCESSFUL), y)
-        return _FinderState(solved, result, aux_struct)
+        is_solved, result = batched_like((jnp.array(False), _SUCCESSFUL), y)
+        return _FinderState(is_solved, result, aux_struct)
 
     def step(self, fn, y, args, options, state, tags):
         del tags
@@ -124,22 +124,22 @@ class PicardNewton(
         pending = all_finite(y)
         solve = ft.partial(solve_by_sweeps, self._tolerance, self.picard_steps)
         if "solve_blocks" in options:
-            found, solved = options["solve_blocks"](args, solve, y, pending)
+            found, is_solved = options["solve_blocks"](args, solve, y, pending)
         else:
-            found, solved = solve(_image(fn, args), scale, y, pending)
-        pending = pending & ~solved
+            found, is_solved = solve(_image(fn, args), scale, y, pending)
+        pending = pending & ~is_solved
         if self.newton_steps == 0:
             # A program without Newton's method compiles in half the time.
             y_new = found
             result = optx.RESULTS.where(pending, _UNSOLVED, _SUCCESSFUL)
         else:
-            y_new, result = self._rescued(fn, scale, args, y, found, pending)
-        solved = result == _SUCCESSFUL
+            y_new, result = self._by_newton(fn, scale, args, y, found, pending)
+        is_solved = result == _SUCCESSFUL
         # Evaluate the equations once more only if there is auxiliary output.
         aux = fn(y_new, args)[1] if jtu.tree_leaves(state.aux) else state.aux
-        return y_new, _FinderState(solved, result, state.aux), aux
+        return y_new, _FinderState(is_solved, result, state.aux), aux
 
-    def _rescued(
+    def _by_newton(
         self,
         fn: Callable,
         scale: Callable,
@@ -177,7 +177,7 @@ class PicardNewton(
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
-        return state.solved, state.result
+        return state.is_solved, state.result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del fn, args, options, state, tags, result

@@ -56,7 +56,7 @@ class _SweepState(NamedTuple):
     - `y`: the iterate.
     - `relaxation`: the relaxation factor.
     - `level`: the base-2 logarithm of the size of the last correction.
-    - `solved`: whether it was small enough.
+    - `is_solved`: whether it was small enough.
     - `pending`: whether to continue.
     - `done`: the number of sweeps so far, for any path of the batch.
     - `ahead`: the number of sweeps until the next check; zero at the end.
@@ -65,13 +65,13 @@ class _SweepState(NamedTuple):
     y: Halves | None
     relaxation: Scalar
     level: Scalar
-    solved: Bool[Array, ""]
+    is_solved: Bool[Array, ""]
     pending: Bool[Array, ""]
     done: IntScalarLike
     ahead: IntScalarLike
 
 
-class _Swept(NamedTuple):
+class _AfterSweeps(NamedTuple):
     """The result of the sweeps between two checks.
 
     - `change`: the last correction.
@@ -82,7 +82,7 @@ class _Swept(NamedTuple):
     y: Halves
 
 
-class _Checked(NamedTuple):
+class _Decision(NamedTuple):
     """The decision at a convergence check.
 
     - `state`: the next state, except for the iterate.
@@ -127,7 +127,7 @@ def solve_by_sweeps(
         return y if in_halves else y.q
 
     def sweep_and_check(state: _SweepState) -> _SweepState:
-        change, y = _swept(image, state, in_halves)
+        change, y = _sweep_until_check(image, state, in_halves)
         correction = tolerance.measure(change, scale(value_of(y)))
         # The first correction is bounded by the size of the state.
         earlier = jnp.minimum(state.level, log2(correction.bound))
@@ -138,11 +138,11 @@ def solve_by_sweeps(
         # only one kernel reads them: otherwise ten arrays took 1.1 times as long.
         new, back = materialize(check)
 
-        # All paths of a batch sweep together, but each keeps only its own sweeps.
-        def own(y: Array, start: Array, old: Array) -> Array:
+        # All paths of a batch sweep together, but a path that has ended stays where it was.
+        def of_pending_paths(y: Array, start: Array, old: Array) -> Array:
             return jnp.where(state.pending, jnp.where(back, start, y), old)
 
-        return new._replace(y=jtu.tree_map(own, y, start, state.y))
+        return new._replace(y=jtu.tree_map(of_pending_paths, y, start, state.y))
 
     one = jnp.ones((), dtype)
     inf = jnp.full((), jnp.inf, dtype)
@@ -154,14 +154,14 @@ def solve_by_sweeps(
         y=start,
         relaxation=one,
         level=inf,
-        solved=no,
+        is_solved=no,
         pending=pending,
         # The counts are shared by the batch, so that the loops keep unbatched lengths.
         done=0,
         ahead=first,
     )
     state = lax.while_loop(lambda state: state.ahead > 0, sweep_and_check, state)
-    return value_of(state.y), state.solved
+    return value_of(state.y), state.is_solved
 
 
 def _first_sweeps(dtype, in_halves: bool) -> int:
@@ -171,7 +171,7 @@ def _first_sweeps(dtype, in_halves: bool) -> int:
     return _FIRST_IN_DOUBLE if in_halves else _FIRST_DOUBLED_IN_DOUBLE
 
 
-def _swept(image: Map, state: _SweepState, in_halves: bool) -> _Swept:
+def _sweep_until_check(image: Map, state: _SweepState, in_halves: bool) -> _AfterSweeps:
     """All sweeps until the next check."""
 
     # Each half is taken from an evaluation of its own. XLA drops what an evaluation
@@ -188,20 +188,20 @@ def _swept(image: Map, state: _SweepState, in_halves: bool) -> _Swept:
 
         return jtu.tree_map(between, new, old)
 
-    def once(_, y: Halves) -> Halves:
+    def sweep(_, y: Halves) -> Halves:
         y = Halves(relaxed(new_p(y), y.p), y.q)
         return Halves(y.p, relaxed(new_q(y), y.q))
 
     if not in_halves:
-        y = lax.fori_loop(0, state.ahead, once, state.y)
+        y = lax.fori_loop(0, state.ahead, sweep, state.y)
         # The halves may converge to different solutions of y = \Phi(\Phi(y)); only their
         # difference shows that.
-        return _Swept((y.q**ω - y.p**ω).ω, y)
+        return _AfterSweeps((y.q**ω - y.p**ω).ω, y)
     # A loop that also carried the previous iterate would copy it in each sweep: steps of 64
     # pairs took 1.1 to 1.4 times as long, although the program was a tenth shorter.
-    before = lax.fori_loop(0, state.ahead - 1, once, state.y)
-    y = once(None, before)
-    return _Swept((y**ω - before**ω).ω, y)
+    before = lax.fori_loop(0, state.ahead - 1, sweep, state.y)
+    y = sweep(None, before)
+    return _AfterSweeps((y**ω - before**ω).ω, y)
 
 
 def _check(
@@ -211,14 +211,14 @@ def _check(
     last: CorrectionSize,
     first: int,
     most: int,
-) -> _Checked:
+) -> _Decision:
     """What to do next. The base-2 logarithms of the `last` and an earlier correction are
     `level` and `earlier`; `first` and `most` are numbers of sweeps."""
     # In base-2 logarithms, so that the number of further sweeps is a quotient.
     rate = (level - earlier) / state.ahead
     done = state.done + state.ahead
     stalled = rate >= STALLED
-    solved = converged(level, rate, last.rounded, stalled)
+    is_solved = converged(level, rate, last.rounded, stalled)
     # Sweeps that diverged get one more try. If it stalls, Newton's method takes over.
     again = stalled & (state.relaxation > _STRONGEST)
     ratio = jnp.exp2(rate)
@@ -228,7 +228,7 @@ def _check(
     further = (level + MARGIN) / jnp.where(tuned, -_RELAXED, -rate)
     # Sweeps that would not end in time end now, before they cost anything.
     in_time = again | (~stalled & (done + further < most))
-    pending = state.pending & ~solved & in_time & (done < most)
+    pending = state.pending & ~is_solved & in_time & (done < most)
     # Newton's method begins where the sweeps ended, unless that is far from a solution.
     near = ~stalled & (last.small | pending)
     count = jnp.where(again, first, further)
@@ -240,12 +240,12 @@ def _check(
         y=None,
         relaxation=jnp.where(again, _STRONGEST, relaxation),
         level=jnp.where(again, jnp.inf, level),
-        solved=jnp.where(state.pending, solved, state.solved),
+        is_solved=jnp.where(state.pending, is_solved, state.is_solved),
         pending=pending,
         done=done,
         ahead=jnp.minimum(most_of_batch(count), _MOST_BETWEEN_CHECKS),
     )
-    return _Checked(new, ~(near | solved))
+    return _Decision(new, ~(near | is_solved))
 
 
 def best_relaxation(rate: Scalar) -> Scalar:

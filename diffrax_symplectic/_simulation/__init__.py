@@ -21,7 +21,7 @@ from .engines import (
     state_itself,
     warn_of_stragglers,
 )
-from .levels import combined, Combination, Level, level_weights
+from .levels import combinations, Combination, Level, level_weights
 from .loop import (
     along,
     independent_steps,
@@ -30,4 +30,4 @@ from .loop import (
     simulate,
     values_of_paths,
 )
-from .problem import advice_on_failures, Drawn, Problem, ravel, real_vector
+from .problem import advice_on_failures, DrawnStart, Problem, ravel, real_vector

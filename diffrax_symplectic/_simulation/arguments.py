@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
@@ -22,7 +23,7 @@ from .._brownian import (
     TOO_STRONG,
     typed_key,
 )
-from .._custom_types import Args, Y
+from .._custom_types import Args, RealScalarLike, Y
 from .._signature import once_for_each_signature
 from .._solver import own_path
 from .._terms import (
@@ -221,17 +222,22 @@ def check_shapes(
     """Raises an error unless terms and `phi` fit the state, and the latter is real."""
     check_fit(terms, t0, y0, args)
     check_takes("phi", phi, "t", "y", "args")
-    check_real("phi", jtu.tree_leaves(_shape_of(phi, terms, t0, y0, args)))
+    check_real("phi", jtu.tree_leaves(_result_struct(phi, terms, t0, y0, args)))
 
 
-def _shape_of(
+def _result_struct(
     phi: Callable, terms: PyTree, t0: Float[np.ndarray, ""], y0: Y, args: Args
-) -> PyTree:
-    """The shape of `phi`'s result. Errors explain which state `phi` gets."""
-    once = lambda t, y, args: evaluated("phi", phi, t, y, args=args)
+) -> PyTree[jax.ShapeDtypeStruct]:
+    """Shapes and dtypes of what `phi` returns. For spins and complex amplitudes, errors
+    explain which state `phi` gets."""
+
+    def result(t: RealScalarLike, y: Y, args: Args) -> PyTree[Array]:
+        return evaluated("phi", phi, t, y, args=args)
+
     try:
-        return eqx.filter_eval_shape(once, t0, y0, args)
+        return eqx.filter_eval_shape(result, t0, y0, args)
     except (TypeError, AttributeError, IndexError) as error:
+        # Such as those of `s.x` or `s[2]`, where `s` is a pair and not a spin.
         if has_lifted(terms):
             error.add_note(
                 "For spins and complex amplitudes `phi(t, y, args)` gets the pair "

@@ -17,12 +17,12 @@ from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .._arguments import check_untraced
 from .._fused import (
+    functions_and_arrays,
     Kernels,
     Lanes,
     PathFunctions,
     sample_key,
     Shared,
-    split,
     without_rescue,
 )
 from .._lapack import lapack_in_turn
@@ -94,11 +94,11 @@ def _sample_keys(key: PRNGKeyArray, high: _Words, low: _Words) -> Array:
 
 
 @eqx.filter_jit
-def _drawn(
+def _draw_starts(
     p: Problem, key: PRNGKeyArray, high: _Words, low: _Words
 ) -> tuple[PyTree, PyTree]:
-    """`Problem.drawn` for the paths of a batch."""
-    return jax.vmap(p.drawn)(_sample_keys(key, high, low))
+    """`Problem.draw_start` for the paths of a batch."""
+    return jax.vmap(p.draw_start)(_sample_keys(key, high, low))
 
 
 @eqx.filter_jit
@@ -157,7 +157,7 @@ def _fused_batch(
         for k in range(len(lanes.y))
     ]
     stopped = np.asarray(lanes.stopped)
-    return Batch(_unraveled(p.y0, entries), stopped, int(np.sum(stopped)))
+    return Batch(_states_of_entries(p.y0, entries), stopped, int(np.sum(stopped)))
 
 
 class FusedStart(NamedTuple):
@@ -175,10 +175,10 @@ def fused_start(
 ) -> FusedStart:
     """Compiles the kernels of a problem, unless they are known, and starts these paths."""
     own_args = None if p.args_of is None else eqx.filter(p.args, eqx.is_array)
-    functions, arrays = split(_bare(p), key, own_args, p.paths_differ)
+    functions, arrays = functions_and_arrays(_bare(p), key, own_args, p.paths_differ)
     kernels = _kernels(functions)
     if p.paths_differ:
-        y0, args = _drawn(p, key, *_halves(sample_numbers))
+        y0, args = _draw_starts(p, key, *_halves(sample_numbers))
     else:
         y0 = p.y0
         args = None
@@ -223,26 +223,30 @@ def _with_stragglers(
     size = min(len(sample_numbers), 4**power)
     rest = by_jax(p, key, sample_numbers[np.resize(which, size)], level)
 
-    def replaced(fused: np.ndarray, by_jax: np.ndarray) -> np.ndarray:
+    def with_those_of_jax(fused: np.ndarray, by_jax: np.ndarray) -> np.ndarray:
         y = np.array(fused)
         y[which] = by_jax[: len(which)]
         return y
 
     failed = np.zeros(len(sample_numbers), bool)
     failed[which] = rest.failed[: len(which)]
-    return Batch(jtu.tree_map(replaced, fused.y, rest.y), failed, len(which))
+    return Batch(jtu.tree_map(with_those_of_jax, fused.y, rest.y), failed, len(which))
 
 
-def _unraveled(y0: PyTree, entries: list[np.ndarray]) -> PyTree[np.ndarray]:
-    """The state, from its entries, each with axes for paths and times."""
+def _states_of_entries(y0: PyTree, entries: list[np.ndarray]) -> PyTree[np.ndarray]:
+    """States in the structure of `y0`, with leading axes for paths and times, from their
+    entries, each an array with these axes."""
     leaves, treedef = jtu.tree_flatten(y0)
-    rest = iter(entries)
+    left = iter(entries)
     axes = entries[0].shape
     each = []
     for leaf in leaves:
-        own = [next(rest) for _ in range(leaf.size)]
-        # An empty array has no entries to stack.
-        stacked = np.stack(own, axis=-1) if own else np.zeros((*axes, 0), leaf.dtype)
+        of_leaf = [next(left) for _ in range(leaf.size)]
+        if of_leaf:
+            stacked = np.stack(of_leaf, axis=-1)
+        else:
+            # An empty array has no entries to stack.
+            stacked = np.zeros((*axes, 0), leaf.dtype)
         each.append(stacked.reshape(*axes, *leaf.shape))
     return treedef.unflatten(each)
 
@@ -264,9 +268,9 @@ def _refusal(error: BaseException | None) -> ValueError | None:
 def _origin(location: str) -> str:
     """The function of the user's code that an operation comes from, if JAX recorded it: the
     first one outside of installed packages."""
-    own = str(Path(__file__).parents[1])
+    package = str(Path(__file__).parents[1])
     for source in source_lines(location):
-        if "site-packages" not in source.file and not source.file.startswith(own):
+        if "site-packages" not in source.file and not source.file.startswith(package):
             where = f"({source.file}, line {source.line})"
             return f", which `{source.function}` needs {where}"
     return ""

@@ -77,14 +77,14 @@ def level_weights(
     [Talay and Tubaro (1990)](https://doi.org/10.1080/07362999008809220) show that the error
     has an expansion in powers of $h$.
     """
-    best = _extrapolated(order, levels)
+    best = _extrapolation_weights(order, levels)
     if levels == 1:
         return best[None]
     # The finer levels alone, which eliminate one power of the step size less.
-    before = np.append(0.0, _extrapolated(order, levels - 1))
+    before = np.append(0.0, _extrapolation_weights(order, levels - 1))
     rows = [best, np.eye(levels)[-1] - best, best - before]
     if levels > 2:
-        of_some = _extrapolated(order, levels - 2)
+        of_some = _extrapolation_weights(order, levels - 2)
         coarse, middle, fine = (np.pad(of_some, (k, 2 - k)) for k in range(3))
         last = fine - middle
         change_before = middle - coarse
@@ -94,14 +94,16 @@ def level_weights(
     return np.stack(rows)
 
 
-def _extrapolated(order: int | float, levels: int) -> Float[np.ndarray, " levels"]:
+def _extrapolation_weights(
+    order: int | float, levels: int
+) -> Float[np.ndarray, " levels"]:
     """The weights of the means that add up to one, and cancel all error terms."""
     powers = np.append(0.0, order + min(order, 1) * np.arange(levels - 1))
     system = 2.0 ** -np.outer(powers, np.arange(levels))
     return np.linalg.solve(system, np.eye(levels)[0])
 
 
-def combined(
+def combinations(
     weights: Float[Array | np.ndarray, "combinations levels"],
     x: Float[Array, "levels ..."],
 ) -> Float[Array, "combinations ..."]:

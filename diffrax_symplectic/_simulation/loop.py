@@ -15,7 +15,7 @@ from .._custom_types import Y
 from .._root_finder import all_finite
 from .._terms import path_keys, with_keys
 from .levels import Level
-from .problem import Drawn, Problem
+from .problem import DrawnStart, Problem
 
 
 # On CPUs so many paths are stepped at once. The arrays of more overflow the cache in every
@@ -45,7 +45,7 @@ class PathStates(eqx.Module):
 
     @staticmethod
     def start(
-        p: Problem, drawn: Drawn, solver_state: PyTree[Array], control: Any = None
+        p: Problem, drawn: DrawnStart, solver_state: PyTree[Array], control: Any = None
     ) -> "PathStates":
         """Paths at the start."""
         failed = ~jax.vmap(all_finite)(drawn.y0)
@@ -123,19 +123,19 @@ def _on_level(
 
     def body(i, carry):
         paths, saved = carry
-        return _recorded(p, level, measure, i + 1, motion.step(i, paths), saved)
+        return _measure_if_saved(p, level, measure, i + 1, motion.step(i, paths), saved)
 
     saves, m = p.num_outputs
     dtype = p.dtype_of_values
     phi = jax.ShapeDtypeStruct((len(motion.start.failed), m), dtype)
     measured = jax.eval_shape(measure, phi, motion.start.failed)
     saved = jnp.zeros((saves, *measured.shape), dtype)
-    carry = _recorded(p, level, measure, 0, motion.start, saved)
+    carry = _measure_if_saved(p, level, measure, 0, motion.start, saved)
     paths, saved = lax.fori_loop(0, level.num_steps, body, carry)
     return Simulated(saved, paths.failed, paths.control)
 
 
-def _recorded(
+def _measure_if_saved(
     p: Problem,
     level: Level,
     measure: Callable,
@@ -168,7 +168,7 @@ def _recorded(
 def independent_steps(
     p: Problem,
     level: Level,
-    drawn: Drawn,
+    drawn: DrawnStart,
     terms_of: Callable[[Any], PyTree],
     randomness: Callable[[Any], PyTree[Array]],
 ) -> Motion:
@@ -177,8 +177,9 @@ def independent_steps(
 
     def step(i, paths):
         def one(random, y, solver_state, args):
-            own = p.with_args(args)
-            return own.step(terms_of(random), i, level.h, y, solver_state)
+            problem_of_path = p.with_args(args)
+            terms = terms_of(random)
+            return problem_of_path.step(terms, i, level.h, y, solver_state)
 
         states = paths.y, paths.solver_state, paths.args
         y, solver_state, success = _in_blocks(one, randomness(i), *states)
@@ -196,17 +197,17 @@ def values_of_paths(
 ) -> tuple[Float[Array, "levels S n m"], Bool[Array, "levels n"]]:
     """The values of `phi` for independent paths, one for each key, on all levels and at the
     times at which to average, and which paths failed."""
-    own_keys = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
-    drawn = jax.vmap(p.drawn)(keys)
+    keys_of_paths = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
+    drawn = jax.vmap(p.draw_start)(keys)
 
     def begin(level: Level) -> Motion:
         return independent_steps(
             p,
             level,
             drawn,
-            terms_of=lambda own: with_keys(p.terms, own),
+            terms_of=lambda keys_of_path: with_keys(p.terms, keys_of_path),
             # A path draws the increments of all steps from its keys.
-            randomness=lambda i: own_keys,
+            randomness=lambda i: keys_of_paths,
         )
 
     done = simulate(p, begin)
@@ -220,7 +221,7 @@ def _in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
     is_whole = count > _PATHS_AT_ONCE and count % _PATHS_AT_ONCE == 0
     if not is_whole or jax.default_backend() != "cpu":
         return jax.vmap(fn)(*args)
-    return lax.map(lambda own: fn(*own), args, batch_size=_PATHS_AT_ONCE)
+    return lax.map(lambda args: fn(*args), args, batch_size=_PATHS_AT_ONCE)
 
 
 def along(mask: Bool[Array, " n"], x: Array) -> Array:

@@ -50,7 +50,7 @@ from .arguments import (
     given_state,
     step_numbers,
 )
-from .levels import combined, Level, level_weights, levels_of
+from .levels import combinations, Level, level_weights, levels_of
 
 
 # Folded into the key of a sample to draw its `y0` and `args`. The keys of its paths are
@@ -58,7 +58,7 @@ from .levels import combined, Level, level_weights, levels_of
 _START_KEY = 0x517A87
 
 
-class Drawn(NamedTuple):
+class DrawnStart(NamedTuple):
     """The start of a path (or of many, along the first axis of each array).
 
     - `y0`: its initial state.
@@ -186,23 +186,23 @@ class Problem(eqx.Module):
         """Whether not all paths have the same `y0` and `args`."""
         return self.y0_of is not None or self.args_of is not None
 
-    def drawn(self, key: PRNGKeyArray) -> Drawn:
+    def draw_start(self, key: PRNGKeyArray) -> DrawnStart:
         """The start of the sample with this key."""
         for_y0, for_args = jr.split(jr.fold_in(key, _START_KEY))
-        own = None
+        own_args = None
         if self.args_of is not None:
-            own = eqx.filter(drawn_args(self.args_of, for_args), eqx.is_array)
+            own_args = eqx.filter(drawn_args(self.args_of, for_args), eqx.is_array)
         if self.y0_of is None:
-            return Drawn(self.y0, own)
-        args = self.with_args(own).args
-        return Drawn(drawn_state(self.y0_of, for_y0, args), own)
+            return DrawnStart(self.y0, own_args)
+        args = self.with_args(own_args).args
+        return DrawnStart(drawn_state(self.y0_of, for_y0, args), own_args)
 
-    def with_args(self, own: PyTree[Array]) -> "Problem":
+    def with_args(self, own_args: PyTree[Array]) -> "Problem":
         """The problem of a path that was drawn."""
-        if self.args_of is None and own is None:
+        if self.args_of is None and own_args is None:
             return self
         rest = eqx.filter(self.args, eqx.is_array, inverse=True)
-        return dataclasses.replace(self, args=eqx.combine(own, rest))
+        return dataclasses.replace(self, args=eqx.combine(own_args, rest))
 
     def init(
         self, terms: PyTree, i: Any, h: Float[Array | np.ndarray, ""], y: Y
@@ -256,11 +256,11 @@ class Problem(eqx.Module):
         shaped = [part.reshape(*axes, *leaf.shape) for part, leaf in zip(parts, leaves)]
         return treedef.unflatten(shaped)
 
-    def combined(
+    def combinations(
         self, x: Float[Array, "levels ..."]
     ) -> Float[Array, "combinations ..."]:
         """The combinations of values on all levels."""
-        return combined(self.weights, x)
+        return combinations(self.weights, x)
 
     def shaped(
         self, x: Float[Array | np.ndarray, "combinations S n m"]

@@ -43,7 +43,7 @@ _ALL = [
     if kind.record is not None
 ]
 # Those that need friction, from `langevin_terms`.
-LANGEVIN: tuple[type[AbstractSymplecticSolver], ...] = tuple(
+LANGEVIN: tuple[type[AbstractLangevinSplitting], ...] = tuple(
     kind for kind in _ALL if issubclass(kind, AbstractLangevinSplitting)
 )
 # All others that do not wrap another solver.

@@ -22,7 +22,7 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 from .._arguments import check_state, whole_number
 from .._batch import batched_like
 from .._brownian import drives, most_demanding, path_of
-from .._custom_types import Args, Y
+from .._custom_types import Args, Terms, Y
 from .._root_finder import PicardNewton
 from .._tableau import (
     AbstractTableau,
@@ -37,7 +37,7 @@ from .._terms import check_structure, number_of_noises, split_terms
 from .driven import drift_driven, noise_driven
 from .record import Record, Want
 from .step import no_failure, Outcome, result_of, Step, take_step
-from .times import result_at
+from .times import result_with_times_checked
 
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         diffrax.LocalLinearInterpolation
     )
     record: ClassVar[Record | None] = None
-    # Whether it takes terms with a `constraint`.
+    # Whether it takes constrained terms.
     keeps_constraints: ClassVar[bool] = False
     structure: AbstractVar[Structure]
     variables: AbstractVar[tuple[str, ...]]
@@ -258,11 +258,11 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         name = type(self).__name__
         driven |= noise_driven(from_drift, h, noise, variables, t0, t1, args, name)
         y1, outcome = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
-        result = result_at(terms, t0, t1, result_of(outcome, y1))
+        result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), outcome, result
 
 
-def _drop_absent(tableau: FlatTableau, drift: tuple, noise: tuple) -> FlatTableau:
+def _drop_absent(tableau: FlatTableau, drift: Terms, noise: Terms) -> FlatTableau:
     """Drops stages that no term drives (an ODE has no noise), and without drift the
     brackets of drift and noise."""
     keep = [

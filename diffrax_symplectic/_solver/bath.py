@@ -3,7 +3,6 @@
 import functools as ft
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -11,13 +10,14 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from .._compat import direction, unwrapped
-from .._custom_types import Args, RealScalarLike, Y
+from .._compat import direction
+from .._custom_types import Args, RealScalarLike, Terms, Y
 from .._root_finder import eliminate, MAX_WRITTEN_OUT
 from .._terms import (
     AbstractFriction,
     acts_elementwise,
     Dependence,
+    field_of,
     has_lifted,
     rate,
     semidefinite_root,
@@ -32,7 +32,7 @@ _MAX_SOLVED = 16
 
 
 def check_friction(
-    drift: tuple, friction: tuple, t0: RealScalarLike, y0: Y, args: Args, solver: str
+    drift: Terms, friction: Terms, t0: RealScalarLike, y0: Y, args: Args, solver: str
 ) -> None:
     """Raises a `ValueError` unless there is friction that is linear in the momenta, and a
     drift beside it. `drift` and `friction` are the terms of each, and `solver` is the name
@@ -82,7 +82,7 @@ def check_friction(
 
 
 def after_friction(
-    friction: tuple,
+    friction: Terms,
     t: RealScalarLike,
     h: RealScalarLike,
     y: tuple[PyTree[Array], PyTree[Array]],
@@ -126,7 +126,7 @@ def after_friction(
     if flat.size > _MAX_SOLVED:
         constant = _matrices_if_constant(friction, t, y, args)
     if constant is not None:
-        return unravel(flat + _solved_with(constant, step, matrix, right))
+        return unravel(flat + _solve_by_modes(constant, step, matrix, right))
     # Elimination in XLA operations takes a tenth of LAPACK's time for matrices this small.
     solve = eliminate if flat.size <= MAX_WRITTEN_OUT else jnp.linalg.solve
     return unravel(flat + solve(matrix, right))
@@ -145,13 +145,12 @@ class _Matrices(NamedTuple):
 
 
 def _matrices_if_constant(
-    friction: tuple, t: RealScalarLike, y: Y, args: Args
+    friction: Terms, t: RealScalarLike, y: Y, args: Args
 ) -> _Matrices | None:
     """The matrices of friction that is known to be the same at all times and positions."""
     if len(friction) != 1:
         return None
-    term = unwrapped(friction[0])
-    field = term.vector_field if isinstance(term, diffrax.ODETerm) else None
+    field = field_of(friction[0])
     if not isinstance(field, AbstractFriction):
         return None
     p, q = y
@@ -173,14 +172,14 @@ def _matrices_if_constant(
     return _Matrices(G, direction(friction) * inverse_masses)
 
 
-def _solved_with(
+def _solve_by_modes(
     constant: _Matrices,
     step: Float[Array, ""],
     matrix: Float[Array, "n n"],
     right: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """Solves `matrix @ x = right` for `matrix = 1 + step / 2 * G M^-1`, by the modes of
-    the `constant` matrices G and M^-1.
+    """The solution of `matrix @ x = right` for `matrix = 1 + step / 2 * G M^-1`, by the
+    modes of the `constant` matrices G and M^-1.
 
     The modes do not depend on the step. (Sizes of steps differ by rounding errors, so that
     `matrix` itself is not the same in all; it carries the derivatives.) They are computed

@@ -30,7 +30,7 @@ from .driven import drawn_variables, drift_driven
 from .general import GAUSS, ImplicitMidpoint
 from .record import Record
 from .step import no_failure, Outcome, result_of, Step, take_step
-from .times import result_at
+from .times import result_with_times_checked
 
 
 _HALVES = np.array([1 / 2, 1 / 2])
@@ -193,7 +193,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
             return lax.cond(flow.is_drift, drift_flow, noise_flow, flow, *carry), None
 
         (y1, outcome), _ = lax.scan(one_flow, (y0, outcome), flows)
-        result = result_at(terms, t0, t1, result_of(outcome, y1))
+        result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), outcome, result
 
     def _flows(self, terms, t0, t1) -> _Flow:

@@ -38,6 +38,7 @@ def apply_brackets(
         return term.vf_prod(t, y, args, unravel(increments))
 
     def summand(column: Float[Array, " m"], unit: Float[Array, " m"]) -> Y:
+        """That of one `l`, from the column `A_kl` and the unit vector of `l`."""
         b_l = ft.partial(field, unit)
         return jax.jvp(b_l, (y,), (field(column, y),))[1]
 
@@ -46,7 +47,7 @@ def apply_brackets(
     return _total(jax.vmap(summand)(A.T, units), len(A))
 
 
-def bridge(
+def bridge_coefficients(
     h: RealScalarLike, W: PyTree, H: PyTree, K: PyTree | None
 ) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
     r"""$H_k$ and $L_{kl} / h$ of [`diffrax_symplectic.PlateauGauss`][] for `m` noises,
@@ -56,27 +57,27 @@ def bridge(
     plus an independent remainder. The time average of its mean square is $h / 15$ without
     the second summand, and $3 h / 70$ with it.
     """
-    increments, _ = jfu.ravel_pytree(W)
-    areas, _ = jfu.ravel_pytree(H)
+    W_k, _ = jfu.ravel_pytree(W)
+    H_k, _ = jfu.ravel_pytree(H)
     # In a solve backward in time steps are negative, and the mean square is not.
-    size = jnp.abs(h).astype(areas.dtype)
-    one = jnp.eye(areas.size, dtype=areas.dtype) * size
-    # Each of these is half of the time average of a square.
-    second = 3 / 5 * jnp.outer(areas, areas)
+    size = jnp.abs(h).astype(H_k.dtype)
+    of_remainder = jnp.eye(H_k.size, dtype=H_k.dtype) * size
+    # Each summand is half of the time average of a square.
+    L_kl = 3 / 5 * jnp.outer(H_k, H_k)
     if K is None:
-        return areas, second + one / 30
-    more_areas, _ = jfu.ravel_pytree(K)
-    mixed = jnp.outer(increments, more_areas)
-    squares = 60 / 7 * jnp.outer(more_areas, more_areas)
-    second = second + squares - (mixed + mixed.T) / 2
-    return areas, second + 3 / 140 * one
+        return H_k, L_kl + of_remainder / 30
+    K_k, _ = jfu.ravel_pytree(K)
+    mixed = jnp.outer(W_k, K_k)
+    squares = 60 / 7 * jnp.outer(K_k, K_k)
+    L_kl = L_kl + squares - (mixed + mixed.T) / 2
+    return H_k, L_kl + 3 / 140 * of_remainder
 
 
 @eqx.filter_jit
 def apply_bridge(
     drift: jtu.Partial,
     noise: tuple[diffrax.AbstractTerm, ...],
-    bridge: tuple[Float[Array, " m"], Float[Array, "m m"]],
+    bridge_coefficients: tuple[Float[Array, " m"], Float[Array, "m m"]],
     h: RealScalarLike,
     args: Args,
     t: RealScalarLike,
@@ -88,7 +89,7 @@ def apply_bridge(
     """
     _, unravel = raveled([control_struct(term) for term in noise])
     t = jnp.asarray(t, jnp.result_type(h))
-    areas, _ = bridge
+    areas, _ = bridge_coefficients
 
     def b(increments: Float[Array, " m"], t: Array, y: Y) -> Y:
         """The noise with these increments."""
@@ -118,7 +119,7 @@ def apply_bridge(
         return (double**ω + area * single**ω).ω
 
     units: Any = np.eye(areas.size, dtype=areas.dtype)
-    return _total(jax.vmap(summand)(units, *bridge), len(units))
+    return _total(jax.vmap(summand)(units, *bridge_coefficients), len(units))
 
 
 def _total(summands: Y, m: int) -> Y:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from .._arguments import check_pair
 from .._compat import replaced, unwrapped
-from .._custom_types import Args, RealScalarLike, Y
+from .._custom_types import Args, RealScalarLike, Terms, Y
 from .._terms import (
     apply,
     check_start,
@@ -29,7 +29,7 @@ from .._terms import (
 from .base import AbstractSymplecticSolver
 from .bath import after_friction
 from .driven import drawn_variables, drift_driven
-from .flow import begun, Flow, handed_on, kicks_and_rest, moved_by
+from .flow import begin_flow, Flow, handed_on, kicks_and_rest, moved_by
 from .step import no_failure
 
 
@@ -65,8 +65,7 @@ def verlet_step(
     of the solver, for errors about its path."""
     surface = Surface.of(terms, t0, y0, args)
     drift, noise = split_terms(without_constraint(terms))
-    p, unravel_p = jfu.ravel_pytree(y0[0])
-    q, unravel_q = jfu.ravel_pytree(y0[1])
+    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
     half = (t1 - t0) / 2
     # A path that failed before needs no multipliers: in a batch, others would wait for it.
     pending = before == optx.RESULTS.successful
@@ -83,7 +82,7 @@ def verlet_step(
     p, q, second = surface.free_flight(p, surface.normal_space(q), half, pending)
     p = surface.tangent(p, surface.normal_space(q))
     y1 = (unravel_p(p), unravel_q(q))
-    return _ended(y1, first & second, before)
+    return _end_of_step(y1, first & second, before)
 
 
 class ConstrainedState(NamedTuple):
@@ -113,13 +112,13 @@ def begin_baoab(
     keeps = getattr(flow, "keeps_constraints", flow is None)
     if not keeps:
         raise ValueError(
-            f"The flow {flow!r} does not keep the `constraint` of the terms. Use "
+            f"The flow {flow!r} does not keep the constraint of the terms. Use "
             "`BAOAB()` or `BAOAB(StormerVerlet())`."
         )
     outcome = init_constrained(solver, terms, t0, y0, args)
     kicks, rest = _kicks_and_rest(flow, terms)
     force = _force(kicks, t0, y0, args) if kicks else None
-    return ConstrainedState(force, begun(flow, rest, t0, t1, y0, args), outcome)
+    return ConstrainedState(force, begin_flow(flow, rest, t0, t1, y0, args), outcome)
 
 
 def baoab_step(
@@ -139,8 +138,7 @@ def baoab_step(
     surface = Surface.of(terms, t0, y0, args)
     kicks, rest = _kicks_and_rest(flow, terms)
     _, friction, noise = split_friction(without_constraint(terms))
-    p, unravel_p = jfu.ravel_pytree(y0[0])
-    q, unravel_q = jfu.ravel_pytree(y0[1])
+    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
     half = jnp.asarray((t1 - t0) / 2, p.dtype)
     middle = t0 + (t1 - t0) / 2
     pending = before.outcome == optx.RESULTS.successful
@@ -157,8 +155,7 @@ def baoab_step(
             return p, q, state, found
         y = (unravel_p(p), unravel_q(at.q))
         y, state, result = moved_by(flow, steps, rest, begin, end, half, y, args, state)
-        p, _ = jfu.ravel_pytree(y[0])
-        q, _ = jfu.ravel_pytree(y[1])
+        (p, _), (q, _) = map(jfu.ravel_pytree, y)
         return p, q, state, result == diffrax.RESULTS.successful
 
     # B and A. Between them the momentum need not be tangent: the multipliers of the flight
@@ -193,11 +190,11 @@ def baoab_step(
         p = p + half * force
     p = surface.tangent(p, surface.normal_space(q))
     y1 = (unravel_p(p), unravel_q(q))
-    y1, outcome = _ended(y1, first & second, before.outcome)
+    y1, outcome = _end_of_step(y1, first & second, before.outcome)
     return y1, ConstrainedState(force, flow_state, outcome)
 
 
-def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
+def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
     """The terms whose forces are the kicks, and those that the flow follows on the
     surface."""
     drift, _, _ = split_friction(without_constraint(terms))
@@ -207,14 +204,14 @@ def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[tuple, tup
     return kicks, (first, *others)
 
 
-def _force(kicks: tuple, t: RealScalarLike, y: Y, args: Args) -> Array:
+def _force(kicks: Terms, t: RealScalarLike, y: Y, args: Args) -> Array:
     """The force of the kicks, as a vector."""
     force, _ = rate(kicks, t, y, args)
     return jfu.ravel_pytree(force)[0]
 
 
 def _kick(
-    noise: tuple, t0: RealScalarLike, t1: RealScalarLike, y: Y, args: Args, name: str
+    noise: Terms, t0: RealScalarLike, t1: RealScalarLike, y: Y, args: Args, name: str
 ) -> Array:
     """The change of the momenta by the noise, as a vector."""
     drawn = drawn_variables(noise, ["W"], t0, t1, name)
@@ -222,7 +219,7 @@ def _kick(
     return jfu.ravel_pytree(kick)[0]
 
 
-def _ended(
+def _end_of_step(
     y1: Y, found: Bool[Array, ""], before: optx.RESULTS
 ) -> tuple[Y, optx.RESULTS]:
     """The end of a step, and the state of the solver after it."""

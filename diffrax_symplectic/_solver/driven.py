@@ -21,13 +21,13 @@ from .._brownian import (
     WeakBrownianPath,
 )
 from .._compat import direction, resolution, ω
-from .._custom_types import Args, RealScalarLike
+from .._custom_types import Args, RealScalarLike, Terms
 from .._terms import apply, brownian_paths
-from .brackets import apply_brackets, apply_bridge, bridge
+from .brackets import apply_brackets, apply_bridge, bridge_coefficients
 
 
 def drift_driven(
-    drift: tuple, t0: RealScalarLike, t1: RealScalarLike, args: Args
+    drift: Terms, t0: RealScalarLike, t1: RealScalarLike, args: Args
 ) -> jtu.Partial:
     """What drives the drift stages of the step: a function `(t, y)` that returns the
     change of the state by the drift over the whole step."""
@@ -38,7 +38,7 @@ def drift_driven(
 def noise_driven(
     drift: jtu.Partial,
     h: RealScalarLike,
-    noise: tuple,
+    noise: Terms,
     names: list[str],
     t0: RealScalarLike,
     t1: RealScalarLike,
@@ -68,7 +68,9 @@ def noise_driven(
             case "noise":
                 functions[name] = jtu.Partial(apply, noise, values[name], args)
             case "drift brackets":
-                areas = bridge(h, values["W"], values["H"], values.get("K"))
+                areas = bridge_coefficients(
+                    h, values["W"], values["H"], values.get("K")
+                )
                 functions[name] = jtu.Partial(
                     apply_bridge, drift, noise, areas, h, args
                 )
@@ -84,7 +86,7 @@ def noise_driven(
 
 
 def drawn_variables(
-    noise: tuple,
+    noise: Terms,
     names: list[str],
     t0: RealScalarLike,
     t1: RealScalarLike,
@@ -128,7 +130,7 @@ def _rank(name: str) -> int:
     return VARIABLES[name].rank if name in VARIABLES else -1
 
 
-def _how_to_get(name: str, noise: tuple) -> str:
+def _how_to_get(name: str, noise: Terms) -> str:
     """What a path needs to have this random variable, for messages."""
     variable = VARIABLES.get(name)
     if variable is None:
@@ -159,7 +161,7 @@ def _in_time(
 
 
 def _within_resolution(
-    noise: tuple, t0: RealScalarLike, t1: RealScalarLike
+    noise: Terms, t0: RealScalarLike, t1: RealScalarLike
 ) -> RealScalarLike:
     """`t1`, with an error when run if a `VirtualBrownianTree` does not resolve the step."""
     h = jnp.abs(t1 - t0)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, PyTree
 from .._arguments import check_takes
 from .._batch import refused_where
 from .._compat import direction
-from .._custom_types import Args, RealScalarLike, Y
+from .._custom_types import Args, RealScalarLike, Terms, Y
 from .._root_finder import all_finite
 from .._terms import rate, slow_apart
 from .base import AbstractSymplecticSolver
@@ -55,7 +55,7 @@ def check_flow(flow: Any, steps: int, owner: str) -> None:
         )
 
 
-def kicks_and_rest(flow: Flow, drift: tuple) -> tuple[tuple, tuple]:
+def kicks_and_rest(flow: Flow, drift: Terms) -> tuple[Terms, Terms]:
     """The terms whose forces are the kicks, and those that the flow follows."""
     if flow is None:
         return drift, drift
@@ -64,7 +64,7 @@ def kicks_and_rest(flow: Flow, drift: tuple) -> tuple[tuple, tuple]:
 
 
 def check_follows(
-    flow: Flow, drift: tuple, t0: RealScalarLike, y0: Y, args: Args
+    flow: Flow, drift: Terms, t0: RealScalarLike, y0: Y, args: Args
 ) -> None:
     """Raises a `ValueError` if a flow does not take this drift or state."""
     if is_solver(flow):
@@ -110,8 +110,8 @@ _NAN = (
 )
 
 
-def begun(
-    flow: Flow, drift: tuple, t0: RealScalarLike, t1: Any, y0: Y, args: Args
+def begin_flow(
+    flow: Flow, drift: Terms, t0: RealScalarLike, t1: Any, y0: Y, args: Args
 ) -> PyTree[Array]:
     """The state of the solver that is the flow, or whether a function returns NaN."""
     if flow is None:
@@ -125,7 +125,7 @@ def begun(
 def moved_by(
     flow: Flow,
     steps: int,
-    drift: tuple,
+    drift: Terms,
     t0: RealScalarLike,
     t1: RealScalarLike,
     time: RealScalarLike,
@@ -149,7 +149,7 @@ def moved_by(
     terms = diffrax.MultiTerm(*drift)
     h = (t1 - t0) / steps
 
-    def step(carry: tuple, k: Any) -> tuple[tuple, None]:
+    def step(carry: tuple[Any, ...], k: Any) -> tuple[tuple[Any, ...], None]:
         y, state, _ = carry
         begin = t0 + k * h
         # What the bath did is a jump for a solver that remembers the end of its last step.

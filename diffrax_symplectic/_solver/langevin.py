@@ -6,7 +6,7 @@ from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
 import diffrax
 import equinox as eqx
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from .._arguments import check_state, whole_number
 from .._compat import unwrapped
@@ -25,7 +25,7 @@ from .bath import after_friction, check_friction
 from .constrained import baoab_step, begin_baoab
 from .driven import drawn_variables
 from .flow import (
-    begun,
+    begin_flow,
     check_flow,
     check_follows,
     Flow,
@@ -37,13 +37,13 @@ from .flow import (
 )
 from .record import Record
 from .step import result_of
-from .times import result_at
+from .times import result_with_times_checked
 
 
 if TYPE_CHECKING:
-    from typing import ClassVar as AbstractVar
+    from typing import ClassVar as AbstractClassVar, ClassVar as AbstractVar
 else:
-    from equinox import AbstractVar
+    from equinox import AbstractClassVar, AbstractVar
 
 
 class SplittingState(NamedTuple):
@@ -64,10 +64,19 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
     kick at the start."""
 
     variables: ClassVar[tuple[str, ...]] = ("W",)
-    symmetric: eqx.AbstractClassVar[bool]
+    symmetric: AbstractClassVar[bool]
+    # How many parts of a step are friction and noise, each over an equal share of it.
+    friction_parts: ClassVar[int] = 1
     flow: AbstractVar[Flow]
     # The steps of a solver over half a flow.
     steps: AbstractVar[int]
+
+    @classmethod
+    def area_factor(cls, rate_times_step: ArrayLike) -> Any:
+        """The factor by which a step shrinks areas, where friction is one rate for all
+        momenta. At zero a step has no inverse."""
+        x = rate_times_step / (2 * cls.friction_parts)
+        return ((1 - x) / (1 + x)) ** cls.friction_parts
 
     def stage_vectors(self, num_noises):
         if not is_solver(self.flow):
@@ -106,7 +115,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         forces = None
         if self.symmetric and kicks:
             forces, _ = rate(kicks, t0, y0, args)
-        return SplittingState(forces, begun(self.flow, rest, t0, t1, y0, args))
+        return SplittingState(forces, begin_flow(self.flow, rest, t0, t1, y0, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         own_terms = terms
@@ -149,7 +158,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         result = result_of(None, (p, q))
         if self.flow is not None:
             result = R.where(flowed == R.successful, result, flowed)
-        result = result_at(terms, t0, t1, result)
+        result = result_with_times_checked(terms, t0, t1, result)
         # Exchanged once more, if the state is Diffrax's (x, v).
         _, y1 = momentum_first(own_terms, (p, q))
         state = SplittingState(forces, flow_state)
@@ -245,7 +254,7 @@ class BAOAB(AbstractLangevinSplitting):
     **Diffrax's terms.** It also takes `diffrax.UnderdampedLangevinDriftTerm` and
     `diffrax.UnderdampedLangevinDiffusionTerm`, with their state `(x, v)`.
 
-    **Constraints.** For terms with a `constraint` this is g-BAOAB: A is a step of RATTLE,
+    **Constraints.** For constrained terms this is g-BAOAB: A is a step of RATTLE,
     as in [`diffrax_symplectic.StormerVerlet`][], and B and O keep momenta tangent, with
     their exact Maxwell distribution. With the flow `StormerVerlet()`, kinetic energies at
     the ends of long steps are better.
@@ -300,7 +309,7 @@ class BAOAB(AbstractLangevinSplitting):
             made_jump,
             type(self).__name__,
         )
-        result = result_at(terms, t0, t1, result_of(state.outcome, y1))
+        result = result_with_times_checked(terms, t0, t1, result_of(state.outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), state, result
 
 

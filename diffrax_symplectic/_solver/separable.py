@@ -15,7 +15,7 @@ from .base import (
 from .constrained import init_constrained, verlet_step
 from .record import Record
 from .step import Outcome, result_of
-from .times import result_at
+from .times import result_with_times_checked
 
 
 Variant: TypeAlias = Literal["a", "b", "c", "d", "e", "f"]
@@ -206,7 +206,7 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     one evaluation of the forces, and must resolve the fastest frequency $\omega$ of $H_0$:
     $\omega h < 2$.
 
-    **Constraints.** For terms with a `constraint` each drift over $h / 2$ is a step of
+    **Constraints.** For constrained terms each drift over $h / 2$ is a step of
     RATTLE, $q \gets q + \frac h2 M^{-1} p$ with $p \gets p - J(q)^\top \lambda$ and
     multipliers $\lambda$ for which the new $q$ satisfies the constraint, and momenta are
     made tangent, $J M^{-1} p = 0$. Multipliers are found by Newton's method to rounding; a
@@ -248,7 +248,7 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
             return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
         at = terms, t0, t1, y0, args
         y1, outcome = verlet_step(*at, solver_state, type(self).__name__)
-        result = result_at(terms, t0, t1, result_of(outcome, y1))
+        result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), outcome, result
 
 

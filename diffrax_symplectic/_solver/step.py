@@ -173,7 +173,7 @@ class Stages(eqx.Module):
         return _evaluate(self.step, [tableau.stages[i] for i in group], position)
 
 
-def closed(step: Step, y0: Y) -> Step:
+def with_explicit_arrays(step: Step, y0: Y) -> Step:
     """The same step, with the arrays that its functions capture made explicit. Each
     function is traced once, here."""
     # Converted functions accept only the types that they were traced for.
@@ -230,40 +230,44 @@ def _part(y: PyTree, part: str) -> PyTree:
 def _position(
     y0: Y, stages: tuple[Stage, ...], rows: np.ndarray, values: Values
 ) -> PyTree[Array]:
-    """`y0 + sum_i rows[:, i] values[i]` over the known values, stacked unless there is only
-    one row."""
+    """`y0 + sum_i rows[:, i] values[i]`, stacked unless there is only one row. `values` may
+    hold stages that these rows do not use, with weights of zero; stages that are not in it
+    count as zero."""
 
-    def scaled(i: int) -> PyTree[Array]:
-        column = rows[:, i]
-        if len(column) == 1:
-            weight = float(column[0])
-            # A product with one would stay in the program.
-            return values[i] if weight == 1 else (weight * values[i] ** ω).ω
+    def moved(part: str) -> PyTree[Array]:
+        """The state, or half of it, moved by the stages that write it."""
+        base = _part(y0, part)
+        # Zeros are left out here, since XLA may not drop products with zero, which are not
+        # zero for infinite values.
+        products = [
+            _product(rows[:, i], value)
+            for i, value in values.items()
+            if rows[:, i].any() and stages[i].writes == part
+        ]
+        if products:
+            # Add the small terms first, for fewer roundings at the size of the state.
+            return (base**ω + tree_sum(products) ** ω).ω
+        return base if len(rows) == 1 else jtu.tree_map(for_each_row, base)
 
-        def products(value: Array) -> Any:
-            one_axis_each = (-1, *[1] * value.ndim)
-            return column.astype(value.dtype).reshape(one_axis_each) * value
-
-        return jtu.tree_map(products, values[i])
-
-    def stack(x: Array) -> Array:
+    def for_each_row(x: Array) -> Array:
         return jnp.broadcast_to(x, (len(rows), *jnp.shape(x)))
 
-    def add(part: str) -> PyTree[Array]:
-        base = _part(y0, part)
-        total = None
-        for i in values:
-            # Zeros are left out here, since XLA may not drop products with zero, which are
-            # not zero for infinite values.
-            if rows[:, i].any() and stages[i].writes == part:
-                total = scaled(i) if total is None else (total**ω + scaled(i) ** ω).ω
-        if total is None:
-            return base if len(rows) == 1 else jtu.tree_map(stack, base)
-        # Add the small terms first, for fewer roundings at the size of the state.
-        return (base**ω + total**ω).ω
-
     # A tableau writes whole states, or halves of states, but not both.
-    return add("y") if stages[0].writes == "y" else (add("p"), add("q"))
+    return moved("y") if stages[0].writes == "y" else (moved("p"), moved("q"))
+
+
+def _product(weights: np.ndarray, value: _Value) -> PyTree[Array]:
+    """A value times each of these weights, stacked unless there is only one."""
+    if len(weights) == 1:
+        weight = float(weights[0])
+        # A product with one would stay in the program.
+        return value if weight == 1 else (weight * value**ω).ω
+
+    def products(x: Array) -> Any:
+        as_column = (-1, *[1] * x.ndim)
+        return weights.astype(x.dtype).reshape(as_column) * x
+
+    return jtu.tree_map(products, value)
 
 
 # The outcome of the stage equations, or of an earlier failed step; `None` if there are
@@ -318,7 +322,7 @@ def result_of(outcome: Outcome, y1: Y) -> diffrax.RESULTS:
 def _traced_once(
     plan: StepPlan, step: Step, y0: Y, before, finder: Any, max_steps: int
 ):
-    stages = Stages(plan, closed(step, y0), y0)
+    stages = Stages(plan, with_explicit_arrays(step, y0), y0)
     y1, _, outcome = _implicit_step(stages, before, finder=finder, max_steps=max_steps)
     return y1, outcome
 

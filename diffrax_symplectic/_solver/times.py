@@ -23,7 +23,8 @@ _OUTSIDE = (
 
 
 def check_resolution(h: float, t0: float, t1: float, dtype: Any) -> None:
-    """Raises a `ValueError` if `result_at` would report steps of this size as failed."""
+    """Raises a `ValueError` if `result_with_times_checked` would report steps of this size
+    as failed."""
     rounding = float(jnp.finfo(dtype).eps) * max(abs(t0), abs(t1))
     if h < ROUNDINGS * rounding:
         raise ValueError(
@@ -33,7 +34,7 @@ def check_resolution(h: float, t0: float, t1: float, dtype: Any) -> None:
         )
 
 
-def result_at(
+def result_with_times_checked(
     terms: PyTree[diffrax.AbstractTerm],
     t0: RealScalarLike,
     t1: RealScalarLike,
@@ -47,13 +48,13 @@ def result_at(
     h = t1 - t0
     # The times of a single step may be integers.
     eps = float(jnp.finfo(jnp.result_type(t0, jnp.float32)).eps)
-    short = h < ROUNDINGS * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-    result = R.where(short, R.dt_min_reached, result)
+    is_too_short = h < ROUNDINGS * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    result = R.where(is_too_short, R.dt_min_reached, result)
     for path in brownian_paths(terms):
         # Most paths have no ends, so that nothing needs to be checked when run. Ends that
         # are traced arrays cannot be compared here.
-        known = isinstance(path.t0, float) and isinstance(path.t1, float)
-        if known and path.t0 == -np.inf and path.t1 == np.inf:
+        is_known = isinstance(path.t0, float) and isinstance(path.t1, float)
+        if is_known and path.t0 == -np.inf and path.t1 == np.inf:
             continue
         # In a solve backward in time Diffrax changes the sign of all times.
         forward = direction(terms) > 0
@@ -61,6 +62,6 @@ def result_at(
         end = jnp.where(forward, t1, -t0)
         # Times are rounded, so that the last step may end just behind the path.
         slack = 0.01 * h
-        outside = (begin < path.t0 - slack) | (end > path.t1 + slack)
-        result = eqx.error_if(result, outside, _OUTSIDE)
+        is_outside = (begin < path.t0 - slack) | (end > path.t1 + slack)
+        result = eqx.error_if(result, is_outside, _OUTSIDE)
     return result

@@ -1,12 +1,16 @@
 """Operations with regions: conditionals and loops."""
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 from .backend import array_types, drjit
 from .mlir import block_of, call_target, operations_in
 from .operation import Operation, rule
 from .tensor import as_own_literal, chosen, copied, flat, known, merged, Tensor, unflat
+
+
+# A function that returns entries of arrays.
+_Branch: TypeAlias = Callable[[], tuple[Any, ...]]
 
 
 @rule
@@ -37,19 +41,21 @@ def _case(o, index):
     for i in raising:
         o.fail(index.item() == i)
     branches = [i for i in range(number) if i not in raising]
-    return unflat(_taken(o, index.item(), branches), o.shapes())
+    return unflat(_result_of_branch(o, index.item(), branches), o.shapes())
 
 
-def _taken(o: Operation, index: Any, branches: Sequence[int]) -> tuple:
+def _result_of_branch(
+    o: Operation, index: Any, branches: Sequence[int]
+) -> tuple[Any, ...]:
     """The entries that the branch with this index returns. If there is none in `branches`,
     it is the last of them."""
     first, *others = branches
 
-    def run_first() -> tuple:
+    def run_first() -> tuple[Any, ...]:
         return copied(o.run(first, []))
 
-    def run_others() -> tuple:
-        return _taken(o, index, others)
+    def run_others() -> tuple[Any, ...]:
+        return _result_of_branch(o, index, others)
 
     if not others:
         return run_first()
@@ -57,13 +63,13 @@ def _taken(o: Operation, index: Any, branches: Sequence[int]) -> tuple:
 
 
 def _conditional(
-    o: Operation, condition: Any, if_true: Callable, if_false: Callable
-) -> tuple:
+    o: Operation, condition: Any, if_true: _Branch, if_false: _Branch
+) -> tuple[Any, ...]:
     """The entries that one of two functions returns: where the condition holds, those of
     the first."""
 
-    def with_failures(branch: Callable[[], tuple]) -> Callable[[], tuple]:
-        def run() -> tuple:
+    def with_failures(branch: _Branch) -> _Branch:
+        def run() -> tuple[Any, ...]:
             entries, failed = o.failing(branch)
             return *entries, failed
 
@@ -89,10 +95,10 @@ def _if(o, condition):
     if value is not None:
         return o.run(0 if value else 1, [])
 
-    def if_true() -> tuple:
+    def if_true() -> tuple[Any, ...]:
         return copied(o.run(0, []))
 
-    def if_false() -> tuple:
+    def if_false() -> tuple[Any, ...]:
         return copied(o.run(1, []))
 
     # With `select` in its place both branches run: the midpoint rule, whose sweeps have
@@ -147,7 +153,7 @@ def _loop(o: Operation, state: list[Tensor], moves: Sequence[bool]) -> list[Tens
         # A lane that failed could go on for ever.
         return going.item() & ~(failed | new)
 
-    def once(failed: Any, *entries: Any) -> tuple:
+    def once(failed: Any, *entries: Any) -> tuple[Any, ...]:
         state, new = o.failing(lambda: o.run(1, whole(entries)))
         return failed | new, *copied(chosen(state, moves))
 

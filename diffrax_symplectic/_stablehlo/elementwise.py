@@ -117,28 +117,32 @@ def _sign(a):
     return dr.select(a == 0, 0, dr.select(a > 0, type(a)(1), type(a)(-1)))
 
 
-def _power(a, b):
-    """Uses logarithms, or multiplication for small integer exponents."""
-    if is_literal(b) and float(b[0]).is_integer() and abs(b[0]) <= _MOST_MULTIPLIED:
-        return _integer_power(a, int(b[0]))
+def _power(base, exponent):
+    """By logarithms, or by multiplication for small integer exponents."""
+    if is_literal(exponent):
+        known = exponent[0]
+        if float(known).is_integer() and abs(known) <= _MOST_MULTIPLIED:
+            return _integer_power(base, int(known))
     dr = drjit()
-    number = type(a)
-    size = dr.exp(dr.log(dr.abs(a)) * b)
+    dtype = type(base)
+    size = dr.exp(dr.log(dr.abs(base)) * exponent)
     # Of a negative number only whole powers are real: odd ones are negative.
-    whole = dr.floor(b) == b
-    odd = dr.floor(b / 2) * 2 != b
-    other = dr.select(dr.isinf(a), size, number(np.nan))
-    negative = dr.select(whole, dr.select(odd, -size, size), other)
-    power = dr.select(a < 0, negative, size)
-    # Where a logarithm of zero would meet an exponent of zero, and of one an infinite one.
-    power = dr.select((a == 0) & (b > 0), number(0), power)
-    return dr.select((b == 0) | (a == 1), number(1), power)
+    is_whole = dr.floor(exponent) == exponent
+    is_odd = dr.floor(exponent / 2) * 2 != exponent
+    whole_power = dr.select(is_odd, -size, size)
+    other_power = dr.select(dr.isinf(base), size, dtype(np.nan))
+    of_negative = dr.select(is_whole, whole_power, other_power)
+    power = dr.select(base < 0, of_negative, size)
+    # Where the product of logarithm and exponent is infinity times zero, or may be: a power
+    # of zero, the power zero, and a power of one.
+    power = dr.select((base == 0) & (exponent > 0), dtype(0), power)
+    return dr.select((exponent == 0) | (base == 1), dtype(1), power)
 
 
-def _integer_power(a, exponent: int):
+def _integer_power(base, exponent: int):
     """By repeated squares."""
-    power = type(a)(1)
-    square = a
+    power = type(base)(1)
+    square = base
     left = abs(exponent)
     while left:
         power = power * square if left & 1 else power
@@ -175,23 +179,24 @@ def _atan(a):
     return _atan2(a, type(a)(1))
 
 
-def _atan2(a, b):
+def _atan2(y, x):
     """By the arcsine of an angle of at most 45 degrees. Dr.Jit's own takes a maximum that
     LLVM 15 and 16 cannot compile: they abort the process."""
     dr = drjit()
-    number = type(a)
-    steep = dr.abs(a) > dr.abs(b)
-    small = dr.select(steep, dr.abs(b), dr.abs(a))
-    large = dr.select(steep, dr.abs(a), dr.abs(b))
+    dtype = type(y)
+    steep = dr.abs(y) > dr.abs(x)
+    small = dr.select(steep, dr.abs(x), dr.abs(y))
+    large = dr.select(steep, dr.abs(y), dr.abs(x))
     # Two infinities count as equal.
-    slope = dr.select(small == large, number(1), small / large)
+    slope = dr.select(small == large, dtype(1), small / large)
     angle = dr.asin(slope / dr.sqrt(1 + slope * slope))
     # From one eighth of the circle to all of it.
     angle = dr.select(steep, np.pi / 2 - angle, angle)
-    angle = dr.select(a == 0, number(0), angle)
-    # The sign of `b` counts, also where it is zero: the angle of (0, -0) is pi.
-    angle = dr.select(dr.copysign(number(1), b) < 0, np.pi - angle, angle)
-    return dr.select(_is_nan(a) | _is_nan(b), a + b, dr.copysign(angle, a))
+    # Two zeros counted as equal, too, but their angle is 0.
+    angle = dr.select(y == 0, dtype(0), angle)
+    # The sign of `x` counts, also where it is zero: the angle of (0, -0) is pi.
+    angle = dr.select(dr.copysign(dtype(1), x) < 0, np.pi - angle, angle)
+    return dr.select(_is_nan(y) | _is_nan(x), y + x, dr.copysign(angle, y))
 
 
 def _erf(a):
@@ -202,14 +207,14 @@ def _erfc(a):
     """In the tail `1 - erf(a)` has no digits left. So it is a smooth function, of which
     `_erfc_series` has a polynomial, times `exp(-a^2)`."""
     dr = drjit()
-    number = type(a)
+    dtype = type(a)
     # Not infinite, of which the next quotient would be NaN.
-    size = _minimum(dr.abs(a), number(_ERFC_END))
+    size = _minimum(dr.abs(a), dtype(_ERFC_END))
     s = (size - _ERFC_MIDDLE) / (size + _ERFC_MIDDLE)
     first, *others = _erfc_series(_ERFC_DEGREES[dr.itemsize_v(a)])
     # The sum of the Chebyshev series, by Clenshaw's recurrence.
-    current = number(0)
-    previous = number(0)
+    current = dtype(0)
+    previous = dtype(0)
     for coefficient in reversed(others):
         following = dr.fma(2 * s, current, coefficient - previous)
         previous = current
@@ -236,11 +241,11 @@ def _erfc_series(degree: int) -> list[float]:
 
     # An interpolation at Chebyshev's nodes, so many that only rounding is left in the
     # coefficients that are kept. NumPy's `chebinterpolate` rounds more.
-    number = 64
-    angles = (np.arange(number) + 0.5) * np.pi / number
+    num_nodes = 64
+    angles = (np.arange(num_nodes) + 0.5) * np.pi / num_nodes
     # Where the variable of the polynomials is the cosine of the angle.
     x = _ERFC_MIDDLE / np.tan(angles / 2) ** 2
-    series = np.asarray(dct((1 + 2 * x) * erfcx(x))) / number
+    series = np.asarray(dct((1 + 2 * x) * erfcx(x))) / num_nodes
     series[0] /= 2
     return series[: degree + 1].tolist()
 

@@ -61,14 +61,14 @@ def to_integer(kind: type, a: Any) -> Any:
     """Rounded to zero. What StableHLO leaves open is as in JAX: NaN becomes zero, and
     numbers out of range the smallest or the largest integer."""
     dr = drjit()
-    number = type(a)
+    dtype = type(a)
     signed = dr.is_signed_v(kind)
     bits = 8 * dr.itemsize_v(kind)
     # The first whole number beyond the range, a power of two, and the float before it.
     end = 2 ** (bits - 1 if signed else bits)
     below = float(np.nextafter(end, 0, dtype=f"f{dr.itemsize_v(a)}"))
     low = -end if signed else 0
-    inside = dr.select(a > low, dr.select(a < end, a, number(below)), number(low))
+    inside = dr.select(a > low, dr.select(a < end, a, dtype(below)), dtype(low))
     # Dr.Jit has no conversion to integers of eight bits.
     whole = kind(array_types()["i32"](inside)) if bits < 32 else kind(inside)
     if int(below) < end - 1:

@@ -136,14 +136,17 @@ def source_lines(location: str) -> list[SourceLine]:
     """The lines that an operation of MLIR comes from, innermost first, out of its printed
     location. JAX records several if `jax_traceback_in_locations_limit` says so."""
     found = re.findall(r'"([^"]*)"\("([^"]+)":(\d+)', location)
-    return [SourceLine(_named(name), file, int(line)) for name, file, line in found]
+    return [
+        SourceLine(_name_of_function(name), file, int(line))
+        for name, file, line in found
+    ]
 
 
 # What Python calls parts of a function: `fn.<locals>.<genexpr>` is a line of `fn`.
 _UNNAMED = ("<locals>", "<genexpr>", "<listcomp>", "<dictcomp>", "<setcomp>")
 
 
-def _named(qualified: str) -> str:
+def _name_of_function(qualified: str) -> str:
     """The name of the function that code of this qualified name stands in."""
     names = [part for part in qualified.split(".") if part not in _UNNAMED]
     return names[-1] if names else qualified

@@ -76,9 +76,9 @@ def _matrices(o: Operation, x: Tensor, side: str) -> np.ndarray:
 def _reduce(o, *xs):
     # Several arrays may be reduced together, such as values and places for `argmax`.
     # First come the arrays, then where each reduction starts.
-    number = len(xs) // 2
-    arrays = xs[:number]
-    starts = xs[number:]
+    num_arrays = len(xs) // 2
+    arrays = xs[:num_arrays]
+    starts = xs[num_arrays:]
     shape = arrays[0].shape
     axes = o.ints("dimensions")
     kept = [axis for axis in range(len(shape)) if axis not in axes]
@@ -93,7 +93,7 @@ def _reduce(o, *xs):
         for part in parts:
             total = o.run(0, [*total, *part])
         columns.append(total)
-    return _joined(columns, tuple(sizes), number)
+    return _join_columns(columns, tuple(sizes), num_arrays)
 
 
 def _entries_at(arrays: Sequence[Tensor], place: Any) -> list[Tensor]:
@@ -101,13 +101,12 @@ def _entries_at(arrays: Sequence[Tensor], place: Any) -> list[Tensor]:
     return [Tensor([x.entries[place]], ()) for x in arrays]
 
 
-def _joined(
-    columns: list[list[Tensor]], shape: tuple[int, ...], number: int
+def _join_columns(
+    columns: list[list[Tensor]], shape: tuple[int, ...], num_arrays: int
 ) -> list[Tensor]:
     """Arrays of this shape. Each of `columns` has an entry of each of them."""
-    return [
-        Tensor([column[k].item() for column in columns], shape) for k in range(number)
-    ]
+    entries = [[column[k].item() for column in columns] for k in range(num_arrays)]
+    return [Tensor(of_array, shape) for of_array in entries]
 
 
 # Neutral elements, by the operation that is repeated.
@@ -137,9 +136,9 @@ def _changes_nothing(o: Operation, starts: Sequence[Tensor]) -> bool:
 @rule
 def _reduce_window(o, *xs):
     """Cumulative sums, and other reductions of windows."""
-    number = len(xs) // 2
-    arrays = xs[:number]
-    initial = xs[number:]
+    num_arrays = len(xs) // 2
+    arrays = xs[:num_arrays]
+    initial = xs[num_arrays:]
     if any(size > 1 for size in o.optional("base_dilations")):
         raise NotReplayed(o.op, f"`{o.op.name}` of entries that are apart")
     shape = arrays[0].shape
@@ -160,7 +159,7 @@ def _reduce_window(o, *xs):
                 place = arrays[0].places[tuple(at)]
                 total = o.run(0, [*total, *_entries_at(arrays, place)])
         columns.append(total)
-    return _joined(columns, o.shape, number)
+    return _join_columns(columns, o.shape, num_arrays)
 
 
 @rule
@@ -181,9 +180,10 @@ def _sort(o, *xs):
                 # takes both of each array in turn. The right one is asked about first: they
                 # are exchanged only if the right one must stand first, so equals stay.
                 pairs = [Tensor([x[i]], ()) for x in outs for i in (right, left)]
-                wrong = o.run(0, pairs)[0].item()
+                (answer,) = o.run(0, pairs)
+                is_wrong = answer.item()
                 for x in outs:
-                    low = select(wrong, x[right], x[left])
-                    x[right] = select(wrong, x[left], x[right])
-                    x[left] = low
+                    first = select(is_wrong, x[right], x[left])
+                    x[right] = select(is_wrong, x[left], x[right])
+                    x[left] = first
     return [Tensor(out, x.shape) for out, x in zip(outs, xs)]

@@ -143,7 +143,7 @@ def each(fn: Callable, *xs: Tensor) -> Tensor:
     return Tensor([fn(*row) for row in zip(*columns)], largest.shape)
 
 
-def flat(xs: Sequence[Tensor]) -> tuple:
+def flat(xs: Sequence[Tensor]) -> tuple[Any, ...]:
     """The entries of all these tensors."""
     return tuple(entry for x in xs for entry in x.entries)
 
@@ -156,7 +156,7 @@ def unflat(entries: Iterable[Any], shapes: Sequence[tuple[int, ...]]) -> list[Te
     ]
 
 
-def copied(xs: Sequence[Tensor]) -> tuple:
+def copied(xs: Sequence[Tensor]) -> tuple[Any, ...]:
     """The entries of these tensors as objects of their own, as a branch or the body of a
     loop must return them: Dr.Jit writes the result of a conditional into the objects that
     a branch returned, so a value from outside would change for all who hold it."""

@@ -142,7 +142,7 @@ def drift_order(tableau: FlatTableau) -> int:
 @ft.singledispatch
 def _strong(tableau: AbstractTableau) -> dict:
     """The conditions for the strong order of the tableau's family."""
-    raise _unknown(tableau)
+    raise _unknown_tableau(tableau)
 
 
 @_strong.register
@@ -205,7 +205,7 @@ class _Weak(NamedTuple):
 @ft.singledispatch
 def _weak(tableau: AbstractTableau) -> _Weak:
     """The conditions for the weak order of the tableau's family."""
-    raise _unknown(tableau)
+    raise _unknown_tableau(tableau)
 
 
 @_weak.register
@@ -363,7 +363,7 @@ def _variance(name: str) -> float:
     return variable.variance
 
 
-def _unknown(tableau: AbstractTableau) -> ValueError:
+def _unknown_tableau(tableau: AbstractTableau) -> ValueError:
     return ValueError(
         "The conditions are known for `GeneralTableau`, `SeparableTableau`, "
         f"`PartitionedTableau` and `AdditiveTableau`; got `{type(tableau).__name__}`."

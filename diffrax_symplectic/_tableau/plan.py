@@ -6,7 +6,7 @@ import functools as ft
 import itertools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool
@@ -130,9 +130,9 @@ def _merge(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
         if channels_agree != same_channels or not _same_evaluation(tableau, i, j):
             continue
         if same_channels:
-            merged = _added(tableau, i, j)
+            merged = _with_coefficients_added(tableau, i, j)
         elif _same_use(tableau, i, j):
-            merged = _driven_by_both(tableau, i, j)
+            merged = _with_channels_joined(tableau, i, j)
         else:
             continue
         # Merge one pair at a time: the merged stage may equal another.
@@ -158,18 +158,18 @@ def _same_use(tableau: FlatTableau, i: int, j: int) -> bool:
     return in_stages and _equal(tableau.weights[i], tableau.weights[j])
 
 
-def _added(tableau: FlatTableau, i: int, j: int) -> FlatTableau:
+def _with_coefficients_added(tableau: FlatTableau, i: int, j: int) -> FlatTableau:
     """The tableau without stage `j`, whose coefficients are added to those of `i`."""
     matrix = tableau.matrix.copy()
     weights = tableau.weights.copy()
     # A sum that should vanish may not in floating point: 0.1 + 0.2 - 0.3 is not 0.
     matrix[:, i] = _snap(matrix[:, i] + matrix[:, j])
     weights[i] = _snap(weights[i] + weights[j])
-    added = dataclasses.replace(tableau, matrix=matrix, weights=weights)
-    return _without(added, j)
+    with_sums = dataclasses.replace(tableau, matrix=matrix, weights=weights)
+    return _without(with_sums, j)
 
 
-def _driven_by_both(tableau: FlatTableau, i: int, j: int) -> FlatTableau:
+def _with_channels_joined(tableau: FlatTableau, i: int, j: int) -> FlatTableau:
     """The tableau without stage `j`, whose channels drive stage `i` as well."""
     channels = tableau.stages[i].channels + tableau.stages[j].channels
     stages = list(tableau.stages)
@@ -215,7 +215,7 @@ def _as_block(
 
 def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
     """Groups stages that evaluate the same vector field."""
-    groups: dict[tuple, list[int]] = {}
+    groups: dict[tuple[Any, ...], list[int]] = {}
     for i in stages:
         groups.setdefault(tableau.stages[i].kind, []).append(i)
     return tuple(tuple(group) for group in groups.values())

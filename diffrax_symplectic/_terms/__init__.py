@@ -3,7 +3,7 @@ paths that they hold.
 
 What users call:
 
-- `hamiltonian`: `hamiltonian_terms` and `noise_terms`, the symplectic gradients.
+- `hamiltonian`: `hamiltonian_terms` and `noise_terms`.
 - `langevin`: `langevin_terms` and `bath_terms`; a folder.
 - `spins`, `waves`: `spin_terms` and `wave_terms`, Hamiltonians of another variable, which
   `lifted` makes of `(p, q)`.
@@ -16,6 +16,7 @@ What solvers and expectations ask of terms, from the bottom up:
 - `evaluation`: calls of the user's functions, with advice on their errors.
 - `constrained_drift`: the drift of a system with a constraint.
 - `drift_and_noise`: which terms are drifts, and which are noises.
+- `symplectic_gradients`: the vector fields of Hamiltonians.
 - `vector_fields`: vector fields times controls.
 - `step_variables`: the random variables of a step and their laws.
 - `structure`: whether a system has the structure that a solver needs, and what is wrong
@@ -26,9 +27,9 @@ from .constrained_drift import constrained, constraint_of
 from .constrained_drift import refuse_constraint, without_constraint
 from .constraint import check_start, constrained_state, NormalSpace, Surface
 from .dependence import acts_elementwise, Dependence
-from .drift_and_noise import control_struct, number_of_noises, split_terms
+from .drift_and_noise import control_struct, field_of, number_of_noises, split_terms
 from .evaluation import evaluated
-from .hamiltonian import hamiltonian_terms, IndexedNoise, noise_terms, slow_apart
+from .hamiltonian import hamiltonian_terms, noise_terms
 from .langevin import AbstractFriction, bath_terms, friction_apart, FrictionAlong
 from .langevin import langevin_terms, momentum_first, semidefinite_root, split_friction
 from .lifted import has_lifted
@@ -41,5 +42,6 @@ from .structure import additive_fault, check_assertions, check_baths_have_own_no
 from .structure import check_drifts_differ, check_stratonovich, check_structure
 from .structure import commuting, constant_fault, Fault, FRICTION
 from .structure import needs_truncation, separable_fault, without_truncation
+from .symplectic_gradients import IndexedNoise, slow_apart
 from .vector_fields import apply, apply_one, check_fit, rate, tree_sum
 from .waves import from_pair, to_pair, wave_terms

@@ -17,8 +17,8 @@ Constraint = Callable[[PyTree, Args], Float[Array, " c"]]
 
 # What every refusal advises. These two solvers find the multipliers of a constraint.
 KEEP = (
-    "Use `StormerVerlet()`, or for the terms of `langevin_terms` `BAOAB()`: they keep it "
-    "to rounding"
+    "Use `StormerVerlet()`, or for the terms of `langevin_terms` `BAOAB()`: they keep the "
+    "constraint to rounding"
 )
 
 
@@ -46,7 +46,7 @@ class ConstrainedDrift(diffrax.AbstractTerm):
 
     def prod(self, vf, control) -> NoReturn:
         raise ValueError(
-            "These terms have a `constraint`, and cannot be solved without multipliers. "
+            "These terms are constrained, and cannot be solved without multipliers. "
             f"{KEEP}."
         )
 
@@ -67,7 +67,7 @@ def constraint_of(terms: PyTree[diffrax.AbstractTerm]) -> Constraint | None:
     # One at a time would leave the other: their multipliers belong to one equation.
     if len(found) > 1:
         raise ValueError(
-            f"Only one of the terms may have a `constraint`; got {len(found)}. Return all "
+            f"Only one of the terms may be constrained; got {len(found)}. Return all "
             "constraints from one function, as one array of shape `(c,)`."
         )
     return found[0] if found else None
@@ -85,7 +85,7 @@ def without_constraint(terms: _T) -> _T:
 def refuse_constraint(terms: PyTree[diffrax.AbstractTerm], name: str) -> None:
     """Raises a `ValueError` if the terms have a constraint."""
     if constraint_of(terms) is not None:
-        raise ValueError(f"`{name}` takes no terms with a `constraint`. {KEEP}.")
+        raise ValueError(f"`{name}` takes no constrained terms. {KEEP}.")
 
 
 def _nan_like(x: Array) -> Array:

@@ -26,14 +26,14 @@ class Dependence:
 
     def independent(self, of: Callable, part: Callable = lambda out: out) -> bool:
         """Whether `part(result)` is independent of `of(*inputs)`, PyTrees of arrays."""
-        used_results = _marked(part, self._out)
+        used_results = _marks(part, self._out)
         # A program for these results alone reads fewer inputs.
         _, read = dce_jaxpr(self._jaxpr, used_results)
-        marked = _marked(lambda inputs: of(*inputs), self._inputs)
+        marked = _marks(lambda inputs: of(*inputs), self._inputs)
         return not any(is_read and asked for is_read, asked in zip(read, marked))
 
 
-def _marked(select: Callable, tree: PyTree) -> list[bool]:
+def _marks(select: Callable, tree: PyTree) -> list[bool]:
     """Which leaves of `tree` are leaves of `select(tree)`."""
     # Leaves may be equal, or have no values, so they are told apart by their numbers.
     treedef = jtu.tree_structure(tree)

@@ -1,6 +1,8 @@
 """The terms of a system one by one: which are drifts, which are noises, and how many noises
 there are."""
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
@@ -8,7 +10,7 @@ from jaxtyping import PyTree
 
 from .._brownian import num_noises
 from .._compat import is_adjoint_term, unwrapped
-from .._custom_types import RealScalarLike
+from .._custom_types import RealScalarLike, Terms
 from .constrained_drift import ConstrainedDrift
 from .paths import brownian_paths
 
@@ -22,7 +24,7 @@ _BACKSOLVE = (
 )
 
 
-def split_terms(terms: diffrax.AbstractTerm) -> tuple[tuple, tuple]:
+def split_terms(terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
     """Drift terms and noise terms. A term is noise if it has a Brownian path, or if it is
     neither the first term nor an `ODETerm`.
 
@@ -47,11 +49,18 @@ def _is_ode(term: diffrax.AbstractTerm) -> bool:
     return isinstance(unwrapped(term), diffrax.ODETerm | ConstrainedDrift)
 
 
-def flattened(terms: diffrax.AbstractTerm) -> tuple:
+def flattened(terms: diffrax.AbstractTerm) -> Terms:
     """The terms of a `MultiTerm`, including nested ones."""
     if isinstance(terms, diffrax.MultiTerm):
         return tuple(part for term in terms.terms for part in flattened(term))
     return (terms,)
+
+
+def field_of(term: diffrax.AbstractTerm) -> Any:
+    """The vector field of an `ODETerm`, also of one that Diffrax has wrapped; `None` for
+    other terms."""
+    term = unwrapped(term)
+    return term.vector_field if isinstance(term, diffrax.ODETerm) else None
 
 
 def control_struct(

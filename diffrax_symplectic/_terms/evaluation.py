@@ -49,12 +49,12 @@ def scalar_energy(out: PyTree, name: str = "H0") -> Array:
             "of freedom. (For a batch of paths write it for one path, and `jax.vmap` the "
             "solve.)"
         )
-    check_real(name, out)
+    check_real_energies(name, out)
     # `jax.grad` refuses integers, such as the `0` of a particle without energy.
     return jnp.asarray(out, jnp.result_type(out, float))
 
 
-def check_real(name: str, out: PyTree[Array]) -> None:
+def check_real_energies(name: str, out: PyTree[Array]) -> None:
     if not all(map(_is_real, jtu.tree_leaves(out))):
         raise ValueError(
             f"`{name}` must return real numbers; got {eqx.tree_pformat(out)}. Take "

@@ -11,7 +11,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
 from .._arguments import check_takes, real_array
-from .hamiltonian import hamiltonian_terms, IndexedNoise
+from .hamiltonian import hamiltonian_terms
+from .symplectic_gradients import IndexedNoise
 
 
 class Lifted(eqx.Module):

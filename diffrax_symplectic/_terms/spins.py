@@ -111,8 +111,9 @@ class _DampedPrecession(eqx.Module):
         w3 = g3 + alpha * (s1 * g2 - s2 * g1)
         # `symplectic_gradient` of `omega . s(p, q)`, with `omega` fixed, by hand: it takes
         # 1.3 times as long by `jax.grad`.
-        p1, p2 = _components(y[0])
-        q1, q2 = _components(y[1])
+        p, q = y
+        p1, p2 = _components(p)
+        q1, q2 = _components(q)
         dp1 = -(w1 * q2 - w2 * p2 + w3 * q1)
         dp2 = -(w1 * q1 + w2 * p1 - w3 * q2)
         dq1 = w1 * p2 + w2 * q2 + w3 * p1

@@ -146,7 +146,7 @@ def _paths_of_known_laws(
             "`terms` must hold Brownian paths whose laws are known, a `WeakBrownianPath` "
             "or a Gaussian path with `levy_area=BrownianIncrement`, `SpaceTimeLevyArea` or "
             "`SpaceTimeTimeLevyArea`, also within a `PlateauBrownianPath`; got "
-            f"{[_named(path) for path in unknown]}. (For a system without noise, pass a "
+            f"{[_name_of(path) for path in unknown]}. (For a system without noise, pass a "
             "noise that is zero, such as `0 * q`.)"
         )
     return paths
@@ -164,5 +164,5 @@ def _known_numbers(paths: list[diffrax.AbstractBrownianPath]) -> tuple[int, ...]
     return path_numbers(paths)
 
 
-def _named(path: diffrax.AbstractBrownianPath) -> str:
+def _name_of(path: diffrax.AbstractBrownianPath) -> str:
     return f"{type(path).__name__} with {getattr(path.levy_area, '__name__', '?')}"

@@ -12,24 +12,24 @@ from jaxtyping import Array, Float, PyTree
 
 from .._brownian import num_noises, raveled
 from .._compat import unwrapped, ω
-from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
+from .._custom_types import Args, IntScalarLike, RealScalarLike, Terms, Y
 from .constrained_drift import without_constraint
 from .drift_and_noise import control_struct, flattened
-from .hamiltonian import HamiltonianNoise, OneNoise
+from .symplectic_gradients import HamiltonianNoise, OneNoise
 
 
 # With `jit` this is traced and lowered once for several stages.
 @eqx.filter_jit
-def apply(terms: tuple, controls: list, args: Args, t: RealScalarLike, y: Y) -> Y:
+def apply(terms: Terms, controls: list, args: Args, t: RealScalarLike, y: Y) -> Y:
     """The sum over terms of vector field times control."""
     pairs = zip(terms, controls)
     parts = [term.vf_prod(t, y, args, control) for term, control in pairs]
-    return _checked_sum(parts, y)
+    return _sum_like(parts, y)
 
 
 @eqx.filter_jit
 def apply_one(
-    terms: tuple,
+    terms: Terms,
     number: IntScalarLike,
     increment: Float[Array, ""],
     args: Args,
@@ -48,12 +48,12 @@ def apply_one(
         here = (before <= number) & (number < before + m)
         local = jnp.clip(number - before, 0, m - 1)
         only = jnp.where(here, increment, 0)
-        parts.append(_one_product(term, struct, local, only, args, t, y))
+        parts.append(_product_of_one_noise(term, struct, local, only, args, t, y))
         before += m
-    return _checked_sum(parts, y)
+    return _sum_like(parts, y)
 
 
-def _one_product(
+def _product_of_one_noise(
     term: diffrax.AbstractTerm,
     struct: PyTree[jax.ShapeDtypeStruct],
     number: IntScalarLike,
@@ -63,22 +63,26 @@ def _one_product(
     y: Y,
 ) -> Y:
     """The vector field of one noise of this term times its increment. `struct` are the
-    shapes of all increments. Where possible no other noise is evaluated or multiplied."""
+    shapes of this term's increments. Where possible no other noise is evaluated or
+    multiplied."""
+    # Only the kind is read from the user's term. The term itself is called, which keeps the
+    # direction of time that Diffrax wraps around it.
     if isinstance(unwrapped(term), HamiltonianNoise):
         return term.vf_prod(t, y, args, OneNoise(number, increment))
     if isinstance(unwrapped(term), diffrax.ControlTerm):
-        matrix = term.vf(t, y, args)
+        field = term.vf(t, y, args)
         # A single array of noises, not a Lineax operator or another PyTree.
-        one_array = eqx.is_array(matrix) and isinstance(struct, jax.ShapeDtypeStruct)
-        if one_array and matrix.ndim > 0 and matrix.shape[-1:] == struct.shape:
-            return matrix[..., number] * increment.astype(matrix.dtype)
+        one_array = eqx.is_array(field) and isinstance(struct, jax.ShapeDtypeStruct)
+        # A scalar noise has no axis of noises to index.
+        if one_array and field.ndim > 0 and field.shape[-1:] == struct.shape:
+            return field[..., number] * increment.astype(field.dtype)
     # Other terms add up all noises, so all increments but this one are zero.
     flat, unravel = raveled(struct)
     only = flat.at[number].set(increment.astype(flat.dtype))
     return term.vf_prod(t, y, args, unravel(only))
 
 
-def rate(drift: tuple, t: RealScalarLike, y: Y, args: Args) -> Y:
+def rate(drift: Terms, t: RealScalarLike, y: Y, args: Args) -> Y:
     """The rate of change of the state by the drift."""
     t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
     # Over a step of size one, whose place does not matter to a drift driven by time.
@@ -101,18 +105,18 @@ def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
     # First, since its message names the term and its path.
     check_increments(parts, t0, y0, args)
 
-    def changed(t: RealScalarLike) -> Y:
+    def total_change(t: RealScalarLike) -> Y:
         controls = [term.contr(t, t) for term in parts]
         return apply(parts, controls, args, t0, y0)
 
-    eqx.filter_eval_shape(changed, t0)
+    eqx.filter_eval_shape(total_change, t0)
 
 
 def _is_term(x: Any) -> bool:
     return isinstance(x, diffrax.AbstractTerm)
 
 
-def check_increments(terms: tuple, t0: RealScalarLike, y0: Y, args: Args) -> None:
+def check_increments(terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> None:
     """Raises a `ValueError` if a `ControlTerm` cannot multiply its vector field by the
     increments of its path. (The errors of JAX and Lineax name neither.)"""
 
@@ -159,7 +163,7 @@ def tree_sum(values: list[Y]) -> Y:
     return total
 
 
-def _checked_sum(parts: list[Y], y: Y) -> Y:
+def _sum_like(parts: list[Y], y: Y) -> Y:
     """The sum. Raises a `ValueError` unless all have the dtypes and shapes of the state."""
 
     def check(change: Any, x: Any) -> None:

@@ -7,6 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._solver import LANGEVIN
 
 from ._page import fill, Page, table
 
@@ -14,8 +15,7 @@ from ._page import fill, Page, table
 OMEGA, FRICTION = 20.0, 0.5
 # Friction between two halves of a flow, and in the drift.
 CASES = {
-    "BAOAB": ds.BAOAB(),
-    "LangevinMiddle": ds.LangevinMiddle(),
+    **{kind.__name__: kind() for kind in LANGEVIN},
     "BAOAB(ImplicitMidpoint)": ds.BAOAB(ds.ImplicitMidpoint()),
     "BAOAB(linear_flow)": ds.BAOAB(ds.linear_flow(np.array([[OMEGA**2]]))),
     "ImplicitMidpoint": ds.ImplicitMidpoint(),

@@ -6,7 +6,7 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from diffrax_symplectic._expectation.fitted.bases import Frame, Hermite
+from diffrax_symplectic._expectation.fitted.bases import CovarianceFrame, Hermite
 from diffrax_symplectic._expectation.fitted.grid import Grid
 from diffrax_symplectic._expectation.fitted.polynomials import (
     exponents,
@@ -41,10 +41,12 @@ def test_polynomials_are_orthonormal_and_fits_nested():
 def test_points_whose_values_overflow_are_left_out_of_a_fit():
     basis, good = Hermite(2, (2,)), jnp.ones(200, bool)
     points = jr.normal(KEY, (200, 2))
-    frame = Frame.of(points, good, jnp.ones(2))
+    frame = CovarianceFrame.of(points, good, jnp.ones(2))
     values = (points[:, 0] ** 2 - points[:, 1])[:, None, None, None]
     spoiled = values.at[:5].set(jnp.inf).at[5].set(jnp.nan)
-    fitted = jax.jit(lambda values: basis.fitted_to(values, frame, points, good))
+    fitted = jax.jit(
+        lambda values: basis.least_squares_fit(values, frame, points, good)
+    )
     np.testing.assert_allclose(fitted(spoiled), fitted(values), atol=1e-9)
 
 
@@ -55,7 +57,7 @@ def test_a_grid_interpolates_with_degree_five_and_is_zero_beyond():
     # Two points at least are to lie on either side.
     inner = axis[9]
     x = jr.uniform(KEY, (50, 2), minval=-inner, maxval=inner)
-    at = jax.vmap(lambda x: grid.interpolated(x, c)[0])
+    at = jax.vmap(lambda x: grid.interpolate(x, c)[0])
     np.testing.assert_allclose(at(x), fn(*x.T), atol=1e-13)
     assert not np.any(at(jnp.where(jnp.abs(x) < inner / 2, x + jnp.sign(x), 2 * x)))
 
@@ -70,9 +72,9 @@ def test_what_a_grid_corrects_is_exact_at_its_points_and_falls_to_zero_at_its_ed
     def fitted(points):
         frame = grid.frame(points, good, jnp.ones(2))
         value = lambda y: fn(y)[None, None, None]
-        c = grid.fitted(value, frame, points, good, None)
+        c = grid.coefficients(value, frame, points, good, None)
         nodes = frame.states(inner)
-        at_nodes = jax.vmap(lambda y: grid.combined(frame, y, c)[0, 0, 0])(nodes)
+        at_nodes = jax.vmap(lambda y: grid.value_at(frame, y, c)[0, 0, 0])(nodes)
         return c[-(16**2) :].reshape(16, 16), at_nodes, jax.vmap(fn)(nodes)
 
     correction, got, expected = fitted(points)
@@ -98,14 +100,14 @@ def test_a_grid_is_even_where_most_states_are_and_holds_all(heavy):
 def test_frames_do_not_depend_on_units_and_leave_out_what_does_not_move():
     mixed = jnp.array([[3.0, 1, 0], [0, 2, 0], [1, 0, 1]])
     points, good = jr.normal(KEY, (500, 3)) @ mixed, jnp.ones(500, bool)
-    frame = Frame.of(points, good, jnp.ones(3))
+    frame = CovarianceFrame.of(points, good, jnp.ones(3))
     z = frame.at(points)
     np.testing.assert_allclose(z.T @ z / 500, np.eye(3), atol=1e-10)
     np.testing.assert_allclose(frame.states(z), points, atol=1e-12)
     scale = jnp.array([1.0, 2.0**90, 2.0**-90])
-    other = Frame.of(points * scale, good, scale)
+    other = CovarianceFrame.of(points * scale, good, scale)
     np.testing.assert_array_equal(other.at(points * scale), z)
     still = jnp.append(points, jnp.full((500, 1), 7e-30), axis=1)
-    frame = Frame.of(still, good, jnp.array([1.0, 1, 1, 0]))
-    np.testing.assert_array_equal(frame.moved(still)[:, 3], still[:, 3])
+    frame = CovarianceFrame.of(still, good, jnp.array([1.0, 1, 1, 0]))
+    np.testing.assert_array_equal(frame.perturbed(still)[:, 3], still[:, 3])
     assert np.all(np.isfinite(frame.at(still)))

@@ -451,7 +451,7 @@ def test_thermometers_show_what_a_step_leaves_of_the_temperature():
             np.testing.assert_allclose(means["kinetic"], kinetic, rtol=1e-9)
         else:
             assert means["kinetic"] < 0.99 * T
-    with pytest.raises(ValueError, match="takes no terms with a `constraint`"):
+    with pytest.raises(ValueError, match="takes no constrained terms"):
         ds.equipartition(ROD)
 
 

@@ -11,7 +11,7 @@ from ..._simulation import advice_on_failures, Combination
 from ..sampling import ROUNDING
 from .estimate import combined_results, Expectation
 from .moments import total
-from .tolerance import largest_of, shortfall
+from .tolerance import largest_error, shortfall
 
 
 # With an `r` of `std_error` above this, means of exp(5 x) with normal x were off by forty
@@ -54,7 +54,7 @@ def _of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
     if estimate.num_samples == 0:
         rest = "there is no mean"
     else:
-        largest = largest_of(estimate.failed_error)
+        largest = largest_error(estimate.failed_error)
         rest = (
             "they are left out of the mean, and could change it by more than its standard "
             f"error, up to {largest:.1e}, which is part of `error`"

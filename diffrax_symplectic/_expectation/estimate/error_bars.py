@@ -121,13 +121,13 @@ def _results_of_array(
     rounding = rounding_floor * float(jnp.finfo(dtype).eps) * size
     spread_of = ft.partial(_spread_of, n, rounding)
 
-    own = spread_of(norm.value, largest.value, mean.heaviness)
+    controlled = spread_of(norm.value, largest.value, mean.heaviness)
     results = Results(
         mean=mean.value,
-        std_error=own.error,
-        plain_std_error=own.error,
-        variance=own.s**2,
-        heaviness=own.r,
+        std_error=controlled.error,
+        plain_std_error=controlled.error,
+        variance=controlled.s**2,
+        heaviness=controlled.r,
         dropped=np.zeros(plain_mean.shape, bool),
         spread=largest.without_control if mean.largest is None else mean.largest,
     )
@@ -145,10 +145,12 @@ def _results_of_array(
         plain = spread_of(norm.plain, largest.plain)
         results = results._replace(
             mean=np.where(dropped, plain_mean, mean.value),
-            std_error=np.where(dropped, plain.error, np.hypot(own.error, unseen)),
+            std_error=np.where(
+                dropped, plain.error, np.hypot(controlled.error, unseen)
+            ),
             plain_std_error=plain.error,
-            variance=np.where(dropped, plain.s, own.s) ** 2,
-            heaviness=np.where(dropped, plain.r, own.r),
+            variance=np.where(dropped, plain.s, controlled.s) ** 2,
+            heaviness=np.where(dropped, plain.r, controlled.r),
             dropped=dropped,
         )
     if n == 0:

@@ -173,7 +173,7 @@ class Expectation(eqx.Module):
         largest deviation of another path's value from the mean. (For sorted paths, that is
         the mean over the replicates.) It does not decrease with more paths, and is NaN if
         there is no other path."""
-        drawn = sum(own.end - own.begin for own in self.moments)
+        drawn = sum(batch.end - batch.begin for batch in self.moments)
         # Samples that are left out, as single paths are, or as many samples as the paths
         # that failed in others would be, as in replicates.
         left_out = drawn - self.num_samples

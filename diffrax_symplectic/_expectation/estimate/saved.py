@@ -38,17 +38,26 @@ def header_of(estimate: Any) -> dict[str, Any]:
 
 
 def arrays_of(estimate: Any) -> dict[str, np.ndarray]:
-    """The arrays of an `Expectation`, by names that are made of a field and positions."""
+    """The arrays of an `Expectation` (which is defined above this module), by their names.
+    For example `mean_value_0_1` is leaf 1 of the field `value` of the `mean` of batch 0."""
     trees = {"tails": estimate.tails}
-    for i, moments in enumerate(estimate.moments):
+    for batch, moments in enumerate(estimate.moments):
         for name in _AVERAGED:
             for field, tree in getattr(moments, name).fields.items():
-                trees[f"{name}_{field}_{i}"] = tree
+                trees[_name_of_tree(name, field, batch)] = tree
     arrays = {"key_data": estimate.key_data}
     for name, tree in trees.items():
-        for k, leaf in enumerate(jtu.tree_leaves(tree)):
-            arrays[f"{name}_{k}"] = np.asarray(leaf)
+        for leaf, array in enumerate(jtu.tree_leaves(tree)):
+            arrays[_name_of_leaf(name, leaf)] = np.asarray(array)
     return arrays
+
+
+def _name_of_tree(name: str, field: str, batch: int) -> str:
+    return f"{name}_{field}_{batch}"
+
+
+def _name_of_leaf(tree: str, leaf: int) -> str:
+    return f"{tree}_{leaf}"
 
 
 def fields_from(
@@ -60,24 +69,27 @@ def fields_from(
     count = len(header["dtypes"])
 
     def tree(name: str) -> PyTree[np.ndarray]:
-        leaves = [arrays[f"{name}_{k}"] for k in range(count)]
-        return _filled(structure, iter(leaves))
+        leaves = [arrays[_name_of_leaf(name, leaf)] for leaf in range(count)]
+        return _tree_of(structure, iter(leaves))
 
-    def averaged(name: str, i: int) -> Averaged:
+    def averaged(name: str, batch: int) -> Averaged:
         fields = header["averaged"]
-        return Averaged(**{field: tree(f"{name}_{field}_{i}") for field in fields})
+        trees = {field: tree(_name_of_tree(name, field, batch)) for field in fields}
+        return Averaged(**trees)
 
-    def moments(i: int, counts: list[Any]) -> Moments:
-        trees = {name: averaged(name, i) for name in _AVERAGED}
-        dtypes = _filled(structure, iter(header["dtypes"]))
+    def moments(batch: int, counts: list[Any]) -> Moments:
+        trees = {name: averaged(name, batch) for name in _AVERAGED}
+        dtypes = _tree_of(structure, iter(header["dtypes"]))
         begin, end, good, failed, failed_on = counts
         return Moments(
             begin, end, good, failed, tuple(failed_on), **trees, dtypes=dtypes
         )
 
+    ranges = enumerate(header["ranges"])
+    batches = tuple(moments(batch, counts) for batch, counts in ranges)
     fields = {name: header[name] for name in _PLAIN_FIELDS}
     return fields | {
-        "moments": tuple(moments(i, x) for i, x in enumerate(header["ranges"])),
+        "moments": batches,
         "key_data": arrays["key_data"],
         "sampling": _sampling_from(header),
         "tails": tree("tails") if header["tails"] else None,
@@ -123,14 +135,14 @@ def _structure(tree: Any) -> Any:
     )
 
 
-def _filled(structure: Any, leaves: Iterator[Any]) -> Any:
+def _tree_of(structure: Any, leaves: Iterator[Any]) -> Any:
     """The PyTree with this structure and these leaves."""
     ((kind, inner),) = structure.items()
     if kind == "dict":
-        return {name: _filled(node, leaves) for name, node in inner.items()}
+        return {name: _tree_of(node, leaves) for name, node in inner.items()}
     if kind == "none":
         return None
     if kind == "array":
         return next(leaves)
-    nodes = [_filled(node, leaves) for node in inner]
+    nodes = [_tree_of(node, leaves) for node in inner]
     return nodes if kind == "list" else tuple(nodes)

@@ -41,34 +41,36 @@ def share_of(estimate: Expectation, tol: float | None) -> float:
     """The estimated share of the samples needed that has been taken."""
     if tol is None or estimate.num_samples < 2:
         return 0.0
-    largest = max(largest_of(estimate.std_error), tol)
+    largest = max(largest_error(estimate.std_error), tol)
     return (tol / largest) ** 2 if np.isfinite(largest) else 0.0
 
 
 def shortfall(estimate: Expectation, tol: float) -> str:
-    """Which part of the error exceeds the tolerance, and what it would take."""
+    """Which part of the error exceeds the tolerance, and what it would take: for messages,
+    one or two sentences without their first capital and their last full stop."""
     if is_any(estimate.off_order):
         return (
             "the changes from step to step do not fit the order of the solver, so the "
             "error is not known. Pass a smaller `dt0`"
         )
-    step = largest_of(estimate.discretization_error)
-    sampling = largest_of(estimate.std_error)
-    failed = largest_of(estimate.failed_error)
-    if failed > max(step, sampling):
+    discretization = largest_error(estimate.discretization_error)
+    sampling = largest_error(estimate.std_error)
+    failed = largest_error(estimate.failed_error)
+    if failed > max(discretization, sampling):
         return (
             f"failed paths could change the mean by {failed:.1e}. Take smaller steps, or a "
             "more stable solver"
         )
-    if step > sampling:
+    if discretization > sampling:
         return (
-            f"{step:.1e} remains of the discretization error with {estimate.levels} "
-            f"levels. Pass a smaller `dt0`, or more `levels`"
+            f"{discretization:.1e} remains of the discretization error with "
+            f"{estimate.levels} levels. Pass a smaller `dt0`, or more `levels`"
         )
-    needed = estimate.num_paths * (sampling / tol) ** 2
+    needed_paths = estimate.num_paths * (sampling / tol) ** 2
     return (
         f"the sampling error is {sampling:.1e} after {estimate.num_paths:,} paths. It "
-        f"takes about {needed:.1e}: continue with `start=`, or pass another `sampling`"
+        f"takes about {needed_paths:.1e} paths: continue with `start=`, or pass another "
+        "`sampling`"
     )
 
 
@@ -76,7 +78,7 @@ def is_any(tree: PyTree[np.ndarray] | None) -> bool:
     return any(bool(np.any(leaf)) for leaf in jtu.tree_leaves(tree))
 
 
-def largest_of(errors: PyTree[np.ndarray | np.floating] | None) -> float:
+def largest_error(errors: PyTree[np.ndarray | np.floating] | None) -> float:
     """The largest of all numbers, and zero without any."""
     leaves = jtu.tree_leaves(errors)
     return max((float(np.max(leaf, initial=0.0)) for leaf in leaves), default=0.0)

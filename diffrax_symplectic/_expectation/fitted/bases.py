@@ -40,7 +40,7 @@ _QUADRATIC_NUMBERS = 2**13
 Target: TypeAlias = Callable[..., Float[Array, "C S m"]]
 
 
-class Frame(eqx.Module):
+class CovarianceFrame(eqx.Module):
     """Coordinates in which the states have mean zero and standard deviations of about one.
     Components of the state that do not move are ignored."""
 
@@ -60,7 +60,7 @@ class Frame(eqx.Module):
     @staticmethod
     def of(
         points: Float[Array, "n d"], good: Bool[Array, " n"], unit: Float[Array, " d"]
-    ) -> "Frame":
+    ) -> "CovarianceFrame":
         """The frame along the axes of the covariance of the good points. `unit` makes the
         components comparable, and is zero for components that do not move."""
         weights = equal_weights(good, points.dtype)
@@ -74,9 +74,9 @@ class Frame(eqx.Module):
         size = jnp.sqrt(jnp.maximum(variances, _FLOOR**2 * variances[-1]) + tiny)
         to = axes.T / size[:, None] * inverse
         back = unit[:, None] * axes * size
-        return Frame(mean, to, back)
+        return CovarianceFrame(mean, to, back)
 
-    def moved(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
+    def perturbed(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
         """The states, perturbed at random."""
         # The same in all steps: drawing from keys would take long to compile.
         z = np.random.default_rng(0).normal(0, _MOVE, states.shape)
@@ -130,7 +130,7 @@ class AbstractBasis(eqx.Module):
         component."""
 
     @abc.abstractmethod
-    def fitted(
+    def coefficients(
         self,
         target: Target,
         frame: Any,
@@ -141,7 +141,7 @@ class AbstractBasis(eqx.Module):
         """The coefficients. `keys` are the keys of the pilot's paths, for estimates."""
 
     @abc.abstractmethod
-    def combined(
+    def value_at(
         self, frame: Any, y: Float[Array, " d"], c: Float[Array, "size *C S m"]
     ) -> Float[Array, "*C S m"]:
         """The function with these coefficients at a state."""
@@ -167,16 +167,16 @@ class Hermite(AbstractBasis):
         return self.pilots
 
     def frame(self, states, good, unit):
-        return Frame.of(states, good, unit)
+        return CovarianceFrame.of(states, good, unit)
 
-    def fitted(self, target, frame, states, good, keys):
-        points = frame.moved(states)
-        return self.fitted_to(jax.vmap(target)(points), frame, points, good)
+    def coefficients(self, target, frame, states, good, keys):
+        points = frame.perturbed(states)
+        return self.least_squares_fit(jax.vmap(target)(points), frame, points, good)
 
-    def fitted_to(
+    def least_squares_fit(
         self,
         values: Float[Array, "n C S m"],
-        frame: Frame,
+        frame: CovarianceFrame,
         points: Float[Array, "n d"],
         good: Bool[Array, " n"],
     ) -> Float[Array, "size C S m"]:
@@ -191,15 +191,18 @@ class Hermite(AbstractBasis):
         c = least_squares(B, flat, sizes)
         return c.reshape(-1, *values.shape[1:])
 
-    def at(self, frame: Frame, points: Float[Array, "n d"]) -> Float[Array, "n size"]:
+    def at(
+        self, frame: CovarianceFrame, points: Float[Array, "n d"]
+    ) -> Float[Array, "n size"]:
         """All polynomials at points."""
         each = lambda z: jnp.stack(hermite(z, max(self.candidates)))
         return jax.vmap(each)(frame.at(points))
 
-    def combined(self, frame, y, c):
+    def value_at(self, frame, y, c):
         # As a sum this compiles to one loop without temporary arrays.
         polynomials = hermite(frame.at(y), max(self.candidates))
-        return ft.reduce(jnp.add, [b * own for b, own in zip(polynomials, c)])
+        terms = [value * coefficient for value, coefficient in zip(polynomials, c)]
+        return ft.reduce(jnp.add, terms)
 
 
 def _is_finite_row(x: Float[Array, "n ..."]) -> Bool[Array, " n"]:
@@ -240,7 +243,7 @@ class Quadratic(AbstractBasis):
     def frame(self, states, good, unit):
         return CentredFrame(equal_weights(good, states.dtype) @ states, unit)
 
-    def fitted(self, target, frame, states, good, keys):
+    def coefficients(self, target, frame, states, good, keys):
         def derivatives(args):
             key, y = args
             shifted = lambda z: target(y + frame.unit * z, key)
@@ -263,7 +266,7 @@ class Quadratic(AbstractBasis):
         degrees = np.array(self.candidates)[:, None, None]
         return jnp.where(order <= degrees, mean, 0)
 
-    def combined(self, frame, y, c):
+    def value_at(self, frame, y, c):
         z = (y - frame.mean) * inverse_or_zero(frame.unit)
         d = len(y)
         first = c[:d]

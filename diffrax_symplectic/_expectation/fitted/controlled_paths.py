@@ -39,7 +39,7 @@ def controlled_paths(
     levels). With a wider `law` of the noise deviations beyond the `usual` ones are
     estimated."""
     functions = functions.chosen(choice.best)
-    drawn = jax.vmap(p.drawn)(keys)
+    drawn = jax.vmap(p.draw_start)(keys)
 
     def begin(level: Level) -> Motion:
         noise = Noise.of(p, level)
@@ -51,9 +51,10 @@ def controlled_paths(
 
             def one(y, solver_state, args, key):
                 x, log_ratio = noise.draw(key, i, own_law.share, own_law.tilts)
-                own = noise.with_args(args)
+                of_path = noise.with_args(args)
                 at_end = lambda y1: u(i, y1)
-                return own.advance(i, y, solver_state, at_end, second, x), log_ratio
+                after = of_path.advance(i, y, solver_state, at_end, second, x)
+                return after, log_ratio
 
             states = paths.y, paths.solver_state, paths.args
             after, log_ratio = jax.vmap(one)(*states, keys)
@@ -86,7 +87,7 @@ def controlled_paths(
     is_at_start = along(p.levels.saved_steps[0] == 0, plain[0])
     fitted_mean = jnp.where(is_at_start, plain, fitted_mean)
     on_levels = plain - control, plain, control, fitted_mean
-    value, plain, control, fitted_mean = map(p.combined, on_levels)
+    value, plain, control, fitted_mean = map(p.combinations, on_levels)
 
     center = usual.center[:, :, None]
     deviations = jnp.abs(value - jnp.where(choice.used[:, None], fitted_mean, center))

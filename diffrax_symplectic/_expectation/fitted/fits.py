@@ -54,7 +54,7 @@ class FittedFunctions(eqx.Module):
     def __call__(self, i: Any, y: Y) -> Float[Array, "*C S m"]:
         """Their values at a state after step `i`."""
         frame = jtu.tree_map(lambda x: x[i], self.frames)
-        return self.basis.combined(frame, ravel(y), self.coefficients[i])
+        return self.basis.value_at(frame, ravel(y), self.coefficients[i])
 
     def chosen(self, best: Int[Array | np.ndarray, "S m"]) -> "FittedFunctions":
         """The functions with one candidate for each component."""
@@ -78,27 +78,27 @@ def fit(
     pilot = _pilot(noise, jr.split(key, basis.pilots))
     unit = _unit(p, pilot, num_steps)
 
-    def frame(i: Any) -> PyTree[Array]:
+    def frame_after(i: Any) -> PyTree[Array]:
         return basis.frame(pilot.states[i], pilot.good, unit)
 
     def backward(j: Any, u: FittedFunctions) -> FittedFunctions:
         i = num_steps - 1 - j
-        own = frame(i)
+        frame = frame_after(i)
         target = _target(noise, u, i)
-        c = basis.fitted(target, own, pilot.states[i], pilot.good, pilot.keys)
+        c = basis.coefficients(target, frame, pilot.states[i], pilot.good, pilot.keys)
         put = lambda of_steps, of_step: of_steps.at[i].set(of_step)
-        frames = jtu.tree_map(put, u.frames, own)
+        frames = jtu.tree_map(put, u.frames, frame)
         return FittedFunctions(frames, put(u.coefficients, c), None, basis)
 
     # Arrays have room for the most steps of a level, so that levels share one program.
     zeros = lambda struct: jnp.zeros((p.finest_steps, *struct.shape), struct.dtype)
-    frames = jtu.tree_map(zeros, jax.eval_shape(lambda: frame(0)))
+    frames = jtu.tree_map(zeros, jax.eval_shape(lambda: frame_after(0)))
     shape = p.finest_steps, basis.size, len(basis.candidates), *p.num_outputs
     u = FittedFunctions(frames, jnp.zeros(shape, p.dtype), None, basis)
     u = lax.fori_loop(0, num_steps, backward, u)
     second = _second(noise, pilot, u)
-    fitted = FittedFunctions(u.frames, u.coefficients, second, basis)
-    return fitted, jnp.sum(~pilot.good)
+    functions = FittedFunctions(u.frames, u.coefficients, second, basis)
+    return functions, jnp.sum(~pilot.good)
 
 
 def _target(noise: Noise, u: FittedFunctions, i: Any) -> Target:
@@ -166,8 +166,9 @@ def _pilot(noise: Noise, keys: Key[Array, " n"]) -> _Pilot:
         # With equal probabilities the pilot spreads further than the paths, so that the fit
         # also holds for outliers.
         x, _ = noise.draw(key, i, jnp.ones(()))
-        own = noise.with_args(args)
-        y, _, success = own.step(i, y, own.fresh(i, y), x)
+        noise_of_path = noise.with_args(args)
+        solver_state = noise_of_path.fresh(i, y)
+        y, _, success = noise_of_path.step(i, y, solver_state, x)
         return y, success
 
     def forward(i: Any, carry: tuple[PathStates, Array]) -> tuple[PathStates, Array]:
@@ -178,7 +179,7 @@ def _pilot(noise: Noise, keys: Key[Array, " n"]) -> _Pilot:
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
     # For a fit it is good enough that solvers start anew in each step.
-    paths = PathStates.start(p, jax.vmap(p.drawn)(keys), solver_state=None)
+    paths = PathStates.start(p, jax.vmap(p.draw_start)(keys), solver_state=None)
     starts = jax.vmap(ravel)(paths.y)
     states = jnp.broadcast_to(starts, (p.finest_steps, *starts.shape))
     carry = paths, states

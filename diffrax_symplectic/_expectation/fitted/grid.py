@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..._products import tensordot
-from .bases import AbstractBasis, Frame, Hermite
+from .bases import AbstractBasis, CovarianceFrame, Hermite
 
 
 # The width of a grid relative to the pilot's range. For the mean of q^2 of a pendulum, the
@@ -42,24 +42,56 @@ _MOST_STRETCHED = 1e4
 _LEAST_BENT = 0.01
 
 
-class Stretched(eqx.Module):
+class StretchedFrame(eqx.Module):
     """Coordinates from -1 to 1 on a grid: linear near the middle, and growing with the
-    fourth root further out, where there are few paths."""
+    fourth root further out, where there are few paths.
 
-    inner: Frame
-    middle: Float[Array, " d"]
-    # The coordinate is `_bent(_bent(factor * (z - middle))) / edge`.
+    For the coordinate `z` of `inner` it is `_bent(_bent(factor * (z - median))) / edge`.
+    """
+
+    inner: CovarianceFrame
+    median: Float[Array, " d"]
     factor: Float[Array, " d"]
     edge: Float[Array, " d"]
 
+    @staticmethod
+    def of(
+        inner: CovarianceFrame,
+        z: Float[Array, "n d"],
+        good: Bool[Array, " n"],
+        num_for_quartiles: int,
+    ) -> "StretchedFrame":
+        """The coordinates for paths at `z`, of which some are `good`. A few of them suffice
+        for the quartiles."""
+        least = jnp.min(jnp.where(good[:, None], z, jnp.inf), axis=0)
+        most = jnp.max(jnp.where(good[:, None], z, -jnp.inf), axis=0)
+        few = jnp.where(good[:, None], z, jnp.nan)[:num_for_quartiles]
+        levels = jnp.array([0.25, 0.5, 0.75])
+        first_quartile, median, third_quartile = jnp.nanquantile(few, levels, axis=0)
+        furthest = jnp.maximum(most - median, median - least)
+        half_width = jnp.maximum(_WIDER * furthest, 1)
+        # In the middle the spacing is as on a uniform grid of this half-width.
+        uniform_half = jnp.clip(
+            _EVEN * (third_quartile - first_quartile),
+            half_width / _MOST_STRETCHED,
+            half_width,
+        )
+        # With `bend`, the argument of `_bent(_bent(...))` at the edge, the coordinate has
+        # the slope `bend / half_width / edge` in the middle, where `_bent` has slope 1. So
+        # `half_width / uniform_half` is `bend / edge`, about `(1 + bend**2) ** (3 / 8)`. Of
+        # this follows `bend`.
+        ratio = half_width / uniform_half
+        bend = jnp.sqrt(jnp.maximum(ratio ** (8 / 3) - 1, _LEAST_BENT))
+        return StretchedFrame(inner, median, bend / half_width, _bent(_bent(bend)))
+
     def at(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The coordinates of states."""
-        return _bent(_bent(self.factor * (self.inner.at(y) - self.middle))) / self.edge
+        return _bent(_bent(self.factor * (self.inner.at(y) - self.median))) / self.edge
 
     def states(self, x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The states with these coordinates."""
         unscaled = _straight(_straight(self.edge * x))
-        return self.inner.states(self.middle + unscaled / self.factor)
+        return self.inner.states(self.median + unscaled / self.factor)
 
 
 def _bent(x: Array) -> Array:
@@ -101,34 +133,21 @@ class Grid(AbstractBasis):
         return Hermite(self.d, _DEGREES)
 
     def frame(self, states, good, unit):
-        inner = Frame.of(states, good, unit)
-        z = inner.at(states)
-        low = jnp.min(jnp.where(good[:, None], z, jnp.inf), axis=0)
-        high = jnp.max(jnp.where(good[:, None], z, -jnp.inf), axis=0)
-        # A few states suffice for the quartiles.
-        few = jnp.where(good[:, None], z, jnp.nan)[: self._base.pilots]
-        levels = jnp.array([0.25, 0.5, 0.75])
-        lower, middle, upper = jnp.nanquantile(few, levels, axis=0)
-        half = jnp.maximum(_WIDER * jnp.maximum(high - middle, middle - low), 1)
-        # In the middle the spacing is as on a uniform grid of this half-width.
-        even = jnp.clip(_EVEN * (upper - lower), half / _MOST_STRETCHED, half)
-        # The argument of `_bent(_bent(...))` at the edge. That function is about the fourth
-        # root of this argument there, and has slope 1 in the middle.
-        bend = jnp.sqrt(jnp.maximum((half / even) ** (8 / 3) - 1, _LEAST_BENT))
-        return Stretched(inner, middle, bend / half, _bent(_bent(bend)))
+        inner = CovarianceFrame.of(states, good, unit)
+        return StretchedFrame.of(inner, inner.at(states), good, self._base.pilots)
 
-    def fitted(self, target, frame, states, good, keys):
+    def coefficients(self, target, frame, states, good, keys):
         base = self._base
         n = base.pilots
         axes = [np.linspace(-1, 1, self.candidates[0])] * self.d
         x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, self.d)
         nodes = frame.states(jnp.asarray(x, states.dtype))
         # In one call, so that the target is compiled once.
-        points = jnp.concatenate([frame.inner.moved(states[:n]), nodes])
+        points = jnp.concatenate([frame.inner.perturbed(states[:n]), nodes])
         values = jax.vmap(target)(points)
         # One copy for each degree.
         at_pilots = jnp.repeat(values[:n], len(_DEGREES), axis=1)
-        c = base.fitted_to(at_pilots, frame.inner, points[:n], good[:n])
+        c = base.least_squares_fit(at_pilots, frame.inner, points[:n], good[:n])
         residual = values[n:] - tensordot(base.at(frame.inner, nodes), c, 1)
         # The target may overflow where it grows fast.
         residual = jnp.where(jnp.isfinite(residual), residual, 0)
@@ -143,12 +162,12 @@ class Grid(AbstractBasis):
         falling = jnp.asarray(falling, residual.dtype)[:, None, None, None]
         return jnp.concatenate([c, residual * falling])
 
-    def combined(self, frame, y, c):
+    def value_at(self, frame, y, c):
         size = self._base.size
-        correction = self.interpolated(frame.at(y), c[size:])
-        return self._base.combined(frame.inner, y, c[:size]) + correction
+        correction = self.interpolate(frame.at(y), c[size:])
+        return self._base.value_at(frame.inner, y, c[:size]) + correction
 
-    def interpolated(
+    def interpolate(
         self, x: Float[Array, " d"], c: Float[Array, "nodes ..."]
     ) -> Float[Array, "..."]:
         """The values on the grid, interpolated at a point, and zero beyond the grid."""
@@ -162,11 +181,11 @@ class Grid(AbstractBasis):
         place = jnp.clip(jnp.where(inside, place, n / 2), half - 1, n - half)
         begin = jnp.minimum(jnp.floor(place) - (half - 1), n - _STENCIL)
         start = jnp.pad(begin.astype(jnp.int32), (0, len(rest)))
-        values = c.reshape(*[n] * self.d, *rest)
-        block = lax.dynamic_slice(values, start, (*[_STENCIL] * self.d, *rest))
+        grid = c.reshape(*[n] * self.d, *rest)
+        block = lax.dynamic_slice(grid, start, (*[_STENCIL] * self.d, *rest))
         weights = _lagrange([place - begin - j for j in range(_STENCIL)])
         for j in range(self.d):
-            products = [own[j] * values for own, values in zip(weights, block)]
+            products = [weight[j] * row for weight, row in zip(weights, block)]
             block = ft.reduce(jnp.add, products)
         return jnp.where(inside, block, 0)
 

@@ -101,7 +101,9 @@ class Noise(eqx.Module):
         # have one law or two.
         for law in dict.fromkeys(self.laws):
             has_law = np.array([other == law for other in self.laws])
-            outcome, log_ratio_of_law = _drawn(law, words, share, tilts, x.dtype)
+            outcome, log_ratio_of_law = _draw_outcomes(
+                law, words, share, tilts, x.dtype
+            )
             x = jnp.where(has_law, outcome, x)
             log_ratio = jnp.where(has_law, log_ratio_of_law, log_ratio)
         return x, jnp.sum(log_ratio)
@@ -225,7 +227,7 @@ class Noise(eqx.Module):
         )
 
 
-def _drawn(
+def _draw_outcomes(
     law: Discrete,
     words: UInt32[Array, " n"],
     share: ArrayLike,

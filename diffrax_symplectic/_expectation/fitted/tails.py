@@ -54,11 +54,11 @@ def laws_of_trials(p: Problem) -> list[TrialLaw]:
     laws = Noise.of(p, p.level(0)).laws
     no_share = np.zeros(len(p.levels.h), p.dtype)
     no_tilts = np.zeros((len(no_share), len(laws)), p.dtype)
-    share = _strongest(p, laws, widened, 1.0)
+    share = _strongest_change(p, laws, widened, 1.0)
     of_trials = [TrialLaw(no_share, no_tilts), TrialLaw(share, no_tilts)]
     m = number_of_noises(p.terms)
     if m <= _MOST_NOISES:
-        tilt = _strongest(p, laws, _tilted_from_own, _MOST_TILTED)
+        tilt = _strongest_change(p, laws, _tilted_from_own, _MOST_TILTED)
         for sides in itertools.product((-1, 1), repeat=m):
             tilts = no_tilts.copy()
             # The increments come first, and then variables that are only in products.
@@ -71,8 +71,8 @@ def _tilted_from_own(law: Discrete, tilt: float) -> np.ndarray:
     return tilted(law, np.array(law.probabilities), tilt)
 
 
-def _strongest(
-    p: Problem, laws: tuple[Discrete, ...], changed: _Change, most: float
+def _strongest_change(
+    p: Problem, laws: tuple[Discrete, ...], change_law: _Change, most: float
 ) -> Float[np.ndarray, " levels"]:
     """For each level the largest `z`, up to `most`, for which the laws `changed(law, z)`
     give all variables of a path, on all levels together, a relative entropy of at most 8
@@ -80,26 +80,26 @@ def _strongest(
     steps = p.levels.num_steps
     counts = collections.Counter(laws)
     # By bisection, for all levels at once, since `z` depends on the number of steps.
-    low = np.zeros(len(steps))
-    high = np.full(len(steps), most)
+    allowed = np.zeros(len(steps))
+    too_much = np.full(len(steps), most)
     for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        of_step = np.array([_relative_entropy(counts, changed, z) for z in middle])
+        middle = (allowed + too_much) / 2
+        of_step = np.array([_relative_entropy(counts, change_law, z) for z in middle])
         is_too_much = steps * of_step > _NATS / len(steps)
-        low = np.where(is_too_much, low, middle)
-        high = np.where(is_too_much, middle, high)
-    return low.astype(p.dtype)
+        allowed = np.where(is_too_much, allowed, middle)
+        too_much = np.where(is_too_much, middle, too_much)
+    return allowed.astype(p.dtype)
 
 
 def _relative_entropy(
-    counts: collections.Counter[Discrete], changed: _Change, z: float
+    counts: collections.Counter[Discrete], change_law: _Change, z: float
 ) -> float:
     """How far the variables of a step, so many of each law, are from their own laws if
     these are changed: the sum of `q log(q / p)`, in nats."""
     nats = 0.0
     for law, count in counts.items():
         p = np.array(law.probabilities)
-        q = changed(law, z)
+        q = change_law(law, z)
         nats += count * np.sum(q * np.log(q / p))
     return nats
 

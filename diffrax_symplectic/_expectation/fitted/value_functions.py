@@ -18,6 +18,7 @@ from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
 from ..._arguments import check_untraced, whole_number
 from ..._compat import quickly_compiled
+from ..._custom_types import Devices
 from ..._lapack import lapack_in_turn
 from ..._simulation import Combination, Problem
 from ..._solver import without_newton
@@ -107,7 +108,7 @@ class ValueFunctions(AbstractSampling):
         # One trial for each candidate, on the same paths.
         candidates = range(len(basis.candidates))
         tried = [trials.of_candidate(k, own_law) for k in candidates]
-        compared = _compared(tried, trials.outputs)
+        compared = _compare(tried, trials.outputs)
         choice = compared.choice
         if self.degree and not np.any(choice.used):
             warnings.warn(
@@ -116,7 +117,7 @@ class ValueFunctions(AbstractSampling):
                 stacklevel=5,
             )
         # Paths with wider noise estimate the deviations beyond the largest in the trial.
-        usual = _usual(tried, choice, trials.outputs, problem.dtype)
+        usual = _usual_deviations(tried, choice, trials.outputs, problem.dtype)
         size = _BATCHES_OF_WIDE_TRIAL * self.batch_size
         wide = [trials.run(choice, usual, law, size) for law in wider_laws]
         return trials.plan(choice, usual, own_law, self.num_paths)._replace(
@@ -139,7 +140,7 @@ class _Trials(NamedTuple):
     outputs: tuple[int, int]
     shapes: Averaged
     key: PRNGKeyArray
-    devices: tuple
+    devices: Devices
     batch_size: int
 
     def plan(
@@ -206,7 +207,7 @@ class _Compared(NamedTuple):
         return float(np.max(np.where(is_random, fractions, 0), initial=0.0))
 
 
-def _compared(tried: list[Expectation], outputs: tuple[int, int]) -> _Compared:
+def _compare(tried: list[Expectation], outputs: tuple[int, int]) -> _Compared:
     """Compares the candidates, each of which was tried alone."""
     each = np.stack([_flat(estimate.std_error, outputs) for estimate in tried])
     # A candidate without an error has failed.
@@ -221,7 +222,7 @@ def _compared(tried: list[Expectation], outputs: tuple[int, int]) -> _Compared:
     return _Compared(choice, errors, plain, _flat(tried[0].mean, outputs))
 
 
-def _usual(
+def _usual_deviations(
     tried: list[Expectation], choice: Choice, outputs: tuple[int, int], dtype: Any
 ) -> Usual:
     """The mean without control, and the largest deviation in the trials of what each
@@ -270,10 +271,10 @@ def _fits_by(
 ) -> tuple[FittedFunctions, int]:
     """The fits of all levels, and how many of the pilot's paths failed."""
     count = len(problem.levels.h)
-    each = [_fitted(problem, np.array([k]), key, basis) for k in range(count)]
+    each = [_fit_of_level(problem, np.array([k]), key, basis) for k in range(count)]
     check_untraced("`expectation`", [number for _, number in each])
     lost = sum(int(number) for _, number in each)
-    functions = [own for own, _ in each]
+    functions = [fit_of_level for fit_of_level, _ in each]
     if count == 1:
         return functions[0], lost
     return jtu.tree_map(lambda *xs: jnp.concatenate(xs), *functions), lost
@@ -281,11 +282,11 @@ def _fits_by(
 
 @quickly_compiled
 @lapack_in_turn
-def _fitted(
+def _fit_of_level(
     problem: Problem, index: Int[Array, "1"], key: PRNGKeyArray, basis: AbstractBasis
 ) -> tuple[FittedFunctions, Int[Array, ""]]:
     """The fit of the level with this index, with a leading axis of levels, and how many of
     the pilot's paths failed."""
     level = problem.level(index[0])
-    own, lost = fit(Noise.of(problem, level), jr.fold_in(key, index[0]), basis)
-    return jtu.tree_map(lambda x: x[None], own), lost
+    functions, lost = fit(Noise.of(problem, level), jr.fold_in(key, index[0]), basis)
+    return jtu.tree_map(lambda x: x[None], functions), lost

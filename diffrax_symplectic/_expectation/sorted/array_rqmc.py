@@ -24,7 +24,7 @@ from ..._brownian import (
 from ..._custom_types import Y
 from ..._simulation import (
     along,
-    combined,
+    combinations,
     independent_steps,
     Level,
     Motion,
@@ -148,7 +148,7 @@ def _replicates(
     (replicate,) = keys
     # Not from quasi-random points, since a function of a key takes any number of them.
     start_keys = jr.split(jr.fold_in(replicate, _KEY_OF_STARTS), n)
-    drawn = jax.vmap(p.drawn)(start_keys)
+    drawn = jax.vmap(p.draw_start)(start_keys)
 
     def begin(level: Level) -> Motion:
         motion = independent_steps(
@@ -167,11 +167,11 @@ def _replicates(
     done = simulate(p, begin, _mean_of_good)
     # An axis for the samples, of which there is one.
     means, heavy, largest = jnp.moveaxis(done.saved[:, :, :, None], 2, 0)
-    means = p.combined(means)
+    means = p.combinations(means)
     # The largest over all levels.
     heavy = jnp.broadcast_to(jnp.max(heavy, axis=0), means.shape)
     # A path may fail on any level.
-    largest = combined(abs(p.weights), largest)
+    largest = combinations(abs(p.weights), largest)
     averaged = Averaged(
         p.shaped(means), heaviness=p.shaped(heavy), largest=p.shaped(largest)
     )

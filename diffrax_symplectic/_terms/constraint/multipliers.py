@@ -74,8 +74,8 @@ def find_multipliers(
     def step(state: _Newton) -> _Newton:
         newton = correction(residual, state.x, None)
         # By how much this correction and the one before change each constraint, at most.
-        change = combined(jnp.abs(newton.change), slopes)
-        before = combined(jnp.abs(state.correction), slopes) + rounding
+        change = weighted_sum(jnp.abs(newton.change), slopes)
+        before = weighted_sum(jnp.abs(state.correction), slopes) + rounding
         # By how much the derivative along the one before has changed: the residual before
         # is the old derivative. In units of each constraint, so that none hides others.
         bend = jnp.abs(newton.derivative(state.correction) - state.residual)
@@ -119,7 +119,7 @@ def products(a: Float[Array, "c n"], b: Float[Array, "d n"]) -> Float[Array, "c 
     return _total(a.T[:, :, None] * b.T[:, None, :])
 
 
-def combined(x: Multipliers, vectors: Float[Array, "c n"]) -> Vector:
+def weighted_sum(x: Multipliers, vectors: Float[Array, "c n"]) -> Vector:
     """The sum of the vectors times these numbers."""
     return _total(x[:, None] * vectors)
 

@@ -26,7 +26,7 @@ from .surface import Surface
 
 
 _DEPENDENT = (
-    "The gradients of `constraint` at `y0` are linearly dependent, or zero. Leave out "
+    "The gradients of the constraints at `y0` are linearly dependent, or zero. Leave out "
     "constraints that follow from the others, and write each so that its gradient does not "
     "vanish where it is zero, such as `jnp.sum(q**2) - 1`. For atoms on a line no distance "
     "follows from the others: fix one, and put each atom between its ends on the line, "
@@ -35,7 +35,7 @@ _DEPENDENT = (
 
 
 _OFF = (
-    "`y0` is off the `constraint`, or its momenta are not tangent to it. Pass "
+    "`y0` is off the constraint, or its momenta are not tangent to it. Pass "
     "`constrained_state(terms, y0, args)`. (Diffrax converts a float32 state to the dtype "
     "of the times. If they are float64, pass them as `jnp.float32(t)`, too, or `y0` in "
     "float64: a state on the constraint to single precision is off it in double.)"
@@ -78,17 +78,19 @@ def _check_masses(
 ) -> None:
     """Raises a `ValueError` unless velocities are linear in the momenta."""
     surface = Surface.of(terms, t0, y0, args)
-    p0, _ = jfu.ravel_pytree(y0[0])
+    p0, _ = y0
+    flat_p0, _ = jfu.ravel_pytree(p0)
 
     # The change of the velocity by an impulse: the second derivative of H0 by p, times it.
-    def pushed(p: Vector, impulse: Vector) -> Vector:
+    def change_of_velocity(p: Vector, impulse: Vector) -> Vector:
         return jax.jvp(surface.velocity, (p,), (impulse,))[1]
 
     # It may depend on the impulse, but not on the momentum: then the masses are constant.
     # Only the shape of the second argument matters.
-    if not Dependence(pushed, p0, p0).independent(lambda p, impulse: p):
+    traced = Dependence(change_of_velocity, flat_p0, flat_p0)
+    if not traced.independent(lambda p, impulse: p):
         raise ValueError(
-            "Terms with a `constraint` need constant masses, H0 = p . M^-1 p / 2 + "
+            "Constrained terms need constant masses, H0 = p . M^-1 p / 2 + "
             "U(t, q), but the second derivative of H0 by p depends on p. Write squares of "
             "momenta, such as `jnp.sum(p**2 / mass) / 2`."
         )
@@ -120,7 +122,7 @@ def constrained_state(
 
     **Arguments:**
 
-    - `terms`: the terms, with a `constraint`.
+    - `terms`: constrained terms, made with `constraint=`.
     - `y0`: the state `(p, q)`.
     - `args`: as for `diffrax.diffeqsolve`.
 
@@ -132,7 +134,7 @@ def constrained_state(
     """
     if constraint_of(terms) is None:
         raise ValueError(
-            "`constrained_state` needs terms with a `constraint`, such as "
+            "`constrained_state` needs constrained terms, such as "
             "`hamiltonian_terms(H0, constraint=constraint)`."
         )
     check_pair(y0)
@@ -142,11 +144,11 @@ def constrained_state(
     check_fit(diffrax.MultiTerm(*drift), t, y0, args)
     if fault := separable_fault(drift, (), t, y0, args):
         raise ValueError(
-            "Terms with a `constraint` need H0 = p . M^-1 p / 2 + U(t, q), but "
+            "Constrained terms need H0 = p . M^-1 p / 2 + U(t, q), but "
             f"{fault.reason}. {fault.advice}"
         )
     _check_masses(terms, t, y0, args)
-    y1, found, is_dependent = _projected(terms, t, y0, args)
+    y1, found, is_dependent = _projection(terms, t, y0, args)
     if not is_traced(found):
         if is_dependent:
             raise ValueError(_DEPENDENT)
@@ -160,7 +162,7 @@ def constrained_state(
 
 
 @eqx.filter_jit
-def _projected(
+def _projection(
     terms: PyTree[diffrax.AbstractTerm], t: RealScalarLike, y0: PyTree, args: Args
 ) -> tuple[PyTree, Bool[Array, ""], Bool[Array, ""]]:
     """The nearest allowed state, whether Newton's method found it, and whether the

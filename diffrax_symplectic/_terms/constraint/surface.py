@@ -21,12 +21,12 @@ from ..evaluation import evaluated
 from ..langevin import split_friction
 from ..vector_fields import rate
 from .multipliers import (
-    combined,
     find_multipliers,
     Multipliers,
     products,
     solve_tangent,
     Vector,
+    weighted_sum,
 )
 
 
@@ -113,7 +113,7 @@ class Surface(NamedTuple):
             gram = products(at.normals, self._pushed(changes))
         # How fast the momentum would leave the surface.
         speeds = products(at.normals, self.velocity(p)[None])[:, 0]
-        return p - combined(solve_matrix(gram, speeds), changes)
+        return p - weighted_sum(solve_matrix(gram, speeds), changes)
 
     def free_flight(
         self,
@@ -136,7 +136,7 @@ class Surface(NamedTuple):
 
         # The unknowns are `time * lambda`, so that `time` may be small.
         def moved(x: Multipliers) -> Vector:
-            return free - combined(x, at.along)
+            return free - weighted_sum(x, at.along)
 
         def residual(x: Multipliers) -> Multipliers:
             return self.residual(moved(x))
@@ -151,7 +151,7 @@ class Surface(NamedTuple):
         # Derivatives come from the equations, and not through the loop that solves them.
         start = jnp.zeros(len(at.gram), p.dtype)
         x, found = lax.custom_root(residual, start, solve, solve_tangent, has_aux=True)
-        return p - combined(x / time, at.normals), moved(x), found > 0
+        return p - weighted_sum(x / time, at.normals), moved(x), found > 0
 
     def is_dependent(self, at: NormalSpace) -> Bool[Array, ""]:
         """Whether the normals are linearly dependent, up to rounding errors."""

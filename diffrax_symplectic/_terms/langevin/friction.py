@@ -368,7 +368,7 @@ def semidefinite_root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
     size = jnp.sqrt(jnp.maximum(diagonal, 0))
     most = 10 * (n * eps) ** 0.5 * size[:, None] * size
 
-    def column(j: Any, carry: tuple) -> tuple:
+    def column(j: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
         """The next column of the root; what is left of the matrix without it."""
         left, root, is_valid = carry
         pivot = left[j, j]

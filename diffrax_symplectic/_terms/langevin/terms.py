@@ -14,13 +14,14 @@ from jaxtyping import Array, PyTree
 
 from ..._arguments import check_pair, check_takes
 from ..._brownian import increment_struct, raveled, TruncatedBrownianPath
-from ..._compat import replaced, unwrapped, ω
-from ..._custom_types import Args, BM, RealScalarLike
+from ..._compat import replaced, ω
+from ..._custom_types import Args, BM, RealScalarLike, Terms
 from ..constrained_drift import constrained, Constraint
-from ..drift_and_noise import split_terms
+from ..drift_and_noise import field_of, split_terms
 from ..evaluation import evaluated, scalar_energy
-from ..hamiltonian import AbstractNoise, hamiltonian_terms
+from ..hamiltonian import hamiltonian_terms
 from ..paths import as_path
+from ..symplectic_gradients import AbstractNoise
 from .friction import (
     checked_friction,
     checked_temperature,
@@ -76,9 +77,9 @@ def langevin_terms(
     $\gamma$, pass $G = \gamma m$. If $H_0$ and $T$ are constant, $e^{-H_0 / T}$ is
     stationary. Itô and Stratonovich agree.
 
-    `BAOAB` and [`diffrax_symplectic.LangevinMiddle`][] treat friction in a step of their
-    own; other solvers put it in the drift, with positions wrong to first order if masses
-    depend on them; [`diffrax_symplectic.LinearFlow`][] refuses it. Add noise by
+    Solvers for heat baths, such as `BAOAB`, treat friction in a step of their own; other
+    solvers put it in the drift, with positions wrong to first order if masses depend on
+    them; [`diffrax_symplectic.LinearFlow`][] refuses it. Add noise by
     [`diffrax_symplectic.noise_terms`][], a second bath by
     [`diffrax_symplectic.bath_terms`][], each with its own key.
 
@@ -161,22 +162,23 @@ def bath_terms(
     return diffrax.MultiTerm(diffrax.ODETerm(field), noise)
 
 
-def split_friction(terms: PyTree[diffrax.AbstractTerm]) -> tuple[tuple, tuple, tuple]:
+def split_friction(terms: PyTree[diffrax.AbstractTerm]) -> tuple[Terms, Terms, Terms]:
     """The drift without friction, the friction, and the noise."""
     drift, noise = split_terms(terms)
     rest, friction = friction_apart(drift)
     return rest, friction, noise
 
 
-def friction_apart(drift: tuple) -> tuple[tuple, tuple]:
-    """The drift without friction, and the friction."""
+def friction_apart(drift: Terms) -> tuple[Terms, Terms]:
+    """The drift without friction, and the friction. A term may be a drift with friction, as
+    that of `langevin_terms`, which is taken apart; friction alone, as that of `bath_terms`;
+    or a drift without friction."""
     rest = []
     friction = []
     for term in drift:
-        own = unwrapped(term)
-        field = own.vector_field if isinstance(own, diffrax.ODETerm) else None
-        # `replaced` keeps the direction of time, which Diffrax wraps around each term.
+        field = field_of(term)
         if isinstance(field, DriftWithFriction):
+            # `replaced` keeps the direction of time, which Diffrax wraps around each term.
             rest.append(replaced(term, diffrax.ODETerm(field.drift)))
             friction.append(replaced(term, diffrax.ODETerm(field.friction)))
         elif isinstance(field, AbstractFriction):
@@ -233,8 +235,9 @@ class DriftWithFriction(eqx.Module):
     friction: AbstractFriction
 
     def __call__(self, t: RealScalarLike, y: tuple[_P, _P], args: Args):
+        _, q = y
         dp, dq = self.drift(t, y, args)
-        force = self.friction.force(t, y[1], args, dq)
+        force = self.friction.force(t, q, args, dq)
         return (dp**ω + force**ω).ω, dq
 
 
@@ -258,7 +261,7 @@ class BathNoise(AbstractNoise):
         self, t: RealScalarLike, y: tuple[_P, _P], args: Args, control: BM
     ) -> tuple[_P, _P]:
         check_pair(y)
-        q = y[1]
+        _, q = y
         T = value_at("temperature", self.temperature, t, q, args)
         kick = root_product_with(self.friction, T, t, q, args, control)
         return kick, jtu.tree_map(jnp.zeros_like, q)

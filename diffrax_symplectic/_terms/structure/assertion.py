@@ -1,7 +1,5 @@
 """Structures that a user asserts, compared with the values of the terms at one state."""
 
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax
@@ -22,7 +20,7 @@ from ..drift_and_noise import control_struct
 _DIRECTIONS = 4
 
 
-def contradicted(
+def is_contradicted(
     structure: str,
     is_noise: bool,
     term: diffrax.AbstractTerm,
@@ -57,45 +55,52 @@ def _contradicts(
     args: Args,
 ) -> Bool[Array, ""]:
     """Whether a derivative that the structure forbids is larger than rounding errors, along
-    any of some random directions."""
+    any of some random directions.
+
+    With the change (dp, dq) of the state by the term, the structures forbid:
+
+    - additive: derivatives of dp and dq by p and q;
+    - separable, of a noise: dq itself, and derivatives of dp by p;
+    - separable, of a drift: derivatives of dp by p, and of dq by q and t.
+    """
     flat, unravel = raveled((y0, control_struct(term, t0)))
-    # Between rounding errors, also of long sums, and any mistake of the user's. Times may
-    # have more digits than the state.
+    # A bound between rounding errors, also of long sums, and any real mistake. Times may
+    # have more digits than the state, so the dtype of the state decides.
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).eps)
     rounding = eps ** (2 / 3)
 
-    def along(direction: Array) -> Bool[Array, ""]:
-        (dp, dq), control = unravel(direction)
-        zero = jtu.tree_map(jnp.zeros_like, dp)
+    def is_broken_along(direction: Array) -> Bool[Array, ""]:
+        (along_p, along_q), control = unravel(direction)
+        zero = jtu.tree_map(jnp.zeros_like, along_p)
 
-        def change(t: Array, y: Y) -> Y:
+        def change_of_state(t: Array, y: Y) -> Y:
             return term.vf_prod(t, y, args, control)
 
-        def derivative(dt: Any, dy: Y) -> Y:
-            tangents = (jnp.full_like(t0, dt), dy)
-            return jax.jvp(change, (t0, y0), tangents)[1]
+        def derivative(along_t: float, along_y: Y) -> Y:
+            tangents = (jnp.full_like(t0, along_t), along_y)
+            return jax.jvp(change_of_state, (t0, y0), tangents)[1]
 
-        value = change(t0, y0)
-        by_p = derivative(0, (dp, zero))
-        by_q = derivative(0, (zero, dq))
-        by_t = derivative(1, (zero, zero))
+        dp, dq = change_of_state(t0, y0)
+        dp_by_p, dq_by_p = derivative(0.0, (along_p, zero))
+        dp_by_q, dq_by_q = derivative(0.0, (zero, along_q))
+        dp_by_t, dq_by_t = derivative(1.0, (zero, zero))
         if structure == "additive":
-            forbidden = by_p, by_q
+            forbidden = [dp_by_p, dq_by_p, dp_by_q, dq_by_q]
         elif is_noise:
-            # All changes of the position, and those of the momentum that depend on it.
-            forbidden = value[1], by_p, by_q[1], by_t[1]
+            # `dq` may vanish at this state alone, so its derivatives count, too.
+            forbidden = [dq, dq_by_p, dq_by_q, dq_by_t, dp_by_p]
         else:
-            # The mixed derivative of H0, and that of dH0/dp by the time.
-            forbidden = by_p[0], by_q[1], by_t[1]
-        everything = value, by_p, by_q, by_t
+            forbidden = [dp_by_p, dq_by_q, dq_by_t]
+        of_p = [dp, dp_by_p, dp_by_q, dp_by_t]
+        of_q = [dq, dq_by_p, dq_by_q, dq_by_t]
         # Values that are not finite compare as false: they tell nothing.
-        return largest(forbidden) > rounding * largest(everything)
+        return largest_entry(forbidden) > rounding * largest_entry([of_p, of_q])
 
     directions = jr.normal(jr.key(0), (_DIRECTIONS, flat.size), flat.dtype)
-    return jnp.any(jax.vmap(along)(directions))
+    return jnp.any(jax.vmap(is_broken_along)(directions))
 
 
-def largest(tree: PyTree[Array]) -> Array:
+def largest_entry(tree: PyTree[Array]) -> Array:
     """The largest entry of all arrays, without its sign."""
     flat, _ = jfu.ravel_pytree(tree)
     return jnp.max(jnp.abs(flat))

@@ -14,20 +14,20 @@ from jaxtyping import PyTree
 from ..._arguments import check_pair, pair_fault
 from ..._brownian import raveled
 from ..._compat import at_trace_time, is_traced, unwrapped
-from ..._custom_types import Args, RealScalarLike, Y
+from ..._custom_types import Args, RealScalarLike, Terms, Y
 from ..._tableau import Structure
 from ..constrained_drift import without_constraint
 from ..dependence import Dependence
 from ..drift_and_noise import control_struct, split_terms
-from ..hamiltonian import (
+from ..langevin import friction_apart, split_friction
+from ..lifted import has_lifted
+from ..symplectic_gradients import (
     asserted_structure,
     is_hamiltonian,
     structure_asserted_in,
 )
-from ..langevin import friction_apart, split_friction
-from ..lifted import has_lifted
 from ..vector_fields import check_increments
-from .assertion import contradicted
+from .assertion import is_contradicted
 from .said_twice import check_drifts_differ
 
 
@@ -61,8 +61,8 @@ class Fault(NamedTuple):
 
 def check_structure(
     structure: Structure,
-    drift: tuple,
-    noise: tuple,
+    drift: Terms,
+    noise: Terms,
     t0: RealScalarLike,
     y0: Y,
     args: Args,
@@ -101,14 +101,14 @@ def check_structure(
 
 
 def separable_fault(
-    drift: tuple, noise: tuple, t0: RealScalarLike, y0: Y, args: Args
+    drift: Terms, noise: Terms, t0: RealScalarLike, y0: Y, args: Args
 ) -> Fault | None:
     """Why the system is not of the form `H0 = V(p) + U(t, q)`, `H_k = U_k(t, q)`; `None` if
     it is."""
     if advice := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", advice)
 
-    def traced(terms: tuple) -> list["_Traced"]:
+    def traced(terms: Terms) -> list["_Traced"]:
         left = _not_asserted(terms, "separable")
         return [_Traced(term, _flow(term, t0, y0, args)) for term in left]
 
@@ -214,7 +214,7 @@ def _faults(
     return faults
 
 
-def additive_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
+def additive_fault(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
     """Why the noise is not additive; `None` if it does not depend on the state."""
     if fault := _wrong_assertion("additive", (), noise, t0, y0, args):
         return fault
@@ -226,7 +226,7 @@ def additive_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault
     return None
 
 
-def constant_fault(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
+def constant_fault(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
     """Why additive noise is not constant; `None` if it does not depend on time."""
     for term in noise:
         if not _flow(term, t0, y0, args).independent(_times):
@@ -322,15 +322,15 @@ def _increments(t: Any, y: Y, control: Any) -> Any:
     return control
 
 
-def _not_asserted(terms: tuple, structure: str) -> list[diffrax.AbstractTerm]:
+def _not_asserted(terms: Terms, structure: str) -> list[diffrax.AbstractTerm]:
     """The terms of which the user has not asserted the structure."""
     return [term for term in terms if asserted_structure(term) != structure]
 
 
 def _wrong_assertion(
     structure: str,
-    drift: tuple,
-    noise: tuple,
+    drift: Terms,
+    noise: Terms,
     t0: RealScalarLike,
     y0: Y,
     args: Args,
@@ -347,7 +347,7 @@ def _wrong_assertion(
         for term in terms:
             if asserted_structure(term) != structure:
                 continue
-            if contradicted(structure, is_noise, term, t0, y0, args):
+            if is_contradicted(structure, is_noise, term, t0, y0, args):
                 advice = (
                     f'Leave `structure="{structure}"`, which is wrong here, out of '
                     f"`{structure_asserted_in(term)}`, and {_GENERAL}."
@@ -385,8 +385,8 @@ _GENERAL_BATH = (
 
 
 FRICTION = (
-    "Take friction from `langevin_terms(H0, friction, temperature, path)`: `BAOAB()` "
-    "and `LangevinMiddle()`, or for masses that depend on positions "
-    "`BAOAB(ImplicitMidpoint())`, treat it by a step of its own. (All need a kinetic "
-    "energy that is quadratic in p.)"
+    "Take friction from `langevin_terms(H0, friction, temperature, path)`: solvers for "
+    "heat baths, such as `BAOAB()`, or `BAOAB(ImplicitMidpoint())` for masses that depend "
+    "on positions, treat it by a step of its own. (All need a kinetic energy that is "
+    "quadratic in p.)"
 )

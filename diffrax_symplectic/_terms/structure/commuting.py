@@ -11,13 +11,13 @@ from jaxtyping import Array, Float
 
 from ..._brownian import raveled
 from ..._compat import is_traced, ω
-from ..._custom_types import Args, RealScalarLike, Y
+from ..._custom_types import Args, RealScalarLike, Terms, Y
 from ..drift_and_noise import control_struct
 from ..vector_fields import apply
-from .assertion import largest
+from .assertion import largest_entry
 
 
-def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
+def commuting(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish at random states, for
     these `t0` and `args`; false if this cannot be tested. This is not a proof.
 
@@ -36,7 +36,7 @@ def commuting(noise: tuple, t0: RealScalarLike, y0: Y, args: Args) -> bool:
         along_z = ft.partial(apply, noise, z, args, t0)
         _, first = jax.jvp(along_z, (y,), (along_x(y),))
         _, second = jax.jvp(along_x, (y,), (along_z(y),))
-        return largest(first), largest((first**ω - second**ω).ω)
+        return largest_entry(first), largest_entry((first**ω - second**ω).ω)
 
     try:
         with jax.disable_jit(False):

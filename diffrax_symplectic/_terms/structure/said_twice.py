@@ -10,9 +10,9 @@ from jaxtyping import PyTree
 from ..._brownian import is_key, typed_key
 from ..._compat import is_traced, unwrapped
 from ..drift_and_noise import flattened
-from ..hamiltonian import drift_hamiltonians
 from ..langevin import BathNoise
 from ..paths import brownian_paths
+from ..symplectic_gradients import drift_hamiltonians
 
 
 def check_drifts_differ(terms: PyTree[diffrax.AbstractTerm]) -> None:

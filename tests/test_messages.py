@@ -1,0 +1,94 @@
+"""Messages name arguments that there are."""
+
+import ast
+import inspect
+import re
+from pathlib import Path
+
+import diffrax
+import pytest
+
+import diffrax_symplectic as ds
+
+
+PACKAGE = Path(ds.__file__).parent
+FILES = sorted(PACKAGE.rglob("*.py"))
+# Of the user's functions, by the name of the argument that takes each of them.
+CHECKS = {"check_takes", "evaluated", "check_real", "real_array", "whole_number"}
+# Both in backticks: an argument with its value, and a function of the user's.
+WITH_VALUE = re.compile(r"(?<![\w.])([a-z]\w*)=(?!=)")
+OF_THE_USER = re.compile(r"(?<![\w.])([a-zH]\w*)\([\w, ]*\bargs\)")
+
+
+def parameters(*functions) -> set[str]:
+    return {name for fn in functions for name in inspect.signature(fn).parameters}
+
+
+def public_parameters() -> set[str]:
+    """The arguments of all public functions, classes and methods."""
+    public = [value for name, value in vars(ds).items() if not name.startswith("_")]
+    functions = [value for value in public if callable(value)]
+    methods = [
+        getattr(kind, name)
+        for kind in filter(inspect.isclass, functions)
+        for name in vars(kind)
+        if not name.startswith("_") and inspect.isroutine(getattr(kind, name))
+    ]
+    return parameters(*functions, *methods)
+
+
+def text_of(node: ast.AST) -> str:
+    """A string of the code, with nothing in the place of what is computed."""
+    parts = node.values if isinstance(node, ast.JoinedStr) else [node]
+    return "".join(
+        part.value
+        for part in parts
+        if isinstance(part, ast.Constant) and isinstance(part.value, str)
+    )
+
+
+def messages(tree: ast.AST) -> list[str]:
+    """All strings of a module but its docstrings."""
+    docstrings = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
+    strings = [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant | ast.JoinedStr) and node not in docstrings
+    ]
+    return [text for node in strings if "`" in (text := text_of(node))]
+
+
+def quoted_arguments(file: Path) -> set[str]:
+    """What the messages of a module call an argument."""
+    tree = ast.parse(file.read_text())
+    quoted = re.findall("`([^`]+)`", "\n".join(messages(tree)))
+    found = {name for code in quoted for name in WITH_VALUE.findall(code)}
+    found |= {name for code in quoted for name in OF_THE_USER.findall(code)}
+    for call in ast.walk(tree):
+        if isinstance(call, ast.Call) and getattr(call.func, "id", "") in CHECKS:
+            found.add(text_of(call.args[0]))
+    return found - {""}
+
+
+def test_messages_quote_only_arguments_and_functions_that_there_are():
+    known = public_parameters() | {*vars(ds)}
+    # Users call these, too.
+    known |= parameters(diffrax.diffeqsolve, diffrax.SaveAt)
+    for file in FILES:
+        unknown = quoted_arguments(file) - known
+        assert not unknown, (file.name, unknown)
+
+
+@pytest.mark.parametrize(
+    "code, names",
+    [
+        ("raise ValueError('pass `f(x, old=3)` or `new(q, args)`')", {"old", "new"}),
+        ("raise ValueError(f'pass `{name}={value}`, not `a == b`')", set()),
+        ("check_takes('old', fn, 't', 'args')", {"old"}),
+        ("def f():\n    '''Not `docstrings=3`.'''", set()),
+    ],
+)
+def test_quoted_arguments_are_found(code, names, tmp_path):
+    file = tmp_path / "module.py"
+    file.write_text(code)
+    assert quoted_arguments(file) == names
