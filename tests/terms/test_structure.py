@@ -290,7 +290,7 @@ def test_a_wrong_assertion_is_refused_where_values_are_known(make, solver, name,
         )
 
     field = jnp.array(0.5, dtype)
-    says = rf'at `y0` H0 mixes p and q.*Leave `structure="separable"`.*`{name}`'
+    says = rf'at or near `y0` H0 mixes p and q.*Leave `structure="separable"`.*`{name}`'
     for call in called(make(_in_a_field, "separable"), field):
         with pytest.raises(ValueError, match=says):
             call()
@@ -323,10 +323,35 @@ def test_a_wrong_assertion_is_refused_where_values_are_known(make, solver, name,
 def test_each_part_of_an_assertion_is_compared(structure, H0, noise, says):
     terms = _kicked(H0, structure, noise)
     given = terms, ds.ImplicitMidpoint(), 0.0, 0.2, 0.1, _positive_state
-    with pytest.raises(ValueError, match=f"is wrong: at `y0`.*{says}"):
+    with pytest.raises(ValueError, match=f"is wrong: at or near `y0`.*{says}"):
         ds.ensemble(*given, key=jr.key(0), num_paths=2)
-    with pytest.raises(ValueError, match=f"is wrong: at `y0`.*{says}"):
+    with pytest.raises(ValueError, match=f"is wrong: at or near `y0`.*{says}"):
         ds.suggest_solver(terms, 0.0, _positive_state, want="weak")
+
+
+@pytest.mark.parametrize("momentum", [0.0, 1.0])
+def test_a_wrong_assertion_is_refused_from_an_extremum_too(momentum):
+    # At q = 0 all derivatives of the force -q**2 vanish but the second one.
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: p**2 / 2,
+        lambda t, p, q, args: q**3 / 3,
+        (),
+        structure="additive",
+    )
+    y0 = jnp.array(momentum), jnp.array(0.0)
+    with pytest.raises(ValueError, match="the noise depends on the state"):
+        ds.suggest_solver(terms, 0.0, y0, want="weak")
+
+
+def test_an_assertion_counts_where_the_terms_have_values():
+    # Near the start the noise has none, since the root of a negative number is NaN.
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: p**2 / 2,
+        lambda t, p, q, args: jnp.sqrt(q) * 0 + q,
+        (),
+        structure="additive",
+    )
+    ds.suggest_solver(terms, 0.0, (jnp.array(0.0), jnp.array(0.0)), want="weak")
 
 
 def test_plain_terms_are_not_told_to_assert_a_structure():

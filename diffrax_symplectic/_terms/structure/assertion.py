@@ -1,4 +1,5 @@
-"""Structures that a user asserts, compared with the values of the terms at one state."""
+"""Structures that a user asserts, compared with values of the terms at the start and near
+it."""
 
 import diffrax
 import equinox as eqx
@@ -18,6 +19,9 @@ from ..drift_and_noise import control_struct
 # Random directions of the state and of the control. A derivative that is not zero vanishes
 # along one of them with probability zero; the others are there for rounding errors.
 _DIRECTIONS = 4
+# How far from the start the terms are looked at once more, relative to the largest number
+# of the state: at an extremum a forbidden derivative is zero.
+_NEAR = 1e-3
 
 
 def is_contradicted(
@@ -28,7 +32,8 @@ def is_contradicted(
     y0: Y,
     args: Args,
 ) -> bool:
-    """Whether derivatives of a term at the state `y0` contradict its asserted structure.
+    """Whether derivatives of a term at the state `y0`, or near it, contradict its asserted
+    structure.
 
     What is found is a proof, since rounding errors are far smaller than what counts. The
     converse does not hold: at other states the structure may be another. `False` if any
@@ -69,8 +74,16 @@ def _contradicts(
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).eps)
     rounding = eps ** (2 / 3)
 
+    largest = largest_entry(y0)
+    distance = _NEAR * jnp.where(largest > 0, largest, 1)
+
     def is_broken_along(direction: Array) -> Bool[Array, ""]:
-        (along_p, along_q), control = unravel(direction)
+        along, control = unravel(direction)
+        near = jtu.tree_map(lambda x, dx: x + distance * dx, y0, along)
+        return is_broken_at(y0, along, control) | is_broken_at(near, along, control)
+
+    def is_broken_at(y: Y, along: Y, control: PyTree[Array]) -> Bool[Array, ""]:
+        along_p, along_q = along
         zero = jtu.tree_map(jnp.zeros_like, along_p)
 
         def change_of_state(t: Array, y: Y) -> Y:
@@ -78,9 +91,9 @@ def _contradicts(
 
         def derivative(along_t: float, along_y: Y) -> Y:
             tangents = (jnp.full_like(t0, along_t), along_y)
-            return jax.jvp(change_of_state, (t0, y0), tangents)[1]
+            return jax.jvp(change_of_state, (t0, y), tangents)[1]
 
-        dp, dq = change_of_state(t0, y0)
+        dp, dq = change_of_state(t0, y)
         dp_by_p, dq_by_p = derivative(0.0, (along_p, zero))
         dp_by_q, dq_by_q = derivative(0.0, (zero, along_q))
         dp_by_t, dq_by_t = derivative(1.0, (zero, zero))

@@ -339,9 +339,12 @@ def _wrong_assertion(
     does not have it at `y0`; `None` if there is none, or if values are traced. For
     "additive" pass no drift: only noise can break it."""
     causes = {
-        ("separable", False): "at `y0` H0 mixes p and q, or dH0/dp depends on t",
-        ("separable", True): "at `y0` a noise Hamiltonian depends on p",
-        ("additive", True): "at `y0` the noise depends on the state",
+        (
+            "separable",
+            False,
+        ): "at or near `y0` H0 mixes p and q, or dH0/dp depends on t",
+        ("separable", True): "at or near `y0` a noise Hamiltonian depends on p",
+        ("additive", True): "at or near `y0` the noise depends on the state",
     }
     for is_noise, terms in ((False, drift), (True, noise)):
         for term in terms:
