@@ -1,4 +1,5 @@
-"""The picture of the tutorial, drawn by the code of the page itself.
+"""The picture of the tutorial, which is drawn by the code of the page itself, up to where it
+saves it.
 
     python -m examples.portrait
 """
