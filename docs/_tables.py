@@ -1,17 +1,16 @@
-"""The tables of solvers in these pages, made from the solvers' records, and the list of
-all public names:
+"""The table of solvers in these pages, made from the solvers' records, and the list of all
+public names:
 
     python docs/_tables.py
 
-writes them into the files. A test tells if that was forgotten.
+writes both into the files. A test tells if that was forgotten.
 """
 
 import re
 from pathlib import Path
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._solver import AbstractSymplecticSolver, LANGEVIN, SOLVERS, Want
-from diffrax_symplectic._suggest import ranked
+from diffrax_symplectic._solver import AbstractSymplecticSolver, LANGEVIN, SOLVERS
 
 
 _TABLE = re.compile(r"<!-- solvers: (.*?) -->.*?<!-- end -->", re.DOTALL)
@@ -23,11 +22,6 @@ _STRUCTURES = {
     "additive": "additive noise",
     "constant": "additive, constant noise",
     "separable and constant": "separable, constant noise",
-}
-_NOISES = {
-    "any": "any number",
-    "commuting": "commuting noises",
-    "not commuting": "noises that do not commute",
 }
 # Shown around any solver.
 _LINEAR_FLOW = ds.LinearFlow(ds.NinomiyaVictoir(), lambda time, y, args: y)
@@ -46,11 +40,9 @@ def with_tables(markdown: str) -> str:
 
 
 def table(name: str) -> str:
-    """The table of all solvers, or of those suggested for `weak` or `strong` approximation;
-    the names of the solvers for any system; or all public names."""
+    """The table of all solvers, the names of the solvers for any system, or all public
+    names."""
     solvers = [*(solver() for solver in (*SOLVERS, *LANGEVIN)), _LINEAR_FLOW]
-    if name in ("weak", "strong"):
-        return _suggested(name)
     if name == "names any":
         names = [f"`{s.__name__}`" for s in SOLVERS if s().structure == "any"]
         return f"{', '.join(names[:-1])} and {names[-1]}"
@@ -109,23 +101,6 @@ def _facts(solver: AbstractSymplecticSolver) -> dict[str, str]:
             "when to choose it": solver.choose,
         }
     return facts
-
-
-def _suggested(want: Want) -> str:
-    """All that `suggest_solver` names for some system with few noises, best first."""
-    structures = tuple(_STRUCTURES)
-    of = lambda commute: ranked(want, structures, commute, 2)
-    found = {type(s): s for commute in (True, False) for s in of(commute)}
-    rows = []
-    for solver in found.values():
-        facts = _facts(solver)
-        system, noises = facts["structure"], solver.record.noises
-        if noises != "any":
-            system += f"; {_NOISES[noises]}"
-        name = f"`{type(solver).__name__}`"
-        rows.append([name, system, facts[want], facts["when to choose it"]])
-    heads = ["solver", "structure and noises", f"{want} order", "when to choose it"]
-    return _rows(heads, rows)
 
 
 def _rows(columns, rows: list[list[str]]) -> str:
