@@ -22,12 +22,14 @@ import jax.numpy as jnp
 import jax.random as jr
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullLocator, StrMethodFormatter
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._simulation.engines import fused_start, state_itself
 from diffrax_symplectic._simulation.problem import Problem
 
 from .. import rigid_body
+from .._pictures import style
 from ._timing import ensemble, keys, machine, race
 
 
@@ -262,15 +264,24 @@ def draw(c: Callable) -> None:
     steps = [max(10, 2**16 // n) for n in numbers]
     rows = [nanoseconds(midpoint(0.01), n, k, False) for n, k in zip(numbers, steps)]
     in_c = [c(n)[0.01] for n in numbers]
-    fig, ax = plt.subplots(figsize=(5, 3.2), layout="constrained")
-    ax.loglog(numbers, [b for _, b in rows], "o-", label="vmap(diffeqsolve)")
-    ax.loglog(numbers, [a for a, _ in rows], "s-", label="fused")
-    ax.loglog(numbers, in_c, "^--", label="in C")
-    ax.set(xlabel="paths", ylabel="nanoseconds a path and step", ylim=(1, None))
-    ax.legend(frameon=False, fontsize=8)
-    fig.savefig(IMAGE, dpi=150)
+    picture(numbers, [b for _, b in rows], [a for a, _ in rows], in_c)
     for n, (a, b), own in zip(numbers, rows, in_c):
         print(f"{n} paths: fused {a:.1f}, vmap {b:.1f}, C {own:.1f}", flush=True)
+
+
+def picture(numbers, jax_ns, fused, in_c) -> None:
+    figure, ax = plt.subplots(figsize=(6, 3.5))
+    ax.loglog(numbers, jax_ns, label="vmap(diffeqsolve)", **style("JAX"))
+    ax.loglog(numbers, fused, label="fused", **style("fused"))
+    ax.loglog(numbers, in_c, label="in C", **style("midpoint by hand"))
+    ax.set(xlabel="number of paths", ylabel="nanoseconds per path and step")
+    ax.set(ylim=(1, 200))
+    ax.set_xticks(numbers, [f"{n:,}" for n in numbers])
+    ax.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.legend(loc="upper right", ncols=3)
+    figure.savefig(IMAGE)
+    plt.close(figure)
 
 
 if __name__ == "__main__":

@@ -161,7 +161,6 @@ def section(page: Page) -> str:
     axes.axhline(0, color="k", lw=0.5)
     axes.legend(fontsize=7)
     picture = page.picture(figure, "chain", "Chain of 32 oscillators")
-    plt.close(figure)
     return fill(
         __file__, picture=picture, t1=f"{t1:g}", paths=paths, midpoint=midpoint,
         sizes=" and ".join(map(str, sizes)),

@@ -97,5 +97,4 @@ def section(page: Page) -> str:
     ax.xaxis.set_minor_formatter(NullFormatter())
     ax.legend(fontsize=7)
     picture = page.picture(figure, "langevin", "Bias against cost")
-    plt.close(figure)
     return fill(__file__, table=shown, picture=picture)

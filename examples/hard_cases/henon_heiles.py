@@ -113,7 +113,6 @@ def section(page: Page) -> str:
     for ax in axes:
         ax.legend(fontsize=7)
     picture = page.picture(figure, "henon_heiles", "Hénon–Heiles system")
-    plt.close(figure)
     shown = table(
         ("solver", *[f"$h = {h:g}$" for h in hs[:: max(1, len(hs) - 1)]]), rows
     )

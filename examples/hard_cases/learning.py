@@ -196,7 +196,6 @@ def section(page: Page) -> str:
     for ax in axes:
         ax.legend(fontsize=7)
     picture = page.picture(figure, "learning", "A learned potential")
-    plt.close(figure)
     header = "solver", "$h$", "$s$", "force error", "energy gain"
     return fill(
         __file__, table=table(header, rows), picture=picture, pairs=f"{pairs:,}", s=S,

@@ -147,7 +147,6 @@ def section(page: Page) -> str:
         ax.set(xlabel="T", title=f"{title} of a spin")
         ax.legend(fontsize=7)
     picture = page.picture(figure, "magnet", "Heisenberg magnet at a temperature")
-    plt.close(figure)
     header = "$T$", "spin_terms", "Monte Carlo"
     length = max(ours.length_error for ours, _ in both)
     return fill(

@@ -234,7 +234,6 @@ def section(page: Page) -> str:
     axes[1].set_xticks(hs, [f"{h:g}" for h in hs])
     axes[1].xaxis.set_minor_formatter(NullFormatter())
     picture = page.picture(figure, "nls", "Stochastic nonlinear Schrödinger lattice")
-    plt.close(figure)
     ours, divided = (found[name, hs[0]] for name in SOLVERS if "Midpoint" in name)
     return fill(
         __file__, picture=picture, t1=f"{t1:g}", paths=paths, s=s, h=hs[0], n=f"{N:,}",

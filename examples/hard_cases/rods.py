@@ -177,7 +177,6 @@ def section(page: Page) -> str:
     axes.set(xlabel="cosine of an outer angle", title="density", ylim=(0.43, 0.56))
     axes.legend(fontsize=7)
     picture = page.picture(figure, "rods", "Angles between rods and between springs")
-    plt.close(figure)
     header = (
         "method", "$h$", r"$\langle c^2 \rangle$", "kinetic energy", "stretched",
         "µs per unit of time",

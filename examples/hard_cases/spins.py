@@ -196,7 +196,6 @@ def section(page: Page) -> str:
     for ax in axes:
         ax.legend(fontsize=7)
     picture = page.picture(figure, "spins", "Ring of spins")
-    plt.close(figure)
     return fill(
         __file__, table=shown, picture=picture, t1=f"{t1:g}", noisy_t1=f"{noisy_t1:g}",
         paths=paths, sigma=sigma, h=h,

@@ -129,7 +129,6 @@ def section(page: Page) -> str:
     axes[1].set(xlabel="orbits", title=title)
     axes[1].legend(fontsize=7)
     picture = page.picture(figure, "two_body", "Two-body problem")
-    plt.close(figure)
     shown = table(("solver", "angular momentum", "mean energy"), rows)
     return fill(
         __file__, table=shown, picture=picture, count=count, s=s, part=f"1/{sizes[-1]}"
