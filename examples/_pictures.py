@@ -10,6 +10,7 @@ import re
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
+from cycler import cycler
 
 
 BLUE, SKY, GREEN, ORANGE = "#0072B2", "#56B4E9", "#009E73", "#E69F00"
@@ -22,7 +23,7 @@ plt.rcParams.update(
     {
         "axes.grid": True,
         "axes.labelsize": 10,
-        "axes.prop_cycle": plt.cycler(color=[BLUE, VERMILION, GREEN, ORANGE, PINK]),
+        "axes.prop_cycle": cycler(color=[BLUE, VERMILION, GREEN, ORANGE, PINK]),
         "axes.titlesize": 10,
         "errorbar.capsize": 2,
         "figure.constrained_layout.use": True,

@@ -10,8 +10,8 @@ Strong errors are root mean squares over one set of Brownian paths, by `compare_
 The first measures these, in a quarter of an hour of processor time on however busy a
 machine. The second measures costs, and wants a quiet one: CPU seconds per path, in batches
 of 10,000, in turns after all programs are compiled. What was measured is kept in
-`docs/benchmarks/work_precision.json`, from which all three write `work_precision.md` and its
-pictures.
+`docs/benchmarks/work_precision.json`, from which all three write `work_precision.md` and
+its pictures.
 """
 
 import functools as ft

@@ -66,11 +66,13 @@ def _picture(omega_h, curves: dict[str, np.ndarray]):
     for ax, number in zip(axes, (0, 1)):
         label = ",\n".join(right)
         ax.axhline(1, color=colour("ImplicitMidpoint"), lw=6, alpha=0.3, label=label)
-        for name, found in curves.items():
-            if name not in right:
-                values = found[:, number]
-                shown = np.where(np.isfinite(values), values, np.nan)
-                ax.loglog(omega_h, shown, label=name, **style(name), markevery=6)
+        others = [name for name in curves if name not in right]
+        for shift, name in enumerate(others):
+            values = curves[name][:, number]
+            shown = np.where(np.isfinite(values), values, np.nan)
+            # So that no marker hides another.
+            some = (4 * shift, 20)
+            ax.loglog(omega_h, shown, label=name, **style(name), markevery=some)
         ax.axvline(2, color="k", lw=0.8, ls=":")
         ax.set(xlabel=r"$h \omega$", ylim=(0.05, 30))
         for ticks in (ax.xaxis, ax.yaxis):
@@ -84,7 +86,7 @@ def _picture(omega_h, curves: dict[str, np.ndarray]):
 
 def section(page: Page) -> str:
     cases = {name: CASES[name] for name in (QUICK if page.quick else CASES)}
-    fine = np.geomspace(0.1, 20, 12 if page.quick else 60)
+    fine = np.geomspace(0.1, 20, 12 if page.quick else 200)
     rows = []
     curves = {}
     print("\nNoise on stiff modes: <p^2> / T, omega^2 <q^2> / T")
