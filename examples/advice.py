@@ -505,7 +505,7 @@ def draw(kept: dict) -> None:
     lines = [Line2D([], [], label=solver, **style(solver)) for solver in every]
     figure.legend(handles=lines, loc="outside lower center", ncols=3)
     for ax in axes[-1]:
-        ax.set_xlabel("time for one evaluation")
+        ax.set_xlabel(r"time for one evaluation, $1/\omega$")
     for ax in axes[:, 0]:
         ax.set_ylabel("relative error")
     figure.savefig(DOCS / "img" / "advice.png")

@@ -171,7 +171,7 @@ def draw_errors(ax, rows) -> None:
         points = [(seconds, error) for x, _, error, seconds in rows if x == name]
         ax.plot(*zip(*points), label=name.replace("`", ""), **look)
     ax.set(xscale="log", yscale="log", title="a mean in a double well")
-    ax.set(xlabel="seconds", ylabel="total error")
+    ax.set(xlabel="seconds", ylabel="total error", ylim=(2e-12, 3e-2))
     ax.legend(loc="lower left", fontsize=8)
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from diffrax_symplectic._simulation.levels import level_weights
 
 from .._orders import exact_moment_map, exact_weak_error
-from .._pictures import SKY, style, WIDTH
+from .._pictures import line, SKY, style, WIDTH
 from ._ensembles import Model, MODELS, other, plain, quasi
 from ._limits import limits, LONG
 from ._timing import DOCS, keys, machine, measure
@@ -203,8 +203,7 @@ def draw(results: dict[str, dict]) -> None:
         error = np.logspace(-5.5, -1, 46)
         for name, b in e["others"].items():
             x = extrapolated(b, e["variance"], s["others"][name], error)
-            shown = dict(markevery=15) | style(name)
-            lines[name] = ax.plot(x, error, **shown)[0]
+            lines[name] = ax.plot(x, error, **line(name))[0]
         ax.axhline(TARGET, color="k", lw=0.8, ls=":")
         ax.set(xscale="log", yscale="log", title=title)
         ax.set(ylim=(1e-6, 3e-2), xlim=(1e-3, 1e9))
