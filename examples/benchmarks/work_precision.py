@@ -276,7 +276,7 @@ def measured_seconds() -> dict[str, dict]:
 def draw(kind: str, kept: dict) -> None:
     """Errors against seconds, a panel for each model. A point that is not clear of its own
     error bar is not drawn: it says nothing."""
-    figure, axes = plt.subplots(3, 2, figsize=(WIDTH, 10))
+    figure, axes = plt.subplots(3, 2, figsize=(WIDTH, 11.5))
     for ax, model in zip(axes.flat, STRONG):
         for name, fields in kept["errors"][kind][model].items():
             e = Errors._make(np.array(fields))
@@ -288,10 +288,7 @@ def draw(kind: str, kept: dict) -> None:
             )
         ax.set(xscale="log", yscale="log", title=model)
         ax.set(xlabel="CPU seconds per path", ylabel=f"{kind} error")
-        # Room for the names, to the right of what costs little.
-        low, high = ax.get_xlim()
-        ax.set_xlim(low, high * (high / low) ** 0.35)
-        ax.legend(loc="upper right", fontsize=8)
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
     axes[-1, -1].axis("off")
     figure.savefig(DOCS / f"work_precision_{kind}.png")
     plt.close(figure)
