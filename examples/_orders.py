@@ -329,9 +329,12 @@ def plot_orders(
     for slope in slopes:
         line = 2 * all_errors.max() * (hs / hs.max()) ** slope
         axes.loglog(hs, line, "k:", lw=1)
-        axes.text(hs[-1], 1.3 * line[-1], f"slope {slope:g}", va="bottom")
+        place = dict(ha="right", va="center")
+        axes.text(hs[-1] / 1.15, line[-1], f"slope {slope:g}", **place)
     axes.set(xscale="log", yscale="log", xlabel="step $h$", title=title)
     axes.set_ylim(all_errors[all_errors > 0].min() / 4, 8 * all_errors.max())
+    # Room for the names of the slopes.
+    axes.set_xlim(hs[-1] / 3.5, 1.3 * hs[0])
     axes.set_xticks(hs, [f"$2^{{{np.log2(h):.0f}}}$" for h in hs])
     axes.minorticks_off()
     axes.legend(loc="lower right")

@@ -79,7 +79,7 @@ def figure_5(full: bool) -> None:
     print(f"\nFig. 5: one path to t = {h * steps:g}, h = {h}; the largest ||X| - 1|")
     mus = (0.1, 0.2, 1.0)
     figure, axes = plt.subplots(
-        2, 5, figsize=(WIDTH, 4.4), subplot_kw={"projection": "3d"}
+        2, 5, figsize=(WIDTH, 3.8), subplot_kw={"projection": "3d"}
     )
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 25), np.linspace(0, np.pi, 13))
     sphere = np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)
@@ -108,9 +108,9 @@ def figure_5(full: bool) -> None:
             ax.plot(*shown.T, ".", ms=1, color=colour(name))
             drift = drifts[name][j]
             error = f"off by {drift:.0e}" if np.isfinite(drift) else "overflows"
-            ax.set_title(f"{name}\n{error}" if j == 0 else error, fontsize=9, y=1.05)
-            ax.set_aspect("equal")
-            ax.set_box_aspect(None, zoom=1.5)
+            ax.set_title(f"{name}\n{error}" if j == 0 else error, fontsize=9, y=0.97)
+            ax.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1))
+            ax.set_box_aspect((1, 1, 1), zoom=1.4)
             ax.set_axis_off()
     for ax, j in zip(axes[:, 0], (0, 2)):
         ax.text2D(-0.2, 0.5, rf"$\mu = {mus[j]:g}$", rotation=90, va="center",
