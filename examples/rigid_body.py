@@ -79,7 +79,7 @@ def figure_5(full: bool) -> None:
     print(f"\nFig. 5: one path to t = {h * steps:g}, h = {h}; the largest ||X| - 1|")
     mus = (0.1, 0.2, 1.0)
     figure, axes = plt.subplots(
-        2, 5, figsize=(WIDTH, 3.8), subplot_kw={"projection": "3d"}
+        2, 5, figsize=(WIDTH, 4.1), subplot_kw={"projection": "3d"}
     )
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 25), np.linspace(0, np.pi, 13))
     sphere = np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)
@@ -104,13 +104,13 @@ def figure_5(full: bool) -> None:
         print(f"    {name:12} {listed}", flush=True)
         for ax, j in zip(axes[:, i], (0, 2)):
             ax.plot_wireframe(*sphere, color="0.85", lw=0.3)
-            shown = np.asarray(X[j])[length[j] < 2]
+            shown = np.asarray(X[j])[length[j] < 1.5]
             ax.plot(*shown.T, ".", ms=1, color=colour(name))
             drift = drifts[name][j]
             error = f"off by {drift:.0e}" if np.isfinite(drift) else "overflows"
-            ax.set_title(f"{name}\n{error}" if j == 0 else error, fontsize=9, y=0.97)
+            ax.set_title(f"{name}\n{error}" if j == 0 else error, fontsize=9, y=1.04)
             ax.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1))
-            ax.set_box_aspect((1, 1, 1), zoom=1.4)
+            ax.set_box_aspect((1, 1, 1), zoom=1.25)
             ax.set_axis_off()
     for ax, j in zip(axes[:, 0], (0, 2)):
         ax.text2D(-0.2, 0.5, rf"$\mu = {mus[j]:g}$", rotation=90, va="center",
@@ -221,22 +221,25 @@ def figure_poisson(full: bool) -> None:
     figure, axes = plt.subplots(1, 3, figsize=(WIDTH, 3.4))
     midpoint = style("ImplicitMidpoint")
     hollow = midpoint | dict(ls=":", mfc="white")
-    axes[0].loglog(hs, of_X, label="ImplicitMidpoint for $X$", **hollow)
+    axes[0].loglog(hs, of_X, label="for $X$ itself", **hollow)
     axes[0].loglog(hs, of_pairs, label="with spin_terms", **midpoint)
     axes[0].set(
         xlabel="step $h$", ylabel="Poisson defect of one step", ylim=(1e-17, 10)
     )
+    axes[0].set_title("ImplicitMidpoint")
     axes[0].legend(loc="center", bbox_to_anchor=(0.5, 0.3))
     # Below one unit in the last place there is nothing.
     shown = np.maximum.accumulate(np.maximum(length, 1e-17))
     axes[1].semilogy(ts, shown, **line("ImplicitMidpoint"))
     axes[1].set(xlabel="time", ylabel=r"$||X| - 1|$, largest so far")
+    axes[1].set_ylim(1e-17, 1e-12)
     axes[1].set_title("spin_terms, $h = 0.1$")
-    label = f"NinomiyaVictoir ({slope:.2f})"
+    label = f"slope {slope:.2f}"
     axes[2].loglog(local_hs, local, label=label, **style("NinomiyaVictoir"))
     cube = local[0] * (local_hs / local_hs[0]) ** 3
     axes[2].loglog(local_hs, cube, "k:", label="$h^3$")
     axes[2].set(xlabel="step $h$", ylabel="weak error of one step, $E[X_1^2]$")
+    axes[2].set_title("NinomiyaVictoir")
     axes[2].legend(loc="upper left")
     for ax, sizes in ((axes[0], hs), (axes[2], local_hs)):
         ax.set_xticks(sizes[::2], [f"1/{1 / h:.0f}" for h in sizes[::2]])
