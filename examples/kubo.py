@@ -130,7 +130,9 @@ def figure_3(full: bool) -> None:
         ax.plot(q, p, ".", ms=1, color=colour(name))
         ax.plot(np.cos(angle), np.sin(angle), "k-", lw=0.8)
         ax.set(xlabel="$q$", ylabel="$p$", aspect="equal")
-        ax.set_title(f"{name}\n{shown}", fontsize=9)
+        # As many lines in each, so that the panels are in rows.
+        lines = f"{name}\n{shown}" if "\n" in shown else f"{name}\n{shown}\n"
+        ax.set_title(lines, fontsize=9)
     axes[-1, -1].axis("off")
     save(figure, "fig3.png")
     for name, drift in drifts.items():
