@@ -184,7 +184,7 @@ def plot_growth(results: dict[str, Growth]) -> None:
     axes[0].plot(H * counts, 1 + H * counts, "k:", label="exact solution")
     axes[0].set(ylim=(0, 3.6 * H * COUNTS[-1]), xlabel="time")
     axes[0].set(ylabel="$E[x^2 + y^2]$", title="figure 1: lines exact, dots sampled")
-    axes[0].legend(loc="upper right")
+    axes[0].legend(loc="upper right", fontsize=8, handlelength=1.3)
     axes[1].set_yticks(range(2, len(TABLE_1)), [*TABLE_1][2:])
     axes[1].set(xlabel=r"$|E[x^2 + y^2] - \mathrm{exact}| \,/\, N$", title="table 1")
     axes[1].plot([], [], "kD", ms=5, label="exact")
