@@ -8,6 +8,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import matplotlib.pyplot as plt
 
 import diffrax_symplectic as ds
 
@@ -79,7 +80,6 @@ def claim(what: str, value, low: float = -jnp.inf, high: float = jnp.inf) -> Non
 
 def save(figure, name: str) -> None:
     _output.mkdir(parents=True, exist_ok=True)
-    if figure.get_layout_engine() is None:
-        figure.tight_layout()
-    figure.savefig(_output / name, dpi=80)
+    figure.savefig(_output / name)
+    plt.close(figure)
     print(f"  picture: {_output / name}", flush=True)

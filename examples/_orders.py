@@ -13,6 +13,7 @@ import numpy as np
 import diffrax_symplectic as ds
 
 from ._gallery import briefly, claim, solve
+from ._pictures import style
 
 
 class Errors(NamedTuple):
@@ -306,30 +307,34 @@ def plot_orders(
 ) -> None:
     """Errors with their slopes, what was sampled of them with three standard errors, and
     reference slopes."""
-    for i, (name, e) in enumerate(results.items()):
-        style = dict(color=f"C{i}", ms=3, lw=1, capsize=2)
+    for name, e in results.items():
+        look = style(name)
+        if "sign=1" in name:
+            # Beside the same solver with the other sign.
+            look |= dict(ls=":", marker=">")
         label = name if np.isnan(e.slope) else f"{name} ({e.slope:.2f})"
         bars = 3 * e.std_errors if np.any(e.std_errors) else None
-        axes.errorbar(e.hs, e.errors, bars, label=label, fmt="o-", **style)
+        axes.errorbar(e.hs, e.errors, bars, label=label, **look)
         if sampled is not None and name in sampled:
             e = sampled[name]
             # A point that is not clear of its own bar says nothing.
             clear = e.errors > 3 * e.std_errors
-            style = dict(color=f"C{i}", mfc="none", ms=6, lw=0.8, capsize=3)
-            bars = 3 * e.std_errors[clear]
-            axes.errorbar(e.hs[clear], e.errors[clear], bars, fmt="s", **style)
+            look |= dict(ls="none", marker="s", mfc="none", ms=9, capsize=4)
+            axes.errorbar(e.hs[clear], e.errors[clear], 3 * e.std_errors[clear], **look)
     if sampled is not None:
-        label = "sampled, 3 standard errors,\nwhere that is less than the error"
-        axes.plot([], [], "ks", mfc="none", ms=6, label=label)
+        label = "sampled, where clear of zero"
+        axes.plot([], [], "ks", mfc="none", ms=9, label=label)
     all_errors = np.concatenate([e.errors for e in results.values()])
     hs = next(iter(results.values())).hs
     for slope in slopes:
         line = 2 * all_errors.max() * (hs / hs.max()) ** slope
-        axes.loglog(hs, line, "k:", lw=0.8)
-        axes.annotate(f"slope {slope:g}", (hs[-1], line[-1]), fontsize=8)
-    axes.set(xscale="log", yscale="log", xlabel="step size h", title=title)
-    axes.set_ylim(all_errors[all_errors > 0].min() / 4, 4 * all_errors.max())
+        axes.loglog(hs, line, "k:", lw=1)
+        place = dict(ha="right", va="center")
+        axes.text(hs[-1] / 1.15, line[-1], f"slope {slope:g}", **place)
+    axes.set(xscale="log", yscale="log", xlabel="step $h$", title=title)
+    axes.set_ylim(all_errors[all_errors > 0].min() / 4, 8 * all_errors.max())
+    # Room for the names of the slopes.
+    axes.set_xlim(hs[-1] / 3.5, 1.3 * hs[0])
     axes.set_xticks(hs, [f"$2^{{{np.log2(h):.0f}}}$" for h in hs])
     axes.minorticks_off()
-    axes.legend(fontsize=8)
-    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right")

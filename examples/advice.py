@@ -19,12 +19,15 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
+import matplotlib.pyplot as plt
 import numpy as np
 import optimistix as optx
 from matplotlib.lines import Line2D
 from scipy.linalg import expm
 
 import diffrax_symplectic as ds
+
+from ._pictures import style, WIDTH
 
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -491,37 +494,26 @@ def _in_order(problem: Problem, want, rows: dict) -> dict:
 
 def draw(kept: dict) -> None:
     """The picture of the errors of means."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(5, 3, figsize=(8, 12), layout="constrained")
+    figure, axes = plt.subplots(5, 3, figsize=(WIDTH, 12), sharey=True)
     every = sorted({solver for rows in kept["weak"].values() for solver in rows})
-    styles: dict[str, Any] = {
-        solver: dict(color=colour, marker=".")
-        for solver, colour in zip(every, [*map("C{}".format, range(10)), "k", "0.6"])
-    }
     for ax, name in zip(axes.flat, PROBLEMS):
         budgets = PROBLEMS[name].budgets
         for solver, errors in kept["weak"][name].items():
             shown = np.where(np.isfinite(errors), np.maximum(errors, 1e-10), np.nan)
-            ax.loglog(budgets, shown, **styles[solver])
-        ax.set_title(name, fontsize=8)
+            ax.loglog(budgets, shown, **style(solver))
+        ax.set_title(name, fontsize=9)
         ax.set_ylim(5e-11, 10)
         ax.set_xticks(budgets, map(str, budgets))
         ax.minorticks_off()
     for ax in axes.flat[len(PROBLEMS) :]:
         ax.axis("off")
-    lines = [Line2D([], [], label=solver, **styles[solver]) for solver in every]
-    figure.legend(
-        handles=lines, loc="outside lower center", fontsize=8, ncols=4, frameon=False
-    )
+    lines = [Line2D([], [], label=solver, **style(solver)) for solver in every]
+    figure.legend(handles=lines, loc="outside lower center", ncols=3)
     for ax in axes[-1]:
-        ax.set_xlabel("time for one evaluation", fontsize=8)
+        ax.set_xlabel(r"time for one evaluation, $1/\omega$")
     for ax in axes[:, 0]:
-        ax.set_ylabel("error", fontsize=8)
-    figure.savefig(DOCS / "img" / "advice.png", dpi=100)
+        ax.set_ylabel("relative error")
+    figure.savefig(DOCS / "img" / "advice.png")
     plt.close(figure)
 
 

@@ -10,14 +10,12 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrax_symplectic as ds
 
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+from ._pictures import WIDTH
 
 
 jax.config.update("jax_enable_x64", True)
@@ -52,18 +50,17 @@ def carried(solver) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main() -> None:
-    figure, axes = plt.subplots(
-        1, 2, figsize=(8, 4.2), sharex=True, sharey=True, layout="constrained"
-    )
+    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.4), sharex=True, sharey=True)
     solvers = (ds.StormerVerlet(), "Störmer-Verlet"), (diffrax.Heun(), "Heun")
     for ax, (solver, name) in zip(axes, solvers):
         for t, p, q in zip(TIMES, *carried(solver)):
-            label = f"t = {t:g}, area {area(p, q):.3f}"
+            label = f"$t = {t:g}$, area {area(p, q):.3f}"
             ax.fill(q, p, alpha=0.35, label=label)
-        ax.set(title=f"{name}, h = {H}", xlabel="q", aspect="equal", ylim=(-1.7, 2.7))
-        ax.legend(loc="upper left", fontsize=8)
-    axes[0].set(ylabel="p")
-    figure.savefig(IMG / "concepts.png", dpi=110)
+        ax.set(title=f"{name}, $h = {H}$", xlabel="$q$", aspect="equal")
+        ax.set_ylim(-1.7, 2.9)
+        ax.legend(loc="upper left")
+    axes[0].set(ylabel="$p$")
+    figure.savefig(IMG / "concepts.png")
 
 
 if __name__ == "__main__":

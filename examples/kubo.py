@@ -37,6 +37,7 @@ from ._orders import (
     sampled_weak_error,
     second_moments,
 )
+from ._pictures import colour, WIDTH
 
 
 def make_terms(path, s: float = 1.0):
@@ -93,7 +94,7 @@ def figure_2c(full: bool) -> None:
     report("exact", exact)
     report("sampled", sampled)
     figure, axes = plt.subplots(figsize=(6, 4.5))
-    plot_orders(axes, "2(c): weak error of E(q^2)", exact, sampled)
+    plot_orders(axes, "2(c): weak error of $E[q^2]$", exact, sampled)
     save(figure, "fig2c.png")
     claim_slopes(exact, {"SRKw1(b=0)": 1, "SRKw2": 2, "Milstein": 1})
     claim_samples(exact, sampled)
@@ -110,26 +111,29 @@ def figure_3(full: bool) -> None:
         "SRKw1(b=0)": (ds.SRKw1(b=0.0), weak()),
         "SRKw2": (PAPER_SRKW2, weak()),
     }
-    figure, axes = plt.subplots(1, 5, figsize=(15, 3.6))
+    figure, axes = plt.subplots(2, 3, figsize=(WIDTH, 6.2))
     angle = np.linspace(0, 2 * np.pi, 200)
     drifts = {}
-    for ax, (name, (solver, path)) in zip(axes, solvers.items()):
+    for ax, (name, (solver, path)) in zip(axes.flat, solvers.items()):
         solution = briefly(
             lambda: trajectory(make_terms, path, solver, Y0, h, steps, every=2)
         )
         _, (p, q), success = solution()
         drift = np.max(np.abs(np.hypot(p, q) - 1))
         drifts[name] = float(drift) if success else np.inf
-        title = f"{name}: {drifts[name]:.1e}"
+        shown = f"largest error {drifts[name]:.0e}"
         if name in ("Milstein", "Heun"):
             moment_map = exact_moment_map(make_terms, path, solver, Y0)
             mean = np.trace(second_moments(moment_map, Y0, h, steps))
-            title += f"\nexact E(p^2 + q^2) at the end: {mean:.4g}"
-        print(f"    {title}".replace("\n", "; "), flush=True)
-        ax.plot(q, p, ".", ms=1, color="C1" if name in ("Milstein", "Heun") else "C0")
+            shown += f"\n$E[p^2 + q^2] = {mean:.3g}$ at the end"
+        print(f"    {name}: {shown}".replace("\n", "; "), flush=True)
+        ax.plot(q, p, ".", ms=1, color=colour(name))
         ax.plot(np.cos(angle), np.sin(angle), "k-", lw=0.8)
-        ax.set(xlabel="q", ylabel="p", aspect="equal")
-        ax.set_title(title, fontsize=8)
+        ax.set(xlabel="$q$", ylabel="$p$", aspect="equal")
+        # As many lines in each, so that the panels are in rows.
+        lines = f"{name}\n{shown}" if "\n" in shown else f"{name}\n{shown}\n"
+        ax.set_title(lines, fontsize=9)
+    axes[-1, -1].axis("off")
     save(figure, "fig3.png")
     for name, drift in drifts.items():
         ours = isinstance(solvers[name][0], ds.AbstractSymplecticRungeKutta)
@@ -179,7 +183,7 @@ def figure_strong(full: bool) -> None:
     )
     report("exact", exact)
     figure, axes = plt.subplots(figsize=(6, 4.5))
-    plot_orders(axes, "strong error of (p, q)", exact, slopes=(0.5, 1))
+    plot_orders(axes, "strong error of $(p, q)$", exact, slopes=(0.5, 1))
     save(figure, "kubo_strong.png")
     orders = {"SRKs1": 1, "ImplicitMidpoint": 1, "Milstein": 1, "Euler (Itô)": 0.5}
     claim_slopes(exact, orders)

@@ -41,6 +41,7 @@ from ._orders import (
     second_moments,
     strong_errors,
 )
+from ._pictures import BLUE, line, VERMILION, WIDTH
 
 
 def make_terms(path, s: float = 1.0):
@@ -157,24 +158,20 @@ def figure_1(full: bool) -> None:
 
 
 def plot_growth(results: dict[str, Growth]) -> None:
-    figure, axes = plt.subplots(1, 2, figsize=(13, 5))
+    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.4), width_ratios=(1, 1.2))
     counts = 1000 * np.arange(1, COUNTS[-1] // 1000 + 1)
+    paper = dict(ls="none", marker="x", color=VERMILION)
     for i, (name, g) in enumerate(results.items()):
         symplectic = i >= 2
         # The symplectic methods lie on top of each other: one colour, one entry.
-        colour = "C0" if symplectic else f"C{i + 1}"
+        look = dict(color=BLUE) if symplectic else line(name)
         label = f"{len(results) - 2} symplectic methods" if i == 2 else name
         if name == "Euler":
             label = "Euler (off the chart)"
-        axes[0].plot(
-            H * counts,
-            g.exact,
-            color=colour,
-            ls="-" if symplectic else "--",
-            label=None if i > 2 else label,
-        )
+        axes[0].plot(H * counts, g.exact, label=None if i > 2 else label, **look)
         bars = 3 * g.std_errors
-        axes[0].errorbar(H * counts, g.sampled, bars, fmt=".", color=colour, ms=3)
+        dots = look | dict(ls="none", marker=".")
+        axes[0].errorbar(H * counts, g.sampled, bars, **dots)
         if symplectic:
             last = max(np.flatnonzero(np.isfinite(g.sampled)), default=0)
             biases = np.abs(np.array(g[:2]) - 1 - H * counts)[:, last] / counts[last]
@@ -182,22 +179,21 @@ def plot_growth(results: dict[str, Growth]) -> None:
             bar = 3 * g.std_errors[last] / counts[last]
             # Wider ones say nothing about what is compared here.
             if bar < 0.001:
-                axes[1].errorbar(biases[1], i, xerr=bar, fmt="C0s", ms=3)
-            axes[1].plot(TABLE_1[name][2], [i] * 3, "rx", ms=5)
+                axes[1].errorbar(biases[1], i, xerr=bar, fmt="s", color=BLUE)
+            axes[1].plot(TABLE_1[name][2], [i] * 3, **paper)
     axes[0].plot(H * counts, 1 + H * counts, "k:", label="exact solution")
-    axes[0].set(ylim=(0, 3 * H * COUNTS[-1]), xlabel="time", ylabel="E(x^2 + y^2)")
-    axes[0].set_title("figure 1: exact (lines), sampled (dots), h = 0.2")
-    axes[0].legend(loc="upper right")
+    axes[0].set(ylim=(0, 3.6 * H * COUNTS[-1]), xlabel="time")
+    axes[0].set(ylabel="$E[x^2 + y^2]$", title="figure 1: lines exact, dots sampled")
+    axes[0].legend(loc="upper right", fontsize=8, handlelength=1.3)
     axes[1].set_yticks(range(2, len(TABLE_1)), [*TABLE_1][2:])
-    axes[1].set(xlabel="|E(x^2 + y^2) - exact| / N", title="table 1")
+    axes[1].set(xlabel=r"$|E[x^2 + y^2] - \mathrm{exact}| \,/\, N$", title="table 1")
     axes[1].plot([], [], "kD", ms=5, label="exact")
-    axes[1].plot([], [], "rx", label="paper, three values of N")
+    axes[1].plot([], [], label="paper, three values of $N$", **paper)
     if axes[1].containers:
-        axes[1].plot([], [], "C0s", ms=3, label="sampled, 3 standard errors")
+        axes[1].plot([], [], "s", color=BLUE, label="sampled, 3 standard errors")
     # Above all rows.
-    axes[1].set_ylim(top=len(TABLE_1) + 1.2)
-    axes[1].legend(loc="upper center", ncols=3)
-    axes[1].grid(alpha=0.3)
+    axes[1].set_ylim(top=len(TABLE_1) + 2.4)
+    axes[1].legend(loc="upper center")
     save(figure, "fig1.png")
 
 
@@ -224,7 +220,7 @@ def figure_2a(full: bool) -> None:
     report("exact", exact)
     report("quasi-Monte Carlo", sampled)
     figure, axes = plt.subplots(figsize=(6, 4.5))
-    plot_orders(axes, "2(a): weak error of E(x^2)", exact, sampled)
+    plot_orders(axes, "2(a): weak error of $E[x^2]$", exact, sampled)
     save(figure, "fig2a.png")
     claim_slopes(exact, {"SRKw5": 2, "Euler": 1})
     claim_samples(exact, sampled)
@@ -292,10 +288,10 @@ def figure_2b(full: bool) -> None:
     report("sampled", sampled)
     del nonlinear["SRKs4(sign=1)"]
     report(f"pendulum (not in the paper), {paths:,} paths", nonlinear)
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.5))
+    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.5))
     slopes = 1, 1.5, 2
-    plot_orders(axes[0], "2(b): strong error of x", exact, sampled, slopes)
-    plot_orders(axes[1], "strong error, pendulum", nonlinear, slopes=slopes)
+    plot_orders(axes[0], "2(b): strong error of $x$", exact, sampled, slopes)
+    plot_orders(axes[1], "strong error of $x$, pendulum", nonlinear, slopes=slopes)
     save(figure, "fig2b.png")
     # The terms that keep SRKs4 at order 3/2 vanish where the drift is linear.
     claim_slopes(exact, {"SRKs4": 2, "SRKs4(sign=1)": 2, "Euler": 1})

@@ -10,9 +10,12 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrax_symplectic as ds
+
+from ._pictures import BLUE, style, VERMILION, WIDTH
 
 
 X = np.array([[0, 1], [1, 0]])
@@ -66,13 +69,7 @@ def sampled(key, times, h: float):
 
 
 def main():
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    from matplotlib.ticker import NullFormatter
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH, 3.8))
     times, paths = np.arange(1, 13) * 1.0, 1_000
     values = jax.jit(jax.vmap(lambda key: sampled(key, times, 0.1)))(
         jr.split(jr.key(0), paths)
@@ -81,24 +78,27 @@ def main():
     rho = jax.vmap(lindblad)(fine)
     for i, (M, name) in enumerate(((X, "x"), (Z, "z"))):
         line = jnp.trace(rho @ M, axis1=1, axis2=2).real
-        left.plot(fine, line, f"C{i}", lw=1, label=f"sigma_{name}, Lindblad")
+        colour = (BLUE, VERMILION)[i]
+        left.plot(fine, line, color=colour, ls=("-", "--")[i])
         bars = 3 * jnp.std(values[..., i], axis=0) / paths**0.5
         left.errorbar(
-            times, jnp.mean(values[..., i], axis=0), bars, fmt=f"C{i}o", ms=3, lw=1,
-            capsize=2, label=f"sigma_{name}, {paths:,} paths",
+            times, jnp.mean(values[..., i], axis=0), bars, ls="none", color=colour,
+            marker="os"[i], label=rf"$\sigma_{name}$",
         )  # fmt: skip
-    left.set(xlabel="t", title="E <sigma>, with three standard errors")
+    left.set(xlabel="time $t$", ylabel=r"mean $E\langle\sigma\rangle$")
+    left.set_title(f"lines: Lindblad equation; dots: {paths:,} paths")
     steps = 2 ** np.arange(2, 8)
     for name, solver in (("SRKw1", ds.SRKw1()), ("StrangGauss", ds.StrangGauss())):
         found = jnp.stack([density(solver, 2.0, int(n)) for n in steps])
         bias = jnp.trace((found - lindblad(2.0)) @ X, axis1=1, axis2=2).real
-        right.loglog(2 / steps, np.abs(bias), "o-", ms=3, lw=1, label=name)
-    right.xaxis.set_minor_formatter(NullFormatter())
-    right.set(xlabel="h", title="bias of E <sigma_x> at t = 2, without sampling")
+        right.loglog(2 / steps, np.abs(bias), label=name, **style(name))
+    right.set_xticks(2 / steps, [f"1/{n // 2}" if n > 2 else "1" for n in steps])
+    right.minorticks_off()
+    right.set(xlabel="step $h$", ylabel=r"bias of $E\langle\sigma_x\rangle$ at $t = 2$")
+    right.set_title("without sampling")
     for ax in (left, right):
-        ax.legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(Path(__file__).parents[1] / "docs/img/qubit.png", dpi=100)
+        ax.legend()
+    figure.savefig(Path(__file__).parents[1] / "docs/img/qubit.png")
 
 
 if __name__ == "__main__":

@@ -16,15 +16,13 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 import diffrax_symplectic as ds
 
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+from ._pictures import colour, style, WIDTH
 
 
 jax.config.update("jax_enable_x64", True)
@@ -155,27 +153,26 @@ def measured() -> list[tuple[str, int, float, float]]:
 
 
 def draw_portrait(ax) -> None:
-    for name, solver, colour in (
-        ("Heun", diffrax.Heun(), "C1"),
-        ("ImplicitMidpoint", ds.ImplicitMidpoint(), "C0"),
-    ):
+    for solver in (diffrax.Heun(), ds.ImplicitMidpoint()):
+        name = type(solver).__name__
         p, q = portrait(solver)
         near = np.hypot(p, q) < 2.2
-        ax.plot(q[near], p[near], ".", ms=2, color=colour, label=name)
-    ax.set(xlabel="q", ylabel="p", title=f"a noisy oscillator to t = {H * STEPS:g}")
+        ax.plot(q[near], p[near], ".", ms=2, color=colour(name), label=name)
+    ax.set(xlabel="$q$", ylabel="$p$")
+    ax.set_title(f"a noisy oscillator to $t = {H * STEPS:g}$")
     ax.set(xlim=(-2.3, 2.3), ylim=(-2.3, 2.9), aspect="equal")
-    ax.legend(loc="upper center", ncols=2, markerscale=4, frameon=False)
+    ax.legend(loc="upper center", ncols=2, markerscale=4)
 
 
 def draw_errors(ax, rows) -> None:
-    styles = {HEUN: "C1o--", PLAIN: "C4o--", DEFAULT: "C0o-"}
-    for name, style in styles.items():
+    styles = {HEUN: style("Heun"), PLAIN: style("StormerVerlet") | dict(ls=":")}
+    styles[DEFAULT] = style("StormerVerlet")
+    for name, look in styles.items():
         points = [(seconds, error) for x, _, error, seconds in rows if x == name]
-        ax.plot(*zip(*points), style, label=name.replace("`", ""))
+        ax.plot(*zip(*points), label=name.replace("`", ""), **look)
     ax.set(xscale="log", yscale="log", title="a mean in a double well")
-    ax.set(xlabel="seconds", ylabel="total error")
-    ax.legend(loc="lower left", fontsize=8, frameon=False)
-    ax.grid(alpha=0.3)
+    ax.set(xlabel="seconds", ylabel="total error", ylim=(2e-12, 3e-2))
+    ax.legend(loc="lower left", fontsize=8)
 
 
 def main() -> None:
@@ -185,12 +182,16 @@ def main() -> None:
         writer.writerow(("estimate", "steps", "total error", "seconds"))
         for name, steps, error, seconds in rows:
             writer.writerow((name, steps, f"{error:.1e}", f"{seconds:.2g}"))
+    draw(rows)
+
+
+def draw(rows) -> None:
     figure, (left, right) = plt.subplots(
-        1, 2, figsize=(9, 3.8), layout="constrained", width_ratios=(1, 1.3)
+        1, 2, figsize=(WIDTH, 3.6), width_ratios=(1, 1.3)
     )
     draw_portrait(left)
     draw_errors(right, rows)
-    figure.savefig(IMG / "first.png", dpi=110)
+    figure.savefig(IMG / "first.png")
 
 
 if __name__ == "__main__":

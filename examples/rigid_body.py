@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullLocator
 
 import diffrax_symplectic as ds
 
@@ -35,6 +36,7 @@ from ._orders import (
     resolved_solvers,
     sampled_weak_error,
 )
+from ._pictures import colour, line, style, WIDTH
 from ._transfer import enumerated_expectation, transfer_weak_errors
 from .benchmarks._exact import rigid_body_square
 
@@ -77,7 +79,7 @@ def figure_5(full: bool) -> None:
     print(f"\nFig. 5: one path to t = {h * steps:g}, h = {h}; the largest ||X| - 1|")
     mus = (0.1, 0.2, 1.0)
     figure, axes = plt.subplots(
-        2, 5, figsize=(11, 5), subplot_kw={"projection": "3d"}, layout="constrained"
+        2, 5, figsize=(WIDTH, 4.1), subplot_kw={"projection": "3d"}
     )
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 25), np.linspace(0, np.pi, 13))
     sphere = np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)
@@ -102,14 +104,17 @@ def figure_5(full: bool) -> None:
         print(f"    {name:12} {listed}", flush=True)
         for ax, j in zip(axes[:, i], (0, 2)):
             ax.plot_wireframe(*sphere, color="0.85", lw=0.3)
-            colour = "C1" if i < 2 else "C0"
-            shown = np.asarray(X[j])[length[j] < 2]
-            ax.plot(*shown.T, ".", ms=1, color=colour)
-            ax.set_title(
-                f"{name}, mu = {mus[j]}:\n{drifts[name][j]:.1e}", fontsize=8, y=0.9
-            )
-            ax.set_aspect("equal")
+            shown = np.asarray(X[j])[length[j] < 1.5]
+            ax.plot(*shown.T, ".", ms=1, color=colour(name))
+            drift = drifts[name][j]
+            error = f"off by {drift:.0e}" if np.isfinite(drift) else "overflows"
+            ax.set_title(f"{name}\n{error}" if j == 0 else error, fontsize=9, y=1.04)
+            ax.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1))
+            ax.set_box_aspect((1, 1, 1), zoom=1.25)
             ax.set_axis_off()
+    for ax, j in zip(axes[:, 0], (0, 2)):
+        ax.text2D(-0.2, 0.5, rf"$\mu = {mus[j]:g}$", rotation=90, va="center",
+                  transform=ax.transAxes)  # fmt: skip
     save(figure, "fig5.png")
     for name, drift in drifts.items():
         ours = isinstance(SOLVERS[name][0], ds.AbstractSymplecticRungeKutta)
@@ -142,7 +147,7 @@ def figure_6b(full: bool) -> None:
     report("exact", exact)
     report("sampled", sampled)
     figure, axes = plt.subplots(figsize=(6, 4.5))
-    plot_orders(axes, "6(b): weak error of E(X1^2)", exact, sampled)
+    plot_orders(axes, "6(b): weak error of $E[X_1^2]$", exact, sampled)
     save(figure, "fig6b.png")
     claim_slopes(exact, {"SRKw2": 2, "Milstein": 1})
     claim_small_first_order("SRKw1(b=0)", exact["SRKw1(b=0)"])
@@ -213,21 +218,32 @@ def figure_poisson(full: bool) -> None:
     local_hs = 2.0 ** -np.arange(2, 7)
     local = np.abs(local_weak_errors(local_hs))
     slope = np.polyfit(np.log(local_hs), np.log(local), 1)[0]
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.5), layout="constrained")
-    axes[0].loglog(hs, of_X, "o-C1", label="ImplicitMidpoint of X")
-    axes[0].loglog(hs, of_pairs, "o-C0", label="ImplicitMidpoint, spin_terms")
-    axes[0].set(xlabel="h", title="Poisson defect of one step")
-    axes[0].legend(fontsize=8)
-    axes[1].semilogy(ts, length + 1e-17, "C0", lw=0.5)
-    axes[1].set(xlabel="t", title="||X| - 1|, ImplicitMidpoint, spin_terms, h = 0.1")
-    axes[2].loglog(local_hs, local, "o-C0", label=f"NinomiyaVictoir ({slope:.2f})")
-    axes[2].loglog(
-        local_hs, local[0] * (local_hs / local_hs[0]) ** 3, "k:", label="h^3"
+    figure, axes = plt.subplots(1, 3, figsize=(WIDTH, 3.4))
+    midpoint = style("ImplicitMidpoint")
+    hollow = midpoint | dict(ls=":", mfc="white")
+    axes[0].loglog(hs, of_X, label="for $X$ itself", **hollow)
+    axes[0].loglog(hs, of_pairs, label="with spin_terms", **midpoint)
+    axes[0].set(
+        xlabel="step $h$", ylabel="Poisson defect of one step", ylim=(1e-17, 10)
     )
-    axes[2].set_xticks(local_hs[::2], [f"1/{1 / h:.0f}" for h in local_hs[::2]])
-    axes[2].minorticks_off()
-    axes[2].set(xlabel="h", title="local weak error of E(X1^2), three noises")
-    axes[2].legend(fontsize=8)
+    axes[0].set_title("ImplicitMidpoint")
+    axes[0].legend(loc="center", bbox_to_anchor=(0.5, 0.3))
+    # Below one unit in the last place there is nothing.
+    shown = np.maximum.accumulate(np.maximum(length, 1e-17))
+    axes[1].semilogy(ts, shown, **line("ImplicitMidpoint"))
+    axes[1].set(xlabel="time", ylabel=r"$||X| - 1|$, largest so far")
+    axes[1].set_ylim(1e-17, 1e-12)
+    axes[1].set_title("spin_terms, $h = 0.1$")
+    label = f"slope {slope:.2f}"
+    axes[2].loglog(local_hs, local, label=label, **style("NinomiyaVictoir"))
+    cube = local[0] * (local_hs / local_hs[0]) ** 3
+    axes[2].loglog(local_hs, cube, "k:", label="$h^3$")
+    axes[2].set(xlabel="step $h$", ylabel="weak error of one step, $E[X_1^2]$")
+    axes[2].set_title("NinomiyaVictoir")
+    axes[2].legend(loc="upper left")
+    for ax, sizes in ((axes[0], hs), (axes[2], local_hs)):
+        ax.set_xticks(sizes[::2], [f"1/{1 / h:.0f}" for h in sizes[::2]])
+        ax.xaxis.set_minor_locator(NullLocator())
     save(figure, "poisson.png")
     claim("Poisson defect by spin_terms", of_pairs.max(), high=1e-13)
     claim("Poisson defect of the midpoint rule for X, h = 1/4", of_X[0], low=1e-4)

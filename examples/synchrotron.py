@@ -26,6 +26,7 @@ from ._orders import (
     sampled_weak_error,
     strong_errors,
 )
+from ._pictures import BLUE, line, WIDTH
 from ._transfer import enumerated_expectation, transfer_weak_errors
 
 
@@ -70,7 +71,7 @@ def figure_2d(full: bool) -> None:
     sampled = study(paths)
     report("sampled", sampled)
     figure, axes = plt.subplots(figsize=(6, 4.5))
-    plot_orders(axes, "2(d): strong error of P", sampled, slopes=(0.5, 1))
+    plot_orders(axes, "2(d): strong error of $P$", sampled, slopes=(0.5, 1))
     save(figure, "fig2d.png")
     claim_slopes(sampled, {"SRKs3": 1, "Euler": 1})
 
@@ -110,10 +111,10 @@ def figure_4(full: bool) -> None:
     print(
         f"\nFig. 4: paths to t = {h * steps:g}, h = {h}; the mean of H0 over {paths:,}"
     )
-    figure, panels = plt.subplots(3, 4, figsize=(15, 9))
-    for unused in panels[2]:
-        unused.remove()
-    energies = figure.add_subplot(3, 1, 3)
+    figure = plt.figure(figsize=(WIDTH, 7.5))
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.3, 1))[:, 0]
+    panels = above.subplots(2, 4, sharex=True, sharey=True)
+    energies = below.subplots()
     ts = np.linspace(0, h * steps, steps // 10 + 1)
     # d E(H0) / dt = E(s1^2 cos^2 Q + s2^2 sin^2 Q) / 2.
     start = H0(0.0, 1.0, 0.0, None)
@@ -123,13 +124,20 @@ def figure_4(full: bool) -> None:
         p, mean, bar = long_run(solver, path, h, steps, paths)
         means[name] = mean[-1], bar[-1]
         print(f"    {name:8} {mean[-1]:8.3f} +- {bar[-1]:.3f}", flush=True)
-        ax.plot(ts, p, color="C1" if name == "Euler" else "C0", lw=0.3)
-        ax.set(title=f"{name}: P of one path", ylim=(-12, 12))
-        energies.errorbar(ts, mean, 3 * bar, label=name, errorevery=100, lw=0.8)
+        look = line(name) if name == "Euler" else dict(color=BLUE)
+        ax.plot(ts, p, color=look["color"], lw=0.3)
+        ax.set(title=name, ylim=(-12, 12))
+        # The symplectic methods lie on top of each other: one colour, one entry.
+        first = name == next(iter(LONG_RUN))
+        label = f"{len(LONG_RUN) - 1} symplectic methods" if first else None
+        label = name if name == "Euler" else label
+        energies.errorbar(ts, mean, 3 * bar, label=label, errorevery=100, **look)
     energies.fill_between(ts, low, high, color="0.8", label="bounds of the exact mean")
-    energies.set(xlabel="time", ylim=(-5, 30))
-    energies.set_title(f"mean of H0 over {paths:,} paths, 3 standard errors")
-    energies.legend(fontsize=7, ncols=3)
+    above.supylabel("$P$ of one path", fontsize=10)
+    above.supxlabel("time", fontsize=10)
+    energies.set(xlabel="time", ylabel="mean of $H_0$", ylim=(-5, 32))
+    energies.set_title(f"{paths:,} paths, bars of three standard errors")
+    energies.legend(loc="upper left")
     save(figure, "fig4.png")
     for name, (mean, bar) in means.items():
         if name == "Euler":
@@ -179,7 +187,7 @@ def figure_6a(full: bool) -> None:
     report("exact", exact)
     report("sampled", sampled)
     figure, axes = plt.subplots(figsize=(6, 4.5))
-    plot_orders(axes, "6(a): weak error of E(P^2)", exact, sampled)
+    plot_orders(axes, "6(a): weak error of $E[P^2]$", exact, sampled)
     save(figure, "fig6a.png")
     claim_slopes(exact, {"SRKw4(a21=0)": 2, "Euler": 1})
     claim_small_first_order("SRKw3a", exact["SRKw3a"])

@@ -12,9 +12,12 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrax_symplectic as ds
+
+from ._pictures import BLUE, style, VERMILION, WIDTH
 
 
 ALPHA = 0.5
@@ -112,37 +115,37 @@ def stationary_bias(
 
 
 def main():
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH, 3.8))
     fine = np.linspace(0.05, 3, 200)
-    left.plot(fine, langevin(1 / fine), "k", lw=1, label="coth(1/T) - T")
+    left.plot(fine, langevin(1 / fine), "k", label=r"$\coth(1/T) - T$")
     Ts = np.array([0.2, 0.4, 0.7, 1.0, 1.5, 2.0, 3.0])
     for i, (what, label) in enumerate(
-        ((in_field, "one spin in a field: s_z"), (neighbours, "chain: s_i . s_i+1"))
+        (
+            (in_field, "one spin in a field, $s_z$"),
+            (neighbours, r"chain, $s_i \cdot s_{i+1}$"),
+        )
     ):
         run = jax.jit(lambda T, what=what: sampled(what, T))
         means, errors = np.array([run(T) for T in Ts]).T
         left.errorbar(
-            Ts, means, 3 * errors, fmt=f"C{i}" + "os"[i], ms=3 + 3 * i, lw=1, capsize=2,
-            fillstyle="none", label=label,
+            Ts, means, 3 * errors, ls="none", color=(BLUE, VERMILION)[i],
+            marker="os"[i], ms=4 + 4 * i, fillstyle="none", label=label,
         )  # fmt: skip
-    left.set(xlabel="T", title="means, with three standard errors")
+    left.set(xlabel="temperature $T$", ylabel="mean")
+    left.set_title("bars of three standard errors")
     hs, T = np.array([0.8, 0.4, 0.2]), 0.6
     H, what = (lambda s: -s[2]), (lambda s: s[2:])
     for solver in (ds.ImplicitMidpoint(), ds.NinomiyaVictoir()):
         bias = stationary_bias(H, what, solver, hs, ALPHA, T, degree=5)[:, 0]
-        right.loglog(hs, np.abs(bias), "o-", ms=3, lw=1, label=type(solver).__name__)
+        name = type(solver).__name__
+        right.loglog(hs, np.abs(bias), label=name, **style(name))
     right.minorticks_off()
     right.set_xticks(hs, map(str, hs))
-    right.set(xlabel="h", title=f"bias of E s_z at T = {T}, without sampling")
+    right.set(xlabel="step $h$", ylabel=f"bias of $E[s_z]$ at $T = {T}$")
+    right.set_title("without sampling")
     for ax in (left, right):
-        ax.legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(Path(__file__).parents[1] / "docs/img/warm_spins.png", dpi=100)
+        ax.legend()
+    figure.savefig(Path(__file__).parents[1] / "docs/img/warm_spins.png")
 
 
 if __name__ == "__main__":

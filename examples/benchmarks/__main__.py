@@ -23,7 +23,7 @@ def main() -> None:
     step_sizes.main()
     tolerance.main()
     members.main()
-    work_precision.main()
+    work_precision.main("errors", "seconds")
     total_error.main()
 
 

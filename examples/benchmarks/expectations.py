@@ -20,22 +20,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrax_symplectic as ds
 
 from .. import linear_oscillator, synchrotron
+from .._pictures import style, WIDTH
 from ..hard_cases import chain
 from . import _exact
 from ._ensembles import MODELS
 from ._timing import DOCS
 from .work_precision import two_noises
-
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-from matplotlib.ticker import NullFormatter  # noqa: E402
 
 
 class Case(NamedTuple):
@@ -230,20 +226,20 @@ def measure(name: str) -> dict[str, Any]:
 
 
 def draw(measured: dict[str, dict]) -> None:
-    figure, axes = plt.subplots(1, 4, figsize=(12, 3.4), sharey=True)
-    for ax, name in zip(axes, PICTURE):
-        for marker, sampling in zip(
-            "s^o", ("IndependentPaths", "ArrayRQMC", "ValueFunctions")
-        ):
-            ax.loglog(*zip(*measured[name][sampling]), marker + "-", label=sampling)
-        ax.xaxis.set_minor_formatter(NullFormatter())
+    figure, axes = plt.subplots(2, 2, figsize=(WIDTH, 6), sharex=True, sharey=True)
+    for ax, name in zip(axes.flat, PICTURE):
+        for sampling in ("IndependentPaths", "ArrayRQMC", "ValueFunctions"):
+            dots = zip(*measured[name][sampling])
+            ax.loglog(*dots, label=sampling, **style(sampling))
         ax.set_title(name)
+    for ax in axes[-1]:
         ax.set_xlabel("seconds")
-        ax.grid(alpha=0.3)
-    axes[0].set_ylabel("total error")
-    axes[2].legend(fontsize=8, loc="lower left")
-    figure.tight_layout()
-    figure.savefig(DOCS / "samplings.png", dpi=110)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("total error")
+    lines, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(lines, labels, loc="outside upper center", ncols=3)
+    figure.savefig(DOCS / "samplings.png")
+    plt.close(figure)
 
 
 def table(measured: dict[str, dict]) -> str:

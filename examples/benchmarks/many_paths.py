@@ -19,6 +19,7 @@ import matplotlib.pyplot as plt
 
 import diffrax_symplectic as ds
 
+from .._pictures import style, WIDTH
 from ._timing import DOCS, machine
 from .fused import Case, CASES
 
@@ -141,21 +142,32 @@ def write(table: Table) -> None:
         f"| system | | {heads} |",
         "|---" * (2 + len(NUMBERS)) + "|",
     ]
-    fig, axes = plt.subplots(2, 3, figsize=(9, 5), sharex=True, layout="constrained")
-    for name, ax in zip(SYSTEMS, axes.flat):
+    for name in SYSTEMS:
         for way in WAYS:
             if nanoseconds := table.get((name, way)):
                 shown = " | ".join(f"{float(f'{x:.3g}'):,.10g}" for x in nanoseconds)
                 rows.append(f"| {name} | {way} | {shown} |")
-                ax.loglog(NUMBERS, nanoseconds, "o-", ms=3, label=way.strip("`"))
-        ax.set_title(name.replace("`", ""), fontsize=8)
-        ax.set_ylim(1, None)
-    axes[0, 0].legend(frameon=False, fontsize=7)
-    fig.supxlabel("paths", fontsize=8)
-    fig.supylabel("processor ns per path and step", fontsize=8)
-    fig.savefig(DOCS / "many_paths.png", dpi=150)
+    draw(table)
     image = "![Processor time per path and step](many_paths.png)"
     (DOCS / "many_paths.md").write_text("\n".join([*rows, "", image, ""]))
+
+
+def draw(table: Table) -> None:
+    figure, axes = plt.subplots(
+        3, 2, figsize=(WIDTH, 8), sharex=True, sharey=True, squeeze=False
+    )
+    for name, ax in zip(SYSTEMS, axes.flat):
+        for way in WAYS:
+            if nanoseconds := table.get((name, way)):
+                label = way.strip("`")
+                ax.loglog(NUMBERS, nanoseconds, label=label, **style(label))
+        ax.set_title(name.replace("`", "").replace("Henon", "Hénon"))
+    lines, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(lines, labels, loc="outside upper center", ncols=3)
+    figure.supxlabel("number of paths", fontsize=10)
+    figure.supylabel("processor nanoseconds per path and step", fontsize=10)
+    figure.savefig(DOCS / "many_paths.png")
+    plt.close(figure)
 
 
 if __name__ == "__main__":

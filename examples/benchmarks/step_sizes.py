@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from jax import lax
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 import diffrax_symplectic as ds
 
+from .._pictures import style, WIDTH
 from ._timing import DOCS, keys, machine, race
 from .growth import chain, network, ring
 
@@ -267,25 +268,22 @@ def page(rows: list[Row]) -> str:
 
 
 def draw(rows: list[Row]) -> None:
-    figure, axes = plt.subplots(1, 4, figsize=(13, 3.4), layout="constrained")
-    names = dict.fromkeys(row.name for row in rows if row.system.title in PICTURED)
-    colors = {name: f"C{i}" for i, name in enumerate(names)}
-    for ax, title in zip(axes, PICTURED):
-        for row in rows:
-            if row.system.title == title:
-                x = row.system.frequency * np.array(SIZES)
-                label = row.name.strip("`")
-                style = "--" if row.name in (HEUN, BY_HAND) else "-"
-                ax.loglog(
-                    x, row.nanoseconds, style,
-                    marker=".", color=colors[row.name], label=label,
-                )  # fmt: skip
+    figure, axes = plt.subplots(2, 2, figsize=(WIDTH, 6.5))
+    for ax, title in zip(axes.flat, PICTURED):
+        shown = [row for row in rows if row.system.title == title]
+        x = shown[0].system.frequency * np.array(SIZES)
+        for row in shown:
+            label = row.name.strip("`")
+            ax.loglog(x, row.nanoseconds, label=label, **style(label))
         ax.set(title=title, xlabel=r"$\omega h$")
-        ax.xaxis.set_minor_formatter(NullFormatter())
-    lines, labels = axes[0].get_legend_handles_labels()
-    figure.legend(lines, labels, loc="outside right center", fontsize=8)
-    axes[0].set_ylabel("nanoseconds per path and step")
-    figure.savefig(DOCS / "step_sizes.png", dpi=120)
+        ax.set_xticks(x, [f"{each:g}" for each in x])
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+        ax.minorticks_off()
+    lines, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(lines, labels, loc="outside lower center", ncols=4)
+    figure.supylabel("nanoseconds per path and step", fontsize=10)
+    figure.savefig(DOCS / "step_sizes.png")
     plt.close(figure)
 
 

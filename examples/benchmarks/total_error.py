@@ -20,19 +20,16 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 
 from diffrax_symplectic._simulation.levels import level_weights
 
 from .._orders import exact_moment_map, exact_weak_error
+from .._pictures import line, SKY, style, WIDTH
 from ._ensembles import Model, MODELS, other, plain, quasi
 from ._limits import limits, LONG
 from ._timing import DOCS, keys, machine, measure
-
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
 
 
 KEPT = Path(__file__).parents[1] / "output" / "total_error"
@@ -191,33 +188,37 @@ def to_target(rows: list[dict], times: list[float], target: float = TARGET) -> f
 
 
 def draw(results: dict[str, dict]) -> None:
-    figure, axes = plt.subplots(4, 2, figsize=(9.5, 14))
-    colors = {"expectation": "C2", "Heun": "C3", "SlowRK": "C1", "ShARK": "C4"}
-    colors |= {"quasi, one level": "C9", "quasi, two levels": "C0"}
+    figure, axes = plt.subplots(4, 2, figsize=(WIDTH, 11), sharex=True, sharey=True)
+    named = {"expectation": "IndependentPaths"}
+    named |= {x: x.replace("quasi", "ArrayRQMC") for x in LEVELS}
+    # Two levels look like all other pictures of this sampling.
+    styles = {name: style(label) for name, label in named.items()}
+    styles["quasi, one level"] = style("ArrayRQMC") | dict(color=SKY)
     lines = {}
     for ax, (title, result) in zip(axes.flat, results.items()):
         e, s = result["errors"], result["seconds"]
         for name in (*LEVELS, "expectation"):
             y = [row["error"] for row in e[name]]
-            lines[name] = ax.plot(s[name], y, "o-", ms=4, color=colors[name])[0]
+            lines[name] = ax.plot(s[name], y, **styles[name])[0]
         error = np.logspace(-5.5, -1, 46)
         for name, b in e["others"].items():
             x = extrapolated(b, e["variance"], s["others"][name], error)
-            lines[name] = ax.plot(x, error, "--", color=colors[name])[0]
-        ax.axhline(TARGET, color="k", lw=0.5, ls=":")
+            lines[name] = ax.plot(x, error, **line(name))[0]
+        ax.axhline(TARGET, color="k", lw=0.8, ls=":")
         ax.set(xscale="log", yscale="log", title=title)
         ax.set(ylim=(1e-6, 3e-2), xlim=(1e-3, 1e9))
-        ax.set(xlabel="seconds", ylabel="total error")
-        ax.grid(alpha=0.3)
+    # Those below which there is no other panel have the labels of the axis.
+    for ax in axes.flat[-3:-1]:
+        ax.set_xlabel("seconds")
+        ax.tick_params(labelbottom=True)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("total error")
     ax = axes.flat[-1]
     ax.axis("off")
-    named = {"expectation": "IndependentPaths"}
-    named |= {x: x.replace("quasi", "ArrayRQMC") for x in LEVELS}
     labels = [named.get(x, f"diffrax.{x}") for x in lines]
-    ax.legend(lines.values(), labels, loc="center", fontsize=12)
-    figure.tight_layout()
+    ax.legend(lines.values(), labels, loc="center")
     DOCS.mkdir(parents=True, exist_ok=True)
-    figure.savefig(DOCS / "total_error.png", dpi=80)
+    figure.savefig(DOCS / "total_error.png")
     plt.close(figure)
 
 

@@ -1,18 +1,22 @@
 """Speed against accuracy on the four models, and one with two noises:
 
+    python -m examples.benchmarks.work_precision errors
+    python -m examples.benchmarks.work_precision seconds
     python -m examples.benchmarks.work_precision
 
 Weak errors are exact on the linear models (linear and Kubo oscillator, two noises) and
 estimated by quasi-Monte Carlo on the others, with error bars of three standard errors.
 Strong errors are root mean squares over one set of Brownian paths, by `compare_solvers`.
-Costs are CPU seconds per path, in batches of 10,000, measured in turns after all programs
-are compiled. Errors take a quarter of an hour of processor time; they are kept in
-`examples/output`, and are measured again after they are removed there. Writes
-`docs/benchmarks/work_precision.md` and its picture.
+The first measures these, in a quarter of an hour of processor time on however busy a
+machine. The second measures costs, and wants a quiet one: CPU seconds per path, in batches
+of 10,000, in turns after all programs are compiled. What was measured is kept in
+`docs/benchmarks/work_precision.json`, from which all three write `work_precision.md` and
+its pictures.
 """
 
 import functools as ft
 import json
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +26,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrax_symplectic as ds
@@ -33,15 +37,12 @@ from .._orders import (
     exact_moment_map,
     exact_weak_error,
 )
+from .._pictures import style, WIDTH
 from ._exact import two_noises_square
 from ._timing import DOCS, ensemble, keys, machine
 
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-
-
-KEPT = Path(__file__).parents[1] / "output" / "work_precision"
+KEPT = DOCS / "work_precision.json"
 BATCH = 10_000
 # Of the steps whose time is measured.
 H, STEPS = 1 / 64, 16
@@ -237,16 +238,17 @@ def weak_errors(model: str) -> dict[str, Errors]:
 ERRORS = {"weak": weak_errors, "strong": strong_errors}
 
 
-def kept(kind: str, model: str) -> dict[str, Errors]:
-    """The errors that were measured, or are measured now."""
-    path = KEPT / f"{kind}, {model}.json"
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        fields = ERRORS[kind](model).items()
-        path.write_text(json.dumps({name: np.stack(e).tolist() for name, e in fields}))
-        print(f"{kind}, {model}: done", flush=True)
-    stored = json.loads(path.read_text()).items()
-    return {name: Errors._make(np.array(fields)) for name, fields in stored}
+def measured_errors() -> dict[str, dict]:
+    """By kind, model and name of the solver: step sizes, errors, and standard errors."""
+    out = {kind: {} for kind in ERRORS}
+    for kind, errors_of in ERRORS.items():
+        for model in STRONG:
+            out[kind][model] = {
+                name: [[float(f"{x:.6g}") for x in field] for field in errors]
+                for name, errors in errors_of(model).items()
+            }
+            print(f"{kind}, {model}: done", flush=True)
+    return out
 
 
 def programs() -> dict[Any, Program]:
@@ -264,29 +266,48 @@ def programs() -> dict[Any, Program]:
     return out
 
 
-def draw(axes, title: str, results: dict[str, tuple[float, Errors]]) -> list[str]:
-    """Draws errors against seconds, and returns rows of a table. A point that is not
-    clear of its own error bar is not drawn: it says nothing."""
+def measured_seconds() -> dict[str, dict]:
+    """Per path and step, by kind of error, model and name."""
+    out = {kind: {model: {} for model in STRONG} for kind in ERRORS}
+    for (kind, model, name), seconds in costs(programs()).items():
+        out[kind][model][name] = float(f"{seconds:.4g}")
+    return out
+
+
+def draw(kind: str, kept: dict) -> None:
+    """Errors against seconds, a panel for each model. A point that is not clear of its own
+    error bar is not drawn: it says nothing."""
+    figure, axes = plt.subplots(3, 2, figsize=(WIDTH, 11.5))
+    for ax, model in zip(axes.flat, STRONG):
+        for name, fields in kept["errors"][kind][model].items():
+            e = Errors._make(np.array(fields))
+            seconds = kept["seconds"][kind][model][name] / e.hs
+            clear = e.errors > 3 * e.std_errors
+            bars = 3 * e.std_errors[clear]
+            ax.errorbar(
+                seconds[clear], e.errors[clear], bars, label=name, **style(name)
+            )
+        ax.set(xscale="log", yscale="log", title=model)
+        ax.set(xlabel="CPU seconds per path", ylabel=f"{kind} error")
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
+    axes[-1, -1].axis("off")
+    figure.savefig(DOCS / f"work_precision_{kind}.png")
+    plt.close(figure)
+
+
+def rows(kind: str, model: str, kept: dict) -> list[str]:
+    """Of the table."""
     lines = []
-    kind, _, model = title.partition(", ")
     system = model
-    for i, (name, (cost, e)) in enumerate(results.items()):
-        seconds, clear = cost / e.hs, e.errors > 3 * e.std_errors
-        style = "--" if name in dir(diffrax) else "-"
-        axes.errorbar(
-            seconds[clear], e.errors[clear], 3 * e.std_errors[clear], label=name,
-            color=f"C{i}", ls=style, marker="o", ms=3, lw=1, capsize=2,
-        )  # fmt: skip
+    for name, fields in kept["errors"][kind][model].items():
+        e = Errors._make(np.array(fields))
+        seconds = kept["seconds"][kind][model][name] / e.hs[SHOWN]
         error, own = e.errors[SHOWN], e.std_errors[SHOWN]
         bar = f" ± {own:.0e}" if own > error / 10 else ""
         if name != "StratonovichMilstein":  # the picture has it
-            cells = system, name, f"{error:.1e}{bar}", f"{seconds[SHOWN] * 1e6:.2f}"
+            cells = system, name, f"{error:.1e}{bar}", f"{seconds * 1e6:.2f}"
             lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |"))
             system = ""  # only in the first row of a system
-    axes.set(xscale="log", yscale="log", title=model)
-    axes.set(xlabel="CPU seconds per path", ylabel=kind.lower())
-    axes.legend(fontsize=7)
-    axes.grid(alpha=0.3)
     return lines
 
 
@@ -299,30 +320,38 @@ EXPLAINED = {
 HEAD = "| system | solver | error | µs |", "|---" * 4 + "|"
 
 
-def main() -> None:
+def write(kept: dict) -> None:
     lines = [
         "# Speed against accuracy",
         "",
         Path(__file__).with_suffix(".md").read_text().strip(),
         "",
         "Bars: three standard errors; points not clear of zero are omitted. CPU time per "
-        f"path, one core, batches of 10,000. {machine()}. Made by `python -m "
+        f"path, one core, batches of 10,000. {kept['machine']}. Made by `python -m "
         "examples.benchmarks.work_precision`.",
-        "",
-        "![Errors against CPU seconds per path](work_precision.png)",
     ]
-    figure, axes = plt.subplots(5, 2, figsize=(11, 22), layout="constrained")
-    seconds = costs(programs())
-    for column, kind in zip(axes.T, ERRORS):
-        lines += ["", f"## {kind.title()} errors", "", EXPLAINED[kind], "", *HEAD]
-        for ax, model in zip(column, STRONG):
-            errors = kept(kind, model).items()
-            results = {name: (seconds[kind, model, name], e) for name, e in errors}
-            lines += draw(ax, f"{kind.title()} error, {model}", results)
-    DOCS.mkdir(parents=True, exist_ok=True)
-    figure.savefig(DOCS / "work_precision.png", dpi=90)
+    for kind in ERRORS:
+        draw(kind, kept)
+        title = f"{kind.title()} errors"
+        picture = f"![{title} against CPU seconds per path](work_precision_{kind}.png)"
+        lines += ["", f"## {title}", "", picture, "", EXPLAINED[kind], "", *HEAD]
+        for model in STRONG:
+            lines += rows(kind, model, kept)
     (DOCS / "work_precision.md").write_text("\n".join(lines) + "\n")
 
 
+def main(*kinds: str) -> None:
+    """Measures `errors` or `seconds` anew, and writes the page."""
+    kept = json.loads(KEPT.read_text()) if KEPT.exists() else {}
+    if "errors" in kinds:
+        kept["errors"] = measured_errors()
+    if "seconds" in kinds:
+        kept["seconds"] = measured_seconds()
+        kept["machine"] = machine()
+    if kinds:
+        KEPT.write_text(json.dumps(kept, indent=1) + "\n")
+    write(kept)
+
+
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

@@ -14,6 +14,7 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
+from .._pictures import line, style, WIDTH
 from ..stability._page import fill, Page, table
 from ._ensemble import ensemble, gaussian, Mean, plateaus, truncated
 
@@ -88,7 +89,7 @@ def section(page: Page) -> str:
     names = ["ImplicitMidpoint", "Heun"] if page.quick else SOLVERS
     print(f"\nHenon-Heiles from energy 0.15 until t = {t1:g}, {paths:,} paths")
     rows = []
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4))
+    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 3.8))
     for name in names:
         solver, make_path = SOLVERS[name]
         left, balances = [], []
@@ -98,22 +99,24 @@ def section(page: Page) -> str:
                 assert r.failed == 0
                 if s == 0:
                     ts = np.linspace(0, t1, r.energies.shape[1])
-                    axes[0].plot(ts, r.energies[0], lw=0.7, label=name)
+                    axes[0].plot(ts, r.energies[0], **line(name))
                 else:
                     balances.append(str(r.balance))
                     left.append(r.left)
         rows.append((name, *balances[:: max(1, len(hs) - 1)]))
         y, error = np.array(left).T
-        axes[1].errorbar(
-            hs, y, 3 * error, marker="o", ms=3, lw=1, capsize=2, label=name
-        )
-    axes[0].axhline(ESCAPE, color="k", lw=0.5, ls=":")
-    axes[0].set(xlabel="t", title="H0 without noise, h = 0.2", ylim=(0.14, 0.2))
-    axes[1].set(xscale="log", xlabel="h", title="share of orbits that left, s = 0.003")
-    for ax in axes:
-        ax.legend(fontsize=7)
+        axes[1].errorbar(hs, y, 3 * error, label=name, **style(name))
+    axes[0].axhline(ESCAPE, color="k", lw=0.8, ls=":")
+    axes[0].text(t1, ESCAPE, "escape energy", ha="right", va="bottom")
+    axes[0].set(xlabel="time $t$", ylabel="energy $H_0$", ylim=(0.14, 0.2))
+    axes[0].set_title("without noise, $h = 0.2$")
+    axes[1].set(xscale="log", xlabel="step $h$", ylabel="share of orbits that left")
+    axes[1].set(title="$s = 0.003$", ylim=(0, 1.05))
+    axes[1].set_xticks(hs, [f"{h:g}" for h in hs])
+    axes[1].minorticks_off()
+    handles, labels = axes[1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
     picture = page.picture(figure, "henon_heiles", "Hénon–Heiles system")
-    plt.close(figure)
     shown = table(
         ("solver", *[f"$h = {h:g}$" for h in hs[:: max(1, len(hs) - 1)]]), rows
     )

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 import diffrax_symplectic as ds
 
+from .._pictures import line, WIDTH
 from ..stability._page import fill, Page, table
 
 
@@ -178,7 +179,7 @@ def section(page: Page) -> str:
     print(f"\nLearning U and s from {pairs:,} pairs of observations")
     observed = observe(jr.key(0), trajectories, length)
     rows = []
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4))
+    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 3.6))
     exact = -jax.vmap(jax.grad(true_potential))(jnp.asarray(SEEN))
     for name, solver in SOLVERS.items():
         for steps in counts:
@@ -188,15 +189,14 @@ def section(page: Page) -> str:
                 (name, SPACING / steps, f"{r.s:.4f}", f"{r.force_error:.4f}", drift)
             )
             if steps == 2:
-                axes[0].plot(SEEN, r.forces, lw=1, label=name)
-                axes[1].plot(SEEN, r.forces - exact, lw=1, label=name)
-    axes[0].plot(SEEN, exact, "k:", lw=1, label="exact")
-    axes[0].set(xlabel="q", title=f"force, h = {SPACING / 2:g}")
-    axes[1].set(xlabel="q", title="its error")
-    for ax in axes:
-        ax.legend(fontsize=7)
+                axes[0].plot(SEEN, r.forces, **line(name), label=name)
+                axes[1].plot(SEEN, r.forces - exact, **line(name))
+    axes[0].plot(SEEN, exact, "k:", label="exact")
+    axes[0].set(xlabel="position $q$", ylabel="force")
+    axes[1].set(xlabel="position $q$", ylabel="error of the force")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=3)
     picture = page.picture(figure, "learning", "A learned potential")
-    plt.close(figure)
     header = "solver", "$h$", "$s$", "force error", "energy gain"
     return fill(
         __file__, table=table(header, rows), picture=picture, pairs=f"{pairs:,}", s=S,

@@ -17,6 +17,7 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
+from .._pictures import BLUE, VERMILION
 from ..benchmarks._timing import ensemble as many, keys, measure
 from ..stability._page import fill, Page, table
 from ._ensemble import ensemble, gaussian, Mean
@@ -136,6 +137,10 @@ METHODS = {
 }
 
 
+# Of the same solver, for two systems.
+LOOKS = {"BAOAB, rods": (BLUE, "o"), "BAOAB, springs": (VERMILION, "s")}
+
+
 def seconds_per_time(name: str, repeats: int) -> float:
     """Of one path, of many at once, in each unit of time."""
     make_terms, solver, h = METHODS[name]
@@ -144,13 +149,13 @@ def seconds_per_time(name: str, repeats: int) -> float:
     return measure(solve, keys(paths), repeats=repeats).seconds / (paths * steps * h)
 
 
-def show_density(axes, samples: np.ndarray, name: str) -> None:
+def show_density(axes, samples: np.ndarray, **look) -> None:
     """With error bars of three standard errors."""
     counts, edges = np.histogram(samples, 12, (-1, 1))
     to_density = 1 / (len(samples) * np.diff(edges))
     middle = (edges[1:] + edges[:-1]) / 2
     error = 3 * np.sqrt(counts) * to_density
-    axes.errorbar(middle, counts * to_density, error, fmt="o", ms=3, lw=1, label=name)
+    axes.errorbar(middle, counts * to_density, error, ls="none", **look)
 
 
 def section(page: Page) -> str:
@@ -158,7 +163,7 @@ def section(page: Page) -> str:
     exact = exact_square(8 if page.quick else 20)
     print(f"\nRods at a temperature: angles at t = {t1:g}, {paths:,} paths")
     rows = []
-    figure, axes = plt.subplots(figsize=(6, 4))
+    figure, axes = plt.subplots(figsize=(6.5, 4))
     for name, (make_terms, solver, h) in METHODS.items():
         r = angles(make_terms, solver, h, t1, paths)
         micro = 1e6 * seconds_per_time(name, 2 if page.quick else 20)
@@ -169,15 +174,15 @@ def section(page: Page) -> str:
         )
         # The angles between Heun's springs are those between others.
         if not name.startswith("Heun"):
-            show_density(axes, r.outer, name)
+            colour, marker = LOOKS[name]
+            show_density(axes, r.outer, color=colour, marker=marker, label=name)
     c = np.linspace(-1, 1, 41)
     density = density_of_one(c, 6 if page.quick else 20)
-    axes.plot(c, density, "k", lw=1, label="rods, exact")
-    axes.axhline(0.5, color="k", lw=1, ls=":", label="springs, exact")
-    axes.set(xlabel="cosine of an outer angle", title="density", ylim=(0.43, 0.56))
-    axes.legend(fontsize=7)
+    axes.plot(c, density, color=BLUE, label="rods, exact")
+    axes.axhline(0.5, color=VERMILION, ls="--", label="springs, exact")
+    axes.set(xlabel="cosine of an outer angle", ylabel="density", ylim=(0.43, 0.56))
+    figure.legend(loc="outside upper center", ncols=4)
     picture = page.picture(figure, "rods", "Angles between rods and between springs")
-    plt.close(figure)
     header = (
         "method", "$h$", r"$\langle c^2 \rangle$", "kinetic energy", "stretched",
         "µs per unit of time",

@@ -17,6 +17,7 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
+from .._pictures import line, WIDTH
 from ..stability._page import fill, Page, table
 from ._ensemble import Mean
 
@@ -175,28 +176,30 @@ def section(page: Page) -> str:
     print(f"\nRing of {N:,} spins without noise, until t = {t1:g}")
     print(f"and with sigma = {sigma}, at t = {noisy_t1:g}, {paths} paths")
     rows = []
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4))
-    for i, (name, method) in enumerate(METHODS.items()):
+    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 3.8))
+    for name, method in METHODS.items():
         still = course(method, 0.0, h, round(t1 / h), 1)
         noisy = course(method, sigma, h, round(noisy_t1 / h), paths)
         rows.append(
             (name, f"{still.energy_error:.1e}", f"{still.total_error:.1e}",
              str(noisy.excess(sigma)), f"{poisson_defect(method, h, sigma):.1e}")
         )  # fmt: skip
-        style = dict(color=f"C{i}", ls="-:-"[i], label=name)
-        axes[0].plot(still.ts, still.energy[0], **style)
-        axes[1].plot(noisy.ts, np.mean(noisy.energy, axis=0), **style)
+        look = line(name) | dict(label=name)
+        if "spin_terms" in name:
+            # It lies below the other one.
+            look |= dict(lw=4, alpha=0.4)
+        axes[0].plot(still.ts, still.energy[0], **look)
+        axes[1].plot(noisy.ts, np.mean(noisy.energy, axis=0), **look)
     ts = np.linspace(0, noisy_t1)
     exact = energy(0.0, start(), None) * np.exp(-2 * sigma**2 * ts)
-    axes[1].plot(ts, exact, "k--", lw=1, label="exact mean")
+    axes[1].plot(ts, exact, "k:", label="exact mean")
     header = "method", "$H_0$", "$M$", "noisy $H_0$", "Poisson defect"
     shown = table(header, rows)
-    axes[0].set(xlabel="t", title=f"energy without noise, h = {h}")
-    axes[1].set(xlabel="t", title=f"mean energy with noise, {paths} paths, h = {h}")
-    for ax in axes:
-        ax.legend(fontsize=7)
+    axes[0].set(xlabel="time $t$", ylabel="energy $H_0$", title="without noise")
+    axes[1].set(xlabel="time $t$", ylabel="mean energy", title="with noise")
+    handles, labels = axes[1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
     picture = page.picture(figure, "spins", "Ring of spins")
-    plt.close(figure)
     return fill(
         __file__, table=shown, picture=picture, t1=f"{t1:g}", noisy_t1=f"{noisy_t1:g}",
         paths=paths, sigma=sigma, h=h,

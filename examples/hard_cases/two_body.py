@@ -14,6 +14,7 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
+from .._pictures import colour, line, WIDTH
 from ..stability._page import fill, Page, table
 from ._ensemble import ensemble, gaussian, Mean, plateaus, truncated
 
@@ -103,7 +104,7 @@ def section(page: Page) -> str:
     names = ["ImplicitMidpoint", "Heun"] if page.quick else SOLVERS
     print(f"\nTwo-body problem, {count} orbits, s = {s}, {paths} paths")
     rows = []
-    figure, axes = plt.subplots(1, 2, figsize=(11, 5))
+    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.2))
     for name in names:
         solver, make_path = SOLVERS[name]
         for per_orbit in sizes:
@@ -113,9 +114,10 @@ def section(page: Page) -> str:
             if per_orbit == sizes[0]:
                 error = np.max(np.abs(r.momentum / r.momentum[:, :1] - 1), axis=0)
                 ts = np.arange(len(error)) / per_orbit
-                axes[1].loglog(ts[1:], error[1:] + 1e-17, label=name, lw=1)
+                axes[1].loglog(ts[1:], error[1:] + 1e-17, label=name, **line(name))
                 if name == "ImplicitMidpoint":
-                    axes[0].plot(*r.position[0].T, lw=0.3)
+                    axes[0].plot(*r.position[0].T, color=colour(name), lw=0.3)
+                    axes[0].plot(0, 0, "k+", ms=8)
                 continue
             if r.failed_share == 1:
                 rows.append((name, "fails", "fails"))
@@ -123,13 +125,12 @@ def section(page: Page) -> str:
             assert r.failed_share == 0
             balance = r.balance(PERIOD / per_orbit, s)
             rows.append((name, f"{r.momentum_error:.1e}", str(balance)))
-    title = f"one path, ImplicitMidpoint, {sizes[0]} steps per orbit"
-    axes[0].set(aspect="equal", title=title, xlabel="$q_1$", ylabel="$q_2$")
-    title = f"largest error of the angular momentum, {sizes[0]} steps"
-    axes[1].set(xlabel="orbits", title=title)
-    axes[1].legend(fontsize=7)
+    axes[0].set(aspect="equal", xlabel="$q_1$", ylabel="$q_2$")
+    axes[0].set_title("one path, ImplicitMidpoint")
+    axes[1].set(xlabel="orbits", ylabel="largest relative error, angular momentum")
+    axes[1].set_title(f"{sizes[0]} steps per orbit")
+    axes[1].legend(loc="upper left", bbox_to_anchor=(0, 0.75))
     picture = page.picture(figure, "two_body", "Two-body problem")
-    plt.close(figure)
     shown = table(("solver", "angular momentum", "mean energy"), rows)
     return fill(
         __file__, table=shown, picture=picture, count=count, s=s, part=f"1/{sizes[-1]}"

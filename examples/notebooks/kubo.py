@@ -70,10 +70,11 @@ solutions = {
 # %% The midpoint rule stays on the unit circle, the path of Heun's method spirals outwards
 fig, axes = plt.subplots(1, 2, figsize=(7.5, 3.7), sharex=True, sharey=True)
 angle = np.linspace(0, 2 * np.pi, 200)
+colours = {"ImplicitMidpoint": "#0072B2", "Heun": "#D55E00"}
 for ax, (name, (_, p, q)) in zip(axes, solutions.items()):
-    ax.plot(q, p, ".", ms=2)
+    ax.plot(q, p, ".", ms=2, color=colours[name])
     ax.plot(np.cos(angle), np.sin(angle), "k", lw=0.8)
-    ax.set(title=name, xlabel="q", ylabel="p", aspect="equal")
+    ax.set(title=name, xlabel="$q$", ylabel="$p$", aspect="equal")
     print(f"{name:17} largest | |(p, q)| - 1 | = {abs(np.hypot(p, q) - 1).max():.1e}")
 plt.show()
 

@@ -69,10 +69,11 @@ sampled = {
 
 # %% Mean square against time: StormerVerlet follows the exact line, Heun leaves it
 fig, ax = plt.subplots(figsize=(6, 3.5))
-ax.plot([0, t1], [1, 1 + t1], "k:", label="exact: 1 + t")
+colours = {"StormerVerlet": "#009E73", "Heun": "#D55E00"}
+ax.plot([0, t1], [1, 1 + t1], "k:", label="exact: $1 + t$")
 for name, (mean, error) in sampled.items():
-    ax.errorbar(ts, mean, 3 * error, fmt="o", ms=4, label=name)
-ax.set(xlabel="t", ylabel="E(p² + q²)", title=f"h = {h}, bars: 3 standard errors")
+    ax.errorbar(ts, mean, 3 * error, fmt="o", ms=4, label=name, color=colours[name])
+ax.set(xlabel="$t$", ylabel="$E[p^2 + q^2]$", title="bars of three standard errors")
 ax.legend()
 plt.show()
 

@@ -80,13 +80,15 @@ _, X_heun = solve(plain, diffrax.Heun(), X0, mu)
 # %% A path on the sphere, and the change of the length of X in time
 fig = plt.figure(figsize=(9, 3.7))
 ax = fig.add_subplot(1, 2, 1, projection="3d")
-ax.plot(*X.T, ".", ms=2)
+blue, vermilion = "#0072B2", "#D55E00"
+ax.plot(*X.T, ".", ms=2, color=blue)
 ax.set(title="ImplicitMidpoint with spin_terms", aspect="equal")
 ax = fig.add_subplot(1, 2, 2)
-for name, x in (("ImplicitMidpoint with spin_terms", X), ("Heun", X_heun)):
-    ax.semilogy(ts, abs(np.linalg.norm(x, axis=1) - 1) + 1e-17, label=name)
-ax.set(xlabel="t", title="||X| - 1|")
-ax.legend(fontsize=8)
+error = lambda X: abs(np.linalg.norm(X, axis=1) - 1) + 1e-17
+ax.semilogy(ts, error(X), color=blue, label="ImplicitMidpoint with spin_terms")
+ax.semilogy(ts, error(X_heun), color=vermilion, ls="--", label="Heun")
+ax.set(xlabel="$t$", ylabel="$||X| - 1|$")
+ax.legend(loc="center right", fontsize=8)
 fig.tight_layout()
 plt.show()
 
@@ -131,9 +133,11 @@ _, X_silent = solve(terms, ds.ImplicitMidpoint(), y0, 0 * mu, ds.from_spinors)
 # %% Energy without noise: within a narrow band with spin_terms, drifting with Heun
 energy = jax.vmap(lambda X: H0(0.0, X, None))
 fig, ax = plt.subplots(figsize=(6, 3.2))
-ax.plot(ts, energy(X_silent), label="ImplicitMidpoint with spin_terms")
-ax.plot(ts[1:], energy(X_renormalized), label="Heun, renormalized")
-ax.set(xlabel="t", title="$H_0$ without noise")
+label = "ImplicitMidpoint with spin_terms"
+ax.plot(ts, energy(X_silent), color=blue, label=label)
+label = "Heun, renormalized"
+ax.plot(ts[1:], energy(X_renormalized), color=vermilion, ls="--", label=label)
+ax.set(xlabel="$t$", ylabel="$H_0$ without noise")
 ax.legend()
 plt.show()
 

@@ -81,17 +81,19 @@ bunches = {
 
 # %% Phase space at the end, and mean energy: Euler's method heats the bunch
 fig, (ax, energy) = plt.subplots(1, 2, figsize=(9, 3.7))
-for name, (P, Q) in bunches.items():
-    ax.plot((Q[:, -1] + np.pi) % (2 * np.pi) - np.pi, P[:, -1], ".", ms=2, label=name)
+for colour, (name, (P, Q)) in zip(("#009E73", "#404040"), bunches.items()):
+    turned = (Q[:, -1] + np.pi) % (2 * np.pi) - np.pi
+    ax.plot(turned, P[:, -1], ".", ms=2, color=colour)
     E = H0(0.0, P, Q, None)
-    energy.errorbar(ts, E.mean(0), 3 * E.std(0) / np.sqrt(len(E)), label=name)
+    bars = 3 * E.std(0) / np.sqrt(len(E))
+    energy.errorbar(ts, E.mean(0), bars, color=colour, label=name)
 Q = np.linspace(-np.pi, np.pi, 200)
 for sign in (1, -1):
     ax.plot(Q, sign * 2 * omega * np.cos(Q / 2), "k", lw=0.8)
-ax.set(xlabel="Q", ylabel="P", title=f"t = {t1:.0f}; lines: the bucket")
+ax.set(xlabel="$Q$", ylabel="$P$", title=f"$t = {t1:.0f}$; lines: the bucket")
 low, high = (H0(0.0, *y0, None) + s**2 / 2 * ts for s in (sigma2, sigma1))
 energy.fill_between(ts, low, high, color="0.7", label="bounds of the exact mean")
-energy.set(xlabel="t", title="mean of $H_0$")
+energy.set(xlabel="$t$", ylabel="mean of $H_0$")
 energy.legend(fontsize=8)
 fig.tight_layout()
 plt.show()

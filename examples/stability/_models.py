@@ -16,14 +16,6 @@ def weak(key, shape=(), **kwargs):
     return ds.WeakBrownianPath(shape, key, **kwargs)
 
 
-def second(key, shape=()):
-    return ds.SRKw5().path(shape, key)
-
-
-def third(key, shape=()):
-    return ds.AdditiveGauss().path(shape, key)
-
-
 def gaussian(key, shape=()):
     return ds.FixedStepBrownianPath(shape, key)
 
@@ -41,7 +33,7 @@ class Case(NamedTuple):
     models: tuple[str, ...] = ("linear", "kubo", "spring")
 
 
-_SEPARABLE, _ADDITIVE = ("linear", "spring"), ("linear",)
+_SEPARABLE = ("linear", "spring")
 GENERAL = {
     "ImplicitMidpoint": Case(ds.ImplicitMidpoint(), weak),
     "SRKs1": Case(ds.SRKs1(), weak),
@@ -56,11 +48,6 @@ SEPARABLE = {
     "SRKw3b": Case(ds.SRKw3("b"), weak, _SEPARABLE),
     "SRKw3c": Case(ds.SRKw3("c"), weak, _SEPARABLE),
     "SRKw4": Case(ds.SRKw4(), weak, _SEPARABLE),
-}
-ADDITIVE = {
-    "SRKs4": Case(ds.SRKs4(), areas, _ADDITIVE),
-    "SRKw5": Case(ds.SRKw5(), second, _ADDITIVE),
-    "AdditiveGauss": Case(ds.AdditiveGauss(), third, _ADDITIVE),
 }
 DIFFRAX = {
     "Heun": Case(diffrax.Heun(), gaussian),

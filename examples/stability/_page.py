@@ -7,12 +7,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import matplotlib
+import matplotlib.pyplot as plt
 
 from .._command import compile_quickly, hasten
 
-
-matplotlib.use("Agg")
 
 ROOT = Path(__file__).parents[2]
 
@@ -29,10 +27,11 @@ class Page(NamedTuple):
         return ROOT / ("examples/output" if self.quick else "docs")
 
     def picture(self, figure, name: str, caption: str) -> str:
-        """Saves it; returns the Markdown that shows it."""
+        """Saves and closes it; returns the Markdown that shows it."""
         path = self.folder / self.name / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110, bbox_inches="tight")
+        figure.savefig(path)
+        plt.close(figure)
         print(f"picture: {path.relative_to(ROOT)}", flush=True)
         return f"![{caption}]({self.name}/{name}.png)"
 

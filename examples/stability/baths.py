@@ -5,10 +5,12 @@ import jax.numpy as jnp
 import jax.random as jr
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import StrMethodFormatter
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._solver import LANGEVIN
 
+from .._pictures import colour, style, WIDTH
 from ._page import fill, Page, table
 
 
@@ -57,29 +59,46 @@ def _cell(pair) -> str:
     return f"{p:.3f}, {q:.3f}" if np.isfinite(p) else "grows"
 
 
+def _picture(omega_h, curves: dict[str, np.ndarray]):
+    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.4), sharey=True)
+    # Those that are right at every step lie upon each other.
+    right = [name for name, x in curves.items() if np.max(np.abs(x - 1)) < 1e-6]
+    for ax, number in zip(axes, (0, 1)):
+        label = ",\n".join(right)
+        ax.axhline(1, color=colour("ImplicitMidpoint"), lw=6, alpha=0.3, label=label)
+        others = [name for name in curves if name not in right]
+        for shift, name in enumerate(others):
+            values = curves[name][:, number]
+            shown = np.where(np.isfinite(values), values, np.nan)
+            # So that no marker hides another.
+            some = (4 * shift, 20)
+            ax.loglog(omega_h, shown, label=name, **style(name), markevery=some)
+        ax.axvline(2, color="k", lw=0.8, ls=":")
+        ax.set(xlabel=r"$h \omega$", ylim=(0.05, 30))
+        for ticks in (ax.xaxis, ax.yaxis):
+            ticks.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes[0].set_title(r"$\langle p^2 \rangle / T$")
+    axes[1].set_title(r"$\omega^2 \langle q^2 \rangle / T$")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, ncols=3, loc="outside lower center")
+    return figure
+
+
 def section(page: Page) -> str:
     cases = {name: CASES[name] for name in (QUICK if page.quick else CASES)}
-    fine = np.geomspace(0.1, 20, 12 if page.quick else 60)
-    figure, axes = plt.subplots(1, 2, figsize=(9, 5), sharey=True, layout="constrained")
+    fine = np.geomspace(0.1, 20, 12 if page.quick else 200)
     rows = []
+    curves = {}
     print("\nNoise on stiff modes: <p^2> / T, omega^2 <q^2> / T")
-    for number, (name, solver) in enumerate(cases.items()):
+    for name, solver in cases.items():
         found = energies(solver, np.concatenate([SHOWN, fine]))
         rows.append((f"`{name}`", *map(_cell, found[: len(SHOWN)])))
-        style = dict(color=f"C{number % 10}", ls=("-", "--")[number // 10], lw=1.5)
-        for ax, values in zip(axes, found[len(SHOWN) :].T):
-            shown = np.where(np.isfinite(values), values, np.nan)
-            ax.loglog(fine, shown, label=name, **style)
-    titles = r"$\langle p^2 \rangle / T$", r"$\omega^2 \langle q^2 \rangle / T$"
-    for ax, title in zip(axes, titles):
-        ax.axhline(1, color="k", lw=0.5, ls=":")
-        ax.set(xlabel=r"$h\omega$", title=title, ylim=(0.02, 10))
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, fontsize=8, ncols=4, loc="outside lower center")
+        curves[name] = found[len(SHOWN) :]
     heads = ["solver", *(f"$h \\omega = {x:g}$" for x in SHOWN)]
     energy_table = table(heads, rows)
-    picture = page.picture(figure, "baths", "Energies of a mode in a heat bath")
-    plt.close(figure)
+    picture = page.picture(
+        _picture(fine, curves), "baths", "Energies of a mode in a heat bath"
+    )
     return fill(
         __file__,
         table=energy_table,

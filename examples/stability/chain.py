@@ -12,6 +12,7 @@ import numpy as np
 
 import diffrax_symplectic as ds
 
+from .._pictures import style, WIDTH
 from ._page import fill, Page, table
 
 
@@ -69,7 +70,6 @@ CASES: dict[str, tuple[Any, tuple[float, ...]]] = {
         (0.05, 0.1, 0.2, 0.5, 0.8),
     ),
 }
-COLOURS = {name: f"C{number}" for number, name in enumerate(CASES)}
 
 
 def path_means(solver, h: float, length: float) -> Callable:
@@ -108,7 +108,7 @@ def measured(solver, h: float, quick: bool) -> tuple[float, float]:
 
 
 def section(page: Page) -> str:
-    figure, ax = plt.subplots(figsize=(7, 4), layout="constrained")
+    figure, ax = plt.subplots(figsize=(WIDTH, 4.4))
     rows = []
     print("\nA chain of stiff springs: the mean soft energy")
     for name, (solver, steps) in CASES.items():
@@ -119,17 +119,17 @@ def section(page: Page) -> str:
             rows.append(
                 (f"`{name}`", f"{h:g}", f"{1 / h:.1f}", f"{mean:.3f} ± {error:.3f}")
             )
-        ax.errorbar(taken, means, 2 * errors, fmt="o-", color=COLOURS[name], label=name)
-    ax.axhspan(EXACT * (1 - PROMISED), EXACT * (1 + PROMISED), color="k", alpha=0.15)
-    ax.set(xscale="log", xlabel="$h$, one soft force", ylabel="mean soft energy")
+        ax.errorbar(taken, means, 2 * errors, label=name, **style(name))
+    band = EXACT * (1 - PROMISED), EXACT * (1 + PROMISED)
+    ax.axhspan(*band, color="k", alpha=0.15, lw=0)
+    ax.set(xscale="log", xlabel="step $h$", ylabel="mean soft energy")
     ticks = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
     ax.set_xticks(ticks, [f"{x:g}" for x in ticks])
     ax.minorticks_off()
     if not page.quick:
         ax.set(ylim=(56.6, 57.4))  # resonances lie far below
-    ax.legend(fontsize=8, frameon=False, loc="lower left")
+    figure.legend(loc="outside lower center", ncols=2)
     heads = "solver", "$h$", "soft forces a unit of time", "mean soft energy"
     energies = table(heads, rows)
     picture = page.picture(figure, "chain", "Mean soft energy against the step")
-    plt.close(figure)
     return fill(__file__, table=energies, picture=picture, exact=f"{EXACT:g}")

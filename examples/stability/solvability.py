@@ -1,5 +1,6 @@
 """How often the stage equation of a step is not solved, and whether it could have been."""
 
+import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from matplotlib.colors import LogNorm
 
 import diffrax_symplectic as ds
 
+from .._pictures import WIDTH
 from ._page import fill, Page, table
 
 
@@ -146,28 +148,31 @@ def shares(model: Model, solver, hs, strengths, steps: int, seed: int = 0) -> Sh
 
 def _picture(page: Page, hs, strengths, results: dict[str, Shares]) -> str:
     figure, axes = plt.subplots(
-        len(results), len(LAWS), figsize=(15, 3 * len(results)), sharex=True,
-        sharey=True, layout="constrained", squeeze=False,
+        len(results), len(LAWS), figsize=(WIDTH, 0.8 + 1.9 * len(results)),
+        sharex=True, sharey=True, squeeze=False,
     )  # fmt: skip
     image = None
     for row, (name, r) in zip(axes, results.items()):
-        row[0].set_ylabel(f"{name}\nh")
+        system = name.split(", ")[1]
+        row[0].set_ylabel(f"{system}\nstep $h$")
         for ax, failed, none in zip(row, r.failed, r.unsolvable):
             image = ax.pcolormesh(
                 strengths, hs, np.ma.masked_equal(failed, 0),
-                norm=LogNorm(1e-4, 1), cmap="viridis",
+                norm=LogNorm(1e-4, 1), cmap="viridis_r",
             )  # fmt: skip
             if none.any():
                 ax.contour(strengths, hs, none, [1 / r.steps / 2], colors="r")
             ax.set(xscale="log", yscale="log")
+            ax.grid(visible=False)
     for ax, law in zip(axes[0], LAWS):
-        ax.set_title(law.label)
+        ax.set_title(re.sub(", k = (.)", r",\n$k = \1$", law.label), fontsize=9)
     for ax in axes[-1]:
-        ax.set_xlabel("s")
+        ax.set_xlabel("noise $s$")
+        ax.set_xticks([0.1, 1], ["0.1", "1"])
     assert image is not None
-    figure.colorbar(image, ax=axes, label="share of steps that fail (white: none)")
+    label = "share of steps that fail (white: none)"
+    figure.colorbar(image, ax=axes, label=label, location="bottom", aspect=50)
     markdown = page.picture(figure, "solvability", "Shares of steps that fail")
-    plt.close(figure)
     return markdown
 
 
@@ -198,8 +203,12 @@ def section(page: Page) -> str:
     )
     error = max(np.max(r.std_error(r.failed)[:, i, j]) for r in results.values())
     given_up = max(np.max(r.given_up[:, i, j]) for r in results.values())
-    kept = {n: r for n, r in results.items() if n.startswith("ImplicitMidpoint")}
-    picture = _picture(page, hs, strengths, kept)
+    failing = {
+        name: r
+        for name, r in results.items()
+        if name.startswith("ImplicitMidpoint") and r.failed.any()
+    }
+    picture = _picture(page, hs, strengths, failing)
     return fill(__file__, 
         table=shown, picture=picture, steps=f"{steps:,}", h=f"{hs[i]:.2g}",
         s=f"{strengths[j]:.2g}", given_up=f"{100 * given_up:.2f}",

@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import jax.random as jr
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import StrMethodFormatter
 
 import diffrax_symplectic as ds
 
+from .._pictures import style, WIDTH
 from ._models import areas, Case, gaussian, weak
 from ._page import fill, Page, table
 
@@ -40,7 +42,9 @@ CASES = {
 QUICK = ("ImplicitMidpoint", "StormerVerlet")
 # In the picture these have a colour each, and implicit methods, which lie upon each other,
 # one of them for all.
-COLOURS = dict(PlateauVerlet="C1", StormerVerlet="C0", Heun="C3", EulerHeun="C4")
+PICTURED = "PlateauVerlet", "StormerVerlet", "Heun", "EulerHeun"
+# Below this a spectral radius is 1 but for rounding.
+ROUNDING = 1e-12
 # The table has these.
 SHOWN = (
     "ImplicitMidpoint", "SRKs3", "SRKw4", "SRKs4", "PlateauVerlet", "StormerVerlet",
@@ -149,20 +153,21 @@ def section(page: Page) -> str:
     points, t1, paths = (40, 2.0, 64) if page.quick else (400, 20.0, 1024)
     cases = {n: CASES[n] for n in (QUICK if page.quick else CASES)}
     omegas = np.geomspace(0.1, 10, points)
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4))
-    implicit = [name for name in cases if name not in COLOURS]
-    styles = {name: dict(color="0.6", lw=1, zorder=1) for name in implicit}
-    styles[implicit[0]]["label"] = f"implicit ({len(implicit)} methods)"
-    styles |= {name: dict(color=c, lw=1.5, label=name) for name, c in COLOURS.items()}
+    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4))
+    implicit = [name for name in cases if name not in PICTURED]
+    alike = dict(color="0.6", marker="o", zorder=1)
+    styles = {name: alike for name in implicit}
+    styles[implicit[0]] = alike | dict(label=f"implicit ({len(implicit)} methods)")
+    styles |= {name: style(name) | dict(label=name) for name in PICTURED}
     for name, case in cases.items():
         excess = spectral_radii(case, omegas / fastest()) - 1
-        axes[0].loglog(omegas, np.maximum(np.abs(excess), 1e-16), **styles[name])
-    axes[0].set(
-        xlabel=r"$h\omega$", ylabel="spectral radius - 1", title="linear coupling"
-    )
-    axes[0].axvline(2, color="k", lw=0.5, ls=":")
-    axes[0].axvline(4, color="k", lw=0.5, ls=":")
-    axes[0].legend(fontsize=8, loc="lower left", bbox_to_anchor=(0, 0.12))
+        shown = np.maximum(np.abs(excess), ROUNDING)
+        axes[0].loglog(omegas, shown, **styles[name], markevery=40)
+    axes[0].set(xlabel=r"$h \omega$", title="linear coupling")
+    axes[0].set_ylabel("spectral radius $-$ 1")
+    axes[0].text(0.1, 2 * ROUNDING, "stable")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
 
     print(f"\nStiff: mean of H0 at t = {t1:g}, less its exact value, {paths} paths")
     some = np.array([0.1, 0.5, 1.0, 1.9, 2.1, 3.9, 4.1, 10.0])
@@ -180,16 +185,14 @@ def section(page: Page) -> str:
         errors += [e.excess_error for e in results if np.isfinite(e.excess)]
         y = np.array([e.fast for e in results])
         y = np.where(np.isfinite(y), y, np.nan)
-        axes[1].semilogx(some, y, "o-", ms=4, **styles[name])
-    axes[1].set(
-        xlabel=r"$h\omega$", ylabel="mean energy of the fast oscillator",
-        title="quartic coupling", ylim=(0, None),
-    )  # fmt: skip
-    axes[1].axhline(0.5, color="k", lw=0.5, ls=":")
+        axes[1].semilogx(some, y, **styles[name])
+    axes[1].set(xlabel=r"$h \omega$", title="quartic coupling", ylim=(0, None))
+    axes[1].set_ylabel("mean energy of the fast oscillator")
+    for ax in axes:
+        ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     header = "solver", "limit", *[f"$h \\omega = {some[k]:g}$" for k in shown]
     energy_table = table(header, rows)
     picture = page.picture(figure, "stiff", "Stiff system")
-    plt.close(figure)
     return fill(__file__, 
         picture=picture, energy_table=energy_table, t1=f"{t1:g}",
         paths=f"{paths:,}", omega=f"{OMEGA:g}",
