@@ -1,5 +1,5 @@
 """The picture of the tutorial, which is drawn by the code of the page itself, up to where
-it is saved.
+it saves it.
 
     python -m examples.portrait
 """
