@@ -166,5 +166,5 @@ def section(page: Page) -> str:
     picture = page.picture(figure, "rounding", "Growth of rounding errors")
     return fill(
         __file__, table=shown, picture=picture, steps=f"{steps:,}", paths=paths,
-        bias=f"{in_epsilons['Kubo, SRKw2']:.1g}",
+        bias=f"{in_epsilons['Kubo, ImplicitMidpoint']:.1g}",
     )  # fmt: skip
