@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from .._compat import is_traced
 from .._custom_types import RealScalarLike
-from .stepwise import Increment, raveled, step_size
+from .stepwise import Increment, step_size, zeros_and_unravel
 
 
 class Piece(eqx.Module):
@@ -70,7 +70,7 @@ class Piece(eqx.Module):
     ) -> Increment:
         """The increment over a step of size `h` for a path of this shape. With `use_levy`
         it is of type `kind`, with the areas of this segment."""
-        _, unravel = raveled(shape)
+        _, unravel = zeros_and_unravel(shape)
         if not use_levy:
             return unravel(self.W)
         variables = {"W": unravel(self.W)}

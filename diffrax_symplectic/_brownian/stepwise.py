@@ -154,11 +154,12 @@ class AbstractWrappedPath(AbstractStepwisePath):
         """This path's increment, from the other's over a step of size `h`."""
 
     def num_words(self, use_levy: bool = False) -> int:
-        return stepwise(self.path).num_words(use_levy) + self.num_own_words(use_levy)
+        wrapped = checked_stepwise(self.path)
+        return wrapped.num_words(use_levy) + self.num_own_words(use_levy)
 
     def increment(self, words, t0, t1, use_levy: bool = False) -> Increment:
         # The words of the wrapped path come first, as if it were alone.
-        path = stepwise(self.path)
+        path = checked_stepwise(self.path)
         increment = path.increment(words, t0, t1, use_levy)
         own_words = words[path.num_words(use_levy) :]
         return self.changed(increment, own_words, t1 - t0, use_levy)
@@ -198,7 +199,7 @@ class UnspecifiedPath(diffrax.AbstractBrownianPath):
         )
 
 
-def stepwise(path: diffrax.AbstractBrownianPath) -> AbstractStepwisePath:
+def checked_stepwise(path: diffrax.AbstractBrownianPath) -> AbstractStepwisePath:
     """`path`. Raises a `ValueError` if its steps cannot be computed from given words."""
     if not isinstance(path, AbstractStepwisePath):
         raise ValueError(
@@ -253,7 +254,7 @@ def num_noises(shape: PyTree[jax.ShapeDtypeStruct]) -> int:
     return sum(leaf.size for leaf in jtu.tree_leaves(shape))
 
 
-def raveled(like: PyTree) -> tuple[Array, Callable]:
+def zeros_and_unravel(like: PyTree) -> tuple[Array, Callable]:
     """Zeros in the structure, shapes and dtypes of `like` as one vector, and what restores
     the structure of such a vector."""
     zeros = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)

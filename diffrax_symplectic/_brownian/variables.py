@@ -139,19 +139,21 @@ def drives(name: str) -> str:
     return VARIABLES[name].drives if name in VARIABLES else "noise"
 
 
-def most_demanding(names: Collection[str]) -> RandomVariable | None:
+def most_demanding_variable(names: Collection[str]) -> RandomVariable | None:
     """The random variable of the highest rank among these, or `None` if all are unknown."""
     # A solver of the user's own may have variables that are not known here.
     known = [VARIABLES[name] for name in names if name in VARIABLES]
     return max(known, key=lambda variable: variable.rank, default=None)
 
 
-def path_of(variables: Collection[str], *, gaussian: bool, bounded: bool) -> _MakePath:
+def path_maker(
+    variables: Collection[str], *, gaussian: bool, bounded: bool
+) -> _MakePath:
     """Makes a path with these random variables. If only increments are needed, they may be
     `gaussian`, and then also `bounded`, for implicit methods."""
     # The path of the increments alone is the discrete one.
     decisive = set(variables) - {"W"} if gaussian else variables
-    variable = most_demanding(decisive)
+    variable = most_demanding_variable(decisive)
     if variable is not None:
         return variable.path
     return _truncated if bounded else FixedStepBrownianPath

@@ -51,7 +51,7 @@ class ConstrainedDrift(diffrax.AbstractTerm):
         )
 
 
-def constrained(
+def with_constraint(
     drift: diffrax.AbstractTerm, constraint: Constraint | None
 ) -> diffrax.AbstractTerm:
     """The drift with its constraint, if there is one."""
@@ -82,7 +82,7 @@ def without_constraint(terms: _T) -> _T:
     return jtu.tree_map(freed, terms, is_leaf=_is_constrained)
 
 
-def refuse_constraint(terms: PyTree[diffrax.AbstractTerm], name: str) -> None:
+def check_unconstrained(terms: PyTree[diffrax.AbstractTerm], name: str) -> None:
     """Raises a `ValueError` if the terms have a constraint."""
     if constraint_of(terms) is not None:
         raise ValueError(f"`{name}` takes no constrained terms. {KEEP}.")

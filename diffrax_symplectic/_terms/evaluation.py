@@ -13,7 +13,9 @@ from .._arguments import shapes
 from .._custom_types import Args
 
 
-def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Array]:
+def call_user_function(
+    name: str, H: Callable, *inputs: PyTree, args: Args
+) -> PyTree[Array]:
     """`H(*inputs, args)`, with advice on its errors."""
     # A copy, so that functions which modify `args` in place are the same in each trace.
     copy = jtu.tree_map(lambda leaf: leaf, args)

@@ -67,7 +67,7 @@ def shapes_as_paths(terms: PyTree) -> PyTree:
     return jtu.tree_map(with_path, terms, is_leaf=_is_control)
 
 
-def has_shapes(terms: PyTree) -> list[bool]:
+def which_are_shapes(terms: PyTree) -> list[bool]:
     """For each Brownian path of the terms, in order, whether its shape stands in its
     place."""
     return [_is_unspecified(path) for path in brownian_paths(shapes_as_paths(terms))]
@@ -125,7 +125,7 @@ def replace_paths(terms: PyTree, new: Callable) -> PyTree:
     return jtu.tree_map(replaced, terms, is_leaf=_is_path)
 
 
-def specified(terms: PyTree, make: Callable) -> PyTree:
+def with_paths_for_shapes(terms: PyTree, make: Callable) -> PyTree:
     """The terms with `make(shape, key)` in place of each shape of a path. The keys differ:
     each shape is a Brownian motion of its own."""
     terms = shapes_as_paths(terms)

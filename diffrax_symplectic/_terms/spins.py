@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._arguments import check_pair
 from .._custom_types import Args, RealScalarLike
-from .evaluation import evaluated, scalar_energy
+from .evaluation import call_user_function, scalar_energy
 from .lifted import checked_damping, damping_for, lifted_terms
 
 
@@ -98,7 +98,7 @@ class _DampedPrecession(eqx.Module):
         s = from_spinors(y)
 
         def energy(s: _Spins) -> Array:
-            return scalar_energy(evaluated("H0", self.H0, t, s, args=args))
+            return scalar_energy(call_user_function("H0", self.H0, t, s, args=args))
 
         gradient = jax.grad(energy)(s)
         alpha = damping_for(_EACH, self.alpha, s.shape[:-1], s.dtype)

@@ -19,9 +19,9 @@ from .._brownian import (
     laws_of,
     num_noises,
     ONLY_A_SHAPE,
-    raveled,
     step_size,
     UnspecifiedPath,
+    zeros_and_unravel,
 )
 from .._compat import is_traced
 from .paths import brownian_paths, path_numbers, replace_paths, shapes_as_paths
@@ -95,7 +95,7 @@ class _Motion(NamedTuple):
 
     def given(self, values: Float[Array, " size"], h) -> GivenPath:
         """A path with these variables in every step, in units of the root of `h`."""
-        flat, unravel = raveled(self.shape)
+        flat, unravel = zeros_and_unravel(self.shape)
         scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(flat.dtype)
         # One row for each attribute of the increment, in the order of the laws.
         rows = scaled.reshape(-1, self.noises)

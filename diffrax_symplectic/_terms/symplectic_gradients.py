@@ -20,7 +20,7 @@ from .._compat import replaced, ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike, Terms
 from .dependence import Dependence
 from .drift_and_noise import field_of
-from .evaluation import check_real_energies, evaluated, scalar_energy
+from .evaluation import call_user_function, check_real_energies, scalar_energy
 
 
 if TYPE_CHECKING:
@@ -59,7 +59,9 @@ class IndexedNoise(eqx.Module):
         self, k: IntScalarLike, t: RealScalarLike, p: PyTree, q: PyTree, args: Args
     ) -> Array:
         """`H_k`, for `k` from 0 to `m - 1`. Raises a `ValueError` if it is not a scalar."""
-        return scalar_energy(evaluated("H", self.H, k, t, p, q, args=args), "H")
+        return scalar_energy(
+            call_user_function("H", self.H, k, t, p, q, args=args), "H"
+        )
 
     def __call__(self, t: RealScalarLike, p: PyTree, q: PyTree, args: Args) -> Array:
         numbers = jnp.arange(self.m)
@@ -101,7 +103,9 @@ class Drift(eqx.Module):
         check_pair(y)
 
         def scalar(p: Momenta, q: Momenta) -> Array:
-            energy = scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
+            energy = scalar_energy(
+                call_user_function("H0", self.H0, t, p, q, args=args)
+            )
             if self.slow is None:
                 return energy
             return energy + _slow_energy(self.slow, t, q, args)
@@ -125,7 +129,7 @@ class SlowForce(eqx.Module):
 
 
 def _slow_energy(slow: Callable, t: RealScalarLike, q: Momenta, args: Args) -> Array:
-    return scalar_energy(evaluated("slow", slow, t, q, args=args), "slow")
+    return scalar_energy(call_user_function("slow", slow, t, q, args=args), "slow")
 
 
 def slow_apart(drift: Terms) -> tuple[Terms, Terms]:
@@ -245,7 +249,7 @@ class HamiltonianNoise(AbstractNoise):
             # It gives advice on the errors of its function by itself.
             H = self.noise(t, p, q, args)
         else:
-            H = evaluated("noise", self.noise, t, p, q, args=args)
+            H = call_user_function("noise", self.noise, t, p, q, args=args)
         if not _has_one_for_each_noise(H, struct):
             raise ValueError(
                 "`noise` must return one Hamiltonian for each noise of the path, which has "

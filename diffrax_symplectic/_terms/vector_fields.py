@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, Float, PyTree
 
-from .._brownian import num_noises, raveled
+from .._brownian import num_noises, zeros_and_unravel
 from .._compat import unwrapped, ω
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Terms, Y
 from .constrained_drift import without_constraint
@@ -77,7 +77,7 @@ def _product_of_one_noise(
         if one_array and field.ndim > 0 and field.shape[-1:] == struct.shape:
             return field[..., number] * increment.astype(field.dtype)
     # Other terms add up all noises, so all increments but this one are zero.
-    flat, unravel = raveled(struct)
+    flat, unravel = zeros_and_unravel(struct)
     only = flat.at[number].set(increment.astype(flat.dtype))
     return term.vf_prod(t, y, args, unravel(only))
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
 from .._arguments import check_pair, shapes
 from .._custom_types import Args, RealScalarLike
-from .evaluation import evaluated, scalar_energy
+from .evaluation import call_user_function, scalar_energy
 from .lifted import checked_damping, damping_for, lifted_terms
 
 
@@ -120,7 +120,7 @@ class _DampedWaves(eqx.Module):
             )
 
         def energy(p: Array, q: Array) -> Array:
-            H = evaluated("H0", self.H0, t, from_pair((p, q)), args=args)
+            H = call_user_function("H0", self.H0, t, from_pair((p, q)), args=args)
             return scalar_energy(H)
 
         by_p, by_q = jax.grad(energy, argnums=(0, 1))(p, q)

@@ -17,7 +17,7 @@ from ..._arguments import is_real_number
 from ..._custom_types import Args, RealScalarLike
 from ..._root_finder import max_norm, solve_matrix
 from ..constrained_drift import Constraint, constraint_of, without_constraint
-from ..evaluation import evaluated
+from ..evaluation import call_user_function
 from ..langevin import split_friction
 from ..vector_fields import rate
 from .multipliers import (
@@ -193,7 +193,7 @@ def _rounding(at: NormalSpace, q: Vector) -> Multipliers:
 def _values(constraint: Constraint, q: PyTree, args: Args) -> Float[Array, " c"]:
     """The values of the constraints. Raises a `ValueError` unless they are a real array of
     shape `(c,)`."""
-    value = evaluated("constraint", constraint, q, args=args)
+    value = call_user_function("constraint", constraint, q, args=args)
     if not is_real_number(value) or jnp.ndim(value) != 1 or jnp.size(value) == 0:
         # With the dtype, such as `f32[2]`: that alone may be what is wrong.
         got = eqx.tree_pformat(value, struct_as_array=True)

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 from ..._arguments import check_takes, real_array, shapes
 from ..._compat import is_traced
 from ..._custom_types import Args, BM, RealScalarLike
-from ..evaluation import evaluated
+from ..evaluation import call_user_function
 
 
 _P = PyTree[Array]
@@ -61,7 +61,9 @@ class _MatrixOrNumbers(eqx.Module):
 
 def value_at(name: str, value: Any, t, q: _P, args: Args) -> PyTree:
     """A constant, or the value of a function."""
-    return evaluated(name, value, t, q, args=args) if callable(value) else value
+    return (
+        call_user_function(name, value, t, q, args=args) if callable(value) else value
+    )
 
 
 def product_with(friction: Any, t, q: _P, args: Args, velocity: _P) -> _P:

@@ -13,12 +13,12 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from ..._arguments import check_pair, check_takes
-from ..._brownian import increment_struct, raveled, TruncatedBrownianPath
+from ..._brownian import increment_struct, TruncatedBrownianPath, zeros_and_unravel
 from ..._compat import replaced, ω
 from ..._custom_types import Args, BM, RealScalarLike, Terms
-from ..constrained_drift import constrained, Constraint
+from ..constrained_drift import Constraint, with_constraint
 from ..drift_and_noise import field_of, split_terms
-from ..evaluation import evaluated, scalar_energy
+from ..evaluation import call_user_function, scalar_energy
 from ..hamiltonian import hamiltonian_terms
 from ..paths import as_path
 from ..symplectic_gradients import AbstractNoise
@@ -121,7 +121,7 @@ def langevin_terms(
     hamiltonian = dataclasses.replace(hamiltonian, made_by="langevin_terms")
     friction_term, *noise = bath_terms(H0, friction, temperature, path).terms
     damped = DriftWithFriction(hamiltonian, friction_term.vector_field)
-    drift = constrained(diffrax.ODETerm(damped), constraint)
+    drift = with_constraint(diffrax.ODETerm(damped), constraint)
     return diffrax.MultiTerm(drift, *noise)
 
 
@@ -219,7 +219,7 @@ class Friction(AbstractFriction):
         p, q = y
 
         def energy(p: _P) -> Array:
-            return scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
+            return scalar_energy(call_user_function("H0", self.H0, t, p, q, args=args))
 
         return jax.grad(energy)(p)
 
@@ -250,7 +250,7 @@ class BathNoise(AbstractNoise):
 
     def vf(self, t: RealScalarLike, y: tuple[_P, _P], args: Args) -> PyTree[Array]:
         # For each array of the state, with a trailing axis of noises.
-        flat, unravel = raveled(increment_struct(self.path))
+        flat, unravel = zeros_and_unravel(increment_struct(self.path))
 
         def product(unit: Array) -> tuple[_P, _P]:
             return self.vf_prod(t, y, args, unravel(unit))

@@ -10,7 +10,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree
 
-from ..._brownian import raveled
+from ..._brownian import zeros_and_unravel
 from ..._compat import is_traced
 from ..._custom_types import Args, RealScalarLike, Y
 from ..drift_and_noise import control_struct
@@ -68,7 +68,7 @@ def _contradicts(
     - separable, of a noise: dq itself, and derivatives of dp by p;
     - separable, of a drift: derivatives of dp by p, and of dq by q and t.
     """
-    flat, unravel = raveled((y0, control_struct(term, t0)))
+    flat, unravel = zeros_and_unravel((y0, control_struct(term, t0)))
     # A bound between rounding errors, also of long sums, and any real mistake. Times may
     # have more digits than the state, so the dtype of the state decides.
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).eps)

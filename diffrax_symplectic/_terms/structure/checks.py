@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ..._arguments import check_pair, pair_fault
-from ..._brownian import raveled
+from ..._brownian import zeros_and_unravel
 from ..._compat import at_trace_time, is_traced, unwrapped
 from ..._custom_types import Args, RealScalarLike, Terms, Y
 from ..._tableau import Structure
@@ -300,7 +300,7 @@ def _is_zero(
         return False
     struct = control_struct(term, t0)
     with at_trace_time():
-        flat, unravel = raveled(struct)
+        flat, unravel = zeros_and_unravel(struct)
         changes = [
             unwrapped(term).vf_prod(t0, y0, args, unravel(unit))[half]
             for unit in jnp.eye(flat.size, dtype=flat.dtype)

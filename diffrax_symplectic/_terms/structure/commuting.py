@@ -9,7 +9,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from ..._brownian import raveled
+from ..._brownian import zeros_and_unravel
 from ..._compat import is_traced, ω
 from ..._custom_types import Args, RealScalarLike, Terms, Y
 from ..drift_and_noise import control_struct
@@ -17,7 +17,7 @@ from ..vector_fields import apply
 from .assertion import largest_entry
 
 
-def commuting(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
+def noises_commute(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish at random states, for
     these `t0` and `args`; false if this cannot be tested. This is not a proof.
 
@@ -25,7 +25,7 @@ def commuting(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
     struct = [control_struct(term, t0) for term in noise]
-    flat, unravel = raveled((jtu.tree_map(jnp.asarray, y0), struct, struct))
+    flat, unravel = zeros_and_unravel((jtu.tree_map(jnp.asarray, y0), struct, struct))
 
     @eqx.filter_jit
     @jax.vmap

@@ -14,7 +14,7 @@ from ..paths import brownian_paths, path_numbers, replace_paths
 from .checks import additive_fault
 
 
-def needs_truncation(
+def which_need_truncation(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: Y, args: Args
 ) -> tuple[bool, ...]:
     """For each Brownian path of the terms, whether implicit steps need its increments
