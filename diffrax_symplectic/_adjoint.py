@@ -28,7 +28,7 @@ from ._compat import (
 )
 from ._custom_types import IntScalarLike, Y
 from ._solver import is_solver, LANGEVIN
-from ._terms import refuse_constraint
+from ._terms import check_unconstrained
 
 
 class ReversingAdjoint(diffrax.AbstractAdjoint):
@@ -91,7 +91,7 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
             raise ValueError(
                 "`ReversingAdjoint` takes no `solver_state` and no `controller_state`."
             )
-        refuse_constraint(terms, "ReversingAdjoint")
+        check_unconstrained(terms, "ReversingAdjoint")
         _check_supported(solver, stepsize_controller, event, saveat)
         # Each step of the backward pass recomputes the solver state (see `made_jump`).
         kwargs |= dict(

@@ -28,7 +28,7 @@ from ._simulation import (
     warn_of_truncation,
 )
 from ._solver import Want
-from ._terms import has_shapes, path_keys, with_keys
+from ._terms import path_keys, which_are_shapes, with_keys
 
 
 # Entries of all states in a batch: enough to keep every core busy, in tens of megabytes.
@@ -190,7 +190,7 @@ def ensemble(
         want=want,
         user="ensemble",
     )
-    if want == "strong" and any(has_shapes(terms)):
+    if want == "strong" and any(which_are_shapes(terms)):
         check_gaussian(solver)
     warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
     if batch_size is None:

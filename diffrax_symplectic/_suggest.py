@@ -41,21 +41,21 @@ from ._terms import (
     check_baths_have_own_noise,
     check_drifts_differ,
     check_fit,
-    commuting,
     constant_fault,
     constraint_of,
     Fault,
     FRICTION,
     friction_apart,
     has_unknown_law,
-    needs_truncation,
+    noises_commute,
     number_of_noises,
     path_numbers,
     random_paths,
     separable_fault,
-    specified,
     split_terms,
+    which_need_truncation,
     with_paths,
+    with_paths_for_shapes,
     without_constraint,
     without_truncation,
 )
@@ -173,7 +173,7 @@ def suggest_solver(
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
     # Any path serves to inspect the terms.
-    given_terms = specified(terms, WeakBrownianPath)
+    given_terms = with_paths_for_shapes(terms, WeakBrownianPath)
     terms = without_constraint(given_terms)
     drift, noise = _parts(terms)
     check_state(y0, "suggest_solver")
@@ -190,7 +190,7 @@ def suggest_solver(
     numbers = path_numbers(random_paths(terms))
 
     # Solvers make paths without knowing what they drive.
-    needed = needs_truncation(terms, t0, y0, args)
+    needed = which_need_truncation(terms, t0, y0, args)
 
     def terms_with(make: Callable) -> jtu.Partial:
         """A function of a key: the terms with paths made by `make`."""
@@ -287,7 +287,7 @@ def _inspect(
         num_noises == 1
         or len(structures) > 0
         or in_forces
-        or commuting(noise, t0, y0, args)
+        or noises_commute(noise, t0, y0, args)
     )
     _, our_friction = friction_apart(drift)
     friction = takes_friction_apart(terms, t0, y0, args, BAOAB())

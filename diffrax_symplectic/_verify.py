@@ -19,12 +19,12 @@ from ._terms import (
     apply_one,
     as_spins,
     check_baths_have_own_noise,
+    check_unconstrained,
     constraint_of,
     from_spinors,
     number_of_noises,
     outcomes,
     rate,
-    refuse_constraint,
     split_friction,
     split_terms,
     step_variables,
@@ -312,7 +312,7 @@ def second_moment_map(
     **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for
     constrained terms.
     """
-    refuse_constraint(terms, "second_moment_map")
+    check_unconstrained(terms, "second_moment_map")
     flat, unravel = jfu.ravel_pytree(y0)
     size = flat.size
     # The step is affine, so its values at zero and at the unit vectors give its matrix.
@@ -387,7 +387,7 @@ def weak_order_defect(
     **Raises:** as [`diffrax_symplectic.step_expectation`][], and a `ValueError` for
     constrained terms.
     """
-    refuse_constraint(terms, "weak_order_defect")
+    check_unconstrained(terms, "weak_order_defect")
     expected = step_expectation(terms, solver, t0, t1, y0, args, fn=fn, nodes=nodes)
     generator = _generator(
         terms, args, ito=isinstance(solver, diffrax.AbstractItoSolver)

@@ -16,8 +16,8 @@ from diffrax_symplectic._suggest import _shape_code, ranked
 from diffrax_symplectic._terms import (
     brownian_paths,
     path_numbers,
-    specified,
     with_paths,
+    with_paths_for_shapes,
 )
 
 from .problems import damped_terms
@@ -334,7 +334,9 @@ def test_each_shape_of_a_path_is_a_brownian_motion_of_its_own():
     shape = UnspecifiedPath(shape=jax.ShapeDtypeStruct((), jnp.float64))
     assert path_numbers([shape, shape]) == (0, 1)
     for first in (shape, ds.WeakBrownianPath((), jr.key(0))):
-        keys = _keys(specified(_driven(first, shape, shape), ds.WeakBrownianPath))
+        keys = _keys(
+            with_paths_for_shapes(_driven(first, shape, shape), ds.WeakBrownianPath)
+        )
         assert len(set.union(*keys)) == 3
 
 

@@ -1,15 +1,15 @@
 from .stepwise import AbstractStepwisePath, AbstractWrappedPath, GivenPath, Increment
 from .stepwise import (
     checked_shape,
+    checked_stepwise,
     increment_struct,
     is_random,
     laws_of,
     num_noises,
     ONLY_A_SHAPE,
-    raveled,
     step_size,
-    stepwise,
     UnspecifiedPath,
+    zeros_and_unravel,
 )
 from .paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
 from .random import AbstractLaw, check_key, derived_key, Discrete, is_key
@@ -23,4 +23,4 @@ from .wrappers import (
     TOO_STRONG,
     TruncatedBrownianPath,
 )
-from .variables import drives, most_demanding, path_of, VARIABLES
+from .variables import drives, most_demanding_variable, path_maker, VARIABLES

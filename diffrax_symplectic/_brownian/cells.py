@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from .._compat import is_traced
 from .._custom_types import RealScalarLike
-from .stepwise import Increment, raveled, step_size
+from .stepwise import Increment, step_size, zeros_and_unravel
 
 
 class Piece(eqx.Module):
@@ -46,9 +46,9 @@ class Piece(eqx.Module):
     @property
     def H(self) -> Float[Array, " m"]:
         """The space-time Lévy area; zero for an empty segment."""
-        # Integrals compose by addition, areas do not, so a segment holds the integral.
+        # A segment holds the integral, which composes by addition, and not the area.
         assert self.integral is not None
-        return self.integral / or_one(self.h) - self.W / 2
+        return self.integral / positive_or_one(self.h) - self.W / 2
 
     def then(self, other: "Piece") -> "Piece":
         """This segment followed by another, by Chen's rule."""
@@ -63,14 +63,14 @@ class Piece(eqx.Module):
 
     def as_increment(
         self,
-        kind: Any,
+        increment_type: Any,
         shape: PyTree[jax.ShapeDtypeStruct],
         h: RealScalarLike,
         use_levy: bool,
     ) -> Increment:
         """The increment over a step of size `h` for a path of this shape. With `use_levy`
-        it is of type `kind`, with the areas of this segment."""
-        _, unravel = raveled(shape)
+        it is of type `increment_type`, with the areas of this segment."""
+        _, unravel = zeros_and_unravel(shape)
         if not use_levy:
             return unravel(self.W)
         variables = {"W": unravel(self.W)}
@@ -78,23 +78,23 @@ class Piece(eqx.Module):
             variables["H"] = unravel(self.H)
         if self.A is not None:
             variables["A"] = self.A
-        return kind(dt=step_size(h, shape), **variables)
+        return increment_type(dt=step_size(h, shape), **variables)
 
 
-def or_one(h: Float[Array, ""]) -> Float[Array, ""]:
+def positive_or_one(h: Float[Array, ""]) -> Float[Array, ""]:
     """`h`, or 1 for an empty segment, as a divisor. In a batch, paths that have reached
     their end take empty steps until all paths have."""
     return jnp.where(h > 0, h, 1)
 
 
 def checked_cell(cell: float | None) -> float | None:
-    """The length of a cell as a number of Python, or `None`. Raises a `ValueError` for
-    anything else."""
+    """The length of a cell as a number of Python, or `None`. Raises a `ValueError` unless
+    it is positive, finite and not traced."""
     if cell is None:
         return None
-    # It is a static field of a path, so it must be known while tracing.
-    known = eqx.is_array_like(cell) and not is_traced(cell)
-    if not known or np.ndim(cell) != 0 or not 0 < float(cell) < np.inf:
+    # The cell is a static field of a path, so it must be known while tracing.
+    is_known = eqx.is_array_like(cell) and not is_traced(cell)
+    if not is_known or np.ndim(cell) != 0 or not 0 < float(cell) < np.inf:
         raise ValueError(
             f"`cell` must be a positive number that is not traced, or `None`; got {cell!r}."
         )
@@ -109,22 +109,24 @@ def compose(
     path_name: str,
 ) -> Piece:
     """The segment from `t0` to `t1`, where `sample(i)` is the cell that starts at
-    `i * cell`. An error when run if it does not consist of whole cells."""
-    first = jnp.round(t0 / cell).astype(int)
-    last = jnp.round(t1 / cell).astype(int)
-    off = jnp.maximum(jnp.abs(first * cell - t0), jnp.abs(last * cell - t1))
-    # Times are sums of rounded steps, so they are met only nearly.
-    last = eqx.error_if(
-        last,
-        (off > 1e-3 * cell) | (last < first),
+    `i * cell`. It is an error when run if the segment does not consist of whole cells."""
+    first_cell = jnp.round(t0 / cell).astype(int)
+    end_cell = jnp.round(t1 / cell).astype(int)
+    off_at_start = jnp.abs(first_cell * cell - t0)
+    off_at_end = jnp.abs(end_cell * cell - t1)
+    off = jnp.maximum(off_at_start, off_at_end)
+    # Times are sums of rounded steps, so they meet multiples of `cell` only nearly.
+    end_cell = eqx.error_if(
+        end_cell,
+        (off > 1e-3 * cell) | (end_cell < first_cell),
         f"Steps of a `{path_name}` with `cell` must begin and end at multiples of `cell`. "
         "If they should, their times may have been rounded too much: enable 64 bits, or "
         "step with `diffrax.StepTo`.",
     )
-    struct = jax.eval_shape(sample, first)
+    struct = jax.eval_shape(sample, first_cell)
     empty = jtu.tree_map(lambda leaf: lax.full_like(leaf, 0), struct)
 
-    def extended(i: Int[Array, ""], piece: Piece) -> Piece:
+    def extend(i: Int[Array, ""], piece: Piece) -> Piece:
         return piece.then(sample(i))
 
-    return lax.fori_loop(first, last, extended, empty)
+    return lax.fori_loop(first_cell, end_cell, extend, empty)

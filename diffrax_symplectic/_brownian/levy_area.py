@@ -12,10 +12,10 @@ from .._arguments import whole_number
 from .._batch import materialize
 from .._custom_types import BM, RealScalarLike
 from .._products import dot
-from .cells import checked_cell, compose, or_one, Piece
+from .cells import checked_cell, compose, Piece, positive_or_one
 from .random import AREA_WORDS, check_key, normal_from_words, place_of, random_words
 from .stepwise import AbstractWrappedPath, Increment, increment_struct, num_noises
-from .wrappers import require_space_time_area
+from .wrappers import check_space_time_area
 
 
 class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
@@ -34,7 +34,7 @@ class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
 
 
 # Matrix products over at most this many Fourier terms are unrolled.
-_WRITTEN_OUT = 4
+_MOST_UNROLLED = 4
 
 
 class LevyAreaBrownianPath(AbstractWrappedPath):
@@ -90,7 +90,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         negative or `cell` is not positive; an error when run if a step does not consist of
         whole cells.
         """
-        require_space_time_area(path, type(self).__name__)
+        check_space_time_area(path, type(self).__name__)
         check_key(key, type(self).__name__)
         self.path = path
         self.key = key
@@ -101,46 +101,52 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         cell = self.cell
         if cell is not None:
 
-            def time(i: Array) -> Array:
+            def start_of(i: Array) -> Array:
                 # Through rounding a cell may end just beyond the end of the path.
                 return jnp.clip(i * cell, self.path.t0, self.path.t1)
 
             def sample(i: Array) -> Piece:
-                return self._sample(time(i), time(i + 1))
+                return self._draw_piece(start_of(i), start_of(i + 1))
 
             piece = compose(t0, t1, cell, sample, type(self).__name__)
         elif use_levy:
-            piece = self._sample(t0, t1)
+            piece = self._draw_piece(t0, t1)
         else:
             # The increment alone needs none of the words drawn here.
             return self.path.evaluate(t0, t1)
-        return self._increment(piece, t1 - t0, use_levy)
+        return self._as_increment(piece, t1 - t0, use_levy)
 
     def num_own_words(self, use_levy: bool) -> int:
         if not use_levy:
             return 0
         m = num_noises(increment_struct(self.path))
-        return sum(_num_normals(m, self.num_terms))
+        return sum(_normals_by_use(m, self.num_terms))
 
-    def changed(self, increment, own_words, h, use_levy) -> Increment:
-        """Samples the step as a whole, regardless of `cell`."""
+    def own_increment(self, increment, own_words, h, use_levy) -> Increment:
+        """The increment with areas, sampled over the step as a whole, regardless of
+        `cell`."""
         if not use_levy:
             return increment
-        return self._increment(self._piece(increment, own_words, h), h, use_levy)
+        return self._as_increment(
+            self._piece_from_words(increment, own_words, h), h, use_levy
+        )
 
-    def _increment(self, piece: Piece, h: RealScalarLike, use_levy: bool) -> Increment:
+    def _as_increment(
+        self, piece: Piece, h: RealScalarLike, use_levy: bool
+    ) -> Increment:
         shape = increment_struct(self.path)
         return piece.as_increment(LevyAreaIncrement, shape, h, use_levy)
 
-    def _sample(self, t0: Array, t1: Array) -> Piece:
+    def _draw_piece(self, t0: Array, t1: Array) -> Piece:
         """The path between these times, drawn as one piece."""
-        # The areas read each normal number several times.
+        # The areas read each normal number several times, and XLA would compute it anew
+        # for each.
         increment = materialize(lambda: self.path.evaluate(t0, t1, use_levy=True))
         num_words = self.num_own_words(True)
         words = random_words(self.key, place_of(t0, t1), 1, num_words, AREA_WORDS)
-        return self._piece(increment, words[0], t1 - t0)
+        return self._piece_from_words(increment, words[0], t1 - t0)
 
-    def _piece(
+    def _piece_from_words(
         self, increment: Increment, words: UInt32[Array, " normals"], h: RealScalarLike
     ) -> Piece:
         """The path over a step of size `h` with this increment, with areas from `words`."""
@@ -148,24 +154,24 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         H, _ = jfu.ravel_pytree(increment.H)
         piece = Piece.of(increment, jnp.abs(h))
         normals = normal_from_words(words, H.dtype)
-        # A bridge over a step is one over unit time, scaled by the root of its size. Its
-        # areas are scaled by the size.
-        scaled = H / jnp.sqrt(or_one(piece.h))
-        bridge = piece.h * _bridge_area(scaled, normals, self.num_terms)
+        # The bridge over a step is one over unit time, scaled by the root of the step size.
+        # Its areas are scaled by the step size.
+        unit_H = H / jnp.sqrt(positive_or_one(piece.h))
+        bridge_area = piece.h * _bridge_area(unit_H, normals, self.num_terms)
         # The area between the line and the bridge, which only its integral enters.
         outer = jnp.outer(H, piece.W)
-        return dataclasses.replace(piece, A=outer - outer.T + bridge)
+        return dataclasses.replace(piece, A=outer - outer.T + bridge_area)
 
 
-def _num_normals(m: int, terms: int) -> tuple[int, ...]:
+def _normals_by_use(m: int, num_terms: int) -> tuple[int, ...]:
     """The numbers of normal variables that the areas of `m` noises need: for the cosine and
     sine coefficients, for the sum of all other cosine coefficients, and for the two parts
     of the remainder's area."""
-    return m * terms, m * terms, m, m, m * (m - 1) // 2
+    return m * num_terms, m * num_terms, m, m, m * (m - 1) // 2
 
 
 def _bridge_area(
-    H: Float[Array, " m"], normals: Float[Array, " normals"], terms: int
+    H: Float[Array, " m"], normals: Float[Array, " normals"], num_terms: int
 ) -> Float[Array, "m m"]:
     r"""The Lévy areas of a Brownian bridge over unit time with the integral `H`, from
     independent standard normal numbers.
@@ -175,27 +181,29 @@ def _bridge_area(
     area $\pi \sum_r r (a_{kr} b_{lr} - b_{kr} a_{lr})$.
     """
     m = H.size
-    orders = np.arange(1, terms + 1)
+    orders = np.arange(1, num_terms + 1)
     variances = 1 / (2 * np.pi**2 * orders**2)
     # Over all orders the variances add up to 1/12, and their squares to 1/360.
     rest = 1 / 12 - np.sum(variances)
     # With many terms, rounding could make it negative.
     rest_squared = max(1 / 360 - np.sum(variances**2), 0)
-    # In NumPy until here, since constants of the program should not be computed by it.
+    # NumPy computes the constants above, so that the program does not.
     deviations = jnp.asarray(np.sqrt(variances), H.dtype)
-    ends = np.cumsum(_num_normals(m, terms))
-    cosines, sines, from_rest, by_mean, by_area = jnp.split(normals, ends[:-1])
-    a = deviations * cosines.reshape(m, terms)
-    b = deviations * sines.reshape(m, terms)
-    total = jnp.sum(a, axis=1) + np.sqrt(rest) * from_rest
-    # Condition on the sum of all cosine coefficients, including the remainder: it is -H.
+    ends = np.cumsum(_normals_by_use(m, num_terms))
+    cosines, sines, for_rest, for_mean, for_area = jnp.split(normals, ends[:-1])
+    a = deviations * cosines.reshape(m, num_terms)
+    b = deviations * sines.reshape(m, num_terms)
+    total = jnp.sum(a, axis=1) + np.sqrt(rest) * for_rest
+    # The sum of all cosine coefficients, including the remainder, is -H. Given this, each
+    # one changes by its share of the variance, s_r / (1/12), in the difference.
     a = a - jnp.asarray(12 * variances, H.dtype) * (total + H)[:, None]
     series = _weighted_product(a, b, np.pi * orders)
     # Cosine coefficients of the remainder have mean -12 s_r H, which gives the first part
-    # of its area, and variance s_r - 12 s_r^2, which gives the second.
-    mean = jnp.outer(H, np.sqrt(72 * rest_squared) * by_mean)
-    size = np.sqrt(rest - 12 * rest_squared)
-    area = series - mean + size * _strictly_upper(by_area, m)
+    # of its area, and variance s_r - 12 s_r^2, which gives the second. Since (pi r)^2 s_r
+    # is 1/2, the variances of these parts are sums of 144 s_r^2 / 2 and of s_r - 12 s_r^2.
+    mean_part = jnp.outer(H, np.sqrt(72 * rest_squared) * for_mean)
+    deviation = np.sqrt(rest - 12 * rest_squared)
+    area = series - mean_part + deviation * _strictly_upper(for_area, m)
     return area - area.T
 
 
@@ -203,7 +211,7 @@ def _weighted_product(
     a: Float[Array, "m terms"], b: Float[Array, "m terms"], weights: np.ndarray
 ) -> Float[Array, "m m"]:
     """`a diag(weights) b^T`."""
-    if len(weights) > _WRITTEN_OUT:
+    if len(weights) > _MOST_UNROLLED:
         a = a * jnp.asarray(weights, a.dtype)
         return dot(a, b.T)
     # Batched products of small matrices cost more than their arithmetic.
@@ -216,8 +224,8 @@ def _weighted_product(
 
 def _strictly_upper(x: Float[Array, " n"], m: int) -> Float[Array, "m m"]:
     """The matrix with the entries `x` above its diagonal."""
-    place = np.zeros((m, m), int)
-    place[np.triu_indices(m, 1)] = np.arange(x.size)
-    # Gather, since scattering is slow. For one noise there is no entry to gather from.
+    number = np.zeros((m, m), int)
+    number[np.triu_indices(m, 1)] = np.arange(x.size)
+    # A gather, since scattering is slow. For one noise there is no entry to gather from.
     padded = jnp.append(x, 0) if x.size == 0 else x
-    return jnp.triu(padded[place], 1)
+    return jnp.triu(padded[number], 1)

@@ -108,8 +108,8 @@ class WeakBrownianPath(AbstractPathWithLaws):
 
     @property
     def laws(self) -> dict[str, AbstractLaw]:
-        # Their order is that of the random words. `W` is first, so that it does not depend
-        # on the others.
+        # The laws have the order of the random words. `W` is first, so that it does not
+        # depend on the others.
         laws = {
             "W": THREE_POINT if self.order == 2 else FOUR_POINT,
             "second": THREE_POINT if self.second else None,
@@ -190,13 +190,13 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
             return self.increment(words, t0, t1, use_levy)
         h = jnp.asarray(self.cell, t0.dtype)
 
-        def sample(i) -> Piece:
-            # Cells are numbered, so their place needs no rounding. The number is exact, as
-            # the times of a cell are not.
+        def sample(i: Array) -> Piece:
+            # The number of a cell serves as its place: it is exact, and the times of the
+            # cell are rounded.
             place = (i.astype(jnp.int32), jnp.array(0))
-            # Always draw the areas, so that increments do not depend on `use_levy`.
-            words = self.words(place, True)
-            return Piece.of(self.increment(words, 0 * h, h, True), h)
+            # Areas are always drawn, so that increments do not depend on `use_levy`.
+            words = self.words(place, use_levy=True)
+            return Piece.of(self.increment(words, 0 * h, h, use_levy=True), h)
 
         piece = compose(t0, t1, self.cell, sample, type(self).__name__)
         return piece.as_increment(self.levy_area, self.shape, t1 - t0, use_levy)

@@ -30,11 +30,12 @@ AREA_WORDS = 2 * _MOST_PAIRS
 
 
 def random_words(
-    key: PRNGKeyArray, place: Place, sets: int, n: int, begin: int = 0
-) -> UInt32[Array, "sets n"]:
-    """Random words for a step at `place`, in `sets` sets of `n` words each. More sets leave
-    the first ones unchanged. Words for different values of `begin` are independent, so a
-    path and a wrapper around it may share a key."""
+    key: PRNGKeyArray, place: Place, num_sets: int, set_size: int, begin: int = 0
+) -> UInt32[Array, "num_sets set_size"]:
+    """Random words for a step at `place`, in `num_sets` sets of `set_size` words each. More
+    sets leave the first ones unchanged. Words for different values of `begin` are
+    independent, so a path and a wrapper around it may share a key. Raises a `ValueError`
+    for an array of keys."""
     key = typed_key(key)
     if key.ndim > 0:
         raise ValueError(
@@ -42,27 +43,30 @@ def random_words(
             f"{key.shape}. Use `jax.vmap` over it."
         )
     count, exponent = place
-    num_words = sets * n
+    num_words = num_sets * set_size
     num_pairs = (num_words + 1) // 2
     if is_threefry(key) and 0 < num_pairs <= _MOST_PAIRS:
         # With the place as counter, one hash yields two words. Folding and splitting keys
-        # would take three hashes for the first word.
-        numbers = np.arange(begin, begin + num_pairs, dtype=np.uint32)
+        # would take three hashes for the first word. The exponent fills the upper 12 of 32
+        # bits, the number of the pair the 20 bits below.
+        pair_numbers = np.arange(begin, begin + num_pairs, dtype=np.uint32)
         upper = count.astype(jnp.uint32)
-        lower = (exponent.astype(jnp.uint32) << 20) + numbers
+        lower = (exponent.astype(jnp.uint32) << 20) + pair_numbers
 
-        def hashed() -> tuple[Array, ...]:
+        def hash_counters() -> tuple[Array, ...]:
             pair = _threefry(jr.key_data(key), upper, lower)
             # A single word needs only the first of its pair.
             return pair[:num_words]
 
         # XLA would compute each of the two words in a separate kernel.
-        words = jnp.stack(materialize(hashed), axis=1)
-        return words.reshape(-1)[:num_words].reshape(sets, n)
-    at = jr.fold_in(jr.fold_in(key, count), exponent)
-    # Each set from a key of its own, so that more sets leave the first ones unchanged.
-    each = [jr.bits(jr.fold_in(at, begin + i), (n,), jnp.uint32) for i in range(sets)]
-    return jnp.stack(each)
+        words = jnp.stack(materialize(hash_counters), axis=1)
+        return words.reshape(-1)[:num_words].reshape(num_sets, set_size)
+    step_key = jr.fold_in(jr.fold_in(key, count), exponent)
+    # Each set has a key of its own, so that more sets leave the first ones unchanged.
+    set_keys = [jr.fold_in(step_key, begin + i) for i in range(num_sets)]
+    return jnp.stack(
+        [jr.bits(set_key, (set_size,), jnp.uint32) for set_key in set_keys]
+    )
 
 
 # Threefry-2x32 rotates by these numbers of bits, in turns, four times before it adds keys.
@@ -80,21 +84,22 @@ def _threefry(
     keys = [key[0], key[1], key[0] ^ key[1] ^ _PARITY]
     first = upper + keys[0]
     second = lower + keys[1]
-    for i in range(5):
-        for bits in _ROTATIONS[i % 2]:
+    # Five groups of four rounds, after each of which two of the keys are added, in turns.
+    for group in range(5):
+        for bits in _ROTATIONS[group % 2]:
             first = first + second
             second = first ^ ((second << bits) | (second >> (32 - bits)))
-        first = first + keys[(i + 1) % 3]
-        second = second + keys[(i + 2) % 3] + np.uint32(i + 1)
+        first = first + keys[(group + 1) % 3]
+        second = second + keys[(group + 2) % 3] + np.uint32(group + 1)
     return first, second
 
 
-def check_key(key: Any, user: str) -> None:
+def check_key(key: Any, caller_name: str) -> None:
     """Raises a `ValueError` unless `key` is a random key (from `jax.random.key` or
     `jax.random.PRNGKey`) or an array of keys, to be used with `jax.vmap`."""
     if not is_key(key):
         raise ValueError(
-            f"`{user}` needs a random key, such as `jax.random.key(0)`; got {key!r}."
+            f"`{caller_name}` needs a random key, such as `jax.random.key(0)`; got {key!r}."
         )
 
 
@@ -112,19 +117,21 @@ def typed_key(key: PRNGKeyArray | UInt32[Array, "..."]) -> PRNGKeyArray:
     return jr.wrap_key_data(key) if key.dtype == jnp.uint32 else key
 
 
-def derived_key(key: PRNGKeyArray, old):
+def derived_key(key: PRNGKeyArray, old: Array) -> Array:
     """A key derived from `key` to take the place of `old`, of the same kind and shape.
     Equal old keys get the same new one."""
-    typed = typed_key(old)
-    words = jr.key_data(typed)
-    for word in words.reshape(-1):
+    old_words = jr.key_data(typed_key(old))
+    for word in old_words.reshape(-1):
         key = jr.fold_in(key, word)
-    data = jr.bits(key, words.shape, jnp.uint32)
-    return jr.wrap_key_data(data, impl=jr.key_impl(old)) if old is typed else data
+    new_words = jr.bits(key, old_words.shape, jnp.uint32)
+    if old.dtype == jnp.uint32:
+        # A key from `jax.random.PRNGKey` consists of its words.
+        return new_words
+    return jr.wrap_key_data(new_words, impl=jr.key_impl(old))
 
 
-# Odd constants, which keep steps of round numbers away from where `place_of` rounds: their
-# sizes from powers of two, and their middles in units from integers.
+# `place_of` rounds sizes of steps to powers of two and their middles to integers. These odd
+# constants keep steps of round numbers away from where it rounds.
 _OFF_POWERS = 1.37
 _OFF_INTEGERS = 0.29
 
@@ -136,14 +143,14 @@ def place_of(t0: Array, t1: Array) -> Place:
     third and 0.7 of the step (1.37 times a quarter and a half); the second is the exponent.
     So two steps have the same integers only if they overlap.
     """
-    per_unit, exponent = _inverse_power_of_two(jnp.abs(t1 - t0) * _OFF_POWERS)
+    units_per_time, exponent = _inverse_power_of_two(jnp.abs(t1 - t0) * _OFF_POWERS)
     # Late in a long float32 solve, two steps may round to the same middle. So the integer
     # part of the start, which is exact, is split off before adding half a step.
-    start = t0 * per_unit
-    half = (t1 - t0) / 2 * per_unit
+    start = t0 * units_per_time
+    half = (t1 - t0) / 2 * units_per_time
     whole = jnp.floor(start)
     rest = jnp.floor(start - whole + half + _OFF_INTEGERS)
-    # Wrap around after 2^31 counts, or fewer in half precision.
+    # The count wraps around after 2^31 units, or fewer in half precision.
     period = 2.0 ** min(31, jnp.finfo(whole.dtype).maxexp - 1)
     whole = whole - period * jnp.trunc(whole / period)
     return whole.astype(jnp.int32) + rest.astype(jnp.int32), exponent
@@ -151,14 +158,15 @@ def place_of(t0: Array, t1: Array) -> Place:
 
 def _inverse_power_of_two(x: Array) -> tuple[Array, Integer[Array, ""]]:
     """One over a power of two that is between a quarter and half of `x > 0`, and the
-    exponent of `x`, from its bits: `jnp.frexp` and `jnp.ldexp` would take as long as a
-    random word."""
+    exponent of that power. They come from the bits of `x`: `jnp.frexp` and `jnp.ldexp`
+    would take as long as a random word."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(x, f"int{info.bits}")
     # The number is positive, so above its mantissa is only the exponent.
     biased = bits >> info.nmant
     bias = 2 ** (info.nexp - 1) - 1
-    # An exponent with an empty mantissa is a power of two.
+    # An exponent with an empty mantissa is a power of two, here one over the largest power
+    # of two up to `x`. Twice this belongs to half of that power.
     inverse = lax.bitcast_convert_type((2 * bias - biased) << info.nmant, x.dtype) * 2
     exponent = biased.astype(jnp.int32) - (bias + 1)
     # For an empty step, in which a path has no noise, any unit will do.
@@ -169,9 +177,9 @@ class AbstractLaw(abc.ABC):
     """The law of a scalar random variable with mean zero. Laws are compared by value."""
 
     @abc.abstractmethod
-    def outcomes(self, nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    def outcomes(self, num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
         """Values and probabilities of a discrete law, or quadrature points and weights that
-        integrate polynomials of degree `2 nodes - 1` exactly."""
+        integrate polynomials of degree `2 num_nodes - 1` exactly."""
 
     @abc.abstractmethod
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
@@ -187,15 +195,15 @@ class Discrete(AbstractLaw):
     probabilities: tuple[float, ...]
     cuts: tuple[int, ...]
 
-    def outcomes(self, nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    def outcomes(self, num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
         return np.array(self.values), np.array(self.probabilities)
 
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
         values = [np.asarray(value, dtype) for value in self.values]
         sample = jnp.full(words.shape, values[-1])
-        # From the last cut to the first, each of which decides for the words below it. A
-        # table of values would need a gather, which is slow on CPUs.
-        for cut, value in reversed([*zip(self.cuts, values)]):
+        # Each cut decides for all words below it, so the last cut comes first. A table of
+        # values would need a gather, which is slow on CPUs.
+        for cut, value in zip(reversed(self.cuts), reversed(values[:-1])):
             sample = jnp.where(words < np.uint32(cut), value, sample)
         return sample
 
@@ -206,8 +214,8 @@ class Gaussian(AbstractLaw):
 
     variance: float = 1.0
 
-    def outcomes(self, nodes: int) -> tuple[np.ndarray, np.ndarray]:
-        points, weights = np.polynomial.hermite_e.hermegauss(nodes)
+    def outcomes(self, num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+        points, weights = np.polynomial.hermite_e.hermegauss(num_nodes)
         return np.sqrt(self.variance) * points, weights / np.sqrt(2 * np.pi)
 
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
@@ -238,9 +246,10 @@ def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]
     interval of length `2^-32`."""
     half = np.asarray(0.5, dtype)
     unit = np.asarray(2.0**-31, dtype)
-    # Processors convert signed integers to floats faster.
+    # Processors convert signed integers to floats faster than unsigned ones.
     signed = lax.bitcast_convert_type(words ^ np.uint32(2**31), np.int32)
-    # 2 q with its sign, and 2 p: each is accurate where the other is not.
+    # 2 q with its sign, and 2 p: each is accurate where the other is not. Half a unit more
+    # is the middle of the interval.
     two_q = (signed.astype(dtype) + half) * unit
     tail = lax.bitcast_convert_type(jnp.minimum(words, ~words), np.int32)
     two_p = (tail.astype(dtype) + half) * unit
@@ -267,14 +276,14 @@ _LIKELY = float((3 + np.sqrt(6)) / 12)
 _UNLIKELY = float((3 - np.sqrt(6)) / 12)
 _RARE = round(2**32 * _UNLIKELY)
 
-# Matches moments 1 to 5 of the normal distribution. Odd moments vanish exactly, since as
-# many words give one sign as the other.
+# This law matches moments 1 to 5 of the normal distribution. Odd moments vanish exactly,
+# since as many words give one sign as the other.
 THREE_POINT = Discrete(
     values=(-_ROOT3, 0.0, _ROOT3),
     probabilities=(1 / 6, 2 / 3, 1 / 6),
     cuts=(_SIXTH, 2**32 - _SIXTH),
 )
-# Matches moments 1 to 7. Words below 2^31 give negative values.
+# This law matches moments 1 to 7. Words below 2^31 give negative values.
 FOUR_POINT = Discrete(
     values=(-_LARGE, -_SMALL, _LARGE, _SMALL),
     probabilities=(_UNLIKELY, _LIKELY, _UNLIKELY, _LIKELY),

@@ -101,13 +101,15 @@ class AbstractPathWithLaws(AbstractStepwisePath):
     def laws(self) -> Mapping[str, AbstractLaw]: ...
 
     def num_words(self, use_levy: bool = False) -> int:
-        return (len(self.laws) if use_levy else 1) * num_noises(self.shape)
+        num_sets = len(self.laws) if use_levy else 1
+        return num_sets * num_noises(self.shape)
 
     def words(self, place: Place, use_levy: bool) -> UInt32[Array, " num_words"]:
         """The path's random words for a place on the time axis."""
-        sets = len(self.laws) if use_levy else 1
-        # In sets, so that the words of the first law do not depend on `use_levy`.
-        return random_words(self.key, place, sets, num_noises(self.shape)).reshape(-1)
+        # One set for each law, so that the words of the first do not depend on `use_levy`.
+        num_sets = len(self.laws) if use_levy else 1
+        words = random_words(self.key, place, num_sets, num_noises(self.shape))
+        return words.reshape(-1)
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         words = self.words(place_of(t0, t1), use_levy)
@@ -115,15 +117,16 @@ class AbstractPathWithLaws(AbstractStepwisePath):
 
     def increment(self, words, t0, t1, use_levy: bool = False) -> Increment:
         h = t1 - t0
-        n = num_noises(self.shape)
+        set_size = num_noises(self.shape)
         if not use_levy:
-            return draw_set(self.laws["W"], words[:n], h, self.shape)
-        drawn = {}
+            law = self.laws["W"]
+            return variables_from_words(law, words[:set_size], h, self.shape)
+        variables = {}
         for i, (name, law) in enumerate(self.laws.items()):
-            own_words = words[i * n : (i + 1) * n]
-            drawn[name] = draw_set(law, own_words, h, self.shape)
-        # `levy_area` is any class of increments to a type checker.
-        return cast(Any, self.levy_area)(dt=step_size(h, self.shape), **drawn)
+            own_words = words[i * set_size : (i + 1) * set_size]
+            variables[name] = variables_from_words(law, own_words, h, self.shape)
+        # To a type checker `levy_area` is any class of increments.
+        return cast(Any, self.levy_area)(dt=step_size(h, self.shape), **variables)
 
 
 class AbstractWrappedPath(AbstractStepwisePath):
@@ -141,27 +144,28 @@ class AbstractWrappedPath(AbstractStepwisePath):
 
     @abc.abstractmethod
     def num_own_words(self, use_levy: bool) -> int:
-        """The number of random words that `changed` needs."""
+        """The number of random words that `own_increment` needs."""
 
     @abc.abstractmethod
-    def changed(
+    def own_increment(
         self,
         increment: Increment,
         own_words: UInt32[Array, " num_own_words"],
         h: RealScalarLike,
         use_levy: bool,
     ) -> Increment:
-        """This path's increment, from the other's over a step of size `h`."""
+        """The increment of this path over a step of size `h`, from that of the other."""
 
     def num_words(self, use_levy: bool = False) -> int:
-        return stepwise(self.path).num_words(use_levy) + self.num_own_words(use_levy)
+        wrapped = checked_stepwise(self.path)
+        return wrapped.num_words(use_levy) + self.num_own_words(use_levy)
 
     def increment(self, words, t0, t1, use_levy: bool = False) -> Increment:
         # The words of the wrapped path come first, as if it were alone.
-        path = stepwise(self.path)
-        increment = path.increment(words, t0, t1, use_levy)
-        own_words = words[path.num_words(use_levy) :]
-        return self.changed(increment, own_words, t1 - t0, use_levy)
+        wrapped = checked_stepwise(self.path)
+        increment = wrapped.increment(words, t0, t1, use_levy)
+        own_words = words[wrapped.num_words(use_levy) :]
+        return self.own_increment(increment, own_words, t1 - t0, use_levy)
 
 
 class GivenPath(diffrax.AbstractBrownianPath):
@@ -198,8 +202,9 @@ class UnspecifiedPath(diffrax.AbstractBrownianPath):
         )
 
 
-def stepwise(path: diffrax.AbstractBrownianPath) -> AbstractStepwisePath:
-    """`path`. Raises a `ValueError` if its steps cannot be computed from given words."""
+def checked_stepwise(path: diffrax.AbstractBrownianPath) -> AbstractStepwisePath:
+    """The same path. Raises a `ValueError` if its steps cannot be computed from given
+    words."""
     if not isinstance(path, AbstractStepwisePath):
         raise ValueError(
             "The random variables of this path cannot be set from outside. Use a "
@@ -222,10 +227,11 @@ GAUSSIAN_LAWS: Mapping[type, Mapping[str, AbstractLaw]] = {
 
 
 def laws_of(path: diffrax.AbstractBrownianPath) -> Mapping[str, AbstractLaw] | None:
-    """The laws of the random variables of a step, or `None` if they are unknown."""
+    """The laws of the random variables of a step of size 1, by their name in the increment;
+    or `None` if they are unknown."""
     if isinstance(path, AbstractStepwisePath):
         return path.laws
-    # Those of Diffrax have no attribute for it. Other paths may have any law.
+    # Diffrax's paths do not state their laws. Paths of other classes may have any law.
     if isinstance(path, diffrax.UnsafeBrownianPath | diffrax.VirtualBrownianTree):
         return GAUSSIAN_LAWS.get(path.levy_area)
     return None
@@ -241,7 +247,7 @@ def is_random(path: diffrax.AbstractBrownianPath) -> bool:
 def increment_struct(
     path: diffrax.AbstractBrownianPath,
 ) -> PyTree[jax.ShapeDtypeStruct]:
-    """Shapes, dtypes and structure of an increment."""
+    """The shapes and dtypes of an increment, in its structure."""
     if isinstance(path, UnspecifiedPath):
         return path.shape
     # With times as in a solve, both share the trace of `evaluate`.
@@ -253,37 +259,37 @@ def num_noises(shape: PyTree[jax.ShapeDtypeStruct]) -> int:
     return sum(leaf.size for leaf in jtu.tree_leaves(shape))
 
 
-def raveled(like: PyTree) -> tuple[Array, Callable]:
-    """Zeros in the structure, shapes and dtypes of `like` as one vector, and what restores
-    the structure of such a vector."""
+def zeros_and_unravel(like: PyTree) -> tuple[Array, Callable]:
+    """Zeros in the structure, shapes and dtypes of `like` as one vector, and the function
+    that restores this structure from a vector."""
     zeros = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
     return jfu.ravel_pytree(zeros)
 
 
 def step_size(h: RealScalarLike, shape: PyTree[jax.ShapeDtypeStruct]) -> PyTree[Array]:
     """The field `dt` of an increment of this shape."""
-    # Diffrax's increments have one for each leaf, each in the dtype of its leaf.
+    # Diffrax's increments have one step size for each leaf, in the dtype of the leaf.
     return jtu.tree_map(lambda leaf: jnp.asarray(h, leaf.dtype), shape)
 
 
-def draw_set(
+def variables_from_words(
     law: AbstractLaw,
     words: UInt32[Array, " n"],
     h: RealScalarLike,
     like: PyTree[jax.ShapeDtypeStruct | Array],
 ) -> PyTree[Array]:
-    """A random variable for each noise, over a step of size `h`, in the structure, shapes
-    and dtypes of `like`."""
+    """A random variable with this law for each noise, over a step of size `h`, in the
+    structure, shapes and dtypes of `like`."""
     leaves, treedef = jtu.tree_flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
-    # Diffrax steps backward in time with negated times, and negates the increments.
-    root = jnp.sqrt(jnp.abs(h))
-    out = []
-    for piece, leaf in zip(jnp.split(words, ends[:-1]), leaves):
-        sample = law.from_words(piece.reshape(leaf.shape), leaf.dtype)
-        # In the leaf's own precision, which that of the times may exceed.
-        out.append(sample * root.astype(leaf.dtype))
-    return jtu.tree_unflatten(treedef, out)
+    # `h` is negative backward in time. Diffrax itself negates the increments.
+    sqrt_h = jnp.sqrt(jnp.abs(h))
+    variables = []
+    for leaf_words, leaf in zip(jnp.split(words, ends[:-1]), leaves):
+        sample = law.from_words(leaf_words.reshape(leaf.shape), leaf.dtype)
+        # Times may have a higher precision than the leaf.
+        variables.append(sample * sqrt_h.astype(leaf.dtype))
+    return jtu.tree_unflatten(treedef, variables)
 
 
 def checked_shape(
@@ -292,7 +298,7 @@ def checked_shape(
     """The shape of the increments of a path; a tuple of integers means a single array.
     Raises a `ValueError` for anything else, and for dtypes that are not real."""
     if isinstance(shape, tuple) and all(isinstance(size, int) for size in shape):
-        # The default dtype now, not when a step is drawn: the two may differ.
+        # The dtype is the default of this moment, which may change before a step is drawn.
         shape = jax.ShapeDtypeStruct(shape, jnp.result_type(float))
     for leaf in jtu.tree_leaves(shape):
         if not isinstance(leaf, jax.ShapeDtypeStruct) or min(leaf.shape, default=0) < 0:

@@ -25,7 +25,7 @@ def _truncated(shape: Any, key: PRNGKeyArray) -> TruncatedBrownianPath:
     return TruncatedBrownianPath(FixedStepBrownianPath(shape, key))
 
 
-# Wrappers draw other random words from the same key.
+# A wrapper may share the key of its path: it draws other random words from it.
 def _with_levy_areas(shape: Any, key: PRNGKeyArray) -> LevyAreaBrownianPath:
     return LevyAreaBrownianPath(_with_space_time_area(shape, key), key)
 
@@ -63,7 +63,7 @@ class RandomVariable(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """Its name, and how to get it."""
+        """The name of the variable, and how to get a path with it."""
         return f"{self.name}. Make its path by `solver.path(shape, key)`"
 
 
@@ -83,7 +83,7 @@ _plateau = ft.partial(
     rank=5,
 )
 
-# By the attribute of the increment.
+# The random variables, by the attribute of the increment that holds them.
 VARIABLES = {
     "A": RandomVariable(
         increment=LevyAreaIncrement,
@@ -134,24 +134,27 @@ VARIABLES = {
 
 
 def drives(name: str) -> str:
-    """The `drives` of the random variable of this name. Unknown variables drive the vector
-    fields of the noise."""
+    """The vector fields that the random variable of this name multiplies, as in
+    `RandomVariable`: for an unknown variable those of the noise."""
     return VARIABLES[name].drives if name in VARIABLES else "noise"
 
 
-def most_demanding(names: Collection[str]) -> RandomVariable | None:
+def most_demanding_variable(names: Collection[str]) -> RandomVariable | None:
     """The random variable of the highest rank among these, or `None` if all are unknown."""
     # A solver of the user's own may have variables that are not known here.
     known = [VARIABLES[name] for name in names if name in VARIABLES]
     return max(known, key=lambda variable: variable.rank, default=None)
 
 
-def path_of(variables: Collection[str], *, gaussian: bool, bounded: bool) -> _MakePath:
-    """Makes a path with these random variables. If only increments are needed, they may be
-    `gaussian`, and then also `bounded`, for implicit methods."""
-    # The path of the increments alone is the discrete one.
+def path_maker(
+    variables: Collection[str], *, gaussian: bool, bounded: bool
+) -> _MakePath:
+    """A function of a shape and a key that makes a path with these random variables. If
+    only increments are needed, they may be `gaussian`, and then also `bounded`, for
+    implicit methods."""
+    # In the table, the path of `"W"` is the discrete one.
     decisive = set(variables) - {"W"} if gaussian else variables
-    variable = most_demanding(decisive)
+    variable = most_demanding_variable(decisive)
     if variable is not None:
         return variable.path
     return _truncated if bounded else FixedStepBrownianPath

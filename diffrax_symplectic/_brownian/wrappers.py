@@ -22,11 +22,11 @@ from .random import (
 )
 from .stepwise import (
     AbstractWrappedPath,
-    draw_set,
     Increment,
     increment_struct,
     laws_of,
     num_noises,
+    variables_from_words,
 )
 
 
@@ -40,13 +40,15 @@ TOO_STRONG = (
 )
 
 
-def require_space_time_area(path: diffrax.AbstractBrownianPath, wrapper: str) -> None:
+def check_space_time_area(
+    path: diffrax.AbstractBrownianPath, wrapper_name: str
+) -> None:
     """Raises a `ValueError` unless the increments of `path` have space-time Lévy area."""
     # Anything that is no path fails the same test.
     area = getattr(path, "levy_area", type(None))
     if not issubclass(area, diffrax.AbstractSpaceTimeLevyArea):
         raise ValueError(
-            f"`{wrapper}` needs a path with space-time Lévy area, for example "
+            f"`{wrapper_name}` needs a path with space-time Lévy area, for example "
             "`FixedStepBrownianPath(shape, key, diffrax.SpaceTimeLevyArea)`; got "
             f"{type(path).__name__} with {area.__name__}."
         )
@@ -57,7 +59,7 @@ def has_bounded_increments(path: diffrax.AbstractBrownianPath) -> bool:
     if isinstance(path, TruncatedBrownianPath):
         return True
     laws = laws_of(path)
-    return laws is not None and all(isinstance(x, Discrete) for x in laws.values())
+    return laws is not None and all(isinstance(law, Discrete) for law in laws.values())
 
 
 class TruncatedBrownianPath(AbstractWrappedPath):
@@ -115,12 +117,12 @@ class TruncatedBrownianPath(AbstractWrappedPath):
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         increment = self.path.evaluate(t0, t1, use_levy=use_levy)
         no_words = jnp.zeros(0, jnp.uint32)
-        return self.changed(increment, no_words, t1 - t0, use_levy)
+        return self.own_increment(increment, no_words, t1 - t0, use_levy)
 
     def num_own_words(self, use_levy: bool) -> int:
         return 0
 
-    def changed(self, increment, own_words, h, use_levy) -> Increment:
+    def own_increment(self, increment, own_words, h, use_levy) -> Increment:
         h = jnp.abs(h)
         h = eqx.error_if(h, h >= 1, TOO_STRONG)
         # The bound of an empty step is zero.
@@ -138,16 +140,19 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 def lost_variance(path: diffrax.AbstractBrownianPath, h: float) -> float:
     """The share of the variance of an increment over a step of size `h` that is lost by
     truncation."""
-    lost = 0.0
+    share = 0.0
     while isinstance(path, AbstractWrappedPath):
         if isinstance(path, TruncatedBrownianPath):
-            lost = max(lost, _lost_beyond(math.sqrt(2 * path.k * max(-math.log(h), 0))))
+            # In units of the root of `h`; zero for steps of size 1 and longer.
+            bound = math.sqrt(2 * path.k * max(-math.log(h), 0))
+            share = max(share, _variance_beyond(bound))
         path = path.path
-    return lost
+    return share
 
 
-def _lost_beyond(bound: float) -> float:
-    """`1 - E[min(|x|, bound)^2]` for a standard normal `x`."""
+def _variance_beyond(bound: float) -> float:
+    """`1 - E[min(|x|, bound)^2]` for a standard normal `x`, by partial integration of
+    `x^2 - bound^2` over both tails."""
     density = math.exp(-(bound**2) / 2) / math.sqrt(2 * math.pi)
     tail = math.erfc(bound / math.sqrt(2)) / 2
     return 2 * (bound * density + (1 - bound**2) * tail)
@@ -177,10 +182,10 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
 
     @property
     def C(self) -> BM:
-        return jtu.tree_map(_offset, self.dt, self.W, self.H, self.sign)
+        return jtu.tree_map(_plateau_offset, self.dt, self.W, self.H, self.sign)
 
 
-def _offset(h: Array, W: Array, H: Array, sign: Array) -> Array:
+def _plateau_offset(h: Array, W: Array, H: Array, sign: Array) -> Array:
     """The variables `C` of one array of noises."""
     # In a solve backward in time Diffrax negates everything, including the step size.
     h = jnp.abs(h).astype(W.dtype)
@@ -205,7 +210,7 @@ class PlateauBrownianPath(AbstractWrappedPath):
 
         **Raises:** a `ValueError` if `path` has no space-time Lévy area.
         """
-        require_space_time_area(path, type(self).__name__)
+        check_space_time_area(path, type(self).__name__)
         check_key(key, type(self).__name__)
         self.path = path
         self.key = key
@@ -215,24 +220,24 @@ class PlateauBrownianPath(AbstractWrappedPath):
         laws = laws_of(self.path)
         if laws is None:
             return None
-        # These increments do not include space-time-time areas. The order is that of the
-        # random words, of which the wrapped path's come first.
+        # These increments do not include space-time-time areas. The laws have the order of
+        # the random words, of which those of the wrapped path come first.
         return {"W": laws["W"], "H": laws["H"], "sign": TWO_POINT}
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         increment = self.path.evaluate(t0, t1, use_levy=use_levy)
         if not use_levy:
             return increment
-        n = self.num_own_words(use_levy)
-        words = random_words(self.key, place_of(t0, t1), 1, n, PLATEAU_WORDS)
-        return self.changed(increment, words[0], t1 - t0, use_levy)
+        num_words = self.num_own_words(use_levy)
+        words = random_words(self.key, place_of(t0, t1), 1, num_words, PLATEAU_WORDS)
+        return self.own_increment(increment, words[0], t1 - t0, use_levy)
 
     def num_own_words(self, use_levy: bool) -> int:
         return num_noises(increment_struct(self.path)) if use_levy else 0
 
-    def changed(self, increment, own_words, h, use_levy) -> Increment:
+    def own_increment(self, increment, own_words, h, use_levy) -> Increment:
         if not use_levy:
             return increment
         assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
-        sign = draw_set(TWO_POINT, own_words, h, increment.W)
+        sign = variables_from_words(TWO_POINT, own_words, h, increment.W)
         return PlateauIncrement(increment.dt, increment.W, increment.H, sign)

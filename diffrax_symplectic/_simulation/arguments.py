@@ -28,10 +28,10 @@ from .._signature import once_for_each_signature
 from .._solver import own_path
 from .._terms import (
     brownian_paths,
+    call_user_function,
     check_baths_have_own_noise,
     check_drifts_differ,
     check_fit,
-    evaluated,
     has_lifted,
 )
 
@@ -232,7 +232,7 @@ def _result_struct(
     explain which state `phi` gets."""
 
     def result(t: RealScalarLike, y: Y, args: Args) -> PyTree[Array]:
-        return evaluated("phi", phi, t, y, args=args)
+        return call_user_function("phi", phi, t, y, args=args)
 
     try:
         return eqx.filter_eval_shape(result, t0, y0, args)

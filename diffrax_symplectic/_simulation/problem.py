@@ -31,12 +31,12 @@ from .._terms import (
     check_start,
     check_stratonovich,
     constraint_of,
-    has_shapes,
-    needs_truncation,
     path_numbers,
-    specified,
     step_variables,
     StepVariables,
+    which_are_shapes,
+    which_need_truncation,
+    with_paths_for_shapes,
     without_truncation,
 )
 from .arguments import (
@@ -120,8 +120,8 @@ class Problem(eqx.Module):
                 "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
             )
         # In each sample other keys take the place of these.
-        shapes = has_shapes(terms)
-        terms = specified(terms, ft.partial(own_path, solver, want))
+        shapes = which_are_shapes(terms)
+        terms = with_paths_for_shapes(terms, ft.partial(own_path, solver, want))
         counts = step_numbers(t0, t1, dt0, ts)
 
         # Any draw has the right structure.
@@ -146,7 +146,7 @@ class Problem(eqx.Module):
         check_noise(terms)
         # Solvers make paths without knowing what they drive. Those of the user are kept.
         if any(shapes):
-            needed = needs_truncation(terms, start, y0, args)
+            needed = which_need_truncation(terms, start, y0, args)
             needless = [own and not need for own, need in zip(shapes, needed)]
             terms = without_truncation(terms, needless)
         check_truncation(terms, float(dt0))

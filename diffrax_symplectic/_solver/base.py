@@ -21,7 +21,7 @@ from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
 from .._arguments import check_state, whole_number
 from .._batch import batched_like
-from .._brownian import drives, most_demanding, path_of
+from .._brownian import drives, most_demanding_variable, path_maker
 from .._custom_types import Args, Terms, Y
 from .._root_finder import PicardNewton
 from .._tableau import (
@@ -89,7 +89,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
     @property
     def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
         """The least that the path's increments must contain."""
-        variable = most_demanding(self.variables)
+        variable = most_demanding_variable(self.variables)
         if variable is None:
             return diffrax.AbstractBrownianIncrement
         return variable.increment
@@ -158,7 +158,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
             strong = self.record is not None and self.record.strong is not None
             want = "strong" if strong else "weak"
         implicit = isinstance(self, diffrax.AbstractImplicitSolver)
-        make = path_of(self.variables, gaussian=want == "strong", bounded=implicit)
+        make = path_maker(self.variables, gaussian=want == "strong", bounded=implicit)
         return make(shape, key)
 
     def __repr__(self) -> str:

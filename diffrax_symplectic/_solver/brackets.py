@@ -13,7 +13,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._brownian import raveled
+from .._brownian import zeros_and_unravel
 from .._compat import ω
 from .._custom_types import Args, RealScalarLike, Y
 from .._terms import control_struct, tree_sum
@@ -32,7 +32,7 @@ def apply_brackets(
 
     For antisymmetric `A` this is `sum_l Db_l (sum_k A_kl b_k)`, with `m` derivatives.
     """
-    _, unravel = raveled(control_struct(term))
+    _, unravel = zeros_and_unravel(control_struct(term))
 
     def field(increments: Float[Array, " m"], y: Y) -> Y:
         return term.vf_prod(t, y, args, unravel(increments))
@@ -87,7 +87,7 @@ def apply_bridge(
     is the drift times `h`, and `[b, A] = A' b - b' A`. Time is treated as a component of
     the state that the drift advances by `h`. Computes `m` double brackets for `m` noises.
     """
-    _, unravel = raveled([control_struct(term) for term in noise])
+    _, unravel = zeros_and_unravel([control_struct(term) for term in noise])
     t = jnp.asarray(t, jnp.result_type(h))
     areas, _ = bridge_coefficients
 

@@ -17,13 +17,13 @@ from .._custom_types import Args, RealScalarLike, Terms, Y
 from .._terms import (
     apply,
     check_start,
-    constrained,
     constraint_of,
     NormalSpace,
     rate,
     split_friction,
     split_terms,
     Surface,
+    with_constraint,
     without_constraint,
 )
 from .base import AbstractSymplecticSolver
@@ -200,7 +200,7 @@ def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[Terms, Ter
     drift, _, _ = split_friction(without_constraint(terms))
     kicks, rest = kicks_and_rest(flow, drift)
     first, *others = rest
-    first = replaced(first, constrained(unwrapped(first), constraint_of(terms)))
+    first = replaced(first, with_constraint(unwrapped(first), constraint_of(terms)))
     return kicks, (first, *others)
 
 

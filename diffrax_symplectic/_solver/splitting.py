@@ -11,9 +11,9 @@ from .._compat import direction
 from .._custom_types import RealScalarLike, Y
 from .._tableau import Structure
 from .._terms import (
+    check_unconstrained,
     Dependence,
     momentum_first,
-    refuse_constraint,
     slow_apart,
     split_friction,
 )
@@ -179,7 +179,7 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
             )
 
     def init(self, terms, t0, t1, y0, args) -> Any:
-        refuse_constraint(terms, type(self).__name__)
+        check_unconstrained(terms, type(self).__name__)
         self.check(terms, t0, y0, args)
         state = self.solver.init(terms, t0, t1, y0, args)
         broken = returns_nan(self.flow, direction(terms) * (t1 - t0) / 2, y0, args)

@@ -23,25 +23,25 @@ What solvers and expectations ask of terms, from the bottom up:
   with it; a folder.
 """
 
-from .constrained_drift import constrained, constraint_of
-from .constrained_drift import refuse_constraint, without_constraint
+from .constrained_drift import check_unconstrained, constraint_of
+from .constrained_drift import with_constraint, without_constraint
 from .constraint import check_start, constrained_state, NormalSpace, Surface
 from .dependence import acts_elementwise, Dependence
 from .drift_and_noise import control_struct, field_of, number_of_noises, split_terms
-from .evaluation import evaluated
+from .evaluation import call_user_function
 from .hamiltonian import hamiltonian_terms, noise_terms
 from .langevin import AbstractFriction, bath_terms, friction_apart, FrictionAlong
 from .langevin import langevin_terms, momentum_first, semidefinite_root, split_friction
 from .lifted import has_lifted
-from .paths import brownian_paths, has_shapes, has_unknown_law, path_keys, path_numbers
-from .paths import random_paths, replace_paths, shapes_as_paths, specified
-from .paths import with_keys, with_paths
+from .paths import brownian_paths, has_unknown_law, path_keys, path_numbers
+from .paths import random_paths, replace_paths, shapes_as_paths, which_are_shapes
+from .paths import with_keys, with_paths, with_paths_for_shapes
 from .spins import as_spins, from_spinors, spin_terms, to_spinors
 from .step_variables import outcomes, step_variables, StepVariables
 from .structure import additive_fault, check_assertions, check_baths_have_own_noise
 from .structure import check_drifts_differ, check_stratonovich, check_structure
-from .structure import commuting, constant_fault, Fault, FRICTION
-from .structure import needs_truncation, separable_fault, without_truncation
+from .structure import constant_fault, Fault, FRICTION, noises_commute
+from .structure import separable_fault, which_need_truncation, without_truncation
 from .symplectic_gradients import IndexedNoise, slow_apart
 from .vector_fields import apply, apply_one, check_fit, rate, tree_sum
 from .waves import from_pair, to_pair, wave_terms

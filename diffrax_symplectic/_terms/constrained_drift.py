@@ -15,7 +15,7 @@ from .._custom_types import Args
 _T = TypeVar("_T")
 Constraint = Callable[[PyTree, Args], Float[Array, " c"]]
 
-# What every refusal advises. These two solvers find the multipliers of a constraint.
+# The advice of every refusal. These two solvers find the multipliers of a constraint.
 KEEP = (
     "Use `StormerVerlet()`, or for the terms of `langevin_terms` `BAOAB()`: they keep the "
     "constraint to rounding"
@@ -37,8 +37,8 @@ class ConstrainedDrift(diffrax.AbstractTerm):
         check_takes("constraint", self.constraint, "q", "args")
 
     def vf(self, t, y, args) -> PyTree[Array]:
-        # Diffrax looks at the structure of this before a solve, with any solver, so it
-        # cannot be the error. Its values must not be used.
+        # Diffrax looks at the structure of the vector field before any solve, so the error
+        # cannot be raised here. The values must not be used.
         return jtu.tree_map(_nan_like, y)
 
     def contr(self, t0, t1, **kwargs) -> Any:
@@ -51,7 +51,7 @@ class ConstrainedDrift(diffrax.AbstractTerm):
         )
 
 
-def constrained(
+def with_constraint(
     drift: diffrax.AbstractTerm, constraint: Constraint | None
 ) -> diffrax.AbstractTerm:
     """The drift with its constraint, if there is one."""
@@ -61,31 +61,33 @@ def constrained(
 def constraint_of(terms: PyTree[diffrax.AbstractTerm]) -> Constraint | None:
     """The constraint of these terms, if there is one. Raises a `ValueError` if there are
     several."""
-    # Also within a `MultiTerm`, and within Diffrax's wrapper for the direction of time.
+    # The drift may be within a `MultiTerm`, and within Diffrax's wrapper for the direction
+    # of time.
     leaves = jtu.tree_leaves(terms, is_leaf=_is_constrained)
-    found = [leaf.constraint for leaf in leaves if _is_constrained(leaf)]
-    # One at a time would leave the other: their multipliers belong to one equation.
-    if len(found) > 1:
+    constraints = [leaf.constraint for leaf in leaves if _is_constrained(leaf)]
+    # The multipliers of all constraints belong to one equation: a step that keeps one
+    # constraint would leave the other.
+    if len(constraints) > 1:
         raise ValueError(
-            f"Only one of the terms may be constrained; got {len(found)}. Return all "
+            f"Only one of the terms may be constrained; got {len(constraints)}. Return all "
             "constraints from one function, as one array of shape `(c,)`."
         )
-    return found[0] if found else None
+    return constraints[0] if len(constraints) > 0 else None
 
 
 def without_constraint(terms: _T) -> _T:
-    """The same terms, free to leave the constraint."""
+    """The same terms without their constraint, if they have one."""
 
-    def freed(x: Any) -> Any:
+    def unconstrained(x: Any) -> Any:
         return x.drift if _is_constrained(x) else x
 
-    return jtu.tree_map(freed, terms, is_leaf=_is_constrained)
+    return jtu.tree_map(unconstrained, terms, is_leaf=_is_constrained)
 
 
-def refuse_constraint(terms: PyTree[diffrax.AbstractTerm], name: str) -> None:
+def check_unconstrained(terms: PyTree[diffrax.AbstractTerm], caller_name: str) -> None:
     """Raises a `ValueError` if the terms have a constraint."""
     if constraint_of(terms) is not None:
-        raise ValueError(f"`{name}` takes no constrained terms. {KEEP}.")
+        raise ValueError(f"`{caller_name}` takes no constrained terms. {KEEP}.")
 
 
 def _nan_like(x: Array) -> Array:

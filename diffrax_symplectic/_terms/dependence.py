@@ -28,13 +28,14 @@ class Dependence:
         """Whether `part(result)` is independent of `of(*inputs)`, PyTrees of arrays."""
         used_results = _marks(part, self._out)
         # A program for these results alone reads fewer inputs.
-        _, read = dce_jaxpr(self._jaxpr, used_results)
-        marked = _marks(lambda inputs: of(*inputs), self._inputs)
-        return not any(is_read and asked for is_read, asked in zip(read, marked))
+        _, read_inputs = dce_jaxpr(self._jaxpr, used_results)
+        asked_inputs = _marks(lambda inputs: of(*inputs), self._inputs)
+        pairs = zip(read_inputs, asked_inputs)
+        return not any(is_read and is_asked for is_read, is_asked in pairs)
 
 
 def _marks(select: Callable, tree: PyTree) -> list[bool]:
-    """Which leaves of `tree` are leaves of `select(tree)`."""
+    """For each leaf of `tree`, in order, whether it is a leaf of `select(tree)`."""
     # Leaves may be equal, or have no values, so they are told apart by their numbers.
     treedef = jtu.tree_structure(tree)
     numbers = treedef.unflatten(range(treedef.num_leaves))
@@ -47,7 +48,7 @@ def _marks(select: Callable, tree: PyTree) -> list[bool]:
 _ELEMENTWISE = frozenset(
     "add add_any convert_element_type copy div integer_pow mul neg select_n sub".split()
 )
-# Those whose parameters hold what they call.
+# Operations whose parameters hold the program that they call.
 _CALLS = frozenset({"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"})
 
 # The number of the input whose entries the entries of an array depend on, each on the same
@@ -71,28 +72,28 @@ def acts_elementwise(fn: Callable, x: PyTree[Array]) -> bool:
 def _sources(jaxpr: Jaxpr, numbers: Sequence[_Source]) -> list[_Source] | None:
     """The source of each result, given those of the inputs. `None` if some operation mixes
     the entries of an input, or two inputs."""
-    # What no result needs may mix entries: the derivative of a product of all of them
-    # also computes the product.
-    jaxpr, read = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
-    read_numbers = [number for number, is_read in zip(numbers, read) if is_read]
-    known = dict(zip(jaxpr.invars, read_numbers))
+    # Operations that no result needs are left out, since they may mix entries: the
+    # derivative of a product of all entries also computes the product.
+    jaxpr, read_inputs = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+    read_numbers = [number for number, is_read in zip(numbers, read_inputs) if is_read]
+    known_sources = dict(zip(jaxpr.invars, read_numbers))
 
     def source_of(x: Any) -> _Source:
-        return None if isinstance(x, Literal) else known.get(x)
+        return None if isinstance(x, Literal) else known_sources.get(x)
 
     for eqn in jaxpr.eqns:
         sources = [source_of(x) for x in eqn.invars]
-        found = {number for number in sources if number is not None}
-        if len(found) == 0:
+        distinct = {number for number in sources if number is not None}
+        if len(distinct) == 0:
             continue
-        inner = _called_by(eqn)
-        if inner is not None:
-            results = _sources(inner, sources)
+        called = _called_by(eqn)
+        if called is not None:
+            results = _sources(called, sources)
             if results is None:
                 return None
-            known.update(zip(eqn.outvars, results))
-        elif len(found) == 1 and _is_elementwise(eqn, sources):
-            known.update(dict.fromkeys(eqn.outvars, found.pop()))
+            known_sources.update(zip(eqn.outvars, results))
+        elif len(distinct) == 1 and _is_elementwise(eqn, sources):
+            known_sources.update(dict.fromkeys(eqn.outvars, distinct.pop()))
         else:
             return None
     return [source_of(x) for x in jaxpr.outvars]
@@ -102,9 +103,9 @@ def _called_by(eqn: Any) -> Jaxpr | None:
     """The program that an operation calls with its own arguments, if it is such a call."""
     if eqn.primitive.name not in _CALLS:
         return None
-    inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
-    # With its constants, or without them.
-    return getattr(inner, "jaxpr", inner)
+    called = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
+    # Some operations hold the program with its constants, others without them.
+    return getattr(called, "jaxpr", called)
 
 
 def _is_elementwise(eqn: Any, sources: Sequence[_Source]) -> bool:
@@ -116,7 +117,7 @@ def _is_elementwise(eqn: Any, sources: Sequence[_Source]) -> bool:
     if eqn.primitive.name == "dot_general":
         # The derivative of `p @ p` multiplies by a scalar in this way.
         return len(tracked) == 1 and any(x.aval.size == 1 for x in eqn.invars)
-    # These keep entries where they keep the shape.
+    # These two keep the entries if they keep the shape, as they do here.
     if eqn.primitive.name in ("reshape", "broadcast_in_dim"):
         return True
     return eqn.primitive.name in _ELEMENTWISE

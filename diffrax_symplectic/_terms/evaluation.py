@@ -13,12 +13,25 @@ from .._arguments import shapes
 from .._custom_types import Args
 
 
-def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Array]:
-    """`H(*inputs, args)`, with advice on its errors."""
-    # A copy, so that functions which modify `args` in place are the same in each trace.
+# Errors of a function that needs the values of its arguments while JAX traces it.
+_NEED_VALUES = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.NonConcreteBooleanIndexError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+
+def call_user_function(
+    name: str, function: Callable, *inputs: PyTree, args: Args
+) -> PyTree[Array]:
+    """Returns `function(*inputs, args)`, where `function` is the user's argument of this
+    name. Its errors while JAX traces it are raised with advice."""
+    # The function gets a copy: if it modifies `args` in place, each trace still has the
+    # same ones.
     copy = jtu.tree_map(lambda leaf: leaf, args)
     try:
-        return H(*inputs, copy)
+        return function(*inputs, copy)
     except _NEED_VALUES as error:
         raise ValueError(
             f"`{name}` needs concrete values while JAX traces it, in an `if`, `while`, "
@@ -32,32 +45,25 @@ def evaluated(name: str, H: Callable, *inputs: PyTree, args: Args) -> PyTree[Arr
         raise
 
 
-# Errors of a function that needs the values of its arguments while JAX traces it.
-_NEED_VALUES = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.NonConcreteBooleanIndexError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-)
-
-
-def scalar_energy(out: PyTree, name: str = "H0") -> Array:
-    """The output of a Hamiltonian. Raises a `ValueError` if it is not a real scalar."""
-    if not jtu.all_leaves([out]) or jnp.shape(out) != ():
+def checked_energy(energy: PyTree, name: str = "H0") -> Array:
+    """The value of the user's Hamiltonian of this name, as a float. Raises a `ValueError`
+    if it is not a real scalar."""
+    if not jtu.all_leaves([energy]) or jnp.shape(energy) != ():
         raise ValueError(
-            f"`{name}` must return a scalar; got shape {shapes(out)}. Sum over the degrees "
-            "of freedom. (For a batch of paths write it for one path, and `jax.vmap` the "
-            "solve.)"
+            f"`{name}` must return a scalar; got shape {shapes(energy)}. Sum over the "
+            "degrees of freedom. (For a batch of paths write it for one path, and "
+            "`jax.vmap` the solve.)"
         )
-    check_real_energies(name, out)
+    check_real_energies(name, energy)
     # `jax.grad` refuses integers, such as the `0` of a particle without energy.
-    return jnp.asarray(out, jnp.result_type(out, float))
+    return jnp.asarray(energy, jnp.result_type(energy, float))
 
 
-def check_real_energies(name: str, out: PyTree[Array]) -> None:
-    if not all(map(_is_real, jtu.tree_leaves(out))):
+def check_real_energies(name: str, energies: PyTree[Array]) -> None:
+    """Raises a `ValueError` unless the user's Hamiltonians of this name are real."""
+    if not all(map(_is_real, jtu.tree_leaves(energies))):
         raise ValueError(
-            f"`{name}` must return real numbers; got {eqx.tree_pformat(out)}. Take "
+            f"`{name}` must return real numbers; got {eqx.tree_pformat(energies)}. Take "
             "`jnp.real` of numbers that are mathematically real, such as <psi| A |psi>."
         )
 

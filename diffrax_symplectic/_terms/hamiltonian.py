@@ -8,7 +8,7 @@ from jaxtyping import Array, PyTree
 
 from .._arguments import check_takes
 from .._custom_types import Args, RealScalarLike
-from .constrained_drift import constrained, Constraint
+from .constrained_drift import Constraint, with_constraint
 from .paths import as_path
 from .symplectic_gradients import (
     AssertedStructure,
@@ -91,7 +91,7 @@ def hamiltonian_terms(
     if slow is not None:
         check_takes("slow", slow, "t", "q", "args")
     drift = diffrax.ODETerm(Drift(H0, structure, slow=slow))
-    drift = constrained(drift, constraint)
+    drift = with_constraint(drift, constraint)
     if noise is None and path is None:
         return diffrax.MultiTerm(drift)
     # If only one of the two was left out, its own check says so.

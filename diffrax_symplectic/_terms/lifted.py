@@ -26,9 +26,9 @@ class Lifted(eqx.Module):
     chart: Callable[[tuple[PyTree, PyTree]], PyTree]
 
     def __call__(self, *inputs) -> PyTree[Array]:
-        # An `IndexedNoise` passes the index before the time.
-        *before, p, q, args = inputs
-        return self.H(*before, self.chart((p, q)), args)
+        # The first inputs are the time, or from an `IndexedNoise` the index and the time.
+        *index_and_time, p, q, args = inputs
+        return self.H(*index_and_time, self.chart((p, q)), args)
 
 
 def has_lifted(terms: PyTree) -> bool:
@@ -45,29 +45,32 @@ def lifted_terms(
     noise: Callable | None,
     path: diffrax.AbstractBrownianPath | PyTree | None,
     chart: Callable[[tuple[PyTree, PyTree]], PyTree],
-    name: str,
+    variable_name: str,
 ) -> diffrax.MultiTerm:
-    """The terms of Hamiltonians in `chart((p, q))`, a variable called `name`."""
-    check_takes("H0", H0, "t", name, "args")
+    """The terms of Hamiltonians in the variable `chart((p, q))`, which messages call
+    `variable_name`."""
+    check_takes("H0", H0, "t", variable_name, "args")
     if noise is None:
         if path is not None:
             raise ValueError(
-                f"`noise` must be a function, called as `noise(t, {name}, args)`; got "
-                "None. Without noise, leave out `path`, too."
+                f"`noise` must be a function, called as `noise(t, {variable_name}, args)`; "
+                "got None. Without noise, leave out `path`, too."
             )
-        lifted = None
+        lifted_noise = None
     elif isinstance(noise, IndexedNoise):
-        # Still one noise at a time, for the solvers that follow one after another.
-        lifted = IndexedNoise(Lifted(noise.H, chart), noise.m)
+        # The noise can still be evaluated one at a time, for the solvers that follow the
+        # flow of one noise after another.
+        lifted_noise = IndexedNoise(Lifted(noise.H, chart), noise.m)
     else:
-        check_takes("noise", noise, "t", name, "args")
-        lifted = Lifted(noise, chart)
-    return hamiltonian_terms(Lifted(H0, chart), lifted, path)
+        check_takes("noise", noise, "t", variable_name, "args")
+        lifted_noise = Lifted(noise, chart)
+    return hamiltonian_terms(Lifted(H0, chart), lifted_noise, path)
 
 
 def checked_damping(each: str, alpha: ArrayLike) -> ArrayLike:
-    """A damping in arrays, a number or one for `each` of what is damped. Raises a
-    `ValueError` if it is known to be negative or not finite."""
+    """The damping `alpha` in an array: a number, or one for each vector that is damped,
+    such as "each spin" for `each`. Raises a `ValueError` if it is known to be negative or
+    not finite."""
     return real_array(
         "damping", alpha, kind=f"a number, or an array with one for {each}"
     )
@@ -76,8 +79,9 @@ def checked_damping(each: str, alpha: ArrayLike) -> ArrayLike:
 def damping_for(
     each: str, alpha: ArrayLike, shape: tuple[int, ...], dtype: Any
 ) -> Array:
-    """The damping of vectors of this shape, NaN where it is negative or not finite. Raises
-    a `ValueError` if its shape is another."""
+    """The damping `alpha` of vectors in an array of this shape, without the axis of their
+    components; NaN where it is negative or not finite. Raises a `ValueError` unless it is a
+    number or has this shape."""
     alpha = jnp.asarray(alpha, dtype)
     if alpha.shape not in ((), shape):
         raise ValueError(

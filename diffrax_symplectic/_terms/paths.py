@@ -50,8 +50,8 @@ def _is_shape(path: Any) -> bool:
     if isinstance(path, tuple) and all(isinstance(n, int) for n in path):
         return True
     leaves = jtu.tree_leaves(path)
-    is_struct = [isinstance(x, jax.ShapeDtypeStruct) for x in leaves]
-    return len(leaves) > 0 and all(is_struct)
+    are_structs = all(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves)
+    return len(leaves) > 0 and are_structs
 
 
 def shapes_as_paths(terms: PyTree) -> PyTree:
@@ -67,9 +67,9 @@ def shapes_as_paths(terms: PyTree) -> PyTree:
     return jtu.tree_map(with_path, terms, is_leaf=_is_control)
 
 
-def has_shapes(terms: PyTree) -> list[bool]:
-    """For each Brownian path of the terms, in order, whether its shape stands in its
-    place."""
+def which_are_shapes(terms: PyTree) -> list[bool]:
+    """For each Brownian path of the terms, in order, whether the terms hold its shape
+    instead of the path."""
     return [_is_unspecified(path) for path in brownian_paths(shapes_as_paths(terms))]
 
 
@@ -79,7 +79,8 @@ def brownian_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
 
 
 def random_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
-    """Those Brownian paths of the terms that have a random key."""
+    """The Brownian paths of the terms that draw their noise from a random key, and the
+    shapes of paths."""
     return [path for path in brownian_paths(terms) if is_random(path)]
 
 
@@ -92,21 +93,23 @@ def has_unknown_law(path: diffrax.AbstractBrownianPath) -> bool:
 def path_numbers(paths: Sequence[diffrax.AbstractBrownianPath]) -> tuple[int, ...]:
     """The number of the Brownian motion that each path samples, counted from 0. Equal paths
     sample the same one; two shapes of paths never do."""
-    found: list[diffrax.AbstractBrownianPath] = []
+    motions: list[diffrax.AbstractBrownianPath] = []
     numbers = []
     for path in paths:
-        same = (k for k, other in enumerate(found) if _are_equal(path, other))
-        numbers.append(next(same, len(found)))
-        if numbers[-1] == len(found):
-            found.append(path)
+        same = (k for k, motion in enumerate(motions) if _are_equal(path, motion))
+        number = next(same, None)
+        if number is None:
+            number = len(motions)
+            motions.append(path)
+        numbers.append(number)
     return tuple(numbers)
 
 
 def _are_equal(
     path: diffrax.AbstractBrownianPath, other: diffrax.AbstractBrownianPath
 ) -> bool:
-    """Whether two paths are the same. Traced paths are if they hold the same arrays, since
-    their values are not known."""
+    """Whether two paths are the same. The values of traced paths are not known: these are
+    the same if they hold the same arrays."""
     if _is_unspecified(path):
         return False
     with at_trace_time():
@@ -116,68 +119,74 @@ def _are_equal(
     return bool(equal)
 
 
-def replace_paths(terms: PyTree, new: Callable) -> PyTree:
-    """The terms with `new(path)` in place of each Brownian path."""
+def replace_paths(terms: PyTree, new_path: Callable) -> PyTree:
+    """The terms with `new_path(path)` in place of each Brownian path."""
 
-    def replaced(x: Any) -> Any:
-        return new(x) if _is_path(x) else x
+    def replace(x: Any) -> Any:
+        return new_path(x) if _is_path(x) else x
 
-    return jtu.tree_map(replaced, terms, is_leaf=_is_path)
+    return jtu.tree_map(replace, terms, is_leaf=_is_path)
 
 
-def specified(terms: PyTree, make: Callable) -> PyTree:
-    """The terms with `make(shape, key)` in place of each shape of a path. The keys differ:
-    each shape is a Brownian motion of its own."""
+def with_paths_for_shapes(terms: PyTree, make_path: Callable) -> PyTree:
+    """The terms with `make_path(shape, key)` in place of each shape of a path. The keys
+    differ: each shape is a Brownian motion of its own."""
     terms = shapes_as_paths(terms)
-    alone = all(map(_is_unspecified, brownian_paths(terms)))
-    seeds = itertools.count(0 if alone else _SEED_BESIDE_OTHERS)
+    has_only_shapes = all(map(_is_unspecified, brownian_paths(terms)))
+    seeds = itertools.count(0 if has_only_shapes else _SEED_BESIDE_OTHERS)
 
-    def new(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
+    def new_path(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
         if not isinstance(path, UnspecifiedPath):
             return path
-        return make(path.shape, jr.key(next(seeds)))
+        return make_path(path.shape, jr.key(next(seeds)))
 
-    return replace_paths(terms, new)
+    return replace_paths(terms, new_path)
 
 
 def with_paths(
-    make: Callable, numbers: tuple[int, ...], terms: PyTree, key: PRNGKeyArray
+    make_path: Callable, numbers: tuple[int, ...], terms: PyTree, key: PRNGKeyArray
 ) -> PyTree:
-    """The terms with new paths, made from a shape and a key. `numbers` are the
-    `path_numbers` of their random paths; others are not replaced. Paths of the user's own
-    classes only get other keys."""
-    left = iter(numbers)
+    """The terms with `make_path(shape, key)` in place of each random path. `numbers` are
+    the `path_numbers` of the random paths: those with the same number get the same key.
+    Paths of the user's own classes only get other keys."""
+    remaining_numbers = iter(numbers)
 
-    def new(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
+    def new_path(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
         if not is_random(path):
             return path
-        number = next(left)
+        number = next(remaining_numbers)
         # With one Brownian motion, which is the usual case, the user's key is its key: the
         # same path can then be made by hand.
-        own = key if number == 0 else jr.fold_in(key, number + 1)
+        path_key = key if number == 0 else jr.fold_in(key, number + 1)
         if not has_unknown_law(path):
-            return make(increment_struct(path), own)
-        derived = lambda x: derived_key(own, x) if is_key(x) else x
-        return jtu.tree_map(derived, path)
+            return make_path(increment_struct(path), path_key)
 
-    return replace_paths(terms, new)
+        def with_new_key(x: Any) -> Any:
+            return derived_key(path_key, x) if is_key(x) else x
+
+        return jtu.tree_map(with_new_key, path)
+
+    return replace_paths(terms, new_path)
 
 
 def path_keys(terms: PyTree[diffrax.AbstractTerm], key: PRNGKeyArray) -> list[Array]:
     """New random keys for the paths in `terms`, derived from `key`. Paths that share a key
     get the same new one."""
-    old = filter(is_key, jtu.tree_leaves(brownian_paths(terms)))
-    return [derived_key(key, x) for x in old]
+    old_keys = filter(is_key, jtu.tree_leaves(brownian_paths(terms)))
+    return [derived_key(key, old_key) for old_key in old_keys]
 
 
 def with_keys(terms: PyTree[diffrax.AbstractTerm], keys: list[Array]) -> PyTree:
     """The terms with these keys, from `path_keys`, in their paths."""
-    left = iter(keys)
+    remaining_keys = iter(keys)
 
-    def rekeyed(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
-        return jtu.tree_map(lambda x: next(left) if is_key(x) else x, path)
+    def with_next_key(x: Any) -> Any:
+        return next(remaining_keys) if is_key(x) else x
 
-    return replace_paths(terms, rekeyed)
+    def new_path(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
+        return jtu.tree_map(with_next_key, path)
+
+    return replace_paths(terms, new_path)
 
 
 def _is_path(x: Any) -> bool:

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._arguments import check_pair
 from .._custom_types import Args, RealScalarLike
-from .evaluation import evaluated, scalar_energy
+from .evaluation import call_user_function, checked_energy
 from .lifted import checked_damping, damping_for, lifted_terms
 
 
@@ -88,8 +88,8 @@ _EACH = "each spin"
 
 
 class _DampedPrecession(eqx.Module):
-    """The velocity of the pair for `ds/dt = s x omega`, `omega = grad H0 + alpha s x grad
-    H0`."""
+    """The velocity of the pair `(p, q)` for `ds/dt = s x omega` with `omega = grad H0 +
+    alpha s x grad H0`."""
 
     H0: _SpinHamiltonian
     alpha: ArrayLike = eqx.field(converter=ft.partial(checked_damping, _EACH))
@@ -98,12 +98,12 @@ class _DampedPrecession(eqx.Module):
         s = from_spinors(y)
 
         def energy(s: _Spins) -> Array:
-            return scalar_energy(evaluated("H0", self.H0, t, s, args=args))
+            return checked_energy(call_user_function("H0", self.H0, t, s, args=args))
 
         gradient = jax.grad(energy)(s)
         alpha = damping_for(_EACH, self.alpha, s.shape[:-1], s.dtype)
-        # Without damping `omega` is the gradient. The cross product turns it, so that the
-        # spin spirals to lower energy.
+        # Without damping `omega` is the gradient. The cross product that damping adds lets
+        # the spin spiral to lower energy.
         s1, s2, s3 = _components(s)
         g1, g2, g3 = _components(gradient)
         w1 = g1 + alpha * (s2 * g3 - s3 * g2)
@@ -148,7 +148,7 @@ def from_spinors(y: _Spinors) -> _Spins:
     """
     check_pair(y)
     p, q = y
-    # So `q` has the structure and the shape of `p`.
+    # The check of the pair ensures that `q` has the structure and the shape of `p`.
     if not eqx.is_array_like(p) or jnp.shape(p)[-1:] != (2,):
         raise ValueError(
             "The state of spins is a pair `(p, q)` of arrays of shape `(..., 2)`: pass "
@@ -192,17 +192,17 @@ def to_spinors(s: _Spins) -> _Spinors:
         "leave it out.",
     )
     s1, s2, s3 = _components(s / scale)
-    north = s3 >= 0
+    is_north = s3 >= 0
     length = jnp.sqrt(s1**2 + s2**2 + s3**2)
-    # The larger of |a| and |b|, whose number is real, and the other number: divided by the
-    # larger one, it is accurate near both poles.
-    real = jnp.sqrt(2 * (length + jnp.where(north, s3, -s3)))
-    other_q = 2 * s1 / real
-    other_p = 2 * s2 / real
-    p1 = jnp.where(north, 0, other_p)
-    p2 = jnp.where(north, -other_p, 0)
-    q1 = jnp.where(north, real, other_q)
-    q2 = jnp.where(north, other_q, real)
+    # Of `a` and `b` the larger one is chosen real. The other one follows by a division by
+    # it, which is accurate near both poles.
+    larger = jnp.sqrt(2 * (length + jnp.where(is_north, s3, -s3)))
+    other_q = 2 * s1 / larger
+    other_p = 2 * s2 / larger
+    p1 = jnp.where(is_north, 0, other_p)
+    p2 = jnp.where(is_north, -other_p, 0)
+    q1 = jnp.where(is_north, larger, other_q)
+    q2 = jnp.where(is_north, other_q, larger)
     root = jnp.sqrt(scale)
     return root * jnp.stack([p1, p2], axis=-1), root * jnp.stack([q1, q2], axis=-1)
 

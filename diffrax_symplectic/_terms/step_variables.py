@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -19,11 +20,12 @@ from .._brownian import (
     laws_of,
     num_noises,
     ONLY_A_SHAPE,
-    raveled,
     step_size,
     UnspecifiedPath,
+    zeros_and_unravel,
 )
 from .._compat import is_traced
+from .._custom_types import RealScalarLike
 from .paths import brownian_paths, path_numbers, replace_paths, shapes_as_paths
 
 
@@ -40,25 +42,35 @@ class StepVariables(NamedTuple):
 
 
 def step_variables(
-    terms: PyTree[diffrax.AbstractTerm], h, numbers: tuple[int, ...] | None = None
+    terms: PyTree[diffrax.AbstractTerm],
+    h: RealScalarLike,
+    numbers: tuple[int, ...] | None = None,
 ) -> StepVariables:
     """The variables of a step of size `h`. `numbers` are the `path_numbers` of the paths of
     the terms, which programs, whose keys are traced, have to be told."""
     paths = _paths_of_known_laws(terms)
-    numbers = _known_numbers(paths) if numbers is None else numbers
-    # Equal paths are one Brownian motion, whose variables are drawn once.
-    motions = [_Motion.of(paths[numbers.index(k)]) for k in range(max(numbers) + 1)]
-    ends = np.cumsum([motion.size for motion in motions])
+    numbers = _checked_numbers(paths) if numbers is None else numbers
+    # Paths with the same number are one Brownian motion, whose variables are drawn once.
+    first_paths = [paths[numbers.index(number)] for number in range(max(numbers) + 1)]
+    motions = [_Motion.of(path) for path in first_paths]
+    ends = np.cumsum([motion.num_variables for motion in motions])
 
     def terms_with(
         values: Float[Array | np.ndarray, " n"],
     ) -> PyTree[diffrax.AbstractTerm]:
-        each = jnp.split(values, ends[:-1])
-        given = [motion.given(x, h) for motion, x in zip(motions, each)]
-        left = iter(numbers)
-        return replace_paths(terms, lambda _: given[next(left)])
+        pieces = jnp.split(values, ends[:-1])
+        given_paths = [
+            motion.path_with(piece, h) for motion, piece in zip(motions, pieces)
+        ]
+        remaining_numbers = iter(numbers)
 
-    laws = tuple(law for motion in motions for law in motion.each_law)
+        def new_path(path: diffrax.AbstractBrownianPath) -> GivenPath:
+            del path
+            return given_paths[next(remaining_numbers)]
+
+        return replace_paths(terms, new_path)
+
+    laws = tuple(law for motion in motions for law in motion.law_of_each)
     return StepVariables(laws, terms_with)
 
 
@@ -68,13 +80,13 @@ class _Motion(NamedTuple):
     - `path`: a path that samples it.
     - `laws`: the laws of the attributes of its increments, in their order.
     - `shape`: the shape of an increment.
-    - `noises`: the number of noises, each with all of these laws.
+    - `num_noises`: the number of noises, each of which has a variable with each law.
     """
 
     path: diffrax.AbstractBrownianPath
     laws: Mapping[str, AbstractLaw]
-    shape: PyTree
-    noises: int
+    shape: PyTree[jax.ShapeDtypeStruct]
+    num_noises: int
 
     @staticmethod
     def of(path: diffrax.AbstractBrownianPath) -> "_Motion":
@@ -84,47 +96,51 @@ class _Motion(NamedTuple):
         return _Motion(path, laws, shape, num_noises(shape))
 
     @property
-    def size(self) -> int:
+    def num_variables(self) -> int:
         """The number of its random variables in a step."""
-        return len(self.laws) * self.noises
+        return len(self.laws) * self.num_noises
 
     @property
-    def each_law(self) -> list[AbstractLaw]:
+    def law_of_each(self) -> list[AbstractLaw]:
         """The law of each of its random variables."""
-        return [law for law in self.laws.values() for _ in range(self.noises)]
+        return [law for law in self.laws.values() for _ in range(self.num_noises)]
 
-    def given(self, values: Float[Array, " size"], h) -> GivenPath:
-        """A path with these variables in every step, in units of the root of `h`."""
-        flat, unravel = raveled(self.shape)
-        scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(flat.dtype)
-        # One row for each attribute of the increment, in the order of the laws.
-        rows = scaled.reshape(-1, self.noises)
+    def path_with(
+        self, values: Float[Array, " num_variables"], h: RealScalarLike
+    ) -> GivenPath:
+        """A path with these variables, in units of the root of `h`, in every step."""
+        zeros, unravel = zeros_and_unravel(self.shape)
+        scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(zeros.dtype)
+        # (laws, noises): a row is one attribute of the increment.
+        rows = scaled.reshape(-1, self.num_noises)
         attributes = {name: unravel(row) for name, row in zip(self.laws, rows)}
         make_increment: Any = self.path.levy_area
         increment = make_increment(dt=step_size(h, self.shape), **attributes)
-        make = jtu.Partial(_constant, increment)
+        make = jtu.Partial(_same_increment, increment)
         return GivenPath(make=make, levy_area=type(increment))
 
 
 def outcomes(
-    laws: Sequence[AbstractLaw], nodes: int
+    laws: Sequence[AbstractLaw], num_nodes: int
 ) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, " K"]]:
-    """All values of variables with these laws, and their probabilities or quadrature
-    weights."""
+    """All values of independent variables with these laws, and their probabilities, or for
+    Gaussian variables the points and weights of a quadrature with `num_nodes` in each."""
     values_of_each = []
     weights_of_each = []
     for law in laws:
-        values, weights = law.outcomes(nodes)
+        values, weights = law.outcomes(num_nodes)
         values_of_each.append(values)
         weights_of_each.append(weights)
-    # They are independent: all combinations, whose weights are products.
+    # Every combination is an outcome, whose weight is a product, as they are independent.
     values = np.array([*itertools.product(*values_of_each)])
     weights = np.array([*itertools.product(*weights_of_each)])
     return values, np.prod(weights, axis=1)
 
 
-def _constant(increment, t0, t1, use_levy: bool) -> Increment:
-    """The same increment over every step."""
+def _same_increment(
+    increment: Any, t0: RealScalarLike, t1: RealScalarLike | None, use_levy: bool
+) -> Increment:
+    """The same increment over every step, with all of its attributes or `W` alone."""
     del t0, t1
     return increment if use_levy else increment.W
 
@@ -152,9 +168,9 @@ def _paths_of_known_laws(
     return paths
 
 
-def _known_numbers(paths: list[diffrax.AbstractBrownianPath]) -> tuple[int, ...]:
-    """The `path_numbers` of paths. Raises a `ValueError` for several of which it is not
-    known, inside a program, whether they are the same."""
+def _checked_numbers(paths: list[diffrax.AbstractBrownianPath]) -> tuple[int, ...]:
+    """The `path_numbers` of paths. Raises a `ValueError` if there are several and they are
+    traced, since it is then not known which are the same."""
     if len(paths) > 1 and any(map(is_traced, jtu.tree_leaves(paths))):
         raise ValueError(
             "`terms` hold several Brownian paths with traced keys, of which it is not "

@@ -20,7 +20,7 @@ from .._compat import replaced, ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike, Terms
 from .dependence import Dependence
 from .drift_and_noise import field_of
-from .evaluation import check_real_energies, evaluated, scalar_energy
+from .evaluation import call_user_function, check_real_energies, checked_energy
 
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ else:
     from equinox import AbstractVar
 
 
-# Momenta or positions: of one structure and one shape each, which are those of the other.
+# Momenta or positions, which have the same structure and shapes.
 Momenta = PyTree[Shaped[Array, "?*p"], "P"]
 _State = tuple[Momenta, Momenta]
 Hamiltonian = Callable[[RealScalarLike, Momenta, Momenta, Args], PyTree[Array]]
@@ -59,7 +59,8 @@ class IndexedNoise(eqx.Module):
         self, k: IntScalarLike, t: RealScalarLike, p: PyTree, q: PyTree, args: Args
     ) -> Array:
         """`H_k`, for `k` from 0 to `m - 1`. Raises a `ValueError` if it is not a scalar."""
-        return scalar_energy(evaluated("H", self.H, k, t, p, q, args=args), "H")
+        value = call_user_function("H", self.H, k, t, p, q, args=args)
+        return checked_energy(value, name="H")
 
     def __call__(self, t: RealScalarLike, p: PyTree, q: PyTree, args: Args) -> Array:
         numbers = jnp.arange(self.m)
@@ -100,13 +101,14 @@ class Drift(eqx.Module):
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
         check_pair(y)
 
-        def scalar(p: Momenta, q: Momenta) -> Array:
-            energy = scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
+        def total_energy(p: Momenta, q: Momenta) -> Array:
+            value = call_user_function("H0", self.H0, t, p, q, args=args)
+            energy = checked_energy(value)
             if self.slow is None:
                 return energy
             return energy + _slow_energy(self.slow, t, q, args)
 
-        return symplectic_gradient(scalar, y)
+        return symplectic_gradient(total_energy, y)
 
 
 class SlowForce(eqx.Module):
@@ -125,7 +127,9 @@ class SlowForce(eqx.Module):
 
 
 def _slow_energy(slow: Callable, t: RealScalarLike, q: Momenta, args: Args) -> Array:
-    return scalar_energy(evaluated("slow", slow, t, q, args=args), "slow")
+    """The value of the potential `slow`. Raises a `ValueError` if it is not a scalar."""
+    value = call_user_function("slow", slow, t, q, args=args)
+    return checked_energy(value, name="slow")
 
 
 def slow_apart(drift: Terms) -> tuple[Terms, Terms]:
@@ -135,9 +139,9 @@ def slow_apart(drift: Terms) -> tuple[Terms, Terms]:
     for term in drift:
         field = field_of(term)
         if isinstance(field, Drift) and field.slow is not None:
-            without = dataclasses.replace(field, slow=None)
+            fast = dataclasses.replace(field, slow=None)
             # `replaced` keeps the direction of time, which Diffrax wraps around each term.
-            rest.append(replaced(term, diffrax.ODETerm(without)))
+            rest.append(replaced(term, diffrax.ODETerm(fast)))
             slow.append(replaced(term, diffrax.ODETerm(SlowForce(field.slow))))
         else:
             rest.append(term)
@@ -167,18 +171,19 @@ class HamiltonianNoise(AbstractNoise):
     structure: AssertedStructure | None = eqx.field(static=True, default=None)
 
     def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
-        # For each array of the state, with a trailing axis of noises: what Diffrax's own
-        # solvers ask for, if they take several stages with one field.
+        # Diffrax's own solvers ask for this if they take several stages with one field.
         hamiltonians = self._hamiltonians_at(t, y, args)
 
-        def flat(y: _State) -> Array:
-            return jfu.ravel_pytree(hamiltonians(y))[0]
+        def flat_hamiltonians(y: _State) -> Array:
+            flat, _ = jfu.ravel_pytree(hamiltonians(y))
+            return flat
 
         def noises_last(x: Array) -> Array:
             return jnp.moveaxis(x, 0, -1)
 
-        dp, dq = jtu.tree_map(noises_last, jax.jacrev(flat)(y))
-        return (-(dq**ω)).ω, dp
+        # For each array of the state: (noises, *shape) to (*shape, noises).
+        by_p, by_q = jtu.tree_map(noises_last, jax.jacrev(flat_hamiltonians)(y))
+        return (-(by_q**ω)).ω, by_p
 
     def vf_prod(
         self, t: RealScalarLike, y: _State, args: Args, control: BM | OneNoise
@@ -186,23 +191,24 @@ class HamiltonianNoise(AbstractNoise):
         # The noise of a step is the gradient of one scalar, for any number of noises.
         hamiltonians = self._hamiltonians_at(t, y, args)
 
-        def one_of_them(p: Momenta, q: Momenta, one: OneNoise) -> Array:
+        def energy_of_one(p: Momenta, q: Momenta, one: OneNoise) -> Array:
             if isinstance(self.noise, IndexedNoise):
                 H = self.noise.one(one.number, t, p, q, args)
             else:
-                H = jfu.ravel_pytree(hamiltonians((p, q)))[0][one.number]
+                flat, _ = jfu.ravel_pytree(hamiltonians((p, q)))
+                H = flat[one.number]
             return H * jnp.asarray(one.increment, H.dtype)
 
         def dot(H: Array, increment: Array) -> Array:
             return jnp.sum(H * increment.astype(H.dtype))
 
-        def scalar(p: Momenta, q: Momenta) -> Any:
+        def energy(p: Momenta, q: Momenta) -> Any:
             if isinstance(control, OneNoise):
-                return one_of_them(p, q, control)
+                return energy_of_one(p, q, control)
             dots = jtu.tree_map(dot, hamiltonians((p, q)), control)
             return sum(jtu.tree_leaves(dots))
 
-        return symplectic_gradient(scalar, y)
+        return symplectic_gradient(energy, y)
 
     def is_vf_expensive(self, t0, t1, y, args) -> bool:
         # `vf` takes one reverse pass per noise, `vf_prod` a single one.
@@ -222,7 +228,8 @@ class HamiltonianNoise(AbstractNoise):
             p, q = state
             return self._evaluated_hamiltonians(t, p, q, args, struct)
 
-        # Their gradient would be zero, and noise would be missing without an error.
+        # The gradient of such Hamiltonians is zero, so noise would be missing without an
+        # error.
         if Dependence(hamiltonians, y).independent(of=lambda state: state):
             raise ValueError(
                 "`noise` does not depend on the state, so there is no noise. Return "
@@ -242,10 +249,10 @@ class HamiltonianNoise(AbstractNoise):
     ) -> PyTree[Array]:
         """The noise Hamiltonians, in the structure and shapes of the path."""
         if isinstance(self.noise, IndexedNoise):
-            # It gives advice on the errors of its function by itself.
+            # An `IndexedNoise` gives advice on the errors of its function by itself.
             H = self.noise(t, p, q, args)
         else:
-            H = evaluated("noise", self.noise, t, p, q, args=args)
+            H = call_user_function("noise", self.noise, t, p, q, args=args)
         if not _has_one_for_each_noise(H, struct):
             raise ValueError(
                 "`noise` must return one Hamiltonian for each noise of the path, which has "
@@ -262,49 +269,57 @@ def _has_one_for_each_noise(
     """Whether these are the noise Hamiltonians of a path with increments like `struct`."""
     if jtu.tree_structure(H) != jtu.tree_structure(struct):
         return False
-    pairs = zip(jtu.tree_leaves(H), jtu.tree_leaves(struct))
-    # A single noise may be a scalar.
-    return all(
-        jnp.shape(leaf) == s.shape or jnp.size(leaf) == s.size == 1 for leaf, s in pairs
-    )
+    for leaf, leaf_struct in zip(jtu.tree_leaves(H), jtu.tree_leaves(struct)):
+        # The shapes of a single noise may differ: both may be scalars or arrays.
+        is_single = jnp.size(leaf) == leaf_struct.size == 1
+        if jnp.shape(leaf) != leaf_struct.shape and not is_single:
+            return False
+    return True
 
 
-def symplectic_gradient(scalar: Callable, y: _State) -> _State:
-    """`(-dH/dq, dH/dp)` for `H = scalar(p, q)`."""
+def symplectic_gradient(energy: Callable, y: _State) -> _State:
+    """`(-dH/dq, dH/dp)` for `H = energy(p, q)`."""
     p, q = y
-    dp, dq = jax.grad(scalar, argnums=(0, 1))(p, q)
-    return (-(dq**ω)).ω, dp
+    by_p, by_q = jax.grad(energy, argnums=(0, 1))(p, q)
+    return (-(by_q**ω)).ω, by_p
 
 
 def is_hamiltonian(term: diffrax.AbstractTerm) -> bool:
     """Whether a term comes from Hamiltonians."""
-    return len(_parts(term)) > 0
+    return len(_hamiltonian_parts(term)) > 0
 
 
 def drift_hamiltonians(terms: PyTree[diffrax.AbstractTerm]) -> list[Hamiltonian]:
     """The Hamiltonians of all drifts."""
-    return [part.H0 for part in _parts(terms) if isinstance(part, Drift)]
+    return [part.H0 for part in _hamiltonian_parts(terms) if isinstance(part, Drift)]
 
 
 def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
     """The `structure` that the user asserted for a term, and for all parts of it."""
-    asserted = {part.structure for part in _parts(term)}
+    asserted = {part.structure for part in _hamiltonian_parts(term)}
     return asserted.pop() if len(asserted) == 1 else None
 
 
 def structure_asserted_in(term: diffrax.AbstractTerm) -> str | None:
     """The function that made a term from Hamiltonians, and that takes the `structure` of
     these; `None` for other terms."""
-    drifts = [part for part in _parts(term) if isinstance(part, Drift)]
+    drifts = [part for part in _hamiltonian_parts(term) if isinstance(part, Drift)]
     if len(drifts) > 0:
         return drifts[0].made_by
     return "hamiltonian_terms" if is_hamiltonian(term) else None
 
 
-def _parts(term: PyTree[diffrax.AbstractTerm]) -> list[Drift | HamiltonianNoise]:
-    """What comes from Hamiltonians in a term, which may be wrapped or have friction."""
-    return [x for x in jtu.tree_leaves(term, is_leaf=_is_part) if _is_part(x)]
+def _hamiltonian_parts(
+    term: PyTree[diffrax.AbstractTerm],
+) -> list[Drift | HamiltonianNoise]:
+    """The vector fields and noises in a term that come from Hamiltonians. The term may be
+    wrapped or have friction."""
+    return [
+        x
+        for x in jtu.tree_leaves(term, is_leaf=_is_hamiltonian_part)
+        if _is_hamiltonian_part(x)
+    ]
 
 
-def _is_part(x: Any) -> bool:
+def _is_hamiltonian_part(x: Any) -> bool:
     return isinstance(x, Drift | HamiltonianNoise)

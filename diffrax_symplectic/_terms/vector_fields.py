@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, Float, PyTree
 
-from .._brownian import num_noises, raveled
+from .._brownian import num_noises, zeros_and_unravel
 from .._compat import unwrapped, ω
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Terms, Y
 from .constrained_drift import without_constraint
@@ -18,13 +18,14 @@ from .drift_and_noise import control_struct, flattened
 from .symplectic_gradients import HamiltonianNoise, OneNoise
 
 
-# With `jit` this is traced and lowered once for several stages.
+# Under `jit` this function is traced and lowered once for several stages.
 @eqx.filter_jit
 def apply(terms: Terms, controls: list, args: Args, t: RealScalarLike, y: Y) -> Y:
-    """The sum over terms of vector field times control."""
+    """The change of the state: the sum over terms of vector field times control. Raises a
+    `ValueError` if it does not have the dtypes and shapes of the state."""
     pairs = zip(terms, controls)
-    parts = [term.vf_prod(t, y, args, control) for term, control in pairs]
-    return _sum_like(parts, y)
+    changes = [term.vf_prod(t, y, args, control) for term, control in pairs]
+    return _checked_sum(changes, y)
 
 
 @eqx.filter_jit
@@ -38,19 +39,21 @@ def apply_one(
 ) -> Y:
     """The vector field of one noise times its increment. `number` is its index among the
     noises of all terms, in the order of their flattened controls."""
-    parts = []
+    changes = []
     # The number of noises of the terms before this one.
-    before = 0
+    num_before = 0
     for term in terms:
         struct = control_struct(term)
-        m = num_noises(struct)
+        num_own = num_noises(struct)
         # If the noise belongs to another term, this one adds zero.
-        here = (before <= number) & (number < before + m)
-        local = jnp.clip(number - before, 0, m - 1)
-        only = jnp.where(here, increment, 0)
-        parts.append(_product_of_one_noise(term, struct, local, only, args, t, y))
-        before += m
-    return _sum_like(parts, y)
+        is_own = (num_before <= number) & (number < num_before + num_own)
+        own_number = jnp.clip(number - num_before, 0, num_own - 1)
+        own_increment = jnp.where(is_own, increment, 0)
+        changes.append(
+            _product_of_one_noise(term, struct, own_number, own_increment, args, t, y)
+        )
+        num_before += num_own
+    return _checked_sum(changes, y)
 
 
 def _product_of_one_noise(
@@ -62,32 +65,32 @@ def _product_of_one_noise(
     t: RealScalarLike,
     y: Y,
 ) -> Y:
-    """The vector field of one noise of this term times its increment. `struct` are the
-    shapes of this term's increments. Where possible no other noise is evaluated or
-    multiplied."""
+    """The vector field of one noise of this term times its increment. `number` is its index
+    in the flattened increments of the term, which have the shapes and dtypes of `struct`.
+    Where possible no other noise is evaluated or multiplied."""
     # Only the kind is read from the user's term. The term itself is called, which keeps the
     # direction of time that Diffrax wraps around it.
     if isinstance(unwrapped(term), HamiltonianNoise):
         return term.vf_prod(t, y, args, OneNoise(number, increment))
     if isinstance(unwrapped(term), diffrax.ControlTerm):
         field = term.vf(t, y, args)
-        # A single array of noises, not a Lineax operator or another PyTree.
-        one_array = eqx.is_array(field) and isinstance(struct, jax.ShapeDtypeStruct)
+        # Lineax operators and other PyTrees cannot be indexed by the noise.
+        is_array = eqx.is_array(field) and isinstance(struct, jax.ShapeDtypeStruct)
         # A scalar noise has no axis of noises to index.
-        if one_array and field.ndim > 0 and field.shape[-1:] == struct.shape:
+        if is_array and field.ndim > 0 and field.shape[-1:] == struct.shape:
             return field[..., number] * increment.astype(field.dtype)
     # Other terms add up all noises, so all increments but this one are zero.
-    flat, unravel = raveled(struct)
-    only = flat.at[number].set(increment.astype(flat.dtype))
-    return term.vf_prod(t, y, args, unravel(only))
+    zeros, unravel = zeros_and_unravel(struct)
+    increments = zeros.at[number].set(increment.astype(zeros.dtype))
+    return term.vf_prod(t, y, args, unravel(increments))
 
 
 def rate(drift: Terms, t: RealScalarLike, y: Y, args: Args) -> Y:
     """The rate of change of the state by the drift."""
     t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
-    # Over a step of size one, whose place does not matter to a drift driven by time.
-    zero = jnp.zeros_like(t)
-    controls = [term.contr(zero, zero + 1) for term in drift]
+    # The step has size one. Its place does not matter, since the drift is driven by time.
+    start = jnp.zeros_like(t)
+    controls = [term.contr(start, start + 1) for term in drift]
     return apply(drift, controls, args, t, y)
 
 
@@ -102,7 +105,7 @@ def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
     if not _is_term(terms):
         return
     parts = tuple(flattened(without_constraint(terms)))
-    # First, since its message names the term and its path.
+    # This check comes first, since its message names the term and its path.
     check_increments(parts, t0, y0, args)
 
     def total_change(t: RealScalarLike) -> Y:
@@ -127,7 +130,7 @@ def check_increments(terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Non
             return term.prod(field, increments)
         except (TypeError, ValueError) as error:
             is_operator = isinstance(field, lx.AbstractLinearOperator)
-            takes = field.in_structure() if is_operator else field
+            expected = field.in_structure() if is_operator else field
             kind = "a Lineax operator on" if is_operator else "an array"
             instead = "Construct the path with the shape and dtype that the field takes"
             if len(jtu.tree_leaves(y0)) > 1 and not is_operator:
@@ -141,7 +144,7 @@ def check_increments(terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Non
                 instead += ", for an array the shape of its last axes"
             raise ValueError(
                 "A `ControlTerm` cannot multiply its vector field, "
-                f"{kind} {_brief(takes)}, by the increments of its path, "
+                f"{kind} {_brief(expected)}, by the increments of its path, "
                 f"{_brief(increments)}. {instead}."
             ) from error
 
@@ -163,13 +166,14 @@ def tree_sum(values: list[Y]) -> Y:
     return total
 
 
-def _sum_like(parts: list[Y], y: Y) -> Y:
-    """The sum. Raises a `ValueError` unless all have the dtypes and shapes of the state."""
+def _checked_sum(changes: list[Y], y: Y) -> Y:
+    """The sum of changes of the state `y`. Raises a `ValueError` unless each has the dtypes
+    and shapes of the state."""
 
-    def check(change: Any, x: Any) -> None:
-        # Either may be a number of Python or NumPy. (Not `jnp.result_type`: a weakly typed
-        # scalar that was made before 64 bits were enabled is float32, with result type
-        # float64.)
+    def check_change(change: Any, x: Any) -> None:
+        # Either may be a number of Python or NumPy. (Its `jnp.result_type` may not be its
+        # dtype: a weakly typed scalar that was made before 64 bits were enabled is float32,
+        # with result type float64.)
         change = jnp.asarray(change)
         x = jnp.asarray(x)
         if (change.dtype, change.shape) != (x.dtype, x.shape):
@@ -180,6 +184,6 @@ def _sum_like(parts: list[Y], y: Y) -> Y:
                 "and times a dtype that is not wider."
             )
 
-    for part in parts:
-        jtu.tree_map(check, part, y)
-    return tree_sum(parts)
+    for change in changes:
+        jtu.tree_map(check_change, change, y)
+    return tree_sum(changes)

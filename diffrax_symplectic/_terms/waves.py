@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
 from .._arguments import check_pair, shapes
 from .._custom_types import Args, RealScalarLike
-from .evaluation import evaluated, scalar_energy
+from .evaluation import call_user_function, checked_energy
 from .lifted import checked_damping, damping_for, lifted_terms
 
 
@@ -104,7 +104,8 @@ _EACH = "each vector of amplitudes"
 
 
 class _DampedWaves(eqx.Module):
-    """The velocity of the pair for `dpsi/dt = -i g + alpha (psi g^+ psi - g psi^+ psi)`."""
+    """The velocity of the pair `(p, q)` for `dpsi/dt = -i g + alpha (psi g^+ psi - g psi^+
+    psi)` with `g = dH0/dpsi^*`."""
 
     H0: _WaveHamiltonian
     alpha: ArrayLike = eqx.field(converter=ft.partial(checked_damping, _EACH))
@@ -120,20 +121,20 @@ class _DampedWaves(eqx.Module):
             )
 
         def energy(p: Array, q: Array) -> Array:
-            H = evaluated("H0", self.H0, t, from_pair((p, q)), args=args)
-            return scalar_energy(H)
+            psi = from_pair((p, q))
+            return checked_energy(call_user_function("H0", self.H0, t, psi, args=args))
 
         by_p, by_q = jax.grad(energy, argnums=(0, 1))(p, q)
         vectors = jnp.shape(q)[:-1]
         alpha = damping_for(_EACH, self.alpha, vectors, jnp.result_type(q))
-        # In real numbers, as the state: g = (by_q + i by_p) / sqrt(2), psi = (q + i p) /
-        # sqrt(2). The first two are the parts of 2 g^+ psi, the third is 2 psi^+ psi.
-        half = alpha[..., None] / 2
+        # The state is real: g = (by_q + i by_p) / sqrt(2) and psi = (q + i p) / sqrt(2). So
+        # `real` and `imaginary` are the parts of 2 g^+ psi, and `squares` is 2 psi^+ psi.
+        half_alpha = alpha[..., None] / 2
         real = _dot(by_q, q) + _dot(by_p, p)
         imaginary = _dot(by_q, p) - _dot(by_p, q)
         squares = _dot(p, p) + _dot(q, q)
-        dp = -by_q + half * (real * p + imaginary * q - squares * by_p)
-        dq = by_p + half * (real * q - imaginary * p - squares * by_q)
+        dp = -by_q + half_alpha * (real * p + imaginary * q - squares * by_p)
+        dq = by_p + half_alpha * (real * q - imaginary * p - squares * by_q)
         return dp, dq
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._brownian import most_demanding
+from diffrax_symplectic._brownian import most_demanding_variable
 from diffrax_symplectic._solver import LANGEVIN, SOLVERS
 from diffrax_symplectic._tableau import make_plan
 
@@ -531,7 +531,7 @@ def test_a_path_without_what_a_step_needs_is_refused_with_advice(solver):
     plain = ds.FixedStepBrownianPath((2,), jr.key(0))
     terms = SYSTEMS[solver.structure].terms(plain)
     name = type(solver).__name__
-    needed = most_demanding(solver.variables)
+    needed = most_demanding_variable(solver.variables)
     with pytest.raises(ValueError, match=f"`{name}` needs") as info:
         solver.step(terms, 0.0, 0.1, y0, args, None, False)
     assert "by `solver.path(shape, key)`." in str(info.value)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._terms import commuting
+from diffrax_symplectic._terms import noises_commute
 
 from ..families import slow_except
 
@@ -218,7 +218,7 @@ def test_noises_commute_only_if_that_could_be_tested():
     ):
         noise = lambda t, p, q, args: jnp.stack([jnp.sum(p * q), second(p, q)])
         term = ds.hamiltonian_terms(_good_H0, noise, path).terms[1]
-        assert commuting((term,), 0.0, _positive_state, None) == expected
+        assert noises_commute((term,), 0.0, _positive_state, None) == expected
 
 
 _positive_state = jnp.array([0.3, 0.1]), jnp.array([0.5, 0.2])
@@ -393,5 +393,5 @@ def test_a_check_of_the_users_does_not_stop_the_advice():
 
     path = ds.WeakBrownianPath((2,), jr.key(0))
     terms = ds.hamiltonian_terms(lambda t, p, q, args: jnp.sum(p * q), noise, path)
-    assert not commuting((terms.terms[1],), 0.0, _positive_state, None)
+    assert not noises_commute((terms.terms[1],), 0.0, _positive_state, None)
     assert len(ds.suggest_solver(terms, 0.0, _positive_state, want="strong")) > 0

@@ -16,9 +16,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray, PyTree, 
 from ..._arguments import check_real, check_takes, whole_number
 from ..._brownian import (
     AbstractStepwisePath,
+    checked_stepwise,
     GivenPath,
     Increment,
-    stepwise,
     THREE_POINT,
 )
 from ..._custom_types import Y
@@ -239,7 +239,7 @@ class StepWords(NamedTuple):
 def step_words(terms: PyTree[diffrax.AbstractTerm]) -> StepWords:
     """The words of a step. Equal paths are one Brownian motion, and take the same words.
     Raises a `ValueError` for a path whose increments cannot be computed from words."""
-    paths = [stepwise(path) for path in brownian_paths(terms)]
+    paths = [checked_stepwise(path) for path in brownian_paths(terms)]
     starts: dict[int, int] = {}
     slices: list[tuple[int, int]] = []
     end = 0

@@ -20,8 +20,8 @@ Multipliers: TypeAlias = Float[Array, " c"]
 
 # Newton's method takes three or four steps, and up to twice as many from far away.
 _MOST_STEPS = 30
-# A fraction of so many units in the last place is a rounding error.
-_ROUNDING = 10.0
+# Changes of a number by up to so many units in the last place are rounding errors.
+_ROUNDING_UNITS = 10.0
 
 
 class _Newton(NamedTuple):
@@ -30,9 +30,9 @@ class _Newton(NamedTuple):
     - `x`: the multipliers.
     - `residual`: the constraints before their last correction.
     - `correction`: the last correction.
-    - `left`: how many corrections may follow; `_SOLVED` after the last one. (In place of a
-        number and two flags: with an array for each, steps of 1,000 rigid dimers took 1.2
-        times as long.)
+    - `left`: how many corrections may follow; `_SOLVED` after the last one. (One number
+        stands for a number and two flags: with an array for each, steps of 1,000 rigid
+        dimers took 1.2 times as long.)
     """
 
     x: Multipliers
@@ -66,18 +66,18 @@ def find_multipliers(
     constraint, which is zero.
     """
     slopes = jnp.abs(gram)
-    noise = _ROUNDING * float(jnp.finfo(start.dtype).eps)
+    relative_rounding = _ROUNDING_UNITS * float(jnp.finfo(start.dtype).eps)
 
-    def going(state: _Newton) -> Bool[Array, ""]:
+    def is_going(state: _Newton) -> Bool[Array, ""]:
         return state.left > 0
 
     def step(state: _Newton) -> _Newton:
         newton = correction(residual, state.x, None)
-        # By how much this correction and the one before change each constraint, at most.
+        # At most, this correction and the one before change each constraint by so much.
         change = weighted_sum(jnp.abs(newton.change), slopes)
         before = weighted_sum(jnp.abs(state.correction), slopes) + rounding
-        # By how much the derivative along the one before has changed: the residual before
-        # is the old derivative. In units of each constraint, so that none hides others.
+        # The change of the derivative along the correction before: its old value is the
+        # residual before. It has the units of each constraint, so that none hides others.
         bend = jnp.abs(newton.derivative(state.correction) - state.residual)
         # The next correction is at most this fraction of this one. (Half of the bend is
         # what was left to this one, and the square of the ratio of both is left to the
@@ -85,8 +85,8 @@ def find_multipliers(
         fraction = max_norm(change / before) * max_norm(bend / before)
         # The first correction has none before it.
         fraction = jnp.where(state.left < _MOST_STEPS, fraction, 1)
-        # Strictly, since infinite corrections solve nothing.
-        is_solved = jnp.all(change * fraction < rounding + noise * change)
+        # The inequality is strict, since infinite corrections solve nothing.
+        is_solved = jnp.all(change * fraction < rounding + relative_rounding * change)
         failed = jnp.any(jnp.isnan(change))
         left = jnp.where(failed, 0, state.left - 1)
         return _Newton(
@@ -103,24 +103,28 @@ def find_multipliers(
         left=jnp.where(pending, _MOST_STEPS, 0),
     )
     first = batched_like(first, (residual(start), gram, rounding, pending))
-    last = lax.while_loop(going, step, first)
+    last = lax.while_loop(is_going, step, first)
     found = last.left == _SOLVED
     return jnp.where(found, last.x, 0), found
 
 
 def solve_tangent(apply: Callable, rhs: Multipliers) -> Multipliers:
-    """Solves the linear equations for the derivative of the multipliers."""
+    """Solves the linear equations `apply(x) = rhs` for the derivative of the multipliers,
+    in the form that `lax.custom_root` asks for."""
+    # Its columns are the images of the unit vectors.
     matrix = jax.vmap(apply, out_axes=1)(jnp.eye(len(rhs), dtype=rhs.dtype))
     return solve_matrix(matrix, rhs)
 
 
 def products(a: Float[Array, "c n"], b: Float[Array, "d n"]) -> Float[Array, "c d"]:
-    """The scalar products of all pairs."""
+    """The scalar products of all rows of `a` with all rows of `b`."""
+    # (n, c, d), summed over the first axis.
     return _total(a.T[:, :, None] * b.T[:, None, :])
 
 
 def weighted_sum(x: Multipliers, vectors: Float[Array, "c n"]) -> Vector:
-    """The sum of the vectors times these numbers."""
+    """The sum of the vectors, the rows, times the numbers `x`."""
+    # (c, n), summed over the first axis.
     return _total(x[:, None] * vectors)
 
 

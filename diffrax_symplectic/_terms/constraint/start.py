@@ -45,13 +45,13 @@ _OFF = (
 def check_start(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether the constraints are dependent at `y0`, and whether it is off them. Raises a
-    `ValueError` if either is known while tracing, and for constraints that no solver takes.
-    Otherwise it is an error when run, but not in a batch."""
+    """Raises a `ValueError` if the constraints are dependent at `y0`, if `y0` is off them,
+    or if no solver takes them. Returns the first two as flags: what is not known while
+    tracing is an error when run, but in a batch only the flag of its path."""
     _check_masses(terms, t0, y0, args)
     # A check has no derivative. Taking one would trace it again.
-    fixed = jtu.tree_map(_without_derivative, (y0, args))
-    is_dependent, is_off = _faults(terms, t0, *fixed)
+    fixed_y0, fixed_args = jtu.tree_map(_without_derivative, (y0, args))
+    is_dependent, is_off = _start_faults(terms, t0, fixed_y0, fixed_args)
     return refused_where(is_dependent, _DEPENDENT), refused_where(is_off, _OFF)
 
 
@@ -59,15 +59,17 @@ def _without_derivative(x: Any) -> Any:
     return lax.stop_gradient(x) if eqx.is_inexact_array(x) else x
 
 
-# Outside of a program its operations would be compiled one by one.
+# Without `jit` the operations of this function would be compiled one by one.
 @eqx.filter_jit
-def _faults(
+def _start_faults(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Whether the constraints are dependent at `y0`, and, unless they are, whether it is
     off them."""
     surface = Surface.of(terms, t0, y0, args)
-    (p, _), (q, _) = map(jfu.ravel_pytree, y0)
+    p0, q0 = y0
+    p, _ = jfu.ravel_pytree(p0)
+    q, _ = jfu.ravel_pytree(q0)
     at = surface.normal_space(q)
     is_dependent = surface.is_dependent(at)
     return is_dependent, ~is_dependent & surface.is_off(p, at)
@@ -76,19 +78,21 @@ def _faults(
 def _check_masses(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
 ) -> None:
-    """Raises a `ValueError` unless velocities are linear in the momenta."""
+    """Raises a `ValueError` unless velocities are linear in the momenta, which they are for
+    constant masses."""
     surface = Surface.of(terms, t0, y0, args)
     p0, _ = y0
     flat_p0, _ = jfu.ravel_pytree(p0)
 
-    # The change of the velocity by an impulse: the second derivative of H0 by p, times it.
+    # The change by an impulse is the second derivative of H0 by p, times the impulse.
     def change_of_velocity(p: Vector, impulse: Vector) -> Vector:
-        return jax.jvp(surface.velocity, (p,), (impulse,))[1]
+        _, change = jax.jvp(surface.velocity, (p,), (impulse,))
+        return change
 
-    # It may depend on the impulse, but not on the momentum: then the masses are constant.
-    # Only the shape of the second argument matters.
-    traced = Dependence(change_of_velocity, flat_p0, flat_p0)
-    if not traced.independent(lambda p, impulse: p):
+    # The change may depend on the impulse, but not on the momentum: then the masses are
+    # constant. Of the second argument only the shape matters, which is that of momenta.
+    dependence = Dependence(change_of_velocity, flat_p0, flat_p0)
+    if not dependence.independent(of=lambda p, impulse: p):
         raise ValueError(
             "Constrained terms need constant masses, H0 = p . M^-1 p / 2 + "
             "U(t, q), but the second derivative of H0 by p depends on p. Write squares of "
@@ -157,8 +161,8 @@ def constrained_state(
                 "`constrained_state` found no positions with `constraint(q, args) = 0` "
                 "from `y0`. Pass one that is closer to them."
             )
-    okay = found & ~is_dependent
-    return jtu.tree_map(lambda x: jnp.where(okay, x, jnp.nan), y1)
+    is_valid = found & ~is_dependent
+    return jtu.tree_map(lambda x: jnp.where(is_valid, x, jnp.nan), y1)
 
 
 @eqx.filter_jit
@@ -168,11 +172,16 @@ def _projection(
     """The nearest allowed state, whether Newton's method found it, and whether the
     constraints are dependent there."""
     surface = Surface.of(terms, t, y0, args)
-    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
-    # Without a momentum, all of the way is that of the multipliers.
-    _, q, found = surface.free_flight(jnp.zeros_like(p), surface.normal_space(q), 1.0)
+    p0, q0 = y0
+    p, unravel_p = jfu.ravel_pytree(p0)
+    q, unravel_q = jfu.ravel_pytree(q0)
+    # In a flight without momentum only the multipliers move the positions.
+    no_momentum = jnp.zeros_like(p)
+    at_y0 = surface.normal_space(q)
+    _, q, found = surface.free_flight(no_momentum, at_y0, time=1.0)
     at = surface.normal_space(q)
-    # Twice, so that the rest of a momentum that was normal is tangent, too.
+    # The second projection removes the rounding errors of the first, which matter if the
+    # momentum was nearly normal.
     p = surface.tangent(surface.tangent(p, at), at)
     y1 = (unravel_p(p), unravel_q(q))
     return y1, found, surface.is_dependent(at)

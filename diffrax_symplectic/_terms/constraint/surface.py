@@ -17,7 +17,7 @@ from ..._arguments import is_real_number
 from ..._custom_types import Args, RealScalarLike
 from ..._root_finder import max_norm, solve_matrix
 from ..constrained_drift import Constraint, constraint_of, without_constraint
-from ..evaluation import evaluated
+from ..evaluation import call_user_function
 from ..langevin import split_friction
 from ..vector_fields import rate
 from .multipliers import (
@@ -72,30 +72,32 @@ class Surface(NamedTuple):
         _, unravel = jfu.ravel_pytree(q0)
 
         def residual(q: Vector) -> Multipliers:
-            return _values(constraint, unravel(q), args)
+            return _checked_values(constraint, unravel(q), args)
 
         def velocity(p: Vector) -> Vector:
-            # For separable H0, at any position.
+            # H0 is separable, so any position gives the same velocity.
             _, dq = rate(drift, t, (unravel(p), q0), args)
-            return jfu.ravel_pytree(dq)[0]
+            flat, _ = jfu.ravel_pytree(dq)
+            return flat
 
         return Surface(residual, velocity)
 
     def normal_space(self, q: Vector) -> NormalSpace:
         """The directions normal to the surface at this position."""
         normals = jax.jacrev(self.residual)(q)
-        along = self._pushed(normals)
+        along = self._velocity_changes(normals)
         return NormalSpace(q, normals, along, products(normals, along))
 
-    def _pushed(self, impulses: Float[Array, "c n"]) -> Float[Array, "c n"]:
-        """The change of the velocity by each of these changes of the momentum."""
+    def _velocity_changes(self, impulses: Float[Array, "c n"]) -> Float[Array, "c n"]:
+        """The change of the velocity by each of these impulses, changes of the momentum."""
         # The velocity is linear, so its derivative is the same at every momentum.
         zero = jnp.zeros_like(impulses[0])
 
-        def change(impulse: Vector) -> Vector:
-            return jax.jvp(self.velocity, (zero,), (impulse,))[1]
+        def velocity_change(impulse: Vector) -> Vector:
+            _, change = jax.jvp(self.velocity, (zero,), (impulse,))
+            return change
 
-        return jax.vmap(change)(impulses)
+        return jax.vmap(velocity_change)(impulses)
 
     def tangent(
         self,
@@ -103,15 +105,15 @@ class Surface(NamedTuple):
         at: NormalSpace,
         response: Callable[[Vector], Vector] | None = None,
     ) -> Vector:
-        """The momentum after the impulses of the constraint forces that make it tangent.
-        An impulse changes the momentum by itself, or by its `response`."""
+        """The tangent momentum: `p` after those impulses of the constraint forces that make
+        it tangent. An impulse changes the momentum by itself, or by its `response`."""
         if response is None:
             gram = at.gram
             changes = at.normals
         else:
             changes = jax.vmap(response)(at.normals)
-            gram = products(at.normals, self._pushed(changes))
-        # How fast the momentum would leave the surface.
+            gram = products(at.normals, self._velocity_changes(changes))
+        # J v, the speeds at which the momentum `p` would leave the surface.
         speeds = products(at.normals, self.velocity(p)[None])[:, 0]
         return p - weighted_sum(solve_matrix(gram, speeds), changes)
 
@@ -131,31 +133,34 @@ class Surface(NamedTuple):
         the difference. Nothing is solved for, nor found, if not `pending`.
         """
         time = jnp.asarray(time, p.dtype)
-        free = at.q + time * self.velocity(p)
-        rounding = _rounding(at, free)
+        # The position without constraint forces.
+        unconstrained_q = at.q + time * self.velocity(p)
+        rounding = _rounding(at, unconstrained_q)
 
         # The unknowns are `time * lambda`, so that `time` may be small.
-        def moved(x: Multipliers) -> Vector:
-            return free - weighted_sum(x, at.along)
+        def position(x: Multipliers) -> Vector:
+            return unconstrained_q - weighted_sum(x, at.along)
 
         def residual(x: Multipliers) -> Multipliers:
-            return self.residual(moved(x))
+            return self.residual(position(x))
 
         def solve(residual: Callable, start: Multipliers) -> tuple[Multipliers, Array]:
             x, found = find_multipliers(
                 residual, at.gram, rounding, start, jnp.asarray(pending)
             )
-            # As a float: `custom_root` gives other types a tangent of a wrong type.
+            # The flag becomes a float: `custom_root` gives other types a tangent of a wrong
+            # type.
             return x, found.astype(x.dtype)
 
         # Derivatives come from the equations, and not through the loop that solves them.
         start = jnp.zeros(len(at.gram), p.dtype)
         x, found = lax.custom_root(residual, start, solve, solve_tangent, has_aux=True)
-        return p - weighted_sum(x / time, at.normals), moved(x), found > 0
+        return p - weighted_sum(x / time, at.normals), position(x), found > 0
 
     def is_dependent(self, at: NormalSpace) -> Bool[Array, ""]:
         """Whether the normals are linearly dependent, up to rounding errors."""
-        # In a solve backward in time velocities change their sign.
+        # In a solve backward in time velocities, and with them the matrix, change their
+        # sign.
         gram = at.gram * jnp.sign(jnp.trace(at.gram))
         size = jnp.sqrt(jnp.diag(gram))
         # A pivot is the squared sine of the angle between a normal and the ones before it.
@@ -165,37 +170,44 @@ class Surface(NamedTuple):
 
     def is_off(self, p: Vector, at: NormalSpace) -> Bool[Array, ""]:
         """Whether a state is farther from the surface than rounding errors explain."""
-        # Between rounding errors, also of long sums, and any mistake of the user's.
+        # This bound lies between rounding errors, also of long sums, and any mistake of the
+        # user's.
         eps = float(jnp.finfo(p.dtype).eps)
-        near = eps ** (2 / 3)
+        bound = eps ** (2 / 3)
         # A constraint rounds as its positions do, or, where these are near the origin, as
         # numbers of the size of its radius of curvature do: to show that radius, gradients
         # are differentiated along a direction that no symmetry singles out.
         along = jnp.cos(1.0 + jnp.arange(len(at.q), dtype=p.dtype))
-        _, turned = jax.jvp(jax.jacrev(self.residual), (at.q,), (along,))
-        bend = jnp.sum(jnp.abs(turned), axis=1)
-        curved = jnp.sum(at.normals**2, axis=1) / jnp.where(bend > 0, bend, jnp.inf)
-        size = jnp.maximum(_rounding(at, at.q) / eps, curved)
-        position_is_on = jnp.all(jnp.abs(self.residual(at.q)) <= near * size)
+        _, changes = jax.jvp(jax.jacrev(self.residual), (at.q,), (along,))
+        # (constraints, positions), summed over the positions.
+        curvature = jnp.sum(jnp.abs(changes), axis=1)
+        squares = jnp.sum(at.normals**2, axis=1)
+        # The gradient times the radius of curvature.
+        by_radius = squares / jnp.where(curvature > 0, curvature, jnp.inf)
+        size = jnp.maximum(_rounding(at, at.q) / eps, by_radius)
+        position_is_on = jnp.all(jnp.abs(self.residual(at.q)) <= bound * size)
         normal_part = p - self.tangent(p, at)
-        momentum_is_tangent = max_norm(normal_part) <= near * max_norm(p)
+        momentum_is_tangent = max_norm(normal_part) <= bound * max_norm(p)
         return ~(position_is_on & momentum_is_tangent)
 
 
 def _rounding(at: NormalSpace, q: Vector) -> Multipliers:
-    """By how much one unit in the last place of each position changes the constraints."""
+    """The change of each constraint by one unit in the last place of each position `q`."""
     info = jnp.finfo(q.dtype)
-    ulps = float(info.eps) * jnp.abs(q)
-    # Never zero, since it is a divisor.
-    return products(jnp.abs(at.normals), ulps[None])[:, 0] + float(info.tiny)
+    last_places = float(info.eps) * jnp.abs(q)
+    changes = products(jnp.abs(at.normals), last_places[None])[:, 0]
+    # The result is a divisor, so it must not be zero.
+    return changes + float(info.tiny)
 
 
-def _values(constraint: Constraint, q: PyTree, args: Args) -> Float[Array, " c"]:
+def _checked_values(
+    constraint: Constraint, q: PyTree, args: Args
+) -> Float[Array, " c"]:
     """The values of the constraints. Raises a `ValueError` unless they are a real array of
     shape `(c,)`."""
-    value = evaluated("constraint", constraint, q, args=args)
+    value = call_user_function("constraint", constraint, q, args=args)
     if not is_real_number(value) or jnp.ndim(value) != 1 or jnp.size(value) == 0:
-        # With the dtype, such as `f32[2]`: that alone may be what is wrong.
+        # This names the dtype, too, as in `f32[2]`: it alone may be wrong.
         got = eqx.tree_pformat(value, struct_as_array=True)
         raise ValueError(
             "`constraint(q, args)` must return a real array of shape `(c,)`, one number "

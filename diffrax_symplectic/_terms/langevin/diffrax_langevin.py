@@ -1,6 +1,8 @@
 """Diffrax's own terms for Langevin dynamics, with the velocity in the place of the
 momentum."""
 
+import functools as ft
+
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,11 +13,12 @@ from ..._arguments import check_pair
 from ..._compat import replaced, unwrapped
 from ..._custom_types import Args, RealScalarLike
 from ..drift_and_noise import flattened
-from .friction import like, not_negative
+from .friction import in_precision_of, not_negative
 from .terms import AbstractFriction, DriftWithFriction
 
 
-_P = PyTree[Array]
+# A half of the state, velocities or positions.
+_Half = PyTree[Array]
 
 
 def momentum_first(
@@ -25,7 +28,7 @@ def momentum_first(
     the halves of their state `(x, v)` exchanged. Other terms and their states are returned
     as they are."""
     parts = flattened(terms)
-    if not any(map(_is_drift, parts)):
+    if not any(map(_is_langevin_drift, parts)):
         return terms, y
     check_pair(y)
     x, v = y
@@ -33,21 +36,21 @@ def momentum_first(
     return diffrax.MultiTerm(*exchanged), (v, x)
 
 
-def _is_drift(term: diffrax.AbstractTerm) -> bool:
+def _is_langevin_drift(term: diffrax.AbstractTerm) -> bool:
     return isinstance(unwrapped(term), diffrax.UnderdampedLangevinDriftTerm)
 
 
 def _exchanged(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
-    """A term of the state `(x, v)` as one of `(v, x)`, and with friction apart if it is
-    Diffrax's Langevin term."""
+    """A term of the state `(x, v)` as one of `(v, x)`. If it is Diffrax's Langevin drift,
+    its friction is made a part that solvers for heat baths find."""
     if isinstance(term, diffrax.UnderdampedLangevinDriftTerm):
-        # Its `gamma` acts on velocities of mass one, as the friction here does.
+        # The `gamma` of Diffrax acts on velocities of mass one, as the friction here does.
         friction = _PrefixFriction(term.gamma)
         return diffrax.ODETerm(DriftWithFriction(_Frictionless(term), friction))
     if isinstance(term, diffrax.ODETerm):
         return diffrax.ODETerm(_ExchangedField(term))
-    # A noise term.
-    return _Exchanged(term)
+    # All other terms are noise.
+    return _ExchangedNoise(term)
 
 
 class _Frictionless(eqx.Module):
@@ -55,9 +58,9 @@ class _Frictionless(eqx.Module):
 
     term: diffrax.UnderdampedLangevinDriftTerm
 
-    def __call__(self, t: RealScalarLike, y: tuple[_P, _P], args: Args):
+    def __call__(self, t: RealScalarLike, y: tuple[_Half, _Half], args: Args):
         v, x = y
-        # Without velocity there is no friction, so that the forces are left.
+        # Without velocity there is no friction, so only the forces are left.
         no_velocity = jtu.tree_map(jnp.zeros_like, v)
         _, dv = self.term.vf(t, (x, no_velocity), args)
         return dv, v
@@ -77,13 +80,14 @@ class _PrefixFriction(AbstractFriction):
     def force(self, t, q, args, velocity):
         del t, q, args
 
-        def force_on(v: Array, gamma: ArrayLike) -> Array:
-            return -not_negative(like(gamma, v)) * v
+        def force_on_array(gamma: ArrayLike, v: Array) -> Array:
+            return -not_negative(in_precision_of(gamma, v)) * v
 
-        def forces_on(gamma: ArrayLike, v: _P) -> _P:
-            return jtu.tree_map(lambda leaf: force_on(leaf, gamma), v)
+        def force_on_subtree(gamma: ArrayLike, v: _Half) -> _Half:
+            return jtu.tree_map(ft.partial(force_on_array, gamma), v)
 
-        return jtu.tree_map(forces_on, self.gamma, velocity)
+        # One leaf of `gamma` may be that of several arrays of velocities.
+        return jtu.tree_map(force_on_subtree, self.gamma, velocity)
 
 
 class _ExchangedField(eqx.Module):
@@ -91,13 +95,13 @@ class _ExchangedField(eqx.Module):
 
     term: diffrax.ODETerm
 
-    def __call__(self, t: RealScalarLike, y: tuple[_P, _P], args: Args):
+    def __call__(self, t: RealScalarLike, y: tuple[_Half, _Half], args: Args):
         v, x = y
         dx, dv = self.term.vf(t, (x, v), args)
         return dv, dx
 
 
-class _Exchanged(diffrax.AbstractTerm):
+class _ExchangedNoise(diffrax.AbstractTerm):
     """A noise term of the state `(x, v)`, as one of `(v, x)`."""
 
     term: diffrax.AbstractTerm

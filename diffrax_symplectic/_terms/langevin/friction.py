@@ -15,12 +15,15 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 from ..._arguments import check_takes, real_array, shapes
 from ..._compat import is_traced
 from ..._custom_types import Args, BM, RealScalarLike
-from ..evaluation import evaluated
+from ..evaluation import call_user_function
 
 
-_P = PyTree[Array]
+# Momenta, velocities or positions: one array, or a PyTree of arrays.
+_Momenta = PyTree[Array]
 # A friction or a temperature, constant or a function.
-Value = PyTree[ArrayLike] | Callable[[RealScalarLike, _P, Args], PyTree[ArrayLike]]
+Value = (
+    PyTree[ArrayLike] | Callable[[RealScalarLike, _Momenta, Args], PyTree[ArrayLike]]
+)
 
 _KIND = "a real number, an array or PyTree of them, or a function of `(t, q, args)`"
 
@@ -59,56 +62,64 @@ class _MatrixOrNumbers(eqx.Module):
     root: Array
 
 
-def value_at(name: str, value: Any, t, q: _P, args: Args) -> PyTree:
-    """A constant, or the value of a function."""
-    return evaluated(name, value, t, q, args=args) if callable(value) else value
+def value_at(name: str, value: Any, t, q: _Momenta, args: Args) -> PyTree:
+    """The user's friction, temperature or directions, called `name` in messages: a
+    constant, or the value of a function."""
+    return (
+        call_user_function(name, value, t, q, args=args) if callable(value) else value
+    )
 
 
-def product_with(friction: Any, t, q: _P, args: Args, velocity: _P) -> _P:
+def product_with(
+    friction: Any, t, q: _Momenta, args: Args, velocity: _Momenta
+) -> _Momenta:
     """`G v`."""
     if isinstance(friction, FrictionAlong):
-        # The speed along each direction first: a matrix would cost more.
-        columns = _columns(friction, t, q, args)
-        speeds = jtu.tree_leaves(jtu.tree_map(_speeds_along, columns, velocity))
-        return jtu.tree_map(lambda d: d @ sum(speeds), columns)
-    value = _for_each("friction", value_at("friction", friction, t, q, args), q)
-    return jtu.tree_map(_product, value, velocity, is_leaf=_is_matrix_or_numbers)
+        # Products with the directions cost less than one with a matrix. Each array of
+        # momenta adds its part to the speeds along the directions.
+        columns = _checked_columns(friction, t, q, args)
+        parts = jtu.tree_leaves(jtu.tree_map(_speeds_along, columns, velocity))
+        return jtu.tree_map(lambda directions: directions @ sum(parts), columns)
+    value = _value_for_each("friction", value_at("friction", friction, t, q, args), q)
+    return jtu.tree_map(_product, value, velocity, is_leaf=_may_be_matrix)
 
 
 def _speeds_along(directions: Array, v: Array) -> Array:
-    """The scalar product of each direction, along the last axis, with the velocity."""
-    return jnp.tensordot(v, directions, jnp.ndim(v))
+    """The scalar product of each direction with the velocity; the last axis of `directions`
+    numbers them."""
+    return jnp.tensordot(v, directions, axes=jnp.ndim(v))
 
 
-def _product(g: Any, v: Array) -> Array:
+def _product(friction: Any, v: Array) -> Array:
     """`G v` for the velocities of one array."""
-    value = g.value if isinstance(g, _MatrixOrNumbers) else g
+    value = friction.value if isinstance(friction, _MatrixOrNumbers) else friction
     if not _is_matrix(value, jnp.shape(v)):
-        return not_negative(like(value, v)) * v
-    force = jnp.tensordot(like(value, v), v, jnp.ndim(v))
-    if not isinstance(g, _MatrixOrNumbers):
+        return not_negative(in_precision_of(value, v)) * v
+    force = jnp.tensordot(in_precision_of(value, v), v, axes=jnp.ndim(v))
+    if not isinstance(friction, _MatrixOrNumbers):
         # Whether the value of a function is semidefinite is seen when its root is taken.
         return force
-    return jnp.where(g.is_semidefinite, force, jnp.nan)
+    return jnp.where(friction.is_semidefinite, force, jnp.nan)
 
 
 def root_product_with(
-    friction: Any, T: PyTree, t, q: _P, args: Args, control: BM
-) -> _P:
-    """`B W`, with `B B^T = 2 T G`."""
+    friction: Any, T: PyTree, t, q: _Momenta, args: Args, control: BM
+) -> _Momenta:
+    """`B W` for the increments `W = control`, with `B B^T = 2 T G`. Raises a `ValueError`
+    if their shapes do not fit the friction or the momenta."""
     if isinstance(friction, FrictionAlong):
-        columns = _columns(friction, t, q, args)
-        return _noise_along(columns, _single_temperature(T), control)
+        columns = _checked_columns(friction, t, q, args)
+        return _noise_along(columns, _checked_single_temperature(T), control)
     same_structure = jtu.tree_structure(control) == jtu.tree_structure(q)
     if not same_structure or _shapes_of(control) != _shapes_of(q):
         raise ValueError(
             f"The `path` of `langevin_terms` must have the shape of `q`, {shapes(q)}; got "
             f"shape {shapes(control)}."
         )
-    value = _for_each("friction", value_at("friction", friction, t, q, args), q)
-    heat = _for_each("temperature", T, q)
+    value = _value_for_each("friction", value_at("friction", friction, t, q, args), q)
+    temperature = _value_for_each("temperature", T, q)
     return jtu.tree_map(
-        _noise_of, value, heat, control, q, is_leaf=_is_matrix_or_numbers
+        _noise_of, value, temperature, control, q, is_leaf=_may_be_matrix
     )
 
 
@@ -116,16 +127,19 @@ def _shapes_of(tree: PyTree) -> list[tuple[int, ...]]:
     return [jnp.shape(leaf) for leaf in jtu.tree_leaves(tree)]
 
 
-def _noise_of(g: Any, T: ArrayLike, w: Array, x: Array) -> Array:
-    """The noise `w` of the momenta of one array, in the shape of `x`."""
-    w = like(w, x)
-    matrix = g.value if isinstance(g, _MatrixOrNumbers) else g
-    if _is_matrix(matrix, jnp.shape(x)):
-        scale = _root(2 * like(_single_temperature(T), x))
-        root = (
-            g.root if isinstance(g, _MatrixOrNumbers) else semidefinite_root(like(g, x))
-        )
-        return scale * jnp.tensordot(like(root, x), w, jnp.ndim(w))
+def _noise_of(friction: Any, T: ArrayLike, w: Array, x: Array) -> Array:
+    """`B W` for the momenta of one array, in the shape of the positions `x`, with their
+    friction, temperature and increments `w`."""
+    w = in_precision_of(w, x)
+    has_root = isinstance(friction, _MatrixOrNumbers)
+    value = friction.value if has_root else friction
+    if _is_matrix(value, jnp.shape(x)):
+        scale = _root(2 * in_precision_of(_checked_single_temperature(T), x))
+        if has_root:
+            root = friction.root
+        else:
+            root = semidefinite_root(in_precision_of(value, x))
+        return scale * jnp.tensordot(in_precision_of(root, x), w, axes=jnp.ndim(w))
     if jnp.shape(T) not in ((), jnp.shape(x)):
         raise ValueError(
             "An array of `temperature` must be a scalar, or have the shape of its momenta, "
@@ -133,117 +147,123 @@ def _noise_of(g: Any, T: ArrayLike, w: Array, x: Array) -> Array:
             f"{_broadcast_advice('temperature', jnp.shape(T), jnp.shape(x))}"
         )
     # Where either is negative, NaN makes the path fail.
-    return _root(like(matrix, x)) * _root(2 * like(T, x)) * w
+    return _root(in_precision_of(value, x)) * _root(2 * in_precision_of(T, x)) * w
 
 
-def _noise_along(columns: _P, T: ArrayLike, control: BM) -> _P:
-    """The noise with one increment for each direction: no root is taken."""
+def _noise_along(columns: _Momenta, T: ArrayLike, control: BM) -> _Momenta:
+    """`sqrt(2 T) sum_k d_k W_k`, with one increment for each direction. Raises a
+    `ValueError` if the path has another number of noises."""
     flat, _ = jfu.ravel_pytree(control)
-    number = jnp.shape(jtu.tree_leaves(columns)[0])[-1:]
-    if number != flat.shape:
+    # The shape `(m,)` for `m` directions, which all arrays share.
+    noise_shape = jnp.shape(jtu.tree_leaves(columns)[0])[-1:]
+    if noise_shape != flat.shape:
         raise ValueError(
             "The `path` of `langevin_terms` must have one noise for each direction of the "
-            f"friction, shape {number}; got shape {shapes(control)}."
+            f"friction, shape {noise_shape}; got shape {shapes(control)}."
         )
 
     def kick(directions: Array) -> Array:
-        scale = _root(2 * like(T, directions))
-        return directions @ (scale * like(flat, directions))
+        scale = _root(2 * in_precision_of(T, directions))
+        return directions @ (scale * in_precision_of(flat, directions))
 
     return jtu.tree_map(kick, columns)
 
 
-def _columns(friction: FrictionAlong, t, q: _P, args: Args) -> _P:
-    """The directions for each array of the momenta, with a trailing axis of noises."""
+def _checked_columns(friction: FrictionAlong, t, q: _Momenta, args: Args) -> _Momenta:
+    """The directions for each array of the momenta, with a trailing axis of noises. Raises
+    a `ValueError` if their shapes do not fit the momenta."""
     columns = value_at("directions", friction.directions, t, q, args)
-    columns = _for_each("directions", columns, q)
-    given = _shapes_of(columns)
+    columns = _value_for_each("directions", columns, q)
+    column_shapes = _shapes_of(columns)
     # All arrays have the same directions, so their last axes agree.
-    one_number = len({shape[-1:] for shape in given}) == 1
-    fit = [
-        len(shape) > 0 and shape[:-1] == momenta
-        for shape, momenta in zip(given, _shapes_of(q))
-    ]
-    if not one_number or not all(fit):
+    has_one_number = len({shape[-1:] for shape in column_shapes}) == 1
+    pairs = zip(column_shapes, _shapes_of(q))
+    fits_momenta = all(
+        len(shape) > 0 and shape[:-1] == momenta_shape for shape, momenta_shape in pairs
+    )
+    if not has_one_number or not fits_momenta:
         raise ValueError(
             "`directions` of `FrictionAlong` must have the shape of the momenta and one "
             f"more axis, for the noises; got shape {shapes(columns)} for momenta of shape "
             f"{shapes(q)}."
         )
-    return jtu.tree_map(like, columns, q)
+    return jtu.tree_map(in_precision_of, columns, q)
 
 
-def _is_matrix(g: ArrayLike, momenta: tuple[int, ...]) -> bool:
+def _is_matrix(value: ArrayLike, momenta_shape: tuple[int, ...]) -> bool:
     """Whether this is a matrix for momenta of this shape, and not a number or an array of
     them. Raises a `ValueError` if it is neither."""
-    if jnp.shape(g) in ((), momenta):
+    if jnp.shape(value) in ((), momenta_shape):
         return False
-    if jnp.shape(g) != momenta * 2:
+    if jnp.shape(value) != momenta_shape * 2:
         raise ValueError(
             "An array of `friction` must be a scalar, or have the shape of its momenta, "
-            f"{momenta}, or as a matrix the shape {momenta * 2}; got shape {jnp.shape(g)}."
-            f"{_broadcast_advice('friction', jnp.shape(g), momenta)}"
+            f"{momenta_shape}, or as a matrix the shape {momenta_shape * 2}; got shape "
+            f"{jnp.shape(value)}."
+            f"{_broadcast_advice('friction', jnp.shape(value), momenta_shape)}"
         )
     return True
 
 
 def _broadcast_advice(
-    name: str, shape: tuple[int, ...], momenta: tuple[int, ...]
+    name: str, shape: tuple[int, ...], momenta_shape: tuple[int, ...]
 ) -> str:
     """What to pass instead of an array of this shape if NumPy would broadcast it, which is
     not done here: the shape of a matrix and that of momenta could not be told apart."""
-    if not _broadcasts(shape, momenta):
+    if not _broadcasts(shape, momenta_shape):
         return ""
-    return f" To repeat it along an axis, pass `{name} * jnp.ones({momenta})`."
+    return f" To repeat it along an axis, pass `{name} * jnp.ones({momenta_shape})`."
 
 
-def _broadcasts(shape: tuple[int, ...], momenta: tuple[int, ...]) -> bool:
+def _broadcasts(shape: tuple[int, ...], momenta_shape: tuple[int, ...]) -> bool:
     """Whether NumPy would repeat an array of this shape to that of the momenta."""
     try:
-        return np.broadcast_shapes(shape, momenta) == momenta
+        return np.broadcast_shapes(shape, momenta_shape) == momenta_shape
     except ValueError:
         return False
 
 
-def _check_fits_path(g: ArrayLike, path: tuple[int, ...]) -> None:
+def _check_fits_path(friction: ArrayLike, path_shape: tuple[int, ...]) -> None:
     """Raises a `ValueError` if an array of friction and a path of this shape belong to
     momenta of different shapes. Before the solve it is not known which of them is wrong."""
-    shape = jnp.shape(g)
-    # Where broadcasting was meant, the path is right.
-    if shape in ((), path, path * 2) or _broadcasts(shape, path):
+    shape = jnp.shape(friction)
+    # An array that NumPy would broadcast is wrong by itself, and the path is right.
+    if shape in ((), path_shape, path_shape * 2) or _broadcasts(shape, path_shape):
         return
-    half = len(shape) // 2
-    momenta = shape[:half] if shape == shape[:half] * 2 else shape
+    # A matrix has the shape of its momenta twice.
+    half = shape[: len(shape) // 2]
+    momenta_shape = half if shape == half * 2 else shape
     raise ValueError(
         "`friction` and the `path` of `langevin_terms` must be those of the same momenta; "
-        f"got friction of shape {shape} and a path of shape {path}. For momenta of shape "
-        f"{momenta} pass a path of shape {momenta}, one noise for each momentum. For "
-        f"momenta of shape {path} pass friction of that shape, or a matrix of shape "
-        f"{path * 2}."
+        f"got friction of shape {shape} and a path of shape {path_shape}. For momenta of "
+        f"shape {momenta_shape} pass a path of shape {momenta_shape}, one noise for each "
+        f"momentum. For momenta of shape {path_shape} pass friction of that shape, or a "
+        f"matrix of shape {path_shape * 2}."
     )
 
 
-def _for_each(name: str, value: PyTree, p: _P) -> PyTree:
-    """`value` in the structure of the momenta: one that is given once is that of each."""
-    if jtu.all_leaves([value], is_leaf=_is_matrix_or_numbers):
+def _value_for_each(name: str, value: PyTree, p: _Momenta) -> PyTree:
+    """The user's argument `name`, a value for each array of momenta, in the structure of
+    the momenta `p`: a single value is that of each array. Raises a `ValueError` if it has
+    another structure."""
+    if jtu.all_leaves([value], is_leaf=_may_be_matrix):
         return jtu.tree_map(lambda _: value, p)
-    if jtu.tree_structure(value, is_leaf=_is_matrix_or_numbers) != jtu.tree_structure(
-        p
-    ):
-        is_list = isinstance(value, list | tuple)
-        instead = (
-            f" For an array pass `jnp.array({name})`, not a list." if is_list else ""
-        )
+    if jtu.tree_structure(value, is_leaf=_may_be_matrix) != jtu.tree_structure(p):
+        # The momenta may be given by their shapes.
+        momenta = eqx.tree_pformat(p, struct_as_array=True)
+        advice = ""
+        if isinstance(value, list | tuple):
+            advice = f" For an array pass `jnp.array({name})`, not a list."
         raise ValueError(
             f"`{name}` must be one number or array, or have the structure of the momenta "
-            f"{eqx.tree_pformat(p)}; got {eqx.tree_pformat(value)}.{instead}"
+            f"{momenta}; got {eqx.tree_pformat(value)}.{advice}"
         )
     return value
 
 
-def _single_temperature(T: PyTree) -> ArrayLike:
-    """Raises a `ValueError` unless this is one number. (With several, friction that mixes
-    momenta has no stationary density that is known.)"""
+def _checked_single_temperature(T: PyTree) -> ArrayLike:
+    """The temperature. Raises a `ValueError` unless it is one number. (With several,
+    friction that mixes momenta has no stationary density that is known.)"""
     if not jtu.all_leaves([T]) or jnp.shape(T) != ():
         raise ValueError(
             "`temperature` must be one number for friction by a matrix or along "
@@ -252,10 +272,10 @@ def _single_temperature(T: PyTree) -> ArrayLike:
     return T
 
 
-def not_negative(g: Array) -> Array:
-    """`g`, or NaN where it is negative."""
+def not_negative(friction: Array) -> Array:
+    """The friction, or NaN where it is negative."""
     # Traced values cannot raise an error; NaN makes their path fail.
-    return jnp.where(g >= 0, g, jnp.nan)
+    return jnp.where(friction >= 0, friction, jnp.nan)
 
 
 def _root(x: Array) -> Array:
@@ -267,22 +287,24 @@ def _root(x: Array) -> Array:
     """
     positive = x > 0
     root = jnp.sqrt(jnp.where(positive, x, 1))
-    # Zero itself, and not a part of `x`, which would hand its derivative on.
+    # At zero the result is a constant, and not `x`, which would hand its derivative on.
     return jnp.where(positive, root, jnp.where(x == 0, 0.0, jnp.nan).astype(x.dtype))
 
 
-def like(x: ArrayLike, y: Array) -> Array:
-    """`x` in the precision of `y`."""
-    return jnp.asarray(x, jnp.result_type(y))
+def in_precision_of(x: ArrayLike, other: Array) -> Array:
+    """`x` in the precision of `other`."""
+    return jnp.asarray(x, jnp.result_type(other))
 
 
-def _is_matrix_or_numbers(x: Any) -> bool:
+def _may_be_matrix(x: Any) -> bool:
     return isinstance(x, _MatrixOrNumbers)
 
 
-def checked_friction(friction: Any, struct: PyTree | None) -> Any:
-    """The friction with the roots of constant matrices, for a path of this shape, if there
-    is one. Raises a `ValueError` if it is known to be invalid."""
+def checked_friction(
+    friction: Any, path_struct: PyTree[jax.ShapeDtypeStruct] | None
+) -> Any:
+    """The friction with the roots of constant matrices, for a path with increments like
+    `path_struct`, or without a path. Raises a `ValueError` if it is known to be invalid."""
     if isinstance(friction, FrictionAlong):
         if callable(friction.directions):
             check_takes("directions", friction.directions, "t", "q", "args")
@@ -295,14 +317,21 @@ def checked_friction(friction: Any, struct: PyTree | None) -> Any:
             "`friction` must be a number, an array, a PyTree of arrays, a `FrictionAlong`, "
             f"or a function `(t, q, args)`; got {friction!r}."
         )
-    if jtu.all_leaves([friction]) or struct is None:
-        # One for all momenta, whose shape is known if all have the same.
-        known = {leaf.shape for leaf in jtu.tree_leaves(struct)}
-        shape = known.pop() if len(known) == 1 else None
-        return jtu.tree_map(lambda g: _checked_array(g, shape), friction)
-    momenta = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape), struct)
-    each = _for_each("friction", friction, momenta)
-    return jtu.tree_map(lambda g, p: _checked_array(g, jnp.shape(p)), each, momenta)
+    if path_struct is None:
+        # The shapes of the momenta are known in the solve only.
+        return jtu.tree_map(lambda value: _checked_array(value, None), friction)
+    if jtu.all_leaves([friction]):
+        # One friction for all arrays of momenta, whose shape is known if they share it.
+        path_shapes = {leaf.shape for leaf in jtu.tree_leaves(path_struct)}
+        momenta_shape = path_shapes.pop() if len(path_shapes) == 1 else None
+        return _checked_array(friction, momenta_shape)
+    # The path has the shapes of the momenta.
+    friction_of_each = _value_for_each("friction", friction, path_struct)
+    return jtu.tree_map(
+        lambda value, leaf: _checked_array(value, leaf.shape),
+        friction_of_each,
+        path_struct,
+    )
 
 
 def _as_array_or_function(x: Any) -> Any:
@@ -310,31 +339,33 @@ def _as_array_or_function(x: Any) -> Any:
 
 
 def _checked_array(
-    g: ArrayLike, momenta: tuple[int, ...] | None
+    friction: ArrayLike, momenta_shape: tuple[int, ...] | None
 ) -> Array | _MatrixOrNumbers:
-    """The friction of an array of momenta, of this shape if it is known, from that of the
-    path. Raises a `ValueError` if it is known to be invalid."""
-    shape = jnp.shape(g)
+    """The friction of an array of momenta, whose shape is that of their path, or `None` if
+    it is not known. Raises a `ValueError` if the friction is known to be invalid."""
+    shape = jnp.shape(friction)
     # A matrix has the shape of its momenta twice.
-    half = len(shape) // 2
-    may_be_matrix = half > 0 and shape == shape[:half] * 2
-    if momenta is not None:
-        _check_fits_path(g, momenta)
-    is_matrix = momenta is not None and _is_matrix(g, momenta)
+    half = shape[: len(shape) // 2]
+    may_be_matrix = len(half) > 0 and shape == half * 2
+    is_matrix = False
+    if momenta_shape is not None:
+        _check_fits_path(friction, momenta_shape)
+        is_matrix = _is_matrix(friction, momenta_shape)
     if not may_be_matrix:
-        return jnp.asarray(real_array("friction", g, kind=_KIND))
-    root = semidefinite_root(jnp.asarray(g, jnp.result_type(g, float)))
+        return jnp.asarray(real_array("friction", friction, kind=_KIND))
+    root = semidefinite_root(jnp.asarray(friction, jnp.result_type(friction, float)))
     is_semidefinite = ~jnp.any(jnp.isnan(root))
-    either = _MatrixOrNumbers(jnp.asarray(g), is_semidefinite, root)
+    matrix_or_numbers = _MatrixOrNumbers(jnp.asarray(friction), is_semidefinite, root)
     if is_traced(is_semidefinite):
-        return either
-    # Without the shape of the momenta it may be numbers that are valid as they are.
-    if not is_semidefinite and (is_matrix or not np.all(np.asarray(g) >= 0)):
+        return matrix_or_numbers
+    # Without the shape of the momenta the array may be valid as numbers.
+    may_be_numbers = not is_matrix and bool(np.all(np.asarray(friction) >= 0))
+    if not is_semidefinite and not may_be_numbers:
         raise ValueError(
             "`friction` must be a symmetric positive semidefinite matrix, or an array of "
-            f"numbers that are not negative, one for each momentum; got {g!r}."
+            f"numbers that are not negative, one for each momentum; got {friction!r}."
         )
-    return either
+    return matrix_or_numbers
 
 
 def checked_temperature(temperature: Any) -> Any:
@@ -349,7 +380,7 @@ def checked_temperature(temperature: Any) -> Any:
     return jtu.tree_map(checked, temperature)
 
 
-# Traced and compiled once for each shape.
+# With `jit` this function is traced and compiled once for each shape.
 @jax.jit
 def semidefinite_root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
     r"""$L$ with $L L^\top$ equal to a symmetric positive semidefinite matrix: its Cholesky
@@ -362,32 +393,35 @@ def semidefinite_root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
     square = matrix.reshape(n, n)
     eps = jnp.finfo(square.dtype).eps
     diagonal = jnp.diag(square)
-    # The error of a pivot, a difference of numbers up to the entry of the diagonal.
+    # The error of a pivot, which is a difference of numbers up to the diagonal entry.
     rounding = 10 * n * eps * diagonal
-    # No entry of what is left of a semidefinite matrix without its tiny pivots is larger.
+    # If the matrix is semidefinite, no entry that is left at the end, when only tiny pivots
+    # remain, is larger than this.
     size = jnp.sqrt(jnp.maximum(diagonal, 0))
-    most = 10 * (n * eps) ** 0.5 * size[:, None] * size
+    largest_left = 10 * (n * eps) ** 0.5 * size[:, None] * size
 
-    def column(j: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The next column of the root; what is left of the matrix without it."""
+    def with_column(j: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        """What is left of the matrix without column `j` of the root, the root with this
+        column, and whether the matrix may still be semidefinite."""
         left, root, is_valid = carry
         pivot = left[j, j]
-        used = pivot > rounding[j]
-        below = left[:, j] / jnp.sqrt(jnp.where(used, pivot, 1))
-        below = jnp.where(used & (jnp.arange(n) >= j), below, 0)
-        left = left - below[:, None] * below
+        is_used = pivot > rounding[j]
+        entries = left[:, j] / jnp.sqrt(jnp.where(is_used, pivot, 1))
+        entries = jnp.where(is_used & (jnp.arange(n) >= j), entries, 0)
+        left = left - entries[:, None] * entries
         is_valid = is_valid & (pivot >= -rounding[j])
-        return left, root.at[:, j].set(below), is_valid
+        return left, root.at[:, j].set(entries), is_valid
 
     is_valid = _is_symmetric(square) & jnp.all(jnp.isfinite(square))
     begin = (square, jnp.zeros_like(square), is_valid)
-    # Unrolled for all matrices that the fused engine solves with: it takes no column whose
-    # number is known only when it runs.
-    left, root, is_valid = jax.lax.fori_loop(0, n, column, begin, unroll=n <= 16)
-    is_valid = is_valid & jnp.all(jnp.abs(left) <= most)
+    # The loop is unrolled for all matrices that the fused engine solves with: the engine
+    # takes no column whose number is known only when it runs.
+    left, root, is_valid = jax.lax.fori_loop(0, n, with_column, begin, unroll=n <= 16)
+    is_valid = is_valid & jnp.all(jnp.abs(left) <= largest_left)
     return jnp.where(is_valid, root, jnp.nan).reshape(matrix.shape)
 
 
 def _is_symmetric(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
-    size = 100 * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
-    return jnp.max(jnp.abs(matrix - matrix.T)) <= size
+    """Whether a matrix is symmetric up to rounding errors."""
+    rounding = 100 * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
+    return jnp.max(jnp.abs(matrix - matrix.T)) <= rounding

@@ -13,12 +13,12 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from ..._arguments import check_pair, check_takes
-from ..._brownian import increment_struct, raveled, TruncatedBrownianPath
+from ..._brownian import increment_struct, TruncatedBrownianPath, zeros_and_unravel
 from ..._compat import replaced, ω
 from ..._custom_types import Args, BM, RealScalarLike, Terms
-from ..constrained_drift import constrained, Constraint
+from ..constrained_drift import Constraint, with_constraint
 from ..drift_and_noise import field_of, split_terms
-from ..evaluation import evaluated, scalar_energy
+from ..evaluation import call_user_function, checked_energy
 from ..hamiltonian import hamiltonian_terms
 from ..paths import as_path
 from ..symplectic_gradients import AbstractNoise
@@ -33,8 +33,9 @@ from .friction import (
 )
 
 
-_P = PyTree[Array]
-_Hamiltonian = Callable[[RealScalarLike, _P, _P, Args], PyTree[Array]]
+# Momenta, velocities or positions: one array, or a PyTree of arrays.
+_Momenta = PyTree[Array]
+_Hamiltonian = Callable[[RealScalarLike, _Momenta, _Momenta, Args], PyTree[Array]]
 
 
 def langevin_terms(
@@ -45,7 +46,7 @@ def langevin_terms(
     *,
     structure: Any = None,
     constraint: Constraint | None = None,
-    slow: Callable[[RealScalarLike, _P, Args], Array] | None = None,
+    slow: Callable[[RealScalarLike, _Momenta, Args], Array] | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of Langevin dynamics: a Hamiltonian system in a heat bath. Solve with
     [`diffrax_symplectic.BAOAB`][] unless masses depend on positions, then with
@@ -116,12 +117,11 @@ def langevin_terms(
     semidefinite; and, while the solve is traced, if their shapes do not fit. Paths fail
     where this is not known before.
     """
-    alone = hamiltonian_terms(H0, structure=structure, slow=slow)
-    hamiltonian = alone.terms[0].vector_field
-    hamiltonian = dataclasses.replace(hamiltonian, made_by="langevin_terms")
+    (frictionless,) = hamiltonian_terms(H0, structure=structure, slow=slow).terms
+    field = dataclasses.replace(frictionless.vector_field, made_by="langevin_terms")
     friction_term, *noise = bath_terms(H0, friction, temperature, path).terms
-    damped = DriftWithFriction(hamiltonian, friction_term.vector_field)
-    drift = constrained(diffrax.ODETerm(damped), constraint)
+    field_with_friction = DriftWithFriction(field, friction_term.vector_field)
+    drift = with_constraint(diffrax.ODETerm(field_with_friction), constraint)
     return diffrax.MultiTerm(drift, *noise)
 
 
@@ -149,15 +149,14 @@ def bath_terms(
             "without noise neither of them."
         )
     if path is None:
-        # The shape of the momenta is known in the solve only.
-        field = Friction(H0, checked_friction(friction, None))
+        field = Friction(H0, checked_friction(friction, path_struct=None))
         return diffrax.MultiTerm(diffrax.ODETerm(field))
     path = as_path(path)
     if isinstance(path, TruncatedBrownianPath):
-        # As `solver.path` makes it, which does not know the terms. It would cool the bath.
+        # `solver.path` truncates without knowing the terms. Here it would cool the bath.
         path = path.path
     field = Friction(H0, checked_friction(friction, increment_struct(path)))
-    # The same friction in both, so that they cannot get out of balance.
+    # Both terms hold the same friction, so that they cannot get out of balance.
     noise = BathNoise(field.friction, checked_temperature(temperature), path)
     return diffrax.MultiTerm(diffrax.ODETerm(field), noise)
 
@@ -171,8 +170,8 @@ def split_friction(terms: PyTree[diffrax.AbstractTerm]) -> tuple[Terms, Terms, T
 
 def friction_apart(drift: Terms) -> tuple[Terms, Terms]:
     """The drift without friction, and the friction. A term may be a drift with friction, as
-    that of `langevin_terms`, which is taken apart; friction alone, as that of `bath_terms`;
-    or a drift without friction."""
+    from `langevin_terms`, which is taken apart; friction alone, as from `bath_terms`; or a
+    drift without friction."""
     rest = []
     friction = []
     for term in drift:
@@ -192,16 +191,20 @@ class AbstractFriction(eqx.Module):
     """A vector field `(-G v, 0)` with the velocities `v`."""
 
     @abc.abstractmethod
-    def velocity(self, t: RealScalarLike, y: tuple[_P, _P], args: Args) -> _P:
-        """The velocities `v`."""
+    def velocity(
+        self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args
+    ) -> _Momenta:
+        """The velocities `v` of the state `y = (p, q)`."""
 
     @abc.abstractmethod
-    def force(self, t: RealScalarLike, q: _P, args: Args, velocity: _P) -> _P:
-        """`-G v`."""
+    def force(
+        self, t: RealScalarLike, q: _Momenta, args: Args, velocity: _Momenta
+    ) -> _Momenta:
+        """`-G v` at the positions `q`, for `v = velocity`."""
 
     def __call__(
-        self, t: RealScalarLike, y: tuple[_P, _P], args: Args
-    ) -> tuple[_P, _P]:
+        self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args
+    ) -> tuple[_Momenta, _Momenta]:
         """`(-G v, 0)`."""
         check_pair(y)
         _, q = y
@@ -218,8 +221,8 @@ class Friction(AbstractFriction):
     def velocity(self, t, y, args):
         p, q = y
 
-        def energy(p: _P) -> Array:
-            return scalar_energy(evaluated("H0", self.H0, t, p, q, args=args))
+        def energy(p: _Momenta) -> Array:
+            return checked_energy(call_user_function("H0", self.H0, t, p, q, args=args))
 
         return jax.grad(energy)(p)
 
@@ -234,7 +237,7 @@ class DriftWithFriction(eqx.Module):
     drift: Callable
     friction: AbstractFriction
 
-    def __call__(self, t: RealScalarLike, y: tuple[_P, _P], args: Args):
+    def __call__(self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args):
         _, q = y
         dp, dq = self.drift(t, y, args)
         force = self.friction.force(t, q, args, dq)
@@ -248,18 +251,21 @@ class BathNoise(AbstractNoise):
     temperature: Value
     path: diffrax.AbstractBrownianPath
 
-    def vf(self, t: RealScalarLike, y: tuple[_P, _P], args: Args) -> PyTree[Array]:
-        # For each array of the state, with a trailing axis of noises.
-        flat, unravel = raveled(increment_struct(self.path))
+    def vf(
+        self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args
+    ) -> PyTree[Array]:
+        zeros, unravel = zeros_and_unravel(increment_struct(self.path))
 
-        def product(unit: Array) -> tuple[_P, _P]:
+        def product(unit: Array) -> tuple[_Momenta, _Momenta]:
             return self.vf_prod(t, y, args, unravel(unit))
 
-        return jax.vmap(product, out_axes=-1)(jnp.eye(flat.size, dtype=flat.dtype))
+        # (noises, noises) to (*shape, noises) for each array of the state.
+        units = jnp.eye(zeros.size, dtype=zeros.dtype)
+        return jax.vmap(product, out_axes=-1)(units)
 
     def vf_prod(
-        self, t: RealScalarLike, y: tuple[_P, _P], args: Args, control: BM
-    ) -> tuple[_P, _P]:
+        self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args, control: BM
+    ) -> tuple[_Momenta, _Momenta]:
         check_pair(y)
         _, q = y
         T = value_at("temperature", self.temperature, t, q, args)

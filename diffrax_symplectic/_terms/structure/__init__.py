@@ -15,6 +15,6 @@ from .checks import (
     check_structure,
 )
 from .checks import constant_fault, Fault, FRICTION, separable_fault
-from .commuting import commuting
+from .commuting import noises_commute
 from .said_twice import check_baths_have_own_noise, check_drifts_differ
-from .truncation import needs_truncation, without_truncation
+from .truncation import which_need_truncation, without_truncation

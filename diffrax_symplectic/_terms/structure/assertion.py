@@ -10,24 +10,26 @@ import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree
 
-from ..._brownian import raveled
+from ..._brownian import zeros_and_unravel
 from ..._compat import is_traced
 from ..._custom_types import Args, RealScalarLike, Y
 from ..drift_and_noise import control_struct
+from ..symplectic_gradients import AssertedStructure
 
 
-# Random directions of the state and of the control. A derivative that is not zero vanishes
-# along one of them with probability zero; the others are there for rounding errors.
-_DIRECTIONS = 4
-# How far from the start the terms are looked at once more, relative to the largest number
-# of the state: at an extremum a forbidden derivative is zero.
-_NEAR = 1e-3
+# The number of random directions of the state and of the control. Along one of them a
+# derivative that is not zero vanishes with probability zero; the others are there for
+# rounding errors.
+_NUM_DIRECTIONS = 4
+# The terms are looked at once more at this distance from the start, relative to the largest
+# number of the state: at an extremum a forbidden derivative is zero.
+_RELATIVE_DISTANCE = 1e-3
 
 
-def is_contradicted(
-    structure: str,
-    is_noise: bool,
+def contradicts_assertion(
     term: diffrax.AbstractTerm,
+    structure: AssertedStructure,
+    is_noise: bool,
     t0: RealScalarLike,
     y0: Y,
     args: Args,
@@ -35,26 +37,27 @@ def is_contradicted(
     """Whether derivatives of a term at the state `y0`, or near it, contradict its asserted
     structure.
 
-    What is found is a proof, since rounding errors are far smaller than what counts. The
-    converse does not hold: at other states the structure may be another. `False` if any
+    A contradiction is a proof, since rounding errors are far smaller than what counts. The
+    converse does not hold: the structure may be violated at other states. `False` if any
     value is traced, as in every program of a solve.
     """
     if any(map(is_traced, jtu.tree_leaves((term, t0, y0, args)))):
         return False
     t0 = jnp.asarray(t0, jnp.result_type(float))
     y0 = jtu.tree_map(jnp.asarray, y0)
-    # Not eagerly, operation by operation, where the user debugs under `jax.disable_jit()`.
+    # One program, also where the user debugs under `jax.disable_jit()`: operation by
+    # operation this would be slow.
     with jax.disable_jit(False):
-        found = _contradicts(structure, is_noise, term, t0, y0, args)
-    # Traced, if these values are constants of a program of the user's.
-    return not is_traced(found) and bool(found)
+        is_broken = _breaks_structure(term, structure, is_noise, t0, y0, args)
+    # Under `jax.jit` of the user's the result is traced, even for constants.
+    return not is_traced(is_broken) and bool(is_broken)
 
 
 @eqx.filter_jit
-def _contradicts(
-    structure: str,
-    is_noise: bool,
+def _breaks_structure(
     term: diffrax.AbstractTerm,
+    structure: AssertedStructure,
+    is_noise: bool,
     t0: Array,
     y0: Y,
     args: Args,
@@ -68,19 +71,19 @@ def _contradicts(
     - separable, of a noise: dq itself, and derivatives of dp by p;
     - separable, of a drift: derivatives of dp by p, and of dq by q and t.
     """
-    flat, unravel = raveled((y0, control_struct(term, t0)))
+    zeros, unravel = zeros_and_unravel((y0, control_struct(term, t0)))
     # A bound between rounding errors, also of long sums, and any real mistake. Times may
     # have more digits than the state, so the dtype of the state decides.
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).eps)
     rounding = eps ** (2 / 3)
 
     largest = largest_entry(y0)
-    distance = _NEAR * jnp.where(largest > 0, largest, 1)
+    distance = _RELATIVE_DISTANCE * jnp.where(largest > 0, largest, 1)
 
     def is_broken_along(direction: Array) -> Bool[Array, ""]:
         along, control = unravel(direction)
-        near = jtu.tree_map(lambda x, dx: x + distance * dx, y0, along)
-        return is_broken_at(y0, along, control) | is_broken_at(near, along, control)
+        nearby = jtu.tree_map(lambda x, dx: x + distance * dx, y0, along)
+        return is_broken_at(y0, along, control) | is_broken_at(nearby, along, control)
 
     def is_broken_at(y: Y, along: Y, control: PyTree[Array]) -> Bool[Array, ""]:
         along_p, along_q = along
@@ -109,11 +112,11 @@ def _contradicts(
         # Values that are not finite compare as false: they tell nothing.
         return largest_entry(forbidden) > rounding * largest_entry([of_p, of_q])
 
-    directions = jr.normal(jr.key(0), (_DIRECTIONS, flat.size), flat.dtype)
+    directions = jr.normal(jr.key(0), (_NUM_DIRECTIONS, zeros.size), zeros.dtype)
     return jnp.any(jax.vmap(is_broken_along)(directions))
 
 
 def largest_entry(tree: PyTree[Array]) -> Array:
-    """The largest entry of all arrays, without its sign."""
+    """The largest absolute value of an entry of any array."""
     flat, _ = jfu.ravel_pytree(tree)
     return jnp.max(jnp.abs(flat))

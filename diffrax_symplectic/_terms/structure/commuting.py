@@ -9,7 +9,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from ..._brownian import raveled
+from ..._brownian import zeros_and_unravel
 from ..._compat import is_traced, ω
 from ..._custom_types import Args, RealScalarLike, Terms, Y
 from ..drift_and_noise import control_struct
@@ -17,7 +17,7 @@ from ..vector_fields import apply
 from .assertion import largest_entry
 
 
-def commuting(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
+def noises_commute(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish at random states, for
     these `t0` and `args`; false if this cannot be tested. This is not a proof.
 
@@ -25,37 +25,40 @@ def commuting(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
     struct = [control_struct(term, t0) for term in noise]
-    flat, unravel = raveled((jtu.tree_map(jnp.asarray, y0), struct, struct))
+    zeros, unravel = zeros_and_unravel((jtu.tree_map(jnp.asarray, y0), struct, struct))
 
     @eqx.filter_jit
     @jax.vmap
     def sizes(point: Float[Array, " n"]) -> tuple[Array, Array]:
-        """The sizes of `Db_x b_z` and of the bracket, at a state and two combinations."""
+        """The sizes of `Db_z b_x` and of the bracket `Db_z b_x - Db_x b_z`, at a state `y`
+        and for the combinations `x` and `z` of the noises, which are parts of `point`."""
         y, x, z = unravel(point)
-        along_x = ft.partial(apply, noise, x, args, t0)
-        along_z = ft.partial(apply, noise, z, args, t0)
-        _, first = jax.jvp(along_z, (y,), (along_x(y),))
-        _, second = jax.jvp(along_x, (y,), (along_z(y),))
+        b_x = ft.partial(apply, noise, x, args, t0)
+        b_z = ft.partial(apply, noise, z, args, t0)
+        _, first = jax.jvp(b_z, (y,), (b_x(y),))
+        _, second = jax.jvp(b_x, (y,), (b_z(y),))
         return largest_entry(first), largest_entry((first**ω - second**ω).ω)
 
     try:
         with jax.disable_jit(False):
-            size, bracket = sizes(_random_points(flat))
-            finite = jnp.isfinite(size) & jnp.isfinite(bracket)
-            # What is left of brackets that cancel are rounding errors of their summands.
-            small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
-            found = jax.block_until_ready(jnp.any(finite) & jnp.all(small | ~finite))
+            size, bracket = sizes(_random_points(zeros))
+            is_finite = jnp.isfinite(size) & jnp.isfinite(bracket)
+            # A bracket that cancels leaves rounding errors of its summands.
+            is_small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
+            commute = jax.block_until_ready(
+                jnp.any(is_finite) & jnp.all(is_small | ~is_finite)
+            )
     except RuntimeError:
-        # From a user's `equinox.error_if`, at states that the user did not choose.
+        # A user's `equinox.error_if` may fail at states that the user did not choose.
         return False
     # Inside `jax.jit` the result is not known.
-    return not is_traced(found) and bool(found)
+    return not is_traced(commute) and bool(commute)
 
 
-def _random_points(flat: Float[Array, " n"]) -> Float[Array, "8 n"]:
-    """Four points of either sign, and four between 0 and 1, where most functions are
-    defined."""
-    shape = (4, *flat.shape)
-    anywhere = jr.normal(jr.key(0), shape, flat.dtype)
-    positive = jr.uniform(jr.key(0), shape, flat.dtype)
-    return jnp.concatenate([anywhere, positive])
+def _random_points(like: Float[Array, " n"]) -> Float[Array, "8 n"]:
+    """Four vectors in the shape of `like` with entries of either sign, and four with
+    entries between 0 and 1, where most functions are defined."""
+    shape = (4, *like.shape)
+    of_either_sign = jr.normal(jr.key(0), shape, like.dtype)
+    positive = jr.uniform(jr.key(0), shape, like.dtype)
+    return jnp.concatenate([of_either_sign, positive])

@@ -12,41 +12,43 @@ from ..._compat import is_traced, unwrapped
 from ..drift_and_noise import flattened
 from ..langevin import BathNoise
 from ..paths import brownian_paths
-from ..symplectic_gradients import drift_hamiltonians
+from ..symplectic_gradients import drift_hamiltonians, Hamiltonian
 
 
 def check_drifts_differ(terms: PyTree[diffrax.AbstractTerm]) -> None:
     """Raises a `ValueError` if two drifts have the same Hamiltonian, which would count
     twice."""
-    found = []
+    earlier: list[Hamiltonian] = []
     for H0 in drift_hamiltonians(terms):
-        # Of Modules with traced parameters it is not known whether they are equal.
-        if any(eqx.tree_equal(H0, other) is True for other in found):
+        # The result is not `True` but traced for Modules with traced parameters, which may
+        # be equal or not.
+        if any(eqx.tree_equal(H0, other) is True for other in earlier):
             raise ValueError(
-                f"`H0` stands in two drift terms ({_name(H0)}), so it would count twice. "
-                "Make one drift of it, by `hamiltonian_terms` or `langevin_terms`, and add "
-                "noise alone by `noise_terms(noise, path)`, or a second bath by "
+                f"`H0` stands in two drift terms ({_function_name(H0)}), so it would count "
+                "twice. Make one drift of it, by `hamiltonian_terms` or `langevin_terms`, "
+                "and add noise alone by `noise_terms(noise, path)`, or a second bath by "
                 "`bath_terms(H0, friction, temperature, path)`: "
                 "`diffrax.MultiTerm(*terms.terms, *noise_terms(noise, path).terms)`."
             )
-        found.append(H0)
+        earlier.append(H0)
 
 
-def _name(H0) -> str:
+def _function_name(H0: Hamiltonian) -> str:
+    """The name of a function, or of the class of a Module."""
     return getattr(H0, "__name__", type(H0).__name__)
 
 
 def check_baths_have_own_noise(terms: PyTree[diffrax.AbstractTerm]) -> None:
     """Raises a `ValueError` if a bath shares a random key with another term: with one
-    Brownian motion for both, the temperature would be wrong. Traced keys may be equal
-    without being known to be."""
-    parts = [term for term in flattened(terms) if len(brownian_paths(term)) > 0]
-    keys = [_known_keys(term) for term in parts]
-    for place, term in enumerate(parts):
+    Brownian motion for both, the temperature would be wrong. Traced keys are not compared,
+    since their values are not known."""
+    noise = [term for term in flattened(terms) if len(brownian_paths(term)) > 0]
+    keys = [_known_keys(term) for term in noise]
+    for place, term in enumerate(noise):
         if not isinstance(unwrapped(term), BathNoise):
             continue
-        others = set().union(*keys[:place], *keys[place + 1 :])
-        if keys[place] & others:
+        other_keys = set().union(*keys[:place], *keys[place + 1 :])
+        if keys[place] & other_keys:
             raise ValueError(
                 "The path of a bath has the same random key as the path of another term, "
                 "so both would be one Brownian motion, and the temperature would be wrong. "
@@ -56,7 +58,8 @@ def check_baths_have_own_noise(terms: PyTree[diffrax.AbstractTerm]) -> None:
 
 
 def _known_keys(term: diffrax.AbstractTerm) -> set[bytes]:
-    """The words of the random keys of the paths of a term."""
+    """The random keys of the paths of a term that are not traced, each as its words."""
     keys = filter(is_key, jtu.tree_leaves(brownian_paths(term)))
-    data = [jr.key_data(typed_key(key)) for key in keys]
-    return {np.asarray(words).tobytes() for words in data if not is_traced(words)}
+    words_of_each = [jr.key_data(typed_key(key)) for key in keys]
+    known = [words for words in words_of_each if not is_traced(words)]
+    return {np.asarray(words).tobytes() for words in known}

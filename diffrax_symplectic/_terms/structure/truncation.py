@@ -14,7 +14,7 @@ from ..paths import brownian_paths, path_numbers, replace_paths
 from .checks import additive_fault
 
 
-def needs_truncation(
+def which_need_truncation(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: Y, args: Args
 ) -> tuple[bool, ...]:
     """For each Brownian path of the terms, whether implicit steps need its increments
@@ -25,26 +25,32 @@ def needs_truncation(
     through the positions alone, which a step of size h moves by its h-th part, and bounds
     would cool the bath."""
     noise = [term for term in flattened(terms) if len(brownian_paths(term)) > 0]
-    needs = []
+    # One flag for each path, in the order of `brownian_paths(terms)`.
+    depends_on_state = []
     for term in noise:
         is_bath = isinstance(unwrapped(term), BathNoise)
         depends = not is_bath and additive_fault((term,), t0, y0, args) is not None
-        needs += [depends] * len(brownian_paths(term))
-    # One Brownian motion in several places has one law.
+        depends_on_state += [depends] * len(brownian_paths(term))
+    # Equal paths are one Brownian motion, which has one law.
     numbers = path_numbers(brownian_paths(terms))
-    needy = {number for number, need in zip(numbers, needs) if need}
-    return tuple(number in needy for number in numbers)
+    flags = zip(numbers, depends_on_state)
+    truncated_numbers = {number for number, depends in flags if depends}
+    return tuple(number in truncated_numbers for number in numbers)
 
 
 def without_truncation(
-    terms: PyTree[diffrax.AbstractTerm], where: Sequence[bool] | None = None
+    terms: PyTree[diffrax.AbstractTerm], which: Sequence[bool] | None = None
 ) -> PyTree[diffrax.AbstractTerm]:
-    """The terms with what is truncated in place of truncated paths: of all, or of those
-    `where` it is wanted."""
-    wanted = iter([True] * len(brownian_paths(terms)) if where is None else where)
+    """The terms with the path within each truncated path in its place; or only in place of
+    those paths whose flag in `which`, with one for each path, is true."""
+    if which is None:
+        which = [True] * len(brownian_paths(terms))
+    remaining_flags = iter(which)
 
-    def new(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
-        is_cut = isinstance(path, TruncatedBrownianPath)
-        return path.path if next(wanted) and is_cut else path
+    def new_path(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
+        is_wanted = next(remaining_flags)
+        if is_wanted and isinstance(path, TruncatedBrownianPath):
+            return path.path
+        return path
 
-    return replace_paths(terms, new)
+    return replace_paths(terms, new_path)
