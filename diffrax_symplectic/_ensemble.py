@@ -212,7 +212,7 @@ def ensemble(
         ts=float(problem.t0) + saved_steps * float(problem.levels.h[0]),
         ys=joined.y,
         failed=joined.failed,
-        num_stragglers=joined.stragglers,
+        num_stragglers=joined.num_stragglers,
         engine=engine,
         _problem=problem,
         _key=key,
@@ -239,7 +239,7 @@ def _join(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
         return states[:, 0] if at_end else states
 
     y = jtu.tree_map(join, *[batch.y for batch in batches])
-    return Batch(y, failed, sum(batch.stragglers for batch in batches))
+    return Batch(y, failed, sum(batch.num_stragglers for batch in batches))
 
 
 def _warn_of(joined: Batch, bounded: bool) -> None:
@@ -252,4 +252,4 @@ def _warn_of(joined: Batch, bounded: bool) -> None:
             f"with `~failed`. {advice_on_failures(bounded)}",
             stacklevel=3,
         )
-    warn_of_stragglers(joined.stragglers, lost, count, stacklevel=3)
+    warn_of_stragglers(joined.num_stragglers, lost, count, stacklevel=3)

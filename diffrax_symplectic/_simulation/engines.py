@@ -57,12 +57,12 @@ class Batch(NamedTuple):
 
     - `y`: the states.
     - `failed`: which paths failed. Their states are meaningless.
-    - `stragglers`: how many paths the fused kernel handed back to JAX.
+    - `num_stragglers`: how many paths the fused kernel handed back to JAX.
     """
 
     y: PyTree[np.ndarray]
     failed: Bool[np.ndarray, " n"]
-    stragglers: int = 0
+    num_stragglers: int = 0
 
 
 def state_itself(t, y, args):
@@ -132,7 +132,7 @@ def by_drjit(
             raise
         # The errors behind it are about recordings, and pages long.
         raise refused from None
-    if fused.stragglers == 0:
+    if fused.num_stragglers == 0:
         return fused
     return _with_stragglers(p, key, sample_numbers, level, fused)
 

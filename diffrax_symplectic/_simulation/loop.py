@@ -69,7 +69,7 @@ class PathStates(eqx.Module):
 
 def _kept_where(failed: Bool[Array, " n"], old: PyTree, new: PyTree) -> PyTree:
     """The new values, and the old ones for failed paths."""
-    pick = lambda new, old: jnp.where(along(failed, new), old, new)
+    pick = lambda new, old: jnp.where(mask_like(failed, new), old, new)
     return jtu.tree_map(pick, new, old)
 
 
@@ -153,7 +153,7 @@ def _measure_if_saved(
         phi = jax.vmap(phi_of)(paths.y, paths.args)
         failed = paths.failed | ~jax.vmap(all_finite)(phi)
         # `ts` may repeat a time, so one step may have several places.
-        here = along(level.saved_steps == i, saved)
+        here = mask_like(level.saved_steps == i, saved)
         return failed, jnp.where(here, measure(phi, failed), saved)
 
     def pass_by():
@@ -224,6 +224,6 @@ def _in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
     return lax.map(lambda args: fn(*args), args, batch_size=_PATHS_AT_ONCE)
 
 
-def along(mask: Bool[Array, " n"], x: Array) -> Array:
+def mask_like(mask: Bool[Array, " n"], x: Array) -> Array:
     """A mask of the first axis, broadcastable against `x`."""
     return mask.reshape(-1, *[1] * (x.ndim - 1))

@@ -272,7 +272,7 @@ class Problem(eqx.Module):
         return self.unravel(jnp.swapaxes(x, 1, 2))
 
     @property
-    def shape_of_sample(self) -> PyTree[jax.ShapeDtypeStruct]:
+    def sample_struct(self) -> PyTree[jax.ShapeDtypeStruct]:
         """The shapes of the values of one sample, for all combinations of levels."""
         times, m = self.num_outputs
         x = np.zeros((len(self.weights), times, 1, m), self.dtype_of_values)
