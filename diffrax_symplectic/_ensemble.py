@@ -188,7 +188,7 @@ def ensemble(
         ts=[t1] if ts is None else ts,
         levels=1,
         want=want,
-        user="ensemble",
+        caller="ensemble",
     )
     if want == "strong" and any(has_shapes(terms)):
         check_gaussian(solver)
