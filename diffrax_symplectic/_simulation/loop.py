@@ -130,8 +130,9 @@ def _on_level(
 
     def step_and_measure(i, carry):
         paths, saved = carry
-        after = motion.step(i, paths)
-        return _measure_if_saved(p, level, measure, i + 1, after, saved)
+        num_steps = i + 1
+        paths = motion.step(i, paths)
+        return _measure_if_saved(p, level, measure, num_steps, paths, saved)
 
     num_saves, m = p.num_outputs
     num_paths = len(motion.start.failed)
