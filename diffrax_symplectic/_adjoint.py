@@ -120,7 +120,8 @@ ReversingAdjoint.__init__.__doc__ = """**Arguments:**
 def _check_supported(
     solver: Any, controller: Any, event: diffrax.Event | None, saveat: diffrax.SaveAt
 ) -> None:
-    """Raises a `ValueError` for what the backward pass does not know how to undo."""
+    """Raises a `ValueError` for solves that the backward pass does not know how to
+    undo."""
     known_steps = diffrax.ConstantStepSize | diffrax.StepTo
     if not _undoes_its_steps(solver):
         fault = (
@@ -150,17 +151,18 @@ def _check_supported(
 
 def _saves_states_alone(saveat: diffrax.SaveAt) -> bool:
     """Whether states are saved at the end or at given times, and nothing else is."""
-    sub = saveat.subs
+    sub_saveat = saveat.subs
     # Several of them would be a PyTree.
-    if saveat.dense or not isinstance(sub, diffrax.SubSaveAt):
+    if saveat.dense or not isinstance(sub_saveat, diffrax.SubSaveAt):
         return False
-    at_end_and_times = sub.t1 and sub.ts is not None
-    return not (sub.steps or sub.t0 or at_end_and_times) and saves_states(sub)
+    saves_both = sub_saveat.t1 and sub_saveat.ts is not None
+    saves_more = sub_saveat.steps or sub_saveat.t0 or saves_both
+    return not saves_more and saves_states(sub_saveat)
 
 
 def _undoes_its_steps(solver: Any) -> bool:
-    """Whether a step with negated increments leads back to where a step began. This is
-    known of solvers of this package only."""
+    """Whether a step with negated increments leads back to where a step began, which is
+    known for solvers of this package only."""
     return is_solver(solver) and solver.undoes_its_steps
 
 
@@ -173,25 +175,26 @@ def _solve(inputs, *, adjoint, throw, **kwargs):
 
 
 def _run(adjoint: ReversingAdjoint, inputs: Any, outer_while_loop: Callable, kwargs):
-    """The final state of Diffrax's loop, and statistics."""
+    """The final state of Diffrax's loop, and statistics. `inputs` are differentiated:
+    state, `args`, terms and solver. `kwargs` are the other arguments of `loop`."""
     y, args, terms, solver = inputs
-    begun = with_y(kwargs["init_state"], y)
-    others = kwargs | {"init_state": begun}
+    init_state = with_y(kwargs["init_state"], y)
+    kwargs = kwargs | {"init_state": init_state}
     return run_steps(
-        adjoint, outer_while_loop, args=args, terms=terms, solver=solver, **others
+        adjoint, outer_while_loop, args=args, terms=terms, solver=solver, **kwargs
     )
 
 
 class _Residuals(NamedTuple):
     """What the forward pass leaves for the backward pass.
 
-    - `rows`: the checkpoints, evenly spaced over the steps.
+    - `checkpoints`: the saved states, evenly spaced over the steps, along the first axis.
     - `y1`: the state at the end.
     - `num_steps`: the number of steps made.
     - `num_saved`: the number of saved times.
     """
 
-    rows: PyTree[Array]
+    checkpoints: PyTree[Array]
     y1: Y
     num_steps: IntScalarLike
     num_saved: IntScalarLike
@@ -202,22 +205,22 @@ def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
     del perturbed, throw
     times = StepTimes(kwargs["stepsize_controller"], kwargs["init_state"])
     every = _steps_between(times, adjoint.checkpoints)
-    recorded = []
+    checkpoints_of_loop = []
 
     def recording_while_loop(cond_fun, body_fun, init_val, *, buffers, **options):
-        """The loop over steps, which also carries the rows of saved states."""
+        """The loop over steps, which also carries the checkpoints, a row for each."""
 
         def empty_rows(x: Array) -> Array:
             return jnp.zeros((adjoint.checkpoints, *jnp.shape(x)), x.dtype)
 
-        def going(carry):
+        def is_going(carry):
             state, _ = carry
             return cond_fun(state)
 
-        def body(carry):
+        def record_and_step(carry):
             state, rows = carry
-            now = solve_state(state)
-            row, rest = jnp.divmod(now.num_steps, every)
+            before_step = solve_state(state)
+            row, rest = jnp.divmod(before_step.num_steps, every)
             # States between checkpoints go to the row after the last one, which `save`
             # drops.
             row = jnp.where(rest == 0, row, adjoint.checkpoints)
@@ -225,7 +228,7 @@ def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
             def save(x: Array, saved: Array) -> Array:
                 return saved.at[row].set(x, mode="drop")
 
-            return body_fun(state), jtu.tree_map(save, now.y, rows)
+            return body_fun(state), jtu.tree_map(save, before_step.y, rows)
 
         def buffers_of_state(carry):
             state, _ = carry
@@ -233,27 +236,32 @@ def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
 
         rows = jtu.tree_map(empty_rows, solve_state(init_val).y)
         final, rows = while_loop(
-            going,
-            body,
+            is_going,
+            record_and_step,
             (init_val, rows),
             buffers=buffers_of_state,
             kind="lax",
             **options,
         )
-        # Diffrax passes on only its own state.
-        recorded.append(rows)
+        # Diffrax returns only its own state, so the checkpoints leave by this list.
+        checkpoints_of_loop.append(rows)
         return final
 
     out = _run(adjoint, inputs, recording_while_loop, kwargs)
     final_state, _ = out
     final = solve_state(final_state)
-    [rows] = recorded
-    return out, _Residuals(rows, final.y, final.num_steps, final.num_saved)
+    [checkpoints] = checkpoints_of_loop
+    return out, _Residuals(
+        checkpoints=checkpoints,
+        y1=final.y,
+        num_steps=final.num_steps,
+        num_saved=final.num_saved,
+    )
 
 
 def _steps_between(times: StepTimes, checkpoints: int) -> IntScalarLike:
-    """The number of steps between two saved states."""
-    # Rounded up, so that there are rows enough.
+    """The number of steps between two checkpoints."""
+    # The quotient is rounded up, so that the checkpoints suffice for all steps.
     return jnp.maximum(1, -(-jnp.asarray(times.number()) // checkpoints))
 
 
@@ -264,7 +272,7 @@ class _Walk(NamedTuple):
     - `y`: the state there.
     - `a_y`, `a_parameters`: the derivatives of the loss with respect to this state, and to
         the parameters so far.
-    - `saved`: the number of saved times before this one.
+    - `num_saved`: the number of saved times before this one.
     - `size`: the size of nearby states.
     - `arrived`: whether the pass met all checkpoints so far.
     """
@@ -273,7 +281,7 @@ class _Walk(NamedTuple):
     y: Y
     a_y: Y
     a_parameters: PyTree[Array]
-    saved: Array
+    num_saved: Array
     size: Array
     arrived: Bool[Array, ""]
 
@@ -282,7 +290,7 @@ class _Walk(NamedTuple):
 def _solve_bwd(
     residuals: _Residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwargs
 ):
-    rows, y1, num_steps, num_saved = residuals
+    checkpoints, y1, num_steps, num_saved = residuals
     saveat = kwargs["saveat"].subs
     times = StepTimes(kwargs["stepsize_controller"], kwargs["init_state"])
     every = _steps_between(times, adjoint.checkpoints)
@@ -290,8 +298,9 @@ def _solve_bwd(
     _, *is_perturbed = perturbed
     diff, nondiff = eqx.partition(parameters, is_perturbed)
     final_grad, _ = grad_out
-    number = 1 if saveat.ts is None else len(saveat.ts)
-    g = _with_zeros(solve_state(final_grad).ys, y1, number)
+    num_times = 1 if saveat.ts is None else len(saveat.ts)
+    # The derivatives of the loss with respect to the saved states.
+    a_ys = _with_zeros(solve_state(final_grad).ys, y1, num_times)
 
     def step(y: Y, diff: PyTree[Array], i: IntScalarLike, back: bool) -> Y:
         """One step between the times of steps `i` and `i + 1`, forward or back."""
@@ -305,138 +314,147 @@ def _solve_bwd(
         else:
             begin = t0
             end = t1
-        # As after a jump, since the solver state belongs to another step.
+        # The solver state belongs to another step, so the step is made as after a jump.
         made_jump = True
         solver_state = times.solver_state()
         y1, *_ = solver.step(terms, begin, end, y, args, solver_state, made_jump)
         return y1
 
-    def going(walk: _Walk) -> Bool[Array, ""]:
+    def is_going(walk: _Walk) -> Bool[Array, ""]:
         return walk.i > 0
 
-    def body(walk: _Walk) -> _Walk:
+    def step_back(walk: _Walk) -> _Walk:
         i = walk.i - 1
         y_found = step(walk.y, diff, i, back=True)
         size = jnp.maximum(optx.max_norm(y_found), _PER_STEP * walk.size)
-        y, arrived = _begin_anew(y_found, rows, i, every, walk.arrived, size)
-        # Derivatives with respect to the state at the end of the step; and to that at its
-        # start, without what comes through the step.
-        passed = _Passed(walk.a_y, (0 * walk.a_y**ω).ω, walk.saved)
+        y, arrived = _restarted(y_found, checkpoints, i, every, walk.arrived, size)
+        passed = _Passed(
+            a_y1=walk.a_y, a_y0=(0 * walk.a_y**ω).ω, num_saved=walk.num_saved
+        )
         if saveat.ts is not None:
             t0 = times.time(i)
             t1 = times.time(i + 1)
-            passed = _saved_between(t0, t1, saveat.ts, g, passed)
-        # Forward again, from the state that was found: its transposed Jacobian is exact.
+            passed = _saved_between(t0, t1, saveat.ts, a_ys, passed)
+        # The step is made forward again, from the state that was found, so that its
+        # transposed Jacobian is exact.
         forward = ft.partial(step, i=i, back=False)
         _, vjp = jax.vjp(forward, y, diff)
-        through, a_parameters = vjp(passed.a_y1)
+        a_y_through_step, a_parameters = vjp(passed.a_y1)
         return _Walk(
             i=i,
             y=y,
             a_parameters=(walk.a_parameters**ω + a_parameters**ω).ω,
-            a_y=(passed.a_y0**ω + through**ω).ω,
-            saved=passed.saved,
+            a_y=(passed.a_y0**ω + a_y_through_step**ω).ω,
+            num_saved=passed.num_saved,
             size=size,
             arrived=arrived,
         )
 
     if saveat.ts is None:
-        a_y1 = jtu.tree_map(lambda g: g[-1], g)
+        a_y1 = jtu.tree_map(lambda a: a[-1], a_ys)
     else:
-        # Saved states at the end itself are met in the last step.
-        a_y1 = jtu.tree_map(lambda g: 0 * g[0], g)
+        # States saved at the end itself are met in the last step.
+        a_y1 = jtu.tree_map(lambda a: 0 * a[0], a_ys)
     walk = _Walk(
         i=jnp.asarray(num_steps),
         y=y1,
         a_y=a_y1,
         a_parameters=jtu.tree_map(jnp.zeros_like, diff),
-        saved=jnp.asarray(num_saved),
+        num_saved=jnp.asarray(num_saved),
         size=optx.max_norm(y1),
         arrived=jnp.array(True),
     )
-    walk = lax.while_loop(going, body, walk)
-    a_y = walk.a_y
+    walk = lax.while_loop(is_going, step_back, walk)
+    a_y0 = walk.a_y
     if saveat.ts is not None:
-        # States saved at the start itself.
-        before = jnp.arange(len(saveat.ts)) < walk.saved
-        a_y = jtu.tree_map(lambda a, g: a + jnp.tensordot(before, g, 1), a_y, g)
-    return _if_arrived(walk.arrived, throw, (a_y, *walk.a_parameters))
+        # States saved at the start itself lie in no step.
+        is_at_start = jnp.arange(len(saveat.ts)) < walk.num_saved
+        add_rows = lambda a, rows: a + jnp.tensordot(is_at_start, rows, 1)
+        a_y0 = jtu.tree_map(add_rows, a_y0, a_ys)
+    return _if_arrived(walk.arrived, throw, (a_y0, *walk.a_parameters))
 
 
-def _with_zeros(grad_ys: PyTree[Array | None], y1: Y, number: int) -> PyTree[Array]:
-    """The derivatives of the loss with respect to the saved states. Those that it does not
-    depend on have none, which is zero here."""
+def _with_zeros(grad_ys: PyTree[Array | None], y1: Y, num_times: int) -> PyTree[Array]:
+    """The derivatives of the loss with respect to the states at all saved times, with zeros
+    in place of `None`, which JAX gives where the loss does not depend on a leaf."""
 
-    def or_zeros(y1: Array, grad: Array | None) -> Array:
+    def or_zeros(y1_leaf: Array, grad: Array | None) -> Array:
         if grad is None:
-            return jnp.zeros((number, *jnp.shape(y1)), y1.dtype)
+            return jnp.zeros((num_times, *jnp.shape(y1_leaf)), y1_leaf.dtype)
         return grad
 
     return jtu.tree_map(or_zeros, y1, grad_ys, is_leaf=lambda x: x is None)
 
 
 # The fraction of its size that a state passes to the one before it. Thus a start at rest,
-# where weak increments may leave it for dozens of steps, gets the size of later states.
+# which weak increments may not leave for dozens of steps, gets the size of later states.
 _PER_STEP = 0.9
 
 
-def _begin_anew(
+def _restarted(
     y: Y,
-    rows: PyTree[Array],
+    checkpoints: PyTree[Array],
     i: IntScalarLike,
     every: IntScalarLike,
     arrived: Bool[Array, ""],
     size: Array,
 ) -> tuple[Y, Bool[Array, ""]]:
-    """The state after `i` steps, replaced by the checkpoint if there is one, and whether
-    both agree, for states of this `size`."""
-    # Between checkpoints this reads the one before, and does not use it.
+    """The state after `i` steps, replaced by the checkpoint if there is one; and whether
+    the pass has `arrived` so far and both agree, for states of this `size`."""
+    # Between checkpoints this reads the checkpoint before, and does not use it.
     row, rest = jnp.divmod(i, every)
-    exact = jtu.tree_map(lambda rows: rows[row], rows)
-    error = optx.max_norm((y**ω - exact**ω).ω)
+    checkpoint = jtu.tree_map(lambda rows: rows[row], checkpoints)
+    error = optx.max_norm((y**ω - checkpoint**ω).ω)
     eps = float(jnp.finfo(error.dtype).eps)
-    close = error <= eps ** (2 / 3) * jnp.maximum(size, optx.max_norm(exact))
-    here = rest == 0
-    y = jtu.tree_map(lambda walked, saved: jnp.where(here, saved, walked), y, exact)
-    return y, arrived & (close | ~here)
+    agrees = error <= eps ** (2 / 3) * jnp.maximum(size, optx.max_norm(checkpoint))
+    is_at_checkpoint = rest == 0
+
+    def exact(walked: Array, saved: Array) -> Array:
+        return jnp.where(is_at_checkpoint, saved, walked)
+
+    y = jtu.tree_map(exact, y, checkpoint)
+    return y, arrived & (agrees | ~is_at_checkpoint)
 
 
 class _Passed(NamedTuple):
-    """Derivatives at a step, as saved times are passed on the way back.
+    """Derivatives of the loss at a step, as saved times are passed on the way back.
 
-    - `a_y1`: with respect to the state at its end.
-    - `a_y0`: with respect to the state at its start, without what comes through the step.
-    - `saved`: the number of saved times before.
+    - `a_y1`: with respect to the state at the end of the step.
+    - `a_y0`: with respect to the state at the start of the step, apart from its effect on
+        the state at the end.
+    - `num_saved`: the number of saved times that are not passed yet.
     """
 
     a_y1: Y
     a_y0: Y
-    saved: Array
+    num_saved: Array
 
 
-def _saved_between(t0, t1, ts: Array, g: PyTree[Array], passed: _Passed) -> _Passed:
-    """Adds the derivatives with respect to the states saved between `t0` and `t1`, which
-    are interpolated linearly."""
+def _saved_between(t0, t1, ts: Array, a_ys: PyTree[Array], passed: _Passed) -> _Passed:
+    """Adds the derivatives `a_ys` with respect to the states saved after `t0` and up to
+    `t1`, which Diffrax interpolates linearly from the states at `t0` and `t1`."""
 
-    def added(y: Y, share: Array, at: Array) -> Y:
-        return jtu.tree_map(lambda a, g: a + share * g[at], y, g)
+    def with_share(a_y: Y, share: Array, index: Array) -> Y:
+        return jtu.tree_map(lambda a, rows: a + share * rows[index], a_y, a_ys)
 
-    def add(passed: _Passed) -> _Passed:
-        last = passed.saved - 1
+    def pass_one(passed: _Passed) -> _Passed:
+        last = passed.num_saved - 1
         share = (ts[last] - t0) / (t1 - t0)
-        a_y1 = added(passed.a_y1, share, last)
-        a_y0 = added(passed.a_y0, 1 - share, last)
+        a_y1 = with_share(passed.a_y1, share, last)
+        a_y0 = with_share(passed.a_y0, 1 - share, last)
         return _Passed(a_y1, a_y0, last)
 
-    def more(passed: _Passed) -> Bool[Array, ""]:
+    def has_more(passed: _Passed) -> Bool[Array, ""]:
         # If no saved time is left, this reads the last one, but does not use it.
-        return (passed.saved > 0) & (ts[passed.saved - 1] > t0)
+        return (passed.num_saved > 0) & (ts[passed.num_saved - 1] > t0)
 
-    return lax.while_loop(more, add, passed)
+    return lax.while_loop(has_more, pass_one, passed)
 
 
 def _steps_without_inverse() -> str:
-    """Steps of solvers for heat baths that shrink areas to zero, for messages."""
+    """Steps of solvers for heat baths that shrink areas to zero, for messages: such as
+    "`BAOAB` with rate of friction times step equal to 2"."""
+    # The zero of `area_factor`: its x is the rate times the step over 2 `friction_parts`.
     return " or of ".join(
         f"`{kind.__name__}` with rate of friction times step equal to "
         f"{2 * kind.friction_parts}"
@@ -446,7 +464,8 @@ def _steps_without_inverse() -> str:
 
 
 def _if_arrived(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyTree:
-    """The gradients; or if the backward pass failed, an error when run, or NaN."""
+    """The gradients, if the backward pass arrived; otherwise an error when run, or without
+    `throw` NaN."""
     if throw:
         return eqx.error_if(
             gradients,

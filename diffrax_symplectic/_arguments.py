@@ -15,15 +15,16 @@ from ._compat import is_traced
 from ._custom_types import Y
 
 
-# Names of positions and momenta (or velocities) in this order, where momenta come first.
+# Names of arguments that show that a function takes positions before momenta (or
+# velocities), where momenta come first.
 _POSITIONS_FIRST = (("x", "v"), ("x", "p"), ("q", "v"))
 
 
 def check_takes(name: str, fn: Any, *arguments: str) -> None:
     """Raises a `ValueError` unless `fn` takes these arguments, in this order."""
-    call = f"`{name}({', '.join(arguments)})`"
+    usage = f"`{name}({', '.join(arguments)})`"
     if not callable(fn):
-        raise ValueError(f"`{name}` must be a function, called as {call}; got {fn!r}.")
+        raise ValueError(f"`{name}` must be a function, called as {usage}; got {fn!r}.")
     try:
         signature = inspect.signature(fn)
     except ValueError:
@@ -33,7 +34,7 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
         signature.bind(*arguments)
     except TypeError:
         raise ValueError(
-            f"`{name}` is called as {call}; got a function with other arguments, "
+            f"`{name}` is called as {usage}; got a function with other arguments, "
             f"`{signature}`."
         ) from None
     by_position = (
@@ -45,16 +46,17 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
         for parameter in signature.parameters.values()
         if parameter.kind in by_position
     ]
-    # Other names than ours are fine, but ours in another place is a mistake, which would
-    # show in no shape: momenta and positions are alike.
-    swapped = any(
-        name in arguments and name != ours for name, ours in zip(names, arguments)
+    # Names other than those of `arguments` are fine, but one of these in another place is a
+    # mistake. No shape would show it: momenta and positions are alike.
+    is_swapped = any(
+        given in arguments and given != expected
+        for given, expected in zip(names, arguments)
     )
     takes_pair = arguments[1:3] == ("p", "q")
     positions_first = takes_pair and tuple(names[1:3]) in _POSITIONS_FIRST
-    if swapped or positions_first:
+    if is_swapped or positions_first:
         raise ValueError(
-            f"`{name}` is called as {call}; got a function with its arguments in another "
+            f"`{name}` is called as {usage}; got a function with its arguments in another "
             f"order, `{signature}`."
         )
 
@@ -65,24 +67,24 @@ def takes_args(fn: Any) -> bool:
     try:
         parameters = inspect.signature(fn).parameters
     except ValueError:
-        # As above.
+        # Some functions written in C have no signature.
         return False
-    needed = [
+    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    required = [
         parameter
         for parameter in parameters.values()
         if parameter.default is inspect.Parameter.empty
-        and parameter.kind is not inspect.Parameter.VAR_POSITIONAL
-        and parameter.kind is not inspect.Parameter.VAR_KEYWORD
+        and parameter.kind not in variadic
     ]
-    return "args" in parameters or len(needed) > 1
+    return "args" in parameters or len(required) > 1
 
 
 def check_solver(name: str, solver: Any) -> None:
-    """Raises a `ValueError` unless this is a solver."""
+    """Raises a `ValueError` unless the argument of this name is a solver."""
     if isinstance(solver, diffrax.AbstractSolver):
         return
     example = "ImplicitMidpoint"
-    # A class in place of its instance is what is most often passed by mistake.
+    # The most common mistake is to pass a class in place of its instance.
     if isinstance(solver, type) and issubclass(solver, diffrax.AbstractSolver):
         example = solver.__name__
     raise ValueError(
@@ -91,17 +93,18 @@ def check_solver(name: str, solver: Any) -> None:
 
 
 def whole_number(name: str, value: Any, least: int = 1) -> int:
-    """Raises a `ValueError` unless this is an integer, `least` or larger."""
+    """The value of the argument of this name, as an integer of Python. Raises a
+    `ValueError` unless it is an integer, `least` or larger."""
     # `True` is an integer to Python.
-    integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not integer or value < least:
+    is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not is_integer or value < least:
         kind = "a positive integer" if least == 1 else f"an integer, {least} or larger"
         raise ValueError(f"`{name}` must be {kind}; got {value!r}.")
     return int(value)
 
 
 def check_real(name: str, leaves: list) -> None:
-    """Raises a `ValueError` unless the `leaves` that a function returned are real."""
+    """Raises a `ValueError` unless the function of this name returned real `leaves`."""
     if len(leaves) == 0:
         raise ValueError(f"`{name}` must return real arrays; it returned none.")
     dtypes = [getattr(leaf, "dtype", type(leaf)) for leaf in leaves]
@@ -119,13 +122,14 @@ def _is_real(dtype: Any) -> bool:
 
 
 def real_array(name: str, value: Any, *, kind: str) -> ArrayLike:
-    """Raises a `ValueError` unless this is a real number or array that is finite and
-    not negative, as far as its values are known while tracing."""
-    fits = is_real_number(value)
-    if fits and not is_traced(value):
+    """The value of the argument of this name. Raises a `ValueError` unless it is a real
+    number or array that is finite and not negative, as far as its values are known while
+    tracing. `kind` says what it must be, such as "a number"."""
+    is_allowed = is_real_number(value)
+    if is_allowed and not is_traced(value):
         values = np.asarray(value)
-        fits = np.all(np.isfinite(values) & (values >= 0))
-    if not fits:
+        is_allowed = np.all(np.isfinite(values) & (values >= 0))
+    if not is_allowed:
         raise ValueError(
             f"`{name}` must be {kind}, finite and not negative; got {brief(value)}."
         )
@@ -133,22 +137,23 @@ def real_array(name: str, value: Any, *, kind: str) -> ArrayLike:
 
 
 def is_real_number(value: Any) -> bool:
-    """Whether this is a real number, or an array of them. Truth values are none: a mask in
-    place of a number is a mistake."""
+    """Whether this is a real number, or an array of real numbers. Truth values do not
+    count: a mask in place of a number is a mistake."""
     dtype = getattr(value, "dtype", type(value))
     kinds = (jnp.floating, jnp.integer)
-    has_kind = any(jnp.issubdtype(dtype, kind) for kind in kinds)
-    return eqx.is_array_like(value) and has_kind
+    has_real_dtype = any(jnp.issubdtype(dtype, kind) for kind in kinds)
+    return eqx.is_array_like(value) and has_real_dtype
 
 
 def check_untraced(caller: str, tree: Any) -> None:
-    """Raises a `ValueError` if any array is known only when a program runs."""
+    """Raises a `ValueError` if any array is known only when a program runs. `caller` is for
+    the message, such as "`ensemble`", in backticks."""
     if any(is_traced(x) for x in jtu.tree_leaves(tree)):
         raise inside_jax(caller)
 
 
 def inside_jax(caller: str) -> ValueError:
-    """The error for a call inside a JAX transformation."""
+    """The error for a call of `caller` inside a JAX transformation."""
     return ValueError(
         f"{caller} cannot run inside JAX transformations, since batches are collected "
         "outside of JAX. Call it outside of `jit`, `vmap` and `grad`. To differentiate a "
@@ -157,7 +162,7 @@ def inside_jax(caller: str) -> ValueError:
 
 
 def brief(tree: PyTree) -> str:
-    """Values for messages. Of long arrays only the first and the last ones are shown."""
+    """Values for messages. Long arrays are shown by their first and last entries."""
     with np.printoptions(threshold=8, edgeitems=2):
         return str(tree)
 
@@ -169,17 +174,18 @@ def shapes(tree: PyTree) -> str:
     return eqx.tree_pformat(jax.eval_shape(lambda: tree), struct_as_array=True)
 
 
-def check_state(y0: Y, solver: str) -> None:
+def check_state(y0: Y, caller: str) -> None:
     """Raises a `ValueError` unless the state consists of real floating-point arrays, in
-    one precision of at least 32 bits."""
+    one precision of at least 32 bits. `caller` is the name of the solver or function that
+    the state was passed to."""
     leaves = jtu.tree_leaves(y0)
     if len(leaves) == 0:
-        raise ValueError(f"`{solver}` needs a state with at least one array.")
+        raise ValueError(f"`{caller}` needs a state with at least one array.")
     for leaf in leaves:
         dtype = jnp.result_type(leaf)
         if jnp.issubdtype(dtype, jnp.complexfloating):
             raise ValueError(
-                f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
+                f"`{caller}` needs a state `y0` of real floating-point arrays; got an "
                 f"array of dtype {dtype}. For complex amplitudes `psi` with Hamiltonians "
                 "construct the terms with `wave_terms(H0, noise, path)` and pass "
                 "`y0=to_pair(psi0)`. For other equations split the state into its real and "
@@ -187,16 +193,16 @@ def check_state(y0: Y, solver: str) -> None:
             )
         if not jnp.issubdtype(dtype, jnp.floating) or jnp.finfo(dtype).bits < 32:
             raise ValueError(
-                f"`{solver}` needs a state `y0` of real floating-point arrays; got an "
+                f"`{caller}` needs a state `y0` of real floating-point arrays; got an "
                 f"array of dtype {dtype}. Convert it with `.astype(float)`, to float32 or "
                 "float64."
             )
-    # A step would promote them, and Diffrax refuses a state whose dtype changes with a
-    # message that names neither.
-    if len({jnp.result_type(leaf) for leaf in leaves}) > 1:
+    # A step would promote the arrays, and Diffrax refuses a state whose dtype changes, with
+    # a message that does not name the dtypes.
+    dtypes = {str(jnp.result_type(leaf)) for leaf in leaves}
+    if len(dtypes) > 1:
         raise ValueError(
-            f"`{solver}` needs all arrays of `y0` to have one dtype; got "
-            f"{sorted({str(jnp.result_type(leaf)) for leaf in leaves})}."
+            f"`{caller}` needs all arrays of `y0` to have one dtype; got {sorted(dtypes)}."
         )
 
 
@@ -207,14 +213,14 @@ def check_pair(y: PyTree) -> None:
 
 
 def pair_fault(y: PyTree) -> str | None:
-    """What to pass instead of `y`; `None` if it is a pair of the same structure and
-    shapes."""
+    """A message that says what to pass instead of `y`; `None` if `y` is a pair of the same
+    structure and shapes."""
     advice = (
         "The state of a Hamiltonian system is a pair `(p, q)` of arrays (or PyTrees) of "
         "the same structure and shapes: pass `y0=(p0, q0)`, or for spins "
         "`y0=to_spinors(s0)`, or for complex amplitudes `y0=to_pair(psi0)`. "
     )
-    # First, since a complex array is the most common state that is no pair.
+    # Complex arrays come first: they are the most common states that are no pairs.
     if any(jnp.iscomplexobj(leaf) for leaf in jtu.tree_leaves(y)):
         return (
             f"{advice}Both are real; got {eqx.tree_pformat(y)}. For complex amplitudes "

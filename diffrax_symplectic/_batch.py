@@ -18,10 +18,11 @@ from ._custom_types import IntScalarLike
 
 _T = TypeVar("_T")
 
-# Stragglers are gathered and served in groups of a batch's size over this number. Usually
-# there are few, and each group costs its full size. When all paths computed for as long as
-# any was pending, ensembles with a few hard paths took 8 to 85 times as long.
-_PARTS = 256
+# Stragglers are gathered and served in groups, whose size is that of the batch over this
+# number. Usually there are few stragglers, and each group costs its full size. When all
+# paths computed for as long as any was pending, ensembles with a few hard paths took 8 to
+# 85 times as long.
+_MOST_GROUPS = 256
 
 
 @jax.custom_batching.custom_vmap
@@ -35,7 +36,7 @@ def most_of_batch(number: IntScalarLike) -> IntScalarLike:
 def _(size, in_batched, number):
     del size
     largest = jnp.max(number, 0) if in_batched[0] else number
-    # Called again, for an outer batch.
+    # The function is called again, since an outer batch may have numbers, too.
     return most_of_batch(largest), False
 
 
@@ -47,8 +48,8 @@ def batched_like(values: _T, others: PyTree) -> _T:
     time to trace `StrangGauss`.
     """
     arrays = [leaf for leaf in jtu.tree_leaves(others) if eqx.is_array(leaf)]
-    # Copies, which are no operations of the program: `custom_jvp` does not convert arrays
-    # of NumPy, over which a user may have batched.
+    # The copies are arrays of JAX, and no operations of the program: `custom_jvp` does not
+    # convert arrays of NumPy, over which a user may have batched.
     return _batched(*jtu.tree_map(jnp.array, (values, arrays)))
 
 
@@ -60,21 +61,22 @@ def _all_or_none(values: _T, others: list[Array]) -> _T:
 
 @_all_or_none.def_vmap
 def _(size, in_batched, values, others):
-    # Called only if anything is batched. Then all values are, too.
-    spread = _spread(size, in_batched[0], values)
-    return _all_or_none(spread, others), _all_batched(values)
+    # JAX calls this rule only if anything is batched. Then all values become so.
+    repeated = _repeated(size, in_batched[0], values)
+    return _all_or_none(repeated, others), _all_batched(values)
 
 
-def _spread(size: int, batched: PyTree[bool], values: _T) -> _T:
+def _repeated(size: int, is_batched: PyTree[bool], values: _T) -> _T:
     """`values`, with those that are not batched repeated for each path of the batch."""
 
-    def spread(is_batched: bool, x: Array) -> Array:
+    def repeat(is_batched: bool, x: Array) -> Array:
         return x if is_batched else jnp.broadcast_to(x, (size, *jnp.shape(x)))
 
-    return jtu.tree_map(spread, batched, values)
+    return jtu.tree_map(repeat, is_batched, values)
 
 
 def _all_batched(values: PyTree) -> PyTree[bool]:
+    """What a batching rule returns if all `values` are batched: `True` for each."""
     return jtu.tree_map(lambda _: True, values)
 
 
@@ -119,47 +121,48 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
     Under `vmap` a conditional becomes a select: all paths compute, with memory for all.
     Here the stragglers (`pending` paths) are gathered from the batch and served in groups.
     """
-    # Trace `fn` once, here: under `vmap`, `jax.jit` would trace it again.
+    # `fn` is traced once, here: under `vmap`, `jax.jit` would trace it again.
     call, arrays = captured_arrays(fn, value)
-    # The same program for each level of nested batches.
-    by_parts = jax.jit(ft.partial(_by_parts, call))
+    # Each level of nested batches runs the same program.
+    in_groups = jax.jit(ft.partial(_in_groups, call))
 
     # Each path's `own` arrays have a leading axis; `common` arrays are shared.
     @jax.custom_batching.custom_vmap
     def serve(pending, value, own, common):
-        return by_parts(pending, value, own, common)
+        return in_groups(pending, value, own, common)
 
     @serve.def_vmap
     def _(size, in_batched, pending, value, own, common):
         # Nested batches are joined into one: stragglers of all of them share the groups.
+        # The axes of an array are (outer batch, inner batch, ...).
         inner_size = pending.shape[1 if in_batched[0] else 0]
 
-        def join(batched: bool, x: Array) -> Array:
-            x = x if batched else jnp.broadcast_to(x, (size, *x.shape))
+        def join(is_batched: bool, x: Array) -> Array:
+            x = x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
             return x.reshape(size * inner_size, *x.shape[2:])
 
-        def repeat_if(batched: bool, x: Array) -> Array | None:
-            return jnp.repeat(x, inner_size, axis=0) if batched else None
+        def repeat_if(is_batched: bool, x: Array) -> Array | None:
+            return jnp.repeat(x, inner_size, axis=0) if is_batched else None
 
-        def keep_unless(batched: bool, x: Array) -> Array | None:
-            return None if batched else x
+        def keep_unless(is_batched: bool, x: Array) -> Array | None:
+            return None if is_batched else x
 
-        def part_again(x: Array) -> Array:
+        def separate(x: Array) -> Array:
             return x.reshape(size, inner_size, *x.shape[1:])
 
-        batched_each = tuple(in_batched[:3])
-        batched_common = in_batched[3]
-        pending, value, own = jtu.tree_map(join, batched_each, (pending, value, own))
-        # Captured arrays that the outer batch has are the inner paths' own.
-        more = jtu.tree_map(repeat_if, batched_common, common)
-        rest = jtu.tree_map(keep_unless, batched_common, common)
-        value = serve(pending, value, eqx.combine(own, more), rest)
-        return jtu.tree_map(part_again, value), _all_batched(value)
+        *paths_batched, common_batched = in_batched
+        paths = (pending, value, own)
+        pending, value, own = jtu.tree_map(join, tuple(paths_batched), paths)
+        # Captured arrays over which the outer batch runs become the joined paths' own.
+        newly_own = jtu.tree_map(repeat_if, common_batched, common)
+        still_common = jtu.tree_map(keep_unless, common_batched, common)
+        value = serve(pending, value, eqx.combine(own, newly_own), still_common)
+        return jtu.tree_map(separate, value), _all_batched(value)
 
-    # One path is a batch of one.
-    own_arrays = jtu.tree_map(lambda _: None, arrays)
+    # One path is a batch of one, and all captured arrays are common.
+    own = jtu.tree_map(lambda _: None, arrays)
     pending, value = _with_axis((pending, value))
-    return _first(serve(pending, value, own_arrays, arrays))
+    return _first(serve(pending, value, own, common=arrays))
 
 
 def _with_axis(tree: _T) -> _T:
@@ -172,20 +175,20 @@ def _first(tree: _T) -> _T:
     return jtu.tree_map(lambda x: x[0], tree)
 
 
-def _by_parts(
+def _in_groups(
     call: Callable,
     pending: Bool[Array, " size"],
     value: _T,
     own: PyTree[Array | None],
     common: PyTree[Array | None],
 ) -> _T:
-    """`value` of a batch, with `call` applied for the paths that are `pending`. Of the
-    arrays that it captures, `own` have an axis for the paths."""
+    """`value` of a batch, with `call` applied for the paths that are `pending`. It captures
+    arrays: `own` have an axis for the paths, `common` have not."""
     size = len(pending)
-    # Rounded up, so that a small batch has groups of one.
-    part = -(-size // _PARTS)
+    # The quotient is rounded up, so that a small batch has groups of one.
+    group_size = -(-size // _MOST_GROUPS)
 
-    def by_call(value: _T, own: PyTree) -> _T:
+    def called(value: _T, own: PyTree) -> _T:
         return call(value, eqx.combine(own, common))
 
     def unchanged(value: _T, own: PyTree) -> _T:
@@ -195,29 +198,29 @@ def _by_parts(
     if size == 1:
         # A conditional is cheaper than a loop, and stays one: there is no batch.
         alone = _first((value, own))
-        return _with_axis(lax.cond(pending[0], by_call, unchanged, *alone))
+        return _with_axis(lax.cond(pending[0], called, unchanged, *alone))
 
-    def serve_part(carry):
-        """Applies `call` for the next `part` of the paths that are pending."""
+    def serve_group(carry):
+        """Applies `call` for the next group of the paths that are pending."""
         pending, value = carry
-        # Like `jnp.nonzero`, which compiles to a dozen kernels. If fewer paths are pending,
-        # the surplus indices lie beyond the batch and are dropped. Unsigned indices need no
-        # code for negative ones.
-        flag, which = lax.top_k(pending.astype(jnp.float32), part)
-        which = jnp.where(flag > 0, which, size).astype(jnp.uint32)
-        gathered = jtu.tree_map(lambda x: x[which], (value, own))
-        new = jax.vmap(by_call)(*gathered)
+        # The indices are those of `jnp.nonzero`, which compiles to a dozen kernels. If
+        # fewer paths are pending, the surplus indices lie beyond the batch and are dropped.
+        # Unsigned indices need no code for negative ones.
+        is_pending, places = lax.top_k(pending.astype(jnp.float32), group_size)
+        places = jnp.where(is_pending > 0, places, size).astype(jnp.uint32)
+        gathered = jtu.tree_map(lambda x: x[places], (value, own))
+        new = jax.vmap(called)(*gathered)
 
-        def scatter(x: Array, y: Any) -> Array:
-            return x.at[which].set(y, mode="drop")
+        def scatter(x: Array, new: Any) -> Array:
+            return x.at[places].set(new, mode="drop")
 
         return scatter(pending, False), jtu.tree_map(scatter, value, new)
 
-    def some_pending(carry):
+    def any_pending(carry):
         pending, _ = carry
         return jnp.any(pending)
 
-    _, value = lax.while_loop(some_pending, serve_part, (pending, value))
+    _, value = lax.while_loop(any_pending, serve_group, (pending, value))
     return value
 
 
@@ -230,19 +233,19 @@ def materialize(fn: Callable[[], _T]) -> _T:
     branch of a conditional, and a barrier hides that the condition is always true.
     """
 
-    # Traced once, although it is called for its shapes, in a branch, and elsewhere than on
-    # CPUs. (JAX names what it traces. It prints a bound method with all that it is bound
-    # to, for 50 ms each time, but not a function.)
+    # `fn` is traced once, although it is called for its shapes, in a branch, and elsewhere
+    # than on CPUs. (It is wrapped in a function, since JAX names what it traces, and prints
+    # a bound method with all that it is bound to, for 50 ms each time.)
     @jax.jit
     def once() -> _T:
         return fn()
 
-    def in_a_conditional() -> _T:
-        shapes = jax.eval_shape(once)
+    def in_conditional() -> _T:
+        structs = jax.eval_shape(once)
 
         def zeros() -> _T:
-            return jtu.tree_map(lambda leaf: lax.full_like(leaf, 0), shapes)
+            return jtu.tree_map(lambda struct: lax.full_like(struct, 0), structs)
 
         return lax.cond(lax.optimization_barrier(True), once, zeros)
 
-    return lax.platform_dependent(cpu=in_a_conditional, default=once)
+    return lax.platform_dependent(cpu=in_conditional, default=once)

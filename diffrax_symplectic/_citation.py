@@ -9,7 +9,7 @@ import diffrax
 import jax.tree_util as jtu
 
 
-# A link in a docstring, and a field of an entry.
+# A link in a docstring, and a field of an entry in BibTeX.
 _DOI = re.compile(r"https://doi\.org/([^\s)]+)")
 _DOI_FIELD = re.compile(r"doi = \{(.*?)\}")
 
@@ -25,11 +25,11 @@ def citation(*args: Any, **kwargs: Any) -> None:
     **Arguments:** any arguments of `diffrax.diffeqsolve`.
     """
     diffrax.citation(*args, **kwargs)
-    # Like Diffrax, by what the arguments are, wherever they stand.
+    # Like Diffrax, this accepts arguments by position and by name, and any part of them.
     bound = inspect.signature(diffrax.diffeqsolve).bind_partial(*args, **kwargs)
     entries = _entries()
     for cls in _classes(bound.arguments):
-        # The sources stand in the docstrings, once.
+        # The sources of a class are the links in its docstring.
         dois = list(dict.fromkeys(_DOI.findall(cls.__doc__ or "")))
         if len(dois) > 0:
             print(
@@ -37,7 +37,7 @@ def citation(*args: Any, **kwargs: Any) -> None:
             )
             print(*(f"% - {doi}" for doi in dois), sep="\n")
         for doi in dois:
-            # BibTeX rejects repeated keys.
+            # BibTeX rejects repeated keys, so each entry is printed once.
             if doi in entries:
                 print(entries.pop(doi))
 
@@ -47,14 +47,14 @@ def _classes(tree: Any) -> list[type]:
     # A dictionary in place of a set, to keep the order.
     found: dict[type, None] = {}
 
-    # Called for each node on the way down, containers and modules among them, which are no
-    # leaves.
-    def note(node: Any) -> bool:
+    # JAX calls this for each node on the way down, also for containers and modules, which
+    # are no leaves.
+    def record(node: Any) -> bool:
         if type(node).__module__.split(".")[0] == "diffrax_symplectic":
             found[type(node)] = None
         return False
 
-    jtu.tree_leaves(tree, is_leaf=note)
+    jtu.tree_leaves(tree, is_leaf=record)
     return list(found)
 
 
@@ -65,7 +65,7 @@ def _entries() -> dict[str, str]:
     by_doi = {}
     for entry in entries:
         match = _DOI_FIELD.search(entry)
-        # Books without one cannot be linked to, so no docstring asks for them.
+        # Books without a DOI cannot be linked to, so no docstring asks for them.
         if match is not None:
             by_doi[match[1]] = entry
     return by_doi

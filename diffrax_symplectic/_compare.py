@@ -32,15 +32,16 @@ from ._terms import (
 )
 
 
-# The number of steps of the reference in the smallest compared step. An error of order 1/2
-# is then a third of what is measured, and of any higher order less.
-_FINER = 8
+# The number of steps of the reference in the smallest compared step. With order 1/2 the
+# error of the reference is then 8^(-1/2), about a third, of the error that is measured;
+# with any higher order it is less.
+_REFERENCE_STEPS = 8
 
 
 class PathResults(NamedTuple):
     """The results of a batch of paths.
 
-    - `results`: the states at the end, or what `phi` makes of them.
+    - `results`: the states at the end, or the values of `phi` there.
     - `okay`: which paths succeeded.
     """
 
@@ -48,7 +49,7 @@ class PathResults(NamedTuple):
     okay: Bool[Array, " num_paths"]
 
 
-class _Measured(NamedTuple):
+class _MeasuredError(NamedTuple):
     """An error with its standard error, and the number of paths that it leaves out."""
 
     error: float
@@ -96,7 +97,7 @@ class Comparison:
             error = f"{step.error:.1e} +- {step.std_error:.0e}"
             row = f"{step.solver:20} {step.dt:9.3g} {error:>22} {step.seconds:17.1e}"
             lines.append(row + failed)
-        lines += [f"{name}: {why}" for name, why in self.refused.items()]
+        lines += [f"{name}: {reason}" for name, reason in self.refused.items()]
         return "\n".join(lines)
 
     __repr__ = __str__
@@ -115,13 +116,14 @@ class Comparison:
 
         if axes is None:
             _, axes = plt.subplots(layout="constrained")
-        for name in dict.fromkeys(step.solver for step in self.steps):
-            own = [step for step in self.steps if step.solver == name]
+        # One name for each solver, in the order of `steps`.
+        for solver_name in dict.fromkeys(step.solver for step in self.steps):
+            of_solver = [step for step in self.steps if step.solver == solver_name]
             axes.errorbar(
-                x=[step.seconds for step in own],
-                y=[step.error for step in own],
-                yerr=[3 * step.std_error for step in own],
-                label=name,
+                x=[step.seconds for step in of_solver],
+                y=[step.error for step in of_solver],
+                yerr=[3 * step.std_error for step in of_solver],
+                label=solver_name,
                 marker="o",
                 capsize=2,
             )
@@ -198,54 +200,54 @@ def compare_solvers(
     if phi is not None:
         _check_scalar(phi, t1, y0, args)
     system = _ComparedSystem(terms, t0, t1, y0, args, phi)
-    cell = min(dts) / _FINER
+    reference_dt = min(dts) / _REFERENCE_STEPS
 
-    def keys(number: int) -> PRNGKeyArray:
+    def keys_of_paths(number: int) -> PRNGKeyArray:
         return jr.split(jr.fold_in(key, number), num_paths)
 
-    def own_runs(solver: diffrax.AbstractSolver) -> Callable:
-        """Runs along the path that the solver gets in a solve."""
-        return system.batch(solver, ft.partial(own_path, solver, want))
+    def solve_with_own_path(solver: diffrax.AbstractSolver) -> Callable:
+        """The function that solves along the path that the solver gets in a solve."""
+        return system.solve_batch(solver, ft.partial(own_path, solver, want))
 
-    def compared_runs(solver: diffrax.AbstractSolver) -> Callable:
-        """Runs of which the error is measured."""
+    def solve_to_compare(solver: diffrax.AbstractSolver) -> Callable:
+        """The function that solves for the results whose error is measured."""
         if want == "weak":
-            return own_runs(solver)
+            return solve_with_own_path(solver)
         # Strong errors need a common Brownian motion, which not all solvers can use.
-        return system.batch(solver, ft.partial(common_path, solver, cell))
+        return system.solve_batch(solver, ft.partial(common_path, solver, reference_dt))
 
-    # Keys 0 are those of strong errors. Weak errors are from independent paths, so the keys
-    # of each step size are its own.
-    fine = compared_runs(reference)(keys(0), jnp.asarray(cell))
-    # They are traced if a function closes over traced values.
-    check_untraced("`compare_solvers`", fine)
+    # Strong errors are along the paths with number 0. Weak errors are from independent
+    # paths, so each step size has paths with a number of its own.
+    exact = solve_to_compare(reference)(keys_of_paths(0), jnp.asarray(reference_dt))
+    # The results are traced if a function of the user closes over traced values.
+    check_untraced("`compare_solvers`", exact)
     steps = []
     refused = {}
     for solver in solvers:
-        name = repr(solver)
-        timed = own_runs(solver)
-        compared = timed if want == "weak" else compared_runs(solver)
+        solver_name = repr(solver)
+        timed = solve_with_own_path(solver)
+        compared = timed if want == "weak" else solve_to_compare(solver)
         try:
             # Refusals are errors while tracing, so that nothing need be compiled for them.
-            eqx.filter_eval_shape(compared, keys(0), jnp.asarray(dts[0]))
+            eqx.filter_eval_shape(compared, keys_of_paths(0), jnp.asarray(dts[0]))
         except ValueError as error:
-            refused[name] = str(error).splitlines()[0]
+            refused[solver_name] = str(error).splitlines()[0]
             continue
         # The first call compiles, and is not timed.
-        jax.block_until_ready(timed(keys(1), jnp.asarray(dts[0])))
+        jax.block_until_ready(timed(keys_of_paths(1), jnp.asarray(dts[0])))
         for number, dt in enumerate(dts, start=1):
-            # An array, since a number would be compiled for.
+            # The step size is an array: with a number the program would compile anew.
             traced_dt = jnp.asarray(dt)
             begin = time.perf_counter()
-            out = jax.block_until_ready(timed(keys(number), traced_dt))
+            results = jax.block_until_ready(timed(keys_of_paths(number), traced_dt))
             seconds = (time.perf_counter() - begin) / num_paths
             if want == "strong":
-                measured = strong_error(compared(keys(0), traced_dt), fine)
+                measured = strong_error(compared(keys_of_paths(0), traced_dt), exact)
             else:
-                measured = weak_error(out, fine)
+                measured = weak_error(results, exact)
             steps.append(
                 ComparedStep(
-                    solver=name,
+                    solver=solver_name,
                     dt=float(traced_dt),
                     error=measured.error,
                     std_error=measured.std_error,
@@ -257,7 +259,7 @@ def compare_solvers(
 
 
 class _ComparedSystem(NamedTuple):
-    """What all compared solvers solve, with the names of `compare_solvers`."""
+    """The arguments of `compare_solvers` that all compared solvers share."""
 
     terms: diffrax.AbstractTerm
     t0: float
@@ -266,21 +268,25 @@ class _ComparedSystem(NamedTuple):
     args: Args
     phi: Callable[[RealScalarLike, Y, Args], ArrayLike] | None
 
-    def batch(self, solver: diffrax.AbstractSolver, make_path: Callable) -> Callable:
-        """The results of paths as a function of their keys and the step size."""
+    def solve_batch(
+        self, solver: diffrax.AbstractSolver, make_path: Callable
+    ) -> Callable[[PRNGKeyArray, Array], PathResults]:
+        """The function of the keys of paths and the step size that solves for these paths,
+        compiled. `make_path` is as for `with_paths`."""
         terms, t0, t1, y0, args, phi = self
-        # Terms that share a path share it again.
+        # Terms that share a path share a path again.
         numbers = path_numbers(random_paths(terms))
 
         @eqx.filter_jit
         @lapack_in_turn
         @ft.partial(jax.vmap, in_axes=(0, None))
         def results(key: PRNGKeyArray, dt: Array) -> PathResults:
-            # Paths fail where a step has no solution, and are counted.
-            own = without_truncation(with_paths(make_path, numbers, terms, key))
-            check_stratonovich(own, solver, t0, y0, args)
+            # Increments are not truncated: paths fail where a step has no solution, and are
+            # counted.
+            own_terms = without_truncation(with_paths(make_path, numbers, terms, key))
+            check_stratonovich(own_terms, solver, t0, y0, args)
             sol = diffrax.diffeqsolve(
-                own, solver, t0, t1, dt, y0, args, max_steps=None,
+                own_terms, solver, t0, t1, dt, y0, args, max_steps=None,
                 adjoint=diffrax.ForwardMode(), throw=False,
             )  # fmt: skip
             y1 = jtu.tree_map(lambda y: y[-1], sol.ys)
@@ -290,40 +296,51 @@ class _ComparedSystem(NamedTuple):
         return results
 
 
-def strong_error(out: PathResults, fine: PathResults) -> _Measured:
+def strong_error(compared: PathResults, exact: PathResults) -> _MeasuredError:
     """The root mean square of the difference over the paths that both solvers finish, and
     the number of paths that either does not finish."""
-    okay = np.asarray(out.okay & fine.okay)
+    okay = np.asarray(compared.okay & exact.okay)
 
-    def squared_difference(y: Array, exact: Array) -> np.ndarray:
-        return np.asarray(y - exact, np.float64).reshape(len(okay), -1) ** 2
+    def squared_differences(y: Array, exact_y: Array) -> np.ndarray:
+        return np.asarray(y - exact_y, np.float64).reshape(len(okay), -1) ** 2
 
-    each = jtu.tree_map(squared_difference, out.results, fine.results)
-    squares = np.concatenate(jtu.tree_leaves(each), axis=1).sum(axis=1)
-    mean, std_error = _mean(squares, okay)
-    # Without an error there is no relative one: 0 / 0 is NaN.
+    # (paths, entries) for each leaf of the state
+    leaves = jtu.tree_leaves(
+        jtu.tree_map(squared_differences, compared.results, exact.results)
+    )
+    squares = np.concatenate(leaves, axis=1).sum(axis=1)
+    mean_square, std_error = _mean_and_std_error(squares, okay)
+    # If there is no difference at all, 0 / 0 makes the standard error NaN.
     with np.errstate(all="ignore"):
-        rms = np.sqrt(mean)
-        # By the derivative of the square root.
-        of_rms = std_error / (2 * rms)
-    return _Measured(float(rms), float(of_rms), int(np.sum(~okay)))
+        rms = np.sqrt(mean_square)
+        # The derivative of the square root is 1 / (2 sqrt).
+        std_error_of_rms = std_error / (2 * rms)
+    return _MeasuredError(
+        error=float(rms),
+        std_error=float(std_error_of_rms),
+        num_failed=int(np.sum(~okay)),
+    )
 
 
-def weak_error(out: PathResults, fine: PathResults) -> _Measured:
-    """The difference of the means, and the number of failed paths of the first."""
-    mean, std_error = _mean(*out)
-    exact, other = _mean(*fine)
-    # Both are from independent paths, so that variances add up.
-    both = math.hypot(std_error, other)
-    return _Measured(abs(mean - exact), both, int(np.sum(~np.asarray(out.okay))))
+def weak_error(compared: PathResults, exact: PathResults) -> _MeasuredError:
+    """The difference of the means, and the number of failed paths of the compared
+    solver."""
+    mean, std_error = _mean_and_std_error(compared.results, compared.okay)
+    exact_mean, exact_std_error = _mean_and_std_error(exact.results, exact.okay)
+    return _MeasuredError(
+        error=abs(mean - exact_mean),
+        # Both means are from independent paths, so their variances add up.
+        std_error=math.hypot(std_error, exact_std_error),
+        num_failed=int(np.sum(~np.asarray(compared.okay))),
+    )
 
 
-def _mean(x: Any, okay: Any) -> tuple[float, float]:
-    """The mean of the values that are `okay`, and its standard error."""
+def _mean_and_std_error(values: Any, okay: Any) -> tuple[float, float]:
+    """The mean of the values of paths that are `okay`, and its standard error."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
         # If no path is left, the mean is NaN, and the number of failures tells why.
         warnings.simplefilter("ignore", RuntimeWarning)
-        kept = np.asarray(x, np.float64)[np.asarray(okay)]
+        kept = np.asarray(values, np.float64)[np.asarray(okay)]
         return float(np.mean(kept)), float(np.std(kept) / np.sqrt(len(kept)))
 
 
@@ -339,12 +356,12 @@ def _check_solvers(solvers: Any, reference: Any) -> None:
 def _check_scalar(phi: Any, t: RealScalarLike, y0: Y, args: Args) -> None:
     """Raises a `ValueError` unless `phi` returns one real number."""
     check_takes("phi", phi, "t", "y", "args")
-    out = eqx.filter_eval_shape(phi, jnp.asarray(t, float), y0, args)
-    leaves = jtu.tree_leaves(out)
+    result = eqx.filter_eval_shape(phi, jnp.asarray(t, float), y0, args)
+    leaves = jtu.tree_leaves(result)
     check_real("phi", leaves)
-    one_number = len(leaves) == 1 and jnp.shape(leaves[0]) == ()
-    if not one_number:
-        raise ValueError(f"`phi` must return one number; got shape {shapes(out)}.")
+    is_one_number = len(leaves) == 1 and jnp.shape(leaves[0]) == ()
+    if not is_one_number:
+        raise ValueError(f"`phi` must return one number; got shape {shapes(result)}.")
 
 
 def _steps_as_floats(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
@@ -355,8 +372,9 @@ def _steps_as_floats(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
     if np.ndim(dts) != 1 or len(dts) == 0:
         raise ValueError(f"`dt0` must be a list of step sizes; got {dts!r}.")
     for dt in dts:
-        # First, since nothing can be divided by zero.
-        if not dt or not _is_whole((t1 - t0) / dt) or not _is_whole(dt / min(dts)):
+        # Zero comes first, since nothing can be divided by it.
+        is_allowed = dt != 0 and _is_whole((t1 - t0) / dt) and _is_whole(dt / min(dts))
+        if not is_allowed:
             raise ValueError(
                 f"Every step in `dt0` must divide the interval from {t0} to {t1} and be a "
                 f"multiple of the smallest; got {dt}. Take for example "
@@ -366,5 +384,5 @@ def _steps_as_floats(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
 
 
 def _is_whole(x: float) -> bool:
-    """Whether this is a positive whole number, up to the rounding of a quotient."""
+    """Whether this quotient is a positive whole number, up to rounding."""
     return math.isfinite(x) and x > 0.5 and abs(x - round(x)) < 1e-6

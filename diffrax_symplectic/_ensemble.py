@@ -31,11 +31,12 @@ from ._solver import Want
 from ._terms import path_keys, which_are_shapes, with_keys
 
 
-# Entries of all states in a batch: enough to keep every core busy, in tens of megabytes.
+# The number of entries of all states in a batch: enough to keep every core busy, in tens of
+# megabytes.
 _ENTRIES = {"jax": 2**17, "drjit": 2**20}
-# Accelerators need this many times as many.
+# Accelerators need this many times as many entries.
 _MORE_ON_ACCELERATORS = 16
-# The fewest paths in a batch, however large their states, so that batches are few.
+# The fewest paths in a batch, however large their states are, so that batches are few.
 _FEWEST_PATHS = 256
 
 
@@ -81,8 +82,8 @@ class Ensemble(eqx.Module):
 def _words(number: IntScalarLike) -> tuple[ArrayLike, ArrayLike]:
     """The upper and the lower 32 bits of the number of a path. Raises a `ValueError`
     unless it is an integer that is not negative, as far as that is known."""
-    is_one = eqx.is_array_like(number) and jnp.shape(number) == ()
-    if not is_one or not jnp.issubdtype(jnp.result_type(number), jnp.integer):
+    is_scalar = eqx.is_array_like(number) and jnp.shape(number) == ()
+    if not is_scalar or not jnp.issubdtype(jnp.result_type(number), jnp.integer):
         raise ValueError(
             f"`number` must be one integer, 0 or larger; got {brief(number)}. For several "
             "paths, batch over their numbers: `jax.vmap(paths.start)(numbers)`."
@@ -91,7 +92,7 @@ def _words(number: IntScalarLike) -> tuple[ArrayLike, ArrayLike]:
         high, low = divmod(whole_number("number", int(number), least=0), 2**32)
         return np.uint32(high), np.uint32(low)
     traced = jnp.asarray(number)
-    # Of a number with fewer bits the upper ones are zero.
+    # If the number has 32 bits or fewer, the shift gives zero.
     return (traced >> 32).astype(jnp.uint32), traced.astype(jnp.uint32)
 
 
@@ -188,68 +189,74 @@ def ensemble(
         ts=[t1] if ts is None else ts,
         levels=1,
         want=want,
-        user="ensemble",
+        caller="ensemble",
     )
     if want == "strong" and any(which_are_shapes(terms)):
         check_gaussian(solver)
     warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
     if batch_size is None:
-        batch_size = _default_size(engine, problem)
-    size = whole_number("batch_size", batch_size)
+        batch_size = _default_batch_size(engine, problem)
+    batch_size = min(whole_number("batch_size", batch_size), num_paths)
 
-    paths_by = ENGINES[engine]
+    simulate_batch = ENGINES[engine]
     batches = []
-    for begin in range(0, num_paths, size):
-        # JAX compiles for one batch size: the last batch is cut afterwards.
-        remaining = num_paths if engine == "jax" else num_paths - begin
-        n = min(size, remaining)
-        sample_numbers = np.arange(begin, begin + n, dtype=np.uint64)
-        batches.append(paths_by(problem, key, sample_numbers))
-    joined = _join(batches, num_paths, at_end=ts is None)
-    _warn_of(joined, problem.bounded)
+    for first in range(0, num_paths, batch_size):
+        # JAX compiles for one batch size: surplus paths of the last batch are cut
+        # afterwards.
+        size = batch_size
+        if engine != "jax":
+            size = min(batch_size, num_paths - first)
+        sample_numbers = np.arange(first, first + size, dtype=np.uint64)
+        batches.append(simulate_batch(problem, key, sample_numbers))
+    joined = _joined(batches, num_paths, at_end=ts is None)
+    _warn_of_failures(joined, problem.bounded)
+    # The times of the steps, from which the times of the user differ by rounding errors.
     saved_steps = np.asarray(problem.levels.saved_steps[0])
+    saved_times = float(problem.t0) + saved_steps * float(problem.levels.h[0])
     return Ensemble(
-        ts=float(problem.t0) + saved_steps * float(problem.levels.h[0]),
+        ts=saved_times,
         ys=joined.y,
         failed=joined.failed,
-        num_stragglers=joined.stragglers,
+        num_stragglers=joined.num_stragglers,
         engine=engine,
         _problem=problem,
         _key=key,
     )
 
 
-def _default_size(engine: str, problem: Problem) -> int:
-    """The number of paths in a batch."""
-    entries = _ENTRIES[engine]
+def _default_batch_size(engine: str, problem: Problem) -> int:
+    """The number of paths in a batch if the user does not say it."""
+    entries_of_batch = _ENTRIES[engine]
     if jax.default_backend() != "cpu":
-        entries *= _MORE_ON_ACCELERATORS
-    of_path = sum(leaf.size for leaf in jtu.tree_leaves(problem.y0))
-    return max(_FEWEST_PATHS, entries // of_path)
+        entries_of_batch *= _MORE_ON_ACCELERATORS
+    entries_of_path = sum(leaf.size for leaf in jtu.tree_leaves(problem.y0))
+    return max(_FEWEST_PATHS, entries_of_batch // entries_of_path)
 
 
-def _join(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
-    """All batches as one, cut to this number of paths, with NaN as states of failed ones.
-    Without the axis of times if the states were wanted `at_end` only."""
+def _joined(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
+    """All batches as one, cut to this number of paths, with NaN for the states of failed
+    paths. Without the axis of times if the states were wanted `at_end` only."""
     failed = np.concatenate([batch.failed for batch in batches])[:num_paths]
 
-    def join(*parts: np.ndarray) -> np.ndarray:
-        states = np.concatenate(parts)[:num_paths]
+    def join(*leaves: np.ndarray) -> np.ndarray:
+        # (paths, times, ...)
+        states = np.concatenate(leaves)[:num_paths]
         states[failed] = np.nan
         return states[:, 0] if at_end else states
 
     y = jtu.tree_map(join, *[batch.y for batch in batches])
-    return Batch(y, failed, sum(batch.stragglers for batch in batches))
+    return Batch(y, failed, sum(batch.num_stragglers for batch in batches))
 
 
-def _warn_of(joined: Batch, bounded: bool) -> None:
-    """Warns of failed paths and of many stragglers."""
-    count = len(joined.failed)
-    lost = int(np.sum(joined.failed))
-    if lost > 0:
+def _warn_of_failures(joined: Batch, bounded: bool) -> None:
+    """Warns of failed paths and of many stragglers. `bounded` is as for
+    `advice_on_failures`."""
+    num_paths = len(joined.failed)
+    num_failed = int(np.sum(joined.failed))
+    if num_failed > 0:
         warnings.warn(
-            f"{lost:,} of {count:,} paths failed. Their states are NaN: select the others "
-            f"with `~failed`. {advice_on_failures(bounded)}",
+            f"{num_failed:,} of {num_paths:,} paths failed. Their states are NaN: select "
+            f"the others with `~failed`. {advice_on_failures(bounded)}",
             stacklevel=3,
         )
-    warn_of_stragglers(joined.stragglers, lost, count, stacklevel=3)
+    warn_of_stragglers(joined.num_stragglers, num_failed, num_paths, stacklevel=3)

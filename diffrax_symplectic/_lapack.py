@@ -74,40 +74,41 @@ class _Turns:
     """Evaluates a program in which each call of LAPACK waits for the one before."""
 
     def __init__(self):
-        # The results of the last call.
-        self._before: Sequence[Any] = ()
+        # The results of the last call of LAPACK so far.
+        self._results_before: Sequence[Any] = ()
 
     def run(self, program: Jaxpr | ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
-        """The results of a program."""
+        """The results of a program for these arguments."""
         jaxpr = getattr(program, "jaxpr", program)
         consts = getattr(program, "consts", [])
         values = dict(zip(jaxpr.constvars, consts)) | dict(zip(jaxpr.invars, args))
 
-        def read(x: Any) -> Any:
-            return x.val if isinstance(x, Literal) else values[x]
+        def value_of(atom: Any) -> Any:
+            return atom.val if isinstance(atom, Literal) else values[atom]
 
         for eqn in jaxpr.eqns:
-            outs = self._results(eqn, [read(x) for x in eqn.invars])
-            values.update(zip(eqn.outvars, outs))
-        return [read(x) for x in jaxpr.outvars]
+            results = self._results(eqn, [value_of(atom) for atom in eqn.invars])
+            values.update(zip(eqn.outvars, results))
+        return [value_of(atom) for atom in jaxpr.outvars]
 
     def _results(self, eqn: Any, args: list[Any]) -> Sequence[Any]:
-        """The results of one operation. If LAPACK has a part in it, it waits for the last
-        one that LAPACK had a part in."""
+        """The results of one operation. An operation that calls LAPACK waits for the last
+        one before that did."""
         name = eqn.primitive.name
         if not _calls_lapack(eqn):
             return bound(eqn, args, eqn.params)
         if name in _CALLS:
             return self.run(eqn.params[_CALLS[name]], args)
         if name == "custom_linear_solve":
-            return self.run(*_solve_of(eqn, args))
-        # A loop waits as a whole, and so does what comes after it.
-        args = _after(self._before, args)
+            solve, args_of_solve = _program_of_linear_solve(eqn, args)
+            return self.run(solve, args_of_solve)
+        # A loop as a whole waits for the call before, and the next call for the loop.
+        args = _after(self._results_before, args)
         params = eqn.params
         if name in _CONTROL_FLOW:
             params = _with_turns_inside(params)
-        self._before = bound(eqn, args, params)
-        return self._before
+        self._results_before = bound(eqn, args, params)
+        return self._results_before
 
 
 def _calls_lapack(eqn: Any) -> bool:
@@ -118,46 +119,50 @@ def _calls_lapack(eqn: Any) -> bool:
     return any(map(_calls_lapack, inner_eqns))
 
 
-def _after(before: Sequence[Any], args: list[Any]) -> list[Any]:
-    """`args`, which XLA cannot know before all of `before`."""
-    if len(before) == 0:
+def _after(results_before: Sequence[Any], args: list[Any]) -> list[Any]:
+    """`args`, with the same values, but computed from all of `results_before`, too."""
+    if len(results_before) == 0:
         return args
-    # Always false, which XLA does not see. A barrier alone does not suffice: XLA removes it
-    # before it looks which operations can run side by side.
-    wait = lax.optimization_barrier(jnp.array(False))
-    for x in before:
+    # `never` is false, which XLA does not see. A barrier alone does not suffice: XLA
+    # removes it before it looks which operations can run side by side.
+    never = lax.optimization_barrier(jnp.array(False))
+    for x in results_before:
         if _is_plain(x):
-            wait = wait & (jnp.ravel(x)[0] != 0)
-    return [_where(wait, x) if _is_plain(x) else x for x in args]
+            never = never & (jnp.ravel(x)[0] != 0)
+    return [_zeros_if(never, x) if _is_plain(x) else x for x in args]
 
 
 def _is_plain(x: Any) -> bool:
-    """Whether this is an array of numbers with an entry, and not of random keys."""
-    return jnp.size(x) > 0 and not jnp.issubdtype(
-        jnp.result_type(x), jax.dtypes.extended
-    )
+    """Whether this is an array of numbers, not of random keys, with at least one entry."""
+    is_extended = jnp.issubdtype(jnp.result_type(x), jax.dtypes.extended)
+    return jnp.size(x) > 0 and not is_extended
 
 
-def _where(wait: Bool[Array, ""], x: Any) -> Array:
-    return jnp.where(wait, jnp.zeros_like(x), x)
+def _zeros_if(condition: Bool[Array, ""], x: Any) -> Array:
+    return jnp.where(condition, jnp.zeros_like(x), x)
 
 
-def _solve_of(eqn: Any, args: list[Any]) -> tuple[ClosedJaxpr, list[Any]]:
+def _program_of_linear_solve(
+    eqn: Any, args: list[Any]
+) -> tuple[ClosedJaxpr, list[Any]]:
     """The program that `lax.custom_linear_solve` calls, and its arguments."""
+    # The arguments of the operation are the constants of four functions, of which `solve`
+    # is the third, and the right-hand side.
     lengths = eqn.params["const_lengths"]
-    # The constants of four functions, `solve` the third of them, and the right-hand side.
-    first = lengths.matvec + lengths.vecmat
+    begin = lengths.matvec + lengths.vecmat
+    constants_of_solve = args[begin : begin + lengths.solve]
     rhs = args[sum(lengths) :]
-    return eqn.params["jaxprs"].solve, [*args[first : first + lengths.solve], *rhs]
+    return eqn.params["jaxprs"].solve, [*constants_of_solve, *rhs]
 
 
 def _with_turns_inside(params: dict[str, Any]) -> dict[str, Any]:
-    """The parameters of an operation, with calls in turn in all programs among them."""
+    """The parameters of an operation. In all programs among them, each call of LAPACK waits
+    for the one before."""
 
-    def in_turn(x: Any) -> Any:
-        if not isinstance(x, ClosedJaxpr):
-            return x
-        shapes = [variable.aval for variable in x.jaxpr.invars]
-        return jax.make_jaxpr(lambda *args: _Turns().run(x, args))(*shapes)
+    def in_turn(param: Any) -> Any:
+        if not isinstance(param, ClosedJaxpr):
+            return param
+        structs = [variable.aval for variable in param.jaxpr.invars]
+        return jax.make_jaxpr(lambda *args: _Turns().run(param, args))(*structs)
 
     return jtu.tree_map(in_turn, params, is_leaf=is_program)

@@ -61,11 +61,12 @@ from ._terms import (
 )
 
 
-# The most that a higher order may cost. At the cost of a hundred steps of the midpoint
-# rule, `NinomiyaVictoir` had 0.1, 0.16, 0.14 and 1.2 times its error for 2, 3, 4 and 6
-# noises of linear systems with two or three degrees of freedom; 12 is its cost for four.
+# The most stage vectors that a step of higher order may solve for. At the cost of a hundred
+# steps of the midpoint rule, `NinomiyaVictoir` had 0.1, 0.16, 0.14 and 1.2 times its error
+# for 2, 3, 4 and 6 noises of linear systems with two or three degrees of freedom. It solves
+# for 12 stage vectors with four noises.
 _MOST_STAGE_VECTORS = 12
-# For baths whose Hamiltonian is quadratic in the momenta, and otherwise any.
+# The solver for a heat bath whose Hamiltonian is any that is quadratic in the momenta.
 _BATH_OF_ANY_ENERGY = BAOAB(ImplicitMidpoint())
 
 
@@ -112,13 +113,14 @@ class Suggestions(Sequence[Suggestion]):
 
     def __str__(self) -> str:
         lines = textwrap.wrap(self.system, 88)
-        for number, s in enumerate(self, start=1):
-            strong = "" if s.strong_order is None else f", strong {s.strong_order:g}"
-            orders = f"weak order {s.weak_order:g}{strong}"
-            lines.append(f"{number}. {_code(s.solver):20} {orders}")
-            lines.append(f"   path: {s.path}")
+        for number, suggestion in enumerate(self, start=1):
+            orders = f"weak order {suggestion.weak_order:g}"
+            if suggestion.strong_order is not None:
+                orders += f", strong {suggestion.strong_order:g}"
+            lines.append(f"{number}. {_code(suggestion.solver):20} {orders}")
+            lines.append(f"   path: {suggestion.path}")
             lines += textwrap.wrap(
-                s.reason, 88, initial_indent="   ", subsequent_indent="   "
+                suggestion.reason, 88, initial_indent="   ", subsequent_indent="   "
             )
         return "\n".join(lines)
 
@@ -175,7 +177,7 @@ def suggest_solver(
     # Any path serves to inspect the terms.
     given_terms = with_paths_for_shapes(terms, WeakBrownianPath)
     terms = without_constraint(given_terms)
-    drift, noise = _parts(terms)
+    drift, noise = _drift_and_noise(terms)
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
     check_fit(terms, t0, y0, args)
@@ -189,16 +191,23 @@ def suggest_solver(
 
     numbers = path_numbers(random_paths(terms))
 
-    # Solvers make paths without knowing what they drive.
+    # Solvers make paths without knowing what they drive, so some are truncated needlessly.
     needed = which_need_truncation(terms, t0, y0, args)
 
-    def terms_with(make: Callable) -> jtu.Partial:
-        """A function of a key: the terms with paths made by `make`."""
-        with_own = ft.partial(_terms_with, make, numbers, needed)
-        return jtu.Partial(with_own, given_terms)
+    def terms_with(make_path: Callable) -> jtu.Partial:
+        """The function of a key that returns the terms with paths made by `make_path`."""
+        fill = ft.partial(_terms_with_paths, make_path, numbers, needed)
+        return jtu.Partial(fill, given_terms)
 
-    found = tuple(
-        _suggestion(solver, want, terms, system.commute, any(needed), terms_with)
+    suggestions = tuple(
+        _suggestion(
+            solver,
+            want,
+            terms,
+            commute=system.commute,
+            needs_bounded=any(needed),
+            terms_with=terms_with,
+        )
         for solver in solvers
     )
     description = f"For {want} approximation. {system.in_a_sentence()}"
@@ -207,33 +216,35 @@ def suggest_solver(
             " Its `diffrax.UnsafeBrownianPath` rounds times to 32 bits and repeats its "
             "noise late in a run (Diffrax issue 733): use one of the paths below."
         )
-    return Suggestions(description, found)
+    return Suggestions(description, suggestions)
 
 
-def _terms_with(
-    make: Callable,
+def _terms_with_paths(
+    make_path: Callable,
     numbers: tuple[int, ...],
     needed: tuple[bool, ...],
     terms: diffrax.AbstractTerm,
     key: PRNGKeyArray,
 ) -> diffrax.AbstractTerm:
-    """`with_paths`, truncated only where it is `needed`."""
-    needless = [not need for need in needed]
-    return without_truncation(with_paths(make, numbers, terms, key), needless)
+    """The terms with paths made by `make_path` for this key, truncated only where that is
+    `needed`."""
+    needless = [not is_needed for is_needed in needed]
+    filled = with_paths(make_path, numbers, terms, key)
+    return without_truncation(filled, needless)
 
 
 class _System(NamedTuple):
     """What decides which solvers suit a system.
 
-    - `structures`: those that it has.
+    - `structures`: the structures that it has.
     - `fault`: why it is not separable; `None` if it is.
     - `num_noises`: the number of its scalar Brownian motions.
-    - `commute`: whether they commute, as far as is known.
+    - `commute`: whether these commute, as far as is known.
     - `friction`: whether it has friction that solvers for heat baths, such as `BAOAB()`,
         treat by a step of its own.
-    - `general_bath`: whether only `BAOAB` with the midpoint rule for its flow does, as for
-        masses that depend on positions.
-    - `constrained`: whether its positions are.
+    - `general_bath`: whether it has friction that only `BAOAB(ImplicitMidpoint())` treats
+        by a step of its own, as for masses that depend on positions.
+    - `constrained`: whether its positions are constrained.
     """
 
     structures: list[Structure]
@@ -245,33 +256,34 @@ class _System(NamedTuple):
     constrained: bool
 
     def in_a_sentence(self) -> str:
-        """The structure of the system, for users."""
-        noises = "one noise"
+        """The structure of the system, such as "The system is separable, with friction and
+        one noise.", and what the user could change to have more solvers."""
+        parts = "one noise"
         if self.num_noises > 1:
             how = "commute" if self.commute else "do not commute"
-            noises = f"{self.num_noises} noises that {how}"
+            parts = f"{self.num_noises} noises that {how}"
         if self.friction or self.general_bath:
-            noises = f"friction and {noises}"
+            parts = f"friction and {parts}"
         if self.constrained:
-            noises = f"constraints, {noises}"
+            parts = f"constraints, {parts}"
         fault = self.fault
         reason = "" if fault is None else fault.reason
-        kind = " and ".join(self.structures) or f"general ({reason})"
-        sentence = f"The system is {kind}, with {noises}."
+        structure = " and ".join(self.structures) or f"general ({reason})"
+        description = f"The system is {structure}, with {parts}."
         if fault is None or self.friction:
-            return sentence
+            return description
         # A user who reads this may want one of the solvers that are not suggested.
         if self.structures and fault.wrong_way_round:
-            sentence += f" It is not separable: {reason}."
+            description += f" It is not separable: {reason}."
         if fault.friction:
-            sentence += f" {FRICTION}"
-        return sentence
+            description += f" {FRICTION}"
+        return description
 
 
 def _inspect(
     drift: Terms, noise: Terms, t0: Array, y0: Y, args: Args, constrained: bool
 ) -> _System:
-    """The system, by tracing its terms."""
+    """The structure of the system, found by tracing its terms."""
     fault = separable_fault(drift, noise, t0, y0, args)
     structures: list[Structure] = [] if fault else ["separable"]
     if additive_fault(noise, t0, y0, args) is None:
@@ -281,19 +293,20 @@ def _inspect(
     terms = diffrax.MultiTerm(*drift, *noise)
     num_noises = number_of_noises(terms)
     # Noise in the forces commutes, whatever the drift is.
-    in_forces = separable_fault((), noise, t0, y0, args) is None
-    # At random states only if nothing else decides, since that compiles a program.
+    noise_in_forces = separable_fault((), noise, t0, y0, args) is None
+    # Noises are compared at random states only if nothing else decides, since that compiles
+    # a program.
     commute = (
         num_noises == 1
         or len(structures) > 0
-        or in_forces
+        or noise_in_forces
         or noises_commute(noise, t0, y0, args)
     )
-    _, our_friction = friction_apart(drift)
+    _, friction_terms = friction_apart(drift)
     friction = takes_friction_apart(terms, t0, y0, args, BAOAB())
     general_bath = (
         not friction
-        and len(our_friction) > 0
+        and len(friction_terms) > 0
         and not constrained
         and takes_friction_apart(terms, t0, y0, args, _BATH_OF_ANY_ENERGY)
     )
@@ -314,15 +327,16 @@ def _suitable(
     paths: list[diffrax.AbstractBrownianPath],
     one_term: bool,
 ) -> list[AbstractSymplecticSolver]:
-    """The solvers for a system, best first. `paths` are those of its noises, and
-    `one_term` says whether one term holds all of these."""
+    """The solvers for a system, best first. `paths` are the paths of its noises, and
+    `one_term` says whether one term holds all noises. Raises a `ValueError` if no solver
+    keeps the constraints of the system."""
     solvers = ranked(
         want,
         system.structures,
-        system.commute,
-        system.num_noises,
-        system.friction,
-        system.general_bath,
+        commute=system.commute,
+        num_noises=system.num_noises,
+        friction=system.friction,
+        general_bath=system.general_bath,
     )
     if system.constrained:
         solvers = [solver for solver in solvers if solver.keeps_constraints]
@@ -337,9 +351,14 @@ def _suitable(
     if not one_term or not jtu.all_leaves([increment_struct(paths[0])]):
         # Lévy areas are only sampled between the noises of one array.
         solvers = [solver for solver in solvers if not _needs_areas(solver)]
-    # No other path can take the place of these.
-    given = [path for path in paths if not is_random(path) or has_unknown_law(path)]
-    return [solver for solver in solvers if all(_holds(path, solver) for path in given)]
+    # No path of a solver can take the place of given noise, or of a path whose law is not
+    # known.
+    kept = [path for path in paths if not is_random(path) or has_unknown_law(path)]
+    return [
+        solver
+        for solver in solvers
+        if all(_has_variables_for(path, solver) for path in kept)
+    ]
 
 
 def _needs_areas(solver: AbstractSymplecticSolver) -> bool:
@@ -347,16 +366,18 @@ def _needs_areas(solver: AbstractSymplecticSolver) -> bool:
     return "noise brackets" in map(drives, solver.variables)
 
 
-def _holds(
+def _has_variables_for(
     path: diffrax.AbstractBrownianPath, solver: AbstractSymplecticSolver
 ) -> bool:
     """Whether a given path has the random variables that the solver needs."""
-    area = getattr(path, "levy_area", diffrax.AbstractBrownianIncrement)
-    return solver.variables == ("W",) or issubclass(area, solver.minimal_levy_area)
+    # The class of increments, by the name that paths of Diffrax have for it.
+    increment = getattr(path, "levy_area", diffrax.AbstractBrownianIncrement)
+    return solver.variables == ("W",) or issubclass(increment, solver.minimal_levy_area)
 
 
-def _parts(terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
-    """Drift and noise terms. Raises a `ValueError` if a noise has no Brownian path."""
+def _drift_and_noise(terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
+    """The drift terms and the noise terms. Raises a `ValueError` if there is no noise, or
+    a noise has no Brownian path."""
     advice = (
         "Pass the terms of a Stratonovich system, `hamiltonian_terms(H0, noise, path)` or "
         "`MultiTerm(ODETerm(f), ControlTerm(g, path))`, with a Brownian path"
@@ -379,7 +400,7 @@ def takes_friction_apart(
     args: Args,
     solver: BAOAB,
 ) -> bool:
-    """Whether these are Langevin terms that a `BAOAB` accepts."""
+    """Whether these are Langevin terms that this `BAOAB` accepts."""
     try:
         solver.check(terms, t0, y0, args)
     except ValueError:
@@ -396,31 +417,38 @@ def ranked(
     general_bath: bool = False,
 ) -> list[AbstractSymplecticSolver]:
     """The suggested solvers for systems of these structures (`"any"` is implied) and with
-    such noises, best first. `friction` says that the terms are Langevin terms, whose other
-    terms are separable, and `general_bath` that they are others of this kind."""
+    such noises, best first. `friction` and `general_bath` are as in `_System`."""
     structures = {"any", *structures}
     if {"separable", "constant"} <= structures:
         structures.add("separable and constant")
 
     def rank(solver: AbstractSymplecticSolver) -> tuple[Any, ...]:
-        """What to sort by: the smallest tuple is the best solver."""
+        """What to sort by: the best solver has the smallest tuple."""
         record = _record(solver)
         order = record.order(want, commute)
         assert order is not None
-        # In a heat bath most means are stationary ones, of positions.
+        # In a heat bath most means are stationary means of functions of positions.
         wants_stationary = friction and want == "weak"
-        inexact = wants_stationary and "qq" not in record.stationary
-        systems = solver.stage_vectors(num_noises)
+        is_inexact = wants_stationary and "qq" not in record.stationary
+        # The sizes of the systems of equations of a step.
+        stage_vectors = solver.stage_vectors(num_noises)
         # In a separable system only half of the state is solved for.
-        cost = sum(systems) / (2 if solver.structure == "separable" else 1)
-        too_many = cost > _MOST_STAGE_VECTORS
-        wrong_on_stiff_modes = record.heats is False
-        largest = max(systems, default=0)
-        return inexact, too_many, -order, wrong_on_stiff_modes, cost, largest
+        cost = sum(stage_vectors) / (2 if solver.structure == "separable" else 1)
+        is_costly = cost > _MOST_STAGE_VECTORS
+        is_wrong_on_stiff_modes = record.heats is False
+        largest_system = max(stage_vectors, default=0)
+        return (
+            is_inexact,
+            is_costly,
+            -order,
+            is_wrong_on_stiff_modes,
+            cost,
+            largest_system,
+        )
 
     noises = ("any", "commuting" if commute else "not commuting")
 
-    def fits(solver: AbstractSymplecticSolver) -> bool:
+    def is_suggested(solver: AbstractSymplecticSolver) -> bool:
         record = _record(solver)
         return want in record.suggested and record.noises in noises
 
@@ -428,8 +456,8 @@ def ranked(
     solvers = [solver for solver in all_solvers if solver.structure in structures]
     if friction:
         solvers += [kind() for kind in LANGEVIN]
-    best = sorted(filter(fits, solvers), key=rank)
-    return [_BATH_OF_ANY_ENERGY, *best] if general_bath else best
+    best_first = sorted(filter(is_suggested, solvers), key=rank)
+    return [_BATH_OF_ANY_ENERGY, *best_first] if general_bath else best_first
 
 
 def _record(solver: AbstractSymplecticSolver) -> Record:
@@ -438,11 +466,12 @@ def _record(solver: AbstractSymplecticSolver) -> Record:
 
 
 def _code(solver: AbstractSymplecticSolver, module: str = "") -> str:
-    """The code that constructs the solver."""
-    given = ""
+    """The code that constructs the solver, such as `BAOAB(ImplicitMidpoint())`, with the
+    prefix `module` for each name."""
+    flow = ""
     if isinstance(solver, BAOAB) and is_solver(solver.flow):
-        given = _code(solver.flow, module)  # pyright: ignore
-    return f"{module}{type(solver).__name__}({given})"
+        flow = _code(solver.flow, module)  # pyright: ignore
+    return f"{module}{type(solver).__name__}({flow})"
 
 
 def _suggestion(
@@ -450,38 +479,39 @@ def _suggestion(
     want: Want,
     terms: diffrax.AbstractTerm,
     commute: bool,
-    bounded: bool,
+    needs_bounded: bool,
     terms_with: Callable,
 ) -> Suggestion:
-    """The suggestion of this solver. `bounded` is whether implicit steps need bounded
-    increments. `terms_with(make)` returns, as a function of a key, the terms with paths
-    that are made by `make`."""
+    """The suggestion of this solver. `needs_bounded` is whether implicit steps need bounded
+    increments. `terms_with(make_path)` returns, as a function of a key, the terms with
+    paths that are made by `make_path`."""
     record = _record(solver)
     random = random_paths(terms)
     replaced = [path for path in random if not has_unknown_law(path)]
     if replaced:
         struct = increment_struct(replaced[0])
         shape = _shape_code(struct)
-        code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
+        path_code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
         made = solver.path(struct, jr.key(0), want=want)
-        if isinstance(made, TruncatedBrownianPath) and not bounded:
-            code = f"ds.FixedStepBrownianPath({shape}, key)"
+        if isinstance(made, TruncatedBrownianPath) and not needs_bounded:
+            path_code = f"ds.FixedStepBrownianPath({shape}, key)"
     elif random:
-        code = f"the `{type(random[0]).__name__}` of the terms, with another key"
+        path_code = f"the `{type(random[0]).__name__}` of the terms, with another key"
     else:
-        code = "the path of the terms, which holds given noise"
+        path_code = "the path of the terms, which holds given noise"
     return Suggestion(
         solver=solver,
         weak_order=cast(int, record.order("weak", commute)),
         strong_order=record.order("strong", commute),
-        path=code,
+        path=path_code,
         reason=record.reason,
         terms=terms_with(ft.partial(solver.path, want=want)),
     )
 
 
 def _shape_code(shape: PyTree[jax.ShapeDtypeStruct]) -> str:
-    """The code for the shape of a path."""
+    """The code for the shape of a path, such as `(3,)`."""
+    # A PyTree of shapes has no short code.
     if not isinstance(shape, jax.ShapeDtypeStruct):
         return "shape"
     if shape.dtype == jnp.result_type(float):

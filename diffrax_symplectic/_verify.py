@@ -35,7 +35,7 @@ from ._terms import (
 
 def _one_step(terms, solver, t0, t1, y0, args) -> tuple[Y, diffrax.RESULTS]:
     """The end of one step, and whether it succeeded."""
-    # Not by `diffrax.diffeqsolve`, whose loop takes longer to trace than the step.
+    # `diffrax.diffeqsolve` is not used: its loop takes longer to trace than the step.
     solver_state = solver.init(terms, t0, t1, y0, args)
     y1, _, _, _, result = solver.step(
         terms, t0, t1, y0, args, solver_state, made_jump=False
@@ -88,32 +88,38 @@ def symplecticity_defect(
     jacobian, result = jax.jacrev(step, has_aux=True)(flat)
     # A failed step has no Jacobian to be judged.
     jacobian = result.error_if(jacobian, result != diffrax.RESULTS.successful)
+    # The first half of `flat` is p, the second q.
     half = flat.size // 2
     zero = np.zeros((half, half))
-    one = np.eye(half)
-    omega = jnp.asarray(np.block([[zero, one], [-one, zero]]), flat.dtype)
+    identity = np.eye(half)
+    omega = np.block([[zero, identity], [-identity, zero]])
+    omega = jnp.asarray(omega, flat.dtype)
     defect = _dot(jacobian.T, _dot(omega, jacobian)) - omega
     if constraint_of(terms) is not None:
-        # Columns: an orthonormal basis.
+        # The columns of Z are an orthonormal basis of the allowed directions.
         Z = _allowed_directions(terms, t0, y0, args)
         defect = _dot(Z.T, _dot(defect, Z))
     return jnp.max(jnp.abs(defect))
 
 
 def _allowed_directions(terms, t0, y0: Y, args: Args) -> Float[Array, "n k"]:
-    """An orthonormal basis of the directions along which a state can move that satisfies
-    constraint(q) = 0 and J v = 0."""
+    """An orthonormal basis, in columns, of the directions along which a state can move that
+    satisfies constraint(q) = 0 and J v = 0, with the Jacobian J of the constraint and the
+    velocities v."""
     surface = Surface.of(terms, t0, y0, args)
     flat, _ = jfu.ravel_pytree(y0)
 
     def equations(x):
+        """The left-hand sides of both equations, at the state `x`."""
         p, q = jnp.split(x, 2)
-        off, speed = jax.jvp(surface.residual, (q,), (surface.velocity(p),))
-        return jnp.concatenate([off, speed])
+        residual, J_v = jax.jvp(surface.residual, (q,), (surface.velocity(p),))
+        return jnp.concatenate([residual, J_v])
 
+    # The allowed directions are orthogonal to the gradients of the equations. Of the rows
+    # of V_transposed, the first ones span these gradients, and the others the rest.
     normals = jax.jacrev(equations)(flat)
-    _, _, V = jnp.linalg.svd(normals, full_matrices=True)
-    return V[len(normals) :].T
+    _, _, V_transposed = jnp.linalg.svd(normals, full_matrices=True)
+    return V_transposed[len(normals) :].T
 
 
 # By default accelerators multiply in half precision, which would look like a defect.
@@ -170,9 +176,11 @@ def poisson_defect(
     def matrix(rows: Array) -> Array:
         return rows.reshape(num_components, num_components)
 
-    # P(s) multiplies each row by a cross product, so it is never formed.
-    before = _dot(matrix(gradients), matrix(jnp.cross(s0, gradients)).T)
-    return jnp.max(jnp.abs(before - matrix(jnp.cross(s1, units)).T))
+    # P(s) is never formed: the cross products of s with the rows of a matrix are the
+    # columns of P(s) times the transposed matrix. J P(s0) J^T, and then P(s1):
+    transported = _dot(matrix(gradients), matrix(jnp.cross(s0, gradients)).T)
+    exact = matrix(jnp.cross(s1, units)).T
+    return jnp.max(jnp.abs(transported - exact))
 
 
 def equipartition(
@@ -231,14 +239,14 @@ def equipartition(
         force, velocity = rate(drift, t, y, args)
         n = sum(leaf.size for leaf in jtu.tree_leaves(q))
         return {
-            "kinetic": _inner(p, velocity) / n,
-            "configurational": -_inner(q, force) / n,
+            "kinetic": _inner_product(p, velocity) / n,
+            "configurational": -_inner_product(q, force) / n,
         }
 
     return phi
 
 
-def _inner(a: PyTree[Array], b: PyTree[Array]) -> Any:
+def _inner_product(a: PyTree[Array], b: PyTree[Array]) -> Any:
     products = jtu.tree_map(lambda x, y: jnp.sum(x * y), a, b)
     return sum(jtu.tree_leaves(products))
 
@@ -316,10 +324,13 @@ def second_moment_map(
     flat, unravel = jfu.ravel_pytree(y0)
     size = flat.size
     # The step is affine, so its values at zero and at the unit vectors give its matrix.
-    # Differentiating it would take far more tracing. Row 0 is the zero vector.
+    # Differentiating it would take far more tracing. Row 0 of `starts` is zero, the others
+    # are the unit vectors.
     starts = jnp.eye(size + 1, size, k=-1, dtype=flat.dtype)
 
     def outcome(terms_of_step: PyTree) -> tuple[Array, diffrax.RESULTS]:
+        """The Kronecker product of Z with itself, for one outcome of the variables."""
+
         def step(y: Array) -> tuple[Array, diffrax.RESULTS]:
             y1, result = _one_step(terms_of_step, solver, t0, t1, unravel(y), args)
             end, _ = jfu.ravel_pytree(y1)
@@ -337,16 +348,18 @@ def second_moment_map(
 
 
 def _average(outcome: Callable, terms, h, nodes: int) -> PyTree[Array]:
-    """The expectation of `outcome(terms) -> (value, result)`."""
+    """The expectation over a step of size `h` of the value that `outcome(terms)` returns
+    beside the result of the step, for terms with one outcome of the random variables.
+    `nodes` is as for `step_expectation`."""
     check_baths_have_own_noise(terms)
     laws, terms_with = step_variables(terms, h)
     variables, weights = outcomes(laws, nodes)
 
-    def of_variables(values: Array) -> tuple[PyTree[Array], diffrax.RESULTS]:
-        return outcome(terms_with(values))
+    def outcome_of(values_of_variables: Array) -> tuple[PyTree[Array], diffrax.RESULTS]:
+        return outcome(terms_with(values_of_variables))
 
-    # Traced once for all outcomes.
-    values, result = jax.vmap(of_variables)(variables)  # pyright: ignore
+    # The step is traced once for all outcomes, which are the rows of `variables`.
+    values, result = jax.vmap(outcome_of)(variables)  # pyright: ignore
     values = result.error_if(values, result != diffrax.RESULTS.successful)
 
     def mean(value: Array) -> Array:
@@ -388,7 +401,7 @@ def weak_order_defect(
     constrained terms.
     """
     check_unconstrained(terms, "weak_order_defect")
-    expected = step_expectation(terms, solver, t0, t1, y0, args, fn=fn, nodes=nodes)
+    mean = step_expectation(terms, solver, t0, t1, y0, args, fn=fn, nodes=nodes)
     generator = _generator(
         terms, args, ito=isinstance(solver, diffrax.AbstractItoSolver)
     )
@@ -396,17 +409,17 @@ def weak_order_defect(
     def phi(t: RealScalarLike, y: Y) -> PyTree[Array]:
         return fn(t, y, args)
 
-    # Vector fields must have the precision of the state.
+    # Time has the dtype of the state, so that vector fields have it, too.
     t = jnp.asarray(t0, jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).dtype)
-    defect = expected
-    power = phi
-    factor = 1.0
-    # In round j, `power` is L^j phi and `factor` is h^j / j!.
+    defect = mean
+    # In round j this is L^j phi, as a function of time and state, and h^j / j!.
+    power_of_generator = phi
+    coefficient = 1.0
     for j in range(order + 1):
-        exact = power(t, y0)
-        defect = (defect**ω - factor * exact**ω).ω
-        power = generator(power)
-        factor = factor * (t1 - t0) / (j + 1)
+        value = power_of_generator(t, y0)
+        defect = (defect**ω - coefficient * value**ω).ω
+        power_of_generator = generator(power_of_generator)
+        coefficient = coefficient * (t1 - t0) / (j + 1)
     return defect
 
 
@@ -429,9 +442,9 @@ def _generator(terms, args, ito: bool) -> Callable:
 
     def generator(phi: Callable) -> Callable:
         def applied(t: RealScalarLike, y: Y) -> PyTree[Array]:
-            still = jtu.tree_map(jnp.zeros_like, y)
-            velocity = rate(drift, t, y, args) if drift else still
-            # The derivatives by time and along the drift in one: along (1, a).
+            zero = jtu.tree_map(jnp.zeros_like, y)
+            velocity = rate(drift, t, y, args) if drift else zero
+            # The derivatives by time and along the drift are one derivative, along (1, a).
             _, total = jax.jvp(phi, (t, y), (jnp.ones_like(t), velocity))
             for field in fields:
                 second = _second_derivative(phi, field, t, y, ito)
@@ -448,12 +461,12 @@ def _second_derivative(
 ) -> PyTree[Array]:
     """The second derivative of `phi` along a vector field: along its flow, or for an Itô
     equation along the straight line of its value at `y`."""
-    here = field(t, y)
+    field_at_y = field(t, y)
 
-    def along_field(y: Y) -> PyTree[Array]:
-        direction = here if ito else field(t, y)
+    def first_derivative(y: Y) -> PyTree[Array]:
+        direction = field_at_y if ito else field(t, y)
         _, derivative = jax.jvp(lambda y: phi(t, y), (y,), (direction,))
         return derivative
 
-    _, second = jax.jvp(along_field, (y,), (here,))
-    return second
+    _, second_derivative = jax.jvp(first_derivative, (y,), (field_at_y,))
+    return second_derivative

@@ -13,19 +13,34 @@ import diffrax_symplectic as ds
 
 PACKAGE = Path(ds.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
+# Users do not construct these.
+RESULTS = (ds.Comparison, ds.Ensemble, ds.Expectation, ds.Suggestion, ds.Suggestions)
+# What messages quote besides: the first argument of the user's `flow`, a field of an
+# `Expectation`, an argument that JAX names, the function of Diffrax, libraries, packages.
+OTHERS = {
+    "time",
+    "error",
+    "compiler_options",
+    "diffeqsolve",
+    "llvm",
+    "libllvm",
+    "diffrax_symplectic",
+}
 # Of the user's functions, by the name of the argument that takes each of them.
 CHECKS = {"check_takes", "evaluated", "check_real", "real_array", "whole_number"}
-# Both in backticks: an argument with its value, and a function of the user's.
+# In backticks: an argument with its value, a function of the user's, and a name alone.
 WITH_VALUE = re.compile(r"(?<![\w.])([a-z]\w*)=(?!=)")
 OF_THE_USER = re.compile(r"(?<![\w.])([a-zH]\w*)\([\w, ]*\bargs\)")
+ALONE = re.compile(r"[a-z]\w+")
 
 
 def parameters(*functions) -> set[str]:
     return {name for fn in functions for name in inspect.signature(fn).parameters}
 
 
-def public_parameters() -> set[str]:
-    """The arguments of all public functions, classes and methods."""
+def public_functions() -> list:
+    """All public functions, classes and methods but the classes of results, which users do
+    not construct: the fields of these are no arguments."""
     public = [value for name, value in vars(ds).items() if not name.startswith("_")]
     functions = [value for value in public if callable(value)]
     methods = [
@@ -34,7 +49,7 @@ def public_parameters() -> set[str]:
         for name in vars(kind)
         if not name.startswith("_") and inspect.isroutine(getattr(kind, name))
     ]
-    return parameters(*functions, *methods)
+    return [fn for fn in (*functions, *methods) if fn not in RESULTS]
 
 
 def text_of(node: ast.AST) -> str:
@@ -64,25 +79,36 @@ def quoted_arguments(file: Path) -> set[str]:
     quoted = re.findall("`([^`]+)`", "\n".join(messages(tree)))
     found = {name for code in quoted for name in WITH_VALUE.findall(code)}
     found |= {name for code in quoted for name in OF_THE_USER.findall(code)}
+    found |= {code for code in quoted if ALONE.fullmatch(code)}
     for call in ast.walk(tree):
         if isinstance(call, ast.Call) and getattr(call.func, "id", "") in CHECKS:
             found.add(text_of(call.args[0]))
     return found - {""}
 
 
-def test_messages_quote_only_arguments_and_functions_that_there_are():
-    known = public_parameters() | {*vars(ds)}
+def known_names() -> set[str]:
+    functions = public_functions()
+    names = {fn.__name__ for fn in functions}
     # Users call these, too.
-    known |= parameters(diffrax.diffeqsolve, diffrax.SaveAt)
+    return names | OTHERS | parameters(*functions, diffrax.diffeqsolve, diffrax.SaveAt)
+
+
+def test_messages_quote_only_arguments_and_functions_that_there_are():
+    known = known_names()
     for file in FILES:
         unknown = quoted_arguments(file) - known
         assert not unknown, (file.name, unknown)
+
+
+def test_fields_of_results_are_no_arguments():
+    assert "num_stragglers" not in known_names() and "num_paths" in known_names()
 
 
 @pytest.mark.parametrize(
     "code, names",
     [
         ("raise ValueError('pass `f(x, old=3)` or `new(q, args)`')", {"old", "new"}),
+        ("raise ValueError('`old` must be a number, and so must `H0.new`')", {"old"}),
         ("raise ValueError(f'pass `{name}={value}`, not `a == b`')", set()),
         ("check_takes('old', fn, 't', 'args')", {"old"}),
         ("def f():\n    '''Not `docstrings=3`.'''", set()),

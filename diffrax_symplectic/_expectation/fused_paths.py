@@ -76,7 +76,7 @@ class FusedPaths:
         ]
         self.count += number * len(batches)
         self.lost += sum(int(np.sum(batch.failed)) for batch in batches)
-        self.stragglers += sum(batch.stragglers for batch in batches)
+        self.stragglers += sum(batch.num_stragglers for batch in batches)
         return _Paths(
             y=jtu.tree_map(_stack_levels, *[batch.y for batch in batches]),
             failed=_stack_levels(*[batch.failed for batch in batches]),

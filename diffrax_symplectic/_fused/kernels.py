@@ -25,16 +25,16 @@ from .._stablehlo import (
     unflat,
 )
 from .path_functions import PathFunctions
-from .program import as_numbers, entry_kinds, pack, Program, shapes, unpack
+from .program import as_numbers, entry_kinds, pack, Program, shapes_of, unpack
 
 
-# Kernels of larger systems take long to compile.
+# Kernels of systems with more numbers in their state take long to compile.
 _MOST_NUMBERS = 256
-# Kernels of more operations compile for longer than JAX: the stage equations of 64 rods, of
-# 20,000, for 4.3 s where JAX takes 5.2 s, and a loop of linear systems, of 53,000, for 16 s
-# where JAX takes 4.9 s.
+# Kernels of more operations compile for longer than programs of JAX. The stage equations of
+# 64 rods, 20,000 operations, compile for 4.3 s, by JAX for 5.2 s; a loop of linear systems,
+# 53,000 operations, for 16 s, by JAX for 4.9 s.
 _MOST_OPERATIONS = 25_000
-# Dr.Jit warns if a function is recorded more often.
+# Dr.Jit warns of a function that is recorded more often than this.
 _MOST_RECORDINGS = 100
 
 
@@ -70,6 +70,7 @@ class Kernels:
 
     def __init__(self, functions: PathFunctions):
         self._functions = functions
+        # These are shapes and dtypes of the arguments for which the programs are lowered.
         word = jax.ShapeDtypeStruct((), "uint32")
         arrays = functions.arrays
         key = functions.key
@@ -77,7 +78,7 @@ class Kernels:
         own = [*keys, *functions.own_args]
         y = jax.eval_shape(functions.y0, arrays)
         _check_size(sum(x.size for x in y))
-        self._keys = Program(
+        self._path_keys = Program(
             functions.path_keys,
             dict(arrays=arrays, key=key, high=word, low=word),
         )
@@ -92,137 +93,149 @@ class Kernels:
                 solver_state=jax.eval_shape(functions.start, arrays, own, y),
             ),
         )
-        self._moves = self._which_arrays_move()
+        self._is_moving = self._moving_arrays()
         self._constants = self._step.replay.constants()
-        self._start = jax.jit(self._solver_state_at_start)
+        self._compiled_solver_state = jax.jit(self._solver_state_at_start)
         self._make_keys = frozen(self._record_keys, _MOST_RECORDINGS)
         self._take_steps = frozen(self._record_steps, _MOST_RECORDINGS)
 
-    def _which_arrays_move(self) -> list[bool]:
-        """Which arrays of the solver state are the paths' own. Those that a step returns
-        unchanged are shared, if all paths start alike: then they need no registers."""
-        types = self._step.types["solver_state"]
-        # It is the last argument of a step.
-        first = len(self._step.replay.arguments) - len(types)
-        # The results of a step: the state, the solver state, and whether it succeeded.
-        begin = len(self._step.types["y"])
-        returned = self._step.replay.handed_on[begin : begin + len(types)]
+    def _moving_arrays(self) -> list[bool]:
+        """For each array of the solver state, whether each path has its own. If all paths
+        start alike, they share the arrays that a step returns unchanged, which then need no
+        registers."""
+        num_arrays = len(self._step.types["solver_state"])
+        # The solver state is the last argument of a step.
+        first_argument = len(self._step.replay.arguments) - num_arrays
+        # The results of a step are the state, the solver state, and whether it succeeded.
+        first_result = len(self._step.types["y"])
+        # For each array of the new solver state, the number of the argument that it is.
+        sources = self._step.replay.handed_on[first_result : first_result + num_arrays]
         return [
-            self._functions.paths_differ or source != first + k
-            for k, source in enumerate(returned)
+            self._functions.paths_differ or source != first_argument + k
+            for k, source in enumerate(sources)
         ]
 
     def _solver_state_at_start(
-        self, arrays, key, y: list[Array], args: list[Array]
+        self, arrays: list[Array], key, y: list[Array], own_args: list[Array]
     ) -> list:
-        """The solver state at the start of all paths, or of each if they differ."""
+        """The leaves of the solver state before the first step: of all paths, or along a
+        leading axis of each, if paths differ."""
 
-        def of_one(y: list[Array], args: list[Array]) -> list[Array]:
-            def with_key(low: Array) -> list[Array]:
+        def of_path(y: list[Array], own_args: list[Array]) -> list[Array]:
+            def of_path_with_number(low: Array) -> list[Array]:
                 high = jnp.zeros_like(low)
                 keys = self._functions.path_keys(arrays, key, high, low)
-                return self._functions.start(arrays, [*keys, *args], y)
+                return self._functions.start(arrays, [*keys, *own_args], y)
 
-            # No solver draws random numbers in `init`. JAX raises an error if the result
-            # depends on the axis of numbers.
-            return jax.vmap(with_key, out_axes=None)(jnp.zeros(1, "uint32"))
+            # No solver draws random numbers in `init`, so the number of a path does not
+            # matter. JAX raises an error if the result depends on the axis of numbers.
+            number = jnp.zeros(1, "uint32")
+            return jax.vmap(of_path_with_number, out_axes=None)(number)
 
         if self._functions.paths_differ:
-            return jax.vmap(of_one)(y, args)
-        return of_one(y, args)
+            return jax.vmap(of_path)(y, own_args)
+        return of_path(y, own_args)
 
     def begin(
         self,
         arrays: list[Array],
         key: PRNGKeyArray,
         h: RealScalarLike,
-        first: int,
-        number: int,
+        first_path: int,
+        num_paths: int,
         y0: PyTree[Array],
-        args: PyTree[Array],
+        own_args: PyTree[Array],
     ) -> tuple[Lanes, Shared]:
-        """The paths of the samples `first` to `first + number - 1`, and what they share in
-        steps of size `h`. If paths differ, `y0` and their own `args` have a leading axis of
-        paths."""
+        """The paths with the numbers `first_path` to `first_path + num_paths - 1`, and what
+        they share in steps of size `h`. If paths differ, `y0` and `own_args` have a leading
+        axis of paths."""
         dr = drjit()
         kinds = array_types()
-        # Opaque: a number would be a constant of the kernel, so that every batch compiled a
-        # kernel of its own, in 20 to 40 ms.
-        samples = dr.arange(kinds["ui64"], number) + dr.opaque(kinds["ui64"], first)
-        high = kinds["ui32"](samples >> 32)
-        low = kinds["ui32"](samples)
+        # The number of the first path is opaque: otherwise it would be a constant of the
+        # kernel, so that every batch compiled a kernel of its own, in 20 to 40 ms.
+        offset = dr.opaque(kinds["ui64"], first_path)
+        path_numbers = dr.arange(kinds["ui64"], num_paths) + offset
+        high = kinds["ui32"](path_numbers >> 32)
+        low = kinds["ui32"](path_numbers)
         dr.eval(high, low)
-        keys = self._make_keys(pack(self._types_for_keys, [*arrays, key]), high, low)
-        y = jtu.tree_leaves(y0)
-        own_args = jtu.tree_leaves(args)
-        solver_state = self._start(arrays, key, y, own_args)
-        shared = [*arrays, np.asarray(h), *chosen(solver_state, self._stays)]
+        packed_for_keys = pack(self._types_for_keys, [*arrays, key])
+        keys = self._make_keys(packed_for_keys, high, low)
+        y_leaves = jtu.tree_leaves(y0)
+        args_leaves = jtu.tree_leaves(own_args)
+        solver_state = self._compiled_solver_state(arrays, key, y_leaves, args_leaves)
+        moving = chosen(solver_state, self._is_moving)
+        fixed = chosen(solver_state, self._is_fixed)
+        args_entries = self._in_lanes(self._types_of_own_args, args_leaves, num_paths)
         lanes = Lanes(
-            own=[*keys, *self._for_all(self._types_of_own_args, own_args, number)],
-            y=self._for_all(self._step.types["y"], y, number),
-            solver_state=self._for_all(
-                self._types_of_moving, chosen(solver_state, self._moves), number
-            ),
-            stopped=dr.opaque(kinds["i1"], False, number),
+            own=[*keys, *args_entries],
+            y=self._in_lanes(self._step.types["y"], y_leaves, num_paths),
+            solver_state=self._in_lanes(self._types_of_moving, moving, num_paths),
+            stopped=dr.opaque(kinds["i1"], False, num_paths),
         )
-        return lanes, Shared(pack(self._types_of_shared, shared), self._constants)
+        packed = pack(self._types_of_shared, [*arrays, np.asarray(h), *fixed])
+        return lanes, Shared(packed, self._constants)
 
     def advance(self, lanes: Lanes, shared: Shared, begin: int, end: int) -> Lanes:
         """The paths after the steps `begin` to `end - 1`."""
-        # Opaque, so that other numbers need no other kernel.
+        # Numbers of steps are opaque, so that other numbers need no other kernel.
         opaque = ft.partial(drjit().opaque, array_types()["i32"])
         y, solver_state, stopped = self._take_steps(
             *shared, opaque(begin), opaque(end), *lanes
         )
         return Lanes(lanes.own, y, solver_state, stopped)
 
-    def _for_all(
-        self, types: list[ArrayType], arrays: list[Array], number: int
+    def _in_lanes(
+        self, types: list[ArrayType], arrays: list[Array], num_paths: int
     ) -> list[Any]:
-        """The entries of these arrays, for each of the paths."""
+        """A Dr.Jit array for each entry of these arrays, with a lane for each path. If
+        paths differ, the arrays have a leading axis of paths."""
         kinds = entry_kinds(types)
         if self._functions.paths_differ:
-            # A row of numbers for each entry.
-            rows = [row for x in arrays for row in as_numbers(x).reshape(number, -1).T]
+            # (entries, paths) for each array
+            matrices = [as_numbers(x).reshape(num_paths, -1).T for x in arrays]
+            rows = [row for matrix in matrices for row in matrix]
             return [in_memory(kind, row) for kind, row in zip(kinds, rows, strict=True)]
         entries = [entry for x in arrays for entry in as_numbers(x).flat]
         return [
-            drjit().opaque(array_types()[kind], entry.item(), number)
+            drjit().opaque(array_types()[kind], entry.item(), num_paths)
             for kind, entry in zip(kinds, entries, strict=True)
         ]
 
     @property
     def _types_for_keys(self) -> list[ArrayType]:
-        return [*self._keys.types["arrays"], *self._keys.types["key"]]
+        return [*self._path_keys.types["arrays"], *self._path_keys.types["key"]]
 
     @property
     def _types_of_own_args(self) -> list[ArrayType]:
+        # In what each path has of its own, the keys come first, and then `args`.
         own = self._step.types["own"]
-        return own[len(own) - len(self._functions.own_args) :]
+        num_keys = len(own) - len(self._functions.own_args)
+        return own[num_keys:]
 
     @property
     def _types_of_shared(self) -> list[ArrayType]:
         types = self._step.types
-        still = chosen(types["solver_state"], self._stays)
-        return [*types["arrays"], *types["h"], *still]
+        fixed = chosen(types["solver_state"], self._is_fixed)
+        return [*types["arrays"], *types["h"], *fixed]
 
     @property
     def _types_of_moving(self) -> list[ArrayType]:
-        return chosen(self._step.types["solver_state"], self._moves)
+        return chosen(self._step.types["solver_state"], self._is_moving)
 
     @property
-    def _stays(self) -> list[bool]:
-        return [not moves for moves in self._moves]
+    def _is_fixed(self) -> list[bool]:
+        return [not is_moving for is_moving in self._is_moving]
 
     def _record_keys(self, packed: dict[str, Any], high: Any, low: Any) -> list[Any]:
-        """The words of the paths' own random keys, as Dr.Jit records their computation."""
-        args = unpack(self._types_for_keys, packed)
-        keys, _ = self._keys.replay(*args, scalar(high), scalar(low))
+        """The words of the random keys of the paths with the numbers `high * 2^32 + low`,
+        as Dr.Jit records their computation."""
+        arrays_and_key = unpack(self._types_for_keys, packed)
+        keys, _ = self._path_keys.replay(*arrays_and_key, scalar(high), scalar(low))
         return [*flat(keys)]
 
     def _record_steps(
         self,
-        packed_of_shared: dict[str, Any],
+        packed: dict[str, Any],
         constants: list[Any],
         begin: Any,
         end: Any,
@@ -231,72 +244,76 @@ class Kernels:
         solver_state: list[Any],
         stopped: Any,
     ) -> tuple[list[Any], list[Any], Any]:
-        """The loop over steps, as Dr.Jit records it: the state, the solver state and which
-        paths stopped, from those before."""
+        """The state, the solver state and which paths stopped after the steps `begin` to
+        `end - 1`, from those before, as Dr.Jit records the loop over steps."""
         select = drjit().select
-        first = variable_number(begin + 1)
+        first_variable = variable_number(begin + 1)
         step = self._step
-        number_of_arrays = len(step.types["arrays"])
-        shared = unpack(self._types_of_shared, packed_of_shared)
-        arrays = shared[:number_of_arrays]
-        h, *still = shared[number_of_arrays:]
-        of_path = unflat(own, shapes(step.types["own"]))
-        shapes_of_y = shapes(step.types["y"])
-        shapes_of_moving = shapes(self._types_of_moving)
+        num_arrays = len(step.types["arrays"])
+        shared = unpack(self._types_of_shared, packed)
+        arrays = shared[:num_arrays]
+        h, *fixed = shared[num_arrays:]
+        own_tensors = unflat(own, shapes_of(step.types["own"]))
+        shapes_of_y = shapes_of(step.types["y"])
+        shapes_of_moving = shapes_of(self._types_of_moving)
 
-        def goes_on(i: Any, *_: Any) -> Any:
+        def has_more_steps(i: Any, *_: Any) -> Any:
             return i < end
 
-        def one_step(i: Any, stopped: Any, *numbers: Any) -> tuple[Any, ...]:
-            left = iter(numbers)
-            states = unflat(left, shapes_of_y)
-            moving = unflat(left, shapes_of_moving)
-            whole_state = merged(self._moves, moving, still)
+        # The entries are those of `y`, followed by those of the moving solver state.
+        def after_step(i: Any, stopped: Any, *entries: Any) -> tuple[Any, ...]:
+            remaining_entries = iter(entries)
+            y_tensors = unflat(remaining_entries, shapes_of_y)
+            moving = unflat(remaining_entries, shapes_of_moving)
+            whole_solver_state = merged(self._is_moving, moving, fixed)
             results, errors = step.replay(
                 *arrays,
-                *of_path,
+                *own_tensors,
                 h,
                 scalar(i),
-                *states,
-                *whole_state,
+                *y_tensors,
+                *whole_solver_state,
                 constants=constants,
             )
-            *results, success = results
+            *states, success = results
             # LLVM schedules by the order: with the success first, a step of `StormerVerlet`
             # in single precision takes 1.13 times as long, and of Heun's method 0.85.
-            for lost in (*errors, ~success.item()):
-                stopped = stopped | lost
-            moved = chosen(results[len(states) :], self._moves)
-            new = [*flat(results[: len(states)]), *flat(moved)]
+            for is_failed in (*errors, ~success.item()):
+                stopped = stopped | is_failed
+            new_y = states[: len(y_tensors)]
+            new_moving = chosen(states[len(y_tensors) :], self._is_moving)
+            new_entries = [*flat(new_y), *flat(new_moving)]
             # A path that stopped stays where it was: its numbers could be NaN, with which
             # sweeps end last.
-            kept = [select(stopped, old, entry) for old, entry in zip(numbers, new)]
+            kept = [select(stopped, old, new) for old, new in zip(entries, new_entries)]
             return i + 1, stopped, *kept
 
         state = (begin, stopped, *y, *solver_state)
-        _, stopped, *numbers = drjit().while_loop(
-            state, goes_on, one_step, mode="symbolic"
+        _, stopped, *entries = drjit().while_loop(
+            state, has_more_steps, after_step, mode="symbolic"
         )
-        last = max(map(variable_number, [stopped, *numbers]))
-        _warn_of_operations(last - first)
-        return numbers[: len(y)], numbers[len(y) :], stopped
+        # Dr.Jit numbers its variables one after another: one for each operation.
+        last_variable = max(map(variable_number, [stopped, *entries]))
+        _warn_of_operations(last_variable - first_variable)
+        return entries[: len(y)], entries[len(y) :], stopped
 
 
-def _warn_of_operations(number: int) -> None:
-    """Warns, before it is compiled, of a kernel that compiles for longer than JAX."""
-    if number > _MOST_OPERATIONS:
+def _warn_of_operations(num_operations: int) -> None:
+    """Warns of a kernel that compiles for longer than a program of JAX, before it does."""
+    if num_operations > _MOST_OPERATIONS:
         warnings.warn(
-            f"A step of this system is a kernel of about {number:,} operations, which "
-            "compiles for longer than JAX does, for seconds to minutes: loops of known "
-            'length, sorting and linear algebra are written out. Pass `engine="jax"`, '
-            "unless the paths are very many.",
+            f"A step of this system is a kernel of about {num_operations:,} operations, "
+            "which compiles for longer than JAX does, for seconds to minutes: loops of "
+            "known length, sorting and linear algebra are written out. Pass "
+            '`engine="jax"`, unless the paths are very many.',
             stacklevel=2,
         )
 
 
-def _check_size(number: int) -> None:
-    if number > _MOST_NUMBERS:
+def _check_size(num_numbers: int) -> None:
+    """Raises a `ValueError` for states of more numbers than kernels take."""
+    if num_numbers > _MOST_NUMBERS:
         raise ValueError(
             f'`engine="drjit"` takes states of up to {_MOST_NUMBERS} numbers; got '
-            f'{number}. Pass `engine="jax"`.'
+            f'{num_numbers}. Pass `engine="jax"`.'
         )

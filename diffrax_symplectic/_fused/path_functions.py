@@ -20,8 +20,8 @@ from .._terms import path_keys, with_keys
 class SteppedSystem(Protocol):
     """What a kernel needs of a system: a PyTree whose leaves are all that it reads.
 
-    - `terms`: with random keys, in place of which each path has its own.
-    - `y0`, `args`: of all paths, or examples of those that paths have of their own.
+    - `terms`: the terms, with random keys for which each path substitutes its own.
+    - `y0`, `args`: the initial state and `args` of all paths, or examples if paths differ.
     """
 
     terms: PyTree
@@ -62,8 +62,8 @@ class PathFunctions(NamedTuple):
     is what a kernel is compiled for.
 
     In these functions `arrays` are the arrays of the system, and `own` is what each path
-    has of its own: the words of its random keys, and arrays of its `args` if these are
-    drawn.
+    has of its own: the words of its random keys, followed by the arrays of its `args` if
+    these are drawn.
 
     - `treedef`, `static`, `structs`: the system. Where it has an array, `static` is `None`
         and `structs` has its shape and type.
@@ -81,8 +81,8 @@ class PathFunctions(NamedTuple):
     paths_differ: bool
     settings: tuple[Any, ...]
 
-    # The programs of a kernel are traced from these methods, so that all that they read is
-    # a field above, or an argument.
+    # The programs of a kernel are traced from the methods below. All that they read is a
+    # field above or an argument, so that equal `PathFunctions` have equal programs.
 
     @property
     def arrays(self) -> list[jax.ShapeDtypeStruct]:
@@ -96,10 +96,10 @@ class PathFunctions(NamedTuple):
 
     def system(self, arrays: Sequence[Any]) -> SteppedSystem:
         """The system with these arrays."""
-        left = iter(arrays)
+        remaining_arrays = iter(arrays)
         # What is no array, such as the user's functions, is part of what is compiled.
         leaves = [
-            value if struct is None else next(left)
+            value if struct is None else next(remaining_arrays)
             for value, struct in zip(self.static, self.structs)
         ]
         return self.treedef.unflatten(leaves)
@@ -113,8 +113,9 @@ class PathFunctions(NamedTuple):
         return path_keys(self.system(arrays).terms, sample_key(key, high, low))
 
     def start(self, arrays: list[Array], own: list[Array], y: list[Array]) -> list:
-        """The leaves of the state of the solver before the first step from `y`."""
-        system, terms = self._of_path(arrays, own)
+        """The leaves of the state of the solver before the first step of a path from
+        `y`."""
+        system, terms = self._system_and_terms(arrays, own)
         y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
         # No solver's initial state depends on the size of a step.
         h = jnp.ones((), jnp.result_type(*jtu.tree_leaves(y)))
@@ -123,25 +124,28 @@ class PathFunctions(NamedTuple):
     def step(
         self, arrays, own, h, i, y: list[Array], solver_state: list[Array]
     ) -> Stepped:
-        """Step number `i` of size `h`."""
-        system, terms = self._of_path(arrays, own)
-        # Shapes alone tell how the leaves belong together; `init` is not run.
-        structure = eqx.filter_eval_shape(system.init, terms, 0, h, system.y0)
+        """A path after step number `i` of size `h`, from the leaves of its state `y` and of
+        the solver's state."""
+        system, terms = self._system_and_terms(arrays, own)
+        # `init` is traced and not run: only the structure of the solver's state is needed.
+        struct = eqx.filter_eval_shape(system.init, terms, 0, h, system.y0)
         y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
-        solver_state = jtu.tree_unflatten(jtu.tree_structure(structure), solver_state)
+        solver_state = jtu.tree_unflatten(jtu.tree_structure(struct), solver_state)
         y, solver_state, success = system.step(terms, i, h, y, solver_state)
         return Stepped(jtu.tree_leaves(y), jtu.tree_leaves(solver_state), success)
 
-    def _of_path(self, arrays: list[Array], own: list[Array]):
-        """The system and the terms of a path."""
+    def _system_and_terms(
+        self, arrays: list[Array], own: list[Array]
+    ) -> tuple[SteppedSystem, PyTree]:
+        """The system with the `args` of a path, and its terms with the keys of the path."""
         system = self.system(arrays)
-        # The keys come first, and then the arrays of `args`.
-        number = len(own) - len(self.own_args)
-        keys = own[:number]
+        # In `own` the keys come first, and then the arrays of `args`.
+        num_keys = len(own) - len(self.own_args)
+        keys = own[:num_keys]
         args = None
         if self.own_args:
-            structure = jtu.tree_structure(eqx.filter(system.args, eqx.is_array))
-            args = jtu.tree_unflatten(structure, own[number:])
+            treedef = jtu.tree_structure(eqx.filter(system.args, eqx.is_array))
+            args = jtu.tree_unflatten(treedef, own[num_keys:])
         return system.with_args(args), with_keys(system.terms, keys)
 
 
@@ -156,14 +160,15 @@ def functions_and_arrays(
     own_args: PyTree[Array],
     paths_differ: bool,
 ) -> tuple[PathFunctions, list[Array]]:
-    """What a kernel is compiled for, and the arrays that it reads.
+    """The functions of one path, for which a kernel is compiled, and the arrays of the
+    system, which the kernel reads.
 
     `own_args` is an example of the arrays in `args` that each path has of its own, and
     `paths_differ` says whether each has its own initial state and `args`.
     """
     leaves, treedef = jtu.tree_flatten(system)
     _check_keys([key, *leaves])
-    # Arrays of NumPy, too: another parameter must not need another kernel.
+    # Arrays of NumPy are inputs, too: another parameter must not need another kernel.
     arrays = [jnp.asarray(x) if _is_array(x) else None for x in leaves]
     functions = PathFunctions(
         treedef=treedef,

@@ -1,9 +1,9 @@
 """The root finder of a fused step: sweeps for one path, without a fallback.
 
-When corrections are small enough, and when sweeps are relaxed, is decided as in
-`_root_finder/sweeps.py`. The loop is another: there all paths of a batch sweep together,
-and checks are rare since they cost much. In a kernel each path ends by itself, and checks
-after every sweep.
+As in `_root_finder/sweeps.py` it is decided when corrections are small enough, and when
+sweeps are relaxed. The loop differs: there all paths of a batch sweep together, and checks
+are rare since they cost much. In a kernel each path ends by itself, and checks after every
+sweep.
 """
 
 import functools as ft
@@ -34,10 +34,11 @@ from .._solver import with_changed_stages
 
 # A path with a step that needs more sweeps is handed back to JAX.
 _MOST_SWEEPS = 48
-# Beyond a correction of so many tolerances sweeps diverge. (It is finite in single
-# precision, too.)
+# Sweeps diverge if a correction is larger than this, in units of the tolerance. (The number
+# is finite in single precision, too.)
 _HUGE = 1e30
-# Sweeps that diverge are relaxed as for this rate at most: their own may be infinite.
+# Sweeps that diverge may have an infinite rate, the ratio of two corrections. Rates beyond
+# this one are relaxed as this one is.
 _FASTEST_GROWTH = 4
 
 
@@ -45,31 +46,34 @@ class _Equations(NamedTuple):
     r"""The equations $y = \Phi(y)$ of a step, in two halves.
 
     - `image`: the map $\Phi$.
-    - `in_halves`: whether unknowns are `Halves`. Otherwise these are the doubled system
-        $y = \Phi(z)$, $z = \Phi(y)$. It is solved when $y = z$: a cycle of period two
-        solves it, too, with $y \neq z$.
+    - `in_halves`: whether the unknowns are `Halves`. Otherwise the equations are doubled,
+        to $y = \Phi(z)$, $z = \Phi(y)$, with the halves $y$ and $z$. They are solved when
+        $y = z$: a cycle of period two fulfils them, too, with $y \neq z$.
     """
 
     image: Callable[[PyTree[Array]], PyTree[Array]]
     in_halves: bool
 
     def start(self, guess: PyTree[Array]) -> Halves:
+        """The iterate before the first sweep."""
         return guess if self.in_halves else Halves(guess, guess)
 
     def sweep(self, y: Halves, relaxation: Scalar | None = None) -> Halves:
-        """The iterate after a sweep, in which $q$ reads the new $p$. `None` is no
-        relaxation, and no operation."""
+        """The iterate after a sweep, in which $q$ reads the new $p$. Without a `relaxation`
+        this takes fewer operations than with a relaxation of one."""
         new_p = self.image(y).p if self.in_halves else self.image(y.q)
         y = Halves(_relaxed(new_p, y.p, relaxation), y.q)
         new_q = self.image(y).q if self.in_halves else self.image(y.p)
         return Halves(y.p, _relaxed(new_q, y.q, relaxation))
 
     def value(self, y: Halves) -> PyTree[Array]:
-        """An iterate in the structure of the unknowns."""
+        """The unknowns of an iterate."""
         return y if self.in_halves else y.q
 
     def correction(self, old: Halves, new: Halves) -> PyTree[Array]:
-        """How far an iterate is from a solution, by the last sweep."""
+        """The change of the unknowns by the last sweep, from `old` to `new`; for doubled
+        equations the difference of the two halves, since only equal halves are a
+        solution."""
         return (new**ω - old**ω).ω if self.in_halves else (new.q**ω - new.p**ω).ω
 
 
@@ -80,7 +84,7 @@ def _relaxed(new: PyTree, old: PyTree, relaxation: Scalar | None) -> PyTree[Arra
 
 
 class _Criterion(NamedTuple):
-    """When a correction is small enough.
+    """What decides whether a correction is small enough.
 
     - `weights`: for each leaf, the inverse of its tolerance.
     - `rounding`: the largest correction that may be a rounding error.
@@ -96,12 +100,15 @@ class _Criterion(NamedTuple):
         tolerance, and whether sweeps have converged."""
         sizes = _sizes(correction)
         size = _largest([x * weight for x, weight in zip(sizes, self.weights)])
-        # The next correction is smaller by the same ratio, `size / before`: without the
-        # division. A growing correction says nothing about the next.
+        # The next correction is expected to be `size * (size / before)`, and compared with
+        # the tolerance over a margin, here without a division. If corrections grow, the
+        # ratio says nothing, and counts as one.
         smaller = jnp.where(size < before, size, before)
-        below = 2.0**MARGIN * size * smaller <= before
-        stalled = size >= 2.0**STALLED * before
-        return size, below | (stalled & (_largest(sizes) <= self.rounding))
+        is_below = 2.0**MARGIN * size * smaller <= before
+        # Rounding errors do not shrink any further.
+        is_stalled = size >= 2.0**STALLED * before
+        is_rounding = _largest(sizes) <= self.rounding
+        return size, is_below | (is_stalled & is_rounding)
 
 
 class _State(NamedTuple):
@@ -110,28 +117,30 @@ class _State(NamedTuple):
     - `y`: the iterate.
     - `size`: the size of its last correction, in units of the tolerance.
     - `is_solved`: whether the equations are solved.
-    - `done`: the number of sweeps.
+    - `num_sweeps`: the number of sweeps so far.
     """
 
     y: Halves
     size: Scalar
     is_solved: Bool[Array, ""]
-    done: Array
+    num_sweeps: Array
 
 
 def solve_one_path(
     image: Callable, scale: Callable, guess: PyTree[Array], pending: Bool[Array, ""]
 ) -> tuple[PyTree[Array], Bool[Array, ""]]:
-    r"""Solves $y = \Phi(y)$ from a `guess`, if it is `pending`. Returns the last iterate,
-    and whether it is a solution.
+    r"""Solves $y = \Phi(y)$ from a `guess`, where $\Phi$ is the `image`, unless the path
+    is not `pending`. Returns the last iterate, and whether it is a solution.
 
-    The arguments are those that [`diffrax_symplectic.PicardNewton`][] is called with.
+    `scale` maps an iterate to the sizes to which errors are relative. The arguments are
+    those that [`diffrax_symplectic.PicardNewton`][] is called with.
     """
     equations = _Equations(image, isinstance(guess, Halves))
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
-    # Three sweeps before the loop: they make two corrections, whose ratio is the rate of
-    # convergence.
+    # Three sweeps come before the loop: they make two corrections, whose ratio is the rate
+    # of convergence.
     first = equations.sweep(equations.start(guess))
+    # The tolerance is taken once, at the first iterate.
     criterion = _criterion(scale(equations.value(first)), dtype)
     second = equations.sweep(first)
     third = equations.sweep(second)
@@ -139,8 +148,9 @@ def solve_one_path(
     before, _ = criterion.measure(equations.correction(first, second), one)
     size, is_solved = criterion.measure(equations.correction(second, third), before)
 
-    # Relaxed once: later rates are those of relaxed sweeps, to which the formula does not
-    # apply. A branch, since few paths take it, and a division takes as long as a sweep.
+    # The relaxation is chosen once: later rates are those of relaxed sweeps, to which its
+    # formula does not apply. It is a branch, since few paths take it, and a division takes
+    # as long as a sweep.
     relaxation = lax.cond(
         size > SLOW * before,
         lambda: best_relaxation(jnp.minimum(size / before, _FASTEST_GROWTH)),
@@ -151,10 +161,11 @@ def solve_one_path(
         y = equations.sweep(last.y, relaxation)
         correction = equations.correction(last.y, y)
         size, is_solved = criterion.measure(correction, last.size)
-        return _State(y, size, is_solved, last.done + 1)
+        return _State(y, size, is_solved, last.num_sweeps + 1)
 
     def goes_on(last: _State) -> Bool[Array, ""]:
-        return ~last.is_solved & (last.done < _MOST_SWEEPS) & (last.size < _HUGE)
+        may_sweep = last.num_sweeps < _MOST_SWEEPS
+        return ~last.is_solved & may_sweep & (last.size < _HUGE)
 
     state = _State(third, size, ~pending | is_solved, jnp.full((), 3, jnp.int32))
     last = lax.while_loop(goes_on, sweep_again, state)
@@ -162,9 +173,8 @@ def solve_one_path(
 
 
 def _criterion(scale: PyTree[Array], dtype: Any) -> _Criterion:
-    """The criterion for a state of size `scale`: corrections below two units in the last
+    """The criterion for states of size `scale`: corrections below two units in the last
     place, leaf by leaf."""
-    # The tolerance is taken once, at the first sweep.
     eps = jnp.finfo(dtype).eps
     scales = _sizes(scale)
     weights = [_inverse(2 * eps * x) for x in scales]
@@ -173,15 +183,19 @@ def _criterion(scale: PyTree[Array], dtype: Any) -> _Criterion:
 
 def _inverse(x: Scalar) -> Scalar:
     """The inverse of a positive finite number up to a factor of two, from its exponent: a
-    division takes as long as a sweep. The inverse of zero is large, not infinite. Others
-    give minus infinity, which the check at the end finds."""
+    division takes as long as a sweep. The inverse of zero is large, not infinite. Numbers
+    that are not finite give minus infinity, which the check at the end of the step
+    finds."""
     info = jnp.finfo(x.dtype)
-    kind = jnp.dtype(f"int{info.bits}")
-    # Read as an integer, the bits of a float are its exponent, followed by its mantissa,
-    # which is cut off. The difference of two such integers subtracts exponents.
-    one = int(np.asarray(1, x.dtype).view(kind))
-    power = lax.bitcast_convert_type(x, kind) >> info.nmant << info.nmant
-    return lax.bitcast_convert_type(jnp.asarray(2 * one, kind) - power, x.dtype)
+    integer = jnp.dtype(f"int{info.bits}")
+    # Read as an integer, the bits of a float are its exponent, followed by its mantissa.
+    # Shifts there and back set the mantissa to zero: a power of two is left.
+    bits_of_one = int(np.asarray(1, x.dtype).view(integer))
+    bits_of_power = lax.bitcast_convert_type(x, integer) >> info.nmant << info.nmant
+    # Exponents are stored with an offset, that of one. Twice the offset minus the stored
+    # exponent of 2^k is the stored exponent of 2^-k.
+    inverse = jnp.asarray(2 * bits_of_one, integer) - bits_of_power
+    return lax.bitcast_convert_type(inverse, x.dtype)
 
 
 def _sizes(y: PyTree[Array]) -> list[Scalar]:
@@ -227,23 +241,24 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
 def without_rescue(solver: Any) -> Any:
     """The solver, and all solvers in it, with `Sweeps` in place of `PicardNewton`."""
 
-    def with_sweeps(x: Any) -> Any:
-        _check_tolerance(x.root_finder)
-        # No iterations of Optimistix: `Sweeps` solves the equations before the first.
+    def with_sweeps(stages: Any) -> Any:
+        _check_tolerance(stages.root_finder)
+        # Optimistix makes no iterations: `Sweeps` solves the equations before the first.
         fields = lambda stages: (stages.root_finder, stages.root_find_max_steps)
-        return eqx.tree_at(fields, x, (Sweeps(), 0))
+        return eqx.tree_at(fields, stages, (Sweeps(), 0))
 
     return with_changed_stages(solver, with_sweeps)
 
 
 def _check_tolerance(finder: PicardNewton) -> None:
-    """Raises a `ValueError` for another tolerance than rounding error. (Numbers of steps
-    are those of JAX, which takes the paths that are not solved here.)"""
+    """Raises a `ValueError` for a tolerance other than rounding error. (Limits on the
+    numbers of steps are not read here: they hold for JAX, which simulates the paths that
+    are not solved here.)"""
     usual = PicardNewton()
     for name in ("rtol", "atol", "norm"):
         if getattr(finder, name) != getattr(usual, name):
             raise ValueError(
                 '`engine="drjit"` solves each step to rounding error; got '
-                f"`PicardNewton({name}={getattr(finder, name)})`. Leave it out, or pass "
+                f"`PicardNewton({name}={getattr(finder, name)})`. Leave this out, or pass "
                 '`engine="jax"`.'
             )

@@ -23,7 +23,7 @@ from .engines import (
 )
 from .levels import combinations, Combination, Level, level_weights
 from .loop import (
-    along,
+    mask_like,
     independent_steps,
     Motion,
     PathStates,

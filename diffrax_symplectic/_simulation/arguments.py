@@ -36,38 +36,46 @@ from .._terms import (
 )
 
 
-# Times are given in decimals, so a number of steps is whole up to this fraction of it.
-_ROUNDED = 1e-6
-# Cells are given in decimals, too. Beyond this fraction of a cell, a step would take the
-# increment of another.
-_ROUNDED_CELL = 1e-3
-# What is lost of the variance of the noise beyond this is said. It is the size of the noise
-# in a bath, its temperature.
-_MUCH_LOST = 1e-3
+# Times are given in decimals, so a quotient of times counts as a whole number of steps if
+# it differs from one by at most this fraction of it.
+_TIME_ROUNDING = 1e-6
+# Cells are given in decimals, too. A step that begins farther from the start of a cell, in
+# units of the cell, would take the increment of another cell.
+_CELL_ROUNDING = 1e-3
+# A loss of variance beyond this fraction is a warning. In a heat bath the temperature falls
+# by the same fraction.
+_MOST_LOST_VARIANCE = 1e-3
 
 
 class StepNumbers(NamedTuple):
-    """The numbers of steps with step size `dt0`: after which to average, and all."""
+    """Numbers of steps with step size `dt0`.
+
+    - `saved`: for each saved time, the number of steps before it.
+    - `total`: the number of all steps.
+    """
 
     saved: Int[np.ndarray, "..."]
     total: np.integer
 
 
-def checked_key(user: str, key: Any, others: Any) -> PRNGKeyArray:
-    """The key of a call of `user`, as a typed key. Raises a `ValueError` unless it is one,
-    and for traced arrays in it or in the `others`."""
+def checked_key(caller: str, key: Any, others: Any) -> PRNGKeyArray:
+    """The key that `caller` was called with, as a typed key. Raises a `ValueError` unless
+    it is a random key, and for traced arrays in it or in the other arguments."""
     # Inside `jit` a new array is traced, too. Functions that close over traced values of
-    # other transformations are found once something that depends on these is needed.
-    new = jnp.zeros(())
-    check_untraced(f"`{user}`", (key, others, new))
-    check_key(key, user)
+    # other transformations are found later, when a result that depends on these values is
+    # read.
+    new_array = jnp.zeros(())
+    check_untraced(f"`{caller}`", (key, others, new_array))
+    check_key(key, caller)
     return typed_key(key)
 
 
 def step_numbers(
     t0: Any, t1: Any, dt0: Any, ts: Sequence[Any] | np.ndarray | Array | None
 ) -> StepNumbers:
-    """Raises a `ValueError` unless all times are numbers, a whole number of steps apart."""
+    """The numbers of steps from `t0` to each of `ts` (to `t1` if `ts` is `None`) and to
+    `t1`. Raises a `ValueError` unless all times are numbers, a whole number of steps
+    apart."""
     if dt0 is None:
         raise ValueError("`dt0` must be a number: steps are fixed; got None.")
     given = f"got dt0={dt0!r}, t0={t0!r}, t1={t1!r}"
@@ -79,22 +87,23 @@ def step_numbers(
     if not (0 < step < np.inf and begin < end < np.inf):
         raise ValueError(f"`dt0` must be positive, and `t1` after `t0`; {given}.")
     times = np.array([end] if ts is None else ts, float).reshape(-1)
-    # Of all steps last.
-    counts = (np.append(times, end) - begin) / step
-    whole = np.round(counts)
-    if not np.all(np.abs(counts - whole) <= _ROUNDED * np.maximum(whole, 1)):
+    # The last quotient is the number of all steps.
+    quotients = (np.append(times, end) - begin) / step
+    counts = np.round(quotients)
+    roundings = _TIME_ROUNDING * np.maximum(counts, 1)
+    if not np.all(np.abs(quotients - counts) <= roundings):
         raise ValueError(
             "Choose a `dt0` that divides the intervals between `t0`, `t1` and `ts`: `t1` "
             "and each of `ts` must be a whole number of steps after `t0`. Got "
             f"dt0={step}, t0={begin}, t1={end} and ts={brief(times)}."
         )
-    if len(times) == 0 or np.any(whole < 0) or np.any(whole > whole[-1]):
+    if len(times) == 0 or np.any(counts < 0) or np.any(counts > counts[-1]):
         raise ValueError(
             "`ts` must hold at least one time, all between `t0` and `t1`; got "
             f"{brief(times)}."
         )
-    *saved, total = whole.astype(np.int32)
-    return StepNumbers(np.array(saved), total)
+    *saved, total = counts.astype(np.int32)
+    return StepNumbers(saved=np.array(saved), total=total)
 
 
 def given_state(y0: Y) -> Y:
@@ -124,9 +133,13 @@ def drawn_args(args_of: Callable, key: PRNGKeyArray) -> Args:
             "Hamiltonians take a function in `args`, pass it in a tuple or a dictionary."
         )
         raise
-    # Each path has its own arrays. (What is neither kind of array is the same for all.)
-    is_numpy = lambda x: isinstance(x, np.ndarray | np.generic)
-    return jtu.tree_map(lambda x: jnp.asarray(x) if is_numpy(x) else x, args)
+
+    # Each path has its own arrays of JAX. All paths share leaves that are no arrays.
+    def as_jax_array(leaf: Any) -> Any:
+        is_numpy = isinstance(leaf, np.ndarray | np.generic)
+        return jnp.asarray(leaf) if is_numpy else leaf
+
+    return jtu.tree_map(as_jax_array, args)
 
 
 def check_finite(y0: Y) -> None:
@@ -136,8 +149,8 @@ def check_finite(y0: Y) -> None:
 
 
 def check_noise(terms: PyTree) -> None:
-    """Raises a `ValueError` if nothing in the terms is random, or if something in them
-    would count twice."""
+    """Raises a `ValueError` if nothing in the terms is random, or if they hold one drift
+    or one noise twice."""
     check_drifts_differ(terms)
     check_baths_have_own_noise(terms)
     paths = brownian_paths(terms)
@@ -156,7 +169,7 @@ def check_noise(terms: PyTree) -> None:
 
 
 def check_truncation(terms: PyTree, h: float) -> None:
-    """Raises a `ValueError` if steps of size `h` leave nothing of truncated increments."""
+    """Raises a `ValueError` if truncated increments over steps of size `h` are all zero."""
     if any(lost_variance(path, h) == 1 for path in brownian_paths(terms)):
         raise ValueError(f"{TOO_STRONG} Got dt0={h}.")
 
@@ -164,7 +177,7 @@ def check_truncation(terms: PyTree, h: float) -> None:
 def warn_of_truncation(terms: PyTree, h: float, stacklevel: int) -> None:
     """Warns if truncated increments lose much of their variance in steps of size `h`."""
     lost = max(lost_variance(path, h) for path in brownian_paths(terms))
-    if lost > _MUCH_LOST:
+    if lost > _MOST_LOST_VARIANCE:
         warnings.warn(
             "The increments of a `TruncatedBrownianPath`, which implicit solvers get where "
             f"the noise depends on the state, lose {lost:.1%} of their variance in steps "
@@ -177,9 +190,12 @@ def warn_of_truncation(terms: PyTree, h: float, stacklevel: int) -> None:
 
 
 def has_discrete_increments(solver: diffrax.AbstractSolver) -> bool:
-    """Whether a solver exists in the weak sense only: no path for it is Gaussian."""
+    """Whether the path that a solver makes has discrete increments even if paths with the
+    law of the solution are wanted, as for a weak method."""
     path = own_path(solver, "strong", (), jr.key(0))
-    return isinstance((laws_of(path) or {}).get("W"), Discrete)
+    # The laws of a path of the user's class may be unknown.
+    laws = laws_of(path) or {}
+    return isinstance(laws.get("W"), Discrete)
 
 
 def check_gaussian(solver: diffrax.AbstractSolver) -> None:
@@ -207,8 +223,9 @@ def check_cells(terms: PyTree, t0: float, h: float) -> None:
             )
 
 
-def _is_multiple(x: float, cell: float) -> bool:
-    return abs(x / cell - round(x / cell)) <= _ROUNDED_CELL
+def _is_multiple(time: float, cell: float) -> bool:
+    quotient = time / cell
+    return abs(quotient - round(quotient)) <= _CELL_ROUNDING
 
 
 @once_for_each_signature
@@ -219,17 +236,19 @@ def check_shapes(
     y0: Y,
     args: Args,
 ) -> None:
-    """Raises an error unless terms and `phi` fit the state, and the latter is real."""
+    """Raises an error unless the terms fit the state, and `phi` takes it and returns real
+    arrays."""
     check_fit(terms, t0, y0, args)
     check_takes("phi", phi, "t", "y", "args")
-    check_real("phi", jtu.tree_leaves(_result_struct(phi, terms, t0, y0, args)))
+    result = _result_struct(phi, terms, t0, y0, args)
+    check_real("phi", jtu.tree_leaves(result))
 
 
 def _result_struct(
     phi: Callable, terms: PyTree, t0: Float[np.ndarray, ""], y0: Y, args: Args
 ) -> PyTree[jax.ShapeDtypeStruct]:
-    """Shapes and dtypes of what `phi` returns. For spins and complex amplitudes, errors
-    explain which state `phi` gets."""
+    """The shapes and dtypes of the arrays that `phi` returns. For spins and complex
+    amplitudes, errors explain which state `phi` gets."""
 
     def result(t: RealScalarLike, y: Y, args: Args) -> PyTree[Array]:
         return call_user_function("phi", phi, t, y, args=args)
@@ -237,7 +256,7 @@ def _result_struct(
     try:
         return eqx.filter_eval_shape(result, t0, y0, args)
     except (TypeError, AttributeError, IndexError) as error:
-        # Such as those of `s.x` or `s[2]`, where `s` is a pair and not a spin.
+        # A user who takes the pair for a spin `s` writes `s.x`, `s[2]` or `-s`.
         if has_lifted(terms):
             error.add_note(
                 "For spins and complex amplitudes `phi(t, y, args)` gets the pair "

@@ -32,23 +32,27 @@ from .loop import values_of_paths
 from .problem import Problem
 
 
-# Beyond this share, stragglers take most of the time.
+# Stragglers that are a larger share of all paths take most of the time.
 _MANY = 0.05
 
 
-def warn_of_stragglers(stragglers: int, lost: int, count: int, stacklevel: int) -> None:
-    """Warns if JAX simulated many of `count` paths again, of which `lost` failed."""
-    if stragglers - lost > _MANY * count:
+def warn_of_stragglers(
+    num_stragglers: int, num_failed: int, num_paths: int, stacklevel: int
+) -> None:
+    """Warns if JAX simulated many paths again, besides those that failed."""
+    # JAX does not solve the steps of failed paths either, so for these `engine="jax"`,
+    # which the warning advises, would be no remedy.
+    if num_stragglers - num_failed > _MANY * num_paths:
         warnings.warn(
-            f"{stragglers:,} of {count:,} paths had steps that the fused kernel did not "
-            "solve, or the sine or cosine of an angle beyond 2^31 (in single precision "
-            "2^13), and were simulated again by JAX. Take smaller steps or angles, or "
-            '`engine="jax"`.',
+            f"{num_stragglers:,} of {num_paths:,} paths had steps that the fused kernel "
+            "did not solve, or the sine or cosine of an angle beyond 2^31 (in single "
+            "precision 2^13), and were simulated again by JAX. Take smaller steps or "
+            'angles, or `engine="jax"`.',
             stacklevel=stacklevel + 1,
         )
 
 
-# The high or the low 32 bits of the numbers of samples.
+# The numbers of samples have 64 bits. These are the high or the low 32 bits of each.
 _Words: TypeAlias = Array | np.ndarray
 
 
@@ -56,17 +60,17 @@ class Batch(NamedTuple):
     """Paths along the first axis of each array, saved times along the second.
 
     - `y`: the states.
-    - `failed`: which paths failed. Their states are meaningless.
-    - `stragglers`: how many paths the fused kernel handed back to JAX.
+    - `failed`: which paths failed. The states of these are meaningless.
+    - `num_stragglers`: how many paths the fused kernel handed back to JAX.
     """
 
     y: PyTree[np.ndarray]
     failed: Bool[np.ndarray, " n"]
-    stragglers: int = 0
+    num_stragglers: int = 0
 
 
 def state_itself(t, y, args):
-    """The function to average if the states themselves are wanted."""
+    """The state: the function `phi` of a problem whose states are wanted."""
     del t, args
     return y
 
@@ -74,22 +78,25 @@ def state_itself(t, y, args):
 def by_jax(
     p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:
-    """With the loop of `expectation`."""
-    paths = _paths(p, key, *_halves(sample_numbers))
-    # They are traced if a function closes over traced values.
-    check_untraced("`ensemble`", paths)
-    y, failed = jax.device_get(paths)
+    """The paths with these sample numbers, on one level, simulated by JAX, with the loop of
+    `expectation`."""
+    high, low = _words(sample_numbers)
+    on_all_levels = _paths_by_jax(p, key, high, low)
+    # The results are traced if a function of the user closes over traced values.
+    check_untraced("`ensemble`", on_all_levels)
+    y, failed = jax.device_get(on_all_levels)
     return Batch(jtu.tree_map(lambda x: x[level], y), failed[level])
 
 
-def _halves(sample_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The high and the low 32 bits."""
-    high = (sample_numbers >> np.uint64(32)).astype(np.uint32)
-    return high, (sample_numbers & np.uint64(0xFFFFFFFF)).astype(np.uint32)
+def _words(sample_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The high and the low 32 bits of 64-bit numbers."""
+    high = sample_numbers >> np.uint64(32)
+    low = sample_numbers & np.uint64(0xFFFFFFFF)
+    return high.astype(np.uint32), low.astype(np.uint32)
 
 
 def _sample_keys(key: PRNGKeyArray, high: _Words, low: _Words) -> Array:
-    """The keys of the samples with these numbers."""
+    """The random keys of the samples with these numbers."""
     return jax.vmap(ft.partial(sample_key, key))(high, low)
 
 
@@ -103,19 +110,23 @@ def _draw_starts(
 
 @eqx.filter_jit
 @lapack_in_turn
-def _paths(
+def _paths_by_jax(
     p: Problem, key: PRNGKeyArray, high: _Words, low: _Words
 ) -> tuple[PyTree[Array], Bool[Array, "levels n"]]:
     """The saved states of the paths of a batch, along axes of levels, paths and times, and
     which paths failed."""
+    # (levels, times, paths, entries of the state)
     states, failed = values_of_paths(p, _sample_keys(key, high, low))
-    return p.unravel(jnp.swapaxes(states, 1, 2)), failed
+    # (levels, paths, times, entries of the state)
+    states = jnp.swapaxes(states, 1, 2)
+    return p.unravel(states), failed
 
 
 def by_drjit(
     p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:
-    """With a fused kernel. JAX simulates again the paths that the kernel could not finish.
+    """The paths with these sample numbers, on one level, simulated by a fused kernel. JAX
+    simulates again the paths that the kernel could not finish.
 
     Raises an `ImportError` without Dr.Jit, and a `ValueError` if the system cannot be
     replayed."""
@@ -127,12 +138,12 @@ def by_drjit(
             "nothing else."
         ) from error
     except (NotReplayed, RuntimeError) as error:
-        refused = _refusal(error)
-        if refused is None:
+        refusal = _refusal(error)
+        if refusal is None:
             raise
-        # The errors behind it are about recordings, and pages long.
-        raise refused from None
-    if fused.stragglers == 0:
+        # The errors behind the refusal are about recordings, and pages long.
+        raise refusal from None
+    if fused.num_stragglers == 0:
         return fused
     return _with_stragglers(p, key, sample_numbers, level, fused)
 
@@ -140,24 +151,30 @@ def by_drjit(
 def _fused_batch(
     p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int
 ) -> Batch:
-    """The paths from the kernel alone: those that it did not finish count as failed."""
+    """The paths of a batch from the kernel alone: those that it did not finish count as
+    failed."""
     kernels, lanes, shared = fused_start(p, key, sample_numbers, level)
     saved_steps = np.asarray(p.level(level).saved_steps)
-    # From the number of a step to the entries of all states after it. The kernel is called
-    # for the steps between two times.
-    after: dict[int, list[np.ndarray]] = {}
-    done = 0
-    for step in np.unique(saved_steps).tolist():
-        if step > done:
-            lanes = kernels.advance(lanes, shared, done, step)
-        done = step
-        after[step] = [np.asarray(entry) for entry in lanes.y]
+    # For each number of steps, the entries of the states after them: an array for each
+    # entry, along the paths. The kernel is called for the steps between two saved times.
+    entries_after: dict[int, list[np.ndarray]] = {}
+    num_done = 0
+    for num_steps in np.unique(saved_steps).tolist():
+        if num_steps > num_done:
+            lanes = kernels.advance(lanes, shared, num_done, num_steps)
+        num_done = num_steps
+        entries_after[num_steps] = [np.asarray(entry) for entry in lanes.y]
+    # An array (paths, times) for each entry. `ts` may repeat a time.
     entries = [
-        np.stack([after[step][k] for step in saved_steps.tolist()], axis=1)
+        np.stack([entries_after[step][k] for step in saved_steps.tolist()], axis=1)
         for k in range(len(lanes.y))
     ]
     stopped = np.asarray(lanes.stopped)
-    return Batch(_states_of_entries(p.y0, entries), stopped, int(np.sum(stopped)))
+    return Batch(
+        y=_states_of_entries(p.y0, entries),
+        failed=stopped,
+        num_stragglers=int(np.sum(stopped)),
+    )
 
 
 class FusedStart(NamedTuple):
@@ -173,26 +190,42 @@ class FusedStart(NamedTuple):
 def fused_start(
     p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> FusedStart:
-    """Compiles the kernels of a problem, unless they are known, and starts these paths."""
+    """The paths with these sample numbers before their first step, and the kernels of the
+    problem, which are compiled unless they are known."""
     own_args = None if p.args_of is None else eqx.filter(p.args, eqx.is_array)
-    functions, arrays = functions_and_arrays(_bare(p), key, own_args, p.paths_differ)
+    functions, arrays = functions_and_arrays(
+        _compiled_problem(p), key, own_args, p.paths_differ
+    )
     kernels = _kernels(functions)
     if p.paths_differ:
-        y0, args = _draw_starts(p, key, *_halves(sample_numbers))
+        high, low = _words(sample_numbers)
+        y0, args = _draw_starts(p, key, high, low)
     else:
         y0 = p.y0
         args = None
-    h = p.level(level).h
-    first = int(sample_numbers[0])
-    lanes, shared = kernels.begin(arrays, key, h, first, len(sample_numbers), y0, args)
+    lanes, shared = kernels.begin(
+        arrays,
+        key,
+        h=p.level(level).h,
+        first_path=int(sample_numbers[0]),
+        num_paths=len(sample_numbers),
+        y0=y0,
+        own_args=args,
+    )
     return FusedStart(kernels, lanes, shared)
 
 
-def _bare(p: Problem) -> Problem:
-    """The problem as a kernel is compiled for it: with plain sweeps for root finders, and
-    without step sizes, times and numbers of steps, which are inputs of the kernel."""
-    none = jnp.zeros(1, jnp.int32)
-    level = Level(none, jnp.ones_like(p.levels.h[:1]), none, none[None])
+def _compiled_problem(p: Problem) -> Problem:
+    """The problem for which a kernel is compiled: with plain sweeps for root finders, and
+    with placeholders for step sizes, times and numbers of steps, which are inputs of the
+    kernel."""
+    zero = jnp.zeros(1, jnp.int32)
+    level = Level(
+        index=zero,
+        h=jnp.ones_like(p.levels.h[:1]),
+        num_steps=zero,
+        saved_steps=zero[None],
+    )
     return dataclasses.replace(
         p,
         solver=without_rescue(p.solver),
@@ -205,7 +238,7 @@ def _bare(p: Problem) -> Problem:
     )
 
 
-# A kernel keeps what the user's functions capture, so only a few are kept.
+# A kernel keeps all that the user's functions capture, so only a few kernels are kept.
 @ft.lru_cache(maxsize=8)
 def _kernels(functions: PathFunctions) -> Kernels:
     return Kernels(functions)
@@ -215,46 +248,50 @@ def _with_stragglers(
     p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int, fused: Batch
 ) -> Batch:
     """The paths of a batch, with those that the kernel did not finish simulated by JAX."""
-    # What the kernel returned for these is where it stopped. From there JAX would need the
-    # solver's state, too: it begins anew, which also gives the same path as without kernel.
-    (which,) = np.nonzero(fused.failed)
-    # Rounded up to a power of four, so that JAX compiles few programs.
-    power = int(np.ceil(np.log(len(which)) / np.log(4)))
+    # To go on from where the kernel stopped, JAX would need the solver's state, too. JAX
+    # begins anew, which also gives the same paths as without a kernel.
+    (places,) = np.nonzero(fused.failed)
+    num_stragglers = len(places)
+    # The size is rounded up to a power of four, by repeating stragglers, so that JAX
+    # compiles few programs.
+    power = int(np.ceil(np.log(num_stragglers) / np.log(4)))
     size = min(len(sample_numbers), 4**power)
-    rest = by_jax(p, key, sample_numbers[np.resize(which, size)], level)
+    repeated_places = np.resize(places, size)
+    solved = by_jax(p, key, sample_numbers[repeated_places], level)
 
-    def with_those_of_jax(fused: np.ndarray, by_jax: np.ndarray) -> np.ndarray:
-        y = np.array(fused)
-        y[which] = by_jax[: len(which)]
-        return y
+    def with_stragglers(fused_leaf: np.ndarray, solved_leaf: np.ndarray) -> np.ndarray:
+        leaf = np.array(fused_leaf)
+        leaf[places] = solved_leaf[:num_stragglers]
+        return leaf
 
     failed = np.zeros(len(sample_numbers), bool)
-    failed[which] = rest.failed[: len(which)]
-    return Batch(jtu.tree_map(with_those_of_jax, fused.y, rest.y), failed, len(which))
+    failed[places] = solved.failed[:num_stragglers]
+    y = jtu.tree_map(with_stragglers, fused.y, solved.y)
+    return Batch(y, failed, num_stragglers)
 
 
 def _states_of_entries(y0: PyTree, entries: list[np.ndarray]) -> PyTree[np.ndarray]:
-    """States in the structure of `y0`, with leading axes for paths and times, from their
-    entries, each an array with these axes."""
+    """States in the structure of `y0`, with leading axes for paths and times, from an array
+    (paths, times) for each of their entries."""
     leaves, treedef = jtu.tree_flatten(y0)
-    left = iter(entries)
-    axes = entries[0].shape
-    each = []
+    remaining_entries = iter(entries)
+    paths_and_times = entries[0].shape
+    state_leaves = []
     for leaf in leaves:
-        of_leaf = [next(left) for _ in range(leaf.size)]
-        if of_leaf:
-            stacked = np.stack(of_leaf, axis=-1)
+        leaf_entries = [next(remaining_entries) for _ in range(leaf.size)]
+        if leaf_entries:
+            stacked = np.stack(leaf_entries, axis=-1)
         else:
             # An empty array has no entries to stack.
-            stacked = np.zeros((*axes, 0), leaf.dtype)
-        each.append(stacked.reshape(*axes, *leaf.shape))
-    return treedef.unflatten(each)
+            stacked = np.zeros((*paths_and_times, 0), leaf.dtype)
+        state_leaves.append(stacked.reshape(*paths_and_times, *leaf.shape))
+    return treedef.unflatten(state_leaves)
 
 
 def _refusal(error: BaseException | None) -> ValueError | None:
     """The error for the user if an operation cannot be replayed; `None` if the error is
-    another one, to be raised as it is. Dr.Jit wraps errors of the functions with which it
-    records a loop."""
+    another one, to be raised as it is."""
+    # Dr.Jit wraps errors of the functions from which it records a loop.
     while error is not None and not isinstance(error, NotReplayed):
         error = error.__cause__ or error.__context__
     if error is None:
@@ -266,8 +303,9 @@ def _refusal(error: BaseException | None) -> ValueError | None:
 
 
 def _origin(location: str) -> str:
-    """The function of the user's code that an operation comes from, if JAX recorded it: the
-    first one outside of installed packages."""
+    """A relative clause that names the function of the user's code from which an operation
+    comes, such as ", which `energy` needs (well.py, line 3)": the first function outside of
+    installed packages. The clause is empty if JAX recorded no such function."""
     package = str(Path(__file__).parents[1])
     for source in source_lines(location):
         if "site-packages" not in source.file and not source.file.startswith(package):

@@ -17,9 +17,9 @@ _MOST_STEPS = 2**31
 
 
 class Level(eqx.Module):
-    """One step size, or several, along a leading axis.
+    """A level: one step size for the whole solve. Or several levels, along a leading axis.
 
-    - `index`: its number, counted from the coarsest.
+    - `index`: the number of the level, 0 for the longest step.
     - `h`: the step size.
     - `num_steps`: the number of steps.
     - `saved_steps`: the numbers of steps after which to average.
@@ -32,19 +32,22 @@ class Level(eqx.Module):
 
 
 def levels_of(dt0: float, counts: StepNumbers, levels: int, dtype: Any) -> Level:
-    """All levels, along a leading axis: each has half the step of the one before. Raises a
-    `ValueError` for too many steps."""
+    """All levels, along a leading axis: each has half the step of the one before. `counts`
+    are the numbers of steps on the first level. Raises a `ValueError` for too many
+    steps."""
     if counts.total * 2.0 ** (levels - 1) >= _MOST_STEPS:
         raise ValueError(
             f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "
             "2^31 steps. Pass fewer levels: two to four are enough to extrapolate."
         )
-    finer = 2 ** np.arange(levels, dtype=np.int32)
+    index = np.arange(levels, dtype=np.int32)
+    steps_in_dt0 = 2**index
     return Level(
-        index=np.arange(levels, dtype=np.int32),
-        h=np.asarray(dt0 / finer, dtype),
-        num_steps=finer * counts.total,
-        saved_steps=finer[:, None] * counts.saved,
+        index=index,
+        h=np.asarray(dt0 / steps_in_dt0, dtype),
+        num_steps=steps_in_dt0 * counts.total,
+        # (levels, saves)
+        saved_steps=steps_in_dt0[:, None] * counts.saved,
     )
 
 
@@ -80,24 +83,35 @@ def level_weights(
     best = _extrapolation_weights(order, levels)
     if levels == 1:
         return best[None]
-    # The finer levels alone, which eliminate one power of the step size less.
-    before = np.append(0.0, _extrapolation_weights(order, levels - 1))
-    rows = [best, np.eye(levels)[-1] - best, best - before]
+    # The extrapolation from all levels but the coarsest, which eliminates one power of the
+    # step size less.
+    best_without_coarsest = np.append(0.0, _extrapolation_weights(order, levels - 1))
+    finest = np.eye(levels)[-1]
+    rows = [best, finest - best, best - best_without_coarsest]
     if levels > 2:
-        of_some = _extrapolation_weights(order, levels - 2)
-        coarse, middle, fine = (np.pad(of_some, (k, 2 - k)) for k in range(3))
-        last = fine - middle
+        # The extrapolations from all but two neighbouring levels, of which there are three.
+        weights = _extrapolation_weights(order, levels - 2)
+        coarse = np.pad(weights, (0, 2))
+        middle = np.pad(weights, (1, 1))
+        fine = np.pad(weights, (2, 0))
+        last_change = fine - middle
         change_before = middle - coarse
-        # The first power of the step size that is left in these.
+        # These extrapolations eliminate `levels - 3` powers of the step size. Halving the
+        # step multiplies their error by 2^-power, with the first power that is left.
         power = order + levels - 3
-        rows += [last, change_before, last - 2.0**-power * change_before]
+        miss = last_change - 2.0**-power * change_before
+        rows += [last_change, change_before, miss]
     return np.stack(rows)
 
 
 def _extrapolation_weights(
     order: int | float, levels: int
 ) -> Float[np.ndarray, " levels"]:
-    """The weights of the means that add up to one, and cancel all error terms."""
+    """The weights of the means on all levels that add up to one, and cancel the first
+    `levels - 1` terms of the error."""
+    # With step h / 2^k on level k, a term in h^power is multiplied by 2^(-power k). The
+    # first equation, of power 0, is that the weights add up to one; the others make terms
+    # of the error vanish.
     powers = np.append(0.0, order + min(order, 1) * np.arange(levels - 1))
     system = 2.0 ** -np.outer(powers, np.arange(levels))
     return np.linalg.solve(system, np.eye(levels)[0])

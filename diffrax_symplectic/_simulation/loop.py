@@ -18,10 +18,10 @@ from .levels import Level
 from .problem import DrawnStart, Problem
 
 
-# On CPUs so many paths are stepped at once. The arrays of more overflow the cache in every
-# sweep over their stage equations: for a million paths of `ArrayRQMC` by the midpoint rule
-# this saves a quarter to a half of the processor time. In smaller blocks the batches of
-# `ensemble` take up to a fifth longer.
+# The number of paths that are stepped at once on CPUs. The arrays of more paths overflow
+# the cache in every sweep over their stage equations: for a million paths of `ArrayRQMC` by
+# the midpoint rule blocks save a quarter to a half of the processor time. In smaller blocks
+# the batches of `ensemble` take up to a fifth longer.
 _PATHS_AT_ONCE = 2**16
 
 
@@ -47,7 +47,8 @@ class PathStates(eqx.Module):
     def start(
         p: Problem, drawn: DrawnStart, solver_state: PyTree[Array], control: Any = None
     ) -> "PathStates":
-        """Paths at the start."""
+        """Paths before their first step. A path whose initial state is not finite has
+        failed."""
         failed = ~jax.vmap(all_finite)(drawn.y0)
         y = _kept_where(failed, p.y0, drawn.y0)
         return PathStates(y, solver_state, failed, drawn.args, control)
@@ -69,8 +70,11 @@ class PathStates(eqx.Module):
 
 def _kept_where(failed: Bool[Array, " n"], old: PyTree, new: PyTree) -> PyTree:
     """The new values, and the old ones for failed paths."""
-    pick = lambda new, old: jnp.where(along(failed, new), old, new)
-    return jtu.tree_map(pick, new, old)
+
+    def kept(new_leaf: Array, old_leaf: Array) -> Array:
+        return jnp.where(mask_like(failed, new_leaf), old_leaf, new_leaf)
+
+    return jtu.tree_map(kept, new, old)
 
 
 class Motion(NamedTuple):
@@ -85,9 +89,9 @@ class Motion(NamedTuple):
 
 
 class Simulated(NamedTuple):
-    """The paths of all levels.
+    """The paths of all levels, or of one level without the axis of levels.
 
-    - `saved`: what was measured after each saved step.
+    - `saved`: the measured values after each saved step.
     - `failed`: which paths have failed at the end.
     - `control`: the control variates at the end.
     """
@@ -98,6 +102,7 @@ class Simulated(NamedTuple):
 
 
 def _phi_itself(phi: Array, failed: Bool[Array, " n"]) -> Array:
+    """The values of `phi`: the measurement that saves them as they are."""
     del failed
     return phi
 
@@ -107,10 +112,12 @@ def simulate(
     begin: Callable[[Level], Motion],
     measure: Callable[[Array, Bool[Array, " n"]], Array] = _phi_itself,
 ) -> Simulated:
-    """Solves all levels. `measure(phi, failed)` is saved after each saved step."""
+    """Simulates the paths of all levels, which `begin(level)` starts. After each saved step
+    `measure(phi, failed)` is saved, with `phi` of shape `(n, m)`."""
     on_level = ft.partial(_on_level, p, begin, measure)
     if len(p.levels.h) == 1:
-        return jtu.tree_map(lambda x: x[None], on_level(p.level(0)))
+        only_level = on_level(p.level(0))
+        return jtu.tree_map(lambda x: x[None], only_level)
     # All levels share one compiled program.
     return lax.map(on_level, p.levels)
 
@@ -118,20 +125,24 @@ def simulate(
 def _on_level(
     p: Problem, begin: Callable[[Level], Motion], measure: Callable, level: Level
 ) -> Simulated:
-    """Solves one level."""
+    """Simulates the paths of one level."""
     motion = begin(level)
 
-    def body(i, carry):
+    def step_and_measure(i, carry):
         paths, saved = carry
-        return _measure_if_saved(p, level, measure, i + 1, motion.step(i, paths), saved)
+        num_steps = i + 1
+        paths = motion.step(i, paths)
+        return _measure_if_saved(p, level, measure, num_steps, paths, saved)
 
-    saves, m = p.num_outputs
+    num_saves, m = p.num_outputs
+    num_paths = len(motion.start.failed)
     dtype = p.dtype_of_values
-    phi = jax.ShapeDtypeStruct((len(motion.start.failed), m), dtype)
+    phi = jax.ShapeDtypeStruct((num_paths, m), dtype)
     measured = jax.eval_shape(measure, phi, motion.start.failed)
-    saved = jnp.zeros((saves, *measured.shape), dtype)
+    saved = jnp.zeros((num_saves, *measured.shape), dtype)
+    # A saved time may be `t0`.
     carry = _measure_if_saved(p, level, measure, 0, motion.start, saved)
-    paths, saved = lax.fori_loop(0, level.num_steps, body, carry)
+    paths, saved = lax.fori_loop(0, level.num_steps, step_and_measure, carry)
     return Simulated(saved, paths.failed, paths.control)
 
 
@@ -143,25 +154,25 @@ def _measure_if_saved(
     paths: PathStates,
     saved: Float[Array, "S ..."],
 ) -> tuple[PathStates, Float[Array, "S ..."]]:
-    """Measures the paths after `i` steps, if this is a saved step. A path whose `phi` is
-    not finite has failed."""
+    """The paths after `i` steps, and the saved values, to which this adds a measurement if
+    step `i` is a saved one. A path whose `phi` is not finite has failed."""
 
-    def record():
+    def measured():
         def phi_of(y, args):
             return p.with_args(args).values(p.t0 + i * level.h, y)
 
         phi = jax.vmap(phi_of)(paths.y, paths.args)
         failed = paths.failed | ~jax.vmap(all_finite)(phi)
-        # `ts` may repeat a time, so one step may have several places.
-        here = along(level.saved_steps == i, saved)
-        return failed, jnp.where(here, measure(phi, failed), saved)
+        # `ts` may repeat a time, so several rows of `saved` may belong to this step.
+        is_row_of_step = mask_like(level.saved_steps == i, saved)
+        return failed, jnp.where(is_row_of_step, measure(phi, failed), saved)
 
-    def pass_by():
+    def unchanged():
         return paths.failed, saved
 
     # One predicate for all paths, so that `phi` is evaluated only after saved steps.
     is_saved = jnp.any(level.saved_steps == i)
-    failed, saved = lax.cond(is_saved, record, pass_by)
+    failed, saved = lax.cond(is_saved, measured, unchanged)
     return eqx.tree_at(lambda states: states.failed, paths, failed), saved
 
 
@@ -173,22 +184,25 @@ def independent_steps(
     randomness: Callable[[Any], PyTree[Array]],
 ) -> Motion:
     """The motion of independent paths, whose starts were `drawn`. In step `i` each path has
-    the terms `terms_of(r)`, with `r` its own row of `randomness(i)`."""
+    the terms `terms_of(random)`, where `random` is the row of `randomness(i)` that belongs
+    to the path."""
 
-    def step(i, paths):
-        def one(random, y, solver_state, args):
+    def step(i: Any, paths: PathStates) -> PathStates:
+        def step_of_path(random, y, solver_state, args):
             problem_of_path = p.with_args(args)
             terms = terms_of(random)
             return problem_of_path.step(terms, i, level.h, y, solver_state)
 
-        states = paths.y, paths.solver_state, paths.args
-        y, solver_state, success = _in_blocks(one, randomness(i), *states)
+        y, solver_state, success = _vmapped_in_blocks(
+            step_of_path, randomness(i), paths.y, paths.solver_state, paths.args
+        )
         return paths.moved(p, y, solver_state, success)
 
-    def start(random, y, args):
-        return p.with_args(args).init(terms_of(random), 0, level.h, y)
+    def solver_state_at_start(random, y, args):
+        problem_of_path = p.with_args(args)
+        return problem_of_path.init(terms_of(random), 0, level.h, y)
 
-    solver_state = jax.vmap(start)(randomness(0), drawn.y0, drawn.args)
+    solver_state = jax.vmap(solver_state_at_start)(randomness(0), drawn.y0, drawn.args)
     return Motion(step, PathStates.start(p, drawn, solver_state))
 
 
@@ -210,20 +224,20 @@ def values_of_paths(
             randomness=lambda i: keys_of_paths,
         )
 
-    done = simulate(p, begin)
-    return done.saved, done.failed
+    simulated = simulate(p, begin)
+    return simulated.saved, simulated.failed
 
 
-def _in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
+def _vmapped_in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
     """`jax.vmap(fn)(*args)`, on CPUs one block of paths after another."""
-    count = len(jtu.tree_leaves(args)[0])
-    # A block of another size would be compiled for itself.
-    is_whole = count > _PATHS_AT_ONCE and count % _PATHS_AT_ONCE == 0
-    if not is_whole or jax.default_backend() != "cpu":
+    num_paths = len(jtu.tree_leaves(args)[0])
+    # A last block of another size would be compiled for itself.
+    has_whole_blocks = num_paths > _PATHS_AT_ONCE and num_paths % _PATHS_AT_ONCE == 0
+    if not has_whole_blocks or jax.default_backend() != "cpu":
         return jax.vmap(fn)(*args)
     return lax.map(lambda args: fn(*args), args, batch_size=_PATHS_AT_ONCE)
 
 
-def along(mask: Bool[Array, " n"], x: Array) -> Array:
-    """A mask of the first axis, broadcastable against `x`."""
+def mask_like(mask: Bool[Array, " n"], x: Array) -> Array:
+    """A mask of the first axis of `x`, with axes of length 1 for the others."""
     return mask.reshape(-1, *[1] * (x.ndim - 1))

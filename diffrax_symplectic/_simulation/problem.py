@@ -53,17 +53,18 @@ from .arguments import (
 from .levels import combinations, Level, level_weights, levels_of
 
 
-# Folded into the key of a sample to draw its `y0` and `args`. The keys of its paths are
-# folded from the words of the user's keys: a number that is unlikely to be one of them.
+# The number that is folded into the key of a sample to draw its `y0` and `args`. The words
+# of the user's keys are folded into the same key for the paths: this number is unlikely to
+# be one of them.
 _START_KEY = 0x517A87
 
 
 class DrawnStart(NamedTuple):
     """The start of a path (or of many, along the first axis of each array).
 
-    - `y0`: its initial state.
-    - `args`: the arrays of its own `args`, for `Problem.with_args`; nothing unless they are
-        drawn.
+    - `y0`: the initial state.
+    - `args`: the arrays in the `args` of the path, for `Problem.with_args`; `None` if all
+        paths have the same `args`.
     """
 
     y0: Y
@@ -74,7 +75,8 @@ class Problem(eqx.Module):
     """The arguments of `expectation`, by the same names, and the levels, along a leading
     axis. Where `y0` or `args` is a function of a random key, `y0` and `args` are an example
     of its values. Outside of programs times, levels and weights are NumPy arrays: there
-    each operation of JAX is a program of its own, which takes some 20 ms to compile."""
+    each operation of JAX is a program of its own, which takes some 20 ms to compile. Where
+    a problem is the argument of a function, it is called `p`."""
 
     phi: Callable[[RealScalarLike, Y, Args], PyTree]
     terms: PyTree[diffrax.AbstractTerm]
@@ -109,22 +111,23 @@ class Problem(eqx.Module):
         ts: Sequence[Any] | np.ndarray | Array | None,
         levels: int,
         want: Want = "weak",
-        user: str = "expectation",
+        caller: str = "expectation",
     ) -> "Problem":
-        """Raises a `ValueError` for bad arguments of `user`, the function called. `want` is
-        the purpose of the paths that take the place of shapes."""
+        """The problem of these arguments of `caller`, with a path of the solver in place of
+        each shape in `terms`. `want` is the purpose of these paths. Raises a `ValueError`
+        for bad arguments."""
         levels = whole_number("levels", levels)
         check_solver("solver", solver)
         if isinstance(solver, diffrax.HalfSolver):
             raise ValueError(
                 "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
             )
-        # In each sample other keys take the place of these.
-        shapes = which_are_shapes(terms)
+        was_shape = which_are_shapes(terms)
+        # The paths get keys for an example. In each sample others take their place.
         terms = with_paths_for_shapes(terms, ft.partial(own_path, solver, want))
         counts = step_numbers(t0, t1, dt0, ts)
 
-        # Any draw has the right structure.
+        # Any draw has the structure of all: these keys serve as well as others.
         args_of = args if callable(args) else None
         if args_of is not None:
             args = drawn_args(args_of, jr.key(0))
@@ -133,50 +136,57 @@ class Problem(eqx.Module):
             y0 = drawn_state(y0_of, jr.key(1), args)
         else:
             y0 = given_state(y0)
-        check_state(y0, user)
+        check_state(y0, caller)
         if y0_of is None:
             check_finite(y0)
 
-        start = np.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
-        check_shapes(phi, terms, start, y0, args)
-        # Here, where the values of `y0` are known. In the program of a solve they are not.
-        check_assertions(terms, start, y0, args)
+        # Times have the dtype of the state.
+        t0_of_dtype = np.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
+        check_shapes(phi, terms, t0_of_dtype, y0, args)
+        # Here the values of `y0` are known. In the program of a solve they are not.
+        check_assertions(terms, t0_of_dtype, y0, args)
         if constraint_of(terms) is not None:
-            check_start(terms, start, y0, args)
+            check_start(terms, t0_of_dtype, y0, args)
         check_noise(terms)
-        # Solvers make paths without knowing what they drive. Those of the user are kept.
-        if any(shapes):
-            needed = which_need_truncation(terms, start, y0, args)
-            needless = [own and not need for own, need in zip(shapes, needed)]
+        # A solver makes a path without knowing what it drives: it truncates increments that
+        # need not be. Paths of the user are kept as they are.
+        if any(was_shape):
+            needed = which_need_truncation(terms, t0_of_dtype, y0, args)
+            needless = [
+                is_made and not is_needed
+                for is_made, is_needed in zip(was_shape, needed)
+            ]
             terms = without_truncation(terms, needless)
         check_truncation(terms, float(dt0))
-        smallest = float(dt0) / 2 ** (levels - 1)
+        smallest_step = float(dt0) / 2 ** (levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):
-            check_resolution(smallest, float(t0), float(t1), start.dtype)
-        check_stratonovich(terms, solver, start, y0, args, all_terms=True)
-        check_cells(terms, float(t0), smallest)
+            check_resolution(smallest_step, float(t0), float(t1), t0_of_dtype.dtype)
+        check_stratonovich(terms, solver, t0_of_dtype, y0, args, all_terms=True)
+        check_cells(terms, float(t0), smallest_step)
 
-        grid = levels_of(float(dt0), counts, levels, start.dtype)
+        all_levels = levels_of(float(dt0), counts, levels, t0_of_dtype.dtype)
+        # Solvers of other packages have no `weak_order`, and solvers of the user may not
+        # state theirs: it counts as 1.
         order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
         weights = np.asarray(level_weights(order, levels), jnp.result_type(float))
         return Problem(
             phi=phi,
             terms=terms,
             solver=solver,
-            t0=start,
+            t0=t0_of_dtype,
             y0=y0,
             args=args,
             y0_of=y0_of,
             args_of=args_of,
-            levels=grid,
+            levels=all_levels,
             weights=weights,
             at_end=ts is None,
             path_numbers=path_numbers(brownian_paths(terms)),
-            finest_steps=int(grid.num_steps[-1]),
+            finest_steps=int(all_levels.num_steps[-1]),
         )
 
     def level(self, index: IntScalarLike) -> Level:
-        """The level with this number."""
+        """The level with this number, which may be traced."""
         if is_traced(index):
             return jtu.tree_map(lambda x: jnp.asarray(x)[index], self.levels)
         return jtu.tree_map(lambda x: x[index], self.levels)
@@ -188,21 +198,21 @@ class Problem(eqx.Module):
 
     def draw_start(self, key: PRNGKeyArray) -> DrawnStart:
         """The start of the sample with this key."""
-        for_y0, for_args = jr.split(jr.fold_in(key, _START_KEY))
+        y0_key, args_key = jr.split(jr.fold_in(key, _START_KEY))
         own_args = None
         if self.args_of is not None:
-            own_args = eqx.filter(drawn_args(self.args_of, for_args), eqx.is_array)
+            own_args = eqx.filter(drawn_args(self.args_of, args_key), eqx.is_array)
         if self.y0_of is None:
             return DrawnStart(self.y0, own_args)
         args = self.with_args(own_args).args
-        return DrawnStart(drawn_state(self.y0_of, for_y0, args), own_args)
+        return DrawnStart(drawn_state(self.y0_of, y0_key, args), own_args)
 
     def with_args(self, own_args: PyTree[Array]) -> "Problem":
-        """The problem of a path that was drawn."""
+        """The problem of a path with these arrays in its `args`, as in `DrawnStart`."""
         if self.args_of is None and own_args is None:
             return self
-        rest = eqx.filter(self.args, eqx.is_array, inverse=True)
-        return dataclasses.replace(self, args=eqx.combine(own_args, rest))
+        shared_args = eqx.filter(self.args, eqx.is_array, inverse=True)
+        return dataclasses.replace(self, args=eqx.combine(own_args, shared_args))
 
     def init(
         self, terms: PyTree, i: Any, h: Float[Array | np.ndarray, ""], y: Y
@@ -223,15 +233,18 @@ class Problem(eqx.Module):
     ) -> tuple[Y, PyTree[Array], Bool[Array, ""]]:
         """One step of one path: its state and the arrays of the solver's state after the
         step, and whether it succeeded."""
-        # Both from the number of the step: `next_t` is exactly the `t` of the next step.
+        # Both times follow from the number of the step, so that `next_t` is exactly the `t`
+        # of the next step.
         t = self.t0 + i * h
         next_t = self.t0 + (i + 1) * h
         # Only arrays are carried from step to step. The rest of the solver's state does not
-        # change: it is that of `init`, traced for its structure only.
-        fresh = eqx.filter_eval_shape(self.solver.init, terms, t, next_t, y, self.args)
+        # change: it is taken from `init`, which is traced and not run.
+        initial = eqx.filter_eval_shape(
+            self.solver.init, terms, t, next_t, y, self.args
+        )
         is_struct = lambda x: isinstance(x, jax.ShapeDtypeStruct)
-        rest = eqx.filter(fresh, is_struct, inverse=True)
-        solver_state = eqx.combine(solver_state, rest)
+        constant_part = eqx.filter(initial, is_struct, inverse=True)
+        solver_state = eqx.combine(solver_state, constant_part)
         y, _, _, solver_state, result = self.solver.step(
             terms, t, next_t, y, self.args, solver_state, made_jump=False
         )
@@ -247,9 +260,10 @@ class Problem(eqx.Module):
         return real_vector(self.phi(t, y, self.args))
 
     def unravel(self, x: Float[Array | np.ndarray, "*axes m"]) -> PyTree[Array]:
-        """Flat values of `phi` in its own structure."""
-        shape = jax.eval_shape(lambda: self.phi(self.t0, self.y0, self.args))
-        leaves, treedef = jtu.tree_flatten(shape)
+        """Vectors of all numbers of `phi`, as from `values`, in the structure of `phi`,
+        with the other axes of `x` in front."""
+        struct = jax.eval_shape(lambda: self.phi(self.t0, self.y0, self.args))
+        leaves, treedef = jtu.tree_flatten(struct)
         ends = np.cumsum([leaf.size for leaf in leaves])
         parts = jnp.split(x, ends[:-1], axis=-1)
         axes = x.shape[:-1]
@@ -259,7 +273,7 @@ class Problem(eqx.Module):
     def combinations(
         self, x: Float[Array, "levels ..."]
     ) -> Float[Array, "combinations ..."]:
-        """The combinations of values on all levels."""
+        """The combinations of values on all levels, as in `level_weights`."""
         return combinations(self.weights, x)
 
     def shaped(
@@ -269,19 +283,23 @@ class Problem(eqx.Module):
         of times, if there is one."""
         if self.at_end:
             return self.unravel(x[:, 0])
+        # (combinations, n, S, m)
         return self.unravel(jnp.swapaxes(x, 1, 2))
 
     @property
-    def shape_of_sample(self) -> PyTree[jax.ShapeDtypeStruct]:
-        """The shapes of the values of one sample, for all combinations of levels."""
-        times, m = self.num_outputs
-        x = np.zeros((len(self.weights), times, 1, m), self.dtype_of_values)
+    def sample_struct(self) -> PyTree[jax.ShapeDtypeStruct]:
+        """The shapes and dtypes of the values of one sample, for all combinations of
+        levels."""
+        num_times, m = self.num_outputs
+        x = np.zeros((len(self.weights), num_times, 1, m), self.dtype_of_values)
+        one_sample = jax.eval_shape(lambda: self.shaped(x))
 
         def without_samples(struct: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-            combinations, _, *rest = struct.shape
-            return jax.ShapeDtypeStruct((combinations, *rest), struct.dtype)
+            num_combinations, _, *other_axes = struct.shape
+            shape = (num_combinations, *other_axes)
+            return jax.ShapeDtypeStruct(shape, struct.dtype)
 
-        return jtu.tree_map(without_samples, jax.eval_shape(lambda: self.shaped(x)))
+        return jtu.tree_map(without_samples, one_sample)
 
     @property
     def bounded(self) -> bool:
@@ -295,7 +313,7 @@ class Problem(eqx.Module):
 
     @property
     def dtype(self) -> Any:
-        """The dtype of the state, which is that of times and fits."""
+        """The dtype of the state, which times and fits have, too."""
         return jnp.result_type(*jtu.tree_leaves(self.y0))
 
     @property
@@ -306,11 +324,13 @@ class Problem(eqx.Module):
 
 
 def advice_on_failures(bounded: bool) -> str:
-    """What to do about failed paths. `bounded` is whether the increments of all paths are
-    known to be bounded."""
-    instead = "" if bounded else " or bounded increments, as from a `WeakBrownianPath`,"
+    """What to do about failed paths, in a sentence for messages. `bounded` is whether the
+    increments of all paths are known to be bounded."""
+    alternative = " or bounded increments, as from a `WeakBrownianPath`,"
+    if bounded:
+        alternative = ""
     return (
-        f"Take smaller steps{instead} and look for NaNs in `y0`, `args` and the "
+        f"Take smaller steps{alternative} and look for NaNs in `y0`, `args` and the "
         "Hamiltonians, and for a `temperature` or `friction` that is negative or, as a "
         "matrix, not symmetric positive semidefinite."
     )

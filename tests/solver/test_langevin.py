@@ -77,13 +77,13 @@ def test_momenta_of_baoab_are_too_cold_by_a_known_factor(h):
     np.testing.assert_allclose(moments, exact, rtol=1e-13, atol=1e-14)
 
 
-LANGEVIN = pytest.mark.parametrize("solver", [ds.BAOAB(), ds.LangevinMiddle()])
+BOTH_SPLITTINGS = pytest.mark.parametrize("solver", [ds.BAOAB(), ds.LangevinMiddle()])
 
 
 BOTH = [(friction, masses) for friction in FRICTIONS for masses in KINETIC]
 
 
-@LANGEVIN
+@BOTH_SPLITTINGS
 @pytest.mark.parametrize(
     "kinds",
     slow_except([("number", "each"), ("matrix", "matrix")], BOTH),
@@ -104,7 +104,7 @@ def test_springs_of_any_friction_and_masses_keep_the_temperature(kinds, solver):
     np.testing.assert_allclose(moments[:3, :3], momenta, atol=1e-13)
 
 
-@LANGEVIN
+@BOTH_SPLITTINGS
 @pytest.mark.parametrize("friction", slow_except(["matrix"], FRICTIONS))
 def test_free_particles_diffuse_as_einstein_says_for_any_step(friction, solver):
     G = FRICTIONS[friction]
@@ -125,7 +125,7 @@ def test_free_particles_diffuse_as_einstein_says_for_any_step(friction, solver):
         np.testing.assert_allclose(grown / (2 * h), exact, rtol=1e-10, atol=1e-11)
 
 
-@LANGEVIN
+@BOTH_SPLITTINGS
 def test_mobility_is_exact(solver):
     force, h = 0.3, 1.5
     H0 = lambda t, p, q, args: p**2 / (2 * MASS) - force * q
@@ -314,7 +314,7 @@ def _diffrax_terms(path, gamma=GAMMA):
     )
 
 
-@LANGEVIN
+@BOTH_SPLITTINGS
 def test_terms_of_diffrax_are_taken_as_they_are(solver):
     path = weak_path(2)
     H0 = lambda t, p, q, args: jnp.sum(U * p**2 / 2 + q**4 / 4 - args * jnp.cos(q))

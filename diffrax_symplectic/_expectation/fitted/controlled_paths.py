@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Key
 
-from ..._simulation import along, Level, Motion, PathStates, Problem, simulate
+from ..._simulation import Level, mask_like, Motion, PathStates, Problem, simulate
 from ..sampling import Averaged, Samples
 from .fits import Choice, FittedFunctions
 from .noise import Noise
@@ -59,7 +59,9 @@ def controlled_paths(
             states = paths.y, paths.solver_state, paths.args
             after, log_ratio = jax.vmap(one)(*states, keys)
             # A failed path has no value, but its control must be finite.
-            change = jnp.where(along(after.success, after.control), after.control, 0)
+            change = jnp.where(
+                mask_like(after.success, after.control), after.control, 0
+            )
             before = paths.control
             # The mean over the first step.
             fitted_mean = jnp.where(i == 0, after.value - change, before.fitted_mean)
@@ -84,7 +86,7 @@ def controlled_paths(
     control = jnp.swapaxes(done.control.value, 1, 2).astype(plain.dtype)
     fitted_mean = jnp.swapaxes(done.control.fitted_mean, 1, 2).astype(plain.dtype)
     # At the start itself nothing is random.
-    is_at_start = along(p.levels.saved_steps[0] == 0, plain[0])
+    is_at_start = mask_like(p.levels.saved_steps[0] == 0, plain[0])
     fitted_mean = jnp.where(is_at_start, plain, fitted_mean)
     on_levels = plain - control, plain, control, fitted_mean
     value, plain, control, fitted_mean = map(p.combinations, on_levels)

@@ -94,7 +94,7 @@ class ValueFunctions(AbstractSampling):
         chosen = chosen_basis(problem, self.degree)
         warn_of_long_fit(chosen, stacklevel=5)
         basis = chosen.basis
-        shape = problem.shape_of_sample
+        shape = problem.sample_struct
         trials = _Trials(
             problem,
             _fits(problem, key, basis),

@@ -23,10 +23,10 @@ from ..._brownian import (
 )
 from ..._custom_types import Y
 from ..._simulation import (
-    along,
     combinations,
     independent_steps,
     Level,
+    mask_like,
     Motion,
     PathStates,
     Problem,
@@ -202,7 +202,7 @@ def _in_order(sort_by: Callable[[Y], PyTree[Array]], paths: PathStates) -> PathS
 def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "3 ..."]:
     """The mean over the paths that have not failed, the `r` of these paths as in
     `Expectation.std_error`, and the largest deviation of one of them."""
-    mask = along(~failed, x)
+    mask = mask_like(~failed, x)
     count = jnp.sum(~failed).astype(x.dtype)
 
     def mean(x: Array) -> Array:
