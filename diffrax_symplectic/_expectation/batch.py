@@ -1,6 +1,5 @@
 """The program that computes one batch on each device."""
 
-import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -17,30 +16,31 @@ from .._lapack import lapack_in_turn
 from .sampling import Averaged, Samples
 
 
-# Powers of two up to this one below the largest that the dtype holds: sums of 2^24 numbers
-# of this size stay in range.
-_ROOM = 24
+# Numbers are scaled by powers of two whose exponents are this much below the largest of the
+# dtype: sums of 2^24 numbers of this size stay in range.
+_SPARE_EXPONENTS = 24
 
 
 class BatchMoments(NamedTuple):
     """What is known of the samples of a batch. Arrays in an `Averaged` have leading axes
     for devices and combinations of levels.
 
-    - `good`: the number of good samples.
-    - `failed`: the number of failed paths. A path that fails on several levels counts once.
+    - `num_good`: the number of good samples.
+    - `num_failed`: the number of failed paths. A path that fails on several levels counts
+        once.
     - `failed_on`: the number of paths that failed on each level.
     - `mean`: the mean of the good samples.
-    - `rest`: the rounding error of this mean, which is added to it in float64.
+    - `mean_correction`: what rounding took from this mean. It is added in float64.
     - `norm`: the root of the sum of squared deviations from the exact mean.
     - `largest`: the largest deviation.
     - `size`: the largest absolute value.
     """
 
-    good: Int[Array, "*devices"]
-    failed: Int[Array, "*devices"]
+    num_good: Int[Array, "*devices"]
+    num_failed: Int[Array, "*devices"]
     failed_on: Int[Array, "*devices levels"]
     mean: Averaged
-    rest: Averaged
+    mean_correction: Averaged
     norm: Averaged
     largest: Averaged
     size: Averaged
@@ -49,34 +49,39 @@ class BatchMoments(NamedTuple):
 def _moments_on_devices(
     sampler: Callable[..., Samples],
     key_data: UInt32[Array, "..."],
-    impl: Any,
+    key_impl: Any,
     first: UInt32[Array, "2"],
-    wanted: Int[Array, ""],
+    num_wanted: Int[Array, ""],
     mesh: Mesh,
     n: int,
 ) -> BatchMoments:
-    """The moments on all devices, along a leading axis. Each takes `n` samples, the first
-    one from sample number `first` on, in two halves of 32 bits. The first `wanted`
-    count."""
+    """The moments on all devices, along a leading axis. Each device takes `n` samples, and
+    the first device begins with sample number `first`, given as its low and its high 32
+    bits. Only the first `num_wanted` samples of all devices together count."""
     if mesh.size == 1:
-        moments = _of_device(sampler, key_data, impl, first, wanted, n, 0)
+        moments = _moments_on_device(
+            sampler, key_data, key_impl, first, num_wanted, n, device=0
+        )
         return jtu.tree_map(lambda x: x[None], moments)
     dynamic, static = eqx.partition(sampler, eqx.is_array)
 
     # The devices do not communicate until the end, so each one's result does not depend on
     # how many there are.
-    def shard(dynamic, first, wanted):
+    def gathered_moments(dynamic, first, num_wanted):
         sampler = eqx.combine(dynamic, static)
         device = jax.lax.axis_index("samples")
-        moments = _of_device(sampler, key_data, impl, first, wanted, n, device)
+        moments = _moments_on_device(
+            sampler, key_data, key_impl, first, num_wanted, n, device
+        )
         return jtu.tree_map(lambda x: jax.lax.all_gather(x, "samples"), moments)
 
-    none = PartitionSpec()
-    sharded = jax.shard_map(
-        shard, mesh=mesh, in_specs=none, out_specs=none, check_vma=False
+    # Every device gets all arguments, and returns the moments of all.
+    whole = PartitionSpec()
+    on_all_devices = jax.shard_map(
+        gathered_moments, mesh=mesh, in_specs=whole, out_specs=whole, check_vma=False
     )
     try:
-        return sharded(dynamic, first, wanted)
+        return on_all_devices(dynamic, first, num_wanted)
     except ValueError as error:
         # The loop of Diffrax's default adjoint rejects arrays that vary between devices.
         if is_closure_mismatch(error):
@@ -90,79 +95,99 @@ def _moments_on_devices(
 
 
 batch_moments = eqx.filter_jit(_moments_on_devices)
-# For samples that take less time than compiling their program.
+# The same for samples that take less time than compiling their program.
 quick_batch_moments = quickly_compiled(_moments_on_devices)
 
 
-def _of_device(
+def _moments_on_device(
     sampler: Callable[..., Samples],
     key_data: UInt32[Array, "..."],
-    impl: Any,
+    key_impl: Any,
     first: UInt32[Array, "2"],
-    wanted: Int[Array, ""],
+    num_wanted: Int[Array, ""],
     n: int,
     device: Any,
 ) -> BatchMoments:
-    """The moments on one device, by its number."""
+    """The moments on the device with this number, of its `n` samples."""
+    # The places of the samples among those of all devices.
     index = device * n + jnp.arange(n)
     # The sum of `first` and `index` in two halves, since there may be no 64-bit integers.
-    low = first[0] + index.astype(jnp.uint32)
-    high = first[1] + (low < first[0]).astype(jnp.uint32)
-    key = jr.wrap_key_data(jnp.asarray(key_data), impl=impl)
+    first_low = first[0]
+    first_high = first[1]
+    low = first_low + index.astype(jnp.uint32)
+    has_carry = low < first_low
+    high = first_high + has_carry.astype(jnp.uint32)
+    key = jr.wrap_key_data(jnp.asarray(key_data), impl=key_impl)
 
     def sample_key(high: Array, low: Array) -> PRNGKeyArray:
         return jr.fold_in(jr.fold_in(key, high), low)
 
     samples = lapack_in_turn(sampler)(jax.vmap(sample_key)(high, low))
     # The last batch is cut here: another size would be another program.
-    is_wanted = index < wanted
+    is_wanted = index < num_wanted
     good = samples.good & is_wanted
-    lost = jnp.where(is_wanted, samples.lost, 0)
-    failed = jnp.sum(jnp.max(lost, axis=0))
+    # (levels, samples)
+    num_failed = jnp.where(is_wanted, samples.num_failed, 0)
+    num_failed_on_any = jnp.sum(jnp.max(num_failed, axis=0))
     fields = samples.averaged.fields
     # All fields of one shape are summed at once, since fewer operations compile sooner.
     stacked = jtu.tree_map(lambda *of_fields: jnp.stack(of_fields), *fields.values())
     leaves, treedef = jtu.tree_flatten(stacked)
-    each = [_moments_of_array(leaf, good) for leaf in leaves]
+    moments_of_leaves = [_moments_of_array(leaf, good) for leaf in leaves]
 
-    def by_field(*of_leaves: Array) -> Averaged:
-        tree = treedef.unflatten(of_leaves)
-        parts = [jtu.tree_map(lambda x, k=k: x[k], tree) for k in range(len(fields))]
-        return Averaged(**dict(zip(fields, parts)))
+    def averaged_of(leaves: tuple[Array, ...]) -> Averaged:
+        tree = treedef.unflatten(leaves)
+        trees = [jtu.tree_map(lambda x, k=k: x[k], tree) for k in range(len(fields))]
+        return Averaged(**dict(zip(fields, trees)))
 
-    moments = itertools.starmap(by_field, zip(*each))
-    return BatchMoments(jnp.sum(good), failed, jnp.sum(lost, axis=1), *moments)
+    # Each moment of all leaves, in place of all moments of each leaf.
+    mean, mean_correction, norm, largest, size = map(
+        averaged_of, zip(*moments_of_leaves)
+    )
+    return BatchMoments(
+        num_good=jnp.sum(good),
+        num_failed=num_failed_on_any,
+        failed_on=jnp.sum(num_failed, axis=1),
+        mean=mean,
+        mean_correction=mean_correction,
+        norm=norm,
+        largest=largest,
+        size=size,
+    )
 
 
 def _moments_of_array(
     x: Float[Array, "fields combinations n ..."], good: Bool[Array, " n"]
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """`mean`, `rest`, `norm`, `largest` and `size` of `BatchMoments` for one array."""
-    mask = good.reshape(-1, *[1] * (x.ndim - 3))
-    n = jnp.maximum(jnp.sum(good), 1)
+    """`mean`, `mean_correction`, `norm`, `largest` and `size` of `BatchMoments` for one
+    array, whose third axis is that of samples."""
+    is_used = good.reshape(-1, *[1] * (x.ndim - 3))
+    num_good = jnp.maximum(jnp.sum(good), 1)
 
-    def largest_of(x: Array) -> Array:
+    def largest_of_samples(x: Array) -> Array:
         return jnp.max(jnp.abs(x), axis=2)
 
-    x = jnp.where(mask, x, 0)
-    size = largest_of(x)
-    to_unit, from_unit = _powers(size)
-    mean = from_unit * (jnp.sum(x * to_unit[:, :, None], axis=2) / n)
+    x = jnp.where(is_used, x, 0)
+    size = largest_of_samples(x)
+    to_unit, from_unit = _scales(size)
+    mean = from_unit * (jnp.sum(x * to_unit[:, :, None], axis=2) / num_good)
     # Two passes avoid cancellation. The second also finds the rounding error of the mean.
-    deviations = jnp.where(mask, x - mean[:, :, None], 0)
-    largest = largest_of(deviations)
-    to_unit, from_unit = _powers(largest)
-    z = deviations * to_unit[:, :, None]
-    rest = jnp.sum(z, axis=2) / n
-    squares = jnp.maximum(jnp.sum(z**2, axis=2) - n * rest**2, 0)
-    return mean, from_unit * rest, from_unit * jnp.sqrt(squares), largest, size
+    deviations = jnp.where(is_used, x - mean[:, :, None], 0)
+    largest = largest_of_samples(deviations)
+    to_unit, from_unit = _scales(largest)
+    scaled = deviations * to_unit[:, :, None]
+    correction = jnp.sum(scaled, axis=2) / num_good
+    # The squared deviations from the corrected mean.
+    squares = jnp.sum(scaled**2, axis=2) - num_good * correction**2
+    norm = from_unit * jnp.sqrt(jnp.maximum(squares, 0))
+    return mean, from_unit * correction, norm, largest, size
 
 
-def _powers(size: Array) -> tuple[Array, Array]:
+def _scales(size: Array) -> tuple[Array, Array]:
     """A power of two that scales numbers of this size to about one, so that sums of them
-    and of their squares stay in range; and its inverse. (XLA divides by multiplying with
-    the inverse, which may underflow.)"""
-    most = jnp.finfo(size.dtype).maxexp - _ROOM
+    and of their squares stay in range; and its inverse, to scale back. (XLA divides by
+    multiplying with the inverse, which may underflow.)"""
+    most = jnp.finfo(size.dtype).maxexp - _SPARE_EXPONENTS
     exponent = jnp.clip(jnp.frexp(size)[1], -most, most)
     one = jnp.ones_like(size)
     return jnp.ldexp(one, -exponent), jnp.ldexp(one, exponent)

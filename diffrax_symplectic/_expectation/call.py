@@ -18,7 +18,7 @@ class CheckedCall(NamedTuple):
 
     - `key`: as a typed key.
     - `first`: the number of the first sample.
-    - `devices`: all that share the work.
+    - `devices`: the devices that share the work.
     """
 
     key: PRNGKeyArray
@@ -27,17 +27,18 @@ class CheckedCall(NamedTuple):
 
 
 def checked_call(
-    user: str,
+    function_name: str,
     key: Any,
     tol: Any = None,
     start: Any = None,
     first: Any = 0,
     devices: Sequence[Any] | None = None,
-    others: Any = (),
+    other_arguments: Any = (),
 ) -> CheckedCall:
-    """Raises a `ValueError` for invalid arguments of `user`, the function called, and for
-    traced arrays in `key` and in the `others`."""
-    key = checked_key(user, key, others)
+    """The arguments, with defaults in place of `None`. Raises a `ValueError` for invalid
+    ones, and for traced arrays in `key` and in `other_arguments`. `function_name` is the
+    function that the user called, for messages."""
+    key = checked_key(function_name, key, other_arguments)
     if start is not None and first != 0:
         raise ValueError(
             "Pass either `start`, which continues after its last sample, or `first`."
@@ -48,7 +49,7 @@ def checked_call(
         raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")
     if start is not None and not isinstance(start, Expectation):
         raise ValueError(
-            f"`start` must be what `{user}` returned, or `None`; got {start!r}."
+            f"`start` must be what `{function_name}` returned, or `None`; got {start!r}."
         )
     devices = jax.devices() if devices is None else devices
     is_sequence = isinstance(devices, Sequence)

@@ -21,15 +21,17 @@ from .sampling import AbstractSampling, SamplingPlan, SAVED_SAMPLINGS
 from .sorted import ArrayRQMC, step_words
 
 
-# No sample's key is folded from this number.
-_NO_SAMPLE = 0xFFFFFFFF
+# Folded into the key of a call to draw trials. Numbers of samples, from which the keys of
+# samples are folded, are smaller.
+_TRIAL_KEY = 0xFFFFFFFF
 # Value functions are chosen where they are fitted on a grid, up to this many outcomes of
-# one step and of all steps, which a fit visits at each point. With these, 32 points along
-# each of two axes are less than `basis_choice` allows (32^2 * 48 = 49,152 for one step).
+# one step and of all steps. A fit takes each outcome at each point. With 32 points along
+# each of two axes that is less than `basis_choice` allows (32^2 * 48 = 49,152 for one
+# step).
 _MOST_OUTCOMES_OF_STEP = 48
 _MOST_OUTCOMES_OF_STEPS = 2**12
-# Paths are sorted up to this dimension: the default of 2^14 paths are eleven along each of
-# four coordinates.
+# Paths are sorted in up to this many dimensions: the default of 2^14 paths leaves eleven
+# along each of four coordinates.
 _MOST_COMPONENTS_SORTED = 4
 # Where a fit leaves more than this of the standard error, paths are sorted instead. For an
 # indicator and a call option on the pendulum fits left 26% and 1.3%, and sorted paths had
@@ -56,7 +58,7 @@ _PATHS_OF_TRIAL = 2**14
 _MOST_WORDS = 2**8
 
 
-class Wanted(NamedTuple):
+class Request(NamedTuple):
     """How the user of `expectation` wants it to be computed.
 
     - `has_path`: whether the `terms` hold paths, rather than their shapes.
@@ -72,7 +74,7 @@ class Wanted(NamedTuple):
     devices: Devices
 
 
-class Chosen(NamedTuple):
+class Decision(NamedTuple):
     """What is computed, and how. The plan holds the reason."""
 
     problem: Problem
@@ -80,46 +82,38 @@ class Chosen(NamedTuple):
     plan: SamplingPlan
 
 
-def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
-    """Chooses the law of the increments and the sampling, as far as the user did not. The
-    docstring of `expectation` states the rules. `problem_for` maps the purpose of paths
-    that are not known yet to the problem."""
-    has_path, key, sampling, tol, start, engine, devices = wanted
+def choose(problem_for: Callable[[Want], Problem], request: Request) -> Decision:
+    """Chooses the law of the increments and the sampling, as far as the user did not.
+    `docs/expectation.md` states the rules. `problem_for` maps a purpose ("weak" or
+    "strong"), for which the solver makes the paths that the user left open, to the
+    problem."""
+    has_path, key, sampling, tol, start, engine, devices = request
     if engine not in (None, "jax", "drjit"):
         raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
     if sampling is None and start is not None:
         sampling = start.sampling
 
-    # Discrete increments, unless `phi` is not smooth.
-    problem = problem_for("weak")
-    why_law = ""
-    # Value functions need discrete increments, as do solvers of the weak sense.
-    needs_discrete = isinstance(sampling, ValueFunctions)
-    needs_discrete |= has_discrete_increments(problem.solver)
-    if has_kinks(problem) and not has_path and not needs_discrete:
-        problem = problem_for("strong")
-        why_law = "Gaussian increments, since phi may not be smooth"
+    problem, why_law = _problem_and_reason(problem_for, sampling, has_path)
 
     why_sampling = ""
-    is_chosen = sampling is None
-    if is_chosen:
+    is_open = sampling is None
+    if is_open:
         sampling, why_sampling = sampling_for(problem, tol, engine)
     sampling = _checked_sampling(sampling, start)
-
     if engine == "drjit":
         plan = fused_plan(problem, key, sampling, devices)
     else:
         plan = sampling.prepare(problem, trial_key(key), devices)
-        # Only fits leave something.
-        instead = None
-        if is_chosen and plan.remainder > _MOST_REMAINDER:
-            instead = sorted_paths(problem, tol)
-        if instead is not None:
+
+    # Of the plans only one by value functions has a remainder.
+    if is_open and plan.remainder > _MOST_REMAINDER:
+        sorted_sampling = array_rqmc_for(problem, tol)
+        if sorted_sampling is not None:
             why_sampling = (
                 "sorted paths, since fitted value functions leave "
                 f"{plan.remainder:.1%} of the standard error"
             )
-            sampling = instead
+            sampling = sorted_sampling
             plan = sampling.prepare(problem, trial_key(key), devices)
 
     reason = "; ".join(filter(None, [why_sampling, why_law, plan.reason]))
@@ -127,20 +121,38 @@ def choose(problem_for: Callable[[Want], Problem], wanted: Wanted) -> Chosen:
         reason = start.reason
     plan = plan._replace(reason=reason, rounding_floor=problem.finest_steps)
     if start is not None and tol is None and plan.num_samples == _MOST_SAMPLES:
-        # Without `tol` the number of samples stays as it was.
-        used = start.moments[-1].end - start.moments[0].begin
-        plan = plan._replace(num_samples=used)
-    return Chosen(problem, sampling, plan)
+        # `start` had a tolerance, and this call has none: it takes no further samples.
+        num_taken = start.moments[-1].end - start.moments[0].begin
+        plan = plan._replace(num_samples=num_taken)
+    return Decision(problem, sampling, plan)
+
+
+def _problem_and_reason(
+    problem_for: Callable[[Want], Problem],
+    sampling: AbstractSampling | None,
+    has_path: bool,
+) -> tuple[Problem, str]:
+    """The problem, and the reason for the law of its increments if that is not the usual
+    one. Increments are discrete, unless `phi` may not be smooth and the user left the law
+    open."""
+    problem = problem_for("weak")
+    # Value functions need discrete increments, as do solvers of the weak sense.
+    needs_discrete = isinstance(sampling, ValueFunctions)
+    needs_discrete |= has_discrete_increments(problem.solver)
+    if has_kinks(problem) and not has_path and not needs_discrete:
+        reason = "Gaussian increments, since phi may not be smooth"
+        return problem_for("strong"), reason
+    return problem, ""
 
 
 def trial_key(key: PRNGKeyArray) -> PRNGKeyArray:
     """The key of trials, which are not part of the estimate."""
-    return jr.fold_in(key, _NO_SAMPLE)
+    return jr.fold_in(key, _TRIAL_KEY)
 
 
 def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampling:
-    """The sampling. Raises a `ValueError` unless it is one, of the class that `start` was
-    sampled by, if there is a `start`."""
+    """The sampling itself. Raises a `ValueError` if it is not a sampling, or if `start` was
+    sampled by one of another class."""
     if not isinstance(sampling, AbstractSampling):
         names = ", ".join(f"`{name}`" for name in SAVED_SAMPLINGS)
         raise ValueError(
@@ -158,45 +170,52 @@ def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampl
 def sampling_for(
     problem: Problem, tol: float | None, engine: str | None = None
 ) -> tuple[AbstractSampling, str]:
-    """The sampling, and the reason."""
+    """The sampling that suits a problem best, and the reason for this choice."""
     if engine == "drjit":
-        # The engine has no other.
-        return _independent_paths(problem, tol), ""
-    components = _num_components(problem)
-    steps = _num_steps(problem)
+        # This engine takes independent paths only, so there is nothing to choose.
+        return _independent_sampling(problem, tol), ""
+    num_components = _num_components(problem)
     num_outcomes = count_outcomes(problem)
-    why = f"{components} components of the state, {steps:,} steps"
+    size = f"{num_components} components of the state, {_num_steps(problem):,} steps"
     if num_outcomes:
-        why += f" of {num_outcomes} outcomes each"
+        size += f" of {num_outcomes} outcomes each"
     if _can_be_fitted(problem, num_outcomes):
-        fitted = ValueFunctions(num_paths=_MOST_SAMPLES) if tol else ValueFunctions()
-        return fitted, f"value functions for {why}"
-    sampling = sorted_paths(problem, tol)
+        sampling = ValueFunctions(num_paths=_MOST_SAMPLES) if tol else ValueFunctions()
+        return sampling, f"value functions for {size}"
+    sampling = array_rqmc_for(problem, tol)
     if sampling is not None:
-        return sampling, f"sorted paths for {why}"
-    return _independent_paths(problem, tol), f"independent paths for {why}"
+        return sampling, f"sorted paths for {size}"
+    return _independent_sampling(problem, tol), f"independent paths for {size}"
 
 
-def _independent_paths(problem: Problem, tol: float | None) -> IndependentPaths:
-    """As many independent paths as are affordable."""
+def _independent_sampling(problem: Problem, tol: float | None) -> IndependentPaths:
+    """As many independent paths as there is time for, or with `tol` as many as it takes."""
     if tol:
         return IndependentPaths(_MOST_SAMPLES)
-    affordable = _affordable_operations(problem) / operations_per_step(problem)
-    return IndependentPaths(int(np.clip(affordable, _FEWEST_PATHS, _PATHS)))
+    # The operations of each step, for one more path.
+    operations = operations_per_step(problem)
+    num_affordable = _affordable_operations(problem) / operations
+    return IndependentPaths(int(np.clip(num_affordable, _FEWEST_PATHS, _PATHS)))
 
 
-def sorted_paths(problem: Problem, tol: float | None) -> ArrayRQMC | None:
-    """Sorted paths, or `None` for many components and for paths that cannot be sorted."""
+def array_rqmc_for(problem: Problem, tol: float | None) -> ArrayRQMC | None:
+    """As many sorted paths as there is time for; `None` if sorting does not help or is not
+    possible."""
     if not _can_be_sorted(problem):
         return None
-    usual = ArrayRQMC()
-    operations = usual.replicates * (
+    default = ArrayRQMC()
+    # The operations of each step, for one more path in every replicate.
+    operations = default.replicates * (
         operations_per_step(problem) + _OPERATIONS_OF_SORTING
     )
-    affordable = max(int(_affordable_operations(problem) / operations), _FEWEST_PATHS)
-    # Rounded down to a power of two, as Sobol' points need.
-    size = min(2 ** (affordable.bit_length() - 1), usual.num_paths)
-    return ArrayRQMC(size, _MOST_SAMPLES if tol else usual.replicates)
+    num_affordable = int(_affordable_operations(problem) / operations)
+    num_affordable = max(num_affordable, _FEWEST_PATHS)
+    # Sobol' points need a power of two: the largest that is affordable.
+    power_of_two = 2 ** (num_affordable.bit_length() - 1)
+    return ArrayRQMC(
+        num_paths=min(power_of_two, default.num_paths),
+        replicates=_MOST_SAMPLES if tol else default.replicates,
+    )
 
 
 def _affordable_operations(problem: Problem) -> float:
@@ -204,10 +223,11 @@ def _affordable_operations(problem: Problem) -> float:
     return _SECONDS * OPERATIONS_PER_SECOND / _num_steps(problem)
 
 
-def few_paths(problem: Problem) -> AbstractSampling:
-    """The most accurate sampling of a few seconds that takes Gaussian increments, too."""
+def trial_sampling(problem: Problem) -> AbstractSampling:
+    """The sampling for a trial of a few seconds: the most accurate one that takes Gaussian
+    increments, too."""
     if _can_be_sorted(problem):
-        return ArrayRQMC(_PATHS_OF_SORTED_TRIAL, _REPLICATES_OF_TRIAL)
+        return ArrayRQMC(_PATHS_OF_SORTED_TRIAL, replicates=_REPLICATES_OF_TRIAL)
     return IndependentPaths(_PATHS_OF_TRIAL)
 
 
@@ -222,7 +242,8 @@ def _num_steps(problem: Problem) -> int:
 
 def _can_be_fitted(problem: Problem, num_outcomes: int | None) -> bool:
     """Whether value functions are the best choice, as far as it is known without a fit."""
-    # They leave the variance of the start, for which few paths are too few.
+    # Value functions leave the variance of random starts, for which their few paths do not
+    # suffice.
     if problem.paths_differ or not num_outcomes:
         return False
     return (
@@ -237,6 +258,6 @@ def _can_be_sorted(problem: Problem) -> bool:
     if _num_components(problem) > _MOST_COMPONENTS_SORTED:
         return False
     try:
-        return 0 < step_words(problem.terms).number <= _MOST_WORDS
+        return 0 < step_words(problem.terms).num_words <= _MOST_WORDS
     except ValueError:
         return False

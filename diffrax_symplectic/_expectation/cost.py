@@ -37,14 +37,15 @@ _OF_LAPACK = 3_000
 @once_for_each_signature
 def operations_per_step(problem: Problem) -> int:
     """How many operations on single numbers a step of one path takes, as a measure of its
-    cost. Those that take longer than a sum count as several."""
-    # A rescue by Newton's method is rare.
+    cost. An operation that takes longer than a sum counts as several."""
+    # Newton's method, which rescues paths whose sweeps fail, is rarely used.
     lean = dataclasses.replace(problem, solver=without_newton(problem.solver))
-    traced, _, _ = eqx.filter_make_jaxpr(_step)(lean, problem.y0)
-    return max(1, _operations(traced.jaxpr, in_loop=False))
+    traced, _, _ = eqx.filter_make_jaxpr(_first_step)(lean, problem.y0)
+    return max(1, _count_operations(traced.jaxpr, in_loop=False))
 
 
-def _step(problem: Problem, y: Y) -> tuple[Y, Float[Array, ""]]:
+def _first_step(problem: Problem, y: Y) -> tuple[Y, Float[Array, ""]]:
+    """The state after step 0 from `y`, and whether the step succeeded."""
     i = jnp.zeros((), jnp.int32)
     h = problem.level(i).h
     state = problem.init(problem.terms, i, h, y)
@@ -52,29 +53,31 @@ def _step(problem: Problem, y: Y) -> tuple[Y, Float[Array, ""]]:
     return y, success
 
 
-def _operations(jaxpr: Jaxpr, in_loop: bool) -> int:
+def _count_operations(jaxpr: Jaxpr, in_loop: bool) -> int:
+    """The number of operations in a program, with the programs inside it. `in_loop` is
+    whether it is a part of a `while` loop."""
     count = 0
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         size = sum(map(_size, eqn.outvars))
-        inner = programs_in(eqn)
+        inner_programs = programs_in(eqn)
         if name == "while" and not in_loop:
-            count += _SWEEPS * sum(_operations(program, True) for program in inner)
-        elif name == "scan":
-            passes = eqn.params["length"]
-            count += passes * sum(_operations(program, in_loop) for program in inner)
-        elif inner:
-            # In a batch all branches of a conditional are evaluated.
-            count += sum(_operations(program, in_loop) for program in inner)
+            sweep = sum(_count_operations(x, in_loop=True) for x in inner_programs)
+            count += _SWEEPS * sweep
+        elif inner_programs:
+            # A loop inside a sweep counts once. In a batch all branches of a conditional
+            # are evaluated.
+            passes = eqn.params["length"] if name == "scan" else 1
+            count += passes * sum(_count_operations(x, in_loop) for x in inner_programs)
         elif name in LAPACK:
             count += _OF_LAPACK
         elif name in _TRANSCENDENTAL and in_loop:
             count += _OF_TRANSCENDENTAL * size
         elif name == "dot_general":
-            (contracted, _), _ = eqn.params["dimension_numbers"]
+            (contracted_axes, _), _ = eqn.params["dimension_numbers"]
             factor, _ = eqn.invars
             shape = factor.aval.shape  # pyright: ignore (of arrays)
-            count += size * math.prod(shape[axis] for axis in contracted)
+            count += size * math.prod(shape[axis] for axis in contracted_axes)
         else:
             count += size
     return count

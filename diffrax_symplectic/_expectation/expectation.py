@@ -28,8 +28,14 @@ from .._terms import (
     without_truncation,
 )
 from .call import checked_call
-from .choose import choose, few_paths, trial_key, Wanted
-from .estimate import cautions, Expectation, ExpectationInterrupted, needs_level
+from .choose import choose, Request, trial_key, trial_sampling
+from .estimate import (
+    cautions,
+    Expectation,
+    ExpectationInterrupted,
+    largest_error,
+    needs_level,
+)
 from .fused_paths import FusedPaths
 from .kinks import has_kinks
 from .long_steps import is_unstable_at_start
@@ -41,8 +47,8 @@ from .sampling import AbstractSampling
 # and with `tol` at most so many, the last of which has steps of `dt0 / 32`.
 _FEWEST_LEVELS = 2
 _MOST_LEVELS = 6
-# Means differ if their difference is this many standard errors: by chance that happens
-# once in sixteen thousand times.
+# Two means count as different if they are this many standard errors apart: by chance that
+# happens once in sixteen thousand times.
 _SURE_OF_LAW = 4
 
 
@@ -171,24 +177,23 @@ def expectation(
     key, first, devices = checked_call(
         "expectation", key, tol, start, first, devices, arguments
     )
-    may_add_levels = False
+    # An estimate with other levels cannot continue `start`.
+    may_add_levels = levels is None and start is None
     if levels is None:
         levels = _FEWEST_LEVELS if start is None else start.levels
-        # Other levels are another estimate.
-        may_add_levels = start is None
 
     is_open = any(isinstance(path, UnspecifiedPath) for path in brownian_paths(terms))
-    wanted = Wanted(not is_open, key, sampling, tol, start, engine, devices)
+    request = Request(not is_open, key, sampling, tol, start, engine, devices)
     problem_of = ft.partial(Problem.of, phi, terms, solver, t0, t1, dt0, y0, args, ts)
     with Meter(progress_meter) as meter:
         while True:
             try:
-                chosen = choose(ft.partial(problem_of, levels), wanted)
+                decision = choose(ft.partial(problem_of, levels), request)
             except ExpectationInterrupted:
                 # Trial samples are not part of the estimate, and cannot be continued.
                 raise KeyboardInterrupt from None
-            problem, sampling, plan = chosen
-            estimate = run(plan, key, devices, sampling, start, first, tol, meter)
+            problem, used_sampling, plan = decision
+            estimate = run(plan, key, devices, used_sampling, start, first, tol, meter)
             if tol is None or not may_add_levels or levels == _MOST_LEVELS:
                 break
             if not needs_level(estimate, tol):
@@ -197,12 +202,16 @@ def expectation(
 
     for message in cautions(estimate, tol, problem.bounded):
         warnings.warn(message, stacklevel=2)
-    if isinstance(paths := plan.paths_of, FusedPaths):
-        warn_of_stragglers(paths.stragglers, paths.lost, paths.count, stacklevel=2)
+    paths = plan.simulate_paths
+    if isinstance(paths, FusedPaths):
+        warn_of_stragglers(
+            paths.num_stragglers, paths.num_failed, paths.num_paths, stacklevel=2
+        )
     _warn_of_rounding(estimate, problem)
-    # A part of an estimate is not warned of again.
+    # Warnings of the problem come with its first samples, and not again with later parts.
     if start is None and first == 0:
-        # Three levels are checked for the order, and one promises nothing of the step.
+        # With three levels the order is checked, which shows such steps. With one level the
+        # result does not claim to include the discretization error.
         if estimate.levels == 2 and is_unstable_at_start(problem):
             warnings.warn(
                 f"Steps of `dt0={float(dt0):g}` are too long for `{type(solver).__name__}` "
@@ -220,7 +229,8 @@ def expectation(
 def _warn_of_law(
     estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
 ) -> None:
-    """If phi is not smooth, discrete increments may change its mean."""
+    """Warns if discrete increments change the mean of a `phi` that may not be smooth, by a
+    trial with Gaussian increments."""
     paths = random_paths(problem.terms)
     laws = [law for path in paths for law in (laws_of(path) or {}).values()]
     if not any(isinstance(law, Discrete) for law in laws):
@@ -236,36 +246,41 @@ def _warn_of_law(
     gaussian_path = ft.partial(own_path, problem.solver, "strong")
     terms = with_paths(gaussian_path, path_numbers(paths), problem.terms, key)
     terms = without_truncation(terms)
-    gaussian = dataclasses.replace(problem, terms=terms)
+    gaussian_problem = dataclasses.replace(problem, terms=terms)
     key = trial_key(key)
-    plan = few_paths(gaussian).prepare(gaussian, key, devices)
+    plan = trial_sampling(gaussian_problem).prepare(gaussian_problem, key, devices)
     trial = run(plan, key, devices)
-    change = jtu.tree_map(lambda x, y: np.abs(x - y), estimate.mean, trial.mean)
-    error = jtu.tree_map(np.hypot, estimate.std_error, trial.std_error)
-    is_beyond = jtu.tree_map(lambda x, y: np.any(x > _SURE_OF_LAW * y), change, error)
-    if any(jtu.tree_leaves(is_beyond)):
-        most = max(float(np.max(x, initial=0.0)) for x in jtu.tree_leaves(change))
+
+    def is_different(change: np.ndarray, error: np.ndarray) -> np.bool_:
+        return np.any(change > _SURE_OF_LAW * error)
+
+    changes = jtu.tree_map(lambda x, y: np.abs(x - y), estimate.mean, trial.mean)
+    errors = jtu.tree_map(np.hypot, estimate.std_error, trial.std_error)
+    if any(jtu.tree_leaves(jtu.tree_map(is_different, changes, errors))):
         warnings.warn(
             "`phi` is not smooth, and its mean changes by up to "
-            f"{most:.1e} with Gaussian increments, which is more than the error of the "
-            "estimate: the discrete increments of a `WeakBrownianPath` (and of "
-            "`ValueFunctions`) are for smooth functions. Pass the shape in place of the "
-            "path in `terms`, or a `FixedStepBrownianPath`, and another `sampling` than "
-            "`ValueFunctions`.",
+            f"{largest_error(changes):.1e} with Gaussian increments, which is more than "
+            "the error of the estimate: the discrete increments of a `WeakBrownianPath` "
+            "(and of `ValueFunctions`) are for smooth functions. Pass the shape in place "
+            "of the path in `terms`, or a `FixedStepBrownianPath`, and another `sampling` "
+            "than `ValueFunctions`.",
             stacklevel=3,
         )
 
 
 def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
-    """In single precision, rounding can exceed a small sampling error."""
+    """Warns if rounding in single precision may exceed the sampling error."""
     precision = np.finfo(problem.dtype)
     if precision.bits >= 64:
         return
-    # Step sizes are rounded along with times, so errors of the same sign add up.
+    # Step sizes are rounded along with times, so errors of the same sign add up over steps.
     fraction = float(precision.eps) * problem.finest_steps
 
-    def is_near_rounding(mean: Any, error: Any) -> np.bool_:
-        return np.any(error <= 2 * (fraction * np.abs(mean)))
+    def is_near_rounding(mean: Any, std_error: Any) -> np.bool_:
+        # Estimates report at least this (see `rounding_floor`). Within twice this floor,
+        # rounding may be most of the standard error.
+        floor = fraction * np.abs(mean)
+        return np.any(std_error <= 2 * floor)
 
     near = jtu.tree_map(is_near_rounding, estimate.mean, estimate.std_error)
     if any(jtu.tree_leaves(near)):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Key, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
 from .._custom_types import Devices
 from .._root_finder import all_finite
@@ -24,7 +24,7 @@ _FUSED_BATCH = 2**19
 def fused_plan(
     problem: Problem, key: PRNGKeyArray, sampling: Any, devices: Devices
 ) -> SamplingPlan:
-    r"""A plan in which a kernel simulates independent paths, and JAX evaluates $\phi$.
+    r"""A plan by which a kernel simulates independent paths, and JAX evaluates $\phi$.
     Raises a `ValueError` for another `sampling`, or several devices."""
     if not isinstance(sampling, IndependentPaths):
         raise ValueError(
@@ -40,15 +40,15 @@ def fused_plan(
     plan = sampling.plan(jtu.Partial(_samples, problem), levels, devices)
     if sampling.batch_size is None:
         plan = plan._replace(batch_size=_FUSED_BATCH)
-    return plan._replace(paths_of=FusedPaths(problem, key))
+    return plan._replace(simulate_paths=FusedPaths(problem, key))
 
 
 class FusedPaths:
-    """The paths of a plan, by their numbers.
+    """Simulates the paths of a plan by a fused kernel, and counts them.
 
-    - `count`: the number of paths so far, on all levels.
-    - `lost`: how many of these failed.
-    - `stragglers`: how many were handed back to JAX.
+    - `num_paths`: the number of paths so far, on all levels.
+    - `num_failed`: how many of these failed.
+    - `num_stragglers`: how many of these the kernel handed back to JAX.
     """
 
     def __init__(self, problem: Problem, key: PRNGKeyArray):
@@ -56,34 +56,36 @@ class FusedPaths:
         self._problem = dataclasses.replace(problem, phi=state_itself, at_end=False)
         self._key = key
         self._last: _NumberedPaths | None = None
-        self.count = 0
-        self.lost = 0
-        self.stragglers = 0
+        self.num_paths = 0
+        self.num_failed = 0
+        self.num_stragglers = 0
 
-    def __call__(self, first: int, number: int) -> "_Paths":
-        """The paths of this number of samples, from sample `first` on."""
+    def __call__(self, first: int, num_samples: int) -> "_Paths":
+        """The paths of this number of samples, from sample number `first` on."""
         # `expectation` asks for the first batch twice: to know the shapes of samples, and
         # for the samples.
-        if self._last is None or self._last.which != (first, number):
-            self._last = _NumberedPaths((first, number), self._batch(first, number))
+        numbers = range(first, first + num_samples)
+        if self._last is None or self._last.numbers != numbers:
+            self._last = _NumberedPaths(numbers, self._simulate(numbers))
         return self._last.paths
 
-    def _batch(self, first: int, number: int) -> "_Paths":
-        samples = np.arange(first, first + number, dtype=np.uint64)
+    def _simulate(self, numbers: range) -> "_Paths":
+        """The paths of the samples with these numbers."""
+        sample_numbers = np.arange(numbers.start, numbers.stop, dtype=np.uint64)
         batches = [
-            by_drjit(self._problem, self._key, samples, level)
+            by_drjit(self._problem, self._key, sample_numbers, level)
             for level in range(len(self._problem.levels.h))
         ]
-        self.count += number * len(batches)
-        self.lost += sum(int(np.sum(batch.failed)) for batch in batches)
-        self.stragglers += sum(batch.num_stragglers for batch in batches)
+        self.num_paths += len(numbers) * len(batches)
+        self.num_failed += sum(int(np.sum(batch.failed)) for batch in batches)
+        self.num_stragglers += sum(batch.num_stragglers for batch in batches)
         return _Paths(
-            y=jtu.tree_map(_stack_levels, *[batch.y for batch in batches]),
-            failed=_stack_levels(*[batch.failed for batch in batches]),
+            y=jtu.tree_map(_stacked_levels, *[batch.y for batch in batches]),
+            failed=_stacked_levels(*[batch.failed for batch in batches]),
         )
 
 
-def _stack_levels(*levels: np.ndarray) -> np.ndarray:
+def _stacked_levels(*levels: np.ndarray) -> np.ndarray:
     return np.stack(levels)
 
 
@@ -99,25 +101,34 @@ class _Paths(NamedTuple):
 
 
 class _NumberedPaths(NamedTuple):
-    """Paths, and `which` they are: the number of the first sample, and of samples."""
+    """Paths, and the numbers of their samples."""
 
-    which: tuple[int, int]
+    numbers: range
     paths: _Paths
 
 
 def _samples(p: Problem, paths: _Paths, keys: Key[Array, " n"]) -> Samples:
-    """The samples with these random keys, whose paths are known."""
-    _, own_args = jax.vmap(p.draw_start)(keys)
+    """The samples of paths that are known: one for each random key, by which a path draws
+    its `args`, too."""
+    _, args_of_paths = jax.vmap(p.draw_start)(keys)
 
-    def values_of_path(times: Any, y: PyTree[Array], own: PyTree[Array]) -> Array:
-        return jax.vmap(p.with_args(own).values)(times, y)
+    def values_of_path(
+        times: Any, y: PyTree[Array], own_args: PyTree[Array]
+    ) -> Float[Array, "S m"]:
+        return jax.vmap(p.with_args(own_args).values)(times, y)
 
-    def values_on_level(level: Level, y: PyTree[Array]) -> Array:
+    def values_on_level(level: Level, y: PyTree[Array]) -> Float[Array, "n S m"]:
         times = p.t0 + level.saved_steps * level.h
-        return jax.vmap(values_of_path, (None, 0, 0))(times, y, own_args)
+        return jax.vmap(values_of_path, (None, 0, 0))(times, y, args_of_paths)
 
+    # (levels, n, S, m)
     phi = jax.vmap(values_on_level)(p.levels, paths.y)
     finite = jax.vmap(jax.vmap(all_finite))(phi)
-    lost = jnp.asarray(paths.failed) | ~finite
-    values = p.shaped(p.combinations(jnp.swapaxes(phi, 1, 2)))
-    return Samples(Averaged(values), ~jnp.any(lost, axis=0), lost)
+    failed = jnp.asarray(paths.failed) | ~finite
+    # (levels, S, n, m)
+    phi = jnp.swapaxes(phi, 1, 2)
+    return Samples(
+        averaged=Averaged(p.shaped(p.combinations(phi))),
+        good=~jnp.any(failed, axis=0),
+        num_failed=failed,
+    )

@@ -43,21 +43,27 @@ class IndependentPaths(AbstractSampling):
 
     def prepare(self, problem, key, devices):
         levels = len(problem.levels.h)
-        return self.plan(jtu.Partial(_paths, problem), levels, devices)
+        return self.plan(jtu.Partial(_samples, problem), levels, devices)
 
     def plan(
         self, sampler: Callable[..., Samples], levels: int, devices: Devices
     ) -> SamplingPlan:
-        """The plan for samples that are made one for each key, by any function."""
+        """The plan for a `sampler`, any function that makes a sample for each key."""
         if self.batch_size is None:
             size = _BATCH_ON_CPU if devices[0].platform == "cpu" else _BATCH_ELSEWHERE
         else:
             size = whole_number("batch_size", self.batch_size)
-        return SamplingPlan(sampler, self.num_paths, size, levels=levels)
+        return SamplingPlan(
+            sampler, num_samples=self.num_paths, batch_size=size, levels=levels
+        )
 
 
-def _paths(p: Problem, keys: Key[Array, " n"]) -> Samples:
+def _samples(p: Problem, keys: Key[Array, " n"]) -> Samples:
     """A sample is a path, with the same random key on all levels."""
-    saved, failed = values_of_paths(p, keys)
-    good = ~jnp.any(failed, axis=0)
-    return Samples(Averaged(p.shaped(p.combinations(saved))), good, failed)
+    # (levels, S, n, m) and (levels, n)
+    values, failed = values_of_paths(p, keys)
+    return Samples(
+        averaged=Averaged(p.shaped(p.combinations(values))),
+        good=~jnp.any(failed, axis=0),
+        num_failed=failed,
+    )

@@ -10,7 +10,8 @@ from .._compat import Jaxpr, Literal, programs_in
 from .._simulation import Problem
 
 
-# All others are smooth, except perhaps at single points.
+# The operations of JAX with kinks or jumps. All others are smooth, except perhaps at single
+# points.
 _NOT_SMOOTH = frozenset(
     "abs argmax argmin ceil clamp eq floor ge gt le lt max min ne reduce_max reduce_min "
     "round sign sort top_k".split()
@@ -25,22 +26,24 @@ def has_kinks(problem: Problem) -> bool:
 
 def may_have_kinks(fn: Callable, y: PyTree) -> bool:
     """Whether `fn(y)` contains an operation that is not smooth in `y`, such as `abs`, a
-    maximum or a comparison. Some of these functions are smooth all the same."""
+    maximum or a comparison. Some functions that contain one are smooth all the same."""
     leaves, treedef = jtu.tree_flatten(y)
     traced = jax.make_jaxpr(lambda *leaves: fn(treedef.unflatten(leaves)))(*leaves)
-    return _is_rough(traced.jaxpr)
+    return _may_be_rough(traced.jaxpr)
 
 
-def _is_rough(jaxpr: Jaxpr) -> bool:
-    """Whether a program contains an operation that is not smooth, on what depends on its
-    inputs."""
-    # What a function captures is constant in `y`.
+def _may_be_rough(jaxpr: Jaxpr) -> bool:
+    """Whether a program applies an operation that is not smooth to variables that depend on
+    its inputs."""
+    # What the function captures is not among the inputs: it is constant in `y`.
     dependent = set(jaxpr.invars)
     for eqn in jaxpr.eqns:
         variables = [x for x in eqn.invars if not isinstance(x, Literal)]
         if not any(x in dependent for x in variables):
             continue
         dependent.update(eqn.outvars)
-        if eqn.primitive.name in _NOT_SMOOTH or any(map(_is_rough, programs_in(eqn))):
+        if eqn.primitive.name in _NOT_SMOOTH:
+            return True
+        if any(map(_may_be_rough, programs_in(eqn))):
             return True
     return False

@@ -17,10 +17,11 @@ from .._terms import brownian_paths, constraint_of, has_unknown_law
 
 # A step that enlarges a small change of the state by more than this, and turns it around,
 # is unstable. Exact flows turn changes around, too, but over a step that resolves them they
-# do not enlarge them at the same time. `StormerVerlet` has it for omega h = 2.003.
+# do not enlarge them at the same time. On an oscillator of frequency omega the steps of
+# `StormerVerlet` enlarge changes by this factor at omega h = 2.003.
 _UNSTABLE = 1.1
-# So many steps of the tangent flow leave the most unstable direction of a random one. As
-# many more show its growth.
+# After this many steps of the tangent flow any change of the state points in the most
+# unstable direction. Its growth is measured over as many more steps.
 _ITERATIONS = 50
 
 
@@ -28,20 +29,20 @@ class _Growth(NamedTuple):
     """How a small change of the state grows in steps that are all taken from one state.
 
     - `change`: the change, scaled to length one.
-    - `log`: the logarithm of its growth so far.
+    - `log_growth`: the logarithm of the factor by which it grew in the steps that count.
     - `along_itself`: the scalar product of the change after the last step with the one
         before it. It is negative if the step turned the change around.
     """
 
     change: Float[Array, " n"]
-    log: Float[Array, ""]
+    log_growth: Float[Array, ""]
     along_itself: Float[Array, ""]
 
 
 def is_unstable_at_start(problem: Problem) -> bool:
-    """Whether an explicit solver of this package's kind is unstable at the start of a path,
-    with steps of `dt0` and increments of zero. Two levels need not show it: where forces
-    are bounded, steps of `dt0` and half of it may both leave a random state."""
+    """Whether an explicit solver of this package is unstable at the start of a path, with
+    steps of `dt0` and increments of zero. Two levels need not show it: where forces are
+    bounded, steps of `dt0` and half of it may both leave a random state."""
     solver = problem.solver
     if not isinstance(solver, AbstractSymplecticSolver) or solver.stage_vectors(1):
         return False
@@ -50,17 +51,18 @@ def is_unstable_at_start(problem: Problem) -> bool:
     if any(map(has_unknown_law, brownian_paths(problem.terms))):
         return False
     growth = _quick_growth(problem)
-    return bool(
-        growth.log > _ITERATIONS * np.log(_UNSTABLE) and growth.along_itself < 0
-    )
+    grows = growth.log_growth > _ITERATIONS * np.log(_UNSTABLE)
+    turns_around = growth.along_itself < 0
+    return bool(grows and turns_around)
 
 
 def _growth(problem: Problem) -> _Growth:
-    """The growth of the change that a step enlarges most."""
+    """The growth of the change that a step from `y0` enlarges most, by power iteration with
+    the derivative of the step."""
     h = problem.level(0).h
     variables = problem.variables(h)
     terms = variables.terms_with(jnp.zeros(len(variables.laws)))
-    flat, unravel = jfu.ravel_pytree(problem.y0)
+    flat_y0, unravel = jfu.ravel_pytree(problem.y0)
 
     def step(x: Array) -> Array:
         y = unravel(x)
@@ -68,16 +70,18 @@ def _growth(problem: Problem) -> _Growth:
         return jfu.ravel_pytree(y1)[0]
 
     def after_step(number: Array, before: _Growth) -> _Growth:
-        _, after = jax.jvp(step, (flat,), (before.change,))
-        length = jnp.linalg.norm(after)
-        counted = jnp.where(number < _ITERATIONS, 0.0, jnp.log(length))
-        along_itself = before.change @ after
-        return _Growth(after / length, before.log + counted, along_itself)
+        _, change = jax.jvp(step, (flat_y0,), (before.change,))
+        # The change before the step has length one, so this is its growth.
+        length = jnp.linalg.norm(change)
+        counted_log = jnp.where(number < _ITERATIONS, 0.0, jnp.log(length))
+        along_itself = before.change @ change
+        return _Growth(change / length, before.log_growth + counted_log, along_itself)
 
-    # No symmetry singles it out.
-    change = jnp.cos(1.0 + jnp.arange(flat.size, dtype=flat.dtype))
-    zero = jnp.zeros((), flat.dtype)
-    start = _Growth(change / jnp.linalg.norm(change), zero, zero)
+    # An arbitrary direction, without the symmetries that a problem may have: it contains
+    # the most unstable one.
+    direction = jnp.cos(1.0 + jnp.arange(flat_y0.size, dtype=flat_y0.dtype))
+    zero = jnp.zeros((), flat_y0.dtype)
+    start = _Growth(direction / jnp.linalg.norm(direction), zero, zero)
     return lax.fori_loop(0, 2 * _ITERATIONS, after_step, start)
 
 

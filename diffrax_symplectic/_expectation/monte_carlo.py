@@ -1,5 +1,6 @@
 """Averages of any function of a random key."""
 
+import functools as ft
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -105,14 +106,14 @@ def monte_carlo(
         )
     arguments = ["key"] if levels == 1 else ["key", "level"]
     check_takes("fn", fn, *arguments)
-    # An event that is checked at the end of each step has the order 1/2.
+    # First-passage times have the order 1/2, if events are checked at the end of each step.
     is_half = isinstance(order, float) and order == 0.5
     is_whole = isinstance(order, int | np.integer) and order >= 1
     if order is not None and not (is_half or is_whole):
         raise ValueError(f"`order` must be a positive integer, or 1/2; got {order!r}.")
     sampling = IndependentPaths(num_paths, batch_size)
     weights = level_weights(float(order or 1), levels)
-    plan = sampling.plan(jtu.Partial(_of_function, fn, weights), levels, devices)
+    plan = sampling.plan(jtu.Partial(_samples, fn, weights), levels, devices)
     with Meter(progress_meter) as meter:
         estimate = run(plan, key, devices, sampling, start, first, tol, meter)
     for message in cautions(estimate, tol, bounded=False):
@@ -120,40 +121,47 @@ def monte_carlo(
     return estimate
 
 
-def _of_function(
+def _samples(
     fn: Callable,
     weights: Float[Array | np.ndarray, "combinations levels"],
     keys: Key[Array, " n"],
 ) -> Samples:
     """A sample is a value of the function, with the same random key on all levels."""
-    levels = weights.shape[1]
-
-    def on_level(level: int) -> tuple[PyTree[Array], Bool[Array, " n"]]:
-        call = fn if levels == 1 else lambda key: fn(key, level)
-        return jax.vmap(lambda key: _evaluate(call, key))(keys)
+    _, levels = weights.shape
 
     # A level is a Python integer, by which a function may choose its step, so each level is
     # a call of its own.
-    each = [on_level(level) for level in range(levels)]
-    values, good = jtu.tree_map(lambda *xs: jnp.stack(xs), *each)
+    values_and_success = []
+    for level in range(levels):
+        arguments = () if levels == 1 else (level,)
+        of_key = ft.partial(_value_and_success, fn, arguments)
+        values_and_success.append(jax.vmap(of_key)(keys))
+    # (levels, n, ...) and (levels, n)
+    values, success = jtu.tree_map(lambda *xs: jnp.stack(xs), *values_and_success)
 
     values = jtu.tree_map(lambda x: combinations(weights, x), values)
-    return Samples(Averaged(values), jnp.all(good, axis=0), ~good)
+    return Samples(
+        averaged=Averaged(values),
+        good=jnp.all(success, axis=0),
+        num_failed=~success,
+    )
 
 
-def _evaluate(fn: Callable, key: PRNGKeyArray) -> tuple[PyTree[Array], Bool[Array, ""]]:
-    """The $\\phi$ that `fn` returns, and whether the path succeeded."""
-    out = fn(key)
+def _value_and_success(
+    fn: Callable, arguments: tuple[int, ...], key: PRNGKeyArray
+) -> tuple[PyTree[Array], Bool[Array, ""]]:
+    """The $\\phi$ that `fn(key, *arguments)` returns, and whether the path succeeded."""
+    phi = fn(key, *arguments)
     success = jnp.array(True)
-    is_pair = isinstance(out, tuple) and len(out) == 2
-    if is_pair and isinstance(out[1], diffrax.RESULTS):
-        out, result = out
+    is_pair = isinstance(phi, tuple) and len(phi) == 2
+    if is_pair and isinstance(phi[1], diffrax.RESULTS):
+        phi, result = phi
         success = diffrax.is_okay(result)
-    if any(map(is_result, jtu.tree_leaves(out, is_leaf=is_result))):
+    if any(map(is_result, jtu.tree_leaves(phi, is_leaf=is_result))):
         raise ValueError(
             "`fn` returns a result of a solve within phi, where it would be averaged. "
             "Return a pair `(phi, sol.result)`, so that failed paths are excluded."
         )
-    check_real("fn", jtu.tree_leaves(out))
-    out = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), out)
-    return out, success & all_finite(out)
+    check_real("fn", jtu.tree_leaves(phi))
+    phi = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), phi)
+    return phi, success & all_finite(phi)

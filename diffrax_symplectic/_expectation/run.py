@@ -64,17 +64,17 @@ def run(
     """The estimate from the samples of a plan, which continues `start`, or begins with
     sample number `first`. The result does not depend on the number of devices."""
     # One past the last sample that is part of the estimate.
-    done = first
+    estimate_end = first
     if start is not None:
         first = start.moments[0].begin
-        done = start.moments[-1].end
+        estimate_end = start.moments[-1].end
     end = first + plan.num_samples
     batches = _Batches(plan, key, devices)
-    none = batches.nothing(done, end)
+    no_moments = batches.without_samples(estimate_end, end)
     estimate = Expectation(
-        moments=(none,),
+        moments=(no_moments,),
         key_data=batches.key_data,
-        paths_per_sample=plan.paths,
+        paths_per_sample=plan.paths_per_sample,
         rounding_floor=plan.rounding_floor,
         sampling=sampling,
         reason=plan.reason,
@@ -82,56 +82,64 @@ def run(
     )
     if start is not None:
         check_same(start, estimate, "`start`")
-        if done > end:
+        if estimate_end > end:
             raise ValueError(
                 "The number of paths (or replicates) includes `start`, which has "
-                f"{done - first} already; got {plan.num_samples}. Pass a larger number."
+                f"{estimate_end - first} already; got {plan.num_samples}. Pass a larger "
+                "number."
             )
         estimate = dataclasses.replace(estimate, moments=start.moments)
 
-    running: collections.deque[BatchMoments] = collections.deque()
+    running_batches: collections.deque[BatchMoments] = collections.deque()
     # One past the last sample of the batches that were started.
-    begun = done
+    started_end = estimate_end
     try:
         while True:
-            is_more = begun < end and not _stops(estimate, plan.least, tol)
-            if is_more:
-                running.append(batches.start(begun, end, batches.sampler_at(begun)))
-                begun += batches.size * len(devices)
-            # While one batch is being computed, the previous one is added up.
-            has_previous = len(running) > (1 if is_more else 0)
+            starts_batch = started_end < end and not _stops(
+                estimate, plan.least_samples, tol
+            )
+            if starts_batch:
+                sampler = batches.sampler_at(started_end)
+                running_batches.append(batches.start(started_end, end, sampler))
+                started_end += batches.size * len(devices)
+            # While the batch just started is being computed, the one before is added up.
+            has_previous = len(running_batches) > (1 if starts_batch else 0)
             if has_previous:
-                for of_device in batches.of_devices(running.popleft()):
-                    # Where to stop does not depend on how many devices there are.
-                    if done < end and not _stops(estimate, plan.least, tol):
-                        after = min(done + batches.size, end)
-                        new = _in_float64(of_device, done, after, none.dtypes)
-                        moments = joined((*estimate.moments, new))
-                        estimate = dataclasses.replace(estimate, moments=moments)
-                        done = after
+                for of_device in batches.on_devices(running_batches.popleft()):
+                    # The moments of each device are a batch of their own: where to stop
+                    # does not depend on how many devices there are.
+                    if estimate_end == end or _stops(estimate, plan.least_samples, tol):
+                        break
+                    batch_end = min(estimate_end + batches.size, end)
+                    new_moments = _in_float64(
+                        of_device, estimate_end, batch_end, no_moments.dtypes
+                    )
+                    moments = joined((*estimate.moments, new_moments))
+                    estimate = dataclasses.replace(estimate, moments=moments)
+                    estimate_end = batch_end
                 if meter is not None:
-                    share = (done - first) / plan.num_samples
+                    share = (estimate_end - first) / plan.num_samples
                     meter.step(max(share, share_of(estimate, tol)))
-            elif not is_more:
+            elif not starts_batch:
                 break
     except KeyboardInterrupt:
         raise ExpectationInterrupted(
-            _with_tol_reached(estimate, plan.least, tol)
+            _with_tol_reached(estimate, plan.least_samples, tol)
         ) from None
-    return _with_tol_reached(estimate, plan.least, tol)
+    return _with_tol_reached(estimate, plan.least_samples, tol)
 
 
 class _Batches:
-    """The batches of a plan: each device takes `size` samples at once."""
+    """The batches of a plan, in each of which every device takes `size` samples."""
 
     def __init__(self, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices):
         self.size = min(plan.batch_size, plan.num_samples)
         self.key_data = np.asarray(jr.key_data(key))
-        self._impl = jr.key_impl(key)
+        self._key_impl = jr.key_impl(key)
         self._sampler = plan.sampler
-        self._paths_of = plan.paths_of
+        self._simulate_paths = plan.simulate_paths
         self._devices = devices
-        self._shapes = plan.shapes
+        self._struct = plan.struct
         self._levels = plan.levels
         self._batch_moments: Any = quick_batch_moments if plan.quick else batch_moments
         if jax.process_count() > 1:
@@ -140,61 +148,76 @@ class _Batches:
             self._sampler = lambda keys: plan.sampler(keys)
         self._mesh = Mesh(np.array(devices), ("samples",))
 
-    def sampler_at(self, at: int) -> Callable[..., Samples]:
-        """What makes the samples of the batch from sample `at` on."""
-        if self._paths_of is None:
+    def sampler_at(self, first: int) -> Callable[..., Samples]:
+        """The sampler for the batch from sample number `first` on."""
+        if self._simulate_paths is None:
             return self._sampler
-        # Of a `Partial` of a `Partial` JAX would take the inner one for a function, arrays
-        # and all, and compile anew for each.
-        return jtu.Partial(_of_paths, self._sampler, self._paths_of(at, self.size))
+        paths = self._simulate_paths(first, self.size)
+        # The sampler is an argument of a function: JAX would take the inner `Partial` of a
+        # `Partial` for its function, with the arrays in it, and compile anew for each.
+        return jtu.Partial(_samples_of_paths, self._sampler, paths)
 
-    def start(self, at: int, end: int, sampler: Callable[..., Samples]) -> BatchMoments:
-        """Starts one batch on each device, from sample `at` on and up to `end`."""
-        count = len(self._devices)
-        low_high = np.array([at & 0xFFFFFFFF, at >> 32], np.uint32)
-        wanted = np.array(max(0, min(self.size * count, end - at)), np.int32)
-        if count == 1:
-            low_high, wanted = jax.device_put((low_high, wanted), self._devices[0])
+    def start(
+        self, first: int, end: int, sampler: Callable[..., Samples]
+    ) -> BatchMoments:
+        """Starts a batch on all devices, from sample number `first` on. Samples from number
+        `end` on do not count."""
+        num_devices = len(self._devices)
+        low_high = np.array([first & 0xFFFFFFFF, first >> 32], np.uint32)
+        num_wanted = max(0, min(self.size * num_devices, end - first))
+        num_wanted = np.array(num_wanted, np.int32)
+        if num_devices == 1:
+            on_device = jax.device_put((low_high, num_wanted), self._devices[0])
+            low_high, num_wanted = on_device
         return self._batch_moments(
-            sampler, self.key_data, self._impl, low_high, wanted, self._mesh, self.size
+            sampler,
+            self.key_data,
+            self._key_impl,
+            low_high,
+            num_wanted,
+            self._mesh,
+            self.size,
         )
 
-    def of_devices(self, running: BatchMoments) -> list[BatchMoments]:
-        """The moments on each device, on the host. Waits for them."""
-        # They are traced if a function closes over traced values.
-        check_untraced("`expectation` or `monte_carlo`", running)
-        arrays = jax.device_get(running)
-        count = len(self._devices)
-        return [jtu.tree_map(lambda x, k=k: x[k], arrays) for k in range(count)]
+    def on_devices(self, running_batch: BatchMoments) -> list[BatchMoments]:
+        """The moments on each device, copied to the host as soon as they are computed."""
+        # The moments are traced if a function closes over traced values.
+        check_untraced("`expectation` or `monte_carlo`", running_batch)
+        arrays = jax.device_get(running_batch)
+        num_devices = len(self._devices)
+        return [jtu.tree_map(lambda x, k=k: x[k], arrays) for k in range(num_devices)]
 
-    def nothing(self, at: int, end: int) -> Moments:
-        """The moments of no samples."""
-        shapes = self._shapes
-        if shapes is None:
+    def without_samples(self, first: int, end: int) -> Moments:
+        """The moments of no samples, which the batch from sample number `first` on
+        continues."""
+        struct = self._struct
+        if struct is None:
             # JAX caches this trace and uses it for the first batch.
-            sampler = self.sampler_at(at)
-            struct = eqx.filter_eval_shape(self.start, at, end, sampler)
+            sampler = self.sampler_at(first)
+            of_batch = eqx.filter_eval_shape(self.start, first, end, sampler)
             # Without the axis of devices.
-            shapes = jtu.tree_map(
-                lambda s: jax.ShapeDtypeStruct(s.shape[1:], s.dtype), struct.mean
+            struct = jtu.tree_map(
+                lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), of_batch.mean
             )
-        zeros = jtu.tree_map(lambda s: np.zeros(s.shape), shapes)
+        zeros = jtu.tree_map(lambda x: np.zeros(x.shape), struct)
         return Moments(
-            begin=at,
-            end=at,
-            good=0,
-            failed=0,
+            begin=first,
+            end=first,
+            num_good=0,
+            num_failed=0,
             failed_on=(0,) * self._levels,
             mean=zeros,
             norm=zeros,
             largest=zeros,
             size=zeros,
-            dtypes=jtu.tree_map(lambda s: str(s.dtype), shapes.value),
+            dtypes=jtu.tree_map(lambda x: str(x.dtype), struct.value),
         )
 
 
-def _of_paths(sampler: Callable, paths: PyTree, keys: Key[Array, " n"]) -> Samples:
-    """The samples from paths that were computed outside of JAX."""
+def _samples_of_paths(
+    sampler: Callable, paths: PyTree, keys: Key[Array, " n"]
+) -> Samples:
+    """The samples from paths that were computed outside JAX."""
     return sampler(paths, keys)
 
 
@@ -202,15 +225,15 @@ def _in_float64(
     of_device: BatchMoments, begin: int, end: int, dtypes: PyTree[str]
 ) -> Moments:
     """The moments of samples `begin` to `end - 1`, in float64."""
-    # Single precision could not hold the sum of a mean and its rounding error.
+    # Single precision could not hold the sum of a mean and its correction.
     wide = jtu.tree_map(lambda x: x.astype(float), of_device)
     return Moments(
         begin=begin,
         end=end,
-        good=int(of_device.good),
-        failed=int(of_device.failed),
+        num_good=int(of_device.num_good),
+        num_failed=int(of_device.num_failed),
         failed_on=tuple(map(int, of_device.failed_on)),
-        mean=jtu.tree_map(np.add, wide.mean, wide.rest),
+        mean=jtu.tree_map(np.add, wide.mean, wide.mean_correction),
         norm=wide.norm,
         largest=wide.largest,
         size=wide.size,
@@ -218,18 +241,19 @@ def _in_float64(
     )
 
 
-def _stops(estimate: Expectation, least: int, tol: float | None) -> bool:
+def _stops(estimate: Expectation, least_samples: int, tol: float | None) -> bool:
     """Whether there are enough samples for the tolerance, or more would not help."""
-    if tol is None or estimate.num_samples < least:
+    if tol is None or estimate.num_samples < least_samples:
         return False
     return is_reached(estimate, tol) or is_stuck(estimate, tol)
 
 
 def _with_tol_reached(
-    estimate: Expectation, least: int, tol: float | None
+    estimate: Expectation, least_samples: int, tol: float | None
 ) -> Expectation:
     """The estimate, which now says whether it reached the tolerance."""
-    reached = None
-    if tol is not None:
-        reached = estimate.num_samples >= least and is_reached(estimate, tol)
-    return dataclasses.replace(estimate, tol_reached=reached)
+    if tol is None:
+        return dataclasses.replace(estimate, tol_reached=None)
+    has_enough = estimate.num_samples >= least_samples
+    tol_reached = has_enough and is_reached(estimate, tol)
+    return dataclasses.replace(estimate, tol_reached=tol_reached)

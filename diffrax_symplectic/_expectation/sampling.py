@@ -22,12 +22,13 @@ class Averaged(NamedTuple):
     else some samplings know of it. Each field has the structure of `phi`, or is `None`.
 
     - `value`: the value of a sample.
-    - `heaviness`: of a replicate of many paths, `r` of `Expectation.std_error` for these,
-        which measures how heavy their tails are.
-    - `largest`: of a replicate, the largest deviation of a path from its mean.
-    - `plain`: of a path with a control variate, its value without.
-    - `control`: of a path with a control variate, the latter, `plain` minus `value`.
-    - `tails`: of a path with a control variate, its deviation from the mean, if that is in
+    - `heaviness`: for a replicate of many paths, the `r` of `Expectation.std_error` over
+        these paths, which measures how heavy their tails are.
+    - `largest`: for a replicate, the largest deviation of one of its paths from its mean.
+    - `plain`: for a path with a control variate, its value without the control variate.
+    - `control`: for a path with a control variate, the control variate, which is `plain`
+        minus `value`.
+    - `tails`: for a path with a control variate, its deviation from the mean, if that is in
         the tails, and otherwise zero.
     """
 
@@ -55,12 +56,12 @@ class Samples(eqx.Module):
     - `averaged`: their values, with two leading axes in each array, for combinations of
         levels and for samples.
     - `good`: which samples are good.
-    - `lost`: how many paths failed in each, on each level.
+    - `num_failed`: how many paths failed in each, on each level.
     """
 
     averaged: Averaged
     good: Bool[Array, " n"]
-    lost: Int[Array, "levels n"] | Bool[Array, "levels n"]
+    num_failed: Int[Array, "levels n"] | Bool[Array, "levels n"]
 
 
 class SamplingPlan(NamedTuple):
@@ -69,34 +70,34 @@ class SamplingPlan(NamedTuple):
     - `sampler`: a callable PyTree that makes one sample for each of several random keys.
     - `num_samples`: the most samples, including the samples of an estimate to continue.
     - `batch_size`: the number of samples that each device takes at once.
-    - `paths`: the number of paths in a sample, on each level.
+    - `paths_per_sample`: the number of paths in a sample, on each level.
     - `levels`: the number of levels.
-    - `least`: the fewest samples whose variance is estimated well enough to stop.
+    - `least_samples`: the fewest samples whose variance is estimated well enough to stop.
     - `reason`: why this sampling was chosen, for the result.
     - `remainder`: the largest fraction of a standard error that a control variate leaves of
         it, by trials.
-    - `shapes`: the shapes of what is averaged of one sample, if they are known without a
-        trace.
+    - `struct`: the shapes and dtypes of what is averaged of one sample, if they are known
+        without a trace.
     - `quick`: whether the samples take less time than compiling their program, so that it
         is compiled for speed of compilation.
     - `tails`, `rounding_floor`: as in `Expectation`.
-    - `paths_of`: for paths computed outside JAX, maps the number of the first sample and
-        the number of samples to an argument that the sampler takes before the keys.
+    - `simulate_paths`: for paths computed outside JAX, maps the number of the first sample
+        and the number of samples to an argument that the sampler takes before the keys.
     """
 
     sampler: Callable[..., Samples]
     num_samples: int
     batch_size: int
-    paths: int = 1
+    paths_per_sample: int = 1
     levels: int = 1
-    least: int = 2
+    least_samples: int = 2
     reason: str = ""
     remainder: float = 0.0
-    shapes: Averaged | None = None
+    struct: Averaged | None = None
     quick: bool = False
     tails: PyTree[np.ndarray] | None = None
     rounding_floor: int = 1
-    paths_of: Callable[[int, int], Any] | None = None
+    simulate_paths: Callable[[int, int], Any] | None = None
 
 
 class AbstractSampling(eqx.Module):

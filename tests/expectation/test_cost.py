@@ -13,7 +13,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._expectation import choose
 from diffrax_symplectic._expectation.choose import sampling_for
 from diffrax_symplectic._expectation.cost import (
-    _operations,
+    _count_operations,
     OPERATIONS_PER_SECOND,
     operations_per_step,
 )
@@ -67,13 +67,13 @@ def sine_in_a_loop_in_a_loop(x):
 )
 def test_the_operations_of_a_program_are_counted(fn, count):
     program = jax.make_jaxpr(fn)(jnp.ones(5)).jaxpr
-    assert _operations(program, in_loop=False) == count
+    assert _count_operations(program, in_loop=False) == count
 
 
 def test_a_call_of_lapack_counts_as_thousands_of_operations():
     program = jax.make_jaxpr(triangular_solve)(jnp.ones(5)).jaxpr
     # What surrounds it makes the identity and some copies.
-    assert 3_000 <= _operations(program, in_loop=False) <= 3_300
+    assert 3_000 <= _count_operations(program, in_loop=False) <= 3_300
 
 
 def problem_of(solver, n=3, steps=100, levels=1):

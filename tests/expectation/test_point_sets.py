@@ -9,7 +9,10 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from diffrax_symplectic._expectation.sorted.hilbert import _curve, hilbert_order
+from diffrax_symplectic._expectation.sorted.hilbert import (
+    _places_on_curve,
+    hilbert_order,
+)
 from diffrax_symplectic._expectation.sorted.points import (
     nested_scramble,
     num_seeds,
@@ -73,7 +76,7 @@ def test_the_curve_meets_each_cell_once_and_goes_on_to_its_neighbour(
     )
     axes = np.meshgrid(*[np.arange(2**bits)] * d, indexing="ij")
     cells = np.stack(axes, -1).reshape(-1, d).astype(np.uint32)
-    place = np.asarray(_curve([*jnp.asarray(cells).T], 48, jnp.uint64))
+    place = np.asarray(_places_on_curve([*jnp.asarray(cells).T], 48, jnp.uint64))
     np.testing.assert_array_equal(np.sort(place), np.arange(len(cells)))
     moves = np.diff(cells[np.argsort(place)].astype(int), axis=0)
     assert np.all(np.abs(moves).sum(axis=1) == 1)

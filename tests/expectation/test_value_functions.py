@@ -400,7 +400,7 @@ def test_a_fit_that_would_take_long_is_coarser_or_told(monkeypatch):
     at = lambda steps: chosen_basis(
         Problem.of(SQUARE, PENDULUM, VERLET, 0, 1, 1 / steps, Y0, None, None, 1), None
     )
-    sites = [at(steps).basis.sites for steps in (100, 10_000, 100_000)]
+    sites = [at(steps).basis.num_sites for steps in (100, 10_000, 100_000)]
     assert sites == sorted(sites, reverse=True) and len(set(sites)) == 3
     assert 100_000 * 3 * sites[-1] < 2**27
     monkeypatch.setattr(basis_choice, "_OUT_OF_PROPORTION", 1000)

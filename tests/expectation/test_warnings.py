@@ -81,14 +81,14 @@ def test_of_a_fit_that_takes_long(monkeypatch):
 
 
 def test_of_a_fit_that_is_no_better(monkeypatch):
-    compared = value_functions._compared
+    comparison = value_functions._comparison
 
     def none_is_better(*given):
-        found = compared(*given)
+        found = comparison(*given)
         unused = np.zeros_like(found.choice.used)
         return found._replace(choice=found.choice._replace(used=unused))
 
-    monkeypatch.setattr(value_functions, "_compared", none_is_better)
+    monkeypatch.setattr(value_functions, "_comparison", none_is_better)
     here(mean(first, sampling=ds.ValueFunctions(2, 64)), "is no better than")
 
 

@@ -15,4 +15,4 @@ from .estimate import (
     ExpectationInterrupted,
 )
 from .moments import joined, Moments, total
-from .tolerance import is_reached, is_stuck, needs_level, share_of
+from .tolerance import is_reached, is_stuck, largest_error, needs_level, share_of

@@ -14,63 +14,65 @@ from .moments import total
 from .tolerance import largest_error, shortfall
 
 
-# With an `r` of `std_error` above this, means of exp(5 x) with normal x were off by forty
-# standard errors, and means of exp(3 x) by five.
+# With a `heaviness` above this, means of exp(5 x) with normal x were off by forty standard
+# errors, and means of exp(3 x) by five.
 _HEAVY = 0.35
-# Which does not matter where so many standard errors are less than the whole error, as for
-# value functions that leave 1e-16 beside a discretization error of 1e-7.
-_WORST = 100
+# Heavy tails do not matter where this many standard errors are less than the whole error,
+# as for value functions that leave 1e-16 beside a discretization error of 1e-7.
+_NEGLIGIBLE_BELOW = 100
 # Two steps do not agree if the extrapolation from them changes the mean by more than this
-# share of it. Of a method of order 2, the bias of the longer step is then more than twice
-# the mean.
+# share of it. For a method of order 2, the bias of the longer step is four times this
+# change, and thus more than twice the mean.
 _MUCH = 0.5
-# Unless that change may be the noise of the samples, so many standard errors: by chance it
-# is more once in sixteen thousand times.
+# The change must also be this many of its standard errors: by chance it is more once in
+# sixteen thousand times.
 _SURE_OF_CHANGE = 4
-# Many more paths fail with the longer step if they are so many times those with half of it:
-# then the longer one is too long for the method, rather than paths bad by themselves.
+# The longer step is too long for the method, rather than paths bad by themselves, if this
+# many times as many paths fail with it as with half of it.
 _MANY_MORE = 10
 
 
 def cautions(estimate: Expectation, tol: float | None, bounded: bool) -> Iterator[str]:
-    """What the user is warned of. `bounded` is whether the increments of all paths are
+    """The warnings for an estimate. `bounded` is whether the increments of all paths are
     known to be bounded."""
     if estimate.num_failed > 0:
-        yield from _of_failures(estimate, bounded)
+        yield from _cautions_on_failures(estimate, bounded)
     if estimate.num_samples > 1:
-        yield from _of_spread(estimate)
-        yield from _of_first_steps(estimate)
+        yield from _cautions_on_mean(estimate)
+        yield from _cautions_on_samples(estimate)
+        yield from _cautions_on_steps(estimate)
     if tol is not None and not estimate.tol_reached:
         yield f"`tol={tol}` was not reached: {shortfall(estimate, tol)}."
 
 
-def _of_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
-    """A warning of failed paths, if they could change the mean by more than its error."""
+def _cautions_on_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
+    """Warns of failed paths that could change the mean by more than its standard error."""
     changes = jtu.tree_leaves(estimate.failed_error)
     errors = jtu.tree_leaves(estimate.std_error)
-    # Without samples both are NaN.
+    # Without samples both are NaN, which is no reason to return.
     if all(np.all(change <= error) for change, error in zip(changes, errors)):
         return
     if estimate.num_samples == 0:
-        rest = "there is no mean"
+        consequence = "there is no mean"
     else:
         largest = largest_error(estimate.failed_error)
-        rest = (
+        consequence = (
             "they are left out of the mean, and could change it by more than its standard "
             f"error, up to {largest:.1e}, which is part of `error`"
         )
     if estimate.levels > 1:
-        longest, next_one, *_ = estimate.failed_on
-        if longest > _MANY_MORE * next_one:
-            rest += (
-                f"; the first two steps do not agree, since {longest:,} paths fail with "
-                f"steps of `dt0` and {next_one:,} with half of it"
+        num_with_dt0, num_with_half, *_ = estimate.failed_on
+        if num_with_dt0 > _MANY_MORE * num_with_half:
+            consequence += (
+                f"; the first two steps do not agree, since {num_with_dt0:,} paths fail "
+                f"with steps of `dt0` and {num_with_half:,} with half of it"
             )
-    yield f"{estimate.num_failed:,} paths failed: {rest}. {advice_on_failures(bounded)}"
+    advice = advice_on_failures(bounded)
+    yield f"{estimate.num_failed:,} paths failed: {consequence}. {advice}"
 
 
-def _of_spread(estimate: Expectation) -> Iterator[str]:
-    """Warnings of values whose mean or standard error cannot be trusted."""
+def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
+    """Warns of a mean or a standard error that cannot be trusted."""
     results = jtu.tree_leaves((estimate.mean, estimate.std_error))
     if not all(np.all(np.isfinite(x)) for x in results):
         yield (
@@ -87,16 +89,23 @@ def _of_spread(estimate: Expectation) -> Iterator[str]:
         )
 
     def may_be_off(heaviness: Any, std_error: Any, error: Any) -> Any:
-        return np.any((heaviness > _HEAVY) & (_WORST * std_error >= error))
+        matters = _NEGLIGIBLE_BELOW * std_error >= error
+        return np.any((heaviness > _HEAVY) & matters)
 
-    of_tails = best.heaviness, estimate.std_error, estimate.error
-    if any(jtu.tree_leaves(jtu.tree_map(may_be_off, *of_tails))):
+    is_off = jtu.tree_map(
+        may_be_off, best.heaviness, estimate.std_error, estimate.error
+    )
+    if any(jtu.tree_leaves(is_off)):
         yield (
             f"A few of the {estimate.num_paths:,} paths account for most of the variance: "
             "still rarer paths may contribute much to the mean, and the standard error may "
             "be too small. Take many more paths, or a function that grows more slowly."
         )
-    dtype = _underflowing(estimate)
+
+
+def _cautions_on_samples(estimate: Expectation) -> Iterator[str]:
+    """Warns of samples that are all zero, or all equal."""
+    dtype = _dtype_of_underflow(estimate)
     if dtype is not None:
         yield (
             f"A component is zero, or underflows {dtype}, on all paths. If it "
@@ -114,22 +123,26 @@ def _of_spread(estimate: Expectation) -> Iterator[str]:
         )
 
 
-def _of_first_steps(estimate: Expectation) -> Iterator[str]:
-    """A warning of two steps whose means differ much. (Three are checked for the order.)"""
+def _cautions_on_steps(estimate: Expectation) -> Iterator[str]:
+    """Warns of two steps whose means differ much. (Three are checked for the order.)"""
     if estimate.levels != 2:
         return
-    change = combined_results(estimate, Combination.EXTRAPOLATION)
-    whole = total(estimate.moments)
 
-    def disagree(change: Any, noise: Any, finest: Any, size: Any, dtype: str) -> Any:
+    def disagrees(change: Any, noise: Any, finest: Any, size: Any, dtype: str) -> Any:
         rounding = ROUNDING * float(jnp.finfo(dtype).eps) * size[Combination.BEST]
-        is_large = np.abs(change) > np.maximum(_SURE_OF_CHANGE * noise, rounding)
-        return np.any(is_large & (np.abs(change) > _MUCH * np.abs(finest)))
+        is_real = np.abs(change) > np.maximum(_SURE_OF_CHANGE * noise, rounding)
+        is_large = np.abs(change) > _MUCH * np.abs(finest)
+        return np.any(is_real & is_large)
 
+    change = combined_results(estimate, Combination.EXTRAPOLATION)
     finest = jtu.tree_map(np.add, estimate.mean, estimate.bias)
-    size = jtu.tree_map(np.fmax, whole.size.value, whole.size.without_control)
-    arguments = change.mean, change.std_error, finest, size, whole.dtypes
-    if any(jtu.tree_leaves(jtu.tree_map(disagree, *arguments))):
+    moments = total(estimate.moments)
+    # The largest absolute values of samples, by which their rounding is measured.
+    size = jtu.tree_map(np.fmax, moments.size.value, moments.size.without_control)
+    is_wrong = jtu.tree_map(
+        disagrees, change.mean, change.std_error, finest, size, moments.dtypes
+    )
+    if any(jtu.tree_leaves(is_wrong)):
         yield (
             "The first two steps do not agree: extrapolation from steps of `dt0` and half "
             "of it changes the mean by more than half of it. Pass a smaller `dt0`, or "
@@ -137,16 +150,18 @@ def _of_first_steps(estimate: Expectation) -> Iterator[str]:
         )
 
 
-def _underflowing(estimate: Expectation) -> str | None:
-    """The dtype of a component that is zero or underflows on all paths, if there is one."""
-    whole = total(estimate.moments)
-    both = whole.size.without_control, whole.dtypes
-    for size, dtype in zip(*map(jtu.tree_leaves, both)):
-        if np.max(size[Combination.BEST]) < _least(dtype):
+def _dtype_of_underflow(estimate: Expectation) -> str | None:
+    """The dtype of an array of `phi` that is zero or underflows on all paths, if there is
+    one."""
+    moments = total(estimate.moments)
+    sizes = jtu.tree_leaves(moments.size.without_control)
+    dtypes = jtu.tree_leaves(moments.dtypes)
+    for size, dtype in zip(sizes, dtypes):
+        if np.max(size[Combination.BEST]) < _smallest_accurate(dtype):
             return dtype
     return None
 
 
-def _least(dtype: str) -> float:
+def _smallest_accurate(dtype: str) -> float:
     """The smallest number whose rounding errors do not underflow."""
     return float(jnp.finfo(dtype).tiny / jnp.finfo(dtype).eps)

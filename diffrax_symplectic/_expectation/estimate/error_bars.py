@@ -16,29 +16,30 @@ from .moments import Moments
 # A control variate is dropped if its mean is this many standard errors from zero: by chance
 # that happens less than once in a million times.
 _SURE_OF_CONTROL = 5
-# Unless its own `r` exceeds this value: its tails are then so heavy that its standard error
-# is not reliable.
+# A control variate with a `heaviness` above this is kept all the same: its tails are then
+# so heavy that the standard error of its mean is not reliable.
 _HEAVY_CONTROL = 0.1
 # The largest deviation of n normal samples exceeds the root of this number times log(n), in
 # standard deviations, with a probability of less than n^(-5/4).
 _OUTLYING = 4.5
-# A single sample that accounts for all of the variance has r = 1, where the standard error
-# would be infinite.
+# The largest `heaviness` that is used: with r = 1, where a single sample accounts for all
+# of the variance, the standard error would be infinite.
 _MOST_HEAVY = 1 - 1e-6
-# The last change by a smaller step, over what the order foretells from the change before.
-# In between, the steps are taken to be in the asymptotic range. (Of half an order less it
-# would be 1.41, of two orders more 0.25.)
-_FASTEST = 0.25
-_SLOWEST = 1.33
-# The standard errors by which it may miss them.
-_BY_CHANCE = 2
+# The steps fit the order if the last change by a smaller step, divided by what the order
+# foretells from the change before, is between these. (An order less by a half makes this
+# ratio 1.41, and an order more by two 0.25.)
+_LEAST_RATIO = 0.25
+_LARGEST_RATIO = 1.33
+# The last change may be outside that range by this many standard errors.
+_ERRORS_BY_CHANCE = 2
 
 
 def heaviness(largest: Any, s: Any, n: Any, numpy: Any = np) -> Any:
-    """The `r` of `Expectation.std_error`, from the largest deviation and the standard
-    deviation `s` of `n` values, by NumPy or `jax.numpy`. (Not finite if `s` is zero.)"""
-    usual = s * numpy.sqrt(_OUTLYING * numpy.log(numpy.maximum(n, 2)))
-    return numpy.maximum(largest - usual, 0) / (s * numpy.sqrt(n))
+    """The `r` of `Expectation.std_error`, which measures how heavy the tails of `n` values
+    are, from their largest deviation and their standard deviation `s`. `numpy` is NumPy or
+    `jax.numpy`. Not finite if `s` is zero."""
+    largest_of_normal = s * numpy.sqrt(_OUTLYING * numpy.log(numpy.maximum(n, 2)))
+    return numpy.maximum(largest - largest_of_normal, 0) / (s * numpy.sqrt(n))
 
 
 class Results(NamedTuple):
@@ -75,31 +76,35 @@ def results_of(
     and `tails` are those of `Expectation`.
     """
     treedef = jtu.tree_structure(moments.mean.value)
-    # Only fits of value functions estimate tails by paths of their own. Deviations of zero
-    # there add nothing to the standard errors.
+    # Only value functions estimate tails by paths of their own. Without them, deviations of
+    # zero add nothing to the standard errors.
     if tails is None:
         tails = jtu.tree_map(np.zeros_like, moments.mean.value)
-    each = [
-        _results_of_array(moments.good, rounding_floor, *parts)
-        for parts in zip(
-            _by_array(moments.mean),
-            _by_array(moments.norm),
-            _by_array(moments.largest),
-            jtu.tree_leaves(moments.dtypes),
-            jtu.tree_leaves(tails),
-        )
+    # The moments of each array of `phi`.
+    moments_of_arrays = zip(
+        _split_by_array(moments.mean),
+        _split_by_array(moments.norm),
+        _split_by_array(moments.largest),
+        jtu.tree_leaves(moments.dtypes),
+        jtu.tree_leaves(tails),
+    )
+    results_of_arrays = [
+        _results_of_array(moments.num_good, rounding_floor, *of_array)
+        for of_array in moments_of_arrays
     ]
-    # `each` has all fields of one array after another, each with an axis of combinations.
-    # PyTrees need all arrays of one field after another, at this combination.
-    fields = [[array[combination] for array in arrays] for arrays in zip(*each)]
-    return Results(*map(treedef.unflatten, fields))
+    # The transpose: the arrays of each field, at this combination, which make a PyTree.
+    trees = [
+        treedef.unflatten([array[combination] for array in arrays])
+        for arrays in zip(*results_of_arrays)
+    ]
+    return Results(*trees)
 
 
-def _by_array(averaged: Averaged) -> list[Averaged]:
-    """For each array of `phi` what is averaged of it."""
+def _split_by_array(averaged: Averaged) -> list[Averaged]:
+    """What is averaged of each array of `phi`."""
     fields = averaged.fields
-    by_field = zip(*map(jtu.tree_leaves, fields.values()))
-    return [Averaged(**dict(zip(fields, parts))) for parts in by_field]
+    arrays_of_fields = map(jtu.tree_leaves, fields.values())
+    return [Averaged(**dict(zip(fields, arrays))) for arrays in zip(*arrays_of_fields)]
 
 
 @np.errstate(all="ignore")
@@ -116,41 +121,40 @@ def _results_of_array(
     over `n` samples. `tails` is the mean absolute deviation in the tails, as paths with
     wider noise estimate it."""
     plain_mean = mean.without_control
-    # Combinations of levels are differences of values as large as the mean.
+    # The best combination comes first. All others are differences of values of its size.
     size = np.fmax(np.abs(mean.value[:1]), np.abs(plain_mean[:1]))
     rounding = rounding_floor * float(jnp.finfo(dtype).eps) * size
     spread_of = ft.partial(_spread_of, n, rounding)
 
-    controlled = spread_of(norm.value, largest.value, mean.heaviness)
+    value = spread_of(norm.value, largest.value, mean.heaviness)
     results = Results(
         mean=mean.value,
-        std_error=controlled.error,
-        plain_std_error=controlled.error,
-        variance=controlled.s**2,
-        heaviness=controlled.r,
+        std_error=value.std_error,
+        plain_std_error=value.std_error,
+        variance=value.s**2,
+        heaviness=value.r,
         dropped=np.zeros(plain_mean.shape, bool),
         spread=largest.without_control if mean.largest is None else mean.largest,
     )
     if mean.control is not None:
         control = spread_of(norm.control, largest.control)
-        allowed = np.fmax(_SURE_OF_CONTROL * control.error, ROUNDING * rounding)
-        is_fine = np.abs(mean.control) <= allowed
-        is_fine |= control.r > _HEAVY_CONTROL
-        is_fine &= np.isfinite(mean.value)
-        # Combinations of levels belong together: for all or for none.
-        dropped = np.broadcast_to(~np.all(is_fine, axis=0), plain_mean.shape)
+        allowed = np.fmax(_SURE_OF_CONTROL * control.std_error, ROUNDING * rounding)
+        is_kept = np.abs(mean.control) <= allowed
+        is_kept |= control.r > _HEAVY_CONTROL
+        is_kept &= np.isfinite(mean.value)
+        # A control variate is kept for all combinations of levels or for none.
+        dropped = np.broadcast_to(~np.all(is_kept, axis=0), plain_mean.shape)
         # Tails that the samples show are in their variance already. (NaN, from a trial
         # without a value, is ignored.)
-        unseen = np.where(tails > mean.tails, tails - mean.tails, 0)
+        unseen_tails = np.where(tails > mean.tails, tails - mean.tails, 0)
+        std_error = np.hypot(value.std_error, unseen_tails)
         plain = spread_of(norm.plain, largest.plain)
         results = results._replace(
             mean=np.where(dropped, plain_mean, mean.value),
-            std_error=np.where(
-                dropped, plain.error, np.hypot(controlled.error, unseen)
-            ),
-            plain_std_error=plain.error,
-            variance=np.where(dropped, plain.s, controlled.s) ** 2,
-            heaviness=np.where(dropped, plain.r, controlled.r),
+            std_error=np.where(dropped, plain.std_error, std_error),
+            plain_std_error=plain.std_error,
+            variance=np.where(dropped, plain.s, value.s) ** 2,
+            heaviness=np.where(dropped, plain.r, value.r),
             dropped=dropped,
         )
     if n == 0:
@@ -159,12 +163,16 @@ def _results_of_array(
 
 
 class _Spread(NamedTuple):
-    """How values spread: their standard deviation, their `heaviness`, and the standard
-    error of their mean."""
+    """How values spread.
+
+    - `s`: their standard deviation.
+    - `r`: their `heaviness`.
+    - `std_error`: the standard error of their mean.
+    """
 
     s: np.ndarray
     r: np.ndarray
-    error: np.ndarray
+    std_error: np.ndarray
 
 
 def _spread_of(
@@ -172,38 +180,42 @@ def _spread_of(
     rounding: np.ndarray,
     norm: np.ndarray,
     largest: np.ndarray,
-    within: np.ndarray | None = None,
+    r_of_paths: np.ndarray | None = None,
 ) -> _Spread:
-    """The spread of `n` values, from their moments. `within` is the `heaviness` of the
-    paths that each value is a mean of, which hides their tails."""
+    """The spread of `n` values, from their moments, by the formula of
+    `Expectation.std_error`. If each value is a mean over paths, which hides the tails of
+    these, `r_of_paths` is the `heaviness` of the paths."""
     s = norm / np.sqrt(n - 1) if n > 1 else np.full_like(norm, np.nan)
     r = np.where(s > 0, heaviness(largest, s, n), 0)
     # Rounding errors can have heavy tails, too.
     r = np.where(largest > ROUNDING * rounding, r, 0)
-    if within is not None:
-        r = np.fmax(r, within)
+    if r_of_paths is not None:
+        r = np.fmax(r, r_of_paths)
     r = np.minimum(r, _MOST_HEAVY)
-    error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
-    return _Spread(s, r, np.maximum(error, rounding))
+    std_error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
+    return _Spread(s, r, np.maximum(std_error, rounding))
 
 
 @np.errstate(invalid="ignore")
 def is_off_order(last: Any, miss: Any, miss_error: Any) -> np.ndarray:
-    """Whether the last change is not what the order makes of the change before. `miss` is
-    the difference of the two."""
+    """Whether the `last` change by a smaller step does not fit the order of the solver.
+    `miss` is this change minus what the order foretells from the change before, and
+    `miss_error` its standard error."""
     foretold = last - miss
-    ends = np.stack([_FASTEST * foretold, _SLOWEST * foretold])
-    allowed = _BY_CHANCE * miss_error
-    low = np.min(ends, axis=0) - allowed
-    high = np.max(ends, axis=0) + allowed
+    # Where `foretold` is negative, the largest ratio gives the lower end.
+    ends = np.stack([_LEAST_RATIO * foretold, _LARGEST_RATIO * foretold])
+    allowance = _ERRORS_BY_CHANCE * miss_error
+    low = np.min(ends, axis=0) - allowance
+    high = np.max(ends, axis=0) + allowance
     return (last < low) | (last > high)
 
 
 def remaining_error(
     off_order: Any, extrapolation: Any, last: Any, before: Any
 ) -> np.ndarray:
-    """An estimate of the discretization error that remains: the change by the last
-    extrapolation, or the largest change where the changes do not fit the order."""
+    """An estimate of the discretization error that remains: the size of the change by the
+    last `extrapolation`, or where the changes do not fit the order, of the largest among
+    it, the `last` change by a smaller step and the change `before`."""
     size = np.abs(extrapolation)
-    largest = np.maximum(np.abs(last), np.abs(before))
-    return np.where(off_order, np.maximum(size, largest), size)
+    largest_change = np.maximum(np.abs(last), np.abs(before))
+    return np.where(off_order, np.maximum(size, largest_change), size)

@@ -63,7 +63,7 @@ class Expectation(eqx.Module):
 
     @property
     def num_samples(self) -> int:
-        return sum(x.good for x in self.moments)
+        return sum(part.num_good for part in self.moments)
 
     @property
     def num_paths(self) -> int:
@@ -71,7 +71,7 @@ class Expectation(eqx.Module):
 
     @property
     def num_failed(self) -> int:
-        return sum(x.failed for x in self.moments)
+        return sum(part.num_failed for part in self.moments)
 
     @property
     def failed_on(self) -> tuple[int, ...]:
@@ -173,16 +173,16 @@ class Expectation(eqx.Module):
         largest deviation of another path's value from the mean. (For sorted paths, that is
         the mean over the replicates.) It does not decrease with more paths, and is NaN if
         there is no other path."""
-        drawn = sum(batch.end - batch.begin for batch in self.moments)
-        # Samples that are left out, as single paths are, or as many samples as the paths
-        # that failed in others would be, as in replicates.
-        left_out = drawn - self.num_samples
-        lost = max(left_out, self.num_failed / self.paths_per_sample)
-        fraction = lost / max(drawn, 1)
-        # Of no samples the largest deviation is zero.
-        known = 1.0 if self.num_samples > 0 else np.nan
-        spread = self._results(Combination.BEST).spread
-        return jtu.tree_map(lambda most: known * fraction * most, spread)
+        num_drawn = sum(part.end - part.begin for part in self.moments)
+        # A sample of one path is left out if the path fails. A replicate leaves out its
+        # failed paths, which are counted here as a fraction of a sample.
+        num_left_out = num_drawn - self.num_samples
+        num_lost = max(num_left_out, self.num_failed / self.paths_per_sample)
+        fraction = num_lost / max(num_drawn, 1)
+        if self.num_samples == 0:
+            fraction = np.nan
+        largest_deviation = self._results(Combination.BEST).spread
+        return jtu.tree_map(lambda x: fraction * x, largest_deviation)
 
     @property
     def off_order(self) -> PyTree[np.ndarray] | None:
@@ -199,14 +199,14 @@ class Expectation(eqx.Module):
         quantile of Student's $t$ with `num_samples - 1` degrees of freedom. (For 95% this
         is 2.13 with 16 samples, and 1.96 with very many.) Where sampling is a small part of
         `error` the interval holds the mean more often than that."""
-        # Imported here: it would double the time to import this package.
+        # SciPy is imported here, since it would double the time to import this package.
         from scipy.special import stdtrit
 
         factor = stdtrit(max(self.num_samples - 1, 1), (1 + confidence) / 2)
         mean = self.mean
         reach = jtu.tree_map(lambda error: factor * error, self.error)
-        lower = jtu.tree_map(lambda center, side: center - side, mean, reach)
-        upper = jtu.tree_map(lambda center, side: center + side, mean, reach)
+        lower = jtu.tree_map(np.subtract, mean, reach)
+        upper = jtu.tree_map(np.add, mean, reach)
         return lower, upper
 
     def merge(self, *others: "Expectation") -> "Expectation":
@@ -233,11 +233,12 @@ class Expectation(eqx.Module):
             check_same(self, other, "An estimate to merge")
         parts = [part for estimate in (self, *others) for part in estimate.moments]
         parts.sort(key=lambda part: part.begin)
-        for one, after in zip(parts, parts[1:]):
-            if after.begin < one.end:
+        for before, after in zip(parts, parts[1:]):
+            if after.begin < before.end:
+                last_in_both = min(before.end, after.end) - 1
                 raise ValueError(
-                    f"Samples {after.begin:,} to {min(one.end, after.end) - 1:,} are in "
-                    "two of the estimates to merge. Pass a different `first` for each part."
+                    f"Samples {after.begin:,} to {last_in_both:,} are in two "
+                    "of the estimates to merge. Pass a different `first` for each part."
                 )
         return dataclasses.replace(self, moments=joined(parts), tol_reached=None)
 
@@ -272,16 +273,16 @@ class Expectation(eqx.Module):
             lines.append("not included: the discretization error (see `levels`)")
         if self.levels == 2:
             lines.append("the order of the solver is unchecked (see `levels`)")
-        if any(np.any(leaf) for leaf in jtu.tree_leaves(self.off_order)):
+        if any(np.any(is_off) for is_off in jtu.tree_leaves(self.off_order)):
             lines.append(
                 "the changes from step to step do not fit the order: the largest of them "
                 "is taken for the error (take smaller steps)"
             )
-        how = "" if self.sampling is None else f", {self.sampling}"
         levels = "1 level" if self.levels == 1 else f"{self.levels} levels"
-        lines.append(
-            f"{self.num_paths:,} paths on {levels}, {self.num_failed:,} failed{how}"
-        )
+        paths = f"{self.num_paths:,} paths on {levels}, {self.num_failed:,} failed"
+        if self.sampling is not None:
+            paths += f", {self.sampling}"
+        lines.append(paths)
         if self.reason:
             lines.append(self.reason)
         if self.tol_reached is False:
@@ -291,25 +292,23 @@ class Expectation(eqx.Module):
     __repr__ = __str__
 
     def _lines_of_means(self) -> list[str]:
-        """A line for each number of the mean: the number, its error, and the parts of it
-        that are not zero. Where there are several numbers, the line begins with the place
-        of the number in the PyTree."""
-        parts = {
-            "sampling": self.std_error,
-            "discretization": self.discretization_error,
-            "failed paths": self.failed_error,
-        }
-        parts = {name: _flat(part) for name, part in parts.items() if part is not None}
-        if self.num_failed == 0:
-            del parts["failed paths"]
-        means = _flat(self.mean)
-        errors = _flat(self.error)
+        """A line for each number of the mean, such as `['energy'][0]: 0.364083 ± 8.6e-05
+        (sampling 5.1e-05, discretization 6.9e-05)`: the place of the number in the PyTree,
+        if there is one, the number, its error, and the parts of the error, if there are
+        several."""
+        errors_by_source = {"sampling": _numbers(self.std_error)}
+        if self.levels > 1:
+            errors_by_source["discretization"] = _numbers(self.discretization_error)
+        if self.num_failed > 0:
+            errors_by_source["failed paths"] = _numbers(self.failed_error)
+        means = _numbers(self.mean)
+        errors = _numbers(self.error)
         lines = []
         for k, label in enumerate(_labels(self.mean)):
-            line = f"{_with_digits(means[k], errors[k])} ± {errors[k]:.1e}"
-            if len(parts) > 1:
-                each = [f"{name} {part[k]:.1e}" for name, part in parts.items()]
-                line += f" ({', '.join(each)})"
+            line = f"{_rounded(means[k], errors[k])} ± {errors[k]:.1e}"
+            if len(errors_by_source) > 1:
+                sources = [f"{name} {x[k]:.1e}" for name, x in errors_by_source.items()]
+                line += f" ({', '.join(sources)})"
             lines.append(f"{label}: {line}" if label else line)
         return lines
 
@@ -320,7 +319,7 @@ class Expectation(eqx.Module):
 
 
 def combined_results(estimate: Expectation, combination: Combination) -> Results:
-    """All results for a combination of levels. Users see some of them."""
+    """All results for a combination of levels, of which users see some as properties."""
     return estimate._results(combination)
 
 
@@ -348,29 +347,30 @@ def check_same(one: Expectation, other: Expectation, name: str) -> None:
         )
 
 
-def _flat(tree: PyTree[np.ndarray | np.floating]) -> list[float]:
-    """All numbers."""
+def _numbers(tree: PyTree[np.ndarray | np.floating] | None) -> list[float]:
+    """All numbers in a PyTree of arrays."""
     return [float(x) for leaf in jtu.tree_leaves(tree) for x in np.ravel(leaf)]
 
 
 def _labels(tree: PyTree[np.ndarray | np.floating]) -> list[str]:
-    """For each number its place, such as `['energy'][0, 2]`; nothing for a single array
-    without axes."""
+    """The place of each number in a PyTree of arrays, such as `['energy'][0, 2]`; the
+    empty string for a single array without axes."""
     labels = []
     for path, leaf in jtu.tree_leaves_with_path(tree):
         for index in np.ndindex(np.shape(leaf)):
-            axes = f"[{', '.join(map(str, index))}]" if index else ""
-            labels.append(jtu.keystr(path) + axes)
+            place = f"[{', '.join(map(str, index))}]" if index else ""
+            labels.append(jtu.keystr(path) + place)
     return labels
 
 
-def _with_digits(mean: float, error: float) -> str:
-    """The mean, with two digits of its error."""
-    least = np.clip(np.nan_to_num(error), 1e-15, 1)
-    digits = 1 - math.floor(math.log10(least))
-    # With more, the mean's own digits end first.
-    mode = "fixed" if digits < 14 else "maxprec"
-    return np.array2string(np.asarray(mean), precision=digits, floatmode=mode)
+def _rounded(mean: float, error: float) -> str:
+    """The mean, rounded to two digits of its error: `0.364083` for an error of 8.6e-05."""
+    # No error is shown with more decimals than float64 has, and none with fewer than one.
+    size = np.clip(np.nan_to_num(error), 1e-15, 1)
+    decimals = 1 - math.floor(math.log10(size))
+    # With more decimals, the mean's own digits may end first.
+    mode = "fixed" if decimals < 14 else "maxprec"
+    return np.array2string(np.asarray(mean), precision=decimals, floatmode=mode)
 
 
 class ExpectationInterrupted(KeyboardInterrupt):

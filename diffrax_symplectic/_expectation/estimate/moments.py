@@ -13,8 +13,8 @@ from ..sampling import Averaged
 class Moments(NamedTuple):
     """Statistics of samples `begin` to `end - 1`, on the host and in float64.
 
-    - `good`: the number of good samples.
-    - `failed`: the number of failed paths, each counted once.
+    - `num_good`: the number of good samples.
+    - `num_failed`: the number of failed paths, each counted once.
     - `failed_on`: the number of paths that failed on each level.
     - `mean`: the mean of the good samples. Arrays have a leading axis for combinations of
         levels.
@@ -27,8 +27,8 @@ class Moments(NamedTuple):
 
     begin: int
     end: int
-    good: int
-    failed: int
+    num_good: int
+    num_failed: int
     failed_on: tuple[int, ...]
     mean: Averaged
     norm: Averaged
@@ -41,26 +41,28 @@ def joined(parts: Iterable[Moments]) -> tuple[Moments, ...]:
     """The moments in order, with neighbours combined in the way a binary counter carries.
     The result depends on the batches but not on the order of their arrival, and only a few
     entries remain."""
-    out: list[Moments] = []
-    for one in parts:
-        out.append(one)
-        while len(out) > 1 and _are_halves(out[-2], out[-1]):
-            last = out.pop()
-            out.append(_both(out.pop(), last))
-    return tuple(out)
+    joined_parts: list[Moments] = []
+    for part in parts:
+        joined_parts.append(part)
+        while len(joined_parts) > 1 and _are_halves(joined_parts[-2], joined_parts[-1]):
+            last = joined_parts.pop()
+            before = joined_parts.pop()
+            joined_parts.append(_moments_of_both(before, last))
+    return tuple(joined_parts)
 
 
 def total(parts: tuple[Moments, ...]) -> Moments:
     """The moments of all samples."""
     whole, *rest = parts
-    for one in rest:
-        whole = _both(whole, one)
+    for part in rest:
+        whole = _moments_of_both(whole, part)
     return whole
 
 
 def _are_halves(a: Moments, b: Moments) -> bool:
-    """Whether `a` and `b` are neighbours of one length, with `a` at an even place among all
-    ranges of this length. (Without samples `a` joins any neighbour.)"""
+    """Whether `a` and then `b` are the halves of a range that begins at a multiple of its
+    length, as samples 8 to 11 and 12 to 15 are. (Without samples `a` joins any part that
+    follows it.)"""
     length = a.end - a.begin
     if a.end != b.begin:
         return False
@@ -70,29 +72,31 @@ def _are_halves(a: Moments, b: Moments) -> bool:
 
 
 @np.errstate(over="ignore", invalid="ignore", under="ignore")
-def _both(a: Moments, b: Moments) -> Moments:
-    """The moments of both, by the pairwise formula of Chan, Golub and LeVeque."""
-    n = max(a.good + b.good, 1)
-    share_of_b = b.good / n
-    # Times the difference of the means, squared, this adds to the squared deviations.
-    weight = np.sqrt(a.good / n * b.good)
-    change = jtu.tree_map(np.subtract, b.mean, a.mean)
+def _moments_of_both(a: Moments, b: Moments) -> Moments:
+    """The moments of all samples of `a` and `b`, by the pairwise formula of
+    [Chan, Golub and LeVeque (1983)](https://doi.org/10.1080/00031305.1983.10483115)."""
+    n = max(a.num_good + b.num_good, 1)
+    share_of_b = b.num_good / n
+    # The squared deviations of both are the sum of those of `a` and `b`, and of the squared
+    # difference of their means times `a.num_good * b.num_good / n`.
+    weight = np.sqrt(a.num_good / n * b.num_good)
+    difference = jtu.tree_map(np.subtract, b.mean, a.mean)
 
-    def mean(of_a, of_b, change):
+    def mean(of_a, of_b, difference):
         # Without samples `a` has no mean.
-        return of_b if a.good == 0 else of_a + change * share_of_b
+        return of_b if a.num_good == 0 else of_a + difference * share_of_b
 
-    def norm(of_a, of_b, change):
-        return np.hypot(np.hypot(of_a, of_b), weight * change)
+    def norm(of_a, of_b, difference):
+        return np.hypot(np.hypot(of_a, of_b), weight * difference)
 
     return Moments(
         begin=a.begin,
         end=b.end,
-        good=a.good + b.good,
-        failed=a.failed + b.failed,
+        num_good=a.num_good + b.num_good,
+        num_failed=a.num_failed + b.num_failed,
         failed_on=tuple(map(sum, zip(a.failed_on, b.failed_on))),
-        mean=jtu.tree_map(mean, a.mean, b.mean, change),
-        norm=jtu.tree_map(norm, a.norm, b.norm, change),
+        mean=jtu.tree_map(mean, a.mean, b.mean, difference),
+        norm=jtu.tree_map(norm, a.norm, b.norm, difference),
         largest=jtu.tree_map(np.maximum, a.largest, b.largest),
         size=jtu.tree_map(np.maximum, a.size, b.size),
         dtypes=b.dtypes,

@@ -11,9 +11,9 @@ from ..sampling import Averaged, SAVED_SAMPLINGS
 from .moments import Moments
 
 
-# The fields of `Moments` that are an `Averaged`, and those that are integers.
+# The fields of `Moments` that are an `Averaged`, and those that are counts.
 _AVERAGED = ("mean", "norm", "largest", "size")
-_COUNTS = ("begin", "end", "good", "failed", "failed_on")
+_COUNTS = ("begin", "end", "num_good", "num_failed", "failed_on")
 # The fields of an estimate that JSON takes as they are.
 _PLAIN_FIELDS = ("paths_per_sample", "rounding_floor", "reason", "tol_reached")
 
@@ -21,25 +21,30 @@ _PLAIN_FIELDS = ("paths_per_sample", "rounding_floor", "reason", "tol_reached")
 def header_of(estimate: Any) -> dict[str, Any]:
     """All of an `Expectation` but its arrays, for JSON. Raises a `ValueError` for PyTree
     nodes that JSON cannot express."""
+    # All batches have the same structure.
+    batch, *_ = estimate.moments
+    ranges = [[getattr(x, name) for name in _COUNTS] for x in estimate.moments]
     sampling = estimate.sampling
-    one, *_ = estimate.moments
-    fields = {} if sampling is None else vars(sampling)
+    sampling_fields = {} if sampling is None else vars(sampling)
+    # A function, such as `sort_by`, is left out.
+    plain_fields = {
+        name: _plain(x) for name, x in sampling_fields.items() if _is_plain(x)
+    }
     header = {
-        "ranges": [[getattr(x, name) for name in _COUNTS] for x in estimate.moments],
-        "structure": _structure(one.mean.value),
-        "averaged": list(one.mean.fields),
-        "dtypes": jtu.tree_leaves(one.dtypes),
+        "ranges": ranges,
+        "structure": _structure(batch.mean.value),
+        "averaged": list(batch.mean.fields),
+        "dtypes": jtu.tree_leaves(batch.dtypes),
         "sampling": None if sampling is None else type(sampling).__name__,
-        # A function, such as `sort_by`, is left out.
-        "fields": {name: _plain(x) for name, x in fields.items() if _is_plain(x)},
+        "fields": plain_fields,
         "tails": estimate.tails is not None,
     }
     return header | {name: getattr(estimate, name) for name in _PLAIN_FIELDS}
 
 
 def arrays_of(estimate: Any) -> dict[str, np.ndarray]:
-    """The arrays of an `Expectation` (which is defined above this module), by their names.
-    For example `mean_value_0_1` is leaf 1 of the field `value` of the `mean` of batch 0."""
+    """The arrays of an `Expectation` (whose module imports this one), by their names. For
+    example `mean_value_0_1` is leaf 1 of the field `value` of the `mean` of batch 0."""
     trees = {"tails": estimate.tails}
     for batch, moments in enumerate(estimate.moments):
         for name in _AVERAGED:
@@ -66,10 +71,10 @@ def fields_from(
     """The fields of the `Expectation` from which `header_of` and `arrays_of` made these.
     Raises a `ValueError` for an unknown sampling."""
     structure = header["structure"]
-    count = len(header["dtypes"])
+    num_leaves = len(header["dtypes"])
 
     def tree(name: str) -> PyTree[np.ndarray]:
-        leaves = [arrays[_name_of_leaf(name, leaf)] for leaf in range(count)]
+        leaves = [arrays[_name_of_leaf(name, leaf)] for leaf in range(num_leaves)]
         return _tree_of(structure, iter(leaves))
 
     def averaged(name: str, batch: int) -> Averaged:
@@ -78,11 +83,17 @@ def fields_from(
         return Averaged(**trees)
 
     def moments(batch: int, counts: list[Any]) -> Moments:
-        trees = {name: averaged(name, batch) for name in _AVERAGED}
+        trees: Any = {name: averaged(name, batch) for name in _AVERAGED}
         dtypes = _tree_of(structure, iter(header["dtypes"]))
-        begin, end, good, failed, failed_on = counts
+        begin, end, num_good, num_failed, failed_on = counts
         return Moments(
-            begin, end, good, failed, tuple(failed_on), **trees, dtypes=dtypes
+            begin=begin,
+            end=end,
+            num_good=num_good,
+            num_failed=num_failed,
+            failed_on=tuple(failed_on),
+            **trees,
+            dtypes=dtypes,
         )
 
     ranges = enumerate(header["ranges"])
@@ -97,6 +108,7 @@ def fields_from(
 
 
 def _sampling_from(header: dict[str, Any]) -> Any:
+    """The sampling, without the functions that it may have had."""
     name = header["sampling"]
     if name is None:
         return None
@@ -119,9 +131,9 @@ def _plain(x: Any) -> Any:
 
 def _structure(tree: Any) -> Any:
     """A PyTree of arrays as nested dictionaries of one entry each: the kind of a node, and
-    what it holds."""
+    what it holds. For example `{"list": [{"array": 0}, {"none": 0}]}` for `[x, None]`."""
     if type(tree) is dict and all(type(name) is str for name in tree):
-        # JAX sorts keys.
+        # Keys are sorted, as JAX sorts them when it takes the leaves.
         return {"dict": {name: _structure(tree[name]) for name in sorted(tree)}}
     if type(tree) in (list, tuple):
         return {type(tree).__name__: [_structure(inner) for inner in tree]}
@@ -136,7 +148,8 @@ def _structure(tree: Any) -> Any:
 
 
 def _tree_of(structure: Any, leaves: Iterator[Any]) -> Any:
-    """The PyTree with this structure and these leaves."""
+    """The PyTree with this structure, from `_structure`, and these leaves."""
+    # A node has a single entry.
     ((kind, inner),) = structure.items()
     if kind == "dict":
         return {name: _tree_of(node, leaves) for name, node in inner.items()}

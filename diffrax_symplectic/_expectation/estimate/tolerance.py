@@ -8,12 +8,13 @@ from ..._simulation import Combination
 from .estimate import combined_results, Expectation
 
 
-# More samples are of no use once their own part of the error is this share of the
-# tolerance: without it the error would be less by an eighth at most.
-_SHARE = 0.5
-# What remains of the discretization error is noisy. By chance it exceeds the tolerance by
-# this many of its standard errors once in fifty times.
-_BY_CHANCE = 2
+# More samples are of no use once the standard error is at most this share of the tolerance:
+# without it an error as large as the tolerance would be less by about an eighth at
+# most.
+_SHARE_OF_SAMPLING = 0.5
+# What remains of the discretization error is known up to noise. By chance it exceeds the
+# tolerance by this many of its standard errors once in fifty times.
+_ERRORS_BY_CHANCE = 2
 
 
 def is_reached(estimate: Expectation, tol: float) -> bool:
@@ -25,8 +26,9 @@ def is_stuck(estimate: Expectation, tol: float) -> bool:
     """Whether more samples would not reach the tolerance."""
     if is_any(estimate.off_order) or _is_step_beyond(estimate, tol):
         return True
-    # What is left comes from the step, or from failed paths.
-    is_sampled = _all_within(estimate.std_error, _SHARE * tol)
+    # If the standard error is small, the rest of the error comes from the step or from
+    # failed paths.
+    is_sampled = _all_within(estimate.std_error, _SHARE_OF_SAMPLING * tol)
     return is_sampled and not _all_within(estimate.error, tol)
 
 
@@ -41,8 +43,9 @@ def share_of(estimate: Expectation, tol: float | None) -> float:
     """The estimated share of the samples needed that has been taken."""
     if tol is None or estimate.num_samples < 2:
         return 0.0
-    largest = max(largest_error(estimate.std_error), tol)
-    return (tol / largest) ** 2 if np.isfinite(largest) else 0.0
+    std_error = max(largest_error(estimate.std_error), tol)
+    # The standard error decreases like one over the square root of the number of samples.
+    return (tol / std_error) ** 2 if np.isfinite(std_error) else 0.0
 
 
 def shortfall(estimate: Expectation, tol: float) -> str:
@@ -54,22 +57,22 @@ def shortfall(estimate: Expectation, tol: float) -> str:
             "error is not known. Pass a smaller `dt0`"
         )
     discretization = largest_error(estimate.discretization_error)
-    sampling = largest_error(estimate.std_error)
-    failed = largest_error(estimate.failed_error)
-    if failed > max(discretization, sampling):
+    sampling_error = largest_error(estimate.std_error)
+    failed_error = largest_error(estimate.failed_error)
+    if failed_error > max(discretization, sampling_error):
         return (
-            f"failed paths could change the mean by {failed:.1e}. Take smaller steps, or a "
-            "more stable solver"
+            f"failed paths could change the mean by {failed_error:.1e}. Take smaller "
+            "steps, or a more stable solver"
         )
-    if discretization > sampling:
+    if discretization > sampling_error:
         return (
             f"{discretization:.1e} remains of the discretization error with "
             f"{estimate.levels} levels. Pass a smaller `dt0`, or more `levels`"
         )
-    needed_paths = estimate.num_paths * (sampling / tol) ** 2
+    needed_paths = estimate.num_paths * (sampling_error / tol) ** 2
     return (
-        f"the sampling error is {sampling:.1e} after {estimate.num_paths:,} paths. It "
-        f"takes about {needed_paths:.1e} paths: continue with `start=`, or pass another "
+        f"the sampling error is {sampling_error:.1e} after {estimate.num_paths:,} paths. "
+        f"It takes about {needed_paths:.1e} paths: continue with `start=`, or pass another "
         "`sampling`"
     )
 
@@ -79,7 +82,7 @@ def is_any(tree: PyTree[np.ndarray] | None) -> bool:
 
 
 def largest_error(errors: PyTree[np.ndarray | np.floating] | None) -> float:
-    """The largest of all numbers, and zero without any."""
+    """The largest number in a PyTree of errors, or zero if there is none."""
     leaves = jtu.tree_leaves(errors)
     return max((float(np.max(leaf, initial=0.0)) for leaf in leaves), default=0.0)
 
@@ -94,8 +97,9 @@ def _is_step_beyond(estimate: Expectation, tol: float) -> bool:
         return False
 
     def is_beyond(error: np.ndarray, noise: np.ndarray) -> np.bool_:
-        return np.any(error - _BY_CHANCE * noise > tol)
+        return np.any(error - _ERRORS_BY_CHANCE * noise > tol)
 
+    # The discretization error is the change by the last extrapolation.
     noise = combined_results(estimate, Combination.EXTRAPOLATION).std_error
-    beyond = jtu.tree_map(is_beyond, estimate.discretization_error, noise)
-    return any(jtu.tree_leaves(beyond))
+    each = jtu.tree_map(is_beyond, estimate.discretization_error, noise)
+    return any(jtu.tree_leaves(each))

@@ -17,7 +17,7 @@ from ..._products import dot, tensordot
 from .polynomials import hermite, least_squares, num_polynomials
 
 
-# The pilot's paths for each polynomial, and the fewest. The fit hardly depends on them: of
+# The pilot's paths for each polynomial, and the fewest. The fit hardly depends on them: for
 # the Hénon-Heiles system, by degree 6, 5 to 90 for each polynomial left standard errors of
 # 0.6e-7 to 1.8e-7, for 1e-3 without a fit.
 _PILOTS_PER_POLYNOMIAL = 30
@@ -27,16 +27,18 @@ _FEWEST_PILOTS = 256
 # standard errors of that system, and of a pendulum by degree 4, 2 to 5 times larger.
 _MOVE = 0.2
 # Lower bound of the standard deviations along the axes of the covariance, as a fraction of
-# the largest. Along shorter axes the points do not determine a fit. Of both systems 0.001
+# the largest. Along shorter axes the points do not determine a fit. For both systems 0.001
 # to 0.3 left the same standard errors.
 _FLOOR = 0.1
-# The pilot's states over which derivatives are averaged; fewer in many dimensions, down to
-# the fewest, since a Hessian needs as many gradients.
-_QUADRATIC_PILOTS = 128
+# The most and the fewest states of the pilot over which derivatives are averaged. In `d`
+# dimensions there are `2**13 / d` of them between these bounds, since a Hessian needs `d`
+# gradients.
+_MOST_QUADRATIC_PILOTS = 128
 _FEWEST_QUADRATIC_PILOTS = 16
-_QUADRATIC_NUMBERS = 2**13
+_QUADRATIC_GRADIENTS = 2**13
 
-# The target value of a function at a state; with a random key, an estimate of it.
+# Maps a state to the values that functions are fitted to, or a state and a random key to
+# estimates of them.
 Target: TypeAlias = Callable[..., Float[Array, "C S m"]]
 
 
@@ -46,16 +48,16 @@ class CovarianceFrame(eqx.Module):
 
     mean: Float[Array, " d"]
     # The matrices from states to coordinates and back.
-    to: Float[Array, "d d"]
-    back: Float[Array, "d d"]
+    to_coordinates: Float[Array, "d d"]
+    to_states: Float[Array, "d d"]
 
     def at(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The coordinates of states."""
-        return dot(y - self.mean, self.to.T)
+        return dot(y - self.mean, self.to_coordinates.T)
 
     def states(self, z: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The states with these coordinates."""
-        return self.mean + dot(z, self.back.T)
+        return self.mean + dot(z, self.to_states.T)
 
     @staticmethod
     def of(
@@ -65,26 +67,31 @@ class CovarianceFrame(eqx.Module):
         components comparable, and is zero for components that do not move."""
         weights = equal_weights(good, points.dtype)
         mean = weights @ points
-        inverse = inverse_or_zero(unit)
-        scaled = (points - mean) * inverse
-        # In ascending order.
-        variances, axes = jnp.linalg.eigh((scaled.T * weights) @ scaled)
-        # Keeps the matrices finite where nothing moves at all.
+        inverse_unit = inverse_or_zero(unit)
+        scaled = (points - mean) * inverse_unit
+        covariance = (scaled.T * weights) @ scaled
+        # The variances along the axes are in ascending order.
+        variances, axes = jnp.linalg.eigh(covariance)
+        least_variance = _FLOOR**2 * variances[-1]
+        # This keeps the matrices finite where nothing moves at all.
         tiny = jnp.finfo(points.dtype).eps ** 2
-        size = jnp.sqrt(jnp.maximum(variances, _FLOOR**2 * variances[-1]) + tiny)
-        to = axes.T / size[:, None] * inverse
-        back = unit[:, None] * axes * size
-        return CovarianceFrame(mean, to, back)
+        deviations = jnp.sqrt(jnp.maximum(variances, least_variance) + tiny)
+        return CovarianceFrame(
+            mean=mean,
+            to_coordinates=axes.T / deviations[:, None] * inverse_unit,
+            to_states=unit[:, None] * axes * deviations,
+        )
 
     def perturbed(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
         """The states, perturbed at random."""
-        # The same in all steps: drawing from keys would take long to compile.
+        # The moves are the same in all steps, since drawing from keys would take long to
+        # compile.
         z = np.random.default_rng(0).normal(0, _MOVE, states.shape)
-        return states + dot(jnp.asarray(z, states.dtype), self.back.T)
+        return states + dot(jnp.asarray(z, states.dtype), self.to_states.T)
 
 
 def equal_weights(good: Bool[Array, " n"], dtype: Any) -> Float[Array, " n"]:
-    """Weights of a mean over what is good."""
+    """The weights of the mean over all points or paths that are good."""
     return good.astype(dtype) / jnp.maximum(jnp.sum(good), 1)
 
 
@@ -111,12 +118,12 @@ class AbstractBasis(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def pilots(self) -> int:
+    def num_pilots(self) -> int:
         """The number of pilot paths that a fit needs."""
 
     @property
     @abc.abstractmethod
-    def sites(self) -> int:
+    def num_sites(self) -> int:
         """The number of states at which a fit evaluates its target."""
 
     @abc.abstractmethod
@@ -138,7 +145,8 @@ class AbstractBasis(eqx.Module):
         good: Bool[Array, " n"],
         keys: Key[Array, " n"],
     ) -> Float[Array, "size C S m"]:
-        """The coefficients. `keys` are the keys of the pilot's paths, for estimates."""
+        """The coefficients of the functions fitted to `target`, at or near the pilot's
+        `states`. `keys` are the keys of its paths, by which a target can be estimated."""
 
     @abc.abstractmethod
     def value_at(
@@ -159,19 +167,20 @@ class Hermite(AbstractBasis):
         return num_polynomials(self.d, max(self.candidates))
 
     @property
-    def pilots(self):
+    def num_pilots(self):
         return max(_FEWEST_PILOTS, _PILOTS_PER_POLYNOMIAL * self.size)
 
     @property
-    def sites(self):
-        return self.pilots
+    def num_sites(self):
+        return self.num_pilots
 
     def frame(self, states, good, unit):
         return CovarianceFrame.of(states, good, unit)
 
     def coefficients(self, target, frame, states, good, keys):
         points = frame.perturbed(states)
-        return self.least_squares_fit(jax.vmap(target)(points), frame, points, good)
+        values = jax.vmap(target)(points)
+        return self.least_squares_fit(values, frame, points, good)
 
     def least_squares_fit(
         self,
@@ -181,31 +190,32 @@ class Hermite(AbstractBasis):
         good: Bool[Array, " n"],
     ) -> Float[Array, "size C S m"]:
         """The least-squares fit to the values at the good points."""
-        B = self.at(frame, points)
-        flat = values.reshape(*values.shape[:2], -1)
+        B = self.polynomials(frame, points)
+        # (n, C, S * m)
+        flat_values = values.reshape(*values.shape[:2], -1)
         # Rows of zeros have no part in a fit.
-        is_used = good & _is_finite_row(B) & _is_finite_row(flat)
+        is_used = good & _finite_rows(B) & _finite_rows(flat_values)
         B = jnp.where(is_used[:, None], B, 0)
-        flat = jnp.where(is_used[:, None, None], flat, 0)
+        flat_values = jnp.where(is_used[:, None, None], flat_values, 0)
         sizes = [num_polynomials(self.d, degree) for degree in self.candidates]
-        c = least_squares(B, flat, sizes)
+        c = least_squares(B, flat_values, sizes)
         return c.reshape(-1, *values.shape[1:])
 
-    def at(
+    def polynomials(
         self, frame: CovarianceFrame, points: Float[Array, "n d"]
     ) -> Float[Array, "n size"]:
-        """All polynomials at points."""
-        each = lambda z: jnp.stack(hermite(z, max(self.candidates)))
-        return jax.vmap(each)(frame.at(points))
+        """The values of all polynomials at points."""
+        at_point = lambda z: jnp.stack(hermite(z, max(self.candidates)))
+        return jax.vmap(at_point)(frame.at(points))
 
     def value_at(self, frame, y, c):
-        # As a sum this compiles to one loop without temporary arrays.
+        # As a sum of products this compiles to one loop without temporary arrays.
         polynomials = hermite(frame.at(y), max(self.candidates))
         terms = [value * coefficient for value, coefficient in zip(polynomials, c)]
         return ft.reduce(jnp.add, terms)
 
 
-def _is_finite_row(x: Float[Array, "n ..."]) -> Bool[Array, " n"]:
+def _finite_rows(x: Float[Array, "n ..."]) -> Bool[Array, " n"]:
     return jnp.isfinite(x).reshape(len(x), -1).all(axis=1)
 
 
@@ -231,36 +241,41 @@ class Quadratic(AbstractBasis):
         return self.d + self.d**2
 
     @property
-    def pilots(self):
-        by_memory = _QUADRATIC_NUMBERS // self.d
-        return int(np.clip(by_memory, _FEWEST_QUADRATIC_PILOTS, _QUADRATIC_PILOTS))
+    def num_pilots(self):
+        affordable = _QUADRATIC_GRADIENTS // self.d
+        return int(
+            np.clip(affordable, _FEWEST_QUADRATIC_PILOTS, _MOST_QUADRATIC_PILOTS)
+        )
 
     @property
-    def sites(self):
+    def num_sites(self):
         # A Hessian costs as much as `d` gradients, and a gradient as much as two values.
-        return 2 * self.d * self.pilots
+        return 2 * self.d * self.num_pilots
 
     def frame(self, states, good, unit):
         return CentredFrame(equal_weights(good, states.dtype) @ states, unit)
 
     def coefficients(self, target, frame, states, good, keys):
-        def derivatives(args):
-            key, y = args
-            shifted = lambda z: target(y + frame.unit * z, key)
+        def derivatives(key_and_state):
+            key, y = key_and_state
+            target_at = lambda z: target(y + frame.unit * z, key)
 
-            def slope(z):
-                first = jax.jacrev(shifted)(z)
-                return first, first
+            def gradient_twice(z):
+                gradient = jax.jacrev(target_at)(z)
+                return gradient, gradient
 
-            # The gradient comes along, without another evaluation.
-            second, first = jax.jacfwd(slope, has_aux=True)(jnp.zeros_like(y))
+            # The gradient comes along with its derivative, without another evaluation.
+            hessian_and_gradient = jax.jacfwd(gradient_twice, has_aux=True)
+            # (C, S, m, d, d) and (C, S, m, d)
+            second, first = hessian_and_gradient(jnp.zeros_like(y))
             second = second.reshape(*first.shape[:-1], -1)
+            # (d + d**2, C, S, m)
             return jnp.moveaxis(jnp.concatenate([first, second], -1), -1, 0)
 
         # One path after another, since a Hessian needs the memory of `d` gradients.
-        each = lax.map(derivatives, (keys, states))
-        weights = equal_weights(good, each.dtype)
-        mean = tensordot(weights, jnp.where(jnp.isfinite(each), each, 0), 1)
+        of_paths = lax.map(derivatives, (keys, states))
+        weights = equal_weights(good, of_paths.dtype)
+        mean = tensordot(weights, jnp.where(jnp.isfinite(of_paths), of_paths, 0), 1)
         # A candidate of degree 1 has no second derivatives.
         order = np.repeat([1, 2], [self.d, self.d**2])[:, None, None, None]
         degrees = np.array(self.candidates)[:, None, None]

@@ -1,5 +1,6 @@
 """Target functions, fitted backwards in time at the states of a pilot run."""
 
+import functools as ft
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,15 +19,15 @@ from .bases import AbstractBasis, equal_weights, Target
 from .noise import Noise
 
 
-# The states over which second derivatives along the noise are averaged. A rough mean will
-# do: with any number in place of it, the control variate has mean zero.
+# The number of states over which second derivatives along the noise are averaged. A rough
+# mean will do: with any number in place of it, the control variate has mean zero.
 _STATES_FOR_SECOND = 32
 
 
 class Choice(NamedTuple):
     """What is used for each time at which to average and each component of `phi`.
 
-    - `best`: the number of the candidate.
+    - `best`: the number of the best candidate.
     - `used`: whether its control variate is used, or none.
     """
 
@@ -40,7 +41,7 @@ class FittedFunctions(eqx.Module):
     is chosen. For several levels there is another leading axis.
 
     - `frames`: the coordinates of the basis, with a leading axis of steps.
-    - `coefficients`: of the functions of the basis, which are `size` many, with axes for
+    - `coefficients`: the coefficients of the `size` functions of the basis, with axes for
         steps, `size`, `C`, `S` and `m`.
     - `second`: second derivatives along the noise, from `Noise.second`, with axes for
         steps, twice the random variables, `C`, `S` and `m`.
@@ -56,8 +57,8 @@ class FittedFunctions(eqx.Module):
         frame = jtu.tree_map(lambda x: x[i], self.frames)
         return self.basis.value_at(frame, ravel(y), self.coefficients[i])
 
-    def chosen(self, best: Int[Array | np.ndarray, "S m"]) -> "FittedFunctions":
-        """The functions with one candidate for each component."""
+    def of_candidates(self, best: Int[Array | np.ndarray, "S m"]) -> "FittedFunctions":
+        """The functions of these candidates, one for each time and component."""
 
         def take(x: Float[Array, "... C S m"]) -> Float[Array, "... S m"]:
             index = best.reshape(*[1] * (x.ndim - 2), *best.shape)
@@ -71,11 +72,11 @@ class FittedFunctions(eqx.Module):
 def fit(
     noise: Noise, key: PRNGKeyArray, basis: AbstractBasis
 ) -> tuple[FittedFunctions, Int[Array, ""]]:
-    """The functions of a level, for its noise: a pilot run forward, and fits backward; and
-    how many of the pilot's paths failed."""
+    """The functions of a level, by a pilot run forward in time and fits backward; and how
+    many of the pilot's paths failed."""
     p = noise.problem
     num_steps = noise.level.num_steps
-    pilot = _pilot(noise, jr.split(key, basis.pilots))
+    pilot = _pilot(noise, jr.split(key, basis.num_pilots))
     unit = _unit(p, pilot, num_steps)
 
     def frame_after(i: Any) -> PyTree[Array]:
@@ -86,61 +87,64 @@ def fit(
         frame = frame_after(i)
         target = _target(noise, u, i)
         c = basis.coefficients(target, frame, pilot.states[i], pilot.good, pilot.keys)
-        put = lambda of_steps, of_step: of_steps.at[i].set(of_step)
-        frames = jtu.tree_map(put, u.frames, frame)
-        return FittedFunctions(frames, put(u.coefficients, c), None, basis)
+        put_step = lambda of_steps, of_step: of_steps.at[i].set(of_step)
+        frames = jtu.tree_map(put_step, u.frames, frame)
+        return FittedFunctions(frames, put_step(u.coefficients, c), None, basis)
 
-    # Arrays have room for the most steps of a level, so that levels share one program.
+    # All levels have arrays for the steps of the finest one, so that they share a program.
     zeros = lambda struct: jnp.zeros((p.finest_steps, *struct.shape), struct.dtype)
     frames = jtu.tree_map(zeros, jax.eval_shape(lambda: frame_after(0)))
     shape = p.finest_steps, basis.size, len(basis.candidates), *p.num_outputs
     u = FittedFunctions(frames, jnp.zeros(shape, p.dtype), None, basis)
     u = lax.fori_loop(0, num_steps, backward, u)
-    second = _second(noise, pilot, u)
+    second = _second_derivatives(noise, pilot, u)
     functions = FittedFunctions(u.frames, u.coefficients, second, basis)
-    return functions, jnp.sum(~pilot.good)
+    num_failed = jnp.sum(~pilot.good)
+    return functions, num_failed
 
 
 def _target(noise: Noise, u: FittedFunctions, i: Any) -> Target:
-    """What the functions after step `i` are fitted to, as a function of a flat state:
-    `phi` itself for the time at the end of this step, and for later times the mean over the
-    next step of the functions after it, which are known. For earlier times it is zero."""
+    """What the functions after step `i` are fitted to, as a function of a flat state. For
+    averages at the end of this step that is `phi` itself, for later ones the mean over the
+    next step of the functions after it, which are known, and for earlier ones zero."""
     p = noise.problem
     level = noise.level
     _, unravel = jfu.ravel_pytree(p.y0)
-    # After the last step there is no next one, whose mean is not used.
+    # After the last step the mean over a next one is computed, too, but not used.
     next_step = jnp.minimum(i + 1, level.num_steps - 1)
 
     def value(x: Float[Array, " d"], key: PRNGKeyArray | None = None) -> Array:
         y = unravel(x)
-        draw = None
+        x_drawn = None
         if key is not None:
-            # Other numbers than those of the pilot's own steps.
-            draw, _ = noise.draw(key, p.finest_steps + i)
-        later = noise.mean(next_step, y, lambda y1: u(next_step, y1), draw)
-        phi = p.values(p.t0 + (i + 1) * level.h, y).astype(later.dtype)
+            # The pilot's own steps draw by the numbers below `finest_steps`.
+            x_drawn, _ = noise.draw(key, p.finest_steps + i)
+        mean = noise.mean(next_step, y, lambda y1: u(next_step, y1), x_drawn)
+        phi = p.values(p.t0 + (i + 1) * level.h, y).astype(mean.dtype)
         is_now = level.saved_steps == i + 1
         is_later = level.saved_steps > i + 1
-        of_later = jnp.where(is_later[:, None], later, 0)
-        return jnp.where(is_now[:, None], phi, of_later)
+        mean_or_zero = jnp.where(is_later[:, None], mean, 0)
+        return jnp.where(is_now[:, None], phi, mean_or_zero)
 
     return value
 
 
-def _second(
+def _second_derivatives(
     noise: Noise, pilot: "_Pilot", u: FittedFunctions
 ) -> Float[Array, "steps n n C S m"] | None:
-    """Second derivatives of the functions along the noise, at some states before each
-    step."""
+    """Second derivatives of the functions after each step along its noise, averaged over
+    some of the pilot's states before the step; `None` if they are not needed."""
     _, unravel = jfu.ravel_pytree(noise.problem.y0)
 
-    def of_step(step_and_states):
+    def mean_of_step(step_and_states):
         i, states = step_and_states
         return noise.second(i, jax.vmap(unravel)(states), lambda y: u(i, y))
 
-    before = jnp.concatenate([pilot.starts[None], pilot.states[:-1]])
-    few = before[:, :_STATES_FOR_SECOND]
-    return lax.map(of_step, (jnp.arange(noise.problem.finest_steps), few))
+    # (steps, paths, d)
+    states_before = jnp.concatenate([pilot.starts[None], pilot.states[:-1]])
+    few_states = states_before[:, :_STATES_FOR_SECOND]
+    steps = jnp.arange(noise.problem.finest_steps)
+    return lax.map(mean_of_step, (steps, few_states))
 
 
 class _Pilot(NamedTuple):
@@ -152,20 +156,20 @@ class _Pilot(NamedTuple):
     - `good`: which of them did not fail.
     """
 
-    keys: Key[Array, " n"]
+    keys: Key[Array, " paths"]
     starts: Float[Array, "paths d"]
     states: Float[Array, "steps paths d"]
     good: Bool[Array, " paths"]
 
 
-def _pilot(noise: Noise, keys: Key[Array, " n"]) -> _Pilot:
-    """The paths with these keys."""
+def _pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
+    """Simulates a path for each key."""
     p = noise.problem
 
     def step(i: Any, y: Y, args: PyTree[Array], key: PRNGKeyArray):
-        # With equal probabilities the pilot spreads further than the paths, so that the fit
-        # also holds for outliers.
-        x, _ = noise.draw(key, i, jnp.ones(()))
+        # With equal probabilities of all outcomes the pilot's paths spread further than
+        # others, so that the fit also holds for outliers.
+        x, _ = noise.draw(key, i, share=jnp.ones(()))
         noise_of_path = noise.with_args(args)
         solver_state = noise_of_path.fresh(i, y)
         y, _, success = noise_of_path.step(i, y, solver_state, x)
@@ -173,12 +177,12 @@ def _pilot(noise: Noise, keys: Key[Array, " n"]) -> _Pilot:
 
     def forward(i: Any, carry: tuple[PathStates, Array]) -> tuple[PathStates, Array]:
         paths, states = carry
-        each = jax.vmap(lambda *of_path: step(i, *of_path))
-        y, success = each(paths.y, paths.args, keys)
+        step_of_all = jax.vmap(ft.partial(step, i))
+        y, success = step_of_all(paths.y, paths.args, keys)
         paths = paths.moved(p, y, None, success)
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
-    # For a fit it is good enough that solvers start anew in each step.
+    # Solvers start anew in each step, which is good enough for a fit.
     paths = PathStates.start(p, jax.vmap(p.draw_start)(keys), solver_state=None)
     starts = jax.vmap(ravel)(paths.y)
     states = jnp.broadcast_to(starts, (p.finest_steps, *starts.shape))
@@ -193,9 +197,11 @@ def _unit(p: Problem, pilot: _Pilot, num_steps: Any) -> Float[Array, " d"]:
     start, _ = jfu.ravel_pytree(p.y0)
     if p.y0_of is not None:
         start = jnp.mean(pilot.starts, axis=0)
+    # (steps, paths, d)
     distances = jnp.where(pilot.good[:, None], jnp.abs(pilot.states - start), 0)
     # Dividing by the largest value first avoids underflow of squares in single precision.
-    most = jnp.max(distances, axis=(0, 1))
-    distances = distances / jnp.where(most > 0, most, 1)
+    largest = jnp.max(distances, axis=(0, 1))
+    distances = distances / jnp.where(largest > 0, largest, 1)
     weights = equal_weights(pilot.good, start.dtype)
-    return most * jnp.sqrt(jnp.einsum("n,ind->d", weights, distances**2) / num_steps)
+    mean_square = jnp.einsum("n,ind->d", weights, distances**2) / num_steps
+    return largest * jnp.sqrt(mean_square)

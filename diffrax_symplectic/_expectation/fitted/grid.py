@@ -21,8 +21,8 @@ from .bases import AbstractBasis, CovarianceFrame, Hermite
 # leave the grid, and 3e-9 with one of 2.5, where its points are far apart.
 _WIDER = 1.5
 # The fraction of the width at which the values start to fall to zero (with 0.6 the standard
-# error of the pendulum was 2e-7), and the fraction of that where the polynomials are
-# compared, near the edge.
+# error of the pendulum was 2e-7), and the fraction of that fraction beyond which points are
+# near the edge, where the polynomials are compared.
 _FALLS = 0.9
 _NEAR_EDGE = 0.8
 # The interpolation points along each axis: polynomials of degree 5. With 4 points the
@@ -34,7 +34,8 @@ _PILOTS = 2**13
 # A grid corrects the best polynomial of these degrees.
 _DEGREES = (0, 2, 4)
 # In the middle the spacing is that of a uniform grid whose half-width is this many
-# interquartile ranges: for normal states, 9.4 standard deviations.
+# interquartile ranges: for normal states, whose range is 1.35 standard deviations, 9.4 of
+# these.
 _EVEN = 7
 # The grid is at most this many times as wide as that, since the interquartile range may be
 # zero, and always stretched a little, since coordinates are divided by the stretching.
@@ -65,24 +66,31 @@ class StretchedFrame(eqx.Module):
         for the quartiles."""
         least = jnp.min(jnp.where(good[:, None], z, jnp.inf), axis=0)
         most = jnp.max(jnp.where(good[:, None], z, -jnp.inf), axis=0)
-        few = jnp.where(good[:, None], z, jnp.nan)[:num_for_quartiles]
-        levels = jnp.array([0.25, 0.5, 0.75])
-        first_quartile, median, third_quartile = jnp.nanquantile(few, levels, axis=0)
+        few_paths = jnp.where(good[:, None], z, jnp.nan)[:num_for_quartiles]
+        probabilities = jnp.array([0.25, 0.5, 0.75])
+        quartiles = jnp.nanquantile(few_paths, probabilities, axis=0)
+        first_quartile, median, third_quartile = quartiles
         furthest = jnp.maximum(most - median, median - least)
         half_width = jnp.maximum(_WIDER * furthest, 1)
         # In the middle the spacing is as on a uniform grid of this half-width.
-        uniform_half = jnp.clip(
+        uniform_half_width = jnp.clip(
             _EVEN * (third_quartile - first_quartile),
             half_width / _MOST_STRETCHED,
             half_width,
         )
-        # With `bend`, the argument of `_bent(_bent(...))` at the edge, the coordinate has
-        # the slope `bend / half_width / edge` in the middle, where `_bent` has slope 1. So
-        # `half_width / uniform_half` is `bend / edge`, about `(1 + bend**2) ** (3 / 8)`. Of
-        # this follows `bend`.
-        ratio = half_width / uniform_half
-        bend = jnp.sqrt(jnp.maximum(ratio ** (8 / 3) - 1, _LEAST_BENT))
-        return StretchedFrame(inner, median, bend / half_width, _bent(_bent(bend)))
+        # In the middle, where `_bent` has slope 1, the coordinate has the slope
+        # `factor / edge`, which is `1 / uniform_half_width`. At the edge the argument of
+        # `_bent(_bent(...))` is `bend = factor * half_width`. So `stretch` is
+        # `bend / _bent(_bent(bend))`: one at zero, and for large `bend` about
+        # `bend ** (3 / 4)`. It is replaced by `(1 + bend**2) ** (3 / 8)`, and solved.
+        stretch = half_width / uniform_half_width
+        bend = jnp.sqrt(jnp.maximum(stretch ** (8 / 3) - 1, _LEAST_BENT))
+        return StretchedFrame(
+            inner=inner,
+            median=median,
+            factor=bend / half_width,
+            edge=_bent(_bent(bend)),
+        )
 
     def at(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The coordinates of states."""
@@ -120,12 +128,12 @@ class Grid(AbstractBasis):
         return self._base.size + self.candidates[0] ** self.d
 
     @property
-    def pilots(self):
+    def num_pilots(self):
         return _PILOTS
 
     @property
-    def sites(self):
-        return self._base.pilots + self.candidates[0] ** self.d
+    def num_sites(self):
+        return self._base.num_pilots + self.candidates[0] ** self.d
 
     @property
     def _base(self) -> Hermite:
@@ -134,33 +142,36 @@ class Grid(AbstractBasis):
 
     def frame(self, states, good, unit):
         inner = CovarianceFrame.of(states, good, unit)
-        return StretchedFrame.of(inner, inner.at(states), good, self._base.pilots)
+        return StretchedFrame.of(inner, inner.at(states), good, self._base.num_pilots)
 
     def coefficients(self, target, frame, states, good, keys):
         base = self._base
-        n = base.pilots
+        n = base.num_pilots
         axes = [np.linspace(-1, 1, self.candidates[0])] * self.d
         x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, self.d)
         nodes = frame.states(jnp.asarray(x, states.dtype))
-        # In one call, so that the target is compiled once.
+        # All points are in one call, so that the target is compiled once.
         points = jnp.concatenate([frame.inner.perturbed(states[:n]), nodes])
         values = jax.vmap(target)(points)
-        # One copy for each degree.
-        at_pilots = jnp.repeat(values[:n], len(_DEGREES), axis=1)
-        c = base.least_squares_fit(at_pilots, frame.inner, points[:n], good[:n])
-        residual = values[n:] - tensordot(base.at(frame.inner, nodes), c, 1)
+        # One copy of the values for each degree.
+        values_at_pilots = jnp.repeat(values[:n], len(_DEGREES), axis=1)
+        c = base.least_squares_fit(values_at_pilots, frame.inner, points[:n], good[:n])
+        # (nodes, degrees, S, m)
+        residual = values[n:] - tensordot(base.polynomials(frame.inner, nodes), c, 1)
         # The target may overflow where it grows fast.
         residual = jnp.where(jnp.isfinite(residual), residual, 0)
-        # The degree that leaves the least near the edge, for each component.
+        # The best degree, for each component, leaves the least near the edge.
         distance = np.max(np.abs(x), axis=1)
         is_near_edge = (distance > _FALLS * _NEAR_EDGE) & (distance < _FALLS)
-        most = jnp.max(jnp.abs(residual[is_near_edge]), axis=0)
-        best = jnp.argmin(most, axis=0)[None, None]
-        residual = jnp.take_along_axis(residual, best, 1)
-        c = jnp.take_along_axis(c, best, 1)
-        falling = np.prod(_falling((np.abs(x) - _FALLS) / (1 - _FALLS)), axis=1)
-        falling = jnp.asarray(falling, residual.dtype)[:, None, None, None]
-        return jnp.concatenate([c, residual * falling])
+        largest_residual = jnp.max(jnp.abs(residual[is_near_edge]), axis=0)
+        best_degree = jnp.argmin(largest_residual, axis=0)[None, None]
+        residual = jnp.take_along_axis(residual, best_degree, 1)
+        c = jnp.take_along_axis(c, best_degree, 1)
+        # From 0, where the correction starts to fall, to 1 at the edge.
+        place_of_fall = (np.abs(x) - _FALLS) / (1 - _FALLS)
+        factor = np.prod(_falling(place_of_fall), axis=1)
+        factor = jnp.asarray(factor, residual.dtype)[:, None, None, None]
+        return jnp.concatenate([c, residual * factor])
 
     def value_at(self, frame, y, c):
         size = self._base.size
@@ -172,41 +183,50 @@ class Grid(AbstractBasis):
     ) -> Float[Array, "..."]:
         """The values on the grid, interpolated at a point, and zero beyond the grid."""
         n = self.candidates[0]
-        rest = c.shape[1:]
-        # Grid points to each side of the point.
+        value_shape = c.shape[1:]
+        # The number of grid points on each side of the point.
         half = _STENCIL // 2
+        # The coordinates of the point, in spacings of the grid from its first point.
         place = (x + 1) * (n - 1) / 2
-        inside = jnp.all((place >= half - 1) & (place <= n - half))
+        is_inside = jnp.all((place >= half - 1) & (place <= n - half))
         # Outside, the result at some place inside is computed, and dropped.
-        place = jnp.clip(jnp.where(inside, place, n / 2), half - 1, n - half)
+        place = jnp.clip(jnp.where(is_inside, place, n / 2), half - 1, n - half)
         begin = jnp.minimum(jnp.floor(place) - (half - 1), n - _STENCIL)
-        start = jnp.pad(begin.astype(jnp.int32), (0, len(rest)))
-        grid = c.reshape(*[n] * self.d, *rest)
-        block = lax.dynamic_slice(grid, start, (*[_STENCIL] * self.d, *rest))
-        weights = _lagrange([place - begin - j for j in range(_STENCIL)])
-        for j in range(self.d):
-            products = [weight[j] * row for weight, row in zip(weights, block)]
+        start_indices = jnp.pad(begin.astype(jnp.int32), (0, len(value_shape)))
+        values_on_grid = c.reshape(*[n] * self.d, *value_shape)
+        block_shape = *[_STENCIL] * self.d, *value_shape
+        block = lax.dynamic_slice(values_on_grid, start_indices, block_shape)
+        weights = _lagrange_polynomials([place - begin - j for j in range(_STENCIL)])
+        # Each pass sums over the leading axis, which is the next axis of the grid.
+        for axis in range(self.d):
+            products = [weight[axis] * row for weight, row in zip(weights, block)]
             block = ft.reduce(jnp.add, products)
-        return jnp.where(inside, block, 0)
+        return jnp.where(is_inside, block, 0)
 
 
-def _lagrange(distances: list[Float[Array, " d"]]) -> list[Float[Array, " d"]]:
-    """The Lagrange polynomials of the points `0, 1, ..., k - 1`, from the distances to each
-    of them."""
+def _lagrange_polynomials(
+    distances: list[Float[Array, " d"]],
+) -> list[Float[Array, " d"]]:
+    """The Lagrange polynomials of the points `0, 1, ..., k - 1`, where `distances` holds
+    the distances `x`, `x - 1`, ..., `x - (k - 1)` of `x` to each of them."""
     k = len(distances)
-    # Each is a product over the points to the left, times one over the points to the right.
+    # Polynomial `j` is the product of the distances to all points but point `j`: `left[j]`
+    # to those before it, `right[j]` to those after it.
     left = [*itertools.accumulate(distances[:-1], jnp.multiply, initial=1.0)]
     right = [*itertools.accumulate(distances[:0:-1], jnp.multiply, initial=1.0)][::-1]
-    weights = []
+    polynomials = []
     for j in range(k):
-        # The same product at point `j`.
-        at_own_point = math.factorial(j) * math.factorial(k - 1 - j)
-        sign = (-1) ** (k - 1 - j)
-        weights.append(left[j] * right[j] / (sign * at_own_point))
-    return weights
+        # It is divided by its value at point `j`, where it is to be one. There the
+        # distances before are `j, ..., 1`, and those after are `-1, ..., -(k - 1 - j)`.
+        num_after = k - 1 - j
+        sign = (-1) ** num_after
+        value = sign * (math.factorial(j) * math.factorial(num_after))
+        polynomials.append(left[j] * right[j] / value)
+    return polynomials
 
 
 def _falling(x: np.ndarray) -> np.ndarray:
-    """Falls from 1 at 0 to 0 at 1, with two vanishing derivatives at both ends."""
+    """A function that falls from 1 at 0 to 0 at 1, with two vanishing derivatives at both
+    ends."""
     x = np.clip(x, 0, 1)
     return 1 - x**3 * (10 - 15 * x + 6 * x**2)

@@ -57,29 +57,32 @@ class Noise(eqx.Module):
     problem: Problem
     level: Level
     laws: tuple[Discrete, ...] = eqx.field(static=True)
-    # Values and probabilities, if there are few.
+    # The outcomes of a step (of all variables together) and their probabilities, if there
+    # are few outcomes.
     outcomes: tuple[Float[np.ndarray, "K n"], Float[np.ndarray, " K"]] | None
 
     @staticmethod
     def of(problem: Problem, level: Level) -> "Noise":
-        """Raises a `ValueError` for random variables without finitely many outcomes."""
+        """The noise of a level. Raises a `ValueError` for random variables without finitely
+        many outcomes."""
         laws = problem.variables(level.h).laws
-        discrete = tuple(law for law in laws if isinstance(law, Discrete))
-        if len(discrete) < len(laws):
+        discrete_laws = tuple(law for law in laws if isinstance(law, Discrete))
+        if len(discrete_laws) < len(laws):
             raise ValueError(
                 "`ValueFunctions` sums over the outcomes of a step, but Gaussian "
                 "increments have infinitely many. Use a `WeakBrownianPath` in place of the "
                 "path in `terms`, or pass `sampling=ArrayRQMC(num_paths)`."
             )
-        if math.prod(len(law.values) for law in discrete) > _MOST_OUTCOMES:
-            return Noise(problem, level, discrete, None)
-        values, probabilities = outcomes(discrete, 1)
-        few = values.astype(problem.dtype), probabilities
-        return Noise(problem, level, discrete, few)
+        num_outcomes = math.prod(len(law.values) for law in discrete_laws)
+        if num_outcomes > _MOST_OUTCOMES:
+            return Noise(problem, level, discrete_laws, outcomes=None)
+        values, probabilities = outcomes(discrete_laws, 1)
+        few_outcomes = values.astype(problem.dtype), probabilities
+        return Noise(problem, level, discrete_laws, few_outcomes)
 
-    def with_args(self, own: PyTree[Array]) -> "Noise":
+    def with_args(self, own_args: PyTree[Array]) -> "Noise":
         """The noise for a path with its own `args`."""
-        return dataclasses.replace(self, problem=self.problem.with_args(own))
+        return dataclasses.replace(self, problem=self.problem.with_args(own_args))
 
     def draw(
         self,
@@ -88,17 +91,17 @@ class Noise(eqx.Module):
         share: ArrayLike = 0.0,
         tilt: ArrayLike = 0.0,
     ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-        """The variables drawn from the key and this number, and their log likelihood ratio.
-        In a fraction `share` (from 0 to 1) of draws all outcomes are equally probable.
-        Probabilities are multiplied by the exponential of `tilt`, a number or one for each
-        variable, times the outcome."""
+        """The variables drawn from the key and this number, and their log likelihood ratio:
+        of the law they are drawn by to their own law. In a fraction `share` (from 0 to 1)
+        of draws all outcomes are equally probable. Probabilities are multiplied by the
+        exponential of `tilt`, a number or one for each variable, times the outcome."""
         place = number, jnp.asarray(self.level.index)
         words = random_words(key, place, 1, len(self.laws))[0]
         x = jnp.zeros(len(self.laws), self.problem.dtype)
         log_ratio = jnp.zeros_like(x)
         tilts = jnp.broadcast_to(tilt, x.shape)
-        # Once for each different law, rather than for each variable: hundreds of variables
-        # have one law or two.
+        # Outcomes are drawn once for each different law, rather than for each variable:
+        # hundreds of variables have one law or two.
         for law in dict.fromkeys(self.laws):
             has_law = np.array([other == law for other in self.laws])
             outcome, log_ratio_of_law = _draw_outcomes(
@@ -109,31 +112,34 @@ class Noise(eqx.Module):
         return x, jnp.sum(log_ratio)
 
     def nodes(self, x: Array | None = None) -> tuple[Any, np.ndarray]:
-        """Nodes and weights of the expectation over the variables. Given a draw `x`, unless
-        there are few outcomes, two nodes that estimate it."""
+        """Nodes and weights of the expectation over the variables: all outcomes and their
+        probabilities, if there are few outcomes. Otherwise two nodes that estimate the
+        expectation from a draw `x`, or without a draw `2 * n + 1` nodes."""
         if self.outcomes is not None:
             return self.outcomes
         if x is not None:
             # The mean over a draw and its opposite is right for all odd functions.
             return jnp.stack([x, -x]), np.full(2, 0.5)
-        # Exact for polynomials of degree 3, or 5 in one variable.
+        # Two nodes along each axis, at `sqrt(3)` standard deviations with weight 1/6, as in
+        # Gauss-Hermite quadrature, and zero. They are exact for polynomials of degree 3, or
+        # 5 in one variable.
         n = len(self.laws)
-        arms = np.diag(np.sqrt(3 * self._variances()))
-        points = np.concatenate([arms, -arms, np.zeros((1, n))])
+        on_axes = np.diag(np.sqrt(3 * self._variances()))
+        nodes = np.concatenate([on_axes, -on_axes, np.zeros((1, n))])
         weights = np.append(np.full(2 * n, 1 / 6), 1 - n / 3)
-        return points.astype(self.problem.dtype), weights
+        return nodes.astype(self.problem.dtype), weights
 
     def mean(self, i: Any, y: Y, u: Function, x: Array | None = None) -> Array:
         """The expectation of `u` after step `i` from `y`, over `nodes(x)`; NaN if a step
         fails."""
-        points, weights = self.nodes(x)
+        nodes, weights = self.nodes(x)
         solver_state = self.fresh(i, y)
 
         def value(x: Array) -> Array:
             y1, _, success = self.step(i, y, solver_state, x)
             return jnp.where(success, u(y1), jnp.nan)
 
-        values = jax.vmap(value)(points)
+        values = jax.vmap(value)(nodes)
         return tensordot(weights.astype(values.dtype), values, 1)
 
     def advance(
@@ -150,14 +156,15 @@ class Noise(eqx.Module):
         if self.outcomes is None:
             assert second is not None
             return self._advance_by_derivatives(i, y, solver_state, u, second, x)
-        points, weights = self.outcomes
-        ends, states, success = jax.vmap(lambda x: self.step(i, y, solver_state, x))(
-            points
-        )
+        outcomes_of_x, probabilities = self.outcomes
+        step_by_outcome = jax.vmap(lambda x: self.step(i, y, solver_state, x))
+        ends, solver_states, success = step_by_outcome(outcomes_of_x)
         values = jax.vmap(u)(ends)
-        drawn = jnp.argmax(jnp.all(points == x, axis=1))
-        mean = tensordot(weights.astype(values.dtype), values, 1)
-        y1, new_state, value = jtu.tree_map(lambda x: x[drawn], (ends, states, values))
+        drawn = jnp.argmax(jnp.all(outcomes_of_x == x, axis=1))
+        mean = tensordot(probabilities.astype(values.dtype), values, 1)
+        y1, new_state, value = jtu.tree_map(
+            lambda of_outcomes: of_outcomes[drawn], (ends, solver_states, values)
+        )
         # One failed outcome makes the mean wrong, and with it the control variate.
         return StepOfPath(y1, new_state, jnp.all(success), value, value - mean)
 
@@ -173,26 +180,34 @@ class Noise(eqx.Module):
         """`advance` for many outcomes, by the formula of this class."""
         y1, new_state, success = self.step(i, y, solver_state, x)
 
-        def after(x: Array) -> Array:
-            return u(self.step(i, y, solver_state, x)[0])
+        def u_after(x: Array) -> Array:
+            end, _, _ = self.step(i, y, solver_state, x)
+            return u(end)
 
-        first = jax.jacrev(after)(0 * x)
+        first = jax.jacrev(u_after)(0 * x)
+        # The second derivatives times this are `x^T C x - tr(C Sigma)`.
         square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
         control = tensordot(first, x, 1) + tensordot(square, second, 2) / 2
         return StepOfPath(y1, new_state, success, u(y1), control)
 
     def second(self, i: Any, ys: Y, u: Function) -> Array | None:
-        """The mean of the second derivatives over `ys`, if there are many outcomes."""
+        """The mean of the second derivatives of `u` after step `i` along the variables,
+        over the states `ys` before it; `None` if there are few outcomes."""
         if self.outcomes is not None:
             return None
         zero = jnp.zeros(len(self.laws), self.problem.dtype)
 
         def hessian(y: Y) -> Array:
-            after = lambda x: u(self.step(i, y, self.fresh(i, y), x)[0])
-            return jax.hessian(after)(zero)
+            def u_after(x: Array) -> Array:
+                end, _, _ = self.step(i, y, self.fresh(i, y), x)
+                return u(end)
+
+            return jax.hessian(u_after)(zero)
 
         # One state after another, since a Hessian of many variables takes much memory.
+        # (C, S, m, n, n)
         mean = jnp.mean(jax.lax.map(hessian, ys), axis=0)
+        # (n, n, C, S, m)
         return jnp.moveaxis(mean, (-2, -1), (0, 1))
 
     def step(
@@ -208,14 +223,14 @@ class Noise(eqx.Module):
         terms = self._terms(np.zeros(len(self.laws)))
         state = self.problem.init(terms, i, self.level.h, y)
 
-        # XLA would evaluate what follows from a constant result for all states and outcomes
-        # while compiling: for 6,300 states and 27 outcomes for more than a second, with an
-        # alarm.
-        def hidden(x: Array) -> Array:
+        # The result of a solve, an integer, is a constant here. XLA would evaluate what
+        # follows from it for all states and outcomes while compiling: for 6,300 states and
+        # 27 outcomes for more than a second, with an alarm.
+        def hide_if_result(x: Array) -> Array:
             is_result = jnp.issubdtype(x.dtype, jnp.integer)
             return jax.lax.optimization_barrier(x) if is_result else x
 
-        return jtu.tree_map(hidden, state)
+        return jtu.tree_map(hide_if_result, state)
 
     def _terms(self, x: Any) -> PyTree:
         """The terms with paths that give these variables in every step."""
@@ -238,6 +253,7 @@ def _draw_outcomes(
     random word each."""
     p = np.array(law.probabilities, dtype)
     q = widened(law, share)
+    # (variables, outcomes)
     q = jax.vmap(lambda tilt: tilted(law, q, tilt))(tilts)
     # The law as it is has cuts in integers, by which a `WeakBrownianPath` draws, too. With
     # other cuts, by rounded probabilities, few draws would differ, but the law would not be
@@ -266,12 +282,12 @@ def tilted(law: Discrete, q: Any, tilt: Any) -> Any:
 
 
 def count_outcomes(problem: Problem) -> int | None:
-    """The number of outcomes of a step, or `None` if there are many."""
+    """The number of outcomes of a step, or `None` if there are many or infinitely many."""
     try:
-        few = Noise.of(problem, problem.level(0)).outcomes
+        noise = Noise.of(problem, problem.level(0))
     except ValueError:
         return None
-    if few is None:
+    if noise.outcomes is None:
         return None
-    _, probabilities = few
+    _, probabilities = noise.outcomes
     return len(probabilities)

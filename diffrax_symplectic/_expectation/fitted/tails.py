@@ -24,17 +24,17 @@ from ..sampling import ROUNDING
 from .noise import Noise, tilted, widened
 
 
-# The relative entropy of a whole path's wider noise with respect to its own law, in nats.
-# Typical paths of the wider noise are then e^8 = 3,000 times less likely by their own law:
-# rare enough to show the tails, and not so rare that no weight is left.
+# The relative entropy of the changed noise of a whole path with respect to its own law, in
+# nats. Typical paths of the changed noise are then e^8 = 3,000 times less likely by their
+# own law: rare enough to show the tails, and not so rare that no weight is left.
 _NATS = 8.0
 # With this tilt the largest of three outcomes, sqrt(3) times as large as the standard
 # deviation, is e^7 = 1,000 times as likely next to the middle one as before: nearly all
 # outcomes are the largest.
 _MOST_TILTED = 4.0
-# Halvings of an interval until only rounding errors in single precision remain.
+# The halvings of an interval after which only rounding errors in single precision remain.
 _HALVINGS = 30
-# The most noises of which paths are pushed to all sides: each more doubles the trials.
+# The most noises that push paths to all sides: each further one doubles the trials.
 _MOST_NOISES = 2
 
 # The probabilities that a law has after a change by a number.
@@ -55,40 +55,43 @@ def laws_of_trials(p: Problem) -> list[TrialLaw]:
     no_share = np.zeros(len(p.levels.h), p.dtype)
     no_tilts = np.zeros((len(no_share), len(laws)), p.dtype)
     share = _strongest_change(p, laws, widened, 1.0)
-    of_trials = [TrialLaw(no_share, no_tilts), TrialLaw(share, no_tilts)]
-    m = number_of_noises(p.terms)
-    if m <= _MOST_NOISES:
-        tilt = _strongest_change(p, laws, _tilted_from_own, _MOST_TILTED)
-        for sides in itertools.product((-1, 1), repeat=m):
+    trial_laws = [TrialLaw(no_share, no_tilts), TrialLaw(share, no_tilts)]
+    num_noises = number_of_noises(p.terms)
+    if num_noises <= _MOST_NOISES:
+        tilt = _strongest_change(p, laws, _tilted_law, _MOST_TILTED)
+        for sides in itertools.product((-1, 1), repeat=num_noises):
             tilts = no_tilts.copy()
-            # The increments come first, and then variables that are only in products.
-            tilts[:, :m] = np.outer(tilt, sides)
-            of_trials.append(TrialLaw(no_share, tilts))
-    return of_trials
+            # The increments come first. The other variables, which are only in products
+            # with them, are not tilted.
+            tilts[:, :num_noises] = np.outer(tilt, sides)
+            trial_laws.append(TrialLaw(no_share, tilts))
+    return trial_laws
 
 
-def _tilted_from_own(law: Discrete, tilt: float) -> np.ndarray:
+def _tilted_law(law: Discrete, tilt: float) -> np.ndarray:
     return tilted(law, np.array(law.probabilities), tilt)
 
 
 def _strongest_change(
     p: Problem, laws: tuple[Discrete, ...], change_law: _Change, most: float
 ) -> Float[np.ndarray, " levels"]:
-    """For each level the largest `z`, up to `most`, for which the laws `changed(law, z)`
+    """For each level the largest `z`, up to `most`, for which the laws `change_law(law, z)`
     give all variables of a path, on all levels together, a relative entropy of at most 8
     nats with respect to their own laws."""
-    steps = p.levels.num_steps
+    num_steps = p.levels.num_steps
     counts = collections.Counter(laws)
-    # By bisection, for all levels at once, since `z` depends on the number of steps.
-    allowed = np.zeros(len(steps))
-    too_much = np.full(len(steps), most)
+    # Each level, which has its own number of steps, has an equal part of the entropy.
+    most_nats = _NATS / len(num_steps)
+    # The bisection of all levels at once.
+    lower = np.zeros(len(num_steps))
+    upper = np.full(len(num_steps), most)
     for _ in range(_HALVINGS):
-        middle = (allowed + too_much) / 2
-        of_step = np.array([_relative_entropy(counts, change_law, z) for z in middle])
-        is_too_much = steps * of_step > _NATS / len(steps)
-        allowed = np.where(is_too_much, allowed, middle)
-        too_much = np.where(is_too_much, middle, too_much)
-    return allowed.astype(p.dtype)
+        middle = (lower + upper) / 2
+        nats = np.array([_relative_entropy(counts, change_law, z) for z in middle])
+        is_too_much = num_steps * nats > most_nats
+        lower = np.where(is_too_much, lower, middle)
+        upper = np.where(is_too_much, middle, upper)
+    return lower.astype(p.dtype)
 
 
 def _relative_entropy(
@@ -122,21 +125,22 @@ class Usual(NamedTuple):
     ) -> Float[Array, "combinations S n m"]:
         """The deviations of paths that are in the tails, times the likelihood ratios of
         these paths, and zero for others. `plain` are the values without control."""
-        # Deviations must exceed rounding.
+        # Deviations count only if they exceed rounding.
         rounding = ROUNDING * jnp.finfo(deviations.dtype).eps * jnp.abs(plain)
         is_beyond = deviations > self.largest[:, :, None] + rounding
-        # Cap ratios at one: paths that are likelier without wider noise are seen without
-        # it.
+        # Ratios are at most one: paths that are likelier by the own law of the noise are
+        # seen without another one.
         ratio = jnp.exp(-jnp.maximum(log_ratio, 0))[:, None]
         return jnp.where(is_beyond, ratio * deviations, 0)
 
 
 def largest_tails(trials: list[Expectation]) -> PyTree[np.ndarray]:
-    """The largest of the mean deviations in the tails, over trials by several laws."""
+    """The largest mean deviation in the tails among trials by several laws, for each
+    component."""
 
     def largest(*tails: np.ndarray) -> np.ndarray:
         # A trial without a value is ignored.
         return ft.reduce(np.fmax, tails)
 
-    each = [total(estimate.moments).mean.tails for estimate in trials]
-    return jtu.tree_map(largest, *each)
+    tails = [total(estimate.moments).mean.tails for estimate in trials]
+    return jtu.tree_map(largest, *tails)

@@ -39,8 +39,8 @@ from .noise import Noise
 from .tails import largest_tails, laws_of_trials, TrialLaw, Usual
 
 
-# Folded into the key of a call to draw trials. (Numbers of levels, by which fits are drawn,
-# are smaller.)
+# Folded into the key of a call to draw trials. (Numbers of levels, which are folded into it
+# to draw fits, are smaller.)
 _TRIAL_KEY = 0xFFFFFFFE
 # A trial with wider noise has this many batches, more than the trial of one batch beyond
 # whose deviations it looks.
@@ -94,12 +94,12 @@ class ValueFunctions(AbstractSampling):
         chosen = chosen_basis(problem, self.degree)
         warn_of_long_fit(chosen, stacklevel=5)
         basis = chosen.basis
-        shape = problem.sample_struct
+        struct = problem.sample_struct
         trials = _Trials(
             problem,
             _fits(problem, key, basis),
             outputs=problem.num_outputs,
-            shapes=Averaged(shape, plain=shape, control=shape, tails=shape),
+            struct=Averaged(struct, plain=struct, control=struct, tails=struct),
             key=jr.fold_in(key, _TRIAL_KEY),
             devices=devices,
             batch_size=self.batch_size,
@@ -107,23 +107,24 @@ class ValueFunctions(AbstractSampling):
         own_law, *wider_laws = laws_of_trials(problem)
         # One trial for each candidate, on the same paths.
         candidates = range(len(basis.candidates))
-        tried = [trials.of_candidate(k, own_law) for k in candidates]
-        compared = _compare(tried, trials.outputs)
-        choice = compared.choice
+        estimates = [trials.of_candidate(k, own_law) for k in candidates]
+        comparison = _comparison(estimates, trials.outputs)
+        choice = comparison.choice
         if self.degree and not np.any(choice.used):
             warnings.warn(
                 f"`degree={self.degree}` is no better than no control variate, so none is "
                 "used. Pass another `degree`, or another `sampling`.",
                 stacklevel=5,
             )
-        # Paths with wider noise estimate the deviations beyond the largest in the trial.
-        usual = _usual_deviations(tried, choice, trials.outputs, problem.dtype)
-        size = _BATCHES_OF_WIDE_TRIAL * self.batch_size
-        wide = [trials.run(choice, usual, law, size) for law in wider_laws]
-        return trials.plan(choice, usual, own_law, self.num_paths)._replace(
+        # Paths with wider noise estimate the deviations beyond the largest in these trials.
+        usual = _usual_deviations(estimates, choice, trials.outputs, problem.dtype)
+        num_wide = _BATCHES_OF_WIDE_TRIAL * self.batch_size
+        wide_trials = [trials.run(choice, usual, law, num_wide) for law in wider_laws]
+        plan = trials.plan(choice, usual, own_law, self.num_paths)
+        return plan._replace(
             reason=_reason(basis, choice),
-            tails=largest_tails(wide),
-            remainder=compared.remainder(problem.dtype),
+            tails=largest_tails(wide_trials),
+            remainder=comparison.remainder(problem.dtype),
         )
 
 
@@ -131,14 +132,14 @@ class _Trials(NamedTuple):
     """What all trials of a problem share, and the estimate itself.
 
     - `outputs`: the numbers of times at which to average and of components of `phi`.
-    - `shapes`: as in `SamplingPlan`.
+    - `struct`: as in `SamplingPlan`.
     - `key`: the random key of all trials, whose paths are not part of the estimate.
     """
 
     problem: Problem
     functions: FittedFunctions
     outputs: tuple[int, int]
-    shapes: Averaged
+    struct: Averaged
     key: PRNGKeyArray
     devices: Devices
     batch_size: int
@@ -147,13 +148,15 @@ class _Trials(NamedTuple):
         self, choice: Choice, usual: Usual, law: TrialLaw, num_samples: int
     ) -> SamplingPlan:
         """The plan for paths whose noise has this law."""
-        fixed = self.problem, self.functions, choice, usual, law
+        sampler = jtu.Partial(
+            controlled_paths, self.problem, self.functions, choice, usual, law
+        )
         return SamplingPlan(
-            jtu.Partial(controlled_paths, *fixed),
-            num_samples,
-            self.batch_size,
+            sampler,
+            num_samples=num_samples,
+            batch_size=self.batch_size,
             levels=len(self.problem.levels.h),
-            shapes=self.shapes,
+            struct=self.struct,
             quick=True,
         )
 
@@ -166,25 +169,30 @@ class _Trials(NamedTuple):
 
     def of_candidate(self, k: int, law: TrialLaw) -> Expectation:
         """An estimate from one batch, with the same candidate for all components."""
-        choice = Choice(np.full(self.outputs, k), np.ones(self.outputs, bool))
-        # The same program estimates tails, but nothing is beyond these deviations.
+        choice = Choice(best=np.full(self.outputs, k), used=np.ones(self.outputs, bool))
+        # The same program estimates tails, but nothing deviates by more than infinity.
         shape = len(self.problem.weights), *self.outputs
         dtype = self.problem.dtype
-        unlimited = Usual(np.zeros(shape, dtype), np.full(shape, np.inf, dtype))
+        unlimited = Usual(
+            center=np.zeros(shape, dtype), largest=np.full(shape, np.inf, dtype)
+        )
         return self.run(choice, unlimited, law, self.batch_size)
 
 
 def _flat(
-    tree: PyTree[np.ndarray | np.floating], outputs: tuple[int, int], *axes: int
+    tree: PyTree[np.ndarray | np.floating],
+    outputs: tuple[int, int],
+    *leading_axes: int,
 ) -> np.ndarray:
-    """The arrays of a PyTree in the structure of `phi` as one array, with axes for times
-    and for components, behind these other axes."""
-    times, _ = outputs
-    leaves = [np.reshape(leaf, (*axes, times, -1)) for leaf in jtu.tree_leaves(tree)]
+    """The arrays of a PyTree in the structure of `phi` as one array of shape
+    `(*leading_axes, S, m)`."""
+    num_times, _ = outputs
+    shape = *leading_axes, num_times, -1
+    leaves = [np.reshape(leaf, shape) for leaf in jtu.tree_leaves(tree)]
     return np.concatenate(leaves, axis=-1)
 
 
-class _Compared(NamedTuple):
+class _Comparison(NamedTuple):
     """The candidates, compared by their trials, with axes for times and components.
 
     - `choice`: the best candidates, and where they are better than none.
@@ -200,56 +208,64 @@ class _Compared(NamedTuple):
 
     def remainder(self, dtype: Any) -> float:
         """The largest fraction of a standard error that is left with control."""
-        # Where nothing is random, as of a constant, both errors are rounding errors.
+        # Where nothing is random, as for a constant `phi`, both errors are rounding errors.
         is_random = self.plain > ROUNDING * jnp.finfo(dtype).eps * np.abs(self.mean)
         errors = np.minimum(self.errors, self.plain)
         fractions = errors / np.where(is_random, self.plain, 1)
         return float(np.max(np.where(is_random, fractions, 0), initial=0.0))
 
 
-def _compare(tried: list[Expectation], outputs: tuple[int, int]) -> _Compared:
-    """Compares the candidates, each of which was tried alone."""
-    each = np.stack([_flat(estimate.std_error, outputs) for estimate in tried])
-    # A candidate without an error has failed.
-    each = np.nan_to_num(each, nan=np.inf)
-    errors = np.min(each, axis=0)
-    # Without control all trials are the same.
-    best = combined_results(tried[0], Combination.BEST)
-    plain = _flat(best.plain_std_error, outputs)
+def _comparison(estimates: list[Expectation], outputs: tuple[int, int]) -> _Comparison:
+    """Compares the candidates, by estimates with one each."""
+    # (C, S, m)
+    all_errors = np.stack([_flat(x.std_error, outputs) for x in estimates])
+    # A candidate whose error is NaN has failed.
+    all_errors = np.nan_to_num(all_errors, nan=np.inf)
+    errors = np.min(all_errors, axis=0)
+    # Without control all estimates are the same.
+    first, *_ = estimates
+    results = combined_results(first, Combination.BEST)
+    plain = _flat(results.plain_std_error, outputs)
     # A fit is used where the error without it is NaN, too.
     is_worse = errors >= plain
-    choice = Choice(np.argmin(each, axis=0), ~is_worse)
-    return _Compared(choice, errors, plain, _flat(tried[0].mean, outputs))
+    choice = Choice(best=np.argmin(all_errors, axis=0), used=~is_worse)
+    return _Comparison(choice, errors, plain, mean=_flat(first.mean, outputs))
 
 
 def _usual_deviations(
-    tried: list[Expectation], choice: Choice, outputs: tuple[int, int], dtype: Any
+    estimates: list[Expectation],
+    choice: Choice,
+    outputs: tuple[int, int],
+    dtype: Any,
 ) -> Usual:
-    """The mean without control, and the largest deviation in the trials of what each
-    component uses."""
-    trials = [total(estimate.moments) for estimate in tried]
-    combinations, *_ = jtu.tree_leaves(trials[0].mean.value)[0].shape
+    """The mean without control and the largest deviations, by estimates with one candidate
+    each: for each component those with its best candidate, or without control."""
+    moments = [total(estimate.moments) for estimate in estimates]
+    first, *_ = moments
+    num_combinations, *_ = jtu.tree_leaves(first.mean.value)[0].shape
 
     def flat(tree: PyTree[np.ndarray]) -> np.ndarray:
-        return _flat(tree, outputs, combinations)
+        return _flat(tree, outputs, num_combinations)
 
-    # Without control all trials are the same.
-    center = flat(trials[0].mean.plain)
-    without = flat(trials[0].largest.plain)
-    each = [flat(trial.largest.value) for trial in trials]
+    # Without control all estimates are the same.
+    center = flat(first.mean.plain)
+    largest_plain = flat(first.largest.plain)
+    # (C, combinations, S, m)
+    with_candidates = np.stack([flat(x.largest.value) for x in moments])
     best = np.asarray(choice.best)[None, None]
-    with_fit = np.take_along_axis(np.stack(each), best, 0)[0]
-    largest = np.where(choice.used, with_fit, without)
+    largest_with_best = np.take_along_axis(with_candidates, best, 0)[0]
+    largest = np.where(choice.used, largest_with_best, largest_plain)
     return Usual(center.astype(dtype), largest.astype(dtype))
 
 
 def _reason(basis: AbstractBasis, choice: Choice) -> str:
-    """Which candidates were chosen, with zero for none."""
-    names = np.array([0, *basis.candidates])
-    chosen = np.unique(names[np.where(choice.used, choice.best + 1, 0)])
+    """Which candidates were chosen, with zero for none, such as
+    `degree: 2, 4, chosen among 0, 2, 4`."""
+    options = np.array([0, *basis.candidates])
+    chosen = np.unique(options[np.where(choice.used, choice.best + 1, 0)])
     return (
         f"{basis.kind}: {', '.join(map(str, chosen))}, chosen among "
-        f"{', '.join(map(str, np.unique(names)))}"
+        f"{', '.join(map(str, np.unique(options)))}"
     )
 
 
@@ -258,26 +274,32 @@ def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> FittedFu
     # Newton's method is a quarter of the time to compile a fit, and few of its states need
     # it. A state at which the sweeps fail is left out of the fit.
     lean = dataclasses.replace(problem, solver=without_newton(problem.solver))
-    functions, lost = _fits_by(lean, key, basis)
-    if lost == 0 or eqx.tree_equal(lean.solver, problem.solver):
+    functions, num_failed = _fits_and_failures(lean, key, basis)
+    if num_failed == 0 or eqx.tree_equal(lean.solver, problem.solver):
         return functions
-    # Steps too long for sweeps: the fit is made again, with Newton's method.
-    functions, _ = _fits_by(problem, key, basis)
+    # If paths of the pilot fail, steps are too long for sweeps: the fit is made again, with
+    # Newton's method.
+    functions, _ = _fits_and_failures(problem, key, basis)
     return functions
 
 
-def _fits_by(
+def _fits_and_failures(
     problem: Problem, key: PRNGKeyArray, basis: AbstractBasis
 ) -> tuple[FittedFunctions, int]:
     """The fits of all levels, and how many of the pilot's paths failed."""
-    count = len(problem.levels.h)
-    each = [_fit_of_level(problem, np.array([k]), key, basis) for k in range(count)]
-    check_untraced("`expectation`", [number for _, number in each])
-    lost = sum(int(number) for _, number in each)
-    functions = [fit_of_level for fit_of_level, _ in each]
-    if count == 1:
-        return functions[0], lost
-    return jtu.tree_map(lambda *xs: jnp.concatenate(xs), *functions), lost
+    functions = []
+    failures = []
+    for index in range(len(problem.levels.h)):
+        on_level, failures_on_level = _fit_of_level(
+            problem, np.array([index]), key, basis
+        )
+        functions.append(on_level)
+        failures.append(failures_on_level)
+    check_untraced("`expectation`", failures)
+    num_failed = sum(map(int, failures))
+    if len(functions) == 1:
+        return functions[0], num_failed
+    return jtu.tree_map(lambda *xs: jnp.concatenate(xs), *functions), num_failed
 
 
 @quickly_compiled
@@ -288,5 +310,6 @@ def _fit_of_level(
     """The fit of the level with this index, with a leading axis of levels, and how many of
     the pilot's paths failed."""
     level = problem.level(index[0])
-    functions, lost = fit(Noise.of(problem, level), jr.fold_in(key, index[0]), basis)
-    return jtu.tree_map(lambda x: x[None], functions), lost
+    key_of_level = jr.fold_in(key, index[0])
+    functions, num_failed = fit(Noise.of(problem, level), key_of_level, basis)
+    return jtu.tree_map(lambda x: x[None], functions), num_failed

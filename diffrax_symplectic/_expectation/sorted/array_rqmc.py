@@ -49,9 +49,9 @@ from .points import num_seeds, randomized, sobol_points
 
 # SciPy has direction numbers for this many coordinates of Sobol' points.
 _MAX_DIMENSION = 21201
-# Fewer replicates do not estimate their variance well enough to stop: the error bar of
-# eight is uncertain by a quarter.
-_BEFORE_STOPPING = 8
+# The fewest replicates after which an estimate with `tol` may stop. Fewer do not estimate
+# their variance well enough: the error bar of eight is uncertain by a quarter.
+_LEAST_REPLICATES = 8
 # With fewer paths along each coordinate, neighbours are far apart: nearly all paths are at
 # an edge of the cloud.
 _FEWEST_ALONG_COORDINATE = 3
@@ -90,149 +90,159 @@ class ArrayRQMC(AbstractSampling):
     (2008)](https://doi.org/10.1287/opre.1080.0556).
     """
 
-    num_paths: int = eqx.field(default=2**14, converter=lambda x: _power_of_two(x))
+    num_paths: int = eqx.field(default=2**14, converter=lambda x: _checked_num_paths(x))
     replicates: int = eqx.field(
         default=16, converter=lambda x: whole_number("replicates", x, 2)
     )
     sort_by: Callable[[Y], PyTree[ArrayLike]] | None = None
 
     def prepare(self, problem, key, devices):
-        words = step_words(problem.terms)
-        if not 0 < words.number <= _MAX_DIMENSION:
+        layout = step_words(problem.terms)
+        if not 0 < layout.num_words <= _MAX_DIMENSION:
             raise ValueError(
-                f"`terms` need {words.number:,} random variables in each step; "
+                f"`terms` need {layout.num_words:,} random variables in each step; "
                 f"`ArrayRQMC` takes 1 to {_MAX_DIMENSION:,}, the dimensions of Sobol' "
                 "points. Pass `sampling=IndependentPaths(num_paths)`."
             )
-        sort_by = _state if self.sort_by is None else self.sort_by
+        sort_by = _state_itself if self.sort_by is None else self.sort_by
         check_takes("sort_by", sort_by, "y")
-        sorted_by = eqx.filter_eval_shape(sort_by, problem.y0)
-        check_real("sort_by", jtu.tree_leaves(sorted_by))
-        dimension = jax.eval_shape(lambda: real_vector(sort_by(problem.y0))).size
-        points = jnp.asarray(sobol_points(self.num_paths, words.number))
+        coordinates = eqx.filter_eval_shape(sort_by, problem.y0)
+        check_real("sort_by", jtu.tree_leaves(coordinates))
+        num_coordinates = jax.eval_shape(lambda: real_vector(sort_by(problem.y0))).size
+        points = jnp.asarray(sobol_points(self.num_paths, layout.num_words))
 
-        along_coordinate = self.num_paths ** (1 / dimension)
+        # The number of paths along each coordinate, if they fill a cube.
+        along_coordinate = self.num_paths ** (1 / num_coordinates)
         if along_coordinate < _FEWEST_ALONG_COORDINATE:
+            most_coordinates = int(math.log(self.num_paths, _FEWEST_ALONG_COORDINATE))
             warnings.warn(
-                f"{self.num_paths:,} paths are sorted by {dimension} coordinates, which "
-                f"leaves {along_coordinate:.1f} along each: neighbours are far apart, and "
-                "`ArrayRQMC` gains little over `IndependentPaths`. Pass a `sort_by` that "
-                "returns the few coordinates that matter most, at most "
-                f"{int(math.log(self.num_paths, _FEWEST_ALONG_COORDINATE))}.",
+                f"{self.num_paths:,} paths are sorted by {num_coordinates} coordinates, "
+                f"which leaves {along_coordinate:.1f} along each: neighbours are far "
+                "apart, and `ArrayRQMC` gains little over `IndependentPaths`. Pass a "
+                "`sort_by` that returns the few coordinates that matter most, at most "
+                f"{most_coordinates}.",
                 stacklevel=5,
             )
         return SamplingPlan(
-            jtu.Partial(_replicates, problem, sort_by, points, words),
+            jtu.Partial(_samples, problem, sort_by, points, layout),
             num_samples=self.replicates,
             # All paths of a replicate are solved at once, which is a batch already.
             batch_size=1,
-            paths=self.num_paths,
+            paths_per_sample=self.num_paths,
             levels=len(problem.levels.h),
-            least=_BEFORE_STOPPING,
+            least_samples=_LEAST_REPLICATES,
         )
 
 
-def _replicates(
+def _samples(
     p: Problem,
     sort_by: Callable[[Y], PyTree[Array]],
     points: UInt32[Array, "n d"],
-    words: "StepWords",
+    layout: "StepWords",
     keys: Key[Array, "1"],
 ) -> Samples:
-    """A sample is the mean over all paths of a replicate. Algorithm 1 of
+    """A sample is the mean over all paths of a replicate, by algorithm 1 of
     [L'Ecuyer, Lécot and Tuffin (2008)](https://doi.org/10.1287/opre.1080.0556).
 
-    `points` come from `sobol_points`, with a coordinate for each random variable of a step.
+    `points` come from `sobol_points`, one for each path, with a coordinate for each random
+    variable of a step.
     """
     n, _ = points.shape
-    (replicate,) = keys
-    # Not from quasi-random points, since a function of a key takes any number of them.
-    start_keys = jr.split(jr.fold_in(replicate, _KEY_OF_STARTS), n)
-    drawn = jax.vmap(p.draw_start)(start_keys)
+    (replicate_key,) = keys
+    # Starts are independent, rather than from Sobol' points, since a function of a key may
+    # draw any number of random variables.
+    start_keys = jr.split(jr.fold_in(replicate_key, _KEY_OF_STARTS), n)
+    starts = jax.vmap(p.draw_start)(start_keys)
 
     def begin(level: Level) -> Motion:
         motion = independent_steps(
             p,
             level,
-            drawn,
-            lambda own_words: with_words(p.terms, words, own_words),
-            lambda i: _words_of_step(replicate, level, i, points, words.sixths),
+            starts,
+            lambda words: with_words(p.terms, layout, words),
+            lambda i: _words_of_paths(replicate_key, level, i, points, layout.sixths),
         )
 
         def step(i, paths):
-            return motion.step(i, _in_order(sort_by, paths))
+            return motion.step(i, _sorted_paths(sort_by, paths))
 
         return Motion(step, motion.start)
 
-    done = simulate(p, begin, _mean_of_good)
-    # An axis for the samples, of which there is one.
-    means, heavy, largest = jnp.moveaxis(done.saved[:, :, :, None], 2, 0)
-    means = p.combinations(means)
-    # The largest over all levels.
-    heavy = jnp.broadcast_to(jnp.max(heavy, axis=0), means.shape)
-    # A path may fail on any level.
+    simulated = simulate(p, begin, _statistics)
+    # From (levels, S, 3, m) to (3, levels, S, n, m), with an axis for the samples, of which
+    # there is one.
+    statistics = jnp.moveaxis(simulated.saved[:, :, :, None], 2, 0)
+    mean, r, largest = statistics
+    mean = p.combinations(mean)
+    # The largest `r` on any level, for all combinations.
+    r = jnp.broadcast_to(jnp.max(r, axis=0), mean.shape)
+    # The most by which a path can deviate in a combination of levels: the largest
+    # deviations on all of them may be deviations of one path.
     largest = combinations(abs(p.weights), largest)
     averaged = Averaged(
-        p.shaped(means), heaviness=p.shaped(heavy), largest=p.shaped(largest)
+        p.shaped(mean), heaviness=p.shaped(r), largest=p.shaped(largest)
     )
-    lost = jnp.sum(done.failed, axis=1, keepdims=True)
-    return Samples(averaged, jnp.ones(1, bool), lost)
+    num_failed = jnp.sum(simulated.failed, axis=1, keepdims=True)
+    return Samples(averaged, good=jnp.ones(1, bool), num_failed=num_failed)
 
 
-def _words_of_step(
-    replicate: PRNGKeyArray,
+def _words_of_paths(
+    replicate_key: PRNGKeyArray,
     level: Level,
     i: Any,
     points: UInt32[Array, "n d"],
     sixths: bool,
 ) -> UInt32[Array, "n d"]:
-    """The random words of all paths in step `i`: the points, scrambled anew."""
-    key = jr.fold_in(jr.fold_in(replicate, level.index), i)
+    """The random words of each path in step `i`: the points, scrambled anew."""
+    key = jr.fold_in(jr.fold_in(replicate_key, level.index), i)
     _, d = points.shape
     return randomized(points, jr.bits(key, (num_seeds(d),), jnp.uint32), sixths)
 
 
-def _in_order(sort_by: Callable[[Y], PyTree[Array]], paths: PathStates) -> PathStates:
-    """The paths, sorted, with those that failed at the end."""
+def _sorted_paths(
+    sort_by: Callable[[Y], PyTree[Array]], paths: PathStates
+) -> PathStates:
+    """The paths in order along Hilbert's curve, with failed paths at the end."""
     coordinates = jax.vmap(lambda y: real_vector(sort_by(y)))(paths.y)
     order = hilbert_order(coordinates, paths.failed)
     return jtu.tree_map(lambda x: x[order], paths)
 
 
-def _mean_of_good(x: Array, failed: Bool[Array, " n"]) -> Float[Array, "3 ..."]:
-    """The mean over the paths that have not failed, the `r` of these paths as in
-    `Expectation.std_error`, and the largest deviation of one of them."""
-    mask = mask_like(~failed, x)
-    count = jnp.sum(~failed).astype(x.dtype)
+def _statistics(phi: Float[Array, "n m"], failed: Bool[Array, " n"]) -> Array:
+    """The mean over the paths that have not failed, their `heaviness`, and the largest
+    deviation of one of them from the mean, along a leading axis."""
+    is_good = mask_like(~failed, phi)
+    num_good = jnp.sum(~failed).astype(phi.dtype)
 
-    def mean(x: Array) -> Array:
-        # In two stages, so that rounding errors in single precision do not add up.
-        rows = 1 << ((len(x).bit_length() - 1) // 2)
-        x = jnp.where(mask, x, 0)
-        total = jnp.sum(jnp.sum(x.reshape(rows, -1, *x.shape[1:]), axis=0), axis=0)
-        return total / count
+    def mean_of_good(x: Float[Array, "n m"]) -> Float[Array, " m"]:
+        # The sum has two stages, so that rounding errors in single precision do not add up.
+        # The number of paths is a power of two, and about its root are summed in each.
+        num_rows = 2 ** ((len(x).bit_length() - 1) // 2)
+        rows = jnp.where(is_good, x, 0).reshape(num_rows, -1, *x.shape[1:])
+        return jnp.sum(jnp.sum(rows, axis=0), axis=0) / num_good
 
-    center = mean(x)
-    deviations = jnp.where(mask, jnp.abs(x - center), 0)
+    mean = mean_of_good(phi)
+    deviations = jnp.where(is_good, jnp.abs(phi - mean), 0)
     largest = jnp.max(deviations, axis=0)
-    # In units of the largest deviation, so that squares neither overflow nor underflow.
-    s = jnp.sqrt(mean((deviations / jnp.where(largest > 0, largest, 1)) ** 2))
+    # The standard deviation is in units of the largest deviation, which is then 1, so that
+    # squares neither overflow nor underflow.
+    s = jnp.sqrt(mean_of_good((deviations / jnp.where(largest > 0, largest, 1)) ** 2))
     # Rounding errors can have heavy tails, too.
-    is_random = largest > ROUNDING * jnp.finfo(x.dtype).eps * jnp.abs(center)
-    r = jnp.where(is_random, heaviness(1, s, count, jnp), 0)
-    return jnp.stack([center, r, largest])
+    is_random = largest > ROUNDING * jnp.finfo(phi.dtype).eps * jnp.abs(mean)
+    r = jnp.where(is_random, heaviness(1, s, num_good, jnp), 0)
+    return jnp.stack([mean, r, largest])
 
 
 class StepWords(NamedTuple):
-    """Which random words of a step each path in `terms` takes.
+    """Which random words of a step each Brownian path in `terms` takes.
 
     - `slices`: the first word of each path, and one past the last.
-    - `number`: the number of all words.
-    - `sixths`: whether there is only a single three-point variable, as in `randomized`.
+    - `num_words`: the number of all words.
+    - `sixths`: whether all that is drawn is one three-point variable, as in `randomized`.
     """
 
     slices: tuple[tuple[int, int], ...]
-    number: int
+    num_words: int
     sixths: bool
 
 
@@ -240,36 +250,39 @@ def step_words(terms: PyTree[diffrax.AbstractTerm]) -> StepWords:
     """The words of a step. Equal paths are one Brownian motion, and take the same words.
     Raises a `ValueError` for a path whose increments cannot be computed from words."""
     paths = [checked_stepwise(path) for path in brownian_paths(terms)]
-    starts: dict[int, int] = {}
+    # The first word of each Brownian motion, by its number.
+    first_words: dict[int, int] = {}
     slices: list[tuple[int, int]] = []
-    end = 0
-    for number, path in zip(path_numbers(paths), paths):
-        start = starts.setdefault(number, end)
-        slices.append((start, start + path.num_words(use_levy=True)))
-        end = max(end, slices[-1][1])
-    sixths = end == 1 and paths[0].laws == {"W": THREE_POINT}
-    return StepWords(tuple(slices), end, sixths)
+    num_words = 0
+    for path_number, path in zip(path_numbers(paths), paths):
+        start = first_words.setdefault(path_number, num_words)
+        end = start + path.num_words(use_levy=True)
+        slices.append((start, end))
+        num_words = max(num_words, end)
+    sixths = num_words == 1 and paths[0].laws == {"W": THREE_POINT}
+    return StepWords(tuple(slices), num_words, sixths)
 
 
 def with_words(
     terms: PyTree[diffrax.AbstractTerm],
-    step: StepWords,
-    words: UInt32[Array, " number"],
+    layout: StepWords,
+    words: UInt32[Array, " num_words"],
 ) -> PyTree[diffrax.AbstractTerm]:
     """The terms, with paths whose increments are computed from these words."""
-    slices = iter(step.slices)
+    # `replace_paths` visits paths in the order of `brownian_paths`.
+    slices = iter(layout.slices)
 
-    def given(path: diffrax.AbstractBrownianPath) -> GivenPath:
+    def path_from_words(path: diffrax.AbstractBrownianPath) -> GivenPath:
         start, end = next(slices)
-        make = jtu.Partial(_from_words, path, words[start:end])
+        make = jtu.Partial(_increment_from_words, path, words[start:end])
         return GivenPath(make=make, levy_area=path.levy_area)
 
-    return replace_paths(terms, given)
+    return replace_paths(terms, path_from_words)
 
 
-def _from_words(
+def _increment_from_words(
     path: AbstractStepwisePath,
-    words: UInt32[Array, " number"],
+    words: UInt32[Array, " num_words"],
     t0: Any,
     t1: Any,
     use_levy: bool,
@@ -278,16 +291,18 @@ def _from_words(
     return path.increment(words[: path.num_words(use_levy)], t0, t1, use_levy)
 
 
-def _state(y: Y) -> Y:
+def _state_itself(y: Y) -> Y:
     """The default of `sort_by`."""
     return y
 
 
-def _power_of_two(value: Any) -> int:
-    whole = whole_number("num_paths", value, 2)
-    if whole & (whole - 1):
+def _checked_num_paths(value: Any) -> int:
+    """The value as an integer. Raises a `ValueError` unless it is a power of two."""
+    num_paths = whole_number("num_paths", value, 2)
+    below = 2 ** (num_paths.bit_length() - 1)
+    if num_paths != below:
         raise ValueError(
             "`num_paths` must be a power of two, for which Sobol' points are balanced; got "
-            f"{whole}. Pass {2 ** (whole.bit_length() - 1)} or {2 ** whole.bit_length()}."
+            f"{num_paths}. Pass {below} or {2 * below}."
         )
-    return whole
+    return num_paths

@@ -9,15 +9,15 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int32, UInt, UInt32
 
 
-# The most bits of a coordinate that sorting uses: 65,536 cells along each axis, four times
-# the default number of paths. Each bit costs some operations on all paths.
+# The most bits of a coordinate that sorting uses: 16 bits are 65,536 cells along each axis,
+# four times the default number of paths. Each bit costs some operations on all paths.
 _COORDINATE_BITS = 16
 # About how many states the range of a coordinate is estimated from, and the share of them
 # that is left out at either end. The range need not be accurate: the grid is three times as
 # wide.
 _SAMPLE = 256
 _OUTLIERS = 1 / 50
-# The bits of an unsigned integer, less one that marks the rows at the end.
+# The bits of an unsigned integer, less the highest, which marks the rows at the end.
 _BITS_OF_64 = 63
 _BITS_OF_32 = 31
 
@@ -30,68 +30,76 @@ def hilbert_order(
     n, _ = z.shape
     has_64_bits = jnp.result_type(float) == np.float64
     if not has_64_bits:
-        key = _curve(_on_grid(z, _BITS_OF_32), _BITS_OF_32, jnp.uint32)
-        key = jnp.where(last, np.uint32(2**_BITS_OF_32), key)
-        return lax.sort((key, jnp.arange(n, dtype=jnp.int32)), num_keys=1)[1]
+        place = _places_on_curve(_cells(z, _BITS_OF_32), _BITS_OF_32, jnp.uint32)
+        place = jnp.where(last, np.uint32(2**_BITS_OF_32), place)
+        rows = jnp.arange(n, dtype=jnp.int32)
+        _, order = lax.sort((place, rows), num_keys=1)
+        return order
     # On CPUs XLA sorts a single array of unsigned integers ten times as fast as anything
-    # else, so the row's index is packed into the bits below its curve index.
-    index_bits = (n - 1).bit_length()
-    bits = _BITS_OF_64 - index_bits
-    key = _curve(_on_grid(z, bits), bits, jnp.uint64)
-    key = jnp.where(last, np.uint64(2**bits), key)
-    packed = (key << np.uint64(index_bits)) | jnp.arange(n, dtype=jnp.uint64)
+    # else, so the row's number is packed into the bits below its place on the curve.
+    row_bits = (n - 1).bit_length()
+    place_bits = _BITS_OF_64 - row_bits
+    place = _places_on_curve(_cells(z, place_bits), place_bits, jnp.uint64)
+    place = jnp.where(last, np.uint64(2**place_bits), place)
+    packed = (place << np.uint64(row_bits)) | jnp.arange(n, dtype=jnp.uint64)
     packed = jnp.sort(packed)
-    return (packed & np.uint64(2**index_bits - 1)).astype(jnp.int32)
+    return (packed & np.uint64(2**row_bits - 1)).astype(jnp.int32)
 
 
-def _resolution(d: int, total: int) -> int:
-    """The bits of each of `d` coordinates, if there are `total` bits together."""
-    return max(1, min(_COORDINATE_BITS, total // d))
+def _bits_of_coordinate(d: int, total_bits: int) -> int:
+    """The bits of each of `d` coordinates that share `total_bits`."""
+    return max(1, min(_COORDINATE_BITS, total_bits // d))
 
 
-def _on_grid(z: Float[Array, "n d"], total: int) -> list[UInt32[Array, " n"]]:
-    """The coordinates as integers of `total` bits together. Coordinates for which no bit is
-    left are dropped.
+def _cells(z: Float[Array, "n d"], total_bits: int) -> list[UInt32[Array, " n"]]:
+    """The coordinates of points as integers, the cells of a grid, which share `total_bits`.
+    Coordinates for which no bit is left are dropped.
 
     The grid is three times as wide as the range of nearly all states, and outliers are
     clipped to its edges, so that they do not coarsen it.
     """
     n, d = z.shape
-    d = min(d, total)
-    bits = _resolution(d, total)
+    d = min(d, total_bits)
+    bits = _bits_of_coordinate(d, total_bits)
     z = jnp.nan_to_num(z[:, :d])
     sample = jnp.sort(z[:: max(1, n // _SAMPLE)], axis=0)
-    outliers = int(len(sample) * _OUTLIERS)
-    low = sample[outliers]
-    high = sample[-1 - outliers]
+    num_outliers = int(len(sample) * _OUTLIERS)
+    low = sample[num_outliers]
+    high = sample[-1 - num_outliers]
     width = jnp.where(high > low, high - low, 1)
-    x = ((z - low) / width + 1) * np.asarray(2.0**bits / 3, z.dtype)
-    # At most 16 bits each, which are exact in single precision.
-    x = jnp.clip(x, 0, 2.0**bits - 1).astype(jnp.uint32)
-    return [x[:, i] for i in range(d)]
+    # From 0 to 1 in the first third of the grid, from 1 to 2 between `low` and `high`.
+    thirds = (z - low) / width + 1
+    cells = thirds * np.asarray(2.0**bits / 3, z.dtype)
+    # Integers of at most 16 bits are exact in single precision.
+    cells = jnp.clip(cells, 0, 2.0**bits - 1).astype(jnp.uint32)
+    return [cells[:, i] for i in range(d)]
 
 
-def _curve(x: list[UInt32[Array, " n"]], total: int, dtype: Any) -> UInt[Array, " n"]:
-    """The index along Hilbert's curve, by the algorithm of
+def _places_on_curve(
+    cells: list[UInt32[Array, " n"]], total_bits: int, dtype: Any
+) -> UInt[Array, " n"]:
+    """The place of each cell along Hilbert's curve, by the algorithm of
     [Skilling (2004)](https://doi.org/10.1063/1.1751381)."""
-    bits = _resolution(len(x), total)
+    bits = _bits_of_coordinate(len(cells), total_bits)
     # In one dimension the curve is the line itself.
-    if len(x) > 1:
-        x = _transposed_index(x, bits)
-    # Its bits are dealt out in turn to the numbers in `x`, the highest first.
-    index = jnp.zeros(x[0].shape, dtype)
+    transposed = cells if len(cells) == 1 else _transposed_place(cells, bits)
+    # The bits of the place are dealt out in turn to the numbers in `transposed`, the
+    # highest first. Here they are collected again.
+    place = jnp.zeros(transposed[0].shape, dtype)
     for b in range(bits - 1, -1, -1):
-        for coordinate in x:
-            bit = ((coordinate >> np.uint32(b)) & np.uint32(1)).astype(dtype)
-            index = (index << np.asarray(1, dtype)) | bit
-    return index
+        for number in transposed:
+            bit = ((number >> np.uint32(b)) & np.uint32(1)).astype(dtype)
+            place = (place << np.asarray(1, dtype)) | bit
+    return place
 
 
-def _transposed_index(
-    x: list[UInt32[Array, " n"]], bits: int
+def _transposed_place(
+    cells: list[UInt32[Array, " n"]], bits: int
 ) -> list[UInt32[Array, " n"]]:
-    """The index as as many numbers as there are coordinates, of `bits` bits each."""
-    x = [*x]
+    """The place along the curve in Skilling's transposed form: one number of `bits` bits
+    for each coordinate, to which the bits of the place are dealt out in turn. (This is
+    `AxestoTranspose` of the paper, with `x` for its `X`.)"""
+    x = [*cells]
     for b in range(bits - 1, 0, -1):
         bit = np.uint32(1 << b)
         below = np.uint32((1 << b) - 1)

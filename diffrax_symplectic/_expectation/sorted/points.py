@@ -13,7 +13,7 @@ from jaxtyping import Array, UInt32
 _SIX = 6
 
 
-# A set may take a gigabyte.
+# Only the last set of points is kept, since one may take a gigabyte.
 @ft.lru_cache(maxsize=1)
 def sobol_points(num_points: int, dimension: int) -> np.ndarray:
     r"""The first points of the Sobol' sequence, as 32-bit words. `num_points` is a power of
@@ -26,7 +26,7 @@ def sobol_points(num_points: int, dimension: int) -> np.ndarray:
     The direction numbers are from
     [Joe and Kuo (2008)](https://doi.org/10.1137/070709359), as in SciPy.
     """
-    # Imported here because it takes most of a second.
+    # SciPy is imported here because that takes most of a second.
     from scipy.stats import qmc
 
     sequence = qmc.Sobol(dimension, scramble=False, bits=32)
@@ -58,19 +58,24 @@ def nested_scramble(
 
 def _reverse_bits(words: UInt32[Array, "..."]) -> UInt32[Array, "..."]:
     """The words with their bits in opposite order."""
-    # Exchanges neighbours: single bits, then pairs, and so on. A mask has the lower ones.
+    # Neighbours are exchanged: single bits, then pairs, and so on up to halves of the word.
+    # A mask selects the lower one of each two neighbours.
     masks = {1: 0x55555555, 2: 0x33333333, 4: 0x0F0F0F0F, 8: 0x00FF00FF}
-    for width, lower in masks.items():
+    for width, lower_ones in masks.items():
         shift = np.uint32(width)
-        mask = np.uint32(lower)
+        mask = np.uint32(lower_ones)
         words = ((words >> shift) & mask) | ((words & mask) << shift)
     return (words >> np.uint32(16)) | (words << np.uint32(16))
 
 
 def num_seeds(dimension: int) -> int:
     """The number of random words that `randomized` needs."""
-    # One to scramble indices, two for each coordinate, and two for blocks of six.
-    return 3 + 2 * dimension
+    for_indices = 1
+    # One to scramble each coordinate, and one to shift it.
+    for_coordinates = 2 * dimension
+    # One for the first block of six, and one for the place in it.
+    for_blocks = 2
+    return for_indices + for_coordinates + for_blocks
 
 
 def randomized(
@@ -90,32 +95,36 @@ def randomized(
     n, d = points.shape
     if not sixths or n < _SIX:
         return _scrambled(points, jnp.arange(n, dtype=jnp.uint32), seeds)
-    # Blocks of six and points both start at random, so each point has the same law, and is
-    # the smallest of its block with probability 1/6.
+    # The first point and its place in its block are random. So each point has the same law,
+    # and is the smallest of its block with probability 1/6.
     start = seeds[-2]
     offset = seeds[-1] % np.uint32(_SIX)
-    # Enough for any offset.
-    blocks = n // _SIX + 2
-    number = jnp.arange(_SIX * blocks, dtype=jnp.uint32) + start
-    words = _scrambled(points, number & np.uint32(n - 1), seeds)
-    words = words.reshape(blocks, _SIX)
-    smallest = words == jnp.min(words, axis=1, keepdims=True)
-    largest = words == jnp.max(words, axis=1, keepdims=True)
-    words = jnp.where(largest, np.uint32(2**32 - 1), np.uint32(2**31))
-    words = jnp.where(smallest, np.uint32(0), words).reshape(-1, d)
+    # `n` points are in at most `n // 6 + 2` blocks, wherever the first one begins.
+    num_blocks = n // _SIX + 2
+    numbers = jnp.arange(_SIX * num_blocks, dtype=jnp.uint32) + start
+    # The points in turn, beginning again after the last (`n` is a power of two).
+    words = _scrambled(points, numbers & np.uint32(n - 1), seeds)
+    words = words.reshape(num_blocks, _SIX)
+    is_smallest = words == jnp.min(words, axis=1, keepdims=True)
+    is_largest = words == jnp.max(words, axis=1, keepdims=True)
+    words = jnp.where(is_largest, np.uint32(2**32 - 1), np.uint32(2**31))
+    words = jnp.where(is_smallest, np.uint32(0), words).reshape(-1, d)
     return lax.dynamic_slice_in_dim(words, offset.astype(jnp.int32), n)
 
 
 def _scrambled(
     points: UInt32[Array, "n d"],
-    number: UInt32[Array, " m"],
+    numbers: UInt32[Array, " m"],
     seeds: UInt32[Array, " s"],
 ) -> UInt32[Array, "m d"]:
     """The points with these numbers, both the numbers and the points scrambled."""
     n, d = points.shape
-    # Numbers have fewer bits than words: the scrambling is of the leading ones.
+    # Numbers below `n`, a power of two, have `n.bit_length() - 1` of the 32 bits of a word.
+    # They are scrambled as the leading bits.
     unused_bits = np.uint32(33 - n.bit_length())
-    number = nested_scramble(number << unused_bits, seeds[0]) >> unused_bits
-    words = nested_scramble(points[number.astype(jnp.int32)], seeds[1 : 1 + d])
+    numbers = nested_scramble(numbers << unused_bits, seeds[0]) >> unused_bits
+    scrambling_seeds = seeds[1 : 1 + d]
+    shifts = seeds[1 + d : 1 + 2 * d]
+    words = nested_scramble(points[numbers.astype(jnp.int32)], scrambling_seeds)
     # The hash of one seed is not quite uniform; a digital shift makes it so.
-    return words ^ seeds[1 + d : 1 + 2 * d]
+    return words ^ shifts
