@@ -17,7 +17,8 @@ from .tolerance import Tolerance
 
 # Derivatives are solved to rounding error, as steps are by default.
 _TOLERANCE = Tolerance(rtol=None, atol=0.0, norm=optx.max_norm)
-# As many as `PicardNewton` takes by default, for systems with the same rate of convergence.
+# The default of `picard_steps` of `PicardNewton`: sweeps for a derivative converge at the
+# rate of those for the step.
 _MOST_SWEEPS = 200
 
 
@@ -28,14 +29,15 @@ def differentiate(
     derivative of $\Phi$ along $k$ and $b$ the derivative along everything else; and by
     transposition its adjoint.
 
-    If there is a `solver`, such as that of `optx.Newton`, it solves for any number of
-    unknowns. Without, up to four unknowns are solved for by elimination, and more by the
-    sweeps that solved the step: they converge if those did. Stragglers are gathered from
-    the batch, and their systems are solved one by one, by elimination or GMRES.
+    A `solver`, such as the linear solver of `optx.Newton`, solves for any number of
+    unknowns. If it is `None`, up to four unknowns are solved for by elimination, and more
+    by sweeps like those that solved the step: they converge if those did. Stragglers are
+    gathered from the batch, and their systems are solved one by one, by elimination or
+    GMRES.
     """
-    # As one vector: JAX cannot transpose a solve if only some arrays of the right-hand side
-    # depend on the differentiated inputs.
-    flat, unravel = jfu.ravel_pytree(rhs)
+    # The unknowns are one vector: JAX cannot transpose a solve if only some arrays of the
+    # right-hand side depend on the differentiated inputs.
+    flat_rhs, unravel = jfu.ravel_pytree(rhs)
 
     def operator(x: Float[Array, " n"]) -> Float[Array, " n"]:
         image, _ = jfu.ravel_pytree(linear(unravel(x)))
@@ -43,8 +45,9 @@ def differentiate(
 
     # The same function solves the transposed system, which has the same eigenvalues, so
     # that sweeps converge as fast.
-    either = ft.partial(_solve, solver)
-    return unravel(lax.custom_linear_solve(operator, flat, either, either))
+    solve_either = ft.partial(_solve, solver)
+    solution = lax.custom_linear_solve(operator, flat_rhs, solve_either, solve_either)
+    return unravel(solution)
 
 
 def _solve(
@@ -52,21 +55,22 @@ def _solve(
     operator: Callable[[Array], Array],
     rhs: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """The solution of `operator(x) = rhs`, of a system that a step could solve."""
+    """The solution of `operator(x) = rhs`, where `operator` is one minus the linearized map
+    of the stage equations of a solved step, or its transpose."""
     if rhs.size <= MAX_WRITTEN_OUT or solver is not None:
         return solve(operator, rhs, solver).value
 
     def image(x: Float[Array, " n"]) -> Float[Array, " n"]:
         return x + (rhs - operator(x))
 
-    def itself(x: Float[Array, " n"]) -> Float[Array, " n"]:
+    def scale(x: Float[Array, " n"]) -> Float[Array, " n"]:
         return x
 
-    found, is_solved = solve_by_sweeps(
+    by_sweeps, is_solved = solve_by_sweeps(
         _TOLERANCE,
         _MOST_SWEEPS,
         image,
-        itself,
+        scale,
         guess=jnp.zeros_like(rhs),
         pending=jnp.array(True),
     )
@@ -74,7 +78,7 @@ def _solve(
     # cannot be as small as the rounding errors of one product.
     reduction = float(jnp.finfo(rhs.dtype).eps) ** 0.9
 
-    def exactly(_: Float[Array, " n"]) -> Float[Array, " n"]:
-        return solve(operator, rhs, None, reduction).value
+    def solve_straggler(_: Float[Array, " n"]) -> Float[Array, " n"]:
+        return solve(operator, rhs, solver=None, reduction=reduction).value
 
-    return where_pending(exactly, ~is_solved, found)
+    return where_pending(solve_straggler, ~is_solved, by_sweeps)

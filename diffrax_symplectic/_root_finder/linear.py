@@ -25,8 +25,8 @@ LinearSolver: TypeAlias = lx.AbstractLinearSolver[Any] | None
 _MAX_DENSE = 32
 # Up to this many unknowns, elimination is unrolled; the code grows with their cube.
 MAX_WRITTEN_OUT = 4
-# Restarted GMRES: the number of directions, and the reduction of the residual. The next
-# Newton correction makes up for the error of this one.
+# GMRES restarts after this number of directions. By default it reduces the residual by this
+# factor only: the next Newton correction makes up for the error.
 _DIRECTIONS = 20
 REDUCTION = 1e-3
 
@@ -62,19 +62,26 @@ def correction(fn: _Map, x: _Vector, solver: LinearSolver) -> NewtonCorrection:
     """The Newton correction for `fn(x) = 0` at `x`."""
     if solver is not None or x.size > _MAX_DENSE:
         value, derivative = jax.linearize(fn, x)
-        return NewtonCorrection(value, *solve(derivative, value, solver), derivative)
+        change, found = solve(derivative, value, solver)
+        return NewtonCorrection(value, change, found, derivative)
 
-    # With `jvp` the compiled program contains `fn` only once.
+    # The columns of the Jacobian are the derivatives along unit vectors. With `jvp` the
+    # compiled program contains `fn` only once.
     def value_and_column(unit: _Vector) -> tuple[_Vector, _Vector]:
         return jax.jvp(fn, (x,), (unit,))
 
     value, matrix = jax.vmap(value_and_column, out_axes=(None, 1))(_units(x))
 
     def product(vector: _Vector) -> _Vector:
-        # Unrolled, so that XLA fuses it: it reduces short axes slowly on CPUs.
+        # The sum is unrolled, so that XLA fuses it: it reduces short axes slowly on CPUs.
         return ft.reduce(operator.add, vector[:, None] * matrix.T)
 
-    return NewtonCorrection(value, eliminate(matrix, value), jnp.array(True), product)
+    return NewtonCorrection(
+        residual=value,
+        change=eliminate(matrix, value),
+        found=jnp.array(True),
+        derivative=product,
+    )
 
 
 def solve(
@@ -98,9 +105,9 @@ def solve(
 
 
 def solve_matrix(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
-    """Solves `matrix @ x = rhs`, differentiably. Of a singular matrix `x` is not finite, or
-    large."""
-    # To rounding error, also by GMRES.
+    """Solves `matrix @ x = rhs`, differentiably. If the matrix is singular, `x` is not
+    finite, or large."""
+    # GMRES, too, solves to rounding error here.
     reduction = float(jnp.finfo(rhs.dtype).eps) ** 0.9
 
     def multiply(x: _Vector) -> _Vector:
@@ -109,7 +116,7 @@ def solve_matrix(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     def solve_by(matrix: Float[Array, "n n"], apply: _Map, rhs: _Vector) -> _Vector:
         if len(matrix) <= _MAX_DENSE:
             return eliminate(matrix, rhs)
-        return solve(apply, rhs, None, reduction).value
+        return solve(apply, rhs, solver=None, reduction=reduction).value
 
     # Derivatives come from the equation: they are solves with the matrix, or in reverse
     # mode with its transpose.
@@ -125,7 +132,7 @@ def _units(x: _Vector) -> Any:
 
 
 def _largest_or_one(rhs: _Vector) -> Scalar:
-    """The largest entry, or 1 if all are zero, as a divisor."""
+    """The largest absolute value of the entries, or 1 if all are zero, as a divisor."""
     size = optx.max_norm(rhs)
     return jnp.where(size > 0, size, 1)
 
@@ -140,15 +147,16 @@ def eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
         augmented = jnp.concatenate([matrix, rhs[:, None]], axis=1)
         cleared = lax.fori_loop(0, num_unknowns, _clear_column, augmented)
         return cleared[:, num_unknowns]
-    # The division makes XLA store the right-hand side. Otherwise it would be recomputed in
+    # The division makes XLA store the right-hand side. Otherwise XLA would recompute it in
     # each unrolled entry, which takes 0.1 s more to compile for four unknowns.
     size = _largest_or_one(rhs)
+    # The rows of the augmented matrix, whose last column is the right-hand side.
     rows = [[*row, entry] for row, entry in zip(matrix, rhs / size)]
     for k in range(num_unknowns):
         _bring_up_pivot(rows, k)
-        # A single division: dividing every entry would take longer than multiplying.
-        scale = 1 / rows[k][k]
-        rows[k] = [scale * entry for entry in rows[k]]
+        # One division and a product for each entry take less time than a division for each.
+        inverse = 1 / rows[k][k]
+        rows[k] = [inverse * entry for entry in rows[k]]
         # Rows above are cleared, too (Gauss-Jordan), in place of a substitution backward.
         for i in {*range(num_unknowns)} - {k}:
             factor = rows[i][k]
@@ -157,23 +165,26 @@ def eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
 
 
 def _bring_up_pivot(rows: list[list[Scalar]], k: int) -> None:
-    """Brings up the row with the largest entry of column `k`, from row `k` or below."""
-    # Pairwise swaps are selects, which a batch can do without gathering rows.
+    """Exchanges rows, in place, so that of row `k` and those below, row `k` has the largest
+    entry of column `k` by size."""
+    # Pairwise swaps are selections, which a batch can do without gathering rows.
     for i in range(k + 1, len(rows)):
-        swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
+        is_larger = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
         pairs = list(zip(rows[k], rows[i]))
-        rows[k] = [jnp.where(swap, lower, upper) for upper, lower in pairs]
-        rows[i] = [jnp.where(swap, upper, lower) for upper, lower in pairs]
+        rows[k] = [jnp.where(is_larger, lower, upper) for upper, lower in pairs]
+        rows[i] = [jnp.where(is_larger, upper, lower) for upper, lower in pairs]
 
 
 def _clear_column(k: IntScalarLike, rows: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """One step of elimination: scales the row with the largest pivot, moves it to row `k`,
     and clears column `k` in all other rows."""
-    place = jnp.arange(len(rows))
-    # Rows above have had their turn. A negative number is never the largest.
-    largest = jnp.argmax(jnp.where(place < k, -1, jnp.abs(rows[:, k])))
-    pivot = rows[largest] / rows[largest, k]
-    # Selections, which the fused engine replays: unlike a scatter to a row that differs
-    # between paths.
-    rows = jnp.where((place == largest)[:, None], rows[k], rows)
-    return jnp.where((place == k)[:, None], pivot, rows - rows[:, k, None] * pivot)
+    numbers = jnp.arange(len(rows))
+    # The rows above row `k` have had their turn. A negative size is never the largest.
+    sizes = jnp.where(numbers < k, -1, jnp.abs(rows[:, k]))
+    pivot = jnp.argmax(sizes)
+    pivot_row = rows[pivot] / rows[pivot, k]
+    # Rows are replaced by selections, which the fused engine replays. It does not replay a
+    # scatter to a row that differs between paths.
+    rows = jnp.where((numbers == pivot)[:, None], rows[k], rows)
+    cleared = rows - rows[:, k, None] * pivot_row
+    return jnp.where((numbers == k)[:, None], pivot_row, cleared)

@@ -79,12 +79,12 @@ class Newton(eqx.Module):
     linear_solver: lx.AbstractLinearSolver | None
 
     def solve(self, guess: _Vector, most: int) -> tuple[_Vector, optx.RESULTS]:
-        """The last iterate from a `guess`, after at most so many iterations, and whether it
+        """The last iterate from a `guess`, after at most `most` iterations, and whether it
         is a solution."""
-        # In place of `optx.root_find`, which takes a seventh longer to trace a step.
+        # With `optx.root_find` a step would take a seventh longer to trace.
         zero = jnp.zeros((), self.start.dtype)
         no = jnp.array(False)
-        begun = Progress(
+        start = Progress(
             anchor=self.start,
             reached=zero,
             target=zero + 1,
@@ -93,7 +93,7 @@ class Newton(eqx.Module):
             searching=no,
             is_solved=no,
         )
-        begun, number = batched_like((begun, jnp.array(0)), guess)
+        start, number = batched_like((start, jnp.array(0)), guess)
 
         def pending(carry):
             number, _, state = carry
@@ -103,50 +103,53 @@ class Newton(eqx.Module):
             number, k, state = carry
             return number + 1, *self.step(k, state)
 
-        _, k, state = lax.while_loop(pending, body, (number, guess, begun))
+        _, k, state = lax.while_loop(pending, body, (number, guess, start))
         R: Any = optx.RESULTS
         failure = R.where(state.hopeless, R.nonfinite, R.nonlinear_max_steps_reached)
         return k, R.where(state.is_solved, R.successful, failure)
 
     def step(self, y: _Vector, state: Progress) -> tuple[_Vector, Progress]:
-        """One iteration for the current target: the corrected iterate, or the guess for the
-        next target."""
+        """One iteration from the iterate `y` for the current target: the corrected iterate,
+        or the guess for the next target."""
         s = state.target
-        whole = state.target == 1
+        is_whole_step = state.target == 1
 
         def equations(k: _Vector) -> _Vector:
             return (1 - s) * (k - self.start) + s * self.residual(k)
 
         residual, change, found, _ = correction(equations, y, self.linear_solver)
-        moved = max_norm(y)
+        size_of_iterate = max_norm(y)
         k = y - change
-        states = self.scale(self.restore(k))
-        measured = self.tolerance.measure(self.restore(change), states)
-        size = measured.size
+        scale = self.scale(self.restore(k))
+        correction_size = self.tolerance.measure(self.restore(change), scale)
+        size = correction_size.size
         tries = state.tries + 1
         # The first correction has none to be compared with.
-        shrink = jnp.where(state.tries > 0, ratio(size, state.size), 1)
+        shrinkage = jnp.where(state.tries > 0, ratio(size, state.size), 1)
         level = log2(size)
-        rate = log2(shrink)
+        rate = log2(shrinkage)
         # Newton's method converges quadratically near a solution. Corrections that shrink
         # by less than four there have reached rounding errors.
-        at_rounding = shrink >= 0.25
-        is_solved = converged(level, rate, measured.rounded, at_rounding)
+        at_rounding = shrinkage >= 0.25
+        is_solved = converged(level, rate, correction_size.rounded, at_rounding)
         # Far from any solution, rounding errors of a large Jacobian can hide the unknowns
         # with small coefficients. Corrections are then small, but residuals exceed the
         # state.
-        whole_state = largest([max_norm(x) for x in jtu.tree_leaves(states)])
-        state_size = jnp.maximum(whole_state, moved) + self.tolerance.atol
-        is_solved &= whole & found & (max_norm(residual) <= state_size) & all_finite(k)
+        size_of_scale = largest([max_norm(x) for x in jtu.tree_leaves(scale)])
+        size_of_state = jnp.maximum(size_of_scale, size_of_iterate)
+        size_of_state = size_of_state + self.tolerance.atol
+        residual_fits = max_norm(residual) <= size_of_state
+        is_solved &= is_whole_step & found & residual_fits & all_finite(k)
 
-        at_once = whole & (state.reached == 0) & ~state.searching
-        # The last part and the search begin near a solution, or fail soon: two corrections
-        # are the fewest that can be compared.
-        patience = jnp.where(at_once, _PATIENCE, 2)
+        # The whole step at once is tried first, from a guess that may be poor. The last
+        # part of a continuation and the search begin near a solution, or fail soon: two
+        # corrections are the fewest that can be compared.
+        is_first_try = is_whole_step & (state.reached == 0) & ~state.searching
+        patience = jnp.where(is_first_try, _PATIENCE, 2)
         # A zero correction away from a solution is no progress either.
-        stalled = (tries >= patience) & ~((shrink < _SHRINK) & (size > 0))
-        slow = ~whole & (tries >= _PATIENCE_IN_PART)
-        arrived = (max_norm(change) < _LOOSE * moved) & ~whole
+        stalled = (tries >= patience) & ~((shrinkage < _SHRINK) & (size > 0))
+        slow = ~is_whole_step & (tries >= _PATIENCE_IN_PART)
+        arrived = (max_norm(change) < _LOOSE * size_of_iterate) & ~is_whole_step
         failed = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~is_solved
         state = state._replace(tries=tries, size=size, is_solved=is_solved)
         return _next_target(state, k, arrived, failed & ~state.searching)
@@ -155,18 +158,20 @@ class Newton(eqx.Module):
 def _next_target(
     progress: Progress, k: _Vector, arrived: Bool[Array, ""], failed: Bool[Array, ""]
 ) -> tuple[_Vector, Progress]:
-    """Advances if the target was reached, and goes back if Newton's method `failed`."""
+    """The next iterate and target: further ahead if the target was reached (`arrived`), and
+    back from the anchor if Newton's method `failed`."""
     target = progress.target
     stride = progress.target - progress.reached
-    turned = failed & (_SHORTER * stride < _SHORTEST)
+    # If parts get too short, the branch of solutions has turned back.
+    has_turned_back = failed & (_SHORTER * stride < _SHORTEST)
     longer = jnp.minimum(target + _LONGER * stride, 1)
     # A search for any solution is one for the full equations.
-    shorter = jnp.where(turned, 1, progress.reached + _SHORTER * stride)
+    shorter = jnp.where(has_turned_back, 1, progress.reached + _SHORTER * stride)
     k = jnp.where(failed, progress.anchor, k)
     return k, progress._replace(
         anchor=jnp.where(arrived, k, progress.anchor),
         reached=jnp.where(arrived, target, progress.reached),
         target=jnp.where(arrived, longer, jnp.where(failed, shorter, target)),
         tries=jnp.where(arrived | failed, 0, progress.tries),
-        searching=progress.searching | turned,
+        searching=progress.searching | has_turned_back,
     )

@@ -26,7 +26,7 @@ class _FinderState(NamedTuple):
     """The state of the root finder, between its only step and the end.
 
     - `is_solved`: whether the equations are solved.
-    - `result`: the reason if they cannot be.
+    - `result`: success, or the reason why they are not.
     - `aux`: the structure of the auxiliary output.
     """
 
@@ -118,25 +118,28 @@ class PicardNewton(
 
     def step(self, fn, y, args, options, state, tags):
         del tags
-        scale = options.get("scale", _itself)
+        scale = options.get("scale", _unknowns_themselves)
         # A guess that is not finite stands for a path that failed before. It is left alone,
         # so that the others of its batch need not wait for it.
         pending = all_finite(y)
         solve = ft.partial(solve_by_sweeps, self._tolerance, self.picard_steps)
         if "solve_blocks" in options:
-            found, is_solved = options["solve_blocks"](args, solve, y, pending)
+            by_sweeps, is_solved = options["solve_blocks"](args, solve, y, pending)
         else:
-            found, is_solved = solve(_image(fn, args), scale, y, pending)
+            by_sweeps, is_solved = solve(_image(fn, args), scale, y, pending)
+        # Newton's method is for the paths that sweeps did not solve.
         pending = pending & ~is_solved
         if self.newton_steps == 0:
-            # A program without Newton's method compiles in half the time.
-            y_new = found
+            # Without Newton's method a program compiles in half the time.
+            y_new = by_sweeps
             result = optx.RESULTS.where(pending, _UNSOLVED, _SUCCESSFUL)
         else:
-            y_new, result = self._by_newton(fn, scale, args, y, found, pending)
+            y_new, result = self._by_newton(fn, scale, args, y, by_sweeps, pending)
         is_solved = result == _SUCCESSFUL
-        # Evaluate the equations once more only if there is auxiliary output.
-        aux = fn(y_new, args)[1] if jtu.tree_leaves(state.aux) else state.aux
+        aux = state.aux
+        # The equations are evaluated once more only if there is auxiliary output.
+        if jtu.tree_leaves(state.aux):
+            _, aux = fn(y_new, args)
         return y_new, _FinderState(is_solved, result, state.aux), aux
 
     def _by_newton(
@@ -145,17 +148,18 @@ class PicardNewton(
         scale: Callable,
         args: Any,
         guess: PyTree[Array],
-        found: PyTree[Array],
+        by_sweeps: PyTree[Array],
         pending: Bool[Array, ""],
     ) -> tuple[PyTree[Array], optx.RESULTS]:
-        """The solution by Newton's method where sweeps left the equations `pending`, and
-        what they `found` elsewhere."""
-        # As one vector: a loop needs separate kernels to select, gather and scatter each
-        # array of its state.
-        k, restore = jfu.ravel_pytree(found)
+        """The solution by Newton's method for the `pending` paths, which sweeps did not
+        solve, and the solution `by_sweeps` for all others; and the results."""
+        # The unknowns are one vector: a loop needs separate kernels to select, gather and
+        # scatter each array of its state.
+        k, restore = jfu.ravel_pytree(by_sweeps)
 
         def residual(k: Array) -> Array:
-            return jfu.ravel_pytree(fn(restore(k), args)[0])[0]
+            value, _ = fn(restore(k), args)
+            return jfu.ravel_pytree(value)[0]
 
         # Continuation starts from the guess of the step, not from where the sweeps ended.
         start, _ = jfu.ravel_pytree(guess)
@@ -168,11 +172,11 @@ class PicardNewton(
             linear_solver=self.linear_solver,
         )
 
-        def rescue(value: tuple[Array, optx.RESULTS]) -> tuple[Array, optx.RESULTS]:
+        def solve(value: tuple[Array, optx.RESULTS]) -> tuple[Array, optx.RESULTS]:
             k, _ = value
             return newton.solve(k, self.newton_steps)
 
-        k, result = where_pending(rescue, pending, (k, _SUCCESSFUL))
+        k, result = where_pending(solve, pending, (k, _SUCCESSFUL))
         return restore(k), result
 
     def terminate(self, fn, y, args, options, state, tags):
@@ -184,7 +188,7 @@ class PicardNewton(
         return y, aux, {}
 
 
-def _itself(k: PyTree[Array]) -> PyTree[Array]:
+def _unknowns_themselves(k: PyTree[Array]) -> PyTree[Array]:
     return k
 
 
@@ -192,7 +196,7 @@ def _image(fn: Callable, args: Any) -> Callable[[PyTree[Array]], PyTree[Array]]:
     r"""The map $\Phi$ of equations that are given as $k - \Phi(k) = 0$."""
 
     def image(k: PyTree[Array]) -> PyTree[Array]:
-        # Optimistix asks for a residual, and sweeps for the image.
-        return (k**ω - fn(k, args)[0] ** ω).ω
+        residual, _ = fn(k, args)
+        return (k**ω - residual**ω).ω
 
     return image

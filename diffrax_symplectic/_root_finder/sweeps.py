@@ -17,26 +17,27 @@ from .tolerance import converged, CorrectionSize, log2, MARGIN, Tolerance
 
 Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]
 
-# Sweeps before the first convergence check, as needed for a short step: with an error that
-# shrinks by a factor of about 60 in each, to the 16 digits of double precision, or to the 8
-# of single precision.
+# Sweeps before the first convergence check, as needed for a short step, whose error shrinks
+# by a factor of about 60 in each: 60^9 is 1e16, for the digits of double precision, and
+# 60^6 is beyond the 1e8 of single precision.
 _FIRST_IN_DOUBLE = 9
 _FIRST_IN_SINGLE = 6
-# The same for a doubled system (y = \Phi(y) as p = \Phi(q), q = \Phi(p)), where a sweep
-# evaluates everything twice, so fewer suffice.
+# The same for a doubled system (y = \Phi(y) as p = \Phi(q), q = \Phi(p)), where fewer
+# sweeps suffice, since each evaluates everything twice.
 _FIRST_DOUBLED_IN_DOUBLE = 6
 _FIRST_DOUBLED_IN_SINGLE = 5
 # The most sweeps between two convergence checks: rates near one are not known accurately.
 _MOST_BETWEEN_CHECKS = 32
-# The same when corrections are as small as rounding errors.
+# The most sweeps until the next check when corrections are as small as rounding errors.
 _MOST_ROUNDED = 3
 # Sweeps with a slower rate of convergence are under-relaxed. Faster ones would gain less
 # than one sweep.
 SLOW = 0.3
-# The relaxation factor after divergence, which is optimal for a rate of 8.
+# The relaxation factor after divergence, which is optimal for a rate of 8:
+# 2 / (1 + sqrt(1 + 8)).
 _STRONGEST = 0.5
-# The base-2 logarithm of the rate expected of relaxed sweeps. By the formula the rate is
-# 0.17 or better for rates up to one, but only after the first few sweeps.
+# The base-2 logarithm of the rate expected of relaxed sweeps, a quarter. By Young's formula
+# the rate is 0.17 or better for rates up to one, but only after the first few sweeps.
 _RELAXED = -2.0
 # The base-2 logarithm of 0.87, the rate above which sweeps count as not converging.
 STALLED = -0.2
@@ -58,8 +59,8 @@ class _SweepState(NamedTuple):
     - `level`: the base-2 logarithm of the size of the last correction.
     - `is_solved`: whether it was small enough.
     - `pending`: whether to continue.
-    - `done`: the number of sweeps so far, for any path of the batch.
-    - `ahead`: the number of sweeps until the next check; zero at the end.
+    - `done`: the number of sweeps so far, shared by all paths of the batch.
+    - `ahead`: the number of sweeps until the next check, shared by them; zero at the end.
     """
 
     y: Halves | None
@@ -123,6 +124,7 @@ def solve_by_sweeps(
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
     first = _first_sweeps(dtype, in_halves)
 
+    # The halves of a doubled system agree in the end.
     def value_of(y: PyTree[Array]) -> PyTree[Array]:
         return y if in_halves else y.q
 
@@ -139,15 +141,15 @@ def solve_by_sweeps(
         new, back = materialize(check)
 
         # All paths of a batch sweep together, but a path that has ended stays where it was.
-        def of_pending_paths(y: Array, start: Array, old: Array) -> Array:
+        def next_iterate(y: Array, start: Array, old: Array) -> Array:
             return jnp.where(state.pending, jnp.where(back, start, y), old)
 
-        return new._replace(y=jtu.tree_map(of_pending_paths, y, start, state.y))
+        return new._replace(y=jtu.tree_map(next_iterate, y, start, state.y))
 
     one = jnp.ones((), dtype)
     inf = jnp.full((), jnp.inf, dtype)
     no = jnp.array(False)
-    # The check batches these values in any case: without their batching here, JAX would
+    # The check batches these values in any case. If they were not batched here, JAX would
     # trace the loop again to find that out.
     start, pending, one, inf, no = batched_like((start, pending, one, inf, no), guess)
     state = _SweepState(
@@ -156,7 +158,7 @@ def solve_by_sweeps(
         level=inf,
         is_solved=no,
         pending=pending,
-        # The counts are shared by the batch, so that the loops keep unbatched lengths.
+        # The batch shares the counts, so that the loops keep unbatched lengths.
         done=0,
         ahead=first,
     )
@@ -165,14 +167,15 @@ def solve_by_sweeps(
 
 
 def _first_sweeps(dtype, in_halves: bool) -> int:
-    """The number of sweeps before the first convergence check."""
+    """The number of sweeps before the first convergence check, for unknowns of this dtype,
+    in halves or as a doubled system."""
     if jnp.finfo(dtype).bits < 64:
         return _FIRST_IN_SINGLE if in_halves else _FIRST_DOUBLED_IN_SINGLE
     return _FIRST_IN_DOUBLE if in_halves else _FIRST_DOUBLED_IN_DOUBLE
 
 
 def _sweep_until_check(image: Map, state: _SweepState, in_halves: bool) -> _AfterSweeps:
-    """All sweeps until the next check."""
+    """The iterate after all sweeps until the next check, and the last correction."""
 
     # Each half is taken from an evaluation of its own. XLA drops what an evaluation
     # computes for the other half.
@@ -183,19 +186,20 @@ def _sweep_until_check(image: Map, state: _SweepState, in_halves: bool) -> _Afte
         return image(y).q if in_halves else image(y.p)
 
     def relaxed(new: PyTree[Array], old: PyTree[Array]) -> PyTree[Array]:
-        def between(new: Array, old: Array) -> Array:
+        def relaxed_leaf(new: Array, old: Array) -> Array:
             return old + state.relaxation.astype(new.dtype) * (new - old)
 
-        return jtu.tree_map(between, new, old)
+        return jtu.tree_map(relaxed_leaf, new, old)
 
     def sweep(_, y: Halves) -> Halves:
+        # The positions are updated with the new momenta.
         y = Halves(relaxed(new_p(y), y.p), y.q)
         return Halves(y.p, relaxed(new_q(y), y.q))
 
     if not in_halves:
         y = lax.fori_loop(0, state.ahead, sweep, state.y)
-        # The halves may converge to different solutions of y = \Phi(\Phi(y)); only their
-        # difference shows that.
+        # The halves may converge to different solutions of y = \Phi(\Phi(y)). Only their
+        # difference shows that, so it serves as the correction.
         return _AfterSweeps((y.q**ω - y.p**ω).ω, y)
     # A loop that also carried the previous iterate would copy it in each sweep: steps of 64
     # pairs took 1.1 to 1.4 times as long, although the program was a tenth shorter.
@@ -213,8 +217,9 @@ def _check(
     most: int,
 ) -> _Decision:
     """What to do next. The base-2 logarithms of the `last` and an earlier correction are
-    `level` and `earlier`; `first` and `most` are numbers of sweeps."""
-    # In base-2 logarithms, so that the number of further sweeps is a quotient.
+    `level` and `earlier`. `first` is the number of sweeps before the first check, and
+    `most` the most in all."""
+    # The rate is a base-2 logarithm, so that the number of further sweeps is a quotient.
     rate = (level - earlier) / state.ahead
     done = state.done + state.ahead
     stalled = rate >= STALLED
@@ -222,14 +227,16 @@ def _check(
     # Sweeps that diverged get one more try. If it stalls, Newton's method takes over.
     again = stalled & (state.relaxation > _STRONGEST)
     ratio = jnp.exp2(rate)
-    # Relaxed once, at the first check: later rates are those of relaxed sweeps, to which
-    # the formula does not apply.
+    # The relaxation is tuned once, at the first check: later rates are those of relaxed
+    # sweeps, to which the formula does not apply.
     tuned = (state.done == 0) & (ratio > SLOW) & ~stalled
+    # After so many sweeps the level is at `-MARGIN`.
     further = (level + MARGIN) / jnp.where(tuned, -_RELAXED, -rate)
     # Sweeps that would not end in time end now, before they cost anything.
     in_time = again | (~stalled & (done + further < most))
     pending = state.pending & ~is_solved & in_time & (done < most)
-    # Newton's method begins where the sweeps ended, unless that is far from a solution.
+    # Newton's method begins where the sweeps ended if that is near a solution, or else at
+    # the guess.
     near = ~stalled & (last.small | pending)
     count = jnp.where(again, first, further)
     # Corrections as small as rounding errors show no rate.

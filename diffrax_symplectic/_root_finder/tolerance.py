@@ -21,12 +21,12 @@ _SHORT = 4
 _WIDE = 32
 
 
-# The base-2 logarithm of 64, the factor by which the next correction must be below the
-# tolerance. The remaining error has the same sign in every step and would add up to a
-# drift, while rounding errors cancel.
+# The next correction must be below the tolerance by a factor of 64, of which this is the
+# base-2 logarithm. The remaining error has the same sign in every step and would add up to
+# a drift, while rounding errors cancel.
 MARGIN = 6
-# Corrections below this many roundings of the whole state may be rounding errors, of all
-# stages together. They count as such only if they no longer shrink.
+# Corrections below this many roundings of the whole state may be the rounding errors of all
+# stages together. They count as rounding errors only if they no longer shrink.
 ROUNDINGS = 100
 # A correction below this fraction of the state is small: the iterate is close enough for
 # Newton's method to begin with.
@@ -64,7 +64,7 @@ class Tolerance(NamedTuple):
 
     def sizes(self, y: PyTree[Array]) -> list[Scalar]:
         """The norm of each leaf."""
-        # The same number, from a program that is faster.
+        # The `max_norm` of this module is the same number, from a faster program.
         norm = max_norm if self.norm is optx.max_norm else self.norm
         return [norm(leaf) for leaf in jtu.tree_leaves(y)]
 
@@ -72,24 +72,26 @@ class Tolerance(NamedTuple):
         """The size of a correction to a state of size `scale`, in the same structure."""
         sizes = self.sizes(change)
         scales = self.sizes(scale)
-        whole = largest(scales)
+        whole_state = largest(scales)
         size = self._in_units(sizes, scales)
-        bound = self._in_units([whole], [whole])
+        bound = self._in_units([whole_state], [whole_state])
         eps = float(jnp.finfo(size.dtype).eps)
-        # Strictly below, so that an infinite correction to an infinite state is neither.
-        rounded = largest(sizes) < ROUNDINGS * eps * whole
-        small = largest(sizes) < _SMALL * whole
+        # An infinite correction to an infinite state is neither, since it is not strictly
+        # below.
+        rounded = largest(sizes) < ROUNDINGS * eps * whole_state
+        small = largest(sizes) < _SMALL * whole_state
         return CorrectionSize(size, bound, rounded, small)
 
     def _in_units(self, sizes: list[Scalar], scales: list[Scalar]) -> Scalar:
         """The largest of these sizes, each in units of its tolerance."""
         eps = jnp.finfo(jnp.result_type(*sizes)).eps
         rtol = 2 * eps if self.rtol is None else self.rtol
-        # Leaf by leaf, so that one far from zero does not hide errors of one near zero.
-        each = [
+        # Leaves are measured one by one, so that a leaf far from zero does not hide the
+        # errors of a leaf near zero.
+        ratios = [
             ratio(size, rtol * scale + self.atol) for size, scale in zip(sizes, scales)
         ]
-        return largest(each)
+        return largest(ratios)
 
 
 def max_norm(x: Array) -> Scalar:
@@ -102,11 +104,11 @@ def max_norm(x: Array) -> Scalar:
     # The bits of nonnegative floats, read as integers, are ordered like their values, with
     # NaNs largest. The maximum of floats may lose NaNs; with an extra test for them, steps
     # of 16 pairs took 1.1 times as long in single precision.
-    kind = f"int{jnp.finfo(x.dtype).bits}"
-    bits = lax.bitcast_convert_type(jnp.abs(x), kind).reshape(-1)
+    integer_dtype = f"int{jnp.finfo(x.dtype).bits}"
+    bits = lax.bitcast_convert_type(jnp.abs(x), integer_dtype).reshape(-1)
     final_size = 1 if x.size <= _SHORT else _WIDE
     while bits.size > final_size:
-        # Halves of equal size; of an odd number, both have the middle entry.
+        # The halves have equal sizes. If the size is odd, both contain the middle entry.
         first = bits[: (bits.size + 1) // 2]
         second = bits[bits.size // 2 :]
         bits = jnp.maximum(first, second)
@@ -134,17 +136,19 @@ def log2(x: Scalar) -> Scalar:
     """The base-2 logarithm of a positive number to within 0.09, with the mantissa as a
     linear interpolation. With the library function steps took 1.05 to 1.4 times as long.
     Zero is below all other numbers, and NaN above."""
-    # Read as an integer, the bits of a float are its exponent, followed by its mantissa.
+    # The bits of a positive float, read as an integer, are its biased exponent, followed by
+    # its mantissa: as a number in units of the exponent, a linear interpolation of the
+    # logarithm. `minexp - 1` removes the bias.
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(jnp.abs(x), f"int{info.bits}").astype(x.dtype)
     return bits * 2.0**-info.nmant + float(info.minexp - 1)
 
 
 def converged(level: Scalar, rate: Scalar, rounded: _Flag, stalled: _Flag) -> _Flag:
-    """Whether the next correction will be below the tolerance; or corrections have
-    `stalled` at rounding errors. `level` and `rate` are the base-2 logarithms of the last
-    correction, in units of the tolerance, and of its ratio to the previous one."""
-    # With linear convergence the next correction is smaller by the same ratio. A growing
-    # correction says nothing about the next, so that at least the last must be small.
+    """Whether the next correction will be below the tolerance by `MARGIN`; or corrections
+    have `stalled` at rounding errors. `level` and `rate` are the base-2 logarithms of the
+    last correction, in units of the tolerance, and of its ratio to the previous one."""
+    # With linear convergence the next correction is smaller by the same ratio. A correction
+    # that grew says nothing about the next one, so that it must be small itself.
     next_level = level + jnp.minimum(rate, 0)
     return (next_level <= -MARGIN) | (stalled & rounded)

@@ -17,8 +17,9 @@ from .general import GAUSS
 from .record import Record
 
 
-def _nonzero(value: Any) -> float:
-    """Raises a `ValueError` unless `beta2` is a finite real number other than zero."""
+def _checked_beta2(value: Any) -> float:
+    """`beta2` as a float. Raises a `ValueError` unless it is a finite real number other
+    than zero."""
     beta2 = real_number("beta2", value)
     if beta2 == 0:
         raise ValueError(
@@ -28,8 +29,8 @@ def _nonzero(value: Any) -> float:
     return beta2
 
 
-def _sign(value: Any) -> int:
-    """Raises a `ValueError` unless this is 1 or -1."""
+def _checked_sign(value: Any) -> int:
+    """`sign` as an integer. Raises a `ValueError` unless it is 1 or -1."""
     # `True == 1`, but a boolean says nothing about a sign.
     if isinstance(value, bool) or value not in (-1, 1):
         raise ValueError(f"`sign` must be 1 or -1; got {value!r}.")
@@ -81,9 +82,9 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         most_friction=1.0,
     )
     beta1: float = free_parameter("beta1", 0.0)
-    beta2: float = eqx.field(default=1.0, static=True, converter=_nonzero)
+    beta2: float = eqx.field(default=1.0, static=True, converter=_checked_beta2)
     b: float = free_parameter("b", 0.0)
-    sign: int = eqx.field(default=-1, static=True, converter=_sign)
+    sign: int = eqx.field(default=-1, static=True, converter=_checked_sign)
 
     @property
     def tableau(self) -> AdditiveTableau:
@@ -91,16 +92,18 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         beta2 = self.beta2
         # I_k0 / h has the variance h / 3, while that of the path is h / 2 in the mean over
         # the step. So the squares of the factors are 3 / 2 in the mean over both stages.
-        first = 1 + self.sign / np.sqrt(2)
-        second = 1 - self.sign / np.sqrt(2)
-        B = np.array([[first, 0], [second - self.b, self.b]])
-        weights = beta2 * np.array([1, -1])
-        # I_k0 / h = W / 2 + H, in Diffrax's variables.
+        first_factor = 1 + self.sign / np.sqrt(2)
+        second_factor = 1 - self.sign / np.sqrt(2)
+        # The coefficients of I_k and I_k0 / h in the formulas above.
+        B_of_I_k0 = np.array([[first_factor, 0], [second_factor - self.b, self.b]])
+        beta_of_I_k = np.array([beta1, 1 - beta1])
+        beta_of_I_k0 = np.array([beta2, -beta2])
+        # In Diffrax's variables, I_k = W and I_k0 / h = W / 2 + H.
         return AdditiveTableau(
             alpha=[1 / 2, 1 / 2],
-            beta={"W": np.array([beta1, 1 - beta1]) + weights / 2, "H": weights},
+            beta={"W": beta_of_I_k + beta_of_I_k0 / 2, "H": beta_of_I_k0},
             A=[[1 / 4, 0], [1 / 2, 1 / 4]],
-            B={"W": B / 2, "H": B},
+            B={"W": B_of_I_k0 / 2, "H": B_of_I_k0},
             c1=[1 + (beta1 - 1) / beta2, 1 + beta1 / beta2],
         )
 
@@ -142,8 +145,8 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     )
 
 
-# The coefficient of the variables eta below.
-_SPREAD = np.sqrt(1 / 6)
+# The coefficient of the variables eta in the stages of `AdditiveGauss`.
+_ETA = np.sqrt(1 / 6)
 
 
 @documented
@@ -191,8 +194,8 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         B={
             "W": GAUSS.sum(axis=1, keepdims=True),
             # Each stage has a variable of its own, so that stages correlate through `W`.
-            "second": [[_SPREAD], [0]],
-            "third": [[0], [_SPREAD]],
+            "second": [[_ETA], [0]],
+            "third": [[0], [_ETA]],
         },
         c1=[0],
         constant=True,

@@ -34,7 +34,7 @@ from .._tableau import (
     Structure,
 )
 from .._terms import check_structure, number_of_noises, split_terms
-from .driven import drift_driven, noise_driven
+from .driven import drift_change, noise_changes
 from .record import Record, Want
 from .step import no_failure, Outcome, result_of, Step, take_step
 from .times import result_with_times_checked
@@ -47,8 +47,8 @@ else:
     from equinox import AbstractVar
 
 
-# The solver state is whether all stage equations were solved so far: in a batch Diffrax
-# continues to step failed paths.
+# The solver state is an `Outcome`: whether all stage equations were solved so far. Diffrax
+# continues to step a failed path while others of its batch go on.
 class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
     r"""The base class of all solvers of this package, and of your own solvers that are not
     Runge--Kutta methods.
@@ -106,21 +106,20 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
     def _order_for(
         self, want: Want, terms: PyTree[diffrax.AbstractTerm]
     ) -> int | float | None:
-        """The order on record, for strong or weak approximation: for several noises the one
-        without assuming that they commute. `None` if there is no record, or in it no such
-        order."""
+        """The strong or weak order on record: with several noises, the order if they do not
+        commute. `None` if there is no record, or no such order in it."""
         # Solvers of the user's own need no record.
         if self.record is None:
             return None
-        commuting = self.record.order(want, commute=True)
-        others = self.record.order(want, commute=False)
-        # One noise commutes with itself, and without noise there is nothing to commute. Of
-        # several it is not known here, since it depends on values, so the lower order is
-        # returned. Terms are looked at only if it matters: for most solvers they may be
-        # `None`.
-        if commuting == others or number_of_noises(terms) <= 1:
-            return commuting
-        return others
+        order_if_commuting = self.record.order(want, commute=True)
+        order_if_not = self.record.order(want, commute=False)
+        # The terms are looked at only if it matters: for most solvers they may be `None`.
+        if order_if_commuting == order_if_not:
+            return order_if_commuting
+        # One noise commutes with itself, and without noise there is nothing to commute.
+        # Whether several commute depends on values, which are not known here, so the lower
+        # order is returned.
+        return order_if_commuting if number_of_noises(terms) <= 1 else order_if_not
 
     def path(
         self,
@@ -155,31 +154,37 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         if want not in ("strong", "weak", None):
             raise ValueError(f'`want` must be "strong" or "weak"; got {want!r}.')
         if want is None:
-            strong = self.record is not None and self.record.strong is not None
-            want = "strong" if strong else "weak"
-        implicit = isinstance(self, diffrax.AbstractImplicitSolver)
-        make = path_maker(self.variables, gaussian=want == "strong", bounded=implicit)
-        return make(shape, key)
+            has_strong_order = (
+                self.record is not None and self.record.strong is not None
+            )
+            want = "strong" if has_strong_order else "weak"
+        is_implicit = isinstance(self, diffrax.AbstractImplicitSolver)
+        make_path = path_maker(
+            self.variables, gaussian=want == "strong", bounded=is_implicit
+        )
+        return make_path(shape, key)
 
     def __repr__(self) -> str:
-        """The parameters that differ from the defaults, in one line."""
-        given = []
+        """The class and the parameters that differ from its defaults, in one line, such as
+        `SRKs1(a=0.5)`."""
+        arguments = []
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            # Whether traced values are equal is not known.
+            # `tree_equal` of traced values is a traced boolean: they count as different.
             is_default = eqx.tree_equal(value, field.default) is True
             if field.repr and not is_default:
-                # A module may have a `__repr__` of its own, as this one does.
-                module = isinstance(value, eqx.Module)
-                text = repr(value) if module else eqx.tree_pformat(value)
-                given.append(f"{field.name}={text}")
-        return f"{type(self).__name__}({', '.join(given)})"
+                # `tree_pformat` would ignore the `__repr__` of a module, such as this one.
+                is_module = isinstance(value, eqx.Module)
+                text = repr(value) if is_module else eqx.tree_pformat(value)
+                arguments.append(f"{field.name}={text}")
+        return f"{type(self).__name__}({', '.join(arguments)})"
 
     def check(self, terms, t0, y0: Y, args: Args) -> None:
         """Raises a `ValueError` unless the state and the terms suit the solver."""
-        name = type(self).__name__
-        check_state(y0, name)
-        check_structure(self.structure, *split_terms(terms), t0, y0, args, name)
+        solver_name = type(self).__name__
+        check_state(y0, solver_name)
+        drift, noise = split_terms(terms)
+        check_structure(self.structure, drift, noise, t0, y0, args, solver_name)
 
     def func(self, terms, t0, y0: Y, args: Args) -> PyTree[ArrayLike]:
         return terms.vf(t0, y0, args)
@@ -211,6 +216,7 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
 
     @property
     def structure(self) -> Structure:
+        # A tableau of the user's own may lack it: `check` refuses `None` with advice.
         return getattr(self.tableau, "structure", None)  # pyright: ignore
 
     @property
@@ -220,7 +226,8 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
     def stage_vectors(self, num_noises: int) -> tuple[int, ...]:
         del num_noises
         blocks = make_plan(self.tableau.flatten()).blocks
-        sizes = [sum(map(len, block.unknown)) for block in blocks]
+        sizes = [sum(len(group) for group in block.unknown) for block in blocks]
+        # A block without unknown stages is explicit, and no system of equations.
         return tuple(size for size in sizes if size > 0)
 
     @property
@@ -234,64 +241,75 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
 
     def init(self, terms, t0, t1, y0: Y, args: Args) -> Outcome:
         del t1
-        # Here, not in `step`, since a solve calls it only once.
+        # The check is here, not in `step`, since a solve calls `init` only once.
         self.check(terms, t0, y0, args)
-        implicit = isinstance(self, diffrax.AbstractImplicitSolver)
-        return no_failure() if implicit else None
+        is_implicit = isinstance(self, diffrax.AbstractImplicitSolver)
+        return no_failure() if is_implicit else None
 
     def step(
         self, terms, t0, t1, y0: Y, args: Args, solver_state: Outcome, made_jump
     ) -> tuple[Y, None, dict[str, Y], Outcome, diffrax.RESULTS]:
         del made_jump
         drift, noise = split_terms(terms)
-        plan = make_plan(_drop_absent(self.tableau.flatten(), drift, noise))
-        variables = _variables(plan.tableau)
-        # All of a step is batched if anything is, since values that become batched within
-        # its loops would be traced again.
-        begun = (t0, t1, y0, solver_state)
-        begin, end, y0, solver_state = batched_like(begun, (begun, terms, args))
-        from_drift = drift_driven(drift, begin, end, args)
+        plan = make_plan(_without_idle_stages(self.tableau.flatten(), drift, noise))
+        # All inputs of a step are batched if any is: values that become batched within its
+        # loops would make JAX trace these again.
+        inputs = (t0, t1, y0, solver_state)
+        begin, end, y0, solver_state = batched_like(inputs, (inputs, terms, args))
         h = end - begin
-        driven = {"h": from_drift} if drift else {}
-        # The path gets the times as they are: if they are the same for all paths of a
-        # batch, so is the place of the step.
-        name = type(self).__name__
-        driven |= noise_driven(from_drift, h, noise, variables, t0, t1, args, name)
-        y1, outcome = take_step(plan, Step(begin, h, driven), y0, self, solver_state)
+        by_drift = drift_change(drift, begin, end, args)
+        by_noise = noise_changes(
+            by_drift,
+            h,
+            noise,
+            _variables(plan.tableau),
+            # The path gets the unbatched times: if these are the same for all paths of a
+            # batch, so is the place of the step in the path.
+            t0,
+            t1,
+            args,
+            type(self).__name__,
+        )
+        changes = {"h": by_drift, **by_noise} if drift else by_noise
+        y1, outcome = take_step(plan, Step(begin, h, changes), y0, self, solver_state)
         result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), outcome, result
 
 
-def _drop_absent(tableau: FlatTableau, drift: Terms, noise: Terms) -> FlatTableau:
-    """Drops stages that no term drives (an ODE has no noise), and without drift the
-    brackets of drift and noise."""
-    keep = [
-        i
-        for i, stage in enumerate(tableau.stages)
-        if len(drift if stage.channels == ("h",) else noise) > 0
-    ]
-    tableau = tableau.take(keep)
+def _without_idle_stages(
+    tableau: FlatTableau, drift: Terms, noise: Terms
+) -> FlatTableau:
+    """The tableau without stages that no term drives (an ODE has no noise); and if there
+    is no drift, without its brackets with the noise."""
+    driven_stages = []
+    for i, stage in enumerate(tableau.stages):
+        terms = drift if stage.channels == ("h",) else noise
+        if len(terms) > 0:
+            driven_stages.append(i)
+    tableau = tableau.take(driven_stages)
     if len(drift) > 0:
         return tableau
-    stages = tuple(_without_brackets(stage) for stage in tableau.stages)
+    stages = tuple(_without_drift_brackets(stage) for stage in tableau.stages)
     return dataclasses.replace(tableau, stages=stages)
 
 
-def _without_brackets(stage: Stage) -> Stage:
-    """The stage without channels that drive brackets with the drift."""
-    kept = [name for name in stage.channels if drives(name) != "drift brackets"]
-    return stage._replace(channels=tuple(kept))
+def _without_drift_brackets(stage: Stage) -> Stage:
+    """The stage without the channels that drive brackets of drift and noise."""
+    channels = [name for name in stage.channels if drives(name) != "drift brackets"]
+    return stage._replace(channels=tuple(channels))
 
 
 def _variables(tableau: FlatTableau) -> list[str]:
-    """The random variables that drive the stages."""
+    """The names of the random variables that drive the stages."""
     channels = [name for stage in tableau.stages for name in stage.channels]
-    # Each once, in an order that is the same in every run.
+    # A dictionary keeps each name once, in the order of the stages. The order of a set
+    # would differ from run to run. "h" is the channel of the drift.
     return [name for name in dict.fromkeys(channels) if name != "h"]
 
 
 def _checked_root_finder(value: Any) -> Any:
-    """Raises a `ValueError` unless this is a root finder, not its class or a SciPy name."""
+    """The root finder `value`. Raises a `ValueError` for anything else, such as a class of
+    root finders or a name that SciPy knows."""
     kinds = optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver
     if not isinstance(value, kinds):
         raise ValueError(
@@ -347,11 +365,13 @@ def free_parameter(name: str, default: float) -> Any:
 
 
 def real_number(name: str, value: Any) -> float:
-    """Raises a `ValueError` unless `value` is a finite real number."""
+    """`value` as a float. Raises a `ValueError`, which quotes the `name` of the parameter,
+    unless it is a finite real number."""
     try:
+        # NumPy's `complex128` is a `complex`, of which `float` would only warn.
         number = math.nan if isinstance(value, complex) else float(value)
     except (TypeError, ValueError):
-        # Errors of JAX about traced arrays are of these types, too.
+        # JAX's errors about traced arrays are of these types, too.
         number = math.nan
     if not math.isfinite(number):
         raise ValueError(

@@ -32,52 +32,63 @@ _MAX_SOLVED = 16
 
 
 def check_friction(
-    drift: Terms, friction: Terms, t0: RealScalarLike, y0: Y, args: Args, solver: str
+    drift: Terms,
+    friction: Terms,
+    t0: RealScalarLike,
+    y0: Y,
+    args: Args,
+    solver_name: str,
 ) -> None:
     """Raises a `ValueError` unless there is friction that is linear in the momenta, and a
-    drift beside it. `drift` and `friction` are the terms of each, and `solver` is the name
-    for messages. Shapes and dependence decide it, not values, so it works under `jit`."""
+    drift beside it. `solver_name` is for messages. Shapes and dependence decide it, not
+    values, so it works under `jit`."""
     if has_lifted(drift):
         raise ValueError(
-            f"`{solver}` applies friction to a canonical momentum, which the state of "
-            "`spin_terms` or `wave_terms` does not have: spins would get shorter. Pass "
+            f"`{solver_name}` applies friction to a canonical momentum, which the state "
+            "of `spin_terms` or `wave_terms` does not have: spins would get shorter. Pass "
             "`damping=` to `spin_terms` or `wave_terms`, and use `ImplicitMidpoint`."
         )
     if len(friction) == 0:
         raise ValueError(
-            f"`{solver}` takes friction from the terms, and these have none. Construct "
-            "them with `langevin_terms(H0, friction, temperature, path)`. (Without "
-            "friction use `StormerVerlet` or `ImplicitMidpoint`.)"
+            f"`{solver_name}` takes friction from the terms, and these have none. "
+            "Construct them with `langevin_terms(H0, friction, temperature, path)`. "
+            "(Without friction use `StormerVerlet` or `ImplicitMidpoint`.)"
         )
     if len(drift) == 0:
-        raise ValueError(f"`{solver}` needs a drift besides friction, that of `H0`.")
+        raise ValueError(
+            f"`{solver_name}` needs a drift besides friction, that of `H0`."
+        )
     p, q = y0
     t0 = jnp.asarray(t0, jnp.result_type(t0, jnp.float32))
 
-    def slope(p: PyTree[Array], along: PyTree[Array]) -> PyTree[Array]:
-        """The derivative of the force along a change of the momenta."""
+    def slope(p: PyTree[Array], change: PyTree[Array]) -> PyTree[Array]:
+        """The derivative of the friction along a `change` of the momenta."""
 
         def force(p: PyTree[Array]) -> PyTree[Array]:
-            return rate(friction, t0, (p, q), args)[0]
+            friction_force, _ = rate(friction, t0, (p, q), args)
+            return friction_force
 
-        return jax.jvp(force, (p,), (along,))[1]
+        _, derivative = jax.jvp(force, (p,), (change,))
+        return derivative
 
     # A function is linear, up to a constant, if its derivative is the same everywhere. The
     # friction is G(t, q) times the velocities dH0/dp, so only these can be nonlinear in p.
-    traced = Dependence(slope, p, p)
-    if not traced.independent(lambda p, along: p):
+    dependence = Dependence(slope, p, p)
+    if not dependence.independent(lambda p, change: p):
         raise ValueError(
-            f"`{solver}` needs friction that is linear in p, but dH0/dp is not: write the "
-            "kinetic energy with `p**2` or products such as `p @ p`. For another kinetic "
-            "energy use `ImplicitMidpoint` or `StrangGauss`, which take these terms."
+            f"`{solver_name}` needs friction that is linear in p, but dH0/dp is not: "
+            "write the kinetic energy with `p**2` or products such as `p @ p`. For another "
+            "kinetic energy use `ImplicitMidpoint` or `StrangGauss`, which take these "
+            "terms."
         )
-    # The derivative is zero along every change, so the force is constant in p.
-    if traced.independent(lambda p, along: along):
+    # The derivative is linear in the change. So if it does not depend on the change, it is
+    # zero, and the friction is constant in p.
+    if dependence.independent(lambda p, change: change):
         raise ValueError(
-            f"`{solver}` has no friction to apply: it acts on the velocities dH0/dp, which "
-            "do not depend on p. Pass the whole Hamiltonian, with its kinetic energy, also "
-            "if a flow solves a part of it: `langevin_terms(H0, friction, temperature, "
-            "path, slow=rest)`."
+            f"`{solver_name}` has no friction to apply: it acts on the velocities "
+            "dH0/dp, which do not depend on p. Pass the whole Hamiltonian, with its "
+            "kinetic energy, also if a flow solves a part of it: `langevin_terms(H0, "
+            "friction, temperature, path, slow=rest)`."
         )
 
 
@@ -99,41 +110,45 @@ def after_friction(
     p, q = y
 
     def force(p: PyTree[Array]) -> PyTree[Array]:
-        return rate(friction, t, (p, q), args)[0]
+        friction_force, _ = rate(friction, t, (p, q), args)
+        return friction_force
 
     if kick is None:
         kick = jtu.tree_map(jnp.zeros_like, p)
+    # In both cases below, F(p + x / 2) = F(p) + S x / 2 with the slope S of F, so that
+    # (1 - h S / 2) x = h F(p) + B W.
     if acts_elementwise(force, p):
         # One equation for each momentum, whose slope is the derivative along ones.
         ones = jtu.tree_map(jnp.ones_like, p)
-        value, slope = jax.jvp(force, (p,), (ones,))
+        forces, slopes = jax.jvp(force, (p,), (ones,))
 
-        def moved(p: Array, value: Array, slope: Array, kick: Array) -> Array:
-            step = jnp.asarray(h, jnp.result_type(p))
-            return p + (step * value + kick) / (1 - step / 2 * slope)
+        def moved(p: Array, force: Array, slope: Array, kick: Array) -> Array:
+            step_size = jnp.asarray(h, jnp.result_type(p))
+            return p + (step_size * force + kick) / (1 - step_size / 2 * slope)
 
-        return jtu.tree_map(moved, p, value, slope, kick)
-    flat, unravel = jfu.ravel_pytree(p)
+        return jtu.tree_map(moved, p, forces, slopes, kick)
+    flat_p, unravel = jfu.ravel_pytree(p)
+    flat_kick, _ = jfu.ravel_pytree(kick)
 
-    def flat_force(flat: Array) -> Array:
-        return jfu.ravel_pytree(force(unravel(flat)))[0]
+    def flat_force(flat_p: Array) -> Array:
+        return jfu.ravel_pytree(force(unravel(flat_p)))[0]
 
-    step = jnp.asarray(h, flat.dtype)
-    slope = jax.jacfwd(flat_force)(flat)
-    right = step * flat_force(flat) + jfu.ravel_pytree(kick)[0]
-    matrix = jnp.eye(flat.size, dtype=flat.dtype) - step / 2 * slope
-    constant = None
-    if flat.size > _MAX_SOLVED:
-        constant = _matrices_if_constant(friction, t, y, args)
-    if constant is not None:
-        return unravel(flat + _solve_by_modes(constant, step, matrix, right))
+    step_size = jnp.asarray(h, flat_p.dtype)
+    slope = jax.jacfwd(flat_force)(flat_p)
+    rhs = step_size * flat_force(flat_p) + flat_kick
+    matrix = jnp.eye(flat_p.size, dtype=flat_p.dtype) - step_size / 2 * slope
+    matrices = None
+    if flat_p.size > _MAX_SOLVED:
+        matrices = _matrices_if_constant(friction, t, y, args)
+    if matrices is not None:
+        return unravel(flat_p + _solve_by_modes(matrices, step_size, matrix, rhs))
     # Elimination in XLA operations takes a tenth of LAPACK's time for matrices this small.
-    solve = eliminate if flat.size <= MAX_WRITTEN_OUT else jnp.linalg.solve
-    return unravel(flat + solve(matrix, right))
+    solve = eliminate if flat_p.size <= MAX_WRITTEN_OUT else jnp.linalg.solve
+    return unravel(flat_p + solve(matrix, rhs))
 
 
 class _Matrices(NamedTuple):
-    """What the step of friction is made of, for momenta as a vector.
+    """The matrices of a step of friction, for momenta as a vector.
 
     - `friction`: the friction on velocities, G.
     - `inverse_masses`: the derivative of the velocities by the momenta, M^-1. In a solve
@@ -147,66 +162,71 @@ class _Matrices(NamedTuple):
 def _matrices_if_constant(
     friction: Terms, t: RealScalarLike, y: Y, args: Args
 ) -> _Matrices | None:
-    """The matrices of friction that is known to be the same at all times and positions."""
+    """The matrices of the friction, or `None` unless they are known to be the same at all
+    times, momenta and positions."""
     if len(friction) != 1:
         return None
     field = field_of(friction[0])
     if not isinstance(field, AbstractFriction):
         return None
     p, q = y
-    flat, unravel = jfu.ravel_pytree(p)
+    flat_p, unravel = jfu.ravel_pytree(p)
 
-    def matrices(t: Any, p: Array, q: PyTree[Array]) -> _Matrices:
-        def force(velocity: Array) -> Array:
-            return jfu.ravel_pytree(field.force(t, q, args, unravel(velocity)))[0]
+    def matrices(t: Any, flat_p: Array, q: PyTree[Array]) -> _Matrices:
+        def force(flat_v: Array) -> Array:
+            return jfu.ravel_pytree(field.force(t, q, args, unravel(flat_v)))[0]
 
-        def velocity(p: Array) -> Array:
-            return jfu.ravel_pytree(field.velocity(t, (unravel(p), q), args))[0]
+        def velocity(flat_p: Array) -> Array:
+            return jfu.ravel_pytree(field.velocity(t, (unravel(flat_p), q), args))[0]
 
-        return _Matrices(-jax.jacfwd(force)(p), jax.jacfwd(velocity)(p))
+        # The force is -G v, linear in v: its derivative is the same at every argument, of
+        # which `flat_p` has the right shape.
+        minus_G = jax.jacfwd(force)(flat_p)
+        return _Matrices(-minus_G, jax.jacfwd(velocity)(flat_p))
 
     t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
-    if not Dependence(matrices, t, flat, q).independent(lambda t, p, q: (t, p, q)):
+    dependence = Dependence(matrices, t, flat_p, q)
+    if not dependence.independent(lambda t, flat_p, q: (t, flat_p, q)):
         return None
-    G, inverse_masses = matrices(t, flat, q)
+    G, inverse_masses = matrices(t, flat_p, q)
     return _Matrices(G, direction(friction) * inverse_masses)
 
 
 def _solve_by_modes(
-    constant: _Matrices,
-    step: Float[Array, ""],
+    matrices: _Matrices,
+    step_size: Float[Array, ""],
     matrix: Float[Array, "n n"],
-    right: Float[Array, " n"],
+    rhs: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """The solution of `matrix @ x = right` for `matrix = 1 + step / 2 * G M^-1`, by the
-    modes of the `constant` matrices G and M^-1.
+    """The solution of `matrix @ x = rhs` for `matrix = 1 + step_size / 2 * G M^-1`, by the
+    modes of the constant matrices G and M^-1.
 
     The modes do not depend on the step. (Sizes of steps differ by rounding errors, so that
-    `matrix` itself is not the same in all; it carries the derivatives.) They are computed
-    here, in the step, since a batch would copy them into the state of each path. On CPUs
-    XLA moves them out of the loop. Elsewhere it leaves them there, forty times as long as a
-    solve.
+    `matrix` itself is not the same in all; it carries the derivatives.) The modes are
+    computed here, in the step, since a batch would copy them into the state of each path.
+    On CPUs XLA moves this computation out of the loop. On other devices XLA would leave it
+    there, where it takes forty times as long as a solve, so these solve with `matrix`.
     """
 
     def multiply(x: Array) -> Array:
         return matrix @ x
 
     def by_modes(rhs: Array) -> Array:
-        return _Modes.of(constant).solve(step, rhs)
+        return _Modes.of(matrices).solve(step_size, rhs)
 
     def by_modes_transposed(rhs: Array) -> Array:
-        return _Modes.of(constant).transposed().solve(step, rhs)
+        return _Modes.of(matrices).transposed().solve(step_size, rhs)
 
     def solve(_: Any, rhs: Array) -> Array:
-        elsewhere = ft.partial(jnp.linalg.solve, matrix)
-        return lax.platform_dependent(rhs, cpu=by_modes, default=elsewhere)
+        by_matrix = ft.partial(jnp.linalg.solve, matrix)
+        return lax.platform_dependent(rhs, cpu=by_modes, default=by_matrix)
 
     def solve_transposed(_: Any, rhs: Array) -> Array:
-        elsewhere = ft.partial(jnp.linalg.solve, matrix.T)
-        return lax.platform_dependent(rhs, cpu=by_modes_transposed, default=elsewhere)
+        by_matrix = ft.partial(jnp.linalg.solve, matrix.T)
+        return lax.platform_dependent(rhs, cpu=by_modes_transposed, default=by_matrix)
 
-    # Its derivatives are those of the equation. Those of eigenvectors may be infinite.
-    return lax.custom_linear_solve(multiply, right, solve, solve_transposed)
+    # Derivatives are those of the equation. Those of eigenvectors may be infinite.
+    return lax.custom_linear_solve(multiply, rhs, solve, solve_transposed)
 
 
 class _Modes(NamedTuple):
@@ -224,6 +244,7 @@ class _Modes(NamedTuple):
 
     @staticmethod
     def of(matrices: _Matrices) -> "_Modes":
+        """The modes of these matrices."""
         root = semidefinite_root(matrices.friction)
         rates, vectors = jnp.linalg.eigh(root.T @ matrices.inverse_masses @ root)
         left = root @ vectors
@@ -232,8 +253,11 @@ class _Modes(NamedTuple):
     def transposed(self) -> "_Modes":
         return _Modes(self.right.T, self.left.T, self.rates)
 
-    def solve(self, step: Float[Array, ""], rhs: Float[Array, " n"]) -> Array:
-        r"""$(1 + \frac h2 G M^{-1})^{-1}$ times a vector. It moves along the columns of
-        `left` only, so what the friction conserves is conserved."""
-        along = (self.right @ rhs) / (1 + step / 2 * self.rates)
-        return rhs - step / 2 * (self.left @ along)
+    def solve(self, step_size: Float[Array, ""], rhs: Float[Array, " n"]) -> Array:
+        r"""$(1 + \frac h2 G M^{-1})^{-1}$ times a vector, by Woodbury's formula: with the
+        matrices $L$ and $R$ of `left` and `right`, it is
+        $1 - \frac h2 L (1 + \frac h2 R L)^{-1} R$, where $R L$ is diagonal with the
+        entries `rates`. The change is along the columns of `left` only, so what the
+        friction conserves is conserved."""
+        in_modes = (self.right @ rhs) / (1 + step_size / 2 * self.rates)
+        return rhs - step_size / 2 * (self.left @ in_modes)

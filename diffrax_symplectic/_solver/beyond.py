@@ -26,7 +26,7 @@ from .base import (
     AbstractSymplecticSolver,
     documented,
 )
-from .driven import drawn_variables, drift_driven
+from .driven import drawn_variables, drift_change
 from .general import GAUSS, ImplicitMidpoint
 from .record import Record
 from .step import no_failure, Outcome, result_of, Step, take_step
@@ -172,59 +172,65 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         outcome = no_failure() if solver_state is None else solver_state
         flows = self._flows(terms, t0, t1)
 
-        def drift_flow(flow: _Flow, y: Y, outcome: Outcome) -> tuple[Y, Outcome]:
+        def after_drift(flow: _Flow, y: Y, outcome: Outcome) -> tuple[Y, Outcome]:
             if len(drift) == 0:
                 return y, outcome
             h = flow.t1 - flow.t0
-            driven = drift_driven(drift, flow.t0, flow.t1, args)
-            step = Step(flow.t0, h, {"h": driven})
+            change = drift_change(drift, flow.t0, flow.t1, args)
+            step = Step(flow.t0, h, {"h": change})
             return take_step(_FLOW, step, y, self, outcome)
 
-        def noise_flow(flow: _Flow, y: Y, outcome: Outcome) -> tuple[Y, Outcome]:
+        def after_noise(flow: _Flow, y: Y, outcome: Outcome) -> tuple[Y, Outcome]:
             if len(noise) == 0:
                 return y, outcome
-            driven = jtu.Partial(apply_one, noise, flow.number, flow.increment, args)
+            change = jtu.Partial(apply_one, noise, flow.number, flow.increment, args)
             # Time stands still, so all stages are at the middle of the step.
-            step = Step(flow.t0, jnp.zeros_like(flow.t0), {"h": driven})
+            step = Step(flow.t0, jnp.zeros_like(flow.t0), {"h": change})
             return take_step(_FLOW, step, y, self, outcome)
 
-        # A loop compiles each kind of flow only once.
-        def one_flow(carry, flow: _Flow):
-            return lax.cond(flow.is_drift, drift_flow, noise_flow, flow, *carry), None
+        def after_flow(carry, flow: _Flow):
+            y, outcome = carry
+            carry = lax.cond(flow.is_drift, after_drift, after_noise, flow, y, outcome)
+            return carry, None
 
-        (y1, outcome), _ = lax.scan(one_flow, (y0, outcome), flows)
+        # A loop compiles each kind of flow only once.
+        (y1, outcome), _ = lax.scan(after_flow, (y0, outcome), flows)
         result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), outcome, result
 
     def _flows(self, terms, t0, t1) -> _Flow:
         """All flows of a step, in order, stacked along a first axis."""
         middle = t0 + (t1 - t0) / 2
-        numbers, increments = self._in_order(terms, t0, t1)
-        at_middle = [middle] * (numbers.size + 1)
-        # The drift comes first and last, and ignores the number.
+        numbers, increments = self._noises_in_order(terms, t0, t1)
+        # The drift moves to the middle of the step first, and from there to its end last.
+        # The noises between stay at the middle. Padding adds both drifts, which ignore the
+        # number and the increment of a noise.
+        middles = [middle] * (numbers.size + 1)
         return _Flow(
             is_drift=np.pad(np.full(numbers.size, False), 1, constant_values=True),
-            t0=jnp.stack([t0, *at_middle]),
-            t1=jnp.stack([*at_middle, t1]),
+            t0=jnp.stack([t0, *middles]),
+            t1=jnp.stack([*middles, t1]),
             number=jnp.pad(numbers, 1),
             increment=jnp.pad(increments, 1),
         )
 
-    def _in_order(self, terms, t0, t1) -> tuple[Array, Array]:
+    def _noises_in_order(self, terms, t0, t1) -> tuple[Array, Array]:
         """The indices of the noises in the order of their flows, and their increments."""
         _, noise = split_terms(terms)
         if len(noise) == 0:
             return jnp.zeros(0, int), jnp.zeros(0)
-        m = number_of_noises(terms)
-        # The order of several noises is chosen by a coin.
-        names = ["W", "two_point"] if m > 1 else ["W"]
-        drawn = drawn_variables(noise, names, t0, t1, type(self).__name__)
-        # One number for each noise, over all terms and leaves.
-        increments, _ = jfu.ravel_pytree(drawn["W"])
-        numbers = jnp.arange(m)
-        if m > 1:
-            coin = jtu.tree_leaves(drawn["two_point"])[0].reshape(-1)[0] > 0
-            numbers = jnp.where(coin, numbers, numbers[::-1])
+        num_noises = number_of_noises(terms)
+        # A coin chooses the order of several noises.
+        names = ["W", "two_point"] if num_noises > 1 else ["W"]
+        variables = drawn_variables(noise, names, t0, t1, type(self).__name__)
+        # One increment for each noise, over all terms and leaves.
+        increments, _ = jfu.ravel_pytree(variables["W"])
+        numbers = jnp.arange(num_noises)
+        if num_noises > 1:
+            # The sign of the first two-point variable is the coin.
+            first_leaf, *_ = jtu.tree_leaves(variables["two_point"])
+            is_heads = first_leaf.reshape(-1)[0] > 0
+            numbers = jnp.where(is_heads, numbers, numbers[::-1])
         return numbers, increments[numbers]
 
 

@@ -37,12 +37,14 @@ def apply_brackets(
     def field(increments: Float[Array, " m"], y: Y) -> Y:
         return term.vf_prod(t, y, args, unravel(increments))
 
-    def summand(column: Float[Array, " m"], unit: Float[Array, " m"]) -> Y:
-        """That of one `l`, from the column `A_kl` and the unit vector of `l`."""
+    def summand(A_l: Float[Array, " m"], unit: Float[Array, " m"]) -> Y:
+        """`Db_l (sum_k A_kl b_k)` for one `l`, from the column `A_l` of the matrix and the
+        unit vector of `l`."""
         b_l = ft.partial(field, unit)
-        return jax.jvp(b_l, (y,), (field(column, y),))[1]
+        _, derivative = jax.jvp(b_l, (y,), (field(A_l, y),))
+        return derivative
 
-    # NumPy's, a constant that XLA folds, unlike `jnp.eye`.
+    # A constant of NumPy, which XLA folds, unlike `jnp.eye`.
     units: Any = np.eye(len(A), dtype=A.dtype)
     return _total(jax.vmap(summand)(A.T, units), len(A))
 
@@ -60,17 +62,17 @@ def bridge_coefficients(
     W_k, _ = jfu.ravel_pytree(W)
     H_k, _ = jfu.ravel_pytree(H)
     # In a solve backward in time steps are negative, and the mean square is not.
-    size = jnp.abs(h).astype(H_k.dtype)
-    of_remainder = jnp.eye(H_k.size, dtype=H_k.dtype) * size
-    # Each summand is half of the time average of a square.
+    step_size = jnp.abs(h).astype(H_k.dtype)
+    h_delta_kl = jnp.eye(H_k.size, dtype=H_k.dtype) * step_size
+    # The squares of the bridge and of its remainder enter with half of their time averages:
+    # 36 u^2 (1 - u)^2 has the average 6 / 5, the square of the factor of K 120 / 7.
     L_kl = 3 / 5 * jnp.outer(H_k, H_k)
     if K is None:
-        return H_k, L_kl + of_remainder / 30
+        return H_k, L_kl + h_delta_kl / 30
     K_k, _ = jfu.ravel_pytree(K)
-    mixed = jnp.outer(W_k, K_k)
-    squares = 60 / 7 * jnp.outer(K_k, K_k)
-    L_kl = L_kl + squares - (mixed + mixed.T) / 2
-    return H_k, L_kl + 3 / 140 * of_remainder
+    W_K = jnp.outer(W_k, K_k)
+    L_kl = L_kl + 60 / 7 * jnp.outer(K_k, K_k) - (W_K + W_K.T) / 2
+    return H_k, L_kl + 3 / 140 * h_delta_kl
 
 
 @eqx.filter_jit
@@ -100,29 +102,32 @@ def apply_bridge(
         increments: Float[Array, " m"], field: Callable, t: Array, y: Y, speed: Array
     ) -> tuple[Y, Y]:
         """`[b, field]`, where `field` advances time by `speed`; and `field` itself."""
-        along = b(increments, t, y)
-        value, change = jax.jvp(lambda y: field(t, y), (y,), (along,))
-        noise_of = ft.partial(b, increments)
-        _, carried = jax.jvp(noise_of, (t, y), (speed, value))
-        return (change**ω - carried**ω).ω, value
+        noise_value = b(increments, t, y)
+        value, change_of_field = jax.jvp(lambda y: field(t, y), (y,), (noise_value,))
+        b_of_increments = ft.partial(b, increments)
+        _, change_of_noise = jax.jvp(b_of_increments, (t, y), (speed, value))
+        return (change_of_field**ω - change_of_noise**ω).ω, value
 
-    def with_drift(unit: Float[Array, " m"], t: Array, y: Y) -> Y:
+    def drift_bracket(unit: Float[Array, " m"], t: Array, y: Y) -> Y:
         """`[b_k, A]` for the noise `k` of this unit vector."""
-        return bracket(unit, drift, t, y, jnp.asarray(h, t.dtype))[0]
+        value, _ = bracket(unit, drift, t, y, jnp.asarray(h, t.dtype))
+        return value
 
-    def summand(unit: Float[Array, " m"], area: Array, column: Float[Array, " m"]) -> Y:
-        """`[L_k . b, [b_k, A]] + H_k [b_k, A]`: the outer brackets of all noises with the
-        inner one of `k` are one bracket, with their sum."""
-        inner = ft.partial(with_drift, unit)
-        # This bracket has no drift, so that it leaves the time.
-        double, single = bracket(column, inner, t, y, jnp.zeros_like(t))
-        return (double**ω + area * single**ω).ω
+    def summand(unit: Float[Array, " m"], H_k: Array, L_k: Float[Array, " m"]) -> Y:
+        """`[sum_l L_kl b_l, [b_k, A]] + H_k [b_k, A]`: by linearity one outer bracket
+        serves for all `l`."""
+        inner = ft.partial(drift_bracket, unit)
+        # The inner bracket contains no drift outside of a bracket, so it leaves the time.
+        double, single = bracket(L_k, inner, t, y, jnp.zeros_like(t))
+        return (double**ω + H_k * single**ω).ω
 
     units: Any = np.eye(areas.size, dtype=areas.dtype)
     return _total(jax.vmap(summand)(units, *bridge_coefficients), len(units))
 
 
-def _total(summands: Y, m: int) -> Y:
-    """The sum of `m` summands, unrolled, so that XLA fuses it with its uses: a reduction
-    over the axis made a step of 8,000 paths three times slower."""
-    return tree_sum([jtu.tree_map(lambda x: x[k], summands) for k in range(m)])
+def _total(summands: Y, num_summands: int) -> Y:
+    """The sum over the first axis of each leaf, unrolled, so that XLA fuses it with its
+    uses: a reduction over the axis made a step of 8,000 paths three times slower."""
+    return tree_sum(
+        [jtu.tree_map(lambda x: x[k], summands) for k in range(num_summands)]
+    )

@@ -1,5 +1,6 @@
 """Steps of constrained systems."""
 
+import functools as ft
 from typing import Any, NamedTuple
 
 import diffrax
@@ -28,8 +29,8 @@ from .._terms import (
 )
 from .base import AbstractSymplecticSolver
 from .bath import after_friction
-from .driven import drawn_variables, drift_driven
-from .flow import begin_flow, Flow, handed_on, kicks_and_rest, moved_by
+from .driven import drawn_variables, drift_change
+from .flow import begin_flow, Flow, forces_at_start, kicks_and_rest, moved_by
 from .step import no_failure
 
 
@@ -40,15 +41,16 @@ def init_constrained(
     y0: Y,
     args: Args,
 ) -> optx.RESULTS:
-    """Whether a path can start here. Raises a `ValueError` for terms that the solver does
-    not take, and for starts off the constraint; a path fails if that is not known."""
+    """Whether a path can start here, as the state of the solver. Raises a `ValueError` for
+    terms that the solver does not take, and for starts off the surface; if the start is
+    traced, so that this is not known, a path off the surface fails."""
     check_pair(y0)
     solver.check(without_constraint(terms), t0, y0, args)
     is_dependent, is_off = check_start(terms, t0, y0, args)
-    results: Any = optx.RESULTS
-    # With dependent constraints it is not known where the surface is.
-    fault = results.where(is_off, results.nonlinear_divergence, no_failure())
-    return results.where(is_dependent, results.singular, fault)
+    R: Any = optx.RESULTS
+    outcome = R.where(is_off, R.nonlinear_divergence, no_failure())
+    # With dependent constraints it is not known where the surface is, so this comes first.
+    return R.where(is_dependent, R.singular, outcome)
 
 
 def verlet_step(
@@ -58,11 +60,11 @@ def verlet_step(
     y0: Y,
     args: Args,
     before: optx.RESULTS,
-    name: str,
+    solver_name: str,
 ) -> tuple[Y, optx.RESULTS]:
     """A step of [`diffrax_symplectic.StormerVerlet`][] on the surface, and its result,
-    which is the state of the solver. `before` is the state before the step, and `name` that
-    of the solver, for errors about its path."""
+    which is the state of the solver. `before` is the state before the step. `solver_name`
+    is for errors about the path."""
     surface = Surface.of(terms, t0, y0, args)
     drift, noise = split_terms(without_constraint(terms))
     (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
@@ -70,19 +72,18 @@ def verlet_step(
     # A path that failed before needs no multipliers: in a batch, others would wait for it.
     pending = before == optx.RESULTS.successful
 
-    p, q, first = surface.free_flight(p, surface.normal_space(q), half, pending)
+    p, q, first_found = surface.free_flight(p, surface.normal_space(q), half, pending)
     # The momentum is not tangent here. It need not be: forces do not depend on it, and the
     # multipliers of the next flight make up for it.
     y = (unravel_p(p), unravel_q(q))
-    # The force times the step.
-    impulse, _ = drift_driven(drift, t0, t1, args)(t0 + half, y)
-    p = p + jfu.ravel_pytree(impulse)[0]
+    force_kick, _ = drift_change(drift, t0, t1, args)(t0 + half, y)
+    p = p + jfu.ravel_pytree(force_kick)[0]
     if len(noise) > 0:
-        p = p + _kick(noise, t0, t1, y, args, name)
-    p, q, second = surface.free_flight(p, surface.normal_space(q), half, pending)
+        p = p + _noise_kick(noise, t0, t1, y, args, solver_name)
+    p, q, second_found = surface.free_flight(p, surface.normal_space(q), half, pending)
     p = surface.tangent(p, surface.normal_space(q))
     y1 = (unravel_p(p), unravel_q(q))
-    return _end_of_step(y1, first & second, before)
+    return _end_and_outcome(y1, first_found & second_found, before)
 
 
 class ConstrainedState(NamedTuple):
@@ -109,8 +110,9 @@ def begin_baoab(
 ) -> ConstrainedState:
     """The state of a solver with this flow at the start. Raises a `ValueError` for a flow
     that leaves the surface, and like `init_constrained`."""
-    keeps = getattr(flow, "keeps_constraints", flow is None)
-    if not keeps:
+    # Free flight keeps constraints by multipliers; a function does not.
+    keeps_constraints = flow is None or getattr(flow, "keeps_constraints", False)
+    if not keeps_constraints:
         raise ValueError(
             f"The flow {flow!r} does not keep the constraint of the terms. Use "
             "`BAOAB()` or `BAOAB(StormerVerlet())`."
@@ -131,10 +133,10 @@ def baoab_step(
     args: Args,
     before: ConstrainedState,
     made_jump: Any,
-    name: str,
+    solver_name: str,
 ) -> tuple[Y, ConstrainedState]:
-    """A step of the solver called `name`, [`diffrax_symplectic.BAOAB`][], on the surface,
-    and its state."""
+    """A step of [`diffrax_symplectic.BAOAB`][] on the surface, and the state after it.
+    `solver_name` is for errors about the path."""
     surface = Surface.of(terms, t0, y0, args)
     kicks, rest = _kicks_and_rest(flow, terms)
     _, friction, noise = split_friction(without_constraint(terms))
@@ -145,52 +147,60 @@ def baoab_step(
 
     def follow(
         p: Array,
-        at: NormalSpace,
+        normal_space: NormalSpace,
         begin: RealScalarLike,
         end: RealScalarLike,
-        state: PyTree,
+        flow_state: PyTree,
     ) -> tuple[Array, Array, PyTree, Bool[Array, ""]]:
+        """The momenta, positions and state of the flow after half a step of it from these
+        momenta and the position of the normal space, and whether it succeeded."""
         if flow is None:
-            p, q, found = surface.free_flight(p, at, half, pending)
-            return p, q, state, found
-        y = (unravel_p(p), unravel_q(at.q))
-        y, state, result = moved_by(flow, steps, rest, begin, end, half, y, args, state)
+            p, q, found = surface.free_flight(p, normal_space, half, pending)
+            return p, q, flow_state, found
+        y = (unravel_p(p), unravel_q(normal_space.q))
+        y, flow_state, result = moved_by(
+            flow, steps, rest, begin, end, half, y, args, flow_state
+        )
         (p, _), (q, _) = map(jfu.ravel_pytree, y)
-        return p, q, state, result == diffrax.RESULTS.successful
+        return p, q, flow_state, result == diffrax.RESULTS.successful
 
     # B and A. Between them the momentum need not be tangent: the multipliers of the flight
     # make up for it.
     force = None
     if kicks:
-        force = handed_on(before.force, made_jump, lambda: _force(kicks, t0, y0, args))
+        compute_force = ft.partial(_force, kicks, t0, y0, args)
+        force = forces_at_start(before.force, made_jump, compute_force)
         p = p + half * force
-    p, q, flow_state, first = follow(
+    p, q, flow_state, first_found = follow(
         p, surface.normal_space(q), t0, middle, before.flow
     )
-    at = surface.normal_space(q)
-    p = surface.tangent(p, at)
+    normal_space = surface.normal_space(q)
+    p = surface.tangent(p, normal_space)
     y = (unravel_p(p), unravel_q(q))
     # O
-    kick = _kick(noise, t0, t1, y, args, name) if noise else jnp.zeros_like(p)
+    kick = (
+        _noise_kick(noise, t0, t1, y, args, solver_name) if noise else jnp.zeros_like(p)
+    )
 
     # Friction acts on the impulses of the constraint forces, too: then friction and noise
     # are the midpoint rule within the tangent space, which keeps its Maxwell distribution.
-    def after(impulse: Array) -> Array:
-        moved = after_friction(friction, middle, t1 - t0, y, args, unravel_p(impulse))
-        return jfu.ravel_pytree(moved)[0]
+    def after_bath(impulse: Array) -> Array:
+        p = after_friction(friction, middle, t1 - t0, y, args, unravel_p(impulse))
+        return jfu.ravel_pytree(p)[0]
 
     def response(impulse: Array) -> Array:
-        return jax.jvp(after, (kick,), (impulse,))[1]
+        _, change_of_p = jax.jvp(after_bath, (kick,), (impulse,))
+        return change_of_p
 
-    p = surface.tangent(after(kick), at, response)
+    p = surface.tangent(after_bath(kick), normal_space, response)
     # A and B
-    p, q, flow_state, second = follow(p, at, middle, t1, flow_state)
+    p, q, flow_state, second_found = follow(p, normal_space, middle, t1, flow_state)
     if kicks:
         force = _force(kicks, t1, (unravel_p(p), unravel_q(q)), args)
         p = p + half * force
     p = surface.tangent(p, surface.normal_space(q))
     y1 = (unravel_p(p), unravel_q(q))
-    y1, outcome = _end_of_step(y1, first & second, before.outcome)
+    y1, outcome = _end_and_outcome(y1, first_found & second_found, before.outcome)
     return y1, ConstrainedState(force, flow_state, outcome)
 
 
@@ -199,6 +209,7 @@ def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[Terms, Ter
     surface."""
     drift, _, _ = split_friction(without_constraint(terms))
     kicks, rest = kicks_and_rest(flow, drift)
+    # The flow finds the constraint of the terms at the first of them.
     first, *others = rest
     first = replaced(first, with_constraint(unwrapped(first), constraint_of(terms)))
     return kicks, (first, *others)
@@ -210,27 +221,33 @@ def _force(kicks: Terms, t: RealScalarLike, y: Y, args: Args) -> Array:
     return jfu.ravel_pytree(force)[0]
 
 
-def _kick(
-    noise: Terms, t0: RealScalarLike, t1: RealScalarLike, y: Y, args: Args, name: str
+def _noise_kick(
+    noise: Terms,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    y: Y,
+    args: Args,
+    solver_name: str,
 ) -> Array:
     """The change of the momenta by the noise, as a vector."""
-    drawn = drawn_variables(noise, ["W"], t0, t1, name)
-    kick, _ = apply(noise, drawn["W"], args, t0 + (t1 - t0) / 2, y)
+    variables = drawn_variables(noise, ["W"], t0, t1, solver_name)
+    kick, _ = apply(noise, variables["W"], args, t0 + (t1 - t0) / 2, y)
     return jfu.ravel_pytree(kick)[0]
 
 
-def _end_of_step(
+def _end_and_outcome(
     y1: Y, found: Bool[Array, ""], before: optx.RESULTS
 ) -> tuple[Y, optx.RESULTS]:
-    """The end of a step, and the state of the solver after it."""
-    results: Any = optx.RESULTS
-    now = results.where(found, results.successful, results.nonlinear_max_steps_reached)
+    """The end of a step, and the outcome of all steps so far, from whether the multipliers
+    of this one were `found` and the outcome `before`."""
+    R: Any = optx.RESULTS
+    outcome = R.where(found, R.successful, R.nonlinear_max_steps_reached)
     # The first failure is the one that is reported.
-    result = results.where(before == results.successful, now, before)
+    outcome = R.where(before == R.successful, outcome, before)
 
     # Without a solution there is no derivative. It is set to zero, so that a failed path
     # does not spoil gradients that are summed over a batch.
     def fixed_if_failed(x: Array) -> Array:
-        return jnp.where(result == results.successful, x, lax.stop_gradient(x))
+        return jnp.where(outcome == R.successful, x, lax.stop_gradient(x))
 
-    return jtu.tree_map(fixed_if_failed, y1), result
+    return jtu.tree_map(fixed_if_failed, y1), outcome

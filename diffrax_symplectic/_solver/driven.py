@@ -1,5 +1,5 @@
-"""What drives the stages of a step: the drift over its length, and the vector fields of the
-noise times the random variables that are drawn for it."""
+"""The changes of the state that drive the stages of a step: by the drift over its length,
+and by the vector fields of the noise times the random variables that are drawn for it."""
 
 import diffrax
 import equinox as eqx
@@ -26,16 +26,16 @@ from .._terms import apply, brownian_paths
 from .brackets import apply_brackets, apply_bridge, bridge_coefficients
 
 
-def drift_driven(
+def drift_change(
     drift: Terms, t0: RealScalarLike, t1: RealScalarLike, args: Args
 ) -> jtu.Partial:
-    """What drives the drift stages of the step: a function `(t, y)` that returns the
-    change of the state by the drift over the whole step."""
-    sizes = [term.contr(t0, t1) for term in drift]
-    return jtu.Partial(apply, drift, sizes, args)
+    """The function `(t, y)` of the drift stages: the change of the state by the drift at
+    this time and state, over the whole step."""
+    controls = [term.contr(t0, t1) for term in drift]
+    return jtu.Partial(apply, drift, controls, args)
 
 
-def noise_driven(
+def noise_changes(
     drift: jtu.Partial,
     h: RealScalarLike,
     noise: Terms,
@@ -43,46 +43,48 @@ def noise_driven(
     t0: RealScalarLike,
     t1: RealScalarLike,
     args: Args,
-    solver: str,
+    solver_name: str,
 ) -> dict[str, jtu.Partial]:
-    """What drives the noise stages of the step of size `h` from `t0` to `t1`: for the name
-    of each random variable, a function `(t, y)` that returns the change of the state by
-    the vector fields that it multiplies. `drift` is that of the drift stages."""
+    """The functions `(t, y)` of the noise stages, by the names of random variables: the
+    change of the state over the step of size `h` from `t0` to `t1` by the vector fields
+    that a variable multiplies. `drift` is the function of the drift stages, for variables
+    that multiply brackets with it."""
     # Most variables are attributes of an increment. The others are computed from several
     # of its attributes, some of which are used only if they are there.
-    attributes = []
-    if_there = []
+    required = []
+    optional = []
     for name in names:
         held = VARIABLES[name].held if name in VARIABLES else None
         if held is None:
-            attributes.append(name)
+            required.append(name)
         else:
-            attributes += held[0]
-            if_there += held[1]
+            attributes, optional_attributes = held
+            required += attributes
+            optional += optional_attributes
     # Each is drawn once, although several variables may be computed from it.
-    attributes = list(dict.fromkeys(attributes))
-    values = drawn_variables(noise, attributes, t0, t1, solver, tuple(if_there))
-    functions = {}
+    required = list(dict.fromkeys(required))
+    values = drawn_variables(noise, required, t0, t1, solver_name, tuple(optional))
+    changes = {}
     for name in names:
         match drives(name):
             case "noise":
-                functions[name] = jtu.Partial(apply, noise, values[name], args)
+                changes[name] = jtu.Partial(apply, noise, values[name], args)
             case "drift brackets":
-                areas = bridge_coefficients(
+                coefficients = bridge_coefficients(
                     h, values["W"], values["H"], values.get("K")
                 )
-                functions[name] = jtu.Partial(
-                    apply_bridge, drift, noise, areas, h, args
+                changes[name] = jtu.Partial(
+                    apply_bridge, drift, noise, coefficients, h, args
                 )
             case "noise brackets" if len(noise) == 1:
                 (areas,) = values[name]
-                functions[name] = jtu.Partial(apply_brackets, noise[0], areas, args)
+                changes[name] = jtu.Partial(apply_brackets, noise[0], areas, args)
             case _:
                 raise ValueError(
-                    f"`{solver}` needs all noises in one term, whose path samples the Lévy "
-                    f"areas between them; got {len(noise)} noise terms. Combine them."
+                    f"`{solver_name}` needs all noises in one term, whose path samples the "
+                    f"Lévy areas between them; got {len(noise)} noise terms. Combine them."
                 )
-    return functions
+    return changes
 
 
 def drawn_variables(
@@ -90,13 +92,13 @@ def drawn_variables(
     names: list[str],
     t0: RealScalarLike,
     t1: RealScalarLike,
-    solver: str,
+    solver_name: str,
     optional: tuple[str, ...] = (),
 ) -> dict[str, list]:
     """The random variables of the step from `t0` to `t1`: for each name, one value for
     each noise term. The `optional` ones are left out unless all increments have them.
 
-    Raises a `ValueError`, in the name of `solver`, if a path does not have one of `names`.
+    Raises a `ValueError`, which quotes `solver_name`, if a path lacks one of `names`.
     """
     t1 = _within_resolution(noise, t0, t1)
     # Without Lévy areas an increment is `W` itself.
@@ -106,22 +108,25 @@ def drawn_variables(
     def draw() -> list[Increment]:
         return [term.contr(t0, t1, **options) for term in noise]
 
-    cheap = all(map(_is_cheap, brownian_paths(noise)))
-    increments = draw() if cheap else materialize(draw)
+    are_cheap = all(map(_is_cheap, brownian_paths(noise)))
+    # XLA may compute a value anew wherever it is used, unless it is materialized.
+    increments = draw() if are_cheap else materialize(draw)
     if only_increments:
         return {"W": increments}
 
     def all_have(name: str) -> bool:
         return all(getattr(x, name, None) is not None for x in increments)
 
-    # The variable first whose paths hold most: its advice fits the others, too.
+    # The variable whose paths hold most comes first: its advice fits the others, too.
     for name in sorted(names, key=_rank, reverse=True):
         if not all_have(name):
-            raise ValueError(f"`{solver}` needs {_how_to_get(name, noise)}.")
+            raise ValueError(f"`{solver_name}` needs {_how_to_get(name, noise)}.")
     variables = {}
     for name in [*names, *filter(all_have, optional)]:
-        pairs = zip(noise, increments)
-        variables[name] = [_in_time(term, name, getattr(x, name)) for term, x in pairs]
+        variables[name] = [
+            _with_sign_restored(term, name, getattr(increment, name))
+            for term, increment in zip(noise, increments)
+        ]
     return variables
 
 
@@ -131,31 +136,33 @@ def _rank(name: str) -> int:
 
 
 def _how_to_get(name: str, noise: Terms) -> str:
-    """What a path needs to have this random variable, for messages."""
+    """What a solver needs for this random variable, as the end of a sentence in a message:
+    "`SRKs4` needs ..."."""
     variable = VARIABLES.get(name)
     if variable is None:
         return f"increments with the attribute `{name}`"
-    records = [path for path in brownian_paths(noise) if _is_record(path)]
-    if not records:
+    fixed_paths = [path for path in brownian_paths(noise) if _is_fixed(path)]
+    if not fixed_paths:
         return variable.advice
     # Another path would be other noise, so that only another solver helps.
     return (
-        f"{variable.name}, but `{type(records[0]).__name__}` has no random key to draw "
+        f"{variable.name}, but `{type(fixed_paths[0]).__name__}` has no random key to draw "
         "them from. Use a solver that needs only increments, such as `StormerVerlet` for "
         "separable systems or `ImplicitMidpoint` for others"
     )
 
 
-def _is_record(path: diffrax.AbstractBrownianPath) -> bool:
-    """Whether a path of the user's holds given noise."""
+def _is_fixed(path: diffrax.AbstractBrownianPath) -> bool:
+    """Whether this is a path of the user's own without a random key, such as recorded
+    noise."""
     return not is_random(path) and not isinstance(path, GivenPath)
 
 
-def _in_time(
+def _with_sign_restored(
     term: diffrax.AbstractTerm, name: str, value: PyTree[Array]
 ) -> PyTree[Array]:
-    """Restores the sign of even random variables, since backward in time Diffrax negates
-    all of them."""
+    """The `value` of a random variable with its own sign: in a solve backward in time
+    Diffrax negates all variables, and even ones must not change."""
     is_even = name in VARIABLES and VARIABLES[name].even
     return (direction(term) * value**ω).ω if is_even else value
 
@@ -164,15 +171,16 @@ def _within_resolution(
     noise: Terms, t0: RealScalarLike, t1: RealScalarLike
 ) -> RealScalarLike:
     """`t1`, with an error when run if a `VirtualBrownianTree` does not resolve the step."""
-    h = jnp.abs(t1 - t0)
+    step_size = jnp.abs(t1 - t0)
     for path in map(_innermost, brownian_paths(noise)):
         if isinstance(path, diffrax.VirtualBrownianTree):
             tol = resolution(path)
-            # Steps of a rounding error, which Diffrax may take at the end, have next to no
-            # noise. A step of just `tol` may be rounded to less.
+            # Diffrax may take a last step of a rounding error, which has next to no noise:
+            # hence the lower bound. A step of just `tol` may be rounded to less: hence the
+            # factor 0.999.
             t1 = eqx.error_if(
                 jnp.asarray(t1),
-                (h < 0.999 * tol) & (h > 1e-6 * tol),
+                (step_size < 0.999 * tol) & (step_size > 1e-6 * tol),
                 "A step is shorter than `tol` of the `VirtualBrownianTree`, which only "
                 "interpolates at this scale, so the noise would be too small. Pass a "
                 "smaller `tol`, or for fixed steps `FixedStepBrownianPath(shape, key)`.",
@@ -181,6 +189,7 @@ def _within_resolution(
 
 
 def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
+    """The path within all wrappers."""
     while isinstance(path, AbstractWrappedPath):
         path = path.path
     return path
@@ -188,7 +197,7 @@ def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPa
 
 def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:
     """Whether its random variables are cheaper to recompute than to store."""
-    # A wrapper for Lévy areas is not: it sums a series.
+    # A wrapper that samples Lévy areas sums a series, which is not cheap.
     while isinstance(path, TruncatedBrownianPath | PlateauBrownianPath):
         path = path.path
     return isinstance(path, WeakBrownianPath | FixedStepBrownianPath)

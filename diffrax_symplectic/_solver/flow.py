@@ -28,35 +28,40 @@ Flow: TypeAlias = AbstractSymplecticSolver | FlowFunction | None
 
 
 def is_solver(flow: Any) -> bool:
+    """Whether a flow is a solver of this package."""
     # `isinstance` would look through wrappers, such as `diffrax.HalfSolver`.
     return issubclass(type(flow), AbstractSymplecticSolver)
 
 
-def check_flow(flow: Any, steps: int, owner: str) -> None:
-    """Raises a `ValueError` for what is no flow, or steps of a flow that takes none."""
-    if flow is None or is_solver(flow):
-        if flow is None and steps > 1:
-            raise ValueError(
-                f"`steps={steps}` of `{owner}` are those of a solver: pass one as `flow`, "
-                "such as `StormerVerlet()`."
-            )
+def check_flow(flow: Any, steps: int, solver_name: str) -> None:
+    """Raises a `ValueError` unless `flow` is a flow, and for several `steps` of a flow that
+    is no solver. `solver_name` is for messages."""
+    if is_solver(flow):
+        return
+    if flow is None and steps > 1:
+        raise ValueError(
+            f"`steps={steps}` of `{solver_name}` are those of a solver: pass one as "
+            "`flow`, such as `StormerVerlet()`."
+        )
+    if flow is None:
         return
     if isinstance(flow, diffrax.AbstractSolver):
         raise ValueError(
-            f"`flow` of `{owner}` must be a solver of this package, such as "
+            f"`flow` of `{solver_name}` must be a solver of this package, such as "
             "`ImplicitMidpoint()`, a `linear_flow`, or a function `(time, y, args)`; got "
             f"`{type(flow).__name__}`."
         )
     check_takes("flow", flow, "time", "y", "args")
     if steps > 1:
         raise ValueError(
-            f"`steps={steps}` of `{owner}` are those of a solver; the flow {flow!r} takes "
-            "one of any length."
+            f"`steps={steps}` of `{solver_name}` are those of a solver; the flow {flow!r} "
+            "takes one of any length."
         )
 
 
 def kicks_and_rest(flow: Flow, drift: Terms) -> tuple[Terms, Terms]:
-    """The terms whose forces are the kicks, and those that the flow follows."""
+    """The terms whose forces are the kicks, and the terms that the flow follows."""
+    # Kicks take the forces of the whole drift, and free flight its velocities.
     if flow is None:
         return drift, drift
     rest, slow = slow_apart(drift)
@@ -76,31 +81,34 @@ def check_follows(
 def check_returns_pair(
     flow: FlowFunction, t0: RealScalarLike, y0: Y, args: Args
 ) -> None:
-    """Raises a `ValueError` if a flow returns another state than it gets."""
+    """Raises a `ValueError` if a flow returns a state of another structure, shape or dtype
+    than it gets."""
     time = jnp.asarray(t0, jnp.result_type(t0, jnp.float32))
     y1 = eqx.filter_eval_shape(flow, time, y0, args)
-    if _shapes_and_types(y1) != _shapes_and_types(y0):
+    if _structure_of(y1) != _structure_of(y0):
         raise ValueError(
             "`flow(time, y, args)` must return a pair like the state, "
             f"{eqx.tree_pformat(y0)}; got {eqx.tree_pformat(y1)}."
         )
 
 
-def _shapes_and_types(y: Y) -> PyTree:
-    leaves, structure = jtu.tree_flatten(y)
-    return structure, [(jnp.shape(x), jnp.result_type(x)) for x in leaves]
+def _structure_of(y: Y) -> PyTree:
+    """The structure of a state, and the shapes and dtypes of its leaves."""
+    leaves, treedef = jtu.tree_flatten(y)
+    return treedef, [(jnp.shape(x), jnp.result_type(x)) for x in leaves]
 
 
 def returns_nan(
     flow: FlowFunction, time: RealScalarLike, y0: Y, args: Args
 ) -> Bool[Array, ""]:
-    """Whether a flow returns NaN at the start of a solve, for half of its first step.
-    Raises an error that names the flow; in a batch the path fails alone."""
+    """Whether a flow returns NaN at the start of a solve, after `time`, half of the first
+    step. Then it is also an error when run, but not in a batch, where the path fails
+    alone."""
     # The check has no derivative.
     y1 = jtu.tree_map(lax.stop_gradient, flow(time, y0, args))
-    is_nan = jnp.stack([jnp.any(jnp.isnan(x)) for x in jtu.tree_leaves(y1)])
-    # A path that has failed already is not the fault of the flow.
-    return refused_where(all_finite(y0) & jnp.any(is_nan), _NAN)
+    leaf_has_nan = jnp.stack([jnp.any(jnp.isnan(x)) for x in jtu.tree_leaves(y1)])
+    # If the path has failed already, NaN is not the fault of the flow.
+    return refused_where(all_finite(y0) & jnp.any(leaf_has_nan), _NAN)
 
 
 _NAN = (
@@ -113,12 +121,15 @@ _NAN = (
 def begin_flow(
     flow: Flow, drift: Terms, t0: RealScalarLike, t1: Any, y0: Y, args: Args
 ) -> PyTree[Array]:
-    """The state of the solver that is the flow, or whether a function returns NaN."""
+    """The state of a flow at the start of a solve whose first step is from `t0` to `t1`:
+    nothing for free flight, the state of a solver, or of a function whether it returns
+    NaN."""
     if flow is None:
         return None
     if not is_solver(flow):
-        half = direction(drift) * (t1 - t0) / 2
-        return returns_nan(flow, half, y0, args)  # pyright: ignore
+        # Steps are positive even in a solve backward in time, where the flow runs back.
+        half_step = direction(drift) * (t1 - t0) / 2
+        return returns_nan(flow, half_step, y0, args)  # pyright: ignore
     return flow.init(diffrax.MultiTerm(*drift), t0, t1, y0, args)  # pyright: ignore
 
 
@@ -133,8 +144,8 @@ def moved_by(
     args: Args,
     state: PyTree[Array],
 ) -> tuple[Y, PyTree[Array], diffrax.RESULTS]:
-    """The state after the flow from `t0` to `t1`, half a step of length `time`; the state
-    of the flow, and its result."""
+    """`y` after the flow from `t0` to `t1`, half a step of length `time`; the state of the
+    flow after it; and its result."""
     if flow is None:
         p, q = y
         _, velocities = rate(drift, t0, y, args)
@@ -143,18 +154,19 @@ def moved_by(
         # Steps are positive even in a solve backward in time, where the flow runs back.
         y1 = flow(direction(drift) * time, y, args)  # pyright: ignore
         R: Any = diffrax.RESULTS
-        # `state` says whether the flow was broken at the start.
+        # The state of a function is whether it returned NaN at the start.
         result = R.where(state, R.nonfinite, result_of(None, y1))
         return y1, state, result
     terms = diffrax.MultiTerm(*drift)
     h = (t1 - t0) / steps
 
-    def step(carry: tuple[Any, ...], k: Any) -> tuple[tuple[Any, ...], None]:
+    def step(carry: tuple[Any, ...], number: Any) -> tuple[tuple[Any, ...], None]:
         y, state, _ = carry
-        begin = t0 + k * h
+        begin = t0 + number * h
         # What the bath did is a jump for a solver that remembers the end of its last step.
+        made_jump = True
         y, _, _, state, result = flow.step(  # pyright: ignore
-            terms, begin, begin + h, y, args, state, True
+            terms, begin, begin + h, y, args, state, made_jump
         )
         return (y, state, result), None
 
@@ -162,7 +174,8 @@ def moved_by(
     if steps == 1:
         carry, _ = step(carry, 0)
     else:
-        # A failure stays in the state of the solver, or in a state that is not finite.
+        # The last result tells of all: after a failure the state of the solver, or a state
+        # that is not finite, makes all further steps fail.
         carry, _ = lax.scan(step, carry, jnp.arange(steps))
     return carry
 
@@ -170,18 +183,18 @@ def moved_by(
 def moved(x: PyTree, time: RealScalarLike, rate: PyTree) -> PyTree:
     """`x` after `time` at a constant rate."""
 
-    def leaf_moved(x: Array, v: Array) -> Array:
-        # In the precision of the state, which times need not have.
-        return x + jnp.asarray(time, jnp.result_type(x)) * v
+    def moved_leaf(x: Array, rate: Array) -> Array:
+        # The time is converted to the precision of the state, which it need not have.
+        return x + jnp.asarray(time, jnp.result_type(x)) * rate
 
-    return jtu.tree_map(leaf_moved, x, rate)
+    return jtu.tree_map(moved_leaf, x, rate)
 
 
-def handed_on(
-    forces: PyTree[Array], made_jump: Any, anew: Callable[[], PyTree[Array]]
+def forces_at_start(
+    last_forces: PyTree[Array], made_jump: Any, compute: Callable[[], PyTree[Array]]
 ) -> PyTree[Array]:
-    """The forces from the end of the last step, or after a jump, which moved the state,
-    those that are computed `anew`."""
+    """The forces at the start of a step: those from the end of the last step, or after a
+    jump, which moved the state, those that `compute()` returns."""
     if made_jump is False:
-        return forces
-    return lax.cond(made_jump, anew, lambda: forces)
+        return last_forces
+    return lax.cond(made_jump, compute, lambda: last_forces)

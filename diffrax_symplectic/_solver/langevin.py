@@ -29,7 +29,7 @@ from .flow import (
     check_flow,
     check_follows,
     Flow,
-    handed_on,
+    forces_at_start,
     is_solver,
     kicks_and_rest,
     moved,
@@ -75,12 +75,14 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
     def area_factor(cls, rate_times_step: ArrayLike) -> Any:
         """The factor by which a step shrinks areas, where friction is one rate for all
         momenta. At zero a step has no inverse."""
+        # Each part is the midpoint rule for friction over its share of the step.
         x = rate_times_step / (2 * cls.friction_parts)
         return ((1 - x) / (1 + x)) ** cls.friction_parts
 
     def stage_vectors(self, num_noises):
         if not is_solver(self.flow):
             return ()
+        # The steps of the flow before and after the bath, one after another.
         return 2 * self.steps * self.flow.stage_vectors(num_noises)  # pyright: ignore
 
     @property
@@ -93,18 +95,18 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         return 2 if self.symmetric else 1
 
     def check(self, terms, t0, y0: Y, args: Args) -> None:
-        name = type(self).__name__
-        check_state(y0, name)
+        solver_name = type(self).__name__
+        check_state(y0, solver_name)
         terms, y0 = momentum_first(terms, y0)
         drift, friction, noise = split_friction(terms)
         kicks, rest = kicks_and_rest(self.flow, drift)
-        check_structure("separable", kicks, noise, t0, y0, args, name)
-        if not all(isinstance(unwrapped(x), diffrax.ODETerm) for x in drift):
+        check_structure("separable", kicks, noise, t0, y0, args, solver_name)
+        if not all(isinstance(unwrapped(term), diffrax.ODETerm) for term in drift):
             raise ValueError(
-                f"`{name}` needs a drift driven by time: pass `langevin_terms(H0, "
+                f"`{solver_name}` needs a drift driven by time: pass `langevin_terms(H0, "
                 "friction, temperature, path)`."
             )
-        check_friction(drift, friction, t0, y0, args, name)
+        check_friction(drift, friction, t0, y0, args, solver_name)
         check_follows(self.flow, rest, t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args) -> Any:
@@ -118,6 +120,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         return SplittingState(forces, begin_flow(self.flow, rest, t0, t1, y0, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
+        # The user's own terms and state: those of Diffrax have the state (x, v).
         own_terms = terms
         own_y0 = y0
         terms, y0 = momentum_first(own_terms, own_y0)
@@ -129,27 +132,31 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         half = h / 2
         middle = t0 + half
 
-        def forces_at_start() -> PyTree[Array]:
-            return rate(kicks, t0, y0, args)[0]
+        def compute_forces() -> PyTree[Array]:
+            forces, _ = rate(kicks, t0, y0, args)
+            return forces
 
         # Kick
         if self.symmetric and kicks:
-            forces = handed_on(forces, made_jump, forces_at_start)
+            forces = forces_at_start(forces, made_jump, compute_forces)
             p = moved(p, half, forces)
         elif kicks:
-            p = moved(p, h, forces_at_start())
+            p = moved(p, h, compute_forces())
         # Flow. XLA drops the half of the rates at (p, q) that is not used.
         follow = ft.partial(moved_by, self.flow, self.steps, rest)
         (p, q), flow_state, _ = follow(t0, middle, half, (p, q), args, flow_state)
         # Friction and noise
         kick = None
         if len(noise) > 0:
-            drawn = drawn_variables(noise, ["W"], t0, t1, type(self).__name__)
-            kick, _ = apply(noise, drawn["W"], args, middle, (p, q))
+            variables = drawn_variables(noise, ["W"], t0, t1, type(self).__name__)
+            kick, _ = apply(noise, variables["W"], args, middle, (p, q))
         p = after_friction(friction, middle, h, (p, q), args, kick)
-        # Flow
+        # Flow. Free flight takes its velocities at the time `begin`, on which they do not
+        # depend: `t1` is the time of the forces below.
         begin = t1 if self.flow is None else middle
-        (p, q), flow_state, flowed = follow(begin, t1, half, (p, q), args, flow_state)
+        (p, q), flow_state, flow_result = follow(
+            begin, t1, half, (p, q), args, flow_state
+        )
         # Kick
         if self.symmetric and kicks:
             forces, _ = rate(kicks, t1, (p, q), args)
@@ -157,9 +164,9 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         R: Any = diffrax.RESULTS
         result = result_of(None, (p, q))
         if self.flow is not None:
-            result = R.where(flowed == R.successful, result, flowed)
+            result = R.where(flow_result == R.successful, result, flow_result)
         result = result_with_times_checked(terms, t0, t1, result)
-        # Exchanged once more, if the state is Diffrax's (x, v).
+        # If the state is Diffrax's (x, v), its halves are exchanged once more.
         _, y1 = momentum_first(own_terms, (p, q))
         state = SplittingState(forces, flow_state)
         return y1, None, dict(y0=own_y0, y1=y1), state, result
@@ -282,7 +289,7 @@ class BAOAB(AbstractLangevinSplitting):
             return _FREE_FLIGHT
         keeps_constraints = getattr(self.flow, "keeps_constraints", False)
         choose = _CHOOSE_FOR_CONSTRAINTS if keeps_constraints else _CHOOSE_A_FLOW
-        # What is exact depends on the flow.
+        # Which stationary moments are exact depends on the flow, so none is promised.
         return _FREE_FLIGHT._replace(choose=choose, stationary=())
 
     @property

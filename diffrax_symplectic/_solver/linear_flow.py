@@ -1,5 +1,6 @@
 """The flow of a linear system, by Cayley's angles."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -14,9 +15,10 @@ from .._compat import is_traced
 from .._custom_types import Args, RealScalarLike
 
 
-# Stiffnesses that differ from their transpose by more of the largest entry are taken for a
-# mistake, and eigenvalues below that are zero: rounding leaves 1e-15 times their number.
-_SYMMETRIC = 1e-8
+# A stiffness is symmetric if it differs from its transpose by at most this fraction of its
+# largest entry, and an eigenvalue is zero below this fraction of the largest. The roundings
+# of both, about 1e-15 times the number of positions, are far below.
+_TOLERANCE = 1e-8
 
 
 def linear_flow(
@@ -96,102 +98,120 @@ def linear_flow(
     **Source:** [Korol, Rosa-Raíces, Bou-Rabee and Miller
     (2020)](https://doi.org/10.1063/1.5134810), for ring polymers.
     """
-    modes = frequencies, to_modes, from_modes
-    given = [x is not None for x in modes]
-    if (stiffness is None) != all(given) or any(given) != all(given):
+    modes = (frequencies, to_modes, from_modes)
+    all_modes_given = all(x is not None for x in modes)
+    any_modes_given = any(x is not None for x in modes)
+    is_either = all_modes_given if stiffness is None else not any_modes_given
+    if not is_either:
         raise ValueError(
             "Pass either `stiffness`, or `frequencies`, `to_modes` and `from_modes`."
         )
     if not is_traced(masses) and not np.all(np.asarray(masses) > 0):
         raise ValueError(f"`masses` must be positive; got {masses!r}.")
-    roots = jnp.sqrt(jnp.asarray(masses, float))
+    mass_roots = jnp.sqrt(jnp.asarray(masses, float))
     if stiffness is not None:
-        omega, vectors = _modes_of(stiffness, roots)
-        to_modes = jtu.Partial(_project, vectors)
-        from_modes = jtu.Partial(_combine, vectors)
+        omega, vectors = _modes_of(stiffness, mass_roots)
+        to_modes = jtu.Partial(_to_modes, vectors)
+        from_modes = jtu.Partial(_from_modes, vectors)
     else:
-        if jnp.ndim(roots) > 0:
+        if jnp.ndim(mass_roots) > 0:
             raise ValueError("With modes that are given, `masses` must be one number.")
         omega = jnp.asarray(frequencies, float)
     assert to_modes is not None and from_modes is not None
-    return CayleyFlow(omega, to_modes, from_modes, roots, jnp.asarray(rest, float))
+    return CayleyFlow(omega, to_modes, from_modes, mass_roots, jnp.asarray(rest, float))
 
 
 def _modes_of(
-    stiffness: ArrayLike, roots: Float[Array, "..."]
+    stiffness: ArrayLike, mass_roots: Float[Array, "..."]
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The frequencies, and the modes in positions times roots of masses as columns."""
+    """The frequencies, and as columns the modes of the positions times the roots of their
+    masses: the eigenvectors of `M^-1/2 K M^-1/2`.
+
+    They are computed by NumPy if all values are known, so that wrong ones raise a
+    `ValueError`.
+    """
     K: Any = stiffness if is_traced(stiffness) else np.asarray(stiffness, float)
-    n = int(round(np.size(K) ** 0.5))
-    half = np.ndim(K) // 2
     shape = np.shape(K)
-    if np.ndim(K) % 2 or shape[:half] != shape[half:]:
+    shape_of_q = shape[: len(shape) // 2]
+    if shape != (*shape_of_q, *shape_of_q):
         raise ValueError(
             f"`stiffness` must have the shape of `q` twice, `(n, n)`; got {shape}."
         )
+    n = math.prod(shape_of_q)
     K = K.reshape(n, n)
-    known = not is_traced(K) and not is_traced(roots)
-    xp: Any = np if known else jnp
-    if known and np.max(abs(K - K.T), initial=0) > _SYMMETRIC * np.max(
-        abs(K), initial=0
-    ):
-        raise ValueError("`stiffness` must be symmetric: it is a second derivative.")
-    each = xp.broadcast_to(xp.asarray(roots), shape[:half]).reshape(-1)
-    squares, vectors = xp.linalg.eigh(K / each[:, None] / each)
-    allowed = _SYMMETRIC * xp.max(abs(squares), initial=0)
-    if known and np.min(squares, initial=0) < -allowed:
+    is_known = not is_traced(K) and not is_traced(mass_roots)
+    xp: Any = np if is_known else jnp
+    if is_known:
+        largest_entry = np.max(abs(K), initial=0)
+        if np.max(abs(K - K.T), initial=0) > _TOLERANCE * largest_entry:
+            raise ValueError(
+                "`stiffness` must be symmetric: it is a second derivative."
+            )
+    root_of_each = xp.broadcast_to(xp.asarray(mass_roots), shape_of_q).reshape(-1)
+    squares, vectors = xp.linalg.eigh(K / root_of_each[:, None] / root_of_each)
+    rounding = _TOLERANCE * xp.max(abs(squares), initial=0)
+    if is_known and np.min(squares, initial=0) < -rounding:
         raise ValueError(
             f"`stiffness` has the negative eigenvalue {np.min(squares):.2g} (over masses): "
             "the rest is no minimum. Leave this part to `slow=`."
         )
-    # Where that is not known, the root of a negative number makes paths fail.
-    squares = xp.where(abs(squares) < allowed, 0.0, squares)
+    squares = xp.where(abs(squares) < rounding, 0.0, squares)
+    # The root of a negative eigenvalue that is traced is NaN, which makes paths fail.
     return jnp.asarray(xp.sqrt(squares)), jnp.asarray(vectors)
 
 
-def _project(
+def _to_modes(
     vectors: Float[Array, "n n"], x: Float[Array, "..."]
 ) -> Float[Array, " n"]:
+    """The modes of `x`, positions or momenta of any shape."""
     return vectors.T.astype(x.dtype) @ x.reshape(-1)
 
 
-def _combine(vectors: Float[Array, "n n"], modes: Float[Array, " n"]) -> Array:
+def _from_modes(vectors: Float[Array, "n n"], modes: Float[Array, " n"]) -> Array:
+    """The positions or momenta of these modes, as a vector."""
     return vectors.astype(modes.dtype) @ modes
 
 
 class CayleyFlow(eqx.Module):
     """The flow that `linear_flow` returns.
 
-    - `frequencies`: of the modes.
+    - `frequencies`: the frequencies of the modes.
     - `to_modes`, `from_modes`: the maps between positions times the roots of masses and
         modes.
-    - `roots`: the roots of the masses.
+    - `mass_roots`: the roots of the masses.
     - `rest`: the positions at rest.
     """
 
     frequencies: Float[Array, "..."]
     to_modes: Callable[[Array], Array]
     from_modes: Callable[[Array], Array]
-    roots: Float[Array, "..."]
+    mass_roots: Float[Array, "..."]
     rest: Float[Array, "..."]
 
     def __call__(
         self, time: RealScalarLike, y: tuple[Array, Array], args: Args
     ) -> tuple[Array, Array]:
-        """The state after `time`, half of a step."""
+        """The state after `time`, half of a step.
+
+        In a mode with the scaled positions `Q = sqrt(m) q` and momenta `P = p / sqrt(m)`,
+        `dP/dt = -omega^2 Q` and `dQ/dt = P`. It turns by the angle `arctan(omega time)`.
+        """
         del args
         check_pair(y)
         p, q = y
         dtype = jnp.result_type(q)
-        roots = self.roots.astype(dtype)
+        mass_roots = self.mass_roots.astype(dtype)
         rest = self.rest.astype(dtype)
         omega = self.frequencies.astype(dtype)
         time = jnp.asarray(time, dtype)
-        # Cosine and sine of the angle, the sine over the frequency.
+        # The sine of the angle is its cosine times `omega time`. The quotient of sine and
+        # frequency is right for a frequency of zero, too.
         cosine = 1 / jnp.sqrt(1 + (omega * time) ** 2)
-        sine = time * cosine
-        P = self.to_modes(p / roots)
-        Q = self.to_modes((q - rest) * roots)
-        p = self.from_modes(cosine * P - omega**2 * sine * Q).reshape(jnp.shape(q))
-        q = self.from_modes(cosine * Q + sine * P).reshape(jnp.shape(q))
-        return p * roots, rest + q / roots
+        sine_over_omega = time * cosine
+        P = self.to_modes(p / mass_roots)
+        Q = self.to_modes((q - rest) * mass_roots)
+        P1 = cosine * P - omega**2 * sine_over_omega * Q
+        Q1 = cosine * Q + sine_over_omega * P
+        p1 = self.from_modes(P1).reshape(jnp.shape(q)) * mass_roots
+        q1 = rest + self.from_modes(Q1).reshape(jnp.shape(q)) / mass_roots
+        return p1, q1

@@ -19,24 +19,26 @@ from .record import Want
 def own_path(
     solver: diffrax.AbstractSolver, want: Want, shape: PyTree, key: PRNGKeyArray
 ) -> diffrax.AbstractBrownianPath:
-    """The path of a solver of this package, or else a Gaussian path."""
+    """The path `solver.path(shape, key)` of a solver of this package, or for any other
+    solver a Gaussian path."""
     # `isinstance` would look through a `diffrax.HalfSolver`.
     if issubclass(type(solver), AbstractSymplecticSolver):
         return cast(AbstractSymplecticSolver, solver).path(shape, key, want=want)
-    return common_path(solver, None, shape, key)
+    return common_path(solver, cell=None, shape=shape, key=key)
 
 
 def common_path(
     solver: diffrax.AbstractSolver, cell: float | None, shape: PyTree, key: PRNGKeyArray
 ) -> diffrax.AbstractBrownianPath:
-    """A Gaussian path with the Lévy areas that the solver needs. With `cell` it is the same
-    Brownian motion for all solvers."""
-    area = diffrax.SpaceTimeLevyArea
-    path = FixedStepBrownianPath(shape, key, levy_area=area, cell=cell)
-    needs = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
-    if needs is PlateauIncrement:
+    """A Gaussian path with the Lévy areas that the solver needs. With `cell`, a time of
+    which all steps are multiples, it is the same Brownian motion for all solvers."""
+    path = FixedStepBrownianPath(
+        shape, key, levy_area=diffrax.SpaceTimeLevyArea, cell=cell
+    )
+    increment = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
+    if increment is PlateauIncrement:
         return PlateauBrownianPath(path, key)
-    if needs is LevyAreaIncrement:
+    if increment is LevyAreaIncrement:
         num_terms = 0 if cell else 2
         return LevyAreaBrownianPath(path, key, num_terms=num_terms, cell=cell)
     return path

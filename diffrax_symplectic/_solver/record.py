@@ -44,9 +44,10 @@ class Record(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """When to choose it, where noise gives stiff modes the wrong energy, and for which
-        friction the temperature is wrong."""
+        """When to choose it, and its limits by `heats` and `most_friction`, in sentences
+        for users."""
         sentences = [self.choose]
+        # If stationary momenta are exact, a heat bath corrects the energy.
         if self.heats is False and "pp" in self.stationary:
             sentences.append("If noise drives stiff modes, only in a heat bath.")
         elif self.heats is False:

@@ -11,26 +11,26 @@ from .._root_finder import PicardNewton
 from .base import AbstractImplicitStages
 
 
-def with_changed_stages(solver: Any, changed: Callable[[Any], Any]) -> Any:
-    """The solver, with `changed(x)` in place of itself or of each solver `x` in it whose
-    stage equations a `PicardNewton` solves."""
+def with_changed_stages(solver: Any, change: Callable[[Any], Any]) -> Any:
+    """The solver, with each solver in it (or itself) whose stage equations a `PicardNewton`
+    solves replaced by what `change` returns for it."""
 
     def is_implicit(x: Any) -> bool:
         return isinstance(x, AbstractImplicitStages)
 
-    def replaced(x: Any) -> Any:
+    def change_if_possible(x: Any) -> Any:
         if is_implicit(x) and isinstance(x.root_finder, PicardNewton):
-            return changed(x)
+            return change(x)
         return x
 
-    return jtu.tree_map(replaced, solver, is_leaf=is_implicit)
+    return jtu.tree_map(change_if_possible, solver, is_leaf=is_implicit)
 
 
 def without_newton(solver: Any) -> Any:
     """The solver, and all solvers in it, with a root finder that ends after its sweeps."""
 
-    def swept(x: Any) -> Any:
-        sweeps = dataclasses.replace(x.root_finder, newton_steps=0)
-        return eqx.tree_at(lambda stages: stages.root_finder, x, sweeps)
+    def with_sweeps_alone(implicit_solver: Any) -> Any:
+        sweeps = dataclasses.replace(implicit_solver.root_finder, newton_steps=0)
+        return eqx.tree_at(lambda x: x.root_finder, implicit_solver, sweeps)
 
-    return with_changed_stages(solver, swept)
+    return with_changed_stages(solver, with_sweeps_alone)

@@ -246,14 +246,15 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         if constraint_of(terms) is None:
             return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
-        at = terms, t0, t1, y0, args
-        y1, outcome = verlet_step(*at, solver_state, type(self).__name__)
+        y1, outcome = verlet_step(
+            terms, t0, t1, y0, args, solver_state, type(self).__name__
+        )
         result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), outcome, result
 
 
-# The three kicks, as combinations of random variables: with M = W / 2 + H, these are M - C,
-# 2 C and W - M - C.
+# The three kicks of `PlateauVerlet`, as combinations of random variables: with
+# M = W / 2 + H these are M - C, 2 C and W - M - C.
 _KICKS = {"W": [1 / 2, 0, 1 / 2], "H": [1, 0, -1], "C": [-1, 2, -1]}
 _plateau_verlet = PartitionedTableau(
     alpha=[1 / 2, 1 / 2],

@@ -27,11 +27,11 @@ class LinearFlowState(NamedTuple):
     """What a `LinearFlow` hands on from the end of a step to the start of the next one.
 
     - `solver`: the state of the solver for the rest.
-    - `broken`: whether the flow returned NaN at the start of the solve.
+    - `is_broken`: whether the flow returned NaN at the start of the solve.
     """
 
     solver: PyTree[Array]
-    broken: Bool[Array, ""]
+    is_broken: Bool[Array, ""]
 
 
 # What to use in a heat bath, for every refusal.
@@ -106,7 +106,8 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
         record = self.solver.record
         if record is None:
             return None
-        # What the solver alone keeps exactly, it need not keep with a flow around it.
+        # With a flow around it, stationary moments that are exact for the solver alone need
+        # not be.
         return record._replace(
             weak=_at_most(record.weak, self.weak),
             strong=_at_most(record.strong, self.strong),
@@ -166,11 +167,11 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
         check_returns_pair(self.flow, t0, y0, args)
         t0 = jnp.asarray(t0, jnp.result_type(t0, jnp.float32))
 
-        def after(time: RealScalarLike, y: Y) -> Y:
+        def after_flow(time: RealScalarLike, y: Y) -> Y:
             return self.flow(time, y, args)
 
-        # `t0` serves as any duration: what depends on what is decided without values.
-        dependence = Dependence(after, t0, y0)
+        # `t0` stands for any duration: dependence is decided without values.
+        dependence = Dependence(after_flow, t0, y0)
         if dependence.independent(lambda time, y: time):
             raise ValueError(
                 "`flow(time, y, args)` of `LinearFlow` does not depend on `time`, so it is "
@@ -181,28 +182,31 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
     def init(self, terms, t0, t1, y0, args) -> Any:
         check_unconstrained(terms, type(self).__name__)
         self.check(terms, t0, y0, args)
-        state = self.solver.init(terms, t0, t1, y0, args)
-        broken = returns_nan(self.flow, direction(terms) * (t1 - t0) / 2, y0, args)
-        return LinearFlowState(state, broken)
+        inner_state = self.solver.init(terms, t0, t1, y0, args)
+        half = direction(terms) * (t1 - t0) / 2
+        is_broken = returns_nan(self.flow, half, y0, args)
+        return LinearFlowState(inner_state, is_broken)
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
-        del made_jump
-        state, broken = solver_state
+        inner_state, is_broken = solver_state
         # Steps are positive even in a solve backward in time, where the flow runs back.
         half = direction(terms) * (t1 - t0) / 2
         y = self.flow(half, y0, args)
         # The flow is a jump for a solver that remembers the end of its last step.
-        y, error, _, state, result = self.solver.step(
-            terms, t0, t1, y, args, state, True
+        made_jump = True
+        y, error, _, inner_state, result = self.solver.step(
+            terms, t0, t1, y, args, inner_state, made_jump
         )
         y1 = self.flow(half, y, args)
         R: Any = diffrax.RESULTS
-        result = R.where(broken, R.nonfinite, result)
-        return y1, error, dict(y0=y0, y1=y1), LinearFlowState(state, broken), result
+        result = R.where(is_broken, R.nonfinite, result)
+        state = LinearFlowState(inner_state, is_broken)
+        return y1, error, dict(y0=y0, y1=y1), state, result
 
 
 def _at_most(order: Order | None, most: int) -> Order | None:
-    """The order of a splitting that has at most this order itself."""
+    """The `order` of a solver, or a pair of orders for two kinds of noises, bounded by the
+    order `most` of the splitting around it."""
     if isinstance(order, tuple):
         commuting, others = order
         return min(commuting, most), min(others, most)

@@ -22,50 +22,52 @@ from .._tableau import Block, FlatTableau, Group, Stage, StepPlan
 from .._terms import tree_sum
 
 
-# The value of a stage: the change of the part of the state that it writes. Of several
-# stages evaluated together, their values are stacked along a first axis.
+# The value of a stage: the change of the part of the state that it writes. The values of
+# several stages that are evaluated together are stacked along a first axis.
 _Value: TypeAlias = PyTree[Array]
 # The values of the stages known so far, by stage number.
 Values: TypeAlias = dict[int, _Value]
 # The values of the unknown stages: for each block, for each of its groups.
 Unknown: TypeAlias = list[list[_Value]]
-# The vector field of one channel times its control, as a function of time and state.
-Driven: TypeAlias = Callable[[RealScalarLike, Y], Y]
+# The change of the state by one channel over the whole step, its vector field times its
+# control, as a function of time and state.
+Change: TypeAlias = Callable[[RealScalarLike, Y], Y]
 
 
 class Step(NamedTuple):
     """One step.
 
     - `t0`, `h`: its start and size.
-    - `driven`: for each channel the vector field times its control.
+    - `changes`: for each channel, the function for the change of the state.
     """
 
     t0: RealScalarLike
     h: RealScalarLike
-    driven: dict[str, Driven]
+    changes: dict[str, Change]
 
 
 class Stages(eqx.Module):
-    """The stages of one step, in the blocks of its plan. Unknown values count as zero."""
+    """The stages of one step, in the blocks of its plan. While a block is solved, values of
+    later blocks count as zero: earlier blocks do not depend on these."""
 
     plan: StepPlan = eqx.field(static=True)
     step: Step
     y0: Y
 
-    def zero_of(self, block: Block) -> list[_Value]:
-        """Zero for each unknown stage of a block."""
+    def zeros_for(self, block: Block) -> list[_Value]:
+        """Zeros for the unknown stages of a block, as a guess."""
 
-        def zero(group: Group) -> _Value:
+        def zero_value(group: Group) -> _Value:
             first = self.plan.tableau.stages[group[0]]
-            # One stage alone is not stacked.
-            stacked = (len(group),) if len(group) > 1 else ()
+            # The value of one stage alone is not stacked.
+            stacked_axis = (len(group),) if len(group) > 1 else ()
 
             def zeros(x: Array) -> Array:
-                return jnp.zeros((*stacked, *jnp.shape(x)), jnp.result_type(x))
+                return jnp.zeros((*stacked_axis, *jnp.shape(x)), jnp.result_type(x))
 
             return jtu.tree_map(zeros, _part(self.y0, first.writes))
 
-        return [zero(group) for group in block.unknown]
+        return [zero_value(group) for group in block.unknown]
 
     def solve_blocks(
         self, solve: Callable, guess: Unknown, pending: Bool[Array, ""]
@@ -94,25 +96,27 @@ class Stages(eqx.Module):
     ) -> tuple[list[_Value], Bool[Array, ""]]:
         """The unknown values of one block, and whether they solve its equations."""
         # For values that are pairs (p, q), sweeps update all momenta, then all positions.
-        pairs = all(type(value) is tuple and len(value) == 2 for value in guess)
+        are_pairs = all(type(value) is tuple and len(value) == 2 for value in guess)
 
-        def pack(k: list[_Value]) -> Any:
-            return Halves(*zip(*k)) if pairs else k
+        # From [(p_1, q_1), (p_2, q_2), ...] to ((p_1, p_2, ...), (q_1, q_2, ...)).
+        def in_halves(k: list[_Value]) -> Any:
+            return Halves(*zip(*k)) if are_pairs else k
 
-        def unpack(k: Any) -> list[_Value]:
-            return [*zip(*k)] if pairs else k
+        def by_group(k: Any) -> list[_Value]:
+            return [*zip(*k)] if are_pairs else k
 
         def image(k: Any) -> Any:
-            return pack(self._image(block, known, unpack(k)))
+            return in_halves(self._image(block, known, by_group(k)))
 
         def scale(k: Any) -> Any:
-            return pack(self._scale(block, unpack(k)))
+            return in_halves(self._scale(block, by_group(k)))
 
-        k, is_solved = solve(image, scale, pack(guess), pending)
-        return unpack(k), is_solved
+        k, is_solved = solve(image, scale, in_halves(guess), pending)
+        return by_group(k), is_solved
 
     def image(self, unknown: Unknown) -> Unknown:
-        r"""$\Phi$ for the whole step."""
+        r"""The values $\Phi(k)$ that the stage equations of the whole step give to its
+        unknown stages, if they have the values $k$. A solution is a fixed point."""
         values: Values = {}
         image = []
         for block, k in zip(self.plan.blocks, unknown):
@@ -121,7 +125,8 @@ class Stages(eqx.Module):
         return image
 
     def _image(self, block: Block, known: Values, k: list[_Value]) -> list[_Value]:
-        r"""$\Phi$ for the unknown values `k` of one block."""
+        r"""$\Phi(k)$ for the unknown values `k` of one block, with the `known` values of
+        earlier blocks."""
         values = self._with_block(block, known, k)
         return [self._evaluate_group(group, values) for group in block.unknown]
 
@@ -137,13 +142,13 @@ class Stages(eqx.Module):
         for group in block.explicit:
             evaluate = ft.partial(self._evaluate_group, group, values)
             # Within an iteration, storing a value costs as much as computing it again.
-            shared = keep and _uses(self.plan.tableau, group) > 1
-            new = materialize(evaluate) if shared else evaluate()
-            values = values | _unstack(group, new)
+            is_shared = keep and _num_uses(self.plan.tableau, group) > 1
+            value = materialize(evaluate) if is_shared else evaluate()
+            values = values | _unstack(group, value)
         return values
 
     def end(self, unknown: Unknown) -> Y:
-        """The end of the step."""
+        """The state at the end of the step, from the values of its unknown stages."""
         tableau = self.plan.tableau
         values: Values = {}
         for block, k in zip(self.plan.blocks, unknown):
@@ -155,13 +160,15 @@ class Stages(eqx.Module):
         return [self._scale(block, k) for block, k in zip(self.plan.blocks, unknown)]
 
     def _scale(self, block: Block, unknown: list[_Value]) -> list[_Value]:
+        """`scale` for the unknown values of one block."""
+
         def size(y: Array, k: Array) -> Array:
-            # Never below the value itself, so that a step from rest has a scale.
+            # With the value itself, a step from rest has a scale, too.
             return jnp.abs(y) + jnp.abs(k)
 
         def scale(group: Group, value: _Value) -> _Value:
-            changed = _part(self.y0, self.plan.tableau.stages[group[0]].writes)
-            return jtu.tree_map(size, changed, value)
+            changed_part = _part(self.y0, self.plan.tableau.stages[group[0]].writes)
+            return jtu.tree_map(size, changed_part, value)
 
         return [scale(group, k) for group, k in zip(block.unknown, unknown)]
 
@@ -174,32 +181,36 @@ class Stages(eqx.Module):
 
 
 def with_explicit_arrays(step: Step, y0: Y) -> Step:
-    """The same step, with the arrays that its functions capture made explicit. Each
-    function is traced once, here."""
+    """The same step, with the arrays that its functions capture as leaves of the PyTree, so
+    that derivatives with respect to these are seen. Each function is traced once, here."""
     # Converted functions accept only the types that they were traced for.
     dtype = jnp.result_type(step.t0, step.h, float)
     t0 = jnp.asarray(step.t0, dtype)
     h = jnp.asarray(step.h, dtype)
-    driven = {
-        name: eqx.filter_closure_convert(fn, t0, y0) for name, fn in step.driven.items()
+    changes = {
+        name: eqx.filter_closure_convert(change, t0, y0)
+        for name, change in step.changes.items()
     }
-    return Step(t0, h, driven)
+    return Step(t0, h, changes)
 
 
-def _uses(tableau: FlatTableau, group: Group) -> int:
+def _num_uses(tableau: FlatTableau, group: Group) -> int:
     """The number of positions that the values of `group` enter, including the end of the
     step."""
-    columns = np.vstack([tableau.matrix, tableau.weights])[:, list(group)]
-    return int(np.count_nonzero(columns.any(axis=1)))
+    # A row for each position, a column for each stage.
+    coefficients = np.vstack([tableau.matrix, tableau.weights])
+    is_used = coefficients[:, list(group)].any(axis=1)
+    return int(np.count_nonzero(is_used))
 
 
 def _unstack(group: Group, value: _Value) -> Values:
-    """The values of a group, one by one."""
+    """The values of a group by stage number, from its stacked `value`."""
     if len(group) == 1:
-        return {group[0]: value}
+        (number,) = group
+        return {number: value}
     return {
-        i: jtu.tree_map(lambda stacked: stacked[place], value)
-        for place, i in enumerate(group)
+        number: jtu.tree_map(lambda stacked: stacked[place], value)
+        for place, number in enumerate(group)
     }
 
 
@@ -209,36 +220,39 @@ def _evaluate(step: Step, stages: list[Stage], y: Y) -> _Value:
 
     def value(c: RealScalarLike, y: Y) -> _Value:
         t = step.t0 + c * step.h
-        total = tree_sum([step.driven[name](t, y) for name in first.channels])
-        return _part(total, first.writes)
+        change = tree_sum([step.changes[name](t, y) for name in first.channels])
+        return _part(change, first.writes)
 
     if len(stages) == 1:
         return value(first.c, y)
     # `vmap` keeps the compiled code as small as for one evaluation.
-    times = [stage.c for stage in stages]
-    if len(set(times)) == 1:
-        # What depends on time alone is then computed once.
-        return jax.vmap(value, in_axes=(None, 0))(times[0], y)
-    return jax.vmap(value)(jnp.asarray(times, jnp.result_type(step.h, float)), y)
+    fractions = [stage.c for stage in stages]
+    if len(set(fractions)) == 1:
+        # With one time for all, what depends on time alone is computed once.
+        return jax.vmap(value, in_axes=(None, 0))(first.c, y)
+    return jax.vmap(value)(jnp.asarray(fractions, jnp.result_type(step.h, float)), y)
 
 
 def _part(y: PyTree, part: str) -> PyTree:
-    """The state `y`, or its half `"p"` or `"q"`."""
-    return y if part == "y" else y["pq".index(part)]
+    """The state `y`, or for `"p"` or `"q"` its half of this name."""
+    if part == "y":
+        return y
+    p, q = y
+    return p if part == "p" else q
 
 
 def _position(
     y0: Y, stages: tuple[Stage, ...], rows: np.ndarray, values: Values
 ) -> PyTree[Array]:
-    """`y0 + sum_i rows[:, i] values[i]`, stacked unless there is only one row. `values` may
-    hold stages that these rows do not use, with weights of zero; stages that are not in it
-    count as zero."""
+    """`y0 + sum_i rows[:, i] values[i]`: a position for each of these rows of coefficients,
+    stacked unless there is only one. `values` may hold stages that these rows do not use,
+    with coefficients of zero; stages that are not in it count as zero."""
 
     def moved(part: str) -> PyTree[Array]:
         """The state, or half of it, moved by the stages that write it."""
-        base = _part(y0, part)
-        # Zeros are left out here, since XLA may not drop products with zero, which are not
-        # zero for infinite values.
+        start = _part(y0, part)
+        # Products with zero are left out here. XLA may not drop them: the product of zero
+        # and infinity is NaN.
         products = [
             _product(rows[:, i], value)
             for i, value in values.items()
@@ -246,14 +260,16 @@ def _position(
         ]
         if products:
             # Add the small terms first, for fewer roundings at the size of the state.
-            return (base**ω + tree_sum(products) ** ω).ω
-        return base if len(rows) == 1 else jtu.tree_map(for_each_row, base)
+            return (start**ω + tree_sum(products) ** ω).ω
+        return start if len(rows) == 1 else jtu.tree_map(for_each_row, start)
 
     def for_each_row(x: Array) -> Array:
         return jnp.broadcast_to(x, (len(rows), *jnp.shape(x)))
 
-    # A tableau writes whole states, or halves of states, but not both.
-    return moved("y") if stages[0].writes == "y" else (moved("p"), moved("q"))
+    # The stages of a tableau all write whole states, or all write halves of states.
+    if stages[0].writes == "y":
+        return moved("y")
+    return moved("p"), moved("q")
 
 
 def _product(weights: np.ndarray, value: _Value) -> PyTree[Array]:
@@ -264,14 +280,15 @@ def _product(weights: np.ndarray, value: _Value) -> PyTree[Array]:
         return value if weight == 1 else (weight * value**ω).ω
 
     def products(x: Array) -> Any:
+        # The weights along a new first axis, and an axis of length one for each of `x`.
         as_column = (-1, *[1] * x.ndim)
         return weights.astype(x.dtype).reshape(as_column) * x
 
     return jtu.tree_map(products, value)
 
 
-# The outcome of the stage equations, or of an earlier failed step; `None` if there are
-# none.
+# The outcome of the stage equations of a step, or of an earlier step that failed; `None`
+# for a solver without stage equations.
 Outcome: TypeAlias = optx.RESULTS | None
 
 
@@ -285,21 +302,21 @@ def take_step(
     """The end of the step, and whether its stage equations were solved, by the root finder
     of `solver`. A path that failed `before` is skipped."""
     if plan.num_unknown == 0:
-        nothing = [[]] * len(plan.blocks)
-        return Stages(plan, step, y0).end(nothing), before
+        no_unknown: Unknown = [[] for _ in plan.blocks]
+        return Stages(plan, step, y0).end(no_unknown), before
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         raise ValueError(
             f"The tableau of `{type(solver).__name__}` has implicit stages. Let the class "
             "also inherit from `diffrax_symplectic.AbstractImplicitStages`."
         )
     before = no_failure() if before is None else before
-    return _traced_once(
+    return _jitted_implicit_step(
         plan, step, y0, before, solver.root_finder, solver.root_find_max_steps
     )
 
 
 def no_failure() -> optx.RESULTS:
-    """The result before the first step, as arrays, since it is carried by a loop."""
+    """The outcome before the first step, as arrays, since a loop carries it."""
     return jtu.tree_map(jnp.asarray, optx.RESULTS.successful)
 
 
@@ -308,18 +325,18 @@ def _failed(result: optx.RESULTS) -> Bool[Array, ""]:
 
 
 def result_of(outcome: Outcome, y1: Y) -> diffrax.RESULTS:
-    """The result of a step."""
+    """The result of a step that ends at `y1`, as Diffrax reports it."""
     R = diffrax.RESULTS
-    # Finite stages may still have an end that overflows.
-    finite = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
+    # The end may overflow although all stages are finite.
+    result = R.where(all_finite(y1), R.successful, R.nonfinite)  # pyright: ignore
     if outcome is None:
-        return finite
-    return R.where(_failed(outcome), R.promote(outcome), finite)
+        return result
+    return R.where(_failed(outcome), R.promote(outcome), result)
 
 
-# Diffrax traces a step three times or more.
+# Diffrax traces a step three times or more. Under `filter_jit` that is done once.
 @eqx.filter_jit
-def _traced_once(
+def _jitted_implicit_step(
     plan: StepPlan, step: Step, y0: Y, before, finder: Any, max_steps: int
 ):
     stages = Stages(plan, with_explicit_arrays(step, y0), y0)
@@ -338,11 +355,11 @@ def _implicit_step(
             "`BestSoFarRootFinder` returns an iterate from before the last correction, "
             "which does not solve the stage equations. Pass the root finder that it wraps."
         )
-    lost = _failed(before)
-    guess = [stages.zero_of(block) for block in stages.plan.blocks]
-    guess, lost = batched_like((guess, lost), (stages, before))
-    # Optimistix stops at once if the guess is not finite.
-    guess = jtu.tree_map(lambda k: jnp.where(lost, jnp.nan, k), guess)
+    failed_before = _failed(before)
+    guess = [stages.zeros_for(block) for block in stages.plan.blocks]
+    guess, failed_before = batched_like((guess, failed_before), (stages, before))
+    # A guess that is not finite makes the root finder stop at once.
+    guess = jtu.tree_map(lambda k: jnp.where(failed_before, jnp.nan, k), guess)
     sol = optx.root_find(
         lambda k, stages: (k**ω - stages.image(k) ** ω).ω,
         finder,
@@ -353,7 +370,7 @@ def _implicit_step(
         max_steps=max_steps,
         throw=False,
     )
-    result = optx.RESULTS.where(lost, before, sol.result)
+    result = optx.RESULTS.where(failed_before, before, sol.result)
     return stages.end(sol.value), sol.value, result
 
 
@@ -369,26 +386,28 @@ def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
     failed = _failed(result) | ~all_finite(y1)
     root = jtu.tree_map(lambda k: jnp.where(failed, 0, k), unknown)
 
-    # What is not differentiated has `None` for a tangent, which `jax.jvp` does not take.
-    fixed = jtu.tree_map(_is_none, t_stages, is_leaf=_is_none)
-    fixed_part, moving = eqx.partition(stages, fixed, is_leaf=_is_none)
+    # A leaf that is not differentiated has the tangent `None`, which `jax.jvp` does not
+    # take.
+    has_no_tangent = jtu.tree_map(_is_none, t_stages, is_leaf=_is_none)
+    constants, variables = eqx.partition(stages, has_no_tangent, is_leaf=_is_none)
 
-    def image(moving: Stages) -> Unknown:
-        return eqx.combine(moving, fixed_part).image(root)
+    def image(variables: Stages) -> Unknown:
+        return eqx.combine(variables, constants).image(root)
 
-    def end(moving: Stages, unknown: Unknown) -> Y:
-        return eqx.combine(moving, fixed_part).end(unknown)
+    def end(variables: Stages, unknown: Unknown) -> Y:
+        return eqx.combine(variables, constants).end(unknown)
 
-    # With k = Phi(k, x): dk = (dPhi / dk) dk + (dPhi / dx) dx.
-    _, rhs = jax.jvp(image, (moving,), (t_stages,))
+    # The unknown values k satisfy k = Phi(k, x) with the variables x. So their tangents
+    # satisfy dk = (dPhi / dk) dk + (dPhi / dx) dx.
+    _, rhs = jax.jvp(image, (variables,), (t_stages,))
     _, linear = jax.linearize(stages.image, root)
     # The linear solver of a root finder, as in `PicardNewton` and `optx.Newton`, serves for
     # derivatives, too. Others (`optx.FixedPointIteration`, `optx.Dogleg`) have none.
     t_unknown = differentiate(getattr(finder, "linear_solver", None), linear, rhs)
-    _, t_y1 = jax.jvp(end, (moving, root), (t_stages, t_unknown))
+    _, t_y1 = jax.jvp(end, (variables, root), (t_stages, t_unknown))
     t_y1, t_unknown = jtu.tree_map(lambda t: jnp.where(failed, 0, t), (t_y1, t_unknown))
-    no_tangent = jtu.tree_map(lambda _: None, result)
-    return (y1, unknown, result), (t_y1, t_unknown, no_tangent)
+    t_result = jtu.tree_map(lambda _: None, result)
+    return (y1, unknown, result), (t_y1, t_unknown, t_result)
 
 
 def _is_none(x: Any) -> bool:

@@ -23,8 +23,8 @@ _OUTSIDE = (
 
 
 def check_resolution(h: float, t0: float, t1: float, dtype: Any) -> None:
-    """Raises a `ValueError` if `result_with_times_checked` would report steps of this size
-    as failed."""
+    """Raises a `ValueError` for steps of size `h` between `t0` and `t1` that are too short
+    for times of this dtype: `result_with_times_checked` would report each as failed."""
     rounding = float(jnp.finfo(dtype).eps) * max(abs(t0), abs(t1))
     if h < ROUNDINGS * rounding:
         raise ValueError(
@@ -40,7 +40,7 @@ def result_with_times_checked(
     t1: RealScalarLike,
     result: diffrax.RESULTS,
 ) -> diffrax.RESULTS:
-    """`result` of the step from `t0` to `t1`, or `RESULTS.dt_min_reached` if it is too
+    """The `result` of the step from `t0` to `t1`, or `RESULTS.dt_min_reached` if it is too
     short for the rounding of times. An error when run if a path does not cover the step."""
     R: Any = diffrax.RESULTS
     t0 = jnp.asarray(t0)
@@ -53,14 +53,15 @@ def result_with_times_checked(
     for path in brownian_paths(terms):
         # Most paths have no ends, so that nothing needs to be checked when run. Ends that
         # are traced arrays cannot be compared here.
-        is_known = isinstance(path.t0, float) and isinstance(path.t1, float)
-        if is_known and path.t0 == -np.inf and path.t1 == np.inf:
+        are_known = isinstance(path.t0, float) and isinstance(path.t1, float)
+        if are_known and path.t0 == -np.inf and path.t1 == np.inf:
             continue
         # In a solve backward in time Diffrax changes the sign of all times.
         forward = direction(terms) > 0
         begin = jnp.where(forward, t0, -t1)
         end = jnp.where(forward, t1, -t0)
-        # Times are rounded, so that the last step may end just behind the path.
+        # Times are rounded, so that a step may begin just before the path or end just after
+        # it. A hundredth of the step is at least one rounding: see `ROUNDINGS`.
         slack = 0.01 * h
         is_outside = (begin < path.t0 - slack) | (end > path.t1 + slack)
         result = eqx.error_if(result, is_outside, _OUTSIDE)

@@ -24,31 +24,34 @@ def _sharding_constraint(o, x):
 
 
 def _raises(region: Any) -> bool:
-    """Whether it calls back to Python, as `equinox.error_if` does to raise an error."""
+    """Whether a region calls back to Python, as it does for `equinox.error_if`."""
     calls = [op for op in operations_in(region) if "custom_call" in op.name]
     return any("callback" in call_target(op) for op in calls)
 
 
 @rule
 def _case(o, index):
-    number = len(o.op.regions)
+    num_branches = len(o.op.regions)
     value = known(index)
     if value is not None:
         # An index that is out of range stands for the last branch.
-        return o.run(int(value) if 0 <= value < number else number - 1, [])
-    raising = [i for i in range(number) if _raises(o.op.regions[i])]
+        is_in_range = 0 <= value < num_branches
+        return o.run(int(value) if is_in_range else num_branches - 1, [])
     # A kernel cannot raise an error. Lanes that would are marked, and take another branch.
-    for i in raising:
-        o.fail(index.item() == i)
-    branches = [i for i in range(number) if i not in raising]
+    branches = []
+    for i, region in enumerate(o.op.regions):
+        if _raises(region):
+            o.fail(index.item() == i)
+        else:
+            branches.append(i)
     return unflat(_result_of_branch(o, index.item(), branches), o.shapes())
 
 
 def _result_of_branch(
     o: Operation, index: Any, branches: Sequence[int]
 ) -> tuple[Any, ...]:
-    """The entries that the branch with this index returns. If there is none in `branches`,
-    it is the last of them."""
+    """The entries that the branch of this index returns, or the last of `branches` if these
+    do not contain it."""
     first, *others = branches
 
     def run_first() -> tuple[Any, ...]:
@@ -75,7 +78,8 @@ def _conditional(
 
         return run
 
-    # Symbolic: as part of the kernel. Otherwise Dr.Jit may run a branch at once.
+    # A symbolic conditional is a part of the kernel. Otherwise Dr.Jit may run a branch at
+    # once.
     out = drjit().if_stmt(
         (),
         condition,
@@ -108,61 +112,66 @@ def _if(o, condition):
 
 
 # The most iterations to unroll, of a loop whose condition is known.
-_WRITTEN_OUT = 8
-# Of one that moves indices only, such as a bisection or the exchanges of rows of a matrix.
-# Written out, most of its operations are folded.
-_INDICES_WRITTEN_OUT = 32
+_MOST_UNROLLED = 8
+# The same for a loop that changes indices only, such as a bisection or the exchanges of
+# rows of a matrix. Most operations of its unrolled iterations are folded.
+_MOST_UNROLLED_OF_INDICES = 32
 
 
 @rule
 def _while(o, *xs):
-    moves = _which_move(o)
-    indices_only = not any(map(drjit().is_float_v, flat(chosen(xs, moves))))
-    most = _INDICES_WRITTEN_OUT if indices_only else _WRITTEN_OUT
+    changes = _which_change(o)
+    indices_only = not any(map(drjit().is_float_v, flat(chosen(xs, changes))))
+    most = _MOST_UNROLLED_OF_INDICES if indices_only else _MOST_UNROLLED
     state = [*xs]
-    number = 0
-    # As long as the condition is known, the loop is written out. What is left then, or
-    # after too many iterations, is a loop of the kernel.
-    while (go_on := known(o.run(0, state)[0])) is not None and number < most:
-        if not go_on:
+    # As long as the condition is known, the loop is unrolled. The iterations that are left
+    # then, or after too many, are a loop of the kernel.
+    for _ in range(most):
+        (condition,) = o.run(0, state)
+        goes_on = known(condition)
+        if goes_on is None:
+            break
+        if not goes_on:
             return state
         state = o.run(1, state)
-        number += 1
-    return _loop(o, state, moves)
+    return _loop(o, state, changes)
 
 
-def _which_move(o: Operation) -> list[bool]:
+def _which_change(o: Operation) -> list[bool]:
     """Which values of a loop its body changes."""
     body = block_of(o.op, 1)
     *_, last = body.operations
     return [new != old for new, old in zip(last.operands, body.arguments)]
 
 
-def _loop(o: Operation, state: list[Tensor], moves: Sequence[bool]) -> list[Tensor]:
+def _loop(o: Operation, state: list[Tensor], changes: Sequence[bool]) -> list[Tensor]:
     """A loop of the kernel, from this state on."""
     # Values that do not change stay out of the loop's state, so that constants stay known.
-    start = chosen(state, moves)
-    still = chosen(state, [not move for move in moves])
-    shapes = [x.shape for x in start]
+    variables = chosen(state, changes)
+    constants = chosen(state, [not change for change in changes])
+    shapes = [x.shape for x in variables]
 
-    def whole(entries: Iterable[Any]) -> list[Tensor]:
-        return merged(moves, unflat(entries, shapes), still)
+    def whole_state(entries: Iterable[Any]) -> list[Tensor]:
+        return merged(changes, unflat(entries, shapes), constants)
 
     def goes_on(failed: Any, *entries: Any) -> Any:
-        (going,), new = o.failing(lambda: o.run(0, whole(entries)))
+        (condition,), fails_now = o.failing(lambda: o.run(0, whole_state(entries)))
         # A lane that failed could go on for ever.
-        return going.item() & ~(failed | new)
+        return condition.item() & ~(failed | fails_now)
 
-    def once(failed: Any, *entries: Any) -> tuple[Any, ...]:
-        state, new = o.failing(lambda: o.run(1, whole(entries)))
-        return failed | new, *copied(chosen(state, moves))
+    def iterate(failed: Any, *entries: Any) -> tuple[Any, ...]:
+        new_state, fails_now = o.failing(lambda: o.run(1, whole_state(entries)))
+        return failed | fails_now, *copied(chosen(new_state, changes))
 
     # Where no lane can fail, Dr.Jit leaves the mask out.
     none = array_types()["i1"](False)
-    out = drjit().while_loop((none, *flat(start)), goes_on, once, mode="symbolic")
+    out = drjit().while_loop(
+        (none, *flat(variables)), goes_on, iterate, mode="symbolic"
+    )
     failed, *entries = map(as_own_literal, out)
     o.fail(failed)
-    end = whole(entries)
-    # A loop returns no mask of its condition, but such lanes have stopped there.
+    end = whole_state(entries)
+    # A loop of Dr.Jit does not return the lanes that fail in its condition. They stopped
+    # there, so that the condition at the end marks them once more.
     o.run(0, end)
     return end

@@ -19,13 +19,13 @@ from .integers import arithmetic_shift, logical_shift, safe_divisor, shift_left
 # Powers with whole exponents up to this size are products, of at most twelve factors, which
 # have no logarithm of a negative number. Larger ones are computed by logarithms.
 _MOST_MULTIPLIED = 64
-# For the complementary error function: the place, from zero to infinity, that its series
-# has in the middle, and the degree of the series for each size of numbers in bytes. The
+# The series of the complementary error function maps this place to the middle of its range,
+# and zero and infinity to the ends. Its degree depends on the size of numbers in bytes. The
 # first coefficients left out are 2e-9 and 7e-17. With a middle of 4 they are as small, with
 # 2 larger.
 _ERFC_MIDDLE = 3.0
 _ERFC_DEGREES = {4: 11, 8: 23}
-# Both precisions have zero from here on.
+# The complementary error function is zero in both precisions from here on.
 _ERFC_END = 30.0
 
 
@@ -103,7 +103,7 @@ def _remainder(a, b):
     size = dr.abs(a)
     step = dr.abs(b)
     rest = dr.fma(-dr.trunc(size / step), step, size)
-    # Where the quotient was rounded to the next whole number.
+    # Where the quotient was rounded to the next whole number, the rest is off by one step.
     rest = dr.select(rest < 0, rest + step, dr.select(rest >= step, rest - step, rest))
     rest = dr.select(dr.isinf(b) & dr.isfinite(a), size, rest)
     return dr.select(dr.isfinite(a) & ~(b == 0), dr.copysign(rest, a), type(a)(np.nan))
@@ -126,28 +126,30 @@ def _power(base, exponent):
     dr = drjit()
     dtype = type(base)
     size = dr.exp(dr.log(dr.abs(base)) * exponent)
-    # Of a negative number only whole powers are real: odd ones are negative.
+    # A negative number has real powers for whole exponents only, negative for odd ones.
     is_whole = dr.floor(exponent) == exponent
     is_odd = dr.floor(exponent / 2) * 2 != exponent
     whole_power = dr.select(is_odd, -size, size)
     other_power = dr.select(dr.isinf(base), size, dtype(np.nan))
     of_negative = dr.select(is_whole, whole_power, other_power)
     power = dr.select(base < 0, of_negative, size)
-    # Where the product of logarithm and exponent is infinity times zero, or may be: a power
-    # of zero, the power zero, and a power of one.
+    # The product of logarithm and exponent is infinity times zero, or may be, for powers of
+    # zero, the power zero, and powers of one.
     power = dr.select((base == 0) & (exponent > 0), dtype(0), power)
     return dr.select((exponent == 0) | (base == 1), dtype(1), power)
 
 
 def _integer_power(base, exponent: int):
-    """By repeated squares."""
+    """The power for an exponent that is known, by repeated squares."""
     power = type(base)(1)
+    # The squares are those of the bits of the exponent, from the last bit on.
     square = base
-    left = abs(exponent)
-    while left:
-        power = power * square if left & 1 else power
+    bits = abs(exponent)
+    while bits:
+        is_odd = bits & 1
+        power = power * square if is_odd else power
         square = square * square
-        left = left >> 1
+        bits = bits >> 1
     return 1 / power if exponent < 0 else power
 
 
@@ -208,7 +210,7 @@ def _erfc(a):
     `_erfc_series` has a polynomial, times `exp(-a^2)`."""
     dr = drjit()
     dtype = type(a)
-    # Not infinite, of which the next quotient would be NaN.
+    # The size is bounded, since the next quotient would be NaN for infinity.
     size = _minimum(dr.abs(a), dtype(_ERFC_END))
     s = (size - _ERFC_MIDDLE) / (size + _ERFC_MIDDLE)
     first, *others = _erfc_series(_ERFC_DEGREES[dr.itemsize_v(a)])
@@ -243,7 +245,7 @@ def _erfc_series(degree: int) -> list[float]:
     # coefficients that are kept. NumPy's `chebinterpolate` rounds more.
     num_nodes = 64
     angles = (np.arange(num_nodes) + 0.5) * np.pi / num_nodes
-    # Where the variable of the polynomials is the cosine of the angle.
+    # The places where the variable of the polynomials is the cosine of these angles.
     x = _ERFC_MIDDLE / np.tan(angles / 2) ** 2
     series = np.asarray(dct((1 + 2 * x) * erfcx(x))) / num_nodes
     series[0] /= 2
@@ -260,7 +262,8 @@ def _rsqrt(a):
 
 def _half_exp(a):
     """Half of the exponential, which is finite also where the exponential overflows."""
-    # Its error is that of the root twice, so it serves only there.
+    # The error of the root counts twice, so this serves only where the exponential
+    # overflows.
     root = drjit().exp(a / 2)
     return root / 2 * root
 
@@ -317,7 +320,7 @@ def _erf_inv(a):
 
 def _round_half_away(a):
     dr = drjit()
-    # The sum of `a` and one half is rounded itself. The fraction that is compared is exact.
+    # The fraction that is compared is exact. The sum of `a` and one half would be rounded.
     whole = dr.trunc(a)
     away = whole + dr.copysign(type(a)(1), a)
     return dr.select(dr.abs(a - whole) >= 0.5, away, whole)

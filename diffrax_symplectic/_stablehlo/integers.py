@@ -8,14 +8,16 @@ from .backend import array_types, drjit
 
 
 def safe_divisor(a, b):
-    """A safe divisor for integers, and where the given one is 0 and -1: processors trap on
-    division by zero, and of the smallest integer by -1."""
+    """A divisor in place of the integer `b`, by which `a` can be divided; the mask where
+    `b` is 0; and the mask where it is -1. Processors trap on division by zero, and of the
+    smallest integer by -1: there the divisor is 1."""
     dr = drjit()
-    zero = b == 0
-    # A number without sign is never -1.
-    minus_one = (b == -1) if dr.is_signed_v(b) else ~zero & zero
-    overflow = minus_one & (a == _least(a))
-    return dr.select(zero | overflow, type(b)(1), b), zero, minus_one
+    is_zero = b == 0
+    # A number without sign is never -1: the mask is false everywhere.
+    is_minus_one = (b == -1) if dr.is_signed_v(b) else ~is_zero & is_zero
+    overflows = is_minus_one & (a == _least(a))
+    safe = dr.select(is_zero | overflows, type(b)(1), b)
+    return safe, is_zero, is_minus_one
 
 
 def _least(a):
@@ -30,7 +32,7 @@ def _least(a):
 
 def shift_left(a, b):
     b = _without_sign(b)
-    # By all bits or more it gives zero. LLVM leaves that undefined.
+    # A shift by all bits or more gives zero. LLVM leaves it undefined.
     return drjit().select(b < 8 * drjit().itemsize_v(a), a << type(a)(b), 0)
 
 
@@ -43,7 +45,7 @@ def logical_shift(a, b):
 def arithmetic_shift(a, b):
     b = _without_sign(b)
     signed = _integer("i", a)
-    # By all bits or more it leaves the sign.
+    # A shift by all bits or more leaves the sign.
     most = type(b)(8 * drjit().itemsize_v(a) - 1)
     return type(a)(signed >> type(signed)(drjit().select(b < most, b, most)))
 
@@ -58,19 +60,23 @@ def _integer(name: str, a: Any) -> Any:
 
 
 def to_integer(kind: type, a: Any) -> Any:
-    """Rounded to zero. What StableHLO leaves open is as in JAX: NaN becomes zero, and
-    numbers out of range the smallest or the largest integer."""
+    """The floating-point number `a` as an integer of this type, rounded to zero. What
+    StableHLO leaves open is as in JAX: NaN becomes zero, and numbers out of range the
+    smallest or the largest integer."""
     dr = drjit()
     dtype = type(a)
-    signed = dr.is_signed_v(kind)
+    is_signed = dr.is_signed_v(kind)
     bits = 8 * dr.itemsize_v(kind)
     # The first whole number beyond the range, a power of two, and the float before it.
-    end = 2 ** (bits - 1 if signed else bits)
-    below = float(np.nextafter(end, 0, dtype=f"f{dr.itemsize_v(a)}"))
-    low = -end if signed else 0
-    inside = dr.select(a > low, dr.select(a < end, a, dtype(below)), dtype(low))
+    end = 2 ** (bits - 1 if is_signed else bits)
+    float_below = float(np.nextafter(end, 0, dtype=f"f{dr.itemsize_v(a)}"))
+    least = -end if is_signed else 0
+    at_most = dr.select(a < end, a, dtype(float_below))
+    in_range = dr.select(a > least, at_most, dtype(least))
     # Dr.Jit has no conversion to integers of eight bits.
-    whole = kind(array_types()["i32"](inside)) if bits < 32 else kind(inside)
-    if int(below) < end - 1:
-        whole = dr.select(a < end, whole, kind(end - 1))
-    return dr.select(~(a == a), kind(0), whole)
+    integer = kind(array_types()["i32"](in_range)) if bits < 32 else kind(in_range)
+    # If the largest integer is no float, larger numbers have become a smaller integer.
+    if int(float_below) < end - 1:
+        integer = dr.select(a < end, integer, kind(end - 1))
+    is_nan = ~(a == a)
+    return dr.select(is_nan, kind(0), integer)

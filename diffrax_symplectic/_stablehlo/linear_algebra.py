@@ -28,7 +28,8 @@ def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
     rows = [[*row] for row in a]
     pivots = []
     for step in range(min(len(rows), len(rows[0]) if rows else 0)):
-        # The largest entry of what is left of the column. Each path has its own.
+        # The row of the largest entry in what is left of the column, which differs between
+        # paths.
         largest = dr.abs(rows[step][step])
         pivot = index(step)
         for below in range(step + 1, len(rows)):
@@ -36,16 +37,17 @@ def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
             larger = size > largest
             largest = dr.select(larger, size, largest)
             pivot = dr.select(larger, index(below), pivot)
-        # Rows have no address within a kernel: every row below may be the one to exchange.
+        # Rows have no address within a kernel: any row below may be the one to exchange
+        # with the first, and becomes the top one then.
         first = rows[step]
         top = first
         for below in range(step + 1, len(rows)):
-            here = pivot == below
+            is_pivot = pivot == below
             row = rows[below]
-            rows[below] = _where(here, first, row)
-            top = _where(here, row, top)
+            rows[below] = _where(is_pivot, first, row)
+            top = _where(is_pivot, row, top)
         rows[step] = top
-        # Below a pivot of zero are zeros.
+        # If the pivot is zero, so is all that is below it.
         inverse = dr.select(top[step] == 0, 0, 1 / top[step])
         for below in range(step + 1, len(rows)):
             row = rows[below]
@@ -76,7 +78,7 @@ def _cholesky(a: Matrix) -> tuple[Matrix, Any]:
         square = row[column]
         for k in range(column):
             square = dr.fma(-row[k], row[k], square)
-        # Also if it is NaN.
+        # The comparison is false for NaN, too.
         failed = failed | ~(square > 0)
         row[column] = dr.sqrt(square)
         # One division for the whole column.
@@ -127,33 +129,42 @@ def _tensor(matrices: list[Matrix], shape: tuple[int, ...]) -> Tensor:
 
 
 def _getrf(o: Operation, x: Tensor) -> list[Tensor]:
-    done = [_lu(a) for a in _matrices(o, x)]
-    _, pivots, info = o.shapes()
+    factors = []
+    pivots = []
+    for matrix in _matrices(o, x):
+        factors_of_matrix, pivots_of_matrix = _lu(matrix)
+        factors.append(factors_of_matrix)
+        pivots.extend(pivots_of_matrix)
+    _, shape_of_pivots, shape_of_info = o.shapes()
     # JAX asks `info` for arguments that LAPACK does not take, not for pivots of zero.
-    fine = array_types()["i32"](0)
+    success = array_types()["i32"](0)
     return [
-        _tensor([factors for factors, _ in done], x.shape),
-        Tensor([pivot for _, own in done for pivot in own], pivots),
-        Tensor([fine] * len(done), info),
+        _tensor(factors, x.shape),
+        Tensor(pivots, shape_of_pivots),
+        Tensor([success] * len(factors), shape_of_info),
     ]
 
 
 def _potrf(o: Operation, x: Tensor) -> list[Tensor]:
     upper = o.letter("uplo") == "U"
-    matrices = _matrices(o, x)
-    # `A = U^T U` with the transpose of the lower factor.
-    done = [_cholesky(_transposed(a) if upper else a) for a in matrices]
-    factors = [_transposed(factor) if upper else factor for factor, _ in done]
-    # JAX asks whether `info` is zero.
-    info = [drjit().select(lost, array_types()["i32"](1), 0) for _, lost in done]
-    return [_tensor(factors, x.shape), Tensor(info, o.shapes()[1])]
+    factors = []
+    info = []
+    for matrix in _matrices(o, x):
+        # The upper factor U of `A = U^T U` is the transpose of the lower one.
+        factor, failed = _cholesky(_transposed(matrix) if upper else matrix)
+        factors.append(_transposed(factor) if upper else factor)
+        # JAX asks whether `info` is zero.
+        info.append(drjit().select(failed, array_types()["i32"](1), 0))
+    _, shape_of_info = o.shapes()
+    return [_tensor(factors, x.shape), Tensor(info, shape_of_info)]
 
 
 def _trsm(o: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
     lower = o.letter("uplo") == "L"
     unit = o.letter("diag") == "U"
     right = o.letter("side") == "R"
-    # X A = B is A^T X^T = B^T.
+    # The matrix is on the right in `X A = B`, which is `A^T X^T = B^T`. So it is transposed
+    # for either of `trans_x` and `right`, but not for both.
     turns = (o.letter("trans_x") != "N") != right
     out = []
     for matrix, rhs in zip(_matrices(o, a), _matrices(o, b), strict=True):

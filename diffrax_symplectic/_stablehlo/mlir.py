@@ -45,7 +45,7 @@ def sole_operation(region: Any) -> str | None:
     """The name of the operation that is all that a region of MLIR does, on its arguments in
     their order; `None` for other regions."""
     operations = operations_in(region)
-    # The last one returns.
+    # The last operation returns.
     if len(operations) != 2:
         return None
     op, _ = operations
@@ -88,8 +88,11 @@ def attribute_part(op: Any, name: str, key: str) -> list[int]:
     """An entry of an attribute with several, which MLIR only prints: as
     `#stablehlo.gather<offset_dims = [0], index_vector_dim = 1>`. Entries that are zero or
     empty are not printed."""
-    found = re.search(rf"\b{key} = (\[[^\]]*\]|\d+)", str(op.attributes[name]))
-    return [int(i) for i in re.findall(r"\d+", found[1])] if found else []
+    # A list in brackets, or one number.
+    entry = re.search(rf"\b{key} = (\[[^\]]*\]|\d+)", str(op.attributes[name]))
+    if entry is None:
+        return []
+    return [int(number) for number in re.findall(r"\d+", entry[1])]
 
 
 def constant_values(op: Any) -> np.ndarray:
@@ -98,27 +101,31 @@ def constant_values(op: Any) -> np.ndarray:
     shape = tuple(kind.shape)
     if not str(kind.element_type).startswith("complex"):
         return np.broadcast_to(np.asarray(op.attributes["value"]), shape)
-    # MLIR gives the values of real constants only: complex ones are read from its text.
+    # MLIR gives the values of real constants only: complex ones are read from its text,
+    # `dense<"0x...">` with the bytes of many, or `dense<[(1.0,2.0), ...]>`.
     text = str(op)
-    size = 8 if "complex<f64>" in text else 4
-    if found := re.search(r'dense<"0x([0-9A-F]+)">', text):
-        parts = np.frombuffer(bytes.fromhex(found[1]), f"<f{size}")
+    bytes_of_part = 8 if "complex<f64>" in text else 4
+    if in_hexadecimal := re.search(r'dense<"0x([0-9A-F]+)">', text):
+        parts = np.frombuffer(bytes.fromhex(in_hexadecimal[1]), f"<f{bytes_of_part}")
     else:
         pairs = re.findall(r"\(([^(),]+),([^(),]+)\)", text.split(" : ")[0])
-        numbers = [_printed_number(x, size) for pair in pairs for x in pair]
-        parts = np.array(numbers, f"<f{size}")
-    # Not `real + 1j * imag`, which turns an infinite part into a NaN of the other.
+        numbers = [_number_of(part, bytes_of_part) for pair in pairs for part in pair]
+        parts = np.array(numbers, f"<f{bytes_of_part}")
+    # Real and imaginary parts alternate. `real + 1j * imag` would turn an infinite part
+    # into a NaN of the other.
     values = parts[::2] + 0j
     values.imag = parts[1::2]
+    # A constant of equal entries is printed as one entry, which is repeated.
     return np.resize(values, shape)
 
 
-def _printed_number(text: str, size: int) -> float:
-    """A number as MLIR prints it: as hexadecimal bits if it is not finite."""
+def _number_of(text: str, num_bytes: int) -> float:
+    """The number that MLIR prints as this text: as hexadecimal bits if it is not finite."""
     text = text.strip()
     if not text.startswith("0x"):
         return float(text)
-    return float(np.array(int(text, 16), f"<u{size}").view(f"<f{size}"))
+    bits = np.array(int(text, 16), f"<u{num_bytes}")
+    return float(bits.view(f"<f{num_bytes}"))
 
 
 class SourceLine(NamedTuple):
@@ -134,11 +141,12 @@ class SourceLine(NamedTuple):
 
 def source_lines(location: str) -> list[SourceLine]:
     """The lines that an operation of MLIR comes from, innermost first, out of its printed
-    location. JAX records several if `jax_traceback_in_locations_limit` says so."""
-    found = re.findall(r'"([^"]*)"\("([^"]+)":(\d+)', location)
+    location, which holds each as `"fn"("file.py":12:...)`. JAX records several lines if
+    `jax_traceback_in_locations_limit` says so."""
+    lines = re.findall(r'"([^"]*)"\("([^"]+)":(\d+)', location)
     return [
         SourceLine(_name_of_function(name), file, int(line))
-        for name, file, line in found
+        for name, file, line in lines
     ]
 
 

@@ -75,12 +75,14 @@ def _pad(o, x, value):
         begin + np.arange(size) * (gap + 1)
         for begin, gap, size in zip(low, between, x.shape)
     ]
-    inside = [(0 <= at) & (at < size) for at, size in zip(targets, o.shape)]
-    kept = [at[which] for at, which in zip(targets, inside)]
-    # The value stands behind the entries of `x`.
-    places = np.full(o.shape, len(x.entries))
-    places[np.ix_(*kept)] = x.places[np.ix_(*inside)]
-    return [Tensor([*x.entries, value.item()], ()).take(places)]
+    is_inside = [(0 <= at) & (at < size) for at, size in zip(targets, o.shape)]
+    kept = [at[inside] for at, inside in zip(targets, is_inside)]
+    # One list of the entries of `x` and the value, which comes last.
+    all_entries = Tensor([*x.entries, value.item()], ())
+    place_of_value = len(x.entries)
+    places = np.full(o.shape, place_of_value)
+    places[np.ix_(*kept)] = x.places[np.ix_(*is_inside)]
+    return [all_entries.take(places)]
 
 
 @rule
@@ -136,5 +138,5 @@ def _in_total_order(a: Any) -> Any:
     """An integer that orders floating-point numbers, with NaN above infinity."""
     bits = 8 * drjit().itemsize_v(a)
     number = drjit().reinterpret_array(array_types()[f"i{bits}"], a)
-    # Of negative numbers all bits but the sign are turned.
+    # All bits but the sign are turned in negative numbers, which the shift tells.
     return number ^ ((number >> (bits - 1)) & (2 ** (bits - 1) - 1))

@@ -105,20 +105,19 @@ class Operation(NamedTuple):
 
     def fail(self, mask: Any) -> None:
         """Marks the lanes of this mask as failed."""
-        # That no lane fails is often known while the kernel is recorded.
+        # Often it is known while the kernel is recorded that no lane fails.
         if not (is_literal(mask) and not mask[0]):
             self.errors.append(mask)
 
     def failing(self, fn: Callable[[], Any]) -> tuple[Any, Any]:
         """What `fn` returns, and the mask of the lanes that fail in it: within a loop or
         branch a mask belongs to its inside, which has to return it."""
-        before = len(self.errors)
-        out = fn()
-        failed = ft.reduce(
-            operator.or_, self.errors[before:], array_types()["i1"](False)
-        )
-        del self.errors[before:]
-        return out, failed
+        num_before = len(self.errors)
+        returned = fn()
+        new_errors = self.errors[num_before:]
+        del self.errors[num_before:]
+        none = array_types()["i1"](False)
+        return returned, ft.reduce(operator.or_, new_errors, none)
 
 
 class NotReplayed(Exception):

@@ -10,7 +10,7 @@ from . import (  # noqa: F401 (they fill the table)
     reductions,
     windows,
 )
-from .angles import too_large
+from .angles import lanes_with_too_large_angle
 from .complex import complex_functions, is_complex
 from .elementwise import elementwise
 from .operation import NotReplayed, Operation, Rule, RULES
@@ -25,23 +25,26 @@ def rule_of(name: str) -> Rule | None:
         return RULES.get(name)
 
     def entry_by_entry(o: Operation, *xs: Tensor) -> list[Tensor]:
+        """The rule that applies the function of this name to each entry."""
         if name == "select" and same_table(xs[1], xs[2]):
-            # As in `vmap` of a conditional: a table stays in memory.
+            # `vmap` of a conditional selects between two equal tables: one stays in memory.
             return [xs[1]]
-        # Of a selection the first operand is not complex.
-        pairs = any(is_complex(x.entries[0]) for x in xs)
-        function = of_complex if pairs else of_real
+        # Any operand may be the complex one: the first of a selection is its mask.
+        has_complex_operand = any(is_complex(x.entries[0]) for x in xs)
+        function = of_complex if has_complex_operand else of_real
         if function is None:
-            raise NotReplayed(o.op, f"`{o.op.name}` of complex numbers")
+            kind = "complex" if has_complex_operand else "real"
+            raise NotReplayed(o.op, f"`{o.op.name}` of {kind} numbers")
 
-        def checked(*entries: Any) -> Any:
-            # JAX has sines and cosines of all angles: it gets such paths.
-            lost = too_large(name, *entries)
-            if lost is not None:
-                o.fail(lost)
+        def apply(*entries: Any) -> Any:
+            # Dr.Jit's sine is wrong beyond some angle. Lanes with a larger angle fail, and
+            # JAX simulates their paths again.
+            lanes = lanes_with_too_large_angle(name, *entries)
+            if lanes is not None:
+                o.fail(lanes)
             return function(*entries)
 
-        return [each(checked, *xs)]
+        return [each(apply, *xs)]
 
     return entry_by_entry
 

@@ -17,7 +17,7 @@ from .operation import NotReplayed, Operation, rule
 from .tensor import known, Tensor
 
 
-# Exchanges grow with the square of the number.
+# The most numbers to sort: exchanges grow with the square of the number.
 _MOST_SORTED = 16
 
 
@@ -33,7 +33,7 @@ def _dot_general(o, a, b):
     right = _matrices(o, b, "rhs")
     _, rows, _ = left.shape
     batch, columns, _ = right.shape
-    # Of numbers of another type than the result: products and sums have its type.
+    # Products and sums have the type of the result, to which other numbers are converted.
     a_entries = [x if type(x) is o.kind else o.kind(x) for x in a.entries]
     b_entries = [x if type(x) is o.kind else o.kind(x) for x in b.entries]
     out = []
@@ -55,7 +55,8 @@ def _left_out(factors: Sequence[Any], others: Sequence[Any]) -> Any:
     unknown = [x for x in others if not is_literal(x)]
     if not unknown or not any(map(is_zero, factors)):
         return 0
-    # The same for all rows of a sparse matrix, so that they stay cheap.
+    # The sum is over all unknown factors, not those beside zeros alone: so it is the same
+    # for all rows of a sparse matrix, which stay cheap.
     total = ft.reduce(operator.add, unknown)
     return total - total
 
@@ -104,9 +105,12 @@ def _entries_at(arrays: Sequence[Tensor], place: Any) -> list[Tensor]:
 def _join_columns(
     columns: list[list[Tensor]], shape: tuple[int, ...], num_arrays: int
 ) -> list[Tensor]:
-    """Arrays of this shape. Each of `columns` has an entry of each of them."""
-    entries = [[column[k].item() for column in columns] for k in range(num_arrays)]
-    return [Tensor(of_array, shape) for of_array in entries]
+    """Arrays of this shape from `columns`, each of which has an entry of each array."""
+    arrays = []
+    for k in range(num_arrays):
+        entries = [column[k].item() for column in columns]
+        arrays.append(Tensor(entries, shape))
+    return arrays
 
 
 # Neutral elements, by the operation that is repeated.
@@ -128,7 +132,7 @@ def _changes_nothing(o: Operation, starts: Sequence[Tensor]) -> bool:
     if value is None or repeated is None:
         return False
     if repeated == "and":
-        # All bits. Of integers, one has a single bit.
+        # The neutral element has all bits set, which the integer 1 has not.
         return bool(~value == 0)
     return bool(value == _NEUTRAL.get(repeated))
 

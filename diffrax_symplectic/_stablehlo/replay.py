@@ -1,6 +1,5 @@
 """Replays a program that JAX lowered for one path on arrays with many paths."""
 
-import itertools
 from collections import ChainMap
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeAlias
@@ -32,7 +31,7 @@ class Replay:
     """
 
     def __init__(self, program: Any):
-        # It owns the operations, so that it must be kept.
+        # The module owns the operations, so that it must be kept.
         self._module = stablehlo_module(program)
         self._functions = functions_of(self._module)
         self._constants = _large_constants([*self._functions.values()])
@@ -61,12 +60,13 @@ class Replay:
 
     @property
     def _main(self) -> Any:
+        """The block of the function `main`, in MLIR."""
         return block_of(self._functions["main"])
 
     def constants(self) -> list[Any]:
         """The large constants of the program, as arrays of Dr.Jit in memory."""
-        # Made once by the caller, since a frozen function of Dr.Jit takes arrays in memory
-        # as arguments only.
+        # The caller makes them once, and passes them to each call: a frozen function of
+        # Dr.Jit takes arrays in memory as arguments only.
         return [
             in_memory(_type_of(variable).kind, values.ravel())
             for variable, values in self._constants.items()
@@ -93,10 +93,11 @@ class Replay:
     def _block(
         self, block: Any, args: Sequence[Tensor], outer: Values, errors: list[Any]
     ) -> list[Tensor]:
-        """What the operations of a block return, one after another."""
+        """What a block returns, whose operations run one after another. `outer` holds the
+        variables that it sees from outside."""
         values = outer.new_child(dict(zip(block.arguments, args)))
         for view in block.operations:
-            # Of an operation that MLIR has a class for, this is the general form.
+            # The general form of an operation, for which MLIR may have a class of its own.
             op = view.operation
             operands = [values[operand] for operand in op.operands]
             if op.name in _RETURNS:
@@ -113,7 +114,7 @@ class Replay:
             try:
                 return self._call(callee_of(op), operands, errors)
             except NotReplayed as error:
-                # The location of a called function does not name its caller.
+                # An operation in a called function has no location in its caller.
                 error.location += str(op.location)
                 raise
         if op.results and op.results[0] in self._memory:
@@ -134,7 +135,7 @@ class Replay:
         except (TypeError, RuntimeError) as error:
             if _is_named(error):
                 raise
-            # Dr.Jit's own, which names neither the operation nor its place.
+            # An error of Dr.Jit names neither the operation nor its place.
             raise NotReplayed(op, f"`{op.name}` of these types ({error})") from error
 
     def _table(self, variable: Any) -> Tensor:
@@ -150,34 +151,36 @@ def _type_of(variable: Any) -> ArrayType:
 
 
 def _is_named(error: BaseException | None) -> bool:
-    """Whether it follows from an operation in a branch or loop, which is named already."""
+    """Whether an error names an operation already: it is a `NotReplayed`, or follows from
+    one in a branch or loop, for which Dr.Jit raises an error of its own."""
     while error is not None and not isinstance(error, NotReplayed):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
 def _is_empty(variable: Any) -> bool:
+    """Whether a variable is an array without entries."""
     # A token, which orders side effects, has no shape.
     return 0 in getattr(variable.type, "shape", ())
 
 
 def _large_constants(functions: list[Any]) -> dict[Any, np.ndarray]:
     """The constants of more entries than stay in registers, by their variables."""
-    found = {}
+    values = {}
     for op in _operations(functions):
         if op.name != "stablehlo.constant":
             continue
         (variable,) = op.results
         if _type_of(variable).size > MOST_IN_REGISTERS:
-            found[variable] = constant_values(op)
-    return found
+            values[variable] = constant_values(op)
+    return values
 
 
 def _operations(functions: list[Any]) -> Iterator[Any]:
-    """All operations, those of regions included."""
-    left = [function.operation for function in functions]
-    while left:
-        op = left.pop()
+    """All operations of these functions, those in regions included."""
+    remaining = [function.operation for function in functions]
+    while remaining:
+        op = remaining.pop()
         yield op
-        inner = map(operations_in, op.regions)
-        left.extend(itertools.chain.from_iterable(inner))
+        for region in op.regions:
+            remaining.extend(operations_in(region))

@@ -1,5 +1,6 @@
 """Arrays of one path as lists of Dr.Jit arrays, each with one entry for all paths."""
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
@@ -91,11 +92,11 @@ class Tensor(NamedTuple):
 
 def same_table(a: Tensor, b: Tensor) -> bool:
     """Whether both are the same part of the same array in memory."""
-    one = a.entries
+    table = a.entries
     other = b.entries
-    if not (isinstance(one, Table) and isinstance(other, Table)):
+    if not (isinstance(table, Table) and isinstance(other, Table)):
         return False
-    return one.memory is other.memory and np.array_equal(one.places, other.places)
+    return table.memory is other.memory and np.array_equal(table.places, other.places)
 
 
 def scalar(entry: Any) -> Tensor:
@@ -116,19 +117,23 @@ def in_memory(kind: str, values: np.ndarray) -> Any:
         real = in_memory(part, np.real(values))
         imag = in_memory(part, np.imag(values))
         return array_type(real, imag)
-    # As a list, which is copied: memory of NumPy could be freed while Dr.Jit records.
+    # A list is copied. Memory of NumPy could be freed while Dr.Jit records.
     return array_type(values.tolist())
 
 
 def known(x: Tensor) -> np.ndarray | None:
-    """The values, if Dr.Jit knows them: constants, and what it folded from constants."""
-    # Of an index that is known, loops are unrolled and entries selected while recording.
+    """The values of constants, and of what Dr.Jit folded from constants; `None` if an entry
+    is not known while the kernel is recorded.
+
+    With a known index, loops are unrolled and entries selected while recording.
+    """
     if not all(map(is_literal, x.entries)):
         return None
     return np.array([_value(entry) for entry in x.entries]).reshape(x.shape)
 
 
 def _value(literal: Any) -> Any:
+    """The number in a literal of Dr.Jit."""
     if drjit().is_complex_v(literal):
         return complex(literal.real[0], literal.imag[0])
     return literal[0]
@@ -136,11 +141,13 @@ def _value(literal: Any) -> Any:
 
 def each(fn: Callable, *xs: Tensor) -> Tensor:
     """Applies a function entry by entry. A scalar is repeated as needed."""
-    # Of a scalar and an array with one entry, the array has the shape of the result.
+    # The result has the shape of the largest array: beside a scalar, an array with a single
+    # entry counts as larger, since it has axes.
     largest = max(xs, key=lambda x: (len(x.entries), len(x.shape)))
     size = len(largest.entries)
+    # The entries of each array, repeated if it is a scalar.
     columns = [x.entries if len(x.entries) == size else [*x.entries] * size for x in xs]
-    return Tensor([fn(*row) for row in zip(*columns)], largest.shape)
+    return Tensor([fn(*entries) for entries in zip(*columns)], largest.shape)
 
 
 def flat(xs: Sequence[Tensor]) -> tuple[Any, ...]:
@@ -150,10 +157,12 @@ def flat(xs: Sequence[Tensor]) -> tuple[Any, ...]:
 
 def unflat(entries: Iterable[Any], shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
     """Tensors of these shapes from the first of these entries: the inverse of `flat`."""
-    left = iter(entries)
-    return [
-        Tensor([next(left) for _ in range(math.prod(shape))], shape) for shape in shapes
-    ]
+    remaining = iter(entries)
+    tensors = []
+    for shape in shapes:
+        own_entries = itertools.islice(remaining, math.prod(shape))
+        tensors.append(Tensor([*own_entries], shape))
+    return tensors
 
 
 def copied(xs: Sequence[Tensor]) -> tuple[Any, ...]:
@@ -174,14 +183,15 @@ def as_own_literal(entry: Any) -> Any:
 
 
 def chosen(xs: Sequence[Any], mask: Sequence[bool]) -> list[Any]:
-    """Those of `xs` where the mask is true."""
-    return [x for x, yes in zip(xs, mask, strict=True) if yes]
+    """The elements of `xs` where the mask is true."""
+    return [x for x, is_chosen in zip(xs, mask, strict=True) if is_chosen]
 
 
 def merged(
     mask: Sequence[bool], where_true: Iterable[Any], where_false: Iterable[Any]
 ) -> list[Any]:
-    """One list of two, in the order of a mask: the inverse of `chosen`."""
-    yes = iter(where_true)
-    no = iter(where_false)
-    return [next(yes) if here else next(no) for here in mask]
+    """One list of two, as long as the mask: the next element of `where_true` where it is
+    true, and of `where_false` elsewhere. The inverse of `chosen`."""
+    true_elements = iter(where_true)
+    false_elements = iter(where_false)
+    return [next(true_elements if is_true else false_elements) for is_true in mask]

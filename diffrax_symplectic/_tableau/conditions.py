@@ -44,8 +44,8 @@ def symplectic_residuals(tableau: AbstractTableau) -> Float[np.ndarray, "s s"]:
     """
     flat = tableau.flatten()
     weighted = flat.weights[:, None] * flat.matrix
-    # Quadratic invariants are conserved if these vanish. A pair of stages contributes only
-    # if each reads what the other writes: otherwise its term is no function of both.
+    # Quadratic invariants are conserved if the residuals vanish. Only pairs of stages that
+    # read what the other writes contribute to the change of an invariant.
     residuals = np.outer(flat.weights, flat.weights) - weighted - weighted.T
     return np.where(flat.reads & flat.reads.T, residuals, 0.0)
 
@@ -79,9 +79,9 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     """
     if order not in (1, 2):
         raise ValueError(f"`order` must be 1 or 2; got {order!r}.")
-    weak = _weak(tableau)
-    conditions = weak.first if order == 1 else weak.first | weak.second
-    return {name: float(value) for name, value in conditions.items()}
+    weak = _weak_conditions(tableau)
+    residuals = weak.first if order == 1 else weak.first | weak.second
+    return {formula: float(residual) for formula, residual in residuals.items()}
 
 
 def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
@@ -109,20 +109,23 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
     **Source:** [Burrage and Burrage (2000)](https://doi.org/10.1137/S0036142999363206) for
     general tableaus; [Rößler (2010)](https://doi.org/10.1137/09076636X) for the others.
     """
-    return {name: float(value) for name, value in _strong(tableau).items()}
+    residuals = _strong_conditions(tableau)
+    return {formula: float(residual) for formula, residual in residuals.items()}
 
 
 def drift_order(tableau: FlatTableau) -> int:
     """The order without noise, up to 4, by Butcher's conditions for each part of the state
     that the stages write."""
-    drift = [i for i, stage in enumerate(tableau.stages) if stage.channels == ("h",)]
-    flat = tableau.take(drift)
+    numbers = [i for i, stage in enumerate(tableau.stages) if stage.channels == ("h",)]
+    flat = tableau.take(numbers)
     writes = np.array([stage.writes for stage in flat.stages])
     # Coefficients of values that a stage does not read belong to no rooted tree.
     M = np.where(flat.reads, flat.matrix, 0.0)
-    e = np.ones(len(drift))
+    e = np.ones(len(numbers))
     c = M @ e
-    # For each order its rooted trees, and the exact value of their weighted sum.
+    # For each order the vectors of its rooted trees, and the exact value of their products
+    # with the weights (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations
+    # I, section II.2).
     conditions = (
         [(e, 1)],
         [(c, 1 / 2)],
@@ -140,12 +143,13 @@ def drift_order(tableau: FlatTableau) -> int:
 
 
 @ft.singledispatch
-def _strong(tableau: AbstractTableau) -> dict:
-    """The conditions for the strong order of the tableau's family."""
+def _strong_conditions(tableau: AbstractTableau) -> dict:
+    """The residuals of the conditions for the strong order of the tableau's family, by
+    formula."""
     raise _unknown_tableau(tableau)
 
 
-@_strong.register
+@_strong_conditions.register
 def _(tableau: GeneralTableau) -> dict:
     _check_noise(tableau)
     return {
@@ -155,31 +159,32 @@ def _(tableau: GeneralTableau) -> dict:
     }
 
 
-@_strong.register
+@_strong_conditions.register
 def _(tableau: SeparableTableau) -> dict:
-    # The paper's other random variables are not independent of `W`.
-    others = _others_vanish(tableau.beta, A1e=tableau.A1.sum(axis=1))
-    return _strong(tableau.partitioned()) | others
+    # The paper's other random variables depend on `W`, so there is a condition for these,
+    # too.
+    others = _conditions_on_others(tableau.beta, A1e=tableau.A1.sum(axis=1))
+    return _strong_conditions(tableau.partitioned()) | others
 
 
-@_strong.register
+@_strong_conditions.register
 def _(tableau: PartitionedTableau) -> dict:
     return {
         "alpha.e - 1": tableau.alpha.sum() - 1,
         "alpha_hat.e - 1": tableau.alpha_hat.sum() - 1,
         "beta.e - 1": tableau.beta["W"].sum() - 1,
-        **_others_vanish(tableau.beta, e=np.ones(len(tableau.A1))),
+        **_conditions_on_others(tableau.beta, e=np.ones(len(tableau.A1))),
     }
 
 
-@_strong.register
+@_strong_conditions.register
 def _(tableau: AdditiveTableau) -> dict:
-    # The weak and the strong expansion have the same terms, but for the integrals with the
-    # space-time area: those of order 3/2 below.
-    weak = _weak(tableau)
+    # The strong expansion has the terms of the weak one, and at order 3/2 the integrals
+    # with the space-time area.
+    weak = _weak_conditions(tableau)
     alpha = tableau.alpha
     c1 = tableau.c1
-    # Without the space-time area its conditions fail, which is the right answer.
+    # A tableau without the space-time area has zeros here, and fails its conditions.
     B_H = tableau.B.get("H", np.zeros((len(alpha), len(c1))))
     beta_H = tableau.beta.get("H", np.zeros(len(c1)))
     return {
@@ -191,11 +196,11 @@ def _(tableau: AdditiveTableau) -> dict:
     }
 
 
-class _Weak(NamedTuple):
-    """Conditions for a weak order, from their formulas to their residuals.
+class _WeakConditions(NamedTuple):
+    """The residuals of the conditions for a weak order, by formula.
 
-    - `first`: those for order 1.
-    - `second`: the additional ones for order 2.
+    - `first`: the conditions for order 1.
+    - `second`: the additional conditions for order 2.
     """
 
     first: dict
@@ -203,13 +208,13 @@ class _Weak(NamedTuple):
 
 
 @ft.singledispatch
-def _weak(tableau: AbstractTableau) -> _Weak:
-    """The conditions for the weak order of the tableau's family."""
+def _weak_conditions(tableau: AbstractTableau) -> _WeakConditions:
+    """The residuals of the conditions for the weak orders of the tableau's family."""
     raise _unknown_tableau(tableau)
 
 
-@_weak.register
-def _(tableau: GeneralTableau) -> _Weak:
+@_weak_conditions.register
+def _(tableau: GeneralTableau) -> _WeakConditions:
     _check_noise(tableau)
     # Short names, for formulas that can be compared with their keys.
     al = tableau.alpha
@@ -221,10 +226,11 @@ def _(tableau: GeneralTableau) -> _Weak:
     A1e = A1.sum(axis=1)
     B0e = B0.sum(axis=1)
     B1e = B1.sum(axis=1)
-    # The expectation of the double brackets: E L_kl = h^2 delta_kl / 12 times
-    # [b, [b, a]] = a''bb + a'b'b - b''ba - 2 b'a'b + b'b'a.
-    brackets = "drift brackets" in map(drives, tableau.noise)
-    L = be.sum() / 12 if brackets else 0.0
+    # The double brackets have the expectation E L_kl = h^2 delta_kl / 12 times
+    # [b, [b, a]] = a''bb + a'b'b - b''ba - 2 b'a'b + b'b'a, which adds to the conditions on
+    # these five derivatives.
+    has_brackets = "drift brackets" in map(drives, tableau.noise)
+    L = be.sum() / 12 if has_brackets else 0.0
     first = {
         "alpha.e - 1": al.sum() - 1,
         "(beta.e)^2 - 1": be.sum() ** 2 - 1,
@@ -246,11 +252,11 @@ def _(tableau: GeneralTableau) -> _Weak:
         "beta.((A1e)(B1e)) - 1/4": be @ (A1e * B1e) - 1 / 4 - L,
         "beta.B1(A1e) - 1/4": be @ B1 @ A1e - 1 / 4 + L,
     }
-    return _Weak(first, second)
+    return _WeakConditions(first, second)
 
 
-@_weak.register
-def _(tableau: PartitionedTableau) -> _Weak:
+@_weak_conditions.register
+def _(tableau: PartitionedTableau) -> _WeakConditions:
     be = tableau.beta["W"]
     A1 = tableau.A1
     B0e = {name: B0.sum(axis=1) for name, B0 in tableau.B0.items()}
@@ -258,15 +264,15 @@ def _(tableau: PartitionedTableau) -> _Weak:
         "alpha.e - 1": tableau.alpha.sum() - 1,
         "alpha_hat.e - 1": tableau.alpha_hat.sum() - 1,
         "(beta.e)^2 - 1": be.sum() ** 2 - 1,
-        **_others_vanish(tableau.beta, e=np.ones(len(A1))),
+        **_conditions_on_others(tableau.beta, e=np.ones(len(A1))),
     }
     # The random variables of a step are independent, so the mean of a product of two
     # vanishes unless they are the same.
-    squares = sum(
+    sum_of_squares = sum(
         _variance(name) * (tableau.alpha_hat @ row_sums**2)
         for name, row_sums in B0e.items()
     )
-    products = sum(
+    sum_of_products = sum(
         _variance(name) * (tableau.beta[name] @ A1 @ row_sums)
         for name, row_sums in B0e.items()
         if name in tableau.beta
@@ -276,56 +282,57 @@ def _(tableau: PartitionedTableau) -> _Weak:
         "alpha_hat.Ae - 1/2": tableau.alpha_hat @ tableau.A.sum(axis=1) - 1 / 2,
         "(beta.e)(alpha_hat.B0e) - 1/2": be.sum() * (tableau.alpha_hat @ B0e["W"])
         - 1 / 2,
-        "sum over variables: variance alpha_hat.(B0e)^2 - 1/2": squares - 1 / 2,
+        "sum over variables: variance alpha_hat.(B0e)^2 - 1/2": sum_of_squares - 1 / 2,
         "(beta.e)(beta.A1e) - 1/2": be.sum() * (be @ A1.sum(axis=1)) - 1 / 2,
-        "sum over variables: variance beta.A1(B0e)": products,
+        "sum over variables: variance beta.A1(B0e)": sum_of_products,
     }
-    return _Weak(first, second)
+    return _WeakConditions(first, second)
 
 
-@_weak.register
-def _(tableau: SeparableTableau) -> _Weak:
+@_weak_conditions.register
+def _(tableau: SeparableTableau) -> _WeakConditions:
     """With conditions on the paper's other random variables, which depend on `W`."""
-    # The sums over independent variables above hold for `W` alone. For the others the paper
-    # has conditions of its own.
+    # The sums over independent variables of a `PartitionedTableau` hold for `W` alone. For
+    # the others the paper has conditions of its own.
     only_W = {"W": tableau.B0["W"]}
-    weak = _weak(dataclasses.replace(tableau.partitioned(), B0=only_W))
+    weak = _weak_conditions(dataclasses.replace(tableau.partitioned(), B0=only_W))
     B0e = tableau.B0["W"].sum(axis=1)
-    # Not an identifier, so no keyword.
+    # A dictionary, since "A1(B0e)" is no name of an argument.
     moments = {"A1e": tableau.A1.sum(axis=1), "A1(B0e)": tableau.A1 @ B0e}
-    others = _others_vanish(tableau.beta, **moments)
+    others = _conditions_on_others(tableau.beta, **moments)
     third_moment = {"beta.A1((B0e)^2)": tableau.beta["W"] @ tableau.A1 @ B0e**2}
-    return _Weak(weak.first, weak.second | third_moment | others)
+    return _WeakConditions(weak.first, weak.second | third_moment | others)
 
 
-@_weak.register
-def _(tableau: AdditiveTableau) -> _Weak:
+@_weak_conditions.register
+def _(tableau: AdditiveTableau) -> _WeakConditions:
     alpha = tableau.alpha
     Be = {name: B.sum(axis=1) for name, B in tableau.B.items()}
     first = {"alpha.e - 1": alpha.sum() - 1}
     for name, weights in tableau.beta.items():
-        # Any variable but the increment itself must not enter constant noise at all.
+        # The end of a step with constant noise contains the increment `W` itself, and no
+        # other variable.
         exact = 1 if name == "W" else 0
         first[f"beta[{name}].e - {exact}"] = weights.sum() - exact
-    squares = sum(
+    sum_of_squares = sum(
         _variance(name) * (alpha @ row_sums**2) for name, row_sums in Be.items()
     )
     second = {
         "alpha.Ae - 1/2": alpha @ tableau.A.sum(axis=1) - 1 / 2,
         "alpha.B[W]e - 1/2": alpha @ Be["W"] - 1 / 2,
-        "sum over variables: variance alpha.(Be)^2 - 1/2": squares - 1 / 2,
+        "sum over variables: variance alpha.(Be)^2 - 1/2": sum_of_squares - 1 / 2,
     }
     # The times at which constant noise is evaluated do not matter.
     if not tableau.constant:
         second["beta[W].c1 - 1/2"] = tableau.beta["W"] @ tableau.c1 - 1 / 2
-    return _Weak(first, second)
+    return _WeakConditions(first, second)
 
 
 def _check_noise(tableau: GeneralTableau) -> None:
     """Raises a `ValueError` unless the increment drives the noise of a general tableau."""
-    # All variables share the weights. So another one that multiplies the noise itself would
-    # add to the increment, and change all moments that the conditions are made of. Those
-    # that multiply brackets are of higher order, and are counted where they matter.
+    # All variables share the weights. So another variable that multiplies the noise itself
+    # would add to the increment, and change all moments that the conditions are made of.
+    # Variables that multiply brackets are of higher order: their expectation is counted.
     noise_itself = [name for name in tableau.noise if drives(name) == "noise"]
     if noise_itself != ["W"]:
         raise ValueError(
@@ -335,14 +342,18 @@ def _check_noise(tableau: GeneralTableau) -> None:
         )
 
 
-def _others_vanish(beta: Mapping[str, np.ndarray], **moments: np.ndarray) -> dict:
-    """The conditions that the moments of random variables other than `W` vanish."""
-    return {
-        f"beta[{name}].{label}": weights @ moment
-        for name, weights in beta.items()
-        if name != "W"
-        for label, moment in moments.items()
-    }
+def _conditions_on_others(
+    beta: Mapping[str, np.ndarray], **moments: np.ndarray
+) -> dict:
+    """The residuals of the conditions that the products of the weights `beta` of random
+    variables other than `W` with these `moments` vanish, by formula, as in `beta[H].e`."""
+    residuals = {}
+    for name, weights in beta.items():
+        if name == "W":
+            continue
+        for formula, moment in moments.items():
+            residuals[f"beta[{name}].{formula}"] = weights @ moment
+    return residuals
 
 
 def _variance(name: str) -> float:
@@ -351,9 +362,9 @@ def _variance(name: str) -> float:
     variable = VARIABLES.get(name)
     if variable is None or variable.variance is None:
         known = [
-            other
-            for other, described in VARIABLES.items()
-            if described.variance is not None
+            known_name
+            for known_name, known_variable in VARIABLES.items()
+            if known_variable.variance is not None
         ]
         raise ValueError(
             f"The conditions are known for the random variables {', '.join(known)}; got a "
@@ -385,29 +396,32 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
       c_i + c_{\sigma(i)} = 1.$$
     """
     channels = {name for stage in tableau.stages for name in stage.channels}
-    # Even random variables keep their sign in a step back, so they are no negated controls.
+    # Even random variables keep their sign in a step back, so such a step is none with
+    # negated controls.
     if not channels <= _NEGATED:
         return False
     # Few stages have more than one partner, so that few pairings are tried.
     partners = [_partners(tableau, i) for i in range(len(tableau.stages))]
     for sigma in itertools.product(*partners):
-        paired = all(sigma[j] == i for i, j in enumerate(sigma))
-        both = tableau.matrix + tableau.matrix[np.ix_(sigma, sigma)]
-        # Ignore coefficients of values that a stage does not read.
-        wrong = np.where(tableau.reads, both - tableau.weights, 0)
-        if paired and np.allclose(wrong, 0, atol=_ROUNDING):
+        is_pairing = all(sigma[j] == i for i, j in enumerate(sigma))
+        # Entry `i, j` is a_ij + a_sigma(i)sigma(j) - b_j.
+        matrix_of_partners = tableau.matrix[np.ix_(sigma, sigma)]
+        residuals = tableau.matrix + matrix_of_partners - tableau.weights
+        # Coefficients of values that a stage does not read have no effect.
+        residuals = np.where(tableau.reads, residuals, 0)
+        if is_pairing and np.allclose(residuals, 0, atol=_ROUNDING):
             return True
     return False
 
 
 def _partners(tableau: FlatTableau, i: int) -> list[int]:
     """The stages that may be paired with stage `i`, by their kinds, times and weights."""
-    this = tableau.stages[i]
+    stage = tableau.stages[i]
     partners = []
     for j, other in enumerate(tableau.stages):
         # In a separable system, functions of p do not depend on time.
-        mirrored = this.reads == "p" or np.isclose(other.c, 1 - this.c)
-        same_weight = np.isclose(tableau.weights[i], tableau.weights[j])
-        if other.kind == this.kind and mirrored and same_weight:
+        times_fit = stage.reads == "p" or np.isclose(other.c, 1 - stage.c)
+        has_same_weight = np.isclose(tableau.weights[i], tableau.weights[j])
+        if other.kind == stage.kind and times_fit and has_same_weight:
             partners.append(j)
     return partners

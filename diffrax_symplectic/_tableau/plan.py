@@ -60,10 +60,10 @@ class StepPlan:
 
 
 def make_plan(tableau: FlatTableau) -> StepPlan:
-    """Drops unused stages, merges equal ones, and orders the rest. Equal tableaus share one
-    plan, the same object in every trace."""
-    # A plan is static data of a traced step, so that a new object would be a new trace. As
-    # bytes, unlike as arrays, coefficients are hashable.
+    """The plan of a step: unused stages are dropped, equal ones merged, and the rest is
+    ordered. Equal tableaus share one plan, the same object in every trace."""
+    # A plan is static data of a traced step, so that a new object would be a new trace.
+    # Arrays cannot be keys of a cache: the coefficients are passed as bytes.
     return _make_plan(
         tableau.stages,
         np.asarray(tableau.matrix, np.float64).tobytes(),
@@ -75,28 +75,30 @@ def make_plan(tableau: FlatTableau) -> StepPlan:
 # parameters would fill an unbounded cache.
 @ft.lru_cache(maxsize=1024)
 def _make_plan(stages: tuple[Stage, ...], matrix: bytes, weights: bytes) -> StepPlan:
+    """`make_plan` for the stages and the coefficients, as bytes, of a tableau."""
     num_stages = len(stages)
     tableau = FlatTableau(
         stages=stages,
         matrix=np.frombuffer(matrix, np.float64).reshape(num_stages, num_stages),
         weights=np.frombuffer(weights, np.float64),
     )
-    # Coefficients of values that a stage does not read would count as dependencies.
-    masked = np.where(tableau.reads, tableau.matrix, 0.0)
-    tableau = dataclasses.replace(tableau, matrix=_snap(masked))
-    # Each of the three can make more work for the others: stages that become equal once
-    # others were dropped, or weights that cancel once stages were merged.
+    # A coefficient counts as a dependency, also one of a value that a stage does not read.
+    matrix_of_reads = np.where(tableau.reads, tableau.matrix, 0.0)
+    tableau = dataclasses.replace(tableau, matrix=_snapped(matrix_of_reads))
+    # Each of the three reductions can make more work for the others: stages may become
+    # equal once others were dropped, and weights may cancel once stages were merged.
     previous = None
     while previous is None or len(tableau.stages) < len(previous.stages):
         previous = tableau
-        tableau = _merge(tableau, same_channels=True)
-        tableau = _live(tableau)
-        # Last, since a stage whose weight cancels would keep others from being merged.
-        tableau = _merge(tableau, same_channels=False)
+        tableau = _with_merged_stages(tableau, same_channels=True)
+        tableau = _with_live_stages(tableau)
+        # This comes last, since a stage whose weight cancels would keep others from being
+        # merged.
+        tableau = _with_merged_stages(tableau, same_channels=False)
     return StepPlan(tableau, _blocks(tableau))
 
 
-def _snap(x: np.ndarray | np.floating) -> np.ndarray:
+def _snapped(x: np.ndarray | np.floating) -> np.ndarray:
     """`x`, with numbers that are zero up to rounding set to zero: any other coefficient
     counts as a dependency."""
     return np.where(np.abs(x) < _TOLERANCE, 0.0, x)
@@ -107,23 +109,24 @@ def _equal(x: np.ndarray | float, y: np.ndarray | float) -> bool:
     return np.allclose(x, y, rtol=0, atol=_TOLERANCE)
 
 
-def _live(tableau: FlatTableau) -> FlatTableau:
-    """Keeps the stages that the end of the step depends on."""
+def _with_live_stages(tableau: FlatTableau) -> FlatTableau:
+    """The tableau with only the stages that the end of the step depends on."""
     depends = tableau.matrix != 0
-    live = tableau.weights != 0
-    # No chain of dependencies is longer than the number of stages.
+    is_live = tableau.weights != 0
+    # Each round adds the stages that live ones depend on. No chain of dependencies is
+    # longer than the number of stages.
     for _ in tableau.stages:
-        live = live | (live @ depends)
-    return tableau.take(np.flatnonzero(live).tolist())
+        is_live = is_live | (is_live @ depends)
+    return tableau.take(np.flatnonzero(is_live).tolist())
 
 
-def _merge(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
-    """Merges pairs of stages whose vector fields are evaluated at the same time and state,
-    reading and changing the same part of the state.
+def _with_merged_stages(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
+    """The tableau with pairs of stages merged whose vector fields are evaluated at the same
+    time and state, reading and changing the same part of the state.
 
-    With the same channels (the controls that drive them) they have the same value, and
-    their coefficients are added. With different channels they can be merged if they enter
-    everything with the same coefficients.
+    With the same channels (the controls that drive them) two stages have the same value,
+    and their coefficients are added. With different channels they can be merged if they
+    enter everything with the same coefficients.
     """
     for i, j in itertools.combinations(range(len(tableau.stages)), 2):
         channels_agree = tableau.stages[i].channels == tableau.stages[j].channels
@@ -135,8 +138,8 @@ def _merge(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
             merged = _with_channels_joined(tableau, i, j)
         else:
             continue
-        # Merge one pair at a time: the merged stage may equal another.
-        return _merge(merged, same_channels)
+        # Pairs are merged one at a time, since the merged stage may equal another.
+        return _with_merged_stages(merged, same_channels)
     return tableau
 
 
@@ -163,8 +166,8 @@ def _with_coefficients_added(tableau: FlatTableau, i: int, j: int) -> FlatTablea
     matrix = tableau.matrix.copy()
     weights = tableau.weights.copy()
     # A sum that should vanish may not in floating point: 0.1 + 0.2 - 0.3 is not 0.
-    matrix[:, i] = _snap(matrix[:, i] + matrix[:, j])
-    weights[i] = _snap(weights[i] + weights[j])
+    matrix[:, i] = _snapped(matrix[:, i] + matrix[:, j])
+    weights[i] = _snapped(weights[i] + weights[j])
     with_sums = dataclasses.replace(tableau, matrix=matrix, weights=weights)
     return _without(with_sums, j)
 
@@ -182,20 +185,25 @@ def _without(tableau: FlatTableau, j: int) -> FlatTableau:
 
 
 def _blocks(tableau: FlatTableau) -> tuple[Block, ...]:
-    """Strongly connected components of the dependencies, dependencies first."""
+    """The blocks of a step, the strongly connected components of the dependencies. Each
+    comes after the blocks that it depends on."""
     num_stages = len(tableau.stages)
     depends = tableau.matrix != 0
-    # The transitive closure by Warshall's algorithm: after round k, all chains through the
-    # first k stages are known.
-    reach = depends
+    # Entry `i, j` says whether a chain of dependencies leads from stage `i` to stage `j`.
+    # By Warshall's algorithm, all chains through the first stages up to `k` are known after
+    # round `k`. Each stage reaches itself, so that an explicit stage is a component, too.
+    reaches = depends | np.eye(num_stages, dtype=bool)
     for k in range(num_stages):
-        reach = reach | (reach[:, k, None] & reach[k])
-    # Each stage reaches itself, so that an explicit stage is a component of its own.
-    closed = reach | np.eye(num_stages, dtype=bool)
-    mutual = closed & closed.T
-    components = {tuple(np.flatnonzero(row).tolist()) for row in mutual}
-    # A block depends on fewer stages than any block that depends on it.
-    ordered = sorted(components, key=lambda block: (closed[block[0]].sum(), block))
+        reaches = reaches | (reaches[:, k, None] & reaches[k])
+    is_mutual = reaches & reaches.T
+    components = {tuple(np.flatnonzero(row).tolist()) for row in is_mutual}
+
+    def rank(component: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
+        # A block depends on fewer stages than any block that depends on it. Equal numbers
+        # are ordered by the numbers of the stages.
+        return int(reaches[component[0]].sum()), component
+
+    ordered = sorted(components, key=rank)
     return tuple(_as_block(component, depends, tableau) for component in ordered)
 
 
@@ -206,18 +214,19 @@ def _as_block(
     cut = _cut(component, depends)
     unknown = _groups(cut.unknown, tableau)
     if len(unknown) > 1:
-        # Stages of other kinds would unstack the values again: without stacking, an
-        # iteration of five stages takes a third less time.
+        # Each group would unstack the values of the other groups again. Without stacking,
+        # an iteration of five stages takes a third less time.
         unknown = tuple((i,) for group in unknown for i in group)
     explicit = [group for ready in cut.rounds for group in _groups(ready, tableau)]
     return Block(unknown, tuple(explicit))
 
 
 def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
-    """Groups stages that evaluate the same vector field."""
+    """These stages in groups that evaluate the same vector field."""
     groups: dict[tuple[Any, ...], list[int]] = {}
     for i in stages:
-        groups.setdefault(tableau.stages[i].kind, []).append(i)
+        kind = tableau.stages[i].kind
+        groups.setdefault(kind, []).append(i)
     return tuple(tuple(group) for group in groups.values())
 
 
@@ -249,11 +258,11 @@ def _rounds(stages: Sequence[int], depends: _Dependencies) -> list[list[int]] | 
     """Stages in rounds, each of which depends on no stage of its own or a later round.
     `None` if they depend on each other in a cycle."""
     rounds = []
-    rest = list(stages)
-    while rest:
-        ready = [i for i in rest if not depends[i, rest].any()]
+    remaining = list(stages)
+    while remaining:
+        ready = [i for i in remaining if not depends[i, remaining].any()]
         if not ready:
             return None
         rounds.append(ready)
-        rest = [i for i in rest if i not in ready]
+        remaining = [i for i in remaining if i not in ready]
     return rounds

@@ -66,18 +66,21 @@ class FlatTableau:
     @property
     def reads(self) -> Bool[np.ndarray, "s s"]:
         """Whether stage `i` reads a part of the state that stage `j` changes."""
-        # A stage that writes "y" changes both parts, but then no stage of the same tableau
-        # reads only one: the families below mix "p" and "q", or use "y" alone. So a test
-        # for equal names (or none) suffices.
-        reads = [b.writes in a.reads for a in self.stages for b in self.stages]
+        # The stages of a tableau below write "p" or "q", or all of them write "y". So a
+        # stage that reads anything from a stage reads the part of the same name.
+        reads = [
+            reader.reads == writer.writes
+            for reader in self.stages
+            for writer in self.stages
+        ]
         return np.array(reads, bool).reshape(self.matrix.shape)
 
-    def take(self, keep: list[int]) -> "FlatTableau":
-        """The tableau with only the stages `keep`."""
+    def take(self, numbers: list[int]) -> "FlatTableau":
+        """The tableau with only the stages of these numbers, in this order."""
         return FlatTableau(
-            stages=tuple(self.stages[i] for i in keep),
-            matrix=self.matrix[np.ix_(keep, keep)],
-            weights=self.weights[keep],
+            stages=tuple(self.stages[i] for i in numbers),
+            matrix=self.matrix[np.ix_(numbers, numbers)],
+            weights=self.weights[numbers],
         )
 
 
@@ -102,7 +105,7 @@ Coefficients: TypeAlias = Any
 CoefficientsByVariable: TypeAlias = Any
 
 
-def _coefficients(
+def _checked_coefficients(
     name: str, value: Coefficients, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "..."]:
     """`value` as a read-only array. Raises a `ValueError` unless it holds real, finite
@@ -128,23 +131,24 @@ def _coefficients(
     return array
 
 
-def _check(
+def _replace_by_checked(
     tableau: AbstractTableau,
     by_variable: tuple[str, ...] = (),
     **shapes: tuple[int, ...],
 ) -> None:
     """Replaces coefficients by checked arrays; those `by_variable` by dictionaries from the
-    names of random variables to such arrays."""
+    names of random variables to such arrays. Raises a `ValueError` for wrong shapes, or
+    numbers that are not real and finite."""
     for name, shape in shapes.items():
         value = getattr(tableau, name)
         if name in by_variable:
-            named = value if isinstance(value, Mapping) else {"W": value}
+            arrays = value if isinstance(value, Mapping) else {"W": value}
             checked = {
-                variable: _coefficients(f"{name}[{variable!r}]", array, shape)
-                for variable, array in named.items()
+                variable: _checked_coefficients(f"{name}[{variable!r}]", array, shape)
+                for variable, array in arrays.items()
             }
         else:
-            checked = _coefficients(name, value, shape)
+            checked = _checked_coefficients(name, value, shape)
         # A frozen dataclass refuses `tableau.name = checked`, in `__post_init__` too.
         object.__setattr__(tableau, name, checked)
 
@@ -152,7 +156,7 @@ def _check(
 def _variables(*parts: Mapping[str, np.ndarray]) -> list[str]:
     """The names of all random variables in these coefficients, in order of first
     appearance."""
-    # A dictionary keeps the order, which that of a set would change from run to run.
+    # A dictionary keeps this order. The order of a set would differ from run to run.
     return list(dict.fromkeys(name for part in parts for name in part))
 
 
@@ -160,10 +164,10 @@ def _side_by_side(
     part: Mapping[str, np.ndarray], variables: list[str], shape: tuple[int, ...]
 ) -> Float[np.ndarray, "..."]:
     """The coefficients for each of these random variables, of this `shape` each,
-    concatenated. Variables without coefficients have zeros."""
+    concatenated along the last axis. Variables without coefficients have zeros."""
     zeros = np.zeros(shape)
-    each = [part.get(variable, zeros) for variable in variables]
-    return np.concatenate(each, axis=-1)
+    arrays = [part.get(variable, zeros) for variable in variables]
+    return np.concatenate(arrays, axis=-1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -211,8 +215,8 @@ class GeneralTableau(AbstractTableau):
 
     def __post_init__(self):
         # A string is a sequence of strings, too: `noise="W"` would pass the second test.
-        is_one_name = isinstance(self.noise, str)
-        if is_one_name or not all(isinstance(name, str) for name in self.noise):
+        is_string = isinstance(self.noise, str)
+        if is_string or not all(isinstance(name, str) for name in self.noise):
             raise ValueError(
                 '`noise` must hold the names of random variables, as in `("W",)`; got '
                 f"{self.noise!r}."
@@ -224,10 +228,10 @@ class GeneralTableau(AbstractTableau):
                 f"got {', '.join(map(repr, unknown))}."
             )
         object.__setattr__(self, "noise", tuple(self.noise))
-        # The weights say how many stages there are, since each stage has one.
+        # Each stage has a weight, so the weights say how many stages there are.
         drift_stages = np.size(self.alpha)
         noise_stages = np.size(self.beta)
-        _check(
+        _replace_by_checked(
             self,
             alpha=(drift_stages,),
             beta=(noise_stages,),
@@ -299,7 +303,7 @@ class SeparableTableau(AbstractTableau):
         drift_stages = np.size(self.alpha)
         # `beta` may be a dictionary, so the number of noise stages is taken from `A1`.
         noise_stages = len(self.A1)
-        _check(
+        _replace_by_checked(
             self,
             by_variable=("beta", "B0"),
             alpha=(drift_stages,),
@@ -358,8 +362,9 @@ class PartitionedTableau(AbstractTableau):
     def __post_init__(self):
         forces = np.size(self.alpha)
         velocities = np.size(self.alpha_hat)
+        # `beta` may be a dictionary, so the number of noise stages is taken from `A1`.
         noise_stages = len(self.A1)
-        _check(
+        _replace_by_checked(
             self,
             by_variable=("beta", "B0"),
             alpha=(forces,),
@@ -380,12 +385,13 @@ class PartitionedTableau(AbstractTableau):
         # Each random variable has noise stages of its own, all at the same points.
         A1 = np.concatenate([self.A1] * len(variables))
         noise_times = self.A1.sum(axis=1)
-        # Forces come first, which makes them the unknowns, as they cost more to evaluate.
+        # Forces come first: a plan tries to take the first stages for its unknowns, and
+        # forces cost more to evaluate than velocities.
         force_stages = [
             Stage(("h",), float(c_hat), "q", "p") for c_hat in self.A_hat.sum(axis=1)
         ]
-        # Velocities do not depend on time. With one and the same time, those at equal
-        # momenta can be merged.
+        # Velocities do not depend on time. All have the same time, so that a plan can merge
+        # velocities at equal momenta.
         velocity_stages = [Stage(("h",), 0.0, "p", "q") for _ in range(velocities)]
         noise = [
             Stage((variable,), float(c1), "q", "p")
@@ -442,8 +448,9 @@ class AdditiveTableau(AbstractTableau):
 
     def __post_init__(self):
         drift_stages = np.size(self.alpha)
+        # `beta` may be a dictionary, so the number of noise stages is taken from `c1`.
         noise_stages = np.size(self.c1)
-        _check(
+        _replace_by_checked(
             self,
             by_variable=("beta", "B"),
             alpha=(drift_stages,),
@@ -464,16 +471,17 @@ class AdditiveTableau(AbstractTableau):
         B = _side_by_side(self.B, variables, (drift_stages, noise_stages))
         beta = _side_by_side(self.beta, variables, (noise_stages,))
         drift = [Stage(("h",), float(c0), "y", "y") for c0 in self.A.sum(axis=1)]
-        # These read no part of the state, so they are evaluated once in a step, not in
-        # every iteration of the root finder.
+        # Noise stages read no part of the state, so they are evaluated once in a step, not
+        # in every iteration of the root finder.
         noise = [
             Stage((variable,), float(c1), "", "y")
             for variable in variables
             for c1 in self.c1
         ]
-        nothing = np.zeros((len(noise), drift_stages + len(noise)))
+        # Noise stages depend on no stage.
+        noise_rows = np.zeros((len(noise), drift_stages + len(noise)))
         return FlatTableau(
             stages=(*drift, *noise),
-            matrix=np.block([[self.A, B], [nothing]]),
+            matrix=np.block([[self.A, B], [noise_rows]]),
             weights=np.concatenate([self.alpha, beta]),
         )
