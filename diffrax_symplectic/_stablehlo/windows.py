@@ -54,8 +54,8 @@ def _windows(
         what = (
             f"`{o.op.name}` with an index per path, among {num_places} places (the most "
             f"are {_MOST_PLACES}, but for an array in `args` or from outside of the "
-            "function that is not drawn for each path, computed, or returned by a branch or "
-            "loop)"
+            "function that is not drawn for each path, computed, or returned by a "
+            "branch or loop)"
         )
         raise NotReplayed(o.op, what)
     for starts_and_masks in itertools.product(*axes):
