@@ -41,6 +41,7 @@ from .kinks import has_kinks
 from .long_steps import is_unstable_at_start
 from .run import Meter, NO_METER, run
 from .sampling import AbstractSampling
+from .strong_friction import unresolved_friction
 
 
 # The levels, unless the user chooses them: the fewest that tell the discretization error,
@@ -165,8 +166,9 @@ def expectation(
     by more than the standard error, if a few samples account for most of the variance, if
     all samples are equal or underflow, if a fit was dropped or takes long, and if `phi` is
     not smooth and a trial with Gaussian increments has another mean than discrete ones. Of
-    the steps: if two levels do not agree, if steps are too long for an explicit solver at
-    `y0`, and if rounding in single precision may exceed the standard error.
+    the steps: if two levels do not agree, if steps at `y0` are too long for an explicit
+    solver or for the friction, and if rounding in single precision may exceed the standard
+    error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and
@@ -220,6 +222,10 @@ def expectation(
                 "states, and two levels may agree on a wrong mean. Pass a smaller `dt0`.",
                 stacklevel=2,
             )
+        if estimate.levels == 2:
+            what = unresolved_friction(problem, float(dt0))
+            if what is not None:
+                warnings.warn(what, stacklevel=2)
         warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
         if has_kinks(problem):
             _warn_of_law(estimate, problem, key, devices)

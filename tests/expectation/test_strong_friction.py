@@ -1,0 +1,119 @@
+"""Warnings of steps that do not resolve the friction."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+
+
+FEW = ds.IndependentPaths(64)
+MASSES = jnp.array([2.0, 0.5, 4.0])
+STIFFNESS = jnp.array([[4.0, 1.0, 0.0], [1.0, 3.0, 0.5], [0.0, 0.5, 2.0]])
+
+
+def _well(t, p, q, args):
+    return jnp.sum(p**2 / MASSES) / 2 + q @ STIFFNESS @ q / 2
+
+
+def _told(terms, solver, h, y0, phi=lambda t, y, args: jnp.sum(y[1] ** 2), **options):
+    """The estimate, and whether a warning tells of the friction."""
+    options = dict(sampling=FEW) | options
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        got = ds.expectation(
+            phi, terms, solver, 0, 8 * h, h, y0, key=jr.key(0), **options
+        )
+    return got, any("do not resolve" in str(x.message) for x in told)
+
+
+REST = jnp.zeros(3), jnp.zeros(3)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
+def test_solvers_with_friction_in_the_drift_are_told_beyond_their_limit(scale):
+    # In any unit of time. The largest decay rate is 0.8 / 0.5 for the friction 0.8.
+    def energy(t, p, q, args):
+        return jnp.sum(p**2 / MASSES) / 2 + q @ STIFFNESS @ q / (2 * scale**2)
+
+    terms = ds.langevin_terms(energy, 0.8 / scale, 1.0, (3,))
+    for solver, most in ((ds.AdditiveGauss(), 2.0), (ds.SRKw5(), 0.5)):
+        for factor in (0.9, 1.1):
+            h = factor * most * 0.5 / 0.8 * scale
+            assert _told(terms, solver, h, REST)[1] == (factor > 1)
+
+
+def test_a_bead_is_too_hot_on_both_levels_and_told():
+    H0 = lambda t, p, q, args: p**2 / 2 + 50 * q**2
+    terms = ds.langevin_terms(H0, 1000.0, 1.0, ())
+    y0 = jnp.array(0.0), jnp.array(0.0)
+    phi = lambda t, y, args: y[1] ** 2
+    sampling = ds.IndependentPaths(1000)
+    got, told = _told(terms, ds.AdditiveGauss(), 2.0, y0, phi, sampling=sampling)
+    # The exact mean is at most 0.01, in equilibrium.
+    assert got.mean - 2 * got.error > 0.02
+    assert told
+
+
+def test_a_flow_that_keeps_overdamped_positions_where_they_are_is_told():
+    # The relaxation time is 1: after 4 of it <q^2> is 0.00044.
+    G = k = 1e4
+    H0 = lambda t, p, q, args: p**2 / 2 + k * q**2 / 2
+    terms = ds.langevin_terms(H0, G, 1.0, ())
+    y0 = jnp.array(0.0), jnp.array(1.0)
+    solver = ds.BAOAB(ds.ImplicitMidpoint())
+    got, told = _told(terms, solver, 0.5, y0, lambda t, y, args: y[1] ** 2)
+    assert got.mean - 10 * got.error > 0.1
+    assert told
+    # Plain midpoint steps relax, and steps that resolve the vibration do.
+    assert not _told(terms, ds.ImplicitMidpoint(), 0.5, y0)[1]
+    assert not _told(terms, solver, 0.015, y0)[1]
+
+
+@pytest.mark.parametrize(
+    "solver", [ds.BAOAB(), ds.LangevinMiddle(), ds.ImplicitMidpoint(), ds.SRKw1()]
+)
+def test_solvers_for_every_friction_are_not_told(solver):
+    terms = ds.langevin_terms(_well, 100.0, 1.0, (3,))
+    assert not _told(terms, solver, 0.2, REST)[1]
+
+
+def test_stiff_modes_with_weak_friction_keep_their_law_and_are_not_told():
+    H0 = lambda t, p, q, args: p**2 / 2 + 1e4 * q**2 / 2
+    terms = ds.langevin_terms(H0, 1.0, 1.0, ())
+    y0 = jnp.array(0.0), jnp.array(0.0)
+    assert not _told(terms, ds.BAOAB(ds.ImplicitMidpoint()), 0.5, y0)[1]
+
+
+def test_friction_that_depends_on_positions_masses_and_args_is_that_of_the_start():
+    H0 = lambda t, p, q, args: (p**2 * jnp.exp(-q) + q**2) / 2
+    friction = lambda t, q, args: args * jnp.exp(q)  # a rate
+    terms = ds.langevin_terms(H0, friction, 1.0, ())
+    y0 = {"near": (0.0, 0.0), "far": (0.0, 2.0)}
+    for start in y0.values():
+        start = jax.tree.map(jnp.array, start)
+        for rate in (4.0, 6.0):  # h = 0.1 and the limit 0.5
+            got, told = _told(terms, ds.StrangGauss(), 0.1, start, args=jnp.array(rate))
+            assert told == (rate > 5)
+            assert np.isfinite(got.mean)
+
+
+def test_with_three_levels_the_order_is_checked_instead():
+    terms = ds.langevin_terms(_well, 8.0, 1.0, (3,))
+    assert _told(terms, ds.SRKw5(), 0.2, REST)[1]
+    assert not _told(terms, ds.SRKw5(), 0.2, REST, levels=3)[1]
+    assert not _told(terms, ds.SRKw5(), 0.2, REST, levels=1)[1]
+
+
+def test_the_warning_names_the_line_of_the_user():
+    terms = ds.langevin_terms(_well, 8.0, 1.0, (3,))
+    phi = lambda t, y, args: jnp.sum(y[1] ** 2)
+    given = phi, terms, ds.SRKw5(), 0, 2, 0.2, REST
+    with pytest.warns(UserWarning, match="do not resolve the friction") as told:
+        ds.expectation(*given, key=jr.key(1), sampling=FEW)
+    where = {x.filename for x in told if "do not resolve" in str(x.message)}
+    assert where == {__file__}
