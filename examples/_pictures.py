@@ -92,6 +92,10 @@ STYLES = {
 STYLES["Milstein"] = STYLES["StratonovichMilstein"]
 
 
+# Of solvers that have no style yet.
+_OTHER = Style("0.4", ":", "x")
+
+
 def style(name: str) -> dict[str, Any]:
     """The arguments of `plot` for a solver or a sampling, by the name of its class, perhaps
     with arguments in brackets and more after a comma: `SRKw1(b=0)`, `Heun, springs`."""
@@ -99,7 +103,8 @@ def style(name: str) -> dict[str, Any]:
     # With the solver or the flow within, if that has a style of its own.
     full = f"{solver}({arguments[0]})" if arguments else solver
     plain = "SRKw3" if solver.startswith("SRKw3") else solver
-    found = next(STYLES[key] for key in (name, full, solver, plain) if key in STYLES)
+    names = (name, full, solver, plain)
+    found = next((STYLES[key] for key in names if key in STYLES), _OTHER)
     return dict(color=found.colour, ls=found.line, marker=found.marker)
 
 
