@@ -58,12 +58,12 @@ class IndependentPaths(AbstractSampling):
         )
 
 
-def _samples(p: Problem, keys: Key[Array, " n"]) -> Samples:
+def _samples(problem: Problem, keys: Key[Array, " n"]) -> Samples:
     """A sample is a path, with the same random key on all levels."""
     # (levels, S, n, m) and (levels, n)
-    values, failed = values_of_paths(p, keys)
+    values, failed = values_of_paths(problem, keys)
     return Samples(
-        averaged=Averaged(p.shaped(p.combinations(values))),
+        averaged=Averaged(problem.shaped(problem.combinations(values))),
         good=~jnp.any(failed, axis=0),
         num_failed=failed,
     )

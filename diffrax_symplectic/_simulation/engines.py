@@ -76,12 +76,12 @@ def state_itself(t, y, args):
 
 
 def by_jax(
-    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
+    problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:
     """The paths with these sample numbers, on one level, simulated by JAX, with the loop of
     `expectation`."""
     high, low = _words(sample_numbers)
-    on_all_levels = _paths_by_jax(p, key, high, low)
+    on_all_levels = _paths_by_jax(problem, key, high, low)
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`ensemble`", on_all_levels)
     y, failed = jax.device_get(on_all_levels)
@@ -102,28 +102,28 @@ def _sample_keys(key: PRNGKeyArray, high: _Words, low: _Words) -> Array:
 
 @eqx.filter_jit
 def _draw_starts(
-    p: Problem, key: PRNGKeyArray, high: _Words, low: _Words
+    problem: Problem, key: PRNGKeyArray, high: _Words, low: _Words
 ) -> tuple[PyTree, PyTree]:
     """`Problem.draw_start` for the paths of a batch."""
-    return jax.vmap(p.draw_start)(_sample_keys(key, high, low))
+    return jax.vmap(problem.draw_start)(_sample_keys(key, high, low))
 
 
 @eqx.filter_jit
 @lapack_in_turn
 def _paths_by_jax(
-    p: Problem, key: PRNGKeyArray, high: _Words, low: _Words
+    problem: Problem, key: PRNGKeyArray, high: _Words, low: _Words
 ) -> tuple[PyTree[Array], Bool[Array, "levels n"]]:
     """The saved states of the paths of a batch, along axes of levels, paths and times, and
     which paths failed."""
     # (levels, times, paths, entries of the state)
-    states, failed = values_of_paths(p, _sample_keys(key, high, low))
+    states, failed = values_of_paths(problem, _sample_keys(key, high, low))
     # (levels, paths, times, entries of the state)
     states = jnp.swapaxes(states, 1, 2)
-    return p.unravel(states), failed
+    return problem.unravel(states), failed
 
 
 def by_drjit(
-    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
+    problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:
     """The paths with these sample numbers, on one level, simulated by a fused kernel. JAX
     simulates again the paths that the kernel could not finish.
@@ -131,7 +131,7 @@ def by_drjit(
     Raises an `ImportError` without Dr.Jit, and a `ValueError` if the system cannot be
     replayed."""
     try:
-        fused = _fused_batch(p, key, sample_numbers, level)
+        fused = _fused_batch(problem, key, sample_numbers, level)
     except ImportError as error:
         raise ImportError(
             f'`engine="drjit"` needs Dr.Jit. {error}; or pass `engine="jax"`, which needs '
@@ -145,16 +145,16 @@ def by_drjit(
         raise refusal from None
     if fused.num_stragglers == 0:
         return fused
-    return _with_stragglers(p, key, sample_numbers, level, fused)
+    return _with_stragglers(problem, key, sample_numbers, level, fused)
 
 
 def _fused_batch(
-    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int
+    problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int
 ) -> Batch:
     """The paths of a batch from the kernel alone: those that it did not finish count as
     failed."""
-    kernels, lanes, shared = fused_start(p, key, sample_numbers, level)
-    saved_steps = np.asarray(p.level(level).saved_steps)
+    kernels, lanes, shared = fused_start(problem, key, sample_numbers, level)
+    saved_steps = np.asarray(problem.level(level).saved_steps)
     # For each number of steps, the entries of the states after them: an array for each
     # entry, along the paths. The kernel is called for the steps between two saved times.
     entries_after: dict[int, list[np.ndarray]] = {}
@@ -171,7 +171,7 @@ def _fused_batch(
     ]
     stopped = np.asarray(lanes.stopped)
     return Batch(
-        y=_states_of_entries(p.y0, entries),
+        y=_states_of_entries(problem.y0, entries),
         failed=stopped,
         num_stragglers=int(np.sum(stopped)),
     )
@@ -188,25 +188,27 @@ class FusedStart(NamedTuple):
 
 
 def fused_start(
-    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
+    problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> FusedStart:
     """The paths with these sample numbers before their first step, and the kernels of the
     problem, which are compiled unless they are known."""
-    own_args = None if p.args_of is None else eqx.filter(p.args, eqx.is_array)
+    own_args = (
+        None if problem.args_of is None else eqx.filter(problem.args, eqx.is_array)
+    )
     functions, arrays = functions_and_arrays(
-        _compiled_problem(p), key, own_args, p.paths_differ
+        _compiled_problem(problem), key, own_args, problem.paths_differ
     )
     kernels = _kernels(functions)
-    if p.paths_differ:
+    if problem.paths_differ:
         high, low = _words(sample_numbers)
-        y0, args = _draw_starts(p, key, high, low)
+        y0, args = _draw_starts(problem, key, high, low)
     else:
-        y0 = p.y0
+        y0 = problem.y0
         args = None
     lanes, shared = kernels.begin(
         arrays,
         key,
-        h=p.level(level).h,
+        h=problem.level(level).h,
         first_path=int(sample_numbers[0]),
         num_paths=len(sample_numbers),
         y0=y0,
@@ -215,20 +217,20 @@ def fused_start(
     return FusedStart(kernels, lanes, shared)
 
 
-def _compiled_problem(p: Problem) -> Problem:
+def _compiled_problem(problem: Problem) -> Problem:
     """The problem for which a kernel is compiled: with plain sweeps for root finders, and
     with placeholders for step sizes, times and numbers of steps, which are inputs of the
     kernel."""
     zero = jnp.zeros(1, jnp.int32)
     level = Level(
         index=zero,
-        h=jnp.ones_like(p.levels.h[:1]),
+        h=jnp.ones_like(problem.levels.h[:1]),
         num_steps=zero,
         saved_steps=zero[None],
     )
     return dataclasses.replace(
-        p,
-        solver=without_rescue(p.solver),
+        problem,
+        solver=without_rescue(problem.solver),
         y0_of=None,
         args_of=None,
         levels=level,
@@ -245,7 +247,11 @@ def _kernels(functions: PathFunctions) -> Kernels:
 
 
 def _with_stragglers(
-    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int, fused: Batch
+    problem: Problem,
+    key: PRNGKeyArray,
+    sample_numbers: np.ndarray,
+    level: int,
+    fused: Batch,
 ) -> Batch:
     """The paths of a batch, with those that the kernel did not finish simulated by JAX."""
     # To go on from where the kernel stopped, JAX would need the solver's state, too. JAX
@@ -257,7 +263,7 @@ def _with_stragglers(
     power = int(np.ceil(np.log(num_stragglers) / np.log(4)))
     size = min(len(sample_numbers), 4**power)
     repeated_places = np.resize(places, size)
-    solved = by_jax(p, key, sample_numbers[repeated_places], level)
+    solved = by_jax(problem, key, sample_numbers[repeated_places], level)
 
     def with_stragglers(fused_leaf: np.ndarray, solved_leaf: np.ndarray) -> np.ndarray:
         leaf = np.array(fused_leaf)

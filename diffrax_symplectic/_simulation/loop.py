@@ -45,17 +45,20 @@ class PathStates(eqx.Module):
 
     @staticmethod
     def start(
-        p: Problem, drawn: DrawnStart, solver_state: PyTree[Array], control: Any = None
+        problem: Problem,
+        drawn: DrawnStart,
+        solver_state: PyTree[Array],
+        control: Any = None,
     ) -> "PathStates":
         """Paths before their first step. A path whose initial state is not finite has
         failed."""
         failed = ~jax.vmap(all_finite)(drawn.y0)
-        y = _kept_where(failed, p.y0, drawn.y0)
+        y = _kept_where(failed, problem.y0, drawn.y0)
         return PathStates(y, solver_state, failed, drawn.args, control)
 
     def moved(
         self,
-        p: Problem,
+        problem: Problem,
         y: Y,
         solver_state: PyTree[Array],
         success: Bool[Array, " n"],
@@ -64,7 +67,7 @@ class PathStates(eqx.Module):
         """The paths after a step to `y`, with failed paths reset."""
         failed = self.failed | ~success
         solver_state = _kept_where(failed, self.solver_state, solver_state)
-        y = _kept_where(failed, p.y0, y)
+        y = _kept_where(failed, problem.y0, y)
         return PathStates(y, solver_state, failed, self.args, control)
 
 
@@ -108,22 +111,22 @@ def _phi_itself(phi: Array, failed: Bool[Array, " n"]) -> Array:
 
 
 def simulate(
-    p: Problem,
+    problem: Problem,
     begin: Callable[[Level], Motion],
     measure: Callable[[Array, Bool[Array, " n"]], Array] = _phi_itself,
 ) -> Simulated:
     """Simulates the paths of all levels, which `begin(level)` starts. After each saved step
     `measure(phi, failed)` is saved, with `phi` of shape `(n, m)`."""
-    on_level = ft.partial(_on_level, p, begin, measure)
-    if len(p.levels.h) == 1:
-        only_level = on_level(p.level(0))
+    on_level = ft.partial(_on_level, problem, begin, measure)
+    if len(problem.levels.h) == 1:
+        only_level = on_level(problem.level(0))
         return jtu.tree_map(lambda x: x[None], only_level)
     # All levels share one compiled program.
-    return lax.map(on_level, p.levels)
+    return lax.map(on_level, problem.levels)
 
 
 def _on_level(
-    p: Problem, begin: Callable[[Level], Motion], measure: Callable, level: Level
+    problem: Problem, begin: Callable[[Level], Motion], measure: Callable, level: Level
 ) -> Simulated:
     """Simulates the paths of one level."""
     motion = begin(level)
@@ -132,22 +135,22 @@ def _on_level(
         paths, saved = carry
         num_steps = i + 1
         paths = motion.step(i, paths)
-        return _measure_if_saved(p, level, measure, num_steps, paths, saved)
+        return _measure_if_saved(problem, level, measure, num_steps, paths, saved)
 
-    num_saves, m = p.num_outputs
+    num_saves, m = problem.num_outputs
     num_paths = len(motion.start.failed)
-    dtype = p.dtype_of_values
+    dtype = problem.dtype_of_values
     phi = jax.ShapeDtypeStruct((num_paths, m), dtype)
     measured = jax.eval_shape(measure, phi, motion.start.failed)
     saved = jnp.zeros((num_saves, *measured.shape), dtype)
     # A saved time may be `t0`.
-    carry = _measure_if_saved(p, level, measure, 0, motion.start, saved)
+    carry = _measure_if_saved(problem, level, measure, 0, motion.start, saved)
     paths, saved = lax.fori_loop(0, level.num_steps, step_and_measure, carry)
     return Simulated(saved, paths.failed, paths.control)
 
 
 def _measure_if_saved(
-    p: Problem,
+    problem: Problem,
     level: Level,
     measure: Callable,
     i: Any,
@@ -159,7 +162,7 @@ def _measure_if_saved(
 
     def measured():
         def phi_of(y, args):
-            return p.with_args(args).values(p.t0 + i * level.h, y)
+            return problem.with_args(args).values(problem.t0 + i * level.h, y)
 
         phi = jax.vmap(phi_of)(paths.y, paths.args)
         failed = paths.failed | ~jax.vmap(all_finite)(phi)
@@ -177,7 +180,7 @@ def _measure_if_saved(
 
 
 def independent_steps(
-    p: Problem,
+    problem: Problem,
     level: Level,
     drawn: DrawnStart,
     terms_of: Callable[[Any], PyTree],
@@ -189,42 +192,42 @@ def independent_steps(
 
     def step(i: Any, paths: PathStates) -> PathStates:
         def step_of_path(random, y, solver_state, args):
-            problem_of_path = p.with_args(args)
+            problem_of_path = problem.with_args(args)
             terms = terms_of(random)
             return problem_of_path.step(terms, i, level.h, y, solver_state)
 
         y, solver_state, success = _vmapped_in_blocks(
             step_of_path, randomness(i), paths.y, paths.solver_state, paths.args
         )
-        return paths.moved(p, y, solver_state, success)
+        return paths.moved(problem, y, solver_state, success)
 
     def solver_state_at_start(random, y, args):
-        problem_of_path = p.with_args(args)
+        problem_of_path = problem.with_args(args)
         return problem_of_path.init(terms_of(random), 0, level.h, y)
 
     solver_state = jax.vmap(solver_state_at_start)(randomness(0), drawn.y0, drawn.args)
-    return Motion(step, PathStates.start(p, drawn, solver_state))
+    return Motion(step, PathStates.start(problem, drawn, solver_state))
 
 
 def values_of_paths(
-    p: Problem, keys: Key[Array, " n"]
+    problem: Problem, keys: Key[Array, " n"]
 ) -> tuple[Float[Array, "levels S n m"], Bool[Array, "levels n"]]:
     """The values of `phi` for independent paths, one for each key, on all levels and at the
     times at which to average, and which paths failed."""
-    keys_of_paths = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
-    drawn = jax.vmap(p.draw_start)(keys)
+    keys_of_paths = jax.vmap(lambda key: path_keys(problem.terms, key))(keys)
+    drawn = jax.vmap(problem.draw_start)(keys)
 
     def begin(level: Level) -> Motion:
         return independent_steps(
-            p,
+            problem,
             level,
             drawn,
-            terms_of=lambda keys_of_path: with_keys(p.terms, keys_of_path),
+            terms_of=lambda keys_of_path: with_keys(problem.terms, keys_of_path),
             # A path draws the increments of all steps from its keys.
             randomness=lambda i: keys_of_paths,
         )
 
-    simulated = simulate(p, begin)
+    simulated = simulate(problem, begin)
     return simulated.saved, simulated.failed
 
 

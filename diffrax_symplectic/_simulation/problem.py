@@ -75,8 +75,7 @@ class Problem(eqx.Module):
     """The arguments of `expectation`, by the same names, and the levels, along a leading
     axis. Where `y0` or `args` is a function of a random key, `y0` and `args` are an example
     of its values. Outside of programs times, levels and weights are NumPy arrays: there
-    each operation of JAX is a program of its own, which takes some 20 ms to compile. Where
-    a problem is the argument of a function, it is called `p`."""
+    each operation of JAX is a program of its own, which takes some 20 ms to compile."""
 
     phi: Callable[[RealScalarLike, Y, Args], PyTree]
     terms: PyTree[diffrax.AbstractTerm]

@@ -28,7 +28,7 @@ class _Control(NamedTuple):
 
 
 def controlled_paths(
-    p: Problem,
+    problem: Problem,
     functions: FittedFunctions,
     choice: Choice,
     usual: Usual,
@@ -39,10 +39,10 @@ def controlled_paths(
     leading axis of levels. Deviations beyond the `usual` ones are averaged apart, which
     paths with a wider `law` of the noise estimate."""
     functions = functions.of_candidates(choice.best)
-    starts = jax.vmap(p.draw_start)(keys)
+    starts = jax.vmap(problem.draw_start)(keys)
 
     def begin(level: Level) -> Motion:
-        noise = Noise.of(p, level)
+        noise = Noise.of(problem, level)
         u = jtu.tree_map(lambda x: x[level.index], functions)
         law_on_level = TrialLaw(*[x[level.index] for x in law])
 
@@ -71,31 +71,33 @@ def controlled_paths(
                 fitted_mean=fitted_mean,
                 log_ratio=before.log_ratio + log_ratio,
             )
-            return paths.moved(p, after.y, after.solver_state, after.success, control)
+            return paths.moved(
+                problem, after.y, after.solver_state, after.success, control
+            )
 
         def first_solver_state(y, args):
             return noise.with_args(args).fresh(0, y)
 
-        dtype = jax.eval_shape(lambda: u(0, p.y0)).dtype
-        zero = jnp.zeros((len(keys), *p.num_outputs), dtype)
+        dtype = jax.eval_shape(lambda: u(0, problem.y0)).dtype
+        zero = jnp.zeros((len(keys), *problem.num_outputs), dtype)
         no_control = _Control(zero, zero, jnp.zeros(len(keys), dtype))
         solver_state = jax.vmap(first_solver_state)(*starts)
-        return Motion(step, PathStates.start(p, starts, solver_state, no_control))
+        return Motion(step, PathStates.start(problem, starts, solver_state, no_control))
 
-    simulated = simulate(p, begin)
+    simulated = simulate(problem, begin)
     # (levels, S, n, m)
     plain = simulated.saved
     # From (levels, n, S, m) to the same.
     control = jnp.swapaxes(simulated.control.value, 1, 2).astype(plain.dtype)
     fitted_mean = jnp.swapaxes(simulated.control.fitted_mean, 1, 2).astype(plain.dtype)
     # At the start itself nothing is random, and no function is fitted.
-    is_at_start = mask_like(p.levels.saved_steps[0] == 0, plain[0])
+    is_at_start = mask_like(problem.levels.saved_steps[0] == 0, plain[0])
     fitted_mean = jnp.where(is_at_start, plain, fitted_mean)
     # (combinations, S, n, m)
-    value = p.combinations(plain - control)
-    plain = p.combinations(plain)
-    control = p.combinations(control)
-    fitted_mean = p.combinations(fitted_mean)
+    value = problem.combinations(plain - control)
+    plain = problem.combinations(plain)
+    control = problem.combinations(control)
+    fitted_mean = problem.combinations(fitted_mean)
 
     center = usual.center[:, :, None]
     mean = jnp.where(choice.used[:, None], fitted_mean, center)
@@ -103,10 +105,10 @@ def controlled_paths(
     log_ratio = jnp.sum(simulated.control.log_ratio, axis=0)
     tails = usual.tails(deviations, plain, log_ratio)
     averaged = Averaged(
-        p.shaped(value),
-        plain=p.shaped(plain),
-        control=p.shaped(control),
-        tails=p.shaped(tails),
+        problem.shaped(value),
+        plain=problem.shaped(plain),
+        control=problem.shaped(control),
+        tails=problem.shaped(tails),
     )
     good = ~jnp.any(simulated.failed, axis=0)
     return Samples(averaged, good, num_failed=simulated.failed)

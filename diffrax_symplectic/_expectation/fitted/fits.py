@@ -74,10 +74,10 @@ def fit(
 ) -> tuple[FittedFunctions, Int[Array, ""]]:
     """The functions of a level, by a pilot run forward in time and fits backward; and how
     many of the pilot's paths failed."""
-    p = noise.problem
+    problem = noise.problem
     num_steps = noise.level.num_steps
     pilot = _pilot(noise, jr.split(key, basis.num_pilots))
-    unit = _unit(p, pilot, num_steps)
+    unit = _unit(problem, pilot, num_steps)
 
     def frame_after(i: Any) -> PyTree[Array]:
         return basis.frame(pilot.states[i], pilot.good, unit)
@@ -92,10 +92,17 @@ def fit(
         return FittedFunctions(frames, put_step(u.coefficients, c), None, basis)
 
     # All levels have arrays for the steps of the finest one, so that they share a program.
-    zeros = lambda struct: jnp.zeros((p.finest_steps, *struct.shape), struct.dtype)
+    zeros = lambda struct: jnp.zeros(
+        (problem.finest_steps, *struct.shape), struct.dtype
+    )
     frames = jtu.tree_map(zeros, jax.eval_shape(lambda: frame_after(0)))
-    shape = p.finest_steps, basis.size, len(basis.candidates), *p.num_outputs
-    u = FittedFunctions(frames, jnp.zeros(shape, p.dtype), None, basis)
+    shape = (
+        problem.finest_steps,
+        basis.size,
+        len(basis.candidates),
+        *problem.num_outputs,
+    )
+    u = FittedFunctions(frames, jnp.zeros(shape, problem.dtype), None, basis)
     u = lax.fori_loop(0, num_steps, backward, u)
     second = _second_derivatives(noise, pilot, u)
     functions = FittedFunctions(u.frames, u.coefficients, second, basis)
@@ -107,9 +114,9 @@ def _target(noise: Noise, u: FittedFunctions, i: Any) -> Target:
     """What the functions after step `i` are fitted to, as a function of a flat state. For
     averages at the end of this step that is `phi` itself, for later ones the mean over the
     next step of the functions after it, which are known, and for earlier ones zero."""
-    p = noise.problem
+    problem = noise.problem
     level = noise.level
-    _, unravel = jfu.ravel_pytree(p.y0)
+    _, unravel = jfu.ravel_pytree(problem.y0)
     # After the last step the mean over a next one is computed, too, but not used.
     next_step = jnp.minimum(i + 1, level.num_steps - 1)
 
@@ -118,9 +125,9 @@ def _target(noise: Noise, u: FittedFunctions, i: Any) -> Target:
         x_drawn = None
         if key is not None:
             # The pilot's own steps draw by the numbers below `finest_steps`.
-            x_drawn, _ = noise.draw(key, p.finest_steps + i)
+            x_drawn, _ = noise.draw(key, problem.finest_steps + i)
         mean = noise.mean(next_step, y, lambda y1: u(next_step, y1), x_drawn)
-        phi = p.values(p.t0 + (i + 1) * level.h, y).astype(mean.dtype)
+        phi = problem.values(problem.t0 + (i + 1) * level.h, y).astype(mean.dtype)
         is_now = level.saved_steps == i + 1
         is_later = level.saved_steps > i + 1
         mean_or_zero = jnp.where(is_later[:, None], mean, 0)
@@ -164,7 +171,7 @@ class _Pilot(NamedTuple):
 
 def _pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
     """Simulates a path for each key."""
-    p = noise.problem
+    problem = noise.problem
 
     def step(i: Any, y: Y, args: PyTree[Array], key: PRNGKeyArray):
         # With equal probabilities of all outcomes the pilot's paths spread further than
@@ -179,23 +186,25 @@ def _pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
         paths, states = carry
         step_of_all = jax.vmap(ft.partial(step, i))
         y, success = step_of_all(paths.y, paths.args, keys)
-        paths = paths.moved(p, y, None, success)
+        paths = paths.moved(problem, y, None, success)
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
     # Solvers start anew in each step, which is good enough for a fit.
-    paths = PathStates.start(p, jax.vmap(p.draw_start)(keys), solver_state=None)
+    paths = PathStates.start(
+        problem, jax.vmap(problem.draw_start)(keys), solver_state=None
+    )
     starts = jax.vmap(ravel)(paths.y)
-    states = jnp.broadcast_to(starts, (p.finest_steps, *starts.shape))
+    states = jnp.broadcast_to(starts, (problem.finest_steps, *starts.shape))
     carry = paths, states
     paths, states = lax.fori_loop(0, noise.level.num_steps, forward, carry)
     return _Pilot(keys, starts, states, ~paths.failed)
 
 
-def _unit(p: Problem, pilot: _Pilot, num_steps: Any) -> Float[Array, " d"]:
+def _unit(problem: Problem, pilot: _Pilot, num_steps: Any) -> Float[Array, " d"]:
     """How far each component moves: the root of the mean squared distance from the start
     over all steps of good paths. Zero for components that do not move."""
-    start, _ = jfu.ravel_pytree(p.y0)
-    if p.y0_of is not None:
+    start, _ = jfu.ravel_pytree(problem.y0)
+    if problem.y0_of is not None:
         start = jnp.mean(pilot.starts, axis=0)
     # (steps, paths, d)
     distances = jnp.where(pilot.good[:, None], jnp.abs(pilot.states - start), 0)

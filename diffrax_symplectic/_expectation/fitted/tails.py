@@ -48,17 +48,17 @@ class TrialLaw(NamedTuple):
     tilts: Float[Array | np.ndarray, "*levels n"]
 
 
-def laws_of_trials(p: Problem) -> list[TrialLaw]:
+def laws_of_trials(problem: Problem) -> list[TrialLaw]:
     """The noise's own law, a wider one, and for one noise or two those in which each noise
     pushes to one side."""
-    laws = Noise.of(p, p.level(0)).laws
-    no_share = np.zeros(len(p.levels.h), p.dtype)
-    no_tilts = np.zeros((len(no_share), len(laws)), p.dtype)
-    share = _strongest_change(p, laws, widened, 1.0)
+    laws = Noise.of(problem, problem.level(0)).laws
+    no_share = np.zeros(len(problem.levels.h), problem.dtype)
+    no_tilts = np.zeros((len(no_share), len(laws)), problem.dtype)
+    share = _strongest_change(problem, laws, widened, 1.0)
     trial_laws = [TrialLaw(no_share, no_tilts), TrialLaw(share, no_tilts)]
-    num_noises = number_of_noises(p.terms)
+    num_noises = number_of_noises(problem.terms)
     if num_noises <= _MOST_NOISES:
-        tilt = _strongest_change(p, laws, _tilted_law, _MOST_TILTED)
+        tilt = _strongest_change(problem, laws, _tilted_law, _MOST_TILTED)
         for sides in itertools.product((-1, 1), repeat=num_noises):
             tilts = no_tilts.copy()
             # The increments come first. The other variables, which are only in products
@@ -73,12 +73,12 @@ def _tilted_law(law: Discrete, tilt: float) -> np.ndarray:
 
 
 def _strongest_change(
-    p: Problem, laws: tuple[Discrete, ...], change_law: _Change, most: float
+    problem: Problem, laws: tuple[Discrete, ...], change_law: _Change, most: float
 ) -> Float[np.ndarray, " levels"]:
     """For each level the largest `z`, up to `most`, for which the laws `change_law(law, z)`
     give all variables of a path, on all levels together, a relative entropy of at most 8
     nats with respect to their own laws."""
-    num_steps = p.levels.num_steps
+    num_steps = problem.levels.num_steps
     counts = collections.Counter(laws)
     # Each level, which has its own number of steps, has an equal part of the entropy.
     most_nats = _NATS / len(num_steps)
@@ -91,7 +91,7 @@ def _strongest_change(
         is_too_much = num_steps * nats > most_nats
         lower = np.where(is_too_much, lower, middle)
         upper = np.where(is_too_much, middle, upper)
-    return lower.astype(p.dtype)
+    return lower.astype(problem.dtype)
 
 
 def _relative_entropy(

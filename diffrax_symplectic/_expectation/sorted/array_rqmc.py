@@ -135,7 +135,7 @@ class ArrayRQMC(AbstractSampling):
 
 
 def _samples(
-    p: Problem,
+    problem: Problem,
     sort_by: Callable[[Y], PyTree[Array]],
     points: UInt32[Array, "n d"],
     layout: "StepWords",
@@ -152,14 +152,14 @@ def _samples(
     # Starts are independent, rather than from Sobol' points, since a function of a key may
     # draw any number of random variables.
     start_keys = jr.split(jr.fold_in(replicate_key, _KEY_OF_STARTS), n)
-    starts = jax.vmap(p.draw_start)(start_keys)
+    starts = jax.vmap(problem.draw_start)(start_keys)
 
     def begin(level: Level) -> Motion:
         motion = independent_steps(
-            p,
+            problem,
             level,
             starts,
-            lambda words: with_words(p.terms, layout, words),
+            lambda words: with_words(problem.terms, layout, words),
             lambda i: _words_of_paths(replicate_key, level, i, points, layout.sixths),
         )
 
@@ -168,19 +168,21 @@ def _samples(
 
         return Motion(step, motion.start)
 
-    simulated = simulate(p, begin, _statistics)
+    simulated = simulate(problem, begin, _statistics)
     # From (levels, S, 3, m) to (3, levels, S, n, m), with an axis for the samples, of which
     # there is one.
     statistics = jnp.moveaxis(simulated.saved[:, :, :, None], 2, 0)
     mean, r, largest = statistics
-    mean = p.combinations(mean)
+    mean = problem.combinations(mean)
     # The largest `r` on any level, for all combinations.
     r = jnp.broadcast_to(jnp.max(r, axis=0), mean.shape)
     # The most by which a path can deviate in a combination of levels: the largest
     # deviations on all of them may be deviations of one path.
-    largest = combinations(abs(p.weights), largest)
+    largest = combinations(abs(problem.weights), largest)
     averaged = Averaged(
-        p.shaped(mean), heaviness=p.shaped(r), largest=p.shaped(largest)
+        problem.shaped(mean),
+        heaviness=problem.shaped(r),
+        largest=problem.shaped(largest),
     )
     num_failed = jnp.sum(simulated.failed, axis=1, keepdims=True)
     return Samples(averaged, good=jnp.ones(1, bool), num_failed=num_failed)
