@@ -128,7 +128,7 @@ def _samples(problem: Problem, paths: _Paths, keys: Key[Array, " n"]) -> Samples
     # (levels, S, n, m)
     phi = jnp.swapaxes(phi, 1, 2)
     return Samples(
-        averaged=Averaged(problem.shaped(problem.combinations(phi))),
+        averaged=Averaged(problem.unravel_samples(problem.combinations(phi))),
         good=~jnp.any(failed, axis=0),
         num_failed=failed,
     )

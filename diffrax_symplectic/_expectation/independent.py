@@ -63,7 +63,7 @@ def _samples(problem: Problem, keys: Key[Array, " n"]) -> Samples:
     # (levels, S, n, m) and (levels, n)
     values, failed = values_of_paths(problem, keys)
     return Samples(
-        averaged=Averaged(problem.shaped(problem.combinations(values))),
+        averaged=Averaged(problem.unravel_samples(problem.combinations(values))),
         good=~jnp.any(failed, axis=0),
         num_failed=failed,
     )

@@ -141,7 +141,9 @@ class _Batches:
         self._devices = devices
         self._struct = plan.struct
         self._levels = plan.levels
-        self._batch_moments: Any = quick_batch_moments if plan.quick else batch_moments
+        self._batch_moments: Any = (
+            quick_batch_moments if plan.is_quick else batch_moments
+        )
         if jax.process_count() > 1:
             # All processes hold the same arrays. Captured by a function they become
             # constants; as arguments they would have to be placed on all devices.

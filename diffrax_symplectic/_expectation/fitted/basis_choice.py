@@ -54,8 +54,8 @@ def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
     """The basis for polynomials of this degree, or for `None` a grid or polynomials of
     several degrees to try. Raises a `ValueError` if the fit needs too much memory, or for
     random variables without finitely many outcomes."""
-    _, weights = Noise.of(problem, problem.level(0)).nodes()
-    num_nodes = len(weights)
+    noise = Noise.of(problem, problem.level(0))
+    num_nodes = len(noise.weighted_nodes().weights)
     total_steps = int(np.sum(problem.levels.num_steps))
     basis = _basis(problem, degree, num_nodes, total_steps)
     num_states = basis.num_sites * num_nodes
@@ -136,7 +136,9 @@ def _has_many_of_degree_two(d: int) -> bool:
 
 def _num_functions(problem: Problem) -> int:
     """The number of functions in a fit: for all levels, steps, times and components."""
-    return len(problem.levels.h) * problem.finest_steps * math.prod(problem.num_outputs)
+    return (
+        len(problem.levels.h) * problem.finest_steps * math.prod(problem.output_shape)
+    )
 
 
 def _check_memory(problem: Problem, basis: Hermite) -> None:
