@@ -37,7 +37,7 @@ def fused_plan(
             "Pass `devices=jax.devices()[:1]`."
         )
     levels = len(problem.levels.h)
-    plan = sampling.plan(jtu.Partial(_samples, problem), levels, devices)
+    plan = sampling.plan(jtu.Partial(_samples_of_fused_paths, problem), levels, devices)
     if sampling.batch_size is None:
         plan = plan._replace(batch_size=_FUSED_BATCH)
     return plan._replace(simulate_paths=FusedPaths(problem, key))
@@ -107,7 +107,9 @@ class _NumberedPaths(NamedTuple):
     paths: _Paths
 
 
-def _samples(problem: Problem, paths: _Paths, keys: Key[Array, " n"]) -> Samples:
+def _samples_of_fused_paths(
+    problem: Problem, paths: _Paths, keys: Key[Array, " n"]
+) -> Samples:
     """The samples of paths that are known: one for each random key, by which a path draws
     its `args`, too."""
     _, args_of_paths = jax.vmap(problem.draw_start)(keys)

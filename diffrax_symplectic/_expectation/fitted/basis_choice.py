@@ -83,7 +83,7 @@ def _basis(
         grid = _finest_grid(problem, d, num_nodes, total_steps)
         if grid is not None:
             return grid
-        degrees = _degrees(d, num_nodes, total_steps)
+        degrees = _candidate_degrees(d, num_nodes, total_steps)
     else:
         degrees = (whole_number("degree", degree, 0),)
     # Averaged derivatives cost less than a fit to many polynomials.
@@ -106,14 +106,14 @@ def _finest_grid(
         # The loop over steps backward holds the coefficients twice.
         memory = 2 * problem.dtype.itemsize * grid.size * _num_functions(problem)
         num_ends = size**d * num_nodes
-        is_quick = num_ends <= _MOST_ENDS_OF_STEP
-        is_quick &= num_ends * total_steps <= _MOST_ENDS
-        if memory <= _MOST_MEMORY and is_quick:
+        fits_into_step = num_ends <= _MOST_ENDS_OF_STEP
+        is_quick = num_ends * total_steps <= _MOST_ENDS
+        if memory <= _MOST_MEMORY and fits_into_step and is_quick:
             return grid
     return None
 
 
-def _degrees(d: int, num_nodes: int, total_steps: int) -> tuple[int, ...]:
+def _candidate_degrees(d: int, num_nodes: int, total_steps: int) -> tuple[int, ...]:
     """The degrees to try: the highest that has few polynomials and does not take too long,
     and all even degrees below it."""
     if _has_many_of_degree_two(d):
@@ -122,6 +122,7 @@ def _degrees(d: int, num_nodes: int, total_steps: int) -> tuple[int, ...]:
     def is_allowed(degree: int) -> bool:
         if num_polynomials(d, degree) > _MOST_POLYNOMIALS:
             return False
+        # The ends of all steps from all points of the fit.
         num_ends = Hermite(d, (degree,)).num_sites * num_nodes * total_steps
         return degree <= _LEAST_DEGREE_TRIED or num_ends <= _MOST_ENDS
 
@@ -131,6 +132,7 @@ def _degrees(d: int, num_nodes: int, total_steps: int) -> tuple[int, ...]:
 
 
 def _has_many_of_degree_two(d: int) -> bool:
+    """Whether there are too many polynomials of degree 2 for a fit by least squares."""
     return num_polynomials(d, 2) > _MOST_POLYNOMIALS
 
 

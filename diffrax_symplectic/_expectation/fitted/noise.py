@@ -177,9 +177,9 @@ class Noise(eqx.Module):
         step_by_outcome = jax.vmap(lambda x: self.step(i, y, solver_state, x))
         ends, solver_states, success = step_by_outcome(outcomes_of_x)
         values = jax.vmap(u)(ends)
-        mean = tensordot(probabilities.astype(values.dtype), values, 1)
         # The path itself takes the outcome that is equal to `x`.
         index_of_x = jnp.argmax(jnp.all(outcomes_of_x == x, axis=1))
+        mean = tensordot(probabilities.astype(values.dtype), values, 1)
         y1, solver_state_after, value = jtu.tree_map(
             lambda of_outcomes: of_outcomes[index_of_x], (ends, solver_states, values)
         )
