@@ -152,8 +152,8 @@ def _samples_of_function(
 def _value_and_success(
     fn: Callable, arguments: tuple[int, ...], key: PRNGKeyArray
 ) -> tuple[PyTree[Array], Bool[Array, ""]]:
-    """The $\\phi$ that `fn(key, *arguments)` returns, in floating-point numbers, and whether
-    the path succeeded."""
+    """The $\\phi$ that `fn(key, *arguments)` returns, in floating-point numbers, and
+    whether the path succeeded."""
     phi = fn(key, *arguments)
     success = jnp.array(True)
     is_pair = isinstance(phi, tuple) and len(phi) == 2
