@@ -198,19 +198,9 @@ def ensemble(
     if batch_size is None:
         batch_size = _default_batch_size(engine, problem)
     batch_size = min(whole_number("batch_size", batch_size), num_paths)
-
-    simulate_batch = ENGINES[engine]
-    batches = []
-    for first in range(0, num_paths, batch_size):
-        # JAX compiles for one batch size: surplus paths of the last batch are cut
-        # afterwards.
-        size = batch_size
-        if engine != "jax":
-            size = min(batch_size, num_paths - first)
-        sample_numbers = np.arange(first, first + size, dtype=np.uint64)
-        batches.append(simulate_batch(problem, key, sample_numbers))
+    batches = _simulated_batches(problem, key, engine, num_paths, batch_size)
     whole = _concatenated(batches, num_paths, at_end=ts is None)
-    _warn_of_failures(whole, problem.bounded)
+    _warn_of_failures(whole, problem.has_bounded_increments)
     # The times of the steps, from which the times of the user differ by rounding errors.
     saved_steps = np.asarray(problem.levels.saved_steps[0])
     saved_times = float(problem.t0) + saved_steps * float(problem.levels.h[0])
@@ -232,6 +222,22 @@ def _default_batch_size(engine: str, problem: Problem) -> int:
         entries_of_batch *= _FACTOR_ON_ACCELERATORS
     entries_of_path = sum(leaf.size for leaf in jtu.tree_leaves(problem.y0))
     return max(_FEWEST_PATHS, entries_of_batch // entries_of_path)
+
+
+def _simulated_batches(
+    problem: Problem, key: PRNGKeyArray, engine: str, num_paths: int, batch_size: int
+) -> list[Batch]:
+    """The batches that hold this number of paths, and maybe surplus ones at the end."""
+    simulate_batch = ENGINES[engine]
+    batches = []
+    for first in range(0, num_paths, batch_size):
+        # JAX compiles for one batch size, so the last batch has it, too.
+        size = batch_size
+        if engine != "jax":
+            size = min(batch_size, num_paths - first)
+        sample_numbers = np.arange(first, first + size, dtype=np.uint64)
+        batches.append(simulate_batch(problem, key, sample_numbers))
+    return batches
 
 
 def _concatenated(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:

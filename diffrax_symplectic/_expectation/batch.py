@@ -124,13 +124,7 @@ def _moments_on_device(
     are those of `_moments_on_devices`."""
     # The places of the samples among those of all devices.
     index = device * n + jnp.arange(n)
-    # The number of the first sample plus the index, in two halves, since there may be no
-    # 64-bit integers.
-    first_low = low_high[0]
-    first_high = low_high[1]
-    low = first_low + index.astype(jnp.uint32)
-    has_carry = low < first_low
-    high = first_high + has_carry.astype(jnp.uint32)
+    high, low = _sum_in_halves(low_high, index)
     key = jr.wrap_key_data(jnp.asarray(key_data), impl=key_impl)
 
     def sample_key(high: Array, low: Array) -> PRNGKeyArray:
@@ -165,6 +159,20 @@ def _moments_on_device(
         largest=averaged_of("largest"),
         size=averaged_of("size"),
     )
+
+
+def _sum_in_halves(
+    low_high: UInt32[Array, "2"], index: Int[Array, " n"]
+) -> tuple[UInt32[Array, " n"], UInt32[Array, " n"]]:
+    """The high and the low 32 bits of a number, from its low and its high ones, plus an
+    index. (There may be no 64-bit integers.)"""
+    first_low = low_high[0]
+    first_high = low_high[1]
+    low = first_low + index.astype(jnp.uint32)
+    # The sum wrapped around.
+    has_carry = low < first_low
+    high = first_high + has_carry.astype(jnp.uint32)
+    return high, low
 
 
 def _moments_of_array(

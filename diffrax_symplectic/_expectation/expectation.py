@@ -202,7 +202,7 @@ def expectation(
                 break
             levels += 1
 
-    for message in cautions(estimate, tol, problem.bounded):
+    for message in cautions(estimate, tol, problem.has_bounded_increments):
         warnings.warn(message, stacklevel=2)
     paths = plan.simulate_paths
     if isinstance(paths, FusedPaths):

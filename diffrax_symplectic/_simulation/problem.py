@@ -298,7 +298,7 @@ class Problem(eqx.Module):
         return jtu.tree_map(without_samples, one_sample)
 
     @property
-    def bounded(self) -> bool:
+    def has_bounded_increments(self) -> bool:
         """Whether the increments of all paths are known to be bounded."""
         return all(has_bounded_increments(path) for path in brownian_paths(self.terms))
 

@@ -327,7 +327,7 @@ def combined_results(estimate: Expectation, combination: Combination) -> Results
 
 def check_same(one: Expectation, other: Expectation, name: str) -> None:
     """Raises a `ValueError` if the estimates have different keys, shapes or numbers of
-    paths in a sample."""
+    paths in a sample. `name` is what messages call one of them, such as "`start`"."""
     if not np.array_equal(one.key_data, other.key_data):
         raise ValueError(
             f"{name} has another `key`. Pass the same `key` for all parts of an "

@@ -51,7 +51,7 @@ class CovarianceFrame(eqx.Module):
     to_coordinates: Float[Array, "d d"]
     to_states: Float[Array, "d d"]
 
-    def at(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
+    def coordinates(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The coordinates of states."""
         return dot(y - self.mean, self.to_coordinates.T)
 
@@ -206,11 +206,11 @@ class Hermite(AbstractBasis):
     ) -> Float[Array, "n size"]:
         """The values of all polynomials at points."""
         at_point = lambda z: jnp.stack(hermite(z, max(self.candidates)))
-        return jax.vmap(at_point)(frame.at(points))
+        return jax.vmap(at_point)(frame.coordinates(points))
 
     def value_at(self, frame, y, c):
         # As a sum of products this compiles to one loop without temporary arrays.
-        polynomials = hermite(frame.at(y), max(self.candidates))
+        polynomials = hermite(frame.coordinates(y), max(self.candidates))
         terms = [value * coefficient for value, coefficient in zip(polynomials, c)]
         return ft.reduce(jnp.add, terms)
 

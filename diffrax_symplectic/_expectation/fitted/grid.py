@@ -96,9 +96,9 @@ class StretchedFrame(eqx.Module):
             edge=_compressed(_compressed(bend)),
         )
 
-    def at(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
+    def coordinates(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The coordinates of states."""
-        scaled = self.factor * (self.inner.at(y) - self.median)
+        scaled = self.factor * (self.inner.coordinates(y) - self.median)
         return _compressed(_compressed(scaled)) / self.edge
 
     def states(self, x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
@@ -147,7 +147,9 @@ class Grid(AbstractBasis):
 
     def frame(self, states, good, unit):
         inner = CovarianceFrame.of(states, good, unit)
-        return StretchedFrame.of(inner, inner.at(states), good, self._base.num_pilots)
+        return StretchedFrame.of(
+            inner, inner.coordinates(states), good, self._base.num_pilots
+        )
 
     def coefficients(self, target, frame, states, good, keys):
         base = self._base
@@ -180,7 +182,7 @@ class Grid(AbstractBasis):
 
     def value_at(self, frame, y, c):
         size = self._base.size
-        correction = self.interpolate(frame.at(y), c[size:])
+        correction = self.interpolate(frame.coordinates(y), c[size:])
         return self._base.value_at(frame.inner, y, c[:size]) + correction
 
     def interpolate(
