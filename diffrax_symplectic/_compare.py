@@ -211,8 +211,8 @@ def compare_solvers(
         _check_scalar(phi, t1, y0, args)
     system = _ComparedSystem(terms, t0, t1, y0, args, phi, key, num_paths)
     reference_dt = min(dts) / _REFERENCE_STEPS
-    solve_exactly = system.solve_to_compare(reference, reference_dt)
-    exact = solve_exactly(system.keys(_COMMON_PATHS), jnp.asarray(reference_dt))
+    solve_for_reference = system.solve_to_compare(reference, reference_dt)
+    exact = solve_for_reference(system.keys(_COMMON_PATHS), jnp.asarray(reference_dt))
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`compare_solvers`", exact)
     steps = []

@@ -144,7 +144,7 @@ def _moments_on_device(
     moments_of_leaves = [_moments_of_array(leaf, good) for leaf in leaves]
 
     def averaged_of(moment: str) -> Averaged:
-        """One moment of all leaves, as PyTrees in the structure of `phi`, one a field."""
+        """One moment of all leaves, with a PyTree like `phi` in each field."""
         tree = treedef.unflatten([getattr(x, moment) for x in moments_of_leaves])
         trees = [jtu.tree_map(lambda x, k=k: x[k], tree) for k in range(len(fields))]
         return Averaged(**dict(zip(fields, trees)))

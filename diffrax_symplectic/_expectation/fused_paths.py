@@ -114,6 +114,7 @@ def _samples_of_fused_paths(
     its `args`, too."""
     _, args_of_paths = jax.vmap(problem.draw_start)(keys)
 
+    # `y` holds the states of a path at all times.
     def values_of_path(
         times: Any, y: PyTree[Array], own_args: PyTree[Array]
     ) -> Float[Array, "S m"]:

@@ -63,14 +63,14 @@ def run(
 ) -> Expectation:
     """The estimate from the samples of a plan, which continues `start`, or begins with
     sample number `first`. The result does not depend on the number of devices."""
-    # The first sample of a batch, where no batch was added yet.
-    first_new = first
+    # The number of the first sample that is not in `start`.
+    next_sample = first
     if start is not None:
         first = start.moments[0].begin
-        first_new = start.moments[-1].end
+        next_sample = start.moments[-1].end
     end = first + plan.num_samples
     batches = _Batches(plan, key, devices)
-    no_moments = batches.without_samples(first_new, end)
+    no_moments = batches.without_samples(next_sample, end)
     estimate = Expectation(
         moments=(no_moments,),
         key_data=batches.key_data,
@@ -82,23 +82,23 @@ def run(
     )
     if start is not None:
         check_same(start, estimate, "`start`")
-        if first_new > end:
+        if next_sample > end:
             raise ValueError(
                 "The number of paths (or replicates) includes `start`, which has "
-                f"{first_new - first} already; got {plan.num_samples}. Pass a larger "
+                f"{next_sample - first} already; got {plan.num_samples}. Pass a larger "
                 "number."
             )
         estimate = dataclasses.replace(estimate, moments=start.moments)
 
-    def has_enough_samples() -> bool:
-        return _stops(estimate, plan.least_samples, tol)
+    def needs_no_more_samples() -> bool:
+        return _needs_no_more_samples(estimate, plan.least_samples, tol)
 
     running_batches: collections.deque[BatchMoments] = collections.deque()
     # One past the last sample of the batches that were started.
-    started_end = first_new
+    started_end = next_sample
     try:
         while True:
-            starts_batch = started_end < end and not has_enough_samples()
+            starts_batch = started_end < end and not needs_no_more_samples()
             if starts_batch:
                 sampler = batches.sampler_at(started_end)
                 running_batches.append(batches.start(started_end, end, sampler))
@@ -109,7 +109,7 @@ def run(
                 for of_device in batches.on_devices(running_batches.popleft()):
                     # The moments of each device are a batch of their own: where to stop
                     # does not depend on how many devices there are.
-                    if _end_of(estimate) == end or has_enough_samples():
+                    if _end_of(estimate) == end or needs_no_more_samples():
                         break
                     estimate = _with_batch(
                         estimate, of_device, batches.size, end, no_moments.dtypes
@@ -261,7 +261,9 @@ def _in_float64(
     )
 
 
-def _stops(estimate: Expectation, least_samples: int, tol: float | None) -> bool:
+def _needs_no_more_samples(
+    estimate: Expectation, least_samples: int, tol: float | None
+) -> bool:
     """Whether there are enough samples for the tolerance, or more would not help."""
     if tol is None or estimate.num_samples < least_samples:
         return False

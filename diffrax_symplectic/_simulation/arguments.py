@@ -241,8 +241,8 @@ def check_shapes(
     y0: Y,
     args: Args,
 ) -> None:
-    """Raises an error unless the terms fit the state, and `phi` takes it and returns real
-    arrays."""
+    """Raises an error unless the terms fit the state, and `phi` takes this state and
+    returns real arrays."""
     check_fit(terms, t0, y0, args)
     check_takes("phi", phi, "t", "y", "args")
     result = _result_struct(phi, terms, t0, y0, args)
