@@ -46,37 +46,44 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
         for parameter in signature.parameters.values()
         if parameter.kind in by_position
     ]
-    # Names other than those of `arguments` are fine, but one of these in another place is a
-    # mistake. No shape would show it: momenta and positions are alike.
-    is_swapped = any(
-        given in arguments and given != expected
-        for given, expected in zip(names, arguments)
-    )
-    takes_pair = arguments[1:3] == ("p", "q")
-    positions_first = takes_pair and tuple(names[1:3]) in _POSITIONS_FIRST
-    if is_swapped or positions_first:
+    if _have_other_order(names, arguments):
         raise ValueError(
             f"`{name}` is called as {usage}; got a function with its arguments in another "
             f"order, `{signature}`."
         )
 
 
+def _have_other_order(names: list[str], arguments: tuple[str, ...]) -> bool:
+    """Whether the names of a function's parameters show that it takes the arguments in
+    another order."""
+    # Names other than those of `arguments` are fine, but one of these in another place is a
+    # mistake. No shape would show it: momenta and positions are alike.
+    is_any_misplaced = any(
+        name in arguments and name != argument
+        for name, argument in zip(names, arguments)
+    )
+    # Momenta and positions come after the time.
+    takes_momenta_first = arguments[1:3] == ("p", "q")
+    has_positions_first = tuple(names[1:3]) in _POSITIONS_FIRST
+    return is_any_misplaced or (takes_momenta_first and has_positions_first)
+
+
 def takes_args(fn: Any) -> bool:
     """Whether a function is called as `fn(key, args)`, not as `fn(key)`: with a parameter
-    of this name, or with a second one that has no default."""
+    named `args`, or with a second one that has no default."""
     try:
         parameters = inspect.signature(fn).parameters
     except ValueError:
         # Some functions written in C have no signature.
         return False
     variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    required = [
+    without_default = [
         parameter
         for parameter in parameters.values()
         if parameter.default is inspect.Parameter.empty
         and parameter.kind not in variadic
     ]
-    return "args" in parameters or len(required) > 1
+    return "args" in parameters or len(without_default) > 1
 
 
 def check_solver(name: str, solver: Any) -> None:
@@ -104,7 +111,8 @@ def whole_number(name: str, value: Any, least: int = 1) -> int:
 
 
 def check_real(name: str, leaves: list) -> None:
-    """Raises a `ValueError` unless the function of this name returned real `leaves`."""
+    """Raises a `ValueError` unless the function of this name returned `leaves` that are
+    real: one or more arrays, numbers or structs of arrays."""
     if len(leaves) == 0:
         raise ValueError(f"`{name}` must return real arrays; it returned none.")
     dtypes = [getattr(leaf, "dtype", type(leaf)) for leaf in leaves]
@@ -116,6 +124,7 @@ def check_real(name: str, leaves: list) -> None:
 
 
 def _is_real(dtype: Any) -> bool:
+    """Whether a mean over values of this dtype is a real number."""
     # Booleans are the values of events, whose mean is a probability.
     kinds = (jnp.floating, jnp.integer, jnp.bool_)
     return any(jnp.issubdtype(dtype, kind) for kind in kinds)

@@ -48,8 +48,8 @@ def batched_like(values: _T, others: PyTree) -> _T:
     time to trace `StrangGauss`.
     """
     arrays = [leaf for leaf in jtu.tree_leaves(others) if eqx.is_array(leaf)]
-    # The copies are arrays of JAX, and no operations of the program: `custom_jvp` does not
-    # convert arrays of NumPy, over which a user may have batched.
+    # `jnp.array` makes arrays of JAX, and no operations of the program: `custom_jvp` does
+    # not convert arrays of NumPy, over which a user may have batched.
     return _batched(*jtu.tree_map(jnp.array, (values, arrays)))
 
 
@@ -126,43 +126,52 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
     # Each level of nested batches runs the same program.
     in_groups = jax.jit(ft.partial(_in_groups, call))
 
-    # Each path's `own` arrays have a leading axis; `common` arrays are shared.
+    # Of the arrays that `fn` captures, each path has its own, with a leading axis for the
+    # paths, and all paths have common ones.
     @jax.custom_batching.custom_vmap
-    def serve(pending, value, own, common):
-        return in_groups(pending, value, own, common)
+    def serve(pending, value, own_arrays, common_arrays):
+        return in_groups(pending, value, own_arrays, common_arrays)
 
     @serve.def_vmap
-    def _(size, in_batched, pending, value, own, common):
+    def _(size, in_batched, pending, value, own_arrays, common_arrays):
         # Nested batches are joined into one: stragglers of all of them share the groups.
         # The axes of an array are (outer batch, inner batch, ...).
         inner_size = pending.shape[1 if in_batched[0] else 0]
 
-        def join(is_batched: bool, x: Array) -> Array:
+        def join_axes(is_batched: bool, x: Array) -> Array:
             x = x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
             return x.reshape(size * inner_size, *x.shape[2:])
 
-        def repeat_if(is_batched: bool, x: Array) -> Array | None:
+        def repeated_if_batched(is_batched: bool, x: Array) -> Array | None:
             return jnp.repeat(x, inner_size, axis=0) if is_batched else None
 
-        def keep_unless(is_batched: bool, x: Array) -> Array | None:
-            return None if is_batched else x
-
-        def separate(x: Array) -> Array:
+        def separate_axes(x: Array) -> Array:
             return x.reshape(size, inner_size, *x.shape[1:])
 
-        *paths_batched, common_batched = in_batched
-        paths = (pending, value, own)
-        pending, value, own = jtu.tree_map(join, tuple(paths_batched), paths)
-        # Captured arrays over which the outer batch runs become the joined paths' own.
-        newly_own = jtu.tree_map(repeat_if, common_batched, common)
-        still_common = jtu.tree_map(keep_unless, common_batched, common)
-        value = serve(pending, value, eqx.combine(own, newly_own), still_common)
-        return jtu.tree_map(separate, value), _all_batched(value)
+        *are_paths_batched, are_common_batched = in_batched
+        paths = (pending, value, own_arrays)
+        pending, value, own_arrays = jtu.tree_map(
+            join_axes, tuple(are_paths_batched), paths
+        )
+        # Common arrays over which the outer batch runs become the joined paths' own.
+        new_own_arrays = jtu.tree_map(
+            repeated_if_batched, are_common_batched, common_arrays
+        )
+        own_arrays = eqx.combine(own_arrays, new_own_arrays)
+        common_arrays = jtu.tree_map(
+            _none_if_batched, are_common_batched, common_arrays
+        )
+        value = serve(pending, value, own_arrays, common_arrays)
+        return jtu.tree_map(separate_axes, value), _all_batched(value)
 
     # One path is a batch of one, and all captured arrays are common.
-    own = jtu.tree_map(lambda _: None, arrays)
+    no_own_arrays = jtu.tree_map(lambda _: None, arrays)
     pending, value = _with_axis((pending, value))
-    return _first(serve(pending, value, own, common=arrays))
+    return _first(serve(pending, value, no_own_arrays, arrays))
+
+
+def _none_if_batched(is_batched: bool, x: Array) -> Array | None:
+    return None if is_batched else x
 
 
 def _with_axis(tree: _T) -> _T:
@@ -179,42 +188,45 @@ def _in_groups(
     call: Callable,
     pending: Bool[Array, " size"],
     value: _T,
-    own: PyTree[Array | None],
-    common: PyTree[Array | None],
+    own_arrays: PyTree[Array | None],
+    common_arrays: PyTree[Array | None],
 ) -> _T:
-    """`value` of a batch, with `call` applied for the paths that are `pending`. It captures
-    arrays: `own` have an axis for the paths, `common` have not."""
+    """`value` of a batch, with `call` applied for the paths that are `pending`. The second
+    argument of `call` are the arrays that it captures: of `own_arrays`, with an axis for
+    the paths, and of `common_arrays`, without."""
     size = len(pending)
     # The quotient is rounded up, so that a small batch has groups of one.
     group_size = -(-size // _MOST_GROUPS)
 
-    def called(value: _T, own: PyTree) -> _T:
-        return call(value, eqx.combine(own, common))
+    def call_for_path(value: _T, own_arrays: PyTree) -> _T:
+        return call(value, eqx.combine(own_arrays, common_arrays))
 
-    def unchanged(value: _T, own: PyTree) -> _T:
-        del own
+    def keep_value(value: _T, own_arrays: PyTree) -> _T:
+        del own_arrays
         return value
 
     if size == 1:
         # A conditional is cheaper than a loop, and stays one: there is no batch.
-        alone = _first((value, own))
-        return _with_axis(lax.cond(pending[0], called, unchanged, *alone))
+        only_path = _first((value, own_arrays))
+        return _with_axis(lax.cond(pending[0], call_for_path, keep_value, *only_path))
 
     def serve_group(carry):
-        """Applies `call` for the next group of the paths that are pending."""
+        """Applies `call` for the next group of the paths that are pending, and removes
+        these from `pending`."""
         pending, value = carry
         # The indices are those of `jnp.nonzero`, which compiles to a dozen kernels. If
         # fewer paths are pending, the surplus indices lie beyond the batch and are dropped.
         # Unsigned indices need no code for negative ones.
         is_pending, places = lax.top_k(pending.astype(jnp.float32), group_size)
         places = jnp.where(is_pending > 0, places, size).astype(jnp.uint32)
-        gathered = jtu.tree_map(lambda x: x[places], (value, own))
-        new = jax.vmap(called)(*gathered)
+        gathered = jtu.tree_map(lambda x: x[places], (value, own_arrays))
+        values_of_group = jax.vmap(call_for_path)(*gathered)
 
-        def scatter(x: Array, new: Any) -> Array:
-            return x.at[places].set(new, mode="drop")
+        def scatter(x: Array, x_of_group: Any) -> Array:
+            return x.at[places].set(x_of_group, mode="drop")
 
-        return scatter(pending, False), jtu.tree_map(scatter, value, new)
+        pending = scatter(pending, False)
+        return pending, jtu.tree_map(scatter, value, values_of_group)
 
     def any_pending(carry):
         pending, _ = carry
@@ -240,7 +252,7 @@ def materialize(fn: Callable[[], _T]) -> _T:
     def once() -> _T:
         return fn()
 
-    def in_conditional() -> _T:
+    def computed_in_conditional() -> _T:
         structs = jax.eval_shape(once)
 
         def zeros() -> _T:
@@ -248,4 +260,4 @@ def materialize(fn: Callable[[], _T]) -> _T:
 
         return lax.cond(lax.optimization_barrier(True), once, zeros)
 
-    return lax.platform_dependent(cpu=in_conditional, default=once)
+    return lax.platform_dependent(cpu=computed_in_conditional, default=once)

@@ -29,7 +29,7 @@ def citation(*args: Any, **kwargs: Any) -> None:
     bound = inspect.signature(diffrax.diffeqsolve).bind_partial(*args, **kwargs)
     entries = _entries()
     for cls in _classes(bound.arguments):
-        # The sources of a class are the links in its docstring.
+        # The sources of a class are the links in its docstring, here each of them once.
         dois = list(dict.fromkeys(_DOI.findall(cls.__doc__ or "")))
         if len(dois) > 0:
             print(
@@ -45,17 +45,18 @@ def citation(*args: Any, **kwargs: Any) -> None:
 def _classes(tree: Any) -> list[type]:
     """The classes of this package that occur in `tree`, in order."""
     # A dictionary in place of a set, to keep the order.
-    found: dict[type, None] = {}
+    classes: dict[type, None] = {}
 
     # JAX calls this for each node on the way down, also for containers and modules, which
     # are no leaves.
     def record(node: Any) -> bool:
         if type(node).__module__.split(".")[0] == "diffrax_symplectic":
-            found[type(node)] = None
+            classes[type(node)] = None
+        # JAX goes on to what the node holds.
         return False
 
     jtu.tree_leaves(tree, is_leaf=record)
-    return list(found)
+    return list(classes)
 
 
 def _entries() -> dict[str, str]:

@@ -6,7 +6,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -36,6 +36,11 @@ from ._terms import (
 # error of the reference is then 8^(-1/2), about a third, of the error that is measured;
 # with any higher order it is less.
 _REFERENCE_STEPS = 8
+# The number of the batch of paths along which the reference is solved, and with strong
+# errors all solvers.
+_COMMON_PATHS = 0
+# A quotient of times counts as a whole number if it differs from one by less than this.
+_TIME_ROUNDING = 1e-6
 
 
 class PathResults(NamedTuple):
@@ -47,6 +52,10 @@ class PathResults(NamedTuple):
 
     results: PyTree[Array]
     okay: Bool[Array, " num_paths"]
+
+
+# Solves for the paths with these keys, by this step size.
+_SolveBatch: TypeAlias = Callable[[PRNGKeyArray, Array], PathResults]
 
 
 class _MeasuredError(NamedTuple):
@@ -91,6 +100,7 @@ class Comparison:
 
     def __str__(self) -> str:
         title = f"{self.kind} error"
+        # The columns of the heading are as wide as those of the rows below.
         lines = [f"{'solver':20} {'dt':>9} {title:>22} {'seconds per path':>17}"]
         for step in self.steps:
             failed = f"  {step.num_failed} failed" if step.num_failed else ""
@@ -118,11 +128,11 @@ class Comparison:
             _, axes = plt.subplots(layout="constrained")
         # One name for each solver, in the order of `steps`.
         for solver_name in dict.fromkeys(step.solver for step in self.steps):
-            of_solver = [step for step in self.steps if step.solver == solver_name]
+            steps = [step for step in self.steps if step.solver == solver_name]
             axes.errorbar(
-                x=[step.seconds for step in of_solver],
-                y=[step.error for step in of_solver],
-                yerr=[3 * step.std_error for step in of_solver],
+                x=[step.seconds for step in steps],
+                y=[step.error for step in steps],
+                yerr=[3 * step.std_error for step in steps],
                 label=solver_name,
                 marker="o",
                 capsize=2,
@@ -199,62 +209,19 @@ def compare_solvers(
     _check_solvers(solvers, reference)
     if phi is not None:
         _check_scalar(phi, t1, y0, args)
-    system = _ComparedSystem(terms, t0, t1, y0, args, phi)
+    system = _ComparedSystem(terms, t0, t1, y0, args, phi, key, num_paths)
     reference_dt = min(dts) / _REFERENCE_STEPS
-
-    def keys_of_paths(number: int) -> PRNGKeyArray:
-        return jr.split(jr.fold_in(key, number), num_paths)
-
-    def solve_with_own_path(solver: diffrax.AbstractSolver) -> Callable:
-        """The function that solves along the path that the solver gets in a solve."""
-        return system.solve_batch(solver, ft.partial(own_path, solver, want))
-
-    def solve_to_compare(solver: diffrax.AbstractSolver) -> Callable:
-        """The function that solves for the results whose error is measured."""
-        if want == "weak":
-            return solve_with_own_path(solver)
-        # Strong errors need a common Brownian motion, which not all solvers can use.
-        return system.solve_batch(solver, ft.partial(common_path, solver, reference_dt))
-
-    # Strong errors are along the paths with number 0. Weak errors are from independent
-    # paths, so each step size has paths with a number of its own.
-    exact = solve_to_compare(reference)(keys_of_paths(0), jnp.asarray(reference_dt))
+    solve_for_reference = system.solve_to_compare(reference, reference_dt)
+    exact = solve_for_reference(system.keys(_COMMON_PATHS), jnp.asarray(reference_dt))
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`compare_solvers`", exact)
     steps = []
     refused = {}
     for solver in solvers:
-        solver_name = repr(solver)
-        timed = solve_with_own_path(solver)
-        compared = timed if want == "weak" else solve_to_compare(solver)
         try:
-            # Refusals are errors while tracing, so that nothing need be compiled for them.
-            eqx.filter_eval_shape(compared, keys_of_paths(0), jnp.asarray(dts[0]))
-        except ValueError as error:
-            refused[solver_name] = str(error).splitlines()[0]
-            continue
-        # The first call compiles, and is not timed.
-        jax.block_until_ready(timed(keys_of_paths(1), jnp.asarray(dts[0])))
-        for number, dt in enumerate(dts, start=1):
-            # The step size is an array: with a number the program would compile anew.
-            traced_dt = jnp.asarray(dt)
-            begin = time.perf_counter()
-            results = jax.block_until_ready(timed(keys_of_paths(number), traced_dt))
-            seconds = (time.perf_counter() - begin) / num_paths
-            if want == "strong":
-                measured = strong_error(compared(keys_of_paths(0), traced_dt), exact)
-            else:
-                measured = weak_error(results, exact)
-            steps.append(
-                ComparedStep(
-                    solver=solver_name,
-                    dt=float(traced_dt),
-                    error=measured.error,
-                    std_error=measured.std_error,
-                    seconds=seconds,
-                    num_failed=measured.num_failed,
-                )
-            )
+            steps += _compared_steps(system, solver, dts, exact, reference_dt)
+        except _Refused as refusal:
+            refused[repr(solver)] = str(refusal)
     return Comparison(want, tuple(steps), refused)
 
 
@@ -267,13 +234,38 @@ class _ComparedSystem(NamedTuple):
     y0: Y
     args: Args
     phi: Callable[[RealScalarLike, Y, Args], ArrayLike] | None
+    key: PRNGKeyArray
+    num_paths: int
 
-    def solve_batch(
+    @property
+    def is_strong(self) -> bool:
+        """Whether errors are those of paths, rather than of means."""
+        return self.phi is None
+
+    def keys(self, batch_number: int) -> PRNGKeyArray:
+        """The keys of the paths of a batch."""
+        return jr.split(jr.fold_in(self.key, batch_number), self.num_paths)
+
+    def solve_with_own_path(self, solver: diffrax.AbstractSolver) -> _SolveBatch:
+        """The function that solves along the path that the solver gets in a solve."""
+        want = "strong" if self.is_strong else "weak"
+        return self._solve_batch(solver, ft.partial(own_path, solver, want))
+
+    def solve_to_compare(
+        self, solver: diffrax.AbstractSolver, reference_dt: float
+    ) -> _SolveBatch:
+        """The function that solves for the results whose error is measured."""
+        if not self.is_strong:
+            return self.solve_with_own_path(solver)
+        # Strong errors need a common Brownian motion, which not all solvers can use.
+        return self._solve_batch(solver, ft.partial(common_path, solver, reference_dt))
+
+    def _solve_batch(
         self, solver: diffrax.AbstractSolver, make_path: Callable
-    ) -> Callable[[PRNGKeyArray, Array], PathResults]:
-        """The function of the keys of paths and the step size that solves for these paths,
-        compiled. `make_path` is as for `with_paths`."""
-        terms, t0, t1, y0, args, phi = self
+    ) -> _SolveBatch:
+        """The function that solves along the paths of `make_path`, as for `with_paths`,
+        compiled."""
+        terms, t0, t1, y0, args, phi, *_ = self
         # Terms that share a path share a path again.
         numbers = path_numbers(random_paths(terms))
 
@@ -296,6 +288,57 @@ class _ComparedSystem(NamedTuple):
         return results
 
 
+class _Refused(Exception):
+    """A solver does not accept the terms, for the reason in the message."""
+
+
+def _compared_steps(
+    system: _ComparedSystem,
+    solver: diffrax.AbstractSolver,
+    dts: list[float],
+    exact: PathResults,
+    reference_dt: float,
+) -> list[ComparedStep]:
+    """Measures a solver with each step size. Raises `_Refused` if it does not accept the
+    terms."""
+    timed_solve = system.solve_with_own_path(solver)
+    compared_solve = timed_solve
+    if system.is_strong:
+        compared_solve = system.solve_to_compare(solver, reference_dt)
+    common_keys = system.keys(_COMMON_PATHS)
+    try:
+        # Refusals are errors while tracing, so that nothing need be compiled for them.
+        eqx.filter_eval_shape(compared_solve, common_keys, jnp.asarray(dts[0]))
+    except ValueError as error:
+        raise _Refused(str(error).splitlines()[0]) from None
+    # The first call compiles, and is not timed.
+    jax.block_until_ready(timed_solve(system.keys(1), jnp.asarray(dts[0])))
+    steps = []
+    # Weak errors are from independent paths, so each step size has a batch of its own.
+    for batch_number, dt in enumerate(dts, start=1):
+        # The step size is an array: with a number the program would compile anew.
+        dt_array = jnp.asarray(dt)
+        keys = system.keys(batch_number)
+        begin = time.perf_counter()
+        results = jax.block_until_ready(timed_solve(keys, dt_array))
+        seconds = (time.perf_counter() - begin) / system.num_paths
+        if system.is_strong:
+            measured = strong_error(compared_solve(common_keys, dt_array), exact)
+        else:
+            measured = weak_error(results, exact)
+        steps.append(
+            ComparedStep(
+                solver=repr(solver),
+                dt=float(dt_array),
+                error=measured.error,
+                std_error=measured.std_error,
+                seconds=seconds,
+                num_failed=measured.num_failed,
+            )
+        )
+    return steps
+
+
 def strong_error(compared: PathResults, exact: PathResults) -> _MeasuredError:
     """The root mean square of the difference over the paths that both solvers finish, and
     the number of paths that either does not finish."""
@@ -309,15 +352,15 @@ def strong_error(compared: PathResults, exact: PathResults) -> _MeasuredError:
         jtu.tree_map(squared_differences, compared.results, exact.results)
     )
     squares = np.concatenate(leaves, axis=1).sum(axis=1)
-    mean_square, std_error = _mean_and_std_error(squares, okay)
+    mean_square, std_error_of_mean_square = _mean_and_std_error(squares, okay)
     # If there is no difference at all, 0 / 0 makes the standard error NaN.
     with np.errstate(all="ignore"):
-        rms = np.sqrt(mean_square)
+        root_mean_square = np.sqrt(mean_square)
         # The derivative of the square root is 1 / (2 sqrt).
-        std_error_of_rms = std_error / (2 * rms)
+        std_error = std_error_of_mean_square / (2 * root_mean_square)
     return _MeasuredError(
-        error=float(rms),
-        std_error=float(std_error_of_rms),
+        error=float(root_mean_square),
+        std_error=float(std_error),
         num_failed=int(np.sum(~okay)),
     )
 
@@ -340,8 +383,9 @@ def _mean_and_std_error(values: Any, okay: Any) -> tuple[float, float]:
     with np.errstate(all="ignore"), warnings.catch_warnings():
         # If no path is left, the mean is NaN, and the number of failures tells why.
         warnings.simplefilter("ignore", RuntimeWarning)
-        kept = np.asarray(values, np.float64)[np.asarray(okay)]
-        return float(np.mean(kept)), float(np.std(kept) / np.sqrt(len(kept)))
+        okay_values = np.asarray(values, np.float64)[np.asarray(okay)]
+        std_error = np.std(okay_values) / np.sqrt(len(okay_values))
+        return float(np.mean(okay_values)), float(std_error)
 
 
 def _check_solvers(solvers: Any, reference: Any) -> None:
@@ -385,4 +429,5 @@ def _steps_as_floats(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
 
 def _is_whole(x: float) -> bool:
     """Whether this quotient is a positive whole number, up to rounding."""
-    return math.isfinite(x) and x > 0.5 and abs(x - round(x)) < 1e-6
+    # Above a half, so that it does not count as zero.
+    return math.isfinite(x) and x > 0.5 and abs(x - round(x)) < _TIME_ROUNDING

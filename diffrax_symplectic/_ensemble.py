@@ -33,9 +33,9 @@ from ._terms import path_keys, which_are_shapes, with_keys
 
 # The number of entries of all states in a batch: enough to keep every core busy, in tens of
 # megabytes.
-_ENTRIES = {"jax": 2**17, "drjit": 2**20}
+_ENTRIES_OF_BATCH = {"jax": 2**17, "drjit": 2**20}
 # Accelerators need this many times as many entries.
-_MORE_ON_ACCELERATORS = 16
+_FACTOR_ON_ACCELERATORS = 16
 # The fewest paths in a batch, however large their states are, so that batches are few.
 _FEWEST_PATHS = 256
 
@@ -76,10 +76,10 @@ class Ensemble(eqx.Module):
         return y0, self._problem.with_args(own_args).args
 
     def _key_of(self, number: IntScalarLike) -> PRNGKeyArray:
-        return sample_key(self._key, *_words(number))
+        return sample_key(self._key, *_words_of_number(number))
 
 
-def _words(number: IntScalarLike) -> tuple[ArrayLike, ArrayLike]:
+def _words_of_number(number: IntScalarLike) -> tuple[ArrayLike, ArrayLike]:
     """The upper and the lower 32 bits of the number of a path. Raises a `ValueError`
     unless it is an integer that is not negative, as far as that is known."""
     is_scalar = eqx.is_array_like(number) and jnp.shape(number) == ()
@@ -89,6 +89,7 @@ def _words(number: IntScalarLike) -> tuple[ArrayLike, ArrayLike]:
             "paths, batch over their numbers: `jax.vmap(paths.start)(numbers)`."
         )
     if not is_traced(number):
+        # Python's integers may have more than 32 bits, whatever those of JAX have.
         high, low = divmod(whole_number("number", int(number), least=0), 2**32)
         return np.uint32(high), np.uint32(low)
     traced = jnp.asarray(number)
@@ -169,8 +170,8 @@ def ensemble(
     Dr.Jit or LLVM is missing. Warns if paths failed, if many are stragglers, and
     if truncation takes more than 0.1% of the variance of increments.
     """
-    arguments = terms, t0, t1, dt0, y0, args
-    key = checked_key("ensemble", key, arguments)
+    other_arguments = terms, t0, t1, dt0, y0, args
+    key = checked_key("ensemble", key, other_arguments)
     num_paths = whole_number("num_paths", num_paths)
     engine = "jax" if engine is None else engine
     if engine not in ENGINES:
@@ -197,27 +198,17 @@ def ensemble(
     if batch_size is None:
         batch_size = _default_batch_size(engine, problem)
     batch_size = min(whole_number("batch_size", batch_size), num_paths)
-
-    simulate_batch = ENGINES[engine]
-    batches = []
-    for first in range(0, num_paths, batch_size):
-        # JAX compiles for one batch size: surplus paths of the last batch are cut
-        # afterwards.
-        size = batch_size
-        if engine != "jax":
-            size = min(batch_size, num_paths - first)
-        sample_numbers = np.arange(first, first + size, dtype=np.uint64)
-        batches.append(simulate_batch(problem, key, sample_numbers))
-    joined = _joined(batches, num_paths, at_end=ts is None)
-    _warn_of_failures(joined, problem.bounded)
+    batches = _simulated_batches(problem, key, engine, num_paths, batch_size)
+    whole = _concatenated(batches, num_paths, at_end=ts is None)
+    _warn_of_failures(whole, problem.has_bounded_increments)
     # The times of the steps, from which the times of the user differ by rounding errors.
     saved_steps = np.asarray(problem.levels.saved_steps[0])
     saved_times = float(problem.t0) + saved_steps * float(problem.levels.h[0])
     return Ensemble(
         ts=saved_times,
-        ys=joined.y,
-        failed=joined.failed,
-        num_stragglers=joined.num_stragglers,
+        ys=whole.y,
+        failed=whole.failed,
+        num_stragglers=whole.num_stragglers,
         engine=engine,
         _problem=problem,
         _key=key,
@@ -226,37 +217,53 @@ def ensemble(
 
 def _default_batch_size(engine: str, problem: Problem) -> int:
     """The number of paths in a batch if the user does not say it."""
-    entries_of_batch = _ENTRIES[engine]
+    entries_of_batch = _ENTRIES_OF_BATCH[engine]
     if jax.default_backend() != "cpu":
-        entries_of_batch *= _MORE_ON_ACCELERATORS
+        entries_of_batch *= _FACTOR_ON_ACCELERATORS
     entries_of_path = sum(leaf.size for leaf in jtu.tree_leaves(problem.y0))
     return max(_FEWEST_PATHS, entries_of_batch // entries_of_path)
 
 
-def _joined(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
+def _simulated_batches(
+    problem: Problem, key: PRNGKeyArray, engine: str, num_paths: int, batch_size: int
+) -> list[Batch]:
+    """The batches that hold this number of paths, and maybe surplus ones at the end."""
+    simulate_batch = ENGINES[engine]
+    batches = []
+    for first in range(0, num_paths, batch_size):
+        # JAX compiles for one batch size, so the last batch has it, too.
+        size = batch_size
+        if engine != "jax":
+            size = min(batch_size, num_paths - first)
+        sample_numbers = np.arange(first, first + size, dtype=np.uint64)
+        batches.append(simulate_batch(problem, key, sample_numbers))
+    return batches
+
+
+def _concatenated(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
     """All batches as one, cut to this number of paths, with NaN for the states of failed
     paths. Without the axis of times if the states were wanted `at_end` only."""
     failed = np.concatenate([batch.failed for batch in batches])[:num_paths]
 
-    def join(*leaves: np.ndarray) -> np.ndarray:
+    def concatenate(*leaves: np.ndarray) -> np.ndarray:
         # (paths, times, ...)
         states = np.concatenate(leaves)[:num_paths]
         states[failed] = np.nan
         return states[:, 0] if at_end else states
 
-    y = jtu.tree_map(join, *[batch.y for batch in batches])
+    y = jtu.tree_map(concatenate, *[batch.y for batch in batches])
     return Batch(y, failed, sum(batch.num_stragglers for batch in batches))
 
 
-def _warn_of_failures(joined: Batch, bounded: bool) -> None:
-    """Warns of failed paths and of many stragglers. `bounded` is as for
+def _warn_of_failures(whole: Batch, bounded: bool) -> None:
+    """Warns of failed paths and of many stragglers among all paths. `bounded` is as for
     `advice_on_failures`."""
-    num_paths = len(joined.failed)
-    num_failed = int(np.sum(joined.failed))
+    num_paths = len(whole.failed)
+    num_failed = int(np.sum(whole.failed))
     if num_failed > 0:
         warnings.warn(
             f"{num_failed:,} of {num_paths:,} paths failed. Their states are NaN: select "
             f"the others with `~failed`. {advice_on_failures(bounded)}",
             stacklevel=3,
         )
-    warn_of_stragglers(joined.num_stragglers, num_failed, num_paths, stacklevel=3)
+    warn_of_stragglers(whole.num_stragglers, num_failed, num_paths, stacklevel=3)

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 
-# The number of signatures that a function remembers. Each holds the user's functions.
-_REMEMBERED = 128
+# The most signatures that a function remembers. Each holds the user's functions.
+_MOST_REMEMBERED = 128
 Result = TypeVar("Result")
 
 
@@ -50,19 +50,19 @@ def once_for_each_signature(fn: Callable[..., Result]) -> Callable[..., Result]:
 
     @ft.wraps(fn)
     def call_once(*args: Any) -> Result:
-        key = signature(args)
+        of_args = signature(args)
         try:
-            is_known = key in results
+            is_known = of_args in results
         except TypeError:
-            # A leaf that cannot be hashed.
+            # A leaf cannot be hashed.
             return fn(*args)
         if not is_known:
-            # Errors are not remembered.
-            results[key] = fn(*args)
+            # If `fn` raises an error, nothing is remembered.
+            results[of_args] = fn(*args)
         # The least recently used result is dropped first.
-        results.move_to_end(key)
-        if len(results) > _REMEMBERED:
+        results.move_to_end(of_args)
+        if len(results) > _MOST_REMEMBERED:
             results.popitem(last=False)
-        return results[key]
+        return results[of_args]
 
     return call_once

@@ -16,9 +16,11 @@ from .._lapack import lapack_in_turn
 from .sampling import Averaged, Samples
 
 
-# Numbers are scaled by powers of two whose exponents are this much below the largest of the
-# dtype: sums of 2^24 numbers of this size stay in range.
+# The exponents of scales are at least this much below the largest of the dtype, so that
+# sums of 2^24 numbers of this size stay in range.
 _SPARE_EXPONENTS = 24
+# The name of the axis of devices.
+_DEVICE_AXIS = "samples"
 
 
 class BatchMoments(NamedTuple):
@@ -46,34 +48,44 @@ class BatchMoments(NamedTuple):
     size: Averaged
 
 
+class _ArrayMoments(NamedTuple):
+    """The fields of the same names of `BatchMoments`, for arrays of one shape."""
+
+    mean: Float[Array, "fields combinations ..."]
+    mean_correction: Float[Array, "fields combinations ..."]
+    norm: Float[Array, "fields combinations ..."]
+    largest: Float[Array, "fields combinations ..."]
+    size: Float[Array, "fields combinations ..."]
+
+
 def _moments_on_devices(
     sampler: Callable[..., Samples],
     key_data: UInt32[Array, "..."],
     key_impl: Any,
-    first: UInt32[Array, "2"],
+    low_high: UInt32[Array, "2"],
     num_wanted: Int[Array, ""],
     mesh: Mesh,
     n: int,
 ) -> BatchMoments:
     """The moments on all devices, along a leading axis. Each device takes `n` samples, and
-    the first device begins with sample number `first`, given as its low and its high 32
-    bits. Only the first `num_wanted` samples of all devices together count."""
+    the first device begins with the sample number whose low and high 32 bits are in
+    `low_high`. Only the first `num_wanted` samples of all devices together count."""
     if mesh.size == 1:
         moments = _moments_on_device(
-            sampler, key_data, key_impl, first, num_wanted, n, device=0
+            sampler, key_data, key_impl, low_high, num_wanted, n, device=0
         )
         return jtu.tree_map(lambda x: x[None], moments)
     dynamic, static = eqx.partition(sampler, eqx.is_array)
 
     # The devices do not communicate until the end, so each one's result does not depend on
     # how many there are.
-    def gathered_moments(dynamic, first, num_wanted):
+    def gathered_moments(dynamic, low_high, num_wanted):
         sampler = eqx.combine(dynamic, static)
-        device = jax.lax.axis_index("samples")
+        device = jax.lax.axis_index(_DEVICE_AXIS)
         moments = _moments_on_device(
-            sampler, key_data, key_impl, first, num_wanted, n, device
+            sampler, key_data, key_impl, low_high, num_wanted, n, device
         )
-        return jtu.tree_map(lambda x: jax.lax.all_gather(x, "samples"), moments)
+        return jtu.tree_map(lambda x: jax.lax.all_gather(x, _DEVICE_AXIS), moments)
 
     # Every device gets all arguments, and returns the moments of all.
     whole = PartitionSpec()
@@ -81,7 +93,7 @@ def _moments_on_devices(
         gathered_moments, mesh=mesh, in_specs=whole, out_specs=whole, check_vma=False
     )
     try:
-        return on_all_devices(dynamic, first, num_wanted)
+        return on_all_devices(dynamic, low_high, num_wanted)
     except ValueError as error:
         # The loop of Diffrax's default adjoint rejects arrays that vary between devices.
         if is_closure_mismatch(error):
@@ -103,20 +115,16 @@ def _moments_on_device(
     sampler: Callable[..., Samples],
     key_data: UInt32[Array, "..."],
     key_impl: Any,
-    first: UInt32[Array, "2"],
+    low_high: UInt32[Array, "2"],
     num_wanted: Int[Array, ""],
     n: int,
     device: Any,
 ) -> BatchMoments:
-    """The moments on the device with this number, of its `n` samples."""
+    """The moments on the device with this number, of its `n` samples. The other arguments
+    are those of `_moments_on_devices`."""
     # The places of the samples among those of all devices.
     index = device * n + jnp.arange(n)
-    # The sum of `first` and `index` in two halves, since there may be no 64-bit integers.
-    first_low = first[0]
-    first_high = first[1]
-    low = first_low + index.astype(jnp.uint32)
-    has_carry = low < first_low
-    high = first_high + has_carry.astype(jnp.uint32)
+    high, low = _sum_in_halves(low_high, index)
     key = jr.wrap_key_data(jnp.asarray(key_data), impl=key_impl)
 
     def sample_key(high: Array, low: Array) -> PRNGKeyArray:
@@ -135,34 +143,45 @@ def _moments_on_device(
     leaves, treedef = jtu.tree_flatten(stacked)
     moments_of_leaves = [_moments_of_array(leaf, good) for leaf in leaves]
 
-    def averaged_of(leaves: tuple[Array, ...]) -> Averaged:
-        tree = treedef.unflatten(leaves)
+    def averaged_of(moment: str) -> Averaged:
+        """One moment of all leaves, with a PyTree like `phi` in each field."""
+        tree = treedef.unflatten([getattr(x, moment) for x in moments_of_leaves])
         trees = [jtu.tree_map(lambda x, k=k: x[k], tree) for k in range(len(fields))]
         return Averaged(**dict(zip(fields, trees)))
 
-    # Each moment of all leaves, in place of all moments of each leaf.
-    mean, mean_correction, norm, largest, size = map(
-        averaged_of, zip(*moments_of_leaves)
-    )
     return BatchMoments(
         num_good=jnp.sum(good),
         num_failed=num_failed_on_any,
         failed_on=jnp.sum(num_failed, axis=1),
-        mean=mean,
-        mean_correction=mean_correction,
-        norm=norm,
-        largest=largest,
-        size=size,
+        mean=averaged_of("mean"),
+        mean_correction=averaged_of("mean_correction"),
+        norm=averaged_of("norm"),
+        largest=averaged_of("largest"),
+        size=averaged_of("size"),
     )
+
+
+def _sum_in_halves(
+    low_high: UInt32[Array, "2"], index: Int[Array, " n"]
+) -> tuple[UInt32[Array, " n"], UInt32[Array, " n"]]:
+    """The high and the low 32 bits of a number, from its low and its high ones, plus an
+    index. (There may be no 64-bit integers.)"""
+    first_low = low_high[0]
+    first_high = low_high[1]
+    low = first_low + index.astype(jnp.uint32)
+    # The sum wrapped around.
+    has_carry = low < first_low
+    high = first_high + has_carry.astype(jnp.uint32)
+    return high, low
 
 
 def _moments_of_array(
     x: Float[Array, "fields combinations n ..."], good: Bool[Array, " n"]
-) -> tuple[Array, Array, Array, Array, Array]:
-    """`mean`, `mean_correction`, `norm`, `largest` and `size` of `BatchMoments` for one
-    array, whose third axis is that of samples."""
+) -> _ArrayMoments:
+    """The moments of one array, whose third axis is that of samples."""
     is_used = good.reshape(-1, *[1] * (x.ndim - 3))
-    num_good = jnp.maximum(jnp.sum(good), 1)
+    # Sums over no samples are zero, and so are then their means.
+    divisor = jnp.maximum(jnp.sum(good), 1)
 
     def largest_of_samples(x: Array) -> Array:
         return jnp.max(jnp.abs(x), axis=2)
@@ -170,24 +189,30 @@ def _moments_of_array(
     x = jnp.where(is_used, x, 0)
     size = largest_of_samples(x)
     to_unit, from_unit = _scales(size)
-    mean = from_unit * (jnp.sum(x * to_unit[:, :, None], axis=2) / num_good)
+    mean = from_unit * (jnp.sum(x * to_unit[:, :, None], axis=2) / divisor)
     # Two passes avoid cancellation. The second also finds the rounding error of the mean.
     deviations = jnp.where(is_used, x - mean[:, :, None], 0)
     largest = largest_of_samples(deviations)
     to_unit, from_unit = _scales(largest)
     scaled = deviations * to_unit[:, :, None]
-    correction = jnp.sum(scaled, axis=2) / num_good
-    # The squared deviations from the corrected mean.
-    squares = jnp.sum(scaled**2, axis=2) - num_good * correction**2
-    norm = from_unit * jnp.sqrt(jnp.maximum(squares, 0))
-    return mean, from_unit * correction, norm, largest, size
+    scaled_correction = jnp.sum(scaled, axis=2) / divisor
+    # The sum of squared deviations from the corrected mean.
+    scaled_squares = jnp.sum(scaled**2, axis=2) - divisor * scaled_correction**2
+    return _ArrayMoments(
+        mean=mean,
+        mean_correction=from_unit * scaled_correction,
+        norm=from_unit * jnp.sqrt(jnp.maximum(scaled_squares, 0)),
+        largest=largest,
+        size=size,
+    )
 
 
 def _scales(size: Array) -> tuple[Array, Array]:
     """A power of two that scales numbers of this size to about one, so that sums of them
     and of their squares stay in range; and its inverse, to scale back. (XLA divides by
     multiplying with the inverse, which may underflow.)"""
-    most = jnp.finfo(size.dtype).maxexp - _SPARE_EXPONENTS
-    exponent = jnp.clip(jnp.frexp(size)[1], -most, most)
+    largest_exponent = jnp.finfo(size.dtype).maxexp - _SPARE_EXPONENTS
+    _, exponent = jnp.frexp(size)
+    exponent = jnp.clip(exponent, -largest_exponent, largest_exponent)
     one = jnp.ones_like(size)
     return jnp.ldexp(one, -exponent), jnp.ldexp(one, exponent)

@@ -175,17 +175,17 @@ def expectation(
     variances of batches; [Talay and Tubaro
     (1990)](https://doi.org/10.1080/07362999008809220) for extrapolation.
     """
-    arguments = terms, t0, t1, dt0, y0, args, ts
+    other_arguments = terms, t0, t1, dt0, y0, args, ts
     key, first, devices = checked_call(
-        "expectation", key, tol, start, first, devices, arguments
+        "expectation", key, tol, start, first, devices, other_arguments
     )
     # An estimate with other levels cannot continue `start`.
     may_add_levels = levels is None and start is None
     if levels is None:
         levels = _FEWEST_LEVELS if start is None else start.levels
 
-    is_open = any(isinstance(path, UnspecifiedPath) for path in brownian_paths(terms))
-    request = Request(not is_open, key, sampling, tol, start, engine, devices)
+    has_shape = any(isinstance(path, UnspecifiedPath) for path in brownian_paths(terms))
+    request = Request(not has_shape, key, sampling, tol, start, engine, devices)
     problem_of = ft.partial(Problem.of, phi, terms, solver, t0, t1, dt0, y0, args, ts)
     with Meter(progress_meter) as meter:
         while True:
@@ -202,7 +202,7 @@ def expectation(
                 break
             levels += 1
 
-    for message in cautions(estimate, tol, problem.bounded):
+    for message in cautions(estimate, tol, problem.has_bounded_increments):
         warnings.warn(message, stacklevel=2)
     paths = plan.simulate_paths
     if isinstance(paths, FusedPaths):
@@ -223,9 +223,9 @@ def expectation(
                 stacklevel=2,
             )
         if estimate.levels == 2:
-            what = unresolved_friction(problem, float(dt0))
-            if what is not None:
-                warnings.warn(what, stacklevel=2)
+            message = unresolved_friction(problem, float(dt0))
+            if message is not None:
+                warnings.warn(message, stacklevel=2)
         warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
         if has_kinks(problem):
             _warn_of_law(estimate, problem, key, devices)
@@ -249,13 +249,7 @@ def _warn_of_law(
             stacklevel=3,
         )
         return
-    gaussian_path = ft.partial(own_path, problem.solver, "strong")
-    terms = with_paths(gaussian_path, path_numbers(paths), problem.terms, key)
-    terms = without_truncation(terms)
-    gaussian_problem = dataclasses.replace(problem, terms=terms)
-    key = trial_key(key)
-    plan = trial_sampling(gaussian_problem).prepare(gaussian_problem, key, devices)
-    trial = run(plan, key, devices)
+    trial = _trial_with_gaussian_increments(problem, key, devices)
 
     def is_different(change: np.ndarray, error: np.ndarray) -> np.bool_:
         return np.any(change > _SURE_OF_LAW * error)
@@ -274,6 +268,21 @@ def _warn_of_law(
         )
 
 
+def _trial_with_gaussian_increments(
+    problem: Problem, key: PRNGKeyArray, devices: Devices
+) -> Expectation:
+    """An estimate of the same mean, with Gaussian increments in place of those of `terms`,
+    for a solver that takes them. `key` is that of the call."""
+    numbers = path_numbers(random_paths(problem.terms))
+    gaussian_path = ft.partial(own_path, problem.solver, "strong")
+    terms = with_paths(gaussian_path, numbers, problem.terms, key)
+    gaussian_problem = dataclasses.replace(problem, terms=without_truncation(terms))
+    sampling = trial_sampling(gaussian_problem)
+    key_of_trial = trial_key(key)
+    plan = sampling.prepare(gaussian_problem, key_of_trial, devices)
+    return run(plan, key_of_trial, devices)
+
+
 def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
     """Warns if rounding in single precision may exceed the sampling error."""
     precision = np.finfo(problem.dtype)
@@ -288,8 +297,8 @@ def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
         floor = fraction * np.abs(mean)
         return np.any(std_error <= 2 * floor)
 
-    near = jtu.tree_map(is_near_rounding, estimate.mean, estimate.std_error)
-    if any(jtu.tree_leaves(near)):
+    is_near = jtu.tree_map(is_near_rounding, estimate.mean, estimate.std_error)
+    if any(jtu.tree_leaves(is_near)):
         warnings.warn(
             "Rounding errors may be larger than the sampling error: over "
             f"{problem.finest_steps:,} steps in {precision.dtype} they are about "

@@ -37,7 +37,7 @@ def fused_plan(
             "Pass `devices=jax.devices()[:1]`."
         )
     levels = len(problem.levels.h)
-    plan = sampling.plan(jtu.Partial(_samples, problem), levels, devices)
+    plan = sampling.plan(jtu.Partial(_samples_of_fused_paths, problem), levels, devices)
     if sampling.batch_size is None:
         plan = plan._replace(batch_size=_FUSED_BATCH)
     return plan._replace(simulate_paths=FusedPaths(problem, key))
@@ -107,28 +107,31 @@ class _NumberedPaths(NamedTuple):
     paths: _Paths
 
 
-def _samples(p: Problem, paths: _Paths, keys: Key[Array, " n"]) -> Samples:
+def _samples_of_fused_paths(
+    problem: Problem, paths: _Paths, keys: Key[Array, " n"]
+) -> Samples:
     """The samples of paths that are known: one for each random key, by which a path draws
     its `args`, too."""
-    _, args_of_paths = jax.vmap(p.draw_start)(keys)
+    _, args_of_paths = jax.vmap(problem.draw_start)(keys)
 
+    # `y` holds the states of a path at all times.
     def values_of_path(
         times: Any, y: PyTree[Array], own_args: PyTree[Array]
     ) -> Float[Array, "S m"]:
-        return jax.vmap(p.with_args(own_args).values)(times, y)
+        return jax.vmap(problem.with_args(own_args).values)(times, y)
 
     def values_on_level(level: Level, y: PyTree[Array]) -> Float[Array, "n S m"]:
-        times = p.t0 + level.saved_steps * level.h
+        times = problem.t0 + level.saved_steps * level.h
         return jax.vmap(values_of_path, (None, 0, 0))(times, y, args_of_paths)
 
     # (levels, n, S, m)
-    phi = jax.vmap(values_on_level)(p.levels, paths.y)
+    phi = jax.vmap(values_on_level)(problem.levels, paths.y)
     finite = jax.vmap(jax.vmap(all_finite))(phi)
     failed = jnp.asarray(paths.failed) | ~finite
     # (levels, S, n, m)
     phi = jnp.swapaxes(phi, 1, 2)
     return Samples(
-        averaged=Averaged(p.shaped(p.combinations(phi))),
+        averaged=Averaged(problem.unravel_samples(problem.combinations(phi))),
         good=~jnp.any(failed, axis=0),
         num_failed=failed,
     )

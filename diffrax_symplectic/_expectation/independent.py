@@ -43,7 +43,9 @@ class IndependentPaths(AbstractSampling):
 
     def prepare(self, problem, key, devices):
         levels = len(problem.levels.h)
-        return self.plan(jtu.Partial(_samples, problem), levels, devices)
+        return self.plan(
+            jtu.Partial(_samples_of_independent_paths, problem), levels, devices
+        )
 
     def plan(
         self, sampler: Callable[..., Samples], levels: int, devices: Devices
@@ -58,12 +60,12 @@ class IndependentPaths(AbstractSampling):
         )
 
 
-def _samples(p: Problem, keys: Key[Array, " n"]) -> Samples:
+def _samples_of_independent_paths(problem: Problem, keys: Key[Array, " n"]) -> Samples:
     """A sample is a path, with the same random key on all levels."""
     # (levels, S, n, m) and (levels, n)
-    values, failed = values_of_paths(p, keys)
+    values, failed = values_of_paths(problem, keys)
     return Samples(
-        averaged=Averaged(p.shaped(p.combinations(values))),
+        averaged=Averaged(problem.unravel_samples(problem.combinations(values))),
         good=~jnp.any(failed, axis=0),
         num_failed=failed,
     )

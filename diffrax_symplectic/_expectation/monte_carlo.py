@@ -104,8 +104,8 @@ def monte_carlo(
             "Several `levels` need `order=`, the weak order of the solver; got "
             f"levels={levels!r} and order=None."
         )
-    arguments = ["key"] if levels == 1 else ["key", "level"]
-    check_takes("fn", fn, *arguments)
+    names_of_arguments = ["key"] if levels == 1 else ["key", "level"]
+    check_takes("fn", fn, *names_of_arguments)
     # First-passage times have the order 1/2, if events are checked at the end of each step.
     is_half = isinstance(order, float) and order == 0.5
     is_whole = isinstance(order, int | np.integer) and order >= 1
@@ -113,7 +113,9 @@ def monte_carlo(
         raise ValueError(f"`order` must be a positive integer, or 1/2; got {order!r}.")
     sampling = IndependentPaths(num_paths, batch_size)
     weights = level_weights(float(order or 1), levels)
-    plan = sampling.plan(jtu.Partial(_samples, fn, weights), levels, devices)
+    plan = sampling.plan(
+        jtu.Partial(_samples_of_function, fn, weights), levels, devices
+    )
     with Meter(progress_meter) as meter:
         estimate = run(plan, key, devices, sampling, start, first, tol, meter)
     for message in cautions(estimate, tol, bounded=False):
@@ -121,7 +123,7 @@ def monte_carlo(
     return estimate
 
 
-def _samples(
+def _samples_of_function(
     fn: Callable,
     weights: Float[Array | np.ndarray, "combinations levels"],
     keys: Key[Array, " n"],
@@ -134,8 +136,8 @@ def _samples(
     values_and_success = []
     for level in range(levels):
         arguments = () if levels == 1 else (level,)
-        of_key = ft.partial(_value_and_success, fn, arguments)
-        values_and_success.append(jax.vmap(of_key)(keys))
+        value_and_success_of = ft.partial(_value_and_success, fn, arguments)
+        values_and_success.append(jax.vmap(value_and_success_of)(keys))
     # (levels, n, ...) and (levels, n)
     values, success = jtu.tree_map(lambda *xs: jnp.stack(xs), *values_and_success)
 
@@ -150,7 +152,8 @@ def _samples(
 def _value_and_success(
     fn: Callable, arguments: tuple[int, ...], key: PRNGKeyArray
 ) -> tuple[PyTree[Array], Bool[Array, ""]]:
-    """The $\\phi$ that `fn(key, *arguments)` returns, and whether the path succeeded."""
+    """The $\\phi$ that `fn(key, *arguments)` returns, in floating-point numbers, and
+    whether the path succeeded."""
     phi = fn(key, *arguments)
     success = jnp.array(True)
     is_pair = isinstance(phi, tuple) and len(phi) == 2

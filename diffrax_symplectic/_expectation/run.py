@@ -19,13 +19,13 @@ from .._custom_types import Devices
 from .batch import batch_moments, BatchMoments, quick_batch_moments
 from .estimate import (
     check_same,
+    combined_in_halves,
     Expectation,
     ExpectationInterrupted,
     is_reached,
     is_stuck,
-    joined,
     Moments,
-    share_of,
+    share_of_needed,
 )
 from .sampling import Samples, SamplingPlan
 
@@ -63,14 +63,14 @@ def run(
 ) -> Expectation:
     """The estimate from the samples of a plan, which continues `start`, or begins with
     sample number `first`. The result does not depend on the number of devices."""
-    # One past the last sample that is part of the estimate.
-    estimate_end = first
+    # The number of the first sample that is not in `start`.
+    next_sample = first
     if start is not None:
         first = start.moments[0].begin
-        estimate_end = start.moments[-1].end
+        next_sample = start.moments[-1].end
     end = first + plan.num_samples
     batches = _Batches(plan, key, devices)
-    no_moments = batches.without_samples(estimate_end, end)
+    no_moments = batches.without_samples(next_sample, end)
     estimate = Expectation(
         moments=(no_moments,),
         key_data=batches.key_data,
@@ -82,22 +82,23 @@ def run(
     )
     if start is not None:
         check_same(start, estimate, "`start`")
-        if estimate_end > end:
+        if next_sample > end:
             raise ValueError(
                 "The number of paths (or replicates) includes `start`, which has "
-                f"{estimate_end - first} already; got {plan.num_samples}. Pass a larger "
+                f"{next_sample - first} already; got {plan.num_samples}. Pass a larger "
                 "number."
             )
         estimate = dataclasses.replace(estimate, moments=start.moments)
 
+    def needs_no_more_samples() -> bool:
+        return _needs_no_more_samples(estimate, plan.least_samples, tol)
+
     running_batches: collections.deque[BatchMoments] = collections.deque()
     # One past the last sample of the batches that were started.
-    started_end = estimate_end
+    started_end = next_sample
     try:
         while True:
-            starts_batch = started_end < end and not _stops(
-                estimate, plan.least_samples, tol
-            )
+            starts_batch = started_end < end and not needs_no_more_samples()
             if starts_batch:
                 sampler = batches.sampler_at(started_end)
                 running_batches.append(batches.start(started_end, end, sampler))
@@ -108,18 +109,14 @@ def run(
                 for of_device in batches.on_devices(running_batches.popleft()):
                     # The moments of each device are a batch of their own: where to stop
                     # does not depend on how many devices there are.
-                    if estimate_end == end or _stops(estimate, plan.least_samples, tol):
+                    if _end_of(estimate) == end or needs_no_more_samples():
                         break
-                    batch_end = min(estimate_end + batches.size, end)
-                    new_moments = _in_float64(
-                        of_device, estimate_end, batch_end, no_moments.dtypes
+                    estimate = _with_batch(
+                        estimate, of_device, batches.size, end, no_moments.dtypes
                     )
-                    moments = joined((*estimate.moments, new_moments))
-                    estimate = dataclasses.replace(estimate, moments=moments)
-                    estimate_end = batch_end
                 if meter is not None:
-                    share = (estimate_end - first) / plan.num_samples
-                    meter.step(max(share, share_of(estimate, tol)))
+                    share = (_end_of(estimate) - first) / plan.num_samples
+                    meter.step(max(share, share_of_needed(estimate, tol)))
             elif not starts_batch:
                 break
     except KeyboardInterrupt:
@@ -127,6 +124,27 @@ def run(
             _with_tol_reached(estimate, plan.least_samples, tol)
         ) from None
     return _with_tol_reached(estimate, plan.least_samples, tol)
+
+
+def _end_of(estimate: Expectation) -> int:
+    """One past the last sample of the estimate."""
+    return estimate.moments[-1].end
+
+
+def _with_batch(
+    estimate: Expectation,
+    of_device: BatchMoments,
+    batch_size: int,
+    end: int,
+    dtypes: PyTree[str],
+) -> Expectation:
+    """The estimate with the next batch, of which samples before number `end` count, and
+    which was computed in these `dtypes`."""
+    begin = _end_of(estimate)
+    batch_end = min(begin + batch_size, end)
+    new_moments = _in_float64(of_device, begin, batch_end, dtypes)
+    moments = combined_in_halves((*estimate.moments, new_moments))
+    return dataclasses.replace(estimate, moments=moments)
 
 
 class _Batches:
@@ -141,7 +159,9 @@ class _Batches:
         self._devices = devices
         self._struct = plan.struct
         self._levels = plan.levels
-        self._batch_moments: Any = quick_batch_moments if plan.quick else batch_moments
+        self._batch_moments: Any = (
+            quick_batch_moments if plan.is_quick else batch_moments
+        )
         if jax.process_count() > 1:
             # All processes hold the same arrays. Captured by a function they become
             # constants; as arguments they would have to be placed on all devices.
@@ -241,7 +261,9 @@ def _in_float64(
     )
 
 
-def _stops(estimate: Expectation, least_samples: int, tol: float | None) -> bool:
+def _needs_no_more_samples(
+    estimate: Expectation, least_samples: int, tol: float | None
+) -> bool:
     """Whether there are enough samples for the tolerance, or more would not help."""
     if tol is None or estimate.num_samples < least_samples:
         return False

@@ -78,8 +78,8 @@ class SamplingPlan(NamedTuple):
         it, by trials.
     - `struct`: the shapes and dtypes of what is averaged of one sample, if they are known
         without a trace.
-    - `quick`: whether the samples take less time than compiling their program, so that it
-        is compiled for speed of compilation.
+    - `is_quick`: whether the samples take less time than compiling their program, which is
+        then compiled for speed of compilation.
     - `tails`, `rounding_floor`: as in `Expectation`.
     - `simulate_paths`: for paths computed outside JAX, maps the number of the first sample
         and the number of samples to an argument that the sampler takes before the keys.
@@ -94,7 +94,7 @@ class SamplingPlan(NamedTuple):
     reason: str = ""
     remainder: float = 0.0
     struct: Averaged | None = None
-    quick: bool = False
+    is_quick: bool = False
     tails: PyTree[np.ndarray] | None = None
     rounding_floor: int = 1
     simulate_paths: Callable[[int, int], Any] | None = None

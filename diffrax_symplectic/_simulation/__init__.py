@@ -24,10 +24,11 @@ from .engines import (
 from .levels import combinations, Combination, Level, level_weights
 from .loop import (
     mask_like,
-    independent_steps,
+    independent_motion,
     Motion,
     PathStates,
     simulate,
+    Simulated,
     values_of_paths,
 )
 from .problem import advice_on_failures, DrawnStart, Problem, ravel, real_vector

@@ -78,14 +78,16 @@ def step_numbers(
     apart."""
     if dt0 is None:
         raise ValueError("`dt0` must be a number: steps are fixed; got None.")
-    given = f"got dt0={dt0!r}, t0={t0!r}, t1={t1!r}"
+    arguments = f"dt0={dt0!r}, t0={t0!r}, t1={t1!r}"
     if not all(eqx.is_array_like(x) and np.ndim(x) == 0 for x in (t0, t1, dt0)):
-        raise ValueError(f"`t0`, `t1` and `dt0` must be numbers; {given}.")
+        raise ValueError(f"`t0`, `t1` and `dt0` must be numbers; got {arguments}.")
     begin = float(t0)
     end = float(t1)
     step = float(dt0)
     if not (0 < step < np.inf and begin < end < np.inf):
-        raise ValueError(f"`dt0` must be positive, and `t1` after `t0`; {given}.")
+        raise ValueError(
+            f"`dt0` must be positive, and `t1` after `t0`; got {arguments}."
+        )
     times = np.array([end] if ts is None else ts, float).reshape(-1)
     # The last quotient is the number of all steps.
     quotients = (np.append(times, end) - begin) / step
@@ -135,11 +137,13 @@ def drawn_args(args_of: Callable, key: PRNGKeyArray) -> Args:
         raise
 
     # Each path has its own arrays of JAX. All paths share leaves that are no arrays.
-    def as_jax_array(leaf: Any) -> Any:
-        is_numpy = isinstance(leaf, np.ndarray | np.generic)
-        return jnp.asarray(leaf) if is_numpy else leaf
+    return jtu.tree_map(_with_jax_arrays, args)
 
-    return jtu.tree_map(as_jax_array, args)
+
+def _with_jax_arrays(leaf: Any) -> Any:
+    """The leaf, as an array of JAX if it is one of NumPy."""
+    is_numpy = isinstance(leaf, np.ndarray | np.generic)
+    return jnp.asarray(leaf) if is_numpy else leaf
 
 
 def check_finite(y0: Y) -> None:
@@ -212,6 +216,7 @@ def check_gaussian(solver: diffrax.AbstractSolver) -> None:
 def check_cells(terms: PyTree, t0: float, h: float) -> None:
     """Raises a `ValueError` for steps that are not made up of whole cells of a path."""
     for path in brownian_paths(terms):
+        # Most paths have no cells.
         cell = getattr(path, "cell", None)
         if cell is None:
             continue
@@ -236,8 +241,8 @@ def check_shapes(
     y0: Y,
     args: Args,
 ) -> None:
-    """Raises an error unless the terms fit the state, and `phi` takes it and returns real
-    arrays."""
+    """Raises an error unless the terms fit the state, and `phi` takes this state and
+    returns real arrays."""
     check_fit(terms, t0, y0, args)
     check_takes("phi", phi, "t", "y", "args")
     result = _result_struct(phi, terms, t0, y0, args)

@@ -33,7 +33,7 @@ from .problem import Problem
 
 
 # Stragglers that are a larger share of all paths take most of the time.
-_MANY = 0.05
+_MOST_STRAGGLERS = 0.05
 
 
 def warn_of_stragglers(
@@ -42,7 +42,7 @@ def warn_of_stragglers(
     """Warns if JAX simulated many paths again, besides those that failed."""
     # JAX does not solve the steps of failed paths either, so for these `engine="jax"`,
     # which the warning advises, would be no remedy.
-    if num_stragglers - num_failed > _MANY * num_paths:
+    if num_stragglers - num_failed > _MOST_STRAGGLERS * num_paths:
         warnings.warn(
             f"{num_stragglers:,} of {num_paths:,} paths had steps that the fused kernel "
             "did not solve, or the sine or cosine of an angle beyond 2^31 (in single "
@@ -52,7 +52,7 @@ def warn_of_stragglers(
         )
 
 
-# The numbers of samples have 64 bits. These are the high or the low 32 bits of each.
+# The high or the low 32 bits of each of several sample numbers, which have 64 bits.
 _Words: TypeAlias = Array | np.ndarray
 
 
@@ -76,15 +76,15 @@ def state_itself(t, y, args):
 
 
 def by_jax(
-    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
+    problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:
     """The paths with these sample numbers, on one level, simulated by JAX, with the loop of
     `expectation`."""
     high, low = _words(sample_numbers)
-    on_all_levels = _paths_by_jax(p, key, high, low)
+    states_and_failed = _paths_by_jax(problem, key, high, low)
     # The results are traced if a function of the user closes over traced values.
-    check_untraced("`ensemble`", on_all_levels)
-    y, failed = jax.device_get(on_all_levels)
+    check_untraced("`ensemble`", states_and_failed)
+    y, failed = jax.device_get(states_and_failed)
     return Batch(jtu.tree_map(lambda x: x[level], y), failed[level])
 
 
@@ -102,28 +102,28 @@ def _sample_keys(key: PRNGKeyArray, high: _Words, low: _Words) -> Array:
 
 @eqx.filter_jit
 def _draw_starts(
-    p: Problem, key: PRNGKeyArray, high: _Words, low: _Words
+    problem: Problem, key: PRNGKeyArray, high: _Words, low: _Words
 ) -> tuple[PyTree, PyTree]:
     """`Problem.draw_start` for the paths of a batch."""
-    return jax.vmap(p.draw_start)(_sample_keys(key, high, low))
+    return jax.vmap(problem.draw_start)(_sample_keys(key, high, low))
 
 
 @eqx.filter_jit
 @lapack_in_turn
 def _paths_by_jax(
-    p: Problem, key: PRNGKeyArray, high: _Words, low: _Words
+    problem: Problem, key: PRNGKeyArray, high: _Words, low: _Words
 ) -> tuple[PyTree[Array], Bool[Array, "levels n"]]:
     """The saved states of the paths of a batch, along axes of levels, paths and times, and
     which paths failed."""
     # (levels, times, paths, entries of the state)
-    states, failed = values_of_paths(p, _sample_keys(key, high, low))
+    states, failed = values_of_paths(problem, _sample_keys(key, high, low))
     # (levels, paths, times, entries of the state)
     states = jnp.swapaxes(states, 1, 2)
-    return p.unravel(states), failed
+    return problem.unravel(states), failed
 
 
 def by_drjit(
-    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
+    problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:
     """The paths with these sample numbers, on one level, simulated by a fused kernel. JAX
     simulates again the paths that the kernel could not finish.
@@ -131,7 +131,7 @@ def by_drjit(
     Raises an `ImportError` without Dr.Jit, and a `ValueError` if the system cannot be
     replayed."""
     try:
-        fused = _fused_batch(p, key, sample_numbers, level)
+        fused = _fused_batch(problem, key, sample_numbers, level)
     except ImportError as error:
         raise ImportError(
             f'`engine="drjit"` needs Dr.Jit. {error}; or pass `engine="jax"`, which needs '
@@ -145,35 +145,36 @@ def by_drjit(
         raise refusal from None
     if fused.num_stragglers == 0:
         return fused
-    return _with_stragglers(p, key, sample_numbers, level, fused)
+    return _with_stragglers(problem, key, sample_numbers, level, fused)
 
 
 def _fused_batch(
-    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int
+    problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int
 ) -> Batch:
     """The paths of a batch from the kernel alone: those that it did not finish count as
     failed."""
-    kernels, lanes, shared = fused_start(p, key, sample_numbers, level)
-    saved_steps = np.asarray(p.level(level).saved_steps)
+    kernels, lanes, shared = fused_start(problem, key, sample_numbers, level)
+    saved_steps = np.asarray(problem.level(level).saved_steps)
     # For each number of steps, the entries of the states after them: an array for each
     # entry, along the paths. The kernel is called for the steps between two saved times.
     entries_after: dict[int, list[np.ndarray]] = {}
-    num_done = 0
+    num_steps_done = 0
     for num_steps in np.unique(saved_steps).tolist():
-        if num_steps > num_done:
-            lanes = kernels.advance(lanes, shared, num_done, num_steps)
-        num_done = num_steps
+        # No step comes before a saved time that is `t0`.
+        if num_steps > num_steps_done:
+            lanes = kernels.advance(lanes, shared, num_steps_done, num_steps)
+        num_steps_done = num_steps
         entries_after[num_steps] = [np.asarray(entry) for entry in lanes.y]
     # An array (paths, times) for each entry. `ts` may repeat a time.
     entries = [
         np.stack([entries_after[step][k] for step in saved_steps.tolist()], axis=1)
         for k in range(len(lanes.y))
     ]
-    stopped = np.asarray(lanes.stopped)
+    is_unfinished = np.asarray(lanes.stopped)
     return Batch(
-        y=_states_of_entries(p.y0, entries),
-        failed=stopped,
-        num_stragglers=int(np.sum(stopped)),
+        y=_states_of_entries(problem.y0, entries),
+        failed=is_unfinished,
+        num_stragglers=int(np.sum(is_unfinished)),
     )
 
 
@@ -188,47 +189,49 @@ class FusedStart(NamedTuple):
 
 
 def fused_start(
-    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
+    problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> FusedStart:
     """The paths with these sample numbers before their first step, and the kernels of the
     problem, which are compiled unless they are known."""
-    own_args = None if p.args_of is None else eqx.filter(p.args, eqx.is_array)
+    example_args = None
+    if problem.args_of is not None:
+        example_args = eqx.filter(problem.args, eqx.is_array)
     functions, arrays = functions_and_arrays(
-        _compiled_problem(p), key, own_args, p.paths_differ
+        _compiled_problem(problem), key, example_args, problem.paths_differ
     )
     kernels = _kernels(functions)
-    if p.paths_differ:
+    if problem.paths_differ:
         high, low = _words(sample_numbers)
-        y0, args = _draw_starts(p, key, high, low)
+        y0, own_args = _draw_starts(problem, key, high, low)
     else:
-        y0 = p.y0
-        args = None
+        y0 = problem.y0
+        own_args = None
     lanes, shared = kernels.begin(
         arrays,
         key,
-        h=p.level(level).h,
+        h=problem.level(level).h,
         first_path=int(sample_numbers[0]),
         num_paths=len(sample_numbers),
         y0=y0,
-        own_args=args,
+        own_args=own_args,
     )
     return FusedStart(kernels, lanes, shared)
 
 
-def _compiled_problem(p: Problem) -> Problem:
+def _compiled_problem(problem: Problem) -> Problem:
     """The problem for which a kernel is compiled: with plain sweeps for root finders, and
     with placeholders for step sizes, times and numbers of steps, which are inputs of the
     kernel."""
     zero = jnp.zeros(1, jnp.int32)
     level = Level(
         index=zero,
-        h=jnp.ones_like(p.levels.h[:1]),
+        h=jnp.ones_like(problem.levels.h[:1]),
         num_steps=zero,
         saved_steps=zero[None],
     )
     return dataclasses.replace(
-        p,
-        solver=without_rescue(p.solver),
+        problem,
+        solver=without_rescue(problem.solver),
         y0_of=None,
         args_of=None,
         levels=level,
@@ -245,28 +248,33 @@ def _kernels(functions: PathFunctions) -> Kernels:
 
 
 def _with_stragglers(
-    p: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int, fused: Batch
+    problem: Problem,
+    key: PRNGKeyArray,
+    sample_numbers: np.ndarray,
+    level: int,
+    fused: Batch,
 ) -> Batch:
-    """The paths of a batch, with those that the kernel did not finish simulated by JAX."""
+    """The paths of a batch, of which the kernel did not finish one or more, with these
+    simulated by JAX."""
     # To go on from where the kernel stopped, JAX would need the solver's state, too. JAX
     # begins anew, which also gives the same paths as without a kernel.
-    (places,) = np.nonzero(fused.failed)
-    num_stragglers = len(places)
-    # The size is rounded up to a power of four, by repeating stragglers, so that JAX
+    (stragglers,) = np.nonzero(fused.failed)
+    num_stragglers = len(stragglers)
+    # Their number is rounded up to a power of four, by repeating stragglers, so that JAX
     # compiles few programs.
     power = int(np.ceil(np.log(num_stragglers) / np.log(4)))
-    size = min(len(sample_numbers), 4**power)
-    repeated_places = np.resize(places, size)
-    solved = by_jax(p, key, sample_numbers[repeated_places], level)
+    num_to_solve = min(len(sample_numbers), 4**power)
+    repeated_stragglers = np.resize(stragglers, num_to_solve)
+    solved = by_jax(problem, key, sample_numbers[repeated_stragglers], level)
 
-    def with_stragglers(fused_leaf: np.ndarray, solved_leaf: np.ndarray) -> np.ndarray:
+    def with_solved(fused_leaf: np.ndarray, solved_leaf: np.ndarray) -> np.ndarray:
         leaf = np.array(fused_leaf)
-        leaf[places] = solved_leaf[:num_stragglers]
+        leaf[stragglers] = solved_leaf[:num_stragglers]
         return leaf
 
-    failed = np.zeros(len(sample_numbers), bool)
-    failed[places] = solved.failed[:num_stragglers]
-    y = jtu.tree_map(with_stragglers, fused.y, solved.y)
+    # So far all stragglers counted as failed.
+    failed = with_solved(fused.failed, solved.failed)
+    y = jtu.tree_map(with_solved, fused.y, solved.y)
     return Batch(y, failed, num_stragglers)
 
 
@@ -297,20 +305,20 @@ def _refusal(error: BaseException | None) -> ValueError | None:
     if error is None:
         return None
     return ValueError(
-        f'`engine="drjit"` cannot replay {error}{_origin(error.location)}. Pass '
+        f'`engine="drjit"` cannot replay {error}{_clause_of_origin(error.location)}. Pass '
         '`engine="jax"`, or write the function without it.'
     )
 
 
-def _origin(location: str) -> str:
+def _clause_of_origin(location: str) -> str:
     """A relative clause that names the function of the user's code from which an operation
     comes, such as ", which `energy` needs (well.py, line 3)": the first function outside of
     installed packages. The clause is empty if JAX recorded no such function."""
     package = str(Path(__file__).parents[1])
     for source in source_lines(location):
         if "site-packages" not in source.file and not source.file.startswith(package):
-            where = f"({source.file}, line {source.line})"
-            return f", which `{source.function}` needs {where}"
+            place = f"({source.file}, line {source.line})"
+            return f", which `{source.function}` needs {place}"
     return ""
 
 

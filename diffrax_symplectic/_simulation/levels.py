@@ -31,11 +31,11 @@ class Level(eqx.Module):
     saved_steps: Int[Array | np.ndarray, "*levels saves"]
 
 
-def levels_of(dt0: float, counts: StepNumbers, levels: int, dtype: Any) -> Level:
-    """All levels, along a leading axis: each has half the step of the one before. `counts`
-    are the numbers of steps on the first level. Raises a `ValueError` for too many
-    steps."""
-    if counts.total * 2.0 ** (levels - 1) >= _MOST_STEPS:
+def levels_of(dt0: float, steps_of_dt0: StepNumbers, levels: int, dtype: Any) -> Level:
+    """All levels, along a leading axis: each has half the step of the one before.
+    `steps_of_dt0` are the numbers of steps on the first level. Raises a `ValueError` for
+    too many steps."""
+    if steps_of_dt0.total * 2.0 ** (levels - 1) >= _MOST_STEPS:
         raise ValueError(
             f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "
             "2^31 steps. Pass fewer levels: two to four are enough to extrapolate."
@@ -45,9 +45,9 @@ def levels_of(dt0: float, counts: StepNumbers, levels: int, dtype: Any) -> Level
     return Level(
         index=index,
         h=np.asarray(dt0 / steps_in_dt0, dtype),
-        num_steps=steps_in_dt0 * counts.total,
+        num_steps=steps_in_dt0 * steps_of_dt0.total,
         # (levels, saves)
-        saved_steps=steps_in_dt0[:, None] * counts.saved,
+        saved_steps=steps_in_dt0[:, None] * steps_of_dt0.saved,
     )
 
 
@@ -113,8 +113,9 @@ def _extrapolation_weights(
     # first equation, of power 0, is that the weights add up to one; the others make terms
     # of the error vanish.
     powers = np.append(0.0, order + min(order, 1) * np.arange(levels - 1))
-    system = 2.0 ** -np.outer(powers, np.arange(levels))
-    return np.linalg.solve(system, np.eye(levels)[0])
+    matrix = 2.0 ** -np.outer(powers, np.arange(levels))
+    right_side = np.append(1.0, np.zeros(levels - 1))
+    return np.linalg.solve(matrix, right_side)
 
 
 def combinations(

@@ -45,17 +45,20 @@ class PathStates(eqx.Module):
 
     @staticmethod
     def start(
-        p: Problem, drawn: DrawnStart, solver_state: PyTree[Array], control: Any = None
+        problem: Problem,
+        starts: DrawnStart,
+        solver_state: PyTree[Array],
+        control: Any = None,
     ) -> "PathStates":
         """Paths before their first step. A path whose initial state is not finite has
         failed."""
-        failed = ~jax.vmap(all_finite)(drawn.y0)
-        y = _kept_where(failed, p.y0, drawn.y0)
-        return PathStates(y, solver_state, failed, drawn.args, control)
+        failed = ~jax.vmap(all_finite)(starts.y0)
+        y = _replaced_where(failed, starts.y0, problem.y0)
+        return PathStates(y, solver_state, failed, starts.args, control)
 
-    def moved(
+    def after_step(
         self,
-        p: Problem,
+        problem: Problem,
         y: Y,
         solver_state: PyTree[Array],
         success: Bool[Array, " n"],
@@ -63,18 +66,20 @@ class PathStates(eqx.Module):
     ) -> "PathStates":
         """The paths after a step to `y`, with failed paths reset."""
         failed = self.failed | ~success
-        solver_state = _kept_where(failed, self.solver_state, solver_state)
-        y = _kept_where(failed, p.y0, y)
+        solver_state = _replaced_where(failed, solver_state, self.solver_state)
+        y = _replaced_where(failed, y, problem.y0)
         return PathStates(y, solver_state, failed, self.args, control)
 
 
-def _kept_where(failed: Bool[Array, " n"], old: PyTree, new: PyTree) -> PyTree:
-    """The new values, and the old ones for failed paths."""
+def _replaced_where(
+    failed: Bool[Array, " n"], values: PyTree, replacements: PyTree
+) -> PyTree:
+    """The values of all paths, with the replacements for failed ones."""
 
-    def kept(new_leaf: Array, old_leaf: Array) -> Array:
-        return jnp.where(mask_like(failed, new_leaf), old_leaf, new_leaf)
+    def replaced(value: Array, replacement: Array) -> Array:
+        return jnp.where(mask_like(failed, value), replacement, value)
 
-    return jtu.tree_map(kept, new, old)
+    return jtu.tree_map(replaced, values, replacements)
 
 
 class Motion(NamedTuple):
@@ -108,123 +113,129 @@ def _phi_itself(phi: Array, failed: Bool[Array, " n"]) -> Array:
 
 
 def simulate(
-    p: Problem,
-    begin: Callable[[Level], Motion],
+    problem: Problem,
+    motion_on: Callable[[Level], Motion],
     measure: Callable[[Array, Bool[Array, " n"]], Array] = _phi_itself,
 ) -> Simulated:
-    """Simulates the paths of all levels, which `begin(level)` starts. After each saved step
-    `measure(phi, failed)` is saved, with `phi` of shape `(n, m)`."""
-    on_level = ft.partial(_on_level, p, begin, measure)
-    if len(p.levels.h) == 1:
-        only_level = on_level(p.level(0))
+    """Simulates the paths of all levels, which move as `motion_on(level)` says. After each
+    saved step `measure(phi, failed)` is saved, with `phi` of shape `(n, m)`."""
+    simulate_level = ft.partial(_simulate_level, problem, motion_on, measure)
+    if len(problem.levels.h) == 1:
+        only_level = simulate_level(problem.level(0))
         return jtu.tree_map(lambda x: x[None], only_level)
     # All levels share one compiled program.
-    return lax.map(on_level, p.levels)
+    return lax.map(simulate_level, problem.levels)
 
 
-def _on_level(
-    p: Problem, begin: Callable[[Level], Motion], measure: Callable, level: Level
+def _simulate_level(
+    problem: Problem,
+    motion_on: Callable[[Level], Motion],
+    measure: Callable,
+    level: Level,
 ) -> Simulated:
     """Simulates the paths of one level."""
-    motion = begin(level)
+    motion = motion_on(level)
 
     def step_and_measure(i, carry):
         paths, saved = carry
         num_steps = i + 1
         paths = motion.step(i, paths)
-        return _measure_if_saved(p, level, measure, num_steps, paths, saved)
+        return _measure_if_saved(problem, level, measure, num_steps, paths, saved)
 
-    num_saves, m = p.num_outputs
+    num_saves, m = problem.output_shape
     num_paths = len(motion.start.failed)
-    dtype = p.dtype_of_values
+    dtype = problem.dtype_of_values
     phi = jax.ShapeDtypeStruct((num_paths, m), dtype)
     measured = jax.eval_shape(measure, phi, motion.start.failed)
     saved = jnp.zeros((num_saves, *measured.shape), dtype)
     # A saved time may be `t0`.
-    carry = _measure_if_saved(p, level, measure, 0, motion.start, saved)
+    carry = _measure_if_saved(problem, level, measure, 0, motion.start, saved)
     paths, saved = lax.fori_loop(0, level.num_steps, step_and_measure, carry)
     return Simulated(saved, paths.failed, paths.control)
 
 
 def _measure_if_saved(
-    p: Problem,
+    problem: Problem,
     level: Level,
     measure: Callable,
-    i: Any,
+    num_steps: Any,
     paths: PathStates,
     saved: Float[Array, "S ..."],
 ) -> tuple[PathStates, Float[Array, "S ..."]]:
-    """The paths after `i` steps, and the saved values, to which this adds a measurement if
-    step `i` is a saved one. A path whose `phi` is not finite has failed."""
+    """The paths after so many steps, and the saved values, with a measurement among them if
+    these steps end at a saved time. A path whose `phi` is not finite has failed."""
 
-    def measured():
+    def with_measurement():
         def phi_of(y, args):
-            return p.with_args(args).values(p.t0 + i * level.h, y)
+            return problem.with_args(args).values(problem.t0 + num_steps * level.h, y)
 
         phi = jax.vmap(phi_of)(paths.y, paths.args)
         failed = paths.failed | ~jax.vmap(all_finite)(phi)
-        # `ts` may repeat a time, so several rows of `saved` may belong to this step.
-        is_row_of_step = mask_like(level.saved_steps == i, saved)
-        return failed, jnp.where(is_row_of_step, measure(phi, failed), saved)
+        # `ts` may repeat a time, so several rows of `saved` may belong to this time.
+        is_row_of_time = mask_like(level.saved_steps == num_steps, saved)
+        return failed, jnp.where(is_row_of_time, measure(phi, failed), saved)
 
     def unchanged():
         return paths.failed, saved
 
     # One predicate for all paths, so that `phi` is evaluated only after saved steps.
-    is_saved = jnp.any(level.saved_steps == i)
-    failed, saved = lax.cond(is_saved, measured, unchanged)
+    is_saved = jnp.any(level.saved_steps == num_steps)
+    failed, saved = lax.cond(is_saved, with_measurement, unchanged)
     return eqx.tree_at(lambda states: states.failed, paths, failed), saved
 
 
-def independent_steps(
-    p: Problem,
+def independent_motion(
+    problem: Problem,
     level: Level,
-    drawn: DrawnStart,
+    starts: DrawnStart,
     terms_of: Callable[[Any], PyTree],
-    randomness: Callable[[Any], PyTree[Array]],
+    randomness_of_step: Callable[[Any], PyTree[Array]],
 ) -> Motion:
-    """The motion of independent paths, whose starts were `drawn`. In step `i` each path has
-    the terms `terms_of(random)`, where `random` is the row of `randomness(i)` that belongs
-    to the path."""
+    """The motion of independent paths from these starts. `randomness_of_step(i)` holds
+    random numbers or keys for step `i`, with a row for each path, and a path has the terms
+    `terms_of(row)` in this step."""
 
     def step(i: Any, paths: PathStates) -> PathStates:
-        def step_of_path(random, y, solver_state, args):
-            problem_of_path = p.with_args(args)
-            terms = terms_of(random)
-            return problem_of_path.step(terms, i, level.h, y, solver_state)
+        def step_of_path(row, y, solver_state, args):
+            problem_of_path = problem.with_args(args)
+            return problem_of_path.step(terms_of(row), i, level.h, y, solver_state)
 
         y, solver_state, success = _vmapped_in_blocks(
-            step_of_path, randomness(i), paths.y, paths.solver_state, paths.args
+            step_of_path, randomness_of_step(i), paths.y, paths.solver_state, paths.args
         )
-        return paths.moved(p, y, solver_state, success)
+        return paths.after_step(problem, y, solver_state, success)
 
-    def solver_state_at_start(random, y, args):
-        problem_of_path = p.with_args(args)
-        return problem_of_path.init(terms_of(random), 0, level.h, y)
+    def solver_state_at_start(row, y, args):
+        problem_of_path = problem.with_args(args)
+        return problem_of_path.init(terms_of(row), 0, level.h, y)
 
-    solver_state = jax.vmap(solver_state_at_start)(randomness(0), drawn.y0, drawn.args)
-    return Motion(step, PathStates.start(p, drawn, solver_state))
+    # A path that starts from a state that is not finite has a solver state that fits this
+    # state, rather than its replacement in `PathStates.start`: the path has failed anyway.
+    solver_state = jax.vmap(solver_state_at_start)(
+        randomness_of_step(0), starts.y0, starts.args
+    )
+    return Motion(step, PathStates.start(problem, starts, solver_state))
 
 
 def values_of_paths(
-    p: Problem, keys: Key[Array, " n"]
+    problem: Problem, keys: Key[Array, " n"]
 ) -> tuple[Float[Array, "levels S n m"], Bool[Array, "levels n"]]:
     """The values of `phi` for independent paths, one for each key, on all levels and at the
     times at which to average, and which paths failed."""
-    keys_of_paths = jax.vmap(lambda key: path_keys(p.terms, key))(keys)
-    drawn = jax.vmap(p.draw_start)(keys)
+    keys_of_paths = jax.vmap(lambda key: path_keys(problem.terms, key))(keys)
+    starts = jax.vmap(problem.draw_start)(keys)
 
-    def begin(level: Level) -> Motion:
-        return independent_steps(
-            p,
+    def motion_on(level: Level) -> Motion:
+        return independent_motion(
+            problem,
             level,
-            drawn,
-            terms_of=lambda keys_of_path: with_keys(p.terms, keys_of_path),
-            # A path draws the increments of all steps from its keys.
-            randomness=lambda i: keys_of_paths,
+            starts,
+            terms_of=lambda keys_of_path: with_keys(problem.terms, keys_of_path),
+            # A path draws the increments of all steps from the same keys.
+            randomness_of_step=lambda i: keys_of_paths,
         )
 
-    simulated = simulate(p, begin)
+    simulated = simulate(problem, motion_on)
     return simulated.saved, simulated.failed
 
 

@@ -75,8 +75,7 @@ class Problem(eqx.Module):
     """The arguments of `expectation`, by the same names, and the levels, along a leading
     axis. Where `y0` or `args` is a function of a random key, `y0` and `args` are an example
     of its values. Outside of programs times, levels and weights are NumPy arrays: there
-    each operation of JAX is a program of its own, which takes some 20 ms to compile. Where
-    a problem is the argument of a function, it is called `p`."""
+    each operation of JAX is a program of its own, which takes some 20 ms to compile."""
 
     phi: Callable[[RealScalarLike, Y, Args], PyTree]
     terms: PyTree[diffrax.AbstractTerm]
@@ -122,12 +121,14 @@ class Problem(eqx.Module):
             raise ValueError(
                 "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
             )
-        was_shape = which_are_shapes(terms)
+        # For each path in `terms`, whether the solver makes it.
+        is_made_by_solver = which_are_shapes(terms)
         # The paths get keys for an example. In each sample others take their place.
         terms = with_paths_for_shapes(terms, ft.partial(own_path, solver, want))
-        counts = step_numbers(t0, t1, dt0, ts)
+        steps_of_dt0 = step_numbers(t0, t1, dt0, ts)
 
-        # Any draw has the structure of all: these keys serve as well as others.
+        # Where `args` or `y0` is drawn, an example takes its place. Any draw has the
+        # structure of all: these keys serve as well as others.
         args_of = args if callable(args) else None
         if args_of is not None:
             args = drawn_args(args_of, jr.key(0))
@@ -148,15 +149,9 @@ class Problem(eqx.Module):
         if constraint_of(terms) is not None:
             check_start(terms, t0_of_dtype, y0, args)
         check_noise(terms)
-        # A solver makes a path without knowing what it drives: it truncates increments that
-        # need not be. Paths of the user are kept as they are.
-        if any(was_shape):
-            needed = which_need_truncation(terms, t0_of_dtype, y0, args)
-            needless = [
-                is_made and not is_needed
-                for is_made, is_needed in zip(was_shape, needed)
-            ]
-            terms = without_truncation(terms, needless)
+        if any(is_made_by_solver):
+            is_needed = which_need_truncation(terms, t0_of_dtype, y0, args)
+            terms = _without_needless_truncation(terms, is_made_by_solver, is_needed)
         check_truncation(terms, float(dt0))
         smallest_step = float(dt0) / 2 ** (levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):
@@ -164,7 +159,7 @@ class Problem(eqx.Module):
         check_stratonovich(terms, solver, t0_of_dtype, y0, args, all_terms=True)
         check_cells(terms, float(t0), smallest_step)
 
-        all_levels = levels_of(float(dt0), counts, levels, t0_of_dtype.dtype)
+        all_levels = levels_of(float(dt0), steps_of_dt0, levels, t0_of_dtype.dtype)
         # Solvers of other packages have no `weak_order`, and solvers of the user may not
         # state theirs: it counts as 1.
         order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
@@ -239,17 +234,17 @@ class Problem(eqx.Module):
         next_t = self.t0 + (i + 1) * h
         # Only arrays are carried from step to step. The rest of the solver's state does not
         # change: it is taken from `init`, which is traced and not run.
-        initial = eqx.filter_eval_shape(
+        initial_state = eqx.filter_eval_shape(
             self.solver.init, terms, t, next_t, y, self.args
         )
         is_struct = lambda x: isinstance(x, jax.ShapeDtypeStruct)
-        constant_part = eqx.filter(initial, is_struct, inverse=True)
-        solver_state = eqx.combine(solver_state, constant_part)
-        y, _, _, solver_state, result = self.solver.step(
-            terms, t, next_t, y, self.args, solver_state, made_jump=False
+        constant_part = eqx.filter(initial_state, is_struct, inverse=True)
+        whole_state = eqx.combine(solver_state, constant_part)
+        y, _, _, whole_state, result = self.solver.step(
+            terms, t, next_t, y, self.args, whole_state, made_jump=False
         )
         success = diffrax.is_okay(result) & all_finite(y)
-        return y, eqx.filter(solver_state, eqx.is_array), success
+        return y, eqx.filter(whole_state, eqx.is_array), success
 
     def variables(self, h: Float[Array | np.ndarray, ""]) -> StepVariables:
         """The random variables of a step of this size."""
@@ -267,8 +262,8 @@ class Problem(eqx.Module):
         ends = np.cumsum([leaf.size for leaf in leaves])
         parts = jnp.split(x, ends[:-1], axis=-1)
         axes = x.shape[:-1]
-        shaped = [part.reshape(*axes, *leaf.shape) for part, leaf in zip(parts, leaves)]
-        return treedef.unflatten(shaped)
+        arrays = [part.reshape(*axes, *leaf.shape) for part, leaf in zip(parts, leaves)]
+        return treedef.unflatten(arrays)
 
     def combinations(
         self, x: Float[Array, "levels ..."]
@@ -276,11 +271,11 @@ class Problem(eqx.Module):
         """The combinations of values on all levels, as in `level_weights`."""
         return combinations(self.weights, x)
 
-    def shaped(
+    def unravel_samples(
         self, x: Float[Array | np.ndarray, "combinations S n m"]
     ) -> PyTree[Array]:
-        """Values of samples in the structure of `phi`, with the axis of samples before that
-        of times, if there is one."""
+        """Values of samples in the structure of `phi`, with axes for combinations, samples
+        and times in front; without the axis of times if the mean is at `t1` only."""
         if self.at_end:
             return self.unravel(x[:, 0])
         # (combinations, n, S, m)
@@ -290,9 +285,10 @@ class Problem(eqx.Module):
     def sample_struct(self) -> PyTree[jax.ShapeDtypeStruct]:
         """The shapes and dtypes of the values of one sample, for all combinations of
         levels."""
-        num_times, m = self.num_outputs
+        num_times, m = self.output_shape
+        # (combinations, S, n, m) for a single sample.
         x = np.zeros((len(self.weights), num_times, 1, m), self.dtype_of_values)
-        one_sample = jax.eval_shape(lambda: self.shaped(x))
+        one_sample = jax.eval_shape(lambda: self.unravel_samples(x))
 
         def without_samples(struct: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
             num_combinations, _, *other_axes = struct.shape
@@ -302,7 +298,7 @@ class Problem(eqx.Module):
         return jtu.tree_map(without_samples, one_sample)
 
     @property
-    def bounded(self) -> bool:
+    def has_bounded_increments(self) -> bool:
         """Whether the increments of all paths are known to be bounded."""
         return all(has_bounded_increments(path) for path in brownian_paths(self.terms))
 
@@ -317,10 +313,25 @@ class Problem(eqx.Module):
         return jnp.result_type(*jtu.tree_leaves(self.y0))
 
     @property
-    def num_outputs(self) -> tuple[int, int]:
-        """The number of times at which to average, and of components of `phi`."""
+    def output_shape(self) -> tuple[int, int]:
+        """The number `S` of times at which to average, and `m` of components of `phi`."""
         m = jax.eval_shape(lambda: self.values(self.t0, self.y0)).size
         return self.levels.saved_steps.shape[1], m
+
+
+def _without_needless_truncation(
+    terms: PyTree[diffrax.AbstractTerm],
+    is_made_by_solver: Sequence[bool],
+    is_needed: Sequence[bool],
+) -> PyTree[diffrax.AbstractTerm]:
+    """The terms without truncation in those paths that a solver makes and that need none. A
+    solver makes a path without knowing what it drives, and truncates its increments to be
+    safe. Paths of the user are kept as they are."""
+    is_needless = [
+        is_made and not needs_truncation
+        for is_made, needs_truncation in zip(is_made_by_solver, is_needed)
+    ]
+    return without_truncation(terms, is_needless)
 
 
 def advice_on_failures(bounded: bool) -> str:

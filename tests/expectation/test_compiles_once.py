@@ -115,5 +115,5 @@ def test_xla_does_not_know_the_result_before_a_step_of_a_fit():
         1,
     )
     noise = Noise.of(problem, problem.level(0))
-    program = jax.jit(lambda y: noise.fresh(0, y)).lower(y0).as_text()
+    program = jax.jit(lambda y: noise.new_solver_state(0, y)).lower(y0).as_text()
     assert "optimization_barrier" in program

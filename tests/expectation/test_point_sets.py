@@ -14,9 +14,10 @@ from diffrax_symplectic._expectation.sorted.hilbert import (
     hilbert_order,
 )
 from diffrax_symplectic._expectation.sorted.points import (
+    balanced_in_sixths,
     nested_scramble,
     num_seeds,
-    randomized,
+    scrambled,
     sobol_points,
 )
 
@@ -25,7 +26,7 @@ def test_points_are_a_digital_net_after_scrambling():
     n, d = 256, 2
     seeds = jr.bits(jr.key(0), (50, num_seeds(d)), jnp.uint32)
     points = jnp.asarray(sobol_points(n, d))
-    words = np.asarray(jax.jit(jax.vmap(lambda s: randomized(points, s)))(seeds))
+    words = np.asarray(jax.jit(jax.vmap(lambda s: scrambled(points, s)))(seeds))
     for k in range(1, 9):
         # 2^k consecutive points, and 2^k intervals for each coordinate.
         cells = (words >> np.uint32(32 - k)).reshape(50, -1, 2**k, d)
@@ -41,7 +42,7 @@ def test_one_three_point_variable_is_balanced_among_any_six():
     n = 256
     seeds = jr.bits(jr.key(0), (4000, num_seeds(1)), jnp.uint32)
     points = jnp.asarray(sobol_points(n, 1))
-    sixths = jax.jit(jax.vmap(lambda s: randomized(points, s, sixths=True)))
+    sixths = jax.jit(jax.vmap(lambda s: balanced_in_sixths(points, s)))
     words = np.asarray(sixths(seeds))[..., 0].astype(np.int64)
     signs = (words >= 2**32 - 2**32 // 6).astype(int) - (words < 2**32 // 6)
     for sign in (-1, 1):

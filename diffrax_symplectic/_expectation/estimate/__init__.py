@@ -14,5 +14,5 @@ from .estimate import (
     Expectation,
     ExpectationInterrupted,
 )
-from .moments import joined, Moments, total
-from .tolerance import is_reached, is_stuck, largest_error, needs_level, share_of
+from .moments import combined_in_halves, Moments, total
+from .tolerance import is_reached, is_stuck, largest_error, needs_level, share_of_needed

@@ -1,6 +1,5 @@
 """Means, standard errors and what else follows from the moments of samples."""
 
-import functools as ft
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -72,7 +71,7 @@ def results_of(
     """The results for one combination of levels.
 
     Each array of `moments.mean` has the shape `(combinations, ...)`, where the dots are the
-    axes of one component of the mean; so has each array of `tails`. `rounding_floor`
+    axes of one array of the mean; so has each array of `tails`. `rounding_floor`
     and `tails` are those of `Expectation`.
     """
     treedef = jtu.tree_structure(moments.mean.value)
@@ -80,8 +79,8 @@ def results_of(
     # zero add nothing to the standard errors.
     if tails is None:
         tails = jtu.tree_map(np.zeros_like, moments.mean.value)
-    # The moments of each array of `phi`.
-    moments_of_arrays = zip(
+    moments_of_arrays = map(
+        _ArrayMoments,
         _split_by_array(moments.mean),
         _split_by_array(moments.norm),
         _split_by_array(moments.largest),
@@ -89,7 +88,7 @@ def results_of(
         jtu.tree_leaves(tails),
     )
     results_of_arrays = [
-        _results_of_array(moments.num_good, rounding_floor, *of_array)
+        _results_of_array(moments.num_good, rounding_floor, of_array)
         for of_array in moments_of_arrays
     ]
     # The transpose: the arrays of each field, at this combination, which make a PyTree.
@@ -100,6 +99,22 @@ def results_of(
     return Results(*trees)
 
 
+class _ArrayMoments(NamedTuple):
+    """The moments of one array of `phi`, for each combination of levels.
+
+    - `mean`, `norm`, `largest`: as in `Moments`.
+    - `dtype`: the dtype in which the array was computed.
+    - `tails`: the mean absolute deviation in the tails, as paths with wider noise estimate
+        it.
+    """
+
+    mean: Averaged
+    norm: Averaged
+    largest: Averaged
+    dtype: str
+    tails: Float[np.ndarray, "combinations ..."]
+
+
 def _split_by_array(averaged: Averaged) -> list[Averaged]:
     """What is averaged of each array of `phi`."""
     fields = averaged.fields
@@ -108,58 +123,65 @@ def _split_by_array(averaged: Averaged) -> list[Averaged]:
 
 
 @np.errstate(all="ignore")
-def _results_of_array(
-    n: int,
-    rounding_floor: int,
-    mean: Averaged,
-    norm: Averaged,
-    largest: Averaged,
-    dtype: str,
-    tails: Float[np.ndarray, "combinations ..."],
-) -> Results:
+def _results_of_array(n: int, rounding_floor: int, moments: _ArrayMoments) -> Results:
     """The results for an array of `phi` and each combination of levels, from its moments
-    over `n` samples. `tails` is the mean absolute deviation in the tails, as paths with
-    wider noise estimate it."""
+    over `n` samples."""
+    mean = moments.mean
     plain_mean = mean.without_control
     # The best combination comes first. All others are differences of values of its size.
     size = np.fmax(np.abs(mean.value[:1]), np.abs(plain_mean[:1]))
-    rounding = rounding_floor * float(jnp.finfo(dtype).eps) * size
-    spread_of = ft.partial(_spread_of, n, rounding)
-
-    value = spread_of(norm.value, largest.value, mean.heaviness)
+    rounding = rounding_floor * float(jnp.finfo(moments.dtype).eps) * size
+    value_spread = _spread_of(
+        n, rounding, moments.norm.value, moments.largest.value, mean.heaviness
+    )
+    largest_of_paths = mean.largest
+    if largest_of_paths is None:
+        largest_of_paths = moments.largest.without_control
     results = Results(
         mean=mean.value,
-        std_error=value.std_error,
-        plain_std_error=value.std_error,
-        variance=value.s**2,
-        heaviness=value.r,
+        std_error=value_spread.std_error,
+        plain_std_error=value_spread.std_error,
+        variance=value_spread.s**2,
+        heaviness=value_spread.r,
         dropped=np.zeros(plain_mean.shape, bool),
-        spread=largest.without_control if mean.largest is None else mean.largest,
+        spread=largest_of_paths,
     )
     if mean.control is not None:
-        control = spread_of(norm.control, largest.control)
-        allowed = np.fmax(_SURE_OF_CONTROL * control.std_error, ROUNDING * rounding)
-        is_kept = np.abs(mean.control) <= allowed
-        is_kept |= control.r > _HEAVY_CONTROL
-        is_kept &= np.isfinite(mean.value)
-        # A control variate is kept for all combinations of levels or for none.
-        dropped = np.broadcast_to(~np.all(is_kept, axis=0), plain_mean.shape)
-        # Tails that the samples show are in their variance already. (NaN, from a trial
-        # without a value, is ignored.)
-        unseen_tails = np.where(tails > mean.tails, tails - mean.tails, 0)
-        std_error = np.hypot(value.std_error, unseen_tails)
-        plain = spread_of(norm.plain, largest.plain)
-        results = results._replace(
-            mean=np.where(dropped, plain_mean, mean.value),
-            std_error=np.where(dropped, plain.std_error, std_error),
-            plain_std_error=plain.std_error,
-            variance=np.where(dropped, plain.s, value.s) ** 2,
-            heaviness=np.where(dropped, plain.r, value.r),
-            dropped=dropped,
-        )
+        results = _results_with_control(results, n, rounding, moments)
     if n == 0:
         return results._replace(mean=np.full_like(plain_mean, np.nan))
     return results
+
+
+def _results_with_control(
+    results: Results, n: int, rounding: np.ndarray, moments: _ArrayMoments
+) -> Results:
+    """The results for values with a control variate, without it where it is dropped, and
+    with an allowance for tails that no sample shows."""
+    mean = moments.mean
+    control_spread = _spread_of(
+        n, rounding, moments.norm.control, moments.largest.control
+    )
+    plain_spread = _spread_of(n, rounding, moments.norm.plain, moments.largest.plain)
+    allowed = np.fmax(_SURE_OF_CONTROL * control_spread.std_error, ROUNDING * rounding)
+    is_kept = np.abs(mean.control) <= allowed
+    is_kept |= control_spread.r > _HEAVY_CONTROL
+    is_kept &= np.isfinite(mean.value)
+    # A control variate is kept for all combinations of levels or for none.
+    dropped = np.broadcast_to(~np.all(is_kept, axis=0), mean.plain.shape)
+    # Tails that the samples show are in their variance already. (NaN, from a trial without
+    # a value, is ignored.)
+    has_unseen_tails = moments.tails > mean.tails
+    unseen_tails = np.where(has_unseen_tails, moments.tails - mean.tails, 0)
+    std_error = np.hypot(results.std_error, unseen_tails)
+    return results._replace(
+        mean=np.where(dropped, mean.plain, mean.value),
+        std_error=np.where(dropped, plain_spread.std_error, std_error),
+        plain_std_error=plain_spread.std_error,
+        variance=np.where(dropped, plain_spread.s**2, results.variance),
+        heaviness=np.where(dropped, plain_spread.r, results.heaviness),
+        dropped=dropped,
+    )
 
 
 class _Spread(NamedTuple):
@@ -201,9 +223,9 @@ def is_off_order(last: Any, miss: Any, miss_error: Any) -> np.ndarray:
     """Whether the `last` change by a smaller step does not fit the order of the solver.
     `miss` is this change minus what the order foretells from the change before, and
     `miss_error` its standard error."""
-    foretold = last - miss
-    # Where `foretold` is negative, the largest ratio gives the lower end.
-    ends = np.stack([_LEAST_RATIO * foretold, _LARGEST_RATIO * foretold])
+    prediction = last - miss
+    # Where the prediction is negative, the largest ratio gives the lower end.
+    ends = np.stack([_LEAST_RATIO * prediction, _LARGEST_RATIO * prediction])
     allowance = _ERRORS_BY_CHANCE * miss_error
     low = np.min(ends, axis=0) - allowance
     high = np.max(ends, axis=0) + allowance

@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 
 from ..._simulation import Combination
 from .error_bars import is_off_order, remaining_error, Results, results_of
-from .moments import joined, Moments, total
+from .moments import combined_in_halves, Moments, total
 from .saved import arrays_of, fields_from, header_of
 
 
@@ -240,7 +240,9 @@ class Expectation(eqx.Module):
                     f"Samples {after.begin:,} to {last_in_both:,} are in two "
                     "of the estimates to merge. Pass a different `first` for each part."
                 )
-        return dataclasses.replace(self, moments=joined(parts), tol_reached=None)
+        return dataclasses.replace(
+            self, moments=combined_in_halves(parts), tol_reached=None
+        )
 
     def save(self, file: str | Path | BinaryIO) -> None:
         """Writes the estimate to a NumPy `.npz` file, which `Expectation.load` reads.
@@ -325,7 +327,7 @@ def combined_results(estimate: Expectation, combination: Combination) -> Results
 
 def check_same(one: Expectation, other: Expectation, name: str) -> None:
     """Raises a `ValueError` if the estimates have different keys, shapes or numbers of
-    paths in a sample."""
+    paths in a sample. `name` is what messages call one of them, such as "`start`"."""
     if not np.array_equal(one.key_data, other.key_data):
         raise ValueError(
             f"{name} has another `key`. Pass the same `key` for all parts of an "

@@ -37,22 +37,26 @@ class Moments(NamedTuple):
     dtypes: PyTree[str]
 
 
-def joined(parts: Iterable[Moments]) -> tuple[Moments, ...]:
-    """The moments in order, with neighbours combined in the way a binary counter carries.
-    The result depends on the batches but not on the order of their arrival, and only a few
-    entries remain."""
-    joined_parts: list[Moments] = []
+def combined_in_halves(parts: Iterable[Moments]) -> tuple[Moments, ...]:
+    """The moments of the same samples in fewer parts: two neighbours that are halves of one
+    range become one, again and again, in the way a binary counter carries. `parts` are in
+    the order of their samples.
+
+    The result is the same if some of the parts were combined before, so it does not depend
+    on the order in which batches are computed, and only a few parts remain.
+    """
+    combined_parts: list[Moments] = []
     for part in parts:
-        joined_parts.append(part)
-        while len(joined_parts) > 1 and _are_halves(joined_parts[-2], joined_parts[-1]):
-            last = joined_parts.pop()
-            before = joined_parts.pop()
-            joined_parts.append(_moments_of_both(before, last))
-    return tuple(joined_parts)
+        combined_parts.append(part)
+        while len(combined_parts) > 1 and _are_halves(*combined_parts[-2:]):
+            second_half = combined_parts.pop()
+            first_half = combined_parts.pop()
+            combined_parts.append(_moments_of_both(first_half, second_half))
+    return tuple(combined_parts)
 
 
 def total(parts: tuple[Moments, ...]) -> Moments:
-    """The moments of all samples."""
+    """The moments of all samples of one part or more."""
     whole, *rest = parts
     for part in rest:
         whole = _moments_of_both(whole, part)
@@ -61,8 +65,8 @@ def total(parts: tuple[Moments, ...]) -> Moments:
 
 def _are_halves(a: Moments, b: Moments) -> bool:
     """Whether `a` and then `b` are the halves of a range that begins at a multiple of its
-    length, as samples 8 to 11 and 12 to 15 are. (Without samples `a` joins any part that
-    follows it.)"""
+    length, as samples 8 to 11 and 12 to 15 are. (If `a` has no samples, it counts as such a
+    half with any part that follows it.)"""
     length = a.end - a.begin
     if a.end != b.begin:
         return False
@@ -83,7 +87,7 @@ def _moments_of_both(a: Moments, b: Moments) -> Moments:
     difference = jtu.tree_map(np.subtract, b.mean, a.mean)
 
     def mean(of_a, of_b, difference):
-        # Without samples `a` has no mean.
+        # The mean of no samples is a placeholder.
         return of_b if a.num_good == 0 else of_a + difference * share_of_b
 
     def norm(of_a, of_b, difference):

@@ -11,9 +11,10 @@ from ..sampling import Averaged, SAVED_SAMPLINGS
 from .moments import Moments
 
 
-# The fields of `Moments` that are an `Averaged`, and those that are counts.
+# The fields of `Moments` that are an `Averaged`, and those that are numbers (of samples or
+# of paths) or tuples of them.
 _AVERAGED = ("mean", "norm", "largest", "size")
-_COUNTS = ("begin", "end", "num_good", "num_failed", "failed_on")
+_NUMBERS = ("begin", "end", "num_good", "num_failed", "failed_on")
 # The fields of an estimate that JSON takes as they are.
 _PLAIN_FIELDS = ("paths_per_sample", "rounding_floor", "reason", "tol_reached")
 
@@ -23,16 +24,19 @@ def header_of(estimate: Any) -> dict[str, Any]:
     nodes that JSON cannot express."""
     # All batches have the same structure.
     batch, *_ = estimate.moments
-    ranges = [[getattr(x, name) for name in _COUNTS] for x in estimate.moments]
+    numbers_of_batches = [
+        [getattr(moments, name) for name in _NUMBERS] for moments in estimate.moments
+    ]
     sampling = estimate.sampling
     sampling_fields = {} if sampling is None else vars(sampling)
     # A function, such as `sort_by`, is left out.
     plain_fields = {
-        name: _plain(x) for name, x in sampling_fields.items() if _is_plain(x)
+        name: _number_for_json(x) for name, x in sampling_fields.items() if _is_plain(x)
     }
+    # The names here are those of the files.
     header = {
-        "ranges": ranges,
-        "structure": _structure(batch.mean.value),
+        "ranges": numbers_of_batches,
+        "structure": _structure_as_json(batch.mean.value),
         "averaged": list(batch.mean.fields),
         "dtypes": jtu.tree_leaves(batch.dtypes),
         "sampling": None if sampling is None else type(sampling).__name__,
@@ -82,25 +86,18 @@ def fields_from(
         trees = {field: tree(_name_of_tree(name, field, batch)) for field in fields}
         return Averaged(**trees)
 
-    def moments(batch: int, counts: list[Any]) -> Moments:
+    def moments_of_batch(batch: int, values: list[Any]) -> Moments:
+        numbers: Any = dict(zip(_NUMBERS, values))
+        # JSON has lists only.
+        numbers["failed_on"] = tuple(numbers["failed_on"])
         trees: Any = {name: averaged(name, batch) for name in _AVERAGED}
         dtypes = _tree_of(structure, iter(header["dtypes"]))
-        begin, end, num_good, num_failed, failed_on = counts
-        return Moments(
-            begin=begin,
-            end=end,
-            num_good=num_good,
-            num_failed=num_failed,
-            failed_on=tuple(failed_on),
-            **trees,
-            dtypes=dtypes,
-        )
+        return Moments(**numbers, **trees, dtypes=dtypes)
 
-    ranges = enumerate(header["ranges"])
-    batches = tuple(moments(batch, counts) for batch, counts in ranges)
+    moments = [moments_of_batch(*of_batch) for of_batch in enumerate(header["ranges"])]
     fields = {name: header[name] for name in _PLAIN_FIELDS}
     return fields | {
-        "moments": batches,
+        "moments": tuple(moments),
         "key_data": arrays["key_data"],
         "sampling": _sampling_from(header),
         "tails": tree("tails") if header["tails"] else None,
@@ -121,22 +118,25 @@ def _sampling_from(header: dict[str, Any]) -> Any:
 
 
 def _is_plain(x: Any) -> bool:
+    """Whether JSON takes this value, from `_number_for_json`."""
     return x is None or isinstance(x, int | float | str | np.integer)
 
 
-def _plain(x: Any) -> Any:
-    """JSON takes integers of Python only."""
+def _number_for_json(x: Any) -> Any:
+    """The value, as an integer of Python if it is one of NumPy."""
     return int(x) if isinstance(x, np.integer) else x
 
 
-def _structure(tree: Any) -> Any:
-    """A PyTree of arrays as nested dictionaries of one entry each: the kind of a node, and
-    what it holds. For example `{"list": [{"array": 0}, {"none": 0}]}` for `[x, None]`."""
+def _structure_as_json(tree: Any) -> Any:
+    """The structure of a PyTree of arrays, for JSON. Each node is a dictionary from its
+    kind to its contents: `{"list": [{"array": 0}, {"none": 0}]}` for `[x, None]`. The
+    contents of an array or of `None` are a zero without a meaning."""
     if type(tree) is dict and all(type(name) is str for name in tree):
         # Keys are sorted, as JAX sorts them when it takes the leaves.
-        return {"dict": {name: _structure(tree[name]) for name in sorted(tree)}}
+        children = {name: _structure_as_json(tree[name]) for name in sorted(tree)}
+        return {"dict": children}
     if type(tree) in (list, tuple):
-        return {type(tree).__name__: [_structure(inner) for inner in tree]}
+        return {type(tree).__name__: [_structure_as_json(child) for child in tree]}
     if tree is None:
         return {"none": 0}
     if isinstance(tree, np.ndarray | np.generic):
@@ -148,14 +148,14 @@ def _structure(tree: Any) -> Any:
 
 
 def _tree_of(structure: Any, leaves: Iterator[Any]) -> Any:
-    """The PyTree with this structure, from `_structure`, and these leaves."""
+    """The PyTree with this structure, from `_structure_as_json`, and these leaves."""
     # A node has a single entry.
-    ((kind, inner),) = structure.items()
+    ((kind, contents),) = structure.items()
     if kind == "dict":
-        return {name: _tree_of(node, leaves) for name, node in inner.items()}
+        return {name: _tree_of(child, leaves) for name, child in contents.items()}
     if kind == "none":
         return None
     if kind == "array":
         return next(leaves)
-    nodes = [_tree_of(node, leaves) for node in inner]
-    return nodes if kind == "list" else tuple(nodes)
+    children = [_tree_of(child, leaves) for child in contents]
+    return children if kind == "list" else tuple(children)

@@ -19,17 +19,17 @@ _ERRORS_BY_CHANCE = 2
 
 def is_reached(estimate: Expectation, tol: float) -> bool:
     """Whether the whole error of each mean is small enough, and can be trusted."""
-    return _all_within(estimate.error, tol) and not is_any(estimate.off_order)
+    return _all_within(estimate.error, tol) and not is_any_true(estimate.off_order)
 
 
 def is_stuck(estimate: Expectation, tol: float) -> bool:
     """Whether more samples would not reach the tolerance."""
-    if is_any(estimate.off_order) or _is_step_beyond(estimate, tol):
+    if is_any_true(estimate.off_order) or _is_discretization_beyond(estimate, tol):
         return True
     # If the standard error is small, the rest of the error comes from the step or from
     # failed paths.
-    is_sampled = _all_within(estimate.std_error, _SHARE_OF_SAMPLING * tol)
-    return is_sampled and not _all_within(estimate.error, tol)
+    has_enough_samples = _all_within(estimate.std_error, _SHARE_OF_SAMPLING * tol)
+    return has_enough_samples and not _all_within(estimate.error, tol)
 
 
 def needs_level(estimate: Expectation, tol: float) -> bool:
@@ -39,7 +39,7 @@ def needs_level(estimate: Expectation, tol: float) -> bool:
     return _all_within(estimate.failed_error, tol)
 
 
-def share_of(estimate: Expectation, tol: float | None) -> float:
+def share_of_needed(estimate: Expectation, tol: float | None) -> float:
     """The estimated share of the samples needed that has been taken."""
     if tol is None or estimate.num_samples < 2:
         return 0.0
@@ -51,7 +51,7 @@ def share_of(estimate: Expectation, tol: float | None) -> float:
 def shortfall(estimate: Expectation, tol: float) -> str:
     """Which part of the error exceeds the tolerance, and what it would take: for messages,
     one or two sentences without their first capital and their last full stop."""
-    if is_any(estimate.off_order):
+    if is_any_true(estimate.off_order):
         return (
             "the changes from step to step do not fit the order of the solver, so the "
             "error is not known. Pass a smaller `dt0`"
@@ -77,7 +77,8 @@ def shortfall(estimate: Expectation, tol: float) -> str:
     )
 
 
-def is_any(tree: PyTree[np.ndarray] | None) -> bool:
+def is_any_true(tree: PyTree[np.ndarray] | None) -> bool:
+    """Whether any entry of the masks in a PyTree is true."""
     return any(bool(np.any(leaf)) for leaf in jtu.tree_leaves(tree))
 
 
@@ -91,7 +92,7 @@ def _all_within(errors: PyTree[np.ndarray | np.floating], tol: float) -> bool:
     return all(bool(np.all(error <= tol)) for error in jtu.tree_leaves(errors))
 
 
-def _is_step_beyond(estimate: Expectation, tol: float) -> bool:
+def _is_discretization_beyond(estimate: Expectation, tol: float) -> bool:
     """Whether the discretization error alone exceeds the tolerance, beyond its noise."""
     if estimate.levels == 1:
         return False
@@ -101,5 +102,5 @@ def _is_step_beyond(estimate: Expectation, tol: float) -> bool:
 
     # The discretization error is the change by the last extrapolation.
     noise = combined_results(estimate, Combination.EXTRAPOLATION).std_error
-    each = jtu.tree_map(is_beyond, estimate.discretization_error, noise)
-    return any(jtu.tree_leaves(each))
+    is_any_beyond = jtu.tree_map(is_beyond, estimate.discretization_error, noise)
+    return any(jtu.tree_leaves(is_any_beyond))

@@ -25,11 +25,11 @@ _FEWEST_PILOTS = 256
 # The pilot's states are perturbed by this fraction of their standard deviations: after the
 # first steps the paths are in only a few different states. Four times as much made the
 # standard errors of that system, and of a pendulum by degree 4, 2 to 5 times larger.
-_MOVE = 0.2
+_PERTURBATION = 0.2
 # Lower bound of the standard deviations along the axes of the covariance, as a fraction of
 # the largest. Along shorter axes the points do not determine a fit. For both systems 0.001
 # to 0.3 left the same standard errors.
-_FLOOR = 0.1
+_LEAST_DEVIATION = 0.1
 # The most and the fewest states of the pilot over which derivatives are averaged. In `d`
 # dimensions there are `2**13 / d` of them between these bounds, since a Hessian needs `d`
 # gradients.
@@ -51,7 +51,7 @@ class CovarianceFrame(eqx.Module):
     to_coordinates: Float[Array, "d d"]
     to_states: Float[Array, "d d"]
 
-    def at(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
+    def coordinates(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The coordinates of states."""
         return dot(y - self.mean, self.to_coordinates.T)
 
@@ -72,7 +72,7 @@ class CovarianceFrame(eqx.Module):
         covariance = (scaled.T * weights) @ scaled
         # The variances along the axes are in ascending order.
         variances, axes = jnp.linalg.eigh(covariance)
-        least_variance = _FLOOR**2 * variances[-1]
+        least_variance = _LEAST_DEVIATION**2 * variances[-1]
         # This keeps the matrices finite where nothing moves at all.
         tiny = jnp.finfo(points.dtype).eps ** 2
         deviations = jnp.sqrt(jnp.maximum(variances, least_variance) + tiny)
@@ -84,9 +84,9 @@ class CovarianceFrame(eqx.Module):
 
     def perturbed(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
         """The states, perturbed at random."""
-        # The moves are the same in all steps, since drawing from keys would take long to
-        # compile.
-        z = np.random.default_rng(0).normal(0, _MOVE, states.shape)
+        # The perturbations are the same in all steps, since drawing from keys would take
+        # long to compile.
+        z = np.random.default_rng(0).normal(0, _PERTURBATION, states.shape)
         return states + dot(jnp.asarray(z, states.dtype), self.to_states.T)
 
 
@@ -194,7 +194,7 @@ class Hermite(AbstractBasis):
         # (n, C, S * m)
         flat_values = values.reshape(*values.shape[:2], -1)
         # Rows of zeros have no part in a fit.
-        is_used = good & _finite_rows(B) & _finite_rows(flat_values)
+        is_used = good & _is_finite_row(B) & _is_finite_row(flat_values)
         B = jnp.where(is_used[:, None], B, 0)
         flat_values = jnp.where(is_used[:, None, None], flat_values, 0)
         sizes = [num_polynomials(self.d, degree) for degree in self.candidates]
@@ -206,16 +206,16 @@ class Hermite(AbstractBasis):
     ) -> Float[Array, "n size"]:
         """The values of all polynomials at points."""
         at_point = lambda z: jnp.stack(hermite(z, max(self.candidates)))
-        return jax.vmap(at_point)(frame.at(points))
+        return jax.vmap(at_point)(frame.coordinates(points))
 
     def value_at(self, frame, y, c):
         # As a sum of products this compiles to one loop without temporary arrays.
-        polynomials = hermite(frame.at(y), max(self.candidates))
+        polynomials = hermite(frame.coordinates(y), max(self.candidates))
         terms = [value * coefficient for value, coefficient in zip(polynomials, c)]
         return ft.reduce(jnp.add, terms)
 
 
-def _finite_rows(x: Float[Array, "n ..."]) -> Bool[Array, " n"]:
+def _is_finite_row(x: Float[Array, "n ..."]) -> Bool[Array, " n"]:
     return jnp.isfinite(x).reshape(len(x), -1).all(axis=1)
 
 
@@ -257,26 +257,30 @@ class Quadratic(AbstractBasis):
 
     def coefficients(self, target, frame, states, good, keys):
         def derivatives(key_and_state):
+            """The first and second derivatives at a state, in units of the frame."""
             key, y = key_and_state
-            target_at = lambda z: target(y + frame.unit * z, key)
+
+            def target_from_state(z):
+                return target(y + frame.unit * z, key)
 
             def gradient_twice(z):
-                gradient = jax.jacrev(target_at)(z)
+                gradient = jax.jacrev(target_from_state)(z)
                 return gradient, gradient
 
             # The gradient comes along with its derivative, without another evaluation.
             hessian_and_gradient = jax.jacfwd(gradient_twice, has_aux=True)
             # (C, S, m, d, d) and (C, S, m, d)
-            second, first = hessian_and_gradient(jnp.zeros_like(y))
-            second = second.reshape(*first.shape[:-1], -1)
+            hessian, gradient = hessian_and_gradient(jnp.zeros_like(y))
+            flat_hessian = hessian.reshape(*gradient.shape[:-1], -1)
             # (d + d**2, C, S, m)
-            return jnp.moveaxis(jnp.concatenate([first, second], -1), -1, 0)
+            return jnp.moveaxis(jnp.concatenate([gradient, flat_hessian], -1), -1, 0)
 
         # One path after another, since a Hessian needs the memory of `d` gradients.
         of_paths = lax.map(derivatives, (keys, states))
         weights = equal_weights(good, of_paths.dtype)
         mean = tensordot(weights, jnp.where(jnp.isfinite(of_paths), of_paths, 0), 1)
-        # A candidate of degree 1 has no second derivatives.
+        # A candidate of degree 1 has no second derivatives. Orders and degrees are arrays
+        # of shape (d + d**2, 1, 1, 1) and (C, 1, 1).
         order = np.repeat([1, 2], [self.d, self.d**2])[:, None, None, None]
         degrees = np.array(self.candidates)[:, None, None]
         return jnp.where(order <= degrees, mean, 0)
@@ -284,8 +288,8 @@ class Quadratic(AbstractBasis):
     def value_at(self, frame, y, c):
         z = (y - frame.mean) * inverse_or_zero(frame.unit)
         d = len(y)
-        first = c[:d]
-        second = c[d:].reshape(d, d, *c.shape[1:])
+        gradient = c[:d]
+        hessian = c[d:].reshape(d, d, *c.shape[1:])
         # The Taylor polynomial without its constant, which has no part in a control
         # variate.
-        return tensordot(z, first + tensordot(z, second, 1) / 2, 1)
+        return tensordot(z, gradient + tensordot(z, hessian, 1) / 2, 1)

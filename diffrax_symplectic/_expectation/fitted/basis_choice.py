@@ -50,14 +50,14 @@ class ChosenBasis(NamedTuple):
     num_entries: int
 
 
-def chosen_basis(p: Problem, degree: int | None) -> ChosenBasis:
+def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
     """The basis for polynomials of this degree, or for `None` a grid or polynomials of
     several degrees to try. Raises a `ValueError` if the fit needs too much memory, or for
     random variables without finitely many outcomes."""
-    _, weights = Noise.of(p, p.level(0)).nodes()
-    num_nodes = len(weights)
-    total_steps = int(np.sum(p.levels.num_steps))
-    basis = _basis(p, degree, num_nodes, total_steps)
+    noise = Noise.of(problem, problem.level(0))
+    num_nodes = len(noise.weighted_nodes().weights)
+    total_steps = int(np.sum(problem.levels.num_steps))
+    basis = _basis(problem, degree, num_nodes, total_steps)
     num_states = basis.num_sites * num_nodes
     return ChosenBasis(basis, num_states, num_states * total_steps * basis.d)
 
@@ -74,27 +74,29 @@ def warn_of_long_fit(chosen: ChosenBasis, stacklevel: int) -> None:
 
 
 def _basis(
-    p: Problem, degree: int | None, num_nodes: int, total_steps: int
+    problem: Problem, degree: int | None, num_nodes: int, total_steps: int
 ) -> AbstractBasis:
     """The basis for a noise with so many nodes in a step, and so many steps on all levels
     together."""
-    d = sum(leaf.size for leaf in jtu.tree_leaves(p.y0))
+    d = sum(leaf.size for leaf in jtu.tree_leaves(problem.y0))
     if degree is None:
-        grid = _finest_grid(p, d, num_nodes, total_steps)
+        grid = _finest_grid(problem, d, num_nodes, total_steps)
         if grid is not None:
             return grid
-        degrees = _degrees(d, num_nodes, total_steps)
+        degrees = _candidate_degrees(d, num_nodes, total_steps)
     else:
         degrees = (whole_number("degree", degree, 0),)
     # Averaged derivatives cost less than a fit to many polynomials.
     if _has_many_of_degree_two(d) and max(degrees) <= 2:
         return Quadratic(d, degrees)
     basis = Hermite(d, degrees)
-    _check_memory(p, basis)
+    _check_memory(problem, basis)
     return basis
 
 
-def _finest_grid(p: Problem, d: int, num_nodes: int, total_steps: int) -> Grid | None:
+def _finest_grid(
+    problem: Problem, d: int, num_nodes: int, total_steps: int
+) -> Grid | None:
     """The finest grid that memory and time allow; `None` if there is none, or in many
     dimensions."""
     if d > MOST_DIMENSIONS_OF_GRID:
@@ -102,16 +104,16 @@ def _finest_grid(p: Problem, d: int, num_nodes: int, total_steps: int) -> Grid |
     for size in _SIZES_OF_GRID:
         grid = Grid(d, (size,))
         # The loop over steps backward holds the coefficients twice.
-        memory = 2 * p.dtype.itemsize * grid.size * _num_functions(p)
+        memory = 2 * problem.dtype.itemsize * grid.size * _num_functions(problem)
         num_ends = size**d * num_nodes
-        is_quick = num_ends <= _MOST_ENDS_OF_STEP
-        is_quick &= num_ends * total_steps <= _MOST_ENDS
-        if memory <= _MOST_MEMORY and is_quick:
+        fits_into_step = num_ends <= _MOST_ENDS_OF_STEP
+        is_quick = num_ends * total_steps <= _MOST_ENDS
+        if memory <= _MOST_MEMORY and fits_into_step and is_quick:
             return grid
     return None
 
 
-def _degrees(d: int, num_nodes: int, total_steps: int) -> tuple[int, ...]:
+def _candidate_degrees(d: int, num_nodes: int, total_steps: int) -> tuple[int, ...]:
     """The degrees to try: the highest that has few polynomials and does not take too long,
     and all even degrees below it."""
     if _has_many_of_degree_two(d):
@@ -120,6 +122,7 @@ def _degrees(d: int, num_nodes: int, total_steps: int) -> tuple[int, ...]:
     def is_allowed(degree: int) -> bool:
         if num_polynomials(d, degree) > _MOST_POLYNOMIALS:
             return False
+        # The ends of all steps from all points of the fit.
         num_ends = Hermite(d, (degree,)).num_sites * num_nodes * total_steps
         return degree <= _LEAST_DEGREE_TRIED or num_ends <= _MOST_ENDS
 
@@ -129,20 +132,23 @@ def _degrees(d: int, num_nodes: int, total_steps: int) -> tuple[int, ...]:
 
 
 def _has_many_of_degree_two(d: int) -> bool:
+    """Whether there are too many polynomials of degree 2 for a fit by least squares."""
     return num_polynomials(d, 2) > _MOST_POLYNOMIALS
 
 
-def _num_functions(p: Problem) -> int:
+def _num_functions(problem: Problem) -> int:
     """The number of functions in a fit: for all levels, steps, times and components."""
-    return len(p.levels.h) * p.finest_steps * math.prod(p.num_outputs)
+    return (
+        len(problem.levels.h) * problem.finest_steps * math.prod(problem.output_shape)
+    )
 
 
-def _check_memory(p: Problem, basis: Hermite) -> None:
+def _check_memory(problem: Problem, basis: Hermite) -> None:
     """Raises a `ValueError` if a fit needs too much memory."""
     # The fit holds the polynomials at all points of one step, and the coefficients of all
     # functions.
-    num_rows = basis.num_pilots + len(basis.candidates) * _num_functions(p)
-    memory = p.dtype.itemsize * basis.size * num_rows
+    num_rows = basis.num_pilots + len(basis.candidates) * _num_functions(problem)
+    memory = problem.dtype.itemsize * basis.size * num_rows
     if memory > _MOST_MEMORY:
         raise ValueError(
             f"`degree={max(basis.candidates)}` has {basis.size:,} polynomials in "

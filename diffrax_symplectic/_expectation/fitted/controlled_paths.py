@@ -7,11 +7,19 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Key
 
-from ..._simulation import Level, mask_like, Motion, PathStates, Problem, simulate
+from ..._simulation import (
+    Level,
+    mask_like,
+    Motion,
+    PathStates,
+    Problem,
+    simulate,
+    Simulated,
+)
 from ..sampling import Averaged, Samples
 from .fits import Choice, FittedFunctions
 from .noise import Noise
-from .tails import TrialLaw, Usual
+from .tails import TrialLaw, UsualDeviations
 
 
 class _Control(NamedTuple):
@@ -19,7 +27,7 @@ class _Control(NamedTuple):
 
     - `value`: the control variate.
     - `fitted_mean`: the mean of `phi` by the fitted functions, from the first step on.
-    - `log_ratio`: the log likelihood ratio of the path.
+    - `log_ratio`: the log likelihood ratio of the path, as from `Noise.draw`.
     """
 
     value: Float[Array, "S m"]
@@ -28,85 +36,102 @@ class _Control(NamedTuple):
 
 
 def controlled_paths(
-    p: Problem,
+    problem: Problem,
     functions: FittedFunctions,
     choice: Choice,
-    usual: Usual,
+    usual_deviations: UsualDeviations,
     law: TrialLaw,
     keys: Key[Array, " n"],
 ) -> Samples:
     """A sample is the value of a path minus its control variate, by `functions` with a
-    leading axis of levels. Deviations beyond the `usual` ones are averaged apart, which
-    paths with a wider `law` of the noise estimate."""
+    leading axis of levels. Deviations beyond the usual ones are averaged apart, which paths
+    with a wider `law` of the noise estimate."""
     functions = functions.of_candidates(choice.best)
-    starts = jax.vmap(p.draw_start)(keys)
+    starts = jax.vmap(problem.draw_start)(keys)
 
-    def begin(level: Level) -> Motion:
-        noise = Noise.of(p, level)
+    def motion_on(level: Level) -> Motion:
+        noise = Noise.of(problem, level)
         u = jtu.tree_map(lambda x: x[level.index], functions)
-        law_on_level = TrialLaw(*[x[level.index] for x in law])
+        share = law.share[level.index]
+        tilts = law.tilts[level.index]
 
         def step(i, paths):
-            second = jtu.tree_map(lambda x: x[i], u.second)
+            second_derivatives = jtu.tree_map(lambda x: x[i], u.second_derivatives)
 
             def step_of_path(y, solver_state, args, key):
-                share, tilts = law_on_level
                 x, log_ratio = noise.draw(key, i, share, tilts)
-                noise_of_path = noise.with_args(args)
-                u_after = lambda y1: u(i, y1)
-                after = noise_of_path.advance(i, y, solver_state, u_after, second, x)
-                return after, log_ratio
+                u_after_step = lambda y1: u(i, y1)
+                path_after = noise.with_args(args).advance(
+                    i, y, solver_state, u_after_step, second_derivatives, x
+                )
+                return path_after, log_ratio
 
             states = paths.y, paths.solver_state, paths.args
             after, log_ratio = jax.vmap(step_of_path)(*states, keys)
             # A failed path has no value, but its control must be finite.
-            change = jnp.where(
+            control_of_step = jnp.where(
                 mask_like(after.success, after.control), after.control, 0
             )
             before = paths.control
-            # The functions after the first step, averaged over this step.
-            fitted_mean = jnp.where(i == 0, after.value - change, before.fitted_mean)
+            # The control of a step is the value after it minus the mean over the step. So
+            # this is the mean over the first step of the functions after it.
+            fitted_mean = jnp.where(
+                i == 0, after.value - control_of_step, before.fitted_mean
+            )
             control = _Control(
-                value=before.value + jnp.where(choice.used, change, 0),
+                value=before.value + jnp.where(choice.used, control_of_step, 0),
                 fitted_mean=fitted_mean,
                 log_ratio=before.log_ratio + log_ratio,
             )
-            return paths.moved(p, after.y, after.solver_state, after.success, control)
+            return paths.after_step(
+                problem, after.y, after.solver_state, after.success, control
+            )
 
         def first_solver_state(y, args):
-            return noise.with_args(args).fresh(0, y)
+            return noise.with_args(args).new_solver_state(0, y)
 
-        dtype = jax.eval_shape(lambda: u(0, p.y0)).dtype
-        zero = jnp.zeros((len(keys), *p.num_outputs), dtype)
+        dtype = jax.eval_shape(lambda: u(0, problem.y0)).dtype
+        zero = jnp.zeros((len(keys), *problem.output_shape), dtype)
         no_control = _Control(zero, zero, jnp.zeros(len(keys), dtype))
         solver_state = jax.vmap(first_solver_state)(*starts)
-        return Motion(step, PathStates.start(p, starts, solver_state, no_control))
+        return Motion(step, PathStates.start(problem, starts, solver_state, no_control))
 
-    simulated = simulate(p, begin)
+    simulated = simulate(problem, motion_on)
+    return _samples_of(problem, choice, usual_deviations, simulated)
+
+
+def _samples_of(
+    problem: Problem,
+    choice: Choice,
+    usual_deviations: UsualDeviations,
+    simulated: Simulated,
+) -> Samples:
+    """The samples from simulated paths, whose `control` is a `_Control`."""
     # (levels, S, n, m)
     plain = simulated.saved
     # From (levels, n, S, m) to the same.
     control = jnp.swapaxes(simulated.control.value, 1, 2).astype(plain.dtype)
     fitted_mean = jnp.swapaxes(simulated.control.fitted_mean, 1, 2).astype(plain.dtype)
     # At the start itself nothing is random, and no function is fitted.
-    is_at_start = mask_like(p.levels.saved_steps[0] == 0, plain[0])
+    is_at_start = mask_like(problem.levels.saved_steps[0] == 0, plain[0])
     fitted_mean = jnp.where(is_at_start, plain, fitted_mean)
     # (combinations, S, n, m)
-    value = p.combinations(plain - control)
-    plain = p.combinations(plain)
-    control = p.combinations(control)
-    fitted_mean = p.combinations(fitted_mean)
+    value = problem.combinations(plain - control)
+    plain = problem.combinations(plain)
+    control = problem.combinations(control)
+    fitted_mean = problem.combinations(fitted_mean)
 
-    center = usual.center[:, :, None]
+    center = usual_deviations.center[:, :, None]
     mean = jnp.where(choice.used[:, None], fitted_mean, center)
     deviations = jnp.abs(value - mean)
+    # The random variables of all levels are drawn independently, so ratios are multiplied.
     log_ratio = jnp.sum(simulated.control.log_ratio, axis=0)
-    tails = usual.tails(deviations, plain, log_ratio)
+    tails = usual_deviations.deviations_beyond(deviations, plain, log_ratio)
     averaged = Averaged(
-        p.shaped(value),
-        plain=p.shaped(plain),
-        control=p.shaped(control),
-        tails=p.shaped(tails),
+        problem.unravel_samples(value),
+        plain=problem.unravel_samples(plain),
+        control=problem.unravel_samples(control),
+        tails=problem.unravel_samples(tails),
     )
     good = ~jnp.any(simulated.failed, axis=0)
     return Samples(averaged, good, num_failed=simulated.failed)

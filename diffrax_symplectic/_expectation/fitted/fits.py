@@ -43,13 +43,14 @@ class FittedFunctions(eqx.Module):
     - `frames`: the coordinates of the basis, with a leading axis of steps.
     - `coefficients`: the coefficients of the `size` functions of the basis, with axes for
         steps, `size`, `C`, `S` and `m`.
-    - `second`: second derivatives along the noise, from `Noise.second`, with axes for
-        steps, twice the random variables, `C`, `S` and `m`.
+    - `second_derivatives`: those along the noise, from `Noise.mean_second_derivatives`,
+        with axes for steps, twice the random variables, `C`, `S` and `m`; `None` if there
+        are few outcomes.
     """
 
     frames: PyTree[Array]
     coefficients: Float[Array, "..."]
-    second: Float[Array, "..."] | None
+    second_derivatives: Float[Array, "..."] | None
     basis: AbstractBasis = eqx.field(static=True)
 
     def __call__(self, i: Any, y: Y) -> Float[Array, "*C S m"]:
@@ -64,9 +65,13 @@ class FittedFunctions(eqx.Module):
             index = best.reshape(*[1] * (x.ndim - 2), *best.shape)
             return jnp.take_along_axis(x, index, -3).squeeze(-3)
 
-        coefficients = take(self.coefficients)
-        second = None if self.second is None else take(self.second)
-        return FittedFunctions(self.frames, coefficients, second, self.basis)
+        return FittedFunctions(
+            frames=self.frames,
+            coefficients=take(self.coefficients),
+            # `None` has no leaves.
+            second_derivatives=jtu.tree_map(take, self.second_derivatives),
+            basis=self.basis,
+        )
 
 
 def fit(
@@ -74,16 +79,17 @@ def fit(
 ) -> tuple[FittedFunctions, Int[Array, ""]]:
     """The functions of a level, by a pilot run forward in time and fits backward; and how
     many of the pilot's paths failed."""
-    p = noise.problem
+    problem = noise.problem
     num_steps = noise.level.num_steps
     pilot = _pilot(noise, jr.split(key, basis.num_pilots))
-    unit = _unit(p, pilot, num_steps)
+    unit = _unit(problem, pilot, num_steps)
 
     def frame_after(i: Any) -> PyTree[Array]:
         return basis.frame(pilot.states[i], pilot.good, unit)
 
-    def backward(j: Any, u: FittedFunctions) -> FittedFunctions:
-        i = num_steps - 1 - j
+    def fit_step(num_fitted: Any, u: FittedFunctions) -> FittedFunctions:
+        # The functions after later steps come first: those after a step are fitted to them.
+        i = num_steps - 1 - num_fitted
         frame = frame_after(i)
         target = _target(noise, u, i)
         c = basis.coefficients(target, frame, pilot.states[i], pilot.good, pilot.keys)
@@ -92,13 +98,24 @@ def fit(
         return FittedFunctions(frames, put_step(u.coefficients, c), None, basis)
 
     # All levels have arrays for the steps of the finest one, so that they share a program.
-    zeros = lambda struct: jnp.zeros((p.finest_steps, *struct.shape), struct.dtype)
+    def zeros(struct: jax.ShapeDtypeStruct) -> Array:
+        return jnp.zeros((problem.finest_steps, *struct.shape), struct.dtype)
+
     frames = jtu.tree_map(zeros, jax.eval_shape(lambda: frame_after(0)))
-    shape = p.finest_steps, basis.size, len(basis.candidates), *p.num_outputs
-    u = FittedFunctions(frames, jnp.zeros(shape, p.dtype), None, basis)
-    u = lax.fori_loop(0, num_steps, backward, u)
-    second = _second_derivatives(noise, pilot, u)
-    functions = FittedFunctions(u.frames, u.coefficients, second, basis)
+    shape = (
+        problem.finest_steps,
+        basis.size,
+        len(basis.candidates),
+        *problem.output_shape,
+    )
+    u = FittedFunctions(frames, jnp.zeros(shape, problem.dtype), None, basis)
+    u = lax.fori_loop(0, num_steps, fit_step, u)
+    functions = FittedFunctions(
+        frames=u.frames,
+        coefficients=u.coefficients,
+        second_derivatives=_second_derivatives(noise, pilot, u),
+        basis=basis,
+    )
     num_failed = jnp.sum(~pilot.good)
     return functions, num_failed
 
@@ -106,25 +123,28 @@ def fit(
 def _target(noise: Noise, u: FittedFunctions, i: Any) -> Target:
     """What the functions after step `i` are fitted to, as a function of a flat state. For
     averages at the end of this step that is `phi` itself, for later ones the mean over the
-    next step of the functions after it, which are known, and for earlier ones zero."""
-    p = noise.problem
+    next step of the functions after it, which are known, and for earlier ones zero. A
+    random key, if there is one, serves to estimate this mean where a step has many
+    outcomes."""
+    problem = noise.problem
     level = noise.level
-    _, unravel = jfu.ravel_pytree(p.y0)
+    _, unravel = jfu.ravel_pytree(problem.y0)
     # After the last step the mean over a next one is computed, too, but not used.
     next_step = jnp.minimum(i + 1, level.num_steps - 1)
 
-    def value(x: Float[Array, " d"], key: PRNGKeyArray | None = None) -> Array:
-        y = unravel(x)
-        x_drawn = None
+    def value(flat_y: Float[Array, " d"], key: PRNGKeyArray | None = None) -> Array:
+        y = unravel(flat_y)
+        x = None
         if key is not None:
-            # The pilot's own steps draw by the numbers below `finest_steps`.
-            x_drawn, _ = noise.draw(key, p.finest_steps + i)
-        mean = noise.mean(next_step, y, lambda y1: u(next_step, y1), x_drawn)
-        phi = p.values(p.t0 + (i + 1) * level.h, y).astype(mean.dtype)
-        is_now = level.saved_steps == i + 1
+            # The pilot's own steps draw by the indices below `finest_steps`.
+            x, _ = noise.draw(key, problem.finest_steps + i)
+        mean = noise.mean(next_step, y, lambda y1: u(next_step, y1), x)
+        phi = problem.values(problem.t0 + (i + 1) * level.h, y).astype(mean.dtype)
+        # Which of the times at which to average are the end of this step, or later.
+        is_end_of_step = level.saved_steps == i + 1
         is_later = level.saved_steps > i + 1
         mean_or_zero = jnp.where(is_later[:, None], mean, 0)
-        return jnp.where(is_now[:, None], phi, mean_or_zero)
+        return jnp.where(is_end_of_step[:, None], phi, mean_or_zero)
 
     return value
 
@@ -138,9 +158,10 @@ def _second_derivatives(
 
     def mean_of_step(step_and_states):
         i, states = step_and_states
-        return noise.second(i, jax.vmap(unravel)(states), lambda y: u(i, y))
+        u_after_step = lambda y1: u(i, y1)
+        return noise.mean_second_derivatives(i, jax.vmap(unravel)(states), u_after_step)
 
-    # (steps, paths, d)
+    # The states before each step are those after the step before: (steps, paths, d).
     states_before = jnp.concatenate([pilot.starts[None], pilot.states[:-1]])
     few_states = states_before[:, :_STATES_FOR_SECOND]
     steps = jnp.arange(noise.problem.finest_steps)
@@ -164,14 +185,16 @@ class _Pilot(NamedTuple):
 
 def _pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
     """Simulates a path for each key."""
-    p = noise.problem
+    problem = noise.problem
 
-    def step(i: Any, y: Y, args: PyTree[Array], key: PRNGKeyArray):
+    def step(
+        i: Any, y: Y, args: PyTree[Array], key: PRNGKeyArray
+    ) -> tuple[Y, Bool[Array, ""]]:
         # With equal probabilities of all outcomes the pilot's paths spread further than
         # others, so that the fit also holds for outliers.
         x, _ = noise.draw(key, i, share=jnp.ones(()))
         noise_of_path = noise.with_args(args)
-        solver_state = noise_of_path.fresh(i, y)
+        solver_state = noise_of_path.new_solver_state(i, y)
         y, _, success = noise_of_path.step(i, y, solver_state, x)
         return y, success
 
@@ -179,29 +202,31 @@ def _pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
         paths, states = carry
         step_of_all = jax.vmap(ft.partial(step, i))
         y, success = step_of_all(paths.y, paths.args, keys)
-        paths = paths.moved(p, y, None, success)
+        paths = paths.after_step(problem, y, None, success)
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
     # Solvers start anew in each step, which is good enough for a fit.
-    paths = PathStates.start(p, jax.vmap(p.draw_start)(keys), solver_state=None)
+    paths = PathStates.start(
+        problem, jax.vmap(problem.draw_start)(keys), solver_state=None
+    )
     starts = jax.vmap(ravel)(paths.y)
-    states = jnp.broadcast_to(starts, (p.finest_steps, *starts.shape))
+    states = jnp.broadcast_to(starts, (problem.finest_steps, *starts.shape))
     carry = paths, states
     paths, states = lax.fori_loop(0, noise.level.num_steps, forward, carry)
     return _Pilot(keys, starts, states, ~paths.failed)
 
 
-def _unit(p: Problem, pilot: _Pilot, num_steps: Any) -> Float[Array, " d"]:
+def _unit(problem: Problem, pilot: _Pilot, num_steps: Any) -> Float[Array, " d"]:
     """How far each component moves: the root of the mean squared distance from the start
     over all steps of good paths. Zero for components that do not move."""
-    start, _ = jfu.ravel_pytree(p.y0)
-    if p.y0_of is not None:
+    start, _ = jfu.ravel_pytree(problem.y0)
+    if problem.y0_of is not None:
         start = jnp.mean(pilot.starts, axis=0)
     # (steps, paths, d)
     distances = jnp.where(pilot.good[:, None], jnp.abs(pilot.states - start), 0)
     # Dividing by the largest value first avoids underflow of squares in single precision.
     largest = jnp.max(distances, axis=(0, 1))
-    distances = distances / jnp.where(largest > 0, largest, 1)
+    scaled = distances / jnp.where(largest > 0, largest, 1)
     weights = equal_weights(pilot.good, start.dtype)
-    mean_square = jnp.einsum("n,ind->d", weights, distances**2) / num_steps
+    mean_square = jnp.einsum("n,ind->d", weights, scaled**2) / num_steps
     return largest * jnp.sqrt(mean_square)

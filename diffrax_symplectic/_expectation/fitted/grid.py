@@ -10,21 +10,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..._products import tensordot
 from .bases import AbstractBasis, CovarianceFrame, Hermite
 
 
-# The width of a grid relative to the pilot's range. For the mean of q^2 of a pendulum, the
-# standard error was 1.3e-10 (1.7e-2 without a fit); 2e-6 with a width of 1.05, where paths
-# leave the grid, and 3e-9 with one of 2.5, where its points are far apart.
-_WIDER = 1.5
+# The half-width of a grid, in distances from the median to the furthest pilot path. For the
+# mean of q^2 of a pendulum, the standard error was 1.3e-10 (1.7e-2 without a fit); 2e-6
+# with a width of 1.05, where paths leave the grid, and 3e-9 with one of 2.5, where its
+# points are far apart.
+_WIDTH_PER_RANGE = 1.5
 # The fraction of the width at which the values start to fall to zero (with 0.6 the standard
 # error of the pendulum was 2e-7), and the fraction of that fraction beyond which points are
 # near the edge, where the polynomials are compared.
-_FALLS = 0.9
-_NEAR_EDGE = 0.8
+_START_OF_FALL = 0.9
+_START_OF_EDGE = 0.8
 # The interpolation points along each axis: polynomials of degree 5. With 4 points the
 # standard error of the pendulum was 4e-8, with 8 it was 7e-12 to 5e-10.
 _STENCIL = 6
@@ -34,20 +35,22 @@ _PILOTS = 2**13
 # A grid corrects the best polynomial of these degrees.
 _DEGREES = (0, 2, 4)
 # In the middle the spacing is that of a uniform grid whose half-width is this many
-# interquartile ranges: for normal states, whose range is 1.35 standard deviations, 9.4 of
-# these.
-_EVEN = 7
-# The grid is at most this many times as wide as that, since the interquartile range may be
-# zero, and always stretched a little, since coordinates are divided by the stretching.
-_MOST_STRETCHED = 1e4
-_LEAST_BENT = 0.01
+# interquartile ranges: for normal states, whose range is 1.35 standard deviations, 9.4
+# standard deviations.
+_RANGES_OF_UNIFORM_GRID = 7
+# The grid is at most this many times as wide as that uniform one, since the interquartile
+# range may be zero. And it is always stretched a little, with at least this squared `bend`,
+# since coordinates are divided by a number that is zero without stretching.
+_MOST_STRETCH = 1e4
+_LEAST_SQUARED_BEND = 0.01
 
 
 class StretchedFrame(eqx.Module):
     """Coordinates from -1 to 1 on a grid: linear near the middle, and growing with the
     fourth root further out, where there are few paths.
 
-    For the coordinate `z` of `inner` it is `_bent(_bent(factor * (z - median))) / edge`.
+    For the coordinate `z` of `inner` it is
+    `_compressed(_compressed(factor * (z - median))) / edge`.
     """
 
     inner: CovarianceFrame
@@ -66,50 +69,52 @@ class StretchedFrame(eqx.Module):
         for the quartiles."""
         least = jnp.min(jnp.where(good[:, None], z, jnp.inf), axis=0)
         most = jnp.max(jnp.where(good[:, None], z, -jnp.inf), axis=0)
+        # NaNs are left out.
         few_paths = jnp.where(good[:, None], z, jnp.nan)[:num_for_quartiles]
         probabilities = jnp.array([0.25, 0.5, 0.75])
         quartiles = jnp.nanquantile(few_paths, probabilities, axis=0)
         first_quartile, median, third_quartile = quartiles
         furthest = jnp.maximum(most - median, median - least)
-        half_width = jnp.maximum(_WIDER * furthest, 1)
+        half_width = jnp.maximum(_WIDTH_PER_RANGE * furthest, 1)
         # In the middle the spacing is as on a uniform grid of this half-width.
         uniform_half_width = jnp.clip(
-            _EVEN * (third_quartile - first_quartile),
-            half_width / _MOST_STRETCHED,
+            _RANGES_OF_UNIFORM_GRID * (third_quartile - first_quartile),
+            half_width / _MOST_STRETCH,
             half_width,
         )
-        # In the middle, where `_bent` has slope 1, the coordinate has the slope
+        # In the middle, where `_compressed` has slope 1, the coordinate has the slope
         # `factor / edge`, which is `1 / uniform_half_width`. At the edge the argument of
-        # `_bent(_bent(...))` is `bend = factor * half_width`. So `stretch` is
-        # `bend / _bent(_bent(bend))`: one at zero, and for large `bend` about
+        # `_compressed(_compressed(...))` is `bend = factor * half_width`. So `stretch` is
+        # `bend / _compressed(_compressed(bend))`: one at zero, and for large `bend` about
         # `bend ** (3 / 4)`. It is replaced by `(1 + bend**2) ** (3 / 8)`, and solved.
         stretch = half_width / uniform_half_width
-        bend = jnp.sqrt(jnp.maximum(stretch ** (8 / 3) - 1, _LEAST_BENT))
+        bend = jnp.sqrt(jnp.maximum(stretch ** (8 / 3) - 1, _LEAST_SQUARED_BEND))
         return StretchedFrame(
             inner=inner,
             median=median,
             factor=bend / half_width,
-            edge=_bent(_bent(bend)),
+            edge=_compressed(_compressed(bend)),
         )
 
-    def at(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
+    def coordinates(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The coordinates of states."""
-        return _bent(_bent(self.factor * (self.inner.at(y) - self.median))) / self.edge
+        scaled = self.factor * (self.inner.coordinates(y) - self.median)
+        return _compressed(_compressed(scaled)) / self.edge
 
     def states(self, x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The states with these coordinates."""
-        unscaled = _straight(_straight(self.edge * x))
+        unscaled = _expanded(_expanded(self.edge * x))
         return self.inner.states(self.median + unscaled / self.factor)
 
 
-def _bent(x: Array) -> Array:
+def _compressed(x: Array) -> Array:
     """An odd function with slope 1 at zero, which grows like the square root. (It takes a
     quarter of the time of a logarithm.)"""
     return x / jnp.sqrt(jnp.sqrt(1 + x**2))
 
 
-def _straight(x: Array) -> Array:
-    """The inverse of `_bent`."""
+def _expanded(x: Array) -> Array:
+    """The inverse of `_compressed`."""
     return x * jnp.sqrt(x**2 / 2 + jnp.sqrt(1 + x**4 / 4))
 
 
@@ -142,40 +147,42 @@ class Grid(AbstractBasis):
 
     def frame(self, states, good, unit):
         inner = CovarianceFrame.of(states, good, unit)
-        return StretchedFrame.of(inner, inner.at(states), good, self._base.num_pilots)
+        return StretchedFrame.of(
+            inner, inner.coordinates(states), good, self._base.num_pilots
+        )
 
     def coefficients(self, target, frame, states, good, keys):
         base = self._base
-        n = base.num_pilots
+        num_pilots = base.num_pilots
         axes = [np.linspace(-1, 1, self.candidates[0])] * self.d
+        # The coordinates of the grid points: (nodes, d).
         x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, self.d)
         nodes = frame.states(jnp.asarray(x, states.dtype))
+        pilots = frame.inner.perturbed(states[:num_pilots])
         # All points are in one call, so that the target is compiled once.
-        points = jnp.concatenate([frame.inner.perturbed(states[:n]), nodes])
-        values = jax.vmap(target)(points)
-        # One copy of the values for each degree.
-        values_at_pilots = jnp.repeat(values[:n], len(_DEGREES), axis=1)
-        c = base.least_squares_fit(values_at_pilots, frame.inner, points[:n], good[:n])
+        values = jax.vmap(target)(jnp.concatenate([pilots, nodes]))
+        # One copy of the values for each degree: (pilots, degrees, S, m).
+        values_at_pilots = jnp.repeat(values[:num_pilots], len(_DEGREES), axis=1)
+        c = base.least_squares_fit(
+            values_at_pilots, frame.inner, pilots, good[:num_pilots]
+        )
+        polynomials = base.polynomials(frame.inner, nodes)
         # (nodes, degrees, S, m)
-        residual = values[n:] - tensordot(base.polynomials(frame.inner, nodes), c, 1)
+        residual = values[num_pilots:] - tensordot(polynomials, c, 1)
         # The target may overflow where it grows fast.
         residual = jnp.where(jnp.isfinite(residual), residual, 0)
-        # The best degree, for each component, leaves the least near the edge.
-        distance = np.max(np.abs(x), axis=1)
-        is_near_edge = (distance > _FALLS * _NEAR_EDGE) & (distance < _FALLS)
-        largest_residual = jnp.max(jnp.abs(residual[is_near_edge]), axis=0)
-        best_degree = jnp.argmin(largest_residual, axis=0)[None, None]
+        best_degree = _best_degree_near_edge(x, residual)
         residual = jnp.take_along_axis(residual, best_degree, 1)
         c = jnp.take_along_axis(c, best_degree, 1)
         # From 0, where the correction starts to fall, to 1 at the edge.
-        place_of_fall = (np.abs(x) - _FALLS) / (1 - _FALLS)
-        factor = np.prod(_falling(place_of_fall), axis=1)
+        progress_of_fall = (np.abs(x) - _START_OF_FALL) / (1 - _START_OF_FALL)
+        factor = np.prod(_smooth_fall(progress_of_fall), axis=1)
         factor = jnp.asarray(factor, residual.dtype)[:, None, None, None]
         return jnp.concatenate([c, residual * factor])
 
     def value_at(self, frame, y, c):
         size = self._base.size
-        correction = self.interpolate(frame.at(y), c[size:])
+        correction = self.interpolate(frame.coordinates(y), c[size:])
         return self._base.value_at(frame.inner, y, c[:size]) + correction
 
     def interpolate(
@@ -184,13 +191,15 @@ class Grid(AbstractBasis):
         """The values on the grid, interpolated at a point, and zero beyond the grid."""
         n = self.candidates[0]
         value_shape = c.shape[1:]
-        # The number of grid points on each side of the point.
+        # The number of interpolation points on each side of the point.
         half = _STENCIL // 2
         # The coordinates of the point, in spacings of the grid from its first point.
         place = (x + 1) * (n - 1) / 2
+        # Whether the grid has so many points on each side.
         is_inside = jnp.all((place >= half - 1) & (place <= n - half))
         # Outside, the result at some place inside is computed, and dropped.
         place = jnp.clip(jnp.where(is_inside, place, n / 2), half - 1, n - half)
+        # The first interpolation point along each axis.
         begin = jnp.minimum(jnp.floor(place) - (half - 1), n - _STENCIL)
         start_indices = jnp.pad(begin.astype(jnp.int32), (0, len(value_shape)))
         values_on_grid = c.reshape(*[n] * self.d, *value_shape)
@@ -204,28 +213,40 @@ class Grid(AbstractBasis):
         return jnp.where(is_inside, block, 0)
 
 
+def _best_degree_near_edge(
+    x: Float[np.ndarray, "nodes d"], residual: Float[Array, "nodes degrees S m"]
+) -> Int[Array, "1 1 S m"]:
+    """The index of the degree that leaves the least near the edge of the grid, for each
+    time and component. `x` are the coordinates of the nodes."""
+    distance = np.max(np.abs(x), axis=1)
+    is_beyond_middle = distance > _START_OF_FALL * _START_OF_EDGE
+    is_near_edge = is_beyond_middle & (distance < _START_OF_FALL)
+    largest_residual = jnp.max(jnp.abs(residual[is_near_edge]), axis=0)
+    return jnp.argmin(largest_residual, axis=0)[None, None]
+
+
 def _lagrange_polynomials(
     distances: list[Float[Array, " d"]],
 ) -> list[Float[Array, " d"]]:
-    """The Lagrange polynomials of the points `0, 1, ..., k - 1`, where `distances` holds
-    the distances `x`, `x - 1`, ..., `x - (k - 1)` of `x` to each of them."""
+    """The Lagrange polynomials of the points `0, 1, ..., k - 1` at `x`, where `distances`
+    holds the distances `x`, `x - 1`, ..., `x - (k - 1)` of `x` to each of them."""
     k = len(distances)
-    # Polynomial `j` is the product of the distances to all points but point `j`: `left[j]`
-    # to those before it, `right[j]` to those after it.
-    left = [*itertools.accumulate(distances[:-1], jnp.multiply, initial=1.0)]
-    right = [*itertools.accumulate(distances[:0:-1], jnp.multiply, initial=1.0)][::-1]
+    # Polynomial `j` is the product of the distances to all points but point `j`: to those
+    # before it, times to those after it.
+    before = [*itertools.accumulate(distances[:-1], jnp.multiply, initial=1.0)]
+    after = [*itertools.accumulate(distances[:0:-1], jnp.multiply, initial=1.0)][::-1]
     polynomials = []
     for j in range(k):
         # It is divided by its value at point `j`, where it is to be one. There the
         # distances before are `j, ..., 1`, and those after are `-1, ..., -(k - 1 - j)`.
         num_after = k - 1 - j
         sign = (-1) ** num_after
-        value = sign * (math.factorial(j) * math.factorial(num_after))
-        polynomials.append(left[j] * right[j] / value)
+        value_at_j = sign * (math.factorial(j) * math.factorial(num_after))
+        polynomials.append(before[j] * after[j] / value_at_j)
     return polynomials
 
 
-def _falling(x: np.ndarray) -> np.ndarray:
+def _smooth_fall(x: np.ndarray) -> np.ndarray:
     """A function that falls from 1 at 0 to 0 at 1, with two vanishing derivatives at both
     ends."""
     x = np.clip(x, 0, 1)

@@ -27,6 +27,18 @@ _MOST_OUTCOMES = 100
 Function: TypeAlias = Callable[[Y], Array]
 
 
+class WeightedNodes(NamedTuple):
+    """Values of the random variables of a step, and weights by which the expectation of any
+    function of them is a sum over these values.
+
+    - `nodes`: the values of all variables, along the last axis.
+    - `weights`: the weight of each node: its probability, if the nodes are all outcomes.
+    """
+
+    nodes: Float[Array | np.ndarray, "K n"]
+    weights: Float[np.ndarray, " K"]
+
+
 class StepOfPath(NamedTuple):
     """A path after a step, from `Noise.advance`.
 
@@ -57,9 +69,9 @@ class Noise(eqx.Module):
     problem: Problem
     level: Level
     laws: tuple[Discrete, ...] = eqx.field(static=True)
-    # The outcomes of a step (of all variables together) and their probabilities, if there
+    # The outcomes of a step (of all variables together) with their probabilities, if there
     # are few outcomes.
-    outcomes: tuple[Float[np.ndarray, "K n"], Float[np.ndarray, " K"]] | None
+    outcomes: WeightedNodes | None
 
     @staticmethod
     def of(problem: Problem, level: Level) -> "Noise":
@@ -77,7 +89,7 @@ class Noise(eqx.Module):
         if num_outcomes > _MOST_OUTCOMES:
             return Noise(problem, level, discrete_laws, outcomes=None)
         values, probabilities = outcomes(discrete_laws, 1)
-        few_outcomes = values.astype(problem.dtype), probabilities
+        few_outcomes = WeightedNodes(values.astype(problem.dtype), probabilities)
         return Noise(problem, level, discrete_laws, few_outcomes)
 
     def with_args(self, own_args: PyTree[Array]) -> "Noise":
@@ -87,15 +99,17 @@ class Noise(eqx.Module):
     def draw(
         self,
         key: PRNGKeyArray,
-        number: Any,
+        draw_index: Any,
         share: ArrayLike = 0.0,
         tilt: ArrayLike = 0.0,
     ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-        """The variables drawn from the key and this number, and their log likelihood ratio:
-        of the law they are drawn by to their own law. In a fraction `share` (from 0 to 1)
-        of draws all outcomes are equally probable. Probabilities are multiplied by the
-        exponential of `tilt`, a number or one for each variable, times the outcome."""
-        place = number, jnp.asarray(self.level.index)
+        """The variables `x` drawn from the key and this index, and their log likelihood
+        ratio: the logarithm of the probability of `x` by the law that it is drawn by,
+        divided by its probability by the variables' own law. In a fraction `share` (from 0
+        to 1) of draws all outcomes are equally probable. Probabilities are multiplied by
+        the exponential of `tilt`, a number or one for each variable, times the outcome."""
+        place = draw_index, jnp.asarray(self.level.index)
+        # One random word for each variable, from a single block of words.
         words = random_words(key, place, 1, len(self.laws))[0]
         x = jnp.zeros(len(self.laws), self.problem.dtype)
         log_ratio = jnp.zeros_like(x)
@@ -104,14 +118,14 @@ class Noise(eqx.Module):
         # hundreds of variables have one law or two.
         for law in dict.fromkeys(self.laws):
             has_law = np.array([other == law for other in self.laws])
-            outcome, log_ratio_of_law = _draw_outcomes(
+            outcomes_of_law, log_ratio_of_law = _draw_outcomes(
                 law, words, share, tilts, x.dtype
             )
-            x = jnp.where(has_law, outcome, x)
+            x = jnp.where(has_law, outcomes_of_law, x)
             log_ratio = jnp.where(has_law, log_ratio_of_law, log_ratio)
         return x, jnp.sum(log_ratio)
 
-    def nodes(self, x: Array | None = None) -> tuple[Any, np.ndarray]:
+    def weighted_nodes(self, x: Array | None = None) -> WeightedNodes:
         """Nodes and weights of the expectation over the variables: all outcomes and their
         probabilities, if there are few outcomes. Otherwise two nodes that estimate the
         expectation from a draw `x`, or without a draw `2 * n + 1` nodes."""
@@ -119,23 +133,23 @@ class Noise(eqx.Module):
             return self.outcomes
         if x is not None:
             # The mean over a draw and its opposite is right for all odd functions.
-            return jnp.stack([x, -x]), np.full(2, 0.5)
+            return WeightedNodes(jnp.stack([x, -x]), np.full(2, 0.5))
         # Two nodes along each axis, at `sqrt(3)` standard deviations with weight 1/6, as in
-        # Gauss-Hermite quadrature, and zero. They are exact for polynomials of degree 3, or
-        # 5 in one variable.
+        # Gauss-Hermite quadrature, and zero, with what is left of a total weight of one.
+        # They are exact for polynomials of degree 3, or 5 in one variable.
         n = len(self.laws)
-        on_axes = np.diag(np.sqrt(3 * self._variances()))
-        nodes = np.concatenate([on_axes, -on_axes, np.zeros((1, n))])
+        nodes_on_axes = np.diag(np.sqrt(3 * self._variances()))
+        nodes = np.concatenate([nodes_on_axes, -nodes_on_axes, np.zeros((1, n))])
         weights = np.append(np.full(2 * n, 1 / 6), 1 - n / 3)
-        return nodes.astype(self.problem.dtype), weights
+        return WeightedNodes(nodes.astype(self.problem.dtype), weights)
 
     def mean(self, i: Any, y: Y, u: Function, x: Array | None = None) -> Array:
-        """The expectation of `u` after step `i` from `y`, over `nodes(x)`; NaN if a step
-        fails."""
-        nodes, weights = self.nodes(x)
-        solver_state = self.fresh(i, y)
+        """The expectation of `u` after step `i` from `y`, over `weighted_nodes(x)`; NaN if
+        a step fails."""
+        nodes, weights = self.weighted_nodes(x)
+        solver_state = self.new_solver_state(i, y)
 
-        def value(x: Array) -> Array:
+        def value(x: Array | np.ndarray) -> Array:
             y1, _, success = self.step(i, y, solver_state, x)
             return jnp.where(success, u(y1), jnp.nan)
 
@@ -148,25 +162,35 @@ class Noise(eqx.Module):
         y: Y,
         solver_state: PyTree[Array],
         u: Function,
-        second: Array | None,
+        second_derivatives: Array | None,
         x: Array,
     ) -> StepOfPath:
         """Step `i` of a path with variables `x`, and the control variate of `u` in it.
-        `second` comes from the method of the same name."""
+        `second_derivatives` comes from `mean_second_derivatives`."""
         if self.outcomes is None:
-            assert second is not None
-            return self._advance_by_derivatives(i, y, solver_state, u, second, x)
+            assert second_derivatives is not None
+            return self._advance_by_derivatives(
+                i, y, solver_state, u, second_derivatives, x
+            )
         outcomes_of_x, probabilities = self.outcomes
+        # A step for each outcome: the states of the path and of the solver after it.
         step_by_outcome = jax.vmap(lambda x: self.step(i, y, solver_state, x))
         ends, solver_states, success = step_by_outcome(outcomes_of_x)
         values = jax.vmap(u)(ends)
-        drawn = jnp.argmax(jnp.all(outcomes_of_x == x, axis=1))
+        # The path itself takes the outcome that is equal to `x`.
+        index_of_x = jnp.argmax(jnp.all(outcomes_of_x == x, axis=1))
         mean = tensordot(probabilities.astype(values.dtype), values, 1)
-        y1, new_state, value = jtu.tree_map(
-            lambda of_outcomes: of_outcomes[drawn], (ends, solver_states, values)
+        y1, solver_state_after, value = jtu.tree_map(
+            lambda of_outcomes: of_outcomes[index_of_x], (ends, solver_states, values)
         )
         # One failed outcome makes the mean wrong, and with it the control variate.
-        return StepOfPath(y1, new_state, jnp.all(success), value, value - mean)
+        return StepOfPath(
+            y=y1,
+            solver_state=solver_state_after,
+            success=jnp.all(success),
+            value=value,
+            control=value - mean,
+        )
 
     def _advance_by_derivatives(
         self,
@@ -174,23 +198,31 @@ class Noise(eqx.Module):
         y: Y,
         solver_state: PyTree[Array],
         u: Function,
-        second: Array,
+        second_derivatives: Array,
         x: Array,
     ) -> StepOfPath:
         """`advance` for many outcomes, by the formula of this class."""
-        y1, new_state, success = self.step(i, y, solver_state, x)
+        y1, solver_state_after, success = self.step(i, y, solver_state, x)
 
         def u_after(x: Array) -> Array:
             end, _, _ = self.step(i, y, solver_state, x)
             return u(end)
 
-        first = jax.jacrev(u_after)(0 * x)
-        # The second derivatives times this are `x^T C x - tr(C Sigma)`.
-        square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
-        control = tensordot(first, x, 1) + tensordot(square, second, 2) / 2
-        return StepOfPath(y1, new_state, success, u(y1), control)
+        first_derivatives = jax.jacrev(u_after)(0 * x)
+        # The second derivatives `C`, multiplied by this matrix and summed over both axes,
+        # are `x^T C x - tr(C Sigma)`.
+        centred_square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
+        linear = tensordot(first_derivatives, x, 1)
+        quadratic = tensordot(centred_square, second_derivatives, 2) / 2
+        return StepOfPath(
+            y=y1,
+            solver_state=solver_state_after,
+            success=success,
+            value=u(y1),
+            control=linear + quadratic,
+        )
 
-    def second(self, i: Any, ys: Y, u: Function) -> Array | None:
+    def mean_second_derivatives(self, i: Any, ys: Y, u: Function) -> Array | None:
         """The mean of the second derivatives of `u` after step `i` along the variables,
         over the states `ys` before it; `None` if there are few outcomes."""
         if self.outcomes is not None:
@@ -199,7 +231,7 @@ class Noise(eqx.Module):
 
         def hessian(y: Y) -> Array:
             def u_after(x: Array) -> Array:
-                end, _, _ = self.step(i, y, self.fresh(i, y), x)
+                end, _, _ = self.step(i, y, self.new_solver_state(i, y), x)
                 return u(end)
 
             return jax.hessian(u_after)(zero)
@@ -211,35 +243,37 @@ class Noise(eqx.Module):
         return jnp.moveaxis(mean, (-2, -1), (0, 1))
 
     def step(
-        self, i: Any, y: Y, solver_state: PyTree[Array], x: Array
+        self, i: Any, y: Y, solver_state: PyTree[Array], x: Array | np.ndarray
     ) -> tuple[Y, PyTree[Array], Bool[Array, ""]]:
         """`Problem.step` with these variables."""
         terms = self._terms(x)
         return self.problem.step(terms, i, self.level.h, y, solver_state)
 
-    def fresh(self, i: Any, y: Y) -> PyTree[Array]:
+    def new_solver_state(self, i: Any, y: Y) -> PyTree[Array]:
         """The state of a solver that starts at step `i`. It is used in fits, which affect
         only the variance; paths carry their own solver state."""
         terms = self._terms(np.zeros(len(self.laws)))
-        state = self.problem.init(terms, i, self.level.h, y)
-
-        # The result of a solve, an integer, is a constant here. XLA would evaluate what
-        # follows from it for all states and outcomes while compiling: for 6,300 states and
-        # 27 outcomes for more than a second, with an alarm.
-        def hide_if_result(x: Array) -> Array:
-            is_result = jnp.issubdtype(x.dtype, jnp.integer)
-            return jax.lax.optimization_barrier(x) if is_result else x
-
-        return jtu.tree_map(hide_if_result, state)
+        solver_state = self.problem.init(terms, i, self.level.h, y)
+        return jtu.tree_map(_hidden_if_result, solver_state)
 
     def _terms(self, x: Any) -> PyTree:
         """The terms with paths that give these variables in every step."""
         return self.problem.variables(self.level.h).terms_with(x)
 
     def _variances(self) -> np.ndarray:
+        """The variance of each variable. (All have mean zero.)"""
         return np.array(
             [np.dot(law.probabilities, np.square(law.values)) for law in self.laws]
         )
+
+
+def _hidden_if_result(x: Array) -> Array:
+    """An array of a solver's state, hidden from XLA behind a barrier if it is an integer:
+    the result of a solve, which is a constant in a new state. XLA would evaluate what
+    follows from this constant for all states and outcomes while compiling: for 6,300 states
+    and 27 outcomes for more than a second, with an alarm."""
+    is_result = jnp.issubdtype(x.dtype, jnp.integer)
+    return jax.lax.optimization_barrier(x) if is_result else x
 
 
 def _draw_outcomes(
@@ -249,35 +283,39 @@ def _draw_outcomes(
     tilts: Float[Array, " n"],
     dtype: Any,
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Outcomes by one law, widened and tilted, and their log likelihood ratios, from one
-    random word each."""
-    p = np.array(law.probabilities, dtype)
-    q = widened(law, share)
+    """Outcomes of variables with one law, widened and tilted, and their log likelihood
+    ratios, from one random word each."""
+    own_probabilities = np.array(law.probabilities, dtype)
+    wider = widened_probabilities(law, share)
     # (variables, outcomes)
-    q = jax.vmap(lambda tilt: tilted(law, q, tilt))(tilts)
-    # The law as it is has cuts in integers, by which a `WeakBrownianPath` draws, too. With
-    # other cuts, by rounded probabilities, few draws would differ, but the law would not be
-    # exact.
+    probabilities = jax.vmap(lambda tilt: tilted_probabilities(law, wider, tilt))(tilts)
+    # A variable has the outcome whose index is the number of cuts that are not above its
+    # word. The law as it is has cuts in integers, by which a `WeakBrownianPath` draws, too.
+    # With other cuts, by rounded probabilities, few draws would differ, but the law would
+    # not be exact.
     is_unchanged = (share == 0) & (tilts == 0)
-    cuts = (jnp.cumsum(q, axis=1)[:, :-1] * 2.0**32).astype(jnp.uint32)
+    cuts = (jnp.cumsum(probabilities, axis=1)[:, :-1] * 2.0**32).astype(jnp.uint32)
     cuts = jnp.where(is_unchanged[:, None], np.array(law.cuts, np.uint32), cuts)
     index = jnp.sum(words[:, None] >= cuts, axis=1)
     outcome = jnp.asarray(law.values, dtype)[index]
-    log_ratios = jnp.take_along_axis(jnp.log(q / p), index[:, None], axis=1)
-    return outcome, log_ratios[:, 0]
+    log_ratio_of_outcomes = jnp.log(probabilities / own_probabilities)
+    log_ratio = jnp.take_along_axis(log_ratio_of_outcomes, index[:, None], axis=1)
+    return outcome, log_ratio[:, 0]
 
 
-def widened(law: Discrete, share: Any) -> Any:
-    """Probabilities between those of the law (for a `share` of zero) and equal ones."""
-    p = np.array(law.probabilities, jnp.result_type(share))
-    return (1 - share) * p + share / len(p)
+def widened_probabilities(law: Discrete, share: Any) -> Any:
+    """Probabilities between those of the law (for a `share` of zero) and equal ones (for
+    one)."""
+    own = np.array(law.probabilities, jnp.result_type(share))
+    return (1 - share) * own + share / len(own)
 
 
-def tilted(law: Discrete, q: Any, tilt: Any) -> Any:
-    """Probabilities `q` times the exponential of `tilt` times the outcome, normalized."""
+def tilted_probabilities(law: Discrete, probabilities: Any, tilt: Any) -> Any:
+    """The probabilities times the exponential of `tilt` times the outcome, normalized."""
     # Numbers stay on the host: trials of tails call this hundreds of times.
     numpy = jnp if isinstance(tilt, jax.Array) else np
-    weights = q * numpy.exp(tilt * np.array(law.values, jnp.result_type(tilt)))
+    values = np.array(law.values, jnp.result_type(tilt))
+    weights = probabilities * numpy.exp(tilt * values)
     return weights / numpy.sum(weights)
 
 
@@ -287,7 +325,4 @@ def count_outcomes(problem: Problem) -> int | None:
         noise = Noise.of(problem, problem.level(0))
     except ValueError:
         return None
-    if noise.outcomes is None:
-        return None
-    _, probabilities = noise.outcomes
-    return len(probabilities)
+    return None if noise.outcomes is None else len(noise.outcomes.weights)

@@ -40,24 +40,28 @@ def hermite(x: Float[Array, " d"], degree: int) -> list[Float[Array, ""]]:
     """Products of normalized Hermite polynomials, in the order of `exponents`. Each is a
     product of two known factors, so that a sum over them compiles to one loop without
     temporary arrays."""
-    # Polynomials of one variable each, by their recurrence
-    # `sqrt(k + 1) h[k + 1] = x h[k] - sqrt(k) h[k - 1]`.
-    of_variables = []
-    for variable in x:
-        of_degrees = [jnp.ones_like(variable), variable]
-        for k in range(1, degree):
-            unscaled = variable * of_degrees[-1] - math.sqrt(k) * of_degrees[-2]
-            of_degrees.append(unscaled / math.sqrt(k + 1))
-        of_variables.append(of_degrees)
+    factors = [_hermite_of_one_variable(variable, degree) for variable in x]
     # Products of several variables, by their exponents. Lower degrees come first, so the
     # product without its last variable is known.
-    known = {(0,) * len(x): jnp.ones_like(x[0])}
+    products = {(0,) * len(x): jnp.ones_like(x[0])}
     for powers in exponents(len(x), degree)[1:]:
         last_variable = max(j for j, power in enumerate(powers) if power > 0)
         others = (*powers[:last_variable], 0, *powers[last_variable + 1 :])
-        factor = of_variables[last_variable][powers[last_variable]]
-        known[powers] = known[others] * factor
-    return [*known.values()]
+        factor = factors[last_variable][powers[last_variable]]
+        products[powers] = products[others] * factor
+    return [*products.values()]
+
+
+def _hermite_of_one_variable(
+    x: Float[Array, ""], degree: int
+) -> list[Float[Array, ""]]:
+    """The normalized Hermite polynomials of degrees 0, 1, ..., and of degree 1 in any case,
+    by their recurrence `sqrt(k + 1) h[k + 1] = x h[k] - sqrt(k) h[k - 1]`."""
+    polynomials = [jnp.ones_like(x), x]
+    for k in range(1, degree):
+        unscaled = x * polynomials[-1] - math.sqrt(k) * polynomials[-2]
+        polynomials.append(unscaled / math.sqrt(k + 1))
+    return polynomials
 
 
 def least_squares(
@@ -72,7 +76,8 @@ def least_squares(
     """
     # Columns are scaled to length one, so that one ridge suits all.
     lengths = jnp.sqrt(jnp.sum(B**2, axis=0))
-    B = B / jnp.where(lengths > 0, lengths, 1)
+    lengths = jnp.where(lengths > 0, lengths, 1)
+    B = B / lengths
     _, num_columns = B.shape
     ridge = _RIDGE * jnp.finfo(B.dtype).eps * jnp.eye(num_columns, dtype=B.dtype)
     L = jnp.linalg.cholesky(dot(B.T, B) + ridge)
@@ -101,4 +106,5 @@ def least_squares(
     c = jax.lax.fori_loop(0, _REFINEMENTS, refine, c)
     # (P, C, m)
     c = jnp.moveaxis(c, 0, 1)
-    return c / jnp.where(lengths > 0, lengths, 1)[:, None, None]
+    # From the scaled polynomials to those of the caller.
+    return c / lengths[:, None, None]

@@ -21,7 +21,7 @@ from ..._simulation import Problem
 from ..._terms import number_of_noises
 from ..estimate import Expectation, total
 from ..sampling import ROUNDING
-from .noise import Noise, tilted, widened
+from .noise import Noise, tilted_probabilities, widened_probabilities
 
 
 # The relative entropy of the changed noise of a whole path with respect to its own law, in
@@ -32,33 +32,35 @@ _NATS = 8.0
 # deviation, is e^7 = 1,000 times as likely next to the middle one as before: nearly all
 # outcomes are the largest.
 _MOST_TILTED = 4.0
-# The halvings of an interval after which only rounding errors in single precision remain.
+# The bisection halves its interval this many times, after which only rounding errors in
+# single precision remain.
 _HALVINGS = 30
 # The most noises that push paths to all sides: each further one doubles the trials.
 _MOST_NOISES = 2
 
-# The probabilities that a law has after a change by a number.
-_Change: TypeAlias = Callable[[Discrete, float], np.ndarray]
+# Maps a law and the strength of a change to the probabilities that the law has after it.
+_ChangeOfLaw: TypeAlias = Callable[[Discrete, float], np.ndarray]
 
 
 class TrialLaw(NamedTuple):
-    """A law of the noise: what `Noise.draw` takes, on each level."""
+    """A law of the noise: the `share` and, for each random variable of a step, the `tilt`
+    that `Noise.draw` takes, on each level."""
 
     share: Float[Array | np.ndarray, "*levels"]
     tilts: Float[Array | np.ndarray, "*levels n"]
 
 
-def laws_of_trials(p: Problem) -> list[TrialLaw]:
+def laws_of_trials(problem: Problem) -> list[TrialLaw]:
     """The noise's own law, a wider one, and for one noise or two those in which each noise
-    pushes to one side."""
-    laws = Noise.of(p, p.level(0)).laws
-    no_share = np.zeros(len(p.levels.h), p.dtype)
-    no_tilts = np.zeros((len(no_share), len(laws)), p.dtype)
-    share = _strongest_change(p, laws, widened, 1.0)
+    pushes to one side, in the order of `itertools.product`."""
+    laws = Noise.of(problem, problem.level(0)).laws
+    no_share = np.zeros(len(problem.levels.h), problem.dtype)
+    no_tilts = np.zeros((len(no_share), len(laws)), problem.dtype)
+    share = _strongest_change(problem, laws, widened_probabilities, 1.0)
     trial_laws = [TrialLaw(no_share, no_tilts), TrialLaw(share, no_tilts)]
-    num_noises = number_of_noises(p.terms)
+    num_noises = number_of_noises(problem.terms)
     if num_noises <= _MOST_NOISES:
-        tilt = _strongest_change(p, laws, _tilted_law, _MOST_TILTED)
+        tilt = _strongest_change(problem, laws, _with_own_tilted, _MOST_TILTED)
         for sides in itertools.product((-1, 1), repeat=num_noises):
             tilts = no_tilts.copy()
             # The increments come first. The other variables, which are only in products
@@ -68,18 +70,23 @@ def laws_of_trials(p: Problem) -> list[TrialLaw]:
     return trial_laws
 
 
-def _tilted_law(law: Discrete, tilt: float) -> np.ndarray:
-    return tilted(law, np.array(law.probabilities), tilt)
+def _with_own_tilted(law: Discrete, tilt: float) -> np.ndarray:
+    """The law's own probabilities, tilted."""
+    return tilted_probabilities(law, np.array(law.probabilities), tilt)
 
 
 def _strongest_change(
-    p: Problem, laws: tuple[Discrete, ...], change_law: _Change, most: float
+    problem: Problem,
+    laws: tuple[Discrete, ...],
+    probabilities_after: _ChangeOfLaw,
+    most: float,
 ) -> Float[np.ndarray, " levels"]:
-    """For each level the largest `z`, up to `most`, for which the laws `change_law(law, z)`
-    give all variables of a path, on all levels together, a relative entropy of at most 8
-    nats with respect to their own laws."""
-    num_steps = p.levels.num_steps
-    counts = collections.Counter(laws)
+    """For each level the largest strength, up to `most`, for which the probabilities
+    `probabilities_after(law, strength)` give all variables of a path, on all levels
+    together, a relative entropy of at most 8 nats with respect to their own laws. (The
+    relative entropy grows with the strength.)"""
+    num_steps = problem.levels.num_steps
+    law_counts = collections.Counter(laws)
     # Each level, which has its own number of steps, has an equal part of the entropy.
     most_nats = _NATS / len(num_steps)
     # The bisection of all levels at once.
@@ -87,28 +94,33 @@ def _strongest_change(
     upper = np.full(len(num_steps), most)
     for _ in range(_HALVINGS):
         middle = (lower + upper) / 2
-        nats = np.array([_relative_entropy(counts, change_law, z) for z in middle])
-        is_too_much = num_steps * nats > most_nats
+        nats_of_step = np.array(
+            [_relative_entropy(law_counts, probabilities_after, z) for z in middle]
+        )
+        is_too_much = num_steps * nats_of_step > most_nats
         lower = np.where(is_too_much, lower, middle)
         upper = np.where(is_too_much, middle, upper)
-    return lower.astype(p.dtype)
+    return lower.astype(problem.dtype)
 
 
 def _relative_entropy(
-    counts: collections.Counter[Discrete], change_law: _Change, z: float
+    law_counts: collections.Counter[Discrete],
+    probabilities_after: _ChangeOfLaw,
+    strength: float,
 ) -> float:
-    """How far the variables of a step, so many of each law, are from their own laws if
-    these are changed: the sum of `q log(q / p)`, in nats."""
+    """The relative entropy of the variables of a step, so many of each law, after a change
+    of this strength: the sum of `after * log(after / before)` over the probabilities of all
+    outcomes, in nats."""
     nats = 0.0
-    for law, count in counts.items():
-        p = np.array(law.probabilities)
-        q = change_law(law, z)
-        nats += count * np.sum(q * np.log(q / p))
+    for law, count in law_counts.items():
+        before = np.array(law.probabilities)
+        after = probabilities_after(law, strength)
+        nats += count * np.sum(after * np.log(after / before))
     return nats
 
 
-class Usual(NamedTuple):
-    """What ordinary paths show, beyond which deviations are in the tails.
+class UsualDeviations(NamedTuple):
+    """The deviations that ordinary paths show, beyond which they are in the tails.
 
     - `center`: the mean without control.
     - `largest`: the largest deviation from it, or with control from the fitted mean.
@@ -117,30 +129,32 @@ class Usual(NamedTuple):
     center: Float[Array | np.ndarray, "combinations S m"]
     largest: Float[Array | np.ndarray, "combinations S m"]
 
-    def tails(
+    def deviations_beyond(
         self,
         deviations: Float[Array, "combinations S n m"],
         plain: Float[Array, "combinations S n m"],
         log_ratio: Float[Array, " n"],
     ) -> Float[Array, "combinations S n m"]:
         """The deviations of paths that are in the tails, times the likelihood ratios of
-        these paths, and zero for others. `plain` are the values without control."""
+        these paths, and zero for others. `plain` are the values without control, and
+        `log_ratio` is as from `Noise.draw`, summed over all steps."""
         # Deviations count only if they exceed rounding.
         rounding = ROUNDING * jnp.finfo(deviations.dtype).eps * jnp.abs(plain)
         is_beyond = deviations > self.largest[:, :, None] + rounding
-        # Ratios are at most one: paths that are likelier by the own law of the noise are
-        # seen without another one.
-        ratio = jnp.exp(-jnp.maximum(log_ratio, 0))[:, None]
-        return jnp.where(is_beyond, ratio * deviations, 0)
+        # The weight of a path is its probability by the own law of the noise, divided by
+        # its probability by the law it is drawn by. It is at most one here: paths that are
+        # likelier by the own law are seen without another one.
+        weight = jnp.exp(-jnp.maximum(log_ratio, 0))[:, None]
+        return jnp.where(is_beyond, weight * deviations, 0)
 
 
 def largest_tails(trials: list[Expectation]) -> PyTree[np.ndarray]:
     """The largest mean deviation in the tails among trials by several laws, for each
     component."""
+    mean_tails = [total(estimate.moments).mean.tails for estimate in trials]
+    return jtu.tree_map(_largest, *mean_tails)
 
-    def largest(*tails: np.ndarray) -> np.ndarray:
-        # A trial without a value is ignored.
-        return ft.reduce(np.fmax, tails)
 
-    tails = [total(estimate.moments).mean.tails for estimate in trials]
-    return jtu.tree_map(largest, *tails)
+def _largest(*of_trials: np.ndarray) -> np.ndarray:
+    """The largest numbers, without trials that have no value (NaN)."""
+    return ft.reduce(np.fmax, of_trials)

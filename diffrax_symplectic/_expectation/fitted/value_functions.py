@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from ..._arguments import check_untraced, whole_number
 from ..._compat import quickly_compiled
@@ -36,7 +36,7 @@ from .basis_choice import chosen_basis, warn_of_long_fit
 from .controlled_paths import controlled_paths
 from .fits import Choice, fit, FittedFunctions
 from .noise import Noise
-from .tails import largest_tails, laws_of_trials, TrialLaw, Usual
+from .tails import largest_tails, laws_of_trials, TrialLaw, UsualDeviations
 
 
 # Folded into the key of a call to draw trials. (Numbers of levels, which are folded into it
@@ -95,20 +95,22 @@ class ValueFunctions(AbstractSampling):
         warn_of_long_fit(chosen, stacklevel=5)
         basis = chosen.basis
         struct = problem.sample_struct
-        trials = _Trials(
+        controlled = _ControlledSampling(
             problem,
             _fits(problem, key, basis),
-            outputs=problem.num_outputs,
+            output_shape=problem.output_shape,
             struct=Averaged(struct, plain=struct, control=struct, tails=struct),
-            key=jr.fold_in(key, _TRIAL_KEY),
+            trial_key=jr.fold_in(key, _TRIAL_KEY),
             devices=devices,
             batch_size=self.batch_size,
         )
         own_law, *wider_laws = laws_of_trials(problem)
         # One trial for each candidate, on the same paths.
-        candidates = range(len(basis.candidates))
-        estimates = [trials.of_candidate(k, own_law) for k in candidates]
-        comparison = _comparison(estimates, trials.outputs)
+        trials_of_candidates = [
+            controlled.trial_of_candidate(candidate, own_law)
+            for candidate in range(len(basis.candidates))
+        ]
+        comparison = _comparison(trials_of_candidates, problem.output_shape)
         choice = comparison.choice
         if self.degree and not np.any(choice.used):
             warnings.warn(
@@ -117,10 +119,16 @@ class ValueFunctions(AbstractSampling):
                 stacklevel=5,
             )
         # Paths with wider noise estimate the deviations beyond the largest in these trials.
-        usual = _usual_deviations(estimates, choice, trials.outputs, problem.dtype)
-        num_wide = _BATCHES_OF_WIDE_TRIAL * self.batch_size
-        wide_trials = [trials.run(choice, usual, law, num_wide) for law in wider_laws]
-        plan = trials.plan(choice, usual, own_law, self.num_paths)
+        usual_deviations = _usual_deviations(
+            trials_of_candidates, choice, problem.output_shape, problem.dtype
+        )
+        wide_trials = [
+            controlled.trial(
+                choice, usual_deviations, law, _BATCHES_OF_WIDE_TRIAL * self.batch_size
+            )
+            for law in wider_laws
+        ]
+        plan = controlled.plan(choice, usual_deviations, own_law, self.num_paths)
         return plan._replace(
             reason=_reason(basis, choice),
             tails=largest_tails(wide_trials),
@@ -128,28 +136,38 @@ class ValueFunctions(AbstractSampling):
         )
 
 
-class _Trials(NamedTuple):
-    """What all trials of a problem share, and the estimate itself.
+class _ControlledSampling(NamedTuple):
+    """What the trials and the estimate share: paths with control variates.
 
-    - `outputs`: the numbers of times at which to average and of components of `phi`.
+    - `output_shape`: as in `Problem`.
     - `struct`: as in `SamplingPlan`.
-    - `key`: the random key of all trials, whose paths are not part of the estimate.
+    - `trial_key`: the random key of all trials, whose paths are not part of the estimate.
     """
 
     problem: Problem
     functions: FittedFunctions
-    outputs: tuple[int, int]
+    output_shape: tuple[int, int]
     struct: Averaged
-    key: PRNGKeyArray
+    trial_key: PRNGKeyArray
     devices: Devices
     batch_size: int
 
     def plan(
-        self, choice: Choice, usual: Usual, law: TrialLaw, num_samples: int
+        self,
+        choice: Choice,
+        usual_deviations: UsualDeviations,
+        law: TrialLaw,
+        num_samples: int,
     ) -> SamplingPlan:
         """The plan for paths whose noise has this law."""
+        # A `Partial` is a PyTree: a program is compiled once for all arrays in it.
         sampler = jtu.Partial(
-            controlled_paths, self.problem, self.functions, choice, usual, law
+            controlled_paths,
+            self.problem,
+            self.functions,
+            choice,
+            usual_deviations,
+            law,
         )
         return SamplingPlan(
             sampler,
@@ -157,36 +175,44 @@ class _Trials(NamedTuple):
             batch_size=self.batch_size,
             levels=len(self.problem.levels.h),
             struct=self.struct,
-            quick=True,
+            # These few paths take less time than compiling their program.
+            is_quick=True,
         )
 
-    def run(
-        self, choice: Choice, usual: Usual, law: TrialLaw, num_samples: int
+    def trial(
+        self,
+        choice: Choice,
+        usual_deviations: UsualDeviations,
+        law: TrialLaw,
+        num_samples: int,
     ) -> Expectation:
-        """An estimate from this number of paths."""
-        plan = self.plan(choice, usual, law, num_samples)
-        return run(plan, self.key, self.devices)
+        """An estimate from this number of paths, which are not part of the result."""
+        plan = self.plan(choice, usual_deviations, law, num_samples)
+        return run(plan, self.trial_key, self.devices)
 
-    def of_candidate(self, k: int, law: TrialLaw) -> Expectation:
-        """An estimate from one batch, with the same candidate for all components."""
-        choice = Choice(best=np.full(self.outputs, k), used=np.ones(self.outputs, bool))
+    def trial_of_candidate(self, candidate: int, law: TrialLaw) -> Expectation:
+        """A trial of one batch, with the same candidate for all components."""
+        choice = Choice(
+            best=np.full(self.output_shape, candidate),
+            used=np.ones(self.output_shape, bool),
+        )
         # The same program estimates tails, but nothing deviates by more than infinity.
-        shape = len(self.problem.weights), *self.outputs
+        shape = len(self.problem.weights), *self.output_shape
         dtype = self.problem.dtype
-        unlimited = Usual(
+        no_tails = UsualDeviations(
             center=np.zeros(shape, dtype), largest=np.full(shape, np.inf, dtype)
         )
-        return self.run(choice, unlimited, law, self.batch_size)
+        return self.trial(choice, no_tails, law, self.batch_size)
 
 
-def _flat(
+def _as_one_array(
     tree: PyTree[np.ndarray | np.floating],
-    outputs: tuple[int, int],
+    output_shape: tuple[int, int],
     *leading_axes: int,
 ) -> np.ndarray:
     """The arrays of a PyTree in the structure of `phi` as one array of shape
-    `(*leading_axes, S, m)`."""
-    num_times, _ = outputs
+    `(*leading_axes, S, m)`, where `output_shape` is `(S, m)`."""
+    num_times, _ = output_shape
     shape = *leading_axes, num_times, -1
     leaves = [np.reshape(leaf, shape) for leaf in jtu.tree_leaves(tree)]
     return np.concatenate(leaves, axis=-1)
@@ -196,71 +222,83 @@ class _Comparison(NamedTuple):
     """The candidates, compared by their trials, with axes for times and components.
 
     - `choice`: the best candidates, and where they are better than none.
-    - `errors`: the standard errors with them.
-    - `plain`: the standard errors without a control variate.
+    - `least_errors`: the standard errors with them.
+    - `plain_errors`: the standard errors without a control variate.
     - `mean`: the mean.
     """
 
     choice: Choice
-    errors: np.ndarray
-    plain: np.ndarray
-    mean: np.ndarray
+    least_errors: Float[np.ndarray, "S m"]
+    plain_errors: Float[np.ndarray, "S m"]
+    mean: Float[np.ndarray, "S m"]
 
     def remainder(self, dtype: Any) -> float:
         """The largest fraction of a standard error that is left with control."""
         # Where nothing is random, as for a constant `phi`, both errors are rounding errors.
-        is_random = self.plain > ROUNDING * jnp.finfo(dtype).eps * np.abs(self.mean)
-        errors = np.minimum(self.errors, self.plain)
-        fractions = errors / np.where(is_random, self.plain, 1)
+        rounding = ROUNDING * jnp.finfo(dtype).eps * np.abs(self.mean)
+        is_random = self.plain_errors > rounding
+        errors = np.minimum(self.least_errors, self.plain_errors)
+        fractions = errors / np.where(is_random, self.plain_errors, 1)
         return float(np.max(np.where(is_random, fractions, 0), initial=0.0))
 
 
-def _comparison(estimates: list[Expectation], outputs: tuple[int, int]) -> _Comparison:
-    """Compares the candidates, by estimates with one each."""
+def _comparison(
+    trials_of_candidates: list[Expectation], output_shape: tuple[int, int]
+) -> _Comparison:
+    """Compares the candidates, by a trial of each."""
     # (C, S, m)
-    all_errors = np.stack([_flat(x.std_error, outputs) for x in estimates])
+    errors = np.stack(
+        [_as_one_array(trial.std_error, output_shape) for trial in trials_of_candidates]
+    )
     # A candidate whose error is NaN has failed.
-    all_errors = np.nan_to_num(all_errors, nan=np.inf)
-    errors = np.min(all_errors, axis=0)
-    # Without control all estimates are the same.
-    first, *_ = estimates
+    errors = np.nan_to_num(errors, nan=np.inf)
+    least_errors = np.min(errors, axis=0)
+    # The trials have the same paths, so without control their results are the same.
+    first, *_ = trials_of_candidates
     results = combined_results(first, Combination.BEST)
-    plain = _flat(results.plain_std_error, outputs)
+    plain_errors = _as_one_array(results.plain_std_error, output_shape)
     # A fit is used where the error without it is NaN, too.
-    is_worse = errors >= plain
-    choice = Choice(best=np.argmin(all_errors, axis=0), used=~is_worse)
-    return _Comparison(choice, errors, plain, mean=_flat(first.mean, outputs))
+    is_worse = least_errors >= plain_errors
+    return _Comparison(
+        choice=Choice(best=np.argmin(errors, axis=0), used=~is_worse),
+        least_errors=least_errors,
+        plain_errors=plain_errors,
+        mean=_as_one_array(first.mean, output_shape),
+    )
 
 
 def _usual_deviations(
-    estimates: list[Expectation],
+    trials_of_candidates: list[Expectation],
     choice: Choice,
-    outputs: tuple[int, int],
+    output_shape: tuple[int, int],
     dtype: Any,
-) -> Usual:
-    """The mean without control and the largest deviations, by estimates with one candidate
-    each: for each component those with its best candidate, or without control."""
-    moments = [total(estimate.moments) for estimate in estimates]
-    first, *_ = moments
+) -> UsualDeviations:
+    """The mean without control and the largest deviations in the trials: for each component
+    those with its best candidate, or without control."""
+    moments_of_trials = [total(trial.moments) for trial in trials_of_candidates]
+    first, *_ = moments_of_trials
     num_combinations, *_ = jtu.tree_leaves(first.mean.value)[0].shape
 
-    def flat(tree: PyTree[np.ndarray]) -> np.ndarray:
-        return _flat(tree, outputs, num_combinations)
+    def as_one_array(tree: PyTree[np.ndarray]) -> np.ndarray:
+        return _as_one_array(tree, output_shape, num_combinations)
 
-    # Without control all estimates are the same.
-    center = flat(first.mean.plain)
-    largest_plain = flat(first.largest.plain)
+    # The trials have the same paths, so without control their results are the same.
+    center = as_one_array(first.mean.plain)
+    largest_plain = as_one_array(first.largest.plain)
     # (C, combinations, S, m)
-    with_candidates = np.stack([flat(x.largest.value) for x in moments])
+    largest_with_candidates = np.stack(
+        [as_one_array(moments.largest.value) for moments in moments_of_trials]
+    )
     best = np.asarray(choice.best)[None, None]
-    largest_with_best = np.take_along_axis(with_candidates, best, 0)[0]
+    largest_with_best = np.take_along_axis(largest_with_candidates, best, 0)[0]
     largest = np.where(choice.used, largest_with_best, largest_plain)
-    return Usual(center.astype(dtype), largest.astype(dtype))
+    return UsualDeviations(center.astype(dtype), largest.astype(dtype))
 
 
 def _reason(basis: AbstractBasis, choice: Choice) -> str:
     """Which candidates were chosen, with zero for none, such as
     `degree: 2, 4, chosen among 0, 2, 4`."""
+    # A candidate comes one place later here, behind the zero.
     options = np.array([0, *basis.candidates])
     chosen = np.unique(options[np.where(choice.used, choice.best + 1, 0)])
     return (
@@ -273,9 +311,10 @@ def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> FittedFu
     """The fits of all levels."""
     # Newton's method is a quarter of the time to compile a fit, and few of its states need
     # it. A state at which the sweeps fail is left out of the fit.
-    lean = dataclasses.replace(problem, solver=without_newton(problem.solver))
-    functions, num_failed = _fits_and_failures(lean, key, basis)
-    if num_failed == 0 or eqx.tree_equal(lean.solver, problem.solver):
+    sweeps_only = dataclasses.replace(problem, solver=without_newton(problem.solver))
+    functions, num_failed = _fits_and_failures(sweeps_only, key, basis)
+    has_no_newton = eqx.tree_equal(sweeps_only.solver, problem.solver)
+    if num_failed == 0 or has_no_newton:
         return functions
     # If paths of the pilot fail, steps are too long for sweeps: the fit is made again, with
     # Newton's method.
@@ -287,19 +326,20 @@ def _fits_and_failures(
     problem: Problem, key: PRNGKeyArray, basis: AbstractBasis
 ) -> tuple[FittedFunctions, int]:
     """The fits of all levels, and how many of the pilot's paths failed."""
-    functions = []
-    failures = []
+    functions_of_levels = []
+    failures_of_levels = []
     for index in range(len(problem.levels.h)):
-        on_level, failures_on_level = _fit_of_level(
-            problem, np.array([index]), key, basis
-        )
-        functions.append(on_level)
-        failures.append(failures_on_level)
-    check_untraced("`expectation`", failures)
-    num_failed = sum(map(int, failures))
-    if len(functions) == 1:
-        return functions[0], num_failed
-    return jtu.tree_map(lambda *xs: jnp.concatenate(xs), *functions), num_failed
+        # An array, by which one program fits all levels.
+        functions, num_failed = _fit_of_level(problem, np.array([index]), key, basis)
+        functions_of_levels.append(functions)
+        failures_of_levels.append(num_failed)
+    # The numbers are traced if a function of the user closes over traced values.
+    check_untraced("`expectation`", failures_of_levels)
+    num_failed = sum(map(int, failures_of_levels))
+    if len(functions_of_levels) == 1:
+        return functions_of_levels[0], num_failed
+    functions = jtu.tree_map(lambda *xs: jnp.concatenate(xs), *functions_of_levels)
+    return functions, num_failed
 
 
 @quickly_compiled

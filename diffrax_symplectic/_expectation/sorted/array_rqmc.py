@@ -1,5 +1,6 @@
 """Array-RQMC: all paths of a randomization step together, sorted before each step."""
 
+import functools as ft
 import math
 import warnings
 from collections.abc import Callable
@@ -24,7 +25,7 @@ from ..._brownian import (
 from ..._custom_types import Y
 from ..._simulation import (
     combinations,
-    independent_steps,
+    independent_motion,
     Level,
     mask_like,
     Motion,
@@ -44,7 +45,7 @@ from ..sampling import (
     saved_by_name,
 )
 from .hilbert import hilbert_order
-from .points import num_seeds, randomized, sobol_points
+from .points import balanced_in_sixths, num_seeds, scrambled, sobol_points
 
 
 # SciPy has direction numbers for this many coordinates of Sobol' points.
@@ -58,6 +59,25 @@ _FEWEST_ALONG_COORDINATE = 3
 # Folded into the key of a replicate to draw the starts of its paths. (Numbers of levels are
 # smaller.)
 _KEY_OF_STARTS = 0xFFFFFFFF
+
+
+def _warn_of_many_coordinates(
+    num_paths: int, num_coordinates: int, stacklevel: int
+) -> None:
+    """Warns if paths that are sorted by so many coordinates are far from their
+    neighbours."""
+    # If the paths fill a cube.
+    num_along_coordinate = num_paths ** (1 / num_coordinates)
+    if num_along_coordinate < _FEWEST_ALONG_COORDINATE:
+        most_coordinates = int(math.log(num_paths, _FEWEST_ALONG_COORDINATE))
+        warnings.warn(
+            f"{num_paths:,} paths are sorted by {num_coordinates} coordinates, which "
+            f"leaves {num_along_coordinate:.1f} along each: neighbours are far apart, and "
+            "`ArrayRQMC` gains little over `IndependentPaths`. Pass a `sort_by` that "
+            "returns the few coordinates that matter most, at most "
+            f"{most_coordinates}.",
+            stacklevel=stacklevel + 1,
+        )
 
 
 @saved_by_name
@@ -110,21 +130,9 @@ class ArrayRQMC(AbstractSampling):
         check_real("sort_by", jtu.tree_leaves(coordinates))
         num_coordinates = jax.eval_shape(lambda: real_vector(sort_by(problem.y0))).size
         points = jnp.asarray(sobol_points(self.num_paths, layout.num_words))
-
-        # The number of paths along each coordinate, if they fill a cube.
-        along_coordinate = self.num_paths ** (1 / num_coordinates)
-        if along_coordinate < _FEWEST_ALONG_COORDINATE:
-            most_coordinates = int(math.log(self.num_paths, _FEWEST_ALONG_COORDINATE))
-            warnings.warn(
-                f"{self.num_paths:,} paths are sorted by {num_coordinates} coordinates, "
-                f"which leaves {along_coordinate:.1f} along each: neighbours are far "
-                "apart, and `ArrayRQMC` gains little over `IndependentPaths`. Pass a "
-                "`sort_by` that returns the few coordinates that matter most, at most "
-                f"{most_coordinates}.",
-                stacklevel=5,
-            )
+        _warn_of_many_coordinates(self.num_paths, num_coordinates, stacklevel=5)
         return SamplingPlan(
-            jtu.Partial(_samples, problem, sort_by, points, layout),
+            jtu.Partial(_samples_of_replicate, problem, sort_by, points, layout),
             num_samples=self.replicates,
             # All paths of a replicate are solved at once, which is a batch already.
             batch_size=1,
@@ -134,8 +142,8 @@ class ArrayRQMC(AbstractSampling):
         )
 
 
-def _samples(
-    p: Problem,
+def _samples_of_replicate(
+    problem: Problem,
     sort_by: Callable[[Y], PyTree[Array]],
     points: UInt32[Array, "n d"],
     layout: "StepWords",
@@ -152,15 +160,17 @@ def _samples(
     # Starts are independent, rather than from Sobol' points, since a function of a key may
     # draw any number of random variables.
     start_keys = jr.split(jr.fold_in(replicate_key, _KEY_OF_STARTS), n)
-    starts = jax.vmap(p.draw_start)(start_keys)
+    starts = jax.vmap(problem.draw_start)(start_keys)
 
-    def begin(level: Level) -> Motion:
-        motion = independent_steps(
-            p,
+    def motion_on(level: Level) -> Motion:
+        motion = independent_motion(
+            problem,
             level,
             starts,
-            lambda words: with_words(p.terms, layout, words),
-            lambda i: _words_of_paths(replicate_key, level, i, points, layout.sixths),
+            terms_of=lambda words: with_words(problem.terms, layout, words),
+            randomness_of_step=ft.partial(
+                _words_of_paths, replicate_key, level, points, layout
+            ),
         )
 
         def step(i, paths):
@@ -168,19 +178,20 @@ def _samples(
 
         return Motion(step, motion.start)
 
-    simulated = simulate(p, begin, _statistics)
+    simulated = simulate(problem, motion_on, _statistics)
     # From (levels, S, 3, m) to (3, levels, S, n, m), with an axis for the samples, of which
     # there is one.
-    statistics = jnp.moveaxis(simulated.saved[:, :, :, None], 2, 0)
-    mean, r, largest = statistics
-    mean = p.combinations(mean)
+    mean, r, largest = jnp.moveaxis(simulated.saved[:, :, :, None], 2, 0)
+    mean = problem.combinations(mean)
     # The largest `r` on any level, for all combinations.
     r = jnp.broadcast_to(jnp.max(r, axis=0), mean.shape)
     # The most by which a path can deviate in a combination of levels: the largest
     # deviations on all of them may be deviations of one path.
-    largest = combinations(abs(p.weights), largest)
+    largest = combinations(abs(problem.weights), largest)
     averaged = Averaged(
-        p.shaped(mean), heaviness=p.shaped(r), largest=p.shaped(largest)
+        problem.unravel_samples(mean),
+        heaviness=problem.unravel_samples(r),
+        largest=problem.unravel_samples(largest),
     )
     num_failed = jnp.sum(simulated.failed, axis=1, keepdims=True)
     return Samples(averaged, good=jnp.ones(1, bool), num_failed=num_failed)
@@ -189,14 +200,17 @@ def _samples(
 def _words_of_paths(
     replicate_key: PRNGKeyArray,
     level: Level,
-    i: Any,
     points: UInt32[Array, "n d"],
-    sixths: bool,
+    layout: "StepWords",
+    i: Any,
 ) -> UInt32[Array, "n d"]:
     """The random words of each path in step `i`: the points, scrambled anew."""
     key = jr.fold_in(jr.fold_in(replicate_key, level.index), i)
     _, d = points.shape
-    return randomized(points, jr.bits(key, (num_seeds(d),), jnp.uint32), sixths)
+    seeds = jr.bits(key, (num_seeds(d),), jnp.uint32)
+    if layout.is_one_three_point_variable:
+        return balanced_in_sixths(points, seeds)
+    return scrambled(points, seeds)
 
 
 def _sorted_paths(
@@ -210,13 +224,14 @@ def _sorted_paths(
 
 def _statistics(phi: Float[Array, "n m"], failed: Bool[Array, " n"]) -> Array:
     """The mean over the paths that have not failed, their `heaviness`, and the largest
-    deviation of one of them from the mean, along a leading axis."""
+    deviation of one of them from the mean, along a leading axis. The number of paths is a
+    power of two."""
     is_good = mask_like(~failed, phi)
     num_good = jnp.sum(~failed).astype(phi.dtype)
 
     def mean_of_good(x: Float[Array, "n m"]) -> Float[Array, " m"]:
         # The sum has two stages, so that rounding errors in single precision do not add up.
-        # The number of paths is a power of two, and about its root are summed in each.
+        # About the root of the number of paths are summed in each.
         num_rows = 2 ** ((len(x).bit_length() - 1) // 2)
         rows = jnp.where(is_good, x, 0).reshape(num_rows, -1, *x.shape[1:])
         return jnp.sum(jnp.sum(rows, axis=0), axis=0) / num_good
@@ -226,7 +241,8 @@ def _statistics(phi: Float[Array, "n m"], failed: Bool[Array, " n"]) -> Array:
     largest = jnp.max(deviations, axis=0)
     # The standard deviation is in units of the largest deviation, which is then 1, so that
     # squares neither overflow nor underflow.
-    s = jnp.sqrt(mean_of_good((deviations / jnp.where(largest > 0, largest, 1)) ** 2))
+    scaled = deviations / jnp.where(largest > 0, largest, 1)
+    s = jnp.sqrt(mean_of_good(scaled**2))
     # Rounding errors can have heavy tails, too.
     is_random = largest > ROUNDING * jnp.finfo(phi.dtype).eps * jnp.abs(mean)
     r = jnp.where(is_random, heaviness(1, s, num_good, jnp), 0)
@@ -238,12 +254,13 @@ class StepWords(NamedTuple):
 
     - `slices`: the first word of each path, and one past the last.
     - `num_words`: the number of all words.
-    - `sixths`: whether all that is drawn is one three-point variable, as in `randomized`.
+    - `is_one_three_point_variable`: whether nothing else is drawn. Then the words are
+        `balanced_in_sixths`.
     """
 
     slices: tuple[tuple[int, int], ...]
     num_words: int
-    sixths: bool
+    is_one_three_point_variable: bool
 
 
 def step_words(terms: PyTree[diffrax.AbstractTerm]) -> StepWords:
@@ -255,12 +272,13 @@ def step_words(terms: PyTree[diffrax.AbstractTerm]) -> StepWords:
     slices: list[tuple[int, int]] = []
     num_words = 0
     for path_number, path in zip(path_numbers(paths), paths):
+        # A Brownian motion that was met before keeps its words; a new one takes the next.
         start = first_words.setdefault(path_number, num_words)
         end = start + path.num_words(use_levy=True)
         slices.append((start, end))
         num_words = max(num_words, end)
-    sixths = num_words == 1 and paths[0].laws == {"W": THREE_POINT}
-    return StepWords(tuple(slices), num_words, sixths)
+    is_one_three_point = num_words == 1 and paths[0].laws == {"W": THREE_POINT}
+    return StepWords(tuple(slices), num_words, is_one_three_point)
 
 
 def with_words(
@@ -299,10 +317,10 @@ def _state_itself(y: Y) -> Y:
 def _checked_num_paths(value: Any) -> int:
     """The value as an integer. Raises a `ValueError` unless it is a power of two."""
     num_paths = whole_number("num_paths", value, 2)
-    below = 2 ** (num_paths.bit_length() - 1)
-    if num_paths != below:
+    power_below = 2 ** (num_paths.bit_length() - 1)
+    if num_paths != power_below:
         raise ValueError(
             "`num_paths` must be a power of two, for which Sobol' points are balanced; got "
-            f"{num_paths}. Pass {below} or {2 * below}."
+            f"{num_paths}. Pass {power_below} or {2 * power_below}."
         )
     return num_paths

@@ -15,33 +15,51 @@ _COORDINATE_BITS = 16
 # About how many states the range of a coordinate is estimated from, and the share of them
 # that is left out at either end. The range need not be accurate: the grid is three times as
 # wide.
-_SAMPLE = 256
-_OUTLIERS = 1 / 50
-# The bits of an unsigned integer, less the highest, which marks the rows at the end.
-_BITS_OF_64 = 63
-_BITS_OF_32 = 31
+_SAMPLE_SIZE = 256
+_SHARE_OF_OUTLIERS = 1 / 50
+# The bits of an unsigned integer of 64 or 32 bits, less the highest, which marks the rows
+# at the end.
+_BITS_OF_UINT64 = 63
+_BITS_OF_UINT32 = 31
 
 
 def hilbert_order(
-    z: Float[Array, "n d"], last: Bool[Array, " n"]
+    z: Float[Array, "n d"], is_last: Bool[Array, " n"]
 ) -> Int32[Array, " n"]:
-    """The indices of the rows of `z` in order along Hilbert's curve, with the rows marked
-    `last` at the end."""
-    n, _ = z.shape
+    """The indices of the rows of `z`, the coordinates of states, in order along Hilbert's
+    curve, with the rows marked `is_last` at the end."""
     has_64_bits = jnp.result_type(float) == np.float64
-    if not has_64_bits:
-        place = _places_on_curve(_cells(z, _BITS_OF_32), _BITS_OF_32, jnp.uint32)
-        place = jnp.where(last, np.uint32(2**_BITS_OF_32), place)
-        rows = jnp.arange(n, dtype=jnp.int32)
-        _, order = lax.sort((place, rows), num_keys=1)
-        return order
+    return (
+        _order_by_64_bits(z, is_last) if has_64_bits else _order_by_32_bits(z, is_last)
+    )
+
+
+def _order_by_32_bits(
+    z: Float[Array, "n d"], is_last: Bool[Array, " n"]
+) -> Int32[Array, " n"]:
+    """`hilbert_order` by 32-bit integers."""
+    bits = _BITS_OF_UINT32
+    places = _places_on_curve(_cells(z, bits), bits, jnp.uint32)
+    # Beyond all places on the curve.
+    places = jnp.where(is_last, np.uint32(2**bits), places)
+    rows = jnp.arange(len(z), dtype=jnp.int32)
+    _, order = lax.sort((places, rows), num_keys=1)
+    return order
+
+
+def _order_by_64_bits(
+    z: Float[Array, "n d"], is_last: Bool[Array, " n"]
+) -> Int32[Array, " n"]:
+    """`hilbert_order` by 64-bit integers."""
     # On CPUs XLA sorts a single array of unsigned integers ten times as fast as anything
     # else, so the row's number is packed into the bits below its place on the curve.
+    n, _ = z.shape
     row_bits = (n - 1).bit_length()
-    place_bits = _BITS_OF_64 - row_bits
-    place = _places_on_curve(_cells(z, place_bits), place_bits, jnp.uint64)
-    place = jnp.where(last, np.uint64(2**place_bits), place)
-    packed = (place << np.uint64(row_bits)) | jnp.arange(n, dtype=jnp.uint64)
+    place_bits = _BITS_OF_UINT64 - row_bits
+    places = _places_on_curve(_cells(z, place_bits), place_bits, jnp.uint64)
+    # Beyond all places on the curve.
+    places = jnp.where(is_last, np.uint64(2**place_bits), places)
+    packed = (places << np.uint64(row_bits)) | jnp.arange(n, dtype=jnp.uint64)
     packed = jnp.sort(packed)
     return (packed & np.uint64(2**row_bits - 1)).astype(jnp.int32)
 
@@ -58,16 +76,17 @@ def _cells(z: Float[Array, "n d"], total_bits: int) -> list[UInt32[Array, " n"]]
     The grid is three times as wide as the range of nearly all states, and outliers are
     clipped to its edges, so that they do not coarsen it.
     """
-    n, d = z.shape
-    d = min(d, total_bits)
+    n, num_coordinates = z.shape
+    d = min(num_coordinates, total_bits)
     bits = _bits_of_coordinate(d, total_bits)
     z = jnp.nan_to_num(z[:, :d])
-    sample = jnp.sort(z[:: max(1, n // _SAMPLE)], axis=0)
-    num_outliers = int(len(sample) * _OUTLIERS)
+    # Each so many of the states, each coordinate sorted by itself.
+    sample = jnp.sort(z[:: max(1, n // _SAMPLE_SIZE)], axis=0)
+    num_outliers = int(len(sample) * _SHARE_OF_OUTLIERS)
     low = sample[num_outliers]
     high = sample[-1 - num_outliers]
     width = jnp.where(high > low, high - low, 1)
-    # From 0 to 1 in the first third of the grid, from 1 to 2 between `low` and `high`.
+    # The place in the grid, in thirds of the grid: from 1 to 2 between `low` and `high`.
     thirds = (z - low) / width + 1
     cells = thirds * np.asarray(2.0**bits / 3, z.dtype)
     # Integers of at most 16 bits are exact in single precision.
@@ -78,19 +97,19 @@ def _cells(z: Float[Array, "n d"], total_bits: int) -> list[UInt32[Array, " n"]]
 def _places_on_curve(
     cells: list[UInt32[Array, " n"]], total_bits: int, dtype: Any
 ) -> UInt[Array, " n"]:
-    """The place of each cell along Hilbert's curve, by the algorithm of
-    [Skilling (2004)](https://doi.org/10.1063/1.1751381)."""
+    """The place of each cell along Hilbert's curve, an integer of this dtype, by the
+    algorithm of [Skilling (2004)](https://doi.org/10.1063/1.1751381)."""
     bits = _bits_of_coordinate(len(cells), total_bits)
     # In one dimension the curve is the line itself.
     transposed = cells if len(cells) == 1 else _transposed_place(cells, bits)
     # The bits of the place are dealt out in turn to the numbers in `transposed`, the
     # highest first. Here they are collected again.
-    place = jnp.zeros(transposed[0].shape, dtype)
+    places = jnp.zeros(transposed[0].shape, dtype)
     for b in range(bits - 1, -1, -1):
         for number in transposed:
             bit = ((number >> np.uint32(b)) & np.uint32(1)).astype(dtype)
-            place = (place << np.asarray(1, dtype)) | bit
-    return place
+            places = (places << np.asarray(1, dtype)) | bit
+    return places
 
 
 def _transposed_place(
@@ -98,7 +117,8 @@ def _transposed_place(
 ) -> list[UInt32[Array, " n"]]:
     """The place along the curve in Skilling's transposed form: one number of `bits` bits
     for each coordinate, to which the bits of the place are dealt out in turn. (This is
-    `AxestoTranspose` of the paper, with `x` for its `X`.)"""
+    `AxestoTranspose` of the paper, with `x` for its `X`, `bit` for `Q`, `below` for `P` and
+    `flips` for `t`.)"""
     x = [*cells]
     for b in range(bits - 1, 0, -1):
         bit = np.uint32(1 << b)
@@ -106,9 +126,9 @@ def _transposed_place(
         for i in range(len(x)):
             # Invert the lower bits of the first coordinate, or exchange them with the lower
             # bits of this one.
-            inverts = (x[i] & bit) != 0
-            exchanged = jnp.where(inverts, np.uint32(0), (x[0] ^ x[i]) & below)
-            x[0] = x[0] ^ jnp.where(inverts, below, exchanged)
+            is_inverted = (x[i] & bit) != 0
+            exchanged = jnp.where(is_inverted, np.uint32(0), (x[0] ^ x[i]) & below)
+            x[0] = x[0] ^ jnp.where(is_inverted, below, exchanged)
             if i > 0:
                 x[i] = x[i] ^ exchanged
     # Decode the Gray code.
@@ -118,5 +138,6 @@ def _transposed_place(
     for b in range(bits - 1, 0, -1):
         below = np.uint32((1 << b) - 1)
         is_set = (x[-1] & np.uint32(1 << b)) != 0
+        # The bits of the last number flip all lower bits of all numbers.
         flips = flips ^ jnp.where(is_set, below, np.uint32(0))
     return [coordinate ^ flips for coordinate in x]

@@ -1,6 +1,7 @@
 """Randomized low-discrepancy points, as random 32-bit words."""
 
 import functools as ft
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Array, UInt32
 
 # The number of consecutive points among which a single three-point variable is balanced:
 # its outer values have probability one sixth.
-_SIX = 6
+_BLOCK = 6
 
 
 # Only the last set of points is kept, since one may take a gigabyte.
@@ -41,6 +42,10 @@ def nested_scramble(
     not at random, as a function of the bits above it. For each seed this is a bijection
     which maps intervals of length `2^-k` to such intervals, for all `k`.
 
+    It is a bijection since each of its parts is one: a sum; a product with an odd number;
+    and `x ^ (x * c)` with an even `c`, where a bit of the result is the same bit of `x`,
+    flipped or not by the bits below it.
+
     Section 4 of [Laine and Karras (2011)](https://doi.org/10.1111/j.1467-8659.2011.01978.x)
     and [Burley (2020)](https://jcgt.org/published/0009/04/01/), with the constants of
     Vegdahl (2021).
@@ -68,63 +73,101 @@ def _reverse_bits(words: UInt32[Array, "..."]) -> UInt32[Array, "..."]:
     return (words >> np.uint32(16)) | (words << np.uint32(16))
 
 
+class _Seeds(NamedTuple):
+    """The random words of one randomization.
+
+    - `of_indices`: scrambles the indices of the points.
+    - `of_coordinates`: scramble the coordinates.
+    - `shifts`: shift the coordinates.
+    - `first_index`: for `balanced_in_sixths`, the index of the first point.
+    - `place_in_block`: for `balanced_in_sixths`, the place of this point in its block.
+    """
+
+    of_indices: UInt32[Array, ""]
+    of_coordinates: UInt32[Array, " d"]
+    shifts: UInt32[Array, " d"]
+    first_index: UInt32[Array, ""]
+    place_in_block: UInt32[Array, ""]
+
+    @staticmethod
+    def of(words: UInt32[Array, " s"], dimension: int) -> "_Seeds":
+        """The seeds from `num_seeds(dimension)` random words."""
+        return _Seeds(
+            of_indices=words[0],
+            of_coordinates=words[1 : 1 + dimension],
+            shifts=words[1 + dimension : 1 + 2 * dimension],
+            first_index=words[-2],
+            place_in_block=words[-1],
+        )
+
+
 def num_seeds(dimension: int) -> int:
-    """The number of random words that `randomized` needs."""
+    """The number of random words that a randomization needs, as in `_Seeds`."""
     for_indices = 1
     # One to scramble each coordinate, and one to shift it.
     for_coordinates = 2 * dimension
-    # One for the first block of six, and one for the place in it.
+    # One for the first index, and one for its place in a block.
     for_blocks = 2
     return for_indices + for_coordinates + for_blocks
 
 
-def randomized(
-    points: UInt32[Array, "n d"], seeds: UInt32[Array, " s"], sixths: bool = False
+def scrambled(
+    points: UInt32[Array, "n d"], seeds: UInt32[Array, " s"]
 ) -> UInt32[Array, "n d"]:
-    """The points of `sobol_points`, scrambled. Each word is exactly uniform.
+    """The points of `sobol_points`, scrambled, with `num_seeds(d)` random words for seeds.
+    Each word is exactly uniform.
 
     The indices of the points are scrambled as well as their coordinates. Otherwise
     neighbours would have complementary coordinates in the same order everywhere, and errors
     that alternate along the sorted paths would add up.
-
-    `sixths` is for a single coordinate of which only the first sixth, the last sixth and
-    the range between are told apart. A power of two is not divisible by six, so of each six
-    consecutive points the smallest becomes the first word of the range, the largest the
-    last, and the others the middle.
     """
     n, d = points.shape
-    if not sixths or n < _SIX:
-        return _scrambled(points, jnp.arange(n, dtype=jnp.uint32), seeds)
+    indices = jnp.arange(n, dtype=jnp.uint32)
+    return _scrambled_points(points, indices, _Seeds.of(seeds, d))
+
+
+def balanced_in_sixths(
+    points: UInt32[Array, "n 1"], seeds: UInt32[Array, " s"]
+) -> UInt32[Array, "n 1"]:
+    """As `scrambled`, for a single coordinate of which only the first sixth, the last sixth
+    and the range between are told apart. Up to rounding, 1e-9, these have the probabilities
+    1/6, 1/6 and 2/3.
+
+    A power of two is not divisible by six, so of each six consecutive points the smallest
+    becomes the first word of the range, the largest the last, and the others the middle.
+    """
+    n, d = points.shape
+    if n < _BLOCK:
+        return scrambled(points, seeds)
     # The first point and its place in its block are random. So each point has the same law,
     # and is the smallest of its block with probability 1/6.
-    start = seeds[-2]
-    offset = seeds[-1] % np.uint32(_SIX)
+    parts = _Seeds.of(seeds, d)
+    place_in_block = parts.place_in_block % np.uint32(_BLOCK)
     # `n` points are in at most `n // 6 + 2` blocks, wherever the first one begins.
-    num_blocks = n // _SIX + 2
-    numbers = jnp.arange(_SIX * num_blocks, dtype=jnp.uint32) + start
+    num_blocks = n // _BLOCK + 2
+    places = jnp.arange(_BLOCK * num_blocks, dtype=jnp.uint32)
     # The points in turn, beginning again after the last (`n` is a power of two).
-    words = _scrambled(points, numbers & np.uint32(n - 1), seeds)
-    words = words.reshape(num_blocks, _SIX)
-    is_smallest = words == jnp.min(words, axis=1, keepdims=True)
-    is_largest = words == jnp.max(words, axis=1, keepdims=True)
-    words = jnp.where(is_largest, np.uint32(2**32 - 1), np.uint32(2**31))
-    words = jnp.where(is_smallest, np.uint32(0), words).reshape(-1, d)
-    return lax.dynamic_slice_in_dim(words, offset.astype(jnp.int32), n)
+    indices = (places + parts.first_index) & np.uint32(n - 1)
+    words = _scrambled_points(points, indices, parts)
+    blocks = words.reshape(num_blocks, _BLOCK)
+    is_smallest = blocks == jnp.min(blocks, axis=1, keepdims=True)
+    is_largest = blocks == jnp.max(blocks, axis=1, keepdims=True)
+    middle_or_last = jnp.where(is_largest, np.uint32(2**32 - 1), np.uint32(2**31))
+    balanced = jnp.where(is_smallest, np.uint32(0), middle_or_last).reshape(-1, d)
+    return lax.dynamic_slice_in_dim(balanced, place_in_block.astype(jnp.int32), n)
 
 
-def _scrambled(
-    points: UInt32[Array, "n d"],
-    numbers: UInt32[Array, " m"],
-    seeds: UInt32[Array, " s"],
-) -> UInt32[Array, "m d"]:
-    """The points with these numbers, both the numbers and the points scrambled."""
-    n, d = points.shape
-    # Numbers below `n`, a power of two, have `n.bit_length() - 1` of the 32 bits of a word.
+def _scrambled_points(
+    points: UInt32[Array, "n d"], indices: UInt32[Array, " k"], seeds: _Seeds
+) -> UInt32[Array, "k d"]:
+    """The points with these indices, with both the indices and the points scrambled."""
+    n, _ = points.shape
+    # Indices below `n`, a power of two, have `n.bit_length() - 1` of the 32 bits of a word.
     # They are scrambled as the leading bits.
     unused_bits = np.uint32(33 - n.bit_length())
-    numbers = nested_scramble(numbers << unused_bits, seeds[0]) >> unused_bits
-    scrambling_seeds = seeds[1 : 1 + d]
-    shifts = seeds[1 + d : 1 + 2 * d]
-    words = nested_scramble(points[numbers.astype(jnp.int32)], scrambling_seeds)
+    leading = nested_scramble(indices << unused_bits, seeds.of_indices)
+    scrambled_indices = leading >> unused_bits
+    chosen_points = points[scrambled_indices.astype(jnp.int32)]
+    words = nested_scramble(chosen_points, seeds.of_coordinates)
     # The hash of one seed is not quite uniform; a digital shift makes it so.
-    return words ^ shifts
+    return words ^ seeds.shifts
