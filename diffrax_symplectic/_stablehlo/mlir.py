@@ -63,7 +63,7 @@ def attribute_integers(op: Any, name: str) -> list[int]:
     return [int(i) for i in op.attributes[name]]
 
 
-def attribute_rows(op: Any, name: str) -> np.ndarray:
+def attribute_matrix(op: Any, name: str) -> np.ndarray:
     """An attribute of MLIR that is a matrix of integers."""
     return np.asarray(op.attributes[name])
 

@@ -24,7 +24,7 @@ def rule_of(name: str) -> Rule | None:
     if of_real is None and of_complex is None:
         return RULES.get(name)
 
-    def entry_by_entry(o: Operation, *xs: Tensor) -> list[Tensor]:
+    def entry_by_entry(operation: Operation, *xs: Tensor) -> list[Tensor]:
         """The rule that applies the function of this name to each entry."""
         if name == "select" and same_table(xs[1], xs[2]):
             # `vmap` of a conditional selects between two equal tables: one stays in memory.
@@ -34,14 +34,16 @@ def rule_of(name: str) -> Rule | None:
         function = of_complex if has_complex_operand else of_real
         if function is None:
             kind = "complex" if has_complex_operand else "real"
-            raise NotReplayed(o.op, f"`{o.op.name}` of {kind} numbers")
+            raise NotReplayed(
+                operation.mlir_op, f"`{operation.full_name}` of {kind} numbers"
+            )
 
         def apply(*entries: Any) -> Any:
             # Dr.Jit's sine is wrong beyond some angle. Lanes with a larger angle fail, and
             # JAX simulates their paths again.
             lanes = lanes_with_too_large_angle(name, *entries)
             if lanes is not None:
-                o.fail(lanes)
+                operation.fail(lanes)
             return function(*entries)
 
         return [each(apply, *xs)]
