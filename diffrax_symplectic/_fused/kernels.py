@@ -14,15 +14,15 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 from .._compat import frozen, variable_number
 from .._custom_types import RealScalarLike
 from .._stablehlo import (
+    array_in_memory,
     array_types,
     ArrayType,
     chosen,
     drjit,
-    flat,
-    in_memory,
+    entries_of,
     merged,
     scalar,
-    unflat,
+    tensors_from,
 )
 from .path_functions import PathFunctions
 from .program import as_numbers, entry_kinds, pack, Program, shapes_of, unpack
@@ -109,7 +109,9 @@ class Kernels:
         # The results of a step are the state, the solver state, and whether it succeeded.
         first_result = len(self._step.types["y"])
         # For each array of the new solver state, the number of the argument that it is.
-        sources = self._step.replay.handed_on[first_result : first_result + num_arrays]
+        sources = self._step.replay.returned_arguments[
+            first_result : first_result + num_arrays
+        ]
         return [
             self._functions.paths_differ or source != first_argument + k
             for k, source in enumerate(sources)
@@ -194,7 +196,10 @@ class Kernels:
             # (entries, paths) for each array
             matrices = [as_numbers(x).reshape(num_paths, -1).T for x in arrays]
             rows = [row for matrix in matrices for row in matrix]
-            return [in_memory(kind, row) for kind, row in zip(kinds, rows, strict=True)]
+            return [
+                array_in_memory(kind, row)
+                for kind, row in zip(kinds, rows, strict=True)
+            ]
         entries = [entry for x in arrays for entry in as_numbers(x).flat]
         return [
             drjit().opaque(array_types()[kind], entry.item(), num_paths)
@@ -231,7 +236,7 @@ class Kernels:
         as Dr.Jit records their computation."""
         arrays_and_key = unpack(self._types_for_keys, packed)
         keys, _ = self._path_keys.replay(*arrays_and_key, scalar(high), scalar(low))
-        return [*flat(keys)]
+        return [*entries_of(keys)]
 
     def _record_steps(
         self,
@@ -253,7 +258,7 @@ class Kernels:
         shared = unpack(self._types_of_shared, packed)
         arrays = shared[:num_arrays]
         h, *fixed = shared[num_arrays:]
-        own_tensors = unflat(own, shapes_of(step.types["own"]))
+        own_tensors = tensors_from(own, shapes_of(step.types["own"]))
         shapes_of_y = shapes_of(step.types["y"])
         shapes_of_moving = shapes_of(self._types_of_moving)
 
@@ -263,8 +268,8 @@ class Kernels:
         # The entries are those of `y`, followed by those of the moving solver state.
         def after_step(i: Any, stopped: Any, *entries: Any) -> tuple[Any, ...]:
             remaining_entries = iter(entries)
-            y_tensors = unflat(remaining_entries, shapes_of_y)
-            moving = unflat(remaining_entries, shapes_of_moving)
+            y_tensors = tensors_from(remaining_entries, shapes_of_y)
+            moving = tensors_from(remaining_entries, shapes_of_moving)
             whole_solver_state = merged(self._is_moving, moving, fixed)
             results, errors = step.replay(
                 *arrays,
@@ -282,7 +287,7 @@ class Kernels:
                 stopped = stopped | is_failed
             new_y = states[: len(y_tensors)]
             new_moving = chosen(states[len(y_tensors) :], self._is_moving)
-            new_entries = [*flat(new_y), *flat(new_moving)]
+            new_entries = [*entries_of(new_y), *entries_of(new_moving)]
             # A path that stopped stays where it was: its numbers could be NaN, with which
             # sweeps end last.
             kept = [select(stopped, old, new) for old, new in zip(entries, new_entries)]

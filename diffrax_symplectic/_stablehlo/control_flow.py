@@ -6,7 +6,16 @@ from typing import Any, TypeAlias
 from .backend import array_types, drjit
 from .mlir import block_of, call_target, operations_in
 from .operation import Operation, rule
-from .tensor import as_own_literal, chosen, copied, flat, known, merged, Tensor, unflat
+from .tensor import (
+    as_own_literal,
+    chosen,
+    copied_entries,
+    entries_of,
+    known_values,
+    merged,
+    Tensor,
+    tensors_from,
+)
 
 
 # Runs a branch of a conditional and returns the entries of its results.
@@ -39,7 +48,7 @@ def _raises(region: Any) -> bool:
 def _case(operation: Operation, index: Tensor) -> list[Tensor]:
     regions = operation.mlir_op.regions
     last = len(regions) - 1
-    value = known(index)
+    value = known_values(index)
     if value is not None:
         # An index that is out of range stands for the last branch.
         return operation.run(int(value) if 0 <= value <= last else last, [])
@@ -51,7 +60,7 @@ def _case(operation: Operation, index: Tensor) -> list[Tensor]:
         else:
             branches.append(i)
     results = _results_of_branch(operation, index.item(), branches)
-    return unflat(results, operation.shapes)
+    return tensors_from(results, operation.shapes)
 
 
 def _results_of_branch(
@@ -63,7 +72,7 @@ def _results_of_branch(
     first, *others = branches
 
     def run_first() -> tuple[Any, ...]:
-        return copied(operation.run(first, []))
+        return copied_entries(operation.run(first, []))
 
     def run_one_of_others() -> tuple[Any, ...]:
         return _results_of_branch(operation, index, others)
@@ -105,20 +114,20 @@ def _returning_failures(operation: Operation, branch: _RunBranch) -> _RunBranch:
 
 @rule
 def _if(operation: Operation, condition: Tensor) -> list[Tensor]:
-    value = known(condition)
+    value = known_values(condition)
     if value is not None:
         return operation.run(_IF_TRUE if value else _IF_FALSE, [])
 
     def if_true() -> tuple[Any, ...]:
-        return copied(operation.run(_IF_TRUE, []))
+        return copied_entries(operation.run(_IF_TRUE, []))
 
     def if_false() -> tuple[Any, ...]:
-        return copied(operation.run(_IF_FALSE, []))
+        return copied_entries(operation.run(_IF_FALSE, []))
 
     # With `select` in its place both branches run: the midpoint rule, whose sweeps have
     # such branches, took 21 ns a step in place of 13.
     results = _conditional(operation, condition.item(), if_true, if_false)
-    return unflat(results, operation.shapes)
+    return tensors_from(results, operation.shapes)
 
 
 # The most iterations to unroll, of a loop whose condition is known.
@@ -131,7 +140,7 @@ _MOST_UNROLLED_OF_INDICES = 32
 @rule
 def _while(operation: Operation, *xs: Tensor) -> list[Tensor]:
     changes = _which_change(operation)
-    changing_entries = flat(chosen(xs, changes))
+    changing_entries = entries_of(chosen(xs, changes))
     has_only_indices = not any(map(drjit().is_float_v, changing_entries))
     most = _MOST_UNROLLED_OF_INDICES if has_only_indices else _MOST_UNROLLED
     state = [*xs]
@@ -139,7 +148,7 @@ def _while(operation: Operation, *xs: Tensor) -> list[Tensor]:
     # then, or after too many, are a loop of the kernel.
     for _ in range(most):
         (condition,) = operation.run(_CONDITION, state)
-        goes_on = known(condition)
+        goes_on = known_values(condition)
         if goes_on is None:
             break
         if not goes_on:
@@ -167,7 +176,7 @@ def _loop(
     shapes = [x.shape for x in variables]
 
     def whole_state(entries: Iterable[Any]) -> list[Tensor]:
-        return merged(changes, unflat(entries, shapes), constants)
+        return merged(changes, tensors_from(entries, shapes), constants)
 
     # Beside the entries, Dr.Jit's loop has in its state the mask of the lanes that failed
     # so far.
@@ -183,12 +192,12 @@ def _loop(
         new_state, fails_now = operation.with_failures(
             lambda: operation.run(_BODY, whole_state(entries))
         )
-        return failed | fails_now, *copied(chosen(new_state, changes))
+        return failed | fails_now, *copied_entries(chosen(new_state, changes))
 
     # Where no lane can fail, Dr.Jit leaves the mask out.
     no_lane = array_types()["i1"](False)
     results = drjit().while_loop(
-        (no_lane, *flat(variables)), goes_on, iterate, mode="symbolic"
+        (no_lane, *entries_of(variables)), goes_on, iterate, mode="symbolic"
     )
     failed, *entries = map(as_own_literal, results)
     operation.fail(failed)

@@ -11,7 +11,7 @@ from .backend import array_types, drjit
 from .complex import equal, is_complex
 from .integers import to_integer
 from .operation import NotReplayed, Operation, rule
-from .tensor import constant, each, flat, Tensor
+from .tensor import constant, entries_of, map_entries, Tensor
 
 
 @rule
@@ -59,7 +59,7 @@ def _reverse(operation: Operation, x: Tensor) -> list[Tensor]:
 
 @rule
 def _concatenate(operation: Operation, *xs: Tensor) -> list[Tensor]:
-    whole = Tensor([*flat(xs)], ())
+    whole = Tensor([*entries_of(xs)], ())
     # Where the entries of each array begin in the list of all.
     begins = np.cumsum([0, *[len(x.entries) for x in xs]])
     places = [x.places + begin for x, begin in zip(xs, begins)]
@@ -91,7 +91,7 @@ def _pad(operation: Operation, x: Tensor, value: Tensor) -> list[Tensor]:
 
 @rule
 def _convert(operation: Operation, x: Tensor) -> list[Tensor]:
-    return [each(ft.partial(_converted, operation.kind), x)]
+    return [map_entries(ft.partial(_converted, operation.kind), x)]
 
 
 def _converted(kind: type, entry: Any) -> Any:
@@ -117,12 +117,12 @@ def _bitcast_convert(operation: Operation, x: Tensor) -> list[Tensor]:
     def reinterpreted(entry: Any) -> Any:
         return drjit().reinterpret_array(operation.kind, entry)
 
-    return [each(reinterpreted, x)]
+    return [map_entries(reinterpreted, x)]
 
 
 @rule
 def _complex(operation: Operation, real: Tensor, imag: Tensor) -> list[Tensor]:
-    return [each(operation.kind, real, imag)]
+    return [map_entries(operation.kind, real, imag)]
 
 
 @rule
@@ -131,17 +131,19 @@ def _compare(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
     direction = operation.word("comparison_direction").lower()
     compare = getattr(operator, direction)
     if operation.has("compare_type") and operation.word("compare_type") == "TOTALORDER":
-        a = each(_in_total_order, a)
-        b = each(_in_total_order, b)
+        a = map_entries(_in_total_order, a)
+        b = map_entries(_in_total_order, b)
     # All entries are of one type.
     if is_complex(a.entries[0]):
         # Complex numbers have no order: the direction is `eq` or `ne`.
-        is_equal = each(equal, a, b)
-        return [is_equal if direction == "eq" else each(operator.invert, is_equal)]
+        is_equal = map_entries(equal, a, b)
+        return [
+            is_equal if direction == "eq" else map_entries(operator.invert, is_equal)
+        ]
     if direction == "ne":
         # NaN differs from everything. In Dr.Jit NaN != NaN is false, unless it is folded.
-        return [each(operator.invert, each(operator.eq, a, b))]
-    return [each(compare, a, b)]
+        return [map_entries(operator.invert, map_entries(operator.eq, a, b))]
+    return [map_entries(compare, a, b)]
 
 
 def _in_total_order(a: Any) -> Any:

@@ -14,7 +14,7 @@ from .backend import drjit
 from .complex import is_complex
 from .elementwise import is_zero
 from .operation import NotReplayed, ONLY_REGION, Operation, rule
-from .tensor import known, scalar, Tensor
+from .tensor import known_values, scalar, Tensor
 
 
 # The most numbers to sort: exchanges grow with the square of the number.
@@ -143,7 +143,7 @@ def _changes_nothing(operation: Operation, initial: Sequence[Tensor]) -> bool:
     """Whether a reduction starts from the neutral element of its operation."""
     if len(initial) > 1:
         return False
-    value = known(initial[0])
+    value = known_values(initial[0])
     repeated = operation.reduces_by
     if value is None or repeated is None:
         return False

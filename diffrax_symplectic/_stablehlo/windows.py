@@ -20,7 +20,15 @@ import numpy as np
 from .backend import array_types, drjit
 from .elementwise import elementwise
 from .operation import NotReplayed, ONLY_REGION, Operation, rule
-from .tensor import constant, each, flat, known, scalar, Table, Tensor
+from .tensor import (
+    constant,
+    entries_of,
+    known_values,
+    map_entries,
+    scalar,
+    Table,
+    Tensor,
+)
 
 
 # The most windows among which one is selected by its index. Each costs a selection of every
@@ -58,7 +66,7 @@ _StartsAlongAxis: TypeAlias = Callable[[Tensor, int], list[_PossibleStart]]
 def _clipped_starts(start: Tensor, last: int) -> list[_PossibleStart]:
     """The indices from 0 to `last` at which a window may begin along an axis. An index out
     of range counts as the nearest of these."""
-    value = known(start)
+    value = known_values(start)
     if value is not None:
         return [_PossibleStart(int(np.clip(value, 0, last)), True)]
     if last == 0:
@@ -71,7 +79,7 @@ def _clipped_starts(start: Tensor, last: int) -> list[_PossibleStart]:
 
 def _starts_in_range(start: Tensor, last: int) -> list[_PossibleStart]:
     """As `_clipped_starts`, but a window whose index is out of range begins nowhere."""
-    value = known(start)
+    value = known_values(start)
     if value is not None:
         return [_PossibleStart(int(value), True)] if 0 <= value <= last else []
     index = start.item()
@@ -122,7 +130,7 @@ def _selected(mask: Any, new: Tensor, old: Tensor | None) -> Tensor:
     # lane is one of the possible ones, so a later one replaces these where they are wrong.
     if old is None or mask is True:
         return new
-    return each(ft.partial(drjit().select, mask), new, old)
+    return map_entries(ft.partial(drjit().select, mask), new, old)
 
 
 def _window_at(
@@ -130,7 +138,8 @@ def _window_at(
 ) -> Tensor:
     """The window of `x` that begins at `starts`, moved into `x` if it is not within. Both
     `starts` and `sizes` have an element for each axis."""
-    if isinstance(x.entries, Table) and any(known(start) is None for start in starts):
+    is_known = all(known_values(start) is not None for start in starts)
+    if isinstance(x.entries, Table) and not is_known:
         return _window_of_table(operation, x, x.entries, starts, sizes)
     window = None
     for slices, mask in _possible_windows(operation, x, starts, sizes):
@@ -206,7 +215,7 @@ def _widened(index: Tensor) -> Tensor:
         is_narrow = drjit().itemsize_v(entry) < 4
         return array_types()["i32"](entry) if is_narrow else entry
 
-    return each(widened_entry, index)
+    return map_entries(widened_entry, index)
 
 
 @rule
@@ -219,7 +228,7 @@ def _dynamic_update_slice(
     operation: Operation, x: Tensor, update: Tensor, *starts: Tensor
 ) -> list[Tensor]:
     # One list: the entries of `x`, followed by those of the update.
-    both = Tensor([*flat([x, update])], ())
+    both = Tensor([*entries_of([x, update])], ())
     wide_starts = [*map(_widened, starts)]
     result = None
     # The first possible window is taken for all lanes, and replaced by each of the others
@@ -299,7 +308,7 @@ def _gather(operation: Operation, x: Tensor, indices: Tensor) -> list[Tensor]:
         batched_axes=dict(zip(batched_axes, batched_axes_of_indices)),
     )
     sizes = operation.integers("slice_sizes")
-    entries = flat(
+    entries = entries_of(
         [_window_at(operation, x, starts, sizes) for starts in starts_of_windows]
     )
     windows = Tensor([*entries], (*shape, *sizes))
