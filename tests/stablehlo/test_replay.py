@@ -56,7 +56,7 @@ def test_the_types_of_arguments_are_known():
 
 def test_results_that_are_arguments_are_known():
     program = text_of(lambda x, y: (y, x + y, x, 1.0), *[jnp.zeros(())] * 2)
-    assert Replay(program).handed_on == [1, None, 0, None]
+    assert Replay(program).returned_arguments == [1, None, 0, None]
 
 
 def test_a_replay_is_part_of_the_loop_that_it_stands_in():
