@@ -435,7 +435,7 @@ def _ends_with(code: str) -> subprocess.CompletedProcess:
 
 @needs_llvm
 def test_drjit_writes_the_result_of_a_conditional_into_what_its_branch_returned():
-    # So `_stablehlo.tensor.copied` copies what a branch returns.
+    # So `_stablehlo.tensor.copied_entries` copies what a branch returns.
     done = _ends_with(
         """
         y = 3 * x

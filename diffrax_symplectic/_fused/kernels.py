@@ -14,15 +14,15 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 from .._compat import frozen, variable_number
 from .._custom_types import RealScalarLike
 from .._stablehlo import (
+    array_in_memory,
     array_types,
     ArrayType,
     chosen,
     drjit,
-    flat,
-    in_memory,
+    entries_of,
     merged,
     scalar,
-    unflat,
+    tensors_from,
 )
 from .path_functions import PathFunctions
 from .program import as_numbers, entry_kinds, pack, Program, shapes_of, unpack
@@ -70,7 +70,8 @@ class Kernels:
 
     def __init__(self, functions: PathFunctions):
         self._functions = functions
-        # These are shapes and dtypes of the arguments for which the programs are lowered.
+        # Programs are lowered for shapes and dtypes of their arguments. The number of a
+        # path is two words.
         word = jax.ShapeDtypeStruct((), "uint32")
         arrays = functions.arrays
         key = functions.key
@@ -88,7 +89,7 @@ class Kernels:
                 arrays=arrays,
                 own=own,
                 h=jax.ShapeDtypeStruct((), jnp.result_type(*y)),
-                number=jax.ShapeDtypeStruct((), "int32"),
+                i=jax.ShapeDtypeStruct((), "int32"),
                 y=y,
                 solver_state=jax.eval_shape(functions.start, arrays, own, y),
             ),
@@ -108,8 +109,9 @@ class Kernels:
         first_argument = len(self._step.replay.arguments) - num_arrays
         # The results of a step are the state, the solver state, and whether it succeeded.
         first_result = len(self._step.types["y"])
+        returned = self._step.replay.returned_arguments
         # For each array of the new solver state, the number of the argument that it is.
-        sources = self._step.replay.handed_on[first_result : first_result + num_arrays]
+        sources = returned[first_result : first_result + num_arrays]
         return [
             self._functions.paths_differ or source != first_argument + k
             for k, source in enumerate(sources)
@@ -118,23 +120,24 @@ class Kernels:
     def _solver_state_at_start(
         self, arrays: list[Array], key, y: list[Array], own_args: list[Array]
     ) -> list:
-        """The leaves of the solver state before the first step: of all paths, or along a
-        leading axis of each, if paths differ."""
+        """The leaves of the solver state before the first step: the state of all paths; or
+        if paths differ, the states of all along a leading axis, which `y` and `own_args`
+        have, too."""
 
-        def of_path(y: list[Array], own_args: list[Array]) -> list[Array]:
-            def of_path_with_number(low: Array) -> list[Array]:
+        def start_of_path(y: list[Array], own_args: list[Array]) -> list[Array]:
+            def start_of_numbered_path(low: Array) -> list[Array]:
                 high = jnp.zeros_like(low)
                 keys = self._functions.path_keys(arrays, key, high, low)
                 return self._functions.start(arrays, [*keys, *own_args], y)
 
             # No solver draws random numbers in `init`, so the number of a path does not
-            # matter. JAX raises an error if the result depends on the axis of numbers.
-            number = jnp.zeros(1, "uint32")
-            return jax.vmap(of_path_with_number, out_axes=None)(number)
+            # matter. With `out_axes=None`, JAX raises an error if the result depends on it.
+            path_numbers = jnp.zeros(1, "uint32")
+            return jax.vmap(start_of_numbered_path, out_axes=None)(path_numbers)
 
         if self._functions.paths_differ:
-            return jax.vmap(of_path)(y, own_args)
-        return of_path(y, own_args)
+            return jax.vmap(start_of_path)(y, own_args)
+        return start_of_path(y, own_args)
 
     def begin(
         self,
@@ -194,7 +197,10 @@ class Kernels:
             # (entries, paths) for each array
             matrices = [as_numbers(x).reshape(num_paths, -1).T for x in arrays]
             rows = [row for matrix in matrices for row in matrix]
-            return [in_memory(kind, row) for kind, row in zip(kinds, rows, strict=True)]
+            return [
+                array_in_memory(kind, row)
+                for kind, row in zip(kinds, rows, strict=True)
+            ]
         entries = [entry for x in arrays for entry in as_numbers(x).flat]
         return [
             drjit().opaque(array_types()[kind], entry.item(), num_paths)
@@ -231,7 +237,7 @@ class Kernels:
         as Dr.Jit records their computation."""
         arrays_and_key = unpack(self._types_for_keys, packed)
         keys, _ = self._path_keys.replay(*arrays_and_key, scalar(high), scalar(low))
-        return [*flat(keys)]
+        return [*entries_of(keys)]
 
     def _record_steps(
         self,
@@ -247,26 +253,30 @@ class Kernels:
         """The state, the solver state and which paths stopped after the steps `begin` to
         `end - 1`, from those before, as Dr.Jit records the loop over steps."""
         select = drjit().select
+        # Dr.Jit numbers its variables one after another, one for each operation. So the
+        # number of this variable and of the last one below count the operations between.
         first_variable = variable_number(begin + 1)
         step = self._step
+        # In the order in which `begin` packs them: the arrays of the system, the step size,
+        # and the arrays of the solver state that steps do not change.
         num_arrays = len(step.types["arrays"])
         shared = unpack(self._types_of_shared, packed)
         arrays = shared[:num_arrays]
         h, *fixed = shared[num_arrays:]
-        own_tensors = unflat(own, shapes_of(step.types["own"]))
+        own_tensors = tensors_from(own, shapes_of(step.types["own"]))
         shapes_of_y = shapes_of(step.types["y"])
         shapes_of_moving = shapes_of(self._types_of_moving)
 
-        def has_more_steps(i: Any, *_: Any) -> Any:
+        def has_more_steps(i: Any, *_state: Any) -> Any:
             return i < end
 
         # The entries are those of `y`, followed by those of the moving solver state.
         def after_step(i: Any, stopped: Any, *entries: Any) -> tuple[Any, ...]:
             remaining_entries = iter(entries)
-            y_tensors = unflat(remaining_entries, shapes_of_y)
-            moving = unflat(remaining_entries, shapes_of_moving)
+            y_tensors = tensors_from(remaining_entries, shapes_of_y)
+            moving = tensors_from(remaining_entries, shapes_of_moving)
             whole_solver_state = merged(self._is_moving, moving, fixed)
-            results, errors = step.replay(
+            results, error_masks = step.replay(
                 *arrays,
                 *own_tensors,
                 h,
@@ -278,21 +288,21 @@ class Kernels:
             *states, success = results
             # LLVM schedules by the order: with the success first, a step of `StormerVerlet`
             # in single precision takes 1.13 times as long, and of Heun's method 0.85.
-            for is_failed in (*errors, ~success.item()):
-                stopped = stopped | is_failed
+            for failed in (*error_masks, ~success.item()):
+                stopped = stopped | failed
             new_y = states[: len(y_tensors)]
-            new_moving = chosen(states[len(y_tensors) :], self._is_moving)
-            new_entries = [*flat(new_y), *flat(new_moving)]
+            new_solver_state = states[len(y_tensors) :]
+            new_moving = chosen(new_solver_state, self._is_moving)
+            new_entries = [*entries_of(new_y), *entries_of(new_moving)]
             # A path that stopped stays where it was: its numbers could be NaN, with which
             # sweeps end last.
             kept = [select(stopped, old, new) for old, new in zip(entries, new_entries)]
             return i + 1, stopped, *kept
 
-        state = (begin, stopped, *y, *solver_state)
+        state_at_begin = (begin, stopped, *y, *solver_state)
         _, stopped, *entries = drjit().while_loop(
-            state, has_more_steps, after_step, mode="symbolic"
+            state_at_begin, has_more_steps, after_step, mode="symbolic"
         )
-        # Dr.Jit numbers its variables one after another: one for each operation.
         last_variable = max(map(variable_number, [stopped, *entries]))
         _warn_of_operations(last_variable - first_variable)
         return entries[: len(y)], entries[len(y) :], stopped

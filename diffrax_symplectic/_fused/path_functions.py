@@ -128,25 +128,29 @@ class PathFunctions(NamedTuple):
         the solver's state."""
         system, terms = self._system_and_terms(arrays, own)
         # `init` is traced and not run: only the structure of the solver's state is needed.
-        struct = eqx.filter_eval_shape(system.init, terms, 0, h, system.y0)
+        solver_struct = eqx.filter_eval_shape(system.init, terms, 0, h, system.y0)
         y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
-        solver_state = jtu.tree_unflatten(jtu.tree_structure(struct), solver_state)
+        solver_state = jtu.tree_unflatten(
+            jtu.tree_structure(solver_struct), solver_state
+        )
         y, solver_state, success = system.step(terms, i, h, y, solver_state)
         return Stepped(jtu.tree_leaves(y), jtu.tree_leaves(solver_state), success)
 
     def _system_and_terms(
         self, arrays: list[Array], own: list[Array]
     ) -> tuple[SteppedSystem, PyTree]:
-        """The system with the `args` of a path, and its terms with the keys of the path."""
+        """The system with the `args` of a path, and its terms with the keys of the path.
+        (The terms within the system keep the keys of the system.)"""
         system = self.system(arrays)
-        # In `own` the keys come first, and then the arrays of `args`.
+        # In `own` the keys come first, and then the arrays of `args`, as `Kernels` joins
+        # them.
         num_keys = len(own) - len(self.own_args)
         keys = own[:num_keys]
-        args = None
+        own_args = None
         if self.own_args:
             treedef = jtu.tree_structure(eqx.filter(system.args, eqx.is_array))
-            args = jtu.tree_unflatten(treedef, own[num_keys:])
-        return system.with_args(args), with_keys(system.terms, keys)
+            own_args = jtu.tree_unflatten(treedef, own[num_keys:])
+        return system.with_args(own_args), with_keys(system.terms, keys)
 
 
 def sample_key(key: PRNGKeyArray, high, low) -> PRNGKeyArray:
@@ -169,18 +173,18 @@ def functions_and_arrays(
     leaves, treedef = jtu.tree_flatten(system)
     _check_keys([key, *leaves])
     # Arrays of NumPy are inputs, too: another parameter must not need another kernel.
-    arrays = [jnp.asarray(x) if _is_array(x) else None for x in leaves]
+    arrays_or_none = [jnp.asarray(x) if _is_array(x) else None for x in leaves]
     functions = PathFunctions(
         treedef=treedef,
         static=tuple(None if _is_array(x) else x for x in leaves),
-        structs=tuple(None if x is None else _struct(x) for x in arrays),
+        structs=tuple(None if x is None else _struct(x) for x in arrays_or_none),
         impl=str(jr.key_impl(key)),
         own_args=tuple(map(_struct, jtu.tree_leaves(own_args))),
         paths_differ=paths_differ,
         # The type of Python's floats says whether JAX has 64 bits.
         settings=(jax.default_backend(), jnp.result_type(float)),
     )
-    return functions, [x for x in arrays if x is not None]
+    return functions, [x for x in arrays_or_none if x is not None]
 
 
 def _check_keys(leaves: Sequence[Any]) -> None:

@@ -12,9 +12,9 @@ from jaxtyping import Array, PyTree
 
 from .._arguments import inside_jax
 from .._stablehlo import (
+    array_in_memory,
     array_types,
     ArrayType,
-    in_memory,
     MOST_IN_REGISTERS,
     Replay,
     Table,
@@ -80,7 +80,7 @@ def pack(
     for array_type, x in zip(types, arrays, strict=True):
         rows[array_type.kind].append(as_numbers(x).ravel())
     return {
-        kind: in_memory(kind, np.concatenate(rows_of_kind))
+        kind: array_in_memory(kind, np.concatenate(rows_of_kind))
         for kind, rows_of_kind in rows.items()
     }
 

@@ -86,7 +86,7 @@ def _relaxed(new: PyTree, old: PyTree, relaxation: Scalar | None) -> PyTree[Arra
 class _Criterion(NamedTuple):
     """What decides whether a correction is small enough.
 
-    - `weights`: for each leaf, the inverse of its tolerance.
+    - `weights`: for each leaf, the inverse of its tolerance, up to a factor of two.
     - `rounding`: the largest correction that may be a rounding error.
     """
 
@@ -94,24 +94,24 @@ class _Criterion(NamedTuple):
     rounding: Scalar
 
     def measure(
-        self, correction: PyTree[Array], before: Scalar
+        self, correction: PyTree[Array], size_before: Scalar
     ) -> tuple[Scalar, Bool[Array, ""]]:
-        """The size of a correction that follows one of size `before`, in units of the
+        """The size of a correction that follows one of size `size_before`, in units of the
         tolerance, and whether sweeps have converged."""
         sizes = _sizes(correction)
         size = _largest([x * weight for x, weight in zip(sizes, self.weights)])
-        # The next correction is expected to be `size * (size / before)`, and compared with
-        # the tolerance over a margin, here without a division. If corrections grow, the
-        # ratio says nothing, and counts as one.
-        smaller = jnp.where(size < before, size, before)
-        is_below = 2.0**MARGIN * size * smaller <= before
+        # The next correction is expected to be `size * (size / size_before)`, and compared
+        # with the tolerance over a margin, here without a division. If corrections grow,
+        # the ratio says nothing, and counts as one.
+        smaller = jnp.where(size < size_before, size, size_before)
+        is_next_small = 2.0**MARGIN * size * smaller <= size_before
         # Rounding errors do not shrink any further.
-        is_stalled = size >= 2.0**STALLED * before
+        is_stalled = size >= 2.0**STALLED * size_before
         is_rounding = _largest(sizes) <= self.rounding
-        return size, is_below | (is_stalled & is_rounding)
+        return size, is_next_small | (is_stalled & is_rounding)
 
 
-class _State(NamedTuple):
+class _SweepState(NamedTuple):
     """The state of the loop over sweeps.
 
     - `y`: the iterate.
@@ -145,31 +145,36 @@ def solve_one_path(
     second = equations.sweep(first)
     third = equations.sweep(second)
     one = jnp.ones((), dtype)
-    before, _ = criterion.measure(equations.correction(first, second), one)
-    size, is_solved = criterion.measure(equations.correction(second, third), before)
+    # Of the first correction only the size is needed: there is none before to compare with.
+    size_before, _ = criterion.measure(equations.correction(first, second), one)
+    last_correction = equations.correction(second, third)
+    size, is_solved = criterion.measure(last_correction, size_before)
 
     # The relaxation is chosen once: later rates are those of relaxed sweeps, to which its
     # formula does not apply. It is a branch, since few paths take it, and a division takes
     # as long as a sweep.
     relaxation = lax.cond(
-        size > SLOW * before,
-        lambda: best_relaxation(jnp.minimum(size / before, _FASTEST_GROWTH)),
+        size > SLOW * size_before,
+        lambda: best_relaxation(jnp.minimum(size / size_before, _FASTEST_GROWTH)),
         lambda: one,
     )
 
-    def sweep_again(last: _State) -> _State:
-        y = equations.sweep(last.y, relaxation)
-        correction = equations.correction(last.y, y)
-        size, is_solved = criterion.measure(correction, last.size)
-        return _State(y, size, is_solved, last.num_sweeps + 1)
+    def sweep_again(state: _SweepState) -> _SweepState:
+        y = equations.sweep(state.y, relaxation)
+        correction = equations.correction(state.y, y)
+        size, is_solved = criterion.measure(correction, state.size)
+        return _SweepState(y, size, is_solved, state.num_sweeps + 1)
 
-    def goes_on(last: _State) -> Bool[Array, ""]:
-        may_sweep = last.num_sweeps < _MOST_SWEEPS
-        return ~last.is_solved & may_sweep & (last.size < _HUGE)
+    def goes_on(state: _SweepState) -> Bool[Array, ""]:
+        may_sweep = state.num_sweeps < _MOST_SWEEPS
+        return ~state.is_solved & may_sweep & (state.size < _HUGE)
 
-    state = _State(third, size, ~pending | is_solved, jnp.full((), 3, jnp.int32))
-    last = lax.while_loop(goes_on, sweep_again, state)
-    return equations.value(last.y), last.is_solved
+    # A path that is not pending counts as solved, and sweeps no more.
+    counts_as_solved = ~pending | is_solved
+    num_sweeps = jnp.full((), 3, jnp.int32)
+    state = _SweepState(third, size, counts_as_solved, num_sweeps)
+    end = lax.while_loop(goes_on, sweep_again, state)
+    return equations.value(end.y), end.is_solved
 
 
 def _criterion(scale: PyTree[Array], dtype: Any) -> _Criterion:
@@ -214,7 +219,8 @@ def _larger(a: Scalar, b: Scalar) -> Scalar:
 
 
 class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
-    """Solves the stage equations by sweeps, in `init`; fails if they do not converge."""
+    """Solves the stage equations by sweeps, all in `init`: Optimistix makes no step. Its
+    state is the solution and whether it is one. Fails if sweeps do not converge."""
 
     rtol: float = 0.0
     atol: float = 0.0
@@ -251,12 +257,12 @@ def without_rescue(solver: Any) -> Any:
 
 
 def _check_tolerance(finder: PicardNewton) -> None:
-    """Raises a `ValueError` for a tolerance other than rounding error. (Limits on the
-    numbers of steps are not read here: they hold for JAX, which simulates the paths that
+    """Raises a `ValueError` unless the tolerance is the default, rounding error. (Limits on
+    the numbers of steps are not compared: they hold for JAX, which simulates the paths that
     are not solved here.)"""
-    usual = PicardNewton()
+    default = PicardNewton()
     for name in ("rtol", "atol", "norm"):
-        if getattr(finder, name) != getattr(usual, name):
+        if getattr(finder, name) != getattr(default, name):
             raise ValueError(
                 '`engine="drjit"` solves each step to rounding error; got '
                 f"`PicardNewton({name}={getattr(finder, name)})`. Leave this out, or pass "

@@ -42,10 +42,10 @@ from .replay import Replay
 from .tensor import (
     ArrayType,
     chosen,
-    flat,
-    in_memory,
+    entries_of,
+    array_in_memory,
     merged,
     MOST_IN_REGISTERS,
     scalar,
 )
-from .tensor import Table, Tensor, unflat
+from .tensor import Table, Tensor, tensors_from

@@ -5,13 +5,13 @@ from collections.abc import Callable
 from typing import Any
 
 from .backend import drjit
-from .complex import exponent, is_complex
+from .complex import is_complex, log_of_power
 
 
-# The largest angles, for each size of numbers in bytes, whose sine and cosine Dr.Jit has to
-# a unit in the last place. For twice this angle they are off by 4 units in single
+# The largest angles whose sine and cosine Dr.Jit has to a unit in the last place, for each
+# size of numbers in bytes. For twice this angle they are off by 4 units in single
 # precision, and by 1e138 in double.
-_LARGEST = {4: 2.0**13, 8: 2.0**31}
+_LARGEST_ANGLES = {4: 2.0**13, 8: 2.0**31}
 
 
 def _itself(a):
@@ -27,7 +27,7 @@ _ANGLES_OF_REAL: dict[str, Callable[..., Any]] = {
 _ANGLES_OF_COMPLEX: dict[str, Callable[..., Any]] = {
     "cosine": operator.attrgetter("real"),
     "exponential": operator.attrgetter("imag"),
-    "power": lambda a, b: exponent(a, b).imag,
+    "power": lambda base, exponent: log_of_power(base, exponent).imag,
     "sine": operator.attrgetter("real"),
 }
 
@@ -39,4 +39,4 @@ def lanes_with_too_large_angle(name: str, *operands: Any) -> Any | None:
     if name not in angles:
         return None
     angle = angles[name](*operands)
-    return drjit().abs(angle) > _LARGEST[drjit().itemsize_v(angle)]
+    return drjit().abs(angle) > _LARGEST_ANGLES[drjit().itemsize_v(angle)]

@@ -18,20 +18,20 @@ def is_complex(a: Any) -> bool:
 
 
 def _divide(a, b):
+    """`a conj(b) / |b|^2`, scaled so that no square overflows."""
     if is_zero(b.imag):
         # By a real number, as in many Hamiltonians.
         inverse = 1 / b.real
         return type(a)(a.real * inverse, a.imag * inverse)
     dr = drjit()
-    # Scaled, so that no square overflows.
-    real = dr.abs(b.real)
-    imag = dr.abs(b.imag)
-    size = dr.select(real > imag, real, imag)
+    real_size = dr.abs(b.real)
+    imag_size = dr.abs(b.imag)
+    size = dr.select(real_size > imag_size, real_size, imag_size)
     # Zero and infinity cannot be scaled.
-    unit = dr.select((size > 0) & dr.isfinite(size), 1 / size, 1)
-    scaled = type(a)(b.real * unit, b.imag * unit)
-    inverse = unit / dr.squared_norm(scaled)
-    product = a * dr.conj(scaled)
+    scale = dr.select((size > 0) & dr.isfinite(size), 1 / size, 1)
+    scaled_b = type(a)(b.real * scale, b.imag * scale)
+    inverse = scale / dr.squared_norm(scaled_b)
+    product = a * dr.conj(scaled_b)
     return type(a)(product.real * inverse, product.imag * inverse)
 
 
@@ -54,12 +54,14 @@ def _sign(a):
 def _square_root(a):
     """The root with a real part that is not negative, without cancellation."""
     dr = drjit()
-    # The larger part of the root is a sum, and the other follows from their product.
-    size = dr.sqrt((_absolute(a) + dr.abs(a.real)) / 2)
-    other = dr.select(size == 0, 0, a.imag / (2 * size))
-    right = a.real >= 0
-    real = dr.select(right, size, dr.abs(other))
-    imag = dr.select(right, other, dr.copysign(size, a.imag))
+    # The larger part of the root is a root of a sum. The other part follows from their
+    # product, which is half of the imaginary part of `a`.
+    larger = dr.sqrt((_absolute(a) + dr.abs(a.real)) / 2)
+    smaller = dr.select(larger == 0, 0, a.imag / (2 * larger))
+    # To the right of the imaginary axis the real part is the larger one.
+    is_right = a.real >= 0
+    real = dr.select(is_right, larger, dr.abs(smaller))
+    imag = dr.select(is_right, smaller, dr.copysign(larger, a.imag))
     return type(a)(real, imag)
 
 
@@ -75,18 +77,19 @@ def _exp(a):
     return type(a)(size * cosine, size * sine)
 
 
-def exponent(a, b):
-    """The logarithm of the power."""
-    return b * _log(a)
+def log_of_power(base, exponent):
+    """The logarithm of `base**exponent`."""
+    return exponent * _log(base)
 
 
-def _power(a, b):
+def _power(base, exponent):
     dr = drjit()
     # The logarithm of zero is infinite, and its product with the exponent NaN.
-    zero = (a.real == 0) & (a.imag == 0)
-    to_the_zeroth = (b.real == 0) & (b.imag == 0)
-    of_zero = dr.select(to_the_zeroth, type(a)(1), type(a)(0))
-    return dr.select(zero, of_zero, _exp(exponent(a, b)))
+    is_zero_base = (base.real == 0) & (base.imag == 0)
+    is_zeroth_power = (exponent.real == 0) & (exponent.imag == 0)
+    power_of_zero = dr.select(is_zeroth_power, type(base)(1), type(base)(0))
+    power = _exp(log_of_power(base, exponent))
+    return dr.select(is_zero_base, power_of_zero, power)
 
 
 def _sine(a):

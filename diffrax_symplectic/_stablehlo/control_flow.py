@@ -6,20 +6,35 @@ from typing import Any, TypeAlias
 from .backend import array_types, drjit
 from .mlir import block_of, call_target, operations_in
 from .operation import Operation, rule
-from .tensor import as_own_literal, chosen, copied, flat, known, merged, Tensor, unflat
+from .tensor import (
+    as_own_literal,
+    chosen,
+    copied_entries,
+    entries_of,
+    known_values,
+    merged,
+    Tensor,
+    tensors_from,
+)
 
 
-# A function that returns entries of arrays.
-_Branch: TypeAlias = Callable[[], tuple[Any, ...]]
+# Runs a branch of a conditional and returns the entries of its results.
+_RunBranch: TypeAlias = Callable[[], tuple[Any, ...]]
+
+# The numbers of the regions of a conditional, and of a loop.
+_IF_TRUE = 0
+_IF_FALSE = 1
+_CONDITION = 0
+_BODY = 1
 
 
 @rule
-def _optimization_barrier(o, *xs):
+def _optimization_barrier(operation: Operation, *xs: Tensor) -> list[Tensor]:
     return [*xs]
 
 
 @rule
-def _sharding_constraint(o, x):
+def _sharding_constraint(operation: Operation, x: Tensor) -> list[Tensor]:
     return [x]
 
 
@@ -30,85 +45,89 @@ def _raises(region: Any) -> bool:
 
 
 @rule
-def _case(o, index):
-    num_branches = len(o.op.regions)
-    value = known(index)
+def _case(operation: Operation, index: Tensor) -> list[Tensor]:
+    regions = operation.mlir_op.regions
+    last = len(regions) - 1
+    value = known_values(index)
     if value is not None:
         # An index that is out of range stands for the last branch.
-        is_in_range = 0 <= value < num_branches
-        return o.run(int(value) if is_in_range else num_branches - 1, [])
+        return operation.run(int(value) if 0 <= value <= last else last, [])
     # A kernel cannot raise an error. Lanes that would are marked, and take another branch.
     branches = []
-    for i, region in enumerate(o.op.regions):
+    for i, region in enumerate(regions):
         if _raises(region):
-            o.fail(index.item() == i)
+            operation.fail(index.item() == i)
         else:
             branches.append(i)
-    return unflat(_result_of_branch(o, index.item(), branches), o.shapes())
+    results = _results_of_branch(operation, index.item(), branches)
+    return tensors_from(results, operation.shapes)
 
 
-def _result_of_branch(
-    o: Operation, index: Any, branches: Sequence[int]
+def _results_of_branch(
+    operation: Operation, index: Any, branches: Sequence[int]
 ) -> tuple[Any, ...]:
-    """The entries that the branch of this index returns, or the last of `branches` if these
-    do not contain it."""
+    """The entries that a branch of a `case` returns: the one of number `index`, which each
+    lane has of its own, or the last of `branches` if these do not contain the number.
+    There must be at least one branch."""
     first, *others = branches
 
     def run_first() -> tuple[Any, ...]:
-        return copied(o.run(first, []))
+        return copied_entries(operation.run(first, []))
 
-    def run_others() -> tuple[Any, ...]:
-        return _result_of_branch(o, index, others)
+    def run_one_of_others() -> tuple[Any, ...]:
+        return _results_of_branch(operation, index, others)
 
     if not others:
         return run_first()
-    return _conditional(o, index == first, run_first, run_others)
+    return _conditional(operation, index == first, run_first, run_one_of_others)
 
 
 def _conditional(
-    o: Operation, condition: Any, if_true: _Branch, if_false: _Branch
+    operation: Operation, condition: Any, if_true: _RunBranch, if_false: _RunBranch
 ) -> tuple[Any, ...]:
-    """The entries that one of two functions returns: where the condition holds, those of
-    the first."""
-
-    def with_failures(branch: _Branch) -> _Branch:
-        def run() -> tuple[Any, ...]:
-            entries, failed = o.failing(branch)
-            return *entries, failed
-
-        return run
-
+    """The entries that one of two branches returns, for each lane by its own condition.
+    Lanes that fail in their branch are marked."""
     # A symbolic conditional is a part of the kernel. Otherwise Dr.Jit may run a branch at
     # once.
-    out = drjit().if_stmt(
+    results = drjit().if_stmt(
         (),
         condition,
-        with_failures(if_true),
-        with_failures(if_false),
+        _returning_failures(operation, if_true),
+        _returning_failures(operation, if_false),
         mode="symbolic",
     )
     # A constant of the inside would abort the process if it were used outside.
-    *entries, failed = map(as_own_literal, out)
-    o.fail(failed)
+    *entries, failed = map(as_own_literal, results)
+    operation.fail(failed)
     return tuple(entries)
 
 
+def _returning_failures(operation: Operation, branch: _RunBranch) -> _RunBranch:
+    """A branch that also returns the mask of the lanes that fail in it, as the last."""
+
+    def run() -> tuple[Any, ...]:
+        entries, failed = operation.with_failures(branch)
+        return *entries, failed
+
+    return run
+
+
 @rule
-def _if(o, condition):
-    value = known(condition)
+def _if(operation: Operation, condition: Tensor) -> list[Tensor]:
+    value = known_values(condition)
     if value is not None:
-        return o.run(0 if value else 1, [])
+        return operation.run(_IF_TRUE if value else _IF_FALSE, [])
 
     def if_true() -> tuple[Any, ...]:
-        return copied(o.run(0, []))
+        return copied_entries(operation.run(_IF_TRUE, []))
 
     def if_false() -> tuple[Any, ...]:
-        return copied(o.run(1, []))
+        return copied_entries(operation.run(_IF_FALSE, []))
 
     # With `select` in its place both branches run: the midpoint rule, whose sweeps have
     # such branches, took 21 ns a step in place of 13.
-    out = _conditional(o, condition.item(), if_true, if_false)
-    return unflat(out, o.shapes())
+    results = _conditional(operation, condition.item(), if_true, if_false)
+    return tensors_from(results, operation.shapes)
 
 
 # The most iterations to unroll, of a loop whose condition is known.
@@ -119,59 +138,71 @@ _MOST_UNROLLED_OF_INDICES = 32
 
 
 @rule
-def _while(o, *xs):
-    changes = _which_change(o)
-    indices_only = not any(map(drjit().is_float_v, flat(chosen(xs, changes))))
-    most = _MOST_UNROLLED_OF_INDICES if indices_only else _MOST_UNROLLED
+def _while(operation: Operation, *xs: Tensor) -> list[Tensor]:
+    changes = _which_change(operation)
+    changing_entries = entries_of(chosen(xs, changes))
+    has_only_indices = not any(map(drjit().is_float_v, changing_entries))
+    most = _MOST_UNROLLED_OF_INDICES if has_only_indices else _MOST_UNROLLED
     state = [*xs]
     # As long as the condition is known, the loop is unrolled. The iterations that are left
     # then, or after too many, are a loop of the kernel.
     for _ in range(most):
-        (condition,) = o.run(0, state)
-        goes_on = known(condition)
+        (condition,) = operation.run(_CONDITION, state)
+        goes_on = known_values(condition)
         if goes_on is None:
             break
         if not goes_on:
             return state
-        state = o.run(1, state)
-    return _loop(o, state, changes)
+        state = operation.run(_BODY, state)
+    return _loop(operation, state, changes)
 
 
-def _which_change(o: Operation) -> list[bool]:
-    """Which values of a loop its body changes."""
-    body = block_of(o.op, 1)
+def _which_change(operation: Operation) -> list[bool]:
+    """For each value of a loop's state, whether the loop's body changes it."""
+    body = block_of(operation.mlir_op, _BODY)
+    # The last operation returns the new state.
     *_, last = body.operations
     return [new != old for new, old in zip(last.operands, body.arguments)]
 
 
-def _loop(o: Operation, state: list[Tensor], changes: Sequence[bool]) -> list[Tensor]:
-    """A loop of the kernel, from this state on."""
+def _loop(
+    operation: Operation, state: list[Tensor], changes: Sequence[bool]
+) -> list[Tensor]:
+    """The state at the end of a loop of the kernel, which starts from `state`. `changes`
+    says which values of the state the loop's body changes."""
     # Values that do not change stay out of the loop's state, so that constants stay known.
     variables = chosen(state, changes)
     constants = chosen(state, [not change for change in changes])
     shapes = [x.shape for x in variables]
 
     def whole_state(entries: Iterable[Any]) -> list[Tensor]:
-        return merged(changes, unflat(entries, shapes), constants)
+        return merged(changes, tensors_from(entries, shapes), constants)
+
+    # Beside the entries, Dr.Jit's loop has in its state the mask of the lanes that failed
+    # so far.
 
     def goes_on(failed: Any, *entries: Any) -> Any:
-        (condition,), fails_now = o.failing(lambda: o.run(0, whole_state(entries)))
+        (condition,), fails_now = operation.with_failures(
+            lambda: operation.run(_CONDITION, whole_state(entries))
+        )
         # A lane that failed could go on for ever.
         return condition.item() & ~(failed | fails_now)
 
     def iterate(failed: Any, *entries: Any) -> tuple[Any, ...]:
-        new_state, fails_now = o.failing(lambda: o.run(1, whole_state(entries)))
-        return failed | fails_now, *copied(chosen(new_state, changes))
+        new_state, fails_now = operation.with_failures(
+            lambda: operation.run(_BODY, whole_state(entries))
+        )
+        return failed | fails_now, *copied_entries(chosen(new_state, changes))
 
     # Where no lane can fail, Dr.Jit leaves the mask out.
-    none = array_types()["i1"](False)
-    out = drjit().while_loop(
-        (none, *flat(variables)), goes_on, iterate, mode="symbolic"
+    no_lane = array_types()["i1"](False)
+    results = drjit().while_loop(
+        (no_lane, *entries_of(variables)), goes_on, iterate, mode="symbolic"
     )
-    failed, *entries = map(as_own_literal, out)
-    o.fail(failed)
-    end = whole_state(entries)
+    failed, *entries = map(as_own_literal, results)
+    operation.fail(failed)
+    state_at_end = whole_state(entries)
     # A loop of Dr.Jit does not return the lanes that fail in its condition. They stopped
     # there, so that the condition at the end marks them once more.
-    o.run(0, end)
-    return end
+    operation.run(_CONDITION, state_at_end)
+    return state_at_end

@@ -37,7 +37,8 @@ def _add(a, b):
 
 
 def is_zero(a: Any) -> bool:
-    """Whether it is zero for all paths, known while the kernel is recorded."""
+    """Whether a number is zero for all paths, and this is known while the kernel is
+    recorded."""
     return is_literal(a) and a[0] == 0
 
 
@@ -46,7 +47,7 @@ def _multiply(a, b):
     if dr.is_mask_v(a):
         return a & b
     if dr.is_float_v(a):
-        # Dr.Jit folds each product with zero, though that with infinity is NaN.
+        # Dr.Jit takes each product with a known zero for zero. With infinity it is NaN.
         if is_zero(a) and not is_literal(b):
             return _times_zero(b, a)
         if is_zero(b) and not is_literal(a):
@@ -55,9 +56,12 @@ def _multiply(a, b):
 
 
 def _times_zero(a, zero):
-    # The difference is zero, but not a constant, and NaN of an infinite number.
-    same = a - a
-    return a * (-same if np.signbit(zero[0]) else same)
+    """The product of a number that is not known while the kernel is recorded and a zero
+    that is."""
+    # The difference is zero, too, but Dr.Jit does not fold it, and it is NaN for an
+    # infinite number.
+    unknown_zero = a - a
+    return a * (-unknown_zero if np.signbit(zero[0]) else unknown_zero)
 
 
 # Dr.Jit's own maximum and minimum of floats abort the process with LLVM 15 and 16, which
@@ -95,16 +99,26 @@ def _divide(a, b):
 
 
 def _remainder(a, b):
+    """`a - trunc(a / b) b`, which has the sign of `a`."""
+    if drjit().is_float_v(a):
+        return _remainder_of_floats(a, b)
     dr = drjit()
-    if not dr.is_float_v(a):
-        safe, zero, minus_one = safe_divisor(a, b)
-        rest = a - (a // safe) * safe
-        return dr.select(zero, a, dr.select(minus_one, type(a)(0), rest))
+    safe, zero, minus_one = safe_divisor(a, b)
+    rest = a - (a // safe) * safe
+    return dr.select(zero, a, dr.select(minus_one, type(a)(0), rest))
+
+
+def _remainder_of_floats(a, b):
+    dr = drjit()
     size = dr.abs(a)
-    step = dr.abs(b)
-    rest = dr.fma(-dr.trunc(size / step), step, size)
-    # Where the quotient was rounded to the next whole number, the rest is off by one step.
-    rest = dr.select(rest < 0, rest + step, dr.select(rest >= step, rest - step, rest))
+    divisor = dr.abs(b)
+    rest = dr.fma(-dr.trunc(size / divisor), divisor, size)
+    # Where the quotient was rounded to the next whole number, the rest is off by one
+    # divisor.
+    is_negative = rest < 0
+    one_more = rest + divisor
+    at_most_one_less = dr.select(rest >= divisor, rest - divisor, rest)
+    rest = dr.select(is_negative, one_more, at_most_one_less)
     rest = dr.select(dr.isinf(b) & dr.isfinite(a), size, rest)
     return dr.select(dr.isfinite(a) & ~(b == 0), dr.copysign(rest, a), type(a)(np.nan))
 
@@ -118,56 +132,62 @@ def _sign(a):
 
 
 def _power(base, exponent):
-    """By logarithms, or by multiplication for small integer exponents."""
+    """By multiplication for small whole exponents that are known while the kernel is
+    recorded, and otherwise by logarithms."""
     if is_literal(exponent):
-        known = exponent[0]
-        if float(known).is_integer() and abs(known) <= _MOST_MULTIPLIED:
-            return _integer_power(base, int(known))
+        value = exponent[0]
+        if float(value).is_integer() and abs(value) <= _MOST_MULTIPLIED:
+            return _whole_power(base, int(value))
     dr = drjit()
     dtype = type(base)
-    size = dr.exp(dr.log(dr.abs(base)) * exponent)
+    power_of_size = dr.exp(dr.log(dr.abs(base)) * exponent)
     # A negative number has real powers for whole exponents only, negative for odd ones.
     is_whole = dr.floor(exponent) == exponent
     is_odd = dr.floor(exponent / 2) * 2 != exponent
-    whole_power = dr.select(is_odd, -size, size)
-    other_power = dr.select(dr.isinf(base), size, dtype(np.nan))
+    whole_power = dr.select(is_odd, -power_of_size, power_of_size)
+    # As in JAX, minus infinity has powers for other exponents, too.
+    other_power = dr.select(dr.isinf(base), power_of_size, dtype(np.nan))
     of_negative = dr.select(is_whole, whole_power, other_power)
-    power = dr.select(base < 0, of_negative, size)
+    power = dr.select(base < 0, of_negative, power_of_size)
     # The product of logarithm and exponent is infinity times zero, or may be, for powers of
     # zero, the power zero, and powers of one.
     power = dr.select((base == 0) & (exponent > 0), dtype(0), power)
     return dr.select((exponent == 0) | (base == 1), dtype(1), power)
 
 
-def _integer_power(base, exponent: int):
+def _whole_power(base, exponent: int):
     """The power for an exponent that is known, by repeated squares."""
     power = type(base)(1)
-    # The squares are those of the bits of the exponent, from the last bit on.
+    # The power is the product of `base**(2**k)` over the bits `k` that the exponent has,
+    # here from the last bit on.
     square = base
     bits = abs(exponent)
     while bits:
-        is_odd = bits & 1
-        power = power * square if is_odd else power
+        is_last_bit_set = bits & 1
+        power = power * square if is_last_bit_set else power
         square = square * square
         bits = bits >> 1
     return 1 / power if exponent < 0 else power
 
 
 def _expm1(a):
-    """Kahan's formula, in which the rounding error of the exponential cancels."""
+    """Kahan's formula `(e - 1) a / log(e)` with `e = exp(a)`, in which the rounding error
+    of the exponential cancels."""
     dr = drjit()
     exp = dr.exp(a)
     near_zero = (exp - 1) * a / dr.log(exp)
+    # The formula is 0 / 0 where the exponential is rounded to one, and NaN of infinity.
     return dr.select(exp == 1, a, dr.select(dr.abs(a) > 1, exp - 1, near_zero))
 
 
 def _log1p(a):
-    """Kahan's formula, in which the rounding error of the sum cancels."""
+    """Kahan's formula `log(s) a / (s - 1)` with `s = 1 + a`, in which the rounding error of
+    the sum cancels."""
     dr = drjit()
-    moved = 1 + a
-    log = dr.log(moved)
-    near_zero = log * a / (moved - 1)
-    return dr.select(moved == 1, a, dr.select(dr.isfinite(moved), near_zero, log))
+    total = 1 + a
+    log = dr.log(total)
+    near_zero = log * a / (total - 1)
+    return dr.select(total == 1, a, dr.select(dr.isfinite(total), near_zero, log))
 
 
 def _tan(a):
@@ -187,10 +207,10 @@ def _atan2(y, x):
     dr = drjit()
     dtype = type(y)
     steep = dr.abs(y) > dr.abs(x)
-    small = dr.select(steep, dr.abs(x), dr.abs(y))
-    large = dr.select(steep, dr.abs(y), dr.abs(x))
-    # Two infinities count as equal.
-    slope = dr.select(small == large, dtype(1), small / large)
+    shorter = dr.select(steep, dr.abs(x), dr.abs(y))
+    longer = dr.select(steep, dr.abs(y), dr.abs(x))
+    # The quotient of two infinities would be NaN: they count as equal.
+    slope = dr.select(shorter == longer, dtype(1), shorter / longer)
     angle = dr.asin(slope / dr.sqrt(1 + slope * slope))
     # From one eighth of the circle to all of it.
     angle = dr.select(steep, np.pi / 2 - angle, angle)
@@ -206,28 +226,35 @@ def _erf(a):
 
 
 def _erfc(a):
-    """In the tail `1 - erf(a)` has no digits left. So it is a smooth function, of which
-    `_erfc_series` has a polynomial, times `exp(-a^2)`."""
+    r"""In the tail `1 - erf(a)` has no digits left. So for $x = |a|$ it is computed as
+    $e^{-x^2} g(x) / (1 + 2 x)$, where `_erfc_series` has a polynomial for $g$."""
     dr = drjit()
     dtype = type(a)
     # The size is bounded, since the next quotient would be NaN for infinity.
     size = _minimum(dr.abs(a), dtype(_ERFC_END))
-    s = (size - _ERFC_MIDDLE) / (size + _ERFC_MIDDLE)
-    first, *others = _erfc_series(_ERFC_DEGREES[dr.itemsize_v(a)])
-    # The sum of the Chebyshev series, by Clenshaw's recurrence.
-    current = dtype(0)
-    previous = dtype(0)
-    for coefficient in reversed(others):
-        following = dr.fma(2 * s, current, coefficient - previous)
-        previous = current
-        current = following
-    smooth = dr.fma(s, current, first - previous)
+    variable = (size - _ERFC_MIDDLE) / (size + _ERFC_MIDDLE)
+    series = _erfc_series(_ERFC_DEGREES[dr.itemsize_v(a)])
+    smooth = _chebyshev_sum(series, variable)
     # The rounding error of the square is the relative error of its exponential: near 26,
     # 256 units in the last place. What was rounded off comes back as a factor.
     square = size * size
     rounded_off = dr.fma(size, size, -square)
     tail = dr.exp(-square) * (1 - rounded_off) * smooth / (1 + 2 * size)
     return dr.select(_is_nan(a), a, dr.select(a < 0, 2 - tail, tail))
+
+
+def _chebyshev_sum(series: list[float], x):
+    """The sum of Chebyshev polynomials with these coefficients at `x`, by Clenshaw's
+    recurrence `b_k = c_k + 2 x b_(k+1) - b_(k+2)`: the sum is `c_0 + x b_1 - b_2`."""
+    dr = drjit()
+    first, *others = series
+    current = type(x)(0)
+    previous = type(x)(0)
+    for coefficient in reversed(others):
+        following = dr.fma(2 * x, current, coefficient - previous)
+        previous = current
+        current = following
+    return dr.fma(x, current, first - previous)
 
 
 @ft.cache
@@ -245,8 +272,10 @@ def _erfc_series(degree: int) -> list[float]:
     # coefficients that are kept. NumPy's `chebinterpolate` rounds more.
     num_nodes = 64
     angles = (np.arange(num_nodes) + 0.5) * np.pi / num_nodes
-    # The places where the variable of the polynomials is the cosine of these angles.
+    # Here the variable of the polynomials is the cosine of these angles.
     x = _ERFC_MIDDLE / np.tan(angles / 2) ** 2
+    # `erfcx(x)` is `exp(x^2) erfc(x)`. The polynomial of degree n is `cos(n angle)`, so
+    # that a cosine transform gives the coefficients, the first one doubled.
     series = np.asarray(dct((1 + 2 * x) * erfcx(x))) / num_nodes
     series[0] /= 2
     return series[: degree + 1].tolist()
@@ -271,11 +300,13 @@ def _half_exp(a):
 def _sinh(a):
     dr = drjit()
     size = dr.abs(a)
-    grown = _expm1(size)
-    # Where the exponential overflows, the quotient is NaN.
-    value = dr.select(
-        dr.isinf(grown), _half_exp(size), (grown + grown / (grown + 1)) / 2
-    )
+    expm1 = _expm1(size)
+    overflows = dr.isinf(expm1)
+    after_overflow = _half_exp(size)
+    # With `e` for `expm1`, exp(x) is e + 1 and exp(-x) is 1 - e / (e + 1). Where the
+    # exponential overflows, this quotient is NaN.
+    difference = expm1 + expm1 / (expm1 + 1)
+    value = dr.select(overflows, after_overflow, difference / 2)
     return dr.copysign(value, a)
 
 
@@ -289,8 +320,8 @@ def _cosh(a):
 def _tanh(a):
     # On CPUs Dr.Jit's own is as accurate, but gives 0 for -0, and in single precision -1
     # and 1 have different values. Of a negative number the exponential does not overflow.
-    shrunk = _expm1(-2 * drjit().abs(a))
-    return drjit().copysign(-shrunk / (shrunk + 2), a)
+    expm1 = _expm1(-2 * drjit().abs(a))
+    return drjit().copysign(-expm1 / (expm1 + 2), a)
 
 
 def _atanh(a):
@@ -312,18 +343,21 @@ def _erf_inv(a):
         return start
     y = start
     for _ in range(2):
-        newton = (dr.erf(y) - a) * (np.sqrt(np.pi) / 2) * dr.exp(y * y)
-        y = y - newton / (1 + y * newton)
-    # At the ends, and beyond them, it is infinite or NaN, and has no digits to gain.
+        # For `f(y) = erf(y) - a`, Newton's step is `f / f'`. Halley's method divides it by
+        # `1 - (f / f') f'' / (2 f')`, and `f'' / f'` is `-2 y`.
+        newton_step = (dr.erf(y) - a) * (np.sqrt(np.pi) / 2) * dr.exp(y * y)
+        y = y - newton_step / (1 + y * newton_step)
+    # At the ends, and beyond them, the inverse is infinite or NaN, and `start` is right.
     return dr.select(dr.abs(a) < 1, y, start)
 
 
 def _round_half_away(a):
     dr = drjit()
-    # The fraction that is compared is exact. The sum of `a` and one half would be rounded.
     whole = dr.trunc(a)
-    away = whole + dr.copysign(type(a)(1), a)
-    return dr.select(dr.abs(a - whole) >= 0.5, away, whole)
+    next_whole = whole + dr.copysign(type(a)(1), a)
+    # The fraction is exact. The sum of `a` and one half would be rounded.
+    fraction = dr.abs(a - whole)
+    return dr.select(fraction >= 0.5, next_whole, whole)
 
 
 def _square(a):

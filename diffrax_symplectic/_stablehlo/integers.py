@@ -26,8 +26,9 @@ def _least(a):
     return type(a)(-(2 ** (bits - 1)) if drjit().is_signed_v(a) else 0)
 
 
-# Dr.Jit shifts by the type of a number, StableHLO by the operation. A number of bits below
-# zero counts as a large one: without sign it is.
+# In Dr.Jit the type of a number decides whether a shift is logical or arithmetic, in
+# StableHLO the operation. A negative number of bits counts as a large one, as which its
+# bits read without sign.
 
 
 def shift_left(a, b):
@@ -44,19 +45,19 @@ def logical_shift(a, b):
 
 def arithmetic_shift(a, b):
     b = _without_sign(b)
-    signed = _integer("i", a)
+    signed = _with_same_bits("i", a)
     # A shift by all bits or more leaves the sign.
     most = type(b)(8 * drjit().itemsize_v(a) - 1)
     return type(a)(signed >> type(signed)(drjit().select(b < most, b, most)))
 
 
 def _without_sign(a):
-    return _integer("ui", a)
+    return _with_same_bits("ui", a)
 
 
-def _integer(name: str, a: Any) -> Any:
-    """The integer of the same bits, signed (`i`) or not (`ui`)."""
-    return array_types()[f"{name}{8 * drjit().itemsize_v(a)}"](a)
+def _with_same_bits(prefix: str, a: Any) -> Any:
+    """The integer of the same bits, of a signed type (`i`) or one without sign (`ui`)."""
+    return array_types()[f"{prefix}{8 * drjit().itemsize_v(a)}"](a)
 
 
 def to_integer(kind: type, a: Any) -> Any:
@@ -67,16 +68,16 @@ def to_integer(kind: type, a: Any) -> Any:
     dtype = type(a)
     is_signed = dr.is_signed_v(kind)
     bits = 8 * dr.itemsize_v(kind)
-    # The first whole number beyond the range, a power of two, and the float before it.
+    # The first whole number above the range, a power of two, and the float before it.
     end = 2 ** (bits - 1 if is_signed else bits)
-    float_below = float(np.nextafter(end, 0, dtype=f"f{dr.itemsize_v(a)}"))
+    float_below_end = float(np.nextafter(end, 0, dtype=f"f{dr.itemsize_v(a)}"))
     least = -end if is_signed else 0
-    at_most = dr.select(a < end, a, dtype(float_below))
-    in_range = dr.select(a > least, at_most, dtype(least))
+    below_end = dr.select(a < end, a, dtype(float_below_end))
+    in_range = dr.select(a > least, below_end, dtype(least))
     # Dr.Jit has no conversion to integers of eight bits.
     integer = kind(array_types()["i32"](in_range)) if bits < 32 else kind(in_range)
     # If the largest integer is no float, larger numbers have become a smaller integer.
-    if int(float_below) < end - 1:
+    if int(float_below_end) < end - 1:
         integer = dr.select(a < end, integer, kind(end - 1))
     is_nan = ~(a == a)
     return dr.select(is_nan, kind(0), integer)

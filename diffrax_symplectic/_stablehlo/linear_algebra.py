@@ -17,166 +17,203 @@ from .tensor import Tensor
 # Larger matrices take long to compile.
 _MOST_UNKNOWNS = 16
 
+# A list of rows, whose entries are Dr.Jit arrays.
 Matrix: TypeAlias = list[list[Any]]
 
 
 def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
     """The factors of `P A = L U` in one matrix, as `getrf` gives them, and for each column
     the row that was exchanged with it, counted from one."""
-    dr = drjit()
-    index = array_types()["i32"]
     rows = [[*row] for row in a]
+    num_columns = len(rows[0]) if rows else 0
     pivots = []
-    for step in range(min(len(rows), len(rows[0]) if rows else 0)):
-        # The row of the largest entry in what is left of the column, which differs between
-        # paths.
-        largest = dr.abs(rows[step][step])
-        pivot = index(step)
-        for below in range(step + 1, len(rows)):
-            size = dr.abs(rows[below][step])
-            larger = size > largest
-            largest = dr.select(larger, size, largest)
-            pivot = dr.select(larger, index(below), pivot)
-        # Rows have no address within a kernel: any row below may be the one to exchange
-        # with the first, and becomes the top one then.
-        first = rows[step]
-        top = first
-        for below in range(step + 1, len(rows)):
-            is_pivot = pivot == below
-            row = rows[below]
-            rows[below] = _where(is_pivot, first, row)
-            top = _where(is_pivot, row, top)
-        rows[step] = top
-        # If the pivot is zero, so is all that is below it.
-        inverse = dr.select(top[step] == 0, 0, 1 / top[step])
-        for below in range(step + 1, len(rows)):
-            row = rows[below]
-            factor = row[step] * inverse
-            rest = _minus_multiple(row[step + 1 :], factor, top[step + 1 :])
-            rows[below] = [*row[:step], factor, *rest]
+    for column in range(min(len(rows), num_columns)):
+        pivot = _number_of_pivot_row(rows, column)
+        _exchange_with_pivot_row(rows, column, pivot)
+        _eliminate_below(rows, column)
         pivots.append(pivot + 1)
     return rows, pivots
 
 
+def _number_of_pivot_row(rows: Matrix, column: int) -> Any:
+    """The number of the row with the largest entry of a column, from the diagonal down. It
+    differs between paths."""
+    dr = drjit()
+    index = array_types()["i32"]
+    largest = dr.abs(rows[column][column])
+    pivot = index(column)
+    for below in range(column + 1, len(rows)):
+        size = dr.abs(rows[below][column])
+        is_larger = size > largest
+        largest = dr.select(is_larger, size, largest)
+        pivot = dr.select(is_larger, index(below), pivot)
+    return pivot
+
+
+def _exchange_with_pivot_row(rows: Matrix, top: int, pivot: Any) -> None:
+    """Exchanges the row number `top` with row `pivot`, which is the same or one below."""
+    # Rows have no address within a kernel: any row below may be the one to exchange.
+    old_top = rows[top]
+    new_top = old_top
+    for below in range(top + 1, len(rows)):
+        is_pivot = pivot == below
+        row = rows[below]
+        rows[below] = _where(is_pivot, old_top, row)
+        new_top = _where(is_pivot, row, new_top)
+    rows[top] = new_top
+
+
+def _eliminate_below(rows: Matrix, column: int) -> None:
+    """Subtracts multiples of the row on the diagonal from those below, so that their
+    entries in this column become zero, and stores the factors in place of these zeros."""
+    top = rows[column]
+    # If the pivot is zero, so is all that is below it.
+    inverse = drjit().select(top[column] == 0, 0, 1 / top[column])
+    for below in range(column + 1, len(rows)):
+        row = rows[below]
+        factor = row[column] * inverse
+        rest = _minus_multiple(row[column + 1 :], factor, top[column + 1 :])
+        rows[below] = [*row[:column], factor, *rest]
+
+
 def _where(mask: Any, row: list[Any], other: list[Any]) -> list[Any]:
     """One row where a mask is true, and another elsewhere."""
-    return [drjit().select(mask, entry, old) for entry, old in zip(row, other)]
+    return [drjit().select(mask, x, y) for x, y in zip(row, other)]
 
 
 def _minus_multiple(row: list[Any], factor: Any, other: list[Any]) -> list[Any]:
-    """A row less a multiple of another."""
-    return [drjit().fma(-factor, entry, old) for old, entry in zip(row, other)]
+    """`row - factor * other`."""
+    return [drjit().fma(-factor, y, x) for x, y in zip(row, other)]
 
 
 def _cholesky(a: Matrix) -> tuple[Matrix, Any]:
-    """The lower factor of `A = L L^T`, and where `A` is not positive definite. Reads the
-    lower triangle, and leaves the upper one."""
+    """The lower factor of `A = L L^T`, and the mask of the lanes in which `A` is not
+    positive definite. Reads the lower triangle, and leaves the upper one.
+
+    Column by column, from the entries `a` of `A` and `l` of `L`, with sums over `k < j`:
+
+        l_jj = sqrt(a_jj - sum l_jk^2)
+        l_ij = (a_ij - sum l_ik l_jk) / l_jj
+    """
     dr = drjit()
     rows = [[*row] for row in a]
     failed = array_types()["i1"](False)
-    for column, row in enumerate(rows):
-        square = row[column]
-        for k in range(column):
+    for j, row in enumerate(rows):
+        square = row[j]
+        for k in range(j):
             square = dr.fma(-row[k], row[k], square)
         # The comparison is false for NaN, too.
         failed = failed | ~(square > 0)
-        row[column] = dr.sqrt(square)
+        row[j] = dr.sqrt(square)
         # One division for the whole column.
-        inverse = 1 / row[column]
-        for below in rows[column + 1 :]:
-            entry = below[column]
-            for k in range(column):
+        inverse = 1 / row[j]
+        for below in rows[j + 1 :]:
+            entry = below[j]
+            for k in range(j):
                 entry = dr.fma(-below[k], row[k], entry)
-            below[column] = entry * inverse
+            below[j] = entry * inverse
     return rows, failed
 
 
-def _solve_triangular(a: Matrix, b: Matrix, lower: bool, unit: bool) -> Matrix:
-    """The solution of `A X = B`. Reads one triangle of `A`, and with `unit` takes its
-    diagonal for ones."""
+def _solve_triangular(a: Matrix, b: Matrix, is_lower: bool, is_unit: bool) -> Matrix:
+    """The solution of `A X = B`. Reads one triangle of `A`, the lower or the upper one,
+    and with `is_unit` takes its diagonal for ones."""
     n = len(a)
-    solved: dict[int, list[Any]] = {}
+    rows_of_solution: dict[int, list[Any]] = {}
     # From the row with a single unknown on, each row has one more.
-    for i in range(n) if lower else reversed(range(n)):
+    for i in range(n) if is_lower else reversed(range(n)):
         row = b[i]
-        for j, known in solved.items():
-            row = _minus_multiple(row, a[i][j], known)
-        if not unit:
+        for j, solved_row in rows_of_solution.items():
+            row = _minus_multiple(row, a[i][j], solved_row)
+        if not is_unit:
             inverse = 1 / a[i][i]
             row = [entry * inverse for entry in row]
-        solved[i] = row
-    return [solved[i] for i in range(n)]
+        rows_of_solution[i] = row
+    return [rows_of_solution[i] for i in range(n)]
 
 
 def _transposed(a: Matrix) -> Matrix:
     return [[*column] for column in zip(*a)]
 
 
-def _matrices(o: Operation, x: Tensor) -> list[Matrix]:
-    """The matrices of a batch."""
-    rows, columns = x.shape[-2:]
+def _matrices(operation: Operation, x: Tensor) -> list[Matrix]:
+    """The matrices of a batch, whose last two axes are theirs. Raises a `NotReplayed` if
+    they are too large."""
+    *batch, num_rows, num_columns = x.shape
     # `inv` has as many right-hand sides as unknowns.
-    if max(rows, columns) > _MOST_UNKNOWNS:
-        what = f"`{call_target(o.op)}` with more than {_MOST_UNKNOWNS} unknowns"
-        raise NotReplayed(o.op, what)
-    places = x.places.reshape(math.prod(x.shape[:-2]), rows, columns)
-    return [[[x.entries[i] for i in row] for row in matrix] for matrix in places]
+    if max(num_rows, num_columns) > _MOST_UNKNOWNS:
+        target = call_target(operation.mlir_op)
+        what = f"`{target}` with more than {_MOST_UNKNOWNS} unknowns"
+        raise NotReplayed(operation.mlir_op, what)
+    places = x.places.reshape(math.prod(batch), num_rows, num_columns)
+    return [
+        [[x.entries[place] for place in row] for row in matrix] for matrix in places
+    ]
 
 
-def _tensor(matrices: list[Matrix], shape: tuple[int, ...]) -> Tensor:
+def _tensor_of(matrices: list[Matrix], shape: tuple[int, ...]) -> Tensor:
     """The inverse of `_matrices`."""
-    return Tensor([entry for a in matrices for row in a for entry in row], shape)
+    entries = [entry for matrix in matrices for row in matrix for entry in row]
+    return Tensor(entries, shape)
 
 
-def _getrf(o: Operation, x: Tensor) -> list[Tensor]:
+# The functions below are called as LAPACK's are, without the letter for the type of
+# numbers. Their arguments and results are those with which JAX calls these.
+
+
+def _getrf(operation: Operation, x: Tensor) -> list[Tensor]:
+    """The factors of `P A = L U`, the exchanges of rows, and `info`."""
     factors = []
     pivots = []
-    for matrix in _matrices(o, x):
+    for matrix in _matrices(operation, x):
         factors_of_matrix, pivots_of_matrix = _lu(matrix)
         factors.append(factors_of_matrix)
         pivots.extend(pivots_of_matrix)
-    _, shape_of_pivots, shape_of_info = o.shapes()
+    _, shape_of_pivots, shape_of_info = operation.shapes
     # JAX asks `info` for arguments that LAPACK does not take, not for pivots of zero.
     success = array_types()["i32"](0)
     return [
-        _tensor(factors, x.shape),
+        _tensor_of(factors, x.shape),
         Tensor(pivots, shape_of_pivots),
         Tensor([success] * len(factors), shape_of_info),
     ]
 
 
-def _potrf(o: Operation, x: Tensor) -> list[Tensor]:
-    upper = o.letter("uplo") == "U"
+def _potrf(operation: Operation, x: Tensor) -> list[Tensor]:
+    """Cholesky's factor of a positive definite matrix, and `info`."""
+    is_upper = operation.letter("uplo") == "U"
     factors = []
     info = []
-    for matrix in _matrices(o, x):
+    for matrix in _matrices(operation, x):
         # The upper factor U of `A = U^T U` is the transpose of the lower one.
-        factor, failed = _cholesky(_transposed(matrix) if upper else matrix)
-        factors.append(_transposed(factor) if upper else factor)
+        factor, failed = _cholesky(_transposed(matrix) if is_upper else matrix)
+        factors.append(_transposed(factor) if is_upper else factor)
         # JAX asks whether `info` is zero.
         info.append(drjit().select(failed, array_types()["i32"](1), 0))
-    _, shape_of_info = o.shapes()
-    return [_tensor(factors, x.shape), Tensor(info, shape_of_info)]
+    _, shape_of_info = operation.shapes
+    return [_tensor_of(factors, x.shape), Tensor(info, shape_of_info)]
 
 
-def _trsm(o: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
-    lower = o.letter("uplo") == "L"
-    unit = o.letter("diag") == "U"
-    right = o.letter("side") == "R"
-    # The matrix is on the right in `X A = B`, which is `A^T X^T = B^T`. So it is transposed
-    # for either of `trans_x` and `right`, but not for both.
-    turns = (o.letter("trans_x") != "N") != right
-    out = []
-    for matrix, rhs in zip(_matrices(o, a), _matrices(o, b), strict=True):
-        rhs = _transposed(rhs) if right else rhs
-        matrix = _transposed(matrix) if turns else matrix
-        x = _solve_triangular(matrix, rhs, lower != turns, unit)
-        out.append(_transposed(x) if right else x)
-    return [_tensor(out, b.shape)]
+def _trsm(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
+    """The solution of a triangular system, with the matrix on either side."""
+    is_lower = operation.letter("uplo") == "L"
+    is_unit = operation.letter("diag") == "U"
+    is_on_the_right = operation.letter("side") == "R"
+    # `X A = B` is `A^T X^T = B^T`. So the matrix is transposed if it is on the right or
+    # LAPACK is asked to transpose it, but not for both.
+    is_transposed = (operation.letter("trans_x") != "N") != is_on_the_right
+    solutions = []
+    pairs = zip(_matrices(operation, a), _matrices(operation, b), strict=True)
+    for matrix, rhs in pairs:
+        rhs = _transposed(rhs) if is_on_the_right else rhs
+        matrix = _transposed(matrix) if is_transposed else matrix
+        # The transpose of a lower triangle is an upper one.
+        x = _solve_triangular(matrix, rhs, is_lower != is_transposed, is_unit)
+        solutions.append(_transposed(x) if is_on_the_right else x)
+    return [_tensor_of(solutions, b.shape)]
 
 
-# LAPACK's names without the letter for the type of numbers.
-_CALLS: dict[str, Callable[..., list[Tensor]]] = {
+_LAPACK: dict[str, Callable[..., list[Tensor]]] = {
     "getrf": _getrf,
     "potrf": _potrf,
     "trsm": _trsm,
@@ -184,10 +221,11 @@ _CALLS: dict[str, Callable[..., list[Tensor]]] = {
 
 
 @rule
-def _custom_call(o, *xs):
-    name = call_target(o.op)
+def _custom_call(operation: Operation, *xs: Tensor) -> list[Tensor]:
+    target = call_target(operation.mlir_op)
+    # The first letter of LAPACK's name says the precision, single or double.
     for letter in ("s", "d"):
-        for call, fn in _CALLS.items():
-            if name == f"lapack_{letter}{call}_ffi":
-                return fn(o, *xs)
-    raise NotReplayed(o.op, f"a call of `{name}`")
+        for name, fn in _LAPACK.items():
+            if target == f"lapack_{letter}{name}_ffi":
+                return fn(operation, *xs)
+    raise NotReplayed(operation.mlir_op, f"a call of `{target}`")

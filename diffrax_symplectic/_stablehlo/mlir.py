@@ -63,7 +63,7 @@ def attribute_integers(op: Any, name: str) -> list[int]:
     return [int(i) for i in op.attributes[name]]
 
 
-def attribute_rows(op: Any, name: str) -> np.ndarray:
+def attribute_matrix(op: Any, name: str) -> np.ndarray:
     """An attribute of MLIR that is a matrix of integers."""
     return np.asarray(op.attributes[name])
 
@@ -97,20 +97,24 @@ def attribute_part(op: Any, name: str, key: str) -> list[int]:
 
 def constant_values(op: Any) -> np.ndarray:
     """The values of a constant of StableHLO, in its own shape."""
-    kind = op.results[0].type
-    shape = tuple(kind.shape)
-    if not str(kind.element_type).startswith("complex"):
-        return np.broadcast_to(np.asarray(op.attributes["value"]), shape)
-    # MLIR gives the values of real constants only: complex ones are read from its text,
-    # `dense<"0x...">` with the bytes of many, or `dense<[(1.0,2.0), ...]>`.
-    text = str(op)
-    bytes_of_part = 8 if "complex<f64>" in text else 4
+    type_of_result = op.results[0].type
+    shape = tuple(type_of_result.shape)
+    if str(type_of_result.element_type).startswith("complex"):
+        return _complex_constant(str(op), shape)
+    return np.broadcast_to(np.asarray(op.attributes["value"]), shape)
+
+
+def _complex_constant(text: str, shape: tuple[int, ...]) -> np.ndarray:
+    """The values of a complex constant, of which MLIR gives only the text: either
+    `dense<"0x...">` with the bytes of many, or `dense<[(1.0,2.0), ...]>`."""
+    num_bytes = 8 if "complex<f64>" in text else 4
     if in_hexadecimal := re.search(r'dense<"0x([0-9A-F]+)">', text):
-        parts = np.frombuffer(bytes.fromhex(in_hexadecimal[1]), f"<f{bytes_of_part}")
+        parts = np.frombuffer(bytes.fromhex(in_hexadecimal[1]), f"<f{num_bytes}")
     else:
+        # The type of the constant follows after the colon.
         pairs = re.findall(r"\(([^(),]+),([^(),]+)\)", text.split(" : ")[0])
-        numbers = [_number_of(part, bytes_of_part) for pair in pairs for part in pair]
-        parts = np.array(numbers, f"<f{bytes_of_part}")
+        numbers = [_number_of(part, num_bytes) for pair in pairs for part in pair]
+        parts = np.array(numbers, f"<f{num_bytes}")
     # Real and imaginary parts alternate. `real + 1j * imag` would turn an infinite part
     # into a NaN of the other.
     values = parts[::2] + 0j
@@ -120,7 +124,8 @@ def constant_values(op: Any) -> np.ndarray:
 
 
 def _number_of(text: str, num_bytes: int) -> float:
-    """The number that MLIR prints as this text: as hexadecimal bits if it is not finite."""
+    """The number of this size that MLIR prints as this text: as hexadecimal bits if it is
+    not finite."""
     text = text.strip()
     if not text.startswith("0x"):
         return float(text)

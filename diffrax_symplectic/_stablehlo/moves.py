@@ -10,87 +10,92 @@ import numpy as np
 from .backend import array_types, drjit
 from .complex import equal, is_complex
 from .integers import to_integer
-from .operation import NotReplayed, rule
-from .tensor import constant, each, flat, Tensor
+from .operation import NotReplayed, Operation, rule
+from .tensor import constant, entries_of, map_entries, Tensor
 
 
 @rule
-def _constant(o):
-    return [constant(o.kind, o.value)]
+def _constant(operation: Operation) -> list[Tensor]:
+    return [constant(operation.kind, operation.value)]
 
 
 @rule
-def _iota(o):
-    along = np.indices(o.shape)[o.number("iota_dimension")]
-    return [constant(o.kind, along)]
+def _iota(operation: Operation) -> list[Tensor]:
+    indices = np.indices(operation.shape)[operation.integer("iota_dimension")]
+    return [constant(operation.kind, indices)]
 
 
 @rule
-def _broadcast_in_dim(o, x):
+def _broadcast_in_dim(operation: Operation, x: Tensor) -> list[Tensor]:
     # The axes of `x` in the order of those of the result, and new ones of length one.
-    sizes = [1] * len(o.shape)
-    for axis, size in zip(o.ints("broadcast_dimensions"), x.shape):
+    sizes = [1] * len(operation.shape)
+    for axis, size in zip(operation.integers("broadcast_dimensions"), x.shape):
         sizes[axis] = size
-    return [x.take(np.broadcast_to(x.places.reshape(sizes), o.shape))]
+    return [x.take(np.broadcast_to(x.places.reshape(sizes), operation.shape))]
 
 
 @rule
-def _reshape(o, x):
-    return [Tensor(x.entries, o.shape)]
+def _reshape(operation: Operation, x: Tensor) -> list[Tensor]:
+    return [Tensor(x.entries, operation.shape)]
 
 
 @rule
-def _transpose(o, x):
-    return [x.take(x.places.transpose(o.ints("permutation")))]
+def _transpose(operation: Operation, x: Tensor) -> list[Tensor]:
+    return [x.take(x.places.transpose(operation.integers("permutation")))]
 
 
 @rule
-def _slice(o, x):
-    begins = o.ints("start_indices")
-    ends = o.ints("limit_indices")
-    kept = tuple(map(slice, begins, ends, o.ints("strides")))
+def _slice(operation: Operation, x: Tensor) -> list[Tensor]:
+    begins = operation.integers("start_indices")
+    ends = operation.integers("limit_indices")
+    kept = tuple(map(slice, begins, ends, operation.integers("strides")))
     return [x.take(x.places[kept])]
 
 
 @rule
-def _reverse(o, x):
-    return [x.take(np.flip(x.places, o.ints("dimensions")))]
+def _reverse(operation: Operation, x: Tensor) -> list[Tensor]:
+    return [x.take(np.flip(x.places, tuple(operation.integers("dimensions"))))]
 
 
 @rule
-def _concatenate(o, *xs):
-    whole = Tensor([*flat(xs)], ())
+def _concatenate(operation: Operation, *xs: Tensor) -> list[Tensor]:
+    whole = Tensor([*entries_of(xs)], ())
     # Where the entries of each array begin in the list of all.
     begins = np.cumsum([0, *[len(x.entries) for x in xs]])
     places = [x.places + begin for x, begin in zip(xs, begins)]
-    return [whole.take(np.concatenate(places, o.number("dimension")))]
+    return [whole.take(np.concatenate(places, operation.integer("dimension")))]
 
 
 @rule
-def _pad(o, x, value):
-    low = o.ints("edge_padding_low")
-    between = o.ints("interior_padding")
-    # Along each axis, where the entries of `x` go. A negative padding drops some of them.
+def _pad(operation: Operation, x: Tensor, value: Tensor) -> list[Tensor]:
+    before = operation.integers("edge_padding_low")
+    between = operation.integers("interior_padding")
+    # For each axis, the index in the result of each index of `x`. A negative padding moves
+    # some out of the result.
     targets = [
-        begin + np.arange(size) * (gap + 1)
-        for begin, gap, size in zip(low, between, x.shape)
+        begin + np.arange(length) * (gap + 1)
+        for begin, gap, length in zip(before, between, x.shape)
     ]
-    is_inside = [(0 <= at) & (at < size) for at, size in zip(targets, o.shape)]
-    kept = [at[inside] for at, inside in zip(targets, is_inside)]
+    is_inside = [
+        (0 <= target) & (target < length)
+        for target, length in zip(targets, operation.shape)
+    ]
+    targets_inside = [target[inside] for target, inside in zip(targets, is_inside)]
     # One list of the entries of `x` and the value, which comes last.
     all_entries = Tensor([*x.entries, value.item()], ())
     place_of_value = len(x.entries)
-    places = np.full(o.shape, place_of_value)
-    places[np.ix_(*kept)] = x.places[np.ix_(*is_inside)]
+    places = np.full(operation.shape, place_of_value)
+    places[np.ix_(*targets_inside)] = x.places[np.ix_(*is_inside)]
     return [all_entries.take(places)]
 
 
 @rule
-def _convert(o, x):
-    return [each(ft.partial(_converted, o.kind), x)]
+def _convert(operation: Operation, x: Tensor) -> list[Tensor]:
+    return [map_entries(ft.partial(_converted, operation.kind), x)]
 
 
 def _converted(kind: type, entry: Any) -> Any:
+    """An entry as a number of this type of Dr.Jit."""
     dr = drjit()
     if type(entry) is kind:
         return entry
@@ -102,41 +107,55 @@ def _converted(kind: type, entry: Any) -> Any:
 
 
 @rule
-def _bitcast_convert(o, x):
-    if o.shape != x.shape:
-        raise NotReplayed(o.op, f"`{o.op.name}` between numbers of different sizes")
+def _bitcast_convert(operation: Operation, x: Tensor) -> list[Tensor]:
+    if operation.shape != x.shape:
+        raise NotReplayed(
+            operation.mlir_op,
+            f"`{operation.full_name}` between numbers of different sizes",
+        )
 
     def reinterpreted(entry: Any) -> Any:
-        return drjit().reinterpret_array(o.kind, entry)
+        return drjit().reinterpret_array(operation.kind, entry)
 
-    return [each(reinterpreted, x)]
-
-
-@rule
-def _complex(o, real, imag):
-    return [each(o.kind, real, imag)]
+    return [map_entries(reinterpreted, x)]
 
 
 @rule
-def _compare(o, a, b):
-    direction = o.word("comparison_direction").lower()
-    if o.has("compare_type") and o.word("compare_type") == "TOTALORDER":
-        a = each(_in_total_order, a)
-        b = each(_in_total_order, b)
+def _complex(operation: Operation, real: Tensor, imag: Tensor) -> list[Tensor]:
+    return [map_entries(operation.kind, real, imag)]
+
+
+@rule
+def _compare(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
+    # The directions are called as Python's functions are, such as `LT`.
+    direction = operation.word("comparison_direction").lower()
+    compare = getattr(operator, direction)
+    if operation.has("compare_type") and operation.word("compare_type") == "TOTALORDER":
+        a = map_entries(_in_total_order, a)
+        b = map_entries(_in_total_order, b)
     # All entries are of one type.
     if is_complex(a.entries[0]):
         # Complex numbers have no order: the direction is `eq` or `ne`.
-        same = each(equal, a, b)
-        return [same if direction == "eq" else each(operator.invert, same)]
+        is_equal = map_entries(equal, a, b)
+        return [
+            is_equal if direction == "eq" else map_entries(operator.invert, is_equal)
+        ]
     if direction == "ne":
         # NaN differs from everything. In Dr.Jit NaN != NaN is false, unless it is folded.
-        return [each(operator.invert, each(operator.eq, a, b))]
-    return [each(getattr(operator, direction), a, b)]
+        return [map_entries(operator.invert, map_entries(operator.eq, a, b))]
+    return [map_entries(compare, a, b)]
 
 
 def _in_total_order(a: Any) -> Any:
-    """An integer that orders floating-point numbers, with NaN above infinity."""
-    bits = 8 * drjit().itemsize_v(a)
-    number = drjit().reinterpret_array(array_types()[f"i{bits}"], a)
-    # All bits but the sign are turned in negative numbers, which the shift tells.
-    return number ^ ((number >> (bits - 1)) & (2 ** (bits - 1) - 1))
+    """An integer that orders floating-point numbers, with NaN above infinity.
+
+    The bits of positive numbers, read as an integer, are in their order, and those of
+    negative numbers in the reverse order.
+    """
+    num_bits = 8 * drjit().itemsize_v(a)
+    bits = drjit().reinterpret_array(array_types()[f"i{num_bits}"], a)
+    # The shift fills all bits with the sign, so that all other bits of negative numbers are
+    # turned.
+    sign = bits >> (num_bits - 1)
+    all_but_sign = 2 ** (num_bits - 1) - 1
+    return bits ^ (sign & all_but_sign)

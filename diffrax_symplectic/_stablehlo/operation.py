@@ -16,8 +16,8 @@ from .mlir import (
     attribute_entry,
     attribute_enum,
     attribute_integers,
+    attribute_matrix,
     attribute_part,
-    attribute_rows,
     attribute_value,
     constant_values,
     has_attribute,
@@ -26,82 +26,96 @@ from .mlir import (
 from .tensor import Tensor
 
 
+# The number of the region of an operation that has a single one, such as a reduction.
+ONLY_REGION = 0
+
+
 class Operation(NamedTuple):
     """An operation of a program.
 
-    - `op`: the object of MLIR.
-    - `run`: `run(i, arguments)` runs the region number `i`, such as the body of a loop.
+    - `mlir_op`: the object of MLIR.
+    - `run`: `run(i, arguments)` returns the results of region number `i`, such as the body
+        of a loop.
     - `errors`: masks of the lanes that raise an error, to which rules append. The caller
         of the program sees to these lanes.
     """
 
-    op: Any
+    mlir_op: Any
     run: Callable[..., list[Tensor]]
     errors: list[Any]
 
     @property
+    def full_name(self) -> str:
+        """The name with the dialect, such as `stablehlo.add`, as in messages."""
+        return self.mlir_op.name
+
+    @property
     def name(self) -> str:
         """The name without the dialect, such as `add`."""
-        return self.op.name.split(".")[-1]
+        return _without_dialect(self.full_name)
 
     @property
     def shape(self) -> tuple[int, ...]:
         """The shape of the first result."""
-        return tuple(self.op.results[0].type.shape)
+        return tuple(self.mlir_op.results[0].type.shape)
 
     @property
     def kind(self) -> Any:
-        """The type of Dr.Jit arrays for the first result."""
-        type_of_result = self.op.results[0].type
+        """The type of Dr.Jit arrays for the entries of the first result. Raises a
+        `NotReplayed` if Dr.Jit has none."""
+        type_of_result = self.mlir_op.results[0].type
         # A token, which orders side effects, has no type of entries.
         name = str(getattr(type_of_result, "element_type", type_of_result))
         if name not in array_types():
-            raise NotReplayed(self.op, f"numbers of type `{name}`")
+            raise NotReplayed(self.mlir_op, f"numbers of type `{name}`")
         return array_types()[name]
 
     @property
     def value(self) -> np.ndarray:
         """The values of a constant."""
-        return constant_values(self.op)
+        return constant_values(self.mlir_op)
 
     @property
     def reduces_by(self) -> str | None:
         """The name of the operation that a reduction repeats, such as `add`; `None` if its
         region does more than one."""
-        name = sole_operation(self.op.regions[0])
-        return None if name is None else name.split(".")[-1]
+        full_name = sole_operation(self.mlir_op.regions[ONLY_REGION])
+        return None if full_name is None else _without_dialect(full_name)
+
+    @property
+    def shapes(self) -> list[tuple[int, ...]]:
+        """The shapes of all results."""
+        return [tuple(result.type.shape) for result in self.mlir_op.results]
+
+    # The methods below read an attribute of the operation, by its name in StableHLO.
 
     def has(self, name: str) -> bool:
-        return has_attribute(self.op, name)
+        return has_attribute(self.mlir_op, name)
 
-    def ints(self, name: str) -> list[int]:
-        return attribute_integers(self.op, name)
+    def integers(self, name: str) -> list[int]:
+        return attribute_integers(self.mlir_op, name)
 
-    def optional(self, name: str) -> list[int]:
-        """As `ints`, or nothing if there is no such attribute."""
-        return self.ints(name) if self.has(name) else []
+    def optional_integers(self, name: str) -> list[int]:
+        """As `integers`; an empty list if there is no such attribute."""
+        return self.integers(name) if self.has(name) else []
 
-    def number(self, name: str) -> int:
-        return attribute_value(self.op, name)
+    def integer(self, name: str) -> int:
+        return attribute_value(self.mlir_op, name)
 
-    def rows(self, name: str) -> np.ndarray:
-        return attribute_rows(self.op, name)
+    def matrix(self, name: str) -> np.ndarray:
+        return attribute_matrix(self.mlir_op, name)
 
     def letter(self, name: str) -> str:
         """An argument of LAPACK, such as `U` for an upper triangle."""
-        return chr(attribute_entry(self.op, "mhlo.backend_config", name))
+        return chr(attribute_entry(self.mlir_op, "mhlo.backend_config", name))
 
     def word(self, name: str) -> str:
         """The value of an enumeration, such as `LT`."""
-        return attribute_enum(self.op, name)
+        return attribute_enum(self.mlir_op, name)
 
     def part(self, name: str, key: str) -> list[int]:
         """An entry of an attribute with several, such as `offset_dims` of a `gather`."""
-        return attribute_part(self.op, name, key)
-
-    def shapes(self) -> list[tuple[int, ...]]:
-        """The shapes of all results."""
-        return [tuple(result.type.shape) for result in self.op.results]
+        return attribute_part(self.mlir_op, name, key)
 
     def fail(self, mask: Any) -> None:
         """Marks the lanes of this mask as failed."""
@@ -109,26 +123,33 @@ class Operation(NamedTuple):
         if not (is_literal(mask) and not mask[0]):
             self.errors.append(mask)
 
-    def failing(self, fn: Callable[[], Any]) -> tuple[Any, Any]:
-        """What `fn` returns, and the mask of the lanes that fail in it: within a loop or
-        branch a mask belongs to its inside, which has to return it."""
+    def with_failures(self, fn: Callable[[], Any]) -> tuple[Any, Any]:
+        """What `fn` returns, and the mask of the lanes that fail in it, which are taken out
+        of `errors`: a mask that is recorded within a loop or branch cannot be used outside,
+        so the loop or branch has to return it."""
         num_before = len(self.errors)
         returned = fn()
         new_errors = self.errors[num_before:]
         del self.errors[num_before:]
-        none = array_types()["i1"](False)
-        return returned, ft.reduce(operator.or_, new_errors, none)
+        no_lane = array_types()["i1"](False)
+        return returned, ft.reduce(operator.or_, new_errors, no_lane)
+
+
+def _without_dialect(full_name: str) -> str:
+    return full_name.split(".")[-1]
 
 
 class NotReplayed(Exception):
-    """An operation that cannot be replayed, and which part of it.
+    """An operation that cannot be replayed.
 
     - `location`: where it comes from, as JAX recorded it.
     """
 
-    def __init__(self, op: Any, what: str | None = None):
-        super().__init__(what or f"`{op.name}`")
-        self.location = str(op.location)
+    def __init__(self, mlir_op: Any, what: str | None = None):
+        """`what` is the message: the part that cannot be replayed. Without it, the message
+        is the name of the operation."""
+        super().__init__(what or f"`{mlir_op.name}`")
+        self.location = str(mlir_op.location)
 
 
 # From an operation and its operands to its results.

@@ -1,6 +1,8 @@
 """The table of operations that can be replayed. An elementwise operation is a line in
 `elementwise` or `complex`; any other is a function with the decorator `rule`."""
 
+import functools as ft
+from collections.abc import Callable
 from typing import Any
 
 from . import (  # noqa: F401 (they fill the table)
@@ -14,7 +16,7 @@ from .angles import lanes_with_too_large_angle
 from .complex import complex_functions, is_complex
 from .elementwise import elementwise
 from .operation import NotReplayed, Operation, Rule, RULES
-from .tensor import each, same_table, Tensor
+from .tensor import map_entries, same_table, Tensor
 
 
 def rule_of(name: str) -> Rule | None:
@@ -24,8 +26,7 @@ def rule_of(name: str) -> Rule | None:
     if of_real is None and of_complex is None:
         return RULES.get(name)
 
-    def entry_by_entry(o: Operation, *xs: Tensor) -> list[Tensor]:
-        """The rule that applies the function of this name to each entry."""
+    def entry_by_entry(operation: Operation, *xs: Tensor) -> list[Tensor]:
         if name == "select" and same_table(xs[1], xs[2]):
             # `vmap` of a conditional selects between two equal tables: one stays in memory.
             return [xs[1]]
@@ -34,19 +35,21 @@ def rule_of(name: str) -> Rule | None:
         function = of_complex if has_complex_operand else of_real
         if function is None:
             kind = "complex" if has_complex_operand else "real"
-            raise NotReplayed(o.op, f"`{o.op.name}` of {kind} numbers")
-
-        def apply(*entries: Any) -> Any:
-            # Dr.Jit's sine is wrong beyond some angle. Lanes with a larger angle fail, and
-            # JAX simulates their paths again.
-            lanes = lanes_with_too_large_angle(name, *entries)
-            if lanes is not None:
-                o.fail(lanes)
-            return function(*entries)
-
-        return [each(apply, *xs)]
+            raise NotReplayed(
+                operation.mlir_op, f"`{operation.full_name}` of {kind} numbers"
+            )
+        return [map_entries(ft.partial(_applied, operation, function), *xs)]
 
     return entry_by_entry
+
+
+def _applied(operation: Operation, function: Callable, *entries: Any) -> Any:
+    """An elementwise function of one entry of each operand. Dr.Jit's sine is wrong beyond
+    some angle: lanes with a larger angle fail, and JAX simulates their paths again."""
+    failed = lanes_with_too_large_angle(operation.name, *entries)
+    if failed is not None:
+        operation.fail(failed)
+    return function(*entries)
 
 
 def names() -> set[str]:

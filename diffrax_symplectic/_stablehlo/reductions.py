@@ -13,45 +13,52 @@ from .._compat import is_literal
 from .backend import drjit
 from .complex import is_complex
 from .elementwise import is_zero
-from .operation import NotReplayed, Operation, rule
-from .tensor import known, Tensor
+from .operation import NotReplayed, ONLY_REGION, Operation, rule
+from .tensor import known_values, scalar, Tensor
 
 
 # The most numbers to sort: exchanges grow with the square of the number.
 _MOST_SORTED = 16
 
 
+def _is_real_float(a: Any) -> bool:
+    return drjit().is_float_v(a) and not is_complex(a)
+
+
 def _multiplied_and_added(a: Any, b: Any, c: Any) -> Any:
     """`a b + c`, in one operation if it can be."""
-    real = drjit().is_float_v(c) and not is_complex(c)
-    return drjit().fma(a, b, c) if real else a * b + c
+    return drjit().fma(a, b, c) if _is_real_float(c) else a * b + c
 
 
 @rule
-def _dot_general(o, a, b):
-    left = _matrices(o, a, "lhs")
-    right = _matrices(o, b, "rhs")
-    _, rows, _ = left.shape
-    batch, columns, _ = right.shape
+def _dot_general(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
+    # The places of the factors, of shapes (batch, rows, summed) and (batch, columns,
+    # summed): row times column for each entry of the result.
+    places_in_a = _as_matrices(operation, a, "lhs")
+    places_in_b = _as_matrices(operation, b, "rhs")
+    batch_size, num_rows, _ = places_in_a.shape
+    _, num_columns, _ = places_in_b.shape
     # Products and sums have the type of the result, to which other numbers are converted.
-    a_entries = [x if type(x) is o.kind else o.kind(x) for x in a.entries]
-    b_entries = [x if type(x) is o.kind else o.kind(x) for x in b.entries]
-    out = []
-    for k, row, column in np.ndindex(batch, rows, columns):
-        ours = [a_entries[i] for i in left[k, row]]
-        theirs = [b_entries[j] for j in right[k, column]]
-        total = o.kind(0)
-        if drjit().is_float_v(total) and not is_complex(total):
-            total = total + _left_out(ours, theirs) + _left_out(theirs, ours)
-        for x, y in zip(ours, theirs):
+    kind = operation.kind
+    a_entries = [x if type(x) is kind else kind(x) for x in a.entries]
+    b_entries = [x if type(x) is kind else kind(x) for x in b.entries]
+    results = []
+    for batch, i, j in np.ndindex(batch_size, num_rows, num_columns):
+        row = [a_entries[place] for place in places_in_a[batch, i]]
+        column = [b_entries[place] for place in places_in_b[batch, j]]
+        total = kind(0)
+        if _is_real_float(total):
+            total = total + _sum_left_out(row, column) + _sum_left_out(column, row)
+        for x, y in zip(row, column):
             total = _multiplied_and_added(x, y, total)
-        out.append(total)
-    return [Tensor(out, o.shape)]
+        results.append(total)
+    return [Tensor(results, operation.shape)]
 
 
-def _left_out(factors: Sequence[Any], others: Sequence[Any]) -> Any:
-    """The sum of the products that Dr.Jit leaves out, those with a zero that is known while
-    the kernel is recorded: zero, or NaN if the other factor may be infinite."""
+def _sum_left_out(factors: Sequence[Any], others: Sequence[Any]) -> Any:
+    """The sum of the products that Dr.Jit leaves out, because one of `factors` is a zero
+    that is known while the kernel is recorded: zero, or NaN if a number among `others` is
+    infinite or NaN."""
     unknown = [x for x in others if not is_literal(x)]
     if not unknown or not any(map(is_zero, factors)):
         return 0
@@ -61,12 +68,12 @@ def _left_out(factors: Sequence[Any], others: Sequence[Any]) -> Any:
     return total - total
 
 
-def _matrices(o: Operation, x: Tensor, side: str) -> np.ndarray:
-    """The places of a factor of `dot_general`: with an axis for the products, one for what
-    stays, and one to sum over."""
+def _as_matrices(operation: Operation, x: Tensor, side: str) -> np.ndarray:
+    """The places of a factor of `dot_general`, which is the `lhs` or the `rhs`, in the
+    shape (batch, kept axes, summed axes): each group of axes is one axis here."""
     name = "dot_dimension_numbers"
-    batch = o.part(name, f"{side}_batching_dimensions")
-    summed = o.part(name, f"{side}_contracting_dimensions")
+    batch = operation.part(name, f"{side}_batching_dimensions")
+    summed = operation.part(name, f"{side}_contracting_dimensions")
     kept = [axis for axis in range(len(x.shape)) if axis not in (*batch, *summed)]
     groups = (batch, kept, summed)
     sizes = [math.prod(x.shape[axis] for axis in axes) for axes in groups]
@@ -74,41 +81,50 @@ def _matrices(o: Operation, x: Tensor, side: str) -> np.ndarray:
 
 
 @rule
-def _reduce(o, *xs):
-    # Several arrays may be reduced together, such as values and places for `argmax`.
-    # First come the arrays, then where each reduction starts.
-    num_arrays = len(xs) // 2
-    arrays = xs[:num_arrays]
-    starts = xs[num_arrays:]
+def _reduce(operation: Operation, *xs: Tensor) -> list[Tensor]:
+    arrays, initial = _arrays_and_initial(xs)
     shape = arrays[0].shape
-    axes = o.ints("dimensions")
+    axes = operation.integers("dimensions")
     kept = [axis for axis in range(len(shape)) if axis not in axes]
-    sizes = [shape[axis] for axis in kept]
-    rows = arrays[0].places.transpose(*kept, *axes).reshape(math.prod(sizes), -1)
-    neutral = _changes_nothing(o, starts)
-    columns = []
-    for row in rows:
-        parts = [_entries_at(arrays, place) for place in row]
+    shape_of_results = tuple(shape[axis] for axis in kept)
+    # (entries of a result, entries that are reduced to one)
+    num_results = math.prod(shape_of_results)
+    places = arrays[0].places.transpose(*kept, *axes).reshape(num_results, -1)
+    is_neutral = _changes_nothing(operation, initial)
+    totals = []
+    for places_of_total in places:
+        parts = [_entries_at(arrays, place) for place in places_of_total]
         # Most reductions start from a neutral element, such as zero in a sum.
-        total = parts.pop(0) if parts and neutral else [*starts]
+        total = parts.pop(0) if parts and is_neutral else [*initial]
         for part in parts:
-            total = o.run(0, [*total, *part])
-        columns.append(total)
-    return _join_columns(columns, tuple(sizes), num_arrays)
+            total = operation.run(ONLY_REGION, [*total, *part])
+        totals.append(total)
+    return _arrays_of(totals, shape_of_results, len(arrays))
+
+
+def _arrays_and_initial(
+    operands: Sequence[Tensor],
+) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    """The two halves of the operands of a reduction: arrays of one shape, and the value
+    from which each starts. Several arrays are reduced together where the result of one
+    depends on the others, such as values and places for `argmax`."""
+    num_arrays = len(operands) // 2
+    return operands[:num_arrays], operands[num_arrays:]
 
 
 def _entries_at(arrays: Sequence[Tensor], place: Any) -> list[Tensor]:
     """The entries of all these arrays at a place, each as an array without axes."""
-    return [Tensor([x.entries[place]], ()) for x in arrays]
+    return [scalar(x.entries[place]) for x in arrays]
 
 
-def _join_columns(
-    columns: list[list[Tensor]], shape: tuple[int, ...], num_arrays: int
+def _arrays_of(
+    totals: list[list[Tensor]], shape: tuple[int, ...], num_arrays: int
 ) -> list[Tensor]:
-    """Arrays of this shape from `columns`, each of which has an entry of each array."""
+    """Arrays of this shape. `totals` are their entries in row-major order, each a list with
+    the entry of each array, as an array without axes."""
     arrays = []
     for k in range(num_arrays):
-        entries = [column[k].item() for column in columns]
+        entries = [total[k].item() for total in totals]
         arrays.append(Tensor(entries, shape))
     return arrays
 
@@ -123,12 +139,12 @@ _NEUTRAL = {
 }
 
 
-def _changes_nothing(o: Operation, starts: Sequence[Tensor]) -> bool:
+def _changes_nothing(operation: Operation, initial: Sequence[Tensor]) -> bool:
     """Whether a reduction starts from the neutral element of its operation."""
-    if len(starts) > 1:
+    if len(initial) > 1:
         return False
-    value = known(starts[0])
-    repeated = o.reduces_by
+    value = known_values(initial[0])
+    repeated = operation.reduces_by
     if value is None or repeated is None:
         return False
     if repeated == "and":
@@ -138,56 +154,76 @@ def _changes_nothing(o: Operation, starts: Sequence[Tensor]) -> bool:
 
 
 @rule
-def _reduce_window(o, *xs):
+def _reduce_window(operation: Operation, *xs: Tensor) -> list[Tensor]:
     """Cumulative sums, and other reductions of windows."""
-    num_arrays = len(xs) // 2
-    arrays = xs[:num_arrays]
-    initial = xs[num_arrays:]
-    if any(size > 1 for size in o.optional("base_dilations")):
-        raise NotReplayed(o.op, f"`{o.op.name}` of entries that are apart")
+    arrays, initial = _arrays_and_initial(xs)
+    if any(size > 1 for size in operation.optional_integers("base_dilations")):
+        raise NotReplayed(
+            operation.mlir_op, f"`{operation.full_name}` of entries that are apart"
+        )
     shape = arrays[0].shape
     ones = [1] * len(shape)
-    sizes = o.ints("window_dimensions")
-    strides = o.optional("window_strides") or ones
-    gaps = o.optional("window_dilations") or ones
-    # Pairs of the padding before and after. What lies outside is left out, as XLA does. The
-    # specification has the initial value there, which is the same if it is neutral.
-    padding = o.rows("padding") if o.has("padding") else np.zeros((len(shape), 2), int)
-    before = padding.reshape(len(shape), 2)[:, 0]
-    columns = []
-    for window in np.ndindex(*o.shape):
+    sizes = operation.integers("window_dimensions")
+    strides = np.array(operation.optional_integers("window_strides") or ones)
+    distances = np.array(operation.optional_integers("window_dilations") or ones)
+    padding_before = _padding_before(operation, len(shape))
+    totals = []
+    for window in np.ndindex(*operation.shape):
+        corner = np.array(window) * strides - padding_before
         total = [*initial]
         for offset in np.ndindex(*sizes):
-            at = np.array(window) * strides + np.array(offset) * gaps - before
-            if np.all((at >= 0) & (at < shape)):
-                place = arrays[0].places[tuple(at)]
-                total = o.run(0, [*total, *_entries_at(arrays, place)])
-        columns.append(total)
-    return _join_columns(columns, o.shape, num_arrays)
+            index = corner + np.array(offset) * distances
+            # What lies in the padding is left out, as XLA does. The specification has the
+            # initial value there, which is the same if it is neutral.
+            if np.all((index >= 0) & (index < shape)):
+                place = arrays[0].places[tuple(index)]
+                entries = _entries_at(arrays, place)
+                total = operation.run(ONLY_REGION, [*total, *entries])
+        totals.append(total)
+    return _arrays_of(totals, operation.shape, len(arrays))
+
+
+def _padding_before(operation: Operation, num_axes: int) -> np.ndarray:
+    """How far a `reduce_window` pads its arrays at the beginning of each axis."""
+    if not operation.has("padding"):
+        return np.zeros(num_axes, int)
+    # Pairs of the padding before and after. Without axes, there are none.
+    before, _ = operation.matrix("padding").reshape(num_axes, 2).T
+    return before
 
 
 @rule
-def _sort(o, *xs):
+def _sort(operation: Operation, *xs: Tensor) -> list[Tensor]:
     """Exchanges of neighbours until all are in order, which keep the order of equals."""
-    axis = o.number("dimension")
+    axis = operation.integer("dimension")
     length = xs[0].shape[axis]
     if length > _MOST_SORTED:
-        raise NotReplayed(o.op, f"`{o.op.name}` of more than {_MOST_SORTED} numbers")
-    select = drjit().select
+        raise NotReplayed(
+            operation.mlir_op,
+            f"`{operation.full_name}` of more than {_MOST_SORTED} numbers",
+        )
     # Arrays that are sorted together: the first ones may be keys of the others.
-    outs = [[*x.entries] for x in xs]
-    for row in np.moveaxis(xs[0].places, axis, -1).reshape(-1, length):
+    arrays = [[*x.entries] for x in xs]
+    for places in np.moveaxis(xs[0].places, axis, -1).reshape(-1, length):
         # After each round the largest of those left is at their end.
         for end in range(length, 1, -1):
-            for left, right in itertools.pairwise(row[:end]):
-                # The region says whether the first of two must stand before the second, and
-                # takes both of each array in turn. The right one is asked about first: they
-                # are exchanged only if the right one must stand first, so equals stay.
-                pairs = [Tensor([x[i]], ()) for x in outs for i in (right, left)]
-                (answer,) = o.run(0, pairs)
-                is_wrong = answer.item()
-                for x in outs:
-                    first = select(is_wrong, x[right], x[left])
-                    x[right] = select(is_wrong, x[left], x[right])
-                    x[left] = first
-    return [Tensor(out, x.shape) for out, x in zip(outs, xs)]
+            for left, right in itertools.pairwise(places[:end]):
+                _put_in_order(operation, arrays, left, right)
+    return [Tensor(entries, x.shape) for entries, x in zip(arrays, xs)]
+
+
+def _put_in_order(
+    operation: Operation, arrays: list[list[Any]], left: int, right: int
+) -> None:
+    """Exchanges the entries at two places, in all arrays, where the order is wrong."""
+    # The region says whether the first of two must stand before the second, and takes both
+    # of each array in turn. The right one is asked about first: they are exchanged only if
+    # the right one must stand first, so equals stay.
+    pairs = [scalar(entries[place]) for entries in arrays for place in (right, left)]
+    (answer,) = operation.run(ONLY_REGION, pairs)
+    is_wrong = answer.item()
+    select = drjit().select
+    for entries in arrays:
+        new_left = select(is_wrong, entries[right], entries[left])
+        entries[right] = select(is_wrong, entries[left], entries[right])
+        entries[left] = new_left

@@ -10,7 +10,7 @@ from .._compat import stablehlo_module
 from .mlir import block_of, callee_of, constant_values, functions_of, operations_in
 from .operation import NotReplayed, Operation
 from .operations import rule_of
-from .tensor import ArrayType, in_memory, MOST_IN_REGISTERS, Table, Tensor
+from .tensor import array_in_memory, ArrayType, MOST_IN_REGISTERS, Table, Tensor
 
 
 _RETURNS = ("func.return", "stablehlo.return")
@@ -49,8 +49,9 @@ class Replay:
         return [_type_of(result) for result in last.operands]
 
     @property
-    def handed_on(self) -> list[int | None]:
-        """For each result, the number of the argument that it equals, or `None`."""
+    def returned_arguments(self) -> list[int | None]:
+        """For each result, the number of the argument that is returned unchanged as this
+        result, or `None`."""
         arguments = [*self._main.arguments]
         *_, last = self._main.operations
         return [
@@ -68,7 +69,7 @@ class Replay:
         # The caller makes them once, and passes them to each call: a frozen function of
         # Dr.Jit takes arrays in memory as arguments only.
         return [
-            in_memory(_type_of(variable).kind, values.ravel())
+            array_in_memory(_type_of(variable).kind, values.ravel())
             for variable, values in self._constants.items()
         ]
 
@@ -117,9 +118,10 @@ class Replay:
                 # An operation in a called function has no location in its caller.
                 error.location += str(op.location)
                 raise
+        # A large constant.
         if op.results and op.results[0] in self._memory:
             return [self._table(op.results[0])]
-
+        # Arrays without entries need no rule, whatever the operation.
         if op.results and all(map(_is_empty, op.results)):
             return [Tensor([], tuple(result.type.shape)) for result in op.results]
 
@@ -133,7 +135,7 @@ class Replay:
         try:
             return rule(operation, *operands)
         except (TypeError, RuntimeError) as error:
-            if _is_named(error):
+            if _names_an_operation(error):
                 raise
             # An error of Dr.Jit names neither the operation nor its place.
             raise NotReplayed(op, f"`{op.name}` of these types ({error})") from error
@@ -150,8 +152,8 @@ def _type_of(variable: Any) -> ArrayType:
     return ArrayType(tuple(variable.type.shape), str(variable.type.element_type))
 
 
-def _is_named(error: BaseException | None) -> bool:
-    """Whether an error names an operation already: it is a `NotReplayed`, or follows from
+def _names_an_operation(error: BaseException | None) -> bool:
+    """Whether an error says which operation failed: it is a `NotReplayed`, or follows from
     one in a branch or loop, for which Dr.Jit raises an error of its own."""
     while error is not None and not isinstance(error, NotReplayed):
         error = error.__cause__ or error.__context__

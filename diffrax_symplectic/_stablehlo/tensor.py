@@ -31,7 +31,7 @@ class Table(Sequence):
     """The entries of an array that all paths share: positions in an array of Dr.Jit in
     memory. An entry is read where a rule asks for it; each path may ask for its own.
 
-    - `memory`: the array, in its own order.
+    - `memory`: the array of Dr.Jit, in its own order.
     - `places`: where in `memory` the entries are.
     - `values`: the values in `memory` if these are constants of the program, so that
         operations with them can be folded.
@@ -92,11 +92,11 @@ class Tensor(NamedTuple):
 
 def same_table(a: Tensor, b: Tensor) -> bool:
     """Whether both are the same part of the same array in memory."""
-    table = a.entries
+    one = a.entries
     other = b.entries
-    if not (isinstance(table, Table) and isinstance(other, Table)):
+    if not (isinstance(one, Table) and isinstance(other, Table)):
         return False
-    return table.memory is other.memory and np.array_equal(table.places, other.places)
+    return one.memory is other.memory and np.array_equal(one.places, other.places)
 
 
 def scalar(entry: Any) -> Tensor:
@@ -109,21 +109,21 @@ def constant(kind: type, values: np.ndarray) -> Tensor:
     return Tensor([kind(value.item()) for value in values.flat], values.shape)
 
 
-def in_memory(kind: str, values: np.ndarray) -> Any:
+def array_in_memory(kind: str, values: np.ndarray) -> Any:
     """A Dr.Jit array with these values as its lanes."""
     array_type = array_types()[kind]
     if np.iscomplexobj(values):
         part = kind.removeprefix("complex<").removesuffix(">")
-        real = in_memory(part, np.real(values))
-        imag = in_memory(part, np.imag(values))
+        real = array_in_memory(part, np.real(values))
+        imag = array_in_memory(part, np.imag(values))
         return array_type(real, imag)
     # A list is copied. Memory of NumPy could be freed while Dr.Jit records.
     return array_type(values.tolist())
 
 
-def known(x: Tensor) -> np.ndarray | None:
-    """The values of constants, and of what Dr.Jit folded from constants; `None` if an entry
-    is not known while the kernel is recorded.
+def known_values(x: Tensor) -> np.ndarray | None:
+    """The values of an array whose entries are constants, or were folded from constants by
+    Dr.Jit; `None` if an entry is not known while the kernel is recorded.
 
     With a known index, loops are unrolled and entries selected while recording.
     """
@@ -139,37 +139,44 @@ def _value(literal: Any) -> Any:
     return literal[0]
 
 
-def each(fn: Callable, *xs: Tensor) -> Tensor:
-    """Applies a function entry by entry. A scalar is repeated as needed."""
+def map_entries(fn: Callable, *xs: Tensor) -> Tensor:
+    """Applies a function entry by entry. The arrays have one shape, but for scalars, which
+    are repeated as needed."""
     # The result has the shape of the largest array: beside a scalar, an array with a single
     # entry counts as larger, since it has axes.
     largest = max(xs, key=lambda x: (len(x.entries), len(x.shape)))
     size = len(largest.entries)
     # The entries of each array, repeated if it is a scalar.
-    columns = [x.entries if len(x.entries) == size else [*x.entries] * size for x in xs]
-    return Tensor([fn(*entries) for entries in zip(*columns)], largest.shape)
+    operands = [
+        x.entries if len(x.entries) == size else [*x.entries] * size for x in xs
+    ]
+    results = [fn(*entries) for entries in zip(*operands)]
+    return Tensor(results, largest.shape)
 
 
-def flat(xs: Sequence[Tensor]) -> tuple[Any, ...]:
+def entries_of(xs: Sequence[Tensor]) -> tuple[Any, ...]:
     """The entries of all these tensors."""
     return tuple(entry for x in xs for entry in x.entries)
 
 
-def unflat(entries: Iterable[Any], shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
-    """Tensors of these shapes from the first of these entries: the inverse of `flat`."""
+def tensors_from(
+    entries: Iterable[Any], shapes: Sequence[tuple[int, ...]]
+) -> list[Tensor]:
+    """Tensors of these shapes from the first of these entries, one after another: the
+    inverse of `entries_of`."""
     remaining = iter(entries)
     tensors = []
     for shape in shapes:
-        own_entries = itertools.islice(remaining, math.prod(shape))
-        tensors.append(Tensor([*own_entries], shape))
+        entries_of_tensor = itertools.islice(remaining, math.prod(shape))
+        tensors.append(Tensor([*entries_of_tensor], shape))
     return tensors
 
 
-def copied(xs: Sequence[Tensor]) -> tuple[Any, ...]:
+def copied_entries(xs: Sequence[Tensor]) -> tuple[Any, ...]:
     """The entries of these tensors as objects of their own, as a branch or the body of a
     loop must return them: Dr.Jit writes the result of a conditional into the objects that
     a branch returned, so a value from outside would change for all who hold it."""
-    return tuple(type(entry)(entry) for entry in flat(xs))
+    return tuple(type(entry)(entry) for entry in entries_of(xs))
 
 
 def as_own_literal(entry: Any) -> Any:

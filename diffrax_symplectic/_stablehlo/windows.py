@@ -4,85 +4,117 @@ paths.
 Entries in registers have no address. A window whose place each path computes is selected
 by comparing the index with every place that it may have. Arrays in memory are read where
 the index says.
+
+Here a *start* is the index at which a window begins along one axis, and *places* are
+positions in the list of the entries of an array.
 """
 
 import functools as ft
 import itertools
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from .backend import array_types, drjit
 from .elementwise import elementwise
-from .operation import NotReplayed, Operation, rule
-from .tensor import constant, each, flat, known, Table, Tensor
+from .operation import NotReplayed, ONLY_REGION, Operation, rule
+from .tensor import (
+    constant,
+    entries_of,
+    known_values,
+    map_entries,
+    scalar,
+    Table,
+    Tensor,
+)
 
 
-# The most places to compare an index with. Each costs a selection of every entry.
-_MOST_PLACES = 64
+# The most windows among which one is selected by its index. Each costs a selection of every
+# entry.
+_MOST_WINDOWS = 64
 
 
-class _Window(NamedTuple):
-    """A place that a window of an array may have.
+class _PossibleStart(NamedTuple):
+    """An index at which a window may begin along an axis.
 
-    - `slices`: the place, as a slice of each axis.
-    - `here`: the mask of the lanes whose window is there, or `True` for all.
+    - `begin`: the index.
+    - `mask`: the lanes whose window begins there, or `True` for all.
+    """
+
+    begin: int
+    mask: Any
+
+
+class _PossibleWindow(NamedTuple):
+    """A part of an array where a window may be.
+
+    - `slices`: the part, as a slice of each axis.
+    - `mask`: the lanes whose window is there, or `True` for all.
     """
 
     slices: tuple[slice, ...]
-    here: Any
+    mask: Any
 
 
-def _windows(
-    o: Operation,
+# From the start of a window along an axis and the last index at which it fits to all
+# indices at which it may begin.
+_StartsAlongAxis: TypeAlias = Callable[[Tensor, int], list[_PossibleStart]]
+
+
+def _clipped_starts(start: Tensor, last: int) -> list[_PossibleStart]:
+    """The indices from 0 to `last` at which a window may begin along an axis. An index out
+    of range counts as the nearest of these."""
+    value = known_values(start)
+    if value is not None:
+        return [_PossibleStart(int(np.clip(value, 0, last)), True)]
+    if last == 0:
+        return [_PossibleStart(0, True)]
+    index = start.item()
+    between = [_PossibleStart(begin, index == begin) for begin in range(1, last)]
+    first = _PossibleStart(0, index <= 0)
+    return [first, *between, _PossibleStart(last, index >= last)]
+
+
+def _starts_in_range(start: Tensor, last: int) -> list[_PossibleStart]:
+    """As `_clipped_starts`, but a window whose index is out of range begins nowhere."""
+    value = known_values(start)
+    if value is not None:
+        return [_PossibleStart(int(value), True)] if 0 <= value <= last else []
+    index = start.item()
+    return [_PossibleStart(begin, index == begin) for begin in range(last + 1)]
+
+
+def _possible_windows(
+    operation: Operation,
     x: Tensor,
     starts: Sequence[Tensor],
     sizes: Sequence[int],
-    clip: bool = True,
-) -> Iterator[_Window]:
-    """The possible places of a window of these sizes in `x`. Windows that are not within
-    `x` are moved into it, or else left out."""
-    # For each axis, the possible starts with their masks.
-    axes = [
-        _starts_along(start, length - size, clip)
+    starts_along_axis: _StartsAlongAxis = _clipped_starts,
+) -> Iterator[_PossibleWindow]:
+    """The parts of `x` where a window may be that begins at `starts`, and has these sizes.
+    Both have an element for each axis of `x`."""
+    starts_of_axes = [
+        starts_along_axis(start, length - size)
         for start, length, size in zip(starts, x.shape, sizes)
     ]
-    num_places = math.prod(map(len, axes))
-    if num_places > _MOST_PLACES:
+    num_windows = math.prod(map(len, starts_of_axes))
+    if num_windows > _MOST_WINDOWS:
         what = (
-            f"`{o.op.name}` with an index per path, among {num_places} places (the most "
-            f"are {_MOST_PLACES}, but for an array in `args` or from outside of the "
-            "function that is not drawn for each path, computed, or returned by a "
+            f"`{operation.full_name}` with an index per path, among {num_windows} places "
+            f"(the most are {_MOST_WINDOWS}, but for an array in `args` or from outside of "
+            "the function that is not drawn for each path, computed, or returned by a "
             "branch or loop)"
         )
-        raise NotReplayed(o.op, what)
-    for starts_and_masks in itertools.product(*axes):
+        raise NotReplayed(operation.mlir_op, what)
+    for corner in itertools.product(*starts_of_axes):
         slices = []
-        here = True
-        for (begin, mask), size in zip(starts_and_masks, sizes):
-            slices.append(slice(begin, begin + size))
-            here = _both_masks(here, mask)
-        yield _Window(tuple(slices), here)
-
-
-def _starts_along(start: Tensor, most: int, clip: bool) -> list[tuple[int, Any]]:
-    """The possible starts of a window along an axis, from 0 to `most`, each with the mask
-    of the lanes that start there, or `True` for all. With `clip`, an index out of range
-    counts as the nearest start; without, it has none."""
-    value = known(start)
-    if value is not None and clip:
-        return [(int(np.clip(value, 0, most)), True)]
-    if value is not None:
-        return [(int(value), True)] if 0 <= value <= most else []
-    if clip and most == 0:
-        return [(0, True)]
-    index = start.item()
-    if not clip:
-        return [(place, index == place) for place in range(most + 1)]
-    between = [(place, index == place) for place in range(1, most)]
-    return [(0, index <= 0), *between, (most, index >= most)]
+        mask = True
+        for start, size in zip(corner, sizes):
+            slices.append(slice(start.begin, start.begin + size))
+            mask = _both_masks(mask, start.mask)
+        yield _PossibleWindow(tuple(slices), mask)
 
 
 def _both_masks(one: Any, other: Any) -> Any:
@@ -92,64 +124,79 @@ def _both_masks(one: Any, other: Any) -> Any:
     return one if other is True else one & other
 
 
-def _selected(here: Any, new: Tensor, old: Tensor | None) -> Tensor:
+def _selected(mask: Any, new: Tensor, old: Tensor | None) -> Tensor:
     """The new entries in the lanes of a mask, and the old ones elsewhere."""
-    # Without old entries this is the first of several places. Each lane has one of these,
-    # so that the others replace it where it is wrong.
-    if old is None or here is True:
+    # Without old entries, `new` are those of the first possible window. The window of each
+    # lane is one of the possible ones, so a later one replaces these where they are wrong.
+    if old is None or mask is True:
         return new
-    return each(ft.partial(drjit().select, here), new, old)
+    return map_entries(ft.partial(drjit().select, mask), new, old)
 
 
-def _window(
-    o: Operation, x: Tensor, starts: Sequence[Tensor], sizes: Sequence[int]
+def _window_at(
+    operation: Operation, x: Tensor, starts: Sequence[Tensor], sizes: Sequence[int]
 ) -> Tensor:
-    """The window of `x` that starts there, moved into `x` if need be."""
-    if isinstance(x.entries, Table) and any(known(start) is None for start in starts):
-        return _from_table(o, x, x.entries, starts, sizes)
-    out = None
-    for slices, here in _windows(o, x, starts, sizes):
-        out = _selected(here, x.take(x.places[slices]), out)
-    assert out is not None
-    return out
+    """The window of `x` that begins at `starts`, moved into `x` if it is not within. Both
+    `starts` and `sizes` have an element for each axis."""
+    is_known = all(known_values(start) is not None for start in starts)
+    if isinstance(x.entries, Table) and not is_known:
+        return _window_of_table(operation, x, x.entries, starts, sizes)
+    window = None
+    for slices, mask in _possible_windows(operation, x, starts, sizes):
+        window = _selected(mask, x.take(x.places[slices]), window)
+    # There is at least one possible window, since starts are clipped.
+    assert window is not None
+    return window
 
 
-def _from_table(
-    o: Operation,
+def _window_of_table(
+    operation: Operation,
     x: Tensor,
     table: Table,
     starts: Sequence[Tensor],
     sizes: Sequence[int],
 ) -> Tensor:
-    """A window of an array in memory, at each path's own place."""
-    # The place of each entry of `x` in memory: `x` may be a part of the table, or its
-    # transpose.
+    """As `_window_at`, where the entries of `x` are those of the `table` in memory. Each
+    path reads its own window."""
+    # `x` may be a part of what is in memory, or its transpose.
     places = table.places.reshape(x.shape)
-    corner = int(places.flat[0])
-    # The distance in memory between neighbours along each axis.
-    strides = [
-        int(places.take(1, axis).flat[0]) - corner if size > 1 else 0
-        for axis, size in enumerate(x.shape)
-    ]
-    # Addresses are computed from the strides, which is wrong for entries that were moved in
-    # another way.
-    regular = np.broadcast_to(corner + _offsets(strides, x.shape), x.shape)
-    if not np.array_equal(regular, places):
-        what = f"`{o.op.name}` with an index per path, from an array in another order"
-        raise NotReplayed(o.op, what)
+    strides = _strides(operation, places)
     signed = array_types()["i32"]
-    begin = signed(corner)
+    # The place of the window's first entry: that of the first entry of `x`, and a stride
+    # for each index.
+    corner = signed(int(places.flat[0]))
     for start, stride, length, size in zip(starts, strides, x.shape, sizes):
         index = start.item()
         dtype = type(index)
         # The index is moved into `x` in its own type: made signed, a large one would be
         # negative.
         in_range = elementwise()["clamp"](dtype(0), index, dtype(length - size))
-        begin = begin + signed(in_range) * stride
+        corner = corner + signed(in_range) * stride
     offsets = np.broadcast_to(_offsets(strides, sizes), sizes)
     unsigned = array_types()["ui32"]
-    entries = [table.gathered(unsigned(begin + int(offset))) for offset in offsets.flat]
+    entries = [
+        table.gathered(unsigned(corner + int(offset))) for offset in offsets.flat
+    ]
     return Tensor(entries, tuple(sizes))
+
+
+def _strides(operation: Operation, places: np.ndarray) -> list[int]:
+    """For each axis of an array in memory, the distance between neighbours along it, from
+    the places of the entries. Raises a `NotReplayed` if distances differ along an axis."""
+    first = int(places.flat[0])
+    strides = [
+        int(places.take(1, axis).flat[0]) - first if size > 1 else 0
+        for axis, size in enumerate(places.shape)
+    ]
+    # Entries that were moved in another way than by slices and transposes have no strides.
+    expected = np.broadcast_to(first + _offsets(strides, places.shape), places.shape)
+    if not np.array_equal(expected, places):
+        what = (
+            f"`{operation.full_name}` with an index per path, from an array in another "
+            "order"
+        )
+        raise NotReplayed(operation.mlir_op, what)
+    return strides
 
 
 def _offsets(strides: Sequence[int], shape: Sequence[int]) -> np.ndarray | int:
@@ -168,139 +215,151 @@ def _widened(index: Tensor) -> Tensor:
         is_narrow = drjit().itemsize_v(entry) < 4
         return array_types()["i32"](entry) if is_narrow else entry
 
-    return each(widened_entry, index)
+    return map_entries(widened_entry, index)
 
 
 @rule
-def _dynamic_slice(o, x, *starts):
-    return [_window(o, x, [*map(_widened, starts)], o.shape)]
+def _dynamic_slice(operation: Operation, x: Tensor, *starts: Tensor) -> list[Tensor]:
+    return [_window_at(operation, x, [*map(_widened, starts)], operation.shape)]
 
 
 @rule
-def _dynamic_update_slice(o, x, update, *starts):
-    # One list: the entries of `x`, then those of the update.
-    both = Tensor([*flat([x, update])], ())
-    out = None
-    # The first place is taken for all lanes, and replaced by the others in their lanes.
-    for slices, here in _windows(o, x, [*map(_widened, starts)], update.shape):
+def _dynamic_update_slice(
+    operation: Operation, x: Tensor, update: Tensor, *starts: Tensor
+) -> list[Tensor]:
+    # One list: the entries of `x`, followed by those of the update.
+    both = Tensor([*entries_of([x, update])], ())
+    wide_starts = [*map(_widened, starts)]
+    result = None
+    # The first possible window is taken for all lanes, and replaced by each of the others
+    # in its lanes.
+    for slices, mask in _possible_windows(operation, x, wide_starts, update.shape):
         places = x.places.copy()
         places[slices] = len(x.entries) + update.places
-        out = _selected(here, both.take(places), out)
-    assert out is not None
-    return [out]
+        result = _selected(mask, both.take(places), result)
+    assert result is not None
+    return [result]
 
 
-class _Starts(NamedTuple):
-    """Where the windows of a `gather` or `scatter` begin.
+class _Windows(NamedTuple):
+    """The windows of a `gather` or `scatter`.
 
-    - `batch`: the shape of the array of windows.
-    - `each`: for each window, in row-major order, its index along each axis.
-    - `batched_axes`: the axes along which a window follows its own place in `batch`.
+    - `shape`: the shape of the array of windows.
+    - `starts`: for each window, in row-major order, its start along each axis.
     """
 
-    batch: tuple[int, ...]
-    each: list[list[Tensor]]
-    batched_axes: list[int]
+    shape: tuple[int, ...]
+    starts: list[list[Tensor]]
 
 
-def _starts(
+def _windows(
     x: Tensor,
     indices: Tensor,
     vector_axis: int,
     axes: Sequence[int],
     batched_axes: dict[int, int],
-) -> _Starts:
-    """Where windows of `x` begin.
+) -> _Windows:
+    """The windows of `x` that a `gather` reads or a `scatter` writes.
 
-    `indices` holds a vector for each window, along the axis `vector_axis`: its index along
-    each of `axes`. `batched_axes` maps axes of `x` to the axes of `indices` along
-    which both go in step.
+    `indices` holds a vector for each window, along the axis `vector_axis`: the starts of
+    the window along each of `axes`. `batched_axes` maps axes of `x` to axes of `indices`:
+    along these, a window starts at its own position in the array of windows. Along all
+    other axes windows start at zero.
     """
     # If `indices` have no such axis, each vector is a single number.
     has_no_axis = vector_axis == len(indices.shape)
-    shape = (*indices.shape, 1) if has_no_axis else indices.shape
+    shape_of_indices = (*indices.shape, 1) if has_no_axis else indices.shape
     indices = _widened(indices)
-    # (batch, the numbers of a vector)
-    places = np.moveaxis(indices.places.reshape(shape), vector_axis, -1)
-    batch = places.shape[:-1]
+    # (*windows, the numbers of a vector)
+    places = np.moveaxis(indices.places.reshape(shape_of_indices), vector_axis, -1)
+    shape = places.shape[:-1]
 
-    def known_index(value: Any) -> Tensor:
+    def constant_start(value: int) -> Tensor:
         return constant(array_types()["i32"], np.asarray(value))
 
-    def start(window: tuple[int, ...]) -> list[Tensor]:
-        """The index along each axis at which the window of this place in `batch` begins."""
-        index_along = [known_index(0)] * len(x.shape)
+    def starts_of(window: tuple[int, ...]) -> list[Tensor]:
+        """The start along each axis of the window at this position in the array of
+        windows."""
+        starts = [constant_start(0)] * len(x.shape)
         for axis, place in zip(axes, places[window]):
-            index_along[axis] = Tensor([indices.entries[place]], ())
-        for axis, indices_axis in batched_axes.items():
-            # The batch lacks the vector's axis, so axes behind it have moved up by one.
-            is_behind = indices_axis > vector_axis
-            batch_axis = indices_axis - 1 if is_behind else indices_axis
-            index_along[axis] = known_index(window[batch_axis])
-        return index_along
+            starts[axis] = scalar(indices.entries[place])
+        for axis, axis_of_indices in batched_axes.items():
+            # The array of windows lacks the vectors' axis, so axes behind it move up by
+            # one.
+            is_behind = axis_of_indices > vector_axis
+            axis_of_windows = axis_of_indices - 1 if is_behind else axis_of_indices
+            starts[axis] = constant_start(window[axis_of_windows])
+        return starts
 
-    starts = [start(window) for window in np.ndindex(*batch)]
-    return _Starts(batch, starts, [*batched_axes])
+    return _Windows(shape, [starts_of(window) for window in np.ndindex(*shape)])
 
 
 @rule
-def _gather(o, x, indices):
+def _gather(operation: Operation, x: Tensor, indices: Tensor) -> list[Tensor]:
     name = "dimension_numbers"
-    sizes = o.ints("slice_sizes")
-    in_step = zip(
-        o.part(name, "operand_batching_dims"),
-        o.part(name, "start_indices_batching_dims"),
-    )
-    batch, starts, batched_axes = _starts(
+    batched_axes = operation.part(name, "operand_batching_dims")
+    batched_axes_of_indices = operation.part(name, "start_indices_batching_dims")
+    shape, starts_of_windows = _windows(
         x,
         indices,
         # This number is printed only if it is not zero: an empty list has the sum zero.
-        vector_axis=sum(o.part(name, "index_vector_dim")),
-        axes=o.part(name, "start_index_map"),
-        batched_axes=dict(in_step),
+        vector_axis=sum(operation.part(name, "index_vector_dim")),
+        axes=operation.part(name, "start_index_map"),
+        batched_axes=dict(zip(batched_axes, batched_axes_of_indices)),
     )
-    entries = flat([_window(o, x, start, sizes) for start in starts])
-    windows = Tensor([*entries], (*batch, *sizes))
+    sizes = operation.integers("slice_sizes")
+    entries = entries_of(
+        [_window_at(operation, x, starts, sizes) for starts in starts_of_windows]
+    )
+    windows = Tensor([*entries], (*shape, *sizes))
     # The result does not have these axes of a window, which have length one.
-    dropped = [*o.part(name, "collapsed_slice_dims"), *batched_axes]
-    places = windows.places.squeeze(tuple(len(batch) + axis for axis in dropped))
-    # The other axes of a window go to where the result has them.
-    window_axes = range(len(batch), places.ndim)
-    return [windows.take(np.moveaxis(places, window_axes, o.part(name, "offset_dims")))]
+    dropped = [*operation.part(name, "collapsed_slice_dims"), *batched_axes]
+    places = windows.places.squeeze(tuple(len(shape) + axis for axis in dropped))
+    # The other axes of a window, which are the last ones here, go to where the result has
+    # them.
+    last_axes = range(len(shape), places.ndim)
+    window_axes = operation.part(name, "offset_dims")
+    return [windows.take(np.moveaxis(places, last_axes, window_axes))]
 
 
 @rule
-def _scatter(o, x, indices, updates):
+def _scatter(
+    operation: Operation, x: Tensor, indices: Tensor, updates: Tensor
+) -> list[Tensor]:
     name = "scatter_dimension_numbers"
-    in_step = zip(
-        o.part(name, "input_batching_dims"),
-        o.part(name, "scatter_indices_batching_dims"),
-    )
-    batch, starts, batched_axes = _starts(
+    batched_axes = operation.part(name, "input_batching_dims")
+    batched_axes_of_indices = operation.part(name, "scatter_indices_batching_dims")
+    shape, starts_of_windows = _windows(
         x,
         indices,
-        vector_axis=sum(o.part(name, "index_vector_dim")),
-        axes=o.part(name, "scatter_dims_to_operand_dims"),
-        batched_axes=dict(in_step),
+        # As in `_gather`, an empty list stands for zero.
+        vector_axis=sum(operation.part(name, "index_vector_dim")),
+        axes=operation.part(name, "scatter_dims_to_operand_dims"),
+        batched_axes=dict(zip(batched_axes, batched_axes_of_indices)),
     )
-    window_axes = o.part(name, "update_window_dims")
+    window_axes = operation.part(name, "update_window_dims")
     # Along the other axes of `x` a window has length one, and `updates` have no axis.
-    axes_of_length_one = {*o.part(name, "inserted_window_dims"), *batched_axes}
+    axes_of_length_one = {*operation.part(name, "inserted_window_dims"), *batched_axes}
     sizes_of_updates = iter([updates.shape[axis] for axis in window_axes])
     sizes = [
         1 if axis in axes_of_length_one else next(sizes_of_updates)
         for axis in range(len(x.shape))
     ]
-    # (windows, the entries of a window)
-    last_axes = range(len(batch), updates.places.ndim)
+    # The axes of a window become the last ones: (windows, the entries of a window).
+    last_axes = range(len(shape), updates.places.ndim)
     places = np.moveaxis(updates.places, window_axes, last_axes)
-    rows = places.reshape(math.prod(batch), -1)
-    out = [*x.entries]
+    rows = places.reshape(math.prod(shape), -1)
+    entries = [*x.entries]
     # Windows are written one after another: they may overlap, and the region may add.
-    for start, row in zip(starts, rows):
-        for slices, here in _windows(o, x, start, sizes, clip=False):
+    # Windows that are not within `x` are not written at all.
+    for starts, row in zip(starts_of_windows, rows):
+        possible_windows = _possible_windows(
+            operation, x, starts, sizes, _starts_in_range
+        )
+        for slices, mask in possible_windows:
             for target, source in zip(x.places[slices].flat, row):
-                old = Tensor([out[target]], ())
-                (new,) = o.run(0, [old, Tensor([updates.entries[source]], ())])
-                out[target] = _selected(here, new, old).item()
-    return [Tensor(out, x.shape)]
+                old = scalar(entries[target])
+                update = scalar(updates.entries[source])
+                (new,) = operation.run(ONLY_REGION, [old, update])
+                entries[target] = _selected(mask, new, old).item()
+    return [Tensor(entries, x.shape)]

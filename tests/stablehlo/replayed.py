@@ -6,7 +6,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffrax_symplectic._stablehlo import array_types, drjit, in_memory, Replay, Tensor
+from diffrax_symplectic._stablehlo import (
+    array_in_memory,
+    array_types,
+    drjit,
+    Replay,
+    Tensor,
+)
 
 
 def text_of(fn: Callable, *structs: jax.ShapeDtypeStruct) -> str:
@@ -65,7 +71,7 @@ def stacked(x: Tensor, kind: str, number: int) -> np.ndarray:
 def tensor(x: np.ndarray, kind: str) -> Tensor:
     """An array with an axis of lanes as a tensor."""
     columns = x.reshape(len(x), -1).T
-    return Tensor([in_memory(kind, column) for column in columns], x.shape[1:])
+    return Tensor([array_in_memory(kind, column) for column in columns], x.shape[1:])
 
 
 def lanes(entry: Any, number: int) -> np.ndarray:

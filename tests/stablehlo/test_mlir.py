@@ -65,7 +65,7 @@ def test_attributes_of_operations_are_read():
 
 
 def test_regions_of_operations_are_read():
-    """If this fails: print the operation, and adapt `attribute_rows`, `operations_in` or
+    """If this fails: print the operation, and adapt `attribute_matrix`, `operations_in` or
     `sole_operation`."""
 
     def windows(x):
@@ -73,7 +73,7 @@ def test_regions_of_operations_are_read():
         return jax.lax.reduce_window(x, 0.0, jax.lax.add, (2, 1), (1, 1), padding)
 
     reduction = _operation(_lowered(windows, (4, 3)), "stablehlo.reduce_window")
-    assert mlir.attribute_rows(reduction, "padding").tolist() == [[1, 0], [0, 2]]
+    assert mlir.attribute_matrix(reduction, "padding").tolist() == [[1, 0], [0, 2]]
     inside = mlir.operations_in(reduction.regions[0])
     assert [op.name for op in inside] == ["stablehlo.add", "stablehlo.return"]
     assert mlir.sole_operation(reduction.regions[0]) == "stablehlo.add"

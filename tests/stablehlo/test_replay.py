@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from diffrax_symplectic._stablehlo import (
+    array_in_memory,
     array_types,
     drjit,
-    in_memory,
     NotReplayed,
     Replay,
     scalar,
@@ -56,7 +56,7 @@ def test_the_types_of_arguments_are_known():
 
 def test_results_that_are_arguments_are_known():
     program = text_of(lambda x, y: (y, x + y, x, 1.0), *[jnp.zeros(())] * 2)
-    assert Replay(program).handed_on == [1, None, 0, None]
+    assert Replay(program).returned_arguments == [1, None, 0, None]
 
 
 def test_a_replay_is_part_of_the_loop_that_it_stands_in():
@@ -67,7 +67,7 @@ def test_a_replay_is_part_of_the_loop_that_it_stands_in():
         return i + 1, result.item()
 
     count = array_types()["i32"](0)
-    start = in_memory("f64", X)
+    start = array_in_memory("f64", X)
     _, end = drjit().while_loop((count, start), lambda i, _: i < 5, once)
     np.testing.assert_array_equal(end, 32 * X)
 
@@ -78,8 +78,8 @@ def test_large_constants_are_read_from_memory():
     places = np.array([3, 999, 0], np.int32)
     (in_this_array,) = replay.constants()
     np.testing.assert_array_equal(in_this_array, table)
-    other = in_memory("f64", -table)
-    index = scalar(in_memory("i32", places))
+    other = array_in_memory("f64", -table)
+    index = scalar(array_in_memory("i32", places))
     for memory, exact in ((in_this_array, table), (other, -table)):
         ((found,), _) = replay(index, constants=[memory])
         np.testing.assert_array_equal(found.item(), exact[places])
@@ -92,7 +92,7 @@ def test_errors_name_the_lanes_that_raise_them():
         return eqx.error_if(2 * x, x > 1, "too large")
 
     replay = Replay(text_of(fn, jnp.zeros(())))
-    ((result,), errors) = replay(scalar(in_memory("f64", X)))
+    ((result,), errors) = replay(scalar(array_in_memory("f64", X)))
     (lost,) = errors
     np.testing.assert_array_equal(lost, X > 1)
     kept = ~np.asarray(lost)
@@ -114,7 +114,7 @@ def test_errors_in_branches_and_loops_name_their_lanes():
 
     for fn, exact in ((in_a_branch, [-1.0, 1.0]), (in_a_loop, [-13.0])):
         replay = Replay(text_of(fn, jnp.zeros(())))
-        ((result,), errors) = replay(scalar(in_memory("f64", X)))
+        ((result,), errors) = replay(scalar(array_in_memory("f64", X)))
         lost = np.any([np.asarray(error) for error in errors], axis=0)
         np.testing.assert_array_equal(np.asarray(result.item())[~lost], exact)
 
