@@ -46,7 +46,7 @@ _MOST_SAMPLES = 10**9
 _SECONDS = 10
 # Sorted paths are drawn and sorted before each step, which takes as long as this many
 # operations for each path.
-_OPERATIONS_OF_SORTING = 1500
+_OPERATIONS_OF_SORTING = 3000
 # The fewest paths, however long they take: fewer do not know their own spread.
 _FEWEST_PATHS = 2**8
 # The sizes of a trial, a part of those of an estimate: it looks for changes that are

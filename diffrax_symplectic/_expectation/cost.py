@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._compat import Jaxpr, programs_in
+from .._compat import dce_jaxpr, Jaxpr, programs_in
 from .._custom_types import Y
 from .._lapack import LAPACK
 from .._signature import once_for_each_signature
@@ -16,22 +16,38 @@ from .._simulation import Problem
 from .._solver import without_newton
 
 
-# The operations of two cores in a second in large batches of paths. The constants
-# here are a fit to 24 systems and solvers, from the pendulum to a chain of 64 oscillators:
-# seconds predicted are 0.5 to 2.3 times those measured for 22 of them (0.3 for a spin with
-# slow sweeps, 3.5 for two noises whose linear flows need one sweep).
-OPERATIONS_PER_SECOND = 3e10
-# The passes through a loop. All loops of a step are sweeps over its equations.
-_SWEEPS = 4
-# A sine in a loop takes as long as so many sums.
-_OF_TRANSCENDENTAL = 8
-_TRANSCENDENTAL = frozenset(
-    "acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1 "
-    "lgamma log log1p logistic pow sin sinh tan tanh".split()
-)
-# Operations on matrices are calls of LAPACK, which take some 100 ns each: as long as so
-# many sums.
-_OF_LAPACK = 3_000
+# The sums that two cores compute in a second in large batches of paths. This constant, the
+# passes through a loop, and the costs of complex numbers and of a sine are a fit to the
+# processor time of 26 systems and solvers, from the pendulum to a Schroedinger lattice and
+# Brownian paths of a user's own: seconds predicted are 0.4 to 2.5 times those measured.
+OPERATIONS_PER_SECOND = 6e10
+# The passes through a loop of unknown length with no other such loop inside of it: sweeps
+# over the equations of a step until the last path of a batch has converged, or the levels
+# of a `diffrax.VirtualBrownianTree`.
+_PASSES = 12
+# As many real numbers take as long as a complex one.
+_OF_COMPLEX = 7
+# Operations on matrices are calls of LAPACK, which take some 100 ns each.
+_OF_LAPACK = 6_000
+# The operations that are not a sum, by the number of sums that take as long as one of their
+# results. Except for sines and their like, which the compiler partly merges, they were
+# timed by themselves. Operations that only move numbers are free.
+_NAMES_BY_COST = {
+    0: "bitcast_convert_type broadcast_in_dim complex convert_element_type copy imag "
+    "random_unwrap random_wrap real reshape squeeze transpose",
+    4: "cbrt div integer_pow rem rsqrt sqrt",
+    20: "exp exp2 tanh",
+    75: "acos acosh asin asinh atan atan2 atanh cos cosh cumlogsumexp cummax cummin "
+    "cumprod cumsum erf erf_inv erfc expm1 lgamma log log1p logistic pow sin sinh tan",
+    # A call of the generator, which hashes in a loop.
+    150: "random_bits random_fold_in random_seed random_split threefry2x32",
+    900: "sort",
+}
+_COST_BY_NAME = {
+    name: cost for cost, names in _NAMES_BY_COST.items() for name in names.split()
+}
+# Reductions read their arguments from memory: the cost for each number that they read.
+_OF_REDUCTION = 10
 
 
 @once_for_each_signature
@@ -41,7 +57,7 @@ def operations_per_step(problem: Problem) -> int:
     # Newton's method, which rescues paths whose sweeps fail, is rarely used.
     lean = dataclasses.replace(problem, solver=without_newton(problem.solver))
     traced, _, _ = eqx.filter_make_jaxpr(_first_step)(lean, problem.y0)
-    return max(1, _count_operations(traced.jaxpr, in_loop=False))
+    return max(1, _count_operations(traced.jaxpr))
 
 
 def _first_step(problem: Problem, y: Y) -> tuple[Y, Float[Array, ""]]:
@@ -53,35 +69,59 @@ def _first_step(problem: Problem, y: Y) -> tuple[Y, Float[Array, ""]]:
     return y, success
 
 
-def _count_operations(jaxpr: Jaxpr, in_loop: bool) -> int:
-    """The number of operations in a program, with the programs inside it. `in_loop` is
-    whether it is a part of a `while` loop."""
-    count = 0
-    for eqn in jaxpr.eqns:
-        name = eqn.primitive.name
-        size = sum(map(_size, eqn.outvars))
-        inner_programs = programs_in(eqn)
-        if name == "while" and not in_loop:
-            sweep = sum(_count_operations(x, in_loop=True) for x in inner_programs)
-            count += _SWEEPS * sweep
-        elif inner_programs:
-            # A loop inside a sweep counts once. In a batch all branches of a conditional
-            # are evaluated.
-            passes = eqn.params["length"] if name == "scan" else 1
-            count += passes * sum(_count_operations(x, in_loop) for x in inner_programs)
-        elif name in LAPACK:
-            count += _OF_LAPACK
-        elif name in _TRANSCENDENTAL and in_loop:
-            count += _OF_TRANSCENDENTAL * size
-        elif name == "dot_general":
-            (contracted_axes, _), _ = eqn.params["dimension_numbers"]
-            factor, _ = eqn.invars
-            shape = factor.aval.shape  # pyright: ignore (of arrays)
-            count += size * math.prod(shape[axis] for axis in contracted_axes)
-        else:
-            count += size
-    return count
+def _count_operations(jaxpr: Jaxpr) -> int:
+    """The number of operations in a program, with the programs inside it."""
+    # What no result needs is not computed: a sweep over the momenta evaluates the force,
+    # although the program contains the velocity, too.
+    jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+    return sum(map(_operations_of, jaxpr.eqns))
+
+
+def _operations_of(eqn: Any) -> int:
+    """The number of operations that an operation on arrays consists of."""
+    name = eqn.primitive.name
+    inner_programs = programs_in(eqn)
+    if inner_programs:
+        # In a batch all branches of a conditional are evaluated.
+        count = sum(map(_count_operations, inner_programs))
+        return _passes(eqn) * count
+    if name in LAPACK:
+        return _OF_LAPACK
+    if name.startswith("reduce_"):
+        return _OF_REDUCTION * sum(map(_size, eqn.invars))
+    size = sum(map(_size, eqn.outvars))
+    if name == "dot_general":
+        (contracted_axes, _), _ = eqn.params["dimension_numbers"]
+        factor, _ = eqn.invars
+        shape = factor.aval.shape  # pyright: ignore (of arrays)
+        size *= math.prod(shape[axis] for axis in contracted_axes)
+    cost = _COST_BY_NAME.get(name, 1)
+    if any(_is_complex(x) for x in eqn.outvars):
+        cost *= _OF_COMPLEX
+    return cost * size
+
+
+def _passes(eqn: Any) -> int:
+    """How often the programs in an operation run."""
+    if eqn.primitive.name == "scan":
+        return eqn.params["length"]
+    # Loops around others check whether these are done, which is mostly so.
+    if eqn.primitive.name == "while" and not any(map(_has_loop, programs_in(eqn))):
+        return _PASSES
+    return 1
+
+
+def _has_loop(jaxpr: Jaxpr) -> bool:
+    """Whether a program contains a loop of unknown length."""
+    return any(
+        eqn.primitive.name == "while" or any(map(_has_loop, programs_in(eqn)))
+        for eqn in jaxpr.eqns
+    )
 
 
 def _size(variable: Any) -> int:
     return math.prod(variable.aval.shape)
+
+
+def _is_complex(variable: Any) -> bool:
+    return jnp.issubdtype(variable.aval.dtype, jnp.complexfloating)

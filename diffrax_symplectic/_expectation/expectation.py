@@ -38,7 +38,7 @@ from .estimate import (
 )
 from .fused_paths import FusedPaths
 from .kinks import has_kinks
-from .long_steps import is_unstable_at_start
+from .long_steps import is_unstable_at_start, may_be_too_long
 from .run import Meter, NO_METER, run
 from .sampling import AbstractSampling
 from .strong_friction import unresolved_friction
@@ -202,7 +202,16 @@ def expectation(
                 break
             levels += 1
 
-    for message in cautions(estimate, tol, problem.has_bounded_increments):
+    # `num_paths` are those that did not fail.
+    most_fail = estimate.num_failed > estimate.num_paths
+    cause = ""
+    if most_fail and may_be_too_long(problem):
+        cause = (
+            f"Most likely, steps of `dt0={float(dt0):g}` are too long for "
+            f"`{type(solver).__name__}`: pass `dt0={float(dt0) / 4:g}` or less, or an "
+            "implicit solver. "
+        )
+    for message in cautions(estimate, tol, problem.has_bounded_increments, cause):
         warnings.warn(message, stacklevel=2)
     paths = plan.simulate_paths
     if isinstance(paths, FusedPaths):

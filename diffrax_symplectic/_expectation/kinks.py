@@ -6,7 +6,7 @@ import jax
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
-from .._compat import Jaxpr, Literal, programs_in
+from .._compat import dce_jaxpr, Jaxpr, Literal, programs_in
 from .._simulation import Problem
 
 
@@ -25,16 +25,18 @@ def has_kinks(problem: Problem) -> bool:
 
 
 def may_have_kinks(fn: Callable, y: PyTree) -> bool:
-    """Whether `fn(y)` contains an operation that is not smooth in `y`, such as `abs`, a
-    maximum or a comparison. Some functions that contain one are smooth all the same."""
+    """Whether `fn(y)` depends on an operation that is not smooth in `y`, such as `abs`, a
+    maximum or a comparison. Some functions that depend on one are smooth all the same."""
     leaves, treedef = jtu.tree_flatten(y)
     traced = jax.make_jaxpr(lambda *leaves: fn(treedef.unflatten(leaves)))(*leaves)
     return _may_be_rough(traced.jaxpr)
 
 
 def _may_be_rough(jaxpr: Jaxpr) -> bool:
-    """Whether a program applies an operation that is not smooth to variables that depend on
-    its inputs."""
+    """Whether the results of a program depend on an operation that is not smooth, applied
+    to variables that depend on its inputs."""
+    # An operation that no result needs, such as a comparison for a message, is left out.
+    jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
     # What the function captures is not among the inputs: it is constant in `y`.
     dependent = set(jaxpr.invars)
     for eqn in jaxpr.eqns:

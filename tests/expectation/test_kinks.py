@@ -49,6 +49,43 @@ def test_kinks_are_seen_in_the_operations(phi, kinks):
     assert may_have_kinks(phi, (jnp.zeros(3), jnp.ones(3))) == kinks
 
 
+def _square_and_size(x):
+    return x**2, jnp.abs(x)
+
+
+def _square_after_a_loop(x):
+    """The largest of the numbers is kept beside the numbers that are returned."""
+
+    def step(carry, _):
+        x, largest = carry
+        return (x / 2, jnp.maximum(x, largest)), None
+
+    (x, _), _ = jax.lax.scan(step, (x, x), length=3)
+    return x**2
+
+
+def _square_of_some(x):
+    message_needs = x > 3
+    del message_needs
+    return x**2
+
+
+@pytest.mark.parametrize(
+    "phi, kinks",
+    [
+        (_square_of_some, False),
+        (lambda x: _square_and_size(x)[0], False),
+        (lambda x: jax.jit(_square_and_size)(x)[0], False),
+        (lambda x: jax.jit(_square_and_size)(x)[1], True),
+        (_square_after_a_loop, False),
+        (lambda x: jax.lax.cond(True, _square_and_size, _square_and_size, x)[0], False),
+        (lambda x: jax.jit(_square_of_some)(x), False),
+    ],
+)
+def test_a_comparison_that_no_result_needs_is_no_kink(phi, kinks):
+    assert may_have_kinks(phi, jnp.ones(3)) == kinks
+
+
 def test_a_shape_becomes_a_gaussian_path_where_phi_jumps():
     estimate = mean(beyond, walk(()))
     assert isinstance(estimate.sampling, ds.ArrayRQMC)

@@ -114,3 +114,31 @@ def test_the_warning_names_the_line_of_the_user():
         got = ds.expectation(*given, key=jr.key(1), sampling=FEW)
     assert np.isfinite(got.mean)
     assert {x.filename for x in told if "too long" in str(x.message)} == {__file__}
+
+
+def _stiff(t, p, q, args):
+    return p**2 / 2 + 200 * q**4
+
+
+def _failures(H0, solver, h, y0=Y0):
+    """The warning of failed paths."""
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: q / 5, ())
+    with pytest.warns(UserWarning, match="paths failed") as told:
+        ds.expectation(
+            _cosine, terms, solver, 0, 60 * h, h, y0, key=jr.key(1), sampling=FEW
+        )
+    (found,) = [str(x.message) for x in told if "paths failed" in str(x.message)]
+    return found
+
+
+@pytest.mark.parametrize("solver", [ds.StormerVerlet(), diffrax.Heun()])
+def test_a_run_in_which_all_paths_fail_names_the_step(solver):
+    message = _failures(_stiff, solver, 0.5)
+    name = type(solver).__name__
+    assert f"Most likely, steps of `dt0=0.5` are too long for `{name}`" in message
+    assert "pass `dt0=0.125` or less" in message
+
+
+def test_a_hamiltonian_that_is_not_finite_is_not_blamed_on_the_step():
+    singular = lambda t, p, q, args: p**2 / 2 + jnp.sqrt(q - 2)
+    assert "Most likely" not in _failures(singular, ds.StormerVerlet(), 0.5)

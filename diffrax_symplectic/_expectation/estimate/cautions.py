@@ -32,11 +32,13 @@ _SURE_OF_CHANGE = 4
 _MANY_MORE = 10
 
 
-def cautions(estimate: Expectation, tol: float | None, bounded: bool) -> Iterator[str]:
+def cautions(
+    estimate: Expectation, tol: float | None, bounded: bool, cause: str = ""
+) -> Iterator[str]:
     """The warnings for an estimate. `bounded` is whether the increments of all paths are
-    known to be bounded."""
+    known to be bounded, `cause` a sentence on why paths failed, if that is known."""
     if estimate.num_failed > 0:
-        yield from _cautions_on_failures(estimate, bounded)
+        yield from _cautions_on_failures(estimate, bounded, cause)
     if estimate.num_samples > 1:
         yield from _cautions_on_mean(estimate)
         yield from _cautions_on_samples(estimate)
@@ -45,7 +47,9 @@ def cautions(estimate: Expectation, tol: float | None, bounded: bool) -> Iterato
         yield f"`tol={tol}` was not reached: {shortfall(estimate, tol)}."
 
 
-def _cautions_on_failures(estimate: Expectation, bounded: bool) -> Iterator[str]:
+def _cautions_on_failures(
+    estimate: Expectation, bounded: bool, cause: str
+) -> Iterator[str]:
     """Warns of failed paths that could change the mean by more than its standard error."""
     changes = jtu.tree_leaves(estimate.failed_error)
     errors = jtu.tree_leaves(estimate.std_error)
@@ -68,7 +72,7 @@ def _cautions_on_failures(estimate: Expectation, bounded: bool) -> Iterator[str]
                 f"with steps of `dt0` and {num_with_half:,} with half of it"
             )
     advice = advice_on_failures(bounded)
-    yield f"{estimate.num_failed:,} paths failed: {consequence}. {advice}"
+    yield f"{estimate.num_failed:,} paths failed: {consequence}. {cause}{advice}"
 
 
 def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
