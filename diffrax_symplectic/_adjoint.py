@@ -204,47 +204,20 @@ class _Residuals(NamedTuple):
 def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
     del perturbed, throw
     times = StepTimes(kwargs["stepsize_controller"], kwargs["init_state"])
-    every = _steps_between(times, adjoint.checkpoints)
+    steps_between = _steps_between(times, adjoint.checkpoints)
     checkpoints_of_loop = []
 
-    def recording_while_loop(cond_fun, body_fun, init_val, *, buffers, **options):
-        """The loop over steps, which also carries the checkpoints, a row for each."""
-
-        def empty_rows(x: Array) -> Array:
-            return jnp.zeros((adjoint.checkpoints, *jnp.shape(x)), x.dtype)
-
-        def is_going(carry):
-            state, _ = carry
-            return cond_fun(state)
-
-        def record_and_step(carry):
-            state, rows = carry
-            before_step = solve_state(state)
-            row, rest = jnp.divmod(before_step.num_steps, every)
-            # States between checkpoints go to the row after the last one, which `save`
-            # drops.
-            row = jnp.where(rest == 0, row, adjoint.checkpoints)
-
-            def save(x: Array, saved: Array) -> Array:
-                return saved.at[row].set(x, mode="drop")
-
-            return body_fun(state), jtu.tree_map(save, before_step.y, rows)
-
-        def buffers_of_state(carry):
-            state, _ = carry
-            return buffers(state)
-
-        rows = jtu.tree_map(empty_rows, solve_state(init_val).y)
-        final, rows = while_loop(
-            is_going,
-            record_and_step,
-            (init_val, rows),
-            buffers=buffers_of_state,
-            kind="lax",
+    def recording_while_loop(cond_fun, body_fun, init_val, **options):
+        final, checkpoints = _while_loop_with_checkpoints(
+            adjoint.checkpoints,
+            steps_between,
+            cond_fun,
+            body_fun,
+            init_val,
             **options,
         )
         # Diffrax returns only its own state, so the checkpoints leave by this list.
-        checkpoints_of_loop.append(rows)
+        checkpoints_of_loop.append(checkpoints)
         return final
 
     out = _run(adjoint, inputs, recording_while_loop, kwargs)
@@ -259,12 +232,60 @@ def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
     )
 
 
-def _steps_between(times: StepTimes, checkpoints: int) -> IntScalarLike:
+def _steps_between(times: StepTimes, num_checkpoints: int) -> IntScalarLike:
     """The number of steps between two checkpoints."""
     # The quotient is rounded up, so that the checkpoints suffice for all steps.
-    return jnp.maximum(1, -(-jnp.asarray(times.number()) // checkpoints))
+    return jnp.maximum(1, -(-jnp.asarray(times.number()) // num_checkpoints))
 
 
+def _while_loop_with_checkpoints(
+    num_checkpoints: int,
+    steps_between: IntScalarLike,
+    cond_fun: Callable,
+    body_fun: Callable,
+    init_val: Any,
+    *,
+    buffers: Callable,
+    **options,
+) -> tuple[Any, PyTree[Array]]:
+    """Diffrax's loop over steps, which also carries the checkpoints, a row for each: its
+    final state, and the checkpoints."""
+
+    def empty_rows(x: Array) -> Array:
+        return jnp.zeros((num_checkpoints, *jnp.shape(x)), x.dtype)
+
+    def is_going(carry):
+        state, _ = carry
+        return cond_fun(state)
+
+    def record_and_step(carry):
+        state, rows = carry
+        before_step = solve_state(state)
+        row, rest = jnp.divmod(before_step.num_steps, steps_between)
+        # States between checkpoints go to the row after the last one, which `save` drops.
+        row = jnp.where(rest == 0, row, num_checkpoints)
+
+        def save(x: Array, saved: Array) -> Array:
+            return saved.at[row].set(x, mode="drop")
+
+        return body_fun(state), jtu.tree_map(save, before_step.y, rows)
+
+    def buffers_of_state(carry):
+        state, _ = carry
+        return buffers(state)
+
+    rows = jtu.tree_map(empty_rows, solve_state(init_val).y)
+    return while_loop(
+        is_going,
+        record_and_step,
+        (init_val, rows),
+        buffers=buffers_of_state,
+        kind="lax",
+        **options,
+    )
+
+
+# From here on, `a_x` is the derivative of the loss with respect to `x`.
 class _Walk(NamedTuple):
     """The state of the backward pass.
 
@@ -274,7 +295,7 @@ class _Walk(NamedTuple):
         the parameters so far.
     - `num_saved`: the number of saved times before this one.
     - `size`: the size of nearby states.
-    - `arrived`: whether the pass met all checkpoints so far.
+    - `agrees`: whether the pass agreed with all checkpoints so far.
     """
 
     i: Array
@@ -283,7 +304,7 @@ class _Walk(NamedTuple):
     a_parameters: PyTree[Array]
     num_saved: Array
     size: Array
-    arrived: Bool[Array, ""]
+    agrees: Bool[Array, ""]
 
 
 @_solve.def_bwd
@@ -291,34 +312,16 @@ def _solve_bwd(
     residuals: _Residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwargs
 ):
     checkpoints, y1, num_steps, num_saved = residuals
-    saveat = kwargs["saveat"].subs
+    ts = kwargs["saveat"].subs.ts
     times = StepTimes(kwargs["stepsize_controller"], kwargs["init_state"])
-    every = _steps_between(times, adjoint.checkpoints)
+    steps_between = _steps_between(times, adjoint.checkpoints)
     _, *parameters = inputs
     _, *is_perturbed = perturbed
     diff, nondiff = eqx.partition(parameters, is_perturbed)
+    step = ft.partial(_step_of_solve, times, nondiff)
     final_grad, _ = grad_out
-    num_times = 1 if saveat.ts is None else len(saveat.ts)
-    # The derivatives of the loss with respect to the saved states.
+    num_times = 1 if ts is None else len(ts)
     a_ys = _with_zeros(solve_state(final_grad).ys, y1, num_times)
-
-    def step(y: Y, diff: PyTree[Array], i: IntScalarLike, back: bool) -> Y:
-        """One step between the times of steps `i` and `i + 1`, forward or back."""
-        args, terms, solver = eqx.combine(diff, nondiff)
-        t0 = times.time(i)
-        t1 = times.time(i + 1)
-        if back:
-            begin = -t1
-            end = -t0
-            terms = reversed_in_time(terms)
-        else:
-            begin = t0
-            end = t1
-        # The solver state belongs to another step, so the step is made as after a jump.
-        made_jump = True
-        solver_state = times.solver_state()
-        y1, *_ = solver.step(terms, begin, end, y, args, solver_state, made_jump)
-        return y1
 
     def is_going(walk: _Walk) -> Bool[Array, ""]:
         return walk.i > 0
@@ -326,31 +329,33 @@ def _solve_bwd(
     def step_back(walk: _Walk) -> _Walk:
         i = walk.i - 1
         y_found = step(walk.y, diff, i, back=True)
-        size = jnp.maximum(optx.max_norm(y_found), _PER_STEP * walk.size)
-        y, arrived = _restarted(y_found, checkpoints, i, every, walk.arrived, size)
-        passed = _Passed(
+        size = jnp.maximum(optx.max_norm(y_found), _SIZE_KEPT_PER_STEP * walk.size)
+        y, agrees = _meet_checkpoint(
+            y_found, checkpoints, i, steps_between, walk.agrees, size
+        )
+        cotangents = _StepCotangents(
             a_y1=walk.a_y, a_y0=(0 * walk.a_y**ω).ω, num_saved=walk.num_saved
         )
-        if saveat.ts is not None:
+        if ts is not None:
             t0 = times.time(i)
             t1 = times.time(i + 1)
-            passed = _saved_between(t0, t1, saveat.ts, a_ys, passed)
+            cotangents = _with_saved_cotangents(t0, t1, ts, a_ys, cotangents)
         # The step is made forward again, from the state that was found, so that its
         # transposed Jacobian is exact.
         forward = ft.partial(step, i=i, back=False)
         _, vjp = jax.vjp(forward, y, diff)
-        a_y_through_step, a_parameters = vjp(passed.a_y1)
+        a_y_through_step, a_parameters = vjp(cotangents.a_y1)
         return _Walk(
             i=i,
             y=y,
             a_parameters=(walk.a_parameters**ω + a_parameters**ω).ω,
-            a_y=(passed.a_y0**ω + a_y_through_step**ω).ω,
-            num_saved=passed.num_saved,
+            a_y=(cotangents.a_y0**ω + a_y_through_step**ω).ω,
+            num_saved=cotangents.num_saved,
             size=size,
-            arrived=arrived,
+            agrees=agrees,
         )
 
-    if saveat.ts is None:
+    if ts is None:
         a_y1 = jtu.tree_map(lambda a: a[-1], a_ys)
     else:
         # States saved at the end itself are met in the last step.
@@ -362,16 +367,44 @@ def _solve_bwd(
         a_parameters=jtu.tree_map(jnp.zeros_like, diff),
         num_saved=jnp.asarray(num_saved),
         size=optx.max_norm(y1),
-        arrived=jnp.array(True),
+        agrees=jnp.array(True),
     )
     walk = lax.while_loop(is_going, step_back, walk)
     a_y0 = walk.a_y
-    if saveat.ts is not None:
+    if ts is not None:
         # States saved at the start itself lie in no step.
-        is_at_start = jnp.arange(len(saveat.ts)) < walk.num_saved
+        is_at_start = jnp.arange(len(ts)) < walk.num_saved
         add_rows = lambda a, rows: a + jnp.tensordot(is_at_start, rows, 1)
         a_y0 = jtu.tree_map(add_rows, a_y0, a_ys)
-    return _if_arrived(walk.arrived, throw, (a_y0, *walk.a_parameters))
+    return _checked_gradients(walk.agrees, throw, (a_y0, *walk.a_parameters))
+
+
+def _step_of_solve(
+    times: StepTimes,
+    nondiff: PyTree,
+    y: Y,
+    diff: PyTree[Array],
+    i: IntScalarLike,
+    back: bool,
+) -> Y:
+    """The state after one step from `y` between the times of steps `i` and `i + 1`, forward
+    or back. `diff` and `nondiff` are the two parts of `args`, terms and solver: what is
+    differentiated, and everything else."""
+    args, terms, solver = eqx.combine(diff, nondiff)
+    t0 = times.time(i)
+    t1 = times.time(i + 1)
+    if back:
+        begin = -t1
+        end = -t0
+        terms = reversed_in_time(terms)
+    else:
+        begin = t0
+        end = t1
+    # The solver state belongs to another step, so the step is made as after a jump.
+    made_jump = True
+    solver_state = times.solver_state()
+    y1, *_ = solver.step(terms, begin, end, y, args, solver_state, made_jump)
+    return y1
 
 
 def _with_zeros(grad_ys: PyTree[Array | None], y1: Y, num_times: int) -> PyTree[Array]:
@@ -388,35 +421,38 @@ def _with_zeros(grad_ys: PyTree[Array | None], y1: Y, num_times: int) -> PyTree[
 
 # The fraction of its size that a state passes to the one before it. Thus a start at rest,
 # which weak increments may not leave for dozens of steps, gets the size of later states.
-_PER_STEP = 0.9
+_SIZE_KEPT_PER_STEP = 0.9
 
 
-def _restarted(
+def _meet_checkpoint(
     y: Y,
     checkpoints: PyTree[Array],
     i: IntScalarLike,
-    every: IntScalarLike,
-    arrived: Bool[Array, ""],
+    steps_between: IntScalarLike,
+    agreed_so_far: Bool[Array, ""],
     size: Array,
 ) -> tuple[Y, Bool[Array, ""]]:
-    """The state after `i` steps, replaced by the checkpoint if there is one; and whether
-    the pass has `arrived` so far and both agree, for states of this `size`."""
+    """The state `y` after `i` steps, replaced by the checkpoint if there is one; and
+    whether the pass `agreed_so_far` and agrees with this one, for states of this `size`.
+    `steps_between` is the number of steps from one checkpoint to the next."""
     # Between checkpoints this reads the checkpoint before, and does not use it.
-    row, rest = jnp.divmod(i, every)
+    row, rest = jnp.divmod(i, steps_between)
     checkpoint = jtu.tree_map(lambda rows: rows[row], checkpoints)
     error = optx.max_norm((y**ω - checkpoint**ω).ω)
+    # A third of the digits may be lost to rounding errors on the way. The gradients, which
+    # are taken at states between checkpoints, then keep two thirds.
     eps = float(jnp.finfo(error.dtype).eps)
     agrees = error <= eps ** (2 / 3) * jnp.maximum(size, optx.max_norm(checkpoint))
     is_at_checkpoint = rest == 0
 
-    def exact(walked: Array, saved: Array) -> Array:
-        return jnp.where(is_at_checkpoint, saved, walked)
+    def saved_if_there_is_one(found: Array, saved: Array) -> Array:
+        return jnp.where(is_at_checkpoint, saved, found)
 
-    y = jtu.tree_map(exact, y, checkpoint)
-    return y, arrived & (agrees | ~is_at_checkpoint)
+    y = jtu.tree_map(saved_if_there_is_one, y, checkpoint)
+    return y, agreed_so_far & (agrees | ~is_at_checkpoint)
 
 
-class _Passed(NamedTuple):
+class _StepCotangents(NamedTuple):
     """Derivatives of the loss at a step, as saved times are passed on the way back.
 
     - `a_y1`: with respect to the state at the end of the step.
@@ -430,25 +466,29 @@ class _Passed(NamedTuple):
     num_saved: Array
 
 
-def _saved_between(t0, t1, ts: Array, a_ys: PyTree[Array], passed: _Passed) -> _Passed:
-    """Adds the derivatives `a_ys` with respect to the states saved after `t0` and up to
-    `t1`, which Diffrax interpolates linearly from the states at `t0` and `t1`."""
+def _with_saved_cotangents(
+    t0, t1, ts: Array, a_ys: PyTree[Array], cotangents: _StepCotangents
+) -> _StepCotangents:
+    """`cotangents` with the derivatives `a_ys` added with respect to the states that were
+    saved at those times `ts` after `t0` and up to `t1`. Diffrax interpolates these states
+    linearly: `(1 - share) * y0 + share * y1` at the time `t0 + share * (t1 - t0)`."""
 
     def with_share(a_y: Y, share: Array, index: Array) -> Y:
         return jtu.tree_map(lambda a, rows: a + share * rows[index], a_y, a_ys)
 
-    def pass_one(passed: _Passed) -> _Passed:
-        last = passed.num_saved - 1
+    def pass_one(cotangents: _StepCotangents) -> _StepCotangents:
+        last = cotangents.num_saved - 1
         share = (ts[last] - t0) / (t1 - t0)
-        a_y1 = with_share(passed.a_y1, share, last)
-        a_y0 = with_share(passed.a_y0, 1 - share, last)
-        return _Passed(a_y1, a_y0, last)
+        a_y1 = with_share(cotangents.a_y1, share, last)
+        a_y0 = with_share(cotangents.a_y0, 1 - share, last)
+        return _StepCotangents(a_y1, a_y0, last)
 
-    def has_more(passed: _Passed) -> Bool[Array, ""]:
+    def has_more(cotangents: _StepCotangents) -> Bool[Array, ""]:
         # If no saved time is left, this reads the last one, but does not use it.
-        return (passed.num_saved > 0) & (ts[passed.num_saved - 1] > t0)
+        num_saved = cotangents.num_saved
+        return (num_saved > 0) & (ts[num_saved - 1] > t0)
 
-    return lax.while_loop(has_more, pass_one, passed)
+    return lax.while_loop(has_more, pass_one, cotangents)
 
 
 def _steps_without_inverse() -> str:
@@ -463,13 +503,15 @@ def _steps_without_inverse() -> str:
     )
 
 
-def _if_arrived(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyTree:
-    """The gradients, if the backward pass arrived; otherwise an error when run, or without
-    `throw` NaN."""
+def _checked_gradients(
+    agrees: Bool[Array, ""], throw: bool, gradients: PyTree
+) -> PyTree:
+    """The gradients, if the backward pass agrees with all checkpoints; otherwise an error
+    when run, or without `throw` NaN."""
     if throw:
         return eqx.error_if(
             gradients,
-            ~arrived,
+            ~agrees,
             "`ReversingAdjoint` could not reconstruct the solution: rounding errors grew "
             "too large between two checkpoints, or a step has no inverse, as one of "
             f"{_steps_without_inverse()}. Increase `checkpoints`, change the step, or pass "
@@ -478,6 +520,6 @@ def _if_arrived(arrived: Bool[Array, ""], throw: bool, gradients: PyTree) -> PyT
 
     # A gradient that is silently wrong would be worse.
     def or_nan(x: Array) -> Array:
-        return jnp.where(arrived, x, cast(Array, jnp.nan))
+        return jnp.where(agrees, x, cast(Array, jnp.nan))
 
     return jtu.tree_map(or_nan, gradients)

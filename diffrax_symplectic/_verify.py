@@ -109,17 +109,18 @@ def _allowed_directions(terms, t0, y0: Y, args: Args) -> Float[Array, "n k"]:
     surface = Surface.of(terms, t0, y0, args)
     flat, _ = jfu.ravel_pytree(y0)
 
-    def equations(x):
+    def equations(x: Array) -> Array:
         """The left-hand sides of both equations, at the state `x`."""
         p, q = jnp.split(x, 2)
         residual, J_v = jax.jvp(surface.residual, (q,), (surface.velocity(p),))
         return jnp.concatenate([residual, J_v])
 
-    # The allowed directions are orthogonal to the gradients of the equations. Of the rows
-    # of V_transposed, the first ones span these gradients, and the others the rest.
-    normals = jax.jacrev(equations)(flat)
-    _, _, V_transposed = jnp.linalg.svd(normals, full_matrices=True)
-    return V_transposed[len(normals) :].T
+    # The allowed directions are orthogonal to the gradients of the equations. The rows of
+    # V^T are orthonormal: the first ones, as many as there are equations, span the
+    # gradients, and all others the allowed directions.
+    gradients = jax.jacrev(equations)(flat)
+    _, _, V_transposed = jnp.linalg.svd(gradients, full_matrices=True)
+    return V_transposed[len(gradients) :].T
 
 
 # By default accelerators multiply in half precision, which would look like a defect.
@@ -154,15 +155,16 @@ def poisson_defect(
     **Raises:** a `ValueError` if `y0` is neither; an error when run if a spin of the pair
     `y0` has length zero, or if the solver reports a failed step.
     """
-    # Spins may be given as spinors, for terms of which the step is symplectic.
-    lifted = isinstance(y0, tuple)
-    s0 = from_spinors(y0) if lifted else as_spins(y0)
+    # The state of `spin_terms` is a pair of spinors; the state of other terms may be the
+    # spins themselves.
+    are_spinors = isinstance(y0, tuple)
+    s0 = from_spinors(y0) if are_spinors else as_spins(y0)
 
     def step(s: Array) -> tuple[Array, tuple[Array, diffrax.RESULTS]]:
         # Any spinors of a spin will do, since all of them move to those of the same spin.
-        y0 = to_spinors(s) if lifted else s
+        y0 = to_spinors(s) if are_spinors else s
         y1, result = _one_step(terms, solver, t0, t1, y0, args)
-        s1 = from_spinors(y1) if lifted else y1
+        s1 = from_spinors(y1) if are_spinors else y1
         return s1, (s1, result)
 
     jacobian, (s1, result) = jax.jacrev(step, has_aux=True)(s0)
@@ -178,9 +180,9 @@ def poisson_defect(
 
     # P(s) is never formed: the cross products of s with the rows of a matrix are the
     # columns of P(s) times the transposed matrix. J P(s0) J^T, and then P(s1):
-    transported = _dot(matrix(gradients), matrix(jnp.cross(s0, gradients)).T)
-    exact = matrix(jnp.cross(s1, units)).T
-    return jnp.max(jnp.abs(transported - exact))
+    J_P_Jt = _dot(matrix(gradients), matrix(jnp.cross(s0, gradients)).T)
+    P_s1 = matrix(jnp.cross(s1, units)).T
+    return jnp.max(jnp.abs(J_P_Jt - P_s1))
 
 
 def equipartition(
@@ -348,9 +350,9 @@ def second_moment_map(
 
 
 def _average(outcome: Callable, terms, h, nodes: int) -> PyTree[Array]:
-    """The expectation over a step of size `h` of the value that `outcome(terms)` returns
-    beside the result of the step, for terms with one outcome of the random variables.
-    `nodes` is as for `step_expectation`."""
+    """The expectation of a value after a step of size `h`. `outcome` gets the terms with
+    one outcome of the random variables of the step, and returns the value and the result
+    of the step. `nodes` is as for `step_expectation`."""
     check_baths_have_own_noise(terms)
     laws, terms_with = step_variables(terms, h)
     variables, weights = outcomes(laws, nodes)
@@ -441,7 +443,7 @@ def _generator(terms, args, ito: bool) -> Callable:
     ]
 
     def generator(phi: Callable) -> Callable:
-        def applied(t: RealScalarLike, y: Y) -> PyTree[Array]:
+        def L_phi(t: RealScalarLike, y: Y) -> PyTree[Array]:
             zero = jtu.tree_map(jnp.zeros_like, y)
             velocity = rate(drift, t, y, args) if drift else zero
             # The derivatives by time and along the drift are one derivative, along (1, a).
@@ -451,7 +453,7 @@ def _generator(terms, args, ito: bool) -> Callable:
                 total = (total**ω + second**ω / 2).ω
             return total
 
-        return applied
+        return L_phi
 
     return generator
 
@@ -459,8 +461,9 @@ def _generator(terms, args, ito: bool) -> Callable:
 def _second_derivative(
     phi: Callable, field: Callable, t: RealScalarLike, y: Y, ito: bool
 ) -> PyTree[Array]:
-    """The second derivative of `phi` along a vector field: along its flow, or for an Itô
-    equation along the straight line of its value at `y`."""
+    r"""The second derivative of `phi` along a vector field $b$: along its flow, $b \cdot
+    \nabla (b \cdot \nabla \phi)$; or for an Itô equation along the straight line through
+    `y` in the direction of $b(y)$, $b^\top (\nabla^2 \phi)\, b$."""
     field_at_y = field(t, y)
 
     def first_derivative(y: Y) -> PyTree[Array]:

@@ -13,7 +13,7 @@ from diffrax._term import WrapTerm
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._adjoint import (
-    _restarted,
+    _meet_checkpoint,
     _steps_without_inverse,
     _undoes_its_steps,
 )
@@ -286,7 +286,7 @@ def test_the_way_back_leads_to_rest(path):
 def test_a_loss_on_the_way_back_is_not_forgotten_at_the_next_saved_state():
     # The states after no, two and four steps.
     saved = jnp.array([3.0, 2.0, 1.0])
-    at_saved = lambda y, found, size=0.0: _restarted(
+    at_saved = lambda y, found, size=0.0: _meet_checkpoint(
         y, saved, jnp.array(2), 2, jnp.array(found), jnp.array(size)
     )
     assert at_saved(jnp.array(2.0), True) == (2.0, True)
@@ -295,7 +295,7 @@ def test_a_loss_on_the_way_back_is_not_forgotten_at_the_next_saved_state():
     assert at_saved(jnp.array(2 + 1.01 * bound), True) == (2.0, False)
     assert at_saved(jnp.array(2 + 1.01 * bound), True, 2.1) == (2.0, True)
     assert at_saved(jnp.array(2.0), False) == (2.0, False)
-    between = _restarted(
+    between = _meet_checkpoint(
         jnp.array(1.6), saved, jnp.array(3), 2, jnp.array(True), jnp.array(0.0)
     )
     assert between == (1.6, True)

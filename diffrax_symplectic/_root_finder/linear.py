@@ -147,8 +147,9 @@ def eliminate(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
         augmented = jnp.concatenate([matrix, rhs[:, None]], axis=1)
         cleared = lax.fori_loop(0, num_unknowns, _clear_column, augmented)
         return cleared[:, num_unknowns]
-    # The division makes XLA store the right-hand side. Otherwise XLA would recompute it in
-    # each unrolled entry, which takes 0.1 s more to compile for four unknowns.
+    # The right-hand side is divided by its size, which makes XLA store it. Otherwise XLA
+    # would recompute it in each unrolled entry, which takes 0.1 s more to compile for four
+    # unknowns.
     size = _largest_or_one(rhs)
     # The rows of the augmented matrix, whose last column is the right-hand side.
     rows = [[*row, entry] for row, entry in zip(matrix, rhs / size)]
@@ -170,6 +171,7 @@ def _bring_up_pivot(rows: list[list[Scalar]], k: int) -> None:
     # Pairwise swaps are selections, which a batch can do without gathering rows.
     for i in range(k + 1, len(rows)):
         is_larger = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
+        # The entries of both rows, column by column.
         pairs = list(zip(rows[k], rows[i]))
         rows[k] = [jnp.where(is_larger, lower, upper) for upper, lower in pairs]
         rows[i] = [jnp.where(is_larger, upper, lower) for upper, lower in pairs]
@@ -178,13 +180,13 @@ def _bring_up_pivot(rows: list[list[Scalar]], k: int) -> None:
 def _clear_column(k: IntScalarLike, rows: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """One step of elimination: scales the row with the largest pivot, moves it to row `k`,
     and clears column `k` in all other rows."""
-    numbers = jnp.arange(len(rows))
+    row_numbers = jnp.arange(len(rows))
     # The rows above row `k` have had their turn. A negative size is never the largest.
-    sizes = jnp.where(numbers < k, -1, jnp.abs(rows[:, k]))
+    sizes = jnp.where(row_numbers < k, -1, jnp.abs(rows[:, k]))
     pivot = jnp.argmax(sizes)
     pivot_row = rows[pivot] / rows[pivot, k]
     # Rows are replaced by selections, which the fused engine replays. It does not replay a
     # scatter to a row that differs between paths.
-    rows = jnp.where((numbers == pivot)[:, None], rows[k], rows)
+    rows = jnp.where((row_numbers == pivot)[:, None], rows[k], rows)
     cleared = rows - rows[:, k, None] * pivot_row
-    return jnp.where((numbers == k)[:, None], pivot_row, cleared)
+    return jnp.where((row_numbers == k)[:, None], pivot_row, cleared)

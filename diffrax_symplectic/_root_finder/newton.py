@@ -30,6 +30,11 @@ _SHRINK = 0.5
 # A part of the step is solved once corrections are below this fraction of the iterate. It
 # only serves as the guess for the next part.
 _LOOSE = 0.1
+# Near a solution Newton's method converges quadratically. Corrections there that are above
+# this fraction of the previous one have reached rounding errors.
+_SHRINK_AT_ROUNDING = 0.25
+# Two corrections are the fewest that can be compared.
+_FEWEST_TO_COMPARE = 2
 # The next part is twice as long after a success, and a quarter as long after a failure.
 _LONGER = 2.0
 _SHORTER = 0.25
@@ -61,7 +66,7 @@ class Progress(NamedTuple):
     is_solved: Bool[Array, ""]
 
     @property
-    def hopeless(self) -> Bool[Array, ""]:
+    def is_hopeless(self) -> Bool[Array, ""]:
         """Whether even the search for any solution has left the equations' domain."""
         return self.searching & ~jnp.isfinite(self.size)
 
@@ -78,100 +83,118 @@ class Newton(eqx.Module):
     tolerance: Tolerance
     linear_solver: lx.AbstractLinearSolver | None
 
-    def solve(self, guess: _Vector, most: int) -> tuple[_Vector, optx.RESULTS]:
-        """The last iterate from a `guess`, after at most `most` iterations, and whether it
+    def solve(
+        self, guess: _Vector, max_iterations: int
+    ) -> tuple[_Vector, optx.RESULTS]:
+        """The last iterate from a `guess`, after at most so many iterations, and whether it
         is a solution."""
         # With `optx.root_find` a step would take a seventh longer to trace.
         zero = jnp.zeros((), self.start.dtype)
-        no = jnp.array(False)
+        false = jnp.array(False)
         start = Progress(
             anchor=self.start,
             reached=zero,
             target=zero + 1,
             tries=jnp.array(0),
             size=zero,
-            searching=no,
-            is_solved=no,
+            searching=false,
+            is_solved=false,
         )
-        start, number = batched_like((start, jnp.array(0)), guess)
+        start, count = batched_like((start, jnp.array(0)), guess)
 
-        def pending(carry):
-            number, _, state = carry
-            return (number < most) & ~state.is_solved & ~state.hopeless
+        def is_going(carry):
+            count, _, progress = carry
+            in_time = count < max_iterations
+            return in_time & ~progress.is_solved & ~progress.is_hopeless
 
         def body(carry):
-            number, k, state = carry
-            return number + 1, *self.step(k, state)
+            count, k, progress = carry
+            return count + 1, *self.step(k, progress)
 
-        _, k, state = lax.while_loop(pending, body, (number, guess, start))
+        _, k, progress = lax.while_loop(is_going, body, (count, guess, start))
         R: Any = optx.RESULTS
-        failure = R.where(state.hopeless, R.nonfinite, R.nonlinear_max_steps_reached)
-        return k, R.where(state.is_solved, R.successful, failure)
+        failure = R.where(
+            progress.is_hopeless, R.nonfinite, R.nonlinear_max_steps_reached
+        )
+        return k, R.where(progress.is_solved, R.successful, failure)
 
-    def step(self, y: _Vector, state: Progress) -> tuple[_Vector, Progress]:
-        """One iteration from the iterate `y` for the current target: the corrected iterate,
+    def step(self, k: _Vector, progress: Progress) -> tuple[_Vector, Progress]:
+        """One iteration from the iterate `k` for the current target: the corrected iterate,
         or the guess for the next target."""
-        s = state.target
-        is_whole_step = state.target == 1
+        s = progress.target
+        is_whole_step = progress.target == 1
 
         def equations(k: _Vector) -> _Vector:
             return (1 - s) * (k - self.start) + s * self.residual(k)
 
-        residual, change, found, _ = correction(equations, y, self.linear_solver)
-        size_of_iterate = max_norm(y)
-        k = y - change
-        scale = self.scale(self.restore(k))
-        correction_size = self.tolerance.measure(self.restore(change), scale)
+        newton = correction(equations, k, self.linear_solver)
+        size_of_iterate = max_norm(k)
+        next_k = k - newton.change
+        scale = self.scale(self.restore(next_k))
+        correction_size = self.tolerance.measure(self.restore(newton.change), scale)
         size = correction_size.size
-        tries = state.tries + 1
+        tries = progress.tries + 1
         # The first correction has none to be compared with.
-        shrinkage = jnp.where(state.tries > 0, ratio(size, state.size), 1)
+        shrinkage = jnp.where(progress.tries > 0, ratio(size, progress.size), 1)
         level = log2(size)
         rate = log2(shrinkage)
-        # Newton's method converges quadratically near a solution. Corrections that shrink
-        # by less than four there have reached rounding errors.
-        at_rounding = shrinkage >= 0.25
-        is_solved = converged(level, rate, correction_size.rounded, at_rounding)
+        is_at_rounding = shrinkage >= _SHRINK_AT_ROUNDING
+        is_solved = converged(
+            level, rate, correction_size.is_rounding, stalled=is_at_rounding
+        )
         # Far from any solution, rounding errors of a large Jacobian can hide the unknowns
         # with small coefficients. Corrections are then small, but residuals exceed the
         # state.
         size_of_scale = largest([max_norm(x) for x in jtu.tree_leaves(scale)])
-        size_of_state = jnp.maximum(size_of_scale, size_of_iterate)
-        size_of_state = size_of_state + self.tolerance.atol
-        residual_fits = max_norm(residual) <= size_of_state
-        is_solved &= is_whole_step & found & residual_fits & all_finite(k)
+        allowed_residual = jnp.maximum(size_of_scale, size_of_iterate)
+        allowed_residual = allowed_residual + self.tolerance.atol
+        residual_fits = max_norm(newton.residual) <= allowed_residual
+        is_solved &= is_whole_step & newton.found & residual_fits & all_finite(next_k)
 
         # The whole step at once is tried first, from a guess that may be poor. The last
-        # part of a continuation and the search begin near a solution, or fail soon: two
-        # corrections are the fewest that can be compared.
-        is_first_try = is_whole_step & (state.reached == 0) & ~state.searching
-        patience = jnp.where(is_first_try, _PATIENCE, 2)
+        # part of a continuation and the search begin near a solution, or fail soon.
+        is_first_try = is_whole_step & (progress.reached == 0) & ~progress.searching
+        patience = jnp.where(is_first_try, _PATIENCE, _FEWEST_TO_COMPARE)
         # A zero correction away from a solution is no progress either.
-        stalled = (tries >= patience) & ~((shrinkage < _SHRINK) & (size > 0))
-        slow = ~is_whole_step & (tries >= _PATIENCE_IN_PART)
-        arrived = (max_norm(change) < _LOOSE * size_of_iterate) & ~is_whole_step
-        failed = (~jnp.isfinite(size) | stalled | slow) & ~arrived & ~is_solved
-        state = state._replace(tries=tries, size=size, is_solved=is_solved)
-        return _next_target(state, k, arrived, failed & ~state.searching)
+        is_due = tries >= patience
+        makes_progress = (shrinkage < _SHRINK) & (size > 0)
+        has_stalled = is_due & ~makes_progress
+        is_slow = ~is_whole_step & (tries >= _PATIENCE_IN_PART)
+        is_near = max_norm(newton.change) < _LOOSE * size_of_iterate
+        part_is_solved = is_near & ~is_whole_step
+        has_failed = ~jnp.isfinite(size) | has_stalled | is_slow
+        has_failed = has_failed & ~part_is_solved & ~is_solved
+        progress = progress._replace(tries=tries, size=size, is_solved=is_solved)
+        # A search goes on from where it is: there is no shorter part to go back to.
+        return _next_target(
+            progress, next_k, part_is_solved, has_failed & ~progress.searching
+        )
 
 
 def _next_target(
-    progress: Progress, k: _Vector, arrived: Bool[Array, ""], failed: Bool[Array, ""]
+    progress: Progress,
+    k: _Vector,
+    part_is_solved: Bool[Array, ""],
+    has_failed: Bool[Array, ""],
 ) -> tuple[_Vector, Progress]:
-    """The next iterate and target: further ahead if the target was reached (`arrived`), and
-    back from the anchor if Newton's method `failed`."""
+    """The next iterate and target, from the iterate `k`: a target further ahead if this
+    one was reached by a part of the step, `part_is_solved`; a nearer one, from the anchor,
+    if Newton's method `has_failed`; and otherwise the same."""
     target = progress.target
     stride = progress.target - progress.reached
     # If parts get too short, the branch of solutions has turned back.
-    has_turned_back = failed & (_SHORTER * stride < _SHORTEST)
+    has_turned_back = has_failed & (_SHORTER * stride < _SHORTEST)
     longer = jnp.minimum(target + _LONGER * stride, 1)
     # A search for any solution is one for the full equations.
     shorter = jnp.where(has_turned_back, 1, progress.reached + _SHORTER * stride)
-    k = jnp.where(failed, progress.anchor, k)
+    k = jnp.where(has_failed, progress.anchor, k)
+    anchor = jnp.where(part_is_solved, k, progress.anchor)
+    reached = jnp.where(part_is_solved, target, progress.reached)
+    same_or_shorter = jnp.where(has_failed, shorter, target)
     return k, progress._replace(
-        anchor=jnp.where(arrived, k, progress.anchor),
-        reached=jnp.where(arrived, target, progress.reached),
-        target=jnp.where(arrived, longer, jnp.where(failed, shorter, target)),
-        tries=jnp.where(arrived | failed, 0, progress.tries),
+        anchor=anchor,
+        reached=reached,
+        target=jnp.where(part_is_solved, longer, same_or_shorter),
+        tries=jnp.where(part_is_solved | has_failed, 0, progress.tries),
         searching=progress.searching | has_turned_back,
     )

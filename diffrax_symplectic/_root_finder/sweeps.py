@@ -29,16 +29,16 @@ _FIRST_DOUBLED_IN_SINGLE = 5
 # The most sweeps between two convergence checks: rates near one are not known accurately.
 _MOST_BETWEEN_CHECKS = 32
 # The most sweeps until the next check when corrections are as small as rounding errors.
-_MOST_ROUNDED = 3
+_MOST_AT_ROUNDING = 3
 # Sweeps with a slower rate of convergence are under-relaxed. Faster ones would gain less
 # than one sweep.
 SLOW = 0.3
 # The relaxation factor after divergence, which is optimal for a rate of 8:
 # 2 / (1 + sqrt(1 + 8)).
-_STRONGEST = 0.5
+_STRONGEST_RELAXATION = 0.5
 # The base-2 logarithm of the rate expected of relaxed sweeps, a quarter. By Young's formula
 # the rate is 0.17 or better for rates up to one, but only after the first few sweeps.
-_RELAXED = -2.0
+_RELAXED_RATE = -2.0
 # The base-2 logarithm of 0.87, the rate above which sweeps count as not converging.
 STALLED = -0.2
 
@@ -59,8 +59,9 @@ class _SweepState(NamedTuple):
     - `level`: the base-2 logarithm of the size of the last correction.
     - `is_solved`: whether it was small enough.
     - `pending`: whether to continue.
-    - `done`: the number of sweeps so far, shared by all paths of the batch.
-    - `ahead`: the number of sweeps until the next check, shared by them; zero at the end.
+    - `num_done`: the number of sweeps so far, shared by all paths of the batch.
+    - `num_ahead`: the number of sweeps until the next check, shared by them; zero at the
+        end.
     """
 
     y: Halves | None
@@ -68,8 +69,8 @@ class _SweepState(NamedTuple):
     level: Scalar
     is_solved: Bool[Array, ""]
     pending: Bool[Array, ""]
-    done: IntScalarLike
-    ahead: IntScalarLike
+    num_done: IntScalarLike
+    num_ahead: IntScalarLike
 
 
 class _AfterSweeps(NamedTuple):
@@ -87,23 +88,23 @@ class _Decision(NamedTuple):
     """The decision at a convergence check.
 
     - `state`: the next state, except for the iterate.
-    - `back`: whether to go back to the guess.
+    - `goes_back`: whether to go back to the guess.
     """
 
     state: _SweepState
-    back: Bool[Array, ""]
+    goes_back: Bool[Array, ""]
 
 
 def solve_by_sweeps(
     tolerance: Tolerance,
-    most: int,
+    max_sweeps: int,
     image: Map,
     scale: Map,
     guess: PyTree[Array],
     pending: Bool[Array, ""],
 ) -> tuple[PyTree[Array], Bool[Array, ""]]:
     r"""Solves $y = \Phi(y)$ from a `guess` for all `pending` paths of a batch, with at most
-    `most` sweeps, until each path has converged or is seen not to converge. Returns the
+    `max_sweeps`, until each path has converged or is seen not to converge. Returns the
     iterate (the guess if sweeps diverged), and whether it is a solution.
 
     In a sweep $q$ is updated with the new $p$ (Gauss--Seidel). For an oscillating
@@ -122,7 +123,7 @@ def solve_by_sweeps(
     in_halves = isinstance(guess, Halves)
     start = guess if in_halves else Halves(guess, guess)
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
-    first = _first_sweeps(dtype, in_halves)
+    first_sweeps = _sweeps_before_first_check(dtype, in_halves)
 
     # The halves of a doubled system agree in the end.
     def value_of(y: PyTree[Array]) -> PyTree[Array]:
@@ -132,41 +133,44 @@ def solve_by_sweeps(
         change, y = _sweep_until_check(image, state, in_halves)
         correction = tolerance.measure(change, scale(value_of(y)))
         # The first correction is bounded by the size of the state.
-        earlier = jnp.minimum(state.level, log2(correction.bound))
+        last_level = jnp.minimum(state.level, log2(correction.bound))
         level = log2(correction.size)
-        check = ft.partial(_check, state, level, earlier, correction, first, most)
+        check = ft.partial(
+            _decide, state, level, last_level, correction, first_sweeps, max_sweeps
+        )
         # Without `materialize` the result would be recomputed wherever it is used: steps of
         # small systems took 1.3 to 2.8 times as long. The logarithms are inside, so that
         # only one kernel reads them: otherwise ten arrays took 1.1 times as long.
-        new, back = materialize(check)
+        next_state, goes_back = materialize(check)
 
         # All paths of a batch sweep together, but a path that has ended stays where it was.
         def next_iterate(y: Array, start: Array, old: Array) -> Array:
-            return jnp.where(state.pending, jnp.where(back, start, y), old)
+            return jnp.where(state.pending, jnp.where(goes_back, start, y), old)
 
-        return new._replace(y=jtu.tree_map(next_iterate, y, start, state.y))
+        return next_state._replace(y=jtu.tree_map(next_iterate, y, start, state.y))
 
     one = jnp.ones((), dtype)
     inf = jnp.full((), jnp.inf, dtype)
-    no = jnp.array(False)
+    false = jnp.array(False)
     # The check batches these values in any case. If they were not batched here, JAX would
     # trace the loop again to find that out.
-    start, pending, one, inf, no = batched_like((start, pending, one, inf, no), guess)
+    initial_values = (start, pending, one, inf, false)
+    start, pending, one, inf, false = batched_like(initial_values, guess)
     state = _SweepState(
         y=start,
         relaxation=one,
         level=inf,
-        is_solved=no,
+        is_solved=false,
         pending=pending,
         # The batch shares the counts, so that the loops keep unbatched lengths.
-        done=0,
-        ahead=first,
+        num_done=0,
+        num_ahead=first_sweeps,
     )
-    state = lax.while_loop(lambda state: state.ahead > 0, sweep_and_check, state)
+    state = lax.while_loop(lambda state: state.num_ahead > 0, sweep_and_check, state)
     return value_of(state.y), state.is_solved
 
 
-def _first_sweeps(dtype, in_halves: bool) -> int:
+def _sweeps_before_first_check(dtype, in_halves: bool) -> int:
     """The number of sweeps before the first convergence check, for unknowns of this dtype,
     in halves or as a doubled system."""
     if jnp.finfo(dtype).bits < 64:
@@ -197,62 +201,65 @@ def _sweep_until_check(image: Map, state: _SweepState, in_halves: bool) -> _Afte
         return Halves(y.p, relaxed(new_q(y), y.q))
 
     if not in_halves:
-        y = lax.fori_loop(0, state.ahead, sweep, state.y)
+        y = lax.fori_loop(0, state.num_ahead, sweep, state.y)
         # The halves may converge to different solutions of y = \Phi(\Phi(y)). Only their
         # difference shows that, so it serves as the correction.
         return _AfterSweeps((y.q**ω - y.p**ω).ω, y)
     # A loop that also carried the previous iterate would copy it in each sweep: steps of 64
     # pairs took 1.1 to 1.4 times as long, although the program was a tenth shorter.
-    before = lax.fori_loop(0, state.ahead - 1, sweep, state.y)
-    y = sweep(None, before)
-    return _AfterSweeps((y**ω - before**ω).ω, y)
+    before_last = lax.fori_loop(0, state.num_ahead - 1, sweep, state.y)
+    y = sweep(None, before_last)
+    return _AfterSweeps((y**ω - before_last**ω).ω, y)
 
 
-def _check(
+def _decide(
     state: _SweepState,
     level: Scalar,
-    earlier: Scalar,
-    last: CorrectionSize,
-    first: int,
-    most: int,
+    last_level: Scalar,
+    correction: CorrectionSize,
+    first_sweeps: int,
+    max_sweeps: int,
 ) -> _Decision:
-    """What to do next. The base-2 logarithms of the `last` and an earlier correction are
-    `level` and `earlier`. `first` is the number of sweeps before the first check, and
-    `most` the most in all."""
+    """What to do next, after a correction of this size. Its base-2 logarithm is `level`,
+    and that of the correction at the last check is `last_level`. `first_sweeps` is the
+    number of sweeps before the first check, and `max_sweeps` the most in all."""
     # The rate is a base-2 logarithm, so that the number of further sweeps is a quotient.
-    rate = (level - earlier) / state.ahead
-    done = state.done + state.ahead
+    rate = (level - last_level) / state.num_ahead
+    num_done = state.num_done + state.num_ahead
     stalled = rate >= STALLED
-    is_solved = converged(level, rate, last.rounded, stalled)
+    is_solved = converged(level, rate, correction.is_rounding, stalled)
     # Sweeps that diverged get one more try. If it stalls, Newton's method takes over.
-    again = stalled & (state.relaxation > _STRONGEST)
+    starts_again = stalled & (state.relaxation > _STRONGEST_RELAXATION)
     ratio = jnp.exp2(rate)
     # The relaxation is tuned once, at the first check: later rates are those of relaxed
     # sweeps, to which the formula does not apply.
-    tuned = (state.done == 0) & (ratio > SLOW) & ~stalled
+    is_tuned_now = (state.num_done == 0) & (ratio > SLOW) & ~stalled
     # After so many sweeps the level is at `-MARGIN`.
-    further = (level + MARGIN) / jnp.where(tuned, -_RELAXED, -rate)
+    num_needed = (level + MARGIN) / jnp.where(is_tuned_now, -_RELAXED_RATE, -rate)
     # Sweeps that would not end in time end now, before they cost anything.
-    in_time = again | (~stalled & (done + further < most))
-    pending = state.pending & ~is_solved & in_time & (done < most)
+    in_time = starts_again | (~stalled & (num_done + num_needed < max_sweeps))
+    pending = state.pending & ~is_solved & in_time & (num_done < max_sweeps)
     # Newton's method begins where the sweeps ended if that is near a solution, or else at
     # the guess.
-    near = ~stalled & (last.small | pending)
-    count = jnp.where(again, first, further)
+    is_near = ~stalled & (correction.is_small | pending)
+    num_ahead = jnp.where(starts_again, first_sweeps, num_needed)
     # Corrections as small as rounding errors show no rate.
-    count = jnp.where(last.rounded, jnp.minimum(count, _MOST_ROUNDED), count)
-    count = jnp.ceil(jnp.where(pending, count, 0)).astype(int)
-    relaxation = jnp.where(tuned, best_relaxation(ratio), state.relaxation)
-    new = _SweepState(
+    num_ahead = jnp.where(
+        correction.is_rounding, jnp.minimum(num_ahead, _MOST_AT_ROUNDING), num_ahead
+    )
+    num_ahead = jnp.ceil(jnp.where(pending, num_ahead, 0)).astype(int)
+    relaxation = jnp.where(is_tuned_now, best_relaxation(ratio), state.relaxation)
+    next_state = _SweepState(
         y=None,
-        relaxation=jnp.where(again, _STRONGEST, relaxation),
-        level=jnp.where(again, jnp.inf, level),
+        relaxation=jnp.where(starts_again, _STRONGEST_RELAXATION, relaxation),
+        level=jnp.where(starts_again, jnp.inf, level),
         is_solved=jnp.where(state.pending, is_solved, state.is_solved),
         pending=pending,
-        done=done,
-        ahead=jnp.minimum(most_of_batch(count), _MOST_BETWEEN_CHECKS),
+        num_done=num_done,
+        # The path of the batch that needs the most sweeps decides for all.
+        num_ahead=jnp.minimum(most_of_batch(num_ahead), _MOST_BETWEEN_CHECKS),
     )
-    return _Decision(new, ~(near | is_solved))
+    return _Decision(next_state, goes_back=~(is_near | is_solved))
 
 
 def best_relaxation(rate: Scalar) -> Scalar:

@@ -38,16 +38,16 @@ class CorrectionSize(NamedTuple):
 
     - `size`: the largest over all leaves, in units of their tolerances: 1 is just accepted.
     - `bound`: the `size` of a correction as large as the whole state.
-    - `rounded`: whether it is as small as rounding errors of the whole state, which can
+    - `is_rounding`: whether it is as small as rounding errors of the whole state, which can
         keep the corrections of a comparatively small leaf above its own tolerance forever.
-    - `small`: whether it is below a hundredth of the whole state, so that the iterate is
+    - `is_small`: whether it is below a hundredth of the whole state, so that the iterate is
         worth keeping.
     """
 
     size: Scalar
     bound: Scalar
-    rounded: _Flag
-    small: _Flag
+    is_rounding: _Flag
+    is_small: _Flag
 
 
 class Tolerance(NamedTuple):
@@ -76,11 +76,11 @@ class Tolerance(NamedTuple):
         size = self._in_units(sizes, scales)
         bound = self._in_units([whole_state], [whole_state])
         eps = float(jnp.finfo(size.dtype).eps)
-        # An infinite correction to an infinite state is neither, since it is not strictly
-        # below.
-        rounded = largest(sizes) < ROUNDINGS * eps * whole_state
-        small = largest(sizes) < _SMALL * whole_state
-        return CorrectionSize(size, bound, rounded, small)
+        # An infinite correction to an infinite state is neither rounding nor small, since
+        # it is not strictly below.
+        is_rounding = largest(sizes) < ROUNDINGS * eps * whole_state
+        is_small = largest(sizes) < _SMALL * whole_state
+        return CorrectionSize(size, bound, is_rounding, is_small)
 
     def _in_units(self, sizes: list[Scalar], scales: list[Scalar]) -> Scalar:
         """The largest of these sizes, each in units of its tolerance."""
@@ -144,11 +144,12 @@ def log2(x: Scalar) -> Scalar:
     return bits * 2.0**-info.nmant + float(info.minexp - 1)
 
 
-def converged(level: Scalar, rate: Scalar, rounded: _Flag, stalled: _Flag) -> _Flag:
+def converged(level: Scalar, rate: Scalar, is_rounding: _Flag, stalled: _Flag) -> _Flag:
     """Whether the next correction will be below the tolerance by `MARGIN`; or corrections
-    have `stalled` at rounding errors. `level` and `rate` are the base-2 logarithms of the
-    last correction, in units of the tolerance, and of its ratio to the previous one."""
+    no longer shrink (`stalled`) and are as small as rounding errors (`is_rounding`).
+    `level` and `rate` are the base-2 logarithms of the last correction, in units of the
+    tolerance, and of its ratio to the previous one."""
     # With linear convergence the next correction is smaller by the same ratio. A correction
     # that grew says nothing about the next one, so that it must be small itself.
     next_level = level + jnp.minimum(rate, 0)
-    return (next_level <= -MARGIN) | (stalled & rounded)
+    return (next_level <= -MARGIN) | (stalled & is_rounding)

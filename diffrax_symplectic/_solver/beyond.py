@@ -95,13 +95,13 @@ class _Flow(NamedTuple):
 
     - `is_drift`: whether it is the flow of the drift, not of one noise.
     - `t0`, `t1`: the times between which it moves; the same for noise.
-    - `number`, `increment`: which noise, and its increment; ignored for the drift.
+    - `noise_index`, `increment`: which noise, and its increment; ignored for the drift.
     """
 
     is_drift: Any
     t0: Array
     t1: Array
-    number: Array
+    noise_index: Array
     increment: Array
 
 
@@ -183,7 +183,9 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         def after_noise(flow: _Flow, y: Y, outcome: Outcome) -> tuple[Y, Outcome]:
             if len(noise) == 0:
                 return y, outcome
-            change = jtu.Partial(apply_one, noise, flow.number, flow.increment, args)
+            change = jtu.Partial(
+                apply_one, noise, flow.noise_index, flow.increment, args
+            )
             # Time stands still, so all stages are at the middle of the step.
             step = Step(flow.t0, jnp.zeros_like(flow.t0), {"h": change})
             return take_step(_FLOW, step, y, self, outcome)
@@ -201,16 +203,16 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     def _flows(self, terms, t0, t1) -> _Flow:
         """All flows of a step, in order, stacked along a first axis."""
         middle = t0 + (t1 - t0) / 2
-        numbers, increments = self._noises_in_order(terms, t0, t1)
+        indices, increments = self._noises_in_order(terms, t0, t1)
         # The drift moves to the middle of the step first, and from there to its end last.
         # The noises between stay at the middle. Padding adds both drifts, which ignore the
-        # number and the increment of a noise.
-        middles = [middle] * (numbers.size + 1)
+        # index and the increment of a noise.
+        middles = [middle] * (indices.size + 1)
         return _Flow(
-            is_drift=np.pad(np.full(numbers.size, False), 1, constant_values=True),
+            is_drift=np.pad(np.full(indices.size, False), 1, constant_values=True),
             t0=jnp.stack([t0, *middles]),
             t1=jnp.stack([*middles, t1]),
-            number=jnp.pad(numbers, 1),
+            noise_index=jnp.pad(indices, 1),
             increment=jnp.pad(increments, 1),
         )
 
@@ -225,13 +227,13 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         variables = drawn_variables(noise, names, t0, t1, type(self).__name__)
         # One increment for each noise, over all terms and leaves.
         increments, _ = jfu.ravel_pytree(variables["W"])
-        numbers = jnp.arange(num_noises)
+        indices = jnp.arange(num_noises)
         if num_noises > 1:
             # The sign of the first two-point variable is the coin.
             first_leaf, *_ = jtu.tree_leaves(variables["two_point"])
             is_heads = first_leaf.reshape(-1)[0] > 0
-            numbers = jnp.where(is_heads, numbers, numbers[::-1])
-        return numbers, increments[numbers]
+            indices = jnp.where(is_heads, indices, indices[::-1])
+        return indices, increments[indices]
 
 
 @documented

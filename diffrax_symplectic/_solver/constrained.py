@@ -151,18 +151,18 @@ def baoab_step(
         begin: RealScalarLike,
         end: RealScalarLike,
         flow_state: PyTree,
-    ) -> tuple[Array, Array, PyTree, Bool[Array, ""]]:
-        """The momenta, positions and state of the flow after half a step of it from these
-        momenta and the position of the normal space, and whether it succeeded."""
+    ) -> _AfterFlow:
+        """Half a step of the flow from these momenta and the position of the normal
+        space."""
         if flow is None:
             p, q, found = surface.free_flight(p, normal_space, half, pending)
-            return p, q, flow_state, found
+            return _AfterFlow(p, q, flow_state, found)
         y = (unravel_p(p), unravel_q(normal_space.q))
         y, flow_state, result = moved_by(
             flow, steps, rest, begin, end, half, y, args, flow_state
         )
         (p, _), (q, _) = map(jfu.ravel_pytree, y)
-        return p, q, flow_state, result == diffrax.RESULTS.successful
+        return _AfterFlow(p, q, flow_state, result == diffrax.RESULTS.successful)
 
     # B and A. Between them the momentum need not be tangent: the multipliers of the flight
     # make up for it.
@@ -202,6 +202,20 @@ def baoab_step(
     y1 = (unravel_p(p), unravel_q(q))
     y1, outcome = _end_and_outcome(y1, first_found & second_found, before.outcome)
     return y1, ConstrainedState(force, flow_state, outcome)
+
+
+class _AfterFlow(NamedTuple):
+    """What half a step of the flow leads to.
+
+    - `p`, `q`: the momenta and positions, as vectors.
+    - `state`: the state of the flow.
+    - `found`: whether it succeeded, and found the multipliers.
+    """
+
+    p: Array
+    q: Array
+    state: PyTree
+    found: Bool[Array, ""]
 
 
 def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:

@@ -49,20 +49,7 @@ def noise_changes(
     change of the state over the step of size `h` from `t0` to `t1` by the vector fields
     that a variable multiplies. `drift` is the function of the drift stages, for variables
     that multiply brackets with it."""
-    # Most variables are attributes of an increment. The others are computed from several
-    # of its attributes, some of which are used only if they are there.
-    required = []
-    optional = []
-    for name in names:
-        held = VARIABLES[name].held if name in VARIABLES else None
-        if held is None:
-            required.append(name)
-        else:
-            attributes, optional_attributes = held
-            required += attributes
-            optional += optional_attributes
-    # Each is drawn once, although several variables may be computed from it.
-    required = list(dict.fromkeys(required))
+    required, optional = _attributes_for(names)
     values = drawn_variables(noise, required, t0, t1, solver_name, tuple(optional))
     changes = {}
     for name in names:
@@ -85,6 +72,24 @@ def noise_changes(
                     f"Lévy areas between them; got {len(noise)} noise terms. Combine them."
                 )
     return changes
+
+
+def _attributes_for(names: list[str]) -> tuple[list[str], list[str]]:
+    """The attributes of an increment from which the random variables of these names are
+    computed: those that are required, and those that are used if they are there."""
+    required = []
+    optional = []
+    for name in names:
+        held = VARIABLES[name].held if name in VARIABLES else None
+        if held is None:
+            # Most variables are attributes themselves.
+            required.append(name)
+        else:
+            attributes, optional_attributes = held
+            required += attributes
+            optional += optional_attributes
+    # Each is drawn once, although several variables may be computed from it.
+    return list(dict.fromkeys(required)), optional
 
 
 def drawn_variables(

@@ -142,7 +142,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
             p = moved(p, half, forces)
         elif kicks:
             p = moved(p, h, compute_forces())
-        # Flow. XLA drops the half of the rates at (p, q) that is not used.
+        # Flow. Of the rates at (p, q) only the velocities are used; XLA drops the forces.
         follow = ft.partial(moved_by, self.flow, self.steps, rest)
         (p, q), flow_state, _ = follow(t0, middle, half, (p, q), args, flow_state)
         # Friction and noise

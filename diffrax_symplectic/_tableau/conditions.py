@@ -47,7 +47,7 @@ def symplectic_residuals(tableau: AbstractTableau) -> Float[np.ndarray, "s s"]:
     # Quadratic invariants are conserved if the residuals vanish. Only pairs of stages that
     # read what the other writes contribute to the change of an invariant.
     residuals = np.outer(flat.weights, flat.weights) - weighted - weighted.T
-    return np.where(flat.reads & flat.reads.T, residuals, 0.0)
+    return np.where(flat.reads_from & flat.reads_from.T, residuals, 0.0)
 
 
 def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, float]:
@@ -116,12 +116,14 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
 def drift_order(tableau: FlatTableau) -> int:
     """The order without noise, up to 4, by Butcher's conditions for each part of the state
     that the stages write."""
-    numbers = [i for i, stage in enumerate(tableau.stages) if stage.channels == ("h",)]
-    flat = tableau.take(numbers)
+    drift_stages = [
+        i for i, stage in enumerate(tableau.stages) if stage.channels == ("h",)
+    ]
+    flat = tableau.take(drift_stages)
     writes = np.array([stage.writes for stage in flat.stages])
     # Coefficients of values that a stage does not read belong to no rooted tree.
-    M = np.where(flat.reads, flat.matrix, 0.0)
-    e = np.ones(len(numbers))
+    M = np.where(flat.reads_from, flat.matrix, 0.0)
+    e = np.ones(len(drift_stages))
     c = M @ e
     # For each order the vectors of its rooted trees, and the exact value of their products
     # with the weights (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations
@@ -132,6 +134,7 @@ def drift_order(tableau: FlatTableau) -> int:
         [(c**2, 1 / 3), (M @ c, 1 / 6)],
         [(c**3, 1 / 4), (c * (M @ c), 1 / 8), (M @ c**2, 1 / 12), (M @ M @ c, 1 / 24)],
     )
+    # The place of a list of trees is the order that remains if its condition fails.
     for order, trees in enumerate(conditions):
         for (tree, exact), part in itertools.product(trees, set(writes)):
             # Momenta and positions have weights of their own, and each part its condition.
@@ -215,6 +218,7 @@ def _weak_conditions(tableau: AbstractTableau) -> _WeakConditions:
 
 @_weak_conditions.register
 def _(tableau: GeneralTableau) -> _WeakConditions:
+    """For one noise, and order 1 for any number."""
     _check_noise(tableau)
     # Short names, for formulas that can be compared with their keys.
     al = tableau.alpha
@@ -257,6 +261,7 @@ def _(tableau: GeneralTableau) -> _WeakConditions:
 
 @_weak_conditions.register
 def _(tableau: PartitionedTableau) -> _WeakConditions:
+    """For random variables that are independent of each other."""
     be = tableau.beta["W"]
     A1 = tableau.A1
     B0e = {name: B0.sum(axis=1) for name, B0 in tableau.B0.items()}
@@ -266,8 +271,8 @@ def _(tableau: PartitionedTableau) -> _WeakConditions:
         "(beta.e)^2 - 1": be.sum() ** 2 - 1,
         **_conditions_on_others(tableau.beta, e=np.ones(len(A1))),
     }
-    # The random variables of a step are independent, so the mean of a product of two
-    # vanishes unless they are the same.
+    # As they are independent, the mean of a product of two vanishes unless they are the
+    # same: only squares are left, with the variance as their mean.
     sum_of_squares = sum(
         _variance(name) * (tableau.alpha_hat @ row_sums**2)
         for name, row_sums in B0e.items()
@@ -306,12 +311,13 @@ def _(tableau: SeparableTableau) -> _WeakConditions:
 
 @_weak_conditions.register
 def _(tableau: AdditiveTableau) -> _WeakConditions:
+    """For any number of noises, by sums over all independent random variables."""
     alpha = tableau.alpha
     Be = {name: B.sum(axis=1) for name, B in tableau.B.items()}
     first = {"alpha.e - 1": alpha.sum() - 1}
     for name, weights in tableau.beta.items():
-        # The end of a step with constant noise contains the increment `W` itself, and no
-        # other variable.
+        # To first order the noise does not change in a step: its increment `W` counts once
+        # at the end, and every other variable not at all.
         exact = 1 if name == "W" else 0
         first[f"beta[{name}].e - {exact}"] = weights.sum() - exact
     sum_of_squares = sum(
@@ -381,8 +387,8 @@ def _unknown_tableau(tableau: AbstractTableau) -> ValueError:
     )
 
 
-# The controls that change sign when a step is reversed.
-_NEGATED = {
+# The channels whose controls change sign when a step is reversed.
+_NEGATED_CHANNELS = {
     "h",
     *(name for name, variable in VARIABLES.items() if not variable.even),
 }
@@ -393,22 +399,26 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
     This holds if stages can be paired, $i \leftrightarrow \sigma(i)$, such that
 
     $$a_{ij} + a_{\sigma(i)\sigma(j)} = b_j, \qquad b_{\sigma(j)} = b_j, \qquad
-      c_i + c_{\sigma(i)} = 1.$$
+      c_i + c_{\sigma(i)} = 1,$$
+
+    with the matrix $a$, the weights $b$ and the times $c$ of the tableau: then stage $i$ of
+    the step is stage $\sigma(i)$ of the step back, at the same state and time.
     """
     channels = {name for stage in tableau.stages for name in stage.channels}
-    # Even random variables keep their sign in a step back, so such a step is none with
-    # negated controls.
-    if not channels <= _NEGATED:
+    # Even random variables keep their sign in a step back, so that not all of its controls
+    # are negated.
+    if not channels <= _NEGATED_CHANNELS:
         return False
     # Few stages have more than one partner, so that few pairings are tried.
     partners = [_partners(tableau, i) for i in range(len(tableau.stages))]
     for sigma in itertools.product(*partners):
+        # The partner of the partner of a stage is the stage.
         is_pairing = all(sigma[j] == i for i, j in enumerate(sigma))
         # Entry `i, j` is a_ij + a_sigma(i)sigma(j) - b_j.
         matrix_of_partners = tableau.matrix[np.ix_(sigma, sigma)]
         residuals = tableau.matrix + matrix_of_partners - tableau.weights
         # Coefficients of values that a stage does not read have no effect.
-        residuals = np.where(tableau.reads, residuals, 0)
+        residuals = np.where(tableau.reads_from, residuals, 0)
         if is_pairing and np.allclose(residuals, 0, atol=_ROUNDING):
             return True
     return False

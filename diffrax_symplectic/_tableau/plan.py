@@ -5,7 +5,7 @@ import dataclasses
 import functools as ft
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -83,18 +83,18 @@ def _make_plan(stages: tuple[Stage, ...], matrix: bytes, weights: bytes) -> Step
         weights=np.frombuffer(weights, np.float64),
     )
     # A coefficient counts as a dependency, also one of a value that a stage does not read.
-    matrix_of_reads = np.where(tableau.reads, tableau.matrix, 0.0)
+    matrix_of_reads = np.where(tableau.reads_from, tableau.matrix, 0.0)
     tableau = dataclasses.replace(tableau, matrix=_snapped(matrix_of_reads))
     # Each of the three reductions can make more work for the others: stages may become
     # equal once others were dropped, and weights may cancel once stages were merged.
     previous = None
     while previous is None or len(tableau.stages) < len(previous.stages):
         previous = tableau
-        tableau = _with_merged_stages(tableau, same_channels=True)
+        tableau = _with_equal_stages_merged(tableau)
         tableau = _with_live_stages(tableau)
         # This comes last, since a stage whose weight cancels would keep others from being
         # merged.
-        tableau = _with_merged_stages(tableau, same_channels=False)
+        tableau = _with_channels_merged(tableau)
     return StepPlan(tableau, _blocks(tableau))
 
 
@@ -120,27 +120,44 @@ def _with_live_stages(tableau: FlatTableau) -> FlatTableau:
     return tableau.take(np.flatnonzero(is_live).tolist())
 
 
-def _with_merged_stages(tableau: FlatTableau, same_channels: bool) -> FlatTableau:
-    """The tableau with pairs of stages merged whose vector fields are evaluated at the same
-    time and state, reading and changing the same part of the state.
+def _with_equal_stages_merged(tableau: FlatTableau) -> FlatTableau:
+    """The tableau without stages that have the same value as another, because the same
+    channels (the controls that drive them) drive both at the same time and state. Their
+    coefficients are added."""
 
-    With the same channels (the controls that drive them) two stages have the same value,
-    and their coefficients are added. With different channels they can be merged if they
-    enter everything with the same coefficients.
-    """
-    for i, j in itertools.combinations(range(len(tableau.stages)), 2):
-        channels_agree = tableau.stages[i].channels == tableau.stages[j].channels
-        if channels_agree != same_channels or not _same_evaluation(tableau, i, j):
-            continue
-        if same_channels:
-            merged = _with_coefficients_added(tableau, i, j)
-        elif _same_use(tableau, i, j):
-            merged = _with_channels_joined(tableau, i, j)
-        else:
-            continue
-        # Pairs are merged one at a time, since the merged stage may equal another.
-        return _with_merged_stages(merged, same_channels)
+    def are_equal(i: int, j: int) -> bool:
+        same_channels = tableau.stages[i].channels == tableau.stages[j].channels
+        return same_channels and _same_evaluation(tableau, i, j)
+
+    # Pairs are merged one at a time, since the merged stage may equal another.
+    while pair := _first_pair(tableau, are_equal):
+        tableau = _with_coefficients_added(tableau, *pair)
     return tableau
+
+
+def _with_channels_merged(tableau: FlatTableau) -> FlatTableau:
+    """The tableau with one stage, with the channels of both, in place of two that are
+    driven by different channels at the same time and state, and enter everything with the
+    same coefficients: its value is the sum of both."""
+
+    def can_be_summed(i: int, j: int) -> bool:
+        same_channels = tableau.stages[i].channels == tableau.stages[j].channels
+        if same_channels or not _same_evaluation(tableau, i, j):
+            return False
+        return _same_use(tableau, i, j)
+
+    # Pairs are merged one at a time, since the merged stage may be merged with another.
+    while pair := _first_pair(tableau, can_be_summed):
+        tableau = _with_channels_joined(tableau, *pair)
+    return tableau
+
+
+def _first_pair(
+    tableau: FlatTableau, may_be_merged: Callable[[int, int], bool]
+) -> tuple[int, int] | None:
+    """The first pair of stages `i < j` with `may_be_merged(i, j)`, if there is one."""
+    pairs = itertools.combinations(range(len(tableau.stages)), 2)
+    return next((pair for pair in pairs if may_be_merged(*pair)), None)
 
 
 def _same_evaluation(tableau: FlatTableau, i: int, j: int) -> bool:

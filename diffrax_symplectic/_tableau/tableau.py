@@ -64,16 +64,16 @@ class FlatTableau:
     weights: Float[np.ndarray, " s"]
 
     @property
-    def reads(self) -> Bool[np.ndarray, "s s"]:
+    def reads_from(self) -> Bool[np.ndarray, "s s"]:
         """Whether stage `i` reads a part of the state that stage `j` changes."""
-        # The stages of a tableau below write "p" or "q", or all of them write "y". So a
-        # stage that reads anything from a stage reads the part of the same name.
-        reads = [
-            reader.reads == writer.writes
+        # The stages of a tableau below write "p" or "q", or all of them write "y". So equal
+        # names suffice.
+        rows = [
+            [reader.reads == writer.writes for writer in self.stages]
             for reader in self.stages
-            for writer in self.stages
         ]
-        return np.array(reads, bool).reshape(self.matrix.shape)
+        # Without stages, NumPy does not know the second axis.
+        return np.array(rows, bool).reshape(self.matrix.shape)
 
     def take(self, numbers: list[int]) -> "FlatTableau":
         """The tableau with only the stages of these numbers, in this order."""
@@ -136,9 +136,10 @@ def _replace_by_checked(
     by_variable: tuple[str, ...] = (),
     **shapes: tuple[int, ...],
 ) -> None:
-    """Replaces coefficients by checked arrays; those `by_variable` by dictionaries from the
-    names of random variables to such arrays. Raises a `ValueError` for wrong shapes, or
-    numbers that are not real and finite."""
+    """Replaces coefficients of the tableau by checked, read-only arrays. `shapes` are their
+    shapes, by the names of the fields. A field in `by_variable` may hold a dictionary from
+    names of random variables to coefficients of this shape, and is replaced by one. Raises
+    a `ValueError` for wrong shapes, or numbers that are not real and finite."""
     for name, shape in shapes.items():
         value = getattr(tableau, name)
         if name in by_variable:
@@ -153,20 +154,23 @@ def _replace_by_checked(
         object.__setattr__(tableau, name, checked)
 
 
-def _variables(*parts: Mapping[str, np.ndarray]) -> list[str]:
-    """The names of all random variables in these coefficients, in order of first
-    appearance."""
+def _variables(*coefficients: Mapping[str, np.ndarray]) -> list[str]:
+    """The names of all random variables that have coefficients in one of these
+    dictionaries, in order of first appearance."""
+    names = [name for by_variable in coefficients for name in by_variable]
     # A dictionary keeps this order. The order of a set would differ from run to run.
-    return list(dict.fromkeys(name for part in parts for name in part))
+    return list(dict.fromkeys(names))
 
 
 def _side_by_side(
-    part: Mapping[str, np.ndarray], variables: list[str], shape: tuple[int, ...]
+    coefficients: Mapping[str, np.ndarray],
+    variables: list[str],
+    shape: tuple[int, ...],
 ) -> Float[np.ndarray, "..."]:
-    """The coefficients for each of these random variables, of this `shape` each,
+    """The coefficients of each of these random variables, of this `shape` each,
     concatenated along the last axis. Variables without coefficients have zeros."""
     zeros = np.zeros(shape)
-    arrays = [part.get(variable, zeros) for variable in variables]
+    arrays = [coefficients.get(variable, zeros) for variable in variables]
     return np.concatenate(arrays, axis=-1)
 
 
@@ -382,7 +386,8 @@ class PartitionedTableau(AbstractTableau):
         variables = _variables(self.B0, self.beta)
         B0 = _side_by_side(self.B0, variables, (velocities, noise_stages))
         beta = _side_by_side(self.beta, variables, (noise_stages,))
-        # Each random variable has noise stages of its own, all at the same points.
+        # Each random variable has noise stages of its own, all at the same points: the
+        # velocities enter those of each variable in the same way.
         A1 = np.concatenate([self.A1] * len(variables))
         noise_times = self.A1.sum(axis=1)
         # Forces come first: a plan tries to take the first stages for its unknowns, and
@@ -393,21 +398,22 @@ class PartitionedTableau(AbstractTableau):
         # Velocities do not depend on time. All have the same time, so that a plan can merge
         # velocities at equal momenta.
         velocity_stages = [Stage(("h",), 0.0, "p", "q") for _ in range(velocities)]
-        noise = [
+        all_noise_stages = [
             Stage((variable,), float(c1), "q", "p")
             for variable in variables
             for c1 in noise_times
         ]
-        stages = (*force_stages, *velocity_stages, *noise)
-        # Momenta depend on forces and noise at positions, positions on velocities.
+        stages = (*force_stages, *velocity_stages, *all_noise_stages)
+        # Where forces, velocities and noise stand among the stages. Momenta, at which
+        # velocities are evaluated, depend on forces and noise; positions on velocities.
         matrix = np.zeros((len(stages), len(stages)))
-        at_forces = slice(0, len(force_stages))
-        at_velocities = slice(at_forces.stop, at_forces.stop + velocities)
-        at_noise = slice(at_velocities.stop, len(stages))
-        matrix[at_forces, at_velocities] = self.A_hat
-        matrix[at_velocities, at_forces] = self.A
-        matrix[at_velocities, at_noise] = B0
-        matrix[at_noise, at_velocities] = A1
+        of_forces = slice(0, len(force_stages))
+        of_velocities = slice(of_forces.stop, of_forces.stop + velocities)
+        of_noise = slice(of_velocities.stop, len(stages))
+        matrix[of_forces, of_velocities] = self.A_hat
+        matrix[of_velocities, of_forces] = self.A
+        matrix[of_velocities, of_noise] = B0
+        matrix[of_noise, of_velocities] = A1
         return FlatTableau(
             stages=stages,
             matrix=matrix,

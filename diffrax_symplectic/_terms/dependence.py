@@ -26,21 +26,20 @@ class Dependence:
 
     def independent(self, of: Callable, part: Callable = lambda out: out) -> bool:
         """Whether `part(result)` is independent of `of(*inputs)`, PyTrees of arrays."""
-        used_results = _marks(part, self._out)
+        is_in_part = _which_are_selected(part, self._out)
         # A program for these results alone reads fewer inputs.
-        _, read_inputs = dce_jaxpr(self._jaxpr, used_results)
-        asked_inputs = _marks(lambda inputs: of(*inputs), self._inputs)
-        pairs = zip(read_inputs, asked_inputs)
-        return not any(is_read and is_asked for is_read, is_asked in pairs)
+        _, is_read = dce_jaxpr(self._jaxpr, is_in_part)
+        is_asked = _which_are_selected(lambda inputs: of(*inputs), self._inputs)
+        return not any(read and asked for read, asked in zip(is_read, is_asked))
 
 
-def _marks(select: Callable, tree: PyTree) -> list[bool]:
+def _which_are_selected(select: Callable, tree: PyTree) -> list[bool]:
     """For each leaf of `tree`, in order, whether it is a leaf of `select(tree)`."""
     # Leaves may be equal, or have no values, so they are told apart by their numbers.
     treedef = jtu.tree_structure(tree)
-    numbers = treedef.unflatten(range(treedef.num_leaves))
-    chosen = set(jtu.tree_leaves(select(numbers)))
-    return [number in chosen for number in range(treedef.num_leaves)]
+    tree_of_numbers = treedef.unflatten(range(treedef.num_leaves))
+    selected_numbers = set(jtu.tree_leaves(select(tree_of_numbers)))
+    return [number in selected_numbers for number in range(treedef.num_leaves)]
 
 
 # Operations that may act on what is linear in an input, entry by entry. All others count
@@ -56,46 +55,55 @@ _CALLS = frozenset({"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp
 _Source: TypeAlias = int | None
 
 
+class _MixesEntries(Exception):
+    """Some operation mixes the entries of an input, or two inputs."""
+
+
 def acts_elementwise(fn: Callable, x: PyTree[Array]) -> bool:
     """Whether each entry of `fn(x)`, in the structure of `x`, is known to depend on the
     same entry of `x` alone. Then its derivative is diagonal. The converse does not hold."""
     closed = jax.make_jaxpr(fn)(x)
+    # Each input is its own source.
     numbers = list(range(len(closed.jaxpr.invars)))
-    sources = _sources(closed.jaxpr, numbers)
-    if sources is None:
+    try:
+        sources = _sources_of_results(closed.jaxpr, numbers)
+    except _MixesEntries:
         return False
     return all(
         source is None or source == number for number, source in zip(numbers, sources)
     )
 
 
-def _sources(jaxpr: Jaxpr, numbers: Sequence[_Source]) -> list[_Source] | None:
-    """The source of each result, given those of the inputs. `None` if some operation mixes
-    the entries of an input, or two inputs."""
+def _sources_of_results(
+    jaxpr: Jaxpr, sources_of_inputs: Sequence[_Source]
+) -> list[_Source]:
+    """The source of each result of a program. Raises `_MixesEntries` if a result has no
+    single source, with each entry from the same entry."""
     # Operations that no result needs are left out, since they may mix entries: the
     # derivative of a product of all entries also computes the product.
     jaxpr, read_inputs = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
-    read_numbers = [number for number, is_read in zip(numbers, read_inputs) if is_read]
-    known_sources = dict(zip(jaxpr.invars, read_numbers))
+    pairs = zip(sources_of_inputs, read_inputs)
+    sources_of_read_inputs = [source for source, is_read in pairs if is_read]
+    source_of_variable = dict(zip(jaxpr.invars, sources_of_read_inputs))
 
     def source_of(x: Any) -> _Source:
-        return None if isinstance(x, Literal) else known_sources.get(x)
+        # Constants of the program, and what follows from them alone, are not in the
+        # dictionary, and have no source.
+        return None if isinstance(x, Literal) else source_of_variable.get(x)
 
     for eqn in jaxpr.eqns:
         sources = [source_of(x) for x in eqn.invars]
-        distinct = {number for number in sources if number is not None}
+        distinct = {source for source in sources if source is not None}
         if len(distinct) == 0:
             continue
         called = _called_by(eqn)
         if called is not None:
-            results = _sources(called, sources)
-            if results is None:
-                return None
-            known_sources.update(zip(eqn.outvars, results))
+            results = _sources_of_results(called, sources)
+            source_of_variable.update(zip(eqn.outvars, results))
         elif len(distinct) == 1 and _is_elementwise(eqn, sources):
-            known_sources.update(dict.fromkeys(eqn.outvars, distinct.pop()))
+            source_of_variable.update(dict.fromkeys(eqn.outvars, distinct.pop()))
         else:
-            return None
+            raise _MixesEntries
     return [source_of(x) for x in jaxpr.outvars]
 
 

@@ -63,8 +63,8 @@ class IndexedNoise(eqx.Module):
         return checked_energy(value, name="H")
 
     def __call__(self, t: RealScalarLike, p: PyTree, q: PyTree, args: Args) -> Array:
-        numbers = jnp.arange(self.m)
-        return jax.vmap(lambda k: self.one(k, t, p, q, args))(numbers)
+        indices = jnp.arange(self.m)
+        return jax.vmap(lambda k: self.one(k, t, p, q, args))(indices)
 
 
 IndexedNoise.__init__.__doc__ = """**Arguments:**
@@ -81,11 +81,11 @@ while the solve is traced, if `H` does not return a scalar.
 class OneNoise(eqx.Module):
     """A control with a single nonzero noise.
 
-    - `number`: its index in the flattened path.
+    - `index`: that of the noise in the flattened path.
     - `increment`: its value.
     """
 
-    number: IntScalarLike
+    index: IntScalarLike
     increment: RealScalarLike
 
 
@@ -193,10 +193,10 @@ class HamiltonianNoise(AbstractNoise):
 
         def energy_of_one(p: Momenta, q: Momenta, one: OneNoise) -> Array:
             if isinstance(self.noise, IndexedNoise):
-                H = self.noise.one(one.number, t, p, q, args)
+                H = self.noise.one(one.index, t, p, q, args)
             else:
                 flat, _ = jfu.ravel_pytree(hamiltonians((p, q)))
-                H = flat[one.number]
+                H = flat[one.index]
             return H * jnp.asarray(one.increment, H.dtype)
 
         def dot(H: Array, increment: Array) -> Array:
@@ -270,7 +270,8 @@ def _has_one_for_each_noise(
     if jtu.tree_structure(H) != jtu.tree_structure(struct):
         return False
     for leaf, leaf_struct in zip(jtu.tree_leaves(H), jtu.tree_leaves(struct)):
-        # The shapes of a single noise may differ: both may be scalars or arrays.
+        # The shapes of a single noise may differ: its Hamiltonian may be a scalar and its
+        # increment an array of one number, or the other way round.
         is_single = jnp.size(leaf) == leaf_struct.size == 1
         if jnp.shape(leaf) != leaf_struct.shape and not is_single:
             return False

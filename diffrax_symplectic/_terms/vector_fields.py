@@ -31,57 +31,59 @@ def apply(terms: Terms, controls: list, args: Args, t: RealScalarLike, y: Y) -> 
 @eqx.filter_jit
 def apply_one(
     terms: Terms,
-    number: IntScalarLike,
+    index: IntScalarLike,
     increment: Float[Array, ""],
     args: Args,
     t: RealScalarLike,
     y: Y,
 ) -> Y:
-    """The vector field of one noise times its increment. `number` is its index among the
-    noises of all terms, in the order of their flattened controls."""
+    """The vector field of one noise times its increment. `index` is that of the noise among
+    the noises of all terms, in the order of their flattened controls."""
     changes = []
     # The number of noises of the terms before this one.
     num_before = 0
     for term in terms:
         struct = control_struct(term)
-        num_own = num_noises(struct)
+        num_in_term = num_noises(struct)
         # If the noise belongs to another term, this one adds zero.
-        is_own = (num_before <= number) & (number < num_before + num_own)
-        own_number = jnp.clip(number - num_before, 0, num_own - 1)
-        own_increment = jnp.where(is_own, increment, 0)
+        is_in_term = (num_before <= index) & (index < num_before + num_in_term)
+        index_in_term = jnp.clip(index - num_before, 0, num_in_term - 1)
+        increment_or_zero = jnp.where(is_in_term, increment, 0)
         changes.append(
-            _product_of_one_noise(term, struct, own_number, own_increment, args, t, y)
+            _product_of_one_noise(
+                term, struct, index_in_term, increment_or_zero, args, t, y
+            )
         )
-        num_before += num_own
+        num_before += num_in_term
     return _checked_sum(changes, y)
 
 
 def _product_of_one_noise(
     term: diffrax.AbstractTerm,
     struct: PyTree[jax.ShapeDtypeStruct],
-    number: IntScalarLike,
+    index: IntScalarLike,
     increment: Float[Array, ""],
     args: Args,
     t: RealScalarLike,
     y: Y,
 ) -> Y:
-    """The vector field of one noise of this term times its increment. `number` is its index
-    in the flattened increments of the term, which have the shapes and dtypes of `struct`.
-    Where possible no other noise is evaluated or multiplied."""
+    """The vector field of one noise of this term times its increment. `index` is that of
+    the noise in the flattened increments of the term, which have the shapes and dtypes of
+    `struct`. Where possible no other noise is evaluated or multiplied."""
     # Only the kind is read from the user's term. The term itself is called, which keeps the
     # direction of time that Diffrax wraps around it.
     if isinstance(unwrapped(term), HamiltonianNoise):
-        return term.vf_prod(t, y, args, OneNoise(number, increment))
+        return term.vf_prod(t, y, args, OneNoise(index, increment))
     if isinstance(unwrapped(term), diffrax.ControlTerm):
         field = term.vf(t, y, args)
         # Lineax operators and other PyTrees cannot be indexed by the noise.
         is_array = eqx.is_array(field) and isinstance(struct, jax.ShapeDtypeStruct)
         # A scalar noise has no axis of noises to index.
         if is_array and field.ndim > 0 and field.shape[-1:] == struct.shape:
-            return field[..., number] * increment.astype(field.dtype)
-    # Other terms add up all noises, so all increments but this one are zero.
+            return field[..., index] * increment.astype(field.dtype)
+    # Everything else adds up all noises, so all increments but this one are zero.
     zeros, unravel = zeros_and_unravel(struct)
-    increments = zeros.at[number].set(increment.astype(zeros.dtype))
+    increments = zeros.at[index].set(increment.astype(zeros.dtype))
     return term.vf_prod(t, y, args, unravel(increments))
 
 
@@ -129,28 +131,33 @@ def check_increments(terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Non
         try:
             return term.prod(field, increments)
         except (TypeError, ValueError) as error:
-            is_operator = isinstance(field, lx.AbstractLinearOperator)
-            expected = field.in_structure() if is_operator else field
-            kind = "a Lineax operator on" if is_operator else "an array"
-            instead = "Construct the path with the shape and dtype that the field takes"
-            if len(jtu.tree_leaves(y0)) > 1 and not is_operator:
-                kind = "arrays"
-                instead = (
-                    "Of a state of several arrays the vector field must be a Lineax "
-                    "operator, such as a `lineax.FunctionLinearOperator` that maps the "
-                    "increments to a change of the state"
-                )
-            elif not is_operator:
-                instead += ", for an array the shape of its last axes"
-            raise ValueError(
-                "A `ControlTerm` cannot multiply its vector field, "
-                f"{kind} {_brief(expected)}, by the increments of its path, "
-                f"{_brief(increments)}. {instead}."
-            ) from error
+            raise _unfit_increments(field, increments, y0) from error
 
     for term in terms:
         if isinstance(unwrapped(term), diffrax.ControlTerm):
             eqx.filter_eval_shape(product, term)
+
+
+def _unfit_increments(field: Any, increments: PyTree, y0: Y) -> ValueError:
+    """The error for a vector field that cannot be multiplied by these increments."""
+    fitting_path = "Construct the path with the shape and dtype that the field takes"
+    if isinstance(field, lx.AbstractLinearOperator):
+        description = f"a Lineax operator on {_brief(field.in_structure())}"
+        advice = fitting_path
+    elif len(jtu.tree_leaves(y0)) > 1:
+        description = f"arrays {_brief(field)}"
+        advice = (
+            "Of a state of several arrays the vector field must be a Lineax operator, such "
+            "as a `lineax.FunctionLinearOperator` that maps the increments to a change of "
+            "the state"
+        )
+    else:
+        description = f"an array {_brief(field)}"
+        advice = f"{fitting_path}, for an array the shape of its last axes"
+    return ValueError(
+        f"A `ControlTerm` cannot multiply its vector field, {description}, by the "
+        f"increments of its path, {_brief(increments)}. {advice}."
+    )
 
 
 def _brief(tree: PyTree) -> str:
@@ -167,23 +174,24 @@ def tree_sum(values: list[Y]) -> Y:
 
 
 def _checked_sum(changes: list[Y], y: Y) -> Y:
-    """The sum of changes of the state `y`. Raises a `ValueError` unless each has the dtypes
-    and shapes of the state."""
-
-    def check_change(change: Any, x: Any) -> None:
-        # Either may be a number of Python or NumPy. (Its `jnp.result_type` may not be its
-        # dtype: a weakly typed scalar that was made before 64 bits were enabled is float32,
-        # with result type float64.)
-        change = jnp.asarray(change)
-        x = jnp.asarray(x)
-        if (change.dtype, change.shape) != (x.dtype, x.shape):
-            raise ValueError(
-                f"The terms change an array of dtype and shape {x.dtype}{x.shape} by one "
-                f"of {change.dtype}{change.shape}. Give the state, the vector fields and "
-                "the path (as `shape=jax.ShapeDtypeStruct(shape, dtype)`) the same dtype, "
-                "and times a dtype that is not wider."
-            )
-
+    """The sum of changes of the state `y`, at least one. Raises a `ValueError` unless each
+    has the dtypes and shapes of the state; JAX raises its own for another structure."""
     for change in changes:
-        jtu.tree_map(check_change, change, y)
+        jtu.tree_map(_check_change, change, y)
     return tree_sum(changes)
+
+
+def _check_change(change: Any, x: Any) -> None:
+    """Raises a `ValueError` unless the change of an array `x` of the state has the dtype
+    and the shape of `x`."""
+    # Either may be a number of Python or NumPy. Arrays have a `.dtype`, which need not be
+    # the `jnp.result_type` of a scalar.
+    change = jnp.asarray(change)
+    x = jnp.asarray(x)
+    if (change.dtype, change.shape) != (x.dtype, x.shape):
+        raise ValueError(
+            f"The terms change an array of dtype and shape {x.dtype}{x.shape} by one "
+            f"of {change.dtype}{change.shape}. Give the state, the vector fields and "
+            "the path (as `shape=jax.ShapeDtypeStruct(shape, dtype)`) the same dtype, "
+            "and times a dtype that is not wider."
+        )

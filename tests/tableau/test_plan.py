@@ -36,7 +36,7 @@ def _base(rng) -> FlatTableau:
     # The end of the step depends on stage 4 by way of two others only.
     weights[[4, 6, 7]], matrix[8:, 4] = 0, 0
     tableau = FlatTableau(STAGES, matrix, weights)
-    return dataclasses.replace(tableau, matrix=np.where(tableau.reads, matrix, 0))
+    return dataclasses.replace(tableau, matrix=np.where(tableau.reads_from, matrix, 0))
 
 
 def _end(tableau: FlatTableau):
@@ -78,7 +78,7 @@ def _in_more_words(tableau: FlatTableau, rng) -> FlatTableau:
     tableau.matrix[:, used:], tableau.weights[used:] = 0, 0
     tableau.matrix[used, used + 1] = 1
     junk = np.where(
-        tableau.reads, tableau.matrix, rng.normal(size=tableau.matrix.shape)
+        tableau.reads_from, tableau.matrix, rng.normal(size=tableau.matrix.shape)
     )
     order = rng.permutation(used + 2).tolist()
     return dataclasses.replace(tableau, matrix=junk).take(order)

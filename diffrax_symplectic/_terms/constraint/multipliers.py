@@ -30,15 +30,15 @@ class _Newton(NamedTuple):
     - `x`: the multipliers.
     - `residual`: the constraints before their last correction.
     - `correction`: the last correction.
-    - `left`: how many corrections may follow; `_SOLVED` after the last one. (One number
-        stands for a number and two flags: with an array for each, steps of 1,000 rigid
-        dimers took 1.2 times as long.)
+    - `remaining`: how many corrections may follow; `_SOLVED` after the last one, and 0 if
+        the method failed. (With an array for each of the three, steps of 1,000 rigid dimers
+        took 1.2 times as long.)
     """
 
     x: Multipliers
     residual: Multipliers
     correction: Multipliers
-    left: Array
+    remaining: Array
 
 
 _SOLVED = -1
@@ -69,42 +69,42 @@ def find_multipliers(
     relative_rounding = _ROUNDING_UNITS * float(jnp.finfo(start.dtype).eps)
 
     def is_going(state: _Newton) -> Bool[Array, ""]:
-        return state.left > 0
+        return state.remaining > 0
 
     def step(state: _Newton) -> _Newton:
         newton = correction(residual, state.x, None)
         # At most, this correction and the one before change each constraint by so much.
         change = weighted_sum(jnp.abs(newton.change), slopes)
-        before = weighted_sum(jnp.abs(state.correction), slopes) + rounding
+        change_before = weighted_sum(jnp.abs(state.correction), slopes) + rounding
         # The change of the derivative along the correction before: its old value is the
         # residual before. It has the units of each constraint, so that none hides others.
         bend = jnp.abs(newton.derivative(state.correction) - state.residual)
         # The next correction is at most this fraction of this one. (Half of the bend is
         # what was left to this one, and the square of the ratio of both is left to the
         # next: Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.)
-        fraction = max_norm(change / before) * max_norm(bend / before)
+        fraction = max_norm(change / change_before) * max_norm(bend / change_before)
         # The first correction has none before it.
-        fraction = jnp.where(state.left < _MOST_STEPS, fraction, 1)
+        fraction = jnp.where(state.remaining < _MOST_STEPS, fraction, 1)
         # The inequality is strict, since infinite corrections solve nothing.
         is_solved = jnp.all(change * fraction < rounding + relative_rounding * change)
         failed = jnp.any(jnp.isnan(change))
-        left = jnp.where(failed, 0, state.left - 1)
+        remaining = jnp.where(failed, 0, state.remaining - 1)
         return _Newton(
             x=state.x - newton.change,
             residual=newton.residual,
             correction=newton.change,
-            left=jnp.where(is_solved, _SOLVED, left),
+            remaining=jnp.where(is_solved, _SOLVED, remaining),
         )
 
     first = _Newton(
         x=start,
         residual=jnp.zeros_like(start),
         correction=jnp.zeros_like(start),
-        left=jnp.where(pending, _MOST_STEPS, 0),
+        remaining=jnp.where(pending, _MOST_STEPS, 0),
     )
     first = batched_like(first, (residual(start), gram, rounding, pending))
     last = lax.while_loop(is_going, step, first)
-    found = last.left == _SOLVED
+    found = last.remaining == _SOLVED
     return jnp.where(found, last.x, 0), found
 
 

@@ -48,7 +48,7 @@ def check_start(
     """Raises a `ValueError` if the constraints are dependent at `y0`, if `y0` is off them,
     or if no solver takes them. Returns the first two as flags: what is not known while
     tracing is an error when run, but in a batch only the flag of its path."""
-    _check_masses(terms, t0, y0, args)
+    _check_constant_masses(terms, t0, y0, args)
     # A check has no derivative. Taking one would trace it again.
     fixed_y0, fixed_args = jtu.tree_map(_without_derivative, (y0, args))
     is_dependent, is_off = _start_faults(terms, t0, fixed_y0, fixed_args)
@@ -64,22 +64,22 @@ def _without_derivative(x: Any) -> Any:
 def _start_faults(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether the constraints are dependent at `y0`, and, unless they are, whether it is
-    off them."""
+    """Whether the constraints are dependent at `y0`, and, unless they are, whether `y0`
+    is off them."""
     surface = Surface.of(terms, t0, y0, args)
     p0, q0 = y0
     p, _ = jfu.ravel_pytree(p0)
     q, _ = jfu.ravel_pytree(q0)
-    at = surface.normal_space(q)
-    is_dependent = surface.is_dependent(at)
-    return is_dependent, ~is_dependent & surface.is_off(p, at)
+    normal_space = surface.normal_space(q)
+    is_dependent = surface.is_dependent(normal_space)
+    return is_dependent, ~is_dependent & surface.is_off(p, normal_space)
 
 
-def _check_masses(
+def _check_constant_masses(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
 ) -> None:
-    """Raises a `ValueError` unless velocities are linear in the momenta, which they are for
-    constant masses."""
+    """Raises a `ValueError` unless the masses are constant: unless velocities are linear in
+    the momenta, up to a constant."""
     surface = Surface.of(terms, t0, y0, args)
     p0, _ = y0
     flat_p0, _ = jfu.ravel_pytree(p0)
@@ -90,7 +90,7 @@ def _check_masses(
         return change
 
     # The change may depend on the impulse, but not on the momentum: then the masses are
-    # constant. Of the second argument only the shape matters, which is that of momenta.
+    # constant. The second `flat_p0` stands for an impulse, of which only the shape counts.
     dependence = Dependence(change_of_velocity, flat_p0, flat_p0)
     if not dependence.independent(of=lambda p, impulse: p):
         raise ValueError(
@@ -151,7 +151,7 @@ def constrained_state(
             "Constrained terms need H0 = p . M^-1 p / 2 + U(t, q), but "
             f"{fault.reason}. {fault.advice}"
         )
-    _check_masses(terms, t, y0, args)
+    _check_constant_masses(terms, t, y0, args)
     y1, found, is_dependent = _projection(terms, t, y0, args)
     if not is_traced(found):
         if is_dependent:
@@ -177,11 +177,11 @@ def _projection(
     q, unravel_q = jfu.ravel_pytree(q0)
     # In a flight without momentum only the multipliers move the positions.
     no_momentum = jnp.zeros_like(p)
-    at_y0 = surface.normal_space(q)
-    _, q, found = surface.free_flight(no_momentum, at_y0, time=1.0)
-    at = surface.normal_space(q)
+    normal_space = surface.normal_space(q)
+    _, q, found = surface.free_flight(no_momentum, normal_space, time=1.0)
+    normal_space = surface.normal_space(q)
     # The second projection removes the rounding errors of the first, which matter if the
     # momentum was nearly normal.
-    p = surface.tangent(surface.tangent(p, at), at)
+    p = surface.tangent(surface.tangent(p, normal_space), normal_space)
     y1 = (unravel_p(p), unravel_q(q))
-    return y1, found, surface.is_dependent(at)
+    return y1, found, surface.is_dependent(normal_space)

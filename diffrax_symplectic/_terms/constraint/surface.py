@@ -37,13 +37,13 @@ class NormalSpace(NamedTuple):
 
     - `q`: the position.
     - `normals`: the gradients of the constraints, `J`.
-    - `along`: the changes of the velocity by impulses along them, `J M^-1`.
+    - `velocity_changes`: the changes of the velocity by impulses along them, `J M^-1`.
     - `gram`: `J M^-1 J^T`.
     """
 
     q: Vector
     normals: Float[Array, "c n"]
-    along: Float[Array, "c n"]
+    velocity_changes: Float[Array, "c n"]
     gram: Float[Array, "c c"]
 
 
@@ -85,8 +85,8 @@ class Surface(NamedTuple):
     def normal_space(self, q: Vector) -> NormalSpace:
         """The directions normal to the surface at this position."""
         normals = jax.jacrev(self.residual)(q)
-        along = self._velocity_changes(normals)
-        return NormalSpace(q, normals, along, products(normals, along))
+        changes = self._velocity_changes(normals)
+        return NormalSpace(q, normals, changes, products(normals, changes))
 
     def _velocity_changes(self, impulses: Float[Array, "c n"]) -> Float[Array, "c n"]:
         """The change of the velocity by each of these impulses, changes of the momentum."""
@@ -102,25 +102,25 @@ class Surface(NamedTuple):
     def tangent(
         self,
         p: Vector,
-        at: NormalSpace,
+        normal_space: NormalSpace,
         response: Callable[[Vector], Vector] | None = None,
     ) -> Vector:
         """The tangent momentum: `p` after those impulses of the constraint forces that make
         it tangent. An impulse changes the momentum by itself, or by its `response`."""
         if response is None:
-            gram = at.gram
-            changes = at.normals
+            gram = normal_space.gram
+            changes = normal_space.normals
         else:
-            changes = jax.vmap(response)(at.normals)
-            gram = products(at.normals, self._velocity_changes(changes))
+            changes = jax.vmap(response)(normal_space.normals)
+            gram = products(normal_space.normals, self._velocity_changes(changes))
         # J v, the speeds at which the momentum `p` would leave the surface.
-        speeds = products(at.normals, self.velocity(p)[None])[:, 0]
+        speeds = products(normal_space.normals, self.velocity(p)[None])[:, 0]
         return p - weighted_sum(solve_matrix(gram, speeds), changes)
 
     def free_flight(
         self,
         p: Vector,
-        at: NormalSpace,
+        normal_space: NormalSpace,
         time: RealScalarLike,
         pending: Bool[Array, ""] | bool = True,
     ) -> tuple[Vector, Vector, Bool[Array, ""]]:
@@ -134,68 +134,69 @@ class Surface(NamedTuple):
         """
         time = jnp.asarray(time, p.dtype)
         # The position without constraint forces.
-        unconstrained_q = at.q + time * self.velocity(p)
-        rounding = _rounding(at, unconstrained_q)
+        unconstrained_q = normal_space.q + time * self.velocity(p)
+        rounding = _rounding(normal_space, unconstrained_q)
 
         # The unknowns are `time * lambda`, so that `time` may be small.
         def position(x: Multipliers) -> Vector:
-            return unconstrained_q - weighted_sum(x, at.along)
+            return unconstrained_q - weighted_sum(x, normal_space.velocity_changes)
 
         def residual(x: Multipliers) -> Multipliers:
             return self.residual(position(x))
 
         def solve(residual: Callable, start: Multipliers) -> tuple[Multipliers, Array]:
             x, found = find_multipliers(
-                residual, at.gram, rounding, start, jnp.asarray(pending)
+                residual, normal_space.gram, rounding, start, jnp.asarray(pending)
             )
             # The flag becomes a float: `custom_root` gives other types a tangent of a wrong
             # type.
             return x, found.astype(x.dtype)
 
         # Derivatives come from the equations, and not through the loop that solves them.
-        start = jnp.zeros(len(at.gram), p.dtype)
+        start = jnp.zeros(len(normal_space.gram), p.dtype)
         x, found = lax.custom_root(residual, start, solve, solve_tangent, has_aux=True)
-        return p - weighted_sum(x / time, at.normals), position(x), found > 0
+        return p - weighted_sum(x / time, normal_space.normals), position(x), found > 0
 
-    def is_dependent(self, at: NormalSpace) -> Bool[Array, ""]:
+    def is_dependent(self, normal_space: NormalSpace) -> Bool[Array, ""]:
         """Whether the normals are linearly dependent, up to rounding errors."""
         # In a solve backward in time velocities, and with them the matrix, change their
         # sign.
-        gram = at.gram * jnp.sign(jnp.trace(at.gram))
+        gram = normal_space.gram * jnp.sign(jnp.trace(normal_space.gram))
         size = jnp.sqrt(jnp.diag(gram))
         # A pivot is the squared sine of the angle between a normal and the ones before it.
         pivots = jnp.diag(jnp.linalg.cholesky(gram / size / size[:, None])) ** 2
         rounding = 1000 * jnp.finfo(gram.dtype).eps
         return ~jnp.all(pivots > rounding)
 
-    def is_off(self, p: Vector, at: NormalSpace) -> Bool[Array, ""]:
+    def is_off(self, p: Vector, normal_space: NormalSpace) -> Bool[Array, ""]:
         """Whether a state is farther from the surface than rounding errors explain."""
-        # This bound lies between rounding errors, also of long sums, and any mistake of the
-        # user's.
+        # Two thirds of the digits have to agree. This bound lies between rounding errors,
+        # also of long sums, and any mistake of the user's.
         eps = float(jnp.finfo(p.dtype).eps)
         bound = eps ** (2 / 3)
         # A constraint rounds as its positions do, or, where these are near the origin, as
         # numbers of the size of its radius of curvature do: to show that radius, gradients
         # are differentiated along a direction that no symmetry singles out.
-        along = jnp.cos(1.0 + jnp.arange(len(at.q), dtype=p.dtype))
-        _, changes = jax.jvp(jax.jacrev(self.residual), (at.q,), (along,))
+        q = normal_space.q
+        direction = jnp.cos(1.0 + jnp.arange(len(q), dtype=p.dtype))
+        _, changes = jax.jvp(jax.jacrev(self.residual), (q,), (direction,))
         # (constraints, positions), summed over the positions.
         curvature = jnp.sum(jnp.abs(changes), axis=1)
-        squares = jnp.sum(at.normals**2, axis=1)
+        squares = jnp.sum(normal_space.normals**2, axis=1)
         # The gradient times the radius of curvature.
         by_radius = squares / jnp.where(curvature > 0, curvature, jnp.inf)
-        size = jnp.maximum(_rounding(at, at.q) / eps, by_radius)
-        position_is_on = jnp.all(jnp.abs(self.residual(at.q)) <= bound * size)
-        normal_part = p - self.tangent(p, at)
+        size = jnp.maximum(_rounding(normal_space, q) / eps, by_radius)
+        position_is_on = jnp.all(jnp.abs(self.residual(q)) <= bound * size)
+        normal_part = p - self.tangent(p, normal_space)
         momentum_is_tangent = max_norm(normal_part) <= bound * max_norm(p)
         return ~(position_is_on & momentum_is_tangent)
 
 
-def _rounding(at: NormalSpace, q: Vector) -> Multipliers:
+def _rounding(normal_space: NormalSpace, q: Vector) -> Multipliers:
     """The change of each constraint by one unit in the last place of each position `q`."""
     info = jnp.finfo(q.dtype)
     last_places = float(info.eps) * jnp.abs(q)
-    changes = products(jnp.abs(at.normals), last_places[None])[:, 0]
+    changes = products(jnp.abs(normal_space.normals), last_places[None])[:, 0]
     # The result is a divisor, so it must not be zero.
     return changes + float(info.tiny)
 

@@ -190,6 +190,12 @@ def _separable_faults(
     """All reasons why a system is not separable, if momenta are the half of the state with
     this number, 0 or 1. `leaves_unchanged` says whether a noise term leaves the half with a
     number unchanged."""
+    of_drift = _faults_of_drift(momentum_half, drift)
+    return of_drift + _faults_of_noise(momentum_half, noise, leaves_unchanged)
+
+
+def _faults_of_drift(momentum_half: int, drift: list[_Traced]) -> list[Fault]:
+    """`_separable_faults` of the drift."""
     position_half = 1 - momentum_half
 
     # Parts of the inputs of `_dependence`.
@@ -238,6 +244,29 @@ def _separable_faults(
                 cause = of_plain if is_plain else rule.derivative
                 by_friction = is_plain and rule.by_friction
                 faults.append(Fault(cause, advice, friction=by_friction))
+    return faults
+
+
+def _faults_of_noise(
+    momentum_half: int,
+    noise: list[_Traced],
+    leaves_unchanged: Callable[[diffrax.AbstractTerm, int], bool],
+) -> list[Fault]:
+    """`_separable_faults` of the noise."""
+    position_half = 1 - momentum_half
+
+    # A part of the inputs of `_dependence`.
+    def momenta(t: Any, y: Y, control: Any) -> PyTree:
+        return y[momentum_half]
+
+    # Parts of its result, the change of the state.
+    def change_of_momenta(change: Y) -> PyTree:
+        return change[momentum_half]
+
+    def change_of_positions(change: Y) -> PyTree:
+        return change[position_half]
+
+    faults = []
     for term, dependence in noise:
         is_plain = not is_hamiltonian(term)
         advice = _advice("separable", term)
