@@ -21,6 +21,8 @@ _FORMULA = re.compile(
     r'<(?P<tag>span|div) class="arithmatex">\s*\\[(\[](?P<tex>.*?)\\[)\]]\s*</(?P=tag)>',
     re.DOTALL,
 )
+# A command, or another character.
+_TOKEN = re.compile(r"\\[a-zA-Z]+|\\?.", re.DOTALL)
 # Raises an error for what it does not know, which ends the build.
 _mathml = LatexToMathML()
 
@@ -67,9 +69,29 @@ def on_page_content(page_html, page, config, files):
 
 
 def _render(formula: re.Match) -> str:
-    displayed = formula["tag"] == "div"
-    mathml = _convert(html.unescape(formula["tex"]), displayed)
-    return f'<div class="formula">{mathml}</div>' if displayed else mathml
+    tex = html.unescape(formula["tex"])
+    if formula["tag"] == "span":
+        return _convert(tex, False)
+    # Browsers do not break formulas into lines, but they do between formulas.
+    parts = [_convert(part, True) for part in _equations(tex)]
+    return f'<div class="formula">{" ".join(parts)}</div>'
+
+
+def _equations(tex: str) -> list[str]:
+    """What stands in a displayed formula between wide spaces that are not within a matrix
+    or braces."""
+    parts = [""]
+    depth = 0
+    for token in _TOKEN.findall(tex):
+        if token in (r"\begin", "{"):
+            depth += 1
+        elif token in (r"\end", "}"):
+            depth -= 1
+        if token in (r"\quad", r"\qquad") and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += token
+    return [part for part in parts if part.strip()]
 
 
 @ft.cache
