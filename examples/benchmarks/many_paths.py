@@ -150,17 +150,16 @@ def write(machine: str, nanoseconds: Table) -> None:
         "float64. Times include the call itself, which dominates for few paths. "
         f"`ArrayRQMC` splits the paths into {REPLICATES} replicates. {machine}. Made by "
         "`python -m examples.benchmarks.many_paths`.\n",
-        f"| system | | {heads} |",
-        "|---" * (2 + len(SHOWN)) + "|",
+        f"| paths | {heads} |",
+        "|---" * (1 + len(SHOWN)) + "|",
     ]
     for system in SYSTEMS:
-        title = f" {system}"  # only in the first row of a system
+        rows.append(f"| **{system}** |" + " |" * len(SHOWN))
         for way, found in nanoseconds[system].items():
             if found:
                 some = [found[NUMBERS.index(number)] for number in SHOWN]
                 shown = " | ".join(f"{float(f'{x:.3g}'):,.10g}" for x in some)
-                rows.append(f"|{title} | {way} | {shown} |")
-                title = ""
+                rows.append(f"| {way} | {shown} |")
     draw(nanoseconds)
     image = "![Processor time per path and step](many_paths.png)"
     (DOCS / "many_paths.md").write_text("\n".join([*rows, "", image, ""]))

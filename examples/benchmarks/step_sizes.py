@@ -235,8 +235,8 @@ every step. The picture's "midpoint by hand" makes twelve fixed-point iterations
 
 ![Cost of a step against frequency times step size](step_sizes.png)
 
-| system | solver | {sizes} | `Heun` | gradient |
-|---|---|{lines}---|---|
+| solver | {sizes} | gradient |
+|---|{lines}---|
 """
 
 
@@ -254,23 +254,19 @@ def page(machine: str, rows: list[Row]) -> str:
         machine=machine, steps=STEPS, sizes=sizes, lines=lines,
         least=min(growth), most=max(growth),
     )  # fmt: skip
-    system, heun = "", ""
     for row in rows:
-        if row.name == HEUN:
-            # In the first row of a system.
-            system = row.system
-            heun = f"{row.nanoseconds[SIZES.index(0.1)]:,.0f}"
-        if row.name in (HEUN, BY_HAND) or row.system in PICTURED:
+        if row.name == BY_HAND or row.system in PICTURED:
             continue
+        if row.name == HEUN:
+            text += f"| **{row.system}** |{' |' * (len(SHOWN) + 1)}\n"
         cells = [
             f"{x:,.0f}" + (f" ({share:.1%})" if share > 0 else "")
             for h, x, share in zip(SIZES, row.nanoseconds, row.failed)
             if h in SHOWN
         ]
         gradient = "/".join(f"{x:.1f}" for x in row.gradient)
-        line = system, row.name, *cells, heun, gradient
+        line = row.name, *cells, gradient
         text += f"| {' | '.join(line)} |\n".replace("|  |", "| |")
-        system, heun = "", ""
     return text
 
 
