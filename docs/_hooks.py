@@ -21,6 +21,8 @@ _FORMULA = re.compile(
     r'<(?P<tag>span|div) class="arithmatex">\s*\\[(\[](?P<tex>.*?)\\[)\]]\s*</(?P=tag)>',
     re.DOTALL,
 )
+# A cell of a table with a number, perhaps in bold: browsers break those like 1e-9.
+_NUMBER = re.compile(r"<td>((?:<strong>)?[-+]?\d[^\s<]*(?:</strong>)?)</td>")
 # A command, or another character.
 _TOKEN = re.compile(r"\\[a-zA-Z]+|\\?.", re.DOTALL)
 # Raises an error for what it does not know, which ends the build.
@@ -65,6 +67,7 @@ def on_env(env, config, files):
 
 
 def on_page_content(page_html, page, config, files):
+    page_html = _NUMBER.sub(r'<td class="number">\1</td>', page_html)
     return _FORMULA.sub(_render, page_html)
 
 

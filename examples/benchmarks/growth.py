@@ -159,7 +159,7 @@ CASES = {
     "Schrödinger ring": (ring, (1, 16, 1024)),
     "network as the potential": (network, (4, 64, 256)),
 }
-COLUMNS = ("$d$", "Heun, µs", "time", "compilation", "value and gradient", "memory")
+COLUMNS = ("$d$", "Heun, µs", "time", "compile", "value and gradient", "memory")
 INTRODUCTION = """\
 `ImplicitMidpoint` costs {least} to {most} times as much as Diffrax's `Heun`, from 1 to
 4,096 degrees of freedom $d$.
