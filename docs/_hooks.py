@@ -23,6 +23,8 @@ _FORMULA = re.compile(
 )
 # A cell of a table with a number, perhaps in bold: browsers break those like 1e-9.
 _NUMBER = re.compile(r"<td>((?:<strong>)?[-+]?\d[^\s<]*(?:</strong>)?)</td>")
+# A row with one cell in bold and the others empty: a heading within a table.
+_HEADING = re.compile(r"<td>(<strong>.*?</strong>)</td>((?:\s*<td></td>)+)(?=\s*</tr>)")
 # A command, or another character.
 _TOKEN = re.compile(r"\\[a-zA-Z]+|\\?.", re.DOTALL)
 # Raises an error for what it does not know, which ends the build.
@@ -67,8 +69,14 @@ def on_env(env, config, files):
 
 
 def on_page_content(page_html, page, config, files):
+    page_html = _HEADING.sub(_over_the_row, page_html)
     page_html = _NUMBER.sub(r'<td class="number">\1</td>', page_html)
     return _FORMULA.sub(_render, page_html)
+
+
+def _over_the_row(heading: re.Match) -> str:
+    columns = 1 + heading[2].count("<td>")
+    return f'<td colspan="{columns}">{heading[1]}</td>'
 
 
 def _render(formula: re.Match) -> str:
