@@ -149,7 +149,7 @@ def write(machine: str, nanoseconds: Table) -> None:
         f"{ROUNDS} calls of {STEPS} steps (fewer where a call exceeds {PATIENCE:.0f} s), "
         "float64. Times include the call itself, which dominates for few paths. "
         f"`ArrayRQMC` splits the paths into {REPLICATES} replicates. {machine}. Made by "
-        "`python -m examples.benchmarks.many_paths`.\n",
+        "`python -m examples.benchmarks.many_paths measure`.\n",
         f"| paths | {heads} |",
         "|---" * (1 + len(SHOWN)) + "|",
     ]

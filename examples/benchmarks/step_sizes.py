@@ -231,7 +231,7 @@ Nanoseconds per path and step with random numbers, {steps} steps, 512 paths ($20
 size $d$), float64. Percentages: paths with a failed step. Gradient: value and reverse-mode
 gradient, relative to the value, at $h = 0.01$ and 0.4. `Heun` costs nearly the same at
 every step. The picture's "midpoint by hand" makes twelve fixed-point iterations per step.
-{machine}. Made by `python -m examples.benchmarks.step_sizes`.
+{machine}. Made by `python -m examples.benchmarks.step_sizes measure`.
 
 ![Cost of a step against frequency times step size](step_sizes.png)
 
