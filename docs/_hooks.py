@@ -21,6 +21,12 @@ _FORMULA = re.compile(
     r'<(?P<tag>span|div) class="arithmatex">\s*\\[(\[](?P<tex>.*?)\\[)\]]\s*</(?P=tag)>',
     re.DOTALL,
 )
+# A cell of a table with a number, perhaps in bold: browsers break those like 1e-9.
+_NUMBER = re.compile(r"<td>((?:<strong>)?[-+]?\d[^\s<]*(?:</strong>)?)</td>")
+# A row with one cell in bold and the others empty: a heading within a table.
+_HEADING = re.compile(r"<td>(<strong>.*?</strong>)</td>((?:\s*<td></td>)+)(?=\s*</tr>)")
+# A command, or another character.
+_TOKEN = re.compile(r"\\[a-zA-Z]+|\\?.", re.DOTALL)
 # Raises an error for what it does not know, which ends the build.
 _mathml = LatexToMathML()
 
@@ -63,13 +69,40 @@ def on_env(env, config, files):
 
 
 def on_page_content(page_html, page, config, files):
+    page_html = _HEADING.sub(_over_the_row, page_html)
+    page_html = _NUMBER.sub(r'<td class="number">\1</td>', page_html)
     return _FORMULA.sub(_render, page_html)
 
 
+def _over_the_row(heading: re.Match) -> str:
+    columns = 1 + heading[2].count("<td>")
+    return f'<td colspan="{columns}">{heading[1]}</td>'
+
+
 def _render(formula: re.Match) -> str:
-    displayed = formula["tag"] == "div"
-    mathml = _convert(html.unescape(formula["tex"]), displayed)
-    return f'<div class="formula">{mathml}</div>' if displayed else mathml
+    tex = html.unescape(formula["tex"])
+    if formula["tag"] == "span":
+        return _convert(tex, False)
+    # Browsers do not break formulas into lines, but they do between formulas.
+    parts = [_convert(part, True) for part in _equations(tex)]
+    return f'<div class="formula">{" ".join(parts)}</div>'
+
+
+def _equations(tex: str) -> list[str]:
+    """What stands in a displayed formula between wide spaces that are not within a matrix
+    or braces."""
+    parts = [""]
+    depth = 0
+    for token in _TOKEN.findall(tex):
+        if token in (r"\begin", "{"):
+            depth += 1
+        elif token in (r"\end", "}"):
+            depth -= 1
+        if token in (r"\quad", r"\qquad") and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += token
+    return [part for part in parts if part.strip()]
 
 
 @ft.cache

@@ -17,8 +17,9 @@ BLUE, SKY, GREEN, ORANGE = "#0072B2", "#56B4E9", "#009E73", "#E69F00"
 VERMILION, PINK, BLACK, GREY = "#D55E00", "#CC79A7", "#000000", "#808080"
 WINE, OLIVE, INDIGO = "#882255", "#999933", "#332288"
 
-# At 8 inches for the width of a page, letters of 9 points have 11 of its 700 pixels.
-WIDTH = 8.0
+# In inches. On a phone, where 360 pixels are left for it, letters of 10 points have 8 of
+# them, and on a wide screen 17 of 720.
+WIDTH = 6.0
 plt.rcParams.update(
     {
         "axes.grid": True,
@@ -27,12 +28,12 @@ plt.rcParams.update(
         "axes.titlesize": 10,
         "errorbar.capsize": 2,
         "figure.constrained_layout.use": True,
-        "font.size": 9,
+        "font.size": 10,
         "grid.alpha": 0.3,
-        "legend.fontsize": 9,
+        "legend.fontsize": 10,
         "legend.frameon": False,
         "lines.linewidth": 1.3,
-        "lines.markersize": 4,
+        "lines.markersize": 5,
         "savefig.dpi": 120,
     }
 )
@@ -111,6 +112,11 @@ def style(name: str) -> dict[str, Any]:
 def line(name: str) -> dict[str, Any]:
     """The same for curves of many points: without markers."""
     return style(name) | dict(marker="")
+
+
+def dots(name: str) -> dict[str, Any]:
+    """The same for markers without lines, large enough to be told apart by their shapes."""
+    return style(name) | dict(ls="none", ms=8)
 
 
 def colour(name: str) -> str:

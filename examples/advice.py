@@ -10,7 +10,8 @@ import dataclasses
 import datetime
 import json
 import sys
-from collections.abc import Callable
+import textwrap
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from scipy.linalg import expm
 
 import diffrax_symplectic as ds
 
-from ._pictures import style, WIDTH
+from ._pictures import dots, WIDTH
 
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -453,34 +454,120 @@ def measure(names) -> None:
         KEPT.write_text(json.dumps(table, indent=1) + "\n")
 
 
+# The tables of means, in the order of the page. The budgets in one table are the same.
+TABLES = {
+    "Additive noise": ("free particle", "oscillator", "coloured forcing"),
+    "Friction": (
+        "free particle in a bath",
+        "oscillator in a bath, transient",
+        "oscillator in a bath, stationary",
+        "strong friction",
+        "two baths",
+        "coloured forcing with friction, late",
+    ),
+    "Steps that do not resolve the mode": (
+        "stiff oscillator",
+        "stiff oscillator in a bath",
+    ),
+    "Multiplicative noise": (
+        "noisy spring",
+        "noisy spring with friction",
+        "Kubo oscillator",
+        "two noises that do not commute",
+    ),
+}
+# Single paths are compared at so many of the budgets.
+STRONG_BUDGETS = 2
+
+
 def page(kept: dict) -> str:
     """The page of these errors, with solvers in the order of the suggestions."""
-
-    def tables(want, names, number=None):
-        parts = []
-        for name in names:
-            problem = PROBLEMS[name]
-            rows = _in_order(problem, want, kept[want][name])
-            parts.append(_table(name, rows, problem.budgets[:number]))
-        return "\n\n".join(parts)
-
+    weak = [
+        _folded(title, _table("weak", names, kept)) for title, names in TABLES.items()
+    ]
     text = Path(__file__).with_suffix(".md").read_text()
     return text.format(
-        weak=tables("weak", PROBLEMS),
-        strong=tables("strong", kept["strong"], 2),
+        summary=_summary(kept),
+        weak="\n\n".join(weak),
+        strong=_folded("Single paths", _table("strong", kept["strong"], kept)),
         strong_std_error=max(kept["strong_std_error"].values()),
-        nonlinear="\n\n".join(
-            _nonlinear_table(name, kept["nonlinear"][name]) for name in NONLINEAR
-        ),
+        nonlinear=_folded("Nonlinear systems", _nonlinear_table(kept["nonlinear"])),
         day=kept["day"],
         nonlinear_budget=NONLINEAR_BUDGET,
     )
 
 
-def _nonlinear_table(name: str, rows: dict[str, list[float]]) -> str:
-    lines = [f"| **{name}** | error | standard error |", "|---|---|---|"]
-    for solver, (error, std_error) in rows.items():
-        lines.append(f"| `{solver}` | {error:.1e} | {std_error:.1e} |")
+def _folded(title: str, table: str) -> str:
+    return f'??? note "{title}"\n\n' + textwrap.indent(table, "    ")
+
+
+def _summary(kept: dict) -> str:
+    """The solvers within twice the smallest error, with the budgets at which they are, if
+    not at all of them."""
+    lines = ["| system | means | single paths |", "|---|---|---|"]
+    for name in (name for names in TABLES.values() for name in names):
+        means = _best("weak", name, kept)
+        paths = _best("strong", name, kept) if name in kept["strong"] else ""
+        lines.append(f"| {name} | {means} | {paths} |".replace("|  |", "| |"))
+    return "\n".join(lines)
+
+
+def _best(want: str, name: str, kept: dict) -> str:
+    budgets = _budgets(want, name)
+    rows = _in_order(PROBLEMS[name], want, kept[want][name])
+    parts = []
+    for solver, good in _good(rows).items():
+        at = [f"{budget:g}" for budget, is_good in zip(budgets, good) if is_good]
+        if len(at) == len(budgets):
+            parts.append(f"`{solver}`")
+        elif at:
+            parts.append(f"`{solver}` ({', '.join(at)})")
+    return ", ".join(parts)
+
+
+def _budgets(want: str, name: str) -> tuple[float, ...]:
+    budgets = PROBLEMS[name].budgets
+    return budgets[:STRONG_BUDGETS] if want == "strong" else budgets
+
+
+def _good(rows: dict[str, list[float]]) -> dict[str, np.ndarray]:
+    """For each solver and budget, whether the error is within twice the smallest."""
+    best = np.nanmin(np.array(list(rows.values())), axis=0)
+    limit = 2 * np.maximum(best, ROUNDING)
+    return {solver: np.array(errors) <= limit for solver, errors in rows.items()}
+
+
+def _table(want: str, names: Iterable[str], kept: dict) -> str:
+    """A table of several systems, each below a row with its name."""
+    lines = []
+    for name in names:
+        budgets = _budgets(want, name)
+        empty = " |" * len(budgets)
+        if not lines:
+            lines.append(f"| time per evaluation | {' | '.join(map(str, budgets))} |")
+            lines.append("|---" * (1 + len(budgets)) + "|")
+        lines.append(f"| **{name}** |{empty}")
+        rows = _in_order(PROBLEMS[name], want, kept[want][name])
+        good = _good(rows)
+        for solver, errors in rows.items():
+            cells = [
+                f"**{_shown(error)}**" if is_good else _shown(error)
+                for error, is_good in zip(errors, good[solver])
+            ]
+            lines.append(f"| `{solver}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _shown(error: float) -> str:
+    return f"{error:.1e}" if np.isfinite(error) else "grows"
+
+
+def _nonlinear_table(found: dict[str, dict[str, list[float]]]) -> str:
+    lines = ["| | error | standard error |", "|---|---|---|"]
+    for name in NONLINEAR:
+        lines.append(f"| **{name}** | | |")
+        for solver, (error, std_error) in found[name].items():
+            lines.append(f"| `{solver}` | {error:.1e} | {std_error:.1e} |")
     return "\n".join(lines)
 
 
@@ -492,43 +579,32 @@ def _in_order(problem: Problem, want, rows: dict) -> dict:
     return {name: rows[name] for name in [*names, *others]}
 
 
+# The ends of the axis of errors in the picture.
+SMALLEST = 1e-10
+GROWS = 100.0
+
+
 def draw(kept: dict) -> None:
-    """The picture of the errors of means."""
-    figure, axes = plt.subplots(5, 3, figsize=(WIDTH, 12), sharey=True)
+    """The picture of the errors of means: a row for each system, with the smallest error on
+    the left, at the second of its budgets for systems with three, else at the first."""
+    figure, ax = plt.subplots(figsize=(WIDTH, 7.5))
     every = sorted({solver for rows in kept["weak"].values() for solver in rows})
-    for ax, name in zip(axes.flat, PROBLEMS):
-        budgets = PROBLEMS[name].budgets
+    for row, name in enumerate(PROBLEMS):
+        shown = len(PROBLEMS[name].budgets) - 2
         for solver, errors in kept["weak"][name].items():
-            shown = np.where(np.isfinite(errors), np.maximum(errors, 1e-10), np.nan)
-            ax.loglog(budgets, shown, **style(solver))
-        ax.set_title(name, fontsize=9)
-        ax.set_ylim(5e-11, 10)
-        ax.set_xticks(budgets, map(str, budgets))
-        ax.minorticks_off()
-    for ax in axes.flat[len(PROBLEMS) :]:
-        ax.axis("off")
-    lines = [Line2D([], [], label=solver, **style(solver)) for solver in every]
-    figure.legend(handles=lines, loc="outside lower center", ncols=3)
-    for ax in axes[-1]:
-        ax.set_xlabel(r"time for one evaluation, $1/\omega$")
-    for ax in axes[:, 0]:
-        ax.set_ylabel("relative error")
+            # Those that grow stand beside the largest.
+            error = np.clip(errors[shown], SMALLEST, GROWS)
+            ax.plot(error, row, **dots(solver), alpha=0.8)
+    ax.set_yticks(range(len(PROBLEMS)), [textwrap.fill(name, 22) for name in PROBLEMS])
+    ax.set(xscale="log", ylim=(len(PROBLEMS) - 0.5, -0.5), xlabel="relative error")
+    powers = (-8, -6, -4, -2, 0)
+    labels = ["≤ 1e-10", *(f"1e{power}" for power in powers), "grows"]
+    ax.set_xticks([SMALLEST, *(10.0**power for power in powers), GROWS], labels)
+    ax.minorticks_off()
+    lines = [Line2D([], [], label=solver, **dots(solver)) for solver in every]
+    figure.legend(handles=lines, loc="outside lower center", ncols=2)
     figure.savefig(DOCS / "img" / "advice.png")
     plt.close(figure)
-
-
-def _table(name: str, rows: dict, budgets) -> str:
-    best = np.nanmin(np.array(list(rows.values())), axis=0)
-    lines = [f"| **{name}** | {' | '.join(map(str, budgets))} |"]
-    lines.append("|---" * (1 + len(budgets)) + "|")
-    for solver, errors in rows.items():
-        cells = []
-        for error, least in zip(errors, best):
-            cell = "grows" if not np.isfinite(error) else f"{error:.1e}"
-            good = error <= 2 * max(least, ROUNDING)
-            cells.append(f"**{cell}**" if good else cell)
-        lines.append(f"| `{solver}` | {' | '.join(cells)} |")
-    return "\n".join(lines)
 
 
 # Errors below this are as good as none.

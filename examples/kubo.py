@@ -111,7 +111,7 @@ def figure_3(full: bool) -> None:
         "SRKw1(b=0)": (ds.SRKw1(b=0.0), weak()),
         "SRKw2": (PAPER_SRKW2, weak()),
     }
-    figure, axes = plt.subplots(2, 3, figsize=(WIDTH, 6.2))
+    figure, axes = plt.subplots(2, 3, figsize=(WIDTH, 5.4))
     angle = np.linspace(0, 2 * np.pi, 200)
     drifts = {}
     for ax, (name, (solver, path)) in zip(axes.flat, solvers.items()):
@@ -125,14 +125,18 @@ def figure_3(full: bool) -> None:
         if name in ("Milstein", "Heun"):
             moment_map = exact_moment_map(make_terms, path, solver, Y0)
             mean = np.trace(second_moments(moment_map, Y0, h, steps))
-            shown += f"\n$E[p^2 + q^2] = {mean:.3g}$ at the end"
+            shown += f"\n$E[p^2 + q^2] = {mean:.3g}$"
         print(f"    {name}: {shown}".replace("\n", "; "), flush=True)
         ax.plot(q, p, ".", ms=1, color=colour(name))
         ax.plot(np.cos(angle), np.sin(angle), "k-", lw=0.8)
-        ax.set(xlabel="$q$", ylabel="$p$", aspect="equal")
+        ax.set(aspect="equal")
         # As many lines in each, so that the panels are in rows.
         lines = f"{name}\n{shown}" if "\n" in shown else f"{name}\n{shown}\n"
         ax.set_title(lines, fontsize=9)
+    for ax in axes[-1]:
+        ax.set_xlabel("$q$")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("$p$")
     axes[-1, -1].axis("off")
     save(figure, "fig3.png")
     for name, drift in drifts.items():

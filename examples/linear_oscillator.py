@@ -158,7 +158,7 @@ def figure_1(full: bool) -> None:
 
 
 def plot_growth(results: dict[str, Growth]) -> None:
-    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.4), width_ratios=(1, 1.2))
+    figure, axes = plt.subplots(2, 1, figsize=(WIDTH, 7.5), height_ratios=(1, 1.4))
     counts = 1000 * np.arange(1, COUNTS[-1] // 1000 + 1)
     paper = dict(ls="none", marker="x", color=VERMILION)
     for i, (name, g) in enumerate(results.items()):
@@ -184,7 +184,7 @@ def plot_growth(results: dict[str, Growth]) -> None:
     axes[0].plot(H * counts, 1 + H * counts, "k:", label="exact solution")
     axes[0].set(ylim=(0, 3.6 * H * COUNTS[-1]), xlabel="time")
     axes[0].set(ylabel="$E[x^2 + y^2]$", title="figure 1: lines exact, dots sampled")
-    axes[0].legend(loc="upper right", fontsize=8, handlelength=1.3)
+    axes[0].legend(loc="upper right")
     axes[1].set_yticks(range(2, len(TABLE_1)), [*TABLE_1][2:])
     axes[1].set(xlabel=r"$|E[x^2 + y^2] - \mathrm{exact}| \,/\, N$", title="table 1")
     axes[1].plot([], [], "kD", ms=5, label="exact")
@@ -192,8 +192,8 @@ def plot_growth(results: dict[str, Growth]) -> None:
     if axes[1].containers:
         axes[1].plot([], [], "s", color=BLUE, label="sampled, 3 standard errors")
     # Above all rows.
-    axes[1].set_ylim(top=len(TABLE_1) + 2.4)
-    axes[1].legend(loc="upper center")
+    axes[1].set_ylim(top=len(TABLE_1) + 1.4)
+    axes[1].legend(loc="upper center", ncols=2)
     save(figure, "fig1.png")
 
 
@@ -288,7 +288,7 @@ def figure_2b(full: bool) -> None:
     report("sampled", sampled)
     del nonlinear["SRKs4(sign=1)"]
     report(f"pendulum (not in the paper), {paths:,} paths", nonlinear)
-    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.5))
+    figure, axes = plt.subplots(2, 1, figsize=(WIDTH, 8.5))
     slopes = 1, 1.5, 2
     plot_orders(axes[0], "2(b): strong error of $x$", exact, sampled, slopes)
     plot_orders(axes[1], "strong error of $x$, pendulum", nonlinear, slopes=slopes)

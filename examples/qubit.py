@@ -69,7 +69,7 @@ def sampled(key, times, h: float):
 
 
 def main():
-    figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH, 3.8))
+    figure, (above, below) = plt.subplots(2, 1, figsize=(WIDTH, 6.5))
     times, paths = np.arange(1, 13) * 1.0, 1_000
     values = jax.jit(jax.vmap(lambda key: sampled(key, times, 0.1)))(
         jr.split(jr.key(0), paths)
@@ -79,24 +79,24 @@ def main():
     for i, (M, name) in enumerate(((X, "x"), (Z, "z"))):
         line = jnp.trace(rho @ M, axis1=1, axis2=2).real
         colour = (BLUE, VERMILION)[i]
-        left.plot(fine, line, color=colour, ls=("-", "--")[i])
+        above.plot(fine, line, color=colour, ls=("-", "--")[i])
         bars = 3 * jnp.std(values[..., i], axis=0) / paths**0.5
-        left.errorbar(
+        above.errorbar(
             times, jnp.mean(values[..., i], axis=0), bars, ls="none", color=colour,
             marker="os"[i], label=rf"$\sigma_{name}$",
         )  # fmt: skip
-    left.set(xlabel="time $t$", ylabel=r"mean $E\langle\sigma\rangle$")
-    left.set_title(f"lines: Lindblad equation; dots: {paths:,} paths")
+    above.set(xlabel="time $t$", ylabel=r"mean $E\langle\sigma\rangle$")
+    above.set_title(f"lines: Lindblad equation; dots: {paths:,} paths")
     steps = 2 ** np.arange(2, 8)
     for name, solver in (("SRKw1", ds.SRKw1()), ("StrangGauss", ds.StrangGauss())):
         found = jnp.stack([density(solver, 2.0, int(n)) for n in steps])
         bias = jnp.trace((found - lindblad(2.0)) @ X, axis1=1, axis2=2).real
-        right.loglog(2 / steps, np.abs(bias), label=name, **style(name))
-    right.set_xticks(2 / steps, [f"1/{n // 2}" if n > 2 else "1" for n in steps])
-    right.minorticks_off()
-    right.set(xlabel="step $h$", ylabel=r"bias of $E\langle\sigma_x\rangle$ at $t = 2$")
-    right.set_title("without sampling")
-    for ax in (left, right):
+        below.loglog(2 / steps, np.abs(bias), label=name, **style(name))
+    below.set_xticks(2 / steps, [f"1/{n // 2}" if n > 2 else "1" for n in steps])
+    below.minorticks_off()
+    below.set(xlabel="step $h$", ylabel=r"bias of $E\langle\sigma_x\rangle$ at $t = 2$")
+    below.set_title("without sampling")
+    for ax in (above, below):
         ax.legend()
     figure.savefig(Path(__file__).parents[1] / "docs/img/qubit.png")
 

@@ -159,9 +159,9 @@ def draw_portrait(ax) -> None:
         near = np.hypot(p, q) < 2.2
         ax.plot(q[near], p[near], ".", ms=2, color=colour(name), label=name)
     ax.set(xlabel="$q$", ylabel="$p$")
-    ax.set_title(f"a noisy oscillator to $t = {H * STEPS:g}$")
-    ax.set(xlim=(-2.3, 2.3), ylim=(-2.3, 2.9), aspect="equal")
-    ax.legend(loc="upper center", ncols=2, markerscale=4)
+    ax.set_title(f"noisy oscillator, $t = {H * STEPS:g}$")
+    ax.set(xlim=(-2.3, 2.3), ylim=(-2.3, 3.6), aspect="equal")
+    ax.legend(loc="upper center", markerscale=4)
 
 
 def draw_errors(ax, rows) -> None:
@@ -171,8 +171,7 @@ def draw_errors(ax, rows) -> None:
         points = [(seconds, error) for x, _, error, seconds in rows if x == name]
         ax.plot(*zip(*points), label=name.replace("`", ""), **look)
     ax.set(xscale="log", yscale="log", title="a mean in a double well")
-    ax.set(xlabel="seconds", ylabel="total error", ylim=(2e-12, 3e-2))
-    ax.legend(loc="lower left", fontsize=8)
+    ax.set(xlabel="seconds", ylabel="total error", ylim=(2e-10, 3e-2))
 
 
 def main() -> None:
@@ -187,10 +186,12 @@ def main() -> None:
 
 def draw(rows) -> None:
     figure, (left, right) = plt.subplots(
-        1, 2, figsize=(WIDTH, 3.6), width_ratios=(1, 1.3)
+        1, 2, figsize=(WIDTH, 4), width_ratios=(1, 1.1)
     )
     draw_portrait(left)
     draw_errors(right, rows)
+    lines, labels = right.get_legend_handles_labels()
+    figure.legend(lines, labels, loc="outside lower center")
     figure.savefig(IMG / "first.png")
 
 

@@ -79,7 +79,7 @@ def figure_5(full: bool) -> None:
     print(f"\nFig. 5: one path to t = {h * steps:g}, h = {h}; the largest ||X| - 1|")
     mus = (0.1, 0.2, 1.0)
     figure, axes = plt.subplots(
-        2, 5, figsize=(WIDTH, 4.1), subplot_kw={"projection": "3d"}
+        2, 5, figsize=(WIDTH, 3.4), subplot_kw={"projection": "3d"}
     )
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 25), np.linspace(0, np.pi, 13))
     sphere = np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)
@@ -218,7 +218,9 @@ def figure_poisson(full: bool) -> None:
     local_hs = 2.0 ** -np.arange(2, 7)
     local = np.abs(local_weak_errors(local_hs))
     slope = np.polyfit(np.log(local_hs), np.log(local), 1)[0]
-    figure, axes = plt.subplots(1, 3, figsize=(WIDTH, 3.4))
+    figure = plt.figure(figsize=(WIDTH, 6.5))
+    panels = figure.subplot_mosaic("AB;CC")
+    axes = [panels[name] for name in "ABC"]
     midpoint = style("ImplicitMidpoint")
     hollow = midpoint | dict(ls=":", mfc="white")
     axes[0].loglog(hs, of_X, label="for $X$ itself", **hollow)

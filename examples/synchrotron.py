@@ -111,7 +111,7 @@ def figure_4(full: bool) -> None:
     print(
         f"\nFig. 4: paths to t = {h * steps:g}, h = {h}; the mean of H0 over {paths:,}"
     )
-    figure = plt.figure(figsize=(WIDTH, 7.5))
+    figure = plt.figure(figsize=(WIDTH, 7))
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.3, 1))[:, 0]
     panels = above.subplots(2, 4, sharex=True, sharey=True)
     energies = below.subplots()

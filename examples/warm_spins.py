@@ -115,9 +115,9 @@ def stationary_bias(
 
 
 def main():
-    figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH, 3.8))
+    figure, (above, below) = plt.subplots(2, 1, figsize=(WIDTH, 6.5))
     fine = np.linspace(0.05, 3, 200)
-    left.plot(fine, langevin(1 / fine), "k", label=r"$\coth(1/T) - T$")
+    above.plot(fine, langevin(1 / fine), "k", label=r"$\coth(1/T) - T$")
     Ts = np.array([0.2, 0.4, 0.7, 1.0, 1.5, 2.0, 3.0])
     for i, (what, label) in enumerate(
         (
@@ -127,23 +127,23 @@ def main():
     ):
         run = jax.jit(lambda T, what=what: sampled(what, T))
         means, errors = np.array([run(T) for T in Ts]).T
-        left.errorbar(
+        above.errorbar(
             Ts, means, 3 * errors, ls="none", color=(BLUE, VERMILION)[i],
             marker="os"[i], ms=4 + 4 * i, fillstyle="none", label=label,
         )  # fmt: skip
-    left.set(xlabel="temperature $T$", ylabel="mean")
-    left.set_title("bars of three standard errors")
+    above.set(xlabel="temperature $T$", ylabel="mean")
+    above.set_title("bars of three standard errors")
     hs, T = np.array([0.8, 0.4, 0.2]), 0.6
     H, what = (lambda s: -s[2]), (lambda s: s[2:])
     for solver in (ds.ImplicitMidpoint(), ds.NinomiyaVictoir()):
         bias = stationary_bias(H, what, solver, hs, ALPHA, T, degree=5)[:, 0]
         name = type(solver).__name__
-        right.loglog(hs, np.abs(bias), label=name, **style(name))
-    right.minorticks_off()
-    right.set_xticks(hs, map(str, hs))
-    right.set(xlabel="step $h$", ylabel=f"bias of $E[s_z]$ at $T = {T}$")
-    right.set_title("without sampling")
-    for ax in (left, right):
+        below.loglog(hs, np.abs(bias), label=name, **style(name))
+    below.minorticks_off()
+    below.set_xticks(hs, map(str, hs))
+    below.set(xlabel="step $h$", ylabel=f"bias of $E[s_z]$ at $T = {T}$")
+    below.set_title("without sampling")
+    for ax in (above, below):
         ax.legend()
     figure.savefig(Path(__file__).parents[1] / "docs/img/warm_spins.png")
 

@@ -201,3 +201,10 @@ def test_errors_of_the_page_are_those_measured_now():
         np.testing.assert_allclose(errors, kept, rtol=1e-6)
     page = (advice.DOCS / "advice.md").read_text()
     assert page == advice.page(KEPT), "run `python -m examples.advice`"
+
+
+def test_each_system_is_in_one_table_with_others_of_equal_budgets():
+    names = [name for table in advice.TABLES.values() for name in table]
+    assert sorted(names) == sorted(advice.PROBLEMS)
+    for table in advice.TABLES.values():
+        assert len({advice.PROBLEMS[name].budgets for name in table}) == 1

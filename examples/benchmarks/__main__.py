@@ -19,11 +19,13 @@ def main() -> None:
     calls.main()
     ensemble.main()
     growth.main()
-    many_paths.main()
-    step_sizes.main()
+    many_paths.main("measure")
+    step_sizes.main("measure")
     tolerance.main()
     members.main()
     work_precision.main("errors", "seconds")
+    total_error.main("errors")
+    total_error.main("seconds")
     total_error.main()
 
 

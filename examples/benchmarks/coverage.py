@@ -158,16 +158,16 @@ def covered(cell: Cell, sampling: Any, repetitions: int) -> np.ndarray:
 
 
 def table(repetitions: int, cells: list[Cell] = CELLS, report: Callable = print) -> str:
-    head = f"| sampling | noise | $s$ | $t$ | {' | '.join(NAMES)} |"
-    lines = [head, "|---" * 8 + "|"]
+    head = f"| sampling | {' | '.join(NAMES)} |"
+    lines = [head, "|---" * 5 + "|"]
     for cell in cells:
+        kind = f"{cell.noise}, $s = {cell.strength:g}$, $t = {cell.t1:g}$"
+        lines.append(f"| **{kind}** | | | | |")
         for name, sampling in SAMPLINGS.items():
             shares = covered(cell, sampling, repetitions)
-            cells_ = f"`{name}`", cell.noise, f"{cell.strength:g}", f"{cell.t1:g}"
-            lines.append(
-                "| " + " | ".join([*cells_, *(f"{x:.1%}" for x in shares)]) + " |"
-            )
-            report(lines[-1])
+            shown = " | ".join(f"{x:.1%}" for x in shares)
+            lines.append(f"| `{name}` | {shown} |")
+            report(f"{kind}: {lines[-1]}")
         jax.clear_caches()
     return "\n".join(lines)
 

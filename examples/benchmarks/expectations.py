@@ -3,8 +3,9 @@
     python -m examples.benchmarks.expectations measure [MODEL ...]
     python -m examples.benchmarks.expectations
 
-The first measures, on a quiet machine, and keeps what it measures in `examples/output`. The
-second writes the picture and the section about it in `docs/benchmarks/total_error.md`.
+The first measures, on a quiet machine, and keeps what it measures in
+`docs/benchmarks/samplings.json`. The second writes the picture and the section about it in
+`docs/benchmarks/total_error.md`.
 Exact values are known in closed form or computed without sampling: by quadrature (quartic
 Kubo), backwards in time by splines (pendulum, double well, quartic with two noises) or on
 Chebyshev grids (synchrotron, Hénon-Heiles).
@@ -14,7 +15,6 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -178,7 +178,7 @@ CASES = {
 
 
 PICTURE = "linear oscillator", "Kubo oscillator", "pendulum", "synchrotron"
-KEPT = Path(__file__).parents[1] / "output" / "expectations"
+KEPT = DOCS / "samplings.json"
 SEEDS = range(1, 5)
 
 
@@ -226,7 +226,7 @@ def measure(name: str) -> dict[str, Any]:
 
 
 def draw(measured: dict[str, dict]) -> None:
-    figure, axes = plt.subplots(2, 2, figsize=(WIDTH, 6), sharex=True, sharey=True)
+    figure, axes = plt.subplots(2, 2, figsize=(WIDTH, 6.5), sharex=True, sharey=True)
     for ax, name in zip(axes.flat, PICTURE):
         for sampling in ("IndependentPaths", "ArrayRQMC", "ValueFunctions"):
             dots = zip(*measured[name][sampling])
@@ -263,8 +263,8 @@ def table(measured: dict[str, dict]) -> str:
 
 
 def write() -> None:
-    read = lambda name: json.loads((KEPT / f"{name}.json").read_text())
-    measured = {name: read(name) for name in CASES if (KEPT / f"{name}.json").exists()}
+    kept = _read()
+    measured = {name: kept[name] for name in CASES if name in kept}
     draw(measured)
     page = DOCS / "total_error.md"
     before, rest = page.read_text().split("<!-- samplings -->\n")[::2]
@@ -272,11 +272,15 @@ def write() -> None:
     page.write_text(before + marker + "\n" + table(measured) + "\n\n" + marker + rest)
 
 
+def _read() -> dict[str, Any]:
+    return json.loads(KEPT.read_text()) if KEPT.exists() else {}
+
+
 if __name__ == "__main__":
     if sys.argv[1:2] != ["measure"]:
         write()
     for name in sys.argv[2:] or (CASES if sys.argv[1:] else ()):
-        KEPT.mkdir(parents=True, exist_ok=True)
-        (KEPT / f"{name}.json").write_text(json.dumps(measure(name)))
-        print(name, (KEPT / f"{name}.json").read_text(), flush=True)
+        found = measure(name)
+        KEPT.write_text(json.dumps(_read() | {name: found}, indent=1) + "\n")
+        print(name, found, flush=True)
         jax.clear_caches()

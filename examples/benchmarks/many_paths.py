@@ -1,13 +1,17 @@
 """Whether many paths cost more, each, than few: processor time per path and step of
 `ensemble`, by both engines, and of `ArrayRQMC`.
 
+    python -m examples.benchmarks.many_paths measure
     python -m examples.benchmarks.many_paths
 
-Writes `docs/benchmarks/many_paths.md` and the chart beside it. Processor time counts all
+The first measures, and keeps what it measures in `docs/benchmarks/many_paths.json`. Both
+write `many_paths.md` and the chart beside it from that. Processor time counts all
 cores, and does not count other programs that take turns on them.
 """
 
 import functools as ft
+import json
+import sys
 import time
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -24,7 +28,10 @@ from ._timing import DOCS, machine
 from .fused import Case, CASES
 
 
+KEPT = DOCS / "many_paths.json"
 NUMBERS = [2**k for k in range(6, 21, 2)]
+# The table has these, the chart all of them.
+SHOWN = [2**6, 2**10, 2**16, 2**20]
 # The start of a path, which draws its random keys, costs as much as ten steps of
 # `StormerVerlet`. It should not count for much, and for as much everywhere.
 STEPS = 64
@@ -109,59 +116,66 @@ def measured(name: str, way: str) -> list[float]:
     return found
 
 
-# From the name of a system and the way to the nanoseconds for each of `NUMBERS`.
-Table: TypeAlias = dict[tuple[str, str], list[float]]
+# By system and way, the nanoseconds for each of `NUMBERS`.
+Table: TypeAlias = dict[str, dict[str, list[float]]]
 
 
-def main() -> None:
-    write({(name, way): measured(name, way) for name in SYSTEMS for way in WAYS})
+def main(*kinds: str) -> None:
+    if "measure" in kinds:
+        table = {name: {way: measured(name, way) for way in WAYS} for name in SYSTEMS}
+        kept = {"machine": machine(), "nanoseconds": table}
+        KEPT.write_text(json.dumps(kept, indent=1) + "\n")
+    write(**json.loads(KEPT.read_text()))
 
 
 def rise(table: Table, *ways: str) -> float:
     """By how much the cost per path grows at most, as a fraction, from `MANY` paths on."""
     found = 0.0
-    for (_, way), nanoseconds in table.items():
-        if way in ways and nanoseconds:
-            many = nanoseconds[NUMBERS.index(MANY) :]
-            found = max(found, max(many) / many[0] - 1)
+    for by_way in table.values():
+        for way in ways:
+            if many := by_way[way][NUMBERS.index(MANY) :]:
+                found = max(found, max(many) / many[0] - 1)
     return found
 
 
-def write(table: Table) -> None:
-    heads = " | ".join(f"{number:,}" for number in NUMBERS)
+def write(machine: str, nanoseconds: Table) -> None:
+    heads = " | ".join(f"{number:,}" for number in SHOWN)
     rows = [
         "# Many paths\n\n"
         f"From {MANY:,} paths to {NUMBERS[-1]:,} the cost per path rises by at most "
-        f"{rise(table, 'fused', 'JAX'):.0%} in [ensembles](../ensembles.md), and by "
-        f"{rise(table, '`ArrayRQMC`'):.0%} in `ArrayRQMC`, which sorts them.\n\n"
+        f"{rise(nanoseconds, 'fused', 'JAX'):.0%} in [ensembles](../ensembles.md), and by "
+        f"{rise(nanoseconds, '`ArrayRQMC`'):.0%} in `ArrayRQMC`, which sorts them.\n\n"
         "Processor nanoseconds per path and step, best of "
         f"{ROUNDS} calls of {STEPS} steps (fewer where a call exceeds {PATIENCE:.0f} s), "
         "float64. Times include the call itself, which dominates for few paths. "
-        f"`ArrayRQMC` splits the paths into {REPLICATES} replicates. {machine()}. Made by "
-        "`python -m examples.benchmarks.many_paths`.\n",
-        f"| system | | {heads} |",
-        "|---" * (2 + len(NUMBERS)) + "|",
+        f"`ArrayRQMC` splits the paths into {REPLICATES} replicates. {machine}. Made by "
+        "`python -m examples.benchmarks.many_paths measure`.\n",
+        f"| paths | {heads} |",
+        "|---" * (1 + len(SHOWN)) + "|",
     ]
-    for name in SYSTEMS:
-        for way in WAYS:
-            if nanoseconds := table.get((name, way)):
-                shown = " | ".join(f"{float(f'{x:.3g}'):,.10g}" for x in nanoseconds)
-                rows.append(f"| {name} | {way} | {shown} |")
-    draw(table)
+    for system in SYSTEMS:
+        rows.append(f"| **{system}** |" + " |" * len(SHOWN))
+        for way, found in nanoseconds[system].items():
+            if found:
+                some = [found[NUMBERS.index(number)] for number in SHOWN]
+                shown = " | ".join(f"{float(f'{x:.3g}'):,.10g}" for x in some)
+                rows.append(f"| {way} | {shown} |")
+    draw(nanoseconds)
     image = "![Processor time per path and step](many_paths.png)"
     (DOCS / "many_paths.md").write_text("\n".join([*rows, "", image, ""]))
 
 
 def draw(table: Table) -> None:
     figure, axes = plt.subplots(
-        3, 2, figsize=(WIDTH, 8), sharex=True, sharey=True, squeeze=False
+        3, 2, figsize=(WIDTH, 8.5), sharex=True, sharey=True, squeeze=False
     )
     for name, ax in zip(SYSTEMS, axes.flat):
         for way in WAYS:
-            if nanoseconds := table.get((name, way)):
+            if nanoseconds := table[name][way]:
                 label = way.strip("`")
                 ax.loglog(NUMBERS, nanoseconds, label=label, **style(label))
-        ax.set_title(name.replace("`", "").replace("Henon", "Hénon"))
+        title = name.replace("`", "").replace("Henon", "Hénon")
+        ax.set_title(title.replace(", ", ",\n", 1))
     lines, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(lines, labels, loc="outside upper center", ncols=3)
     figure.supxlabel("number of paths", fontsize=10)
@@ -171,4 +185,4 @@ def draw(table: Table) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

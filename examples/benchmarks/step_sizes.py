@@ -1,10 +1,14 @@
 """What a step costs, against its size and the number of unknowns:
 
+    python -m examples.benchmarks.step_sizes measure
     python -m examples.benchmarks.step_sizes
 
-Writes `docs/benchmarks/step_sizes.md` and a picture.
+The first measures, on a quiet machine, and keeps what it measures in
+`docs/benchmarks/step_sizes.json`. Both write `step_sizes.md` and a picture from that.
 """
 
+import json
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,6 +27,7 @@ from ._timing import DOCS, keys, machine, race
 from .growth import chain, network, ring
 
 
+KEPT = DOCS / "step_sizes.json"
 SIZES = (0.01, 0.05, 0.1, 0.2, 0.4)
 # The table has these, the picture all of them.
 SHOWN = (0.01, 0.1, 0.4)
@@ -167,7 +172,9 @@ def _by_hand(system: System) -> Callable:
 
 
 class Row(NamedTuple):
-    system: System
+    # The title of the system, and its largest frequency.
+    system: str
+    frequency: float
     name: str
     nanoseconds: tuple[float, ...]
     # Value and gradient as a multiple of that, at the least and the largest step size.
@@ -194,7 +201,7 @@ def measure(system: System) -> list[Row]:
     rows = []
     for name in calls:
         row = Row(
-            system, name, tuple(times[name]),
+            system.title, system.frequency, name, tuple(times[name]),
             _over_value(name, calls, gradients, batch), tuple(failed[name]),
         )  # fmt: skip
         print(row[1:], flush=True)
@@ -224,54 +231,50 @@ Nanoseconds per path and step with random numbers, {steps} steps, 512 paths ($20
 size $d$), float64. Percentages: paths with a failed step. Gradient: value and reverse-mode
 gradient, relative to the value, at $h = 0.01$ and 0.4. `Heun` costs nearly the same at
 every step. The picture's "midpoint by hand" makes twelve fixed-point iterations per step.
-{machine}. Made by `python -m examples.benchmarks.step_sizes`.
+{machine}. Made by `python -m examples.benchmarks.step_sizes measure`.
 
 ![Cost of a step against frequency times step size](step_sizes.png)
 
-| system | solver | {sizes} | `Heun` | gradient |
-|---|---|{lines}---|---|
+| solver | {sizes} | gradient |
+|---|{lines}---|
 """
 
 
-def page(rows: list[Row]) -> str:
+def page(machine: str, rows: list[Row]) -> str:
     sizes = " | ".join(f"$h = {h}$" for h in SHOWN)
     lines = "---|" * len(SHOWN)
     growth = [
         row.nanoseconds[-1] / row.nanoseconds[0]
         for row in rows
         if row.name not in (HEUN, BY_HAND)
-        and row.system.title not in PICTURED
+        and row.system not in PICTURED
         and not any(row.failed)
     ]
     text = INTRODUCTION.format(
-        machine=machine(), steps=STEPS, sizes=sizes, lines=lines,
+        machine=machine, steps=STEPS, sizes=sizes, lines=lines,
         least=min(growth), most=max(growth),
     )  # fmt: skip
-    system, heun = "", ""
     for row in rows:
-        if row.name == HEUN:
-            # In the first row of a system.
-            system = row.system.title
-            heun = f"{row.nanoseconds[SIZES.index(0.1)]:,.0f}"
-        if row.name in (HEUN, BY_HAND) or row.system.title in PICTURED:
+        if row.name == BY_HAND or row.system in PICTURED:
             continue
+        if row.name == HEUN:
+            text += f"| **{row.system}** |{' |' * (len(SHOWN) + 1)}\n"
         cells = [
             f"{x:,.0f}" + (f" ({share:.1%})" if share > 0 else "")
             for h, x, share in zip(SIZES, row.nanoseconds, row.failed)
             if h in SHOWN
         ]
         gradient = "/".join(f"{x:.1f}" for x in row.gradient)
-        line = system, row.name, *cells, heun, gradient
+        line = row.name, *cells, gradient
         text += f"| {' | '.join(line)} |\n".replace("|  |", "| |")
-        system, heun = "", ""
     return text
 
 
 def draw(rows: list[Row]) -> None:
-    figure, axes = plt.subplots(2, 2, figsize=(WIDTH, 6.5))
+    figure, axes = plt.subplots(2, 2, figsize=(WIDTH, 7))
     for ax, title in zip(axes.flat, PICTURED):
-        shown = [row for row in rows if row.system.title == title]
-        x = shown[0].system.frequency * np.array(SIZES)
+        shown = [row for row in rows if row.system == title]
+        x = shown[0].frequency * np.array(SIZES)
         for row in shown:
             label = row.name.strip("`")
             ax.loglog(x, row.nanoseconds, label=label, **style(label))
@@ -281,17 +284,22 @@ def draw(rows: list[Row]) -> None:
         ax.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         ax.minorticks_off()
     lines, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(lines, labels, loc="outside lower center", ncols=4)
+    figure.legend(lines, labels, loc="outside lower center", ncols=3)
     figure.supylabel("nanoseconds per path and step", fontsize=10)
     figure.savefig(DOCS / "step_sizes.png")
     plt.close(figure)
 
 
-def main() -> None:
-    rows = [row for system in _systems() for row in measure(system)]
-    (DOCS / "step_sizes.md").write_text(page(rows))
+def main(*kinds: str) -> None:
+    if "measure" in kinds:
+        measured = [row for system in _systems() for row in measure(system)]
+        kept = {"machine": machine(), "rows": [row._asdict() for row in measured]}
+        KEPT.write_text(json.dumps(kept, indent=1) + "\n")
+    kept = json.loads(KEPT.read_text())
+    rows = [Row(**row) for row in kept["rows"]]
+    (DOCS / "step_sizes.md").write_text(page(kept["machine"], rows))
     draw(rows)
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

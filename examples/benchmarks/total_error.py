@@ -6,7 +6,7 @@
 
 The first measures errors, of the models named or of all, on however busy a machine. The
 second measures how long the estimates take, and wants a quiet one. Both keep what they
-measure in `examples/output`. The last writes `docs/benchmarks/total_error.md` and its
+measure in `docs/benchmarks/total_error.json`. The last writes `total_error.md` and its
 picture from that, and measures what is missing; with `--quick` it goes through all of this
 at small sizes for one model and writes nothing. The section down to 1e-10 is that of
 `expectations`, which is to be run afterwards.
@@ -32,7 +32,7 @@ from ._limits import limits, LONG
 from ._timing import DOCS, keys, machine, measure
 
 
-KEPT = Path(__file__).parents[1] / "output" / "total_error"
+KEPT = DOCS / "total_error.json"
 # An estimate is of so many replicates.
 REPLICATES = 4
 REPETITIONS = 20
@@ -217,7 +217,6 @@ def draw(results: dict[str, dict]) -> None:
     ax.axis("off")
     labels = [named.get(x, f"diffrax.{x}") for x in lines]
     ax.legend(lines.values(), labels, loc="center")
-    DOCS.mkdir(parents=True, exist_ok=True)
     figure.savefig(DOCS / "total_error.png")
     plt.close(figure)
 
@@ -260,15 +259,24 @@ def limit_tables(measured: dict) -> dict[str, str]:
 
 def kept(kind: str, name: str, fn: Callable, again: bool) -> dict:
     """What was measured, or is measured now."""
-    path = KEPT / kind / f"{name}.json"
-    if again or not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
+    everything = _read()
+    if again or name not in everything.get(kind, {}):
         begin = time.process_time()
-        path.write_text(json.dumps(fn()))
+        found = fn()
         used = time.process_time() - begin
+        # With what was measured beside it meanwhile.
+        everything = _read()
+        everything.setdefault(kind, {})[name] = found
+        if kind == "seconds":
+            everything["machine"] = machine()
+        KEPT.write_text(json.dumps(everything, indent=1) + "\n")
         print(f"{kind}, {name}: {used:.0f} s of processor time", flush=True)
         jax.clear_caches()
-    return json.loads(path.read_text())
+    return everything[kind][name]
+
+
+def _read() -> dict[str, Any]:
+    return json.loads(KEPT.read_text()) if KEPT.exists() else {}
 
 
 def main(kind: str | None = None, names: list[str] | None = None) -> None:
@@ -289,7 +297,7 @@ def write(results: dict[str, dict], measured: dict) -> None:
     draw(results)
     page = Path(__file__).with_suffix(".md").read_text()
     text = page.format(
-        machine=machine(), rows=table(results), replicates=REPLICATES,
+        machine=_read()["machine"], rows=table(results), replicates=REPLICATES,
         chain_error=f"{results['chain of 32']['errors']['exact error']:.0e}",
         **limit_tables(measured),
     )  # fmt: skip

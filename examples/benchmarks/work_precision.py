@@ -277,20 +277,26 @@ def measured_seconds() -> dict[str, dict]:
 def draw(kind: str, kept: dict) -> None:
     """Errors against seconds, a panel for each model. A point that is not clear of its own
     error bar is not drawn: it says nothing."""
-    figure, axes = plt.subplots(3, 2, figsize=(WIDTH, 11.5))
+    figure, axes = plt.subplots(3, 2, figsize=(WIDTH, 9.5))
+    entries = {}
     for ax, model in zip(axes.flat, STRONG):
         for name, fields in kept["errors"][kind][model].items():
             e = Errors._make(np.array(fields))
             seconds = kept["seconds"][kind][model][name] / e.hs
             clear = e.errors > 3 * e.std_errors
             bars = 3 * e.std_errors[clear]
-            ax.errorbar(
-                seconds[clear], e.errors[clear], bars, label=name, **style(name)
+            entries[name] = ax.errorbar(
+                seconds[clear], e.errors[clear], bars, **style(name)
             )
         ax.set(xscale="log", yscale="log", title=model)
-        ax.set(xlabel="CPU seconds per path", ylabel=f"{kind} error")
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
+    # Those below which there is no other panel.
+    for ax in axes.flat[-3:-1]:
+        ax.set_xlabel("CPU seconds per path")
+    for ax in axes[:, 0]:
+        ax.set_ylabel(f"{kind} error")
     axes[-1, -1].axis("off")
+    names = sorted(entries)
+    axes[-1, -1].legend([entries[name] for name in names], names, loc="center")
     figure.savefig(DOCS / f"work_precision_{kind}.png")
     plt.close(figure)
 

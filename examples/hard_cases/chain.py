@@ -143,7 +143,7 @@ def section(page: Page) -> str:
     midpoint = " and ".join(f"{rate:.2f}" for rate in rates)
 
     print(f"\nNonlinear chain, beta = 1: energy at t = {t1:g}, {paths} paths")
-    figure, axes = plt.subplots(figsize=(6.5, 4.2))
+    figure, axes = plt.subplots(figsize=(6, 4.2))
     for number, name in enumerate(names):
         solver, make_path = SOLVERS[name]
         means = []

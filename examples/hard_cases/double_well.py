@@ -79,7 +79,7 @@ def section(page: Page) -> str:
     hs = np.array([0.2, 0.1] if page.quick else [0.4, 0.2, 0.1, 0.05])
     print(f"\nDouble well with friction: stationary moments less Gibbs, T = {T:g}")
     rows = []
-    figure, ax = plt.subplots(figsize=(6.5, 4.6))
+    figure, ax = plt.subplots(figsize=(6, 4.6))
     for name in names:
         step, evaluations = LANGEVIN[name]
         bias = stationary_bias(step, lambda q: energy(0.0, q), T, hs)
@@ -99,6 +99,6 @@ def section(page: Page) -> str:
     ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     ax.xaxis.set_minor_formatter(NullFormatter())
-    figure.legend(loc="outside lower center", ncols=3)
+    figure.legend(loc="outside lower center", ncols=2)
     picture = page.picture(figure, "langevin", "Bias against cost")
     return fill(__file__, table=shown, picture=picture)

@@ -163,7 +163,7 @@ def section(page: Page) -> str:
     exact = exact_square(8 if page.quick else 20)
     print(f"\nRods at a temperature: angles at t = {t1:g}, {paths:,} paths")
     rows = []
-    figure, axes = plt.subplots(figsize=(6.5, 4))
+    figure, axes = plt.subplots(figsize=(6, 4))
     for name, (make_terms, solver, h) in METHODS.items():
         r = angles(make_terms, solver, h, t1, paths)
         micro = 1e6 * seconds_per_time(name, 2 if page.quick else 20)
@@ -181,7 +181,7 @@ def section(page: Page) -> str:
     axes.plot(c, density, color=BLUE, label="rods, exact")
     axes.axhline(0.5, color=VERMILION, ls="--", label="springs, exact")
     axes.set(xlabel="cosine of an outer angle", ylabel="density", ylim=(0.43, 0.56))
-    figure.legend(loc="outside upper center", ncols=4)
+    figure.legend(loc="outside upper center", ncols=2)
     picture = page.picture(figure, "rods", "Angles between rods and between springs")
     header = (
         "method", "$h$", r"$\langle c^2 \rangle$", "kinetic energy", "stretched",

@@ -104,7 +104,7 @@ def section(page: Page) -> str:
     names = ["ImplicitMidpoint", "Heun"] if page.quick else SOLVERS
     print(f"\nTwo-body problem, {count} orbits, s = {s}, {paths} paths")
     rows = []
-    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.2))
+    figure, axes = plt.subplots(2, 1, figsize=(WIDTH, 7.5))
     for name in names:
         solver, make_path = SOLVERS[name]
         for per_orbit in sizes:
@@ -127,7 +127,7 @@ def section(page: Page) -> str:
             rows.append((name, f"{r.momentum_error:.1e}", str(balance)))
     axes[0].set(aspect="equal", xlabel="$q_1$", ylabel="$q_2$")
     axes[0].set_title("one path, ImplicitMidpoint")
-    axes[1].set(xlabel="orbits", ylabel="largest relative error, angular momentum")
+    axes[1].set(xlabel="orbits", ylabel="error of the angular momentum")
     axes[1].set_title(f"{sizes[0]} steps per orbit")
     axes[1].legend(loc="upper left", bbox_to_anchor=(0, 0.75))
     picture = page.picture(figure, "two_body", "Two-body problem")

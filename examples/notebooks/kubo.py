@@ -68,7 +68,7 @@ solutions = {
 }
 
 # %% The midpoint rule stays on the unit circle, the path of Heun's method spirals outwards
-fig, axes = plt.subplots(1, 2, figsize=(7.5, 3.7), sharex=True, sharey=True)
+fig, axes = plt.subplots(1, 2, figsize=(6, 3.3), sharex=True, sharey=True)
 angle = np.linspace(0, 2 * np.pi, 200)
 colours = {"ImplicitMidpoint": "#0072B2", "Heun": "#D55E00"}
 for ax, (name, (_, p, q)) in zip(axes, solutions.items()):

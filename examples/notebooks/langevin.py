@@ -48,7 +48,7 @@ sol = diffrax.diffeqsolve(
 p, q = sol.ys
 
 # %% It turns over now and then
-fig, ax = plt.subplots(figsize=(7, 3))
+fig, ax = plt.subplots(figsize=(6, 3))
 ax.plot(ts, q / (2 * np.pi))
 ax.set(xlabel="t", ylabel="turns")
 plt.show()
@@ -76,7 +76,7 @@ density = np.exp(np.cos(angle) / T)
 density /= np.trapezoid(density, angle)
 
 # %% The angles of 20,000 pendulums, and the exact density
-fig, ax = plt.subplots(figsize=(7, 3))
+fig, ax = plt.subplots(figsize=(6, 3))
 ax.hist(np.mod(q + np.pi, 2 * np.pi) - np.pi, bins=60, density=True, alpha=0.4)
 ax.plot(angle, density, "k")
 ax.set(xlabel="q", ylabel="density")

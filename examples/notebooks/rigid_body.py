@@ -78,17 +78,17 @@ ts, X = solve(terms, ds.ImplicitMidpoint(), y0, mu, ds.from_spinors)
 _, X_heun = solve(plain, diffrax.Heun(), X0, mu)
 
 # %% A path on the sphere, and the change of the length of X in time
-fig = plt.figure(figsize=(9, 3.7))
-ax = fig.add_subplot(1, 2, 1, projection="3d")
+fig = plt.figure(figsize=(6, 7))
+ax = fig.add_subplot(2, 1, 1, projection="3d")
 blue, vermilion = "#0072B2", "#D55E00"
 ax.plot(*X.T, ".", ms=2, color=blue)
 ax.set(title="ImplicitMidpoint with spin_terms", aspect="equal")
-ax = fig.add_subplot(1, 2, 2)
+ax = fig.add_subplot(2, 1, 2)
 error = lambda X: abs(np.linalg.norm(X, axis=1) - 1) + 1e-17
 ax.semilogy(ts, error(X), color=blue, label="ImplicitMidpoint with spin_terms")
 ax.semilogy(ts, error(X_heun), color=vermilion, ls="--", label="Heun")
 ax.set(xlabel="$t$", ylabel="$||X| - 1|$")
-ax.legend(loc="center right", fontsize=8)
+ax.legend(loc="center right")
 fig.tight_layout()
 plt.show()
 

@@ -80,7 +80,7 @@ bunches = {
 # $\sigma_2^2/2$ and $\sigma_1^2/2$.
 
 # %% Phase space at the end, and mean energy: Euler's method heats the bunch
-fig, (ax, energy) = plt.subplots(1, 2, figsize=(9, 3.7))
+fig, (ax, energy) = plt.subplots(2, 1, figsize=(6, 7))
 for colour, (name, (P, Q)) in zip(("#009E73", "#404040"), bunches.items()):
     turned = (Q[:, -1] + np.pi) % (2 * np.pi) - np.pi
     ax.plot(turned, P[:, -1], ".", ms=2, color=colour)
@@ -94,7 +94,7 @@ ax.set(xlabel="$Q$", ylabel="$P$", title=f"$t = {t1:.0f}$; lines: the bucket")
 low, high = (H0(0.0, *y0, None) + s**2 / 2 * ts for s in (sigma2, sigma1))
 energy.fill_between(ts, low, high, color="0.7", label="bounds of the exact mean")
 energy.set(xlabel="$t$", ylabel="mean of $H_0$")
-energy.legend(fontsize=8)
+energy.legend()
 fig.tight_layout()
 plt.show()
 

@@ -129,7 +129,7 @@ def section(page: Page) -> str:
     if not page.quick:
         ax.set(ylim=(56.6, 57.4))  # resonances lie far below
     figure.legend(loc="outside lower center", ncols=2)
-    heads = "solver", "$h$", "soft forces a unit of time", "mean soft energy"
+    heads = "solver", "$h$", "soft forces per time", "mean soft energy"
     energies = table(heads, rows)
     picture = page.picture(figure, "chain", "Mean soft energy against the step")
     return fill(__file__, table=energies, picture=picture, exact=f"{EXACT:g}")
